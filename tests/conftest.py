@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import pytest
 from hypothesis import HealthCheck, settings
 from kaggle_image import pack_wheel
+from shared import write_recipe
 
 from mkpc_kaggle.demo import DemoSet, write_demo
 from mkpc_kaggle.package.wheels import BUNDLED
@@ -70,13 +71,8 @@ def wheels(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def small_recipe(tmp_path: Path) -> Path:
-    """The file of a quick recipe of two stages."""
-    path = tmp_path / "small.toml"
-    units = [
-        f'{{ stage = {stage}, matcher = "sift", long_side = {side} }}' for stage, side in ((1, 320), (2, 400))
-    ]
-    path.write_text(f"units = [{', '.join(units)}]\n[magsac]\npermutations = 1\nmax_iterations = 5000\n")
-    return path
+    magsac = "[magsac]\npermutations = 1\nmax_iterations = 5000\n"
+    return write_recipe(tmp_path / "small.toml", (1, 320), (2, 400), more=magsac)
 
 
 @pytest.fixture

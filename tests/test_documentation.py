@@ -55,11 +55,10 @@ def options_of(parser: argparse.ArgumentParser) -> set[str]:
     return {text for action in parser._actions for text in action.option_strings}
 
 
-def subcommands() -> dict[str, argparse.ArgumentParser]:
-    (action,) = [
-        action for action in make_parser(list(COMMANDS))._actions if isinstance(action, argparse._SubParsersAction)
-    ]
-    return dict(action.choices)
+def inner(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
+    """The parsers of its commands, by name."""
+    groups = [action.choices for action in parser._actions if isinstance(action, argparse._SubParsersAction)]
+    return {name: each for choices in groups for name, each in choices.items()}
 
 
 def commands(page: Path) -> Iterator[tuple[str, list[str]]]:
@@ -72,18 +71,15 @@ def commands(page: Path) -> Iterator[tuple[str, list[str]]]:
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_pages_name_commands_and_options_that_there_are(page):
-    known = subcommands()
+    known = inner(make_parser(list(COMMANDS)))
     for name, options in commands(page):
         assert name in known, name
-        inner = [action for action in known[name]._actions if isinstance(action, argparse._SubParsersAction)]
-        parsers = [known[name], *(parser for action in inner for parser in action.choices.values())]
-        have = set().union(*map(options_of, parsers))
+        have = set().union(*map(options_of, [known[name], *inner(known[name]).values()]))
         assert set(options) <= have, (name, set(options) - have)
 
 
-BLOCKS = [
-    block for page in PAGES for block in re.findall(r"^```python\n(.*?)^```", page.read_text("utf-8"), re.M | re.S)
-]
+PYTHON = re.compile(r"^```python\n(.*?)^```", re.M | re.S)
+BLOCKS = [block for page in PAGES for block in PYTHON.findall(page.read_text("utf-8"))]
 
 
 @pytest.mark.parametrize("block", BLOCKS, ids=range(len(BLOCKS)))

@@ -67,29 +67,21 @@ def test_fallbacks_take_the_places_of_matchers_that_are_unfit_and_are_forgotten_
 
 
 def test_a_recipe_reads_as_written():
+    second = unit(stage=2, matcher='"x"', long_side=800, max_matches=5)
+    third = unit(stage=2, matcher='"dkm"', long_side=None, area='"540x720"', stretch="true")
     recipe = parse(
-        'description = "two"\n'
-        + units(
-            unit(),
-            unit(stage=2, matcher='"x"', long_side=800, max_matches=5),
-            unit(stage=2, matcher='"dkm"', long_side=None, area='"540x720"', stretch="true"),
-        )
+        f'description = "two"\n{units(unit(), second, third)}'
         + "[mkpc]\neps = 0.1\nmin_samples = 7\nexpand_x = 2\n"
-        + '[magsac]\nmethod = "ransac"\nthreshold = 1.5\n[focal]\nsigma = 0.2\n'
-        + "[matchers.sift]\nfeatures = 10\n"
+        + '[magsac]\nmethod = "ransac"\nthreshold = 1.5\n[focal]\nsigma = 0.2\n[matchers.sift]\nfeatures = 10\n'
     )
-    assert recipe.units == (
-        Unit(1, "sift", 640),
-        Unit(2, "x", 800, 5),
-        Unit(2, "dkm", area="540x720", stretch=True),
-    )
+    dkm = Unit(2, "dkm", area="540x720", stretch=True)
+    assert recipe.units == (Unit(1, "sift", 640), Unit(2, "x", 800, 5), dkm)
     assert recipe.mkpc == MkpcConfig(eps=0.1, min_samples=7, expand_x=2.0)
     assert type(recipe.mkpc.expand_x) is float
     assert recipe.magsac == RobustConfig(Method.RANSAC, threshold=1.5)
     assert recipe.focal == FocalConfig(sigma=0.2)
     assert (recipe.name, recipe.description) == ("mine", "two")
-    assert options_of(recipe, "sift").features == 10
-    assert options_of(recipe, "sift").ratio == 0.8
+    assert (options_of(recipe, "sift").features, options_of(recipe, "sift").ratio) == (10, 0.8)
 
 
 def test_unit_names_tell_units_apart():
@@ -113,19 +105,16 @@ def unit(**changes):
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        # keys
         ("colour = 1\n" + SIFT, r"'colour'; known keys: description, units, mkpc, magsac, focal, matchers, scene"),
         (units(unit(longside=640)), r"unit 1.*'longside'.*stage, matcher, long_side, max_matches, area"),
         (SIFT + "[mkpc]\nepsilon = 1\n", r"\[mkpc\].*'epsilon'.*eps, min_samples, share, expand_x"),
         (units(unit(stage=None)), r"unit 1: missing keys 'stage'"),
         ("", "no units"),
         ("units = [", "not valid TOML"),
-        # types
         (SIFT + "[mkpc]\nmin_samples = 5.0\n", r"\[mkpc\], key 'min_samples': expected int, got 5.0"),
         (SIFT + '[magsac]\nmethod = "MAGSAC"\n', r"'MAGSAC' is none of 'magsac', 'ransac'"),
         (units(unit(stage="true")), r"key 'stage': expected int, got True"),
         ('units = "sift"\n', "units|unit 1"),
-        # units
         (units(unit(stage=2)), "so it must have stage 1"),
         (units(unit(), unit(max_matches=9)), "1:sift@640 twice"),
         (units(unit(), unit(matcher='"a"', fallback='"sift"')), "1:sift@640 twice"),
@@ -138,7 +127,6 @@ def unit(**changes):
             (units(unit(long_side=None, area=f'"{area}"')), f'height x width such as "540x720", not {area!r}')
             for area in ("540", "540x0", "540 x 720", "640x100000")
         ],
-        # ranges
         (SIFT + "[mkpc]\neps = nan\n", r"table \[mkpc\]: .*eps must be in \[1e-06, inf\), not nan"),
         (SIFT + "[magsac]\nthreshold = 0\n", r"threshold must be in \(0, inf\), not 0"),
     ],

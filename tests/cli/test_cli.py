@@ -8,8 +8,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from shared import run_command
 
-from mkpc_kaggle.cli import main
 from mkpc_kaggle.data.competition import read_test_side, write_submission
 from mkpc_kaggle.demo import DemoSet
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
@@ -31,14 +31,13 @@ def test_a_reader_that_leaves_ends_the_command_quietly():
     reader, writer = os.pipe()
     os.close(reader)
     with os.fdopen(writer, "wb") as out:
-        done = subprocess.run(
-            [sys.executable, "-m", "mkpc_kaggle", "recipes"], stdout=out, stderr=subprocess.PIPE, check=False
-        )
+        command = [sys.executable, "-m", "mkpc_kaggle", "recipes"]
+        done = subprocess.run(command, stdout=out, stderr=subprocess.PIPE, check=False)
     assert (done.returncode, done.stderr) == (141, b"")
 
 
 def test_recipes_are_listed_with_what_they_lack(clean_environment, capsys):
-    assert main(["recipes"]) == 0
+    assert run_command("recipes") == 0
     out = capsys.readouterr().out
     light = out[out.index("light: ") :]
     assert "xfeat_lighterglue: no weights (xfeat: xfeat.pt or xfeat_sparse_bnfolded.safetensors" in light
@@ -52,12 +51,12 @@ def test_check_tells_good_from_bad(demo, tmp_path, capsys):
     ids = [pair.id for pair in read_test_side(demo.test_dir)]
     path = tmp_path / "submission.csv"
     write_submission(path, dict.fromkeys(ids, FALLBACK_FUNDAMENTAL))
-    assert main(["check", str(path), "--test-dir", str(demo.test_dir)]) == 0
+    assert run_command("check", path, "--test-dir", demo.test_dir) == 0
     assert "good: 8 rows" in capsys.readouterr().out
     write_submission(path, dict.fromkeys(ids[1:], np.full((3, 3), np.nan)))
-    assert main(["check", str(path), "--test-dir", str(demo.test_dir)]) == 1
+    assert run_command("check", path, "--test-dir", demo.test_dir) == 1
     assert "1 samples are missing" in capsys.readouterr().out
-    assert main(["check", str(path), "--test-dir", str(tmp_path)]) == 2
+    assert run_command("check", path, "--test-dir", tmp_path) == 2
 
 
 def match_arguments(demo: DemoSet, recipe: Path, out: Path) -> list[str]:
@@ -67,7 +66,7 @@ def match_arguments(demo: DemoSet, recipe: Path, out: Path) -> list[str]:
 
 def test_match_prints_f_and_draws_the_pair(demo, small_recipe, tmp_path, capsys):
     figure = tmp_path / "new" / "pair.png"
-    assert main(match_arguments(demo, small_recipe, figure)) == 0
+    assert run_command(*match_arguments(demo, small_recipe, figure)) == 0
     out = capsys.readouterr().out.splitlines()
     F = np.array([[float(value) for value in line.split()] for line in out[:3]])
     assert np.linalg.norm(F) == pytest.approx(1)
@@ -86,8 +85,8 @@ def test_matplotlib_leaves_nothing_where_home_cannot_be_written(demo, small_reci
 
 def test_match_draws_a_pair_that_has_nothing_in_common(clean_environment, tmp_path, capsys):
     cv2.imwrite(str(tmp_path / "a.png"), np.full((60, 90, 3), 127, np.uint8))
-    match, figure = ["match", *[str(tmp_path / "a.png")] * 2], tmp_path / "pair.png"
-    assert main([*match, "--licence", "permissive", "--out", str(figure)]) == 0
+    match, figure = ["match", *[tmp_path / "a.png"] * 2], tmp_path / "pair.png"
+    assert run_command(*match, "--licence", "permissive", "--out", figure) == 0
     assert "this is the fallback: too few distinct matches" in capsys.readouterr().out
     assert figure.exists()
 
@@ -98,6 +97,6 @@ def test_what_a_command_printed_has_been_flushed_when_it_ends_however_long_a_rea
             self.whole = self.getvalue(), threading.current_thread()
 
     monkeypatch.setattr(sys, "stdout", stream := Flushed())
-    assert main(["recipes"]) == 0
+    assert run_command("recipes") == 0
     assert stream.whole == (stream.getvalue(), threading.main_thread())  # a thread would not be waited for
     assert "auto: " in stream.getvalue()

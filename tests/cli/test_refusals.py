@@ -45,13 +45,8 @@ def test_what_cannot_be_done_is_refused_in_one_line_before_any_work(
 ):
     shutil.copytree(demo.test_dir, "demo/test")
     Path("demo/train").mkdir()
-    for name in (
-        "demo/train/scaling_factors.csv",
-        "x.png",
-        "w/m.pth",
-        "users/train/a.csv",
-        "truth/test_truth.csv",
-    ):
+    inputs = ("demo/train/scaling_factors.csv", "x.png", "w/m.pth", "users/train/a.csv", "truth/test_truth.csv")
+    for name in inputs:
         Path(name).parent.mkdir(parents=True, exist_ok=True)
         Path(name).write_text("precious")
     monkeypatch.setattr(write, "build_world", lambda *_, **__: pytest.fail("rendered before it was refused"))

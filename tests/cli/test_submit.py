@@ -18,16 +18,13 @@ HERE = ("--no-report", "--workers", "0")  # in one process
 
 
 def command(test_dir: Path, output: Path, recipe: Path | str, *more: str) -> list[str]:
-    script = str(ROOT / "make_submission.py")
-    paths = ("--test-dir", str(test_dir), "--output", str(output), "--recipe", str(recipe))
-    return [sys.executable, script, *paths, *more]
+    paths = ["--test-dir", str(test_dir), "--output", str(output), "--recipe", str(recipe)]
+    return [sys.executable, str(ROOT / "make_submission.py"), *paths, *more]
 
 
-def make(test_dir: Path, output: Path, recipe: Path | str, *more: str) -> subprocess.CompletedProcess[str]:
+def make(*paths: Path | str) -> subprocess.CompletedProcess[str]:
     environment = {name: value for name, value in os.environ.items() if name != "MKPC_WEIGHTS"}
-    return subprocess.run(
-        command(test_dir, output, recipe, *more), capture_output=True, text=True, env=environment, check=False
-    )
+    return subprocess.run(command(*paths), capture_output=True, text=True, env=environment, check=False)
 
 
 def assert_good(output: Path, test_dir: Path) -> None:
@@ -78,9 +75,10 @@ def test_a_limit_that_is_over_at_the_start_leaves_a_whole_file_and_is_told(demo,
     assert_good(tmp_path / "submission.csv", demo.test_dir)
 
 
-@pytest.mark.parametrize(
-    "former", [None, "", "sample_id,fundamental_matrix\nof another test set,0 0 0 0 0 0 0 0 0\n"]
-)
+OF_ANOTHER = "sample_id,fundamental_matrix\nof another test set,0 0 0 0 0 0 0 0 0\n"
+
+
+@pytest.mark.parametrize("former", [None, "", OF_ANOTHER])
 def test_a_whole_submission_is_there_before_weights_and_devices_are_looked_at(demo, tmp_path, monkeypatch, former):
     def look(*_, **__):
         assert submission_problems(output, [pair.id for pair in read_test_side(demo.test_dir)]) == []

@@ -4,10 +4,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from shared import run_command
 from web import Site, serve
 from weight_files import DATA, OTHER, digest_of, line, put
 
-from mkpc_kaggle.cli import main
 from mkpc_kaggle.weights import UNVERIFIED, WeightFile, store
 
 FILES = (
@@ -29,7 +29,7 @@ def weights(tmp_path: Path) -> Path:
 
 
 def test_list_says_what_is_there_and_what_the_missing_would_enable(weights, capsys):
-    assert main(["weights", "list", "--weights", str(weights)]) == 0
+    assert run_command("weights", "list", "--weights", weights) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[1].split() == ["sift", "MIT", "-", str(weights / "sift.pt")]
     users = ["aliked,", "aliked_lightglue"]
@@ -39,10 +39,10 @@ def test_list_says_what_is_there_and_what_the_missing_would_enable(weights, caps
 
 
 def test_verify_lists_refused_files_and_fails(weights, capsys):
-    assert main(["weights", "verify", "--weights", str(put(weights, "b.pt", b"what may be it"))]) == 0
+    assert run_command("weights", "verify", "--weights", put(weights, "b.pt", b"what may be it")) == 0
     assert "3 files, 0 refused" in capsys.readouterr().out
     put(weights, "a.pt", DATA)
-    assert main(["weights", "verify", "--weights", str(weights)]) == 1
+    assert run_command("weights", "verify", "--weights", weights) == 1
     assert "it has the bytes of sift.pt" in capsys.readouterr().out
 
 
@@ -57,10 +57,10 @@ def test_fetch_takes_files_slots_and_recipes(tmp_path, monkeypatch, capsys):
             replace(FILES[2], source=site.url),
         )
         monkeypatch.setattr(store, "manifest", lambda: web)
-        assert main(["weights", "fetch", "sift.pt", "sift", str(recipe), "--out", str(tmp_path / "out")]) == 0
+        assert run_command("weights", "fetch", "sift.pt", "sift", recipe, "--out", tmp_path / "out") == 0
         out = capsys.readouterr().out
         assert len(site.asked) == 2
-        assert main(["weights", "fetch", "a.pt", "sift", "--out", str(tmp_path / "out")]) == 1
+        assert run_command("weights", "fetch", "a.pt", "sift", "--out", tmp_path / "out") == 1
         assert len(site.asked) == 2
     assert f"sift.pt: licence MIT, from {site.url}\nsift.pt: fetched\n" in out
     assert "b.pt: fetched: not verified" in out
@@ -76,18 +76,18 @@ def test_the_first_download_of_a_file_without_a_digest_is_the_one_that_is_accept
 ):
     monkeypatch.setenv("no_proxy", "127.0.0.1")
     out = tmp_path / "out"
-    fetch = ["weights", "fetch", "b.pt", "--out", str(out)]
+    fetch = ["weights", "fetch", "b.pt", "--out", out]
     with serve(Site(DATA)) as site:
         monkeypatch.setattr(store, "manifest", lambda: (replace(FILES[2], licence="own", source=site.url),))
-        assert main(fetch) == 0
+        assert run_command(*fetch) == 0
         (pinned,) = store.WeightStore([out]).files
         assert (pinned.size, pinned.digest, pinned.licence) == (len(DATA), digest_of(DATA), "own")
         (out / "b.pt").unlink()
-        assert main(fetch) == 0
+        assert run_command(*fetch) == 0
         (out / "b.pt").unlink()
         site.data = OTHER
         capsys.readouterr()
-        assert main(fetch) == 1
+        assert run_command(*fetch) == 1
     told = capsys.readouterr().out
     assert digest_of(OTHER) in told
     assert digest_of(DATA) in told

@@ -6,7 +6,6 @@ import re
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from shared import DATA, needs_data
 
 from mkpc_kaggle.data.competition import (
     read_submission,
@@ -16,7 +15,6 @@ from mkpc_kaggle.data.competition import (
     write_submission,
 )
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.geometry.cameras import fundamental_of_cameras
 
 HEADER = "sample_id,batch_id,image_1_id,image_2_id"
 EYE = np.eye(3)
@@ -147,19 +145,6 @@ def test_a_train_side_that_cannot_be_read_is_refused_by_file(train, file, old, n
     with pytest.raises(UserError, match=re.escape(says)) as refused:
         read_train_side(train, **options)
     assert options or new == "" or file in str(refused.value)
-
-
-@needs_data
-def test_cameras_of_the_shared_train_side_give_its_fundamental_matrices():
-    csv = DATA / "train" / "fountain_p11" / "pair_covisibility.csv"
-    truth = dict(line.split(",")[::2] for line in csv.read_text().splitlines()[1:])
-    scenes = read_train_side(DATA / "train", scenes=["fountain_p11"], pairs_per_scene=5)
-    assert len(scenes[0].pairs) == 5
-    for true in scenes[0].pairs:
-        assert all(image.is_file() for image in true.pair.images)
-        F = fundamental_of_cameras(true.camera0, true.camera1)
-        expected = np.array(truth[true.pair.id.partition(";")[2]].split(), float).reshape(3, 3)
-        assert_allclose(F * np.sign(np.sum(F * expected)), expected, rtol=0, atol=1e-9)
 
 
 def test_a_submission_keeps_its_numbers_and_their_order(tmp_path):

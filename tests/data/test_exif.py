@@ -25,27 +25,24 @@ def write(path, *tags, **more):
 def test_stored_pixels_are_read_and_views_set_upright_as_by_opencv(tmp_path, orientation, suffix, order):
     path = write(tmp_path / f"a{suffix}", orientation, order=order)
     image = read_image(path)
-    assert_array_equal(
-        image.pixels, cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)[..., ::-1]
-    )
+    stored = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    assert_array_equal(image.pixels, stored[..., ::-1])
     upright = cv2.imread(str(path))[..., ::-1]
     shown = np.rot90(image.pixels, image.turns)
     assert_array_equal(shown, upright[:, ::-1] if orientation in {2, 4, 5, 7} else upright)
 
 
-@pytest.mark.parametrize(
-    "tags",
-    [
-        {"tA405": 28},
-        {"tA405": 28, "t920A": (42, 10), "tA20E": (250, 1), "tA210": 2},
-        {"tA405": 0, "t920A": (42, 10), "tA20E": (250, 1), "tA210": 2},
-        {"t920A": (42, 10), "tA20E": (100, 1), "tA210": 3},
-        {"t920A": (42, 10), "tA20E": (101, 10), "tA210": 4},
-        {"t920A": (42, 10), "tA20E": (10, 1001), "tA210": 5},
-        {"t920A": (42, 10), "tA20E": (250, 1), "tA210": 1},
-        {},
-    ],
-)
+POSSIBLE = [  # a focal length for film of 35 mm; a focal length, a resolution, and its unit
+    {"tA405": 28},
+    {"tA405": 28, "t920A": (42, 10), "tA20E": (250, 1), "tA210": 2},
+    {"tA405": 0, "t920A": (42, 10), "tA20E": (250, 1), "tA210": 2},
+    *({"t920A": (42, 10), "tA20E": by, "tA210": n} for n, by in ((3, (100, 1)), (4, (101, 10)), (5, (10, 1001)))),
+    {"t920A": (42, 10), "tA20E": (250, 1), "tA210": 1},
+    {},
+]
+
+
+@pytest.mark.parametrize("tags", POSSIBLE)
 @pytest.mark.parametrize("order", "<>")
 def test_the_focal_length_is_that_of_colmap(tmp_path, tags, order):
     path = write(tmp_path / "a.jpg", 6, order=order, **tags)

@@ -8,16 +8,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from numpy.testing import assert_array_equal
 
 from mkpc_kaggle.data import images
-from mkpc_kaggle.data.images import ByteCache, Image, ImageStore, Unreadable, content_digest, read_image
+from mkpc_kaggle.data.images import Image, ImageStore, Unreadable, content_digest, read_image
 
 
 def write(path, pixels, *options):
-    """RGB, gray or RGBA -> the file."""
     order = {4: cv2.COLOR_RGBA2BGRA, 3: cv2.COLOR_RGB2BGR}.get(pixels.shape[2] if pixels.ndim == 3 else 1)
     done, data = cv2.imencode(path.suffix, pixels if order is None else cv2.cvtColor(pixels, order), options)
     assert done
@@ -59,8 +56,7 @@ def test_a_file_that_is_not_a_picture_has_its_reason(tmp_path):
     png = write(tmp_path / "cut.png", noise(64, 64, 3))
     png.write_bytes(png.read_bytes()[: png.stat().st_size // 2])
     assert "cut off" in reason(png)
-    for shape, told in (((3, 300), "300 x 3 pixels"), ((300, 3), "3 x 300 pixels")):
-        assert told in reason(write(tmp_path / "line.png", noise(*shape)))
+    assert "300 x 3 pixels" in reason(write(tmp_path / "line.png", noise(3, 300)))
     assert isinstance(read_image(write(tmp_path / "strip.png", noise(10, 300))), Image)
     assert "cannot be read" in reason(tmp_path / "directory.png")
     assert reason(tmp_path / "none.png") == "no such file"
@@ -74,13 +70,9 @@ def test_an_array_is_named_by_its_content_and_shape_or_refused():
     name = Image.of_array(pixels).name
     assert name == Image.of_array(pixels.copy()).name
     assert name not in (Image.of_array(pixels.reshape(4, 6, 3)).name, Image.of_array(255 - pixels).name)
-    for shape, kind in (
-        ((4, 4, 4), np.uint8),
-        ((2, 4, 4, 3), np.uint8),
-        ((0, 4, 3), np.uint8),
-        ((4, 4, 3), np.float32),
-    ):
-        with pytest.raises(ValueError, match=rf"not {np.dtype(kind)} \({shape[0]},"):
+    wrong = [((4, 4, 4), "uint8"), ((2, 4, 4, 3), "uint8"), ((0, 4, 3), "uint8"), ((4, 4, 3), "float32")]
+    for shape, kind in wrong:
+        with pytest.raises(ValueError, match=rf"not {kind} \({shape[0]},"):
             Image.of_array(np.zeros(shape, kind))
 
 
@@ -99,20 +91,13 @@ def decoded(monkeypatch):
 
 
 def test_prefetched_images_are_decoded_in_the_background(monkeypatch):
-    started, go = threading.Event(), threading.Event()
-
-    def slow(path):
-        started.set()
-        assert go.wait(60)
-        return Image(str(path), np.zeros((1, 1, 3), np.uint8))
-
-    monkeypatch.setattr(images, "read_image", slow)
-    store = ImageStore()
-    store.prefetch([Path("a")])  # comes back although nothing can be decoded yet
-    assert started.wait(60)
-    go.set()
-    assert store.get(Path("a")).name == "a"
-    store.close()
+    go = threading.Event()
+    image = Image("a", np.zeros((1, 1, 3), np.uint8))
+    monkeypatch.setattr(images, "read_image", lambda path: image if go.wait(60) else None)
+    with closing(ImageStore()) as store:
+        store.prefetch([Path("a")])  # comes back although nothing can be decoded yet
+        go.set()
+        assert store.get(Path("a")) is image
 
 
 def test_a_file_is_decoded_once_unless_it_made_room_or_is_unreadable(decoded):
@@ -124,27 +109,6 @@ def test_a_file_is_decoded_once_unless_it_made_room_or_is_unreadable(decoded):
     with closing(ImageStore(limit_bytes=299)) as small:  # an image above the limit is handed out all the same
         assert [small.get(Path("a")).name for _ in range(2)] == ["a", "a"]
     assert len(decoded) == 9
-
-
-@given(
-    st.integers(0, 20),
-    st.lists(st.tuples(st.sampled_from("abcde"), st.one_of(st.none(), st.integers(0, 25))), max_size=40),
-)
-def test_the_cache_agrees_with_a_plain_list_in_order_of_use(limit, steps):
-    """A step puts a value of that size, or with no size asks for the key."""
-    cache: ByteCache[str, int] = ByteCache(limit)
-    used: list[tuple[str, int]] = []
-    for key, size in steps:
-        entry = next((entry for entry in used if entry[0] == key), None)
-        if size is None:
-            assert cache.get(key) == (entry[1] if entry else None)
-        else:
-            cache.put(key, size, size)
-            entry = (key, size) if size <= limit else None
-        used = [other for other in used if other[0] != key] + ([entry] if entry else [])
-        while sum(size for _, size in used) > limit:
-            used.pop(0)
-        assert cache.bytes == sum(size for _, size in used)
 
 
 def test_the_digest_of_a_file_is_that_of_its_bytes(tmp_path):

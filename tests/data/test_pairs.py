@@ -1,6 +1,5 @@
 """Lists of pairs: lines that are read or refused, and what ``validate`` makes of a list."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,8 +7,8 @@ import cv2
 import numpy as np
 import pytest
 from pair_lists import line_of, line_of_pair, turned_camera, write_list
+from shared import scores_of
 
-from mkpc_kaggle.cli import main
 from mkpc_kaggle.data.competition import Pair, read_train_side
 from mkpc_kaggle.data.pairs import parse_line, read_pairs
 from mkpc_kaggle.engine.settings import Settings
@@ -95,22 +94,8 @@ def test_the_true_matrix_has_no_error(demo, scenes, tmp_path):
         assert all(path.is_file() for path in true.pair.images)
 
 
-def errors_of(listed: Path, root: Path, recipe: Path) -> list[float]:
-    """Of the rotation of each pair, in degrees, as `validate` writes it."""
-    command = [
-        "validate",
-        "--pairs",
-        str(listed),
-        "--image-root",
-        str(root),
-        "--recipe",
-        str(recipe),
-        "--workers",
-        "0",
-    ]
-    assert main([*command, "--json", str(listed.with_suffix(".json"))]) == 0
-    (scene,) = json.loads(listed.with_suffix(".json").read_text())["scenes"]
-    return [pair["rotation_error_degrees"] for pair in scene["pairs"]]
+def listed(home: Path, root: Path) -> tuple[object, ...]:
+    return "--pairs", home / "list.txt", "--image-root", root
 
 
 def test_a_listed_image_is_set_upright_and_scored_by_the_camera_of_its_stored_pixels(
@@ -127,7 +112,8 @@ def test_a_listed_image_is_set_upright_and_scored_by_the_camera_of_its_stored_pi
             cameras.append(turned_camera(camera, -quarters, Size(*upright.shape[1::-1])))
         lines.append(line_of((names[0], names[1]), (cameras[0], cameras[1]), turns))
     (tmp_path / "list.txt").write_text("\n".join(lines))
-    assert max(errors_of(tmp_path / "list.txt", tmp_path, small_recipe)) < 5
+    scores = scores_of(tmp_path / "scores.json", *listed(tmp_path, tmp_path), "--recipe", small_recipe)
+    assert max(pair["rotation_error_degrees"] for pair in scores["scenes"][0]["pairs"]) < 5
 
 
 def test_the_estimate_of_a_pair_depends_on_its_cameras():
@@ -139,25 +125,11 @@ def test_the_estimate_of_a_pair_depends_on_its_cameras():
 def test_failures_count_as_such(demo, scenes, tmp_path, capsys):
     """One pair of two cannot be read: half of what the other reaches is left."""
     true = max(scenes[0].pairs, key=lambda true: true.covisibility)
-    out = tmp_path / "scores.json"
     good = line_of_pair(true, demo.train_dir)
     bad = line_of(("missing.jpg", "none.jpg"), (true.camera0, true.camera1), (1, 0))
     (tmp_path / "list.txt").write_text(f"{good}\n\n{bad}\n")
-    arguments = ["validate", "--pairs", str(tmp_path / "list.txt"), "--image-root", str(demo.train_dir)]
-    arguments += [
-        "--recipe",
-        "classical",
-        "--method",
-        "ransac",
-        "--threshold",
-        "1",
-        "--workers",
-        "0",
-        "--json",
-        str(out),
-    ]
-    assert main(arguments) == 0
-    scores = json.loads(out.read_text())
+    ransac = ("--recipe", "classical", "--method", "ransac", "--threshold", 1)
+    scores = scores_of(tmp_path / "scores.json", *listed(tmp_path, demo.train_dir), *ransac)
     assert scores["mAA"] is None
     found, missing = scores["scenes"][0]["pairs"]
     assert found["rotation_error_degrees"] < 5

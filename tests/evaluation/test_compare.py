@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from shared import run_command
 
-from mkpc_kaggle.cli import main
 from mkpc_kaggle.demo import DemoSet
 from mkpc_kaggle.evaluation.compare import Comparison, paired_difference
 from mkpc_kaggle.evaluation.validate import PairScore, SceneScore, Validation
@@ -57,17 +57,15 @@ def test_different_pairs_are_not_compared():
         Comparison(tuple(Validation("a", (SceneScore("s", pairs),)) for pairs in ((p, q), (q, p))))
 
 
-def compare(demo: DemoSet, *more: str) -> int:
-    return main(
-        ["validate", "--train-dir", str(demo.train_dir), "--pairs-per-scene", "4", "--workers", "0", *more]
-    )
+def compare(demo: DemoSet, *more: object) -> int:
+    return run_command("validate", "--train-dir", demo.train_dir, "--pairs-per-scene", 4, "--workers", 0, *more)
 
 
 def test_a_recipe_against_its_units_on_whole_images(demo, small_recipe, tmp_path, capsys):
     out = tmp_path / "scores.json"
     compared = f"{small_recipe}:whole-images", str(small_recipe)
-    arguments = ["--compare", *compared, "--work-dir", str(tmp_path / "work")]
-    assert compare(demo, *arguments, "--json", str(out)) == 0
+    arguments = ["--compare", *compared, "--work-dir", tmp_path / "work"]
+    assert compare(demo, *arguments, "--json", out) == 0
     table = capsys.readouterr().out.split("seconds a pair\n")[-1]
     scores = json.loads(out.read_text())
     assert [run["recipe"] for run in scores["recipes"]] == ["small (whole-images)", "small"]
@@ -91,7 +89,7 @@ def test_a_comparison_of_runs_that_failed_or_ran_out_of_time_has_their_exit_stat
     for image in train.rglob("*.jpg"):
         image.write_bytes(b"no picture")
     compared = ["--pairs-per-scene", "2", "--compare", f"{small_recipe}:stage-1", f"{small_recipe}:whole-images"]
-    assert main(["validate", "--train-dir", str(train), *compared]) == 1
+    assert run_command("validate", "--train-dir", train, *compared) == 1
     printed = capsys.readouterr().out
     assert printed.count("the run failed: errors left 2 of 2 pairs without an F") == 2
     assert "gain of mAA" in printed
@@ -105,11 +103,10 @@ def test_what_recipes_have_in_common_is_matched_once(demo, small_recipe, tmp_pat
     other, third, text = tmp_path / "other.toml", tmp_path / "third.toml", small_recipe.read_text()
     third.write_text(f"{text}threshold = 1.0\n")
     other.write_text(text.replace("400", "440") + "\n[focal]\nsigma = 0.3\n")
-    recipes = map(str, (small_recipe, third, other))
-    assert compare(demo, "--compare", *recipes, "--work-dir", str(tmp_path / "work")) == 0
+    assert compare(demo, "--compare", small_recipe, third, other, "--work-dir", tmp_path / "work") == 0
     printed = capsys.readouterr().out
     assert re.findall(r"(\d+) units run", printed) == ["8", "0", "4"], "each common unit runs once"
     shared = printed.split("recipe other")[-1]
-    assert compare(demo, "--recipe", str(other), "--work-dir", str(tmp_path / "alone")) == 0
+    assert compare(demo, "--recipe", other, "--work-dir", tmp_path / "alone") == 0
     scores = shared.splitlines()[1:5]
     assert "\n".join(scores) in capsys.readouterr().out, "as if it had been matched"

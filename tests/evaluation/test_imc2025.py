@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from shared import run_command
 
-from mkpc_kaggle.cli import main
 from mkpc_kaggle.evaluation.imc2025 import DatasetScore, score_dataset
 
 THRESHOLDS = (0.025, 0.05, 0.1, 0.2, 0.5, 1.0)
@@ -94,12 +94,7 @@ ROW = f"set,a,a0.png,{POSE}"
     ("table", "before", "after", "told"),
     [
         ("train_labels", POSE, HUGE, "line 2: '1e308;.*' has a number beyond 1e\\+12"),
-        (
-            "train_labels",
-            POSE,
-            POSE.replace("1", "nan", 1),
-            "train_labels.csv: set/a0.png has no pose, and is not",
-        ),
+        ("train_labels", POSE, POSE.replace("1", "nan", 1), "labels.csv: set/a0.png has no pose, and is not"),
         ("train_labels", None, LABELS, "train_labels.csv has no rows"),
         ("train_thresholds", "set,a,", "set,b,", "has no thresholds of set/a"),
         ("train_thresholds", "0.5;", "nan;", "line 2: expected 3 positive thresholds or more, found '0.025;.*nan"),
@@ -107,12 +102,7 @@ ROW = f"set,a,a0.png,{POSE}"
         ("train_thresholds", "set,a", "other,a,1;2;3\nset,a", "train_labels.csv lacks the dataset 'other'"),
         ("submission", ROW, f"other,a,a0.png,{POSE},0;0;0\n{ROW}", "submission.csv: .* lacks the dataset 'other'"),
         ("submission", None, LABELS, "submission.csv has no rows"),
-        (
-            "submission",
-            "set,outliers,x.png",
-            "set,outliers,y.png",
-            "2 images of set are missing or unknown, such as x",
-        ),
+        ("submission", "outliers,x", "outliers,y", "2 images of set are missing or unknown, such as x"),
         ("submission", "set,a,a0.png", "set,a,a1.png", "the image set/a1.png is there twice"),
         ("submission", POSE, "1;0;0", "expected 9 and 3 numbers joined by ';', found 3 and 3"),
         ("submission", POSE, "north", "'north' is not a list of numbers joined by ';'"),
@@ -125,7 +115,7 @@ def test_a_table_that_cannot_be_scored_is_refused_in_one_line(tmp_path, capsys, 
     submission.write_text((home / "train_labels.csv").read_text())
     path = home / f"{table}.csv"
     path.write_text(after if before is None else path.read_text().replace(before, after, 1))
-    assert main(["validate", "--imc2025", str(home), "--submission", str(submission)]) == 2
+    assert run_command("validate", "--imc2025", home, "--submission", submission) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert re.search(told, line)
 
@@ -134,7 +124,7 @@ def test_the_command_scores_a_file_and_a_dataset_of_outliers_alone_needs_no_thre
     home = write_truth(tmp_path)
     with (home / "train_labels.csv").open("a") as stream:
         stream.write(f"a\x1b[2Jb,outliers,x.png,{';'.join(['nan'] * 9)},nan;nan;nan\n")
-    assert main(["validate", "--imc2025", str(home), "--submission", str(home / "train_labels.csv")]) == 0
+    assert run_command("validate", "--imc2025", home, "--submission", home / "train_labels.csv") == 0
     rows = [line.split() for line in capsys.readouterr().out.splitlines()]
     assert rows[2:] == [
         ["set", "1.0000", "1.0000", "1.0000"],

@@ -1,4 +1,3 @@
-import json
 import pickle
 import re
 import sqlite3
@@ -14,10 +13,9 @@ from pair_lists import line_of, line_of_pair, write_list
 from protocol_by_hand import auc, evaluate
 from rectified import RectifiedMatcher
 from scipy.spatial.transform import Rotation
-from shared import DATA, needs_data
+from shared import DATA, needs_data, run_command, scores_of, write_recipe
 
 from mkpc_kaggle import TwoStageMatcher
-from mkpc_kaggle.cli import main
 from mkpc_kaggle.data.competition import read_train_side
 from mkpc_kaggle.data.images import read_image
 from mkpc_kaggle.data.pairs import read_pairs
@@ -36,18 +34,8 @@ K = np.array([[800.0, 0, 320], [0, 800, 240], [0, 0, 1]])
 CAMERAS = Camera(K, np.eye(3), np.zeros(3)), Camera(K, np.eye(3), np.array([1.0, 0, 0.1]))
 
 
-def validate(listed: Path, root: Path, recipe: Path) -> list[str]:
-    return [
-        "validate",
-        "--pairs",
-        str(listed),
-        "--image-root",
-        str(root),
-        "--recipe",
-        str(recipe),
-        "--workers",
-        "0",
-    ]
+def listed(file: Path, root: Path, recipe: Path) -> list[object]:
+    return ["--pairs", file, "--image-root", root, "--recipe", recipe]
 
 
 def matches_of(journal: JournalReader, position: int) -> Matches:
@@ -57,7 +45,7 @@ def matches_of(journal: JournalReader, position: int) -> Matches:
 OUTDOORS = ["castle_p19", "fountain_p11", "herz_jesus_p8", "reichstag_26"]
 
 
-def sharp(camera: Camera) -> Camera:
+def precise(camera: Camera) -> Camera:
     """The camera with a rotation of all digits: with six, the angle from a trace is wrong by up to 0.1 degrees."""
     return replace(camera, R=Rotation.from_matrix(camera.R).as_matrix())
 
@@ -65,28 +53,18 @@ def sharp(camera: Camera) -> Camera:
 @needs_data
 @pytest.mark.parametrize(
     ("scenes", "pairs", "units"),
-    [
-        (["scannet_samples"], 8, [(1, 640)]),
-        (OUTDOORS, 1, [(1, 480), (1, 640), (2, 480)]),
-    ],
+    [(["scannet_samples"], 8, [(1, 640)]), (OUTDOORS, 1, [(1, 480), (1, 640), (2, 480)])],
 )
 def test_an_independent_evaluation_of_the_same_matches_agrees(scenes, pairs, units, tmp_path):
     train = DATA / "train"
-    truths = [
-        true for scene in read_train_side(train, scenes=scenes, pairs_per_scene=pairs) for true in scene.pairs
-    ]
-    lines = [
-        line_of_pair(replace(true, camera0=sharp(true.camera0), camera1=sharp(true.camera1)), train)
-        for true in truths
-    ]
-    listed = tmp_path / "list.txt"
-    listed.write_text("\n".join(lines))
-    recipe, out = tmp_path / "recipe.toml", tmp_path / "scores.json"
-    text = ", ".join(f'{{ stage = {stage}, matcher = "sift", long_side = {side} }}' for stage, side in units)
-    recipe.write_text(f"units = [{text}]")
-    command = [*validate(listed, train, recipe), "--protocol", "superglue", "--work-dir", str(tmp_path)]
-    assert main([*command, "--json", str(out)]) == 0
-    scores = json.loads(out.read_text())
+    read = read_train_side(train, scenes=scenes, pairs_per_scene=pairs)
+    truths = [true for scene in read for true in scene.pairs]
+    sharp = [replace(true, camera0=precise(true.camera0), camera1=precise(true.camera1)) for true in truths]
+    lines = [line_of_pair(true, train) for true in sharp]
+    (tmp_path / "list.txt").write_text("\n".join(lines))
+    recipe = write_recipe(tmp_path / "recipe.toml", *units)
+    options = listed(tmp_path / "list.txt", train, recipe)
+    scores = scores_of(tmp_path / "s.json", *options, "--protocol", "superglue", "--work-dir", tmp_path)
     side = max(side for stage, side in units if stage == 1)
     expected = []
     with JournalReader(tmp_path) as journal:
@@ -101,16 +79,12 @@ def test_an_independent_evaluation_of_the_same_matches_agrees(scenes, pairs, uni
                 residual = expected[-1]["t"] @ record.pair_fundamental  # t is E's left null vector
                 np.testing.assert_allclose(residual, 0, atol=1e-6)
     (scene,) = scores["scenes"]
-    for key, own in (
-        ("rotation", "rotation_error_degrees"),
-        ("translation", "translation_error_degrees"),
-        ("precision", "precision"),
-        ("matching_score", "matching_score"),
-    ):
-        found = [np.inf if pair[own] is None else pair[own] for pair in scene["pairs"]]
+    own = {"rotation": "rotation_error_degrees", "translation": "translation_error_degrees"}
+    for key in ("rotation", "translation", "precision", "matching_score"):
+        found = [np.inf if pair[own.get(key, key)] is None else pair[own.get(key, key)] for pair in scene["pairs"]]
         np.testing.assert_allclose(found, [pair[key] for pair in expected], atol=1e-6, err_msg=key)
-        if "error" not in own:
-            assert scores[own] == pytest.approx(np.mean(found), abs=1e-9)
+        if key not in own:
+            assert scores[key] == pytest.approx(np.mean(found), abs=1e-9)
     errors = [max(pair["rotation"], pair["translation"]) for pair in expected]
     for limit in (5, 10, 20):
         assert scores["AUC"][str(limit)] == pytest.approx(auc(errors, limit), abs=1e-6)
@@ -250,13 +224,13 @@ BAD = {
 @pytest.mark.parametrize("name", BAD)
 def test_bad_lists_and_regions_get_one_line_and_exit_2(name, demo, scenes, small_recipe, tmp_path, capsys):
     file, write, told = BAD[name]
-    listed = write_list(tmp_path / "list.txt", [replace(scenes[0], pairs=scenes[0].pairs[:1])], demo.train_dir)
+    one = write_list(tmp_path / "list.txt", [replace(scenes[0], pairs=scenes[0].pairs[:1])], demo.train_dir)
     write(tmp_path / file)
     source, regions = tmp_path / file, []
     if file == "regions.csv":
-        source.write_text(source.read_text().replace("A,B", ",".join(listed.read_text().split()[:2])))
-        source, regions = listed, ["--regions", str(source)]
-    assert main([*validate(source, demo.train_dir, small_recipe), *regions]) == 2
+        source.write_text(source.read_text().replace("A,B", ",".join(one.read_text().split()[:2])))
+        source, regions = one, ["--regions", source]
+    assert run_command("validate", *listed(source, demo.train_dir, small_recipe), *regions) == 2
     out, err = capsys.readouterr()
     assert "executed" not in out
     (line,) = err.splitlines()
@@ -271,19 +245,17 @@ def test_regions_of_ones_own_take_the_place_of_mkpcs(demo, scenes, small_recipe,
     second = match.matches[match.in_stage(2)]
     assert len(second)
     assert boxes[0].contains(second.points0).all()
-    listed = write_list(tmp_path / "list.txt", [replace(scenes[0], pairs=(true,))], demo.train_dir)
+    one = write_list(tmp_path / "list.txt", [replace(scenes[0], pairs=(true,))], demo.train_dir)
     cells = ",".join(f"{box.left} {box.top} {box.right} {box.bottom}" for box in boxes)
-    table(f"{','.join(listed.read_text().split()[:2])},{cells}")(tmp_path / "regions.csv")
-    command = [*validate(listed, demo.train_dir, small_recipe), "--work-dir", str(tmp_path / "run")]
-    given = ["--regions", str(tmp_path / "regions.csv")]
+    table(f"{','.join(one.read_text().split()[:2])},{cells}")(tmp_path / "regions.csv")
+    command = ["validate", "--workers", 0, *listed(one, demo.train_dir, small_recipe)]
+    given = ["--regions", tmp_path / "regions.csv"]
     for options, rows in ((given, 2), ([], 3), (given, 3)):
-        assert main([*command, *options]) == 0
+        assert run_command(*command, "--work-dir", tmp_path / "run", *options) == 0
         with JournalReader(tmp_path / "run") as journal:
             (record,), found = journal.records(), matches_of(journal, 0)
         assert ([region.box for region in record.regions] == [*boxes]) == bool(options)
         assert ({region.reason for region in record.regions} == {RegionReason.GIVEN}) == bool(options)
         with closing(sqlite3.connect(tmp_path / "run" / "journal.sqlite")) as database:
-            assert database.execute("SELECT count(*) FROM points").fetchone() == (rows,), (
-                "other regions, other points"
-            )
+            assert database.execute("SELECT count(*) FROM points").fetchone() == (rows,)  # other regions, others
     np.testing.assert_array_equal(found.points0, match.matches.points0)

@@ -6,25 +6,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from shared import run_command, scores_of
 
-from mkpc_kaggle.cli import main
-from mkpc_kaggle.data.competition import (
-    Pair,
-    TrainScene,
-    TruePair,
-    read_test_side,
-    read_train_side,
-    write_submission,
-)
+from mkpc_kaggle.data import competition
+from mkpc_kaggle.data.competition import Pair, TrainScene, TruePair, read_test_side, read_train_side
 from mkpc_kaggle.demo import DemoSet
 from mkpc_kaggle.engine.records import PairRecord
-from mkpc_kaggle.evaluation.validate import (
-    SceneScore,
-    Step,
-    score_record,
-    score_submission,
-    score_table,
-)
+from mkpc_kaggle.evaluation.validate import SceneScore, Step, score_record, score_submission, score_table
 from mkpc_kaggle.geometry.cameras import Camera, fundamental_of_cameras
 from mkpc_kaggle.geometry.metrics import AUC_THRESHOLDS
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
@@ -32,7 +20,6 @@ from mkpc_kaggle.reporting.run_log import read_log
 
 
 def true_matrices(demo: DemoSet) -> dict[str, np.ndarray]:
-    """The true F of the test side's samples, in the test side's order of images."""
     cameras: dict[str, tuple[Camera, Camera]] = {}
     for scene in read_train_side(demo.train_dir, min_covisibility=0):
         for true in scene.pairs:
@@ -46,14 +33,14 @@ def true_matrices(demo: DemoSet) -> dict[str, np.ndarray]:
 def test_the_true_matrices_score_one_whatever_the_order_of_the_images(demo, tmp_path):
     truth = true_matrices(demo)
     assert list(truth) == [pair.id for pair in read_test_side(demo.test_dir)]
-    write_submission(tmp_path / "true.csv", truth)
+    competition.write_submission(tmp_path / "true.csv", truth)
     scored = score_submission(tmp_path / "true.csv", demo.truth_csv, read_train_side(demo.train_dir))
     assert scored.maa() == 1
     assert [scored.auc(threshold) for threshold in AUC_THRESHOLDS] == pytest.approx([1, 1, 1], abs=1e-3)
     assert sum(len(scene.pairs) for scene in scored.scenes) == 8
     lines = score_table(scored)
     assert lines[1].split()[1:3] == ["8", "1.0000"]
-    write_submission(tmp_path / "fallback.csv", dict.fromkeys(truth, FALLBACK_FUNDAMENTAL))
+    competition.write_submission(tmp_path / "fallback.csv", dict.fromkeys(truth, FALLBACK_FUNDAMENTAL))
     scored = score_submission(tmp_path / "fallback.csv", demo.truth_csv, read_train_side(demo.train_dir))
     assert scored.maa() < 0.2
 
@@ -61,10 +48,10 @@ def test_the_true_matrices_score_one_whatever_the_order_of_the_images(demo, tmp_
 def test_samples_that_a_submission_has_no_row_for_count_as_failed_and_are_named(demo, tmp_path, capsys):
     truth = true_matrices(demo)
     some, whole, out = tmp_path / "some.csv", tmp_path / "whole.csv", tmp_path / "scores.json"
-    write_submission(some, dict(list(truth.items())[:2]))
-    write_submission(whole, truth)
-    score = ["validate", "--train-dir", str(demo.train_dir), "--truth", str(demo.truth_csv), "--json", str(out)]
-    assert main([*score, "--submission", str(some)]) == 0
+    competition.write_submission(some, dict(list(truth.items())[:2]))
+    competition.write_submission(whole, truth)
+    score = ["validate", "--train-dir", demo.train_dir, "--truth", demo.truth_csv, "--json", out, "--submission"]
+    assert run_command(*score, some) == 0
     lacking = list(truth)[2:]
     printed = capsys.readouterr().out
     assert "6 samples have no row and count as failed: " in printed
@@ -72,7 +59,7 @@ def test_samples_that_a_submission_has_no_row_for_count_as_failed_and_are_named(
     figures = json.loads(out.read_text())
     assert figures["mAA"] == 2 / 8
     assert sorted(figures["missing"]) == sorted(lacking)
-    assert main([*score, "--submission", str(some), "--submission", str(whole)]) == 0
+    assert run_command(*score, some, "--submission", whole) == 0
     assert [each["mAA"] for each in json.loads(out.read_text())["submissions"]] == [2 / 8, 1]
 
 
@@ -89,21 +76,16 @@ def test_a_failed_pair_counts_as_failed_even_where_the_fallback_happens_to_be_ri
     assert right.error.angle < 1e-6
 
 
-def scores_of(demo: DemoSet, recipe: Path, *options: str) -> dict[str, Any]:
-    """What `validate --json` writes."""
-    out = recipe.with_suffix(".json")
-    arguments = ["validate", "--train-dir", str(demo.train_dir), "--recipe", str(recipe), "--json", str(out)]
-    assert main([*arguments, "--workers", "0", *options]) == 0
-    scores: dict[str, Any] = json.loads(out.read_text())
-    return scores
+def on_demo(demo: DemoSet, recipe: Path, *options: object) -> dict[str, Any]:
+    return scores_of(recipe.with_suffix(".json"), "--train-dir", demo.train_dir, "--recipe", recipe, *options)
 
 
 def test_each_step_of_the_estimate_has_a_column(demo, small_recipe, capsys):
-    plain = scores_of(demo, small_recipe)
+    plain = on_demo(demo, small_recipe)
     assert plain["mAA_by_step"] == {"MAGSAC": plain["mAA"]}
     capsys.readouterr()
     small_recipe.write_text(small_recipe.read_text() + "[focal]\n[scene]\n")
-    scores = scores_of(demo, small_recipe)
+    scores = on_demo(demo, small_recipe)
     printed = capsys.readouterr().out
     by_step = scores["mAA_by_step"]
     assert list(by_step) == ["MAGSAC", "+ prior", "+ scene"]
@@ -118,8 +100,8 @@ def test_each_step_of_the_estimate_has_a_column(demo, small_recipe, capsys):
 
 
 def test_a_work_directory_keeps_the_journal_and_a_report_that_shows_the_pairs(demo, small_recipe, tmp_path):
-    options = ["--pairs-per-scene", "2", "--mode", "whole-images", "--units", "1:sift@400"]
-    scores = scores_of(demo, small_recipe, *options, "--work-dir", str(tmp_path / "work"))
+    options = ["--pairs-per-scene", 2, "--mode", "whole-images", "--units", "1:sift@400"]
+    scores = on_demo(demo, small_recipe, *options, "--work-dir", tmp_path / "work")
     assert [set(pair["matches"]) for pair in scores["scenes"][0]["pairs"]] == [{"1:sift@400"}] * 2
     page = tmp_path / "work" / "report.html"
     assert page.read_text(encoding="utf-8").count("<img ") == 2 + 1
@@ -158,7 +140,7 @@ def test_a_validation_that_hangs_ends_at_its_limit(demo):
     ],
 )
 def test_options_that_make_no_validation_are_refused(demo, small_recipe, options, told, capsys):
-    places = {"T": str(demo.train_dir), "R": str(small_recipe)}
-    assert main(["validate", *(places.get(option, option) for option in options)]) == 2
+    places = {"T": demo.train_dir, "R": small_recipe}
+    assert run_command("validate", *(places.get(option, option) for option in options)) == 2
     captured = capsys.readouterr()
     assert (told in captured.err, captured.out) == (True, "")

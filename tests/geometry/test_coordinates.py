@@ -130,12 +130,6 @@ def test_a_box_holds_the_points_on_its_pixels_half_open_and_never_nan():
     assert (box.size, box.area) == (Size(8, 4), 32)
 
 
-def test_a_view_holds_points_on_content_but_not_on_padding():
-    view = View(Box(100, 100, 140, 120), Size(20, 10), Size(32, 16))
-    points = np.array([(-0.5, -0.5), (19.4, 9.4), (19.5, 5), (5, 9.5), (-0.6, 5), (5, np.inf)])
-    assert view.holds(points).tolist() == [True] * 2 + [False] * 4
-
-
 @pytest.mark.parametrize("content", [Size(64, 16), Size(64, 19), Size(32, 16), Size(90, 16)])
 def test_shrinking_averages_what_would_alias(content):
     stripes = np.tile(np.array([[0], [255]] * 32, np.uint8), (1, 64))

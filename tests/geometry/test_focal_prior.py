@@ -41,15 +41,6 @@ def with_prior(matches, priors=WEAK, magsac=MAGSAC, config=CONFIG, model=ModelKi
     return estimate_with_prior(matches, priors, magsac, config, model)
 
 
-def assert_is_a_value(result, count):
-    assert result.matrix.shape == (3, 3)
-    assert np.isfinite(result.matrix).all()
-    assert np.linalg.norm(result.matrix) == pytest.approx(1)
-    assert result.inliers.shape == (count,)
-    if not result.ok:
-        assert result.inlier_count == 0
-
-
 def test_focal_lengths_and_pose_are_found_among_outliers():
     result = with_prior(seen(CAMERAS, 400, 0.05, 150))
     assert result.ok
@@ -125,15 +116,12 @@ def degenerate():
 def test_degenerate_matches_end_in_a_value(name):
     matches = degenerate()[name]
     result = with_prior(matches)
-    assert_is_a_value(result, len(matches))
+    assert np.isfinite(result.matrix).all()
+    assert np.linalg.norm(result.matrix) == pytest.approx(1)
+    assert result.inliers.shape == (len(matches),)
+    assert result.ok == (result.inlier_count > 0)
     assert ("too few distinct matches" in result.failure) == (name in ("five", "none"))
     assert name != "six" or (result.ok and result.magsac is None)
-
-
-def test_the_focal_lengths_are_stated_and_the_cost_is_below_magsacs():
-    stats = with_prior(seen(CAMERAS, n=300, noise=0.2, outliers=60)).stats
-    assert 30 <= stats.cost < stats.magsac_cost, "a half for each outlier"
-    assert_allclose(stats.focals, (900, 1300), rtol=0.3)
 
 
 def test_magsac_wins_over_focal_lengths_that_are_too_implausible():

@@ -19,10 +19,6 @@ def rectified(right, wrong, seed=0, box=(800, 600)):
     return Matches(points0, points1, np.ones(right + wrong))
 
 
-def own_support(matches):
-    return support(estimate(matches, QUICK).matrix, matches)
-
-
 @pytest.mark.parametrize("wrong", [0, 60, 1000])
 def test_right_matches_support_their_f_among_any_number_of_wrong_ones(wrong):
     assert support(FALLBACK_FUNDAMENTAL, rectified(200, wrong)) > MIN_SUPPORT
@@ -30,7 +26,8 @@ def test_right_matches_support_their_f_among_any_number_of_wrong_ones(wrong):
 
 @pytest.mark.parametrize("wrong", [8, 60, 500, 5000])
 def test_wrong_matches_alone_do_not_support_the_best_f_that_is_found(wrong):
-    assert own_support(rectified(0, wrong)) < MIN_SUPPORT
+    matches = rectified(0, wrong)
+    assert support(estimate(matches, QUICK).matrix, matches) < MIN_SUPPORT
 
 
 def test_thousands_of_inliers_in_one_spot_say_nothing():
@@ -41,8 +38,7 @@ def test_thousands_of_inliers_in_one_spot_say_nothing():
 
 def test_duplicates_count_once_and_few_matches_never_tell():
     matches = rectified(200, 60)
-    assert support(FALLBACK_FUNDAMENTAL, Matches.concatenate([matches] * 3)) == support(
-        FALLBACK_FUNDAMENTAL, matches
-    )
+    once, thrice = (support(FALLBACK_FUNDAMENTAL, Matches.concatenate([matches] * n)) for n in (1, 3))
+    assert once == thrice
     for count in (0, 1, 7):
         assert support(FALLBACK_FUNDAMENTAL, rectified(count, 0)) == 0

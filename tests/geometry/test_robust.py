@@ -16,14 +16,7 @@ from mkpc_kaggle.geometry import robust
 from mkpc_kaggle.geometry.cameras import Camera, fundamental_of_cameras
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.metrics import pose_error
-from mkpc_kaggle.geometry.robust import (
-    FALLBACK_FUNDAMENTAL,
-    Method,
-    ModelKind,
-    RobustConfig,
-    estimate,
-    sampson_distances,
-)
+from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, Method, ModelKind, RobustConfig, estimate
 
 DEFAULT = RobustConfig()
 WIDTH, HEIGHT = 1024, 768
@@ -95,9 +88,9 @@ def test_the_fundamental_matrix_is_found_among_outliers(seed, method):
     result = estimate(matches, RobustConfig(method=method))
     assert_agrees(result, truth)
     assert np.linalg.svd(result.matrix, compute_uv=False)[2] < 1e-9
-    assert sampson_distances(result.matrix, seen(seed + 10, 1)).max() > 1  # another scene's match
+    assert robust.sampson_distances(result.matrix, seen(seed + 10, 1)).max() > 1  # another scene's match
     fresh = seen(seed, 500)[180:]
-    distances = sampson_distances(result.matrix, fresh)
+    distances = robust.sampson_distances(result.matrix, fresh)
     assert np.median(distances) < 0.07  # MAGSAC++ is a weighted mean of near samples: RANSAC here is below 0.001
     assert distances.max() < 0.35
 
@@ -131,14 +124,14 @@ def test_magsac_finds_the_pose_of_noisy_matches_at_a_threshold_of_a_pixel():
 
 def test_sampson_distance_is_in_pixels_and_the_same_in_either_order():
     matches = Matches(np.array([(10, 20), (30, 40)]), np.array([(500, 20), (7, 43)]), np.ones(2))
-    assert_allclose(sampson_distances(FALLBACK_FUNDAMENTAL, matches), [0, 3 / np.sqrt(2)])
+    assert_allclose(robust.sampson_distances(FALLBACK_FUNDAMENTAL, matches), [0, 3 / np.sqrt(2)])
     twice = FALLBACK_FUNDAMENTAL @ np.diag([1, 0.5, 1])  # the second image is half as high: y1 = y0 / 2
     matches = Matches(np.array([(10, 20)]), np.array([(500, 13)]), np.ones(1))
     distance = 3 / np.sqrt(1 + 0.5**2)
-    assert_allclose(sampson_distances(twice, matches), [distance])
+    assert_allclose(robust.sampson_distances(twice, matches), [distance])
     swapped = Matches(matches.points1, matches.points0, np.ones(1))
-    assert_allclose(sampson_distances(1e-6 * twice.T, swapped), [distance])
-    assert sampson_distances(twice, Matches.empty()).shape == (0,)
+    assert_allclose(robust.sampson_distances(1e-6 * twice.T, swapped), [distance])
+    assert robust.sampson_distances(twice, Matches.empty()).shape == (0,)
 
 
 @pytest.mark.parametrize("model", ModelKind)

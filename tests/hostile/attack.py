@@ -94,11 +94,7 @@ def prepared(command: str, room: Path) -> int:
 
 
 def _start(
-    command: str,
-    room: Path,
-    env: dict[str, str],
-    limits: str = "-c 0",
-    stderr: Callable[[], int] | None = None,
+    command: str, room: Path, env: dict[str, str], limits: str = "-c 0", stderr: Callable[[], int] | None = None
 ) -> "subprocess.Popen[bytes]":
     limited = ["sh", "-c", f'ulimit -d {MEMORY_KIB}; ulimit {limits}; exec "$@"', "sh"]
     own = {
@@ -125,10 +121,10 @@ def _start(
 
 def _wait(process: "subprocess.Popen[bytes]", room: Path) -> tuple[int | None, str]:
     """Return the status, ``None`` if the process had to be killed, and the output."""
-    status = None
-    with suppress(subprocess.TimeoutExpired):
+    status: int | None = None
+    try:
         status = process.wait(HANGS_S)
-    if status is None:
+    except subprocess.TimeoutExpired:
         os.killpg(process.pid, signal.SIGKILL)
         process.wait()
     return status, (room / "out" / "log").read_text(errors="replace")

@@ -45,8 +45,6 @@ def serve(answer: bytes) -> int:
 
 
 def served(answer: bytes, size: str = "102400", part: Callable[[Path], object] = nothing) -> Make:
-    """Write a manifest beside weights, with a file from a server that answers so."""
-
     def make(room: Path) -> None:
         source = f"http://127.0.0.1:{serve(answer)}/a.bin"
         written("listed/weights_manifest.txt", f"a.bin  {size}  {DIGEST}  MIT  slot  {source}\n")(room)

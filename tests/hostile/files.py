@@ -1,29 +1,27 @@
 """Something else in the place of each file that a command reads."""
 
 import os
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 from attack import EITHER, REFUSED, Case
-from room import (
-    HEADER,
-    INSTEAD,
-    RECIPE,
-    RECONSTRUCT,
-    REPORTED,
-    SUBMIT,
-    TABLE,
-    UNIT,
-    makes,
-    replaced,
-    resumed,
-    written,
-)
+from room import HEADER, RECIPE, RECONSTRUCT, REPORTED, SUBMIT, TABLE, UNIT, makes, replaced, resumed, written
 from weight_bombs import AUTO, CONVERT, NAME, SEARCH
 
+INSTEAD: dict[str, Callable[[Path], object]] = {  # of a file
+    "a directory": Path.mkdir,
+    "a pipe": os.mkfifo,
+    "a link to /dev/zero": lambda path: path.symlink_to("/dev/zero"),
+    "a link to nothing": lambda path: path.symlink_to("nothing"),
+    "noise": lambda path: path.write_bytes(np.random.default_rng(1).bytes(5000)),
+    "a sparse file of 1 TB": lambda path: [path.touch(), os.truncate(path, 1 << 40)],
+}
+X = "D/test_images/b1/x.png"
 READ: dict[str, tuple[str, tuple[int, ...]]] = {  # by its path: what reads it, and how that may end
     "D/test.csv": (SUBMIT, REFUSED),
-    "D/test_images/b1/x.png": (REPORTED, (0,)),
+    X: (REPORTED, (0,)),
     "quick.toml": (SUBMIT, REFUSED),
     "I/0.png": (f"{RECONSTRUCT} --rotations", EITHER),
     "pairs.txt": (f"{RECONSTRUCT} --pairs pairs.txt", REFUSED),
@@ -66,9 +64,7 @@ GOOD_RECIPES = {
 }
 IMAGES: dict[str, Callable[[Path], object]] = {
     "a link to another image": lambda path: path.symlink_to(path.with_name("z.png")),
-    "a name in another case": lambda path: path.with_name("X.PNG").write_bytes(
-        path.with_name("z.png").read_bytes()
-    ),
+    "a name in another case": lambda path: shutil.copy(path.with_name("z.png"), path.with_name("X.PNG")),
 }
 
 
@@ -97,9 +93,7 @@ CASES = [
     *makes("journals", f"{SUBMIT} --fresh", {"its first half, forgotten": resumed(halve)}, (0,)),
     *makes("journals", "journal out/s.work --csv out/t", {"its first half, read": resumed(halve)}),
     *makes("files", CONVERT, {"a.pt is a directory of a pipe": replaced("a.pt", unpacked)}),
-    *makes(
-        "files", SUBMIT, {name: replaced("D/test_images/b1/x.png", make) for name, make in IMAGES.items()}, (0,)
-    ),
+    *makes("files", SUBMIT, {name: replaced(X, make) for name, make in IMAGES.items()}, (0,)),
     *makes("tables", SUBMIT, tables_of("D/test.csv", TABLES)),
     *makes("tables", SUBMIT, tables_of("D/test.csv", GOOD_TABLES), (0,)),
     Case("tables", "5,000 pairs of no images", SUBMIT, written("D/test.csv", NO_IMAGES), (1,)),

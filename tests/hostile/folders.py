@@ -51,14 +51,15 @@ ODD: dict[str, Callable[[Path], object]] = {
     "folders 50 deep": lambda folder: write_images(folder.joinpath(*"abcde" * 10)),
     "ids that meet": lambda folder: [write_images(folder / name) for name in ("a_b", "a/b", "I", "a/b/c")],
 }
+JOURNAL = ("out", "o", "work", "journal.sqlite")
 CHANGES: dict[str, Make] = {  # between two runs
     "an ending that was changed": lambda room: (room / "I/0.png").rename(room / "I/0.jpeg"),
     "an image that was changed": lambda room: (room / "I/0.png").write_bytes(encoded(".png", picture(50))),
     "an image that was removed": lambda room: (room / "I/0.png").unlink(),
     "a dataset more": lambda room: write_images(room / "I/more"),
     "no database": lambda room: (room / "out/o/database.db").unlink(),
-    "no journal": lambda room: (room / "out/o/work/journal.sqlite").unlink(),
-    "a journal of noise": lambda room: (room / "out/o/work/journal.sqlite").write_bytes(os.urandom(9999)),
+    "no journal": lambda room: room.joinpath(*JOURNAL).unlink(),
+    "a journal of noise": lambda room: room.joinpath(*JOURNAL).write_bytes(os.urandom(9999)),
     "a database of noise": lambda room: (room / "out/o/database.db").write_bytes(os.urandom(9999)),
     "a file of the user's": lambda room: (room / "out/o/notes.txt").touch(),
     "another recipe": lambda room: (room / "quick.toml").write_text(RECIPE.replace("200", "190")),
@@ -71,20 +72,17 @@ def below(name: str, table: dict[str, Callable[[Path], object]]) -> dict[str, Ma
 
 
 def names(table: dict[str, bytes]) -> dict[str, Make]:
-    """Return changes that add an image, or a folder of images, of each name."""
+    """Return changes that add an image, or a folder of images, of each name, which may be no text."""
 
-    def add(room: Path, name: bytes) -> None:
-        images = os.fsencode(room / "I")
-        with open(os.path.join(images, name + b".png"), "wb") as stream:  # noqa: PTH118, PTH123  it may be no text
-            stream.write(encoded(".png", picture(40)))
-
-    def add_folder(room: Path, name: bytes) -> None:
+    def add(room: Path, name: bytes, is_folder: bool) -> None:
         write_images(room / "J")
-        os.rename(room / "J", os.path.join(os.fsencode(room / "I"), name))  # noqa: PTH104, PTH118
+        (room / "J.png").write_bytes(encoded(".png", picture(40)))
+        made = "J" if is_folder else "J.png"
+        os.rename(room / made, os.path.join(os.fsencode(room / "I"), name + made[1:].encode()))  # noqa: PTH104, PTH118
 
     return {
-        f"{what} name: {told}": lambda room, m=make, n=name: m(room, n)
-        for what, make in (("an image's", add), ("a folder's", add_folder))
+        f"{what} name: {told}": lambda room, n=name, f=is_folder: add(room, n, f)
+        for what, is_folder in (("an image's", False), ("a folder's", True))
         for told, name in table.items()
     }
 
@@ -97,9 +95,7 @@ CASES = [
     *makes("folders", TO_TABLES, names(GOOD_NAMES), (0,)),
     *makes("folders", TO_TABLES, below("I", ALIKE)),
     *makes("folders", TO_TABLES, below("I", ODD), (0,)),
-    *makes(
-        "folders", RECONSTRUCT, {f"again: {name}": resumed(change) for name, change in CHANGES.items()}, EITHER
-    ),
+    *makes("folders", RECONSTRUCT, {f"again: {name}": resumed(make) for name, make in CHANGES.items()}, EITHER),
     *(
         Case("folders", f"{name} after 4 s", RECONSTRUCT, nothing, (1, *STATUSES[name]), act=sends(name, 4.0))
         for name in ENDS

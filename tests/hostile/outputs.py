@@ -76,11 +76,8 @@ EXPORTS_OVER: dict[str, Callable[[Path], object]] = {
 
 def in_folder(table: dict[str, Callable[[Path], object]]) -> dict[str, Make]:
     """Return how to put the results of a finished run, and a folder U of the user, into the room."""
-
-    def making(make: Callable[[Path], object]) -> Make:
-        return resumed(lambda room: [(room / "U").mkdir(), make(room / "U")])
-
-    return {name: making(make) for name, make in table.items()}
+    makings = {name: lambda room, m=make: [(room / "U").mkdir(), m(room / "U")] for name, make in table.items()}
+    return {name: resumed(make) for name, make in makings.items()}
 
 
 MATCH = "match D/test_images/b1/x.png D/test_images/b1/y.png --recipe quick.toml --out"

@@ -1,6 +1,5 @@
 """The room of a case before anything hostile is in it: a test side, a train side, a folder of images, a recipe."""
 
-import os
 import shutil
 import tempfile
 from collections.abc import Callable, Mapping
@@ -106,21 +105,6 @@ def replaced(name: str, make: Callable[[Path], object]) -> Make:
 
 def written(name: str, data: bytes | str) -> Make:
     return replaced(name, lambda path: path.write_bytes(data.encode() if isinstance(data, str) else data))
-
-
-def write_sparse(path: Path) -> None:
-    with path.open("wb") as stream:
-        stream.truncate(1 << 40)
-
-
-INSTEAD: dict[str, Callable[[Path], object]] = {  # of a file
-    "a directory": Path.mkdir,
-    "a pipe": os.mkfifo,
-    "a link to /dev/zero": lambda path: path.symlink_to("/dev/zero"),
-    "a link to nothing": lambda path: path.symlink_to("nothing"),
-    "noise": lambda path: path.write_bytes(np.random.default_rng(1).bytes(5000)),
-    "a sparse file of 1 TB": write_sparse,
-}
 
 
 def makes(

@@ -34,7 +34,6 @@ def tensors_of(value: Any) -> list[torch.Tensor]:
 
 
 def rows(matches: Any) -> torch.Tensor:
-    """(M, 4): the points in both pictures."""
     return torch.from_numpy(np.hstack([matches.points0, matches.points1]))
 
 

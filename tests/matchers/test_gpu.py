@@ -27,15 +27,13 @@ UNIT = Unit(1, "own", 64)
 RECIPE = Recipe((UNIT,))
 
 
-def gpus_here(monkeypatch: pytest.MonkeyPatch, *capabilities: tuple[int, int]) -> None:
+def gpus_here(monkeypatch, *capabilities: tuple[int, int]):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: len(capabilities))
     monkeypatch.setattr(devices, "gpu_capabilities", lambda: list(capabilities))
 
 
-def test_a_missing_gpu_is_refused_and_half_precision_asks_every_gpu_that_the_run_uses(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_missing_gpu_is_refused_and_half_precision_asks_every_gpu_that_the_run_uses(monkeypatch):
     gpus_here(monkeypatch, (7, 5), (6, 0))
     assert resolve_placement("cuda:1", "float32").device == "cuda:1"
     with pytest.raises(UserError, match="--device cuda:2: this machine has only cuda:0, cuda:1"):
@@ -44,8 +42,8 @@ def test_a_missing_gpu_is_refused_and_half_precision_asks_every_gpu_that_the_run
     assert fastest == [Precision.FLOAT32, Precision.FLOAT16, Precision.FLOAT32]
 
 
-def test_the_parent_of_workers_never_initialises_cuda(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse() -> None:
+def test_the_parent_of_workers_never_initialises_cuda(monkeypatch):
+    def refuse():
         raise AssertionError("CUDA was initialised in the parent")
 
     monkeypatch.setattr(torch.cuda, "_lazy_init", refuse)
@@ -57,7 +55,7 @@ def test_the_parent_of_workers_never_initialises_cuda(monkeypatch: pytest.Monkey
     assert [place.name for place in site.of(Work.MATCH)] == ["cuda:0", "cuda:1"]
 
 
-def test_gpus_on_which_nothing_can_be_computed_leave_the_work_to_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_gpus_on_which_nothing_can_be_computed_leave_the_work_to_the_cpu(monkeypatch):
     gpu_capabilities.cache_clear()
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(devices, "ASK_CAPABILITIES", "raise SystemExit('no kernel image')")
@@ -66,7 +64,7 @@ def test_gpus_on_which_nothing_can_be_computed_leave_the_work_to_the_cpu(monkeyp
         assert str(assemble("classical").placement) == "device cpu in float32"
 
 
-def test_a_probe_of_the_gpus_that_hangs_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_probe_of_the_gpus_that_hangs_is_ended(monkeypatch):
     monkeypatch.setattr(devices, "ASK_CAPABILITIES", "import time; time.sleep(600)")
     monkeypatch.setattr(devices, "PROBE_TIMEOUT_S", 0.1)
     gpu_capabilities.cache_clear()
@@ -74,8 +72,8 @@ def test_a_probe_of_the_gpus_that_hangs_is_ended(monkeypatch: pytest.MonkeyPatch
         gpu_capabilities()
 
 
-def test_a_device_that_multiplies_and_cannot_convolve_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    def convolve(*_: object) -> None:
+def test_a_device_that_multiplies_and_cannot_convolve_is_refused(monkeypatch):
+    def convolve(*_: object):
         raise RuntimeError("cuDNN error: CUDNN_STATUS_EXECUTION_FAILED_CUDART")
 
     with DeviceDouble(1) as double:
@@ -92,7 +90,7 @@ class Maps:
     others: tuple[torch.Tensor, ...] = ()
 
 
-def test_the_cache_is_sized_by_the_memory_that_is_free_and_the_workers_on_it() -> None:
+def test_the_cache_is_sized_by_the_memory_that_is_free_and_the_workers_on_it():
     made = assemble("classical", device="cpu")
     assert made.pipeline()._encodings.limit == ENCODING_CACHE_BYTES
     with DeviceDouble(2, memory=12 << 30):
@@ -109,7 +107,7 @@ class Own:
 
     spec = MatcherSpec("own", "own")
 
-    def __init__(self, value: float) -> None:
+    def __init__(self, value: float):
         self.value = value
         self.seen: list[tuple[str, str]] = []
         self.encoded = 0
@@ -131,7 +129,7 @@ def works() -> list[PairMatch]:
 
 
 @pytest.mark.skipif(not hasattr(torch.backends.cudnn, "conv"), reason="PyTorch before 2.9 has other names for it")
-def test_matchers_run_without_tf32_and_the_process_keeps_its_settings() -> None:
+def test_matchers_run_without_tf32_and_the_process_keeps_its_settings():
     before, own = settings(), Own(1.0)
     Pipeline(RECIPE, lambda name: own).match(works(), RECIPE.units)
     assert set(own.seen) == {("ieee", "ieee")}
@@ -141,7 +139,7 @@ def test_matchers_run_without_tf32_and_the_process_keeps_its_settings() -> None:
     assert settings() == before
 
 
-def test_features_that_are_not_finite_load_the_matcher_in_float32_and_are_an_error_there() -> None:
+def test_features_that_are_not_finite_load_the_matcher_in_float32_and_are_an_error_there():
     half, exact = Own(float("inf")), Own(1.0)
     runner = Pipeline(RECIPE, lambda name: half, load_float32=lambda name: exact)
     with pytest.warns(RuntimeWarning, match="own runs in float32"):
@@ -153,7 +151,7 @@ def test_features_that_are_not_finite_load_the_matcher_in_float32_and_are_an_err
     assert {work.results[0].failure for work in failed} == {"NonFiniteError: features of own are not finite"}
 
 
-def test_finite_numbers_pass_however_large_their_sum_and_whatever_holds_them() -> None:
+def test_finite_numbers_pass_however_large_their_sum_and_whatever_holds_them():
     check_finite("maps", Maps(torch.full((9, 9), 65504.0, dtype=torch.float16), (torch.arange(3),)), [])
     with pytest.raises(NonFiniteError, match="maps are not finite"):
         check_finite("maps", [Maps(torch.zeros(2), (torch.tensor([0.0, -torch.inf]),))])

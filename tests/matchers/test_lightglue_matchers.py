@@ -24,16 +24,13 @@ def glue(**shape: Any) -> nn.Module:
 
 def old_names(state: dict[str, Tensor]) -> dict[str, Any]:
     """As the public files name a layer's attentions; the thresholds are computed."""
-    renamed = {
-        re.sub(r"^transformers\.(\d+)\.(self|cross)_attn", r"\2_attn.\1", name): state[name] for name in state
-    }
-    return {name: tensor for name, tensor in renamed.items() if name != "confidence_thresholds"}
+    pattern, kept = r"^transformers\.(\d+)\.(self|cross)_attn", state.keys() - {"confidence_thresholds"}
+    return {re.sub(pattern, r"\2_attn.\1", name): state[name] for name in kept}
 
 
 def published_aliked(state: dict[str, Tensor]) -> dict[str, Any]:
-    return {
-        re.sub(r"(block[34]\.conv[12])\.weight", r"\1.regular_conv.weight", name): state[name] for name in state
-    }
+    pattern = r"(block[34]\.conv[12])\.weight"
+    return {re.sub(pattern, r"\1.regular_conv.weight", name): tensor for name, tensor in state.items()}
 
 
 def beside_an_optimizer(state: dict[str, Tensor]) -> dict[str, Any]:

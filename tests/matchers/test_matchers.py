@@ -68,7 +68,6 @@ def photograph_encoding(name):
 
 
 def match_photograph(name, pixels):
-    """Matches of the photograph, image 0, and other pixels, image 1."""
     matcher = matcher_of(name)
     return matcher.match([photograph_encoding(name)], matcher.encode([picture(pixels, matcher)]))[0]
 

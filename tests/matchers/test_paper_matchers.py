@@ -9,19 +9,16 @@ import cv2
 import numpy as np
 import pytest
 from checkpoints import FILES, use_manifest, write_checkpoints
+from shared import run_command
 from standin import scene, use_narrow
 
-from mkpc_kaggle.cli import main
 from mkpc_kaggle.data.competition import read_submission, read_test_side, submission_problems
 from mkpc_kaggle.engine.journal_reader import JournalReader
 
 LONG, AREA = ("long_side = 209", "long_side = 150"), ('area = "96x128"', 'area = "70x90"')
 # The sizes of the units of stages 1 and 2, which fit no network's multiple, and the matcher's options.
-TRIALS = {
-    "superglue": (LONG, ""),
-    "loftr": (LONG, ""),
-    "quadtree": (LONG, ""),
-    "aspanformer": (LONG, ""),
+TRIALS = dict.fromkeys(("superglue", "loftr", "quadtree", "aspanformer"), (LONG, ""))
+TRIALS |= {
     "loma": (LONG, 'variant = "b128"\nmax_keypoints = 300\nmatch_threshold = 0.0'),
     "dkm": (AREA, "matches = 300"),
     "roma": (AREA, "matches = 300"),
@@ -33,12 +30,8 @@ def test_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A test side of odd sizes, landscape and portrait, a picture without texture, and one of 33 x 47 pixels."""
     directory = tmp_path_factory.mktemp("made")
     whole = scene(240, 240, channels=3)
-    pictures = {
-        "landscape": whole[64:203, 16:225],
-        "portrait": whole[16:225, 40:179],
-        "small": whole[120:167, 80:113],
-        "blank": np.zeros((131, 175, 3), np.uint8),
-    }
+    pictures = {"landscape": whole[64:203, 16:225], "portrait": whole[16:225, 40:179]}
+    pictures |= {"small": whole[120:167, 80:113], "blank": np.zeros((131, 175, 3), np.uint8)}
     (directory / "test_images" / "made").mkdir(parents=True)
     for name, pixels in pictures.items():
         cv2.imwrite(str(directory / "test_images" / "made" / f"{name}.png"), pixels)
@@ -57,8 +50,8 @@ def test_odd_small_and_blank_pictures_go_through(clean_environment, monkeypatch,
     units = [f'{{ stage = {n}, matcher = "{matcher}", {size} }}' for n, size in enumerate(sizes, start=1)]
     (tmp_path / "r.toml").write_text(f"units = [{', '.join(units)}]\n[matchers.{matcher}]\n{options}")
     output, given = tmp_path / "out.csv", ("--recipe", tmp_path / "r.toml", "--weights", tmp_path)
-    arguments = ("--test-dir", test_dir, "--output", output, *given, "--device", "cpu", "--workers", 0)
-    assert main(["submit", "--no-report", *map(str, arguments)]) == 0
+    options = ("--test-dir", test_dir, "--output", output, *given, "--device", "cpu", "--workers", 0)
+    assert run_command("submit", "--no-report", *options) == 0
     assert submission_problems(output, [pair.id for pair in read_test_side(test_dir)]) == []
     for F in read_submission(output).values():
         strengths = np.linalg.svd(F, compute_uv=False)

@@ -1,4 +1,4 @@
-"""Half precision changes matches and warps less than a grey level of noise in the pictures does.
+"""Half precision changes matches less than a grey level of noise in the pictures does.
 
 The weights are stand-ins, so the bounds are of the arithmetic, not of the matching.
 """
@@ -15,52 +15,27 @@ from pictures import agreement
 from mkpc_kaggle.matchers.contract import Placement, Precision
 from mkpc_kaggle.pipeline.devices import fastest_precision, resolve_placement
 
-half_precisions = pytest.mark.parametrize("precision", [Precision.BFLOAT16, Precision.FLOAT16])
 
-
-def matcher_and_encodings(name, precision, *, noise):
-    """The matcher, and its encodings of two pictures; with noise, each value is changed by up to one."""
+@cache
+def matches_of(name, precision=Precision.FLOAT32, noise=0):
+    """(M, 4): the points of both pictures; with noise, each value is changed by up to one."""
     matcher, encodings = MATCHERS[name](Placement(precision=precision)), []
     for shift in (SHIFT, 0):
         shown = picture(matcher.spec.colour, 0, shift)
         change = np.random.default_rng(0).integers(-noise, noise + 1, shown.pixels.shape)
         pixels = (shown.pixels + change).clip(0, 255).astype(np.uint8)
-        encodings.append(matcher.encode([replace(shown, pixels=pixels)])[0])
-    return matcher, encodings
-
-
-@cache
-def matches_of(name, precision=Precision.FLOAT32, noise=0):
-    """(M, 4): the points of both pictures."""
-    matcher, (first, second) = matcher_and_encodings(name, precision, noise=noise)
-    (found,) = matcher.match([first], [second])
+        encodings.append(matcher.encode([replace(shown, pixels=pixels)]))
+    (found,) = matcher.match(*encodings)
     return torch.from_numpy(np.hstack([found.points0, found.points1]))
 
 
-@half_precisions
+@pytest.mark.parametrize("precision", [Precision.BFLOAT16, Precision.FLOAT16])
 @pytest.mark.parametrize("name", ["loftr", "quadtree", "aspanformer", "roma", "loma", "aliked"])
 def test_matches_move_less_than_by_noise(name, precision):
     exact, half, disturbed = matches_of(name), matches_of(name, precision), matches_of(name, noise=1)
     assert len(exact) > 20
     assert agreement(exact, half, within=0.25) > agreement(exact, disturbed, within=0.25)
     assert not torch.equal(exact, half)
-
-
-@cache
-@torch.inference_mode()
-def warp_of(precision=Precision.FLOAT32, noise=0):
-    matcher, encodings = matcher_and_encodings("dkm", precision, noise=noise)
-    dense, _ = matcher._network.match(*(encoding.features for encoding in encodings))
-    assert dense.warp.dtype == dense.certainty.dtype == torch.float32
-    return dense.warp[..., 2:]
-
-
-@half_precisions
-def test_dkms_warps_move_less_than_by_noise(precision):
-    by_half, by_noise = (
-        (warp_of() - other).norm(dim=-1).median() for other in (warp_of(precision), warp_of(noise=1))
-    )
-    assert 0 < by_half < 0.5 * by_noise
 
 
 def test_auto_takes_half_precision_where_the_processor_has_it(monkeypatch):

@@ -31,7 +31,6 @@ assemble("light")
 
 @pytest.fixture
 def more_matchers(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Path]:
-    """A folder whose files are matchers too."""
     monkeypatch.setattr(adapters, "__path__", [*adapters.__path__, str(tmp_path)])
     matcher_names.cache_clear()
     yield tmp_path

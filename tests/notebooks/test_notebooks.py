@@ -11,10 +11,6 @@ from offline_notebook import execute, needs_namespaces, outputs, pictures, print
 ROOT = Path(__file__).resolve().parents[2]
 TOUR = ROOT / "notebooks" / "mkpc_tour.ipynb"
 PATHS = os.pathsep.join([str(ROOT), str(TOUR.parent)])  # Jupyter starts a kernel in the folder of its notebook
-SMALL = """
-units = [{ stage = 1, matcher = "sift", long_side = 320 }, { stage = 2, matcher = "sift", long_side = 400 }]
-magsac = { permutations = 1, max_iterations = 5000 }
-"""
 SETTINGS = {  # as a user would edit them
     '"classical:whole-images", "classical"': '"small.toml:stage-1", "small.toml"',
     "SCENES = []": 'SCENES = ["courtyard"]',
@@ -23,7 +19,6 @@ SETTINGS = {  # as a user would edit them
 
 
 def figures_of(notebook: nbformat.NotebookNode) -> int:
-    """Return the number of figures that its cells ask for."""
     return sum(cell.source.count("show(figures.") for cell in notebook.cells if cell.cell_type == "code")
 
 
@@ -48,8 +43,8 @@ def test_the_tour_is_committed_with_all_its_pictures_and_nothing_else():
 
 
 @needs_namespaces
-def test_without_a_train_side_recipes_are_compared_on_the_demo_set(tmp_path):
-    (tmp_path / "small.toml").write_text(SMALL, encoding="utf-8")
+def test_without_a_train_side_recipes_are_compared_on_the_demo_set(small_recipe, tmp_path):
+    """The recipe is ``small.toml`` in the notebook's folder."""
     notebook = nbformat.read(ROOT / "notebooks" / "validate.ipynb", as_version=4)
     (cell,) = (cell for cell in notebook.cells if cell.id == "settings")
     for former, new in SETTINGS.items():

@@ -48,13 +48,11 @@ class Kaggle:
         self.notebook = packaged / "kernel" / "submission.ipynb"
 
     def set(self, former: str, new: str) -> None:
-        """Edit the notebook as a user would."""
         text = self.notebook.read_text(encoding="utf-8")
         assert former in text
         self.notebook.write_text(text.replace(former, new), encoding="utf-8")
 
     def run(self, **more: str) -> str:
-        """Execute the notebook; what it printed."""
         variables = environment(KAGGLE_ROOT=str(self.root), **more)
         return printed(execute(self.notebook, self.executed, self.image, self.working, variables))
 
@@ -143,10 +141,8 @@ def test_what_pip_says_is_stated_with_the_advice_where_no_wheel_fits(kaggle, dem
     wheel.rename(wheel.with_name("pycolmap-4.2.1-cp27-cp27m-manylinux_2_28_x86_64.whl"))
     with pytest.raises(AssertionError, match="ERROR: ") as stopped:
         kaggle.run()
-    python = python_version()
-    assert f"no wheel of pycolmap is for Python {python}: package again with --python {python}" in str(
-        stopped.value
-    )
+    told = "no wheel of pycolmap is for Python {0}: package again with --python {0}".format(python_version())
+    assert told in str(stopped.value)
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
@@ -160,7 +156,5 @@ def test_notebooks_are_committed_in_one_form_with_pictures_at_most(path):
     shown = [output for cell in code for output in cell.outputs]
     assert all(cell.execution_count is None for cell in code)
     assert not shown or path.stem == "mkpc_tour"
-    assert all(
-        output["output_type"] == "display_data" and set(output["data"]) == {"image/jpeg"} for output in shown
-    )
+    assert all((each["output_type"], *each["data"]) == ("display_data", "image/jpeg") for each in shown)
     assert set(notebook.metadata) == {"kernelspec", "language_info"}

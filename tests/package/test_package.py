@@ -13,11 +13,10 @@ from zipfile import ZipFile
 import pytest
 import torch
 from kaggle_image import UNPACKED, environment, python_version, upload
-from shared import contents
+from shared import contents, run_command
 from weight_files import digest_of, line, put
 
 from mkpc_kaggle import __version__
-from mkpc_kaggle.cli import main
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.package import Package, Request, find_checkout, make_package
 from mkpc_kaggle.package.files import licence_text
@@ -27,7 +26,6 @@ from mkpc_kaggle.weights.manifest import read_manifest
 
 
 def checkpoint(number: float) -> bytes:
-    """A torch checkpoint, which is a zip file."""
     stream = io.BytesIO()
     torch.save({"a": torch.full((3,), number)}, stream)
     return stream.getvalue()
@@ -73,7 +71,6 @@ def out(made: tuple[Path, Package]) -> Path:
 
 
 def metadata_of(out: Path) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The dataset's and the kernel's."""
     dataset, kernel = ((out / name / f"{name}-metadata.json").read_text() for name in ("dataset", "kernel"))
     return json.loads(dataset), json.loads(kernel)
 
@@ -109,12 +106,11 @@ def test_weights_survive_the_upload_and_are_held_against_the_datasets_manifest(o
     data = (mount / "free.pt.safetensors").read_bytes()
     assert (told.name, told.size, told.digest) == ("free.pt.safetensors", len(data), digest_of(data))
     assert (told.licence, told.slot) == ("MIT", "free")
-    verify = ["weights", "verify", "--weights", str(tmp_path / "input")]
-    verify += ["--manifest", str(mount / "weights_manifest.txt")]
-    assert main(verify) == 0
+    verify = ["weights", "verify", "--weights", tmp_path / "input", "--manifest", mount / "weights_manifest.txt"]
+    assert run_command(*verify) == 0
     assert "1 files, 0 refused, 0 missing" in capsys.readouterr().out
     (mount / "free.pt.safetensors").unlink()
-    assert main(verify) == 1
+    assert run_command(*verify) == 1
     assert "missing" in capsys.readouterr().out
 
 
@@ -135,17 +131,14 @@ def test_what_the_image_has_is_used_where_it_satisfies_even_without_a_wheel_for_
     for path in dataset.glob("[!k]*.whl"):
         (tmp_path / path.name).symlink_to(path)
     dry = [sys.executable, "-m", "pip", "install", "--dry-run", "--no-index", "--no-deps", "--find-links"]
-    done = subprocess.run(
-        [*dry, str(tmp_path), *lines[1:]], capture_output=True, text=True, check=False, env=environment()
-    )
+    command = [*dry, str(tmp_path), *lines[1:]]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment())
     assert done.returncode == 0, done.stderr
 
 
 def test_the_kernel_runs_on_a_gpu_without_internet_on_the_competition_and_the_dataset(out):
     dataset, kernel = metadata_of(out)
-    assert (
-        6 <= len(dataset["title"]) <= 50 and 20 <= len(dataset["subtitle"]) <= 80
-    )  # limits of the kaggle command
+    assert 6 <= len(dataset["title"]) <= 50 and 20 <= len(dataset["subtitle"]) <= 80  # Kaggle's limits
     assert (kernel["enable_gpu"], kernel["enable_internet"]) == (True, False)
     assert kernel["dataset_sources"] == [dataset["id"]] == ["someone/mkpc-kaggle"]
     assert kernel["id"] == "someone/" + kernel["title"].lower().replace(" ", "-")
@@ -165,19 +158,18 @@ def test_the_same_request_gives_the_same_bytes_and_leaves_files_alone(wanted, tm
 
 
 def test_a_private_package_has_all_weights_and_a_public_one_refuses_to_be_laid_over_it(wanted, capsys):
-    assert wanted.wheels is not None
-    arguments = ["package", "--owner", "someone", "--out", str(wanted.out), "--python", python_version()]
-    arguments += ["--wheels", str(wanted.wheels), "--weights", str(wanted.weights[0])]
-    assert main([*arguments, "--private"]) == 0
+    arguments = ["package", "--owner", "someone", "--out", wanted.out, "--python", python_version()]
+    arguments += ["--wheels", wanted.wheels, "--weights", wanted.weights[0]]
+    assert run_command(*arguments, "--private") == 0
     out = " ".join(capsys.readouterr().out.split())
     assert "private on Kaggle, do not share it" in out
     assert "kept.pt (Magic-Leap-noncommercial)" in out
     kept = wanted.out / "dataset" / "kept.pt.safetensors"
     assert torch.equal(load_tensors(kept)["a"], torch.full((3,), 2.0))
-    assert main(arguments) == 2
+    assert run_command(*arguments) == 2
     assert "kept.pt.safetensors. Remove them" in capsys.readouterr().err
     kept.unlink()
-    assert main(arguments) == 0
+    assert run_command(*arguments) == 0
     assert "Left out" in capsys.readouterr().out
 
 
@@ -203,11 +195,8 @@ def test_the_wheel_holds_what_a_run_needs_and_asks_for_what_is_bundled(tmp_path,
     wheel = build_wheel(find_checkout(), tmp_path)
     asked = [line.replace("_", "-").partition(">=")[0] for line in install_lines(wheel, wheels.iterdir())]
     pinned = [pin.partition("==") for pin in pins(find_checkout())]
-    assert (
-        sorted(asked[1:])
-        == sorted(BUNDLED)
-        == sorted(name.replace("_", "-") for name, _, version in pinned if version)
-    )
+    bundled = sorted(name.replace("_", "-") for name, _, version in pinned if version)
+    assert sorted(asked[1:]) == sorted(BUNDLED) == bundled
     names = ZipFile(wheel).namelist()
     assert {"mkpc_kaggle/weights_manifest.txt", "mkpc_kaggle/recipes/auto.toml"} <= set(names)
     assert not [name for name in names if name.startswith(("tests/", "notebooks/"))]

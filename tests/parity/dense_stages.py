@@ -8,14 +8,12 @@ import pytest
 import torch
 from golden import GOLDEN, Stage, Within, compared, golden_arrays, in_order, ready, seeded_tensor
 
-from mkpc_kaggle.geometry.coordinates import Size, from_normalised
 from mkpc_kaggle.matchers.networks import roma
 from mkpc_kaggle.matchers.networks.dense_sampling import balancing_weights, density, draw, sample_matches
 from mkpc_kaggle.matchers.networks.dense_warp import dense_warp
 from mkpc_kaggle.matchers.networks.dkm import DKM
-from mkpc_kaggle.matchers.networks.grids import as_grid, as_map
 from mkpc_kaggle.matchers.networks.pixels import network_input
-from mkpc_kaggle.matchers.networks.roma import RoMa, anchor_mean
+from mkpc_kaggle.matchers.networks.roma import RoMa
 
 MODES = {"threshold_balanced": 0.05, "balanced": 1.0}  # of sampling, by the golden files' names: the threshold
 
@@ -146,20 +144,6 @@ def roma_batched():
     return values
 
 
-def roma_parts_stages():
-    """Yield positions of DINOv2 at other sizes, and the mean of the best anchor and its neighbours."""
-    golden, dinov2 = golden_arrays("roma", "parts"), network_of("roma").dinov2
-    values = {}
-    for name in (name for name in golden if name.startswith("pos_")):
-        _, size, channels = name.split("_")
-        values[name] = dinov2.positions(*map(int, size.split("x")))[..., :: int(channels.removeprefix("ch"))]
-    logits = seeded_tensor("golden.cls_logits", (2, 4096, 5, 6), 4096 * 30 * 0.25)
-    for position, anchor in enumerate(golden["cls_boost_index"].tolist()):
-        logits[:, anchor, position // 6, position % 6] += 3
-    values["cls_flow"] = as_map(anchor_mean(as_grid(logits)))
-    yield from compared(values, golden, tolerances_of("roma"))
-
-
 def sampling_stages(name, suffix=""):
     golden, main, tolerances = golden_arrays(name, "sampling"), golden_arrays(name, "main"), tolerances_of(name)
     number, seed = (int(golden.get(key, value)) for key, value in (("num", 1000), ("seed", 1234)))
@@ -177,16 +161,7 @@ def sampling_stages(name, suffix=""):
     good, evenness = warp[golden["good_index"]], balancing_weights(golden["density"])
     values = {"good_matches": good, "good_certainty": weights[golden["good_index"]], "balance_p": evenness}
     values |= dict.fromkeys(("density", "density_exact"), density(good))
-    if "kde_points" in golden:
-        values |= dict.fromkeys(("kde_density", "kde_density_exact"), density(golden["kde_points"]))
-    height0, width0, height1, width1 = golden["pixel_sizes_HA_WA_HB_WB"].tolist()
-    sides = golden["pixel_in"].numpy().reshape(-1, 2, 2).swapaxes(0, 1)
-    for side, points, size in zip("AB", sides, (Size(width0, height0), Size(width1, height1)), strict=True):
-        values[f"pixel_{side}"] = torch.from_numpy(from_normalised(points, size)) + 0.5  # centres are at halves
-    # Half precision draws by its density what no other device would.
-    yield from compared(
-        values | {"density_half": density(good)}, golden, {"density_half": Within(share=0.1)} | tolerances
-    )
+    yield from compared(values, golden, tolerances)
     yield Stage("balanced_index", draw(evenness, golden["noise2"], number), golden["balanced_index"])
 
 
@@ -204,5 +179,5 @@ CASES = {
     f"{name} {case}": lambda name=name, case=case, make=make: dense_stages(name, case, make())
     for (name, case), make in VALUES.items()
 }
-CASES |= {"dkm sampling": partial(sampling_stages, "dkm"), "roma parts": roma_parts_stages}
+CASES["dkm sampling"] = partial(sampling_stages, "dkm")
 CASES["roma sampling"] = partial(sampling_stages, "roma", "_float32")

@@ -155,7 +155,6 @@ def whole(variant):
 
 
 def pipeline_stages(case, variant):
-    """Yield the stages from two images to matched points."""
     golden, network = golden_arrays("loma", case), whole(variant)
     images = golden if "image0" in golden else golden_arrays("loma", "pipeline_b128")
     side, number = int(golden["descriptor_side"]), int(golden["num_keypoints"])

@@ -2,33 +2,22 @@
 
 import json
 import re
-from contextlib import contextmanager
-from copy import deepcopy
 from dataclasses import replace
 from functools import cache, partial
 
-import pytest
 import torch
-from golden import GOLDEN, Stage, Within, compared, golden_arrays, ready, recorded, seeded_tensor, standin_state
+from golden import GOLDEN, Within, compared, golden_arrays, ready, recorded, seeded_tensor, standin_state
 
-from mkpc_kaggle.matchers.networks import quadtree
 from mkpc_kaggle.matchers.networks.aspanformer import AspanFormer
 from mkpc_kaggle.matchers.networks.coarse_matching import Cells, half_log_confidences
 from mkpc_kaggle.matchers.networks.fine_matching import cell_points
-from mkpc_kaggle.matchers.networks.grids import mean_pool
 from mkpc_kaggle.matchers.networks.loftr import Loftr
-from mkpc_kaggle.matchers.networks.position import FIXED_DECAY, ORIGINAL_DECAY, sine_positions
-from mkpc_kaggle.matchers.networks.quadtree import Attended, Quadtree, attend, quadtree_attention
+from mkpc_kaggle.matchers.networks.quadtree import Quadtree
 
 LOFTR = {"coarse": 1e-4, "conf": 1e-4, "mconf": 1e-4, "expec_f": 1e-4, "mkpts1_f": 5e-4}
 QUADTREE = {"coarse": 1e-4, "conf": 2e-4, "mconf": 2e-4, "expec_f": 5e-4, "mkpts1_f": 2e-3}
 # Expectation: in half windows, of four pixels.
 ASPANFORMER = {"coarse": 1e-4, "m?conf": Within(1e-6, relative=2e-3), "expec_f": 5e-4, "mkpts": 1e-2}
-# exp rounds the seventh frequency, near a tie, one way on AMD, the other on Intel; 256 times it is 7.6e-6.
-POSITION = {"chan_first24": 1e-6, "col": 1e-5, "corner": 1e-5}
-HEADS = 2  # of the golden vectors of QuadTree's operator
-NEAR_TIE = 1e-4  # of logits up to 10: float32 rounds them by some 1e-5
-MAX_NEAR_TIES = 5  # of 32,000 choices; 0 or 1 were seen on different processors
 
 
 def confidence_of(network, grid0, grid1, masks):
@@ -71,101 +60,25 @@ def masks_and_scales(golden):
 
 
 @cache
-def standin(name):
-    return ready({"loftr": Loftr, "quadtree": Quadtree}[name](), standin_state(name))
+def standin(network):
+    """QuadTree's coarse level computes in float64: in float32 rounding decides near ties of its key cells."""
+    made = ready(network(), standin_state(network.__name__.lower()))
+    if network is Quadtree:
+        made.backbone.double()
+        made.loftr_coarse.double()
+        made.fine_preprocess.register_forward_pre_hook(lambda _, given: tuple(part.float() for part in given))
+    return made
 
 
-def loftr_stages(name, case, tolerances):
-    golden = golden_arrays(name, case)
-    images = [golden[f"image{side}_u8"].float()[:, None] / 255 for side in (0, 1)]
-    values = computed(standin(name), images, *masks_and_scales(golden))
+def loftr_stages(network, case, tolerances):
+    golden = golden_arrays(network.__name__.lower(), case)
+    kind = torch.float64 if network is Quadtree else torch.float32
+    images = [golden[f"image{side}_u8"].to(kind)[:, None] / 255 for side in (0, 1)]
+    values = computed(standin(network), images, *masks_and_scales(golden))
     values["conf_rows"] = values["conf"][:, ::7]
     for side in ("coarse0", "coarse1"):
         values[side] = values[side][..., :: 2 if case == "same_size" else 4]
     yield from compared(values, golden, tolerances)
-
-
-def position_stages():
-    golden = golden_arrays("loftr", "pos_encoding")
-    for prefix, decay in (("buggy", ORIGINAL_DECAY), ("fixed", FIXED_DECAY)):
-        table = sine_positions(256, 256, decay).permute(2, 0, 1)
-        got = {"chan_first24": table[:24, :12, :16], "col": table[:, 7, 200], "corner": table[:, 255, 255]}
-        for name, values in got.items():
-            yield Stage(f"{prefix}_{name}", values, golden[f"{prefix}_{name}"], POSITION[name])
-
-
-def golden_choices(images):
-    """Return the key cells that each call of ``attend`` keeps in float64, which is the reference's choice.
-
-    The choice is discontinuous. In float32 the processor's rounding decides a near tie, in float64 it does not.
-    """
-    choices = []
-
-    def recording(*given):
-        found = attend(*given)
-        choices.append(found.kept)
-        return found
-
-    network = deepcopy(standin("quadtree")).double()
-    with patched_attend(recording):
-        network.transform(*(network.encode(image.double()).coarse for image in images))
-    return [kept for kept in choices if kept is not None]
-
-
-@contextmanager
-def patched_attend(function):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(quadtree, "attend", function)
-        yield
-
-
-def choosing(choices, near_ties):
-    """Return an ``attend`` that keeps these cells, and counts in ``near_ties`` where it would keep others.
-
-    It fails where the logits of the cells differ by more than rounding.
-    """
-    remaining = iter(choices)
-
-    def chosen(q, k, v, keep):
-        found = attend(q, k, v, keep)
-        if keep is None:
-            return found
-        golden, logits = next(remaining), (q * q.shape[-1] ** -0.5) @ k.transpose(-1, -2)
-        loss = logits.gather(-1, found.kept).amin(-1) - logits.gather(-1, golden).amin(-1)
-        assert loss.max() < NEAR_TIE
-        near_ties.append(int((loss > 0).sum()))
-        return Attended(found.message, golden)
-
-    return chosen
-
-
-def quadtree_stages(case):
-    golden, near_ties = golden_arrays("quadtree", case), []
-    choices = golden_choices([golden[f"image{side}_u8"][:, None] / 255 for side in (0, 1)])
-    with patched_attend(choosing(choices, near_ties)):
-        yield from loftr_stages("quadtree", case, QUADTREE)
-    assert len(near_ties) == len(choices)
-    assert sum(near_ties) <= MAX_NEAR_TIES, f"{sum(near_ties)} choices differ by less than {NEAR_TIE:g}"
-
-
-def by_head(grid):
-    """(N, h, w, HEADS D) -> (N HEADS, h, w, D)."""
-    return grid.unflatten(3, (HEADS, -1)).permute(0, 3, 1, 2, 4).flatten(0, 1)
-
-
-def operator_stages(case):
-    golden = golden_arrays("quadtree", case)
-    q, k, v = (by_head(golden[name].permute(0, 2, 3, 1)) for name in "qkv")
-    topks = tuple(golden["topks"][:2].tolist())
-    pooled = [mean_pool(x, 4).flatten(1, 2)[:, None] for x in (q, k, v)]
-    kept = attend(*pooled, topks[0]).kept  # (2 HEADS, 1, cells, 6)
-    kept = kept[:, 0].unflatten(0, (-1, HEADS)).permute(0, 2, 3, 1)
-    # The set of kept cells counts, not their order.
-    kept, expected = (x.long().sort(dim=2).values for x in (kept, golden["top_idx_level0"]))
-    message = quadtree_attention(q, k, v, golden["level_weight"].softmax(0), topks)
-    message = message.flatten(1, 2).unflatten(0, (-1, HEADS)).transpose(1, 2)  # (2, h w, HEADS, D)
-    yield Stage("top_idx_level0", kept, expected)
-    yield Stage("message", message, golden["message"], 1e-5)
 
 
 class Evaluated(AspanFormer):
@@ -240,14 +153,13 @@ ASPANFORMERS = {
     "outdoor_padded_batch": lambda: Evaluated(MEGADEPTH, (7, 7)),
     "indoor_direct": lambda: Evaluated((1.0, 1.0), (4, 3), border=0),
 }
+FAMILY = (
+    (Loftr, ("same_size", "diff_size", "masked_batch", "no_match"), LOFTR),
+    (Quadtree, ("same_size", "diff_size_extension", "masked_batch"), QUADTREE),
+)
 CASES = {
-    f"loftr {case}": partial(loftr_stages, "loftr", case, LOFTR)
-    for case in ("same_size", "diff_size", "masked_batch", "no_match")
+    f"{network.__name__} {case}": partial(loftr_stages, network, case, tolerances)
+    for network, cases, tolerances in FAMILY
+    for case in cases
 }
-CASES["loftr positions"] = position_stages
-CASES |= {
-    f"quadtree {case}": partial(quadtree_stages, case)
-    for case in ("same_size", "diff_size_extension", "masked_batch")
-}
-CASES |= {f"quadtree {case}": partial(operator_stages, case) for case in ("attention_op", "attention_op_unequal")}
 CASES |= {f"aspanformer {case}": partial(aspanformer_stages, case, make) for case, make in ASPANFORMERS.items()}

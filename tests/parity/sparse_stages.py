@@ -13,7 +13,6 @@ from mkpc_kaggle.matchers.networks.superglue import SuperGlue, log_optimal_trans
 from mkpc_kaggle.matchers.networks.superpoint import (
     SuperPoint,
     SuperPointKeypoints,
-    sample_descriptors,
     score_map,
     suppress_non_maxima,
 )
@@ -24,10 +23,9 @@ SUPERGLUE = {"score_matrix": 1e-3, "log_assignment": 1e-3, "matching_scores": 1e
 
 
 def superpoint(options):
-    unchanged = {
-        name: value for name, value in options.items() if name not in ("descriptor_dim", "remove_borders")
-    }
-    return ready(SuperPoint(**unchanged, border=options["remove_borders"]), standin_state("superpoint"))
+    options["border"] = options.pop("remove_borders")
+    del options["descriptor_dim"]
+    return ready(SuperPoint(**options), standin_state("superpoint"))
 
 
 def image_of(pixels):
@@ -57,12 +55,6 @@ def suppression_stages():
         for radius in range(5):
             got = suppress_non_maxima(golden[name][None], radius)[0]
             yield Stage(f"{name}, radius {radius}", got, golden[f"{name}_nms{radius}"])
-
-
-def sampling_stages():
-    golden = golden_arrays("superpoint", "descriptor_sampling")
-    got = sample_descriptors(golden["field"], golden["keypoints"])
-    yield Stage("descriptors", got.T, golden["descriptors"], 1e-5)
 
 
 def superglue(options):
@@ -130,7 +122,6 @@ def sinkhorn_stages():
 
 
 def pipeline_stages():
-    """Yield the stages of SuperPoint, then of SuperGlue, from two images."""
     golden = golden_arrays("superglue", "pipeline_pair")
     config = json.loads(golden["config"])
     detector, network = superpoint(config["superpoint"]), superglue(config["superglue"])
@@ -146,7 +137,7 @@ CASES = {
     f"superpoint {case}": partial(superpoint_stages, case)
     for case in ("default_160x216", "outdoor_160x216", "odd_171x229", "noborder_64x72")
 }
-CASES |= {"superpoint nms_cases": suppression_stages, "superpoint descriptor_sampling": sampling_stages}
+CASES["superpoint nms_cases"] = suppression_stages
 CASES |= {
     f"superglue {case}": partial(superglue_stages, case)
     for case in ("full_60x47", "eval20_33x71", "batch2_20x26", "tiny_1x3")

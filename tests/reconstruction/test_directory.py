@@ -39,16 +39,12 @@ def out(tmp_path: Path) -> Path:
     return tmp_path / "out"
 
 
-def link(target: str) -> Callable[[Path], object]:
-    return lambda path: path.symlink_to(target)
-
-
 IN_THE_WAY: dict[str, tuple[str, Callable[[Path], object]]] = {
     "an exported model": ("a/models/0/points.ply", Path.touch),
     "an open database": ("a/database.db-wal", Path.touch),
     "a dataset's file that no run has made": ("c/database.db", lambda path: write(path.parent, [path.name])),
-    "a link for work": ("work", link("../images")),
-    "a link for a dataset": ("b", link("../images")),
+    "a link for work": ("work", lambda path: path.symlink_to("../images")),
+    "a link for a dataset": ("b", lambda path: path.symlink_to("../images")),
     "a pipe for a table": ("report.html", os.mkfifo),
 }
 

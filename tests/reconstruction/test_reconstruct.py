@@ -3,8 +3,6 @@
 import csv
 import hashlib
 import sqlite3
-import subprocess
-import sys
 import time
 from collections.abc import Mapping
 from contextlib import closing
@@ -20,12 +18,12 @@ import pytest
 from exif_files import set_exif
 from pair_lists import turned_camera
 from rectified import Seen, flat, number_of
+from shared import run_command
 from sklearn.datasets import load_sample_image
 from synthetic import SyntheticMatcher
 
 from benchmarks.synthetic_scene import SIZE, SyntheticScene, synthetic_scene
 from mkpc_kaggle import reconstruct
-from mkpc_kaggle.cli import main
 from mkpc_kaggle.data import images
 from mkpc_kaggle.data.images import TURNS, Image, Unreadable, read_image
 from mkpc_kaggle.engine.budget import Budget
@@ -38,7 +36,6 @@ from mkpc_kaggle.recipe import Recipe, Unit
 from mkpc_kaggle.reconstruction.folder import read_folder, read_pair_list
 from mkpc_kaggle.reconstruction.outputs import Cameras, camera_rows, submission_rows
 from mkpc_kaggle.reconstruction.run import FolderResult, for_cameras, reconstruct_folder
-from mkpc_kaggle.reporting.run_log import read_log
 from mkpc_kaggle.scene.likeness import local_features, most_alike, shortlist
 from mkpc_kaggle.scene.reconstruction import RegisteredImage
 
@@ -62,8 +59,7 @@ class MixedMatcher(SyntheticMatcher):
                 names = [f"{first - start:04}", f"{second - start:04}"]
                 (found,) = (p.matches for p in scene.pairs if [p.image0.name, p.image1.name] == names)
                 return found  # views are upright and as large as the images
-        rng = np.random.default_rng([first, second])
-        return Matches(rng.uniform(10, 500, (25, 2)), rng.uniform(10, 500, (25, 2)), np.ones(25))
+        return Matches(*np.random.default_rng([first, second]).uniform(10, 500, (2, 25, 2)), np.ones(25))
 
 
 def write_flat(folder: Path, count: int = FIRST + SECOND + OTHERS) -> Path:
@@ -83,7 +79,6 @@ def run(root: Path, out: Path, matcher: SyntheticMatcher | None = None, **option
 
 @pytest.fixture(scope="module")
 def mixed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, FolderResult]:
-    """A folder of two scenes and other images, reconstructed."""
     home = tmp_path_factory.mktemp("mixed")
     return home / "out", run(write_flat(home / "images"), home / "out")
 
@@ -95,15 +90,14 @@ def cameras(result: FolderResult) -> Mapping[str, RegisteredImage]:
 
 def contents(out: Path) -> dict[str, str]:
     """What a run left, but for its journal; of a database its rows, since SQLite counts who has opened it."""
-
-    def data(path: Path) -> bytes:
-        if path.suffix != ".db":
-            return path.read_bytes()
-        with closing(sqlite3.connect(path)) as database:
-            return "".join(database.iterdump()).encode()
-
-    files = [path for path in sorted(out.rglob("*")) if path.is_file() and "work" not in path.parts]
-    return {str(path.relative_to(out)): hashlib.sha256(data(path)).hexdigest() for path in files}
+    found = {}
+    for path in sorted(out.rglob("*")):
+        if path.suffix == ".db":
+            with closing(sqlite3.connect(path)) as database:
+                found[str(path.relative_to(out))] = "".join(database.iterdump())
+        elif path.is_file() and "work" not in path.parts:
+            found[str(path.relative_to(out))] = hashlib.sha256(path.read_bytes()).hexdigest()
+    return found
 
 
 def test_mixed_scenes_are_a_model_each_and_foreign_images_are_in_none(mixed):
@@ -134,7 +128,6 @@ ORIENTATIONS = (1, 6, 8, 3, 6, 1)  # of the images of a phone, by EXIF
 
 
 def write_from_phone(folder: Path) -> Path:
-    """The images of the first scene, stored as a phone stores them."""
     write_flat(folder, FIRST)
     for number, orientation in enumerate(ORIENTATIONS):
         path = folder / f"{number:02}.png"
@@ -166,7 +159,7 @@ def test_colmap_goes_on_with_photographs_that_exif_turns(tmp_path):
         np.testing.assert_allclose(record.camera.R @ cameras(result)["00.png"].camera.R.T, expected, atol=0.01)
 
 
-def test_what_was_removed_of_the_results_is_made_again(tmp_path):
+def test_results_that_were_removed_are_made_again_and_an_image_that_was_absent_comes_back(tmp_path):
     root, out = write_flat(tmp_path / "images", 4), tmp_path / "out"
     run(root, out)
     before = contents(out)
@@ -174,14 +167,7 @@ def test_what_was_removed_of_the_results_is_made_again(tmp_path):
         (out / removed).unlink()
         matcher = MixedMatcher()
         run(root, out, matcher)
-        assert contents(out) == before
-        assert matcher.calls == []
-
-
-def test_an_image_that_was_absent_for_a_run_comes_back_with_the_former_files(tmp_path):
-    root, out = write_flat(tmp_path / "images", 4), tmp_path / "out"
-    run(root, out)
-    before = contents(out)
+        assert (contents(out), matcher.calls) == (before, [])
     (root / "03.png").rename(tmp_path / "away.png")
     run(root, out)
     (tmp_path / "away.png").rename(root / "03.png")
@@ -229,7 +215,7 @@ def test_folders_that_cannot_be_reconstructed_get_one_line(tmp_path, capsys):
     root, out = tmp_path / "images", tmp_path / "out"
 
     def refused(out: Path = out) -> str:
-        assert main(["reconstruct", str(root), "--out", str(out), "--recipe", "classical"]) == 2
+        assert run_command("reconstruct", root, "--out", out, "--recipe", "classical") == 2
         (line,) = capsys.readouterr().err.splitlines()
         return line
 
@@ -248,41 +234,21 @@ def test_folders_that_cannot_be_reconstructed_get_one_line(tmp_path, capsys):
 def test_a_folder_without_a_readable_image_says_so_and_fails(tmp_path, capsys):
     for name in ("a.png", "b.png"):
         (tmp_path / name).write_bytes(b"")
-    arguments = [str(tmp_path), "--out", f"{tmp_path}-out", "--recipe", "classical", "--workers", "0"]
-    assert main(["reconstruct", *arguments]) == 1
+    options = ["--out", f"{tmp_path}-out", "--recipe", "classical", "--workers", 0]
+    assert run_command("reconstruct", tmp_path, *options) == 1
     said = capsys.readouterr().out
     assert f"cannot be read: {tmp_path / 'a.png'}: the file is empty" in said
     assert "the run failed" in said
 
 
-def test_the_command_ends_with_the_same_files_after_a_kill(demo, small_recipe, tmp_path):
-    """On rendered images: killed as soon as something is in the journal, then given again."""
-    images = demo.train_dir / "courtyard" / "images"
-
-    def command(out: Path) -> list[str]:
-        options = ["--out", str(out), "--recipe", str(small_recipe), "--format", "imc2025", "--workers", "0"]
-        return [sys.executable, "-m", "mkpc_kaggle", "reconstruct", str(images), *options]
-
-    killed = subprocess.Popen(command(tmp_path / "out"), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    while killed.poll() is None and not matched(tmp_path / "out" / "work"):
-        time.sleep(0.05)
-    killed.kill()
-    killed.wait()
-    for out in ("out", "undisturbed"):
-        subprocess.run(command(tmp_path / out), check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    found, expected = contents(tmp_path / "out"), contents(tmp_path / "undisturbed")
-    assert {"cameras.csv", "submission.csv", "database.db", "models/0/images.bin", "report.html"} <= found.keys()
-    del found["report.html"], expected["report.html"]  # it tells of times
-    assert found == expected
-    with (tmp_path / "out" / "submission.csv").open() as stream:
+def test_the_command_writes_tables_models_a_database_and_a_page(demo, small_recipe, tmp_path):
+    images, out = demo.train_dir / "courtyard" / "images", tmp_path / "out"
+    options = ["--recipe", small_recipe, "--format", "imc2025", "--workers", 0]
+    assert run_command("reconstruct", images, "--out", out, *options) == 0
+    results = {"cameras.csv", "submission.csv", "database.db", "models/0/images.bin", "report.html"}
+    assert results <= contents(out).keys()
+    with (out / "submission.csv").open() as stream:
         assert [row["image"] for row in csv.DictReader(stream)] == sorted(path.name for path in images.iterdir())
-
-
-def matched(work_dir: Path) -> bool:
-    try:
-        return any(event.kind == "job" for event in read_log(work_dir).events)
-    except UserError:  # nothing is there yet
-        return False
 
 
 def photographs(folder: Path, count: int) -> list[Path]:
@@ -308,11 +274,8 @@ def test_a_shortlist_has_images_that_are_alike_and_none_that_cannot_be_read(tmp_
     assert shortlist(most_alike(lambda: nothing, 1)) == [(0, 1), (0, 2)]
 
 
-@dataclass
 class UprightSift(SyntheticMatcher):
     """SIFT that takes every keypoint for upright, so that it knows no turned image again."""
-
-    name: str = "synthetic"
 
     def encode(self, pictures):  # type: ignore[no-untyped-def,override]
         sift, found = cv2.SIFT_create(3000), []
@@ -324,14 +287,11 @@ class UprightSift(SyntheticMatcher):
             found.append(sift.compute(gray, keypoints))
         return found
 
-    def match(self, encodings0, encodings1):  # type: ignore[no-untyped-def,override]
-        matches = []
-        for (points0, found0), (points1, found1) in zip(encodings0, encodings1, strict=True):
-            near = cv2.BFMatcher().knnMatch(found0, found1, k=2)
-            good = [first for first, second in near if first.distance < 0.75 * second.distance]
-            ends = [points0[m.queryIdx].pt for m in good], [points1[m.trainIdx].pt for m in good]
-            matches.append(Matches(*ends, np.ones(len(good))))
-        return matches
+    def _match(self, seen0, seen1):  # type: ignore[no-untyped-def,override]
+        near = cv2.BFMatcher().knnMatch(seen0[1], seen1[1], k=2)
+        good = [first for first, second in near if first.distance < 0.75 * second.distance]
+        ends = [seen0[0][m.queryIdx].pt for m in good], [seen1[0][m.trainIdx].pt for m in good]
+        return Matches(*ends, np.ones(len(good)))
 
 
 def test_images_that_lie_on_a_side_are_found(tmp_path):

@@ -9,6 +9,7 @@ import time
 import cv2
 import numpy as np
 import pytest
+from shared import write_recipe
 from test_reconstruct import contents
 
 ROUNDS, KILLS = 4, 5  # of each round, before the run that nobody disturbs
@@ -27,15 +28,8 @@ def test_a_run_that_is_killed_at_random_moments_ends_with_the_same_files(demo, t
     cv2.imwrite(str(lying), np.rot90(cv2.imread(str(lying))))
 
     def begin(out: str) -> "subprocess.Popen[bytes]":
-        options = [
-            "--recipe",
-            str(tmp_path / "small.toml"),
-            "--rotations",
-            "--format",
-            "imc2025",
-            "--workers",
-            "1",
-        ]
+        recipe = str(tmp_path / "small.toml")
+        options = ["--recipe", recipe, "--rotations", "--format", "imc2025", "--workers", "1"]
         command = ["-m", "mkpc_kaggle", "reconstruct", str(tmp_path / "images"), "--out", str(tmp_path / out)]
         return subprocess.Popen([sys.executable, *command, *options], stdout=subprocess.DEVNULL)
 
@@ -44,8 +38,7 @@ def test_a_run_that_is_killed_at_random_moments_ends_with_the_same_files(demo, t
         del found["report.html"]  # it tells of times
         return found
 
-    units = '{ stage = 1, matcher = "sift", long_side = 320 }', '{ stage = 2, matcher = "sift", long_side = 400 }'
-    (tmp_path / "small.toml").write_text(f"units = [{', '.join(units)}]")
+    write_recipe(tmp_path / "small.toml", (1, 320), (2, 400))
     start = time.monotonic()
     assert begin("undisturbed").wait() == 0
     whole_s, expected, rng = time.monotonic() - start, files_of("undisturbed"), random.Random(0)

@@ -74,18 +74,14 @@ def test_cameras_are_seen_from_above_and_from_the_side_with_the_points_before_th
 
 
 def test_a_strip_shows_both_images_upright_at_one_height_with_matches_where_they_are():
-    images = (
-        Image.of_array(np.full((200, 100, 3), 250, np.uint8)).turned(1),
-        Image.of_array(np.full((300, 300, 3), 5, np.uint8)),
-    )
+    lying = Image.of_array(np.full((200, 100, 3), 250, np.uint8)).turned(1)
+    square = Image.of_array(np.full((300, 300, 3), 5, np.uint8))
     matches = Matches(np.array([[89.5, 9.5]]), np.array([[149.5, 149.5]]), np.ones(1))
     found = Estimate(ModelKind.F, np.eye(3), np.array([True]))
-    figure = draw_strip(images, PairMatch((UnitResult(UNITS[0], matches),), None, found))
+    figure = draw_strip((lying, square), PairMatch((UnitResult(UNITS[0], matches),), None, found))
     drawn = cv2.imdecode(np.frombuffer(encode(figure, "jpeg"), np.uint8), cv2.IMREAD_COLOR)
     assert drawn.shape[:2] == pytest.approx((480, 960 + 480), abs=1)  # older versions of matplotlib round down
     assert drawn[400, 100].min() > 200
     assert drawn[400, 1400].max() < 50
-    ends = np.concatenate(
-        [dots.get_offsets() for dots in figure.axes[0].collections if len(dots.get_offsets()) > 1]
-    )
-    np.testing.assert_allclose(ends, [[0.1, 0.1], [2 + 0.5, 0.5]])
+    ends = [dots.get_offsets() for dots in figure.axes[0].collections if len(dots.get_offsets()) > 1]
+    np.testing.assert_allclose(np.concatenate(ends), [[0.1, 0.1], [2 + 0.5, 0.5]])

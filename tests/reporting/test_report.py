@@ -11,8 +11,8 @@ from types import SimpleNamespace
 import pandas as pd
 import pytest
 from rectified import THREE_UNITS, RectifiedMatcher, run, write_pairs
+from shared import run_command
 
-from mkpc_kaggle.cli import main
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.jobs import WantedPair
 from mkpc_kaggle.engine.journal import Journal
@@ -29,8 +29,7 @@ class Tags(HTMLParser):
 
     def __init__(self, text: str) -> None:
         super().__init__()
-        self.names: list[str] = []
-        self.sources: list[str] = []
+        self.names, self.sources = list[str](), list[str]()
         self.feed(text)
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
@@ -55,7 +54,7 @@ def empty_journal(work_dir: Path, pairs: list[Pair], **about: object) -> Journal
 
 def test_a_run_exports_tables_that_pandas_reads_as_they_are(tmp_path, capsys):
     pairs = a_run(tmp_path)
-    assert main(["journal", str(tmp_path / "work"), "--csv", str(tmp_path / "csv")]) == 0
+    assert run_command("journal", tmp_path / "work", "--csv", tmp_path / "csv") == 0
     assert len(capsys.readouterr().out.splitlines()) == 4
     log = read_log(tmp_path / "work")
     for name, table in log.named_tables().items():
@@ -71,9 +70,9 @@ def test_a_run_exports_tables_that_pandas_reads_as_they_are(tmp_path, capsys):
     assert len(table["regions"]) == 2 * 11
     assert set(table["events"]["kind"]) >= {"start", "end"}
     capsys.readouterr()
-    assert main(["journal", str(tmp_path / "work"), "--csv", str(tmp_path / "csv")]) == 0, "its own are replaced"
+    assert run_command("journal", tmp_path / "work", "--csv", tmp_path / "csv") == 0, "its own are replaced"
     capsys.readouterr()
-    assert main(["journal", str(tmp_path / "work")]) == 0
+    assert run_command("journal", tmp_path / "work") == 0
     out = capsys.readouterr().out
     assert re.search("complete after .*: 11 of 12 pairs have an F", out)
     assert "the file is empty" in out
@@ -87,9 +86,9 @@ def test_a_run_exports_tables_that_pandas_reads_as_they_are(tmp_path, capsys):
 def test_an_export_that_cannot_be_written_is_refused(tmp_path, capsys):
     empty_journal(tmp_path, []).close()
     (tmp_path / "file").touch()
-    assert main(["journal", str(tmp_path), "--csv", str(tmp_path / "file" / "x")]) == 2
+    assert run_command("journal", tmp_path, "--csv", tmp_path / "file" / "x") == 2
     assert "cannot be written" in capsys.readouterr().err
-    assert main(["journal", str(tmp_path / "none"), "--report", str(tmp_path / "x")]) == 2
+    assert run_command("journal", tmp_path / "none", "--report", tmp_path / "x") == 2
     assert "has no journal.sqlite" in capsys.readouterr().err
 
 
@@ -100,7 +99,7 @@ def test_an_export_replaces_nothing_but_its_own_tables(tmp_path, make, capsys):
     empty_journal(tmp_path, []).close()
     (tmp_path / "csv").mkdir()
     make(tmp_path / "csv" / "units.csv")
-    assert main(["journal", str(tmp_path), "--csv", str(tmp_path / "csv")]) == 2
+    assert run_command("journal", tmp_path, "--csv", tmp_path / "csv") == 2
     assert "units.csv exists and is no such table" in capsys.readouterr().err
     assert [path.name for path in (tmp_path / "csv").iterdir()] == ["units.csv"]
     assert read_log(tmp_path).pairs == ()
@@ -112,12 +111,8 @@ def test_the_page_begins_with_the_verdict_has_pictures_inside_and_asks_for_nothi
     assert report_run(tmp_path / "work", page, inf, pairs) == f"report: {page}"
     text = page.read_text(encoding="utf-8")
     assert re.search("<h1>Complete after .*: 11 of 12 pairs have an F</h1>", text)
-    assert re.findall("<h2>(.*?)</h2>", text) == [
-        "Missing results",
-        "The weakest pairs",
-        "Where the time went",
-        "What made this",
-    ]
+    titles = ["Missing results", "The weakest pairs", "Where the time went", "What made this"]
+    assert re.findall("<h2>(.*?)</h2>", text) == titles
     tags = Tags(text)
     assert tags.names.count("img") == 11 + 1, "the pairs with an F, and jobs over time"
     assert "script" not in tags.names
@@ -192,6 +187,6 @@ def test_the_command_draws_a_page_with_the_images_of_a_test_side(tmp_path):
     (tmp_path / "test.csv").write_text("\n".join(["sample_id,batch_id,image_1_id,image_2_id", *rows]))
     run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
     page = tmp_path / "report.html"
-    for more, told in (["--test-dir", str(tmp_path)], "<img"), ([], "where the images are is not known"):
-        assert main(["journal", str(tmp_path / "work"), "--report", str(page), *more]) == 0
+    for more, told in (["--test-dir", tmp_path], "<img"), ([], "where the images are is not known"):
+        assert run_command("journal", tmp_path / "work", "--report", page, *more) == 0
         assert told in page.read_text()

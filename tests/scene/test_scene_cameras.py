@@ -50,10 +50,8 @@ def test_cameras_start_with_the_focal_length_of_exif(tmp_path, cameras, exif, fo
 
 
 def with_exif(scene: SyntheticScene, factor: float) -> Sequence[BatchPair]:
-    focals = {name: factor * float(camera.K[0, 0]) for name, camera in scene.cameras.items()}
-
     def told(image: BatchImage) -> BatchImage:
-        return replace(image, focal=focals[image.name])
+        return replace(image, focal=factor * float(scene.cameras[image.name].K[0, 0]))
 
     return [replace(pair, image0=told(pair.image0), image1=told(pair.image1)) for pair in scene.pairs]
 

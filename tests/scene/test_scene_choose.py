@@ -20,15 +20,12 @@ def scene() -> SyntheticScene:
 
 
 def model(cameras: dict[str, Camera], points: int = 100) -> SfmModel:
-    registered = (
-        RegisteredImage(BatchImage(name, f"digest of {name}", SIZE), camera, points)
-        for name, camera in cameras.items()
-    )
-    return SfmModel(tuple(registered), np.zeros((points, 3)), 0.5)
+    images = {name: BatchImage(name, f"digest of {name}", SIZE) for name in cameras}
+    registered = tuple(RegisteredImage(images[name], cameras[name], points) for name in cameras)
+    return SfmModel(registered, np.zeros((points, 3)), 0.5)
 
 
 def choice(models: list[SfmModel], scene: SyntheticScene, **changes: object) -> Choice:
-    """What the first pair gets."""
     found = [{image.image.digest: image for image in model.images} for model in models]
     return choose(replace(scene.pairs[0], **changes), found)
 

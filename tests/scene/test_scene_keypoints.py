@@ -45,13 +45,6 @@ def test_a_keypoint_is_the_mean_of_its_points_and_near_each_of_them(points):
         assert np.abs(points - keypoints[place]).max() <= 1.5 * 0.75 + 1e-5
 
 
-def test_points_on_both_sides_of_a_cells_border_are_one_keypoint():
-    keypoints, place = merge_points(np.array([[0.74, 1.49], [0.76, 1.51], [9, 9]], np.float32), 0.75)
-    assert len(keypoints) == 2
-    assert place[0] == place[1] != place[2]
-    np.testing.assert_allclose(keypoints[place[0]], [0.75, 1.5], atol=1e-6)
-
-
 def test_a_keypoint_is_matched_once_and_to_what_was_found_most_often():
     index = np.array([[0, 5], [0, 6], [0, 6], [1, 6], [2, 7], [2, 8]])
     assert one_to_one(index).tolist() == [[0, 6], [2, 7]]

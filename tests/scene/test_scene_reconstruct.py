@@ -115,33 +115,29 @@ def test_a_pair_whose_matches_agree_on_something_else_keeps_its_own(scene):
     assert all(choice.from_scene for choice in solution.choices[:-1])
 
 
-def test_too_few_pairs_make_no_scene(scene):
+def test_too_few_pairs_or_matches_make_no_scene(scene):
     two = tuple(pair for pair in scene.pairs if pair.image0 == scene.pairs[0].image0)[:2]
     (found,) = reconstruct_batch(two, SceneConfig()).reconstructions
     assert found.failure == "2 pairs connect 3 images; a scene needs 1.35 an image"
+    for none in ([], [pair_of("01", Matches.empty())]):
+        assert reconstruct_batch(none, SceneConfig()).reconstructions == ()
 
 
-def test_a_batch_without_matches_has_no_scene():
-    assert reconstruct_batch([], SceneConfig()).reconstructions == ()
-    assert reconstruct_batch([pair_of("01", Matches.empty())], SceneConfig()).reconstructions == ()
+POINTS, OTHERS = np.random.default_rng(0).uniform(10, 500, (2, 60, 2))
+LINE = np.column_stack([POINTS[:, 0], POINTS[:, 0]])
+DEGENERATE = {
+    "random": (POINTS, OTHERS),
+    "one point": (np.full((60, 2), 50.0), np.full((60, 2), 60.0)),
+    "a line": (LINE, LINE + 5),
+    "the same places": (POINTS, POINTS),
+    "a homography": (POINTS, POINTS[:, ::-1] * 0.9 + 20),  # of a plane, or a camera that only turned
+}
 
 
-def junk(kind: str, count: int = 60) -> Matches:
-    points, other = np.random.default_rng(0).uniform(10, 500, (2, count, 2))
-    line = np.column_stack([points[:, 0], points[:, 0]])
-    both = {
-        "random": (points, other),
-        "one point": (np.full((count, 2), 50.0), np.full((count, 2), 60.0)),
-        "a line": (line, line + 5),
-        "the same places": (points, points),
-        "a homography": (points, points[:, ::-1] * 0.9 + 20),  # of a plane, or a camera that only turned
-    }
-    return Matches(*both[kind], np.ones(count))
-
-
-@pytest.mark.parametrize("kind", ["random", "one point", "a line", "the same places", "a homography"])
+@pytest.mark.parametrize("kind", DEGENERATE)
 def test_degenerate_matches_give_a_reason(kind):
-    solution = reconstruct_batch([pair_of(names, junk(kind)) for names in ("01", "12", "02", "23")], SceneConfig())
+    matches = Matches(*DEGENERATE[kind], np.ones(60))
+    solution = reconstruct_batch([pair_of(names, matches) for names in ("01", "12", "02", "23")], SceneConfig())
     (found,) = solution.reconstructions
     assert found.models or found.failure
     for choice in solution.choices:

@@ -72,12 +72,10 @@ def focals_of(solution: Solution) -> list[float]:
 
 def mean_angle(solution: Solution, scene: SyntheticScene) -> float:
     """Between the found and the true direction from one image to the other, in degrees."""
-    angles = []
-    registered = registered_images(solution)
+    angles, registered = [], registered_images(solution)
     for pair in scene.pairs:
         found_cameras = [registered[image.digest].camera for image in (pair.image0, pair.image1)]
-        cameras = found_cameras, scene.true_cameras(pair)
-        found, wanted = (relative_pose(*both)[1] for both in cameras)
+        found, wanted = (relative_pose(*both)[1] for both in (found_cameras, scene.true_cameras(pair)))
         angles.append(np.degrees(np.arccos(found @ wanted / np.linalg.norm(found) / np.linalg.norm(wanted))))
     return float(np.mean(angles))
 

@@ -28,11 +28,8 @@ def plain(state: dict[str, Tensor]) -> dict[str, Any]:
 
 def wrapped(state: dict[str, Tensor]) -> dict[str, Any]:
     """As a training run saves its network: under a prefix, beside what else it wants to remember."""
-    return {
-        "epoch": 29,
-        "global_step": 12345,
-        "state_dict": {f"matcher.{name}": tensor for name, tensor in state.items()},
-    }
+    prefixed = {f"matcher.{name}": tensor for name, tensor in state.items()}
+    return {"epoch": 29, "global_step": 12345, "state_dict": prefixed}
 
 
 def wrapped_aspanformer(state: dict[str, Tensor]) -> dict[str, Any]:
@@ -75,14 +72,7 @@ FILES = (
     PublicFile("superglue_outdoor.pth", "superglue", "superglue-outdoor", "superglue", SuperGlue),
     PublicFile("outdoor_ds.ckpt", "loftr", "loftr-outdoor", "loftr", Loftr, wrapped),
     PublicFile("quadtree_outdoor.ckpt", "quadtree", "quadtree-outdoor", "quadtree", Quadtree, wrapped),
-    PublicFile(
-        "aspanformer_outdoor.ckpt",
-        "aspanformer",
-        "aspanformer-outdoor",
-        "aspanformer",
-        AspanFormer,
-        wrapped_aspanformer,
-    ),
+    PublicFile("aspan.pt", "aspanformer", "aspanformer-outdoor", "aspanformer", AspanFormer, wrapped_aspanformer),
     PublicFile("DKMv3_outdoor.pth", "dkm", "dkm-outdoor", "dkm", DKM),
     # Narrow ones, which load where ``standin.use_narrow`` was called.
     PublicFile("roma_outdoor.pth", "roma", "roma-outdoor", "roma", narrow_roma, roma_alone),
@@ -92,7 +82,6 @@ FILES = (
 
 
 def write_checkpoints(directory: Path, files: Iterable[PublicFile] = FILES) -> tuple[WeightFile, ...]:
-    """The files' lines of a manifest, sizes and digests included."""
     lines = []
     for file in files:
         path = directory / file.name
@@ -103,7 +92,6 @@ def write_checkpoints(directory: Path, files: Iterable[PublicFile] = FILES) -> t
 
 
 def store_of(directory: Path, files: Iterable[PublicFile]) -> WeightStore:
-    """A store that has these files."""
     return WeightStore([directory], write_checkpoints(directory, files))
 
 

@@ -43,14 +43,9 @@ class Tagged(torch.Tensor):
 
     @staticmethod
     def __new__(cls, held, where):
-        made = torch.Tensor._make_wrapper_subclass(
-            cls,
-            held.shape,
-            strides=held.stride(),
-            storage_offset=held.storage_offset(),
-            dtype=held.dtype,
-            device=torch.device("meta", where.index),
-        )
+        device = torch.device("meta", where.index)
+        layout = {"strides": held.stride(), "storage_offset": held.storage_offset(), "dtype": held.dtype}
+        made = torch.Tensor._make_wrapper_subclass(cls, held.shape, **layout, device=device)
         made.held, made.place = held, where
         return made
 
@@ -151,12 +146,9 @@ class DeviceDouble(TorchDispatchMode):
         yield torch.inference_mode, "__enter__", lambda mode: grads.append(torch.set_grad_enabled(False))
         yield torch.inference_mode, "__exit__", lambda mode, *error: grads.pop().__exit__(*error)
         enter, leave = torch.autocast.__enter__, torch.autocast.__exit__
-        yield torch.autocast, "__enter__", lambda cast: (self._autocast.entered.append(cast), enter(cast))[1]
-        yield (
-            torch.autocast,
-            "__exit__",
-            lambda cast, *error: (self._autocast.entered.pop(), leave(cast, *error))[1],
-        )
+        entered = self._autocast.entered
+        yield torch.autocast, "__enter__", lambda cast: (entered.append(cast), enter(cast))[1]
+        yield torch.autocast, "__exit__", lambda cast, *error: (entered.pop(), leave(cast, *error))[1]
         yield torch.amp.autocast_mode, "is_autocast_available", lambda kind: True
         yield torch.cuda.amp.common, "amp_definitely_not_available", lambda: False
 

@@ -42,7 +42,6 @@ def standin_state(network, *which, **part):
 
 
 def seeded_tensor(name, shape, gain=1.0):
-    """The stand-in value of one parameter, for the folders without a ``standin.py``."""
     return torch.from_numpy(_module(GOLDEN / "seeded_weights.py").seeded_tensor(name, shape, gain))
 
 
@@ -64,7 +63,6 @@ def recorded(network, names):
 
 
 def ready(network, state):
-    """The network with these weights as it runs, its batch norms folded."""
     network.load_state_dict(state, strict=True)
     return prepared(network.eval(), Placement())
 

@@ -13,21 +13,13 @@ from kornia.feature import DISK, XFeat
 from torch import nn
 
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
-from mkpc_kaggle.matchers.adapters import (
-    aliked_lightglue,
-    aspanformer,
-    disk_lightglue,
-    loftr,
-    quadtree,
-    sift_lightglue,
-    xfeat_lighterglue,
-)
+from mkpc_kaggle.matchers.adapters import disk_lightglue, sift_lightglue, xfeat_lighterglue
 from mkpc_kaggle.matchers.adapters.aliked import AlikedMatcher, AlikedOptions
 from mkpc_kaggle.matchers.adapters.dkm import DkmMatcher
 from mkpc_kaggle.matchers.adapters.loma import LomaAdapter, LomaOptions
 from mkpc_kaggle.matchers.adapters.roma import RomaMatcher, RomaOptions
 from mkpc_kaggle.matchers.adapters.superglue import SuperGlueMatcher
-from mkpc_kaggle.matchers.contract import Colour, MatcherSpec, Picture, Placement
+from mkpc_kaggle.matchers.contract import Colour, Picture, Placement
 from mkpc_kaggle.matchers.dense import DenseOptions
 from mkpc_kaggle.matchers.lightglue import LightGlueMatcher, light_glue
 from mkpc_kaggle.matchers.networks.aliked import Aliked
@@ -39,6 +31,7 @@ from mkpc_kaggle.matchers.networks.placement import prepared
 from mkpc_kaggle.matchers.networks.quadtree import Quadtree
 from mkpc_kaggle.matchers.networks.superglue import SuperGlue
 from mkpc_kaggle.matchers.networks.superpoint import SuperPoint
+from mkpc_kaggle.matchers.registry import spec_of
 from mkpc_kaggle.matchers.semi_dense import SemiDenseMatcher
 from mkpc_kaggle.matchers.sparse import Encoder, KeypointEncoder
 from tests.support.standin import filled, narrow_roma, scene
@@ -49,13 +42,11 @@ SHIFT = 8  # pixels between the two pictures of a pair
 
 @cache
 def standin(name: str, make: Callable[..., nn.Module], *settings: Any, **named: Any) -> nn.Module:
-    """The network of these settings, filled once."""
     return filled(make(*settings, **named), name)
 
 
 def ours(placement: Placement, *network: Any, **named: Any) -> Any:
-    """A network of ours, ready to run there."""
-    return prepared(copy.deepcopy(standin(*network, **named)), placement)
+    return prepared(kornias(*network, **named), placement)
 
 
 def kornias(*network: Any, **named: Any) -> Any:
@@ -68,8 +59,8 @@ def superglue_matcher(placement: Placement, keypoints: int = 200) -> SuperGlueMa
     return SuperGlueMatcher(superpoint, ours(placement, "superglue", SuperGlue, 20), placement.device)
 
 
-def semi_dense_matcher(spec: MatcherSpec, make: type[nn.Module], placement: Placement) -> SemiDenseMatcher:
-    return SemiDenseMatcher(ours(placement, spec.name, make), spec, placement.device)
+def semi_dense_matcher(name: str, make: type[nn.Module], placement: Placement) -> SemiDenseMatcher:
+    return SemiDenseMatcher(ours(placement, name, make), spec_of(name, "test"), placement.device)
 
 
 def dkm_matcher(placement: Placement, passes: int = 1, matches: int = 300) -> DkmMatcher:
@@ -85,36 +76,29 @@ def loma_matcher(placement: Placement) -> LomaAdapter:
     return LomaAdapter(ours(placement, "loma", Loma, Variant.B128), options, placement.device)
 
 
-def aliked_encoder(placement: Placement, keypoints: int = 200) -> KeypointEncoder:
-    return KeypointEncoder(ours(placement, "aliked", Aliked, keypoints), placement.device)
-
-
 def aliked_matcher(placement: Placement, keypoints: int = 200) -> AlikedMatcher:
-    return AlikedMatcher(aliked_encoder(placement, keypoints), AlikedOptions())
+    return AlikedMatcher(aliked_keypoints(placement, keypoints)[0], AlikedOptions())
 
 
-def aliked_keypoints(placement: Placement, keypoints: int) -> tuple[MatcherSpec, Encoder, dict[str, Any]]:
-    return aliked_lightglue.SPEC, aliked_encoder(placement, keypoints), {"input_dim": 128}
+Keypoints = tuple[Encoder, dict[str, Any]]  # and the shape of LightGlue for them
 
 
-def disk_keypoints(placement: Placement, keypoints: int) -> tuple[MatcherSpec, Encoder, dict[str, Any]]:
-    encoder = disk_lightglue.disk_encoder(kornias("disk", DISK), keypoints, placement)
-    return disk_lightglue.SPEC, encoder, {"input_dim": 128}
+def aliked_keypoints(placement: Placement, keypoints: int) -> Keypoints:
+    return KeypointEncoder(ours(placement, "aliked", Aliked, keypoints), placement.device), {"input_dim": 128}
 
 
-def sift_keypoints(placement: Placement, keypoints: int) -> tuple[MatcherSpec, Encoder, dict[str, Any]]:
-    return sift_lightglue.SPEC, sift_lightglue.SiftEncoder(keypoints, placement.device), sift_lightglue.SHAPE
+def disk_keypoints(placement: Placement, keypoints: int) -> Keypoints:
+    return disk_lightglue.disk_encoder(kornias("disk", DISK), keypoints, placement), {"input_dim": 128}
 
 
-def make_xfeat() -> nn.Module:
-    return XFeat().net
+def sift_keypoints(placement: Placement, keypoints: int) -> Keypoints:
+    return sift_lightglue.SiftEncoder(keypoints, placement.device), sift_lightglue.SHAPE
 
 
-def xfeat_keypoints(placement: Placement, keypoints: int) -> tuple[MatcherSpec, Encoder, dict[str, Any]]:
+def xfeat_keypoints(placement: Placement, keypoints: int) -> Keypoints:
     network = XFeat(top_k=keypoints, detection_threshold=0.0)
-    network.net = kornias("xfeat", make_xfeat)
-    encoder = xfeat_lighterglue.xfeat_encoder(network, keypoints, placement)
-    return xfeat_lighterglue.SPEC, encoder, xfeat_lighterglue.SHAPE
+    network.net = filled(network.net, "xfeat")
+    return xfeat_lighterglue.xfeat_encoder(network, keypoints, placement), xfeat_lighterglue.SHAPE
 
 
 KEYPOINTS = {
@@ -128,15 +112,16 @@ KEYPOINTS = {
 def lightglue_matcher(
     name: str, placement: Placement, keypoints: int = 200, layers: int = 2, threshold: float = 0.0
 ) -> LightGlueMatcher:
-    spec, encoder, shape = KEYPOINTS[name](placement, keypoints)
-    return LightGlueMatcher(spec, encoder, kornias("lightglue", light_glue, layers, threshold, **shape), placement)
+    encoder, shape = KEYPOINTS[name](placement, keypoints)
+    network = kornias("lightglue", light_glue, layers, threshold, **shape)
+    return LightGlueMatcher(spec_of(name, "test"), encoder, network, placement)
 
 
 MATCHERS: dict[str, Callable[[Placement], Any]] = {
     "superglue": superglue_matcher,
-    "loftr": partial(semi_dense_matcher, loftr.SPEC, Loftr),
-    "quadtree": partial(semi_dense_matcher, quadtree.SPEC, Quadtree),
-    "aspanformer": partial(semi_dense_matcher, aspanformer.SPEC, AspanFormer),
+    "loftr": partial(semi_dense_matcher, "loftr", Loftr),
+    "quadtree": partial(semi_dense_matcher, "quadtree", Quadtree),
+    "aspanformer": partial(semi_dense_matcher, "aspanformer", AspanFormer),
     "dkm": dkm_matcher,
     "dkm, two passes": partial(dkm_matcher, passes=2),
     "roma": roma_matcher,

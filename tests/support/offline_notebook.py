@@ -53,12 +53,10 @@ def execute(
 
 
 def printed(notebook: nbformat.NotebookNode) -> str:
-    """All that an executed notebook's cells printed."""
     return "".join(output["text"] for output in outputs(notebook) if output["output_type"] == "stream")
 
 
 def pictures(notebook: nbformat.NotebookNode) -> int:
-    """How many pictures an executed notebook shows."""
     return sum(bool({"image/png", "image/jpeg"} & set(output.get("data", {}))) for output in outputs(notebook))
 
 

@@ -83,17 +83,14 @@ def write_pairs(directory: Path, count: int) -> list[Pair]:
 
 
 def flat(number: int, size: Size = SIZE) -> np.ndarray:
-    """An image with a brightness of its own."""
     return np.full((size.height, size.width, 3), 10 + 10 * number, np.uint8)
 
 
 def number_of(seen: Seen) -> int:
-    """Which :func:`flat` image it is."""
     return seen.brightness // 10 - 1
 
 
 def batch_pairs(directory: Path, images: int = 4, batch: str = "one", size: Size = SIZE) -> list[Pair]:
-    """All pairs of :func:`flat` images."""
     directory.mkdir(parents=True, exist_ok=True)
     paths = [directory / f"{number}.png" for number in range(images)]
     for number, path in enumerate(paths):
@@ -128,5 +125,4 @@ def run(
 
 
 def matrices(report: RunReport) -> list[bytes]:
-    """Each pair's own F."""
     return [record.pair_fundamental.tobytes() for record in report.records]

@@ -1,8 +1,12 @@
-"""What tests share: the material beside the repository, in ``../shared``, and what is in a folder."""
+"""What tests share: the material beside the repository, in ``../shared``, commands, recipes and folders."""
 
+import json
 from pathlib import Path
+from typing import Any
 
 import pytest
+
+from mkpc_kaggle.cli import main
 
 SHARED = Path(__file__).resolve().parents[3] / "shared"
 DATA = SHARED / "data"
@@ -13,5 +17,22 @@ needs_weights = pytest.mark.skipif(not WEIGHTS.is_dir(), reason=f"no checkpoints
 
 
 def contents(directory: Path) -> dict[str, bytes]:
-    """The files below a directory."""
     return {str(path.relative_to(directory)): path.read_bytes() for path in directory.rglob("*") if path.is_file()}
+
+
+def run_command(*words: object) -> int:
+    """Run a command of the package in this process; return its exit status."""
+    return main([*map(str, words)])
+
+
+def scores_of(out: Path, *options: object) -> dict[str, Any]:
+    """Run ``validate`` with these options in this process; return what it writes to the JSON file ``out``."""
+    assert run_command("validate", "--workers", 0, "--json", out, *options) == 0
+    return json.loads(out.read_text())
+
+
+def write_recipe(path: Path, *units: tuple[int, int], more: str = "") -> Path:
+    """Write a recipe with a unit of SIFT for each stage and long side."""
+    texts = [f'{{ stage = {stage}, matcher = "sift", long_side = {side} }}' for stage, side in units]
+    path.write_text(f"units = [{', '.join(texts)}]\n{more}")
+    return path

@@ -32,74 +32,35 @@ class StandIn:
 
 
 # Found by trial: with them a picture and its shifted copy have matches, and not everything matches.
+SUPERGLUE = {"kenc.encoder.12.weight": 0.3, "kenc.encoder.12.bias": 0.1, "final_proj.weight": 5.0}
+SUPERGLUE |= {"*.attn.proj.[01].weight": 16.0, "*.mlp.0.weight": 8.0, "*.mlp.3.weight": 0.1, "*.mlp.3.bias": 0.01}
+LIGHTGLUE = {"input_proj.weight": 16.0, "transformers.*.ffn.3.*": 0.1, "*.final_proj.weight": 4.0}
+ASPANFORMER = {"*.layer3_outconv.weight": 2.0, "*.flow_decoder.2.weight": 0.3}
+ROMA = {"*.gamma": 10.0, "*.cls_token": 10.0, "*.pos_embed": 40.0, "*.conv_refiner.*.out_conv.weight": 10.0}
+# Features of coarse strides are not of one place, so that shifted pictures would have little in common.
+LOMA = {"*decoder.layers.[48].out_conv.*": 0.05, "matcher.posenc.Wr.weight": 3.0, "matcher.*.ffn.3.weight": 0.1}
+LOMA |= {"matcher.*.Wqkv.weight": 1.4, "matcher.*.to_qk.weight": 1.4}
 STAND_INS = {
     "superpoint": StandIn(3.0, {"conv1a.weight": 2.0, "convPb.weight": 2.0}, {"convPb.bias[64]": 7.0}),
-    "superglue": StandIn(
-        1.0,
-        {
-            "kenc.encoder.12.weight": 0.3,
-            "kenc.encoder.12.bias": 0.1,
-            "gnn.layers.*.attn.proj.[01].weight": 16.0,
-            "gnn.layers.*.mlp.0.weight": 8.0,
-            "gnn.layers.*.mlp.3.weight": 0.1,
-            "gnn.layers.*.mlp.3.bias": 0.01,
-            "final_proj.weight": 5.0,
-        },
-        {"bin_score": 45.0},
-    ),
+    "superglue": StandIn(1.0, SUPERGLUE, {"bin_score": 45.0}),
     "loftr": StandIn(2.0, {"backbone.layer3_outconv.weight": 0.9}),
-    "quadtree": StandIn(
-        2.0, {"backbone.layer3_outconv.weight": 1.8, "loftr_coarse.layers.*.attn.py_att.weight": 4.0}
-    ),
-    "aspanformer": StandIn(
-        2.0,
-        {"backbone.layer3_outconv.weight": 2.0, "loftr_coarse.layers.*.flow_decoder.2.weight": 0.3},
-        {"coarse_matching.temperature": 6.0},
-    ),
+    "quadtree": StandIn(2.0, {"backbone.layer3_outconv.weight": 1.8, "*.attn.py_att.weight": 4.0}),
+    "aspanformer": StandIn(2.0, ASPANFORMER, {"coarse_matching.temperature": 6.0}),
     "aliked": StandIn(2.0, {"score_head.6.weight": 3.0, "desc_head.offset_conv.2.*": 3.0}),
     "disk": StandIn(2.0),
     "xfeat": StandIn(2.0),
-    "lightglue": StandIn(
-        1.0, {"input_proj.weight": 16.0, "transformers.*.ffn.3.*": 0.1, "log_assignment.*.final_proj.weight": 4.0}
-    ),
-    "roma": StandIn(
-        1.5,
-        {
-            "dinov2.*.gamma": 10.0,
-            "dinov2.cls_token": 10.0,
-            "dinov2.pos_embed": 40.0,
-            "decoder.embedding_decoder.to_out.weight": 1.0,
-            "decoder.conv_refiner.*.out_conv.weight": 10.0,
-        },
-    ),
-    "dkm": StandIn(
-        1.5,
-        {"decoder.embedding_decoder.terminal_module.*.weight": 2.0, "decoder.conv_refiner.*.out_conv.weight": 2.0},
-    ),
-    "loma": StandIn(
-        2.0,
-        {
-            # What coarse features say is not of one place, so that shifted pictures would have little in common.
-            "*decoder.layers.[48].out_conv.*": 0.05,
-            "matcher.posenc.Wr.weight": 3.0,
-            "matcher.transformers.*.Wqkv.weight": 1.4,
-            "matcher.transformers.*.to_qk.weight": 1.4,
-            "matcher.transformers.*.ffn.3.weight": 0.1,
-        },
-    ),
+    "lightglue": StandIn(1.0, LIGHTGLUE),
+    "roma": StandIn(1.5, ROMA),
+    "dkm": StandIn(1.5, {"*.terminal_module.*.weight": 2.0, "*.conv_refiner.*.out_conv.weight": 2.0}),
+    "loma": StandIn(2.0, LOMA),
 }
 
 
 # RoMa with fewer channels, a thirtieth of its size: most of what is left is VGG.
+REFINERS = {16: (64, 16, 7, 369), 8: (48, 8, 3, 153), 4: (32, 8, 2, 97), 2: (16, 4, None, 36), 1: (9, 6, None, 24)}
 NARROW = RomaConfig(
     DinoV2Config(width=64, blocks=2, heads=2, positions=5),
-    refiners={
-        16: WarpRefinerShape(64, 16, 7, 369),
-        8: WarpRefinerShape(48, 8, 3, 153),
-        4: WarpRefinerShape(32, 8, 2, 97),
-        2: WarpRefinerShape(16, 4, None, 36),
-        1: WarpRefinerShape(9, 6, None, 24),
-    },
+    refiners={stride: WarpRefinerShape(*shape) for stride, shape in REFINERS.items()},
     blocks=2,
     heads=2,
 )
@@ -146,9 +107,8 @@ def standin_state(network: nn.Module, standin: StandIn) -> dict[str, Tensor]:
             state[name] = torch.zeros_like(tensor)
             continue
         scale = np.prod([factor for pattern, factor in standin.scales.items() if fnmatchcase(name, pattern)])
-        state[name] = torch.from_numpy(
-            np.asarray(scale * value_of(name, tuple(tensor.shape), standin.gain), np.float32)
-        )
+        value = scale * value_of(name, tuple(tensor.shape), standin.gain)
+        state[name] = torch.from_numpy(np.asarray(value, np.float32))
     for name, value in standin.values.items():
         key, _, entry = name.removesuffix("]").partition("[")
         state[key].view(-1)[slice(None) if not entry else int(entry)] = value
@@ -156,7 +116,6 @@ def standin_state(network: nn.Module, standin: StandIn) -> dict[str, Tensor]:
 
 
 def filled(network: nn.Module, name: str) -> nn.Module:
-    """The network with the stand-in weights of that name."""
     network.load_state_dict(standin_state(network, STAND_INS[name]))
     return network
 

@@ -36,5 +36,4 @@ class SyntheticMatcher(RectifiedMatcher):
 
 
 def synthetic_pairs(directory: Path, images: int = 6, batch: str = "batch") -> list[Pair]:
-    """All pairs of the flat images, in one batch."""
     return batch_pairs(directory, images, batch, SIZE)

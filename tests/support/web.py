@@ -61,7 +61,6 @@ class _Handler(BaseHTTPRequestHandler):
 
 @contextmanager
 def serve(site: Site) -> Iterator[Site]:
-    """Serve while the block runs, at ``site.url``."""
     handler = type("Handler", (_Handler,), {"site": site})
     with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
         thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})

@@ -13,13 +13,8 @@ from mkpc_kaggle.weights.manifest import UNVERIFIED, WeightFile
 
 def test_every_tensor_comes_through_whatever_it_shares(tmp_path):
     base = torch.arange(12.0).reshape(3, 4)
-    tensors = {
-        "net.base": base,
-        "net.turned": base.t(),
-        "net.same": base,
-        "net.half": torch.tensor(0.5, dtype=torch.bfloat16),
-        "net.count": torch.tensor([3]),
-    }
+    tensors = {"net.base": base, "net.turned": base.t(), "net.same": base, "net.count": torch.tensor([3])}
+    tensors |= {"net.half": torch.tensor(0.5, dtype=torch.bfloat16)}
     torch.save({"state_dict": tensors, "epoch": 3}, tmp_path / "x.ckpt")
     line = convert(tmp_path / "x.ckpt", tmp_path / "new" / "x.safetensors")
     data = (tmp_path / "new" / "x.safetensors").read_bytes()
