@@ -106,7 +106,7 @@ class SceneRecord:
     points: int = 0
     seconds: float = 0.0
     failure: str = ""
-    models: tuple[SfmModel, ...] = ()
+    models: tuple[SfmModel, ...] = field(default=(), compare=False)
 
     @classmethod
     def of(cls, batch: str, found: Sequence[Reconstruction], seconds: float = 0.0) -> "SceneRecord":

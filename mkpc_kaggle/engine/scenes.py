@@ -95,9 +95,9 @@ class Scenes:
         self._stale |= changed
         for name in changed:
             self.losses.skipped.pop(name, None)
-        names = (name for name in self.batches if name in self._stale - self._running)
-        tried = (name for name in names if name not in self.losses.skipped and self._matches(name))
-        return sorted(tried, key=self.made.__contains__)
+        stale = self._stale - self._running - self.losses.skipped.keys()
+        waiting = (name for name in self.batches if name in stale and self._matches(name))
+        return sorted(waiting, key=self.made.__contains__)
 
     def reserve(self) -> float:
         """Return the seconds that the pending reconstructions will probably take."""

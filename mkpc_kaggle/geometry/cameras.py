@@ -21,7 +21,7 @@ class Camera:
 
     @property
     def centre(self) -> NDArray[np.float64]:
-        """The camera's position (3,) in the world."""
+        """Position in the world, (3,)."""
         return -self.R.T @ self.t
 
     @property

@@ -111,7 +111,7 @@ def test_what_is_saved_is_read_after_opening_again(whole: Journal, tmp_path: Pat
         assert records[0].regions == REGIONS
         assert np.array_equal(records[0].chosen_fundamental, 3 * F)
         assert np.array_equal(records[0].magsac_fundamental, 2 * F)
-        assert replace(scenes["one"], models=()) == replace(before[1]["one"], models=())
+        assert scenes == before[1]
         (model,), (known,) = scenes["one"].models, before[1]["one"].models
         assert (model.points.tolist(), model.reprojection_error) == ([[0.0, 0.0, 5.0]], 0.7)
         for image, other in zip(model.images, known.images, strict=True):

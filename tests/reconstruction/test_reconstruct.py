@@ -140,7 +140,7 @@ def test_colmap_goes_on_with_photographs_that_exif_turns(tmp_path):
     root, out = write_from_phone(tmp_path / "images"), tmp_path / "out"
     result = run(root, out)
     sizes = {f"{n:02}.png": SIZE if o in (1, 3) else SIZE[::-1] for n, o in enumerate(ORIENTATIONS)}
-    assert {name: record.size for name, record in cameras(result).items()} == sizes
+    assert {name: record.image.size for name, record in cameras(result).items()} == sizes
     settings = {"min_model_size": 3, "random_seed": 0, "extract_colors": True, "num_threads": 1}
     options = pycolmap.IncrementalPipelineOptions(settings)
     (model,) = pycolmap.incremental_mapping(out / "database.db", root, tmp_path, options).values()
