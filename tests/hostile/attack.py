@@ -15,8 +15,7 @@ from pathlib import Path
 
 import pytest
 from processes import started_with
-
-from mkpc_kaggle.data.competition import read_test_side, submission_problems
+from shared import problems_of
 
 ROOT = Path(__file__).resolve().parents[2]
 # Of data, for each process; not of address space, of which CUDA builds of PyTorch reserve more.
@@ -79,7 +78,7 @@ def attack(case: Case, room: Path) -> None:
         faults += [f"left running: {line}" for line in _orphans(mark)]
         was_interrupted = status not in (0, 1) and output.strip() in ("", "error: interrupted")  # at its start
         if case.submission and not was_interrupted and "submit" in command and status in ENDED_BY_ITSELF:
-            faults += _submission_faults(room)
+            faults += [f"submission: {problem}" for problem in problems_of(room / "out" / "s.csv", room / "D")]
         if status in (0, 1) and "reconstruct" in command and TOO_LATE not in output:
             faults += _result_faults(room / "out" / "o", status)
     after = _snapshot(room)
@@ -142,11 +141,6 @@ def _faults(case: Case, status: int | None, output: str, room: Path) -> Iterator
         yield f"the output has no {case.says!r}"
     if status in (0, 1, 2) and (left := sorted(path.name for path in (room / "tmp").iterdir())):
         yield f"left in the folder for temporary files: {left}"
-
-
-def _submission_faults(room: Path) -> list[str]:
-    ids = [pair.id for pair in read_test_side(room / "D")]
-    return [f"submission: {problem}" for problem in submission_problems(room / "out" / "s.csv", ids)]
 
 
 def _result_faults(out: Path, status: int) -> Iterator[str]:

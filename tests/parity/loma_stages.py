@@ -78,10 +78,9 @@ def descriptor_values(descriptor, images, points):
 
 def matcher_values(matcher, image0, image1, threshold):
     """Of a single pair, as a batch of one."""
-    last = f"transformers.{LAYERS - 1}"
-    with recorded(matcher, [last]) as calls:
+    with recorded(matcher, f"transformers.{LAYERS - 1}") as calls:
         matcher(image0, image1, threshold)
-    similarity = matcher.similarity(calls[last][0][1], len(image0.points))
+    similarity = matcher.similarity(calls[0][1], len(image0.points))
     scores = log_scores(similarity)
     return {"similarity": similarity, "scores": scores.exp()} | assignment_values(scores[0], threshold)
 

@@ -37,9 +37,9 @@ def computed(network, images, masks, scales, coarse_scales=None):
     Points are multiplied by ``scales`` (N, 2) of either side, coarse ones by ``coarse_scales`` if given.
     """
     maps = [network.encode(image) for image in images]
-    with recorded(network, ["loftr_coarse"]) as calls:
+    with recorded(network, "loftr_coarse") as calls:
         matches = network.match(*maps, masks)
-    transformed = zip(calls["loftr_coarse"][0][1], maps, strict=True)
+    transformed = zip(calls[0][1], maps, strict=True)
     grids = [tokens.reshape(len(tokens), *own.coarse.shape[2:], 256) for tokens, own in transformed]
     coarse, confidence = matches.coarse, confidence_of(network, *grids, masks)
     values = {"conf": confidence, "conf_rowmax": confidence.amax(2), "conf_colmax": confidence.amax(1)}

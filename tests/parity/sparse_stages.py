@@ -94,9 +94,9 @@ def assignment_values(log_scores, threshold, suffix=""):
 def plan_of(network, image0, image1):
     """Return the score matrix of a pair, and the logarithm of its transport plan with the dustbins."""
     n0 = len(image0.points)
-    with recorded(network, ["final_proj"]) as calls:
+    with recorded(network, "final_proj") as calls:
         network(image0, image1)
-    scores = network.score_matrix(calls["final_proj"][0][1], n0)
+    scores = network.score_matrix(calls[0][1], n0)
     return scores, log_optimal_transport(scores, network.bin_score, network.sinkhorn_iterations)[0]
 
 
