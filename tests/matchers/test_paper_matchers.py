@@ -3,8 +3,6 @@
 The weights are stand-ins: the matches mean nothing, but all of the real code finds them.
 """
 
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
@@ -26,7 +24,7 @@ TRIALS |= {
 
 
 @pytest.fixture(scope="module")
-def test_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def test_dir(tmp_path_factory):
     """A test side of odd sizes, landscape and portrait, a picture without texture, and one of 33 x 47 pixels."""
     directory = tmp_path_factory.mktemp("made")
     whole = scene(240, 240, channels=3)

@@ -1,8 +1,6 @@
 """Names of files and folders as they come: taken, passed over with a line, or refused; never a traceback."""
 
 import os
-from collections.abc import Iterable
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +12,7 @@ from mkpc_kaggle.reconstruction.folder import read_folder, read_pair_list
 from mkpc_kaggle.reconstruction.outputs import submission_rows
 
 
-def written(root: Path, *names: str) -> Path:
+def written(root, *names):
     for name in names:
         path = os.path.join(os.fsencode(root), os.fsencode(name))  # noqa: PTH118  a name may be no text
         os.makedirs(os.path.dirname(path), exist_ok=True)  # noqa: PTH103, PTH120
@@ -23,7 +21,7 @@ def written(root: Path, *names: str) -> Path:
     return root
 
 
-def names_of(root: Path) -> dict[str, list[str]]:
+def names_of(root):
     return {name: [file.name for file in files] for name, files in read_folder(root).items()}
 
 
@@ -69,9 +67,9 @@ def test_names_in_a_list_of_pairs_may_have_blanks(tmp_path):
         read_pair_list(tmp_path / "pairs.txt", root, read_folder(root))
 
 
-def rows_of(root: Path, files: Iterable[str]) -> list[tuple[str, ...]]:
+def rows_of(root, files):
     record = CameraRecord("x", "x", 0, (0, 0, 0), (0, 0, 1), (0, 1, 0), 100.0, Size(10, 10), 5)
-    cameras: dict[str, dict[Path, CameraRecord | None]] = {}
+    cameras = {}
     for name in files:
         path = root / name
         cameras.setdefault(path.parent.relative_to(root).as_posix(), {})[path] = record
