@@ -32,17 +32,13 @@ class Seen:
     brightness: int
 
 
-def plenty(_: int) -> int:
-    return 150
-
-
 @dataclass
 class RectifiedMatcher:
     """``seconds`` for each pair; ``matches`` by the brightness of image 0; ``calls``: (long side, brightness)."""
 
     name: str = "rectified"
     seconds: float = 0.0
-    matches: Callable[[int], int] = plenty
+    matches: Callable[[int], int] = lambda _: 150
     calls: list[tuple[int, int]] = field(default_factory=list)
 
     @property
@@ -75,10 +71,10 @@ def write_pairs(directory: Path, count: int) -> list[Pair]:
     pairs = []
     directory.mkdir(parents=True, exist_ok=True)
     for index in range(count):
-        paths = [directory / f"{index:03d}_{side}.png" for side in (0, 1)]
+        paths = [str(directory / f"{index:03d}_{side}.png") for side in (0, 1)]
         for path in paths:
-            cv2.imwrite(str(path), np.full((72, 80, 3), 10 + index, np.uint8))
-        pairs.append(Pair(f"set;{index:03d}", "set", *map(str, paths)))
+            cv2.imwrite(path, np.full((72, 80, 3), 10 + index, np.uint8))
+        pairs.append(Pair(f"set;{index:03d}", "set", *paths))
     return pairs
 
 
