@@ -12,7 +12,7 @@ from sklearn.cluster import DBSCAN
 
 from mkpc_kaggle.geometry import critical_region as regions
 from mkpc_kaggle.geometry.coordinates import Box, Size
-from mkpc_kaggle.geometry.critical_region import MkpcConfig, RegionReason, critical_region, find_clusters
+from mkpc_kaggle.geometry.critical_region import MkpcConfig, RegionReason, critical_region, expand_box
 
 SQUARE = Size(1000, 1000)
 PAPER = MkpcConfig()
@@ -72,7 +72,7 @@ def test_clusters_are_kept_down_to_the_share_largest_first_and_equal_ones_in_the
 
 def test_clusters_tell_their_points_from_noise_and_those_that_are_kept():
     points = np.concatenate([block(600, 600, 640, 640, 5), lone(3), block(100, 100, 140, 140, 101)])
-    clusters = find_clusters(points, SQUARE, PAPER)
+    clusters = regions.find_clusters(points, SQUARE, PAPER)
     assert_array_equal(clusters.sizes, [5, 101])
     assert_array_equal(clusters.labels, [0] * 5 + [-1] * 3 + [1] * 101)
     assert_array_equal(clusters.kept, [1])  # 5 / 101 < 0.05
@@ -85,21 +85,17 @@ def test_x_is_normalised_by_the_width_and_y_by_the_height():
     stack = np.repeat(np.array([[500, 100]], np.float32), 6, axis=0)
     for shift, last_label in [((40, 0), 0), ((60, 0), 1), ((0, 9), 0), ((0, 20), 1)]:
         points = np.concatenate([stack, stack + np.float32(shift)])
-        assert find_clusters(points, size, PAPER).labels.max() == last_label
-        assert find_clusters(points[:, ::-1], Size(200, 1000), PAPER).labels.max() == last_label
+        assert regions.find_clusters(points, size, PAPER).labels.max() == last_label
+        assert regions.find_clusters(points[:, ::-1], Size(200, 1000), PAPER).labels.max() == last_label
 
 
 def test_the_box_grows_about_its_centre_and_holds_the_pixels_that_the_points_lie_on():
-    assert regions.expand_box(np.array([(99.5, 100.49), (130.49, 131.4)]), SQUARE, 1.0, 1.0) == Box(
-        100, 100, 131, 132
-    )
+    assert expand_box(np.array([(99.5, 100.49), (130.49, 131.4)]), SQUARE, 1.0, 1.0) == Box(100, 100, 131, 132)
     points = np.array([(200, 300), (399, 331)], np.float32)
-    assert regions.expand_box(points, SQUARE, 1.05, 1.0) == Box(195, 300, 405, 332)
-    assert regions.expand_box(points[:, ::-1], SQUARE, 1.0, 1.05) == Box(300, 195, 332, 405)
+    assert expand_box(points, SQUARE, 1.05, 1.0) == Box(195, 300, 405, 332)
+    assert expand_box(points[:, ::-1], SQUARE, 1.0, 1.05) == Box(300, 195, 332, 405)
     # 101 columns grow by 2.525 on either side: edges are rounded outwards
-    assert regions.expand_box(np.array([(200, 300), (300, 331)], np.float32), SQUARE, 1.05, 1.0) == Box(
-        197, 300, 304, 332
-    )
+    assert expand_box(np.array([(200, 300), (300, 331)], np.float32), SQUARE, 1.05, 1.0) == Box(197, 300, 304, 332)
 
 
 def test_points_that_are_not_finite_or_not_on_the_image_are_ignored():
@@ -134,7 +130,7 @@ def test_the_box_is_on_the_image_and_holds_every_kept_point(seed, size, config):
         assert box == Box.whole(size)
         return
     on_image = points[Box.whole(size).contains(points)]
-    clusters = find_clusters(on_image, size, config)
+    clusters = regions.find_clusters(on_image, size, config)
     assert len(clusters.kept) == got.kept
     assert box.contains(on_image[clusters.in_kept]).all()
     assert min(box.size) >= config.min_side
