@@ -47,10 +47,8 @@ def test_a_submission_is_made_resumed_and_computed_again_where_a_unit_changed(de
 def test_a_killed_run_goes_on_and_ends_with_the_bytes_of_an_undisturbed_one(demo, small_recipe, tmp_path):
     undisturbed, output = tmp_path / "undisturbed.csv", tmp_path / "submission.csv"
     make(demo.test_dir, undisturbed, small_recipe, *HERE)
-    running = subprocess.Popen(
-        command(demo.test_dir, output, small_recipe, "--no-report"), stderr=subprocess.PIPE, text=True
-    )
-    assert running.stderr is not None
+    begun = command(demo.test_dir, output, small_recipe, "--no-report")
+    running = subprocess.Popen(begun, stderr=subprocess.PIPE, text=True)
     for line in running.stderr:  # the progress: the first deepened pair
         if line.startswith("deepen"):
             break
@@ -90,7 +88,7 @@ def test_a_whole_submission_is_there_before_weights_and_devices_are_looked_at(de
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("command", ["submit --test-dir {test}", "reconstruct {test}/test_images --out out"])
-def test_a_signal_is_answered_while_weights_are_read(
+def test_a_signal_ends_the_reading_of_weights(
     demo, tmp_path, clean_environment, monkeypatch, number, command, capsys
 ):
     def read_for_long(path):

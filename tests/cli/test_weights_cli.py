@@ -71,9 +71,7 @@ def test_fetch_takes_files_slots_and_recipes(tmp_path, monkeypatch, capsys):
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == there
 
 
-def test_the_first_download_of_a_file_without_a_digest_is_the_one_that_is_accepted_from_then_on(
-    tmp_path, monkeypatch, capsys
-):
+def test_the_first_download_of_a_file_without_a_digest_is_accepted_from_then_on(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("no_proxy", "127.0.0.1")
     out = tmp_path / "out"
     fetch = ["weights", "fetch", "b.pt", "--out", out]

@@ -101,9 +101,7 @@ def listed(home: Path, root: Path) -> tuple[object, ...]:
     return "--pairs", home / "list.txt", "--image-root", root
 
 
-def test_a_listed_image_is_set_upright_and_scored_by_the_camera_of_its_stored_pixels(
-    demo, scenes, small_recipe, tmp_path
-):
+def test_a_listed_image_is_set_upright_and_scored_as_it_is_stored(demo, scenes, small_recipe, tmp_path):
     """Images stored on their sides, with cameras to match, score as the upright images do."""
     lines, true = [], max(scenes[0].pairs, key=lambda true: true.covisibility)
     for number, turns in enumerate([(1, 3), (2, 0), (3, 3)]):

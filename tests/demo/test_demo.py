@@ -31,7 +31,7 @@ def numbers(text: str, *shape: int) -> np.ndarray:
     return np.array([float(word) for word in text.split(" ")]).reshape(shape)
 
 
-def smooth_texture() -> np.ndarray:
+def blobs() -> np.ndarray:
     """Blobs of some 16 texels: the intensity changes fast enough to show half a pixel."""
     noise = np.random.default_rng(0).uniform(0, 255, (32, 32, 3)).astype(np.uint8)
     return cv2.resize(noise, (512, 512), interpolation=cv2.INTER_CUBIC)
@@ -43,7 +43,7 @@ def upright(left: tuple[float, float], right: tuple[float, float], low: float, h
 
 def test_a_view_warped_by_depth_falls_on_the_other():
     """Image, depth and camera agree to a small part of a pixel; half a pixel would show."""
-    texture = smooth_texture()
+    texture = blobs()
     surfaces = [
         upright((-6, 9), (2, 12), -3, 5, texture),
         upright((2, 12), (8, 7), -3, 5, texture),
@@ -70,9 +70,7 @@ def test_a_view_warped_by_depth_falls_on_the_other():
 def test_two_views_share_half_of_a_wall_and_neither_sky_nor_what_a_screen_hides():
     # A view is 10 m wide at the wall; half of that is a baseline of 5 m.
     a, b = (look_at((x, 0, 0), (x, 10, 0), 200, (200, 150)) for x in (0.0, 5.0))
-    wall, screen = (
-        upright((x - w, y), (x + w, y), -50, 50, smooth_texture()) for x, y, w in ((0, 10, 50), (5, 2, 2))
-    )
+    wall, screen = (upright((x - w, y), (x + w, y), -50, 50, blobs()) for x, y, w in ((0, 10, 50), (5, 2, 2)))
     for surfaces, shared in (([wall], 0.5), ([wall, screen], 0), ([], 0)):
         (_, depth_a), (_, depth_b) = (render(surfaces, camera) for camera in (a, b))
         assert covisibility(a, depth_a, b, depth_b) == pytest.approx(shared, abs=0.02)

@@ -94,8 +94,5 @@ CASES = [
     *makes("folders", TO_TABLES, below("I", ALIKE)),
     *makes("folders", TO_TABLES, below("I", ODD), (0,)),
     *makes("folders", RECONSTRUCT, {f"again: {name}": resumed(make) for name, make in CHANGES.items()}, EITHER),
-    *(
-        Case("folders", f"{name} after 4 s", RECONSTRUCT, nothing, (1, *STATUSES[name]), act=sends(name, 4.0))
-        for name in ENDS
-    ),
+    *(Case("folders", f"{n} after 4 s", RECONSTRUCT, nothing, (1, *STATUSES[n]), act=sends(n, 4.0)) for n in ENDS),
 ]

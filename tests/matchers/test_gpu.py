@@ -20,7 +20,7 @@ from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.pipeline.devices import fastest_precision, gpu_capabilities, require_device, resolve_placement
 from mkpc_kaggle.pipeline.failures import DeviceError
 from mkpc_kaggle.pipeline.pair import PairMatch
-from mkpc_kaggle.pipeline.stages import ENCODING_CACHE_BYTES, Pipeline
+from mkpc_kaggle.pipeline.stages import Pipeline
 from mkpc_kaggle.recipe import Recipe, Unit
 
 UNIT = Unit(1, "own", 64)
@@ -88,14 +88,6 @@ def test_a_device_that_multiplies_and_cannot_convolve_is_refused(monkeypatch):
 class Maps:
     coarse: torch.Tensor
     others: tuple[torch.Tensor, ...] = ()
-
-
-def test_the_cache_is_sized_by_the_memory_that_is_free_and_the_workers_on_it():
-    made = assemble("classical", device="cpu")
-    assert made.pipeline()._encodings.limit == ENCODING_CACHE_BYTES
-    with DeviceDouble(2, memory=12 << 30):
-        assert made.on("cuda:1").pipeline()._encodings.limit == 3 << 30
-        assert made.on("cuda:1", 3).pipeline()._encodings.limit == 1 << 30
 
 
 def settings() -> tuple[str, str]:

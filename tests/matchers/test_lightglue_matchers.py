@@ -69,9 +69,7 @@ def test_layers_compute_in_the_precision_that_is_asked_for(precision, store):
     """LightGlue turns off any autocast around it: what counts is set around its layers."""
     matcher, seen = load("aliked_lightglue", store, precision), []
     for part in ("posenc.Wr", "transformers.1.cross_attn.to_out", "transformers.1", "log_assignment.1"):
-        matcher._glue.get_submodule(part).register_forward_hook(
-            lambda part, given, found: seen.append(found[0].dtype)
-        )
+        matcher._glue.get_submodule(part).register_forward_hook(lambda *call: seen.append(call[-1][0].dtype))
     encodings = matcher.encode([picture(64, 96, multiple=32)])
     matcher.match(encodings, encodings)
     exact = torch.float32

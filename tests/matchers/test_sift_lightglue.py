@@ -19,21 +19,15 @@ PICTURE = picture(130, 171, channels=1)
 def test_keypoints_and_log_assignment_are_the_golden_ones():
     golden, glue = golden_arrays("sift_lightglue", "herz_jesus"), light_glue(9, 0.1, **SHAPE)
     state = glue.state_dict()
-    seeded = {
-        name: seeded_tensor(name, tuple(state[name].shape)) for name in state if name != "confidence_thresholds"
-    }
+    seeded = {n: seeded_tensor(n, tuple(x.shape)) for n, x in state.items() if n != "confidence_thresholds"}
     glue.load_state_dict(state | seeded)
     found = []
     glue.register_forward_hook(lambda *call: found.append(call[-1]["log_assignment"][0]))
     matcher = LightGlueMatcher(SPEC, SiftEncoder(512, "cpu"), glue, Placement())
     encodings = matcher.encode([as_picture(golden[f"image{number}"].numpy()) for number in (0, 1)])
     for number, keypoints in enumerate(encodings):
-        parts = {
-            "keypoints": keypoints.points + 0.25,  # OpenCV's offset
-            "scales": keypoints.scales,
-            "oris": keypoints.orientations,
-            "descriptors": keypoints.descriptors,
-        }
+        parts = {"keypoints": keypoints.points + 0.25}  # OpenCV's offset
+        parts |= {"scales": keypoints.scales, "oris": keypoints.orientations, "descriptors": keypoints.descriptors}
         expected = np.hstack([golden[f"{part}{number}"].reshape(len(keypoints), -1) for part in parts])
         own = np.hstack([part.reshape(len(keypoints), -1) for part in parts.values()])
         assert_allclose(own[np.lexsort(own[:, :2].T)], expected[np.lexsort(expected[:, :2].T)], atol=1e-5)

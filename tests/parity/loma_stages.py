@@ -153,9 +153,8 @@ def pipeline_stages(case, variant):
     yield Stage("points", mine, theirs, 1e-3)
 
 
-CASES = {
-    f"loma detector_{case}": partial(detector_stages, case) for case in ("160x208", "157x203", "batch2_72x96")
-}
+DETECTIONS = ("160x208", "157x203", "batch2_72x96")
+CASES = {f"loma detector_{case}": partial(detector_stages, case) for case in DETECTIONS}
 CASES |= {"loma sampling": sampling_stages, "loma resize": resize_stages}
 CASES["loma descriptor_b128"] = partial(descriptor_stages, Variant.B128, "b128_157x203")
 CASES |= {
