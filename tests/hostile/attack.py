@@ -8,7 +8,7 @@ import sys
 import tempfile
 import time
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -32,7 +32,7 @@ Make = Callable[[Path], object]
 Act = Callable[["subprocess.Popen[bytes]"], None]
 
 
-def nothing(_: object) -> None:
+def nothing(_):
     """Leave the room as it is."""
 
 
@@ -59,11 +59,11 @@ class Case:
     stderr: Callable[[], int] | None = None  # opens the descriptor that the command writes to; else the log
 
     @property
-    def id(self) -> str:
+    def id(self):
         return f"{self.group}: {self.name}"
 
 
-def attack(case: Case, room: Path) -> None:
+def attack(case, room):
     """Run the case in the room. The test fails with all faults."""
     case.make(room)
     before = _snapshot(room)
@@ -87,25 +87,18 @@ def attack(case: Case, room: Path) -> None:
         pytest.fail("\n".join([case.id, case.command, *faults, f"output:\n{output[-3000:]}"]), pytrace=False)
 
 
-def prepared(command: str, room: Path) -> int:
+def prepared(command, room):
     """Return the exit status of an undisturbed command."""
     return _start(command, room, {}).wait()
 
 
-def _start(
-    command: str, room: Path, env: dict[str, str], limits: str = "-c 0", stderr: Callable[[], int] | None = None
-) -> "subprocess.Popen[bytes]":
+def _start(command, room, env, limits="-c 0", stderr=None):
     limited = ["sh", "-c", f'ulimit -d {MEMORY_KIB}; ulimit {limits}; exec "$@"', "sh"]
-    own = {
-        "PATH": os.defpath,
-        "PYTHONPATH": str(ROOT),
-        "OMP_NUM_THREADS": "1",
-        "HOME": str(room / "home"),
-        "TMPDIR": str(room / "tmp"),
-        "PYTHONDONTWRITEBYTECODE": "1",
-        "MPLCONFIGDIR": str(Path(tempfile.gettempdir()) / "hostile-matplotlib"),  # its list of fonts takes seconds
-        "no_proxy": "*",
-    }
+    own = {"PATH": os.defpath, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": "1"}
+    own |= {"HOME": str(room / "home"), "TMPDIR": str(room / "tmp"), "no_proxy": "*"}
+    own["MPLCONFIGDIR"] = str(
+        Path(tempfile.gettempdir()) / "hostile-matplotlib"
+    )  # its list of fonts takes seconds
     with (room / "out" / "log").open("ab") as log:
         return subprocess.Popen(
             [*limited, sys.executable, "-m", "mkpc_kaggle", *shlex.split(command)],
@@ -118,9 +111,9 @@ def _start(
         )
 
 
-def _wait(process: "subprocess.Popen[bytes]", room: Path) -> tuple[int | None, str]:
+def _wait(process, room):
     """Return the status, ``None`` if the process had to be killed, and the output."""
-    status: int | None = None
+    status = None
     try:
         status = process.wait(HANGS_S)
     except subprocess.TimeoutExpired:
@@ -129,7 +122,7 @@ def _wait(process: "subprocess.Popen[bytes]", room: Path) -> tuple[int | None, s
     return status, (room / "out" / "log").read_text(errors="replace")
 
 
-def _faults(case: Case, status: int | None, output: str, room: Path) -> Iterator[str]:
+def _faults(case, status, output, room):
     yield from (f"the output has {crash!r}" for crash in CRASHES if crash in output)
     if status is None:
         yield f"it hangs: not over after {HANGS_S} s"
@@ -143,7 +136,7 @@ def _faults(case: Case, status: int | None, output: str, room: Path) -> Iterator
         yield f"left in the folder for temporary files: {left}"
 
 
-def _result_faults(out: Path, status: int) -> Iterator[str]:
+def _result_faults(out, status):
     """Yield the faults of the results of a folder of images."""
     table = out / "cameras.csv"
     lines = table.read_text().splitlines() if table.is_file() else [""]
@@ -156,7 +149,7 @@ def _result_faults(out: Path, status: int) -> Iterator[str]:
     yield from (f"left: {path}" for path in out.rglob(".*") if path.name != ".png")
 
 
-def _orphans(mark: str) -> list[str]:
+def _orphans(mark):
     """Kill the processes of the case that still run, and return their command lines."""
     for _ in range(600):
         if not (left := started_with(mark)):
@@ -168,9 +161,9 @@ def _orphans(mark: str) -> list[str]:
     return [f"{process} {command[:200]}" for process, command in left.items()]
 
 
-def _snapshot(room: Path) -> dict[str, tuple[object, ...]]:
+def _snapshot(room):
     """Return the state of each file and folder of the room, except what a command may write."""
-    states: dict[str, tuple[object, ...]] = {}
+    states = {}
     for folder, folders, names in os.walk(os.fsencode(room)):
         if folder == os.fsencode(room):
             folders[:] = [name for name in folders if name not in (b"out", b"tmp")]
