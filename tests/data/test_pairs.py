@@ -1,7 +1,6 @@
 """Lists of pairs: lines that are read or refused, and what ``validate`` makes of a list."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -97,7 +96,7 @@ def test_the_true_matrix_has_no_error(demo, scenes, tmp_path):
         assert all(path.is_file() for path in true.pair.images)
 
 
-def listed(home: Path, root: Path) -> tuple[object, ...]:
+def listed(home, root):
     return "--pairs", home / "list.txt", "--image-root", root
 
 

@@ -9,7 +9,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from shared import run_command
 
-from mkpc_kaggle.demo import DemoSet
 from mkpc_kaggle.evaluation.compare import Comparison, paired_difference
 from mkpc_kaggle.evaluation.validate import PairScore, SceneScore, Validation
 from mkpc_kaggle.geometry.metrics import PoseError
@@ -55,7 +54,7 @@ def test_different_pairs_are_not_compared():
         Comparison(tuple(Validation("a", (SceneScore("s", pairs),)) for pairs in ((p, q), (q, p))))
 
 
-def compare(demo: DemoSet, *more: object) -> int:
+def compare(demo, *more):
     return run_command("validate", "--train-dir", demo.train_dir, "--pairs-per-scene", 4, "--workers", 0, *more)
 
 

@@ -96,9 +96,7 @@ def _start(command, room, env, limits="-c 0", stderr=None):
     limited = ["sh", "-c", f'ulimit -d {MEMORY_KIB}; ulimit {limits}; exec "$@"', "sh"]
     own = {"PATH": os.defpath, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": "1"}
     own |= {"HOME": str(room / "home"), "TMPDIR": str(room / "tmp"), "no_proxy": "*"}
-    own["MPLCONFIGDIR"] = str(
-        Path(tempfile.gettempdir()) / "hostile-matplotlib"
-    )  # its list of fonts takes seconds
+    own["MPLCONFIGDIR"] = str(Path(tempfile.gettempdir()) / "hostile-matplotlib")  # its list of fonts is slow
     with (room / "out" / "log").open("ab") as log:
         return subprocess.Popen(
             [*limited, sys.executable, "-m", "mkpc_kaggle", *shlex.split(command)],

@@ -8,15 +8,7 @@ from mkpc_kaggle.geometry.coordinates import Box, Size, View
 from mkpc_kaggle.matchers.contract import Picture
 
 
-def picture(
-    height,
-    width,
-    name="scene",
-    *,
-    channels=3,
-    multiple=1,
-    padding=(0, 0),
-):
+def picture(height, width, name="scene", *, channels=3, multiple=1, padding=(0, 0)):
     """The scene of that name, one to one, with at least that padding on the right and at the bottom."""
     pixels = scene(height, width, channels, name)
     return as_picture(pixels if channels == 3 else pixels[..., 0], multiple, padding)

@@ -2,7 +2,6 @@
 
 import os
 import re
-from pathlib import Path
 from zipfile import ZipFile
 
 import pytest
@@ -19,7 +18,7 @@ from mkpc_kaggle.weights.manifest import digest_of as file_digest
 pytestmark = pytest.mark.usefixtures("nowhere_else")
 
 
-def found_by(weights: WeightStore) -> Path:
+def found_by(weights):
     return weights.find("slot").path
 
 
@@ -56,7 +55,7 @@ def test_the_first_alternative_that_is_there_is_taken_and_missing_ones_are_all_n
 
 
 def test_a_renamed_file_is_found_by_its_size_and_digest(tmp_path, monkeypatch):
-    read: list[Path] = []
+    read = []
     monkeypatch.setattr(store, "digest_of", lambda path: read.append(path) or file_digest(path))
     put(tmp_path / "data set" / "v1", "model")
     put(tmp_path, "same size.dat", OTHER)
@@ -165,7 +164,7 @@ SHA256 = "sha256:" + "0f" * 32
 
 
 def test_the_manifest_has_every_slot_of_every_matcher_with_its_licence():
-    licences: dict[str, set[str]] = {}
+    licences = {}
     for file in manifest():
         licences.setdefault(file.slot, set()).add(file.licence)
     for spec in (spec_of(name, "test") for name in matcher_names()):
