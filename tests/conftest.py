@@ -2,7 +2,6 @@
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
 from hypothesis import HealthCheck, settings
@@ -12,10 +11,6 @@ from shared import write_recipe
 from mkpc_kaggle.demo import DemoSet, write_demo
 from mkpc_kaggle.package.wheels import BUNDLED
 from mkpc_kaggle.weights import store as weight_store
-
-if TYPE_CHECKING:
-    from mkpc_kaggle.data.competition import Pair
-    from mkpc_kaggle.engine.request import RunReport
 
 # Before torch is imported, here and in the processes of the tests: their tensors are small, and on a busy machine
 # threads wait for each other more than they work.
@@ -45,7 +40,7 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> DemoSet:
 
 
 @pytest.fixture(scope="session")
-def pairs(tmp_path_factory: pytest.TempPathFactory) -> "list[Pair]":
+def pairs(tmp_path_factory):
     """Twelve pairs of flat images, which the matcher of :mod:`rectified` tells apart by their brightness."""
     from rectified import write_pairs
 
@@ -53,7 +48,7 @@ def pairs(tmp_path_factory: pytest.TempPathFactory) -> "list[Pair]":
 
 
 @pytest.fixture(scope="session")
-def undisturbed(pairs: "list[Pair]", tmp_path_factory: pytest.TempPathFactory) -> "RunReport":
+def undisturbed(pairs, tmp_path_factory):
     """A run over these pairs in which nothing goes wrong."""
     from rectified import THREE_UNITS, RectifiedMatcher, run
 

@@ -4,7 +4,6 @@ import argparse
 import ast
 import json
 import re
-from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -18,7 +17,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 
 
-def texts_of(source: str) -> Iterator[str]:
+def texts_of(source):
     """The texts of a program, with {} for what is put into them; adjoining texts are joined."""
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.JoinedStr):
@@ -28,7 +27,7 @@ def texts_of(source: str) -> Iterator[str]:
             yield node.value
 
 
-def everything_said() -> str:
+def everything_said():
     sources = [path.read_text(encoding="utf-8") for path in sorted((ROOT / "mkpc_kaggle").rglob("*.py"))]
     cells = json.loads((ROOT / "notebooks" / "submission.ipynb").read_text(encoding="utf-8"))["cells"]
     code = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
@@ -36,7 +35,7 @@ def everything_said() -> str:
     return "\n".join(text for source in [*sources, *python] for text in texts_of(source))
 
 
-def pattern_of(message: str) -> str:
+def pattern_of(message):
     """Three dots stand for anything, F for the name of a model."""
     literal = re.escape(message).replace(r"\ ", " ").replace(r"\.\.\.", ".*")
     return re.sub(r"\bF\b", r"\\{\\}", literal)
@@ -51,17 +50,17 @@ def test_every_message_of_the_troubleshooting_page_is_one_of_the_programs():
     assert [message for message in known if not re.search(pattern_of(message), said)] == []
 
 
-def options_of(parser: argparse.ArgumentParser) -> set[str]:
+def options_of(parser):
     return {text for action in parser._actions for text in action.option_strings}
 
 
-def inner(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
+def inner(parser):
     """The parsers of its commands, by name."""
     groups = [action.choices for action in parser._actions if isinstance(action, argparse._SubParsersAction)]
     return {name: each for choices in groups for name, each in choices.items()}
 
 
-def commands(page: Path) -> Iterator[tuple[str, list[str]]]:
+def commands(page):
     """Each command of ours on a page, and the options that it is given there."""
     text = page.read_text(encoding="utf-8").replace("\\\n", " ")
     for line in re.findall(r"(?:(?:python -m mkpc_kaggle|mkpc) [a-z]|make_submission\.py )[^`\n#;]*", text):

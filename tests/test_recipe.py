@@ -84,12 +84,6 @@ def test_a_recipe_reads_as_written():
     assert (options_of(recipe, "sift").features, options_of(recipe, "sift").ratio) == (10, 0.8)
 
 
-def test_unit_names_tell_units_apart():
-    assert Unit(2, "sift", 1280).name == "2:sift@1280"
-    assert Unit(2, "dkm", area="540x720").name == "2:dkm@540x720"
-    assert Unit(2, "dkm", area="540x720", stretch=True).name == "2:dkm@540x720!"
-
-
 def test_a_unit_shows_a_crop_at_its_size():
     crop = Box(10, 20, 110, 220)
     assert Unit(1, "a", 640).view(crop, 32) == View.fit(crop, long_side=640, multiple=32)

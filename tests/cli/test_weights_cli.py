@@ -1,14 +1,13 @@
 """``python -m mkpc_kaggle weights``: what it prints and the status it ends with."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 from shared import run_command
 from web import Site, serve
 from weight_files import DATA, OTHER, digest_of, line, put
 
-from mkpc_kaggle.weights import UNVERIFIED, WeightFile, store
+from mkpc_kaggle.weights import UNVERIFIED, store
 
 FILES = (
     line("sift.pt", slot="sift"),
@@ -19,12 +18,12 @@ FILES = (
 
 
 @pytest.fixture(autouse=True)
-def own_manifest(monkeypatch: pytest.MonkeyPatch, nowhere_else: None) -> None:
+def own_manifest(monkeypatch, nowhere_else):
     monkeypatch.setattr(store, "manifest", lambda: FILES)
 
 
 @pytest.fixture
-def weights(tmp_path: Path) -> Path:
+def weights(tmp_path):
     return put(put(tmp_path / "weights", "sift.pt"), "renamed.pt", OTHER)
 
 
@@ -51,7 +50,7 @@ def test_fetch_takes_files_slots_and_recipes(tmp_path, monkeypatch, capsys):
     recipe.write_text('units = [{stage = 1, matcher = "aliked", long_side = 320}]')
     monkeypatch.setenv("no_proxy", "127.0.0.1")
     with serve(Site(DATA)) as site:
-        web: tuple[WeightFile, ...] = (
+        web = (
             replace(FILES[0], source=site.url),
             replace(FILES[1], source="by hand"),
             replace(FILES[2], source=site.url),
@@ -71,9 +70,7 @@ def test_fetch_takes_files_slots_and_recipes(tmp_path, monkeypatch, capsys):
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == there
 
 
-def test_the_first_download_of_a_file_without_a_digest_is_the_one_that_is_accepted_from_then_on(
-    tmp_path, monkeypatch, capsys
-):
+def test_the_first_download_of_a_file_without_a_digest_is_accepted_from_then_on(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("no_proxy", "127.0.0.1")
     out = tmp_path / "out"
     fetch = ["weights", "fetch", "b.pt", "--out", out]

@@ -7,13 +7,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from mkpc_kaggle.data.competition import (
-    read_submission,
-    read_test_side,
-    read_train_side,
-    submission_problems,
-    write_submission,
-)
+from mkpc_kaggle.data import competition
+from mkpc_kaggle.data.competition import read_submission, read_test_side, read_train_side, write_submission
 from mkpc_kaggle.errors import UserError
 
 HEADER = "sample_id,batch_id,image_1_id,image_2_id"
@@ -156,7 +151,7 @@ def test_a_submission_keeps_its_numbers_and_their_order(tmp_path):
     assert list(read) == list(rows)
     for name, F in rows.items():
         assert_allclose(read[name], F, rtol=1e-11, atol=0)
-    assert submission_problems(tmp_path / "submission.csv", list(rows)) == []
+    assert competition.submission_problems(tmp_path / "submission.csv", list(rows)) == []
     write_submission(tmp_path / "x.csv", {"b": EYE, "a": -EYE / 2})
     expected = b"sample_id,fundamental_matrix\nb,1 0 0 0 1 0 0 0 1\na,-0.5 -0 -0 -0 -0.5 -0 -0 -0 -0.5\n"
     with (tmp_path / "x.csv").open("rb") as former:
@@ -182,9 +177,9 @@ def test_a_submission_keeps_its_numbers_and_their_order(tmp_path):
 )
 def test_each_problem_of_a_submission_is_the_only_one_found(tmp_path, content, says):
     (tmp_path / "x.csv").write_text(content.replace("{F}", "1 2 3 4 5 6 7 8 9"))
-    (problem,) = submission_problems(tmp_path / "x.csv", ["a", "b"])
+    (problem,) = competition.submission_problems(tmp_path / "x.csv", ["a", "b"])
     assert re.search(says, problem)
     (tmp_path / "x.csv").write_text("sample_id,fundamental_matrix\nb,1\na,0 0 0 0 0 0 0 0 0\n")
-    assert len(submission_problems(tmp_path / "x.csv", ["a", "b"])) == 3, "all are told at once"
-    (problem,) = submission_problems(tmp_path / "y.csv", ["a"])
+    assert len(competition.submission_problems(tmp_path / "x.csv", ["a", "b"])) == 3, "all are told at once"
+    (problem,) = competition.submission_problems(tmp_path / "y.csv", ["a"])
     assert "no such file" in problem

@@ -1,7 +1,6 @@
 """Lists of pairs: lines that are read or refused, and what ``validate`` makes of a list."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -94,13 +93,11 @@ def test_the_true_matrix_has_no_error(demo, scenes, tmp_path):
         assert all(path.is_file() for path in true.pair.images)
 
 
-def listed(home: Path, root: Path) -> tuple[object, ...]:
+def listed(home, root):
     return "--pairs", home / "list.txt", "--image-root", root
 
 
-def test_a_listed_image_is_set_upright_and_scored_by_the_camera_of_its_stored_pixels(
-    demo, scenes, small_recipe, tmp_path
-):
+def test_a_listed_image_is_set_upright_and_scored_as_it_is_stored(demo, scenes, small_recipe, tmp_path):
     """Images stored on their sides, with cameras to match, score as the upright images do."""
     lines, true = [], max(scenes[0].pairs, key=lambda true: true.covisibility)
     for number, turns in enumerate([(1, 3), (2, 0), (3, 3)]):

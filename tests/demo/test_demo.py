@@ -1,14 +1,13 @@
 """The demo data set: its cameras, pixels and files agree with one another."""
 
 import csv
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 from shared import contents
 
-from mkpc_kaggle.demo import SCENE_NAMES, DemoSet, write_demo
+from mkpc_kaggle.demo import SCENE_NAMES, write_demo
 from mkpc_kaggle.demo.camera import covisibility, look_at, project, unproject, visible_mask
 from mkpc_kaggle.demo.render import render
 from mkpc_kaggle.demo.world import build_world, quad
@@ -18,32 +17,32 @@ SCALE = 0.2
 
 
 @pytest.fixture(scope="module")
-def small_demo(tmp_path_factory: pytest.TempPathFactory) -> DemoSet:
+def small_demo(tmp_path_factory):
     return write_demo(tmp_path_factory.mktemp("demo"), image_scale=SCALE)
 
 
-def rows(path: Path) -> list[dict[str, str]]:
+def rows(path):
     with path.open(newline="") as file:
         return list(csv.DictReader(file))
 
 
-def numbers(text: str, *shape: int) -> np.ndarray:
+def numbers(text, *shape):
     return np.array([float(word) for word in text.split(" ")]).reshape(shape)
 
 
-def smooth_texture() -> np.ndarray:
+def blobs():
     """Blobs of some 16 texels: the intensity changes fast enough to show half a pixel."""
     noise = np.random.default_rng(0).uniform(0, 255, (32, 32, 3)).astype(np.uint8)
     return cv2.resize(noise, (512, 512), interpolation=cv2.INTER_CUBIC)
 
 
-def upright(left: tuple[float, float], right: tuple[float, float], low: float, high: float, texture: np.ndarray):
+def upright(left, right, low, high, texture):
     return quad((*left, high), (*right, high), (*left, low), texture)
 
 
 def test_a_view_warped_by_depth_falls_on_the_other():
     """Image, depth and camera agree to a small part of a pixel; half a pixel would show."""
-    texture = smooth_texture()
+    texture = blobs()
     surfaces = [
         upright((-6, 9), (2, 12), -3, 5, texture),
         upright((2, 12), (8, 7), -3, 5, texture),
@@ -56,7 +55,7 @@ def test_a_view_warped_by_depth_falls_on_the_other():
     points = unproject(first, np.column_stack([x, y]).astype(float), depth_a[y, x].astype(float))
     pixels, _ = project(second, points)
 
-    def difference(shift: tuple[float, float]) -> float:
+    def difference(shift):
         maps = np.zeros((*depth_a.shape, 2), dtype=np.float32)
         maps[y, x] = pixels + np.array(shift)
         warped = cv2.remap(image_b, maps[..., 0], maps[..., 1], cv2.INTER_LINEAR)
@@ -70,9 +69,7 @@ def test_a_view_warped_by_depth_falls_on_the_other():
 def test_two_views_share_half_of_a_wall_and_neither_sky_nor_what_a_screen_hides():
     # A view is 10 m wide at the wall; half of that is a baseline of 5 m.
     a, b = (look_at((x, 0, 0), (x, 10, 0), 200, (200, 150)) for x in (0.0, 5.0))
-    wall, screen = (
-        upright((x - w, y), (x + w, y), -50, 50, smooth_texture()) for x, y, w in ((0, 10, 50), (5, 2, 2))
-    )
+    wall, screen = (upright((x - w, y), (x + w, y), -50, 50, blobs()) for x, y, w in ((0, 10, 50), (5, 2, 2)))
     for surfaces, shared in (([wall], 0.5), ([wall, screen], 0), ([], 0)):
         (_, depth_a), (_, depth_b) = (render(surfaces, camera) for camera in (a, b))
         assert covisibility(a, depth_a, b, depth_b) == pytest.approx(shared, abs=0.02)

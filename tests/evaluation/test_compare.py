@@ -9,7 +9,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from shared import run_command
 
-from mkpc_kaggle.demo import DemoSet
 from mkpc_kaggle.evaluation.compare import Comparison, paired_difference
 from mkpc_kaggle.evaluation.validate import PairScore, SceneScore, Validation
 from mkpc_kaggle.geometry.metrics import PoseError
@@ -27,13 +26,11 @@ def test_scenes_count_alike_however_many_pairs_they_have():
 @given(st.lists(tenths, min_size=1, max_size=3), st.randoms(use_true_random=False))
 def test_the_interval_holds_the_gain_and_turns_with_it(firsts, random):
     scenes = [(first, random.sample(first, len(first)), PAIRS[: len(first)]) for first in firsts]
-    difference = paired_difference(scenes)
-    assert difference == paired_difference(scenes)
-    assert difference.low - 1e-9 <= difference.gain <= difference.high + 1e-9
+    one = paired_difference(scenes)
+    assert one == paired_difference(scenes)
+    assert one.low - 1e-9 <= one.gain <= one.high + 1e-9
     other = paired_difference([(second, first, images) for first, second, images in scenes])
-    assert (other.gain, other.low, other.high) == pytest.approx(
-        (-difference.gain, -difference.high, -difference.low)
-    )
+    assert (other.gain, other.low, other.high) == pytest.approx((-one.gain, -one.high, -one.low))
 
 
 def test_the_interval_holds_the_truth_where_a_gain_is_of_images():
@@ -57,7 +54,7 @@ def test_different_pairs_are_not_compared():
         Comparison(tuple(Validation("a", (SceneScore("s", pairs),)) for pairs in ((p, q), (q, p))))
 
 
-def compare(demo: DemoSet, *more: object) -> int:
+def compare(demo, *more):
     return run_command("validate", "--train-dir", demo.train_dir, "--pairs-per-scene", 4, "--workers", 0, *more)
 
 
@@ -82,9 +79,7 @@ def test_a_recipe_against_its_units_on_whole_images(demo, small_recipe, tmp_path
     assert again.split("seconds a pair\n")[-1] == table
 
 
-def test_a_comparison_of_runs_that_failed_or_ran_out_of_time_has_their_exit_status(
-    demo, small_recipe, tmp_path, capsys
-):
+def test_a_comparison_of_runs_that_failed_or_ended_early_has_their_status(demo, small_recipe, tmp_path, capsys):
     train = shutil.copytree(demo.train_dir, tmp_path / "train")
     for image in train.rglob("*.jpg"):
         image.write_bytes(b"no picture")

@@ -1,8 +1,6 @@
 import json
 import subprocess
 import sys
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +8,6 @@ from shared import run_command, scores_of
 
 from mkpc_kaggle.data import competition
 from mkpc_kaggle.data.competition import Pair, TrainScene, TruePair, read_test_side, read_train_side
-from mkpc_kaggle.demo import DemoSet
 from mkpc_kaggle.engine.records import PairRecord
 from mkpc_kaggle.evaluation.validate import SceneScore, Step, score_record, score_submission, score_table
 from mkpc_kaggle.geometry.cameras import Camera, fundamental_of_cameras
@@ -19,8 +16,8 @@ from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 from mkpc_kaggle.reporting.run_log import read_log
 
 
-def true_matrices(demo: DemoSet) -> dict[str, np.ndarray]:
-    cameras: dict[str, tuple[Camera, Camera]] = {}
+def true_matrices(demo):
+    cameras = {}
     for scene in read_train_side(demo.train_dir, min_covisibility=0):
         for true in scene.pairs:
             first, second = true.pair.images[0].stem, true.pair.images[1].stem
@@ -76,7 +73,7 @@ def test_a_failed_pair_counts_as_failed_even_where_the_fallback_happens_to_be_ri
     assert right.error.angle < 1e-6
 
 
-def on_demo(demo: DemoSet, recipe: Path, *options: object) -> dict[str, Any]:
+def on_demo(demo, recipe, *options):
     return scores_of(recipe.with_suffix(".json"), "--train-dir", demo.train_dir, "--recipe", recipe, *options)
 
 

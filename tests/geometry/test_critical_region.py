@@ -1,4 +1,4 @@
-"""The critical region: the paper's Algorithm 1 and Crop Area Expansion, to the letter."""
+"""The critical region: the paper's Algorithm 1 and Crop Area Expansion, to the letter; DBSCAN of merged points."""
 
 from itertools import product
 
@@ -7,16 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_array_equal
+from scipy.spatial import KDTree
+from sklearn.cluster import DBSCAN
 
+from mkpc_kaggle.geometry import critical_region as regions
 from mkpc_kaggle.geometry.coordinates import Box, Size
-from mkpc_kaggle.geometry.critical_region import (
-    MkpcConfig,
-    RegionReason,
-    critical_region,
-    expand_box,
-    find_clusters,
-    keep_clusters,
-)
+from mkpc_kaggle.geometry.critical_region import MkpcConfig, RegionReason, critical_region, expand_box
 
 SQUARE = Size(1000, 1000)
 PAPER = MkpcConfig()
@@ -65,18 +61,18 @@ def test_the_share_is_compared_to_the_letter():
     for percent, hundreds in product(range(1, 100), (1, 7, 11)):
         share, largest, least = percent / 100, 100 * hundreds, percent * hundreds
         assert least / largest >= share  # Algorithm 1's own words
-        assert len(keep_clusters(np.array([largest, least]), share)) == 2, (least, largest)
-        assert len(keep_clusters(np.array([largest, least - 1]), share)) == 1, (least, largest)
+        assert len(regions.keep_clusters(np.array([largest, least]), share)) == 2, (least, largest)
+        assert len(regions.keep_clusters(np.array([largest, least - 1]), share)) == 1, (least, largest)
 
 
 def test_clusters_are_kept_down_to_the_share_largest_first_and_equal_ones_in_their_order():
     for sizes, kept in ([4, 100, 6, 5, 3, 50], [1, 5, 2, 3]), ([7, 9, 7, 9], [1, 3, 0, 2]), ([], []):
-        assert_array_equal(keep_clusters(np.array(sizes, int), 0.05), kept)
+        assert_array_equal(regions.keep_clusters(np.array(sizes, int), 0.05), kept)
 
 
 def test_clusters_tell_their_points_from_noise_and_those_that_are_kept():
     points = np.concatenate([block(600, 600, 640, 640, 5), lone(3), block(100, 100, 140, 140, 101)])
-    clusters = find_clusters(points, SQUARE, PAPER)
+    clusters = regions.find_clusters(points, SQUARE, PAPER)
     assert_array_equal(clusters.sizes, [5, 101])
     assert_array_equal(clusters.labels, [0] * 5 + [-1] * 3 + [1] * 101)
     assert_array_equal(clusters.kept, [1])  # 5 / 101 < 0.05
@@ -89,8 +85,8 @@ def test_x_is_normalised_by_the_width_and_y_by_the_height():
     stack = np.repeat(np.array([[500, 100]], np.float32), 6, axis=0)
     for shift, last_label in [((40, 0), 0), ((60, 0), 1), ((0, 9), 0), ((0, 20), 1)]:
         points = np.concatenate([stack, stack + np.float32(shift)])
-        assert find_clusters(points, size, PAPER).labels.max() == last_label
-        assert find_clusters(points[:, ::-1], Size(200, 1000), PAPER).labels.max() == last_label
+        assert regions.find_clusters(points, size, PAPER).labels.max() == last_label
+        assert regions.find_clusters(points[:, ::-1], Size(200, 1000), PAPER).labels.max() == last_label
 
 
 def test_the_box_grows_about_its_centre_and_holds_the_pixels_that_the_points_lie_on():
@@ -134,7 +130,50 @@ def test_the_box_is_on_the_image_and_holds_every_kept_point(seed, size, config):
         assert box == Box.whole(size)
         return
     on_image = points[Box.whole(size).contains(points)]
-    clusters = find_clusters(on_image, size, config)
+    clusters = regions.find_clusters(on_image, size, config)
     assert len(clusters.kept) == got.kept
     assert box.contains(on_image[clusters.in_kept]).all()
     assert min(box.size) >= config.min_side
+
+
+EPS, MIN_SAMPLES = 0.05, 5
+
+
+def clumps(rng, n):
+    """Six clumps of many widths, farther apart than eps, and a little noise."""
+    corner = np.stack([np.arange(6) % 3, np.arange(6) // 3], axis=1) * 0.3 + 0.15
+    clump = rng.integers(6, size=n)
+    points = corner[clump] + rng.normal(size=(n, 2)) * (10.0 ** np.linspace(-4, -1.7, 6))[clump, None]
+    points[:5] = [(0.95, 0.1 + 0.2 * i) for i in range(5)]
+    return points
+
+
+DISTRIBUTIONS = [lambda rng, n: rng.random((n, 2)), clumps, lambda rng, n: np.full((n, 2), 0.3)]
+
+
+@pytest.mark.parametrize("count", [200, regions.MERGE_ABOVE + 1])
+@pytest.mark.parametrize("sample", DISTRIBUTIONS)
+def test_merged_points_have_scikit_learns_clusters(sample, count):
+    points = sample(np.random.default_rng(1), count)
+    merged = regions.dbscan(points, eps=EPS, min_samples=MIN_SAMPLES)
+    expected = DBSCAN(eps=EPS, min_samples=MIN_SAMPLES, algorithm="kd_tree").fit_predict(points)
+    # Only points at the edge of a cluster may differ; clusters have other numbers.
+    both = np.unique(np.column_stack([merged, expected])[(merged >= 0) & (expected >= 0)], axis=0)
+    assert len(both) == expected.max() + 1 == merged.max() + 1
+    assert np.mean((merged >= 0) != (expected >= 0)) < 0.002
+
+
+def test_many_points_are_merged_so_that_memory_stays_linear(monkeypatch):
+    seen = []
+    fit = DBSCAN.fit
+
+    def spy(self, points, sample_weight=None):
+        seen.append((points, sample_weight))
+        return fit(self, points, sample_weight=sample_weight)
+
+    monkeypatch.setattr(DBSCAN, "fit", spy)
+    regions.dbscan(clumps(np.random.default_rng(2), 20_000), eps=EPS, min_samples=MIN_SAMPLES)
+    [(cells, counts)] = seen
+    assert counts.sum() == 20_000
+    # pi 10^2 cells, and those that the circle only touches
+    assert KDTree(cells).query_ball_point(cells, EPS, return_length=True).max() < 450

@@ -119,7 +119,7 @@ def test_degenerate_matches_end_in_a_value(name):
     assert np.isfinite(result.matrix).all()
     assert np.linalg.norm(result.matrix) == pytest.approx(1)
     assert result.inliers.shape == (len(matches),)
-    assert result.ok == (result.inlier_count > 0)
+    assert result.ok or result.inlier_count == 0
     assert ("too few distinct matches" in result.failure) == (name in ("five", "none"))
     assert name != "six" or (result.ok and result.magsac is None)
 

@@ -198,9 +198,7 @@ def test_whatever_the_points_are_the_answer_is_an_estimate(data, n, model, metho
 
 
 @pytest.mark.parametrize("refused", [1, 3])
-def test_what_opencv_refuses_costs_that_permutation_alone_and_is_the_reason_where_it_refuses_all(
-    refused, monkeypatch
-):
+def test_a_refusal_by_opencv_costs_its_permutation_and_is_the_reason_where_all_are_refused(refused, monkeypatch):
     calls = []
 
     def find(*points, **settings):

@@ -8,15 +8,14 @@ import sys
 import tempfile
 import time
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
 from processes import started_with
-
-from mkpc_kaggle.data.competition import read_test_side, submission_problems
+from shared import problems_of
 
 ROOT = Path(__file__).resolve().parents[2]
 # Of data, for each process; not of address space, of which CUDA builds of PyTorch reserve more.
@@ -33,7 +32,7 @@ Make = Callable[[Path], object]
 Act = Callable[["subprocess.Popen[bytes]"], None]
 
 
-def nothing(_: object) -> None:
+def nothing(_):
     """Leave the room as it is."""
 
 
@@ -60,11 +59,11 @@ class Case:
     stderr: Callable[[], int] | None = None  # opens the descriptor that the command writes to; else the log
 
     @property
-    def id(self) -> str:
+    def id(self):
         return f"{self.group}: {self.name}"
 
 
-def attack(case: Case, room: Path) -> None:
+def attack(case, room):
     """Run the case in the room. The test fails with all faults."""
     case.make(room)
     before = _snapshot(room)
@@ -79,7 +78,7 @@ def attack(case: Case, room: Path) -> None:
         faults += [f"left running: {line}" for line in _orphans(mark)]
         was_interrupted = status not in (0, 1) and output.strip() in ("", "error: interrupted")  # at its start
         if case.submission and not was_interrupted and "submit" in command and status in ENDED_BY_ITSELF:
-            faults += _submission_faults(room)
+            faults += [f"submission: {problem}" for problem in problems_of(room / "out" / "s.csv", room / "D")]
         if status in (0, 1) and "reconstruct" in command and TOO_LATE not in output:
             faults += _result_faults(room / "out" / "o", status)
     after = _snapshot(room)
@@ -88,25 +87,16 @@ def attack(case: Case, room: Path) -> None:
         pytest.fail("\n".join([case.id, case.command, *faults, f"output:\n{output[-3000:]}"]), pytrace=False)
 
 
-def prepared(command: str, room: Path) -> int:
+def prepared(command, room):
     """Return the exit status of an undisturbed command."""
     return _start(command, room, {}).wait()
 
 
-def _start(
-    command: str, room: Path, env: dict[str, str], limits: str = "-c 0", stderr: Callable[[], int] | None = None
-) -> "subprocess.Popen[bytes]":
+def _start(command, room, env, limits="-c 0", stderr=None):
     limited = ["sh", "-c", f'ulimit -d {MEMORY_KIB}; ulimit {limits}; exec "$@"', "sh"]
-    own = {
-        "PATH": os.defpath,
-        "PYTHONPATH": str(ROOT),
-        "OMP_NUM_THREADS": "1",
-        "HOME": str(room / "home"),
-        "TMPDIR": str(room / "tmp"),
-        "PYTHONDONTWRITEBYTECODE": "1",
-        "MPLCONFIGDIR": str(Path(tempfile.gettempdir()) / "hostile-matplotlib"),  # its list of fonts takes seconds
-        "no_proxy": "*",
-    }
+    own = {"PATH": os.defpath, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": "1"}
+    own |= {"HOME": str(room / "home"), "TMPDIR": str(room / "tmp"), "no_proxy": "*"}
+    own["MPLCONFIGDIR"] = str(Path(tempfile.gettempdir()) / "hostile-matplotlib")  # its list of fonts is slow
     with (room / "out" / "log").open("ab") as log:
         return subprocess.Popen(
             [*limited, sys.executable, "-m", "mkpc_kaggle", *shlex.split(command)],
@@ -119,9 +109,9 @@ def _start(
         )
 
 
-def _wait(process: "subprocess.Popen[bytes]", room: Path) -> tuple[int | None, str]:
+def _wait(process, room):
     """Return the status, ``None`` if the process had to be killed, and the output."""
-    status: int | None = None
+    status = None
     try:
         status = process.wait(HANGS_S)
     except subprocess.TimeoutExpired:
@@ -130,7 +120,7 @@ def _wait(process: "subprocess.Popen[bytes]", room: Path) -> tuple[int | None, s
     return status, (room / "out" / "log").read_text(errors="replace")
 
 
-def _faults(case: Case, status: int | None, output: str, room: Path) -> Iterator[str]:
+def _faults(case, status, output, room):
     yield from (f"the output has {crash!r}" for crash in CRASHES if crash in output)
     if status is None:
         yield f"it hangs: not over after {HANGS_S} s"
@@ -144,12 +134,7 @@ def _faults(case: Case, status: int | None, output: str, room: Path) -> Iterator
         yield f"left in the folder for temporary files: {left}"
 
 
-def _submission_faults(room: Path) -> list[str]:
-    ids = [pair.id for pair in read_test_side(room / "D")]
-    return [f"submission: {problem}" for problem in submission_problems(room / "out" / "s.csv", ids)]
-
-
-def _result_faults(out: Path, status: int) -> Iterator[str]:
+def _result_faults(out, status):
     """Yield the faults of the results of a folder of images."""
     table = out / "cameras.csv"
     lines = table.read_text().splitlines() if table.is_file() else [""]
@@ -162,7 +147,7 @@ def _result_faults(out: Path, status: int) -> Iterator[str]:
     yield from (f"left: {path}" for path in out.rglob(".*") if path.name != ".png")
 
 
-def _orphans(mark: str) -> list[str]:
+def _orphans(mark):
     """Kill the processes of the case that still run, and return their command lines."""
     for _ in range(600):
         if not (left := started_with(mark)):
@@ -174,9 +159,9 @@ def _orphans(mark: str) -> list[str]:
     return [f"{process} {command[:200]}" for process, command in left.items()]
 
 
-def _snapshot(room: Path) -> dict[str, tuple[object, ...]]:
+def _snapshot(room):
     """Return the state of each file and folder of the room, except what a command may write."""
-    states: dict[str, tuple[object, ...]] = {}
+    states = {}
     for folder, folders, names in os.walk(os.fsencode(room)):
         if folder == os.fsencode(room):
             folders[:] = [name for name in folders if name not in (b"out", b"tmp")]

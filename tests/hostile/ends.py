@@ -2,11 +2,9 @@
 
 import os
 import signal
-import subprocess
 import time
-from collections.abc import Iterator
 
-from attack import REFUSED, Act, Case
+from attack import REFUSED, Case
 from room import CALIBRATION, SUBMIT, makes, options, written
 
 WITHOUT_LIMIT = SUBMIT.replace(" --time-limit 5m", "").replace(" --workers 0", "")
@@ -45,10 +43,10 @@ AGAIN = SUBMIT.replace("quick.toml", "classical")
 WORKING = f"{WITHOUT_LIMIT.replace('quick.toml', 'classical')} --workers"
 
 
-def sends(name: str, *after: float, group: bool = False) -> Act:
+def sends(name, *after, group=False):
     """Send the signal after so many seconds, and again after each further time."""
 
-    def act(process: "subprocess.Popen[bytes]") -> None:
+    def act(process):
         for seconds in after:
             time.sleep(seconds)
             if process.poll() is None:
@@ -58,7 +56,7 @@ def sends(name: str, *after: float, group: bool = False) -> Act:
     return act
 
 
-def signals() -> Iterator[Case]:
+def signals():
     for name in ENDS:
         acts = {f"after {after} s": sends(name, after) for after in SOON}
         acts |= {f"to all after {after} s": sends(name, after, group=True) for after in SOON[::2]}

@@ -3,19 +3,17 @@
 import hashlib
 import os
 import threading
-from collections.abc import Callable
 from contextlib import suppress
-from pathlib import Path
 from socketserver import BaseRequestHandler, ThreadingTCPServer
 
-from attack import Case, Make, nothing
+from attack import Case, nothing
 from room import written
 
 DATA = bytes(range(256)) * 400
 DIGEST = "sha256:" + hashlib.sha256(DATA).hexdigest()
 OK = b"HTTP/1.1 200 OK\r\n"
 REDIRECTION = b"HTTP/1.1 302 Found\r\nLocation: %b\r\n\r\n"
-ANSWERS: dict[str, bytes] = {
+ANSWERS = {
     "noise": os.urandom(10_000),
     "a head of 10 MB": OK + b"A: " + b"x" * 10_000_000,
     "too many bytes": OK + b"\r\n" + DATA * 10,
@@ -23,18 +21,18 @@ ANSWERS: dict[str, bytes] = {
     "a redirection to a file": REDIRECTION % b"file:///etc/hostname",
     "a redirection to itself": REDIRECTION % b"/a.bin",
 }
-PARTS: dict[str, Callable[[Path], object]] = {
+PARTS = {
     "a link": lambda path: path.symlink_to("../../quick.toml"),
     "a pipe": os.mkfifo,
     "too many bytes": lambda path: path.write_bytes(DATA * 2),
 }
 
 
-def serve(answer: bytes) -> int:
+def serve(answer):
     """Give each connection the same answer, whatever it asks. Return the port."""
 
     class Handler(BaseRequestHandler):
-        def handle(self) -> None:
+        def handle(self):
             self.request.recv(65536)
             with suppress(OSError):
                 self.request.sendall(answer)
@@ -44,8 +42,8 @@ def serve(answer: bytes) -> int:
     return server.server_address[1]
 
 
-def served(answer: bytes, size: str = "102400", part: Callable[[Path], object] = nothing) -> Make:
-    def make(room: Path) -> None:
+def served(answer, size="102400", part=nothing):
+    def make(room):
         source = f"http://127.0.0.1:{serve(answer)}/a.bin"
         written("listed/weights_manifest.txt", f"a.bin  {size}  {DIGEST}  MIT  slot  {source}\n")(room)
         (room / "out" / "w").mkdir()

@@ -2,7 +2,6 @@
 
 import os
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +9,7 @@ from attack import EITHER, REFUSED, Case
 from room import HEADER, RECIPE, RECONSTRUCT, REPORTED, SUBMIT, TABLE, UNIT, makes, replaced, resumed, written
 from weight_bombs import AUTO, CONVERT, NAME, SEARCH
 
-INSTEAD: dict[str, Callable[[Path], object]] = {  # of a file
+INSTEAD = {  # of a file
     "a directory": Path.mkdir,
     "a pipe": os.mkfifo,
     "a link to /dev/zero": lambda path: path.symlink_to("/dev/zero"),
@@ -19,7 +18,7 @@ INSTEAD: dict[str, Callable[[Path], object]] = {  # of a file
     "a sparse file of 1 TB": lambda path: [path.touch(), os.truncate(path, 1 << 40)],
 }
 X = "D/test_images/b1/x.png"
-READ: dict[str, tuple[str, tuple[int, ...]]] = {  # by its path: what reads it, and how that may end
+READ = {  # by its path: what reads it, and how that may end
     "D/test.csv": (SUBMIT, REFUSED),
     X: (REPORTED, (0,)),
     "quick.toml": (SUBMIT, REFUSED),
@@ -62,23 +61,23 @@ GOOD_RECIPES = {
     "lines of another system": RECIPE.replace("\n", "\r\n"),
     "a million comments": "# nothing\n" * 1_000_000 + RECIPE,
 }
-IMAGES: dict[str, Callable[[Path], object]] = {
+IMAGES = {
     "a link to another image": lambda path: path.symlink_to(path.with_name("z.png")),
     "a name in another case": lambda path: shutil.copy(path.with_name("z.png"), path.with_name("X.PNG")),
 }
 
 
-def tables_of(name: str, texts: dict[str, bytes | str]) -> dict[str, Callable[[Path], None]]:
+def tables_of(name, texts):
     return {what: written(name, text) for what, text in texts.items()}
 
 
-def unpacked(path: Path) -> None:
+def unpacked(path):
     (path / "data").mkdir(parents=True)
     (path / "data.pkl").write_bytes(b"\x80\x02}.")
     os.mkfifo(path / "data" / "0")
 
 
-def halve(room: Path) -> None:
+def halve(room):
     path = room / "out/s.work/journal.sqlite"
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 

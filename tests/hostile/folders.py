@@ -4,10 +4,8 @@ tests/reconstruction has more directories of results and lists of pairs.
 """
 
 import os
-from collections.abc import Callable
-from pathlib import Path
 
-from attack import EITHER, Case, Make, nothing
+from attack import EITHER, Case, nothing
 from ends import ENDS, STATUSES, sends
 from outputs import mine
 from room import IMAGES_TO, RECIPE, RECONSTRUCT, encoded, makes, options, picture, resumed, write_images
@@ -20,7 +18,7 @@ OUTS = {
     "in no name": "''",
     "in 300 characters": f"out/{'o' * 300}",
 }
-IN_THE_WAY: dict[str, Callable[[Path], object]] = {  # of results in the folder P of the user
+IN_THE_WAY = {  # of results in the folder P of the user
     "database.db of the user's": lambda folder: mine(folder / "database.db"),
     "a journal of the user's": lambda folder: [folder.mkdir(), mine(folder / "work" / "journal.sqlite")],
     "a mark that is none": lambda folder: [folder.mkdir(), mine(folder / "work" / "results.json")],
@@ -40,19 +38,19 @@ GOOD_NAMES = {
     "250 characters": b"n" * 250,
 }
 BAD_NAMES = {"Latin 1": b"caf\xe9", "a line feed": b"a\nb", "a line separator": "a\u2028b".encode()}
-ALIKE: dict[str, Callable[[Path], object]] = {
+ALIKE = {
     "two of one stem": lambda folder: (folder / "0.jpg").write_bytes(encoded(".jpg")),
     "one in capitals": lambda folder: (folder / "0.PNG").write_bytes(encoded(".png")),
     "a folder called as a result": lambda folder: write_images(folder / "MODELS"),
 }
-ODD: dict[str, Callable[[Path], object]] = {
+ODD = {
     "an ending alone": lambda folder: (folder / ".png").write_bytes(encoded(".png")),
     "links that go round": lambda folder: (folder / "round").symlink_to("."),
     "folders 50 deep": lambda folder: write_images(folder.joinpath(*"abcde" * 10)),
     "ids that meet": lambda folder: [write_images(folder / name) for name in ("a_b", "a/b", "I", "a/b/c")],
 }
 JOURNAL = ("out", "o", "work", "journal.sqlite")
-CHANGES: dict[str, Make] = {  # between two runs
+CHANGES = {  # between two runs
     "an ending that was changed": lambda room: (room / "I/0.png").rename(room / "I/0.jpeg"),
     "an image that was changed": lambda room: (room / "I/0.png").write_bytes(encoded(".png", picture(50))),
     "an image that was removed": lambda room: (room / "I/0.png").unlink(),
@@ -66,15 +64,15 @@ CHANGES: dict[str, Make] = {  # between two runs
 }
 
 
-def below(name: str, table: dict[str, Callable[[Path], object]]) -> dict[str, Make]:
+def below(name, table):
     """Return changes of the room from changes of a path in it."""
     return {what: lambda room, m=make: m(room / name) for what, make in table.items()}
 
 
-def names(table: dict[str, bytes]) -> dict[str, Make]:
+def names(table):
     """Return changes that add an image, or a folder of images, of each name, which may be no text."""
 
-    def add(room: Path, name: bytes, is_folder: bool) -> None:
+    def add(room, name, is_folder):
         write_images(room / "J")
         (room / "J.png").write_bytes(encoded(".png", picture(40)))
         made = "J" if is_folder else "J.png"
@@ -96,8 +94,5 @@ CASES = [
     *makes("folders", TO_TABLES, below("I", ALIKE)),
     *makes("folders", TO_TABLES, below("I", ODD), (0,)),
     *makes("folders", RECONSTRUCT, {f"again: {name}": resumed(make) for name, make in CHANGES.items()}, EITHER),
-    *(
-        Case("folders", f"{name} after 4 s", RECONSTRUCT, nothing, (1, *STATUSES[name]), act=sends(name, 4.0))
-        for name in ENDS
-    ),
+    *(Case("folders", f"{n} after 4 s", RECONSTRUCT, nothing, (1, *STATUSES[n]), act=sends(n, 4.0)) for n in ENDS),
 ]

@@ -2,14 +2,12 @@
 
 import struct
 import zlib
-from collections.abc import Callable
 
 import cv2
 import numpy as np
-from attack import Make
 from room import RECONSTRUCT, REPORTED, SUBMIT, encoded, makes, picture, replaced
 
-DAMAGES: dict[str, Callable[[bytes], bytes]] = {
+DAMAGES = {
     "its first half": lambda data: data[: len(data) // 2],
     "its second half": lambda data: data[len(data) // 2 :],
     "bytes after its end": lambda data: data + b"\0" * 10_000,
@@ -20,22 +18,22 @@ DAMAGES: dict[str, Callable[[bytes], bytes]] = {
 }
 
 
-def chunk(kind: bytes, data: bytes) -> bytes:
+def chunk(kind, data):
     return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
 
-def png(width: int, height: int, *chunks: bytes, depth: int = 8) -> bytes:
+def png(width, height, *chunks, depth=8):
     """Return a PNG that claims that size; without chunks it has a byte of pixels."""
     head = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, depth, 0, 0, 0, 0))
     body = b"".join(chunks) or chunk(b"IDAT", zlib.compress(b"\0"))
     return b"\x89PNG\r\n\x1a\n" + head + body + chunk(b"IEND", b"")
 
 
-def rows(width: int, height: int, depth: int = 8) -> bytes:
+def rows(width, height, depth=8):
     return chunk(b"IDAT", zlib.compress(bytes((1 + (width * depth + 7) // 8) * height)))
 
 
-ODD: dict[str, Callable[[], bytes]] = {
+ODD = {
     "2^31 - 1 pixels a side": lambda: png(2**31 - 1, 2**31 - 1),
     "20,000 black pixels a side": lambda: png(20_000, 20_000, rows(20_000, 20_000, 1), depth=1),
     "1 x 60,000 pixels": lambda: encoded(".jpg", cv2.resize(picture(0), (1, 60_000))),
@@ -45,7 +43,7 @@ ODD: dict[str, Callable[[], bytes]] = {
 }
 
 
-def at(name: str, make: Callable[[], bytes]) -> Make:
+def at(name, make):
     return replaced(name, lambda path: path.write_bytes(make()))
 
 

@@ -1,10 +1,8 @@
 """Paths where no result can be written, or that hold precious files; tests/data/test_outputs.py has more."""
 
 import os
-from collections.abc import Callable
-from pathlib import Path
 
-from attack import Case, Make, nothing
+from attack import Case, nothing
 from room import SUBMIT, makes, options, resumed
 
 REFUSALS = {
@@ -18,13 +16,13 @@ REFUSALS = {
     "the full device": "/dev/full",
     "the journal among the images": "out/s.csv --work-dir D/test_images",
 }
-IN_THE_WAY: dict[str, Make] = {
+IN_THE_WAY = {
     "a link to the table": lambda room: (room / "out/s.csv").symlink_to("../D/test.csv"),
     "a hard link to the table": lambda room: os.link(room / "D/test.csv", room / "out/s.csv"),
     "a pipe for the journal's directory": lambda room: os.mkfifo(room / "out/s.work"),
     "a directory for the report": lambda room: (room / "out/s.html").mkdir(),
 }
-REPLACED: dict[str, Make] = {
+REPLACED = {
     "a link to itself": lambda room: (room / "out/s.csv").symlink_to("s.csv"),
     "a pipe": lambda room: os.mkfifo(room / "out/s.csv"),
     "a pipe for the partial file": lambda room: os.mkfifo(room / "out/.s.csv.part"),
@@ -50,12 +48,12 @@ DEMOS = {
 }
 
 
-def mine(path: Path) -> None:
+def mine(path):
     path.parent.mkdir(exist_ok=True)
     path.write_text("mine")
 
 
-DEMOS_OVER: dict[str, Callable[[Path], object]] = {  # in the folder U of the user
+DEMOS_OVER = {  # in the folder U of the user
     "a train side of the user's": lambda folder: mine(folder / "train" / "scaling_factors.csv"),
     "a truth of the user's": lambda folder: mine(folder / "test_truth.csv"),
     "a link to a train side": lambda folder: (folder / "train").symlink_to("../D"),
@@ -63,7 +61,7 @@ DEMOS_OVER: dict[str, Callable[[Path], object]] = {  # in the folder U of the us
     "a pipe for the mark": lambda folder: os.mkfifo(folder / "demo.txt"),
     "another mark": lambda folder: [mine(folder / "demo.txt"), mine(folder / "test_truth.csv")],
 }
-EXPORTS_OVER: dict[str, Callable[[Path], object]] = {
+EXPORTS_OVER = {
     "a table of the user's": lambda folder: mine(folder / "pairs.csv"),
     "a link to an image": lambda folder: (folder / "units.csv").symlink_to("../D/test_images/b1/x.png"),
     "a link to the journal": lambda folder: (folder / "regions.csv").symlink_to("../out/s.work/journal.sqlite"),
@@ -74,7 +72,7 @@ EXPORTS_OVER: dict[str, Callable[[Path], object]] = {
 }
 
 
-def in_folder(table: dict[str, Callable[[Path], object]]) -> dict[str, Make]:
+def in_folder(table):
     """Return how to put the results of a finished run, and a folder U of the user, into the room."""
     makings = {name: lambda room, m=make: [(room / "U").mkdir(), m(room / "U")] for name, make in table.items()}
     return {name: resumed(make) for name, make in makings.items()}

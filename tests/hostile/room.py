@@ -2,15 +2,12 @@
 
 import shutil
 import tempfile
-from collections.abc import Callable, Mapping
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
-from attack import REFUSED, Case, Make, prepared
-from numpy.typing import NDArray
+from attack import REFUSED, Case, prepared
 
 HEADER = "sample_id,batch_id,image_1_id,image_2_id\n"
 TABLE = HEADER + "b1;x-y,b1,x,y\nb1;y-z,b1,y,z\n"
@@ -38,7 +35,7 @@ DEPTHS = (1.0, 2.0, 3.0, 1.5, 2.5)  # inverse depths of five bands of rows: the 
 
 
 @cache
-def picture(shift: int) -> NDArray[np.uint8]:
+def picture(shift):
     """Return the view of a camera that has moved to the right by that many pixels of the farthest band."""
     noise = np.random.default_rng(0).integers(0, 256, (SIDE, 3 * SIDE, 3)).astype(np.float32)
     rough = sum(cv2.GaussianBlur(noise, (0, 0), width) * width for width in (1.5, 4.0))
@@ -48,20 +45,20 @@ def picture(shift: int) -> NDArray[np.uint8]:
     return np.concatenate([band[:, start : start + SIDE] for band, start in bands])
 
 
-def encoded(suffix: str, image: NDArray[np.uint8] | None = None, *options: int) -> bytes:
+def encoded(suffix, image=None, *options):
     """Return the bytes of an image file; of the first view unless another is given."""
     done, data = cv2.imencode(suffix, picture(0) if image is None else image, list(options))
     assert done
     return data.tobytes()
 
 
-def write_images(folder: Path, names: str = "0123", suffix: str = ".png") -> None:
+def write_images(folder, names="0123", suffix=".png"):
     folder.mkdir(parents=True)
     for number, name in enumerate(names):
         (folder / f"{name}{suffix}").write_bytes(encoded(suffix, picture(4 * number)))
 
 
-def write_template(room: Path) -> Path:
+def write_template(room):
     write_images(room / "D" / "test_images" / "b1", "xyz")
     write_images(room / "T" / "s" / "images", "xyz", ".jpg")
     write_images(room / "I")
@@ -73,7 +70,7 @@ def write_template(room: Path) -> Path:
 
 
 @cache
-def finished() -> Path:
+def finished():
     """Return a room in which ``SUBMIT`` and ``RECONSTRUCT`` have ended, made once per process."""
     room = write_template(Path(tempfile.mkdtemp(prefix="hostile-")) / "room")
     for command in (SUBMIT, RECONSTRUCT):
@@ -82,20 +79,20 @@ def finished() -> Path:
     return room
 
 
-def resumed(change: Callable[[Path], object]) -> Make:
+def resumed(change):
     """Put the results of both finished commands into the room, then change it."""
 
-    def make(room: Path) -> None:
+    def make(room):
         shutil.copytree(finished() / "out", room / "out", dirs_exist_ok=True)
         change(room)
 
     return make
 
 
-def replaced(name: str, make: Callable[[Path], object]) -> Make:
+def replaced(name, make):
     """Replace a file of the room by what ``make`` puts there."""
 
-    def replace(room: Path) -> None:
+    def replace(room):
         (room / name).parent.mkdir(parents=True, exist_ok=True)
         (room / name).unlink(missing_ok=True)
         make(room / name)
@@ -103,19 +100,15 @@ def replaced(name: str, make: Callable[[Path], object]) -> Make:
     return replace
 
 
-def written(name: str, data: bytes | str) -> Make:
+def written(name, data):
     return replaced(name, lambda path: path.write_bytes(data.encode() if isinstance(data, str) else data))
 
 
-def makes(
-    group: str, command: str, table: Mapping[str, Make], statuses: tuple[int, ...] = REFUSED, **more: Any
-) -> list[Case]:
+def makes(group, command, table, statuses=REFUSED, **more):
     """Return a case for each change of the room, by its name; ``more`` are further fields of the cases."""
     return [Case(group, name, command, make, statuses, **more) for name, make in table.items()]
 
 
-def options(
-    group: str, command: str, table: Mapping[str, str], statuses: tuple[int, ...] = REFUSED, **more: Any
-) -> list[Case]:
+def options(group, command, table, statuses=REFUSED, **more):
     """Return a case for each end of the command, by its name."""
     return [Case(group, name, f"{command} {end}", statuses=statuses, **more) for name, end in table.items()]

@@ -1,7 +1,6 @@
 """The standing attack: the real command on hostile inputs, each case in its own process (see ``attack``)."""
 
 import shutil
-from pathlib import Path
 
 import ends
 import faults
@@ -13,21 +12,20 @@ import outputs
 import pytest
 import unread
 import weight_bombs
-from attack import Case, attack
+from attack import attack
 from room import write_template
 
 SOURCES = (files, images, outputs, ends, faults, weight_bombs, fetches, folders, unread)
-ALL: list[Case] = [case for source in SOURCES for case in source.CASES]
+ALL = [case for source in SOURCES for case in source.CASES]
 QUICK = {case.group: case for case in reversed(ALL)}.values()  # the first of each group runs with the other tests
+MARKED = [pytest.param(case, id=case.id, marks=() if case in QUICK else pytest.mark.slow) for case in ALL]
 
 
 @pytest.fixture(scope="session")
-def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def template(tmp_path_factory):
     return write_template(tmp_path_factory.mktemp("template") / "room")
 
 
-@pytest.mark.parametrize(
-    "case", [pytest.param(case, id=case.id, marks=() if case in QUICK else pytest.mark.slow) for case in ALL]
-)
+@pytest.mark.parametrize("case", MARKED)
 def test_a_hostile_input_is_survived(case, template, tmp_path):
     attack(case, shutil.copytree(template, tmp_path / "room"))

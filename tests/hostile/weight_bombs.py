@@ -2,7 +2,6 @@
 
 import io
 import zipfile
-from collections.abc import Iterator
 
 from attack import REFUSED, Case
 from room import SUBMIT, written
@@ -30,7 +29,7 @@ SAFETENSORS = {
 }
 
 
-def archive(data: bytes) -> bytes:
+def archive(data):
     """Return the smallest archive that torch takes for a checkpoint, with this pickle."""
     whole = io.BytesIO()
     with zipfile.ZipFile(whole, "w") as file:
@@ -39,7 +38,7 @@ def archive(data: bytes) -> bytes:
     return whole.getvalue()
 
 
-def cases() -> Iterator[Case]:
+def cases():
     for name, data in PICKLES.items():
         yield Case("weights", name, CONVERT, written("a.pt", archive(data)), REFUSED)
         yield Case("weights", f"{name}, old format", CONVERT, written("a.pt", data), REFUSED)

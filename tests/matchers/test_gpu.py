@@ -2,7 +2,6 @@
 
 import time
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import pytest
@@ -20,14 +19,14 @@ from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.pipeline.devices import fastest_precision, gpu_capabilities, require_device, resolve_placement
 from mkpc_kaggle.pipeline.failures import DeviceError
 from mkpc_kaggle.pipeline.pair import PairMatch
-from mkpc_kaggle.pipeline.stages import ENCODING_CACHE_BYTES, Pipeline
+from mkpc_kaggle.pipeline.stages import Pipeline
 from mkpc_kaggle.recipe import Recipe, Unit
 
 UNIT = Unit(1, "own", 64)
 RECIPE = Recipe((UNIT,))
 
 
-def gpus_here(monkeypatch, *capabilities: tuple[int, int]):
+def gpus_here(monkeypatch, *capabilities):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: len(capabilities))
     monkeypatch.setattr(devices, "gpu_capabilities", lambda: list(capabilities))
@@ -73,7 +72,7 @@ def test_a_probe_of_the_gpus_that_hangs_is_ended(monkeypatch):
 
 
 def test_a_device_that_multiplies_and_cannot_convolve_is_refused(monkeypatch):
-    def convolve(*_: object):
+    def convolve(*_):
         raise RuntimeError("cuDNN error: CUDNN_STATUS_EXECUTION_FAILED_CUDART")
 
     with DeviceDouble(1) as double:
@@ -90,15 +89,7 @@ class Maps:
     others: tuple[torch.Tensor, ...] = ()
 
 
-def test_the_cache_is_sized_by_the_memory_that_is_free_and_the_workers_on_it():
-    made = assemble("classical", device="cpu")
-    assert made.pipeline()._encodings.limit == ENCODING_CACHE_BYTES
-    with DeviceDouble(2, memory=12 << 30):
-        assert made.on("cuda:1").pipeline()._encodings.limit == 3 << 30
-        assert made.on("cuda:1", 3).pipeline()._encodings.limit == 1 << 30
-
-
-def settings() -> tuple[str, str]:
+def settings():
     return torch.backends.cudnn.conv.fp32_precision, torch.backends.cuda.matmul.fp32_precision
 
 
@@ -107,22 +98,22 @@ class Own:
 
     spec = MatcherSpec("own", "own")
 
-    def __init__(self, value: float):
+    def __init__(self, value):
         self.value = value
-        self.seen: list[tuple[str, str]] = []
+        self.seen = []
         self.encoded = 0
 
-    def encode(self, pictures: Any) -> list[Maps]:
+    def encode(self, pictures):
         self.seen.append(settings())
         self.encoded += len(pictures)
         return [Maps(torch.full((4,), self.value)) for _ in pictures]
 
-    def match(self, encodings0: Any, encodings1: Any) -> list[Matches]:
+    def match(self, encodings0, encodings1):
         self.seen.append(settings())
         return [Matches.empty() for _ in encodings0]
 
 
-def works() -> list[PairMatch]:
+def works():
     rows = np.random.default_rng(0).integers(0, 255, (3, 48, 64, 3), np.uint8)
     images = [Image.of_array(pixels) for pixels in rows]
     return [PairMatch(images=(images[0], other)) for other in images[1:]]

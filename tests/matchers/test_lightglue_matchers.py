@@ -2,38 +2,35 @@
 
 import re
 from functools import partial
-from typing import Any
 
 import pytest
 import torch
 from checkpoints import PublicFile, store_of
 from kornia.feature import DISK
 from pictures import picture
-from torch import Tensor, nn
 
 from mkpc_kaggle.matchers.contract import Colour, Placement, Precision
 from mkpc_kaggle.matchers.lightglue import LightGlueOptions, light_glue
 from mkpc_kaggle.matchers.networks.aliked import Aliked
 from mkpc_kaggle.matchers.registry import load_matcher
-from mkpc_kaggle.weights import WeightStore
 
 
-def glue(**shape: Any) -> nn.Module:
+def glue(**shape):
     return light_glue(2, 0.1, input_dim=128, **shape)
 
 
-def old_names(state: dict[str, Tensor]) -> dict[str, Any]:
+def old_names(state):
     """As the public files name a layer's attentions; the thresholds are computed."""
     pattern, kept = r"^transformers\.(\d+)\.(self|cross)_attn", state.keys() - {"confidence_thresholds"}
     return {re.sub(pattern, r"\2_attn.\1", name): state[name] for name in kept}
 
 
-def published_aliked(state: dict[str, Tensor]) -> dict[str, Any]:
+def published_aliked(state):
     pattern = r"(block[34]\.conv[12])\.weight"
     return {re.sub(pattern, r"\1.regular_conv.weight", name): tensor for name, tensor in state.items()}
 
 
-def beside_an_optimizer(state: dict[str, Tensor]) -> dict[str, Any]:
+def beside_an_optimizer(state):
     return {"extractor": state, "optim": {"lr": 0.1}}
 
 
@@ -48,16 +45,16 @@ FILES = (
 
 
 @pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory) -> WeightStore:
+def store(tmp_path_factory):
     return store_of(tmp_path_factory.mktemp("weights"), FILES)
 
 
-def load(name: str, store: WeightStore, precision: Precision = Precision.FLOAT32, **options: Any) -> Any:
+def load(name, store, precision=Precision.FLOAT32, **options):
     return load_matcher(name, store, LightGlueOptions(**options), Placement(precision=precision))
 
 
 @pytest.mark.parametrize("name", ["aliked_lightglue", "disk_lightglue", "sift_lightglue"])
-def test_a_picture_matches_itself_point_by_point(name: str, store: WeightStore) -> None:
+def test_a_picture_matches_itself_point_by_point(name, store):
     matcher = load(name, store, features=300, threshold=0.0)
     channels = 1 if matcher.spec.colour is Colour.GRAY else 3
     encodings = matcher.encode([picture(97, 131, channels=channels, multiple=32)])
@@ -68,13 +65,11 @@ def test_a_picture_matches_itself_point_by_point(name: str, store: WeightStore) 
 
 
 @pytest.mark.parametrize("precision", Precision)
-def test_layers_compute_in_the_precision_that_is_asked_for(precision: Precision, store: WeightStore) -> None:
+def test_layers_compute_in_the_precision_that_is_asked_for(precision, store):
     """LightGlue turns off any autocast around it: what counts is set around its layers."""
     matcher, seen = load("aliked_lightglue", store, precision), []
     for part in ("posenc.Wr", "transformers.1.cross_attn.to_out", "transformers.1", "log_assignment.1"):
-        matcher._glue.get_submodule(part).register_forward_hook(
-            lambda part, given, found: seen.append(found[0].dtype)
-        )
+        matcher._glue.get_submodule(part).register_forward_hook(lambda *call: seen.append(call[-1][0].dtype))
     encodings = matcher.encode([picture(64, 96, multiple=32)])
     matcher.match(encodings, encodings)
     exact = torch.float32

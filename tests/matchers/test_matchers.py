@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from numpy.testing import assert_allclose
-from pictures import as_picture
+from pictures import as_picture, match_one
 from shared import WEIGHTS, needs_weights
 from sklearn.datasets import load_sample_image
 from torch import nn
@@ -54,22 +54,12 @@ def matcher_of(name):
     return load_matcher(name, WeightStore([WEIGHTS] if WEIGHTS.is_dir() else []), options, Placement())
 
 
-def picture(pixels, matcher, padding=(0, 0)):
-    """(H, W, 3) RGB as that matcher wants it, one to one, with at least that padding in pixels."""
-    if matcher.spec.colour is Colour.GRAY:
-        pixels = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
-    return as_picture(pixels, matcher.spec.multiple, padding)
-
-
-@cache
-def photograph_encoding(name):
-    matcher = matcher_of(name)
-    return matcher.encode([picture(photograph(), matcher)])[0]
-
-
 def match_photograph(name, pixels):
     matcher = matcher_of(name)
-    return matcher.match([photograph_encoding(name)], matcher.encode([picture(pixels, matcher)]))[0]
+    both = photograph(), pixels
+    if matcher.spec.colour is Colour.GRAY:
+        both = [cv2.cvtColor(each, cv2.COLOR_RGB2GRAY) for each in both]
+    return match_one(matcher, *(as_picture(each, matcher.spec.multiple) for each in both))
 
 
 def offsets(matches, H):

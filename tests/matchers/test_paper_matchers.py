@@ -3,16 +3,14 @@
 The weights are stand-ins: the matches mean nothing, but all of the real code finds them.
 """
 
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
 from checkpoints import FILES, use_manifest, write_checkpoints
-from shared import run_command
+from shared import problems_of, run_command
 from standin import scene, use_narrow
 
-from mkpc_kaggle.data.competition import read_submission, read_test_side, submission_problems
+from mkpc_kaggle.data.competition import read_submission
 from mkpc_kaggle.engine.journal_reader import JournalReader
 
 LONG, AREA = ("long_side = 209", "long_side = 150"), ('area = "96x128"', 'area = "70x90"')
@@ -26,7 +24,7 @@ TRIALS |= {
 
 
 @pytest.fixture(scope="module")
-def test_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def test_dir(tmp_path_factory):
     """A test side of odd sizes, landscape and portrait, a picture without texture, and one of 33 x 47 pixels."""
     directory = tmp_path_factory.mktemp("made")
     whole = scene(240, 240, channels=3)
@@ -52,7 +50,7 @@ def test_odd_small_and_blank_pictures_go_through(clean_environment, monkeypatch,
     output, given = tmp_path / "out.csv", ("--recipe", tmp_path / "r.toml", "--weights", tmp_path)
     options = ("--test-dir", test_dir, "--output", output, *given, "--device", "cpu", "--workers", 0)
     assert run_command("submit", "--no-report", *options) == 0
-    assert submission_problems(output, [pair.id for pair in read_test_side(test_dir)]) == []
+    assert problems_of(output, test_dir) == []
     for F in read_submission(output).values():
         strengths = np.linalg.svd(F, compute_uv=False)
         assert strengths[2] < 1e-6 * strengths[0] < 1e6 * strengths[1]

@@ -15,6 +15,8 @@ from pictures import agreement
 from mkpc_kaggle.matchers.contract import Placement, Precision
 from mkpc_kaggle.pipeline.devices import fastest_precision, resolve_placement
 
+NAMES = ["superglue", "loftr", "quadtree", "aspanformer", "roma", "loma", "aliked", "xfeat_lighterglue"]
+
 
 @cache
 def matches_of(name, precision=Precision.FLOAT32, noise=0):
@@ -30,7 +32,7 @@ def matches_of(name, precision=Precision.FLOAT32, noise=0):
 
 
 @pytest.mark.parametrize("precision", [Precision.BFLOAT16, Precision.FLOAT16])
-@pytest.mark.parametrize("name", ["loftr", "quadtree", "aspanformer", "roma", "loma", "aliked"])
+@pytest.mark.parametrize("name", NAMES)
 def test_matches_move_less_than_by_noise(name, precision):
     exact, half, disturbed = matches_of(name), matches_of(name, precision), matches_of(name, noise=1)
     assert len(exact) > 20

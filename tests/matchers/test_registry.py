@@ -2,7 +2,6 @@
 
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -30,7 +29,7 @@ assemble("light")
 
 
 @pytest.fixture
-def more_matchers(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Path]:
+def more_matchers(monkeypatch, tmp_path):
     monkeypatch.setattr(adapters, "__path__", [*adapters.__path__, str(tmp_path)])
     matcher_names.cache_clear()
     yield tmp_path
@@ -39,7 +38,7 @@ def more_matchers(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[P
         sys.modules.pop(f"{adapters.__name__}.{name}", None)
 
 
-def test_the_template_of_a_matcher_is_a_matcher(more_matchers: Path) -> None:
+def test_the_template_of_a_matcher_is_a_matcher(more_matchers):
     page = (Path(__file__).parents[2] / "CONTRIBUTING.md").read_text(encoding="utf-8")
     (more_matchers / "orb.py").write_text(page.split("```python\n")[1].split("```")[0])
     image = load_sample_image("china.jpg")
@@ -49,14 +48,14 @@ def test_the_template_of_a_matcher_is_a_matcher(more_matchers: Path) -> None:
     assert not TwoStageMatcher(Recipe((Unit(1, "orb", 640),)))(image, flat).estimate.ok
 
 
-def test_a_broken_matcher_is_told_with_its_reason_and_costs_no_other(more_matchers: Path) -> None:
+def test_a_broken_matcher_is_told_with_its_reason_and_costs_no_other(more_matchers):
     (more_matchers / "broken.py").write_text("from json import no_such_thing\nSPEC = None\n")
     with pytest.raises(UserError, match=r"my recipe: matcher broken cannot be used here \(ImportError: .*no_such"):
         spec_of("broken", "my recipe")
     assert spec_of("sift", "test").name == "sift"
 
 
-def test_without_kornia_its_matchers_alone_are_lost(clean_environment: None) -> None:
+def test_without_kornia_its_matchers_alone_are_lost(clean_environment):
     done = subprocess.run([sys.executable, "-c", WITHOUT_KORNIA], capture_output=True, text=True, check=False)
     assert "superglue_outdoor.pth" in done.stdout, done.stderr
     assert "\nweights: matcher xfeat_lighterglue cannot be used here (ModuleNotFoundError" in done.stdout

@@ -1,8 +1,5 @@
 """LoFTR, QuadTree and ASpanFormer: properties of the networks, and the matchers from public checkpoints."""
 
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 import torch
@@ -50,8 +47,8 @@ def test_span_attention_in_chunks_is_that_of_the_whole(monkeypatch):
             torch.testing.assert_close(span_attention(q, k, v, samples, 2, mask), whole, rtol=1e-4, atol=1e-5)
 
 
-def test_weights_with_optimal_transport_are_refused_with_what_to_take_instead(tmp_path: Path) -> None:
-    def with_bin_score(state: dict[str, torch.Tensor]) -> dict[str, Any]:
+def test_weights_with_optimal_transport_are_refused_with_what_to_take_instead(tmp_path):
+    def with_bin_score(state):
         return wrapped(state | {"coarse_matching.bin_score": torch.ones(())})
 
     store = store_of(tmp_path, [PublicFile("x.ckpt", "loftr", "loftr-outdoor", "loftr", Loftr, with_bin_score)])
@@ -60,7 +57,7 @@ def test_weights_with_optimal_transport_are_refused_with_what_to_take_instead(tm
 
 
 @pytest.mark.parametrize("name", ["loftr", "quadtree", "aspanformer"])
-def test_points_of_image_0_are_centres_of_cells_within_the_border_of_the_content(name: str) -> None:
+def test_points_of_image_0_are_centres_of_cells_within_the_border_of_the_content(name):
     matcher = MATCHERS[name](Placement())
     padded = picture(97, 131, channels=1, multiple=matcher.spec.multiple, padding=(20, 40))
     whole = picture(97, 131, channels=1, multiple=matcher.spec.multiple)

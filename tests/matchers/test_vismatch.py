@@ -42,9 +42,8 @@ def test_points_are_pixels_from_the_first_ones_centre_and_confidences_are_scores
 
 def test_images_are_rgb_in_0_to_1_and_padded_to_the_multiple_in_both_stages():
     standin, recipe = Vismatch(), Recipe((Unit(1, "own", 200), Unit(2, "own", 160)))
-    found = TwoStageMatcher(recipe, matchers={"own": VismatchMatcher(standin, "own", multiple=64)})(
-        PICTURE, PICTURE
-    )
+    matchers = {"own": VismatchMatcher(standin, "own", multiple=64)}
+    found = TwoStageMatcher(recipe, matchers=matchers)(PICTURE, PICTURE)
     assert [(result.failure, len(result.matches) > 20) for result in found.results] == [("", True)] * 2
     assert [tuple(image.shape) for image in standin.seen[:2]] == [(3, 192, 256)] * 2
     assert torch.equal(standin.seen[0][:, :160, :200], torch.from_numpy(PICTURE).permute(2, 0, 1) / 255)

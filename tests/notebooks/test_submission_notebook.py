@@ -9,9 +9,8 @@ import pytest
 from kaggle_image import environment, make_image, python_version, upload
 from offline_notebook import execute, needs_namespaces, pictures, printed
 from packaging.requirements import Requirement
-from shared import DATA, WEIGHTS
+from shared import DATA, WEIGHTS, problems_of
 
-from mkpc_kaggle.data.competition import read_test_side, submission_problems
 from mkpc_kaggle.package import Request, make_package
 from mkpc_kaggle.package.metadata import COMPETITION
 from mkpc_kaggle.package.wheels import PYTHONS
@@ -47,11 +46,6 @@ class Kaggle:
         upload(packaged / "dataset", self.dataset)
         self.notebook = packaged / "kernel" / "submission.ipynb"
 
-    def set(self, former: str, new: str) -> None:
-        text = self.notebook.read_text(encoding="utf-8")
-        assert former in text
-        self.notebook.write_text(text.replace(former, new), encoding="utf-8")
-
     def run(self, **more: str) -> str:
         variables = environment(KAGGLE_ROOT=str(self.root), **more)
         return printed(execute(self.notebook, self.executed, self.image, self.working, variables))
@@ -60,8 +54,7 @@ class Kaggle:
         return pictures(nbformat.read(self.executed, as_version=4))
 
     def problems(self) -> list[str]:
-        ids = [pair.id for pair in read_test_side(self.test_dir)]
-        return submission_problems(self.working / "submission.csv", ids)
+        return problems_of(self.working / "submission.csv", self.test_dir)
 
 
 @pytest.fixture

@@ -4,11 +4,11 @@ import json
 from functools import cache, partial
 
 import numpy as np
+import PIL.Image
 import pytest
 import torch
 from golden import GOLDEN, Stage, Within, compared, golden_arrays, in_order, ready, seeded_tensor
 
-from mkpc_kaggle.matchers.networks import roma
 from mkpc_kaggle.matchers.networks.dense_sampling import balancing_weights, density, draw, sample_matches
 from mkpc_kaggle.matchers.networks.dense_warp import dense_warp
 from mkpc_kaggle.matchers.networks.dkm import DKM
@@ -91,8 +91,7 @@ def batch_of(pixels):
 
 
 def resized_by_pil(pixels, size):
-    image = pytest.importorskip("PIL.Image", reason="the golden images were resized by PIL")
-    resized = image.fromarray(pixels.numpy()).resize(size[::-1], image.Resampling.BICUBIC)
+    resized = PIL.Image.fromarray(pixels.numpy()).resize(size[::-1], PIL.Image.Resampling.BICUBIC)
     return torch.from_numpy(np.array(resized))
 
 
@@ -113,13 +112,6 @@ def dkm_one_way():
     return computed("dkm", coarse, symmetric=False) | computed("dkm", coarse, fine, symmetric=False)
 
 
-def dkm_batched():
-    golden = golden_arrays("dkm", "batched")
-    pair = golden["query"], golden["support"]
-    one_way = computed("dkm", pair, symmetric=False)
-    return computed("dkm", pair) | {f"one_way_{part}": one_way[part] for part in ("warp", "certainty")}
-
-
 def roma_upsample():
     values = computed("roma", images_of("roma", "rsA", "rsB"), images_of("roma", "imA", "imB", size=(168, 168)))
     return second_pass(values, "warp", "certainty")
@@ -129,19 +121,6 @@ def roma_one_way():
     images, high = (images_of("roma", "imA", "imB", size=size) for size in ((112, 140), (150, 202)))
     values = computed("roma", images, symmetric=False)
     return values | second_pass(computed("roma", images, high, symmetric=False))
-
-
-def roma_batched():
-    golden = golden_arrays("roma", "batched")
-    pair, high = ([golden[f"{side}{name}"] for side in ("query", "support")] for name in ("", "_high"))
-    values = computed("roma", pair) | second_pass(computed("roma", pair, high))
-    forward = computed("roma", pair, symmetric=False)
-    with pytest.MonkeyPatch.context() as patch:  # the release's displacements follow its settings' size
-        patch.setattr(roma, "stretch", lambda size: 1.25 * 112 / 560)
-        other = computed("roma", pair)
-    for part in ("warp", "certainty"):
-        values |= {f"one_way_{part}": forward[part], f"other_setting_{part}": other[part]}
-    return values
 
 
 def sampling_stages(name, suffix=""):
@@ -169,11 +148,9 @@ VALUES = {  # by network and golden file
     ("dkm", "main"): lambda: computed("dkm", images_of("dkm", "imA_96x128", "imB_96x128")),
     ("dkm", "upsample"): dkm_upsample,
     ("dkm", "odd_one_way"): dkm_one_way,
-    ("dkm", "batched"): dkm_batched,
     ("roma", "main"): lambda: computed("roma", images_of("roma", "rsA", "rsB")),
     ("roma", "upsample"): roma_upsample,
     ("roma", "unequal_one_way"): roma_one_way,
-    ("roma", "batched"): roma_batched,
 }
 CASES = {
     f"{name} {case}": lambda name=name, case=case, make=make: dense_stages(name, case, make())

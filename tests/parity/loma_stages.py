@@ -11,8 +11,7 @@ from sparse_stages import assignment_values
 
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.matchers.contract import Placement
-from mkpc_kaggle.matchers.networks.dad import Dad, select_keypoints
-from mkpc_kaggle.matchers.networks.dedode import dedode_b, dedode_g
+from mkpc_kaggle.matchers.networks.dad import select_keypoints
 from mkpc_kaggle.matchers.networks.loma import UNUSED, Loma, Variant, detector_size, parameter_name
 from mkpc_kaggle.matchers.networks.loma_matcher import LAYERS, LomaKeypoints, LomaMatcher, log_scores
 from mkpc_kaggle.matchers.networks.pixels import resized
@@ -24,26 +23,19 @@ TOLERANCES |= {"similarity": 1e-3, "scores": 1e-4, "matching_scores": 1e-4, ".*_
 
 
 @cache
-def detector():
-    return filled(Dad(), standin_state("loma", "B128", "_detector."), "detector.")
-
-
-@cache
-def descriptor(variant):
-    network = {"B128": partial(dedode_b, 128), "B": partial(dedode_g, 256)}[variant]()
-    return filled(network, standin_state("loma", variant, "_descriptor."), "descriptor.")
+def whole(variant):
+    network = Loma(variant)
+    tensors = {parameter_name(n): t for n, t in standin_state("loma", variant.upper()).items()}
+    load_into(network, tensors, what="golden", unused=UNUSED)
+    return prepared(network, Placement())
 
 
 @cache
 def matcher(variant):
     descriptors, width = {"B128": (128, 256), "B": (256, 256), "L": (256, 512), "G": (256, 1024)}[variant]
-    tensors = standin_state("loma", variant, not_prefix="_d")
-    return filled(LomaMatcher(descriptors, width), tensors, "matcher.")
-
-
-def filled(network, tensors, part):
-    ours = {parameter_name(name): tensor for name, tensor in tensors.items()}
-    fitting = {name.removeprefix(part): tensor for name, tensor in ours.items() if not re.match(UNUSED, name)}
+    network = LomaMatcher(descriptors, width)
+    names = ((parameter_name(n), t) for n, t in standin_state("loma", variant, not_prefix="_d").items())
+    fitting = {name.removeprefix("matcher."): tensor for name, tensor in names if not re.match(UNUSED, name)}
     load_into(network, fitting, what="golden")
     return prepared(network, Placement())
 
@@ -54,41 +46,22 @@ def image_of(pixels):
     return image.reshape(-1, *pixels.shape[-3:]).permute(0, 3, 1, 2)
 
 
-def detector_values(detector, images, number):
-    logits, found = detector.logits(images), detector(images, number)
-    return {
-        "score_map": logits,
-        "dense_probs": logits.flatten(1).softmax(dim=1).view_as(logits),
-        "keypoints": torch.stack([each.points for each in found]),
-        "keypoint_probs": torch.stack([each.scores for each in found]),
-    }
-
-
-def descriptor_values(descriptor, images, points):
-    """At the points, and at every third pixel of the images."""
-    height, width = images.shape[2:]
-    rows, columns = ((2 * torch.arange(side) + 1) / side - 1 for side in (height, width))
-    pixels = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), dim=2)[::3, ::3]
-    dense = descriptor(images, pixels.reshape(1, -1, 2).expand(len(images), -1, -1))
-    return {
-        "dense_descriptors": dense.mT.unflatten(2, pixels.shape[:2])[:, ::32],
-        "descriptors": descriptor(images, points),
-    }
-
-
 def matcher_values(matcher, image0, image1, threshold):
     """Of a single pair, as a batch of one."""
-    last = f"transformers.{LAYERS - 1}"
-    with recorded(matcher, [last]) as calls:
+    with recorded(matcher, f"transformers.{LAYERS - 1}") as calls:
         matcher(image0, image1, threshold)
-    similarity = matcher.similarity(calls[last][0][1], len(image0.points))
+    similarity = matcher.similarity(calls[0][1], len(image0.points))
     scores = log_scores(similarity)
     return {"similarity": similarity, "scores": scores.exp()} | assignment_values(scores[0], threshold)
 
 
 def detector_stages(case):
-    golden = golden_arrays("loma", f"detector_{case}")
-    values = detector_values(detector(), image_of(golden["image"]), golden["keypoints"].shape[-2])
+    golden, detector = golden_arrays("loma", f"detector_{case}"), whole(Variant.B128).detector
+    images = image_of(golden["image"])
+    logits, found = detector.logits(images), detector(images, golden["keypoints"].shape[-2])
+    values = {"score_map": logits, "dense_probs": logits.flatten(1).softmax(dim=1).view_as(logits)}
+    values["keypoints"] = torch.stack([each.points for each in found])
+    values["keypoint_probs"] = torch.stack([each.scores for each in found])
     yield from compared(values, golden, TOLERANCES)
 
 
@@ -126,8 +99,13 @@ def resize_stages():
 
 
 def descriptor_stages(variant, case):
-    golden = golden_arrays("loma", f"descriptor_{case}")
-    values = descriptor_values(descriptor(variant), image_of(golden["image"]), golden["keypoints"][None])
+    """Yield descriptors at every third pixel of an image, and at its keypoints."""
+    golden, descriptor = golden_arrays("loma", f"descriptor_{case}"), whole(variant).descriptor
+    image = image_of(golden["image"])
+    rows, columns = ((2 * torch.arange(side) + 1) / side - 1 for side in image.shape[2:])
+    pixels = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), dim=2)[::3, ::3]
+    dense = descriptor(image, pixels.reshape(1, -1, 2)).mT.unflatten(2, pixels.shape[:2])[:, ::32]
+    values = {"dense_descriptors": dense, "descriptors": descriptor(image, golden["keypoints"][None])}
     yield from compared(values, golden, TOLERANCES)
 
 
@@ -144,14 +122,6 @@ def matcher_stages(case):
             values |= assignment_values(log_plan, threshold, f"_threshold{threshold}")
         assert {name for name in golden if name.startswith("matches")} <= values.keys()
         yield from compared(values, arrays, TOLERANCES)
-
-
-@cache
-def whole(variant):
-    network = Loma(variant)
-    tensors = {parameter_name(n): t for n, t in standin_state("loma", variant.upper()).items()}
-    load_into(network, tensors, what="golden", unused=UNUSED)
-    return prepared(network, Placement())
 
 
 def pipeline_stages(case, variant):
@@ -183,17 +153,16 @@ def pipeline_stages(case, variant):
     yield Stage("points", mine, theirs, 1e-3)
 
 
-CASES = {
-    f"loma detector_{case}": partial(detector_stages, case) for case in ("160x208", "157x203", "batch2_72x96")
-}
+DETECTIONS = ("160x208", "157x203", "batch2_72x96")
+CASES = {f"loma detector_{case}": partial(detector_stages, case) for case in DETECTIONS}
 CASES |= {"loma sampling": sampling_stages, "loma resize": resize_stages}
-CASES["loma descriptor_b128"] = partial(descriptor_stages, "B128", "b128_157x203")
+CASES["loma descriptor_b128"] = partial(descriptor_stages, Variant.B128, "b128_157x203")
 CASES |= {
     f"loma matcher_{case}": partial(matcher_stages, case)
     for case in ("b_60x47", "b128_33x71", "l_24x18", "g_14x11", "b_batch2_20x26", "b_1x3", "b_1x1")
 }
 CASES["loma pipeline_b128"] = partial(pipeline_stages, "pipeline_b128", Variant.B128)
 SLOW = {
-    "loma descriptor_g": partial(descriptor_stages, "B", "g_168x210"),
+    "loma descriptor_g": partial(descriptor_stages, Variant.B, "g_168x210"),
     "loma pipeline_b": partial(pipeline_stages, "pipeline_b", Variant.B),
 }

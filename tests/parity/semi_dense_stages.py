@@ -24,10 +24,7 @@ def confidence_of(network, grid0, grid1, masks):
     """Return the full confidence matrix (N, L, S)."""
     masks = masks or [torch.ones(grid.shape[:3], dtype=torch.bool) for grid in (grid0, grid1)]
     pairs = zip(grid0 * network.similarity_scale, grid1, *masks, strict=True)
-    all_cells = [
-        Cells(first.flatten(0, 1), second.flatten(0, 1), mask0.flatten(), mask1.flatten())
-        for first, second, mask0, mask1 in pairs
-    ]
+    all_cells = [Cells(a.flatten(0, 1), b.flatten(0, 1), m.flatten(), n.flatten()) for a, b, m, n in pairs]
     return torch.stack([torch.cat(list(half_log_confidences(cells))) for cells in all_cells]).mul(2).exp()
 
 
@@ -37,9 +34,9 @@ def computed(network, images, masks, scales, coarse_scales=None):
     Points are multiplied by ``scales`` (N, 2) of either side, coarse ones by ``coarse_scales`` if given.
     """
     maps = [network.encode(image) for image in images]
-    with recorded(network, ["loftr_coarse"]) as calls:
+    with recorded(network, "loftr_coarse") as calls:
         matches = network.match(*maps, masks)
-    transformed = zip(calls["loftr_coarse"][0][1], maps, strict=True)
+    transformed = zip(calls[0][1], maps, strict=True)
     grids = [tokens.reshape(len(tokens), *own.coarse.shape[2:], 256) for tokens, own in transformed]
     coarse, confidence = matches.coarse, confidence_of(network, *grids, masks)
     values = {"conf": confidence, "conf_rowmax": confidence.amax(2), "conf_colmax": confidence.amax(1)}

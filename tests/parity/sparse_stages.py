@@ -94,9 +94,9 @@ def assignment_values(log_scores, threshold, suffix=""):
 def plan_of(network, image0, image1):
     """Return the score matrix of a pair, and the logarithm of its transport plan with the dustbins."""
     n0 = len(image0.points)
-    with recorded(network, ["final_proj"]) as calls:
+    with recorded(network, "final_proj") as calls:
         network(image0, image1)
-    scores = network.score_matrix(calls["final_proj"][0][1], n0)
+    scores = network.score_matrix(calls[0][1], n0)
     return scores, log_optimal_transport(scores, network.bin_score, network.sinkhorn_iterations)[0]
 
 
@@ -121,25 +121,11 @@ def sinkhorn_stages():
         yield Stage(f"log_assignment_{iterations}", got, golden[f"log_assignment_{iterations}"], 1e-5)
 
 
-def pipeline_stages():
-    golden = golden_arrays("superglue", "pipeline_pair")
-    config = json.loads(golden["config"])
-    detector, network = superpoint(config["superpoint"]), superglue(config["superglue"])
-    images = [detector(image_of(golden[f"image{index}"]))[0] for index in (0, 1)]
-    for index, found in enumerate(images):
-        values = {f"keypoints{index}": found.points, f"scores{index}": found.scores}
-        yield from compared(values, golden, SUPERPOINT)
-    _, log_plan = plan_of(network, *images)
-    yield from compared(assignment_values(log_plan[:-1, :-1], network.match_threshold), golden, SUPERGLUE)
-
-
 CASES = {
     f"superpoint {case}": partial(superpoint_stages, case)
     for case in ("default_160x216", "outdoor_160x216", "odd_171x229", "noborder_64x72")
 }
 CASES["superpoint nms_cases"] = suppression_stages
-CASES |= {
-    f"superglue {case}": partial(superglue_stages, case)
-    for case in ("full_60x47", "eval20_33x71", "batch2_20x26", "tiny_1x3")
-}
-CASES |= {"superglue sinkhorn": sinkhorn_stages, "superglue pipeline_pair": pipeline_stages}
+MATCHED = ("full_60x47", "eval20_33x71", "batch2_20x26", "tiny_1x3")
+CASES |= {f"superglue {case}": partial(superglue_stages, case) for case in MATCHED}
+CASES["superglue sinkhorn"] = sinkhorn_stages

@@ -2,7 +2,6 @@
 
 import json
 import os
-from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -17,19 +16,19 @@ FILES = ["database.db", *(f"models/0/{name}" for name in MODEL_FILES)]
 TABLES = ["cameras.csv", "report.html", "submission.csv"]
 
 
-def write(folder: Path, names: list[str], text: str = "made") -> None:
+def write(folder, names, text="made"):
     for name in names:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text(text)
 
 
-def files_of(folder: Path) -> dict[str, str]:
+def files_of(folder):
     paths = [path for path in folder.rglob("*") if path.is_file() and path.name != "results.json"]
     return {path.relative_to(folder).as_posix(): path.read_text() for path in sorted(paths)}
 
 
 @pytest.fixture
-def out(tmp_path: Path) -> Path:
+def out(tmp_path):
     """What a run has made of two datasets; and an image of the user's next to it."""
     with output_directory(tmp_path / "out", "ab", "imc2025"):
         for name in "ab":
@@ -39,7 +38,7 @@ def out(tmp_path: Path) -> Path:
     return tmp_path / "out"
 
 
-IN_THE_WAY: dict[str, tuple[str, Callable[[Path], object]]] = {
+IN_THE_WAY = {
     "an exported model": ("a/models/0/points.ply", Path.touch),
     "an open database": ("a/database.db-wal", Path.touch),
     "a dataset's file that no run has made": ("c/database.db", lambda path: write(path.parent, [path.name])),
@@ -133,14 +132,14 @@ def test_former_files_stay_until_the_new_ones_are_whole(tmp_path, monkeypatch):
     """A disk that is full while models are written costs neither the former models nor the former database."""
     write(tmp_path, FILES, "former")
 
-    def write_files(is_full: bool) -> None:
-        def fill(folder: Path) -> None:
+    def write_files(is_full):
+        def fill(folder):
             write(folder, [*MODEL_FILES[:1]] if is_full else [*MODEL_FILES], "new")
             if is_full:
                 raise OSError(28, "No space left on device")
 
         model = SimpleNamespace(images=(), colmap=SimpleNamespace(frames={}, write=fill))
-        colmap.write_files(tmp_path, None, None, {}, [model])  # type: ignore[arg-type,list-item]
+        colmap.write_files(tmp_path, None, None, {}, [model])
 
     monkeypatch.setattr(colmap, "_fill", lambda *_: None)
     with pytest.raises(OSError, match="No space"):

@@ -1,33 +1,31 @@
 """The focal lengths that cameras start with, by EXIF or not, and the cameras that images are told to share."""
 
-from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import pycolmap
 import pytest
 
-from benchmarks.synthetic_scene import SIZE, SyntheticScene, registered_images, synthetic_scene
+from benchmarks.synthetic_scene import SIZE, registered_images, synthetic_scene
 from mkpc_kaggle.geometry.coordinates import Size
-from mkpc_kaggle.recipe import Recipe, SceneConfig, Unit
+from mkpc_kaggle.recipe import Recipe, Unit
 from mkpc_kaggle.reconstruction.run import for_cameras
 from mkpc_kaggle.scene.colmap import write_files
 from mkpc_kaggle.scene.reconstruct import reconstruct_batch, reconstruct_sharing
 from mkpc_kaggle.scene.shared_intrinsics import given_intrinsics
-from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair, ViewGraph
+from mkpc_kaggle.scene.view_graph import BatchImage, ViewGraph
 
 IMAGES = [BatchImage(f"{n}", f"{n}", SIZE, focal) for n, focal in enumerate((0.0, 900.0, 1000.0, 1040.0))]
 TALL = BatchImage("tall", "tall", Size(*reversed(SIZE)))
 GUESS = 1.1 * max(SIZE)
 
 
-def config(cameras: str = "auto", **more: bool) -> SceneConfig:
+def config(cameras="auto", **more):
     scene = for_cameras(Recipe((Unit(1, "sift", 640),)), cameras).scene
     assert scene is not None
     return replace(scene, **more)
 
 
-def focals_of(directory: Path, settings: SceneConfig) -> list[float]:
+def focals_of(directory, settings):
     """The focal length that each image's camera starts with, and the number of cameras."""
     graph = ViewGraph((*IMAGES, TALL), ())
     write_files(directory, graph, settings, given_intrinsics(graph.images, settings), [])
@@ -49,8 +47,8 @@ def test_cameras_start_with_the_focal_length_of_exif(tmp_path, cameras, exif, fo
     assert focals_of(tmp_path, config(cameras, exif=exif)) == pytest.approx(focals)
 
 
-def with_exif(scene: SyntheticScene, factor: float) -> Sequence[BatchPair]:
-    def told(image: BatchImage) -> BatchImage:
+def with_exif(scene, factor):
+    def told(image):
         return replace(image, focal=factor * float(scene.cameras[image.name].K[0, 0]))
 
     return [replace(pair, image0=told(pair.image0), image1=told(pair.image1)) for pair in scene.pairs]

@@ -9,7 +9,7 @@ build has a guard; all that Python can ask it says ``cuda:N``, and all operators
 What raises :class:`MixedDevicesError`: an operator on tensors of two devices, but for a CPU tensor of no
 dimensions and for CPU indices into a tagged tensor, which a GPU takes as well; a generator of another device.
 ``.numpy()`` of a tagged tensor is the TypeError that it is on a GPU. What it cannot show: a GPU's rounding, its
-memory, its speed.
+memory, its speed, half precision.
 
 Enter it in the thread that computes; networks that were moved within it are of no use outside of it.
 """
@@ -20,14 +20,9 @@ from contextlib import ExitStack
 from unittest.mock import patch
 
 import torch
-from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_flatten, tree_map
 
-# Some of what autocast takes in half precision on a GPU, and in float32.
-PRODUCTS = {"conv2d", "linear", "matmul", "__matmul__", "bmm", "mm", "einsum"}
-HALVED = PRODUCTS | {"prelu", "scaled_dot_product_attention"}
-WIDENED = {"softmax", "log_softmax", "exp", "log", "pow", "sum", "cumsum", "norm", "normalize", "logsigmoid"}
 INDEXING = {"index", "index_put", "index_put_", "_index_put_impl_", "_unsafe_index"}
 
 
@@ -93,7 +88,6 @@ class DeviceDouble(TorchDispatchMode):
         self.count, self.memory = count, memory
         self.operators = 0  # run on tagged tensors so far
         self._generators = {}
-        self._autocast = Autocast()
         self._undo = []
 
     def __enter__(self):
@@ -105,7 +99,6 @@ class DeviceDouble(TorchDispatchMode):
         stack.callback(torch.__future__.set_overwrite_module_params_on_conversion, overwriting)
         stack.callback(torch._C._set_only_lift_cpu_tensors, torch._C._only_lift_cpu_tensors())
         torch._C._set_only_lift_cpu_tensors(True)  # torch.tensor(..., device="cuda") comes by here
-        stack.enter_context(self._autocast)
         self._undo.append((stack, DeviceDouble.current))
         DeviceDouble.current = self
         return super().__enter__()
@@ -145,10 +138,6 @@ class DeviceDouble(TorchDispatchMode):
         grads = []
         yield torch.inference_mode, "__enter__", lambda mode: grads.append(torch.set_grad_enabled(False))
         yield torch.inference_mode, "__exit__", lambda mode, *error: grads.pop().__exit__(*error)
-        enter, leave = torch.autocast.__enter__, torch.autocast.__exit__
-        entered = self._autocast.entered
-        yield torch.autocast, "__enter__", lambda cast: (entered.append(cast), enter(cast))[1]
-        yield torch.autocast, "__exit__", lambda cast, *error: (entered.pop(), leave(cast, *error))[1]
         yield torch.amp.autocast_mode, "is_autocast_available", lambda kind: True
         yield torch.cuda.amp.common, "amp_definitely_not_available", lambda: False
 
@@ -214,26 +203,3 @@ class DeviceDouble(TorchDispatchMode):
         made_for = self._generators.get(generator._cdata) if generator is not None else where
         if made_for != where:
             raise MixedDevicesError(f"{name}: a generator of {made_for} for a tensor on {where}")
-
-
-class Autocast(TorchFunctionMode):
-    """What autocast for GPUs does to tagged tensors; PyTorch's own does it by a device that these are not on."""
-
-    def __init__(self):
-        super().__init__()
-        self.entered = []
-
-    def __torch_function__(self, func, types, args=(), kwargs=None):
-        casts = [cast for cast in self.entered if cast.device == "cuda"]
-        name = getattr(func, "__name__", "")
-        if not casts or not casts[-1]._enabled or name not in HALVED | WIDENED:
-            return func(*args, **(kwargs or {}))
-        half = casts[-1].fast_dtype
-        taken = half if name in HALVED else torch.float32
-
-        def cast(value):
-            floats = isinstance(value, Tagged) and value.dtype in (torch.float32, torch.float16, torch.bfloat16)
-            return value.to(taken) if floats else value
-
-        args, kwargs = tree_map(cast, (args, kwargs or {}))
-        return func(*args, **kwargs)

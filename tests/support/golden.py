@@ -26,19 +26,15 @@ def golden_arrays(network, case):
     """The arrays of one file by their names, as tensors where they hold numbers, else as text."""
     with np.load(GOLDEN / network / f"{case}.npz") as file:
         arrays = {name: file[name] for name in file}
-    return {
-        name: str(array) if array.dtype.kind == "U" else torch.from_numpy(array) for name, array in arrays.items()
-    }
+    kinds = {True: str, False: torch.from_numpy}
+    return {name: kinds[array.dtype.kind == "U"](array) for name, array in arrays.items()}
 
 
 @lru_cache(maxsize=1)  # the largest have a gigabyte
 def standin_state(network, *which, **part):
     """The stand-in checkpoint that the folder's ``standin.py`` makes, or that part of it, as tensors."""
-    recipe = _module(GOLDEN / network / "standin.py")
-    return {
-        name: torch.from_numpy(np.asarray(value))
-        for name, value in recipe.standin_state_dict(*which, **part).items()
-    }
+    values = _module(GOLDEN / network / "standin.py").standin_state_dict(*which, **part)
+    return {name: torch.from_numpy(np.asarray(value)) for name, value in values.items()}
 
 
 def seeded_tensor(name, shape, gain=1.0):
@@ -46,20 +42,12 @@ def seeded_tensor(name, shape, gain=1.0):
 
 
 @contextmanager
-def recorded(network, names):
-    """Lists by module name, which fill with the inputs and the output of each call of these modules."""
-    calls = {name: [] for name in names}
-    hooks = [
-        network.get_submodule(name).register_forward_hook(
-            lambda _module, inputs, output, calls=calls[name]: calls.append((inputs, output))
-        )
-        for name in names
-    ]
-    try:
-        yield calls
-    finally:
-        for hook in hooks:
-            hook.remove()
+def recorded(network, name):
+    """A list that fills with the inputs and the output of each call of that module."""
+    calls = []
+    hook = network.get_submodule(name).register_forward_hook(lambda _, *call: calls.append(call))
+    yield calls
+    hook.remove()
 
 
 def ready(network, state):

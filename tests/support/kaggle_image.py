@@ -5,8 +5,7 @@ import re
 import shutil
 import sys
 import venv
-from collections.abc import Sequence
-from importlib.metadata import Distribution, PackageNotFoundError, distribution
+from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from zipfile import ZipFile, is_zipfile
 
@@ -15,7 +14,7 @@ UNPACKED = (".zip", ".tar", ".gz", ".pt", ".pth", ".ckpt")  # Kaggle unpacks arc
 PACKAGES = ("numpy", "pandas", "scipy", "scikit-learn", "opencv-python-headless", "torch", "pip", *BESIDE)
 
 
-def upload(folder: Path, mount: Path) -> None:
+def upload(folder, mount):
     """What Kaggle makes of an uploaded folder: sub-folders are dropped, archives become directories."""
     mount.mkdir(parents=True)
     for path in folder.iterdir():
@@ -26,23 +25,21 @@ def upload(folder: Path, mount: Path) -> None:
             shutil.copyfile(path, mount / path.name)
 
 
-def make_image(directory: Path) -> Path:
+def make_image(directory):
     """An environment with links to this interpreter's copies of the packages; its interpreter."""
     venv.create(directory, symlinks=True)
     site = next(directory.glob("lib/python*/site-packages"))
     for installed in closure(PACKAGES).values():
-        for entry in {
-            file.parts[0] for file in installed.files or () if file.parts[0] not in ("..", "__pycache__")
-        }:
+        for entry in {file.parts[0] for file in installed.files or ()} - {"..", "__pycache__"}:
             link = site / entry
             if not link.is_symlink():
                 link.symlink_to(Path(str(installed.locate_file(entry))))
     return directory / "bin" / "python"
 
 
-def closure(names: Sequence[str]) -> dict[str, Distribution]:
+def closure(names):
     """The named distributions and all that they need, as far as they are here, by name."""
-    found: dict[str, Distribution] = {}
+    found = {}
     waiting = list(names)
     while waiting:
         name = waiting.pop()
@@ -58,7 +55,7 @@ def closure(names: Sequence[str]) -> dict[str, Distribution]:
     return found
 
 
-def pack_wheel(name: str, directory: Path) -> Path:
+def pack_wheel(name, directory):
     """The wheel that an installed distribution came from, but for the order and dates of its entries."""
     installed = distribution(name)
     tags = re.findall(r"^Tag: (.*)$", installed.read_text("WHEEL") or "", re.MULTILINE)
@@ -74,12 +71,12 @@ def pack_wheel(name: str, directory: Path) -> Path:
     return path
 
 
-def environment(**more: str) -> dict[str, str]:
+def environment(**more):
     """This process's environment without what leads to its own packages, or tells that a test is running."""
     hidden = ("PYTHONPATH", "VIRTUAL_ENV", "MKPC_WEIGHTS", "PYTEST_CURRENT_TEST")
     kept = {name: value for name, value in os.environ.items() if name not in hidden}
     return {**kept, "PYTHONNOUSERSITE": "1", **more}
 
 
-def python_version() -> str:
+def python_version():
     return f"{sys.version_info.major}.{sys.version_info.minor}"

@@ -4,13 +4,11 @@ A new matcher is one line in ``MATCHERS``.
 """
 
 import copy
-from collections.abc import Callable
 from functools import cache, partial
 from typing import Any
 
 import numpy as np
 from kornia.feature import DISK, XFeat
-from torch import nn
 
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
 from mkpc_kaggle.matchers.adapters import disk_lightglue, sift_lightglue, xfeat_lighterglue
@@ -19,7 +17,7 @@ from mkpc_kaggle.matchers.adapters.dkm import DkmMatcher
 from mkpc_kaggle.matchers.adapters.loma import LomaAdapter, LomaOptions
 from mkpc_kaggle.matchers.adapters.roma import RomaMatcher, RomaOptions
 from mkpc_kaggle.matchers.adapters.superglue import SuperGlueMatcher
-from mkpc_kaggle.matchers.contract import Colour, Picture, Placement
+from mkpc_kaggle.matchers.contract import Colour, Picture
 from mkpc_kaggle.matchers.dense import DenseOptions
 from mkpc_kaggle.matchers.lightglue import LightGlueMatcher, light_glue
 from mkpc_kaggle.matchers.networks.aliked import Aliked
@@ -41,61 +39,61 @@ SHIFT = 8  # pixels between the two pictures of a pair
 
 
 @cache
-def standin(name: str, make: Callable[..., nn.Module], *settings: Any, **named: Any) -> nn.Module:
+def standin(name, make, *settings, **named):
     return filled(make(*settings, **named), name)
 
 
-def ours(placement: Placement, *network: Any, **named: Any) -> Any:
+def ours(placement, *network, **named):
     return prepared(kornias(*network, **named), placement)
 
 
-def kornias(*network: Any, **named: Any) -> Any:
+def kornias(*network, **named):
     """A network of kornia's, which its matcher will move."""
     return copy.deepcopy(standin(*network, **named))
 
 
-def superglue_matcher(placement: Placement, keypoints: int = 200) -> SuperGlueMatcher:
+def superglue_matcher(placement, keypoints=200):
     superpoint = ours(placement, "superpoint", SuperPoint, max_keypoints=keypoints)
     return SuperGlueMatcher(superpoint, ours(placement, "superglue", SuperGlue, 20), placement.device)
 
 
-def semi_dense_matcher(name: str, make: type[nn.Module], placement: Placement) -> SemiDenseMatcher:
+def semi_dense_matcher(name, make, placement):
     return SemiDenseMatcher(ours(placement, name, make), spec_of(name, "test"), placement.device)
 
 
-def dkm_matcher(placement: Placement, passes: int = 1, matches: int = 300) -> DkmMatcher:
+def dkm_matcher(placement, passes=1, matches=300):
     return DkmMatcher(ours(placement, "dkm", DKM), DenseOptions(passes, matches=matches), placement.device)
 
 
-def roma_matcher(placement: Placement) -> RomaMatcher:
+def roma_matcher(placement):
     return RomaMatcher(ours(placement, "roma", narrow_roma), RomaOptions(matches=300), placement.device)
 
 
-def loma_matcher(placement: Placement) -> LomaAdapter:
+def loma_matcher(placement):
     options = LomaOptions(Variant.B128, max_keypoints=200, match_threshold=0.0)
     return LomaAdapter(ours(placement, "loma", Loma, Variant.B128), options, placement.device)
 
 
-def aliked_matcher(placement: Placement, keypoints: int = 200) -> AlikedMatcher:
+def aliked_matcher(placement, keypoints=200):
     return AlikedMatcher(aliked_keypoints(placement, keypoints)[0], AlikedOptions())
 
 
 Keypoints = tuple[Encoder, dict[str, Any]]  # and the shape of LightGlue for them
 
 
-def aliked_keypoints(placement: Placement, keypoints: int) -> Keypoints:
+def aliked_keypoints(placement, keypoints):
     return KeypointEncoder(ours(placement, "aliked", Aliked, keypoints), placement.device), {"input_dim": 128}
 
 
-def disk_keypoints(placement: Placement, keypoints: int) -> Keypoints:
+def disk_keypoints(placement, keypoints):
     return disk_lightglue.disk_encoder(kornias("disk", DISK), keypoints, placement), {"input_dim": 128}
 
 
-def sift_keypoints(placement: Placement, keypoints: int) -> Keypoints:
+def sift_keypoints(placement, keypoints):
     return sift_lightglue.SiftEncoder(keypoints, placement.device), sift_lightglue.SHAPE
 
 
-def xfeat_keypoints(placement: Placement, keypoints: int) -> Keypoints:
+def xfeat_keypoints(placement, keypoints):
     network = XFeat(top_k=keypoints, detection_threshold=0.0)
     network.net = filled(network.net, "xfeat")
     return xfeat_lighterglue.xfeat_encoder(network, keypoints, placement), xfeat_lighterglue.SHAPE
@@ -109,15 +107,13 @@ KEYPOINTS = {
 }
 
 
-def lightglue_matcher(
-    name: str, placement: Placement, keypoints: int = 200, layers: int = 2, threshold: float = 0.0
-) -> LightGlueMatcher:
+def lightglue_matcher(name, placement, keypoints=200, layers=2, threshold=0.0):
     encoder, shape = KEYPOINTS[name](placement, keypoints)
     network = kornias("lightglue", light_glue, layers, threshold, **shape)
     return LightGlueMatcher(spec_of(name, "test"), encoder, network, placement)
 
 
-MATCHERS: dict[str, Callable[[Placement], Any]] = {
+MATCHERS = {
     "superglue": superglue_matcher,
     "loftr": partial(semi_dense_matcher, "loftr", Loftr),
     "quadtree": partial(semi_dense_matcher, "quadtree", Quadtree),
@@ -131,7 +127,7 @@ MATCHERS: dict[str, Callable[[Placement], Any]] = {
 }
 
 
-def picture(colour: Colour, number: int, shift: int = 0) -> Picture:
+def picture(colour, number, shift=0):
     """A part of the scene of that number, which begins up to SHIFT pixels further right."""
     channels = 1 if colour is Colour.GRAY else 3
     whole = scene(SIZE.height, SIZE.width + SHIFT, channels, name=f"picture {number}")

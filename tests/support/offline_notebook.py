@@ -7,7 +7,6 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Mapping
 from copy import deepcopy
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -29,19 +28,11 @@ finally:
     nbformat.write(notebook, sys.argv[2])
 """
 OFFLINE = ("unshare", "--map-root-user", "--net")
+HAS_NAMESPACES = shutil.which("unshare") and subprocess.run([*OFFLINE, "true"], check=False).returncode == 0
+needs_namespaces = pytest.mark.skipif(not HAS_NAMESPACES, reason="unshare --net is not permitted here")
 
 
-def no_namespaces() -> bool:
-    """Whether this machine allows no network namespace without interfaces."""
-    return shutil.which("unshare") is None or subprocess.run([*OFFLINE, "true"], check=False).returncode != 0
-
-
-needs_namespaces = pytest.mark.skipif(no_namespaces(), reason="unshare --net is not permitted here")
-
-
-def execute(
-    notebook: Path, executed: Path, python: str | Path, working: Path, variables: Mapping[str, str]
-) -> nbformat.NotebookNode:
+def execute(notebook, executed, python, working, variables):
     """Run ``notebook`` in ``working`` under that interpreter; the executed notebook, also in ``executed``."""
     command = [*OFFLINE, str(python), "-c", EXECUTE, str(notebook), str(executed)]
     # Not under pytest's own directory: the path of a socket may have no more than 107 characters.
@@ -52,19 +43,19 @@ def execute(
     return nbformat.read(executed, as_version=4)
 
 
-def printed(notebook: nbformat.NotebookNode) -> str:
+def printed(notebook):
     return "".join(output["text"] for output in outputs(notebook) if output["output_type"] == "stream")
 
 
-def pictures(notebook: nbformat.NotebookNode) -> int:
+def pictures(notebook):
     return sum(bool({"image/png", "image/jpeg"} & set(output.get("data", {}))) for output in outputs(notebook))
 
 
-def outputs(notebook: nbformat.NotebookNode) -> list[nbformat.NotebookNode]:
+def outputs(notebook):
     return [output for cell in notebook.cells for output in cell.get("outputs", ())]
 
 
-def with_pictures_alone(notebook: nbformat.NotebookNode) -> nbformat.NotebookNode:
+def with_pictures_alone(notebook):
     """The form in which the tour is committed: its pictures, and nothing else that tells of a run."""
     kept = deepcopy(notebook)
     kept.metadata = {name: kept.metadata[name] for name in ("kernelspec", "language_info")}
@@ -81,7 +72,7 @@ def with_pictures_alone(notebook: nbformat.NotebookNode) -> nbformat.NotebookNod
     return kept
 
 
-def main(path: Path) -> None:
+def main(path):
     with TemporaryDirectory() as directory:
         executed = execute(path, Path(directory) / "executed.ipynb", sys.executable, path.parent, os.environ)
     path.write_text(nbformat.writes(with_pictures_alone(executed)) + "\n", encoding="utf-8")

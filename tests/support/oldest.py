@@ -17,11 +17,8 @@ LEFT_OUT = ("torch", "ruff", "mypy")  # the last two run in `make lint` only
 def lowest_versions(extras: Sequence[str]) -> Iterator[str]:
     """Each dependency at its floor, once; raises ``KeyError`` for an extra that is not declared."""
     project = tomllib.loads(PROJECT.read_text(encoding="utf-8"))["project"]
-    declared = [
-        *project["dependencies"],
-        *(line for name in extras for line in project["optional-dependencies"][name]),
-    ]
-    for line in dict.fromkeys(declared):
+    more = [line for name in extras for line in project["optional-dependencies"][name]]
+    for line in dict.fromkeys([*project["dependencies"], *more]):
         floor = re.match(r"([A-Za-z0-9_.-]+)>=([0-9.]+)", line)
         if floor and floor[1] not in LEFT_OUT:
             yield f"{floor[1]}=={floor[2]}"

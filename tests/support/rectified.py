@@ -5,23 +5,20 @@ It sees every pair as rectified: a point of image 1 is the point of image 0 move
 """
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from itertools import combinations
-from pathlib import Path
 
 import cv2
 import numpy as np
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.budget import Budget
-from mkpc_kaggle.engine.cluster import RayCluster
-from mkpc_kaggle.engine.request import RunReport
 from mkpc_kaggle.engine.session import Interrupt, Session, Watchdog, run_pairs, submit
 from mkpc_kaggle.geometry.coordinates import Size, View
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.matchers.contract import MatcherSpec, Picture
+from mkpc_kaggle.matchers.contract import MatcherSpec
 from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.recipe import Recipe, Unit
 
@@ -32,30 +29,26 @@ class Seen:
     brightness: int
 
 
-def plenty(_: int) -> int:
-    return 150
-
-
 @dataclass
 class RectifiedMatcher:
     """``seconds`` for each pair; ``matches`` by the brightness of image 0; ``calls``: (long side, brightness)."""
 
     name: str = "rectified"
     seconds: float = 0.0
-    matches: Callable[[int], int] = plenty
+    matches: Callable[[int], int] = lambda _: 150
     calls: list[tuple[int, int]] = field(default_factory=list)
 
     @property
-    def spec(self) -> MatcherSpec:
+    def spec(self):
         return MatcherSpec(self.name, "a matcher for tests")
 
-    def encode(self, pictures: Sequence[Picture]) -> list[Seen]:
+    def encode(self, pictures):
         return [Seen(picture.view, int(np.median(picture.pixels))) for picture in pictures]
 
-    def match(self, encodings0: Sequence[Seen], encodings1: Sequence[Seen]) -> list[Matches]:
+    def match(self, encodings0, encodings1):
         return [self._match(*pair) for pair in zip(encodings0, encodings1, strict=True)]
 
-    def _match(self, seen0: Seen, seen1: Seen) -> Matches:
+    def _match(self, seen0, seen1):
         self.calls.append((max(seen0.view.content), seen0.brightness))
         time.sleep(self.seconds)
         count = self.matches(seen0.brightness)
@@ -70,27 +63,27 @@ THREE_UNITS = Recipe((SWEEP, SECOND, THIRD))
 SIZE = Size(80, 72)
 
 
-def write_pairs(directory: Path, count: int) -> list[Pair]:
+def write_pairs(directory, count):
     """Pairs of flat 80 x 72 images, each with a brightness of its own: 10, 11, ..."""
     pairs = []
     directory.mkdir(parents=True, exist_ok=True)
     for index in range(count):
-        paths = [directory / f"{index:03d}_{side}.png" for side in (0, 1)]
+        paths = [str(directory / f"{index:03d}_{side}.png") for side in (0, 1)]
         for path in paths:
-            cv2.imwrite(str(path), np.full((72, 80, 3), 10 + index, np.uint8))
-        pairs.append(Pair(f"set;{index:03d}", "set", *map(str, paths)))
+            cv2.imwrite(path, np.full((72, 80, 3), 10 + index, np.uint8))
+        pairs.append(Pair(f"set;{index:03d}", "set", *paths))
     return pairs
 
 
-def flat(number: int, size: Size = SIZE) -> np.ndarray:
+def flat(number, size=SIZE):
     return np.full((size.height, size.width, 3), 10 + 10 * number, np.uint8)
 
 
-def number_of(seen: Seen) -> int:
+def number_of(seen):
     return seen.brightness // 10 - 1
 
 
-def batch_pairs(directory: Path, images: int = 4, batch: str = "one", size: Size = SIZE) -> list[Pair]:
+def batch_pairs(directory, images=4, batch="one", size=SIZE):
     directory.mkdir(parents=True, exist_ok=True)
     paths = [directory / f"{number}.png" for number in range(images)]
     for number, path in enumerate(paths):
@@ -100,19 +93,19 @@ def batch_pairs(directory: Path, images: int = 4, batch: str = "one", size: Size
 
 
 def run(
-    pairs: Sequence[Pair],
-    recipe: Recipe,
-    matcher: RectifiedMatcher,
-    work_dir: Path,
+    pairs,
+    recipe,
+    matcher,
+    work_dir,
     *,
-    limit: float = float("inf"),
-    budget: Budget | None = None,
-    interrupt: Interrupt | None = None,
-    publish: Callable[..., None] = lambda *_: None,
-    output: Path | None = None,
-    workers: int | RayCluster | None = 0,
-    is_watched: bool = False,
-) -> RunReport:
+    limit=float("inf"),
+    budget=None,
+    interrupt=None,
+    publish=lambda *_: None,
+    output=None,
+    workers=0,
+    is_watched=False,
+):
     """Run the recipe with that matcher; the submission is written to ``output``, or given to ``publish``."""
     assembly = assemble(recipe, matchers={matcher.name: matcher}, device="cpu")
     budget = budget or Budget(time.monotonic(), limit)
@@ -124,5 +117,5 @@ def run(
         return run_pairs(pairs, assembly, session, publish)
 
 
-def matrices(report: RunReport) -> list[bytes]:
+def matrices(report):
     return [record.pair_fundamental.tobytes() for record in report.records]

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from mkpc_kaggle.cli import main
+from mkpc_kaggle.data.competition import read_test_side, submission_problems
 
 SHARED = Path(__file__).resolve().parents[3] / "shared"
 DATA = SHARED / "data"
@@ -23,6 +24,10 @@ def contents(directory: Path) -> dict[str, bytes]:
 def run_command(*words: object) -> int:
     """Run a command of the package in this process; return its exit status."""
     return main([*map(str, words)])
+
+
+def problems_of(submission: Path, test_dir: Path) -> list[str]:
+    return submission_problems(submission, [pair.id for pair in read_test_side(test_dir)])
 
 
 def scores_of(out: Path, *options: object) -> dict[str, Any]:

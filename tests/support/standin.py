@@ -4,13 +4,12 @@ Every number is made of bytes of SHAKE-256 of a name, so that no generator of nu
 """
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 
 import numpy as np
 import torch
-from torch import Tensor, nn
 
 from mkpc_kaggle.matchers.adapters import roma as adapter
 from mkpc_kaggle.matchers.networks.dinov2 import DinoV2Config
@@ -66,23 +65,23 @@ NARROW = RomaConfig(
 )
 
 
-def narrow_roma() -> RoMa:
+def narrow_roma():
     return RoMa(NARROW)
 
 
-def use_narrow(monkeypatch) -> None:
+def use_narrow(monkeypatch):
     """RoMas that are loaded from now on are narrow ones, and so must their files be."""
     monkeypatch.setattr(adapter, "RoMa", narrow_roma)
 
 
-def uniform(name: str, shape: Sequence[int] = ()) -> np.ndarray:
+def uniform(name, shape=()):
     """float64 in (-1, 1), 2^16 different values, as the name has it."""
     count = int(np.prod(shape, dtype=int))
     whole = np.frombuffer(hashlib.shake_256(name.encode()).digest(2 * count), "<u2").astype(np.float64)
     return ((2 * whole + 1) / 2**16 - 1).reshape(shape)
 
 
-def value_of(name: str, shape: Sequence[int], gain: float) -> np.ndarray:
+def value_of(name, shape, gain):
     """The value of one parameter or buffer.
 
     Maps have no mean, so that a flat input leaves them silent, and the variance ``gain`` / fan-in. Norms are
@@ -99,7 +98,7 @@ def value_of(name: str, shape: Sequence[int], gain: float) -> np.ndarray:
     return 0.1 * numbers
 
 
-def standin_state(network: nn.Module, standin: StandIn) -> dict[str, Tensor]:
+def standin_state(network, standin):
     """A checkpoint of a network of ours: float32 tensors by name; integer buffers are 0."""
     state = {}
     for name, tensor in network.state_dict().items():
@@ -115,12 +114,12 @@ def standin_state(network: nn.Module, standin: StandIn) -> dict[str, Tensor]:
     return state
 
 
-def filled(network: nn.Module, name: str) -> nn.Module:
+def filled(network, name):
     network.load_state_dict(standin_state(network, STAND_INS[name]))
     return network
 
 
-def scene(height: int, width: int, channels: int = 1, name: str = "scene") -> np.ndarray:
+def scene(height, width, channels=1, name="scene"):
     """A picture with texture at all scales, (height, width, channels) uint8; exact, for it is made of integers."""
     total = np.zeros((height, width, channels), int)
     for cell in (3, 8, 24):

@@ -1,4 +1,4 @@
-"""Tensors come out of every kind of checkpoint, and nothing in it runs."""
+"""Tensors come out of every kind of checkpoint, and nothing in it runs; checkpoints as safetensors."""
 
 import contextlib
 import operator
@@ -9,10 +9,8 @@ import types
 import zipfile
 from argparse import Namespace
 from collections import Counter, OrderedDict
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -20,23 +18,24 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from safetensors.torch import save_file
 from torch import nn
-from weight_files import put
+from weight_files import digest_of, put
 
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.weights import load_tensors
+from mkpc_kaggle.weights import checkpoint, load_tensors
+from mkpc_kaggle.weights.checkpoint import convert
+from mkpc_kaggle.weights.manifest import UNVERIFIED, WeightFile
 
 TENSORS = {"a.weight": torch.arange(6.0).reshape(2, 3), "a.count": torch.tensor(7), "b": torch.zeros(0)}
-Save = Callable[[Any, Path], None]
 
 
 save_legacy = partial(torch.save, _use_new_zipfile_serialization=False)
 
 
-def save_pickle(value: object, path: Path) -> None:
+def save_pickle(value, path):
     path.write_bytes(pickle.dumps(value, protocol=2))
 
 
-def assert_same(loaded: dict[str, torch.Tensor], wanted: dict[str, torch.Tensor]) -> None:
+def assert_same(loaded, wanted):
     assert list(loaded) == list(wanted)
     for name, tensor in wanted.items():
         found = loaded[name]
@@ -59,7 +58,7 @@ def test_every_file_format_gives_the_same_plain_tensors(tmp_path, save, wrapped)
 @pytest.mark.parametrize("save", [torch.save, save_legacy])
 def test_anything_but_a_table_of_plain_tensors_is_refused(tmp_path, save):
     ones, base = torch.ones(2, 3), torch.zeros(10_000)
-    odd: list[object] = [ones, [ones], {"state_dict": 3}, {3: ones}, {"x": ones.to_sparse()}]
+    odd = [ones, [ones], {"state_dict": 3}, {3: ones}, {"x": ones.to_sparse()}]
     odd += [{"x": ones.to_sparse_csr()}, {"x": ones.to("meta")}]
     odd += [{"x": torch.quantize_per_tensor(ones, 0.1, 0, torch.quint8)}, {"x": torch.zeros(1).expand(1_000_000)}]
     odd += [{"x": torch.nested.nested_tensor([ones[0], ones[1, :2]])}, {str(n): base for n in range(100)}]
@@ -91,7 +90,7 @@ def schedule(epoch): ...
 
 
 @pytest.fixture
-def framework(monkeypatch: pytest.MonkeyPatch) -> types.ModuleType:
+def framework(monkeypatch):
     """A training framework that is missing when the checkpoint is read."""
     module = types.ModuleType("training_framework")
     exec(FRAMEWORK, module.__dict__)
@@ -99,7 +98,7 @@ def framework(monkeypatch: pytest.MonkeyPatch) -> types.ModuleType:
     return module
 
 
-def training_checkpoint(framework: types.ModuleType, state: dict[str, torch.Tensor]) -> dict[str, Any]:
+def training_checkpoint(framework, state):
     return {
         "epoch": 3,
         "pytorch-lightning_version": "1.3.5",
@@ -115,15 +114,9 @@ def training_checkpoint(framework: types.ModuleType, state: dict[str, torch.Tens
 def test_a_training_checkpoint_with_unknown_classes_gives_its_tensors(tmp_path, framework):
     base = torch.arange(24.0).reshape(4, 6)
     network = nn.Sequential(nn.Linear(3, 2), nn.BatchNorm1d(2))
-    state: dict[str, torch.Tensor] = OrderedDict(network.state_dict())
-    state |= {
-        "shared": base,
-        "columns": base.t(),
-        "strided": base[::2, 1::3],
-        "parameter": nn.Parameter(torch.ones(3)),
-        "empty": torch.zeros(0, 3),
-        "complex": torch.tensor([1 + 2j]),
-    }
+    state = OrderedDict(network.state_dict())
+    state |= {"shared": base, "columns": base.t(), "strided": base[::2, 1::3], "empty": torch.zeros(0, 3)}
+    state |= {"parameter": nn.Parameter(torch.ones(3)), "complex": torch.tensor([1 + 2j])}
     for dtype in (torch.bfloat16, torch.float16, torch.int64, torch.uint8, torch.bool):
         state[f"{dtype}"] = torch.tensor([[0, 1, 1], [1, 0, 0]]).to(dtype)
     assert hasattr(network.state_dict(), "_metadata")
@@ -145,14 +138,14 @@ def test_the_old_format_with_unknown_classes_is_refused(tmp_path, framework):
 class Call:
     """Pickled, it is a call of any function."""
 
-    def __init__(self, function: Callable[..., Any], *arguments: Any, state: Any = None) -> None:
-        self.reduced = (function, arguments) if state is None else (function, arguments, state)
+    def __init__(self, *reduced, **state):
+        self.reduced = (reduced[0], reduced[1:], *state.values())
 
-    def __reduce__(self) -> Any:
+    def __reduce__(self):
         return self.reduced
 
 
-def nasty(sentinel: Path) -> dict[str, object]:
+def nasty(sentinel):
     """Calls that would make the sentinel file, by what they go through."""
     command = f"touch {sentinel}"
     hidden = sentinel.with_name("hidden.pt")
@@ -188,7 +181,7 @@ def test_a_malicious_pickle_runs_nothing(tmp_path, save):
         sentinel.rmdir() if sentinel.is_dir() else sentinel.unlink()
 
 
-def with_pickle(path: Path, change: Callable[[bytes], bytes]) -> Path:
+def with_pickle(path, change):
     """A checkpoint with an unknown object beside its tensors, as torch writes it, its pickle changed."""
     torch.save({"state_dict": TENSORS, "options": Namespace()}, path)
     with zipfile.ZipFile(path) as archive:
@@ -219,7 +212,7 @@ def test_records_that_unpack_to_more_than_the_file_or_overlap_are_refused(tmp_pa
 @settings(max_examples=100)
 @given(st.lists(st.tuples(st.integers(0, 10_000), st.integers(0, 255)), min_size=1, max_size=3))
 def test_a_damaged_pickle_gives_tensors_or_a_refusal(tmp_path_factory, changes):
-    def damaged(data: bytes) -> bytes:
+    def damaged(data):
         changed = bytearray(data)
         for place, byte in changes:
             changed[place % len(data)] = byte
@@ -230,3 +223,47 @@ def test_a_damaged_pickle_gives_tensors_or_a_refusal(tmp_path_factory, changes):
         assert all(isinstance(tensor, torch.Tensor) for tensor in load_tensors(path).values())
     except UserError as refusal:
         assert "x.pt cannot be read as a checkpoint" in str(refusal)
+
+
+def test_every_tensor_comes_through_whatever_it_shares(tmp_path):
+    base = torch.arange(12.0).reshape(3, 4)
+    tensors = {"net.base": base, "net.turned": base.t(), "net.same": base, "net.count": torch.tensor([3])}
+    tensors |= {"net.half": torch.tensor(0.5, dtype=torch.bfloat16)}
+    torch.save({"state_dict": tensors, "epoch": 3}, tmp_path / "x.ckpt")
+    line = convert(tmp_path / "x.ckpt", tmp_path / "new" / "x.safetensors")
+    data = (tmp_path / "new" / "x.safetensors").read_bytes()
+    assert (line.name, line.size, line.digest) == ("x.safetensors", len(data), digest_of(data))
+    source = f"x.ckpt ({digest_of((tmp_path / 'x.ckpt').read_bytes())}) with the same tensor names"
+    assert (line.licence, line.slot, line.source) == ("?", "?", source)
+    loaded = load_tensors(tmp_path / "new" / "x.safetensors")
+    assert loaded.keys() == tensors.keys()
+    assert all(torch.equal(loaded[name], tensor) for name, tensor in tensors.items())
+    assert [path.name for path in (tmp_path / "new").iterdir()] == ["x.safetensors"]
+
+
+def test_the_line_takes_over_what_the_manifest_knows(tmp_path, monkeypatch):
+    torch.save({"a": torch.zeros(1)}, tmp_path / "x.pt")
+    digest = digest_of((tmp_path / "x.pt").read_bytes())
+    by_digest = WeightFile("known.pt", -1, digest, "MIT", "slot", "web")
+    by_name = WeightFile("x.pt", -1, UNVERIFIED, "BSD", "other", "web")
+    another = WeightFile("x.pt", -1, digest_of(b""), "BSD", "other", "web")
+    told = []
+    for files in ([by_name, by_digest], [by_name], [another]):
+        monkeypatch.setattr(checkpoint, "manifest", lambda files=files: files)
+        line = convert(tmp_path / "x.pt", tmp_path / "x.safetensors")
+        told.append((line.licence, line.slot, line.source.split()[0]))
+    assert told == [("MIT", "slot", "known.pt"), ("BSD", "other", "x.pt"), ("?", "?", "x.pt")]
+
+
+@pytest.mark.filterwarnings("ignore:ComplexHalf")
+def test_what_cannot_be_converted_is_stated(tmp_path):
+    torch.save({"a": torch.zeros(1)}, tmp_path / "x.pt")
+    torch.save({"a": torch.zeros(1).to(torch.complex32)}, tmp_path / "odd.pt")
+    for file, result, message in (
+        ("x.pt", "x.bin", r"x\.bin: the name must end in \.safetensors"),
+        ("gone.pt", "x.safetensors", r"gone\.pt cannot be read"),
+        ("odd.pt", "x.safetensors", r"odd\.pt: safetensors has no type for tensors of torch\.complex32"),
+        ("x.pt", "x.pt/x.safetensors", r"x\.safetensors cannot be written"),
+    ):
+        with pytest.raises(UserError, match=message):
+            convert(tmp_path / file, tmp_path / result)

@@ -1,40 +1,38 @@
 """Downloads against a local server: whole, broken off, resumed, wrong, impossible."""
 
-from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 from web import Site, serve
 from weight_files import DATA, digest_of, line, put
 
-from mkpc_kaggle.weights import UNVERIFIED, WeightFile, fetch
-from mkpc_kaggle.weights.fetch import ATTEMPTS, BLOCK_BYTES, Fetched, FetchOutcome, choose
+from mkpc_kaggle.weights import UNVERIFIED, fetch
+from mkpc_kaggle.weights.fetch import ATTEMPTS, BLOCK_BYTES, FetchOutcome, choose
 
 BIG = bytes(range(256)) * 1000
 CUT = 100_000
 
 
 @pytest.fixture
-def site(monkeypatch: pytest.MonkeyPatch) -> Iterator[Site]:
+def site(monkeypatch):
     monkeypatch.setenv("no_proxy", "127.0.0.1")
     with serve(Site(BIG)) as site:
         yield site
 
 
-def get(site: Site, directory: Path, file: WeightFile | None = None, pauses: list[float] | None = None) -> Fetched:
+def get(site, directory, file=None, pauses=None):
     """Download without a pause between attempts; ``pauses`` takes the seconds that there would have been."""
     wanted = replace(file or line(data=BIG), source=f"{site.url} (renamed)")
     return fetch.fetch(wanted, directory, wait=([] if pauses is None else pauses).append)
 
 
-def names_in(directory: Path) -> list[str]:
+def names_in(directory):
     return sorted(path.name for path in directory.iterdir())
 
 
 def test_a_broken_connection_is_taken_up_where_it_broke(site, tmp_path):
     site.breaks = [CUT, 5]
-    pauses: list[float] = []
+    pauses = []
     fetched = get(site, tmp_path / "new" / "weights", pauses=pauses)
     assert (fetched.outcome, fetched.note) == (FetchOutcome.FETCHED, "")
     assert fetched.path.read_bytes() == BIG
@@ -46,7 +44,7 @@ def test_a_broken_connection_is_taken_up_where_it_broke(site, tmp_path):
 
 def test_another_call_goes_on_where_the_last_one_gave_up(site, tmp_path):
     site.breaks = [CUT] + [0] * (ATTEMPTS - 1)
-    pauses: list[float] = []
+    pauses = []
     failed = get(site, tmp_path, pauses=pauses)
     assert failed.outcome is FetchOutcome.FAILED
     assert f"{ATTEMPTS} attempts failed" in failed.note
@@ -88,7 +86,7 @@ def test_only_errors_that_pass_are_waited_for(site, tmp_path, status, requests):
 
 
 def test_what_cannot_be_reached_or_written_is_told(site, tmp_path):
-    pauses: list[float] = []
+    pauses = []
     gone = fetch.fetch(replace(line(), source="http://127.0.0.1:9/a.bin"), tmp_path, wait=pauses.append)
     assert (gone.outcome, len(pauses)) == (FetchOutcome.FAILED, ATTEMPTS - 1)
     assert "127.0.0.1:9" in gone.note
