@@ -43,7 +43,6 @@ SCENES = {
 }
 OF_NAN = "sample_id,fundamental_matrix\n1,nan nan nan nan nan nan nan nan nan\n"
 SUBMISSIONS = {
-    "empty": "",
     "of NaN": OF_NAN,
     "of huge numbers": "sample_id,fundamental_matrix\n1,1e308 1e308 1 1 1 1 1 1 1\n",
 }
@@ -121,6 +120,7 @@ CASES = [
         statuses=REFUSED,
         says=r"a\x1b[2J\n: no",
     ),
+    Case("arguments", "an empty submission", SCORE, written("sub.csv", ""), REFUSED, "lacks the columns"),
     Case("arguments", "an owner that is a path", "package --out out/p --owner ../x", statuses=REFUSED),
     *signals(),
 ]
