@@ -173,11 +173,11 @@ def draw_both(images: Images, match: PairMatch) -> "Figure":
     counts = [
         f"{what}: stage {stage}, {np.count_nonzero(match.in_stage(stage))} points, "
         f"{np.count_nonzero(match.in_stage(stage) & inliers)} inliers"
-        for stage, what in ((1, "blue dots"), (2, "orange triangles"))
+        for stage, what in ((1, "dots"), (2, "triangles"))
     ]
     _title(row[0], "\n".join(counts))
     total = f"together: {len(match.matches)} points, {match.estimate.inlier_count} inliers"
-    _title(row[1], f"{total}\ngrey crosses: outliers")
+    _title(row[1], f"{total}\ncrosses: outliers")
     return figure
 
 

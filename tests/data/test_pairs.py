@@ -1,6 +1,7 @@
 """Lists of pairs: lines that are read or refused, and what ``validate`` makes of a list."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np

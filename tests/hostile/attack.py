@@ -24,6 +24,7 @@ HANGS_S = 600
 REFUSED = (2,)
 EITHER = (0, 1, 2)  # a valid result, a result that states what is missing, or a clear refusal
 CRASHES = ("Traceback (most recent call last)", "Fatal Python error", "Segmentation fault", "core dumped")
+MISTYPED = ("expected one argument", "unrecognized arguments", "arguments are required")  # a mistake of the case
 ENDED_BY_ITSELF = (0, 1, 128 + signal.SIGINT, 128 + signal.SIGTERM)
 TOO_LATE = "the time limit passed before the first results"
 MARK = "MKPC_HOSTILE_CASE"
@@ -121,7 +122,7 @@ def _wait(process, room):
 
 
 def _faults(case, status, output, room):
-    yield from (f"the output has {crash!r}" for crash in CRASHES if crash in output)
+    yield from (f"the output has {crash!r}" for crash in (*CRASHES, *MISTYPED) if crash in output)
     if status is None:
         yield f"it hangs: not over after {HANGS_S} s"
     elif status not in case.statuses:

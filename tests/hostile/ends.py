@@ -28,7 +28,6 @@ SCENES = {
 HEADER = "sample_id,fundamental_matrix\n"
 SUBMITTED_NAN = written("sub.csv", f"{HEADER}1,nan nan nan nan nan nan nan nan nan\n")
 SUBMISSIONS = {
-    "a submission empty": written("sub.csv", ""),
     "a submission of NaN": SUBMITTED_NAN,
     "a submission of huge numbers": written("sub.csv", f"{HEADER}1,1e308 1e308 1 1 1 1 1 1 1\n"),
 }
@@ -87,6 +86,7 @@ CASES = [
     *makes("arguments", SCORE, SUBMISSIONS, (0,)),
     *makes("arguments", "check sub.csv --test-dir D", {"a checked submission of NaN": SUBMITTED_NAN}, (1,)),
     Case("arguments", "a name that clears the screen", "match 'a\x1b[2J\n' b", statuses=REFUSED, says=CLEARED),
+    Case("arguments", "an empty submission", SCORE, written("sub.csv", ""), REFUSED, "lacks the columns"),
     Case("arguments", "an owner that is a path", "package --out out/p --owner ../x", statuses=REFUSED),
     *signals(),
 ]

@@ -3,7 +3,7 @@
 import os
 
 from attack import Case, nothing
-from room import SUBMIT, makes, options, resumed
+from room import REPORTED, makes, options, resumed
 
 REFUSALS = {
     "the table": "D/test.csv",
@@ -12,7 +12,7 @@ REFUSALS = {
     "a name that ends as work directories do": "out/q.work",
     "a name of 300 characters": f"out/{'s' * 300}.csv",
     "below /proc": "/proc/s.csv",
-    "the submission in the lock's place": "--work-dir out --output out/journal.lock",
+    "the submission in the lock's place": "out/journal.lock --work-dir out",
     "the full device": "/dev/full",
     "the journal among the images": "out/s.csv --work-dir D/test_images",
 }
@@ -80,7 +80,7 @@ def in_folder(table):
 
 MATCH = "match D/test_images/b1/x.png D/test_images/b1/y.png --recipe quick.toml --out"
 EXPORT = "journal out/s.work --csv"
-TO = SUBMIT.replace("out/s.csv --no-report ", "") + " --output"
+TO = f"{REPORTED} --output"  # the last one counts
 ODD = {"a line feed": "'out/a\nb.csv'", "new directories": "out/a/b/c/d/s.csv"}
 CASES = [
     *options("outputs", TO, REFUSALS),
