@@ -154,7 +154,10 @@ class Scenes:
         return tuple(self.made.get(name) or SceneRecord(name, failure=missing[name]) for name in self.batches)
 
     def _due(self, now: float) -> str | None:
-        """Return a batch whose pairs have what fits, all units if it has a scene already, or whatever they get."""
+        """Return a batch to reconstruct now, if any.
+
+        A first scene waits for the units that fit, the next one for all units, and none after matching has ended.
+        """
         if not (waiting := self.waiting()):
             return None
         pending, plan = self._estimates.pending(now), self._plan

@@ -18,7 +18,7 @@ class State:
     ``had`` (N, U): the current points. ``matches`` (N,): their number. ``is_estimated`` (N,): whether the estimate
     is current. ``inliers`` (N,), ``own`` (N, 3, 3), ``has_own`` (N,): of the standing estimate. ``unreadable``
     (N,): an image cannot be read. The first ``rows`` pairs have a row. ``changed`` are the pairs with other points
-    or another estimate since their scenes were looked at. ``digests`` are those of the images by name.
+    or another estimate since their scenes were looked at. ``digests`` has the digest of each image by name.
     """
 
     def __init__(
