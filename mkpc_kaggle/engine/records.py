@@ -97,8 +97,8 @@ class PairRecord:
 class SceneRecord:
     """The reconstruction of a batch: numbers of images, registered images and points, and its models.
 
-    The largest model comes first. A model keeps some of its points, evenly chosen. ``failure`` is the reason for no
-    model.
+    The largest model comes first. A model keeps some of its points, evenly chosen. Without a model, ``failure`` is
+    the reason.
     """
 
     batch: str
