@@ -15,6 +15,7 @@ from faulty import (
     thread_place,
     use_places,
 )
+from mkpc_kaggle.pipeline.failures import DeviceError, FailureKind, failure_of, reason_of
 from rectified import SECOND, SWEEP, THIRD, THREE_UNITS, RectifiedMatcher, matrices, run
 
 from mkpc_kaggle.cli import main, options
@@ -23,7 +24,6 @@ from mkpc_kaggle.engine.places import Place
 from mkpc_kaggle.engine.request import Ending, RunReport
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.pipeline.assembly import Assembly, assemble
-from mkpc_kaggle.pipeline.failures import DeviceError, FailureKind, failure_of, reason_of
 
 COUNT = 12
 VICTIM = 3  # brightness 13

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from device_double import DeviceDouble
+from mkpc_kaggle.pipeline.failures import DeviceError
 
 from mkpc_kaggle.data.images import Image
 from mkpc_kaggle.engine.places import LocalSite, Work
@@ -17,7 +18,6 @@ from mkpc_kaggle.matchers.dtypes import check_finite, exact_float32
 from mkpc_kaggle.pipeline import devices
 from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.pipeline.devices import fastest_precision, gpu_capabilities, require_device, resolve_placement
-from mkpc_kaggle.pipeline.failures import DeviceError
 from mkpc_kaggle.pipeline.pair import PairMatch
 from mkpc_kaggle.pipeline.stages import Pipeline
 from mkpc_kaggle.recipe import Recipe, Unit
