@@ -15,7 +15,6 @@ from faulty import (
     thread_place,
     use_places,
 )
-from mkpc_kaggle.pipeline.failures import DeviceError, FailureKind, failure_of, reason_of
 from rectified import SECOND, SWEEP, THIRD, THREE_UNITS, RectifiedMatcher, matrices, run
 
 from mkpc_kaggle.cli import main, options
@@ -23,6 +22,7 @@ from mkpc_kaggle.data.competition import read_test_side, submission_problems
 from mkpc_kaggle.engine.places import Place
 from mkpc_kaggle.engine.request import Ending, RunReport
 from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.matchers.failures import DeviceError, FailureKind, failure_of, reason_of
 from mkpc_kaggle.pipeline.assembly import Assembly, assemble
 
 COUNT = 12

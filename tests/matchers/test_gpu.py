@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 from device_double import DeviceDouble
-from mkpc_kaggle.pipeline.failures import DeviceError
 
 from mkpc_kaggle.data.images import Image
 from mkpc_kaggle.engine.places import LocalSite, Work
@@ -15,6 +14,7 @@ from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import MatcherSpec, NonFiniteError, Precision
 from mkpc_kaggle.matchers.dtypes import check_finite, exact_float32
+from mkpc_kaggle.matchers.failures import DeviceError
 from mkpc_kaggle.pipeline import devices
 from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.pipeline.devices import fastest_precision, gpu_capabilities, require_device, resolve_placement
@@ -96,7 +96,7 @@ def settings():
 class Own:
     """Encodes pictures as ``value`` and matches nothing; notes how GPUs were to compute."""
 
-    spec = MatcherSpec("own", "own")
+    spec = MatcherSpec("own")
 
     def __init__(self, value):
         self.value = value
