@@ -38,6 +38,11 @@ def shown(name: object) -> str:
     return "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in str(name))
 
 
+def printable(text: str) -> str:
+    """Return ``text`` with escapes for characters that UTF-8 cannot encode. Paths may have them."""
+    return text.encode("utf-8", "backslashreplace").decode()
+
+
 @contextmanager
 def writing(what: str) -> Iterator[None]:
     """Convert an ``OSError`` in the block to a :class:`UserError`: ``what`` cannot be written."""

@@ -13,7 +13,7 @@ from mkpc_kaggle.cli import options
 from mkpc_kaggle.config import from_table
 from mkpc_kaggle.data.competition import TrainScene, read_train_side
 from mkpc_kaggle.data.outputs import require_apart
-from mkpc_kaggle.data.pairs import read_pairs, read_regions
+from mkpc_kaggle.data.pairs import read_pairs
 from mkpc_kaggle.engine.console import say
 from mkpc_kaggle.engine.request import Ending
 from mkpc_kaggle.engine.session import Interrupt, Session, Watchdog, interruptible
@@ -30,6 +30,7 @@ from mkpc_kaggle.evaluation.validate import (
 )
 from mkpc_kaggle.geometry.robust import Method, RobustConfig
 from mkpc_kaggle.pipeline.assembly import Assembly
+from mkpc_kaggle.pipeline.stages import read_regions
 from mkpc_kaggle.recipe import split_mode
 from mkpc_kaggle.reporting.summary import left_out_line, summary, trouble
 
@@ -108,10 +109,8 @@ def run(arguments: argparse.Namespace) -> int:
     else:
         names = filter(None, arguments.scenes.split(","))
         scenes = read_train_side(root, scenes=names, min_covisibility=least, pairs_per_scene=most)
-    status = 0
-    figures: dict[str, Any] | None = None
     if arguments.submission is not None:
-        figures = _score(arguments, scenes)
+        status, figures = _score(arguments, scenes)
     else:
         with tempfile.TemporaryDirectory(prefix="mkpc-") as temporary:
             status, figures = _match_and_score(arguments, scenes, root, arguments.work_dir or Path(temporary))
@@ -144,14 +143,14 @@ def _require_a_whole(given: argparse.Namespace) -> None:
             raise UserError(message)
 
 
-def _score(arguments: argparse.Namespace, scenes: Sequence[TrainScene]) -> dict[str, Any]:
-    """Print the scores of submissions. Return all figures."""
+def _score(arguments: argparse.Namespace, scenes: Sequence[TrainScene]) -> tuple[int, dict[str, Any] | None]:
+    """Print the scores of submissions. Return the exit status and all figures."""
     figures = []
     for submission in arguments.submission:
         validation = score_submission(submission, arguments.truth, scenes)
         say("\n".join([str(submission), *score_table(validation)]))
         figures.append(to_json(validation))
-    return {"submissions": figures} if len(figures) > 1 else figures[0]
+    return 0, {"submissions": figures} if len(figures) > 1 else figures[0]
 
 
 def _match_and_score(
@@ -164,17 +163,15 @@ def _match_and_score(
     compared: list[str] = arguments.compare or []
     choices = [split_mode(text) for text in compared] or [(arguments.recipe, arguments.mode)]
     pairs = [true.pair for scene in scenes for true in scene.pairs]
-    regions = None if arguments.regions is None else read_regions(arguments.regions, root, pairs)
+    regions = {} if arguments.regions is None else read_regions(arguments.regions, root, pairs)
     validations, status = [], 0
     with interruptible() as interrupt, Watchdog(options.budget_of(arguments), interrupt) as watchdog:
         watchdog.save = lambda: "the time limit passed before the scores were printed"
-        assemblies = [_assemble(arguments, interrupt, *choice) for choice in choices]
+        assemblies = [replace(_assemble(arguments, interrupt, *choice), regions=regions) for choice in choices]
         for number, assembly in enumerate(assemblies):
             session = Session(work_dir, options.budget_of(arguments), interrupt, workers=arguments.workers)
             in_front = arguments.in_front or arguments.protocol is not None
-            validation = validate(
-                scenes, replace(assembly, regions=regions or {}), session, str(root), in_front=in_front
-            )
+            validation = validate(scenes, assembly, session, str(root), in_front=in_front)
             validations.append(validation)
             report = validation.report
             assert report is not None

@@ -9,12 +9,12 @@ import csv
 import os
 import re
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,8 +31,6 @@ MAX_LINE = 1 << 24  # characters of a row: another file may be one line of gigab
 CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")  # characters that end lines, or drive a terminal
 # Names of directories, of drives (Windows), and names that no file can have.
 NOT_PLAIN = re.compile(rf"^\.{{0,2}}$|^[A-Za-z]:|[/\\]|{CONTROL.pattern}")
-
-Item = TypeVar("Item")
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +80,7 @@ def read_test_side(directory: Path) -> tuple[Pair, ...]:
     """
     path, images = test_side(directory)
     pairs: dict[str, Pair] = {}
-    files = cache(lambda batch: ImageFiles(images / batch))
+    files = cache(lambda batch: image_files(images / batch))
     for where, (sample, *ids) in read_rows(path, ("sample_id", "batch_id", "image_1_id", "image_2_id")):
         if sample in pairs:
             raise UserError(f"{where}: the sample_id {sample!r} is not unique")
@@ -90,7 +88,7 @@ def read_test_side(directory: Path) -> tuple[Pair, ...]:
             raise UserError(f"{where}: the sample_id {sample!r} has control characters: no submission can hold it")
         batch, first, second = (plain_name(name, where) for name in ids)
         # A large table names a batch in thousands of rows: interning shares one string.
-        pairs[sample] = Pair(sample, sys.intern(batch), files(batch)[first], files(batch)[second])
+        pairs[sample] = Pair(sample, sys.intern(batch), files(batch)(first), files(batch)(second))
     if not images.is_dir():
         raise UserError(f"{images}: no such directory; --test-dir must hold test.csv and test_images/")
     if not pairs:
@@ -105,13 +103,11 @@ def read_train_side(
     min_covisibility: float = 0.1,
     pairs_per_scene: int | None = None,
 ) -> tuple[TrainScene, ...]:
-    """Return the named scenes of a train side, or all of them.
+    """Return the named scenes of a train side, or all; ``pairs_per_scene`` are evenly spread over their table.
 
-    ``pairs_per_scene`` limits each scene to that number of pairs, evenly spread over its table. Raises
-    :class:`UserError` for missing files and scenes, and for malformed cells.
+    Raises :class:`UserError` for missing files and scenes, and for malformed cells.
     """
-    path = directory / "scaling_factors.csv"
-    rows = read_rows(path, ("scene", "scaling_factor"))
+    rows = read_rows(directory / "scaling_factors.csv", ("scene", "scaling_factor"))
     metres = {plain_name(scene, where): float(*_numbers(cell, where, 1)) for where, (scene, cell) in rows}
     wanted = list(scenes) or sorted(name for name in metres if (directory / name).is_dir())
     if not wanted:
@@ -127,15 +123,14 @@ def _read_scene(directory: Path, metres: float, min_covisibility: float, most: i
     for where, (image, *cells) in read_rows(directory / "calibration.csv", columns):
         K, R, t = (_numbers(cell, where, count) for cell, count in zip(cells, (9, 9, 3), strict=True))
         cameras[plain_name(image, where)] = Camera(K.reshape(3, 3), R.reshape(3, 3), t)
-    path = directory / "pair_covisibility.csv"
-    images, pairs = ImageFiles(directory / "images"), []
+    path, images, pairs = directory / "pair_covisibility.csv", image_files(directory / "images"), []
     for where, (key, cell) in read_rows(path, ("pair", "covisibility")):
         covisibility = float(*_numbers(cell, where, 1))
         first, _, second = key.partition("-")
         if first not in cameras or second not in cameras:
             raise UserError(f"{where}: the pair {key!r} is not two images of calibration.csv")
         if covisibility >= min_covisibility:
-            pair = Pair(pair_id(directory.name, first, second), directory.name, images[first], images[second])
+            pair = Pair(f"{directory.name};{key}", directory.name, images(first), images(second))
             pairs.append(TruePair(pair, cameras[first], cameras[second], covisibility))
     if not pairs:
         raise UserError(f"{path} has no pair with a covisibility of at least {min_covisibility:g}")
@@ -163,22 +158,21 @@ def submission_problems(path: Path, sample_ids: Sequence[str]) -> list[str]:
         rows = [cells for _, cells in read_rows(path, SUBMISSION_COLUMNS, only=True)]
     except UserError as error:
         return [str(error)]
-    found, problems = [sample for sample, _ in rows], []
-    present, wanted = set(found), set(sample_ids)
-    if missing := [sample for sample in sample_ids if sample not in present]:
+    found, problems = dict.fromkeys(sample for sample, _ in rows), []
+    wanted = dict.fromkeys(sample_ids)
+    if missing := [sample for sample in wanted if sample not in found]:
         problems.append(f"{len(missing)} samples are missing, the first is {missing[0]}")
     elif surplus := [sample for sample in found if sample not in wanted]:
         problems.append(f"{len(surplus)} samples are not in test.csv, the first is {surplus[0]}")
-    elif found != list(sample_ids):
+    elif [sample for sample, _ in rows] != [*wanted]:
         problems.append("the samples are not in the order of test.csv, or a sample appears twice")
     for sample, cell in rows:
         try:
             F = _numbers(cell, sample, 9)
-        except UserError as error:
-            problems.append(str(error))
-        else:
             if not F.any() or not np.isfinite(F).all():
                 problems.append(f"{sample}: the matrix is zero, or a number in it is not finite")
+        except UserError as error:
+            problems.append(str(error))
     return problems
 
 
@@ -210,35 +204,26 @@ def read_rows(path: Path, columns: Sequence[str], *, only: bool = False) -> Iter
         raise UserError(f"{path} cannot be read as a table: {error}") from error
 
 
-def plain_name(name: str, where: object) -> str:
+def plain_name(name: str, where: str) -> str:
     """Return ``name`` if it is a plain file name. Raise :class:`UserError` if it may leave its directory."""
     if NOT_PLAIN.search(name):
         raise UserError(f"{where}: the id {name!r} is not a plain name, so it cannot name a file here")
     return name
 
 
-def pair_id(scene: str, first: str, second: str) -> str:
-    """Return the id of a pair of the train side in a run."""
-    return f"{scene};{first}-{second}"
-
-
-def evenly_spread(items: Sequence[Item], most: int | None) -> list[Item]:
+def evenly_spread(items: Sequence[Any], most: int | None) -> list[Any]:
     """Return up to ``most`` of the items, including the first and the last."""
     count = len(items) if most is None else min(most, len(items))
     return [items[index] for index in np.linspace(0, len(items) - 1, count).round().astype(int)]
 
 
-class ImageFiles(dict[str, str]):
-    """Paths of the images of a directory by id, listed once; an unknown id gives a png that does not exist."""
-
-    def __init__(self, directory: Path) -> None:
-        self.directory = directory
-        with suppress(OSError, ValueError):  # missing, too long, or not of the file system's encoding
-            images = sorted(path for path in directory.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES)
-            self.update((path.stem, str(path)) for path in reversed(images))
-
-    def __missing__(self, image_id: str) -> str:
-        return f"{self.directory}{os.sep}{image_id}.png"  # a Path would cache the name of each missing image
+def image_files(directory: Path) -> Callable[[str], str]:
+    """List a directory. Return the path of an image by its id; an unknown id gives a png that does not exist."""
+    known: dict[str, str] = {}
+    with suppress(OSError, ValueError):  # missing, too long, or not of the file system's encoding
+        images = sorted(path for path in directory.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES)
+        known = {path.stem: str(path) for path in reversed(images)}
+    return lambda name: known.get(name) or f"{directory}{os.sep}{name}.png"
 
 
 def _numbers(cell: str, where: str, count: int) -> NDArray[np.float64]:

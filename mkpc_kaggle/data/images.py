@@ -16,7 +16,7 @@ from io import BytesIO
 from math import hypot, inf
 from numbers import Real
 from pathlib import Path
-from typing import Generic, TypeVar
+from typing import Any
 
 import cv2
 import numpy as np
@@ -26,10 +26,6 @@ from mkpc_kaggle.config import Range
 from mkpc_kaggle.errors import shown
 from mkpc_kaggle.geometry.coordinates import Pixels, Size
 
-Key = TypeVar("Key")
-Value = TypeVar("Value")
-
-NOT_A_PICTURE = "not a picture, or cut off: it cannot be decoded"
 MAX_ASPECT = 32  # of the sides; longer views would be a few pixels high, or would not fit into memory
 
 ORIENTATION, DIRECTORY, FOCAL_MM = 0x0112, 0x8769, 0x920A  # tags of EXIF
@@ -61,8 +57,7 @@ class Image:
 
     @property
     def size(self) -> Size:
-        height, width = self.pixels.shape[:2]
-        return Size(width, height)
+        return Size(self.pixels.shape[1], self.pixels.shape[0])
 
     @cached_property
     def gray(self) -> Pixels:
@@ -102,7 +97,8 @@ def read_image(path: Path) -> Image | Unreadable:
     except (OSError, ValueError, MemoryError, cv2.error) as error:
         return Unreadable(name, f"cannot be read: {error}")
     if bgr is None:
-        return Unreadable(name, NOT_A_PICTURE if data.size else "the file is empty")
+        cause = "not a picture, or cut off: it cannot be decoded" if data.size else "the file is empty"
+        return Unreadable(name, cause)
     height, width = bgr.shape[:2]
     if max(height, width) > MAX_ASPECT * min(height, width):
         return Unreadable(name, f"{width} x {height} pixels: one side is more than {MAX_ASPECT} times the other")
@@ -142,25 +138,20 @@ def _content_digest(data: Pixels) -> str:
     return hashlib.blake2b(data.data, digest_size=16).hexdigest()
 
 
-def printable(text: str) -> str:
-    """Return ``text`` with escapes for characters that UTF-8 cannot encode. Paths may have them."""
-    return text.encode("utf-8", "backslashreplace").decode()
-
-
-class ByteCache(Generic[Key, Value]):
+class ByteCache:
     """Cache of the most recently used values, up to ``limit`` bytes. Not thread-safe."""
 
     def __init__(self, limit: int) -> None:
         self.limit, self.bytes = limit, 0
-        self._entries: OrderedDict[Key, tuple[Value, int]] = OrderedDict()
+        self._entries: OrderedDict[Any, tuple[Any, int]] = OrderedDict()
 
-    def get(self, key: Key) -> Value | None:
-        if key not in self._entries:
-            return None
-        self._entries.move_to_end(key)
-        return self._entries[key][0]
+    def get(self, key: Any) -> Any:
+        """Return the value of a key, or ``None``."""
+        if key in self._entries:
+            self._entries.move_to_end(key)
+        return self._entries.get(key, (None,))[0]
 
-    def put(self, key: Key, value: Value, size: int) -> None:
+    def put(self, key: Any, value: Any, size: int) -> None:
         self.bytes -= self._entries.pop(key, (value, 0))[1]
         if size <= self.limit:
             self._entries[key] = value, size
@@ -173,7 +164,7 @@ class ImageStore:
     """Images by path, decoded in the background; caches the most recently used. Not thread-safe."""
 
     def __init__(self, limit_bytes: int = 512 << 20) -> None:
-        self._images: ByteCache[Path, Image] = ByteCache(limit_bytes)
+        self._images = ByteCache(limit_bytes)
         self._pending: dict[Path, Future[Image | Unreadable]] = {}
         self._decoder = ThreadPoolExecutor(1, thread_name_prefix="decode")
 
@@ -186,7 +177,7 @@ class ImageStore:
     def get(self, path: Path) -> Image | Unreadable:
         """Wait until the image is decoded, then return it."""
         self.prefetch([path])
-        image = self._images.get(path) or self._pending.pop(path).result()
+        image: Image | Unreadable = self._images.get(path) or self._pending.pop(path).result()
         if isinstance(image, Image):
             self._images.put(path, image, image.pixels.nbytes)
         return image

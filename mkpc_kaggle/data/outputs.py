@@ -30,7 +30,7 @@ def require_apart(
     files = {option: path for option, path in outputs.items() if path is not None}
     inputs = list(inputs)
     for option, path in files.items():
-        is_result = path.suffix.lower() in RESULTS.get(option, ())
+        is_result = path.suffix.lower() in RESULTS[option]
         if not path.name or os.path.isdir(path):  # noqa: PTH112  Path raises for a name that is too long
             raise UserError(f"{option} {str(path)!r} is a directory; name a file")
         lost = [f"{other} {there}" for other, there in files.items() if other != option and same_file(path, there)]
@@ -43,19 +43,18 @@ def require_apart(
             raise UserError(f"{option} {path} would be written over {lost[0]}; name another file")
         if option in ("--json", "--report") and not is_result and os.path.isfile(path):  # noqa: PTH113
             raise UserError(f"{option} {path} exists and is not a {RESULTS[option][0]} file; name another file")
-    for source in inputs:
-        if work_dir is not None and lies_in(work_dir, source):
-            raise UserError(f"--work-dir {work_dir} would be written over the input {source}; name another place")
+    if work_dir is not None and (source := next((each for each in inputs if lies_in(work_dir, each)), None)):
+        raise UserError(f"--work-dir {work_dir} would be written over the input {source}; name another place")
 
 
 def require_table(path: Path, columns: Iterable[str]) -> None:
     """Raise :class:`UserError` if ``path`` exists and is not a table with these columns."""
+    with suppress(OSError):
+        if path.is_file() and not path.is_symlink():  # a pipe would block
+            with path.open(encoding="utf-8", errors="replace") as stream:
+                if stream.readline(1 << 16).rstrip("\n") == ",".join(columns):
+                    return
     if os.path.lexists(path):
-        with suppress(OSError):
-            if path.is_file() and not path.is_symlink():  # a pipe would block
-                with path.open(encoding="utf-8", errors="replace") as stream:
-                    if stream.readline(1 << 16).rstrip("\n") == ",".join(columns):
-                        return
         raise UserError(f"{path} exists and is no such table; name another directory")
 
 
@@ -70,10 +69,9 @@ def lies_in(path: Path, directory: Path) -> bool:
 
 
 def same_file(path: Path, other: Path) -> bool:
-    try:  # links, and case-insensitive file systems
+    with suppress(OSError):  # links, and case-insensitive file systems
         return os.path.realpath(path) == os.path.realpath(other) or path.samefile(other)
-    except OSError:
-        return False
+    return False
 
 
 @contextmanager

@@ -3,14 +3,12 @@
 One line per pair: ``name0 name1 turns0 turns1 K0 K1 T_0to1``, separated by blanks. Names are paths under the image
 root. ``turns`` are the counter-clockwise quarter turns that set an image upright, in addition to its EXIF's. K (9
 numbers) and T (16) are stored row by row and refer to the stored pixels: X_1 = R X_0 + t with T = [R t; 0 1].
-
 A file ``.npz``, or a directory of ``.npz`` files, is LoFTR's list of MegaDepth-1500, ``scene_info``.
 """
 
 import pickle
 import zipfile
-from collections.abc import Iterable, Iterator
-from contextlib import suppress
+from collections.abc import Iterator
 from io import BytesIO
 from itertools import chain
 from math import nan
@@ -18,17 +16,14 @@ from pathlib import Path, PureWindowsPath
 from typing import Any
 
 import numpy as np
-import PIL.Image
 
-from mkpc_kaggle.data.competition import Pair, TrainScene, TruePair, evenly_spread, read_rows
+from mkpc_kaggle.data.competition import Pair, TrainScene, TruePair, evenly_spread
 from mkpc_kaggle.errors import UserError, read_text
 from mkpc_kaggle.geometry.cameras import Camera
-from mkpc_kaggle.geometry.coordinates import Box
 
 FIELDS = 2 + 2 + 9 + 9 + 16
 EXPECTED = "name0 name1 turns0 turns1 K0 (9 numbers) K1 (9) T_0to1 (16)"
 MAX_SKEWNESS = 1e-3  # of R R^T from the identity; files round poses to few digits
-MAX_ARRAY_BYTES = 1 << 28  # limit for an unpacked array of a .npz
 # The only names that pickled arrays need. Any other name might run code.
 NAMES = {"ndarray": np.ndarray, "dtype": np.dtype, "encode": lambda text, _: text.encode("latin-1")}
 NAMES |= {"_reconstruct": np.empty(0).__reduce__()[0], "scalar": np.float64(0).__reduce__()[0]}
@@ -37,8 +32,8 @@ NAMES |= {"_reconstruct": np.empty(0).__reduce__()[0], "scalar": np.float64(0)._
 def read_pairs(file: Path, image_root: Path, *, most: int | None = None) -> TrainScene:
     """Return the pairs of a list as a scene of unknown scale, with intrinsics to estimate E.
 
-    ``most`` limits the number of pairs, evenly spread. An unreadable image is not an error here: the run reports
-    it. Raises :class:`UserError` for a list without pairs and for a malformed line.
+    ``most`` limits the number of pairs, evenly spread. An unreadable image is not an error here. Raises
+    :class:`UserError` for a list without pairs and for a malformed line.
     """
     if not image_root.is_dir():
         raise UserError(f"--image-root {image_root}: no such directory")
@@ -51,44 +46,12 @@ def read_pairs(file: Path, image_root: Path, *, most: int | None = None) -> Trai
     return TrainScene(file.stem, nan, tuple(evenly_spread(pairs, most)))
 
 
-def read_regions(file: Path, image_root: Path, pairs: Iterable[Pair]) -> dict[tuple[str, ...], tuple[Box, Box]]:
-    """Return the stage-2 boxes of these pairs, keyed by their image files.
-
-    ``file`` is a table ``image_0,image_1,box_0,box_1``: paths under the root; left, top, right and bottom in whole
-    pixels of the stored file, the latter two exclusive. Raises :class:`UserError` for a malformed table, for a box
-    that is malformed or extends beyond its image, and for a missing pair.
-    """
-    boxes: dict[tuple[str, ...], tuple[Box, Box]] = {}
-    found: dict[tuple[str, ...], tuple[Box, Box]] = {}
-    for where, (name0, name1, *cells) in read_rows(file, ("image_0", "image_1", "box_0", "box_1")):
-        try:
-            box0, box1 = (Box(*map(int, cell.split())) for cell in cells)
-        except (ValueError, TypeError) as error:
-            message = f"expected left, top, right and bottom of a box, found {cells[0]!r} and {cells[1]!r}"
-            raise UserError(f"{where}: {message}") from error
-        boxes[str(image_root / name0), str(image_root / name1)] = box0, box1
-    for pair in pairs:
-        files = pair.file0, pair.file1
-        if files not in boxes:
-            raise UserError(f"{file} has no regions of the pair {pair.id}")
-        found[files] = boxes[files]
-        for path, box in zip(files, boxes[files], strict=True):
-            with suppress(OSError, PIL.Image.DecompressionBombError), PIL.Image.open(path) as picture:
-                if box.right > picture.width or box.bottom > picture.height:
-                    size = f"{picture.width} x {picture.height}"
-                    raise UserError(
-                        f"{file}: a box ends at {box.right}, {box.bottom}, beyond {path} of {size} pixels"
-                    )
-    return found
-
-
 def parse_line(line: str, file: Path, number: int, image_root: Path) -> TruePair:
     """Return the pair of a line. Raise :class:`UserError` with its location and the expected format."""
     cells, where = line.split(), f"{file}, line {number}"
     if len(cells) != FIELDS:
         raise UserError(f"{where}: expected {FIELDS} fields, {EXPECTED}, found {len(cells)}")
-    names = cells[:2]
-    for name in names:
+    for name in (names := cells[:2]):
         path = PureWindowsPath(name)  # the strictest rules: drives and backslashes count too
         if path.anchor or ".." in path.parts or "\0" in name:
             raise UserError(f"{where}: {name!r} points outside the image root; expected a path without ..")
@@ -117,10 +80,10 @@ def parse_line(line: str, file: Path, number: int, image_root: Path) -> TruePair
 
 
 def lines_of_scene_info(file: Path) -> Iterator[str]:
-    """Yield a line of the list for each pair of a ``scene_info`` file.
+    """Yield a line of the list for each pair of a ``scene_info`` file, without executing code of the file.
 
     A pair has two indices into ``image_paths``, ``intrinsics``, (3, 3), and ``poses``, (4, 4) world to camera.
-    Raises :class:`UserError` for any other file. Executes no code of the file.
+    Raises :class:`UserError` for any other file.
     """
     try:
         with zipfile.ZipFile(file) as archive:
@@ -142,8 +105,6 @@ class _Arrays(pickle.Unpickler):
 
 
 def _array(archive: zipfile.ZipFile, name: str) -> Any:
-    if archive.getinfo(name).file_size > MAX_ARRAY_BYTES:
-        raise ValueError(f"{name} has more than {MAX_ARRAY_BYTES} bytes")
     stream = BytesIO(archive.read(name))
     try:
         return np.lib.format.read_array(stream, allow_pickle=False)

@@ -45,9 +45,7 @@ class World:
 
 
 def build_world(name: str, *, seed: int = 0, image_scale: float = 1.0) -> World:
-    """Build a world. Only its name and the seed decide its content. Raises ValueError for an unknown name."""
-    if name not in SCENES:
-        raise ValueError(f"unknown scene {name!r}; known: {', '.join(SCENE_NAMES)}")
+    """Build a world. Only its name, one of ``SCENE_NAMES``, and the seed decide its content."""
     rng = np.random.default_rng([seed, *name.encode()])
     unit = 1 / SCENES[name]
     surfaces = tuple(

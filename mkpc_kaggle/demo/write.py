@@ -57,8 +57,7 @@ def write_demo(
     """Render the scenes (all of them by default) and write both sides under `directory`.
 
     The same arguments give the same bytes. `image_scale` scales all images and their K.
-    Raises ValueError for an unknown scene, and :class:`UserError` if the directory has a train or test side that
-    no demo wrote.
+    Raises :class:`UserError` if the directory has a train or test side that no demo wrote.
     """
     demo = DemoSet(directory, directory / "train", directory / "test", directory / "test_truth.csv")
     _claim(demo)

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from mkpc_kaggle.data.images import printable
 from mkpc_kaggle.engine.jobs import Estimated, Outcome, PairPoints, WantedPair
 from mkpc_kaggle.engine.journal_reader import (
     FILE_NAME,
@@ -24,7 +23,7 @@ from mkpc_kaggle.engine.journal_reader import (
     undamaged,
 )
 from mkpc_kaggle.engine.records import SceneRecord
-from mkpc_kaggle.errors import UserError, writing
+from mkpc_kaggle.errors import UserError, printable, writing
 from mkpc_kaggle.recipe import Unit
 from mkpc_kaggle.scene.choose import Choice
 

@@ -35,7 +35,7 @@ from mkpc_kaggle.engine.journal_reader import JournalReader
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import ModelKind
-from mkpc_kaggle.pipeline import failures
+from mkpc_kaggle.matchers import failures
 from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult, with_estimate
 from mkpc_kaggle.recipe import Recipe, Unit
 from mkpc_kaggle.scene.reconstruct import Solution, reconstruct_batch

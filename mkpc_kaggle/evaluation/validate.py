@@ -14,7 +14,7 @@ from typing import Any
 
 from scipy.spatial.transform import Rotation
 
-from mkpc_kaggle.data.competition import TrainScene, TruePair, pair_id, read_rows, read_submission
+from mkpc_kaggle.data.competition import TrainScene, TruePair, read_rows, read_submission
 from mkpc_kaggle.engine.journal_reader import JournalReader
 from mkpc_kaggle.engine.records import PairRecord
 from mkpc_kaggle.engine.request import RunReport
@@ -211,8 +211,8 @@ def score_submission(submission: Path, truth: Path, scenes: Sequence[TrainScene]
     known: dict[str, tuple[str, Matrix3 | None]] = {}
     for _, (sample, scene, first, second) in read_rows(truth, columns):
         F = found.get(sample)
-        known[pair_id(scene, first, second)] = sample, F
-        known[pair_id(scene, second, first)] = sample, None if F is None else F.T
+        known[f"{scene};{first}-{second}"] = sample, F
+        known[f"{scene};{second}-{first}"] = sample, None if F is None else F.T
     scored, missing = [], []
     for there in scenes:
         of_scene = [(true, *known[true.pair.id]) for true in there.pairs if true.pair.id in known]

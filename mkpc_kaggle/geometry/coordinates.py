@@ -51,9 +51,6 @@ class Box:
     def area(self) -> int:
         return self.size.width * self.size.height
 
-    def is_within(self, size: Size) -> bool:
-        return min(self.left, self.top) >= 0 and self.right <= size.width and self.bottom <= size.height
-
     def contains(self, points: NDArray[np.floating]) -> NDArray[np.bool_]:
         """Which points, (N, 2) in image pixels, lie on the box's pixels; never for NaN."""
         x, y = points[:, 0], points[:, 1]
@@ -127,7 +124,7 @@ class View:
         """
         crop = self.crop
         cut = image[crop.top : crop.bottom, crop.left : crop.right]
-        if not crop.is_within(Size(image.shape[1], image.shape[0])):
+        if min(crop.left, crop.top) < 0 or cut.shape[1::-1] != crop.size:
             raise ValueError(f"{crop} leaves the image of {image.shape[1]} x {image.shape[0]} pixels")
         # OpenCV counts quarters clockwise, and a single one is 0.
         picture = cv2.rotate(cut, 3 - self.turns) if self.turns else cut

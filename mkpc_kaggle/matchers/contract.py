@@ -66,12 +66,11 @@ class MatcherSpec:
     """The description of a matcher, known before it is loaded."""
 
     name: str
-    summary: str
     options: type = NoOptions  # a frozen dataclass; a recipe's table [matchers.NAME] sets its fields
     colour: Colour = Colour.RGB
     multiple: int = 1  # pictures are padded to multiples of it
-    licences: tuple[str, ...] = ()  # tags of the weights
     slots: tuple[str, ...] = ()  # of the manifest; ``{name}`` stands for that option's value
+    licences: tuple[str, ...] = ()  # tags of weights that the manifest does not list
 
     def slots_for(self, options: Any) -> tuple[str, ...]:
         """Return the slots of the manifest that a matcher with these options needs."""

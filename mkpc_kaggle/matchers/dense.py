@@ -3,7 +3,7 @@
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import torch
 
@@ -29,8 +29,7 @@ class DenseOptions:
         check_ranges(self, passes=Range(1, 2), first_pass=Range(0, 1, "(]"), matches=AT_LEAST_1, threshold=SHARE)
 
 
-@dataclass(frozen=True, eq=False)
-class DenseEncoding:
+class DenseEncoding(NamedTuple):
     """A picture's features, the size of its content, and a checksum of its pixels."""
 
     features: DenseFeatures
@@ -85,10 +84,10 @@ class DenseMatcher(PairwiseMatcher[DenseEncoding]):
         # PyTorch's CPU generator uses 32 bits of a seed, so both checksums become one of 32 bits.
         seed = zlib.crc32(second.checksum.to_bytes(4), first.checksum)
         generator = torch.Generator(warp.device).manual_seed(seed)
-        found = sample_matches(warp, certainty, options.matches, options.threshold, generator=generator)
-        points = found.matches.cpu().numpy()
+        index = sample_matches(warp, certainty, options.matches, options.threshold, generator)
+        points = warp[index].cpu().numpy()
         return Matches(
             from_normalised(points[:, :2], first.content),
             from_normalised(points[:, 2:], second.content),
-            certainty[found.index].cpu().numpy(),
+            certainty[index].cpu().numpy(),
         )

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -31,8 +31,7 @@ class SemiDenseOptions:
         check_ranges(self, threshold=SHARE)
 
 
-@dataclass(frozen=True, eq=False)
-class SemiDenseEncoding:
+class SemiDenseEncoding(NamedTuple):
     """A picture's feature maps, a batch of one, and the size of its content."""
 
     maps: FeatureMaps

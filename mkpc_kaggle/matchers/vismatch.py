@@ -34,7 +34,7 @@ class VismatchMatcher(PairwiseMatcher[Picture]):
         multiple: int = 1,
         licences: tuple[str, ...] = (),
     ) -> None:
-        self.spec = MatcherSpec(name, f"{name}, of vismatch", multiple=multiple, licences=licences)
+        self.spec = MatcherSpec(name, multiple=multiple, licences=licences)
         self._matcher = matcher
         self._corner = corner
         matcher.skip_ransac = True

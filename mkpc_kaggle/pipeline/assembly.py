@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from mkpc_kaggle.errors import warn_once
-from mkpc_kaggle.matchers.contract import Matcher, MatcherSpec, Placement, Precision
+from mkpc_kaggle.matchers.contract import Matcher, Placement, Precision
 from mkpc_kaggle.matchers.registry import load_matcher
 from mkpc_kaggle.pipeline.availability import FAULTS, Licence, by_kind, options_of, refusal, slots_of, unavailable
 from mkpc_kaggle.pipeline.devices import AUTO, gpus_of, require_device, resolve_placement
@@ -51,7 +51,7 @@ class Assembly:
     def pipeline(self) -> Pipeline:
         """Return a pipeline that loads each matcher on first use.
 
-        Raises :class:`mkpc_kaggle.pipeline.failures.DeviceError` if the device cannot compute.
+        Raises :class:`mkpc_kaggle.matchers.failures.DeviceError` if the device cannot compute.
         """
         device = self.placement.device
         require_device(device)
@@ -92,8 +92,8 @@ class Assembly:
         return {slot: file for slot in slots if (file := self.weights.find(slot))}
 
     def _load(self, name: str, placement: Placement) -> Matcher[Any]:
-        own = self.matchers.get(name)
-        return own or load_matcher(name, self.weights, options_of(self.recipe, name), placement)
+        given = self.matchers.get(name)
+        return given or load_matcher(name, self.weights, options_of(self.recipe, name), placement)
 
 
 def assemble(
@@ -112,7 +112,6 @@ def assemble(
     A fallback replaces an unavailable matcher; without one, recipe ``auto`` drops its units. ``scenes`` switches
     the reconstruction of batches on or off; ``None`` follows the recipe. Raises :class:`UserError`.
     """
-    require_types(recipe, device, matchers)
     own = matchers or {}
     store = WeightStore(weights)
     written = load_recipe(recipe) if isinstance(recipe, str) else recipe
@@ -129,21 +128,7 @@ def assemble(
     left_out = by_kind({name: reasons[name] for name in written.matcher_names if name in reasons})
     chosen = chosen.only(lambda unit: unit.matcher not in lacking).with_scenes(scenes).in_mode(mode)
     made = Assembly(chosen, store, resolve_placement(device, precision), left_out, own, device)
-    files = made.weight_files.values()
-    if unverified := sorted(file.path.name for file in files if file.state is State.UNVERIFIED):
-        listed = ", ".join(unverified)
+    unverified = (file.path.name for file in made.weight_files.values() if file.state is State.UNVERIFIED)
+    if listed := ", ".join(sorted(unverified)):
         warn_once(f"weights not verified: {listed}; `python -m mkpc_kaggle weights verify` says why")
     return made
-
-
-def require_types(recipe: object, device: object, matchers: object) -> None:
-    """Raise ``TypeError`` for arguments that :func:`assemble` does not accept."""
-    if not isinstance(recipe, Recipe | str):
-        raise TypeError(f"a recipe is a Recipe, a name, or a path as text, not {recipe!r}")
-    if not isinstance(device, str):
-        raise TypeError(f"a device is text such as 'cuda:0', not {device!r}")
-    if not isinstance(matchers, Mapping | None):
-        raise TypeError(f"matchers are a mapping from names to matchers, not {matchers!r}")
-    for name, matcher in (matchers or {}).items():
-        if not isinstance(getattr(matcher, "spec", None), MatcherSpec):
-            raise TypeError(f"matcher {name!r} has no `spec` that is a MatcherSpec: {matcher!r}")

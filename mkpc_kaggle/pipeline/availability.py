@@ -4,14 +4,15 @@ from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from enum import StrEnum
+from itertools import chain
 from types import MappingProxyType
 from typing import Any
 
 from mkpc_kaggle.config import from_table
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.matchers.contract import Matcher, Placement
+from mkpc_kaggle.matchers.failures import reason_of
 from mkpc_kaggle.matchers.registry import UnusableError, load_matcher, spec_of
-from mkpc_kaggle.pipeline.failures import reason_of
 from mkpc_kaggle.recipe import Recipe
 from mkpc_kaggle.weights import State, WeightStore
 
@@ -24,8 +25,6 @@ class Licence(StrEnum):
 
 
 class UnavailableKind(StrEnum):
-    """Kinds of reasons, as a summary states them."""
-
     NOT_IMPORTABLE = "cannot be used here"
     NOT_PERMITTED = "weights not permitted"
     NO_WEIGHTS = "no weights"
@@ -56,8 +55,8 @@ def unavailable(
 ) -> dict[str, UnavailableReason]:
     """Return, by name, why matchers of the recipe (fallbacks included) cannot run here.
 
-    ``own`` has the user's matchers by name. ``load`` loads weights of unknown digest to check that they are not
-    damaged. Raises :class:`UserError` for an unknown matcher or option.
+    ``own`` has the user's matchers. ``load`` loads weights of unknown digest to find damage. Raises
+    :class:`UserError` for an unknown matcher or option.
     """
 
     def reason_for(name: str) -> UnavailableReason | None:
@@ -68,10 +67,12 @@ def unavailable(
             return UnavailableReason(UnavailableKind.NOT_IMPORTABLE, reason_of(error.__cause__ or error))
         found = {slot: store.find(slot) for slot in (() if name in own else spec.slots_for(options))}
         files = [file for file in found.values() if file is not None]
-        others = {*spec.licences, *(file.file.licence for file in files)} - PERMISSIVE_TAGS
+        missing = [slot for slot, file in found.items() if file is None]
+        lines = chain((file.file for file in files), *map(store.alternatives, missing))
+        others = {*spec.licences, *(line.licence for line in lines)} - PERMISSIVE_TAGS
         if others and licence is Licence.PERMISSIVE:
             return UnavailableReason(UnavailableKind.NOT_PERMITTED, ", ".join(sorted(others)))
-        if missing := [slot for slot, file in found.items() if file is None]:
+        if missing:
             names = (f"{slot}: {' or '.join(file.name for file in store.alternatives(slot))}" for slot in missing)
             return UnavailableReason(UnavailableKind.NO_WEIGHTS, "; ".join(names))
         try:

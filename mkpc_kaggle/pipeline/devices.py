@@ -8,7 +8,7 @@ from typing import Any
 
 from mkpc_kaggle.errors import UserError, warn_once
 from mkpc_kaggle.matchers.contract import Placement, Precision
-from mkpc_kaggle.pipeline.failures import DeviceError, FailureKind, failure_of, reason_of
+from mkpc_kaggle.matchers.failures import DeviceError, FailureKind, failure_of, reason_of
 
 AUTO = "auto"
 ADVICE = "on Kaggle choose the accelerator GPU T4 x2, elsewhere try --device cpu"
@@ -33,7 +33,7 @@ print(json.dumps([torch.cuda.get_device_capability(gpu) for gpu in gpus]))
 def resolve_placement(device: str, precision: str) -> Placement:
     """Return the placement for the user's words. ``auto`` means "cuda", all GPUs, or the CPU if no GPU computes.
 
-    Raises :class:`UserError` for an unknown word and for a missing GPU.
+    Raises :class:`UserError` for an unknown device and for a missing GPU, ``ValueError`` for an unknown precision.
     """
     import torch
 
@@ -45,8 +45,6 @@ def resolve_placement(device: str, precision: str) -> Placement:
             device = "cpu"
     elif device != "cpu":
         gpus_of(device)
-    if precision not in (AUTO, *Precision):
-        raise UserError(f"unknown precision {precision!r}; known: auto, {', '.join(Precision)}")
     return Placement(device, fastest_precision(device) if precision == AUTO else Precision(precision))
 
 

@@ -57,9 +57,6 @@ class PairMatch:
     def inliers(self) -> Matches:
         return self.matches[self.estimate.inliers]
 
-    def has(self, unit: Unit) -> bool:
-        return any(result.unit == unit for result in self.results)
-
     def in_stage(self, stage: int) -> NDArray[np.bool_]:
         """Return the (N,) mask of the ``matches`` that units of this stage found."""
         chosen = [result.unit.stage == stage for result in self.results]

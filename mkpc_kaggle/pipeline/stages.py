@@ -3,16 +3,16 @@
 Stage 1 matches whole images, MKPC finds the critical region of each image, and stage 2 matches the crops.
 """
 
-import os
-import sys
 import time
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import chain
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+from mkpc_kaggle.data.competition import Pair, read_rows
 from mkpc_kaggle.data.images import ByteCache, Image
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Box, View
@@ -20,16 +20,13 @@ from mkpc_kaggle.geometry.critical_region import CriticalRegion, RegionReason, c
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import Colour, Matcher, NonFiniteError, Picture, encoding_bytes
 from mkpc_kaggle.matchers.dtypes import check_finite, exact_float32
-from mkpc_kaggle.pipeline.failures import FailureKind, failure_of, reason_of
+from mkpc_kaggle.matchers.failures import FailureKind, failure_of, reason_of
 from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
 from mkpc_kaggle.recipe import Recipe, Unit
 
 ENCODING_CACHE_BYTES = 2 << 30
 
 GivenRegions = Mapping[tuple[str, ...], tuple[Box, Box]]  # by the names of both images
-ViewKey = tuple[str, str, View]  # matcher, image and view of an encoding
-
-matched_in: set[int] = set()  # ids of this process and of its forked ancestors, if they matched pairs
 
 
 class Pipeline:
@@ -57,10 +54,10 @@ class Pipeline:
         self._ran: set[Unit] = set()
         self._matchers: dict[str, Matcher[Any]] = {}
         self._notes: dict[str, str] = {}  # on matchers that fell back to float32
-        self._encodings: ByteCache[ViewKey, Any] = ByteCache(cache_bytes)
+        self._encodings = ByteCache(cache_bytes)  # by matcher, image and view
 
     def load(self) -> None:
-        """Load all matchers of the recipe now. Raise :class:`UserError` if one cannot be loaded."""
+        """Load all matchers of the recipe now."""
         for name in self.recipe.matcher_names:
             self._matcher(name)
 
@@ -71,10 +68,8 @@ class Pipeline:
 
         ``may_start(unit)`` is called before each unit on each minibatch; False stops the unit. After a matcher's
         error the minibatch's pairs run singly, and the error of a pair becomes the failure of its result. Raises
-        device errors and memory errors of a single pair, see :mod:`mkpc_kaggle.pipeline.failures`, and
-        :class:`UserError` in a forked child.
+        device errors and memory errors of a single pair, see :mod:`mkpc_kaggle.matchers.failures`.
         """
-        require_unforked()
         pairs, units = list(pairs), list(units)
         for unit in (unit for unit in units if unit.stage == 1):
             self._run(unit, pairs, may_start)
@@ -86,7 +81,7 @@ class Pipeline:
 
     def _run(self, unit: Unit, pairs: list[PairMatch], may_start: Callable[[Unit], bool]) -> None:
         """Add the unit's results to the pairs, in place."""
-        waiting = [number for number, pair in enumerate(pairs) if not pair.has(unit)]
+        waiting = [n for n, pair in enumerate(pairs) if unit not in (result.unit for result in pair.results)]
         while waiting and may_start(unit):
             numbers = waiting[: self._minibatches.get(unit, self.minibatch)]
             results = self._run_minibatch(unit, [pairs[number] for number in numbers])
@@ -111,10 +106,9 @@ class Pipeline:
                 error.add_note(f"in {unit.name}")
                 raise
         # Outside the handler: inside it, the error's traceback holds the tensors of the minibatch.
-        if "torch" in sys.modules:
-            import torch
+        import torch
 
-            torch.cuda.empty_cache()  # cuBLAS and cuDNN cannot use PyTorch's cached memory
+        torch.cuda.empty_cache()  # cuBLAS and cuDNN cannot use PyTorch's cached memory
         self._minibatches[unit] = len(pairs) // 2
         return []
 
@@ -181,25 +175,11 @@ class Pipeline:
         return self._matchers[name]
 
 
-def require_unforked() -> None:
-    """Raise :class:`UserError` in a child that was forked after its parent had matched.
-
-    A forked child has no threads of PyTorch and OpenCV, but waits for them, even with a new matcher.
-    """
-    matched_in.add(os.getpid())
-    if len(matched_in) > 1:
-        raise UserError(
-            "this process was forked after its parent had matched, and would hang: use processes that are "
-            "spawned, such as multiprocessing.get_context('spawn') or DataLoader's multiprocessing_context='spawn'"
-        )
-
-
-def views_of(unit: Unit, multiple: int, pair: PairMatch) -> tuple[View, View]:
+def views_of(unit: Unit, multiple: int, pair: PairMatch) -> tuple[View, ...]:
     """Return the unit's views of both images: whole images in stage 1, critical regions in stage 2."""
     crops = [region.box for region in pair.regions or ()] if unit.stage == 2 else []
     boxes = crops or [Box.whole(image.size) for image in pair.images]
-    first, second = (unit.view(box, multiple, im.turns) for box, im in zip(boxes, pair.images, strict=True))
-    return first, second
+    return tuple(unit.view(box, multiple, im.turns) for box, im in zip(boxes, pair.images, strict=True))
 
 
 def with_regions(pair: PairMatch, recipe: Recipe, given: GivenRegions = MappingProxyType({})) -> PairMatch:
@@ -214,3 +194,23 @@ def with_regions(pair: PairMatch, recipe: Recipe, given: GivenRegions = MappingP
         for points, image in zip((matches.points0, matches.points1), pair.images, strict=True)
     )
     return replace(pair, regions=(region0, region1), cluster_seconds=time.perf_counter() - start)
+
+
+def read_regions(file: Path, image_root: Path, pairs: Iterable[Pair]) -> GivenRegions:
+    """Return the stage-2 boxes of a table, keyed by image files.
+
+    ``file`` is a table ``image_0,image_1,box_0,box_1``: paths under the root; left, top, right and bottom in whole
+    pixels of the stored file, the latter two exclusive. Raises :class:`UserError` for a malformed table or box and
+    for a missing pair. A box beyond its image is not an error here: units of stage 2 fail on that pair.
+    """
+    boxes: dict[tuple[str, ...], tuple[Box, Box]] = {}
+    for where, (name0, name1, *cells) in read_rows(file, ("image_0", "image_1", "box_0", "box_1")):
+        try:
+            box0, box1 = (Box(*map(int, cell.split())) for cell in cells)
+        except (ValueError, TypeError) as error:
+            found = f"{cells[0]!r} and {cells[1]!r}"
+            raise UserError(f"{where}: expected left, top, right and bottom of a box, found {found}") from error
+        boxes[str(image_root / name0), str(image_root / name1)] = box0, box1
+    if missing := [pair.id for pair in pairs if (pair.file0, pair.file1) not in boxes]:
+        raise UserError(f"{file} has no regions of the pair {missing[0]}")
+    return boxes

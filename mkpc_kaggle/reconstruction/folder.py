@@ -6,9 +6,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from mkpc_kaggle.data.competition import CONTROL, IMAGE_SUFFIXES
-from mkpc_kaggle.data.images import printable
 from mkpc_kaggle.engine.console import warn
-from mkpc_kaggle.errors import UserError, read_text
+from mkpc_kaggle.errors import UserError, printable, read_text
 from mkpc_kaggle.reconstruction.directory import RESERVED
 
 Datasets = Mapping[str, Sequence[Path]]  # images of one folder, by its path below the root

@@ -15,12 +15,11 @@ from typing import TYPE_CHECKING
 import pandas as pd
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.data.images import Image, printable
+from mkpc_kaggle.data.images import Image
 from mkpc_kaggle.data.outputs import replacing
 from mkpc_kaggle.engine.budget import format_duration
 from mkpc_kaggle.engine.journal_reader import EventKind
-from mkpc_kaggle.engine.records import SceneRecord
-from mkpc_kaggle.errors import UserError, writing
+from mkpc_kaggle.errors import UserError, printable, writing
 from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
 from mkpc_kaggle.pipeline.two_stage import to_image
 from mkpc_kaggle.reporting.figures import draw_budget, draw_cameras, draw_pair, draw_strip, encode
@@ -172,30 +171,23 @@ def _scenes(log: RunLog) -> list[pd.DataFrame]:
     """Return three tables: reconstructed batches, why pairs have their F, and cameras, weakest first."""
     pairs = log.tables.pairs
     counts = pairs[pairs["source"] == "scene"].groupby("group").size()
-    rows = [
-        (
-            *(scene.batch, scene.images, scene.registered, scene.points, _focals(scene)),
-            *(scene.seconds, int(counts.get(scene.batch, 0)), scene.failure),
-        )
-        for scene in log.scenes
-    ]
+    rows = []
+    for each in log.scenes:
+        focals = [found.focal for model in each.models for found in model.images]
+        spread = f"{median(focals):.0f} ({min(focals):.0f} to {max(focals):.0f})" if focals else ""
+        placed = each.batch, each.images, each.registered, each.points, spread
+        rows.append((*placed, each.seconds, int(counts.get(each.batch, 0)), each.failure))
     heads = ["batch", "images", "cameras", "points", "focals (px)", "seconds", "pairs with its F", "failure"]
     reasons = Counter(str(record.scene.reason) for record in log.records if record.scene is not None)
     batches = pd.DataFrame(rows, columns=heads)
-    cameras = [
-        (name, 100 * sigmas.centre, sigmas.rotation, sigmas.focal) for name, sigmas in weakest_cameras(log.scenes)
-    ]
+    weakest = weakest_cameras(log.scenes)
+    cameras = [(name, 100 * sigmas.centre, sigmas.rotation, sigmas.focal) for name, sigmas in weakest]
     sigmas = ["camera, weakest first", "error of its centre (%)", "rotation (deg)", "focal length (%)"]
     return [
         batches if batches["failure"].any() else batches.drop(columns="failure"),
         pd.DataFrame(reasons.most_common(), columns=["which F a pair has", "pairs"]),
         pd.DataFrame(cameras, columns=sigmas),
     ]
-
-
-def _focals(scene: SceneRecord) -> str:
-    focals = [found.focal for model in scene.models for found in model.images]
-    return f"{median(focals):.0f} ({min(focals):.0f} to {max(focals):.0f})" if focals else ""
 
 
 def _costs(log: RunLog) -> list[pd.DataFrame]:

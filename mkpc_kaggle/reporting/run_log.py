@@ -20,7 +20,6 @@ from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
 from mkpc_kaggle.recipe import Recipe, recipe_of
 
 MAX_DRAWN_PAIRS = 20  # the weakest, which the report draws
-NOT_ENDED = "not ended (at work, or killed)"
 SECONDS = {  # names of the parts of a pair's work
     "decode_seconds": "wait for decoding",
     "encode_seconds": "encode",
@@ -39,8 +38,8 @@ PAIR_COLUMNS: dict[str, type] = {
     **dict.fromkeys(("focal0", "focal1", *(f"f{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3))), float),
 }
 UNIT_COLUMNS = {"pair": int, **UnitRecord.__annotations__}
-BOX = ("left", "top", "right", "bottom")
-REGION_COLUMNS = {**dict.fromkeys(("pair", "image", *BOX), int), "reason": str, "clusters": int, "kept": int}
+REGION_COLUMNS = {**dict.fromkeys(("pair", "image", "left", "top", "right", "bottom"), int), "reason": str}
+REGION_COLUMNS |= {"clusters": int, "kept": int}
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +115,7 @@ class RunLog:
     @property
     def ending(self) -> str:
         ends = [event.text for event in self.session if event.kind == EventKind.END]
-        return ends[-1] if ends else NOT_ENDED
+        return ends[-1] if ends else "not ended (at work, or killed)"
 
     @property
     def seconds(self) -> float:

@@ -20,16 +20,15 @@ def summary(pairs: Sequence[Pair], report: RunReport) -> str:
     tables = run_tables(pairs, report.records)
     resumed = f", {report.resumed} of them from earlier runs" if report.resumed else ""
     done = f"; {report.units_run} units run, {report.estimated} F estimated"
-    failed = filter(None, [trouble(report)])
-    head = headline(tables, report) + resumed + done
-    return "\n".join([head, *_lines(tables, report), *failed])
+    lines = [headline(tables, report) + resumed + done, *_lines(tables, report), trouble(report)]
+    return "\n".join(filter(None, lines))
 
 
 def overview(log: RunLog) -> str:
     """Return the summary of a journal."""
     about = f"recipe {log.recipe.name}, {log.about.device}, {len(log.events)} events"
-    left_out = filter(None, [left_out_line(log.about.left_out)])
-    return "\n".join([headline(log.tables, log), about, *left_out, *_lines(log.tables, log)])
+    lines = [headline(log.tables, log), about, left_out_line(log.about.left_out), *_lines(log.tables, log)]
+    return "\n".join(filter(None, lines))
 
 
 def headline(tables: RunTables, run: RunReport | RunLog) -> str:
@@ -65,10 +64,9 @@ def _error(record: PairRecord) -> str:
 
 def left_out_line(left_out: Sequence[str]) -> str:
     """Return the matchers that did not run, by cause, with advice on weights; empty if all ran."""
-    if not left_out:
-        return ""
     advice = " (`python -m mkpc_kaggle weights fetch --out DIR` gets weights)"
-    return f"left out, {'; '.join(left_out)}" + advice * any(cause.startswith("no weights") for cause in left_out)
+    has_advice = any(cause.startswith("no weights") for cause in left_out)
+    return f"left out, {'; '.join(left_out)}{advice * has_advice}" if left_out else ""
 
 
 def _lines(tables: RunTables, run: RunReport | RunLog) -> list[str]:

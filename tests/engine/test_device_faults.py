@@ -22,8 +22,8 @@ from mkpc_kaggle.data.competition import read_test_side, submission_problems
 from mkpc_kaggle.engine.places import Place
 from mkpc_kaggle.engine.request import Ending, RunReport
 from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.matchers.failures import DeviceError, FailureKind, failure_of, reason_of
 from mkpc_kaggle.pipeline.assembly import Assembly, assemble
-from mkpc_kaggle.pipeline.failures import DeviceError, FailureKind, failure_of, reason_of
 
 COUNT = 12
 VICTIM = 3  # brightness 13

@@ -9,9 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from shared import run_command
 
-from mkpc_kaggle.evaluation.compare import Comparison, paired_difference
-from mkpc_kaggle.evaluation.validate import PairScore, SceneScore, Validation
-from mkpc_kaggle.geometry.metrics import PoseError
+from mkpc_kaggle.evaluation.compare import paired_difference
 
 PAIRS = [*combinations("abcdef", 2)]
 tenths = st.lists(st.integers(0, 10).map(lambda count: count / 10), min_size=1, max_size=len(PAIRS))
@@ -46,12 +44,6 @@ def test_the_interval_holds_the_truth_where_a_gain_is_of_images():
         difference = paired_difference(scenes)
         held += difference.low <= 0.04 <= difference.high
     assert 0.88 <= held / trials <= 0.99
-
-
-def test_different_pairs_are_not_compared():
-    p, q = (PairScore(pair, ("a", "b"), 0.5, PoseError(0, 0, 0)) for pair in "pq")
-    with pytest.raises(ValueError, match="different pairs"):
-        Comparison(tuple(Validation("a", (SceneScore("s", pairs),)) for pairs in ((p, q), (q, p))))
 
 
 def compare(demo, *more):

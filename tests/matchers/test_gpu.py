@@ -14,10 +14,10 @@ from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import MatcherSpec, NonFiniteError, Precision
 from mkpc_kaggle.matchers.dtypes import check_finite, exact_float32
+from mkpc_kaggle.matchers.failures import DeviceError
 from mkpc_kaggle.pipeline import devices
 from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.pipeline.devices import fastest_precision, gpu_capabilities, require_device, resolve_placement
-from mkpc_kaggle.pipeline.failures import DeviceError
 from mkpc_kaggle.pipeline.pair import PairMatch
 from mkpc_kaggle.pipeline.stages import Pipeline
 from mkpc_kaggle.recipe import Recipe, Unit
@@ -96,7 +96,7 @@ def settings():
 class Own:
     """Encodes pictures as ``value`` and matches nothing; notes how GPUs were to compute."""
 
-    spec = MatcherSpec("own", "own")
+    spec = MatcherSpec("own")
 
     def __init__(self, value):
         self.value = value

@@ -20,13 +20,13 @@ def test_matches_are_the_mutual_maxima_of_both_softmaxes(monkeypatch, held):
     monkeypatch.setattr("mkpc_kaggle.matchers.networks.coarse_matching.ROWS_AT_ONCE", {"cpu": 7})
     monkeypatch.setattr("mkpc_kaggle.matchers.networks.coarse_matching.HELD_FLOATS", held)
     generator = torch.Generator().manual_seed(0)
-    grid0, grid1 = (torch.randn(2, 5, width, 16, generator=generator) for width in (6, 7))
+    grid0, grid1 = (torch.randn(5, width, 16, generator=generator) for width in (6, 7))
     matches = coarse_matches(grid0, grid1, 0.5, 0.02, 0, None)
-    similarity = (grid0.flatten(1, 2).double() @ grid1.flatten(1, 2).double().mT) * 0.5
-    confidence = similarity.softmax(1) * similarity.softmax(2)
-    mutual = (confidence == confidence.amax(1, keepdim=True)) & (confidence == confidence.amax(2, keepdim=True))
+    similarity = (grid0.flatten(0, 1).double() @ grid1.flatten(0, 1).double().mT) * 0.5
+    confidence = similarity.softmax(0) * similarity.softmax(1)
+    mutual = (confidence == confidence.amax(0, keepdim=True)) & (confidence == confidence.amax(1, keepdim=True))
     expected = (mutual & (confidence > 0.02)).nonzero()
-    torch.testing.assert_close(torch.stack([matches.batch, matches.cell0, matches.cell1], dim=1), expected)
+    torch.testing.assert_close(torch.stack([matches.cell0, matches.cell1], dim=1), expected)
     torch.testing.assert_close(matches.confidence.double(), confidence[tuple(expected.T)], rtol=1e-5, atol=0)
 
 

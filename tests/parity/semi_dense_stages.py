@@ -21,11 +21,11 @@ ASPANFORMER = {"coarse": 1e-4, "m?conf": Within(1e-6, relative=2e-3), "expec_f":
 
 
 def confidence_of(network, grid0, grid1, masks):
-    """Return the full confidence matrix (N, L, S)."""
+    """Return the full confidence matrix (1, L, S) of grids (1, h, w, 256)."""
     masks = masks or [torch.ones(grid.shape[:3], dtype=torch.bool) for grid in (grid0, grid1)]
-    pairs = zip(grid0 * network.similarity_scale, grid1, *masks, strict=True)
-    all_cells = [Cells(a.flatten(0, 1), b.flatten(0, 1), m.flatten(), n.flatten()) for a, b, m, n in pairs]
-    return torch.stack([torch.cat(list(half_log_confidences(cells))) for cells in all_cells]).mul(2).exp()
+    features0, features1 = (grid.flatten(0, 2) for grid in (grid0 * network.similarity_scale, grid1))
+    cells = Cells(features0, features1, *(mask.flatten() for mask in masks))
+    return torch.cat(list(half_log_confidences(cells)))[None].mul(2).exp()
 
 
 def computed(network, images, masks, scales, coarse_scales=None):
@@ -33,6 +33,16 @@ def computed(network, images, masks, scales, coarse_scales=None):
 
     Points are multiplied by ``scales`` (N, 2) of either side, coarse ones by ``coarse_scales`` if given.
     """
+    given = images, masks, scales, coarse_scales
+    found = []
+    for number in range(len(images[0])):
+        of_pair = (both and [each[number : number + 1] for each in both] for both in given)
+        found.append(computed_of_pair(network, *of_pair))
+        found[-1]["b_ids"] = torch.full_like(found[-1]["i_ids"], number)
+    return {name: torch.cat([values[name] for values in found]) for name in found[0]}
+
+
+def computed_of_pair(network, images, masks, scales, coarse_scales):
     maps = [network.encode(image) for image in images]
     with recorded(network, "loftr_coarse") as calls:
         matches = network.match(*maps, masks)
@@ -40,13 +50,13 @@ def computed(network, images, masks, scales, coarse_scales=None):
     grids = [tokens.reshape(len(tokens), *own.coarse.shape[2:], 256) for tokens, own in transformed]
     coarse, confidence = matches.coarse, confidence_of(network, *grids, masks)
     values = {"conf": confidence, "conf_rowmax": confidence.amax(2), "conf_colmax": confidence.amax(1)}
-    values |= {"b_ids": coarse.batch, "i_ids": coarse.cell0, "j_ids": coarse.cell1, "mconf": coarse.confidence}
+    values |= {"i_ids": coarse.cell0, "j_ids": coarse.cell1, "mconf": coarse.confidence}
     values |= {"expec_f": matches.expectation}
     for side, grid in enumerate(grids):
         points = cell_points((coarse.cell0, coarse.cell1)[side], grid.shape[2])
         values[f"coarse{side}"] = grid.flatten(1, 2)
-        values[f"mkpts{side}_c"] = points * (coarse_scales or scales)[side][coarse.batch]
-        values[f"mkpts{side}_f"] = (matches.points0, matches.points1)[side] * scales[side][coarse.batch]
+        values[f"mkpts{side}_c"] = points * (coarse_scales or scales)[side]
+        values[f"mkpts{side}_f"] = (matches.points0, matches.points1)[side] * scales[side]
     return values
 
 

@@ -40,7 +40,7 @@ class RectifiedMatcher:
 
     @property
     def spec(self):
-        return MatcherSpec(self.name, "a matcher for tests")
+        return MatcherSpec(self.name)
 
     def encode(self, pictures):
         return [Seen(picture.view, int(np.median(picture.pixels))) for picture in pictures]

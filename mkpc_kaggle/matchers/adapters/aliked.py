@@ -22,14 +22,7 @@ class AlikedOptions:
         check_ranges(self, features=AT_LEAST_1, ratio=SHARE)
 
 
-SPEC = MatcherSpec(
-    "aliked",
-    "ALIKED n16, mutual nearest neighbours",
-    AlikedOptions,
-    multiple=32,
-    licences=("BSD-3-Clause",),
-    slots=(SLOT,),
-)
+SPEC = MatcherSpec("aliked", AlikedOptions, multiple=32, slots=(SLOT,))
 
 
 class AlikedMatcher(NeighbourMatcher):

@@ -5,14 +5,7 @@ from mkpc_kaggle.matchers.contract import MatcherSpec, Placement
 from mkpc_kaggle.matchers.lightglue import LightGlueMatcher, LightGlueOptions, load_glue
 from mkpc_kaggle.weights import WeightStore
 
-SPEC = MatcherSpec(
-    "aliked_lightglue",
-    "ALIKED n16 with LightGlue",
-    LightGlueOptions,
-    multiple=32,
-    licences=("BSD-3-Clause", "Apache-2.0"),
-    slots=(SLOT, "aliked-lightglue"),
-)
+SPEC = MatcherSpec("aliked_lightglue", LightGlueOptions, multiple=32, slots=(SLOT, "aliked-lightglue"))
 
 
 def load(weights: WeightStore, options: LightGlueOptions, placement: Placement) -> LightGlueMatcher:

@@ -7,13 +7,7 @@ from mkpc_kaggle.matchers.semi_dense import SemiDenseMatcher, SemiDenseOptions, 
 from mkpc_kaggle.weights import WeightStore
 
 SPEC = MatcherSpec(
-    "aspanformer",
-    "ASpanFormer",
-    SemiDenseOptions,
-    Colour.GRAY,
-    multiple=AspanFormer.multiple,
-    licences=("Apple-noncommercial",),
-    slots=("aspanformer-{training}",),
+    "aspanformer", SemiDenseOptions, Colour.GRAY, AspanFormer.multiple, slots=("aspanformer-{training}",)
 )
 # The border, and the size to which positions are scaled. Indoor weights were published for 480 x 640 only, with
 # unscaled positions and a global level of 15 x 20 cells. At this size our scaling and pooling are the same.

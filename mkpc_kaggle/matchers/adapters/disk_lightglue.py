@@ -8,14 +8,7 @@ from mkpc_kaggle.matchers.lightglue import LightGlueMatcher, LightGlueOptions, l
 from mkpc_kaggle.matchers.sparse import KeypointEncoder, library_encoder
 from mkpc_kaggle.weights import WeightStore, load_into
 
-SPEC = MatcherSpec(
-    "disk_lightglue",
-    "DISK with LightGlue",
-    LightGlueOptions,
-    multiple=16,
-    licences=("Apache-2.0",),
-    slots=("disk", "disk-lightglue"),
-)
+SPEC = MatcherSpec("disk_lightglue", LightGlueOptions, multiple=16, slots=("disk", "disk-lightglue"))
 
 
 def disk_encoder(network: DISK, features: int, placement: Placement) -> KeypointEncoder:

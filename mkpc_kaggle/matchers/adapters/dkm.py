@@ -6,9 +6,8 @@ from mkpc_kaggle.matchers.networks.dkm import DKM
 from mkpc_kaggle.matchers.networks.placement import prepared
 from mkpc_kaggle.weights import WeightStore, load_into
 
-# Published: one pass of 540 x 720 or 480 x 640 (indoors), and two passes up to 864 x 1152. The licence applies to
-# the outdoor weights; the terms of the indoor weights are unclear (see the manifest).
-SPEC = MatcherSpec("dkm", "DKM v3", DenseOptions, licences=("MIT",), slots=("dkm-{training}",))
+# Published: one pass of 540 x 720 or 480 x 640 (indoors), and two passes up to 864 x 1152.
+SPEC = MatcherSpec("dkm", DenseOptions, slots=("dkm-{training}",))
 
 
 class DkmMatcher(DenseMatcher):

@@ -10,15 +10,7 @@ from mkpc_kaggle.weights import WeightStore
 BORDERS = {Training.OUTDOOR: 2, Training.INDOOR: 0}
 
 
-SPEC = MatcherSpec(
-    "loftr",
-    "LoFTR",
-    SemiDenseOptions,
-    Colour.GRAY,
-    multiple=Loftr.multiple,
-    licences=("Apache-2.0",),
-    slots=("loftr-{training}",),
-)
+SPEC = MatcherSpec("loftr", SemiDenseOptions, Colour.GRAY, Loftr.multiple, slots=("loftr-{training}",))
 
 
 def load(weights: WeightStore, options: SemiDenseOptions, placement: Placement) -> SemiDenseMatcher:

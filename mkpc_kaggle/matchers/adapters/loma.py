@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 
@@ -31,13 +32,10 @@ class LomaOptions:
         check_ranges(self, max_keypoints=AT_LEAST_1, descriptor_scale=POSITIVE, match_threshold=SHARE)
 
 
-SPEC = MatcherSpec(
-    "loma", "LoMa: DaD keypoints, DeDoDe descriptors", LomaOptions, licences=("MIT",), slots=("loma-{variant}",)
-)
+SPEC = MatcherSpec("loma", LomaOptions, slots=("loma-{variant}",))
 
 
-@dataclass(frozen=True, eq=False)
-class LomaEncoding:
+class LomaEncoding(NamedTuple):
     keypoints: LomaKeypoints
     content: Size  # of the picture
 

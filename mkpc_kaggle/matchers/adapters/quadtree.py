@@ -6,15 +6,7 @@ from mkpc_kaggle.matchers.networks.quadtree import Quadtree
 from mkpc_kaggle.matchers.semi_dense import SemiDenseMatcher, SemiDenseOptions, load_network
 from mkpc_kaggle.weights import WeightStore
 
-SPEC = MatcherSpec(
-    "quadtree",
-    "LoFTR with QuadTree attention",
-    SemiDenseOptions,
-    Colour.GRAY,
-    multiple=Quadtree.multiple,
-    licences=("Apache-2.0",),
-    slots=("quadtree-{training}",),
-)
+SPEC = MatcherSpec("quadtree", SemiDenseOptions, Colour.GRAY, Quadtree.multiple, slots=("quadtree-{training}",))
 TOPKS = {Training.OUTDOOR: (16, 8), Training.INDOOR: (32, 16)}  # as published
 
 

@@ -19,10 +19,7 @@ class RomaOptions(DenseOptions):
     first_pass: float = 0.648
 
 
-# Licences of the outdoor weights and of DINOv2; the terms of the indoor weights are unclear.
-SPEC = MatcherSpec(
-    "roma", "RoMa", RomaOptions, licences=("MIT", "Apache-2.0"), slots=("roma-{training}", "dinov2-vitl14")
-)
+SPEC = MatcherSpec("roma", RomaOptions, slots=("roma-{training}", "dinov2-vitl14"))
 
 
 class RomaMatcher(DenseMatcher):

@@ -31,7 +31,7 @@ class SiftOptions:
         check_ranges(self, features=AT_LEAST_1, ratio=SHARE, contrast_threshold=AT_LEAST_0)
 
 
-SPEC = MatcherSpec("sift", "RootSIFT, mutual nearest neighbours, ratio test", SiftOptions, Colour.GRAY)
+SPEC = MatcherSpec("sift", SiftOptions, Colour.GRAY)
 
 
 class SiftMatcher(NeighbourMatcher):

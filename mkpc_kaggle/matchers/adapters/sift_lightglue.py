@@ -21,14 +21,7 @@ class SiftLightGlueOptions(LightGlueOptions):
 
 
 SHAPE = {"input_dim": 128, "add_scale_ori": True}
-SPEC = MatcherSpec(
-    "sift_lightglue",
-    "SIFT with LightGlue",
-    SiftLightGlueOptions,
-    Colour.GRAY,
-    licences=("Apache-2.0",),
-    slots=("sift-lightglue",),
-)
+SPEC = MatcherSpec("sift_lightglue", SiftLightGlueOptions, Colour.GRAY, slots=("sift-lightglue",))
 SHIFT_PX = 0.25  # OpenCV's offset without precise upscaling, which the published evaluation does not use
 
 

@@ -35,14 +35,7 @@ class SuperGlueOptions:
 
 
 # No multiple: SuperPoint ignores the rows and columns beyond a multiple of 8.
-SPEC = MatcherSpec(
-    "superglue",
-    "SuperPoint with SuperGlue",
-    SuperGlueOptions,
-    Colour.GRAY,
-    licences=("Magic-Leap-noncommercial",),
-    slots=("superpoint", "superglue-{training}"),
-)
+SPEC = MatcherSpec("superglue", SuperGlueOptions, Colour.GRAY, slots=("superpoint", "superglue-{training}"))
 
 
 class SuperGlueMatcher(PairwiseMatcher[SuperPointKeypoints]):

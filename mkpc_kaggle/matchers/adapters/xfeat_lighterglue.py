@@ -9,14 +9,7 @@ from mkpc_kaggle.matchers.sparse import KeypointEncoder, library_encoder
 from mkpc_kaggle.weights import WeightStore, load_into
 
 SHAPE = {"input_dim": 64, "descriptor_dim": 96, "num_heads": 1}  # a narrow LightGlue
-SPEC = MatcherSpec(
-    "xfeat_lighterglue",
-    "XFeat with LighterGlue: fast, learned",
-    LightGlueOptions,
-    multiple=32,
-    licences=("Apache-2.0",),
-    slots=("xfeat", "xfeat-lighterglue"),
-)
+SPEC = MatcherSpec("xfeat_lighterglue", LightGlueOptions, multiple=32, slots=("xfeat", "xfeat-lighterglue"))
 
 
 def xfeat_encoder(network: XFeat, features: int, placement: Placement) -> KeypointEncoder:

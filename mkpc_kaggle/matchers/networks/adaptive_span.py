@@ -4,8 +4,6 @@ Source: Chen et al., "ASpanFormer: Detector-Free Image Matching with Adaptive Sp
 "Cells" here are 2x2 blocks of queries; each block shares 8 x 8 samples of the key map.
 """
 
-from dataclasses import dataclass
-
 import torch
 from torch import Tensor
 from torch.nn import functional
@@ -13,40 +11,25 @@ from torch.nn import functional
 from mkpc_kaggle.matchers.networks.bilinear import corners, weighted_rows
 from mkpc_kaggle.matchers.networks.grids import mask_valid, mean_pool, softmax_attention, to_2x2_blocks
 
+RADIUS = 5.0  # of a span, in deviations of the flow
 SIDE = 8  # samples on each axis
 SAMPLES = SIDE * SIDE
 CELLS_AT_ONCE = {"cpu": 256, "cuda": 8192}  # a cell's samples take 128 KiB and must fit a CPU's cache
 MASKED = -1e8  # a finite logit: attention is uniform if all keys are masked
 
 
-@dataclass(frozen=True, eq=False)
-class Span:
-    """Samples of P cells of queries: ``centre`` and ``step`` (N, P, 2), (x, y) in cells of the level's key map.
-
-    A sample at (x, y) reads around index (x - 0.5, y - 0.5): the origin is the corner of the key map.
-    """
-
-    centre: Tensor
-    step: Tensor
-
-    def samples(self) -> Tensor:
-        """Return (N, P, 64, 2): x varies slowest."""
-        axis = torch.arange(SIDE, dtype=self.centre.dtype, device=self.centre.device) - (SIDE - 1) / 2
-        offsets = torch.cartesian_prod(axis, axis)  # (64, 2)
-        return self.centre[:, :, None] + offsets * self.step[:, :, None]
-
-
-def adaptive_span(flow: Tensor, radius: float, factor: int) -> Span:
-    """Map a flow (N, h, w, 4) to the span of each cell at the level that pools by ``factor``.
+def adaptive_span(flow: Tensor, factor: int) -> Tensor:
+    """Map a flow (N, h, w, 4) to samples (N, P, 64, 2) of its P cells at the level that pools by ``factor``.
 
     The flow is the target (x, y) in coarse cells of the other image and its log-variances. The samples cover
-    two ``radius`` deviations, with a step of at least one. As published, centres are in units of the level but
-    steps are not.
+    two radii, with a step of at least one; x varies slowest. As published, centres are in units of the level but
+    steps are not. A sample at (x, y) reads around index (x - 0.5, y - 0.5): the origin is the key map's corner.
     """
-    deviation = torch.exp(flow[..., 2:] / 2) * radius
+    deviation = torch.exp(flow[..., 2:] / 2) * RADIUS
     steps = (2 * deviation / SIDE).clamp(min=1.0)
     pooled = mean_pool(torch.cat([flow[..., :2] / factor, steps], dim=-1), 2 * factor).flatten(1, 2)  # (N, P, 4)
-    return Span(*pooled.chunk(2, dim=-1))
+    axis = torch.arange(SIDE, dtype=pooled.dtype, device=pooled.device) - (SIDE - 1) / 2
+    return pooled[:, :, None, :2] + torch.cartesian_prod(axis, axis) * pooled[:, :, None, 2:]
 
 
 def sample_usable(samples: Tensor, mask: Tensor, key_size: tuple[int, int], factor: int) -> Tensor:

@@ -16,7 +16,7 @@ from torch.nn import functional
 from mkpc_kaggle.matchers.dtypes import check_finite
 from mkpc_kaggle.matchers.networks.bilinear import DeformableConv2d, corners, table_of, weighted_rows
 from mkpc_kaggle.matchers.networks.grids import as_grid, pointwise
-from mkpc_kaggle.matchers.networks.layers import ExactConv2d, linear
+from mkpc_kaggle.matchers.networks.layers import ExactConv2d, in_strips, linear
 
 # Published as n16: channels of the four scales (the last is also the descriptors'); positions per descriptor.
 CHANNELS = (16, 32, 64, 128)
@@ -24,7 +24,7 @@ POSITIONS = 16
 RADIUS = 2  # of suppression and of refinement, in pixels
 TEMPERATURE = 0.1  # of the softmax in the refinement window
 PATCH = 3  # pixels per axis from which a keypoint's offsets are computed
-ROWS_AT_ONCE, POSITIONS_AT_ONCE = 16, 1024  # intermediate maps fit a CPU's cache
+POSITIONS_AT_ONCE = 1024  # intermediate maps fit a CPU's cache
 
 
 class Aliked(nn.Module):
@@ -87,13 +87,11 @@ class Aliked(nn.Module):
         x1, *parts = maps
         # (8, C / 4, 1, 1) each: a 1x1 convolution may precede upsampling.
         weights = self.score_head.get_parameter("0.weight").chunk(4, dim=1)
-        total = torch.cat(
-            [
-                functional.conv2d(torch.selu_(self.conv1(rows)).float(), weights[0])
-                for rows in torch.split(x1, ROWS_AT_ONCE, dim=2)
-            ],
-            dim=2,
-        )
+
+        def first(rows: Tensor) -> Tensor:
+            return functional.conv2d(torch.selu_(self.conv1(rows)).float(), weights[0])
+
+        total = in_strips(first, x1, reach=0, channels=CHANNELS[-1] // 4)
         for part, weight in zip(parts, weights[1:], strict=True):
             total += enlarged(functional.conv2d(part.float(), weight), x1.shape[2:])
         logits: Tensor = self.score_head[1:](total)
@@ -150,19 +148,19 @@ class JoinedMap:
         positions = torch.stack([pixels % width, pixels // width % height], dim=1).float()
         parts = [torch.selu_(pointwise(self._conv1, full.index_select(0, pixels)).float())]
         for table, size in zip(tables, self._sizes, strict=True):
-            ratio = positions.new_tensor([_step(size[1], width), _step(size[0], height)])
+            # Both maps share the centres of their corner pixels.
+            ratio = positions.new_tensor([(size[1] - 1) / (width - 1), (size[0] - 1) / (height - 1)])
             parts.append(weighted_rows(table, *corners(positions * ratio, image, size)))
         return functional.normalize(torch.cat(parts, dim=1), dim=1)
 
     def sampled(self, positions: Tensor, image: Tensor) -> Tensor:
         """Sample at positions (Q, 2) of the images ``image`` (Q,): (Q, C) float32, zero outside."""
         pixels, weights = corners(positions, image, self.size)  # (Q, 4)
-        order = torch.arange(pixels.numel(), device=pixels.device).view_as(pixels)
-        blocks = (torch.split(values, POSITIONS_AT_ONCE) for values in (pixels, weights))
+        blocks = zip(*(torch.split(values, POSITIONS_AT_ONCE) for values in (pixels, weights)), strict=True)
         return torch.cat(
             [
-                weighted_rows(self.at(some.flatten()), order[: len(some)], shares)
-                for some, shares in zip(*blocks, strict=True)
+                torch.einsum("qkc,qk->qc", self.at(some.flatten()).view(len(some), 4, -1), shares)
+                for some, shares in blocks
             ]
         )
 
@@ -211,11 +209,6 @@ class DescriptorHead(nn.Module):
 def enlarged(maps: Tensor, size: torch.Size) -> Tensor:
     """Enlarge bilinearly; the centres of the corner pixels stay at the corners."""
     return functional.interpolate(maps, tuple(size), mode="bilinear", align_corners=True)
-
-
-def _step(length: int, full: int) -> float:
-    """Return one pixel of the full length in pixels of a shorter map; both share the centres of their corners."""
-    return (length - 1) / max(full - 1, 1)
 
 
 def strict_maxima(scores: Tensor, count: int) -> Tensor:

@@ -26,10 +26,7 @@ from mkpc_kaggle.matchers.networks.semi_dense import SemiDenseNetwork
 HEADS = 8
 FLOW = 128  # channels of the flow feature, and of the projected positions
 INITIAL_LAYERS, BLOCKS = 2, 4
-RADIUS = 5.0  # of the spans, in deviations of the flow
-SPAN_LEVELS = (2, 1)  # half and full resolution of the coarse map
-
-Factor = tuple[int, int]  # of pooling, (rows, columns)
+POOLING = (4, 4)  # rows and columns of the coarse map per cell of the global level
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +38,7 @@ class Side:
     visual: Tensor
     flow: Tensor
     positions: Tensor
-    factor: Factor
+    factor: tuple[int, int]  # of pooling, (rows, columns)
     mask: Tensor | None
 
     def values(self, projection: nn.Conv1d) -> Tensor:
@@ -155,38 +152,26 @@ class HierarchicalAttention(nn.Module):
 
     def forward(self, q: Tensor, k: Tensor, v: Tensor, flow: Tensor, own: Side, other: Side) -> Tensor:
         """Map queries and flow of ``own``, keys and values of ``other`` to a message (N, h, w, 256)."""
-        coarse, half, full = self.messages(q, k, v, flow, own, other)
-        h, w = q.shape[1:3]
-        stacked = torch.cat([_repeated(coarse, h, w), _repeated(half, h, w), full], dim=-1)
-        merged: Tensor = self.merge_head(stacked)
-        return merged
-
-    def messages(
-        self, q: Tensor, k: Tensor, v: Tensor, flow: Tensor, own: Side, other: Side
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return messages of the global level (N, h / rows, w / columns, 256), of half and of full size."""
         coarse = global_attention(
             mean_pool(q, own.factor),
             mean_pool(k, other.factor),
             mean_pool(v, other.factor),
             self.temp,
             (own.pooled_mask, other.pooled_mask),
-        )
-        half, full = (self._span_level(q, k, v, flow, factor, own.mask) for factor in SPAN_LEVELS)
-        return coarse, half, full
-
-    def _span_level(
-        self, q: Tensor, k: Tensor, v: Tensor, flow: Tensor, factor: int, mask: Tensor | None
-    ) -> Tensor:
-        q, k, v = mean_pool(q, factor), mean_pool(k, factor), mean_pool(v, factor)
-        samples = adaptive_span(flow, RADIUS, factor).samples()
-        usable = None if mask is None else sample_usable(samples, mask, (k.shape[1], k.shape[2]), factor)
-        return span_attention(q, k, v, samples, HEADS, usable)
+        )  # (N, h / rows, w / columns, 256)
+        half, full = (_span_message(q, k, v, flow, factor, own.mask) for factor in (2, 1))
+        size = (q.shape[1], q.shape[2])
+        enlarged = (as_grid(functional.interpolate(as_map(grid), size=size)) for grid in (coarse, half))
+        merged: Tensor = self.merge_head(torch.cat([*enlarged, full], dim=-1))
+        return merged
 
 
-def _repeated(grid: Tensor, height: int, width: int) -> Tensor:
-    """Upsample by nearest neighbours to a whole multiple of the size."""
-    return as_grid(functional.interpolate(as_map(grid), size=(height, width), mode="nearest"))
+def _span_message(q: Tensor, k: Tensor, v: Tensor, flow: Tensor, factor: int, mask: Tensor | None) -> Tensor:
+    """Return the message of the adaptive-span level that pools by ``factor``, (N, h / factor, w / factor, 256)."""
+    q, k, v = mean_pool(q, factor), mean_pool(k, factor), mean_pool(v, factor)
+    samples = adaptive_span(flow, factor)
+    usable = None if mask is None else sample_usable(samples, mask, (k.shape[1], k.shape[2]), factor)
+    return span_attention(q, k, v, samples, HEADS, usable)
 
 
 class AspanBlock(nn.Module):
@@ -244,27 +229,12 @@ class AspanTransformer(nn.Module):
         # The weights of 3x3 convolutions have the memory layout of the grids.
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # missing in torch's stubs
 
-    def project(self, positions: Tensor) -> Tensor:
-        """Map encoded positions (1, h, w, 256) to (1, h, w, 128), for the values."""
-        return pointwise(self.pos_transform, positions)
-
     def forward(self, side0: Side, side1: Side) -> tuple[Tensor, Tensor]:
         """Return the visual features of both, (N, h, w, 256)."""
         side0, side1 = self.ini_layer(side0, side1)
         for block in self.layers:
             side0, side1 = block(side0, side1), block(side1, side0)
         return side0.visual, side1.visual
-
-
-POOLING = (4, 4)  # rows and columns of the coarse map per cell of the global level
-
-
-class MatchingTemperature(nn.Module):
-    """The learned factor of the similarity."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.temperature = nn.Parameter(torch.tensor(10.0))
 
 
 class AspanFormer(SemiDenseNetwork[AspanTransformer]):
@@ -280,12 +250,12 @@ class AspanFormer(SemiDenseNetwork[AspanTransformer]):
     def __init__(self, threshold: float = 0.2, border: int = 2, train_size: tuple[int, int] = (832, 832)) -> None:
         super().__init__(AspanTransformer(), threshold, border)
         self.train_size = train_size
-        self.coarse_matching = MatchingTemperature()
+        self.coarse_matching = nn.ParameterDict({"temperature": torch.tensor(10.0)})
         self.eval().requires_grad_(False)
 
     @property
     def similarity_scale(self) -> Tensor:
-        return self.coarse_matching.temperature / TOP
+        return self.coarse_matching.get_parameter("temperature") / TOP
 
     def transform(self, coarse0: Tensor, coarse1: Tensor, masks: Masks | None = None) -> tuple[Tensor, Tensor]:
         mask0, mask1 = masks or (None, None)
@@ -299,7 +269,8 @@ class AspanFormer(SemiDenseNetwork[AspanTransformer]):
         scale = self.position_scale(height, width)
         positions = sine_positions(height, width, FIXED_DECAY, scale, grid.device)[None]  # (1, h, w, 256)
         visual = (grid + positions).contiguous()
-        return Side(visual, visual.new_empty(0), self.loftr_coarse.project(positions), POOLING, mask)
+        projected = pointwise(self.loftr_coarse.pos_transform, positions)
+        return Side(visual, visual.new_empty(0), projected, POOLING, mask)
 
     def position_scale(self, height: int, width: int) -> tuple[float, float]:
         """Return the factors (y, x) that stretch the positions in a coarse map."""

@@ -6,7 +6,7 @@ softmaxes, then for the maximum of each row and column.
 """
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -18,14 +18,12 @@ ROWS_AT_ONCE = {"cpu": 256, "cuda": 8192}
 HELD_FLOATS = 2**25  # of the matrix: 128 MiB, at 640 x 480 it has 23 million
 
 
-@dataclass(frozen=True, eq=False)
-class CoarseMatches:
-    """M matches in order of (batch, cell0): int64 ``batch``, ``cell0``, ``cell1`` and float32 ``confidence``.
+class CoarseMatches(NamedTuple):
+    """M matches in order of ``cell0``: int64 ``cell0``, ``cell1`` and float32 ``confidence``.
 
     Cells are counted row by row in their own map.
     """
 
-    batch: Tensor
     cell0: Tensor
     cell1: Tensor
     confidence: Tensor
@@ -34,41 +32,22 @@ class CoarseMatches:
 def coarse_matches(
     grid0: Tensor, grid1: Tensor, scale: float | Tensor, threshold: float, border: int, masks: Masks | None
 ) -> CoarseMatches:
-    """Match grids (N, h0, w0, C) and (N, h1, w1, C); ``scale`` times their dot product is the similarity.
+    """Match grids (h0, w0, C) and (h1, w1, C); ``scale`` times their dot product is the similarity.
 
     A match is above ``threshold`` and the best of its row and of its column, border cells included. Then matches
-    with a cell within ``border`` of the content's border are dropped. ``masks``: (N, h, w) bool, True at content.
+    with a cell within ``border`` of the content's border are dropped. ``masks``: (h, w) bool, True at content.
     """
-    masks0, masks1 = masks or (grid0.new_ones(grid.shape[:3], dtype=torch.bool) for grid in (grid0, grid1))
-    found = [
-        _matches_of_pair(*pair, scale, threshold, border)
-        for pair in zip(grid0, grid1, masks0, masks1, strict=True)
-    ]
-    batch = torch.cat([torch.full_like(cells, item) for item, (cells, _, _) in enumerate(found)])
-    return CoarseMatches(batch, *(torch.cat(values) for values in zip(*found, strict=True)))
-
-
-def _matches_of_pair(
-    grid0: Tensor,
-    grid1: Tensor,
-    mask0: Tensor,
-    mask1: Tensor,
-    scale: float | Tensor,
-    threshold: float,
-    border: int,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return ``cell0``, ``cell1`` and ``confidence`` of one pair; grids (h, w, C), masks (h, w)."""
+    mask0, mask1 = masks or (grid0.new_ones(grid.shape[:2], dtype=torch.bool) for grid in (grid0, grid1))
     cells = Cells(grid0.flatten(0, 1) * scale, grid1.flatten(0, 1), mask0.flatten(), mask1.flatten())
     best0, partner, best1 = row_and_column_maxima(cells)
     inner0, inner1 = inner_cells(mask0, border), inner_cells(mask1, border)
     confidence = torch.exp(2 * best0)
     kept = (confidence > threshold) & (best0 == best1[partner]) & inner0 & inner1[partner]
     cell0 = kept.nonzero()[:, 0]
-    return cell0, partner[cell0], confidence[cell0]
+    return CoarseMatches(cell0, partner[cell0], confidence[cell0])
 
 
-@dataclass(frozen=True, eq=False)
-class Cells:
+class Cells(NamedTuple):
     """The L and S coarse cells of a pair: features (L, C) and (S, C), content (L,) and (S,) bool."""
 
     features0: Tensor

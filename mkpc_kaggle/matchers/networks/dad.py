@@ -5,7 +5,7 @@ public checkpoint. For inference only.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -20,8 +20,7 @@ from mkpc_kaggle.matchers.networks.vgg import VGG11, Vgg
 TEMPERATURE = 0.5  # of the softmax over nine pixels that locates a keypoint between pixels
 
 
-@dataclass(frozen=True, eq=False)
-class DadKeypoints:
+class DadKeypoints(NamedTuple):
     """K keypoints of one image by descending score, float32: ``points`` (K, 2) normalised, up to half a pixel
     beyond the edges; ``scores`` (K,), probabilities that sum to 1 over all pixels.
     """
@@ -49,7 +48,7 @@ class Dad(nn.Module):
     def logits(self, image: Tensor) -> Tensor:
         """Return logits (B, H, W) float32."""
         prediction, hidden = self.decoder(self.levels(image))
-        part = self.decoder.last.outputs(hidden, slice(1))
+        part = self.decoder.at(1).outputs(hidden, slice(1))
         return resize(prediction, part.shape[2:], "bicubic").add_(part)[:, 0]
 
     def levels(self, image: Tensor) -> Iterator[Tensor]:

@@ -7,7 +7,7 @@ public checkpoints. For inference only.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -21,8 +21,7 @@ KERNEL, BLOCKS = 5, 5  # side of the depthwise convolutions; number of blocks af
 CHANNELS = 32  # of a prediction, enlarged at a time
 
 
-@dataclass(frozen=True)
-class DedodeRefinerShape:
+class DedodeRefinerShape(NamedTuple):
     """Channels of the input ``features``, inside, and of the output ``context``."""
 
     features: int
@@ -94,10 +93,6 @@ class DedodeDecoder(nn.Module):
             self.layers[str(stride)] = DedodeRefiner(SHAPES[stride], context, prediction, blocks)
             context = SHAPES[stride].context
 
-    @property
-    def last(self) -> DedodeRefiner:
-        return self.at(1)
-
     def at(self, stride: int) -> DedodeRefiner:
         refiner = self.layers[str(stride)]
         assert isinstance(refiner, DedodeRefiner)
@@ -110,17 +105,14 @@ class DedodeDecoder(nn.Module):
         """
         strides = [int(stride) for stride in self.layers]
         # A for loop would keep the features in memory while the next ones are computed.
-        entries = list(map(self.entry, reversed(strides), levels))
+        entries = list(map(DedodeRefiner.entry, map(self.at, reversed(strides)), levels))
         prediction: Tensor | None = None
         context: Tensor | None = None
         for stride in strides[:-1]:
             prediction, context = self.refined(stride, entries.pop(), prediction, context)
         assert prediction is not None
-        mixed = self.last.mixed(entries.pop(), context)
-        return prediction, self.last.hidden(mixed)
-
-    def entry(self, stride: int, features: Tensor) -> Tensor:
-        return self.at(stride).entry(features)
+        mixed = self.at(1).mixed(entries.pop(), context)
+        return prediction, self.at(1).hidden(mixed)
 
     def refined(
         self, stride: int, entry: Tensor, prediction: Tensor | None, context: Tensor | None
@@ -169,7 +161,7 @@ class Dedode(nn.Module):
         """
         prediction, hidden = self.decoder(self.encoder.levels(image))
         # The full-resolution map is never computed, only its two parts at the points.
-        head = self.decoder.last.out_conv
+        head = self.decoder.at(1).out_conv
         weight, bias = (
             parameter[: self.decoder.prediction] for parameter in (head.weight, head.get_parameter("bias"))
         )

@@ -1,7 +1,5 @@
 """Matches drawn evenly from a dense warp: Edstedt et al. 2023, "DKM", section 3.5."""
 
-from dataclasses import dataclass
-
 import torch
 from torch import Generator, Tensor
 
@@ -12,39 +10,16 @@ BLOCK_FLOATS = 2**20
 MIN_EXPONENT = -80  # exp of less is denormal: ten times slower, and adds nothing
 
 
-@dataclass(frozen=True, eq=False)
-class SampledMatches:
-    """``matches`` (M, 4) float32, normalised (x, y) in either image; ``index`` (M,) int64 into the flat warp."""
+def sample_matches(warp: Tensor, certainty: Tensor, number: int, threshold: float, generator: Generator) -> Tensor:
+    """Draw up to ``number`` matches from a warp (N, 4) with its finite certainty (N,): (M,) int64 indices.
 
-    matches: Tensor
-    index: Tensor
-
-
-def sample_matches(
-    warp: Tensor,
-    certainty: Tensor,
-    number: int,
-    threshold: float = 0.05,
-    *,
-    generator: Generator | None = None,
-) -> SampledMatches:
-    """Draw up to ``number`` matches from a warp (N, 4) with its certainty (N,).
-
-    Certainties above ``threshold`` count as 1. Matches without weight are never drawn.
-    ``generator`` (on the tensors' device; default: PyTorch's) fixes the result. Raises ``ValueError`` unless
-    certainties are finite.
+    Certainties above ``threshold`` count as 1. Matches without weight are never drawn. ``generator``, on the
+    tensors' device, fixes the result.
     """
     weights = certainty.masked_fill(certainty > threshold, 1)
-    if not weights.isfinite().all():
-        raise ValueError("certainties must be finite")
-    index = draw(weights, noise_like(weights, generator), number * OVERSAMPLING)
+    index = draw(weights, torch.empty_like(weights).exponential_(generator=generator), number * OVERSAMPLING)
     evenness = balancing_weights(density(warp[index]))
-    index = index[draw(evenness, noise_like(evenness, generator), number)]
-    return SampledMatches(warp[index], index)
-
-
-def noise_like(weights: Tensor, generator: Generator | None) -> Tensor:
-    return torch.empty_like(weights).exponential_(generator=generator)
+    return index[draw(evenness, torch.empty_like(evenness).exponential_(generator=generator), number)]
 
 
 def draw(weights: Tensor, noise: Tensor, number: int) -> Tensor:

@@ -5,7 +5,7 @@ Normalised coordinates as in warp_refiner. Source: Edstedt et al. 2023, "DKM", s
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -16,8 +16,7 @@ from mkpc_kaggle.matchers.networks.layers import ExactConv2d
 from mkpc_kaggle.matchers.networks.warp_refiner import WarpEstimate, identity_map, resize
 
 
-@dataclass(frozen=True, eq=False)
-class Pyramid:
+class Pyramid(NamedTuple):
     """Features of B images, (B, C, h, w), in the network's precision: at strides 1, 2, 4, 8 and maybe more."""
 
     levels: tuple[Tensor, ...]
@@ -26,8 +25,7 @@ class Pyramid:
         return self.levels[stride.bit_length() - 1]
 
 
-@dataclass(frozen=True, eq=False)
-class DenseFeatures:
+class DenseFeatures(NamedTuple):
     """Features of B images: of the images for the first pass, and of larger versions for the second.
 
     ``coefficients`` has (B, n, width) for each Gaussian process of the network, with the images as its support.
@@ -38,8 +36,7 @@ class DenseFeatures:
     fine: Pyramid | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class DenseWarp:
+class DenseWarp(NamedTuple):
     """Warps of B pairs, float32: ``warp`` (B, H, W, 4), (x, y) in the first and in the second image, in [-1, 1];
     ``certainty`` (B, H, W) in [0, 1], 0 where the target is outside. The grid is one of the images'.
     """

@@ -37,7 +37,7 @@ class DinoV2(nn.Module):
         self.cls_token = nn.Parameter(torch.zeros(1, 1, config.width))
         self.pos_embed = nn.Parameter(torch.zeros(1, 1 + config.positions**2, config.width))
         self.mask_token = nn.Parameter(torch.zeros(1, config.width))  # for training only; checkpoints have it
-        self.patch_embed = PatchEmbedding(config.width)
+        self.patch_embed = nn.ModuleDict({"proj": nn.Conv2d(3, config.width, PATCH, PATCH)})
         self.blocks = nn.ModuleList(
             VitBlock(config.width, config.heads, EPSILON, bias=True, scaled=True) for _ in range(config.blocks)
         )
@@ -46,7 +46,10 @@ class DinoV2(nn.Module):
 
     def forward(self, image: Tensor) -> Tensor:
         """Map normalised images (B, 3, 14 h, 14 w) to (B, C, h, w) float32, channels last."""
-        patches = as_grid(self.patch_embed(image))  # (B, h, w, C)
+        embed = self.patch_embed["proj"]
+        patches = as_grid(
+            embed(image.to(self.patch_embed.get_parameter("proj.weight").dtype)).float()
+        )  # (B, h, w, C)
         classes = self.cls_token.expand(len(image), -1, -1)
         tokens = torch.cat([classes, patches.flatten(1, 2)], dim=1).add_(self.positions(*patches.shape[1:3]))
         for block in self.blocks:
@@ -67,17 +70,6 @@ class DinoV2(nn.Module):
         resampled = functional.interpolate(stored, scale_factor=factors, mode="bicubic", align_corners=False)
         assert resampled.shape[2:] == (height, width)
         return torch.cat([self.pos_embed[:, :1], as_grid(resampled).flatten(1, 2)], dim=1)
-
-
-class PatchEmbedding(nn.Module):
-    def __init__(self, width: int) -> None:
-        super().__init__()
-        self.proj = nn.Conv2d(3, width, PATCH, PATCH)
-
-    def forward(self, image: Tensor) -> Tensor:
-        """Map (B, 3, 14 h, 14 w) to (B, C, h, w) float32."""
-        patches: Tensor = self.proj(image.to(self.proj.weight.dtype))
-        return patches.float()
 
 
 class VitBlock(nn.Module):

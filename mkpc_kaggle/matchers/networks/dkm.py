@@ -31,7 +31,7 @@ class DKM(DenseNetwork):
 
     def __init__(self) -> None:
         super().__init__()
-        self.encoder = DkmEncoder()
+        self.encoder = nn.ModuleDict({"net": ResNet50()})
         self.decoder: DkmDecoder = DkmDecoder()
         # Channels-last weights make all maps channels last; loading a checkpoint keeps that.
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # missing in torch's stubs
@@ -39,21 +39,15 @@ class DKM(DenseNetwork):
 
     def encode(self, image: Tensor, fine: Tensor | None = None) -> DenseFeatures:
         """Encode images of any size."""
-        coarse = self.decoder.projected(self.encoder(image))
-        second = None if fine is None else self.encoder(fine, FINE_COARSEST)
+        coarse = self.decoder.projected(self.pyramid(image, 32))
+        second = None if fine is None else self.pyramid(fine, FINE_COARSEST)
         return DenseFeatures(coarse, self.decoder.regress(coarse), second)
 
-
-class DkmEncoder(nn.Module):
-    def __init__(self) -> None:
-        super().__init__()
-        self.net = ResNet50()
-
-    def forward(self, image: Tensor, coarsest: int = 32) -> Pyramid:
+    def pyramid(self, image: Tensor, coarsest: int) -> Pyramid:
         """Return the image (B, 3, H, W) itself and its features at strides 2 to ``coarsest``."""
         image = image.contiguous(memory_format=torch.channels_last)
-        features = self.net(image.to(self.net.conv1.weight.dtype), coarsest)
-        return Pyramid((image, *features))
+        precision = self.encoder.get_parameter("net.conv1.weight").dtype
+        return Pyramid((image, *self.encoder["net"](image.to(precision), coarsest)))
 
 
 class DkmDecoder(WarpDecoder):
@@ -192,7 +186,7 @@ class ResNet50(nn.Module):
         self.layer4 = stage(1024, 512, blocks=3, stride=2)
         self.fc = nn.Linear(2048, 1000)
 
-    def forward(self, image: Tensor, coarsest: int = 32) -> tuple[Tensor, ...]:
+    def forward(self, image: Tensor, coarsest: int) -> tuple[Tensor, ...]:
         """Return features at strides 2, 4, 8, 16 and 32, up to ``coarsest``, of images (B, 3, H, W) of any size.
 
         (B, C, h, w) with C = 64, 256, 512, 1024, 2048; every halving of a side rounds up.

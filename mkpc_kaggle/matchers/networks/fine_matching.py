@@ -1,6 +1,6 @@
 """Refinement of coarse matches in 5x5 windows of the fine maps (Sun et al. 2021, section 3.4)."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -12,11 +12,11 @@ from mkpc_kaggle.matchers.networks.layers import Linear, linear
 COARSE_STRIDE, FINE_STRIDE = 8, 2
 SIDE = 5  # of a window, in fine cells
 CENTRE = SIDE * SIDE // 2
+REACH = SIDE // 2 * FINE_STRIDE  # pixels per unit of the offset, half a window
 
 
-@dataclass(frozen=True, eq=False)
-class SemiDenseMatches:
-    """M matches of a batch of pairs, in order of (batch, coarse cell of image 0).
+class SemiDenseMatches(NamedTuple):
+    """M matches of a pair, in order of the coarse cell of image 0.
 
     ``points0``, ``points1``: (M, 2) float32 (x, y) in pixels of the network's input, in a frame whose origin is
     the corner of the image: the centre of the top-left pixel is (0.5, 0.5). Points of image 0 lie on the
@@ -50,20 +50,20 @@ def cell_points(cells: Tensor, width: int) -> Tensor:
     return torch.stack([cells % width, cells // width], dim=1).float() * COARSE_STRIDE
 
 
-def cut_windows(fine: Tensor, batch: Tensor, cells: Tensor) -> Tensor:
-    """Cut (M, 25, C) float32, row by row, around M coarse cells out of fine maps (N, C, Hf, Wf).
+def cut_windows(fine: Tensor, cells: Tensor) -> Tensor:
+    """Cut (M, 25, C) float32, row by row, around M coarse cells out of a fine map (1, C, Hf, Wf).
 
     A cell's window is centred on the fine cell at its top-left corner; zero outside the map.
     """
-    grid = as_grid(fine)  # (N, Hf, Wf, C)
-    _, height, width, channels = grid.shape
+    grid = as_grid(fine)  # (1, Hf, Wf, C)
+    width, channels = grid.shape[2:]
     step = COARSE_STRIDE // FINE_STRIDE
     coarse_width = width // step
     around = torch.arange(SIDE, device=fine.device) - SIDE // 2
     rows = (cells // coarse_width * step)[:, None, None] + around[:, None]  # (M, 5, 1)
     columns = (cells % coarse_width * step)[:, None, None] + around  # (M, 1, 5)
     # Centres are at multiples of the step, so windows exceed the map at the top and left only.
-    index = (batch[:, None, None] * height + rows.clamp(min=0)) * width + columns.clamp(min=0)  # (M, 5, 5)
+    index = rows.clamp(min=0) * width + columns.clamp(min=0)  # (M, 5, 5)
     windows = grid.reshape(-1, channels).index_select(0, index.flatten()).float().view(-1, SIDE * SIDE, channels)
     return windows.masked_fill_(((rows < 0) | (columns < 0)).flatten(1)[..., None], 0.0)
 
@@ -80,8 +80,3 @@ def expected_offset(windows0: Tensor, windows1: Tensor) -> Tensor:
     mean = heat @ offsets  # (M, 2)
     deviation = (heat @ offsets**2 - mean**2).clamp(min=1e-10).sqrt().sum(dim=1)
     return torch.cat([mean, deviation[:, None]], dim=1)
-
-
-def refined_points(coarse1: Tensor, expectation: Tensor) -> Tensor:
-    """Move coarse points of image 1 (M, 2): an offset of one is half a window, two fine cells."""
-    return coarse1 + expectation[:, :2] * (SIDE // 2 * FINE_STRIDE)

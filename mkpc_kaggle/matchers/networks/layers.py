@@ -5,14 +5,14 @@ map's result has its input's precision again.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 STRIP_FLOATS = 2**21  # of a strip of :func:`in_strips`, at its maximum number of channels
-IMAGES = 16  # on one thread PyTorch uses oneDNN's convolution from this batch size on
+IMAGES = range(16, 65)  # on one thread PyTorch uses oneDNN's convolution from 16 images on
 
 
 def linear(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
@@ -23,7 +23,7 @@ def linear(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
         return functional.linear(x, weight, bias)
     # In float32 oneDNN's 1x1 convolution is as fast as MKL's matrix product on Intel, twice as fast on AMD.
     rows = x.numel() // x.shape[-1]
-    images = IMAGES if rows % IMAGES == 0 else 1
+    images = next((count for count in IMAGES if rows % count == 0), 1)
     seen = x.reshape(images, 1, rows // images, -1).permute(0, 3, 1, 2)  # channels last
     mapped = functional.conv2d(seen, weight[:, :, None, None], bias)  # (images, C_out, 1, rows / images)
     return mapped.permute(0, 2, 3, 1).reshape(*x.shape[:-1], -1)
@@ -69,7 +69,7 @@ def in_strips(function: Callable[[Tensor], Tensor], x: Tensor, *, reach: int, ch
     edges has no effect.
     """
     batch, _, height, width = x.shape
-    rows = max(4 * reach, STRIP_FLOATS // (batch * channels * width))
+    rows = max(1, 4 * reach, STRIP_FLOATS // (batch * channels * width))
     if x.is_cuda or rows >= height:
         return function(x)
     result = None
@@ -84,8 +84,7 @@ def in_strips(function: Callable[[Tensor], Tensor], x: Tensor, *, reach: int, ch
     return result
 
 
-@dataclass(frozen=True, eq=False)
-class Assignment:
+class Assignment(NamedTuple):
     """M matches by ascending ``index0``: keypoints ``index0``, ``index1`` (M,) int64, ``scores`` (M,) in 0..1."""
 
     index0: Tensor

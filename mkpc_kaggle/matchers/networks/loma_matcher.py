@@ -4,7 +4,7 @@ The keypoints of both images share one tensor (1, N, d), N = N0 + N1; only atten
 Parameter names match the public checkpoints. For inference only.
 """
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -16,8 +16,7 @@ HEAD = 64  # channels of an attention head
 LAYERS = 9
 
 
-@dataclass(frozen=True, eq=False)
-class LomaKeypoints:
+class LomaKeypoints(NamedTuple):
     """N keypoints of one image, float32: ``points`` (N, 2), (x, y) in [-1, 1] from edge to edge of the image;
     ``descriptors`` (N, D), of any length.
     """
@@ -45,13 +44,11 @@ def apply_rotary(x: Tensor, rotation: Tensor) -> Tensor:
     return torch.view_as_real(pairs * rotation).flatten(3)
 
 
-class LomaUpdate(nn.Sequential):
-    """The update of a keypoint's features by a message."""
-
-    def __init__(self, width: int) -> None:
-        super().__init__(
-            Linear(2 * width, 2 * width), nn.LayerNorm(2 * width), nn.GELU(), Linear(2 * width, width)
-        )
+def update(width: int) -> nn.Sequential:
+    """Make the layers that update a keypoint's features by a message."""
+    return nn.Sequential(
+        Linear(2 * width, 2 * width), nn.LayerNorm(2 * width), nn.GELU(), Linear(2 * width, width)
+    )
 
 
 class LomaSelfAttention(nn.Module):
@@ -61,7 +58,7 @@ class LomaSelfAttention(nn.Module):
         super().__init__()
         self.Wqkv = Linear(width, 3 * width)
         self.out_proj = Linear(width, width)
-        self.ffn = LomaUpdate(width)
+        self.ffn = update(width)
 
     def forward(self, x: Tensor, n0: int, rotation: Tensor) -> Tensor:
         """Map (1, N, d) to (1, N, d); the first ``n0`` of the N keypoints are image 0's."""
@@ -82,7 +79,7 @@ class LomaCrossAttention(nn.Module):
         self.to_qk = Linear(width, width)
         self.to_v = Linear(width, width)
         self.to_out = Linear(width, width)
-        self.ffn = LomaUpdate(width)
+        self.ffn = update(width)
 
     def forward(self, x: Tensor, n0: int) -> Tensor:
         """Map as :class:`LomaSelfAttention` does."""
@@ -93,7 +90,7 @@ class LomaCrossAttention(nn.Module):
         return updated(x, outputs, self.to_out, self.ffn)
 
 
-def updated(x: Tensor, outputs: list[Tensor], out: Linear, ffn: LomaUpdate) -> Tensor:
+def updated(x: Tensor, outputs: list[Tensor], out: Linear, ffn: nn.Sequential) -> Tensor:
     """Update features (1, N, d) by the attention outputs (1, heads, Ni, 64) of both images."""
     output = torch.cat([each.transpose(1, 2) for each in outputs], dim=1).flatten(2)  # (1, N, d)
     change: Tensor = ffn(torch.cat([x, out(output)], dim=2))

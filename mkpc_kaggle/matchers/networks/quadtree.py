@@ -3,7 +3,6 @@
 Sources: Tang et al., "QuadTree Attention for Vision Transformers", 2022 (type B); Sun et al. 2021 (LoFTR).
 """
 
-from dataclasses import dataclass
 from functools import partial
 
 import torch
@@ -29,38 +28,30 @@ LAYERS = 8
 HIDDEN = 4 * TOP
 
 
-@dataclass(frozen=True, eq=False)
-class Attended:
-    """One level's result for P query cells of G queries each: ``message`` (B, P, G, D), and ``kept`` (B, P, G, K)
-    int64, the key cells (row by row over the level's map) with the highest attention; None at the last level.
+def attend(q: Tensor, k: Tensor, v: Tensor, keep: int) -> tuple[Tensor, Tensor]:
+    """Attend from P cells of G queries, (B, P, G, D), to each cell's keys and values (B, P, S, D).
+
+    Return the messages (B, P, G, D), and (B, P, G, keep) int64: the indices in S of the highest attention.
     """
-
-    message: Tensor
-    kept: Tensor | None
-
-
-def attend(q: Tensor, k: Tensor, v: Tensor, keep: int | None) -> Attended:
-    """Attend from queries (B, P, G, D) to each group's keys and values (B, P, S, D); ``kept`` index S."""
     logits = (q * q.shape[-1] ** -0.5) @ k.transpose(-1, -2)  # (B, P, G, S)
-    kept = None if keep is None else logits.topk(min(keep, logits.shape[-1]), dim=-1, sorted=False).indices
-    return Attended(logits.softmax(dim=-1) @ v, kept)
+    kept = logits.topk(min(keep, logits.shape[-1]), dim=-1, sorted=False).indices
+    return logits.softmax(dim=-1) @ v, kept
 
 
-def attend_children(q: Tensor, k: Tensor, v: Tensor, parents: Tensor, keep: int | None) -> Attended:
+def attend_children(q: Tensor, k: Tensor, v: Tensor, parents: Tensor, keep: int) -> tuple[Tensor, Tensor]:
     """Attend at a finer level: maps (B, h, w, D) of queries, and (B, h_key, w_key, D) of keys and values.
 
     ``parents``: (B, h w / 4, K) int64, the key cells of the level above whose children a 2x2 cell of queries
-    attends to. Children of one parent are adjacent in memory, for one read.
+    attends to. Children of one parent are adjacent in memory, for one read. Return as :func:`attend` does, the
+    kept key cells counted row by row over the level's map.
     """
     w_key = k.shape[2]
     candidates = partial(_children_of, parents=parents)
-    found = attend(to_2x2_blocks(q), candidates(to_2x2_blocks(k)), candidates(to_2x2_blocks(v)), keep)
-    if found.kept is None:
-        return found
-    parent = parents[:, :, None].expand(-1, -1, 4, -1).gather(3, found.kept // 4)  # (B, P, 4, keep)
-    row = parent // (w_key // 2) * 2 + found.kept % 4 // 2
-    column = parent % (w_key // 2) * 2 + found.kept % 2
-    return Attended(found.message, row * w_key + column)
+    message, kept = attend(to_2x2_blocks(q), candidates(to_2x2_blocks(k)), candidates(to_2x2_blocks(v)), keep)
+    parent = parents[:, :, None].expand(-1, -1, 4, -1).gather(3, kept // 4)  # (B, P, 4, keep)
+    row = parent // (w_key // 2) * 2 + kept % 4 // 2
+    column = parent % (w_key // 2) * 2 + kept % 2
+    return message, row * w_key + column
 
 
 def _children_of(cells: Tensor, parents: Tensor) -> Tensor:
@@ -79,23 +70,14 @@ def quadtree_attention(q: Tensor, k: Tensor, v: Tensor, shares: Tensor, topks: t
     """
     (q0, k0, v0), (q1, k1, v1) = ([mean_pool(x, factor) for x in (q, k, v)] for factor in (4, 2))
     batch, h0, w0, width = q0.shape
-    dense = attend(q0.reshape(batch, 1, -1, width), k0.flatten(1, 2)[:, None], v0.flatten(1, 2)[:, None], topks[0])
-    assert dense.kept is not None
-    middle = attend_children(q1, k1, v1, dense.kept[:, 0], topks[1])
-    assert middle.kept is not None
-    fine = attend_children(q, k, v, from_2x2_blocks(middle.kept, 2 * h0, 2 * w0).flatten(1, 2), None)
+    keys, values = (x.flatten(1, 2)[:, None] for x in (k0, v0))
+    dense, kept = attend(q0.reshape(batch, 1, -1, width), keys, values, topks[0])
+    middle, kept = attend_children(q1, k1, v1, kept[:, 0], topks[1])
+    fine, _ = attend_children(q, k, v, from_2x2_blocks(kept, 2 * h0, 2 * w0).flatten(1, 2), 0)
     # A cell's children inherit its message: broadcasting over 2x2 blocks.
-    coarse = dense.message[:, 0, :, None] * shares[0]  # (B, h0 w0, 1, D)
-    merged = from_2x2_blocks(coarse + middle.message * shares[1], 2 * h0, 2 * w0)  # (B, 2 h0, 2 w0, D)
-    return from_2x2_blocks(fine.message * shares[2] + merged.flatten(1, 2)[:, :, None], 4 * h0, 4 * w0)
-
-
-class LevelWeights(nn.Module):
-    """One learned scalar for each level, coarsest first; their softmax are the levels' shares."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.weight = nn.Parameter(torch.ones(LEVELS))
+    coarse = dense[:, 0, :, None] * shares[0]  # (B, h0 w0, 1, D)
+    merged = from_2x2_blocks(coarse + middle * shares[1], 2 * h0, 2 * w0)  # (B, 2 h0, 2 w0, D)
+    return from_2x2_blocks(fine * shares[2] + merged.flatten(1, 2)[:, :, None], 4 * h0, 4 * w0)
 
 
 class QuadtreeAttention(nn.Module):
@@ -108,7 +90,7 @@ class QuadtreeAttention(nn.Module):
         self.q_proj = nn.Conv2d(width, width, 1, bias=False)
         self.k_proj = nn.Conv2d(width, width, 1, bias=False)
         self.v_proj = nn.Conv2d(width, width, 1, bias=False)
-        self.py_att = LevelWeights()
+        self.py_att = nn.ParameterDict({"weight": torch.ones(LEVELS)})  # the levels' shares before their softmax
         self.proj = Linear(width, width)
 
     def forward(self, x: Tensor, source: Tensor) -> Tensor:
@@ -117,7 +99,7 @@ class QuadtreeAttention(nn.Module):
             self._by_head(pointwise(layer, grid))
             for layer, grid in ((self.q_proj, x), (self.k_proj, source), (self.v_proj, source))
         )  # (N heads, h, w, D)
-        shares = self.py_att.weight.softmax(dim=0)
+        shares = self.py_att["weight"].softmax(dim=0)
         # On a CPU head by head, so that gathered keys fit the cache; on a GPU all at once.
         at_once = 1 if x.device.type == "cpu" else len(q)
         parts = zip(*(torch.split(y, at_once) for y in (q, k, v)), strict=True)
@@ -131,30 +113,19 @@ class QuadtreeAttention(nn.Module):
         return grid.view(*grid.shape[:3], self.heads, -1).permute(0, 3, 1, 2, 4).flatten(0, 1)
 
 
-class DepthwiseConvolution(nn.Module):
-    """3x3 over a grid (N, h, w, C), each channel on its own."""
-
-    def __init__(self, width: int) -> None:
-        super().__init__()
-        self.dwconv = nn.Conv2d(width, width, 3, padding=1, groups=width)
-
-    def forward(self, grid: Tensor) -> Tensor:
-        return as_grid(self.dwconv(as_map(grid)))
-
-
 class ConvolutionalMlp(nn.Module):
     """A perceptron with a depthwise convolution over neighbouring cells."""
 
     def __init__(self, width: int, hidden: int) -> None:
         super().__init__()
         self.fc1 = Linear(width, hidden)
-        self.dwconv = DepthwiseConvolution(hidden)
+        self.dwconv = nn.ModuleDict({"dwconv": nn.Conv2d(hidden, hidden, 3, padding=1, groups=hidden)})
         self.fc2 = Linear(hidden, width)
 
     def forward(self, grid: Tensor) -> Tensor:
         """Map (N, h, w, C) to (N, h, w, C)."""
         hidden = functional.relu_(self.fc1(grid.to(self.fc1.weight.dtype)))  # (N, h, w, hidden)
-        out: Tensor = self.fc2(functional.gelu(self.dwconv(hidden)))
+        out: Tensor = self.fc2(functional.gelu(as_grid(self.dwconv["dwconv"](as_map(hidden)))))
         return out.to(grid.dtype)
 
 

@@ -3,7 +3,7 @@
 Source: Sun et al. 2021 (LoFTR), section 3.1; layer names as in the public checkpoints.
 """
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -12,8 +12,7 @@ from torch.nn import functional
 STEM, MIDDLE, TOP, FINE = 128, 196, 256, 128  # channels at 1/2, 1/4 and 1/8, and of the fine output
 
 
-@dataclass(frozen=True, eq=False)
-class FeatureMaps:
+class FeatureMaps(NamedTuple):
     """Maps of B images of H x W pixels: ``coarse`` (B, 256, H/8, W/8) and ``fine`` (B, 128, H/2, W/2).
 
     In the precision of the backbone's weights.

@@ -22,7 +22,7 @@ from mkpc_kaggle.matchers.networks.dense_warp import (
     tokens,
 )
 from mkpc_kaggle.matchers.networks.dinov2 import DinoV2, DinoV2Config, VitBlock
-from mkpc_kaggle.matchers.networks.grids import as_grid
+from mkpc_kaggle.matchers.networks.grids import as_grid, as_map, pointwise
 from mkpc_kaggle.matchers.networks.layers import ExactLinear
 from mkpc_kaggle.matchers.networks.vgg import VGG19, WIDTHS, Vgg
 from mkpc_kaggle.matchers.networks.warp_refiner import (
@@ -30,7 +30,6 @@ from mkpc_kaggle.matchers.networks.warp_refiner import (
     WarpEstimate,
     WarpRefiner,
     WarpRefinerShape,
-    by_rows,
     identity_map,
     refined,
 )
@@ -117,7 +116,7 @@ class Projection(nn.Sequential):
         """Map (B, C, h, w) to (B, C', h, w), both channels last."""
         mix, norm = self
         assert isinstance(mix, nn.Conv2d)
-        projected: Tensor = norm(by_rows(mix, features.to(mix.weight.dtype)))
+        projected: Tensor = norm(as_map(pointwise(mix, as_grid(features.to(mix.weight.dtype)))))
         return projected
 
 

@@ -12,12 +12,12 @@ from torch import Tensor, nn
 from mkpc_kaggle.matchers.dtypes import check_finite
 from mkpc_kaggle.matchers.networks.coarse_matching import CoarseMatches, coarse_matches
 from mkpc_kaggle.matchers.networks.fine_matching import (
+    REACH,
     FinePreprocess,
     SemiDenseMatches,
     cell_points,
     cut_windows,
     expected_offset,
-    refined_points,
 )
 from mkpc_kaggle.matchers.networks.linear_attention import LinearTransformer, Masks
 from mkpc_kaggle.matchers.networks.resnet_fpn import FINE, TOP, FeatureMaps, ResNetFpn
@@ -58,35 +58,30 @@ class SemiDenseNetwork(nn.Module, ABC, Generic[Transformer]):
         """Transform the coarse maps (N, 256, h, w) of both images to grids (N, h, w, 256)."""
 
     def encode(self, image: Tensor) -> FeatureMaps:
-        """Encode gray images (B, 1, H, W), float32 in [0, 1]; ValueError unless ``multiple`` divides sides."""
-        height, width = image.shape[2:]
-        if height % self.multiple or width % self.multiple or height * width == 0:
-            raise ValueError(f"sides of an image must be multiples of {self.multiple}, not {height} x {width}")
-        maps = self.backbone(image)
-        assert isinstance(maps, FeatureMaps)
+        """Encode gray images (B, 1, H, W), float32 in [0, 1]."""
+        maps: FeatureMaps = self.backbone(image)
         return maps
 
     def match(
         self, features0: FeatureMaps, features1: FeatureMaps, masks: Masks | None = None
     ) -> SemiDenseMatches:
-        """Match B pairs; ``masks``: (B, H/8, W/8) bool of each image, True at its content at the top left."""
-        grid0, grid1 = self.transform(features0.coarse, features1.coarse, masks)
-        check_finite("coarse features", grid0, grid1)
-        coarse = coarse_matches(grid0, grid1, self.similarity_scale, self.threshold, self.border, masks)
+        """Match a pair; ``masks``: (1, H/8, W/8) bool of each image, True at its content at the top left."""
+        grids = self.transform(features0.coarse, features1.coarse, masks)
+        check_finite("coarse features", *grids)
+        (grid0,), (grid1,) = grids  # (h, w, 256)
+        content = None if masks is None else (masks[0][0], masks[1][0])
+        coarse = coarse_matches(grid0, grid1, self.similarity_scale, self.threshold, self.border, content)
         expectation = self.refine(coarse, features0.fine, features1.fine, grid0, grid1)
-        points0, points1 = (
-            cell_points(cells, grid.shape[2]) for cells, grid in ((coarse.cell0, grid0), (coarse.cell1, grid1))
-        )
-        return SemiDenseMatches(coarse, points0, refined_points(points1, expectation), expectation)
+        points0, points1 = cell_points(coarse.cell0, grid0.shape[1]), cell_points(coarse.cell1, grid1.shape[1])
+        return SemiDenseMatches(coarse, points0, points1 + expectation[:, :2] * REACH, expectation)
 
     def refine(self, coarse: CoarseMatches, fine0: Tensor, fine1: Tensor, grid0: Tensor, grid1: Tensor) -> Tensor:
         """Return (M, 3): the offset of each match from its coarse cell's corner in image 1, see fine_matching."""
-        indices = (coarse.batch, coarse.cell0, coarse.cell1)
         found = []
-        for batch, cell0, cell1 in zip(*(torch.split(x, WINDOWS_AT_ONCE) for x in indices), strict=True):
-            windows0 = self.fine_preprocess(
-                cut_windows(fine0, batch, cell0), grid0.flatten(1, 2)[batch, cell0]
-            )  # (m, 25, 128)
-            windows1 = self.fine_preprocess(cut_windows(fine1, batch, cell1), grid1.flatten(1, 2)[batch, cell1])
+        for cells in zip(*(torch.split(x, WINDOWS_AT_ONCE) for x in (coarse.cell0, coarse.cell1)), strict=True):
+            windows0, windows1 = (
+                self.fine_preprocess(cut_windows(fine, some), grid.flatten(0, 1)[some])  # (m, 25, 128)
+                for fine, some, grid in zip((fine0, fine1), cells, (grid0, grid1), strict=True)
+            )
             found.append(expected_offset(*self.loftr_fine(windows0, windows1)))
         return torch.cat(found)

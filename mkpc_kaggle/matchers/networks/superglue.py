@@ -41,17 +41,6 @@ def pointwise_network(*channels: int) -> nn.Sequential:
     return nn.Sequential(*steps, Pointwise(*channels[-2:]))
 
 
-class PositionEncoder(nn.Module):
-    """An encoder of keypoints (1, N, 3), normalised x and y and score, as (1, N, 256)."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.encoder = pointwise_network(3, 32, 64, 128, 256, CHANNELS)
-
-    def forward(self, positions: Tensor) -> Tensor:
-        return _on_rows(self.encoder, positions)
-
-
 class SuperGlueAttention(nn.Module):
     """Attention with four heads of 64 channels. In the checkpoint channel c belongs to head ``c mod 4``."""
 
@@ -90,16 +79,10 @@ class SuperGlueLayer(nn.Module):
         self.attn = SuperGlueAttention()
         self.mlp = pointwise_network(2 * CHANNELS, 2 * CHANNELS, CHANNELS)
 
-    def message(self, x: Tensor, n0: int) -> Tensor:
-        """Return messages (1, N, 256) to the keypoints ``x`` (1, N, 256); the first ``n0`` are image 0's."""
-        message: Tensor = self.attn(x, n0, cross=self.cross)
-        return message
-
-    def update(self, x: Tensor, message: Tensor) -> Tensor:
-        return x + _on_rows(self.mlp, torch.cat([x, message], dim=2))
-
     def forward(self, x: Tensor, n0: int) -> Tensor:
-        return self.update(x, self.message(x, n0))
+        """Update the keypoints ``x`` (1, N, 256); the first ``n0`` are image 0's."""
+        message = self.attn(x, n0, cross=self.cross)
+        return x + _on_rows(self.mlp, torch.cat([x, message], dim=2))
 
 
 class SuperGlue(nn.Module):
@@ -112,7 +95,7 @@ class SuperGlue(nn.Module):
         super().__init__()
         self.sinkhorn_iterations = sinkhorn_iterations
         self.match_threshold = match_threshold
-        self.kenc = PositionEncoder()
+        self.kenc = nn.ModuleDict({"encoder": pointwise_network(3, 32, 64, 128, 256, CHANNELS)})
         layers = nn.ModuleList(SuperGlueLayer(cross=index % 2 == 1) for index in range(LAYERS))
         self.gnn = nn.ModuleDict({"layers": layers})
         self.final_proj = Pointwise(CHANNELS, CHANNELS)
@@ -133,14 +116,10 @@ class SuperGlue(nn.Module):
         return mutual_matches(log_plan[0, :-1, :-1], self.match_threshold)
 
     def encoded(self, image: SuperPointKeypoints) -> Tensor:
-        """Return the input features (1, N, 256) of the graph network: descriptor and encoded position."""
-        return image.descriptors[None].float() + self.position(image)
-
-    def position(self, image: SuperPointKeypoints) -> Tensor:
-        """Return the position encoder's output for an image, (1, N, 256)."""
+        """Return the graph network's input (1, N, 256): descriptors plus encoded points and scores."""
         points = normalise_points(image.points, image.size)
-        encoded: Tensor = self.kenc(torch.cat([points, image.scores.float()[:, None]], dim=1)[None])
-        return encoded
+        positions = torch.cat([points, image.scores.float()[:, None]], dim=1)[None]  # (1, N, 3)
+        return image.descriptors[None].float() + _on_rows(self.kenc["encoder"], positions)
 
     @staticmethod
     def score_matrix(projected: Tensor, n0: int) -> Tensor:

@@ -5,7 +5,7 @@ is the one published with SuperGlue's weights, including an error in the samplin
 at integers, as everywhere in the package.
 """
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -18,8 +18,7 @@ CELL = 8  # pixels: the stride of the features
 SUPPRESSION_ROUNDS = 2  # each recovers points that only suppressed points exceed
 
 
-@dataclass(frozen=True, eq=False)
-class SuperPointKeypoints:
+class SuperPointKeypoints(NamedTuple):
     """K keypoints of one image, all float32: ``points`` (K, 2), whole pixels (x, y); ``scores`` (K,) in 0..1;
     ``descriptors`` (K, 256), unit vectors, one a row; ``size`` of the image.
 

@@ -6,12 +6,13 @@ of pixel (column j, row i) is ((2 j + 1) / w - 1, (2 i + 1) / h - 1).
 
 from dataclasses import dataclass
 from math import ceil
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mkpc_kaggle.matchers.networks.grids import as_grid, as_map
+from mkpc_kaggle.matchers.networks.grids import as_grid, as_map, pointwise
 from mkpc_kaggle.matchers.networks.layers import ExactConv2d
 
 HIDDEN_BLOCKS = 8
@@ -41,8 +42,7 @@ SHAPES = {  # by stride
 }
 
 
-@dataclass(frozen=True, eq=False)
-class WarpEstimate:
+class WarpEstimate(NamedTuple):
     """An estimate, float32: ``flow`` (B, 2, h, w), each pixel's position in the other image, normalised and
     unclamped; ``certainty`` (B, 1, h, w), logits.
     """
@@ -74,11 +74,11 @@ class WarpRefiner(nn.Module):
         x = self._look(query, support, flow, stretch)  # (B, inputs, h, w)
         for depthwise, norm, _, mix in (self.block1, *self.hidden_blocks):
             # One variable: at most two maps are in memory at a time.
-            x = by_rows(mix, torch.relu_(norm(depthwise(x))))
+            x = as_map(pointwise(mix, as_grid(torch.relu_(norm(depthwise(x))))))
         corrections: Tensor = self.out_conv(x.float())
         return corrections
 
-    def _look(self, query: Tensor, support: Tensor, flow: Tensor, stretch: float = 1) -> Tensor:
+    def _look(self, query: Tensor, support: Tensor, flow: Tensor, stretch: float) -> Tensor:
         seen = functional.grid_sample(
             support.float(), as_grid(flow), mode="bilinear", padding_mode="zeros", align_corners=False
         )
@@ -97,17 +97,6 @@ def block(inputs: int, outputs: int) -> nn.Sequential:
         nn.ReLU(inplace=True),
         nn.Conv2d(outputs, outputs, 1),
     )
-
-
-def by_rows(pointwise: nn.Conv2d, x: Tensor) -> Tensor:
-    """Apply a 1x1 convolution to (B, C, h, w), channels last. This is most of the network's work.
-
-    Rows are a batch, without a copy. For a batch of one on one thread PyTorch uses MKL's matrix product. oneDNN's
-    convolution is twice as fast on AMD.
-    """
-    rows = as_grid(x).reshape(-1, 1, x.shape[3], x.shape[1])  # (B h, 1, w, C)
-    mixed: Tensor = pointwise(as_map(rows))  # (B h, C', 1, w)
-    return as_map(as_grid(mixed).reshape(len(x), x.shape[2], x.shape[3], -1))
 
 
 def refined(estimate: WarpEstimate, corrections: Tensor, stride: int, full: torch.Size) -> WarpEstimate:
@@ -129,39 +118,32 @@ def local_correlation(query: Tensor, support: Tensor, flow: Tensor, radius: int)
     """
     size, size1 = query.shape[2:], support.shape[2:]
     targets = ((as_grid(flow).reshape(-1, 2) + 1) * flow.new_tensor(size1[::-1]) - 1) / 2  # (P, 2) pixels
-    along_x, along_y = (
-        Taps.around(targets[:, axis], length1, length1 / length, radius)
+    (columns, along_x), (rows, along_y) = (
+        taps(targets[:, axis], length1, length1 / length, radius)
         for axis, length, length1 in ((0, size[1], size1[1]), (1, size[0], size1[0]))
     )
     image = torch.arange(len(query), device=flow.device).repeat_interleave(size.numel())  # (P,)
-    rows = image[:, None] * size1[0] + along_y.pixels
-    index = (rows * size1[1])[:, :, None] + along_x.pixels[:, None]  # (P, Ky, Kx)
+    index = ((image[:, None] * size1[0] + rows) * size1[1])[:, :, None] + columns[:, None]  # (P, Ky, Kx)
 
     queries, keys = (as_grid(features.float()).flatten(0, 2) for features in (query, support))
     products = _products(queries, keys, index.flatten(1)).view_as(index)
-    window = along_y.weights @ products @ along_x.weights.mT  # (P, 2 radius + 1, 2 radius + 1)
+    window = along_y @ products @ along_x.mT  # (P, 2 radius + 1, 2 radius + 1)
     return as_map(window.mul_(query.shape[1] ** -0.5).view(len(query), *size, -1))
 
 
-@dataclass(frozen=True, eq=False)
-class Taps:
-    """Whole ``pixels`` (P, K) int64 covered by the windows of P targets on one axis, and their ``weights``
-    (P, 2 radius + 1, K) at each step of the window: linear, zero outside the axis.
+def taps(targets: Tensor, length: int, step: float, radius: int) -> tuple[Tensor, Tensor]:
+    """Return the pixels (P, K) int64 that the windows of P targets (P,) cover on one axis, and their weights.
+
+    Weights (P, 2 radius + 1, K), at each step of the window, are linear, and zero outside the axis.
     """
-
-    pixels: Tensor
-    weights: Tensor
-
-    @classmethod
-    def around(cls, targets: Tensor, length: int, step: float, radius: int) -> "Taps":
-        steps = torch.arange(-radius, radius + 1, device=targets.device) * step
-        first = (targets - radius * step).floor()
-        reach = torch.arange(ceil(2 * radius * step) + 2, device=targets.device)
-        positions = (targets - first)[:, None] + steps  # (P, 2 radius + 1), from the first pixel
-        weights = (positions[:, :, None] - reach).abs_().neg_().add_(1).clamp_(min=0)
-        pixels = first[:, None].long() + reach
-        outside = (pixels < 0) | (pixels >= length)
-        return cls(pixels.clamp_(0, length - 1), weights.masked_fill_(outside[:, None], 0))
+    steps = torch.arange(-radius, radius + 1, device=targets.device) * step
+    first = (targets - radius * step).floor()
+    reach = torch.arange(ceil(2 * radius * step) + 2, device=targets.device)
+    positions = (targets - first)[:, None] + steps  # (P, 2 radius + 1), from the first pixel
+    weights = (positions[:, :, None] - reach).abs_().neg_().add_(1).clamp_(min=0)
+    pixels = first[:, None].long() + reach
+    outside = (pixels < 0) | (pixels >= length)
+    return pixels.clamp_(0, length - 1), weights.masked_fill_(outside[:, None], 0)
 
 
 def _products(queries: Tensor, keys: Tensor, index: Tensor) -> Tensor:
