@@ -21,7 +21,7 @@ def tiff(orientation: int | None = None, order: str = "<", **tags: Value) -> byt
     exif.endian = order
     if orientation is not None:
         exif[0x0112] = orientation
-    exif.get_ifd(0x8769).update({int(tag[1:], 16): value for tag, value in tags.items()})
+    exif[0x8769] = {int(tag[1:], 16): value for tag, value in tags.items()}
     return exif.tobytes().removeprefix(b"Exif\0\0")
 
 

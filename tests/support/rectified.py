@@ -29,13 +29,17 @@ class Seen:
     brightness: int
 
 
+def plenty(_):  # a function, since workers unpickle the matcher
+    return 150
+
+
 @dataclass
 class RectifiedMatcher:
     """``seconds`` for each pair; ``matches`` by the brightness of image 0; ``calls``: (long side, brightness)."""
 
     name: str = "rectified"
     seconds: float = 0.0
-    matches: Callable[[int], int] = lambda _: 150
+    matches: Callable[[int], int] = plenty
     calls: list[tuple[int, int]] = field(default_factory=list)
 
     @property
