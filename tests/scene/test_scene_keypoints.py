@@ -53,17 +53,17 @@ def test_a_keypoint_is_matched_once_and_to_what_was_found_most_often():
 
 def test_a_point_seen_in_two_pairs_is_one_keypoint():
     edges = [
-        Edge(0, 1, matches((10, 10, 20, 20), (30, 30, 40, 40))),
-        Edge(0, 2, matches((10.1, 9.9, 50, 50))),
+        Edge(0, 1, matches((10.45, 10, 20, 20), (30, 30, 40, 40))),
+        Edge(0, 2, matches((10.55, 9.9, 50, 50))),
         Edge(1, 2, matches((20.05, 20, 50.1, 50))),
     ]
     keypoints, found = keypoints_of(3, *edges)
     assert list(map(len, keypoints)) == [2, 2, 1]
     first, second, third = (index.tolist() for index in found)
-    (a, b), (a2, c) = first[0], second[0]
+    (a, b), (a2, c) = first[0], second[0]  # 10.5 is the border of a cell
     assert a == a2
     assert third == [[b, c]]
-    np.testing.assert_allclose(keypoints[0][a], [10.05, 9.95], atol=1e-5)
+    np.testing.assert_allclose(keypoints[0][a], [10.5, 9.95], atol=1e-5)
 
 
 def test_the_same_picture_under_two_names_is_one_image():
