@@ -13,7 +13,7 @@ from exif_files import set_exif, tiff, with_tiff
 from numpy.testing import assert_array_equal
 
 from mkpc_kaggle.data import images
-from mkpc_kaggle.data.images import Image, ImageStore, Unreadable, content_digest, read_exif, read_image
+from mkpc_kaggle.data.images import ByteCache, Image, ImageStore, Unreadable, content_digest, read_exif, read_image
 from mkpc_kaggle.geometry.coordinates import Size
 
 
@@ -112,6 +112,17 @@ def test_a_file_is_decoded_once_unless_it_made_room_or_is_unreadable(decoded):
     with closing(ImageStore(limit_bytes=299)) as small:  # an image above the limit is handed out all the same
         assert [small.get(Path("a")).name for _ in range(2)] == ["a", "a"]
     assert len(decoded) == 9
+
+
+def test_a_cache_drops_what_was_used_least_recently():
+    cache = ByteCache(3)
+    for key in "abc":
+        cache.put(key, key, 1)
+    assert cache.get("a") == "a"
+    for key, size in (("d", 1), ("c", 2), ("e", 4)):  # without b; without a; itself too large
+        cache.put(key, key, size)
+    assert [cache.get(key) for key in "abcde"] == [None, None, "c", "d", None]
+    assert cache.bytes == 3
 
 
 def test_the_digest_of_a_file_is_that_of_its_bytes(tmp_path):

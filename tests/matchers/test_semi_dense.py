@@ -48,10 +48,9 @@ def test_span_attention_in_chunks_is_that_of_the_whole(monkeypatch):
 
 
 def test_weights_with_optimal_transport_are_refused_with_what_to_take_instead(tmp_path):
-    def with_bin_score(state):
-        return wrapped(state | {"coarse_matching.bin_score": torch.ones(())})
-
-    store = store_of(tmp_path, [PublicFile("x.ckpt", "loftr", "loftr-outdoor", "loftr", Loftr, with_bin_score)])
+    surplus = {"coarse_matching.bin_score": torch.ones(())}
+    file = PublicFile("x.ckpt", "loftr", "loftr-outdoor", "loftr", Loftr, lambda state: wrapped(state | surplus))
+    store = store_of(tmp_path, [file])
     with pytest.raises(UserError, match=r"'loftr-outdoor' match by optimal transport.*outdoor_ds"):
         loftr.load(store, loftr.SPEC.options(), Placement())
 

@@ -47,16 +47,14 @@ def test_cameras_start_with_the_focal_length_of_exif(tmp_path, cameras, exif, fo
     assert focals_of(tmp_path, config(cameras, exif=exif)) == pytest.approx(focals)
 
 
-def with_exif(scene, factor):
-    def told(image):
-        return replace(image, focal=factor * float(scene.cameras[image.name].K[0, 0]))
-
-    return [replace(pair, image0=told(pair.image0), image1=told(pair.image1)) for pair in scene.pairs]
-
-
 def test_a_focal_length_of_exif_is_not_fixed():
     scene = synthetic_scene(5, points=500)
-    solution = reconstruct_batch(with_exif(scene, 1.08), config("image"))
+
+    def told(image):
+        return replace(image, focal=1.08 * float(scene.cameras[image.name].K[0, 0]))
+
+    pairs = [replace(pair, image0=told(pair.image0), image1=told(pair.image1)) for pair in scene.pairs]
+    solution = reconstruct_batch(pairs, config("image"))
     found = registered_images(solution)
     assert len(found) == 5
     for image in scene.images:

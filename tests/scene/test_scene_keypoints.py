@@ -30,10 +30,6 @@ def pair(names: str, found: Matches) -> BatchPair:
     return BatchPair(image(names[0]), image(names[1]), found)
 
 
-def keypoints_of(count: int, *edges: Edge) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    return scene_keypoints(ViewGraph(tuple(map(image, "ABC"[:count])), edges))
-
-
 @given(arrays(np.float32, st.tuples(st.integers(0, 60), st.just(2)), elements=st.floats(-5, 5, width=32)))
 def test_a_keypoint_is_the_mean_of_its_points_and_near_each_of_them(points):
     keypoints, place = merge_points(points, 0.75)
@@ -52,18 +48,18 @@ def test_a_keypoint_is_matched_once_and_to_what_was_found_most_often():
 
 
 def test_a_point_seen_in_two_pairs_is_one_keypoint():
-    edges = [
-        Edge(0, 1, matches((10, 10, 20, 20), (30, 30, 40, 40))),
-        Edge(0, 2, matches((10.1, 9.9, 50, 50))),
+    edges = (
+        Edge(0, 1, matches((10.45, 10, 20, 20), (30, 30, 40, 40))),
+        Edge(0, 2, matches((10.55, 9.9, 50, 50))),
         Edge(1, 2, matches((20.05, 20, 50.1, 50))),
-    ]
-    keypoints, found = keypoints_of(3, *edges)
+    )
+    keypoints, found = scene_keypoints(ViewGraph(tuple(map(image, "ABC")), edges))
     assert list(map(len, keypoints)) == [2, 2, 1]
     first, second, third = (index.tolist() for index in found)
-    (a, b), (a2, c) = first[0], second[0]
+    (a, b), (a2, c) = first[0], second[0]  # 10.5 is the border of a cell
     assert a == a2
     assert third == [[b, c]]
-    np.testing.assert_allclose(keypoints[0][a], [10.05, 9.95], atol=1e-5)
+    np.testing.assert_allclose(keypoints[0][a], [10.5, 9.95], atol=1e-5)
 
 
 def test_the_same_picture_under_two_names_is_one_image():

@@ -20,10 +20,6 @@ from mkpc_kaggle.pipeline import assembly
 from mkpc_kaggle.weights import WeightFile, WeightStore
 
 
-def plain(state):
-    return state
-
-
 def wrapped(state):
     """As a training run saves its network: under a prefix, beside what else it wants to remember."""
     prefixed = {f"matcher.{name}": tensor for name, tensor in state.items()}
@@ -62,7 +58,7 @@ class PublicFile:
     slot: str
     standin: str
     network: Callable[[], nn.Module]
-    layout: Callable[[dict[str, Tensor]], dict[str, Any]] = plain
+    layout: Callable[[dict[str, Tensor]], dict[str, Any]] = lambda state: state
 
 
 FILES = (

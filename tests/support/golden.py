@@ -3,7 +3,6 @@
 import importlib.util
 import re
 import sys
-from collections.abc import Iterable, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
@@ -79,9 +78,6 @@ class Within:
         return self.absolute + self.relative * sizes + self.share * (sizes.max() if sizes.numel() else 0)
 
 
-Tolerances = Mapping[str, float | Within]  # by patterns of names; of others the difference must be 0
-
-
 class Stage(NamedTuple):
     """The value that a network computed at one stage, the expected value, and their allowed difference."""
 
@@ -102,8 +98,11 @@ class Stage(NamedTuple):
         return excess.max().item() if got.numel() else 0.0
 
 
-def compared(values, golden, tolerances: Tolerances, suffix=""):
-    """Yield a stage for each value that the golden file has; batches of one may have no axis there."""
+def compared(values, golden, tolerances, suffix=""):
+    """Yield a stage for each value that the golden file has; batches of one may have no axis there.
+
+    Tolerances are by patterns of names; of others the difference must be 0.
+    """
     names = [name for name in values if f"{name}{suffix}" in golden]
     assert len(names) >= 2
     for name in names:
@@ -117,7 +116,7 @@ def in_order(rows):
     return torch.tensor(sorted(rows.tolist()))
 
 
-def assert_stages(stages: Iterable[Stage]):
+def assert_stages(stages):
     """All stages within their tolerances; the message starts with the first stage that is off."""
     off = [stage for stage in stages if stage.excess > 0]
     assert not off, "; ".join(f"{stage.name} exceeds its tolerance by {stage.excess:.2g}" for stage in off)
