@@ -13,7 +13,6 @@ from typing import Any, Protocol, Self
 from mkpc_kaggle.data.images import content_digest
 from mkpc_kaggle.engine import console
 from mkpc_kaggle.engine.budget import Budget
-from mkpc_kaggle.engine.chronicle import Chronicle
 from mkpc_kaggle.engine.estimates import Estimates
 from mkpc_kaggle.engine.features import Features, Key
 from mkpc_kaggle.engine.jobs import (
@@ -32,7 +31,7 @@ from mkpc_kaggle.engine.journal import Journal
 from mkpc_kaggle.engine.matching import Matching
 from mkpc_kaggle.engine.places import LISTEN_S, START_TIMEOUT_S, Place, Site, Work
 from mkpc_kaggle.engine.plan import Plan
-from mkpc_kaggle.engine.request import Ending, Request, RunReport, Standing
+from mkpc_kaggle.engine.request import Chronicle, Ending, Request, RunReport, Standing
 from mkpc_kaggle.engine.scenes import Scenes, batches_of, extra_pairs_of, standing_scenes
 from mkpc_kaggle.engine.state import State
 from mkpc_kaggle.errors import UserError

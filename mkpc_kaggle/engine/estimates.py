@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mkpc_kaggle.engine.budget import WINDOW
-from mkpc_kaggle.engine.chronicle import Chronicle
 from mkpc_kaggle.engine.jobs import Estimated, EstimateJob, Failure
 from mkpc_kaggle.engine.losses import Losses
 from mkpc_kaggle.engine.plan import HANG_FACTOR, Mask, Plan
+from mkpc_kaggle.engine.request import Chronicle
 from mkpc_kaggle.engine.state import State
 
 MAX_PAIRS = 8  # in a job

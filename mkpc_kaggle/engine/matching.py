@@ -4,10 +4,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 from math import isfinite
 
-from mkpc_kaggle.engine.chronicle import Chronicle
 from mkpc_kaggle.engine.jobs import Failure, MatchJob, Outcome
 from mkpc_kaggle.engine.journal_reader import EventKind
 from mkpc_kaggle.engine.plan import Plan
+from mkpc_kaggle.engine.request import Chronicle
 from mkpc_kaggle.engine.state import State
 from mkpc_kaggle.pipeline.pair import UnitResult
 

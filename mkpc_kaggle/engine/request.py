@@ -1,4 +1,4 @@
-"""The request to a run, and its report."""
+"""The request to a run, what happens during it, and its report."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -8,7 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine.journal_reader import About, Event
+from mkpc_kaggle.engine.budget import Budget
+from mkpc_kaggle.engine.console import Progress
+from mkpc_kaggle.engine.journal import Journal
+from mkpc_kaggle.engine.journal_reader import About, Event, EventKind
 from mkpc_kaggle.engine.records import PairRecord, SceneRecord
 from mkpc_kaggle.engine.settings import Settings
 from mkpc_kaggle.recipe import Recipe
@@ -49,6 +52,30 @@ class Standing:
     fundamentals: NDArray[np.float64]
     scenes: Mapping[str, SceneRecord]
     digests: Mapping[str, str]
+
+
+class Chronicle:
+    """Faults and decisions of a session, which the journal has as events, and the numbers of its results."""
+
+    def __init__(self, journal: Journal, budget: Budget, progress: Progress) -> None:
+        self.progress = progress
+        self.faults: list[str] = []
+        self.explanations: list[Event] = []
+        self.units_run = self.estimated = 0
+        self._journal, self._budget = journal, budget
+
+    def note(self, kind: EventKind, text: str) -> Event:
+        event = Event(kind, self._budget.spent(), text)
+        self._journal.note(event)
+        return event
+
+    def explain(self, text: str) -> None:
+        self.explanations.append(self.note(EventKind.PLAN, text))
+
+    def fault(self, text: str) -> None:
+        if text not in self.faults:
+            self.faults.append(text)
+            self.note(EventKind.FAULT, text)
 
 
 @dataclass(frozen=True)

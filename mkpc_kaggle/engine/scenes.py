@@ -4,7 +4,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine.chronicle import Chronicle
 from mkpc_kaggle.engine.estimates import Estimates
 from mkpc_kaggle.engine.jobs import Failure, SceneJob
 from mkpc_kaggle.engine.journal import Journal
@@ -12,7 +11,7 @@ from mkpc_kaggle.engine.journal_reader import EventKind
 from mkpc_kaggle.engine.losses import Losses
 from mkpc_kaggle.engine.plan import HANG_FACTOR, Plan
 from mkpc_kaggle.engine.records import SceneRecord
-from mkpc_kaggle.engine.request import Request
+from mkpc_kaggle.engine.request import Chronicle, Request
 from mkpc_kaggle.engine.state import State
 from mkpc_kaggle.recipe import SceneConfig
 from mkpc_kaggle.scene.densify import extra_pairs

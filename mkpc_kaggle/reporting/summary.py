@@ -114,8 +114,7 @@ def _scenes(tables: RunTables, scenes: Sequence[SceneRecord]) -> list[str]:
 
 def weakest_line(scenes: Sequence[SceneRecord]) -> list[str]:
     """Return a line with the weakest cameras, if any is known."""
-    weakest = weakest_cameras(scenes)[:3]
-    named = [f"{Path(name).name} ({100 * sigmas.centre:.2g} %)" for name, sigmas in weakest]
+    named = [f"{Path(name).name} ({100 * sigmas.centre:.2g} %)" for name, sigmas in weakest_cameras(scenes)[:3]]
     return [f"weakest cameras, with the error of the centre: {', '.join(named)}"] if named else []
 
 
