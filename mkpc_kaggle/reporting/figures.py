@@ -39,8 +39,7 @@ def draw_pair(image0: Image, image1: Image, match: PairMatch, config: MkpcConfig
     panels = figure.subplot_mosaic([["matches", "matches"], ["0", "1"]])
     counts = f"{len(match.matches)} matches, {match.estimate.inlier_count} inliers"
     drawn = draw_matches(panels["matches"], (image0, image1), match)
-    title = "; ".join(filter(None, [counts, match.estimate.failure, drawn]))
-    panels["matches"].set_title(title, loc="left")
+    panels["matches"].set_title("; ".join(filter(None, [counts, match.estimate.failure, drawn])), loc="left")
     for side, image in enumerate((image0, image1)):
         _draw_clusters(panels[str(side)], image, match, config, side)
     return figure
