@@ -8,7 +8,9 @@ from hypothesis import HealthCheck, settings
 from kaggle_image import pack_wheel
 from shared import write_recipe
 
+from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.demo import DemoSet, write_demo
+from mkpc_kaggle.engine.request import RunReport
 from mkpc_kaggle.package.wheels import BUNDLED
 from mkpc_kaggle.weights import store as weight_store
 
@@ -40,7 +42,7 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> DemoSet:
 
 
 @pytest.fixture(scope="session")
-def pairs(tmp_path_factory):
+def pairs(tmp_path_factory: pytest.TempPathFactory) -> "list[Pair]":
     """Twelve pairs of flat images, which the matcher of :mod:`rectified` tells apart by their brightness."""
     from rectified import write_pairs
 
@@ -48,7 +50,7 @@ def pairs(tmp_path_factory):
 
 
 @pytest.fixture(scope="session")
-def undisturbed(pairs, tmp_path_factory):
+def undisturbed(pairs: "list[Pair]", tmp_path_factory: pytest.TempPathFactory) -> "RunReport":
     """A run over these pairs in which nothing goes wrong."""
     from rectified import THREE_UNITS, RectifiedMatcher, run
 

@@ -4,6 +4,7 @@ import argparse
 import ast
 import json
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -17,7 +18,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 
 
-def texts_of(source):
+def texts_of(source: str) -> Iterator[str]:
     """The texts of a program, with {} for what is put into them; adjoining texts are joined."""
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.JoinedStr):
@@ -27,7 +28,7 @@ def texts_of(source):
             yield node.value
 
 
-def everything_said():
+def everything_said() -> str:
     sources = [path.read_text(encoding="utf-8") for path in sorted((ROOT / "mkpc_kaggle").rglob("*.py"))]
     cells = json.loads((ROOT / "notebooks" / "submission.ipynb").read_text(encoding="utf-8"))["cells"]
     code = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
@@ -35,7 +36,7 @@ def everything_said():
     return "\n".join(text for source in [*sources, *python] for text in texts_of(source))
 
 
-def pattern_of(message):
+def pattern_of(message: str) -> str:
     """Three dots stand for anything, F for the name of a model."""
     literal = re.escape(message).replace(r"\ ", " ").replace(r"\.\.\.", ".*")
     return re.sub(r"\bF\b", r"\\{\\}", literal)
@@ -50,7 +51,7 @@ def test_every_message_of_the_troubleshooting_page_is_one_of_the_programs():
     assert [message for message in known if not re.search(pattern_of(message), said)] == []
 
 
-def options_of(parser):
+def options_of(parser: argparse.ArgumentParser) -> set[str]:
     return {text for action in parser._actions for text in action.option_strings}
 
 
@@ -60,7 +61,7 @@ def inner(parser):
     return {name: each for choices in groups for name, each in choices.items()}
 
 
-def commands(page):
+def commands(page: Path) -> Iterator[tuple[str, list[str]]]:
     """Each command of ours on a page, and the options that it is given there."""
     text = page.read_text(encoding="utf-8").replace("\\\n", " ")
     for line in re.findall(r"(?:(?:python -m mkpc_kaggle|mkpc) [a-z]|make_submission\.py )[^`\n#;]*", text):

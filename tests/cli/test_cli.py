@@ -3,6 +3,7 @@ import subprocess
 import sys
 import threading
 from io import StringIO
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from shared import run_command
 
 from mkpc_kaggle.data.competition import read_test_side, write_submission
+from mkpc_kaggle.demo import DemoSet
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 
 
@@ -57,7 +59,7 @@ def test_check_tells_good_from_bad(demo, tmp_path, capsys):
     assert run_command("check", path, "--test-dir", tmp_path) == 2
 
 
-def match_arguments(demo, recipe, out):
+def match_arguments(demo: DemoSet, recipe: Path, out: Path) -> list[str]:
     images = sorted((demo.train_dir / "courtyard" / "images").iterdir())[:2]
     return ["match", *map(str, images), "--recipe", str(recipe), "--out", str(out)]
 
@@ -91,7 +93,7 @@ def test_match_draws_a_pair_that_has_nothing_in_common(clean_environment, tmp_pa
 
 def test_what_a_command_printed_has_been_flushed_when_it_ends_however_long_a_reader_takes(monkeypatch):
     class Flushed(StringIO):
-        def flush(self):
+        def flush(self) -> None:
             self.whole = self.getvalue(), threading.current_thread()
 
     monkeypatch.setattr(sys, "stdout", stream := Flushed())

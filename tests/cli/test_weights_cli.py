@@ -1,6 +1,7 @@
 """``python -m mkpc_kaggle weights``: what it prints and the status it ends with."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from shared import run_command
@@ -18,12 +19,12 @@ FILES = (
 
 
 @pytest.fixture(autouse=True)
-def own_manifest(monkeypatch, nowhere_else):
+def own_manifest(monkeypatch: pytest.MonkeyPatch, nowhere_else: None) -> None:
     monkeypatch.setattr(store, "manifest", lambda: FILES)
 
 
 @pytest.fixture
-def weights(tmp_path):
+def weights(tmp_path: Path) -> Path:
     return put(put(tmp_path / "weights", "sift.pt"), "renamed.pt", OTHER)
 
 

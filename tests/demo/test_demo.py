@@ -1,13 +1,14 @@
 """The demo data set: its cameras, pixels and files agree with one another."""
 
 import csv
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 from shared import contents
 
-from mkpc_kaggle.demo import SCENE_NAMES, write_demo
+from mkpc_kaggle.demo import SCENE_NAMES, DemoSet, write_demo
 from mkpc_kaggle.demo.camera import covisibility, look_at, project, unproject, visible_mask
 from mkpc_kaggle.demo.render import render
 from mkpc_kaggle.demo.world import build_world, quad
@@ -17,16 +18,16 @@ SCALE = 0.2
 
 
 @pytest.fixture(scope="module")
-def small_demo(tmp_path_factory):
+def small_demo(tmp_path_factory: pytest.TempPathFactory) -> DemoSet:
     return write_demo(tmp_path_factory.mktemp("demo"), image_scale=SCALE)
 
 
-def rows(path):
+def rows(path: Path) -> list[dict[str, str]]:
     with path.open(newline="") as file:
         return list(csv.DictReader(file))
 
 
-def numbers(text, *shape):
+def numbers(text: str, *shape: int) -> np.ndarray:
     return np.array([float(word) for word in text.split(" ")]).reshape(shape)
 
 
@@ -36,7 +37,7 @@ def blobs():
     return cv2.resize(noise, (512, 512), interpolation=cv2.INTER_CUBIC)
 
 
-def upright(left, right, low, high, texture):
+def upright(left: tuple[float, float], right: tuple[float, float], low: float, high: float, texture: np.ndarray):
     return quad((*left, high), (*right, high), (*left, low), texture)
 
 
@@ -55,7 +56,7 @@ def test_a_view_warped_by_depth_falls_on_the_other():
     points = unproject(first, np.column_stack([x, y]).astype(float), depth_a[y, x].astype(float))
     pixels, _ = project(second, points)
 
-    def difference(shift):
+    def difference(shift: tuple[float, float]) -> float:
         maps = np.zeros((*depth_a.shape, 2), dtype=np.float32)
         maps[y, x] = pixels + np.array(shift)
         warped = cv2.remap(image_b, maps[..., 0], maps[..., 1], cv2.INTER_LINEAR)

@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from shared import run_command
 
+from mkpc_kaggle.demo import DemoSet
 from mkpc_kaggle.evaluation.compare import paired_difference
 
 PAIRS = [*combinations("abcdef", 2)]
@@ -46,7 +47,7 @@ def test_the_interval_holds_the_truth_where_a_gain_is_of_images():
     assert 0.88 <= held / trials <= 0.99
 
 
-def compare(demo, *more):
+def compare(demo: DemoSet, *more: str) -> int:
     return run_command("validate", "--train-dir", demo.train_dir, "--pairs-per-scene", 4, "--workers", 0, *more)
 
 

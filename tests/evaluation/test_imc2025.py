@@ -1,36 +1,38 @@
 """The score of 2025 against answers by hand."""
 
 import re
+from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from shared import run_command
 
-from mkpc_kaggle.evaluation.imc2025 import score_dataset
+from mkpc_kaggle.evaluation.imc2025 import DatasetScore, score_dataset
 
 THRESHOLDS = (0.025, 0.05, 0.1, 0.2, 0.5, 1.0)
 
 Centres = dict[str, np.ndarray]
 
 
-def scene(name, count, seed=0):
+def scene(name: str, count: int, seed: int = 0) -> Centres:
     """Camera centres within a cube of 20 metres."""
     centres = np.random.default_rng(seed).uniform(-10, 10, (count, 3))
     return {f"{name}{number}": centre for number, centre in enumerate(centres)}
 
 
-def moved(centres, scale=0.3, seed=5):
+def moved(centres: Mapping[str, np.ndarray], scale: float = 0.3, seed: int = 5) -> Centres:
     """The same in another world."""
     R = Rotation.random(random_state=seed).as_matrix()
     return {name: scale * R @ centre + [3, -1, 7] for name, centre in centres.items()}
 
 
-def some(centres, first, last):
+def some(centres: Centres, first: int, last: int) -> Centres:
     return dict(list(centres.items())[first:last])
 
 
-def score(scenes, *clusters):
+def score(scenes: Mapping[str, Centres], *clusters: Centres) -> DatasetScore:
     named = {f"cluster{number}": cluster for number, cluster in enumerate(clusters)}
     return score_dataset("set", scenes, named, dict.fromkeys(scenes, THRESHOLDS))
 
@@ -76,7 +78,7 @@ LABELS = "dataset,scene,image,rotation_matrix,translation_vector\n"
 POSE = "1;0;0;0;1;0;0;0;1"
 
 
-def write_truth(directory):
+def write_truth(directory: Path) -> Path:
     rows = [f"set,{name[0]},{name}.png,{POSE},{';'.join(map(str, -c))}\n" for name, c in scene("a", 6).items()]
     rows.append(f"set,outliers,x.png,{';'.join(['nan'] * 9)},nan;nan;nan\n")
     (directory / "train_labels.csv").write_text(LABELS + "".join(rows))

@@ -8,6 +8,7 @@ from shared import run_command, scores_of
 
 from mkpc_kaggle.data import competition
 from mkpc_kaggle.data.competition import Pair, TrainScene, TruePair, read_test_side, read_train_side
+from mkpc_kaggle.demo import DemoSet
 from mkpc_kaggle.engine.records import PairRecord
 from mkpc_kaggle.evaluation.validate import SceneScore, Step, score_record, score_submission, score_table
 from mkpc_kaggle.geometry.cameras import Camera, fundamental_of_cameras
@@ -16,7 +17,7 @@ from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 from mkpc_kaggle.reporting.run_log import read_log
 
 
-def true_matrices(demo):
+def true_matrices(demo: DemoSet) -> dict[str, np.ndarray]:
     cameras = {}
     for scene in read_train_side(demo.train_dir, min_covisibility=0):
         for true in scene.pairs:

@@ -8,7 +8,7 @@ import sys
 import tempfile
 import time
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -33,7 +33,7 @@ Make = Callable[[Path], object]
 Act = Callable[["subprocess.Popen[bytes]"], None]
 
 
-def nothing(_):
+def nothing(_: object) -> None:
     """Leave the room as it is."""
 
 
@@ -60,11 +60,11 @@ class Case:
     stderr: Callable[[], int] | None = None  # opens the descriptor that the command writes to; else the log
 
     @property
-    def id(self):
+    def id(self) -> str:
         return f"{self.group}: {self.name}"
 
 
-def attack(case, room):
+def attack(case: Case, room: Path) -> None:
     """Run the case in the room. The test fails with all faults."""
     case.make(room)
     before = _snapshot(room)
@@ -88,12 +88,14 @@ def attack(case, room):
         pytest.fail("\n".join([case.id, case.command, *faults, f"output:\n{output[-3000:]}"]), pytrace=False)
 
 
-def prepared(command, room):
+def prepared(command: str, room: Path) -> int:
     """Return the exit status of an undisturbed command."""
     return _start(command, room, {}).wait()
 
 
-def _start(command, room, env, limits="-c 0", stderr=None):
+def _start(
+    command: str, room: Path, env: dict[str, str], limits: str = "-c 0", stderr: Callable[[], int] | None = None
+) -> "subprocess.Popen[bytes]":
     limited = ["sh", "-c", f'ulimit -d {MEMORY_KIB}; ulimit {limits}; exec "$@"', "sh"]
     own = {"PATH": os.defpath, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": "1"}
     own |= {"HOME": str(room / "home"), "TMPDIR": str(room / "tmp"), "no_proxy": "*"}
@@ -110,7 +112,7 @@ def _start(command, room, env, limits="-c 0", stderr=None):
         )
 
 
-def _wait(process, room):
+def _wait(process: "subprocess.Popen[bytes]", room: Path) -> tuple[int | None, str]:
     """Return the status, ``None`` if the process had to be killed, and the output."""
     status = None
     try:
@@ -121,7 +123,7 @@ def _wait(process, room):
     return status, (room / "out" / "log").read_text(errors="replace")
 
 
-def _faults(case, status, output, room):
+def _faults(case: Case, status: int | None, output: str, room: Path) -> Iterator[str]:
     yield from (f"the output has {crash!r}" for crash in (*CRASHES, *MISTYPED) if crash in output)
     if status is None:
         yield f"it hangs: not over after {HANGS_S} s"
@@ -135,7 +137,7 @@ def _faults(case, status, output, room):
         yield f"left in the folder for temporary files: {left}"
 
 
-def _result_faults(out, status):
+def _result_faults(out: Path, status: int) -> Iterator[str]:
     """Yield the faults of the results of a folder of images."""
     table = out / "cameras.csv"
     lines = table.read_text().splitlines() if table.is_file() else [""]
@@ -148,7 +150,7 @@ def _result_faults(out, status):
     yield from (f"left: {path}" for path in out.rglob(".*") if path.name != ".png")
 
 
-def _orphans(mark):
+def _orphans(mark: str) -> list[str]:
     """Kill the processes of the case that still run, and return their command lines."""
     for _ in range(600):
         if not (left := started_with(mark)):
@@ -160,7 +162,7 @@ def _orphans(mark):
     return [f"{process} {command[:200]}" for process, command in left.items()]
 
 
-def _snapshot(room):
+def _snapshot(room: Path) -> dict[str, tuple[object, ...]]:
     """Return the state of each file and folder of the room, except what a command may write."""
     states = {}
     for folder, folders, names in os.walk(os.fsencode(room)):

@@ -2,9 +2,11 @@
 
 import os
 import signal
+import subprocess
 import time
+from collections.abc import Iterator
 
-from attack import REFUSED, Case
+from attack import REFUSED, Act, Case
 from room import CALIBRATION, SUBMIT, makes, options, written
 
 WITHOUT_LIMIT = SUBMIT.replace(" --time-limit 5m", "").replace(" --workers 0", "")
@@ -42,10 +44,10 @@ AGAIN = SUBMIT.replace("quick.toml", "classical")
 WORKING = f"{WITHOUT_LIMIT.replace('quick.toml', 'classical')} --workers"
 
 
-def sends(name, *after, group=False):
+def sends(name: str, *after: float, group: bool = False) -> Act:
     """Send the signal after so many seconds, and again after each further time."""
 
-    def act(process):
+    def act(process: "subprocess.Popen[bytes]") -> None:
         for seconds in after:
             time.sleep(seconds)
             if process.poll() is None:
@@ -55,7 +57,7 @@ def sends(name, *after, group=False):
     return act
 
 
-def signals():
+def signals() -> Iterator[Case]:
     for name in ENDS:
         acts = {f"after {after} s": sends(name, after) for after in SOON}
         acts |= {f"to all after {after} s": sends(name, after, group=True) for after in SOON[::2]}

@@ -1,6 +1,6 @@
 """Matchers that end their process or misuse its streams, and a disk that is full."""
 
-from attack import EITHER, ROOT, Case
+from attack import EITHER, ROOT, Case, Make
 from room import RECONSTRUCT, SUBMIT, UNIT, encoded, picture, resumed, written
 
 MATCHER = """\
@@ -32,7 +32,7 @@ IN_WORKER = SUBMIT.replace("--workers 0", "--workers 1")
 UNITS = f"units = [{UNIT.format(1).replace('sift', 'faulty')}, {UNIT.format(1)}]"
 
 
-def with_matcher(fault):
+def with_matcher(fault: str) -> Make:
     texts = {"lib/faulty.py": MATCHER.format(fault=fault), "lib/sitecustomize.py": FINDING, "quick.toml": UNITS}
     return lambda room: [written(name, text)(room) for name, text in texts.items()]
 

@@ -3,10 +3,12 @@
 import hashlib
 import os
 import threading
+from collections.abc import Callable
 from contextlib import suppress
+from pathlib import Path
 from socketserver import BaseRequestHandler, ThreadingTCPServer
 
-from attack import Case, nothing
+from attack import Case, Make, nothing
 from room import written
 
 DATA = bytes(range(256)) * 400
@@ -28,11 +30,11 @@ PARTS = {
 }
 
 
-def serve(answer):
+def serve(answer: bytes) -> int:
     """Give each connection the same answer, whatever it asks. Return the port."""
 
     class Handler(BaseRequestHandler):
-        def handle(self):
+        def handle(self) -> None:
             self.request.recv(65536)
             with suppress(OSError):
                 self.request.sendall(answer)
@@ -42,8 +44,8 @@ def serve(answer):
     return server.server_address[1]
 
 
-def served(answer, size="102400", part=nothing):
-    def make(room):
+def served(answer: bytes, size: str = "102400", part: Callable[[Path], object] = nothing) -> Make:
+    def make(room: Path) -> None:
         source = f"http://127.0.0.1:{serve(answer)}/a.bin"
         written("listed/weights_manifest.txt", f"a.bin  {size}  {DIGEST}  MIT  slot  {source}\n")(room)
         (room / "out" / "w").mkdir()

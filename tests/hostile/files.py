@@ -2,6 +2,7 @@
 
 import os
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -67,17 +68,17 @@ IMAGES = {
 }
 
 
-def tables_of(name, texts):
+def tables_of(name: str, texts: dict[str, bytes | str]) -> dict[str, Callable[[Path], None]]:
     return {what: written(name, text) for what, text in texts.items()}
 
 
-def unpacked(path):
+def unpacked(path: Path) -> None:
     (path / "data").mkdir(parents=True)
     (path / "data.pkl").write_bytes(b"\x80\x02}.")
     os.mkfifo(path / "data" / "0")
 
 
-def halve(room):
+def halve(room: Path) -> None:
     path = room / "out/s.work/journal.sqlite"
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 

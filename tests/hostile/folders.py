@@ -4,8 +4,10 @@ tests/reconstruction has more directories of results and lists of pairs.
 """
 
 import os
+from collections.abc import Callable
+from pathlib import Path
 
-from attack import EITHER, Case, nothing
+from attack import EITHER, Case, Make, nothing
 from ends import ENDS, STATUSES, sends
 from outputs import mine
 from room import IMAGES_TO, RECIPE, RECONSTRUCT, encoded, makes, options, picture, resumed, write_images
@@ -64,12 +66,12 @@ CHANGES = {  # between two runs
 }
 
 
-def below(name, table):
+def below(name: str, table: dict[str, Callable[[Path], object]]) -> dict[str, Make]:
     """Return changes of the room from changes of a path in it."""
     return {what: lambda room, m=make: m(room / name) for what, make in table.items()}
 
 
-def names(table):
+def names(table: dict[str, bytes]) -> dict[str, Make]:
     """Return changes that add an image, or a folder of images, of each name, which may be no text."""
 
     def add(room, name, is_folder):

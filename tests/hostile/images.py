@@ -2,9 +2,11 @@
 
 import struct
 import zlib
+from collections.abc import Callable
 
 import cv2
 import numpy as np
+from attack import Make
 from room import RECONSTRUCT, REPORTED, SUBMIT, encoded, makes, picture, replaced
 
 DAMAGES = {
@@ -18,18 +20,18 @@ DAMAGES = {
 }
 
 
-def chunk(kind, data):
+def chunk(kind: bytes, data: bytes) -> bytes:
     return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
 
-def png(width, height, *chunks, depth=8):
+def png(width: int, height: int, *chunks: bytes, depth: int = 8) -> bytes:
     """Return a PNG that claims that size; without chunks it has a byte of pixels."""
     head = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, depth, 0, 0, 0, 0))
     body = b"".join(chunks) or chunk(b"IDAT", zlib.compress(b"\0"))
     return b"\x89PNG\r\n\x1a\n" + head + body + chunk(b"IEND", b"")
 
 
-def rows(width, height, depth=8):
+def rows(width: int, height: int, depth: int = 8) -> bytes:
     return chunk(b"IDAT", zlib.compress(bytes((1 + (width * depth + 7) // 8) * height)))
 
 
@@ -43,7 +45,7 @@ ODD = {
 }
 
 
-def at(name, make):
+def at(name: str, make: Callable[[], bytes]) -> Make:
     return replaced(name, lambda path: path.write_bytes(make()))
 
 

@@ -1,8 +1,10 @@
 """Paths where no result can be written, or that hold precious files; tests/data/test_outputs.py has more."""
 
 import os
+from collections.abc import Callable
+from pathlib import Path
 
-from attack import Case, nothing
+from attack import Case, Make, nothing
 from room import REPORTED, makes, options, resumed
 
 REFUSALS = {
@@ -48,7 +50,7 @@ DEMOS = {
 }
 
 
-def mine(path):
+def mine(path: Path) -> None:
     path.parent.mkdir(exist_ok=True)
     path.write_text("mine")
 
@@ -72,7 +74,7 @@ EXPORTS_OVER = {
 }
 
 
-def in_folder(table):
+def in_folder(table: dict[str, Callable[[Path], object]]) -> dict[str, Make]:
     """Return how to put the results of a finished run, and a folder U of the user, into the room."""
     makings = {name: lambda room, m=make: [(room / "U").mkdir(), m(room / "U")] for name, make in table.items()}
     return {name: resumed(make) for name, make in makings.items()}

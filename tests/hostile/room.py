@@ -2,12 +2,15 @@
 
 import shutil
 import tempfile
+from collections.abc import Callable, Mapping
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
-from attack import REFUSED, Case, prepared
+from attack import REFUSED, Case, Make, prepared
+from numpy.typing import NDArray
 
 HEADER = "sample_id,batch_id,image_1_id,image_2_id\n"
 TABLE = HEADER + "b1;x-y,b1,x,y\nb1;y-z,b1,y,z\n"
@@ -35,7 +38,7 @@ DEPTHS = (1.0, 2.0, 3.0, 1.5, 2.5)  # inverse depths of five bands of rows: the 
 
 
 @cache
-def picture(shift):
+def picture(shift: int) -> NDArray[np.uint8]:
     """Return the view of a camera that has moved to the right by that many pixels of the farthest band."""
     noise = np.random.default_rng(0).integers(0, 256, (SIDE, 3 * SIDE, 3)).astype(np.float32)
     rough = sum(cv2.GaussianBlur(noise, (0, 0), width) * width for width in (1.5, 4.0))
@@ -45,20 +48,20 @@ def picture(shift):
     return np.concatenate([band[:, start : start + SIDE] for band, start in bands])
 
 
-def encoded(suffix, image=None, *options):
+def encoded(suffix: str, image: NDArray[np.uint8] | None = None, *options: int) -> bytes:
     """Return the bytes of an image file; of the first view unless another is given."""
     done, data = cv2.imencode(suffix, picture(0) if image is None else image, list(options))
     assert done
     return data.tobytes()
 
 
-def write_images(folder, names="0123", suffix=".png"):
+def write_images(folder: Path, names: str = "0123", suffix: str = ".png") -> None:
     folder.mkdir(parents=True)
     for number, name in enumerate(names):
         (folder / f"{name}{suffix}").write_bytes(encoded(suffix, picture(4 * number)))
 
 
-def write_template(room):
+def write_template(room: Path) -> Path:
     write_images(room / "D" / "test_images" / "b1", "xyz")
     write_images(room / "T" / "s" / "images", "xyz", ".jpg")
     write_images(room / "I")
@@ -70,7 +73,7 @@ def write_template(room):
 
 
 @cache
-def finished():
+def finished() -> Path:
     """Return a room in which ``SUBMIT`` and ``RECONSTRUCT`` have ended, made once per process."""
     room = write_template(Path(tempfile.mkdtemp(prefix="hostile-")) / "room")
     for command in (SUBMIT, RECONSTRUCT):
@@ -79,20 +82,20 @@ def finished():
     return room
 
 
-def resumed(change):
+def resumed(change: Callable[[Path], object]) -> Make:
     """Put the results of both finished commands into the room, then change it."""
 
-    def make(room):
+    def make(room: Path) -> None:
         shutil.copytree(finished() / "out", room / "out", dirs_exist_ok=True)
         change(room)
 
     return make
 
 
-def replaced(name, make):
+def replaced(name: str, make: Callable[[Path], object]) -> Make:
     """Replace a file of the room by what ``make`` puts there."""
 
-    def replace(room):
+    def replace(room: Path) -> None:
         (room / name).parent.mkdir(parents=True, exist_ok=True)
         (room / name).unlink(missing_ok=True)
         make(room / name)
@@ -100,15 +103,19 @@ def replaced(name, make):
     return replace
 
 
-def written(name, data):
+def written(name: str, data: bytes | str) -> Make:
     return replaced(name, lambda path: path.write_bytes(data.encode() if isinstance(data, str) else data))
 
 
-def makes(group, command, table, statuses=REFUSED, **more):
+def makes(
+    group: str, command: str, table: Mapping[str, Make], statuses: tuple[int, ...] = REFUSED, **more: Any
+) -> list[Case]:
     """Return a case for each change of the room, by its name; ``more`` are further fields of the cases."""
     return [Case(group, name, command, make, statuses, **more) for name, make in table.items()]
 
 
-def options(group, command, table, statuses=REFUSED, **more):
+def options(
+    group: str, command: str, table: Mapping[str, str], statuses: tuple[int, ...] = REFUSED, **more: Any
+) -> list[Case]:
     """Return a case for each end of the command, by its name."""
     return [Case(group, name, f"{command} {end}", statuses=statuses, **more) for name, end in table.items()]

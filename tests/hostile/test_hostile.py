@@ -1,6 +1,7 @@
 """The standing attack: the real command on hostile inputs, each case in its own process (see ``attack``)."""
 
 import shutil
+from pathlib import Path
 
 import ends
 import faults
@@ -22,7 +23,7 @@ MARKED = [pytest.param(case, id=case.id, marks=() if case in QUICK else pytest.m
 
 
 @pytest.fixture(scope="session")
-def template(tmp_path_factory):
+def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_template(tmp_path_factory.mktemp("template") / "room")
 
 

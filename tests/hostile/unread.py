@@ -3,8 +3,10 @@
 import fcntl
 import os
 import zlib
+from collections.abc import Callable
+from pathlib import Path
 
-from attack import Case, prepared
+from attack import Case, Make, prepared
 from images import chunk
 from room import IMAGES_TO, REPORTED, SUBMIT, encoded, picture
 
@@ -21,18 +23,18 @@ COMMANDS = {  # and the end of its work
 }
 
 
-def short_profile(number):
+def short_profile(number: int) -> bytes:
     whole = encoded(".png", picture(12 * number))
     return whole[:HEAD] + chunk(b"iCCP", b"x\0\0" + zlib.compress(b"bad")) + whole[HEAD:]
 
 
-def extra_restart(number):
+def extra_restart(number: int) -> bytes:
     whole = encoded(".jpg", picture(12 * number))
     return whole[: len(whole) // 2] + b"\xff\xd0" + whole[len(whole) // 2 :]
 
 
-def complained_of(make, command):
-    def write(room):
+def complained_of(make: Callable[[int], bytes], command: str) -> Make:
+    def write(room: Path) -> None:
         for number, name in enumerate("xyz"):
             (room / FOLDER / f"{name}.png").write_bytes(make(number))
         if command == JOURNAL:
@@ -41,7 +43,7 @@ def complained_of(make, command):
     return write
 
 
-def full_pipe():
+def full_pipe() -> int:
     """Return the write end of a pipe that is full; the other end stays open, and is not read."""
     _, pipe = os.pipe()
     fcntl.fcntl(pipe, fcntl.F_SETPIPE_SZ, 4096)

@@ -2,6 +2,7 @@
 
 import io
 import zipfile
+from collections.abc import Iterator
 
 from attack import REFUSED, Case
 from room import SUBMIT, written
@@ -29,7 +30,7 @@ SAFETENSORS = {
 }
 
 
-def archive(data):
+def archive(data: bytes) -> bytes:
     """Return the smallest archive that torch takes for a checkpoint, with this pickle."""
     whole = io.BytesIO()
     with zipfile.ZipFile(whole, "w") as file:
@@ -38,7 +39,7 @@ def archive(data):
     return whole.getvalue()
 
 
-def cases():
+def cases() -> Iterator[Case]:
     for name, data in PICKLES.items():
         yield Case("weights", name, CONVERT, written("a.pt", archive(data)), REFUSED)
         yield Case("weights", f"{name}, old format", CONVERT, written("a.pt", data), REFUSED)

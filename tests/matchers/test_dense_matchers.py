@@ -12,7 +12,7 @@ from mkpc_kaggle.matchers.adapters.roma import RomaMatcher, RomaOptions
 from mkpc_kaggle.matchers.contract import Placement
 from mkpc_kaggle.matchers.dense import DenseOptions
 from mkpc_kaggle.matchers.networks.dense_sampling import sample_matches
-from mkpc_kaggle.matchers.networks.dense_warp import DenseWarp
+from mkpc_kaggle.matchers.networks.dense_warp import DenseFeatures, DenseWarp
 from mkpc_kaggle.matchers.networks.dkm import DKM
 from mkpc_kaggle.matchers.networks.grids import as_grid
 from mkpc_kaggle.matchers.networks.warp_refiner import WarpEstimate, identity_map
@@ -38,7 +38,7 @@ def test_what_has_no_weight_is_not_drawn():
 
 
 @pytest.fixture(scope="module")
-def matcher():
+def matcher() -> DkmMatcher:
     return dkm_matcher(Placement())
 
 
@@ -50,17 +50,17 @@ def test_padding_changes_nothing(matcher):
 
 
 class Given:
-    def __init__(self, *warps):
+    def __init__(self, *warps: DenseWarp) -> None:
         self.warps = warps
 
-    def encode(self, image, fine=None):
+    def encode(self, image: torch.Tensor, fine: torch.Tensor | None = None) -> DenseFeatures:
         return None
 
-    def match(self, first, second):
+    def match(self, first: DenseFeatures, second: DenseFeatures) -> tuple[DenseWarp, ...]:
         return self.warps
 
 
-def identity_warp(height, width, certainty):
+def identity_warp(height: int, width: int, certainty: float) -> DenseWarp:
     grid = as_grid(identity_map(torch.zeros(height, width)))  # (1, h, w, 2)
     return DenseWarp(torch.cat([grid, grid], dim=3), torch.full((1, height, width), certainty))
 

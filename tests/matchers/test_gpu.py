@@ -2,6 +2,7 @@
 
 import time
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,7 +27,7 @@ UNIT = Unit(1, "own", 64)
 RECIPE = Recipe((UNIT,))
 
 
-def gpus_here(monkeypatch, *capabilities):
+def gpus_here(monkeypatch: pytest.MonkeyPatch, *capabilities: tuple[int, int]) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: len(capabilities))
     monkeypatch.setattr(devices, "gpu_capabilities", lambda: list(capabilities))
@@ -42,7 +43,7 @@ def test_a_missing_gpu_is_refused_and_half_precision_asks_every_gpu_that_the_run
 
 
 def test_the_parent_of_workers_never_initialises_cuda(monkeypatch):
-    def refuse():
+    def refuse() -> None:
         raise AssertionError("CUDA was initialised in the parent")
 
     monkeypatch.setattr(torch.cuda, "_lazy_init", refuse)
@@ -72,7 +73,7 @@ def test_a_probe_of_the_gpus_that_hangs_is_ended(monkeypatch):
 
 
 def test_a_device_that_multiplies_and_cannot_convolve_is_refused(monkeypatch):
-    def convolve(*_):
+    def convolve(*_: object) -> None:
         raise RuntimeError("cuDNN error: CUDNN_STATUS_EXECUTION_FAILED_CUDART")
 
     with DeviceDouble(1) as double:
@@ -89,7 +90,7 @@ class Maps:
     others: tuple[torch.Tensor, ...] = ()
 
 
-def settings():
+def settings() -> tuple[str, str]:
     return torch.backends.cudnn.conv.fp32_precision, torch.backends.cuda.matmul.fp32_precision
 
 
@@ -98,22 +99,22 @@ class Own:
 
     spec = MatcherSpec("own")
 
-    def __init__(self, value):
+    def __init__(self, value: float) -> None:
         self.value = value
         self.seen = []
         self.encoded = 0
 
-    def encode(self, pictures):
+    def encode(self, pictures: Any) -> list[Maps]:
         self.seen.append(settings())
         self.encoded += len(pictures)
         return [Maps(torch.full((4,), self.value)) for _ in pictures]
 
-    def match(self, encodings0, encodings1):
+    def match(self, encodings0: Any, encodings1: Any) -> list[Matches]:
         self.seen.append(settings())
         return [Matches.empty() for _ in encodings0]
 
 
-def works():
+def works() -> list[PairMatch]:
     rows = np.random.default_rng(0).integers(0, 255, (3, 48, 64, 3), np.uint8)
     images = [Image.of_array(pixels) for pixels in rows]
     return [PairMatch(images=(images[0], other)) for other in images[1:]]

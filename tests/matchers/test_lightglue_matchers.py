@@ -2,35 +2,38 @@
 
 import re
 from functools import partial
+from typing import Any
 
 import pytest
 import torch
 from checkpoints import PublicFile, store_of
 from kornia.feature import DISK
 from pictures import picture
+from torch import Tensor, nn
 
 from mkpc_kaggle.matchers.contract import Colour, Placement, Precision
 from mkpc_kaggle.matchers.lightglue import LightGlueOptions, light_glue
 from mkpc_kaggle.matchers.networks.aliked import Aliked
 from mkpc_kaggle.matchers.registry import load_matcher
+from mkpc_kaggle.weights import WeightStore
 
 
-def glue(**shape):
+def glue(**shape: Any) -> nn.Module:
     return light_glue(2, 0.1, input_dim=128, **shape)
 
 
-def old_names(state):
+def old_names(state: dict[str, Tensor]) -> dict[str, Any]:
     """As the public files name a layer's attentions; the thresholds are computed."""
     pattern, kept = r"^transformers\.(\d+)\.(self|cross)_attn", state.keys() - {"confidence_thresholds"}
     return {re.sub(pattern, r"\2_attn.\1", name): state[name] for name in kept}
 
 
-def published_aliked(state):
+def published_aliked(state: dict[str, Tensor]) -> dict[str, Any]:
     pattern = r"(block[34]\.conv[12])\.weight"
     return {re.sub(pattern, r"\1.regular_conv.weight", name): tensor for name, tensor in state.items()}
 
 
-def beside_an_optimizer(state):
+def beside_an_optimizer(state: dict[str, Tensor]) -> dict[str, Any]:
     return {"extractor": state, "optim": {"lr": 0.1}}
 
 
@@ -45,11 +48,11 @@ FILES = (
 
 
 @pytest.fixture(scope="module")
-def store(tmp_path_factory):
+def store(tmp_path_factory: pytest.TempPathFactory) -> WeightStore:
     return store_of(tmp_path_factory.mktemp("weights"), FILES)
 
 
-def load(name, store, precision=Precision.FLOAT32, **options):
+def load(name: str, store: WeightStore, precision: Precision = Precision.FLOAT32, **options: Any) -> Any:
     return load_matcher(name, store, LightGlueOptions(**options), Placement(precision=precision))
 
 

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +30,7 @@ assemble("light")
 
 
 @pytest.fixture
-def more_matchers(monkeypatch, tmp_path):
+def more_matchers(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Path]:
     monkeypatch.setattr(adapters, "__path__", [*adapters.__path__, str(tmp_path)])
     matcher_names.cache_clear()
     yield tmp_path

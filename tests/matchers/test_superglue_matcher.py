@@ -10,12 +10,13 @@ from mkpc_kaggle.matchers.adapters import superglue
 from mkpc_kaggle.matchers.contract import Placement, Training
 from mkpc_kaggle.matchers.networks.superglue import SuperGlue, log_optimal_transport
 from mkpc_kaggle.matchers.networks.superpoint import SuperPoint
+from mkpc_kaggle.weights import WeightStore
 
 OPTIONS = superglue.SuperGlueOptions(max_keypoints=300, keypoint_threshold=0.0, match_threshold=0.0)
 
 
 @pytest.fixture(scope="module")
-def store(tmp_path_factory):
+def store(tmp_path_factory: pytest.TempPathFactory) -> WeightStore:
     return store_of(tmp_path_factory.mktemp("weights"), [file for file in FILES if file.matcher == "superglue"])
 
 

@@ -4,7 +4,10 @@ import io
 import json
 import subprocess
 import sys
+from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 from zipfile import ZipFile
 
 import pytest
@@ -15,14 +18,14 @@ from weight_files import digest_of, line, put
 
 from mkpc_kaggle import __version__
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.package import Request, find_checkout, make_package
+from mkpc_kaggle.package import Package, Request, find_checkout, make_package
 from mkpc_kaggle.package.files import licence_text
 from mkpc_kaggle.package.wheels import BUNDLED, build_wheel, install_lines, pins
 from mkpc_kaggle.weights import load_tensors, store
 from mkpc_kaggle.weights.manifest import read_manifest
 
 
-def checkpoint(number):
+def checkpoint(number: float) -> bytes:
     stream = io.BytesIO()
     torch.save({"a": torch.full((3,), number)}, stream)
     return stream.getvalue()
@@ -37,7 +40,7 @@ FILES = (
 
 
 @pytest.fixture(scope="module", autouse=True)
-def own_manifest(tmp_path_factory):
+def own_manifest(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.delenv("MKPC_WEIGHTS", raising=False)
         patch.setattr(store, "KAGGLE_INPUT", tmp_path_factory.mktemp("kaggle"))
@@ -45,29 +48,29 @@ def own_manifest(tmp_path_factory):
         yield
 
 
-def request_of(directory, wheels):
+def request_of(directory: Path, wheels: Path) -> Request:
     weights = put(put(directory / "weights", "another_name.pt", DATA), "kept.pt", OTHER)
     return Request(directory / "out", "someone", (weights,), (python_version(),), wheels)
 
 
 @pytest.fixture
-def wanted(tmp_path, wheels):
+def wanted(tmp_path: Path, wheels: Path) -> Request:
     return request_of(tmp_path, wheels)
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory, wheels):
+def made(tmp_path_factory: pytest.TempPathFactory, wheels: Path) -> tuple[Path, Package]:
     """The folder of a package that tests only read, and what it has."""
     request = request_of(tmp_path_factory.mktemp("package"), wheels)
     return request.out, make_package(request)
 
 
 @pytest.fixture(scope="module")
-def out(made):
+def out(made: tuple[Path, Package]) -> Path:
     return made[0]
 
 
-def metadata_of(out):
+def metadata_of(out: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     dataset, kernel = ((out / name / f"{name}-metadata.json").read_text() for name in ("dataset", "kernel"))
     return json.loads(dataset), json.loads(kernel)
 

@@ -40,7 +40,7 @@ def matcher(variant):
     return prepared(network, Placement())
 
 
-def image_of(pixels):
+def image_of(pixels: np.ndarray) -> torch.Tensor:
     """(..., H, W, 3) uint8 -> (B, 3, H, W) in 0..1."""
     image = torch.from_numpy((pixels.numpy() / 255).astype(np.float32))
     return image.reshape(-1, *pixels.shape[-3:]).permute(0, 3, 1, 2)

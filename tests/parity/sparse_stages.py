@@ -3,6 +3,7 @@
 import json
 from functools import partial
 
+import numpy as np
 import torch
 from golden import Stage, compared, golden_arrays, ready, recorded, standin_state
 from torch.nn import functional
@@ -28,7 +29,7 @@ def superpoint(options):
     return ready(SuperPoint(**options), standin_state("superpoint"))
 
 
-def image_of(pixels):
+def image_of(pixels: np.ndarray) -> torch.Tensor:
     return pixels[None, None].float() / 255
 
 

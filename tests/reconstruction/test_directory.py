@@ -16,19 +16,19 @@ FILES = ["database.db", *(f"models/0/{name}" for name in MODEL_FILES)]
 TABLES = ["cameras.csv", "report.html", "submission.csv"]
 
 
-def write(folder, names, text="made"):
+def write(folder: Path, names: list[str], text: str = "made") -> None:
     for name in names:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text(text)
 
 
-def files_of(folder):
+def files_of(folder: Path) -> dict[str, str]:
     paths = [path for path in folder.rglob("*") if path.is_file() and path.name != "results.json"]
     return {path.relative_to(folder).as_posix(): path.read_text() for path in sorted(paths)}
 
 
 @pytest.fixture
-def out(tmp_path):
+def out(tmp_path: Path) -> Path:
     """What a run has made of two datasets; and an image of the user's next to it."""
     with output_directory(tmp_path / "out", "ab", "imc2025"):
         for name in "ab":
@@ -132,8 +132,8 @@ def test_former_files_stay_until_the_new_ones_are_whole(tmp_path, monkeypatch):
     """A disk that is full while models are written costs neither the former models nor the former database."""
     write(tmp_path, FILES, "former")
 
-    def write_files(is_full):
-        def fill(folder):
+    def write_files(is_full: bool) -> None:
+        def fill(folder: Path) -> None:
             write(folder, [*MODEL_FILES[:1]] if is_full else [*MODEL_FILES], "new")
             if is_full:
                 raise OSError(28, "No space left on device")

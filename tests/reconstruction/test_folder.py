@@ -1,6 +1,8 @@
 """Names of files and folders as they come: taken, passed over with a line, or refused; never a traceback."""
 
 import os
+from collections.abc import Iterable
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +16,7 @@ from mkpc_kaggle.scene.reconstruction import RegisteredImage
 from mkpc_kaggle.scene.view_graph import BatchImage
 
 
-def written(root, *names):
+def written(root: Path, *names: str) -> Path:
     for name in names:
         path = os.path.join(os.fsencode(root), os.fsencode(name))  # noqa: PTH118  a name may be no text
         os.makedirs(os.path.dirname(path), exist_ok=True)  # noqa: PTH103, PTH120
@@ -23,7 +25,7 @@ def written(root, *names):
     return root
 
 
-def names_of(root):
+def names_of(root: Path) -> dict[str, list[str]]:
     return {name: [file.name for file in files] for name, files in read_folder(root).items()}
 
 
@@ -69,7 +71,7 @@ def test_names_in_a_list_of_pairs_may_have_blanks(tmp_path):
         read_pair_list(tmp_path / "pairs.txt", root, read_folder(root))
 
 
-def rows_of(root, files):
+def rows_of(root: Path, files: Iterable[str]) -> list[tuple[str, ...]]:
     camera = Camera(np.eye(3), np.eye(3), np.zeros(3))
     placed = 0, RegisteredImage(BatchImage("x", "x", Size(10, 10)), camera, 5)
     cameras = {}

@@ -4,6 +4,7 @@ import csv
 import hashlib
 import sqlite3
 import time
+from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,16 +17,17 @@ import pycolmap
 import pytest
 from exif_files import set_exif
 from pair_lists import turned_camera
-from rectified import flat, number_of
+from rectified import Seen, flat, number_of
 from shared import run_command
 from sklearn.datasets import load_sample_image
 from synthetic import SyntheticMatcher
 
-from benchmarks.synthetic_scene import SIZE, synthetic_scene
+from benchmarks.synthetic_scene import SIZE, SyntheticScene, synthetic_scene
 from mkpc_kaggle import reconstruct
 from mkpc_kaggle.data import images
-from mkpc_kaggle.data.images import TURNS, read_image
+from mkpc_kaggle.data.images import TURNS, Image, Unreadable, read_image
 from mkpc_kaggle.engine.budget import Budget
+from mkpc_kaggle.engine.records import CameraRecord
 from mkpc_kaggle.engine.session import Interrupt, Session
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.matches import Matches
@@ -33,8 +35,8 @@ from mkpc_kaggle.pipeline import pair
 from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.recipe import Recipe, Unit
 from mkpc_kaggle.reconstruction.folder import read_folder, read_pair_list
-from mkpc_kaggle.reconstruction.outputs import camera_rows, submission_rows
-from mkpc_kaggle.reconstruction.run import for_cameras, reconstruct_folder
+from mkpc_kaggle.reconstruction.outputs import Cameras, camera_rows, submission_rows
+from mkpc_kaggle.reconstruction.run import FolderResult, for_cameras, reconstruct_folder
 from mkpc_kaggle.scene.likeness import local_features, most_alike, shortlist
 
 RECIPE = for_cameras(Recipe((Unit(1, "synthetic", SIZE.width),)))
@@ -46,10 +48,10 @@ class MixedMatcher(SyntheticMatcher):
     """Two scenes, and images of neither; between what has nothing in common it finds a few wrong matches."""
 
     @cached_property
-    def scenes(self):
+    def scenes(self) -> tuple[SyntheticScene, SyntheticScene]:
         return synthetic_scene(FIRST, points=500), synthetic_scene(SECOND, points=500, seed=7)
 
-    def _match(self, seen0, seen1):
+    def _match(self, seen0: Seen, seen1: Seen) -> Matches:
         first, second = number_of(seen0), number_of(seen1)
         self.calls.append((first, second))
         for scene, start, count in ((self.scenes[0], 0, FIRST), (self.scenes[1], FIRST, SECOND)):
@@ -60,14 +62,14 @@ class MixedMatcher(SyntheticMatcher):
         return Matches(*np.random.default_rng([first, second]).uniform(10, 500, (2, 25, 2)), np.ones(25))
 
 
-def write_flat(folder, count=FIRST + SECOND + OTHERS):
+def write_flat(folder: Path, count: int = FIRST + SECOND + OTHERS) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     for number in range(count):
         cv2.imwrite(str(folder / f"{number:02}.png"), flat(number, SIZE))
     return folder
 
 
-def run(root, out, matcher=None, **options):
+def run(root: Path, out: Path, matcher: SyntheticMatcher | None = None, **options: object) -> FolderResult:
     matcher = matcher or MixedMatcher()
     budget = Budget(time.monotonic(), float("inf"))
     session = Session(out / "work", budget, Interrupt(), progress=False, workers=0)
@@ -76,17 +78,17 @@ def run(root, out, matcher=None, **options):
 
 
 @pytest.fixture(scope="module")
-def mixed(tmp_path_factory):
+def mixed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, FolderResult]:
     home = tmp_path_factory.mktemp("mixed")
     return home / "out", run(write_flat(home / "images"), home / "out")
 
 
-def cameras(result):
+def cameras(result: FolderResult) -> Mapping[str, CameraRecord]:
     (found,) = result.cameras.values()
     return {file.name: placed[1] for file, placed in found.items() if placed}
 
 
-def contents(out):
+def contents(out: Path) -> dict[str, str]:
     """What a run left, but for its journal; of a database its rows, since SQLite counts who has opened it."""
     found = {}
     for path in sorted(out.rglob("*")):
@@ -125,7 +127,7 @@ def test_the_cameras_are_those_of_the_models_and_right(mixed):
 ORIENTATIONS = (1, 6, 8, 3, 6, 1)  # of the images of a phone, by EXIF
 
 
-def write_from_phone(folder):
+def write_from_phone(folder: Path) -> Path:
     write_flat(folder, FIRST)
     for number, orientation in enumerate(ORIENTATIONS):
         path = folder / f"{number:02}.png"
@@ -212,7 +214,7 @@ def test_only_listed_pairs_are_matched(tmp_path):
 def test_folders_that_cannot_be_reconstructed_get_one_line(tmp_path, capsys):
     root, out = tmp_path / "images", tmp_path / "out"
 
-    def refused(out=out):
+    def refused(out: Path = out) -> str:
         assert run_command("reconstruct", root, "--out", out, "--recipe", "classical") == 2
         (line,) = capsys.readouterr().err.splitlines()
         return line
@@ -249,7 +251,7 @@ def test_the_command_writes_tables_models_a_database_and_a_page(demo, small_reci
         assert [row["image"] for row in csv.DictReader(stream)] == sorted(path.name for path in images.iterdir())
 
 
-def photographs(folder, count):
+def photographs(folder: Path, count: int) -> list[Path]:
     """Overlapping parts of two photographs, one after the other."""
     folder.mkdir()
     paths = []
@@ -324,7 +326,7 @@ def test_the_tables_are_there_at_first_and_again_after_each_scene(tmp_path):
         write_flat(tmp_path / "images" / name, 4)
     published = []
 
-    def publish(found):
+    def publish(found: Cameras) -> None:
         (tmp_path / "out" / "cameras.csv").touch()
         published.append({name: sum(map(bool, each.values())) for name, each in found.items()})
 
@@ -336,7 +338,7 @@ def test_the_tables_are_there_at_first_and_again_after_each_scene(tmp_path):
 def test_python_gives_models_reads_each_image_once_and_estimates_nothing_unused(tmp_path, monkeypatch):
     folder, read = write_flat(tmp_path / "images", FIRST), list[Path]()
 
-    def read_counted(path):
+    def read_counted(path: Path) -> Image | Unreadable:
         read.append(path)
         return read_image(path)
 

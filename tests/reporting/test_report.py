@@ -5,6 +5,7 @@ import re
 import sys
 from html.parser import HTMLParser
 from math import inf
+from pathlib import Path
 from types import SimpleNamespace
 
 import pandas as pd
@@ -26,17 +27,17 @@ EVIL = '<script>alert("$x$")</script>'
 class Tags(HTMLParser):
     """Which tags stand in a page, and what they ask for."""
 
-    def __init__(self, text):
+    def __init__(self, text: str) -> None:
         super().__init__()
         self.names, self.sources = list[str](), list[str]()
         self.feed(text)
 
-    def handle_starttag(self, tag, attrs):
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.names.append(tag)
         self.sources += [value or "" for name, value in attrs if name in ("src", "href")]
 
 
-def a_run(directory, count=12):
+def a_run(directory: Path, count: int = 12) -> list[Pair]:
     """A run over pairs of which the second cannot be read; its work directory is ``directory``/work."""
     pairs = write_pairs(directory / "images", count)
     pairs[1].images[1].write_bytes(b"")
@@ -44,7 +45,7 @@ def a_run(directory, count=12):
     return pairs
 
 
-def empty_journal(work_dir, pairs, **about):
+def empty_journal(work_dir: Path, pairs: list[Pair], **about: object) -> Journal:
     journal = Journal(work_dir)
     wanted = [WantedPair(pair, pair.names, "F") for pair in pairs]
     journal.want(wanted, [], {}, About({**THREE_UNITS.table(), "name": "three"}, **about))

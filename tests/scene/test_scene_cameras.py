@@ -1,13 +1,14 @@
 """The focal lengths that cameras start with, by EXIF or not, and the cameras that images are told to share."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import pycolmap
 import pytest
 
 from benchmarks.synthetic_scene import SIZE, registered_images, synthetic_scene
 from mkpc_kaggle.geometry.coordinates import Size
-from mkpc_kaggle.recipe import Recipe, Unit
+from mkpc_kaggle.recipe import Recipe, SceneConfig, Unit
 from mkpc_kaggle.reconstruction.run import for_cameras
 from mkpc_kaggle.scene.colmap import write_files
 from mkpc_kaggle.scene.reconstruct import reconstruct_batch, reconstruct_sharing
@@ -19,13 +20,13 @@ TALL = BatchImage("tall", "tall", Size(*reversed(SIZE)))
 GUESS = 1.1 * max(SIZE)
 
 
-def config(cameras="auto", **more):
+def config(cameras: str = "auto", **more: bool) -> SceneConfig:
     scene = for_cameras(Recipe((Unit(1, "sift", 640),)), cameras).scene
     assert scene is not None
     return replace(scene, **more)
 
 
-def focals_of(directory, settings):
+def focals_of(directory: Path, settings: SceneConfig) -> list[float]:
     """The focal length that each image's camera starts with, and the number of cameras."""
     graph = ViewGraph((*IMAGES, TALL), ())
     write_files(directory, graph, settings, given_intrinsics(graph.images, settings), [])

@@ -1,17 +1,19 @@
 """Shared intrinsics: recognised by focal lengths, and kept only if they explain the matches."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import pycolmap
 import pytest
 
-from benchmarks.synthetic_scene import registered_images, synthetic_scene
+from benchmarks.synthetic_scene import SyntheticScene, registered_images, synthetic_scene
 from mkpc_kaggle.geometry.cameras import Camera, relative_pose
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.robust import RobustConfig
 from mkpc_kaggle.recipe import SceneConfig
 from mkpc_kaggle.scene.choose import estimate_at_known_focals
-from mkpc_kaggle.scene.reconstruct import reconstruct_batch, reconstruct_sharing
+from mkpc_kaggle.scene.reconstruct import Solution, reconstruct_batch, reconstruct_sharing
 from mkpc_kaggle.scene.reconstruction import RegisteredImage, SfmModel
 from mkpc_kaggle.scene.shared_intrinsics import shared_intrinsics
 from mkpc_kaggle.scene.view_graph import BatchImage, ViewGraph
@@ -22,11 +24,11 @@ CONFIG = SceneConfig()
 OWN = SceneConfig(shared_intrinsics=0)
 
 
-def images(count, size=WIDE, prefix=""):
+def images(count: int, size: Size = WIDE, prefix: str = "") -> list[BatchImage]:
     return [BatchImage(f"{prefix}{number}", f"{prefix}{number}", size) for number in range(count)]
 
 
-def model(registered, focals, points=()):
+def model(registered: Sequence[BatchImage], focals: Sequence[float], points: Sequence[int] = ()) -> SfmModel:
     found = [
         RegisteredImage(image, Camera(np.diag([focal, focal, 1.0]), np.eye(3), np.zeros(3)), seen)
         for image, focal, seen in zip(registered, focals, points or [100] * len(focals), strict=True)
@@ -34,7 +36,7 @@ def model(registered, focals, points=()):
     return SfmModel(tuple(found), np.zeros((0, 3)), 0.5)
 
 
-def shared(*focals, points=()):
+def shared(*focals: float, points: Sequence[int] = ()) -> dict[str, float]:
     """By digest, the shared focal length of wide images, each found to have its own."""
     every = images(len(focals))
     return dict(shared_intrinsics(every, [model(every, focals, points)], 0.02))
@@ -64,11 +66,11 @@ def test_an_image_without_a_camera_shares_that_of_its_size():
     assert found == dict.fromkeys("012345", FOCAL)
 
 
-def focals_of(solution):
+def focals_of(solution: Solution) -> list[float]:
     return [found.focal for each in solution.reconstructions for model in each.models for found in model.images]
 
 
-def mean_angle(solution, scene):
+def mean_angle(solution: Solution, scene: SyntheticScene) -> float:
     """Between the found and the true direction from one image to the other, in degrees."""
     angles, registered = [], registered_images(solution)
     for pair in scene.pairs:

@@ -5,24 +5,25 @@ import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks.synthetic_scene import synthetic_scene
+from benchmarks.synthetic_scene import SyntheticScene, synthetic_scene
 from mkpc_kaggle.recipe import CameraSharing, SceneConfig
 from mkpc_kaggle.scene.reconstruct import reconstruct_batch
+from mkpc_kaggle.scene.reconstruction import SfmModel
 from mkpc_kaggle.scene.uncertainty import camera_sigmas
 
 
-def model_of(scene):
+def model_of(scene: SyntheticScene) -> SfmModel:
     solution = reconstruct_batch(scene.pairs, SceneConfig(cameras=CameraSharing.IMAGE))
     ((model,),) = (found.models for found in solution.reconstructions)
     return model
 
 
 @pytest.fixture(scope="module")
-def model():
+def model() -> SfmModel:
     return model_of(synthetic_scene(6, points=400))
 
 
-def errors_over_sigmas(model, scene):
+def errors_over_sigmas(model: SfmModel, scene: SyntheticScene) -> np.ndarray:
     """Of each image: the errors of rotation, centre and focal length in the frame of all cameras, (N, 3)."""
     true = [scene.cameras[found.image.name] for found in model.images]
     cameras = [found.camera for found in model.images]

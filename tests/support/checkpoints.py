@@ -1,10 +1,12 @@
 """Stand-in checkpoints of the paper's matchers in the public files' own formats, and a manifest that they fit."""
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+import pytest
 import torch
 from standin import STAND_INS, narrow_roma, standin_state
 from torch import Tensor, nn
@@ -20,28 +22,28 @@ from mkpc_kaggle.pipeline import assembly
 from mkpc_kaggle.weights import WeightFile, WeightStore
 
 
-def wrapped(state):
+def wrapped(state: dict[str, Tensor]) -> dict[str, Any]:
     """As a training run saves its network: under a prefix, beside what else it wants to remember."""
     prefixed = {f"matcher.{name}": tensor for name, tensor in state.items()}
     return {"epoch": 29, "global_step": 12345, "state_dict": prefixed}
 
 
-def wrapped_aspanformer(state):
+def wrapped_aspanformer(state: dict[str, Tensor]) -> dict[str, Any]:
     """With the offsets that the published network keeps and does not read."""
     offsets = {f"loftr_coarse.layers.{index}.attention.sample_offset": torch.ones(64, 2) for index in range(4)}
     return wrapped(state | offsets)
 
 
-def roma_alone(state):
+def roma_alone(state: dict[str, Tensor]) -> dict[str, Any]:
     return {name: tensor for name, tensor in state.items() if not name.startswith("dinov2.")}
 
 
-def dinov2_alone(state):
+def dinov2_alone(state: dict[str, Tensor]) -> dict[str, Any]:
     """The backbone has a file of its own."""
     return {name.removeprefix("dinov2."): tensor for name, tensor in state.items() if name.startswith("dinov2.")}
 
 
-def published_loma(state):
+def published_loma(state: dict[str, Tensor]) -> dict[str, Any]:
     """The matcher's names bare, with the assignments of the other layers that training had."""
     names = {name: name.removeprefix("matcher.") for name in state}
     names |= {name: f"_{name}" for name in state if name.startswith(("detector.", "descriptor."))}
@@ -75,7 +77,7 @@ FILES = (
 )
 
 
-def write_checkpoints(directory, files=FILES):
+def write_checkpoints(directory: Path, files: Iterable[PublicFile] = FILES) -> tuple[WeightFile, ...]:
     lines = []
     for file in files:
         path = directory / file.name
@@ -85,10 +87,10 @@ def write_checkpoints(directory, files=FILES):
     return tuple(lines)
 
 
-def store_of(directory, files):
+def store_of(directory: Path, files: Iterable[PublicFile]) -> WeightStore:
     return WeightStore([directory], write_checkpoints(directory, files))
 
 
-def use_manifest(monkeypatch, lines):
+def use_manifest(monkeypatch: pytest.MonkeyPatch, lines: tuple[WeightFile, ...]) -> None:
     """Runs that are begun from now on hold their weights against these lines instead of the package's own."""
     monkeypatch.setattr(assembly, "WeightStore", lambda directories: WeightStore(directories, lines))

@@ -5,7 +5,8 @@ import re
 import shutil
 import sys
 import venv
-from importlib.metadata import PackageNotFoundError, distribution
+from collections.abc import Sequence
+from importlib.metadata import Distribution, PackageNotFoundError, distribution
 from pathlib import Path
 from zipfile import ZipFile, is_zipfile
 
@@ -14,7 +15,7 @@ UNPACKED = (".zip", ".tar", ".gz", ".pt", ".pth", ".ckpt")  # Kaggle unpacks arc
 PACKAGES = ("numpy", "pandas", "scipy", "scikit-learn", "opencv-python-headless", "torch", "pip", *BESIDE)
 
 
-def upload(folder, mount):
+def upload(folder: Path, mount: Path) -> None:
     """What Kaggle makes of an uploaded folder: sub-folders are dropped, archives become directories."""
     mount.mkdir(parents=True)
     for path in folder.iterdir():
@@ -25,7 +26,7 @@ def upload(folder, mount):
             shutil.copyfile(path, mount / path.name)
 
 
-def make_image(directory):
+def make_image(directory: Path) -> Path:
     """An environment with links to this interpreter's copies of the packages; its interpreter."""
     venv.create(directory, symlinks=True)
     site = next(directory.glob("lib/python*/site-packages"))
@@ -37,7 +38,7 @@ def make_image(directory):
     return directory / "bin" / "python"
 
 
-def closure(names):
+def closure(names: Sequence[str]) -> dict[str, Distribution]:
     """The named distributions and all that they need, as far as they are here, by name."""
     found = {}
     waiting = list(names)
@@ -55,7 +56,7 @@ def closure(names):
     return found
 
 
-def pack_wheel(name, directory):
+def pack_wheel(name: str, directory: Path) -> Path:
     """The wheel that an installed distribution came from, but for the order and dates of its entries."""
     installed = distribution(name)
     tags = re.findall(r"^Tag: (.*)$", installed.read_text("WHEEL") or "", re.MULTILINE)
@@ -71,12 +72,12 @@ def pack_wheel(name, directory):
     return path
 
 
-def environment(**more):
+def environment(**more: str) -> dict[str, str]:
     """This process's environment without what leads to its own packages, or tells that a test is running."""
     hidden = ("PYTHONPATH", "VIRTUAL_ENV", "MKPC_WEIGHTS", "PYTEST_CURRENT_TEST")
     kept = {name: value for name, value in os.environ.items() if name not in hidden}
     return {**kept, "PYTHONNOUSERSITE": "1", **more}
 
 
-def python_version():
+def python_version() -> str:
     return f"{sys.version_info.major}.{sys.version_info.minor}"

@@ -4,11 +4,13 @@ A new matcher is one line in ``MATCHERS``.
 """
 
 import copy
+from collections.abc import Callable
 from functools import cache, partial
 from typing import Any
 
 import numpy as np
 from kornia.feature import DISK, XFeat
+from torch import nn
 
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
 from mkpc_kaggle.matchers.adapters import disk_lightglue, sift_lightglue, xfeat_lighterglue
@@ -17,7 +19,7 @@ from mkpc_kaggle.matchers.adapters.dkm import DkmMatcher
 from mkpc_kaggle.matchers.adapters.loma import LomaAdapter, LomaOptions
 from mkpc_kaggle.matchers.adapters.roma import RomaMatcher, RomaOptions
 from mkpc_kaggle.matchers.adapters.superglue import SuperGlueMatcher
-from mkpc_kaggle.matchers.contract import Colour, Picture
+from mkpc_kaggle.matchers.contract import Colour, MatcherSpec, Picture, Placement
 from mkpc_kaggle.matchers.dense import DenseOptions
 from mkpc_kaggle.matchers.lightglue import LightGlueMatcher, light_glue
 from mkpc_kaggle.matchers.networks.aliked import Aliked
@@ -39,20 +41,20 @@ SHIFT = 8  # pixels between the two pictures of a pair
 
 
 @cache
-def standin(name, make, *settings, **named):
+def standin(name: str, make: Callable[..., nn.Module], *settings: Any, **named: Any) -> nn.Module:
     return filled(make(*settings, **named), name)
 
 
-def ours(placement, *network, **named):
+def ours(placement: Placement, *network: Any, **named: Any) -> Any:
     return prepared(kornias(*network, **named), placement)
 
 
-def kornias(*network, **named):
+def kornias(*network: Any, **named: Any) -> Any:
     """A network of kornia's, which its matcher will move."""
     return copy.deepcopy(standin(*network, **named))
 
 
-def superglue_matcher(placement, keypoints=200):
+def superglue_matcher(placement: Placement, keypoints: int = 200) -> SuperGlueMatcher:
     superpoint = ours(placement, "superpoint", SuperPoint, max_keypoints=keypoints)
     return SuperGlueMatcher(superpoint, ours(placement, "superglue", SuperGlue, 20), placement.device)
 
@@ -61,39 +63,39 @@ def semi_dense_matcher(name, make, placement):
     return SemiDenseMatcher(ours(placement, name, make), spec_of(name, "test"), placement.device)
 
 
-def dkm_matcher(placement, passes=1, matches=300):
+def dkm_matcher(placement: Placement, passes: int = 1, matches: int = 300) -> DkmMatcher:
     return DkmMatcher(ours(placement, "dkm", DKM), DenseOptions(passes, matches=matches), placement.device)
 
 
-def roma_matcher(placement):
+def roma_matcher(placement: Placement) -> RomaMatcher:
     return RomaMatcher(ours(placement, "roma", narrow_roma), RomaOptions(matches=300), placement.device)
 
 
-def loma_matcher(placement):
+def loma_matcher(placement: Placement) -> LomaAdapter:
     options = LomaOptions(Variant.B128, max_keypoints=200, match_threshold=0.0)
     return LomaAdapter(ours(placement, "loma", Loma, Variant.B128), options, placement.device)
 
 
-def aliked_matcher(placement, keypoints=200):
+def aliked_matcher(placement: Placement, keypoints: int = 200) -> AlikedMatcher:
     return AlikedMatcher(aliked_keypoints(placement, keypoints)[0], AlikedOptions())
 
 
 Keypoints = tuple[Encoder, dict[str, Any]]  # and the shape of LightGlue for them
 
 
-def aliked_keypoints(placement, keypoints):
+def aliked_keypoints(placement: Placement, keypoints: int) -> tuple[MatcherSpec, Encoder, dict[str, Any]]:
     return KeypointEncoder(ours(placement, "aliked", Aliked, keypoints), placement.device), {"input_dim": 128}
 
 
-def disk_keypoints(placement, keypoints):
+def disk_keypoints(placement: Placement, keypoints: int) -> tuple[MatcherSpec, Encoder, dict[str, Any]]:
     return disk_lightglue.disk_encoder(kornias("disk", DISK), keypoints, placement), {"input_dim": 128}
 
 
-def sift_keypoints(placement, keypoints):
+def sift_keypoints(placement: Placement, keypoints: int) -> tuple[MatcherSpec, Encoder, dict[str, Any]]:
     return sift_lightglue.SiftEncoder(keypoints, placement.device), sift_lightglue.SHAPE
 
 
-def xfeat_keypoints(placement, keypoints):
+def xfeat_keypoints(placement: Placement, keypoints: int) -> tuple[MatcherSpec, Encoder, dict[str, Any]]:
     network = XFeat(top_k=keypoints, detection_threshold=0.0)
     network.net = filled(network.net, "xfeat")
     return xfeat_lighterglue.xfeat_encoder(network, keypoints, placement), xfeat_lighterglue.SHAPE
@@ -107,7 +109,9 @@ KEYPOINTS = {
 }
 
 
-def lightglue_matcher(name, placement, keypoints=200, layers=2, threshold=0.0):
+def lightglue_matcher(
+    name: str, placement: Placement, keypoints: int = 200, layers: int = 2, threshold: float = 0.0
+) -> LightGlueMatcher:
     encoder, shape = KEYPOINTS[name](placement, keypoints)
     network = kornias("lightglue", light_glue, layers, threshold, **shape)
     return LightGlueMatcher(spec_of(name, "test"), encoder, network, placement)
@@ -127,7 +131,7 @@ MATCHERS = {
 }
 
 
-def picture(colour, number, shift=0):
+def picture(colour: Colour, number: int, shift: int = 0) -> Picture:
     """A part of the scene of that number, which begins up to SHIFT pixels further right."""
     channels = 1 if colour is Colour.GRAY else 3
     whole = scene(SIZE.height, SIZE.width + SHIFT, channels, name=f"picture {number}")

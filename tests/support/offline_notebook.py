@@ -7,6 +7,7 @@ import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Mapping
 from copy import deepcopy
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -32,7 +33,9 @@ HAS_NAMESPACES = shutil.which("unshare") and subprocess.run([*OFFLINE, "true"], 
 needs_namespaces = pytest.mark.skipif(not HAS_NAMESPACES, reason="unshare --net is not permitted here")
 
 
-def execute(notebook, executed, python, working, variables):
+def execute(
+    notebook: Path, executed: Path, python: str | Path, working: Path, variables: Mapping[str, str]
+) -> nbformat.NotebookNode:
     """Run ``notebook`` in ``working`` under that interpreter; the executed notebook, also in ``executed``."""
     command = [*OFFLINE, str(python), "-c", EXECUTE, str(notebook), str(executed)]
     # Not under pytest's own directory: the path of a socket may have no more than 107 characters.
@@ -43,19 +46,19 @@ def execute(notebook, executed, python, working, variables):
     return nbformat.read(executed, as_version=4)
 
 
-def printed(notebook):
+def printed(notebook: nbformat.NotebookNode) -> str:
     return "".join(output["text"] for output in outputs(notebook) if output["output_type"] == "stream")
 
 
-def pictures(notebook):
+def pictures(notebook: nbformat.NotebookNode) -> int:
     return sum(bool({"image/png", "image/jpeg"} & set(output.get("data", {}))) for output in outputs(notebook))
 
 
-def outputs(notebook):
+def outputs(notebook: nbformat.NotebookNode) -> list[nbformat.NotebookNode]:
     return [output for cell in notebook.cells for output in cell.get("outputs", ())]
 
 
-def with_pictures_alone(notebook):
+def with_pictures_alone(notebook: nbformat.NotebookNode) -> nbformat.NotebookNode:
     """The form in which the tour is committed: its pictures, and nothing else that tells of a run."""
     kept = deepcopy(notebook)
     kept.metadata = {name: kept.metadata[name] for name in ("kernelspec", "language_info")}
@@ -72,7 +75,7 @@ def with_pictures_alone(notebook):
     return kept
 
 
-def main(path):
+def main(path: Path) -> None:
     with TemporaryDirectory() as directory:
         executed = execute(path, Path(directory) / "executed.ipynb", sys.executable, path.parent, os.environ)
     path.write_text(nbformat.writes(with_pictures_alone(executed)) + "\n", encoding="utf-8")

@@ -1,11 +1,16 @@
 """Writes pairs in the format that :mod:`mkpc_kaggle.data.pairs` reads."""
 
+from collections.abc import Iterable
+from pathlib import Path
+
 import numpy as np
 
+from mkpc_kaggle.data.competition import TrainScene, TruePair
 from mkpc_kaggle.geometry.cameras import Camera, relative_pose
+from mkpc_kaggle.geometry.coordinates import Size
 
 
-def turned_camera(camera, turns, size):
+def turned_camera(camera: Camera, turns: int, size: Size) -> Camera:
     """The camera of ``np.rot90(picture, turns)``, where ``camera`` took a picture of ``size``."""
     quarter = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])
     width, height = size
@@ -16,19 +21,19 @@ def turned_camera(camera, turns, size):
     return camera
 
 
-def line_of(names, cameras, turns=(0, 0)):
+def line_of(names: tuple[str, str], cameras: tuple[Camera, Camera], turns: tuple[int, int] = (0, 0)) -> str:
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = relative_pose(*cameras)
     numbers = np.concatenate([cameras[0].K.ravel(), cameras[1].K.ravel(), T.ravel()])
     return " ".join([*names, *map(str, turns), *(f"{number:.17g}" for number in numbers)])
 
 
-def line_of_pair(true, image_root):
+def line_of_pair(true: TruePair, image_root: Path) -> str:
     image0, image1 = (str(image.relative_to(image_root)) for image in true.pair.images)
     return line_of((image0, image1), (true.camera0, true.camera1))
 
 
-def write_list(path, scenes, image_root):
+def write_list(path: Path, scenes: Iterable[TrainScene], image_root: Path) -> Path:
     lines = [line_of_pair(true, image_root) for scene in scenes for true in scene.pairs]
     path.write_text("\n".join(lines) + "\n")
     return path

@@ -1,42 +1,53 @@
 """Pictures for matchers, and comparisons of matches."""
 
+from typing import Any
+
 import numpy as np
 import torch
 from standin import scene
 
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
+from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import Picture
 
 
-def picture(height, width, name="scene", *, channels=3, multiple=1, padding=(0, 0)):
+def picture(
+    height: int,
+    width: int,
+    name: str = "scene",
+    *,
+    channels: int = 3,
+    multiple: int = 1,
+    padding: tuple[int, int] = (0, 0),
+) -> Picture:
     """The scene of that name, one to one, with at least that padding on the right and at the bottom."""
     pixels = scene(height, width, channels, name)
     return as_picture(pixels if channels == 3 else pixels[..., 0], multiple, padding)
 
 
-def as_picture(pixels, multiple=1, padding=(0, 0)):
+def as_picture(pixels: np.ndarray, multiple: int = 1, padding: tuple[int, int] = (0, 0)) -> Picture:
     content = Size(pixels.shape[1], pixels.shape[0])
     sides = [-(-(side + more) // multiple) * multiple for side, more in zip(content, padding, strict=True)]
     view = View(Box.whole(content), content, Size(*sides))
     return Picture(view.render(np.ascontiguousarray(pixels)), view)
 
 
-def image_of(pixels):
+def image_of(pixels: np.ndarray) -> torch.Tensor:
     """(H, W, 3) uint8 -> (1, 3, H, W) in 0..1."""
     return torch.from_numpy(pixels.copy()).permute(2, 0, 1)[None].float() / 255
 
 
-def match_one(matcher, first, second):
+def match_one(matcher: Any, first: Picture, second: Picture) -> Matches:
     (matches,) = matcher.match(matcher.encode([first]), matcher.encode([second]))
     return matches
 
 
-def same(first, second):
+def same(first: Matches, second: Matches) -> bool:
     parts = ("points0", "points1", "scores")
     return all(getattr(first, part).tobytes() == getattr(second, part).tobytes() for part in parts)
 
 
-def agreement(first, second, within, p=2.0):
+def agreement(first: torch.Tensor, second: torch.Tensor, within: float, p: float = 2.0) -> float:
     """The share of the rows of either that lie within that distance of a row of the other."""
     if not len(first) and not len(second):
         return 1.0

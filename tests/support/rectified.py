@@ -5,20 +5,23 @@ It sees every pair as rectified: a point of image 1 is the point of image 0 move
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from itertools import combinations
+from pathlib import Path
 
 import cv2
 import numpy as np
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.budget import Budget
+from mkpc_kaggle.engine.cluster import RayCluster
+from mkpc_kaggle.engine.request import RunReport
 from mkpc_kaggle.engine.session import Interrupt, Session, Watchdog, run_pairs, submit
 from mkpc_kaggle.geometry.coordinates import Size, View
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.matchers.contract import MatcherSpec
+from mkpc_kaggle.matchers.contract import MatcherSpec, Picture
 from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.recipe import Recipe, Unit
 
@@ -29,7 +32,7 @@ class Seen:
     brightness: int
 
 
-def plenty(_):  # a function, since workers unpickle the matcher
+def plenty(_: int) -> int:
     return 150
 
 
@@ -43,16 +46,16 @@ class RectifiedMatcher:
     calls: list[tuple[int, int]] = field(default_factory=list)
 
     @property
-    def spec(self):
+    def spec(self) -> MatcherSpec:
         return MatcherSpec(self.name)
 
-    def encode(self, pictures):
+    def encode(self, pictures: Sequence[Picture]) -> list[Seen]:
         return [Seen(picture.view, int(np.median(picture.pixels))) for picture in pictures]
 
-    def match(self, encodings0, encodings1):
+    def match(self, encodings0: Sequence[Seen], encodings1: Sequence[Seen]) -> list[Matches]:
         return [self._match(*pair) for pair in zip(encodings0, encodings1, strict=True)]
 
-    def _match(self, seen0, seen1):
+    def _match(self, seen0: Seen, seen1: Seen) -> Matches:
         self.calls.append((max(seen0.view.content), seen0.brightness))
         time.sleep(self.seconds)
         count = self.matches(seen0.brightness)
@@ -67,7 +70,7 @@ THREE_UNITS = Recipe((SWEEP, SECOND, THIRD))
 SIZE = Size(80, 72)
 
 
-def write_pairs(directory, count):
+def write_pairs(directory: Path, count: int) -> list[Pair]:
     """Pairs of flat 80 x 72 images, each with a brightness of its own: 10, 11, ..."""
     pairs = []
     directory.mkdir(parents=True, exist_ok=True)
@@ -79,15 +82,15 @@ def write_pairs(directory, count):
     return pairs
 
 
-def flat(number, size=SIZE):
+def flat(number: int, size: Size = SIZE) -> np.ndarray:
     return np.full((size.height, size.width, 3), 10 + 10 * number, np.uint8)
 
 
-def number_of(seen):
+def number_of(seen: Seen) -> int:
     return seen.brightness // 10 - 1
 
 
-def batch_pairs(directory, images=4, batch="one", size=SIZE):
+def batch_pairs(directory: Path, images: int = 4, batch: str = "one", size: Size = SIZE) -> list[Pair]:
     directory.mkdir(parents=True, exist_ok=True)
     paths = [directory / f"{number}.png" for number in range(images)]
     for number, path in enumerate(paths):
@@ -97,19 +100,19 @@ def batch_pairs(directory, images=4, batch="one", size=SIZE):
 
 
 def run(
-    pairs,
-    recipe,
-    matcher,
-    work_dir,
+    pairs: Sequence[Pair],
+    recipe: Recipe,
+    matcher: RectifiedMatcher,
+    work_dir: Path,
     *,
-    limit=float("inf"),
-    budget=None,
-    interrupt=None,
-    publish=lambda *_: None,
-    output=None,
-    workers=0,
-    is_watched=False,
-):
+    limit: float = float("inf"),
+    budget: Budget | None = None,
+    interrupt: Interrupt | None = None,
+    publish: Callable[..., None] = lambda *_: None,
+    output: Path | None = None,
+    workers: int | RayCluster | None = 0,
+    is_watched: bool = False,
+) -> RunReport:
     """Run the recipe with that matcher; the submission is written to ``output``, or given to ``publish``."""
     assembly = assemble(recipe, matchers={matcher.name: matcher}, device="cpu")
     budget = budget or Budget(time.monotonic(), limit)
@@ -121,5 +124,5 @@ def run(
         return run_pairs(pairs, assembly, session, publish)
 
 
-def matrices(report):
+def matrices(report: RunReport) -> list[bytes]:
     return [record.pair_fundamental.tobytes() for record in report.records]

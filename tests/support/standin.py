@@ -4,12 +4,13 @@ Every number is made of bytes of SHAKE-256 of a name, so that no generator of nu
 """
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 
 import numpy as np
 import torch
+from torch import Tensor, nn
 
 from mkpc_kaggle.matchers.adapters import roma as adapter
 from mkpc_kaggle.matchers.networks.dinov2 import DinoV2Config
@@ -65,23 +66,23 @@ NARROW = RomaConfig(
 )
 
 
-def narrow_roma():
+def narrow_roma() -> RoMa:
     return RoMa(NARROW)
 
 
-def use_narrow(monkeypatch):
+def use_narrow(monkeypatch) -> None:
     """RoMas that are loaded from now on are narrow ones, and so must their files be."""
     monkeypatch.setattr(adapter, "RoMa", narrow_roma)
 
 
-def uniform(name, shape=()):
+def uniform(name: str, shape: Sequence[int] = ()) -> np.ndarray:
     """float64 in (-1, 1), 2^16 different values, as the name has it."""
     count = int(np.prod(shape, dtype=int))
     whole = np.frombuffer(hashlib.shake_256(name.encode()).digest(2 * count), "<u2").astype(np.float64)
     return ((2 * whole + 1) / 2**16 - 1).reshape(shape)
 
 
-def value_of(name, shape, gain):
+def value_of(name: str, shape: Sequence[int], gain: float) -> np.ndarray:
     """The value of one parameter or buffer.
 
     Maps have no mean, so that a flat input leaves them silent, and the variance ``gain`` / fan-in. Norms are
@@ -98,7 +99,7 @@ def value_of(name, shape, gain):
     return 0.1 * numbers
 
 
-def standin_state(network, standin):
+def standin_state(network: nn.Module, standin: StandIn) -> dict[str, Tensor]:
     """A checkpoint of a network of ours: float32 tensors by name; integer buffers are 0."""
     state = {}
     for name, tensor in network.state_dict().items():
@@ -114,12 +115,12 @@ def standin_state(network, standin):
     return state
 
 
-def filled(network, name):
+def filled(network: nn.Module, name: str) -> nn.Module:
     network.load_state_dict(standin_state(network, STAND_INS[name]))
     return network
 
 
-def scene(height, width, channels=1, name="scene"):
+def scene(height: int, width: int, channels: int = 1, name: str = "scene") -> np.ndarray:
     """A picture with texture at all scales, (height, width, channels) uint8; exact, for it is made of integers."""
     total = np.zeros((height, width, channels), int)
     for cell in (3, 8, 24):

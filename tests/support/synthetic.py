@@ -2,10 +2,12 @@
 
 from dataclasses import dataclass, field
 from functools import cached_property
+from pathlib import Path
 
-from rectified import RectifiedMatcher, batch_pairs, number_of
+from rectified import RectifiedMatcher, Seen, batch_pairs, number_of
 
-from benchmarks.synthetic_scene import SIZE, synthetic_scene
+from benchmarks.synthetic_scene import SIZE, SyntheticScene, synthetic_scene
+from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import RobustConfig
 from mkpc_kaggle.recipe import Recipe, SceneConfig, Unit
@@ -23,15 +25,15 @@ class SyntheticMatcher(RectifiedMatcher):
     points: int = field(default=400)
 
     @cached_property
-    def scene(self):
+    def scene(self) -> SyntheticScene:
         return synthetic_scene(self.images, points=self.points)
 
-    def _match(self, seen0, seen1):
+    def _match(self, seen0: Seen, seen1: Seen) -> Matches:
         self.calls.append((max(seen0.view.content), seen0.brightness))
         names = [f"{number_of(seen):04}" for seen in (seen0, seen1)]
         (found,) = (p.matches for p in self.scene.pairs if [p.image0.name, p.image1.name] == names)
         return Matches(seen0.view.from_image(found.points0), seen1.view.from_image(found.points1), found.scores)
 
 
-def synthetic_pairs(directory, images=6, batch="batch"):
+def synthetic_pairs(directory: Path, images: int = 6, batch: str = "batch") -> list[Pair]:
     return batch_pairs(directory, images, batch, SIZE)

@@ -2,6 +2,7 @@
 
 import re
 import threading
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -24,7 +25,7 @@ class Site:
 class _Handler(BaseHTTPRequestHandler):
     site: Site
 
-    def do_GET(self):
+    def do_GET(self) -> None:
         site = self.site
         site.asked.append(self.headers.get("Range", ""))
         if site.redirect:
@@ -35,7 +36,7 @@ class _Handler(BaseHTTPRequestHandler):
             wanted = re.fullmatch(r"bytes=(\d+)-", site.asked[-1])
             self._send(site, int(wanted[1]) if wanted else 0)
 
-    def _send(self, site, start):
+    def _send(self, site: Site, start: int) -> None:
         if start and start >= len(site.data):
             self.send_response(416)
             self.send_header("Content-Range", f"bytes */{len(site.data)}")
@@ -54,12 +55,12 @@ class _Handler(BaseHTTPRequestHandler):
         with suppress(ConnectionError):
             self.wfile.write(body)
 
-    def log_message(self, *_):
+    def log_message(self, *_: object) -> None:
         pass
 
 
 @contextmanager
-def serve(site):
+def serve(site: Site) -> Iterator[Site]:
     handler = type("Handler", (_Handler,), {"site": site})
     with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
         thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})

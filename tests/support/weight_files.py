@@ -1,6 +1,7 @@
 """What the tests of weights share: lines of a manifest, files that fit them, and no other place to search."""
 
 import hashlib
+from pathlib import Path
 
 from mkpc_kaggle.weights import WeightFile
 
@@ -8,15 +9,23 @@ DATA = b"these are the weights"
 OTHER = b"those were the weights"[:21]
 
 
-def digest_of(data):
+def digest_of(data: bytes) -> str:
     return "sha256:" + hashlib.sha256(data).hexdigest()
 
 
-def line(name="a.bin", data=DATA, *, size=None, digest=None, slot="slot", source="somewhere"):
+def line(
+    name: str = "a.bin",
+    data: bytes = DATA,
+    *,
+    size: int | None = None,
+    digest: str | None = None,
+    slot: str = "slot",
+    source: str = "somewhere",
+) -> WeightFile:
     return WeightFile(name, len(data) if size is None else size, digest or digest_of(data), "MIT", slot, source)
 
 
-def put(directory, name="a.bin", data=DATA):
+def put(directory: Path, name: str = "a.bin", data: bytes = DATA) -> Path:
     directory.mkdir(parents=True, exist_ok=True)
     (directory / name).write_bytes(data)
     return directory

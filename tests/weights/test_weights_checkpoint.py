@@ -9,8 +9,10 @@ import types
 import zipfile
 from argparse import Namespace
 from collections import Counter, OrderedDict
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -31,11 +33,11 @@ TENSORS = {"a.weight": torch.arange(6.0).reshape(2, 3), "a.count": torch.tensor(
 save_legacy = partial(torch.save, _use_new_zipfile_serialization=False)
 
 
-def save_pickle(value, path):
+def save_pickle(value: object, path: Path) -> None:
     path.write_bytes(pickle.dumps(value, protocol=2))
 
 
-def assert_same(loaded, wanted):
+def assert_same(loaded: dict[str, torch.Tensor], wanted: dict[str, torch.Tensor]) -> None:
     assert list(loaded) == list(wanted)
     for name, tensor in wanted.items():
         found = loaded[name]
@@ -98,7 +100,7 @@ def framework(monkeypatch):
     return module
 
 
-def training_checkpoint(framework, state):
+def training_checkpoint(framework: types.ModuleType, state: dict[str, torch.Tensor]) -> dict[str, Any]:
     return {
         "epoch": 3,
         "pytorch-lightning_version": "1.3.5",
@@ -141,11 +143,11 @@ class Call:
     def __init__(self, *reduced, **state):
         self.reduced = (reduced[0], reduced[1:], *state.values())
 
-    def __reduce__(self):
+    def __reduce__(self) -> Any:
         return self.reduced
 
 
-def nasty(sentinel):
+def nasty(sentinel: Path) -> dict[str, object]:
     """Calls that would make the sentinel file, by what they go through."""
     command = f"touch {sentinel}"
     hidden = sentinel.with_name("hidden.pt")
@@ -181,7 +183,7 @@ def test_a_malicious_pickle_runs_nothing(tmp_path, save):
         sentinel.rmdir() if sentinel.is_dir() else sentinel.unlink()
 
 
-def with_pickle(path, change):
+def with_pickle(path: Path, change: Callable[[bytes], bytes]) -> Path:
     """A checkpoint with an unknown object beside its tensors, as torch writes it, its pickle changed."""
     torch.save({"state_dict": TENSORS, "options": Namespace()}, path)
     with zipfile.ZipFile(path) as archive:
@@ -212,7 +214,7 @@ def test_records_that_unpack_to_more_than_the_file_or_overlap_are_refused(tmp_pa
 @settings(max_examples=100)
 @given(st.lists(st.tuples(st.integers(0, 10_000), st.integers(0, 255)), min_size=1, max_size=3))
 def test_a_damaged_pickle_gives_tensors_or_a_refusal(tmp_path_factory, changes):
-    def damaged(data):
+    def damaged(data: bytes) -> bytes:
         changed = bytearray(data)
         for place, byte in changes:
             changed[place % len(data)] = byte

@@ -1,32 +1,34 @@
 """Downloads against a local server: whole, broken off, resumed, wrong, impossible."""
 
+from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from web import Site, serve
 from weight_files import DATA, digest_of, line, put
 
-from mkpc_kaggle.weights import UNVERIFIED, fetch
-from mkpc_kaggle.weights.fetch import ATTEMPTS, BLOCK_BYTES, FetchOutcome, choose
+from mkpc_kaggle.weights import UNVERIFIED, WeightFile, fetch
+from mkpc_kaggle.weights.fetch import ATTEMPTS, BLOCK_BYTES, Fetched, FetchOutcome, choose
 
 BIG = bytes(range(256)) * 1000
 CUT = 100_000
 
 
 @pytest.fixture
-def site(monkeypatch):
+def site(monkeypatch: pytest.MonkeyPatch) -> Iterator[Site]:
     monkeypatch.setenv("no_proxy", "127.0.0.1")
     with serve(Site(BIG)) as site:
         yield site
 
 
-def get(site, directory, file=None, pauses=None):
+def get(site: Site, directory: Path, file: WeightFile | None = None, pauses: list[float] | None = None) -> Fetched:
     """Download without a pause between attempts; ``pauses`` takes the seconds that there would have been."""
     wanted = replace(file or line(data=BIG), source=f"{site.url} (renamed)")
     return fetch.fetch(wanted, directory, wait=([] if pauses is None else pauses).append)
 
 
-def names_in(directory):
+def names_in(directory: Path) -> list[str]:
     return sorted(path.name for path in directory.iterdir())
 
 

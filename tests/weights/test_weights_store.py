@@ -2,6 +2,7 @@
 
 import os
 import re
+from pathlib import Path
 from zipfile import ZipFile
 
 import pytest
@@ -18,7 +19,7 @@ from mkpc_kaggle.weights.manifest import digest_of as file_digest
 pytestmark = pytest.mark.usefixtures("nowhere_else")
 
 
-def found_by(weights):
+def found_by(weights: WeightStore) -> Path:
     return weights.find("slot").path
 
 
