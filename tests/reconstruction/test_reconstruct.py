@@ -27,7 +27,6 @@ from mkpc_kaggle import reconstruct
 from mkpc_kaggle.data import images
 from mkpc_kaggle.data.images import TURNS, Image, Unreadable, read_image
 from mkpc_kaggle.engine.budget import Budget
-from mkpc_kaggle.engine.records import CameraRecord
 from mkpc_kaggle.engine.session import Interrupt, Session
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.matches import Matches
@@ -83,7 +82,7 @@ def mixed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, FolderResult]
     return home / "out", run(write_flat(home / "images"), home / "out")
 
 
-def cameras(result: FolderResult) -> Mapping[str, CameraRecord]:
+def cameras(result: FolderResult) -> Mapping[str, RegisteredImage]:
     (found,) = result.cameras.values()
     return {file.name: placed[1] for file, placed in found.items() if placed}
 
