@@ -37,6 +37,7 @@ from mkpc_kaggle.reconstruction.folder import read_folder, read_pair_list
 from mkpc_kaggle.reconstruction.outputs import Cameras, camera_rows, submission_rows
 from mkpc_kaggle.reconstruction.run import FolderResult, for_cameras, reconstruct_folder
 from mkpc_kaggle.scene.likeness import local_features, most_alike, shortlist
+from mkpc_kaggle.scene.reconstruction import RegisteredImage
 
 RECIPE = for_cameras(Recipe((Unit(1, "synthetic", SIZE.width),)))
 FIRST, SECOND, OTHERS = 6, 4, 1  # images of two scenes, and of none
