@@ -119,9 +119,11 @@ def test_a_cache_drops_what_was_used_least_recently():
     for key in "abc":
         cache.put(key, key, 1)
     assert cache.get("a") == "a"
-    for key, size in (("d", 1), ("c", 2), ("e", 4)):  # without b; without a; itself too large
-        cache.put(key, key, size)
-    assert [cache.get(key) for key in "abcde"] == [None, None, "c", "d", None]
+    cache.put("d", "d", 1)
+    assert [cache.get(key) for key in "bcda"] == [None, "c", "d", "a"]
+    cache.put("c", "new", 2)  # instead of the former value and of d
+    cache.put("e", "e", 4)  # too large
+    assert [cache.get(key) for key in "acde"] == ["a", "new", None, None]
     assert cache.bytes == 3
 
 
