@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from math import isfinite
 
 from mkpc_kaggle.engine.jobs import Failure, MatchJob, Outcome
 from mkpc_kaggle.engine.journal_reader import EventKind
@@ -17,8 +16,7 @@ class Matching:
 
     def __init__(self, state: State, plan: Plan, chronicle: Chronicle) -> None:
         self._state, self._plan, self._chronicle = state, plan, chronicle
-        request = state.request
-        self._settings = dict(zip(state.units, request.settings.units, strict=True))
+        self._settings = dict(zip(state.units, state.request.settings.units, strict=True))
 
     def has_work(self, now: float) -> bool:
         return self._plan.has_work(now)
@@ -33,8 +31,7 @@ class Matching:
         return replace(job, pairs=pairs, known=known, upcoming=tuple(upcoming))
 
     def patience(self, job: MatchJob, unknown: float) -> float:
-        seconds = self._plan.patience(job)
-        return seconds if isfinite(seconds) else unknown
+        return self._plan.patience(job, unknown)
 
     def save(self, job: MatchJob, answer: Sequence[Outcome], _: float) -> None:
         self._state.journal.save_outcomes(answer, self._settings)

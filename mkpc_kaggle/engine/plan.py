@@ -176,10 +176,10 @@ class Plan:
         rank = int(np.flatnonzero(self._order == job.indices[-1])[0]) + 1
         return self._order[rank : rank + self.minibatch].tolist() if job.phase is not Phase.FILL else []
 
-    def patience(self, job: MatchJob) -> float:
-        """Return the seconds after which a job hangs, perhaps on a new worker; infinity if a unit is unknown."""
+    def patience(self, job: MatchJob, unknown: float) -> float:
+        """Return the seconds after which a job hangs, perhaps on a new worker; ``unknown`` if one of its costs is."""
         if not all(self.costs.is_known(unit.name) for unit in job.units):
-            return inf
+            return unknown
         expected = len(job.indices) * sum(self.costs.mean(unit.name) for unit in job.units)
         return HANG_FACTOR * expected + self.costs.warm_up(job.units)
 

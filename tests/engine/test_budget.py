@@ -6,9 +6,6 @@ import pytest
 
 from mkpc_kaggle.engine.budget import WINDOW, Budget, Costs, format_duration, monotonic_of, parse_duration
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.recipe import Unit
-
-UNITS = (Unit(1, "a", 100), Unit(2, "b", 100), Unit(1, "c", 100))
 
 
 @pytest.mark.parametrize(
