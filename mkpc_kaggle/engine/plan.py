@@ -177,7 +177,7 @@ class Plan:
         return self._order[rank : rank + self.minibatch].tolist() if job.phase is not Phase.FILL else []
 
     def patience(self, job: MatchJob, unknown: float) -> float:
-        """Return the seconds after which a job hangs, perhaps on a new worker; ``unknown`` if one of its costs is."""
+        """Return the seconds after which a job hangs, perhaps on a new worker; ``unknown`` if a cost is."""
         if not all(self.costs.is_known(unit.name) for unit in job.units):
             return unknown
         expected = len(job.indices) * sum(self.costs.mean(unit.name) for unit in job.units)
