@@ -105,7 +105,7 @@ class _Arrays(pickle.Unpickler):
 
 
 def _array(archive: zipfile.ZipFile, name: str) -> Any:
-    stream = BytesIO(archive.read(name))
+    stream = BytesIO(archive.open(name).read(1 << 28))  # a longer array is cut off, and refused
     try:
         return np.lib.format.read_array(stream, allow_pickle=False)
     except ValueError:  # an array of objects: its header has been read, and its pickle follows

@@ -5,6 +5,7 @@ The text of an error decides its kind, since types differ between versions: a fa
 further call in the process fails, and only a new process helps. After a memory error the process can continue.
 """
 
+import os
 import re
 from enum import Enum, auto
 
@@ -20,6 +21,9 @@ _OUT_OF_MEMORY = re.compile(
 _DEVICE = re.compile(
     "AcceleratorError|CUDA (driver )?error|cuDNN error|cuFFT error|cusolver error|No CUDA GPUs are available"
 )
+
+
+matched_in: set[int] = set()  # ids of this process and of its forked ancestors, if they matched pairs
 
 
 class FailureKind(Enum):
@@ -44,3 +48,16 @@ def reason_of(error: BaseException) -> str:
     text = str(error)
     short = text.partition("\n")[0] if _DEVICE.search(text) else text
     return ", ".join([f"{type(error).__name__}: {short}", *getattr(error, "__notes__", ())])
+
+
+def require_unforked() -> None:
+    """Raise :class:`UserError` in a child that was forked after its parent had matched.
+
+    A forked child has no threads of PyTorch and OpenCV, but waits for them, even with a new matcher.
+    """
+    matched_in.add(os.getpid())
+    if len(matched_in) > 1:
+        raise UserError(
+            "this process was forked after its parent had matched, and would hang: use processes that are "
+            "spawned, such as multiprocessing.get_context('spawn') or DataLoader's multiprocessing_context='spawn'"
+        )

@@ -1,6 +1,7 @@
 """The registry of matchers: each file of ``adapters/`` is a matcher, with a ``SPEC`` and a ``load``."""
 
 import pkgutil
+from collections.abc import Mapping
 from functools import cache
 from importlib import import_module
 from typing import Any
@@ -44,3 +45,13 @@ def _imported(name: str, where: str) -> Any:
     except Exception as error:  # any error at import affects this matcher only
         message = f"matcher {name} cannot be used here ({type(error).__name__}: {error})"
         raise UnusableError(f"{where}: {message}. `--recipe auto` does without it.") from error
+
+
+def require_matchers(matchers: Mapping[str, Matcher[Any]]) -> Mapping[str, Matcher[Any]]:
+    """Return a user's matchers by name. Raise ``TypeError`` for anything else."""
+    if not isinstance(matchers, Mapping):
+        raise TypeError(f"matchers are a mapping from names to matchers, not {matchers!r}")
+    for name, matcher in matchers.items():
+        if not isinstance(getattr(matcher, "spec", None), MatcherSpec):
+            raise TypeError(f"matcher {name!r} has no `spec` that is a MatcherSpec: {matcher!r}")
+    return matchers

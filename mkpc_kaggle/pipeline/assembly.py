@@ -8,7 +8,7 @@ from typing import Any
 
 from mkpc_kaggle.errors import warn_once
 from mkpc_kaggle.matchers.contract import Matcher, Placement, Precision
-from mkpc_kaggle.matchers.registry import load_matcher
+from mkpc_kaggle.matchers.registry import load_matcher, require_matchers
 from mkpc_kaggle.pipeline.availability import FAULTS, Licence, by_kind, options_of, refusal, slots_of, unavailable
 from mkpc_kaggle.pipeline.devices import AUTO, gpus_of, require_device, resolve_placement
 from mkpc_kaggle.pipeline.stages import ENCODING_CACHE_BYTES, GivenRegions, Pipeline
@@ -112,7 +112,9 @@ def assemble(
     A fallback replaces an unavailable matcher; without one, recipe ``auto`` drops its units. ``scenes`` switches
     the reconstruction of batches on or off; ``None`` follows the recipe. Raises :class:`UserError`.
     """
-    own = matchers or {}
+    if not isinstance(recipe, Recipe | str):
+        raise TypeError(f"a recipe is a Recipe, a name, or a path as text, not {recipe!r}")
+    own = require_matchers(matchers or {})
     store = WeightStore(weights)
     written = load_recipe(recipe) if isinstance(recipe, str) else recipe
     reasons = unavailable(written, store, licence, own, load=recipe == AUTO)

@@ -33,8 +33,10 @@ print(json.dumps([torch.cuda.get_device_capability(gpu) for gpu in gpus]))
 def resolve_placement(device: str, precision: str) -> Placement:
     """Return the placement for the user's words. ``auto`` means "cuda", all GPUs, or the CPU if no GPU computes.
 
-    Raises :class:`UserError` for an unknown device and for a missing GPU, ``ValueError`` for an unknown precision.
+    Raises :class:`UserError` for an unknown word and for a missing GPU, ``TypeError`` unless ``device`` is a text.
     """
+    if not isinstance(device, str):
+        raise TypeError(f"a device is text such as 'cuda:0', not {device!r}")
     import torch
 
     if device == AUTO:
@@ -45,6 +47,8 @@ def resolve_placement(device: str, precision: str) -> Placement:
             device = "cpu"
     elif device != "cpu":
         gpus_of(device)
+    if precision not in (AUTO, *Precision):
+        raise UserError(f"unknown precision {precision!r}; known: auto, {', '.join(Precision)}")
     return Placement(device, fastest_precision(device) if precision == AUTO else Precision(precision))
 
 

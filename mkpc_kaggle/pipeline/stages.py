@@ -6,11 +6,14 @@ Stage 1 matches whole images, MKPC finds the critical region of each image, and 
 import time
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
+
+import PIL.Image
 
 from mkpc_kaggle.data.competition import Pair, read_rows
 from mkpc_kaggle.data.images import ByteCache, Image
@@ -20,7 +23,7 @@ from mkpc_kaggle.geometry.critical_region import CriticalRegion, RegionReason, c
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import Colour, Matcher, NonFiniteError, Picture, encoding_bytes
 from mkpc_kaggle.matchers.dtypes import check_finite, exact_float32
-from mkpc_kaggle.matchers.failures import FailureKind, failure_of, reason_of
+from mkpc_kaggle.matchers.failures import FailureKind, failure_of, reason_of, require_unforked
 from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
 from mkpc_kaggle.recipe import Recipe, Unit
 
@@ -68,8 +71,10 @@ class Pipeline:
 
         ``may_start(unit)`` is called before each unit on each minibatch; False stops the unit. After a matcher's
         error the minibatch's pairs run singly, and the error of a pair becomes the failure of its result. Raises
-        device errors and memory errors of a single pair, see :mod:`mkpc_kaggle.matchers.failures`.
+        device errors and memory errors of a single pair, see :mod:`mkpc_kaggle.matchers.failures`, and
+        :class:`UserError` in a forked child.
         """
+        require_unforked()
         pairs, units = list(pairs), list(units)
         for unit in (unit for unit in units if unit.stage == 1):
             self._run(unit, pairs, may_start)
@@ -200,8 +205,8 @@ def read_regions(file: Path, image_root: Path, pairs: Iterable[Pair]) -> GivenRe
     """Return the stage-2 boxes of a table, keyed by image files.
 
     ``file`` is a table ``image_0,image_1,box_0,box_1``: paths under the root; left, top, right and bottom in whole
-    pixels of the stored file, the latter two exclusive. Raises :class:`UserError` for a malformed table or box and
-    for a missing pair. A box beyond its image is not an error here: units of stage 2 fail on that pair.
+    pixels of the stored file, the latter two exclusive. Raises :class:`UserError` for a malformed table, for a box
+    that is malformed or extends beyond its image, and for a missing pair.
     """
     boxes: dict[tuple[str, ...], tuple[Box, Box]] = {}
     for where, (name0, name1, *cells) in read_rows(file, ("image_0", "image_1", "box_0", "box_1")):
@@ -211,6 +216,13 @@ def read_regions(file: Path, image_root: Path, pairs: Iterable[Pair]) -> GivenRe
             found = f"{cells[0]!r} and {cells[1]!r}"
             raise UserError(f"{where}: expected left, top, right and bottom of a box, found {found}") from error
         boxes[str(image_root / name0), str(image_root / name1)] = box0, box1
-    if missing := [pair.id for pair in pairs if (pair.file0, pair.file1) not in boxes]:
-        raise UserError(f"{file} has no regions of the pair {missing[0]}")
+    for pair in pairs:
+        if (files := (pair.file0, pair.file1)) not in boxes:
+            raise UserError(f"{file} has no regions of the pair {pair.id}")
+        for path, box in zip(files, boxes[files], strict=True):
+            # Only the head of the file is read.
+            with suppress(OSError, PIL.Image.DecompressionBombError), PIL.Image.open(path) as picture:
+                if box.right > picture.width or box.bottom > picture.height:
+                    size = f"{picture.width} x {picture.height} pixels"
+                    raise UserError(f"{file}: a box ends at {box.right}, {box.bottom}, beyond {path} of {size}")
     return boxes

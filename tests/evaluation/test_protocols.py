@@ -215,6 +215,7 @@ BAD = {
     "an empty directory": ("pairs", Path.mkdir, "cannot be read"),
     "no columns": ("regions.csv", table("1,2", "a,b"), "lacks the columns image_0"),
     "no row of a pair": ("regions.csv", table("A,C,0 0 9 9,0 0 9 9"), "has no regions of the pair 1: "),
+    "a box outside": ("regions.csv", table("A,B,0 0 9 9,0 0 9 9999"), "a box ends at 9, 9999, beyond .* pixels"),
     "words": ("regions.csv", table("A,B,0 0 x 9,0 0 9 9"), "line 2: expected left, .* '0 0 x 9'"),
     "an empty box": ("regions.csv", table("A,B,9 0 9 9,0 0 9 9"), "line 2: expected left, .* '9 0 9 9'"),
 }

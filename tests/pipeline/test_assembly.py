@@ -1,12 +1,14 @@
 """Putting a run together: which units a recipe keeps here, and why others go or are refused."""
 
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import pytest
 from shared import WEIGHTS, needs_weights
 from weight_files import digest_of
 
+from mkpc_kaggle import reconstruct
 from mkpc_kaggle.engine.settings import Settings
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.matchers.contract import MatcherSpec
@@ -24,6 +26,13 @@ pytestmark = pytest.mark.usefixtures("nowhere_else")
 def own(*licences):
     """A user's matcher that is never run."""
     return {"own": SimpleNamespace(spec=MatcherSpec("own", licences=licences))}
+
+
+@pytest.mark.parametrize("bad", [{"recipe": 5}, {"device": 0}, {"matchers": [1]}, {"matchers": {"own": object()}}])
+def test_what_is_of_a_wrong_type_is_named(bad):
+    for call in (TwoStageMatcher, partial(reconstruct, [])):
+        with pytest.raises(TypeError, match=r"(recipe|device|matcher).* not |has no `spec`"):
+            call(**({"recipe": "classical"} | bad))
 
 
 def test_recipe_auto_leaves_out_the_units_whose_weights_are_missing():

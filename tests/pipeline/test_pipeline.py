@@ -1,5 +1,7 @@
 """The two stages on pictures whose correspondence is known, with real and with misbehaving matchers."""
 
+import multiprocessing
+import warnings
 from collections import Counter
 from dataclasses import replace
 from functools import cache
@@ -277,3 +279,20 @@ def test_a_pair_at_which_a_matcher_raises_costs_the_others_of_its_minibatch_noth
 def test_memory_devices_and_interrupts_are_not_failures_of_a_matcher(error):
     with pytest.raises(type(error), match=str(error)):
         own(Unit(1, "bad", 480), bad=Scripted(error))(*pair())
+
+
+def test_a_matcher_in_a_forked_child_says_that_it_was_forked():
+    match = TwoStageMatcher(SIFT)
+    match(*pair())
+    child = multiprocessing.get_context("fork").Process(target=in_child, args=(match,))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # of Python 3.12: forks of processes with threads
+        child.start()
+    child.join()
+    assert child.exitcode == 0
+
+
+def in_child(match):
+    for matcher in (match, TwoStageMatcher(SIFT)):  # a new one would hang, too
+        with pytest.raises(UserError, match="this process was forked after its parent had matched"):
+            matcher(*pair())
