@@ -108,9 +108,9 @@ def test_a_work_directory_keeps_the_journal_and_a_report_that_shows_the_pairs(de
 
 HANGS = """
 import time
-from mkpc_kaggle.cli import program, validate
+from mkpc_kaggle.cli import main, validate
 validate.validate = lambda *_, **__: time.sleep(600)
-program(["validate", "--train-dir", {train!r}, "--recipe", "classical", "--time-limit", "8s"])
+main(["validate", "--train-dir", {train!r}, "--recipe", "classical", "--time-limit", "8s"])
 """
 
 
