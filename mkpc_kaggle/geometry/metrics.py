@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import inf
+from math import inf, isfinite
 
 import cv2
 import numpy as np
@@ -33,6 +33,13 @@ class PoseError:
     @classmethod
     def failed(cls) -> "PoseError":
         return cls(inf, inf, inf)
+
+    def __str__(self) -> str:
+        if not isfinite(self.rotation):
+            return "no pose"
+        metres, degrees = f"{self.translation:.2f} m", f"{self.translation_angle:.1f} degrees"
+        shift = metres if isfinite(self.translation) else degrees
+        return f"rotation {self.rotation:.1f} degrees off, translation {shift}"
 
     @property
     def angle(self) -> float:
