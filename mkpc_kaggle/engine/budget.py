@@ -74,7 +74,7 @@ class Budget:
 
     @property
     def silence(self) -> float:
-        """Seconds beyond the expected ones after which a worker without an answer hangs."""
+        """Seconds beyond the expected ones after which a silent worker counts as hung."""
         return min(MAX_SILENCE_S, max(MIN_SILENCE_S, SILENCE_SHARE * self.time_limit))
 
     @property

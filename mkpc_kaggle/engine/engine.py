@@ -122,7 +122,7 @@ class Engine:
         return found
 
     def ask(self, request: Request, share: float = 1.0) -> None:
-        """Compute the missing results of a request. No job begins after a share of the remaining time."""
+        """Compute the missing results of a request. No job begins after ``share`` of the remaining time."""
         self._begin(request, is_asked=True)
         self._until = self.budget.clock() + share * self.budget.left() if share < 1 else inf
         self._publish()

@@ -124,7 +124,7 @@ class Journal(JournalReader):
 
     @reading
     def had(self, positions: Iterable[int] | None = None) -> list[sqlite3.Row]:
-        """Return position, number of the unit and matches of the current points, of all pairs or of these."""
+        """Return position, unit number and matches of the current points, for all pairs or for these."""
         return self._of("SELECT position, number, matches FROM current_points", positions)
 
     @reading

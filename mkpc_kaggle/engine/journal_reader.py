@@ -95,7 +95,7 @@ def undamaged(path: Path, advice: str = "delete it with --fresh") -> Iterator[No
 
 
 def reading(read: Method) -> Method:
-    """Decorate a method that reads a journal, which may be damaged."""
+    """Let a method raise :class:`UserError` if the journal that it reads is damaged or unusable."""
 
     @wraps(read)
     def checked(self: Any, *args: Any) -> Any:

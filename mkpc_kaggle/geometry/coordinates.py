@@ -113,7 +113,7 @@ class View:
         return np.asarray(stored - 0.5 + offset, np.float64)
 
     def holds(self, points: NDArray[np.floating]) -> NDArray[np.bool_]:
-        """Which (N, 2) view points lie on content rather than on padding or outside; never for NaN."""
+        """Which (N, 2) points of the view lie on content, not on padding or outside; never for NaN."""
         return Box.whole(self.content).contains(points)
 
     def render(self, image: Pixels) -> Pixels:

@@ -1,4 +1,4 @@
-"""Devices: parsing of their names, the available GPUs, and a test that a device computes."""
+"""Devices: parsing of their names, the available GPUs, and a check that a device works."""
 
 import json
 import subprocess

@@ -56,9 +56,9 @@ def draw_strip(images: tuple[Image, Image], match: PairMatch) -> "Figure":
 
 
 def draw_matches(axes: "Axes", images: tuple[Image, Image], match: PairMatch) -> str:
-    """Show the images side by side, matches as lines, critical regions as boxes. Return the drawn objects.
+    """Show the images side by side, matches as lines, critical regions as boxes. Return a caption.
 
-    Where there are many matches, an even sample is drawn. The axes' unit is the height of both images.
+    Where there are many matches, an even sample is drawn. Each image is one unit of the axes high.
     """
     from matplotlib.collections import LineCollection
 
@@ -151,10 +151,10 @@ def draw_budget(events: Sequence[Event], limit: float | None) -> "Figure":
 
 
 def draw_cameras(scene: SceneRecord, number: int = 0) -> "Figure":
-    """The cameras and points of a model of a batch, 0 the largest, from above and the side, in its own units.
+    """Draw cameras and points of model ``number`` (0: the largest) from above and the side, in its own units.
 
-    An arrow points the way a camera looks. Up is the mean direction of the images' upper borders, and the cameras
-    look ahead. Points far away from nearly all others are cut off. A batch without cameras has a line instead.
+    An arrow points the way a camera looks. Up is the mean of the images' up directions, and ahead is where the
+    cameras look. Points far away from nearly all others are cut off. Without cameras, the figure is a line of text.
     """
     figure = new_figure(8.4, 4.0)
     if not scene.models:

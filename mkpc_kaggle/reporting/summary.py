@@ -40,7 +40,7 @@ def headline(tables: RunTables, run: RunReport | RunLog) -> str:
 def trouble(run: RunReport | RunLog) -> str:
     """Return why a run failed although its file is complete, or an empty string.
 
-    A pair without an F counts if an error is the reason, but not for too few matches or too little time.
+    Pairs without an F count only if an error is the cause, not too few matches or too little time.
     """
     if run.ending in (Ending.NO_WORKER, Ending.NOTHING_RUNS):
         return f"the run failed: {run.ending}, the faults say why; the same command resumes"

@@ -21,7 +21,7 @@ MAX_EXPANSION = 4  # bytes of tensors per byte of the file; some tensors share t
 
 
 class Inert:
-    """A stand-in without effect for classes and functions in a pickle that torch does not know."""
+    """An inert stand-in for those classes and functions of a pickle that torch does not know."""
 
     def __new__(cls, *_: object, **__: object) -> "Inert":
         return object.__new__(cls)

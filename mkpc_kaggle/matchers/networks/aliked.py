@@ -72,7 +72,7 @@ class Aliked(nn.Module):
         return list(zip(points, torch.split(descriptors, counts), strict=True))
 
     def maps(self, images: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return maps (B, c1, H, W) at stride 1, as input of its part, and the parts at strides 2, 8 and 32."""
+        """Return the input (B, c1, H, W) of the part at stride 1, and the parts at strides 2, 8 and 32."""
         # Channels first: with three channels the convolution is faster; its result is channels last.
         x1 = self.block1(images.contiguous().to(self.conv1.weight.dtype))
         x2 = self.block2(functional.avg_pool2d(x1, 2))

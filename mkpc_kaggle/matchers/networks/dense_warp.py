@@ -93,7 +93,7 @@ class DenseNetwork(nn.Module, ABC):
 
 
 def dense_warp(estimate: WarpEstimate, coarse_logits: Tensor) -> DenseWarp:
-    """Return one direction on the query's grid; ``coarse_logits`` (B, 1, h, w) are of stride 16, first pass."""
+    """Return the warp on the query's grid; ``coarse_logits`` (B, 1, h, w): of the first pass, at stride 16."""
     flow, logits = estimate.flow, estimate.certainty
     # Subtract half of the negative coarse logits.
     doubts = resize(coarse_logits, logits.shape[2:]).clamp(max=0)
