@@ -154,7 +154,7 @@ def draw_cameras(scene: SceneRecord, number: int = 0) -> "Figure":
     """Draw cameras and points of model ``number`` (0: the largest) from above and the side, in its own units.
 
     An arrow points the way a camera looks. Up is the mean of the images' up directions, and ahead is where the
-    cameras look. Points far away from nearly all others are cut off. Without cameras, the figure is a line of text.
+    cameras look. Points far away from nearly all others are cut off. Without cameras, it is a line of text.
     """
     figure = new_figure(8.4, 4.0)
     if not scene.models:
