@@ -36,6 +36,8 @@ def camera_sigmas(found: Any) -> dict[str, Sigmas]:
         return {}
     ids, cameras = [image.image_id for image in images], [image.camera for image in images]
     poses = np.block([[solved.get_cam_cross_cov_from_world(i, j) for j in ids] for i in ids])
+    if not np.isfinite(poses).all():  # of a degenerate model
+        return {}
     focals = [solved.get_other_params_cov(each.params)[0, 0] / each.mean_focal_length() ** 2 for each in cameras]
     variances = _pose_variances([image.cam_from_world().matrix() for image in images], poses)
     noise = 2 * fit.initial_cost / redundancy  # variance of a keypoint's coordinate, square pixels

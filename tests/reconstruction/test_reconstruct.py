@@ -243,6 +243,8 @@ def test_a_folder_without_a_readable_image_says_so_and_fails(tmp_path, capsys):
 
 def test_the_command_writes_tables_models_a_database_and_a_page(demo, small_recipe, tmp_path):
     images, out = demo.train_dir / "courtyard" / "images", tmp_path / "out"
+    text = small_recipe.read_text()  # the matches at 320 and 400 pixels are too few with some versions of OpenCV
+    small_recipe.write_text(text.replace("320", "480").replace("400", "640"))
     options = ["--recipe", small_recipe, "--format", "imc2025", "--workers", 0]
     assert run_command("reconstruct", images, "--out", out, *options) == 0
     results = {"cameras.csv", "submission.csv", "database.db", "models/0/images.bin", "report.html"}
