@@ -4,7 +4,7 @@ All cameras together fix the origin, orientation and scale: errors that a simila
 count (the S-transformation of Baarda 1981). The residuals give the noise of keypoints.
 """
 
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -24,35 +24,34 @@ def camera_sigmas(found: Any) -> dict[str, Sigmas]:
     if not 1 < len(images) <= MAX_IMAGES:
         return {}
     config = pycolmap.BundleAdjustmentConfig()
-    for image in images:
-        config.add_image(image.image_id)
+    for number in (ids := [image.image_id for image in images]):
+        config.add_image(number)
     ceres = {"use_gpu": False, "solver_options": {"max_num_iterations": 0, "num_threads": 1}}
     options = pycolmap.BundleAdjustmentOptions({"print_summary": False, "ceres": ceres})
-    adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, found)
-    fit = cast(Any, adjuster.solve()).ceres_summary
+    adjuster: Any = pycolmap.create_default_ceres_bundle_adjuster(options, config, found)
+    fit = adjuster.solve().ceres_summary
     redundancy = fit.num_residuals - fit.num_effective_parameters + 7
-    solved: Any = pycolmap.estimate_ba_covariance(DAMPED, found, adjuster)
-    if redundancy <= 0 or solved is None:
+    solved: Any = redundancy > 0 and pycolmap.estimate_ba_covariance(DAMPED, found, adjuster)
+    if not solved:
         return {}
-    ids, cameras = [image.image_id for image in images], [image.camera for image in images]
     poses = np.block([[solved.get_cam_cross_cov_from_world(i, j) for j in ids] for i in ids])
     if not np.isfinite(poses).all():  # of a degenerate model
         return {}
+    cameras = (image.camera for image in images)
     focals = [solved.get_other_params_cov(each.params)[0, 0] / each.mean_focal_length() ** 2 for each in cameras]
     variances = _pose_variances([image.cam_from_world().matrix() for image in images], poses)
     noise = 2 * fit.initial_cost / redundancy  # variance of a keypoint's coordinate, square pixels
     sigmas = np.sqrt(noise * np.column_stack([variances, focals])) * [np.degrees(1), 1, 100]
-    rows = [Sigmas(*(float(f"{value:.4g}") for value in row)) for row in sigmas]  # later digits vary between calls
-    return {image.name: row for image, row in zip(images, rows, strict=True)}
+    rows = (Sigmas(*(float(f"{value:.4g}") for value in row)) for row in sigmas)  # later digits vary between calls
+    return dict(zip((image.name for image in images), rows, strict=True))
 
 
 def _pose_variances(poses: list[NDArray[np.float64]], covariance: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return variances of rotations, radians, and of centres, in model sizes: (N, 2); ``poses`` are [R | t]."""
     centres = np.array([-pose[:, :3].T @ pose[:, 3] for pose in poses])
-    centres -= centres.mean(axis=0)
-    size = np.sqrt((centres**2).sum(axis=1).mean())
+    size = np.sqrt(centres.var(axis=0).sum())
     moves, similarities = [], []  # Jacobians of angles and centres: by the pose, and by a similarity of the world
-    for pose, centre in zip(poses, centres / size, strict=True):
+    for pose, centre in zip(poses, (centres - centres.mean(axis=0)) / size, strict=True):
         R, t, zero = pose[:, :3], pose[:, 3], np.zeros((3, 4))  # COLMAP's parameters are half angles and t
         moves.append(np.vstack([2 * np.eye(3, 6), -R.T @ np.hstack([2 * cross_matrix(t), np.eye(3)]) / size]))
         similarities.append(np.block([[-R, zero], [-cross_matrix(centre), np.eye(3), centre[:, None]]]))
