@@ -36,11 +36,10 @@ EXIT_INTERRUPTED = 128 + 2  # a shell's status for SIGINT
 def program(arguments: Sequence[str] | None = None) -> NoReturn:
     """Run a command and end the process at once: an orderly interpreter exit takes a second or longer."""
     try:  # Ctrl-C during slow imports is not an error
-        from mkpc_kaggle.engine.budget import process_started
         from mkpc_kaggle.engine.console import leave
 
         former = os.environ.get("MPLCONFIGDIR")
-        status = main(arguments, started=process_started())
+        status = main(arguments)
         if (made := os.environ.get("MPLCONFIGDIR")) != former:  # by matplotlib if it cannot write below HOME
             shutil.rmtree(str(made), ignore_errors=True)  # matplotlib would remove it in an orderly exit
     except KeyboardInterrupt:
@@ -48,12 +47,13 @@ def program(arguments: Sequence[str] | None = None) -> NoReturn:
     leave(status)
 
 
-def main(arguments: Sequence[str] | None = None, *, started: float | None = None) -> int:
+def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command. Return the exit status.
 
     0: done; 1: a check failed; 2: bad input; 130, 143: ended by a signal; 141: the reader of the output closed the
-    pipe. The time limit starts at ``started``; default: now.
+    pipe. The time limit counts from the call, before the slow imports.
     """
+    started = time.monotonic()
     from mkpc_kaggle.engine.console import complain, warn
     from mkpc_kaggle.errors import UserError
 
@@ -69,7 +69,7 @@ def main(arguments: Sequence[str] | None = None, *, started: float | None = None
                 Path.cwd()  # relative paths are undefined without it
             except OSError as error:
                 raise UserError(f"the current directory is gone ({error.strerror}); change to another") from error
-            parsed.started = time.monotonic() if started is None else started
+            parsed.started = started
             printing.enter_context(parsed.printing())
             status = int(parsed.run(parsed) or 0)
             with suppress(OSError, ValueError):  # the disk is full, or the stream closed

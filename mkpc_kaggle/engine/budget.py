@@ -1,13 +1,11 @@
 """The time of a run: durations, its four deadlines, and the measured costs of units."""
 
-import os
 import re
 import time
 from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from math import inf, sqrt
-from pathlib import Path
 from statistics import fmean, median_low
 
 from mkpc_kaggle.errors import UserError
@@ -20,7 +18,6 @@ MAX_SILENCE_S, MIN_SILENCE_S, SILENCE_SHARE = 60.0, 5.0, 0.02  # of a worker, by
 WINDOW = 64  # the number of the latest measurements that count
 MARGIN, MIN_MARGIN = 0.4, 0.01  # of a forecast from one measurement; from n, sqrt(n) times smaller
 MAX_STEP_BACK_S = 60.0  # of the wall clock, between the moment that --started-at names and the start
-MAX_PROCESS_AGE_S = 60.0  # the reported age of an older process is wrong
 
 
 def parse_duration(text: str) -> float:
@@ -154,18 +151,3 @@ def monotonic_of(epoch: float) -> float:
             f"--started-at {epoch:g} is not a moment of the past; it is in seconds since 1970 (date +%s)"
         )
     return time.monotonic() - max(0.0, ago)
-
-
-def process_started() -> float:
-    """Return the monotonic clock's time at which this process began, before its imports.
-
-    From Linux's /proc/self/stat (field 22, clock ticks since boot); elsewhere the time of the call.
-    """
-    try:
-        ticks = Path("/proc/self/stat").read_text().rpartition(")")[2].split()[19]
-        began = int(ticks) / os.sysconf("SC_CLK_TCK")
-        age = time.clock_gettime(time.CLOCK_BOOTTIME) - began
-    except (OSError, AttributeError, ValueError, IndexError):
-        return time.monotonic()
-    now = time.monotonic()  # just after the other clock was read
-    return now - age if 0 <= age < MAX_PROCESS_AGE_S else now

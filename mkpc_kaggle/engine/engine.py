@@ -8,13 +8,11 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from math import inf
 from pathlib import Path
-from typing import Any, Protocol, Self
+from typing import Any, Self
 
 from mkpc_kaggle.data.images import content_digest
 from mkpc_kaggle.engine import console
 from mkpc_kaggle.engine.budget import Budget
-from mkpc_kaggle.engine.estimates import Estimates
-from mkpc_kaggle.engine.features import Features, Key
 from mkpc_kaggle.engine.jobs import (
     Cause,
     EstimateJob,
@@ -28,12 +26,12 @@ from mkpc_kaggle.engine.jobs import (
     visiting_order,
 )
 from mkpc_kaggle.engine.journal import Journal
-from mkpc_kaggle.engine.matching import Matching
 from mkpc_kaggle.engine.places import LISTEN_S, START_TIMEOUT_S, Place, Site, Work
 from mkpc_kaggle.engine.plan import Plan
 from mkpc_kaggle.engine.request import Chronicle, Ending, Request, RunReport, Standing
 from mkpc_kaggle.engine.scenes import Scenes, batches_of, extra_pairs_of, standing_scenes
 from mkpc_kaggle.engine.state import State
+from mkpc_kaggle.engine.tables import Estimates, Features, Key, Points, Table
 from mkpc_kaggle.errors import UserError
 
 UNKNOWN_SHARE, MAX_UNKNOWN_S = 0.25, 3600.0  # of the time left, after which a job of unknown cost hangs
@@ -45,24 +43,6 @@ JOBS: dict[Work, tuple[type[Job], ...]] = {  # of a place by its work, the most 
     Work.LIGHT: (LookJob, EstimateJob),
     Work.SCENE: (SceneJob,),
 }
-
-
-class Table(Protocol):
-    """A derived table of the journal: the jobs that compute its missing and outdated rows."""
-
-    def has_work(self, now: float) -> bool: ...
-
-    def next(self, now: float) -> Job | None:
-        """Return a job for an idle worker, if there is any."""
-
-    def patience(self, job: Any, unknown: float) -> float:
-        """Return the seconds after which a job hangs; ``unknown`` before any was measured."""
-
-    def save(self, job: Any, answer: Any, seconds: float) -> None:
-        """Save the answer to a job that took ``seconds``. Raise ``sqlite3.Error`` if no row can hold it."""
-
-    def lose(self, job: Any, failure: Failure) -> None:
-        """Record that a job failed, or that its worker was lost."""
 
 
 class Engine:
@@ -85,29 +65,25 @@ class Engine:
         self.site, self.journal, self.budget = site, journal, budget
         self.interrupt, self.minibatch = interrupt, minibatch
         self.unwritten = ""
-        self._progress = console.Progress(budget, sys.stderr if progress else None)
-        self._chronicle = Chronicle(journal, budget, self._progress)
-        self._features = Features(journal)
+        self._chronicle = Chronicle(journal, budget, console.Progress(budget, sys.stderr if progress else None))
         self._until = inf
         self._published = budget.clock()
         self._publishing = threading.Lock()
         self._is_open = self._has_loaded = self._has_ended = False
+        self._tables: dict[type[Job], Table] = {LookJob: Features(journal, {})}
         self._begin(nothing)
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._end()
-
-    def _end(self) -> None:
         """End all workers, and publish for the last time."""
         if self._has_ended:
             return
         for place in [*self.site.places, *self.site.fallback]:
             place.kill()
         self.site.close()
-        self._progress.close()
+        self._chronicle.progress.close()
         self._publish()
         self._has_ended = True
 
@@ -115,11 +91,10 @@ class Engine:
 
     def look(self, looks: Mapping[Key, Callable[[], bytes]]) -> dict[Key, bytes]:
         """Return the features of each key (digest of contents, digest of settings), except failed ones."""
-        self._features.want(looks)
+        features = self._tables[LookJob] = Features(self.journal, looks)
         self._loop()
-        found = self._features.found
-        self._features.want({})
-        return found
+        self._tables[LookJob] = Features(self.journal, {})
+        return features.found
 
     def ask(self, request: Request, share: float = 1.0) -> None:
         """Compute the missing results of a request. No job begins after ``share`` of the remaining time."""
@@ -130,7 +105,7 @@ class Engine:
 
     def report(self) -> RunReport:
         """End the run. Return the results of the latest request."""
-        self._end()
+        self.__exit__()
         return RunReport(
             tuple(self.journal.records()),
             self.ending,
@@ -157,8 +132,8 @@ class Engine:
 
     def _begin(self, request: Request, *, is_asked: bool = False) -> None:
         """Find missing and outdated results. If ``is_asked``, record the request in the journal."""
-        recipe, settings = request.recipe, request.settings
-        extra = extra_pairs_of(request.pairs, recipe.scene)
+        recipe, settings, chronicle = request.recipe, request.settings, self._chronicle
+        asked = [*request.pairs, *extra_pairs_of(request.pairs, recipe.scene)]
         pairs = [
             WantedPair(
                 pair,
@@ -166,25 +141,23 @@ class Engine:
                 settings.of_estimate(pair),
                 number < len(request.pairs),
             )
-            for number, pair in enumerate([*request.pairs, *extra])
+            for number, pair in enumerate(asked)
         ]
-        batches = batches_of(each.pair for each in pairs) if recipe.scene is not None else {}
+        batches = batches_of(asked) if recipe.scene is not None else {}
         if is_asked:
             units = list(zip(recipe.units, settings.units, strict=True))
             self.journal.want(pairs, units, dict.fromkeys(batches, settings.scene), request.about)
         digests = self._digests(pairs)
-        made = standing_scenes(self.journal, request)
+        made, order = standing_scenes(self.journal, request), visiting_order(asked)
         self.state = State(self.journal, request, pairs, digests)
-        order, note = visiting_order([each.pair for each in pairs]), self._progress.note
-        explain = self._chronicle.explain
+        explain, note = chronicle.explain, chronicle.progress.note
         self.plan = Plan(recipe.units, self.state, order, self.budget, explain, note, self.minibatch)
-        self.estimates = Estimates(self.state, self.plan, order, self._chronicle)
-        self.scenes = Scenes(batches, made, self.state, self.plan, self.estimates, self._chronicle)
-        self._tables: dict[type[Job], Table] = {
-            MatchJob: Matching(self.state, self.plan, self._chronicle),
+        self.estimates = Estimates(self.state, self.plan, order, chronicle)
+        self.scenes = Scenes(batches, made, self.state, self.plan, self.estimates, chronicle)
+        self._tables |= {
+            MatchJob: Points(self.state, self.plan, chronicle),
             EstimateJob: self.estimates,
             SceneJob: self.scenes,
-            LookJob: self._features,
         }
         complete = self.state.had.all(1) & self.state.is_estimated
         self._resumed = int(complete[: self.state.rows].sum())
@@ -250,10 +223,11 @@ class Engine:
 
     def _time_limit(self, job: Job, now: float) -> float:
         """Return the seconds after which a worker hangs, from measured costs or from the time left."""
-        return self.budget.silence + self._tables[type(job)].patience(job, min(MAX_UNKNOWN_S, self._unknown(now)))
+        patience = self._tables[type(job)].patience(job)
+        return self.budget.silence + (self._unknown(now) if patience is None else patience)
 
     def _unknown(self, now: float) -> float:
-        return UNKNOWN_SHARE * max(0.0, self.budget.stop_units - now)
+        return min(MAX_UNKNOWN_S, UNKNOWN_SHARE * max(0.0, self.budget.stop_units - now))
 
     def _take_answer(self, place: Place, now: float) -> None:
         if place.job is not None:
@@ -262,21 +236,14 @@ class Engine:
         answer, job = place.poll(now), place.job
         if isinstance(answer, Loaded):
             self._has_loaded = self._has_loaded or place.work is Work.MATCH
-        elif answer is not None:
+        elif isinstance(answer, Failure):
             place.job = None
-            if job is not None and not isinstance(answer, Failure):
-                self._save(job, answer, seconds)
-            elif isinstance(answer, Failure):
-                text = f"a job was lost on {place.name}: {answer}" if job else f"{place.name}: {answer}"
-                self._chronicle.fault(text)
-                if place.closed:
-                    self._chronicle.explain(f"no worker is started any more on {place.closed}")
-                if job is not None:
-                    self._tables[type(job)].lose(job, answer)
-                if place.closed and place.work is Work.SCENE:
-                    self.scenes.skip_all(answer)
-            if place.work is Work.SCENE:
-                place.kill()
+            self._lose(place, job, answer)
+        elif answer is not None and job is not None:
+            place.job = None
+            self._save(job, answer, seconds)
+        if place.work is Work.SCENE and answer is not None and not isinstance(answer, Loaded):
+            place.kill()
 
     def _save(self, job: Job, answer: Any, seconds: float) -> None:
         """Save an answer. A result that no table can hold costs itself alone."""
@@ -291,6 +258,16 @@ class Engine:
         if isinstance(job, SceneJob) and job.export is not None:
             self._publish()
 
+    def _lose(self, place: Place, job: Job | None, failure: Failure) -> None:
+        """Record that a worker failed at a job, or could not start."""
+        self._chronicle.fault(f"a job was lost on {place.name}: {failure}" if job else f"{place.name}: {failure}")
+        if place.closed:
+            self._chronicle.explain(f"no worker is started any more on {place.closed}")
+        if job is not None:
+            self._tables[type(job)].lose(job, failure)
+        if place.closed and place.work is Work.SCENE:
+            self.scenes.skip_all(failure)
+
     def _fall_back(self) -> None:
         """Continue elsewhere when the last matching place is closed, or had to skip every unit."""
         places = self.site.of(Work.MATCH)
@@ -299,13 +276,13 @@ class Engine:
         if self.site.fallback and (self.plan.is_closed or self.plan.nothing_runs):
             text = f"matching continues on the {self.site.fallback[0].name}: {reason or Ending.NOTHING_RUNS}"
             self._chronicle.fault(text)
+            self._chronicle.explain(text)
             console.warn(text)
             for place in places:
                 place.kill()
                 self.site.places.remove(place)
             self.site.places += self.site.fallback
             self.site.fallback = []
-            self._chronicle.explain(text)
             self.plan.restart()
         elif self.plan.is_closed and not self._has_loaded and places:
             raise UserError(f"no worker could be started: {reason}")

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from enum import StrEnum
+from enum import IntEnum, StrEnum
 from pathlib import Path
 
 from mkpc_kaggle.data.competition import Pair
@@ -16,13 +16,17 @@ from mkpc_kaggle.scene.reconstruct import Solution
 from mkpc_kaggle.scene.view_graph import BatchImage
 
 
-class Phase(StrEnum):
+class Phase(IntEnum):
     """The priorities of matching, in order."""
 
-    SWEEP = "sweep"  # the first unit on all pairs
-    CONNECT = "connect"  # the first unit on extra pairs, where a batch has few pairs
-    DEEPEN = "deepen"  # the longest prefix of the recipe that fits for all pairs
-    FILL = "fill"  # the other units, on the weakest pairs first
+    SWEEP = 0  # the first unit on all pairs
+    CONNECT = 1  # the first unit on extra pairs, where a batch has few pairs
+    DEEPEN = 2  # the longest prefix of the recipe that fits for all pairs
+    FILL = 3  # the other units, on the weakest pairs first
+    NEVER = 4
+
+    def __str__(self) -> str:
+        return self.name.lower()
 
 
 @dataclass(frozen=True)

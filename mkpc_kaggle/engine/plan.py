@@ -3,7 +3,7 @@
 A plan has no queue. It looks at the state, the costs and the time left whenever a worker is idle.
 
 Two places decide that a unit no longer fits: :meth:`Plan.fit` for all pairs, and
-:meth:`mkpc_kaggle.engine.worker.MatchRunner.run` for a job whose time is over.
+:func:`mkpc_kaggle.engine.worker.match_pairs` for a job whose time is over.
 """
 
 from collections import Counter
@@ -24,9 +24,6 @@ JOB_SHARE = 0.01  # of the time left, which a job of several units takes at most
 HANG_FACTOR = 30.0  # a job that takes this many times what was measured hangs
 RESERVE_SHARE = 0.2  # of the limit, at most, that is reserved for scenes
 MAX_FAILED_PAIRS = 2  # a unit that was skipped on this many pairs and never ran is skipped on all pairs
-
-PHASES = tuple(Phase)
-SWEEP, CONNECT, DEEPEN, FILL, NEVER = range(5)
 
 Mask = NDArray[np.bool_]
 
@@ -59,7 +56,7 @@ class Plan:
         self.restart()
 
     def restart(self) -> None:
-        """Forget all that was learnt of the devices: costs, losses, units that cannot run."""
+        """Forget everything about the devices: costs, losses, units that cannot run."""
         self.costs = Costs()
         self.losses: Losses[tuple[int, str]] = Losses()
         self.unusable = np.zeros(len(self.units), bool)
@@ -77,23 +74,18 @@ class Plan:
     def next(self, now: float) -> MatchJob | None:
         """Return the next job for an idle worker, without its pairs; ``None`` if nothing can be done now."""
         wanted = self._wanted(now)
-        best = np.where(self.busy, NEVER, wanted.min(1))
-        number = int(best.min(initial=NEVER))
-        if number == NEVER:
+        best = np.where(self.busy, Phase.NEVER, wanted.min(1))
+        if (phase := Phase(best.min(initial=Phase.NEVER))) is Phase.NEVER:
             return None
-        self._enter(PHASES[number], now)
-        return self._job(PHASES[number], wanted <= number, best == number, now)
+        self._enter(phase, now)
+        return self._job(phase, wanted <= phase, best == phase, now)
 
     def has_work(self, now: float) -> bool:
-        return not self.is_closed and bool((self._wanted(now)[~self.busy] < NEVER).any())
+        return not self.is_closed and bool((self._wanted(now)[~self.busy] < Phase.NEVER).any())
 
-    def settled(self, now: float) -> Mask:
-        """(N,): the pairs that get no further unit before the filling."""
-        return np.asarray((self._wanted(now).min(1) >= FILL) & ~self.busy)
-
-    def filled(self, now: float) -> Mask:
-        """(N,): the pairs that get no further unit."""
-        return np.asarray((self._wanted(now).min(1) == NEVER) & ~self.busy)
+    def settled(self, now: float, phase: Phase = Phase.FILL) -> Mask:
+        """(N,): the pairs that get no further unit before a phase; before ``NEVER``: none at all."""
+        return np.asarray((self._wanted(now).min(1) >= phase) & ~self.busy)
 
     def fit(self, now: float) -> int:
         """Return the length of the longest prefix of the recipe that all rows can have in the time left."""
@@ -102,19 +94,13 @@ class Plan:
 
     def outlook(self, now: float) -> str:
         """Return how long all missing units would take, and how many units fit in the time left."""
-        unknown = sum(not self.costs.is_known(unit.name) for unit in self._usable)
+        usable, unknown = int((~self.unusable).sum()), int(self._unmeasured.sum())
         text = f"all units on all pairs would take {format_duration(self._needed[-1] / self.workers)}"
         text += f", and {unknown} units were not measured yet" if unknown else ""
         if not isfinite(self.stop):
             return f"{text}; there is no time limit"
-        usable, left = len(self._usable), max(0.0, self.stop - now)
-        return (
-            f"{text}; {min(self.fit(now), usable)} of {usable} units fit in the remaining {format_duration(left)}"
-        )
-
-    @property
-    def _usable(self) -> list[Unit]:
-        return [unit for unit, unusable in zip(self.units, self.unusable, strict=True) if not unusable]
+        left = format_duration(max(0.0, self.stop - now))
+        return f"{text}; {min(self.fit(now), usable)} of {usable} units fit in the remaining {left}"
 
     def _look(self) -> None:
         """Derive which units pairs can still get, and the seconds that prefixes of the recipe take."""
@@ -122,23 +108,23 @@ class Plan:
         for index, name in self.losses.skipped:
             missing[index, self._numbers[name]] = False
         self._missing = missing
-        counts = missing[: self.state.rows].sum(0)
-        forecasts = np.array([self.costs.forecast(unit.name) for unit in self.units])
-        self._needed = np.cumsum(counts * forecasts)
         self._means = np.array([self.costs.mean(unit.name) for unit in self.units])
+        self._unmeasured = ~self.unusable & [not self.costs.is_known(unit.name) for unit in self.units]
+        forecasts = [self.costs.forecast(unit.name) for unit in self.units]
+        self._needed = np.cumsum(missing[: self.state.rows].sum(0) * forecasts)
 
     def _wanted(self, now: float) -> NDArray[np.int_]:
-        """(N, U): the number of the phase in which a pair gets a unit; ``NEVER`` if it would not end in time."""
-        return np.where(self._means < self.stop - now, self._phases(now), NEVER)
+        """(N, U): the phase in which a pair gets a unit; ``NEVER`` if it would not end in time."""
+        return np.where(self._means < self.stop - now, self._phases(now), Phase.NEVER)
 
     def _phases(self, now: float) -> NDArray[np.int_]:
-        """(N, U): the number of the phase to which a missing unit belongs; ``NEVER`` elsewhere."""
-        phases = np.full(self._missing.shape, NEVER)
+        """(N, U): the phase to which a missing unit belongs; ``NEVER`` elsewhere."""
+        phases = np.full(self._missing.shape, Phase.NEVER)
         rows, extra = phases[: self.state.rows], phases[self.state.rows :]
-        rows[:] = np.where(np.arange(len(self.units)) < self.fit(now), DEEPEN, FILL)
-        rows[:, self._first] = SWEEP
-        extra[self._connecting(now), self._first] = CONNECT
-        return np.where(self._missing, phases, NEVER)
+        rows[:] = np.where(np.arange(len(self.units)) < self.fit(now), Phase.DEEPEN, Phase.FILL)
+        rows[:, self._first] = Phase.SWEEP
+        extra[self._connecting(now), self._first] = Phase.CONNECT
+        return np.where(self._missing, phases, Phase.NEVER)
 
     @property
     def _first(self) -> int:
@@ -153,16 +139,16 @@ class Plan:
         most = CONNECT_SHARE * (max(0.0, self.stop - now) + had.sum() * seconds)
         return np.asarray(np.arange(1, had.size + 1) * seconds <= most)
 
-    def _job(self, phase: Phase, lacking: Mask, ready: Mask, now: float) -> MatchJob:
-        """A job for the first pair, or on a GPU for a minibatch of pairs with the same missing units."""
+    def _job(self, phase: Phase, missing: Mask, ready: Mask, now: float) -> MatchJob:
+        """Return a job for the first pair, or on a GPU for a minibatch of pairs with the same missing units."""
         order = self._order[ready[self._order]]
         if phase is Phase.FILL:
             order = order[np.argsort(self.state.inliers[order], kind="stable")]
         first = int(order[0])
-        numbers = sorted(np.flatnonzero(lacking[first]).tolist(), key=lambda number: self.units[number].stage)
+        numbers = sorted(np.flatnonzero(missing[first]).tolist(), key=lambda number: self.units[number].stage)
         units = [self.units[number] for number in numbers]
         alone = any((first, unit.name) in self.losses.alone for unit in units)
-        alike = order[(lacking[order] == lacking[first]).all(1)]
+        alike = order[(missing[order] == missing[first]).all(1)]
         indices = tuple(alike[: 1 if alone else self.minibatch].tolist())
         seconds = [self.costs.mean(unit.name) if self.costs.is_known(unit.name) else inf for unit in units]
         fits = np.cumsum(seconds) * len(indices) < JOB_SHARE * (self.stop - now)
@@ -176,10 +162,10 @@ class Plan:
         rank = int(np.flatnonzero(self._order == job.indices[-1])[0]) + 1
         return self._order[rank : rank + self.minibatch].tolist() if job.phase is not Phase.FILL else []
 
-    def patience(self, job: MatchJob, unknown: float) -> float:
-        """Return the seconds after which a job hangs, perhaps on a new worker; ``unknown`` if a cost is."""
+    def patience(self, job: MatchJob) -> float | None:
+        """Return the seconds after which a job hangs, perhaps on a new worker; ``None`` if a cost is unknown."""
         if not all(self.costs.is_known(unit.name) for unit in job.units):
-            return unknown
+            return None
         expected = len(job.indices) * sum(self.costs.mean(unit.name) for unit in job.units)
         return HANG_FACTOR * expected + self.costs.warm_up(job.units)
 
@@ -188,12 +174,11 @@ class Plan:
         self.phase = phase
         if phase is Phase.SWEEP:
             return
-        fitting = f"{phase} {self.fit(now) if phase is Phase.DEEPEN else ''}"
-        if fitting != self._explained:
+        if (fitting := f"{phase} {self.fit(now) if phase is Phase.DEEPEN else ''}") != self._explained:
             self.explain(f"{phase}: {self.outlook(now)}")
             self._explained = fitting
-        is_measured = all(self.costs.is_known(unit.name) for unit in self._usable)
-        if not self._is_announced and (phase is Phase.FILL or (phase is Phase.DEEPEN and is_measured)):
+        is_measured = phase is Phase.DEEPEN and not self._unmeasured.any()
+        if not self._is_announced and (phase is Phase.FILL or is_measured):
             self.announce(self.outlook(now))
             self._is_announced = True
 
@@ -214,17 +199,13 @@ class Plan:
         if failure.cause is Cause.DEVICE:  # it counts against the place
             self.losses.alone.update(lost)
         elif self.losses.add(lost, failure):
-            self._skip(*lost[0], failure)
+            ((index, name),) = lost
+            self.explain(f"{name} is skipped on pair {index} ({failure})")
+            pairs = Counter(unit for _, unit in self.losses.skipped)[name]
+            if pairs >= MAX_FAILED_PAIRS and not self.costs.has_run(name):
+                self.unusable[self._numbers[name]] = True
+                self.explain(f"{name} is skipped on all pairs: it never ran ({failure})")
         self._look()
-
-    def _skip(self, index: int, name: str, failure: Failure) -> None:
-        self.explain(f"{name} is skipped on pair {index} ({failure})")
-        pairs = Counter(unit for _, unit in self.losses.skipped)[name]
-        if pairs >= MAX_FAILED_PAIRS and not self.costs.has_run(name):
-            self.unusable[self._numbers[name]] = True
-            self.explain(f"{name} is skipped on all pairs: it never ran ({failure})")
-
-    # The remaining work
 
     @property
     def is_complete(self) -> bool:
@@ -235,10 +216,10 @@ class Plan:
     def nothing_runs(self) -> bool:
         return bool(self.unusable.all())
 
-    def progress(self, now: float) -> tuple[Phase, int, int]:
+    def progress(self, now: float) -> tuple[str, int, int]:
         """Return the phase, the number of its pairs that are done, and the number of its pairs."""
-        pending = self._phases(now).min(1) <= PHASES.index(self.phase)
-        rows, total = pending[: self.state.rows], self.state.rows
+        pending, rows = self._phases(now).min(1) <= self.phase, self.state.rows
         if self.phase is Phase.CONNECT:
-            rows, total = pending[self.state.rows :], int(self._connecting(now).sum())
-        return self.phase, total - int(rows.sum()), total
+            total = int(self._connecting(now).sum())
+            return str(self.phase), total - int(pending[rows:].sum()), total
+        return str(self.phase), rows - int(pending[:rows].sum()), rows

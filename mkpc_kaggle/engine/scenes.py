@@ -4,8 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine.estimates import Estimates
-from mkpc_kaggle.engine.jobs import Failure, SceneJob
+from mkpc_kaggle.engine.jobs import Failure, Phase, SceneJob
 from mkpc_kaggle.engine.journal import Journal
 from mkpc_kaggle.engine.journal_reader import EventKind
 from mkpc_kaggle.engine.losses import Losses
@@ -13,6 +12,7 @@ from mkpc_kaggle.engine.plan import HANG_FACTOR, Plan
 from mkpc_kaggle.engine.records import SceneRecord
 from mkpc_kaggle.engine.request import Chronicle, Request
 from mkpc_kaggle.engine.state import State
+from mkpc_kaggle.engine.tables import Estimates
 from mkpc_kaggle.recipe import SceneConfig
 from mkpc_kaggle.scene.densify import extra_pairs
 from mkpc_kaggle.scene.reconstruct import Solution
@@ -21,7 +21,6 @@ MIN_PAIRS = 2  # they can connect three images
 START_S = 3.0  # that a process takes to begin
 MATCH_S = 5e-4  # that a match adds to a reconstruction, before any was measured
 FORECAST_MARGIN = 1.5  # of a forecast from the matches of earlier scenes
-MIN_TOLD_PAIRS = 20  # of a batch whose reconstruction is shown: that of a smaller batch takes seconds
 NOT_RECONSTRUCTED = "not reconstructed in time"
 
 
@@ -43,10 +42,9 @@ def extra_pairs_of(pairs: Sequence[Pair], config: SceneConfig | None) -> list[Pa
         return []
     extra: list[tuple[float, Pair]] = []
     for batch, indices in batches_of(pairs).items():
-        asked = [pairs[index] for index in indices]
-        files = list(dict.fromkeys(file for pair in asked for file in (pair.file0, pair.file1)))
+        files = list(dict.fromkeys(file for index in indices for file in (pairs[index].file0, pairs[index].file1)))
         number = {file: index for index, file in enumerate(files)}
-        ends = [(number[pair.file0], number[pair.file1]) for pair in asked]
+        ends = [(number[pairs[index].file0], number[pairs[index].file1]) for index in indices]
         distinct = len({tuple(sorted(pair)) for pair in ends})
         for count, (i, j) in enumerate(extra_pairs(len(files), ends, config.pairs_per_image), start=distinct):
             key = f"{batch};{Path(files[i]).stem}-{Path(files[j]).stem}"
@@ -85,7 +83,7 @@ class Scenes:
         self._stale = set(batches) - state.journal.current_scenes()
         self._running: set[str] = set()
         self._batch_of = {index: name for name, indices in batches.items() for index in indices}
-        self._rate = 0.0, 0  # seconds and matches of the scenes of this run
+        self._seconds, self._done = 0.0, 0  # of the scenes of this run: their time, their matches
 
     def waiting(self) -> list[str]:
         """Return the batches to reconstruct, never reconstructed batches first."""
@@ -111,13 +109,12 @@ class Scenes:
         self._running.add(batch)
         state, request = self._state, self._state.request
         pairs, source = state.points_of(index for index in self.batches[batch] if state.had[index].any())
-        if len(pairs) >= MIN_TOLD_PAIRS:
-            self._chronicle.progress.note(f"batch {batch}: reconstructing its cameras from {len(pairs)} pairs")
+        self._chronicle.progress.note(f"batch {batch}: reconstructing its cameras from {len(pairs)} pairs")
         inputs, export = state.journal.batch_inputs(batch), request.exports.get(batch)
         return SceneJob(batch, pairs, request.recipe, source, inputs, self._matches(batch), export)
 
-    def patience(self, job: SceneJob, unknown: float) -> float:
-        return max(unknown, HANG_FACTOR * self._forecast(job.matches))
+    def patience(self, job: SceneJob) -> float:
+        return HANG_FACTOR * max(self._forecast(job.matches), START_S + MATCH_S * job.matches)
 
     def save(self, job: SceneJob, answer: Solution, seconds: float) -> None:
         """Save a reconstruction, which may be out of date already."""
@@ -125,8 +122,7 @@ class Scenes:
         if job.export is not None:
             journal.forget_scene(job.batch)  # its files are replaced
         journal.save_scene(record, job.inputs, job.pairs, answer.choices)
-        total, matches = self._rate
-        self._rate = total + max(0.0, seconds - START_S), matches + job.matches
+        self._seconds, self._done = self._seconds + max(0.0, seconds - START_S), self._done + job.matches
         self._running.discard(job.batch)
         self.made[job.batch] = record
         if journal.batch_inputs(job.batch) == job.inputs:
@@ -134,8 +130,7 @@ class Scenes:
         self._state.read_choices()
         text = f"{record.registered} of {record.images} images"
         self._chronicle.note(EventKind.SCENE, f"{job.batch}: {text}")
-        if len(job.pairs) >= MIN_TOLD_PAIRS:
-            self._chronicle.progress.note(f"batch {job.batch}: {text} have a camera")
+        self._chronicle.progress.note(f"batch {job.batch}: {text} have a camera")
 
     def lose(self, job: SceneJob, failure: Failure) -> None:
         """Try a lost reconstruction once more in this run, and again in the next run."""
@@ -161,7 +156,8 @@ class Scenes:
             return None
         pending, plan = self._estimates.pending(now), self._plan
         if plan.busy.any() or plan.has_work(now):
-            ready = {False: plan.settled(now) & ~pending, True: plan.filled(now) & ~pending}
+            phases = {False: Phase.FILL, True: Phase.NEVER}
+            ready = {is_made: plan.settled(now, phase) & ~pending for is_made, phase in phases.items()}
         else:
             ready = dict.fromkeys((False, True), ~pending | (now >= plan.stop))  # too late to wait for estimates
         return next((name for name in waiting if ready[name in self.made][self.batches[name]].all()), None)
@@ -171,5 +167,5 @@ class Scenes:
 
     def _forecast(self, matches: int) -> float:
         """Return the seconds that a reconstruction will probably take."""
-        seconds, done = self._rate
-        return START_S + matches * (FORECAST_MARGIN * seconds / done if done else MATCH_S)
+        rate = FORECAST_MARGIN * self._seconds / self._done if self._done else MATCH_S
+        return START_S + matches * rate

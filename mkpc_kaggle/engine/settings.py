@@ -5,15 +5,14 @@ A digest has the number of its algorithm. Raise the number when the same setting
 
 import hashlib
 import json
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from importlib.metadata import version
 from typing import Any
 
 import cv2
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.pipeline.assembly import Assembly
-from mkpc_kaggle.recipe import Recipe
 
 POINTS, ESTIMATE, SCENE = 1, 2, 2  # numbers of the algorithms
 
@@ -33,23 +32,15 @@ class Settings:
         first = [alone[unit] for unit in recipe.units if unit.stage == 1]
         crops = digest([asdict(recipe.mkpc), first, sorted(assembly.regions.items())])
         units = tuple(alone[unit] if unit.stage == 1 else digest([alone[unit], crops]) for unit in recipe.units)
-        return cls(units, digest([ESTIMATE, *_of_estimates(recipe)]), digest([SCENE, *_of_scenes(recipe)]))
+        estimates = asdict(recipe.magsac), recipe.focal and asdict(recipe.focal), cv2.__version__
+        tracks = [unit.name for unit in recipe.units if unit.tracks]
+        scenes = recipe.scene and asdict(recipe.scene), tracks, *estimates, version("pycolmap")
+        return cls(units, digest([ESTIMATE, *estimates]), digest([SCENE, *scenes]))
 
     def of_estimate(self, pair: Pair) -> str:
         """The digest of all that decides the F of a pair from its points, or its E with known intrinsics."""
         known = pair.intrinsics
         return digest([self.estimate, [K.tolist() for K in known]]) if known else self.estimate
-
-
-def _of_estimates(recipe: Recipe) -> Sequence[Any]:
-    return asdict(recipe.magsac), recipe.focal and asdict(recipe.focal), cv2.__version__
-
-
-def _of_scenes(recipe: Recipe) -> Sequence[Any]:
-    from importlib.metadata import version
-
-    tracks = [unit.name for unit in recipe.units if unit.tracks]
-    return recipe.scene and asdict(recipe.scene), tracks, *_of_estimates(recipe), version("pycolmap")
 
 
 def digest(value: Any) -> str:

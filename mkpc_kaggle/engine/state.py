@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from mkpc_kaggle.engine.jobs import PairPoints, PointSource, WantedPair
+from mkpc_kaggle.engine.jobs import Outcome, PairPoints, PointSource, WantedPair
 from mkpc_kaggle.engine.journal import Journal
 from mkpc_kaggle.engine.journal_reader import matrix_of
 from mkpc_kaggle.engine.request import Request
@@ -25,9 +25,8 @@ class State:
         self, journal: Journal, request: Request, pairs: Sequence[WantedPair], digests: Mapping[str, str]
     ) -> None:
         self.journal, self.request, self.pairs, self.digests = journal, request, pairs, dict(digests)
-        self.rows = len(request.pairs)
+        self.rows, count = len(request.pairs), len(pairs)
         self.units = {unit.name: unit for unit in request.recipe.units}
-        count = len(pairs)
         self.had = np.zeros((count, len(self.units)), bool)
         self.matches, self.inliers = np.zeros(count, int), np.zeros(count, int)
         self.is_estimated, self.has_own, self.unreadable = (np.zeros(count, bool) for _ in range(3))
@@ -39,11 +38,6 @@ class State:
         self.read_choices()
 
     @property
-    def has_row(self) -> NDArray[np.bool_]:
-        """(N,) mask."""
-        return np.arange(len(self.had)) < self.rows
-
-    @property
     def fundamentals(self) -> NDArray[np.float64]:
         """(rows, 3, 3): the F to write: the scene's, else the pair's, else the fallback."""
         written = self.own[: self.rows].copy()
@@ -51,6 +45,13 @@ class State:
             if position < self.rows:
                 written[position] = F
         return written
+
+    def save_outcomes(self, outcomes: Sequence[Outcome]) -> None:
+        """Save what a job found on its pairs."""
+        settings = dict(zip(self.units, self.request.settings.units, strict=True))
+        self.journal.save_outcomes(outcomes, settings)
+        self.digests |= {image.name: image.digest for outcome in outcomes for image in outcome.images}
+        self.refresh(outcome.index for outcome in outcomes)
 
     def refresh(self, positions: Iterable[int]) -> None:
         """Read these pairs again, and all rows of the same images."""

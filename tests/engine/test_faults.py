@@ -228,14 +228,6 @@ def python(code: str, *arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
-def test_the_limit_counts_from_the_start_of_the_process():
-    code = "import time; began = time.monotonic(); from mkpc_kaggle.engine.budget import process_started; "
-    code += "import numpy, pandas; print(process_started(), began)"
-    before = time.monotonic()
-    started, began = map(float, python(code).stdout.split())
-    assert before - 1 < started < began, "the kernel counts hundredths of a second"
-
-
 def test_a_program_leaves_without_what_an_interpreter_does_at_its_end():
     late = "import atexit; atexit.register(print, 'late'); "
     done = python(late + "from mkpc_kaggle.cli import program; program(['recipes'])")
