@@ -11,9 +11,9 @@ from kornia.feature import DISK
 from pictures import picture
 from torch import Tensor, nn
 
+from mkpc_kaggle.matchers.adapters.aliked import aliked_network
 from mkpc_kaggle.matchers.contract import Colour, Placement, Precision
 from mkpc_kaggle.matchers.lightglue import LightGlueOptions, light_glue
-from mkpc_kaggle.matchers.networks.aliked import Aliked
 from mkpc_kaggle.matchers.registry import load_matcher
 from mkpc_kaggle.weights import WeightStore
 
@@ -28,9 +28,8 @@ def old_names(state: dict[str, Tensor]) -> dict[str, Any]:
     return {re.sub(pattern, r"\2_attn.\1", name): state[name] for name in kept}
 
 
-def published_aliked(state: dict[str, Tensor]) -> dict[str, Any]:
-    pattern = r"(block[34]\.conv[12])\.weight"
-    return {re.sub(pattern, r"\1.regular_conv.weight", name): tensor for name, tensor in state.items()}
+def without_the_grid(state: dict[str, Tensor]) -> dict[str, Any]:
+    return {name: tensor for name, tensor in state.items() if name != "dkd.hw_grid"}
 
 
 def beside_an_optimizer(state: dict[str, Tensor]) -> dict[str, Any]:
@@ -39,7 +38,9 @@ def beside_an_optimizer(state: dict[str, Tensor]) -> dict[str, Any]:
 
 SIFT = partial(glue, add_scale_ori=True)
 FILES = (
-    PublicFile("a.pth", "aliked_lightglue", "aliked-n16", "aliked", lambda: Aliked(2048), published_aliked),
+    PublicFile(
+        "a.pth", "aliked_lightglue", "aliked-n16", "aliked", partial(aliked_network, 2048), without_the_grid
+    ),
     PublicFile("b.pth", "aliked_lightglue", "aliked-lightglue", "lightglue", glue, old_names),
     PublicFile("c.pth", "disk_lightglue", "disk", "disk", DISK, beside_an_optimizer),
     PublicFile("d.pth", "disk_lightglue", "disk-lightglue", "lightglue", glue, old_names),

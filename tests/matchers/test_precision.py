@@ -15,7 +15,7 @@ from pictures import agreement
 from mkpc_kaggle.matchers.contract import Placement, Precision
 from mkpc_kaggle.pipeline.devices import fastest_precision, resolve_placement
 
-NAMES = ["superglue", "loftr", "quadtree", "aspanformer", "roma", "loma", "aliked", "xfeat_lighterglue"]
+NAMES = ["superglue", "loftr", "quadtree", "aspanformer", "roma", "loma", "xfeat_lighterglue"]
 
 
 @cache

@@ -14,7 +14,7 @@ from torch import nn
 
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
 from mkpc_kaggle.matchers.adapters import disk_lightglue, sift_lightglue, xfeat_lighterglue
-from mkpc_kaggle.matchers.adapters.aliked import AlikedMatcher, AlikedOptions
+from mkpc_kaggle.matchers.adapters.aliked import AlikedMatcher, AlikedOptions, aliked_encoder, aliked_network
 from mkpc_kaggle.matchers.adapters.dkm import DkmMatcher
 from mkpc_kaggle.matchers.adapters.loma import LomaAdapter, LomaOptions
 from mkpc_kaggle.matchers.adapters.roma import RomaMatcher, RomaOptions
@@ -22,7 +22,6 @@ from mkpc_kaggle.matchers.adapters.superglue import SuperGlueMatcher
 from mkpc_kaggle.matchers.contract import Colour, MatcherSpec, Picture, Placement
 from mkpc_kaggle.matchers.dense import DenseOptions
 from mkpc_kaggle.matchers.lightglue import LightGlueMatcher, light_glue
-from mkpc_kaggle.matchers.networks.aliked import Aliked
 from mkpc_kaggle.matchers.networks.aspanformer import AspanFormer
 from mkpc_kaggle.matchers.networks.dkm import DKM
 from mkpc_kaggle.matchers.networks.loftr import Loftr
@@ -33,7 +32,7 @@ from mkpc_kaggle.matchers.networks.superglue import SuperGlue
 from mkpc_kaggle.matchers.networks.superpoint import SuperPoint
 from mkpc_kaggle.matchers.registry import spec_of
 from mkpc_kaggle.matchers.semi_dense import SemiDenseMatcher
-from mkpc_kaggle.matchers.sparse import Encoder, KeypointEncoder
+from mkpc_kaggle.matchers.sparse import Encoder
 from tests.support.standin import filled, narrow_roma, scene
 
 SIZE = Size(96, 64)
@@ -84,7 +83,7 @@ Keypoints = tuple[Encoder, dict[str, Any]]  # and the shape of LightGlue for the
 
 
 def aliked_keypoints(placement: Placement, keypoints: int) -> tuple[MatcherSpec, Encoder, dict[str, Any]]:
-    return KeypointEncoder(ours(placement, "aliked", Aliked, keypoints), placement.device), {"input_dim": 128}
+    return aliked_encoder(kornias("aliked", aliked_network, keypoints), placement), {"input_dim": 128}
 
 
 def disk_keypoints(placement: Placement, keypoints: int) -> tuple[MatcherSpec, Encoder, dict[str, Any]]:

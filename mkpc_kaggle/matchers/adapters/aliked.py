@@ -1,13 +1,14 @@
-"""ALIKED keypoints (Zhao et al. 2023) with mutual nearest neighbours."""
+"""ALIKED keypoints (Zhao et al. 2023, kornia's network) with mutual nearest neighbours."""
 
 from dataclasses import dataclass
+
+from kornia.feature import ALIKED
+from torch import Tensor
 
 from mkpc_kaggle.config import AT_LEAST_1, SHARE, check_ranges
 from mkpc_kaggle.matchers.contract import MatcherSpec, Placement
 from mkpc_kaggle.matchers.neighbours import NeighbourMatcher
-from mkpc_kaggle.matchers.networks.aliked import Aliked, own_name
-from mkpc_kaggle.matchers.networks.placement import prepared
-from mkpc_kaggle.matchers.sparse import KeypointEncoder
+from mkpc_kaggle.matchers.sparse import KeypointEncoder, library_encoder
 from mkpc_kaggle.weights import WeightStore, load_into
 
 SLOT = "aliked-n16"
@@ -35,11 +36,23 @@ class AlikedMatcher(NeighbourMatcher):
         self.encode = encoder.encode
 
 
+def aliked_network(features: int) -> ALIKED:
+    return ALIKED(SLOT, max_num_keypoints=features, detection_threshold=0.0)  # of any score
+
+
+def aliked_encoder(network: ALIKED, placement: Placement) -> KeypointEncoder:
+    def detect(images: Tensor) -> list[tuple[Tensor, Tensor]]:
+        return [(each.keypoints, each.descriptors) for each in network(images)]
+
+    in_float32 = Placement(placement.device)  # half precision changes three quarters of the keypoints
+    return library_encoder(network, network.score_head, detect, in_float32)
+
+
 def load_encoder(weights: WeightStore, features: int, placement: Placement) -> KeypointEncoder:
     """Load ALIKED's encoder, for all matchers of its keypoints."""
-    network = Aliked(features)
-    load_into(network, {own_name(name): tensor for name, tensor in weights.load(SLOT).items()}, what=SLOT)
-    return KeypointEncoder(prepared(network, placement), placement.device)
+    network = aliked_network(features)
+    load_into(network, weights.load(SLOT), unused=r"dkd\.hw_grid", what=SLOT)  # a constant
+    return aliked_encoder(network, placement)
 
 
 def load(weights: WeightStore, options: AlikedOptions, placement: Placement) -> AlikedMatcher:

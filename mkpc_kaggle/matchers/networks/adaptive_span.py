@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from mkpc_kaggle.matchers.networks.bilinear import corners, weighted_rows
 from mkpc_kaggle.matchers.networks.grids import mask_valid, mean_pool, softmax_attention, to_2x2_blocks
 
 RADIUS = 5.0  # of a span, in deviations of the flow
@@ -79,3 +78,37 @@ def _attend_cells(queries: Tensor, read: Tensor, heads: int, excluded: Tensor | 
             logits.masked_fill_(excluded[:, None], MASKED)
         found.append(softmax_attention(logits, value))
     return torch.cat(found, dim=-1)
+
+
+def corners(positions: Tensor, image: Tensor, size: torch.Size) -> tuple[Tensor, Tensor]:
+    """Return the pixels (Q, 4) int64 around positions (x, y), (Q, 2), in maps ``image`` (Q,), and their bilinear
+    weights (Q, 4).
+
+    Pixels are rows of a table of all maps, map by map and row by row. Pixels outside the map, of ``size`` (h, w),
+    have the weight 0 and the index of another pixel.
+    """
+    height, width = size
+    x, y = positions.unbind(1)
+    first = image * (height * width)
+    rows = [(first + row * width, weight) for row, weight in neighbours(y, height)]
+    columns = neighbours(x, width)
+    index = torch.stack([row + column for row, _ in rows for column, _ in columns], dim=1)
+    return index, torch.stack([along_y * along_x for _, along_y in rows for _, along_x in columns], dim=1)
+
+
+def neighbours(positions: Tensor, length: int) -> list[tuple[Tensor, Tensor]]:
+    """Return the pixels before and after each position (Q,) on one axis, int64, with their weights.
+
+    A NaN position gets a NaN weight and a valid pixel, since a GPU fails on an index out of range.
+    """
+    before = positions.floor()
+    share = positions - before
+    return [
+        (pixel.clamp(0, length - 1).nan_to_num(0).long(), weight.masked_fill((pixel < 0) | (pixel >= length), 0))
+        for pixel, weight in ((before, 1 - share), (before + 1, share))
+    ]
+
+
+def weighted_rows(table: Tensor, index: Tensor, weights: Tensor) -> Tensor:
+    """Sum weights (Q, K) times the rows ``index`` (Q, K) of a table (P, C) over K: (Q, C)."""
+    return functional.embedding_bag(index, table, mode="sum", per_sample_weights=weights)
