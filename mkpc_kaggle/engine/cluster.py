@@ -21,7 +21,7 @@ from typing import Any
 from mkpc_kaggle.engine.jobs import Answer, Cause, Failure, Job
 from mkpc_kaggle.engine.places import Place, Site, Work
 from mkpc_kaggle.engine.process import EXIT_TIMEOUT_S, ThreadWorker
-from mkpc_kaggle.engine.worker import Executor, MatchRunner, Runner, use_threads
+from mkpc_kaggle.engine.worker import Executor, MatchRunner, Runner, with_threads
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.version import __version__
@@ -141,18 +141,13 @@ class RayWorker(ThreadWorker):
         if self._thread.is_alive():
             self._thread.join(max(0.0, until - time.monotonic()))
 
-    def _load(self) -> Answer:
-        self._actor = self._ray.remote(Executor).options(**self._where).remote()
-        if self._killed:
-            self.kill()
-        return self._get(self._actor.load.remote(self._make))
-
-    def _run(self, job: Job) -> Answer:
-        return self._get(self._actor.run.remote(job))
-
-    def _get(self, coming: Any) -> Answer:
+    def _exchange(self, message: Callable[[], Runner] | Job) -> Answer:
+        if self._actor is None:
+            self._actor = self._ray.remote(Executor).options(**self._where).remote()
+            if self._killed:
+                self.kill()
         try:
-            answer: Answer = self._ray.get(coming)
+            answer: Answer = self._ray.get(self._actor.answer.remote(message))
         except self._ray.exceptions.RayError as error:
             is_memory = isinstance(error, self._ray.exceptions.OutOfMemoryError)
             return Failure(Cause.OUT_OF_MEMORY if is_memory else Cause.DIED, message_of(error))
@@ -167,9 +162,7 @@ def make_alike(make: Callable[[], Runner], version: str, paths: tuple[Path, ...]
     for path in paths:
         if not path.exists():
             raise UserError(f"{host} lacks {path}: test set and weights must have the same paths on every machine")
-    if threads:
-        use_threads(threads)
-    return make()
+    return with_threads(make, threads) if threads else make()
 
 
 def join(ray: Any, cluster: RayCluster) -> None:

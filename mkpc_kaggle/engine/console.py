@@ -10,14 +10,12 @@ import os
 import sys
 from contextlib import suppress
 from math import isfinite
-from typing import Any, NoReturn, TextIO
-
-from tqdm import tqdm
+from typing import NoReturn, TextIO
 
 from mkpc_kaggle.engine.budget import Budget, format_duration
-from mkpc_kaggle.engine.streams import DRAIN_S, columns, drain
+from mkpc_kaggle.engine.streams import DRAIN_S, drain, is_terminal
 
-LINE_INTERVAL_S = 30.0  # between lines of progress where a bar cannot be drawn again
+LINE_INTERVAL_S = 30.0  # between lines of progress where a line cannot be drawn again
 
 
 def say(text: str) -> None:
@@ -32,10 +30,10 @@ def complain(text: str) -> None:
     _print(f"error: {text}", sys.stderr)
 
 
-def _print(text: str, stream: TextIO | None) -> None:
+def _print(text: str, stream: TextIO | None, end: str = "\n") -> None:
     with suppress(OSError, ValueError):  # gone, full, or closed
         if stream is not None:
-            print(text, file=stream, flush=True)
+            print(text, file=stream, flush=True, end=end)
 
 
 def leave(status: int, seconds: float = DRAIN_S) -> NoReturn:
@@ -47,55 +45,38 @@ def leave(status: int, seconds: float = DRAIN_S) -> NoReturn:
 
 
 class Progress:
-    """Progress of a phase in pairs (``unit``): a bar on a terminal, occasional lines elsewhere.
+    """Progress of a phase in pairs: a line that is drawn again in place on a terminal, occasional lines elsewhere.
 
-    The children of a notebook's kernel (``!command``) have a terminal whose text is stored, each state of a bar
+    The children of a notebook's kernel (``!command``) have a terminal whose text is stored, each state of a line
     with it. Jupyter marks them with JPY_PARENT_PID.
     """
 
-    def __init__(self, budget: Budget, stream: TextIO | None, unit: str = "pair") -> None:
-        self._budget, self._stream, self._unit = budget, stream, unit
-        self._columns = columns(stream) if stream is not None and "JPY_PARENT_PID" not in os.environ else 0
-        self._bar: tqdm[Any] | None = None
-        self._phase = self._waiting = ""
+    def __init__(self, budget: Budget, stream: TextIO | None) -> None:
+        self._budget, self._stream = budget, stream
+        self._erase = "\r\x1b[K" if is_terminal(stream) and "JPY_PARENT_PID" not in os.environ else ""
+        self._phase = self._line = ""
         self._written = budget.clock()
 
     def show(self, phase: str, done: int, total: int) -> None:
         """Show progress after a job. A phase without pairs is not shown."""
-        if self._stream is None or not total:
+        if not total:
             return
         began, self._phase = phase != self._phase, phase
-        left = f"budget left {format_duration(self._budget.left())}" if isfinite(self._budget.time_limit) else ""
-        if self._columns:
-            with suppress(OSError, ValueError):
-                self._draw(phase if began else "", done, total, left)
-            return
-        count = f"{total} {self._unit}s" if began else f"{done} of {total} {self._unit}s"
-        self._waiting = ", ".join(filter(None, [f"{phase}: {count}", left]))
-        if began or self._budget.clock() - self._written >= LINE_INTERVAL_S:
+        if began and self._erase:
+            self.close()
+        count = f"{total} pairs" if began else f"{done} of {total} pairs"
+        left = f", budget left {format_duration(self._budget.left())}" if isfinite(self._budget.time_limit) else ""
+        self._line = f"{phase}: {count}{left}"
+        if self._erase:
+            _print(self._erase + self._line, self._stream, end="")
+        elif began or self._budget.clock() - self._written >= LINE_INTERVAL_S:
             self.close()
 
     def note(self, text: str) -> None:
-        with suppress(OSError, ValueError):
-            if self._stream is not None:
-                tqdm.write(text, file=self._stream)  # a bar continues below it
+        _print(self._erase + text, self._stream)
 
     def close(self) -> None:
-        """End the bar, or print the pending line."""
-        with suppress(OSError, ValueError):
-            if self._bar is not None:
-                self._bar.close()
-        self._bar = None
-        if self._waiting:
-            _print(self._waiting, self._stream)
-            self._waiting, self._written = "", self._budget.clock()
-
-    def _draw(self, began: str, done: int, total: int, left: str) -> None:
-        if began:
-            self.close()
-            # With a delay, nothing is drawn before the bar is whole: a dead terminal left half a bar.
-            width = self._columns
-            self._bar = tqdm(total=total, desc=began, unit=self._unit, file=self._stream, ncols=width, delay=1e-9)
-        if self._bar is not None:
-            self._bar.set_postfix_str(left, refresh=False)
-            self._bar.update(done - self._bar.n)
+        """End the line on a terminal, or print the pending line."""
+        if self._line:
+            _print("" if self._erase else self._line, self._stream)
+            self._line, self._written = "", self._budget.clock()

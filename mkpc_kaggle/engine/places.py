@@ -15,7 +15,7 @@ from math import inf
 
 from mkpc_kaggle.engine.jobs import Answer, Cause, Failure, Job, Loaded
 from mkpc_kaggle.engine.process import ProcessWorker, ThreadWorker
-from mkpc_kaggle.engine.worker import LightRunner, MatchRunner, SceneRunner, share_cores
+from mkpc_kaggle.engine.worker import MatchRunner, light_runner, scene_runner, share_cores
 from mkpc_kaggle.pipeline.assembly import Assembly
 
 START_TIMEOUT_S = 300.0  # for a worker to load its matchers; over a network's disk that is not quick
@@ -128,7 +128,7 @@ class Site:
         estimators = 1 if threads else max(1, (os.cpu_count() or 1) // CORES_PER_ESTIMATOR)
         worker = ThreadWorker if threads else ProcessWorker
         self.places = [
-            Place(f"estimates {n}", lambda: worker("estimates", LightRunner, self.ring), Work.LIGHT)
+            Place(f"estimates {n}", lambda: worker("estimates", light_runner, self.ring), Work.LIGHT)
             for n in range(estimators)
         ]
         self.places.append(Place("scenes", self.scene_worker, Work.SCENE))
@@ -142,7 +142,7 @@ class Site:
 
     def scene_worker(self) -> ThreadWorker:
         """Return a worker for a scene: always a process, since pycolmap may crash."""
-        return ProcessWorker("scene", SceneRunner, self.ring)
+        return ProcessWorker("scene", scene_runner, self.ring)
 
     def ring(self) -> None:
         self._bell.put(None)

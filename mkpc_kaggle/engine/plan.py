@@ -3,7 +3,7 @@
 A plan has no queue. It looks at the state, the costs and the time left whenever a worker is idle.
 
 Two places decide that a unit no longer fits: :meth:`Plan.fit` for all pairs, and
-:func:`mkpc_kaggle.engine.worker.match_pairs` for a job whose time is over.
+:class:`mkpc_kaggle.engine.worker.MatchRunner` for a job whose time is over.
 """
 
 from collections import Counter

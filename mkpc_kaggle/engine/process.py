@@ -19,8 +19,9 @@ from contextlib import ExitStack, contextmanager, suppress
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
+from typing import cast
 
-from mkpc_kaggle.engine.jobs import Answer, Cause, Failure, Job, Loaded
+from mkpc_kaggle.engine.jobs import Answer, Cause, Failure, Job
 from mkpc_kaggle.engine.streams import unblocked
 from mkpc_kaggle.engine.worker import Executor, Runner, failure_of
 
@@ -35,23 +36,21 @@ EXIT_TIMEOUT_S = 5.0  # a process's pipe closes before the process has ended
 class ThreadWorker:
     """Does jobs, one at a time, in a thread of this process. No call blocks, even if the worker hangs.
 
-    After ``start`` it answers once, :class:`Loaded` or :class:`Failure`; after each ``submit`` once more.
-    ``on_answer`` is called in its thread for each answer. It is not used again after a failure of its
-    place, nor after ``kill``.
+    It answers the maker of its runner, with :class:`Loaded` or :class:`Failure`, and each job once. ``on_answer``
+    is called in its thread for each answer. It is not used again after a failure of its place, nor after ``kill``.
 
     A matcher that hangs or crashes cannot be contained here, and a failed device does not recover. Both need
     processes.
     """
 
     def __init__(self, name: str, make: Callable[[], Runner], on_answer: Callable[[], None]) -> None:
-        self.name = name
-        self._make = make
-        self._on_answer = on_answer
+        self.name, self._on_answer = name, on_answer
         self._executor = Executor()
-        self._orders: queue.SimpleQueue[Job | None] = queue.SimpleQueue()
+        self._messages: queue.SimpleQueue[Callable[[], Runner] | Job | None] = queue.SimpleQueue()
         self._answers: queue.SimpleQueue[Answer] = queue.SimpleQueue()
         self._killed = False
         self._thread = threading.Thread(target=self._live, name=name, daemon=True)
+        self._messages.put(make)
 
     def start(self) -> None:
         try:
@@ -60,7 +59,7 @@ class ThreadWorker:
             self._answers.put(Failure(Cause.NOT_STARTED, str(error)))
 
     def submit(self, job: Job) -> None:
-        self._orders.put(job)
+        self._messages.put(job)
 
     def answer(self) -> Answer | None:
         """Return an answer once; ``None`` while it computes."""
@@ -70,32 +69,23 @@ class ThreadWorker:
 
     def kill(self) -> None:
         self._killed = True
-        self._orders.put(None)
+        self._messages.put(None)
 
     def _live(self) -> None:
-        try:
-            answer = self._load()
-        except Exception as error:  # out of memory, or of processes
-            answer = Failure(Cause.NOT_STARTED, str(error))
-        while True:
+        while (message := self._messages.get()) is not None and not self._killed:
+            try:
+                answer = self._exchange(message)
+            except Exception as error:  # out of memory, or of processes
+                answer = Failure(Cause.NOT_STARTED, str(error))
             self._answers.put(answer)
             self._on_answer()
-            if isinstance(answer, Failure) and answer.cause.is_of_place:
-                return
-            job = self._orders.get()
-            if job is None or self._killed:
-                return
-            answer = self._run(job)
 
-    def _load(self) -> Answer:
-        return self._executor.load(self._make)
-
-    def _run(self, job: Job) -> Answer:
-        return self._executor.run(job)
+    def _exchange(self, message: Callable[[], Runner] | Job) -> Answer:
+        return self._executor.answer(message)
 
 
 class ProcessWorker(ThreadWorker):
-    """A worker process, started with ``spawn``. ``make`` and jobs can be pickled."""
+    """A worker process, started with ``spawn`` for the first message. Messages can be pickled."""
 
     _process: SpawnProcess | None = None
 
@@ -104,26 +94,9 @@ class ProcessWorker(ThreadWorker):
         if self._process is not None:
             self._process.kill()
 
-    def _load(self) -> Answer:
-        context = multiprocessing.get_context("spawn")
-        self._pipe, its_pipe = context.Pipe()
-        process = context.Process(target=serve, args=(its_pipe,), name=self.name, daemon=True)
-        try:
-            with worker_environment():
-                process.start()
-        finally:
-            its_pipe.close()
-        self._process = process
-        if self._killed:  # before there was a process to kill
-            process.kill()
-        return self._exchange(process, self._make)
-
-    def _run(self, job: Job) -> Answer:
-        assert self._process is not None, "only a worker that has loaded gets jobs"
-        return self._exchange(self._process, job)
-
-    def _exchange(self, process: SpawnProcess, message: Callable[[], Runner] | Job) -> Answer:
+    def _exchange(self, message: Callable[[], Runner] | Job) -> Answer:
         """Return the answer to a message, or how the process ended."""
+        process = self._process or self._started()
         try:
             self._pipe.send(message)
             answer: Answer = self._pipe.recv()
@@ -135,6 +108,20 @@ class ProcessWorker(ThreadWorker):
             process.kill()
             return failure_of(error)
         return answer
+
+    def _started(self) -> SpawnProcess:
+        context = multiprocessing.get_context("spawn")
+        self._pipe, its_pipe = context.Pipe()
+        process = context.Process(target=serve, args=(its_pipe,), name=self.name, daemon=True)
+        try:
+            with worker_environment():
+                process.start()
+        finally:
+            its_pipe.close()
+        self._process = process
+        if self._killed:  # before there was a process to kill
+            process.kill()
+        return process
 
 
 def how_it_ended(code: int | None) -> str:
@@ -164,19 +151,17 @@ def worker_environment() -> Iterator[None]:
 
 
 def serve(pipe: Connection) -> None:
-    """Serve as a worker process: receive a maker, then one job after another."""
+    """Serve as a worker process: answer one message after another, the maker of the runner first."""
 
     def make() -> Runner:
-        maker: Callable[[], Runner] = pipe.recv()  # an object that cannot be unpickled is an answer, too
-        return maker()
+        return cast(Callable[[], Runner], pipe.recv())()  # an object that cannot be unpickled is an answer, too
 
     end_with_parent()
-    executor = Executor()
+    executor, message = Executor(), make
     with unblocked(), suppress(EOFError, OSError):  # the parent is gone
-        answer = executor.load(make)
-        pipe.send(answer)
-        while isinstance(answer, Loaded):
-            pipe.send(executor.run(pipe.recv()))
+        while True:
+            pipe.send(executor.answer(message))
+            message = pipe.recv()
 
 
 def end_with_parent() -> None:

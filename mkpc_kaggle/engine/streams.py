@@ -18,7 +18,6 @@ from typing import TextIO
 MAX_WAITING = 1000  # writes: some minutes of a busy bar
 MAX_BYTES = 4096  # of a read
 DRAIN_S = 2.0  # how long the end waits for the remaining text
-COLUMNS = 80  # of a terminal that does not state its width
 
 
 class Relay:
@@ -99,13 +98,10 @@ def _descriptor(stream: TextIO | None) -> int:
     return -1
 
 
-def columns(stream: TextIO) -> int:
-    """Return the width of the terminal where a stream ends; 0 if it ends elsewhere."""
+def is_terminal(stream: TextIO | None) -> bool:
+    """Whether a stream ends at a terminal, perhaps behind a relay."""
     descriptor = _descriptor(stream)
-    end = _relays[descriptor].sink if descriptor in _relays else descriptor
-    with suppress(OSError):
-        return (os.get_terminal_size(end).columns or COLUMNS) if os.isatty(end) else 0
-    return 0
+    return os.isatty(_relays[descriptor].sink if descriptor in _relays else descriptor)
 
 
 def drain(seconds: float = DRAIN_S) -> None:

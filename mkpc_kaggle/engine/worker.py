@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
@@ -51,65 +51,57 @@ CAUSES = {
 }
 
 
-class Runner(Protocol):
-    """Does jobs of some kinds. It may raise anything, never return, or end the process."""
-
-    def run(self, job: Job) -> Answer: ...
+Runner = Callable[[Job], Answer]  # it may raise anything, never return, or end the process
 
 
 class Executor:
-    """The worker's side in any process: it makes its runner, then does jobs. Neither raises."""
+    """The worker's side in any process: the first message makes its runner, the others are jobs. Never raises."""
 
-    runner: Runner
+    _run: Runner | None = None
 
-    def load(self, make: Callable[[], Runner]) -> Answer:
+    def answer(self, message: Callable[[], Runner] | Job) -> Answer:
         try:
-            self.runner = make()
-        except UserError as error:
-            is_device = isinstance(error, failures.DeviceError)
-            return Failure(Cause.DEVICE if is_device else Cause.REFUSED, str(error))
+            if self._run is not None:
+                return self._run(cast(Job, message))
+            self._run = cast(Callable[[], Runner], message)()
         except Exception as error:
+            if self._run is None and isinstance(error, UserError):
+                is_device = isinstance(error, failures.DeviceError)
+                return Failure(Cause.DEVICE if is_device else Cause.REFUSED, str(error))
             return failure_of(error)
         return Loaded()
-
-    def run(self, job: Job) -> Answer:
-        try:
-            return self.runner.run(job)
-        except Exception as error:
-            return failure_of(error)
 
 
 def failure_of(error: Exception) -> Failure:
     return Failure(CAUSES[failures.failure_of(error)], failures.reason_of(error))
 
 
-def use_threads(count: int) -> None:
-    """Let this process compute in ``count`` threads."""
+def with_threads(make: Callable[[], Runner], count: int) -> Runner:
+    """Call ``make`` in a process that computes in ``count`` threads."""
     import cv2
     import torch
 
     torch.set_num_threads(count)
     cv2.setNumThreads(count)
+    return make()
 
 
 def share_cores(make: Callable[[], Runner], share: int) -> Runner:
     """Call ``make`` in one of ``share`` processes that share the machine's cores."""
     import torch
 
-    if share > 1:
-        use_threads(max(1, torch.get_num_threads() // share))
-    return make()
+    return with_threads(make, max(1, torch.get_num_threads() // share)) if share > 1 else make()
 
 
 class MatchRunner:
-    """Matches the pairs of jobs. Raises :class:`mkpc_kaggle.errors.UserError` if the matchers cannot be loaded."""
+    """A runner of match jobs. Raises :class:`mkpc_kaggle.errors.UserError` if the matchers cannot be loaded."""
 
     def __init__(self, make_pipeline: Callable[[], "Pipeline"]) -> None:
         self._pipeline = make_pipeline()
         self._pipeline.load()
         self._images = ImageStore()
 
-    def run(self, job: Job) -> tuple[Outcome, ...]:
+    def __call__(self, job: Job) -> tuple[Outcome, ...]:
         """Match the pairs of a job, with the units that are expected to end in time."""
         assert isinstance(job, MatchJob)
         deadline = time.monotonic() + job.seconds
@@ -148,22 +140,22 @@ def _outcome(index: int, wanted: WantedPair, pair: PairMatch, known: tuple[objec
     return Outcome(index, () if pair.failure else images, found, pair.regions, pair.failure, *seconds)
 
 
-class LightRunner:
-    """Estimates the models of pairs, and looks at images. It needs neither torch nor a device."""
+def light_runner() -> Runner:
+    """Return the runner of estimates and looks at images, without torch and on one thread."""
+    import cv2
+    from threadpoolctl import threadpool_limits  # comes with scikit-learn
 
-    def __init__(self) -> None:
-        import cv2
-        from threadpoolctl import threadpool_limits  # comes with scikit-learn
+    cv2.setNumThreads(1)
+    threadpool_limits(1)
+    return do_light_job
 
-        cv2.setNumThreads(1)
-        threadpool_limits(1)
 
-    def run(self, job: Job) -> tuple[Estimated, ...] | bytes:
-        if isinstance(job, LookJob):
-            return job.do()
-        assert isinstance(job, EstimateJob)
-        points = read_points(job.source, job.pairs)
-        return tuple(estimate_pair(pair, points, job.recipe) for pair in job.pairs)
+def do_light_job(job: Job) -> tuple[Estimated, ...] | bytes:
+    if isinstance(job, LookJob):
+        return job.do()
+    assert isinstance(job, EstimateJob)
+    points = read_points(job.source, job.pairs)
+    return tuple(estimate_pair(pair, points, job.recipe) for pair in job.pairs)
 
 
 def estimate_pair(pair: PairPoints, points: dict[int, Matches], recipe: Recipe) -> Estimated:
@@ -182,15 +174,16 @@ def estimate_pair(pair: PairPoints, points: dict[int, Matches], recipe: Recipe) 
     )
 
 
-class SceneRunner:
-    """Reconstructs batches. pycolmap may end the process: see :mod:`mkpc_kaggle.scene.colmap`."""
+def scene_runner() -> Runner:
+    return reconstruct
 
-    def run(self, job: Job) -> Solution:
-        """Return the cameras of a batch, and a choice for each of its pairs."""
-        assert isinstance(job, SceneJob) and job.recipe.scene is not None
-        points = read_points(job.source, job.pairs)
-        pairs = [batch_pair(pair, points) for pair in job.pairs]
-        return reconstruct_batch(pairs, job.recipe.scene, job.recipe.focal, job.recipe.magsac, job.export)
+
+def reconstruct(job: Job) -> Solution:
+    """Return the cameras of a batch, and a choice for each of its pairs. pycolmap may end the process."""
+    assert isinstance(job, SceneJob) and job.recipe.scene is not None
+    points = read_points(job.source, job.pairs)
+    pairs = [batch_pair(pair, points) for pair in job.pairs]
+    return reconstruct_batch(pairs, job.recipe.scene, job.recipe.focal, job.recipe.magsac, job.export)
 
 
 def batch_pair(pair: PairPoints, points: dict[int, Matches]) -> BatchPair:

@@ -252,7 +252,7 @@ home = Path(sys.argv[1])
 pairs = write_pairs(home / "pairs", 40)
 def publish(standing):
     (home / "out").write_text(str(len(set(map(bytes, standing.fundamentals)))))
-run(pairs, THREE_UNITS, RectifiedMatcher(), home / "work", limit=4.0, publish=publish, is_watched=True)
+run(pairs, THREE_UNITS, RectifiedMatcher(), home / "work", limit=8.0, publish=publish, is_watched=True)
 """
 
 

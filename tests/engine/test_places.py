@@ -9,7 +9,7 @@ from mkpc_kaggle.engine import places
 from mkpc_kaggle.engine.jobs import Cause, Failure, Loaded, MatchJob, Phase
 from mkpc_kaggle.engine.places import LocalSite, Place, Work
 from mkpc_kaggle.engine.process import ThreadWorker
-from mkpc_kaggle.engine.worker import SceneRunner
+from mkpc_kaggle.engine.worker import scene_runner
 
 LOST, DONE = Failure(Cause.DIED), ()
 RAISED, NO_MEMORY = Failure(Cause.RAISED), Failure(Cause.OUT_OF_MEMORY)
@@ -58,7 +58,7 @@ def test_a_thread_that_cannot_start_is_an_answer(monkeypatch):
         raise RuntimeError("can't start new thread")
 
     monkeypatch.setattr(threading.Thread, "start", no_thread)
-    place = Place("scene", lambda: ThreadWorker("scene", SceneRunner, lambda: None))
+    place = Place("scene", lambda: ThreadWorker("scene", scene_runner, lambda: None))
     place.start(0.0)
     assert place.poll(0.0) == Failure(Cause.NOT_STARTED, "can't start new thread")
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from faulty import ScenesBy, choose_scene_for_all_but_the_first, on_fork
+from faulty import choose_scene_for_all_but_the_first, on_fork, runner
 
 from mkpc_kaggle.engine.jobs import Cause, Failure, Loaded, SceneJob
 from mkpc_kaggle.engine.process import WORKER_ENVIRONMENT, ProcessWorker
@@ -37,7 +37,7 @@ class Worker(ProcessWorker):
 
     def __init__(self, make: Callable[[SceneJob], Solution]) -> None:
         self._bell = threading.Semaphore(0)
-        super().__init__("scene", partial(ScenesBy, make), self._bell.release)
+        super().__init__("scene", partial(runner, make), self._bell.release)
 
     def next_answer(self) -> Any:
         assert self._bell.acquire(timeout=120)
@@ -106,13 +106,13 @@ ORPHAN = """
 import os, signal, sys
 sys.path[:0] = {path!r}
 from functools import partial
-from faulty import ScenesBy, befall, hang
+from faulty import befall, hang, runner
 from mkpc_kaggle.engine.process import ProcessWorker
 from test_process import LARGE
 
 if __name__ == "__main__":
     answers, told = os.pipe()
-    worker = ProcessWorker("scene", partial(ScenesBy, partial(befall, hang)), lambda: os.write(told, b"."))
+    worker = ProcessWorker("scene", partial(runner, partial(befall, hang)), lambda: os.write(told, b"."))
     worker.start()
     os.read(answers, 1)
     worker.answer()

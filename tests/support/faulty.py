@@ -20,7 +20,7 @@ from mkpc_kaggle.engine import places, session
 from mkpc_kaggle.engine.jobs import SceneJob
 from mkpc_kaggle.engine.places import LocalSite, Place, Work
 from mkpc_kaggle.engine.process import ThreadWorker
-from mkpc_kaggle.engine.worker import MatchRunner, SceneRunner
+from mkpc_kaggle.engine.worker import MatchRunner, reconstruct
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches
@@ -115,14 +115,9 @@ class NarrowMatcher(RectifiedMatcher):
 SCENE_F = np.array([[0.0, 0, 0.2], [0, 0, -0.5], [-0.3, 0.6, 0.5]])
 
 
-class ScenesBy(SceneRunner):
-    """What a function makes of a job, in place of a reconstruction."""
-
-    def __init__(self, make: Callable[[SceneJob], Solution]) -> None:
-        self._make = make
-
-    def run(self, job: Any) -> Solution:
-        return self._make(job)
+def runner(run: Callable[[SceneJob], Solution]) -> Callable[[SceneJob], Solution]:
+    """Return ``run``: a maker, partial(runner, run), can be pickled."""
+    return run
 
 
 def scenes_by(
@@ -130,9 +125,9 @@ def scenes_by(
 ) -> None:
     """Let ``make`` reconstruct batches, in a thread of this process or, as real runs do, in a process."""
     if process:
-        monkeypatch.setattr(places, "SceneRunner", partial(ScenesBy, make))
+        monkeypatch.setattr(places, "scene_runner", partial(runner, make))
     else:
-        worker = partial(ThreadWorker, "scene", partial(ScenesBy, make))
+        worker = partial(ThreadWorker, "scene", partial(runner, make))
         monkeypatch.setattr(LocalSite, "scene_worker", lambda site: worker(site.ring))
 
 
@@ -154,10 +149,6 @@ def befall(fault: Fault, job: SceneJob) -> Solution:
     """A fault in the place of a reconstruction."""
     fault()
     raise AssertionError
-
-
-def reconstruct(job: SceneJob) -> Solution:
-    return SceneRunner().run(job)
 
 
 def die_within_pycolmap(job: SceneJob) -> Solution:
