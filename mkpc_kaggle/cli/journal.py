@@ -22,7 +22,7 @@ submission. Without options, print an overview of one screen.
                MAGSAC's own F, focal lengths
   units.csv    per unit and pair: matches, inliers, seconds, failure
   regions.csv  per image (0 or 1) and pair: the critical region's box and the reason for it
-  events.csv   times of starts, plans, jobs that ended, faults, ends
+  events.csv   times of starts, plans, scenes, faults, ends
 
 Exit status: 0 done, 2 the journal does not exist, or a file cannot be written.
 """

@@ -30,7 +30,7 @@ from mkpc_kaggle.scene.choose import Choice, Reason
 from mkpc_kaggle.scene.reconstruction import RegisteredImage, SfmModel, Sigmas
 from mkpc_kaggle.scene.view_graph import BatchImage
 
-FORMAT = 13
+FORMAT = 14
 FILE_NAME = "journal.sqlite"
 
 # SQLite's primary result codes that say nothing against a file: no permission, busy, locked, read only, input or
@@ -54,7 +54,6 @@ class EventKind(StrEnum):
 
     START = "start"  # the program began or resumed the run
     PLAN = "plan"  # a decision, and why
-    JOB = "job"  # a job has ended; the text begins with its phase
     SCENE = "scene"  # a batch was reconstructed; the text says how much of it
     FAULT = "fault"
     END = "end"  # the run ended; the text says how

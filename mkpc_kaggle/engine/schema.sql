@@ -161,7 +161,7 @@ CREATE TABLE feature (  -- of an image, or of the images of a dataset, by the di
 
 CREATE TABLE event (
     number INTEGER PRIMARY KEY,
-    kind TEXT NOT NULL CHECK (kind IN ('start', 'plan', 'job', 'scene', 'fault', 'end')),
+    kind TEXT NOT NULL CHECK (kind IN ('start', 'plan', 'scene', 'fault', 'end')),
     seconds REAL NOT NULL,
     text TEXT NOT NULL
 ) STRICT;

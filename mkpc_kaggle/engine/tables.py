@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from mkpc_kaggle.engine.budget import Costs
 from mkpc_kaggle.engine.jobs import Estimated, EstimateJob, Failure, Job, LookJob, MatchJob, Outcome
 from mkpc_kaggle.engine.journal import Journal
-from mkpc_kaggle.engine.journal_reader import EventKind
 from mkpc_kaggle.engine.losses import Losses
 from mkpc_kaggle.engine.plan import HANG_FACTOR, Mask, Plan
 from mkpc_kaggle.engine.request import Chronicle
@@ -57,10 +56,7 @@ class Points:
     def save(self, job: MatchJob, answer: Sequence[Outcome], _: float) -> None:
         self._state.save_outcomes(answer)
         self._plan.on_result(job, answer)
-        found = [each for outcome in answer for each in outcome.found]
-        self._chronicle.units_run += len(found)
-        seconds = sum(each.seconds for each in found)
-        self._chronicle.note(EventKind.JOB, f"{job.phase} {len(job.indices)} pairs {seconds:.3f} s")
+        self._chronicle.units_run += sum(len(outcome.found) for outcome in answer)
         self._chronicle.progress.show(*self._plan.progress(self._plan.budget.clock()))
 
     def _first_stage(self, index: int) -> tuple[UnitResult, ...]:

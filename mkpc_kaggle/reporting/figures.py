@@ -1,4 +1,4 @@
-"""Figures: a pair with its matches, clusters and critical regions; a run's jobs over time; a scene's cameras."""
+"""Figures: a pair with its matches, clusters and critical regions; a scene's cameras."""
 
 from collections.abc import Sequence
 from io import BytesIO
@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from mkpc_kaggle.data.competition import evenly_spread
 from mkpc_kaggle.data.images import Image
 from mkpc_kaggle.data.outputs import replacing
-from mkpc_kaggle.engine.journal_reader import Event, EventKind
 from mkpc_kaggle.engine.records import SceneRecord
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.cameras import Camera
@@ -30,7 +29,6 @@ COLOURS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#56B4E9", "#CC79A7")
 DPI = 110
 STRIP_HEIGHT_PX, MAX_STRIP_PX = 480, 2_000_000
 MAX_INLIERS, MAX_OUTLIERS = 150, 50  # number of lines that stay legible
-MAX_EMPTY = 4  # a time limit of more run lengths is not drawn: it would leave no room for the jobs
 
 
 def draw_pair(image0: Image, image1: Image, match: PairMatch, config: MkpcConfig) -> "Figure":
@@ -124,30 +122,6 @@ def _show(
 def _upright(image: Image) -> View:
     """Return the view of the whole image at its own size."""
     return View.fit(Box.whole(image.size), long_side=max(image.size), turns=image.turns)
-
-
-def draw_budget(events: Sequence[Event], limit: float | None) -> "Figure":
-    """Draw the number of ended jobs over time, a colour for each phase. A flat segment is time without a result.
-
-    ``events`` are the events of a session, ``limit`` is the time limit in seconds.
-    """
-    ended: dict[str, list[float]] = {}
-    for event in events:
-        if event.kind == EventKind.JOB:
-            ended.setdefault(event.text.partition(" ")[0], []).append(event.seconds)
-    figure = new_figure(6.5, 3.2)
-    axes = plain(figure.subplots(), f"{sum(map(len, ended.values()))} jobs ended, over minutes since the start")
-    below, latest = 0, 0.0
-    for phase, times in ended.items():
-        counts = below + 1 + np.arange(len(times))
-        axes.step(np.asarray(times) / 60, counts, "o-", where="post", markersize=2.5, label=phase)
-        below, latest = below + len(times), max(latest, *times)
-    if limit is not None and limit < MAX_EMPTY * latest:
-        axes.axvline(limit / 60, color="black", linewidth=1.2, label="time limit")
-    axes.set(xlim=(0, None), ylim=(0, None), xlabel="minutes")
-    if ended:
-        axes.legend(fontsize=8, frameon=False)
-    return figure
 
 
 def draw_cameras(scene: SceneRecord, number: int = 0) -> "Figure":

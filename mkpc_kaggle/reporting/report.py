@@ -22,7 +22,7 @@ from mkpc_kaggle.engine.journal_reader import EventKind
 from mkpc_kaggle.errors import UserError, printable, writing
 from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
 from mkpc_kaggle.pipeline.two_stage import to_image
-from mkpc_kaggle.reporting.figures import draw_budget, draw_cameras, draw_pair, draw_strip, encode
+from mkpc_kaggle.reporting.figures import draw_cameras, draw_pair, draw_strip, encode
 from mkpc_kaggle.reporting.run_log import RunLog, WeakPair, read_log
 from mkpc_kaggle.reporting.summary import headline, left_out_line, trouble, weakest_cameras
 
@@ -76,7 +76,6 @@ def report_page(log: RunLog, pairs: Sequence[Pair] = (), *, undrawn: str = "") -
         undrawn = "matplotlib is not installed: pip install 'mkpc-kaggle[plots]'"
     sources = {} if undrawn else {pair.id: pair for pair in pairs}
     largest = sorted((s for s in log.scenes if s.registered), key=lambda scene: -scene.registered)[:MAX_SCENES]
-    has_jobs = any(event.kind == EventKind.JOB for event in log.session)
     pages = Environment(loader=PackageLoader("mkpc_kaggle.reporting"), autoescape=True, undefined=StrictUndefined)
     return pages.get_template("report.html").render(
         log=log,
@@ -94,7 +93,6 @@ def report_page(log: RunLog, pairs: Sequence[Pair] = (), *, undrawn: str = "") -
             for scene in ([] if undrawn else largest)
             for number in range(min(len(scene.models), MAX_MODELS))
         ],
-        jobs=_data_uri(draw_budget(log.session, log.about.limit), "png") if has_jobs and not undrawn else "",
         costs=_costs(log),
         plans=_events(log, EventKind.PLAN),
         undrawn=undrawn,
