@@ -1,6 +1,6 @@
 """Cost and accuracy of a batch's reconstruction, from noisy and wrong matches of known cameras.
 
-python -m benchmarks.scenes [26:304 100:2000] [--world front|street] [--threads 1]
+python -m benchmarks.scenes [26:304 100:2000] [--world front|street]
 
 Each size is images:pairs and runs in a separate process, as in the engine. All images see the front; images along
 the street see only nearby facades. `verify` and `map` are CPU seconds. Errors are medians over pairs, in degrees,
@@ -25,14 +25,14 @@ from mkpc_kaggle.scene import colmap
 from mkpc_kaggle.scene.reconstruct import Solution, reconstruct_batch
 
 
-def row(size: str, world: str, config: SceneConfig) -> str:
+def row(size: str, world: str) -> str:
     images, pairs = map(int, size.split(":"))
     scene = street(images, pairs) if world == "street" else synthetic_scene(images, pairs, points=2500)
     seconds: Counter[str] = Counter()
     for name in ("verify", "run_mapper"):
         setattr(colmap, name, timed(getattr(colmap, name), name, seconds))
     begin = time.process_time()
-    solution = reconstruct_batch(scene.pairs, config)
+    solution = reconstruct_batch(scene.pairs, SceneConfig())
     used = time.process_time() - begin
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     matches = np.mean([len(pair.matches) for pair in scene.pairs])
@@ -76,14 +76,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("sizes", nargs="*", default=["26:304", "100:800"])
     parser.add_argument("--world", choices=["front", "street"], default="street")
-    parser.add_argument("--threads", type=int, default=1)
     arguments = parser.parse_args()
-    config = SceneConfig(threads=arguments.threads)
     heads = ("matches", "verify", "map", "all s", "MB", "placed")
     print(f"{'images':>7}{'pairs':>7}" + "".join(f"{head:>9}" for head in heads) + "  rotation  direction")
     for size in arguments.sizes:
         with ProcessPoolExecutor(1, get_context("spawn")) as pool:
-            print(pool.submit(row, size, arguments.world, config).result(), flush=True)
+            print(pool.submit(row, size, arguments.world).result(), flush=True)
 
 
 if __name__ == "__main__":

@@ -77,13 +77,6 @@ class Unit:
         return replace(view, antialias=self.antialias)
 
 
-class CameraModel(StrEnum):
-    """COLMAP's camera models with one focal length and a central principal point; RADIAL adds distortion."""
-
-    PINHOLE = "SIMPLE_PINHOLE"
-    RADIAL = "SIMPLE_RADIAL"
-
-
 class CameraSharing(StrEnum):
     """Camera sharing among the images of one size in a scene."""
 
@@ -96,15 +89,12 @@ class CameraSharing(StrEnum):
 class SceneConfig:
     """Settings of :mod:`mkpc_kaggle.scene`, table ``[scene]`` of a recipe."""
 
-    camera_model: CameraModel = CameraModel.PINHOLE
     shared_intrinsics: float = 0.02  # maximum relative deviation of focal lengths from their median; 0: never
     pairs_per_image: float = 10.0  # a batch with fewer gets extra pairs, used only for its scene; 0: none
     cameras: CameraSharing = CameraSharing.AUTO
-    exif: bool = True  # cameras start with the focal length of EXIF, if known
-    threads: int = 1  # more than one: the last digits differ from run to run
 
     def __post_init__(self) -> None:
-        check_ranges(self, shared_intrinsics=AT_LEAST_0, pairs_per_image=AT_LEAST_0, threads=AT_LEAST_1)
+        check_ranges(self, shared_intrinsics=AT_LEAST_0, pairs_per_image=AT_LEAST_0)
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,11 @@
-"""Messages between the engine and its workers: four kinds of job, and their answers. Plain values."""
+"""Messages between the engine and its workers: four kinds of job, their answers, and a record of lost jobs."""
 
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum, StrEnum
 from pathlib import Path
+from typing import Generic, TypeVar
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.geometry.coordinates import Matrix3
@@ -14,6 +16,10 @@ from mkpc_kaggle.recipe import Recipe, Unit
 from mkpc_kaggle.scene.export import Export
 from mkpc_kaggle.scene.reconstruct import Solution
 from mkpc_kaggle.scene.view_graph import BatchImage
+
+MAX_TRIES = 2  # of an item alone
+
+Item = TypeVar("Item", bound=Hashable)
 
 
 class Phase(IntEnum):
@@ -179,6 +185,29 @@ class Failure:
 
     def __str__(self) -> str:
         return f"{self.cause}: {self.message}" if self.message else str(self.cause)
+
+
+class Losses(Generic[Item]):
+    """Work that lost workers: its items are retried singly, and an item that is lost twice alone is skipped.
+
+    ``alone`` are the items to try singly, ``skipped`` the failures of the items that are no longer tried.
+    """
+
+    def __init__(self) -> None:
+        self.alone: set[Item] = set()
+        self.skipped: dict[Item, Failure] = {}
+        self._tries: Counter[Item] = Counter()
+
+    def add(self, lost: Sequence[Item], failure: Failure) -> bool:
+        """Record the items of a lost job. Return whether its single item is skipped from now on."""
+        self.alone.update(lost)
+        if len(lost) != 1:
+            return False
+        self._tries[lost[0]] += 1
+        if self._tries[lost[0]] < MAX_TRIES:
+            return False
+        self.skipped[lost[0]] = failure
+        return True
 
 
 # A match job or an estimate job is answered by a value for each of its pairs, in order.

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mkpc_kaggle.engine.budget import Budget, Costs, format_duration
-from mkpc_kaggle.engine.jobs import Cause, Failure, MatchJob, Outcome, Phase
-from mkpc_kaggle.engine.losses import Losses
+from mkpc_kaggle.engine.jobs import Cause, Failure, Losses, MatchJob, Outcome, Phase
 from mkpc_kaggle.engine.state import State
 from mkpc_kaggle.recipe import Unit
 

@@ -4,10 +4,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine.jobs import Failure, Phase, SceneJob
+from mkpc_kaggle.engine.jobs import Failure, Losses, Phase, SceneJob
 from mkpc_kaggle.engine.journal import Journal
 from mkpc_kaggle.engine.journal_reader import EventKind
-from mkpc_kaggle.engine.losses import Losses
 from mkpc_kaggle.engine.plan import HANG_FACTOR, Plan
 from mkpc_kaggle.engine.records import SceneRecord
 from mkpc_kaggle.engine.request import Chronicle, Request

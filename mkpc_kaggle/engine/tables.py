@@ -8,9 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mkpc_kaggle.engine.budget import Costs
-from mkpc_kaggle.engine.jobs import Estimated, EstimateJob, Failure, Job, LookJob, MatchJob, Outcome
+from mkpc_kaggle.engine.jobs import Estimated, EstimateJob, Failure, Job, LookJob, Losses, MatchJob, Outcome
 from mkpc_kaggle.engine.journal import Journal
-from mkpc_kaggle.engine.losses import Losses
 from mkpc_kaggle.engine.plan import HANG_FACTOR, Mask, Plan
 from mkpc_kaggle.engine.request import Chronicle
 from mkpc_kaggle.engine.state import State

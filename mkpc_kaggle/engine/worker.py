@@ -3,7 +3,7 @@
 Importing this module does not import torch: only matching needs it.
 
 Threads: one matching process uses all cores, and N processes share them. A process for estimates has one thread, a
-scene has ``threads`` of ``[scene]``, and a machine of a Ray cluster has its number of CPUs.
+scene has one, too, and a machine of a Ray cluster has its number of CPUs.
 """
 
 import time

@@ -10,7 +10,6 @@ Source: Pan et al. 2024 (the global mapper).
 import os
 import shutil
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -20,7 +19,6 @@ import pycolmap
 
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Points, Size
-from mkpc_kaggle.recipe import SceneConfig
 from mkpc_kaggle.scene.export import DATABASE, FORMER, MODELS, PART
 from mkpc_kaggle.scene.keypoints import Index, scene_keypoints
 from mkpc_kaggle.scene.reconstruction import MIN_IMAGES, Reconstruction, RegisteredImage, SfmModel, filter_models
@@ -34,9 +32,10 @@ MAX_TRIALS = 300  # RANSAC trials per edge: more find the same inliers at five t
 LARGE = 100  # images; in a larger scene all tracks cost too much, a smaller scene gains accuracy from them
 TRACKS_PER_IMAGE = 200  # the longest, with which the global mapper starts in a large scene
 SEED = 0
+CAMERA_MODEL = "SIMPLE_PINHOLE"  # a radial camera does not improve focal lengths (docs/results.md)
 
 
-def structure_from_motion(graph: ViewGraph, config: SceneConfig, shared: SharedIntrinsics) -> Reconstruction:
+def structure_from_motion(graph: ViewGraph, shared: SharedIntrinsics) -> Reconstruction:
     """Return pycolmap's reconstruction of a view graph, with any number of models.
 
     Each image has its own camera, except images with ``shared`` intrinsics. Cameras start with the shared focal
@@ -45,13 +44,11 @@ def structure_from_motion(graph: ViewGraph, config: SceneConfig, shared: SharedI
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
     pycolmap.set_random_seed(SEED)
     with pycolmap.Database.open(":memory:") as database:
-        _fill(database, graph, config, shared)
-        return run_mapper(database, graph, config.threads)
+        _fill(database, graph, shared)
+        return run_mapper(database, graph)
 
 
-def write_files(
-    directory: Path, graph: ViewGraph, config: SceneConfig, shared: SharedIntrinsics, models: Sequence[SfmModel]
-) -> None:
+def write_files(directory: Path, graph: ViewGraph, shared: SharedIntrinsics, models: Sequence[SfmModel]) -> None:
     """Write COLMAP's files: the database and one folder per model.
 
     Files are written to a temporary folder in ``directory`` and replace earlier files when all are complete. Files
@@ -63,7 +60,7 @@ def write_files(
     with TemporaryDirectory(prefix=PART, dir=directory) as name:
         made = Path(name)
         with pycolmap.Database.open(str(made / DATABASE)) as database:
-            _fill(database, graph, config, shared)
+            _fill(database, graph, shared)
         for number, model in enumerate(models):
             kept = {each.image.name for each in model.images}
             for frame in [frame for frame in model.colmap.frames.values() if frame.has_pose()]:
@@ -82,19 +79,19 @@ def write_files(
             (made / MODELS).rename(directory / MODELS)
 
 
-def _fill(database: Any, graph: ViewGraph, config: SceneConfig, shared: SharedIntrinsics) -> None:
+def _fill(database: Any, graph: ViewGraph, shared: SharedIntrinsics) -> None:
     """Write images, their cameras and keypoints, and the matches and verified geometry of each edge."""
     keypoints, found = scene_keypoints(graph)
     with pycolmap.DatabaseTransaction(database):
-        cameras = _write_images(database, graph, keypoints, config, shared)
-        geometries = verify(graph.edges, keypoints, found, cameras, config.threads)
+        cameras = _write_images(database, graph, keypoints, shared)
+        geometries = verify(graph.edges, keypoints, found, cameras)
         for edge, matches, geometry in zip(graph.edges, found, geometries, strict=True):
             database.write_matches(edge.first + 1, edge.second + 1, matches)
             database.write_two_view_geometry(edge.first + 1, edge.second + 1, geometry)
 
 
 def _write_images(
-    database: Any, graph: ViewGraph, keypoints: Sequence[Points], config: SceneConfig, shared: SharedIntrinsics
+    database: Any, graph: ViewGraph, keypoints: Sequence[Points], shared: SharedIntrinsics
 ) -> list[Any]:
     """Write images, frames, cameras and rigs. Return each image's camera.
 
@@ -106,8 +103,8 @@ def _write_images(
         focal = shared.get(image.digest)
         key = number if focal is None else (image.size, focal)
         if key not in cameras:
-            start = start_focal(image, config) if focal is None else focal
-            cameras[key] = _write_camera(database, number, image.size, start, config)
+            start = start_focal(image) if focal is None else focal
+            cameras[key] = _write_camera(database, number, image.size, start)
         camera = cameras[key]
         taken = pycolmap.Image(
             name=image.name, camera_id=camera.camera_id, image_id=number, keypoints=np.zeros((0, 2))
@@ -121,9 +118,9 @@ def _write_images(
     return used
 
 
-def _write_camera(database: Any, number: int, size: Size, focal: float, config: SceneConfig) -> Any:
+def _write_camera(database: Any, number: int, size: Size, focal: float) -> Any:
     """Write a camera with this initial focal length, and a rig of this camera alone."""
-    camera = pycolmap.Camera.create_from_model_name(number, config.camera_model.value, focal, *size)
+    camera = pycolmap.Camera.create_from_model_name(number, CAMERA_MODEL, focal, *size)
     camera.has_prior_focal_length = True  # a pair that E explains at this focal length counts as calibrated
     database.write_camera(camera, use_camera_id=True)
     rig = pycolmap.Rig(rig_id=number)
@@ -133,7 +130,7 @@ def _write_camera(database: Any, number: int, size: Size, focal: float, config: 
 
 
 def verify(
-    edges: Sequence[Edge], keypoints: Sequence[Points], matches: Sequence[Index], cameras: list[Any], threads: int
+    edges: Sequence[Edge], keypoints: Sequence[Points], matches: Sequence[Index], cameras: list[Any]
 ) -> list[Any]:
     """Return the epipolar geometry of each edge, with its inliers."""
     ransac = {"max_error": MAX_ERROR_PX, "max_num_trials": MAX_TRIALS, "random_seed": SEED}
@@ -147,13 +144,15 @@ def verify(
         ends = cameras[first], points[first], cameras[second], points[second]
         return pycolmap.estimate_two_view_geometry(*ends, index, options)
 
-    with ThreadPoolExecutor(threads) as pool:
-        return list(pool.map(of_edge, edges, matches))
+    return list(map(of_edge, edges, matches))
 
 
-def run_mapper(database: Any, graph: ViewGraph, threads: int) -> Reconstruction:
+def run_mapper(database: Any, graph: ViewGraph) -> Reconstruction:
     """Return the plausible models of the global mapper from a filled database."""
-    seed, common = {"random_seed": SEED}, {"random_seed": SEED, "num_threads": threads}
+    seed, common = (
+        {"random_seed": SEED},
+        {"random_seed": SEED, "num_threads": 1},
+    )  # with more, the last digits vary
     parts = dict.fromkeys(("rotation_averaging", "global_positioning", "retriangulation"), seed)
     required = {"track_required_tracks_per_view": TRACKS_PER_IMAGE} if len(graph.images) > LARGE else {}
     mapper = {**common, **parts, **required}

@@ -75,24 +75,24 @@ def reconstruct_sharing(
     else:
         parts, make = (graph.strong,), reconstruct_connected
     given = shared = given_intrinsics(graph.images, config)
-    found = [make(part, config, shared) for part in parts]
+    found = [make(part, shared) for part in parts]
     tolerance = config.shared_intrinsics if config.cameras is CameraSharing.AUTO else 0.0
     if alike := shared_intrinsics(graph.images, models_of(found), tolerance):
-        anew = [make(part, config, alike) for part in parts]
+        anew = [make(part, alike) for part in parts]
         before, after = (sum(each.observations for each in made) for made in (found, anew))
         if after >= MIN_OBSERVATIONS * before:
             found, shared = anew, alike
     if directory is not None:
         from mkpc_kaggle.scene.colmap import write_files
 
-        write_files(directory, graph.strong, config, shared, models_of(found))
+        write_files(directory, graph.strong, shared, models_of(found))
     if given:
         focals = {each.image.size: each.focal for model in reversed(models_of(found)) for each in model.images}
         shared = {image.digest: focals[image.size] for image in graph.images if image.size in focals}
     return found, shared
 
 
-def reconstruct_component(graph: ViewGraph, config: SceneConfig, shared: SharedIntrinsics) -> Reconstruction:
+def reconstruct_component(graph: ViewGraph, shared: SharedIntrinsics) -> Reconstruction:
     """Return the reconstruction of a connected graph, or the reason for its failure."""
     images, pairs = len(graph.images), len(graph.edges)
     if images < MIN_IMAGES:
@@ -100,15 +100,15 @@ def reconstruct_component(graph: ViewGraph, config: SceneConfig, shared: SharedI
     if pairs < MIN_PAIRS_PER_IMAGE * images:
         few = f"{pairs} pairs connect {images} images; a scene needs {MIN_PAIRS_PER_IMAGE:g} an image"
         return Reconstruction(graph.names, failure=few)
-    return reconstruct_connected(graph, config, shared)
+    return reconstruct_connected(graph, shared)
 
 
-def reconstruct_connected(graph: ViewGraph, config: SceneConfig, shared: SharedIntrinsics) -> Reconstruction:
+def reconstruct_connected(graph: ViewGraph, shared: SharedIntrinsics) -> Reconstruction:
     """Return pycolmap's reconstruction of a graph, or the reason for its failure."""
     try:
         from mkpc_kaggle.scene.colmap import structure_from_motion
 
-        return structure_from_motion(graph, config, shared)
+        return structure_from_motion(graph, shared)
     except ImportError as error:
         return Reconstruction(graph.names, failure=f"pycolmap cannot be imported: {error}")
     except (RuntimeError, ValueError) as error:

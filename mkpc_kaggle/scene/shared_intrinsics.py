@@ -22,9 +22,9 @@ ZOOM_POINTS = 0.5  # of the median image's points; an image that sees more but d
 SharedIntrinsics: TypeAlias = Mapping[str, float]
 
 
-def start_focal(image: BatchImage, config: SceneConfig) -> float:
-    """Return the initial focal length, in pixels, of an image's camera."""
-    return image.focal if config.exif and image.focal else PRIOR_FOCAL * max(image.size)
+def start_focal(image: BatchImage) -> float:
+    """Return the initial focal length, in pixels, of an image's camera: EXIF's, if known."""
+    return image.focal or PRIOR_FOCAL * max(image.size)
 
 
 def given_intrinsics(images: Sequence[BatchImage], config: SceneConfig) -> SharedIntrinsics:
@@ -33,7 +33,7 @@ def given_intrinsics(images: Sequence[BatchImage], config: SceneConfig) -> Share
         return {}
     starts = {}
     for size in {image.size for image in images}:
-        known = [image.focal for image in images if image.size == size and image.focal and config.exif]
+        known = [image.focal for image in images if image.size == size and image.focal]
         starts[size] = float(np.median(known)) if known else PRIOR_FOCAL * max(size)
     return {image.digest: starts[image.size] for image in images}
 

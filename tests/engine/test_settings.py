@@ -18,7 +18,7 @@ CLASSICAL = load_recipe("classical")
         ({"name": "other", "description": "the same"}, False, False),
         ({"magsac": replace(CLASSICAL.magsac, threshold=0.21)}, True, True),
         ({"focal": None}, True, True),
-        ({"scene": SceneConfig(exif=False)}, False, True),
+        ({"scene": SceneConfig(pairs_per_image=1)}, False, True),
         ({"scene": None}, False, True),
         ({"mkpc": replace(CLASSICAL.mkpc, eps=0.1)}, False, False),
     ],

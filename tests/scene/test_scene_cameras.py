@@ -20,32 +20,30 @@ TALL = BatchImage("tall", "tall", Size(*reversed(SIZE)))
 GUESS = 1.1 * max(SIZE)
 
 
-def config(cameras: str = "auto", **more: bool) -> SceneConfig:
+def config(cameras: str) -> SceneConfig:
     scene = for_cameras(Recipe((Unit(1, "sift", 640),)), cameras).scene
     assert scene is not None
-    return replace(scene, **more)
+    return scene
 
 
 def focals_of(directory: Path, settings: SceneConfig) -> list[float]:
     """The focal length that each image's camera starts with, and the number of cameras."""
     graph = ViewGraph((*IMAGES, TALL), ())
-    write_files(directory, graph, settings, given_intrinsics(graph.images, settings), [])
+    write_files(directory, graph, given_intrinsics(graph.images, settings), [])
     with pycolmap.Database.open(str(directory / "database.db")) as database:
         known = {camera.camera_id: camera.focal_length for camera in database.read_all_cameras()}
         return [*(known[image.camera_id] for image in database.read_all_images()), len(known)]
 
 
 @pytest.mark.parametrize(
-    ("cameras", "exif", "focals"),
+    ("cameras", "focals"),
     [
-        ("auto", True, [GUESS, 900, 1000, 1040, GUESS, 5]),
-        ("image", False, [GUESS] * 5 + [5]),
-        ("folder", True, [1000] * 4 + [GUESS, 2]),  # the median of each size
-        ("folder", False, [GUESS] * 5 + [2]),
+        ("auto", [GUESS, 900, 1000, 1040, GUESS, 5]),
+        ("folder", [1000] * 4 + [GUESS, 2]),  # the median of each size
     ],
 )
-def test_cameras_start_with_the_focal_length_of_exif(tmp_path, cameras, exif, focals):
-    assert focals_of(tmp_path, config(cameras, exif=exif)) == pytest.approx(focals)
+def test_cameras_start_with_the_focal_length_of_exif(tmp_path, cameras, focals):
+    assert focals_of(tmp_path, config(cameras)) == pytest.approx(focals)
 
 
 def test_a_focal_length_of_exif_is_not_fixed():

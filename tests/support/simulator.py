@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine import budget, losses, plan, scenes
+from mkpc_kaggle.engine import budget, jobs, plan, scenes
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.engine import Engine
 from mkpc_kaggle.engine.jobs import (
@@ -64,7 +64,7 @@ MECHANISMS: dict[str, tuple[tuple[object, str, object], ...]] = {  # changes tha
     "short jobs": ((plan, "JOB_SHARE", math.inf),),
     "connect share": ((plan, "CONNECT_SHARE", 1.0),),
     "patience": ((plan, "HANG_FACTOR", math.inf),),
-    "second try": ((losses, "MAX_TRIES", 1),),
+    "second try": ((jobs, "MAX_TRIES", 1),),
     "end of tries": ((plan, "MAX_FAILED_PAIRS", 10**9),),
 }
 
