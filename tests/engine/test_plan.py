@@ -265,7 +265,7 @@ def test_more_time_never_means_fewer_units():
 
 
 def test_random_runs_are_never_late_never_lose_a_row_and_use_their_time():
-    runs = [without_records(simulate(random_scenario(seed, pairs=150))) for seed in range(20)]
+    runs = [without_records(simulate(random_scenario(seed, pairs=150))) for seed in range(12)]
     assert max(run.late for run in runs) == 0
     assert sum(run.lost for run in runs) == 0
     fit = [run for run in runs if run.scenes_fit]
@@ -300,7 +300,7 @@ def test_a_mechanism_that_is_off_costs_units_or_scenes(monkeypatch, mechanism):
 
 def test_planning_a_job_does_not_take_much_longer_for_many_pairs():
     seconds_per_pair = []
-    for count in (300, 3_000):
+    for count in (200, 2_000):
         start = time.thread_time()  # whatever else the machine does
         simulate(Scenario(count, (0.1, 0.5, 0.5), 2, count))
         seconds_per_pair.append((time.thread_time() - start) / count)
