@@ -3,7 +3,7 @@
 python -m benchmarks.pairs [--rounds 3] [--only loftr,roma] [--precision bfloat16]
 
 Each round encodes and matches both images with one matcher after the other; figures are medians. kornia's LoFTR
-and ALIKED are measured too. The memory is the maximum of a separate process, including Python and PyTorch. Weights
+is measured too. The memory is the maximum of a separate process, including Python and PyTorch. Weights
 are stand-ins or random, and matchers detect the maximum number of keypoints. Views have the sizes of the recipes.
 Set ``THP_MEM_ALLOC_ENABLE=1``, as workers do.
 """
@@ -23,7 +23,7 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from kornia.feature import ALIKED, LoFTR
+from kornia.feature import LoFTR
 from numpy.typing import NDArray
 from sklearn.datasets import load_sample_images
 from torch import nn
@@ -129,17 +129,10 @@ def kornias_loftr(placement: Placement) -> Run:
     return lambda: len(network({"image0": image0, "image1": image1})["keypoints0"])
 
 
-def kornias_aliked(placement: Placement) -> Run:
-    """Return a run of kornia's ALIKED in float32, which counts the keypoints of both images."""
-    network = filled(ALIKED("aliked-n16", max_num_keypoints=KEYPOINTS, detection_threshold=0.0).eval(), "aliked")
-    images = [image_batch([each], "cpu") for each in pictures_of(SPARSE, Colour.RGB, 32)]
-    return lambda: sum(int(network(image)[0].n) for image in images)
-
-
 RUNS: dict[str, Callable[[Placement], Run]] = {name: partial(run_of, case) for name, case in CASES.items()}
-RUNS |= {"kornia's loftr": kornias_loftr, "kornia's aliked, keypoints": kornias_aliked}
+RUNS["kornia's loftr"] = kornias_loftr
 SIZES = {name: case.size for name, case in CASES.items()}
-SIZES |= {"kornia's loftr": SEMI_DENSE, "kornia's aliked, keypoints": SPARSE}
+SIZES["kornia's loftr"] = SEMI_DENSE
 
 
 def seconds_of(run: Run) -> float:
