@@ -18,7 +18,7 @@ from mkpc_kaggle.scene.reconstruct import Solution
 
 MIN_PAIRS = 2  # they can connect three images
 START_S = 3.0  # that a process takes to begin
-MATCH_S = 5e-4  # that a match adds to a reconstruction, before any was measured
+MATCH_S = 5e-4  # that a match adds to a reconstruction: before any was measured, and before one hangs
 FORECAST_MARGIN = 1.5  # of a forecast from the matches of earlier scenes
 NOT_RECONSTRUCTED = "not reconstructed in time"
 
