@@ -74,6 +74,7 @@ class Progress:
 
     def note(self, text: str) -> None:
         _print(self._erase + text, self._stream)
+        self._line = "" if self._erase else self._line
 
     def close(self) -> None:
         """End the line on a terminal, or print the pending line."""
