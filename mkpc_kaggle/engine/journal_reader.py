@@ -8,7 +8,7 @@ import os
 import sqlite3
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import wraps
 from pathlib import Path
@@ -30,7 +30,7 @@ from mkpc_kaggle.scene.choose import Choice, Reason
 from mkpc_kaggle.scene.reconstruction import RegisteredImage, SfmModel, Sigmas
 from mkpc_kaggle.scene.view_graph import BatchImage
 
-FORMAT = 13
+FORMAT = 14
 FILE_NAME = "journal.sqlite"
 
 # SQLite's primary result codes that say nothing against a file: no permission, busy, locked, read only, input or
@@ -39,14 +39,14 @@ UNUSABLE = {3, 5, 6, 8, 10, 13, 14}
 # Errors of reading what no run writes.
 DAMAGE = (sqlite3.Error, ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RecursionError)
 
-UNIT_COLUMNS = tuple(each.name for each in fields(UnitRecord) if each.name != "inliers")
-UNITS = f"""SELECT position, revision, decode_seconds, cluster_seconds, {", ".join(UNIT_COLUMNS)}
-    FROM current_points ORDER BY position, number"""
-SCENE_COLUMNS = tuple(each.name for each in fields(SceneRecord) if each.name != "models")
+SUMS = ("matches", "inliers", "decode_seconds", "encode_seconds", "match_seconds", "cluster_seconds")
+UNITS = """SELECT position, revision, unit, stage, matches, decode_seconds, encode_seconds, match_seconds,
+    cluster_seconds, failure, note, keypoints FROM current_points ORDER BY position, number"""
 REGIONS = """SELECT position, r.* FROM current_points c JOIN region r ON r.points = c.revision
     ORDER BY position, c.number DESC, r.image"""  # the first unit of stage 2 comes last
 
 Method = TypeVar("Method", bound=Callable[..., Any])
+Value = TypeVar("Value")
 
 
 class EventKind(StrEnum):
@@ -122,7 +122,7 @@ class JournalReader:
         # A directory that cannot be written has no room for SQLite's locks, and needs none.
         mode = "mode=ro" if os.access(directory, os.W_OK) else "mode=ro&immutable=1"
         with ExitStack() as opened, undamaged(path):
-            self._db = opened.enter_context(closing(connected(f"{path.resolve().as_uri()}?{mode}", timeout=5.0)))
+            self._db = opened.enter_context(closing(connected(path, mode, timeout=5.0)))
             self._db.execute("BEGIN")
             if check:
                 self._check()
@@ -162,23 +162,21 @@ class JournalReader:
         inliers: dict[int, int] = {}
         for row in self._rows("SELECT * FROM standing_estimate"):
             inliers |= zip(map(int, row["inputs"].split()), map(int, row["inliers"].split()), strict=True)
+            focals, rotation = (tuple(map(float, row[name].split())) for name in ("focals", "rotation"))
             values[row["position"]] |= {
                 "pair_fundamental": matrix_of(row["F"]),
                 "magsac_fundamental": None if row["magsac"] is None else matrix_of(row["magsac"]),
                 "failure": row["failure"],
                 "estimate_seconds": row["seconds"],
-                "stats": _stats(row),
+                "stats": value_of(EstimateStats, row, focals=focals, rotation=rotation),
             }
         for row in self._rows(UNITS):
-            found = values[row["position"]]
-            unit = {name: row[name] for name in UNIT_COLUMNS}
-            found.setdefault("units", []).append(UnitRecord(inliers=inliers.get(row["revision"], 0), **unit))
-            for name in ("decode_seconds", "cluster_seconds"):
-                found[name] = found.get(name, 0.0) + row[name]
+            found, counts = values[row["position"]], dict(row) | {"inliers": inliers.get(row["revision"], 0)}
+            found.setdefault("units", []).append(value_of(UnitRecord, counts))
+            found |= {name: found.get(name, 0) + counts[name] for name in SUMS}
         for row in self._rows(REGIONS):
-            box = Box(row["left"], row["top"], row["right"], row["bottom"])
-            region = CriticalRegion(box, RegionReason(row["reason"]), row["clusters"], row["kept"])
-            found = values[row["position"]]
+            found, reason = values[row["position"]], RegionReason(row["reason"])
+            region = value_of(CriticalRegion, row, box=value_of(Box, row), reason=reason)
             found["regions"] = (region,) if row["image"] == 0 else (*found["regions"], region)
         choices = self.choices()
         rows = range(sum(pair["has_row"] for pair in pairs))
@@ -199,9 +197,8 @@ class JournalReader:
         """Return the standing reconstruction of each batch, or its latest row in another table."""
         scenes = {}
         for scene in self._rows(f"SELECT * FROM {table} ORDER BY batch, revision"):
-            values = {name: scene[name] for name in SCENE_COLUMNS}
             models = self._rows("SELECT * FROM model WHERE scene = ? ORDER BY number", scene["revision"])
-            scenes[scene["batch"]] = SceneRecord(**values, models=tuple(map(self._model, models)))
+            scenes[scene["batch"]] = value_of(SceneRecord, scene, models=tuple(map(self._model, models)))
         return scenes
 
     @reading
@@ -250,11 +247,21 @@ class JournalReader:
             raise sqlite3.DatabaseError(trouble)
 
 
-def connected(uri: str, timeout: float = 1.0) -> sqlite3.Connection:
-    """Return a connection whose rows have names, without transactions of Python's own."""
-    db = sqlite3.connect(uri, uri=uri.startswith("file:"), timeout=timeout, isolation_level=None)
+def connected(path: Path | str, options: str = "", timeout: float = 1.0) -> sqlite3.Connection:
+    """Return a connection whose rows have names, without transactions of Python's own.
+
+    ``path`` is a file, opened with ``options`` of an SQLite URI, or ":memory:".
+    """
+    uri = f"{path.resolve().as_uri()}?{options}" if isinstance(path, Path) else f"file:{path}"
+    db = sqlite3.connect(uri, uri=True, timeout=timeout, isolation_level=None)
     db.row_factory = sqlite3.Row
     return db
+
+
+def value_of(kind: type[Value], row: sqlite3.Row | dict[str, Any], **more: Any) -> Value:
+    """Return a dataclass from the columns with the names of its fields; ``more`` are its other fields."""
+    names = [name for name in kind.__annotations__ if name not in more]
+    return kind(**{name: row[name] for name in names}, **more)
 
 
 def to_blob(matches: Matches) -> bytes:
@@ -274,12 +281,6 @@ def matrix_of(blob: bytes) -> Matrix3:
     if not np.isfinite(matrix).all() or not matrix.any():
         raise ValueError("a matrix is zero or not finite")
     return matrix
-
-
-def _stats(row: sqlite3.Row) -> EstimateStats:
-    x, y, z = floats(row["rotation"], 3).tolist()
-    focals, rotation = (row["focal0"], row["focal1"]), (x, y, z)
-    return EstimateStats(row["candidates"], row["cost"], row["magsac_cost"], focals, row["support"], rotation)
 
 
 def _registered(row: sqlite3.Row) -> RegisteredImage:

@@ -97,9 +97,8 @@ CREATE TABLE estimate (  -- of a pair, from its points
     candidates INTEGER NOT NULL,
     cost REAL NOT NULL,
     magsac_cost REAL NOT NULL,
-    focal0 REAL NOT NULL,
-    focal1 REAL NOT NULL,
-    rotation BLOB NOT NULL CHECK (length(rotation) = 24),  -- of an E by its inliers: the axis times radians
+    focals TEXT NOT NULL,  -- two numbers, in pixels
+    rotation TEXT NOT NULL,  -- of an E by its inliers: the axis times radians, three numbers
     seconds REAL NOT NULL,
     UNIQUE (pair, settings, inputs)
 ) STRICT;
