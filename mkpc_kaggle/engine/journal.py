@@ -129,9 +129,7 @@ class Journal(JournalReader):
     @reading
     def digests(self) -> dict[str, str]:
         """Return the digest of each image of a wanted pair that was looked at, by name."""
-        query = """SELECT DISTINCT image.name, digest FROM wanted_pair w JOIN pair ON pair.id = w.pair
-            JOIN image ON image.name IN (image0, image1)"""
-        return dict(map(tuple, self._rows(query)))
+        return dict(map(tuple, self._rows("SELECT DISTINCT name, digest FROM pair_image")))
 
     # The state of the run
 

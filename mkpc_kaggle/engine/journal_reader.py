@@ -40,11 +40,6 @@ UNUSABLE = {3, 5, 6, 8, 10, 13, 14}
 DAMAGE = (sqlite3.Error, ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RecursionError)
 
 SUMS = ("matches", "inliers", "decode_seconds", "encode_seconds", "match_seconds", "cluster_seconds")
-UNITS = """SELECT position, revision, unit, stage, matches, decode_seconds, encode_seconds, match_seconds,
-    cluster_seconds, failure, note, keypoints FROM current_points ORDER BY position, number"""
-REGIONS = """SELECT position, r.* FROM current_points c JOIN region r ON r.points = c.revision
-    ORDER BY position, c.number DESC, r.image"""  # the first unit of stage 2 comes last
-
 Method = TypeVar("Method", bound=Callable[..., Any])
 Value = TypeVar("Value")
 
@@ -170,11 +165,12 @@ class JournalReader:
                 "estimate_seconds": row["seconds"],
                 "stats": value_of(EstimateStats, row, focals=focals, rotation=rotation),
             }
-        for row in self._rows(UNITS):
+        for row in self._rows("SELECT * FROM unit_result ORDER BY position, number"):
             found, counts = values[row["position"]], dict(row) | {"inliers": inliers.get(row["revision"], 0)}
             found.setdefault("units", []).append(value_of(UnitRecord, counts))
             found |= {name: found.get(name, 0) + counts[name] for name in SUMS}
-        for row in self._rows(REGIONS):
+        # The regions of the first unit of stage 2 come last.
+        for row in self._rows("SELECT * FROM region_result ORDER BY position, number DESC, image"):
             found, reason = values[row["position"]], RegionReason(row["reason"])
             region = value_of(CriticalRegion, row, box=value_of(Box, row), reason=reason)
             found["regions"] = (region,) if row["image"] == 0 else (*found["regions"], region)
@@ -185,11 +181,9 @@ class JournalReader:
     @reading
     def choices(self) -> dict[int, Choice]:
         """Return the choices of the standing scenes by the positions of their pairs."""
-        query = """SELECT w.position, c.F, c.reason FROM standing_scene s JOIN choice c ON c.scene = s.revision
-            JOIN wanted_pair w ON w.pair = c.pair AND w.batch = s.batch"""
         return {
-            position: Choice(None if F is None else matrix_of(F), Reason(why))
-            for position, F, why in self._rows(query)
+            position: Choice(None if F is None else matrix_of(F), Reason(reason))
+            for position, F, reason in self._rows("SELECT position, F, reason FROM pair_choice")
         }
 
     @reading
@@ -216,10 +210,8 @@ class JournalReader:
     @reading
     def images(self, position: int) -> tuple[BatchImage, ...]:
         """Return both images of a pair as they were last looked at, or nothing."""
-        query = """SELECT i.* FROM wanted_pair w JOIN pair ON pair.id = w.pair
-            JOIN image i ON i.name = {} WHERE position = ?"""
-        rows = [row for end in ("image0", "image1") for row in self._rows(query.format(end), position)]
-        images = tuple(BatchImage(name, digest, Size(w, h), focal) for name, digest, w, h, focal in rows)
+        rows = self._rows("SELECT * FROM pair_image WHERE position = ? ORDER BY side", position)
+        images = tuple(value_of(BatchImage, row, size=value_of(Size, row)) for row in rows)
         return images if len(images) == 2 else ()
 
     @reading
@@ -230,8 +222,13 @@ class JournalReader:
 
     def _model(self, row: sqlite3.Row) -> SfmModel:
         query = "SELECT * FROM camera WHERE scene = ? AND model = ? ORDER BY rowid"
-        cameras = tuple(map(_registered, self._rows(query, row["scene"], row["number"])))
-        return SfmModel(cameras, floats(row["points"], -1, 3), row["reprojection_error"])
+        images = []
+        for each in self._rows(query, row["scene"], row["number"]):
+            image = BatchImage(each["name"], each["digest"], value_of(Size, each))
+            camera = Camera(floats(each["K"], 3, 3), floats(each["R"], 3, 3), floats(each["t"], 3))
+            sigmas = value_of(Sigmas, each)
+            images.append(RegisteredImage(image, camera, each["points"], () if None in sigmas else sigmas))
+        return SfmModel(tuple(images), floats(row["points"], -1, 3), row["reprojection_error"])
 
     def _rows(self, query: str, *values: Any) -> list[sqlite3.Row]:
         return self._db.execute(query, values).fetchall()
@@ -259,9 +256,8 @@ def connected(path: Path | str, options: str = "", timeout: float = 1.0) -> sqli
 
 
 def value_of(kind: type[Value], row: sqlite3.Row | dict[str, Any], **more: Any) -> Value:
-    """Return a dataclass from the columns with the names of its fields; ``more`` are its other fields."""
-    names = [name for name in kind.__annotations__ if name not in more]
-    return kind(**{name: row[name] for name in names}, **more)
+    """Return a dataclass or named tuple from columns with the names of its fields; ``more`` are other fields."""
+    return kind(**{name: row[name] for name in kind.__annotations__ if name not in more}, **more)
 
 
 def to_blob(matches: Matches) -> bytes:
@@ -281,13 +277,6 @@ def matrix_of(blob: bytes) -> Matrix3:
     if not np.isfinite(matrix).all() or not matrix.any():
         raise ValueError("a matrix is zero or not finite")
     return matrix
-
-
-def _registered(row: sqlite3.Row) -> RegisteredImage:
-    image = BatchImage(row["name"], row["digest"], Size(row["width"], row["height"]))
-    camera = Camera(floats(row["K"], 3, 3), floats(row["R"], 3, 3), floats(row["t"], 3))
-    sigmas = Sigmas(row["rotation"], row["centre"], row["focal"])
-    return RegisteredImage(image, camera, row["points"], () if None in sigmas else sigmas)
 
 
 def floats(blob: bytes, *shape: int) -> NDArray[np.float64]:
