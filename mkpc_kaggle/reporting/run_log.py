@@ -63,10 +63,8 @@ class RunTables:
     def unit_means(self) -> pd.DataFrame:
         """Each ``unit``, the number of ``pairs`` it ran on, its mean ``matches``, ``inliers`` and ``seconds``."""
         units = self.units.assign(seconds=self.units["encode_seconds"] + self.units["match_seconds"])
-        by_unit = units.groupby("unit", sort=False)
-        means = by_unit[["matches", "inliers", "seconds"]].mean()
-        means.insert(0, "pairs", by_unit.size())
-        return means.reset_index()
+        means = {name: (name, "mean") for name in ("matches", "inliers", "seconds")}
+        return units.groupby("unit", sort=False).agg(pairs=("pair", "size"), **means).reset_index()
 
     def unit_reasons(self, column: str = "failure") -> list[str]:
         """Return why units failed or, by ``note``, ran otherwise, and on how many pairs; most frequent first."""
