@@ -2,11 +2,12 @@
 
 import json
 import sqlite3
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack, closing, suppress
 from dataclasses import asdict
+from functools import wraps
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from mkpc_kaggle.engine.journal_reader import (
     About,
     Event,
     JournalReader,
+    Method,
     connected,
     reading,
     to_blob,
@@ -30,6 +32,24 @@ from mkpc_kaggle.scene.choose import Choice
 LOCK_NAME = "journal.lock"
 SCHEMA = Path(__file__).with_name("schema.sql")
 MIN_SQLITE = (3, 37, 0)  # STRICT tables
+
+
+def saving(save: Method) -> Method:
+    """Let a method be one transaction. If the file takes no more, continue in memory."""
+
+    @wraps(save)
+    def transaction(self: "Journal", *args: Any, **named: Any) -> None:
+        try:
+            with self._db:
+                self._db.execute("BEGIN")
+                save(self, *args, **named)
+        except sqlite3.OperationalError as error:
+            if self.is_in_memory:
+                raise
+            self._continue_in_memory(str(error))
+            transaction(self, *args, **named)
+
+    return cast(Method, transaction)
 
 
 class Journal(JournalReader):
@@ -48,19 +68,21 @@ class Journal(JournalReader):
         self.trouble = ""
         with ExitStack() as opened, writing(f"the work directory {directory}"):  # stays open if all is well
             directory.mkdir(parents=True, exist_ok=True)
-            self._lock = opened.enter_context(closing(opened_file(lock)))
+            for path in (lock, self.path):
+                if path.exists() and not path.is_file():
+                    raise UserError(f"{path} is not a regular file; remove it, or name another --work-dir")
             with undamaged(lock, "remove it"):
+                self._lock = opened.enter_context(closing(connected(lock)))
                 self._lock.execute("BEGIN EXCLUSIVE")  # another file: a journal can be read while its run works
             if fresh:
                 for ending in ("", "-journal", "-wal", "-shm"):
                     directory.joinpath(FILE_NAME + ending).unlink(missing_ok=True)
-            self._file = self._db = opened.enter_context(closing(opened_file(self.path)))
             with undamaged(self.path):
+                self._file = self._db = opened.enter_context(closing(connected(self.path)))
                 try:
                     self._open()
                 except sqlite3.OperationalError as error:  # a full disk
-                    self.trouble = str(error)
-                    self.continue_in_memory()
+                    self._continue_in_memory(str(error))
                     self._open()
             opened.pop_all()
 
@@ -80,6 +102,7 @@ class Journal(JournalReader):
 
     # The request
 
+    @saving
     def want(
         self,
         pairs: Sequence[WantedPair],
@@ -88,30 +111,25 @@ class Journal(JournalReader):
         about: About | None = None,
     ) -> None:
         """Replace the request: pairs, units with their settings, settings of each batch's scene."""
-
-        def write(db: sqlite3.Connection) -> None:
-            for table in ("wanted_unit", "wanted_pair", "wanted_batch", "about"):
-                db.execute(f"DELETE FROM {table}")
-            insert(db, "about", value=json.dumps(asdict(about or About())))
-            for number, (unit, settings) in enumerate(units):
-                insert(db, "wanted_unit", number=number, unit=unit.name, stage=unit.stage, settings=settings)
-            for batch, settings in batches.items():
-                insert(db, "wanted_batch", batch=batch, settings=settings)
-            ends = [(*map(printable, each.names), *each.pair.turns) for each in pairs]
-            db.executemany("INSERT OR IGNORE INTO pair (image0, image1, turns0, turns1) VALUES (?, ?, ?, ?)", ends)
-            ids = {tuple(row)[1:]: row["id"] for row in db.execute("SELECT * FROM pair")}
-            for position, (each, end) in enumerate(zip(pairs, ends, strict=True)):
-                asked = {"id": each.pair.id, "batch": each.pair.group, "settings": each.settings}
-                insert(db, "wanted_pair", position=position, pair=ids[end], has_row=each.has_row, **asked)
-
-        self._write(write)
+        for table in ("wanted_unit", "wanted_pair", "wanted_batch", "about"):
+            self._db.execute(f"DELETE FROM {table}")
+        self._insert("about", value=json.dumps(asdict(about or About())))
+        for number, (unit, settings) in enumerate(units):
+            self._insert("wanted_unit", number=number, unit=unit.name, stage=unit.stage, settings=settings)
+        for batch, settings in batches.items():
+            self._insert("wanted_batch", batch=batch, settings=settings)
+        ends = [(*map(printable, each.names), *each.pair.turns) for each in pairs]
+        add = "INSERT OR IGNORE INTO pair (image0, image1, turns0, turns1) VALUES (?, ?, ?, ?)"
+        self._db.executemany(add, ends)
+        ids = {tuple(row)[1:]: row["id"] for row in self._rows("SELECT * FROM pair")}
+        for position, (each, end) in enumerate(zip(pairs, ends, strict=True)):
+            asked = {"id": each.pair.id, "batch": each.pair.group, "settings": each.settings}
+            self._insert("wanted_pair", position=position, pair=ids[end], has_row=each.has_row, **asked)
 
     @reading
     def digests(self) -> dict[str, str]:
         """Return the digest of each image of a wanted pair that was looked at, by name."""
-        query = """SELECT DISTINCT image.name, digest FROM wanted_pair w JOIN pair ON pair.id = w.pair
-            JOIN image ON image.name IN (image0, image1)"""
-        return dict(map(tuple, self._rows(query)))
+        return dict(map(tuple, self._rows("SELECT DISTINCT name, digest FROM pair_image")))
 
     # The state of the run
 
@@ -149,107 +167,88 @@ class Journal(JournalReader):
 
     # Results
 
+    @saving
     def save_digest(self, name: str, digest: str) -> None:
         """Save that an image has another content than it had."""
-        self._write(lambda db: db.execute("UPDATE image SET digest = ? WHERE name = ?", [digest, printable(name)]))
+        self._db.execute("UPDATE image SET digest = ? WHERE name = ?", [digest, printable(name)])
 
-    def save_outcomes(self, outcomes: Iterable[Outcome], settings: Mapping[str, str]) -> None:
+    @saving
+    def save_outcomes(self, outcomes: Sequence[Outcome], settings: Mapping[str, str]) -> None:
         """Save what a job found on its pairs, all or nothing; ``settings`` by the names of units."""
+        for outcome in outcomes:
+            failure = [printable(outcome.failure), outcome.index]
+            self._db.execute("UPDATE wanted_pair SET failure = ? WHERE position = ?", failure)
+            for image in outcome.images:
+                self._insert("image", **image.size._asdict(), **columns(image, "size"))
+            seconds = {"decode_seconds": outcome.decode_seconds, "cluster_seconds": outcome.cluster_seconds}
+            row = {"pair": self._wanted(outcome.index)["pair"]}
+            row |= {f"digest{side}": image.digest for side, image in enumerate(outcome.images)}
+            for found in outcome.found:
+                row |= columns(found, "unit", "warm_up") | seconds | {"settings": settings[found.unit.name]}
+                row |= {"matches": len(found.matches), "points": to_blob(found.matches)}
+                revision = self._insert("points", **row)
+                seconds = dict.fromkeys(seconds, 0.0)  # the pair's, in its first row
+                for side, region in enumerate((outcome.regions or ()) if found.unit.stage == 2 else ()):
+                    box = columns(region.box)
+                    self._insert("region", points=revision, image=side, **columns(region, "box"), **box)
 
-        def write(db: sqlite3.Connection) -> None:
-            for outcome in outcomes:
-                pair = wanted(db, outcome.index)["pair"]
-                failure = [printable(outcome.failure), outcome.index]
-                db.execute("UPDATE wanted_pair SET failure = ? WHERE position = ?", failure)
-                for image in outcome.images:
-                    width, height = image.size
-                    names = {"name": image.name, "digest": image.digest, "focal": image.focal}
-                    insert(db, "image", width=width, height=height, **names)
-                seconds = {"decode_seconds": outcome.decode_seconds, "cluster_seconds": outcome.cluster_seconds}
-                for found in outcome.found:
-                    row = columns(found, "unit", "warm_up", "matches")
-                    row |= {"matches": len(found.matches), "points": to_blob(found.matches)}
-                    digests = {f"digest{side}": image.digest for side, image in enumerate(outcome.images)}
-                    row |= {"pair": pair, "settings": settings[found.unit.name], **digests, **seconds}
-                    revision = insert(db, "points", **row)
-                    seconds = dict.fromkeys(seconds, 0.0)  # the pair's, in its first row
-                    for side, region in enumerate((outcome.regions or ()) if found.unit.stage == 2 else ()):
-                        row = columns(region, "box") | columns(region.box)
-                        insert(db, "region", points=revision, image=side, **row)
+    @saving
+    def save_estimates(self, estimates: Sequence[Estimated]) -> None:
+        for each in estimates:
+            pair, row = self._wanted(each.index), columns(each, "index", "stats") | columns(each.stats)
+            self._insert("estimate", pair=pair["pair"], settings=pair["settings"], **row)
 
-        self._write(write)
-
-    def save_estimates(self, estimates: Iterable[Estimated]) -> None:
-        def write(db: sqlite3.Connection) -> None:
-            for each in estimates:
-                pair, stats = wanted(db, each.index), each.stats
-                row = columns(each, "index", "stats") | columns(stats, "focals", "rotation")
-                row |= {"focal0": stats.focals[0], "focal1": stats.focals[1], "rotation": np.array(stats.rotation)}
-                row |= {"pair": pair["pair"], "settings": pair["settings"]}
-                insert(db, "estimate", **row)
-
-        self._write(write)
-
+    @saving
     def save_scene(
         self, scene: SceneRecord, inputs: str, pairs: Sequence[PairPoints], choices: Sequence[Choice]
     ) -> None:
         """Save the reconstruction of a batch with the choices for its pairs."""
+        (asked,) = self._rows("SELECT settings FROM wanted_batch WHERE batch = ?", printable(scene.batch))
+        row = columns(scene, "models")
+        revision = self._insert("scene", settings=asked["settings"], inputs=inputs, **row)
+        for number, model in enumerate(scene.models):
+            self._insert("model", scene=revision, number=number, **columns(model, "images", "colmap"))
+            for found in model.images:
+                row = columns(found.camera) | columns(found.image, "size", "focal")
+                row |= found.image.size._asdict() | (found.sigmas._asdict() if found.sigmas else {})
+                self._insert("camera", scene=revision, model=number, points=found.points, **row)
+        for pair, chosen in zip(pairs, choices, strict=True):
+            number = self._wanted(pair.index)["pair"]
+            self._insert("choice", scene=revision, pair=number, inputs=pair.revisions, **columns(chosen))
 
-        def write(db: sqlite3.Connection) -> None:
-            (asked,) = db.execute("SELECT settings FROM wanted_batch WHERE batch = ?", [printable(scene.batch)])
-            row = columns(scene, "models")
-            revision = insert(db, "scene", settings=asked["settings"], inputs=inputs, **row)
-            for number, model in enumerate(scene.models):
-                row = columns(model, "images", "colmap")
-                insert(db, "model", scene=revision, number=number, **row)
-                for found in model.images:
-                    row = columns(found.camera) | columns(found.image, "size", "focal")
-                    row |= found.image.size._asdict() | (found.sigmas._asdict() if found.sigmas else {})
-                    insert(db, "camera", scene=revision, model=number, points=found.points, **row)
-            for pair, chosen in zip(pairs, choices, strict=True):
-                row = {"pair": wanted(db, pair.index)["pair"], "inputs": pair.revisions} | columns(chosen)
-                insert(db, "choice", scene=revision, **row)
-
-        self._write(write)
-
+    @saving
     def forget_scene(self, batch: str) -> None:
         """Delete the scenes of a batch: its files were removed."""
-        self._write(lambda db: db.execute("DELETE FROM scene WHERE batch = ?", [batch]))
+        self._db.execute("DELETE FROM scene WHERE batch = ?", [batch])
 
+    @saving
     def save_feature(self, digest: str, settings: str, value: bytes) -> None:
-        self._write(lambda db: insert(db, "feature", digest=digest, settings=settings, value=value))
+        self._insert("feature", digest=digest, settings=settings, value=value)
 
     def note(self, event: Event) -> None:
         """Note an event; it is lost if the journal cannot be written."""
         with suppress(sqlite3.Error):
-            insert(self._db, "event", **columns(event))
+            self._insert("event", **columns(event))
 
-    def _write(self, write: Callable[[sqlite3.Connection], object]) -> None:
-        """Run a transaction. If the file takes no more, continue in memory."""
-        try:
-            self._transact(write)
-        except sqlite3.OperationalError as error:
-            if self.is_in_memory:
-                raise
-            self.trouble = str(error)
-            self.continue_in_memory()
-            self._transact(write)
+    def _insert(self, table: str, **row: Any) -> int:
+        """Insert or replace a row, values by the names of columns. Return its number."""
+        names, marks = ", ".join(f'"{name}"' for name in row), ", ".join("?" * len(row))
+        query = f"REPLACE INTO {table} ({names}) VALUES ({marks}) RETURNING rowid"
+        return int(self._rows(query, *map(stored, row.values()))[0][0])
 
-    def continue_in_memory(self) -> None:
+    def _wanted(self, position: int) -> sqlite3.Row:
+        return self._rows("SELECT * FROM wanted_pair WHERE position = ?", position)[0]
+
+    def _continue_in_memory(self, trouble: str) -> None:
         """Copy everything into memory, and write there from now on."""
-        memory = connected(":memory:")
+        self.trouble, memory = trouble, connected(":memory:")
         try:
             self._file.backup(memory)
         except sqlite3.OperationalError:  # a full disk has no room for SQLite's locks either
-            with closing(connected(f"{self.path.resolve().as_uri()}?immutable=1")) as file:
+            with closing(connected(self.path, "immutable=1")) as file:
                 file.backup(memory)
         memory.execute("PRAGMA foreign_keys = ON")
         self._db = memory
-
-    def _transact(self, write: Callable[[sqlite3.Connection], object]) -> None:
-        with self._db:
-            self._db.execute("BEGIN")
-            write(self._db)
 
     def _open(self) -> None:
         if self._db.execute("SELECT 1 FROM sqlite_master").fetchone() is None:
@@ -265,13 +264,6 @@ class Journal(JournalReader):
         self._db.execute("PRAGMA foreign_keys = ON")
 
 
-def insert(db: sqlite3.Connection, table: str, **row: Any) -> int:
-    """Insert or replace a row, values by the names of columns. Return its number."""
-    names, marks = ", ".join(f'"{name}"' for name in row), ", ".join("?" * len(row))
-    query = f"REPLACE INTO {table} ({names}) VALUES ({marks}) RETURNING rowid"
-    return int(db.execute(query, list(map(stored, row.values()))).fetchone()[0])
-
-
 def columns(value: Any, *without: str) -> dict[str, Any]:
     """Return the fields of a dataclass, which have the names of columns, except some."""
     return {name: item for name, item in vars(value).items() if name not in without}
@@ -284,17 +276,3 @@ def stored(value: Any) -> Any:
     if isinstance(value, np.ndarray):
         return value.astype(np.float64).tobytes()
     return " ".join(map(str, value)) if isinstance(value, tuple) else value
-
-
-def wanted(db: sqlite3.Connection, position: int) -> sqlite3.Row:
-    """Return the row of a requested pair."""
-    row: sqlite3.Row = db.execute("SELECT * FROM wanted_pair WHERE position = ?", [position]).fetchone()
-    return row
-
-
-def opened_file(path: Path) -> sqlite3.Connection:
-    """Open a database to write. Raise :class:`UserError` if that is impossible."""
-    if path.exists() and not path.is_file():
-        raise UserError(f"{path} is not a regular file; remove it, or name another --work-dir")
-    with undamaged(path):
-        return connected(str(path))

@@ -8,7 +8,7 @@ import os
 import sqlite3
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import wraps
 from pathlib import Path
@@ -39,14 +39,9 @@ UNUSABLE = {3, 5, 6, 8, 10, 13, 14}
 # Errors of reading what no run writes.
 DAMAGE = (sqlite3.Error, ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RecursionError)
 
-UNIT_COLUMNS = tuple(each.name for each in fields(UnitRecord) if each.name != "inliers")
-UNITS = f"""SELECT position, revision, decode_seconds, cluster_seconds, {", ".join(UNIT_COLUMNS)}
-    FROM current_points ORDER BY position, number"""
-SCENE_COLUMNS = tuple(each.name for each in fields(SceneRecord) if each.name != "models")
-REGIONS = """SELECT position, r.* FROM current_points c JOIN region r ON r.points = c.revision
-    ORDER BY position, c.number DESC, r.image"""  # the first unit of stage 2 comes last
-
+SUMS = ("matches", "inliers", "decode_seconds", "encode_seconds", "match_seconds", "cluster_seconds")
 Method = TypeVar("Method", bound=Callable[..., Any])
+Value = TypeVar("Value")
 
 
 class EventKind(StrEnum):
@@ -121,7 +116,7 @@ class JournalReader:
         # A directory that cannot be written has no room for SQLite's locks, and needs none.
         mode = "mode=ro" if os.access(directory, os.W_OK) else "mode=ro&immutable=1"
         with ExitStack() as opened, undamaged(path):
-            self._db = opened.enter_context(closing(connected(f"{path.resolve().as_uri()}?{mode}", timeout=5.0)))
+            self._db = opened.enter_context(closing(connected(path, mode, timeout=5.0)))
             self._db.execute("BEGIN")
             if check:
                 self._check()
@@ -161,23 +156,22 @@ class JournalReader:
         inliers: dict[int, int] = {}
         for row in self._rows("SELECT * FROM standing_estimate"):
             inliers |= zip(map(int, row["inputs"].split()), map(int, row["inliers"].split()), strict=True)
+            focals, rotation = (tuple(map(float, row[name].split())) for name in ("focals", "rotation"))
             values[row["position"]] |= {
                 "pair_fundamental": matrix_of(row["F"]),
                 "magsac_fundamental": None if row["magsac"] is None else matrix_of(row["magsac"]),
                 "failure": row["failure"],
                 "estimate_seconds": row["seconds"],
-                "stats": _stats(row),
+                "stats": value_of(EstimateStats, row, focals=focals, rotation=rotation),
             }
-        for row in self._rows(UNITS):
-            found = values[row["position"]]
-            unit = {name: row[name] for name in UNIT_COLUMNS}
-            found.setdefault("units", []).append(UnitRecord(inliers=inliers.get(row["revision"], 0), **unit))
-            for name in ("decode_seconds", "cluster_seconds"):
-                found[name] = found.get(name, 0.0) + row[name]
-        for row in self._rows(REGIONS):
-            box = Box(row["left"], row["top"], row["right"], row["bottom"])
-            region = CriticalRegion(box, RegionReason(row["reason"]), row["clusters"], row["kept"])
-            found = values[row["position"]]
+        for row in self._rows("SELECT * FROM unit_result ORDER BY position, number"):
+            found, counts = values[row["position"]], dict(row) | {"inliers": inliers.get(row["revision"], 0)}
+            found.setdefault("units", []).append(value_of(UnitRecord, counts))
+            found |= {name: found.get(name, 0) + counts[name] for name in SUMS}
+        # The regions of the first unit of stage 2 come last.
+        for row in self._rows("SELECT * FROM region_result ORDER BY position, number DESC, image"):
+            found, reason = values[row["position"]], RegionReason(row["reason"])
+            region = value_of(CriticalRegion, row, box=value_of(Box, row), reason=reason)
             found["regions"] = (region,) if row["image"] == 0 else (*found["regions"], region)
         choices = self.choices()
         rows = range(sum(pair["has_row"] for pair in pairs))
@@ -186,11 +180,9 @@ class JournalReader:
     @reading
     def choices(self) -> dict[int, Choice]:
         """Return the choices of the standing scenes by the positions of their pairs."""
-        query = """SELECT w.position, c.F, c.reason FROM standing_scene s JOIN choice c ON c.scene = s.revision
-            JOIN wanted_pair w ON w.pair = c.pair AND w.batch = s.batch"""
         return {
-            position: Choice(None if F is None else matrix_of(F), Reason(why))
-            for position, F, why in self._rows(query)
+            position: Choice(None if F is None else matrix_of(F), Reason(reason))
+            for position, F, reason in self._rows("SELECT position, F, reason FROM pair_choice")
         }
 
     @reading
@@ -198,9 +190,8 @@ class JournalReader:
         """Return the standing reconstruction of each batch, or its latest row in another table."""
         scenes = {}
         for scene in self._rows(f"SELECT * FROM {table} ORDER BY batch, revision"):
-            values = {name: scene[name] for name in SCENE_COLUMNS}
             models = self._rows("SELECT * FROM model WHERE scene = ? ORDER BY number", scene["revision"])
-            scenes[scene["batch"]] = SceneRecord(**values, models=tuple(map(self._model, models)))
+            scenes[scene["batch"]] = value_of(SceneRecord, scene, models=tuple(map(self._model, models)))
         return scenes
 
     @reading
@@ -218,10 +209,8 @@ class JournalReader:
     @reading
     def images(self, position: int) -> tuple[BatchImage, ...]:
         """Return both images of a pair as they were last looked at, or nothing."""
-        query = """SELECT i.* FROM wanted_pair w JOIN pair ON pair.id = w.pair
-            JOIN image i ON i.name = {} WHERE position = ?"""
-        rows = [row for end in ("image0", "image1") for row in self._rows(query.format(end), position)]
-        images = tuple(BatchImage(name, digest, Size(w, h), focal) for name, digest, w, h, focal in rows)
+        rows = self._rows("SELECT * FROM pair_image WHERE position = ? ORDER BY side", position)
+        images = tuple(value_of(BatchImage, row, size=value_of(Size, row)) for row in rows)
         return images if len(images) == 2 else ()
 
     @reading
@@ -232,8 +221,13 @@ class JournalReader:
 
     def _model(self, row: sqlite3.Row) -> SfmModel:
         query = "SELECT * FROM camera WHERE scene = ? AND model = ? ORDER BY rowid"
-        cameras = tuple(map(_registered, self._rows(query, row["scene"], row["number"])))
-        return SfmModel(cameras, floats(row["points"], -1, 3), row["reprojection_error"])
+        images = []
+        for each in self._rows(query, row["scene"], row["number"]):
+            image = BatchImage(each["name"], each["digest"], value_of(Size, each))
+            camera = Camera(floats(each["K"], 3, 3), floats(each["R"], 3, 3), floats(each["t"], 3))
+            sigmas = value_of(Sigmas, each)
+            images.append(RegisteredImage(image, camera, each["points"], () if None in sigmas else sigmas))
+        return SfmModel(tuple(images), floats(row["points"], -1, 3), row["reprojection_error"])
 
     def _rows(self, query: str, *values: Any) -> list[sqlite3.Row]:
         return self._db.execute(query, values).fetchall()
@@ -249,11 +243,20 @@ class JournalReader:
             raise sqlite3.DatabaseError(trouble)
 
 
-def connected(uri: str, timeout: float = 1.0) -> sqlite3.Connection:
-    """Return a connection whose rows have names, without transactions of Python's own."""
-    db = sqlite3.connect(uri, uri=uri.startswith("file:"), timeout=timeout, isolation_level=None)
+def connected(path: Path | str, options: str = "", timeout: float = 1.0) -> sqlite3.Connection:
+    """Return a connection whose rows have names, without transactions of Python's own.
+
+    ``path`` is a file, opened with ``options`` of an SQLite URI, or ":memory:".
+    """
+    uri = f"{path.resolve().as_uri()}?{options}" if isinstance(path, Path) else f"file:{path}"
+    db = sqlite3.connect(uri, uri=True, timeout=timeout, isolation_level=None)
     db.row_factory = sqlite3.Row
     return db
+
+
+def value_of(kind: type[Value], row: sqlite3.Row | dict[str, Any], **more: Any) -> Value:
+    """Return a dataclass or named tuple from columns with the names of its fields; ``more`` are other fields."""
+    return kind(**{name: row[name] for name in kind.__annotations__ if name not in more}, **more)
 
 
 def to_blob(matches: Matches) -> bytes:
@@ -273,19 +276,6 @@ def matrix_of(blob: bytes) -> Matrix3:
     if not np.isfinite(matrix).all() or not matrix.any():
         raise ValueError("a matrix is zero or not finite")
     return matrix
-
-
-def _stats(row: sqlite3.Row) -> EstimateStats:
-    x, y, z = floats(row["rotation"], 3).tolist()
-    focals, rotation = (row["focal0"], row["focal1"]), (x, y, z)
-    return EstimateStats(row["candidates"], row["cost"], row["magsac_cost"], focals, row["support"], rotation)
-
-
-def _registered(row: sqlite3.Row) -> RegisteredImage:
-    image = BatchImage(row["name"], row["digest"], Size(row["width"], row["height"]))
-    camera = Camera(floats(row["K"], 3, 3), floats(row["R"], 3, 3), floats(row["t"], 3))
-    sigmas = Sigmas(row["rotation"], row["centre"], row["focal"])
-    return RegisteredImage(image, camera, row["points"], () if None in sigmas else sigmas)
 
 
 def floats(blob: bytes, *shape: int) -> NDArray[np.float64]:

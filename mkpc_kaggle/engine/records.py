@@ -48,7 +48,11 @@ class PairRecord:
     failure: str = NOT_REACHED
     units: Sequence[UnitRecord] = ()
     regions: Regions | None = None
+    matches: int = 0  # this and the next fields: of all units
+    inliers: int = 0
     decode_seconds: float = 0.0
+    encode_seconds: float = 0.0
+    match_seconds: float = 0.0
     cluster_seconds: float = 0.0
     estimate_seconds: float = 0.0
     scene: Choice | None = None
@@ -75,22 +79,6 @@ class PairRecord:
     @property
     def reached(self) -> bool:
         return self.failure != NOT_REACHED
-
-    @property
-    def inliers(self) -> int:
-        return sum(unit.inliers for unit in self.units)
-
-    @property
-    def matches(self) -> int:
-        return sum(unit.matches for unit in self.units)
-
-    @property
-    def encode_seconds(self) -> float:
-        return sum(unit.encode_seconds for unit in self.units)
-
-    @property
-    def match_seconds(self) -> float:
-        return sum(unit.match_seconds for unit in self.units)
 
 
 @dataclass(frozen=True)

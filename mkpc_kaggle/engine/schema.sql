@@ -97,9 +97,8 @@ CREATE TABLE estimate (  -- of a pair, from its points
     candidates INTEGER NOT NULL,
     cost REAL NOT NULL,
     magsac_cost REAL NOT NULL,
-    focal0 REAL NOT NULL,
-    focal1 REAL NOT NULL,
-    rotation BLOB NOT NULL CHECK (length(rotation) = 24),  -- of an E by its inliers: the axis times radians
+    focals TEXT NOT NULL,  -- two numbers, in pixels
+    rotation TEXT NOT NULL,  -- of an E by its inliers: the axis times radians, three numbers
     seconds REAL NOT NULL,
     UNIQUE (pair, settings, inputs)
 ) STRICT;
@@ -225,3 +224,26 @@ WHERE NOT EXISTS (
     LEFT JOIN current_points p ON p.position = w.position AND p.revision = CAST(c.inputs AS INTEGER)
     WHERE c.scene = s.revision AND p.revision IS NULL
 );
+
+-- What readers ask for, by the position of a pair.
+
+CREATE VIEW pair_image AS
+SELECT w.position, 0 AS side, i.*
+FROM wanted_pair w JOIN pair ON pair.id = w.pair JOIN image i ON i.name = pair.image0
+UNION ALL
+SELECT w.position, 1, i.*
+FROM wanted_pair w JOIN pair ON pair.id = w.pair JOIN image i ON i.name = pair.image1;
+
+CREATE VIEW unit_result AS
+SELECT position, number, revision, unit, stage, matches, decode_seconds, encode_seconds, match_seconds,
+    cluster_seconds, failure, note, keypoints
+FROM current_points;
+
+CREATE VIEW region_result AS
+SELECT c.position, c.number, r.* FROM current_points c JOIN region r ON r.points = c.revision;
+
+CREATE VIEW pair_choice AS
+SELECT w.position, c.F, c.reason
+FROM standing_scene s
+JOIN choice c ON c.scene = s.revision
+JOIN wanted_pair w ON w.pair = c.pair AND w.batch = s.batch;

@@ -1,6 +1,5 @@
 """Figures: a pair with its matches, clusters and critical regions; a scene's cameras."""
 
-from collections.abc import Sequence
 from io import BytesIO
 from math import sqrt
 from pathlib import Path
@@ -14,7 +13,6 @@ from mkpc_kaggle.data.images import Image
 from mkpc_kaggle.data.outputs import replacing
 from mkpc_kaggle.engine.records import SceneRecord
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Box, View
 from mkpc_kaggle.geometry.critical_region import CriticalRegion, MkpcConfig, find_clusters
 from mkpc_kaggle.pipeline.pair import PairMatch
@@ -136,7 +134,11 @@ def draw_cameras(scene: SceneRecord, number: int = 0) -> "Figure":
         return figure
     cloud, cameras = scene.models[number].points, [found.camera for found in scene.models[number].images]
     centres, looks = np.array([(camera.centre, camera.R[2]) for camera in cameras]).swapaxes(0, 1)
-    right, ahead, up = _axes_of(cameras)
+    _, down, forward = np.mean([camera.R for camera in cameras], axis=0)
+    up = -down / np.linalg.norm(down)
+    ahead = forward - forward @ up * up
+    ahead /= np.linalg.norm(ahead)
+    right = np.cross(ahead, up)
     arrow = 0.12 * (np.ptp(centres, axis=0).max() or 1.0)
     sides = (("above", right, ahead), ("the side", ahead, up))
     for panel, (name, across, upward) in zip(figure.subplots(1, 2), sides, strict=True):
@@ -152,15 +154,6 @@ def draw_cameras(scene: SceneRecord, number: int = 0) -> "Figure":
         panel.set_aspect("equal", adjustable="datalim")
         panel.margins(0.1)
     return figure
-
-
-def _axes_of(cameras: Sequence[Camera]) -> NDArray[np.float64]:
-    """(3, 3), rows right, ahead and up of a scene as :func:`draw_cameras` shows it, in its own units."""
-    _, down, forward = np.mean([camera.R for camera in cameras], axis=0)
-    up = -down / np.linalg.norm(down)
-    ahead = forward - forward @ up * up
-    ahead /= np.linalg.norm(ahead)
-    return np.stack([np.cross(ahead, up), ahead, up])
 
 
 def _near(values: NDArray[np.float64]) -> NDArray[np.bool_]:

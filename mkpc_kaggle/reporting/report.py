@@ -114,10 +114,10 @@ def _facts(log: RunLog) -> Iterator[tuple[str, str, str]]:
     limit = f"of {format_duration(log.about.limit)}" if log.about.limit is not None else "no time limit"
     sessions = sum(event.kind == EventKind.START for event in log.events)
     yield "time", format_duration(log.seconds), limit + (f", session {sessions}" if sessions > 1 else "")
-    reasons = log.tables.regions["reason"].value_counts()
+    reasons = log.tables.regions["reason"]
     if len(reasons):
-        others = ", ".join(f"{count} {reason}" for reason, count in reasons.items())
-        yield "critical regions", f"{reasons.get('cropped', 0)} of {reasons.sum()}", others
+        cropped = f"{sum(reasons == 'cropped')} of {len(reasons)}"
+        yield "critical regions", cropped, ", ".join(log.tables.region_reasons)
     if log.scenes:
         placed, images = (sum(getattr(scene, name) for scene in log.scenes) for name in ("registered", "images"))
         yield "images with a camera", f"{placed} of {images}", f"in {len(log.scenes)} batches"
@@ -178,8 +178,7 @@ def _scenes(log: RunLog) -> list[pd.DataFrame]:
     heads = ["batch", "images", "cameras", "points", "focals (px)", "seconds", "pairs with its F", "failure"]
     reasons = Counter(str(record.scene.reason) for record in log.records if record.scene is not None)
     batches = pd.DataFrame(rows, columns=heads)
-    weakest = weakest_cameras(log.scenes)
-    cameras = [(name, 100 * sigmas.centre, sigmas.rotation, sigmas.focal) for name, sigmas in weakest]
+    cameras = [(name, 100 * of.centre, of.rotation, of.focal) for name, of in weakest_cameras(log.scenes)]
     sigmas = ["camera, weakest first", "error of its centre (%)", "rotation (deg)", "focal length (%)"]
     return [
         batches if batches["failure"].any() else batches.drop(columns="failure"),

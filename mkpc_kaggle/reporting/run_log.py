@@ -14,6 +14,7 @@ from mkpc_kaggle.data.outputs import replacing, require_table
 from mkpc_kaggle.engine.journal_reader import About, Event, EventKind, JournalReader, undamaged
 from mkpc_kaggle.engine.records import PairRecord, SceneRecord, UnitRecord
 from mkpc_kaggle.errors import writing
+from mkpc_kaggle.geometry.coordinates import Box
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import Estimate, ModelKind, sampson_distances
 from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
@@ -32,14 +33,10 @@ VALUES: dict[str, type] = {  # of a pair, as attributes of its record
     **dict.fromkeys(SECONDS, float),
     **{"stats.support": float, "stats.candidates": int, "stats.cost": float, "stats.magsac_cost": float},
 }
-PAIR_COLUMNS: dict[str, type] = {
-    **{"pair": int, "id": object, "group": object},
-    **{name.removeprefix("stats."): kind for name, kind in VALUES.items()},
-    **dict.fromkeys(("focal0", "focal1", *(f"f{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3))), float),
-}
+PAIR_COLUMNS = {"pair": int, "id": str, "group": str, **{key.split(".")[-1]: VALUES[key] for key in VALUES}}
+PAIR_COLUMNS |= dict.fromkeys(("focal0", "focal1", *(f"f{i}{j}" for i in "123" for j in "123")), float)
 UNIT_COLUMNS = {"pair": int, **UnitRecord.__annotations__}
-REGION_COLUMNS = {**dict.fromkeys(("pair", "image", "left", "top", "right", "bottom"), int), "reason": str}
-REGION_COLUMNS |= {"clusters": int, "kept": int}
+REGION_COLUMNS = {"pair": int, "image": int, **Box.__annotations__, "reason": str, "clusters": int, "kept": int}
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,16 +63,19 @@ class RunTables:
     def unit_means(self) -> pd.DataFrame:
         """Each ``unit``, the number of ``pairs`` it ran on, its mean ``matches``, ``inliers`` and ``seconds``."""
         units = self.units.assign(seconds=self.units["encode_seconds"] + self.units["match_seconds"])
-        by_unit = units.groupby("unit", sort=False)
-        means = by_unit[["matches", "inliers", "seconds"]].mean()
-        means.insert(0, "pairs", by_unit.size())
-        return means.reset_index()
+        means = {name: (name, "mean") for name in ("matches", "inliers", "seconds")}
+        return units.groupby("unit", sort=False).agg(pairs=("pair", "size"), **means).reset_index()
 
     def unit_reasons(self, column: str = "failure") -> list[str]:
         """Return why units failed or, by ``note``, ran otherwise, and on how many pairs; most frequent first."""
         noted = self.units[self.units[column] != ""]
         counts = (noted["unit"] + ": " + noted[column]).value_counts()
         return [f"{reason} ({count} pairs)" for reason, count in counts.items()]
+
+    @property
+    def region_reasons(self) -> list[str]:
+        """How many critical regions were chosen for each reason; most frequent first."""
+        return [f"{count} {reason}" for reason, count in self.regions["reason"].value_counts().items()]
 
     @property
     def seconds_by_part(self) -> dict[str, float]:

@@ -69,22 +69,9 @@ def left_out_line(left_out: Sequence[str]) -> str:
     return f"left out, {'; '.join(left_out)}{advice * has_advice}" if left_out else ""
 
 
-def _lines(tables: RunTables, run: RunReport | RunLog) -> list[str]:
-    failed = tables.failed
-    reasons = list(failed["id"][:MAX_LINES] + ": " + failed["failure"][:MAX_LINES])
-    return [
-        *_found(tables),
-        *_scenes(tables, run.scenes),
-        *_list("pairs with the fallback row", reasons, len(failed)),
-        *_list("units that failed", tables.unit_reasons()),
-        *_list("units that ran otherwise than written", tables.unit_reasons("note")),
-        *_list("faults", run.faults),
-    ]
-
-
-def _found(tables: RunTables) -> Iterator[str]:
-    """Yield inliers, critical regions and seconds per pair, and the means of each unit."""
-    inliers, means = tables.solved["inliers"], tables.unit_means
+def _lines(tables: RunTables, run: RunReport | RunLog) -> Iterator[str]:
+    """Yield inliers, means of units, regions, seconds and scenes, then lists of failures, units and faults."""
+    inliers, means, failed, scenes = tables.solved["inliers"], tables.unit_means, tables.failed, run.scenes
     if len(inliers):
         yield f"inliers: median {inliers.median():.0f}, mean {inliers.mean():.1f}, least {inliers.min()}"
         if doubtful := (~tables.solved["overlaps"]).sum():
@@ -93,29 +80,31 @@ def _found(tables: RunTables) -> Iterator[str]:
         yield f"{'unit':<30}{'pairs':>7}{'matches':>9}{'inliers':>9}{'seconds':>9}"
     for unit in means.itertuples():
         yield f"{unit.unit:<30}{unit.pairs:>7}{unit.matches:>9.0f}{unit.inliers:>9.0f}{unit.seconds:>9.2f}"
-    if reasons := [f"{count} {reason}" for reason, count in tables.regions["reason"].value_counts().items()]:
-        yield f"critical regions: {', '.join(reasons)}"
+    if len(tables.regions):
+        yield f"critical regions: {', '.join(tables.region_reasons)}"
     pairs = max(1, len(tables.pairs))
     parts = (f"{name} {seconds / pairs:.3f}" for name, seconds in tables.seconds_by_part.items())
     yield f"seconds a pair: {', '.join(parts)}"
+    if scenes:
+        made = f"{sum(scene.registered > 0 for scene in scenes)} of {len(scenes)} batches reconstructed"
+        images = f"{sum(scene.registered for scene in scenes)} of {sum(scene.images for scene in scenes)} images"
+        chosen = f"F of {sum(tables.pairs['source'] == 'scene')} of {len(tables.pairs)} pairs is from them"
+        yield f"scenes: {made} with {images}; {chosen}"
+        yield from weakest_line(scenes)
+    no_scene = [f"{scene.batch}: {scene.failure}" for scene in scenes if scene.failure]
+    reasons = list(failed["id"][:MAX_LINES] + ": " + failed["failure"][:MAX_LINES])
+    yield from _list("batches without a scene", no_scene)
+    yield from _list("pairs with the fallback row", reasons, len(failed))
+    yield from _list("units that failed", tables.unit_reasons())
+    yield from _list("units that ran otherwise than written", tables.unit_reasons("note"))
+    yield from _list("faults", run.faults)
 
 
-def _scenes(tables: RunTables, scenes: Sequence[SceneRecord]) -> list[str]:
-    """Return the numbers of reconstructed batches and images and of pairs with a scene's F, and failures."""
-    if not scenes:
-        return []
-    made = sum(scene.registered > 0 for scene in scenes)
-    images = f"{sum(scene.registered for scene in scenes)} of {sum(scene.images for scene in scenes)} images"
-    pairs = f"F of {sum(tables.pairs['source'] == 'scene')} of {len(tables.pairs)} pairs is from them"
-    failed = [f"{scene.batch}: {scene.failure}" for scene in scenes if scene.failure]
-    head = f"scenes: {made} of {len(scenes)} batches reconstructed with {images}; {pairs}"
-    return [head, *weakest_line(scenes), *_list("batches without a scene", failed)]
-
-
-def weakest_line(scenes: Sequence[SceneRecord]) -> list[str]:
-    """Return a line with the weakest cameras, if any is known."""
+def weakest_line(scenes: Sequence[SceneRecord]) -> Iterator[str]:
+    """Yield a line with the weakest cameras, if any is known."""
     named = [f"{Path(name).name} ({100 * sigmas.centre:.2g} %)" for name, sigmas in weakest_cameras(scenes)[:3]]
-    return [f"weakest cameras, with the error of the centre: {', '.join(named)}"] if named else []
+    if named:
+        yield f"weakest cameras, with the error of the centre: {', '.join(named)}"
 
 
 def weakest_cameras(scenes: Sequence[SceneRecord]) -> list[tuple[str, Sigmas]]:
@@ -125,11 +114,11 @@ def weakest_cameras(scenes: Sequence[SceneRecord]) -> list[tuple[str, Sigmas]]:
     return sorted(known, key=lambda each: -each[1].centre)
 
 
-def _list(title: str, items: Sequence[str], count: int | None = None) -> list[str]:
-    """Return the first items and their number: ``count``, if ``items`` is only a part."""
+def _list(title: str, items: Sequence[str], count: int | None = None) -> Iterator[str]:
+    """Yield the first items and their number: ``count``, if ``items`` is only a part."""
     count = len(items) if count is None else count
-    if not count:
-        return []
-    shown = [f"  {item}" for item in items[:MAX_LINES]]
-    more = [f"  ... and {count - MAX_LINES} more"] if count > MAX_LINES else []
-    return [f"{title}: {count}", *shown, *more]
+    if count:
+        yield f"{title}: {count}"
+        yield from (f"  {item}" for item in items[:MAX_LINES])
+    if count > MAX_LINES:
+        yield f"  ... and {count - MAX_LINES} more"

@@ -344,7 +344,7 @@ def memory_journal() -> Journal:
     """A journal that leaves no file."""
     with TemporaryDirectory() as directory:
         journal = Journal(Path(directory))
-        journal.continue_in_memory()
+        journal._continue_in_memory("")
         for connection in (journal._file, journal._lock, journal._db):
             weakref.finalize(journal, connection.close)  # since 3.13, Python warns of open connections
         return journal
