@@ -45,9 +45,10 @@ class RayCluster:
         host, _, port = self.address.rpartition(":")
         try:
             socket.create_connection((host, int(port)), timeout=REACH_TIMEOUT_S).close()
-        except OSError as error:
+        except (OSError, OverflowError) as error:  # the second: a port above 65535
+            reason = getattr(error, "strerror", None) or error
             raise UserError(
-                f"--workers ray://{self.address}: no cluster answers there ({error.strerror or error}). Start one "
+                f"--workers ray://{self.address}: no cluster answers there ({reason}). Start one "
                 "with `ray start --head` and join it from the other machines; it prints the address to use."
             ) from error
 

@@ -34,6 +34,7 @@ def test_without_ray_it_says_how_to_install_it(tmp_path: Path, monkeypatch: pyte
         run(write_pairs(tmp_path, 1), THREE_UNITS, RectifiedMatcher(), tmp_path / "w", workers=RayCluster())
 
 
-def test_an_address_where_nothing_answers_is_told_at_once() -> None:
-    with pytest.raises(UserError, match=r"ray://127\.0\.0\.1:1: no cluster answers there"):
-        RayCluster("127.0.0.1:1").require_reachable()
+@pytest.mark.parametrize("port", [1, 99999])
+def test_an_address_where_nothing_answers_is_told_at_once(port: int) -> None:
+    with pytest.raises(UserError, match=rf"ray://127\.0\.0\.1:{port}: no cluster answers there"):
+        RayCluster(f"127.0.0.1:{port}").require_reachable()
