@@ -241,18 +241,21 @@ import sys, time
 sys.path[:0] = {path!r}
 from pathlib import Path
 from rectified import THREE_UNITS, RectifiedMatcher, run, write_pairs
+from mkpc_kaggle.engine.journal import Journal
 from mkpc_kaggle.engine.places import LocalSite
 
-wait, waits = LocalSite.wait, []
+wait, save, saved = LocalSite.wait, Journal.save_estimates, []
+def noted(self, estimates):
+    save(self, estimates)
+    saved.extend(estimates)
 def stuck(self, until):
-    waits.append(until)
-    wait(self, until) if len(waits) < 30 else time.sleep(1000)
-LocalSite.wait = stuck
+    time.sleep(1000) if len(saved) > 1 else wait(self, until)
+Journal.save_estimates, LocalSite.wait = noted, stuck
 home = Path(sys.argv[1])
 pairs = write_pairs(home / "pairs", 40)
 def publish(standing):
     (home / "out").write_text(str(len(set(map(bytes, standing.fundamentals)))))
-run(pairs, THREE_UNITS, RectifiedMatcher(), home / "work", limit=8.0, publish=publish, is_watched=True)
+run(pairs, THREE_UNITS, RectifiedMatcher(), home / "work", limit=10.0, publish=publish, is_watched=True)
 """
 
 

@@ -139,7 +139,7 @@ def test_former_files_stay_until_the_new_ones_are_whole(tmp_path, monkeypatch):
                 raise OSError(28, "No space left on device")
 
         model = SimpleNamespace(images=(), colmap=SimpleNamespace(frames={}, write=fill))
-        colmap.write_files(tmp_path, None, None, {}, [model])
+        colmap.write_files(tmp_path, None, {}, [model])
 
     monkeypatch.setattr(colmap, "_fill", lambda *_: None)
     with pytest.raises(OSError, match="No space"):
