@@ -77,6 +77,9 @@ class Engine:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self._end()
+
+    def _end(self) -> None:
         """End all workers, and publish for the last time."""
         if self._has_ended:
             return
@@ -105,7 +108,7 @@ class Engine:
 
     def report(self) -> RunReport:
         """End the run. Return the results of the latest request."""
-        self.__exit__()
+        self._end()
         return RunReport(
             tuple(self.journal.records()),
             self.ending,
