@@ -40,8 +40,8 @@ def program(arguments: Sequence[str] | None = None) -> NoReturn:
 
         former = os.environ.get("MPLCONFIGDIR")
         status = main(arguments)
-        if (made := os.environ.get("MPLCONFIGDIR")) != former:  # by matplotlib if it cannot write below HOME
-            shutil.rmtree(str(made), ignore_errors=True)  # matplotlib would remove it in an orderly exit
+        if (made := os.environ.get("MPLCONFIGDIR")) != former:  # set by matplotlib if it cannot write below HOME
+            shutil.rmtree(str(made), ignore_errors=True)  # matplotlib removes it only in an orderly exit
     except KeyboardInterrupt:
         os._exit(EXIT_INTERRUPTED)
     leave(status)
@@ -92,7 +92,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def make_parser(arguments: Sequence[str] = tuple(COMMANDS)) -> argparse.ArgumentParser:
-    """Return the parser for these arguments. Import only the commands among them, since imports take time."""
+    """Return the parser for these arguments. Import only the commands that they name: imports take time."""
     text = "Two-stage image matching with Matching Key-Points Crop, offline, inside a time budget."
     parser = argparse.ArgumentParser("mkpc_kaggle", description=text, epilog="COMMAND --help has the options.")
     parser.add_argument("--version", action="version", version=__version__)

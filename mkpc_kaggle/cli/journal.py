@@ -29,7 +29,7 @@ Exit status: 0 done, 2 the journal does not exist, or a file cannot be written.
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.set_defaults(printing=partial(unblocked, "stderr"))  # on which decoders complain
+    parser.set_defaults(printing=partial(unblocked, "stderr"))  # where image decoders print warnings
     parser.add_argument("work_dir", type=Path, metavar="DIR")
     parser.add_argument("--csv", type=Path, metavar="OUT", help="write tables to this directory")
     parser.add_argument("--report", type=Path, metavar="FILE.html", help="write a page with pictures")

@@ -19,7 +19,7 @@ in pixels of the stored files, without the EXIF orientation; figures are upright
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.set_defaults(printing=partial(unblocked, "stderr"))  # on which decoders complain
+    parser.set_defaults(printing=partial(unblocked, "stderr"))  # where image decoders print warnings
     parser.add_argument("image0", type=Path)
     parser.add_argument("image1", type=Path)
     parser.add_argument("--out", type=Path, metavar="FIG.png", help="draw the pair; the suffix sets the format")

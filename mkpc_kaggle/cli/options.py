@@ -56,7 +56,7 @@ def add_run(parser: argparse.ArgumentParser, time_limit: str | None) -> None:
 def assembly_of(arguments: argparse.Namespace, recipe: str, mode: str, interrupt: Interrupt) -> Assembly:
     given = {name: getattr(arguments, name) for name in ("weights", "device", "precision")}
     licence, scenes = Licence(arguments.licence), arguments.reconstruct
-    with interrupt.raising():  # digests of large files
+    with interrupt.raising():  # computing the digests of large files takes long
         return assemble(recipe, **given, mode=Mode(mode), licence=licence, scenes=scenes)
 
 
@@ -73,11 +73,11 @@ def watched_session(
     budget, fresh, workers = budget_of(arguments), arguments.fresh, arguments.workers
     with Watchdog(budget, interrupt) as watchdog:
         yield Session(work_dir, budget, interrupt, fresh, workers=workers, watchdog=watchdog), watchdog
-        drain()  # inside the watchdog: the reader of the output may hang
+        drain()  # while the watchdog is active: the reader of the output may hang
 
 
 def say_start(what: str, assembly: Assembly, work_dir: Path) -> None:
-    """Print the input, the recipe and the matchers that are left out."""
+    """Print the input, the recipe and the omitted matchers."""
     from mkpc_kaggle.reporting.summary import left_out_line  # imports pandas, which takes a while
 
     header = f"{what}, recipe {assembly.recipe.name}, {assembly.placement}, journal in {work_dir}"
@@ -85,7 +85,7 @@ def say_start(what: str, assembly: Assembly, work_dir: Path) -> None:
 
 
 def finish(session: Session, status: int, page: Path | None, pairs: Sequence[Pair]) -> int:
-    """Write the page about a run, if any. Return the exit status: that of a signal, or ``status``."""
+    """Write a run's report to ``page``, if given. Return a signal's exit status, else ``status``."""
     from mkpc_kaggle.reporting.report import report_run
 
     if page is not None:
@@ -94,7 +94,7 @@ def finish(session: Session, status: int, page: Path | None, pairs: Sequence[Pai
 
 
 def plan_lines(arguments: argparse.Namespace, report: RunReport) -> list[str]:
-    """Return the plan: what, when and why, or nothing without ``--explain``."""
+    """Return the plan (what, when and why) as lines with ``--explain``, and no lines without it."""
     return ["plan:", *map(str, report.explanations)] if arguments.explain else []
 
 

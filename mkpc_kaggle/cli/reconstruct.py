@@ -45,7 +45,7 @@ All pairs of up to 100 images are matched; in larger datasets, each image is mat
 
 Exit status: 0 done; 1 no image has a camera, or the run failed; 2 bad input; 130 or 143 ended by a signal.
 """
-MAX_LINES = 20  # of each list
+MAX_LINES = 20  # printed of each list
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -74,7 +74,7 @@ def run(arguments: argparse.Namespace) -> int:
         options.watched_session(arguments, work_dir, interrupt) as (session, watchdog),
         output_directory(out, datasets, arguments.format),
     ):
-        watchdog.status = 1  # until there is a model
+        watchdog.status = 1  # until a model exists
 
         def publish(cameras: Cameras) -> None:
             write_tables(out, cameras, root, arguments.format)
@@ -94,7 +94,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _lines(result: FolderResult) -> Iterator[str]:
-    """Yield a line for each dataset, and the errors."""
+    """Yield lines about the run, each dataset and the errors."""
     report = result.report
     ended = f"{report.ending} after {format_duration(report.seconds)}"
     yield f"{len(result.pairs)} pairs: {ended}; {report.units_run} units run, {report.estimated} F estimated"

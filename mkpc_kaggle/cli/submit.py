@@ -48,7 +48,7 @@ def run(arguments: argparse.Namespace) -> int:
     require_apart(files, [*test_side(arguments.test_dir), Path(arguments.recipe)], work_dir, arguments.weights)
     with interruptible() as interrupt:
         pairs = read_test_side(arguments.test_dir)
-        # Before the watchdog starts: a run that starts after its limit must still leave a complete file.
+        # first_version precedes the watchdog: a run that starts after its limit must leave a complete file.
         with first_version(pairs, output), options.watched_session(arguments, work_dir, interrupt) as watched:
             session, watchdog = watched
             assembly = options.assembly_of(arguments, arguments.recipe, arguments.mode, interrupt)

@@ -144,7 +144,7 @@ def _require_a_whole(given: argparse.Namespace) -> None:
 
 
 def _score(arguments: argparse.Namespace, scenes: Sequence[TrainScene]) -> tuple[int, dict[str, Any] | None]:
-    """Print the scores of submissions. Return the exit status and all figures."""
+    """Print the scores of submissions. Return the exit status and all numbers for ``--json``."""
     figures = []
     for submission in arguments.submission:
         validation = score_submission(submission, arguments.truth, scenes)
@@ -156,9 +156,9 @@ def _score(arguments: argparse.Namespace, scenes: Sequence[TrainScene]) -> tuple
 def _match_and_score(
     arguments: argparse.Namespace, scenes: Sequence[TrainScene], root: Path, work_dir: Path
 ) -> tuple[int, dict[str, Any] | None]:
-    """Run a recipe, or several to compare; they share a journal, so that common units run once.
+    """Run a recipe, or compare several recipes, which share a journal so that common units run once.
 
-    Return the exit status and all figures; no figures of an incomplete comparison.
+    Return the exit status and all numbers for ``--json``; ``None`` if a comparison is incomplete.
     """
     compared: list[str] = arguments.compare or []
     choices = [split_mode(text) for text in compared] or [(arguments.recipe, arguments.mode)]
@@ -178,7 +178,7 @@ def _match_and_score(
             lines = [*filter(None, [left_out_line(assembly.left_out)]), *options.plan_lines(arguments, report)]
             lines += [summary(pairs, report), "", f"recipe {validation.recipe}"]
             say("\n".join([*lines, *score_table(validation), *step_gains(validation)]))
-            # The page draws inliers of F, and a list of pairs has E instead.
+            # The page draws inliers of F, but the pairs of a list have E.
             has_page = arguments.work_dir is not None and arguments.pairs is None
             name = re.sub(r"[^\w.-]+", "_", compared[number]) if compared else "report"
             page = work_dir / f"{name}.html" if has_page else None

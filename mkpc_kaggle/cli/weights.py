@@ -113,7 +113,7 @@ def _convert(arguments: argparse.Namespace) -> None:
 
 
 def files_of(name: str, store: WeightStore) -> list[list[WeightFile]]:
-    """Return the files of a file name, a slot or a recipe: a list of alternatives per slot.
+    """Return the files that a file name, slot or recipe refers to: a list of alternatives per slot.
 
     Raises :class:`UserError` with the known names for an unknown name.
     """
