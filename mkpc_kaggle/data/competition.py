@@ -1,8 +1,8 @@
 """Files of the Image Matching Challenge 2022: the test side, the train side, submissions.
 
-Numbers of matrices and vectors in a cell are separated by blanks, row by row. A test image is
-``test_images/<batch_id>/<image_id>.png``, a train image ``<scene>/images/<image_id>.jpg``; png, jpg and
-jpeg are accepted on both sides. F of a pair satisfies x2^T F x1 = 0, image 1 being the first.
+A cell holds the numbers of a matrix or vector row by row, separated by blanks. A test image is
+``test_images/<batch_id>/<image_id>.png``, a train image ``<scene>/images/<image_id>.jpg``. Both sides accept
+png, jpg and jpeg. F of a pair satisfies x2^T F x1 = 0, where x1 is in the first image.
 """
 
 import csv
@@ -27,20 +27,20 @@ from mkpc_kaggle.geometry.coordinates import Matrix3
 SUBMISSION_COLUMNS = ("sample_id", "fundamental_matrix")
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 
-MAX_LINE = 1 << 24  # characters of a row: another file may be one line of gigabytes
-CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")  # characters that end lines, or drive a terminal
-# Names of directories, of drives (Windows), and names that no file can have.
+MAX_LINE = 1 << 24  # characters of a row; other files may have lines of gigabytes
+CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")  # characters that end lines or control a terminal
+# Names that are empty, "." or "..", or contain a Windows drive, a slash or a control character.
 NOT_PLAIN = re.compile(rf"^\.{{0,2}}$|^[A-Za-z]:|[/\\]|{CONTROL.pattern}")
 
 
 @dataclass(frozen=True, slots=True)
 class Pair:
     id: str  # unique in a run
-    group: str  # the batch or scene that they belong to
-    file0: str  # the images' paths; as text, since a table may have a million rows
+    group: str  # its batch or scene
+    file0: str  # paths of the images; text saves memory, since a table may have a million rows
     file1: str
-    intrinsics: tuple[Matrix3, Matrix3] | None = field(default=None, compare=False)  # with them E is estimated
-    turns: tuple[int, int] = (0, 0)  # quarters, counter-clockwise, by which the images are turned to be matched
+    intrinsics: tuple[Matrix3, Matrix3] | None = field(default=None, compare=False)  # given: E is estimated
+    turns: tuple[int, int] = (0, 0)  # counter-clockwise quarter turns of each image before matching
 
     @property
     def images(self) -> tuple[Path, Path]:
@@ -62,12 +62,12 @@ class TruePair:
 @dataclass(frozen=True, eq=False)
 class TrainScene:
     name: str
-    metres_per_unit: float  # NaN where that is unknown
+    metres_per_unit: float  # NaN if unknown
     pairs: tuple[TruePair, ...]
 
 
 def test_side(directory: Path) -> tuple[Path, Path]:
-    """Return the paths of the table and of the image directory."""
+    """Return the paths of ``test.csv`` and ``test_images/``."""
     home = directory.parent if directory.name == "test_images" else directory
     return home / "test.csv", home / "test_images"
 
@@ -75,8 +75,8 @@ def test_side(directory: Path) -> tuple[Path, Path]:
 def read_test_side(directory: Path) -> tuple[Pair, ...]:
     """Return the pairs of ``test.csv``, in its order. A missing image is not an error here.
 
-    ``directory`` holds ``test.csv`` and ``test_images/``, or is the latter. Raises :class:`UserError` for an
-    unreadable or empty table, and for ids that are repeated or cannot be file names.
+    ``directory`` holds ``test.csv`` and ``test_images/``, or is ``test_images/`` itself. Raises
+    :class:`UserError` for an unreadable or empty table, a repeated sample id, and an unusable id.
     """
     path, images = test_side(directory)
     pairs: dict[str, Pair] = {}
@@ -103,7 +103,7 @@ def read_train_side(
     min_covisibility: float = 0.1,
     pairs_per_scene: int | None = None,
 ) -> tuple[TrainScene, ...]:
-    """Return the named scenes of a train side, or all; ``pairs_per_scene`` are evenly spread over their table.
+    """Return the named scenes, or all, with up to ``pairs_per_scene`` pairs spread evenly over a scene's table.
 
     Raises :class:`UserError` for missing files and scenes, and for malformed cells.
     """
@@ -138,7 +138,7 @@ def _read_scene(directory: Path, metres: float, min_covisibility: float, most: i
 
 
 def write_submission(path: Path, rows: Mapping[str, Matrix3]) -> None:
-    """Write a row for each sample. Raise ``OSError`` and leave an existing file unchanged if that fails."""
+    """Write a row for each sample. If writing fails, leave an existing file unchanged and raise ``OSError``."""
     with replacing(path) as stream:
         table = csv.writer(stream, lineterminator="\n")
         table.writerow(SUBMISSION_COLUMNS)
@@ -153,7 +153,7 @@ def read_submission(path: Path) -> dict[str, Matrix3]:
 
 
 def submission_problems(path: Path, sample_ids: Sequence[str]) -> list[str]:
-    """Return the problems of a submission, a sentence each; empty if the competition accepts it."""
+    """Return the problems of a submission, one sentence each; empty if the competition accepts it."""
     try:
         rows = [cells for _, cells in read_rows(path, SUBMISSION_COLUMNS, only=True)]
     except UserError as error:
@@ -218,9 +218,9 @@ def evenly_spread(items: Sequence[Any], most: int | None) -> list[Any]:
 
 
 def image_files(directory: Path) -> Callable[[str], str]:
-    """List a directory. Return the path of an image by its id; an unknown id gives a png that does not exist."""
+    """List a directory. Return a function from image id to path; an unknown id gives a path of a missing png."""
     known: dict[str, str] = {}
-    with suppress(OSError, ValueError):  # missing, too long, or not of the file system's encoding
+    with suppress(OSError, ValueError):  # the directory is missing, or its name is too long or not encodable
         images = sorted(path for path in directory.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES)
         known = {path.stem: str(path) for path in reversed(images)}
     return lambda name: known.get(name) or f"{directory}{os.sep}{name}.png"

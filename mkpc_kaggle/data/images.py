@@ -1,7 +1,7 @@
-"""Images: decoded once, in the background. An unreadable file is a value with a reason, not an exception.
+"""Images: decoded once, in the background. An unreadable file gives a value with the reason, not an exception.
 
-EXIF gives the orientation of the stored pixels, and the focal length by COLMAP's rule. Source:
-``Bitmap::ExifFocalLength`` of COLMAP 4.2, without its table of sensors.
+EXIF gives the orientation of the stored pixels, and the focal length as COLMAP computes it. Source:
+``Bitmap::ExifFocalLength`` of COLMAP 4.2, without COLMAP's table of sensors.
 """
 
 import hashlib
@@ -26,30 +26,30 @@ from mkpc_kaggle.config import Range
 from mkpc_kaggle.errors import shown
 from mkpc_kaggle.geometry.coordinates import Pixels, Size
 
-MAX_ASPECT = 32  # of the sides; longer views would be a few pixels high, or would not fit into memory
+MAX_ASPECT = 32  # ratio of the sides; a longer image's views would be a few pixels high or exceed the memory
 
 ORIENTATION, DIRECTORY, FOCAL_MM = 0x0112, 0x8769, 0x920A  # tags of EXIF
 PLANE_RESOLUTION, PLANE_UNIT, FOCAL_35MM = 0xA20E, 0xA210, 0xA405
 FILM_MM = 43.27  # diagonal of 35 mm film
 UNITS_MM: dict[float, float] = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
-FOCALS = Range(0.2, 20.0)  # long sides of an image; a focal length outside this range counts as a mistake
-# Counter-clockwise quarter turns that set stored pixels upright, by orientation; mirrored pixels stay mirrored.
+FOCALS = Range(0.2, 20.0)  # in long sides of the image; a focal length outside this range counts as unknown
+# Counter-clockwise quarter turns that set pixels upright, by EXIF orientation; mirrored pixels stay mirrored.
 TURNS: dict[float, int] = {3: 2, 4: 2, 5: 3, 6: 3, 7: 1, 8: 1}
 
 
 @dataclass(frozen=True, eq=False)
 class Image:
-    """A picture as its file stores it; ``turns`` set its views upright."""
+    """An image as stored in its file; ``turns`` rotates its views upright."""
 
     name: str  # unique in a run
     pixels: Pixels  # (H, W, 3) uint8 RGB
     version: str = ""  # :func:`content_digest` of its file
-    focal: float = 0.0  # in pixels, by its EXIF; 0: unknown
-    turns: int = 0  # quarters, counter-clockwise, by its EXIF
+    focal: float = 0.0  # in pixels, from EXIF; 0: unknown
+    turns: int = 0  # counter-clockwise quarter turns, from EXIF
 
     @classmethod
     def of_array(cls, array: Pixels) -> "Image":
-        """Wrap (H, W, 3) RGB or (H, W) gray uint8, named by its content. Raise ``ValueError`` otherwise."""
+        """Wrap a uint8 array (H, W, 3) RGB or (H, W) gray, named by its digest. Raise ``ValueError`` otherwise."""
         if array.dtype != np.uint8 or array.ndim < 2 or array.shape[2:] not in ((), (3,)) or not array.size:
             raise ValueError(f"an image is uint8 (H, W) or (H, W, 3), not {array.dtype} {array.shape}")
         pixels = np.ascontiguousarray(np.stack([array] * 3, axis=2) if array.ndim == 2 else array)
@@ -65,7 +65,7 @@ class Image:
         return np.asarray(cv2.cvtColor(self.pixels, cv2.COLOR_RGB2GRAY), np.uint8)
 
     def turned(self, turns: int) -> "Image":
-        """Return the image with views turned by more quarters, counter-clockwise."""
+        """Return the image with its views rotated by further counter-clockwise quarter turns."""
         return replace(self, turns=(self.turns + turns) % 4) if turns else self
 
 
@@ -82,7 +82,7 @@ class Unreadable:
 
 
 def read_image(path: Path) -> Image | Unreadable:
-    """Decode the stored pixels of a file to RGB, without raising. Divide 16-bit values by 256.
+    """Decode a file's stored pixels to RGB; return failures, never raise. Divide 16-bit values by 256.
 
     OpenCV decides whether a damaged file is readable: version 5 refuses a truncated file.
     """
@@ -108,14 +108,14 @@ def read_image(path: Path) -> Image | Unreadable:
 
 
 def read_exif(data: bytes, size: Size) -> tuple[int, float]:
-    """Return the quarter turns, counter-clockwise, that set an image upright, and its focal length in pixels.
+    """Return the counter-clockwise quarter turns that set an image upright, and its focal length in pixels.
 
-    ``data`` is the file of an image of ``size``. Both numbers are 0 if unknown; damaged EXIF counts as missing.
+    ``data`` has the file's bytes; ``size`` is in pixels. Both results are 0 if unknown. Damaged EXIF is ignored.
     """
     tags: dict[int, float] = {}
     with suppress(Exception), warnings.catch_warnings():  # Pillow raises errors of any type for a damaged file
         warnings.filterwarnings("ignore", module="PIL")
-        # OpenCV turns TIFF itself. Pillow would decode all pixels of a PNG, since EXIF may come after them.
+        # OpenCV already rotates TIFF. Pillow would decode all pixels of a PNG, since EXIF may come after them.
         with PIL.Image.open(BytesIO(data), formats=("JPEG", "PNG", "WEBP")) as picture:
             if picture.format != "PNG" or b"eXIf" in data:
                 exif = picture.getexif()
@@ -161,7 +161,7 @@ class ByteCache:
 
 
 class ImageStore:
-    """Images by path, decoded in the background; caches the most recently used. Not thread-safe."""
+    """Images by path, decoded in the background. The most recently used are cached. Not thread-safe."""
 
     def __init__(self, limit_bytes: int = 512 << 20) -> None:
         self._images = ByteCache(limit_bytes)

@@ -10,7 +10,7 @@ from typing import TextIO
 
 from mkpc_kaggle.errors import UserError
 
-# Suffixes of each option's results. A file with this suffix in an input directory is an earlier run's result.
+# Suffixes of each option's results. In an input directory, a file with one of them is an earlier result.
 RESULTS = {"--output": (".csv",), "--json": (".json",), "--report": (".html", ".htm")}
 RESULTS["--out"] = (".png", ".jpg", ".pdf", ".svg")
 UNFINISHED: set[Path] = set()  # temporary files of this process
@@ -24,8 +24,8 @@ def require_apart(
 ) -> None:
     """Raise :class:`UserError` for outputs that would overwrite an input, another output or the journal.
 
-    ``outputs`` are files, by option; ``inputs`` and ``weights`` are files and directories. A new file is allowed.
-    ``--json`` and ``--report`` overwrite only files with their own suffix.
+    ``outputs`` are files, by option; ``inputs`` and ``weights`` are files and directories. A new file may lie in
+    an input directory. ``--json`` and ``--report`` overwrite only files with their own suffix.
     """
     files = {option: path for option, path in outputs.items() if path is not None}
     inputs = list(inputs)
@@ -69,14 +69,14 @@ def lies_in(path: Path, directory: Path) -> bool:
 
 
 def same_file(path: Path, other: Path) -> bool:
-    with suppress(OSError):  # links, and case-insensitive file systems
+    with suppress(OSError):  # realpath for links, samefile for case-insensitive file systems
         return os.path.realpath(path) == os.path.realpath(other) or path.samefile(other)
     return False
 
 
 @contextmanager
 def replacing(path: Path) -> Iterator[TextIO]:
-    """Open a temporary file that replaces ``path`` when it is complete and on the disk.
+    """Open a temporary file, which replaces ``path`` once the new file is complete and on disk.
 
     The temporary file lies next to ``path``; files that a killed process left there are removed. A device such as
     ``/dev/stdout`` is written directly. Raises ``OSError`` and removes the temporary file if writing fails.
@@ -102,6 +102,6 @@ def replacing(path: Path) -> Iterator[TextIO]:
 
 
 def remove_unfinished() -> None:
-    """Remove the temporary files of :func:`replacing`, for a process that ends before they are complete."""
+    """Remove the incomplete temporary files of :func:`replacing`, since the process ends."""
     for part in tuple(UNFINISHED):
         part.unlink(missing_ok=True)

@@ -1,9 +1,9 @@
 """Lists of pairs with known poses, in the format of SuperGlue's evaluation.
 
 One line per pair: ``name0 name1 turns0 turns1 K0 K1 T_0to1``, separated by blanks. Names are paths under the image
-root. ``turns`` are the counter-clockwise quarter turns that set an image upright, in addition to its EXIF's. K (9
-numbers) and T (16) are stored row by row and refer to the stored pixels: X_1 = R X_0 + t with T = [R t; 0 1].
-A file ``.npz``, or a directory of ``.npz`` files, is LoFTR's list of MegaDepth-1500, ``scene_info``.
+root. ``turns`` are the counter-clockwise quarter turns that set an image upright, after its EXIF rotation. K (9
+numbers) and T (16) are row-major and refer to the stored pixels; X_1 = R X_0 + t with T = [R t; 0 1].
+A ``.npz`` file, or a directory of them, is a list of MegaDepth-1500 in LoFTR's format ``scene_info``.
 """
 
 import pickle
@@ -23,7 +23,7 @@ from mkpc_kaggle.geometry.cameras import Camera
 
 FIELDS = 2 + 2 + 9 + 9 + 16
 EXPECTED = "name0 name1 turns0 turns1 K0 (9 numbers) K1 (9) T_0to1 (16)"
-MAX_SKEWNESS = 1e-3  # of R R^T from the identity; files round poses to few digits
+MAX_SKEWNESS = 1e-3  # deviation of R R^T from the identity; files have poses of few digits
 # The only names that pickled arrays need. Any other name might run code.
 NAMES = {"ndarray": np.ndarray, "dtype": np.dtype, "encode": lambda text, _: text.encode("latin-1")}
 NAMES |= {"_reconstruct": np.empty(0).__reduce__()[0], "scalar": np.float64(0).__reduce__()[0]}
@@ -32,7 +32,7 @@ NAMES |= {"_reconstruct": np.empty(0).__reduce__()[0], "scalar": np.float64(0)._
 def read_pairs(file: Path, image_root: Path, *, most: int | None = None) -> TrainScene:
     """Return the pairs of a list as a scene of unknown scale, with intrinsics to estimate E.
 
-    ``most`` limits the number of pairs, evenly spread. An unreadable image is not an error here. Raises
+    ``most`` limits the pairs, which are then evenly spread. An unreadable image is not an error here. Raises
     :class:`UserError` for a list without pairs and for a malformed line.
     """
     if not image_root.is_dir():
@@ -63,7 +63,7 @@ def parse_line(line: str, file: Path, number: int, image_root: Path) -> TruePair
     K0, K1, T = numbers[:9].reshape(3, 3), numbers[9:18].reshape(3, 3), numbers[18:].reshape(4, 4)
     R, t = T[:3, :3], T[:3, 3]
     has_focals = all(min(K[0, 0], K[1, 1]) > 0 and (K[1, 0], *K[2]) == (0, 0, 0, 1) for K in (K0, K1))
-    with np.errstate(over="ignore", invalid="ignore"):  # the loop below checks that they are finite
+    with np.errstate(over="ignore", invalid="ignore"):  # the loop below checks that the numbers are finite
         is_rotation = np.abs(R @ R.T - np.eye(3)).max() < MAX_SKEWNESS and np.linalg.det(R) > 0
     for holds, expected in (
         ({turns0, turns1} <= {0, 1, 2, 3}, f"0, 1, 2 or 3 quarter turns, found {cells[2]} and {cells[3]}"),
@@ -80,9 +80,9 @@ def parse_line(line: str, file: Path, number: int, image_root: Path) -> TruePair
 
 
 def lines_of_scene_info(file: Path) -> Iterator[str]:
-    """Yield a line of the list for each pair of a ``scene_info`` file, without executing code of the file.
+    """Yield a line of the list for each pair of a ``scene_info`` file, without executing the file's code.
 
-    A pair has two indices into ``image_paths``, ``intrinsics``, (3, 3), and ``poses``, (4, 4) world to camera.
+    A pair has two indices into ``image_paths``, ``intrinsics`` (3, 3) and ``poses`` (4, 4), world to camera.
     Raises :class:`UserError` for any other file.
     """
     try:
@@ -105,7 +105,7 @@ class _Arrays(pickle.Unpickler):
 
 
 def _array(archive: zipfile.ZipFile, name: str) -> Any:
-    stream = BytesIO(archive.open(name).read(1 << 28))  # a longer array is cut off, and refused
+    stream = BytesIO(archive.open(name).read(1 << 28))  # a longer array is cut off, so that reading it fails
     try:
         return np.lib.format.read_array(stream, allow_pickle=False)
     except ValueError:  # an array of objects: its header has been read, and its pickle follows

@@ -1,4 +1,4 @@
-"""The files of both folders: weights as safetensors, their licences, and folders with exactly the given files."""
+"""The files of both folders: choice of weights and licences, conversion to safetensors, writing."""
 
 import filecmp
 import shutil
@@ -24,7 +24,7 @@ class Item:
 
 
 def refuse_other_files(directory: Path, items: Sequence[Item]) -> None:
-    """Raise :class:`UserError` if the folder has other files, which would be uploaded too."""
+    """Raise :class:`UserError` if the folder has files that are not in ``items``: they would be uploaded too."""
     names = {name for item in items for name in (item.name, f".{item.name}.part")}
     others = sorted({path.name for path in directory.glob("*")} - names)
     if others:
@@ -35,9 +35,9 @@ def refuse_other_files(directory: Path, items: Sequence[Item]) -> None:
 
 
 def write_files(directory: Path, items: Sequence[Item]) -> tuple[Item, ...]:
-    """Write files into the folder, except existing ones with the same bytes, and return them as written.
+    """Write the items into the folder, except identical existing files. Return the items with their new paths.
 
-    Raises :class:`UserError` if a file cannot be written; the same call resumes.
+    Raises :class:`UserError` if a file cannot be written. A repeated call resumes.
     """
     try:
         directory.mkdir(parents=True, exist_ok=True)
@@ -61,13 +61,13 @@ class ChosenWeights:
     items: tuple[Item, ...]
     manifest: str  # a line per item
     licence_texts: tuple[Item, ...]
-    restricted: tuple[Item, ...]  # excluded, except from a private package
+    restricted: tuple[Item, ...]  # excluded unless the package is private
 
 
 def choose_weights(store: WeightStore, checkout: Path, staging: Path, *, private: bool) -> ChosenWeights:
-    """Choose the file of each slot in the store, as safetensors: Kaggle would unpack a torch checkpoint.
+    """Choose the file of each slot in the store, as safetensors, since Kaggle would unpack a torch checkpoint.
 
-    Conversions are written to ``staging``. Licences with a text in the checkout allow redistribution.
+    Conversions are written to ``staging``. A licence allows redistribution if the checkout has its text.
     Raises :class:`UserError` if a slot has only damaged files or a checkpoint cannot be read.
     """
     slots = dict.fromkeys(file.slot for file in store.files)
@@ -86,7 +86,7 @@ def choose_weights(store: WeightStore, checkout: Path, staging: Path, *, private
 
 
 def licence_text(checkout: Path, tag: str) -> Path | None:
-    """Return the path of a licence's text, if the checkout has it; ``tag`` is from the manifest."""
+    """Return the path of a licence's text if the checkout has it. ``tag`` is its name in the manifest."""
     texts = {path.stem: path for path in (checkout / "licences").glob("*.txt")}
     return (texts | {"Apache-2.0": checkout / "LICENSE"}).get(tag)
 
@@ -103,7 +103,7 @@ def _good_file(store: WeightStore, slot: str) -> FoundFile | None:
 
 
 def _as_safetensors(found: FoundFile, staging: Path) -> tuple[WeightFile, Path]:
-    """Return the manifest's line and the path of the safetensors file."""
+    """Return the manifest line and path of a file as safetensors, converted if necessary."""
     if found.path.suffix == ".safetensors":
         return replace(found.file, size=found.path.stat().st_size, digest=found.digest), found.path
     # The full name, with its suffix: the manifest may list another conversion under the shorter name.

@@ -10,7 +10,7 @@ from mkpc_kaggle.version import __version__
 COMPETITION = "image-matching-challenge-2022"
 DATASET_SLUG = "mkpc-kaggle"
 KERNEL_TITLE = "MKPC submission"
-KERNEL_SLUG = KERNEL_TITLE.lower().replace(" ", "-")  # Kaggle derives it from the title, and both must agree
+KERNEL_SLUG = KERNEL_TITLE.lower().replace(" ", "-")  # Kaggle derives the slug from the title; both must agree
 LATEST, ORIGINAL = "latest", "original"
 
 
@@ -39,7 +39,7 @@ def dataset_metadata(owner: str, licences: Iterable[str]) -> str:
 
 
 def kernel_metadata(owner: str, notebook: str, image: str) -> str:
-    """Return ``kernel-metadata.json``: two T4, internet off, the competition and our dataset attached.
+    """Return ``kernel-metadata.json``: two T4 GPUs, internet off, the competition and our dataset attached.
 
     ``image`` is ``latest``, ``original`` (the image of the kernel's first version), or an image with the digest
     that ``kaggle kernels pull -m`` reports. Raises :class:`UserError` for other values.

@@ -36,10 +36,10 @@ class Package:
 
 
 def make_package(request: Request) -> Package:
-    """Write both folders and return them; the same request gives the same bytes.
+    """Write both folders and return their files. The same request gives the same bytes.
 
-    Raises :class:`UserError`, before anything is written: without a checkout, for other files in the folders, for
-    damaged weights, and if wheels cannot be built or found.
+    Raises :class:`UserError` before anything is written: if the package runs outside a checkout, a folder has
+    other files, weights are damaged, or wheels cannot be built or found.
     """
     check_owner(request.owner)
     if wrong := [python for python in request.pythons if not re.fullmatch(r"3\.[0-9]{1,2}", python)]:
@@ -80,7 +80,7 @@ def make_package(request: Request) -> Package:
 
 
 def find_checkout() -> Path:
-    """Return the checkout that this package runs from; raise :class:`UserError` if a wheel was installed."""
+    """Return the checkout that this package runs from. Raise :class:`UserError` for an installed wheel."""
     root = Path(__file__).resolve().parents[2]
     if not (root / NOTEBOOK).is_file():
         raise UserError(

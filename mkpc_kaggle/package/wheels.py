@@ -1,4 +1,4 @@
-"""Wheels: ours, built from the checkout, and wheels of dependencies that may be missing in Kaggle's image."""
+"""Our wheel, built from the checkout, and wheels of dependencies that may be missing in Kaggle's image."""
 
 import subprocess
 import sys
@@ -16,21 +16,21 @@ from mkpc_kaggle.errors import UserError
 
 # Direct and indirect dependencies that may be missing or too old in Kaggle's image.
 BUNDLED = ("kornia", "kornia-rs", "pycolmap", "safetensors")
-PYTHONS = ("3.11", "3.12", "3.13", "3.14")  # of Kaggle's current, pinned older and probable next images
+PYTHONS = ("3.11", "3.12", "3.13", "3.14")  # of Kaggle's current, older pinned and probable next images
 PLATFORMS = ("manylinux_2_28_x86_64", "manylinux_2_17_x86_64", "manylinux2014_x86_64")
 
 
 def pins(checkout: Path) -> tuple[str, ...]:
-    """Return ``name==version`` of each bundled package, with the version of the tests."""
+    """Return ``name==version`` of each bundled package, with the version that the tests use."""
     lines = (checkout / "requirements-dev.txt").read_text(encoding="utf-8").splitlines()
     pinned = {canonicalize_name(line.partition("==")[0]): line for line in lines}
     return tuple(pinned[canonicalize_name(name)] for name in BUNDLED)
 
 
 def install_lines(own: Path, wheels: Iterable[Path]) -> tuple[str, ...]:
-    """Return the requirements of the notebook: our wheel, and the ranges of bundled packages of all wheels.
+    """Return the notebook's requirements: our wheel, and the version ranges that wheels set for bundled packages.
 
-    A version of the image within the range is kept, with or without a wheel for its Python.
+    If the image has a version within the range, pip keeps it, even without a wheel for the image's Python.
     """
     lines = (line for wheel in (own, *wheels) for line in _metadata(wheel).get_all("Requires-Dist", []))
     bundled = {
@@ -54,10 +54,10 @@ def build_wheel(checkout: Path, directory: Path) -> Path:
 def collect_wheels(
     requirements: Sequence[str], pythons: Iterable[str], directory: Path, *, kept: Path, wheels: Path | None
 ) -> list[Path]:
-    """Collect the wheels of these requirements for these Python versions (``3.11``), ordered by name.
+    """Collect the wheels of these requirements for Python versions such as ``3.11``, ordered by name.
 
-    The source is the directory ``wheels`` if given. Otherwise it is ``kept``, the output of an earlier run, and
-    pip's index for missing wheels. Raises :class:`UserError` if a wheel is not found.
+    The source is the directory ``wheels``, if given. Otherwise ``kept``, the output of an earlier run, is tried
+    before pip's index. Raises :class:`UserError` if a wheel is not found.
     """
     local = ("--no-index", "--find-links", str(wheels or kept))
     sources = [local] if wheels else [local, ()]
@@ -88,7 +88,7 @@ def _metadata(wheel: Path) -> Message:
 
 
 def _pip(*arguments: str | Path) -> str:
-    """Run this interpreter's pip; return the reason of a failure, or an empty text."""
+    """Run this interpreter's pip. Return the reason of a failure, or an empty text."""
     command = [sys.executable, "-m", "pip", "--disable-pip-version-check", *map(str, arguments)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode == 0:

@@ -1,4 +1,4 @@
-"""Checkpoint files: loading their tensors without running their code, also into a network, and converting them."""
+"""Checkpoint files: loading tensors without running code, filling networks, conversion to safetensors."""
 
 import re
 import zipfile
@@ -16,12 +16,12 @@ if TYPE_CHECKING:
     import torch
     from torch import nn
 
-TENSORS_UNDER = ("state_dict", "extractor")  # the first key in a checkpoint counts
+TENSORS_UNDER = ("state_dict", "extractor")  # keys of a table of tensors; the first one in a checkpoint counts
 MAX_EXPANSION = 4  # bytes of tensors per byte of the file; some tensors share their bytes
 
 
 class Inert:
-    """An inert stand-in for those classes and functions of a pickle that torch does not know."""
+    """An inert stand-in for classes and functions in a pickle that torch does not know."""
 
     def __new__(cls, *_: object, **__: object) -> "Inert":
         return object.__new__(cls)
@@ -31,10 +31,10 @@ class Inert:
 
 
 def load_tensors(path: Path) -> "dict[str, torch.Tensor]":
-    """Load tensors by name, on the CPU, from a safetensors file or a torch checkpoint without executing code.
+    """Load tensors by name, on the CPU, from a safetensors file or a torch checkpoint; execute no code of it.
 
     ``path`` may be the directory of an unpacked torch checkpoint (``NAME/NAME`` on Kaggle). A training checkpoint
-    has its tensors under ``state_dict``, DISK's under ``extractor``; other entries are ignored.
+    has its tensors under ``state_dict``, DISK's checkpoint under ``extractor``. Other entries are ignored.
     Raises :class:`UserError` if the file cannot be read or an entry is not a dense tensor with a name. The same
     error is raised if the tensors have many more bytes than the file.
     """
@@ -65,9 +65,9 @@ def load_into(
 
 
 def convert(source: Path, target: Path, known: WeightFile | None = None) -> WeightFile:
-    """Write contiguous copies of the tensors of ``source`` to ``target``; return its line of a manifest.
+    """Write contiguous copies of the tensors of ``source`` to ``target``; return the target's manifest line.
 
-    ``known`` is the manifest's line of the source; by default it is found by digest, then by name. Raises
+    ``known`` is the manifest line of the source, by default found by digest, then by name. Raises
     :class:`UserError` if the source cannot be read, the target cannot be written, or its name does not end in
     ``.safetensors``.
     """
@@ -112,7 +112,7 @@ def is_unpacked_from(directory: Path, file: WeightFile) -> bool:
 
 
 def _require_plain(table: Mapping[Any, Any], path: Path) -> None:
-    """Raise ``ValueError`` unless all entries have a name and are tensors whose elements lie in memory."""
+    """Raise ``ValueError`` unless all entries are named dense tensors, together not much larger than the file."""
     import torch
 
     for name, value in table.items():
@@ -158,11 +158,11 @@ def _pack(directory: Path, file: Path) -> Path:
 
 
 def _unpickle(path: Path) -> object:
-    """Return the contents of a torch checkpoint, tensors on the CPU.
+    """Return the contents of a torch checkpoint, with tensors on the CPU.
 
-    Training frameworks pickle callbacks and settings of classes that are not installed here, which
-    ``weights_only=True`` refuses. In archives these names are mapped to :class:`Inert`; torch still refuses names
-    of the operating system. The older format must not contain unknown names.
+    Training frameworks pickle callbacks and settings whose classes are not installed here.
+    ``weights_only=True`` refuses them, so in archives their names are mapped to :class:`Inert`. Names of the
+    operating system are still refused. A checkpoint in the older format must not contain unknown names.
     """
     import torch
     from torch.serialization import get_unsafe_globals_in_checkpoint, safe_globals

@@ -55,7 +55,7 @@ def read_manifest(path: Path) -> tuple[WeightFile, ...]:
 
 @cache
 def manifest() -> tuple[WeightFile, ...]:
-    """Return the package's manifest, which is inside a wheel and next to the package in a checkout."""
+    """Return the package's manifest: inside the package in a wheel, next to the package in a checkout."""
     package = Path(__file__).resolve().parents[1]
     for path in (package / MANIFEST, package.parent / MANIFEST):
         if path.is_file():
@@ -64,7 +64,7 @@ def manifest() -> tuple[WeightFile, ...]:
 
 
 def pin(file: WeightFile, path: Path) -> None:
-    """Add the line, with the size and digest of the file at ``path``, to the manifest in its directory."""
+    """Add the line of ``file``, with the size and digest of ``path``, to the manifest next to ``path``."""
     pinned = replace(file, size=path.stat().st_size, digest=digest_of(path))
     own = path.with_name(MANIFEST)
     former = own.read_text(encoding="utf-8") if own.is_file() else ""
@@ -73,9 +73,9 @@ def pin(file: WeightFile, path: Path) -> None:
 
 
 def digest_of(path: Path) -> str:
-    """Return ``sha256:<hex>`` of a file, cached for the process, or of all names and files of a directory.
+    """Return ``sha256:<hex>`` of a file, or of the names and contents of all files in a directory.
 
-    Raises ``OSError`` if it cannot be read.
+    The digest of a file is cached for the process. Raises ``OSError`` if a file cannot be read.
     """
     if path.is_dir():
         files = sorted(file for file in path.rglob("*") if file.is_file())

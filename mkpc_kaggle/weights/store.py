@@ -19,9 +19,9 @@ if TYPE_CHECKING:
     import torch
 
 KAGGLE_INPUT = Path("/kaggle/input")
-IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png"})  # a competition's input has thousands
+IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png"})  # a competition's input has thousands of images
 CHECKPOINT_SUFFIXES = frozenset({".pth", ".pt", ".ckpt", ".safetensors", ".bin", ".pkl", ""})
-MAX_UNKNOWN_SIZE_BYTES = 1 << 28  # files of unknown size have about 50 MB; larger ones are not read
+MAX_UNKNOWN_SIZE_BYTES = 1 << 28  # weights of unknown size have about 50 MB; larger files are not read
 UNPACKED = (
     "this checkpoint was unpacked into a directory, as Kaggle does; it is read from there, but cannot be held "
     "against the manifest's digest. Upload it as safetensors (python -m mkpc_kaggle weights convert)"
@@ -31,17 +31,17 @@ UNPACKED = (
 class State(StrEnum):
     """The result of comparing a file with the manifest."""
 
-    GOOD = "good"  # the bytes of a file of the manifest, under any name
+    GOOD = "good"  # bytes as in the manifest, under any name
     UNVERIFIED = "unverified"  # no digest in the manifest, or an unpacked checkpoint
-    REFUSED = "refused"  # unreadable, or other bytes than in the manifest
+    REFUSED = "refused"  # unreadable, or bytes that differ from the manifest
 
 
 @dataclass(frozen=True)
 class FoundFile:
     """A file that was compared with a line of the manifest.
 
-    ``path`` is a directory if the checkpoint is unpacked. ``digest`` is ``sha256:<hex>`` of the bytes,
-    empty for a file that is unreadable or has no size of the manifest. ``note`` is the reason for the state.
+    ``path`` is a directory if the checkpoint is unpacked. ``digest`` is ``sha256:<hex>`` of the bytes, or
+    empty if the file is unreadable or its size is not in the manifest. ``note`` is the reason for the state.
     """
 
     file: WeightFile
@@ -66,8 +66,8 @@ class Search:
 class WeightStore:
     """Weight files in search directories: ``--weights``, then ``$MKPC_WEIGHTS``, then ``/kaggle/input/**``.
 
-    Files are compared with ``files``, by default the package's manifest and the manifests in the search
-    directories, which list weights converted by ``package``.
+    Files are compared with the lines ``files``. By default, the lines are from the package's manifest and from
+    manifests in the search directories, which list weights that ``package`` converted.
     """
 
     def __init__(self, directories: Iterable[Path] = (), files: Sequence[WeightFile] | None = None) -> None:
@@ -88,7 +88,7 @@ class WeightStore:
     def files(self) -> tuple[WeightFile, ...]:
         """The lines to compare with, one per name; the package's manifest comes first.
 
-        If it has no digest for a file, the digest of a manifest in the search directories counts, which is the
+        If the package's manifest has no digest for a file, a manifest in the search directories supplies it: the
         digest of the first download.
         """
         if self._given_files is not None:
@@ -118,7 +118,7 @@ class WeightStore:
         return search.found
 
     def load(self, slot: str) -> "dict[str, torch.Tensor]":
-        """Load the slot's tensors by name, on the CPU; raises :class:`UserError` if the file is missing."""
+        """Return the slot's tensors by name, on the CPU. Raise :class:`UserError` if the file is missing."""
         found = self.find(slot)
         if found is None:
             names = " or ".join(file.name for file in self.alternatives(slot))
@@ -126,10 +126,10 @@ class WeightStore:
         return load_tensors(found.path)
 
     def search(self, lines: Sequence[WeightFile]) -> Search:
-        """Return the first usable file of these lines; results are cached and sent to workers with the store."""
+        """Return the first usable file for these lines. Results are cached and sent to workers with the store."""
         key = tuple(lines)
         if key not in self._searches:
-            judged: dict[Path, FoundFile] = {}  # by path; a comparison by digest replaces one by name
+            judged: dict[Path, FoundFile] = {}  # by path; comparison by digest replaces comparison by name
             for file in self._candidates(lines):
                 judged[file.path] = file
                 if file.usable:
@@ -139,7 +139,7 @@ class WeightStore:
         return self._searches[key]
 
     def verify(self) -> list[FoundFile]:
-        """Return all files, by path, that have a name or a digest of the manifest."""
+        """Return all files whose name or digest is in the manifest, sorted by path."""
         found = {file.path: file for file in reversed([*self._candidates(self.files)])}  # first per path
         return [found[path] for path in sorted(found)]
 
@@ -159,7 +159,7 @@ class WeightStore:
             directories = (path for path in self._walked[1] if is_unpacked_from(path, file))
             yield from (judge(directory, file) for directory in directories)
 
-    # Indexes: a directory may have a hundred thousand files, the manifest has dozens of lines.
+    # Indexes of the files: a directory may have a hundred thousand, the manifest has dozens of lines.
 
     @cached_property
     def _by_name(self) -> dict[str, list[Path]]:
@@ -180,7 +180,7 @@ class WeightStore:
 
     @cached_property
     def _walked(self) -> tuple[dict[Path, int], list[Path]]:
-        """Sizes in bytes of all files except images (-1: not a regular file), by depth; unpacked checkpoints.
+        """Size in bytes of each file except images, shallow files first (-1: not regular); unpacked checkpoints.
 
         Links are followed, since Kaggle mounts inputs by links. No directory is visited twice, so cycles end.
         """
@@ -235,6 +235,6 @@ def judge(path: Path, file: WeightFile, files: Iterable[WeightFile] = ()) -> Fou
 
 
 def _may_be(size: int, file: WeightFile, files: Iterable[WeightFile]) -> bool:
-    """Return whether a file of ``size`` bytes may have the content of ``file``, or of another of ``files``."""
+    """Return whether a file of ``size`` bytes may have the content of ``file`` or of one of ``files``."""
     may_be_any = size <= MAX_UNKNOWN_SIZE_BYTES and any(line.size < 0 for line in files)
     return file.size < 0 or may_be_any or size in (file.size, *(line.size for line in files))
