@@ -13,11 +13,11 @@ from mkpc_kaggle.recipe import Unit
 
 SUMMARY_FACTOR = 5  # a report may take this many times as long as writing the submission
 WRITE_MARGIN = 1.5  # the next write may take this many times as long as the latest
-MAX_WRITE_SHARE = 0.05  # of the limit, which writing is expected to take at most
-MAX_SILENCE_S, MIN_SILENCE_S, SILENCE_SHARE = 60.0, 5.0, 0.02  # of a worker, by the share of the limit
-WINDOW = 64  # the number of the latest measurements that count
-MARGIN, MIN_MARGIN = 0.4, 0.01  # of a forecast from one measurement; from n, sqrt(n) times smaller
-MAX_STEP_BACK_S = 60.0  # of the wall clock, between the moment that --started-at names and the start
+MAX_WRITE_SHARE = 0.05  # maximum share of the limit for the forecast of a write
+MAX_SILENCE_S, MIN_SILENCE_S, SILENCE_SHARE = 60.0, 5.0, 0.02  # of a worker; the share is of the limit
+WINDOW = 64  # number of latest measurements in the mean
+MARGIN, MIN_MARGIN = 0.4, 0.01  # of a forecast from one measurement; sqrt(n) times smaller from n
+MAX_STEP_BACK_S = 60.0  # of the wall clock, between --started-at and the start
 
 
 def parse_duration(text: str) -> float:
@@ -46,8 +46,8 @@ def format_duration(seconds: float) -> str:
 class Budget:
     """The time of a run since ``started``, in seconds of ``clock``, which never jumps.
 
-    No unit runs after ``stop_units``, and the run waits for no worker after ``stop_waiting``. The last version of
-    the submission is written at ``final_write``. The process has ended at ``limit``.
+    No unit runs after ``stop_units``, and the run stops waiting for workers at ``stop_waiting``. Writing of the
+    final submission starts at ``final_write``. The process ends before ``limit``.
     """
 
     started: float
@@ -60,7 +60,7 @@ class Budget:
 
     @property
     def writing(self) -> float:
-        """Seconds that the next write may take, by the median of the latest: one slow write has no effect."""
+        """Seconds that the next write may take, from the median of the latest: one slow write has no effect."""
         median = median_low(self._writes) if self._writes else 0.0
         return min(WRITE_MARGIN * median, MAX_WRITE_SHARE * self.time_limit)
 
@@ -71,7 +71,7 @@ class Budget:
 
     @property
     def silence(self) -> float:
-        """Seconds beyond the expected ones after which a silent worker counts as hung."""
+        """Seconds beyond the expected time after which a silent worker counts as hung."""
         return min(MAX_SILENCE_S, max(MIN_SILENCE_S, SILENCE_SHARE * self.time_limit))
 
     @property
@@ -91,7 +91,7 @@ class Budget:
         return self.started + self.time_limit
 
     def left(self) -> float:
-        """Seconds until :attr:`stop_units`; never negative."""
+        """Return the seconds until :attr:`stop_units`; never negative."""
         return max(0.0, self.stop_units - self.clock())
 
     def spent(self) -> float:
@@ -101,7 +101,7 @@ class Budget:
 class Costs:
     """Seconds of a unit on a pair, by name.
 
-    A worker's first run of a unit is its warm-up. It counts until another run is measured, and in no forecast.
+    A worker's first run of a unit is a warm-up: the mean until another run is measured, but never a forecast.
     """
 
     def __init__(self) -> None:
@@ -118,7 +118,7 @@ class Costs:
         return unit in self._measured or unit in self._warm_up
 
     def is_known(self, unit: str) -> bool:
-        """Whether more than the warm-up is known."""
+        """Return whether a run after the warm-up was measured."""
         return unit in self._measured
 
     def mean(self, unit: str) -> float:
@@ -128,20 +128,20 @@ class Costs:
         return self._warm_up.get(unit, 0.0)
 
     def forecast(self, unit: str) -> float:
-        """Return the expected seconds with a margin that shrinks as more is known; 0 while nothing is."""
+        """Return the mean plus a margin that shrinks with more measurements; 0 without measurements."""
         if not self.is_known(unit):
             return 0.0
         return self.mean(unit) * (1 + max(MIN_MARGIN, MARGIN / sqrt(len(self._measured[unit]))))
 
     def warm_up(self, units: Iterable[Unit]) -> float:
-        """Return the seconds of the longest of these units' latest first runs on a worker."""
+        """Return the longest warm-up of these units, in seconds, by the latest of each unit."""
         return max((self._warm_up.get(unit.name, 0.0) for unit in units), default=0.0)
 
 
 def monotonic_of(epoch: float) -> float:
     """Return the monotonic clock's time at wall-clock time ``epoch``, in seconds since 1970.
 
-    It is called once, when a run starts, so later jumps of the wall clock do not move the limit. A time less than
+    A run calls this once, at its start, so later jumps of the wall clock do not move the limit. A time less than
     a minute ahead counts as now, because the clock was probably set back. Raises :class:`UserError` for a later
     time.
     """

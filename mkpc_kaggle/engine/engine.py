@@ -34,11 +34,11 @@ from mkpc_kaggle.engine.state import State
 from mkpc_kaggle.engine.tables import Estimates, Features, Key, Points, Table
 from mkpc_kaggle.errors import UserError
 
-UNKNOWN_SHARE, MAX_UNKNOWN_S = 0.25, 3600.0  # of the time left, after which a job of unknown cost hangs
-PUBLISH_INTERVAL_S, PUBLISH_SHARE = 30.0, 0.05  # how often the results are written, and their share of the time
+UNKNOWN_SHARE, MAX_UNKNOWN_S = 0.25, 3600.0  # of the time left; a job of unknown cost that takes longer hangs
+PUBLISH_INTERVAL_S, PUBLISH_SHARE = 30.0, 0.05  # between writes of the results; share of the time for writes
 HASH_THREADS = 4
 
-JOBS: dict[Work, tuple[type[Job], ...]] = {  # of a place by its work, the most urgent first
+JOBS: dict[Work, tuple[type[Job], ...]] = {  # kinds of job for each kind of place, the most urgent first
     Work.MATCH: (MatchJob,),
     Work.LIGHT: (LookJob, EstimateJob),
     Work.SCENE: (SceneJob,),
@@ -46,9 +46,9 @@ JOBS: dict[Work, tuple[type[Job], ...]] = {  # of a place by its work, the most 
 
 
 class Engine:
-    """A run. :meth:`look` and :meth:`ask` compute what the journal does not have.
+    """A run. :meth:`look` and :meth:`ask` compute results that the journal does not have.
 
-    ``nothing`` is a request without pairs, until the first is asked. Setting ``interrupt`` ends the run early.
+    ``nothing``, a request without pairs, holds until :meth:`ask`. Setting ``interrupt`` ends the run early.
     """
 
     def __init__(
@@ -93,7 +93,7 @@ class Engine:
     # Requests
 
     def look(self, looks: Mapping[Key, Callable[[], bytes]]) -> dict[Key, bytes]:
-        """Return the features of each key (digest of contents, digest of settings), except failed ones."""
+        """Return the features by key (digest of contents, digest of settings). Failed ones are left out."""
         features = self._tables[LookJob] = Features(self.journal, looks)
         self._loop()
         self._tables[LookJob] = Features(self.journal, {})
@@ -166,7 +166,7 @@ class Engine:
         self._resumed = int(complete[: self.state.rows].sum())
 
     def _digests(self, pairs: Sequence[WantedPair]) -> dict[str, str]:
-        """Return the digests of the images that have points, digested again: other contents have other points."""
+        """Return the digests of images with points. Digest the files again, since new contents need new points."""
         files = {name: path for each in pairs for name, path in zip(each.names, each.pair.images, strict=True)}
         known = self.journal.digests()
         now = self.digest_files({name: path for name, path in files.items() if name in known})
@@ -214,7 +214,7 @@ class Engine:
                 place.submit(job, self._time_limit(job, now), now)
 
     def _may_work(self, place: Place, now: float) -> bool:
-        """Whether a place without a job will have one when a worker has started."""
+        """Return whether a place will have a job once its worker has started."""
         return place.is_starting and self._has_work(place, now)
 
     def _has_work(self, place: Place, now: float) -> bool:
@@ -225,7 +225,7 @@ class Engine:
         return next((job for job in jobs if job is not None), None)
 
     def _time_limit(self, job: Job, now: float) -> float:
-        """Return the seconds after which a worker hangs, from measured costs or from the time left."""
+        """Return the seconds after which a worker counts as hung, from measured costs or from the time left."""
         patience = self._tables[type(job)].patience(job)
         return self.budget.silence + (self._unknown(now) if patience is None else patience)
 
@@ -249,7 +249,7 @@ class Engine:
             place.kill()
 
     def _save(self, job: Job, answer: Any, seconds: float) -> None:
-        """Save an answer. A result that no table can hold costs itself alone."""
+        """Save an answer. If it cannot be saved, only this job fails."""
         table = self._tables[type(job)]
         try:
             table.save(job, answer, seconds)
@@ -262,7 +262,7 @@ class Engine:
             self._publish()
 
     def _lose(self, place: Place, job: Job | None, failure: Failure) -> None:
-        """Record that a worker failed at a job, or could not start."""
+        """Record that a worker failed on a job, or could not start."""
         self._chronicle.fault(f"a job was lost on {place.name}: {failure}" if job else f"{place.name}: {failure}")
         if place.closed:
             self._chronicle.explain(f"no worker is started any more on {place.closed}")
@@ -272,7 +272,7 @@ class Engine:
             self.scenes.skip_all(failure)
 
     def _fall_back(self) -> None:
-        """Continue elsewhere when the last matching place is closed, or had to skip every unit."""
+        """Continue on the fallback places once all matching places are closed, or every unit is skipped."""
         places = self.site.of(Work.MATCH)
         self.plan.is_closed = self._is_open and all(place.closed for place in places)
         reason = "; ".join(place.closed for place in places if place.closed)
@@ -293,7 +293,7 @@ class Engine:
     # Results
 
     def save_results(self) -> str:
-        """Write the results unless the run has ended. Return why they cannot be written. For any thread."""
+        """Write the results unless the run has ended. Return why that failed, or an empty text. Thread-safe."""
         with self._publishing:
             if not self._has_ended:
                 try:
@@ -326,5 +326,5 @@ class Engine:
 
 
 def name_below(root: str, file: str) -> str:
-    """Return the name of a file below ``root``; a file elsewhere goes by its path."""
+    """Return a file's path relative to ``root``, or the whole path if the file lies elsewhere."""
     return file.removeprefix(root.rstrip(os.sep) + os.sep) if root else file

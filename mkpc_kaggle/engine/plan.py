@@ -1,9 +1,9 @@
-"""Which units to run on which pairs next: one priority order over the state of all pairs.
+"""The choice of the next units and pairs, by one priority order over the state of all pairs.
 
 A plan has no queue. It looks at the state, the costs and the time left whenever a worker is idle.
 
-Two places decide that a unit no longer fits: :meth:`Plan.fit` for all pairs, and
-:class:`mkpc_kaggle.engine.worker.MatchRunner` for a job whose time is over.
+Two rules decide that a unit no longer fits in time: :meth:`Plan.fit` for all pairs, and
+:class:`mkpc_kaggle.engine.worker.MatchRunner` for the units of a job that ran out of time.
 """
 
 from collections import Counter
@@ -19,9 +19,9 @@ from mkpc_kaggle.engine.state import State
 from mkpc_kaggle.recipe import Unit
 
 CONNECT_SHARE = 0.1  # of the time after the sweep, for extra pairs
-JOB_SHARE = 0.01  # of the time left, which a job of several units takes at most
-HANG_FACTOR = 30.0  # a job that takes this many times what was measured hangs
-RESERVE_SHARE = 0.2  # of the limit, at most, that is reserved for scenes
+JOB_SHARE = 0.01  # maximum share of the time left for a job of several units
+HANG_FACTOR = 30.0  # a job that takes this multiple of its measured cost hangs
+RESERVE_SHARE = 0.2  # maximum share of the limit that is reserved for estimates and scenes
 MAX_FAILED_PAIRS = 2  # a unit that was skipped on this many pairs and never ran is skipped on all pairs
 
 Mask = NDArray[np.bool_]
@@ -30,10 +30,10 @@ Mask = NDArray[np.bool_]
 class Plan:
     """The priorities of a run: sweep, connect, deepen, fill.
 
-    ``order`` is the order in which encodings are cached best. ``workers`` match at the same time; ``is_closed``:
-    none can any more. ``reserve`` seconds at the end belong to estimates and scenes. ``busy`` (N,) are the pairs
-    of jobs under way, ``unusable`` (U,) the units that no worker can run. ``announce`` gets one line for the user,
-    ``explain`` each decision.
+    ``order`` visits pairs so that cached encodings are reused. ``workers`` is the number of parallel workers;
+    ``is_closed`` means that no worker is left. ``reserve`` is the time at the end for estimates and scenes, in
+    seconds. ``busy`` (N,) marks the pairs of running jobs, ``unusable`` (U,) the units that no worker can run.
+    ``announce`` receives one line for the user, ``explain`` a line for each decision.
     """
 
     def __init__(
@@ -67,7 +67,7 @@ class Plan:
 
     @property
     def stop(self) -> float:
-        """When no unit may run any more."""
+        """The time after which no unit may run."""
         return self.budget.stop_units - min(self.reserve, RESERVE_SHARE * self.budget.time_limit)
 
     def next(self, now: float) -> MatchJob | None:
@@ -83,7 +83,7 @@ class Plan:
         return not self.is_closed and bool((self._wanted(now)[~self.busy] < Phase.NEVER).any())
 
     def settled(self, now: float, phase: Phase = Phase.FILL) -> Mask:
-        """(N,): the pairs that get no further unit before a phase; before ``NEVER``: none at all."""
+        """Return an (N,) mask of the pairs that get no further unit before ``phase``; ``NEVER``: none at all."""
         return np.asarray((self._wanted(now).min(1) >= phase) & ~self.busy)
 
     def fit(self, now: float) -> int:
@@ -102,7 +102,7 @@ class Plan:
         return f"{text}; {min(self.fit(now), usable)} of {usable} units fit in the remaining {left}"
 
     def _look(self) -> None:
-        """Derive which units pairs can still get, and the seconds that prefixes of the recipe take."""
+        """Update which units pairs can still get, and how many seconds each prefix of the recipe takes."""
         missing = ~self.state.had & ~self.unusable & ~self.state.unreadable[:, None]
         for index, name in self.losses.skipped:
             missing[index, self._numbers[name]] = False
@@ -113,11 +113,11 @@ class Plan:
         self._needed = np.cumsum(missing[: self.state.rows].sum(0) * forecasts)
 
     def _wanted(self, now: float) -> NDArray[np.int_]:
-        """(N, U): the phase in which a pair gets a unit; ``NEVER`` if it would not end in time."""
+        """Return the phase (N, U) in which a pair gets a unit; ``NEVER`` if the unit would not end in time."""
         return np.where(self._means < self.stop - now, self._phases(now), Phase.NEVER)
 
     def _phases(self, now: float) -> NDArray[np.int_]:
-        """(N, U): the phase to which a missing unit belongs; ``NEVER`` elsewhere."""
+        """Return the phase (N, U) of each pair's missing units; ``NEVER`` for the other units."""
         phases = np.full(self._missing.shape, Phase.NEVER)
         rows, extra = phases[: self.state.rows], phases[self.state.rows :]
         rows[:] = np.where(np.arange(len(self.units)) < self.fit(now), Phase.DEEPEN, Phase.FILL)
@@ -127,12 +127,12 @@ class Plan:
 
     @property
     def _first(self) -> int:
-        """The unit of the sweep; -1 if none can run."""
+        """The number of the sweep's unit; -1 if no unit can run."""
         usable = (n for n, unit in enumerate(self.units) if unit.stage == 1 and not self.unusable[n])
         return next(usable, -1)
 
     def _connecting(self, now: float) -> Mask:
-        """(N - rows,): the extra pairs that a tenth of the time suffices for, the most useful first."""
+        """Return an (N - rows,) mask of the extra pairs that fit in a tenth of the time, the most useful first."""
         had = self.state.had[self.state.rows :, self._first]
         seconds = self.costs.forecast(self.units[self._first].name) / self.workers
         most = CONNECT_SHARE * (max(0.0, self.stop - now) + had.sum() * seconds)
@@ -162,14 +162,14 @@ class Plan:
         return self._order[rank : rank + self.minibatch].tolist() if job.phase is not Phase.FILL else []
 
     def patience(self, job: MatchJob) -> float | None:
-        """Return the seconds after which a job hangs, perhaps on a new worker; ``None`` if a cost is unknown."""
+        """Return the seconds after which a job counts as hung, warm-up included; ``None`` if a cost is unknown."""
         if not all(self.costs.is_known(unit.name) for unit in job.units):
             return None
         expected = len(job.indices) * sum(self.costs.mean(unit.name) for unit in job.units)
         return HANG_FACTOR * expected + self.costs.warm_up(job.units)
 
     def _enter(self, phase: Phase, now: float) -> None:
-        """Explain a change of the phase or of the units that fit. Announce once how many fit by measured costs."""
+        """Explain a change of the phase or of the units that fit. Announce the outlook once, by measured costs."""
         self.phase = phase
         if phase is Phase.SWEEP:
             return
@@ -192,10 +192,10 @@ class Plan:
         self._look()
 
     def on_failure(self, job: MatchJob, failure: Failure) -> None:
-        """Record a lost job: it comes back as single pairs and units. Skip a unit that is lost twice on a pair."""
+        """Record a lost job; retry its pairs and units one by one. Skip a unit that is lost twice on a pair."""
         self.busy[list(job.indices)] = False
         lost = [(index, unit.name) for index in job.indices for unit in job.units]
-        if failure.cause is Cause.DEVICE:  # it counts against the place
+        if failure.cause is Cause.DEVICE:  # counts against the worker's place, not the unit
             self.losses.alone.update(lost)
         elif self.losses.add(lost, failure):
             ((index, name),) = lost
@@ -216,7 +216,7 @@ class Plan:
         return bool(self.unusable.all())
 
     def progress(self, now: float) -> tuple[str, int, int]:
-        """Return the phase, the number of its pairs that are done, and the number of its pairs."""
+        """Return the phase, the number of its finished pairs, and the number of all its pairs."""
         pending, rows = self._phases(now).min(1) <= self.phase, self.state.rows
         if self.phase is Phase.CONNECT:
             total = int(self._connecting(now).sum())

@@ -1,4 +1,4 @@
-"""The table of scenes: which batches to reconstruct, when, and how long that takes, in parallel with matching."""
+"""The table of scenes: which batches to reconstruct in parallel with matching, when, and at what cost."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -16,15 +16,15 @@ from mkpc_kaggle.recipe import SceneConfig
 from mkpc_kaggle.scene.densify import extra_pairs
 from mkpc_kaggle.scene.reconstruct import Solution
 
-MIN_PAIRS = 2  # they can connect three images
-START_S = 3.0  # that a process takes to begin
-MATCH_S = 5e-4  # that a match adds to a reconstruction: before any was measured, and before one hangs
-FORECAST_MARGIN = 1.5  # of a forecast from the matches of earlier scenes
+MIN_PAIRS = 2  # the minimum to connect three images
+START_S = 3.0  # start-up time of a process
+MATCH_S = 5e-4  # per match of a reconstruction: initial forecast, and lower bound for a hang
+FORECAST_MARGIN = 1.5  # factor on a forecast from earlier scenes' matches
 NOT_RECONSTRUCTED = "not reconstructed in time"
 
 
 def batches_of(pairs: Iterable[Pair]) -> dict[str, list[int]]:
-    """Return the indices of the pairs of each batch that may be reconstructed: F is wanted, no camera is known."""
+    """Return the pair indices of each batch that can be reconstructed: two or more pairs without intrinsics."""
     batches: dict[str, list[int]] = {}
     for index, pair in enumerate(pairs):
         if pair.intrinsics is None:
@@ -33,9 +33,9 @@ def batches_of(pairs: Iterable[Pair]) -> dict[str, list[int]]:
 
 
 def extra_pairs_of(pairs: Sequence[Pair], config: SceneConfig | None) -> list[Pair]:
-    """Return pairs of a batch's images that no row names, for its scene alone; the most useful first.
+    """Return pairs of batches' images that have no row and are used only for scenes, the most useful first.
 
-    Each batch gets up to ``pairs_per_image``, the batch with the fewest pairs per image first.
+    Each batch gets up to ``pairs_per_image``, starting with the batch with the fewest pairs per image.
     """
     if config is None or not config.pairs_per_image:
         return []
@@ -52,7 +52,7 @@ def extra_pairs_of(pairs: Sequence[Pair], config: SceneConfig | None) -> list[Pa
 
 
 def standing_scenes(journal: Journal, request: Request) -> dict[str, SceneRecord]:
-    """Return the standing scene of each batch. Forget a scene whose files were removed: they are a result, too."""
+    """Return the standing scene of each batch. Forget a scene whose exported files were removed."""
     made = journal.scenes("scene") if request.exports else journal.scenes()
     for batch in request.exports.keys() & made.keys():
         if not request.exports[batch].has_files(len(made[batch].models)):
@@ -62,9 +62,9 @@ def standing_scenes(journal: Journal, request: Request) -> dict[str, SceneRecord
 
 
 class Scenes:
-    """The ``batches`` of a request, by name with the positions of their pairs, and their scenes, current or not.
+    """The scenes of a request's ``batches``, which map a batch's name to the positions of its pairs.
 
-    ``made`` are the standing reconstructions. ``losses`` has why a reconstruction failed.
+    ``made`` has the standing scene of each batch, current or not. ``losses`` has the reasons of failures.
     """
 
     def __init__(
@@ -82,10 +82,10 @@ class Scenes:
         self._stale = set(batches) - state.journal.current_scenes()
         self._running: set[str] = set()
         self._batch_of = {index: name for name, indices in batches.items() for index in indices}
-        self._seconds, self._done = 0.0, 0  # of the scenes of this run: their time, their matches
+        self._seconds, self._done = 0.0, 0  # of this run's scenes: total time, total matches
 
     def waiting(self) -> list[str]:
-        """Return the batches to reconstruct, never reconstructed batches first."""
+        """Return the batches to reconstruct; batches without any scene come first."""
         changed = {self._batch_of[index] for index in self._state.changed if index in self._batch_of}
         self._state.changed.clear()
         self._stale |= changed
@@ -116,10 +116,10 @@ class Scenes:
         return HANG_FACTOR * max(self._forecast(job.matches), START_S + MATCH_S * job.matches)
 
     def save(self, job: SceneJob, answer: Solution, seconds: float) -> None:
-        """Save a reconstruction, which may be out of date already."""
+        """Save a reconstruction, even if it is already out of date."""
         journal, record = self._state.journal, SceneRecord.of(job.batch, answer.reconstructions, seconds)
         if job.export is not None:
-            journal.forget_scene(job.batch)  # its files are replaced
+            journal.forget_scene(job.batch)  # its old files are replaced
         journal.save_scene(record, job.inputs, job.pairs, answer.choices)
         self._seconds, self._done = self._seconds + max(0.0, seconds - START_S), self._done + job.matches
         self._running.discard(job.batch)
@@ -138,7 +138,7 @@ class Scenes:
         self.losses.add([job.batch], failure)
 
     def skip_all(self, failure: Failure) -> None:
-        """No worker reconstructs any further batch."""
+        """Skip all pending batches: no worker can reconstruct them."""
         self.losses.skipped |= dict.fromkeys(self._stale, failure)
 
     def report(self) -> tuple[SceneRecord, ...]:
@@ -149,7 +149,7 @@ class Scenes:
     def _due(self, now: float) -> str | None:
         """Return a batch to reconstruct now, if any.
 
-        A first scene waits for the units that fit, the next one for all units, and none after matching has ended.
+        A batch's first scene waits for the units that fit in time, later scenes for all units until matching ends.
         """
         if not (waiting := self.waiting()):
             return None

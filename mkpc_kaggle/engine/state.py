@@ -1,4 +1,4 @@
-"""The state of all pairs of a request in arrays: the answers of the journal's views, kept up to date."""
+"""The state of all pairs of a request: arrays from the journal's views, kept up to date."""
 
 from collections.abc import Iterable, Mapping, Sequence
 
@@ -13,12 +13,12 @@ from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 
 
 class State:
-    """Arrays for N pairs and U units, by their positions in the request and in its recipe.
+    """Arrays for the N pairs of a request and the U units of its recipe, in their order.
 
-    ``had`` (N, U): the current points. ``matches`` (N,): their number. ``is_estimated`` (N,): whether the estimate
-    is current. ``inliers`` (N,), ``own`` (N, 3, 3), ``has_own`` (N,): of the standing estimate. ``unreadable``
-    (N,): an image cannot be read. The first ``rows`` pairs have a row. ``changed`` are the pairs with other points
-    or another estimate since their scenes were looked at. ``digests`` has the digest of each image by name.
+    ``had`` (N, U): current points exist. ``matches`` (N,): their number. ``is_estimated`` (N,): the estimate is
+    current. ``inliers`` (N,), the F ``own`` (N, 3, 3) and ``has_own`` (N,) are of the standing estimate.
+    ``unreadable`` (N,): an image cannot be read. The first ``rows`` pairs have a row. ``changed``: pairs whose
+    points or estimate changed since :class:`Scenes` last looked. ``digests`` has each image's digest by name.
     """
 
     def __init__(
@@ -39,7 +39,7 @@ class State:
 
     @property
     def fundamentals(self) -> NDArray[np.float64]:
-        """(rows, 3, 3): the F to write: the scene's, else the pair's, else the fallback."""
+        """The F to write (rows, 3, 3): the scene's, else the pair's, else the fallback."""
         written = self.own[: self.rows].copy()
         for position, F in self.by_scene.items():
             if position < self.rows:
@@ -47,14 +47,14 @@ class State:
         return written
 
     def save_outcomes(self, outcomes: Sequence[Outcome]) -> None:
-        """Save what a job found on its pairs."""
+        """Save a job's results on its pairs."""
         settings = dict(zip(self.units, self.request.settings.units, strict=True))
         self.journal.save_outcomes(outcomes, settings)
         self.digests |= {image.name: image.digest for outcome in outcomes for image in outcome.images}
         self.refresh(outcome.index for outcome in outcomes)
 
     def refresh(self, positions: Iterable[int]) -> None:
-        """Read these pairs again, and all rows of the same images."""
+        """Read these pairs again, and all rows that repeat them."""
         changed = {twin for position in positions for twin in self._twins.get(position, (position,))}
         index = sorted(changed)
         self.had[index], self.matches[index], self.is_estimated[index] = False, 0, False
@@ -62,11 +62,11 @@ class State:
         self.changed |= changed
 
     def read_choices(self) -> None:
-        """Read which pairs have the F of their scene."""
+        """Read which pairs take F from their scene."""
         self.by_scene = {n: choice.F for n, choice in self.journal.choices().items() if choice.F is not None}
 
     def points_of(self, positions: Iterable[int]) -> tuple[tuple[PairPoints, ...], PointSource]:
-        """Return references to the current points of pairs, and where a worker reads them."""
+        """Return references to the current points of pairs, and the source for a worker to read the points."""
         pairs = tuple(map(self._points_of, positions))
         revisions = [revision for pair in pairs for revision in pair.revisions]
         points = self.journal.points(revisions) if self.journal.is_in_memory else None

@@ -24,10 +24,10 @@ class Table(Protocol):
     def has_work(self, now: float) -> bool: ...
 
     def next(self, now: float) -> Job | None:
-        """Return a job for an idle worker, if there is any."""
+        """Return a job for an idle worker, or ``None``."""
 
     def patience(self, job: Any) -> float | None:
-        """Return the seconds after which a job hangs, by measured costs; ``None`` before any was measured."""
+        """Return the seconds after which a job counts as hung, by measured costs; ``None`` if no cost is known."""
 
     def save(self, job: Any, answer: Any, seconds: float) -> None:
         """Save the answer to a job that took ``seconds``. Raise ``sqlite3.Error`` if no row can hold it."""
@@ -67,7 +67,7 @@ class Points:
 
 
 class Estimates:
-    """The rows whose estimate is missing or out of date. ``busy`` (N,) are the pairs of jobs under way."""
+    """The missing and outdated estimates of rows. ``busy`` (N,) marks the pairs of running jobs."""
 
     def __init__(self, state: State, plan: Plan, order: Sequence[int], chronicle: Chronicle) -> None:
         self.busy = np.zeros(len(state.pairs), bool)
@@ -77,7 +77,7 @@ class Estimates:
         self._costs = Costs()
 
     def due(self, now: float) -> NDArray[np.int_]:
-        """Return the rows to estimate now, those without any F first. Others wait until they have what fits."""
+        """Return the rows to estimate now: first rows without an F, then rows with all units that fit in time."""
         state = self._state
         due = state.had.any(1) & ~state.is_estimated & ~self.busy & (self._plan.settled(now) | ~state.has_own)
         due[state.rows :] = False
@@ -86,7 +86,7 @@ class Estimates:
         return np.asarray(order[np.argsort(state.has_own[order], kind="stable")])
 
     def pending(self, now: float) -> Mask:
-        """(N,): the pairs that are due or busy."""
+        """Return an (N,) mask of the pairs that are due or busy."""
         pending = self.busy.copy()
         pending[self.due(now)] = True
         return pending
@@ -123,7 +123,7 @@ class Estimates:
             self._chronicle.progress.show("estimate", int(done), int(total))
 
     def lose(self, job: EstimateJob, failure: Failure) -> None:
-        """Try the pairs of a lost job again, one by one. A pair that is lost twice keeps the F that it has."""
+        """Retry the pairs of a lost job one by one. A pair that is lost twice keeps its present F."""
         indices = [pair.index for pair in job.pairs]
         self.busy[indices] = False
         if self._losses.add(indices, failure):
@@ -131,7 +131,7 @@ class Estimates:
 
 
 class Features:
-    """The looks at images that are wanted: ``found`` are their features so far, by key."""
+    """Requested features of images and datasets. ``found`` has the features so far, by key."""
 
     def __init__(self, journal: Journal, looks: Mapping[Key, Callable[[], bytes]]) -> None:
         known = {key: journal.feature(*key) for key in looks}
