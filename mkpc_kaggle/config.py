@@ -80,7 +80,7 @@ SHARE = Range(0, 1)  # a fraction; also the range of scores
 
 
 def check_ranges(config: Any, **ranges: Range) -> None:
-    """Raise ``ValueError`` for the first attribute of ``config`` out of its range."""
+    """Raise ``ValueError`` for the first attribute of ``config`` that is out of its range."""
     for name, allowed in ranges.items():
         number = getattr(config, name)
         if number not in allowed:

@@ -10,7 +10,7 @@ MAX_TEXT_BYTES = 1 << 24
 
 
 class UserError(Exception):
-    """A problem that the user can correct. The message states the problem, the place and the next step."""
+    """A problem that the user can correct. The message states the problem, its location and the next step."""
 
 
 @cache
@@ -34,18 +34,18 @@ def read_text(path: Path) -> str:
 
 
 def shown(name: object) -> str:
-    """Return a name for messages, its control characters escaped: they end lines and drive terminals."""
+    """Return a name for messages. Escape control characters, which end lines and control terminals."""
     return "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in str(name))
 
 
 def printable(text: str) -> str:
-    """Return ``text`` with escapes for characters that UTF-8 cannot encode. Paths may have them."""
+    """Return ``text`` with escapes for characters that UTF-8 cannot encode. Paths may contain these characters."""
     return text.encode("utf-8", "backslashreplace").decode()
 
 
 @contextmanager
 def writing(what: str) -> Iterator[None]:
-    """Convert an ``OSError`` in the block to a :class:`UserError`: ``what`` cannot be written."""
+    """Convert an ``OSError`` in the block to a :class:`UserError` about writing ``what``."""
     try:
         yield
     except OSError as error:

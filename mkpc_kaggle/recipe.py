@@ -1,4 +1,4 @@
-"""Recipes: matchers and their views in order of importance, and the settings of all later steps.
+"""Recipes: units (a matcher on one kind of view) in order of importance, and settings of all later steps.
 
 A recipe is a TOML file: ``mkpc_kaggle/recipes/NAME.toml`` or a custom file.
 """
@@ -39,12 +39,12 @@ class Unit:
     stage: int  # 1: on whole images, 2: on the critical regions
     matcher: str
     long_side: int = 0  # pixels of a view's longer side, or 0 with ``area``
-    max_matches: int = 4096  # keeps the highest scores
+    max_matches: int = 4096  # with the highest scores
     area: str = ""  # height x width, such as "540x720": the area of a view, which keeps its aspect ratio
-    stretch: bool = False  # a view gets exactly this height and width
-    fallback: str = ""  # replaces the matcher if it is unavailable
+    stretch: bool = False  # True: a view gets exactly the height and width of ``area``
+    fallback: str = ""  # the matcher to use if ``matcher`` is unavailable
     antialias: bool = True  # False: shrink views bilinearly, without averaging areas
-    tracks: bool = True  # False: scenes use its matches only if the pair's other units found fewer than 50
+    tracks: bool = True  # False: scenes use the unit's matches only if the pair's other units have fewer than 50
 
     def __post_init__(self) -> None:
         check_ranges(self, stage=Range(1, 2), long_side=Range(0, MAX_SIDE_PX), max_matches=AT_LEAST_1)
@@ -101,7 +101,7 @@ class SceneConfig:
 class Recipe:
     """Units in order of importance, and the settings of MKPC, MAGSAC, the matchers and scenes.
 
-    Raises :class:`UserError` unless the first unit, which sweeps all pairs, has stage 1 and no unit is repeated.
+    Raises :class:`UserError` if a unit is repeated, or the first unit, which sweeps all pairs, is not of stage 1.
     """
 
     units: tuple[Unit, ...]
@@ -143,7 +143,7 @@ class Recipe:
         return replace(self, units=tuple(known[name] for name in names))
 
     def with_fallbacks(self, unavailable: Container[str]) -> "Recipe":
-        """Return the recipe with fallbacks instead of ``unavailable`` matchers, and no other fallbacks."""
+        """Return the recipe with fallbacks in place of ``unavailable`` matchers; remove the other fallbacks."""
         units = (u.with_fallback if u.matcher in unavailable else replace(u, fallback="") for u in self.units)
         return replace(self, units=tuple(units))
 
@@ -154,7 +154,7 @@ class Recipe:
         name = f"{self.name} ({mode})"
         if mode is Mode.STAGE_1:
             return replace(self.only(lambda unit: unit.stage == 1), name=name)
-        whole: dict[str, Unit] = {}  # a unit of both stages runs once: a second run would find the same
+        whole: dict[str, Unit] = {}  # a unit of both stages runs once: a second run would find the same matches
         for unit in (replace(unit, stage=1) for unit in self.units):
             whole.setdefault(unit.name, unit)
         return replace(self, name=name, units=tuple(whole.values()))
@@ -166,7 +166,7 @@ class Recipe:
         return replace(self, scene=SceneConfig() if on else None)
 
     def table(self) -> dict[str, Any]:
-        """Return the table of :func:`recipe_of`, as JSON values."""
+        """Return the table that :func:`recipe_of` reads, as JSON values."""
         values = asdict(self)
         return {
             name: values[name] for name in ("description", "units", "mkpc", "magsac", "focal", "matchers", "scene")
@@ -174,7 +174,7 @@ class Recipe:
 
 
 def split_mode(text: str) -> tuple[str, Mode]:
-    """Return the name or file and the mode of ``RECIPE:MODE``; the mode defaults to two-stage."""
+    """Split ``RECIPE:MODE`` into the recipe's name or file, and the mode, by default two-stage."""
     name, _, mode = text.rpartition(":")
     return (name, Mode(mode)) if name and mode in list(Mode) else (text, Mode.TWO_STAGE)
 

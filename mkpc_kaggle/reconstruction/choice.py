@@ -1,6 +1,6 @@
-"""Choice of the pairs of a folder: images to match with each other, and images to turn for it.
+"""Choice of the pairs of a folder: images to match with each other, and their orientations.
 
-The orientation of an image is found by matching it in four rotations with its most similar images.
+The orientation of an image is found by matching four rotations of the image with its most similar images.
 """
 
 import json
@@ -21,13 +21,13 @@ from mkpc_kaggle.reconstruction.folder import Datasets, Ends
 from mkpc_kaggle.scene.likeness import FEATURE_SETTINGS, PARTNERS, Partners, local_features, most_alike, shortlist
 
 MAX_IMAGES = 100  # with more, each image has a shortlist instead of all pairs
-TRIAL_SHARE = 0.25  # of the time left, for trials of each kind of orientation
-TURN_PARTNERS = 4  # per image, to find its orientation
-MANY_INLIERS = 100  # with one partner: the image is upright
+TRIAL_SHARE = 0.25  # of the time left, for trials of unturned images, and then for trials of turned images
+TURN_PARTNERS = 4  # similar images per image, to find its orientation
+MANY_INLIERS = 100  # with one partner; an image with this number counts as upright
 MIN_INLIERS = 30  # of a turned image
-MIN_GAIN = 2.0  # of inliers, relative to the unturned image
+MIN_GAIN = 2.0  # inliers of a turned image relative to the unturned image
 
-Key = tuple[Path, int, Path]  # an image, its quarter turns, and an unturned image of greater name
+Key = tuple[Path, int, Path]  # an image, its quarter turns, and an unturned image with a greater name
 Near = Mapping[Path, Sequence[Path]]  # the most similar images of each image
 
 
@@ -41,9 +41,9 @@ def choose_pairs(
     listed: Sequence[Ends] | None,
     rotations: bool,
 ) -> list[Pair]:
-    """Return the pairs of all datasets: those ``listed``, all of up to ``MAX_IMAGES`` images, or a shortlist.
+    """Return the pairs of all datasets: as ``listed``, all pairs of up to ``MAX_IMAGES`` images, or a shortlist.
 
-    With ``rotations``, images are turned as the recipe's first unit matches them best.
+    With ``rotations``, images are turned by :func:`find_turns`.
     """
     ends: dict[str, Sequence[Ends]] = {}
     near: dict[Path, list[Path]] = {}
@@ -64,13 +64,13 @@ def choose_pairs(
 
 
 def pair_of(dataset: str, a: Path, b: Path, *turns: int) -> Pair:
-    """Return the pair of two images of a dataset, matched with these quarter turns, counter-clockwise."""
+    """Return the pair of two images of a dataset, matched with these counter-clockwise quarter turns."""
     suffix = f" turned {turns[0]} {turns[1]}" if any(turns) else ""
     return Pair(f"{dataset}/{a.stem}/{b.stem}{suffix}", dataset, str(a), str(b), turns=(turns[0], turns[1]))
 
 
 def find_partners(engine: Engine, dataset: str, files: Sequence[Path], count: int) -> Partners:
-    """Return the ``count`` most similar images of each image of a dataset; none if they could not be compared."""
+    """Return the indices of the ``count`` images most similar to each image; none if the comparison failed."""
     found = engine.digest_files({str(file): file for file in files})
     digests = [found.get(str(file), "") for file in files]
     key = digest(digests), digest([FEATURE_SETTINGS, count])
@@ -87,7 +87,7 @@ def find_partners(engine: Engine, dataset: str, files: Sequence[Path], count: in
 
 
 def compare(directory: Path, digests: Sequence[str], count: int) -> bytes:
-    """Return :func:`most_alike` as JSON, from a journal's features of images with these digests."""
+    """Return :func:`most_alike` as JSON for the images with these digests; a journal has their features."""
     with JournalReader(directory, check=False) as journal:
 
         def features() -> Iterable[bytes]:
@@ -99,11 +99,11 @@ def compare(directory: Path, digests: Sequence[str], count: int) -> bytes:
 def find_turns(
     engine: Engine, near: Near, names: Mapping[Path, str], root: Path, assembly: Assembly, session: Session
 ) -> dict[Path, int]:
-    """Return the quarter turns, counter-clockwise, that set images upright; upright images are left out.
+    """Return the counter-clockwise quarter turns that set images upright; upright images are left out.
 
-    ``names`` are the datasets of images. First all images are matched unturned, then images with few inliers in
-    the other three orientations. An image takes its best orientation if it gains enough, relative to the turns of
-    earlier images.
+    ``names`` has the dataset of each image. First all images are matched unturned, then images with few inliers in
+    the other three orientations. An image gets its best orientation if that gains enough inliers with similar
+    images, as turned so far.
     """
     recipe = assembly.recipe
     trial = replace(assembly, recipe=replace(recipe, units=recipe.units[:1], scene=None))
@@ -111,7 +111,7 @@ def find_turns(
     turns: dict[Path, int] = {}
 
     def inliers(a: Path, times: int) -> int:
-        """Return the most inliers of an image with an image near it, as turned so far."""
+        """Return the most inliers of ``a``, turned ``times`` quarters, with a similar image as turned so far."""
         return max((found.get(relative(a, times - turns.get(b, 0), b), 0) for b in near[a]), default=0)
 
     for tried in ((0,), (1, 2, 3)):

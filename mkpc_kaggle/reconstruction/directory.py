@@ -26,8 +26,8 @@ def output_directory(out: Path, datasets: Iterable[str], form: str | None = None
     """Reserve ``out`` for a run's results. At the end, remove results that only earlier runs made.
 
     With a ``form``, ``submission.csv`` is a result. A result that was changed after its run is not removed. Raise
-    :class:`UserError` for a directory that is neither empty nor marked by a run, and for a link or another file at
-    the path of a result.
+    :class:`UserError` if ``out`` is neither empty nor marked by a run. A link or another file at the path of a
+    result also raises it.
     """
     results = [name for name in TABLES if form or name != "submission.csv"]
     results += [str(PurePosixPath(name, each)) for name in datasets for each in (DATABASE, MODELS)]
@@ -52,7 +52,7 @@ def output_directory(out: Path, datasets: Iterable[str], form: str | None = None
 
 
 def require_directory_apart(out: Path, inputs: Iterable[Path], weights: Iterable[Path]) -> None:
-    """Raise :class:`UserError` for a result directory, ``--out``, that contains an input or lies in one."""
+    """Raise :class:`UserError` if ``out`` contains an input or weights, or lies in an input."""
     inputs = list(inputs)
     for place in (*inputs, *weights, *weights_of_environment()):
         if os.path.lexists(place) and (lies_in(place, out) or (place in inputs and lies_in(out, place))):
@@ -75,7 +75,7 @@ def _write_mark(out: Path, known: Mapping[str, str]) -> None:
 
 
 def _in_the_way(out: Path, results: Iterable[str], marked: Mapping[str, str] | None) -> Iterator[Path]:
-    """Yield the user's links and files at the paths of results, or all of them in an unmarked directory."""
+    """Yield the user's links and files at the paths of results; in an unmarked directory, all links and files."""
     if marked is None:
         yield from (path for path in out.rglob("[!.]*") if path.is_symlink() or not path.is_dir())
     for name in results:
@@ -90,7 +90,7 @@ def _in_the_way(out: Path, results: Iterable[str], marked: Mapping[str, str] | N
 
 
 def _is_inside(out: Path, name: str) -> bool:
-    """Return whether a path lies in ``out`` and no part of it is a link."""
+    """Return whether the path ``name`` below ``out`` lies in ``out`` and contains no link."""
     root = Path(os.path.realpath(out))
     path = root / name
     return path.is_relative_to(root) and os.path.realpath(path) == str(path) and not path.is_symlink()
@@ -104,6 +104,6 @@ def _digest(path: Path) -> str:
 def _remove(path: Path) -> None:
     shutil.rmtree(path) if path.is_dir() else path.unlink()
     for folder in path.parents:
-        with suppress(OSError):  # stop at a non-empty folder
+        with suppress(OSError):  # the folder is not empty
             folder.rmdir()
     warn(f"{path} was removed: an earlier run made it, and this run does not")

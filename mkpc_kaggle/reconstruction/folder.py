@@ -10,15 +10,15 @@ from mkpc_kaggle.engine.console import warn
 from mkpc_kaggle.errors import UserError, printable, read_text
 from mkpc_kaggle.reconstruction.directory import RESERVED
 
-Datasets = Mapping[str, Sequence[Path]]  # images of one folder, by its path below the root
+Datasets = Mapping[str, Sequence[Path]]  # images of each folder, by the folder's path below the root
 Ends = tuple[Path, Path]
 
 
 def read_folder(root: Path) -> Datasets:
-    """Return the datasets of a folder, sorted by name: itself, ".", and each folder below it, if it has images.
+    """Return the datasets, sorted by name: each folder with images below ``root``, and ``root`` itself as ".".
 
-    Hidden files and folders are skipped with a warning. Raises :class:`UserError` if no dataset has two images,
-    for two images of one stem, and for names that cannot be used in result files.
+    Hidden files and folders are skipped with a warning. Raises :class:`UserError` if no dataset has two images, if
+    images of a dataset differ only in the suffix, or if a name cannot be used in result files.
     """
     if not root.is_dir():
         raise UserError(f"{root}: no such directory; name a folder of images, or of folders of images")
@@ -48,7 +48,7 @@ def _is_image(name: str) -> bool:
 
 
 def _require_usable(folder: Path, root: Path, files: Sequence[Path]) -> None:
-    """Raise :class:`UserError` if a name of the dataset or its images does not fit into tables and databases."""
+    """Raise :class:`UserError` if the name of a folder or an image cannot be used in tables and databases."""
     parts = folder.relative_to(root).parts or (root.resolve().name,)
     for name in (*parts, *(path.name for path in files)):
         if CONTROL.search(name) or printable(name) != name:

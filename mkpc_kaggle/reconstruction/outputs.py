@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from mkpc_kaggle.data.outputs import replacing
 from mkpc_kaggle.scene.reconstruction import RegisteredImage
 
-# Of each file of a dataset: the number of its model and its camera; None without a camera.
+# By dataset and file: the number of the model and the camera in that model; None without a camera.
 Cameras = Mapping[str, Mapping[Path, tuple[int, RegisteredImage] | None]]
 
 NO_POSE = ";".join(["nan"] * 9), "nan;nan;nan"
@@ -22,7 +22,7 @@ FORMS = (  # of a submission
 
 
 def write_tables(out: Path, cameras: Cameras, root: Path, form: str | None) -> None:
-    """Write ``cameras.csv`` and, in one of ``FORMS``, ``submission.csv``. Raise ``OSError`` if that fails."""
+    """Write ``cameras.csv``, and ``submission.csv`` if a form is given. Raise ``OSError`` if that fails."""
     tables = {"cameras.csv": camera_rows(cameras, root)}
     if form is not None:
         tables["submission.csv"] = submission_rows(form, cameras, root)
@@ -32,7 +32,7 @@ def write_tables(out: Path, cameras: Cameras, root: Path, form: str | None) -> N
 
 
 def camera_rows(cameras: Cameras, root: Path) -> Iterator[Sequence[str]]:
-    """Yield a row for each image with a camera: its path below the folder, its model, K, R, t, and ``Sigmas``.
+    """Yield a header, and a row per image with a camera: path below ``root``, model, K, R, t, and ``Sigmas``.
 
     The centre of an image's first pixel is (0, 0); X_cam = R X + t. Unknown sigmas are empty cells.
     """
@@ -46,7 +46,7 @@ def camera_rows(cameras: Cameras, root: Path) -> Iterator[Sequence[str]]:
 
 
 def submission_rows(form: str, cameras: Cameras, root: Path) -> Iterator[Sequence[str]]:
-    """Yield a row for each image, in the order of the folder. Make ids and names of 2025 unique by ``_``."""
+    """Yield a header, and a row for each image, in the folder's order. Append ``_`` to repeated ids and names."""
     of_2025 = form == "imc2025"
     heads = ("image_id", "dataset", "scene", "image") if of_2025 else ("image_path", "dataset", "scene")
     yield *heads, "rotation_matrix", "translation_vector"

@@ -1,4 +1,4 @@
-"""Images in, cameras out: a folder by the engine, or a few images in this process."""
+"""From images to cameras: a folder in a run of the engine, or a few images in this process."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -34,9 +34,9 @@ class FolderResult:
 
 
 def for_cameras(recipe: Recipe, sharing: str | None = None) -> Recipe:
-    """The recipe without steps that only improve the F of single pairs, and without extra pairs.
+    """Return the recipe without extra pairs and without steps that only improve the F of single pairs.
 
-    ``sharing`` is a :class:`CameraSharing`; ``None``: as the recipe has it.
+    ``sharing`` is a :class:`CameraSharing`; ``None`` keeps the recipe's.
     """
     scene = replace(recipe.scene or SceneConfig(), pairs_per_image=0.0)
     return replace(recipe, focal=None, scene=replace(scene, cameras=CameraSharing(sharing or scene.cameras)))
@@ -53,11 +53,11 @@ def reconstruct_folder(
     rotations: bool = False,
     publish: Callable[[Cameras], None] = lambda _: None,
 ) -> FolderResult:
-    """Match the pairs of each dataset below ``root``, ``listed`` or of :func:`choose_pairs`, and reconstruct it.
+    """Match the pairs that :func:`choose_pairs` returns for the datasets below ``root``; reconstruct each dataset.
 
-    COLMAP's files of a dataset are in the folder of its name in ``out``. With ``rotations``, images without
-    matches are turned. The process of a scene writes its files before the journal records the scene, so a resumed
-    run makes the missing files. ``publish`` is called with the cameras so far: initially none, then after each
+    COLMAP's files are in ``out``, in a folder with the dataset's name. With ``rotations``, images without matches
+    are turned. A scene's process writes these files before the journal records the scene, so that a resumed run
+    makes missing files. ``publish`` is called with the cameras so far: initially with no cameras, then after each
     scene.
     """
     assembly = replace(assembly, recipe=for_cameras(assembly.recipe))
@@ -79,7 +79,7 @@ def reconstruct_folder(
 
 
 def cameras_of(datasets: Datasets, root: str, results: Standing) -> Cameras:
-    """Return the camera of each image. Files of one content have one camera, that of the largest model with it."""
+    """Return the camera of each image. Identical files share one camera, from the largest model that has it."""
     cameras: dict[str, Mapping[Path, tuple[int, RegisteredImage] | None]] = {}
     for name, files in datasets.items():
         models = results.scenes[name].models if name in results.scenes else ()
@@ -98,7 +98,7 @@ def reconstruct(
     device: str = "auto",
     matchers: Mapping[str, Matcher[Any]] | None = None,
 ) -> tuple[SfmModel, ...]:
-    """Return the models of images, given by their paths, the largest first; none if too few match.
+    """Return the models of the images at these paths, the largest first; no model if too few images match.
 
     This is the command ``reconstruct`` in this process, without budget and journal. Cameras refer to the stored
     pixels of the files, as COLMAP reads them. Raises :class:`UserError` for a recipe that cannot run here, and for
