@@ -1,9 +1,9 @@
-"""Accuracy by time limit: mAA of scenes at limits of 1, 2, 4, 8 and 16 times the sweep, on the real clock.
+"""Accuracy by time limit: mAA of scenes at limits of 1, 2, 4, 8 and 16 times the sweep's time, on the real clock.
 
 python -m benchmarks.anytime --train-dir DIR --out FIGURE.png [--recipes classical light] [--runs 2] [-- OPTION...]
 
-OPTIONs are of `validate`, such as `--scenes A,B`. The sweep is a run of the recipe's first unit alone, from the
-start of its process to its end. *Early* is how long before the limit a process ended, at least; negative is late.
+OPTIONs are options of `validate`, such as `--scenes A,B`. The sweep is a run of the recipe's first unit alone,
+timed from process start to end. *Early* is the minimum time between a process's end and its limit; negative: late.
 """
 
 import argparse

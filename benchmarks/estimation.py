@@ -1,4 +1,4 @@
-"""F by MAGSAC, under a prior on focal lengths, and from the cameras of the batch, on the same matches.
+"""Scores of F by MAGSAC, with a prior on focal lengths, and from a batch's cameras, on the same matches.
 
 python -m benchmarks.estimation --train-dir DIR --journals DIR [DIR ...] [--scenes NAME ...]
     [--estimates NAME ...] [--thresholds PIXELS ...] [--settings TOML ...]
@@ -7,11 +7,11 @@ python -m benchmarks.estimation --train-dir DIR --journals DIR [DIR ...] [--scen
 Journals, the work directories of `validate`, provide the matches and each pair's own F. A journal made with
 ``--min-covisibility 0`` also has the extra pairs that a scene may add; they are not scored.
 
-The unit of evidence is a draw: all images of a scene, or a number of them, and a share of their pairs. The output
-has a table for each journal and share, with a row for each estimate: mAA by scene, its gain over the first
-estimate, and seconds of this process, per pair or batch. Intervals resample images if a scene has one draw, and
-draws otherwise; the mean's also resample scenes. ``--settings`` adds a row for each line of a recipe's table
-[scene], such as "cameras = 'image'". ``--thresholds`` adds two rows for each threshold of MAGSAC.
+The unit of evidence is a draw: some or all images of a scene, and a share of their pairs. The output has a table
+for each journal and share. Each row has an estimate's mAA by scene, gain over the first estimate, and CPU seconds
+per pair or batch. Intervals resample images if each scene has one draw, and draws otherwise; the mean's
+interval then also resamples scenes. ``--settings`` gives a row for each line of a recipe's table [scene], such as
+"cameras = 'image'". ``--thresholds`` replaces the rows by two rows for each threshold of MAGSAC.
 """
 
 import argparse
@@ -52,7 +52,7 @@ OWN, SCENE = "own F", "scene"
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """A pair with its matches and its own F from a journal; F is ``None`` if its estimate failed."""
+    """A pair with its matches and its own F from a journal; F is ``None`` if the estimate failed."""
 
     true: TruePair
     found: PairMatch
@@ -63,7 +63,7 @@ class Known:
         return self.true.pair.names
 
 
-# The F of each pair; the second list has all pairs of the same images in the journal.
+# Returns the F of the pairs in the first list; the second list has all pairs of their images in the journal.
 Estimator: TypeAlias = Callable[[Sequence[Known], Sequence[Known]], Sequence[Matrix3 | None]]
 
 
@@ -99,7 +99,7 @@ PAIR_ESTIMATORS: dict[str, Estimator] = {
 
 
 def by_scene(settings: str, pairs: Sequence[Known], every: Sequence[Known]) -> list[Matrix3 | None]:
-    """Return the F of the pairs as one batch, with the first unit's matches of extra pairs."""
+    """Return the F of pairs reconstructed as one batch, together with the first unit's matches of extra pairs."""
     config = from_table(SceneConfig, tomllib.loads(settings), settings)
     batch = [batch_pair(pair.true, pair.found, pair.F) for pair in pairs]
     for extra in extra_of(pairs, every, config):
@@ -126,7 +126,7 @@ def extra_of(pairs: Sequence[Known], every: Sequence[Known], config: SceneConfig
 
 
 def read_journal(directory: Path) -> tuple[str, dict[str, tuple[PairMatch, Matrix3 | None]]]:
-    """Return the recipe's name, and by pair id the matches and the pair's own F."""
+    """Return the recipe's name, and each pair's matches and own F by pair id."""
     with JournalReader(directory) as journal:
         table = dict(journal.about().recipe)
         recipe = recipe_of(table, table.pop("name"))
@@ -142,7 +142,7 @@ def read_journal(directory: Path) -> tuple[str, dict[str, tuple[PairMatch, Matri
 
 @dataclass(frozen=True, eq=False)
 class Score:
-    """Result of an estimate on a draw of a scene: accuracies of its pairs, their images, total seconds."""
+    """Result of an estimate on a draw of a scene: accuracies of the pairs, images of the pairs, total seconds."""
 
     accuracies: list[float]
     images: list[tuple[str, str]]
@@ -161,7 +161,7 @@ def score(make: Estimator, pairs: Sequence[Known], every: Sequence[Known], scene
 
 
 def drawn(every: Sequence[Known], images: int, share: float, seed: int) -> tuple[list[Known], list[Known]]:
-    """Return a share of the scored pairs of random images, 0 for all images, and all pairs of these images."""
+    """Draw random images, or all if ``images`` is 0. Return a share of their scored pairs, and all their pairs."""
     generator = np.random.default_rng(seed)
     names = sorted({name for pair in every for name in pair.names})
     chosen = set(generator.permutation(names)[: images or None].tolist())
@@ -176,7 +176,7 @@ Draws: TypeAlias = Mapping[str, Sequence[Mapping[str, Score]]]
 
 
 def difference(draws: Draws, first: str, second: str) -> Difference:
-    """Return an estimate's gain and interval, by images if each scene has one draw, and by draws otherwise."""
+    """Return the gain of the second estimate over the first, with its interval over images or over draws."""
     both = [(scene, each[first], each[second]) for scene, scores in draws.items() for each in scores]
     if len(both) == len(draws):
         return paired_difference([(a.accuracies, b.accuracies, a.images) for _, a, b in both])
@@ -185,7 +185,7 @@ def difference(draws: Draws, first: str, second: str) -> Difference:
 
 
 def table(title: str, draws: Draws, names: Sequence[str]) -> list[str]:
-    """Return Markdown; an estimate's second row has its gain by scene, and further lines its gain by draw."""
+    """Return a Markdown table. A second row per estimate has gains by scene; lines below have gains by draw."""
     counts = [f"{name} ({len(scores)})" for name, scores in draws.items()]
     lines = [f"| {title} | {' | '.join(counts)} | mean | gain over the first | seconds |"]
     lines.append("|" + " --- |" * (len(counts) + 4))

@@ -1,4 +1,4 @@
-"""Size of the journal of a long run, the time to save a pair, to resume, and the memory of the process.
+"""Size of a long run's journal, time to save a pair, time to resume, and memory of the process.
 
 python -m benchmarks.journal [--pairs 10000] [--units 5] [--matches 2000]
 """
@@ -32,7 +32,7 @@ def main() -> None:
     parser.add_argument("--matches", type=int, default=2000)
     arguments = parser.parse_args()
     units, rng = [Unit(1, f"m{number}", 1024) for number in range(arguments.units)], np.random.default_rng(0)
-    # Sub-pixel points on images of 1600 x 1200 in random order hardly compress.
+    # Random sub-pixel points on images of 1600 x 1200 pixels hardly compress.
     points = (rng.random((arguments.matches, 2)) * (1600, 1200) for _ in range(2))
     matches = Matches(*points, rng.random(arguments.matches))
     names = [(f"{number}.jpg", f"{number % 100}.jpg") for number in range(arguments.pairs)]

@@ -2,8 +2,8 @@
 
     python -m benchmarks.mixed_folder --train-dir DIR --unrelated IMAGE... --out DIR
 
-OUT/images/mixed has the images of all scenes, and unrelated images; OUT has ``train_labels.csv`` and
-``train_thresholds.csv``, 0.025 to 1 m.
+OUT/images/mixed has the images of all scenes, and unrelated images. OUT has ``train_labels.csv``, and
+``train_thresholds.csv`` with thresholds of 0.025 to 1 m.
 """
 
 import argparse

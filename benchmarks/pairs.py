@@ -1,9 +1,9 @@
-"""Seconds of each matcher for a pair of new images: the column of the README's table.
+"""Seconds per matcher for a pair of new images: a column of the README's table.
 
 python -m benchmarks.pairs [--rounds 3] [--only loftr,roma] [--precision bfloat16]
 
-Each round encodes and matches both images with one matcher after the other; figures are medians. kornia's LoFTR
-is measured too. The memory is the maximum of a separate process, including Python and PyTorch. Weights
+Each round encodes and matches both images with one matcher after the other; times are medians of the rounds.
+kornia's LoFTR is measured too. The memory is the peak of a separate process, including Python and PyTorch. Weights
 are stand-ins or random, and matchers detect the maximum number of keypoints. Views have the sizes of the recipes.
 Set ``THP_MEM_ALLOC_ENABLE=1``, as workers do.
 """
@@ -49,14 +49,14 @@ Run = Callable[[], int]  # runs once and returns the number of matches or keypoi
 
 @dataclass(frozen=True)
 class Case:
-    """A matcher on views (width, height)."""
+    """A matcher, and the size of its views in pixels."""
 
     make: Callable[[Placement], Matcher[Any]]
     size: Size
 
 
 def random_network(make: Callable[[], nn.Module], placement: Placement) -> Any:
-    """Load the matcher with weights that keep activations of order 1: stand-ins of large networks take minutes."""
+    """Return the network with random weights that keep activations of order 1; stand-in weights take minutes."""
     with torch.device("meta"):
         network = make()
     network.to_empty(device="cpu")
@@ -101,7 +101,7 @@ CASES = {
 
 
 def photographs(size: Size) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Return two views, (H, W, 3) RGB, the second 16 pixels further right and 8 further down."""
+    """Return two images (H, W, 3) RGB; the second is the first shifted by 16 pixels right and 8 down."""
     resized = cv2.resize(load_sample_images().images[0], size, interpolation=cv2.INTER_AREA)
     return resized, np.roll(resized, (8, 16), axis=(0, 1))
 
@@ -142,7 +142,7 @@ def seconds_of(run: Run) -> float:
 
 
 def high_water() -> int:
-    """Return the peak memory of this process in kilobytes; ``getrusage`` may report its parent's."""
+    """Return the peak memory of this process in kilobytes; ``getrusage`` may report the parent's peak."""
     kilobytes = re.search(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text())
     assert kilobytes is not None
     return int(kilobytes[1])

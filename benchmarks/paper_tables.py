@@ -1,9 +1,9 @@
 """The paper's tables, row by row, next to their published figures, with one command.
 
-LIST is a list of pairs in the format of SuperGlue's evaluation (docs/benchmarks.md). IMAGES is the directory that
-its names start from. TRAIN_DIR is any train side of the Image Matching Challenge 2022. The rows are in
+LIST is a list of pairs in the format of SuperGlue's evaluation (docs/benchmarks.md). IMAGES is the root
+directory of its names. TRAIN_DIR is any train side of the Image Matching Challenge 2022. The rows are in
 `paper_tables.toml`. The rows of a table share a work directory, so that common units run once; the last column
-counts the units that a row ran. After a kill, the same command resumes. `--pairs N` takes a sample of each list or
+counts the units that a row ran. After a kill, a rerun resumes. `--pairs N` takes a sample of each list or
 scene, and `--matcher` replaces all matchers. Usage:
 
 python -m benchmarks.paper_tables --out DIR --weights DIR [--yfcc LIST IMAGES] [--scannet LIST IMAGES]
@@ -34,7 +34,7 @@ TABLES = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="u
 
 
 def recipe_of(table: str, row: str, method: str, given: argparse.Namespace) -> Recipe:
-    """Return the recipe of a row, with the command's protocol and its matcher, if any."""
+    """Return a row's recipe, with the protocol and the matcher of the command, if given."""
     whole = load_recipe("imc2022" if table == "imc" else table)
     if table == "imc":
         own = next((unit for unit in whole.units if unit.matcher == row), None)

@@ -1,10 +1,10 @@
-"""The alternative: pycolmap's SIFT, exhaustive matching and mappers, on the same pairs.
+"""The alternative: SIFT, exhaustive matching and mappers of pycolmap, on the same pairs.
 
 python -m benchmarks.pycolmap_alone --train-dir DIR [--scenes NAME ...] [--mappers incremental global]
     [--one-camera]
 
 DIR is a train side in the layout of the Image Matching Challenge 2022. All settings are pycolmap's defaults,
-except one SIMPLE_RADIAL camera for each image, or for all of a scene with ``--one-camera``. A pair fails if no
+except the camera: one SIMPLE_RADIAL per image, or per scene with ``--one-camera``. A pair fails if no
 model has both images. The output is the mAA over all pairs with a covisibility of at least 0.1, and CPU seconds.
 """
 

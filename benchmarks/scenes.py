@@ -1,10 +1,10 @@
-"""Cost and accuracy of a batch's reconstruction, from noisy and wrong matches of known cameras.
+"""Cost and accuracy of a batch's reconstruction, from noisy and wrong matches with known cameras.
 
 python -m benchmarks.scenes [26:304 100:2000] [--world front|street]
 
-Each size is images:pairs and runs in a separate process, as in the engine. All images see the front; images along
-the street see only nearby facades. `verify` and `map` are CPU seconds. Errors are medians over pairs, in degrees,
-of the relative rotation and of the direction of translation.
+Each size is images:pairs and runs in a separate process, as in the engine. With `front`, all images see one
+facade; with `street`, images see only nearby facades. `verify` and `map` are CPU seconds. Errors of the
+relative rotation and of the direction of translation are in degrees, medians over pairs.
 """
 
 import argparse
@@ -46,7 +46,7 @@ def row(size: str, world: str) -> str:
 
 
 def timed(function: Callable[..., Any], name: str, seconds: Counter[str]) -> Callable[..., Any]:
-    """Wrap the function to sum its CPU seconds under its name."""
+    """Wrap ``function`` so that its CPU seconds are added to ``seconds[name]``."""
 
     def call(*arguments: Any) -> Any:
         begin = time.process_time()
@@ -59,7 +59,7 @@ def timed(function: Callable[..., Any], name: str, seconds: Counter[str]) -> Cal
 
 
 def errors(solution: Solution, scene: SyntheticScene) -> list[tuple[float, float]]:
-    """Return errors in degrees of each pair with an F from cameras: relative rotation and direction."""
+    """Return rotation and translation direction errors, in degrees, of each pair with an F from the scene."""
     angles = []
     registered = registered_images(solution)
     for pair, choice in zip(scene.pairs, solution.choices, strict=True):

@@ -1,4 +1,4 @@
-"""Use of time by the engine, on random simulated runs.
+"""The engine's use of time in random simulated runs.
 
 Statistics of many runs:
 
@@ -43,7 +43,7 @@ def timeline(scenario: Scenario) -> None:
 
 
 def summary(runs: list[Ran]) -> None:
-    """Print what was late, lost, missed and used."""
+    """Print counts of late runs, lost rows and missed scenes, and the utilisation."""
     busy = [run.utilisation for run in runs if run.work_left]
     print(f"{len(runs)} scenarios, {len(busy)} with work left at the end")
     print(f"late: {sum(run.late > 0 for run in runs)}, rows lost: {sum(run.lost for run in runs)}")

@@ -3,16 +3,16 @@
 python -m benchmarks.stages --train-dir DIR --journals DIR --databases DIR [--scenes NAME ...]
     [--images 18] [--seeds 4] [--cells MATCHES/CELL/ERROR/CAMERA/MAPPER ...]
 
-A row of the table is a scene of these stages. The first row, ``all/0.75/2/pinhole/global``, is ours.
+Each row of the table is a pipeline of these stages. The first row, ``all/0.75/2/pinhole/global``, is ours.
 
-- MATCHES: ``all`` of the journal, those of some units such as ``1:sift@1536+1:aliked@1024``, or ``COLMAP``
-- CELL: size in pixels of the cells in which keypoints are merged; ``0``: none are
-- ERROR: of a verified match in pixels, with our number of trials; from ``4`` with COLMAP's
+- MATCHES: ``all`` in the journal, of some units such as ``1:sift@1536+1:aliked@1024``, or by ``COLMAP``
+- CELL: size in pixels of the cells in which keypoints are merged; ``0``: no merging
+- ERROR: maximum for verified matches in pixels; below ``4`` with our number of trials, else with COLMAP's
 - CAMERA: ``pinhole`` or ``radial``
 - MAPPER: ``global`` or ``incremental``
 
-COLMAP's SIFT and exhaustive matching of a scene are stored in DATABASES/SCENE.db. The other options and the table
-are those of `benchmarks.estimation`. Each image has its own camera.
+COLMAP's SIFT features and matches of a scene are stored in DATABASES/SCENE.db. The other options and the table are
+the same as in `benchmarks.estimation`. Each image has its own camera.
 """
 
 from collections.abc import Iterator, Sequence
@@ -43,7 +43,7 @@ COLMAP_ERROR_PX, COLMAP_TRIALS = 4.0, 10_000
 
 @cache
 def of_colmap(database: Path, images: Path) -> tuple[dict[str, Any], dict[tuple[str, str], NDArray[np.uint32]]]:
-    """Return COLMAP's keypoints (K, 2) of the images of a folder, and the matches (M, 2) of its pairs."""
+    """Return COLMAP's keypoints (K, 2) by image name, and matches (M, 2), as keypoint indices, by name pair."""
     if not database.exists():
         part = database.with_suffix(".part")
         part.unlink(missing_ok=True)
@@ -88,7 +88,7 @@ def incremental(_: Any, database: Any, manager: Any) -> Any:
 
 
 def by_stages(row: str, databases: Path, pairs: Sequence[Known], every: Sequence[Known]) -> list[Matrix3 | None]:
-    """Return the F of the pairs from a row's scene, or their own: an estimator of `benchmarks.estimation`."""
+    """Return each pair's F from a row's scene, else the pair's own: an estimator of `benchmarks.estimation`."""
     source, cell, error, camera, mapper = row.split("/")
     config = SceneConfig(cameras=CameraSharing.IMAGE)
     batch = [

@@ -1,4 +1,4 @@
-"""Batches from known cameras: matches of true points with noise, and wrong matches."""
+"""Synthetic batches with known cameras: noisy matches of true points, and wrong matches."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -15,12 +15,12 @@ from mkpc_kaggle.scene.reconstruction import RegisteredImage
 from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair
 
 SIZE = Size(800, 600)
-# Ascending numbers of the points in an image, (N,), and their detected positions, (N, 2).
+# The points in an image: ascending indices (N,) and detected positions (N, 2).
 Seen = tuple[np.ndarray, np.ndarray]
 
 
 def registered_images(solution: Solution) -> dict[str, RegisteredImage]:
-    """Return the registered images by digest, each from the first model with it."""
+    """Return the registered images by digest, each from the first model that has it."""
     models = [model for found in solution.reconstructions for model in found.models]
     return {found.image.digest: found for model in reversed(models) for found in model.images}
 
@@ -41,7 +41,7 @@ class SyntheticScene:
         return fundamental_of_cameras(*self.true_cameras(pair))
 
     def median_distance(self, F: Matrix3, pair: BatchPair) -> float:
-        """Return the median Sampson distance of a pair's true correspondences from an F, in pixels."""
+        """Return the median Sampson distance, in pixels, of a pair's true correspondences under ``F``."""
         points = [project(camera, self.world[:400]) for camera in self.true_cameras(pair)]
         return float(np.median(sampson_distances(F, Matches(*points, np.ones(len(points[0]))))))
 
@@ -57,10 +57,10 @@ def synthetic_scene(
     prefix: str = "",
     focals: Sequence[float] = (),
 ) -> SyntheticScene:
-    """Return cameras on an arc before a front with depth, and ``pairs`` evenly chosen pairs, or all pairs.
+    """Return a scene of cameras on an arc in front of a facade, with ``pairs`` random pairs or all pairs.
 
-    ``noise`` is the error of an image's detector in pixels in each coordinate: a number, or one for each image. A
-    point has the same error in all pairs of the image, except for a twentieth of a pixel. ``outliers`` is the
+    ``noise`` is the detector's standard deviation in pixels per coordinate: one number, or one for each image. A
+    point has the same error in all pairs of the image, except for a deviation of 0.05 pixels. ``outliers`` is the
     share of wrong matches. Without ``focals``, in pixels, each camera has its own random focal length.
     """
     rng = np.random.default_rng(seed)
@@ -77,7 +77,7 @@ def synthetic_scene(
 def street(
     images: int, pairs: int, *, noise: float = 0.4, outliers: float = 0.25, seed: int = 0
 ) -> SyntheticScene:
-    """Return an image per metre along a loop of facades, matched with its neighbours, up to 290 matches a pair."""
+    """Return a scene of one image per metre along a loop of facades; neighbours have up to 290 matches."""
     rng = np.random.default_rng(seed)
     radius = images / (2 * np.pi)
     angles = 2 * np.pi * np.arange(images) / images
@@ -110,7 +110,7 @@ def batch_of(
     prefix: str = "",
     most: int | None = None,
 ) -> SyntheticScene:
-    """Return images of these cameras, and the pairs with these indices."""
+    """Return the scene of these cameras and of the pairs with the image indices ``ends``."""
     images = tuple(BatchImage(f"{prefix}{n:04}", f"digest of {prefix}{n:04}", SIZE) for n in range(len(cameras)))
     noises = np.broadcast_to(noise, len(cameras)).tolist()
     seen = [see(rng, camera, world, own) for camera, own in zip(cameras, noises, strict=True)]
@@ -129,7 +129,7 @@ def front(rng: np.random.Generator, count: int) -> np.ndarray:
 
 
 def arc_camera(rng: np.random.Generator, where: float) -> Camera:
-    """Return a camera at ``where``, 0 to 1, of an arc of 80 degrees about the front, with a random focal."""
+    """Return a camera at ``where`` (0 to 1) on an 80-degree arc about the facade, with a random focal length."""
     angle = np.radians(80) * (where - 0.5) + rng.normal(0, 0.02)
     distance = rng.uniform(11, 15)
     centre = np.array([distance * np.sin(angle), rng.normal(0, 0.5), 1.5 - distance * np.cos(angle)])
@@ -139,7 +139,7 @@ def arc_camera(rng: np.random.Generator, where: float) -> Camera:
 
 
 def looking(centre: np.ndarray, angle: float, focal: float) -> Camera:
-    """Return a level camera that looks along an angle about the vertical axis."""
+    """Return a level camera whose viewing direction has this angle, in radians, about the vertical axis."""
     return pointed(centre, np.array([np.sin(angle), 0.0, np.cos(angle)]), focal)
 
 
@@ -164,7 +164,7 @@ def project(camera: Camera, world: np.ndarray) -> np.ndarray:
 
 
 def see(rng: np.random.Generator, camera: Camera, world: np.ndarray, noise: float) -> Seen:
-    """Return the points in front of the camera and within the image."""
+    """Detect the points that are in front of the camera and within the image."""
     found = project(camera, world) + rng.normal(0, noise, (len(world), 2))
     ahead = world @ camera.R[2] + camera.t[2] > 0
     numbers = np.flatnonzero(Box.whole(SIZE).contains(found) & ahead)
@@ -172,7 +172,7 @@ def see(rng: np.random.Generator, camera: Camera, world: np.ndarray, noise: floa
 
 
 def match(rng: np.random.Generator, first: Seen, second: Seen, outliers: float, most: int | None) -> Matches:
-    """Return matches of the common points of both images, some dropped and some wrong."""
+    """Return matches of about half the points that both images share; some matches are wrong."""
     common, places0, places1 = np.intersect1d(first[0], second[0], assume_unique=True, return_indices=True)
     kept = np.flatnonzero(rng.random(len(common)) < 0.5)[:most]
     points0 = first[1][places0[kept]] + rng.normal(0, 0.05, (len(kept), 2))

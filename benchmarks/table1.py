@@ -1,9 +1,9 @@
-"""The paper's Table 1 at equal inference count: a matcher's units on whole images against the two stages.
+"""The paper's Table 1 at equal inference count: units on whole images against the two stages, with one matcher.
 
 python -m benchmarks.table1 --matcher sift --out DIR [-- --train-dir DIR --pairs-per-scene 10 ...]
 
-The layouts become recipes in OUT, which `validate --compare` compares with the options after ``--``. They share a
-journal, so that common units run once, and the same command resumes after a kill.
+The layouts become recipes in OUT. `validate --compare` compares them, with the options after ``--``. Recipes
+share a journal, so that common units run once. After a kill, rerun the command to resume.
 """
 
 import argparse
@@ -24,11 +24,11 @@ LAYOUTS = {  # numbers of units on whole images and on critical regions
     "six": (6, 0),
     "three + three": (3, 3),
 }
-CONTRASTS = (("three", "one + two", "two + one"), ("six", "three + three"))  # each against the first
+CONTRASTS = (("three", "one + two", "two + one"), ("six", "three + three"))  # the others against the first
 
 
 def recipe(matcher: str, layout: str) -> str:
-    """Return the recipe of a layout: F of each pair by MAGSAC alone."""
+    """Return the recipe of a layout as TOML; each pair's F is by MAGSAC alone."""
     whole, crops = LAYOUTS[layout]
     stages = (1,) * whole + (2,) * crops
     units = (
