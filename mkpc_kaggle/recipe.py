@@ -39,7 +39,7 @@ class Unit:
     stage: int  # 1: on whole images, 2: on the critical regions
     matcher: str
     long_side: int = 0  # pixels of a view's longer side, or 0 with ``area``
-    max_matches: int = 4096  # with the highest scores
+    max_matches: int = 4096  # the matches with the highest scores
     area: str = ""  # height x width, such as "540x720": the area of a view, which keeps its aspect ratio
     stretch: bool = False  # True: a view gets exactly the height and width of ``area``
     fallback: str = ""  # the matcher to use if ``matcher`` is unavailable

@@ -85,7 +85,7 @@ def say_start(what: str, assembly: Assembly, work_dir: Path) -> None:
 
 
 def finish(session: Session, status: int, page: Path | None, pairs: Sequence[Pair]) -> int:
-    """Write a run's report to ``page``, if given. Return a signal's exit status, else ``status``."""
+    """Write a run's report to ``page``, if given. Return a received signal's exit status, else ``status``."""
     from mkpc_kaggle.reporting.report import report_run
 
     if page is not None:

@@ -57,5 +57,5 @@ def run(arguments: argparse.Namespace) -> int:
             watchdog.status = int(bool(report.unwritten or trouble(report)))
             unwritten = f" is not the last version: {report.unwritten}" if report.unwritten else ""
             lines = [*options.plan_lines(arguments, report), summary(pairs, report)]
-            say("\n".join([*lines, f"submission: {output}{unwritten}"]))  # drawing may exceed the time limit
+            say("\n".join([*lines, f"submission: {output}{unwritten}"]))  # now: drawing may exceed the time limit
             return options.finish(session, watchdog.status, page, pairs)

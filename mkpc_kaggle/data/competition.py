@@ -177,7 +177,7 @@ def submission_problems(path: Path, sample_ids: Sequence[str]) -> list[str]:
 
 
 def read_rows(path: Path, columns: Sequence[str], *, only: bool = False) -> Iterator[tuple[str, list[str]]]:
-    """Yield each row of a CSV file: its location, for messages, and its cells in these columns.
+    """Yield each row of a CSV file as its location, for messages, and its cells in ``columns``.
 
     ``only`` requires that the file has no other columns. Raises :class:`UserError` for an unusable file.
     """
@@ -212,7 +212,7 @@ def plain_name(name: str, where: str) -> str:
 
 
 def evenly_spread(items: Sequence[Any], most: int | None) -> list[Any]:
-    """Return up to ``most`` of the items, including the first and the last."""
+    """Return up to ``most`` items, evenly spread from the first to the last."""
     count = len(items) if most is None else min(most, len(items))
     return [items[index] for index in np.linspace(0, len(items) - 1, count).round().astype(int)]
 

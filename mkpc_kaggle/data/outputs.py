@@ -102,6 +102,6 @@ def replacing(path: Path) -> Iterator[TextIO]:
 
 
 def remove_unfinished() -> None:
-    """Remove the incomplete temporary files of :func:`replacing`, since the process ends."""
+    """Remove the incomplete temporary files of :func:`replacing` before the process ends."""
     for part in tuple(UNFINISHED):
         part.unlink(missing_ok=True)

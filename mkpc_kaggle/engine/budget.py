@@ -1,4 +1,4 @@
-"""The time of a run: durations, its four deadlines, and the measured costs of units."""
+"""The time of a run: durations, four deadlines, and the measured costs of units."""
 
 import re
 import time
@@ -12,7 +12,7 @@ from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.recipe import Unit
 
 SUMMARY_FACTOR = 5  # a report may take this many times as long as writing the submission
-WRITE_MARGIN = 1.5  # the next write may take this many times as long as the latest
+WRITE_MARGIN = 1.5  # the next write may take this many times as long as the median of the latest
 MAX_WRITE_SHARE = 0.05  # maximum share of the limit for the forecast of a write
 MAX_SILENCE_S, MIN_SILENCE_S, SILENCE_SHARE = 60.0, 5.0, 0.02  # of a worker; the share is of the limit
 WINDOW = 64  # number of latest measurements in the mean
@@ -101,7 +101,7 @@ class Budget:
 class Costs:
     """Seconds of a unit on a pair, by name.
 
-    A worker's first run of a unit is a warm-up: the mean until another run is measured, but never a forecast.
+    A worker's first run of a unit is a warm-up. Its time is used as mean until another run, never as forecast.
     """
 
     def __init__(self) -> None:
@@ -139,7 +139,7 @@ class Costs:
 
 
 def monotonic_of(epoch: float) -> float:
-    """Return the monotonic clock's time at wall-clock time ``epoch``, in seconds since 1970.
+    """Return the monotonic clock's time at the wall-clock time ``epoch``, given in seconds since 1970.
 
     A run calls this once, at its start, so later jumps of the wall clock do not move the limit. A time less than
     a minute ahead counts as now, because the clock was probably set back. Raises :class:`UserError` for a later

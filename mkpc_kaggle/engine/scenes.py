@@ -33,7 +33,7 @@ def batches_of(pairs: Iterable[Pair]) -> dict[str, list[int]]:
 
 
 def extra_pairs_of(pairs: Sequence[Pair], config: SceneConfig | None) -> list[Pair]:
-    """Return pairs of batches' images that have no row and are used only for scenes, the most useful first.
+    """Return extra pairs of each batch's images, without a row and only for scenes, the most useful first.
 
     Each batch gets up to ``pairs_per_image``, starting with the batch with the fewest pairs per image.
     """

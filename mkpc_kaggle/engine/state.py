@@ -66,7 +66,7 @@ class State:
         self.by_scene = {n: choice.F for n, choice in self.journal.choices().items() if choice.F is not None}
 
     def points_of(self, positions: Iterable[int]) -> tuple[tuple[PairPoints, ...], PointSource]:
-        """Return references to the current points of pairs, and the source for a worker to read the points."""
+        """Return references to the current points of pairs, and the source from which workers read points."""
         pairs = tuple(map(self._points_of, positions))
         revisions = [revision for pair in pairs for revision in pair.revisions]
         points = self.journal.points(revisions) if self.journal.is_in_memory else None

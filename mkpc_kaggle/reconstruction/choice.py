@@ -130,5 +130,5 @@ def find_turns(
 
 
 def relative(a: Path, times: int, b: Path) -> Key:
-    """Return the key of image a turned by ``times`` quarters and the unturned image b."""
+    """Return the key of image ``a``, turned by ``times`` quarters, and the unturned image ``b``."""
     return (a, times % 4, b) if a < b else (b, -times % 4, a)

@@ -90,7 +90,7 @@ def _in_the_way(out: Path, results: Iterable[str], marked: Mapping[str, str] | N
 
 
 def _is_inside(out: Path, name: str) -> bool:
-    """Return whether the path ``name`` below ``out`` lies in ``out`` and contains no link."""
+    """Return whether ``name``, a path relative to ``out``, stays in ``out`` and passes through no link."""
     root = Path(os.path.realpath(out))
     path = root / name
     return path.is_relative_to(root) and os.path.realpath(path) == str(path) and not path.is_symlink()

@@ -31,7 +31,7 @@ class Inert:
 
 
 def load_tensors(path: Path) -> "dict[str, torch.Tensor]":
-    """Load tensors by name, on the CPU, from a safetensors file or a torch checkpoint; execute no code of it.
+    """Load tensors by name, on the CPU, from a safetensors file or a torch checkpoint without executing code.
 
     ``path`` may be the directory of an unpacked torch checkpoint (``NAME/NAME`` on Kaggle). A training checkpoint
     has its tensors under ``state_dict``, DISK's checkpoint under ``extractor``. Other entries are ignored.

@@ -140,7 +140,7 @@ class WeightStore:
 
     def verify(self) -> list[FoundFile]:
         """Return all files whose name or digest is in the manifest, sorted by path."""
-        found = {file.path: file for file in reversed([*self._candidates(self.files)])}  # first per path
+        found = {file.path: file for file in reversed([*self._candidates(self.files)])}  # the first per path
         return [found[path] for path in sorted(found)]
 
     def _candidates(self, lines: Sequence[WeightFile]) -> Iterator[FoundFile]:
