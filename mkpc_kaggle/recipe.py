@@ -70,10 +70,8 @@ class Unit:
         height, width = map(int, (self.area or "1x1").split("x"))
         if self.stretch:
             view = View.stretched(crop, size=Size(width, height), multiple=multiple, turns=turns)
-        elif self.area:
-            view = View.of_area(crop, area=width * height, multiple=multiple, turns=turns)
         else:
-            view = View.fit(crop, long_side=self.long_side, multiple=multiple, turns=turns)
+            view = View.fit(crop, long_side=self.long_side, area=width * height, multiple=multiple, turns=turns)
         return replace(view, antialias=self.antialias)
 
 

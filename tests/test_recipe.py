@@ -89,7 +89,7 @@ def test_a_recipe_reads_as_written():
 def test_a_unit_shows_a_crop_at_its_size():
     crop = Box(10, 20, 110, 220)
     assert Unit(1, "a", 640).view(crop, 32) == View.fit(crop, long_side=640, multiple=32)
-    assert Unit(1, "a", area="54x72").view(crop, 8) == View.of_area(crop, area=54 * 72, multiple=8)
+    assert Unit(1, "a", area="54x72").view(crop, 8) == View.fit(crop, area=54 * 72, multiple=8)
     assert Unit(1, "a", area="54x72", stretch=True).view(crop, 1).content == Size(72, 54)
 
 

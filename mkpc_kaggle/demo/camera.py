@@ -21,7 +21,7 @@ STEP_PX = 3  # every third pixel of every third row suffices for the covisibilit
 
 @dataclass(frozen=True, eq=False)
 class SizedCamera(Camera):
-    """A camera with its image's width and height in pixels; t in world units."""
+    """A camera with its image's width and height in pixels; t in metres."""
 
     width: int
     height: int
@@ -74,7 +74,7 @@ def visible_mask(
 ) -> NDArray[np.bool_]:
     """Return a bool mask of every `step`-th pixel of `first`: True if `second` shows the same point.
 
-    The depths are (H, W) float32 in world units, inf for the sky, which is never shared. A point is not visible
+    The depths are (H, W) float32 in metres, inf for the sky, which is never shared. A point is not visible
     outside the second image, behind its camera, or behind a nearer surface.
     """
     y, x = np.mgrid[0 : first.height : step, 0 : first.width : step]

@@ -1,6 +1,5 @@
 """The worlds: a ground, three walls and boxes with drawn textures, and their views."""
 
-from dataclasses import dataclass, replace
 from itertools import product
 
 import cv2
@@ -34,30 +33,15 @@ SHOTS = (
 )
 
 
-@dataclass(frozen=True, eq=False)
-class World:
-    """Surfaces and cameras, in units of `metres_per_unit` metres."""
-
-    name: str
-    metres_per_unit: float
-    surfaces: tuple[Surface, ...]
-    cameras: tuple[SizedCamera, ...]
-
-
-def build_world(name: str, *, seed: int = 0, image_scale: float = 1.0) -> World:
-    """Build a world. Only its name, one of ``SCENE_NAMES``, and the seed decide its content."""
+def build_world(name: str, *, seed: int = 0, image_scale: float = 1.0) -> tuple[list[Surface], list[SizedCamera]]:
+    """Return the surfaces and cameras of a world, in metres. Its name and the seed alone decide its content."""
     rng = np.random.default_rng([seed, *name.encode()])
-    unit = 1 / SCENES[name]
-    surfaces = tuple(
-        replace(face, origin=face.origin * unit, edge_u=face.edge_u * unit, edge_v=face.edge_v * unit)
-        for face in _surfaces(rng)
-    )
-    cameras = []
+    surfaces, cameras = _surfaces(rng), []
     for position, target, focal, size, roll in SHOTS:
         eye, towards = np.add(position, rng.uniform(-0.15, 0.15, 3)), np.add(target, rng.uniform(-0.3, 0.3, 3))
-        camera = look_at(eye * unit, towards * unit, focal * max(size), size, roll + rng.uniform(-2, 2))
+        camera = look_at(eye, towards, focal * max(size), size, roll + rng.uniform(-2, 2))
         cameras.append(resized(camera, image_scale))
-    return World(name, SCENES[name], surfaces, tuple(cameras))
+    return surfaces, cameras
 
 
 def _surfaces(rng: np.random.Generator) -> list[Surface]:

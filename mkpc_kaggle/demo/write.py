@@ -2,17 +2,18 @@
 
 import hashlib
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 
 from mkpc_kaggle.demo.camera import FloatImage, Floats, SizedCamera, covisibility
 from mkpc_kaggle.demo.render import Picture, render
-from mkpc_kaggle.demo.world import SCENE_NAMES, World, build_world
+from mkpc_kaggle.demo.world import SCENE_NAMES, SCENES, build_world
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.cameras import fundamental_of_cameras
 
@@ -32,19 +33,17 @@ class DemoSet:
     truth_csv: Path
 
 
-@dataclass(frozen=True, eq=False)
-class Photograph:
-    """A picture (H, W, 3) uint8 BGR with its camera and its depth, (H, W) float32 in world units."""
+class Photograph(NamedTuple):
+    """A picture (H, W, 3) uint8 BGR with its camera and its depth, (H, W) float32 in metres."""
 
-    image_id: str
+    name: str
     camera: SizedCamera
     picture: Picture
     depth: FloatImage
 
 
-@dataclass(frozen=True)
-class DemoPair:
-    """Two images of a scene; `first.image_id > second.image_id`."""
+class DemoPair(NamedTuple):
+    """Two images of a scene; the first has the greater name, as in the competition."""
 
     first: Photograph
     second: Photograph
@@ -61,18 +60,23 @@ def write_demo(
     """
     demo = DemoSet(directory, directory / "train", directory / "test", directory / "test_truth.csv")
     _claim(demo)
-    worlds = [build_world(name, seed=seed, image_scale=image_scale) for name in scenes or SCENE_NAMES]
-    rows: list[tuple[str, str]] = []
-    for world in worlds:
-        photographs = take_photographs(world, seed)
-        ends = combinations(photographs, 2)  # the competition's pairs begin with the greater id
-        pairs = [DemoPair(b, a, covisibility(b.camera, b.depth, a.camera, a.depth)) for a, b in ends]
-        _write_train(demo.train_dir / world.name, photographs, pairs)
-        rows += _write_test(demo.test_dir, world.name, _selected(pairs), seed)
-    factors = (f"{world.name},{world.metres_per_unit:.17g}" for world in worlds)
+    scenes = scenes or SCENE_NAMES
+    samples: list[str] = []
+    truths: list[str] = []
+    for scene in scenes:
+        photographs = take_photographs(scene, seed, image_scale)
+        pairs = [
+            DemoPair(b, a, covisibility(b.camera, b.depth, a.camera, a.depth))
+            for a, b in combinations(photographs, 2)
+        ]
+        _write_train(demo.train_dir / scene, SCENES[scene], photographs, pairs)
+        for sample, truth in _write_test(demo.test_dir, scene, _selected(pairs), seed):
+            samples.append(sample)
+            truths.append(truth)
+    factors = (f"{scene},{SCENES[scene]:.17g}" for scene in scenes)
     _write_rows(demo.train_dir / "scaling_factors.csv", "scene,scaling_factor", factors)
-    _write_rows(demo.test_dir / "test.csv", "sample_id,batch_id,image_1_id,image_2_id", (row[0] for row in rows))
-    _write_rows(demo.truth_csv, "sample_id,scene,image_1_id,image_2_id", (row[1] for row in rows))
+    _write_rows(demo.test_dir / "test.csv", "sample_id,batch_id,image_1_id,image_2_id", samples)
+    _write_rows(demo.truth_csv, "sample_id,scene,image_1_id,image_2_id", truths)
     return demo
 
 
@@ -87,13 +91,14 @@ def _claim(demo: DemoSet) -> None:
     mark.write_text(MARK_TEXT)
 
 
-def take_photographs(world: World, seed: int) -> list[Photograph]:
-    """Render the views of the world's cameras, each with its own exposure, tint and noise."""
+def take_photographs(scene: str, seed: int, image_scale: float) -> list[Photograph]:
+    """Render the views of the scene's cameras, each with its own exposure, tint and noise."""
     photographs = []
-    for number, camera in enumerate(world.cameras):
-        image, depth = render(world.surfaces, camera)
-        rng = np.random.default_rng([seed, number, *world.name.encode()])
-        photographs.append(Photograph(f"{world.name}_{number:04d}", camera, _developed(image, rng), depth))
+    surfaces, cameras = build_world(scene, seed=seed, image_scale=image_scale)
+    for number, camera in enumerate(cameras):
+        image, depth = render(surfaces, camera)
+        rng = np.random.default_rng([seed, number, *scene.encode()])
+        photographs.append(Photograph(f"{scene}_{number:04d}", camera, _developed(image, rng), depth))
     return photographs
 
 
@@ -113,41 +118,35 @@ def _selected(pairs: Sequence[DemoPair]) -> list[DemoPair]:
     return [scored[index] for index in chosen]
 
 
-def _write_train(directory: Path, photographs: Sequence[Photograph], pairs: Sequence[DemoPair]) -> None:
+def _write_train(
+    directory: Path, metres_per_unit: float, photographs: Sequence[Photograph], pairs: Sequence[DemoPair]
+) -> None:
     for each in photographs:
-        _write_image(directory / "images" / f"{each.image_id}.jpg", each.picture, cv2.IMWRITE_JPEG_QUALITY, 95)
-    cameras = ((each.image_id, each.camera) for each in photographs)
-    _write_rows(
-        directory / "calibration.csv",
-        "image_id,camera_intrinsics,rotation_matrix,translation_vector",
-        (f"{name},{_numbers(camera.K)},{_numbers(camera.R)},{_numbers(camera.t)}" for name, camera in cameras),
-    )
-    _write_rows(
-        directory / "pair_covisibility.csv",
-        "pair,covisibility,fundamental_matrix",
-        (
-            f"{p.first.image_id}-{p.second.image_id},{p.covisibility:.17g},"
-            f"{_numbers(fundamental_of_cameras(p.first.camera, p.second.camera))}"
-            for p in pairs
-        ),
-    )
+        _write_image(directory / "images" / f"{each.name}.jpg", each.picture, cv2.IMWRITE_JPEG_QUALITY, 95)
+    header = "image_id,camera_intrinsics,rotation_matrix,translation_vector"
+    cameras = ((each.name, each.camera.K, each.camera.R, each.camera.t / metres_per_unit) for each in photographs)
+    rows = (",".join([name, *map(_numbers, matrices)]) for name, *matrices in cameras)
+    _write_rows(directory / "calibration.csv", header, rows)
+    lines = []
+    for first, second, share in pairs:
+        F = fundamental_of_cameras(first.camera, second.camera)
+        lines.append(f"{first.name}-{second.name},{share:.17g},{_numbers(F)}")
+    _write_rows(directory / "pair_covisibility.csv", "pair,covisibility,fundamental_matrix", lines)
 
 
-def _write_test(directory: Path, scene: str, pairs: Sequence[DemoPair], seed: int) -> list[tuple[str, str]]:
-    """Write the images of one batch; return each pair's rows of test.csv and test_truth.csv."""
+def _write_test(directory: Path, scene: str, pairs: Sequence[DemoPair], seed: int) -> Iterator[tuple[str, str]]:
+    """Write the images of one batch; yield each pair's rows of test.csv and test_truth.csv."""
     batch = _digest(f"{seed}/{scene}")[:8]
-    photographs = {each.image_id: each for pair in pairs for each in (pair.first, pair.second)}
+    photographs = {each.name: each for pair in pairs for each in pair[:2]}
     hidden = {name: _digest(f"{seed}/{scene}/{name}")[:32] for name in photographs}
     for name, each in photographs.items():
         path = directory / "test_images" / batch / f"{hidden[name]}.png"
         _write_image(path, each.picture, cv2.IMWRITE_PNG_COMPRESSION, 1)
-    rows = []
     for pair in pairs:
-        names = sorted((pair.first.image_id, pair.second.image_id), key=hidden.__getitem__, reverse=True)
+        names = sorted((each.name for each in pair[:2]), key=hidden.__getitem__, reverse=True)
         ids = [hidden[name] for name in names]
         sample = f"{scene};{batch};{'-'.join(ids)}"
-        rows.append((f"{sample},{batch},{','.join(ids)}", f"{sample},{scene},{','.join(names)}"))
-    return rows
+        yield f"{sample},{batch},{','.join(ids)}", f"{sample},{scene},{','.join(names)}"
 
 
 def _write_image(path: Path, picture: Picture, option: int, value: int) -> None:

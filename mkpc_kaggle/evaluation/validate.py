@@ -31,7 +31,7 @@ from mkpc_kaggle.recipe import Recipe
 MAX_NAMES = 5  # sample names in a line
 MATCHING = ("precision", "matching_score")
 
-SUPERGLUE = RobustConfig(Method.RANSAC, 1.0, 0.99999, max_iterations=1000, permutations=1, every_match=True)
+SUPERGLUE = RobustConfig(Method.RANSAC, 1.0, max_iterations=1000, permutations=1, every_match=True)
 PROTOCOLS = {"superglue": SUPERGLUE, "loftr": replace(SUPERGLUE, threshold=0.5)}
 
 

@@ -71,28 +71,21 @@ class View:
     antialias: bool = True  # average areas where the crop shrinks
 
     @classmethod
-    def fit(cls, crop: Box, *, long_side: int, multiple: int = 1, turns: int = 0) -> "View":
-        """Return the view of ``crop`` with this longer side in pixels, its aspect kept to the nearest pixel.
+    def fit(cls, crop: Box, *, long_side: int = 0, area: int = 0, multiple: int = 1, turns: int = 0) -> "View":
+        """Return the view of ``crop`` with this longer side in pixels, or with about ``area`` pixels.
 
-        Here, as in the other constructors, both sides are padded up to a multiple of ``multiple``.
+        Its aspect is kept to the nearest pixel. Here, as in :meth:`stretched`, both sides are padded up to a
+        multiple of ``multiple``.
         """
-        return cls._scaled(crop, long_side / max(crop.size), multiple, turns)
-
-    @classmethod
-    def of_area(cls, crop: Box, *, area: int, multiple: int = 1, turns: int = 0) -> "View":
-        """Return the view of ``crop`` with about ``area`` pixels, its aspect kept to the nearest pixel."""
-        return cls._scaled(crop, sqrt(area / crop.area), multiple, turns)
+        scale = long_side / max(crop.size) if long_side else sqrt(area / crop.area)
+        width, height = (max(1, round(side * scale)) for side in _turned_size(crop.size, turns))
+        return cls.stretched(crop, size=Size(width, height), multiple=multiple, turns=turns)
 
     @classmethod
     def stretched(cls, crop: Box, *, size: Size, multiple: int = 1, turns: int = 0) -> "View":
         """Return the view of ``crop``, turned and then resized to exactly ``size``, regardless of its aspect."""
         padded = Size(*(ceil(side / multiple) * multiple for side in size))
         return cls(crop, size, padded, turns)
-
-    @classmethod
-    def _scaled(cls, crop: Box, scale: float, multiple: int, turns: int) -> "View":
-        width, height = (max(1, round(side * scale)) for side in _turned_size(crop.size, turns))
-        return cls.stretched(crop, size=Size(width, height), multiple=multiple, turns=turns)
 
     @property
     def scale(self) -> tuple[float, float]:

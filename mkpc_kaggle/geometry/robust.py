@@ -22,6 +22,7 @@ from mkpc_kaggle.geometry.two_view import Vectors, robust_costs, sampson
 # F of a pure sideways motion, [e_x]_x: finite, rank 2; the epipolar lines are the image rows.
 FALLBACK_FUNDAMENTAL: Matrix3 = np.array([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 FALLBACK_FUNDAMENTAL.setflags(write=False)
+CONFIDENCE = 0.99999  # that no better model is left to find
 FARTHEST = 1e9  # baselines; matches that are farther do not count as in front of a camera
 
 
@@ -48,14 +49,13 @@ class RobustConfig:
 
     method: Method = Method.MAGSAC
     threshold: float = 0.2  # pixels of the stored image
-    confidence: float = 0.99999
     max_iterations: int = 50_000
     permutations: int = 8  # number of fixed permutations; the first is the matches' own order
     threshold_side: int = 0  # if not 0, the threshold is in pixels of the image resized to this long side
     every_match: bool = False  # keep exact duplicates, and estimate from the fewest matches that OpenCV accepts
 
     def __post_init__(self) -> None:
-        check_ranges(self, threshold=POSITIVE, confidence=Range(0, 1, "()"), max_iterations=Range(1, 10**6))
+        check_ranges(self, threshold=POSITIVE, max_iterations=Range(1, 10**6))
         check_ranges(self, permutations=Range(1, 100), threshold_side=Range(0, 99_999))
 
     def in_stored_pixels(
@@ -143,7 +143,7 @@ def consensus(
     if count < (solver.minimal if config.every_match else solver.min_matches):
         return Estimate.failed(model, count, f"too few distinct matches for {model}: {count}")
     method = cv2.USAC_MAGSAC if config.method is Method.MAGSAC else cv2.RANSAC
-    settings = {"method": method, "confidence": config.confidence, "maxIters": config.max_iterations}
+    settings = {"method": method, "confidence": CONFIDENCE, "maxIters": config.max_iterations}
     if intrinsics is not None and model is ModelKind.E:
         points0, points1 = calibrate(points0, intrinsics[0]), calibrate(points1, intrinsics[1])
         settings["focal"] = float(np.mean([K[axis, axis] for K in intrinsics for axis in (0, 1)]))

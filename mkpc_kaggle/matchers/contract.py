@@ -62,6 +62,13 @@ class NoOptions:
 
 
 @dataclass(frozen=True)
+class TrainedOptions:
+    """The options of a matcher with weights for outdoors and indoors."""
+
+    training: Training = Training.OUTDOOR
+
+
+@dataclass(frozen=True)
 class MatcherSpec:
     """The description of a matcher, known before it is loaded."""
 

@@ -2,31 +2,20 @@
 
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import torch
 
-from mkpc_kaggle.config import AT_LEAST_1, SHARE, Range, check_ranges
 from mkpc_kaggle.geometry.coordinates import Size, from_normalised
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.matchers.contract import MatcherSpec, PairwiseMatcher, Picture, Training
+from mkpc_kaggle.matchers.contract import MatcherSpec, PairwiseMatcher, Picture
 from mkpc_kaggle.matchers.dtypes import check_finite
 from mkpc_kaggle.matchers.networks.dense_sampling import sample_matches
 from mkpc_kaggle.matchers.networks.dense_warp import DenseFeatures, DenseNetwork
 from mkpc_kaggle.matchers.networks.pixels import network_input
 
-
-@dataclass(frozen=True)
-class DenseOptions:
-    passes: int = 1  # 2: on pictures scaled by ``first_pass``, then on full ones
-    first_pass: float = 0.625
-    matches: int = 5000  # at most
-    threshold: float = 0.05  # certainties above it count as 1
-    training: Training = Training.OUTDOOR
-
-    def __post_init__(self) -> None:
-        check_ranges(self, passes=Range(1, 2), first_pass=Range(0, 1, "(]"), matches=AT_LEAST_1, threshold=SHARE)
+THRESHOLD = 0.05  # certainties above it count as 1, as published
+MIN_SIDE_PX = 8  # of the second pass
 
 
 class DenseEncoding(NamedTuple):
@@ -40,18 +29,23 @@ class DenseEncoding(NamedTuple):
 class DenseMatcher(PairwiseMatcher[DenseEncoding]):
     """A dense matcher. A match's score is its certainty; sampling depends on the two pictures alone.
 
-    Pictures and pairs are processed one by one, so that results do not depend on the batch. ``multiple``: sides in
-    the first pass are multiples of it; ``min_side_px``: the shortest side of any image.
+    Pictures and pairs are processed one by one, so that results do not depend on the batch. With ``first_pass``,
+    the first of two passes is on pictures scaled by it. ``multiple``: of the sides in the first pass.
     """
 
-    spec: ClassVar[MatcherSpec]
-    multiple: ClassVar[int] = 1
-    min_side_px: ClassVar[int] = 1
+    matches = 5000  # of a pair, at most
 
-    def __init__(self, network: DenseNetwork, options: DenseOptions, device: str) -> None:
-        self.options = options
-        self.device = device
-        self._network = network
+    def __init__(
+        self,
+        spec: MatcherSpec,
+        network: DenseNetwork,
+        device: str,
+        *,
+        multiple: int = 1,
+        first_pass: float | None = None,
+    ) -> None:
+        self.spec, self.device = spec, device
+        self._network, self._multiple, self._first_pass = network, multiple, first_pass
 
     @torch.inference_mode()
     def encode(self, pictures: Sequence[Picture]) -> list[DenseEncoding]:
@@ -62,21 +56,16 @@ class DenseMatcher(PairwiseMatcher[DenseEncoding]):
         # The network accepts any size, so padding is cut off.
         content = picture.pixels[:height, :width].copy()
         pixels = torch.from_numpy(content).permute(2, 0, 1)[None]  # (1, 3, H, W)
-        first = network_input(pixels, self._first_size(picture.content)).to(self.device)
+        share, multiple = self._first_pass or 1, self._multiple
+        rows, columns = (multiple * max(1, round(side * share / multiple)) for side in (height, width))
+        first = network_input(pixels, (rows, columns)).to(self.device)
         second = None
-        if self.options.passes == 2:
-            size = max(self.min_side_px, height), max(self.min_side_px, width)
+        if self._first_pass:
+            size = max(MIN_SIDE_PX, height), max(MIN_SIDE_PX, width)
             second = network_input(pixels, size).to(self.device)
         return DenseEncoding(self._network.encode(first, second), picture.content, zlib.crc32(content.data))
 
-    def _first_size(self, content: Size) -> tuple[int, int]:
-        """Return (H, W) of the first pass's image."""
-        share = self.options.first_pass if self.options.passes == 2 else 1
-        width, height = (self.multiple * max(1, round(side * share / self.multiple)) for side in content)
-        return height, width
-
     def _match(self, first: DenseEncoding, second: DenseEncoding) -> Matches:
-        options = self.options
         warps = self._network.match(first.features, second.features)
         warp = torch.cat([dense.warp.reshape(-1, 4) for dense in warps])
         certainty = torch.cat([dense.certainty.flatten() for dense in warps])
@@ -84,7 +73,7 @@ class DenseMatcher(PairwiseMatcher[DenseEncoding]):
         # PyTorch's CPU generator uses 32 bits of a seed, so both checksums become one of 32 bits.
         seed = zlib.crc32(second.checksum.to_bytes(4), first.checksum)
         generator = torch.Generator(warp.device).manual_seed(seed)
-        index = sample_matches(warp, certainty, options.matches, options.threshold, generator)
+        index = sample_matches(warp, certainty, self.matches, THRESHOLD, generator)
         points = warp[index].cpu().numpy()
         return Matches(
             from_normalised(points[:, :2], first.content),

@@ -1,38 +1,27 @@
 """LightGlue (Lindenberger et al. 2023, kornia's network): shared by all matchers that use it."""
 
 import re
-from dataclasses import dataclass
 from typing import Any
 
 import torch
 from kornia.feature import LightGlue
 from torch import Tensor
 
-from mkpc_kaggle.config import AT_LEAST_1, SHARE, check_ranges
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import MatcherSpec, PairwiseMatcher, Placement
 from mkpc_kaggle.matchers.dtypes import check_finite
 from mkpc_kaggle.matchers.networks.placement import autocast
-from mkpc_kaggle.matchers.sparse import Encoder, Keypoints, matches_of
+from mkpc_kaggle.matchers.sparse import Encode, Keypoints, matches_of
 from mkpc_kaggle.weights import WeightStore, load_into
 
 
-@dataclass(frozen=True)
-class LightGlueOptions:
-    features: int = 2048  # the number of strongest keypoints per picture
-    threshold: float = 0.1  # minimum score of a match (exclusive)
-
-    def __post_init__(self) -> None:
-        check_ranges(self, features=AT_LEAST_1, threshold=SHARE)
-
-
 class LightGlueMatcher(PairwiseMatcher[Keypoints]):
-    """LightGlue on the keypoints of an encoder; a match's score is LightGlue's."""
+    """LightGlue on the keypoints of an encoder; a match's score is LightGlue's, above 0.1 by kornia's default."""
 
-    def __init__(self, spec: MatcherSpec, encoder: Encoder, glue: LightGlue, placement: Placement) -> None:
+    def __init__(self, spec: MatcherSpec, encode: Encode, glue: LightGlue, placement: Placement) -> None:
         self.spec = spec
         self.placement = placement
-        self.encode = encoder.encode
+        self.encode = encode
         self._glue = glue.eval().to(placement.device)
         # Autocast the layers only; their inputs and outputs are float32. Positions of keypoints and scores stay
         # float32. An autocast around LightGlue has no effect: LightGlue turns it off.
@@ -59,20 +48,23 @@ def _glue_input(keypoints: Keypoints) -> dict[str, Tensor]:
     return given
 
 
-def load_glue(weights: WeightStore, slot: str, threshold: float, **shape: int) -> LightGlue:
-    """Load LightGlue with the checkpoint's number of layers; ``shape``: kornia's ``input_dim`` and so on."""
+def load_lightglue(
+    spec: MatcherSpec, encode: Encode, weights: WeightStore, placement: Placement, **shape: Any
+) -> LightGlueMatcher:
+    """Load LightGlue from the spec's last slot, with the checkpoint's number of layers."""
+    slot = spec.slots[-1]
     tensors = {layer_name(name): tensor for name, tensor in weights.load(slot).items()}
     numbers = (int(name.split(".")[1]) for name in tensors if name.startswith("transformers."))
     layers = 1 + max(numbers, default=0)
-    glue = light_glue(layers, threshold, **shape)
+    glue = light_glue(layers, **shape)
     # Without early stopping and pruning, only the last layer's assignment is used.
     early = rf"token_confidence\.|confidence_thresholds|log_assignment\.(?!{layers - 1}\.)"
     load_into(glue, tensors, unused=early, what=slot)
-    return glue
+    return LightGlueMatcher(spec, encode, glue, placement)
 
 
-def light_glue(layers: int, threshold: float, **shape: Any) -> LightGlue:
-    """Make the network without weights; ``threshold`` of a match's score."""
+def light_glue(layers: int, **shape: Any) -> LightGlue:
+    """Make the network without weights; ``shape``: kornia's settings, ``input_dim`` and so on."""
     flash = torch.backends.cuda.flash_sdp_enabled()  # type: ignore[no-untyped-call]  # torch's
     try:
         return LightGlue(
@@ -81,7 +73,6 @@ def light_glue(layers: int, threshold: float, **shape: Any) -> LightGlue:
             flash=False,  # else kornia halves queries, keys and values on a GPU, float32 or not
             depth_confidence=-1,
             width_confidence=-1,
-            filter_threshold=threshold,
             **shape,
         )
     finally:

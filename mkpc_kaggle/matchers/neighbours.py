@@ -28,7 +28,7 @@ class Neighbours:
 class NeighbourMatcher(PairwiseMatcher[Keypoints]):
     """Mutual nearest neighbours whose distance ratio is at most ``ratio``, scored by their cosine."""
 
-    ratio: float
+    ratio = 1.0
 
     def _match(self, first: Keypoints, second: Keypoints) -> Matches:
         pairs = mutual_neighbours(first.descriptors, second.descriptors, self.ratio)

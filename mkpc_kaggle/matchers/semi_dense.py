@@ -1,18 +1,17 @@
 """The adapter of semi-dense networks: feature maps of each picture, matches of coarse cells of each pair."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from mkpc_kaggle.config import SHARE, check_ranges
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Size, from_corner
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.matchers.contract import MatcherSpec, PairwiseMatcher, Picture, Training
+from mkpc_kaggle.matchers.contract import MatcherSpec, PairwiseMatcher, Picture, Placement, TrainedOptions
 from mkpc_kaggle.matchers.networks.fine_matching import COARSE_STRIDE
+from mkpc_kaggle.matchers.networks.placement import prepared
 from mkpc_kaggle.matchers.networks.resnet_fpn import FeatureMaps
 from mkpc_kaggle.matchers.networks.semi_dense import SemiDenseNetwork
 from mkpc_kaggle.matchers.sparse import image_batch
@@ -20,15 +19,6 @@ from mkpc_kaggle.weights import WeightStore, load_into
 
 PREFIX = "matcher."  # of parameter names in the published training checkpoints
 TRANSPORT = "coarse_matching.bin_score"  # only checkpoints of networks with optimal transport have it
-
-
-@dataclass(frozen=True)
-class SemiDenseOptions:
-    threshold: float = 0.2  # a match's confidence is above it
-    training: Training = Training.OUTDOOR
-
-    def __post_init__(self) -> None:
-        check_ranges(self, threshold=SHARE)
 
 
 class SemiDenseEncoding(NamedTuple):
@@ -50,7 +40,7 @@ class SemiDenseEncoding(NamedTuple):
 class SemiDenseMatcher(PairwiseMatcher[SemiDenseEncoding]):
     """A semi-dense matcher; a match's score is the confidence of its coarse cells."""
 
-    def __init__(self, network: SemiDenseNetwork[Any], spec: MatcherSpec, device: str) -> None:
+    def __init__(self, network: SemiDenseNetwork, spec: MatcherSpec, device: str) -> None:
         self.spec = spec
         self.device = device
         self._network = network
@@ -70,15 +60,24 @@ class SemiDenseMatcher(PairwiseMatcher[SemiDenseEncoding]):
         # Even a mask of True only can change rounding.
         found = self._network.match(first.maps, second.maps, None if all(mask.all() for mask in masks) else masks)
         points0, points1 = (from_corner(points.float().cpu().numpy()) for points in (found.points0, found.points1))
-        return Matches(points0, points1, found.coarse.confidence.float().cpu().numpy())
+        return Matches(points0, points1, found.coarse.scores.float().cpu().numpy())
 
 
-def load_network(network: SemiDenseNetwork[Any], weights: WeightStore, slot: str, *, unused: str = "$^") -> None:
+def load_semi_dense(
+    spec: MatcherSpec,
+    network: SemiDenseNetwork,
+    weights: WeightStore,
+    options: TrainedOptions,
+    placement: Placement,
+    *,
+    unused: str = "$^",
+) -> SemiDenseMatcher:
     """Load the published checkpoint, whose names have the training wrapper's prefix, into a network.
 
     Position tables are computed, so the checkpoint's are ignored, and so are names that match ``unused``. Raises
     :class:`UserError` for weights that were trained with optimal transport.
     """
+    (slot,) = spec.slots_for(options)
     tensors = {name.removeprefix(PREFIX): tensor for name, tensor in weights.load(slot).items()}
     if TRANSPORT in tensors:
         raise UserError(
@@ -86,3 +85,4 @@ def load_network(network: SemiDenseNetwork[Any], weights: WeightStore, slot: str
             "trained with it (LoFTR's are called outdoor_ds and indoor_ds_new, not outdoor_ot and indoor_ot)"
         )
     load_into(network, tensors, what=slot, unused=rf".*pos_encoding\.pe$|{unused}")
+    return SemiDenseMatcher(prepared(network, placement), spec, placement.device)

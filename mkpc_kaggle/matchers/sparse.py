@@ -2,12 +2,12 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
+from mkpc_kaggle.config import AT_LEAST_1, check_ranges
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import Picture, Placement
@@ -16,6 +16,14 @@ from mkpc_kaggle.matchers.networks.placement import autocast
 
 # Images (B, 3, H, W) -> the points (K, 2) in pixels and unit descriptors (K, D) of each.
 Detector = Callable[[Tensor], Iterable[tuple[Tensor, Tensor]]]
+
+
+@dataclass(frozen=True)
+class KeypointOptions:
+    features: int = 2048  # the number of strongest keypoints per picture
+
+    def __post_init__(self) -> None:
+        check_ranges(self, features=AT_LEAST_1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,34 +50,25 @@ class Keypoints:
         return len(self.points)
 
 
-class Encoder(Protocol):
-    def encode(self, pictures: Sequence[Picture]) -> list[Keypoints]: ...
+Encode = Callable[[Sequence[Picture]], list[Keypoints]]
 
 
-class KeypointEncoder:
-    """An encoder that runs a detector on a device."""
-
-    def __init__(self, detect: Detector, device: str) -> None:
-        self._detect = detect
-        self._device = device
+def keypoint_encoder(network: nn.Module, features: nn.Module, detect: Detector, placement: Placement) -> Encode:
+    """Return the encoder of a library's network; the output of its part ``features`` must be finite."""
+    network.eval().to(placement.device)
+    what = f"features of {type(network).__name__.lower()}"
+    features.register_forward_hook(lambda _, inputs, found: check_finite(what, found))
 
     @torch.inference_mode()
-    def encode(self, pictures: Sequence[Picture]) -> list[Keypoints]:
-        found = self._detect(image_batch(pictures, self._device))
+    def encode(pictures: Sequence[Picture]) -> list[Keypoints]:
+        with autocast(placement):
+            found = list(detect(image_batch(pictures, placement.device)))
         return [
             Keypoints.on_content(points.float(), descriptors.float(), picture.content)
             for (points, descriptors), picture in zip(found, pictures, strict=True)
         ]
 
-
-def library_encoder(
-    network: nn.Module, features: nn.Module, detect: Detector, placement: Placement
-) -> KeypointEncoder:
-    """Return the encoder of a library's network; the output of its part ``features`` must be finite."""
-    network.eval().to(placement.device)
-    what = f"features of {type(network).__name__.lower()}"
-    features.register_forward_hook(lambda _, inputs, found: check_finite(what, found))
-    return KeypointEncoder(autocast(placement)(detect), placement.device)
+    return encode
 
 
 def matches_of(points0: Tensor, points1: Tensor, index0: Tensor, index1: Tensor, scores: Tensor) -> Matches:

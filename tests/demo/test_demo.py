@@ -87,7 +87,7 @@ def test_fundamental_matrices_and_pictures_are_those_of_the_cameras(small_demo, 
     for row in rows(train / "pair_covisibility.csv"):
         F = fundamental_of_cameras(*(cameras[name] for name in row["pair"].split("-")))
         np.testing.assert_allclose(numbers(row["fundamental_matrix"], 3, 3), F, atol=1e-9)
-    for name, camera in zip(sorted(cameras), build_world(scene_name, image_scale=SCALE).cameras, strict=True):
+    for name, camera in zip(sorted(cameras), build_world(scene_name, image_scale=SCALE)[1], strict=True):
         np.testing.assert_allclose([*cameras[name].K, *cameras[name].R], [*camera.K, *camera.R], atol=1e-9)
         assert cv2.imread(str(train / "images" / f"{name}.jpg")).shape[1::-1] == (camera.width, camera.height)
 

@@ -79,7 +79,7 @@ def test_a_turned_view_is_the_view_of_the_turned_picture(turns, scale, seed):
 def test_a_view_keeps_the_aspect_to_the_nearest_pixel_and_pads_to_the_multiple(crop, long_side, area, multiple):
     fitted = View.fit(crop, long_side=long_side, multiple=multiple)
     assert max(fitted.content) == long_side
-    of_area = View.of_area(crop, area=area, multiple=multiple)
+    of_area = View.fit(crop, area=area, multiple=multiple)
     for view, scale in ((fitted, long_side / max(crop.size)), (of_area, (area / crop.area) ** 0.5)):
         assert view.crop == crop
         for side, content, padded in zip(crop.size, view.content, view.padded, strict=True):

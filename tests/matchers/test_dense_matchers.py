@@ -7,10 +7,8 @@ from light_matchers import dkm_matcher, ours
 from pictures import match_one, picture, same
 from standin import narrow_roma
 
-from mkpc_kaggle.matchers.adapters.dkm import DkmMatcher
-from mkpc_kaggle.matchers.adapters.roma import RomaMatcher, RomaOptions
-from mkpc_kaggle.matchers.contract import Placement
-from mkpc_kaggle.matchers.dense import DenseOptions
+from mkpc_kaggle.matchers.contract import MatcherSpec, Placement
+from mkpc_kaggle.matchers.dense import DenseMatcher
 from mkpc_kaggle.matchers.networks.dense_sampling import sample_matches
 from mkpc_kaggle.matchers.networks.dense_warp import DenseFeatures, DenseWarp
 from mkpc_kaggle.matchers.networks.dkm import DKM
@@ -38,7 +36,7 @@ def test_what_has_no_weight_is_not_drawn():
 
 
 @pytest.fixture(scope="module")
-def matcher() -> DkmMatcher:
+def matcher() -> DenseMatcher:
     return dkm_matcher(Placement())
 
 
@@ -68,7 +66,8 @@ def identity_warp(height: int, width: int, certainty: float) -> DenseWarp:
 def test_points_of_either_picture_are_in_its_own_pixels():
     """Both show the same, at another size: places relative to the edges agree."""
     warps = identity_warp(40, 60, 0.3), identity_warp(80, 30, 0.9)
-    matcher = DkmMatcher(Given(*warps), DenseOptions(matches=9999), "cpu")
+    matcher = DenseMatcher(MatcherSpec("given"), Given(*warps), "cpu")
+    matcher.matches = 9999
     matches = match_one(matcher, picture(40, 60), picture(80, 30))
     assert len(matches) == 40 * 60 + 80 * 30
     expected = (matches.points0 + 0.5) * (30 / 60, 80 / 40) - 0.5
@@ -80,9 +79,9 @@ def test_points_of_either_picture_are_in_its_own_pixels():
     assert set(matches.scores.tolist()) == {float(np.float32(0.3)), float(np.float32(0.9))}
 
 
-@pytest.mark.parametrize(("passes", "sides"), [(2, (56, 84)), (1, (84, 126))])
-def test_sides_of_the_first_pass_are_multiples_of_14(passes, sides):
-    options = RomaOptions(passes=passes, first_pass=0.648)
-    (encoded,) = RomaMatcher(ours(Placement(), "roma", narrow_roma), options, "cpu").encode([picture(86, 130)])
+@pytest.mark.parametrize(("first_pass", "sides"), [(0.648, (56, 84)), (None, (84, 126))])
+def test_sides_of_the_first_pass_are_multiples_of_14(first_pass, sides):
+    network, passes = ours(Placement(), "roma", narrow_roma), {"multiple": 14, "first_pass": first_pass}
+    (encoded,) = DenseMatcher(MatcherSpec("given"), network, "cpu", **passes).encode([picture(86, 130)])
     assert encoded.features.coarse.at(1).shape[2:] == sides
-    assert [each.at(1).shape[2:] for each in [encoded.features.fine] if each] == [(86, 130)] * (passes - 1)
+    assert [each.at(1).shape[2:] for each in [encoded.features.fine] if each] == [(86, 130)] * bool(first_pass)

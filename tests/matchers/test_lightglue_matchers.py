@@ -13,13 +13,14 @@ from torch import Tensor, nn
 
 from mkpc_kaggle.matchers.adapters.aliked import aliked_network
 from mkpc_kaggle.matchers.contract import Colour, Placement, Precision
-from mkpc_kaggle.matchers.lightglue import LightGlueOptions, light_glue
+from mkpc_kaggle.matchers.lightglue import light_glue
 from mkpc_kaggle.matchers.registry import load_matcher
+from mkpc_kaggle.matchers.sparse import KeypointOptions
 from mkpc_kaggle.weights import WeightStore
 
 
 def glue(**shape: Any) -> nn.Module:
-    return light_glue(2, 0.1, input_dim=128, **shape)
+    return light_glue(2, input_dim=128, **shape)
 
 
 def old_names(state: dict[str, Tensor]) -> dict[str, Any]:
@@ -53,13 +54,10 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> WeightStore:
     return store_of(tmp_path_factory.mktemp("weights"), FILES)
 
 
-def load(name: str, store: WeightStore, precision: Precision = Precision.FLOAT32, **options: Any) -> Any:
-    return load_matcher(name, store, LightGlueOptions(**options), Placement(precision=precision))
-
-
 @pytest.mark.parametrize("name", ["aliked_lightglue", "disk_lightglue", "sift_lightglue"])
 def test_a_picture_matches_itself_point_by_point(name, store):
-    matcher = load(name, store, features=300, threshold=0.0)
+    matcher = load_matcher(name, store, KeypointOptions(features=300), Placement())
+    matcher._glue.conf.filter_threshold = 0.0
     channels = 1 if matcher.spec.colour is Colour.GRAY else 3
     encodings = matcher.encode([picture(97, 131, channels=channels, multiple=32)])
     (matches,) = matcher.match(encodings, encodings)
@@ -71,7 +69,8 @@ def test_a_picture_matches_itself_point_by_point(name, store):
 @pytest.mark.parametrize("precision", Precision)
 def test_layers_compute_in_the_precision_that_is_asked_for(precision, store):
     """LightGlue turns off any autocast around it: what counts is set around its layers."""
-    matcher, seen = load("aliked_lightglue", store, precision), []
+    placement, seen = Placement(precision=precision), []
+    matcher = load_matcher("aliked_lightglue", store, KeypointOptions(), placement)
     for part in ("posenc.Wr", "transformers.1.cross_attn.to_out", "transformers.1", "log_assignment.1"):
         matcher._glue.get_submodule(part).register_forward_hook(lambda *call: seen.append(call[-1][0].dtype))
     encodings = matcher.encode([picture(64, 96, multiple=32)])

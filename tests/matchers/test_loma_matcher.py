@@ -17,7 +17,7 @@ from mkpc_kaggle.matchers.networks import layers
 from mkpc_kaggle.matchers.networks.loma import Loma, Variant, detector_size
 from mkpc_kaggle.weights import WeightStore
 
-OPTIONS = LomaOptions(Variant.B128, max_keypoints=200, match_threshold=0.0)
+OPTIONS = LomaOptions(Variant.B128, max_keypoints=200)
 
 
 @pytest.fixture(scope="module")

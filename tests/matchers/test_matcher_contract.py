@@ -18,7 +18,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:.*is not verified")
 SIZES = [((33, 47), (64, 48)), ((9, 120), (40, 40)), ((20, 1), (40, 50))]
 
 
-@pytest.fixture(params=[name for name in MATCHERS if name != "dkm, two passes"], scope="module")
+@pytest.fixture(params=MATCHERS, scope="module")
 def matcher(request):
     return MATCHERS[request.param](Placement())
 

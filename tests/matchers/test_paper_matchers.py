@@ -12,15 +12,14 @@ from standin import scene, use_narrow
 
 from mkpc_kaggle.data.competition import read_submission
 from mkpc_kaggle.engine.journal_reader import JournalReader
+from mkpc_kaggle.matchers.adapters.loma import LomaAdapter
+from mkpc_kaggle.matchers.dense import DenseMatcher
 
 LONG, AREA = ("long_side = 209", "long_side = 150"), ('area = "96x128"', 'area = "70x90"')
 # The sizes of the units of stages 1 and 2, which fit no network's multiple, and the matcher's options.
 TRIALS = dict.fromkeys(("superglue", "loftr", "quadtree", "aspanformer"), (LONG, ""))
-TRIALS |= {
-    "loma": (LONG, 'variant = "b128"\nmax_keypoints = 300\nmatch_threshold = 0.0'),
-    "dkm": (AREA, "matches = 300"),
-    "roma": (AREA, "matches = 300"),
-}
+TRIALS |= dict.fromkeys(("dkm", "roma"), (AREA, ""))
+TRIALS["loma"] = LONG, 'variant = "b128"\nmax_keypoints = 300'
 
 
 @pytest.fixture(scope="module")
@@ -44,6 +43,8 @@ def test_odd_small_and_blank_pictures_go_through(clean_environment, monkeypatch,
     checkpoints = write_checkpoints(tmp_path, [file for file in FILES if file.matcher == matcher])
     use_manifest(monkeypatch, checkpoints)
     use_narrow(monkeypatch)
+    monkeypatch.setattr(DenseMatcher, "matches", 300)
+    monkeypatch.setattr(LomaAdapter, "threshold", 0.0)
     sizes, options = TRIALS[matcher]
     units = [f'{{ stage = {n}, matcher = "{matcher}", {size} }}' for n, size in enumerate(sizes, start=1)]
     (tmp_path / "r.toml").write_text(f"units = [{', '.join(units)}]\n[matchers.{matcher}]\n{options}")

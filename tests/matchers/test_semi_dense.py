@@ -26,8 +26,8 @@ def test_matches_are_the_mutual_maxima_of_both_softmaxes(monkeypatch, held):
     confidence = similarity.softmax(0) * similarity.softmax(1)
     mutual = (confidence == confidence.amax(0, keepdim=True)) & (confidence == confidence.amax(1, keepdim=True))
     expected = (mutual & (confidence > 0.02)).nonzero()
-    torch.testing.assert_close(torch.stack([matches.cell0, matches.cell1], dim=1), expected)
-    torch.testing.assert_close(matches.confidence.double(), confidence[tuple(expected.T)], rtol=1e-5, atol=0)
+    torch.testing.assert_close(torch.stack([matches.index0, matches.index1], dim=1), expected)
+    torch.testing.assert_close(matches.scores.double(), confidence[tuple(expected.T)], rtol=1e-5, atol=0)
 
 
 def test_span_attention_in_chunks_is_that_of_the_whole(monkeypatch):

@@ -10,7 +10,7 @@ from light_matchers import lightglue_matcher
 from numpy.testing import assert_allclose
 from pictures import as_picture, match_one, picture
 
-from mkpc_kaggle.matchers.adapters.sift_lightglue import SHAPE, SPEC, SiftEncoder
+from mkpc_kaggle.matchers.adapters.sift_lightglue import SHAPE, SPEC, sift_encoder
 from mkpc_kaggle.matchers.contract import Placement
 from mkpc_kaggle.matchers.lightglue import LightGlueMatcher, light_glue
 
@@ -19,13 +19,13 @@ PICTURE = picture(130, 171, channels=1)
 
 @needs_golden
 def test_keypoints_and_log_assignment_are_the_golden_ones():
-    golden, glue = golden_arrays("sift_lightglue", "herz_jesus"), light_glue(9, 0.1, **SHAPE)
+    golden, glue = golden_arrays("sift_lightglue", "herz_jesus"), light_glue(9, **SHAPE)
     state = glue.state_dict()
     seeded = {n: seeded_tensor(n, tuple(x.shape)) for n, x in state.items() if n != "confidence_thresholds"}
     glue.load_state_dict(state | seeded)
     found = []
     glue.register_forward_hook(lambda *call: found.append(call[-1]["log_assignment"][0]))
-    matcher = LightGlueMatcher(SPEC, SiftEncoder(512, "cpu"), glue, Placement())
+    matcher = LightGlueMatcher(SPEC, sift_encoder(512, "cpu"), glue, Placement())
     encodings = matcher.encode([as_picture(golden[f"image{number}"].numpy()) for number in (0, 1)])
     for number, keypoints in enumerate(encodings):
         parts = {"keypoints": keypoints.points + 0.25}  # OpenCV's offset
@@ -63,8 +63,8 @@ def test_a_picture_matches_itself_turned_by_quarter_turns(turns):
 
 
 def test_a_pixel_has_one_keypoint_and_the_strongest_are_kept():
-    (few,), (many,) = (SiftEncoder(features, "cpu").encode([PICTURE]) for features in (20, 500))
+    (few,), (many,) = (sift_encoder(features, "cpu")([PICTURE]) for features in (20, 500))
     assert len(many) == len((many.points - 0.25).round().unique(dim=0)) > 100
     assert torch.cdist(few.points, many.points).min(dim=1).values.max() < 0.5
     equal = as_picture(np.tile(np.pad(np.full((6, 6), 255, np.uint8), 13), (4, 4)))
-    assert len(SiftEncoder(5, "cpu").encode([equal])[0]) == 5
+    assert len(sift_encoder(5, "cpu")([equal])[0]) == 5

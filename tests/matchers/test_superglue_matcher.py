@@ -12,8 +12,6 @@ from mkpc_kaggle.matchers.networks.superglue import SuperGlue, log_optimal_trans
 from mkpc_kaggle.matchers.networks.superpoint import SuperPoint
 from mkpc_kaggle.weights import WeightStore
 
-OPTIONS = superglue.SuperGlueOptions(max_keypoints=300, keypoint_threshold=0.0, match_threshold=0.0)
-
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> WeightStore:
@@ -27,7 +25,7 @@ def test_indoor_weights_are_another_slot_and_another_networks_checkpoint_is_refu
         superglue.load(store, indoor, Placement())
     wrong = store_of(tmp_path, [PublicFile("x.pth", "superglue", "superpoint", "superglue", SuperGlue)])
     with pytest.raises(UserError, match="'superpoint' do not fit the network"):
-        superglue.load(wrong, OPTIONS, Placement())
+        superglue.load(wrong, superglue.SuperGlueOptions(), Placement())
 
 
 @pytest.mark.parametrize("spread", [1, 300])

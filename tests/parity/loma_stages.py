@@ -19,7 +19,7 @@ from mkpc_kaggle.matchers.networks.placement import prepared
 from mkpc_kaggle.weights import load_into
 
 TOLERANCES = {"score_map": 1e-4, "keypoints": 1e-6, "dense_descriptors": 2e-4, "descriptors": 2e-4}
-TOLERANCES |= {"similarity": 1e-3, "scores": 1e-4, "matching_scores": 1e-4, ".*_probs": Within(relative=1e-4)}
+TOLERANCES |= {"similarity": 1e-3, "scores": 1e-4, "matching_scores": 1e-4, "dense_probs": Within(relative=1e-4)}
 
 
 @cache
@@ -60,8 +60,7 @@ def detector_stages(case):
     images = image_of(golden["image"])
     logits, found = detector.logits(images), detector(images, golden["keypoints"].shape[-2])
     values = {"score_map": logits, "dense_probs": logits.flatten(1).softmax(dim=1).view_as(logits)}
-    values["keypoints"] = torch.stack([each.points for each in found])
-    values["keypoint_probs"] = torch.stack([each.scores for each in found])
+    values["keypoints"] = torch.stack(found)
     yield from compared(values, golden, TOLERANCES)
 
 
@@ -69,12 +68,10 @@ def sampling_stages():
     golden = golden_arrays("loma", "sampling_cases")
     for name in ("ties", "few", "border", "random"):
         found = select_keypoints(golden[f"{name}_map"], int(golden[f"{name}_asked"]))
-        rows = torch.cat([found.points, found.scores[:, None]], dim=1)
-        expected = torch.cat([golden[f"{name}_keypoints"], golden[f"{name}_probs"][:, None]], dim=1)
+        expected = golden[f"{name}_keypoints"]
         if name == "ties":
-            rows, expected = in_order(rows), in_order(expected)
-        yield Stage(f"{name} points", rows[:, :2], expected[:, :2], 1e-6)
-        yield Stage(f"{name} scores", rows[:, 2], expected[:, 2], Within(relative=1e-4))
+            found, expected = in_order(found), in_order(expected)
+        yield Stage(f"{name} points", found, expected, 1e-6)
 
 
 def resize_stages():
@@ -135,10 +132,8 @@ def pipeline_stages(case, variant):
         assert (1, 3, size.height, size.width) == tuple(golden[f"detector_input_shape{index}"].tolist())
         seen = [image_of(resized_by_pil(pixels, shape)) for shape in (size[::-1], (side, side))]
         keypoints = network.encode(*seen, number)
-        (detected,) = network.detector(seen[0], number)
         found.append(keypoints)
-        values = {"keypoints": keypoints.points, "keypoint_probs": detected.scores}
-        values |= {"descriptors": keypoints.descriptors}
+        values = {"keypoints": keypoints.points, "descriptors": keypoints.descriptors}
         yield from compared(values, golden, TOLERANCES, suffix=index)
     threshold = float(golden["threshold"])
     values = matcher_values(network.matcher, *found, threshold)

@@ -8,16 +8,16 @@ from functools import cache, partial
 import torch
 from golden import GOLDEN, Within, compared, golden_arrays, ready, recorded, seeded_tensor, standin_state
 
+from mkpc_kaggle.matchers.contract import Training
 from mkpc_kaggle.matchers.networks.aspanformer import AspanFormer
 from mkpc_kaggle.matchers.networks.coarse_matching import Cells, half_log_confidences
 from mkpc_kaggle.matchers.networks.fine_matching import cell_points
 from mkpc_kaggle.matchers.networks.loftr import Loftr
 from mkpc_kaggle.matchers.networks.quadtree import Quadtree
 
-LOFTR = {"coarse": 1e-4, "conf": 1e-4, "mconf": 1e-4, "expec_f": 1e-4, "mkpts1_f": 5e-4}
-QUADTREE = {"coarse": 1e-4, "conf": 2e-4, "mconf": 2e-4, "expec_f": 5e-4, "mkpts1_f": 2e-3}
-# Expectation: in half windows, of four pixels.
-ASPANFORMER = {"coarse": 1e-4, "m?conf": Within(1e-6, relative=2e-3), "expec_f": 5e-4, "mkpts": 1e-2}
+LOFTR = {"coarse": 1e-4, "conf": 1e-4, "mconf": 1e-4, "mkpts1_f": 5e-4}
+QUADTREE = {"coarse": 1e-4, "conf": 2e-4, "mconf": 2e-4, "mkpts1_f": 2e-3}
+ASPANFORMER = {"coarse": 1e-4, "m?conf": Within(1e-6, relative=2e-3), "mkpts": 1e-2}
 
 
 def confidence_of(network, grid0, grid1, masks):
@@ -50,10 +50,9 @@ def computed_of_pair(network, images, masks, scales, coarse_scales):
     grids = [tokens.reshape(len(tokens), *own.coarse.shape[2:], 256) for tokens, own in transformed]
     coarse, confidence = matches.coarse, confidence_of(network, *grids, masks)
     values = {"conf": confidence, "conf_rowmax": confidence.amax(2), "conf_colmax": confidence.amax(1)}
-    values |= {"i_ids": coarse.cell0, "j_ids": coarse.cell1, "mconf": coarse.confidence}
-    values |= {"expec_f": matches.expectation}
+    values |= {"i_ids": coarse.index0, "j_ids": coarse.index1, "mconf": coarse.scores}
     for side, grid in enumerate(grids):
-        points = cell_points((coarse.cell0, coarse.cell1)[side], grid.shape[2])
+        points = cell_points((coarse.index0, coarse.index1)[side], grid.shape[2])
         values[f"coarse{side}"] = grid.flatten(1, 2)
         values[f"mkpts{side}_c"] = points * (coarse_scales or scales)[side]
         values[f"mkpts{side}_f"] = (matches.points0, matches.points1)[side] * scales[side]
@@ -91,8 +90,8 @@ def loftr_stages(network, case, tolerances):
 class Evaluated(AspanFormer):
     """As in a published evaluation: one scale (y, x) for positions, the global level of a size (rows, columns)."""
 
-    def __init__(self, scale, coarsest, border=2):
-        super().__init__(1e-3, border)
+    def __init__(self, scale, coarsest, training=Training.OUTDOOR):
+        super().__init__(training)
         self.scale, self.coarsest = scale, coarsest
 
     def side(self, coarse, mask):
@@ -141,7 +140,9 @@ def aspanformer_stages(case, make):
     if masks is None:  # in online mode coarse points are reported before the last rescaling
         shapes = [(o.shape, r.shape) for o, r in zip(originals, images, strict=True)]
         coarse_scales, scales = scales, [torch.tensor([[o[3] / r[3], o[2] / r[2]]]) for o, r in shapes]
-    values = computed(ready(make(), aspanformer_state()), images, masks, scales, coarse_scales)
+    network = ready(make(), aspanformer_state())
+    network.threshold = 1e-3
+    values = computed(network, images, masks, scales, coarse_scales)
     for side, (old, new) in enumerate((("conf_rowmax", "conf_row_max"), ("conf_colmax", "conf_col_max"))):
         values[new] = values.pop(old)
         if masks:  # where all is padding the reference has about 1 / (L S), and this network nothing
@@ -155,10 +156,10 @@ def aspanformer_stages(case, make):
 
 MEGADEPTH = (832 / 1152, 832 / 1152)
 ASPANFORMERS = {
-    "outdoor_online": lambda: AspanFormer(1e-3),
-    "outdoor_online_resize": lambda: AspanFormer(1e-3),
+    "outdoor_online": AspanFormer,
+    "outdoor_online_resize": AspanFormer,
     "outdoor_padded_batch": lambda: Evaluated(MEGADEPTH, (7, 7)),
-    "indoor_direct": lambda: Evaluated((1.0, 1.0), (4, 3), border=0),
+    "indoor_direct": lambda: Evaluated((1.0, 1.0), (4, 3), Training.INDOOR),
 }
 FAMILY = (
     (Loftr, ("same_size", "diff_size", "masked_batch", "no_match"), LOFTR),

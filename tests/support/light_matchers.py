@@ -13,14 +13,12 @@ from kornia.feature import DISK, XFeat
 from torch import nn
 
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
-from mkpc_kaggle.matchers.adapters import disk_lightglue, sift_lightglue, xfeat_lighterglue
-from mkpc_kaggle.matchers.adapters.aliked import AlikedMatcher, AlikedOptions, aliked_encoder, aliked_network
-from mkpc_kaggle.matchers.adapters.dkm import DkmMatcher
+from mkpc_kaggle.matchers.adapters import disk_lightglue, dkm, roma, sift_lightglue, xfeat_lighterglue
+from mkpc_kaggle.matchers.adapters.aliked import AlikedMatcher, aliked_encoder, aliked_network
 from mkpc_kaggle.matchers.adapters.loma import LomaAdapter, LomaOptions
-from mkpc_kaggle.matchers.adapters.roma import RomaMatcher, RomaOptions
 from mkpc_kaggle.matchers.adapters.superglue import SuperGlueMatcher
-from mkpc_kaggle.matchers.contract import Colour, MatcherSpec, Picture, Placement
-from mkpc_kaggle.matchers.dense import DenseOptions
+from mkpc_kaggle.matchers.contract import Colour, Picture, Placement
+from mkpc_kaggle.matchers.dense import DenseMatcher
 from mkpc_kaggle.matchers.lightglue import LightGlueMatcher, light_glue
 from mkpc_kaggle.matchers.networks.aspanformer import AspanFormer
 from mkpc_kaggle.matchers.networks.dkm import DKM
@@ -32,7 +30,7 @@ from mkpc_kaggle.matchers.networks.superglue import SuperGlue
 from mkpc_kaggle.matchers.networks.superpoint import SuperPoint
 from mkpc_kaggle.matchers.registry import spec_of
 from mkpc_kaggle.matchers.semi_dense import SemiDenseMatcher
-from mkpc_kaggle.matchers.sparse import Encoder
+from mkpc_kaggle.matchers.sparse import Encode
 from tests.support.standin import filled, narrow_roma, scene
 
 SIZE = Size(96, 64)
@@ -55,46 +53,55 @@ def kornias(*network: Any, **named: Any) -> Any:
 
 def superglue_matcher(placement: Placement, keypoints: int = 200) -> SuperGlueMatcher:
     superpoint = ours(placement, "superpoint", SuperPoint, max_keypoints=keypoints)
-    return SuperGlueMatcher(superpoint, ours(placement, "superglue", SuperGlue, 20), placement.device)
+    return SuperGlueMatcher(superpoint, ours(placement, "superglue", SuperGlue), placement.device)
 
 
 def semi_dense_matcher(name, make, placement):
     return SemiDenseMatcher(ours(placement, name, make), spec_of(name, "test"), placement.device)
 
 
-def dkm_matcher(placement: Placement, passes: int = 1, matches: int = 300) -> DkmMatcher:
-    return DkmMatcher(ours(placement, "dkm", DKM), DenseOptions(passes, matches=matches), placement.device)
+class LightDense(DenseMatcher):
+    matches = 300
 
 
-def roma_matcher(placement: Placement) -> RomaMatcher:
-    return RomaMatcher(ours(placement, "roma", narrow_roma), RomaOptions(matches=300), placement.device)
+class LightLoma(LomaAdapter):
+    threshold = 0.0
+
+
+def dkm_matcher(placement: Placement, make: type[DenseMatcher] = LightDense) -> DenseMatcher:
+    return make(dkm.SPEC, ours(placement, "dkm", DKM), placement.device)
+
+
+def roma_matcher(placement: Placement) -> DenseMatcher:
+    network = ours(placement, "roma", narrow_roma)
+    return LightDense(roma.SPEC, network, placement.device, multiple=14, first_pass=0.648)
 
 
 def loma_matcher(placement: Placement) -> LomaAdapter:
-    options = LomaOptions(Variant.B128, max_keypoints=200, match_threshold=0.0)
-    return LomaAdapter(ours(placement, "loma", Loma, Variant.B128), options, placement.device)
+    options = LomaOptions(Variant.B128, max_keypoints=200)
+    return LightLoma(ours(placement, "loma", Loma, Variant.B128), options, placement.device)
 
 
 def aliked_matcher(placement: Placement, keypoints: int = 200) -> AlikedMatcher:
-    return AlikedMatcher(aliked_keypoints(placement, keypoints)[0], AlikedOptions())
+    return AlikedMatcher(aliked_keypoints(placement, keypoints)[0])
 
 
-Keypoints = tuple[Encoder, dict[str, Any]]  # and the shape of LightGlue for them
+Keypoints = tuple[Encode, dict[str, Any]]  # and the shape of LightGlue for them
 
 
-def aliked_keypoints(placement: Placement, keypoints: int) -> tuple[MatcherSpec, Encoder, dict[str, Any]]:
+def aliked_keypoints(placement: Placement, keypoints: int) -> Keypoints:
     return aliked_encoder(kornias("aliked", aliked_network, keypoints), placement), {"input_dim": 128}
 
 
-def disk_keypoints(placement: Placement, keypoints: int) -> tuple[MatcherSpec, Encoder, dict[str, Any]]:
+def disk_keypoints(placement: Placement, keypoints: int) -> Keypoints:
     return disk_lightglue.disk_encoder(kornias("disk", DISK), keypoints, placement), {"input_dim": 128}
 
 
-def sift_keypoints(placement: Placement, keypoints: int) -> tuple[MatcherSpec, Encoder, dict[str, Any]]:
-    return sift_lightglue.SiftEncoder(keypoints, placement.device), sift_lightglue.SHAPE
+def sift_keypoints(placement: Placement, keypoints: int) -> Keypoints:
+    return sift_lightglue.sift_encoder(keypoints, placement.device), sift_lightglue.SHAPE
 
 
-def xfeat_keypoints(placement: Placement, keypoints: int) -> tuple[MatcherSpec, Encoder, dict[str, Any]]:
+def xfeat_keypoints(placement: Placement, keypoints: int) -> Keypoints:
     network = XFeat(top_k=keypoints, detection_threshold=0.0)
     network.net = filled(network.net, "xfeat")
     return xfeat_lighterglue.xfeat_encoder(network, keypoints, placement), xfeat_lighterglue.SHAPE
@@ -111,9 +118,9 @@ KEYPOINTS = {
 def lightglue_matcher(
     name: str, placement: Placement, keypoints: int = 200, layers: int = 2, threshold: float = 0.0
 ) -> LightGlueMatcher:
-    encoder, shape = KEYPOINTS[name](placement, keypoints)
-    network = kornias("lightglue", light_glue, layers, threshold, **shape)
-    return LightGlueMatcher(spec_of(name, "test"), encoder, network, placement)
+    encode, shape = KEYPOINTS[name](placement, keypoints)
+    network = kornias("lightglue", light_glue, layers, filter_threshold=threshold, **shape)
+    return LightGlueMatcher(spec_of(name, "test"), encode, network, placement)
 
 
 MATCHERS = {
@@ -122,7 +129,6 @@ MATCHERS = {
     "quadtree": partial(semi_dense_matcher, "quadtree", Quadtree),
     "aspanformer": partial(semi_dense_matcher, "aspanformer", AspanFormer),
     "dkm": dkm_matcher,
-    "dkm, two passes": partial(dkm_matcher, passes=2),
     "roma": roma_matcher,
     "loma": loma_matcher,
     "aliked": aliked_matcher,

@@ -7,14 +7,15 @@ import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
+from unittest.mock import patch
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from mkpc_kaggle.matchers.adapters import roma as adapter
-from mkpc_kaggle.matchers.networks.dinov2 import DinoV2Config
-from mkpc_kaggle.matchers.networks.roma import RoMa, RomaConfig
+from mkpc_kaggle.matchers.networks import dinov2, roma
+from mkpc_kaggle.matchers.networks.roma import RoMa
 from mkpc_kaggle.matchers.networks.warp_refiner import WarpRefinerShape
 
 
@@ -58,16 +59,13 @@ STAND_INS = {
 
 # RoMa with fewer channels, a thirtieth of its size: most of what is left is VGG.
 REFINERS = {16: (64, 16, 7, 369), 8: (48, 8, 3, 153), 4: (32, 8, 2, 97), 2: (16, 4, None, 36), 1: (9, 6, None, 24)}
-NARROW = RomaConfig(
-    DinoV2Config(width=64, blocks=2, heads=2, positions=5),
-    refiners={stride: WarpRefinerShape(*shape) for stride, shape in REFINERS.items()},
-    blocks=2,
-    heads=2,
-)
+REFINERS = {stride: WarpRefinerShape(*shape) for stride, shape in REFINERS.items()}
 
 
 def narrow_roma() -> RoMa:
-    return RoMa(NARROW)
+    vit, decoder = {"WIDTH": 64, "BLOCKS": 2, "HEADS": 2, "POSITIONS": 5}, {"BLOCKS": 2, "HEADS": 2}
+    with patch.multiple(dinov2, **vit), patch.multiple(roma, REFINERS=REFINERS, **decoder):
+        return RoMa()
 
 
 def use_narrow(monkeypatch) -> None:

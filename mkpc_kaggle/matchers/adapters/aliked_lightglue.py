@@ -2,13 +2,13 @@
 
 from mkpc_kaggle.matchers.adapters.aliked import SLOT, load_encoder
 from mkpc_kaggle.matchers.contract import MatcherSpec, Placement
-from mkpc_kaggle.matchers.lightglue import LightGlueMatcher, LightGlueOptions, load_glue
+from mkpc_kaggle.matchers.lightglue import LightGlueMatcher, load_lightglue
+from mkpc_kaggle.matchers.sparse import KeypointOptions
 from mkpc_kaggle.weights import WeightStore
 
-SPEC = MatcherSpec("aliked_lightglue", LightGlueOptions, multiple=32, slots=(SLOT, "aliked-lightglue"))
+SPEC = MatcherSpec("aliked_lightglue", KeypointOptions, multiple=32, slots=(SLOT, "aliked-lightglue"))
 
 
-def load(weights: WeightStore, options: LightGlueOptions, placement: Placement) -> LightGlueMatcher:
-    encoder = load_encoder(weights, options.features, placement)
-    glue = load_glue(weights, "aliked-lightglue", options.threshold, input_dim=128)
-    return LightGlueMatcher(SPEC, encoder, glue, placement)
+def load(weights: WeightStore, options: KeypointOptions, placement: Placement) -> LightGlueMatcher:
+    encode = load_encoder(weights, options.features, placement)
+    return load_lightglue(SPEC, encode, weights, placement, input_dim=128)

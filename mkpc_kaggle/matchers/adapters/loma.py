@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import torch
 
-from mkpc_kaggle.config import AT_LEAST_1, POSITIVE, SHARE, check_ranges
+from mkpc_kaggle.config import AT_LEAST_1, check_ranges
 from mkpc_kaggle.geometry.coordinates import Size, from_normalised
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import MatcherSpec, PairwiseMatcher, Picture, Placement
@@ -19,17 +19,18 @@ from mkpc_kaggle.weights import WeightStore, load_into
 PATCH = 14  # pixels; the side of the descriptor's input is a multiple of it
 
 
+DESCRIPTOR_SCALE = 784 / 1024  # side of the descriptor's square input over the view's longer side, as released
+
+
 @dataclass(frozen=True)
 class LomaOptions:
     """The release's settings for views with a long side of 1024."""
 
     variant: Variant = Variant.B
     max_keypoints: int = 2048
-    descriptor_scale: float = 784 / 1024  # side of the descriptor's square input over the view's longer side
-    match_threshold: float = 0.1
 
     def __post_init__(self) -> None:
-        check_ranges(self, max_keypoints=AT_LEAST_1, descriptor_scale=POSITIVE, match_threshold=SHARE)
+        check_ranges(self, max_keypoints=AT_LEAST_1)
 
 
 SPEC = MatcherSpec("loma", LomaOptions, slots=("loma-{variant}",))
@@ -47,6 +48,7 @@ class LomaAdapter(PairwiseMatcher[LomaEncoding]):
     """
 
     spec = SPEC
+    threshold = 0.1  # a match's score is above it, as released
 
     def __init__(self, network: Loma, options: LomaOptions, device: str) -> None:
         self.options = options
@@ -63,7 +65,7 @@ class LomaAdapter(PairwiseMatcher[LomaEncoding]):
         if min(detected) == 0:
             descriptor, _ = WIDTHS[self.options.variant]
             return LomaKeypoints(*(torch.zeros(0, width, device=self.device) for width in (2, descriptor)))
-        side = PATCH * max(1, round(self.options.descriptor_scale * long_side / PATCH))
+        side = PATCH * max(1, round(DESCRIPTOR_SCALE * long_side / PATCH))
         # Without padding, which would change the descriptors.
         pixels = torch.from_numpy(picture.pixels[: content.height, : content.width].copy()).permute(2, 0, 1)[None]
         to_detect = resized(pixels, (detected.height, detected.width)).to(self.device)
@@ -71,7 +73,7 @@ class LomaAdapter(PairwiseMatcher[LomaEncoding]):
         return self._network.encode(to_detect, to_describe, self.options.max_keypoints)
 
     def _match(self, first: LomaEncoding, second: LomaEncoding) -> Matches:
-        found = self._network.matcher(first.keypoints, second.keypoints, self.options.match_threshold)
+        found = self._network.matcher(first.keypoints, second.keypoints, self.threshold)
         points0, points1 = (
             from_normalised(encoding.keypoints.points[index].cpu().numpy(), encoding.content)
             for encoding, index in ((first, found.index0), (second, found.index1))

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 import torch
 
-from mkpc_kaggle.config import AT_LEAST_0, AT_LEAST_1, SHARE, check_ranges
+from mkpc_kaggle.config import AT_LEAST_0, AT_LEAST_1, check_ranges
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.matchers.contract import Colour, MatcherSpec, PairwiseMatcher, Picture, Placement, Training
+from mkpc_kaggle.matchers.contract import Colour, MatcherSpec, PairwiseMatcher, Picture, Placement, TrainedOptions
 from mkpc_kaggle.matchers.networks.placement import prepared
 from mkpc_kaggle.matchers.networks.superglue import SuperGlue
 from mkpc_kaggle.matchers.networks.superpoint import SuperPoint, SuperPointKeypoints
@@ -16,22 +16,17 @@ from mkpc_kaggle.weights import WeightStore, load_into
 
 
 @dataclass(frozen=True)
-class SuperGlueOptions:
+class SuperGlueOptions(TrainedOptions):
     """Settings of the published outdoor evaluation.
 
     The published indoor evaluation uses ``max_keypoints`` 1024 and ``nms_radius`` 4.
     """
 
     max_keypoints: int = 2048
-    keypoint_threshold: float = 0.005
     nms_radius: int = 3
-    sinkhorn_iterations: int = 20
-    match_threshold: float = 0.2
-    training: Training = Training.OUTDOOR
 
     def __post_init__(self) -> None:
-        check_ranges(self, max_keypoints=AT_LEAST_1, keypoint_threshold=SHARE, nms_radius=AT_LEAST_0)
-        check_ranges(self, sinkhorn_iterations=AT_LEAST_1, match_threshold=SHARE)
+        check_ranges(self, max_keypoints=AT_LEAST_1, nms_radius=AT_LEAST_0)
 
 
 # No multiple: SuperPoint ignores the rows and columns beyond a multiple of 8.
@@ -58,8 +53,7 @@ class SuperGlueMatcher(PairwiseMatcher[SuperPointKeypoints]):
 
 
 def load(weights: WeightStore, options: SuperGlueOptions, placement: Placement) -> SuperGlueMatcher:
-    superpoint = SuperPoint(options.nms_radius, options.keypoint_threshold, options.max_keypoints)
-    superglue = SuperGlue(options.sinkhorn_iterations, options.match_threshold)
+    superpoint, superglue = SuperPoint(options.nms_radius, max_keypoints=options.max_keypoints), SuperGlue()
     for network, slot in zip((superpoint, superglue), SPEC.slots_for(options), strict=True):
         load_into(network, weights.load(slot), what=slot)
     return SuperGlueMatcher(prepared(superpoint, placement), prepared(superglue, placement), placement.device)

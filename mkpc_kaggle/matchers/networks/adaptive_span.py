@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from mkpc_kaggle.matchers.networks.grids import mask_valid, mean_pool, softmax_attention, to_2x2_blocks
+from mkpc_kaggle.matchers.networks.grids import mask_valid, mean_pool, to_2x2_blocks
 
 RADIUS = 5.0  # of a span, in deviations of the flow
 SIDE = 8  # samples on each axis
@@ -76,7 +76,7 @@ def _attend_cells(queries: Tensor, read: Tensor, heads: int, excluded: Tensor | 
         logits = query @ key.transpose(1, 2)  # (p, 4, 64)
         if excluded is not None:
             logits.masked_fill_(excluded[:, None], MASKED)
-        found.append(softmax_attention(logits, value))
+        found.append(logits.softmax(dim=-1) @ value)
     return torch.cat(found, dim=-1)
 
 

@@ -6,17 +6,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from mkpc_kaggle.matchers.contract import Training
 from mkpc_kaggle.matchers.networks.adaptive_span import MASKED, adaptive_span, sample_usable, span_attention
 from mkpc_kaggle.matchers.networks.fine_matching import COARSE_STRIDE
-from mkpc_kaggle.matchers.networks.grids import (
-    Perceptron,
-    as_grid,
-    as_map,
-    mask_valid,
-    mean_pool,
-    pointwise,
-    softmax_attention,
-)
+from mkpc_kaggle.matchers.networks.grids import Perceptron, as_grid, as_map, mask_valid, mean_pool, pointwise
 from mkpc_kaggle.matchers.networks.layers import ExactConv1d
 from mkpc_kaggle.matchers.networks.linear_attention import Masks
 from mkpc_kaggle.matchers.networks.position import FIXED_DECAY, sine_positions
@@ -79,36 +72,47 @@ def global_attention(
     if masks[0] is not None and masks[1] is not None:
         valid = masks[0][:, None, :, None] & masks[1][:, None, None, :]
         logits.masked_fill_(~valid, MASKED)
-    return softmax_attention(logits, values).transpose(1, 2).reshape(q.shape)
+    messages: Tensor = logits.softmax(dim=-1) @ values
+    return messages.transpose(1, 2).reshape(q.shape)
 
 
-class InitialLayer(nn.Module):
-    """An update of the pooled features of one image from the other image."""
+class CrossLayer(nn.Module):
+    """Queries of one image, keys and values of the other, and the update of features of ``width`` by a message."""
 
-    def __init__(self) -> None:
+    def __init__(self, width: int, hidden: int, kernel: int) -> None:
         super().__init__()
         self.q_proj = nn.Conv1d(TOP, TOP, 1, bias=False)
         self.k_proj = nn.Conv1d(TOP, TOP, 1, bias=False)
         self.v_proj = nn.Conv1d(TOP + FLOW, TOP, 1, bias=False)
-        self.merge_head = nn.Conv1d(TOP, TOP, 1, bias=False)
         self.merge_f = Perceptron(
-            nn.Conv2d(2 * TOP, 2 * TOP, 1, bias=False), nn.Conv2d(2 * TOP, TOP, 1, bias=False)
+            nn.Conv2d(width + TOP, hidden, 1, bias=False),
+            nn.Conv2d(hidden, width, kernel, padding=kernel // 2, bias=False),
         )
         self.norm1 = ChannelNorm(TOP)
-        self.norm2 = ChannelNorm(TOP)
+        self.norm2 = ChannelNorm(width)
+
+    def projected(self, own: Side, other: Side) -> tuple[Tensor, Tensor, Tensor]:
+        """Return queries, keys and values, (N, h, w, 256) each."""
+        return pointwise(self.q_proj, own.visual), pointwise(self.k_proj, other.visual), other.values(self.v_proj)
+
+    def updated(self, features: Tensor, message: Tensor) -> Tensor:
+        """Map features (N, h, w, width) and a message (N, h, w, 256) to new features."""
+        merged: Tensor = self.norm2(self.merge_f(torch.cat([features, self.norm1(message)], dim=-1)))
+        return merged.add_(features)
+
+
+class InitialLayer(CrossLayer):
+    """An update of the pooled features of one image from the other image."""
+
+    def __init__(self) -> None:
+        super().__init__(TOP, 2 * TOP, kernel=1)
+        self.merge_head = nn.Conv1d(TOP, TOP, 1, bias=False)
 
     def forward(self, own: Side, other: Side) -> Tensor:
         """Return the new visual feature of ``own`` (N, rows, columns, 256), pooled to the global level."""
-        message = global_attention(
-            pointwise(self.q_proj, own.visual),
-            pointwise(self.k_proj, other.visual),
-            other.values(self.v_proj),
-            1.0,
-            (own.pooled_mask, other.pooled_mask),
-        )
-        message = self.norm1(pointwise(self.merge_head, message))
-        update: Tensor = self.norm2(self.merge_f(torch.cat([own.visual, message], dim=-1)))
-        return update.add_(own.visual)
+        masks = own.pooled_mask, other.pooled_mask
+        message = global_attention(*self.projected(own, other), 1.0, masks)
+        return self.updated(own.visual, pointwise(self.merge_head, message))
 
 
 class InitialStage(nn.Module):
@@ -174,26 +178,16 @@ def _span_message(q: Tensor, k: Tensor, v: Tensor, flow: Tensor, factor: int, ma
     return span_attention(q, k, v, samples, HEADS, usable)
 
 
-class AspanBlock(nn.Module):
+class AspanBlock(CrossLayer):
     """A block that decodes the flow and updates both features along it; the last block updates the visual one."""
 
     def __init__(self, last: bool) -> None:
-        super().__init__()
-        width = TOP if last else TOP + FLOW
+        super().__init__(TOP if last else TOP + FLOW, TOP + FLOW, kernel=3)
         self.last = last
         self.flow_decoder = Perceptron(
             ExactConv1d(FLOW, FLOW // 2, 1, bias=False), ExactConv1d(FLOW // 2, 4, 1, bias=False)
         )
         self.attention = HierarchicalAttention()
-        self.q_proj = nn.Conv1d(TOP, TOP, 1, bias=False)
-        self.k_proj = nn.Conv1d(TOP, TOP, 1, bias=False)
-        self.v_proj = nn.Conv1d(TOP + FLOW, TOP, 1, bias=False)
-        self.merge_f = Perceptron(
-            nn.Conv2d(width + TOP, TOP + FLOW, 1, bias=False),
-            nn.Conv2d(TOP + FLOW, width, 3, padding=1, bias=False),
-        )
-        self.norm1 = ChannelNorm(TOP)
-        self.norm2 = ChannelNorm(width)
 
     def decode_flow(self, own: Side, other: Side) -> Tensor:
         """Return (N, h, w, 4): target (x, y) in coarse cells of ``other`` from its corner, log-variances."""
@@ -203,17 +197,9 @@ class AspanBlock(nn.Module):
 
     def forward(self, own: Side, other: Side) -> Side:
         """Return ``own``, updated."""
-        message = self.attention(
-            pointwise(self.q_proj, own.visual),
-            pointwise(self.k_proj, other.visual),
-            other.values(self.v_proj),
-            self.decode_flow(own, other),
-            own,
-            other,
-        )
+        message = self.attention(*self.projected(own, other), self.decode_flow(own, other), own, other)
         both = own.visual if self.last else torch.cat([own.visual, own.flow], dim=-1)
-        merged = self.merge_f(torch.cat([both, self.norm1(message)], dim=-1))
-        updated = self.norm2(merged).add_(both)
+        updated = self.updated(both, message)
         flow = own.flow if self.last else updated[..., TOP:]
         return replace(own, visual=updated[..., :TOP], flow=flow)
 
@@ -237,19 +223,22 @@ class AspanTransformer(nn.Module):
         return side0.visual, side1.visual
 
 
-class AspanFormer(SemiDenseNetwork[AspanTransformer]):
+class AspanFormer(SemiDenseNetwork):
     """ASpanFormer. Sides are multiples of 32; the two images may differ in size.
 
-    ``train_size``: (height, width) to whose extent the positions of every image are stretched. The defaults were
-    published for outdoor images of any size. Checkpoints also hold ``*.sample_offset``; leave them out, since the
-    published network ignores them.
+    ``train_size``: (height, width) to whose extent the positions of every image are stretched. Indoor weights were
+    published for 480 x 640 only, without a border, with unscaled positions and a global level of 15 x 20 cells. At
+    this size our scaling and pooling are the same.
     """
 
     multiple = 32
+    loftr_coarse: AspanTransformer
 
-    def __init__(self, threshold: float = 0.2, border: int = 2, train_size: tuple[int, int] = (832, 832)) -> None:
-        super().__init__(AspanTransformer(), threshold, border)
-        self.train_size = train_size
+    def __init__(self, training: Training = Training.OUTDOOR) -> None:
+        super().__init__(AspanTransformer())
+        self.train_size = (832, 832)
+        if training is Training.INDOOR:
+            self.train_size, self.border = (480, 640), 0
         self.coarse_matching = nn.ParameterDict({"temperature": torch.tensor(10.0)})
         self.eval().requires_grad_(False)
 

@@ -11,31 +11,21 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from mkpc_kaggle.matchers.networks.layers import linear
+from mkpc_kaggle.matchers.networks.layers import Assignment, linear
 from mkpc_kaggle.matchers.networks.linear_attention import Masks
 
 ROWS_AT_ONCE = {"cpu": 256, "cuda": 8192}
 HELD_FLOATS = 2**25  # of the matrix: 128 MiB, at 640 x 480 it has 23 million
 
 
-class CoarseMatches(NamedTuple):
-    """M matches in order of ``cell0``: int64 ``cell0``, ``cell1`` and float32 ``confidence``.
-
-    Cells are counted row by row in their own map.
-    """
-
-    cell0: Tensor
-    cell1: Tensor
-    confidence: Tensor
-
-
 def coarse_matches(
     grid0: Tensor, grid1: Tensor, scale: float | Tensor, threshold: float, border: int, masks: Masks | None
-) -> CoarseMatches:
+) -> Assignment:
     """Match grids (h0, w0, C) and (h1, w1, C); ``scale`` times their dot product is the similarity.
 
     A match is above ``threshold`` and the best of its row and of its column, border cells included. Then matches
     with a cell within ``border`` of the content's border are dropped. ``masks``: (h, w) bool, True at content.
+    Matched cells are counted row by row in their own grid.
     """
     mask0, mask1 = masks or (grid0.new_ones(grid.shape[:2], dtype=torch.bool) for grid in (grid0, grid1))
     cells = Cells(grid0.flatten(0, 1) * scale, grid1.flatten(0, 1), mask0.flatten(), mask1.flatten())
@@ -44,7 +34,7 @@ def coarse_matches(
     confidence = torch.exp(2 * best0)
     kept = (confidence > threshold) & (best0 == best1[partner]) & inner0 & inner1[partner]
     cell0 = kept.nonzero()[:, 0]
-    return CoarseMatches(cell0, partner[cell0], confidence[cell0])
+    return Assignment(cell0, partner[cell0], confidence[cell0])
 
 
 class Cells(NamedTuple):

@@ -5,28 +5,19 @@ public checkpoint. For inference only.
 """
 
 from collections.abc import Iterator
-from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 from mkpc_kaggle.matchers.dtypes import check_finite
-from mkpc_kaggle.matchers.networks.dedode import DedodeDecoder, resize
+from mkpc_kaggle.matchers.networks.dedode import DedodeDecoder
+from mkpc_kaggle.matchers.networks.layers import resize
 from mkpc_kaggle.matchers.networks.pixels import MEAN, STD
 from mkpc_kaggle.matchers.networks.superpoint import window_maximum
 from mkpc_kaggle.matchers.networks.vgg import VGG11, Vgg
 
 TEMPERATURE = 0.5  # of the softmax over nine pixels that locates a keypoint between pixels
-
-
-class DadKeypoints(NamedTuple):
-    """K keypoints of one image by descending score, float32: ``points`` (K, 2) normalised, up to half a pixel
-    beyond the edges; ``scores`` (K,), probabilities that sum to 1 over all pixels.
-    """
-
-    points: Tensor
-    scores: Tensor
 
 
 class Dad(nn.Module):
@@ -36,8 +27,8 @@ class Dad(nn.Module):
         self.decoder = DedodeDecoder((8, 4, 2, 1), prediction=1, blocks=3, mode="bicubic")
         self.eval().requires_grad_(False)
 
-    def forward(self, image: Tensor, number: int) -> list[DadKeypoints]:
-        """Return up to ``number`` keypoints of each image of (B, 3, H, W), RGB in 0..1, sides of at least 8.
+    def forward(self, image: Tensor, number: int) -> list[Tensor]:
+        """Return up to ``number`` points of each image of (B, 3, H, W), RGB in 0..1, sides of at least 8.
 
         Trained with sides that are multiples of 8, the longer one 1024.
         """
@@ -48,7 +39,7 @@ class Dad(nn.Module):
     def logits(self, image: Tensor) -> Tensor:
         """Return logits (B, H, W) float32."""
         prediction, hidden = self.decoder(self.levels(image))
-        part = self.decoder.at(1).outputs(hidden, slice(1))
+        part = self.decoder.at(1).outputs(hidden)[:, :1]
         return resize(prediction, part.shape[2:], "bicubic").add_(part)[:, 0]
 
     def levels(self, image: Tensor) -> Iterator[Tensor]:
@@ -57,16 +48,19 @@ class Dad(nn.Module):
         return self.encoder.levels((image - mean) / std)
 
 
-def select_keypoints(logits: Tensor, number: int) -> DadKeypoints:
-    """Return the largest maxima of 3 x 3 pixels of a map (H, W); equal ones in one window are all kept."""
+def select_keypoints(logits: Tensor, number: int) -> Tensor:
+    """Return the largest maxima of 3 x 3 pixels of a map (H, W); equal ones in one window are all kept.
+
+    Points (K, 2) are float32, normalised, up to half a pixel beyond the edges, the most probable first.
+    """
     height, width = logits.shape
     probability = logits.flatten().softmax(dim=0).view(1, height, width)
     maxima = probability.where(probability == window_maximum(probability, 1), 0).flatten()
     scores, pixels = maxima.topk(min(number, len(maxima)))
-    scores, pixels = scores[scores > 0], pixels[scores > 0]
+    pixels = pixels[scores > 0]
     rows, columns = pixels // width, pixels % width
     places = torch.stack([columns, rows], dim=1) + subpixel_offsets(logits, rows, columns)
-    return DadKeypoints((2 * places + 1) / places.new_tensor([width, height]) - 1, scores)
+    return (2 * places + 1) / places.new_tensor([width, height]) - 1
 
 
 def subpixel_offsets(logits: Tensor, rows: Tensor, columns: Tensor) -> Tensor:

@@ -13,12 +13,12 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mkpc_kaggle.matchers.networks.dinov2 import DinoV2, DinoV2Config
-from mkpc_kaggle.matchers.networks.layers import ExactConv2d, in_strips
+from mkpc_kaggle.matchers.networks.dinov2 import DinoV2
+from mkpc_kaggle.matchers.networks.layers import ExactConv2d, depthwise_block, in_strips, resize
 from mkpc_kaggle.matchers.networks.vgg import VGG19, Vgg
 
-KERNEL, BLOCKS = 5, 5  # side of the depthwise convolutions; number of blocks after the first
-CHANNELS = 32  # of a prediction, enlarged at a time
+REACH = 2  # pixels, of a depthwise convolution
+BLOCKS = 5  # after the first
 
 
 class DedodeRefinerShape(NamedTuple):
@@ -45,10 +45,9 @@ class DedodeRefiner(nn.Module):
         super().__init__()
         width = shape.hidden
         self.features = shape.features
-        self.block1 = nn.Sequential(
-            nn.Conv2d(shape.features + context, width, 1), *normalised(width), nn.Conv2d(width, width, 1)
-        )
-        self.hidden_blocks = nn.Sequential(*(block(width) for _ in range(blocks)))
+        first, norm = nn.Conv2d(shape.features + context, width, 1), nn.BatchNorm2d(width)
+        self.block1 = nn.Sequential(first, norm, nn.ReLU(inplace=True), nn.Conv2d(width, width, 1))
+        self.hidden_blocks = nn.Sequential(*(depthwise_block(width, width) for _ in range(blocks)))
         self.out_conv = ExactConv2d(width, prediction + shape.context, 1)
 
     def entry(self, features: Tensor) -> Tensor:
@@ -62,19 +61,19 @@ class DedodeRefiner(nn.Module):
         if context is not None:
             # A 1x1 convolution and enlargement commute; the small map is cheaper.
             weight = first.get_parameter("weight")[:, self.features :]
-            entry += resize(functional.conv2d(context.to(weight.dtype), weight), entry.shape[2:], "bilinear")
+            entry += resize(functional.conv2d(context.to(weight.dtype), weight), entry.shape[2:])
         mixed: Tensor = mix(relu(norm(entry)))
         return mixed
 
     def hidden(self, mixed: Tensor) -> Tensor:
         """Return the scaled sum of :meth:`mixed` and its blocks, (B, hidden, h, w)."""
-        reach = KERNEL // 2 * len(self.hidden_blocks)
+        reach = REACH * len(self.hidden_blocks)
         return in_strips(self._hidden, mixed, reach=reach, channels=mixed.shape[1])
 
-    def outputs(self, hidden: Tensor, which: slice = slice(None)) -> Tensor:
-        """Return (B, n, h, w) float32: ``which`` of the channels, the prediction's before the context's."""
-        weight, bias = (self.out_conv.get_parameter(name)[which] for name in ("weight", "bias"))
-        return functional.conv2d(hidden.float(), weight, bias)
+    def outputs(self, hidden: Tensor) -> Tensor:
+        """Return (B, n, h, w) float32: the prediction's channels before the context's."""
+        found: Tensor = self.out_conv(hidden.float())
+        return found
 
     def _hidden(self, mixed: Tensor) -> Tensor:
         blocks: Tensor = self.hidden_blocks(mixed)
@@ -109,49 +108,23 @@ class DedodeDecoder(nn.Module):
         prediction: Tensor | None = None
         context: Tensor | None = None
         for stride in strides[:-1]:
-            prediction, context = self.refined(stride, entries.pop(), prediction, context)
+            refiner = self.at(stride)
+            hidden = refiner.hidden(refiner.mixed(entries.pop(), context))
+            part, context = refiner.outputs(hidden).tensor_split([self.prediction], dim=1)
+            if prediction is not None:
+                part += resize(prediction, part.shape[2:], self.mode)
+            prediction = part
         assert prediction is not None
-        mixed = self.at(1).mixed(entries.pop(), context)
-        return prediction, self.at(1).hidden(mixed)
-
-    def refined(
-        self, stride: int, entry: Tensor, prediction: Tensor | None, context: Tensor | None
-    ) -> tuple[Tensor, Tensor]:
-        """Return the prediction with this stride's correction, and its context."""
-        refiner = self.at(stride)
-        hidden = refiner.hidden(refiner.mixed(entry, context))
-        del entry  # the next maps are the peak of memory
-        part = refiner.outputs(hidden, slice(self.prediction))
-        context = refiner.outputs(hidden, slice(self.prediction, None))
-        if prediction is not None:
-            # In parts: at stride 2 the enlarged map is the largest of all.
-            chunks = (torch.split(map_, CHANNELS, dim=1) for map_ in (part, prediction))
-            for some, coarser in zip(*chunks, strict=True):
-                some.add_(resize(coarser, some.shape[2:], self.mode))
-        return part, context
-
-
-def resize(x: Tensor, size: torch.Size, mode: str) -> Tensor:
-    """Resize (B, C, h, w) to (B, C, *size), without antialiasing, half-pixel centres."""
-    return functional.interpolate(x, tuple(size), mode=mode, align_corners=False)
-
-
-def block(width: int) -> nn.Sequential:
-    depthwise = nn.Conv2d(width, width, KERNEL, padding=KERNEL // 2, groups=width)
-    return nn.Sequential(depthwise, *normalised(width), nn.Conv2d(width, width, 1))
-
-
-def normalised(width: int) -> tuple[nn.Module, nn.Module]:
-    return nn.BatchNorm2d(width), nn.ReLU(inplace=True)
+        return prediction, self.at(1).hidden(self.at(1).mixed(entries.pop(), context))
 
 
 class Dedode(nn.Module):
-    """A descriptor on an ``encoder`` of features at the ``strides``."""
+    """A descriptor; B on VGG's features alone, or G ``with_vit``."""
 
-    def __init__(self, encoder: "Vgg | VggAndVit", strides: tuple[int, ...], channels: int) -> None:
+    def __init__(self, channels: int, *, with_vit: bool) -> None:
         super().__init__()
-        self.encoder = encoder
-        self.decoder = DedodeDecoder(strides, channels, BLOCKS, "bilinear")
+        self.encoder = VggAndVit() if with_vit else Vgg(VGG19)
+        self.decoder = DedodeDecoder((14, 8, 4, 2, 1) if with_vit else (8, 4, 2, 1), channels, BLOCKS, "bilinear")
         self.eval().requires_grad_(False)
 
     def forward(self, image: Tensor, points: Tensor) -> Tensor:
@@ -197,20 +170,11 @@ def read_enlarged(x: Tensor, pixels: Tensor, shares: Tensor, size: torch.Size) -
 class VggAndVit(nn.Module):
     """DINOv2's features and VGG's; sides must be multiples of 14."""
 
-    def __init__(self, vit: DinoV2Config | None) -> None:
+    def __init__(self) -> None:
         super().__init__()
         self.vgg = Vgg(VGG19)
-        self.frozen_dinov2 = nn.ModuleDict({"dinov2_vitl14": DinoV2(vit)})
+        self.frozen_dinov2 = nn.ModuleDict({"dinov2_vitl14": DinoV2()})
 
     def levels(self, image: Tensor) -> Iterator[Tensor]:
         yield from self.vgg.levels(image)
         yield self.frozen_dinov2["dinov2_vitl14"](image)
-
-
-def dedode_b(channels: int) -> Dedode:
-    return Dedode(Vgg(VGG19), (8, 4, 2, 1), channels)
-
-
-def dedode_g(channels: int, vit: DinoV2Config | None = None) -> Dedode:
-    """Make the network; ``vit`` defaults to ViT-L/14."""
-    return Dedode(VggAndVit(vit), (14, 8, 4, 2, 1), channels)

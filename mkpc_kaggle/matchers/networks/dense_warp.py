@@ -12,8 +12,8 @@ from torch import Tensor, nn
 
 from mkpc_kaggle.matchers.dtypes import check_finite
 from mkpc_kaggle.matchers.networks.grids import as_grid
-from mkpc_kaggle.matchers.networks.layers import ExactConv2d
-from mkpc_kaggle.matchers.networks.warp_refiner import WarpEstimate, identity_map, resize
+from mkpc_kaggle.matchers.networks.layers import ExactConv2d, resize
+from mkpc_kaggle.matchers.networks.warp_refiner import WarpEstimate, identity_map
 
 
 class Pyramid(NamedTuple):

@@ -3,7 +3,7 @@
 Without register tokens. Parameter names match the public checkpoints. For inference only.
 """
 
-from dataclasses import dataclass
+from math import isqrt
 
 import torch
 from torch import Tensor, nn
@@ -12,36 +12,26 @@ from torch.nn import functional
 from mkpc_kaggle.matchers.networks.grids import as_grid, as_map
 from mkpc_kaggle.matchers.networks.layers import Linear
 
+WIDTH, BLOCKS, HEADS = 1024, 24, 16  # of ViT-L/14
+POSITIONS = 37  # the side of the stored grid of positional embeddings, in patches
 PATCH = 14  # pixels a side: the stride of the features
 EPSILON = 1e-6  # of the norms
 EXPANSION = 4  # of a perceptron's hidden layer
 OFFSET = 0.1  # added to a grid's sides when positions are resampled, as in training
 
 
-@dataclass(frozen=True)
-class DinoV2Config:
-    """Sizes of ViT-L/14. ``positions``: the side of the stored grid of positional embeddings, in patches."""
-
-    width: int = 1024
-    blocks: int = 24
-    heads: int = 16
-    positions: int = 37
-
-
 class DinoV2(nn.Module):
     """Features of 14 x 14 patches."""
 
-    def __init__(self, config: DinoV2Config | None = None) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self.config = config = config or DinoV2Config()
-        self.cls_token = nn.Parameter(torch.zeros(1, 1, config.width))
-        self.pos_embed = nn.Parameter(torch.zeros(1, 1 + config.positions**2, config.width))
-        self.mask_token = nn.Parameter(torch.zeros(1, config.width))  # for training only; checkpoints have it
-        self.patch_embed = nn.ModuleDict({"proj": nn.Conv2d(3, config.width, PATCH, PATCH)})
-        self.blocks = nn.ModuleList(
-            VitBlock(config.width, config.heads, EPSILON, bias=True, scaled=True) for _ in range(config.blocks)
-        )
-        self.norm = nn.LayerNorm(config.width, EPSILON)
+        self.cls_token = nn.Parameter(torch.zeros(1, 1, WIDTH))
+        self.pos_embed = nn.Parameter(torch.zeros(1, 1 + POSITIONS**2, WIDTH))
+        self.mask_token = nn.Parameter(torch.zeros(1, WIDTH))  # for training only; checkpoints have it
+        self.patch_embed = nn.ModuleDict({"proj": nn.Conv2d(3, WIDTH, PATCH, PATCH)})
+        blocks = (VitBlock(WIDTH, HEADS, EPSILON, bias=True, scaled=True) for _ in range(BLOCKS))
+        self.blocks = nn.ModuleList(blocks)
+        self.norm = nn.LayerNorm(WIDTH, EPSILON)
         self.eval().requires_grad_(False)
 
     def forward(self, image: Tensor) -> Tensor:
@@ -62,7 +52,7 @@ class DinoV2(nn.Module):
 
         The stored grid is resampled by factors slightly above the ratios of the sides, as in training.
         """
-        side = self.config.positions
+        side = isqrt(self.pos_embed.shape[1])
         if (height, width) == (side, side):
             return self.pos_embed
         stored = as_map(self.pos_embed[:, 1:].reshape(1, side, side, -1))  # (1, C, side, side)

@@ -17,13 +17,12 @@ from mkpc_kaggle.matchers.networks.dense_warp import (
     Pyramid,
     WarpDecoder,
 )
-from mkpc_kaggle.matchers.networks.layers import ExactConv2d
-from mkpc_kaggle.matchers.networks.warp_refiner import SHAPES, WarpEstimate, WarpRefiner, refined, resize
+from mkpc_kaggle.matchers.networks.layers import ExactConv2d, resize
+from mkpc_kaggle.matchers.networks.warp_refiner import SHAPES, WarpEstimate, WarpRefiner, refined
 
 STRIDES = (32, 16)  # of the coarse decoder
 FEATURES, POSTERIOR, WIDTH = 512, 256, 384  # its channels
 EXPANSION = 4  # of the channels in a bottleneck of ResNet-50
-FINE_COARSEST = 8  # the coarsest stride of the second pass
 
 
 class DKM(DenseNetwork):
@@ -39,15 +38,15 @@ class DKM(DenseNetwork):
 
     def encode(self, image: Tensor, fine: Tensor | None = None) -> DenseFeatures:
         """Encode images of any size."""
-        coarse = self.decoder.projected(self.pyramid(image, 32))
-        second = None if fine is None else self.pyramid(fine, FINE_COARSEST)
+        coarse = self.decoder.projected(self.pyramid(image))
+        second = None if fine is None else self.pyramid(fine)
         return DenseFeatures(coarse, self.decoder.regress(coarse), second)
 
-    def pyramid(self, image: Tensor, coarsest: int) -> Pyramid:
-        """Return the image (B, 3, H, W) itself and its features at strides 2 to ``coarsest``."""
+    def pyramid(self, image: Tensor) -> Pyramid:
+        """Return the image (B, 3, H, W) itself and its features at strides 2 to 32."""
         image = image.contiguous(memory_format=torch.channels_last)
         precision = self.encoder.get_parameter("net.conv1.weight").dtype
-        return Pyramid((image, *self.encoder["net"](image.to(precision), coarsest)))
+        return Pyramid((image, *self.encoder["net"](image.to(precision))))
 
 
 class DkmDecoder(WarpDecoder):
@@ -186,17 +185,14 @@ class ResNet50(nn.Module):
         self.layer4 = stage(1024, 512, blocks=3, stride=2)
         self.fc = nn.Linear(2048, 1000)
 
-    def forward(self, image: Tensor, coarsest: int) -> tuple[Tensor, ...]:
-        """Return features at strides 2, 4, 8, 16 and 32, up to ``coarsest``, of images (B, 3, H, W) of any size.
+    def forward(self, image: Tensor) -> tuple[Tensor, ...]:
+        """Return features at strides 2, 4, 8, 16 and 32 of images (B, 3, H, W) of any size.
 
         (B, C, h, w) with C = 64, 256, 512, 1024, 2048; every halving of a side rounds up.
         """
         levels = [functional.relu_(self.bn1(self.conv1(image)))]
         x = functional.max_pool2d(levels[0], 3, stride=2, padding=1)
-        for stride, layer in zip(
-            (4, 8, 16, 32), (self.layer1, self.layer2, self.layer3, self.layer4), strict=True
-        ):
-            if stride <= coarsest:
-                x = layer(x)
-                levels.append(x)
+        for layer in (self.layer1, self.layer2, self.layer3, self.layer4):
+            x = layer(x)
+            levels.append(x)
         return tuple(levels)

@@ -5,9 +5,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from mkpc_kaggle.matchers.networks.coarse_matching import CoarseMatches
 from mkpc_kaggle.matchers.networks.grids import as_grid
-from mkpc_kaggle.matchers.networks.layers import Linear, linear
+from mkpc_kaggle.matchers.networks.layers import Assignment, Linear, linear
 
 COARSE_STRIDE, FINE_STRIDE = 8, 2
 SIDE = 5  # of a window, in fine cells
@@ -20,14 +19,13 @@ class SemiDenseMatches(NamedTuple):
 
     ``points0``, ``points1``: (M, 2) float32 (x, y) in pixels of the network's input, in a frame whose origin is
     the corner of the image: the centre of the top-left pixel is (0.5, 0.5). Points of image 0 lie on the
-    grid of coarse cells; points of image 1 are refined by up to 4 pixels. ``expectation``: (M, 3) offset
-    (x, y) in -1..1 and its standard deviation.
+    grid of coarse cells; points of image 1 are refined by up to 4 pixels. ``coarse``: cells, counted row by row
+    in their own map, and the confidence.
     """
 
-    coarse: CoarseMatches
+    coarse: Assignment
     points0: Tensor
     points1: Tensor
-    expectation: Tensor
 
 
 class FinePreprocess(nn.Module):
@@ -69,14 +67,12 @@ def cut_windows(fine: Tensor, cells: Tensor) -> Tensor:
 
 
 def expected_offset(windows0: Tensor, windows1: Tensor) -> Tensor:
-    """Map (M, 25, C) twice to (M, 3) float32: mean offset (x, y) in -1..1, and its standard deviation.
+    """Map (M, 25, C) twice to the mean offset (M, 2) float32, (x, y) in -1..1.
 
     The centre of window 0 is compared with all of window 1; the softmax is the distribution of the offset.
     """
     logits = (windows1 @ windows0[:, CENTRE, :, None])[..., 0] / windows0.shape[2] ** 0.5  # (M, 25)
     axis = torch.linspace(-1.0, 1.0, SIDE, device=logits.device)
     offsets = torch.stack([axis.repeat(SIDE), axis.repeat_interleave(SIDE)], dim=1)  # (25, 2): (x, y)
-    heat = logits.softmax(dim=1)
-    mean = heat @ offsets  # (M, 2)
-    deviation = (heat @ offsets**2 - mean**2).clamp(min=1e-10).sqrt().sum(dim=1)
-    return torch.cat([mean, deviation[:, None]], dim=1)
+    mean: Tensor = logits.softmax(dim=1) @ offsets
+    return mean

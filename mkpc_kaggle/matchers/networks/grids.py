@@ -3,7 +3,6 @@
 A grid is a view of a channels-last feature map, so conversions copy nothing.
 """
 
-import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -69,8 +68,3 @@ class Perceptron(nn.Module):
 def mask_valid(mask: Tensor, factor: int | tuple[int, int]) -> Tensor:
     """Pool (N, h, w) bool: a block is valid only if all of its cells are."""
     return functional.max_pool2d((~mask).float()[:, None], factor)[:, 0] == 0
-
-
-def softmax_attention(logits: Tensor, values: Tensor) -> Tensor:
-    """Map (..., L, S) and (..., S, D) to (..., L, D)."""
-    return torch.softmax(logits, dim=-1) @ values

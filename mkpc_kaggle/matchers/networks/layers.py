@@ -52,6 +52,21 @@ class ExactConv2d(Exact, nn.Conv2d):
     pass
 
 
+def depthwise_block(inputs: int, outputs: int) -> nn.Sequential:
+    """Make a depthwise 5x5 convolution of ``inputs`` channels, and a 1x1 convolution of its ``outputs``."""
+    return nn.Sequential(
+        nn.Conv2d(inputs, outputs, 5, padding=2, groups=inputs),
+        nn.BatchNorm2d(outputs),
+        nn.ReLU(inplace=True),
+        nn.Conv2d(outputs, outputs, 1),
+    )
+
+
+def resize(x: Tensor, size: torch.Size, mode: str = "bilinear") -> Tensor:
+    """Resize (B, C, h, w) to (B, C, *size), larger or smaller, without antialiasing, half-pixel centres."""
+    return functional.interpolate(x, tuple(size), mode=mode, align_corners=False)
+
+
 def attention(q: Tensor, k: Tensor, v: Tensor, precision: torch.dtype) -> Tensor:
     """Return softmax(q k^T / sqrt(D)) v of (B, heads, L, D) and twice (B, heads, S, D), like ``q``.
 
@@ -72,20 +87,15 @@ def in_strips(function: Callable[[Tensor], Tensor], x: Tensor, *, reach: int, ch
     rows = max(1, 4 * reach, STRIP_FLOATS // (batch * channels * width))
     if x.is_cuda or rows >= height:
         return function(x)
-    result = None
+    strips = []
     for top in range(0, height, rows):
         bottom, first = min(top + rows, height), max(0, top - reach)
-        strip = function(x[:, :, first : bottom + reach])[:, :, top - first : bottom - first]
-        if result is None:
-            shape = (batch, strip.shape[1], height, width)
-            result = strip.new_empty(shape).contiguous(memory_format=torch.channels_last)
-        result[:, :, top:bottom] = strip
-    assert result is not None
-    return result
+        strips.append(function(x[:, :, first : bottom + reach])[:, :, top - first : bottom - first])
+    return torch.cat(strips, dim=2).contiguous(memory_format=torch.channels_last)
 
 
 class Assignment(NamedTuple):
-    """M matches by ascending ``index0``: keypoints ``index0``, ``index1`` (M,) int64, ``scores`` (M,) in 0..1."""
+    """M matches by ascending ``index0``: keypoints or cells (M,) int64 of both images, ``scores`` (M,) in 0..1."""
 
     index0: Tensor
     index1: Tensor

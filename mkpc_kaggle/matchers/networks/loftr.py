@@ -2,23 +2,26 @@
 
 from torch import Tensor
 
+from mkpc_kaggle.matchers.contract import Training
 from mkpc_kaggle.matchers.networks.linear_attention import LinearTransformer, Masks
 from mkpc_kaggle.matchers.networks.position import FIXED_DECAY, ORIGINAL_DECAY, with_positions
 from mkpc_kaggle.matchers.networks.resnet_fpn import TOP
 from mkpc_kaggle.matchers.networks.semi_dense import HEADS, SemiDenseNetwork
 
 
-class Loftr(SemiDenseNetwork[LinearTransformer]):
+class Loftr(SemiDenseNetwork):
     """LoFTR. Sides are multiples of 8; the two images may differ in size.
 
-    The defaults were published for ``outdoor_ds``. ``fixed_positions``: True for ``indoor_ds_new`` only.
+    Indoor weights were trained later, with the corrected position encoding, and published without a border.
     """
 
     multiple = 8
 
-    def __init__(self, threshold: float = 0.2, border: int = 2, *, fixed_positions: bool = False) -> None:
-        super().__init__(LinearTransformer(TOP, HEADS, cycles=4), threshold, border)
-        self.decay = FIXED_DECAY if fixed_positions else ORIGINAL_DECAY
+    def __init__(self, training: Training = Training.OUTDOOR) -> None:
+        super().__init__(LinearTransformer(TOP, HEADS, cycles=4))
+        self.decay = ORIGINAL_DECAY
+        if training is Training.INDOOR:
+            self.decay, self.border = FIXED_DECAY, 0
 
     def transform(self, coarse0: Tensor, coarse1: Tensor, masks: Masks | None = None) -> tuple[Tensor, Tensor]:
         grid0, grid1 = with_positions(coarse0, self.decay), with_positions(coarse1, self.decay)

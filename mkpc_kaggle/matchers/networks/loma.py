@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.matchers.networks.dad import Dad
-from mkpc_kaggle.matchers.networks.dedode import dedode_b, dedode_g
+from mkpc_kaggle.matchers.networks.dedode import Dedode
 from mkpc_kaggle.matchers.networks.loma_matcher import LAYERS, LomaKeypoints, LomaMatcher
 
 
@@ -38,7 +38,7 @@ class Loma(nn.Module):
         super().__init__()
         descriptor, width = WIDTHS[variant]
         self.detector = Dad()
-        self.descriptor = (dedode_b if variant is Variant.B128 else dedode_g)(descriptor)
+        self.descriptor = Dedode(descriptor, with_vit=variant is not Variant.B128)
         self.matcher = LomaMatcher(descriptor, width)
         self.eval().requires_grad_(False)
 
@@ -47,8 +47,8 @@ class Loma(nn.Module):
 
         The image has two sizes, (1, 3, H, W) each, RGB in 0..1: for the detector and for the descriptor.
         """
-        (found,) = self.detector(detected, number)
-        return LomaKeypoints(found.points, self.descriptor(described, found.points[None])[0])
+        (points,) = self.detector(detected, number)
+        return LomaKeypoints(points, self.descriptor(described, points[None])[0])
 
 
 def parameter_name(published: str) -> str:

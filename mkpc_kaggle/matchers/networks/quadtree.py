@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from mkpc_kaggle.matchers.contract import Training
 from mkpc_kaggle.matchers.networks.grids import (
     as_grid,
     as_map,
@@ -26,6 +27,8 @@ from mkpc_kaggle.matchers.networks.semi_dense import HEADS, SemiDenseNetwork
 LEVELS = 3
 LAYERS = 8
 HIDDEN = 4 * TOP
+# The number of key cells that each level keeps for the next, coarsest first; as published.
+TOPKS = {Training.OUTDOOR: (16, 8), Training.INDOOR: (32, 16)}
 
 
 def attend(q: Tensor, k: Tensor, v: Tensor, keep: int) -> tuple[Tensor, Tensor]:
@@ -161,17 +164,16 @@ class QuadtreeTransformer(nn.Module):
         return x0, x1
 
 
-class Quadtree(SemiDenseNetwork[QuadtreeTransformer]):
+class Quadtree(SemiDenseNetwork):
     """LoFTR with quadtree attention. Sides are multiples of 32. The published code needs two images of one size.
 
-    ``topks``: the number of key cells that each level keeps for the next, coarsest first. The defaults were
-    published for outdoors. As published, masks apply to the matching of coarse cells only, not to attention.
+    As published, masks apply to the matching of coarse cells only, not to attention.
     """
 
     multiple = 32
 
-    def __init__(self, threshold: float = 0.2, border: int = 2, topks: tuple[int, int] = (16, 8)) -> None:
-        super().__init__(QuadtreeTransformer(topks), threshold, border)
+    def __init__(self, training: Training = Training.OUTDOOR) -> None:
+        super().__init__(QuadtreeTransformer(TOPKS[training]))
 
     def transform(self, coarse0: Tensor, coarse1: Tensor, masks: Masks | None = None) -> tuple[Tensor, Tensor]:
         grids = with_positions(coarse0, FIXED_DECAY), with_positions(coarse1, FIXED_DECAY)

@@ -6,8 +6,7 @@ Coordinates are normalised: (x, y) in [-1, 1], where +-1 are the outer edges of 
 Parameter names match the public checkpoints, DINOv2's under the prefix "dinov2.". For inference only.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
 from math import sqrt
 
 import torch
@@ -21,7 +20,7 @@ from mkpc_kaggle.matchers.networks.dense_warp import (
     WarpDecoder,
     tokens,
 )
-from mkpc_kaggle.matchers.networks.dinov2 import DinoV2, DinoV2Config, VitBlock
+from mkpc_kaggle.matchers.networks.dinov2 import DinoV2, VitBlock
 from mkpc_kaggle.matchers.networks.grids import as_grid, as_map, pointwise
 from mkpc_kaggle.matchers.networks.layers import ExactLinear
 from mkpc_kaggle.matchers.networks.vgg import VGG19, WIDTHS, Vgg
@@ -39,28 +38,17 @@ REFINERS = SHAPES | {1: WarpRefinerShape(9, 6, None, 24)}
 DISPLACEMENT, TRAINED_SIDE = 1.25, 560  # the factor of displacements in a square of this side
 
 SIDE = 64  # of the grid of anchors, for any image shape
-EPSILON = 1e-5  # of the norms
-
-
-@dataclass(frozen=True)
-class RomaConfig:
-    """The published sizes. ``refiners``: shapes by stride; ``blocks`` and ``heads``: of the coarse decoder."""
-
-    dinov2: DinoV2Config = field(default_factory=DinoV2Config)
-    refiners: Mapping[int, WarpRefinerShape] = field(default_factory=lambda: REFINERS)
-    blocks: int = 5
-    heads: int = 8
+BLOCKS, HEADS, EPSILON = 5, 8, 1e-5  # of the coarse decoder; the last of its norms
 
 
 class RoMa(DenseNetwork):
     """RoMa, trained at 560 x 560, with a second pass at 864 x 864."""
 
-    def __init__(self, config: RomaConfig | None = None) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        config = config or RomaConfig()
-        self.dinov2 = DinoV2(config.dinov2)
+        self.dinov2 = DinoV2()
         self.encoder = nn.ModuleDict({"cnn": Vgg(VGG19)})
-        self.decoder: RomaDecoder = RomaDecoder(config)
+        self.decoder: RomaDecoder = RomaDecoder(self.dinov2.norm.weight.numel())
         self.eval().requires_grad_(False)
 
     def encode(self, image: Tensor, fine: Tensor | None = None) -> DenseFeatures:
@@ -72,16 +60,14 @@ class RoMa(DenseNetwork):
 
 
 class RomaDecoder(WarpDecoder):
-    def __init__(self, config: RomaConfig) -> None:
+    def __init__(self, coarse_features: int) -> None:
         super().__init__()
-        width = config.refiners[COARSEST].features
-        inputs = dict(zip((1, 2, 4, 8, COARSEST), (*WIDTHS, config.dinov2.width), strict=True))
-        self.embedding_decoder = AnchorDecoder(2 * width, config.blocks, config.heads)
+        width = REFINERS[COARSEST].features
+        inputs = dict(zip((1, 2, 4, 8, COARSEST), (*WIDTHS, coarse_features), strict=True))
+        self.embedding_decoder = AnchorDecoder(2 * width)
         self.gps = nn.ModuleDict({str(COARSEST): GaussianProcess(width)})
-        self.proj = nn.ModuleDict(
-            {str(s): Projection(inputs[s], shape.features) for s, shape in config.refiners.items()}
-        )
-        self.conv_refiner = nn.ModuleDict({str(s): WarpRefiner(shape) for s, shape in config.refiners.items()})
+        self.proj = nn.ModuleDict({str(s): Projection(inputs[s], shape.features) for s, shape in REFINERS.items()})
+        self.conv_refiner = nn.ModuleDict({str(s): WarpRefiner(shape) for s, shape in REFINERS.items()})
 
     def projected(self, levels: Sequence[Tensor]) -> Pyramid:
         """Return features at strides 1, 2, 4, ..., projected for all later steps."""
@@ -128,11 +114,10 @@ def stretch(size: torch.Size) -> float:
 class AnchorDecoder(nn.Module):
     """A transformer without positional encoding, because the posterior contains positions."""
 
-    def __init__(self, width: int, blocks: int, heads: int) -> None:
+    def __init__(self, width: int) -> None:
         super().__init__()
-        self.blocks = nn.ModuleList(
-            VitBlock(width, heads, EPSILON, bias=False, scaled=False) for _ in range(blocks)
-        )
+        blocks = (VitBlock(width, HEADS, EPSILON, bias=False, scaled=False) for _ in range(BLOCKS))
+        self.blocks = nn.ModuleList(blocks)
         self.to_out = ExactLinear(width, SIDE**2 + 1)
 
     def forward(self, posterior: Tensor, features: Tensor) -> WarpEstimate:

@@ -4,13 +4,12 @@ Backbone, coarse transformer, dual softmax of all pairs of coarse cells, refinem
 """
 
 from abc import ABC, abstractmethod
-from typing import Generic, TypeVar
 
 import torch
 from torch import Tensor, nn
 
 from mkpc_kaggle.matchers.dtypes import check_finite
-from mkpc_kaggle.matchers.networks.coarse_matching import CoarseMatches, coarse_matches
+from mkpc_kaggle.matchers.networks.coarse_matching import coarse_matches
 from mkpc_kaggle.matchers.networks.fine_matching import (
     REACH,
     FinePreprocess,
@@ -19,6 +18,7 @@ from mkpc_kaggle.matchers.networks.fine_matching import (
     cut_windows,
     expected_offset,
 )
+from mkpc_kaggle.matchers.networks.layers import Assignment
 from mkpc_kaggle.matchers.networks.linear_attention import LinearTransformer, Masks
 from mkpc_kaggle.matchers.networks.resnet_fpn import FINE, TOP, FeatureMaps, ResNetFpn
 
@@ -26,10 +26,8 @@ HEADS = 8
 TEMPERATURE = 0.1  # of the dual softmax
 WINDOWS_AT_ONCE = 1024
 
-Transformer = TypeVar("Transformer", bound=nn.Module)
 
-
-class SemiDenseNetwork(nn.Module, ABC, Generic[Transformer]):
+class SemiDenseNetwork(nn.Module, ABC):
     """A semi-dense network for inference only: in evaluation mode, without gradients.
 
     ``multiple``: both sides of an image must be multiples of it. ``threshold``: a match's confidence is above it.
@@ -37,11 +35,11 @@ class SemiDenseNetwork(nn.Module, ABC, Generic[Transformer]):
     """
 
     multiple: int
+    threshold = 0.2
+    border = 2
 
-    def __init__(self, loftr_coarse: Transformer, threshold: float, border: int) -> None:
+    def __init__(self, loftr_coarse: nn.Module) -> None:
         super().__init__()
-        self.threshold = threshold
-        self.border = border
         self.backbone = ResNetFpn()
         self.loftr_coarse = loftr_coarse
         self.fine_preprocess = FinePreprocess(TOP, FINE)
@@ -71,14 +69,14 @@ class SemiDenseNetwork(nn.Module, ABC, Generic[Transformer]):
         (grid0,), (grid1,) = grids  # (h, w, 256)
         content = None if masks is None else (masks[0][0], masks[1][0])
         coarse = coarse_matches(grid0, grid1, self.similarity_scale, self.threshold, self.border, content)
-        expectation = self.refine(coarse, features0.fine, features1.fine, grid0, grid1)
-        points0, points1 = cell_points(coarse.cell0, grid0.shape[1]), cell_points(coarse.cell1, grid1.shape[1])
-        return SemiDenseMatches(coarse, points0, points1 + expectation[:, :2] * REACH, expectation)
+        offsets = self.refine(coarse, features0.fine, features1.fine, grid0, grid1)
+        points0, points1 = cell_points(coarse.index0, grid0.shape[1]), cell_points(coarse.index1, grid1.shape[1])
+        return SemiDenseMatches(coarse, points0, points1 + offsets * REACH)
 
-    def refine(self, coarse: CoarseMatches, fine0: Tensor, fine1: Tensor, grid0: Tensor, grid1: Tensor) -> Tensor:
-        """Return (M, 3): the offset of each match from its coarse cell's corner in image 1, see fine_matching."""
+    def refine(self, coarse: Assignment, fine0: Tensor, fine1: Tensor, grid0: Tensor, grid1: Tensor) -> Tensor:
+        """Return (M, 2): the offset of each match from its coarse cell's corner in image 1, see fine_matching."""
         found = []
-        for cells in zip(*(torch.split(x, WINDOWS_AT_ONCE) for x in (coarse.cell0, coarse.cell1)), strict=True):
+        for cells in zip(*(torch.split(x, WINDOWS_AT_ONCE) for x in (coarse.index0, coarse.index1)), strict=True):
             windows0, windows1 = (
                 self.fine_preprocess(cut_windows(fine, some), grid.flatten(0, 1)[some])  # (m, 25, 128)
                 for fine, some, grid in zip((fine0, fine1), cells, (grid0, grid1), strict=True)

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.matchers.dtypes import check_finite
+from mkpc_kaggle.matchers.networks.grids import pointwise
 from mkpc_kaggle.matchers.networks.layers import Assignment, attention, linear, mutual_matches
 from mkpc_kaggle.matchers.networks.superpoint import SuperPointKeypoints
 
@@ -30,11 +31,14 @@ class Pointwise(nn.Conv1d):
         super().__init__(channels_in, channels_out, kernel_size=1)
 
     def forward(self, x: Tensor) -> Tensor:
-        return linear(x, self.weight[:, :, 0], self.bias)
+        return pointwise(self, x)
 
 
 def pointwise_network(*channels: int) -> nn.Sequential:
-    """Make linear maps between these numbers of channels, batch norm and ReLU between them, for (rows, C)."""
+    """Make linear maps between these numbers of channels, batch norm and ReLU between them.
+
+    For (..., C), once the norms are folded: a batch norm would take another axis for the channels.
+    """
     steps: list[nn.Module] = []
     for width_in, width_out in pairwise(channels[:-1]):
         steps += [Pointwise(width_in, width_out), nn.BatchNorm1d(width_out), nn.ReLU(inplace=True)]
@@ -82,16 +86,17 @@ class SuperGlueLayer(nn.Module):
     def forward(self, x: Tensor, n0: int) -> Tensor:
         """Update the keypoints ``x`` (1, N, 256); the first ``n0`` are image 0's."""
         message = self.attn(x, n0, cross=self.cross)
-        return x + _on_rows(self.mlp, torch.cat([x, message], dim=2))
+        change: Tensor = self.mlp(torch.cat([x, message], dim=2))
+        return x + change
 
 
 class SuperGlue(nn.Module):
     """Keypoint encoder, graph network, optimal transport; for inference only.
 
-    Published results use 20 ``sinkhorn_iterations``. Scores of matches are above ``match_threshold``.
+    Defaults as in published results. Scores of matches are above ``match_threshold``.
     """
 
-    def __init__(self, sinkhorn_iterations: int = 100, match_threshold: float = 0.2) -> None:
+    def __init__(self, sinkhorn_iterations: int = 20, match_threshold: float = 0.2) -> None:
         super().__init__()
         self.sinkhorn_iterations = sinkhorn_iterations
         self.match_threshold = match_threshold
@@ -119,7 +124,8 @@ class SuperGlue(nn.Module):
         """Return the graph network's input (1, N, 256): descriptors plus encoded points and scores."""
         points = normalise_points(image.points, image.size)
         positions = torch.cat([points, image.scores.float()[:, None]], dim=1)[None]  # (1, N, 3)
-        return image.descriptors[None].float() + _on_rows(self.kenc["encoder"], positions)
+        encoded: Tensor = self.kenc["encoder"](positions)
+        return encoded + image.descriptors[None].float()
 
     @staticmethod
     def score_matrix(projected: Tensor, n0: int) -> Tensor:
@@ -131,13 +137,6 @@ class SuperGlue(nn.Module):
 def _by_head(rows: Tensor) -> Tensor:
     """Order the 256 rows of a vector or matrix by head; checkpoints interleave the heads."""
     return rows.reshape(CHANNELS // HEADS, HEADS, -1).transpose(0, 1).reshape(rows.shape)
-
-
-def _on_rows(network: nn.Module, x: Tensor) -> Tensor:
-    """Apply a network of (rows, C) to (1, N, C): there batch norm takes the last axis for the channels."""
-    precision = next(network.parameters()).dtype
-    rows: Tensor = network(x.flatten(0, 1).to(precision))
-    return rows.to(x.dtype).view(*x.shape[:2], -1)
 
 
 def normalise_points(points: Tensor, size: Size) -> Tensor:

@@ -131,28 +131,17 @@ def suppress_non_maxima(scores: Tensor, radius: int) -> Tensor:
     """
     kept = scores == window_maximum(scores, radius)
     for _ in range(SUPPRESSION_ROUNDS):
-        near = window_maximum(kept, radius)
+        near = window_maximum(kept.float(), radius) > 0
         rest = scores.masked_fill(near, 0)
         kept |= (rest == window_maximum(rest, radius)) & ~near
     return scores.masked_fill(~kept, 0)
 
 
 def window_maximum(values: Tensor, radius: int) -> Tensor:
-    """Return the maximum over (2 radius + 1)^2 pixels about each of ``values`` (B, H, W), at least 0 or bool.
-
-    Computed by axis and by doubling in a few vectorised passes; a pooling layer needs (2 radius + 1)^2 comparisons
-    per pixel. The zero padding is never the maximum.
-    """
+    """Return the maximum over (2 radius + 1)^2 pixels about each of ``values`` (B, H, W), axis by axis."""
     window = 2 * radius + 1
-    padded = functional.pad(values, (radius,) * 4)
-    for axis in (1, 2):
-        width = 1  # of the window of the maxima in ``padded``
-        while width < window:
-            step = min(width, window - width)
-            length = padded.shape[axis] - step
-            padded = torch.maximum(padded.narrow(axis, 0, length), padded.narrow(axis, step, length))
-            width += step
-    return padded
+    columns = functional.max_pool2d(values[:, None], (window, 1), 1, (radius, 0))
+    return functional.max_pool2d(columns, (1, window), 1, (0, radius))[:, 0]
 
 
 def sample_descriptors(field: Tensor, points: Tensor) -> Tensor:

@@ -42,27 +42,13 @@ class Vgg(nn.Module):
         """Yield the same one by one, so that not all of them are in memory."""
         first = next(self.parameters())
         x = image.to(first.dtype).contiguous(memory_format=torch.channels_last)
-        for number, level in enumerate(self._levels()):
+        pools = [i for i, layer in enumerate(self.layers) if isinstance(layer, nn.MaxPool2d)]
+        for number, (pool, end) in enumerate(pairwise([-1, *pools, len(self.layers)])):
             if number > 0:
-                x = halved(x)
+                x = self.layers[pool](x)
+            level = self.layers[pool + 1 : end]
             x = in_strips(level, x, reach=self.convolutions[number], channels=WIDTHS[number])
             yield x
-
-    def _levels(self) -> list[nn.Sequential]:
-        """Return the layers between poolings."""
-        layers = list(self.layers)
-        pools = [i for i, layer in enumerate(layers) if isinstance(layer, nn.MaxPool2d)]
-        return [nn.Sequential(*layers[start + 1 : end]) for start, end in pairwise([-1, *pools, len(layers)])]
-
-
-def halved(x: Tensor) -> Tensor:
-    """Return maxima of 2 x 2 pixels. PyTorch's pooling also stores indices, twice as large as the maxima."""
-    height, width = (side // 2 * 2 for side in x.shape[2:])
-    first, *others = (x[:, :, row:height:2, column:width:2] for row in (0, 1) for column in (0, 1))
-    maxima = first.clone(memory_format=torch.channels_last)
-    for pixels in others:
-        torch.maximum(maxima, pixels, out=maxima)
-    return maxima
 
 
 def convolution(width_in: int, width_out: int) -> tuple[nn.Module, ...]:

@@ -4,7 +4,6 @@ Normalised coordinates are (x, y) in [-1, 1]; +-1 are the outer edges of an imag
 of pixel (column j, row i) is ((2 j + 1) / w - 1, (2 i + 1) / h - 1).
 """
 
-from dataclasses import dataclass
 from math import ceil
 from typing import NamedTuple
 
@@ -13,24 +12,18 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mkpc_kaggle.matchers.networks.grids import as_grid, as_map, pointwise
-from mkpc_kaggle.matchers.networks.layers import ExactConv2d
+from mkpc_kaggle.matchers.networks.layers import ExactConv2d, depthwise_block, resize
 
 HIDDEN_BLOCKS = 8
 
 
-@dataclass(frozen=True)
-class WarpRefinerShape:
+class WarpRefinerShape(NamedTuple):
     """Channels: ``features`` of either image, ``embedding`` of the displacement; ``radius`` of the correlation."""
 
     features: int
     embedding: int
     radius: int | None
     hidden: int
-
-    @property
-    def inputs(self) -> int:
-        window = 0 if self.radius is None else (2 * self.radius + 1) ** 2
-        return 2 * self.features + self.embedding + window
 
 
 SHAPES = {  # by stride
@@ -60,8 +53,10 @@ class WarpRefiner(nn.Module):
     def __init__(self, shape: WarpRefinerShape) -> None:
         super().__init__()
         self.radius = shape.radius
-        self.block1 = block(shape.inputs, shape.hidden)
-        self.hidden_blocks = nn.Sequential(*(block(shape.hidden, shape.hidden) for _ in range(HIDDEN_BLOCKS)))
+        window = 0 if shape.radius is None else (2 * shape.radius + 1) ** 2
+        self.block1 = depthwise_block(2 * shape.features + shape.embedding + window, shape.hidden)
+        blocks = (depthwise_block(shape.hidden, shape.hidden) for _ in range(HIDDEN_BLOCKS))
+        self.hidden_blocks = nn.Sequential(*blocks)
         self.out_conv = ExactConv2d(shape.hidden, 3, 1)
         self.disp_emb = ExactConv2d(2, shape.embedding, 1)
 
@@ -88,15 +83,6 @@ class WarpRefiner(nn.Module):
         precision = self.block1.get_parameter("0.weight").dtype
         looks = torch.cat([part.to(precision) for part in parts], dim=1)
         return looks.contiguous(memory_format=torch.channels_last)
-
-
-def block(inputs: int, outputs: int) -> nn.Sequential:
-    return nn.Sequential(
-        nn.Conv2d(inputs, outputs, 5, padding=2, groups=inputs),
-        nn.BatchNorm2d(outputs),
-        nn.ReLU(inplace=True),
-        nn.Conv2d(outputs, outputs, 1),
-    )
 
 
 def refined(estimate: WarpEstimate, corrections: Tensor, stride: int, full: torch.Size) -> WarpEstimate:
@@ -159,11 +145,6 @@ def _products(queries: Tensor, keys: Tensor, index: Tensor) -> Tensor:
         # A row times a matrix; MKL takes ten times as long for the reverse.
         torch.bmm(some[:, None], gathered.transpose(1, 2), out=out[:, None])
     return products
-
-
-def resize(x: Tensor, size: torch.Size) -> Tensor:
-    """Resize (B, C, h, w) to (B, C, *size), bilinear without antialiasing, larger or smaller."""
-    return functional.interpolate(x, tuple(size), mode="bilinear", align_corners=False)
 
 
 def identity_map(like: Tensor) -> Tensor:
