@@ -138,7 +138,10 @@ def test_ten_kills_after_a_change_leave_the_same_bytes(room: Room, change: str) 
     assert room.run() == room.run("fresh.csv")
 
 
-def test_images_added_to_a_folder_are_matched_with_each_other_and_with_the_former(demo, tmp_path, capsys) -> None:
+def test_images_added_to_a_folder_are_matched_with_each_other_and_with_the_former(
+    demo, tmp_path, monkeypatch, capsys
+) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib", None)  # pages without drawings
     images = sorted((demo.train_dir / "courtyard" / "images").iterdir())
     (tmp_path / "in").mkdir()
     recipe, folder = tmp_path / "small.toml", tmp_path / "in"
