@@ -15,10 +15,10 @@ DATA = bytes(range(256)) * 400
 DIGEST = "sha256:" + hashlib.sha256(DATA).hexdigest()
 OK = b"HTTP/1.1 200 OK\r\n"
 REDIRECTION = b"HTTP/1.1 302 Found\r\nLocation: %b\r\n\r\n"
-ANSWERS = {
+ANSWERS = {  # the first is refused at once, and not asked for again
+    "too many bytes": OK + b"\r\n" + DATA * 10,
     "noise": os.urandom(10_000),
     "a head of 10 MB": OK + b"A: " + b"x" * 10_000_000,
-    "too many bytes": OK + b"\r\n" + DATA * 10,
     "a chunk of 2^100": OK + b"Transfer-Encoding: chunked\r\n\r\n1" + b"0" * 25 + b"\r\n" + DATA,
     "a redirection to a file": REDIRECTION % b"file:///etc/hostname",
     "a redirection to itself": REDIRECTION % b"/a.bin",
