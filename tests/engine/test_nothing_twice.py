@@ -1,13 +1,8 @@
 """Nothing is computed twice: what runs after a change, and that the result has the bytes of a fresh run."""
 
-import os
-import random
 import re
 import shutil
-import signal
-import subprocess
 import sys
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +14,6 @@ import pytest
 from mkpc_kaggle.cli import main
 from mkpc_kaggle.demo import DemoSet
 
-ROOT = Path(__file__).resolve().parents[2]
 FIRST, SECOND, THIRD = (
     '{ stage = 1, matcher = "sift", long_side = 320 }',
     '{ stage = 2, matcher = "sift", long_side = 400 }',
@@ -122,20 +116,6 @@ def test_what_runs_after_a_change_and_the_bytes_are_those_of_a_fresh_run(room: R
     (run,) = re.findall(r"(\d+) units run", capsys.readouterr().out)
     assert int(run) == units(room)
     assert again == room.run("fresh.csv")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("change", CHANGES)
-def test_ten_kills_after_a_change_leave_the_same_bytes(room: Room, change: str) -> None:
-    rng = random.Random(change)
-    command = [sys.executable, "-m", "mkpc_kaggle"]
-    CHANGES[change][0](room)
-    for _ in range(10):
-        running = subprocess.Popen([*command, *room.command("a.csv")], cwd=ROOT, stdout=-3, stderr=-3)
-        time.sleep(rng.uniform(0.5, 6.0))
-        os.kill(running.pid, signal.SIGKILL)
-        running.wait()
-    assert room.run() == room.run("fresh.csv")
 
 
 def test_images_added_to_a_folder_are_matched_with_each_other_and_with_the_former(

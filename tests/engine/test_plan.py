@@ -185,13 +185,6 @@ def test_what_a_jobs_own_deadline_cut_off_is_planned_again():
     assert plan.next(7.0).units == (SECOND,)
 
 
-def test_a_pair_whose_image_cannot_be_read_gets_no_further_job():
-    plan = plan_of(1)
-    plan.on_result(plan.next(0.0), [Outcome(0, failure="the file is empty")])
-    assert plan.next(1.0) is None
-    assert plan.is_complete
-
-
 @pytest.mark.parametrize(
     ("limit", "fit"), [(math.inf, "there is no time limit"), (120.0, "2 of 3 units fit in the")]
 )
@@ -233,15 +226,6 @@ def test_pairs_for_the_scenes_alone_take_a_tenth_of_the_time_left_at_most():
     had = np.flatnonzero(plan.state.had[6:].any(1)).tolist()
     assert had == list(range(len(had))), "the most useful first"
     assert 5 < len(had) < 10
-    assert plan.is_complete
-
-
-def test_other_devices_try_what_was_skipped():
-    plan = plan_of(4)
-    list(jobs_of(plan, lambda job: DIED if SECOND in job.units else None))
-    assert plan.unusable[1]
-    plan.restart()
-    assert all(units == (SECOND,) for units in (job.units for job in jobs_of(plan)))
     assert plan.is_complete
 
 
