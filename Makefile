@@ -1,7 +1,7 @@
 # make demo: install, render a demo set, make its submission, score it, draw a pair.
 # make test: install, lint, types, tests.
 # make ray: the tests of worker machines, with Ray installed beside the rest.
-# make hostile: about 360 hostile inputs (tests/hostile), each in a process with 4 GB.
+# make hostile: about 330 hostile inputs (tests/hostile), each in a process with 4 GB.
 # make oldest: the tests with the lowest versions that pyproject.toml declares, on Python 3.11, in .venv-oldest.
 # make newest: the tests with the newest versions that it allows, on Python 3.13 or 3.12, in .venv-newest; PYTHON= names
 #   another Python, TESTS= some of the tests.

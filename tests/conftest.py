@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, settings
 from kaggle_image import pack_wheel
-from shared import write_recipe
+from shared import write_small_recipe
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.demo import DemoSet, write_demo
@@ -68,8 +68,7 @@ def wheels(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def small_recipe(tmp_path: Path) -> Path:
-    magsac = "[magsac]\npermutations = 1\nmax_iterations = 5000\n"
-    return write_recipe(tmp_path / "small.toml", (1, 320), (2, 400), more=magsac)
+    return write_small_recipe(tmp_path)
 
 
 @pytest.fixture

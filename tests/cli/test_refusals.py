@@ -22,6 +22,8 @@ REFUSALS = [
     (f"{SUBMIT} --output /dev/null", "--output /dev/null is a device; name a file"),
     (f"{SUBMIT} --work-dir /dev/null/work", "cannot be written"),
     (f"{SUBMIT} --output .", "is a directory; name a file"),
+    (f"{SUBMIT} --output q.work", "would be written over the work directory q.work"),
+    (f"{SUBMIT} --output {'s' * 300}.csv", "File name too long"),
     (f"{SUBMIT} --output demo/test/test.csv", "would be written over the input demo/test/test.csv"),
     (f"{SUBMIT} --output w/m.pth --weights w", "would be written over the input w"),
     (f"{SUBMIT} --work-dir demo/test/test_images", "would be written over the input demo/test/test_images"),

@@ -5,15 +5,16 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-from shared import problems_of, run_command
+from shared import problems_of, run_command, write_small_recipe
 
+from mkpc_kaggle.demo import DemoSet
 from mkpc_kaggle.errors import UserError
 
 ROOT = Path(__file__).resolve().parents[2]
-HERE = ("--no-report", "--workers", "0")  # in one process
 
 
 def command(test_dir: Path, output: Path, recipe: Path | str, *more: str) -> list[str]:
@@ -26,27 +27,48 @@ def make(*paths: Path | str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command(*paths), capture_output=True, text=True, env=environment, check=False)
 
 
-def test_a_submission_is_made_resumed_and_computed_again_where_a_unit_changed(demo, small_recipe, tmp_path):
-    output = tmp_path / "submission.csv"
-    first = make(demo.test_dir, output, small_recipe)
-    assert first.returncode == 0, first.stderr
-    assert "complete after" in first.stdout
-    assert problems_of(output, demo.test_dir) == []
-    written = output.read_bytes()
-    second = make(demo.test_dir, output, small_recipe, *HERE)
-    assert "8 of them from earlier runs" in second.stdout
-    assert output.read_bytes() == written
+@dataclass(frozen=True)
+class Made:
+    """A submission that the script has made, what it printed, and the bytes of the file."""
+
+    output: Path
+    done: subprocess.CompletedProcess[str]
+    written: bytes
+
+
+@pytest.fixture(scope="module")
+def made(demo: DemoSet, tmp_path_factory: pytest.TempPathFactory) -> Made:
+    home = tmp_path_factory.mktemp("made")
+    output = home / "submission.csv"
+    done = make(demo.test_dir, output, write_small_recipe(home))
+    return Made(output, done, output.read_bytes())
+
+
+def submit(test_dir: Path, output: Path, recipe: Path, *more: str) -> int:
+    """Submit in this process."""
+    options = ("--test-dir", test_dir, "--output", output, "--recipe", recipe, "--no-report", "--workers", 0)
+    return run_command("submit", *options, *more)
+
+
+def test_a_submission_is_made_resumed_and_computed_again_where_a_unit_changed(demo, small_recipe, made, capsys):
+    assert made.done.returncode == 0, made.done.stderr
+    assert "complete after" in made.done.stdout
+    assert problems_of(made.output, demo.test_dir) == []
+    assert submit(demo.test_dir, made.output, small_recipe) == 0
+    assert "8 of them from earlier runs" in capsys.readouterr().out
+    assert made.output.read_bytes() == made.written
     small_recipe.write_text(small_recipe.read_text().replace("400", "401"))
-    assert "8 units run" in make(demo.test_dir, output, small_recipe, *HERE).stdout
-    changed = output.read_bytes()
-    assert changed != written
-    assert "16 units run" in make(demo.test_dir, output, small_recipe, "--fresh", *HERE).stdout
-    assert output.read_bytes() == changed
+    assert submit(demo.test_dir, made.output, small_recipe) == 0
+    assert "8 units run" in capsys.readouterr().out
+    changed = made.output.read_bytes()
+    assert changed != made.written
+    assert submit(demo.test_dir, made.output, small_recipe, "--fresh") == 0
+    assert "16 units run" in capsys.readouterr().out
+    assert made.output.read_bytes() == changed
 
 
-def test_a_killed_run_goes_on_and_ends_with_the_bytes_of_an_undisturbed_one(demo, small_recipe, tmp_path):
-    undisturbed, output = tmp_path / "undisturbed.csv", tmp_path / "submission.csv"
-    make(demo.test_dir, undisturbed, small_recipe, *HERE)
+def test_a_killed_run_goes_on_and_ends_with_the_bytes_of_an_undisturbed_one(demo, small_recipe, made, tmp_path):
+    output = tmp_path / "submission.csv"
     begun = command(demo.test_dir, output, small_recipe, "--no-report")
     running = subprocess.Popen(begun, stderr=subprocess.PIPE, text=True)
     for line in running.stderr:  # the progress: the first deepened pair
@@ -56,9 +78,8 @@ def test_a_killed_run_goes_on_and_ends_with_the_bytes_of_an_undisturbed_one(demo
     running.wait()
     running.stderr.close()
     assert problems_of(output, demo.test_dir) == []
-    resumed = make(demo.test_dir, output, small_recipe, *HERE)
-    assert resumed.returncode == 0, resumed.stderr
-    assert output.read_bytes() == undisturbed.read_bytes()
+    assert submit(demo.test_dir, output, small_recipe) == 0
+    assert output.read_bytes() == made.written
 
 
 def test_a_limit_that_is_over_at_the_start_leaves_a_whole_file_and_is_told(demo, tmp_path):

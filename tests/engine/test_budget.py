@@ -1,7 +1,6 @@
 import math
 import time
 
-import numpy as np
 import pytest
 
 from mkpc_kaggle.engine.budget import WINDOW, Budget, Costs, format_duration, monotonic_of, parse_duration
@@ -65,9 +64,10 @@ def test_the_warm_up_counts_only_until_there_is_another_measurement() -> None:
     assert costs.mean("a") == 10.0
     costs.observe("a", 1.0)
     costs.observe("a", 9.0, warm_up=True)  # another worker's
-    costs.observe("a", 2.0)
+    for seconds in (2.0, 6.0):
+        costs.observe("a", seconds)
     assert costs.is_known("a")
-    assert costs.mean("a") == 1.5
+    assert costs.mean("a") == 3.0 < costs.forecast("a")
 
 
 def test_costs_follow_a_machine_that_slows_down() -> None:
@@ -75,25 +75,6 @@ def test_costs_follow_a_machine_that_slows_down() -> None:
     for seconds in [1.0] * (WINDOW + 1) + [10.0] * WINDOW:
         costs.observe("a", seconds)
     assert costs.mean("a") == 10.0
-
-
-def test_forecasts_grow_surer_with_every_measurement() -> None:
-    costs, margins = Costs(), []
-    for _ in range(1000):
-        costs.observe("a", 1.0)
-        margins.append(costs.forecast("a") - 1)
-    assert margins == sorted(margins, reverse=True)
-
-
-def test_forecasts_of_heavy_tailed_costs_are_not_too_low() -> None:
-    rng = np.random.default_rng(0)
-    shares = []
-    for _ in range(200):
-        costs = Costs()
-        for seconds in np.exp(rng.normal(size=WINDOW + 1)):
-            costs.observe("a", float(seconds))
-        shares.append(costs.mean("a") / np.exp(0.5))
-    assert np.mean(shares) == pytest.approx(1, abs=0.04)
 
 
 def test_a_limit_may_count_from_an_earlier_moment(monkeypatch: pytest.MonkeyPatch) -> None:

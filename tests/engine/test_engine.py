@@ -110,18 +110,6 @@ def test_an_unreadable_image_costs_its_pair_only(tmp_path):
     assert report.ending is Ending.COMPLETE
 
 
-def test_a_matcher_that_raises_costs_its_pair_that_unit_only(tmp_path):
-    def moody(brightness: int) -> int:
-        if brightness == 12:
-            raise RuntimeError("no mood")
-        return 150
-
-    report = run(write_pairs(tmp_path, 4), THREE_UNITS, RectifiedMatcher(matches=moody), tmp_path / "work")
-    assert [record.inliers > 400 for record in report.records] == [True, True, False, True]
-    assert {unit.failure for unit in report.records[2].units} == {"RuntimeError: no mood"}
-    assert "too few distinct matches" in report.records[2].failure
-
-
 @pytest.mark.parametrize(("limit", "ending"), [(5.0, Ending.TIME_IS_UP), (math.inf, Ending.INTERRUPTED)])
 def test_a_unit_that_never_returns_holds_the_run_neither_past_its_limit_nor_after_an_interrupt(
     tmp_path, limit, ending

@@ -185,13 +185,6 @@ def test_what_a_jobs_own_deadline_cut_off_is_planned_again():
     assert plan.next(7.0).units == (SECOND,)
 
 
-def test_a_pair_whose_image_cannot_be_read_gets_no_further_job():
-    plan = plan_of(1)
-    plan.on_result(plan.next(0.0), [Outcome(0, failure="the file is empty")])
-    assert plan.next(1.0) is None
-    assert plan.is_complete
-
-
 @pytest.mark.parametrize(
     ("limit", "fit"), [(math.inf, "there is no time limit"), (120.0, "2 of 3 units fit in the")]
 )
@@ -236,15 +229,6 @@ def test_pairs_for_the_scenes_alone_take_a_tenth_of_the_time_left_at_most():
     assert plan.is_complete
 
 
-def test_other_devices_try_what_was_skipped():
-    plan = plan_of(4)
-    list(jobs_of(plan, lambda job: DIED if SECOND in job.units else None))
-    assert plan.unusable[1]
-    plan.restart()
-    assert all(units == (SECOND,) for units in (job.units for job in jobs_of(plan)))
-    assert plan.is_complete
-
-
 # The engine on a virtual clock
 
 
@@ -265,7 +249,7 @@ def test_more_time_never_means_fewer_units():
 
 
 def test_random_runs_are_never_late_never_lose_a_row_and_use_their_time():
-    runs = [without_records(simulate(random_scenario(seed, pairs=150))) for seed in range(12)]
+    runs = [without_records(simulate(random_scenario(seed, pairs=150))) for seed in range(8)]
     assert max(run.late for run in runs) == 0
     assert sum(run.lost for run in runs) == 0
     fit = [run for run in runs if run.scenes_fit]
@@ -300,7 +284,7 @@ def test_a_mechanism_that_is_off_costs_units_or_scenes(monkeypatch, mechanism):
 
 def test_planning_a_job_does_not_take_much_longer_for_many_pairs():
     seconds_per_pair = []
-    for count in (200, 2_000):
+    for count in (100, 1_000):
         start = time.thread_time()  # whatever else the machine does
         simulate(Scenario(count, (0.1, 0.5, 0.5), 2, count))
         seconds_per_pair.append((time.thread_time() - start) / count)
@@ -324,7 +308,7 @@ def test_a_scene_that_hangs_is_ended_and_the_others_have_their_turn():
     assert any("the worker hung" in fault for fault in ran.report.faults)
 
 
-@pytest.mark.parametrize("moment", range(50, 1050, 200))
+@pytest.mark.parametrize("moment", [50, 450, 850])
 def test_a_run_killed_at_any_moment_leaves_no_scene_out_of_date_when_it_resumes(moment):
     scenario = Scenario(300, (0.5, 1.0), 1, 3600.0, batches=3, pairs_per_image=1.0, misses=0)
     journal = memory_journal()
@@ -368,7 +352,7 @@ def test_scenes_that_never_begin_are_named_and_the_run_ends(monkeypatch):
 
 
 def done_scenario(**changes):
-    return Scenario(200, (0.5, 1.0), 2, 3600.0, batches=4, pairs_per_image=1.5, **changes)
+    return Scenario(100, (0.5, 1.0), 2, 3600.0, batches=4, pairs_per_image=1.5, **changes)
 
 
 @pytest.mark.parametrize("faults", [0.0, 0.2])
@@ -380,6 +364,6 @@ def test_another_estimation_runs_no_unit_and_makes_every_f_and_scene_again(fault
     assert other.report.ending is Ending.COMPLETE and other.late == 0
     assert other.report.units_run == 0
     assert other.stale == set()
-    assert other.report.estimated == 200 or faults
+    assert other.report.estimated == 100 or faults
     back = simulate(done_scenario(), journal)
     assert (back.report.units_run, back.report.estimated, len(back.scenes)) == (0, 0, 0), "both are in the journal"

@@ -170,10 +170,11 @@ def test_a_run_that_goes_on_reconstructs_only_the_batch_whose_image_was_replaced
     assert matrices(again) == own_matrices(pairs, tmp_path / "alone")
 
 
-def test_a_scene_that_was_lost_is_tried_again_by_the_next_run(tmp_path, monkeypatch):
+def test_a_scene_that_was_lost_is_named_and_tried_again_by_the_next_run(tmp_path, monkeypatch):
     scenes_by(monkeypatch, partial(befall, lack_an_image))
     pairs = batch_pairs(tmp_path / "images")
-    run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
+    lost = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
+    assert "  one: the worker failed: KeyError: 'image 7'" in summary(pairs, lost).splitlines()
     scenes_by(monkeypatch, choose_scene_for_all_but_the_first)
     matcher = RectifiedMatcher()
     again = run(pairs, RECIPE, matcher, tmp_path / "work")
@@ -197,10 +198,3 @@ def test_a_model_that_no_table_can_hold_costs_its_scene_alone(tmp_path, monkeypa
     assert [record.source for record in report.records] == ["pair"] * 6
     scenes_by(monkeypatch, choose_scene_for_all_but_the_first)
     assert run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work").faults == ()
-
-
-def test_the_summary_names_a_batch_without_a_scene(tmp_path, monkeypatch):
-    scenes_by(monkeypatch, partial(befall, lack_an_image))
-    pairs = batch_pairs(tmp_path / "images")
-    report = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
-    assert "  one: the worker failed: KeyError: 'image 7'" in summary(pairs, report).splitlines()

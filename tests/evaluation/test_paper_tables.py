@@ -1,6 +1,5 @@
 """The paper's tables in one command."""
 
-import argparse
 from dataclasses import replace
 
 import numpy as np
@@ -8,7 +7,6 @@ from pair_lists import write_list
 
 from benchmarks import paper_tables
 from mkpc_kaggle.data.competition import read_train_side
-from mkpc_kaggle.recipe import load_recipe
 
 
 def test_the_papers_tables_are_made_with_one_command(demo, tmp_path, capsys):
@@ -27,14 +25,3 @@ def test_the_papers_tables_are_made_with_one_command(demo, tmp_path, capsys):
     np.testing.assert_allclose(np.array(yfcc[5][7:10], float), (own - published).mean(axis=0), atol=0.006)
     assert imc[2][0] == "loftr"
     assert imc[2][3:] == ["0.75478", "0.75606", "1"]
-
-
-def test_the_rows_of_the_papers_tables_have_their_sizes_and_the_best_is_the_recipe():
-    given = argparse.Namespace(matcher=None, protocol="none")
-    for table, count in (("yfcc", 16), ("scannet", 8)):
-        rows = paper_tables.TABLES[table]
-        assert len(rows) == count
-        best = paper_tables.recipe_of(table, *rows[-1][:2], given)
-        assert {unit.name for unit in best.units} == {unit.name for unit in load_recipe(table).units}
-    (stretched,) = paper_tables.recipe_of("scannet", "640x480", "ransac", given).units
-    assert stretched.name == "1:superglue@480x640!"

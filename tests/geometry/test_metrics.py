@@ -1,6 +1,6 @@
 """The scores, against answers known by construction or by hand."""
 
-from math import inf, isnan, nan
+from math import inf, isnan
 
 import cv2
 import numpy as np
@@ -146,9 +146,3 @@ def test_matches_are_correct_within_superglues_distance_of_both_epipolar_lines()
     cameras = Camera(K, np.eye(3), np.zeros(3)), Camera(K, np.eye(3), np.array([1.0, 0, 0]))
     matches = Matches(np.array([(5, 0), (5, 0), (5, 0)]), np.array([(90, 12.6), (7, -12.7), (0, 0)]), np.ones(3))
     assert metrics.correct_matches(matches, *cameras).tolist() == [True, False, True]
-
-
-def test_a_pose_error_is_printed_in_metres_where_the_scale_is_known():
-    told = [str(error) for error in (PoseError(1.5, 2, 0.25), PoseError(1.5, 2, nan), PoseError.failed())]
-    off = "rotation 1.5 degrees off, translation"
-    assert told == [f"{off} 0.25 m", f"{off} 2.0 degrees", "no pose"]

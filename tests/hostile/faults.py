@@ -21,9 +21,9 @@ def load(weights, options, placement):
     return Faulty(options, placement.device)
 """
 FAULTS = {  # and a part of the output
+    "prints bytes": ("sys.stdout.reconfigure(); sys.stdout.buffer.write(b'arrived\\n')", "arrived"),
     "ends its process": ("os._exit(3)", "2 units run"),
     "meets an illegal instruction": ("os.kill(os.getpid(), signal.SIGILL)", "2 units run"),
-    "prints bytes": ("sys.stdout.reconfigure(); sys.stdout.buffer.write(b'arrived\\n')", "arrived"),
     "prints no text": ("sys.stdout.write(b'x')", "TypeError: write() argument must be str, not bytes (2 pairs)"),
 }
 ENV = {"PYTHONPATH": f"lib:{ROOT}"}

@@ -9,7 +9,6 @@ from pathlib import Path
 
 from attack import EITHER, Case, Make, nothing
 from ends import ENDS, STATUSES, sends
-from outputs import mine
 from room import IMAGES_TO, RECIPE, RECONSTRUCT, encoded, makes, options, picture, resumed, write_images
 
 OUTS = {
@@ -19,14 +18,6 @@ OUTS = {
     "below /proc": "/proc/o",
     "in no name": "''",
     "in 300 characters": f"out/{'o' * 300}",
-}
-IN_THE_WAY = {  # of results in the folder P of the user
-    "database.db of the user's": lambda folder: mine(folder / "database.db"),
-    "a journal of the user's": lambda folder: [folder.mkdir(), mine(folder / "work" / "journal.sqlite")],
-    "a mark that is none": lambda folder: [folder.mkdir(), mine(folder / "work" / "results.json")],
-    "a link to the images": lambda folder: [folder.mkdir(), (folder / "work").symlink_to("../I")],
-    "a link to itself": lambda folder: folder.symlink_to("P"),
-    "a pipe": os.mkfifo,
 }
 GOOD_NAMES = {
     "hidden": b".thumbnails",
@@ -90,7 +81,6 @@ def names(table: dict[str, bytes]) -> dict[str, Make]:
 TO_TABLES = f"{RECONSTRUCT} --format imc2025"
 CASES = [
     *options("folders", IMAGES_TO, {f"results {where}": out for where, out in OUTS.items()}),
-    *makes("folders", f"{IMAGES_TO} P --fresh", below("P", IN_THE_WAY)),
     *makes("folders", TO_TABLES, names(BAD_NAMES)),
     *makes("folders", TO_TABLES, names(GOOD_NAMES), (0,)),
     *makes("folders", TO_TABLES, below("I", ALIKE)),

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import ends
 import faults
-import fetches
 import files
 import folders
 import images
@@ -16,7 +15,7 @@ import weight_bombs
 from attack import attack
 from room import write_template
 
-SOURCES = (files, images, outputs, ends, faults, weight_bombs, fetches, folders, unread)
+SOURCES = (files, images, outputs, ends, faults, weight_bombs, folders, unread)
 ALL = [case for source in SOURCES for case in source.CASES]
 QUICK = {case.group: case for case in reversed(ALL)}.values()  # the first of each group runs with the other tests
 MARKED = [pytest.param(case, id=case.id, marks=() if case in QUICK else pytest.mark.slow) for case in ALL]

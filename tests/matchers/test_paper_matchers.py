@@ -47,7 +47,8 @@ def test_odd_small_and_blank_pictures_go_through(clean_environment, monkeypatch,
     monkeypatch.setattr(LomaAdapter, "threshold", 0.0)
     sizes, options = TRIALS[matcher]
     units = [f'{{ stage = {n}, matcher = "{matcher}", {size} }}' for n, size in enumerate(sizes, start=1)]
-    (tmp_path / "r.toml").write_text(f"units = [{', '.join(units)}]\n[matchers.{matcher}]\n{options}")
+    magsac = "[magsac]\npermutations = 1\nmax_iterations = 2000"
+    (tmp_path / "r.toml").write_text(f"units = [{', '.join(units)}]\n[matchers.{matcher}]\n{options}\n{magsac}")
     output, given = tmp_path / "out.csv", ("--recipe", tmp_path / "r.toml", "--weights", tmp_path)
     options = ("--test-dir", test_dir, "--output", output, *given, "--device", "cpu", "--workers", 0)
     assert run_command("submit", "--no-report", *options) == 0

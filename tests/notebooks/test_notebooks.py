@@ -7,6 +7,7 @@ from pathlib import Path
 import nbformat
 from kaggle_image import environment
 from offline_notebook import execute, needs_namespaces, outputs, pictures, printed, with_pictures_alone
+from shared import write_recipe
 
 ROOT = Path(__file__).resolve().parents[2]
 TOUR = ROOT / "notebooks" / "mkpc_tour.ipynb"
@@ -24,7 +25,9 @@ def figures_of(notebook: nbformat.NotebookNode) -> int:
 
 @needs_namespaces
 def test_the_tour_runs_on_a_train_side_without_a_network(demo, tmp_path):
+    recipe = write_recipe(tmp_path / "tour.toml", (1, 480), (2, 640), more="[magsac]\npermutations = 1\n[scene]")
     variables = environment(
+        MKPC_RECIPE=str(recipe),
         PYTHONPATH=PATHS,
         MKPC_TRAIN_DIR=str(demo.train_dir),
         MKPC_PAIR="courtyard;courtyard_0006-courtyard_0001",

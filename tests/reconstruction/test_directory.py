@@ -61,7 +61,7 @@ def test_a_link_or_a_file_of_the_users_in_the_place_of_a_result_is_refused(tmp_p
     assert files_of(tmp_path) == before
 
 
-@pytest.mark.parametrize("name", ["notes.txt", "work/journal.sqlite", "link"])
+@pytest.mark.parametrize("name", ["notes.txt", "work/journal.sqlite", "work/results.json", "database.db", "link"])
 def test_a_directory_that_is_neither_empty_nor_ours_is_refused(tmp_path, name):
     write(tmp_path / "out", [name])
     if name == "link":

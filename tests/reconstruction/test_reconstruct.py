@@ -20,7 +20,7 @@ from pair_lists import turned_camera
 from rectified import Seen, flat, number_of
 from shared import run_command
 from sklearn.datasets import load_sample_image
-from synthetic import SyntheticMatcher
+from synthetic import QUICK, SyntheticMatcher
 
 from benchmarks.synthetic_scene import SIZE, SyntheticScene, synthetic_scene
 from mkpc_kaggle import reconstruct
@@ -39,7 +39,7 @@ from mkpc_kaggle.reconstruction.run import FolderResult, for_cameras, reconstruc
 from mkpc_kaggle.scene.likeness import local_features, most_alike, shortlist
 from mkpc_kaggle.scene.reconstruction import RegisteredImage
 
-RECIPE = for_cameras(Recipe((Unit(1, "synthetic", SIZE.width),)))
+RECIPE = for_cameras(Recipe((Unit(1, "synthetic", SIZE.width),), magsac=QUICK))
 FIRST, SECOND, OTHERS = 6, 4, 1  # images of two scenes, and of none
 
 
@@ -280,7 +280,7 @@ class UprightSift(SyntheticMatcher):
     """SIFT that takes every keypoint for upright, so that it knows no turned image again."""
 
     def encode(self, pictures):
-        sift, found = cv2.SIFT_create(3000), []
+        sift, found = cv2.SIFT_create(1000), []
         for picture in pictures:
             gray = cv2.cvtColor(picture.pixels, cv2.COLOR_RGB2GRAY)
             keypoints = sift.detect(gray, None)

@@ -92,9 +92,17 @@ def test_an_export_that_cannot_be_written_is_refused(tmp_path, capsys):
     assert "has no journal.sqlite" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    "make", [lambda path: path.write_text("mine"), lambda path: path.symlink_to("../journal.sqlite"), os.mkfifo]
-)
+MINE = {
+    "a table": lambda path: path.write_text("mine"),
+    "a link to the journal": lambda path: path.symlink_to("../journal.sqlite"),
+    "a link to nothing": lambda path: path.symlink_to("nothing"),
+    "a device": lambda path: path.symlink_to("/dev/zero"),
+    "a pipe": os.mkfifo,
+    "a directory": Path.mkdir,
+}
+
+
+@pytest.mark.parametrize("make", MINE.values(), ids=MINE)
 def test_an_export_replaces_nothing_but_its_own_tables(tmp_path, make, capsys):
     empty_journal(tmp_path, []).close()
     (tmp_path / "csv").mkdir()

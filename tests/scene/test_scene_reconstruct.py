@@ -2,7 +2,6 @@
 
 import pickle
 import sys
-import tempfile
 from dataclasses import replace
 
 import numpy as np
@@ -158,10 +157,3 @@ def test_a_missing_or_broken_pycolmap_is_a_reason(scene, monkeypatch, is_missing
     told = "pycolmap cannot be imported" if is_missing else "pycolmap failed: disk I/O error"
     assert told in solution.reconstructions[0].failure
     assert {choice.reason for choice in solution.choices} == {Reason.UNREGISTERED}
-
-
-def test_nothing_is_written_to_disk(scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    monkeypatch.chdir(tmp_path)
-    assert reconstruct_batch(scene.pairs, SceneConfig()).choices[0].from_scene
-    assert list(tmp_path.iterdir()) == []

@@ -41,3 +41,8 @@ def write_recipe(path: Path, *units: tuple[int, int], more: str = "") -> Path:
     texts = [f'{{ stage = {stage}, matcher = "sift", long_side = {side} }}' for stage, side in units]
     path.write_text(f"units = [{', '.join(texts)}]\n{more}")
     return path
+
+
+def write_small_recipe(directory: Path) -> Path:
+    magsac = "[magsac]\npermutations = 1\nmax_iterations = 5000\n"
+    return write_recipe(directory / "small.toml", (1, 320), (2, 400), more=magsac)

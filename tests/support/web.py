@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from socketserver import BaseRequestHandler, TCPServer, ThreadingTCPServer
 
 
 @dataclass
@@ -61,13 +62,31 @@ class _Handler(BaseHTTPRequestHandler):
 
 @contextmanager
 def serve(site: Site) -> Iterator[Site]:
-    handler = type("Handler", (_Handler,), {"site": site})
-    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+    with _running(ThreadingHTTPServer(("127.0.0.1", 0), type("Handler", (_Handler,), {"site": site}))) as site.url:
+        yield site
+
+
+@contextmanager
+def serve_bytes(answer: bytes) -> Iterator[str]:
+    """Give each connection the same answer, which may be no HTTP. Yield the URL."""
+
+    class Handler(BaseRequestHandler):
+        def handle(self) -> None:
+            self.request.recv(65536)
+            with suppress(OSError):
+                self.request.sendall(answer)
+
+    with _running(ThreadingTCPServer(("127.0.0.1", 0), Handler)) as url:
+        yield url
+
+
+@contextmanager
+def _running(server: TCPServer) -> Iterator[str]:
+    with server:
         thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
         thread.start()
-        site.url = f"http://127.0.0.1:{server.server_address[1]}/a.bin"
         try:
-            yield site
+            yield f"http://127.0.0.1:{server.server_address[1]}/a.bin"
         finally:
             server.shutdown()
             thread.join()

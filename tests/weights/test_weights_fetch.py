@@ -1,11 +1,12 @@
 """Downloads against a local server: whole, broken off, resumed, wrong, impossible."""
 
+import os
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from web import Site, serve
+from web import Site, serve, serve_bytes
 from weight_files import DATA, digest_of, line, put
 
 from mkpc_kaggle.weights import UNVERIFIED, WeightFile, fetch
@@ -117,6 +118,39 @@ def test_no_more_bytes_are_taken_than_the_manifest_has(site, tmp_path):
     assert failed.outcome is FetchOutcome.FAILED
     assert f"more than {len(BIG)} bytes" in failed.note
     assert sum(path.stat().st_size for path in tmp_path.iterdir()) <= len(BIG)
+
+
+OK = b"HTTP/1.1 200 OK\r\n"
+ANSWERS = {
+    "noise": b"\x80\xff" * 5000,
+    "a head of 10 MB": OK + b"A: " + b"x" * 10_000_000,
+    "a chunk of 2^100": OK + b"Transfer-Encoding: chunked\r\n\r\n1" + b"0" * 25 + b"\r\n" + BIG,
+    "a redirection to itself": b"HTTP/1.1 302 Found\r\nLocation: /a.bin\r\n\r\n",
+}
+
+
+@pytest.mark.parametrize("answer", ANSWERS.values(), ids=ANSWERS)
+def test_a_server_that_lies_or_wanders_is_a_failure(monkeypatch, tmp_path, answer):
+    monkeypatch.setenv("no_proxy", "127.0.0.1")
+    with serve_bytes(answer) as url:
+        failed = fetch.fetch(replace(line(), source=url), tmp_path, wait=lambda _: None)
+    assert failed.outcome is FetchOutcome.FAILED
+    assert not failed.path.exists()
+
+
+PARTS = {
+    "a link": lambda path: path.symlink_to("precious"),
+    "a pipe": os.mkfifo,
+    "too many bytes": lambda path: path.write_bytes(BIG * 2),
+}
+
+
+@pytest.mark.parametrize("make", PARTS.values(), ids=PARTS)
+def test_what_is_not_the_part_is_replaced(site, tmp_path, make):
+    put(tmp_path, "precious")
+    make(tmp_path / "a.bin.part")
+    assert get(site, tmp_path).outcome is FetchOutcome.FETCHED
+    assert (tmp_path / "precious").read_bytes() == DATA
 
 
 SOURCES = ["https://drive.google.com/file/d/1", "a.ckpt of a.tar, https://x.org/a.tar", "ftp://x/a", "file:///a"]

@@ -143,24 +143,6 @@ def test_a_manifest_that_cannot_be_read_is_passed_over(tmp_path, text):
         assert WeightStore([tmp_path]).files
 
 
-def test_verify_tells_good_truncated_swapped_renamed_and_unverified_files_apart(tmp_path):
-    contents = {name: name.encode() * 9 for name in ("good", "cut", "swapped", "lost")}
-    files = [line(f"{name}.pt", data) for name, data in contents.items()]
-    files.append(line("free.pt", size=-1, digest=UNVERIFIED))
-    contents |= {"cut": contents["cut"][:-1], "swapped": contents["good"], "free": b"free"}
-    for name in ("good", "cut", "swapped", "free"):
-        put(tmp_path, f"{name}.pt", contents[name])
-    put(tmp_path, "renamed.pt", contents["lost"])
-    put(tmp_path, "none of ours.pt", b"?")
-    checked = {file.path.name: (file.state, file.note) for file in WeightStore([tmp_path], files).verify()}
-    states = {"good.pt": State.GOOD, "cut.pt": State.REFUSED, "swapped.pt": State.REFUSED}
-    states |= {"renamed.pt": State.GOOD, "free.pt": State.UNVERIFIED}
-    assert {name: state for name, (state, _) in checked.items()} == states
-    assert checked["swapped.pt"][1] == "it has the bytes of good.pt"
-    assert checked["renamed.pt"][1] == "it is lost.pt"
-    assert digest_of(b"free") in checked["free.pt"][1]
-
-
 SHA256 = "sha256:" + "0f" * 32
 
 
