@@ -84,5 +84,5 @@ class State:
             self.matches[position] += matches
         for position, F, inliers, failure, is_current in self.journal.estimated(positions):
             self.own[position], self.has_own[position] = matrix_of(F), not failure
-            self.inliers[position] = sum(map(int, inliers.split()))
+            self.inliers[position] = inliers or 0
             self.is_estimated[position] = is_current

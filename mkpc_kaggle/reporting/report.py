@@ -6,13 +6,11 @@ Drawings need matplotlib, and pictures of pairs need the images. The page states
 import base64
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from statistics import median
-from typing import TYPE_CHECKING
-
-import pandas as pd
+from typing import TYPE_CHECKING, TypeAlias
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.data.images import Image
@@ -20,11 +18,21 @@ from mkpc_kaggle.data.outputs import replacing
 from mkpc_kaggle.engine.budget import format_duration
 from mkpc_kaggle.engine.journal_reader import EventKind
 from mkpc_kaggle.errors import UserError, printable, writing
-from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
 from mkpc_kaggle.pipeline.two_stage import to_image
 from mkpc_kaggle.reporting.figures import draw_cameras, draw_pair, draw_strip, encode
 from mkpc_kaggle.reporting.run_log import RunLog, WeakPair, read_log
-from mkpc_kaggle.reporting.summary import headline, left_out_line, trouble, weakest_cameras
+from mkpc_kaggle.reporting.summary import (
+    facts,
+    headline,
+    left_out_line,
+    seconds_by_part,
+    trouble,
+    unit_means,
+    unit_reasons,
+    weakest_cameras,
+)
+
+Table: TypeAlias = tuple[Sequence[str], Sequence[Sequence[object]]]  # heads, rows
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -79,14 +87,14 @@ def report_page(log: RunLog, pairs: Sequence[Pair] = (), *, undrawn: str = "") -
     pages = Environment(loader=PackageLoader("mkpc_kaggle.reporting"), autoescape=True, undefined=StrictUndefined)
     return pages.get_template("report.html").render(
         log=log,
-        verdict=headline(log.tables, log),
+        verdict=headline(log),
         trouble=trouble(log),
-        facts=[*_facts(log)],
+        facts=[*facts(log), _time(log)],
         left_out=left_out_line(log.about.left_out),
         faults=_events(log, EventKind.FAULT),
         failures=_failures(log),
-        unit_failures=pd.DataFrame({"units that failed": log.tables.unit_reasons()}),
-        weakest=[_weak(log, weak, sources) for weak in log.weakest],
+        unit_failures=(["units that failed"], [(reason,) for reason in unit_reasons(log)]),
+        weakest=[_weak(weak, sources) for weak in log.weakest],
         scenes=_scenes(log),
         cameras=[
             (f"{scene.batch}, model {number}", _data_uri(draw_cameras(scene, number), "png"))
@@ -100,46 +108,30 @@ def report_page(log: RunLog, pairs: Sequence[Pair] = (), *, undrawn: str = "") -
     )
 
 
-def _facts(log: RunLog) -> Iterator[tuple[str, str, str]]:
-    """Yield the most important facts: name, value, remark."""
-    solved, sources = log.tables.solved, log.tables.pairs["source"].value_counts()
-    parts = (("scene", "from scenes"), ("pair", "from their own matches"), ("fallback", "fallback"))
-    from_where = ", ".join(f"{sources[source]} {what}" for source, what in parts if source in sources)
-    yield "pairs with an F", f"{len(solved)} of {len(log.pairs)}", from_where
-    if len(solved):
-        least = f"median of a pair, at least {solved['inliers'].min()}"
-        yield "inliers", f"{solved['inliers'].median():.0f}", least
-        threshold = f"supported {MIN_SUPPORT:g} times as well as by chance"
-        yield "pairs that show the same", f"{solved['overlaps'].sum()} of {len(solved)}", threshold
+def _time(log: RunLog) -> tuple[str, str, str]:
+    """Return the time of the last session as a fact."""
     limit = f"of {format_duration(log.about.limit)}" if log.about.limit is not None else "no time limit"
     sessions = sum(event.kind == EventKind.START for event in log.events)
-    yield "time", format_duration(log.seconds), limit + (f", session {sessions}" if sessions > 1 else "")
-    reasons = log.tables.regions["reason"]
-    if len(reasons):
-        cropped = f"{sum(reasons == 'cropped')} of {len(reasons)}"
-        yield "critical regions", cropped, ", ".join(log.tables.region_reasons)
-    if log.scenes:
-        placed, images = (sum(getattr(scene, name) for scene in log.scenes) for name in ("registered", "images"))
-        yield "images with a camera", f"{placed} of {images}", f"in {len(log.scenes)} batches"
+    return "time", format_duration(log.seconds), limit + (f", session {sessions}" if sessions > 1 else "")
 
 
-def _events(log: RunLog, kind: EventKind) -> pd.DataFrame:
+def _events(log: RunLog, kind: EventKind) -> Table:
     rows = [(format_duration(event.seconds), event.text) for event in log.events if event.kind == kind]
-    return pd.DataFrame(rows, columns=["when", kind.value])
+    return ["when", kind.value], rows
 
 
-def _failures(log: RunLog) -> list[pd.DataFrame]:
+def _failures(log: RunLog) -> list[Table]:
     """Return a table of reasons for pairs without an F, if pairs share reasons, and a table of these pairs."""
-    failed = log.tables.failed[["id", "group", "failure"]]
-    counts = failed["failure"].value_counts()
-    reasons = pd.DataFrame({"pairs with the fallback row": counts, "reason": counts.index})
-    by_pair = failed.set_axis(["pair with the fallback row", "batch", "reason"], axis=1)
-    return [reasons, by_pair] if len(counts) < len(failed) else [by_pair]
+    failed = [(r.pair.id, r.pair.group, r.failure) for r in log.records if not r.is_solved]
+    reasons = Counter(reason for _, _, reason in failed)
+    counts = [(count, reason) for reason, count in reasons.most_common()]
+    by_pair = ["pair with the fallback row", "batch", "reason"], failed
+    return [(["pairs with the fallback row", "reason"], counts)] * (len(counts) < len(failed)) + [by_pair]
 
 
-def _weak(log: RunLog, weak: WeakPair, sources: dict[str, Pair]) -> tuple[str, str, str]:
+def _weak(weak: WeakPair, sources: dict[str, Pair]) -> tuple[str, str, str]:
     """Return a weak pair's picture, empty if it is not drawn, its counts and remarks, and its id."""
-    record, pair, picture = weak.record, log.pairs[weak.record.index], ""
+    record, pair, picture = weak.record, weak.record.pair, ""
     parts = [f"{record.inliers} inliers of {record.matches} matches", record.failure]
     parts.append("" if record.overlaps else f"may show different things: support {record.stats.support:.1f}")
     if record.source == "scene":
@@ -165,34 +157,27 @@ def _images(pair: Pair) -> tuple[Image, Image]:
     return first, second
 
 
-def _scenes(log: RunLog) -> list[pd.DataFrame]:
+def _scenes(log: RunLog) -> list[Table]:
     """Return three tables: reconstructed batches, why pairs have their F, and cameras, weakest first."""
-    pairs = log.tables.pairs
-    counts = pairs[pairs["source"] == "scene"].groupby("group").size()
+    counts = Counter(record.pair.group for record in log.records if record.source == "scene")
     rows = []
     for each in log.scenes:
         focals = [found.focal for model in each.models for found in model.images]
         spread = f"{median(focals):.0f} ({min(focals):.0f} to {max(focals):.0f})" if focals else ""
         placed = each.batch, each.images, each.registered, each.points, spread
-        rows.append((*placed, each.seconds, int(counts.get(each.batch, 0)), each.failure))
+        rows.append((*placed, each.seconds, counts[each.batch], each.failure))
     heads = ["batch", "images", "cameras", "points", "focals (px)", "seconds", "pairs with its F", "failure"]
     reasons = Counter(str(record.scene.reason) for record in log.records if record.scene is not None)
-    batches = pd.DataFrame(rows, columns=heads)
     cameras = [(name, 100 * of.centre, of.rotation, of.focal) for name, of in weakest_cameras(log.scenes)]
     sigmas = ["camera, weakest first", "error of its centre (%)", "rotation (deg)", "focal length (%)"]
-    return [
-        batches if batches["failure"].any() else batches.drop(columns="failure"),
-        pd.DataFrame(reasons.most_common(), columns=["which F a pair has", "pairs"]),
-        pd.DataFrame(cameras, columns=sigmas),
-    ]
+    return [(heads, rows), (["which F a pair has", "pairs"], reasons.most_common()), (sigmas, cameras)]
 
 
-def _costs(log: RunLog) -> list[pd.DataFrame]:
-    units = log.tables.unit_means.rename(columns={"unit": "unit (means)"})
-    units["seconds in all"] = units["pairs"] * units["seconds"]
-    parts = pd.DataFrame(log.tables.seconds_by_part.items(), columns=["part of the work", "seconds in all"])
-    parts["seconds a pair"] = parts["seconds in all"] / max(1, len(log.pairs))
-    return [units, parts] if len(units) else []
+def _costs(log: RunLog) -> list[Table]:
+    units = [(*means, means[1] * means[-1]) for means in unit_means(log)]
+    parts = [(name, total, total / len(log.records)) for name, total in seconds_by_part(log).items() if units]
+    heads = ["unit (means)", "pairs", "matches", "inliers", "seconds", "seconds in all"]
+    return [(heads, units), (["part of the work", "seconds in all", "seconds a pair"], parts)] if units else []
 
 
 def _data_uri(figure: "Figure", kind: str) -> str:

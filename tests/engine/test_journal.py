@@ -240,7 +240,7 @@ def read_all(directory: Path) -> None:
     with Journal(directory) as journal:
         want_about = journal.about()
         assert want_about.recipe == {"name": "x"}
-        journal.records(), journal.scenes(), journal.pairs(), journal.events()
+        journal.records(), journal.scenes(), journal.events()
         for position in range(2):
             journal.points(journal.inputs(position).values())
 
