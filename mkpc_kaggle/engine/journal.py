@@ -134,11 +134,11 @@ class Journal(JournalReader):
 
     # The state of the run
 
-    def twins(self) -> dict[int, tuple[int, ...]]:
-        """Return the positions of pairs that several rows name, by each of these positions."""
-        query = "SELECT group_concat(position) FROM wanted_pair GROUP BY pair HAVING count(*) > 1"
-        groups = self._read(lambda row: tuple(map(int, row[0].split(","))), query)
-        return {position: group for group in groups for position in group}
+    def twins(self, position: int) -> list[int]:
+        """Return the positions of all rows of a pair."""
+        query = """SELECT w.position FROM wanted_pair w JOIN wanted_pair asked ON asked.pair = w.pair
+            WHERE asked.position = ? ORDER BY w.position"""
+        return [twin for (twin,) in self._read(tuple, query, position)]
 
     def had(self, positions: Iterable[int] | None = None) -> list[sqlite3.Row]:
         """Return position, unit number and matches of the current points, for all pairs or for these."""

@@ -33,7 +33,6 @@ class State:
         self.own = np.tile(FALLBACK_FUNDAMENTAL, (count, 1, 1))
         self.by_scene: dict[int, NDArray[np.float64]] = {}
         self.changed: set[int] = set()
-        self._twins = journal.twins()
         self._read(None if count else ())
         self.read_choices()
 
@@ -55,7 +54,7 @@ class State:
 
     def refresh(self, positions: Iterable[int]) -> None:
         """Read these pairs again, and all rows of the same images."""
-        changed = {twin for position in positions for twin in self._twins.get(position, (position,))}
+        changed = {twin for position in positions for twin in self.journal.twins(position)}
         index = sorted(changed)
         self.had[index], self.matches[index], self.is_estimated[index] = False, 0, False
         self._read(index)

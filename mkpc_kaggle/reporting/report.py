@@ -17,10 +17,12 @@ from mkpc_kaggle.data.images import Image
 from mkpc_kaggle.data.outputs import replacing
 from mkpc_kaggle.engine.budget import format_duration
 from mkpc_kaggle.engine.journal_reader import EventKind
+from mkpc_kaggle.engine.records import PairRecord
 from mkpc_kaggle.errors import UserError, printable, writing
+from mkpc_kaggle.pipeline.pair import PairMatch
 from mkpc_kaggle.pipeline.two_stage import to_image
 from mkpc_kaggle.reporting.figures import draw_cameras, draw_pair, draw_strip, encode
-from mkpc_kaggle.reporting.run_log import RunLog, WeakPair, read_log
+from mkpc_kaggle.reporting.run_log import RunLog, read_log
 from mkpc_kaggle.reporting.summary import (
     facts,
     headline,
@@ -94,7 +96,7 @@ def report_page(log: RunLog, pairs: Sequence[Pair] = (), *, undrawn: str = "") -
         faults=_events(log, EventKind.FAULT),
         failures=_failures(log),
         unit_failures=(["units that failed"], [(reason,) for reason in unit_reasons(log)]),
-        weakest=[_weak(weak, sources) for weak in log.weakest],
+        weakest=[_weak(*weak, sources) for weak in log.weakest],
         scenes=_scenes(log),
         cameras=[
             (f"{scene.batch}, model {number}", _data_uri(draw_cameras(scene, number), "png"))
@@ -129,27 +131,27 @@ def _failures(log: RunLog) -> list[Table]:
     return [(["pairs with the fallback row", "reason"], counts)] * (len(counts) < len(failed)) + [by_pair]
 
 
-def _weak(weak: WeakPair, sources: dict[str, Pair]) -> tuple[str, str, str]:
+def _weak(record: PairRecord, match: PairMatch, sources: dict[str, Pair]) -> tuple[str, str, str]:
     """Return a weak pair's picture, empty if it is not drawn, its counts and remarks, and its id."""
-    record, pair, picture = weak.record, weak.record.pair, ""
+    pair, picture = record.pair, ""
     parts = [f"{record.inliers} inliers of {record.matches} matches", record.failure]
     parts.append("" if record.overlaps else f"may show different things: support {record.stats.support:.1f}")
     if record.source == "scene":
         parts.append("F is the scene's")
     if pair.id in sources:
         try:
-            picture = _data_uri(draw_strip(_images(sources[pair.id]), weak.match), "jpeg")
+            picture = _data_uri(draw_strip(_images(sources[pair.id]), match), "jpeg")
         except UserError:
             parts.append("an image cannot be read any more")
     return picture, "; ".join(filter(None, parts)), pair.id
 
 
-def weak_figure(log: RunLog, weak: WeakPair, source: Pair) -> "Figure":
+def weak_figure(log: RunLog, match: PairMatch, source: Pair) -> "Figure":
     """Draw the matches, clusters and critical regions of a weak pair, from the journal.
 
     ``source`` is the pair with its image paths. Raises :class:`UserError` for an unreadable image.
     """
-    return draw_pair(*_images(source), weak.match, log.recipe.mkpc)
+    return draw_pair(*_images(source), match, log.recipe.mkpc)
 
 
 def _images(pair: Pair) -> tuple[Image, Image]:

@@ -29,21 +29,13 @@ OTHERS = ("focal0", "focal1", *(f"f{row}{column}" for row in "123" for column in
 
 
 @dataclass(frozen=True, eq=False)
-class WeakPair:
-    """A pair with few inliers, with its matches and its F by MAGSAC."""
-
-    record: PairRecord
-    match: PairMatch
-
-
-@dataclass(frozen=True, eq=False)
 class RunLog:
     path: Path  # of the journal
     about: About
     recipe: Recipe
     records: tuple[PairRecord, ...]  # of each pair, in order
     events: tuple[Event, ...]  # of all sessions
-    weakest: tuple[WeakPair, ...]  # of the pairs that were matched, the fewest inliers first
+    weakest: tuple[tuple[PairRecord, PairMatch], ...]  # matched pairs with F by MAGSAC, the fewest inliers first
     scenes: tuple[SceneRecord, ...] = ()
 
     @property
@@ -79,14 +71,14 @@ def read_log(directory: Path) -> RunLog:
         touched = sorted((record for record in records if record.units), key=lambda r: (r.inliers, r.index))
         units = {unit.name: unit for unit in recipe.units}
 
-        def weak(record: PairRecord) -> WeakPair:
+        def weak(record: PairRecord) -> tuple[PairRecord, PairMatch]:
             inputs, F = journal.inputs(record.index), record.pair_fundamental
             points = journal.points(inputs.values())
             results = tuple(UnitResult(units[name], points[inputs[name]]) for name in inputs)
             distances = sampson_distances(F, Matches.concatenate(points.values()))
             inliers = (distances < recipe.magsac.threshold) & (not record.failure)
             estimate = Estimate(ModelKind.F, F, inliers, record.failure)
-            return WeakPair(record, PairMatch(results, record.regions, estimate))
+            return record, PairMatch(results, record.regions, estimate)
 
         weakest, scenes = tuple(map(weak, touched[:MAX_DRAWN_PAIRS])), tuple(journal.scenes().values())
         return RunLog(journal.path, about, recipe, records, journal.events(), weakest, scenes)

@@ -62,7 +62,7 @@ def test_pairs_get_the_f_of_their_scene_and_keep_their_own(tmp_path, monkeypatch
     assert "weakest cameras, with the error of the centre: 3.png (3 %), 2.png (2 %), 1.png (1 %)" in overview(log)
     assert report_page(log).index("3.png</td>") < report_page(log).index("2.png</td>")
     assert "both cameras are known" in report_page(log)
-    assert all(len(weak.match.results[0].matches) for weak in log.weakest), "what is drawn keeps its points"
+    assert all(len(match.results[0].matches) for _, match in log.weakest), "what is drawn keeps its points"
 
 
 def test_a_focal_length_of_exif_goes_to_the_pairs_the_journal_and_the_scene(tmp_path, monkeypatch):

@@ -126,10 +126,8 @@ def test_the_weakest_pairs_are_drawn_with_the_inliers_that_magsac_found(tmp_path
     a_run(tmp_path)
     log = read_log(tmp_path / "work")
     assert len(log.weakest) == 11
-    for weak in log.weakest:
-        match = weak.match
-        assert len(match.matches) == weak.record.matches
-        assert match.estimate.inlier_count == weak.record.inliers
+    for record, match in log.weakest:
+        assert (len(match.matches), match.estimate.inlier_count) == (record.matches, record.inliers)
 
 
 def test_what_comes_from_files_is_escaped(tmp_path):
