@@ -6,17 +6,16 @@ Drawings need matplotlib, and pictures of pairs need the images. The page states
 import base64
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from statistics import median
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.data.images import Image
 from mkpc_kaggle.data.outputs import replacing
 from mkpc_kaggle.engine.budget import format_duration
-from mkpc_kaggle.engine.journal_reader import EventKind
 from mkpc_kaggle.engine.records import PairRecord
 from mkpc_kaggle.errors import UserError, printable, writing
 from mkpc_kaggle.pipeline.pair import PairMatch
@@ -33,8 +32,6 @@ from mkpc_kaggle.reporting.summary import (
     unit_reasons,
     weakest_cameras,
 )
-
-Table: TypeAlias = tuple[Sequence[str], Sequence[Sequence[object]]]  # heads, rows
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -86,49 +83,34 @@ def report_page(log: RunLog, pairs: Sequence[Pair] = (), *, undrawn: str = "") -
         undrawn = "matplotlib is not installed: pip install 'mkpc-kaggle[plots]'"
     sources = {} if undrawn else {pair.id: pair for pair in pairs}
     largest = sorted((s for s in log.scenes if s.registered), key=lambda scene: -scene.registered)[:MAX_SCENES]
+    failed = [
+        (record.pair.id, record.pair.group, record.failure) for record in log.records if not record.is_solved
+    ]
     pages = Environment(loader=PackageLoader("mkpc_kaggle.reporting"), autoescape=True, undefined=StrictUndefined)
     return pages.get_template("report.html").render(
         log=log,
+        duration=format_duration,
         verdict=headline(log),
         trouble=trouble(log),
-        facts=[*facts(log), _time(log)],
+        facts=facts(log),
         left_out=left_out_line(log.about.left_out),
-        faults=_events(log, EventKind.FAULT),
-        failures=_failures(log),
-        unit_failures=(["units that failed"], [(reason,) for reason in unit_reasons(log)]),
+        failed=failed,
+        failures=Counter(reason for *_, reason in failed).most_common(),
+        unit_failures=[(reason,) for reason in unit_reasons(log)],
         weakest=[_weak(*weak, sources) for weak in log.weakest],
-        scenes=_scenes(log),
+        scenes=[*_scenes(log)],
+        choices=Counter(str(record.scene.reason) for record in log.records if record.scene).most_common(),
+        sigmas=[(name, 100 * of.centre, of.rotation, of.focal) for name, of in weakest_cameras(log.scenes)],
         cameras=[
             (f"{scene.batch}, model {number}", _data_uri(draw_cameras(scene, number), "png"))
             for scene in ([] if undrawn else largest)
             for number in range(min(len(scene.models), MAX_MODELS))
         ],
-        costs=_costs(log),
-        plans=_events(log, EventKind.PLAN),
+        units=[(*means, means[1] * means[-1]) for means in unit_means(log)],
+        parts=[(name, total, total / len(log.records)) for name, total in seconds_by_part(log).items() if total],
         undrawn=undrawn,
         max_rows=MAX_ROWS,
     )
-
-
-def _time(log: RunLog) -> tuple[str, str, str]:
-    """Return the time of the last session as a fact."""
-    limit = f"of {format_duration(log.about.limit)}" if log.about.limit is not None else "no time limit"
-    sessions = sum(event.kind == EventKind.START for event in log.events)
-    return "time", format_duration(log.seconds), limit + (f", session {sessions}" if sessions > 1 else "")
-
-
-def _events(log: RunLog, kind: EventKind) -> Table:
-    rows = [(format_duration(event.seconds), event.text) for event in log.events if event.kind == kind]
-    return ["when", kind.value], rows
-
-
-def _failures(log: RunLog) -> list[Table]:
-    """Return a table of reasons for pairs without an F, if pairs share reasons, and a table of these pairs."""
-    failed = [(r.pair.id, r.pair.group, r.failure) for r in log.records if not r.is_solved]
-    reasons = Counter(reason for _, _, reason in failed)
-    counts = [(count, reason) for reason, count in reasons.most_common()]
-    by_pair = ["pair with the fallback row", "batch", "reason"], failed
-    return [(["pairs with the fallback row", "reason"], counts)] * (len(counts) < len(failed)) + [by_pair]
 
 
 def _weak(record: PairRecord, match: PairMatch, sources: dict[str, Pair]) -> tuple[str, str, str]:
@@ -159,27 +141,14 @@ def _images(pair: Pair) -> tuple[Image, Image]:
     return first, second
 
 
-def _scenes(log: RunLog) -> list[Table]:
-    """Return three tables: reconstructed batches, why pairs have their F, and cameras, weakest first."""
+def _scenes(log: RunLog) -> Iterator[tuple[object, ...]]:
+    """Yield a row of each batch: images, registered images, points, focal lengths, seconds, pairs, failure."""
     counts = Counter(record.pair.group for record in log.records if record.source == "scene")
-    rows = []
     for each in log.scenes:
         focals = [found.focal for model in each.models for found in model.images]
         spread = f"{median(focals):.0f} ({min(focals):.0f} to {max(focals):.0f})" if focals else ""
         placed = each.batch, each.images, each.registered, each.points, spread
-        rows.append((*placed, each.seconds, counts[each.batch], each.failure))
-    heads = ["batch", "images", "cameras", "points", "focals (px)", "seconds", "pairs with its F", "failure"]
-    reasons = Counter(str(record.scene.reason) for record in log.records if record.scene is not None)
-    cameras = [(name, 100 * of.centre, of.rotation, of.focal) for name, of in weakest_cameras(log.scenes)]
-    sigmas = ["camera, weakest first", "error of its centre (%)", "rotation (deg)", "focal length (%)"]
-    return [(heads, rows), (["which F a pair has", "pairs"], reasons.most_common()), (sigmas, cameras)]
-
-
-def _costs(log: RunLog) -> list[Table]:
-    units = [(*means, means[1] * means[-1]) for means in unit_means(log)]
-    parts = [(name, total, total / len(log.records)) for name, total in seconds_by_part(log).items() if units]
-    heads = ["unit (means)", "pairs", "matches", "inliers", "seconds", "seconds in all"]
-    return [(heads, units), (["part of the work", "seconds in all", "seconds a pair"], parts)] if units else []
+        yield (*placed, each.seconds, counts[each.batch], each.failure)
 
 
 def _data_uri(figure: "Figure", kind: str) -> str:

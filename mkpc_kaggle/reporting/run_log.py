@@ -6,6 +6,7 @@ from operator import attrgetter
 from pathlib import Path
 
 from mkpc_kaggle.data.outputs import replacing, require_table
+from mkpc_kaggle.engine.budget import format_duration
 from mkpc_kaggle.engine.journal_reader import About, Event, EventKind, JournalReader, undamaged
 from mkpc_kaggle.engine.records import PairRecord, SceneRecord, UnitRecord
 from mkpc_kaggle.errors import writing
@@ -41,13 +42,13 @@ class RunLog:
     @property
     def session(self) -> tuple[Event, ...]:
         """The events since the run was last started."""
-        starts = [index for index, event in enumerate(self.events) if event.kind == EventKind.START]
-        return self.events[starts[-1] :] if starts else self.events
+        starts = (index for index, event in enumerate(self.events) if event.kind == EventKind.START)
+        return self.events[max(starts, default=0) :]
 
     @property
     def ending(self) -> str:
-        ends = [event.text for event in self.session if event.kind == EventKind.END]
-        return ends[-1] if ends else "not ended (at work, or killed)"
+        ends = (event.text for event in self.session if event.kind == EventKind.END)
+        return next(ends, "not ended (at work, or killed)")
 
     @property
     def seconds(self) -> float:
@@ -56,7 +57,11 @@ class RunLog:
 
     @property
     def faults(self) -> list[str]:
-        return [event.text for event in self.events if event.kind == EventKind.FAULT]
+        return [text for _, text in self.of_kind(EventKind.FAULT)]
+
+    def of_kind(self, kind: str) -> list[tuple[str, str]]:
+        """Return time and text of the events of a kind."""
+        return [(format_duration(event.seconds), event.text) for event in self.events if event.kind == kind]
 
 
 def read_log(directory: Path) -> RunLog:
