@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack, closing, suppress
 from dataclasses import asdict
 from functools import wraps
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -138,13 +139,13 @@ class Journal(JournalReader):
         """Return the positions of all rows of a pair."""
         query = """SELECT w.position FROM wanted_pair w JOIN wanted_pair asked ON asked.pair = w.pair
             WHERE asked.position = ? ORDER BY w.position"""
-        return [twin for (twin,) in self._read(tuple, query, position)]
+        return self._read(itemgetter(0), query, position)
 
-    def had(self, positions: Iterable[int] | None = None) -> list[sqlite3.Row]:
+    def had(self, positions: Iterable[int] | None = None) -> list[tuple[Any, ...]]:
         """Return position, unit number and matches of the current points, for all pairs or for these."""
         return self._of("SELECT position, number, matches FROM current_points", positions)
 
-    def estimated(self, positions: Iterable[int] | None = None) -> list[sqlite3.Row]:
+    def estimated(self, positions: Iterable[int] | None = None) -> list[tuple[Any, ...]]:
         """Return position, F, inliers, failure and whether it is current, of the standing estimates."""
         query = """SELECT position, F, (SELECT sum(value) FROM json_each(inliers)) AS inliers, failure, is_current
             FROM standing_estimate"""
@@ -153,17 +154,17 @@ class Journal(JournalReader):
     def batch_inputs(self, batch: str) -> str:
         """Return the revisions that a scene of a batch would be computed from now."""
         query = "SELECT coalesce(inputs, '') FROM batch_inputs WHERE batch = ?"
-        return next((inputs for (inputs,) in self._read(tuple, query, batch)), "")
+        return next(iter(self._read(itemgetter(0), query, batch)), "")
 
     def current_scenes(self) -> set[str]:
-        return {batch for (batch,) in self._read(tuple, "SELECT batch FROM standing_scene WHERE is_current")}
+        return set(self._read(itemgetter(0), "SELECT batch FROM standing_scene WHERE is_current"))
 
-    def _of(self, query: str, positions: Iterable[int] | None) -> list[sqlite3.Row]:
-        with undamaged(self.path):
-            if positions is None:
-                return self._db.execute(query).fetchall()
-            query += " WHERE position = ?"
-            return [row for position in positions for row in self._db.execute(query, [position])]
+    def _of(self, query: str, positions: Iterable[int] | None) -> list[tuple[Any, ...]]:
+        if positions is None:
+            return self._read(tuple, query)
+        return [
+            row for position in positions for row in self._read(tuple, f"{query} WHERE position = ?", position)
+        ]
 
     # Results
 
@@ -180,17 +181,17 @@ class Journal(JournalReader):
             self._db.execute("UPDATE wanted_pair SET failure = ? WHERE position = ?", failure)
             for image in outcome.images:
                 self._insert("image", **image.size._asdict(), **columns(image, "size"))
-            seconds = {"decode_seconds": outcome.decode_seconds, "cluster_seconds": outcome.cluster_seconds}
-            row = {"pair": self._wanted(outcome.index)["pair"]}
+            count = max(1, len(outcome.found))  # of units, which share the seconds of the pair
+            row = {"pair": self._wanted(outcome.index)["pair"], "decode_seconds": outcome.decode_seconds / count}
+            row |= {"cluster_seconds": outcome.cluster_seconds / count}
             row |= {f"digest{side}": image.digest for side, image in enumerate(outcome.images)}
             for found in outcome.found:
-                row |= columns(found, "unit", "warm_up") | seconds | {"settings": settings[found.unit.name]}
+                row |= columns(found, "unit", "warm_up") | {"settings": settings[found.unit.name]}
                 row |= {"matches": len(found.matches), "points": to_blob(found.matches)}
                 revision = self._insert("points", **row)
-                seconds = dict.fromkeys(seconds, 0.0)  # the pair's, in its first row
                 for side, region in enumerate((outcome.regions or ()) if found.unit.stage == 2 else ()):
-                    box = columns(region.box)
-                    self._insert("region", points=revision, image=side, **columns(region, "box"), **box)
+                    row_of = columns(region, "box") | columns(region.box)
+                    self._insert("region", points=revision, image=side, **row_of)
 
     @saving
     def save_estimates(self, estimates: Sequence[Estimated]) -> None:

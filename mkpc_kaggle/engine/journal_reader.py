@@ -165,7 +165,7 @@ class JournalReader:
     def feature(self, digest: str, settings: str) -> bytes | None:
         """Return the features saved under a key, or ``None``."""
         query = "SELECT value FROM feature WHERE digest = ? AND settings = ?"
-        return next((value for (value,) in self._read(tuple, query, digest, settings)), None)
+        return next(iter(self._read(itemgetter(0), query, digest, settings)), None)
 
     def _scene(self, row: sqlite3.Row) -> SceneRecord:
         models = self._read(self._model, "SELECT * FROM model WHERE scene = ? ORDER BY number", row["revision"])

@@ -2,6 +2,7 @@
 
 import csv
 from dataclasses import astuple, dataclass
+from itertools import chain
 from operator import attrgetter
 from pathlib import Path
 
@@ -10,23 +11,21 @@ from mkpc_kaggle.engine.budget import format_duration
 from mkpc_kaggle.engine.journal_reader import About, Event, EventKind, JournalReader, undamaged
 from mkpc_kaggle.engine.records import PairRecord, SceneRecord, UnitRecord
 from mkpc_kaggle.errors import writing
-from mkpc_kaggle.geometry.coordinates import Box
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import Estimate, ModelKind, sampson_distances
 from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
 from mkpc_kaggle.recipe import Recipe, recipe_of
 
 MAX_DRAWN_PAIRS = 20  # the weakest, which the report draws
-VALUES = ("failure", "source", "matches", "inliers", "overlaps")  # of a pair's record
-SECONDS = {  # also of a pair's record, and how reports name them
+SECONDS = {  # of a pair's record, and how reports name them
     "decode_seconds": "wait for decoding",
     "encode_seconds": "encode",
     "match_seconds": "match",
     "cluster_seconds": "cluster",
     "estimate_seconds": "MAGSAC (in parallel with matching)",
 }
-STATS = ("support", "candidates", "cost", "magsac_cost")
-OTHERS = ("focal0", "focal1", *(f"f{row}{column}" for row in "123" for column in "123"))
+PAIR_HEADS = f"""pair id group image0 image1 failure source matches inliers overlaps {" ".join(SECONDS)}
+    support candidates cost magsac_cost focal0 focal1 f11 f12 f13 f21 f22 f23 f31 f32 f33"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +94,8 @@ def write_csv(log: RunLog, directory: Path) -> list[Path]:
     Only tables with the same columns are replaced. Raises :class:`UserError` for other files of these names, and
     if a table cannot be written.
     """
-    values = attrgetter(*VALUES, *SECONDS, *(f"stats.{name}" for name in STATS))
+    stats = "stats.support", "stats.candidates", "stats.cost", "stats.magsac_cost"
+    values = attrgetter("failure", "source", "matches", "inliers", "overlaps", *SECONDS, *stats)
     pairs = (
         (r.index, r.pair.id, r.pair.group, *r.pair.names, *values(r), *r.stats.focals, *r.chosen_fundamental.flat)
         for r in log.records
@@ -107,10 +107,10 @@ def write_csv(log: RunLog, directory: Path) -> list[Path]:
         for image, region in enumerate(r.regions or ())
     )
     tables = {
-        "pairs": (("pair", "id", "group", "image0", "image1", *VALUES, *SECONDS, *STATS, *OTHERS), pairs),
-        "units": (("pair", *UnitRecord.__annotations__), units),
-        "regions": (("pair", "image", *Box.__annotations__, "reason", "clusters", "kept"), regions),
-        "events": (Event.__annotations__, map(astuple, log.events)),
+        "pairs": (PAIR_HEADS.split(), pairs),
+        "units": (["pair", *UnitRecord.__annotations__], units),
+        "regions": (["pair", "image", "left", "top", "right", "bottom", "reason", "clusters", "kept"], regions),
+        "events": (["kind", "seconds", "text"], map(astuple, log.events)),
     }
     with writing(f"--csv {directory}"):
         directory.mkdir(parents=True, exist_ok=True)
@@ -119,5 +119,5 @@ def write_csv(log: RunLog, directory: Path) -> list[Path]:
             require_table(path, heads)
         for path, (heads, rows) in files.items():
             with replacing(path) as stream:
-                csv.writer(stream, lineterminator="\n").writerows([heads, *rows])
+                csv.writer(stream, lineterminator="\n").writerows(chain([heads], rows))
     return list(files)
