@@ -141,15 +141,12 @@ class Journal(JournalReader):
             WHERE asked.position = ? ORDER BY w.position"""
         return self._read(itemgetter(0), query, position)
 
-    def had(self, positions: Iterable[int] | None = None) -> list[tuple[Any, ...]]:
-        """Return position, unit number and matches of the current points, for all pairs or for these."""
-        return self._of("SELECT position, number, matches FROM current_points", positions)
-
-    def estimated(self, positions: Iterable[int] | None = None) -> list[tuple[Any, ...]]:
-        """Return position, F, inliers, failure and whether it is current, of the standing estimates."""
-        query = """SELECT position, F, (SELECT sum(value) FROM json_each(inliers)) AS inliers, failure, is_current
-            FROM standing_estimate"""
-        return self._of(query, positions)
+    def states(self, positions: Iterable[int] | None = None) -> list[tuple[Any, ...]]:
+        """Return the rows of the view ``pair_state``, for all pairs or for these."""
+        if positions is None:
+            return self._read(tuple, "SELECT * FROM pair_state")
+        query = "SELECT * FROM pair_state WHERE position = ?"
+        return [row for position in positions for row in self._read(tuple, query, position)]
 
     def batch_inputs(self, batch: str) -> str:
         """Return the revisions that a scene of a batch would be computed from now."""
@@ -158,13 +155,6 @@ class Journal(JournalReader):
 
     def current_scenes(self) -> set[str]:
         return set(self._read(itemgetter(0), "SELECT batch FROM standing_scene WHERE is_current"))
-
-    def _of(self, query: str, positions: Iterable[int] | None) -> list[tuple[Any, ...]]:
-        if positions is None:
-            return self._read(tuple, query)
-        return [
-            row for position in positions for row in self._read(tuple, f"{query} WHERE position = ?", position)
-        ]
 
     # Results
 

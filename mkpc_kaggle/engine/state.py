@@ -55,9 +55,7 @@ class State:
     def refresh(self, positions: Iterable[int]) -> None:
         """Read these pairs again, and all rows of the same images."""
         changed = {twin for position in positions for twin in self.journal.twins(position)}
-        index = sorted(changed)
-        self.had[index], self.matches[index], self.is_estimated[index] = False, 0, False
-        self._read(index)
+        self._read(sorted(changed))
         self.changed |= changed
 
     def read_choices(self) -> None:
@@ -78,10 +76,10 @@ class State:
         return PairPoints(position, (image0, image1), points, self.pairs[position].pair.intrinsics, own)
 
     def _read(self, positions: Sequence[int] | None) -> None:
-        for position, unit, matches in self.journal.had(positions):
-            self.had[position, unit] = True
-            self.matches[position] += matches
-        for position, F, inliers, failure, is_current in self.journal.estimated(positions):
-            self.own[position], self.has_own[position] = matrix_of(F), not failure
-            self.inliers[position] = inliers or 0
-            self.is_estimated[position] = is_current
+        for position, units, matches, F, inliers, failure, is_current in self.journal.states(positions):
+            self.had[position] = False
+            self.had[position, [*map(int, (units or "").split())]] = True
+            self.matches[position], self.is_estimated[position] = matches or 0, bool(is_current)
+            if F is not None:
+                self.own[position], self.has_own[position] = matrix_of(F), not failure
+                self.inliers[position] = inliers or 0
