@@ -159,7 +159,8 @@ class JournalReader:
 
     def images(self, position: int) -> tuple[BatchImage, ...]:
         """Return both images of a pair as they were last looked at, or nothing."""
-        images = self._read(_image, "SELECT * FROM pair_image WHERE position = ? ORDER BY side", position)
+        query = "SELECT * FROM pair_image WHERE position = ? ORDER BY side"
+        images = self._read(lambda row: value_of(BatchImage, row, size=value_of(Size, row)), query, position)
         return tuple(images) if len(images) == 2 else ()
 
     def feature(self, digest: str, settings: str) -> bytes | None:
@@ -234,10 +235,6 @@ def _region(row: sqlite3.Row) -> CriticalRegion:
 
 def _choice(row: sqlite3.Row) -> tuple[int, Choice]:
     return row["position"], Choice(row["F"] and matrix_of(row["F"]), Reason(row["reason"]))
-
-
-def _image(row: sqlite3.Row) -> BatchImage:
-    return value_of(BatchImage, row, size=value_of(Size, row))
 
 
 def _registered(row: sqlite3.Row) -> RegisteredImage:

@@ -7,6 +7,7 @@ import base64
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
 from statistics import median
@@ -16,7 +17,6 @@ from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.data.images import Image
 from mkpc_kaggle.data.outputs import replacing
 from mkpc_kaggle.engine.budget import format_duration
-from mkpc_kaggle.engine.records import PairRecord
 from mkpc_kaggle.errors import UserError, printable, writing
 from mkpc_kaggle.pipeline.pair import PairMatch
 from mkpc_kaggle.pipeline.two_stage import to_image
@@ -38,7 +38,6 @@ if TYPE_CHECKING:
 
 WRITING_S, WRITING_S_PER_PAIR = 0.6, 0.0002  # time for a page without drawings
 DRAWING_S = 5.0  # drawings start only with more time left
-MAX_ROWS = 100  # of a table; the journal command exports all rows
 MAX_SCENES, MAX_MODELS = 12, 8  # drawn scenes, and drawn models of a scene
 
 
@@ -97,7 +96,8 @@ def report_page(log: RunLog, pairs: Sequence[Pair] = (), *, undrawn: str = "") -
         failed=failed,
         failures=Counter(reason for *_, reason in failed).most_common(),
         unit_failures=[(reason,) for reason in unit_reasons(log)],
-        weakest=[_weak(*weak, sources) for weak in log.weakest],
+        sources=sources,
+        weakest=[(_picture(sources.get(record.pair.id), match), record) for record, match in log.weakest],
         scenes=[*_scenes(log)],
         choices=Counter(str(record.scene.reason) for record in log.records if record.scene).most_common(),
         sigmas=[(name, 100 * of.centre, of.rotation, of.focal) for name, of in weakest_cameras(log.scenes)],
@@ -109,23 +109,15 @@ def report_page(log: RunLog, pairs: Sequence[Pair] = (), *, undrawn: str = "") -
         units=[(*means, means[1] * means[-1]) for means in unit_means(log)],
         parts=[(name, total, total / len(log.records)) for name, total in seconds_by_part(log).items() if total],
         undrawn=undrawn,
-        max_rows=MAX_ROWS,
     )
 
 
-def _weak(record: PairRecord, match: PairMatch, sources: dict[str, Pair]) -> tuple[str, str, str]:
-    """Return a weak pair's picture, empty if it is not drawn, its counts and remarks, and its id."""
-    pair, picture = record.pair, ""
-    parts = [f"{record.inliers} inliers of {record.matches} matches", record.failure]
-    parts.append("" if record.overlaps else f"may show different things: support {record.stats.support:.1f}")
-    if record.source == "scene":
-        parts.append("F is the scene's")
-    if pair.id in sources:
-        try:
-            picture = _data_uri(draw_strip(_images(sources[pair.id]), match), "jpeg")
-        except UserError:
-            parts.append("an image cannot be read any more")
-    return picture, "; ".join(filter(None, parts)), pair.id
+def _picture(source: Pair | None, match: PairMatch) -> str:
+    """Return a pair's picture, empty if its images are unknown or unreadable."""
+    if source is not None:
+        with suppress(UserError):
+            return _data_uri(draw_strip(_images(source), match), "jpeg")
+    return ""
 
 
 def weak_figure(log: RunLog, match: PairMatch, source: Pair) -> "Figure":
