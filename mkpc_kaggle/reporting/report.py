@@ -81,7 +81,7 @@ def report_page(log: RunLog, pairs: Sequence[Pair] = (), *, undrawn: str = "") -
     if not undrawn and find_spec("matplotlib") is None:
         undrawn = "matplotlib is not installed: pip install 'mkpc-kaggle[plots]'"
     sources = {} if undrawn else {pair.id: pair for pair in pairs}
-    largest = sorted((s for s in log.scenes if s.registered), key=lambda scene: -scene.registered)[:MAX_SCENES]
+    largest = sorted(log.scenes, key=lambda scene: -scene.registered)[:MAX_SCENES]
     failed = [
         (record.pair.id, record.pair.group, record.failure) for record in log.records if not record.is_solved
     ]

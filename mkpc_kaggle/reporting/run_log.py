@@ -39,20 +39,15 @@ class RunLog:
     scenes: tuple[SceneRecord, ...] = ()
 
     @property
-    def session(self) -> tuple[Event, ...]:
-        """The events since the run was last started."""
-        starts = (index for index, event in enumerate(self.events) if event.kind == EventKind.START)
-        return self.events[max(starts, default=0) :]
-
-    @property
     def ending(self) -> str:
-        ends = (event.text for event in self.session if event.kind == EventKind.END)
+        """How the last session ended."""
+        ends = (event.text for event in self.events[-1:] if event.kind == EventKind.END)
         return next(ends, "not ended (at work, or killed)")
 
     @property
     def seconds(self) -> float:
         """Duration of the last session until its last event."""
-        return max((event.seconds for event in self.session), default=0.0)
+        return self.events[-1].seconds if self.events else 0.0
 
     @property
     def faults(self) -> list[str]:
