@@ -130,13 +130,13 @@ def read_journal(directory: Path) -> tuple[str, dict[str, tuple[PairMatch, Matri
     with JournalReader(directory) as journal:
         table = dict(journal.about().recipe)
         recipe = recipe_of(table, table.pop("name"))
-        units, pairs, found = {unit.name: unit for unit in recipe.units}, journal.pairs(), {}
+        units, found = {unit.name: unit for unit in recipe.units}, {}
         for record in (record for record in journal.records() if record.units):
             inputs, images = journal.inputs(record.index), journal.images(record.index)
             points = journal.points(inputs.values())
             results = tuple(UnitResult(units[name], points[revision]) for name, revision in inputs.items())
             match = PairMatch(results, sizes=tuple(image.size for image in images))
-            found[pairs[record.index].id] = match, None if record.failure else record.pair_fundamental
+            found[record.pair.id] = match, None if record.failure else record.pair_fundamental
     return recipe.name, found
 
 

@@ -16,6 +16,7 @@ from mkpc_kaggle.engine.streams import drain, unblocked
 from mkpc_kaggle.pipeline.assembly import Assembly, assemble
 from mkpc_kaggle.pipeline.availability import Licence
 from mkpc_kaggle.recipe import Mode
+from mkpc_kaggle.reporting.summary import left_out_line
 
 
 def add_matching(parser: argparse.ArgumentParser) -> None:
@@ -78,8 +79,6 @@ def watched_session(
 
 def say_start(what: str, assembly: Assembly, work_dir: Path) -> None:
     """Print the input, the recipe and the omitted matchers."""
-    from mkpc_kaggle.reporting.summary import left_out_line  # imports pandas, which takes a while
-
     header = f"{what}, recipe {assembly.recipe.name}, {assembly.placement}, journal in {work_dir}"
     say("\n".join(filter(None, [header, left_out_line(assembly.left_out)])))
 

@@ -56,6 +56,6 @@ def run(arguments: argparse.Namespace) -> int:
             report = submit(pairs, assembly, session, output, str(test_side(arguments.test_dir)[1]))
             watchdog.status = int(bool(report.unwritten or trouble(report)))
             unwritten = f" is not the last version: {report.unwritten}" if report.unwritten else ""
-            lines = [*options.plan_lines(arguments, report), summary(pairs, report)]
+            lines = [*options.plan_lines(arguments, report), summary(report)]
             say("\n".join([*lines, f"submission: {output}{unwritten}"]))  # now: drawing may exceed the time limit
             return options.finish(session, watchdog.status, page, pairs)

@@ -176,7 +176,7 @@ def _match_and_score(
             report = validation.report
             assert report is not None
             lines = [*filter(None, [left_out_line(assembly.left_out)]), *options.plan_lines(arguments, report)]
-            lines += [summary(pairs, report), "", f"recipe {validation.recipe}"]
+            lines += [summary(report), "", f"recipe {validation.recipe}"]
             say("\n".join([*lines, *score_table(validation), *step_gains(validation)]))
             # The page draws inliers of F, but the pairs of a list have E.
             has_page = arguments.work_dir is not None and arguments.pairs is None

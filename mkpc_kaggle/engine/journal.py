@@ -2,12 +2,13 @@
 
 import json
 import sqlite3
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack, closing, suppress
 from dataclasses import asdict
 from functools import wraps
+from operator import itemgetter
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 
 import numpy as np
 
@@ -18,9 +19,7 @@ from mkpc_kaggle.engine.journal_reader import (
     About,
     Event,
     JournalReader,
-    Method,
     connected,
-    reading,
     to_blob,
     undamaged,
 )
@@ -31,7 +30,10 @@ from mkpc_kaggle.scene.choose import Choice
 
 LOCK_NAME = "journal.lock"
 SCHEMA = Path(__file__).with_name("schema.sql")
+ENDS = "(image0, image1, turns0, turns1)"  # what identifies a pair
 MIN_SQLITE = (3, 37, 0)  # STRICT tables
+
+Method = TypeVar("Method", bound=Callable[..., None])
 
 
 def saving(save: Method) -> Method:
@@ -119,51 +121,40 @@ class Journal(JournalReader):
         for batch, settings in batches.items():
             self._insert("wanted_batch", batch=batch, settings=settings)
         ends = [(*map(printable, each.names), *each.pair.turns) for each in pairs]
-        add = "INSERT OR IGNORE INTO pair (image0, image1, turns0, turns1) VALUES (?, ?, ?, ?)"
-        self._db.executemany(add, ends)
-        ids = {tuple(row)[1:]: row["id"] for row in self._rows("SELECT * FROM pair")}
-        for position, (each, end) in enumerate(zip(pairs, ends, strict=True)):
-            asked = {"id": each.pair.id, "batch": each.pair.group, "settings": each.settings}
-            self._insert("wanted_pair", position=position, pair=ids[end], has_row=each.has_row, **asked)
+        self._db.executemany(f"INSERT OR IGNORE INTO pair {ENDS} VALUES (?, ?, ?, ?)", ends)
+        rows = (
+            (position, printable(each.pair.id), printable(each.pair.group), each.settings, each.has_row, *end)
+            for position, (each, end) in enumerate(zip(pairs, ends, strict=True))
+        )
+        add = f"INSERT INTO wanted_pair SELECT ?, ?, ?, id, ?, ?, '' FROM pair WHERE {ENDS} = (?, ?, ?, ?)"
+        self._db.executemany(add, rows)
 
-    @reading
     def digests(self) -> dict[str, str]:
         """Return the digest of each image of a wanted pair that was looked at, by name."""
-        return dict(map(tuple, self._rows("SELECT DISTINCT name, digest FROM pair_image")))
+        return dict(self._read(tuple, "SELECT DISTINCT name, digest FROM pair_image"))
 
     # The state of the run
 
-    @reading
-    def twins(self) -> dict[int, tuple[int, ...]]:
-        """Return the positions of pairs that several rows name, by each of these positions."""
-        query = "SELECT group_concat(position) FROM wanted_pair GROUP BY pair HAVING count(*) > 1"
-        groups = [tuple(map(int, row[0].split(","))) for row in self._rows(query)]
-        return {position: group for group in groups for position in group}
+    def twins(self, position: int) -> list[int]:
+        """Return the positions of all rows of a pair."""
+        query = """SELECT w.position FROM wanted_pair w JOIN wanted_pair asked ON asked.pair = w.pair
+            WHERE asked.position = ? ORDER BY w.position"""
+        return self._read(itemgetter(0), query, position)
 
-    @reading
-    def had(self, positions: Iterable[int] | None = None) -> list[sqlite3.Row]:
-        """Return position, unit number and matches of the current points, for all pairs or for these."""
-        return self._of("SELECT position, number, matches FROM current_points", positions)
+    def states(self, positions: Iterable[int] | None = None) -> list[tuple[Any, ...]]:
+        """Return the rows of the view ``pair_state``, for all pairs or for these."""
+        if positions is None:
+            return self._read(tuple, "SELECT * FROM pair_state")
+        query = "SELECT * FROM pair_state WHERE position = ?"
+        return [row for position in positions for row in self._read(tuple, query, position)]
 
-    @reading
-    def estimated(self, positions: Iterable[int] | None = None) -> list[sqlite3.Row]:
-        """Return position, F, inliers, failure and whether it is current, of the standing estimates."""
-        return self._of("SELECT position, F, inliers, failure, is_current FROM standing_estimate", positions)
-
-    @reading
     def batch_inputs(self, batch: str) -> str:
         """Return the revisions that a scene of a batch would be computed from now."""
-        rows = self._rows("SELECT inputs FROM batch_inputs WHERE batch = ?", batch)
-        return str(rows[0]["inputs"] or "") if rows else ""
+        query = "SELECT coalesce(inputs, '') FROM batch_inputs WHERE batch = ?"
+        return next(iter(self._read(itemgetter(0), query, batch)), "")
 
-    @reading
     def current_scenes(self) -> set[str]:
-        return {row["batch"] for row in self._rows("SELECT batch FROM standing_scene WHERE is_current")}
-
-    def _of(self, query: str, positions: Iterable[int] | None) -> list[sqlite3.Row]:
-        if positions is None:
-            return self._rows(query)
-        return [row for position in positions for row in self._rows(f"{query} WHERE position = ?", position)]
+        return set(self._read(itemgetter(0), "SELECT batch FROM standing_scene WHERE is_current"))
 
     # Results
 
@@ -180,32 +171,33 @@ class Journal(JournalReader):
             self._db.execute("UPDATE wanted_pair SET failure = ? WHERE position = ?", failure)
             for image in outcome.images:
                 self._insert("image", **image.size._asdict(), **columns(image, "size"))
-            seconds = {"decode_seconds": outcome.decode_seconds, "cluster_seconds": outcome.cluster_seconds}
-            row = {"pair": self._wanted(outcome.index)["pair"]}
+            count = max(1, len(outcome.found))  # of units, which share the seconds of the pair
+            row = {"pair": self._wanted(outcome.index)["pair"], "decode_seconds": outcome.decode_seconds / count}
+            row |= {"cluster_seconds": outcome.cluster_seconds / count}
             row |= {f"digest{side}": image.digest for side, image in enumerate(outcome.images)}
             for found in outcome.found:
-                row |= columns(found, "unit", "warm_up") | seconds | {"settings": settings[found.unit.name]}
+                row |= columns(found, "unit", "warm_up") | {"settings": settings[found.unit.name]}
                 row |= {"matches": len(found.matches), "points": to_blob(found.matches)}
                 revision = self._insert("points", **row)
-                seconds = dict.fromkeys(seconds, 0.0)  # the pair's, in its first row
                 for side, region in enumerate((outcome.regions or ()) if found.unit.stage == 2 else ()):
-                    box = columns(region.box)
-                    self._insert("region", points=revision, image=side, **columns(region, "box"), **box)
+                    row_of = columns(region, "box") | columns(region.box)
+                    self._insert("region", points=revision, image=side, **row_of)
 
     @saving
     def save_estimates(self, estimates: Sequence[Estimated]) -> None:
         for each in estimates:
-            pair, row = self._wanted(each.index), columns(each, "index", "stats") | columns(each.stats)
-            self._insert("estimate", pair=pair["pair"], settings=pair["settings"], **row)
+            pair, row = self._wanted(each.index), columns(each, "index", "stats", "inliers") | columns(each.stats)
+            inliers = json.dumps(dict(zip(each.inputs, each.inliers, strict=True)))
+            self._insert("estimate", pair=pair["pair"], settings=pair["settings"], inliers=inliers, **row)
 
     @saving
     def save_scene(
         self, scene: SceneRecord, inputs: str, pairs: Sequence[PairPoints], choices: Sequence[Choice]
     ) -> None:
         """Save the reconstruction of a batch with the choices for its pairs."""
-        (asked,) = self._rows("SELECT settings FROM wanted_batch WHERE batch = ?", printable(scene.batch))
-        row = columns(scene, "models")
-        revision = self._insert("scene", settings=asked["settings"], inputs=inputs, **row)
+        query = "SELECT settings FROM wanted_batch WHERE batch = ?"
+        ((settings,),) = self._db.execute(query, [printable(scene.batch)])
+        revision = self._insert("scene", settings=settings, inputs=inputs, **columns(scene, "models"))
         for number, model in enumerate(scene.models):
             self._insert("model", scene=revision, number=number, **columns(model, "images", "colmap"))
             for found in model.images:
@@ -234,10 +226,13 @@ class Journal(JournalReader):
         """Insert or replace a row, values by the names of columns. Return its number."""
         names, marks = ", ".join(f'"{name}"' for name in row), ", ".join("?" * len(row))
         query = f"REPLACE INTO {table} ({names}) VALUES ({marks}) RETURNING rowid"
-        return int(self._rows(query, *map(stored, row.values()))[0][0])
+        ((number,),) = self._db.execute(query, [*map(stored, row.values())])
+        return int(number)
 
     def _wanted(self, position: int) -> sqlite3.Row:
-        return self._rows("SELECT * FROM wanted_pair WHERE position = ?", position)[0]
+        query = "SELECT * FROM wanted_pair WHERE position = ?"
+        row: sqlite3.Row = self._db.execute(query, [position]).fetchone()
+        return row
 
     def _continue_in_memory(self, trouble: str) -> None:
         """Copy everything into memory, and write there from now on."""

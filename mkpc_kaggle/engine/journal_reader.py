@@ -6,20 +6,22 @@
 import json
 import os
 import sqlite3
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field
 from enum import StrEnum
-from functools import wraps
+from functools import partial
+from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
-from typing import Any, Self, TypeVar, cast
+from typing import Any, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.budget import format_duration
-from mkpc_kaggle.engine.records import NOT_REACHED, PairRecord, SceneRecord, UnitRecord
+from mkpc_kaggle.engine.records import PairRecord, SceneRecord, UnitRecord
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Box, Matrix3, Size
@@ -30,7 +32,7 @@ from mkpc_kaggle.scene.choose import Choice, Reason
 from mkpc_kaggle.scene.reconstruction import RegisteredImage, SfmModel, Sigmas
 from mkpc_kaggle.scene.view_graph import BatchImage
 
-FORMAT = 14
+FORMAT = 15
 FILE_NAME = "journal.sqlite"
 
 # SQLite's primary result codes that say nothing against a file: no permission, busy, locked, read only, input or
@@ -39,8 +41,6 @@ UNUSABLE = {3, 5, 6, 8, 10, 13, 14}
 # Errors of reading what no run writes.
 DAMAGE = (sqlite3.Error, ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RecursionError)
 
-SUMS = ("matches", "inliers", "decode_seconds", "encode_seconds", "match_seconds", "cluster_seconds")
-Method = TypeVar("Method", bound=Callable[..., Any])
 Value = TypeVar("Value")
 
 
@@ -73,7 +73,7 @@ class About:
     recipe: Mapping[str, Any] = field(default_factory=dict)  # a table as of a recipe's file, and its name
     device: str = ""
     limit: float | None = None  # in seconds; None: no limit
-    left_out: tuple[str, ...] = ()  # matchers that did not run, by cause
+    left_out: Sequence[str] = ()  # matchers that did not run, by cause
     versions: Mapping[str, str] = field(default_factory=dict)  # of the package and its main dependencies
 
 
@@ -86,17 +86,6 @@ def undamaged(path: Path, advice: str = "delete it with --fresh") -> Iterator[No
         if getattr(error, "sqlite_errorcode", sqlite3.SQLITE_ERROR) & 0xFF in UNUSABLE:
             raise UserError(f"{path} cannot be used: {error}; is another run using it?") from error
         raise UserError(f"{path} is damaged ({error}); {advice}") from error
-
-
-def reading(read: Method) -> Method:
-    """Let a method raise :class:`UserError` if the journal that it reads is damaged or unusable."""
-
-    @wraps(read)
-    def checked(self: Any, *args: Any) -> Any:
-        with undamaged(self.path):
-            return read(self, *args)
-
-    return cast(Method, checked)
 
 
 class JournalReader:
@@ -131,115 +120,82 @@ class JournalReader:
     def close(self) -> None:
         self._db.close()
 
-    @reading
     def about(self) -> About:
-        values = json.loads(self._rows("SELECT value FROM about")[0]["value"])
-        return About(**{**values, "left_out": tuple(values["left_out"])})
+        return self._read(lambda row: About(**json.loads(row["value"])), "SELECT value FROM about")[0]
 
-    @reading
     def events(self) -> tuple[Event, ...]:
         """Return all events of all sessions, in order."""
-        return tuple(Event(*row) for row in self._rows("SELECT kind, seconds, text FROM event ORDER BY number"))
+        return tuple(self._read(partial(value_of, Event), "SELECT * FROM event ORDER BY number"))
 
-    @reading
-    def pairs(self) -> tuple[Pair, ...]:
-        """Return the pairs that have a row, in order, with the names of their images for files."""
-        query = """SELECT w.id, batch, image0, image1, turns0, turns1 FROM wanted_pair w
-            JOIN pair ON pair.id = w.pair WHERE has_row ORDER BY position"""
-        return tuple(Pair(n, b, f0, f1, turns=(t0, t1)) for n, b, f0, f1, t0, t1 in self._rows(query))
-
-    @reading
     def records(self) -> list[PairRecord]:
         """Return a record of each pair that has a row, in order."""
-        pairs = self._rows("SELECT failure, has_row FROM wanted_pair ORDER BY position")
-        values: list[dict[str, Any]] = [{"failure": pair["failure"] or NOT_REACHED} for pair in pairs]
-        inliers: dict[int, int] = {}
-        for row in self._rows("SELECT * FROM standing_estimate"):
-            inliers |= zip(map(int, row["inputs"].split()), map(int, row["inliers"].split()), strict=True)
-            focals, rotation = (tuple(map(float, row[name].split())) for name in ("focals", "rotation"))
-            values[row["position"]] |= {
-                "pair_fundamental": matrix_of(row["F"]),
-                "magsac_fundamental": None if row["magsac"] is None else matrix_of(row["magsac"]),
-                "failure": row["failure"],
-                "estimate_seconds": row["seconds"],
-                "stats": value_of(EstimateStats, row, focals=focals, rotation=rotation),
-            }
-        for row in self._rows("SELECT * FROM unit_result ORDER BY position, number"):
-            found, counts = values[row["position"]], dict(row) | {"inliers": inliers.get(row["revision"], 0)}
-            found.setdefault("units", []).append(value_of(UnitRecord, counts))
-            found |= {name: found.get(name, 0) + counts[name] for name in SUMS}
-        # The regions of the first unit of stage 2 come last.
-        for row in self._rows("SELECT * FROM region_result ORDER BY position, number DESC, image"):
-            found, reason = values[row["position"]], RegionReason(row["reason"])
-            region = value_of(CriticalRegion, row, box=value_of(Box, row), reason=reason)
-            found["regions"] = (region,) if row["image"] == 0 else (*found["regions"], region)
-        choices = self.choices()
-        rows = range(sum(pair["has_row"] for pair in pairs))
-        return [PairRecord(position, scene=choices.get(position), **values[position]) for position in rows]
+        units = self._by_pair(partial(value_of, UnitRecord), "unit_record")
+        regions, choices = self._by_pair(_region, "region_record"), self.choices()
 
-    @reading
+        def record(row: sqlite3.Row) -> PairRecord:
+            at = row["index"]
+            return _pair_record(row, units=units.get(at, ()), regions=regions.get(at), scene=choices.get(at))
+
+        return self._read(record, 'SELECT * FROM pair_record ORDER BY "index"')
+
     def choices(self) -> dict[int, Choice]:
         """Return the choices of the standing scenes by the positions of their pairs."""
-        return {
-            position: Choice(None if F is None else matrix_of(F), Reason(reason))
-            for position, F, reason in self._rows("SELECT position, F, reason FROM pair_choice")
-        }
+        return dict(self._read(_choice, "SELECT * FROM pair_choice"))
 
-    @reading
     def scenes(self, table: str = "standing_scene") -> dict[str, SceneRecord]:
         """Return the standing reconstruction of each batch, or its latest row in another table."""
-        scenes = {}
-        for scene in self._rows(f"SELECT * FROM {table} ORDER BY batch, revision"):
-            models = self._rows("SELECT * FROM model WHERE scene = ? ORDER BY number", scene["revision"])
-            scenes[scene["batch"]] = value_of(SceneRecord, scene, models=tuple(map(self._model, models)))
-        return scenes
+        scenes = self._read(self._scene, f"SELECT * FROM {table} ORDER BY batch, revision")
+        return {scene.batch: scene for scene in scenes}
 
-    @reading
     def points(self, revisions: Iterable[int]) -> dict[int, Matches]:
         """Return the points of these rows, by revision."""
         query = "SELECT points FROM points WHERE revision = ?"
-        return {revision: from_blob(self._rows(query, revision)[0]["points"]) for revision in revisions}
+        return {each: self._read(lambda row: from_blob(row["points"]), query, each)[0] for each in revisions}
 
-    @reading
     def inputs(self, position: int) -> dict[str, int]:
         """Return the revisions of a pair's current points by unit, in the recipe's order."""
         query = "SELECT unit, revision FROM current_points WHERE position = ? ORDER BY number"
-        return dict(map(tuple, self._rows(query, position)))
+        return dict(self._read(tuple, query, position))
 
-    @reading
     def images(self, position: int) -> tuple[BatchImage, ...]:
         """Return both images of a pair as they were last looked at, or nothing."""
-        rows = self._rows("SELECT * FROM pair_image WHERE position = ? ORDER BY side", position)
-        images = tuple(value_of(BatchImage, row, size=value_of(Size, row)) for row in rows)
-        return images if len(images) == 2 else ()
+        query = "SELECT * FROM pair_image WHERE position = ? ORDER BY side"
+        images = self._read(lambda row: value_of(BatchImage, row, size=value_of(Size, row)), query, position)
+        return tuple(images) if len(images) == 2 else ()
 
-    @reading
     def feature(self, digest: str, settings: str) -> bytes | None:
         """Return the features saved under a key, or ``None``."""
-        found = self._rows("SELECT value FROM feature WHERE digest = ? AND settings = ?", digest, settings)
-        return found[0]["value"] if found else None
+        query = "SELECT value FROM feature WHERE digest = ? AND settings = ?"
+        return next(iter(self._read(itemgetter(0), query, digest, settings)), None)
+
+    def _scene(self, row: sqlite3.Row) -> SceneRecord:
+        models = self._read(self._model, "SELECT * FROM model WHERE scene = ? ORDER BY number", row["revision"])
+        return value_of(SceneRecord, row, models=tuple(models))
 
     def _model(self, row: sqlite3.Row) -> SfmModel:
         query = "SELECT * FROM camera WHERE scene = ? AND model = ? ORDER BY rowid"
-        images = []
-        for each in self._rows(query, row["scene"], row["number"]):
-            image = BatchImage(each["name"], each["digest"], value_of(Size, each))
-            camera = Camera(floats(each["K"], 3, 3), floats(each["R"], 3, 3), floats(each["t"], 3))
-            sigmas = value_of(Sigmas, each)
-            images.append(RegisteredImage(image, camera, each["points"], () if None in sigmas else sigmas))
+        images = self._read(_registered, query, row["scene"], row["number"])
         return SfmModel(tuple(images), floats(row["points"], -1, 3), row["reprojection_error"])
 
-    def _rows(self, query: str, *values: Any) -> list[sqlite3.Row]:
-        return self._db.execute(query, values).fetchall()
+    def _by_pair(self, make: Callable[[sqlite3.Row], Value], view: str) -> dict[int, tuple[Value, ...]]:
+        """Return the values of each pair, by its position, in the order of their numbers."""
+        query = f"SELECT * FROM {view} ORDER BY position, number"
+        values = self._read(lambda row: (row["position"], make(row)), query)
+        return {position: tuple(value for _, value in group) for position, group in groupby(values, itemgetter(0))}
+
+    def _read(self, make: Callable[[sqlite3.Row], Value], query: str, *values: Any) -> list[Value]:
+        """Return a value of each row. Raise :class:`UserError` if the journal is damaged or unusable."""
+        with undamaged(self.path):
+            return [make(row) for row in self._db.execute(query, values)]
 
     def _check(self) -> None:
         """Raise :class:`UserError` for a journal of another format, ``sqlite3.Error`` for a damaged journal."""
-        if self._rows("PRAGMA user_version")[0][0] != FORMAT:
+        if self._db.execute("PRAGMA user_version").fetchone()[0] != FORMAT:
             raise UserError(
                 f"{self.path} was written by another version of this program (its format is not {FORMAT}). "
                 "Use that version, delete it with --fresh, or name another --work-dir."
             )
-        if (trouble := self._rows("PRAGMA quick_check(1)")[0][0]) != "ok":
+        if (trouble := self._db.execute("PRAGMA quick_check(1)").fetchone()[0]) != "ok":
             raise sqlite3.DatabaseError(trouble)
 
 
@@ -254,9 +210,37 @@ def connected(path: Path | str, options: str = "", timeout: float = 1.0) -> sqli
     return db
 
 
-def value_of(kind: type[Value], row: sqlite3.Row | dict[str, Any], **more: Any) -> Value:
-    """Return a dataclass or named tuple from columns with the names of its fields; ``more`` are other fields."""
-    return kind(**{name: row[name] for name in kind.__annotations__ if name not in more}, **more)
+def value_of(kind: type[Value], row: sqlite3.Row, **more: Any) -> Value:
+    """Return a dataclass or named tuple from the columns with the names of its fields; ``more`` are other fields.
+
+    A field whose column is NULL has its default.
+    """
+    names = kind.__annotations__.keys() & row.keys() - more.keys()
+    return kind(**{name: row[name] for name in names if row[name] is not None}, **more)
+
+
+def _pair_record(row: sqlite3.Row, **more: Any) -> PairRecord:
+    if row["F"] is not None:
+        focals, rotation = (tuple(map(float, row[name].split())) for name in ("focals", "rotation"))
+        more["stats"] = value_of(EstimateStats, row, focals=focals, rotation=rotation)
+        more["pair_fundamental"] = matrix_of(row["F"])
+        more["magsac_fundamental"] = row["magsac"] and matrix_of(row["magsac"])
+    pair = Pair(row["id"], row["batch"], row["image0"], row["image1"], turns=(row["turns0"], row["turns1"]))
+    return value_of(PairRecord, row, pair=pair, **more)
+
+
+def _region(row: sqlite3.Row) -> CriticalRegion:
+    return value_of(CriticalRegion, row, box=value_of(Box, row), reason=RegionReason(row["reason"]))
+
+
+def _choice(row: sqlite3.Row) -> tuple[int, Choice]:
+    return row["position"], Choice(row["F"] and matrix_of(row["F"]), Reason(row["reason"]))
+
+
+def _registered(row: sqlite3.Row) -> RegisteredImage:
+    image = BatchImage(row["name"], row["digest"], value_of(Size, row))
+    camera = Camera(floats(row["K"], 3, 3), floats(row["R"], 3, 3), floats(row["t"], 3))
+    return RegisteredImage(image, camera, row["points"], () if row["centre"] is None else value_of(Sigmas, row))
 
 
 def to_blob(matches: Matches) -> bytes:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.geometry.coordinates import Matrix3
 from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, NO_STATS, EstimateStats
@@ -19,7 +20,7 @@ NO_CAMERAS = "no matches connect its images"
 MAX_DRAWN_POINTS = 300  # of a model, evenly chosen
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class UnitRecord:
     """Result of a unit on a pair: numbers of matches and of inliers among them, and seconds."""
 
@@ -44,12 +45,12 @@ class PairRecord:
     """
 
     index: int
+    pair: Pair  # with the names of its images for files
     pair_fundamental: Matrix3 = field(default_factory=FALLBACK_FUNDAMENTAL.copy)
     failure: str = NOT_REACHED
     units: Sequence[UnitRecord] = ()
     regions: Regions | None = None
-    matches: int = 0  # this and the next fields: of all units
-    inliers: int = 0
+    matches: int = 0  # this and the next four fields: of all units
     decode_seconds: float = 0.0
     encode_seconds: float = 0.0
     match_seconds: float = 0.0
@@ -58,6 +59,10 @@ class PairRecord:
     scene: Choice | None = None
     magsac_fundamental: Matrix3 | None = None
     stats: EstimateStats = NO_STATS
+
+    @property
+    def inliers(self) -> int:
+        return sum(unit.inliers for unit in self.units)
 
     @property
     def chosen_fundamental(self) -> Matrix3:
@@ -70,6 +75,10 @@ class PairRecord:
         if self.scene is None or self.scene.F is None:
             return "fallback" if self.failure else "pair"
         return "scene" if self.scene.from_scene else "pair"
+
+    @property
+    def is_solved(self) -> bool:
+        return self.source != "fallback"
 
     @property
     def overlaps(self) -> bool:

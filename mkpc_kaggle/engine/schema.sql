@@ -89,7 +89,7 @@ CREATE TABLE estimate (  -- of a pair, from its points
     pair INTEGER NOT NULL REFERENCES pair,
     settings TEXT NOT NULL,
     inputs TEXT NOT NULL,
-    inliers TEXT NOT NULL,  -- the number among each of the inputs
+    inliers TEXT NOT NULL CHECK (json_valid(inliers)),  -- JSON: their number by the revision of the input
     F BLOB NOT NULL CHECK (length(F) = 72),
     magsac BLOB CHECK (length(magsac) = 72),
     failure TEXT NOT NULL,
@@ -199,17 +199,16 @@ FROM wanted_batch b;
 -- Until a current row exists, the latest row stands in for it, while the first points that it was computed from are current.
 -- A cast takes the first number of a list.
 
-CREATE VIEW standing_estimate AS
-SELECT i.position, e.settings = i.settings AND e.inputs = i.inputs AS is_current, e.*
-FROM pair_inputs i
-JOIN estimate e ON e.revision = coalesce(
+CREATE VIEW pair_standing AS  -- the revision of its estimate, NULL: none
+SELECT i.position, i.settings, i.inputs, coalesce(
     (SELECT c.revision FROM estimate c WHERE c.pair = i.pair AND c.settings = i.settings AND c.inputs = i.inputs),
     (
         SELECT max(l.revision) FROM estimate l
         JOIN current_points p ON p.position = i.position AND p.revision = CAST(l.inputs AS INTEGER)
         WHERE l.pair = i.pair
     )
-);
+) AS estimate
+FROM pair_inputs i;
 
 CREATE VIEW standing_scene AS
 SELECT s.settings = b.settings AND s.inputs = b.inputs AS is_current, s.*
@@ -234,13 +233,42 @@ UNION ALL
 SELECT w.position, 1, i.*
 FROM wanted_pair w JOIN pair ON pair.id = w.pair JOIN image i ON i.name = pair.image1;
 
-CREATE VIEW unit_result AS
-SELECT position, number, revision, unit, stage, matches, decode_seconds, encode_seconds, match_seconds,
-    cluster_seconds, failure, note, keypoints
-FROM current_points;
+CREATE VIEW pair_state AS  -- NULL: no points, no estimate
+SELECT s.position,
+    (SELECT group_concat(c.number, ' ') FROM current_points c WHERE c.position = s.position) AS units,
+    (SELECT sum(c.matches) FROM current_points c WHERE c.position = s.position) AS matches,
+    e.F, (SELECT sum(value) FROM json_each(e.inliers)) AS inliers, e.failure,
+    e.settings = s.settings AND e.inputs = s.inputs AS is_current  -- the estimate
+FROM pair_standing s
+LEFT JOIN estimate e ON e.revision = s.estimate;
 
-CREATE VIEW region_result AS
-SELECT c.position, c.number, r.* FROM current_points c JOIN region r ON r.points = c.revision;
+CREATE VIEW unit_record AS
+SELECT c.position, c.number, c.unit, c.stage, c.matches, coalesce(json_extract(e.inliers, '$."' || c.revision || '"'), 0) AS inliers,
+    c.encode_seconds, c.match_seconds, c.failure, c.note, c.keypoints
+FROM current_points c
+JOIN pair_standing s ON s.position = c.position
+LEFT JOIN estimate e ON e.revision = s.estimate;
+
+CREATE VIEW region_record AS  -- of the first unit of stage 2: the other columns are those of the row with the minimum
+SELECT c.position, min(c.number), r.image AS number, r.*
+FROM current_points c JOIN region r ON r.points = c.revision
+GROUP BY c.position, r.image;
+
+CREATE VIEW pair_record AS  -- NULL: no estimate, no points, no failure
+SELECT w.position AS "index", w.id, w.batch, ends.image0, ends.image1, ends.turns0, ends.turns1,
+    coalesce(e.failure, nullif(w.failure, '')) AS failure, e.F, e.magsac, e.support, e.candidates,
+    e.cost, e.magsac_cost, e.focals, e.rotation, e.seconds AS estimate_seconds, p.*
+FROM wanted_pair w
+JOIN pair ends ON ends.id = w.pair
+JOIN pair_standing s ON s.position = w.position
+LEFT JOIN estimate e ON e.revision = s.estimate
+LEFT JOIN (
+    SELECT position, sum(matches) AS matches, sum(decode_seconds) AS decode_seconds, sum(encode_seconds) AS encode_seconds,
+        sum(match_seconds) AS match_seconds, sum(cluster_seconds) AS cluster_seconds
+    FROM current_points
+    GROUP BY position
+) p ON p.position = w.position
+WHERE w.has_row;
 
 CREATE VIEW pair_choice AS
 SELECT w.position, c.F, c.reason

@@ -33,7 +33,6 @@ class State:
         self.own = np.tile(FALLBACK_FUNDAMENTAL, (count, 1, 1))
         self.by_scene: dict[int, NDArray[np.float64]] = {}
         self.changed: set[int] = set()
-        self._twins = journal.twins()
         self._read(None if count else ())
         self.read_choices()
 
@@ -55,10 +54,8 @@ class State:
 
     def refresh(self, positions: Iterable[int]) -> None:
         """Read these pairs again, and all rows that repeat them."""
-        changed = {twin for position in positions for twin in self._twins.get(position, (position,))}
-        index = sorted(changed)
-        self.had[index], self.matches[index], self.is_estimated[index] = False, 0, False
-        self._read(index)
+        changed = {twin for position in positions for twin in self.journal.twins(position)}
+        self._read(sorted(changed))
         self.changed |= changed
 
     def read_choices(self) -> None:
@@ -79,10 +76,10 @@ class State:
         return PairPoints(position, (image0, image1), points, self.pairs[position].pair.intrinsics, own)
 
     def _read(self, positions: Sequence[int] | None) -> None:
-        for position, unit, matches in self.journal.had(positions):
-            self.had[position, unit] = True
-            self.matches[position] += matches
-        for position, F, inliers, failure, is_current in self.journal.estimated(positions):
-            self.own[position], self.has_own[position] = matrix_of(F), not failure
-            self.inliers[position] = sum(map(int, inliers.split()))
-            self.is_estimated[position] = is_current
+        for position, units, matches, F, inliers, failure, is_current in self.journal.states(positions):
+            self.had[position] = False
+            self.had[position, [*map(int, (units or "").split())]] = True
+            self.matches[position], self.is_estimated[position] = matches or 0, bool(is_current)
+            if F is not None:
+                self.own[position], self.has_own[position] = matrix_of(F), not failure
+                self.inliers[position] = inliers or 0

@@ -7,31 +7,37 @@ import base64
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING
 
-import pandas as pd
-
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.data.images import Image
 from mkpc_kaggle.data.outputs import replacing
 from mkpc_kaggle.engine.budget import format_duration
-from mkpc_kaggle.engine.journal_reader import EventKind
 from mkpc_kaggle.errors import UserError, printable, writing
-from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
+from mkpc_kaggle.pipeline.pair import PairMatch
 from mkpc_kaggle.pipeline.two_stage import to_image
 from mkpc_kaggle.reporting.figures import draw_cameras, draw_pair, draw_strip, encode
-from mkpc_kaggle.reporting.run_log import RunLog, WeakPair, read_log
-from mkpc_kaggle.reporting.summary import headline, left_out_line, trouble, weakest_cameras
+from mkpc_kaggle.reporting.run_log import RunLog, read_log
+from mkpc_kaggle.reporting.summary import (
+    facts,
+    headline,
+    left_out_line,
+    seconds_by_part,
+    trouble,
+    unit_means,
+    unit_reasons,
+    weakest_cameras,
+)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 WRITING_S, WRITING_S_PER_PAIR = 0.6, 0.0002  # time for a page without drawings
 DRAWING_S = 5.0  # drawings start only with more time left
-MAX_ROWS = 100  # of a table; the journal command exports all rows
 MAX_SCENES, MAX_MODELS = 12, 8  # drawn scenes, and drawn models of a scene
 
 
@@ -75,89 +81,51 @@ def report_page(log: RunLog, pairs: Sequence[Pair] = (), *, undrawn: str = "") -
     if not undrawn and find_spec("matplotlib") is None:
         undrawn = "matplotlib is not installed: pip install 'mkpc-kaggle[plots]'"
     sources = {} if undrawn else {pair.id: pair for pair in pairs}
-    largest = sorted((s for s in log.scenes if s.registered), key=lambda scene: -scene.registered)[:MAX_SCENES]
+    largest = sorted(log.scenes, key=lambda scene: -scene.registered)[:MAX_SCENES]
+    failed = [
+        (record.pair.id, record.pair.group, record.failure) for record in log.records if not record.is_solved
+    ]
     pages = Environment(loader=PackageLoader("mkpc_kaggle.reporting"), autoescape=True, undefined=StrictUndefined)
     return pages.get_template("report.html").render(
         log=log,
-        verdict=headline(log.tables, log),
+        duration=format_duration,
+        verdict=headline(log),
         trouble=trouble(log),
-        facts=[*_facts(log)],
+        facts=facts(log),
         left_out=left_out_line(log.about.left_out),
-        faults=_events(log, EventKind.FAULT),
-        failures=_failures(log),
-        unit_failures=pd.DataFrame({"units that failed": log.tables.unit_reasons()}),
-        weakest=[_weak(log, weak, sources) for weak in log.weakest],
-        scenes=_scenes(log),
+        failed=failed,
+        failures=Counter(reason for *_, reason in failed).most_common(),
+        unit_failures=[(reason,) for reason in unit_reasons(log)],
+        sources=sources,
+        weakest=[(_picture(sources.get(record.pair.id), match), record) for record, match in log.weakest],
+        scenes=[*_scenes(log)],
+        choices=Counter(str(record.scene.reason) for record in log.records if record.scene).most_common(),
+        sigmas=[(name, 100 * of.centre, of.rotation, of.focal) for name, of in weakest_cameras(log.scenes)],
         cameras=[
             (f"{scene.batch}, model {number}", _data_uri(draw_cameras(scene, number), "png"))
             for scene in ([] if undrawn else largest)
             for number in range(min(len(scene.models), MAX_MODELS))
         ],
-        costs=_costs(log),
-        plans=_events(log, EventKind.PLAN),
+        units=[(*means, means[1] * means[-1]) for means in unit_means(log)],
+        parts=[(name, total, total / len(log.records)) for name, total in seconds_by_part(log).items() if total],
         undrawn=undrawn,
-        max_rows=MAX_ROWS,
     )
 
 
-def _facts(log: RunLog) -> Iterator[tuple[str, str, str]]:
-    """Yield the most important facts: name, value, remark."""
-    solved, sources = log.tables.solved, log.tables.pairs["source"].value_counts()
-    parts = (("scene", "from scenes"), ("pair", "from their own matches"), ("fallback", "fallback"))
-    from_where = ", ".join(f"{sources[source]} {what}" for source, what in parts if source in sources)
-    yield "pairs with an F", f"{len(solved)} of {len(log.pairs)}", from_where
-    if len(solved):
-        least = f"median of a pair, at least {solved['inliers'].min()}"
-        yield "inliers", f"{solved['inliers'].median():.0f}", least
-        threshold = f"supported {MIN_SUPPORT:g} times as well as by chance"
-        yield "pairs that show the same", f"{solved['overlaps'].sum()} of {len(solved)}", threshold
-    limit = f"of {format_duration(log.about.limit)}" if log.about.limit is not None else "no time limit"
-    sessions = sum(event.kind == EventKind.START for event in log.events)
-    yield "time", format_duration(log.seconds), limit + (f", session {sessions}" if sessions > 1 else "")
-    reasons = log.tables.regions["reason"]
-    if len(reasons):
-        cropped = f"{sum(reasons == 'cropped')} of {len(reasons)}"
-        yield "critical regions", cropped, ", ".join(log.tables.region_reasons)
-    if log.scenes:
-        placed, images = (sum(getattr(scene, name) for scene in log.scenes) for name in ("registered", "images"))
-        yield "images with a camera", f"{placed} of {images}", f"in {len(log.scenes)} batches"
+def _picture(source: Pair | None, match: PairMatch) -> str:
+    """Return a pair's picture, empty if its images are unknown or unreadable."""
+    if source is not None:
+        with suppress(UserError):
+            return _data_uri(draw_strip(_images(source), match), "jpeg")
+    return ""
 
 
-def _events(log: RunLog, kind: EventKind) -> pd.DataFrame:
-    rows = [(format_duration(event.seconds), event.text) for event in log.events if event.kind == kind]
-    return pd.DataFrame(rows, columns=["when", kind.value])
-
-
-def _failures(log: RunLog) -> list[pd.DataFrame]:
-    """Return a table of reasons for pairs without an F, if pairs share reasons, and a table of these pairs."""
-    failed = log.tables.failed[["id", "group", "failure"]]
-    counts = failed["failure"].value_counts()
-    reasons = pd.DataFrame({"pairs with the fallback row": counts, "reason": counts.index})
-    by_pair = failed.set_axis(["pair with the fallback row", "batch", "reason"], axis=1)
-    return [reasons, by_pair] if len(counts) < len(failed) else [by_pair]
-
-
-def _weak(log: RunLog, weak: WeakPair, sources: dict[str, Pair]) -> tuple[str, str, str]:
-    """Return a weak pair's picture, empty if it is not drawn, its counts and remarks, and its id."""
-    record, pair, picture = weak.record, log.pairs[weak.record.index], ""
-    parts = [f"{record.inliers} inliers of {record.matches} matches", record.failure]
-    parts.append("" if record.overlaps else f"may show different things: support {record.stats.support:.1f}")
-    if record.source == "scene":
-        parts.append("F is the scene's")
-    if pair.id in sources:
-        try:
-            picture = _data_uri(draw_strip(_images(sources[pair.id]), weak.match), "jpeg")
-        except UserError:
-            parts.append("an image cannot be read any more")
-    return picture, "; ".join(filter(None, parts)), pair.id
-
-
-def weak_figure(log: RunLog, weak: WeakPair, source: Pair) -> "Figure":
+def weak_figure(log: RunLog, match: PairMatch, source: Pair) -> "Figure":
     """Draw the matches, clusters and critical regions of a weak pair, from the journal.
 
     ``source`` is the pair with its image paths. Raises :class:`UserError` for an unreadable image.
     """
-    return draw_pair(*_images(source), weak.match, log.recipe.mkpc)
+    return draw_pair(*_images(source), match, log.recipe.mkpc)
 
 
 def _images(pair: Pair) -> tuple[Image, Image]:
@@ -165,34 +133,14 @@ def _images(pair: Pair) -> tuple[Image, Image]:
     return first, second
 
 
-def _scenes(log: RunLog) -> list[pd.DataFrame]:
-    """Return three tables: reconstructed batches, why pairs have their F, and cameras, weakest first."""
-    pairs = log.tables.pairs
-    counts = pairs[pairs["source"] == "scene"].groupby("group").size()
-    rows = []
+def _scenes(log: RunLog) -> Iterator[tuple[object, ...]]:
+    """Yield a row of each batch: images, registered images, points, focal lengths, seconds, pairs, failure."""
+    counts = Counter(record.pair.group for record in log.records if record.source == "scene")
     for each in log.scenes:
         focals = [found.focal for model in each.models for found in model.images]
         spread = f"{median(focals):.0f} ({min(focals):.0f} to {max(focals):.0f})" if focals else ""
         placed = each.batch, each.images, each.registered, each.points, spread
-        rows.append((*placed, each.seconds, int(counts.get(each.batch, 0)), each.failure))
-    heads = ["batch", "images", "cameras", "points", "focals (px)", "seconds", "pairs with its F", "failure"]
-    reasons = Counter(str(record.scene.reason) for record in log.records if record.scene is not None)
-    batches = pd.DataFrame(rows, columns=heads)
-    cameras = [(name, 100 * of.centre, of.rotation, of.focal) for name, of in weakest_cameras(log.scenes)]
-    sigmas = ["camera, weakest first", "error of its centre (%)", "rotation (deg)", "focal length (%)"]
-    return [
-        batches if batches["failure"].any() else batches.drop(columns="failure"),
-        pd.DataFrame(reasons.most_common(), columns=["which F a pair has", "pairs"]),
-        pd.DataFrame(cameras, columns=sigmas),
-    ]
-
-
-def _costs(log: RunLog) -> list[pd.DataFrame]:
-    units = log.tables.unit_means.rename(columns={"unit": "unit (means)"})
-    units["seconds in all"] = units["pairs"] * units["seconds"]
-    parts = pd.DataFrame(log.tables.seconds_by_part.items(), columns=["part of the work", "seconds in all"])
-    parts["seconds a pair"] = parts["seconds in all"] / max(1, len(log.pairs))
-    return [units, parts] if len(units) else []
+        yield (*placed, each.seconds, counts[each.batch], each.failure)
 
 
 def _data_uri(figure: "Figure", kind: str) -> str:

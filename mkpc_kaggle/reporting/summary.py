@@ -3,41 +3,44 @@
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from statistics import median
+from typing import TypeAlias
 
-from mkpc_kaggle.data.competition import Pair
+import numpy as np
+
 from mkpc_kaggle.engine.budget import format_duration
 from mkpc_kaggle.engine.records import PairRecord, SceneRecord
 from mkpc_kaggle.engine.request import Ending, RunReport
+from mkpc_kaggle.geometry.critical_region import RegionReason
 from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
-from mkpc_kaggle.reporting.run_log import RunLog, RunTables, run_tables
+from mkpc_kaggle.reporting.run_log import SECONDS, RunLog
 from mkpc_kaggle.scene.reconstruction import Sigmas
 
 MAX_LINES = 8  # of each list
 
+Run: TypeAlias = RunReport | RunLog
 
-def summary(pairs: Sequence[Pair], report: RunReport) -> str:
+
+def summary(report: RunReport) -> str:
     """Return the summary at the end of a run."""
-    tables = run_tables(pairs, report.records)
     resumed = f", {report.resumed} of them from earlier runs" if report.resumed else ""
     done = f"; {report.units_run} units run, {report.estimated} F estimated"
-    lines = [headline(tables, report) + resumed + done, *_lines(tables, report), trouble(report)]
-    return "\n".join(filter(None, lines))
+    return "\n".join(filter(None, [headline(report) + resumed + done, *_lines(report), trouble(report)]))
 
 
 def overview(log: RunLog) -> str:
     """Return the summary of a journal."""
     about = f"recipe {log.recipe.name}, {log.about.device}, {len(log.events)} events"
-    lines = [headline(log.tables, log), about, left_out_line(log.about.left_out), *_lines(log.tables, log)]
-    return "\n".join(filter(None, lines))
+    return "\n".join(filter(None, [headline(log), about, left_out_line(log.about.left_out), *_lines(log)]))
 
 
-def headline(tables: RunTables, run: RunReport | RunLog) -> str:
+def headline(run: Run) -> str:
     """Return the run's ending and the number of pairs with an F."""
-    count = f"{len(tables.solved)} of {len(tables.pairs)} pairs have an F"
+    count = f"{sum(record.is_solved for record in run.records)} of {len(run.records)} pairs have an F"
     return f"{run.ending} after {format_duration(run.seconds)}: {count}"
 
 
-def trouble(run: RunReport | RunLog) -> str:
+def trouble(run: Run) -> str:
     """Return why a run failed although its file is complete, or an empty string.
 
     Pairs without an F count only if an error is the cause, not too few matches or too little time.
@@ -55,7 +58,7 @@ def trouble(run: RunReport | RunLog) -> str:
 
 def _error(record: PairRecord) -> str:
     """Return the error that left a pair without an F, if any."""
-    if record.source != "fallback":
+    if record.is_solved:
         return ""
     if not record.units:
         return record.failure
@@ -69,34 +72,64 @@ def left_out_line(left_out: Sequence[str]) -> str:
     return f"left out, {'; '.join(left_out)}{advice * has_advice}" if left_out else ""
 
 
-def _lines(tables: RunTables, run: RunReport | RunLog) -> Iterator[str]:
-    """Yield inliers, means of units, regions, seconds and scenes, then lists of failures, units and faults."""
-    inliers, means, failed, scenes = tables.solved["inliers"], tables.unit_means, tables.failed, run.scenes
-    if len(inliers):
-        yield f"inliers: median {inliers.median():.0f}, mean {inliers.mean():.1f}, least {inliers.min()}"
-        if doubtful := (~tables.solved["overlaps"]).sum():
-            yield f"pairs that may show different things: {doubtful} (support below {MIN_SUPPORT:g})"
-    if len(means):
-        yield f"{'unit':<30}{'pairs':>7}{'matches':>9}{'inliers':>9}{'seconds':>9}"
-    for unit in means.itertuples():
-        yield f"{unit.unit:<30}{unit.pairs:>7}{unit.matches:>9.0f}{unit.inliers:>9.0f}{unit.seconds:>9.2f}"
-    if len(tables.regions):
-        yield f"critical regions: {', '.join(tables.region_reasons)}"
-    pairs = max(1, len(tables.pairs))
-    parts = (f"{name} {seconds / pairs:.3f}" for name, seconds in tables.seconds_by_part.items())
-    yield f"seconds a pair: {', '.join(parts)}"
+def unit_means(run: Run) -> list[tuple[str, int, float, float, float]]:
+    """Return each unit, its number of pairs, and its means of matches, inliers and seconds."""
+    results: dict[str, list[tuple[float, float, float]]] = {}
+    for unit in (unit for record in run.records for unit in record.units):
+        values = unit.matches, unit.inliers, unit.encode_seconds + unit.match_seconds
+        results.setdefault(unit.unit, []).append(values)
+    return [(name, len(rows), *np.mean(rows, axis=0)) for name, rows in results.items()]
+
+
+def unit_reasons(run: Run, field: str = "failure") -> list[str]:
+    """Return why units failed or, by ``note``, ran otherwise, and on how many pairs; most frequent first."""
+    units = (unit for record in run.records for unit in record.units)
+    counts = Counter(f"{unit.unit}: {getattr(unit, field)}" for unit in units if getattr(unit, field))
+    return [f"{reason} ({count} pairs)" for reason, count in counts.most_common()]
+
+
+def seconds_by_part(run: Run) -> dict[str, float]:
+    """Return the seconds of each part of the work on all pairs."""
+    return {name: sum(getattr(record, field) for record in run.records) for field, name in SECONDS.items()}
+
+
+def facts(run: Run) -> Iterator[tuple[str, str, str]]:
+    """Yield the most important facts: name, value, remark."""
+    records, scenes = run.records, run.scenes
+    solved, sources = [record for record in records if record.is_solved], Counter(each.source for each in records)
+    parts = (("scene", "from scenes"), ("pair", "from their own matches"), ("fallback", "fallback"))
+    from_where = ", ".join(f"{sources[source]} {what}" for source, what in parts if source in sources)
+    yield "pairs with an F", f"{len(solved)} of {len(records)}", from_where
+    if inliers := [record.inliers for record in solved]:
+        yield "inliers", f"{median(inliers):.0f}", f"median of a pair, at least {min(inliers)}"
+        overlapping = sum(record.overlaps for record in solved)
+        threshold = f"supported {MIN_SUPPORT:g} times as well as by chance"
+        yield "pairs that show the same", f"{overlapping} of {len(solved)}", threshold
+    if regions := Counter(region.reason for record in records for region in record.regions or ()):
+        counts = ", ".join(f"{count} {reason}" for reason, count in regions.most_common())
+        yield "critical regions", f"{regions[RegionReason.CROPPED]} of {regions.total()}", counts
     if scenes:
-        made = f"{sum(scene.registered > 0 for scene in scenes)} of {len(scenes)} batches reconstructed"
-        images = f"{sum(scene.registered for scene in scenes)} of {sum(scene.images for scene in scenes)} images"
-        chosen = f"F of {sum(tables.pairs['source'] == 'scene')} of {len(tables.pairs)} pairs is from them"
-        yield f"scenes: {made} with {images}; {chosen}"
-        yield from weakest_line(scenes)
-    no_scene = [f"{scene.batch}: {scene.failure}" for scene in scenes if scene.failure]
-    reasons = list(failed["id"][:MAX_LINES] + ": " + failed["failure"][:MAX_LINES])
+        placed, images = sum(scene.registered for scene in scenes), sum(scene.images for scene in scenes)
+        yield "images with a camera", f"{placed} of {images}", f"in {len(scenes)} batches"
+
+
+def _lines(run: Run) -> Iterator[str]:
+    """Yield the facts, means of units, seconds and weakest cameras, then lists of failures, units and faults."""
+    yield from (f"{name}: {value} ({remark})" for name, value, remark in facts(run))
+    if means := unit_means(run):
+        yield f"{'unit':<30}{'pairs':>7}{'matches':>9}{'inliers':>9}{'seconds':>9}"
+    for name, pairs, matches, inliers, seconds in means:
+        yield f"{name:<30}{pairs:>7}{matches:>9.0f}{inliers:>9.0f}{seconds:>9.2f}"
+    count = max(1, len(run.records))
+    parts = (f"{name} {seconds / count:.3f}" for name, seconds in seconds_by_part(run).items())
+    yield f"seconds a pair: {', '.join(parts)}"
+    yield from weakest_line(run.scenes)
+    no_scene = [f"{scene.batch}: {scene.failure}" for scene in run.scenes if scene.failure]
+    failed = [f"{record.pair.id}: {record.failure}" for record in run.records if not record.is_solved]
     yield from _list("batches without a scene", no_scene)
-    yield from _list("pairs with the fallback row", reasons, len(failed))
-    yield from _list("units that failed", tables.unit_reasons())
-    yield from _list("units that ran otherwise than written", tables.unit_reasons("note"))
+    yield from _list("pairs with the fallback row", failed)
+    yield from _list("units that failed", unit_reasons(run))
+    yield from _list("units that ran otherwise than written", unit_reasons(run, "note"))
     yield from _list("faults", run.faults)
 
 
@@ -114,11 +147,10 @@ def weakest_cameras(scenes: Sequence[SceneRecord]) -> list[tuple[str, Sigmas]]:
     return sorted(known, key=lambda each: -each[1].centre)
 
 
-def _list(title: str, items: Sequence[str], count: int | None = None) -> Iterator[str]:
-    """Yield the first items and their number: ``count``, if ``items`` is only a part."""
-    count = len(items) if count is None else count
-    if count:
-        yield f"{title}: {count}"
+def _list(title: str, items: Sequence[str]) -> Iterator[str]:
+    """Yield the number of items and the first of them."""
+    if items:
+        yield f"{title}: {len(items)}"
         yield from (f"  {item}" for item in items[:MAX_LINES])
-    if count > MAX_LINES:
-        yield f"  ... and {count - MAX_LINES} more"
+    if len(items) > MAX_LINES:
+        yield f"  ... and {len(items) - MAX_LINES} more"

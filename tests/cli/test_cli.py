@@ -18,7 +18,7 @@ from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 def test_importing_the_package_is_cheap_and_geometry_and_weights_bring_no_torch():
     code = (
         "import sys, pkgutil, importlib, mkpc_kaggle\n"
-        "print([m for m in ('torch', 'cv2', 'pandas', 'numpy') if m in sys.modules])\n"
+        "print([m for m in ('torch', 'cv2', 'numpy') if m in sys.modules])\n"
         "import mkpc_kaggle.geometry as g, mkpc_kaggle.weights\n"
         "[importlib.import_module(f'{g.__name__}.{m.name}') for m in pkgutil.iter_modules(g.__path__)]\n"
         "print('torch' in sys.modules)"

@@ -61,7 +61,7 @@ def test_a_run_that_goes_on_from_another_estimation_ends_with_the_bytes_of_a_fre
         # Without the scene F is that of the pairs' own matches, which the journal has.
         assert (report.units_run, report.estimated) == (0, 0 if name == "no scene" else 6)
         assert read_log(journal).recipe == replace(recipe, name=read_log(journal).recipe.name)
-    assert "0 units run, 6 F estimated" in summary(pairs, report)
+    assert "0 units run, 6 F estimated" in summary(report)
 
 
 def die_at_a_write(pairs: Sequence[Pair], recipe: Recipe, work_dir: Path, *, after: bool) -> None:

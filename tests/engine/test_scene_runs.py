@@ -57,12 +57,12 @@ def test_pairs_get_the_f_of_their_scene_and_keep_their_own(tmp_path, monkeypatch
     assert report.records[0].scene.reason is Reason.CONTRADICTION
     assert np.array_equal(published[-1], [record.chosen_fundamental for record in report.records])
     log = read_log(tmp_path / "work")
-    told = "scenes: 1 of 1 batches reconstructed with 4 of 4 images; F of 5 of 6 pairs is from them"
-    assert told in overview(log)
+    assert "pairs with an F: 6 of 6 (5 from scenes, 1 from their own matches)" in overview(log)
+    assert "images with a camera: 4 of 4 (in 1 batches)" in overview(log)
     assert "weakest cameras, with the error of the centre: 3.png (3 %), 2.png (2 %), 1.png (1 %)" in overview(log)
     assert report_page(log).index("3.png</td>") < report_page(log).index("2.png</td>")
     assert "both cameras are known" in report_page(log)
-    assert all(len(weak.match.results[0].matches) for weak in log.weakest), "what is drawn keeps its points"
+    assert all(len(match.results[0].matches) for _, match in log.weakest), "what is drawn keeps its points"
 
 
 def test_a_focal_length_of_exif_goes_to_the_pairs_the_journal_and_the_scene(tmp_path, monkeypatch):

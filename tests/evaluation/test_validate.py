@@ -66,9 +66,9 @@ def test_a_failed_pair_counts_as_failed_even_where_the_fallback_happens_to_be_ri
     camera0, camera1 = Camera(eye, eye, np.zeros(3)), Camera(eye, eye, np.array([1.0, 0, 0]))
     true = TruePair(Pair("p", "s", "a", "b"), camera0, camera1, 0.5)
     scene = TrainScene("s", 1.0, (true,))
-    record = PairRecord(0, FALLBACK_FUNDAMENTAL.copy(), "too few matches")
+    record = PairRecord(0, true.pair, failure="too few matches")
     failed = score_record(true, record, scene, [Step.MAGSAC])
-    right = score_record(true, PairRecord(0, FALLBACK_FUNDAMENTAL.copy(), ""), scene)
+    right = score_record(true, PairRecord(0, true.pair, failure=""), scene)
     assert SceneScore("s", (right, failed, right)).maa() == pytest.approx(2 / 3)
     assert failed.error.rotation == failed.steps[Step.MAGSAC].rotation == np.inf
     assert right.error.angle < 1e-6
@@ -103,7 +103,7 @@ def test_a_work_directory_keeps_the_journal_and_a_report_that_shows_the_pairs(de
     assert [set(pair["matches"]) for pair in scores["scenes"][0]["pairs"]] == [{"1:sift@400"}] * 2
     page = tmp_path / "work" / "report.html"
     assert page.read_text(encoding="utf-8").count("<img ") == 2
-    assert len(read_log(tmp_path / "work").pairs) == 2
+    assert len(read_log(tmp_path / "work").records) == 2
 
 
 HANGS = """

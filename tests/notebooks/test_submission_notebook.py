@@ -4,7 +4,6 @@ import tomllib
 from pathlib import Path
 
 import nbformat
-import pandas as pd
 import pytest
 from kaggle_image import environment, make_image, python_version, upload
 from offline_notebook import execute, needs_namespaces, pictures, printed
@@ -38,7 +37,9 @@ class Kaggle:
 
     def add_test_side(self, test_dir: Path, pairs: int | None = None) -> None:
         self.test_dir.mkdir(parents=True)
-        pd.read_csv(test_dir / "test.csv").head(pairs).to_csv(self.test_dir / "test.csv", index=False)
+        lines = (test_dir / "test.csv").read_text(encoding="utf-8").splitlines()
+        rows = len(lines) if pairs is None else pairs + 1
+        (self.test_dir / "test.csv").write_text("\n".join(lines[:rows]), encoding="utf-8")
         (self.test_dir / "test_images").symlink_to(test_dir / "test_images")
 
     def add_dataset(self, packaged: Path, weights: tuple[Path, ...] = ()) -> None:
@@ -62,7 +63,7 @@ def kaggle(tmp_path: Path, image: Path, wheels: Path) -> Kaggle:
     return Kaggle(tmp_path / "kaggle", image, wheels)
 
 
-VERSIONS = "opencv-python-headless=={} scikit-learn==1.6.1 pandas==2.2.3 scipy==1.15.3 torch=={} numpy=={}"
+VERSIONS = "opencv-python-headless=={} scikit-learn==1.6.1 scipy==1.15.3 torch=={} numpy=={}"
 IMAGES = [  # of Kaggle's: Python, OpenCV, torch, NumPy
     ("3.11", "4.11.0.86", "2.6.0", "1.26.4"),
     ("3.12", "4.13.0.92", "2.11.0", "2.0.2"),
