@@ -9,10 +9,9 @@ from pathlib import Path
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.budget import Budget, monotonic_of, parse_duration
 from mkpc_kaggle.engine.cluster import parse_workers
-from mkpc_kaggle.engine.console import say
+from mkpc_kaggle.engine.console import drain, say, unblocked
 from mkpc_kaggle.engine.request import RunReport
-from mkpc_kaggle.engine.session import Interrupt, Session, Watchdog
-from mkpc_kaggle.engine.streams import drain, unblocked
+from mkpc_kaggle.engine.session import Interrupt, Session
 from mkpc_kaggle.pipeline.assembly import Assembly, assemble
 from mkpc_kaggle.pipeline.availability import Licence
 from mkpc_kaggle.recipe import Mode
@@ -66,13 +65,11 @@ def budget_of(arguments: argparse.Namespace) -> Budget:
 
 
 @contextmanager
-def watched_session(
-    arguments: argparse.Namespace, work_dir: Path, interrupt: Interrupt
-) -> Iterator[tuple[Session, Watchdog]]:
-    """Open a session with these options, and the watchdog that ends the program in time even if the run hangs."""
+def watched_session(arguments: argparse.Namespace, work_dir: Path, interrupt: Interrupt) -> Iterator[Session]:
+    """Open a session with these options, whose watchdog ends the program in time even if the run hangs."""
     budget, fresh, workers = budget_of(arguments), arguments.fresh, arguments.workers
-    with Watchdog(budget, interrupt) as watchdog:
-        yield Session(work_dir, budget, interrupt, fresh, workers=workers, watchdog=watchdog), watchdog
+    with Session(work_dir, budget, interrupt, fresh, workers=workers).watched() as session:
+        yield session
         drain()  # inside the watchdog: the reader of the output may hang
 
 

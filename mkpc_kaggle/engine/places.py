@@ -15,7 +15,7 @@ from math import inf
 
 from mkpc_kaggle.engine.jobs import Answer, Cause, Failure, Job, Loaded
 from mkpc_kaggle.engine.process import ProcessWorker, ThreadWorker
-from mkpc_kaggle.engine.worker import MatchRunner, light_runner, scene_runner, share_cores
+from mkpc_kaggle.engine.worker import MatchRunner, light_runner, scene_runner
 from mkpc_kaggle.pipeline.assembly import Assembly
 
 START_TIMEOUT_S = 300.0  # for a worker to load its matchers; over a network's disk that is not quick
@@ -177,5 +177,5 @@ class LocalSite(Site):
             self.fallback = [self._place("cpu", assembly.on_cpu())]
 
     def _place(self, name: str, assembly: Assembly, share: int = 1) -> Place:
-        make = partial(share_cores, partial(MatchRunner, assembly.pipeline), share)
+        make = partial(MatchRunner, assembly.pipeline, share=share)
         return Place(name, lambda: ProcessWorker(f"mkpc {name}", make, self.ring))

@@ -76,27 +76,20 @@ def failure_of(error: Exception) -> Failure:
     return Failure(CAUSES[failures.failure_of(error)], failures.reason_of(error))
 
 
-def with_threads(make: Callable[[], Runner], count: int) -> Runner:
-    """Call ``make`` in a process that computes in ``count`` threads."""
-    import cv2
-    import torch
-
-    torch.set_num_threads(count)
-    cv2.setNumThreads(count)
-    return make()
-
-
-def share_cores(make: Callable[[], Runner], share: int) -> Runner:
-    """Call ``make`` in one of ``share`` processes that share the machine's cores."""
-    import torch
-
-    return with_threads(make, max(1, torch.get_num_threads() // share)) if share > 1 else make()
-
-
 class MatchRunner:
-    """A runner of match jobs. Raises :class:`mkpc_kaggle.errors.UserError` if the matchers cannot be loaded."""
+    """A runner of match jobs, with ``threads`` threads, or one of ``share`` processes with the machine's cores.
 
-    def __init__(self, make_pipeline: Callable[[], "Pipeline"]) -> None:
+    Raises :class:`mkpc_kaggle.errors.UserError` if the matchers cannot be loaded.
+    """
+
+    def __init__(self, make_pipeline: Callable[[], "Pipeline"], *, threads: int = 0, share: int = 1) -> None:
+        if threads or share > 1:
+            import cv2
+            import torch
+
+            threads = threads or max(1, torch.get_num_threads() // share)
+            torch.set_num_threads(threads)
+            cv2.setNumThreads(threads)
         self._pipeline = make_pipeline()
         self._pipeline.load()
         self._images = ImageStore()
@@ -111,33 +104,30 @@ class MatchRunner:
             return time.monotonic() + expected[unit] < deadline
 
         self._images.prefetch(path for each in job.pairs for path in each.pair.images)
-        pairs = [self._open(each, known) for each, known in zip(job.pairs, job.known, strict=True)]
+        opened = [self._open(each, known) for each, known in zip(job.pairs, job.known, strict=True)]
         self._images.prefetch(job.upcoming)
-        readable = [number for number, pair in enumerate(pairs) if not pair.failure]
-        matched = self._pipeline.match([pairs[number] for number in readable], job.units, may_start)
-        for number, pair in zip(readable, matched, strict=True):
-            pairs[number] = pair
+        matched = iter(self._pipeline.match([pair for pair in opened if not pair.failure], job.units, may_start))
+        pairs = (pair if pair.failure else next(matched) for pair in opened)
         return tuple(_outcome(*each) for each in zip(job.indices, job.pairs, pairs, job.known, strict=True))
 
     def _open(self, wanted: WantedPair, known: tuple[UnitResult, ...]) -> PairMatch:
         """Return the pair with its images; ``failure`` says which of them cannot be read."""
-        start, pair = time.perf_counter(), wanted.pair
-        files = zip(pair.images, pair.turns, strict=True)
+        start, files = time.perf_counter(), zip(wanted.pair.images, wanted.pair.turns, strict=True)
         images = [self._images.get(path).turned(turns) for path, turns in files]
         seconds = time.perf_counter() - start
         readable = tuple(image for image in images if isinstance(image, Image))
         failure = next((str(image) for image in images if not isinstance(image, Image)), "")
-        return PairMatch(known, images=readable, failure=failure, decode_seconds=seconds)
+        return PairMatch(known, images=() if failure else readable, failure=failure, decode_seconds=seconds)
 
 
 def _outcome(index: int, wanted: WantedPair, pair: PairMatch, known: tuple[object, ...]) -> Outcome:
-    """The new results of a pair; its images have the contents that were matched."""
+    """Return the new results of a pair; its images have the contents that were matched."""
     images = tuple(
         BatchImage(name, image.version, image.size, image.focal)
-        for name, image in zip(wanted.names, pair.images, strict=False)  # fewer if one is unreadable
+        for name, image in zip(wanted.names, pair.images, strict=False)  # none if one is unreadable
     )
     found, seconds = pair.results[len(known) :], (pair.decode_seconds, pair.cluster_seconds)
-    return Outcome(index, () if pair.failure else images, found, pair.regions, pair.failure, *seconds)
+    return Outcome(index, images, found, pair.regions, pair.failure, *seconds)
 
 
 def light_runner() -> Runner:
@@ -196,8 +186,7 @@ def batch_pair(pair: PairPoints, points: dict[int, Matches]) -> BatchPair:
 
 def read_points(source: PointSource, pairs: tuple[PairPoints, ...]) -> dict[int, Matches]:
     """Return the points of pairs by revision."""
-    revisions = [revision for pair in pairs for revision in pair.revisions]
     if source.points is not None:
         return source.points
     with JournalReader(source.directory, check=False) as journal:
-        return journal.points(revisions)
+        return journal.points([revision for pair in pairs for revision in pair.revisions])

@@ -303,10 +303,10 @@ def test_a_parent_killed_at_any_moment_leaves_a_whole_file_no_orphans_and_a_run_
 GUARDED = """
 import multiprocessing, os, signal, sys, time
 from mkpc_kaggle.engine.budget import Budget
-from mkpc_kaggle.engine.session import Interrupt, Watchdog
+from mkpc_kaggle.engine.session import Interrupt, Session
 
 if __name__ == "__main__":
-    with Watchdog(Budget(time.monotonic(), float(sys.argv[1])), Interrupt()) as watchdog:
+    with Session("", Budget(time.monotonic(), float(sys.argv[1])), Interrupt()).watched() as session:
         {body}
 """
 
@@ -329,9 +329,9 @@ def test_a_child_that_was_stopped_does_not_outlive_the_watchdog():
 @pytest.mark.parametrize(
     ("body", "status"),
     [
-        ("watchdog.save = lambda: time.sleep(600) or ''", 1),
-        ("watchdog.save = lambda: ''; watchdog.status = 1", 1),
-        ("watchdog.save = lambda: ''", 0),
+        ("session.save = lambda: time.sleep(600) or ''", 1),
+        ("session.save = lambda: ''; session.status = 1", 1),
+        ("session.save = lambda: ''", 0),
     ],
 )
 def test_the_watchdog_leaves_though_writing_hangs_and_keeps_the_status_of_the_run(body, status):
@@ -343,7 +343,7 @@ def test_the_watchdog_leaves_no_unfinished_file(tmp_path):
     body = (
         f"from mkpc_kaggle.data.outputs import replacing, Path; open = {report}; open.__enter__(); time.sleep(600)"
     )
-    assert guarded(f"watchdog.save = lambda: ''; {body}").returncode == 0
+    assert guarded(f"session.save = lambda: ''; {body}").returncode == 0
     assert list(tmp_path.iterdir()) == []
 
 
