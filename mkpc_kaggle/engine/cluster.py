@@ -12,15 +12,15 @@ import textwrap
 import threading
 import time
 from collections.abc import Callable, Iterable
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from mkpc_kaggle.engine.jobs import Answer, Cause, Failure, Job
+from mkpc_kaggle.engine.jobs import Answer, Cause, Failure
 from mkpc_kaggle.engine.places import Place, Site, Work
 from mkpc_kaggle.engine.process import EXIT_TIMEOUT_S, ThreadWorker
-from mkpc_kaggle.engine.worker import Executor, MatchRunner, Runner
+from mkpc_kaggle.engine.worker import Executor, Maker, MatchRunner, Message, Runner
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.version import __version__
@@ -87,7 +87,7 @@ class RaySite(Site):
                 worker.join(until)
             self._ray.shutdown()
 
-    def _add(self, name: str, make: Callable[[], Runner], **where: float) -> None:
+    def _add(self, name: str, make: Maker, **where: float) -> None:
         """Add a place whose workers Ray places by these resources."""
         make = partial(make_alike, make, __version__, self._needed)
 
@@ -104,7 +104,7 @@ class RayWorker(ThreadWorker):
     _actor: Any = None
 
     def __init__(
-        self, name: str, make: Callable[[], Runner], on_answer: Callable[[], None], ray: Any, where: dict[str, Any]
+        self, name: str, make: Maker, on_answer: Callable[[], None], ray: Any, where: dict[str, Any]
     ) -> None:
         super().__init__(name, make, on_answer)
         self._ray, self._where = ray, where
@@ -120,7 +120,7 @@ class RayWorker(ThreadWorker):
         if self._thread.is_alive():
             self._thread.join(max(0.0, until - time.monotonic()))
 
-    def _exchange(self, message: Callable[[], Runner] | Job) -> Answer:
+    def _exchange(self, message: Message) -> Answer:
         if self._actor is None:
             self._actor = self._ray.remote(Executor).options(**self._where).remote()
             if self._killed:
@@ -136,7 +136,7 @@ class RayWorker(ThreadWorker):
         return answer
 
 
-def make_alike(make: Callable[[], Runner], version: str, paths: tuple[Path, ...]) -> Runner:
+def make_alike(make: Maker, version: str, paths: tuple[Path, ...]) -> Runner:
     """Return ``make()`` on a machine of the cluster. Raise :class:`UserError` if it differs from the parent's."""
     host = socket.gethostname()
     if version != __version__:
@@ -165,12 +165,11 @@ def join(ray: Any, cluster: str) -> None:
                 f"--workers {cluster}: no cluster answers there ({reason}). Start one "
                 "with `ray start --head` and join it from the other machines; it prints the address to use."
             ) from error
-    former = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        ray.init(**options, log_to_driver=False, logging_level="ERROR")
-    except (RuntimeError, ConnectionError, ValueError, OSError) as error:
-        raise UserError(f"the Ray cluster cannot be joined: {error}") from error
-    finally:  # Ray replaces this process's signal handlers
+    with ExitStack() as restored:  # Ray replaces this process's signal handlers
         if threading.current_thread() is threading.main_thread():
-            for number, handler in former.items():
-                signal.signal(number, handler)
+            for number in (signal.SIGINT, signal.SIGTERM):
+                restored.callback(signal.signal, number, signal.getsignal(number))
+        try:
+            ray.init(**options, log_to_driver=False, logging_level="ERROR")
+        except (RuntimeError, ConnectionError, ValueError, OSError) as error:
+            raise UserError(f"the Ray cluster cannot be joined: {error}") from error

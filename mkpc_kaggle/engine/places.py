@@ -1,7 +1,7 @@
 """Where workers are: a place has one worker at a time, and is closed when it loses three in a row.
 
 A worker that has not answered by :attr:`Place.limit`, which :meth:`Engine._time_limit` sets, is killed in
-:meth:`Place._lose`: its process gets SIGKILL.
+:meth:`Place._fail`: its process gets SIGKILL.
 """
 
 import os
@@ -35,9 +35,10 @@ class Work(StrEnum):
 
 @dataclass(eq=False)
 class Place:
-    """A place such as "cuda:0": its worker, the worker's job, and the moment until which an answer is awaited.
+    """A place such as "cuda:0": its worker and the worker's job, since a moment of the engine's clock.
 
-    ``closed`` is the reason if no more workers start here.
+    An answer is awaited until ``limit``; without a worker, none is started before it. ``closed`` is the reason if
+    no more workers start here.
     """
 
     name: str
@@ -49,7 +50,7 @@ class Place:
     losses: int = 0
     closed: str = ""
     since: float = 0.0
-    limit: float = inf
+    limit: float = -inf
 
     @property
     def is_idle(self) -> bool:
@@ -61,11 +62,11 @@ class Place:
         return not self.is_loaded and not self.closed and (self.worker is not None or self.losses > 0)
 
     def may_start(self, now: float) -> bool:
-        return self.worker is None and not self.closed and (now >= self.limit or not self.losses)
+        return self.worker is None and not self.closed and now >= self.limit
 
     def start(self, now: float, timeout: float = START_TIMEOUT_S) -> None:
         """Start a worker, which answers when it is loaded."""
-        self.is_loaded, self.since, self.limit = False, now, now + timeout
+        self.since, self.limit = now, now + timeout
         self.worker = self.make()
         self.worker.start()
 
@@ -85,34 +86,36 @@ class Place:
         if answer is None:
             return None
         self.limit = inf
-        if isinstance(answer, Loaded):
+        if isinstance(answer, Failure):
+            self._fail(answer, now)
+        elif isinstance(answer, Loaded):
             self.is_loaded = True
-            return answer
-        if self.is_loaded and not (isinstance(answer, Failure) and answer.cause.is_of_place):
+        else:
             self.losses = 0
-        if isinstance(answer, Failure) and (answer.cause is not Cause.RAISED or not self.is_loaded):
-            self._lose(answer, now)
         return answer
 
     def kill(self) -> None:
-        worker, self.worker, self.job, self.is_loaded = self.worker, None, None, False
-        if worker is not None:
-            worker.kill()
+        if self.worker is not None:
+            self.worker.kill()
+            self.worker, self.is_loaded, self.limit = None, False, -inf
 
-    def _lose(self, failure: Failure, now: float) -> None:
-        """End the worker: memory that ran out is fragmented, and a failing device keeps failing.
+    def _fail(self, failure: Failure, now: float) -> None:
+        """End the worker, except after an error of its job alone.
 
-        A death or a hang does not count against the place if another worker was lost at the same job.
+        Memory that ran out is fragmented, and a failing device keeps failing. A death or a hang does not count
+        against the place if another worker was lost at the same job.
         """
-        job, was_loaded = self.job, self.is_loaded
-        self.kill()
-        self.job, self.limit = job, now
-        is_retry = job is not None and job.is_retry and failure.cause in (Cause.DIED, Cause.TIMED_OUT)
-        if not was_loaded or (failure.cause.is_of_place and not is_retry):
+        is_retry = self.job is not None and self.job.is_retry and failure.cause in (Cause.DIED, Cause.TIMED_OUT)
+        if self.is_loaded and not failure.cause.is_of_place:
+            self.losses = 0
+            if failure.cause is Cause.RAISED:
+                return
+        elif not is_retry:
             self.losses += 1
-            self.limit = now + RESTART_PAUSE_S * self.losses
             if self.losses >= MAX_LOSSES or failure.cause is Cause.REFUSED:
                 self.closed = f"{self.name}: {failure}"
+        self.kill()
+        self.limit = now + RESTART_PAUSE_S * self.losses
 
 
 class Site:

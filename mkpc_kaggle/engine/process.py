@@ -23,7 +23,7 @@ from typing import cast
 
 from mkpc_kaggle.engine.console import unblocked
 from mkpc_kaggle.engine.jobs import Answer, Cause, Failure, Job
-from mkpc_kaggle.engine.worker import Executor, Runner, failure_of
+from mkpc_kaggle.engine.worker import Executor, Maker, Message, Runner, failure_of
 
 # For PyTorch, which reads them once. Threads of OpenMP that wait for each other sleep; by default they spin, and
 # keep the cores from decoding, MAGSAC and other processes (python -m benchmarks.threads). Tensors of 2 MiB and
@@ -44,10 +44,10 @@ class ThreadWorker:
     processes.
     """
 
-    def __init__(self, name: str, make: Callable[[], Runner], on_answer: Callable[[], None]) -> None:
+    def __init__(self, name: str, make: Maker, on_answer: Callable[[], None]) -> None:
         self.name, self._on_answer = name, on_answer
         self._executor = Executor()
-        self._messages: queue.SimpleQueue[Callable[[], Runner] | Job | None] = queue.SimpleQueue()
+        self._messages: queue.SimpleQueue[Message | None] = queue.SimpleQueue()
         self._answers: queue.SimpleQueue[Answer] = queue.SimpleQueue()
         self._killed = False
         self._thread = threading.Thread(target=self._live, name=name, daemon=True)
@@ -81,7 +81,7 @@ class ThreadWorker:
             self._answers.put(answer)
             self._on_answer()
 
-    def _exchange(self, message: Callable[[], Runner] | Job) -> Answer:
+    def _exchange(self, message: Message) -> Answer:
         return self._executor.answer(message)
 
 
@@ -95,7 +95,7 @@ class ProcessWorker(ThreadWorker):
         if self._process is not None:
             self._process.kill()
 
-    def _exchange(self, message: Callable[[], Runner] | Job) -> Answer:
+    def _exchange(self, message: Message) -> Answer:
         """Return the answer to a message, or how the process ended."""
         if self._process is None:
             self._process, self._pipe = spawn(self.name)
@@ -142,7 +142,7 @@ def serve(pipe: Connection) -> None:
     """Serve as a worker process: answer one message after another, the maker of the runner first."""
 
     def make() -> Runner:
-        return cast(Callable[[], Runner], pipe.recv())()  # an object that cannot be unpickled is an answer, too
+        return cast(Maker, pipe.recv())()  # an object that cannot be unpickled is an answer, too
 
     end_with_parent()
     executor, message = Executor(), make

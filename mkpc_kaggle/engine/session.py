@@ -59,25 +59,19 @@ class Interrupt(threading.Event):
 def interruptible() -> Iterator[Interrupt]:
     """Let SIGTERM and Ctrl-C set the interrupt. A second signal has its default effect."""
     interrupt = Interrupt()
-    former = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    with ExitStack() as restored:
 
-    def note(number: int, _: FrameType | None) -> None:
-        restore()
-        interrupt.signal = number
-        interrupt.set()
-        if interrupt.raises:
-            raise KeyboardInterrupt(number)
+        def note(number: int, _: FrameType | None) -> None:
+            restored.close()
+            interrupt.signal = number
+            interrupt.set()
+            if interrupt.raises:
+                raise KeyboardInterrupt(number)
 
-    def restore() -> None:
-        for number, handler in former.items():
-            signal.signal(number, handler)
-
-    for number in former:
-        signal.signal(number, note)
-    try:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            restored.callback(signal.signal, number, signal.getsignal(number))
+            signal.signal(number, note)
         yield interrupt
-    finally:
-        restore()
 
 
 @dataclass

@@ -50,8 +50,9 @@ CAUSES = {
     failures.FailureKind.ORDINARY: Cause.RAISED,
 }
 
-
 Runner = Callable[[Job], Answer]  # it may raise anything, never return, or end the process
+Maker = Callable[[], Runner]
+Message = Maker | Job  # to a worker: first the maker of its runner
 
 
 class Executor:
@@ -59,11 +60,11 @@ class Executor:
 
     _run: Runner | None = None
 
-    def answer(self, message: Callable[[], Runner] | Job) -> Answer:
+    def answer(self, message: Message) -> Answer:
         try:
             if self._run is not None:
                 return self._run(cast(Job, message))
-            self._run = cast(Callable[[], Runner], message)()
+            self._run = cast(Maker, message)()
         except Exception as error:
             if self._run is None and isinstance(error, UserError):
                 is_device = isinstance(error, failures.DeviceError)
