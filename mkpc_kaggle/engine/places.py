@@ -128,10 +128,10 @@ class Site:
     def __init__(self, clock: Callable[[], float], *, threads: bool = False) -> None:
         self._clock = clock
         self._bell: queue.SimpleQueue[None] = queue.SimpleQueue()
+        self._worker = ThreadWorker if threads else ProcessWorker
         estimators = 1 if threads else max(1, (os.cpu_count() or 1) // CORES_PER_ESTIMATOR)
-        worker = ThreadWorker if threads else ProcessWorker
         self.places = [
-            Place(f"estimates {n}", lambda: worker("estimates", light_runner, self.ring), Work.LIGHT)
+            Place(f"estimates {n}", lambda: self._worker("estimates", light_runner, self.ring), Work.LIGHT)
             for n in range(estimators)
         ]
         self.places.append(Place("scenes", self.scene_worker, Work.SCENE))
@@ -165,8 +165,7 @@ class LocalSite(Site):
     def __init__(self, assembly: Assembly, workers: int | None, clock: Callable[[], float]) -> None:
         super().__init__(clock, threads=workers == 0)
         if workers == 0:
-            make = partial(MatchRunner, assembly.pipeline)
-            self.places.append(Place("this process", lambda: ThreadWorker("matching", make, self.ring)))
+            self.places.append(self._place("this process", assembly))
             return
         # On a CPU one process with all threads: two with half of them each do more (recipe light, two cores: the
         # sweep over after 22 s instead of 31), but need twice the memory, and a network's last bits change.
@@ -181,4 +180,4 @@ class LocalSite(Site):
 
     def _place(self, name: str, assembly: Assembly, share: int = 1) -> Place:
         make = partial(MatchRunner, assembly.pipeline, share=share)
-        return Place(name, lambda: ProcessWorker(f"mkpc {name}", make, self.ring))
+        return Place(name, lambda: self._worker(f"mkpc {name}", make, self.ring))

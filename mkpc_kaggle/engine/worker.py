@@ -104,7 +104,6 @@ class MatchRunner:
         def may_start(unit: Unit) -> bool:
             return time.monotonic() + expected[unit] < deadline
 
-        self._images.prefetch(path for each in job.pairs for path in each.pair.images)
         opened = [self._open(each, known) for each, known in zip(job.pairs, job.known, strict=True)]
         self._images.prefetch(job.upcoming)
         matched = iter(self._pipeline.match([pair for pair in opened if not pair.failure], job.units, may_start))
