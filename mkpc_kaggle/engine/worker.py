@@ -27,7 +27,6 @@ from mkpc_kaggle.engine.jobs import (
     MatchJob,
     Outcome,
     PairPoints,
-    PointSource,
     SceneJob,
     WantedPair,
 )
@@ -43,12 +42,6 @@ from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair, tracks_of
 
 if TYPE_CHECKING:
     from mkpc_kaggle.pipeline.stages import Pipeline
-
-CAUSES = {
-    failures.FailureKind.OUT_OF_MEMORY: Cause.OUT_OF_MEMORY,
-    failures.FailureKind.DEVICE: Cause.DEVICE,
-    failures.FailureKind.ORDINARY: Cause.RAISED,
-}
 
 Runner = Callable[[Job], Answer]  # it may raise anything, never return, or end the process
 Maker = Callable[[], Runner]
@@ -74,7 +67,7 @@ class Executor:
 
 
 def failure_of(error: Exception) -> Failure:
-    return Failure(CAUSES[failures.failure_of(error)], failures.reason_of(error))
+    return Failure(Cause[failures.failure_of(error).name], failures.reason_of(error))
 
 
 class MatchRunner:
@@ -144,14 +137,12 @@ def do_light_job(job: Job) -> tuple[Estimated, ...] | bytes:
     if isinstance(job, LookJob):
         return job.do()
     assert isinstance(job, EstimateJob)
-    points = read_points(job.source, job.pairs)
-    return tuple(estimate_pair(pair, points, job.recipe) for pair in job.pairs)
+    return tuple(estimate_pair(pair, results, job.recipe) for pair, results in results_of(job))
 
 
-def estimate_pair(pair: PairPoints, points: dict[int, Matches], recipe: Recipe) -> Estimated:
+def estimate_pair(pair: PairPoints, results: tuple[UnitResult, ...], recipe: Recipe) -> Estimated:
     """Return F of a pair, or E with intrinsics, from its points of all units."""
     start = time.perf_counter()
-    results = tuple(UnitResult(unit, points[revision]) for unit, revision in pair.units)
     sizes, focals = tuple(image.size for image in pair.images), tuple(image.focal for image in pair.images)
     match = PairMatch(results, sizes=sizes, focals=focals)
     model = ModelKind.F if pair.intrinsics is None else ModelKind.E
@@ -171,22 +162,21 @@ def scene_runner() -> Runner:
 def reconstruct(job: Job) -> Solution:
     """Return the cameras of a batch, and a choice for each of its pairs. pycolmap may end the process."""
     assert isinstance(job, SceneJob) and job.recipe.scene is not None
-    points = read_points(job.source, job.pairs)
-    pairs = [batch_pair(pair, points) for pair in job.pairs]
+    pairs = [batch_pair(*each) for each in results_of(job)]
     return reconstruct_batch(pairs, job.recipe.scene, job.recipe.focal, job.recipe.magsac, job.export)
 
 
-def batch_pair(pair: PairPoints, points: dict[int, Matches]) -> BatchPair:
+def batch_pair(pair: PairPoints, results: tuple[UnitResult, ...]) -> BatchPair:
     """Return a pair of a batch with its points; images go by the names of their files."""
-    results = [UnitResult(unit, points[revision]) for unit, revision in pair.units]
     image0, image1 = (replace(image, name=Path(image.name).name) for image in pair.images)
     matches = Matches.concatenate(result.matches for result in results)
     return BatchPair(image0, image1, matches, pair.own, tracks_of(results))
 
 
-def read_points(source: PointSource, pairs: tuple[PairPoints, ...]) -> dict[int, Matches]:
-    """Return the points of pairs by revision."""
-    if source.points is not None:
-        return source.points
-    with JournalReader(source.directory, check=False) as journal:
-        return journal.points([revision for pair in pairs for revision in pair.revisions])
+def results_of(job: EstimateJob | SceneJob) -> list[tuple[PairPoints, tuple[UnitResult, ...]]]:
+    """Return each pair of a job with the points of its units."""
+    points = job.source.points
+    if points is None:
+        with JournalReader(job.source.directory, check=False) as journal:
+            points = journal.points([revision for pair in job.pairs for revision in pair.revisions])
+    return [(pair, tuple(UnitResult(unit, points[row]) for unit, row in pair.units)) for pair in job.pairs]
