@@ -83,8 +83,9 @@ class RaySite(Site):
     def close(self) -> None:
         if self._has_joined and self._ray.is_initialized():
             until = time.monotonic() + EXIT_TIMEOUT_S
-            for worker in self._workers:
-                worker.join(until)
+            for worker in self._workers:  # they have been killed, and their threads end soon
+                if worker.thread.is_alive():
+                    worker.thread.join(max(0.0, until - time.monotonic()))
             self._ray.shutdown()
 
     def _add(self, name: str, make: Maker, **where: float) -> None:
@@ -114,11 +115,6 @@ class RayWorker(ThreadWorker):
         with suppress(self._ray.exceptions.RayError, ValueError):  # the cluster may be gone, its actors with it
             if self._actor is not None:
                 self._ray.kill(self._actor)
-
-    def join(self, until: float) -> None:
-        """Wait until the killed worker's thread has ended, or until a time of the monotonic clock."""
-        if self._thread.is_alive():
-            self._thread.join(max(0.0, until - time.monotonic()))
 
     def _exchange(self, message: Message) -> Answer:
         if self._actor is None:

@@ -100,13 +100,13 @@ class Place:
             self.worker, self.is_loaded, self.limit = None, False, -inf
 
     def _fail(self, failure: Failure, now: float) -> None:
-        """End the worker, except after an error of its job alone.
+        """End the worker, unless its job alone failed.
 
-        Memory that ran out is fragmented, and a failing device keeps failing. A death or a hang does not count
-        against the place if another worker was lost at the same job.
+        Memory that ran out is fragmented, and a failing device keeps failing. Short memory does not count against
+        the place, nor does a death or a hang if another worker was lost at the same job.
         """
         is_retry = self.job is not None and self.job.is_retry and failure.cause in (Cause.DIED, Cause.TIMED_OUT)
-        if self.is_loaded and not failure.cause.is_of_place:
+        if self.is_loaded and failure.cause in (Cause.RAISED, Cause.OUT_OF_MEMORY):
             self.losses = 0
             if failure.cause is Cause.RAISED:
                 return

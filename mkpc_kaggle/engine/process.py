@@ -50,12 +50,12 @@ class ThreadWorker:
         self._messages: queue.SimpleQueue[Message | None] = queue.SimpleQueue()
         self._answers: queue.SimpleQueue[Answer] = queue.SimpleQueue()
         self._killed = False
-        self._thread = threading.Thread(target=self._live, name=name, daemon=True)
+        self.thread = threading.Thread(target=self._live, name=name, daemon=True)
         self._messages.put(make)
 
     def start(self) -> None:
         try:
-            self._thread.start()
+            self.thread.start()
         except RuntimeError as error:  # no thread more
             self._answers.put(Failure(Cause.NOT_STARTED, str(error)))
 

@@ -17,7 +17,6 @@ from types import FrameType
 from typing import Any, Self
 
 import cv2
-import numpy as np
 
 from mkpc_kaggle.data.competition import Pair, submission_problems, write_submission
 from mkpc_kaggle.data.outputs import remove_unfinished, replacing
@@ -141,7 +140,7 @@ def submit(pairs: Sequence[Pair], assembly: Assembly, session: Session, output: 
         ids = (pair.id for pair in pairs)
         write_submission(output, dict(zip(ids, standing.fundamentals, strict=True)))
 
-    return run_pairs(pairs, assembly, session, publish, root)
+    return run_pairs(pairs, assembly, session, root, publish=publish)
 
 
 @contextmanager
@@ -182,19 +181,16 @@ def _identity(path: Path) -> tuple[int, int]:
 
 
 def run_pairs(
-    pairs: Sequence[Pair],
-    assembly: Assembly,
-    session: Session,
-    publish: Callable[[Standing], None] = lambda _: None,
-    root: str = "",
+    pairs: Sequence[Pair], assembly: Assembly, session: Session, root: str = "", **more: Any
 ) -> RunReport:
     """Run the recipe on all pairs. The journal knows their images by their names below ``root``.
 
-    Raises :class:`mkpc_kaggle.errors.UserError` if the journal cannot be used or a matcher cannot be loaded.
+    ``more`` are other fields of the request. Raises :class:`mkpc_kaggle.errors.UserError` if the journal cannot be
+    used or a matcher cannot be loaded.
     """
     folders = dict.fromkeys(path.parent for pair in pairs for path in pair.images)
     with opened_engine(assembly, session, folders) as engine:
-        engine.ask(request_of(pairs, assembly, session, root, publish=publish))
+        engine.ask(request_of(pairs, assembly, session, root, **more))
         return engine.report()
 
 
@@ -210,7 +206,7 @@ def request_of(
         "Python": platform.python_version(),
         "PyTorch": metadata.version("torch"),
         "OpenCV": cv2.__version__,
-        "NumPy": np.__version__,
+        "NumPy": metadata.version("numpy"),
         "SQLite": sqlite3.sqlite_version,
     }
     about = About(table, str(assembly.placement), limit, assembly.left_out, versions)

@@ -119,7 +119,7 @@ def run(
     with session.watched() if is_watched else nullcontext():
         if output is not None:
             return submit(pairs, assembly, session, output)
-        return run_pairs(pairs, assembly, session, publish)
+        return run_pairs(pairs, assembly, session, publish=publish)
 
 
 def matrices(report: RunReport) -> list[bytes]:
