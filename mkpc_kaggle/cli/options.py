@@ -81,13 +81,13 @@ def say_start(what: str, assembly: Assembly, work_dir: Path) -> None:
     say("\n".join(filter(None, [header, left_out_line(assembly.left_out)])))
 
 
-def finish(session: Session, status: int, page: Path | None, pairs: Sequence[Pair]) -> int:
-    """Write the page about a run, if any. Return the exit status: that of a signal, or ``status``."""
+def finish(session: Session, page: Path | None, pairs: Sequence[Pair]) -> int:
+    """Write the page about a run, if any. Return the exit status: that of a signal, or of the session."""
     from mkpc_kaggle.reporting.report import report_run
 
     if page is not None:
         say(report_run(session.work_dir, page, session.must_end(), pairs))
-    return 128 + session.interrupt.signal if session.interrupt.signal else status
+    return 128 + session.interrupt.signal if session.interrupt.signal else session.status
 
 
 def plan_lines(arguments: argparse.Namespace, report: RunReport) -> list[str]:

@@ -90,7 +90,7 @@ def run(arguments: argparse.Namespace) -> int:
         lines = [*options.plan_lines(arguments, result.report), *_lines(result), failed, unwritten]
         say("\n".join(filter(None, [*lines, f"results: {out}"])))
         page = out / "report.html" if result.pairs else None
-        return options.finish(session, session.status, page, result.pairs)
+        return options.finish(session, page, result.pairs)
 
 
 def _lines(result: FolderResult) -> Iterator[str]:

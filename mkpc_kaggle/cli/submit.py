@@ -57,4 +57,4 @@ def run(arguments: argparse.Namespace) -> int:
             unwritten = f" is not the last version: {report.unwritten}" if report.unwritten else ""
             lines = [*options.plan_lines(arguments, report), summary(pairs, report)]
             say("\n".join([*lines, f"submission: {output}{unwritten}"]))  # drawing may exceed the time limit
-            return options.finish(session, session.status, page, pairs)
+            return options.finish(session, page, pairs)

@@ -183,7 +183,8 @@ def _match_and_score(
             has_page = arguments.work_dir is not None and arguments.pairs is None
             name = re.sub(r"[^\w.-]+", "_", compared[number]) if compared else "report"
             page = work_dir / f"{name}.html" if has_page else None
-            status = options.finish(session, max(status, bool(trouble(report))), page, pairs)
+            session.status = max(status, bool(trouble(report)))
+            status = options.finish(session, page, pairs)
             if compared and report.ending != Ending.COMPLETE:
                 say("nothing is compared until all is done; with a --work-dir, the same command resumes")
                 return status or 1, None

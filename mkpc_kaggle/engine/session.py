@@ -80,7 +80,7 @@ class Session:
     ``workers`` is the number of worker processes, or the Ray cluster to work on (see
     :func:`mkpc_kaggle.engine.cluster.join`); 0: the work is done in this process; ``None``: a process for each
     device. ``save`` writes the submission, or returns why the file is not the last version. ``status`` is the exit
-    status if the watchdog ends the program during its final report.
+    status so far, also if the watchdog ends the program during its final report.
     """
 
     work_dir: Path
@@ -201,7 +201,7 @@ def request_of(
     budget, recipe = session.budget, assembly.recipe
     limit = budget.time_limit if isfinite(budget.time_limit) else None
     table = {**recipe.table(), "name": recipe.name}
-    versions = {  # of what the results may depend on
+    versions = {  # of software that changes results
         "mkpc_kaggle": __version__,
         "Python": platform.python_version(),
         "PyTorch": metadata.version("torch"),
