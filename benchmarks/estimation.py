@@ -27,7 +27,6 @@ from statistics import mean
 from typing import TypeAlias
 
 import numpy as np
-from tqdm import tqdm
 
 from mkpc_kaggle.config import from_table
 from mkpc_kaggle.data.competition import TrainScene, TruePair, read_train_side
@@ -249,7 +248,7 @@ def compare(estimators: Mapping[str, Estimator], arguments: argparse.Namespace) 
         for scene in read_train_side(arguments.train_dir, scenes=arguments.scenes, min_covisibility=0):
             every = [Known(true, *journal[true.pair.id]) for true in scene.pairs if true.pair.id in journal]
             plan = [*product(arguments.shares, arguments.images, range(arguments.seeds))] if every else []
-            for share, images, seed in tqdm(plan, desc=f"{recipe}, {scene.name}"):
+            for share, images, seed in plan:
                 if seed and not images and share == 1:
                     continue  # all images of a scene make a single draw
                 pairs, inside = drawn(every, images, share, seed)

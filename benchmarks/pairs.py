@@ -27,7 +27,6 @@ from kornia.feature import LoFTR
 from numpy.typing import NDArray
 from sklearn.datasets import load_sample_images
 from torch import nn
-from tqdm import tqdm
 
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
 from mkpc_kaggle.matchers.adapters.loma import LomaAdapter, LomaOptions
@@ -173,9 +172,9 @@ def main() -> None:
         return
     wanted = arguments.only.split(",")
     runs = {name: make(placement) for name, make in RUNS.items() if any(part in name for part in wanted)}
-    found = {name: run() for name, run in tqdm(runs.items(), desc="warming up")}
+    found = {name: run() for name, run in runs.items()}
     times: dict[str, list[float]] = {name: [] for name in runs}
-    for _ in tqdm(range(arguments.rounds), desc="rounds"):
+    for _ in range(arguments.rounds):
         for name, run in runs.items():
             times[name].append(seconds_of(run))
     print(f"{torch.get_num_threads()} threads, {placement.precision}\n")

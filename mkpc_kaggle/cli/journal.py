@@ -6,7 +6,7 @@ from pathlib import Path
 
 from mkpc_kaggle.data.competition import read_test_side, test_side
 from mkpc_kaggle.data.outputs import require_apart
-from mkpc_kaggle.engine.streams import unblocked
+from mkpc_kaggle.engine.console import unblocked
 from mkpc_kaggle.reporting.report import write_report
 from mkpc_kaggle.reporting.run_log import read_log, write_csv
 from mkpc_kaggle.reporting.summary import overview
@@ -29,7 +29,7 @@ Exit status: 0 done, 2 the journal does not exist, or a file cannot be written.
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.set_defaults(printing=partial(unblocked, "stderr"))  # where image decoders print warnings
+    parser.set_defaults(printing=partial(unblocked, [2]))  # stderr, where image decoders print warnings
     parser.add_argument("work_dir", type=Path, metavar="DIR")
     parser.add_argument("--csv", type=Path, metavar="OUT", help="write tables to this directory")
     parser.add_argument("--report", type=Path, metavar="FILE.html", help="write a page with pictures")

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from mkpc_kaggle.cli import options
 from mkpc_kaggle.data.outputs import require_apart
-from mkpc_kaggle.engine.streams import unblocked
+from mkpc_kaggle.engine.console import unblocked
 from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
 from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher, to_image
 from mkpc_kaggle.reporting.figures import draw_pair, require_format, save
@@ -19,7 +19,7 @@ in pixels of the stored files, without the EXIF orientation; figures are upright
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.set_defaults(printing=partial(unblocked, "stderr"))  # where image decoders print warnings
+    parser.set_defaults(printing=partial(unblocked, [2]))  # stderr, where image decoders print warnings
     parser.add_argument("image0", type=Path)
     parser.add_argument("image1", type=Path)
     parser.add_argument("--out", type=Path, metavar="FIG.png", help="draw the pair; the suffix sets the format")

@@ -9,10 +9,9 @@ from pathlib import Path
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.budget import Budget, monotonic_of, parse_duration
 from mkpc_kaggle.engine.cluster import parse_workers
-from mkpc_kaggle.engine.console import say
+from mkpc_kaggle.engine.console import drain, say, unblocked
 from mkpc_kaggle.engine.request import RunReport
-from mkpc_kaggle.engine.session import Interrupt, Session, Watchdog
-from mkpc_kaggle.engine.streams import drain, unblocked
+from mkpc_kaggle.engine.session import Interrupt, Session
 from mkpc_kaggle.pipeline.assembly import Assembly, assemble
 from mkpc_kaggle.pipeline.availability import Licence
 from mkpc_kaggle.recipe import Mode
@@ -67,13 +66,11 @@ def budget_of(arguments: argparse.Namespace) -> Budget:
 
 
 @contextmanager
-def watched_session(
-    arguments: argparse.Namespace, work_dir: Path, interrupt: Interrupt
-) -> Iterator[tuple[Session, Watchdog]]:
-    """Open a session with these options, and the watchdog that ends the program in time even if the run hangs."""
+def watched_session(arguments: argparse.Namespace, work_dir: Path, interrupt: Interrupt) -> Iterator[Session]:
+    """Open a session with these options, whose watchdog ends the program in time even if the run hangs."""
     budget, fresh, workers = budget_of(arguments), arguments.fresh, arguments.workers
-    with Watchdog(budget, interrupt) as watchdog:
-        yield Session(work_dir, budget, interrupt, fresh, workers=workers, watchdog=watchdog), watchdog
+    with Session(work_dir, budget, interrupt, fresh, workers=workers).watched() as session:
+        yield session
         drain()  # while the watchdog is active: the reader of the output may hang
 
 
@@ -83,13 +80,13 @@ def say_start(what: str, assembly: Assembly, work_dir: Path) -> None:
     say("\n".join(filter(None, [header, left_out_line(assembly.left_out)])))
 
 
-def finish(session: Session, status: int, page: Path | None, pairs: Sequence[Pair]) -> int:
-    """Write a run's report to ``page``, if given. Return a received signal's exit status, else ``status``."""
+def finish(session: Session, page: Path | None, pairs: Sequence[Pair]) -> int:
+    """Write a run's report to ``page``, if given. Return a received signal's exit status, else the session's."""
     from mkpc_kaggle.reporting.report import report_run
 
     if page is not None:
         say(report_run(session.work_dir, page, session.must_end(), pairs))
-    return 128 + session.interrupt.signal if session.interrupt.signal else status
+    return 128 + session.interrupt.signal if session.interrupt.signal else session.status
 
 
 def plan_lines(arguments: argparse.Namespace, report: RunReport) -> list[str]:

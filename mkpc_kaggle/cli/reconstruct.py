@@ -71,14 +71,14 @@ def run(arguments: argparse.Namespace) -> int:
     listed = None if arguments.pairs is None else read_pair_list(arguments.pairs, root, datasets)
     with (
         interruptible() as interrupt,
-        options.watched_session(arguments, work_dir, interrupt) as (session, watchdog),
+        options.watched_session(arguments, work_dir, interrupt) as session,
         output_directory(out, datasets, arguments.format),
     ):
-        watchdog.status = 1  # until a model exists
+        session.status = 1  # until a model exists
 
         def publish(cameras: Cameras) -> None:
             write_tables(out, cameras, root, arguments.format)
-            watchdog.status = int(not any(any(found.values()) for found in cameras.values()))
+            session.status = int(not any(any(found.values()) for found in cameras.values()))
 
         assembly = options.assembly_of(arguments, arguments.recipe, arguments.mode, interrupt)
         assembly = replace(assembly, recipe=for_cameras(assembly.recipe, arguments.camera))
@@ -86,11 +86,11 @@ def run(arguments: argparse.Namespace) -> int:
         given = {"listed": listed, "rotations": arguments.rotations, "publish": publish}
         result = reconstruct_folder(root, datasets, assembly, session, out, **given)
         unwritten, failed = result.report.unwritten, trouble(result.report)
-        watchdog.status = int(bool(failed or unwritten)) or watchdog.status
+        session.status = int(bool(failed or unwritten)) or session.status
         lines = [*options.plan_lines(arguments, result.report), *_lines(result), failed, unwritten]
         say("\n".join(filter(None, [*lines, f"results: {out}"])))
         page = out / "report.html" if result.pairs else None
-        return options.finish(session, watchdog.status, page, result.pairs)
+        return options.finish(session, page, result.pairs)
 
 
 def _lines(result: FolderResult) -> Iterator[str]:

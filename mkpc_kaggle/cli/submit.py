@@ -49,13 +49,12 @@ def run(arguments: argparse.Namespace) -> int:
     with interruptible() as interrupt:
         pairs = read_test_side(arguments.test_dir)
         # first_version precedes the watchdog: a run that starts after its limit must leave a complete file.
-        with first_version(pairs, output), options.watched_session(arguments, work_dir, interrupt) as watched:
-            session, watchdog = watched
+        with first_version(pairs, output), options.watched_session(arguments, work_dir, interrupt) as session:
             assembly = options.assembly_of(arguments, arguments.recipe, arguments.mode, interrupt)
             options.say_start(f"{len(pairs)} pairs", assembly, work_dir)
             report = submit(pairs, assembly, session, output, str(test_side(arguments.test_dir)[1]))
-            watchdog.status = int(bool(report.unwritten or trouble(report)))
+            session.status = int(bool(report.unwritten or trouble(report)))
             unwritten = f" is not the last version: {report.unwritten}" if report.unwritten else ""
             lines = [*options.plan_lines(arguments, report), summary(report)]
             say("\n".join([*lines, f"submission: {output}{unwritten}"]))  # now: drawing may exceed the time limit
-            return options.finish(session, watchdog.status, page, pairs)
+            return options.finish(session, page, pairs)

@@ -16,7 +16,7 @@ from mkpc_kaggle.data.outputs import require_apart
 from mkpc_kaggle.data.pairs import read_pairs
 from mkpc_kaggle.engine.console import say
 from mkpc_kaggle.engine.request import Ending
-from mkpc_kaggle.engine.session import Interrupt, Session, Watchdog, interruptible
+from mkpc_kaggle.engine.session import Interrupt, Session, interruptible
 from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.evaluation.compare import Comparison, comparison_json, comparison_table, step_gains
 from mkpc_kaggle.evaluation.imc2025 import score_imc2025, score_lines
@@ -165,8 +165,9 @@ def _match_and_score(
     pairs = [true.pair for scene in scenes for true in scene.pairs]
     regions = {} if arguments.regions is None else read_regions(arguments.regions, root, pairs)
     validations, status = [], 0
-    with interruptible() as interrupt, Watchdog(options.budget_of(arguments), interrupt) as watchdog:
-        watchdog.save = lambda: "the time limit passed before the scores were printed"
+    budget = options.budget_of(arguments)
+    with interruptible() as interrupt, Session(work_dir, budget, interrupt).watched() as watched:
+        watched.save = lambda: "the time limit passed before the scores were printed"
         assemblies = [replace(_assemble(arguments, interrupt, *choice), regions=regions) for choice in choices]
         for number, assembly in enumerate(assemblies):
             session = Session(work_dir, options.budget_of(arguments), interrupt, workers=arguments.workers)
@@ -182,7 +183,8 @@ def _match_and_score(
             has_page = arguments.work_dir is not None and arguments.pairs is None
             name = re.sub(r"[^\w.-]+", "_", compared[number]) if compared else "report"
             page = work_dir / f"{name}.html" if has_page else None
-            status = options.finish(session, max(status, bool(trouble(report))), page, pairs)
+            session.status = max(status, bool(trouble(report)))
+            status = options.finish(session, page, pairs)
             if compared and report.ending != Ending.COMPLETE:
                 say("nothing is compared until all is done; with a --work-dir, the same command resumes")
                 return status or 1, None

@@ -12,16 +12,15 @@ import textwrap
 import threading
 import time
 from collections.abc import Callable, Iterable
-from contextlib import suppress
-from dataclasses import dataclass
+from contextlib import ExitStack, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from mkpc_kaggle.engine.jobs import Answer, Cause, Failure, Job
+from mkpc_kaggle.engine.jobs import Answer, Cause, Failure
 from mkpc_kaggle.engine.places import Place, Site, Work
 from mkpc_kaggle.engine.process import EXIT_TIMEOUT_S, ThreadWorker
-from mkpc_kaggle.engine.worker import Executor, MatchRunner, Runner, with_threads
+from mkpc_kaggle.engine.worker import Executor, Maker, MatchRunner, Message, Runner
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.version import __version__
@@ -30,50 +29,25 @@ FORMS = "a number of processes, ray (this machine's cluster, or a new one for th
 REACH_TIMEOUT_S = 5.0
 
 
-@dataclass(frozen=True)
-class RayCluster:
-    """The Ray cluster to work on.
+def parse_workers(text: str) -> int | str:
+    """Parse the value of ``--workers``: a number, or a cluster's name as it is.
 
-    ``address``, HOST:PORT, is what ``ray start --head`` prints; this machine must belong to the cluster.
-    Empty: the cluster that runs on this machine, or else a new cluster, which ends with the run.
+    Raises :class:`UserError` with the accepted forms for any other text.
     """
-
-    address: str = ""
-
-    def require_reachable(self) -> None:
-        """Raise :class:`UserError` if nothing listens at the address: Ray itself tries for minutes."""
-        host, _, port = self.address.rpartition(":")
-        try:
-            socket.create_connection((host, int(port)), timeout=REACH_TIMEOUT_S).close()
-        except (OSError, OverflowError) as error:  # the second: a port above 65535
-            reason = getattr(error, "strerror", None) or error
-            raise UserError(
-                f"--workers ray://{self.address}: no cluster answers there ({reason}). Start one "
-                "with `ray start --head` and join it from the other machines; it prints the address to use."
-            ) from error
-
-
-def parse_workers(text: str) -> int | RayCluster:
-    """Parse the value of ``--workers``. Raise :class:`UserError` with the accepted forms for any other text."""
-    if re.fullmatch(r"\d{1,3}", text):
-        return int(text)
-    if text == "ray":
-        return RayCluster()
-    found = re.fullmatch(r"ray://([^/\s]+:\d{1,5})", text)
-    if found is None:
+    if not re.fullmatch(r"\d{1,3}|ray(://[^/\s]+:\d{1,5})?", text):
         raise UserError(f"--workers: {text!r} is none of: {FORMS}")
-    return RayCluster(found[1])
+    return int(text) if text.isdecimal() else text
 
 
 class RaySite(Site):
-    """Machines of a cluster, which is joined when the site is opened.
+    """Machines of a cluster, which is joined when the site is opened: see :func:`join`.
 
     Each must have the weights and the ``folders``, which hold the images. Raises :class:`UserError` where Ray is
     not installed.
     """
 
     def __init__(
-        self, assembly: Assembly, cluster: RayCluster, clock: Callable[[], float], folders: Iterable[Path]
+        self, assembly: Assembly, cluster: str, clock: Callable[[], float], folders: Iterable[Path]
     ) -> None:
         super().__init__(clock)
         # Read when Ray is imported: it must not report usage, and not start a cluster after it was shut down.
@@ -84,9 +58,8 @@ class RaySite(Site):
         except ModuleNotFoundError as error:
             told = '--workers ray needs Ray, which is not installed: pip install "mkpc-kaggle[ray]"'
             raise UserError(told) from error
-        self._ray = ray
+        self._ray, self._has_joined = ray, False
         self._assembly, self._cluster, self._needed = assembly, cluster, (*assembly.weight_paths, *folders)
-        self._has_joined = False
         self._workers: list[RayWorker] = []
 
     def open(self) -> None:
@@ -97,27 +70,33 @@ class RaySite(Site):
         gpus = sum(int(node["Resources"].get("GPU", 0)) for node in machines)
         if gpus and self._assembly.device != "cpu":
             make = partial(MatchRunner, self._assembly.on("cuda:0").pipeline)
-            names = [f"gpu {number}" for number in range(gpus)]
-            self.places += [Place(name, partial(self._worker, name, make, num_gpus=1)) for name in names]
+            for number in range(gpus):
+                self._add(f"gpu {number}", make, num_gpus=1)
         else:
-            make = partial(MatchRunner, self._assembly.pipeline)
             for number, node in enumerate(machines):  # several may have the same name
-                name, cores = f"machine {number} ({node['NodeManagerHostname']})", int(node["Resources"]["CPU"])
-                self.places.append(Place(name, partial(self._worker, name, make, cores, num_cpus=cores)))
+                cores = int(node["Resources"]["CPU"])
+                make = partial(MatchRunner, self._assembly.pipeline, threads=cores)
+                self._add(f"machine {number} ({node['NodeManagerHostname']})", make, num_cpus=cores)
         if not self.of(Work.MATCH):
             raise UserError("the Ray cluster offers neither a CPU nor a GPU")
 
     def close(self) -> None:
         if self._has_joined and self._ray.is_initialized():
             until = time.monotonic() + EXIT_TIMEOUT_S
-            for worker in self._workers:
-                worker.join(until)
+            for worker in self._workers:  # they have been killed, and their threads end soon
+                if worker.thread.is_alive():
+                    worker.thread.join(max(0.0, until - time.monotonic()))
             self._ray.shutdown()
 
-    def _worker(self, name: str, make: Callable[[], Runner], threads: int = 0, **where: Any) -> "RayWorker":
-        make = partial(make_alike, make, __version__, self._needed, threads)
-        self._workers.append(RayWorker(name, make, self.ring, self._ray, {"num_cpus": 0, **where}))
-        return self._workers[-1]
+    def _add(self, name: str, make: Maker, **where: float) -> None:
+        """Add a place whose workers Ray places by these resources."""
+        make = partial(make_alike, make, __version__, self._needed)
+
+        def worker() -> RayWorker:
+            self._workers.append(RayWorker(name, make, self.ring, self._ray, {"num_cpus": 0, **where}))
+            return self._workers[-1]
+
+        self.places.append(Place(name, worker))
 
 
 class RayWorker(ThreadWorker):
@@ -126,7 +105,7 @@ class RayWorker(ThreadWorker):
     _actor: Any = None
 
     def __init__(
-        self, name: str, make: Callable[[], Runner], on_answer: Callable[[], None], ray: Any, where: dict[str, Any]
+        self, name: str, make: Maker, on_answer: Callable[[], None], ray: Any, where: dict[str, Any]
     ) -> None:
         super().__init__(name, make, on_answer)
         self._ray, self._where = ray, where
@@ -137,12 +116,7 @@ class RayWorker(ThreadWorker):
             if self._actor is not None:
                 self._ray.kill(self._actor)
 
-    def join(self, until: float) -> None:
-        """Wait until the killed worker's thread has ended, or until a time of the monotonic clock."""
-        if self._thread.is_alive():
-            self._thread.join(max(0.0, until - time.monotonic()))
-
-    def _exchange(self, message: Callable[[], Runner] | Job) -> Answer:
+    def _exchange(self, message: Message) -> Answer:
         if self._actor is None:
             self._actor = self._ray.remote(Executor).options(**self._where).remote()
             if self._killed:
@@ -151,11 +125,14 @@ class RayWorker(ThreadWorker):
             answer: Answer = self._ray.get(self._actor.answer.remote(message))
         except self._ray.exceptions.RayError as error:
             is_memory = isinstance(error, self._ray.exceptions.OutOfMemoryError)
-            return Failure(Cause.OUT_OF_MEMORY if is_memory else Cause.DIED, message_of(error))
+            # Ray's text, without its own ids
+            lines = [line for line in str(error).splitlines() if not re.match(r"\t\w+: ", line)]
+            reason = textwrap.shorten(" ".join(lines[1:] or lines), 240)
+            return Failure(Cause.OUT_OF_MEMORY if is_memory else Cause.DIED, reason)
         return answer
 
 
-def make_alike(make: Callable[[], Runner], version: str, paths: tuple[Path, ...], threads: int) -> Runner:
+def make_alike(make: Maker, version: str, paths: tuple[Path, ...]) -> Runner:
     """Return ``make()`` on a machine of the cluster. Raise :class:`UserError` if it differs from the parent's."""
     host = socket.gethostname()
     if version != __version__:
@@ -163,27 +140,32 @@ def make_alike(make: Callable[[], Runner], version: str, paths: tuple[Path, ...]
     for path in paths:
         if not path.exists():
             raise UserError(f"{host} lacks {path}: test set and weights must have the same paths on every machine")
-    return with_threads(make, threads) if threads else make()
+    return make()
 
 
-def join(ray: Any, cluster: RayCluster) -> None:
-    """Connect to the cluster. Raise :class:`UserError` if that fails."""
+def join(ray: Any, cluster: str) -> None:
+    """Connect to a cluster, ``ray`` or ``ray://HOST:PORT``. Raise :class:`UserError` if that fails.
+
+    ``ray``: the cluster that runs on this machine, or else a new cluster, which ends with the run. HOST:PORT is
+    what ``ray start --head`` prints; this machine must belong to that cluster.
+    """
     options: dict[str, Any] = {"include_dashboard": False}
-    if cluster.address:
-        cluster.require_reachable()
-        options = {"address": cluster.address}
-    former = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        ray.init(**options, log_to_driver=False, logging_level="ERROR")
-    except (RuntimeError, ConnectionError, ValueError, OSError) as error:
-        raise UserError(f"the Ray cluster cannot be joined: {error}") from error
-    finally:  # Ray replaces this process's signal handlers
+    if address := cluster.partition("://")[2]:
+        options = {"address": address}
+        host, _, port = address.rpartition(":")
+        try:  # Ray itself tries for minutes
+            socket.create_connection((host, int(port)), timeout=REACH_TIMEOUT_S).close()
+        except (OSError, OverflowError) as error:  # the second: a port above 65535
+            reason = getattr(error, "strerror", None) or error
+            raise UserError(
+                f"--workers {cluster}: no cluster answers there ({reason}). Start one "
+                "with `ray start --head` and join it from the other machines; it prints the address to use."
+            ) from error
+    with ExitStack() as restored:  # Ray replaces this process's signal handlers
         if threading.current_thread() is threading.main_thread():
-            for number, handler in former.items():
-                signal.signal(number, handler)
-
-
-def message_of(error: Exception) -> str:
-    """Return Ray's text of an error, shortened and without Ray's own ids."""
-    lines = [line for line in str(error).splitlines() if not re.match(r"\t\w+: ", line)]
-    return textwrap.shorten(" ".join(lines[1:] or lines), 240)
+            for number in (signal.SIGINT, signal.SIGTERM):
+                restored.callback(signal.signal, number, signal.getsignal(number))
+        try:
+            ray.init(**options, log_to_driver=False, logging_level="ERROR")
+        except (RuntimeError, ConnectionError, ValueError, OSError) as error:
+            raise UserError(f"the Ray cluster cannot be joined: {error}") from error

@@ -170,11 +170,6 @@ class Cause(StrEnum):
     OUT_OF_MEMORY = "out of memory"
     RAISED = "the worker failed"
 
-    @property
-    def is_of_place(self) -> bool:
-        """Whether it counts against the worker's place rather than against the job alone."""
-        return self not in (Cause.OUT_OF_MEMORY, Cause.RAISED)
-
 
 @dataclass(frozen=True)
 class Failure:

@@ -1,7 +1,7 @@
 """Where workers are: a place has one worker at a time, and is closed when it loses three in a row.
 
 A worker that has not answered by :attr:`Place.limit`, which :meth:`Engine._time_limit` sets, is killed in
-:meth:`Place._lose`: its process gets SIGKILL.
+:meth:`Place._fail`: its process gets SIGKILL.
 """
 
 import os
@@ -15,7 +15,7 @@ from math import inf
 
 from mkpc_kaggle.engine.jobs import Answer, Cause, Failure, Job, Loaded
 from mkpc_kaggle.engine.process import ProcessWorker, ThreadWorker
-from mkpc_kaggle.engine.worker import MatchRunner, light_runner, scene_runner, share_cores
+from mkpc_kaggle.engine.worker import MatchRunner, light_runner, scene_runner
 from mkpc_kaggle.pipeline.assembly import Assembly
 
 START_TIMEOUT_S = 300.0  # for a worker to load its matchers; over a network's disk that is not quick
@@ -35,9 +35,10 @@ class Work(StrEnum):
 
 @dataclass(eq=False)
 class Place:
-    """A place such as "cuda:0": its worker, the worker's job, and the moment until which an answer is awaited.
+    """A place such as "cuda:0": its worker and the worker's job, since a moment of the engine's clock.
 
-    ``closed`` is the reason if no more workers start here.
+    An answer is awaited until ``limit``; without a worker, none is started before it. ``closed`` is the reason if
+    no more workers start here.
     """
 
     name: str
@@ -49,7 +50,7 @@ class Place:
     losses: int = 0
     closed: str = ""
     since: float = 0.0
-    limit: float = inf
+    limit: float = -inf
 
     @property
     def is_idle(self) -> bool:
@@ -61,11 +62,11 @@ class Place:
         return not self.is_loaded and not self.closed and (self.worker is not None or self.losses > 0)
 
     def may_start(self, now: float) -> bool:
-        return self.worker is None and not self.closed and (now >= self.limit or not self.losses)
+        return self.worker is None and not self.closed and now >= self.limit
 
     def start(self, now: float, timeout: float = START_TIMEOUT_S) -> None:
         """Start a worker, which answers when it is loaded."""
-        self.is_loaded, self.since, self.limit = False, now, now + timeout
+        self.since, self.limit = now, now + timeout
         self.worker = self.make()
         self.worker.start()
 
@@ -85,34 +86,36 @@ class Place:
         if answer is None:
             return None
         self.limit = inf
-        if isinstance(answer, Loaded):
+        if isinstance(answer, Failure):
+            self._fail(answer, now)
+        elif isinstance(answer, Loaded):
             self.is_loaded = True
-            return answer
-        if self.is_loaded and not (isinstance(answer, Failure) and answer.cause.is_of_place):
+        else:
             self.losses = 0
-        if isinstance(answer, Failure) and (answer.cause is not Cause.RAISED or not self.is_loaded):
-            self._lose(answer, now)
         return answer
 
     def kill(self) -> None:
-        worker, self.worker, self.job, self.is_loaded = self.worker, None, None, False
-        if worker is not None:
-            worker.kill()
+        if self.worker is not None:
+            self.worker.kill()
+            self.worker, self.is_loaded, self.limit = None, False, -inf
 
-    def _lose(self, failure: Failure, now: float) -> None:
-        """End the worker: memory that ran out is fragmented, and a failing device keeps failing.
+    def _fail(self, failure: Failure, now: float) -> None:
+        """End the worker, unless its job alone failed.
 
-        A death or a hang does not count against the place if another worker was lost at the same job.
+        Memory that ran out is fragmented, and a failing device keeps failing. Short memory does not count against
+        the place, nor does a death or a hang if another worker was lost at the same job.
         """
-        job, was_loaded = self.job, self.is_loaded
-        self.kill()
-        self.job, self.limit = job, now
-        is_retry = job is not None and job.is_retry and failure.cause in (Cause.DIED, Cause.TIMED_OUT)
-        if not was_loaded or (failure.cause.is_of_place and not is_retry):
+        is_retry = self.job is not None and self.job.is_retry and failure.cause in (Cause.DIED, Cause.TIMED_OUT)
+        if self.is_loaded and failure.cause in (Cause.RAISED, Cause.OUT_OF_MEMORY):
+            self.losses = 0
+            if failure.cause is Cause.RAISED:
+                return
+        elif not is_retry:
             self.losses += 1
-            self.limit = now + RESTART_PAUSE_S * self.losses
             if self.losses >= MAX_LOSSES or failure.cause is Cause.REFUSED:
                 self.closed = f"{self.name}: {failure}"
+        self.kill()
+        self.limit = now + RESTART_PAUSE_S * self.losses
 
 
 class Site:
@@ -125,10 +128,10 @@ class Site:
     def __init__(self, clock: Callable[[], float], *, threads: bool = False) -> None:
         self._clock = clock
         self._bell: queue.SimpleQueue[None] = queue.SimpleQueue()
+        self._worker = ThreadWorker if threads else ProcessWorker
         estimators = 1 if threads else max(1, (os.cpu_count() or 1) // CORES_PER_ESTIMATOR)
-        worker = ThreadWorker if threads else ProcessWorker
         self.places = [
-            Place(f"estimates {n}", lambda: worker("estimates", light_runner, self.ring), Work.LIGHT)
+            Place(f"estimates {n}", lambda: self._worker("estimates", light_runner, self.ring), Work.LIGHT)
             for n in range(estimators)
         ]
         self.places.append(Place("scenes", self.scene_worker, Work.SCENE))
@@ -162,8 +165,7 @@ class LocalSite(Site):
     def __init__(self, assembly: Assembly, workers: int | None, clock: Callable[[], float]) -> None:
         super().__init__(clock, threads=workers == 0)
         if workers == 0:
-            make = partial(MatchRunner, assembly.pipeline)
-            self.places.append(Place("this process", lambda: ThreadWorker("matching", make, self.ring)))
+            self.places.append(self._place("this process", assembly))
             return
         # On a CPU one process with all threads: two with half of them each do more (recipe light, two cores: the
         # sweep over after 22 s instead of 31), but need twice the memory, and a network's last bits change.
@@ -177,5 +179,5 @@ class LocalSite(Site):
             self.fallback = [self._place("cpu", assembly.on_cpu())]
 
     def _place(self, name: str, assembly: Assembly, share: int = 1) -> Place:
-        make = partial(share_cores, partial(MatchRunner, assembly.pipeline), share)
-        return Place(name, lambda: ProcessWorker(f"mkpc {name}", make, self.ring))
+        make = partial(MatchRunner, assembly.pipeline, share=share)
+        return Place(name, lambda: self._worker(f"mkpc {name}", make, self.ring))

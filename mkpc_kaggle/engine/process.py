@@ -4,8 +4,8 @@ No call of the engine blocks: a thread for each worker does the blocking calls. 
 nothing large goes through its start-up pipe, and its end of the other pipe is closed here. So it may die, be
 stopped or be killed at any moment: a write to it, or a read, ends with it.
 
-pebble, which keeps pools of processes, was rejected. It times jobs by the wall clock, which may jump. Its workers
-share a pipe and its lock, so a worker that is killed during an answer blocks all others.
+pebble, which keeps pools of processes, was rejected: it times jobs by the wall clock, and a worker that is killed
+during an answer keeps the lock of all others.
 """
 
 import ctypes
@@ -14,21 +14,22 @@ import os
 import queue
 import signal
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Callable
+from contextlib import ExitStack, suppress
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 from typing import cast
 
+from mkpc_kaggle.engine.console import unblocked
 from mkpc_kaggle.engine.jobs import Answer, Cause, Failure, Job
-from mkpc_kaggle.engine.streams import unblocked
-from mkpc_kaggle.engine.worker import Executor, Runner, failure_of
+from mkpc_kaggle.engine.worker import Executor, Maker, Message, Runner, failure_of
 
 # For PyTorch, which reads them once. Threads of OpenMP that wait for each other sleep; by default they spin, and
 # keep the cores from decoding, MAGSAC and other processes (python -m benchmarks.threads). Tensors of 2 MiB and
 # more come in huge pages, on Linux: in small ones allocating a feature map takes as long as some convolutions.
 WORKER_ENVIRONMENT = {"OMP_WAIT_POLICY": "PASSIVE", "GOMP_SPINCOUNT": "0", "THP_MEM_ALLOC_ENABLE": "1"}
+_environment = threading.Lock()
 PR_SET_PDEATHSIG = 1  # of Linux's prctl
 EXIT_TIMEOUT_S = 5.0  # a process's pipe closes before the process has ended
 
@@ -43,18 +44,18 @@ class ThreadWorker:
     processes.
     """
 
-    def __init__(self, name: str, make: Callable[[], Runner], on_answer: Callable[[], None]) -> None:
+    def __init__(self, name: str, make: Maker, on_answer: Callable[[], None]) -> None:
         self.name, self._on_answer = name, on_answer
         self._executor = Executor()
-        self._messages: queue.SimpleQueue[Callable[[], Runner] | Job | None] = queue.SimpleQueue()
+        self._messages: queue.SimpleQueue[Message | None] = queue.SimpleQueue()
         self._answers: queue.SimpleQueue[Answer] = queue.SimpleQueue()
         self._killed = False
-        self._thread = threading.Thread(target=self._live, name=name, daemon=True)
+        self.thread = threading.Thread(target=self._live, name=name, daemon=True)
         self._messages.put(make)
 
     def start(self) -> None:
         try:
-            self._thread.start()
+            self.thread.start()
         except RuntimeError as error:  # no thread more
             self._answers.put(Failure(Cause.NOT_STARTED, str(error)))
 
@@ -80,7 +81,7 @@ class ThreadWorker:
             self._answers.put(answer)
             self._on_answer()
 
-    def _exchange(self, message: Callable[[], Runner] | Job) -> Answer:
+    def _exchange(self, message: Message) -> Answer:
         return self._executor.answer(message)
 
 
@@ -94,67 +95,54 @@ class ProcessWorker(ThreadWorker):
         if self._process is not None:
             self._process.kill()
 
-    def _exchange(self, message: Callable[[], Runner] | Job) -> Answer:
+    def _exchange(self, message: Message) -> Answer:
         """Return the answer to a message, or how the process ended."""
-        process = self._process or self._started()
+        if self._process is None:
+            self._process, self._pipe = spawn(self.name)
+            if self._killed:  # before there was a process to kill
+                self._process.kill()
         try:
             self._pipe.send(message)
             answer: Answer = self._pipe.recv()
         except (EOFError, OSError):
-            process.join(timeout=EXIT_TIMEOUT_S)
+            self._process.join(timeout=EXIT_TIMEOUT_S)
             self._pipe.close()
-            return Failure(Cause.DIED, how_it_ended(process.exitcode))
+            code = self._process.exitcode
+            how = f"exit status {code}" if code is None or code >= 0 else f"signal {signal.Signals(-code).name}"
+            return Failure(Cause.DIED, how)
         except Exception as error:  # an object that cannot be pickled
-            process.kill()
+            self._process.kill()
             return failure_of(error)
         return answer
 
-    def _started(self) -> SpawnProcess:
-        context = multiprocessing.get_context("spawn")
-        self._pipe, its_pipe = context.Pipe()
-        process = context.Process(target=serve, args=(its_pipe,), name=self.name, daemon=True)
-        try:
-            with worker_environment():
-                process.start()
-        finally:
-            its_pipe.close()
-        self._process = process
-        if self._killed:  # before there was a process to kill
-            process.kill()
-        return process
 
+def spawn(name: str) -> tuple[SpawnProcess, Connection]:
+    """Start a process that serves the other end of the returned pipe.
 
-def how_it_ended(code: int | None) -> str:
-    return f"exit status {code}" if code is None or code >= 0 else f"signal {signal.Signals(-code).name}"
-
-
-_environment = threading.Lock()
-
-
-@contextmanager
-def worker_environment() -> Iterator[None]:
-    """Start processes with :data:`WORKER_ENVIRONMENT`, except variables that the user has set.
-
-    It is removed again here, where the OpenMP library is loaded already. These processes ignore Ctrl-C, which a
-    terminal sends to all, and SIGTERM: their parent handles both, and ends them.
+    It has :data:`WORKER_ENVIRONMENT`, except variables that the user has set. They are removed again here, where
+    the OpenMP library is loaded already. It ignores Ctrl-C, which a terminal sends to all, and SIGTERM: its parent
+    handles both, and ends it.
     """
-    resource_tracker.ensure_running()  # started with the first process, it would unblock them
-    with _environment, ExitStack() as restored:
-        ours = {name: value for name, value in WORKER_ENVIRONMENT.items() if name not in os.environ}
-        os.environ.update(ours)
-        for name in ours:
-            restored.callback(os.environ.pop, name)
+    context = multiprocessing.get_context("spawn")
+    pipe, its_pipe = context.Pipe()
+    process = context.Process(target=serve, args=(its_pipe,), name=name, daemon=True)
+    resource_tracker.ensure_running()  # started with the first process, it would unblock the signals
+    with its_pipe, _environment, ExitStack() as restored:
+        for variable in WORKER_ENVIRONMENT.keys() - os.environ.keys():
+            os.environ[variable] = WORKER_ENVIRONMENT[variable]
+            restored.callback(os.environ.pop, variable)
         if hasattr(signal, "pthread_sigmask"):  # not on Windows
             former = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
             restored.callback(signal.pthread_sigmask, signal.SIG_SETMASK, former)
-        yield
+        process.start()
+    return process, pipe
 
 
 def serve(pipe: Connection) -> None:
     """Serve as a worker process: answer one message after another, the maker of the runner first."""
 
     def make() -> Runner:
-        return cast(Callable[[], Runner], pipe.recv())()  # an object that cannot be unpickled is an answer, too
+        return cast(Maker, pipe.recv())()  # an object that cannot be unpickled is an answer, too
 
     end_with_parent()
     executor, message = Executor(), make

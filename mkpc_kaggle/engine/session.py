@@ -17,17 +17,16 @@ from types import FrameType
 from typing import Any, Self
 
 import cv2
-import numpy as np
 
 from mkpc_kaggle.data.competition import Pair, submission_problems, write_submission
 from mkpc_kaggle.data.outputs import remove_unfinished, replacing
 from mkpc_kaggle.engine import console
 from mkpc_kaggle.engine.budget import Budget
-from mkpc_kaggle.engine.cluster import RayCluster, RaySite
+from mkpc_kaggle.engine.cluster import RaySite
 from mkpc_kaggle.engine.engine import Engine
 from mkpc_kaggle.engine.journal import Journal
 from mkpc_kaggle.engine.journal_reader import About, Event, EventKind
-from mkpc_kaggle.engine.places import LISTEN_S, LocalSite, Site
+from mkpc_kaggle.engine.places import LISTEN_S, LocalSite
 from mkpc_kaggle.engine.request import Request, RunReport, Standing
 from mkpc_kaggle.engine.settings import Settings
 from mkpc_kaggle.errors import UserError, writing
@@ -43,30 +42,45 @@ class Interrupt(threading.Event):
     """Set when the run must end early; ``signal`` is what asked for it, 0 if nothing did."""
 
     signal = 0
-    _raises = False
+    raises = False
 
     @contextmanager
     def raising(self) -> Iterator[None]:
         """Answer a signal with ``KeyboardInterrupt`` of its number, for work that does not check the event."""
-        self._raises = True
+        self.raises = True
         try:
             yield
         finally:
-            self._raises = False
-
-    def note(self, number: int) -> None:
-        self.signal = number
-        self.set()
-        if self._raises:
-            raise KeyboardInterrupt(number)
+            self.raises = False
 
 
-@dataclass(frozen=True)
+@contextmanager
+def interruptible() -> Iterator[Interrupt]:
+    """Let SIGTERM and Ctrl-C set the interrupt. A second signal has its default effect."""
+    interrupt = Interrupt()
+    with ExitStack() as restored:
+
+        def note(number: int, _: FrameType | None) -> None:
+            restored.close()
+            interrupt.signal = number
+            interrupt.set()
+            if interrupt.raises:
+                raise KeyboardInterrupt(number)
+
+        for number in (signal.SIGINT, signal.SIGTERM):
+            restored.callback(signal.signal, number, signal.getsignal(number))
+            signal.signal(number, note)
+        yield interrupt
+
+
+@dataclass
 class Session:
     """The environment of a run: everything besides its pairs and its recipe.
 
-    ``workers`` is the number of worker processes, or the cluster to work on; 0: the work is done in this process;
-    ``None``: a process for each device. ``watchdog`` gets the function that writes the submission.
+    ``workers`` is the number of worker processes, or the Ray cluster to work on (see
+    :func:`mkpc_kaggle.engine.cluster.join`); 0: the work is done in this process; ``None``: a process for each
+    device. ``save`` writes the submission, or returns why the file is not the last version. ``status`` is the exit
+    status so far, also if the watchdog ends the program during its final report.
     """
 
     work_dir: Path
@@ -74,12 +88,49 @@ class Session:
     interrupt: Interrupt
     fresh: bool = False
     progress: bool = True
-    workers: int | RayCluster | None = 0
-    watchdog: "Watchdog | None" = None
+    workers: int | str | None = 0
+    save: Callable[[], str] = lambda: "the time limit passed before the first results were written"
+    status: int = 0
 
     def must_end(self) -> float:
         """Return when the report must be written, by the monotonic clock: then the watchdog ends the process."""
         return time.monotonic() + REPORT_S if self.interrupt.signal else self.budget.final_write
+
+    @contextmanager
+    def watched(self) -> Iterator[Self]:
+        """Write the submission and end the process before the limit, if the program has not ended by itself.
+
+        The watchdog is a thread, so it works wherever other threads hang, unless one holds the GIL. Only a matcher
+        in the program's own process can do that. Worker processes end with the program.
+        """
+        over = threading.Event()
+        if isfinite(self.budget.time_limit):
+            threading.Thread(target=self._watch, args=(over,), name="watchdog", daemon=True).start()
+        try:
+            yield self
+        finally:
+            over.set()
+
+    def _watch(self, over: threading.Event) -> None:
+        budget = self.budget
+        while (left := budget.final_write - budget.clock()) > 0:  # it moves while the run learns
+            if over.wait(min(left, LISTEN_S)):
+                return
+        trouble = "the time limit passed before the last results were written"
+
+        def write() -> None:
+            nonlocal trouble
+            trouble = self.save()
+            with suppress(OSError):
+                remove_unfinished()  # a report, say
+
+        writer = threading.Thread(target=write, name="final write", daemon=True)
+        writer.start()  # the disk may hang
+        writer.join(max(EXIT_S, budget.limit - budget.clock() - EXIT_S))
+        if trouble:
+            console.complain(trouble)
+        status = self.status or int(bool(trouble))
+        console.leave(128 + self.interrupt.signal if self.interrupt.signal else status, EXIT_S / 4)
 
 
 def submit(pairs: Sequence[Pair], assembly: Assembly, session: Session, output: Path, root: str = "") -> RunReport:
@@ -89,7 +140,7 @@ def submit(pairs: Sequence[Pair], assembly: Assembly, session: Session, output: 
         ids = (pair.id for pair in pairs)
         write_submission(output, dict(zip(ids, standing.fundamentals, strict=True)))
 
-    return run_pairs(pairs, assembly, session, publish, root)
+    return run_pairs(pairs, assembly, session, root, publish=publish)
 
 
 @contextmanager
@@ -99,12 +150,14 @@ def first_version(pairs: Sequence[Pair], output: Path) -> Iterator[None]:
     A run that is refused before it has written its own version leaves the former file, or none. Raises
     :class:`mkpc_kaggle.errors.UserError` where ``output`` cannot be written.
     """
-    require_writable(output)
-    ours, ids = None, [pair.id for pair in pairs]
+    if output.is_char_device() or output.is_block_device():
+        raise UserError(f"--output {output} is a device; name a file")
+    ours, former, ids = None, None, [pair.id for pair in pairs]
     with ExitStack() as closed:
-        former = None
-        if not output.exists() or (output.is_file() and submission_problems(output, ids)):
-            with writing(f"--output {output}"):
+        with writing(f"--output {output}"):
+            output.parent.mkdir(parents=True, exist_ok=True)
+            TemporaryFile(dir=output.parent).close()
+            if not output.exists() or (output.is_file() and submission_problems(output, ids)):
                 if output.is_file():
                     former = closed.enter_context(output.open("rb"))  # it outlives its name
                 write_submission(output, dict.fromkeys(ids, FALLBACK_FUNDAMENTAL))
@@ -127,29 +180,17 @@ def _identity(path: Path) -> tuple[int, int]:
     return status.st_ino, status.st_mtime_ns
 
 
-def require_writable(output: Path) -> None:
-    """Make the file's directory if necessary. Raise :class:`UserError` if the file cannot be written."""
-    if output.is_char_device() or output.is_block_device():
-        raise UserError(f"--output {output} is a device; name a file")
-    with writing(f"--output {output}"):
-        output.parent.mkdir(parents=True, exist_ok=True)
-        TemporaryFile(dir=output.parent).close()
-
-
 def run_pairs(
-    pairs: Sequence[Pair],
-    assembly: Assembly,
-    session: Session,
-    publish: Callable[[Standing], None] = lambda _: None,
-    root: str = "",
+    pairs: Sequence[Pair], assembly: Assembly, session: Session, root: str = "", **more: Any
 ) -> RunReport:
     """Run the recipe on all pairs. The journal knows their images by their names below ``root``.
 
-    Raises :class:`mkpc_kaggle.errors.UserError` if the journal cannot be used or a matcher cannot be loaded.
+    ``more`` are other fields of the request. Raises :class:`mkpc_kaggle.errors.UserError` if the journal cannot be
+    used or a matcher cannot be loaded.
     """
     folders = dict.fromkeys(path.parent for pair in pairs for path in pair.images)
     with opened_engine(assembly, session, folders) as engine:
-        engine.ask(request_of(pairs, assembly, session, root, publish=publish))
+        engine.ask(request_of(pairs, assembly, session, root, **more))
         return engine.report()
 
 
@@ -160,7 +201,15 @@ def request_of(
     budget, recipe = session.budget, assembly.recipe
     limit = budget.time_limit if isfinite(budget.time_limit) else None
     table = {**recipe.table(), "name": recipe.name}
-    about = About(table, str(assembly.placement), limit, assembly.left_out, versions())
+    versions = {  # of software that changes results
+        "mkpc_kaggle": __version__,
+        "Python": platform.python_version(),
+        "PyTorch": metadata.version("torch"),
+        "OpenCV": cv2.__version__,
+        "NumPy": metadata.version("numpy"),
+        "SQLite": sqlite3.sqlite_version,
+    }
+    about = About(table, str(assembly.placement), limit, assembly.left_out, versions)
     return Request(pairs, recipe, Settings.of(assembly), root, about=about, **more)
 
 
@@ -170,103 +219,21 @@ def opened_engine(assembly: Assembly, session: Session, folders: Iterable[Path] 
 
     ``folders`` hold the images, on every machine.
     """
+    budget, workers = session.budget, session.workers
     with Journal(session.work_dir, fresh=session.fresh) as journal:
-        journal.note(Event(EventKind.START, session.budget.spent(), ""))
+        journal.note(Event(EventKind.START, budget.spent(), ""))
         engine = Engine(
             request_of((), assembly, session),
-            site_of(folders, assembly, session),
+            RaySite(assembly, workers, budget.clock, folders)
+            if isinstance(workers, str)
+            else LocalSite(assembly, workers, budget.clock),
             journal,
-            session.budget,
+            budget,
             interrupt=session.interrupt,
             progress=session.progress,
             minibatch=assembly.minibatch,
         )
-        if session.watchdog is not None:
-            session.watchdog.save = engine.save_results
+        session.save = engine.save_results
         with engine:
             yield engine
-        journal.note(Event(EventKind.END, session.budget.spent(), engine.ending))
-
-
-def site_of(folders: Iterable[Path], assembly: Assembly, session: Session) -> Site:
-    if isinstance(session.workers, RayCluster):
-        return RaySite(assembly, session.workers, session.budget.clock, folders)
-    return LocalSite(assembly, session.workers, session.budget.clock)
-
-
-def versions() -> dict[str, str]:
-    """Of what the results may depend on, by name."""
-    return {
-        "mkpc_kaggle": __version__,
-        "Python": platform.python_version(),
-        "PyTorch": metadata.version("torch"),
-        "OpenCV": cv2.__version__,
-        "NumPy": np.__version__,
-        "SQLite": sqlite3.sqlite_version,
-    }
-
-
-class Watchdog:
-    """Writes the submission and ends the process before the limit, if the program has not ended by itself.
-
-    It is a thread, so it works wherever other threads hang, unless one holds the GIL. Only a matcher in the
-    program's own process can do that. Worker processes end with the program.
-
-    ``save`` writes the submission, or returns why the file is not the last version. ``status`` is the exit status
-    if the watchdog ends the program during its final report.
-    """
-
-    def __init__(self, budget: Budget, interrupt: Interrupt) -> None:
-        self.save: Callable[[], str] = lambda: "the time limit passed before the first results were written"
-        self.status = 0
-        self._budget, self._interrupt = budget, interrupt
-        self._over = threading.Event()
-
-    def __enter__(self) -> Self:
-        if isfinite(self._budget.time_limit):
-            threading.Thread(target=self._watch, name="watchdog", daemon=True).start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._over.set()
-
-    def _watch(self) -> None:
-        while (left := self._budget.final_write - self._budget.clock()) > 0:  # it moves while the run learns
-            if self._over.wait(min(left, LISTEN_S)):
-                return
-        trouble = ["the time limit passed before the last results were written"]
-
-        def write() -> None:
-            trouble.append(self.save())
-            with suppress(OSError):
-                remove_unfinished()  # a report, say
-
-        writer = threading.Thread(target=write, name="final write", daemon=True)
-        writer.start()  # the disk may hang
-        writer.join(max(EXIT_S, self._budget.limit - self._budget.clock() - EXIT_S))
-        if trouble[-1]:
-            console.complain(trouble[-1])
-        status = self.status or int(bool(trouble[-1]))
-        console.leave(128 + self._interrupt.signal if self._interrupt.signal else status, EXIT_S / 4)
-
-
-@contextmanager
-def interruptible() -> Iterator[Interrupt]:
-    """Let SIGTERM and Ctrl-C set the interrupt. A second signal has its default effect."""
-    interrupt = Interrupt()
-    former = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-
-    def note(number: int, _: FrameType | None) -> None:
-        restore()
-        interrupt.note(number)
-
-    def restore() -> None:
-        for number, handler in former.items():
-            signal.signal(number, handler)
-
-    for number in former:
-        signal.signal(number, note)
-    try:
-        yield interrupt
-    finally:
-        restore()
+        journal.note(Event(EventKind.END, budget.spent(), engine.ending))

@@ -27,7 +27,6 @@ from mkpc_kaggle.engine.jobs import (
     MatchJob,
     Outcome,
     PairPoints,
-    PointSource,
     SceneJob,
     WantedPair,
 )
@@ -44,14 +43,9 @@ from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair, tracks_of
 if TYPE_CHECKING:
     from mkpc_kaggle.pipeline.stages import Pipeline
 
-CAUSES = {
-    failures.FailureKind.OUT_OF_MEMORY: Cause.OUT_OF_MEMORY,
-    failures.FailureKind.DEVICE: Cause.DEVICE,
-    failures.FailureKind.ORDINARY: Cause.RAISED,
-}
-
-
 Runner = Callable[[Job], Answer]  # it may raise anything, never return, or end the process
+Maker = Callable[[], Runner]
+Message = Maker | Job  # to a worker: first the maker of its runner
 
 
 class Executor:
@@ -59,11 +53,11 @@ class Executor:
 
     _run: Runner | None = None
 
-    def answer(self, message: Callable[[], Runner] | Job) -> Answer:
+    def answer(self, message: Message) -> Answer:
         try:
             if self._run is not None:
                 return self._run(cast(Job, message))
-            self._run = cast(Callable[[], Runner], message)()
+            self._run = cast(Maker, message)()
         except Exception as error:
             if self._run is None and isinstance(error, UserError):
                 is_device = isinstance(error, failures.DeviceError)
@@ -73,30 +67,23 @@ class Executor:
 
 
 def failure_of(error: Exception) -> Failure:
-    return Failure(CAUSES[failures.failure_of(error)], failures.reason_of(error))
-
-
-def with_threads(make: Callable[[], Runner], count: int) -> Runner:
-    """Call ``make`` in a process that computes in ``count`` threads."""
-    import cv2
-    import torch
-
-    torch.set_num_threads(count)
-    cv2.setNumThreads(count)
-    return make()
-
-
-def share_cores(make: Callable[[], Runner], share: int) -> Runner:
-    """Call ``make`` in one of ``share`` processes that share the machine's cores."""
-    import torch
-
-    return with_threads(make, max(1, torch.get_num_threads() // share)) if share > 1 else make()
+    return Failure(Cause[failures.failure_of(error).name], failures.reason_of(error))
 
 
 class MatchRunner:
-    """A runner of match jobs. Raises :class:`mkpc_kaggle.errors.UserError` if the matchers cannot be loaded."""
+    """A runner of match jobs, with ``threads`` threads, or one of ``share`` processes with the machine's cores.
 
-    def __init__(self, make_pipeline: Callable[[], "Pipeline"]) -> None:
+    Raises :class:`mkpc_kaggle.errors.UserError` if the matchers cannot be loaded.
+    """
+
+    def __init__(self, make_pipeline: Callable[[], "Pipeline"], *, threads: int = 0, share: int = 1) -> None:
+        if threads or share > 1:
+            import cv2
+            import torch
+
+            threads = threads or max(1, torch.get_num_threads() // share)
+            torch.set_num_threads(threads)
+            cv2.setNumThreads(threads)
         self._pipeline = make_pipeline()
         self._pipeline.load()
         self._images = ImageStore()
@@ -110,34 +97,30 @@ class MatchRunner:
         def may_start(unit: Unit) -> bool:
             return time.monotonic() + expected[unit] < deadline
 
-        self._images.prefetch(path for each in job.pairs for path in each.pair.images)
-        pairs = [self._open(each, known) for each, known in zip(job.pairs, job.known, strict=True)]
+        opened = [self._open(each, known) for each, known in zip(job.pairs, job.known, strict=True)]
         self._images.prefetch(job.upcoming)
-        readable = [number for number, pair in enumerate(pairs) if not pair.failure]
-        matched = self._pipeline.match([pairs[number] for number in readable], job.units, may_start)
-        for number, pair in zip(readable, matched, strict=True):
-            pairs[number] = pair
+        matched = iter(self._pipeline.match([pair for pair in opened if not pair.failure], job.units, may_start))
+        pairs = (pair if pair.failure else next(matched) for pair in opened)
         return tuple(_outcome(*each) for each in zip(job.indices, job.pairs, pairs, job.known, strict=True))
 
     def _open(self, wanted: WantedPair, known: tuple[UnitResult, ...]) -> PairMatch:
         """Return the pair with its images; ``failure`` says which of them cannot be read."""
-        start, pair = time.perf_counter(), wanted.pair
-        files = zip(pair.images, pair.turns, strict=True)
+        start, files = time.perf_counter(), zip(wanted.pair.images, wanted.pair.turns, strict=True)
         images = [self._images.get(path).turned(turns) for path, turns in files]
         seconds = time.perf_counter() - start
         readable = tuple(image for image in images if isinstance(image, Image))
         failure = next((str(image) for image in images if not isinstance(image, Image)), "")
-        return PairMatch(known, images=readable, failure=failure, decode_seconds=seconds)
+        return PairMatch(known, images=() if failure else readable, failure=failure, decode_seconds=seconds)
 
 
 def _outcome(index: int, wanted: WantedPair, pair: PairMatch, known: tuple[object, ...]) -> Outcome:
-    """The new results of a pair; its images have the contents that were matched."""
+    """Return the new results of a pair; its images have the contents that were matched."""
     images = tuple(
         BatchImage(name, image.version, image.size, image.focal)
-        for name, image in zip(wanted.names, pair.images, strict=False)  # fewer if one is unreadable
+        for name, image in zip(wanted.names, pair.images, strict=False)  # none if one is unreadable
     )
     found, seconds = pair.results[len(known) :], (pair.decode_seconds, pair.cluster_seconds)
-    return Outcome(index, () if pair.failure else images, found, pair.regions, pair.failure, *seconds)
+    return Outcome(index, images, found, pair.regions, pair.failure, *seconds)
 
 
 def light_runner() -> Runner:
@@ -154,14 +137,12 @@ def do_light_job(job: Job) -> tuple[Estimated, ...] | bytes:
     if isinstance(job, LookJob):
         return job.do()
     assert isinstance(job, EstimateJob)
-    points = read_points(job.source, job.pairs)
-    return tuple(estimate_pair(pair, points, job.recipe) for pair in job.pairs)
+    return tuple(estimate_pair(pair, results, job.recipe) for pair, results in results_of(job))
 
 
-def estimate_pair(pair: PairPoints, points: dict[int, Matches], recipe: Recipe) -> Estimated:
+def estimate_pair(pair: PairPoints, results: tuple[UnitResult, ...], recipe: Recipe) -> Estimated:
     """Return F of a pair, or E with intrinsics, from its points of all units."""
     start = time.perf_counter()
-    results = tuple(UnitResult(unit, points[revision]) for unit, revision in pair.units)
     sizes, focals = tuple(image.size for image in pair.images), tuple(image.focal for image in pair.images)
     match = PairMatch(results, sizes=sizes, focals=focals)
     model = ModelKind.F if pair.intrinsics is None else ModelKind.E
@@ -181,23 +162,21 @@ def scene_runner() -> Runner:
 def reconstruct(job: Job) -> Solution:
     """Return the cameras of a batch, and a choice for each of its pairs. pycolmap may end the process."""
     assert isinstance(job, SceneJob) and job.recipe.scene is not None
-    points = read_points(job.source, job.pairs)
-    pairs = [batch_pair(pair, points) for pair in job.pairs]
+    pairs = [batch_pair(*each) for each in results_of(job)]
     return reconstruct_batch(pairs, job.recipe.scene, job.recipe.focal, job.recipe.magsac, job.export)
 
 
-def batch_pair(pair: PairPoints, points: dict[int, Matches]) -> BatchPair:
+def batch_pair(pair: PairPoints, results: tuple[UnitResult, ...]) -> BatchPair:
     """Return a pair of a batch with its points; images go by the names of their files."""
-    results = [UnitResult(unit, points[revision]) for unit, revision in pair.units]
     image0, image1 = (replace(image, name=Path(image.name).name) for image in pair.images)
     matches = Matches.concatenate(result.matches for result in results)
     return BatchPair(image0, image1, matches, pair.own, tracks_of(results))
 
 
-def read_points(source: PointSource, pairs: tuple[PairPoints, ...]) -> dict[int, Matches]:
-    """Return the points of pairs by revision."""
-    revisions = [revision for pair in pairs for revision in pair.revisions]
-    if source.points is not None:
-        return source.points
-    with JournalReader(source.directory, check=False) as journal:
-        return journal.points(revisions)
+def results_of(job: EstimateJob | SceneJob) -> list[tuple[PairPoints, tuple[UnitResult, ...]]]:
+    """Return each pair of a job with the points of its units."""
+    points = job.source.points
+    if points is None:
+        with JournalReader(job.source.directory, check=False) as journal:
+            points = journal.points([revision for pair in job.pairs for revision in pair.revisions])
+    return [(pair, tuple(UnitResult(unit, points[row]) for unit, row in pair.units)) for pair in job.pairs]

@@ -29,7 +29,7 @@ matched_in: set[int] = set()  # ids of this process and of its forked ancestors,
 class FailureKind(Enum):
     OUT_OF_MEMORY = auto()  # fewer pairs at a time may fit
     DEVICE = auto()  # this process can no longer compute; the pair is not the cause
-    ORDINARY = auto()  # the matcher cannot process this pair
+    RAISED = auto()  # the matcher cannot process this pair
 
 
 class DeviceError(UserError):
@@ -40,7 +40,7 @@ def failure_of(error: BaseException) -> FailureKind:
     reason = reason_of(error)
     if isinstance(error, MemoryError) or _OUT_OF_MEMORY.search(reason):
         return FailureKind.OUT_OF_MEMORY
-    return FailureKind.DEVICE if _DEVICE.search(reason) else FailureKind.ORDINARY
+    return FailureKind.DEVICE if _DEVICE.search(reason) else FailureKind.RAISED
 
 
 def reason_of(error: BaseException) -> str:

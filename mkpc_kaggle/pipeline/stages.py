@@ -102,9 +102,9 @@ class Pipeline:
             failure = failure_of(error)
             if isinstance(error, NonFiniteError) and self._fall_back_to_float32(unit.matcher, error):
                 return []
-            if failure is FailureKind.ORDINARY and len(pairs) == 1:
+            if failure is FailureKind.RAISED and len(pairs) == 1:
                 return [UnitResult(unit, Matches.empty(), failure=reason_of(error))]
-            if failure is FailureKind.ORDINARY:  # singly, and again if the matcher falls back to float32
+            if failure is FailureKind.RAISED:  # singly, and again if the matcher falls back to float32
                 alone = (self._run_minibatch(unit, [pair]) or self._run_minibatch(unit, [pair]) for pair in pairs)
                 return list(chain.from_iterable(alone))
             if failure is FailureKind.DEVICE or len(pairs) == 1:

@@ -11,8 +11,6 @@ from urllib.error import HTTPError
 from urllib.parse import urlsplit
 from urllib.request import Request, urlopen
 
-from tqdm import tqdm
-
 from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.weights.manifest import UNVERIFIED, WeightFile, digest_of
 from mkpc_kaggle.weights.store import judge
@@ -20,6 +18,7 @@ from mkpc_kaggle.weights.store import judge
 ATTEMPTS = 5
 BLOCK_BYTES = 1 << 20
 TIMEOUT_S = 30.0  # without data
+PROGRESS_INTERVAL_S = 10.0
 MAX_BYTES = 1 << 33  # of a file of unknown size
 WEB_PAGE_HOSTS = ("drive.google.com",)  # they return a web page instead of the file
 TRANSIENT_STATUSES = (408, 416, 425, 429, 500, 502, 503, 504)  # HTTP statuses after which a retry can succeed
@@ -128,15 +127,15 @@ def _receive(url: str, part: Path, file: WeightFile) -> None:
         if response.status != 206:
             have = 0  # the server sends the complete file
         total = None if response.length is None else have + response.length
-        every = 0.1 if sys.stderr.isatty() else 30  # seconds; each update is a line of a log file
-        with (
-            part.open("ab" if have else "wb") as stream,
-            tqdm.wrapattr(stream, "write", total, desc=file.name, initial=have, mininterval=every) as out,
-        ):
+        shown = time.monotonic()
+        with part.open("ab" if have else "wb") as stream:
             while block := response.read1(BLOCK_BYTES):
                 have += len(block)
                 if have > most:
                     raise UserError(f"received more than {most} bytes, the maximum size of {file.name}")
-                out.write(block)
+                stream.write(block)
+                if time.monotonic() - shown > PROGRESS_INTERVAL_S:
+                    shown, whole = time.monotonic(), "" if total is None else f" of {total >> 20}"
+                    print(f"{file.name}: {have >> 20}{whole} MiB", file=sys.stderr)
     if total is not None and have < total:
         raise ConnectionError(f"the connection closed after {have} of {total} bytes")

@@ -6,15 +6,15 @@ from pathlib import Path
 import pytest
 from rectified import THREE_UNITS, RectifiedMatcher, run, write_pairs
 
-from mkpc_kaggle.engine.cluster import RayCluster, parse_workers
+from mkpc_kaggle.engine.cluster import join, parse_workers
 from mkpc_kaggle.errors import UserError
 
 
 @pytest.mark.parametrize(
     ("text", "meant"),
-    [("0", 0), ("12", 12), ("ray", RayCluster()), ("ray://10.0.0.1:6379", RayCluster("10.0.0.1:6379"))],
+    [("0", 0), ("12", 12), ("ray", "ray"), ("ray://10.0.0.1:6379", "ray://10.0.0.1:6379")],
 )
-def test_forms_of_workers(text: str, meant: int | RayCluster) -> None:
+def test_forms_of_workers(text: str, meant: int | str) -> None:
     assert parse_workers(text) == meant
 
 
@@ -31,10 +31,10 @@ def test_other_forms_are_refused_with_those_that_there_are(text: str) -> None:
 def test_without_ray_it_says_how_to_install_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(UserError, match=r'pip install "mkpc-kaggle\[ray\]"'):
-        run(write_pairs(tmp_path, 1), THREE_UNITS, RectifiedMatcher(), tmp_path / "w", workers=RayCluster())
+        run(write_pairs(tmp_path, 1), THREE_UNITS, RectifiedMatcher(), tmp_path / "w", workers="ray")
 
 
 @pytest.mark.parametrize("port", [1, 99999])
 def test_an_address_where_nothing_answers_is_told_at_once(port: int) -> None:
     with pytest.raises(UserError, match=rf"ray://127\.0\.0\.1:{port}: no cluster answers there"):
-        RayCluster(f"127.0.0.1:{port}").require_reachable()
+        join(None, f"ray://127.0.0.1:{port}")

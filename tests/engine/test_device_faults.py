@@ -50,13 +50,13 @@ def test_what_errors_mean():
             "cuDNN error: CUDNN_STATUS_EXECUTION_FAILED",
             "No CUDA GPUs are available",
         ],
-        FailureKind.ORDINARY: ["shapes differ"],
+        FailureKind.RAISED: ["shapes differ"],
     }
     for kind, texts in messages.items():
         assert {failure_of(RuntimeError(text)) for text in texts} == {kind}
     for error in (MemoryError(), torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB.")):
         assert failure_of(error) is FailureKind.OUT_OF_MEMORY
-    assert failure_of(ValueError("no points")) is failure_of(AssertionError()) is FailureKind.ORDINARY
+    assert failure_of(ValueError("no points")) is failure_of(AssertionError()) is FailureKind.RAISED
     illegal = RuntimeError(cuda.format("an illegal memory access was encountered"))
     illegal.add_note("in 1:loftr@840")
     assert reason_of(illegal) == f"RuntimeError: {BROKEN}, in 1:loftr@840"

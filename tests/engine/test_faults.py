@@ -300,18 +300,17 @@ def test_a_parent_killed_at_any_moment_leaves_a_whole_file_no_orphans_and_a_run_
 GUARDED = """
 import multiprocessing, os, signal, sys, time
 from mkpc_kaggle.engine.budget import Budget
-from mkpc_kaggle.engine.session import Interrupt, Watchdog
+from mkpc_kaggle.engine.session import Interrupt, Session
 
 if __name__ == "__main__":
-    budget = Budget(time.monotonic(), {limit})
-    with Watchdog(budget, Interrupt()) as watchdog:
+    with Session("", Budget(time.monotonic(), {limit}), Interrupt()).watched() as session:
         {body}
 """
 
 
 def stuck(body: str) -> subprocess.CompletedProcess[str]:
     """Run the code below a watchdog, then hang half a second before the limit."""
-    body += "; budget.time_limit = budget.spent() + 0.5; time.sleep(600)"
+    body += "; session.budget.time_limit = session.budget.spent() + 0.5; time.sleep(600)"
     return python(GUARDED.format(limit=1000.0, body=body))
 
 
@@ -330,9 +329,9 @@ def test_a_child_that_was_stopped_does_not_outlive_the_watchdog():
 @pytest.mark.parametrize(
     ("body", "status"),
     [
-        ("watchdog.save = lambda: time.sleep(600) or ''", 1),
-        ("watchdog.save = lambda: ''; watchdog.status = 1", 1),
-        ("watchdog.save = lambda: ''", 0),
+        ("session.save = lambda: time.sleep(600) or ''", 1),
+        ("session.save = lambda: ''; session.status = 1", 1),
+        ("session.save = lambda: ''", 0),
     ],
 )
 def test_the_watchdog_leaves_though_writing_hangs_and_keeps_the_status_of_the_run(body, status):
@@ -342,7 +341,7 @@ def test_the_watchdog_leaves_though_writing_hangs_and_keeps_the_status_of_the_ru
 def test_the_watchdog_leaves_no_unfinished_file(tmp_path):
     report = f"replacing(Path({str(tmp_path / 'report.html')!r}))"
     body = f"from mkpc_kaggle.data.outputs import replacing, Path; open = {report}; open.__enter__()"
-    assert stuck(f"watchdog.save = lambda: ''; {body}").returncode == 0
+    assert stuck(f"session.save = lambda: ''; {body}").returncode == 0
     assert list(tmp_path.iterdir()) == []
 
 

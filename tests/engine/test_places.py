@@ -85,7 +85,7 @@ def test_an_answer_that_is_there_counts_though_its_time_is_over():
 def test_the_workers_of_a_machine_share_its_cores_on_gpus_too(monkeypatch, devices, workers, shares):
     made = SimpleNamespace(pipeline=None)
     assembly = SimpleNamespace(devices=devices, on=lambda *_: made, on_cpu=lambda: made)
-    monkeypatch.setattr(places, "ProcessWorker", lambda name, make, ring: make.args[1])
+    monkeypatch.setattr(places, "ProcessWorker", lambda name, make, ring: make.keywords["share"])
     site = LocalSite(assembly, workers, lambda: 0.0)
     assert [place.make() for place in site.of(Work.MATCH)] == shares
     assert [place.make() for place in site.fallback] == [1] * (devices != ("cpu",))

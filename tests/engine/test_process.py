@@ -57,8 +57,8 @@ def start() -> Iterator[Callable[..., Worker]]:
     yield start
     for worker in workers:
         worker.kill()
-        worker._thread.join(timeout=120)
-        assert not worker._thread.is_alive()
+        worker.thread.join(timeout=120)
+        assert not worker.thread.is_alive()
     for process in multiprocessing.active_children():
         process.join(timeout=120)
         assert not process.is_alive()

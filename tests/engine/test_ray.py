@@ -19,7 +19,6 @@ from synthetic import RECIPE as SYNTHETIC
 from synthetic import SyntheticMatcher, synthetic_pairs
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine.cluster import RayCluster
 from mkpc_kaggle.engine.request import Ending
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.matches import Matches
@@ -65,7 +64,7 @@ def cluster() -> Iterator[Any]:
 
 def test_actors_give_the_bytes_of_a_run_in_one_process_though_an_actor_dies(cluster, pairs, undisturbed, tmp_path):
     matcher = FaultyMatcher(fault=die, once=tmp_path / "died")
-    report = run(pairs, THREE_UNITS, matcher, tmp_path / "w", workers=RayCluster(cluster.address))
+    report = run(pairs, THREE_UNITS, matcher, tmp_path / "w", workers=f"ray://{cluster.address}")
     assert report.ending is Ending.COMPLETE
     assert ["the worker died" in fault for fault in report.faults] == [True], report.faults
     assert matrices(report) == matrices(undisturbed)
@@ -82,7 +81,7 @@ def test_a_machine_lost_during_the_run_costs_its_job_alone(cluster, pairs, undis
         cluster.remove_node(lost, allow_graceful=False)
 
     threading.Thread(target=lose, daemon=True).start()
-    report = run(pairs, THREE_UNITS, matcher, tmp_path / "w", workers=RayCluster(cluster.address))
+    report = run(pairs, THREE_UNITS, matcher, tmp_path / "w", workers=f"ray://{cluster.address}")
     assert report.ending is Ending.COMPLETE
     assert "a job was lost on machine " in report.faults[0]
     assert matrices(report) == matrices(undisturbed)
@@ -96,15 +95,13 @@ def test_a_machine_that_lacks_the_weights_or_the_test_set_is_named_when_the_run_
     for asked, weights in ((lacking, ()), (pairs, (missing,))):
         monkeypatch.setattr(Assembly, "weight_paths", weights)
         with pytest.raises(UserError, match=rf"lacks {missing}: test set and weights must have the same paths"):
-            run(
-                asked, THREE_UNITS, RectifiedMatcher(), tmp_path / asked[0].id, workers=RayCluster(cluster.address)
-            )
+            run(asked, THREE_UNITS, RectifiedMatcher(), tmp_path / asked[0].id, workers=f"ray://{cluster.address}")
 
 
 def test_batches_are_reconstructed_on_the_cluster_to_the_same_bytes(cluster, tmp_path):
     batch = synthetic_pairs(tmp_path / "images")
     here = run(batch, SYNTHETIC, SyntheticMatcher(), tmp_path / "here")
-    report = run(batch, SYNTHETIC, SyntheticMatcher(), tmp_path / "w", workers=RayCluster(cluster.address))
+    report = run(batch, SYNTHETIC, SyntheticMatcher(), tmp_path / "w", workers=f"ray://{cluster.address}")
     assert report.faults == ()
     assert [record.source for record in report.records] == ["scene"] * len(batch)
     assert [record.chosen_fundamental.tobytes() for record in report.records] == [
@@ -118,7 +115,6 @@ sys.path[:0] = {path!r}
 from pathlib import Path
 from faulty import FaultyMatcher
 from rectified import THREE_UNITS, run, write_pairs
-from mkpc_kaggle.engine.cluster import RayCluster
 from mkpc_kaggle.engine.session import interruptible
 
 if __name__ == "__main__":
@@ -126,7 +122,7 @@ if __name__ == "__main__":
     pairs = write_pairs(home / "pairs", 200)
     matcher = FaultyMatcher(seconds=0.1, fault=lambda: None, once=home / "begun")
     with interruptible() as interrupt:
-        report = run(pairs, THREE_UNITS, matcher, home / "work", interrupt=interrupt, workers=RayCluster())
+        report = run(pairs, THREE_UNITS, matcher, home / "work", interrupt=interrupt, workers="ray")
     print(report.ending)
 """
 

@@ -28,7 +28,7 @@ from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.jobs import SceneJob
 from mkpc_kaggle.engine.journal import Journal
 from mkpc_kaggle.engine.request import Ending
-from mkpc_kaggle.engine.worker import batch_pair, read_points
+from mkpc_kaggle.engine.worker import batch_pair, results_of
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.recipe import SceneConfig
 from mkpc_kaggle.reporting.report import report_page
@@ -145,8 +145,7 @@ def test_the_scene_of_a_run_is_made_of_tracks_and_judged_by_all_matches(tmp_path
     given: list[BatchPair] = []
 
     def note(job: SceneJob) -> Solution:
-        points = read_points(job.source, job.pairs)
-        given[:] = [batch_pair(pair, points) for pair in job.pairs]
+        given[:] = [batch_pair(*each) for each in results_of(job)]
         return choose_scene_for_all_but_the_first(job)
 
     scenes_by(monkeypatch, note)

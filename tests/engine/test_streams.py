@@ -13,7 +13,7 @@ COMPLAINS = """
 import os, threading
 from mkpc_kaggle.engine.jobs import Loaded
 from mkpc_kaggle.engine.process import ProcessWorker
-from mkpc_kaggle.engine.streams import unblocked
+from mkpc_kaggle.engine.console import unblocked
 
 def complain():
     for number in range(3000):
@@ -54,7 +54,7 @@ def test_native_code_that_complains_to_a_pipe_without_a_reader_does_not_wait(des
 
 
 def test_what_native_code_writes_is_printed(tmp_path):
-    script = "import os\nfrom mkpc_kaggle.engine.streams import unblocked\nwith unblocked():\n"
+    script = "import os\nfrom mkpc_kaggle.engine.console import unblocked\nwith unblocked():\n"
     script += "    os.write(2, b'libjpeg: premature end')\nprint('later', flush=True)\nos.write(2, b', again')"
     done = subprocess.run(
         [sys.executable, "-c", script], capture_output=True, check=True, env=os.environ | {"PYTHONPATH": str(ROOT)}
@@ -63,8 +63,7 @@ def test_what_native_code_writes_is_printed(tmp_path):
 
 
 def test_text_that_a_stream_cannot_encode_and_a_closed_file_end_nothing(tmp_path):
-    script = "import os, sys\nfrom mkpc_kaggle.engine.console import say\n"
-    script += "from mkpc_kaggle.engine.streams import unblocked\nwith unblocked():\n"
+    script = "import os, sys\nfrom mkpc_kaggle.engine.console import say, unblocked\nwith unblocked():\n"
     script += "    say('\u00e9')\n    sys.stdout.buffer.write(b'bytes, ')\n    say('text')\n"
     script += "    os.close(1)\n    say('lost')"
     environment = os.environ | {"PYTHONPATH": str(ROOT), "PYTHONIOENCODING": "ascii", "PYTHONUTF8": "0"}

@@ -176,13 +176,13 @@ def thread_place(
 def use_places(monkeypatch: pytest.MonkeyPatch, *used: Place, fallback: Sequence[Place] = ()) -> None:
     """Let runs match at these places, and look every hundredth of a second for answers, without a pause."""
 
-    def site_of(folders: Any, assembly: Assembly, plan: session.Session) -> LocalSite:
-        site = LocalSite(assembly, 0, plan.budget.clock)
+    def site_of(assembly: Assembly, _: int, clock: Callable[[], float]) -> LocalSite:
+        site = LocalSite(assembly, 0, clock)
         site.places = [*(place for place in site.places if place.work is not Work.MATCH), *used]
         site.fallback = list(fallback)
         return site
 
-    monkeypatch.setattr(session, "site_of", site_of)
+    monkeypatch.setattr(session, "LocalSite", site_of)
     monkeypatch.setattr(places, "LISTEN_S", 0.01)
     monkeypatch.setattr(places, "RESTART_PAUSE_S", 0.0)
 

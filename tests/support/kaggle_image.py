@@ -10,7 +10,7 @@ from importlib.metadata import Distribution, PackageNotFoundError, distribution
 from pathlib import Path
 from zipfile import ZipFile, is_zipfile
 
-BESIDE = ("matplotlib", "tqdm", "ipykernel", "nbclient", "nbformat")
+BESIDE = ("matplotlib", "ipykernel", "nbclient", "nbformat")
 UNPACKED = (".zip", ".tar", ".gz", ".pt", ".pth", ".ckpt")  # Kaggle unpacks archives, as torch's checkpoints are
 PACKAGES = ("numpy", "scipy", "scikit-learn", "opencv-python-headless", "torch", "pip", *BESIDE)
 

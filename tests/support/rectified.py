@@ -16,9 +16,8 @@ import numpy as np
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.budget import Budget
-from mkpc_kaggle.engine.cluster import RayCluster
 from mkpc_kaggle.engine.request import RunReport
-from mkpc_kaggle.engine.session import Interrupt, Session, Watchdog, run_pairs, submit
+from mkpc_kaggle.engine.session import Interrupt, Session, run_pairs, submit
 from mkpc_kaggle.geometry.coordinates import Size, View
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import MatcherSpec, Picture
@@ -110,18 +109,17 @@ def run(
     interrupt: Interrupt | None = None,
     publish: Callable[..., None] = lambda *_: None,
     output: Path | None = None,
-    workers: int | RayCluster | None = 0,
+    workers: int | str | None = 0,
     is_watched: bool = False,
 ) -> RunReport:
     """Run the recipe with that matcher; the submission is written to ``output``, or given to ``publish``."""
     assembly = assemble(recipe, matchers={matcher.name: matcher}, device="cpu")
     budget = budget or Budget(time.monotonic(), limit)
-    interrupt = interrupt or Interrupt()
-    with Watchdog(budget, interrupt) if is_watched else nullcontext() as watchdog:
-        session = Session(work_dir, budget, interrupt, progress=False, workers=workers, watchdog=watchdog)
+    session = Session(work_dir, budget, interrupt or Interrupt(), progress=False, workers=workers)
+    with session.watched() if is_watched else nullcontext():
         if output is not None:
             return submit(pairs, assembly, session, output)
-        return run_pairs(pairs, assembly, session, publish)
+        return run_pairs(pairs, assembly, session, publish=publish)
 
 
 def matrices(report: RunReport) -> list[bytes]:
