@@ -68,7 +68,7 @@ Estimator: TypeAlias = Callable[[Sequence[Known], Sequence[Known]], Sequence[Mat
 
 def with_prior(found: PairMatch, magsac: RobustConfig = MAGSAC) -> Estimate:
     size0, size1 = found.sizes
-    priors = FocalPrior.of_image(size0, FOCAL), FocalPrior.of_image(size1, FOCAL)
+    priors = FocalPrior.of_image(size0), FocalPrior.of_image(size1)
     return estimate_with_prior(found.matches, priors, magsac, FOCAL)
 
 

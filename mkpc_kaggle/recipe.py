@@ -78,7 +78,7 @@ class Unit:
 class CameraSharing(StrEnum):
     """Camera sharing among the images of one size in a scene."""
 
-    AUTO = "auto"  # images whose focal lengths agree, see ``shared_intrinsics``
+    AUTO = "auto"  # images whose focal lengths agree
     IMAGE = "image"  # none
     FOLDER = "folder"  # all: a scene's images are in one folder
 
@@ -87,12 +87,11 @@ class CameraSharing(StrEnum):
 class SceneConfig:
     """Settings of :mod:`mkpc_kaggle.scene`, table ``[scene]`` of a recipe."""
 
-    shared_intrinsics: float = 0.02  # maximum relative deviation of focal lengths from their median; 0: never
     pairs_per_image: float = 10.0  # a batch with fewer gets extra pairs, used only for its scene; 0: none
     cameras: CameraSharing = CameraSharing.AUTO
 
     def __post_init__(self) -> None:
-        check_ranges(self, shared_intrinsics=AT_LEAST_0, pairs_per_image=AT_LEAST_0)
+        check_ranges(self, pairs_per_image=AT_LEAST_0)
 
 
 @dataclass(frozen=True)

@@ -74,14 +74,14 @@ def test_a_recipe_reads_as_written():
     recipe = parse(
         f'description = "two"\n{units(unit(), second, third)}'
         + "[mkpc]\neps = 0.1\nmin_samples = 7\nexpand_x = 2\n"
-        + '[magsac]\nmethod = "ransac"\nthreshold = 1.5\n[focal]\nsigma = 0.2\n[matchers.sift]\nfeatures = 10\n'
+        + '[magsac]\nmethod = "ransac"\nthreshold = 1.5\n[focal]\nscale = 0.2\n[matchers.sift]\nfeatures = 10\n'
     )
     dkm = Unit(2, "dkm", area="540x720", stretch=True)
     assert recipe.units == (Unit(1, "sift", 640), Unit(2, "x", 800, 5), dkm)
     assert recipe.mkpc == MkpcConfig(eps=0.1, min_samples=7, expand_x=2.0)
     assert type(recipe.mkpc.expand_x) is float
     assert recipe.magsac == RobustConfig(Method.RANSAC, threshold=1.5)
-    assert recipe.focal == FocalConfig(sigma=0.2)
+    assert recipe.focal == FocalConfig(scale=0.2)
     assert (recipe.name, recipe.description) == ("mine", "two")
     assert (options_of(recipe, "sift").features, options_of(recipe, "sift").ratio) == (10, 0.8)
 

@@ -49,7 +49,8 @@ ROUGH_SCALES, FINE_SCALES = (4.0,), (2.0, 1.0)  # multiples of the scale, in ord
 ROUGH_MATCHES, FINE_MATCHES = 300, 1000  # maximum numbers, evenly spaced; all matches score the results
 FINE_STARTS = 2  # number of rough results to refine
 FREE_COST = 10.0  # penalty of MAGSAC's own F, which need not have plausible focal lengths
-EXIF_SIGMA = 0.05  # standard deviation of the logarithm of a focal length from EXIF
+FOCAL_RATIO, FOCAL_SIGMA = 1.1, 0.4  # expected focal length over the long side; standard deviation of its log
+EXIF_SIGMA = 0.05  # the same of a focal length from EXIF
 LOG_FOCAL_GRID = (-0.7, -0.35, 0.0, 0.35, 0.7)  # log f / g to decompose MAGSAC's F with; the best is a start
 
 
@@ -57,13 +58,10 @@ LOG_FOCAL_GRID = (-0.7, -0.35, 0.0, 0.35, 0.7)  # log f / g to decompose MAGSAC'
 class FocalConfig:
     """Settings of :func:`estimate_with_prior`, table ``[focal]`` of a recipe; without it F is MAGSAC's."""
 
-    ratio: float = 1.1  # expected focal length over the image's long side
-    sigma: float = 0.4  # standard deviation of the log focal length
     scale: float = 0.35  # scale of the loss, in pixels
-    exif: bool = True  # expect the focal length of an image's EXIF, within 5 %
 
     def __post_init__(self) -> None:
-        check_ranges(self, ratio=POSITIVE, sigma=POSITIVE, scale=POSITIVE)
+        check_ranges(self, scale=POSITIVE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,11 +70,11 @@ class FocalPrior:
     sigma: float  # standard deviation of the log focal length; 0: known
 
     @classmethod
-    def of_image(cls, size: Size, config: FocalConfig, exif_focal: float = 0.0) -> "FocalPrior":
+    def of_image(cls, size: Size, exif_focal: float = 0.0) -> "FocalPrior":
         """Return the prior for an image of ``size``: weak without a focal length from EXIF, in pixels."""
-        if config.exif and exif_focal:
+        if exif_focal:
             return cls.of_focal(exif_focal, EXIF_SIGMA, size)
-        return cls.of_focal(config.ratio * max(size), config.sigma, size)
+        return cls.of_focal(FOCAL_RATIO * max(size), FOCAL_SIGMA, size)
 
     @classmethod
     def of_focal(cls, focal: float, sigma: float, size: Size) -> "FocalPrior":

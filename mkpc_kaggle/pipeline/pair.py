@@ -84,7 +84,7 @@ def with_estimate(
         focals = pair.focals or tuple(image.focal for image in pair.images)
         told = zip(sizes, focals, strict=True)
         known = [FocalPrior(K, 0.0) for K in intrinsics or ()]
-        first, second = known or [FocalPrior.of_image(size, recipe.focal, focal) for size, focal in told]
+        first, second = known or [FocalPrior.of_image(size, focal) for size, focal in told]
         found = estimate_with_prior(matches, (first, second), magsac, recipe.focal, model)
     if found.ok and model is not ModelKind.H:
         K0, K1 = intrinsics if intrinsics and model is ModelKind.E else (np.eye(3), np.eye(3))

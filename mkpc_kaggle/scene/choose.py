@@ -92,7 +92,7 @@ def estimate_at_known_focals(
     first, second = (
         FocalPrior.of_focal(focals[image.digest], FOCAL_SIGMA, image.size)
         if image.digest in focals
-        else FocalPrior.of_image(image.size, config, image.focal)
+        else FocalPrior.of_image(image.size, image.focal)
         for image in images
     )
     found = estimate_with_prior(pair.matches, (first, second), magsac, config)

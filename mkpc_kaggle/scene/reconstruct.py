@@ -76,12 +76,11 @@ def reconstruct_sharing(
         parts, make = (graph.strong,), reconstruct_connected
     given = shared = given_intrinsics(graph.images, config)
     found = [make(part, shared) for part in parts]
-    tolerance = config.shared_intrinsics if config.cameras is CameraSharing.AUTO else 0.0
-    if alike := shared_intrinsics(graph.images, models_of(found), tolerance):
-        anew = [make(part, alike) for part in parts]
-        before, after = (sum(each.observations for each in made) for made in (found, anew))
+    if config.cameras is CameraSharing.AUTO and (alike := shared_intrinsics(graph.images, models_of(found))):
+        again = [make(part, alike) for part in parts]
+        before, after = (sum(each.observations for each in made) for made in (found, again))
         if after >= MIN_OBSERVATIONS * before:
-            found, shared = anew, alike
+            found, shared = again, alike
     if directory is not None:
         from mkpc_kaggle.scene.colmap import write_files
 

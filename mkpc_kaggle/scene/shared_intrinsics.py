@@ -1,8 +1,8 @@
-"""Shared intrinsics of images that one camera took at one zoom, recognised by their focal lengths.
+"""Shared intrinsics of images from one camera at one zoom, detected by their focal lengths.
 
-A separate focal length of an image is ambiguous with the distance to the scene, and few points hardly constrain
-it. If most images of one size agree on their focal length, one camera took them. A second reconstruction then
-shares its intrinsics from the start. If the user states that one camera took them, the first reconstruction does.
+An image's own focal length is ambiguous with the distance to the scene, and poorly constrained by few points. If
+most images of one size agree on their focal length, one camera is assumed, and they are reconstructed again with
+shared intrinsics. If the user states that one camera took them, the first reconstruction shares them already.
 """
 
 from collections.abc import Mapping, Sequence
@@ -10,11 +10,12 @@ from typing import TypeAlias
 
 import numpy as np
 
+from mkpc_kaggle.geometry.focal_prior import FOCAL_RATIO
 from mkpc_kaggle.recipe import CameraSharing, SceneConfig
 from mkpc_kaggle.scene.reconstruction import SfmModel
 from mkpc_kaggle.scene.view_graph import BatchImage
 
-PRIOR_FOCAL = 1.1  # initial focal length without EXIF, in long sides of the image
+TOLERANCE = 0.02  # maximum relative deviation of focal lengths that agree, from their median
 MIN_ALIKE = 5  # registered images of one size
 ZOOM_POINTS = 0.5  # of the median image's points; an image that sees more but disagrees has another zoom
 
@@ -24,7 +25,7 @@ SharedIntrinsics: TypeAlias = Mapping[str, float]
 
 def start_focal(image: BatchImage) -> float:
     """Return the initial focal length, in pixels, of an image's camera: EXIF's, if known."""
-    return image.focal or PRIOR_FOCAL * max(image.size)
+    return image.focal or FOCAL_RATIO * max(image.size)
 
 
 def given_intrinsics(images: Sequence[BatchImage], config: SceneConfig) -> SharedIntrinsics:
@@ -34,24 +35,22 @@ def given_intrinsics(images: Sequence[BatchImage], config: SceneConfig) -> Share
     starts = {}
     for size in {image.size for image in images}:
         known = [image.focal for image in images if image.size == size and image.focal]
-        starts[size] = float(np.median(known)) if known else PRIOR_FOCAL * max(size)
+        starts[size] = float(np.median(known)) if known else FOCAL_RATIO * max(size)
     return {image.digest: starts[image.size] for image in images}
 
 
-def shared_intrinsics(
-    images: Sequence[BatchImage], models: Sequence[SfmModel], tolerance: float
-) -> SharedIntrinsics:
+def shared_intrinsics(images: Sequence[BatchImage], models: Sequence[SfmModel]) -> SharedIntrinsics:
     """Return the focal lengths of images of one size on which more than half of the registered images agree.
 
-    Focal lengths agree within a share of ``tolerance`` of their median. All images of the size share the median,
-    also unregistered ones, except images that see many points at another focal length: they have another zoom.
+    All images of the size share the median, also unregistered ones, except images that see many points at another
+    focal length: they have another zoom.
     """
     registered = {found.image.digest: found for model in reversed(models) for found in model.images}
     shared: dict[str, float] = {}
     for size in {found.image.size for found in registered.values()}:
         alike = [found for found in registered.values() if found.image.size == size]
         focal = float(np.median([found.focal for found in alike]))
-        near = [found for found in alike if abs(found.focal / focal - 1) < tolerance]
+        near = [found for found in alike if abs(found.focal / focal - 1) < TOLERANCE]
         if len(alike) >= MIN_ALIKE and len(near) > len(alike) / 2:
             many = ZOOM_POINTS * float(np.median([found.points for found in alike]))
             zoomed = {found.image for found in alike if found not in near and found.points >= many}

@@ -19,7 +19,7 @@ from mkpc_kaggle.engine.request import Ending
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.robust import Method
 from mkpc_kaggle.pipeline.stages import Pipeline
-from mkpc_kaggle.recipe import Recipe, SceneConfig
+from mkpc_kaggle.recipe import CameraSharing, Recipe, SceneConfig
 from mkpc_kaggle.reporting.run_log import read_log
 from mkpc_kaggle.reporting.summary import summary
 
@@ -30,7 +30,7 @@ ESTIMATIONS = {  # in their order each is made of the journal of the one before
     "threshold": replace(ALONE, magsac=replace(QUICK, threshold=1.0)),
     "RANSAC": replace(ALONE, magsac=replace(QUICK, method=Method.RANSAC)),
     "prior": replace(ALONE, focal=FocalConfig()),
-    "another scene": replace(RECIPE, focal=FocalConfig(sigma=0.2), scene=SceneConfig(shared_intrinsics=0)),
+    "another scene": replace(RECIPE, focal=FocalConfig(scale=0.2), scene=SceneConfig(cameras=CameraSharing.IMAGE)),
 }
 
 

@@ -16,7 +16,7 @@ SIZE = Size(1024, 768)
 CENTRE = np.array([511.5, 383.5])
 MAGSAC = RobustConfig(permutations=1, max_iterations=2000)
 CONFIG = FocalConfig()
-WEAK = FocalPrior.of_image(SIZE, CONFIG), FocalPrior.of_image(SIZE, CONFIG)
+WEAK = FocalPrior.of_image(SIZE), FocalPrior.of_image(SIZE)
 
 
 def camera(focal, turn=0.0, t=(0, 0, 0), centre=CENTRE):
@@ -65,10 +65,10 @@ def test_few_noisy_matches_have_a_better_pose_the_more_is_known_of_the_focal_len
     assert np.median(surely) < 0.7 * np.median(weakly)
 
 
-def test_exif_tells_a_focal_length_within_five_per_cent_unless_it_is_switched_off():
-    known, weak = (FocalPrior.of_image(SIZE, FocalConfig(exif=on), 700.0) for on in (True, False))
-    assert (known.focal, weak.focal) == (700, WEAK[0].focal)
-    assert known.sigma < weak.sigma == WEAK[0].sigma
+def test_exif_tells_a_focal_length():
+    known = FocalPrior.of_image(SIZE, 700.0)
+    assert known.focal == 700 != WEAK[0].focal
+    assert known.sigma < WEAK[0].sigma
 
 
 def test_known_cameras_of_two_focal_lengths_and_any_centre_give_their_essential_matrix():
@@ -126,7 +126,7 @@ def test_degenerate_matches_end_in_a_value(name):
 
 def test_magsac_wins_over_focal_lengths_that_are_too_implausible():
     for sigma, has_focals in ((0.4, True), (0.03, False)):
-        priors = (FocalPrior.of_image(SIZE, FocalConfig(sigma=sigma)),) * 2
+        priors = (FocalPrior.of_focal(WEAK[0].focal, sigma, SIZE),) * 2
         assert any(with_prior(seen(CAMERAS, 400, 0.05), priors).stats.focals) == has_focals
 
 

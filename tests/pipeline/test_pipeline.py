@@ -115,13 +115,13 @@ def test_the_critical_regions_are_where_the_photograph_is():
 
 
 def test_a_prior_on_focal_lengths_goes_by_the_sizes_of_the_images_unless_the_cameras_are_known():
-    focal = FocalConfig(sigma=1e-3)
+    focal = FocalConfig()
     matcher = TwoStageMatcher(replace(SIFT, focal=focal))
     K = np.array([[400.0, 0, 240], [0, 400, 180], [0, 0, 1]])
     by_size = matcher(*pair())
     sizes = [Size(*image.shape[1::-1]) for image in pair()]
     for match, priors in [
-        (by_size, [FocalPrior.of_image(size, focal) for size in sizes]),
+        (by_size, [FocalPrior.of_image(size) for size in sizes]),
         (matcher(*pair(), intrinsics=(K, K)), [FocalPrior(K, 0.0)] * 2),
     ]:
         expected = estimate_with_prior(match.matches, tuple(priors), SIFT.magsac, focal)

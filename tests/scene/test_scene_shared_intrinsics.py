@@ -11,7 +11,7 @@ from mkpc_kaggle.geometry.cameras import Camera, relative_pose
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.robust import RobustConfig
-from mkpc_kaggle.recipe import SceneConfig
+from mkpc_kaggle.recipe import CameraSharing, SceneConfig
 from mkpc_kaggle.scene.choose import estimate_at_known_focals
 from mkpc_kaggle.scene.reconstruct import Solution, reconstruct_batch, reconstruct_sharing
 from mkpc_kaggle.scene.reconstruction import RegisteredImage, SfmModel
@@ -21,7 +21,7 @@ from mkpc_kaggle.scene.view_graph import BatchImage, ViewGraph
 WIDE, TALL = Size(800, 600), Size(600, 800)
 FOCAL = 840.0
 CONFIG = SceneConfig()
-OWN = SceneConfig(shared_intrinsics=0)
+OWN = SceneConfig(cameras=CameraSharing.IMAGE)
 
 
 def images(count: int, size: Size = WIDE, prefix: str = "") -> list[BatchImage]:
@@ -39,7 +39,7 @@ def model(registered: Sequence[BatchImage], focals: Sequence[float], points: Seq
 def shared(*focals: float, points: Sequence[int] = ()) -> dict[str, float]:
     """By digest, the shared focal length of wide images, each found to have its own."""
     every = images(len(focals))
-    return dict(shared_intrinsics(every, [model(every, focals, points)], 0.02))
+    return dict(shared_intrinsics(every, [model(every, focals, points)]))
 
 
 @pytest.mark.parametrize(
@@ -62,7 +62,7 @@ def test_most_images_of_a_size_tell_its_focal_length(focals, points, expected):
 
 def test_an_image_without_a_camera_shares_that_of_its_size():
     every = [*images(6), *images(1, TALL, "tall")]
-    found = shared_intrinsics(every, [model(every[:5], [FOCAL] * 5)], 0.02)
+    found = shared_intrinsics(every, [model(every[:5], [FOCAL] * 5)])
     assert found == dict.fromkeys("012345", FOCAL)
 
 
