@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mkpc_kaggle.evaluation.compare import gain_of
 from mkpc_kaggle.geometry.metrics import ROTATION_THRESHOLDS, TRANSLATION_THRESHOLDS
 from mkpc_kaggle.reporting.figures import COLOURS, DROPPED, new_figure, plain
 
@@ -13,7 +14,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from mkpc_kaggle.evaluation.compare import Comparison
     from mkpc_kaggle.evaluation.validate import Validation
 
 MARKERS = "osD^vPX"
@@ -36,13 +36,13 @@ def draw_scores(validations: Sequence["Validation"]) -> "Figure":
     return figure
 
 
-def draw_gains(comparison: "Comparison") -> "Figure":
+def draw_gains(validations: Sequence["Validation"]) -> "Figure":
     """Draw the gain of each recipe over the first, with its interval, one row per scene and one for their mean."""
-    first, *others = comparison.validations
+    first, *others = validations
     names = [scene.scene for scene in first.scenes]
     figure, axes = _rows(names, f"gain of mAA over {first.recipe}, with 95 % intervals")
     for index, other in enumerate(others):
-        found = [comparison.difference(index + 1, name) for name in (*names, None)]
+        found = [gain_of(other, first, name) for name in (*names, None)]
         gains, low, high = np.array([(gain.gain, gain.low, gain.high) for gain in found]).T
         y, style = _beside(len(found), index, len(others)), _style(index + 1)
         axes.errorbar(

@@ -18,7 +18,7 @@ from mkpc_kaggle.engine.console import say
 from mkpc_kaggle.engine.request import Ending
 from mkpc_kaggle.engine.session import Interrupt, Session, interruptible
 from mkpc_kaggle.errors import UserError, writing
-from mkpc_kaggle.evaluation.compare import Comparison, comparison_json, comparison_table, step_gains
+from mkpc_kaggle.evaluation.compare import comparison_json, comparison_table, step_gains
 from mkpc_kaggle.evaluation.imc2025 import score_imc2025, score_lines
 from mkpc_kaggle.evaluation.validate import (
     PROTOCOLS,
@@ -190,9 +190,8 @@ def _match_and_score(
                 return status or 1, None
     if not compared:
         return status, to_json(validations[0])
-    comparison = Comparison(tuple(validations))
-    say("\n".join(["", *comparison_table(comparison)]))
-    return status, comparison_json(comparison)
+    say("\n".join(["", *comparison_table(validations)]))
+    return status, comparison_json(validations)
 
 
 def _assemble(arguments: argparse.Namespace, interrupt: Interrupt, name: str, mode: str) -> Assembly:

@@ -64,7 +64,8 @@ def render(surfaces: Sequence[Surface], camera: SizedCamera) -> tuple[FloatImage
             continue
         rows, columns = _extent(surface, fine)
         # A (x, y, 1) = (u, v, 1) / depth, which is affine in the pixel; comparing it needs no division.
-        A = np.linalg.inv(fine.K @ _axes_in_camera(surface, fine)).astype(np.float32)
+        axes = np.column_stack([surface.edge_u, surface.edge_v, surface.origin - fine.centre])
+        A = np.linalg.inv(fine.K @ fine.R @ axes).astype(np.float32)
         y, x = (axis.astype(np.float32) for axis in np.ogrid[rows, columns])
         u, v, inverse = (row[0] * x + (row[1] * y + row[2]) for row in A)
         hit = (inverse > nearness[rows, columns]) & (u >= 0) & (u <= inverse) & (v >= 0) & (v <= inverse)
@@ -77,13 +78,6 @@ def render(surfaces: Sequence[Surface], camera: SizedCamera) -> tuple[FloatImage
     with np.errstate(divide="ignore"):
         depth = 1 / nearness[RAYS // 2 :: RAYS, RAYS // 2 :: RAYS]
     return np.asarray(small, np.float32), np.asarray(depth, np.float32)
-
-
-def _axes_in_camera(surface: Surface, camera: SizedCamera) -> Floats:
-    """Return (3, 3): the columns edge_u, edge_v and origin in the camera's frame."""
-    axes = camera.R @ np.column_stack([surface.edge_u, surface.edge_v, surface.origin])
-    axes[:, 2] += camera.t
-    return np.asarray(axes)
 
 
 def _extent(surface: Surface, camera: SizedCamera) -> tuple[slice, slice]:

@@ -11,7 +11,7 @@ from mkpc_kaggle.demo.render import Picture, Surface
 
 Colour = tuple[int, int, int]  # BGR
 
-SCENES = {"courtyard": 2.5, "market": 1.0}  # metres per unit of each world
+SCENES = {"courtyard": 2.5, "market": 1.0}  # metres per unit of length in the files
 SCENE_NAMES = tuple(SCENES)
 
 TEXELS = 72  # a metre

@@ -60,17 +60,12 @@ def _resampled_means(
     return np.asarray(total / count)
 
 
-@dataclass(frozen=True)
-class Comparison:
-    """Validations of the same pairs, compared with the first."""
-
-    validations: tuple[Validation, ...]
-
-    def difference(self, number: int, scene: str | None = None) -> Difference:
-        """Return the mAA of a validation less the first's, in a scene or as the mean over scenes."""
-        runs = self.validations[0], self.validations[number]
-        parts = [[part for part in run.scenes if scene in (None, part.scene)] for run in runs]
-        return paired_difference([(a.accuracies(), b.accuracies(), a.images) for a, b in zip(*parts, strict=True)])
+def gain_of(other: Validation, first: Validation, scene: str | None = None) -> Difference:
+    """Return the mAA of a validation less the first's of the same pairs, in a scene or as the mean over scenes."""
+    both = zip(first.scenes, other.scenes, strict=True)
+    return paired_difference(
+        [(a.accuracies(), b.accuracies(), a.images) for a, b in both if scene in (None, a.scene)]
+    )
 
 
 def seconds_per_pair(validation: Validation) -> float:
@@ -80,17 +75,17 @@ def seconds_per_pair(validation: Validation) -> float:
     return mean(seconds) if records else nan
 
 
-def comparison_table(comparison: Comparison) -> list[str]:
+def comparison_table(validations: Sequence[Validation]) -> list[str]:
     """Return lines: mAA and seconds per pair of each recipe, then its gain over the first by scene and overall."""
-    first, *others = comparison.validations
+    first, *others = validations
     lines = [f"{'recipe':<40}{'mAA':>9}{'seconds a pair':>16}"]
-    lines += [f"{run.recipe:<40}{run.maa():>9.4f}{seconds_per_pair(run):>16.3f}" for run in comparison.validations]
+    lines += [f"{run.recipe:<40}{run.maa():>9.4f}{seconds_per_pair(run):>16.3f}" for run in validations]
     counts = {scene.scene: len(scene.pairs) for scene in first.scenes}
-    for number, other in enumerate(others, start=1):
+    for other in others:
         lines += ["", f"{other.recipe} against {first.recipe}: gain of mAA, {LEVEL:.0%} interval"]
         for name in (*counts, None):
             count = counts[name] if name else sum(counts.values())
-            lines.append(f"{name or 'mean over scenes':<20}{count:>6}  {comparison.difference(number, name)}")
+            lines.append(f"{name or 'mean over scenes':<20}{count:>6}  {gain_of(other, first, name)}")
     return lines
 
 
@@ -105,17 +100,17 @@ def step_gains(validation: Validation) -> list[str]:
     return lines
 
 
-def comparison_json(comparison: Comparison) -> dict[str, Any]:
+def comparison_json(validations: Sequence[Validation]) -> dict[str, Any]:
     """Return all figures as JSON values: each validation, and its gain over the first."""
+    first, *others = validations
 
-    def gain(number: int, name: str | None = None) -> dict[str, float]:
-        difference = comparison.difference(number, name)
+    def gain(other: Validation, name: str | None = None) -> dict[str, float]:
+        difference = gain_of(other, first, name)
         return {"mAA": difference.gain, "low": difference.low, "high": difference.high}
 
-    first, *others = comparison.validations
-    runs = [{**to_json(run), "work_seconds_per_pair": seconds_per_pair(run)} for run in comparison.validations]
+    runs = [{**to_json(run), "work_seconds_per_pair": seconds_per_pair(run)} for run in validations]
     gains = []
-    for number, other in enumerate(others, start=1):
-        scenes = [{"scene": scene.scene, **gain(number, scene.scene)} for scene in first.scenes]
-        gains.append({"recipe": other.recipe, "against": first.recipe, **gain(number), "scenes": scenes})
+    for other in others:
+        scenes = [{"scene": scene.scene, **gain(other, scene.scene)} for scene in first.scenes]
+        gains.append({"recipe": other.recipe, "against": first.recipe, **gain(other), "scenes": scenes})
     return {"recipes": runs, "level": LEVEL, "gains": gains}

@@ -139,20 +139,17 @@ def verify(
     options = pycolmap.TwoViewGeometryOptions(settings)
     points = [found.astype(np.float64) + CENTRE_PX for found in keypoints]
 
-    def of_edge(edge: Edge, index: Index) -> Any:
-        first, second = edge.first, edge.second
-        ends = cameras[first], points[first], cameras[second], points[second]
-        return pycolmap.estimate_two_view_geometry(*ends, index, options)
-
-    return list(map(of_edge, edges, matches))
+    views = list(zip(cameras, points, strict=True))
+    return [
+        pycolmap.estimate_two_view_geometry(*views[edge.first], *views[edge.second], index, options)
+        for edge, index in zip(edges, matches, strict=True)
+    ]
 
 
 def run_mapper(database: Any, graph: ViewGraph) -> Reconstruction:
     """Return the plausible models of the global mapper from a filled database."""
-    seed, common = (
-        {"random_seed": SEED},
-        {"random_seed": SEED, "num_threads": 1},
-    )  # with more, the last digits vary
+    seed = {"random_seed": SEED}
+    common = seed | {"num_threads": 1}  # with more, the last digits vary
     parts = dict.fromkeys(("rotation_averaging", "global_positioning", "retriangulation"), seed)
     required = {"track_required_tracks_per_view": TRACKS_PER_IMAGE} if len(graph.images) > LARGE else {}
     mapper = {**common, **parts, **required}
