@@ -19,11 +19,11 @@ from mkpc_kaggle.engine.journal_reader import (
     About,
     Event,
     JournalReader,
+    SceneRecord,
     connected,
     to_blob,
     undamaged,
 )
-from mkpc_kaggle.engine.records import SceneRecord
 from mkpc_kaggle.errors import UserError, printable, writing
 from mkpc_kaggle.recipe import Unit
 from mkpc_kaggle.scene.choose import Choice

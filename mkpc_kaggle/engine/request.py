@@ -11,8 +11,7 @@ from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.console import Progress
 from mkpc_kaggle.engine.journal import Journal
-from mkpc_kaggle.engine.journal_reader import About, Event, EventKind
-from mkpc_kaggle.engine.records import PairRecord, SceneRecord
+from mkpc_kaggle.engine.journal_reader import About, Event, EventKind, PairRecord, SceneRecord
 from mkpc_kaggle.engine.settings import Settings
 from mkpc_kaggle.recipe import Recipe
 from mkpc_kaggle.scene.export import Export

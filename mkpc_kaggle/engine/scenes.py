@@ -6,9 +6,8 @@ from pathlib import Path
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.jobs import Failure, Losses, Phase, SceneJob
 from mkpc_kaggle.engine.journal import Journal
-from mkpc_kaggle.engine.journal_reader import EventKind
+from mkpc_kaggle.engine.journal_reader import EventKind, SceneRecord
 from mkpc_kaggle.engine.plan import HANG_FACTOR, Plan
-from mkpc_kaggle.engine.records import SceneRecord
 from mkpc_kaggle.engine.request import Chronicle, Request
 from mkpc_kaggle.engine.state import State
 from mkpc_kaggle.engine.tables import Estimates

@@ -15,8 +15,7 @@ from typing import Any
 from scipy.spatial.transform import Rotation
 
 from mkpc_kaggle.data.competition import TrainScene, TruePair, read_rows, read_submission
-from mkpc_kaggle.engine.journal_reader import JournalReader
-from mkpc_kaggle.engine.records import PairRecord
+from mkpc_kaggle.engine.journal_reader import JournalReader, PairRecord
 from mkpc_kaggle.engine.request import RunReport
 from mkpc_kaggle.engine.session import Session, run_pairs
 from mkpc_kaggle.errors import UserError

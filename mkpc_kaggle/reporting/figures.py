@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from mkpc_kaggle.data.competition import evenly_spread
 from mkpc_kaggle.data.images import Image
 from mkpc_kaggle.data.outputs import replacing
-from mkpc_kaggle.engine.records import SceneRecord
+from mkpc_kaggle.engine.journal_reader import SceneRecord
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Box, View
 from mkpc_kaggle.geometry.critical_region import CriticalRegion, MkpcConfig, find_clusters
@@ -146,10 +146,8 @@ def draw_cameras(scene: SceneRecord, number: int = 0) -> "Figure":
         x, y = centres @ across, centres @ upward
         near = _near(cloud @ across) & _near(cloud @ upward)
         panel.scatter(cloud[near] @ across, cloud[near] @ upward, s=2, color=DROPPED, linewidths=0)
-        panel.quiver(
-            *(x, y, arrow * looks @ across, arrow * looks @ upward),
-            **{"angles": "xy", "scale_units": "xy", "scale": 1, "width": 0.004, "color": COLOURS[0]},
-        )
+        ends, style = (arrow * looks @ across, arrow * looks @ upward), {"width": 0.004, "color": COLOURS[0]}
+        panel.quiver(x, y, *ends, angles="xy", scale_units="xy", scale=1, **style)
         panel.scatter(x, y, s=14, color=OUTLIER, linewidths=0, zorder=3)
         panel.set_aspect("equal", adjustable="datalim")
         panel.margins(0.1)

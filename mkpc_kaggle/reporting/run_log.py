@@ -8,8 +8,16 @@ from pathlib import Path
 
 from mkpc_kaggle.data.outputs import replacing, require_table
 from mkpc_kaggle.engine.budget import format_duration
-from mkpc_kaggle.engine.journal_reader import About, Event, EventKind, JournalReader, undamaged
-from mkpc_kaggle.engine.records import PairRecord, SceneRecord, UnitRecord
+from mkpc_kaggle.engine.journal_reader import (
+    About,
+    Event,
+    EventKind,
+    JournalReader,
+    PairRecord,
+    SceneRecord,
+    UnitRecord,
+    undamaged,
+)
 from mkpc_kaggle.errors import writing
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import Estimate, ModelKind, sampson_distances

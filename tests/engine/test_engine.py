@@ -10,8 +10,7 @@ import pytest
 from rectified import SECOND, SWEEP, THIRD, THREE_UNITS, RectifiedMatcher, matrices, run, write_pairs
 
 from mkpc_kaggle.engine.budget import Budget
-from mkpc_kaggle.engine.journal_reader import JournalReader
-from mkpc_kaggle.engine.records import PairRecord
+from mkpc_kaggle.engine.journal_reader import JournalReader, PairRecord
 from mkpc_kaggle.engine.request import Ending, Standing
 from mkpc_kaggle.engine.session import Interrupt, Session, opened_engine
 from mkpc_kaggle.pipeline.assembly import assemble

@@ -14,8 +14,7 @@ from rectified import SECOND, SWEEP, THIRD
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.jobs import Estimated, Outcome, PairPoints, WantedPair
 from mkpc_kaggle.engine.journal import Journal
-from mkpc_kaggle.engine.journal_reader import About, Event, EventKind
-from mkpc_kaggle.engine.records import SceneRecord
+from mkpc_kaggle.engine.journal_reader import About, Event, EventKind, SceneRecord
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Box, Size

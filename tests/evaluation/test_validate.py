@@ -9,7 +9,7 @@ from shared import run_command, scores_of
 from mkpc_kaggle.data import competition
 from mkpc_kaggle.data.competition import Pair, TrainScene, TruePair, read_test_side, read_train_side
 from mkpc_kaggle.demo import DemoSet
-from mkpc_kaggle.engine.records import PairRecord
+from mkpc_kaggle.engine.journal_reader import PairRecord
 from mkpc_kaggle.evaluation.validate import SceneScore, Step, score_record, score_submission, score_table
 from mkpc_kaggle.geometry.cameras import Camera, fundamental_of_cameras
 from mkpc_kaggle.geometry.metrics import AUC_THRESHOLDS
