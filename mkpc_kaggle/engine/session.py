@@ -201,7 +201,7 @@ def request_of(
     budget, recipe = session.budget, assembly.recipe
     limit = budget.time_limit if isfinite(budget.time_limit) else None
     table = {**recipe.table(), "name": recipe.name}
-    versions = {  # of software that changes results
+    versions = {  # software that the results may depend on
         "mkpc_kaggle": __version__,
         "Python": platform.python_version(),
         "PyTorch": metadata.version("torch"),
