@@ -5,7 +5,6 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -27,21 +26,14 @@ def make(*paths: Path | str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command(*paths), capture_output=True, text=True, env=environment, check=False)
 
 
-@dataclass(frozen=True)
-class Made:
-    """A submission that the script has made, what it printed, and the bytes of the file."""
-
-    output: Path
-    done: subprocess.CompletedProcess[str]
-    written: bytes
-
-
 @pytest.fixture(scope="module")
-def made(demo: DemoSet, tmp_path_factory: pytest.TempPathFactory) -> Made:
+def made(
+    demo: DemoSet, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, bytes, subprocess.CompletedProcess[str]]:
+    """A submission that the script has made, its bytes, and how the script ended."""
     home = tmp_path_factory.mktemp("made")
-    output = home / "submission.csv"
-    done = make(demo.test_dir, output, write_small_recipe(home))
-    return Made(output, done, output.read_bytes())
+    done = make(demo.test_dir, home / "submission.csv", write_small_recipe(home))
+    return home / "submission.csv", (home / "submission.csv").read_bytes(), done
 
 
 def submit(test_dir: Path, output: Path, recipe: Path, *more: str) -> int:
@@ -51,20 +43,21 @@ def submit(test_dir: Path, output: Path, recipe: Path, *more: str) -> int:
 
 
 def test_a_submission_is_made_resumed_and_computed_again_where_a_unit_changed(demo, small_recipe, made, capsys):
-    assert made.done.returncode == 0, made.done.stderr
-    assert "complete after" in made.done.stdout
-    assert problems_of(made.output, demo.test_dir) == []
-    assert submit(demo.test_dir, made.output, small_recipe) == 0
+    output, written, done = made
+    assert done.returncode == 0, done.stderr
+    assert "complete after" in done.stdout
+    assert problems_of(output, demo.test_dir) == []
+    assert submit(demo.test_dir, output, small_recipe) == 0
     assert "8 of them from earlier runs" in capsys.readouterr().out
-    assert made.output.read_bytes() == made.written
+    assert output.read_bytes() == written
     small_recipe.write_text(small_recipe.read_text().replace("400", "401"))
-    assert submit(demo.test_dir, made.output, small_recipe) == 0
+    assert submit(demo.test_dir, output, small_recipe) == 0
     assert "8 units run" in capsys.readouterr().out
-    changed = made.output.read_bytes()
-    assert changed != made.written
-    assert submit(demo.test_dir, made.output, small_recipe, "--fresh") == 0
+    changed = output.read_bytes()
+    assert changed != written
+    assert submit(demo.test_dir, output, small_recipe, "--fresh") == 0
     assert "16 units run" in capsys.readouterr().out
-    assert made.output.read_bytes() == changed
+    assert output.read_bytes() == changed
 
 
 def test_a_killed_run_goes_on_and_ends_with_the_bytes_of_an_undisturbed_one(demo, small_recipe, made, tmp_path):
@@ -79,7 +72,7 @@ def test_a_killed_run_goes_on_and_ends_with_the_bytes_of_an_undisturbed_one(demo
     running.stderr.close()
     assert problems_of(output, demo.test_dir) == []
     assert submit(demo.test_dir, output, small_recipe) == 0
-    assert output.read_bytes() == made.written
+    assert output.read_bytes() == made[1]
 
 
 def test_a_limit_that_is_over_at_the_start_leaves_a_whole_file_and_is_told(demo, tmp_path):

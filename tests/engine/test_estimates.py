@@ -109,15 +109,6 @@ def test_the_file_has_the_former_f_until_another_is_there(tmp_path):
     assert last.estimated == 6
 
 
-def test_another_number_of_matches_is_another_unit_and_the_former_points_stay(tmp_path):
-    pairs = synthetic_pairs(tmp_path / "images", 4)
-    before, _ = submission(pairs, ALONE, tmp_path / "work")
-    fewer = replace(ALONE, units=(replace(ALONE.units[0], max_matches=9),))
-    assert submission(pairs, fewer, tmp_path / "work")[1].units_run == 6
-    again, report = submission(pairs, ALONE, tmp_path / "work")
-    assert (report.units_run, report.estimated, again) == (0, 0, before)
-
-
 def test_e_is_estimated_of_the_points_that_f_was_made_of(tmp_path):
     pairs = synthetic_pairs(tmp_path / "images", 4)
     submission(pairs, ALONE, tmp_path / "work")

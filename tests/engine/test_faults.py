@@ -9,6 +9,7 @@ import sys
 import termios
 import threading
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -139,11 +140,18 @@ def arguments_of(demo: DemoSet, recipe: Path, output: Path) -> list[str]:
     return ["--test-dir", str(demo.test_dir), "--no-report", "--output", str(output), "--recipe", str(recipe)]
 
 
-def on_a_closed_terminal(command: list[str]) -> int:
+def on_a_terminal(command: list[str], *, is_stopped: bool = False, is_read: bool = False) -> int:
+    """On a terminal that is stopped, as after Ctrl-S, or that goes away, where ``is_read`` with its first text."""
     ours, its = pty.openpty()
+    if is_stopped:
+        termios.tcflow(its, termios.TCOOFF)
     running = subprocess.Popen(command, stdin=its, stdout=its, stderr=its, start_new_session=True)
-    os.close(ours)
     os.close(its)
+    if is_stopped:
+        running.wait()
+    if is_read:
+        os.read(ours, 1)
+    os.close(ours)
     return running.wait()
 
 
@@ -154,34 +162,13 @@ def without_a_reader(command: list[str]) -> int:
         return subprocess.run(command, stdout=gone, stderr=gone, check=False).returncode
 
 
-def on_a_stopped_terminal(command: list[str]) -> int:
-    """As after Ctrl-S."""
-    ours, its = pty.openpty()
-    termios.tcflow(its, termios.TCOOFF)
-    running = subprocess.Popen(command, stdin=its, stdout=its, stderr=its, start_new_session=True)
-    status = running.wait()
-    os.close(ours)
-    os.close(its)
-    return status
-
-
-def on_a_terminal_that_goes_away(command: list[str]) -> int:
-    """As soon as something is printed there: the processes of workers and scenes are started later."""
-    ours, its = pty.openpty()
-    running = subprocess.Popen(command, stdin=its, stdout=its, stderr=its, start_new_session=True)
-    os.close(its)
-    os.read(ours, 1)
-    os.close(ours)
-    return running.wait()
-
-
 def with_stderr_closed(command: list[str]) -> int:
     return subprocess.run(["sh", "-c", 'exec "$@" 2>&-', "sh", *command], check=False).returncode
 
 
 CANNOT_PRINT = {  # tests/hostile/unread.py has pipes that are full
-    "closed terminal": on_a_closed_terminal,
-    "stopped terminal": on_a_stopped_terminal,
+    "closed terminal": on_a_terminal,
+    "stopped terminal": partial(on_a_terminal, is_stopped=True),
     "stderr closed": with_stderr_closed,
     "no reader": without_a_reader,
 }
@@ -209,7 +196,8 @@ def test_a_run_that_cannot_print_makes_the_whole_submission(
 def test_scenes_are_made_after_the_terminal_went_away(demo, small_recipe, tmp_path):
     output = tmp_path / "submission.csv"
     script = [sys.executable, str(ROOT / "make_submission.py"), "--scenes"]
-    assert on_a_terminal_that_goes_away([*script, *arguments_of(demo, small_recipe, output)]) == 0
+    # As soon as something is printed: the processes of workers and scenes are started later.
+    assert on_a_terminal([*script, *arguments_of(demo, small_recipe, output)], is_read=True) == 0
     log = read_log(tmp_path / "submission.work")
     assert log.faults == []
     assert len(log.scenes) == 1

@@ -7,7 +7,7 @@ import pytest
 
 from mkpc_kaggle.engine.settings import Settings
 from mkpc_kaggle.pipeline.assembly import Assembly, assemble
-from mkpc_kaggle.recipe import SceneConfig, Unit, load_recipe, recipe_names
+from mkpc_kaggle.recipe import SceneConfig, Unit, load_recipe
 
 CLASSICAL = load_recipe("classical")
 
@@ -42,11 +42,3 @@ def test_other_weights_of_a_matcher_change_its_units_and_stage_2(monkeypatch, sl
 
     pairs = zip(digests(), digests(**{slot: "other"}), strict=True)
     assert [former != new for former, new in pairs] == changed
-
-
-@pytest.mark.parametrize("name", recipe_names())
-def test_each_recipe_has_settings_with_all_of_its_matchers(monkeypatch, name):
-    monkeypatch.setattr(Assembly, "weight_files", {})
-    recipe = load_recipe(name)
-    units = Settings.of(replace(assemble(CLASSICAL), recipe=recipe)).units
-    assert len(set(units)) == len(recipe.units)

@@ -34,7 +34,7 @@ def test_the_interval_holds_the_gain_and_turns_with_it(firsts, random):
 
 def test_the_interval_holds_the_truth_where_a_gain_is_of_images():
     """Two scenes of 16 images, all pairs. A pair gains the sum of its images' gains, and noise."""
-    generator, held, trials = np.random.default_rng(7), 0, 100
+    generator, held, trials = np.random.default_rng(7), 0, 60
     ends = [*combinations(range(16), 2)]
     names = [(str(a), str(b)) for a, b in ends]
     for _ in range(trials):
