@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import cv2
 import numpy as np
@@ -17,7 +16,6 @@ SUN = np.array([0.41, -0.51, 0.76])  # the direction towards the light
 AMBIENT, DIFFUSE = 0.72, 0.38
 SKY = (210, 180, 145)  # BGR
 MIN_DEPTH = 1e-3  # metres
-MIN_LEVEL_PX = 8  # the shorter side of a texture's smallest level
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,16 +37,11 @@ class Surface:
         normal = np.cross(self.edge_v, self.edge_u)
         return np.asarray(normal / np.linalg.norm(normal))
 
-    @cached_property
-    def levels(self) -> list[Picture]:
-        """The shaded texture at full, half, quarter size and so on, against aliasing of distant surfaces."""
+    @property
+    def shaded(self) -> Picture:
+        """The texture in the light, (H, W, 3) uint8 BGR."""
         shade = AMBIENT + DIFFUSE * max(0.0, float(self.normal @ SUN))
-        levels = [cv2.convertScaleAbs(self.texture, alpha=shade)]
-        while min(levels[-1].shape[:2]) >= 2 * MIN_LEVEL_PX:
-            height, width = levels[-1].shape[:2]
-            half = cv2.resize(levels[-1], (width // 2, height // 2), interpolation=cv2.INTER_AREA)
-            levels.append(half)
-        return levels  # type: ignore[return-value]  # of uint8, as the texture
+        return np.asarray(cv2.convertScaleAbs(self.texture, alpha=shade), np.uint8)
 
 
 def render(surfaces: Sequence[Surface], camera: SizedCamera) -> tuple[FloatImage, FloatImage]:
@@ -72,7 +65,9 @@ def render(surfaces: Sequence[Surface], camera: SizedCamera) -> tuple[FloatImage
         if hit.any():
             np.copyto(nearness[rows, columns], inverse, where=hit)
             np.divide(1, inverse, out=inverse, where=hit)
-            colours = _colours(surface, A, u * inverse, v * inverse, inverse)
+            texture, half = surface.shaded, np.float32(0.5)
+            x, y = u * inverse * texture.shape[1] - half, v * inverse * texture.shape[0] - half
+            colours = cv2.remap(texture, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
             np.copyto(image[rows, columns], colours, where=hit[..., None])
     small = cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
     with np.errstate(divide="ignore"):
@@ -90,19 +85,3 @@ def _extent(surface: Surface, camera: SizedCamera) -> tuple[slice, slice]:
     ends = np.clip([np.floor(pixels.min(axis=0)), np.ceil(pixels.max(axis=0)) + 1], 0, size)
     (left, top), (right, bottom) = ends.astype(int).tolist()
     return slice(top, bottom), slice(left, right)
-
-
-def _colours(surface: Surface, A: FloatImage, u: FloatImage, v: FloatImage, depth: FloatImage) -> Picture:
-    """Return colours (H, W, 3) at u, v and depth, each (H, W), of the surface's plane."""
-    height, width = surface.texture.shape[:2]
-    # Squared distances in texels of a step in x and of a step in y, over the squared depth.
-    squares = [(width * (A[0, k] - u * A[2, k])) ** 2 + (height * (A[1, k] - v * A[2, k])) ** 2 for k in (0, 1)]
-    texels = (np.sqrt(np.maximum(*squares)) * depth).clip(1, 2.0 ** (len(surface.levels) - 1))
-    wanted = np.log2(texels).astype(np.uint8)
-    colours = np.empty((*u.shape, 3), np.uint8)
-    for number in np.unique(wanted).tolist():
-        level = surface.levels[number]
-        x, y = u * level.shape[1] - np.float32(0.5), v * level.shape[0] - np.float32(0.5)
-        found = cv2.remap(level, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        np.copyto(colours, found, where=(wanted == number)[..., None])
-    return colours
