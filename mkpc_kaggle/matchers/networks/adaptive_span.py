@@ -8,12 +8,11 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from mkpc_kaggle.matchers.networks.grids import mask_valid, mean_pool, to_2x2_blocks
+from mkpc_kaggle.matchers.networks.grids import as_grid, as_map, mask_valid, mean_pool, to_2x2_blocks
 
 RADIUS = 5.0  # of a span, in deviations of the flow
 SIDE = 8  # samples on each axis
-SAMPLES = SIDE * SIDE
-CELLS_AT_ONCE = {"cpu": 256, "cuda": 8192}  # a cell's samples take 128 KiB and must fit a CPU's cache
+CELLS_AT_ONCE = {"cpu": 256, "cuda": 8192}  # a cell's samples take 128 KiB
 MASKED = -1e8  # a finite logit: attention is uniform if all keys are masked
 
 
@@ -38,9 +37,13 @@ def sample_usable(samples: Tensor, mask: Tensor, key_size: tuple[int, int], fact
     Coordinates are relative to the key map (h, w); ``mask`` is (N, h, w) at the coarse level.
     """
     valid = mask_valid(mask, factor).float()[:, None]
+    return read_samples(valid, samples, key_size, mode="nearest")[:, 0] == 1
+
+
+def read_samples(maps: Tensor, samples: Tensor, key_size: tuple[int, int], mode: str = "bilinear") -> Tensor:
+    """Read maps (N, C, h, w) at samples (N, P, 64, 2) of a key map: (N, C, P, 64), zero outside the maps."""
     size = samples.new_tensor([key_size[1], key_size[0]])
-    read = functional.grid_sample(valid, samples / (size / 2) - 1, mode="nearest", align_corners=False)
-    return read[:, 0] == 1
+    return functional.grid_sample(maps, samples / (size / 2) - 1, mode=mode, align_corners=False)
 
 
 def span_attention(
@@ -52,19 +55,16 @@ def span_attention(
     messages are ordered by cell, four queries each, and read as rows of the map without reordering: the
     published networks were trained with this permutation within each two rows.
     """
-    table = torch.cat([k, v], dim=-1)  # (N, h_key, w_key, 2 C)
-    image = torch.arange(len(q), device=q.device).repeat_interleave(samples[0, ..., 0].numel())
-    index, weight = corners(samples.flatten(0, 2) - 0.5, image, table.shape[1:3])  # (N P 64, 4)
-    cells = to_2x2_blocks(q).flatten(0, 1) * (q.shape[3] // heads) ** -0.5  # (N P, 4, C)
-    rows = table.flatten(0, 2)
+    maps, key_size = as_map(torch.cat([k, v], dim=-1)).to(samples.dtype), (k.shape[1], k.shape[2])
+    cells = to_2x2_blocks(q) * (q.shape[3] // heads) ** -0.5  # (N, P, 4, C)
     messages = []
     at_once = CELLS_AT_ONCE.get(q.device.type, 256)
-    for start in range(0, len(cells), at_once):
-        part, taps = slice(start, start + at_once), slice(start * SAMPLES, (start + at_once) * SAMPLES)
-        read = weighted_rows(rows, index[taps], weight[taps])  # (p 64, 2 C)
-        out = None if usable is None else ~usable.flatten(0, 1)[part]
-        messages.append(_attend_cells(cells[part], read.view(-1, SAMPLES, read.shape[1]), heads, out))
-    return torch.cat(messages).view_as(q)
+    for part in (slice(start, start + at_once) for start in range(0, cells.shape[1], at_once)):
+        read = as_grid(read_samples(maps, samples[:, part], key_size)).to(q.dtype)  # (N, p, 64, 2 C)
+        excluded = None if usable is None else ~usable[:, part].flatten(0, 1)
+        found = _attend_cells(cells[:, part].flatten(0, 1), read.flatten(0, 1), heads, excluded)
+        messages.append(found.view_as(cells[:, part]))
+    return torch.cat(messages, dim=1).view_as(q)
 
 
 def _attend_cells(queries: Tensor, read: Tensor, heads: int, excluded: Tensor | None) -> Tensor:
@@ -78,37 +78,3 @@ def _attend_cells(queries: Tensor, read: Tensor, heads: int, excluded: Tensor | 
             logits.masked_fill_(excluded[:, None], MASKED)
         found.append(logits.softmax(dim=-1) @ value)
     return torch.cat(found, dim=-1)
-
-
-def corners(positions: Tensor, image: Tensor, size: torch.Size) -> tuple[Tensor, Tensor]:
-    """Return the pixels (Q, 4) int64 around positions (x, y), (Q, 2), in maps ``image`` (Q,), and their bilinear
-    weights (Q, 4).
-
-    Pixels are rows of a table of all maps, map by map and row by row. Pixels outside the map, of ``size`` (h, w),
-    have the weight 0 and the index of another pixel.
-    """
-    height, width = size
-    x, y = positions.unbind(1)
-    first = image * (height * width)
-    rows = [(first + row * width, weight) for row, weight in neighbours(y, height)]
-    columns = neighbours(x, width)
-    index = torch.stack([row + column for row, _ in rows for column, _ in columns], dim=1)
-    return index, torch.stack([along_y * along_x for _, along_y in rows for _, along_x in columns], dim=1)
-
-
-def neighbours(positions: Tensor, length: int) -> list[tuple[Tensor, Tensor]]:
-    """Return the pixels before and after each position (Q,) on one axis, int64, with their weights.
-
-    A NaN position gets a NaN weight and a valid pixel, since a GPU fails on an index out of range.
-    """
-    before = positions.floor()
-    share = positions - before
-    return [
-        (pixel.clamp(0, length - 1).nan_to_num(0).long(), weight.masked_fill((pixel < 0) | (pixel >= length), 0))
-        for pixel, weight in ((before, 1 - share), (before + 1, share))
-    ]
-
-
-def weighted_rows(table: Tensor, index: Tensor, weights: Tensor) -> Tensor:
-    """Sum weights (Q, K) times the rows ``index`` (Q, K) of a table (P, C) over K: (Q, C)."""
-    return functional.embedding_bag(index, table, mode="sum", per_sample_weights=weights)
