@@ -13,7 +13,6 @@ from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import NO_STATS, EstimateStats
 from mkpc_kaggle.pipeline.pair import Regions, UnitResult
 from mkpc_kaggle.recipe import Recipe, Unit
-from mkpc_kaggle.scene.export import Export
 from mkpc_kaggle.scene.reconstruct import Solution
 from mkpc_kaggle.scene.view_graph import BatchImage
 
@@ -80,12 +79,7 @@ class PairPoints:
         return tuple(revision for _, revision in self.units)
 
 
-@dataclass(frozen=True, eq=False)
-class PointSource:
-    """Where a worker finds points: in the journal of ``directory``, or in ``points`` by revision."""
-
-    directory: Path
-    points: dict[int, Matches] | None = None
+PointSource = Path | dict[int, Matches]  # the directory of the journal with the points, or the points by revision
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +94,7 @@ class EstimateJob:
 
 @dataclass(frozen=True, eq=False)
 class SceneJob:
-    """Reconstruct a batch with ``matches`` from ``inputs``, revisions; ``export``: write COLMAP's files.
+    """Reconstruct a batch with ``matches`` from ``inputs``, revisions. ``export`` is a directory for COLMAP's files.
 
     The answer is a :class:`Solution` whose choices are in the order of the pairs.
     """
@@ -111,7 +105,7 @@ class SceneJob:
     source: PointSource
     inputs: str = ""
     matches: int = 0
-    export: Export | None = None
+    export: Path | None = None
     is_retry: bool = True  # a crash of pycolmap counts against the batch and not against its place
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +15,6 @@ from mkpc_kaggle.engine.journal import Journal
 from mkpc_kaggle.engine.journal_reader import About, Event, EventKind, PairRecord, SceneRecord
 from mkpc_kaggle.engine.settings import Settings
 from mkpc_kaggle.recipe import Recipe
-from mkpc_kaggle.scene.export import Export
 
 
 class Ending(StrEnum):
@@ -31,7 +31,7 @@ class Ending(StrEnum):
 class Request:
     """A request: points and estimates of ``pairs``, whose images lie below ``root``, and their scenes.
 
-    ``exports`` are the batches whose COLMAP files are written. ``publish`` is called with the results first,
+    ``exports`` are the directories of COLMAP's files, by batch. ``publish`` is called with the results first,
     every half minute (less often if it takes long), after each scene with files, and at the end.
     """
 
@@ -39,7 +39,7 @@ class Request:
     recipe: Recipe
     settings: Settings
     root: str = ""
-    exports: Mapping[str, Export] = field(default_factory=dict)
+    exports: Mapping[str, Path] = field(default_factory=dict)
     about: About | None = None
     publish: "Callable[[Standing], None]" = lambda _: None
 

@@ -13,6 +13,7 @@ from mkpc_kaggle.engine.state import State
 from mkpc_kaggle.engine.tables import Estimates
 from mkpc_kaggle.recipe import SceneConfig
 from mkpc_kaggle.scene.densify import extra_pairs
+from mkpc_kaggle.scene.export import has_files
 from mkpc_kaggle.scene.reconstruct import Solution
 
 MIN_PAIRS = 2  # the minimum to connect three images
@@ -54,7 +55,7 @@ def standing_scenes(journal: Journal, request: Request) -> dict[str, SceneRecord
     """Return the standing scene of each batch. Forget a scene whose exported files were removed."""
     made = journal.scenes("scene") if request.exports else journal.scenes()
     for batch in request.exports.keys() & made.keys():
-        if not request.exports[batch].has_files(len(made[batch].models)):
+        if not has_files(request.exports[batch], len(made[batch].models)):
             journal.forget_scene(batch)
             del made[batch]
     return made

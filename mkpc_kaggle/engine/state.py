@@ -66,8 +66,7 @@ class State:
         """Return references to the current points of pairs, and the source from which workers read points."""
         pairs = tuple(map(self._points_of, positions))
         revisions = [revision for pair in pairs for revision in pair.revisions]
-        points = self.journal.points(revisions) if self.journal.is_in_memory else None
-        return pairs, PointSource(self.journal.path.parent, points)
+        return pairs, self.journal.points(revisions) if self.journal.is_in_memory else self.journal.path.parent
 
     def _points_of(self, position: int) -> PairPoints:
         image0, image1 = self.journal.images(position)

@@ -175,8 +175,8 @@ def batch_pair(pair: PairPoints, results: tuple[UnitResult, ...]) -> BatchPair:
 
 def results_of(job: EstimateJob | SceneJob) -> list[tuple[PairPoints, tuple[UnitResult, ...]]]:
     """Return each pair of a job with the points of its units."""
-    points = job.source.points
-    if points is None:
-        with JournalReader(job.source.directory, check=False) as journal:
+    points = job.source
+    if isinstance(points, Path):
+        with JournalReader(points, check=False) as journal:
             points = journal.points([revision for pair in job.pairs for revision in pair.revisions])
     return [(pair, tuple(UnitResult(unit, points[row]) for unit, row in pair.units)) for pair in job.pairs]

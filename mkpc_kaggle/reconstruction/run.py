@@ -19,7 +19,6 @@ from mkpc_kaggle.recipe import CameraSharing, Recipe, SceneConfig
 from mkpc_kaggle.reconstruction.choice import MAX_IMAGES, choose_pairs
 from mkpc_kaggle.reconstruction.folder import Datasets, Ends
 from mkpc_kaggle.reconstruction.outputs import Cameras
-from mkpc_kaggle.scene.export import Export
 from mkpc_kaggle.scene.likeness import PARTNERS, local_features, most_alike, shortlist
 from mkpc_kaggle.scene.reconstruct import models_of, reconstruct_sharing
 from mkpc_kaggle.scene.reconstruction import RegisteredImage, SfmModel
@@ -67,7 +66,7 @@ def reconstruct_folder(
             with writing(f"--out {out}"):
                 publish(standing[0])
         pairs = choose_pairs(engine, root, datasets, assembly, session, listed=listed, rotations=rotations)
-        exports = {name: Export(out / name) for name in datasets}
+        exports = {name: out / name for name in datasets}
 
         def write(results: Standing) -> None:
             standing[:] = [cameras_of(datasets, str(root), results)]

@@ -8,7 +8,6 @@ from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.robust import RobustConfig
 from mkpc_kaggle.recipe import CameraSharing, SceneConfig
 from mkpc_kaggle.scene.choose import Choice, Reason, choose, estimate_at_known_focals
-from mkpc_kaggle.scene.export import Export
 from mkpc_kaggle.scene.reconstruction import MIN_IMAGES, Reconstruction, SfmModel
 from mkpc_kaggle.scene.shared_intrinsics import SharedIntrinsics, given_intrinsics, shared_intrinsics
 from mkpc_kaggle.scene.view_graph import BatchPair, ViewGraph
@@ -34,19 +33,18 @@ def reconstruct_batch(
     config: SceneConfig,
     focal: FocalConfig | None = None,
     magsac: RobustConfig | None = None,
-    export: Export | None = None,
+    export: Path | None = None,
 ) -> Solution:
     """Reconstruct every connected component of a batch, and choose an F for each of its pairs.
 
     With ``focal``, the recipe's prior, a pair without an F from cameras is re-estimated if the scene has a
     focal length, unless the pair contradicts the scene. ``magsac`` defaults to its default settings. With
-    ``export``, the batch is reconstructed as a whole, and COLMAP's files are written.
+    ``export``, a directory, the batch is reconstructed as a whole, and COLMAP's files are written there.
 
     A missing result has a reason; no matches raise an error. Reconstruction takes seconds to minutes and may end
     the process, see :mod:`mkpc_kaggle.scene.colmap`.
     """
-    directory = export.directory if export else None
-    found, shared = reconstruct_sharing(ViewGraph.of_pairs(pairs), config, directory)
+    found, shared = reconstruct_sharing(ViewGraph.of_pairs(pairs), config, export)
     models = [{image.image.digest: image for image in model.images} for model in models_of(found)]
     focals = dict(shared)  # of the first model with the image, or else of its shared camera
     for model in reversed(models):
