@@ -25,12 +25,15 @@ REFUSALS = [
     (f"{SUBMIT} --output q.work", "would be written over the work directory q.work"),
     (f"{SUBMIT} --output {'s' * 300}.csv", "File name too long"),
     (f"{SUBMIT} --output demo/test/test.csv", "would be written over the input demo/test/test.csv"),
+    (f"{SUBMIT} --output link.csv", "would be written over the input demo/test/test.csv"),
+    (f"{SUBMIT} --output hard.csv", "would be written over the input demo/test/test.csv"),
     (f"{SUBMIT} --output w/m.pth --weights w", "would be written over the input w"),
     (f"{SUBMIT} --work-dir demo/test/test_images", "would be written over the input demo/test/test_images"),
     (f"{SUBMIT} --recipe small.toml --output small.toml", "would be written over the input small.toml"),
     (f"{SUBMIT} --output s.html", "would be written over --report"),
     (f"{SUBMIT} --output w/journal.sqlite --work-dir w", "would be written over the work directory"),
     ("validate --train-dir demo/train --json demo/train/scaling_factors.csv", "would be written over the input"),
+    ("validate --train-dir demo/train --json x.png", "exists and is not a .json file"),
     ("journal w --report w/journal.sqlite", "would be written over the work directory"),
     ("journal w --report x.png", "exists and is not a .html file"),
     (f"{MATCH} x.png", "would be written over the input"),
@@ -51,6 +54,8 @@ def test_what_cannot_be_done_is_refused_in_one_line_before_any_work(
     for name in inputs:
         Path(name).parent.mkdir(parents=True, exist_ok=True)
         Path(name).write_text("precious")
+    Path("link.csv").symlink_to("demo/test/test.csv")
+    Path("hard.csv").hardlink_to("demo/test/test.csv")
     monkeypatch.setattr(write, "build_world", lambda *_, **__: pytest.fail("rendered before it was refused"))
     before = contents(tmp_path)
     assert main(command.split()) == 2

@@ -108,9 +108,14 @@ def test_a_name_in_a_mark_never_leads_out_of_the_directory(tmp_path, out, name):
     assert (tmp_path / "images" / "database.db").exists()
 
 
-@pytest.mark.parametrize(("out", "datasets"), [("file", ["."]), ("out", ["a" * 200 + "/" + "b" * 300])])
+@pytest.mark.parametrize(
+    ("out", "datasets"),
+    [("file", ["."]), ("pipe", ["."]), ("loop", ["."]), ("out", ["a" * 200 + "/" + "b" * 300])],
+)
 def test_a_directory_that_cannot_be_written_is_found_before_any_work(tmp_path, out, datasets):
     (tmp_path / "file").touch()
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "loop").symlink_to("loop")
     with pytest.raises(UserError, match="cannot be written"), output_directory(tmp_path / out, datasets):
         raise AssertionError
 
