@@ -94,7 +94,7 @@ class EstimateJob:
 
 @dataclass(frozen=True, eq=False)
 class SceneJob:
-    """Reconstruct a batch with ``matches`` from ``inputs``, revisions. ``export`` is a directory for COLMAP's files.
+    """Reconstruct a batch with ``matches`` from ``inputs``, revisions. COLMAP's files go to the directory ``export``.
 
     The answer is a :class:`Solution` whose choices are in the order of the pairs.
     """

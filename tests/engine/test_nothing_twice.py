@@ -1,8 +1,13 @@
 """Nothing is computed twice: what runs after a change, and that the result has the bytes of a fresh run."""
 
+import os
+import random
 import re
 import shutil
+import signal
+import subprocess
 import sys
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -116,6 +121,19 @@ def test_what_runs_after_a_change_and_the_bytes_are_those_of_a_fresh_run(room: R
     (run,) = re.findall(r"(\d+) units run", capsys.readouterr().out)
     assert int(run) == units(room)
     assert again == room.run("fresh.csv")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("change", CHANGES)
+def test_ten_kills_after_a_change_leave_the_same_bytes(room: Room, change: str) -> None:
+    rng, command = random.Random(change), [sys.executable, "-m", "mkpc_kaggle", *room.command("a.csv")]
+    CHANGES[change][0](room)
+    for _ in range(10):
+        running = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        time.sleep(rng.uniform(0.5, 6.0))
+        os.kill(running.pid, signal.SIGKILL)
+        running.wait()
+    assert room.run() == room.run("fresh.csv")
 
 
 def test_images_added_to_a_folder_are_matched_with_each_other_and_with_the_former(
