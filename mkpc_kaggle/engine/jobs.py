@@ -94,9 +94,9 @@ class EstimateJob:
 
 @dataclass(frozen=True, eq=False)
 class SceneJob:
-    """Reconstruct a batch with ``matches`` from ``inputs``, revisions. COLMAP's files go to the directory ``export``.
+    """Reconstruct a batch with ``matches`` from ``inputs``, revisions.
 
-    The answer is a :class:`Solution` whose choices are in the order of the pairs.
+    ``export`` is a directory for COLMAP's files. The answer is a :class:`Solution`, with a choice for each pair.
     """
 
     batch: str
