@@ -91,7 +91,6 @@ CASES = {
     "xfeat_lighterglue": Case(with_lightglue("xfeat_lighterglue", 6), SPARSE),
     "aliked": Case(partial(light_matchers.aliked_matcher, keypoints=KEYPOINTS), SPARSE),
     "aliked_lightglue": Case(with_lightglue("aliked_lightglue", 9), SPARSE),
-    "disk_lightglue": Case(with_lightglue("disk_lightglue", 9), SPARSE),
     "superglue": Case(partial(light_matchers.superglue_matcher, keypoints=KEYPOINTS), SPARSE),
     "loma, b128": Case(partial(loma, Variant.B128), SPARSE),
     "loma, b": Case(partial(loma, Variant.B), SPARSE),

@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     import torch
     from torch import nn
 
-TENSORS_UNDER = ("state_dict", "extractor")  # keys of a table of tensors; the first one in a checkpoint counts
 MAX_EXPANSION = 4  # bytes of tensors per byte of the file; some tensors share their bytes
 
 
@@ -34,7 +33,7 @@ def load_tensors(path: Path) -> "dict[str, torch.Tensor]":
     """Load tensors by name, on the CPU, from a safetensors file or a torch checkpoint without executing code.
 
     ``path`` may be the directory of an unpacked torch checkpoint (``NAME/NAME`` on Kaggle). A training checkpoint
-    has its tensors under ``state_dict``, DISK's checkpoint under ``extractor``. Other entries are ignored.
+    has its tensors under ``state_dict``. Other entries are ignored.
     Raises :class:`UserError` if the file cannot be read or an entry is not a dense tensor with a name. The same
     error is raised if the tensors have many more bytes than the file.
     """
@@ -142,7 +141,7 @@ def _load_table(path: Path) -> Mapping[Any, Any]:
             "it is not a checkpoint, or contains unsupported objects; save the network's state_dict alone"
         ) from refusal
     if isinstance(contents, dict):
-        contents = next((contents[key] for key in TENSORS_UNDER if key in contents), contents)
+        contents = contents.get("state_dict", contents)
     if not isinstance(contents, dict):
         raise ValueError("it contains no table of named tensors")
     return contents

@@ -29,13 +29,15 @@ def test_estimates_and_scenes_have_a_digest_of_their_settings(changes, estimates
     assert (former.scene != new.scene) == scenes_differ
 
 
-@pytest.mark.parametrize(("slot", "changed"), [("xfeat", [True, False, True]), ("disk", [False, True, True])])
+@pytest.mark.parametrize(
+    ("slot", "changed"), [("xfeat", [True, False, True]), ("aliked-n16", [False, True, True])]
+)
 def test_other_weights_of_a_matcher_change_its_units_and_stage_2(monkeypatch, slot, changed):
-    units = Unit(1, "xfeat_lighterglue", 640), Unit(1, "disk_lightglue", 640), Unit(2, "sift", 640)
+    units = Unit(1, "xfeat_lighterglue", 640), Unit(1, "aliked_lightglue", 640), Unit(2, "sift", 640)
     assembly = replace(assemble(CLASSICAL), recipe=replace(CLASSICAL, units=units))
 
     def digests(**other: str) -> tuple[str, ...]:
-        slots = {"xfeat": "same", "xfeat-lighterglue": "same", "disk": "same", "disk-lightglue": "same"} | other
+        slots = dict.fromkeys(("xfeat", "xfeat-lighterglue", "aliked-n16", "aliked-lightglue"), "same") | other
         files = {name: SimpleNamespace(digest=digest) for name, digest in slots.items()}
         monkeypatch.setattr(Assembly, "weight_files", files)
         return Settings.of(assembly).units

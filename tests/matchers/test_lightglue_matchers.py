@@ -1,4 +1,4 @@
-"""ALIKED, DISK and SIFT with LightGlue, from checkpoints in the public format, with stand-in weights."""
+"""ALIKED and SIFT with LightGlue, from checkpoints in the public format, with stand-in weights."""
 
 import re
 from functools import partial
@@ -7,7 +7,6 @@ from typing import Any
 import pytest
 import torch
 from checkpoints import PublicFile, store_of
-from kornia.feature import DISK
 from pictures import picture
 from torch import Tensor, nn
 
@@ -33,19 +32,13 @@ def without_the_grid(state: dict[str, Tensor]) -> dict[str, Any]:
     return {name: tensor for name, tensor in state.items() if name != "dkd.hw_grid"}
 
 
-def beside_an_optimizer(state: dict[str, Tensor]) -> dict[str, Any]:
-    return {"extractor": state, "optim": {"lr": 0.1}}
-
-
 SIFT = partial(glue, add_scale_ori=True)
 FILES = (
     PublicFile(
         "a.pth", "aliked_lightglue", "aliked-n16", "aliked", partial(aliked_network, 2048), without_the_grid
     ),
     PublicFile("b.pth", "aliked_lightglue", "aliked-lightglue", "lightglue", glue, old_names),
-    PublicFile("c.pth", "disk_lightglue", "disk", "disk", DISK, beside_an_optimizer),
-    PublicFile("d.pth", "disk_lightglue", "disk-lightglue", "lightglue", glue, old_names),
-    PublicFile("e.pth", "sift_lightglue", "sift-lightglue", "lightglue", SIFT, old_names),
+    PublicFile("c.pth", "sift_lightglue", "sift-lightglue", "lightglue", SIFT, old_names),
 )
 
 
@@ -54,7 +47,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> WeightStore:
     return store_of(tmp_path_factory.mktemp("weights"), FILES)
 
 
-@pytest.mark.parametrize("name", ["aliked_lightglue", "disk_lightglue", "sift_lightglue"])
+@pytest.mark.parametrize("name", ["aliked_lightglue", "sift_lightglue"])
 def test_a_picture_matches_itself_point_by_point(name, store):
     matcher = load_matcher(name, store, KeypointOptions(features=300), Placement())
     matcher._glue.conf.filter_threshold = 0.0

@@ -9,11 +9,11 @@ from functools import cache, partial
 from typing import Any
 
 import numpy as np
-from kornia.feature import DISK, XFeat
+from kornia.feature import XFeat
 from torch import nn
 
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
-from mkpc_kaggle.matchers.adapters import disk_lightglue, dkm, roma, sift_lightglue, xfeat_lighterglue
+from mkpc_kaggle.matchers.adapters import dkm, roma, sift_lightglue, xfeat_lighterglue
 from mkpc_kaggle.matchers.adapters.aliked import AlikedMatcher, aliked_encoder, aliked_network
 from mkpc_kaggle.matchers.adapters.loma import LomaAdapter, LomaOptions
 from mkpc_kaggle.matchers.adapters.superglue import SuperGlueMatcher
@@ -93,10 +93,6 @@ def aliked_keypoints(placement: Placement, keypoints: int) -> Keypoints:
     return aliked_encoder(kornias("aliked", aliked_network, keypoints), placement), {"input_dim": 128}
 
 
-def disk_keypoints(placement: Placement, keypoints: int) -> Keypoints:
-    return disk_lightglue.disk_encoder(kornias("disk", DISK), keypoints, placement), {"input_dim": 128}
-
-
 def sift_keypoints(placement: Placement, keypoints: int) -> Keypoints:
     return sift_lightglue.sift_encoder(keypoints, placement.device), sift_lightglue.SHAPE
 
@@ -109,7 +105,6 @@ def xfeat_keypoints(placement: Placement, keypoints: int) -> Keypoints:
 
 KEYPOINTS = {
     "aliked_lightglue": aliked_keypoints,
-    "disk_lightglue": disk_keypoints,
     "sift_lightglue": sift_keypoints,
     "xfeat_lighterglue": xfeat_keypoints,
 }

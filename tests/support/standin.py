@@ -48,7 +48,6 @@ STAND_INS = {
     "quadtree": StandIn(2.0, {"backbone.layer3_outconv.weight": 1.8, "*.attn.py_att.weight": 4.0}),
     "aspanformer": StandIn(2.0, ASPANFORMER, {"coarse_matching.temperature": 6.0}),
     "aliked": StandIn(2.0, {"score_head.6.weight": 3.0, "desc_head.offset_conv.2.*": 3.0}),
-    "disk": StandIn(2.0),
     "xfeat": StandIn(2.0),
     "lightglue": StandIn(1.0, LIGHTGLUE),
     "roma": StandIn(1.5, ROMA),
