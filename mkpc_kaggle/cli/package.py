@@ -4,8 +4,8 @@ import argparse
 from pathlib import Path
 
 from mkpc_kaggle.cli import options
-from mkpc_kaggle.package import Request, make_package
 from mkpc_kaggle.package.metadata import LATEST
+from mkpc_kaggle.package.package import Request, make_package
 from mkpc_kaggle.package.wheels import PYTHONS
 
 HELP = """\

@@ -4,7 +4,6 @@ A world is a ground, three walls and boxes, with drawn textures. Every view has 
 map, so the ground truth is exact.
 """
 
-from mkpc_kaggle.demo.world import SCENE_NAMES
 from mkpc_kaggle.demo.write import DemoSet, write_demo
 
-__all__ = ["SCENE_NAMES", "DemoSet", "write_demo"]
+__all__ = ["DemoSet", "write_demo"]

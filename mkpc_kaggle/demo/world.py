@@ -12,7 +12,6 @@ from mkpc_kaggle.demo.render import Picture, Surface
 Colour = tuple[int, int, int]  # BGR
 
 SCENES = {"courtyard": 2.5, "market": 1.0}  # metres per unit of length in the files
-SCENE_NAMES = tuple(SCENES)
 
 TEXELS = 72  # a metre
 STONE, BRICK, PLASTER, PAVING = (150, 175, 190), (85, 105, 165), (150, 200, 215), (128, 136, 140)

@@ -13,7 +13,7 @@ import numpy as np
 
 from mkpc_kaggle.demo.camera import FloatImage, Floats, SizedCamera, covisibility
 from mkpc_kaggle.demo.render import Picture, render
-from mkpc_kaggle.demo.world import SCENE_NAMES, SCENES, build_world
+from mkpc_kaggle.demo.world import SCENES, build_world
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.cameras import fundamental_of_cameras
 
@@ -60,7 +60,7 @@ def write_demo(
     """
     demo = DemoSet(directory, directory / "train", directory / "test", directory / "test_truth.csv")
     _claim(demo)
-    scenes = scenes or SCENE_NAMES
+    scenes = scenes or tuple(SCENES)
     samples: list[str] = []
     truths: list[str] = []
     for scene in scenes:

@@ -22,16 +22,13 @@ MAX_STEP_BACK_S = 60.0  # of the wall clock, between --started-at and the start
 
 def parse_duration(text: str) -> float:
     """Return the seconds of ``8h45m``, ``90m``, ``60s`` or a number. Raise :class:`UserError` for other text."""
-    parts = re.fullmatch(r"(?:(\d+)h)?(?:(\d+)m)?(?:(\d+(?:\.\d+)?)(s?))?", text.strip())
+    parts = re.fullmatch(r"(?:(\d+)h)?(?:(\d+)m)?(?:(\d+(?:\.\d+)?)s)?|(\d+(?:\.\d+)?)", text.strip())
     if parts is None or not any(parts.groups()):
         raise UserError(f"{text!r} is not a duration; write it as 8h45m, 90m, 60s or a number of seconds")
-    hours, minutes, seconds = (float(part or 0) for part in parts.groups()[:3])
-    if parts[3] and not parts[4] and (parts[1] or parts[2]):
-        unit = "s" if parts[2] else "m"
-        raise UserError(f"{text!r} does not say what {parts[3]} counts: write {text.strip()}{unit}")
-    if hours + minutes + seconds == 0:
+    hours, minutes, seconds, number = (float(part or 0) for part in parts.groups())
+    if not (total := hours * 3600 + minutes * 60 + seconds + number):
         raise UserError("a time limit of 0 leaves no time to work")
-    return hours * 3600 + minutes * 60 + seconds
+    return total
 
 
 def format_duration(seconds: float) -> str:
@@ -113,9 +110,6 @@ class Costs:
             self._warm_up[unit] = seconds
         else:
             self._measured.setdefault(unit, deque(maxlen=WINDOW)).append(seconds)
-
-    def has_run(self, unit: str) -> bool:
-        return unit in self._measured or unit in self._warm_up
 
     def is_known(self, unit: str) -> bool:
         """Return whether a run after the warm-up was measured."""

@@ -188,11 +188,12 @@ class Engine:
                 self._take_answer(place, now)
             self._fall_back()
             self._hand_out(now)
-            if not any(place.job is not None or self._may_work(place, now) for place in self.site.places):
+            places = self.site.places
+            if not any(place.job or (place.is_starting and self._has_work(place, now)) for place in places):
                 return
             if now - self._published > max(PUBLISH_INTERVAL_S, self.budget.writing / PUBLISH_SHARE):
                 self._publish()
-            limits = (place.limit for place in self.site.places)
+            limits = (place.limit for place in places)
             self.site.wait(min(self.budget.stop_waiting, *(limit for limit in limits if limit > now), inf))
 
     def _is_over(self, now: float) -> bool:
@@ -212,10 +213,6 @@ class Engine:
                 place.start(now, START_TIMEOUT_S if place.work is Work.MATCH else min(START_TIMEOUT_S, share))
             elif place.is_idle and (job := self._next_job(place, now)) is not None:
                 place.submit(job, self._time_limit(job, now), now)
-
-    def _may_work(self, place: Place, now: float) -> bool:
-        """Return whether a place will have a job once its worker has started."""
-        return place.is_starting and self._has_work(place, now)
 
     def _has_work(self, place: Place, now: float) -> bool:
         return now < self._until and any(self._tables[kind].has_work(now) for kind in JOBS[place.work])

@@ -201,7 +201,7 @@ class Plan:
             ((index, name),) = lost
             self.explain(f"{name} is skipped on pair {index} ({failure})")
             pairs = Counter(unit for _, unit in self.losses.skipped)[name]
-            if pairs >= MAX_FAILED_PAIRS and not self.costs.has_run(name):
+            if pairs >= MAX_FAILED_PAIRS and not self.costs.mean(name):
                 self.unusable[self._numbers[name]] = True
                 self.explain(f"{name} is skipped on all pairs: it never ran ({failure})")
         self._look()
@@ -217,8 +217,8 @@ class Plan:
 
     def progress(self, now: float) -> tuple[str, int, int]:
         """Return the phase, the number of its finished pairs, and the number of all its pairs."""
-        pending, rows = self._phases(now).min(1) <= self.phase, self.state.rows
+        pairs, total = slice(self.state.rows), self.state.rows
         if self.phase is Phase.CONNECT:
-            total = int(self._connecting(now).sum())
-            return str(self.phase), total - int(pending[rows:].sum()), total
-        return str(self.phase), rows - int(pending[:rows].sum()), rows
+            pairs, total = slice(total, None), int(self._connecting(now).sum())
+        pending = self._phases(now)[pairs].min(1) <= self.phase
+        return str(self.phase), total - int(pending.sum()), total

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from shared import contents
 
-from mkpc_kaggle.demo import SCENE_NAMES, DemoSet, write_demo
+from mkpc_kaggle.demo import DemoSet, write_demo
 from mkpc_kaggle.demo.camera import covisibility, look_at, project, unproject, visible_mask
 from mkpc_kaggle.demo.render import render
-from mkpc_kaggle.demo.world import build_world, quad
+from mkpc_kaggle.demo.world import SCENES, build_world, quad
 from mkpc_kaggle.geometry.cameras import Camera, fundamental_of_cameras
 
 SCALE = 0.2
@@ -77,7 +77,7 @@ def test_two_views_share_half_of_a_wall_and_neither_sky_nor_what_a_screen_hides(
         assert covisibility(a, depth_a, b, depth_b) == covisibility(b, depth_b, a, depth_a)
 
 
-@pytest.mark.parametrize("scene_name", SCENE_NAMES)
+@pytest.mark.parametrize("scene_name", SCENES)
 def test_fundamental_matrices_and_pictures_are_those_of_the_cameras(small_demo, scene_name):
     train = small_demo.train_dir / scene_name
     cameras = {}
@@ -94,7 +94,7 @@ def test_fundamental_matrices_and_pictures_are_those_of_the_cameras(small_demo, 
 
 def test_the_test_side_has_covisible_pairs_of_renamed_train_images(small_demo):
     samples, truths = rows(small_demo.test_dir / "test.csv"), rows(small_demo.truth_csv)
-    assert len({row["sample_id"] for row in samples}) == 8 * len(SCENE_NAMES)
+    assert len({row["sample_id"] for row in samples}) == 8 * len(SCENES)
     for row, truth in zip(samples, truths, strict=True):
         batch, *hidden = row["batch_id"], row["image_1_id"], row["image_2_id"]
         names = truth["image_1_id"], truth["image_2_id"]

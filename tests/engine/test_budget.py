@@ -15,15 +15,9 @@ def test_durations_are_read(text: str, seconds: float) -> None:
     assert parse_duration(text) == seconds
 
 
-@pytest.mark.parametrize("text", ["", "h", "8 hours", "-5s", "1m1h", "0", "0s", "nan", "9:00"])
+@pytest.mark.parametrize("text", ["", "h", "8 hours", "-5s", "1m1h", "0", "0s", "nan", "9:00", "8h45", "1h30m20"])
 def test_what_is_not_a_duration_is_refused(text: str) -> None:
     with pytest.raises(UserError):
-        parse_duration(text)
-
-
-@pytest.mark.parametrize(("text", "meant"), [("8h45", "8h45m"), ("1h30m20", "1h30m20s"), ("5m30", "5m30s")])
-def test_a_duration_whose_last_number_has_no_unit_is_refused_with_what_to_write(text: str, meant: str) -> None:
-    with pytest.raises(UserError, match=f"write {meant}$"):
         parse_duration(text)
 
 

@@ -10,8 +10,8 @@ from offline_notebook import execute, needs_namespaces, pictures, printed
 from packaging.requirements import Requirement
 from shared import DATA, WEIGHTS, problems_of
 
-from mkpc_kaggle.package import Request, make_package
 from mkpc_kaggle.package.metadata import COMPETITION
+from mkpc_kaggle.package.package import Request, make_package
 from mkpc_kaggle.package.wheels import PYTHONS
 
 NOTEBOOKS = sorted((Path(__file__).resolve().parents[2] / "notebooks").glob("*.ipynb"))

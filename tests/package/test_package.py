@@ -18,8 +18,8 @@ from weight_files import digest_of, line, put
 
 from mkpc_kaggle import __version__
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.package import Package, Request, find_checkout, make_package
 from mkpc_kaggle.package.files import licence_text
+from mkpc_kaggle.package.package import Package, Request, find_checkout, make_package
 from mkpc_kaggle.package.wheels import BUNDLED, build_wheel, install_lines, pins
 from mkpc_kaggle.weights import load_tensors, store
 from mkpc_kaggle.weights.manifest import read_manifest
