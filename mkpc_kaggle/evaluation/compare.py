@@ -32,10 +32,10 @@ class Difference:
 
 
 def paired_difference(scenes: Sequence[Paired]) -> Difference:
-    """Return the mean over scenes of the mean gain of a pair, with its interval.
+    """Return the gain, averaged over each scene's pairs and then over scenes, with its confidence interval.
 
     Pairs that share an image are not independent. So the bootstrap resamples images, not pairs: each image of a
-    scene gets a random weight, and a pair has the product of its images' weights. Scenes are not resampled. The
+    scene gets a random weight, and a pair's weight is the product of both. Scenes are not resampled. The
     same input gives the same interval. If pairs share no image, the interval is up to 1.7 times too wide.
     Sources: Rubin 1981 (exponential weights); Owen 2007 (products of weights).
     """
@@ -49,10 +49,10 @@ def paired_difference(scenes: Sequence[Paired]) -> Difference:
 def _resampled_means(
     gains: NDArray[np.float64], images: Sequence[tuple[str, str]], generator: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Return the weighted means of the (P,) gains: (RESAMPLES,), one for each random draw of image weights."""
+    """Return (RESAMPLES,) weighted means of the gains (P,), one for each random draw of image weights."""
     _, ends = np.unique(np.array(images), return_inverse=True)
     ends = ends.reshape(-1, 2)
-    table = np.zeros((2, ends.max() + 1, ends.max() + 1))  # sums of gains, and numbers of pairs, by their images
+    table = np.zeros((2, ends.max() + 1, ends.max() + 1))  # by two images: sum of gains, number of pairs
     np.add.at(table[0], (ends[:, 0], ends[:, 1]), gains)
     np.add.at(table[1], (ends[:, 0], ends[:, 1]), 1.0)
     weights = generator.exponential(size=(RESAMPLES, table.shape[1]))
@@ -61,7 +61,7 @@ def _resampled_means(
 
 
 def gain_of(other: Validation, first: Validation, scene: str | None = None) -> Difference:
-    """Return the mAA of a validation less the first's of the same pairs, in a scene or as the mean over scenes."""
+    """Return the gain in mAA of ``other`` over ``first`` on the same pairs, in a scene or averaged over scenes."""
     both = zip(first.scenes, other.scenes, strict=True)
     return paired_difference(
         [(a.accuracies(), b.accuracies(), a.images) for a, b in both if scene in (None, a.scene)]
@@ -69,14 +69,14 @@ def gain_of(other: Validation, first: Validation, scene: str | None = None) -> D
 
 
 def seconds_per_pair(validation: Validation) -> float:
-    """Return the mean seconds of units, clustering and last estimate over all runs of the journal, or NaN."""
+    """Return the mean seconds per pair of units, clustering and last estimate in the journal; NaN if unknown."""
     records = validation.report.records if validation.report else ()
     seconds = (r.encode_seconds + r.match_seconds + r.cluster_seconds + r.estimate_seconds for r in records)
     return mean(seconds) if records else nan
 
 
 def comparison_table(validations: Sequence[Validation]) -> list[str]:
-    """Return lines: mAA and seconds per pair of each recipe, then its gain over the first by scene and overall."""
+    """Return lines: each recipe's mAA and seconds per pair, then its gain over the first, by scene and overall."""
     first, *others = validations
     lines = [f"{'recipe':<40}{'mAA':>9}{'seconds a pair':>16}"]
     lines += [f"{run.recipe:<40}{run.maa():>9.4f}{seconds_per_pair(run):>16.3f}" for run in validations]
@@ -90,7 +90,7 @@ def comparison_table(validations: Sequence[Validation]) -> list[str]:
 
 
 def step_gains(validation: Validation) -> list[str]:
-    """Return lines: the mean gain of mAA of each step over the previous step; none without metres."""
+    """Return a line per step with the mean gain in mAA over the previous step. Skip scenes without metres."""
     scenes = [scene for scene in validation.scenes if scene.in_metres]
     lines = []
     for steps in pairwise(validation.steps if scenes else ()):
@@ -101,7 +101,7 @@ def step_gains(validation: Validation) -> list[str]:
 
 
 def comparison_json(validations: Sequence[Validation]) -> dict[str, Any]:
-    """Return all figures as JSON values: each validation, and its gain over the first."""
+    """Return all figures as JSON values: each validation, and each later one's gain over the first."""
     first, *others = validations
 
     def gain(other: Validation, name: str | None = None) -> dict[str, float]:

@@ -1,8 +1,8 @@
-"""The score of the Image Matching Challenge 2025: clusters of mixed images, and their cameras.
+"""The score of the Image Matching Challenge 2025, for clusters of mixed images and for their cameras.
 
 ``train_labels.csv`` has ``dataset,scene,image,rotation_matrix,translation_vector``, ``train_thresholds.csv`` has
-``dataset,scene,thresholds``; numbers in a cell are joined by ``;``, and poses are world to camera. An image of the
-scene ``outliers`` belongs to none.
+``dataset,scene,thresholds``; numbers in a cell are joined by ``;``, and poses map world to camera. An image of
+``outliers`` belongs to no scene.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -19,21 +19,21 @@ from mkpc_kaggle.errors import UserError, shown
 
 OUTLIERS = "outliers"
 POSE_COLUMNS = ("dataset", "scene", "image", "rotation_matrix", "translation_vector")
-SKIPPED_THRESHOLDS = 2  # the finest, below the accuracy of the ground truth
-FREE = 3  # images that some similarity always fits
+SKIPPED_THRESHOLDS = 2  # the finest thresholds, below the accuracy of the ground truth
+FREE = 3  # images that do not count, because some similarity always fits them
 MAX_TRIPLETS = 20_000  # per scene and cluster; a random sample of this size if there are more
 REFINEMENTS = 10
-MIN_SPREAD = 1e-12  # sum of squares; centres with a smaller sum coincide
-MAX_NUMBER = 1e12  # of a pose; keeps squares of derived numbers finite
+MIN_SPREAD = 1e-12  # sum of squared distances from the mean; centres with a smaller sum coincide
+MAX_NUMBER = 1e12  # in a cell; keeps squares of derived numbers finite
 
 Points = NDArray[np.float64]  # (N, 3)
-Centres = Mapping[str, Points]  # camera centres, (3,), of a scene or cluster by image; NaN without a camera
-Parts = Mapping[str, Centres]  # the scenes of a dataset, or its clusters
+Centres = Mapping[str, Points]  # camera centre (3,) by image, in a scene or cluster; NaN without a camera
+Parts = Mapping[str, Centres]  # the scenes or the clusters of a dataset, by name
 
 
 @dataclass(frozen=True)
 class DatasetScore:
-    """``maa`` is pooled over the dataset's scenes; ``clusterness`` is the share of correct images in clusters."""
+    """``maa`` is pooled over scenes; ``clusterness`` is the share of correct images in the scenes' clusters."""
 
     dataset: str
     maa: float
@@ -47,7 +47,7 @@ class DatasetScore:
 
 
 def score_imc2025(directory: Path, submission: Path) -> list[DatasetScore]:
-    """Return the score of each dataset of a train side.
+    """Return the submission's score for each dataset of a train side, ``directory``.
 
     Raises :class:`UserError` for unreadable files, for numbers that cannot be scored, and for a missing, unknown
     or repeated image or dataset.
@@ -76,7 +76,7 @@ def score_imc2025(directory: Path, submission: Path) -> list[DatasetScore]:
 def score_dataset(
     name: str, scenes: Parts, clusters: Parts, thresholds: Mapping[str, Sequence[float] | Points]
 ) -> DatasetScore:
-    """Return the score of a dataset. Each scene takes the cluster with most of its images, then the best mAA.
+    """Return the score of a dataset. Each scene takes the cluster with most of its images; mAA decides ties.
 
     The mAA's numerators and denominators are summed over the scenes before the division.
     """
@@ -95,10 +95,10 @@ def score_dataset(
 
 
 def accurate_images(truth: Centres, cluster: Centres, thresholds: Sequence[float] | Points) -> int:
-    """Return the number of images above ``FREE`` with a centre within a threshold, summed over thresholds.
+    """Return the number of images beyond ``FREE`` whose centre is within a threshold, summed over thresholds.
 
-    For each threshold, the best similarity of three images is refined on its inliers: the cluster's centres that
-    it maps to the scene's.
+    For each threshold, the best similarity of three images is refitted to its inliers. Inliers are images whose
+    transformed cluster centre is within the threshold of the scene's.
     """
     common = sorted(name for name in truth.keys() & cluster.keys() if np.isfinite(cluster[name]).all())
     if len(common) < FREE:
@@ -118,9 +118,9 @@ def accurate_images(truth: Centres, cluster: Centres, thresholds: Sequence[float
 
 
 def residuals(source: Points, target: Points, fitted: NDArray[np.intp]) -> NDArray[np.float64]:
-    """Return (B, N) distances of points from targets, after the similarity transform of the ``fitted`` points.
+    """Fit a similarity to each row of indices ``fitted`` (B, k), and return its distances (B, N) from ``target``.
 
-    It is NaN if the fitted sources coincide.
+    Distances are NaN if the fitted sources coincide.
 
     Source: Umeyama 1991, the solution of Horn's problem by a singular value decomposition.
     """
@@ -159,7 +159,7 @@ def _thresholds(path: Path) -> dict[str, dict[str, Points]]:
 
 
 def _centres(path: Path) -> dict[str, dict[str, dict[str, Points]]]:
-    """Return the camera centres of a table of poses, by dataset, scene or cluster, and image."""
+    """Return the camera centres of a table of poses: by dataset, by scene or cluster, by image."""
     found: dict[str, dict[str, dict[str, Points]]] = {}
     seen: set[tuple[str, str]] = set()
     for where, (dataset, scene, image, *cells) in read_rows(path, POSE_COLUMNS):
@@ -176,7 +176,7 @@ def _centres(path: Path) -> dict[str, dict[str, dict[str, Points]]]:
 
 
 def _numbers(cell: str, where: str) -> Points:
-    """Return the numbers of a cell, NaN for unknown ones. Raise :class:`UserError` for an infinite number."""
+    """Return the numbers of a cell, which may be NaN. Raise :class:`UserError` for a malformed or huge number."""
     try:
         found = np.array([float(part) for part in cell.split(";")])
     except ValueError as error:
@@ -187,7 +187,7 @@ def _numbers(cell: str, where: str) -> Points:
 
 
 def score_lines(scores: Sequence[DatasetScore]) -> Iterator[str]:
-    """Yield a row for each dataset, and a row of their mean."""
+    """Yield the heads, a row for each dataset, and a row with the mean score."""
     yield f"{'dataset':<24}{'mAA':>9}{'clusters':>10}{'score':>9}"
     for each in scores:
         yield f"{shown(each.dataset):<24}{each.maa:>9.4f}{each.clusterness:>10.4f}{each.score:>9.4f}"

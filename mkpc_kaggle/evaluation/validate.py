@@ -1,6 +1,6 @@
-"""Run the engine on pairs with known cameras, and score the results.
+"""Runs of the engine on pairs with known cameras, and their scores.
 
-A train side is scored by the competition's rules, and a list of pairs by those of SuperGlue and LoFTR.
+A train side is scored by the competition's rules, a list of pairs by the rules of SuperGlue and LoFTR.
 """
 
 import json
@@ -27,7 +27,7 @@ from mkpc_kaggle.geometry.robust import Method, RobustConfig
 from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.recipe import Recipe
 
-MAX_NAMES = 5  # sample names in a line
+MAX_NAMES = 5  # of samples to list in a line
 MATCHING = ("precision", "matching_score")
 
 SUPERGLUE = RobustConfig(Method.RANSAC, 1.0, max_iterations=1000, permutations=1, every_match=True)
@@ -38,16 +38,16 @@ class Step(StrEnum):
     """Successive estimates of a pair's F."""
 
     MAGSAC = "MAGSAC"
-    PRIOR = "+ prior"  # on the focal lengths
-    SCENE = "+ scene"  # from the cameras of the pair's batch, if these give an F
+    PRIOR = "+ prior"  # the prior on the focal lengths
+    SCENE = "+ scene"  # the F of the batch's reconstructed cameras, if they give one
 
 
 @dataclass(frozen=True)
 class PairScore:
-    """One pair's error, infinite for a failed pair, and its record if the engine made it.
+    """One pair's error, infinite if the pair failed, and the pair's record if the engine ran.
 
-    ``steps`` are the errors after each :class:`Step` of the run; the last is ``error``. For pairs of a list,
-    ``matching`` is the precision and the matching score: correct matches over all, and over keypoints of image 0.
+    ``steps`` has the error after each :class:`Step` of the run; the last equals ``error``. ``matching``, for pairs
+    of a list, has two ratios of correct matches: to all matches (precision) and to image 0's keypoints (score).
     """
 
     id: str
@@ -61,7 +61,7 @@ class PairScore:
 
 @dataclass(frozen=True)
 class SceneScore:
-    """The scores of one scene's pairs; without metres the mAA is NaN."""
+    """The scores of one scene's pairs; the mAA is NaN if the scene's scale in metres is unknown."""
 
     scene: str
     pairs: tuple[PairScore, ...]
@@ -95,7 +95,7 @@ class SceneScore:
 class Validation:
     """The scores of all scenes under one recipe.
 
-    A submission scored from its file has no ``report`` and no ``steps``; ``missing`` are samples without a row.
+    A submission scored from its file has no ``report`` and no ``steps``; ``missing`` lists samples without a row.
     """
 
     recipe: str
@@ -121,11 +121,10 @@ class Validation:
 
 
 def by_protocol(recipe: Recipe, protocol: str) -> Recipe:
-    """Return the recipe with the settings of a protocol. Scoring by a protocol also sets ``in_front``: the inliers
-    of an E select its rotation.
+    """Return the recipe with the settings of a protocol.
 
-    SuperGlue's threshold is in pixels of the resized image, whose long side is the largest of
-    stage 1.
+    Scoring by a protocol also needs ``in_front`` of :func:`validate`. SuperGlue's threshold is in pixels of the
+    resized image, whose long side is the largest of stage 1.
     """
     units = tuple(replace(unit, antialias=False) for unit in recipe.units)
     sides = [unit.long_side or max(map(int, unit.area.split("x"))) for unit in units if unit.stage == 1]
@@ -136,13 +135,13 @@ def by_protocol(recipe: Recipe, protocol: str) -> Recipe:
 def validate(
     scenes: Sequence[TrainScene], assembly: Assembly, session: Session, root: str = "", *, in_front: bool = False
 ) -> Validation:
-    """Run the recipe on the pairs of all scenes, whose images lie below ``root``, and score it.
+    """Run the recipe on the pairs of all scenes, whose images lie below ``root``, and score the results.
 
     With ``in_front``, the inliers of an E select one of its two rotations.
     """
     report = run_pairs([true.pair for scene in scenes for true in scene.pairs], assembly, session, root=root)
     prior = assembly.recipe.focal is not None
-    made = {  # E at known focal lengths has no step of MAGSAC alone
+    made = {  # with known focal lengths, E has no step before the prior
         Step.MAGSAC: not prior or any(record.magsac_fundamental is not None for record in report.records),
         Step.PRIOR: prior,
         Step.SCENE: any(record.scene is not None for record in report.records),
@@ -159,7 +158,7 @@ def validate(
 
 
 def with_matching(pair: PairScore, true: TruePair, journal: JournalReader) -> PairScore:
-    """Return the score with the quality of the pair's matches; NaN for a matching score without keypoints."""
+    """Return the score with ``matching`` set; the matching score is NaN if numbers of keypoints are unknown."""
     assert pair.record is not None
     points = journal.points(journal.inputs(pair.record.index).values())
     matches, units = Matches.concatenate(points.values()), pair.record.units
@@ -172,7 +171,7 @@ def with_matching(pair: PairScore, true: TruePair, journal: JournalReader) -> Pa
 def score_record(
     true: TruePair, record: PairRecord, scene: TrainScene, steps: Sequence[Step] = (), in_front: bool = False
 ) -> PairScore:
-    """Return the score of a pair's record; the fallback row counts as a failure."""
+    """Return the score of a pair's record. An F from the fallback counts as a failure."""
     rotation = Rotation.from_rotvec(record.stats.rotation).as_matrix() if in_front else None
     own = None if record.failure else record.pair_fundamental
     matrices = {
@@ -188,7 +187,7 @@ def score_record(
 def error_of(
     matrix: Matrix3 | None, true: TruePair, scene: TrainScene, rotation: Matrix3 | None = None
 ) -> PoseError:
-    """Return the error of a pair's F, or of its E and a given rotation; infinite without a matrix."""
+    """Return the error of a pair's F, or of its E with a given rotation. It is infinite without a matrix."""
     if matrix is None:
         return PoseError.failed()
     camera0, camera1 = true.camera0, true.camera1
@@ -206,7 +205,7 @@ def score_submission(submission: Path, truth: Path, scenes: Sequence[TrainScene]
     """
     found = read_submission(submission)
     columns = ("sample_id", "scene", "image_1_id", "image_2_id")
-    # The sample and its F by the pair's id in the train side, in either order.
+    # By the pair's id in the train side, with its images in either order: the sample and its F.
     known: dict[str, tuple[str, Matrix3 | None]] = {}
     for _, (sample, scene, first, second) in read_rows(truth, columns):
         F = found.get(sample)
@@ -229,8 +228,8 @@ def score_submission(submission: Path, truth: Path, scenes: Sequence[TrainScene]
 def score_table(validation: Validation) -> list[str]:
     """Return a row for each scene and a row of their mean, with a dash for unknown figures.
 
-    The columns are the mAA, after each of several steps, and the pose AUC after the last. Lists of pairs also have
-    precision and matching score. The last line has the names of samples without a row, if any.
+    The columns are the mAA after each step, and the pose AUC after the last step. Lists of pairs also have
+    precision and matching score. The last line names samples without a row, if any.
     """
     several, is_list = len(validation.steps) > 1, not all(scene.in_metres for scene in validation.scenes)
     heads = [*(validation.steps if several else ["mAA"]), *(f"AUC {angle:.0f}" for angle in AUC_THRESHOLDS)]

@@ -1,8 +1,8 @@
 """The interface of matchers: pictures are encoded one by one, then encodings are matched in pairs.
 
-One contract serves sparse, semi-dense and dense networks. ``encode`` computes all that depends on one picture
-(keypoints and descriptors, or a backbone's feature maps). Its results are cached, because many pairs use the view
-of a whole image. ``match`` computes the rest.
+One contract serves sparse, semi-dense and dense networks. ``encode`` computes everything that depends on one
+picture alone: keypoints and descriptors, or a backbone's feature maps. Encodings of whole images are cached,
+because many pairs share them. ``match`` computes the rest.
 """
 
 import re
@@ -17,7 +17,7 @@ from mkpc_kaggle.geometry.matches import Matches
 
 
 class NonFiniteError(ArithmeticError):
-    """Infinite or NaN values in a network, which half precision can cause."""
+    """Infinite or NaN values in a network, such as from overflow in half precision."""
 
 
 class Colour(StrEnum):
@@ -28,7 +28,7 @@ class Colour(StrEnum):
 
 
 class Precision(StrEnum):
-    """The precision of a network's convolutions and linear layers, by PyTorch's names."""
+    """The precision of a network's convolutions and linear layers; the values are PyTorch's names."""
 
     FLOAT32 = "float32"
     BFLOAT16 = "bfloat16"
@@ -37,9 +37,9 @@ class Precision(StrEnum):
 
 @dataclass(frozen=True)
 class Placement:
-    """The device of a matcher, "cpu" or "cuda:0", and its precision.
+    """A matcher's device, such as "cpu" or "cuda:0", and precision.
 
-    Softmax, transport, least squares and coordinates are always float32.
+    Softmax, optimal transport, least squares and coordinates are always float32.
     """
 
     device: str = "cpu"
@@ -75,24 +75,24 @@ class MatcherSpec:
     name: str
     options: type = NoOptions  # a frozen dataclass; a recipe's table [matchers.NAME] sets its fields
     colour: Colour = Colour.RGB
-    multiple: int = 1  # pictures are padded to multiples of it
-    slots: tuple[str, ...] = ()  # of the manifest; ``{name}`` stands for that option's value
-    licences: tuple[str, ...] = ()  # tags of weights that the manifest does not list
+    multiple: int = 1  # the sides of pictures are padded to multiples of this
+    slots: tuple[str, ...] = ()  # of the manifest; ``{name}`` stands for the value of option ``name``
+    licences: tuple[str, ...] = ()  # licence tags of weights outside the manifest
 
     def slots_for(self, options: Any) -> tuple[str, ...]:
-        """Return the slots of the manifest that a matcher with these options needs."""
+        """Return the manifest's slots that a matcher with these options needs."""
         return tuple(slot.format_map(vars(options)) for slot in self.slots)
 
     def uses(self, slot: str) -> bool:
-        """Return whether any training or variant uses the slot."""
+        """Return whether the matcher uses the slot under any options."""
         return any(fnmatch(slot, re.sub(r"{\w+}", "*", own)) for own in self.slots)
 
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """A matcher's input: ``pixels`` uint8, (H, W, 3) RGB or (H, W) gray, of a ``view``.
+    """A matcher's input: the ``pixels`` of a ``view``, uint8, (H, W, 3) RGB or (H, W) gray.
 
-    Only the top-left ``content`` holds the image; the rest is padding, which must have no points.
+    The image fills the top-left ``content``. The rest is padding, where a matcher must return no points.
     """
 
     pixels: Pixels
@@ -107,7 +107,7 @@ Encoding = TypeVar("Encoding")
 
 
 class Matcher(Protocol[Encoding]):
-    """A loaded matcher. Both methods return one item for each input, in order."""
+    """A loaded matcher. ``encode`` returns one item per picture, ``match`` one per pair, in order."""
 
     @property
     def spec(self) -> MatcherSpec: ...
@@ -115,13 +115,13 @@ class Matcher(Protocol[Encoding]):
     def encode(self, pictures: Sequence[Picture]) -> Sequence[Encoding]:
         """Encode pictures of one shape.
 
-        Encodings are dataclasses, tuples or lists of arrays, by which their size is counted. Arrays must not be
-        views of larger arrays, since encodings are cached one by one.
+        Encodings are dataclasses, tuples or lists of arrays, whose bytes the cache counts. An array must not
+        be a view of a larger one, which the cache would keep in memory.
         """
         ...
 
     def match(self, encodings0: Sequence[Encoding], encodings1: Sequence[Encoding]) -> Sequence[Matches]:
-        """Return the matches of each pair of encodings, in view pixels; empty is legal."""
+        """Return the matches of each pair of encodings, in view pixels. A pair may have none."""
         ...
 
 

@@ -1,4 +1,4 @@
-"""The adapter of dense networks: features of each picture, matches sampled from the warps of a pair."""
+"""The adapter of dense networks, which encodes each picture and samples matches from a pair's warps."""
 
 import zlib
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ from mkpc_kaggle.matchers.networks.dense_warp import DenseFeatures, DenseNetwork
 from mkpc_kaggle.matchers.networks.pixels import network_input
 
 THRESHOLD = 0.05  # certainties above it count as 1, as published
-MIN_SIDE_PX = 8  # of the second pass
+MIN_SIDE_PX = 8  # of the images in the second pass
 
 
 class DenseEncoding(NamedTuple):
@@ -27,13 +27,13 @@ class DenseEncoding(NamedTuple):
 
 
 class DenseMatcher(PairwiseMatcher[DenseEncoding]):
-    """A dense matcher. A match's score is its certainty; sampling depends on the two pictures alone.
+    """A dense matcher. A match's score is its certainty; the random seed depends on the two pictures alone.
 
-    Pictures and pairs are processed one by one, so that results do not depend on the batch. With ``first_pass``,
-    the first of two passes is on pictures scaled by it. ``multiple``: of the sides in the first pass.
+    Pictures and pairs are processed one by one, so that results do not depend on the batch. ``first_pass``
+    scales pictures for the first of two passes; None means one pass. ``multiple``: of the sides in the first pass.
     """
 
-    matches = 5000  # of a pair, at most
+    matches = 5000  # the maximum per pair
 
     def __init__(
         self,
@@ -70,7 +70,7 @@ class DenseMatcher(PairwiseMatcher[DenseEncoding]):
         warp = torch.cat([dense.warp.reshape(-1, 4) for dense in warps])
         certainty = torch.cat([dense.certainty.flatten() for dense in warps])
         check_finite(f"certainties of {self.spec.name}", certainty, warp)
-        # PyTorch's CPU generator uses 32 bits of a seed, so both checksums become one of 32 bits.
+        # PyTorch's CPU generator uses 32 bits of a seed, so the two checksums are combined into 32 bits.
         seed = zlib.crc32(second.checksum.to_bytes(4), first.checksum)
         generator = torch.Generator(warp.device).manual_seed(seed)
         index = sample_matches(warp, certainty, self.matches, THRESHOLD, generator)

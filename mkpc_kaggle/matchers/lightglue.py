@@ -16,7 +16,7 @@ from mkpc_kaggle.weights import WeightStore, load_into
 
 
 class LightGlueMatcher(PairwiseMatcher[Keypoints]):
-    """LightGlue on the keypoints of an encoder; a match's score is LightGlue's, above 0.1 by kornia's default."""
+    """LightGlue on an encoder's keypoints. Scores are LightGlue's, above kornia's default threshold of 0.1."""
 
     def __init__(self, spec: MatcherSpec, encode: Encode, glue: LightGlue, placement: Placement) -> None:
         self.spec = spec
@@ -64,21 +64,21 @@ def load_lightglue(
 
 
 def light_glue(layers: int, **shape: Any) -> LightGlue:
-    """Make the network without weights; ``shape``: kornia's settings, ``input_dim`` and so on."""
+    """Build the network without weights; ``shape`` has kornia's settings, such as ``input_dim``."""
     flash = torch.backends.cuda.flash_sdp_enabled()  # type: ignore[no-untyped-call]  # torch's
     try:
         return LightGlue(
             None,  # type: ignore[arg-type]  # no download; missing in kornia's annotation
             n_layers=layers,
-            flash=False,  # else kornia halves queries, keys and values on a GPU, float32 or not
+            flash=False,  # else kornia casts queries, keys and values on a GPU to float16, even in float32
             depth_confidence=-1,
             width_confidence=-1,
             **shape,
         )
     finally:
-        torch.backends.cuda.enable_flash_sdp(flash)  # kornia changes it for the process
+        torch.backends.cuda.enable_flash_sdp(flash)  # kornia changes this setting for the whole process
 
 
 def layer_name(name: str) -> str:
-    """Return the current name of a parameter in an older checkpoint or in a training wrapper."""
+    """Return the current name of a parameter from an older checkpoint or from a training wrapper."""
     return re.sub(r"^(self|cross)_attn\.(\d+)\.", r"transformers.\2.\1_attn.", name.removeprefix("matcher."))

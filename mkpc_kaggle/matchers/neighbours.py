@@ -16,7 +16,7 @@ BLOCK_ROWS = 2048
 class Neighbours:
     """M mutual pairs: ``index0``, ``index1`` (M,) int64, ``similarity`` (M,) cosine in -1..1, ``ratio`` (M,).
 
-    The ratio is nearest over second nearest distance, the larger one of both directions.
+    A ratio is the nearest over the second nearest distance, the larger one of the two directions.
     """
 
     index0: Tensor
@@ -39,16 +39,16 @@ class NeighbourMatcher(PairwiseMatcher[Keypoints]):
 
 
 def mutual_neighbours(descriptors0: Tensor, descriptors1: Tensor, max_ratio: float = 1.0) -> Neighbours:
-    """Pair unit descriptors, (N, D) and (M, D), that are each other's nearest; in order of the first image.
+    """Pair unit descriptors (N, D) and (M, D) that are each other's nearest, in the order of the first image.
 
-    Of equal neighbours the lower index counts. A missing second neighbour counts as one at the maximum distance.
+    Ties go to the lower index. A missing second neighbour counts as one at the maximum distance.
     Pairs with a ratio above ``max_ratio`` are dropped.
     """
     if len(descriptors0) == 0 or len(descriptors1) == 0:
         nothing = descriptors0.new_zeros(0)
         return Neighbours(nothing.long(), nothing.long(), nothing, nothing)
     similarity, ratio0, nearest0 = _nearest(descriptors0, descriptors1)
-    index0 = (ratio0 <= max_ratio).nonzero()[:, 0]  # few at a low ratio: only these need the other direction
+    index0 = (ratio0 <= max_ratio).nonzero()[:, 0]  # few pass a low ratio; only these need the other direction
     index1 = nearest0[index0]
     _, ratio1, nearest1 = _nearest(descriptors1[index1], descriptors0)
     ratio = torch.maximum(ratio0[index0], ratio1)
@@ -57,7 +57,7 @@ def mutual_neighbours(descriptors0: Tensor, descriptors1: Tensor, max_ratio: flo
 
 
 def _nearest(queries: Tensor, keys: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return each query's highest similarity, its distance ratio, and the index of that neighbour, all (N,)."""
+    """Return each query's highest similarity, distance ratio and index of the nearest key, all (N,)."""
     parts = []
     for block in torch.split(queries, BLOCK_ROWS):
         similarity = block @ keys.T  # (rows, M)

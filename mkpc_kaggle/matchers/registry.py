@@ -13,17 +13,17 @@ from mkpc_kaggle.weights import WeightStore
 
 
 class UnusableError(UserError):
-    """A matcher that cannot be imported on this machine; its cause is the error of the import."""
+    """Error for a matcher that cannot be imported on this machine; ``__cause__`` is the error of the import."""
 
 
 @cache
 def matcher_names() -> tuple[str, ...]:
-    """Return the names of all matchers without importing them. A new matcher is a new file."""
+    """Return the names of all matchers, one per file, without importing them."""
     return tuple(info.name for info in pkgutil.iter_modules(adapters.__path__))
 
 
 def spec_of(name: str, where: str) -> MatcherSpec:
-    """Import a matcher and return its spec; errors name ``where`` the request came from.
+    """Import a matcher and return its spec. Messages of errors start with ``where``, the source of the name.
 
     Raises :class:`UserError` for an unknown name, :class:`UnusableError` if the import fails.
     """
@@ -32,7 +32,7 @@ def spec_of(name: str, where: str) -> MatcherSpec:
 
 
 def load_matcher(name: str, weights: WeightStore, options: Any, placement: Placement) -> Matcher[Any]:
-    """Return the matcher, ready to run; raises :class:`UserError` if its weights are missing or damaged."""
+    """Return the matcher, ready to run. Raise :class:`UserError` if its weights are missing or damaged."""
     matcher: Matcher[Any] = _imported(name, "load").load(weights, options, placement)
     return matcher
 
@@ -48,7 +48,7 @@ def _imported(name: str, where: str) -> Any:
 
 
 def require_matchers(matchers: Mapping[str, Matcher[Any]]) -> Mapping[str, Matcher[Any]]:
-    """Return a user's matchers by name. Raise ``TypeError`` for anything else."""
+    """Return the user's matchers if they are a mapping from names to matchers, else raise ``TypeError``."""
     if not isinstance(matchers, Mapping):
         raise TypeError(f"matchers are a mapping from names to matchers, not {matchers!r}")
     for name, matcher in matchers.items():

@@ -1,4 +1,4 @@
-"""The adapter of semi-dense networks: feature maps of each picture, matches of coarse cells of each pair."""
+"""The adapter of semi-dense networks, which encodes each picture and matches the coarse cells of a pair."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -18,11 +18,11 @@ from mkpc_kaggle.matchers.sparse import image_batch
 from mkpc_kaggle.weights import WeightStore, load_into
 
 PREFIX = "matcher."  # of parameter names in the published training checkpoints
-TRANSPORT = "coarse_matching.bin_score"  # only checkpoints of networks with optimal transport have it
+TRANSPORT = "coarse_matching.bin_score"  # a parameter that only checkpoints with optimal transport have
 
 
 class SemiDenseEncoding(NamedTuple):
-    """A picture's feature maps, a batch of one, and the size of its content."""
+    """A picture's feature maps, as a batch of one, and the size of its content."""
 
     maps: FeatureMaps
     content: Size
@@ -38,7 +38,7 @@ class SemiDenseEncoding(NamedTuple):
 
 
 class SemiDenseMatcher(PairwiseMatcher[SemiDenseEncoding]):
-    """A semi-dense matcher; a match's score is the confidence of its coarse cells."""
+    """A semi-dense matcher; a match's score is the confidence of its pair of coarse cells."""
 
     def __init__(self, network: SemiDenseNetwork, spec: MatcherSpec, device: str) -> None:
         self.spec = spec
@@ -57,7 +57,7 @@ class SemiDenseMatcher(PairwiseMatcher[SemiDenseEncoding]):
 
     def _match(self, first: SemiDenseEncoding, second: SemiDenseEncoding) -> Matches:
         masks = first.mask, second.mask
-        # Even a mask of True only can change rounding.
+        # No masks for pictures without padding: even a mask that is True everywhere can change rounding.
         found = self._network.match(first.maps, second.maps, None if all(mask.all() for mask in masks) else masks)
         points0, points1 = (from_corner(points.float().cpu().numpy()) for points in (found.points0, found.points1))
         return Matches(points0, points1, found.coarse.scores.float().cpu().numpy())
@@ -72,9 +72,9 @@ def load_semi_dense(
     *,
     unused: str = "$^",
 ) -> SemiDenseMatcher:
-    """Load the published checkpoint, whose names have the training wrapper's prefix, into a network.
+    """Load the published checkpoint into a network, and remove the training wrapper's prefix from names.
 
-    Position tables are computed, so the checkpoint's are ignored, and so are names that match ``unused``. Raises
+    Names that match ``unused`` are ignored, and so are position tables, which the network computes. Raises
     :class:`UserError` for weights that were trained with optimal transport.
     """
     (slot,) = spec.slots_for(options)

@@ -14,7 +14,7 @@ from mkpc_kaggle.matchers.contract import Picture, Placement
 from mkpc_kaggle.matchers.dtypes import check_finite
 from mkpc_kaggle.matchers.networks.placement import autocast
 
-# Images (B, 3, H, W) -> the points (K, 2) in pixels and unit descriptors (K, D) of each.
+# Images (B, 3, H, W) -> for each image, points (K, 2) in pixels and unit descriptors (K, D).
 Detector = Callable[[Tensor], Iterable[tuple[Tensor, Tensor]]]
 
 
@@ -30,7 +30,7 @@ class KeypointOptions:
 class Keypoints:
     """K keypoints of one picture: ``points`` (K, 2) float32 in view pixels, unit ``descriptors`` (K, D).
 
-    ``scales`` (K,), diameters in view pixels, and ``orientations`` (K,), radians, if the detector has them.
+    If the detector has them: ``scales`` (K,), diameters in view pixels, and ``orientations`` (K,), radians.
     """
 
     points: Tensor
@@ -41,7 +41,7 @@ class Keypoints:
 
     @classmethod
     def on_content(cls, points: Tensor, descriptors: Tensor, content: Size, *shapes: Tensor) -> "Keypoints":
-        """Return the keypoints on the picture's content, without its padding; ``shapes``: scales, orientations."""
+        """Return the keypoints on the content, none on the padding; ``shapes``: scales and orientations."""
         upper = points.new_tensor(content) - 0.5
         kept = ((points >= -0.5) & (points < upper)).all(dim=1)
         return cls(points[kept], descriptors[kept], content, *(shape[kept] for shape in shapes))
@@ -54,7 +54,7 @@ Encode = Callable[[Sequence[Picture]], list[Keypoints]]
 
 
 def keypoint_encoder(network: nn.Module, features: nn.Module, detect: Detector, placement: Placement) -> Encode:
-    """Return the encoder of a library's network; the output of its part ``features`` must be finite."""
+    """Return the encoder of a library's network, which raises if the part ``features`` outputs NaN or infinity."""
     network.eval().to(placement.device)
     what = f"features of {type(network).__name__.lower()}"
     features.register_forward_hook(lambda _, inputs, found: check_finite(what, found))

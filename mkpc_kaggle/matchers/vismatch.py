@@ -17,12 +17,12 @@ from mkpc_kaggle.matchers.contract import MatcherSpec, PairwiseMatcher, Picture
 
 
 class VismatchMatcher(PairwiseMatcher[Picture]):
-    """A vismatch matcher for :class:`mkpc_kaggle.TwoStageMatcher`, under the name in the recipe's units.
+    """A vismatch matcher for :class:`mkpc_kaggle.TwoStageMatcher`; ``name`` as in the recipe's units.
 
-    ``corner``: the origin of points is the image's top-left corner, as in RoMa, DKM and LoMa; otherwise it is the
-    centre of the top-left pixel. ``multiple``: images are padded to multiples of it; many matchers resize other
-    images, which makes points less accurate. Every pair is matched from pixels; features are not cached. A match
-    without a confidence has the score 1. vismatch's homography is switched off.
+    With ``corner``, the origin of points is the image's top-left corner, as in RoMa, DKM and LoMa; otherwise it is
+    the centre of the top-left pixel. Sides are padded to multiples of ``multiple``, because many matchers resize
+    other images, which makes points less accurate. Every pair is matched from pixels; features are not cached. A
+    match without a confidence has the score 1. vismatch's estimation of a homography is switched off.
     """
 
     def __init__(
@@ -43,7 +43,7 @@ class VismatchMatcher(PairwiseMatcher[Picture]):
         return list(pictures)
 
     def _match(self, picture0: Picture, picture1: Picture) -> Matches:
-        # (3, H, W) float32 in 0..1, padding included, which makes the sides multiples.
+        # (3, H, W) float32 in 0..1, padding included, so the sides are multiples.
         both = (torch.from_numpy(each.pixels).permute(2, 0, 1).float() / 255 for each in (picture0, picture1))
         found = self._matcher(*both)
         points = [np.asarray(found[f"matched_kpts{number}"], np.float32).reshape(-1, 2) for number in (0, 1)]

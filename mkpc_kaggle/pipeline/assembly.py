@@ -16,7 +16,7 @@ from mkpc_kaggle.recipe import Mode, Recipe, Unit, load_recipe
 from mkpc_kaggle.weights import FoundFile, State, WeightStore
 
 CACHE_SHARE = 0.25  # of a GPU's free memory, for the cached encodings of all workers on it
-CUDA_MINIBATCH = 8  # pairs at a time; on a CPU more than one only takes memory
+CUDA_MINIBATCH = 8  # pairs at a time; on a CPU, more than one gains nothing and takes memory
 
 
 @dataclass(frozen=True)
@@ -26,11 +26,11 @@ class Assembly:
     recipe: Recipe
     weights: WeightStore
     placement: Placement
-    left_out: tuple[str, ...] = ()  # the recipe's matchers that do not run, by cause, for messages
+    left_out: tuple[str, ...] = ()  # the recipe's unavailable matchers, grouped by cause, for messages
     matchers: Mapping[str, Matcher[Any]] = field(default_factory=dict)  # the user's ready matchers
-    device: str = AUTO  # as the user named it
+    device: str = AUTO  # as named by the user
     sharing: int = 1  # workers on the placement's device
-    regions: GivenRegions = field(default_factory=dict)  # instead of MKPC's
+    regions: GivenRegions = field(default_factory=dict)  # replace MKPC's regions
 
     @property
     def devices(self) -> tuple[str, ...]:
@@ -42,7 +42,7 @@ class Assembly:
         return CUDA_MINIBATCH if self.placement.device.startswith("cuda") else 1
 
     def on(self, device: str, sharing: int = 1) -> "Assembly":
-        """Return a copy for one device that ``sharing`` workers use."""
+        """Return a copy for one device, shared by ``sharing`` workers."""
         return replace(self, placement=replace(self.placement, device=device), sharing=sharing)
 
     def on_cpu(self) -> "Assembly":
@@ -59,7 +59,7 @@ class Assembly:
         if device != "cpu":
             import torch
 
-            free, _ = torch.cuda.mem_get_info(device)  # little is on it yet
+            free, _ = torch.cuda.mem_get_info(device)  # most of the GPU is still free
             cache_bytes = int(free * CACHE_SHARE / self.sharing)
         return Pipeline(
             self.recipe,
@@ -87,7 +87,7 @@ class Assembly:
 
     @cached_property
     def weight_files(self) -> dict[str, FoundFile]:
-        """Weight files of the matchers, by slot."""
+        """The weight files of the recipe's matchers, by slot."""
         slots = slots_of(self.recipe, [name for name in self.recipe.matcher_names if name not in self.matchers])
         return {slot: file for slot in slots if (file := self.weights.find(slot))}
 
@@ -109,8 +109,8 @@ def assemble(
 ) -> Assembly:
     """Check recipe, options, licences, weights, device and precision before any work, and return the assembly.
 
-    A fallback replaces an unavailable matcher; without one, recipe ``auto`` drops its units. ``scenes`` switches
-    the reconstruction of batches on or off; ``None`` follows the recipe. Raises :class:`UserError`.
+    Raises :class:`UserError`. A fallback replaces an unavailable matcher. Without one, only recipe ``auto`` runs,
+    without the units. ``scenes`` switches the reconstruction of batches on or off; ``None`` follows the recipe.
     """
     if not isinstance(recipe, Recipe | str):
         raise TypeError(f"a recipe is a Recipe, a name, or a path as text, not {recipe!r}")

@@ -1,4 +1,4 @@
-"""Availability of a recipe's matchers: their code, their weights, and the licences of the weights."""
+"""Availability of a recipe's matchers: code, weights, and the licences of the weights."""
 
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
@@ -53,9 +53,9 @@ def unavailable(
     *,
     load: bool = False,
 ) -> dict[str, UnavailableReason]:
-    """Return, by name, why matchers of the recipe (fallbacks included) cannot run here.
+    """Return the reasons, by name, why matchers of the recipe (fallbacks included) cannot run here.
 
-    ``own`` has the user's matchers. ``load`` loads weights of unknown digest to find damage. Raises
+    ``own`` has the user's matchers. With ``load``, weights of unknown digest are loaded to detect damage. Raises
     :class:`UserError` for an unknown matcher or option.
     """
 
@@ -87,7 +87,7 @@ def unavailable(
 
 
 def refusal(recipe: Recipe, reasons: Mapping[str, UnavailableReason]) -> UserError:
-    """Return the error for a recipe with unavailable matchers: the first kind of reason, and the remedy."""
+    """Return an error that names the matchers unavailable for the first kind of reason, and the remedy."""
     first, kind = next((name, reason.kind) for name, reason in reasons.items())
     those = "; ".join(f"{name} ({reason.detail})" for name, reason in reasons.items() if reason.kind is kind)
     if kind is UnavailableKind.NOT_PERMITTED:
@@ -100,19 +100,19 @@ def refusal(recipe: Recipe, reasons: Mapping[str, UnavailableReason]) -> UserErr
 
 
 def by_kind(reasons: Mapping[str, UnavailableReason]) -> tuple[str, ...]:
-    """Return the matchers of each kind, for a summary, such as "no weights: loma, superglue"."""
+    """Return a text for each kind of reason, such as "no weights: loma, superglue", for a summary."""
     kinds = dict.fromkeys(reason.kind for reason in reasons.values())
     return tuple(f"{kind}: {', '.join(name for name in reasons if reasons[name].kind is kind)}" for kind in kinds)
 
 
 def options_of(recipe: Recipe, name: str) -> Any:
-    """Return the matcher's options, as changed by the recipe's ``[matchers.NAME]``."""
+    """Return the matcher's default options, overridden by the recipe's table ``[matchers.NAME]``."""
     where, table = f"recipe {recipe.name!r}", recipe.matchers.get(name, {})
     return from_table(spec_of(name, where).options, table, f"{where}, table [matchers.{name}]")
 
 
 def slots_of(recipe: Recipe, names: Iterable[str]) -> tuple[str, ...]:
-    """Return the distinct slots of these matchers of a recipe, except those that cannot be imported."""
+    """Return the distinct slots of a recipe's named matchers. Skip matchers that cannot be imported."""
     slots: list[str] = []
     for name in names:
         with suppress(UnusableError):

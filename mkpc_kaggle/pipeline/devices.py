@@ -1,4 +1,4 @@
-"""Devices: parsing of their names, the available GPUs, and a check that a device works."""
+"""Devices: names, available GPUs, and a check that a device works."""
 
 import json
 import subprocess
@@ -13,7 +13,7 @@ from mkpc_kaggle.matchers.failures import DeviceError, FailureKind, failure_of, 
 AUTO = "auto"
 ADVICE = "on Kaggle choose the accelerator GPU T4 x2, elsewhere try --device cpu"
 PROBE_TIMEOUT_S = 120.0  # for a process that computes on each GPU
-TENSOR_CORES = (7, 0)  # the first compute capability that is faster in half precision
+TENSOR_CORES = (7, 0)  # the lowest compute capability that is faster in half precision
 # Runs in a separate process: a CUDA context takes hundreds of MB of a GPU, and the workers' parent needs none.
 ASK_CAPABILITIES = """
 import json, torch
@@ -31,9 +31,9 @@ print(json.dumps([torch.cuda.get_device_capability(gpu) for gpu in gpus]))
 
 
 def resolve_placement(device: str, precision: str) -> Placement:
-    """Return the placement for the user's words. ``auto`` means "cuda", all GPUs, or the CPU if no GPU computes.
+    """Return the placement that the user named. ``auto`` means all GPUs ("cuda"), or "cpu" if no GPU computes.
 
-    Raises :class:`UserError` for an unknown word and for a missing GPU, ``TypeError`` unless ``device`` is a text.
+    Raises :class:`UserError` for an unknown name or a missing GPU, ``TypeError`` if ``device`` is not a string.
     """
     if not isinstance(device, str):
         raise TypeError(f"a device is text such as 'cuda:0', not {device!r}")
@@ -53,7 +53,7 @@ def resolve_placement(device: str, precision: str) -> Placement:
 
 
 def fastest_precision(device: str) -> Precision:
-    """Return half precision if the device, or each of several GPUs, has units for it; float32 otherwise."""
+    """Return half precision if the CPU, or every GPU of the device, has units for it; otherwise float32."""
     import torch
 
     if device.startswith("cuda"):
@@ -66,7 +66,7 @@ def fastest_precision(device: str) -> Precision:
 
 
 def gpus_of(device: str) -> list[int]:
-    """Return the numbers of the GPUs that ``cuda`` or ``cuda:N`` names. Counting them creates no CUDA context."""
+    """Return the numbers of the GPUs that ``cuda`` or ``cuda:N`` names. Counting GPUs creates no CUDA context."""
     import torch
 
     kind, _, number = device.partition(":")
@@ -83,7 +83,7 @@ def gpus_of(device: str) -> list[int]:
 
 @cache
 def gpu_capabilities() -> list[tuple[int, int]]:
-    """Return the compute capability of each GPU, such as (7, 5). Raise :class:`UserError` if none computes."""
+    """Return the compute capability of each GPU, such as (7, 5). Raise :class:`UserError` if no GPU computes."""
     command, timeout = [sys.executable, "-c", ASK_CAPABILITIES], PROBE_TIMEOUT_S
     try:
         asked = subprocess.run(command, input="", capture_output=True, text=True, check=True, timeout=timeout)
@@ -96,9 +96,9 @@ def gpu_capabilities() -> list[tuple[int, int]]:
 
 
 def require_device(device: str) -> None:
-    """Multiply and convolve on a device. Raise :class:`DeviceError` if that fails.
+    """Run a product and a convolution on the device. Raise :class:`DeviceError` if either fails.
 
-    PyTorch also lists a GPU for which its build or cuDNN has no kernels. Only a kernel that runs is proof.
+    PyTorch also lists GPUs for which its build or cuDNN has no kernels, so only a kernel that runs is proof.
     """
     if device == "cpu":
         return

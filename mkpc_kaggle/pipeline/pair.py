@@ -38,13 +38,13 @@ class UnitResult:
 
 @dataclass(frozen=True, eq=False)
 class PairMatch:
-    results: tuple[UnitResult, ...] = ()  # in the order of the runs; with an estimate, in the recipe's order
+    results: tuple[UnitResult, ...] = ()  # in the order of execution; once estimated, in the recipe's order
     regions: Regions | None = None  # None until a unit of stage 2 needs them
     estimate: Estimate = NOT_ESTIMATED
-    images: tuple[Image, ...] = ()  # both, while units run; afterwards the next two fields describe them
+    images: tuple[Image, ...] = ()  # both, while units run; afterwards only ``sizes`` and ``focals`` remain
     sizes: tuple[Size, ...] = ()
     focals: tuple[float, ...] = ()
-    failure: str = ""  # which image cannot be read
+    failure: str = ""  # the image that cannot be read
     decode_seconds: float = 0.0
     cluster_seconds: float = 0.0
 
@@ -69,9 +69,9 @@ def with_estimate(
     model: ModelKind = ModelKind.F,
     intrinsics: tuple[Matrix3, Matrix3] | None = None,
 ) -> PairMatch:
-    """Return the pair with its two-view model from all matches.
+    """Return the pair with a two-view model estimated from all matches.
 
-    The matches are in the recipe's order, because MAGSAC's result depends on the order. The recipe's focal prior,
+    The matches are sorted in the recipe's order, because MAGSAC's result depends on it. The recipe's focal prior,
     if any, uses the images' sizes and EXIF, or ``intrinsics`` if given.
     """
     results = tuple(sorted(pair.results, key=lambda result: recipe.units.index(result.unit)))

@@ -35,10 +35,10 @@ GivenRegions = Mapping[tuple[str, ...], tuple[Box, Box]]  # by the names of both
 class Pipeline:
     """Pipeline that runs a recipe's units on chunks of pairs and loads each matcher on first use.
 
-    ``load(name)`` returns a matcher, ``load_float32(name)`` its float32 version, which replaces it permanently if
-    half precision overflows. ``minibatch`` is the number of pairs to match, and of views of one shape to encode,
-    at a time; a unit that runs out of memory uses fewer from then on. Encodings of whole images are reused by many
-    pairs and cached, up to ``cache_bytes``. ``regions`` replace MKPC's.
+    ``load(name)`` returns a matcher. If half precision overflows, ``load_float32(name)`` replaces the matcher
+    permanently. ``minibatch`` is the number of pairs to match at a time, and of views of one shape to encode. A
+    unit that runs out of memory halves its minibatch from then on. Encodings of whole images, which many pairs
+    share, are cached up to ``cache_bytes``. ``regions`` replace MKPC's critical regions.
     """
 
     def __init__(
@@ -67,11 +67,11 @@ class Pipeline:
     def match(
         self, pairs: Sequence[PairMatch], units: Iterable[Unit], may_start: Callable[[Unit], bool] = lambda _: True
     ) -> list[PairMatch]:
-        """Run ``units`` on every pair without their results: stage 1, the critical regions, stage 2.
+        """Run each unit on the pairs that have no result of it: stage 1, the critical regions, stage 2.
 
-        ``may_start(unit)`` is called before each unit on each minibatch; False stops the unit. After a matcher's
-        error the minibatch's pairs run singly, and the error of a pair becomes the failure of its result. Raises
-        device errors and memory errors of a single pair, see :mod:`mkpc_kaggle.matchers.failures`, and
+        ``may_start(unit)`` is called before each minibatch of a unit; False stops the unit. If a matcher raises,
+        the minibatch's pairs run one by one, and a pair that raises again gets a result with this failure. Raises
+        device errors, memory errors on a single pair (see :mod:`mkpc_kaggle.matchers.failures`), and
         :class:`UserError` in a forked child.
         """
         require_unforked()
@@ -95,7 +95,7 @@ class Pipeline:
             waiting = waiting[len(results) :]
 
     def _run_minibatch(self, unit: Unit, pairs: list[PairMatch]) -> list[UnitResult]:
-        """Return the unit's result on each pair, or an empty list to try again: in float32, or on fewer pairs."""
+        """Return the unit's result on each pair, or an empty list to retry in float32 or on fewer pairs."""
         try:
             return self._match(unit, pairs)
         except Exception as error:
@@ -104,13 +104,13 @@ class Pipeline:
                 return []
             if failure is FailureKind.RAISED and len(pairs) == 1:
                 return [UnitResult(unit, Matches.empty(), failure=reason_of(error))]
-            if failure is FailureKind.RAISED:  # singly, and again if the matcher falls back to float32
+            if failure is FailureKind.RAISED:  # one by one, and again if the matcher falls back to float32
                 alone = (self._run_minibatch(unit, [pair]) or self._run_minibatch(unit, [pair]) for pair in pairs)
                 return list(chain.from_iterable(alone))
             if failure is FailureKind.DEVICE or len(pairs) == 1:
                 error.add_note(f"in {unit.name}")
                 raise
-        # Outside the handler: inside it, the error's traceback holds the tensors of the minibatch.
+        # After the handler, because inside it the traceback keeps the minibatch's tensors in memory.
         import torch
 
         torch.cuda.empty_cache()  # cuBLAS and cuDNN cannot use PyTorch's cached memory
@@ -153,7 +153,7 @@ class Pipeline:
         ]
 
     def _encode(self, unit: Unit, wanted: Sequence[tuple[Image, View]]) -> list[Any]:
-        """Return the encodings of views by the unit's matcher, cached or computed, one shape at a time."""
+        """Return the encodings of views: cached ones, and the others computed one shape at a time."""
         matcher = self._matcher(unit.matcher)
         is_gray = matcher.spec.colour is Colour.GRAY
         keys = [(unit.matcher, image.name, view) for image, view in wanted]
@@ -170,7 +170,7 @@ class Pipeline:
                 check_finite(f"features of {unit.matcher}", list(encodings))
                 known |= zip(part, encodings, strict=True)
         for key, image in missing.items():
-            if key[2].crop == Box.whole(image.size):  # only one pair uses a crop
+            if key[2].crop == Box.whole(image.size):  # a crop serves one pair only
                 self._encodings.put(key, known[key], encoding_bytes(known[key]))
         return [known[key] for key in keys]
 
@@ -188,7 +188,7 @@ def views_of(unit: Unit, multiple: int, pair: PairMatch) -> tuple[View, ...]:
 
 
 def with_regions(pair: PairMatch, recipe: Recipe, given: GivenRegions = MappingProxyType({})) -> PairMatch:
-    """Return the pair with each image's critical region: the user's, or that of the matches of stage 1."""
+    """Return the pair with each image's critical region: the user's, or MKPC's from the matches of stage 1."""
     if (boxes := given.get(tuple(image.name for image in pair.images))) is not None:
         first, second = (CriticalRegion(box, RegionReason.GIVEN) for box in boxes)
         return replace(pair, regions=(first, second))
@@ -202,11 +202,11 @@ def with_regions(pair: PairMatch, recipe: Recipe, given: GivenRegions = MappingP
 
 
 def read_regions(file: Path, image_root: Path, pairs: Iterable[Pair]) -> GivenRegions:
-    """Return the stage-2 boxes of a table, keyed by image files.
+    """Return the stage-2 boxes of a table, keyed by the image files of a pair.
 
-    ``file`` is a table ``image_0,image_1,box_0,box_1``: paths under the root; left, top, right and bottom in whole
-    pixels of the stored file, the latter two exclusive. Raises :class:`UserError` for a malformed table, for a box
-    that is malformed or extends beyond its image, and for a missing pair.
+    ``file`` has columns ``image_0,image_1,box_0,box_1``: paths under the root; left, top, right, bottom of boxes
+    in whole pixels of the stored image. Right and bottom are exclusive. Raises :class:`UserError` for a malformed
+    table, for a box that is malformed or extends beyond its image, and for a missing pair.
     """
     boxes: dict[tuple[str, ...], tuple[Box, Box]] = {}
     for where, (name0, name1, *cells) in read_rows(file, ("image_0", "image_1", "box_0", "box_1")):

@@ -25,8 +25,8 @@ class TwoStageMatcher:
         F, points0 = match.estimate.matrix, match.inliers.points0
 
     ``recipe`` is a :class:`Recipe`, a recipe's name, or a path to a TOML file. ``weights`` are directories to
-    search. The ``licence`` "permissive" refuses weights that forbid some uses. ``matchers`` are your own, by their
-    names in the recipe's units. Raises :class:`UserError` for an unknown name and for missing weights.
+    search for weights. ``licence`` "permissive" refuses weights that forbid some uses. ``matchers`` maps names in
+    the recipe's units to your own matchers. Raises :class:`UserError` for an unknown name and for missing weights.
     """
 
     def __init__(
@@ -54,11 +54,11 @@ class TwoStageMatcher:
         intrinsics: tuple[Matrix3, Matrix3] | None = None,
         regions: tuple[Box, Box] | None = None,
     ) -> PairMatch:
-        """Match two images: paths, or arrays (H, W, 3) RGB or (H, W) gray, uint8.
+        """Match two images, given as paths or as uint8 arrays, (H, W, 3) RGB or (H, W) gray.
 
         ``model`` E needs ``intrinsics``, the camera matrices in pixels. ``regions`` replace MKPC's boxes; units of
-        stage 2 fail if a box leaves its image. Points, boxes and F are in pixels of the stored files: EXIF only
-        sets the views upright. A pair without an estimate has ``estimate.failure``.
+        stage 2 fail if a box extends beyond its image. Points, boxes and F are in pixels of the stored files; EXIF
+        only turns the matchers' views upright. If no model is found, ``estimate.failure`` has the reason.
 
         Raises ``ValueError`` for model E without intrinsics and :class:`UserError` for an unreadable image. Memory
         and device errors are not caught.
@@ -72,7 +72,7 @@ class TwoStageMatcher:
 
 
 def to_image(source: str | Path | Pixels | Image) -> Image:
-    """Return the image of a path or an array. Raise :class:`UserError` for an unreadable file."""
+    """Return the image of a path or of an array. Raise :class:`UserError` for an unreadable file."""
     if isinstance(source, Image):
         return source
     if isinstance(source, np.ndarray):
@@ -80,4 +80,4 @@ def to_image(source: str | Path | Pixels | Image) -> Image:
     image = read_image(Path(source))
     if isinstance(image, Unreadable):
         raise UserError(str(image))
-    return replace(image, name=image.version)  # its content: a file may change between two calls
+    return replace(image, name=image.version)  # the name identifies the content: a file may change between calls

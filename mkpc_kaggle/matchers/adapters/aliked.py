@@ -13,7 +13,7 @@ SPEC = MatcherSpec("aliked", KeypointOptions, multiple=32, slots=(SLOT,))
 
 
 class AlikedMatcher(NeighbourMatcher):
-    """ALIKED; a match's score is the cosine of its descriptors."""
+    """ALIKED; a match's score is the cosine of its two descriptors."""
 
     spec = SPEC
 
@@ -22,7 +22,7 @@ class AlikedMatcher(NeighbourMatcher):
 
 
 def aliked_network(features: int) -> ALIKED:
-    return ALIKED(SLOT, max_num_keypoints=features, detection_threshold=0.0)  # of any score
+    return ALIKED(SLOT, max_num_keypoints=features, detection_threshold=0.0)  # keypoints of any score
 
 
 def aliked_encoder(network: ALIKED, placement: Placement) -> Encode:
@@ -34,7 +34,7 @@ def aliked_encoder(network: ALIKED, placement: Placement) -> Encode:
 
 
 def load_encoder(weights: WeightStore, features: int, placement: Placement) -> Encode:
-    """Load ALIKED's encoder, for all matchers of its keypoints."""
+    """Load ALIKED's encoder, which all matchers of ALIKED keypoints share."""
     network = aliked_network(features)
     load_into(network, weights.load(SLOT), unused=r"dkd\.hw_grid", what=SLOT)  # a constant
     return aliked_encoder(network, placement)

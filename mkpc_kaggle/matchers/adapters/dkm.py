@@ -6,7 +6,7 @@ from mkpc_kaggle.matchers.networks.dkm import DKM
 from mkpc_kaggle.matchers.networks.placement import prepared
 from mkpc_kaggle.weights import WeightStore, load_into
 
-# Published: one pass of 540 x 720 or 480 x 640 (indoors), and two passes up to 864 x 1152.
+# Published: one pass at 540 x 720 (indoors 480 x 640), or two passes, the second at up to 864 x 1152.
 SPEC = MatcherSpec("dkm", TrainedOptions, slots=("dkm-{training}",))
 
 

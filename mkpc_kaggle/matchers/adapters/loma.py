@@ -24,7 +24,7 @@ DESCRIPTOR_SCALE = 784 / 1024  # side of the descriptor's square input over the 
 
 @dataclass(frozen=True)
 class LomaOptions:
-    """The release's settings for views with a long side of 1024."""
+    """The released settings, for views with a long side of 1024 pixels."""
 
     variant: Variant = Variant.B
     max_keypoints: int = 2048
@@ -42,13 +42,13 @@ class LomaEncoding(NamedTuple):
 
 
 class LomaAdapter(PairwiseMatcher[LomaEncoding]):
-    """LoMa. A match's score is the product of the softmaxes over either picture's keypoints.
+    """LoMa. A match's score is the product of two softmaxes, one over each picture's keypoints.
 
     Pictures and pairs are processed one by one, so that results do not depend on the batch.
     """
 
     spec = SPEC
-    threshold = 0.1  # a match's score is above it, as released
+    threshold = 0.1  # scores of matches are above this, as released
 
     def __init__(self, network: Loma, options: LomaOptions, device: str) -> None:
         self.options = options
@@ -66,7 +66,7 @@ class LomaAdapter(PairwiseMatcher[LomaEncoding]):
             descriptor, _ = WIDTHS[self.options.variant]
             return LomaKeypoints(*(torch.zeros(0, width, device=self.device) for width in (2, descriptor)))
         side = PATCH * max(1, round(DESCRIPTOR_SCALE * long_side / PATCH))
-        # Without padding, which would change the descriptors.
+        # Cut off the padding, which would change the descriptors.
         pixels = torch.from_numpy(picture.pixels[: content.height, : content.width].copy()).permute(2, 0, 1)[None]
         to_detect = resized(pixels, (detected.height, detected.width)).to(self.device)
         to_describe = resized(pixels, (side, side)).to(self.device)

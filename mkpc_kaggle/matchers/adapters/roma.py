@@ -1,4 +1,4 @@
-"""RoMa (Edstedt et al. 2024): DKM's warps on DINOv2's features, the best single matcher of this benchmark."""
+"""RoMa (Edstedt et al. 2024): DKM's warps from DINOv2's features, the best single matcher in our benchmark."""
 
 import torch
 
@@ -10,7 +10,7 @@ from mkpc_kaggle.matchers.networks.roma import RoMa
 from mkpc_kaggle.weights import WeightStore, load_into
 
 SPEC = MatcherSpec("roma", TrainedOptions, slots=("roma-{training}", "dinov2-vitl14"))
-# Published: two passes of 560 x 560 and 864 x 864, as in a stretched unit of 864 x 864; indoors one of 560.
+# Published: passes at 560 x 560 and 864 x 864, as in a stretched unit of 864 x 864; indoors one at 560 x 560.
 FIRST_PASSES = {Training.OUTDOOR: 0.648, Training.INDOOR: None}
 
 

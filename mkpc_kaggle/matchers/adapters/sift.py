@@ -21,7 +21,7 @@ from mkpc_kaggle.weights import WeightStore
 
 @dataclass(frozen=True)
 class SiftOptions:
-    """``features``: the number of strongest keypoints per picture. ``ratio``: the maximum, in both directions."""
+    """``features``: strongest keypoints per picture. ``ratio``: the maximum distance ratio, in both directions."""
 
     features: int = 8000
     ratio: float = 0.8
@@ -65,7 +65,7 @@ class SiftMatcher(NeighbourMatcher):
 
 
 def root_sift(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Map (K, 128) SIFT to (K, 128) float32 unit vectors; their dot product is the Hellinger kernel."""
+    """Map SIFT descriptors (K, 128) to float32 unit vectors, whose dot product is the Hellinger kernel."""
     sums = np.maximum(descriptors.sum(axis=1, keepdims=True), np.finfo(np.float32).tiny)
     return np.asarray(np.sqrt(descriptors / sums), np.float32)
 

@@ -21,13 +21,13 @@ class SiftLightGlueOptions(KeypointOptions):
 
 SHAPE = {"input_dim": 128, "add_scale_ori": True}
 SPEC = MatcherSpec("sift_lightglue", SiftLightGlueOptions, Colour.GRAY, slots=("sift-lightglue",))
-SHIFT_PX = 0.25  # OpenCV's offset without precise upscaling, which the published evaluation does not use
+SHIFT_PX = 0.25  # OpenCV's offset if precise upscaling is off, as in the published evaluation
 
 
 def sift_encoder(features: int, device: str) -> Encode:
-    """Return OpenCV's SIFT.
+    """Return an encoder with OpenCV's SIFT.
 
-    Of several keypoints at one pixel, it keeps the highest response, then the smallest angle.
+    Of several keypoints at one pixel, keep the highest response; of equal responses, the smallest angle.
     """
     # Octave layers, contrast threshold and edge threshold as in the published evaluation.
     sift = cv2.SIFT_create(features, 4, 0.0066667, 10)  # type: ignore[attr-defined]  # missing in stubs

@@ -1,4 +1,4 @@
-"""SuperPoint keypoints matched by SuperGlue, the paper's matcher. Its weights are for noncommercial research."""
+"""SuperPoint keypoints matched by SuperGlue, as in the MKPC paper. Its weights are for noncommercial research."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -29,12 +29,12 @@ class SuperGlueOptions(TrainedOptions):
         check_ranges(self, max_keypoints=AT_LEAST_1, nms_radius=AT_LEAST_0)
 
 
-# No multiple: SuperPoint ignores the rows and columns beyond a multiple of 8.
+# No padding to a multiple: SuperPoint ignores the rows and columns beyond a multiple of 8.
 SPEC = MatcherSpec("superglue", SuperGlueOptions, Colour.GRAY, slots=("superpoint", "superglue-{training}"))
 
 
 class SuperGlueMatcher(PairwiseMatcher[SuperPointKeypoints]):
-    """SuperGlue. A match's score is its mass in the optimal transport."""
+    """SuperGlue. A match's score is its mass in the optimal transport plan."""
 
     spec = SPEC
 

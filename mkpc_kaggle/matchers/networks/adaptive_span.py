@@ -1,7 +1,7 @@
-"""Attention to keys around the target of a predicted flow, spaced by the uncertainty of the flow.
+"""Attention to keys around the target of a predicted flow, spaced more widely where the flow is uncertain.
 
 Source: Chen et al., "ASpanFormer: Detector-Free Image Matching with Adaptive Span Transformer", 2022, section 3.
-"Cells" here are 2x2 blocks of queries; each block shares 8 x 8 samples of the key map.
+A "cell" here is a 2x2 block of queries, which share 8 x 8 samples of the key map.
 """
 
 import torch
@@ -10,18 +10,18 @@ from torch.nn import functional
 
 from mkpc_kaggle.matchers.networks.grids import as_grid, as_map, mask_valid, mean_pool, to_2x2_blocks
 
-RADIUS = 5.0  # of a span, in deviations of the flow
+RADIUS = 5.0  # of a span, in standard deviations of the flow
 SIDE = 8  # samples on each axis
 CELLS_AT_ONCE = {"cpu": 256, "cuda": 8192}  # a cell's samples take 128 KiB
 MASKED = -1e8  # a finite logit: attention is uniform if all keys are masked
 
 
 def adaptive_span(flow: Tensor, factor: int) -> Tensor:
-    """Map a flow (N, h, w, 4) to samples (N, P, 64, 2) of its P cells at the level that pools by ``factor``.
+    """Map a flow (N, h, w, 4) to samples (N, P, 64, 2) for the P cells of the level pooled by ``factor``.
 
-    The flow is the target (x, y) in coarse cells of the other image and its log-variances. The samples cover
-    two radii, with a step of at least one; x varies slowest. As published, centres are in units of the level but
-    steps are not. A sample at (x, y) reads around index (x - 0.5, y - 0.5): the origin is the key map's corner.
+    A flow is the target (x, y), in coarse cells of the other image, and two log-variances. Samples cover two
+    radii, with a step of at least one; x varies slowest. As published, centres are in units of the level, but
+    steps are not. The origin is the key map's corner: a sample (x, y) reads around index (x - 0.5, y - 0.5).
     """
     deviation = torch.exp(flow[..., 2:] / 2) * RADIUS
     steps = (2 * deviation / SIDE).clamp(min=1.0)
@@ -33,7 +33,7 @@ def adaptive_span(flow: Tensor, factor: int) -> Tensor:
 def sample_usable(samples: Tensor, mask: Tensor, key_size: tuple[int, int], factor: int) -> Tensor:
     """Return (N, P, 64) bool: whether the mask of the *query* image is valid at the samples.
 
-    The mask should be the key image's, but the networks were published with this oversight.
+    The key image's mask would be right, but the networks were published with this oversight.
     Coordinates are relative to the key map (h, w); ``mask`` is (N, h, w) at the coarse level.
     """
     valid = mask_valid(mask, factor).float()[:, None]
@@ -41,7 +41,7 @@ def sample_usable(samples: Tensor, mask: Tensor, key_size: tuple[int, int], fact
 
 
 def read_samples(maps: Tensor, samples: Tensor, key_size: tuple[int, int], mode: str = "bilinear") -> Tensor:
-    """Read maps (N, C, h, w) at samples (N, P, 64, 2) of a key map: (N, C, P, 64), zero outside the maps."""
+    """Return the values (N, C, P, 64) of maps (N, C, h, w) at samples (N, P, 64, 2), zero outside the maps."""
     size = samples.new_tensor([key_size[1], key_size[0]])
     return functional.grid_sample(maps, samples / (size / 2) - 1, mode=mode, align_corners=False)
 
@@ -49,11 +49,11 @@ def read_samples(maps: Tensor, samples: Tensor, key_size: tuple[int, int], mode:
 def span_attention(
     q: Tensor, k: Tensor, v: Tensor, samples: Tensor, heads: int, usable: Tensor | None = None
 ) -> Tensor:
-    """Map queries (N, h, w, C), keys, values (N, h_key, w_key, C), samples (N, h w / 4, 64, 2) to (N, h, w, C).
+    """Attend from queries (N, h, w, C) to keys and values (N, h_key, w_key, C) at samples (N, h w / 4, 64, 2).
 
-    Samples outside the key map have a zero key and value, but still count unless ``usable`` excludes them. The
-    messages are ordered by cell, four queries each, and read as rows of the map without reordering: the
-    published networks were trained with this permutation within each two rows.
+    Return messages (N, h, w, C). A sample outside the key map has a zero key and value, and counts unless
+    ``usable`` excludes it. Messages ordered by cell, four queries each, are read as rows of the map without
+    reordering: the published networks were trained with this permutation within each two rows.
     """
     maps, key_size = as_map(torch.cat([k, v], dim=-1)).to(samples.dtype), (k.shape[1], k.shape[2])
     cells = to_2x2_blocks(q) * (q.shape[3] // heads) ** -0.5  # (N, P, 4, C)
@@ -68,7 +68,7 @@ def span_attention(
 
 
 def _attend_cells(queries: Tensor, read: Tensor, heads: int, excluded: Tensor | None) -> Tensor:
-    """Map scaled queries (p, 4, C), samples (p, 64, 2 C) of keys and values, ``excluded`` (p, 64) to (p, 4, C)."""
+    """Return messages (p, 4, C) to scaled queries from samples (p, 64, 2 C), except from ``excluded`` (p, 64)."""
     keys, values = (half.chunk(heads, dim=-1) for half in read.chunk(2, dim=-1))
     found = []
     # Head by head: batched products of all heads would first copy the samples.

@@ -24,8 +24,8 @@ POOLING = (4, 4)  # rows and columns of the coarse map per cell of the global le
 
 @dataclass(frozen=True, eq=False)
 class Side:
-    """One image in the coarse transformer: ``visual`` (N, h, w, 256), ``flow`` (N, h, w, 128), its projected
-    ``positions`` (1, h, w, 128), the pooling ``factor`` of its global level, ``mask`` (N, h, w) bool or None.
+    """One image in the coarse transformer: features ``visual`` (N, h, w, 256) and ``flow`` (N, h, w, 128),
+    projected ``positions`` (1, h, w, 128), the global level's ``factor``, and ``mask`` (N, h, w) bool or None.
     """
 
     visual: Tensor
@@ -35,18 +35,18 @@ class Side:
     mask: Tensor | None
 
     def values(self, projection: nn.Conv1d) -> Tensor:
-        """Return (N, h, w, 256): the projection of the visual feature and the positions."""
+        """Return the joint projection (N, h, w, 256) of visual features and positions."""
         positions = self.positions.expand(len(self.visual), -1, -1, -1)
         return pointwise(projection, torch.cat([self.visual, positions], dim=-1))
 
     @property
     def pooled_mask(self) -> Tensor | None:
-        """(N, cells of the global level)."""
+        """The mask (N, cells) of the global level, or None."""
         return None if self.mask is None else mask_valid(self.mask, self.factor).flatten(1)
 
 
 class ChannelNorm(nn.Module):
-    """Layer norm with the unbiased deviation, and the epsilon added to it rather than to the variance."""
+    """Layer norm that adds epsilon to the unbiased standard deviation, not to the variance."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -61,7 +61,7 @@ class ChannelNorm(nn.Module):
 def global_attention(
     q: Tensor, k: Tensor, v: Tensor, temperature: Tensor | float, masks: tuple[Tensor | None, Tensor | None]
 ) -> Tensor:
-    """Map grids (N, h, w, C) of queries, (N, h_key, w_key, C) of keys and values to (N, h, w, C).
+    """Return messages to queries (N, h, w, C) from keys and values (N, h_key, w_key, C), like the queries.
 
     A masked query gets the mean of all values, as published.
     """
@@ -77,7 +77,7 @@ def global_attention(
 
 
 class CrossLayer(nn.Module):
-    """Queries of one image, keys and values of the other, and the update of features of ``width`` by a message."""
+    """Projections for cross-attention between images, and the update of ``width`` features by a message."""
 
     def __init__(self, width: int, hidden: int, kernel: int) -> None:
         super().__init__()
@@ -92,7 +92,7 @@ class CrossLayer(nn.Module):
         self.norm2 = ChannelNorm(width)
 
     def projected(self, own: Side, other: Side) -> tuple[Tensor, Tensor, Tensor]:
-        """Return queries, keys and values, (N, h, w, 256) each."""
+        """Return queries of ``own``, and keys and values of ``other``, each (N, h, w, 256)."""
         return pointwise(self.q_proj, own.visual), pointwise(self.k_proj, other.visual), other.values(self.v_proj)
 
     def updated(self, features: Tensor, message: Tensor) -> Tensor:
@@ -109,14 +109,14 @@ class InitialLayer(CrossLayer):
         self.merge_head = nn.Conv1d(TOP, TOP, 1, bias=False)
 
     def forward(self, own: Side, other: Side) -> Tensor:
-        """Return the new visual feature of ``own`` (N, rows, columns, 256), pooled to the global level."""
+        """Return the updated visual features (N, rows, columns, 256) of ``own`` at the global level."""
         masks = own.pooled_mask, other.pooled_mask
         message = global_attention(*self.projected(own, other), 1.0, masks)
         return self.updated(own.visual, pointwise(self.merge_head, message))
 
 
 class InitialStage(nn.Module):
-    """Cross attention at the global level, which starts the flow feature."""
+    """Cross-attention at the global level, which initialises the flow features."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -141,13 +141,13 @@ class InitialStage(nn.Module):
 
 
 def _pooled(side: Side) -> Side:
-    """Pool to the global level. The mask stays, since its user pools it."""
+    """Pool features and positions to the global level. The mask is pooled where it is used."""
     visual, positions = mean_pool(side.visual, side.factor), mean_pool(side.positions, side.factor)
     return replace(side, visual=visual, positions=positions)
 
 
 class HierarchicalAttention(nn.Module):
-    """Messages of the global level and of the two adaptive-span levels, merged."""
+    """Merged messages of the global level and of the two adaptive-span levels."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -171,7 +171,7 @@ class HierarchicalAttention(nn.Module):
 
 
 def _span_message(q: Tensor, k: Tensor, v: Tensor, flow: Tensor, factor: int, mask: Tensor | None) -> Tensor:
-    """Return the message of the adaptive-span level that pools by ``factor``, (N, h / factor, w / factor, 256)."""
+    """Return the message (N, h / factor, w / factor, 256) of the adaptive-span level pooled by ``factor``."""
     q, k, v = mean_pool(q, factor), mean_pool(k, factor), mean_pool(v, factor)
     samples = adaptive_span(flow, factor)
     usable = None if mask is None else sample_usable(samples, mask, (k.shape[1], k.shape[2]), factor)
@@ -179,7 +179,7 @@ def _span_message(q: Tensor, k: Tensor, v: Tensor, flow: Tensor, factor: int, ma
 
 
 class AspanBlock(CrossLayer):
-    """A block that decodes the flow and updates both features along it; the last block updates the visual one."""
+    """A block that decodes the flow and updates both features along it; the last updates only the visual ones."""
 
     def __init__(self, last: bool) -> None:
         super().__init__(TOP if last else TOP + FLOW, TOP + FLOW, kernel=3)
@@ -190,7 +190,7 @@ class AspanBlock(CrossLayer):
         self.attention = HierarchicalAttention()
 
     def decode_flow(self, own: Side, other: Side) -> Tensor:
-        """Return (N, h, w, 4): target (x, y) in coarse cells of ``other`` from its corner, log-variances."""
+        """Return (N, h, w, 4): target (x, y) in coarse cells, from the corner of ``other``, and log-variances."""
         raw = self.flow_decoder(own.flow)
         size = raw.new_tensor([other.visual.shape[2], other.visual.shape[1]])
         return torch.cat([raw[..., :2].sigmoid() * size, raw[..., 2:]], dim=-1)
@@ -216,7 +216,7 @@ class AspanTransformer(nn.Module):
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # missing in torch's stubs
 
     def forward(self, side0: Side, side1: Side) -> tuple[Tensor, Tensor]:
-        """Return the visual features of both, (N, h, w, 256)."""
+        """Return the visual features of both images, each (N, h, w, 256)."""
         side0, side1 = self.ini_layer(side0, side1)
         for block in self.layers:
             side0, side1 = block(side0, side1), block(side1, side0)
@@ -226,9 +226,9 @@ class AspanTransformer(nn.Module):
 class AspanFormer(SemiDenseNetwork):
     """ASpanFormer. Sides are multiples of 32; the two images may differ in size.
 
-    ``train_size``: (height, width) to whose extent the positions of every image are stretched. Indoor weights were
-    published for 480 x 640 only, without a border, with unscaled positions and a global level of 15 x 20 cells. At
-    this size our scaling and pooling are the same.
+    The positions of every image are stretched to ``train_size`` (height, width). Indoor weights were published for
+    480 x 640 only, without a border, with unscaled positions and a global level of 15 x 20 cells. At this size
+    our scaling and pooling are the same.
     """
 
     multiple = 32
@@ -262,6 +262,6 @@ class AspanFormer(SemiDenseNetwork):
         return Side(visual, visual.new_empty(0), projected, POOLING, mask)
 
     def position_scale(self, height: int, width: int) -> tuple[float, float]:
-        """Return the factors (y, x) that stretch the positions in a coarse map."""
+        """Return the factors (y, x) that stretch a coarse map's positions to ``train_size``."""
         train_height, train_width = self.train_size
         return train_height / (COARSE_STRIDE * height), train_width / (COARSE_STRIDE * width)

@@ -15,17 +15,17 @@ from mkpc_kaggle.matchers.networks.layers import Assignment, linear
 from mkpc_kaggle.matchers.networks.linear_attention import Masks
 
 ROWS_AT_ONCE = {"cpu": 256, "cuda": 8192}
-HELD_FLOATS = 2**25  # of the matrix: 128 MiB, at 640 x 480 it has 23 million
+HELD_FLOATS = 2**25  # of the largest stored matrix: 128 MiB; 640 x 480 pixels need 23 million
 
 
 def coarse_matches(
     grid0: Tensor, grid1: Tensor, scale: float | Tensor, threshold: float, border: int, masks: Masks | None
 ) -> Assignment:
-    """Match grids (h0, w0, C) and (h1, w1, C); ``scale`` times their dot product is the similarity.
+    """Match grids (h0, w0, C) and (h1, w1, C); similarities are ``scale`` times dot products.
 
-    A match is above ``threshold`` and the best of its row and of its column, border cells included. Then matches
-    with a cell within ``border`` of the content's border are dropped. ``masks``: (h, w) bool, True at content.
-    Matched cells are counted row by row in their own grid.
+    A match has a confidence above ``threshold``, the best of its row and column, border cells included. Then
+    matches with a cell within ``border`` of the content's border are dropped. ``masks`` (h, w) bool are True at
+    content. Indices of matched cells count row by row in the cell's own grid.
     """
     mask0, mask1 = masks or (grid0.new_ones(grid.shape[:2], dtype=torch.bool) for grid in (grid0, grid1))
     cells = Cells(grid0.flatten(0, 1) * scale, grid1.flatten(0, 1), mask0.flatten(), mask1.flatten())
@@ -58,11 +58,11 @@ class Cells(NamedTuple):
 
 
 def half_log_sums(blocks: Iterable[Tensor]) -> tuple[Tensor, Tensor]:
-    """Return half the logarithm of the sums of exp over each row (L,) and each column (S,) of blocks (l, S)."""
+    """Return half the logsumexp of each row (L,) and of each column (S,) of a matrix in blocks of rows (l, S)."""
     rows_and_columns = [(block.logsumexp(dim=1), block.logsumexp(dim=0)) for block in blocks]
     over_rows, of_blocks = (list(sums) for sums in zip(*rows_and_columns, strict=True))
     over_columns = torch.stack(of_blocks).logsumexp(dim=0)
-    # The sum of a row of padding is minus infinity. Clamping prevents NaN in the difference.
+    # The logarithm for a row of padding is minus infinity. Clamping prevents NaN in later differences.
     finite = torch.finfo(torch.float32).min
     return torch.cat(over_rows).clamp_(min=finite).div_(2), over_columns.clamp_(min=finite).div_(2)
 
@@ -83,7 +83,7 @@ def half_log_confidences(cells: Cells) -> Iterator[Tensor]:
 
 
 def row_and_column_maxima(cells: Cells) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the maximum (L,) and its column (L,) of each row, and the maximum (S,) of each column."""
+    """Return each row's maximum (L,) and its column (L,), and each column's maximum (S,)."""
     of_rows = []
     of_columns = cells.features1.new_full(cells.content1.shape, -torch.inf, dtype=torch.float32)
     for block in half_log_confidences(cells):
@@ -94,7 +94,7 @@ def row_and_column_maxima(cells: Cells) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def inner_cells(mask: Tensor, border: int) -> Tensor:
-    """Return (h w,) bool: cells of the content (h, w) at least ``border`` away from its border."""
+    """Return (h w,) bool: True at cells of the content (h, w) that are at least ``border`` from its edge."""
     h, w = mask.shape
     bottom, right = mask.sum(dim=0).amax() - border, mask.sum(dim=1).amax() - border
     row, column = torch.arange(h, device=mask.device)[:, None], torch.arange(w, device=mask.device)

@@ -17,7 +17,7 @@ from mkpc_kaggle.matchers.networks.pixels import MEAN, STD
 from mkpc_kaggle.matchers.networks.superpoint import window_maximum
 from mkpc_kaggle.matchers.networks.vgg import VGG11, Vgg
 
-TEMPERATURE = 0.5  # of the softmax over nine pixels that locates a keypoint between pixels
+TEMPERATURE = 0.5  # of the softmax over 3 x 3 pixels that refines a keypoint to subpixels
 
 
 class Dad(nn.Module):
@@ -28,9 +28,9 @@ class Dad(nn.Module):
         self.eval().requires_grad_(False)
 
     def forward(self, image: Tensor, number: int) -> list[Tensor]:
-        """Return up to ``number`` points of each image of (B, 3, H, W), RGB in 0..1, sides of at least 8.
+        """Return up to ``number`` points for each of the images (B, 3, H, W), RGB in 0..1, sides at least 8.
 
-        Trained with sides that are multiples of 8, the longer one 1024.
+        In training, sides were multiples of 8, and the longer one was 1024.
         """
         maps = self.logits(image)
         check_finite("keypoint scores of loma", maps)
@@ -49,9 +49,9 @@ class Dad(nn.Module):
 
 
 def select_keypoints(logits: Tensor, number: int) -> Tensor:
-    """Return the largest maxima of 3 x 3 pixels of a map (H, W); equal ones in one window are all kept.
+    """Return the ``number`` highest maxima over 3 x 3 pixels of a map (H, W). All equal maxima of a window count.
 
-    Points (K, 2) are float32, normalised, up to half a pixel beyond the edges, the most probable first.
+    Points (K, 2) are float32, normalised, the most probable first, and up to half a pixel beyond the edges.
     """
     height, width = logits.shape
     probability = logits.flatten().softmax(dim=0).view(1, height, width)
@@ -64,9 +64,9 @@ def select_keypoints(logits: Tensor, number: int) -> Tensor:
 
 
 def subpixel_offsets(logits: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
-    """Return (K, 2) float32 in pixels, within -1..1: the mean of a softmax around pixels (K,) of a map (H, W).
+    """Return offsets (K, 2) float32 in pixels, within -1..1: softmax means around pixels (K,) of a map (H, W).
 
-    Pixels beyond the map count as logits of 0, as they did in training.
+    As in training, logits beyond the map are 0.
     """
     padded = functional.pad(logits, (1, 1, 1, 1))
     steps = torch.arange(3, device=logits.device)

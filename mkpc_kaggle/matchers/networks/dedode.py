@@ -1,9 +1,9 @@
 """DeDoDe descriptors (Edstedt et al. 2024, arXiv 2308.08479) as in LoMa: a dense map, sampled at keypoints.
 
-The decoder, which DaD shares, runs from coarse to fine. At each stride a refiner reads the features and context of
-the coarser strides, adds to the prediction and passes on a context. Predictions are float32 in any precision.
-B uses VGG-19 alone; G adds DINOv2 at stride 14. Coordinates are normalised as in dad. Parameter names match the
-public checkpoints. For inference only.
+The decoder, which DaD shares, runs from coarse to fine. At each stride, a refiner reads the features and the
+coarser stride's context, adds to the prediction and outputs a context. Predictions are float32 in any precision.
+Variant B uses VGG-19 alone; G adds DINOv2 at stride 14. Coordinates are normalised as in dad. Parameter names
+match the public checkpoints. For inference only.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -17,12 +17,12 @@ from mkpc_kaggle.matchers.networks.dinov2 import DinoV2
 from mkpc_kaggle.matchers.networks.layers import ExactConv2d, depthwise_block, in_strips, resize
 from mkpc_kaggle.matchers.networks.vgg import VGG19, Vgg
 
-REACH = 2  # pixels, of a depthwise convolution
-BLOCKS = 5  # after the first
+REACH = 2  # pixels that a depthwise convolution reads on each side
+BLOCKS = 5  # of a refiner, after the first
 
 
 class DedodeRefinerShape(NamedTuple):
-    """Channels of the input ``features``, inside, and of the output ``context``."""
+    """Channels of the input ``features``, of ``hidden`` layers, and of the output ``context``."""
 
     features: int
     hidden: int
@@ -51,12 +51,12 @@ class DedodeRefiner(nn.Module):
         self.out_conv = ExactConv2d(width, prediction + shape.context, 1)
 
     def entry(self, features: Tensor) -> Tensor:
-        """Return the first convolution of features (B, C, h, w) alone: (B, hidden, h, w)."""
+        """Return the first convolution (B, hidden, h, w) of features (B, C, h, w), without the context."""
         weight, bias = (self.block1.get_parameter(f"0.{name}") for name in ("weight", "bias"))
         return functional.conv2d(features.to(weight.dtype), weight[:, : self.features], bias)
 
     def mixed(self, entry: Tensor, context: Tensor | None) -> Tensor:
-        """Mix an :meth:`entry`, which is overwritten, with the coarser context: (B, hidden, h, w)."""
+        """Add the coarser context to an :meth:`entry`, in place, and return the mixed map (B, hidden, h, w)."""
         first, norm, relu, mix = self.block1
         if context is not None:
             # A 1x1 convolution and enlargement commute; the small map is cheaper.
@@ -66,12 +66,12 @@ class DedodeRefiner(nn.Module):
         return mixed
 
     def hidden(self, mixed: Tensor) -> Tensor:
-        """Return the scaled sum of :meth:`mixed` and its blocks, (B, hidden, h, w)."""
+        """Return the scaled sum (B, hidden, h, w) of a :meth:`mixed` map and the blocks' output for it."""
         reach = REACH * len(self.hidden_blocks)
         return in_strips(self._hidden, mixed, reach=reach, channels=mixed.shape[1])
 
     def outputs(self, hidden: Tensor) -> Tensor:
-        """Return (B, n, h, w) float32: the prediction's channels before the context's."""
+        """Return (B, n, h, w) float32: the channels of the prediction, then of the context."""
         found: Tensor = self.out_conv(hidden.float())
         return found
 
@@ -81,7 +81,7 @@ class DedodeRefiner(nn.Module):
 
 
 class DedodeDecoder(nn.Module):
-    """A decoder of ``prediction`` channels, ``blocks`` in each refiner, upsampling in ``mode``."""
+    """A decoder to ``prediction`` channels with ``blocks`` per refiner; ``mode`` interpolates predictions."""
 
     def __init__(self, strides: Sequence[int], prediction: int, blocks: int, mode: str) -> None:
         super().__init__()
@@ -98,12 +98,12 @@ class DedodeDecoder(nn.Module):
         return refiner
 
     def forward(self, levels: Iterable[Tensor]) -> tuple[Tensor, Tensor]:
-        """Return the prediction (B, prediction, h, w) after stride 2, and the last hidden map, (B, 32, H, W).
+        """Return the prediction (B, prediction, h, w) of stride 2, and the hidden map (B, 32, H, W) of stride 1.
 
         ``levels`` yields the features from fine to coarse, so that only one level is in memory at a time.
         """
         strides = [int(stride) for stride in self.layers]
-        # A for loop would keep the features in memory while the next ones are computed.
+        # A for loop would keep a level in memory while the next one is computed.
         entries = list(map(DedodeRefiner.entry, map(self.at, reversed(strides)), levels))
         prediction: Tensor | None = None
         context: Tensor | None = None
@@ -119,7 +119,7 @@ class DedodeDecoder(nn.Module):
 
 
 class Dedode(nn.Module):
-    """A descriptor; B on VGG's features alone, or G ``with_vit``."""
+    """A descriptor: variant G ``with_vit``, otherwise B, which uses VGG's features alone."""
 
     def __init__(self, channels: int, *, with_vit: bool) -> None:
         super().__init__()
@@ -130,7 +130,7 @@ class Dedode(nn.Module):
     def forward(self, image: Tensor, points: Tensor) -> Tensor:
         """Return descriptors (B, K, D) float32, of any length, at points (B, K, 2) of images (B, 3, H, W) in 0..1.
 
-        The images are not normalised. Beyond the image, descriptors fade to 0 within a pixel.
+        The images' colours are not normalised. Beyond the image, descriptors fade to 0 within a pixel.
         """
         prediction, hidden = self.decoder(self.encoder.levels(image))
         # The full-resolution map is never computed, only its two parts at the points.
@@ -146,7 +146,7 @@ class Dedode(nn.Module):
 
 
 def nearest_pixels(points: Tensor, size: torch.Size) -> tuple[Tensor, Tensor]:
-    """Return the four pixels (B, K, 4, 2), column and row, around points (B, K, 2), and their shares (B, K, 4).
+    """Return the four pixels (B, K, 4, 2) (column, row) around points (B, K, 2), and bilinear weights (B, K, 4).
 
     Pixels outside an image of ``size`` (height, width) have weight 0.
     """
@@ -161,14 +161,14 @@ def nearest_pixels(points: Tensor, size: torch.Size) -> tuple[Tensor, Tensor]:
 
 
 def read_enlarged(x: Tensor, pixels: Tensor, shares: Tensor, size: torch.Size) -> Tensor:
-    """Sum weighted pixels (B, K, 4, 2) of a map (B, C, h, w) enlarged bilinearly to ``size``: (B, K, C)."""
+    """Return sums (B, K, C) of pixels, weighted by ``shares``, of a map (B, C, h, w) enlarged to ``size``."""
     centres = (2 * pixels + 1) / pixels.new_tensor([size[1], size[0]]) - 1
     read = functional.grid_sample(x, centres, padding_mode="border", align_corners=False)  # (B, C, K, 4)
     return (read * shares[:, None]).sum(dim=3).mT
 
 
 class VggAndVit(nn.Module):
-    """DINOv2's features and VGG's; sides must be multiples of 14."""
+    """VGG's features, then DINOv2's; sides of images must be multiples of 14."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -3,7 +3,7 @@
 import torch
 from torch import Generator, Tensor
 
-OVERSAMPLING = 4  # before matches are balanced
+OVERSAMPLING = 4  # the factor before matches are balanced
 BANDWIDTH = 0.1  # of the density's kernel, in normalised coordinates
 MIN_DENSITY, LAST_RESORT = 10, 1e-7  # isolated matches are drawn only if no others remain
 BLOCK_FLOATS = 2**20
@@ -11,10 +11,10 @@ MIN_EXPONENT = -80  # exp of less is denormal: ten times slower, and adds nothin
 
 
 def sample_matches(warp: Tensor, certainty: Tensor, number: int, threshold: float, generator: Generator) -> Tensor:
-    """Draw up to ``number`` matches from a warp (N, 4) with its finite certainty (N,): (M,) int64 indices.
+    """Return indices (M,) int64 of up to ``number`` matches, drawn from a warp (N, 4) by finite certainty (N,).
 
-    Certainties above ``threshold`` count as 1. Matches without weight are never drawn. ``generator``, on the
-    tensors' device, fixes the result.
+    Certainties above ``threshold`` count as 1. Matches of certainty 0 are never drawn. ``generator``, on the
+    tensors' device, is the source of randomness.
     """
     weights = certainty.masked_fill(certainty > threshold, 1)
     index = draw(weights, torch.empty_like(weights).exponential_(generator=generator), number * OVERSAMPLING)
@@ -23,7 +23,7 @@ def sample_matches(warp: Tensor, certainty: Tensor, number: int, threshold: floa
 
 
 def draw(weights: Tensor, noise: Tensor, number: int) -> Tensor:
-    """Return up to ``number`` indices (M,) int64 of weights (N,), none twice, none of weight 0.
+    """Draw up to ``number`` distinct indices (M,) int64 of weights (N,), none of weight 0.
 
     Sorting by weight / noise, with exponential noise (N,), equals successive draws in proportion to weight.
     """
@@ -32,7 +32,7 @@ def draw(weights: Tensor, noise: Tensor, number: int) -> Tensor:
 
 
 def density(points: Tensor) -> Tensor:
-    """Sum over all points (N, D), itself included, of exp(-|p - q|^2 / (2 bandwidth^2)): (N,)."""
+    """For each point p (N, D), sum exp(-|p - q|^2 / (2 bandwidth^2)) over all points q, also p: (N,)."""
     density = points.new_empty(len(points))
     rows = max(1, BLOCK_FLOATS // max(1, len(points)))
     for some, out in zip(torch.split(points, rows), torch.split(density, rows), strict=True):

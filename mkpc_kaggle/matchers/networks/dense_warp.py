@@ -1,4 +1,4 @@
-"""Dense warps, shared by DKM and RoMa: for every pixel its position in the other image and a certainty.
+"""Dense warps, shared by DKM and RoMa: every pixel's position in the other image, and a certainty.
 
 Normalised coordinates as in warp_refiner. Source: Edstedt et al. 2023, "DKM", section 3.4, and its published code.
 """
@@ -17,7 +17,7 @@ from mkpc_kaggle.matchers.networks.warp_refiner import WarpEstimate, identity_ma
 
 
 class Pyramid(NamedTuple):
-    """Features of B images, (B, C, h, w), in the network's precision: at strides 1, 2, 4, 8 and maybe more."""
+    """Features (B, C, h, w) of B images at strides 1, 2, 4, 8 and maybe more, in the network's precision."""
 
     levels: tuple[Tensor, ...]
 
@@ -26,9 +26,9 @@ class Pyramid(NamedTuple):
 
 
 class DenseFeatures(NamedTuple):
-    """Features of B images: of the images for the first pass, and of larger versions for the second.
+    """Features of B images: ``coarse`` for the first pass, ``fine`` of larger images for the second.
 
-    ``coefficients`` has (B, n, width) for each Gaussian process of the network, with the images as its support.
+    ``coefficients``: (B, n, width) for each Gaussian process of the network, with these images as the support.
     """
 
     coarse: Pyramid
@@ -37,8 +37,8 @@ class DenseFeatures(NamedTuple):
 
 
 class DenseWarp(NamedTuple):
-    """Warps of B pairs, float32: ``warp`` (B, H, W, 4), (x, y) in the first and in the second image, in [-1, 1];
-    ``certainty`` (B, H, W) in [0, 1], 0 where the target is outside. The grid is one of the images'.
+    """Warps of B pairs, float32, on either image's grid: ``warp`` (B, H, W, 4), (x, y) in the first, then in the
+    second image, in [-1, 1]; ``certainty`` (B, H, W) in [0, 1], and 0 where the target is outside.
     """
 
     warp: Tensor
@@ -53,7 +53,7 @@ class WarpDecoder(nn.Module, ABC):
     """A decoder from the features of two images to the flow between them."""
 
     def forward(self, query: DenseFeatures, support: DenseFeatures) -> tuple[WarpEstimate, Tensor]:
-        """Return the flow from query to support at stride 1 (last pass) and the logits at 16 (first pass)."""
+        """Return the last pass's flow from query to support at stride 1, and the first pass's logits at 16."""
         estimate = self.coarse_estimate(query, support)
         logits = estimate.certainty
         estimate = self.refine(estimate, query.coarse, support.coarse)
@@ -73,7 +73,7 @@ class WarpDecoder(nn.Module, ABC):
 
     @abstractmethod
     def correct(self, estimate: WarpEstimate, query: Pyramid, support: Pyramid, stride: int) -> WarpEstimate:
-        """Correct an estimate, of the size of a stride's features, by that stride's refiner."""
+        """Correct an estimate, at the size of a stride's features, with that stride's refiner."""
 
 
 class DenseNetwork(nn.Module, ABC):
@@ -83,17 +83,17 @@ class DenseNetwork(nn.Module, ABC):
 
     @abstractmethod
     def encode(self, image: Tensor, fine: Tensor | None = None) -> DenseFeatures:
-        """Encode images (B, 3, H, W) of :func:`pixels.network_input`; larger ones are for a second pass."""
+        """Encode images (B, 3, H, W) from :func:`pixels.network_input`; ``fine``: larger, for a second pass."""
 
     def match(self, first: DenseFeatures, second: DenseFeatures) -> tuple[DenseWarp, DenseWarp]:
-        """Match B pairs, whose images may differ in size: warps on the first and on the second image's grid."""
-        # Sequential: one batch of both directions would take twice the memory and as much time.
+        """Return the warps of B pairs on the first and on the second image's grid. Both sizes may differ."""
+        # Sequential: one batch of both directions would take twice the memory and the same time.
         forward, backward = (dense_warp(*self.decoder(*both)) for both in ((first, second), (second, first)))
         return forward, backward.swapped()
 
 
 def dense_warp(estimate: WarpEstimate, coarse_logits: Tensor) -> DenseWarp:
-    """Return the warp on the query's grid; ``coarse_logits`` (B, 1, h, w): of the first pass, at stride 16."""
+    """Return the warp on the query's grid; ``coarse_logits`` (B, 1, h, w): the first pass's at stride 16."""
     flow, logits = estimate.flow, estimate.certainty
     # Subtract half of the negative coarse logits.
     doubts = resize(coarse_logits, logits.shape[2:]).clamp(max=0)
@@ -108,7 +108,7 @@ TEMPERATURE, NOISE_VARIANCE = 0.2, 0.1
 
 
 class GaussianProcess(nn.Module):
-    """A Gaussian process from the support's features to the embedded coordinates of its pixels, of ``width``.
+    """A Gaussian process from the support's features to its pixels' coordinates, embedded in ``width`` channels.
 
     Source: Edstedt et al. 2023, section 3.2.
     """
@@ -127,7 +127,7 @@ class GaussianProcess(nn.Module):
         return mean.mT.reshape(len(query), -1, *query.shape[2:])
 
     def embed_coordinates(self, like: Tensor) -> Tensor:
-        """Return (1, width, h, w) for a map (..., h, w)."""
+        """Return the embedded pixel coordinates (1, width, h, w) of a map (..., h, w)."""
         return torch.cos(8 * math.pi * self.pos_conv(identity_map(like)))
 
 
@@ -137,20 +137,20 @@ def tokens(feature_map: Tensor) -> Tensor:
 
 
 def coefficients(y: Tensor, values: Tensor) -> Tensor:
-    """Return (K_yy + noise)^-1 values: (B, m, C) and (B or 1, m, D) give (B, m, D)."""
+    """Return (K_yy + noise)^-1 values, (B, m, D), for y (B, m, C) and values (B or 1, m, D)."""
     check_finite("coarse features", y)
     covariance = kernel(y, y)
     covariance.diagonal(dim1=1, dim2=2).add_(NOISE_VARIANCE)
-    # Positive definite. LU costs twice as much; batched LU is broken in PyTorch's MKL builds.
+    # The matrix is positive definite. LU costs twice as much; batched LU is broken in PyTorch's MKL builds.
     factor = torch.linalg.cholesky(covariance)
     return torch.cholesky_solve(values.expand(len(y), -1, -1), factor)
 
 
 def kernel(x: Tensor, y: Tensor) -> Tensor:
-    """Return exp((cosine - 1) / T) of all pairs: (B, n, C) and (B, m, C) give (B, n, m), float32.
+    """Return exp((cosine - 1) / T), (B, n, m) float32, of all pairs of rows of x (B, n, C) and y (B, m, C).
 
     Computed in float64: the inverse of a covariance amplifies rounding errors about fifteen times, and so do the
-    refiners. For a pair of 540 x 720 it takes 0.1 s on a CPU and 40 ms on a T4.
+    refiners. A pair of 540 x 720 pixels takes 0.1 s on a CPU and 40 ms on a T4.
     """
     x, y = x.double(), y.double()
     norms = (x.norm(dim=2)[:, :, None] * y.norm(dim=2)[:, None]).add_(1e-6)

@@ -1,6 +1,6 @@
 """DINOv2's vision transformer: Oquab et al., "DINOv2: Learning Robust Visual Features without Supervision", 2023.
 
-Without register tokens. Parameter names match the public checkpoints. For inference only.
+This version has no register tokens. Parameter names match the public checkpoints. For inference only.
 """
 
 from math import isqrt
@@ -21,7 +21,7 @@ OFFSET = 0.1  # added to a grid's sides when positions are resampled, as in trai
 
 
 class DinoV2(nn.Module):
-    """Features of 14 x 14 patches."""
+    """DINOv2's features, one vector per patch of 14 x 14 pixels."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -48,7 +48,7 @@ class DinoV2(nn.Module):
         return as_map(normed[:, 1:].reshape(patches.shape))
 
     def positions(self, height: int, width: int) -> Tensor:
-        """Return the embedding of tokens (1, 1 + h w, C) of a grid of patches, the class token's first.
+        """Return the positional embeddings (1, 1 + h w, C) of a grid of patches, the class token's first.
 
         The stored grid is resampled by factors slightly above the ratios of the sides, as in training.
         """
@@ -63,10 +63,10 @@ class DinoV2(nn.Module):
 
 
 class VitBlock(nn.Module):
-    """Self-attention, then a perceptron, each on normed tokens and added to them (Dosovitskiy et al. 2021, 3.1).
+    """Self-attention, then a perceptron, each with a norm before it and a residual (Dosovitskiy et al. 2021, 3.1).
 
     Sums and norms are float32; the added terms are computed in the precision of the layers' weights.
-    ``epsilon`` of the norms; ``scaled``: each added term has a learned factor per channel.
+    The norms use ``epsilon``. If ``scaled``, each added term has a learned factor per channel.
     """
 
     def __init__(self, width: int, heads: int, epsilon: float, *, bias: bool, scaled: bool) -> None:
@@ -85,7 +85,7 @@ class VitBlock(nn.Module):
 
 
 class VitAttention(nn.Module):
-    """Self-attention of all tokens; ``bias`` of queries, keys and values."""
+    """Self-attention of all tokens. With ``bias``, the projection to queries, keys and values has one."""
 
     def __init__(self, width: int, heads: int, bias: bool) -> None:
         super().__init__()
@@ -95,7 +95,7 @@ class VitAttention(nn.Module):
 
     def forward(self, tokens: Tensor) -> Tensor:
         """Map (B, n, C) to (B, n, C) in the weights' precision."""
-        projected = self.qkv(tokens.to(self.qkv.weight.dtype))  # (B, n, 3 C): all queries, keys, then values
+        projected = self.qkv(tokens.to(self.qkv.weight.dtype))  # (B, n, 3 C): queries, then keys, then values
         split = projected.view(*projected.shape[:2], 3, self.heads, -1).permute(
             2, 0, 3, 1, 4
         )  # (3, B, heads, n, D)

@@ -1,7 +1,7 @@
 """DKM v3: Edstedt et al., "DKM: Dense Kernelized Feature Matching for Geometry Estimation", CVPR 2023.
 
-Every pixel of each image gets a position in the other image and a certainty. Image sizes may differ; the published
-code needs equal sizes. Windows and corrections are in pixels of the query.
+Every pixel of each image gets a position in the other image and a certainty. Images of a pair may differ in size;
+the published code needs equal sizes. Correlation windows and corrections are in pixels of the query.
 Coordinates are normalised: (x, y) in [-1, 1], where +-1 are the outer edges of an image (see warp_refiner).
 Parameter names match the public checkpoints. For inference only.
 """
@@ -21,7 +21,7 @@ from mkpc_kaggle.matchers.networks.layers import ExactConv2d, resize
 from mkpc_kaggle.matchers.networks.warp_refiner import SHAPES, WarpEstimate, WarpRefiner, refined
 
 STRIDES = (32, 16)  # of the coarse decoder
-FEATURES, POSTERIOR, WIDTH = 512, 256, 384  # its channels
+FEATURES, POSTERIOR, WIDTH = 512, 256, 384  # channels of the coarse decoder
 EXPANSION = 4  # of the channels in a bottleneck of ResNet-50
 
 
@@ -58,12 +58,12 @@ class DkmDecoder(WarpDecoder):
         self.conv_refiner = nn.ModuleDict({str(s): WarpRefiner(shape) for s, shape in SHAPES.items()})
 
     def projected(self, pyramid: Pyramid) -> Pyramid:
-        """Return the pyramid of all six strides, with 512 channels at 16 and 32."""
+        """Return the pyramid of all six strides, projected to 512 channels at strides 16 and 32."""
         *finer, at16, at32 = pyramid.levels
         return Pyramid((*finer, self.proj["16"](at16), self.proj["32"](at32)))
 
     def regress(self, support: Pyramid) -> tuple[Tensor, ...]:
-        """Return the coefficients of the Gaussian processes, by :data:`STRIDES`."""
+        """Return the coefficients of the Gaussian processes, in the order of :data:`STRIDES`."""
         processes = zip(self.gps.values(), STRIDES, strict=True)
         return tuple(process.regress(support.at(stride)) for process, stride in processes)  # type: ignore[operator]
 
@@ -98,7 +98,7 @@ class EmbeddingDecoder(nn.Module):
     def forward(
         self, stride: int, posterior: Tensor, features: Tensor, context: Tensor
     ) -> tuple[WarpEstimate, Tensor]:
-        """Map (B, 256, h, w), (B, 512, h, w) and (B, 384, h, w) to the estimate and the next context."""
+        """Map maps (B, C, h, w), with C = 256, 512 and 384 in this order, to the estimate and the next context."""
         at = str(stride)
         own = self.feat_input_modules[at](features)
         embedded = torch.cat([own, posterior.to(own.dtype)], dim=1)  # (B, 512, h, w)
@@ -125,7 +125,7 @@ class ResidualRefinement(nn.Module):
 
 
 class ChannelAttention(nn.Module):
-    """The sum of context and weighted embedding; the means of both give a weight per channel."""
+    """Context plus embedding weighted per channel; the spatial means of both maps give the weights."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -140,9 +140,9 @@ class ChannelAttention(nn.Module):
 
 
 class Bottleneck(nn.Module):
-    """1x1, 3x3 and 1x1 convolutions with a shortcut, a 1x1 convolution where the shape changes.
+    """1x1, 3x3 and 1x1 convolutions with a shortcut, which is a 1x1 convolution where the shape changes.
 
-    Written here because offline installs have no torchvision. The stride sits in the 3x3 convolution.
+    Written here because offline installs have no torchvision. The 3x3 convolution has the stride.
     """
 
     def __init__(self, inputs: int, width: int, stride: int = 1) -> None:
@@ -173,7 +173,7 @@ def stage(inputs: int, width: int, blocks: int, stride: int) -> nn.Sequential:
 
 
 class ResNet50(nn.Module):
-    """ResNet-50. Its classifier is unused and exists for the checkpoints alone."""
+    """ResNet-50. The classifier is unused; it exists because checkpoints have it."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -188,7 +188,7 @@ class ResNet50(nn.Module):
     def forward(self, image: Tensor) -> tuple[Tensor, ...]:
         """Return features at strides 2, 4, 8, 16 and 32 of images (B, 3, H, W) of any size.
 
-        (B, C, h, w) with C = 64, 256, 512, 1024, 2048; every halving of a side rounds up.
+        Features are (B, C, h, w) with C = 64, 256, 512, 1024, 2048; every halving of a side rounds up.
         """
         levels = [functional.relu_(self.bn1(self.conv1(image)))]
         x = functional.max_pool2d(levels[0], 3, stride=2, padding=1)

@@ -19,8 +19,8 @@ class SemiDenseMatches(NamedTuple):
 
     ``points0``, ``points1``: (M, 2) float32 (x, y) in pixels of the network's input, in a frame whose origin is
     the corner of the image: the centre of the top-left pixel is (0.5, 0.5). Points of image 0 lie on the
-    grid of coarse cells; points of image 1 are refined by up to 4 pixels. ``coarse``: cells, counted row by row
-    in their own map, and the confidence.
+    grid of coarse cells; points of image 1 are refined by up to 4 pixels. ``coarse``: cells, as row-major
+    indices in the cell's own map, and confidences.
     """
 
     coarse: Assignment
@@ -44,14 +44,14 @@ class FinePreprocess(nn.Module):
 
 
 def cell_points(cells: Tensor, width: int) -> Tensor:
-    """Map (M,) cells of a coarse map of ``width`` columns to (M, 2) float32 (x, y) in pixels."""
+    """Return the top-left corners (M, 2) float32, (x, y) in pixels, of cells (M,) in a map of ``width`` cells."""
     return torch.stack([cells % width, cells // width], dim=1).float() * COARSE_STRIDE
 
 
 def cut_windows(fine: Tensor, cells: Tensor) -> Tensor:
-    """Cut (M, 25, C) float32, row by row, around M coarse cells out of a fine map (1, C, Hf, Wf).
+    """Cut row-major windows (M, 25, C) float32 around coarse cells (M,) from a fine map (1, C, Hf, Wf).
 
-    A cell's window is centred on the fine cell at its top-left corner; zero outside the map.
+    A window is centred on its coarse cell's top-left fine cell, and is zero outside the map.
     """
     grid = as_grid(fine)  # (1, Hf, Wf, C)
     width, channels = grid.shape[2:]
@@ -67,9 +67,9 @@ def cut_windows(fine: Tensor, cells: Tensor) -> Tensor:
 
 
 def expected_offset(windows0: Tensor, windows1: Tensor) -> Tensor:
-    """Map (M, 25, C) twice to the mean offset (M, 2) float32, (x, y) in -1..1.
+    """Return the mean offset (M, 2) float32, (x, y) in -1..1, between windows (M, 25, C) of both images.
 
-    The centre of window 0 is compared with all of window 1; the softmax is the distribution of the offset.
+    The softmax of window 0's centre compared with all cells of window 1 is the distribution of the offset.
     """
     logits = (windows1 @ windows0[:, CENTRE, :, None])[..., 0] / windows0.shape[2] ** 0.5  # (M, 25)
     axis = torch.linspace(-1.0, 1.0, SIDE, device=logits.device)

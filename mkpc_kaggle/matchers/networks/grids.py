@@ -22,12 +22,12 @@ def as_grid(feature_map: Tensor) -> Tensor:
 
 
 def mean_pool(grid: Tensor, factor: int | tuple[int, int]) -> Tensor:
-    """Average blocks of ``factor`` (rows, columns); drop incomplete ones at the right and bottom."""
+    """Average blocks of ``factor`` (rows, columns); drop incomplete blocks at the right and bottom."""
     return grid if factor == 1 else as_grid(functional.avg_pool2d(as_map(grid), factor))
 
 
 def to_2x2_blocks(grid: Tensor) -> Tensor:
-    """Map (..., h, w, E) to (..., h/2 * w/2, 4, E): 2x2 cells row by row, and row by row within each."""
+    """Map (..., h, w, E) to (..., h/2 * w/2, 4, E): 2x2 blocks row by row, and cells row by row within a block."""
     *lead, h, w, width = grid.shape
     cells = grid.reshape(*lead, h // 2, 2, w // 2, 2, width).transpose(-4, -3)  # (..., h/2, w/2, 2, 2, E)
     return cells.reshape(*lead, h * w // 4, 4, width)
@@ -48,7 +48,7 @@ def pointwise(layer: nn.Conv1d | nn.Conv2d, x: Tensor) -> Tensor:
 class Perceptron(nn.Module):
     """Two layers without biases, a ReLU between them, named as in an ``nn.Sequential``.
 
-    The first is pointwise; so is the second, unless it is a 3x3 convolution of the grid.
+    The first layer is pointwise; the second is pointwise or a 3x3 convolution of the grid.
     """
 
     def __init__(self, first: Layer, second: Layer) -> None:
@@ -66,5 +66,5 @@ class Perceptron(nn.Module):
 
 
 def mask_valid(mask: Tensor, factor: int | tuple[int, int]) -> Tensor:
-    """Pool (N, h, w) bool: a block is valid only if all of its cells are."""
+    """Pool (N, h, w) bool: a block is valid only if all of its cells are valid."""
     return functional.max_pool2d((~mask).float()[:, None], factor)[:, 0] == 0

@@ -1,7 +1,7 @@
 """Linear maps, attention, convolutions in strips and mutual matches, fast on CPUs; for inference only.
 
 A weight may have half precision (see ``placement``). The product is then computed in half precision, and a linear
-map's result has its input's precision again.
+map converts the result back to the input's precision.
 """
 
 from collections.abc import Callable
@@ -16,7 +16,7 @@ IMAGES = range(16, 65)  # on one thread PyTorch uses oneDNN's convolution from 1
 
 
 def linear(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
-    """Multiply (..., C_in) by ``weight`` (C_out, C_in), and add ``bias`` (C_out,): (..., C_out)."""
+    """Map (..., C_in) to (..., C_out): multiply by ``weight`` (C_out, C_in), and add ``bias`` (C_out,)."""
     if weight.dtype != x.dtype:
         return functional.linear(x.to(weight.dtype), weight, bias).to(x.dtype)
     if x.device.type != "cpu" or weight.dtype != torch.float32 or x.numel() == 0:
@@ -30,14 +30,14 @@ def linear(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
 
 
 class Linear(nn.Linear):
-    """A linear map (..., C_in) to (..., C_out)."""
+    """A linear map from (..., C_in) to (..., C_out), by :func:`linear`."""
 
     def forward(self, x: Tensor) -> Tensor:
         return linear(x, self.weight, self.bias)
 
 
 class Exact:
-    """A mark of layers whose outputs are or select coordinates: they stay float32 in any precision."""
+    """A mark of layers that output or select coordinates. These layers stay float32 in any precision."""
 
 
 class ExactLinear(Exact, Linear):
@@ -53,7 +53,7 @@ class ExactConv2d(Exact, nn.Conv2d):
 
 
 def depthwise_block(inputs: int, outputs: int) -> nn.Sequential:
-    """Make a depthwise 5x5 convolution of ``inputs`` channels, and a 1x1 convolution of its ``outputs``."""
+    """Make a depthwise 5x5 convolution of ``inputs`` channels, then a 1x1 convolution of ``outputs``."""
     return nn.Sequential(
         nn.Conv2d(inputs, outputs, 5, padding=2, groups=inputs),
         nn.BatchNorm2d(outputs),
@@ -63,12 +63,12 @@ def depthwise_block(inputs: int, outputs: int) -> nn.Sequential:
 
 
 def resize(x: Tensor, size: torch.Size, mode: str = "bilinear") -> Tensor:
-    """Resize (B, C, h, w) to (B, C, *size), larger or smaller, without antialiasing, half-pixel centres."""
+    """Resize (B, C, h, w) to (B, C, *size) with half-pixel centres, without antialiasing."""
     return functional.interpolate(x, tuple(size), mode=mode, align_corners=False)
 
 
 def attention(q: Tensor, k: Tensor, v: Tensor, precision: torch.dtype) -> Tensor:
-    """Return softmax(q k^T / sqrt(D)) v of (B, heads, L, D) and twice (B, heads, S, D), like ``q``.
+    """Return softmax(q k^T / sqrt(D)) v, like q (B, heads, L, D); k and v are (B, heads, S, D).
 
     Products are computed in ``precision``, the softmax in float32.
     """
@@ -77,11 +77,11 @@ def attention(q: Tensor, k: Tensor, v: Tensor, precision: torch.dtype) -> Tensor
 
 
 def in_strips(function: Callable[[Tensor], Tensor], x: Tensor, *, reach: int, channels: int) -> Tensor:
-    """Return ``function(x)``, (B, C, H, W) to (B, C', H, W), on a CPU by strips of rows that fit its cache.
+    """Map (B, C, H, W) to (B, C', H, W) by ``function``; on a CPU, in strips of rows that fit the cache.
 
     A row of the result depends on ``reach`` rows above and below it. ``channels``: the maximum number of channels
-    inside the function, which must not change its argument. Strips overlap by the reach, so zero padding at their
-    edges has no effect.
+    inside the function. The function must not change ``x``. Strips overlap by the reach, so that zero padding at
+    their edges has no effect.
     """
     batch, _, height, width = x.shape
     rows = max(1, 4 * reach, STRIP_FLOATS // (batch * channels * width))
@@ -95,7 +95,7 @@ def in_strips(function: Callable[[Tensor], Tensor], x: Tensor, *, reach: int, ch
 
 
 class Assignment(NamedTuple):
-    """M matches by ascending ``index0``: keypoints or cells (M,) int64 of both images, ``scores`` (M,) in 0..1."""
+    """M matches by ascending ``index0``: indices (M,) int64 of keypoints or cells, ``scores`` (M,) in 0..1."""
 
     index0: Tensor
     index1: Tensor
@@ -108,7 +108,7 @@ class Assignment(NamedTuple):
 
 
 def mutual_matches(log_scores: Tensor, threshold: float) -> Assignment:
-    """Return pairs of keypoints that are each other's best in (N0, N1) logarithms, scored above the threshold."""
+    """Return pairs of keypoints that are each other's best in ``log_scores`` (N0, N1), if above the threshold."""
     (best0, partner0), partner1 = log_scores.max(dim=1), log_scores.argmax(dim=0)  # (N0,) twice, (N1,)
     index0, scores = torch.arange(len(partner0), device=log_scores.device), best0.exp()
     kept = (partner1[partner0] == index0) & (scores > threshold)

@@ -1,4 +1,4 @@
-"""LoFTR's transformer with linear attention: its coarse one, and the fine one of its descendants.
+"""The transformer with linear attention: LoFTR's coarse one, and the fine one of LoFTR and its descendants.
 
 Sources: Sun et al. 2021, section 3.2; Katharopoulos et al. 2020 (linear attention).
 """
@@ -14,9 +14,9 @@ Masks = tuple[Tensor, Tensor]
 
 
 def linear_attention(q: Tensor, k: Tensor, v: Tensor, heads: int, masks: Masks | None = None) -> Tensor:
-    """Map queries (N, L, C), keys, values (N, S, C) to (N, L, C); head h owns channels from h C/heads.
+    """Map queries (N, L, C), keys and values (N, S, C) to (N, L, C). Each head has consecutive channels.
 
-    ``masks``: of the queries (N, L) and of the keys (N, S), True at content. A masked query's output is zero, a
+    ``masks`` of queries (N, L) and of keys (N, S) are True at content. A masked query's output is zero, and a
     masked key has no effect. ``q`` and ``k`` are overwritten.
     """
     q, k = functional.elu(q, inplace=True).add_(1.0), functional.elu(k, inplace=True).add_(1.0)
@@ -56,7 +56,7 @@ class EncoderLayer(nn.Module):
 
 
 class LinearTransformer(nn.Module):
-    """``cycles`` of a self-attention and a cross-attention layer; each layer serves both images.
+    """``cycles`` of a self-attention and a cross-attention layer. Both images share each layer.
 
     Cross attention runs in sequence: image 1 is updated from the updated image 0.
     """

@@ -12,7 +12,7 @@ from mkpc_kaggle.matchers.networks.semi_dense import HEADS, SemiDenseNetwork
 class Loftr(SemiDenseNetwork):
     """LoFTR. Sides are multiples of 8; the two images may differ in size.
 
-    Indoor weights were trained later, with the corrected position encoding, and published without a border.
+    Indoor weights were trained later, with the corrected position encoding, and were published with border 0.
     """
 
     multiple = 8

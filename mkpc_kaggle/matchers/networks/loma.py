@@ -45,21 +45,21 @@ class Loma(nn.Module):
     def encode(self, detected: Tensor, described: Tensor, number: int) -> LomaKeypoints:
         """Return up to ``number`` keypoints of one image, strongest first.
 
-        The image has two sizes, (1, 3, H, W) each, RGB in 0..1: for the detector and for the descriptor.
+        The image is given at two sizes, for the detector and the descriptor, each (1, 3, H, W) RGB in 0..1.
         """
         (points,) = self.detector(detected, number)
         return LomaKeypoints(points, self.descriptor(described, points[None])[0])
 
 
 def parameter_name(published: str) -> str:
-    """Return our name of a checkpoint's parameter: ``_detector.*``, ``_descriptor.*``, or else the matcher's."""
+    """Return our name of a published parameter: of ``_detector``, of ``_descriptor``, or else of the matcher."""
     return published[1:] if published.startswith("_") else f"matcher.{published}"
 
 
 def detector_size(image: Size, long_side: int) -> Size:
-    """Return the detector's input size: the longer side ``long_side``, both rounded down to multiples of 8.
+    """Return the detector's input size: ``image`` scaled to ``long_side``, then rounded down to multiples of 8.
 
-    As in training: if rounding puts the product just below ``long_side``, that side loses 8 pixels.
+    As in training, if rounding errors put the longer side just below ``long_side``, it loses 8 pixels.
     """
     scale = long_side / max(image)
     return Size(*(8 * int(scale * side / 8) for side in image))

@@ -1,4 +1,4 @@
-"""LoMa's matcher (Nordström et al. 2026, arXiv 2604.04931): LightGlue (Lindenberger et al. 2023), all layers.
+"""LoMa's matcher (Nordström et al. 2026, arXiv 2604.04931): all layers of LightGlue (Lindenberger et al. 2023).
 
 The keypoints of both images share one tensor (1, N, d), N = N0 + N1; only attention separates the images.
 Parameter names match the public checkpoints. For inference only.
@@ -39,7 +39,7 @@ class RotaryEmbedding(nn.Module):
 
 
 def apply_rotary(x: Tensor, rotation: Tensor) -> Tensor:
-    """Rotate pairs of channels of (1, heads, N, 64) by (1, 1, N, 32)."""
+    """Rotate pairs of channels of ``x`` (1, heads, N, 64) by complex numbers (1, 1, N, 32)."""
     pairs = torch.view_as_complex(x.view(*x.shape[:3], -1, 2))
     return torch.view_as_real(pairs * rotation).flatten(3)
 
@@ -52,7 +52,7 @@ def update(width: int) -> nn.Sequential:
 
 
 class LomaSelfAttention(nn.Module):
-    """Messages between the keypoints of one image. ``Wqkv`` orders its outputs by head, channel, then q, k, v."""
+    """Messages between the keypoints of one image. ``Wqkv`` outputs are ordered by head, channel, then q, k, v."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -61,7 +61,7 @@ class LomaSelfAttention(nn.Module):
         self.ffn = update(width)
 
     def forward(self, x: Tensor, n0: int, rotation: Tensor) -> Tensor:
-        """Map (1, N, d) to (1, N, d); the first ``n0`` of the N keypoints are image 0's."""
+        """Map (1, N, d) to (1, N, d); the first ``n0`` of the N keypoints belong to image 0."""
         projected = self.Wqkv(x).view(*x.shape[:2], -1, HEAD, 3).transpose(1, 2)  # (1, heads, N, 64, 3)
         q, k, v = (part.contiguous() for part in projected.unbind(4))
         q, k = apply_rotary(q, rotation), apply_rotary(k, rotation)
@@ -72,7 +72,7 @@ class LomaSelfAttention(nn.Module):
 
 
 class LomaCrossAttention(nn.Module):
-    """Messages between the keypoints of both images, computed from the same input features."""
+    """Messages between the two images' keypoints. Both directions use the same input features."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -82,7 +82,7 @@ class LomaCrossAttention(nn.Module):
         self.ffn = update(width)
 
     def forward(self, x: Tensor, n0: int) -> Tensor:
-        """Map as :class:`LomaSelfAttention` does."""
+        """Map (1, N, d) to (1, N, d); the first ``n0`` of the N keypoints belong to image 0."""
         qk, v = (layer(x).view(*x.shape[:2], -1, HEAD).transpose(1, 2) for layer in (self.to_qk, self.to_v))
         (qk0, qk1), (v0, v1) = ((part[:, :, :n0], part[:, :, n0:]) for part in (qk, v))
         precision = self.to_out.weight.dtype
@@ -109,8 +109,8 @@ class LomaLayer(nn.Module):
 
 
 class LomaMatcher(nn.Module):
-    """A matcher of ``descriptor`` input channels and ``width`` inner channels. Of a checkpoint's assignments only
-    the last layer's is used.
+    """A matcher with ``descriptor`` input channels and ``width`` inner channels. It uses only the last layer's
+    assignment of a checkpoint.
     """
 
     def __init__(self, descriptor: int, width: int) -> None:
@@ -122,7 +122,7 @@ class LomaMatcher(nn.Module):
         self.eval().requires_grad_(False)
 
     def forward(self, image0: LomaKeypoints, image1: LomaKeypoints, threshold: float) -> Assignment:
-        """Return mutual matches scored above the threshold; no keypoints give no matches."""
+        """Return mutual matches scored above the threshold; none if an image has no keypoints."""
         n0, n1 = len(image0.points), len(image1.points)
         if n0 == 0 or n1 == 0:
             return Assignment.empty(image0.points.device)
@@ -139,7 +139,7 @@ class LomaMatcher(nn.Module):
         return x
 
     def similarity(self, features: Tensor, n0: int) -> Tensor:
-        """Return (1, N0, N1)."""
+        """Return the similarities (1, N0, N1) of both images' keypoints."""
         projected = self.log_assignment.get_submodule(f"{LAYERS - 1}.final_proj")(features)
         scaled = projected / features.shape[2] ** 0.25
         similarity: Tensor = scaled[:, :n0] @ scaled[:, n0:].mT
@@ -147,5 +147,5 @@ class LomaMatcher(nn.Module):
 
 
 def log_scores(similarity: Tensor) -> Tensor:
-    """Return the logarithm of the product of the softmax over either image's keypoints, (1, N0, N1)."""
+    """Return the logarithm (1, N0, N1) of the product of two softmaxes, one over each image's keypoints."""
     return similarity.log_softmax(dim=1).add_(similarity.log_softmax(dim=2))

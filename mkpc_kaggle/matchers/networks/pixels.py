@@ -10,9 +10,9 @@ MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet's colour
 def resized(pixels: Tensor, size: tuple[int, int]) -> Tensor:
     """Resize images (B, C, H, W) uint8 on the CPU to (B, C, *size) float32 in 0..1.
 
-    Bicubic with antialiasing in 8 bits, the width first, as in Pillow up to version 12 and so in training. About
+    Bicubic with antialiasing in 8 bits, the width first, as in training with Pillow up to version 12. About
     1 % of the values differ from Pillow's, by one or two grey levels. Pillow 13 resizes a shrinking height before
-    a growing width; then 20 % of the values or more differ.
+    a growing width; then at least 20 % of the values differ.
     """
     if pixels.shape[2:] != size:
         pixels = functional.interpolate(pixels, size, mode="bicubic", antialias=True, align_corners=False)
@@ -20,9 +20,9 @@ def resized(pixels: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def network_input(pixels: Tensor, size: tuple[int, int]) -> Tensor:
-    """Resize and normalise RGB images (B, 3, H, W) uint8 on the CPU: (B, 3, *size) float32.
+    """Resize and normalise RGB images (B, 3, H, W) uint8 on the CPU to (B, 3, *size) float32.
 
-    Resize the original image again for the second pass.
+    For the second pass, call it with the original images again.
     """
     mean, std = (torch.tensor(values)[:, None, None] for values in (MEAN, STD))
     return resized(pixels, size).sub_(mean).div_(std)

@@ -19,8 +19,8 @@ Layer = nn.Linear | nn.Conv1d | nn.Conv2d
 def prepared(network: Network, placement: Placement) -> Network:
     """Prepare the network in place, and return it; checkpoints cannot be loaded afterwards.
 
-    The weights of convolutions and linear layers, except :class:`Exact` ones, get the placement's precision, and
-    so do the maps between convolutions. All else stays float32: sums of transformers, softmax, transport,
+    The weights of convolutions and linear layers, except :class:`Exact` ones, and the maps between convolutions
+    get the placement's precision. All else stays float32: sums of transformers, softmax, optimal transport,
     coordinates.
     """
     fold_norms(network)
@@ -32,7 +32,7 @@ def prepared(network: Network, placement: Placement) -> Network:
 
 
 def fold_norms(network: nn.Module) -> None:
-    """Fold every batch norm into the convolution before it; computed in float64, rounded once."""
+    """Fold every batch norm into the convolution before it, in float64 with one rounding at the end."""
     for parent in list(network.modules()):
         for (conv_name, conv), (norm_name, norm) in pairwise(list(parent.named_children())):
             if isinstance(norm, Norm):
@@ -43,7 +43,7 @@ def fold_norms(network: nn.Module) -> None:
 
 
 def autocast(placement: Placement) -> torch.autocast:
-    """Return an autocast for networks of libraries: PyTorch decides which operators run in half precision."""
+    """Return an autocast for libraries' networks; PyTorch chooses the operators that run in half precision."""
     enabled = placement.precision is not Precision.FLOAT32
     return torch.autocast(torch.device(placement.device).type, dtype_of(placement), enabled)
 

@@ -22,7 +22,7 @@ def sine_positions(
     scale: tuple[float, float] = (1.0, 1.0),
     device: torch.device | None = None,
 ) -> Tensor:
-    """Return (height, width, 256) float32: for g = 0..63 sine and cosine of x w_g, then of y w_g.
+    """Return (height, width, 256) float32: for each g = 0..63, sine and cosine of x w_g, then of y w_g.
 
     w_g = exp(-2 g decay); x and y are the column and row counted from one, times ``scale`` (y, x).
     """
@@ -33,7 +33,7 @@ def sine_positions(
 
 
 def with_positions(coarse: Tensor, decay: float) -> Tensor:
-    """Map a coarse map (N, 256, h, w) to the grid (N, h, w, 256), contiguous, with its positions added."""
+    """Map a coarse map (N, 256, h, w) to a contiguous grid (N, h, w, 256), with position encodings added."""
     grid = as_grid(coarse)
     _, height, width, _ = grid.shape
     return (grid + sine_positions(height, width, decay, device=grid.device)).contiguous()

@@ -32,9 +32,9 @@ TOPKS = {Training.OUTDOOR: (16, 8), Training.INDOOR: (32, 16)}
 
 
 def attend(q: Tensor, k: Tensor, v: Tensor, keep: int) -> tuple[Tensor, Tensor]:
-    """Attend from P cells of G queries, (B, P, G, D), to each cell's keys and values (B, P, S, D).
+    """Attend from P cells of G queries each, (B, P, G, D), to the cell's own keys and values (B, P, S, D).
 
-    Return the messages (B, P, G, D), and (B, P, G, keep) int64: the indices in S of the highest attention.
+    Return messages (B, P, G, D) and the indices (B, P, G, keep) int64, below S, of the highest attention.
     """
     logits = (q * q.shape[-1] ** -0.5) @ k.transpose(-1, -2)  # (B, P, G, S)
     kept = logits.topk(min(keep, logits.shape[-1]), dim=-1, sorted=False).indices
@@ -42,11 +42,11 @@ def attend(q: Tensor, k: Tensor, v: Tensor, keep: int) -> tuple[Tensor, Tensor]:
 
 
 def attend_children(q: Tensor, k: Tensor, v: Tensor, parents: Tensor, keep: int) -> tuple[Tensor, Tensor]:
-    """Attend at a finer level: maps (B, h, w, D) of queries, and (B, h_key, w_key, D) of keys and values.
+    """Attend at a finer level from queries (B, h, w, D) to part of the keys and values (B, h_key, w_key, D).
 
-    ``parents``: (B, h w / 4, K) int64, the key cells of the level above whose children a 2x2 cell of queries
-    attends to. Children of one parent are adjacent in memory, for one read. Return as :func:`attend` does, the
-    kept key cells counted row by row over the level's map.
+    A 2x2 block of queries attends to the children of ``parents`` (B, h w / 4, K) int64, key cells of the coarser
+    level. Children of one parent are adjacent in memory, for one read. Return messages and indices as
+    :func:`attend` does; indices count this level's key cells row by row.
     """
     w_key = k.shape[2]
     candidates = partial(_children_of, parents=parents)
@@ -58,7 +58,7 @@ def attend_children(q: Tensor, k: Tensor, v: Tensor, parents: Tensor, keep: int)
 
 
 def _children_of(cells: Tensor, parents: Tensor) -> Tensor:
-    """Gather cells (B, S, 4, D) by ``parents`` (B, P, K): (B, P, 4 K, D), parent by parent."""
+    """Gather the children (B, P, 4 K, D) of ``parents`` (B, P, K), one by one, from cells (B, S, 4, D)."""
     batch, count, four, width = cells.shape
     offset = torch.arange(batch, device=cells.device)[:, None, None] * count
     found = cells.reshape(-1, four * width).index_select(0, (parents + offset).flatten())
@@ -66,10 +66,10 @@ def _children_of(cells: Tensor, parents: Tensor) -> Tensor:
 
 
 def quadtree_attention(q: Tensor, k: Tensor, v: Tensor, shares: Tensor, topks: tuple[int, int]) -> Tensor:
-    """Map queries (B, h, w, D), keys and values (B, h_key, w_key, D), one head each, to messages (B, h, w, D).
+    """Map queries (B, h, w, D), keys and values (B, h_key, w_key, D) of B heads to messages (B, h, w, D).
 
-    Sides are multiples of 4. The coarsest of three levels of mean pooling attends to all key cells. A next level
-    attends to the children of its parent's ``topks`` best cells. ``shares`` (3,): weights of the levels' messages.
+    Sides are multiples of 4. The coarsest of three levels of mean pooling attends to all key cells. A finer level
+    attends to the children of its parent's ``topks`` best cells. ``shares`` (3,) weight the levels' messages.
     """
     (q0, k0, v0), (q1, k1, v1) = ([mean_pool(x, factor) for x in (q, k, v)] for factor in (4, 2))
     batch, h0, w0, width = q0.shape
@@ -77,7 +77,7 @@ def quadtree_attention(q: Tensor, k: Tensor, v: Tensor, shares: Tensor, topks: t
     dense, kept = attend(q0.reshape(batch, 1, -1, width), keys, values, topks[0])
     middle, kept = attend_children(q1, k1, v1, kept[:, 0], topks[1])
     fine, _ = attend_children(q, k, v, from_2x2_blocks(kept, 2 * h0, 2 * w0).flatten(1, 2), 0)
-    # A cell's children inherit its message: broadcasting over 2x2 blocks.
+    # Broadcasting over 2x2 blocks adds a cell's message to its children's.
     coarse = dense[:, 0, :, None] * shares[0]  # (B, h0 w0, 1, D)
     merged = from_2x2_blocks(coarse + middle * shares[1], 2 * h0, 2 * w0)  # (B, 2 h0, 2 w0, D)
     return from_2x2_blocks(fine * shares[2] + merged.flatten(1, 2)[:, :, None], 4 * h0, 4 * w0)
@@ -93,7 +93,7 @@ class QuadtreeAttention(nn.Module):
         self.q_proj = nn.Conv2d(width, width, 1, bias=False)
         self.k_proj = nn.Conv2d(width, width, 1, bias=False)
         self.v_proj = nn.Conv2d(width, width, 1, bias=False)
-        self.py_att = nn.ParameterDict({"weight": torch.ones(LEVELS)})  # the levels' shares before their softmax
+        self.py_att = nn.ParameterDict({"weight": torch.ones(LEVELS)})  # the levels' shares before the softmax
         self.proj = Linear(width, width)
 
     def forward(self, x: Tensor, source: Tensor) -> Tensor:
@@ -151,7 +151,7 @@ class QuadtreeLayer(nn.Module):
 
 
 class QuadtreeTransformer(nn.Module):
-    """Self and cross attention in turn; a layer serves both images; cross attention updates both at once."""
+    """Alternating self- and cross-attention. Both images share each layer, which updates both at once."""
 
     def __init__(self, topks: tuple[int, int]) -> None:
         super().__init__()

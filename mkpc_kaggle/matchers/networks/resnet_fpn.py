@@ -15,7 +15,7 @@ STEM, MIDDLE, TOP, FINE = 128, 196, 256, 128  # channels at 1/2, 1/4 and 1/8, an
 class FeatureMaps(NamedTuple):
     """Maps of B images of H x W pixels: ``coarse`` (B, 256, H/8, W/8) and ``fine`` (B, 128, H/2, W/2).
 
-    In the precision of the backbone's weights.
+    Both have the precision of the backbone's weights.
     """
 
     coarse: Tensor
@@ -23,7 +23,7 @@ class FeatureMaps(NamedTuple):
 
 
 class ResidualBlock(nn.Module):
-    """Two 3x3 convolutions with a shortcut, a strided 1x1 convolution where the size changes."""
+    """Two 3x3 convolutions with a shortcut, which is a strided 1x1 convolution where the size changes."""
 
     def __init__(self, inputs: int, outputs: int, stride: int = 1) -> None:
         super().__init__()
@@ -44,7 +44,7 @@ class ResidualBlock(nn.Module):
 
 
 def smoothing(inputs: int, outputs: int) -> nn.Sequential:
-    """Return the convolutions after two levels of the pyramid are merged."""
+    """Return the convolutions that smooth the sum of two pyramid levels."""
     return nn.Sequential(
         nn.Conv2d(inputs, inputs, 3, padding=1, bias=False),
         nn.BatchNorm2d(inputs),
@@ -54,7 +54,7 @@ def smoothing(inputs: int, outputs: int) -> nn.Sequential:
 
 
 class ResNetFpn(nn.Module):
-    """Gray images (B, 1, H, W), float32 in [0, 1], sides multiples of 8 -> :class:`FeatureMaps`."""
+    """The backbone: gray images (B, 1, H, W), float32 in [0, 1], sides multiples of 8 -> :class:`FeatureMaps`."""
 
     def __init__(self) -> None:
         super().__init__()

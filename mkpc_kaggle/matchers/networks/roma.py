@@ -1,7 +1,7 @@
 """RoMa: Edstedt et al., "RoMa: Robust Dense Feature Matching", CVPR 2024.
 
-DKM with other features. The coarse ones are DINOv2's, of patches of 14 x 14 pixels. Checkpoints call their stride
-16, and displacements count them as 16 pixels. Image sizes may differ.
+DKM with other features. The coarse features are DINOv2's, one per patch of 14 x 14 pixels. Checkpoints name this
+stride 16; displacements count a patch as 16 pixels. The two images may differ in size.
 Coordinates are normalised: (x, y) in [-1, 1], where +-1 are the outer edges of an image (see warp_refiner).
 Parameter names match the public checkpoints, DINOv2's under the prefix "dinov2.". For inference only.
 """
@@ -35,10 +35,10 @@ from mkpc_kaggle.matchers.networks.warp_refiner import (
 
 COARSEST = 16
 REFINERS = SHAPES | {1: WarpRefinerShape(9, 6, None, 24)}
-DISPLACEMENT, TRAINED_SIDE = 1.25, 560  # the factor of displacements in a square of this side
+DISPLACEMENT, TRAINED_SIDE = 1.25, 560  # the factor of displacements in a square image of this side
 
 SIDE = 64  # of the grid of anchors, for any image shape
-BLOCKS, HEADS, EPSILON = 5, 8, 1e-5  # of the coarse decoder; the last of its norms
+BLOCKS, HEADS, EPSILON = 5, 8, 1e-5  # of the coarse decoder; EPSILON is for its norms
 
 
 class RoMa(DenseNetwork):
@@ -70,7 +70,7 @@ class RomaDecoder(WarpDecoder):
         self.conv_refiner = nn.ModuleDict({str(s): WarpRefiner(shape) for s, shape in REFINERS.items()})
 
     def projected(self, levels: Sequence[Tensor]) -> Pyramid:
-        """Return features at strides 1, 2, 4, ..., projected for all later steps."""
+        """Return features at strides 1, 2, 4, ..., projected to the decoder's channels."""
         return Pyramid(tuple(self.proj[str(2**i)](features) for i, features in enumerate(levels)))
 
     @property
@@ -107,7 +107,7 @@ class Projection(nn.Sequential):
 
 
 def stretch(size: torch.Size) -> float:
-    """Return the factor of displacements in an image (H, W), which keeps their scale in pixels at any size."""
+    """Return the factor of displacements for an image (H, W). It keeps their scale in pixels at any size."""
     return DISPLACEMENT * sqrt(size.numel()) / TRAINED_SIDE
 
 
@@ -121,7 +121,7 @@ class AnchorDecoder(nn.Module):
         self.to_out = ExactLinear(width, SIDE**2 + 1)
 
     def forward(self, posterior: Tensor, features: Tensor) -> WarpEstimate:
-        """Map the query's maps (B, C, h, w) and (B, C', h, w), C + C' the width, to the first estimate."""
+        """Map posterior (B, C, h, w) and features (B, C', h, w), C + C' = width, to the first estimate."""
         x = torch.cat([tokens(posterior), tokens(features)], dim=2)  # (B, h w, C + C')
         for block in self.blocks:
             x = block(x)
@@ -132,10 +132,10 @@ class AnchorDecoder(nn.Module):
 
 
 def anchor_mean(logits: Tensor) -> Tensor:
-    """Return the mean position (..., 2) of the best anchor of (..., 4096) and its four neighbours.
+    """Return the mean position (..., 2) of the best anchor by logits (..., 4096) and of its four neighbours.
 
-    As in training, neighbours are 1 or 64 indices away, also across the ends of rows, and clamped to the first and
-    last anchor. Weights are probabilities.
+    Anchors are weighted by probability. As in training, neighbours are 1 or 64 indices away, also across the ends
+    of rows; indices are clamped to the first and last anchor.
     """
     best = logits.argmax(dim=-1, keepdim=True)
     offsets = torch.tensor([-1, 0, 1, -SIDE, SIDE], device=logits.device)

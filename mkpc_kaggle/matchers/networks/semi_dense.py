@@ -1,6 +1,6 @@
 """The shared parts of LoFTR, QuadTree and ASpanFormer: all except their coarse transformers.
 
-Backbone, coarse transformer, dual softmax of all pairs of coarse cells, refinement in fine windows.
+In order: backbone, coarse transformer, dual softmax of all pairs of coarse cells, refinement in fine windows.
 """
 
 from abc import ABC, abstractmethod
@@ -30,8 +30,8 @@ WINDOWS_AT_ONCE = 1024
 class SemiDenseNetwork(nn.Module, ABC):
     """A semi-dense network for inference only: in evaluation mode, without gradients.
 
-    ``multiple``: both sides of an image must be multiples of it. ``threshold``: a match's confidence is above it.
-    ``border``: coarse cells along the border of an image that get no match.
+    ``multiple``: both sides of an image must be multiples of it. Confidences of matches exceed ``threshold``.
+    ``border``: the width, in coarse cells, of the margin of an image without matches.
     """
 
     multiple: int
@@ -63,7 +63,7 @@ class SemiDenseNetwork(nn.Module, ABC):
     def match(
         self, features0: FeatureMaps, features1: FeatureMaps, masks: Masks | None = None
     ) -> SemiDenseMatches:
-        """Match a pair; ``masks``: (1, H/8, W/8) bool of each image, True at its content at the top left."""
+        """Match a pair; each image's mask (1, H/8, W/8) bool is True at the content, top left."""
         grids = self.transform(features0.coarse, features1.coarse, masks)
         check_finite("coarse features", *grids)
         (grid0,), (grid1,) = grids  # (h, w, 256)
@@ -74,7 +74,7 @@ class SemiDenseNetwork(nn.Module, ABC):
         return SemiDenseMatches(coarse, points0, points1 + offsets * REACH)
 
     def refine(self, coarse: Assignment, fine0: Tensor, fine1: Tensor, grid0: Tensor, grid1: Tensor) -> Tensor:
-        """Return (M, 2): the offset of each match from its coarse cell's corner in image 1, see fine_matching."""
+        """Return offsets (M, 2) of matches from their cells' corners in image 1, in units of :data:`REACH`."""
         found = []
         for cells in zip(*(torch.split(x, WINDOWS_AT_ONCE) for x in (coarse.index0, coarse.index1)), strict=True):
             windows0, windows1 = (

@@ -25,7 +25,7 @@ LAYERS = 18  # of the graph network: self, cross, self, cross, ...
 
 
 class Pointwise(nn.Conv1d):
-    """A linear map of channels, (..., in) to (..., out), whose weight is a convolution's, (out, in, 1)."""
+    """A linear map of channels, (..., in) to (..., out), with a convolution's weight (out, in, 1)."""
 
     def __init__(self, channels_in: int, channels_out: int) -> None:
         super().__init__(channels_in, channels_out, kernel_size=1)
@@ -35,9 +35,9 @@ class Pointwise(nn.Conv1d):
 
 
 def pointwise_network(*channels: int) -> nn.Sequential:
-    """Make linear maps between these numbers of channels, batch norm and ReLU between them.
+    """Make linear maps between these numbers of channels, with batch norm and ReLU between the maps.
 
-    For (..., C), once the norms are folded: a batch norm would take another axis for the channels.
+    Inputs are (..., C). Fold the norms first: a batch norm would take another axis for the channels.
     """
     steps: list[nn.Module] = []
     for width_in, width_out in pairwise(channels[:-1]):
@@ -54,9 +54,9 @@ class SuperGlueAttention(nn.Module):
         self.merge = Pointwise(CHANNELS, CHANNELS)
 
     def forward(self, x: Tensor, n0: int, *, cross: bool) -> Tensor:
-        """Return messages (1, N, 256) to the keypoints ``x`` (1, N, 256); the first ``n0`` are image 0's.
+        """Return messages (1, N, 256) to the keypoints ``x`` (1, N, 256); the first ``n0`` belong to image 0.
 
-        The sources are keypoints of the same image, or of the other one with ``cross``.
+        Messages come from keypoints of the same image, or with ``cross`` from those of the other image.
         """
         # Reordering channels by head costs less in the weights than in all keypoints.
         maps = cast("Iterable[nn.Conv1d]", self.proj)
@@ -84,7 +84,7 @@ class SuperGlueLayer(nn.Module):
         self.mlp = pointwise_network(2 * CHANNELS, 2 * CHANNELS, CHANNELS)
 
     def forward(self, x: Tensor, n0: int) -> Tensor:
-        """Update the keypoints ``x`` (1, N, 256); the first ``n0`` are image 0's."""
+        """Update the keypoints ``x`` (1, N, 256); the first ``n0`` belong to image 0."""
         message = self.attn(x, n0, cross=self.cross)
         change: Tensor = self.mlp(torch.cat([x, message], dim=2))
         return x + change
@@ -93,7 +93,7 @@ class SuperGlueLayer(nn.Module):
 class SuperGlue(nn.Module):
     """Keypoint encoder, graph network, optimal transport; for inference only.
 
-    Defaults as in published results. Scores of matches are above ``match_threshold``.
+    Defaults are as in the published results. Scores of matches exceed ``match_threshold``.
     """
 
     def __init__(self, sinkhorn_iterations: int = 20, match_threshold: float = 0.2) -> None:
@@ -108,7 +108,7 @@ class SuperGlue(nn.Module):
         self.eval().requires_grad_(False)
 
     def forward(self, image0: SuperPointKeypoints, image1: SuperPointKeypoints) -> Assignment:
-        """Match the keypoints of both images; no keypoints give no matches."""
+        """Match the keypoints of both images; no matches if an image has no keypoints."""
         n0, n1 = len(image0.points), len(image1.points)
         if n0 == 0 or n1 == 0:
             return Assignment.empty(image0.points.device)
@@ -140,7 +140,7 @@ def _by_head(rows: Tensor) -> Tensor:
 
 
 def normalise_points(points: Tensor, size: Size) -> Tensor:
-    """Move the origin of points to the image's middle, in units of 0.7 times its longer side; float32."""
+    """Return points from the image's middle, in units of 0.7 times the image's longer side, float32."""
     middle = torch.tensor([size.width / 2, size.height / 2], device=points.device)
     return (points.float() - middle) / (0.7 * max(size))
 
@@ -149,9 +149,9 @@ def log_optimal_transport(scores: Tensor, bin_score: Tensor, iterations: int) ->
     """Return the logarithms of Sinkhorn's plan (B, m + 1, n + 1) float32 for scores (B, m, n); dustbins are last.
 
     Each keypoint has mass 1. The other image's dustbin can take the mass of all keypoints. An iteration scales the
-    rows, then the columns to their masses.
+    rows to their masses, then the columns.
 
-    The potentials u and v are added to the scores, so that nothing leaves float32's range.
+    Adding the potentials u and v to the scores keeps all values in float32's range.
     """
     batch, m, n = scores.shape
     couplings = bin_score.float().expand(batch, m + 1, n + 1).clone()

@@ -20,9 +20,9 @@ SUPPRESSION_ROUNDS = 2  # each recovers points that only suppressed points excee
 
 class SuperPointKeypoints(NamedTuple):
     """K keypoints of one image, all float32: ``points`` (K, 2), whole pixels (x, y); ``scores`` (K,) in 0..1;
-    ``descriptors`` (K, 256), unit vectors, one a row; ``size`` of the image.
+    ``descriptors`` (K, 256), unit vectors; ``size`` of the image.
 
-    Ordered by descending score if ``max_keypoints`` was reached, else by row and column.
+    Ordered by descending score if there were more than ``max_keypoints``, else by row and column.
     """
 
     points: Tensor
@@ -35,8 +35,8 @@ class SuperPoint(nn.Module):
     """A shared trunk of eight convolutions, a detector head (Pa, Pb) and a descriptor head (Da, Db).
 
     ``nms_radius``: half the suppression window, in pixels. Scores are above ``keypoint_threshold``.
-    ``max_keypoints``: the number to keep, -1 for all. ``border``: the width in pixels of the strip along the
-    border without keypoints. SuperGlue's published results use 3, 0.005, 2048, 4 outdoors and 4, 0.005, 1024, 4
+    ``max_keypoints``: the number to keep, -1 for all. ``border``: the width in pixels of a margin without
+    keypoints. SuperGlue's published results use, in this order, 3, 0.005, 2048, 4 outdoors and 4, 0.005, 1024, 4
     indoors. For inference only.
     """
 
@@ -65,9 +65,9 @@ class SuperPoint(nn.Module):
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # missing in torch's stubs
 
     def forward(self, image: Tensor) -> list[SuperPointKeypoints]:
-        """Return the keypoints of each ``image`` of (B, 1, H, W), gray in 0..1; none where a side is below 8.
+        """Return the keypoints of each of the images (B, 1, H, W), gray in 0..1; none if a side is below 8.
 
-        Sides beyond a multiple of 8 have no keypoints in their last rows and columns.
+        Rows and columns beyond the last multiple of 8 have no keypoints.
         """
         batch, _, height, width = image.shape
         size = Size(width, height)
@@ -85,20 +85,20 @@ class SuperPoint(nn.Module):
         return found
 
     def features(self, image: Tensor) -> Tensor:
-        """Return the trunk's (B, 128, h, w) of (B, 1, H, W), with h = floor(H / 8) and w = floor(W / 8)."""
+        """Return the trunk's output (B, 128, h, w) for (B, 1, H, W), with h = floor(H / 8), w = floor(W / 8)."""
         x = image.to(self.conv1a.weight.dtype)
         for first, second in ((self.conv1a, self.conv1b), (self.conv2a, self.conv2b), (self.conv3a, self.conv3b)):
-            # Pooling first: the ReLU has a quarter of the values.
+            # Pool first, so that the ReLU has a quarter of the values.
             x = torch.relu_(functional.max_pool2d(second(torch.relu_(first(x))), 2))
         return torch.relu_(self.conv4b(torch.relu_(self.conv4a(x))))
 
     def logits(self, features: Tensor) -> Tensor:
-        """Return the detector head's (B, 65, h, w): the 64 pixels of a cell row by row and "no keypoint"."""
+        """Return logits (B, 65, h, w) of detection: a cell's 64 pixels row by row, then "no keypoint"."""
         logits: Tensor = self.convPb(torch.relu_(self.convPa(features)))
         return logits
 
     def descriptor_field(self, features: Tensor) -> Tensor:
-        """Return the descriptor head's (B, 256, h, w): one vector a cell, of any length."""
+        """Return the descriptor head's output (B, 256, h, w): one vector per cell, of any length."""
         field: Tensor = self.convDb(torch.relu_(self.convDa(features)))
         return field
 
@@ -138,7 +138,7 @@ def suppress_non_maxima(scores: Tensor, radius: int) -> Tensor:
 
 
 def window_maximum(values: Tensor, radius: int) -> Tensor:
-    """Return the maximum over (2 radius + 1)^2 pixels about each of ``values`` (B, H, W), axis by axis."""
+    """Return the maximum over (2 radius + 1)^2 pixels around each of ``values`` (B, H, W), axis by axis."""
     window = 2 * radius + 1
     columns = functional.max_pool2d(values[:, None], (window, 1), 1, (radius, 0))
     return functional.max_pool2d(columns, (1, window), 1, (0, radius))[:, 0]

@@ -34,12 +34,12 @@ class Vgg(nn.Module):
     def forward(self, image: Tensor) -> list[Tensor]:
         """Return features (B, C, h, w) at strides 1, 2, 4 and 8 of images (B, 3, H, W), before the next pooling.
 
-        Sides of at least 8; every halving rounds down.
+        Sides of images are at least 8; every halving rounds down.
         """
         return list(self.levels(image))
 
     def levels(self, image: Tensor) -> Iterator[Tensor]:
-        """Yield the same one by one, so that not all of them are in memory."""
+        """Yield the features of :meth:`forward` one by one, so that not all of them are in memory."""
         first = next(self.parameters())
         x = image.to(first.dtype).contiguous(memory_format=torch.channels_last)
         pools = [i for i, layer in enumerate(self.layers) if isinstance(layer, nn.MaxPool2d)]

@@ -1,4 +1,4 @@
-"""Warp refiners, DKM's and RoMa's, and their local correlation (Edstedt et al. 2023, section 3.3).
+"""The warp refiners of DKM and RoMa, and their local correlation (Edstedt et al. 2023, section 3.3).
 
 Normalised coordinates are (x, y) in [-1, 1]; +-1 are the outer edges of an image. In an image of w x h the centre
 of pixel (column j, row i) is ((2 j + 1) / w - 1, (2 i + 1) / h - 1).
@@ -18,7 +18,7 @@ HIDDEN_BLOCKS = 8
 
 
 class WarpRefinerShape(NamedTuple):
-    """Channels: ``features`` of either image, ``embedding`` of the displacement; ``radius`` of the correlation."""
+    """Channels of each image's ``features``, the displacement's ``embedding``, inside; correlation ``radius``."""
 
     features: int
     embedding: int
@@ -61,14 +61,14 @@ class WarpRefiner(nn.Module):
         self.disp_emb = ExactConv2d(2, shape.embedding, 1)
 
     def forward(self, query: Tensor, support: Tensor, flow: Tensor, stretch: float = 1) -> Tensor:
-        """Return corrections (B, 3, h, w) of features (B, C, h, w), (B, C, h', w') and a flow (B, 2, h, w).
+        """Return corrections (B, 3, h, w) of a flow (B, 2, h, w), from features (B, C, h, w) and (B, C, h', w').
 
-        The network's displacements are multiplied by ``stretch``. Channel 0 is added to the certainty's logit;
-        1 and 2 are x and y in eighths of the query's pixel at this scale, as shares of the image's sides.
+        Displacements are multiplied by ``stretch`` before they are embedded. Channel 0 corrects the certainty's
+        logit; 1 and 2 correct x and y, in eighths of a query pixel at this stride (see :func:`refined`).
         """
         x = self._look(query, support, flow, stretch)  # (B, inputs, h, w)
         for depthwise, norm, _, mix in (self.block1, *self.hidden_blocks):
-            # One variable: at most two maps are in memory at a time.
+            # A single variable, so that at most two maps are in memory at a time.
             x = as_map(pointwise(mix, as_grid(torch.relu_(norm(depthwise(x))))))
         corrections: Tensor = self.out_conv(x.float())
         return corrections
@@ -86,7 +86,7 @@ class WarpRefiner(nn.Module):
 
 
 def refined(estimate: WarpEstimate, corrections: Tensor, stride: int, full: torch.Size) -> WarpEstimate:
-    """Apply a refiner's corrections to the estimate; ``full`` (H, W): the query's size in the same pass."""
+    """Apply a refiner's corrections to the estimate; ``full`` (H, W): the query image's size in this pass."""
     height, width = full
     unit = corrections.new_tensor([stride / (4 * width), stride / (4 * height)])  # an eighth of a pixel
     flow = estimate.flow + corrections[:, 1:] * unit[:, None, None]
@@ -94,13 +94,13 @@ def refined(estimate: WarpEstimate, corrections: Tensor, stride: int, full: torc
 
 
 def local_correlation(query: Tensor, support: Tensor, flow: Tensor, radius: int) -> Tensor:
-    """Return dot products of each pixel's features with the support's around its target, over sqrt(C).
+    """Return dot products, over sqrt(C), of each query pixel's features with the support's around its target.
 
-    (B, C, h, w), (B, C, h', w') and (B, 2, h, w) give (B, (2 radius + 1)^2, h, w), float32. The window's steps are
-    2 / w and 2 / h, one pixel of the query, row by row. The support is zero outside, bilinear between pixels.
+    (B, C, h, w), (B, C, h', w') and (B, 2, h, w) give (B, (2 radius + 1)^2, h, w), float32, windows row by row.
+    Window steps are one pixel of the query: 2 / w and 2 / h. The support is zero outside, bilinear between pixels.
 
-    The product with a bilinear sample is the bilinear sample of products. So products are computed with the whole
-    pixels that a window covers, and then interpolated.
+    The product with a bilinear sample is the bilinear sample of products. So products are computed with all pixels
+    that a window covers, and then interpolated.
     """
     size, size1 = query.shape[2:], support.shape[2:]
     targets = ((as_grid(flow).reshape(-1, 2) + 1) * flow.new_tensor(size1[::-1]) - 1) / 2  # (P, 2) pixels
@@ -120,7 +120,7 @@ def local_correlation(query: Tensor, support: Tensor, flow: Tensor, radius: int)
 def taps(targets: Tensor, length: int, step: float, radius: int) -> tuple[Tensor, Tensor]:
     """Return the pixels (P, K) int64 that the windows of P targets (P,) cover on one axis, and their weights.
 
-    Weights (P, 2 radius + 1, K), at each step of the window, are linear, and zero outside the axis.
+    Weights (P, 2 radius + 1, K) interpolate linearly at each step of a window. Pixels outside the axis get zero.
     """
     steps = torch.arange(-radius, radius + 1, device=targets.device) * step
     first = (targets - radius * step).floor()
@@ -133,7 +133,7 @@ def taps(targets: Tensor, length: int, step: float, radius: int) -> tuple[Tensor
 
 
 def _products(queries: Tensor, keys: Tensor, index: Tensor) -> Tensor:
-    """Return (P, K) dot products of queries (P, C) with their own keys, (N, C) at ``index`` (P, K)."""
+    """Return the dot products (P, K) of queries (P, C) with the keys (N, C) at ``index`` (P, K)."""
     neighbours, channels = index.shape[1], keys.shape[1]
     # The gathered keys of a block fit a processor's cache; a GPU needs few large blocks.
     floats = 2**26 if keys.is_cuda else 2**20
