@@ -56,7 +56,7 @@ def render(surfaces: Sequence[Surface], camera: SizedCamera) -> tuple[FloatImage
         if surface.normal @ (camera.centre - surface.origin) < MIN_DEPTH:
             continue
         rows, columns = _extent(surface, fine)
-        # A (x, y, 1) = (u, v, 1) / depth is affine in the pixel, and is compared without a division.
+        # A (x, y, 1) = (u, v, 1) / depth is affine in the pixel. So comparisons need no division.
         axes = np.column_stack([surface.edge_u, surface.edge_v, surface.origin - fine.centre])
         A = np.linalg.inv(fine.K @ fine.R @ axes).astype(np.float32)
         y, x = (axis.astype(np.float32) for axis in np.ogrid[rows, columns])

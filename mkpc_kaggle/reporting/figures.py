@@ -105,7 +105,7 @@ def _draw_clusters(axes: "Axes", image: Image, match: PairMatch, config: MkpcCon
 def _show(
     axes: "Axes", image: Image, region: CriticalRegion | None, scale: float = 1.0, left: float = 0.0
 ) -> None:
-    """Draw an upright image and its critical region: the corner at (left, 0), pixels ``scale`` wide."""
+    """Draw an image upright, from (left, 0) with pixels ``scale`` wide, and its critical region."""
     from matplotlib.patches import Polygon
 
     view = _upright(image)

@@ -82,7 +82,7 @@ def unit_means(run: Run) -> list[tuple[str, int, float, float, float]]:
 
 
 def unit_reasons(run: Run, field: str = "failure") -> list[str]:
-    """Return reasons with numbers of pairs, the most frequent first: of failures, or of notes for "note"."""
+    """Return the units' failures, or another ``field``, with numbers of pairs, the most frequent first."""
     units = (unit for record in run.records for unit in record.units)
     counts = Counter(f"{unit.unit}: {getattr(unit, field)}" for unit in units if getattr(unit, field))
     return [f"{reason} ({count} pairs)" for reason, count in counts.most_common()]

@@ -38,11 +38,11 @@ def reconstruct_batch(
     """Reconstruct every connected component of a batch, and choose an F for each of its pairs.
 
     With the recipe's prior ``focal``, a pair without an F from cameras is re-estimated at the scene's focal
-    lengths, unless the pair contradicts the scene. With a directory ``export``, the batch is reconstructed as a
-    whole, and COLMAP's files are written to the directory.
+    lengths, unless the pair contradicts the scene. ``magsac`` has default settings if ``None``. With a directory
+    ``export``, the batch is reconstructed as a whole, and COLMAP's files are written there.
 
-    A failed component or pair has a reason; bad matches never raise. Reconstruction takes seconds to minutes and
-    may end the process, see :mod:`mkpc_kaggle.scene.colmap`.
+    A missing result has a reason; bad matches never raise. Reconstruction takes seconds to minutes and may end the
+    process, see :mod:`mkpc_kaggle.scene.colmap`.
     """
     found, shared = reconstruct_sharing(ViewGraph.of_pairs(pairs), config, export)
     models = [{image.image.digest: image for image in model.images} for model in models_of(found)]
