@@ -137,7 +137,7 @@ def _turned_size(size: Size, turns: int) -> Size:
 
 
 def _turned(points: NDArray[np.float64], turns: int, size: Size) -> NDArray[np.float64]:
-    """Rotate (N, 2) points like ``np.rot90(picture, turns)``; ``size`` is the picture's, (0, 0) its corner."""
+    """Rotate (N, 2) points, relative to the top-left corner of a picture of ``size``, like ``np.rot90``."""
     (x, y), (width, height) = points.T, size
     quarters = (x, y), (y, width - x), (width - x, height - y), (height - y, x)
     return np.stack(quarters[turns % 4], axis=1)
