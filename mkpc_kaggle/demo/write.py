@@ -81,7 +81,7 @@ def write_demo(
 
 
 def _claim(demo: DemoSet) -> None:
-    """Mark the directory as a demo set. Raise :class:`UserError` if it has files that `demo` did not write."""
+    """Mark the directory as a demo set. Raise :class:`UserError` if it has data that `demo` did not write."""
     mark = demo.root / MARK
     is_ours = mark.is_file() and mark.read_text(errors="replace") == MARK_TEXT
     for path in () if is_ours else (mark, demo.train_dir, demo.test_dir, demo.truth_csv):

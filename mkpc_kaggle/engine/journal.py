@@ -210,7 +210,7 @@ class Journal(JournalReader):
 
     @saving
     def forget_scene(self, batch: str) -> None:
-        """Delete the scenes of a batch whose exported files are missing or about to be replaced."""
+        """Delete the scenes of a batch whose exported files are missing or were replaced."""
         self._db.execute("DELETE FROM scene WHERE batch = ?", [batch])
 
     @saving

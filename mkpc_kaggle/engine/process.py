@@ -1,8 +1,8 @@
 """Workers on this machine: in a thread of the engine's process, or in separate processes.
 
 No call of the engine blocks: each worker has a thread for blocking calls. A worker process shares no lock, gets
-nothing large through its start-up pipe, and is alone in holding its end of the message pipe. So it may die or be
-killed at any moment: a pending read or write then ends, too.
+nothing large through its start-up pipe, and is alone in holding its end of the message pipe. So it may die, be
+stopped or be killed at any moment: reads and writes that wait for it end with it.
 
 Process pools of the package pebble were rejected. They time jobs by the wall clock, and a worker killed during an
 answer keeps the lock of all others.
