@@ -15,8 +15,8 @@ from mkpc_kaggle.geometry.cameras import Camera
 Floats = NDArray[np.float64]
 FloatImage = NDArray[np.float32]
 
-DEPTH_TOLERANCE = 0.01  # relative; interpolated inverse depth is exact on a plane
-STEP_PX = 3  # every third pixel of every third row suffices for the covisibility
+DEPTH_TOLERANCE = 0.01  # relative; on a plane, interpolating inverse depth is exact
+STEP_PX = 3  # covisibility needs only every third pixel of every third row
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,10 +30,10 @@ class SizedCamera(Camera):
 def look_at(
     position: ArrayLike, target: ArrayLike, focal: float, size: tuple[int, int], roll: float = 0.0
 ) -> SizedCamera:
-    """Return a camera at `position` with `target` in the middle of its image of `size`, (width, height).
+    """Return a camera at `position` whose image of `size` (width, height) has `target` at its centre.
 
-    `focal` is in pixels; `roll` turns the camera clockwise about its axis, in degrees. Position and target
-    are (3,) world points, one not above the other.
+    `focal` is in pixels. `roll`, in degrees, turns the camera clockwise about its axis. Position and target are
+    world points (3,), neither above the other.
     """
     centre = np.asarray(position, dtype=np.float64)
     forward = _unit(np.asarray(target, dtype=np.float64) - centre)
@@ -48,8 +48,8 @@ def look_at(
 def resized(camera: SizedCamera, scale: float) -> SizedCamera:
     """Return the camera of the image resized by `scale`: `x' = (x + 0.5) * scale - 0.5`.
 
-    Sides are rounded to whole pixels and K keeps the exact scale. So the image loses or gains up to half a pixel
-    on the right and at the bottom.
+    Sides are rounded to whole pixels, but K has the exact scale. So the image loses or gains up to half a pixel on
+    the right and at the bottom.
     """
     to_resized = np.array([[scale, 0, (scale - 1) / 2], [0, scale, (scale - 1) / 2], [0, 0, 1]])
     width, height = (max(1, round(side * scale)) for side in (camera.width, camera.height))
@@ -57,14 +57,14 @@ def resized(camera: SizedCamera, scale: float) -> SizedCamera:
 
 
 def project(camera: SizedCamera, points: Floats) -> tuple[Floats, Floats]:
-    """Project world points (N, 3) to pixels (N, 2) and depths (N,); pixels are undefined where depth <= 0."""
+    """Project world points (N, 3) to pixels (N, 2) and depths (N,). Pixels of depth <= 0 are undefined."""
     image = (points @ camera.R.T + camera.t) @ camera.K.T
     depth = image[:, 2]
     return image[:, :2] / np.where(depth == 0, np.finfo(np.float64).tiny, depth)[:, None], depth
 
 
 def unproject(camera: SizedCamera, pixels: Floats, depth: Floats) -> Floats:
-    """Convert pixels (N, 2) and depths (N,) along the camera's axis to world points (N, 3)."""
+    """Convert pixels (N, 2), with depths (N,) along the camera's axis, to world points (N, 3)."""
     rays = np.column_stack([pixels, np.ones(len(pixels))]) @ np.linalg.inv(camera.K).T
     return np.asarray((rays * depth[:, None] - camera.t) @ camera.R, dtype=np.float64)
 
@@ -72,10 +72,10 @@ def unproject(camera: SizedCamera, pixels: Floats, depth: Floats) -> Floats:
 def visible_mask(
     first: SizedCamera, first_depth: FloatImage, second: SizedCamera, second_depth: FloatImage, step: int = 1
 ) -> NDArray[np.bool_]:
-    """Return a bool mask of every `step`-th pixel of `first`: True if `second` shows the same point.
+    """Return a bool mask, True where `second` shows the same point, at every `step`-th pixel of `first`.
 
-    The depths are (H, W) float32 in metres, inf for the sky, which is never shared. A point is not visible
-    outside the second image, behind its camera, or behind a nearer surface.
+    Depths are (H, W) float32 in metres, and inf for the sky, which is never shared. A point is not visible outside
+    the second image, behind the second camera, or behind a nearer surface.
     """
     y, x = np.mgrid[0 : first.height : step, 0 : first.width : step]
     depth = first_depth[::step, ::step].astype(np.float64)
@@ -93,7 +93,7 @@ def visible_mask(
 def covisibility(
     first: SizedCamera, first_depth: FloatImage, second: SizedCamera, second_depth: FloatImage
 ) -> float:
-    """Return the smaller of two fractions, each of a view that is visible in the other: symmetric, in [0, 1]."""
+    """Return the smaller fraction of one view visible in the other, in [0, 1]; the order does not matter."""
     ways = ((first, first_depth, second, second_depth), (second, second_depth, first, first_depth))
     return min(float(visible_mask(*way, STEP_PX).mean()) for way in ways)
 

@@ -1,4 +1,4 @@
-"""A renderer of textured rectangles: the nearest one per ray, 3 x 3 rays per pixel."""
+"""A renderer of textured rectangles: 3 x 3 rays per pixel, each showing the nearest rectangle."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from mkpc_kaggle.demo.camera import FloatImage, Floats, SizedCamera, project, re
 
 Picture = NDArray[np.uint8]
 
-RAYS = 3  # along each axis of a pixel; odd, so that one of them is the pixel's centre
+RAYS = 3  # along each axis of a pixel; odd, so that one ray passes through the pixel's centre
 SUN = np.array([0.41, -0.51, 0.76])  # the direction towards the light
 AMBIENT, DIFFUSE = 0.72, 0.38
 SKY = (210, 180, 145)  # BGR
@@ -22,8 +22,8 @@ MIN_DEPTH = 1e-3  # metres
 class Surface:
     """The points `origin + u edge_u + v edge_v` for u, v in [0, 1], each (3,) float64 in metres.
 
-    The texture is (H, W, 3) uint8 BGR; its first row is at v = 0. It is seen from the front alone, from where
-    `edge_u` points right and `edge_v` down.
+    The texture is (H, W, 3) uint8 BGR, with its first row at v = 0. A surface is visible only from its front,
+    where `edge_u` points right and `edge_v` down.
     """
 
     origin: Floats
@@ -39,15 +39,15 @@ class Surface:
 
     @property
     def shaded(self) -> Picture:
-        """The texture in the light, (H, W, 3) uint8 BGR."""
+        """The texture in sunlight, (H, W, 3) uint8 BGR."""
         shade = AMBIENT + DIFFUSE * max(0.0, float(self.normal @ SUN))
         return np.asarray(cv2.convertScaleAbs(self.texture, alpha=shade), np.uint8)
 
 
 def render(surfaces: Sequence[Surface], camera: SizedCamera) -> tuple[FloatImage, FloatImage]:
-    """Render a view: image (H, W, 3) float32 BGR in 0..255 and depth (H, W) float32 along the camera's axis.
+    """Render an image (H, W, 3) float32 BGR in 0..255, and depth (H, W) float32 along the camera's axis.
 
-    Depth is measured at the pixel's centre, in metres; inf for the sky.
+    Depth is measured at pixel centres, in metres. The sky's depth is inf.
     """
     fine = resized(camera, RAYS)
     image = np.full((fine.height, fine.width, 3), SKY, np.uint8)
@@ -56,7 +56,7 @@ def render(surfaces: Sequence[Surface], camera: SizedCamera) -> tuple[FloatImage
         if surface.normal @ (camera.centre - surface.origin) < MIN_DEPTH:
             continue
         rows, columns = _extent(surface, fine)
-        # A (x, y, 1) = (u, v, 1) / depth, which is affine in the pixel; comparing it needs no division.
+        # A (x, y, 1) = (u, v, 1) / depth is affine in the pixel. So comparisons need no division.
         axes = np.column_stack([surface.edge_u, surface.edge_v, surface.origin - fine.centre])
         A = np.linalg.inv(fine.K @ fine.R @ axes).astype(np.float32)
         y, x = (axis.astype(np.float32) for axis in np.ogrid[rows, columns])
@@ -76,7 +76,7 @@ def render(surfaces: Sequence[Surface], camera: SizedCamera) -> tuple[FloatImage
 
 
 def _extent(surface: Surface, camera: SizedCamera) -> tuple[slice, slice]:
-    """Return the rows and columns that the surface can touch: all of them if it passes the camera."""
+    """Return the rows and columns that a surface can touch; all if the surface reaches behind the camera."""
     corners = [surface.origin + i * surface.edge_u + j * surface.edge_v for i in (0, 1) for j in (0, 1)]
     pixels, depth = project(camera, np.array(corners))
     size = (camera.width, camera.height)

@@ -1,4 +1,4 @@
-"""The worlds: a ground, three walls and boxes with drawn textures, and their views."""
+"""Worlds of a ground, three walls and boxes with drawn textures, and their cameras."""
 
 from itertools import product
 
@@ -11,9 +11,9 @@ from mkpc_kaggle.demo.render import Picture, Surface
 
 Colour = tuple[int, int, int]  # BGR
 
-SCENES = {"courtyard": 2.5, "market": 1.0}  # metres per unit of length in the files
+SCENES = {"courtyard": 2.5, "market": 1.0}  # metres per unit of the written poses
 
-TEXELS = 72  # a metre
+TEXELS = 72  # per metre
 STONE, BRICK, PLASTER, PAVING = (150, 175, 190), (85, 105, 165), (150, 200, 215), (128, 136, 140)
 GLASS, FRAME = (75, 70, 60), (205, 215, 220)
 WINDOW_M, WINDOW_STEP_M = (1.3, 1.9), 3.1
@@ -33,7 +33,7 @@ SHOTS = (
 
 
 def build_world(name: str, *, seed: int = 0, image_scale: float = 1.0) -> tuple[list[Surface], list[SizedCamera]]:
-    """Return the surfaces and cameras of a world, in metres. Its name and the seed alone decide its content."""
+    """Return the surfaces and cameras of a world, in metres. Only the name and the seed decide its content."""
     rng = np.random.default_rng([seed, *name.encode()])
     surfaces, cameras = _surfaces(rng), []
     for position, target, focal, size, roll in SHOTS:
@@ -44,7 +44,7 @@ def build_world(name: str, *, seed: int = 0, image_scale: float = 1.0) -> tuple[
 
 
 def _surfaces(rng: np.random.Generator) -> list[Surface]:
-    """Return surfaces in metres: x to the east, y to the north wall at 20, z up from the ground."""
+    """Return surfaces in metres: x points east, y north (the north wall is at 20), z up from the ground."""
     surfaces = [
         quad((-20, 20, 0), (20, 20, 0), (-20, -14, 0), paint(rng, 40, 34, PAVING, is_stone=True)),
         quad((-14, 20, 10), (14, 20, 10), (-14, 20, 0), facade(rng, 28, 10, STONE)),
@@ -59,9 +59,9 @@ def _surfaces(rng: np.random.Generator) -> list[Surface]:
 
 
 def box(rng: np.random.Generator, centre: Floats, size: Floats, yaw: float) -> list[Surface]:
-    """Return four sides and the top of a painted box on the ground.
+    """Return the four sides and the top of a painted box on the ground.
 
-    `centre` is (x, y), `size` is (width, depth, height), `yaw` in degrees.
+    `centre` is (x, y), `size` is (width, depth, height), `yaw` is in degrees.
     """
     width, depth, height = size.tolist()
     cos, sin = np.cos(np.radians(yaw)), np.sin(np.radians(yaw))
@@ -80,7 +80,7 @@ def box(rng: np.random.Generator, centre: Floats, size: Floats, yaw: float) -> l
 
 
 def quad(top_left: ArrayLike, top_right: ArrayLike, bottom_left: ArrayLike, picture: Picture) -> Surface:
-    """Return the rectangle with these corners, (3,), as seen from its front."""
+    """Return the rectangle with these corners (3,), named as seen from the front."""
     corner = np.asarray(top_left, dtype=np.float64)
     return Surface(corner, np.subtract(top_right, corner), np.subtract(bottom_left, corner), picture)
 
@@ -97,7 +97,7 @@ def paint(
     picture = np.full((height, width, 3), colour, dtype=np.uint8)
     contrast, max_side_m = (0.06, 1.2) if is_stone else (0.4, 0.9)
     count = width * height // 60
-    # The density of sizes falls with the third power, so the texture looks alike at every scale.
+    # The density of sizes falls with their third power, so the texture looks alike at every scale.
     lengths = np.sort(3 / np.sqrt(rng.uniform((3 / (max_side_m * scale)) ** 2, 1, count)))[::-1]
     sides = lengths[:, None] * np.column_stack([np.ones(count), rng.uniform(0.3, 0.6 if is_stone else 1, count)])
     centres, angles = rng.uniform((0, 0), (width, height), (count, 2)), rng.uniform(0, 180, count)

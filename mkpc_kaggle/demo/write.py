@@ -1,4 +1,4 @@
-"""The demo set on disk, in the layout of the competition's train and test sides."""
+"""The demo set on disk, in the layout of the competition's train and test data."""
 
 import hashlib
 import os
@@ -17,7 +17,7 @@ from mkpc_kaggle.demo.world import SCENES, build_world
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.cameras import fundamental_of_cameras
 
-MIN_COVISIBILITY = 0.1  # the competition scores pairs from this value on
+MIN_COVISIBILITY = 0.1  # minimum of a pair that the competition scores
 TEST_PAIRS = 8  # per scene
 MARK = "demo.txt"
 MARK_TEXT = "Rendered by mkpc_kaggle. The command `demo` replaces train/, test/ and test_truth.csv.\n"
@@ -25,7 +25,7 @@ MARK_TEXT = "Rendered by mkpc_kaggle. The command `demo` replaces train/, test/ 
 
 @dataclass(frozen=True)
 class DemoSet:
-    """The folders of a demo set; `truth_csv` lists the train pictures of each test pair."""
+    """The folders of a demo set; `truth_csv` names the train images of each test pair."""
 
     root: Path
     train_dir: Path
@@ -53,10 +53,10 @@ class DemoPair(NamedTuple):
 def write_demo(
     directory: Path, *, seed: int = 0, scenes: Sequence[str] | None = None, image_scale: float = 1.0
 ) -> DemoSet:
-    """Render the scenes (all of them by default) and write both sides under `directory`.
+    """Render the scenes, by default all, and write their train and test data under `directory`.
 
     The same arguments give the same bytes. `image_scale` scales all images and their K.
-    Raises :class:`UserError` if the directory has a train or test side that no demo wrote.
+    Raises :class:`UserError` if `directory` has train or test data that `demo` did not write.
     """
     demo = DemoSet(directory, directory / "train", directory / "test", directory / "test_truth.csv")
     _claim(demo)
@@ -81,7 +81,7 @@ def write_demo(
 
 
 def _claim(demo: DemoSet) -> None:
-    """Mark the directory as a demo set's; raise :class:`UserError` if it has another's files."""
+    """Mark the directory as a demo set. Raise :class:`UserError` if it has data that `demo` did not write."""
     mark = demo.root / MARK
     is_ours = mark.is_file() and mark.read_text(errors="replace") == MARK_TEXT
     for path in () if is_ours else (mark, demo.train_dir, demo.test_dir, demo.truth_csv):
@@ -92,7 +92,7 @@ def _claim(demo: DemoSet) -> None:
 
 
 def take_photographs(scene: str, seed: int, image_scale: float) -> list[Photograph]:
-    """Render the views of the scene's cameras, each with its own exposure, tint and noise."""
+    """Render the view of each camera of a scene, with its own exposure, tint and noise."""
     photographs = []
     surfaces, cameras = build_world(scene, seed=seed, image_scale=image_scale)
     for number, camera in enumerate(cameras):
@@ -103,7 +103,7 @@ def take_photographs(scene: str, seed: int, image_scale: float) -> list[Photogra
 
 
 def _developed(image: FloatImage, rng: np.random.Generator) -> Picture:
-    """Convert (H, W, 3) float32 in 0..255 to uint8 with exposure, tint and noise, without changing geometry."""
+    """Convert an image (H, W, 3) float32 in 0..255 to uint8, with exposure, tint and noise."""
     gain, gamma, balance = rng.uniform(0.75, 1.25), rng.uniform(0.85, 1.2), rng.uniform(0.93, 1.07, 3)
     light = np.clip(image * (balance * gain / 255).astype(np.float32), 0, 1) ** np.float32(gamma)
     blurred = cv2.GaussianBlur(light, (5, 5), float(rng.uniform(0.3, 0.7)))
@@ -112,7 +112,7 @@ def _developed(image: FloatImage, rng: np.random.Generator) -> Picture:
 
 
 def _selected(pairs: Sequence[DemoPair]) -> list[DemoPair]:
-    """Select the test side's pairs: scored ones, spread evenly over covisibility."""
+    """Select the test pairs among scored pairs, spread evenly over the ranks of covisibility."""
     scored = sorted((p for p in pairs if p.covisibility >= MIN_COVISIBILITY), key=lambda p: p.covisibility)
     chosen = np.linspace(0, len(scored) - 1, min(TEST_PAIRS, len(scored))).round().astype(int)
     return [scored[index] for index in chosen]
@@ -135,7 +135,7 @@ def _write_train(
 
 
 def _write_test(directory: Path, scene: str, pairs: Sequence[DemoPair], seed: int) -> Iterator[tuple[str, str]]:
-    """Write the images of one batch; yield each pair's rows of test.csv and test_truth.csv."""
+    """Write the images of one batch. Yield each pair's row of test.csv and its row of test_truth.csv."""
     batch = _digest(f"{seed}/{scene}")[:8]
     photographs = {each.name: each for pair in pairs for each in pair[:2]}
     hidden = {name: _digest(f"{seed}/{scene}/{name}")[:32] for name in photographs}

@@ -1,7 +1,7 @@
-"""Workers on a Ray cluster: an actor for each GPU, or for each machine without GPUs; Ray places them.
+"""Workers on a Ray cluster. Ray places an actor on each GPU, or on each machine if no GPU is used.
 
-The test set and the weights have the same paths on every machine, as on clusters with a shared file system. If the
-parent's machine or Ray's head fails, the same command resumes from the journal.
+The test set and the weights must have the same paths on every machine, as with a shared file system. If the
+parent's machine or Ray's head node fails, the same command resumes from the journal.
 """
 
 import os
@@ -30,9 +30,9 @@ REACH_TIMEOUT_S = 5.0
 
 
 def parse_workers(text: str) -> int | str:
-    """Parse the value of ``--workers``: a number, or a cluster's name as it is.
+    """Parse the value of ``--workers``: return a number, or a cluster's name unchanged.
 
-    Raises :class:`UserError` with the accepted forms for any other text.
+    Raises :class:`UserError` with the accepted forms if the text has none of them.
     """
     if not re.fullmatch(r"\d{1,3}|ray(://[^/\s]+:\d{1,5})?", text):
         raise UserError(f"--workers: {text!r} is none of: {FORMS}")
@@ -40,9 +40,9 @@ def parse_workers(text: str) -> int | str:
 
 
 class RaySite(Site):
-    """Machines of a cluster, which is joined when the site is opened: see :func:`join`.
+    """Places on the machines of a cluster, which :meth:`open` joins; see :func:`join`.
 
-    Each must have the weights and the ``folders``, which hold the images. Raises :class:`UserError` where Ray is
+    Each machine must have the weights, and the ``folders`` with the images. Raises :class:`UserError` if Ray is
     not installed.
     """
 
@@ -50,7 +50,7 @@ class RaySite(Site):
         self, assembly: Assembly, cluster: str, clock: Callable[[], float], folders: Iterable[Path]
     ) -> None:
         super().__init__(clock)
-        # Read when Ray is imported: it must not report usage, and not start a cluster after it was shut down.
+        # Ray reads these on import. It must not report usage, or start a cluster after its shutdown.
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
         os.environ.setdefault("RAY_ENABLE_AUTO_CONNECT", "0")
         try:
@@ -73,7 +73,7 @@ class RaySite(Site):
             for number in range(gpus):
                 self._add(f"gpu {number}", make, num_gpus=1)
         else:
-            for number, node in enumerate(machines):  # several may have the same name
+            for number, node in enumerate(machines):  # several machines may have the same name
                 cores = int(node["Resources"]["CPU"])
                 make = partial(MatchRunner, self._assembly.pipeline, threads=cores)
                 self._add(f"machine {number} ({node['NodeManagerHostname']})", make, num_cpus=cores)
@@ -83,13 +83,13 @@ class RaySite(Site):
     def close(self) -> None:
         if self._has_joined and self._ray.is_initialized():
             until = time.monotonic() + EXIT_TIMEOUT_S
-            for worker in self._workers:  # they have been killed, and their threads end soon
+            for worker in self._workers:  # killed already; the threads end soon
                 if worker.thread.is_alive():
                     worker.thread.join(max(0.0, until - time.monotonic()))
             self._ray.shutdown()
 
     def _add(self, name: str, make: Maker, **where: float) -> None:
-        """Add a place whose workers Ray places by these resources."""
+        """Add a place for workers that need these resources of Ray."""
         make = partial(make_alike, make, __version__, self._needed)
 
         def worker() -> RayWorker:
@@ -100,7 +100,7 @@ class RaySite(Site):
 
 
 class RayWorker(ThreadWorker):
-    """An actor that Ray places by the resources in ``where``. The thread waits for its answers."""
+    """A worker in a Ray actor with the resources ``where``. The thread waits for the actor's answers."""
 
     _actor: Any = None
 
@@ -112,7 +112,7 @@ class RayWorker(ThreadWorker):
 
     def kill(self) -> None:
         super().kill()
-        with suppress(self._ray.exceptions.RayError, ValueError):  # the cluster may be gone, its actors with it
+        with suppress(self._ray.exceptions.RayError, ValueError):  # the cluster may be gone, and the actor, too
             if self._actor is not None:
                 self._ray.kill(self._actor)
 
@@ -125,7 +125,7 @@ class RayWorker(ThreadWorker):
             answer: Answer = self._ray.get(self._actor.answer.remote(message))
         except self._ray.exceptions.RayError as error:
             is_memory = isinstance(error, self._ray.exceptions.OutOfMemoryError)
-            # Ray's text, without its own ids
+            # Ray's message, without lines of Ray's ids
             lines = [line for line in str(error).splitlines() if not re.match(r"\t\w+: ", line)]
             reason = textwrap.shorten(" ".join(lines[1:] or lines), 240)
             return Failure(Cause.OUT_OF_MEMORY if is_memory else Cause.DIED, reason)
@@ -133,7 +133,7 @@ class RayWorker(ThreadWorker):
 
 
 def make_alike(make: Maker, version: str, paths: tuple[Path, ...]) -> Runner:
-    """Return ``make()`` on a machine of the cluster. Raise :class:`UserError` if it differs from the parent's."""
+    """Return ``make()`` on a machine of the cluster. Raise :class:`UserError` if version or paths differ."""
     host = socket.gethostname()
     if version != __version__:
         raise UserError(f"mkpc-kaggle is {__version__} on {host} and {version} here: install the same on both")
@@ -146,14 +146,14 @@ def make_alike(make: Maker, version: str, paths: tuple[Path, ...]) -> Runner:
 def join(ray: Any, cluster: str) -> None:
     """Connect to a cluster, ``ray`` or ``ray://HOST:PORT``. Raise :class:`UserError` if that fails.
 
-    ``ray``: the cluster that runs on this machine, or else a new cluster, which ends with the run. HOST:PORT is
-    what ``ray start --head`` prints; this machine must belong to that cluster.
+    ``ray`` is the cluster that runs on this machine, or else a new cluster, which ends with the run. ``ray start
+    --head`` prints HOST:PORT. This machine must belong to the cluster at this address.
     """
     options: dict[str, Any] = {"include_dashboard": False}
     if address := cluster.partition("://")[2]:
         options = {"address": address}
         host, _, port = address.rpartition(":")
-        try:  # Ray itself tries for minutes
+        try:  # Ray itself would try for minutes
             socket.create_connection((host, int(port)), timeout=REACH_TIMEOUT_S).close()
         except (OSError, OverflowError) as error:  # the second: a port above 65535
             reason = getattr(error, "strerror", None) or error

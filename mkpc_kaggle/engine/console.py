@@ -1,9 +1,9 @@
-"""The only place that prints during a run: lines, warnings, progress. It never raises, and never waits in a run.
+"""The only module that prints during a run: lines, warnings, progress. Printing never raises or blocks the run.
 
-A pipe without a reader and a stopped terminal (Ctrl-S) block a write forever, and with it every thread that waits
-for the stream's lock. A terminal that goes away (EIO), a full disk and a closed stream make it fail. Native
-libraries write to the descriptors themselves: libjpeg and libpng complain of a photograph while OpenCV decodes it.
-So threads relay what is written to descriptors 1 and 2, in worker processes, too.
+A pipe without a reader or a stopped terminal (Ctrl-S) blocks a write forever, and with it every thread that waits
+for the stream's lock. A lost terminal (EIO), a full disk or a closed stream makes a write fail. Native libraries
+write to the descriptors directly: libjpeg and libpng print warnings while OpenCV decodes a photograph. So threads
+relay all output to descriptors 1 and 2, in the program and in worker processes.
 """
 
 import multiprocessing
@@ -20,10 +20,10 @@ from typing import NoReturn, TextIO
 
 from mkpc_kaggle.engine.budget import Budget, format_duration
 
-LINE_INTERVAL_S = 30.0  # between lines of progress where a line cannot be drawn again
-MAX_WAITING = 1000  # writes: some minutes of a busy line
-MAX_BYTES = 4096  # of a read
-DRAIN_S = 2.0  # how long the end waits for the remaining text
+LINE_INTERVAL_S = 30.0  # between lines of progress if a line cannot be redrawn in place
+MAX_WAITING = 1000  # writes, which a busy progress line makes in a few minutes
+MAX_BYTES = 4096  # per read
+DRAIN_S = 2.0  # maximum wait at the end for the remaining text to be printed
 
 
 def say(text: str) -> None:
@@ -39,16 +39,16 @@ def complain(text: str) -> None:
 
 
 def _print(text: str, stream: TextIO | None, end: str = "\n") -> None:
-    with suppress(OSError, ValueError):  # gone, full, or closed
+    with suppress(OSError, ValueError):  # lost terminal, full disk, or closed stream
         if stream is not None:
             print(text, file=stream, flush=True, end=end)
 
 
 class Progress:
-    """Progress of a phase in pairs: a line that is drawn again in place on a terminal, occasional lines elsewhere.
+    """Progress of a phase in pairs: a line redrawn in place on a terminal, occasional lines elsewhere.
 
-    The children of a notebook's kernel (``!command``) have a terminal whose text is stored, each state of a line
-    with it. Jupyter marks them with JPY_PARENT_PID.
+    A notebook's ``!command`` has a terminal, but Jupyter stores all its text, including every state of a redrawn
+    line. Jupyter sets JPY_PARENT_PID for these processes.
     """
 
     def __init__(self, budget: Budget, stream: TextIO | None) -> None:
@@ -77,7 +77,7 @@ class Progress:
         self._line = "" if self._erase else self._line
 
     def close(self) -> None:
-        """End the line on a terminal, or print the pending line."""
+        """End the redrawn line on a terminal, or print the pending line elsewhere."""
         if self._line:
             _print("" if self._erase else self._line, self._stream)
             self._line, self._written = "", self._budget.clock()
@@ -85,9 +85,9 @@ class Progress:
 
 @contextmanager
 def unblocked(descriptors: Sequence[int] = (1, 2)) -> Iterator[None]:
-    """Let no write to ``sys.stdout`` and ``sys.stderr`` at these descriptors wait. Print the rest at the end.
+    """Relay ``sys.stdout`` and ``sys.stderr``, so that writes never block. Print the remaining text at the end.
 
-    Streams elsewhere, such as a notebook's, stay as they are.
+    Streams at other descriptors, such as a notebook's, are not changed.
     """
     with ExitStack() as ended:
         for stream in (sys.stdout, sys.stderr):
@@ -101,7 +101,7 @@ def unblocked(descriptors: Sequence[int] = (1, 2)) -> Iterator[None]:
 
 
 def drain(seconds: float = DRAIN_S) -> None:
-    """Print the remaining text, for at most ``seconds``."""
+    """Wait at most ``seconds`` until the remaining text is printed."""
 
     def flush() -> None:
         for stream in filter(None, (sys.stdout, sys.stderr)):
@@ -117,7 +117,7 @@ def drain(seconds: float = DRAIN_S) -> None:
 
 
 def leave(status: int, seconds: float = DRAIN_S) -> NoReturn:
-    """End the process and its children, even stopped ones (SIGSTOP). Printing the rest may take ``seconds``."""
+    """End the process and its children, even if stopped (SIGSTOP). Print remaining text for up to ``seconds``."""
     for child in multiprocessing.active_children():
         child.kill()
     drain(seconds)
@@ -125,22 +125,22 @@ def leave(status: int, seconds: float = DRAIN_S) -> NoReturn:
 
 
 def is_terminal(stream: TextIO | None) -> bool:
-    """Whether a stream ends at a terminal, perhaps behind a relay."""
+    """Return whether a stream writes to a terminal, directly or through a relay."""
     descriptor = _descriptor(stream)
     return os.isatty(_relays[descriptor].sink if descriptor in _relays else descriptor)
 
 
 def _descriptor(stream: TextIO | None) -> int:
-    """Return the descriptor of a stream that a write can block; -1 for another."""
+    """Return the descriptor of a stream whose writes can block, else -1."""
     with suppress(OSError, ValueError, AttributeError):
         return stream.fileno() if stream is not None and sys.platform != "win32" else -1
     return -1
 
 
 class Relay:
-    """Relays text from a descriptor to its file, ``sink``, with two threads: one reads, one prints.
+    """A relay from a descriptor to its original file, ``sink``: one thread reads, another prints.
 
-    Text that does not fit into the queue between them is dropped, and text that the file refuses.
+    Text is dropped if the queue between the threads is full, or if the file refuses the write.
     """
 
     def __init__(self, descriptor: int) -> None:
@@ -154,7 +154,7 @@ class Relay:
             threading.Thread(target=work, name=f"relay {descriptor}", daemon=True).start()
 
     def drain(self, until: float) -> bool:
-        """Wait until all is printed, or that moment of the monotonic clock. Return whether it was."""
+        """Wait until all text is printed, at most until ``until`` on the monotonic clock. Return whether it is."""
         while time.monotonic() < until:
             with self._reading:
                 if not select.select([self._source], [], [], 0)[0] and not self._waiting.unfinished_tasks:
@@ -163,14 +163,14 @@ class Relay:
         return False
 
     def close(self) -> None:
-        """Give the descriptor its file back, unless that is stuck: later text must not wait for it either."""
+        """Restore the descriptor's file, unless the file still blocks, since later writes would block, too."""
         if self.drain(time.monotonic() + DRAIN_S / 10):
             os.dup2(self.sink, self._descriptor)
             del _relays[self._descriptor]
 
     def _read(self) -> None:
         data = b"some"
-        while data:  # until no process can write any more
+        while data:  # until no process holds the other end of the pipe
             select.select([self._source], [], [])
             with self._reading, suppress(queue.Full):
                 data = os.read(self._source, MAX_BYTES)
@@ -178,7 +178,7 @@ class Relay:
 
     def _print(self) -> None:
         while data := self._waiting.get():
-            with suppress(OSError):  # gone, or full
+            with suppress(OSError):  # lost terminal, or full disk
                 while data:
                     data = data[os.write(self.sink, data) :]
             self._waiting.task_done()

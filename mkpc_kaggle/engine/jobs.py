@@ -1,4 +1,4 @@
-"""Messages between the engine and its workers: four kinds of job, their answers, and a record of lost jobs."""
+"""Messages between the engine and its workers: four kinds of jobs and their answers; the record of lost jobs."""
 
 from collections import Counter
 from collections.abc import Callable, Hashable, Sequence
@@ -16,18 +16,18 @@ from mkpc_kaggle.recipe import Recipe, Unit
 from mkpc_kaggle.scene.reconstruct import Solution
 from mkpc_kaggle.scene.view_graph import BatchImage
 
-MAX_TRIES = 2  # of an item alone
+MAX_TRIES = 2  # of an item in its own job
 
 Item = TypeVar("Item", bound=Hashable)
 
 
 class Phase(IntEnum):
-    """The priorities of matching, in order."""
+    """Priorities of matching, the most urgent first."""
 
     SWEEP = 0  # the first unit on all pairs
-    CONNECT = 1  # the first unit on extra pairs, where a batch has few pairs
-    DEEPEN = 2  # the longest prefix of the recipe that fits for all pairs
-    FILL = 3  # the other units, on the weakest pairs first
+    CONNECT = 1  # the first unit on extra pairs of batches with few pairs
+    DEEPEN = 2  # the longest prefix of the recipe's units with enough time for all pairs
+    FILL = 3  # the remaining units, weakest pairs first
     NEVER = 4
 
     def __str__(self) -> str:
@@ -36,7 +36,7 @@ class Phase(IntEnum):
 
 @dataclass(frozen=True)
 class WantedPair:
-    """A pair that a run asks for: names of its images, digest of its estimate's settings."""
+    """A pair of the request, with the names of its images and the digest of its estimate's settings."""
 
     pair: Pair
     names: tuple[str, str]
@@ -46,11 +46,11 @@ class WantedPair:
 
 @dataclass(frozen=True)
 class MatchJob:
-    """Run missing ``units`` on the pairs of ``indices``: one pair, or a minibatch on a GPU.
+    """Run missing ``units`` on the pairs at ``indices``: one pair, or a minibatch on a GPU.
 
-    ``expected`` are the seconds that each unit takes on a pair. A unit begins only if it is expected to end within
-    ``seconds`` of the job's start. ``known`` are the points of stage 1 that critical regions are computed from.
-    ``upcoming`` are the images that will probably be matched next. ``is_retry``: a worker was lost at it before.
+    ``expected`` are the expected seconds of each unit per pair. A unit begins only if it is expected to end within
+    ``seconds`` of the job's start. ``known`` are each pair's points of stage 1, for critical regions. ``upcoming``
+    are the images that will probably be matched next. ``is_retry`` states that the work lost a worker before.
     """
 
     phase: Phase
@@ -66,25 +66,25 @@ class MatchJob:
 
 @dataclass(frozen=True, eq=False)
 class PairPoints:
-    """References to a pair's current points: ``units`` with the revisions of their rows, in the recipe's order."""
+    """References to a pair's current points: each unit with its row's revision, in the recipe's order."""
 
     index: int
     images: tuple[BatchImage, BatchImage]
     units: tuple[tuple[Unit, int], ...]
     intrinsics: tuple[Matrix3, Matrix3] | None = None
-    own: Matrix3 | None = None  # for a scene: the F of the pair's own matches
+    own: Matrix3 | None = None  # for a scene: F from the pair's own matches
 
     @property
     def revisions(self) -> tuple[int, ...]:
         return tuple(revision for _, revision in self.units)
 
 
-PointSource = Path | dict[int, Matches]  # the directory of the journal with the points, or the points by revision
+PointSource = Path | dict[int, Matches]  # the journal's directory, or the points by revision
 
 
 @dataclass(frozen=True, eq=False)
 class EstimateJob:
-    """Estimate F, or E with intrinsics, of some pairs."""
+    """Estimate F of each pair, or E if the pair has intrinsics."""
 
     pairs: tuple[PairPoints, ...]
     recipe: Recipe
@@ -94,9 +94,9 @@ class EstimateJob:
 
 @dataclass(frozen=True, eq=False)
 class SceneJob:
-    """Reconstruct a batch with ``matches`` from ``inputs``, revisions.
+    """Reconstruct a batch from ``matches`` matches of the revisions ``inputs``. ``export`` is for COLMAP's files.
 
-    ``export`` is a directory for COLMAP's files. The answer is a :class:`Solution`, with a choice for each pair.
+    The answer is a :class:`Solution`, with choices in the order of the pairs.
     """
 
     batch: str
@@ -106,12 +106,12 @@ class SceneJob:
     inputs: str = ""
     matches: int = 0
     export: Path | None = None
-    is_retry: bool = True  # a crash of pycolmap counts against the batch and not against its place
+    is_retry: bool = True  # a crash of pycolmap counts against the batch, not against its place
 
 
 @dataclass(frozen=True)
 class LookJob:
-    """Compute the features of an image, or of a dataset: the bytes that ``do`` returns."""
+    """Compute the features of an image or of a dataset, as bytes, by calling ``do``."""
 
     key: tuple[str, str]  # digest of the contents, digest of the settings
     do: Callable[[], bytes]
@@ -123,12 +123,12 @@ Job = MatchJob | EstimateJob | SceneJob | LookJob
 
 @dataclass(frozen=True)
 class Loaded:
-    """A worker's first answer: it is ready for a job."""
+    """A worker's first answer: the worker is ready for jobs."""
 
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """Result of a job for a pair: rows of the table ``points``. ``failure`` says which image cannot be read."""
+    """Result of a job for a pair, as rows of the table ``points``. ``failure`` names an unreadable image."""
 
     index: int
     images: tuple[BatchImage, ...] = ()
@@ -141,7 +141,7 @@ class Outcome:
 
 @dataclass(frozen=True, eq=False)
 class Estimated:
-    """The estimate of a pair from the points of ``inputs``; ``inliers`` are the numbers among each of these."""
+    """The estimate of a pair from the point revisions ``inputs``; ``inliers`` has a count for each revision."""
 
     index: int
     inputs: tuple[int, ...]
@@ -154,7 +154,7 @@ class Estimated:
 
 
 class Cause(StrEnum):
-    """Why a worker has no result."""
+    """Cause of a missing result."""
 
     NOT_STARTED = "the worker could not be started"
     REFUSED = "the matchers cannot be loaded"
@@ -167,7 +167,7 @@ class Cause(StrEnum):
 
 @dataclass(frozen=True)
 class Failure:
-    """The answer that a job failed, or that a worker cannot take a job, and why."""
+    """The answer when a job failed or a worker cannot take jobs, with the cause."""
 
     cause: Cause
     message: str = ""
@@ -177,9 +177,9 @@ class Failure:
 
 
 class Losses(Generic[Item]):
-    """Work that lost workers: its items are retried singly, and an item that is lost twice alone is skipped.
+    """Items of lost jobs. Each is retried in its own job, and skipped when that job is lost for the second time.
 
-    ``alone`` are the items to try singly, ``skipped`` the failures of the items that are no longer tried.
+    ``alone`` are the items to retry in their own jobs. ``skipped`` has the failure of each skipped item.
     """
 
     def __init__(self) -> None:
@@ -188,7 +188,7 @@ class Losses(Generic[Item]):
         self._tries: Counter[Item] = Counter()
 
     def add(self, lost: Sequence[Item], failure: Failure) -> bool:
-        """Record the items of a lost job. Return whether its single item is skipped from now on."""
+        """Record the items of a lost job. Return whether it had a single item, which is now skipped."""
         self.alone.update(lost)
         if len(lost) != 1:
             return False
@@ -199,11 +199,11 @@ class Losses(Generic[Item]):
         return True
 
 
-# A match job or an estimate job is answered by a value for each of its pairs, in order.
+# The answer to a match job or an estimate job has a value for each pair, in order.
 Answer = Loaded | tuple[Outcome, ...] | tuple[Estimated, ...] | Solution | bytes | Failure
 
 
 def visiting_order(pairs: Sequence[Pair]) -> list[int]:
-    """Return indices of pairs in which pairs that share an image are adjacent, so that the encoding cache hits."""
+    """Return pair indices in an order that puts pairs with a common image together, for encoding cache hits."""
     keys = [(pair.group, pair.file0, pair.file1) for pair in pairs]
     return sorted(range(len(pairs)), key=keys.__getitem__)

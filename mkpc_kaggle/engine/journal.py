@@ -1,4 +1,4 @@
-"""The durable record of a run: an SQLite file that only the parent writes, a transaction for each answer."""
+"""The durable record of a run: an SQLite file. Only the parent writes it, in one transaction per answer."""
 
 import json
 import sqlite3
@@ -30,14 +30,14 @@ from mkpc_kaggle.scene.choose import Choice
 
 LOCK_NAME = "journal.lock"
 SCHEMA = Path(__file__).with_name("schema.sql")
-ENDS = "(image0, image1, turns0, turns1)"  # what identifies a pair
+ENDS = "(image0, image1, turns0, turns1)"  # columns that identify a pair
 MIN_SQLITE = (3, 37, 0)  # STRICT tables
 
 Method = TypeVar("Method", bound=Callable[..., None])
 
 
 def saving(save: Method) -> Method:
-    """Let a method be one transaction. If the file takes no more, continue in memory."""
+    """Run a method as one transaction. If the file accepts no more data, continue in memory."""
 
     @wraps(save)
     def transaction(self: "Journal", *args: Any, **named: Any) -> None:
@@ -55,10 +55,10 @@ def saving(save: Method) -> Method:
 
 
 class Journal(JournalReader):
-    """The journal of a work directory, created if missing. No other run can open it meanwhile.
+    """The journal of a work directory, created if missing. No other run can open it at the same time.
 
-    When the file takes no more (a full disk), the journal continues in memory, and is copied back when it is
-    closed. ``trouble`` has the reason. Raises :class:`UserError` if the directory cannot be written or is used.
+    If the file accepts no more data (a full disk), the journal continues in memory, and :meth:`close` copies it
+    back. ``trouble`` is the reason. Raises :class:`UserError` if the directory is not writable or is in use.
     """
 
     def __init__(self, directory: Path, *, fresh: bool = False) -> None:
@@ -68,14 +68,14 @@ class Journal(JournalReader):
             )
         self.path, lock = directory / FILE_NAME, directory / LOCK_NAME
         self.trouble = ""
-        with ExitStack() as opened, writing(f"the work directory {directory}"):  # stays open if all is well
+        with ExitStack() as opened, writing(f"the work directory {directory}"):  # kept open unless an error occurs
             directory.mkdir(parents=True, exist_ok=True)
             for path in (lock, self.path):
                 if path.exists() and not path.is_file():
                     raise UserError(f"{path} is not a regular file; remove it, or name another --work-dir")
             with undamaged(lock, "remove it"):
                 self._lock = opened.enter_context(closing(connected(lock)))
-                self._lock.execute("BEGIN EXCLUSIVE")  # another file: a journal can be read while its run works
+                self._lock.execute("BEGIN EXCLUSIVE")  # on a separate file, so others can read the journal
             if fresh:
                 for ending in ("", "-journal", "-wal", "-shm"):
                     directory.joinpath(FILE_NAME + ending).unlink(missing_ok=True)
@@ -93,11 +93,11 @@ class Journal(JournalReader):
         return self._db is not self._file
 
     def close(self) -> None:
-        with suppress(sqlite3.Error):  # the disk is still full; the file stays valid
+        with suppress(sqlite3.Error):  # if the disk is still full, the file stays valid
             if self.is_in_memory:
                 self._db.backup(self._file)
-        with suppress(sqlite3.Error):  # a reader is using it
-            self._file.execute("PRAGMA journal_mode = DELETE")  # a single file again, which can be copied
+        with suppress(sqlite3.Error):  # unless a reader uses the file
+            self._file.execute("PRAGMA journal_mode = DELETE")  # a single file, which can be copied
         self._file.close()
         super().close()
         self._lock.close()
@@ -112,7 +112,7 @@ class Journal(JournalReader):
         batches: Mapping[str, str],
         about: About | None = None,
     ) -> None:
-        """Replace the request: pairs, units with their settings, settings of each batch's scene."""
+        """Replace the request: pairs, units with their settings, and the settings of each batch's scene."""
         for table in ("wanted_unit", "wanted_pair", "wanted_batch", "about"):
             self._db.execute(f"DELETE FROM {table}")
         self._insert("about", value=json.dumps(asdict(about or About())))
@@ -130,26 +130,26 @@ class Journal(JournalReader):
         self._db.executemany(add, rows)
 
     def digests(self) -> dict[str, str]:
-        """Return the digest of each image of a wanted pair that was looked at, by name."""
+        """Return the saved digests of the images of wanted pairs, by name."""
         return dict(self._read(tuple, "SELECT DISTINCT name, digest FROM pair_image"))
 
     # The state of the run
 
     def twins(self, position: int) -> list[int]:
-        """Return the positions of all rows of a pair."""
+        """Return the positions of all rows with the same pair as ``position``."""
         query = """SELECT w.position FROM wanted_pair w JOIN wanted_pair asked ON asked.pair = w.pair
             WHERE asked.position = ? ORDER BY w.position"""
         return self._read(itemgetter(0), query, position)
 
     def states(self, positions: Iterable[int] | None = None) -> list[tuple[Any, ...]]:
-        """Return the rows of the view ``pair_state``, for all pairs or for these."""
+        """Return rows of the view ``pair_state``, for all pairs or for the given positions."""
         if positions is None:
             return self._read(tuple, "SELECT * FROM pair_state")
         query = "SELECT * FROM pair_state WHERE position = ?"
         return [row for position in positions for row in self._read(tuple, query, position)]
 
     def batch_inputs(self, batch: str) -> str:
-        """Return the revisions that a scene of a batch would be computed from now."""
+        """Return the current revisions of a batch's points, from which a scene would be computed."""
         query = "SELECT coalesce(inputs, '') FROM batch_inputs WHERE batch = ?"
         return next(iter(self._read(itemgetter(0), query, batch)), "")
 
@@ -160,18 +160,18 @@ class Journal(JournalReader):
 
     @saving
     def save_digest(self, name: str, digest: str) -> None:
-        """Save that an image has another content than it had."""
+        """Save the digest of an image's changed content."""
         self._db.execute("UPDATE image SET digest = ? WHERE name = ?", [digest, printable(name)])
 
     @saving
     def save_outcomes(self, outcomes: Sequence[Outcome], settings: Mapping[str, str]) -> None:
-        """Save what a job found on its pairs, all or nothing; ``settings`` by the names of units."""
+        """Save the results of a job on all its pairs, or none; ``settings`` are by unit name."""
         for outcome in outcomes:
             failure = [printable(outcome.failure), outcome.index]
             self._db.execute("UPDATE wanted_pair SET failure = ? WHERE position = ?", failure)
             for image in outcome.images:
                 self._insert("image", **image.size._asdict(), **columns(image, "size"))
-            count = max(1, len(outcome.found))  # of units, which share the seconds of the pair
+            count = max(1, len(outcome.found))  # number of units, which share the pair's seconds
             row = {"pair": self._wanted(outcome.index)["pair"], "decode_seconds": outcome.decode_seconds / count}
             row |= {"cluster_seconds": outcome.cluster_seconds / count}
             row |= {f"digest{side}": image.digest for side, image in enumerate(outcome.images)}
@@ -194,7 +194,7 @@ class Journal(JournalReader):
     def save_scene(
         self, scene: SceneRecord, inputs: str, pairs: Sequence[PairPoints], choices: Sequence[Choice]
     ) -> None:
-        """Save the reconstruction of a batch with the choices for its pairs."""
+        """Save the reconstruction of a batch and the choice for each of its pairs."""
         query = "SELECT settings FROM wanted_batch WHERE batch = ?"
         ((settings,),) = self._db.execute(query, [printable(scene.batch)])
         revision = self._insert("scene", settings=settings, inputs=inputs, **columns(scene, "models"))
@@ -210,7 +210,7 @@ class Journal(JournalReader):
 
     @saving
     def forget_scene(self, batch: str) -> None:
-        """Delete the scenes of a batch: its files were removed."""
+        """Delete the scenes of a batch whose exported files are missing or were replaced."""
         self._db.execute("DELETE FROM scene WHERE batch = ?", [batch])
 
     @saving
@@ -218,12 +218,12 @@ class Journal(JournalReader):
         self._insert("feature", digest=digest, settings=settings, value=value)
 
     def note(self, event: Event) -> None:
-        """Note an event; it is lost if the journal cannot be written."""
+        """Save an event, or drop it if the journal cannot be written."""
         with suppress(sqlite3.Error):
             self._insert("event", **columns(event))
 
     def _insert(self, table: str, **row: Any) -> int:
-        """Insert or replace a row, values by the names of columns. Return its number."""
+        """Insert or replace a row, given as values by column name. Return the row's number."""
         names, marks = ", ".join(f'"{name}"' for name in row), ", ".join("?" * len(row))
         query = f"REPLACE INTO {table} ({names}) VALUES ({marks}) RETURNING rowid"
         ((number,),) = self._db.execute(query, [*map(stored, row.values())])
@@ -235,11 +235,11 @@ class Journal(JournalReader):
         return row
 
     def _continue_in_memory(self, trouble: str) -> None:
-        """Copy everything into memory, and write there from now on."""
+        """Copy the journal into memory, and write only there from now on."""
         self.trouble, memory = trouble, connected(":memory:")
         try:
             self._file.backup(memory)
-        except sqlite3.OperationalError:  # a full disk has no room for SQLite's locks either
+        except sqlite3.OperationalError:  # a full disk has no room for SQLite's locks, either
             with closing(connected(self.path, "immutable=1")) as file:
                 file.backup(memory)
         memory.execute("PRAGMA foreign_keys = ON")
@@ -254,18 +254,18 @@ class Journal(JournalReader):
         else:
             self._check()
             self._db.execute("PRAGMA journal_mode = WAL")
-        # Readers do not hold up the writer. A kill loses no result, a power failure the latest results.
+        # Readers do not block the writer. A kill loses no result; a power failure may lose the latest results.
         self._db.execute("PRAGMA synchronous = NORMAL")
         self._db.execute("PRAGMA foreign_keys = ON")
 
 
 def columns(value: Any, *without: str) -> dict[str, Any]:
-    """Return the fields of a dataclass, which have the names of columns, except some."""
+    """Return the fields of a dataclass by name, which are columns, except the fields ``without``."""
     return {name: item for name, item in vars(value).items() if name not in without}
 
 
 def stored(value: Any) -> Any:
-    """Return a value as its column stores it: a matrix as bytes, numbers of rows as a text."""
+    """Return a value as stored in a column: a matrix as bytes, a tuple as text."""
     if isinstance(value, str):
         return printable(value)
     if isinstance(value, np.ndarray):

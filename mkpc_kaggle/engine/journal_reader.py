@@ -1,6 +1,6 @@
-"""The journal of a run, read at one moment: results by pair and batch, and what happened.
+"""The journal of a run, read at one moment: results by pair and batch, and events.
 
-``schema.sql`` has the tables, and in its views the rule that says which rows are current.
+``schema.sql`` defines the tables, and views that decide which rows are current.
 """
 
 import json
@@ -39,12 +39,12 @@ FILE_NAME = "journal.sqlite"
 
 NOT_REACHED = "not reached in time"
 NO_CAMERAS = "no matches connect its images"
-MAX_DRAWN_POINTS = 300  # of a model, evenly chosen
+MAX_DRAWN_POINTS = 300  # per model, evenly chosen
 
-# SQLite's primary result codes that say nothing against a file: no permission, busy, locked, read only, input or
-# output failed, full, cannot be opened.
+# SQLite's primary result codes that do not mean damage: no permission, busy, locked, read only, input or output
+# error, full, cannot be opened.
 UNUSABLE = {3, 5, 6, 8, 10, 13, 14}
-# Errors of reading what no run writes.
+# Errors when reading values that no run writes.
 DAMAGE = (sqlite3.Error, ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RecursionError)
 
 Value = TypeVar("Value")
@@ -54,15 +54,15 @@ class EventKind(StrEnum):
     """Kinds of events."""
 
     START = "start"  # the program began or resumed the run
-    PLAN = "plan"  # a decision, and why
-    SCENE = "scene"  # a batch was reconstructed; the text says how much of it
+    PLAN = "plan"  # a decision, with its reason
+    SCENE = "scene"  # a batch was reconstructed; the text states its registered part
     FAULT = "fault"
-    END = "end"  # the run ended; the text says how
+    END = "end"  # the run ended; the text states the ending
 
 
 @dataclass(frozen=True)
 class Event:
-    """Something that happened ``seconds`` after the start of the program; ``kind`` is an :class:`EventKind`."""
+    """An event ``seconds`` after the start of the program; ``kind`` is an :class:`EventKind`."""
 
     kind: str
     seconds: float
@@ -74,9 +74,9 @@ class Event:
 
 @dataclass(frozen=True)
 class About:
-    """The latest run that wrote a journal, for reports."""
+    """Facts for reports about the last run that wrote the journal."""
 
-    recipe: Mapping[str, Any] = field(default_factory=dict)  # a table as of a recipe's file, and its name
+    recipe: Mapping[str, Any] = field(default_factory=dict)  # the table of a recipe's file, and the recipe's name
     device: str = ""
     limit: float | None = None  # in seconds; None: no limit
     left_out: Sequence[str] = ()  # matchers that did not run, by cause
@@ -85,7 +85,7 @@ class About:
 
 @dataclass(frozen=True, slots=True)
 class UnitRecord:
-    """Result of a unit on a pair: numbers of matches and of inliers among them, and seconds."""
+    """Result of a unit on a pair: numbers of matches and of their inliers, and seconds."""
 
     unit: str
     stage: int
@@ -94,26 +94,26 @@ class UnitRecord:
     encode_seconds: float
     match_seconds: float
     failure: str
-    note: str = ""  # how the unit differed from its settings, such as the precision
+    note: str = ""  # how the unit deviated from its settings, for example in precision
     keypoints: int = 0  # detected in the first view; 0 for a matcher without a detector
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PairRecord:
-    """The F of a pair (E if the pair has intrinsics) and how it was found.
+    """The F of a pair (E if the pair has intrinsics), with its origin.
 
-    ``pair_fundamental`` comes from the pair's own matches. It is the fallback if ``failure`` says why there is no
-    F. ``magsac_fundamental`` is MAGSAC's alone if ``pair_fundamental`` was refined. ``scene`` is the choice by the
-    scene of its batch, ``None`` without a scene. Seconds belong to the current points and estimate.
+    ``pair_fundamental`` comes from the pair's own matches. If ``failure`` is not empty, it is the fallback.
+    ``magsac_fundamental`` is MAGSAC's result before refinement, if any. ``scene`` is the choice by the batch's
+    scene, ``None`` without a scene. Seconds belong to the current points and estimate.
     """
 
     index: int
-    pair: Pair  # with the names of its images for files
+    pair: Pair  # with image names in place of paths
     pair_fundamental: Matrix3 = field(default_factory=FALLBACK_FUNDAMENTAL.copy)
     failure: str = NOT_REACHED
     units: Sequence[UnitRecord] = ()
     regions: Regions | None = None
-    matches: int = 0  # this and the next four fields: of all units
+    matches: int = 0  # this and the next four fields: over all units
     decode_seconds: float = 0.0
     encode_seconds: float = 0.0
     match_seconds: float = 0.0
@@ -129,7 +129,7 @@ class PairRecord:
 
     @property
     def chosen_fundamental(self) -> Matrix3:
-        """The F to write: by the scene of its batch, else the pair's own."""
+        """The F to write: the choice by the batch's scene, else the pair's own F."""
         return self.pair_fundamental if self.scene is None or self.scene.F is None else self.scene.F
 
     @property
@@ -145,7 +145,7 @@ class PairRecord:
 
     @property
     def overlaps(self) -> bool:
-        """Whether the two images probably overlap."""
+        """True if the two images probably overlap."""
         return self.stats.support >= MIN_SUPPORT
 
     @property
@@ -155,10 +155,10 @@ class PairRecord:
 
 @dataclass(frozen=True)
 class SceneRecord:
-    """The reconstruction of a batch: numbers of images, registered images and points, and its models.
+    """The reconstruction of a batch: numbers of images, registered images and points, and the models.
 
-    The largest model comes first. A model keeps some of its points, evenly chosen. Without a model, ``failure`` is
-    the reason.
+    The largest model comes first. Each model has up to ``MAX_DRAWN_POINTS`` of its points, evenly chosen. Without
+    a model, ``failure`` is the reason.
     """
 
     batch: str
@@ -186,7 +186,7 @@ class SceneRecord:
 
 @contextmanager
 def undamaged(path: Path, advice: str = "delete it with --fresh") -> Iterator[None]:
-    """Raise :class:`UserError` if a journal is damaged or cannot be used now."""
+    """Convert errors in the block to a :class:`UserError` about a damaged or unusable journal."""
     try:
         yield
     except DAMAGE as error:
@@ -196,7 +196,7 @@ def undamaged(path: Path, advice: str = "delete it with --fresh") -> Iterator[No
 
 
 class JournalReader:
-    """The journal of a work directory at one moment; a run may be writing to it meanwhile.
+    """A snapshot of the journal of a work directory, even while a run writes to the journal.
 
     All methods raise :class:`UserError` if the file is missing, damaged, or of another format. A position is the
     index of a pair among all pairs that the run asked for.
@@ -209,7 +209,7 @@ class JournalReader:
         self.path = path = directory / FILE_NAME
         if not path.is_file():
             raise UserError(f"{directory} has no {FILE_NAME}: name the work directory of a run (NAME.work)")
-        # A directory that cannot be written has no room for SQLite's locks, and needs none.
+        # SQLite cannot create its locks in a read-only directory, and needs none there.
         mode = "mode=ro" if os.access(directory, os.W_OK) else "mode=ro&immutable=1"
         with ExitStack() as opened, undamaged(path):
             self._db = opened.enter_context(closing(connected(path, mode, timeout=5.0)))
@@ -235,7 +235,7 @@ class JournalReader:
         return tuple(self._read(partial(value_of, Event), "SELECT * FROM event ORDER BY number"))
 
     def records(self) -> list[PairRecord]:
-        """Return a record of each pair that has a row, in order."""
+        """Return the records of all pairs that have a row, in order."""
         units = self._by_pair(partial(value_of, UnitRecord), "unit_record")
         regions, choices = self._by_pair(_region, "region_record"), self.choices()
 
@@ -246,16 +246,16 @@ class JournalReader:
         return self._read(record, 'SELECT * FROM pair_record ORDER BY "index"')
 
     def choices(self) -> dict[int, Choice]:
-        """Return the choices of the standing scenes by the positions of their pairs."""
+        """Return the choices of standing scenes, by the position of the pair."""
         return dict(self._read(_choice, "SELECT * FROM pair_choice"))
 
     def scenes(self, table: str = "standing_scene") -> dict[str, SceneRecord]:
-        """Return the standing reconstruction of each batch, or its latest row in another table."""
+        """Return the standing reconstruction of each batch, or each batch's latest row in another table."""
         scenes = self._read(self._scene, f"SELECT * FROM {table} ORDER BY batch, revision")
         return {scene.batch: scene for scene in scenes}
 
     def points(self, revisions: Iterable[int]) -> dict[int, Matches]:
-        """Return the points of these rows, by revision."""
+        """Return the points of the rows with these revisions, by revision."""
         query = "SELECT points FROM points WHERE revision = ?"
         return {each: self._read(lambda row: from_blob(row["points"]), query, each)[0] for each in revisions}
 
@@ -265,7 +265,7 @@ class JournalReader:
         return dict(self._read(tuple, query, position))
 
     def images(self, position: int) -> tuple[BatchImage, ...]:
-        """Return both images of a pair as they were last looked at, or nothing."""
+        """Return both images of a pair as last read, or an empty tuple if one is unknown."""
         query = "SELECT * FROM pair_image WHERE position = ? ORDER BY side"
         images = self._read(lambda row: value_of(BatchImage, row, size=value_of(Size, row)), query, position)
         return tuple(images) if len(images) == 2 else ()
@@ -285,13 +285,13 @@ class JournalReader:
         return SfmModel(tuple(images), floats(row["points"], -1, 3), row["reprojection_error"])
 
     def _by_pair(self, make: Callable[[sqlite3.Row], Value], view: str) -> dict[int, tuple[Value, ...]]:
-        """Return the values of each pair, by its position, in the order of their numbers."""
+        """Return the values of each pair in the order of their numbers, by the pair's position."""
         query = f"SELECT * FROM {view} ORDER BY position, number"
         values = self._read(lambda row: (row["position"], make(row)), query)
         return {position: tuple(value for _, value in group) for position, group in groupby(values, itemgetter(0))}
 
     def _read(self, make: Callable[[sqlite3.Row], Value], query: str, *values: Any) -> list[Value]:
-        """Return a value of each row. Raise :class:`UserError` if the journal is damaged or unusable."""
+        """Return ``make(row)`` of each row. Raise :class:`UserError` if the journal is damaged or unusable."""
         with undamaged(self.path):
             return [make(row) for row in self._db.execute(query, values)]
 
@@ -307,9 +307,9 @@ class JournalReader:
 
 
 def connected(path: Path | str, options: str = "", timeout: float = 1.0) -> sqlite3.Connection:
-    """Return a connection whose rows have names, without transactions of Python's own.
+    """Return a connection with named columns, and without Python's implicit transactions.
 
-    ``path`` is a file, opened with ``options`` of an SQLite URI, or ":memory:".
+    ``path`` is a file, or ":memory:". ``options`` are the options of the file's SQLite URI.
     """
     uri = f"{path.resolve().as_uri()}?{options}" if isinstance(path, Path) else f"file:{path}"
     db = sqlite3.connect(uri, uri=True, timeout=timeout, isolation_level=None)
@@ -318,9 +318,9 @@ def connected(path: Path | str, options: str = "", timeout: float = 1.0) -> sqli
 
 
 def value_of(kind: type[Value], row: sqlite3.Row, **more: Any) -> Value:
-    """Return a dataclass or named tuple from the columns with the names of its fields; ``more`` are other fields.
+    """Return a dataclass or named tuple whose fields are the columns of the same names; ``more`` are other fields.
 
-    A field whose column is NULL has its default.
+    If a column is NULL, its field has the default value.
     """
     names = kind.__annotations__.keys() & row.keys() - more.keys()
     return kind(**{name: row[name] for name in names if row[name] is not None}, **more)
@@ -356,7 +356,7 @@ def _evenly(points: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def to_blob(matches: Matches) -> bytes:
-    """Return x0, y0, x1, y1 and the score of each match, as little-endian float32."""
+    """Return the bytes of x0, y0, x1, y1 and score of each match, as little-endian float32."""
     return np.column_stack([matches.points0, matches.points1, matches.scores]).astype("<f4").tobytes()
 
 
@@ -367,7 +367,7 @@ def from_blob(blob: bytes) -> Matches:
 
 
 def matrix_of(blob: bytes) -> Matrix3:
-    """Return F from its 72 bytes. Raise ``ValueError`` unless a submission may hold it."""
+    """Return the matrix stored in 72 bytes. Raise ``ValueError`` if it is zero or not finite."""
     matrix = floats(blob, 3, 3)
     if not np.isfinite(matrix).all() or not matrix.any():
         raise ValueError("a matrix is zero or not finite")

@@ -1,7 +1,7 @@
-"""Where workers are: a place has one worker at a time, and is closed when it loses three in a row.
+"""Places of workers. A place has one worker at a time, and is closed after it loses three workers in a row.
 
-A worker that has not answered by :attr:`Place.limit`, which :meth:`Engine._time_limit` sets, is killed in
-:meth:`Place._fail`: its process gets SIGKILL.
+:attr:`Place.limit` comes from :meth:`Engine._time_limit`. :meth:`Place._fail` kills a worker that has not answered
+by this limit: the worker's process gets SIGKILL.
 """
 
 import os
@@ -18,10 +18,10 @@ from mkpc_kaggle.engine.process import ProcessWorker, ThreadWorker
 from mkpc_kaggle.engine.worker import MatchRunner, light_runner, scene_runner
 from mkpc_kaggle.pipeline.assembly import Assembly
 
-START_TIMEOUT_S = 300.0  # for a worker to load its matchers; over a network's disk that is not quick
-RESTART_PAUSE_S = 1.0  # times the workers lost in a row: memory that is short may be free again
-MAX_LOSSES = 3  # workers lost in a row, with no answer between, close a place
-LISTEN_S = 0.2  # how often an interrupt is looked for
+START_TIMEOUT_S = 300.0  # for a worker to load its matchers, which is slow from a network disk
+RESTART_PAUSE_S = 1.0  # times the number of workers lost in a row; short memory may become free meanwhile
+MAX_LOSSES = 3  # number of workers lost in a row, without an answer between, that closes a place
+LISTEN_S = 0.2  # interval between checks for an interrupt
 CORES_PER_ESTIMATOR = 4
 
 
@@ -29,16 +29,16 @@ class Work(StrEnum):
     """The work of a place's workers."""
 
     MATCH = "matching"
-    LIGHT = "estimates"  # and looks at images
+    LIGHT = "estimates"  # and features of images
     SCENE = "scenes"
 
 
 @dataclass(eq=False)
 class Place:
-    """A place such as "cuda:0": its worker and the worker's job, since a moment of the engine's clock.
+    """A place such as "cuda:0", with its worker and the worker's job, which began at ``since``.
 
-    An answer is awaited until ``limit``; without a worker, none is started before it. ``closed`` is the reason if
-    no more workers start here.
+    ``since`` and ``limit`` are times of the engine's clock. A worker must answer by ``limit``; without a worker,
+    the next may start then. ``closed`` is the reason why no more workers start here, else empty.
     """
 
     name: str
@@ -58,14 +58,14 @@ class Place:
 
     @property
     def is_starting(self) -> bool:
-        """Whether a worker is loading, or may be started again after a pause."""
+        """Return whether a worker is loading, or will be started again after a pause."""
         return not self.is_loaded and not self.closed and (self.worker is not None or self.losses > 0)
 
     def may_start(self, now: float) -> bool:
         return self.worker is None and not self.closed and now >= self.limit
 
     def start(self, now: float, timeout: float = START_TIMEOUT_S) -> None:
-        """Start a worker, which answers when it is loaded."""
+        """Start a worker. Its first answer says whether it is loaded."""
         self.since, self.limit = now, now + timeout
         self.worker = self.make()
         self.worker.start()
@@ -77,7 +77,7 @@ class Place:
         self.worker.submit(job)
 
     def poll(self, now: float) -> Answer | None:
-        """Return the worker's answer, or that it hangs; ``None`` while it computes."""
+        """Return the worker's answer, or a :class:`Failure` if it hangs; ``None`` while it computes."""
         if self.worker is None:
             return None
         answer = self.worker.answer()
@@ -100,10 +100,10 @@ class Place:
             self.worker, self.is_loaded, self.limit = None, False, -inf
 
     def _fail(self, failure: Failure, now: float) -> None:
-        """End the worker, unless its job alone failed.
+        """End the worker, unless only its job failed.
 
-        Memory that ran out is fragmented, and a failing device keeps failing. Short memory does not count against
-        the place, nor does a death or a hang if another worker was lost at the same job.
+        After an out-of-memory error, memory stays fragmented. A failed device keeps failing. Lack of memory does
+        not count against the place, nor does a death or a hang on a job that has already lost a worker.
         """
         is_retry = self.job is not None and self.job.is_retry and failure.cause in (Cause.DIED, Cause.TIMED_OUT)
         if self.is_loaded and failure.cause in (Cause.RAISED, Cause.OUT_OF_MEMORY):
@@ -119,9 +119,9 @@ class Place:
 
 
 class Site:
-    """The places of a run. Matching may be elsewhere, estimates and scenes are next to the journal.
+    """The places of a run. Matching may run on other machines; estimates and scenes run next to the journal.
 
-    ``fallback`` are the matching places that take over when the others are closed. Workers call ``ring`` when an
+    ``fallback`` are the matching places that take over when all others are closed. Workers call ``ring`` when an
     answer is ready.
     """
 
@@ -141,34 +141,34 @@ class Site:
         return [place for place in self.places if place.work is work]
 
     def open(self) -> None:
-        """Add the matching places. Raise :class:`mkpc_kaggle.errors.UserError` if there can be none."""
+        """Add the matching places. Raise :class:`mkpc_kaggle.errors.UserError` if none is possible."""
 
     def scene_worker(self) -> ThreadWorker:
-        """Return a worker for a scene: always a process, since pycolmap may crash."""
+        """Return a worker for a scene, always in a process, since pycolmap may crash."""
         return ProcessWorker("scene", scene_runner, self.ring)
 
     def ring(self) -> None:
         self._bell.put(None)
 
     def wait(self, until: float) -> None:
-        """Wait until an answer may be ready, for an interrupt, or until a moment of the engine's clock."""
+        """Wait until an answer or an interrupt may have arrived, at most until ``until`` on the engine's clock."""
         with suppress(queue.Empty):
             self._bell.get(timeout=max(0.0, min(LISTEN_S, until - self._clock())))
 
     def close(self) -> None:
-        """Release the site; its workers have been killed."""
+        """Release the site, after its workers have been killed."""
 
 
 class LocalSite(Site):
-    """A worker process for each device of the machine, or ``workers`` processes; 0: a thread of this process."""
+    """Places of this machine: ``workers`` processes, by default one per device; 0: a thread of this process."""
 
     def __init__(self, assembly: Assembly, workers: int | None, clock: Callable[[], float]) -> None:
         super().__init__(clock, threads=workers == 0)
         if workers == 0:
             self.places.append(self._place("this process", assembly))
             return
-        # On a CPU one process with all threads: two with half of them each do more (recipe light, two cores: the
-        # sweep over after 22 s instead of 31), but need twice the memory, and a network's last bits change.
+        # On a CPU, one process uses all threads. Two with half the threads each are faster (recipe light, two
+        # cores: a sweep of 22 s, not 31 s). But they need twice the memory, and change networks' last bits.
         devices = assembly.devices
         used = [devices[number % len(devices)] for number in range(workers or len(devices))]
         for number, device in enumerate(used):

@@ -1,11 +1,11 @@
 """Workers on this machine: in a thread of the engine's process, or in separate processes.
 
-No call of the engine blocks: a thread for each worker does the blocking calls. No lock is shared with a process,
-nothing large goes through its start-up pipe, and its end of the other pipe is closed here. So it may die, be
-stopped or be killed at any moment: a write to it, or a read, ends with it.
+No call of the engine blocks: each worker has a thread for blocking calls. A worker process shares no lock, gets
+nothing large through its start-up pipe, and is alone in holding its end of the message pipe. So it may die, be
+stopped or be killed at any moment: reads and writes that wait for it end with it.
 
-pebble, which keeps pools of processes, was rejected: it times jobs by the wall clock, and a worker that is killed
-during an answer keeps the lock of all others.
+Process pools of the package pebble were rejected. They time jobs by the wall clock, and a worker killed during an
+answer keeps the lock of all others.
 """
 
 import ctypes
@@ -25,22 +25,22 @@ from mkpc_kaggle.engine.console import unblocked
 from mkpc_kaggle.engine.jobs import Answer, Cause, Failure, Job
 from mkpc_kaggle.engine.worker import Executor, Maker, Message, Runner, failure_of
 
-# For PyTorch, which reads them once. Threads of OpenMP that wait for each other sleep; by default they spin, and
-# keep the cores from decoding, MAGSAC and other processes (python -m benchmarks.threads). Tensors of 2 MiB and
-# more come in huge pages, on Linux: in small ones allocating a feature map takes as long as some convolutions.
+# For PyTorch, which reads these once. OpenMP threads that wait for each other then sleep; by default they spin
+# and keep the cores from decoding, MAGSAC and other processes. On Linux, tensors of 2 MiB or more use huge pages:
+# with small pages, allocating a feature map takes as long as some convolutions.
 WORKER_ENVIRONMENT = {"OMP_WAIT_POLICY": "PASSIVE", "GOMP_SPINCOUNT": "0", "THP_MEM_ALLOC_ENABLE": "1"}
 _environment = threading.Lock()
 PR_SET_PDEATHSIG = 1  # of Linux's prctl
-EXIT_TIMEOUT_S = 5.0  # a process's pipe closes before the process has ended
+EXIT_TIMEOUT_S = 5.0  # for a process to end after its pipe has closed
 
 
 class ThreadWorker:
-    """Does jobs, one at a time, in a thread of this process. No call blocks, even if the worker hangs.
+    """A worker that does one job at a time in a thread of this process. No call blocks, even if the worker hangs.
 
-    It answers the maker of its runner, with :class:`Loaded` or :class:`Failure`, and each job once. ``on_answer``
-    is called in its thread for each answer. It is not used again after a failure of its place, nor after ``kill``.
+    The first answer, to the runner's maker, is :class:`Loaded` or :class:`Failure`. Then each job gets one answer.
+    The thread calls ``on_answer`` after each. A worker is not used again after ``kill`` or a failure of its place.
 
-    A matcher that hangs or crashes cannot be contained here, and a failed device does not recover. Both need
+    A thread cannot contain a matcher that hangs or crashes, and cannot recover from a failed device. Both need
     processes.
     """
 
@@ -56,14 +56,14 @@ class ThreadWorker:
     def start(self) -> None:
         try:
             self.thread.start()
-        except RuntimeError as error:  # no thread more
+        except RuntimeError as error:  # no more threads
             self._answers.put(Failure(Cause.NOT_STARTED, str(error)))
 
     def submit(self, job: Job) -> None:
         self._messages.put(job)
 
     def answer(self) -> Answer | None:
-        """Return an answer once; ``None`` while it computes."""
+        """Return the next answer, each once; ``None`` while the worker computes."""
         with suppress(queue.Empty):
             return self._answers.get_nowait()
         return None
@@ -76,7 +76,7 @@ class ThreadWorker:
         while (message := self._messages.get()) is not None and not self._killed:
             try:
                 answer = self._exchange(message)
-            except Exception as error:  # out of memory, or of processes
+            except Exception as error:  # out of memory, or no more processes
                 answer = Failure(Cause.NOT_STARTED, str(error))
             self._answers.put(answer)
             self._on_answer()
@@ -86,7 +86,7 @@ class ThreadWorker:
 
 
 class ProcessWorker(ThreadWorker):
-    """A worker process, started with ``spawn`` for the first message. Messages can be pickled."""
+    """A worker process, started with ``spawn`` at the first message. Messages must be picklable."""
 
     _process: SpawnProcess | None = None
 
@@ -96,10 +96,10 @@ class ProcessWorker(ThreadWorker):
             self._process.kill()
 
     def _exchange(self, message: Message) -> Answer:
-        """Return the answer to a message, or how the process ended."""
+        """Return the answer to a message, or a :class:`Failure` that states how the process ended."""
         if self._process is None:
             self._process, self._pipe = spawn(self.name)
-            if self._killed:  # before there was a process to kill
+            if self._killed:  # before the process existed
                 self._process.kill()
         try:
             self._pipe.send(message)
@@ -119,14 +119,14 @@ class ProcessWorker(ThreadWorker):
 def spawn(name: str) -> tuple[SpawnProcess, Connection]:
     """Start a process that serves the other end of the returned pipe.
 
-    It has :data:`WORKER_ENVIRONMENT`, except variables that the user has set. They are removed again here, where
-    the OpenMP library is loaded already. It ignores Ctrl-C, which a terminal sends to all, and SIGTERM: its parent
-    handles both, and ends it.
+    The new process has :data:`WORKER_ENVIRONMENT`, except variables that the user has set. This process does not
+    keep the variables, since its OpenMP library is already loaded. The new process ignores SIGTERM and Ctrl-C,
+    which a terminal sends to all processes: the parent handles both signals and ends the process.
     """
     context = multiprocessing.get_context("spawn")
     pipe, its_pipe = context.Pipe()
     process = context.Process(target=serve, args=(its_pipe,), name=name, daemon=True)
-    resource_tracker.ensure_running()  # started with the first process, it would unblock the signals
+    resource_tracker.ensure_running()  # if started with the first process, it would unblock the signals
     with its_pipe, _environment, ExitStack() as restored:
         for variable in WORKER_ENVIRONMENT.keys() - os.environ.keys():
             os.environ[variable] = WORKER_ENVIRONMENT[variable]
@@ -139,14 +139,14 @@ def spawn(name: str) -> tuple[SpawnProcess, Connection]:
 
 
 def serve(pipe: Connection) -> None:
-    """Serve as a worker process: answer one message after another, the maker of the runner first."""
+    """Answer messages in a worker process, one after another; the first is the maker of the runner."""
 
     def make() -> Runner:
-        return cast(Maker, pipe.recv())()  # an object that cannot be unpickled is an answer, too
+        return cast(Maker, pipe.recv())()  # unpickling may raise, which is an answer, too
 
     end_with_parent()
     executor, message = Executor(), make
-    with unblocked(), suppress(EOFError, OSError):  # the parent is gone
+    with unblocked(), suppress(EOFError, OSError):  # the parent has ended
         while True:
             pipe.send(executor.answer(message))
             message = pipe.recv()
@@ -155,9 +155,9 @@ def serve(pipe: Connection) -> None:
 def end_with_parent() -> None:
     """End this process with its parent, even during a computation.
 
-    On Linux it ends with the thread that started it, even if it is stopped.
+    On Linux, it also ends with the thread that started it, and even if stopped (SIGSTOP).
     """
-    with suppress(OSError, AttributeError):  # elsewhere
+    with suppress(OSError, AttributeError):  # not on Linux
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
 
     def wait() -> None:

@@ -1,4 +1,4 @@
-"""The request to a run, what happens during it, and its report."""
+"""A run's request, its events while running, and its final report."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -29,10 +29,10 @@ class Ending(StrEnum):
 
 @dataclass(frozen=True)
 class Request:
-    """A request: points and estimates of ``pairs``, whose images lie below ``root``, and their scenes.
+    """A request for points, estimates and scenes of ``pairs``, whose images are below ``root``.
 
-    ``exports`` are the directories of COLMAP's files, by batch. ``publish`` is called with the results first,
-    every half minute (less often if it takes long), after each scene with files, and at the end.
+    ``exports`` are the directories for COLMAP's files, by batch. ``publish`` is called with the results: at the
+    start, every half minute (less often if slow), after each scene with files, and at the end.
     """
 
     pairs: Sequence[Pair]
@@ -46,7 +46,7 @@ class Request:
 
 @dataclass(frozen=True, eq=False)
 class Standing:
-    """The best results so far: F of each pair (R, 3, 3), the scenes, and the digest of each image by name."""
+    """The best results so far: F of the pairs (R, 3, 3), scenes by batch, and digests of images by name."""
 
     fundamentals: NDArray[np.float64]
     scenes: Mapping[str, SceneRecord]
@@ -54,7 +54,7 @@ class Standing:
 
 
 class Chronicle:
-    """Faults and decisions of a session, which the journal has as events, and the numbers of its results."""
+    """Faults and decisions of a session, also saved as events in the journal, and counts of its results."""
 
     def __init__(self, journal: Journal, budget: Budget, progress: Progress) -> None:
         self.progress = progress
@@ -81,7 +81,7 @@ class Chronicle:
 class RunReport:
     """The outcome of a run: a record of each pair, in order, and how the run ended.
 
-    ``resumed`` pairs were complete before. ``faults`` are lost jobs and unwritten files, with reasons.
+    ``resumed`` is the number of pairs of earlier runs. ``faults`` are lost jobs and unwritten files with reasons.
     ``unwritten`` says why the last version of the results could not be written.
     """
 

@@ -1,4 +1,4 @@
-"""A run from its parts: journal, site, engine, signals, and the end at the limit."""
+"""Assembly of a run: journal, site, engine, signal handling, and the end at the time limit."""
 
 import platform
 import shutil
@@ -34,19 +34,19 @@ from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.version import __version__
 
-EXIT_S = 0.2  # that the system takes to end a process
-REPORT_S = 2.0  # that an interrupted program may take for its report: enough for the tables
+EXIT_S = 0.2  # for the system to end a process
+REPORT_S = 2.0  # for an interrupted program's report; enough for the tables
 
 
 class Interrupt(threading.Event):
-    """Set when the run must end early; ``signal`` is what asked for it, 0 if nothing did."""
+    """Event that is set when the run must end early. ``signal`` is the number of the signal received, or 0."""
 
     signal = 0
     raises = False
 
     @contextmanager
     def raising(self) -> Iterator[None]:
-        """Answer a signal with ``KeyboardInterrupt`` of its number, for work that does not check the event."""
+        """Raise ``KeyboardInterrupt(number)`` on a signal, for work that does not check the event."""
         self.raises = True
         try:
             yield
@@ -77,10 +77,10 @@ def interruptible() -> Iterator[Interrupt]:
 class Session:
     """The environment of a run: everything besides its pairs and its recipe.
 
-    ``workers`` is the number of worker processes, or the Ray cluster to work on (see
-    :func:`mkpc_kaggle.engine.cluster.join`); 0: the work is done in this process; ``None``: a process for each
-    device. ``save`` writes the submission, or returns why the file is not the last version. ``status`` is the exit
-    status so far, also if the watchdog ends the program during its final report.
+    ``workers`` is the number of worker processes, or the name of a Ray cluster (see
+    :func:`mkpc_kaggle.engine.cluster.join`). 0 means this process; ``None`` means a process for each device.
+    ``save`` writes the submission. It returns an empty string, or why the file is not the last version. ``status``
+    is the exit status so far; the watchdog uses it if it ends the program during the final report.
     """
 
     work_dir: Path
@@ -93,15 +93,15 @@ class Session:
     status: int = 0
 
     def must_end(self) -> float:
-        """Return when the report must be written, by the monotonic clock: then the watchdog ends the process."""
+        """Return the deadline of the report on the monotonic clock, when the watchdog ends the process."""
         return time.monotonic() + REPORT_S if self.interrupt.signal else self.budget.final_write
 
     @contextmanager
     def watched(self) -> Iterator[Self]:
-        """Write the submission and end the process before the limit, if the program has not ended by itself.
+        """Run a watchdog: before the limit, it writes the submission and ends a program that has not ended yet.
 
-        The watchdog is a thread, so it works wherever other threads hang, unless one holds the GIL. Only a matcher
-        in the program's own process can do that. Worker processes end with the program.
+        The watchdog is a thread, so it works even if other threads hang, unless one of them holds the GIL. Only a
+        matcher in the program's own process can hold it. Worker processes end with the program.
         """
         over = threading.Event()
         if isfinite(self.budget.time_limit):
@@ -113,7 +113,7 @@ class Session:
 
     def _watch(self, over: threading.Event) -> None:
         budget = self.budget
-        while (left := budget.final_write - budget.clock()) > 0:  # it moves while the run learns
+        while (left := budget.final_write - budget.clock()) > 0:  # the deadline moves as the run measures costs
             if over.wait(min(left, LISTEN_S)):
                 return
         trouble = "the time limit passed before the last results were written"
@@ -122,7 +122,7 @@ class Session:
             nonlocal trouble
             trouble = self.save()
             with suppress(OSError):
-                remove_unfinished()  # a report, say
+                remove_unfinished()  # for example, an unfinished report
 
         writer = threading.Thread(target=write, name="final write", daemon=True)
         writer.start()  # the disk may hang
@@ -134,7 +134,7 @@ class Session:
 
 
 def submit(pairs: Sequence[Pair], assembly: Assembly, session: Session, output: Path, root: str = "") -> RunReport:
-    """Match all pairs. ``output`` always has a row for each pair, the fallback if necessary."""
+    """Match all pairs. ``output`` always has a row for each pair, with the fallback F if necessary."""
 
     def publish(standing: Standing) -> None:
         ids = (pair.id for pair in pairs)
@@ -145,10 +145,10 @@ def submit(pairs: Sequence[Pair], assembly: Assembly, session: Session, output: 
 
 @contextmanager
 def first_version(pairs: Sequence[Pair], output: Path) -> Iterator[None]:
-    """Write fallback rows, unless the file has them, before weights, devices and images: any of those may hang.
+    """Write fallback rows, unless the file is complete, before using weights, devices or images, which may hang.
 
-    A run that is refused before it has written its own version leaves the former file, or none. Raises
-    :class:`mkpc_kaggle.errors.UserError` where ``output`` cannot be written.
+    If the run is refused before its first own results, restore the former file, or remove the new one. Raises
+    :class:`mkpc_kaggle.errors.UserError` if ``output`` cannot be written.
     """
     if output.is_char_device() or output.is_block_device():
         raise UserError(f"--output {output} is a device; name a file")
@@ -159,13 +159,13 @@ def first_version(pairs: Sequence[Pair], output: Path) -> Iterator[None]:
             TemporaryFile(dir=output.parent).close()
             if not output.exists() or (output.is_file() and submission_problems(output, ids)):
                 if output.is_file():
-                    former = closed.enter_context(output.open("rb"))  # it outlives its name
+                    former = closed.enter_context(output.open("rb"))  # the open file outlives its name
                 write_submission(output, dict.fromkeys(ids, FALLBACK_FUNDAMENTAL))
                 ours = _identity(output)
         try:
             yield
         except UserError:
-            with suppress(OSError):  # somebody else has removed it
+            with suppress(OSError):  # another process has removed it
                 if ours == _identity(output):
                     output.unlink()
                     if former is not None:
@@ -175,7 +175,7 @@ def first_version(pairs: Sequence[Pair], output: Path) -> Iterator[None]:
 
 
 def _identity(path: Path) -> tuple[int, int]:
-    """Return an identity of a file's version: a later file may reuse the inode number of a deleted one."""
+    """Identify a version of a file by inode and time, since a new file may reuse a deleted file's inode."""
     status = path.stat()
     return status.st_ino, status.st_mtime_ns
 
@@ -183,7 +183,7 @@ def _identity(path: Path) -> tuple[int, int]:
 def run_pairs(
     pairs: Sequence[Pair], assembly: Assembly, session: Session, root: str = "", **more: Any
 ) -> RunReport:
-    """Run the recipe on all pairs. The journal knows their images by their names below ``root``.
+    """Run the recipe on all pairs. In the journal, an image's name is its path below ``root``.
 
     ``more`` are other fields of the request. Raises :class:`mkpc_kaggle.errors.UserError` if the journal cannot be
     used or a matcher cannot be loaded.
@@ -197,11 +197,11 @@ def run_pairs(
 def request_of(
     pairs: Sequence[Pair], assembly: Assembly, session: Session, root: str = "", **more: Any
 ) -> Request:
-    """Return a request for these pairs; ``more`` are its other fields."""
+    """Return a request for these pairs; ``more`` are other fields of the request."""
     budget, recipe = session.budget, assembly.recipe
     limit = budget.time_limit if isfinite(budget.time_limit) else None
     table = {**recipe.table(), "name": recipe.name}
-    versions = {  # software that the results may depend on
+    versions = {  # of software that may change the results
         "mkpc_kaggle": __version__,
         "Python": platform.python_version(),
         "PyTorch": metadata.version("torch"),
@@ -215,9 +215,9 @@ def request_of(
 
 @contextmanager
 def opened_engine(assembly: Assembly, session: Session, folders: Iterable[Path] = ()) -> Iterator[Engine]:
-    """An engine with its journal. Its workers end, and the last results are published, when it is left.
+    """Open an engine and its journal. On leaving, end the workers and publish the last results.
 
-    ``folders`` hold the images, on every machine.
+    ``folders`` hold the images, and must exist on every machine.
     """
     budget, workers = session.budget, session.workers
     with Journal(session.work_dir, fresh=session.fresh) as journal:

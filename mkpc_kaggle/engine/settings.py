@@ -1,6 +1,6 @@
-"""Digests of the settings of each derived table: they decide which rows are up to date.
+"""Digests of the settings behind each derived table, which decide whether rows are up to date.
 
-A digest has the number of its algorithm. Raise the number when the same settings would give other results.
+A digest includes the version of its algorithm. Increase the version if the same settings give other results.
 """
 
 import hashlib
@@ -14,12 +14,12 @@ import cv2
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.pipeline.assembly import Assembly
 
-POINTS, ESTIMATE, SCENE = 1, 2, 2  # numbers of the algorithms
+POINTS, ESTIMATE, SCENE = 1, 2, 2  # versions of the algorithms
 
 
 @dataclass(frozen=True)
 class Settings:
-    """The digests of a recipe's settings: of each unit, of estimates, and of scenes."""
+    """The digests of a recipe's settings for each unit, for estimates, and for scenes."""
 
     units: tuple[str, ...]
     estimate: str
@@ -38,7 +38,7 @@ class Settings:
         return cls(units, digest([ESTIMATE, *estimates]), digest([SCENE, *scenes]))
 
     def of_estimate(self, pair: Pair) -> str:
-        """The digest of all that decides the F of a pair from its points, or its E with known intrinsics."""
+        """Return the digest of the settings and intrinsics that determine a pair's F or E from its points."""
         known = pair.intrinsics
         return digest([self.estimate, [K.tolist() for K in known]]) if known else self.estimate
 

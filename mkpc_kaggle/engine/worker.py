@@ -1,9 +1,9 @@
-"""The work of workers: matching, estimates, looks at images, reconstructions.
+"""The work of workers: matching, estimates, features of images, reconstructions.
 
-Importing this module does not import torch: only matching needs it.
+Importing this module does not import torch, which only matching needs.
 
-Threads: one matching process uses all cores, and N processes share them. A process for estimates has one thread, a
-scene has one, too, and a machine of a Ray cluster has its number of CPUs.
+Threads: one matching process uses all cores, and N processes share the cores. A process for estimates or scenes
+has one thread. On a Ray cluster without GPUs, a machine's actor has one thread per CPU.
 """
 
 import time
@@ -45,11 +45,11 @@ if TYPE_CHECKING:
 
 Runner = Callable[[Job], Answer]  # it may raise anything, never return, or end the process
 Maker = Callable[[], Runner]
-Message = Maker | Job  # to a worker: first the maker of its runner
+Message = Maker | Job  # to a worker; the first is the maker of the worker's runner
 
 
 class Executor:
-    """The worker's side in any process: the first message makes its runner, the others are jobs. Never raises."""
+    """The worker's side in any process. The first message makes the runner; all others are jobs. Never raises."""
 
     _run: Runner | None = None
 
@@ -71,7 +71,7 @@ def failure_of(error: Exception) -> Failure:
 
 
 class MatchRunner:
-    """A runner of match jobs, with ``threads`` threads, or one of ``share`` processes with the machine's cores.
+    """A runner of match jobs with ``threads`` threads, or as one of ``share`` processes that share the cores.
 
     Raises :class:`mkpc_kaggle.errors.UserError` if the matchers cannot be loaded.
     """
@@ -89,7 +89,7 @@ class MatchRunner:
         self._images = ImageStore()
 
     def __call__(self, job: Job) -> tuple[Outcome, ...]:
-        """Match the pairs of a job, with the units that are expected to end in time."""
+        """Match the pairs of a job with each unit that is expected to end in time."""
         assert isinstance(job, MatchJob)
         deadline = time.monotonic() + job.seconds
         expected = dict(zip(job.units, job.expected, strict=True))
@@ -104,7 +104,7 @@ class MatchRunner:
         return tuple(_outcome(*each) for each in zip(job.indices, job.pairs, pairs, job.known, strict=True))
 
     def _open(self, wanted: WantedPair, known: tuple[UnitResult, ...]) -> PairMatch:
-        """Return the pair with its images; ``failure`` says which of them cannot be read."""
+        """Return the pair with its images; ``failure`` names an unreadable image."""
         start, files = time.perf_counter(), zip(wanted.pair.images, wanted.pair.turns, strict=True)
         images = [self._images.get(path).turned(turns) for path, turns in files]
         seconds = time.perf_counter() - start
@@ -114,17 +114,17 @@ class MatchRunner:
 
 
 def _outcome(index: int, wanted: WantedPair, pair: PairMatch, known: tuple[object, ...]) -> Outcome:
-    """Return the new results of a pair; its images have the contents that were matched."""
+    """Return the new results of a pair, and its images with the digests of the matched contents."""
     images = tuple(
         BatchImage(name, image.version, image.size, image.focal)
-        for name, image in zip(wanted.names, pair.images, strict=False)  # none if one is unreadable
+        for name, image in zip(wanted.names, pair.images, strict=False)  # no images if one is unreadable
     )
     found, seconds = pair.results[len(known) :], (pair.decode_seconds, pair.cluster_seconds)
     return Outcome(index, images, found, pair.regions, pair.failure, *seconds)
 
 
 def light_runner() -> Runner:
-    """Return the runner of estimates and looks at images, without torch and on one thread."""
+    """Return the runner of estimates and image features, without torch and with one thread."""
     import cv2
     from threadpoolctl import threadpool_limits  # comes with scikit-learn
 
@@ -141,7 +141,7 @@ def do_light_job(job: Job) -> tuple[Estimated, ...] | bytes:
 
 
 def estimate_pair(pair: PairPoints, results: tuple[UnitResult, ...], recipe: Recipe) -> Estimated:
-    """Return F of a pair, or E with intrinsics, from its points of all units."""
+    """Estimate F of a pair, or E with intrinsics, from its points of all units."""
     start = time.perf_counter()
     sizes, focals = tuple(image.size for image in pair.images), tuple(image.focal for image in pair.images)
     match = PairMatch(results, sizes=sizes, focals=focals)
@@ -160,14 +160,14 @@ def scene_runner() -> Runner:
 
 
 def reconstruct(job: Job) -> Solution:
-    """Return the cameras of a batch, and a choice for each of its pairs. pycolmap may end the process."""
+    """Return the reconstructions of a batch, and a choice for each pair. pycolmap may end the process."""
     assert isinstance(job, SceneJob) and job.recipe.scene is not None
     pairs = [batch_pair(*each) for each in results_of(job)]
     return reconstruct_batch(pairs, job.recipe.scene, job.recipe.focal, job.recipe.magsac, job.export)
 
 
 def batch_pair(pair: PairPoints, results: tuple[UnitResult, ...]) -> BatchPair:
-    """Return a pair of a batch with its points; images go by the names of their files."""
+    """Return a pair of a batch with its points; images are named by their file names."""
     image0, image1 = (replace(image, name=Path(image.name).name) for image in pair.images)
     matches = Matches.concatenate(result.matches for result in results)
     return BatchPair(image0, image1, matches, pair.own, tracks_of(results))

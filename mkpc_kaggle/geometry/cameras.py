@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from mkpc_kaggle.geometry.coordinates import Matrix3
 from mkpc_kaggle.geometry.two_view import cross_matrix
 
-MIN_BASELINE = 1e-9  # world units; two closer cameras count as one point
+MIN_BASELINE = 1e-9  # world units; closer cameras have the same centre
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,9 +37,9 @@ def relative_pose(camera0: Camera, camera1: Camera) -> tuple[Matrix3, NDArray[np
 
 
 def fundamental_of_cameras(camera0: Camera, camera1: Camera) -> Matrix3:
-    """Return F with x1^T F x0 = 0 and unit Frobenius norm: K1^-T [t]_x R K0^-1.
+    """Return F = K1^-T [t]_x R K0^-1, scaled to unit Frobenius norm, with x1^T F x0 = 0.
 
-    Raises ``ValueError`` if the two cameras have the same centre: F is not defined.
+    Raises ``ValueError`` if the two cameras have the same centre, since F is then undefined.
     """
     R, t = relative_pose(camera0, camera1)
     if np.linalg.norm(t) < MIN_BASELINE * max(1.0, float(np.linalg.norm(camera0.t))):

@@ -1,9 +1,9 @@
-"""Boxes and views: the only place where pixels are converted.
+"""Boxes and views: the only code that converts pixel coordinates.
 
 Pixel centres are at integers: the centre of the top-left pixel is (0, 0), x runs right, y runs down, and an
-image of width w covers [-0.5, w - 0.5). A resize by s maps ``x_view = (x + 0.5) * s - 0.5``, with an s for
-each axis from the *actual* sizes. A crop subtracts an integer offset, a quarter turn permutes the axes. Padding
-goes to the right and the bottom, so it moves nothing.
+image of width w covers [-0.5, w - 0.5). A resize by s gives ``x_view = (x + 0.5) * s - 0.5``. Each
+axis has its own s, computed from the *actual* sizes. A crop subtracts an integer offset. A quarter turn swaps the
+axes and flips one of them. Padding is added right and bottom, so coordinates do not change.
 
 Networks use other conventions: :func:`from_corner` and :func:`from_normalised` convert to this convention.
 """
@@ -52,30 +52,30 @@ class Box:
         return self.size.width * self.size.height
 
     def contains(self, points: NDArray[np.floating]) -> NDArray[np.bool_]:
-        """Which points, (N, 2) in image pixels, lie on the box's pixels; never for NaN."""
+        """Return an (N,) mask of the points (N, 2), in image pixels, on the box's pixels; False for NaN."""
         x, y = points[:, 0], points[:, 1]
         return (x >= self.left - 0.5) & (x < self.right - 0.5) & (y >= self.top - 0.5) & (y < self.bottom - 0.5)
 
 
 @dataclass(frozen=True)
 class View:
-    """The input of a matcher: a crop of an image, rotated by quarter turns, resized, padded right and bottom.
+    """A matcher's input: a crop of an image, rotated by quarter turns, resized, and padded right and bottom.
 
-    Image pixels are pixels of the stored file.
+    Image pixels are pixels of the file as stored, ignoring EXIF orientation.
     """
 
     crop: Box  # in image pixels
     content: Size  # of the crop, turned and resized
-    padded: Size  # of the picture with its padding
-    turns: int = 0  # quarters, counter-clockwise, 0 to 3
+    padded: Size  # of the content with its padding
+    turns: int = 0  # quarter turns, counter-clockwise, 0 to 3
     antialias: bool = True  # average areas where the crop shrinks
 
     @classmethod
     def fit(cls, crop: Box, *, long_side: int = 0, area: int = 0, multiple: int = 1, turns: int = 0) -> "View":
-        """Return the view of ``crop`` with this longer side in pixels, or with about ``area`` pixels.
+        """Return the view of ``crop`` with a longer side of ``long_side`` pixels, or with about ``area`` pixels.
 
-        Its aspect is kept to the nearest pixel. Here, as in :meth:`stretched`, both sides are padded up to a
-        multiple of ``multiple``.
+        The aspect ratio is kept to the nearest pixel. Both sides are padded up to a multiple of ``multiple``, as
+        in :meth:`stretched`.
         """
         scale = long_side / max(crop.size) if long_side else sqrt(area / crop.area)
         width, height = (max(1, round(side * scale)) for side in _turned_size(crop.size, turns))
@@ -83,7 +83,7 @@ class View:
 
     @classmethod
     def stretched(cls, crop: Box, *, size: Size, multiple: int = 1, turns: int = 0) -> "View":
-        """Return the view of ``crop``, turned and then resized to exactly ``size``, regardless of its aspect."""
+        """Return the view of ``crop``, turned and then resized to exactly ``size``, ignoring the aspect ratio."""
         padded = Size(*(ceil(side / multiple) * multiple for side in size))
         return cls(crop, size, padded, turns)
 
@@ -94,34 +94,34 @@ class View:
         return self.content.width / width, self.content.height / height
 
     def from_image(self, points: NDArray[np.floating]) -> NDArray[np.float64]:
-        """(N, 2) image pixels -> (N, 2) view pixels."""
+        """Convert (N, 2) image pixels to (N, 2) view pixels."""
         offset = np.array([self.crop.left, self.crop.top])
         turned = _turned(np.asarray(points, np.float64) - offset + 0.5, self.turns, self.crop.size)
         return np.asarray(turned * self.scale - 0.5, np.float64)
 
     def to_image(self, points: NDArray[np.floating]) -> NDArray[np.float64]:
-        """(N, 2) view pixels -> (N, 2) image pixels: the inverse of :meth:`from_image`."""
+        """Convert (N, 2) view pixels to (N, 2) image pixels, the inverse of :meth:`from_image`."""
         offset, turned = np.array([self.crop.left, self.crop.top]), _turned_size(self.crop.size, self.turns)
         stored = _turned((np.asarray(points, np.float64) + 0.5) / self.scale, -self.turns, turned)
         return np.asarray(stored - 0.5 + offset, np.float64)
 
     def holds(self, points: NDArray[np.floating]) -> NDArray[np.bool_]:
-        """Which (N, 2) points of the view lie on content, not on padding or outside; never for NaN."""
+        """Return an (N,) mask of the points (N, 2), in view pixels, on content, not on padding; False for NaN."""
         return Box.whole(self.content).contains(points)
 
     def render(self, image: Pixels) -> Pixels:
-        """The picture: (H, W) or (H, W, 3) uint8 image -> the same with ``padded`` height and width.
+        """Render the view of a uint8 image (H, W) or (H, W, 3), with ``padded`` height and width.
 
-        Padding is black. Shrinking averages areas, so that nothing aliases, unless ``antialias`` is off. All other
-        resizing is bilinear. Both use the half-pixel convention of this module.
+        Padding is black. Shrinking averages areas to avoid aliasing, unless ``antialias`` is off. All other
+        resizing is bilinear. Both methods use the half-pixel convention of this module.
         """
         crop = self.crop
         cut = image[crop.top : crop.bottom, crop.left : crop.right]
         if min(crop.left, crop.top) < 0 or cut.shape[1::-1] != crop.size:
             raise ValueError(f"{crop} leaves the image of {image.shape[1]} x {image.shape[0]} pixels")
-        # OpenCV counts quarters clockwise, and a single one is 0.
+        # OpenCV's codes turn clockwise; code 0 is one quarter turn.
         picture = cv2.rotate(cut, 3 - self.turns) if self.turns else cut
-        # In two steps: INTER_AREA is itself only where neither axis grows.
+        # Shrink first, then enlarge: INTER_AREA averages areas only if neither axis grows.
         turned = _turned_size(crop.size, self.turns)
         shrunk = Size(*map(min, self.content, turned)) if self.antialias else turned
         picture = cv2.resize(picture, shrunk, interpolation=cv2.INTER_AREA) if shrunk != turned else picture
@@ -137,17 +137,17 @@ def _turned_size(size: Size, turns: int) -> Size:
 
 
 def _turned(points: NDArray[np.float64], turns: int, size: Size) -> NDArray[np.float64]:
-    """(N, 2) points of a picture of ``size``, from its top-left corner -> of ``np.rot90(picture, turns)``."""
+    """Rotate (N, 2) points, relative to the top-left corner of a picture of ``size``, like ``np.rot90``."""
     (x, y), (width, height) = points.T, size
     quarters = (x, y), (y, width - x), (width - x, height - y), (height - y, x)
     return np.stack(quarters[turns % 4], axis=1)
 
 
 def from_corner(points: NDArray[np.floating]) -> NDArray[np.floating]:
-    """(N, 2) pixels counted from the image's top-left corner -> from the centre of its first pixel."""
+    """Move the origin of (N, 2) pixels from the image's top-left corner to the centre of the top-left pixel."""
     return points - np.float32(0.5)
 
 
 def from_normalised(points: NDArray[np.floating], size: Size) -> NDArray[np.floating]:
-    """(N, 2) where +-1 are the outer edges of an image of ``size`` -> its pixels."""
+    """Convert (N, 2) coordinates, with +-1 at the outer edges of an image of ``size``, to pixels."""
     return from_corner((points + 1) * np.array(size, points.dtype) / 2)

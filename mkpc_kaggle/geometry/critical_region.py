@@ -1,8 +1,8 @@
 """The critical region of an image: Matching Key-Points Crop (the paper's Algorithm 1) and Crop Area Expansion.
 
 For each image separately: normalise the matched points of stage 1 by width and height, cluster them, and keep the
-large clusters. Their bounding box, scaled about its centre, is the critical region. If the box cannot be trusted,
-the region is the whole image, with the reason.
+large clusters. The bounding box of the kept points, scaled about its centre, is the critical region. If this box
+is unreliable, the region is the whole image, with the reason.
 """
 
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from mkpc_kaggle.config import AT_LEAST_1, POSITIVE, SHARE, Range, check_ranges
 from mkpc_kaggle.geometry.coordinates import Box, Points, Size
 
-MERGE_ABOVE = 2000  # points; DBSCAN stores the neighbours of each, so clumped points take quadratic memory
+MERGE_ABOVE = 2000  # points; DBSCAN stores each point's neighbours, so dense points take quadratic memory
 CELLS_PER_EPS = 10
 
 
@@ -36,7 +36,7 @@ class MkpcConfig:
 
 
 class RegionReason(StrEnum):
-    """``CROPPED``, ``GIVEN`` by the user, or why the region is the whole image."""
+    """Origin of a region: ``CROPPED``, ``GIVEN`` by the user, or the reason for taking the whole image."""
 
     CROPPED = "cropped"
     GIVEN = "given"
@@ -48,12 +48,12 @@ class RegionReason(StrEnum):
 
 @dataclass(frozen=True)
 class CriticalRegion:
-    """The box of an image for stage 2, in image pixels, and the reason for it."""
+    """The part of an image that stage 2 matches: a box in image pixels, and its reason."""
 
     box: Box
     reason: RegionReason
-    clusters: int = 0  # number found
-    kept: int = 0  # number inside the box
+    clusters: int = 0  # number of clusters found
+    kept: int = 0  # number of clusters inside the box
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +61,7 @@ class Clusters:
     """Clusters of an image's N matched points."""
 
     labels: NDArray[np.intp]  # (N,) the cluster of each point, -1 for noise
-    sizes: NDArray[np.intp]  # (K,) the points of each cluster
+    sizes: NDArray[np.intp]  # (K,) the number of points in each cluster
     kept: NDArray[np.intp]  # labels of the clusters in the critical region, largest first
 
     @property
@@ -105,7 +105,7 @@ def find_clusters(points: Points, size: Size, config: MkpcConfig) -> Clusters:
 def dbscan(points: NDArray[np.float64], *, eps: float, min_samples: int) -> NDArray[np.intp]:
     """Return the labels (N,) of scikit-learn's DBSCAN for ``points`` (N, 2), -1 for noise.
 
-    More than ``MERGE_ABOVE`` points are merged in cells of a tenth of eps, weighted by their number.
+    Above ``MERGE_ABOVE`` points, the points in each cell of side eps / 10 become one weighted mean point.
     """
     from sklearn.cluster import DBSCAN  # the import takes a second
 
@@ -133,9 +133,9 @@ def keep_clusters(sizes: NDArray[np.intp], share: float) -> NDArray[np.intp]:
 
 
 def expand_box(points: Points, size: Size, expand_x: float, expand_y: float) -> Box:
-    """Scale the bounding box of ``points`` about its centre and clip it to the image: Crop Area Expansion.
+    """Return the bounding box of ``points``, scaled about its centre and clipped (Crop Area Expansion).
 
-    The box spans the points' pixels, [min, max + 1) in whole pixels, so it includes the last row and column.
+    Before scaling, the box spans whole pixels, [min, max + 1), so it includes the last row and column.
     Scaled edges are rounded outwards.
     """
     low = np.floor(points.min(axis=0).astype(np.float64) + 0.5)

@@ -1,4 +1,4 @@
-"""Corresponding points of a pair, in full-image pixels outside a matcher. Empty is a legal value."""
+"""Corresponding points of a pair; outside matchers, in full-image pixels. Zero matches are legal."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -52,7 +52,7 @@ class Matches:
         return Matches(self.points0[index], self.points1[index], self.scores[index])
 
     def best(self, most: int) -> "Matches":
-        """Return up to ``most`` matches of the highest scores, in their present order (ties: the earlier)."""
+        """Return up to ``most`` matches of highest score, in their present order; of equal scores, the earlier."""
         if len(self) <= most:
             return self
         chosen = np.argsort(-self.scores, kind="stable")[:most]
@@ -61,7 +61,7 @@ class Matches:
     def to_image(self, view0: View, view1: View) -> "Matches":
         """Convert matches in view pixels to image pixels.
 
-        Drops points that are not finite, lie on padding or outside their view, and matches with non-finite scores.
+        Drops matches with a non-finite point or score, and matches with a point outside its view's content.
         """
         kept = self[view0.holds(self.points0) & view1.holds(self.points1) & np.isfinite(self.scores)]
         return Matches(

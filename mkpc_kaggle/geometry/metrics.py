@@ -15,16 +15,16 @@ from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import calibrate, homogeneous
 from mkpc_kaggle.geometry.two_view import cross_matrix
 
-# The competition's rules. The i-th threshold in degrees belongs to the i-th in metres.
+# The competition's rules. The i-th rotation threshold, degrees, goes with the i-th translation threshold, metres.
 ROTATION_THRESHOLDS = np.linspace(1, 10, 10)
 TRANSLATION_THRESHOLDS = np.geomspace(0.2, 5, 10)
 AUC_THRESHOLDS = (5.0, 10.0, 20.0)  # degrees
-CORRECT = 5e-4  # a correct match's squared distance to its epipolar lines on the planes z = 1, summed over both
+CORRECT = 5e-4  # a correct match's maximum sum of both squared epipolar distances, on the planes z = 1
 
 
 @dataclass(frozen=True)
 class PoseError:
-    """The error of the pose of an F; infinite without an F."""
+    """The error of an F's relative pose; infinite without an F."""
 
     rotation: float  # degrees
     translation_angle: float  # degrees, at most 90, since F leaves the sign open
@@ -50,10 +50,10 @@ class PoseError:
 def pose_error(
     F: Matrix3, camera0: Camera, camera1: Camera, metres_per_unit: float, rotation: Matrix3 | None = None
 ) -> PoseError:
-    """Return the error of the pose of F, or of its translation and a given ``rotation``.
+    """Return the pose error of F, or of F's translation with a given ``rotation``.
 
-    A submission has no points that would select one of F's two rotations. So by default the rotation nearer to
-    the truth counts. The sign of the translation is free.
+    A submission has no points to select one of F's two rotations. So by default the rotation nearer to the truth
+    counts. The sign of the translation is ignored.
     """
     R, t = relative_pose(camera0, camera1)
     # Two rotations, and a direction (3, 1) of unknown sign (Hartley and Zisserman, Multiple View Geometry, 9.6.2).
@@ -72,13 +72,13 @@ def pose_error(
 
 def rotation_angle(R: Matrix3) -> float:
     """Return the angle of a rotation matrix in degrees, 0 to 180, precise at both ends."""
-    # SciPy's Rotation would raise for a matrix of a file that is not a rotation.
+    # SciPy's Rotation raises if a file's matrix is not a rotation.
     skew = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
     return float(np.degrees(np.arctan2(np.linalg.norm(skew), np.trace(R) - 1)))
 
 
 def pair_accuracy(error: PoseError) -> float:
-    """Return the share of the ten threshold pairs that a pair's error meets; a scene's mAA is its mean.
+    """Return the share of the ten threshold pairs that a pair's error meets. A scene's mAA is the mean over pairs.
 
     Source: evaluation page of the Image Matching Challenge 2022.
     """
@@ -87,21 +87,21 @@ def pair_accuracy(error: PoseError) -> float:
 
 
 def correct_matches(matches: Matches, camera0: Camera, camera1: Camera) -> NDArray[np.bool_]:
-    """Return an (N,) mask of the matches that the true cameras confirm, by :data:`CORRECT`."""
+    """Return an (N,) mask of the matches that fit the true cameras within :data:`CORRECT`."""
     R, t = relative_pose(camera0, camera1)
     E = cross_matrix(t) @ R
     x0, x1 = homogeneous(calibrate(matches.points0, camera0.K)), homogeneous(calibrate(matches.points1, camera1.K))
     lines0, lines1 = x1 @ E, x0 @ E.T
-    with np.errstate(divide="ignore", invalid="ignore"):  # cameras with one centre confirm nothing
+    with np.errstate(divide="ignore", invalid="ignore"):  # with equal camera centres, no match is correct
         inverse = 1 / (lines0[:, :2] ** 2).sum(axis=1) + 1 / (lines1[:, :2] ** 2).sum(axis=1)
         return np.asarray((x1 * lines1).sum(axis=1) ** 2 * inverse < CORRECT)
 
 
 def pose_auc(errors: Sequence[PoseError], threshold: float) -> float:
-    """Return the area under the recall curve of the angular error up to ``threshold`` degrees, 0 to 1.
+    """Return the normalised area, 0 to 1, under the recall curve of angular errors up to ``threshold`` degrees.
 
-    The curve is piecewise linear through (error_i, i / n), sorted, as in SuperGlue's evaluation. NaN without
-    pairs.
+    The curve is piecewise linear through the sorted points (error_i, i / n), as in SuperGlue's evaluation. NaN
+    without pairs.
     """
     if not errors:
         return float("nan")

@@ -1,7 +1,7 @@
 """Two-view models from matches: F, E or H by MAGSAC++.
 
-An estimate is always a value. Without a model it holds the reason and the fallback matrix, which is finite and of
-the right rank, so a submission is always complete.
+An estimate always has a matrix. If no model is found, it holds the reason and the fallback matrix, which is finite
+and of the right rank. So a submission is always complete.
 """
 
 from collections.abc import Callable, Sequence
@@ -22,8 +22,8 @@ from mkpc_kaggle.geometry.two_view import Vectors, robust_costs, sampson
 # F of a pure sideways motion, [e_x]_x: finite, rank 2; the epipolar lines are the image rows.
 FALLBACK_FUNDAMENTAL: Matrix3 = np.array([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 FALLBACK_FUNDAMENTAL.setflags(write=False)
-CONFIDENCE = 0.99999  # that no better model is left to find
-FARTHEST = 1e9  # baselines; matches that are farther do not count as in front of a camera
+CONFIDENCE = 0.99999  # probability that no better model remains
+FARTHEST = 1e9  # baselines; farther points do not count as in front of a camera
 
 
 class ModelKind(StrEnum):
@@ -43,14 +43,14 @@ class Method(StrEnum):
 class RobustConfig:
     """Settings of :func:`estimate`, table ``[magsac]`` of a recipe.
 
-    The estimator may stop before it finds the best model, depending on the order of the matches. So it runs on
-    several permutations, and the model with the lowest robust cost at twice the threshold wins.
+    Depending on the order of the matches, the estimator may stop before it finds the best model. So it runs on
+    several permutations. The model with the lowest robust cost at twice the threshold wins.
     """
 
     method: Method = Method.MAGSAC
     threshold: float = 0.2  # pixels of the stored image
     max_iterations: int = 50_000
-    permutations: int = 8  # number of fixed permutations; the first is the matches' own order
+    permutations: int = 8  # number of fixed permutations; the first keeps the order of the matches
     threshold_side: int = 0  # if not 0, the threshold is in pixels of the image resized to this long side
     every_match: bool = False  # keep exact duplicates, and estimate from the fewest matches that OpenCV accepts
 
@@ -61,7 +61,7 @@ class RobustConfig:
     def in_stored_pixels(
         self, sizes: Sequence[Size], intrinsics: tuple[Matrix3, Matrix3] | None = None
     ) -> "RobustConfig":
-        """Return settings for stored images of these sizes, with the same threshold over the mean focal length."""
+        """Return settings with the threshold in stored pixels, at the same ratio to the mean focal length."""
         if not self.threshold_side:
             return self
         scales = np.array([View.fit(Box.whole(size), long_side=self.threshold_side).scale for size in sizes])
@@ -71,10 +71,10 @@ class RobustConfig:
 
 @dataclass(frozen=True)
 class EstimateStats:
-    """Statistics of an estimate, to find out why a pair went wrong.
+    """Statistics of an estimate, for the diagnosis of bad pairs.
 
-    A cost is the sum of the robust costs of the distinct matches, at most 0.5 each. Under a prior on focal lengths
-    it includes the prior, or the penalty of an F without focal lengths.
+    A cost is the sum of the robust costs of the distinct matches, at most 0.5 each. Under a prior on focal
+    lengths, it also includes the cost of the prior, or the penalty for an F without focal lengths.
     """
 
     candidates: int = 0  # number of compared models
@@ -82,7 +82,7 @@ class EstimateStats:
     magsac_cost: float = 0.0  # of MAGSAC's own F; 0 without one
     focals: tuple[float, float] = (0.0, 0.0)  # in pixels, of both images; 0 if unknown
     support: float = 0.0  # see :mod:`mkpc_kaggle.geometry.overlap`
-    rotation: tuple[float, ...] = (0.0, 0.0, 0.0)  # of an E by its inliers, see :func:`rotation_in_front`
+    rotation: tuple[float, ...] = (0.0, 0.0, 0.0)  # of an E, chosen by inliers, see :func:`rotation_in_front`
 
 
 NO_STATS = EstimateStats()
@@ -119,10 +119,10 @@ def estimate(
 ) -> Estimate:
     """Estimate a two-view model from ``matches`` (image pixels).
 
-    Ignores non-finite points and, by default, exact duplicates; duplicates of an inlier are inliers. E needs the
-    two camera matrices, (3, 3) each: the points are calibrated, and the threshold is divided by the mean focal
-    length. Raises ``ValueError`` for E without intrinsics, and never because of the points. The same input gives
-    the same bytes.
+    Ignores non-finite points and, by default, exact duplicates. Duplicates of an inlier are inliers. E needs both
+    camera matrices (3, 3): the points are calibrated, and the threshold is divided by the mean focal length.
+    Raises ``ValueError`` for E without intrinsics, but never because of the points. The same input gives the same
+    bytes.
     """
     if model is ModelKind.E and intrinsics is None:
         raise ValueError("an essential matrix needs the intrinsics, the camera matrix K of both images")
@@ -138,7 +138,7 @@ def consensus(
     model: ModelKind,
     intrinsics: tuple[Matrix3, Matrix3] | None = None,
 ) -> Estimate:
-    """:func:`estimate` for (N, 2) finite points without duplicates."""
+    """Estimate a model as :func:`estimate` does, from finite points (N, 2) without merging duplicates."""
     count, threshold, solver = len(points0), config.threshold, _SOLVERS[model]
     if count < (solver.minimal if config.every_match else solver.min_matches):
         return Estimate.failed(model, count, f"too few distinct matches for {model}: {count}")
@@ -175,7 +175,7 @@ def consensus(
 
 @dataclass(frozen=True, eq=False)
 class DistinctMatches:
-    """The finite distinct matches of N matches, in order of first appearance; without ``merge``, all finite."""
+    """The distinct finite matches of N, in order of first appearance; all finite matches without ``merge``."""
 
     points0: Vectors  # (M, 2)
     points1: Vectors
@@ -209,7 +209,7 @@ def calibrate(points: NDArray[np.floating], K: Matrix3) -> Vectors:
 
 
 def rotation_in_front(E: Matrix3, matches: Matches, intrinsics: tuple[Matrix3, Matrix3]) -> list[float]:
-    """Return the rotation of E that puts most matches in front of both cameras: (3,) its axis times radians."""
+    """Return the rotation of E with most points in front of both cameras, as a rotation vector (3,) in radians."""
     x0, x1 = calibrate(matches.points0, intrinsics[0]), calibrate(matches.points1, intrinsics[1])
     _, R, *_ = cv2.recoverPose(E, x0, x1, np.eye(3), FARTHEST)
     rotation: list[float] = Rotation.from_matrix(R).as_rotvec().tolist()
@@ -225,7 +225,7 @@ def sampson_distances(F: Matrix3, matches: Matches) -> Vectors:
 
 
 def permutation(number: int, count: int) -> NDArray[np.intp]:
-    """Return a fixed permutation of ``count`` matches; number 0 is their own order."""
+    """Return the fixed permutation ``number`` of ``count`` matches; number 0 keeps their order."""
     return np.random.default_rng(number).permutation(count) if number else np.arange(count)
 
 
@@ -240,7 +240,7 @@ def _epipolar_distances(matrix: Matrix3, points0: Vectors, points1: Vectors) -> 
 
 
 def _transfer_distances(matrix: Matrix3, points0: Vectors, points1: Vectors) -> Vectors:
-    """Return (N,) distances in the second image between its points and the points of the first, mapped by H."""
+    """Return (N,) distances between the second image's points and the first image's points, mapped by H."""
     return np.asarray(np.hypot(*(cv2.perspectiveTransform(points0[None], matrix)[0] - points1).T))
 
 
@@ -248,7 +248,7 @@ class _Solver(NamedTuple):
     minimal: int  # the fewest matches that OpenCV accepts
     min_matches: int  # more than a minimal sample, so that matches can contradict the model
     fallback: Matrix3
-    find: Callable[..., Any]  # returns OpenCV's matrix, ``None`` without a model, and mask
+    find: Callable[..., Any]  # returns OpenCV's matrix (``None`` without a model) and mask
     distances: Callable[[Matrix3, Vectors, Vectors], Vectors]
 
 
@@ -260,7 +260,7 @@ def _find_essential(points0: Vectors, points1: Vectors, confidence: float, focal
     stacked, mask = cv2.findEssentialMat(scale * points0, scale * points1, K, prob=confidence, **settings)
     if stacked is None or len(stacked) <= 3:
         return stacked, mask
-    solutions = np.split(stacked, len(stacked) // 3)  # of five points, up to ten
+    solutions = np.split(stacked, len(stacked) // 3)  # five points have up to ten
     return max(solutions, key=lambda E: cv2.recoverPose(E, points0, points1, np.eye(3), FARTHEST)[0]), mask
 
 

@@ -1,13 +1,13 @@
 """Two views as rotation, translation direction and focal lengths, fitted to matches with a robust loss.
 
-A ray y = (u, v, g) has the pixel's offset from the principal point and the expected focal length g. Two views
-satisfy
+A ray y = (u, v, g) holds a pixel's offset (u, v) from the principal point and the expected focal length g. Two
+views satisfy
 
     F = diag(1, 1, f1 / g1) [t]x R diag(1, 1, f0 / g0),     y1^T F y0 = 0,
 
 since K^-1 = diag(1, 1, f) / f. The Sampson distance is r = y1^T F y0 / s (Sampson, 1982; Hartley and Zisserman,
 Multiple View Geometry, 11.4.3). s is the norm of the gradient of y1^T F y0 in the four pixel coordinates, so r is
-in pixels. With P = diag(1, 1, 0), the derivative of r in the elements of F is
+in pixels. With P = diag(1, 1, 0), the derivative of r with respect to F is
 
     dr = (a^T dF y0 + y1^T dF b) / s,     a = y1 - (r / s) P F y0,     b = -(r / s) P F^T y1.
 """
@@ -33,7 +33,7 @@ CROSS.setflags(write=False)
 
 @dataclass(frozen=True, eq=False)
 class TwoView:
-    """X_1 = R X_0 + t, with t (3,) of unit length; ``logs`` (2,) are log f / g of both cameras."""
+    """Two views with X_1 = R X_0 + t and |t| = 1, t (3,); ``logs`` (2,) are log f / g of both cameras."""
 
     R: Matrix3
     t: Vectors
@@ -41,10 +41,10 @@ class TwoView:
 
     @classmethod
     def nearest(cls, F: Matrix3, log0: float = 0.0, log1: float = 0.0) -> "TwoView":
-        """Return the views with these focal lengths whose E is nearest to the E of F.
+        """Return the views with log f / g of ``log0`` and ``log1`` whose E is nearest to the E of F.
 
-        Four combinations of rotation and sign of t have the same F; this is one of them. Raises ``LinAlgError`` if
-        F is not finite.
+        Four combinations of rotation and sign of t have the same F; the result is one of them. Raises
+        ``LinAlgError`` if F is not finite.
         """
         U, _, Vt = np.linalg.svd(F / _focal_factors(np.array([log0, log1])))
         quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, np.linalg.det(U) * np.linalg.det(Vt)]])
@@ -56,7 +56,7 @@ class TwoView:
 
     @property
     def twisted(self) -> "TwoView":
-        """The view with the other rotation of the same F."""
+        """The two views with the same F and the other rotation."""
         return TwoView((2 * np.outer(self.t, self.t) - np.eye(3)) @ self.R, self.t, self.logs)
 
     def depth_signs(self, rays0: Vectors, rays1: Vectors, error: float) -> NDArray[np.float64]:
@@ -73,7 +73,7 @@ class TwoView:
         return np.where(apart, signs, np.nan)
 
     def tangent(self) -> NDArray[np.float64]:
-        """Return the (9, 7) Jacobian of F's elements: rotation (3), t on the sphere (2), logs (2)."""
+        """Return the (9, 7) Jacobian of F's elements, by rotation (3), t on the sphere (2) and logs (2)."""
         F, factors = self.fundamental, _focal_factors(self.logs)
         turns = cross_matrix(self.t) @ CROSS @ self.R * factors
         shifts = np.tensordot(self._tangent_basis().T, CROSS, 1) @ self.R * factors
@@ -82,7 +82,7 @@ class TwoView:
         return np.concatenate([turns, shifts, [by_log0, by_log1]]).reshape(7, 9).T
 
     def moved(self, step: Vectors) -> "TwoView":
-        """Return the view after a step (7,) along the columns of :meth:`tangent`."""
+        """Return the views after a step (7,) along the columns of :meth:`tangent`."""
         t = self.t + self._tangent_basis() @ step[3:5]
         return TwoView(
             Rotation.from_rotvec(step[:3]).as_matrix() @ self.R, t / np.linalg.norm(t), self.logs + step[5:]
@@ -97,9 +97,9 @@ class TwoView:
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """A fit to rays (N, 3) with one ``weight``; ``sigmas`` (2,) are standard deviations of log f / g.
+    """A fit to rays (N, 3) of equal ``weight``; ``sigmas`` (2,) are standard deviations of log f / g.
 
-    A deviation of 0 fixes that focal length.
+    A sigma of 0 fixes the focal length of that camera.
     """
 
     rays0: Vectors
@@ -108,12 +108,12 @@ class Problem:
     weight: float = 1.0
 
     def cost(self, view: TwoView, scale: float) -> float:
-        """Return the sum of the robust costs of the Sampson distances and :meth:`prior_cost`."""
+        """Return :meth:`prior_cost` plus the weighted sum of the robust costs of the Sampson distances."""
         distances = sampson(view.fundamental, self.rays0, self.rays1)
         return self.weight * float(np.sum(robust_costs(distances, scale))) + self.prior_cost(view)
 
     def prior_cost(self, view: TwoView) -> float:
-        """Return half the sum of the squared logs over their variances."""
+        """Return half the sum of squared logs, each over its variance."""
         return 0.5 * float(self._precisions @ view.logs**2)
 
     def fit(self, start: TwoView, scale: float) -> TwoView:
@@ -145,7 +145,7 @@ class Problem:
         return np.array([1 / sigma**2 if sigma else 0.0 for sigma in self.sigmas])
 
     def _step(self, gradient: Vectors, curvature: NDArray[np.float64], damping: float) -> Vectors:
-        """Return the damped step (7,). It is NaN, and so rejected, for a singular system."""
+        """Return the damped step (7,), or NaN for a singular system, so that the step is rejected."""
         free = self._free
         step, damped = np.zeros(7), curvature + damping * np.diag(np.diag(curvature) + MIN_DAMPING)
         try:
@@ -178,7 +178,7 @@ def robust_costs(distances: Vectors, scale: float) -> Vectors:
 
 
 def sampson(F: Matrix3, rays0: Vectors, rays1: Vectors) -> Vectors:
-    """Return (N,) signed Sampson distances in pixels of (N, 3) rays to an F for rays."""
+    """Return (N,) signed Sampson distances, in pixels, of rays (N, 3) under an F for rays."""
     _, lines1, slope = _lines(F, rays0, rays1)
     return np.asarray(_row_dots(rays1, lines1) / slope)
 

@@ -1,1 +1,1 @@
-"""Reports of a run: summary, tables, pages, figures."""
+"""Reports of a run: summary, tables, HTML page and figures."""

@@ -1,4 +1,4 @@
-"""Figures: a pair with its matches, clusters and critical regions; a scene's cameras."""
+"""Figures of pairs, with matches, clusters and critical regions, and of a scene's cameras."""
 
 from io import BytesIO
 from math import sqrt
@@ -26,11 +26,11 @@ INLIER, OUTLIER, REGION, DROPPED = "#009E73", "#D55E00", "#F0E442", "#999999"
 COLOURS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#56B4E9", "#CC79A7")
 DPI = 110
 STRIP_HEIGHT_PX, MAX_STRIP_PX = 480, 2_000_000
-MAX_INLIERS, MAX_OUTLIERS = 150, 50  # number of lines that stay legible
+MAX_INLIERS, MAX_OUTLIERS = 150, 50  # maximum numbers of lines in a legible figure
 
 
 def draw_pair(image0: Image, image1: Image, match: PairMatch, config: MkpcConfig) -> "Figure":
-    """Draw the matches of all units and the critical regions at the top, the clusters of stage 1 below."""
+    """Draw the matches of all units and the critical regions, and below them the clusters of stage 1."""
     figure = new_figure(12, 9)
     panels = figure.subplot_mosaic([["matches", "matches"], ["0", "1"]])
     counts = f"{len(match.matches)} matches, {match.estimate.inlier_count} inliers"
@@ -42,7 +42,7 @@ def draw_pair(image0: Image, image1: Image, match: PairMatch, config: MkpcConfig
 
 
 def draw_strip(images: tuple[Image, Image], match: PairMatch) -> "Figure":
-    """Draw the matches and the critical regions without text, on up to :data:`MAX_STRIP_PX` pixels."""
+    """Draw the matches and the critical regions without text, in up to :data:`MAX_STRIP_PX` pixels."""
     aspect = sum(view.content.width / view.content.height for view in map(_upright, images))
     height = min(STRIP_HEIGHT_PX, sqrt(MAX_STRIP_PX / aspect)) / DPI
     figure = new_figure(aspect * height, height)
@@ -52,9 +52,9 @@ def draw_strip(images: tuple[Image, Image], match: PairMatch) -> "Figure":
 
 
 def draw_matches(axes: "Axes", images: tuple[Image, Image], match: PairMatch) -> str:
-    """Show the images side by side, matches as lines, critical regions as boxes. Return a caption.
+    """Draw the images side by side, matches as lines, and critical regions as boxes. Return a caption.
 
-    Where there are many matches, an even sample is drawn. Each image is one unit of the axes high.
+    Of many matches, an even sample is drawn. In axes coordinates, each image is one unit high.
     """
     from matplotlib.collections import LineCollection
 
@@ -88,7 +88,7 @@ def _draw_clusters(axes: "Axes", image: Image, match: PairMatch, config: MkpcCon
     stage1 = match.matches[match.in_stage(1)]
     points = stage1.points1 if side else stage1.points0
     clusters = find_clusters(points, image.size, config)
-    shown = _upright(image).from_image(points) + 0.5  # from the centres of pixels to their edges
+    shown = _upright(image).from_image(points) + 0.5  # (0, 0) is the top-left corner in the figure
     x, y = shown[~clusters.in_kept].T
     axes.scatter(x, y, s=8, color=DROPPED, marker="x", linewidths=0.7)
     for rank, label in enumerate(clusters.kept):
@@ -105,7 +105,7 @@ def _draw_clusters(axes: "Axes", image: Image, match: PairMatch, config: MkpcCon
 def _show(
     axes: "Axes", image: Image, region: CriticalRegion | None, scale: float = 1.0, left: float = 0.0
 ) -> None:
-    """Draw an image, upright, and its critical region, its corner at (left, 0) and its pixels ``scale`` wide."""
+    """Draw an image upright, from (left, 0) with pixels ``scale`` wide, and its critical region."""
     from matplotlib.patches import Polygon
 
     view = _upright(image)
@@ -118,15 +118,15 @@ def _show(
 
 
 def _upright(image: Image) -> View:
-    """Return the view of the whole image at its own size."""
+    """Return the upright view of the whole image at its original size."""
     return View.fit(Box.whole(image.size), long_side=max(image.size), turns=image.turns)
 
 
 def draw_cameras(scene: SceneRecord, number: int = 0) -> "Figure":
-    """Draw cameras and points of model ``number`` (0: the largest) from above and the side, in its own units.
+    """Draw a model's cameras and points, in model units, from above and the side; number 0 is the largest.
 
-    An arrow points the way a camera looks. Up is the mean of the images' up directions, and ahead is where the
-    cameras look. Points far away from nearly all others are cut off. Without cameras, it is a line of text.
+    An arrow shows the viewing direction of a camera. Up is the images' mean up direction, and ahead is the mean
+    viewing direction. Points far from nearly all others are left out. Without cameras, the figure is only text.
     """
     figure = new_figure(8.4, 4.0)
     if not scene.models:
@@ -155,7 +155,7 @@ def draw_cameras(scene: SceneRecord, number: int = 0) -> "Figure":
 
 
 def _near(values: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return the mask of values that are not far outside the range of nearly all values."""
+    """Return a mask of the values in or near the range of nearly all values."""
     low, high = np.percentile(values, (3, 97)) if len(values) else (0.0, 0.0)
     near: NDArray[np.bool_] = np.abs(values - (low + high) / 2) <= 0.7 * (high - low)
     return near
@@ -171,14 +171,14 @@ def new_figure(width: float, height: float) -> "Figure":
 
 
 def require_format(path: Path) -> None:
-    """Raise :class:`UserError` for a suffix that is not a format of matplotlib, or without matplotlib."""
-    formats = new_figure(1, 1).canvas.get_supported_filetypes().keys() - {"pgf"}  # which needs LaTeX
+    """Raise :class:`UserError` if matplotlib is missing or does not support the suffix as a format."""
+    formats = new_figure(1, 1).canvas.get_supported_filetypes().keys() - {"pgf"}  # pgf needs LaTeX
     if path.suffix[1:].lower() not in formats:
         raise UserError(f"the figure {path} needs a suffix: one of {', '.join(sorted(formats))}")
 
 
 def save(figure: "Figure", path: Path) -> None:
-    """Write a figure in the format of its suffix. Raises :class:`UserError` if it cannot be written."""
+    """Write a figure in the format of the path's suffix. Raises :class:`UserError` if writing fails."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with replacing(path) as stream:
@@ -188,14 +188,14 @@ def save(figure: "Figure", path: Path) -> None:
 
 
 def encode(figure: "Figure", kind: str, dpi: int = DPI) -> bytes:
-    """Return the figure as "png", for lines and text, or "jpeg", for photographs."""
+    """Return the encoded figure; ``kind`` is "png" for lines and text, or "jpeg" for photographs."""
     stream = BytesIO()
     figure.savefig(stream, format=kind, dpi=dpi, pil_kwargs={"quality": 82} if kind == "jpeg" else None)
     return stream.getvalue()
 
 
 def plain(axes: "Axes", title: str) -> "Axes":
-    """Return axes with a title on the left, and without a frame at the top and on the right."""
+    """Return the axes with a title on the left and without the top and right edges of the frame."""
     axes.set_title(title, loc="left", fontsize=10)
     axes.tick_params(labelsize=9)
     axes.spines[["top", "right"]].set_visible(False)
@@ -203,5 +203,5 @@ def plain(axes: "Axes", title: str) -> "Axes":
 
 
 def sample(mask: NDArray[np.bool_], most: int) -> NDArray[np.intp]:
-    """Return up to ``most`` indices of a mask, evenly spread."""
+    """Return up to ``most`` evenly spread indices of the mask's true elements."""
     return np.array(evenly_spread(np.flatnonzero(mask).tolist(), most), np.intp)

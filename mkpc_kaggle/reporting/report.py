@@ -1,6 +1,6 @@
 """``report.html``: a self-contained page about a run, built from its journal.
 
-Drawings need matplotlib, and pictures of pairs need the images. The page states why drawings are missing.
+Drawings need matplotlib, and pictures of pairs also need the images. The page states why drawings are missing.
 """
 
 import base64
@@ -36,16 +36,16 @@ from mkpc_kaggle.reporting.summary import (
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-WRITING_S, WRITING_S_PER_PAIR = 0.6, 0.0002  # time for a page without drawings
-DRAWING_S = 5.0  # drawings start only with more time left
-MAX_SCENES, MAX_MODELS = 12, 8  # drawn scenes, and drawn models of a scene
+WRITING_S, WRITING_S_PER_PAIR = 0.6, 0.0002  # time to write a page without drawings
+DRAWING_S = 5.0  # drawings start only if more time is left
+MAX_SCENES, MAX_MODELS = 12, 8  # number of drawn scenes, and of drawn models per scene
 
 
 def report_run(work_dir: Path, path: Path, ends: float, pairs: Sequence[Pair] = ()) -> str:
-    """Write the report of a run that has just ended. Return a line with its path, or the reason for no report.
+    """Write the report of a run that has just ended. Return a line with the path, or the reason for no report.
 
-    The page is first written without drawings, so that it exists even if the program ends while drawing. ``ends``
-    is the end of the program's time, in seconds of the monotonic clock; ``pairs`` are the run's, to be drawn.
+    The page is first written without drawings, so that it exists even if the program ends while drawing. The
+    program's time ends at ``ends``, in seconds of the monotonic clock. ``pairs`` are the pairs of the run.
     Never raises: a failed report must not change the exit status of a successful run.
     """
     later = f"python -m mkpc_kaggle journal {work_dir} --report {path}"
@@ -74,7 +74,7 @@ def write_report(log: RunLog, path: Path, pairs: Sequence[Pair] = (), *, undrawn
 def report_page(log: RunLog, pairs: Sequence[Pair] = (), *, undrawn: str = "") -> str:
     """Return the HTML document. The template escapes all text from files.
 
-    ``pairs`` have the image paths of the pairs to be drawn; ``undrawn`` is the reason for a page without drawings.
+    ``pairs`` have the image paths for drawings. ``undrawn`` is the reason for a page without drawings.
     """
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
@@ -113,7 +113,7 @@ def report_page(log: RunLog, pairs: Sequence[Pair] = (), *, undrawn: str = "") -
 
 
 def _picture(source: Pair | None, match: PairMatch) -> str:
-    """Return a pair's picture, empty if its images are unknown or unreadable."""
+    """Return a pair's picture as a data URI, empty if an image is unknown or unreadable."""
     if source is not None:
         with suppress(UserError):
             return _data_uri(draw_strip(_images(source), match), "jpeg")
@@ -121,9 +121,9 @@ def _picture(source: Pair | None, match: PairMatch) -> str:
 
 
 def weak_figure(log: RunLog, match: PairMatch, source: Pair) -> "Figure":
-    """Draw the matches, clusters and critical regions of a weak pair, from the journal.
+    """Draw the matches, clusters and critical regions of a weak pair of the log.
 
-    ``source`` is the pair with its image paths. Raises :class:`UserError` for an unreadable image.
+    ``source`` is the pair with image paths. Raises :class:`UserError` for an unreadable image.
     """
     return draw_pair(*_images(source), match, log.recipe.mkpc)
 
@@ -134,7 +134,7 @@ def _images(pair: Pair) -> tuple[Image, Image]:
 
 
 def _scenes(log: RunLog) -> Iterator[tuple[object, ...]]:
-    """Yield a row of each batch: images, registered images, points, focal lengths, seconds, pairs, failure."""
+    """Yield a row per batch: name, images, registered images, points, focals, seconds, pairs, failure."""
     counts = Counter(record.pair.group for record in log.records if record.source == "scene")
     for each in log.scenes:
         focals = [found.focal for model in each.models for found in model.images]

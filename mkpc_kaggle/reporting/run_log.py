@@ -1,4 +1,4 @@
-"""A run for reports: a snapshot of its journal, and its tables as files."""
+"""The data of a run for reports: a snapshot of the journal, and tables as CSV files."""
 
 import csv
 from dataclasses import astuple, dataclass
@@ -24,8 +24,8 @@ from mkpc_kaggle.geometry.robust import Estimate, ModelKind, sampson_distances
 from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
 from mkpc_kaggle.recipe import Recipe, recipe_of
 
-MAX_DRAWN_PAIRS = 20  # the weakest, which the report draws
-SECONDS = {  # of a pair's record, and how reports name them
+MAX_DRAWN_PAIRS = 20  # the number of weakest pairs that the report draws
+SECONDS = {  # fields of a pair's record, and their names in reports
     "decode_seconds": "wait for decoding",
     "encode_seconds": "encode",
     "match_seconds": "match",
@@ -43,18 +43,18 @@ class RunLog:
     recipe: Recipe
     records: tuple[PairRecord, ...]  # of each pair, in order
     events: tuple[Event, ...]  # of all sessions
-    weakest: tuple[tuple[PairRecord, PairMatch], ...]  # matched pairs with F by MAGSAC, the fewest inliers first
+    weakest: tuple[tuple[PairRecord, PairMatch], ...]  # matched pairs, the fewest inliers first
     scenes: tuple[SceneRecord, ...] = ()
 
     @property
     def ending(self) -> str:
-        """How the last session ended."""
+        """The ending of the last session."""
         ends = (event.text for event in self.events[-1:] if event.kind == EventKind.END)
         return next(ends, "not ended (at work, or killed)")
 
     @property
     def seconds(self) -> float:
-        """Duration of the last session until its last event."""
+        """Duration of the last session, until its last event."""
         return self.events[-1].seconds if self.events else 0.0
 
     @property
@@ -62,14 +62,14 @@ class RunLog:
         return [text for _, text in self.of_kind(EventKind.FAULT)]
 
     def of_kind(self, kind: str) -> list[tuple[str, str]]:
-        """Return time and text of the events of a kind."""
+        """Return the time and the text of each event of a kind."""
         return [(format_duration(event.seconds), event.text) for event in self.events if event.kind == kind]
 
 
 def read_log(directory: Path) -> RunLog:
     """Read the journal of a work directory, during a run or after it.
 
-    Raises :class:`UserError` for a missing journal, and for one that this version cannot read.
+    Raises :class:`UserError` if the journal is missing, or if this version cannot read it.
     """
     with JournalReader(directory) as journal, undamaged(journal.path):
         about, records = journal.about(), tuple(journal.records())
@@ -92,10 +92,10 @@ def read_log(directory: Path) -> RunLog:
 
 
 def write_csv(log: RunLog, directory: Path) -> list[Path]:
-    """Write tables of pairs, units, regions and events to files of these names. Return the files.
+    """Write the tables pairs.csv, units.csv, regions.csv and events.csv. Return their paths.
 
-    Only tables with the same columns are replaced. Raises :class:`UserError` for other files of these names, and
-    if a table cannot be written.
+    An existing file is replaced only if it is a table with the same columns. Otherwise, and if a table cannot be
+    written, raises :class:`UserError`.
     """
     stats = "stats.support", "stats.candidates", "stats.cost", "stats.magsac_cost"
     values = attrgetter("failure", "source", "matches", "inliers", "overlaps", *SECONDS, *stats)

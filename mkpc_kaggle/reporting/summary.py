@@ -1,4 +1,4 @@
-"""Summary of a run on one screen: results, costs, failed pairs."""
+"""One-screen summary of a run: results, costs, failed pairs."""
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -16,7 +16,7 @@ from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
 from mkpc_kaggle.reporting.run_log import SECONDS, RunLog
 from mkpc_kaggle.scene.reconstruction import Sigmas
 
-MAX_LINES = 8  # of each list
+MAX_LINES = 8  # per list
 
 Run: TypeAlias = RunReport | RunLog
 
@@ -35,15 +35,15 @@ def overview(log: RunLog) -> str:
 
 
 def headline(run: Run) -> str:
-    """Return the run's ending and the number of pairs with an F."""
+    """Return the run's ending, its duration and the number of pairs with an F."""
     count = f"{sum(record.is_solved for record in run.records)} of {len(run.records)} pairs have an F"
     return f"{run.ending} after {format_duration(run.seconds)}: {count}"
 
 
 def trouble(run: Run) -> str:
-    """Return why a run failed although its file is complete, or an empty string.
+    """Return why a run with a complete file failed, or an empty string.
 
-    Pairs without an F count only if an error is the cause, not too few matches or too little time.
+    A pair without an F counts only if an error is the cause, rather than few matches or little time.
     """
     if run.ending in (Ending.NO_WORKER, Ending.NOTHING_RUNS):
         return f"the run failed: {run.ending}, the faults say why; the same command resumes"
@@ -57,7 +57,7 @@ def trouble(run: Run) -> str:
 
 
 def _error(record: PairRecord) -> str:
-    """Return the error that left a pair without an F, if any."""
+    """Return the error that left a pair without an F, or an empty string."""
     if record.is_solved:
         return ""
     if not record.units:
@@ -66,14 +66,14 @@ def _error(record: PairRecord) -> str:
 
 
 def left_out_line(left_out: Sequence[str]) -> str:
-    """Return the matchers that did not run, by cause, with advice on weights; empty if all ran."""
+    """Return a line with the matchers that did not run, by cause, and advice on weights; empty if all ran."""
     advice = " (`python -m mkpc_kaggle weights fetch --out DIR` gets weights)"
     has_advice = any(cause.startswith("no weights") for cause in left_out)
     return f"left out, {'; '.join(left_out)}{advice * has_advice}" if left_out else ""
 
 
 def unit_means(run: Run) -> list[tuple[str, int, float, float, float]]:
-    """Return each unit, its number of pairs, and its means of matches, inliers and seconds."""
+    """Return a row per unit: name, number of pairs, and mean matches, inliers and seconds."""
     results: dict[str, list[tuple[float, float, float]]] = {}
     for unit in (unit for record in run.records for unit in record.units):
         values = unit.matches, unit.inliers, unit.encode_seconds + unit.match_seconds
@@ -82,19 +82,19 @@ def unit_means(run: Run) -> list[tuple[str, int, float, float, float]]:
 
 
 def unit_reasons(run: Run, field: str = "failure") -> list[str]:
-    """Return why units failed or, by ``note``, ran otherwise, and on how many pairs; most frequent first."""
+    """Return the units' failures, or another ``field``, with numbers of pairs, the most frequent first."""
     units = (unit for record in run.records for unit in record.units)
     counts = Counter(f"{unit.unit}: {getattr(unit, field)}" for unit in units if getattr(unit, field))
     return [f"{reason} ({count} pairs)" for reason, count in counts.most_common()]
 
 
 def seconds_by_part(run: Run) -> dict[str, float]:
-    """Return the seconds of each part of the work on all pairs."""
+    """Return the total seconds of all pairs for each part of the work."""
     return {name: sum(getattr(record, field) for record in run.records) for field, name in SECONDS.items()}
 
 
 def facts(run: Run) -> Iterator[tuple[str, str, str]]:
-    """Yield the most important facts: name, value, remark."""
+    """Yield the most important facts as (name, value, remark)."""
     records, scenes = run.records, run.scenes
     solved, sources = [record for record in records if record.is_solved], Counter(each.source for each in records)
     parts = (("scene", "from scenes"), ("pair", "from their own matches"), ("fallback", "fallback"))
@@ -141,14 +141,14 @@ def weakest_line(scenes: Sequence[SceneRecord]) -> Iterator[str]:
 
 
 def weakest_cameras(scenes: Sequence[SceneRecord]) -> list[tuple[str, Sigmas]]:
-    """Return images and expected errors of their cameras, the largest expected error of the centre first."""
+    """Return (image name, sigmas) of each camera, the largest expected error of the centre first."""
     placed = (found for scene in scenes for model in scene.models for found in model.images)
     known = [(found.image.name, found.sigmas) for found in placed if found.sigmas]
     return sorted(known, key=lambda each: -each[1].centre)
 
 
 def _list(title: str, items: Sequence[str]) -> Iterator[str]:
-    """Yield the number of items and the first of them."""
+    """Yield a line with the number of items, and up to ``MAX_LINES`` items."""
     if items:
         yield f"{title}: {len(items)}"
         yield from (f"  {item}" for item in items[:MAX_LINES])

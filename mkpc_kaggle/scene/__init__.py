@@ -1,1 +1,1 @@
-"""Reconstruction of a batch: keypoints from all matches, pycolmap's models, and the F of each pair."""
+"""Reconstruction of a batch: keypoints from all matches, models by pycolmap, and the choice of each pair's F."""

@@ -15,15 +15,15 @@ from mkpc_kaggle.scene.reconstruction import RegisteredImage
 from mkpc_kaggle.scene.view_graph import BatchPair
 
 CONTRADICTION_ERROR_PX = 2.0  # maximum Sampson distance of a match that agrees with an F
-CONTRADICTION_MATCHES = 30  # minimum number that agrees with the pair's F
-CONTRADICTION_SHARE = 0.05  # of these, the minimum share that must agree with the scene's F
+CONTRADICTION_MATCHES = 30  # minimum number of matches that agree with the pair's F
+CONTRADICTION_SHARE = 0.05  # minimum share of these matches that must agree with the scene's F
 FOCAL_SIGMA = 0.1  # standard deviation of the logarithm of the scene's focal lengths
 
 ModelImages: TypeAlias = Mapping[str, RegisteredImage]  # the registered images of a model, by digest
 
 
 class Reason(StrEnum):
-    """Reason of a pair's :class:`Choice`; only ``SCENE`` means the scene's F."""
+    """Reason for a pair's :class:`Choice`; only ``SCENE`` stands for the scene's F."""
 
     SCENE = "both cameras are known"
     UNREGISTERED = "an image has no camera"
@@ -37,7 +37,7 @@ class Reason(StrEnum):
 class Choice:
     """The F chosen for a pair, (3, 3) of unit norm with x1^T F x0 = 0.
 
-    It is the scene's, or the pair's at the scene's focal lengths; ``None`` if the pair keeps its F.
+    F is the scene's, or the pair's at the scene's focal lengths. ``None`` means that the pair keeps its F.
     """
 
     F: Matrix3 | None
@@ -49,7 +49,7 @@ class Choice:
 
 
 def choose(pair: BatchPair, models: Sequence[ModelImages]) -> Choice:
-    """Return the F of a pair from its cameras in the first model with both, or the reason for none."""
+    """Return the F from a pair's cameras, in the first model with both cameras, or the reason for no F."""
     digests = pair.image0.digest, pair.image1.digest
     if digests[0] == digests[1]:
         return Choice(None, Reason.SAME_IMAGE)
@@ -65,10 +65,10 @@ def choose(pair: BatchPair, models: Sequence[ModelImages]) -> Choice:
 
 
 def contradicts(F: Matrix3, pair: BatchPair) -> bool:
-    """Return whether far fewer of the pair's matches agree with the scene's F than with the pair's.
+    """Return whether far fewer of the pair's matches agree with the scene's F than with the pair's own F.
 
-    The pair's F always agrees with more of its matches. On a repetitive facade it may agree with many times more
-    and be wrong, so only a tiny share counts against the scene.
+    The pair's F normally agrees with more matches. On a repetitive facade, a wrong F may agree with many times
+    more matches, so only a tiny share counts against the scene.
     """
     if pair.pair_fundamental is None:
         return False
@@ -82,7 +82,7 @@ def contradicts(F: Matrix3, pair: BatchPair) -> bool:
 def estimate_at_known_focals(
     pair: BatchPair, focals: Mapping[str, float], config: FocalConfig, magsac: RobustConfig
 ) -> Matrix3 | None:
-    """Return the F, (3, 3), of a pair's matches at the scene's focal lengths, ``focals`` in pixels by digest.
+    """Return F (3, 3) from a pair's matches, with the scene's focal lengths ``focals``, in pixels by digest.
 
     Return ``None`` if neither image has a known focal length or the matches give no F.
     """

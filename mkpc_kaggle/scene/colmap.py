@@ -1,8 +1,8 @@
-"""Structure from motion by pycolmap: a connected view graph in, cameras and points out.
+"""Structure from motion by pycolmap: from a view graph to cameras and points.
 
 pycolmap can abort the process (failed assertion, out of memory), and the global mapper has no time limit. Once
-pycolmap is imported, a SIGTERM ends the process with a stack trace on stderr. A caller that cannot afford this
-must run it in a separate process. Nothing is written to disk, except by :func:`write_files`.
+pycolmap is imported, a SIGTERM ends the process with a stack trace on stderr. To survive
+this, run pycolmap in a separate process. Only :func:`write_files` writes to disk.
 
 Source: Pan et al. 2024 (the global mapper).
 """
@@ -27,10 +27,10 @@ from mkpc_kaggle.scene.uncertainty import camera_sigmas
 from mkpc_kaggle.scene.view_graph import MIN_MATCHES, Edge, ViewGraph
 
 CENTRE_PX = 0.5  # in COLMAP the top-left pixel's centre is (0.5, 0.5), here it is (0, 0)
-MAX_ERROR_PX = 2.0  # of a verified match; 1 px loses accuracy on tourists' photographs, 4 px on repeated windows
-MAX_TRIALS = 300  # RANSAC trials per edge: more find the same inliers at five times the cost
-LARGE = 100  # images; in a larger scene all tracks cost too much, a smaller scene gains accuracy from them
-TRACKS_PER_IMAGE = 200  # the longest, with which the global mapper starts in a large scene
+MAX_ERROR_PX = 2.0  # of a verified match; 1 px loses accuracy on tourist photographs, 4 px on repeated windows
+MAX_TRIALS = 300  # RANSAC trials per edge; more trials find the same inliers at five times the cost
+LARGE = 100  # images; all tracks cost too much in larger scenes and improve smaller ones
+TRACKS_PER_IMAGE = 200  # the longest tracks, from which the global mapper starts in a large scene
 SEED = 0
 CAMERA_MODEL = "SIMPLE_PINHOLE"  # a radial camera does not improve focal lengths (docs/results.md)
 
@@ -38,8 +38,8 @@ CAMERA_MODEL = "SIMPLE_PINHOLE"  # a radial camera does not improve focal length
 def structure_from_motion(graph: ViewGraph, shared: SharedIntrinsics) -> Reconstruction:
     """Return pycolmap's reconstruction of a view graph, with any number of models.
 
-    Each image has its own camera, except images with ``shared`` intrinsics. Cameras start with the shared focal
-    length or EXIF's, and all focal lengths are refined.
+    Each image has its own camera, except images with ``shared`` intrinsics. The initial focal length is the shared
+    one or EXIF's. All focal lengths are refined.
     """
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
     pycolmap.set_random_seed(SEED)
@@ -51,8 +51,8 @@ def structure_from_motion(graph: ViewGraph, shared: SharedIntrinsics) -> Reconst
 def write_files(directory: Path, graph: ViewGraph, shared: SharedIntrinsics, models: Sequence[SfmModel]) -> None:
     """Write COLMAP's files: the database and one folder per model.
 
-    Files are written to a temporary folder in ``directory`` and replace earlier files when all are complete. Files
-    of a model contain only its plausible images.
+    A temporary folder in ``directory`` holds the files until all are complete. Then they replace earlier files. A
+    model's files contain only its plausible images.
     """
     directory.mkdir(parents=True, exist_ok=True)
     for left in directory.glob(f"{PART}*"):  # of a killed process
@@ -80,7 +80,7 @@ def write_files(directory: Path, graph: ViewGraph, shared: SharedIntrinsics, mod
 
 
 def _fill(database: Any, graph: ViewGraph, shared: SharedIntrinsics) -> None:
-    """Write images, their cameras and keypoints, and the matches and verified geometry of each edge."""
+    """Write the images, cameras and keypoints, and each edge's matches and verified geometry."""
     keypoints, found = scene_keypoints(graph)
     with pycolmap.DatabaseTransaction(database):
         cameras = _write_images(database, graph, keypoints, shared)
@@ -95,7 +95,7 @@ def _write_images(
 ) -> list[Any]:
     """Write images, frames, cameras and rigs. Return each image's camera.
 
-    Images and frames are numbered by the image's index plus one, cameras and rigs by their first image.
+    Images and frames have the image's index plus one as id. Cameras and rigs have the id of their first image.
     """
     cameras: dict[object, Any] = {}
     used = []
@@ -119,7 +119,7 @@ def _write_images(
 
 
 def _write_camera(database: Any, number: int, size: Size, focal: float) -> Any:
-    """Write a camera with this initial focal length, and a rig of this camera alone."""
+    """Write a camera with initial focal length ``focal``, and a rig with only this camera."""
     camera = pycolmap.Camera.create_from_model_name(number, CAMERA_MODEL, focal, *size)
     camera.has_prior_focal_length = True  # a pair that E explains at this focal length counts as calibrated
     database.write_camera(camera, use_camera_id=True)
@@ -134,7 +134,7 @@ def verify(
 ) -> list[Any]:
     """Return the epipolar geometry of each edge, with its inliers."""
     ransac = {"max_error": MAX_ERROR_PX, "max_num_trials": MAX_TRIALS, "random_seed": SEED}
-    # COLMAP takes unmoved matches for a watermark, but views from nearby have many of them.
+    # COLMAP takes matches without motion for a watermark, but nearby views have many of these.
     settings = {"ransac": ransac, "min_num_inliers": MIN_MATCHES, "detect_watermark": False}
     options = pycolmap.TwoViewGeometryOptions(settings)
     points = [found.astype(np.float64) + CENTRE_PX for found in keypoints]
@@ -147,9 +147,9 @@ def verify(
 
 
 def run_mapper(database: Any, graph: ViewGraph) -> Reconstruction:
-    """Return the plausible models of the global mapper from a filled database."""
+    """Run the global mapper on a filled database. Return its plausible models."""
     seed = {"random_seed": SEED}
-    common = seed | {"num_threads": 1}  # with more, the last digits vary
+    common = seed | {"num_threads": 1}  # with more threads, the last digits vary
     parts = dict.fromkeys(("rotation_averaging", "global_positioning", "retriangulation"), seed)
     required = {"track_required_tracks_per_view": TRACKS_PER_IMAGE} if len(graph.images) > LARGE else {}
     mapper = {**common, **parts, **required}

@@ -6,17 +6,17 @@ from typing import TypeAlias
 
 import numpy as np
 
-MAX_IMAGES = 2000  # the search is quadratic in their number
+MAX_IMAGES = 2000  # the search is quadratic in the number of images
 
-Ends: TypeAlias = tuple[int, int]  # the two images of a pair by their indices, the smaller first
+Ends: TypeAlias = tuple[int, int]  # indices of a pair's two images, the smaller first
 
 
 def extra_pairs(image_count: int, pairs: Sequence[Ends], per_image: float) -> list[Ends]:
     """Return extra pairs that give a batch ``per_image`` pairs per image, the most useful first.
 
-    ``pairs`` are the existing pairs, in any order. Each step adds a partner to the image in the fewest pairs: the
-    image with the most partners in common, which probably shows the same part of the scene. Among several, the
-    image in the fewest pairs wins. A batch of more than ``MAX_IMAGES`` images gets none.
+    ``pairs`` are the existing pairs, in any order. Each step links the image in the fewest pairs to the image with
+    the most partners in common. The two probably show the same part of the scene. Ties go to the image in the
+    fewest pairs. A batch of more than ``MAX_IMAGES`` images gets no extra pairs.
     """
     if image_count > MAX_IMAGES:
         return []

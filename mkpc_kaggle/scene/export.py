@@ -1,14 +1,14 @@
-"""COLMAP's files of a batch."""
+"""The files that COLMAP reads, of one batch."""
 
 from pathlib import Path
 
 DATABASE, MODELS = "database.db", "models"
 MODEL_FILES = ("cameras.bin", "frames.bin", "images.bin", "points3D.bin", "rigs.bin")
 FORMER = "former"  # folder of the models being replaced
-PART = ".mkpc-new-"  # prefix of temporary folders, whose files replace former files
+PART = ".mkpc-new-"  # prefix of temporary folders for new files
 
 
 def has_files(directory: Path, models: int) -> bool:
-    """Return whether ``directory`` has the files of a reconstruction with that number of models."""
+    """Return whether ``directory`` has the files of a reconstruction with ``models`` models."""
     names = [f"{MODELS}/{number}/{name}" for number in range(models) for name in MODEL_FILES]
     return all(directory.joinpath(name).is_file() for name in (DATABASE, *names))

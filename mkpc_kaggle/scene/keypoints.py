@@ -1,7 +1,7 @@
-"""Keypoints of images from the matches of their pairs: a point that two pairs share becomes one keypoint.
+"""Keypoints of images, merged from the matches of all pairs: points less than a pixel apart are one keypoint.
 
 The position of a point varies by a fraction of a pixel between pairs, resolutions and matchers. Structure from
-motion tracks points through images, so points of an image less than a pixel apart must become one keypoint.
+motion tracks a point through several pairs, so its positions in an image must become one keypoint.
 """
 
 import numpy as np
@@ -32,10 +32,10 @@ def scene_keypoints(graph: ViewGraph) -> tuple[list[Points], list[Index]]:
 
 
 def merge_points(points: Points, cell: float) -> tuple[Points, NDArray[np.intp]]:
-    """Return the float32 means, (K, 2), of points, (N, 2), in each cell, and the index of each point's mean, (N,).
+    """Return each cell's float32 mean (K, 2) of the points (N, 2), and the index (N,) of each point's mean.
 
-    A grid separates close points on both sides of a cell border. A second grid, shifted by half a cell, merges the
-    means of the first.
+    A grid separates close points on the two sides of a cell border. So a second grid, shifted by half a cell,
+    merges the means from the first grid.
     """
     total: NDArray[np.float64] = points.astype(np.float64)
     weight: NDArray[np.float64] = np.ones(len(points))
@@ -51,9 +51,9 @@ def merge_points(points: Points, cell: float) -> tuple[Points, NDArray[np.intp]]
 
 
 def one_to_one(index: NDArray[np.intp]) -> Index:
-    """Return the matches, (M, 2) of (N, 2), that use each keypoint at most once.
+    """Select matches (M, 2) of (N, 2) so that each keypoint is used at most once.
 
-    Of conflicting matches at most one is right: the more frequent match wins, then the earlier.
+    Of conflicting matches, at most one is correct. The more frequent match wins, then the earlier one.
     """
     distinct, first, count = np.unique(index, axis=0, return_index=True, return_counts=True)
     order = np.lexsort((first, -count))

@@ -1,4 +1,4 @@
-"""Similarity of images by a VLAD of RootSIFT: the pairs of a large folder, and the partners of each image.
+"""Similarity of images by VLAD descriptors of RootSIFT, to choose each image's partners in a large folder.
 
 All recipes use RootSIFT: it needs no weights, works with dense matchers, and does not depend on the orientation of
 an image. Source: Jegou et al. 2010; normalisation by Arandjelovic and Zisserman 2013.
@@ -16,24 +16,24 @@ from scipy.cluster.vq import kmeans2, vq
 from mkpc_kaggle.data.images import Image, read_image
 from mkpc_kaggle.matchers.adapters.sift import root_sift
 
-Partners = list[list[int]]  # of each image, by the indices of the images
+Partners = list[list[int]]  # of each image, as indices of images
 
-PARTNERS = 20  # of an image
+PARTNERS = 20  # per image
 WORDS = 64
 SIDE_PX = 640
-FEATURES = 1000  # descriptors of an image
-MAX_TRAINING = 50_000  # descriptors for the words
+FEATURES = 1000  # descriptors per image
+MAX_TRAINING = 50_000  # descriptors to cluster into words
 FEATURE_SETTINGS = f"rootsift {SIDE_PX} {FEATURES} 1"  # ends with the version of the algorithm
-SCALE = np.float32(255)  # of descriptors as bytes
+SCALE = np.float32(255)  # of descriptors stored as bytes
 
 
 def shortlist(partners: Partners) -> list[tuple[int, int]]:
-    """Return the sorted pairs of each image with its partners, the smaller index first."""
+    """Return the sorted, distinct pairs of images and their partners, each with the smaller index first."""
     return sorted({(min(i, j), max(i, j)) for i, others in enumerate(partners) for j in others})
 
 
 def local_features(path: Path) -> bytes:
-    """Return the RootSIFT descriptors of an image, 128 bytes each; empty if it cannot be read."""
+    """Return the RootSIFT descriptors of an image, 128 bytes each; empty if the image is unreadable."""
     image, found = read_image(path), None
     if isinstance(image, Image):
         scale = SIDE_PX / max(image.size)
@@ -43,9 +43,9 @@ def local_features(path: Path) -> bytes:
 
 
 def most_alike(features: Callable[[], Iterable[bytes]], count: int) -> list[list[int]]:
-    """Return for each image the indices of the ``count`` most similar images, by their :func:`local_features`.
+    """Return, for each image, the indices of the ``count`` images with the most similar :func:`local_features`.
 
-    ``features`` is called several times, so that it can stream. An image without features is similar to none.
+    ``features`` is called once per pass, so it can stream. An image without features is similar to no other image.
     """
     share = MAX_TRAINING // max(1, sum(1 for _ in features()))
     training = np.concatenate(
@@ -54,7 +54,7 @@ def most_alike(features: Callable[[], Iterable[bytes]], count: int) -> list[list
     words = training[:: max(1, len(training) // WORDS)][:WORDS]
     if len(words):
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # a word without descriptors
+            warnings.simplefilter("ignore")  # about words without descriptors
             words, _ = kmeans2(training, words, iter=10, minit="matrix")
     table = np.stack([vlad(found, words) for found in map(_unpacked, features())])
     similarity = table @ table.T
@@ -69,7 +69,7 @@ def _unpacked(features: bytes) -> NDArray[np.float32]:
 
 
 def vlad(descriptors: NDArray[np.float32], words: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the VLAD, (W * D,) of unit length, of descriptors, (K, D), by words, (W, D); zero without any."""
+    """Return the unit-length VLAD (W * D,) of descriptors (K, D) over words (W, D); zeros if K is 0."""
     sums = np.zeros_like(words)
     if len(descriptors):
         nearest, _ = vq(descriptors, words)

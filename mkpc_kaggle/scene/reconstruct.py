@@ -1,4 +1,4 @@
-"""Reconstruction of a batch: pairs in, cameras and the pairs' choices out, all of them picklable."""
+"""Reconstruction of a batch: from pairs to cameras and a choice of F for each pair, all picklable."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -12,16 +12,16 @@ from mkpc_kaggle.scene.reconstruction import MIN_IMAGES, Reconstruction, SfmMode
 from mkpc_kaggle.scene.shared_intrinsics import SharedIntrinsics, given_intrinsics, shared_intrinsics
 from mkpc_kaggle.scene.view_graph import BatchPair, ViewGraph
 
-MIN_PAIRS_PER_IMAGE = 1.35  # connected pairs; fewer hardly constrain the cameras
+MIN_PAIRS_PER_IMAGE = 1.35  # connected pairs; with fewer, cameras are poorly constrained
 KEEPS_ITS_F = Reason.SCENE, Reason.SAME_IMAGE, Reason.CONTRADICTION  # not re-estimated at other focal lengths
-MIN_OBSERVATIONS = 0.99  # of the observations without them; with fewer, shared intrinsics are dropped
+MIN_OBSERVATIONS = 0.99  # share of the observations before sharing; with fewer, sharing is dropped
 
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """The reconstructions of a batch's components, and the choice of each pair, in order.
+    """The reconstructions of a batch's components, and a choice for each pair, in the order of the pairs.
 
-    Duplicate images have the name of the first.
+    Images with the same content have the name of the first of them.
     """
 
     reconstructions: tuple[Reconstruction, ...]
@@ -37,16 +37,16 @@ def reconstruct_batch(
 ) -> Solution:
     """Reconstruct every connected component of a batch, and choose an F for each of its pairs.
 
-    With ``focal``, the recipe's prior, a pair without an F from cameras is re-estimated if the scene has a
-    focal length, unless the pair contradicts the scene. ``magsac`` defaults to its default settings. With
-    ``export``, a directory, the batch is reconstructed as a whole, and COLMAP's files are written there.
+    With the recipe's prior ``focal``, a pair without an F from cameras is re-estimated at the scene's focal
+    lengths, unless the pair contradicts the scene. ``magsac`` has default settings if ``None``. With a directory
+    ``export``, the batch is reconstructed as a whole, and COLMAP's files are written there.
 
-    A missing result has a reason; no matches raise an error. Reconstruction takes seconds to minutes and may end
-    the process, see :mod:`mkpc_kaggle.scene.colmap`.
+    A missing result has a reason; bad matches never raise. Reconstruction takes seconds to minutes and may end the
+    process, see :mod:`mkpc_kaggle.scene.colmap`.
     """
     found, shared = reconstruct_sharing(ViewGraph.of_pairs(pairs), config, export)
     models = [{image.image.digest: image for image in model.images} for model in models_of(found)]
-    focals = dict(shared)  # of the first model with the image, or else of its shared camera
+    focals = dict(shared)  # from the first model with the image, else from the image's shared camera
     for model in reversed(models):
         focals |= {digest: image.focal for digest, image in model.items()}
     choices = []
@@ -62,11 +62,11 @@ def reconstruct_batch(
 def reconstruct_sharing(
     graph: ViewGraph, config: SceneConfig, directory: Path | None = None
 ) -> tuple[list[Reconstruction], SharedIntrinsics]:
-    """Return the reconstruction of each component, and the intrinsics that its images share.
+    """Return the reconstruction of each component, and the shared intrinsics of the images.
 
-    Images that seem to share a camera are reconstructed again with shared intrinsics, unless they see fewer points
-    then. Images that are known to share a camera do so from the start; their focal length in the result is the
-    refined one. With a ``directory`` the graph is reconstructed as a whole, and COLMAP's files are written there.
+    If images seem to share a camera, a second reconstruction shares intrinsics. It is kept unless images then see
+    fewer points. If the recipe shares cameras, the first reconstruction does too. The refined focal lengths are
+    returned. With a ``directory``, the graph is reconstructed as a whole, and COLMAP's files are written there.
     """
     if directory is None:
         parts, make = graph.components(), reconstruct_component
@@ -113,6 +113,6 @@ def reconstruct_connected(graph: ViewGraph, shared: SharedIntrinsics) -> Reconst
 
 
 def models_of(reconstructions: Sequence[Reconstruction]) -> tuple[SfmModel, ...]:
-    """Return all models, the largest first."""
+    """Return the models of all reconstructions, the largest first."""
     models = (model for found in reconstructions for model in found.models)
     return tuple(sorted(models, key=lambda model: -len(model.images)))

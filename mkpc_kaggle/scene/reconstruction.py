@@ -12,21 +12,21 @@ from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.scene.view_graph import BatchImage
 
 MIN_IMAGES = 3  # in a model
-MIN_POINTS = 30  # seen by a registered image
+MIN_POINTS = 30  # seen by a plausible image
 FOCALS = Range(0.3, 5.0)  # plausible focal lengths, in long sides of the image
 
 
 class Sigmas(NamedTuple):
-    """Expected root mean square errors of a camera, see :mod:`mkpc_kaggle.scene.uncertainty`."""
+    """Expected root mean square errors of a camera; see :mod:`mkpc_kaggle.scene.uncertainty`."""
 
     rotation: float  # degrees
-    centre: float  # in model sizes: root mean square distances of its cameras from their mean
+    centre: float  # over the model's size, the RMS distance of its cameras from their mean
     focal: float  # percent
 
 
 @dataclass(frozen=True, eq=False)
 class RegisteredImage:
-    """An image with its camera in its model's world units; ``points`` is the number of points that it sees.
+    """An image with its camera, in the model's world units; ``points`` is the number of visible points.
 
     ``sigmas`` is empty if unknown.
     """
@@ -44,9 +44,9 @@ class RegisteredImage:
 
 @dataclass(frozen=True, eq=False)
 class SfmModel:
-    """Cameras and points, (P, 3) float64, of one world; ``reprojection_error`` is the mean in pixels.
+    """Cameras and points (P, 3) float64 in one world frame; ``reprojection_error`` is the mean in pixels.
 
-    ``colmap`` is pycolmap's model, which cannot leave its process.
+    ``colmap`` is pycolmap's model, which is not pickled.
     """
 
     images: tuple[RegisteredImage, ...]
@@ -60,9 +60,9 @@ class SfmModel:
 
 @dataclass(frozen=True, eq=False)
 class Reconstruction:
-    """A connected component of a batch: the names of its images, and its models, the largest first.
+    """Result for a connected component of a batch: image names, and models, the largest first.
 
-    An image may be in several models. ``failure`` is the reason why the component has no model, or empty.
+    An image may be in several models. ``failure`` is the reason for a component without models, else empty.
     """
 
     names: tuple[str, ...]
@@ -81,7 +81,7 @@ class Reconstruction:
 
 
 def filter_models(models: Sequence[SfmModel]) -> tuple[SfmModel, ...]:
-    """Return the models without implausible cameras, the largest first. Drop models with too few images left."""
+    """Remove implausible cameras, then models with too few images. Return the rest, the largest first."""
     cleaned = [replace(model, images=tuple(filter(is_plausible, model.images))) for model in models]
     kept = [model for model in cleaned if len(model.images) >= MIN_IMAGES]
     return tuple(sorted(kept, key=lambda model: (-len(model.images), -len(model.points))))

@@ -1,8 +1,8 @@
 """Shared intrinsics of images from one camera at one zoom, detected by their focal lengths.
 
 An image's own focal length is ambiguous with the distance to the scene, and poorly constrained by few points. If
-most images of one size agree on their focal length, one camera is assumed, and they are reconstructed again with
-shared intrinsics. If the user states that one camera took them, the first reconstruction shares them already.
+most images of one size agree on the focal length, one camera is assumed. A second reconstruction then has shared
+intrinsics. If the user declares one camera, the first reconstruction already has shared intrinsics.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,21 +15,21 @@ from mkpc_kaggle.recipe import CameraSharing, SceneConfig
 from mkpc_kaggle.scene.reconstruction import SfmModel
 from mkpc_kaggle.scene.view_graph import BatchImage
 
-TOLERANCE = 0.02  # maximum relative deviation of focal lengths that agree, from their median
+TOLERANCE = 0.02  # maximum relative deviation of agreeing focal lengths from the median
 MIN_ALIKE = 5  # registered images of one size
-ZOOM_POINTS = 0.5  # of the median image's points; an image that sees more but disagrees has another zoom
+ZOOM_POINTS = 0.5  # share of the median number of points; an image with more that disagrees has another zoom
 
-# Focal length in pixels of the camera that an image shares with others of its size, by the image's digest.
+# By image digest: the focal length, in pixels, of the camera that images of one size share.
 SharedIntrinsics: TypeAlias = Mapping[str, float]
 
 
 def start_focal(image: BatchImage) -> float:
-    """Return the initial focal length, in pixels, of an image's camera: EXIF's, if known."""
+    """Return the initial focal length of an image's camera, in pixels; from EXIF if known."""
     return image.focal or FOCAL_RATIO * max(image.size)
 
 
 def given_intrinsics(images: Sequence[BatchImage], config: SceneConfig) -> SharedIntrinsics:
-    """Return the common initial focal length of the images of each size, if the recipe shares cameras."""
+    """Return one initial focal length for all images of a size, if the recipe shares cameras."""
     if config.cameras is not CameraSharing.FOLDER:
         return {}
     starts = {}
@@ -40,10 +40,10 @@ def given_intrinsics(images: Sequence[BatchImage], config: SceneConfig) -> Share
 
 
 def shared_intrinsics(images: Sequence[BatchImage], models: Sequence[SfmModel]) -> SharedIntrinsics:
-    """Return the focal lengths of images of one size on which more than half of the registered images agree.
+    """Return, for each image size, the focal length on which more than half of the registered images agree.
 
-    All images of the size share the median, also unregistered ones, except images that see many points at another
-    focal length: they have another zoom.
+    All images of the size, registered or not, share the median focal length. Exceptions are images that see many
+    points at another focal length, since they have another zoom.
     """
     registered = {found.image.digest: found for model in reversed(models) for found in model.images}
     shared: dict[str, float] = {}

@@ -1,7 +1,7 @@
-"""Uncertainty of each camera of a reconstruction, from the covariance of its bundle adjustment.
+"""Uncertainty of a reconstruction's cameras, from the covariance of bundle adjustment.
 
-All cameras together fix the origin, orientation and scale: errors that a similarity of the world explains do not
-count (the S-transformation of Baarda 1981). The residuals give the noise of keypoints.
+All cameras together fix the origin, orientation and scale. So errors that a similarity of the world explains do
+not count (the S-transformation of Baarda 1981). The noise of keypoints is estimated from the residuals.
 """
 
 from typing import Any
@@ -14,12 +14,12 @@ from scipy.linalg import block_diag
 from mkpc_kaggle.geometry.two_view import cross_matrix
 from mkpc_kaggle.scene.reconstruction import Sigmas
 
-MAX_IMAGES = 200  # of a model: memory grows with the square of their number, and time with its cube
-DAMPED = pycolmap.BACovarianceOptions({"damping": 1e-3})  # the world is free: the normal equations are singular
+MAX_IMAGES = 200  # of a model; memory is quadratic and time cubic in the number of images
+DAMPED = pycolmap.BACovarianceOptions({"damping": 1e-3})  # the world is free, so the normal equations are singular
 
 
 def camera_sigmas(found: Any) -> dict[str, Sigmas]:
-    """Return the sigmas of the registered images of pycolmap's reconstruction, by name; empty if unknown."""
+    """Return the sigmas of registered images in pycolmap's reconstruction, by name; empty if unknown."""
     images = [image for _, image in sorted(found.images.items()) if image.has_pose and image.num_points3D]
     if not 1 < len(images) <= MAX_IMAGES:
         return {}
@@ -47,10 +47,10 @@ def camera_sigmas(found: Any) -> dict[str, Sigmas]:
 
 
 def _pose_variances(poses: list[NDArray[np.float64]], covariance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return variances of rotations, radians, and of centres, in model sizes: (N, 2); ``poses`` are [R | t]."""
+    """Return variances (N, 2) of rotations, in radians, and centres, in model sizes; ``poses`` are [R | t]."""
     centres = np.array([-pose[:, :3].T @ pose[:, 3] for pose in poses])
     size = np.sqrt(centres.var(axis=0).sum())
-    moves, similarities = [], []  # Jacobians of angles and centres: by the pose, and by a similarity of the world
+    moves, similarities = [], []  # Jacobians of angles and centres by pose, and by world similarity
     for pose, centre in zip(poses, (centres - centres.mean(axis=0)) / size, strict=True):
         R, t, zero = pose[:, :3], pose[:, 3], np.zeros((3, 4))  # COLMAP's parameters are half angles and t
         moves.append(np.vstack([2 * np.eye(3, 6), -R.T @ np.hstack([2 * cross_matrix(t), np.eye(3)]) / size]))

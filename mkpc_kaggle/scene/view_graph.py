@@ -11,15 +11,15 @@ from mkpc_kaggle.geometry.coordinates import Matrix3, Size
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.pipeline.pair import UnitResult
 
-MIN_MATCHES = 15  # of an edge that connects images; also the minimum inliers of a verified edge
-MIN_TRACK_MATCHES = 50  # from units that make tracks; a pair with fewer uses the matches of all units
+MIN_MATCHES = 15  # of a connecting edge; also the minimum number of inliers of a verified edge
+MIN_TRACK_MATCHES = 50  # from units that make tracks; with fewer, a pair uses the matches of all units
 
 
 @dataclass(frozen=True)
 class BatchImage:
-    """An image of a batch: its ``name``, the ``digest`` of its content, its ``size`` in pixels.
+    """An image of a batch, with the ``digest`` of its content and its ``size`` in pixels.
 
-    Names with equal digests are one image. ``focal`` is EXIF's focal length in pixels, 0 if unknown.
+    Images with equal digests count as one image. ``focal`` is EXIF's focal length in pixels, 0 if unknown.
     """
 
     name: str
@@ -30,10 +30,10 @@ class BatchImage:
 
 @dataclass(frozen=True, eq=False)
 class BatchPair:
-    """Two images of a batch and their matches in full-image pixels, which may be empty.
+    """Two images of a batch, and their matches, perhaps none, in full-image pixels.
 
-    ``pair_fundamental`` is the F, (3, 3), from the pair's matches alone, or ``None``. ``tracks`` are the matches
-    for the reconstruction; ``None`` means all matches.
+    ``pair_fundamental`` is F (3, 3) from the pair's matches alone, or ``None``. ``tracks`` are the matches for the
+    reconstruction; ``None`` means all matches.
     """
 
     image0: BatchImage
@@ -45,7 +45,7 @@ class BatchPair:
 
 @dataclass(frozen=True, eq=False)
 class Edge:
-    """All matches between two distinct images, given by their indices in the graph, ``first < second``."""
+    """All matches between two distinct images, whose indices in the graph are ``first < second``."""
 
     first: int
     second: int
@@ -54,7 +54,7 @@ class Edge:
 
 @dataclass(frozen=True, eq=False)
 class ViewGraph:
-    """Distinct images, and the edges between them, sorted by their two ends."""
+    """Distinct images, and their edges, sorted by image indices."""
 
     images: tuple[BatchImage, ...]
     edges: tuple[Edge, ...]
@@ -65,15 +65,15 @@ class ViewGraph:
 
     @property
     def strong(self) -> "ViewGraph":
-        """The graph with only the edges of at least ``MIN_MATCHES`` matches."""
+        """The graph with only the edges that have at least ``MIN_MATCHES`` matches."""
         return ViewGraph(self.images, tuple(edge for edge in self.edges if len(edge.matches) >= MIN_MATCHES))
 
     @classmethod
     def of_pairs(cls, pairs: Sequence[BatchPair]) -> "ViewGraph":
         """Return the graph of a batch's pairs.
 
-        Pairs of the same two images, in either order, become one edge. A pair of an image with itself and a pair
-        without matches make no edge.
+        Pairs of the same two images, in either order, become one edge. A pair of an image with itself, and a
+        pair without matches, make no edge.
         """
         images: dict[str, BatchImage] = {}
         for image in (image for pair in pairs for image in (pair.image0, pair.image1)):
@@ -92,7 +92,7 @@ class ViewGraph:
         return cls(tuple(images.values()), edges)
 
     def components(self) -> tuple["ViewGraph", ...]:
-        """Return the connected components of the strong edges, ordered by their first images."""
+        """Return the components connected by strong edges, ordered by first image."""
         strong = self.strong.edges
         ends = np.array([(edge.first, edge.second) for edge in strong], np.intp).reshape(-1, 2)
         shape = (len(self.images), len(self.images))
@@ -109,6 +109,6 @@ class ViewGraph:
 
 
 def tracks_of(results: Sequence[UnitResult]) -> Matches:
-    """Return the matches for reconstruction: from units that make tracks, or all if these are few."""
+    """Return the matches from units that make tracks, or all matches if these are few."""
     tracks = Matches.concatenate(result.matches for result in results if result.unit.tracks)
     return tracks if len(tracks) >= MIN_TRACK_MATCHES else Matches.concatenate(each.matches for each in results)

@@ -1,4 +1,4 @@
-"""Downloads of the manifest's files: resumed after interruptions, renamed after their digest is verified."""
+"""Downloads of the manifest's files, resumed after interruptions, and renamed once their digest is verified."""
 
 import sys
 import time
@@ -20,7 +20,7 @@ BLOCK_BYTES = 1 << 20
 TIMEOUT_S = 30.0  # without data
 PROGRESS_INTERVAL_S = 10.0
 MAX_BYTES = 1 << 33  # of a file of unknown size
-WEB_PAGE_HOSTS = ("drive.google.com",)  # they return a web page instead of the file
+WEB_PAGE_HOSTS = ("drive.google.com",)  # hosts that return a web page instead of the file
 TRANSIENT_STATUSES = (408, 416, 425, 429, 500, 502, 503, 504)  # HTTP statuses after which a retry can succeed
 
 
@@ -33,7 +33,7 @@ class FetchOutcome(StrEnum):
 
 @dataclass(frozen=True)
 class Fetched:
-    """The result of a download. ``note``: reason of a failure, manual step, or digest of an unverified file."""
+    """The result of a download. ``note``: reason for a failure, manual step, or digest of an unverified file."""
 
     path: Path
     outcome: FetchOutcome
@@ -41,14 +41,14 @@ class Fetched:
 
 
 def url_of(file: WeightFile) -> str | None:
-    """Return the URL of a direct download, or ``None``."""
+    """Return the URL if the file can be downloaded directly, else ``None``."""
     url = file.source.split()[0]
     parts = urlsplit(url)
     return url if parts.scheme in ("http", "https") and parts.hostname not in WEB_PAGE_HOSTS else None
 
 
 def choose(alternatives: Sequence[WeightFile], directory: Path) -> WeightFile:
-    """Choose a line of a slot: the first with a usable file, else the first with a URL, else the first."""
+    """Choose a slot's line of the manifest: the first with a usable file, else with a URL, else the first."""
     there = [file for file in alternatives if judge(directory / file.name, file).usable]
     return next(iter(there + [file for file in alternatives if url_of(file)] + list(alternatives)))
 
@@ -56,8 +56,8 @@ def choose(alternatives: Sequence[WeightFile], directory: Path) -> WeightFile:
 def fetch(file: WeightFile, directory: Path, *, wait: Callable[[float], None] = time.sleep) -> Fetched:
     """Download the file into the directory, which is created if necessary.
 
-    A partial download stays in ``NAME.part``. It is resumed if the manifest has a digest, which finally verifies
-    both parts together. ``wait`` is called with the seconds to pause before the next attempt.
+    A partial download stays in ``NAME.part``. It is resumed only if the manifest has a digest to verify the whole
+    file. ``wait`` is called with the seconds to pause before the next attempt.
     """
     path = directory / file.name
     if judge(path, file).usable:
@@ -81,7 +81,7 @@ def fetch(file: WeightFile, directory: Path, *, wait: Callable[[float], None] = 
 
 
 def _verify(part: Path, file: WeightFile) -> str:
-    """Return a note on the complete download; remove a wrong file and raise :class:`UserError`."""
+    """Return a note if the file has no known digest. Remove a wrong file and raise :class:`UserError`."""
     digest, size = digest_of(part), part.stat().st_size
     if file.digest == UNVERIFIED and file.size in (-1, size):
         return f"not verified: the manifest has no digest for it; this file's is {digest}"
@@ -95,7 +95,7 @@ def _verify(part: Path, file: WeightFile) -> str:
 
 
 def _download(url: str, part: Path, file: WeightFile, wait: Callable[[float], None]) -> None:
-    """Request until the file is complete; raise :class:`UserError` on permanent errors or after all attempts."""
+    """Retry until the file is complete. Raise :class:`UserError` on a permanent error or after all attempts."""
     reason = ""
     for attempt in range(ATTEMPTS):
         if attempt:
@@ -107,7 +107,7 @@ def _download(url: str, part: Path, file: WeightFile, wait: Callable[[float], No
             error.close()
             if error.code not in TRANSIENT_STATUSES:
                 raise UserError(f"{url}: the server says {reason}") from error
-            if error.code == 416:  # range not satisfiable: the partial download is of another version
+            if error.code == 416:  # range not satisfiable: the partial download is from another version
                 part.unlink(missing_ok=True)
         except (OSError, HTTPException, ValueError, OverflowError) as error:  # the last two: a malformed response
             reason = str(error)
@@ -118,7 +118,7 @@ def _download(url: str, part: Path, file: WeightFile, wait: Callable[[float], No
 
 
 def _receive(url: str, part: Path, file: WeightFile) -> None:
-    """Request the missing bytes once; raises ``OSError`` and other errors if the connection breaks."""
+    """Request the missing bytes once. Raise ``OSError`` or another error if the connection breaks."""
     most = file.size if file.size >= 0 else MAX_BYTES
     have = part.stat().st_size if part.exists() else 0
     wanted = {"Range": f"bytes={have}-"} if 0 < have < most and file.digest != UNVERIFIED else {}

@@ -90,7 +90,7 @@ def test_a_comparison_of_runs_that_failed_or_ended_early_has_their_status(demo, 
 def test_what_recipes_have_in_common_is_matched_once(demo, small_recipe, tmp_path, capsys):
     other, third, text = tmp_path / "other.toml", tmp_path / "third.toml", small_recipe.read_text()
     third.write_text(f"{text}threshold = 1.0\n")
-    other.write_text(text.replace("400", "440") + "\n[focal]\nsigma = 0.3\n")
+    other.write_text(text.replace("400", "440") + "\n[focal]\nscale = 0.3\n")
     assert compare(demo, "--compare", small_recipe, third, other, "--work-dir", tmp_path / "work") == 0
     printed = capsys.readouterr().out
     assert re.findall(r"(\d+) units run", printed) == ["8", "0", "4"], "each common unit runs once"
