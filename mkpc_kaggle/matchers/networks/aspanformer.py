@@ -61,7 +61,7 @@ class ChannelNorm(nn.Module):
 def global_attention(
     q: Tensor, k: Tensor, v: Tensor, temperature: Tensor | float, masks: tuple[Tensor | None, Tensor | None]
 ) -> Tensor:
-    """Return messages to queries (N, h, w, C) from keys and values (N, h_key, w_key, C), like the queries.
+    """Return messages (N, h, w, C) to queries of this shape, from keys and values (N, h_key, w_key, C).
 
     A masked query gets the mean of all values, as published.
     """
