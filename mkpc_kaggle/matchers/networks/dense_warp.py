@@ -37,8 +37,8 @@ class DenseFeatures(NamedTuple):
 
 
 class DenseWarp(NamedTuple):
-    """Warps of B pairs, float32, on either image's grid: ``warp`` (B, H, W, 4), (x, y) in the first, then in the
-    second image, in [-1, 1]; ``certainty`` (B, H, W) in [0, 1], and 0 where the target is outside.
+    """Warps of B pairs, float32, on either image's grid. ``warp`` (B, H, W, 4) has (x, y) in the first, then in the
+    second image, in [-1, 1]. ``certainty`` (B, H, W) is in [0, 1], and 0 where the target is outside.
     """
 
     warp: Tensor
