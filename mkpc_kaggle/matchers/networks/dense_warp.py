@@ -37,7 +37,7 @@ class DenseFeatures(NamedTuple):
 
 
 class DenseWarp(NamedTuple):
-    """Warps of B pairs, float32, on either image's grid. ``warp`` (B, H, W, 4) has (x, y) in the first, then in the
+    """Warps of B pairs, float32, on either image's grid. ``warp`` (B, H, W, 4) has (x, y) in the first, then the
     second image, in [-1, 1]. ``certainty`` (B, H, W) is in [0, 1], and 0 where the target is outside.
     """
 
