@@ -35,8 +35,8 @@ def paired_difference(scenes: Sequence[Paired]) -> Difference:
     """Return the gain, averaged over each scene's pairs and then over scenes, with its confidence interval.
 
     Pairs that share an image are not independent. So the bootstrap resamples images, not pairs: each image of a
-    scene gets a random weight, and a pair's weight is the product of both. Scenes are not resampled. The
-    same input gives the same interval. If pairs share no image, the interval is up to 1.7 times too wide.
+    scene gets a random weight, and the product of two image weights is a pair's weight. Scenes are not resampled.
+    The same input gives the same interval. If pairs share no image, the interval is up to 1.7 times too wide.
     Sources: Rubin 1981 (exponential weights); Owen 2007 (products of weights).
     """
     generator = np.random.default_rng(0)

@@ -47,7 +47,7 @@ class DatasetScore:
 
 
 def score_imc2025(directory: Path, submission: Path) -> list[DatasetScore]:
-    """Return the submission's score for each dataset of a train side, ``directory``.
+    """Return the submission's score for each dataset of the train side in ``directory``.
 
     Raises :class:`UserError` for unreadable files, for numbers that cannot be scored, and for a missing, unknown
     or repeated image or dataset.
@@ -118,7 +118,7 @@ def accurate_images(truth: Centres, cluster: Centres, thresholds: Sequence[float
 
 
 def residuals(source: Points, target: Points, fitted: NDArray[np.intp]) -> NDArray[np.float64]:
-    """Fit a similarity to each row of indices ``fitted`` (B, k), and return its distances (B, N) from ``target``.
+    """Fit a similarity to each row of indices, ``fitted`` (B, k), and return the distances (B, N) from ``target``.
 
     Distances are NaN if the fitted sources coincide.
 

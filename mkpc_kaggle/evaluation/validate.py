@@ -47,7 +47,7 @@ class PairScore:
     """One pair's error, infinite if the pair failed, and the pair's record if the engine ran.
 
     ``steps`` has the error after each :class:`Step` of the run; the last equals ``error``. ``matching``, for pairs
-    of a list, has two ratios of correct matches: to all matches (precision) and to image 0's keypoints (score).
+    of a list, is correct matches over all matches (precision) and over keypoints of image 0 (matching score).
     """
 
     id: str
@@ -123,7 +123,7 @@ class Validation:
 def by_protocol(recipe: Recipe, protocol: str) -> Recipe:
     """Return the recipe with the settings of a protocol.
 
-    Scoring by a protocol also needs ``in_front`` of :func:`validate`. SuperGlue's threshold is in pixels of the
+    Scoring by a protocol also sets ``in_front`` of :func:`validate`. SuperGlue's threshold is in pixels of the
     resized image, whose long side is the largest of stage 1.
     """
     units = tuple(replace(unit, antialias=False) for unit in recipe.units)

@@ -30,7 +30,7 @@ class DenseMatcher(PairwiseMatcher[DenseEncoding]):
     """A dense matcher. A match's score is its certainty; the random seed depends on the two pictures alone.
 
     Pictures and pairs are processed one by one, so that results do not depend on the batch. ``first_pass``
-    scales pictures for the first of two passes; None means one pass. ``multiple``: of the sides in the first pass.
+    scales the first of two passes; None means one pass. Sides in the first pass are multiples of ``multiple``.
     """
 
     matches = 5000  # the maximum per pair

@@ -23,7 +23,7 @@ def matcher_names() -> tuple[str, ...]:
 
 
 def spec_of(name: str, where: str) -> MatcherSpec:
-    """Import a matcher and return its spec. Messages of errors start with ``where``, the source of the name.
+    """Import a matcher and return its spec. Error messages start with ``where``, the source of the name.
 
     Raises :class:`UserError` for an unknown name, :class:`UnusableError` if the import fails.
     """

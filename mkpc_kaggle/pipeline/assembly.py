@@ -109,8 +109,8 @@ def assemble(
 ) -> Assembly:
     """Check recipe, options, licences, weights, device and precision before any work, and return the assembly.
 
-    Raises :class:`UserError`. A fallback replaces an unavailable matcher. Without one, only recipe ``auto`` runs,
-    without the units. ``scenes`` switches the reconstruction of batches on or off; ``None`` follows the recipe.
+    Raises :class:`UserError`. A fallback replaces an unavailable matcher; without one, recipe ``auto`` drops its
+    units. ``scenes`` switches the reconstruction of batches on or off; ``None`` follows the recipe.
     """
     if not isinstance(recipe, Recipe | str):
         raise TypeError(f"a recipe is a Recipe, a name, or a path as text, not {recipe!r}")

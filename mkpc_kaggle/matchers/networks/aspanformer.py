@@ -24,8 +24,8 @@ POOLING = (4, 4)  # rows and columns of the coarse map per cell of the global le
 
 @dataclass(frozen=True, eq=False)
 class Side:
-    """One image in the coarse transformer: features ``visual`` (N, h, w, 256) and ``flow`` (N, h, w, 128),
-    projected ``positions`` (1, h, w, 128), the global level's ``factor``, and ``mask`` (N, h, w) bool or None.
+    """One image in the coarse transformer, with features ``visual`` (N, h, w, 256) and ``flow`` (N, h, w, 128).
+    ``positions`` (1, h, w, 128) are projected. ``mask`` is (N, h, w) bool or None.
     """
 
     visual: Tensor
@@ -61,7 +61,7 @@ class ChannelNorm(nn.Module):
 def global_attention(
     q: Tensor, k: Tensor, v: Tensor, temperature: Tensor | float, masks: tuple[Tensor | None, Tensor | None]
 ) -> Tensor:
-    """Return messages to queries (N, h, w, C) from keys and values (N, h_key, w_key, C), like the queries.
+    """Return messages (N, h, w, C) to queries of this shape, from keys and values (N, h_key, w_key, C).
 
     A masked query gets the mean of all values, as published.
     """

@@ -81,7 +81,7 @@ class DedodeRefiner(nn.Module):
 
 
 class DedodeDecoder(nn.Module):
-    """A decoder to ``prediction`` channels with ``blocks`` per refiner; ``mode`` interpolates predictions."""
+    """A decoder to ``prediction`` channels with ``blocks`` per refiner. Predictions are upsampled in ``mode``."""
 
     def __init__(self, strides: Sequence[int], prediction: int, blocks: int, mode: str) -> None:
         super().__init__()

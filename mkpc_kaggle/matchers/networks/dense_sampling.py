@@ -32,7 +32,7 @@ def draw(weights: Tensor, noise: Tensor, number: int) -> Tensor:
 
 
 def density(points: Tensor) -> Tensor:
-    """For each point p (N, D), sum exp(-|p - q|^2 / (2 bandwidth^2)) over all points q, also p: (N,)."""
+    """Return (N,) sums of exp(-|p - q|^2 / (2 bandwidth^2)) over all points q, for each point p of (N, D)."""
     density = points.new_empty(len(points))
     rows = max(1, BLOCK_FLOATS // max(1, len(points)))
     for some, out in zip(torch.split(points, rows), torch.split(density, rows), strict=True):

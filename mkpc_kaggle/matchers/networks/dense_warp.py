@@ -37,8 +37,8 @@ class DenseFeatures(NamedTuple):
 
 
 class DenseWarp(NamedTuple):
-    """Warps of B pairs, float32, on either image's grid: ``warp`` (B, H, W, 4), (x, y) in the first, then in the
-    second image, in [-1, 1]; ``certainty`` (B, H, W) in [0, 1], and 0 where the target is outside.
+    """Warps of B pairs, float32, on either image's grid. ``warp`` (B, H, W, 4) has (x, y) in the first, then the
+    second image, in [-1, 1]. ``certainty`` (B, H, W) is in [0, 1], and 0 where the target is outside.
     """
 
     warp: Tensor
@@ -86,7 +86,7 @@ class DenseNetwork(nn.Module, ABC):
         """Encode images (B, 3, H, W) from :func:`pixels.network_input`; ``fine``: larger, for a second pass."""
 
     def match(self, first: DenseFeatures, second: DenseFeatures) -> tuple[DenseWarp, DenseWarp]:
-        """Return the warps of B pairs on the first and on the second image's grid. Both sizes may differ."""
+        """Return the warps of B pairs on the first and on the second image's grid. Sizes may differ."""
         # Sequential: one batch of both directions would take twice the memory and the same time.
         forward, backward = (dense_warp(*self.decoder(*both)) for both in ((first, second), (second, first)))
         return forward, backward.swapped()

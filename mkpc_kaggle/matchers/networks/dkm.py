@@ -98,7 +98,7 @@ class EmbeddingDecoder(nn.Module):
     def forward(
         self, stride: int, posterior: Tensor, features: Tensor, context: Tensor
     ) -> tuple[WarpEstimate, Tensor]:
-        """Map maps (B, C, h, w), with C = 256, 512 and 384 in this order, to the estimate and the next context."""
+        """Map posterior, features and context (B, 256 / 512 / 384, h, w) to the estimate and the next context."""
         at = str(stride)
         own = self.feat_input_modules[at](features)
         embedded = torch.cat([own, posterior.to(own.dtype)], dim=1)  # (B, 512, h, w)

@@ -44,7 +44,7 @@ class FinePreprocess(nn.Module):
 
 
 def cell_points(cells: Tensor, width: int) -> Tensor:
-    """Return the top-left corners (M, 2) float32, (x, y) in pixels, of cells (M,) in a map of ``width`` cells."""
+    """Return top-left corners (M, 2) float32, (x, y) in pixels, of cells (M,) in a map of ``width`` columns."""
     return torch.stack([cells % width, cells // width], dim=1).float() * COARSE_STRIDE
 
 
@@ -69,7 +69,7 @@ def cut_windows(fine: Tensor, cells: Tensor) -> Tensor:
 def expected_offset(windows0: Tensor, windows1: Tensor) -> Tensor:
     """Return the mean offset (M, 2) float32, (x, y) in -1..1, between windows (M, 25, C) of both images.
 
-    The softmax of window 0's centre compared with all cells of window 1 is the distribution of the offset.
+    The centre of window 0 is compared with each cell of window 1; a softmax gives the offset's distribution.
     """
     logits = (windows1 @ windows0[:, CENTRE, :, None])[..., 0] / windows0.shape[2] ** 0.5  # (M, 25)
     axis = torch.linspace(-1.0, 1.0, SIDE, device=logits.device)

@@ -108,7 +108,7 @@ class Assignment(NamedTuple):
 
 
 def mutual_matches(log_scores: Tensor, threshold: float) -> Assignment:
-    """Return pairs of keypoints that are each other's best in ``log_scores`` (N0, N1), if above the threshold."""
+    """Return pairs of keypoints that are mutually best in ``log_scores`` (N0, N1), scored above the threshold."""
     (best0, partner0), partner1 = log_scores.max(dim=1), log_scores.argmax(dim=0)  # (N0,) twice, (N1,)
     index0, scores = torch.arange(len(partner0), device=log_scores.device), best0.exp()
     kept = (partner1[partner0] == index0) & (scores > threshold)

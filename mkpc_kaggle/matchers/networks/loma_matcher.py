@@ -109,8 +109,8 @@ class LomaLayer(nn.Module):
 
 
 class LomaMatcher(nn.Module):
-    """A matcher with ``descriptor`` input channels and ``width`` inner channels. It uses only the last layer's
-    assignment of a checkpoint.
+    """A matcher with ``descriptor`` input channels and ``width`` inner channels. Of a checkpoint's assignment
+    layers, it uses only the last.
     """
 
     def __init__(self, descriptor: int, width: int) -> None:

@@ -22,7 +22,7 @@ def resized(pixels: Tensor, size: tuple[int, int]) -> Tensor:
 def network_input(pixels: Tensor, size: tuple[int, int]) -> Tensor:
     """Resize and normalise RGB images (B, 3, H, W) uint8 on the CPU to (B, 3, *size) float32.
 
-    For the second pass, call it with the original images again.
+    For the second pass, call this with the original images again.
     """
     mean, std = (torch.tensor(values)[:, None, None] for values in (MEAN, STD))
     return resized(pixels, size).sub_(mean).div_(std)

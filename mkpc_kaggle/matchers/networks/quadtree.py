@@ -58,7 +58,7 @@ def attend_children(q: Tensor, k: Tensor, v: Tensor, parents: Tensor, keep: int)
 
 
 def _children_of(cells: Tensor, parents: Tensor) -> Tensor:
-    """Gather the children (B, P, 4 K, D) of ``parents`` (B, P, K), one by one, from cells (B, S, 4, D)."""
+    """Gather the children (B, P, 4 K, D) of ``parents`` (B, P, K), parent by parent, from cells (B, S, 4, D)."""
     batch, count, four, width = cells.shape
     offset = torch.arange(batch, device=cells.device)[:, None, None] * count
     found = cells.reshape(-1, four * width).index_select(0, (parents + offset).flatten())

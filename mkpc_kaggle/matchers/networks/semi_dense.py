@@ -31,7 +31,7 @@ class SemiDenseNetwork(nn.Module, ABC):
     """A semi-dense network for inference only: in evaluation mode, without gradients.
 
     ``multiple``: both sides of an image must be multiples of it. Confidences of matches exceed ``threshold``.
-    ``border``: the width, in coarse cells, of the margin of an image without matches.
+    ``border``: the width, in coarse cells, of the margin that gets no matches.
     """
 
     multiple: int

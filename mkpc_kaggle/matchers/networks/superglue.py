@@ -56,7 +56,7 @@ class SuperGlueAttention(nn.Module):
     def forward(self, x: Tensor, n0: int, *, cross: bool) -> Tensor:
         """Return messages (1, N, 256) to the keypoints ``x`` (1, N, 256); the first ``n0`` belong to image 0.
 
-        Messages come from keypoints of the same image, or with ``cross`` from those of the other image.
+        Messages come from keypoints of the same image, or with ``cross`` from keypoints of the other image.
         """
         # Reordering channels by head costs less in the weights than in all keypoints.
         maps = cast("Iterable[nn.Conv1d]", self.proj)

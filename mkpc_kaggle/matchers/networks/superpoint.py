@@ -124,10 +124,10 @@ def score_map(logits: Tensor) -> Tensor:
 
 
 def suppress_non_maxima(scores: Tensor, radius: int) -> Tensor:
-    """Set ``scores`` (B, H, W), at least 0, to 0 unless they are the maximum of their square window.
+    """Set non-negative ``scores`` (B, H, W) to 0 unless they are the maximum of their square window.
 
-    All equal maxima in one window are kept. Two rounds recover points that only suppressed points exceed. This is
-    neither greedy suppression nor its fixed point.
+    All equal maxima in one window are kept. Two rounds recover points that only suppressed points exceed. The
+    result is neither that of greedy suppression nor its fixed point.
     """
     kept = scores == window_maximum(scores, radius)
     for _ in range(SUPPRESSION_ROUNDS):

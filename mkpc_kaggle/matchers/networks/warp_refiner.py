@@ -18,7 +18,7 @@ HIDDEN_BLOCKS = 8
 
 
 class WarpRefinerShape(NamedTuple):
-    """Channels of each image's ``features``, the displacement's ``embedding``, inside; correlation ``radius``."""
+    """Channels of either image, of the embedded displacement and of hidden maps; ``radius`` of the correlation."""
 
     features: int
     embedding: int
