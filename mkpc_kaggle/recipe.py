@@ -177,7 +177,7 @@ def split_mode(text: str) -> tuple[str, Mode]:
 
 
 def parse_recipe(text: str, name: str) -> Recipe:
-    """Return the recipe of TOML text. Raise :class:`UserError` if it is invalid."""
+    """Parse a recipe from TOML text. Raise :class:`UserError` if it is invalid."""
     try:
         return recipe_of(tomllib.loads(text), name)
     except (ValueError, RecursionError) as error:  # numbers of thousands of digits, deeply nested tables

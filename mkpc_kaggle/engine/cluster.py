@@ -1,7 +1,7 @@
 """Workers on a Ray cluster. Ray places an actor on each GPU, or on each machine if no GPU is used.
 
 The test set and the weights must have the same paths on every machine, as with a shared file system. If the
-parent's machine or Ray's head node fails, the same command resumes from the journal.
+main machine or Ray's head node fails, rerun the command to resume from the journal.
 """
 
 import os

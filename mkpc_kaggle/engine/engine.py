@@ -48,7 +48,7 @@ JOBS: dict[Work, tuple[type[Job], ...]] = {  # kinds of job for each kind of pla
 class Engine:
     """A run. :meth:`look` and :meth:`ask` compute results that the journal does not have.
 
-    ``nothing``, a request without pairs, holds until :meth:`ask`. Setting ``interrupt`` ends the run early.
+    ``nothing`` is the initial request, without pairs. Setting ``interrupt`` ends the run early.
     """
 
     def __init__(

@@ -260,7 +260,7 @@ class Journal(JournalReader):
 
 
 def columns(value: Any, *without: str) -> dict[str, Any]:
-    """Return the fields of a dataclass by name, which are columns, except the fields ``without``."""
+    """Return a dataclass's fields by name, as columns of a table. Omit the fields named in ``without``."""
     return {name: item for name, item in vars(value).items() if name not in without}
 
 

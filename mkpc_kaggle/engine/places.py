@@ -141,7 +141,7 @@ class Site:
         return [place for place in self.places if place.work is work]
 
     def open(self) -> None:
-        """Add the matching places. Raise :class:`mkpc_kaggle.errors.UserError` if none is possible."""
+        """Add places for matching. Raise :class:`mkpc_kaggle.errors.UserError` if none is possible."""
 
     def scene_worker(self) -> ThreadWorker:
         """Return a worker for a scene, always in a process, since pycolmap may crash."""

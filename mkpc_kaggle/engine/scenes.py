@@ -33,9 +33,9 @@ def batches_of(pairs: Iterable[Pair]) -> dict[str, list[int]]:
 
 
 def extra_pairs_of(pairs: Sequence[Pair], config: SceneConfig | None) -> list[Pair]:
-    """Return extra pairs of each batch's images, without a row and only for scenes, the most useful first.
+    """Return pairs that no row names, for the scenes of their batches, the most useful first.
 
-    Each batch gets up to ``pairs_per_image``, starting with the batch with the fewest pairs per image.
+    Each batch is filled up to ``pairs_per_image``, the batch with the fewest pairs per image first.
     """
     if config is None or not config.pairs_per_image:
         return []

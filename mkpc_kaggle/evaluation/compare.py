@@ -49,7 +49,7 @@ def paired_difference(scenes: Sequence[Paired]) -> Difference:
 def _resampled_means(
     gains: NDArray[np.float64], images: Sequence[tuple[str, str]], generator: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Return (RESAMPLES,) weighted means of the gains (P,), one for each random draw of image weights."""
+    """Return weighted means (RESAMPLES,) of the gains (P,), one for each random draw of image weights."""
     _, ends = np.unique(np.array(images), return_inverse=True)
     ends = ends.reshape(-1, 2)
     table = np.zeros((2, ends.max() + 1, ends.max() + 1))  # by two images: sum of gains, number of pairs

@@ -51,7 +51,7 @@ def _glue_input(keypoints: Keypoints) -> dict[str, Tensor]:
 def load_lightglue(
     spec: MatcherSpec, encode: Encode, weights: WeightStore, placement: Placement, **shape: Any
 ) -> LightGlueMatcher:
-    """Load LightGlue from the spec's last slot, with the checkpoint's number of layers."""
+    """Load LightGlue from the weights of the spec's last slot, with as many layers as these have."""
     slot = spec.slots[-1]
     tensors = {layer_name(name): tensor for name, tensor in weights.load(slot).items()}
     numbers = (int(name.split(".")[1]) for name in tensors if name.startswith("transformers."))

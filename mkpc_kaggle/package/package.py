@@ -36,7 +36,7 @@ class Package:
 
 
 def make_package(request: Request) -> Package:
-    """Write both folders and return their files. The same request gives the same bytes.
+    """Write the folders of dataset and kernel, and return their files. The same request gives the same bytes.
 
     Raises :class:`UserError` before anything is written: if the package runs outside a checkout, a folder has
     other files, weights are damaged, or wheels cannot be built or found.

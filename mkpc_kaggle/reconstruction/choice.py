@@ -70,7 +70,7 @@ def pair_of(dataset: str, a: Path, b: Path, *turns: int) -> Pair:
 
 
 def find_partners(engine: Engine, dataset: str, files: Sequence[Path], count: int) -> Partners:
-    """Return the indices of the ``count`` images most similar to each image; none if the comparison failed."""
+    """Return the indices of the ``count`` images most similar to each image; empty if the comparison failed."""
     found = engine.digest_files({str(file): file for file in files})
     digests = [found.get(str(file), "") for file in files]
     key = digest(digests), digest([FEATURE_SETTINGS, count])

@@ -1,4 +1,4 @@
-"""From images to cameras: a folder in a run of the engine, or a few images in this process."""
+"""Reconstruction of a folder in a run of the engine, or of a few images in this process."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace

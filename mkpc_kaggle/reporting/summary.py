@@ -35,7 +35,7 @@ def overview(log: RunLog) -> str:
 
 
 def headline(run: Run) -> str:
-    """Return the run's ending, its duration and the number of pairs with an F."""
+    """Return a line: how the run ended, its duration, and the number of pairs with an F."""
     count = f"{sum(record.is_solved for record in run.records)} of {len(run.records)} pairs have an F"
     return f"{run.ending} after {format_duration(run.seconds)}: {count}"
 

@@ -1,4 +1,4 @@
-"""SuperPoint keypoints matched by SuperGlue, as in the MKPC paper. Its weights are for noncommercial research."""
+"""SuperPoint keypoints matched by SuperGlue, as in the MKPC paper. Both weights are for noncommercial research."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
