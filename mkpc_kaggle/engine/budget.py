@@ -57,7 +57,7 @@ class Budget:
 
     @property
     def writing(self) -> float:
-        """Seconds allowed for the next write, from the median of the latest writes: one slow write has no effect."""
+        """Seconds allowed for the next write, by the median of the latest writes, which ignores a slow one."""
         median = median_low(self._writes) if self._writes else 0.0
         return min(WRITE_MARGIN * median, MAX_WRITE_SHARE * self.time_limit)
 

@@ -81,8 +81,8 @@ class Chronicle:
 class RunReport:
     """The outcome of a run: a record of each pair, in order, and how the run ended.
 
-    ``resumed`` is the number of pairs that earlier runs finished. ``faults`` are lost jobs and unwritten files, with
-    reasons. ``unwritten`` says why the last version of the results could not be written.
+    ``resumed`` is the number of pairs that earlier runs finished. ``faults`` are lost jobs and unwritten files.
+    ``unwritten`` says why the last version of the results could not be written.
     """
 
     records: tuple[PairRecord, ...]
