@@ -9,6 +9,7 @@ from math import inf
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from rectified import THREE_UNITS, RectifiedMatcher, run, write_pairs
 from shared import run_command
@@ -67,6 +68,7 @@ def test_a_run_exports_tables_that_a_reader_of_csv_files_understands(tmp_path, c
         inliers = [int(unit["inliers"]) for unit in tables["units"] if unit["pair"] == row["pair"]]
         assert sum(inliers) == int(row["inliers"])
         assert (row["image1"], row["overlaps"]) == (record.pair.names[1], str(record.overlaps))
+    assert np.linalg.matrix_rank(read_log(tmp_path / "work").records[1].chosen_fundamental) == 2, "the fallback"
     assert len(tables["units"]) == 3 * 11
     assert len(tables["regions"]) == 2 * 11
     assert {event["kind"] for event in tables["events"]} >= {"start", "end"}
