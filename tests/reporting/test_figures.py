@@ -47,16 +47,6 @@ def test_points_of_stage_2_are_drawn_where_they_are_on_the_crop():
     assert right.images[0].get_array().shape[:2] == (90, 60)
 
 
-def test_an_epipolar_line_is_that_of_the_point():
-    axes = figures.new_figure(3, 3).subplots()
-    F = np.array([[0.0, -1, 2], [1, 0, -3], [-2, 3, 0]])
-    point = np.array([7.0, 5.0], np.float32)
-    figures._line(axes, F, point, color="k")
-    (line,) = axes.lines
-    for on_line in (line.get_xy1(), line.get_xy2()):
-        assert abs(np.append(on_line, 1) @ F @ np.append(point, 1)) < 1e-9
-
-
 def test_cameras_are_seen_from_above_and_from_the_side_with_the_points_before_them():
     """Two cameras two units apart look along the world's x axis, its z axis is up; a wall is ten units ahead."""
     R = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
