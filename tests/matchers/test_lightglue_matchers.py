@@ -33,17 +33,11 @@ def without_the_grid(state: dict[str, Tensor]) -> dict[str, Any]:
     return {name: tensor for name, tensor in state.items() if name != "dkd.hw_grid"}
 
 
-def beside_an_optimizer(state: dict[str, Tensor]) -> dict[str, Any]:
-    return {"extractor": state, "optim": {"lr": 0.1}}
-
-
-SIFT = partial(glue, add_scale_ori=True)
+ALIKED, SIFT = partial(aliked_network, 2048), partial(glue, add_scale_ori=True)
 FILES = (
-    PublicFile(
-        "a.pth", "aliked_lightglue", "aliked-n16", "aliked", partial(aliked_network, 2048), without_the_grid
-    ),
+    PublicFile("a.pth", "aliked_lightglue", "aliked-n16", "aliked", ALIKED, without_the_grid),
     PublicFile("b.pth", "aliked_lightglue", "aliked-lightglue", "lightglue", glue, old_names),
-    PublicFile("c.pth", "disk_lightglue", "disk", "disk", DISK, beside_an_optimizer),
+    PublicFile("c.pth", "disk_lightglue", "disk", "disk", DISK, lambda state: {"extractor": state, "optim": {}}),
     PublicFile("d.pth", "disk_lightglue", "disk-lightglue", "lightglue", glue, old_names),
     PublicFile("e.pth", "sift_lightglue", "sift-lightglue", "lightglue", SIFT, old_names),
 )
