@@ -129,9 +129,7 @@ def aspanformer_stages(case, make):
     golden = golden_arrays("aspanformer", case)
     originals = [golden[f"image{side}"] for side in (0, 1)]
     images = []
-    for (
-        image
-    ) in originals:  # sides rounded down to multiples of 32: bilinear, not antialiased, as in the evaluation
+    for image in originals:  # as in the evaluation: sides rounded down, bilinear, not antialiased
         size = [side // AspanFormer.multiple * AspanFormer.multiple for side in image.shape[2:]]
         images.append(torch.nn.functional.interpolate(image, size=size, mode="bilinear"))
     masks, scales = masks_and_scales(golden)
