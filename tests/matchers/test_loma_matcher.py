@@ -64,10 +64,9 @@ def test_a_checkpoint_with_a_surplus_is_refused_and_half_precision_and_deeper_tr
         loma.load(SimpleNamespace(load=lambda _: good | surplus), OPTIONS, Placement())
     name = "transformers.3.self_attn.Wqkv.weight"
     more = {name: good[name].bfloat16(), "transformers.9.self_attn.out_proj.bias": torch.ones(256)}
-    deeper = loma.load(SimpleNamespace(load=lambda _: good | more), OPTIONS, Placement())._network
-    assert torch.equal(
-        deeper.get_parameter(f"matcher.{name}"), network.get_parameter(f"matcher.{name}").bfloat16().float()
-    )
+    loaded = loma.load(SimpleNamespace(load=lambda _: good | more), OPTIONS, Placement())._network
+    found, exact = (each.get_parameter(f"matcher.{name}") for each in (loaded, network))
+    assert torch.equal(found, exact.bfloat16().float())
 
 
 @torch.inference_mode()
