@@ -228,15 +228,14 @@ def test_damage_is_named(whole: Journal, tmp_path: Path, damage: str, told: str)
         assert had(journal) == []
 
 
-def test_a_journal_of_another_format_is_refused_in_one_line(tmp_path: Path) -> None:
+def test_a_journal_of_another_format_and_an_old_sqlite_are_refused_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with closing(sqlite3.connect(tmp_path / "journal.sqlite")) as db:
         db.execute("CREATE TABLE run (key TEXT PRIMARY KEY, value TEXT NOT NULL)")  # as format 10
     with pytest.raises(UserError, match=r"another version of this program \(its format is not \d+\).*--fresh"):
         Journal(tmp_path)
     Journal(tmp_path, fresh=True).close()
-
-
-def test_an_old_sqlite_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sqlite3, "sqlite_version_info", (3, 36, 0))
     with pytest.raises(UserError, match=r"Python needs 3\.37 or newer"):
         Journal(tmp_path)

@@ -33,14 +33,10 @@ def some(n):
     return Matches(points, points, np.ones(n))
 
 
-def pair(first, second, inliers):
-    results = tuple(UnitResult(unit, some(n)) for unit, n in zip(UNITS, (first, second), strict=True))
-    mask = np.arange(first + second) < inliers
-    return PairMatch(results, REGIONS, Estimate(ModelKind.F, FALLBACK_FUNDAMENTAL, mask))
-
-
 def test_points_of_stage_2_are_drawn_where_they_are_on_the_crop():
-    left, right = figures.draw_stage(IMAGES, pair(0, 20, 20), 2).axes
+    results = tuple(UnitResult(unit, some(n)) for unit, n in zip(UNITS, (0, 20), strict=True))
+    match = PairMatch(results, REGIONS, Estimate(ModelKind.F, FALLBACK_FUNDAMENTAL, np.ones(20, bool)))
+    left, right = figures.draw_stage(IMAGES, match, 2).axes
     assert left.images[0].get_array().shape[:2] == (20, 40)
     xy = np.concatenate([dots.get_offsets() for dots in left.collections])
     np.testing.assert_allclose(xy, some(20).points0 - (20, 10))
