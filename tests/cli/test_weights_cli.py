@@ -51,11 +51,8 @@ def test_fetch_takes_files_slots_and_recipes(tmp_path, monkeypatch, capsys):
     recipe.write_text('units = [{stage = 1, matcher = "aliked", long_side = 320}]')
     monkeypatch.setenv("no_proxy", "127.0.0.1")
     with serve(Site(DATA)) as site:
-        web = (
-            replace(FILES[0], source=site.url),
-            replace(FILES[1], source="by hand"),
-            replace(FILES[2], source=site.url),
-        )
+        sources = site.url, "by hand", site.url
+        web = [replace(file, source=source) for file, source in zip(FILES[:3], sources, strict=True)]
         monkeypatch.setattr(store, "manifest", lambda: web)
         assert run_command("weights", "fetch", "sift.pt", "sift", recipe, "--out", tmp_path / "out") == 0
         out = capsys.readouterr().out

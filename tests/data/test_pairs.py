@@ -6,7 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from pair_lists import line_of, line_of_pair, turned_camera, write_list
+from pair_lists import line_of, turned_camera, write_list
 from shared import scores_of
 
 from mkpc_kaggle.data.competition import Pair, read_train_side
@@ -94,12 +94,8 @@ def test_the_true_matrix_has_no_error(demo, scenes, tmp_path):
         assert all(path.is_file() for path in true.pair.images)
 
 
-def listed(home, root):
-    return "--pairs", home / "list.txt", "--image-root", root
-
-
 def test_a_listed_image_is_set_upright_and_scored_as_it_is_stored(demo, scenes, small_recipe, tmp_path):
-    """Images stored on their sides, with cameras to match, score as the upright images do."""
+    """Images stored on their sides, with cameras to match, score as the upright images do; a missing one fails."""
     lines, true = [], max(scenes[0].pairs, key=lambda true: true.covisibility)
     for number, turns in enumerate([(1, 3), (2, 0), (3, 3)]):
         names, cameras = [], []
@@ -109,35 +105,22 @@ def test_a_listed_image_is_set_upright_and_scored_as_it_is_stored(demo, scenes, 
             cv2.imwrite(str(tmp_path / names[-1]), np.rot90(upright, -quarters))
             cameras.append(turned_camera(camera, -quarters, Size(*upright.shape[1::-1])))
         lines.append(line_of((names[0], names[1]), (cameras[0], cameras[1]), turns))
-    (tmp_path / "list.txt").write_text("\n".join(lines))
-    scores = scores_of(tmp_path / "scores.json", *listed(tmp_path, tmp_path), "--recipe", small_recipe)
-    assert max(pair["rotation_error_degrees"] for pair in scores["scenes"][0]["pairs"]) < 5
+    lines.append(line_of(("missing.jpg", "none.jpg"), (true.camera0, true.camera1)))
+    (tmp_path / "list.txt").write_text("\n\n".join(lines))
+    options = "--pairs", tmp_path / "list.txt", "--image-root", tmp_path, "--method", "ransac", "--threshold", 1
+    scores = scores_of(tmp_path / "scores.json", *options, "--recipe", small_recipe)
+    *found, missing = scores["scenes"][0]["pairs"]
+    assert max(pair["rotation_error_degrees"] for pair in found) < 5
+    assert (missing["rotation_error_degrees"], scores["mAA"]) == (None, None)
+    assert missing["pair"] == "7: missing.jpg none.jpg", "by its line"
+    assert "no such file" in missing["failure"]
+    assert 0 < scores["AUC"]["20"] < 0.75, "of four pairs one has failed"
 
 
 def test_the_estimate_of_a_pair_depends_on_its_cameras():
     settings, pair = Settings((), "estimate", ""), Pair("p", "b", "0", "1")
     digests = [settings.of_estimate(replace(pair, intrinsics=both)) for both in (None, (K, K), (K, K + 1))]
     assert len(set(digests)) == 3
-
-
-def test_failures_count_as_such(demo, scenes, tmp_path, capsys):
-    """One pair of two cannot be read: half of what the other reaches is left."""
-    true = max(scenes[0].pairs, key=lambda true: true.covisibility)
-    good = line_of_pair(true, demo.train_dir)
-    bad = line_of(("missing.jpg", "none.jpg"), (true.camera0, true.camera1), (1, 0))
-    (tmp_path / "list.txt").write_text(f"{good}\n\n{bad}\n")
-    ransac = ("--recipe", "classical", "--method", "ransac", "--threshold", 1)
-    scores = scores_of(tmp_path / "scores.json", *listed(tmp_path, demo.train_dir), *ransac)
-    assert scores["mAA"] is None
-    found, missing = scores["scenes"][0]["pairs"]
-    assert found["rotation_error_degrees"] < 5
-    assert (missing["rotation_error_degrees"], missing["pair"]) == (None, "3: missing.jpg turned 1 none.jpg")
-    assert "no such file" in missing["failure"]
-    error = max(found["rotation_error_degrees"], found["translation_error_degrees"])
-    curve = 0.5 * (20 - error / 2) / 20
-    assert scores["AUC"]["20"] == pytest.approx(curve)
-    row = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("mean over scenes"))
-    assert row.split()[3:5] == ["2", "-"]
 
 
 def test_units_are_taken_in_the_order_in_which_they_are_named():

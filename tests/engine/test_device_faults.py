@@ -12,6 +12,7 @@ from faulty import (
     break_device,
     breaks_after,
     exhaust_gpu,
+    lack_an_image,
     thread_place,
     use_places,
 )
@@ -162,20 +163,16 @@ def test_a_minibatch_that_memory_is_too_short_for_is_halved_once_and_no_worker_l
     assert len(too_large) == 2 * len(THREE_UNITS.units), "seven or eight, and three or four: once a unit"
 
 
-def refuse(_: int) -> int:
-    raise ValueError("no such layer")
-
-
 @pytest.mark.parametrize(
     ("fault", "told"),
     [
-        (refuse, "errors left 8 of 8 pairs without an F, 8 of them with this one: ValueError: no such layer"),
-        (lambda _: break_device(), "no worker left, the faults say why; the same command resumes"),
-        (lambda _: exhaust_gpu(), "every unit was skipped, the faults say why; the same command resumes"),
+        (lack_an_image, "errors left 8 of 8 pairs without an F, 8 of them with this one: KeyError: 'image 7'"),
+        (break_device, "no worker left, the faults say why; the same command resumes"),
+        (exhaust_gpu, "every unit was skipped, the faults say why; the same command resumes"),
     ],
 )
 def test_a_run_that_failed_has_exit_status_one_and_a_line(demo, tmp_path, monkeypatch, capsys, fault, told):
-    matcher = RectifiedMatcher(matches=fault)
+    matcher = RectifiedMatcher(matches=lambda _: fault())
     use_places(monkeypatch, thread_place("this process", matcher))
     made = assemble(THREE_UNITS, matchers={matcher.name: matcher}, device="cpu")
     monkeypatch.setattr(options, "assemble", lambda *_, **__: made)

@@ -99,16 +99,6 @@ def test_a_run_that_ends_before_it_asks_leaves_the_journal_as_it_was(tmp_path):
         assert [len(record.units) for record in journal.records()] == [3, 3, 3]
 
 
-def test_an_unreadable_image_costs_its_pair_only(tmp_path):
-    pairs = write_pairs(tmp_path, 4)
-    pairs[2].images[1].write_bytes(b"")
-    report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
-    assert "the file is empty" in report.records[2].failure
-    assert np.linalg.matrix_rank(report.records[2].pair_fundamental) == 2
-    assert [len(record.units) for record in report.records] == [3, 3, 0, 3]
-    assert report.ending is Ending.COMPLETE
-
-
 @pytest.mark.parametrize(("limit", "ending"), [(5.0, Ending.TIME_IS_UP), (math.inf, Ending.INTERRUPTED)])
 def test_a_unit_that_never_returns_holds_the_run_neither_past_its_limit_nor_after_an_interrupt(
     tmp_path, limit, ending

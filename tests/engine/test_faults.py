@@ -89,14 +89,8 @@ def test_an_error_of_the_engine_itself_leaves_the_latest_version_behind(pairs, t
 
     monkeypatch.setattr(Plan, "on_result", fail_later)
     with pytest.raises(KeyError, match="a bug"):
-        run(
-            pairs,
-            THREE_UNITS,
-            RectifiedMatcher(),
-            tmp_path / "work",
-            publish=lambda standing: published.append(standing.fundamentals),
-        )
-    assert len(published[-1]) == 12
+        run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work", publish=published.append)
+    assert len(published[-1].fundamentals) == 12
     with JournalReader(tmp_path / "work") as journal:
         assert [bool(record.units) for record in journal.records()] == [True, True] + [False] * 10
 

@@ -2,7 +2,7 @@
 
 import os
 import sqlite3
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -109,10 +109,8 @@ def test_what_is_saved_is_read_after_opening_again(whole: Journal, tmp_path: Pat
     with Journal(tmp_path) as again:
         records, scenes = again.records(), again.scenes()
         assert [record.source for record in records] == ["scene", "pair", "fallback"]
-        assert [(unit.unit, unit.matches, unit.inliers) for unit in records[1].units] == [
-            (SWEEP.name, 30, 7),
-            (SECOND.name, 30, 8),
-        ]
+        found = [(unit.unit, unit.matches, unit.inliers) for unit in records[1].units]
+        assert found == [(SWEEP.name, 30, 7), (SECOND.name, 30, 8)]
         assert records[0].regions == REGIONS
         assert np.array_equal(records[0].chosen_fundamental, 3 * F)
         assert np.array_equal(records[0].magsac_fundamental, 2 * F)
@@ -127,40 +125,31 @@ def test_what_is_saved_is_read_after_opening_again(whole: Journal, tmp_path: Pat
         (points,) = again.points([again.inputs(0)[SWEEP.name]]).values()
         assert points.points0.tobytes() == np.random.default_rng(0).random((30, 2)).astype(np.float32).tobytes()
         assert again.events()[-1].text == "\\udcff"
+        assert again.about().recipe == {"name": "x"}
 
 
-CHANGES = {
-    "nothing": want,
-    "unit added": lambda j: want(j, SWEEP, SECOND, THIRD),
-    "unit removed": lambda j: want(j, SWEEP),
-    "threshold": lambda j: want(j, settings="other"),
-    "scene": lambda j: want(j, scene="other"),
-    "pair added": lambda j: want(j, count=4),
-    "order": lambda j: want(j, SECOND, SWEEP),
-    "content": lambda j: j.save_digest("0.png", "new"),
-    "content of second images": lambda j: j.save_digest("c.png", "new"),
-    "more points": lambda j: match(j, 2, SWEEP),
-}
-CURRENT = {  # pairs with all points of before, with a current estimate, and whether the scene is current
-    "nothing": (2, 2, True),
-    "unit added": (2, 2, True),
-    "unit removed": (2, 0, False),
-    "threshold": (2, 0, False),
-    "scene": (2, 2, False),
-    "pair added": (2, 2, True),
-    "order": (2, 0, False),
-    "content": (1, 1, False),
-    "content of second images": (0, 0, False),
-    "more points": (3, 2, False),
+CHANGES = {  # and: pairs with all points of before, with a current estimate, and whether the scene is current
+    "nothing": (want, (2, 2, True)),
+    "unit added": (lambda j: want(j, SWEEP, SECOND, THIRD), (2, 2, True)),
+    "unit removed": (lambda j: want(j, SWEEP), (2, 0, False)),
+    "threshold": (lambda j: want(j, settings="other"), (2, 0, False)),
+    "scene": (lambda j: want(j, scene="other"), (2, 2, False)),
+    "pair added": (lambda j: want(j, count=4), (2, 2, True)),
+    "order": (lambda j: want(j, SECOND, SWEEP), (2, 0, False)),
+    "content": (lambda j: j.save_digest("0.png", "new"), (1, 1, False)),
+    "content of second images": (lambda j: j.save_digest("c.png", "new"), (0, 0, False)),
+    "more points": (lambda j: match(j, 2, SWEEP), (3, 2, False)),
 }
 
 
-@pytest.mark.parametrize("change", CHANGES)
-def test_a_row_is_current_if_today_has_the_same_inputs_and_settings(whole: Journal, change: str) -> None:
-    CHANGES[change](whole)
+@pytest.mark.parametrize(("change", "current"), CHANGES.values(), ids=CHANGES)
+def test_a_row_is_current_if_today_has_the_same_inputs_and_settings(
+    whole: Journal, change: Callable[[Journal], None], current: tuple[int, int, bool]
+) -> None:
+    change(whole)
     pairs = {position for position, _ in had(whole)}
     estimates = sum(bool(is_current) for *_, is_current in whole.states())
-    assert (len(pairs), estimates, bool(whole.current_scenes())) == CURRENT[change]
+    assert (len(pairs), estimates, bool(whole.current_scenes())) == current
 
 
 def test_former_rows_are_current_again_when_the_former_settings_return(whole: Journal) -> None:
@@ -181,18 +170,13 @@ def test_the_latest_rows_stand_in_until_there_are_current_ones_but_not_for_anoth
     assert whole.scenes() == {}
 
 
-def test_rows_of_the_same_images_share_their_points(journal: Journal) -> None:
+def test_rows_of_the_same_images_share_their_points_and_turned_images_are_others(journal: Journal) -> None:
     pairs = [*wanted(2), replace(wanted(1)[0], pair=replace(wanted(1)[0].pair, id="again"))]
     journal.want(pairs, [(SWEEP, "s1")], {})
     match(journal, 0, SWEEP)
     assert had(journal) == [(0, 0), (2, 0)]
     assert [journal.twins(position) for position in range(3)] == [[0, 2], [1], [0, 2]]
-
-
-def test_turned_images_are_other_pairs(journal: Journal) -> None:
-    turned = replace(wanted(1)[0], pair=replace(wanted(1)[0].pair, turns=(1, 0)))
-    match(journal, 0, SWEEP)
-    journal.want([turned], [(SWEEP, "s1")], {})
+    journal.want([replace(pairs[0], pair=replace(pairs[0].pair, turns=(1, 0)))], [(SWEEP, "s1")], {})
     assert had(journal) == []
 
 
@@ -218,7 +202,7 @@ def test_what_a_full_disk_refuses_is_in_memory_and_written_when_there_is_room(tm
         assert len(had(again)) == 200
 
 
-DAMAGES: Sequence[tuple[str, str]] = [
+DAMAGES = [
     ("UPDATE estimate SET F = zeroblob(72)", "zero or not finite"),
     ("PRAGMA ignore_check_constraints = ON; UPDATE points SET points = zeroblob(1000)", "CHECK constraint failed"),
     ("UPDATE region SET reason = 'x'", "RegionReason"),
@@ -234,31 +218,24 @@ def test_damage_is_named(whole: Journal, tmp_path: Path, damage: str, told: str)
     whole.close()
     with closing(sqlite3.connect(tmp_path / "journal.sqlite")) as db:
         db.executescript(damage)
-    with pytest.raises(UserError, match=rf"journal\.sqlite is damaged \(.*{told}.*delete it with --fresh"):
-        read_all(tmp_path)
+    named = pytest.raises(UserError, match=rf"journal\.sqlite is damaged \(.*{told}.*delete it with --fresh")
+    with named, Journal(tmp_path) as journal:
+        journal.about(), journal.records(), journal.scenes(), journal.events()
+        for position in range(2):
+            journal.points(journal.inputs(position).values())
     with Journal(tmp_path, fresh=True) as journal:
         want(journal)
         assert had(journal) == []
 
 
-def read_all(directory: Path) -> None:
-    with Journal(directory) as journal:
-        want_about = journal.about()
-        assert want_about.recipe == {"name": "x"}
-        journal.records(), journal.scenes(), journal.events()
-        for position in range(2):
-            journal.points(journal.inputs(position).values())
-
-
-def test_a_journal_of_another_format_is_refused_in_one_line(tmp_path: Path) -> None:
+def test_a_journal_of_another_format_and_an_old_sqlite_are_refused_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with closing(sqlite3.connect(tmp_path / "journal.sqlite")) as db:
         db.execute("CREATE TABLE run (key TEXT PRIMARY KEY, value TEXT NOT NULL)")  # as format 10
     with pytest.raises(UserError, match=r"another version of this program \(its format is not \d+\).*--fresh"):
         Journal(tmp_path)
     Journal(tmp_path, fresh=True).close()
-
-
-def test_an_old_sqlite_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sqlite3, "sqlite_version_info", (3, 36, 0))
     with pytest.raises(UserError, match=r"Python needs 3\.37 or newer"):
         Journal(tmp_path)

@@ -329,10 +329,8 @@ def test_a_job_of_an_earlier_request_is_saved_before_the_next_request_begins():
     scenario = Scenario(10, (10.0,), 1, 1000.0, spread=0, misses=0, warm_up=0)
     clock, nothing = VirtualClock(), Request((), scenario.recipe, scenario.settings)
     time = Budget(0.0, scenario.limit, clock)
-    site, pairs = (
-        SimulatedSite(scenario, clock, time.stop_units),
-        [Pair(str(n), "", str(n), "b") for n in range(10)],
-    )
+    site = SimulatedSite(scenario, clock, time.stop_units)
+    pairs = [Pair(str(n), "", str(n), "b") for n in range(10)]
     with Engine(nothing, site, memory_journal(), time, interrupt=threading.Event(), progress=False) as engine:
         engine.ask(replace(nothing, pairs=pairs), share=0.05)  # it ends amid the fifth pair
         assert engine.state.had.sum() == 5
@@ -349,19 +347,3 @@ def test_scenes_that_never_begin_are_named_and_the_run_ends(monkeypatch):
     assert ran.late == 0
     assert explained(ran.report.faults, "scenes: the worker hung: no answer for ")
     assert all(scene.failure for scene in ran.report.scenes)
-
-
-def done_scenario(**changes):
-    return Scenario(100, (0.5, 1.0), 2, 3600.0, batches=4, pairs_per_image=1.5, **changes)
-
-
-def test_another_estimation_runs_no_unit_and_makes_every_f_and_scene_again():
-    journal = memory_journal()
-    first = simulate(done_scenario(), journal)
-    assert first.report.ending is Ending.COMPLETE
-    other = simulate(done_scenario(threshold=1.0, job_faults=0.2), journal)
-    assert other.report.ending is Ending.COMPLETE and other.late == 0
-    assert other.report.units_run == 0
-    assert other.stale == set()
-    back = simulate(done_scenario(), journal)
-    assert (back.report.units_run, back.report.estimated, len(back.scenes)) == (0, 0, 0), "both are in the journal"

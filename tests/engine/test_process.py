@@ -64,37 +64,32 @@ def start() -> Iterator[Callable[..., Worker]]:
         assert not process.is_alive()
 
 
-@pytest.fixture
-def at_birth(monkeypatch) -> Callable[[Callable[[int], None]], None]:
-    return partial(on_fork, monkeypatch)
-
-
 def test_a_worker_that_cannot_be_sent_to_its_process_says_so(start):
     assert start(lambda job: None).next_answer().cause is Cause.RAISED
 
 
-def test_a_process_that_dies_at_its_birth_is_told(at_birth, start):
-    at_birth(lambda pid: os.kill(pid, signal.SIGKILL))
+def test_a_process_that_dies_at_its_birth_is_told(monkeypatch, start):
+    on_fork(monkeypatch, lambda pid: os.kill(pid, signal.SIGKILL))
     assert start().next_answer() == Failure(Cause.DIED, "signal SIGKILL")
 
 
-def test_a_process_that_stops_at_its_birth_blocks_nothing(at_birth, start):
-    at_birth(lambda pid: os.kill(pid, signal.SIGSTOP))
+def test_a_process_that_stops_at_its_birth_blocks_nothing(monkeypatch, start):
+    on_fork(monkeypatch, lambda pid: os.kill(pid, signal.SIGSTOP))
     assert start().answer() is None
 
 
-def test_a_start_returns_before_there_is_a_process(at_birth, start):
+def test_a_start_returns_before_there_is_a_process(monkeypatch, start):
     has_returned = threading.Event()
-    at_birth(lambda _: has_returned.wait())
+    on_fork(monkeypatch, lambda _: has_returned.wait())
     worker = start()
     assert worker.answer() is None
     has_returned.set()
     assert worker.next_answer() == Loaded()
 
 
-def test_a_large_job_goes_to_a_stopped_process_without_blocking(at_birth, start):
+def test_a_large_job_goes_to_a_stopped_process_without_blocking(monkeypatch, start):
     born: list[int] = []
-    at_birth(born.append)
+    on_fork(monkeypatch, born.append)
     worker = start()
     assert worker.next_answer() == Loaded()
     os.kill(born[0], signal.SIGSTOP)

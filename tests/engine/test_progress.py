@@ -61,15 +61,3 @@ def test_a_note_is_a_line_of_its_own(stream: StringIO) -> None:
     progress.note("batch one: 4 of 4 images have a camera")
     progress.close()
     assert "batch one: 4 of 4 images have a camera\n" in stream.getvalue()
-
-
-@pytest.mark.parametrize("stream", [StringIO, Terminal])
-def test_a_log_whose_reader_has_left_does_not_end_the_run(stream: type[StringIO]) -> None:
-    class Left(stream):
-        def write(self, text: str) -> int:
-            raise BrokenPipeError
-
-    progress = Progress(Budget(0.0, clock=VirtualClock()), Left())
-    progress.show(Phase.SWEEP, 1, 5)
-    progress.show(Phase.SWEEP, 5, 5)
-    progress.close()

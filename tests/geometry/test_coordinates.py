@@ -44,8 +44,6 @@ RENDERED = {
     "cropped and shrunk": View.fit(Box(13, 8, 90, 65), long_side=51, multiple=32),
     "enlarged along x, shrunk along y": View(Box.whole(IMAGE), Size(240, 40), Size(240, 40)),
     "shrunk along x, enlarged along y": View(Box.whole(IMAGE), Size(60, 170), Size(64, 192)),
-    "turned by a quarter and enlarged": View.fit(Box.whole(IMAGE), long_side=250, turns=1),
-    "cropped, turned by a half and shrunk": View.fit(Box(13, 8, 90, 65), long_side=51, multiple=32, turns=2),
     "cropped and turned by three quarters": View(Box(13, 8, 90, 65), Size(80, 48), Size(96, 48), turns=3),
 }
 

@@ -35,13 +35,10 @@ def region(*parts, size=SQUARE, config=BARE):
     return critical_region(np.concatenate(parts), size, config)
 
 
-NOTHING = np.zeros((0, 2), np.float32)
-
-
 @pytest.mark.parametrize(
     ("points", "reason", "clusters", "kept"),
     [
-        (NOTHING, RegionReason.TOO_FEW_POINTS, 0, 0),
+        (np.zeros((0, 2), np.float32), RegionReason.TOO_FEW_POINTS, 0, 0),
         (block(100, 100, 101, 101, 4), RegionReason.TOO_FEW_POINTS, 0, 0),
         (lone(30), RegionReason.NO_CLUSTER, 0, 0),
         (np.concatenate([block(100, 100, 133, 133, 5), lone(21)]), RegionReason.TOO_SCATTERED, 1, 1),

@@ -7,8 +7,6 @@ from scipy.spatial.transform import Rotation
 
 from mkpc_kaggle.geometry.two_view import Problem, TwoView, sampson
 
-STEP = 1e-6
-
 
 def unit(vector):
     return vector / np.linalg.norm(vector)
@@ -28,10 +26,10 @@ def rays(seed, n=60):
 @pytest.mark.parametrize("k", range(7))
 def test_the_gradient_of_the_cost_is_that_of_finite_differences(k):
     view, problem = random_view(1), Problem(*rays(1), np.array([0.4, 0.2]), weight=2.0)
-    step = STEP * np.eye(7)[k]
+    step = 1e-6 * np.eye(7)[k]
     forth, back = (problem.cost(view.moved(way * step), 30.0) for way in (1, -1))
     gradient, curvature = problem._derivatives(view, 30.0)
-    assert gradient[k] == pytest.approx((forth - back) / (2 * STEP), abs=1e-5)
+    assert gradient[k] == pytest.approx((forth - back) / 2e-6, abs=1e-5)
     assert_allclose(curvature, curvature.T)
 
 

@@ -1,5 +1,7 @@
 """DKM and RoMa: their parts by hand, and the matchers' points and draws."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
@@ -10,7 +12,7 @@ from standin import narrow_roma
 from mkpc_kaggle.matchers.contract import MatcherSpec, Placement
 from mkpc_kaggle.matchers.dense import DenseMatcher
 from mkpc_kaggle.matchers.networks.dense_sampling import sample_matches
-from mkpc_kaggle.matchers.networks.dense_warp import DenseFeatures, DenseWarp
+from mkpc_kaggle.matchers.networks.dense_warp import DenseWarp
 from mkpc_kaggle.matchers.networks.dkm import DKM
 from mkpc_kaggle.matchers.networks.grids import as_grid
 from mkpc_kaggle.matchers.networks.warp_refiner import WarpEstimate, identity_map
@@ -47,17 +49,6 @@ def test_padding_changes_nothing(matcher):
     assert same(match_one(matcher, *plain), match_one(matcher, *padded))
 
 
-class Given:
-    def __init__(self, *warps: DenseWarp) -> None:
-        self.warps = warps
-
-    def encode(self, image: torch.Tensor, fine: torch.Tensor | None = None) -> DenseFeatures:
-        return None
-
-    def match(self, first: DenseFeatures, second: DenseFeatures) -> tuple[DenseWarp, ...]:
-        return self.warps
-
-
 def identity_warp(height: int, width: int, certainty: float) -> DenseWarp:
     grid = as_grid(identity_map(torch.zeros(height, width)))  # (1, h, w, 2)
     return DenseWarp(torch.cat([grid, grid], dim=3), torch.full((1, height, width), certainty))
@@ -66,7 +57,8 @@ def identity_warp(height: int, width: int, certainty: float) -> DenseWarp:
 def test_points_of_either_picture_are_in_its_own_pixels():
     """Both show the same, at another size: places relative to the edges agree."""
     warps = identity_warp(40, 60, 0.3), identity_warp(80, 30, 0.9)
-    matcher = DenseMatcher(MatcherSpec("given"), Given(*warps), "cpu")
+    network = SimpleNamespace(encode=lambda *_: None, match=lambda *_: warps)
+    matcher = DenseMatcher(MatcherSpec("given"), network, "cpu")
     matcher.matches = 9999
     matches = match_one(matcher, picture(40, 60), picture(80, 30))
     assert len(matches) == 40 * 60 + 80 * 30

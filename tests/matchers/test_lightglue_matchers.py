@@ -32,11 +32,9 @@ def without_the_grid(state: dict[str, Tensor]) -> dict[str, Any]:
     return {name: tensor for name, tensor in state.items() if name != "dkd.hw_grid"}
 
 
-SIFT = partial(glue, add_scale_ori=True)
+ALIKED, SIFT = partial(aliked_network, 2048), partial(glue, add_scale_ori=True)
 FILES = (
-    PublicFile(
-        "a.pth", "aliked_lightglue", "aliked-n16", "aliked", partial(aliked_network, 2048), without_the_grid
-    ),
+    PublicFile("a.pth", "aliked_lightglue", "aliked-n16", "aliked", ALIKED, without_the_grid),
     PublicFile("b.pth", "aliked_lightglue", "aliked-lightglue", "lightglue", glue, old_names),
     PublicFile("c.pth", "sift_lightglue", "sift-lightglue", "lightglue", SIFT, old_names),
 )

@@ -1,11 +1,13 @@
 """LoMa as a matcher, and what its networks do beside the numbers of the golden files."""
 
+from types import SimpleNamespace
+
 import cv2
 import numpy as np
 import pytest
 import torch
 from checkpoints import FILES, store_of
-from pictures import as_picture, image_of
+from pictures import as_picture
 from standin import scene
 
 from mkpc_kaggle.errors import UserError
@@ -35,16 +37,6 @@ def network(matcher: LomaAdapter) -> Loma:
     return matcher._network
 
 
-class Holding(WeightStore):
-    """A store whose file holds these tensors, whatever the slot."""
-
-    def __init__(self, tensors: dict[str, torch.Tensor]) -> None:
-        self.tensors = tensors
-
-    def load(self, slot: str) -> dict[str, torch.Tensor]:
-        return self.tensors
-
-
 def test_keypoints_are_where_the_detector_saw_them(matcher):
     """A dot stays in its place when the detector's picture has other sides than the view."""
     pixels = np.full((101, 135, 3), 90, np.uint8)
@@ -69,16 +61,17 @@ def test_a_checkpoint_with_a_surplus_is_refused_and_half_precision_and_deeper_tr
     good = store.load("loma-b128")
     surplus = {"_descriptor.surplus": torch.ones(1)}
     with pytest.raises(UserError, match="'loma-b128' do not fit the network"):
-        loma.load(Holding(good | surplus), OPTIONS, Placement())
+        loma.load(SimpleNamespace(load=lambda _: good | surplus), OPTIONS, Placement())
     name = "transformers.3.self_attn.Wqkv.weight"
     more = {name: good[name].bfloat16(), "transformers.9.self_attn.out_proj.bias": torch.ones(256)}
-    loaded = loma.load(Holding(good | more), OPTIONS, Placement())._network.get_parameter(f"matcher.{name}")
-    assert torch.equal(loaded, network.get_parameter(f"matcher.{name}").bfloat16().float())
+    loaded = loma.load(SimpleNamespace(load=lambda _: good | more), OPTIONS, Placement())._network
+    found, exact = (each.get_parameter(f"matcher.{name}") for each in (loaded, network))
+    assert torch.equal(found, exact.bfloat16().float())
 
 
 @torch.inference_mode()
 def test_strips_of_rows_give_what_the_whole_gives(network, monkeypatch):
-    image = image_of(scene(157, 83, channels=3))
+    image = torch.from_numpy(scene(157, 83, channels=3)).permute(2, 0, 1)[None].float() / 255
     points = torch.rand(1, 50, 2, generator=torch.Generator().manual_seed(0)) * 2 - 1
     logits, descriptors = network.detector.logits(image), network.descriptor(image, points)
     monkeypatch.setattr(layers, "STRIP_FLOATS", 83 * 32 * 50)

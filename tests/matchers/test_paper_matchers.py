@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from checkpoints import FILES, use_manifest, write_checkpoints
 from shared import problems_of, run_command
-from standin import scene, use_narrow
+from standin import narrow_roma, scene
 
 from mkpc_kaggle.data.competition import read_submission
 from mkpc_kaggle.engine.journal_reader import JournalReader
+from mkpc_kaggle.matchers.adapters import roma
 from mkpc_kaggle.matchers.adapters.loma import LomaAdapter
 from mkpc_kaggle.matchers.dense import DenseMatcher
 
@@ -42,7 +43,7 @@ def test_dir(tmp_path_factory):
 def test_odd_small_and_blank_pictures_go_through(clean_environment, monkeypatch, matcher, test_dir, tmp_path):
     checkpoints = write_checkpoints(tmp_path, [file for file in FILES if file.matcher == matcher])
     use_manifest(monkeypatch, checkpoints)
-    use_narrow(monkeypatch)
+    monkeypatch.setattr(roma, "RoMa", narrow_roma)
     monkeypatch.setattr(DenseMatcher, "matches", 300)
     monkeypatch.setattr(LomaAdapter, "threshold", 0.0)
     sizes, options = TRIALS[matcher]

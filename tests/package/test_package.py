@@ -114,14 +114,6 @@ def test_weights_survive_the_upload_and_are_held_against_the_datasets_manifest(o
     assert "missing" in capsys.readouterr().out
 
 
-def test_the_image_is_the_latest_or_one_by_its_digest(out, wanted):
-    image = f"gcr.io/kaggle/python@sha256:{'0a' * 32}"
-    make_package(replace(wanted, image=image))
-    latest, pinned = (metadata_of(folder)[1] for folder in (out, wanted.out))
-    assert (latest["docker_image_pinning_type"], latest.get("docker_image", "")) == ("latest", "")
-    assert (pinned["docker_image_pinning_type"], pinned["docker_image"]) == ("original", image)
-
-
 def test_what_the_image_has_is_used_where_it_satisfies_even_without_a_wheel_for_its_python(out, tmp_path):
     dataset = out / "dataset"
     lines = (dataset / "requirements.txt").read_text().splitlines()
@@ -136,8 +128,13 @@ def test_what_the_image_has_is_used_where_it_satisfies_even_without_a_wheel_for_
     assert done.returncode == 0, done.stderr
 
 
-def test_the_kernel_runs_on_a_gpu_without_internet_on_the_competition_and_the_dataset(out):
+def test_the_kernel_runs_on_a_gpu_without_internet_on_the_latest_image_or_one_by_its_digest(out, wanted):
     dataset, kernel = metadata_of(out)
+    assert (kernel["docker_image_pinning_type"], kernel.get("docker_image", "")) == ("latest", "")
+    image = f"gcr.io/kaggle/python@sha256:{'0a' * 32}"
+    make_package(replace(wanted, image=image))
+    pinned = metadata_of(wanted.out)[1]
+    assert (pinned["docker_image_pinning_type"], pinned["docker_image"]) == ("original", image)
     assert 6 <= len(dataset["title"]) <= 50 and 20 <= len(dataset["subtitle"]) <= 80  # Kaggle's limits
     assert (kernel["enable_gpu"], kernel["enable_internet"]) == (True, False)
     assert kernel["dataset_sources"] == [dataset["id"]] == ["someone/mkpc-kaggle"]

@@ -119,12 +119,6 @@ def aspanformer_state():
     return {name: value for name, value in state.items() if "sample_offset" not in name}
 
 
-def rounded_down(image):
-    """Resize to sides rounded down to multiples of 32: bilinear, not antialiased, as in the evaluation."""
-    size = [side // AspanFormer.multiple * AspanFormer.multiple for side in image.shape[2:]]
-    return torch.nn.functional.interpolate(image, size=size, mode="bilinear")
-
-
 def thinned(name, value):
     """Return the part of a value that a file keeps: ``_cK`` each K-th channel, ``_rowsK`` each K-th row."""
     kind, step = re.fullmatch(r".*_(c|rows)(\d+)", name).groups()
@@ -134,7 +128,10 @@ def thinned(name, value):
 def aspanformer_stages(case, make):
     golden = golden_arrays("aspanformer", case)
     originals = [golden[f"image{side}"] for side in (0, 1)]
-    images = [rounded_down(image) for image in originals]
+    images = []
+    for image in originals:  # as in the evaluation: sides rounded down, bilinear, not antialiased
+        size = [side // AspanFormer.multiple * AspanFormer.multiple for side in image.shape[2:]]
+        images.append(torch.nn.functional.interpolate(image, size=size, mode="bilinear"))
     masks, scales = masks_and_scales(golden)
     coarse_scales = None
     if masks is None:  # in online mode coarse points are reported before the last rescaling

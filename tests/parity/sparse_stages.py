@@ -3,7 +3,6 @@
 import json
 from functools import partial
 
-import numpy as np
 import torch
 from golden import Stage, compared, golden_arrays, ready, recorded, standin_state
 from torch.nn import functional
@@ -23,19 +22,12 @@ SUPERPOINT |= {"dense_descriptors": 1e-5, "descriptors": 1e-5}
 SUPERGLUE = {"score_matrix": 1e-3, "log_assignment": 1e-3, "matching_scores": 1e-4}
 
 
-def superpoint(options):
-    options["border"] = options.pop("remove_borders")
-    del options["descriptor_dim"]
-    return ready(SuperPoint(**options), standin_state("superpoint"))
-
-
-def image_of(pixels: np.ndarray) -> torch.Tensor:
-    return pixels[None, None].float() / 255
-
-
 def superpoint_stages(case):
     golden = golden_arrays("superpoint", case)
-    network, image = superpoint(json.loads(golden["config"])), image_of(golden["image"])
+    options, image = json.loads(golden["config"]), golden["image"][None, None].float() / 255
+    options["border"] = options.pop("remove_borders")
+    del options["descriptor_dim"]
+    network = ready(SuperPoint(**options), standin_state("superpoint"))
     features = network.features(image)
     logits, field = network.logits(features), network.descriptor_field(features)
     scores = score_map(logits)
@@ -56,10 +48,6 @@ def suppression_stages():
         for radius in range(5):
             got = suppress_non_maxima(golden[name][None], radius)[0]
             yield Stage(f"{name}, radius {radius}", got, golden[f"{name}_nms{radius}"])
-
-
-def superglue(options):
-    return ready(SuperGlue(**options), standin_state("superglue"))
 
 
 def golden_pairs(golden):
@@ -103,7 +91,7 @@ def plan_of(network, image0, image1):
 
 def superglue_stages(case):
     golden = golden_arrays("superglue", case)
-    network = superglue(json.loads(golden["config"]))
+    network = ready(SuperGlue(**json.loads(golden["config"])), standin_state("superglue"))
     for image0, image1, arrays in golden_pairs(golden):
         scores, log_plan = plan_of(network, image0, image1)
         found, plan = network(image0, image1), log_plan[:-1, :-1]
@@ -126,7 +114,8 @@ CASES = {
     f"superpoint {case}": partial(superpoint_stages, case)
     for case in ("default_160x216", "outdoor_160x216", "odd_171x229", "noborder_64x72")
 }
-CASES["superpoint nms_cases"] = suppression_stages
-MATCHED = ("full_60x47", "eval20_33x71", "batch2_20x26", "tiny_1x3")
-CASES |= {f"superglue {case}": partial(superglue_stages, case) for case in MATCHED}
-CASES["superglue sinkhorn"] = sinkhorn_stages
+CASES |= {
+    f"superglue {case}": partial(superglue_stages, case)
+    for case in ("full_60x47", "eval20_33x71", "batch2_20x26", "tiny_1x3")
+}
+CASES |= {"superpoint nms_cases": suppression_stages, "superglue sinkhorn": sinkhorn_stages}

@@ -65,24 +65,21 @@ def test_recipes_take_what_is_there_and_fallbacks_stand_in_for_the_rest():
     assert light.recipe == light.recipe.with_fallbacks(())
 
 
-def standins(directory, *names):
-    """A search directory with files of these names, and a manifest that knows them by slot and licence."""
-    for name, _, _ in names:
-        (directory / name).write_bytes(name.encode())
-    return [WeightFile(name, -1, digest_of(name.encode()), licence, slot, "here") for name, slot, licence in names]
-
-
-SUPERGLUE = (
-    ("sp.pth", "superpoint", "Magic-Leap-noncommercial"),
-    ("sg.pth", "superglue-outdoor", "Magic-Leap-noncommercial"),
-)
-PERMITTED = (("loftr.ckpt", "loftr-outdoor", "Apache-2.0"), ("dkm.pth", "dkm-outdoor", "MIT"))
-
-
 @pytest.fixture
 def known_files(monkeypatch, tmp_path):
     """SuperGlue's, LoFTR's and DKM's weights are there, DKM's also for indoors, of unclear terms."""
-    files = standins(tmp_path, *SUPERGLUE, *PERMITTED, ("dkm_in.pth", "dkm-indoor", "unclear"))
+    files = [
+        WeightFile(name, -1, digest_of(name.encode()), licence, slot, "here")
+        for name, slot, licence in (
+            ("sp.pth", "superpoint", "Magic-Leap-noncommercial"),
+            ("sg.pth", "superglue-outdoor", "Magic-Leap-noncommercial"),
+            ("loftr.ckpt", "loftr-outdoor", "Apache-2.0"),
+            ("dkm.pth", "dkm-outdoor", "MIT"),
+            ("dkm_in.pth", "dkm-indoor", "unclear"),
+        )
+    ]
+    for file in files:
+        (tmp_path / file.name).write_bytes(file.name.encode())
     others = [file for file in manifest() if file.slot not in {known.slot for known in files}]
     monkeypatch.setattr(weight_store, "manifest", lambda: (*files, *others))
     return tmp_path

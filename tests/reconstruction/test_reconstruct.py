@@ -127,17 +127,12 @@ def test_the_cameras_are_those_of_the_models_and_right(mixed):
 ORIENTATIONS = (1, 6, 8, 3, 6, 1)  # of the images of a phone, by EXIF
 
 
-def write_from_phone(folder: Path) -> Path:
-    write_flat(folder, FIRST)
+def test_colmap_goes_on_with_photographs_that_exif_turns(tmp_path):
+    root, out = write_flat(tmp_path / "images", FIRST), tmp_path / "out"
     for number, orientation in enumerate(ORIENTATIONS):
-        path = folder / f"{number:02}.png"
+        path = root / f"{number:02}.png"
         cv2.imwrite(str(path), np.rot90(flat(number, SIZE), -TURNS.get(orientation, 0)))
         set_exif(path, orientation)
-    return folder
-
-
-def test_colmap_goes_on_with_photographs_that_exif_turns(tmp_path):
-    root, out = write_from_phone(tmp_path / "images"), tmp_path / "out"
     result = run(root, out)
     sizes = {f"{n:02}.png": SIZE if o in (1, 3) else SIZE[::-1] for n, o in enumerate(ORIENTATIONS)}
     assert {name: record.image.size for name, record in cameras(result).items()} == sizes

@@ -33,28 +33,14 @@ def some(n):
     return Matches(points, points, np.ones(n))
 
 
-def pair(first, second, inliers):
-    results = tuple(UnitResult(unit, some(n)) for unit, n in zip(UNITS, (first, second), strict=True))
-    mask = np.arange(first + second) < inliers
-    return PairMatch(results, REGIONS, Estimate(ModelKind.F, FALLBACK_FUNDAMENTAL, mask))
-
-
 def test_points_of_stage_2_are_drawn_where_they_are_on_the_crop():
-    left, right = figures.draw_stage(IMAGES, pair(0, 20, 20), 2).axes
+    results = tuple(UnitResult(unit, some(n)) for unit, n in zip(UNITS, (0, 20), strict=True))
+    match = PairMatch(results, REGIONS, Estimate(ModelKind.F, FALLBACK_FUNDAMENTAL, np.ones(20, bool)))
+    left, right = figures.draw_stage(IMAGES, match, 2).axes
     assert left.images[0].get_array().shape[:2] == (20, 40)
     xy = np.concatenate([dots.get_offsets() for dots in left.collections])
     np.testing.assert_allclose(xy, some(20).points0 - (20, 10))
     assert right.images[0].get_array().shape[:2] == (90, 60)
-
-
-def test_an_epipolar_line_is_that_of_the_point():
-    axes = figures.new_figure(3, 3).subplots()
-    F = np.array([[0.0, -1, 2], [1, 0, -3], [-2, 3, 0]])
-    point = np.array([7.0, 5.0], np.float32)
-    figures._line(axes, F, point, color="k")
-    (line,) = axes.lines
-    for on_line in (line.get_xy1(), line.get_xy2()):
-        assert abs(np.append(on_line, 1) @ F @ np.append(point, 1)) < 1e-9
 
 
 def test_cameras_are_seen_from_above_and_from_the_side_with_the_points_before_them():

@@ -4,11 +4,11 @@ import csv
 import os
 import re
 import sys
-from html.parser import HTMLParser
 from math import inf
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from rectified import THREE_UNITS, RectifiedMatcher, run, write_pairs
 from shared import run_command
@@ -22,19 +22,6 @@ from mkpc_kaggle.reporting.run_log import read_log
 from mkpc_kaggle.reporting.summary import overview
 
 EVIL = '<script>alert("$x$")</script>'
-
-
-class Tags(HTMLParser):
-    """Which tags stand in a page, and what they ask for."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.names, self.sources = list[str](), list[str]()
-        self.feed(text)
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.names.append(tag)
-        self.sources += [value or "" for name, value in attrs if name in ("src", "href")]
 
 
 def a_run(directory: Path, count: int = 12) -> list[Pair]:
@@ -67,6 +54,7 @@ def test_a_run_exports_tables_that_a_reader_of_csv_files_understands(tmp_path, c
         inliers = [int(unit["inliers"]) for unit in tables["units"] if unit["pair"] == row["pair"]]
         assert sum(inliers) == int(row["inliers"])
         assert (row["image1"], row["overlaps"]) == (record.pair.names[1], str(record.overlaps))
+    assert np.linalg.matrix_rank(read_log(tmp_path / "work").records[1].chosen_fundamental) == 2, "the fallback"
     assert len(tables["units"]) == 3 * 11
     assert len(tables["regions"]) == 2 * 11
     assert {event["kind"] for event in tables["events"]} >= {"start", "end"}
@@ -120,10 +108,9 @@ def test_the_page_begins_with_the_verdict_has_pictures_inside_and_asks_for_nothi
     assert re.search("<h1>Complete after .*: 11 of 12 pairs have an F</h1>", text)
     titles = ["Missing results", "The weakest pairs", "Where the time went", "What made this"]
     assert re.findall("<h2>(.*?)</h2>", text) == titles
-    tags = Tags(text)
-    assert tags.names.count("img") == 11, "the pairs with an F"
-    assert "script" not in tags.names
-    assert all(source.startswith("data:image/") for source in tags.sources)
+    assert text.count("<img ") == 11, "the pairs with an F"
+    assert "<script" not in text
+    assert all(source.startswith("data:image/") for source in re.findall(r"\b(?:src|href)\s*=\s*.(\S*)", text))
     assert not re.search(r"url\(|@import", text)
     assert "the file is empty" in text
     assert "Drawings are missing" not in text
@@ -145,7 +132,7 @@ def test_what_comes_from_files_is_escaped(tmp_path):
     log = read_log(tmp_path)
     for known in ((), pairs):
         text = report_page(log, known)
-        assert "script" not in Tags(text).names
+        assert "<script" not in text
         assert "&lt;script&gt;" in text
     assert EVIL in overview(log)
 
@@ -159,7 +146,7 @@ def test_without_matplotlib_the_page_has_tables_and_says_so(tmp_path, monkeypatc
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     text = report_page(read_log(tmp_path / "work"), pairs)
     assert "matplotlib is not installed" in text
-    assert "img" not in Tags(text).names
+    assert "<img" not in text
     assert pairs[0].id in text
 
 

@@ -30,13 +30,6 @@ def choice(models: list[SfmModel], scene: SyntheticScene, **changes: object) -> 
     return choose(replace(scene.pairs[0], **changes), found)
 
 
-def test_the_scenes_fundamental_is_that_of_the_cameras(scene):
-    chosen = choice([model(scene.cameras)], scene)
-    assert chosen.from_scene
-    assert chosen.reason is Reason.SCENE
-    np.testing.assert_allclose(chosen.F, scene.true_fundamental(scene.pairs[0]))
-
-
 def test_a_pair_whose_cameras_make_no_fundamental_keeps_its_own(scene):
     rest = {name: camera for name, camera in scene.cameras.items() if name != "0000"}
     apart = [model({name: scene.cameras[name]}) for name in ("0000", "0001")]

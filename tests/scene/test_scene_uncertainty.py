@@ -2,7 +2,6 @@
 
 import numpy as np
 import pycolmap
-import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.synthetic_scene import SyntheticScene, synthetic_scene
@@ -16,11 +15,6 @@ def model_of(scene: SyntheticScene) -> SfmModel:
     solution = reconstruct_batch(scene.pairs, SceneConfig(cameras=CameraSharing.IMAGE))
     ((model,),) = (found.models for found in solution.reconstructions)
     return model
-
-
-@pytest.fixture(scope="module")
-def model() -> SfmModel:
-    return model_of(synthetic_scene(6, points=400))
 
 
 def errors_over_sigmas(model: SfmModel, scene: SyntheticScene) -> np.ndarray:
@@ -49,7 +43,8 @@ def test_errors_are_about_as_large_as_expected():
     assert (np.abs(np.log(np.sqrt((ratios**2).mean(axis=0)))) < np.log(1.5)).all()
 
 
-def test_they_are_the_same_in_another_world(model):
+def test_they_are_the_same_in_another_world():
+    model = model_of(synthetic_scene(6, points=400))
     before = camera_sigmas(model.colmap)
     moved = pycolmap.Reconstruction(model.colmap)
     moved.transform(pycolmap.Sim3d(3.0, pycolmap.Rotation3d(np.array([0.3, -0.2, 0.1])), np.array([5.0, -2, 1])))

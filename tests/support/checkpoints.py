@@ -70,7 +70,7 @@ FILES = (
     PublicFile("quadtree_outdoor.ckpt", "quadtree", "quadtree-outdoor", "quadtree", Quadtree, wrapped),
     PublicFile("aspan.pt", "aspanformer", "aspanformer-outdoor", "aspanformer", AspanFormer, wrapped_aspanformer),
     PublicFile("DKMv3_outdoor.pth", "dkm", "dkm-outdoor", "dkm", DKM),
-    # Narrow ones, which load where ``standin.use_narrow`` was called.
+    # Narrow ones, which load where ``adapters.roma.RoMa`` is ``narrow_roma``, too.
     PublicFile("roma_outdoor.pth", "roma", "roma-outdoor", "roma", narrow_roma, roma_alone),
     PublicFile("dinov2_vitl14_pretrain.pth", "roma", "dinov2-vitl14", "roma", narrow_roma, dinov2_alone),
     PublicFile("loma_B128.pth", "loma", "loma-b128", "loma", lambda: Loma(Variant.B128), published_loma),

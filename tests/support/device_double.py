@@ -54,23 +54,11 @@ class Tagged(torch.Tensor):
             return self.held.numpy(force=True)
         raise TypeError(f"can't convert {self.place} device type tensor to numpy")
 
-    def __array__(self, *args, **kwargs):
-        return self.numpy()
-
-    def tolist(self):
-        return self.held.tolist()
-
-    def cuda(self, device=None):
-        return self.to(f"cuda:{device or 0}" if isinstance(device, int | None) else device)
-
     def untyped_storage(self):
         return self.held.untyped_storage()
 
     def new_tensor(self, data, *, dtype=None, device=None, requires_grad=False):
         return torch.tensor(data, dtype=dtype or self.dtype, device=device or self.place)
-
-    def __repr__(self, **_):
-        return f"Tagged({self.place}, {self.held!r})"
 
     @classmethod
     def __torch_dispatch__(cls, func, types, args=(), kwargs=None):
@@ -79,13 +67,13 @@ class Tagged(torch.Tensor):
 
 
 class DeviceDouble(TorchDispatchMode):
-    """``count`` GPUs with ``memory`` bytes each, all free."""
+    """``count`` GPUs."""
 
     current: DeviceDouble | None = None
 
-    def __init__(self, count=1, memory=15 << 30):
+    def __init__(self, count=1):
         super().__init__()
-        self.count, self.memory = count, memory
+        self.count = count
         self.operators = 0  # run on tagged tensors so far
         self._generators = {}
         self._undo = []
@@ -127,9 +115,8 @@ class DeviceDouble(TorchDispatchMode):
             "_lazy_init": lambda: None,
             "is_available": lambda: True,
             "device_count": lambda: self.count,
-            "current_device": lambda: 0,
             "is_bf16_supported": lambda including_emulation=True: True,
-            "mem_get_info": lambda device=None: (self.memory, self.memory),
+            "mem_get_info": lambda device=None: (15 << 30, 15 << 30),
             "empty_cache": lambda: None,
         }
         yield from ((torch.cuda, name, value) for name, value in values.items())

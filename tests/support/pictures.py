@@ -32,11 +32,6 @@ def as_picture(pixels: np.ndarray, multiple: int = 1, padding: tuple[int, int] =
     return Picture(view.render(np.ascontiguousarray(pixels)), view)
 
 
-def image_of(pixels: np.ndarray) -> torch.Tensor:
-    """(H, W, 3) uint8 -> (1, 3, H, W) in 0..1."""
-    return torch.from_numpy(pixels.copy()).permute(2, 0, 1)[None].float() / 255
-
-
 def match_one(matcher: Any, first: Picture, second: Picture) -> Matches:
     (matches,) = matcher.match(matcher.encode([first]), matcher.encode([second]))
     return matches

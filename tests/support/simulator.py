@@ -108,7 +108,6 @@ class Scenario:
     scene_seconds: float = 0.06
     scene_faults: float = 0.0
     seed: int = 0
-    threshold: float = 0.2  # of MAGSAC
     never: str = ""  # the matcher whose worker dies whenever it runs
 
     @property
@@ -120,8 +119,7 @@ class Scenario:
 
     @property
     def settings(self) -> Settings:
-        names = tuple(unit.name for unit in self.recipe.units)
-        return Settings(names, f"estimate {self.threshold}", f"scene {self.threshold}")
+        return Settings(tuple(unit.name for unit in self.recipe.units), "estimate", "scene")
 
     @property
     def work(self) -> float:
@@ -195,9 +193,7 @@ class SceneRun:
     is_faulty: bool
 
 
-Drawn = tuple[
-    float, Answer, float
-]  # the seconds until the answer, the answer, what an injected fault takes of them
+Drawn = tuple[float, Answer, float]  # seconds until the answer, the answer, seconds of an injected fault
 
 
 class SimulatedSite(Site):

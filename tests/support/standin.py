@@ -13,7 +13,6 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from mkpc_kaggle.matchers.adapters import roma as adapter
 from mkpc_kaggle.matchers.networks import dinov2, roma
 from mkpc_kaggle.matchers.networks.roma import RoMa
 from mkpc_kaggle.matchers.networks.warp_refiner import WarpRefinerShape
@@ -65,11 +64,6 @@ def narrow_roma() -> RoMa:
     vit, decoder = {"WIDTH": 64, "BLOCKS": 2, "HEADS": 2, "POSITIONS": 5}, {"BLOCKS": 2, "HEADS": 2}
     with patch.multiple(dinov2, **vit), patch.multiple(roma, REFINERS=REFINERS, **decoder):
         return RoMa()
-
-
-def use_narrow(monkeypatch) -> None:
-    """RoMas that are loaded from now on are narrow ones, and so must their files be."""
-    monkeypatch.setattr(adapter, "RoMa", narrow_roma)
 
 
 def uniform(name: str, shape: Sequence[int] = ()) -> np.ndarray:

@@ -38,12 +38,6 @@ class _Handler(BaseHTTPRequestHandler):
             self._send(site, int(wanted[1]) if wanted else 0)
 
     def _send(self, site: Site, start: int) -> None:
-        if start and start >= len(site.data):
-            self.send_response(416)
-            self.send_header("Content-Range", f"bytes */{len(site.data)}")
-            self.send_header("Content-Length", "0")
-            self.end_headers()
-            return
         body = site.data[start:]
         self.send_response(206 if start else 200)
         if start:
