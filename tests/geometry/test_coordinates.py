@@ -24,18 +24,6 @@ def views(draw):
     return View(draw(boxes()), content, padded, draw(TURNS))
 
 
-def spot(size, centre, sigma):
-    x, y = np.meshgrid(np.arange(size.width), np.arange(size.height))
-    squared = (x - centre[0]) ** 2 + (y - centre[1]) ** 2
-    return np.rint(255 * np.exp(-squared / (2 * sigma**2))).astype(np.uint8)
-
-
-def centroid(picture):
-    weight = picture.astype(np.float64)
-    y, x = np.indices(picture.shape)
-    return np.array([(weight * x).sum(), (weight * y).sum()]) / weight.sum()
-
-
 IMAGE = Size(107, 71)
 RENDERED = {
     "enlarged": View.fit(Box.whole(IMAGE), long_side=250),
@@ -99,9 +87,13 @@ def test_what_networks_count_otherwise_is_led_to_centres_at_integers():
 @pytest.mark.parametrize("centre", [(41.3, 30.8), (55.75, 44.25)])
 def test_a_spot_is_rendered_where_the_map_says(name, centre):
     view = RENDERED[name]
-    picture = view.render(spot(IMAGE, centre, 4.0))
+    x, y = np.meshgrid(np.arange(IMAGE.width), np.arange(IMAGE.height))
+    squared = (x - centre[0]) ** 2 + (y - centre[1]) ** 2
+    picture = view.render(np.rint(255 * np.exp(-squared / (2 * 4.0**2))).astype(np.uint8))
     assert picture.shape == (view.padded.height, view.padded.width)
-    assert_allclose(centroid(picture), view.from_image(np.array([centre]))[0], rtol=0, atol=0.04)
+    y, x = np.indices(picture.shape)
+    centroid = np.average([x.ravel(), y.ravel()], axis=1, weights=picture.ravel())
+    assert_allclose(centroid, view.from_image(np.array([centre]))[0], rtol=0, atol=0.04)
 
 
 @pytest.mark.parametrize("shape", [(71, 107), (71, 107, 3)])

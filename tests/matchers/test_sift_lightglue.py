@@ -36,14 +36,10 @@ def test_keypoints_and_log_assignment_are_the_golden_ones():
         assert (off < 1e-5 + 1e-6 * np.abs(expected)).mean() > 0.998, "OpenCV 4.8 rounds some elsewhere"
         assert off.max() < 2e-3
     names = {"points": "keypoints", "scales": "scales", "orientations": "oris", "descriptors": "descriptors"}
-    given = [
-        [
-            replace(
-                each, **{own: golden[f"{name}{number}"] - 0.25 * (own == "points") for own, name in names.items()}
-            )
-        ]
-        for number, each in enumerate(encodings)
-    ]
+    given = []
+    for number, each in enumerate(encodings):
+        parts = {own: golden[f"{name}{number}"] - 0.25 * (own == "points") for own, name in names.items()}
+        given.append([replace(each, **parts)])
     assert len(matcher.match(*given)[0]) == len(golden["matches"]) == 0
     # Down to -38. The golden values are up to 2e-4 from those in float64, so the tolerance is relative, too.
     assert_allclose(found[0], golden["log_assignment"], rtol=1e-4, atol=1e-4)

@@ -114,13 +114,9 @@ def test_the_page_begins_with_the_verdict_has_pictures_inside_and_asks_for_nothi
     assert not re.search(r"url\(|@import", text)
     assert "the file is empty" in text
     assert "Drawings are missing" not in text
-
-
-def test_the_weakest_pairs_are_drawn_with_the_inliers_that_magsac_found(tmp_path):
-    a_run(tmp_path)
-    log = read_log(tmp_path / "work")
-    assert len(log.weakest) == 11
-    for record, match in log.weakest:
+    weakest = read_log(tmp_path / "work").weakest
+    assert len(weakest) == 11
+    for record, match in weakest:
         assert (len(match.matches), match.estimate.inlier_count) == (record.matches, record.inliers)
 
 

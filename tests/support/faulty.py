@@ -33,8 +33,6 @@ from mkpc_kaggle.scene.view_graph import BatchImage
 
 BROKEN = "CUDA error: an illegal memory access was encountered"
 
-Fault = Callable[[], None]
-
 
 def die() -> None:
     os.kill(os.getpid(), signal.SIGKILL)
@@ -77,7 +75,7 @@ class FaultyMatcher(RectifiedMatcher):
     a file that marks that it has happened.
     """
 
-    fault: Fault = die
+    fault: Callable[[], None] = die
     at: int = 13
     above: int = 0
     once: Path | None = None
@@ -145,7 +143,7 @@ def choose_scene_for_all_but_the_first(job: SceneJob) -> Solution:
     return Solution((Reconstruction(names, (SfmModel(registered, points, 0.5),)),), choices)
 
 
-def befall(fault: Fault, job: SceneJob) -> Solution:
+def befall(fault: Callable[[], None], job: SceneJob) -> Solution:
     """A fault in the place of a reconstruction."""
     fault()
     raise AssertionError

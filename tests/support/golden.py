@@ -1,11 +1,11 @@
 """Golden vectors beside the repository, ``../shared/golden``; tests that need them are skipped without them."""
 
-import importlib.util
 import re
+import runpy
 import sys
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -29,15 +29,23 @@ def golden_arrays(network, case):
     return {name: kinds[array.dtype.kind == "U"](array) for name, array in arrays.items()}
 
 
+@cache
+def recipe(path):
+    """The names that a recipe of weights defines; it puts its own folder on the path, which is taken off again."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "path", [*sys.path])
+        return runpy.run_path(str(path))
+
+
 @lru_cache(maxsize=1)  # the largest have a gigabyte
 def standin_state(network, *which, **part):
     """The stand-in checkpoint that the folder's ``standin.py`` makes, or that part of it, as tensors."""
-    values = _module(GOLDEN / network / "standin.py").standin_state_dict(*which, **part)
+    values = recipe(GOLDEN / network / "standin.py")["standin_state_dict"](*which, **part)
     return {name: torch.from_numpy(np.asarray(value)) for name, value in values.items()}
 
 
 def seeded_tensor(name, shape, gain=1.0):
-    return torch.from_numpy(_module(GOLDEN / "seeded_weights.py").seeded_tensor(name, shape, gain))
+    return torch.from_numpy(recipe(GOLDEN / "seeded_weights.py")["seeded_tensor"](name, shape, gain))
 
 
 @contextmanager
@@ -52,17 +60,6 @@ def recorded(network, name):
 def ready(network, state):
     network.load_state_dict(state, strict=True)
     return prepared(network.eval(), Placement())
-
-
-def _module(path):
-    before = list(sys.path)
-    try:  # a recipe puts its own folder on the path
-        spec = importlib.util.spec_from_file_location(f"golden_{path.parent.name}_{path.stem}", path)
-        module = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(module)
-    finally:
-        sys.path[:] = before
-    return module
 
 
 @dataclass(frozen=True)
