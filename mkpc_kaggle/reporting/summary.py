@@ -101,10 +101,10 @@ def facts(run: Run) -> Iterator[tuple[str, str, str]]:
     from_where = ", ".join(f"{sources[source]} {what}" for source, what in parts if source in sources)
     yield "pairs with an F", f"{len(solved)} of {len(records)}", from_where
     if inliers := [record.inliers for record in solved]:
-        yield "inliers", f"{median(inliers):.0f}", f"median of a pair, at least {min(inliers)}"
+        yield "inliers of a pair", f"{median(inliers):.0f}", f"the median; the minimum is {min(inliers)}"
         overlapping = sum(record.overlaps for record in solved)
-        threshold = f"supported {MIN_SUPPORT:g} times as well as by chance"
-        yield "pairs that show the same", f"{overlapping} of {len(solved)}", threshold
+        threshold = f"at least {MIN_SUPPORT:g} times the inliers expected by chance"
+        yield "overlapping pairs", f"{overlapping} of {len(solved)}", threshold
     if regions := Counter(region.reason for record in records for region in record.regions or ()):
         counts = ", ".join(f"{count} {reason}" for reason, count in regions.most_common())
         yield "critical regions", f"{regions[RegionReason.CROPPED]} of {regions.total()}", counts
