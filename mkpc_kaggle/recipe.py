@@ -83,15 +83,28 @@ class CameraSharing(StrEnum):
     FOLDER = "folder"  # all: a scene's images are in one folder
 
 
+class CameraModel(StrEnum):
+    """COLMAP's camera models of perspective lenses. F of a pair needs one without distortion."""
+
+    SIMPLE_PINHOLE = "SIMPLE_PINHOLE"
+    PINHOLE = "PINHOLE"
+    SIMPLE_RADIAL = "SIMPLE_RADIAL"
+    RADIAL = "RADIAL"
+    OPENCV = "OPENCV"
+    FULL_OPENCV = "FULL_OPENCV"
+
+
 @dataclass(frozen=True)
 class SceneConfig:
     """Settings of :mod:`mkpc_kaggle.scene`, table ``[scene]`` of a recipe."""
 
     pairs_per_image: float = 10.0  # a batch with fewer gets extra pairs, used only for its scene; 0: none
     cameras: CameraSharing = CameraSharing.AUTO
+    camera_model: CameraModel = CameraModel.SIMPLE_PINHOLE
+    threads: int = 1  # of the mapper; with more, the last digits vary from run to run
 
     def __post_init__(self) -> None:
-        check_ranges(self, pairs_per_image=AT_LEAST_0)
+        check_ranges(self, pairs_per_image=AT_LEAST_0, threads=AT_LEAST_1)
 
 
 @dataclass(frozen=True)
