@@ -1,41 +1,16 @@
-# make demo: install, render a demo set, make its submission, score it, draw a pair.
-# make test: install, lint, types, tests.
-# make ray: the tests of worker machines, with Ray installed beside the rest.
-# make hostile: about 330 hostile inputs (tests/hostile), each in a process with 4 GB.
-# make oldest: the tests with the lowest versions that pyproject.toml declares, on Python 3.11, in .venv-oldest.
-# make newest: the tests with the newest versions that it allows, on Python 3.13 or 3.12, in .venv-newest; PYTHON= names
-#   another Python, TESTS= some of the tests.
-
-PYTHON ?= python3
-VENV := .venv
-BIN := $(VENV)/bin
-DEMO := demo
-OLDEST := .venv-oldest
-PYTHON311 ?= python3.11
-IS_CHOSEN := $(filter-out file,$(origin PYTHON))
-NEWEST ?= .venv-newest$(if $(IS_CHOSEN),-$(lastword $(shell $(PYTHON) --version)))
-PYENV := $$HOME/.pyenv/versions
-NEWEST_PYTHON = $(if $(IS_CHOSEN),$(PYTHON),$(shell for python in python3.13 $(PYENV)/3.13*/bin/python python3.12 \
-    $(PYENV)/3.12*/bin/python; do $$python -c 0 2> /dev/null && echo $$python && break; done))
-# Each test runs on one thread.
-TEST_PROCESSES ?= 2
-# Not the declared floor: on most indexes old versions of torch have no build for the CPU, and bring CUDA along.
-TORCH ?= $(shell grep '^torch==' requirements-dev.txt)
-
-.PHONY: demo test ray hostile oldest newest install lint tests clean
-
-demo: install
+# make demo: install
 	$(BIN)/mkpc demo --out $(DEMO)
 	$(BIN)/python make_submission.py --test-dir $(DEMO)/test --recipe auto --output $(DEMO)/submission.csv
 	$(BIN)/mkpc check $(DEMO)/submission.csv --test-dir $(DEMO)/test
-	$(BIN)/python make_submission.py --test-dir $(DEMO)/test --recipe auto --mode whole-images \
-	    --output $(DEMO)/single_stage.csv
-	$(BIN)/mkpc match $(DEMO)/train/courtyard/images/courtyard_0005.jpg \
-	    $(DEMO)/train/courtyard/images/courtyard_0000.jpg --out $(DEMO)/pair.png
 	@echo
-	@$(BIN)/mkpc validate --train-dir $(DEMO)/train --truth $(DEMO)/test_truth.csv \
-	    --submission $(DEMO)/single_stage.csv --submission $(DEMO)/submission.csv
-	@echo "submission: $(DEMO)/submission.csv   figure: $(DEMO)/pair.png"
+	@$(BIN)/mkpc validate --train-dir $(DEMO)/train --truth $(DEMO)/test_truth.csv --submission $(DEMO)/submission.csv
+	@echo
+	@$(BIN)/python -m benchmarks.two_pairs $(DEMO)/train --out $(DEMO)/pair.png
+	@echo
+	@echo "Open $(DEMO)/submission.html: the report of the run. $(DEMO)/pair.png shows the first of the two pairs."
+
+quick: install
+	$(BIN)/python -m pytest --numprocesses $(TEST_PROCESSES) --dist loadfile $(QUICK)
 
 test: install lint tests
 
