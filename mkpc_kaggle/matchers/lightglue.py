@@ -57,8 +57,10 @@ def load_lightglue(
     numbers = (int(name.split(".")[1]) for name in tensors if name.startswith("transformers."))
     layers = 1 + max(numbers, default=0)
     glue = light_glue(layers, **shape)
-    # Without early stopping and pruning, only the last layer's assignment is used.
-    early = rf"token_confidence\.|confidence_thresholds|log_assignment\.(?!{layers - 1}\.)"
+    # Without early stopping and pruning, only the last layer's assignment is used. Some files also have a learned
+    # number per assignment, or the extractor that was trained with LightGlue.
+    assignment = rf"log_assignment\.(?!{layers - 1}\.(matchability|final_proj)\.)"
+    early = rf"token_confidence\.|confidence_thresholds|{assignment}|extractor\."
     load_into(glue, tensors, unused=early, what=slot)
     return LightGlueMatcher(spec, encode, glue, placement)
 

@@ -12,9 +12,9 @@ from mkpc_kaggle.config import from_table
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.matchers.contract import Matcher
 from mkpc_kaggle.matchers.failures import reason_of
-from mkpc_kaggle.matchers.registry import UnusableError, misfit, spec_of
+from mkpc_kaggle.matchers.registry import UnusableError, matcher_names, misfit, spec_of
 from mkpc_kaggle.recipe import Recipe, load_recipe
-from mkpc_kaggle.weights import WeightStore
+from mkpc_kaggle.weights import FoundFile, WeightStore, load_tensors
 
 PERMISSIVE_TAGS = frozenset({"Apache-2.0", "BSD-3-Clause", "MIT"})
 
@@ -80,6 +80,45 @@ def unavailable(
 
     names = dict.fromkeys(name for unit in recipe.units for name in (unit.matcher, unit.fallback) if name)
     return {name: reason for name in names if (reason := reason_for(name)) is not None}
+
+
+@dataclass(frozen=True)
+class Fit:
+    """The result of loading a weight file into the networks that use it: a text for a table."""
+
+    is_refused: bool
+    text: str
+
+
+def fit_of(found: FoundFile, store: WeightStore) -> Fit:
+    """Load a file into the network of each matcher that uses it, on the device "meta".
+
+    Matchers of several files get the others from the store. If these are missing or at fault, the file is not tried.
+    """
+    slot = found.file.slot
+    fitting: list[str] = []
+    untried: list[str] = []
+    try:
+        load_tensors(found.path, "meta")
+        for name in matcher_names():
+            with suppress(UnusableError):
+                spec = spec_of(name, "weights")
+                if (options := spec.options_for(slot)) is None:
+                    continue
+                others = [other for other in spec.slots_for(options) if other != slot]
+                missing = [other for other in others if store.find(other) is None]
+                problem = "" if missing else misfit(name, store.on_meta(found), options)
+                if repr(slot) in problem:
+                    raise UserError(problem)
+                if missing or problem:
+                    untried.append(problem or f"{name} also needs {', '.join(missing)}")
+                else:
+                    fitting.append(name)
+    except UserError as error:
+        return Fit(True, str(error))
+    if fitting:
+        return Fit(False, f"fits {', '.join(fitting)}")
+    return Fit(False, f"not tried in a network: {'; '.join(untried)}" if untried else "")
 
 
 def refusal(recipe: Recipe, reasons: Mapping[str, UnavailableReason]) -> UserError:

@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     import torch
     from torch import nn
 
+WRAPPERS = ("state_dict", "extractor")  # entries that hold the tensors, of training checkpoints and of DISK
+COUNTER = re.compile(r"(.*\.)?num_batches_tracked")  # of a batch norm, used in training only; old files have none
 MAX_EXPANSION = 4  # bytes of tensors per byte of the file; some tensors share their bytes
 
 
@@ -32,9 +34,9 @@ class Inert:
 def load_tensors(path: Path, device: str = "cpu") -> "dict[str, torch.Tensor]":
     """Load tensors by name from a safetensors file or a torch checkpoint without executing code.
 
-    ``path`` may be the directory of an unpacked torch checkpoint (``NAME/NAME`` on Kaggle). A training checkpoint
-    has its tensors under ``state_dict``. Other entries are ignored. On the device "meta", tensors have names, shapes
-    and types only: the file is mapped into memory, and its numbers are not read.
+    ``path`` may be the directory of an unpacked torch checkpoint (``NAME/NAME`` on Kaggle). Some checkpoints have
+    their tensors under one of :data:`WRAPPERS`. Other entries are ignored. On the device "meta", tensors have names,
+    shapes and types only: the file is mapped into memory, and its numbers are not read.
     Raises :class:`UserError` if the file cannot be read or an entry is not a dense tensor with a name. The same
     error is raised if the tensors have many more bytes than the file.
     """
@@ -54,12 +56,16 @@ def load_into(
 ) -> None:
     """Load a checkpoint into a network: all names and shapes must agree.
 
-    Only entries whose names match the pattern ``unused`` may be missing or surplus. A network on the device "meta"
-    takes the tensors themselves, so that a large network is not in memory twice. Raises :class:`UserError` that
-    names up to five entries that do not fit.
+    Only counters of batch norms, and entries whose names match the pattern ``unused``, may be missing or surplus. A
+    network on the device "meta" takes the tensors themselves, so that a large network is not in memory twice. Raises
+    :class:`UserError` that names up to five entries that do not fit.
     """
     own = network.state_dict()
-    odd = [name for name in own.keys() ^ tensors.keys() if not re.match(unused, name)]
+    odd = [
+        name
+        for name in own.keys() ^ tensors.keys()
+        if not re.match(unused, name) and not COUNTER.fullmatch(name)
+    ]
     odd += [name for name in own.keys() & tensors.keys() if own[name].shape != tensors[name].shape]
     if odd:
         raise UserError(f"the weights for {what!r} do not fit the network: {', '.join(sorted(odd)[:5])}")
@@ -146,7 +152,7 @@ def _load_table(path: Path, *, is_mapped: bool = False) -> Mapping[Any, Any]:
             "it is not a checkpoint, or contains unsupported objects; save the network's state_dict alone"
         ) from refusal
     if isinstance(contents, dict):
-        contents = contents.get("state_dict", contents)
+        contents = next((contents[name] for name in WRAPPERS if name in contents), contents)
     if not isinstance(contents, dict):
         raise ValueError("it contains no table of named tensors")
     return contents
