@@ -200,9 +200,9 @@ class Pipeline:
                     raise
                 self._unloadable[name] = error
         if name in self._unloadable:
-            error = self._unloadable[name]
-            reason = str(error) if isinstance(error, UserError) else reason_of(error)
-            raise UnloadableError(f"{name} cannot be loaded: {reason}") from error
+            cause = self._unloadable[name]
+            reason = str(cause) if isinstance(cause, UserError) else reason_of(cause)
+            raise UnloadableError(f"{name} cannot be loaded: {reason}") from cause
         return self._matchers[name]
 
 

@@ -62,9 +62,7 @@ def load_into(
     """
     own = network.state_dict()
     odd = [
-        name
-        for name in own.keys() ^ tensors.keys()
-        if not re.match(unused, name) and not COUNTER.fullmatch(name)
+        name for name in own.keys() ^ tensors.keys() if not re.match(unused, name) and not COUNTER.fullmatch(name)
     ]
     odd += [name for name in own.keys() & tensors.keys() if own[name].shape != tensors[name].shape]
     if odd:

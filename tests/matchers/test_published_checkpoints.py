@@ -73,7 +73,9 @@ class Glue:
             for part in ("to_qk", "to_v", "to_out"):
                 table |= linear(f"{cross}.{part}", width, width)
             for block in (own, cross):
-                table |= linear(f"{block}.ffn.0", 2 * width, 2 * width) | linear(f"{block}.ffn.3", width, 2 * width)
+                table |= linear(f"{block}.ffn.0", 2 * width, 2 * width) | linear(
+                    f"{block}.ffn.3", width, 2 * width
+                )
                 table |= {f"{block}.ffn.1.{name}": (2 * width,) for name in ("weight", "bias")}
             table |= linear(f"log_assignment.{n}.matchability", 1, width)
             table |= linear(f"log_assignment.{n}.final_proj", width, width)
@@ -225,8 +227,11 @@ def test_every_known_list_of_entries_loads(name):
     assert problem_of(matcher, tables) == ""
 
 
+ONE_EACH = [name for name in GOLDEN_LISTS if "indoor" not in name and name not in ("loma_B.pt", "loma_R.pth")]
+
+
 @needs_golden
-@pytest.mark.parametrize("name", GOLDEN_LISTS)
+@pytest.mark.parametrize("name", ONE_EACH)
 def test_counters_of_batch_norms_may_be_missing_and_nothing_else(name):
     matcher, make, _ = GOLDEN_LISTS[name]
     tables = {

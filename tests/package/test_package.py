@@ -199,7 +199,9 @@ def test_weights_that_no_network_takes_are_refused_and_others_named_with_their_m
     notes = {item.name: item.note for item in package.dataset}
     assert [notes[f"{file.name}.safetensors"] for file in lines] == ["fits superglue"] * 2
     monkeypatch.setattr(store, "manifest", lambda: (*lines, line("free.pt", DATA, slot="dkm-outdoor")))
-    with pytest.raises(UserError, match=r"another_name\.pt: the weights for 'dkm-outdoor' do not fit the network: a,"):
+    with pytest.raises(
+        UserError, match=r"another_name\.pt: the weights for 'dkm-outdoor' do not fit the network: a,"
+    ):
         make_package(replace(wanted, private=True))
 
 

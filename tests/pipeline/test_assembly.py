@@ -175,7 +175,9 @@ def misfits(monkeypatch, tmp_path):
     return tmp_path
 
 
-DOES_WITHOUT = r"does without aliked: weights cannot be loaded \(the weights for 'aliked-n16' do not fit the network"
+DOES_WITHOUT = (
+    r"does without aliked: weights cannot be loaded \(the weights for 'aliked-n16' do not fit the network"
+)
 
 
 @pytest.mark.filterwarnings("ignore:.* does without superglue")
@@ -205,7 +207,9 @@ def test_a_named_recipe_runs_the_fallback_of_weights_that_do_not_fit_or_goes_on_
 
 def test_a_recipe_without_a_unit_left_to_sweep_is_refused_with_the_reason(misfits):
     recipe = Recipe((Unit(1, "aliked", 640), Unit(2, "sift", 640)), name="mine")
-    says = "recipe 'mine' has no unit left that can sweep all pairs: weights cannot be loaded: aliked .*'aliked-n16'"
+    says = (
+        "recipe 'mine' has no unit left that can sweep all pairs: weights cannot be loaded: aliked .*'aliked-n16'"
+    )
     with pytest.raises(UserError, match=says):
         assemble(recipe, weights=[misfits])
 

