@@ -26,6 +26,8 @@ PAIRS = range(3)
 SAME_PX = 0.01  # positions agree to 1e-4
 MULTIPLE = 32  # of the sides of the golden pictures
 
+Scores = dict[tuple[float, ...], float]  # by the coordinates of a match's two points
+
 
 @pytest.mark.parametrize("name", [file.name for file in genuine_files()])
 def test_every_genuine_file_fits_the_network_of_each_matcher_that_uses_it(name):
@@ -40,8 +42,9 @@ def test_every_genuine_file_fits_the_network_of_each_matcher_that_uses_it(name):
 
 
 @cache
-def matcher_of(name: str) -> Matcher[Keypoints]:
-    return load_matcher(name, genuine_store(), spec_of(name, "test").options(features=KEYPOINTS), Placement())
+def matcher_of(name: str, **options: float) -> Matcher[Keypoints]:
+    chosen = spec_of(name, "test").options(features=KEYPOINTS, **options)
+    return load_matcher(name, genuine_store(), chosen, Placement())
 
 
 @cache
@@ -89,19 +92,41 @@ def test_keypoints_and_descriptors_are_the_originals(detector, matcher, least, m
     assert np.mean(shares) >= mean
 
 
+def matches_of(name: str, pair: int, kind: str, **options: float) -> tuple[Scores, Scores]:
+    """Return the scores of our matches and of the golden ones, on the golden keypoints, by their points."""
+    keypoints = [golden_keypoints(name.split("_")[0], pair, side) for side in (0, 1)]
+    (found,) = matcher_of(name, **options).match(keypoints[:1], keypoints[1:])
+    indices = golden()[f"{pair}/{name}/{kind}/matches"].T
+    points = [each.points[index].numpy() for each, index in zip(keypoints, indices, strict=True)]
+    scores = golden()[f"{pair}/{name}/{kind}/scores"]
+    return by_points(found.points0, found.points1, found.scores), by_points(*points, scores)
+
+
+def by_points(*columns: NDArray[np.float32]) -> Scores:
+    return {tuple(row): score for *row, score in np.column_stack(columns).tolist()}
+
+
+GLUES = pytest.mark.parametrize("name", ["aliked_lightglue", "xfeat_lighterglue"])
+
+
+@needs_data
 @needs_golden
 @pytest.mark.parametrize("pair", PAIRS)
-@pytest.mark.parametrize(("detector", "name"), [("aliked", "aliked_lightglue"), ("xfeat", "xfeat_lighterglue")])
-def test_matches_of_the_originals_keypoints_are_the_originals(detector, name, pair):
-    keypoints = [golden_keypoints(detector, pair, side) for side in (0, 1)]
-    (found,) = matcher_of(name).match(keypoints[:1], keypoints[1:])
-    indices = golden()[f"{pair}/{name}/full/matches"].T
-    points = (each.points[index].numpy() for each, index in zip(keypoints, indices, strict=True))
-    scores = golden()[f"{pair}/{name}/full/scores"]
-    expected = {tuple(row): score for *row, score in np.column_stack([*points, scores]).tolist()}
-    ours = np.column_stack([found.points0, found.points1, found.scores]).tolist()
-    got = {tuple(row): score for *row, score in ours}
+@GLUES
+def test_all_layers_find_the_originals_matches_of_its_keypoints(name, pair):
+    ours, expected = matches_of(name, pair, "full", depth_confidence=-1, width_confidence=-1)
     # A score at the threshold may fall on either side of it.
-    common = expected.keys() & got.keys()
-    assert len(common) >= 0.995 * len(expected.keys() | got.keys())
-    assert_allclose([got[row] for row in common], [expected[row] for row in common], atol=1e-3)
+    common = expected.keys() & ours.keys()
+    assert len(common) >= 0.995 * len(expected.keys() | ours.keys())
+    assert_allclose([ours[row] for row in common], [expected[row] for row in common], atol=1e-3)
+
+
+@needs_data
+@needs_golden
+@pytest.mark.parametrize("pair", PAIRS)
+@GLUES
+def test_early_stopping_and_pruning_find_nearly_the_originals_matches(name, pair):
+    """By default, as published. Which keypoints are dropped depends on rounding."""
+    ours, expected = matches_of(name, pair, "early")
+    assert abs(len(ours) - len(expected)) <= 0.02 * len(expected)
+    assert len(expected.keys() & ours.keys()) >= 0.98 * len(expected)

@@ -156,7 +156,7 @@ SHA256 = "sha256:" + "0f" * 32
 
 
 # Files whose matchers are the next to come.
-AHEAD = {"aliked-n16rot", "aliked-n32", "disk", "disk-lightglue", "superpoint-lightglue"}
+AHEAD = {"disk", "disk-lightglue", "superpoint-lightglue"}
 
 
 def test_the_manifest_has_every_slot_of_every_matcher():
