@@ -94,7 +94,7 @@ def test_keypoints_and_descriptors_are_the_originals(detector, matcher, least, m
 
 def matches_of(name: str, pair: int, kind: str, **options: float) -> tuple[Scores, Scores]:
     """Return the scores of our matches and of the golden ones, both on the golden keypoints."""
-    keypoints = [golden_keypoints(name.split("_")[0], pair, side) for side in (0, 1)]
+    keypoints = [golden_keypoints(name.partition("_")[0], pair, side) for side in (0, 1)]
     (found,) = matcher_of(name, **options).match(keypoints[:1], keypoints[1:])
     indices = golden()[f"{pair}/{name}/{kind}/matches"].T
     points = [each.points[index].numpy() for each, index in zip(keypoints, indices, strict=True)]
