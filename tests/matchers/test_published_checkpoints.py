@@ -1,7 +1,7 @@
-"""The entries of every published checkpoint, as far as they are known, load into the matchers' networks.
+"""The entries of every published checkpoint, as far as they are known, load into the networks.
 
-Names and shapes alone, on the device "meta", beside what the files have too much: wrappers, counters, training's
-leftovers. The lists of ``shapes.json`` were made from the original networks.
+Names and shapes alone, on the device "meta", beside what the files have too much: wrappers,
+counters, training's leftovers. The lists of ``shapes.json`` were made from the original networks.
 """
 
 import json
@@ -35,7 +35,7 @@ class Published:
 
 
 def problem_of(matcher: str, tables: Mapping[str, Shapes]) -> str:
-    """Return why the checkpoints of one matcher do not fit, for the options that ask for the last of these slots."""
+    """Return why these checkpoints do not fit, with options that ask for the last slot."""
     options = spec_of(matcher, "test").options_for(list(tables)[-1])
     return misfit(matcher, Published(tables), options)
 
@@ -63,7 +63,7 @@ class Glue:
     position: int = 2  # 4: x, y, scale and orientation
 
     def shapes(self) -> dict[str, tuple[int, ...]]:
-        """Return the entries by their current names: 253 with nine layers and a projection of the input."""
+        """Return the entries by their current names: 253 with nine layers and an input projection."""
         width = self.width
         table = linear("input_proj", width, self.inputs) if self.inputs != width else {}
         table |= {"posenc.Wr.weight": (width // self.heads // 2, self.position)}
@@ -227,8 +227,11 @@ def test_every_known_list_of_entries_loads(name):
     assert problem_of(matcher, tables) == ""
 
 
+ONE_EACH = [name for name in GOLDEN_LISTS if "indoor" not in name and name not in ("loma_B.pt", "loma_R.pth")]
+
+
 @needs_golden
-@pytest.mark.parametrize("name", GOLDEN_LISTS)
+@pytest.mark.parametrize("name", ONE_EACH)
 def test_counters_of_batch_norms_may_be_missing_and_nothing_else(name):
     matcher, make, _ = GOLDEN_LISTS[name]
     tables = {

@@ -214,20 +214,52 @@ def test_a_recipe_without_a_unit_left_to_sweep_is_refused_with_the_reason(misfit
         assemble(recipe, weights=[misfits])
 
 
+TWO_UNITS = """
+units = [
+    { stage = 1, matcher = "aliked", long_side = 320 },
+    { stage = 1, matcher = "sift", long_side = 320 },
+]
+"""
+
+
+def submitted(demo, tmp_path, recipe, weights):
+    """Submit with a recipe; "own" has ALIKED and SIFT. Return the exit status and the problems of the file."""
+    (tmp_path / "own.toml").write_text(TWO_UNITS)
+    output = tmp_path / "out" / "submission.csv"
+    chosen = tmp_path / "own.toml" if recipe == "own" else recipe
+    options = ("--output", output, "--recipe", chosen, "--weights", weights, "--workers", 0)
+    status = run_command("submit", "--test-dir", demo.test_dir, *options, "--no-report", "--no-scenes")
+    return status, problems_of(output, demo.test_dir)
+
+
 @pytest.mark.filterwarnings("default:.* does without")  # the command prints it
 @pytest.mark.parametrize("recipe", ["auto", "own"])
 def test_one_checkpoint_that_does_not_fit_ends_no_run(misfits, demo, tmp_path, recipe, capsys):
-    own = tmp_path / "own.toml"
-    units = '{ stage = 1, matcher = "aliked", long_side = 320 }, { stage = 1, matcher = "sift", long_side = 320 }'
-    own.write_text(f"units = [{units}]")
-    test_dir, output = demo.test_dir, tmp_path / "out" / "submission.csv"
-    options = ("--output", output, "--recipe", own if recipe == "own" else "auto", "--weights", misfits)
-    status = run_command("submit", "--test-dir", test_dir, *options, "--no-report", "--workers", 0, "--no-scenes")
+    assert submitted(demo, tmp_path, recipe, misfits) == (0, [])
     told = capsys.readouterr()
-    assert status == 0, told.err
     assert len(re.findall(DOES_WITHOUT, told.err)) == 1
     assert "left out, " in told.out
-    assert problems_of(output, test_dir) == []
+
+
+@pytest.mark.filterwarnings("default:.* does without")
+def test_match_does_without_a_checkpoint_that_does_not_fit_as_submit_does(misfits, demo, tmp_path, capsys):
+    (tmp_path / "own.toml").write_text(TWO_UNITS)
+    images = sorted((demo.test_dir / "test_images").rglob("*.png"))[:2]
+    assert run_command("match", *images, "--recipe", tmp_path / "own.toml", "--weights", misfits) == 0
+    told = capsys.readouterr()
+    assert re.search(DOES_WITHOUT, told.err)
+    assert "1:sift@320" in told.out
+    assert "aliked" not in told.out
+
+
+def test_a_matcher_that_only_a_worker_cannot_load_costs_its_units_and_is_told(
+    misfits, demo, tmp_path, monkeypatch, capsys
+):
+    """As with a damaged record, which shows when its numbers are read."""
+    monkeypatch.setattr(availability, "misfit", lambda *_: "")
+    assert submitted(demo, tmp_path, "own", misfits) == (0, [])
+    told = capsys.readouterr().out
+    assert "units that failed: 1\n  1:aliked@320: aliked cannot be loaded: the weights for 'aliked-n16'" in told
 
 
 def test_a_units_digest_has_all_that_decides_its_points():

