@@ -71,17 +71,22 @@ def _error(record: PairRecord) -> str:
     return next((unit.failure for unit in record.units if unit.failure and not unit.matches), "")
 
 
+MAX_NAMED = 3  # matchers in one line
+
+
 def left_out_line(recipe: Recipe, left_out: Sequence[str]) -> str:
     """Return a line on the matchers of the recipe that do not run, with advice; empty if all run.
 
-    ``left_out`` has a text for each cause. Missing weights are the normal case, so their matchers are counted;
-    `mkpc recipes NAME` lists them.
+    ``left_out`` has a text for each cause. Missing weights are the normal case, so many matchers without are only
+    counted; `mkpc recipes NAME` lists them.
     """
     others = [cause for cause in left_out if not cause.startswith(UnavailableKind.NO_WEIGHTS)]
     missing = [cause for cause in left_out if cause.startswith(UnavailableKind.NO_WEIGHTS)]
     parts = [f"left out, {cause}" for cause in others]
     if missing and set(recipe.matcher_names) == {"sift"}:
         parts.append("RootSIFT only; `mkpc weights fetch light --out weights` adds learned matchers")
+    elif missing and missing[0].count(",") < MAX_NAMED:
+        parts += [f"left out, {cause}" for cause in missing]
     elif missing:
         name = recipe.name.partition(" ")[0]  # without the mode
         count = plural(sum(cause.count(",") + 1 for cause in missing), "matcher")

@@ -88,8 +88,13 @@ def test_a_run_whose_time_is_up_says_what_is_left():
         ),
         (
             ("sift", "loftr"),
-            ("no weights: loma, roma",),
-            "2 matchers without weights; `mkpc recipes auto` lists them",
+            ("no weights: loma (`mkpc weights fetch loma-b128 --out DIR` gets weights)",),
+            "left out, no weights: loma (`mkpc weights fetch loma-b128 --out DIR` gets weights)",
+        ),
+        (
+            ("sift", "loftr"),
+            ("no weights: loma, roma, dkm, superglue",),
+            "4 matchers without weights; `mkpc recipes auto` lists them",
         ),
         (
             ("sift", "loftr"),

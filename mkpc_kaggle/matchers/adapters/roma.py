@@ -33,6 +33,6 @@ def load(weights: WeightStore, options: RomaOptions, placement: Placement) -> De
     own, backbone = SPEC.slots_for(options)
     with torch.device("meta"):
         network = RoMa()
-    tensors = {f"dinov2.{name}": tensor for name, tensor in weights.load(backbone).items()}
-    load_into(network, tensors | weights.load(own), what=f"{own} with {backbone}")
+    load_into(network.dinov2, weights.load(backbone), what=backbone)
+    load_into(network, weights.load(own), unused=r"dinov2\.", what=own)
     return DenseMatcher(SPEC, prepared(network, placement), options, placement.device, multiple=PATCH)
