@@ -170,7 +170,8 @@ def _sfm_model(found: Any, graph: ViewGraph) -> SfmModel:
         camera = Camera(K, pose[:, :3].copy(), pose[:, 3].copy())
         known = graph.images[number - 1], camera, int(image.num_points3D), sigmas.get(image.name, ())
         images.append(RegisteredImage(*known))
-    points = np.array([found.points3D[number].xyz for number in sorted(found.point3D_ids())], np.float64)
-    points = points.reshape(-1, 3)
+    tracks = {number: found.points3D[number].track.length() for number in sorted(found.point3D_ids())}
+    longest_first = sorted(tracks, key=lambda number: -tracks[number])
+    points = np.array([found.points3D[number].xyz for number in longest_first], np.float64).reshape(-1, 3)
     error = float(found.compute_mean_reprojection_error()) if len(points) else 0.0
     return SfmModel(tuple(images), points[np.isfinite(points).all(axis=1)], error, found)
