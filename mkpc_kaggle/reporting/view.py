@@ -81,7 +81,7 @@ def style_and_script() -> "Markup":
     """Return the style and the script of views, once per page; the script starts when the page is complete."""
     from markupsafe import Markup
 
-    style, script = _template("view.css"), _template("view.js")
+    style, script = template("view.css"), template("view.js")
     start = 'document.addEventListener("DOMContentLoaded", () => {\n'
     return Markup(f"<style>\n{style}</style>\n<script>\n{start}{script}}});\n</script>\n")
 
@@ -92,20 +92,20 @@ def view_part(
     *,
     read: Reader = lambda _: None,
     partners: Partners | None = None,
-    picture: str = "",
+    pictures: Sequence[tuple[str, str]] = (),
     metres_per_unit: float | None = None,
 ) -> "Markup":
     """Return the part of a page with the view of a scene's models.
 
-    ``read`` returns pictures, which colour the points; ``picture`` is the URI of a picture to show without
-    scripts. All text is escaped.
+    ``read`` returns pictures, which colour the points. ``pictures`` are captions and URIs of pictures that a
+    browser without scripts shows instead. All text is escaped.
     """
     from jinja2 import Environment, PackageLoader, StrictUndefined
     from markupsafe import Markup
 
     pages = Environment(loader=PackageLoader("mkpc_kaggle.reporting"), autoescape=True, undefined=StrictUndefined)
     data = view_data(models, read=read, partners=partners or {}, metres_per_unit=metres_per_unit)
-    return Markup(pages.get_template("view.html").render(data=data, title=title, picture=picture))
+    return Markup(pages.get_template("view.html").render(data=data, title=title, pictures=pictures))
 
 
 def view_data(
@@ -273,5 +273,6 @@ def _base64(data: bytes) -> str:
 
 
 @cache
-def _template(name: str) -> str:
+def template(name: str) -> str:
+    """Return the text of a file in ``templates/``."""
     return files("mkpc_kaggle.reporting").joinpath("templates", name).read_text(encoding="utf-8")

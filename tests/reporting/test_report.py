@@ -1,6 +1,7 @@
 """The journal command and report.html, on journals with known contents."""
 
 import csv
+import json
 import os
 import re
 import sys
@@ -106,10 +107,11 @@ def test_the_page_begins_with_the_verdict_has_pictures_inside_and_asks_for_nothi
     assert report_run(tmp_path / "work", page, inf, pairs) == f"report: {page}"
     text = page.read_text(encoding="utf-8")
     assert re.search("<h1>Complete after .*: 11 of 12 pairs have an F</h1>", text)
-    titles = ["Missing results", "The weakest pairs", "Where the time went", "What made this"]
+    titles = ["Missing results", "The weakest pairs", "Pairs", "Where the time went", "What made this"]
     assert re.findall("<h2>(.*?)</h2>", text) == titles
     assert text.count("<img ") == 11, "the pairs with an F"
-    assert "<script" not in text
+    assert "With the fallback: 1 pairs; the reasons are below." in text
+    assert re.findall("<script[^>]*>", text) == ["<script>", "<script>"], "both inside the page"
     assert all(source.startswith("data:image/") for source in re.findall(r"\b(?:src|href)\s*=\s*.(\S*)", text))
     assert not re.search(r"url\(|@import", text)
     assert "the file is empty" in text
@@ -120,6 +122,30 @@ def test_the_page_begins_with_the_verdict_has_pictures_inside_and_asks_for_nothi
         assert (len(match.matches), match.estimate.inlier_count) == (record.matches, record.inliers)
 
 
+def test_the_summary_has_the_facts_of_the_page_for_programs(tmp_path):
+    pairs = a_run(tmp_path)
+    report_run(tmp_path / "work", tmp_path / "report.html", inf, pairs)
+    table = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
+    assert table["format"] == "mkpc summary 1"
+    assert table["verdict"].startswith("11 of 12 pairs have an F; with the fallback: 1 pairs")
+    assert (table["pairs"]["count"], table["pairs"]["with_f"]) == (12, 11)
+    assert table["pairs"]["sources"] == {"fallback": 1, "pair": 11}
+    records = read_log(tmp_path / "work").records
+    assert table["pairs"]["inliers_minimum"] == min(record.inliers for record in records if record.is_solved)
+    assert sum(table["pairs"]["inliers_histogram"].values()) == 12
+    assert [unit["pairs"] for unit in table["units"]] == [11, 11, 11]
+
+
+@pytest.mark.parametrize("make", MINE.values(), ids=MINE)
+def test_a_summary_replaces_nothing_but_a_summary(tmp_path, make):
+    empty_journal(tmp_path, []).close()
+    make(tmp_path / "page.summary.json")
+    before = os.lstat(tmp_path / "page.summary.json")
+    assert run_command("journal", tmp_path, "--report", tmp_path / "page.html") == 2
+    assert os.lstat(tmp_path / "page.summary.json") == before
+    assert read_log(tmp_path).records == ()
+
+
 def test_what_comes_from_files_is_escaped(tmp_path):
     pairs = [Pair(EVIL, EVIL, f"{EVIL.replace('/', '')}.png", "b.png")]
     with empty_journal(tmp_path, pairs, device=EVIL, left_out=(EVIL,), versions={EVIL: EVIL}) as journal:
@@ -128,7 +154,8 @@ def test_what_comes_from_files_is_escaped(tmp_path):
     log = read_log(tmp_path)
     for known in ((), pairs):
         text = report_page(log, known)
-        assert "<script" not in text
+        assert EVIL not in text
+        assert text.count("<script") == 2, "the page's own"
         assert "&lt;script&gt;" in text
     assert EVIL in overview(log)
 
