@@ -7,6 +7,7 @@ from pathlib import Path
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.robust import RobustConfig
 from mkpc_kaggle.recipe import CameraSharing, SceneConfig
+from mkpc_kaggle.scene.align import align, read_reference
 from mkpc_kaggle.scene.choose import Choice, Reason, choose, estimate_at_known_focals
 from mkpc_kaggle.scene.reconstruction import MIN_IMAGES, Reconstruction, SfmModel
 from mkpc_kaggle.scene.shared_intrinsics import SharedIntrinsics, given_intrinsics, shared_intrinsics
@@ -66,7 +67,8 @@ def reconstruct_sharing(
 
     If images seem to share a camera, a second reconstruction shares intrinsics. It is kept unless images then see
     fewer points. If the recipe shares cameras, the first reconstruction does too. The refined focal lengths are
-    returned. With a ``directory``, the graph is reconstructed as a whole, and COLMAP's files are written there.
+    returned. With a ``directory``, the graph is reconstructed as a whole, moved onto the cameras of the last
+    complete run, and COLMAP's files are written there.
     """
     if directory is None:
         parts, make = graph.components(), reconstruct_component
@@ -82,6 +84,7 @@ def reconstruct_sharing(
     if directory is not None:
         from mkpc_kaggle.scene.colmap import write_files
 
+        found = align(found, read_reference(directory))
         write_files(directory, graph.strong, shared, models_of(found))
     if given:
         focals = {each.image.size: each.focal for model in reversed(models_of(found)) for each in model.images}

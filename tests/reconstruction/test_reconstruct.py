@@ -243,6 +243,7 @@ def test_the_command_writes_tables_models_a_database_and_a_page(demo, small_reci
     options = ["--recipe", small_recipe, "--format", "imc2025", "--workers", 0]
     assert run_command("reconstruct", images, "--out", out, *options) == 0
     results = {"cameras.csv", "submission.csv", "database.db", "models/0/images.bin", "report.html"}
+    results |= {"sparse/0/points3D.bin", "summary.json", *(f"images/{path.name}" for path in images.iterdir())}
     assert results <= contents(out).keys()
     with (out / "submission.csv").open() as stream:
         assert [row["image"] for row in csv.DictReader(stream)] == sorted(path.name for path in images.iterdir())
