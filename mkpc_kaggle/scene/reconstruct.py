@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
+from mkpc_kaggle.geometry.intrinsics import read as read_intrinsics
 from mkpc_kaggle.geometry.robust import RobustConfig
 from mkpc_kaggle.recipe import CameraSharing, SceneConfig
 from mkpc_kaggle.scene.align import align, read_reference
@@ -70,13 +71,15 @@ def reconstruct_sharing(
     returned. With a ``directory``, the graph is reconstructed as a whole, moved onto the cameras of the last
     complete run, and COLMAP's files are written there.
     """
+    graph = graph.with_intrinsics(read_intrinsics(config.intrinsics))
     if directory is None:
         parts, make = graph.components(), reconstruct_component
     else:
         parts, make = (graph.strong,), reconstruct_connected
-    given = shared = given_intrinsics(graph.images, config)
+    free = [image for image in graph.images if image.digest not in graph.known]
+    given = shared = given_intrinsics(free, config)
     found = [make(part, shared) for part in parts]
-    if config.cameras is CameraSharing.AUTO and (alike := shared_intrinsics(graph.images, models_of(found))):
+    if config.cameras is CameraSharing.AUTO and (alike := shared_intrinsics(free, models_of(found))):
         again = [make(part, alike) for part in parts]
         before, after = (sum(each.observations for each in made) for made in (found, again))
         if after >= MIN_OBSERVATIONS * before:
@@ -88,7 +91,7 @@ def reconstruct_sharing(
         write_files(directory, graph.strong, shared, models_of(found))
     if given:
         focals = {each.image.size: each.focal for model in reversed(models_of(found)) for each in model.images}
-        shared = {image.digest: focals[image.size] for image in graph.images if image.size in focals}
+        shared = {image.digest: focals[image.size] for image in free if image.size in focals}
     return found, shared
 
 
