@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from mkpc_kaggle.cli import options
+from mkpc_kaggle.data.masks import Masks
 from mkpc_kaggle.engine.budget import format_duration
 from mkpc_kaggle.engine.console import say
 from mkpc_kaggle.engine.session import interruptible
@@ -16,6 +17,7 @@ from mkpc_kaggle.reconstruction.directory import output_directory, require_direc
 from mkpc_kaggle.reconstruction.folder import read_folder, read_pair_list
 from mkpc_kaggle.reconstruction.layout import write_layouts
 from mkpc_kaggle.reconstruction.outputs import FORMS, Cameras, write_tables
+from mkpc_kaggle.reconstruction.priors import read_intrinsics_table
 from mkpc_kaggle.reconstruction.run import FolderResult, for_cameras, reconstruct_folder
 from mkpc_kaggle.reporting.summary import trouble, weakest_line
 
@@ -67,6 +69,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     text = """images of one size in a folder that share a camera: if their focal lengths agree (auto), none
         (image), or all (folder)"""
     add("--camera", choices=list(map(str, CameraSharing)), help=text)
+    text = """known cameras, a table with the columns image (a path, a name or a pattern such as 'drone*.jpg'),
+        model (COLMAP's: SIMPLE_PINHOLE, OPENCV, ...), parameters (in COLMAP's order, separated by blanks) and
+        sigma (of the focal length, in percent, or fixed)"""
+    add("--intrinsics", type=Path, metavar="FILE.csv", help=text)
+    text = "masks named as COLMAP's, MASKS/a.jpg.png for a.jpg; points on black pixels are left out"
+    add("--masks", type=Path, metavar="MASKS", help=text)
     add("--fresh", action="store_true", help="delete the journal of an earlier run in OUT/work")
     parser.set_defaults(reconstruct=True)
 
@@ -74,7 +82,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     root, out, work_dir = arguments.images, arguments.out, arguments.out / "work"
     datasets = read_folder(root)
-    require_directory_apart(out, filter(None, [root, arguments.pairs, Path(arguments.recipe)]), arguments.weights)
+    files = [file for found in datasets.values() for file in found]
+    known = "" if arguments.intrinsics is None else read_intrinsics_table(arguments.intrinsics, root, files)
+    masks = Masks() if arguments.masks is None else Masks.of_folder(arguments.masks, root, files)
+    inputs = [root, arguments.pairs, Path(arguments.recipe), arguments.intrinsics, arguments.masks]
+    require_directory_apart(out, filter(None, inputs), arguments.weights)
     listed = None if arguments.pairs is None else read_pair_list(arguments.pairs, root, datasets)
     with (
         interruptible() as interrupt,
@@ -90,7 +102,8 @@ def run(arguments: argparse.Namespace) -> int:
             session.status = int(not any(any(found.values()) for found in cameras.values()))
 
         assembly = options.assembly_of(arguments, arguments.recipe, arguments.mode, interrupt)
-        assembly = replace(assembly, recipe=for_cameras(assembly.recipe, arguments.camera))
+        recipe = for_cameras(assembly.recipe, arguments.camera, known)
+        assembly = replace(assembly, recipe=recipe, masks=masks)
         options.say_start(f"{sum(map(len, datasets.values()))} images", assembly, work_dir)
         given = {"listed": listed, "rotations": arguments.rotations, "publish": publish}
         result = reconstruct_folder(root, datasets, assembly, session, out, **given)

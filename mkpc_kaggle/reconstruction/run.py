@@ -32,13 +32,20 @@ class FolderResult:
     cameras: Cameras
 
 
-def for_cameras(recipe: Recipe, sharing: str | None = None) -> Recipe:
+def for_cameras(recipe: Recipe, sharing: str | None = None, intrinsics: str = "") -> Recipe:
     """Return the recipe without extra pairs and without steps that only improve the F of single pairs.
 
-    ``sharing`` is a :class:`CameraSharing`; ``None`` keeps the recipe's.
+    ``sharing`` is a :class:`CameraSharing`, and ``intrinsics`` are known cameras as in :class:`SceneConfig`.
+    Without them, the recipe's are kept.
     """
-    scene = replace(recipe.scene or SceneConfig(), pairs_per_image=0.0)
-    return replace(recipe, focal=None, scene=replace(scene, cameras=CameraSharing(sharing or scene.cameras)))
+    scene = recipe.scene or SceneConfig()
+    scene = replace(
+        scene,
+        pairs_per_image=0.0,
+        cameras=CameraSharing(sharing or scene.cameras),
+        intrinsics=intrinsics or scene.intrinsics,
+    )
+    return replace(recipe, focal=None, scene=scene)
 
 
 def reconstruct_folder(
