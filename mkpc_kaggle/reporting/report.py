@@ -34,7 +34,7 @@ from mkpc_kaggle.reporting.summary import (
     weakest_cameras,
 )
 from mkpc_kaggle.reporting.verdict import doubt, inlier_histogram, verdict, write_summary
-from mkpc_kaggle.reporting.view import picture_at, style_and_script, template, view_part
+from mkpc_kaggle.reporting.view import View, picture_at, style_and_script, template, view_of, view_part
 
 if TYPE_CHECKING:
     from markupsafe import Markup
@@ -160,6 +160,14 @@ def _views(log: RunLog, pairs: Sequence[Pair], *, is_drawn: bool) -> Iterator[tu
 
         partners = partners_of([record for record in log.records if record.pair.group == scene.batch])
         yield scene.batch, view_part(scene.models, scene.batch, read=read, partners=partners, pictures=pictures)
+
+
+def show_run(work_dir: str | Path, pairs: Sequence[Pair] = ()) -> View:
+    """Return the view of the scenes of a run; ``pairs`` have the paths of the images.
+
+    Raises :class:`UserError` if the journal is missing or damaged.
+    """
+    return view_of(_views(read_log(Path(work_dir)), pairs, is_drawn=False))
 
 
 def partners_of(records: Iterable[PairRecord]) -> dict[str, list[tuple[str, int, int]]]:

@@ -65,10 +65,16 @@ def show(models: Iterable[SfmModel], *, metres_per_unit: float | None = None) ->
     With ``metres_per_unit``, the scale of the largest model, a bar shows a length in metres.
     """
     part = view_part([*models], "the scene", read=picture_at, metres_per_unit=metres_per_unit)
+    return view_of([("", part)])
+
+
+def view_of(parts: Iterable[tuple[str, "Markup"]]) -> View:
+    """Return the view of scenes, given the title and the part of the page of each."""
     style = "body { margin: 0; padding: .5rem; background: #fff; font: 1rem/1.5 system-ui, sans-serif; }"
     title = '<meta charset="utf-8"><title>Cameras and points</title>'
     head = f"{title}\n<style>{style}</style>{style_and_script()}"
-    return View(f'<!doctype html>\n<html lang="en"><head>{head}</head><body>{part}</body></html>')
+    body = "".join(f"<h3>{escape(name)}</h3>{part}" if name else part for name, part in parts)
+    return View(f'<!doctype html>\n<html lang="en"><head>{head}</head><body>{body}</body></html>')
 
 
 def picture_at(path: str) -> Image | None:

@@ -342,9 +342,11 @@ def test_python_gives_models_reads_each_image_once_and_estimates_nothing_unused(
 
     monkeypatch.setattr(images, "read_image", read_counted)
     monkeypatch.setattr(pair, "estimate", lambda *_, **__: pytest.fail("unused"))
-    (first,) = reconstruct(folder.iterdir(), RECIPE, device="cpu", matchers={"synthetic": MixedMatcher()})
+    models = reconstruct(folder.iterdir(), RECIPE, device="cpu", matchers={"synthetic": MixedMatcher()})
+    (first,) = models
     assert sorted(read) == sorted(folder.iterdir())
     assert len(first.images) == FIRST
     truth = MixedMatcher().scenes[0].cameras
+    assert all(f"{number:02}.png" in models.show().page for number in range(FIRST))
     for found in first.images:
         assert found.focal == pytest.approx(truth["00" + Path(found.image.name).stem].K[0, 0], rel=0.03)

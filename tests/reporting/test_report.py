@@ -11,6 +11,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from browser import needs_browser, opened_browser
 from rectified import THREE_UNITS, RectifiedMatcher, run, write_pairs
 from shared import run_command
 
@@ -171,6 +172,38 @@ def test_without_matplotlib_the_page_has_tables_and_says_so(tmp_path, monkeypatc
     assert "matplotlib is not installed" in text
     assert "<img" not in text
     assert pairs[0].id in text
+
+
+@needs_browser
+@pytest.mark.parametrize("width", [1280, 400])
+def test_pairs_sort_and_filter_and_pictures_enlarge(tmp_path, width):
+    pairs = a_run(tmp_path, 6)
+    page = tmp_path / "report.html"
+    report_run(tmp_path / "work", page, inf, pairs)
+    rows = "[...document.querySelectorAll('table.sortable tbody tr')]"
+    with opened_browser() as browser:
+        browser.open(page, width)
+        for kind in ("ascending", "descending"):
+            browser.value("document.querySelectorAll('table.sortable th button')[2].click()")
+            inliers = browser.value(f"{rows}.map((row) => Number(row.cells[2].textContent))")
+            assert inliers == sorted(inliers, reverse=kind == "descending")
+            assert browser.value("document.querySelectorAll('table.sortable th')[2].ariaSort") == kind
+        filled = "document.querySelector('input[type=search]')"
+        browser.value(f"{filled}.value = 'FALLBACK {pairs[1].id}'; {filled}.oninput()")
+        shown = browser.value(f"{rows}.filter((row) => !row.hidden).map((row) => row.cells[0].textContent)")
+        assert shown == [pairs[1].id]
+        browser.value("document.querySelector('figure img').click()")
+        assert browser.value("document.querySelector('dialog').open")
+        assert browser.value("document.querySelector('dialog img').naturalWidth") > 100
+        browser.value("document.querySelector('dialog').click()")
+        assert not browser.value("document.querySelector('dialog').open")
+        wide = (
+            "[...document.querySelectorAll('body *')].filter((e) => e.getBoundingClientRect().right > innerWidth)"
+        )
+        outside = f"{wide}.filter((e) => !e.closest('.wide, .rows')).map((e) => e.outerHTML.slice(0, 200))"
+        assert browser.value(outside) == []
+        assert browser.value("document.documentElement.scrollWidth") <= width
+        assert browser.errors == []
 
 
 def test_a_late_report_leaves_out_drawings_then_itself(tmp_path, monkeypatch):
