@@ -109,7 +109,7 @@ class Models(tuple[SfmModel, ...]):
 
         With ``metres_per_unit``, the scale of a single model, a bar shows a length.
         """
-        from mkpc_kaggle.reporting.view import show  # a layer below; reports are optional here
+        from mkpc_kaggle.reporting.view import show  # jinja2 is slow to import
 
         return show(self, metres_per_unit=metres_per_unit)
 

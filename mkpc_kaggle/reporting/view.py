@@ -109,6 +109,8 @@ def view_part(
     from jinja2 import Environment, PackageLoader, StrictUndefined
     from markupsafe import Markup
 
+    if not any(model.images for model in models):
+        return Markup("<p>No cameras.</p>")
     pages = Environment(loader=PackageLoader("mkpc_kaggle.reporting"), autoescape=True, undefined=StrictUndefined)
     data = view_data(models, read=read, partners=partners or {}, metres_per_unit=metres_per_unit)
     return Markup(pages.get_template("view.html").render(data=data, title=title, pictures=pictures))
