@@ -29,11 +29,11 @@ class Masks:
         """Return the masks below ``directory`` of images below ``root``; an image without a mask is used whole.
 
         Raises :class:`UserError` for a directory that is missing, lies below ``root`` or has no masks of these
-        images, and for a mask that is unreadable or not as large as its image.
+        images. Raises it also for a mask that is unreadable or not as large as its image.
         """
         if not directory.is_dir():
             raise UserError(
-                f"{directory}: no such directory; --masks needs masks such as {directory}/a.jpg{SUFFIX}"
+                f"{directory}: no such directory; --masks names a directory with files such as a.jpg{SUFFIX}"
             )
         if lies_in(directory, root):
             raise UserError(f"--masks {directory} lies in {root}, so masks count as images; move it elsewhere")

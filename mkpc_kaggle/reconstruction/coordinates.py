@@ -23,7 +23,7 @@ STILL = 1e-6  # of the model's size; smaller movements are rounding
 
 
 def forget_coordinates(out: Path, datasets: Iterable[str]) -> None:
-    """Remove the cameras of the last complete run, so that the next models have coordinates of their own."""
+    """Remove the cameras of the last complete run, so that the next models have new coordinates."""
     for dataset in datasets:
         (out / dataset / REFERENCE).unlink(missing_ok=True)
 

@@ -60,7 +60,7 @@ def _link(path: Path, file: Path) -> None:
         path.unlink()
     elif path.exists() and _version(path) == _version(file):
         return
-    with suppress(OSError):  # an old copy is there, or the file system has no links
+    with suppress(OSError):  # an old copy exists, or the file system has no links
         path.symlink_to(file)
         return
     part = path.with_name(f"{PART}{path.name}")

@@ -1,4 +1,4 @@
-"""What the user knows about a folder's cameras: a table of intrinsics."""
+"""Priors of a folder's cameras: the user's table of intrinsics."""
 
 from collections.abc import Iterable
 from pathlib import Path

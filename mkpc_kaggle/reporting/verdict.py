@@ -143,7 +143,7 @@ def write_summary(log: RunLog, page: Path) -> Path | None:
         return None
     path = page.with_name("summary.json" if page.stem == "report" else f"{page.stem}.summary.json")
     if (path.exists() or path.is_symlink()) and not _is_summary(path):
-        raise UserError(f"{path} is in the way, it is no summary of a run; move it")
+        raise UserError(f"{path} is in the way and is not a summary of a run; move it")
     with writing(f"the summary {path}"), replacing(path) as stream:
         stream.write(printable(json.dumps(summary_table(log), indent=1, ensure_ascii=False, allow_nan=False)))
         stream.write("\n")

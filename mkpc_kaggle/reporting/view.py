@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 MAX_PICTURES = 200  # images that are read per scene, for thumbnails and for colours of points
 THUMBNAIL_PX = 320  # the longer side
 JPEG_QUALITY = 70
-FAR = 4.0  # half sizes of the scene; farther points are left out
-GREY = 150  # of a point that no known picture shows
+FAR = 4.0  # half sizes of the scene; the limit of drawn points
+GREY = 150  # points outside all known pictures
 STEPS = 32767  # of a 16-bit coordinate
 FRUSTUM_SHARE = 0.4  # size of a frustum over the distance to the nearest camera
 MIN_FRUSTUM, MAX_FRUSTUM = 0.02, 0.08  # in half sizes of the scene

@@ -1,7 +1,7 @@
 """Coordinates that stay: a new reconstruction moved onto the cameras of an earlier one.
 
-A reconstruction is known up to a similarity. Programs that use earlier coordinates go on with a larger folder if
-its common cameras stay where they were.
+A reconstruction is known up to a similarity. Programs that use earlier coordinates can use a larger
+folder if its common cameras stay where they were.
 """
 
 import json
