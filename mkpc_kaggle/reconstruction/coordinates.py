@@ -8,6 +8,7 @@ import numpy as np
 from mkpc_kaggle.data.outputs import replacing
 from mkpc_kaggle.engine.request import Ending
 from mkpc_kaggle.geometry.cameras import Camera
+from mkpc_kaggle.reconstruction.folder import batch_names
 from mkpc_kaggle.reconstruction.run import FolderResult
 from mkpc_kaggle.scene.align import (
     MIN_COMMON,
@@ -35,6 +36,7 @@ def keep_coordinates(out: Path, root: Path, result: FolderResult) -> Iterator[st
     """
     if result.report.ending != Ending.COMPLETE:
         return
+    batches = batch_names(root, result.cameras)
     for dataset, cameras in result.cameras.items():
         models: dict[int, dict[str, Camera]] = {}
         for file, placed in cameras.items():
@@ -42,14 +44,14 @@ def keep_coordinates(out: Path, root: Path, result: FolderResult) -> Iterator[st
                 number, found = placed
                 models.setdefault(number, {})[file.relative_to(root).as_posix()] = found.camera
         yield from moved_lines(
-            dataset, read_reference(out / dataset), [models[number] for number in sorted(models)]
+            batches[dataset], read_reference(out / dataset), [models[number] for number in sorted(models)]
         )
         if models:
             with replacing(out / dataset / REFERENCE) as stream:
                 write_reference(stream, [models[number] for number in sorted(models)])
 
 
-def moved_lines(dataset: str, earlier: Iterable[Cameras], models: Sequence[Cameras]) -> Iterator[str]:
+def moved_lines(batch: str, earlier: Iterable[Cameras], models: Sequence[Cameras]) -> Iterator[str]:
     """Yield a line for each earlier model whose cameras are in a model now, and have moved."""
     for former in earlier:
         now = max(models, key=lambda model: len(model.keys() & former.keys()), default={})
@@ -61,4 +63,4 @@ def moved_lines(dataset: str, earlier: Iterable[Cameras], models: Sequence[Camer
         if moved.max() > STILL:
             middle, most = 100 * np.median(moved), 100 * moved.max()
             text = f"{len(names)} cameras keep the coordinates of the last run and moved by {middle:.2g} %"
-            yield f"{dataset}: {text} of the model's size (the median; {most:.2g} % at most)"
+            yield f"{batch}: {text} of the model's size (the median; {most:.2g} % at most)"

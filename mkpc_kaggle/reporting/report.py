@@ -27,6 +27,7 @@ from mkpc_kaggle.reporting.run_log import RunLog, read_log
 from mkpc_kaggle.reporting.summary import (
     facts,
     headline,
+    is_doubtful,
     left_out_line,
     seconds_by_part,
     unit_means,
@@ -53,7 +54,7 @@ def report_run(work_dir: Path, path: Path, ends: float, pairs: Sequence[Pair] = 
     program's time ends at ``ends``, in seconds of the monotonic clock. ``pairs`` are the pairs of the run.
     Never raises: a failed report must not change the exit status of a successful run.
     """
-    later = f"python -m mkpc_kaggle journal {work_dir} --report {path}"
+    later = f"mkpc journal {work_dir} --report {path}"
     left = ends - time.monotonic()
     if left < WRITING_S + WRITING_S_PER_PAIR * len(pairs):
         return f"no report, the time is up; later: {later}"
@@ -100,7 +101,7 @@ def report_page(log: RunLog, pairs: Sequence[Pair] = (), *, undrawn: str = "") -
         headline=headline(log),
         found=verdict(log),
         facts=facts(log),
-        left_out=left_out_line(log.about.left_out),
+        left_out=left_out_line(log.recipe, log.about.left_out),
         failed=failed,
         failures=Counter(reason for *_, reason in failed).most_common(),
         unit_failures=[(reason,) for reason in unit_reasons(log)],
@@ -108,13 +109,17 @@ def report_page(log: RunLog, pairs: Sequence[Pair] = (), *, undrawn: str = "") -
         weakest=[(_picture(sources.get(record.pair.id), match), record) for record, match in log.weakest],
         scenes=[*_scenes(log)],
         choices=Counter(str(record.scene.reason) for record in log.records if record.scene).most_common(),
-        sigmas=[(name, 100 * of.centre, of.rotation, of.focal) for name, of in weakest_cameras(log.scenes)],
+        sigmas=[
+            (name, 100 * of.centre, of.rotation, of.focal) if of else (name, "unknown", "", "")
+            for name, of in weakest_cameras(log.scenes)
+        ],
+        is_doubtful=is_doubtful,
+        min_support=MIN_SUPPORT,
         views=[*_views(log, readable, is_drawn=not undrawn)],
         pair_rows=pair_rows(log.records)[:MAX_ROWS],
         more_pairs=max(0, len(log.records) - MAX_ROWS),
         histogram=histogram,
         histogram_most=max(1, *(count for _, count in histogram)),
-        min_support=MIN_SUPPORT,
         units=[(*means, means[1] * means[-1]) for means in unit_means(log)],
         parts=[(name, total, total / len(log.records)) for name, total in seconds_by_part(log).items() if total],
         undrawn=undrawn,

@@ -16,7 +16,7 @@ from mkpc_kaggle.data.outputs import replacing
 from mkpc_kaggle.engine.journal_reader import PairRecord, SceneRecord
 from mkpc_kaggle.errors import UserError, printable, writing
 from mkpc_kaggle.reporting.run_log import RunLog
-from mkpc_kaggle.reporting.summary import headline, seconds_by_part, trouble, unit_means, unit_reasons
+from mkpc_kaggle.reporting.summary import headline, is_doubtful, seconds_by_part, trouble, unit_means, unit_reasons
 from mkpc_kaggle.scene.choose import Reason
 from mkpc_kaggle.scene.reconstruction import RegisteredImage
 from mkpc_kaggle.version import __version__
@@ -59,13 +59,11 @@ def verdict(log: RunLog) -> Verdict:
 def doubt(record: PairRecord) -> str:
     """Return why a pair may show different things, or an empty string.
 
-    Two cameras that agree with the pair settle the doubt.
+    Matches that contradict the cameras are doubtful, too.
     """
-    if record.scene is not None and record.scene.from_scene:
-        return ""
     if record.scene is not None and record.scene.reason is Reason.CONTRADICTION:
         return "its matches contradict the cameras"
-    if record.is_solved and not record.overlaps:
+    if record.is_solved and is_doubtful(record):
         return f"{record.stats.support:.1f} times the inliers by chance"
     return ""
 

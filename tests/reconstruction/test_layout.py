@@ -171,7 +171,7 @@ def test_a_folder_that_grew_keeps_its_coordinates(tmp_path):
     away.rename(root / "05.png")
     after = run(root, out)
     (line,) = keep_coordinates(out, root, after)
-    assert line.startswith(".: 5 cameras keep the coordinates of the last run and moved by ")
+    assert line.startswith("images: 5 cameras keep the coordinates of the last run and moved by ")
     old, new = cameras(before), cameras(after)
     assert (len(old), len(new)) == (5, 6)
     size = np.std([each.camera.centre for each in old.values()], axis=0).max()
