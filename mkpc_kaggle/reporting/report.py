@@ -8,6 +8,7 @@ import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from statistics import median
@@ -23,6 +24,7 @@ from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
 from mkpc_kaggle.pipeline.pair import PairMatch
 from mkpc_kaggle.pipeline.two_stage import to_image
 from mkpc_kaggle.reporting.figures import draw_cameras, draw_pair, draw_strip, encode
+from mkpc_kaggle.reporting.points import clouds_of
 from mkpc_kaggle.reporting.run_log import RunLog, read_log
 from mkpc_kaggle.reporting.summary import (
     facts,
@@ -164,7 +166,19 @@ def _views(log: RunLog, pairs: Sequence[Pair], *, is_drawn: bool) -> Iterator[tu
             return None if path is None else picture_at(str(path))
 
         partners = partners_of([record for record in log.records if record.pair.group == scene.batch])
-        yield scene.batch, view_part(scene.models, scene.batch, read=read, partners=partners, pictures=pictures)
+        models = scene.models
+        clouds = clouds_of(scene, log.path.parent.parent)
+        if clouds:
+            models = tuple(replace(each, points=cloud.points) for each, cloud in zip(models, clouds, strict=True))
+        part = view_part(
+            models,
+            scene.batch,
+            read=read,
+            partners=partners,
+            pictures=pictures,
+            colours=[cloud.colours for cloud in clouds],
+        )
+        yield scene.batch, part
 
 
 def show_run(work_dir: str | Path, pairs: Sequence[Pair] = ()) -> View:

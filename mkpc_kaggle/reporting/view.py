@@ -38,6 +38,7 @@ MIN_FRUSTUM, MAX_FRUSTUM = 0.02, 0.08  # in half sizes of the scene
 FRAME_HEIGHT_PX = 760  # of the view in a notebook
 
 Reader: TypeAlias = Callable[[str], Image | None]  # the picture of an image, by its name in the scene
+Colours: TypeAlias = Sequence[NDArray[np.uint8]]
 Partner: TypeAlias = tuple[str, int, int]  # another image of a pair, the pair's inliers and matches
 Partners: TypeAlias = Mapping[str, Sequence[Partner]]  # by name of the image
 
@@ -99,12 +100,13 @@ def view_part(
     read: Reader = lambda _: None,
     partners: Partners | None = None,
     pictures: Sequence[tuple[str, str]] = (),
+    colours: Colours = (),
     metres_per_unit: float | None = None,
 ) -> "Markup":
     """Return the part of a page with the view of a scene's models.
 
-    ``read`` returns pictures, which colour the points. ``pictures`` are captions and URIs of pictures that a
-    browser without scripts shows instead. All text is escaped.
+    ``read`` returns pictures, which colour the points of models without ``colours``. ``pictures`` are captions and
+    URIs of pictures that a browser without scripts shows instead. All text is escaped.
     """
     from jinja2 import Environment, PackageLoader, StrictUndefined
     from markupsafe import Markup
@@ -112,24 +114,31 @@ def view_part(
     if not any(model.images for model in models):
         return Markup("<p>No cameras.</p>")
     pages = Environment(loader=PackageLoader("mkpc_kaggle.reporting"), autoescape=True, undefined=StrictUndefined)
-    data = view_data(models, read=read, partners=partners or {}, metres_per_unit=metres_per_unit)
+    data = view_data(models, read=read, partners=partners or {}, colours=colours, metres_per_unit=metres_per_unit)
     return Markup(pages.get_template("view.html").render(data=data, title=title, pictures=pictures))
 
 
 def view_data(
-    models: Sequence[SfmModel], *, read: Reader, partners: Partners, metres_per_unit: float | None = None
+    models: Sequence[SfmModel],
+    *,
+    read: Reader,
+    partners: Partners,
+    colours: Colours = (),
+    metres_per_unit: float | None = None,
 ) -> dict[str, Any]:
     """Return the data that ``view.js`` reads, as JSON values.
 
-    Each model is in its own frame: x right, y down, z ahead of the mean camera, and most points within 1 of the
-    origin. Models stand side by side, since their relative scale and position are unknown.
+    ``colours`` has the colours (P, 3) of each model's points, or is empty. Each model is in its own frame: x
+    right, y down, z ahead of the mean camera, and most points within 1 of the origin. Models stand side by side,
+    since their relative scale and position are unknown.
     """
-    shown = [model for model in models if model.images]
+    shown = list(models)
     pictures = _pictures(shown, read)
     frames = [_Frame.of(model) for model in shown]
+    given: Sequence[NDArray[np.uint8] | None] = colours or [None] * len(shown)
     is_measured = metres_per_unit is not None and len(shown) == 1
     return {
-        "models": [_model(*each, pictures, partners) for each in zip(shown, frames, strict=True)],
+        "models": [_model(*each, pictures, partners) for each in zip(shown, frames, given, strict=True)],
         "metres": metres_per_unit / frames[0].scale if is_measured and metres_per_unit else None,
     }
 
@@ -171,11 +180,17 @@ class _Frame:
         return np.asarray(self.scale * (points - self.centre) @ self.axes.T)
 
 
-def _model(model: SfmModel, frame: _Frame, pictures: Mapping[str, Pixels], partners: Partners) -> dict[str, Any]:
+def _model(
+    model: SfmModel,
+    frame: _Frame,
+    known: NDArray[np.uint8] | None,
+    pictures: Mapping[str, Pixels],
+    partners: Partners,
+) -> dict[str, Any]:
     points = model.points[:MAX_POINTS]
     placed = frame.place(points)
     near = np.abs(placed).max(axis=1, initial=0) < FAR
-    colours = point_colours(points[near], model.images, pictures)
+    colours = known[:MAX_POINTS] if known is not None else point_colours(points, model.images, pictures)
     reach = float(np.abs(placed[near]).max(initial=1e-6))
     steps = np.round(placed[near] * (STEPS / reach)).astype("<i2")
     centres = frame.place(np.array([found.camera.centre for found in model.images]))
@@ -183,7 +198,7 @@ def _model(model: SfmModel, frame: _Frame, pictures: Mapping[str, Pixels], partn
         "count": int(near.sum()),
         "range": reach,
         "points": _base64(steps.tobytes()),
-        "colours": _base64(colours.tobytes()),
+        "colours": _base64(colours[near].tobytes()),
         "extent": _rounded(frame.extent),
         "frustum": _frustum_size(centres),
         "cameras": [_camera(found, frame, pictures, partners) for found in model.images],

@@ -8,11 +8,14 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pycolmap
 import pytest
 from browser import Page, needs_browser, opened_browser
 
+from mkpc_kaggle.engine.journal_reader import SceneRecord
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Size
+from mkpc_kaggle.reporting.points import clouds_of
 from mkpc_kaggle.reporting.view import point_colours, show, view_data
 from mkpc_kaggle.scene.reconstruction import MAX_POINTS, RegisteredImage, SfmModel, Sigmas
 from mkpc_kaggle.scene.view_graph import BatchImage
@@ -76,6 +79,27 @@ def test_points_have_the_colours_of_the_images(tmp_path):
     is_left = model.points[:, 0] < 0
     np.testing.assert_array_equal(colours[sides & is_left], np.tile([255, 0, 0], (np.sum(sides & is_left), 1)))
     np.testing.assert_array_equal(colours[sides & ~is_left], np.tile([0, 0, 255], (np.sum(sides & ~is_left), 1)))
+
+
+def test_points_and_colours_come_from_the_files_of_a_reconstruction(tmp_path):
+    settings = {"num_rigs": 1, "num_cameras_per_rig": 1, "num_frames_per_rig": 5, "num_points3D": 40}
+    model = pycolmap.synthesize_dataset(pycolmap.SyntheticDatasetOptions(settings))
+    for number, point in model.points3D.items():
+        point.color = np.array([number, 2 * number, 3 * number], np.uint8)
+        for element in point.track.elements[: number % 3]:
+            model.delete_observation(element.image_id, element.point2D_idx)
+    (tmp_path / "sparse" / "0").mkdir(parents=True)
+    model.write(tmp_path / "sparse" / "0")
+    scene = SceneRecord("set", points=40, models=(a_model(tmp_path),))
+    (cloud,) = clouds_of(scene, tmp_path)
+    expected = sorted(model.points3D.items(), key=lambda item: (-item[1].track.length(), item[0]))
+    np.testing.assert_array_equal(cloud.points, [point.xyz for _, point in expected])
+    np.testing.assert_array_equal(cloud.colours, [point.color for _, point in expected])
+    assert clouds_of(replace(scene, points=41), tmp_path) == (), "of another run"
+    path = tmp_path / "sparse" / "0" / "points3D.bin"
+    for damaged in (path.read_bytes()[:-100], b"", b"\xff" * 100):
+        path.write_bytes(damaged)
+        assert clouds_of(scene, tmp_path) == ()
 
 
 def test_a_view_of_degenerate_models_is_still_data(tmp_path):
