@@ -123,9 +123,12 @@ def test_a_commit_run_without_network_leaves_a_submission_and_shows_pairs(kaggle
 @needs_data
 def test_the_packaged_notebook_with_genuine_weights_matches_with_aliked_and_lightglue(kaggle, tmp_path):
     kaggle.add_test_side(DATA / "test", pairs=1)
-    kaggle.add_dataset(tmp_path / "package", (GENUINE,))
+    (tmp_path / "weights").mkdir()
+    for name in ("aliked-n16.pth", "aliked_lightglue.pth"):  # fewer units: the test is to stay quick
+        (tmp_path / "weights" / name).symlink_to(GENUINE / name)
+    kaggle.add_dataset(tmp_path / "package", (tmp_path / "weights",))
     printed = kaggle.run()
-    assert "0 refused, 0 missing" in printed
+    assert "2 files, 0 refused, 0 missing" in printed
     assert "1 of 1 pairs have an F" in printed
     assert "does without" not in printed
     for unit in ("1:aliked_lightglue", "2:aliked_lightglue"):
