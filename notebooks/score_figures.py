@@ -101,7 +101,7 @@ def _beside(rows: int, index: int, count: int) -> NDArray[np.float64]:
 def _style(index: int) -> dict[str, Any]:
     """Return the style of a recipe by its index, the same in all figures.
 
-    Six colours and seven markers give 42 styles, so that colour-blind readers can tell recipes by shape.
+    Six colours and seven markers give 42 styles, so that shapes distinguish recipes for colour-blind readers.
     """
     return {
         "color": COLOURS[index % len(COLOURS)],
