@@ -105,7 +105,9 @@ def kornias_aliked(weights: WeightStore) -> nn.Module:
     return network
 
 
-def picture_of(image: Image) -> Picture:
+def picture_of(path: Path) -> Picture:
+    image = read_image(path)
+    assert isinstance(image, Image), image
     view = View.fit(Box.whole(image.size), long_side=LONG_SIDE_PX, multiple=32)
     return Picture(view.render(image.pixels), view)
 
@@ -149,9 +151,8 @@ def main() -> None:
             }
             ours = {kind: loaded(matcher, store, of_kind) for kind, of_kind in settings.items()}
             for true in scene.pairs:
-                pictures = [picture_of(read_image(path)) for path in true.pair.images]
-                both = tuple(
-                    encoded(matcher, ours["early"], picture, aliked, times, equal) for picture in pictures
+                first, second = (
+                    encoded(matcher, ours["early"], path, aliked, times, equal) for path in true.pair.images
                 )
                 data = {"image0": glue_input(first), "image1": glue_input(second)}
                 for kind in settings:
@@ -180,12 +181,13 @@ def loaded(matcher: str, store: WeightStore, settings: dict[str, float]) -> Any:
 def encoded(
     matcher: str,
     ours: Any,
-    picture: Picture,
+    path: Path,
     aliked: nn.Module,
     times: Times,
     equal: dict[str, list[float]],
 ) -> Keypoints:
     """Return a picture's keypoints by our encoder; measure ALIKED's beside kornia's."""
+    picture = picture_of(path)
     if matcher != "aliked_lightglue":
         (found,) = ours.encode([picture])
     else:
