@@ -54,7 +54,7 @@ test: install lint
 	@$(MAKE) --no-print-directory tests
 
 weights: install
-	@$(BIN)/python -m mkpc_kaggle weights fetch $(GENUINE) --out "$(WEIGHTS)"
+	@$(BIN)/mkpc weights fetch $(GENUINE) --out "$(WEIGHTS)"
 
 lint:
 	$(BIN)/ruff format --check .

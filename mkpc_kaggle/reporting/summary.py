@@ -167,7 +167,7 @@ def _lines(run: Run) -> Iterator[str]:
         yield f"{name:<30}{pairs:>7}{matches:>9.0f}{inliers:>9.0f}{seconds:>9.2f}"
     count = max(1, len(run.records))
     parts = (f"{name} {seconds / count:.3f}" for name, seconds in seconds_by_part(run).items())
-    yield from textwrap.wrap(f"seconds a pair: {', '.join(parts)}", WIDTH, subsequent_indent="  ")
+    yield from wrapped(f"seconds a pair: {', '.join(parts)}")
     yield from weakest_line(run.scenes)
     yield from pending_lines(run)
     no_scene = [
@@ -183,6 +183,11 @@ def _lines(run: Run) -> Iterator[str]:
     yield from _list("units that failed", unit_reasons(run))
     yield from _list("units that ran otherwise than written", unit_reasons(run, "note"))
     yield from _list("faults", run.faults)
+
+
+def wrapped(text: str) -> list[str]:
+    """Return the text as lines of up to ``WIDTH`` characters; names of files stay whole."""
+    return textwrap.wrap(text, WIDTH, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
 
 
 def pending_lines(run: Run) -> Iterator[str]:
@@ -212,7 +217,7 @@ def weakest_line(scenes: Sequence[SceneRecord]) -> Iterator[str]:
         error = f"{100 * sigmas.centre:.2g} %" if sigmas else "unknown"
         named.append(f"{Path(name).name} ({error})")
     if named:
-        yield f"weakest cameras, with the error of the centre: {', '.join(named)}"
+        yield from wrapped(f"weakest cameras, with the error of the centre: {', '.join(named)}")
 
 
 def weakest_cameras(scenes: Sequence[SceneRecord]) -> list[tuple[str, Sigmas | tuple[()]]]:

@@ -81,5 +81,5 @@ def test_a_recipe_names_a_matcher_of_vismatch(monkeypatch):
 
 def test_without_vismatch_its_matchers_cannot_be_used(monkeypatch):
     monkeypatch.setitem(sys.modules, "vismatch", None)
-    with pytest.raises(UserError, match="matcher vismatch:master cannot be used here"):
+    with pytest.raises(UserError, match="cannot be used here: vismatch:master"):
         TwoStageMatcher(Recipe((Unit(1, "vismatch:master", 200),)))
