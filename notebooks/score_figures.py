@@ -49,7 +49,7 @@ def draw_gains(validations: Sequence["Validation"]) -> "Figure":
             gains, y, xerr=(gains - low, high - gains), **style, linestyle="", capsize=4, label=other.recipe
         )
     axes.axvline(0, color="black", linewidth=1)
-    axes.set_xlabel("mAA gained; an interval that includes 0 proves nothing")
+    axes.set_xlabel("gain of mAA; an interval that includes 0 shows no difference")
     _legend_below(figure)
     return figure
 
@@ -60,7 +60,7 @@ def draw_errors(validations: Sequence["Validation"]) -> "Figure":
     for axes, (kind, unit, thresholds, limits) in zip(figure.subplots(1, 2, sharey=True), PANELS, strict=True):
         plain(axes, f"pairs with a {kind} error below x")
         axes.axvspan(
-            thresholds[0], thresholds[-1], color=DROPPED, alpha=0.2, linewidth=0, label="mAA's thresholds"
+            thresholds[0], thresholds[-1], color=DROPPED, alpha=0.2, linewidth=0, label="thresholds of the mAA"
         )
         for index, validation in enumerate(validations):
             # Failures are infinite: clipped beyond the right edge, so that the curve ends below 1.

@@ -1,4 +1,4 @@
-"""One figure for each step of the method, for a single pair."""
+"""Figures for the steps of the method, on one pair."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -89,7 +89,7 @@ def draw_clusters(images: Images, points: tuple[Points, Points], clusters: tuple
             _dots(axes, xy[found.labels == label], COLOURS[rank % len(COLOURS)])
         for label in _by_size(found):
             _tag(axes, xy[found.labels == label], str(found.sizes[label]))
-        counts = f"numbers: their points; {len(noise)} points are noise"
+        counts = f"numbers: points of each cluster; {len(noise)} points are noise"
         _title(axes, f"image {number}, clusters found: {len(found.sizes)}\n{counts}")
     return figure
 
@@ -106,7 +106,7 @@ def draw_sizes(clusters: tuple[Clusters, Clusters], config: MkpcConfig) -> "Figu
 
 def _size_bars(axes: "Axes", clusters: Clusters, config: MkpcConfig) -> None:
     sizes, kept = clusters.sizes[_by_size(clusters)], len(clusters.kept)
-    axes.set_xlabel("clusters by size; green: kept; orange, hatched: dropped")
+    axes.set_xlabel("clusters, by size; green: kept; orange and hatched: dropped")
     axes.set_ylabel("points")
     if not len(sizes):
         axes.set(xticks=[], yticks=[])
@@ -124,7 +124,7 @@ def _size_bars(axes: "Axes", clusters: Clusters, config: MkpcConfig) -> None:
 def _limit(clusters: Clusters, config: MkpcConfig) -> str:
     if not len(clusters.sizes):
         return ""
-    return f"\ndashed: {config.share:g} of the largest, {config.share * clusters.sizes.max():.1f} points"
+    return f"\ndashed: {config.share:g} of the largest cluster, {config.share * clusters.sizes.max():.1f} points"
 
 
 def draw_boxes(
@@ -136,14 +136,14 @@ def draw_boxes(
         kept = xy[found.in_kept]
         _crosses(axes, xy[~found.in_kept], OUTLIER)
         _dots(axes, kept, INLIER)
-        title = f"image {number}: nothing kept, so no box"
+        title = f"image {number}: no kept points, so no box"
         if len(kept):
             tight = expand_box(kept, image.size, 1, 1)
             wide = expand_box(kept, image.size, config.expand_x, config.expand_y)
             add_box(axes, wide)
             add_box(axes, tight, edgecolor="white", linestyle="--", linewidth=1.5)
-            title = f"image {number}: dashed, kept points, {tight.size.width} x {tight.size.height}\n"
-            title += f"yellow, expanded, {wide.size.width} x {wide.size.height}"
+            title = f"image {number}, dashed: box of the kept points, {tight.size.width} x {tight.size.height}\n"
+            title += f"yellow: expanded box, {wide.size.width} x {wide.size.height}"
         _title(axes, title)
     return figure
 
@@ -157,7 +157,7 @@ def draw_views(images: Images, regions: tuple[CriticalRegion, CriticalRegion], u
     figure, row = side_by_side(pictures, title_lines=2)
     names = [("whole", f"crop ({region.reason})" if region.reason != "cropped" else "crop") for region in regions]
     for index, (axes, view, what) in enumerate(zip(row, views, [*names[0], *names[1]], strict=True)):
-        _title(axes, f"image {index // 2}, {what}\n{view.scale[0]:.2f} times enlarged")
+        _title(axes, f"image {index // 2}, {what}\nscaled by {view.scale[0]:.2f}")
     return figure
 
 
@@ -205,7 +205,7 @@ def draw_epipolar(
         size = images[1].size
         axes.set(xlim=(-0.5, size.width - 0.5), ylim=(size.height - 0.5, -0.5))
         known = "\nwhite, dashed: the true lines" if truth is not None else ""
-        _title(axes, f"image 1: lines of {name}{known}")
+        _title(axes, f"image 1: lines by {name}{known}")
     return figure
 
 
@@ -216,7 +216,7 @@ def draw_plane(images: Images, matches: Matches, homography: Estimate, threshold
         _dots(axes, points[homography.inliers], COLOURS[0])
         _crosses(axes, points[~homography.inliers], OUTLIER)
     explained = f"{homography.inlier_count} of {len(matches)} inliers of F"
-    _title(row[0], f"blue: {explained}\nfit one plane to {threshold:g} pixels")
+    _title(row[0], f"blue: {explained}\nwithin {threshold:g} pixels of one plane")
     _title(row[1], "orange crosses: off the plane")
     return figure
 
@@ -228,7 +228,7 @@ def draw_pose_errors(errors: Mapping[str, PoseError]) -> "Figure":
     for axes, kind, title in zip(
         panels, ("rotation", "translation_angle"), ("rotation", "direction of translation"), strict=True
     ):
-        plain(axes, f"error of the {title}, in degrees")
+        plain(axes, f"error of the {title} (degrees)")
         angles = np.array([getattr(error, kind) for error in errors.values()])
         known = np.isfinite(angles)
         names = [short(name, 40) for name in errors]

@@ -94,6 +94,23 @@ def left_out_line(recipe: Recipe, left_out: Sequence[str]) -> str:
     return "; ".join(parts)
 
 
+def advice(log: RunLog) -> list[str]:
+    """Return sentences on what to add: weights, if only RootSIFT ran, or images, if no pair overlaps."""
+    found = []
+    ran = {unit.unit for record in log.records for unit in record.units}
+    has_missing = any(cause.startswith(UnavailableKind.NO_WEIGHTS) for cause in log.about.left_out)
+    if has_missing and all(name.partition(":")[2].startswith("sift@") for name in ran):
+        found.append(
+            "No weights were found, so only RootSIFT ran. Add weights to the dataset "
+            "(`mkpc package --weights DIR`), or ALIKED and LightGlue from Kaggle Models."
+        )
+    if not any(record.is_solved and not is_doubtful(record) for record in log.records):
+        found.append(
+            "No pair overlaps. Check that the input is the right test set and that its images can be read."
+        )
+    return found
+
+
 def plural(count: int, noun: str) -> str:
     """Return the count with its noun, such as "1 batch" or "2 batches"."""
     ending = "" if count == 1 else "es" if noun.endswith("ch") else "s"

@@ -1,5 +1,7 @@
 """LoFTR, QuadTree and ASpanFormer: properties of the networks, and the matchers from public checkpoints."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
@@ -13,6 +15,7 @@ from mkpc_kaggle.matchers.contract import Placement
 from mkpc_kaggle.matchers.networks.adaptive_span import CELLS_AT_ONCE, span_attention
 from mkpc_kaggle.matchers.networks.coarse_matching import coarse_matches
 from mkpc_kaggle.matchers.networks.loftr import Loftr
+from mkpc_kaggle.matchers.registry import load_matcher, spec_of
 
 
 @pytest.mark.parametrize("held", [0, 2**20])
@@ -68,3 +71,19 @@ def test_points_of_image_0_are_centres_of_cells_within_the_border_of_the_content
     np.testing.assert_array_equal(cells % 1, 0)
     border = matcher._network.border
     assert (cells >= border).all() and (cells < np.array([17, 13]) - border).all()
+
+
+@pytest.mark.parametrize("name", ["loftr", "quadtree", "aspanformer"])
+def test_the_threshold_of_the_options_decides_which_cells_match(name):
+    counts = []
+    for threshold in (0.0, 0.9):
+        adapter = spec_of(name, "test")
+        matcher = MATCHERS[name](Placement())
+        weights = SimpleNamespace(load=lambda slot, known=matcher: known._network.state_dict())
+        options = adapter.options(threshold=threshold)
+        loaded = load_matcher(name, weights, options, Placement())
+        view = picture(64, 96, channels=1, multiple=loaded.spec.multiple)
+        (matches,) = loaded.match(loaded.encode([view]), loaded.encode([view]))
+        counts.append(len(matches))
+        assert (matches.scores > threshold).all()
+    assert counts[0] > counts[1]
