@@ -42,7 +42,7 @@ class Masks:
         for image in images:
             first = first or image
             path = directory / f"{image.relative_to(root).as_posix()}{SUFFIX}"
-            if path.exists():
+            if path.exists():  # as in COLMAP, an image without a mask is used whole
                 _require_usable(path, image)
                 files[str(image)] = str(path), hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest()
         if not files:
@@ -102,5 +102,6 @@ class MaskReader:
             if mask.shape != (size.height, size.width):
                 raise UserError(f"the mask {path} is not as large as its image")
             self._cache.put(image, mask, mask.nbytes)
+        # (0, 0) is the centre of the first pixel; points on the border round to pixels outside.
         columns, rows = np.round(points).astype(np.intp).T
         return np.asarray(mask[rows.clip(0, size.height - 1), columns.clip(0, size.width - 1)])

@@ -37,6 +37,7 @@ def clouds_of(scene: SceneRecord, out: Path) -> Sequence[Cloud]:
     for folder in (out / scene.batch / SPARSE, out / SPARSE):
         with suppress(OSError, struct.error, ValueError):
             found = [read_points(folder / str(n) / "points3D.bin") for n in range(len(scene.models))]
+            # A killed run may have left the files of an earlier scene.
             if sum(count for _, count in found) == scene.points:
                 return [cloud for cloud, _ in found]
     return ()
@@ -60,5 +61,6 @@ def read_points(path: Path) -> tuple[Cloud, int]:
     kept = rows[:MAX_POINTS]
     points = np.array([row[1:4] for row in kept], np.float64).reshape(-1, 3)
     colours = np.array([row[4:7] for row in kept], np.uint8).reshape(-1, 3)
+    # A point that bundle adjustment lost would spoil the extent of the view.
     finite = np.isfinite(points).all(axis=1)
     return Cloud(points[finite], colours[finite]), count

@@ -62,13 +62,16 @@ def find_similarity(cameras: Sequence[Camera], targets: Sequence[Camera]) -> Sim
     """
     if len(cameras) < MIN_COMMON:
         return None
-    R = _mean_rotation([target.R.T @ camera.R for camera, target in zip(cameras, targets, strict=True)])
-    centres, goals = _centres(cameras) @ R.T, _centres(targets)
-    before, after = pdist(centres), pdist(goals)
-    if not (before > 0).any():
+    turns = [target.R.T @ camera.R for camera, target in zip(cameras, targets, strict=True)]
+    R = _mean_rotation(turns)
+    centres = _centres(cameras) @ R.T
+    goals = _centres(targets)
+    scale = _median_scale(centres, goals)
+    if scale is None:
         return None
-    scale = float(np.median(after[before > 0] / before[before > 0]))
-    distances = np.linalg.norm(scale * centres + np.median(goals - scale * centres, axis=0) - goals, axis=1)
+    # Medians tolerate cameras that the two reconstructions place differently.
+    offset = np.median(goals - scale * centres, axis=0)
+    distances = np.linalg.norm(scale * centres + offset - goals, axis=1)
     near = distances <= OUTLIER * np.median(distances)
     if near.sum() < MIN_COMMON:  # of three cameras, none can be called wrong
         near[:] = True
@@ -92,14 +95,25 @@ def _mean_rotation(rotations: Sequence[Matrix3]) -> Matrix3:
     return np.asarray(U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt)
 
 
+def _median_scale(centres: NDArray[np.float64], goals: NDArray[np.float64]) -> float | None:
+    """Return the median ratio of distances between goals and between centres; ``None`` for a single centre."""
+    before = pdist(centres)
+    after = pdist(goals)
+    apart = before > 0
+    return float(np.median(after[apart] / before[apart])) if apart.any() else None
+
+
 def _least_squares(R: Matrix3, centres: NDArray[np.float64], goals: NDArray[np.float64]) -> Similarity | None:
     """Return the similarity with rotation ``R`` that moves the rotated centres (N, 3) to their goals."""
-    spread = centres - centres.mean(axis=0)
+    centre = centres.mean(axis=0)
+    goal = goals.mean(axis=0)
+    spread = centres - centre
     variance = float((spread**2).sum())
-    scale = float((spread * (goals - goals.mean(axis=0))).sum()) / variance if variance else 0.0
-    if not np.isfinite(scale) or scale <= 0:
+    if variance == 0:
         return None
-    return Similarity(scale, R, goals.mean(axis=0) - scale * centres.mean(axis=0))
+    scale = float((spread * (goals - goal)).sum()) / variance
+    # A scale that is not positive would turn the model inside out.
+    return Similarity(scale, R, goal - scale * centre) if scale > 0 else None
 
 
 def _centres(cameras: Sequence[Camera]) -> NDArray[np.float64]:
@@ -141,8 +155,12 @@ def read_reference(directory: Path) -> list[Cameras]:
     models: list[Cameras] = []
     with suppress(OSError, ValueError, TypeError, AttributeError, RecursionError):
         for row in json.loads((directory / REFERENCE).read_text(encoding="utf-8")):
-            numbers = {name: np.array(values, np.float64) for name, values in row.items()}
-            if any(each.shape != (12,) or not np.isfinite(each).all() for each in numbers.values()):
-                return []
-            models.append({n: Camera(np.eye(3), v[:9].reshape(3, 3), v[9:]) for n, v in numbers.items()})
+            cameras = {}
+            for name, values in row.items():
+                numbers = np.array(values, np.float64)
+                if numbers.shape != (12,) or not np.isfinite(numbers).all():
+                    return []
+                R, t = np.split(numbers, [9])
+                cameras[name] = Camera(np.eye(3), R.reshape(3, 3), t)
+            models.append(cameras)
     return models
