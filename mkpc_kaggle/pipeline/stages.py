@@ -59,10 +59,9 @@ class Pipeline:
         self._notes: dict[str, str] = {}  # on matchers that fell back to float32
         self._encodings = ByteCache(cache_bytes)  # by matcher, image and view
 
-    def load(self) -> None:
-        """Load all matchers of the recipe now."""
-        for name in self.recipe.matcher_names:
-            self._matcher(name)
+    def load(self, name: str) -> None:
+        """Load a matcher of the recipe now."""
+        self._matcher(name)
 
     def match(
         self, pairs: Sequence[PairMatch], units: Iterable[Unit], may_start: Callable[[Unit], bool] = lambda _: True

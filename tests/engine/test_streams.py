@@ -65,7 +65,7 @@ def test_what_native_code_writes_is_printed(tmp_path):
 def test_text_that_a_stream_cannot_encode_and_a_closed_file_end_nothing(tmp_path):
     script = "import os, sys\nfrom mkpc_kaggle.engine.console import say, unblocked\nwith unblocked():\n"
     script += "    say('\u00e9')\n    sys.stdout.buffer.write(b'bytes, ')\n    say('text')\n"
-    script += "    os.close(1)\n    say('lost')"
+    script += "    os.close(sys.stdout.fileno())\n    say('lost')"
     environment = os.environ | {"PYTHONPATH": str(ROOT), "PYTHONIOENCODING": "ascii", "PYTHONUTF8": "0"}
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, check=True, env=environment)
     assert done.stdout == b"bytes, text\n"
