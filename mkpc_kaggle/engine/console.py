@@ -210,8 +210,9 @@ def _restore(name: str, stream: TextIO, number: int, sink: int, file: Any) -> No
     if text := file.read(MAX_NATIVE_BYTES):
         _printer.put(sink, text)
     if _printer.drain(time.monotonic() + DRAIN_S / 10):
-        os.dup2(sink, number)
-        os.close(sink)
+        with suppress(OSError):  # closed by the program
+            os.dup2(sink, number)
+            os.close(sink)
     _native.remove(number)
 
 

@@ -151,7 +151,11 @@ class State:
         rows = []
         points = self.points.tolist()
         for index, pair in enumerate(self.pairs):
-            unread = self.tries.given_up.get(("pair", index))
+            failure = ""
+            if unread := self.tries.given_up.get(("pair", index)):
+                failure = unread.message
+            elif index in failures and not any(points[index]):
+                failure = next(iter(failures[index].values()))
             rows.append(
                 Row(
                     pair.id,
@@ -163,7 +167,7 @@ class State:
                     self.estimates[index],
                     sources[index],
                     failures.get(index, {}),
-                    unread.message if unread else "",
+                    failure,
                 )
             )
         units = [(unit.name, unit.stage) for unit in self.units]

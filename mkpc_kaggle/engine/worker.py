@@ -88,7 +88,8 @@ class MatchRunner:
             torch.set_num_threads(threads)
             cv2.setNumThreads(threads)
         self._pipeline = make_pipeline()
-        self.refused = load(self._pipeline)
+        self._pipeline.load()
+        self.refused = self._pipeline.unloadable
         self._images = ImageStore()
         self._files: dict[Path, tuple[int, int]] = {}
 
@@ -159,31 +160,6 @@ def file_state(path: Path) -> tuple[int, int]:
     except (OSError, ValueError):
         return 0, 0
     return status.st_size, status.st_mtime_ns
-
-
-def load(pipeline: "Pipeline") -> dict[str, str]:
-    """Load all matchers of a pipeline. Return the reasons for those that cannot be loaded.
-
-    Raises the last reason if there is no other matcher, and errors of the device and of memory, which are not the
-    matcher's.
-    """
-    refused: dict[str, str] = {}
-    last: Exception | None = None
-    names = pipeline.recipe.matcher_names
-    for name in names:
-        try:
-            pipeline.load(name)
-        except Exception as error:
-            if failures.failure_of(error) is not failures.FailureKind.RAISED:
-                raise
-            if isinstance(error, failures.DeviceError):
-                raise
-            last = error
-            is_told = isinstance(error, UserError)
-            refused[name] = str(error) if is_told else failures.reason_of(error)
-    if last is not None and len(refused) == len(names):
-        raise last
-    return refused
 
 
 def light_runner(*, in_process: bool = True) -> Runner:

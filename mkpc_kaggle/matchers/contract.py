@@ -7,11 +7,13 @@ because many pairs share them. ``match`` computes the rest.
 
 import re
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, fields, is_dataclass
 from enum import StrEnum
-from fnmatch import fnmatch
 from typing import Any, Generic, Protocol, TypeVar
 
+from mkpc_kaggle.config import from_table
+from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Pixels, Size, View
 from mkpc_kaggle.geometry.matches import Matches
 
@@ -38,6 +40,9 @@ class Precision(StrEnum):
 @dataclass(frozen=True)
 class Placement:
     """A matcher's device, such as "cpu" or "cuda:0", and precision.
+
+    A matcher on the device "meta" has no numbers. It is loaded there to learn whether its weights
+    fit.
 
     Softmax, optimal transport, least squares and coordinates are always float32.
     """
@@ -85,7 +90,17 @@ class MatcherSpec:
 
     def uses(self, slot: str) -> bool:
         """Return whether the matcher uses the slot under any options."""
-        return any(fnmatch(slot, re.sub(r"{\w+}", "*", own)) for own in self.slots)
+        return self.options_for(slot) is not None
+
+    def options_for(self, slot: str) -> Any:
+        """Return default options, except what the slot asks for, or ``None`` if no options use it."""
+        for own in self.slots:
+            # A template such as "loftr-{training}" becomes a pattern with the group "training".
+            pattern = re.sub(r"\\{(\w+)\\}", r"(?P<\1>.+)", re.escape(own))
+            if found := re.fullmatch(pattern, slot):
+                with suppress(UserError):
+                    return from_table(self.options, found.groupdict(), f"slot {slot}")
+        return None
 
 
 @dataclass(frozen=True, eq=False)

@@ -37,6 +37,23 @@ def load_matcher(name: str, weights: WeightStore, options: Any, placement: Place
     return matcher
 
 
+def misfit(name: str, weights: WeightStore, options: Any) -> str:
+    """Return why the weights cannot be loaded into the matcher's networks, or an empty text.
+
+    This compares names and shapes on the device "meta", which takes no memory.
+    """
+    import torch
+
+    try:
+        with torch.device("meta"):
+            load_matcher(name, weights.on_meta(), options, Placement("meta"))
+    except UserError as error:
+        return str(error)
+    except Exception:  # an adapter that computes while it loads; its worker finds out
+        return ""
+    return ""
+
+
 def _imported(name: str, where: str) -> Any:
     if name not in matcher_names():
         raise UserError(f"{where}: unknown matcher {name!r}; known: {', '.join(matcher_names())}")

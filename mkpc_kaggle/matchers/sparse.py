@@ -5,14 +5,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from mkpc_kaggle.config import AT_LEAST_1, check_ranges
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import Picture, Placement
-from mkpc_kaggle.matchers.dtypes import check_finite
-from mkpc_kaggle.matchers.networks.placement import autocast
 
 # Images (B, 3, H, W) -> for each image, points (K, 2) in pixels and unit descriptors (K, D).
 Detector = Callable[[Tensor], Iterable[tuple[Tensor, Tensor]]]
@@ -53,16 +51,12 @@ class Keypoints:
 Encode = Callable[[Sequence[Picture]], list[Keypoints]]
 
 
-def keypoint_encoder(network: nn.Module, features: nn.Module, detect: Detector, placement: Placement) -> Encode:
-    """Return the encoder of a library's network, which raises if the part ``features`` outputs NaN or infinity."""
-    network.eval().to(placement.device)
-    what = f"features of {type(network).__name__.lower()}"
-    features.register_forward_hook(lambda _, inputs, found: check_finite(what, found))
+def keypoint_encoder(detect: Detector, placement: Placement) -> Encode:
+    """Return an encoder that runs a detector on the placement's device."""
 
     @torch.inference_mode()
     def encode(pictures: Sequence[Picture]) -> list[Keypoints]:
-        with autocast(placement):
-            found = list(detect(image_batch(pictures, placement.device)))
+        found = list(detect(image_batch(pictures, placement.device)))
         return [
             Keypoints.on_content(points.float(), descriptors.float(), picture.content)
             for (points, descriptors), picture in zip(found, pictures, strict=True)

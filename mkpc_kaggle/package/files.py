@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.pipeline.availability import fit_of
 from mkpc_kaggle.weights import FoundFile, State, WeightFile, WeightStore
 from mkpc_kaggle.weights.checkpoint import convert
 
@@ -67,16 +68,17 @@ class ChosenWeights:
 def choose_weights(store: WeightStore, checkout: Path, staging: Path, *, private: bool) -> ChosenWeights:
     """Choose the file of each slot in the store, as safetensors, since Kaggle would unpack a torch checkpoint.
 
-    Conversions are written to ``staging``. A licence allows redistribution if the checkout has its text.
-    Raises :class:`UserError` if a slot has only damaged files or a checkpoint cannot be read.
+    Conversions are written to ``staging``. A licence allows redistribution if the checkout has its
+    text. Raises :class:`UserError` if a slot has only damaged files, or a checkpoint cannot be read
+    or fits no network.
     """
     slots = dict.fromkeys(file.slot for file in store.files)
     every = [found for found in (_good_file(store, slot) for slot in slots) if found is not None]
     restricted = [found for found in every if licence_text(checkout, found.file.licence) is None]
     shipped = [found for found in every if private or found not in restricted]
     texts = {text for found in shipped if (text := licence_text(checkout, found.file.licence))}
+    notes = [_note(found, store) for found in shipped]
     files = [_as_safetensors(found, staging) for found in shipped]
-    notes = ("" if found.state is State.GOOD else "its original is not verified" for found in shipped)
     return ChosenWeights(
         tuple(Item(file.name, path, file.licence, note) for (file, path), note in zip(files, notes, strict=True)),
         HEADER + "".join(f"{file.line}\n" for file, _ in files),
@@ -89,6 +91,15 @@ def licence_text(checkout: Path, tag: str) -> Path | None:
     """Return the path of a licence's text if the checkout has it. ``tag`` is its name in the manifest."""
     texts = {path.stem: path for path in (checkout / "licences").glob("*.txt")}
     return (texts | {"Apache-2.0": checkout / "LICENSE"}).get(tag)
+
+
+def _note(found: FoundFile, store: WeightStore) -> str:
+    """Return a note on digest and networks. Raise :class:`UserError` if no network takes the file."""
+    fit = fit_of(found, store)
+    if fit.is_refused:
+        raise UserError(f"{found.path}: {fit.text}. Remove it from the directory, or fetch the right file.")
+    verified = "" if found.state is State.GOOD else "its original is not verified"
+    return "; ".join(filter(None, [verified, fit.text]))
 
 
 def _good_file(store: WeightStore, slot: str) -> FoundFile | None:

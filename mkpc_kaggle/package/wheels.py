@@ -1,7 +1,5 @@
 """Our wheel, built from the checkout, and wheels of dependencies that may be missing in Kaggle's image."""
 
-import subprocess
-import sys
 import zipfile
 from collections.abc import Iterable, Sequence
 from email.message import Message
@@ -13,6 +11,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.weights.wheel import run_pip
 
 # Direct and indirect dependencies that may be missing or too old in Kaggle's image.
 BUNDLED = ("kornia", "kornia-rs", "pycolmap", "safetensors")
@@ -45,7 +44,7 @@ def build_wheel(checkout: Path, directory: Path) -> Path:
     """Build our wheel into the directory; the same sources give the same bytes. Raises :class:`UserError`."""
     # If hatchling is not installed, pip downloads it for the build.
     isolation = ["--no-build-isolation"] if find_spec("hatchling") else []
-    failure = _pip("wheel", "--no-deps", *isolation, "--wheel-dir", directory, checkout)
+    failure = run_pip("wheel", "--no-deps", *isolation, "--wheel-dir", directory, checkout)
     if failure:
         raise UserError(f"the wheel could not be built from {checkout}: {failure}")
     return next(directory.glob("mkpc_kaggle-*.whl"))
@@ -65,7 +64,7 @@ def collect_wheels(
     options = ["--only-binary=:all:", "--no-deps", *platforms, "--dest", str(directory)]
     for python in pythons:
         for source in sources:
-            if not (failure := _pip("download", *options, "--python-version", python, *source, *requirements)):
+            if not (failure := run_pip("download", *options, "--python-version", python, *source, *requirements)):
                 break
         else:
             raise UserError(
@@ -85,13 +84,3 @@ def _metadata(wheel: Path) -> Message:
     name, version = wheel.name.split("-")[:2]
     with zipfile.ZipFile(wheel) as archive:
         return Parser().parsestr(archive.read(f"{name}-{version}.dist-info/METADATA").decode())
-
-
-def _pip(*arguments: str | Path) -> str:
-    """Run this interpreter's pip. Return the reason of a failure, or an empty text."""
-    command = [sys.executable, "-m", "pip", "--disable-pip-version-check", *map(str, arguments)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode == 0:
-        return ""
-    *_, last = ["", *filter(str.strip, done.stderr.splitlines())]
-    return last.removeprefix("ERROR: ") or f"pip ended with status {done.returncode}"

@@ -9,7 +9,7 @@ from typing import Any
 from mkpc_kaggle.errors import warn_once
 from mkpc_kaggle.matchers.contract import Matcher, Placement, Precision
 from mkpc_kaggle.matchers.registry import load_matcher, require_matchers
-from mkpc_kaggle.pipeline.availability import FAULTS, Licence, by_kind, options_of, refusal, slots_of, unavailable
+from mkpc_kaggle.pipeline.availability import FAULTS, Licence, left_out, options_of, refusal, slots_of, unavailable
 from mkpc_kaggle.pipeline.devices import AUTO, gpus_of, require_device, resolve_placement
 from mkpc_kaggle.pipeline.stages import ENCODING_CACHE_BYTES, GivenRegions, Pipeline
 from mkpc_kaggle.recipe import Mode, Recipe, Unit, load_recipe
@@ -109,27 +109,38 @@ def assemble(
 ) -> Assembly:
     """Check recipe, options, licences, weights, device and precision before any work, and return the assembly.
 
-    Raises :class:`UserError`. A fallback replaces an unavailable matcher; without one, recipe ``auto`` drops its
-    units. ``scenes`` switches the reconstruction of batches on or off; ``None`` follows the recipe.
+    A fallback replaces an unavailable matcher. Without one, recipe ``auto`` drops its units, and so
+    does every recipe if the matcher cannot be loaded. ``scenes`` switches the reconstruction of
+    batches on or off; ``None`` follows the recipe. Raises :class:`UserError`, also if weights of a
+    recipe other than ``auto`` are missing or not permitted, and if no unit of stage 1 remains.
     """
     if not isinstance(recipe, Recipe | str):
         raise TypeError(f"a recipe is a Recipe, a name, or a path as text, not {recipe!r}")
     own = require_matchers(matchers or {})
     store = WeightStore(weights)
     written = load_recipe(recipe) if isinstance(recipe, str) else recipe
-    reasons = unavailable(written, store, licence, own, load=recipe == AUTO)
+    reasons = unavailable(written, store, licence, own)
     chosen = written.with_fallbacks(reasons)
     lacking = {name: reasons[name] for name in chosen.matcher_names if name in reasons}
-    if lacking and recipe != AUTO:
+    faulty = {name for name, reason in reasons.items() if reason.kind in FAULTS}
+    refused = {
+        unit.matcher: reasons[unit.matcher]
+        for asked, unit in zip(written.units, chosen.units, strict=True)
+        if unit.matcher in reasons and not faulty & {asked.matcher, unit.matcher}
+    }
+    if refused and recipe != AUTO:
+        raise refusal(chosen, refused)
+    if not any(unit.stage == 1 and unit.matcher not in lacking for unit in chosen.units):
         raise refusal(chosen, lacking)
-    for name, reason in lacking.items():
-        if reason.kind in FAULTS:
-            warn_once(f"recipe auto does without {name}: {reason}")
+    for name in dict.fromkeys((*written.matcher_names, *chosen.matcher_names)):
+        if name in faulty:
+            warn_once(f"recipe {written.name} does without {name}: {reasons[name]}")
     for name in sorted(chosen.matchers.keys() - own.keys() - reasons.keys()):
         options_of(chosen, name)  # check the options of unused matchers too
-    left_out = by_kind({name: reasons[name] for name in written.matcher_names if name in reasons})
-    chosen = chosen.only(lambda unit: unit.matcher not in lacking).with_scenes(scenes).in_mode(mode)
-    made = Assembly(chosen, store, resolve_placement(device, precision), left_out, own, device)
+    omitted = {name: reasons[name] for name in written.matcher_names if name in reasons}
+    texts = left_out(written, omitted, is_auto=recipe == AUTO)
+    chosen = chosen.without(lacking).with_scenes(scenes).in_mode(mode)
+    made = Assembly(chosen, store, resolve_placement(device, precision), texts, own, device)
     unverified = (file.path.name for file in made.weight_files.values() if file.state is State.UNVERIFIED)
     if listed := ", ".join(sorted(unverified)):
         warn_once(f"weights not verified: {listed}; `python -m mkpc_kaggle weights verify` says why")

@@ -10,11 +10,11 @@ from typing import Any
 
 from mkpc_kaggle.config import from_table
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.matchers.contract import Matcher, Placement
+from mkpc_kaggle.matchers.contract import Matcher
 from mkpc_kaggle.matchers.failures import reason_of
-from mkpc_kaggle.matchers.registry import UnusableError, load_matcher, spec_of
-from mkpc_kaggle.recipe import Recipe
-from mkpc_kaggle.weights import State, WeightStore
+from mkpc_kaggle.matchers.registry import UnusableError, matcher_names, misfit, spec_of
+from mkpc_kaggle.recipe import Recipe, load_recipe
+from mkpc_kaggle.weights import FoundFile, WeightStore, load_tensors
 
 PERMISSIVE_TAGS = frozenset({"Apache-2.0", "BSD-3-Clause", "MIT"})
 
@@ -40,6 +40,7 @@ class UnavailableReason:
 
     kind: UnavailableKind
     detail: str
+    slots: tuple[str, ...] = ()  # the slots of missing files
 
     def __str__(self) -> str:
         return f"{self.kind} ({self.detail})"
@@ -50,13 +51,12 @@ def unavailable(
     store: WeightStore,
     licence: Licence = Licence.ANY,
     own: Mapping[str, Matcher[Any]] = MappingProxyType({}),
-    *,
-    load: bool = False,
 ) -> dict[str, UnavailableReason]:
     """Return the reasons, by name, why matchers of the recipe (fallbacks included) cannot run here.
 
-    ``own`` has the user's matchers. With ``load``, weights of unknown digest are loaded to detect damage. Raises
-    :class:`UserError` for an unknown matcher or option.
+    ``own`` has the user's matchers. Each of the others is loaded on the device "meta": a file with
+    the manifest's digest may still not fit the network. Raises :class:`UserError` for an unknown
+    matcher or option.
     """
 
     def reason_for(name: str) -> UnavailableReason | None:
@@ -67,28 +67,65 @@ def unavailable(
             return UnavailableReason(UnavailableKind.NOT_IMPORTABLE, reason_of(error.__cause__ or error))
         found = {slot: store.find(slot) for slot in (() if name in own else spec.slots_for(options))}
         files = [file for file in found.values() if file is not None]
-        missing = [slot for slot, file in found.items() if file is None]
+        missing = tuple(slot for slot, file in found.items() if file is None)
         lines = chain((file.file for file in files), *map(store.alternatives, missing))
         others = {*spec.licences, *(line.licence for line in lines)} - PERMISSIVE_TAGS
         if others and licence is Licence.PERMISSIVE:
             return UnavailableReason(UnavailableKind.NOT_PERMITTED, ", ".join(sorted(others)))
         if missing:
             names = (f"{slot}: {' or '.join(file.name for file in store.alternatives(slot))}" for slot in missing)
-            return UnavailableReason(UnavailableKind.NO_WEIGHTS, "; ".join(names))
-        try:
-            if load and any(file.state is State.UNVERIFIED for file in files):
-                load_matcher(name, store, options, Placement())
-        except UserError as error:
-            return UnavailableReason(UnavailableKind.UNREADABLE, str(error))
+            return UnavailableReason(UnavailableKind.NO_WEIGHTS, "; ".join(names), missing)
+        if files and (problem := misfit(name, store, options)):
+            return UnavailableReason(UnavailableKind.UNREADABLE, problem)
         return None
 
     names = dict.fromkeys(name for unit in recipe.units for name in (unit.matcher, unit.fallback) if name)
     return {name: reason for name in names if (reason := reason_for(name)) is not None}
 
 
+@dataclass(frozen=True)
+class Fit:
+    """The result of loading a weight file into the networks that use it: a text for a table."""
+
+    is_refused: bool
+    text: str
+
+
+def fit_of(found: FoundFile, store: WeightStore) -> Fit:
+    """Load a file into the network of each matcher that uses it, on the device "meta".
+
+    Matchers of several files get the others from the store. If these are missing or at fault, the
+    file is not tried.
+    """
+    slot = found.file.slot
+    fitting: list[str] = []
+    untried: list[str] = []
+    try:
+        load_tensors(found.path, "meta")
+        for name in matcher_names():
+            with suppress(UnusableError):
+                spec = spec_of(name, "weights")
+                if (options := spec.options_for(slot)) is None:
+                    continue
+                others = [other for other in spec.slots_for(options) if other != slot]
+                missing = [other for other in others if store.find(other) is None]
+                problem = "" if missing else misfit(name, store.on_meta(found), options)
+                if repr(slot) in problem:
+                    raise UserError(problem)
+                if missing or problem:
+                    untried.append(problem or f"{name} also needs {', '.join(missing)}")
+                else:
+                    fitting.append(name)
+    except UserError as error:
+        return Fit(True, str(error))
+    if fitting:
+        return Fit(False, f"fits {', '.join(fitting)}")
+    return Fit(False, f"not tried in a network: {'; '.join(untried)}" if untried else "")
+
+
 def refusal(recipe: Recipe, reasons: Mapping[str, UnavailableReason]) -> UserError:
     """Return an error that names the matchers unavailable for the first kind of reason, and the remedy."""
-    first, kind = next((name, reason.kind) for name, reason in reasons.items())
+    kind = next(iter(reasons.values())).kind
     those = "; ".join(f"{name} ({reason.detail})" for name, reason in reasons.items() if reason.kind is kind)
     if kind is UnavailableKind.NOT_PERMITTED:
         what = f"--licence permissive refuses recipe {recipe.name!r} for the weights of {those}"
@@ -96,13 +133,28 @@ def refusal(recipe: Recipe, reasons: Mapping[str, UnavailableReason]) -> UserErr
     if kind is UnavailableKind.NO_WEIGHTS:
         what = f"recipe {recipe.name!r} needs weights that were not found: {those}"
         return UserError(f"{what}. Name their directory with --weights, or use --recipe auto, which needs none.")
-    return UserError(f"recipe {recipe.name!r}: matcher {first} {reasons[first]}. `--recipe auto` does without it.")
+    what = f"recipe {recipe.name!r} has no unit left that can sweep all pairs: {kind}: {those}"
+    return UserError(f"{what}. Use --recipe auto, which does without these matchers.")
 
 
-def by_kind(reasons: Mapping[str, UnavailableReason]) -> tuple[str, ...]:
-    """Return a text for each kind of reason, such as "no weights: loma, superglue", for a summary."""
-    kinds = dict.fromkeys(reason.kind for reason in reasons.values())
-    return tuple(f"{kind}: {', '.join(name for name in reasons if reasons[name].kind is kind)}" for kind in kinds)
+def left_out(
+    recipe: Recipe, reasons: Mapping[str, UnavailableReason], *, is_auto: bool = False
+) -> tuple[str, ...]:
+    """Return a text for each kind of reason, such as "no weights: loma, superglue", for a summary.
+
+    Missing weights come with the command that gets them. Recipe auto could use several GB under any
+    licence; the advice is then the recipe light, unless its weights are there.
+    """
+    texts = []
+    for kind in dict.fromkeys(reason.kind for reason in reasons.values()):
+        names = [name for name, reason in reasons.items() if reason.kind is kind]
+        slots = list(dict.fromkeys(slot for name in names for slot in reasons[name].slots))
+        if is_auto:
+            light = load_recipe("light")
+            slots = ["light"] if set(slots) & set(slots_of(light, light.matcher_names)) else []
+        command = f"python -m mkpc_kaggle weights fetch {' '.join(slots)} --out DIR"
+        texts.append(f"{kind}: {', '.join(names)}" + (f" (`{command}` gets weights)" if slots else ""))
+    return tuple(texts)
 
 
 def options_of(recipe: Recipe, name: str) -> Any:

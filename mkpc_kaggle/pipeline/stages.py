@@ -32,6 +32,10 @@ ENCODING_CACHE_BYTES = 2 << 30
 GivenRegions = Mapping[tuple[str, ...], tuple[Box, Box]]  # by the names of both images
 
 
+class UnloadableError(UserError):
+    """Error for a matcher that could not be loaded; ``__cause__`` is the error of its load."""
+
+
 class Pipeline:
     """Pipeline that runs a recipe's units on chunks of pairs and loads each matcher on first use.
 
@@ -56,12 +60,28 @@ class Pipeline:
         self._minibatches: dict[Unit, int] = {}
         self._ran: set[Unit] = set()
         self._matchers: dict[str, Matcher[Any]] = {}
+        self._unloadable: dict[str, Exception] = {}  # by matcher; its units fail with the error
         self._notes: dict[str, str] = {}  # on matchers that fell back to float32
         self._encodings = ByteCache(cache_bytes)  # by matcher, image and view
 
-    def load(self, name: str) -> None:
-        """Load a matcher of the recipe now."""
-        self._matcher(name)
+    def load(self) -> None:
+        """Load all matchers of the recipe now. One that cannot be loaded costs its units only.
+
+        Raises device and memory errors, and the first matcher's error if none can be loaded.
+        """
+        for name in self.recipe.matcher_names:
+            with suppress(UnloadableError):
+                self._matcher(name)
+        if not self._matchers:
+            raise next(iter(self._unloadable.values()))
+
+    @property
+    def unloadable(self) -> dict[str, str]:
+        """The reason for each matcher that could not be loaded."""
+        return {
+            name: str(error) if isinstance(error, UserError) else reason_of(error)
+            for name, error in self._unloadable.items()
+        }
 
     def match(
         self, pairs: Sequence[PairMatch], units: Iterable[Unit], may_start: Callable[[Unit], bool] = lambda _: True
@@ -102,7 +122,8 @@ class Pipeline:
             if isinstance(error, NonFiniteError) and self._fall_back_to_float32(unit.matcher, error):
                 return []
             if failure is FailureKind.RAISED and len(pairs) == 1:
-                return [UnitResult(unit, Matches.empty(), failure=reason_of(error))]
+                reason = str(error) if isinstance(error, UnloadableError) else reason_of(error)
+                return [UnitResult(unit, Matches.empty(), failure=reason)]
             if failure is FailureKind.RAISED:  # one by one, and again if the matcher falls back to float32
                 alone = (self._run_minibatch(unit, [pair]) or self._run_minibatch(unit, [pair]) for pair in pairs)
                 return list(chain.from_iterable(alone))
@@ -174,8 +195,22 @@ class Pipeline:
         return [known[key] for key in keys]
 
     def _matcher(self, name: str) -> Matcher[Any]:
-        if name not in self._matchers:
-            self._matchers[name] = self._load(name)
+        """Return the matcher, loaded on first use.
+
+        Raises :class:`UnloadableError` at every call if its first load failed, unless for want of
+        memory or of a device, which a new worker may have.
+        """
+        if name not in self._matchers and name not in self._unloadable:
+            try:
+                self._matchers[name] = self._load(name)
+            except Exception as error:
+                if failure_of(error) is not FailureKind.RAISED:
+                    raise
+                self._unloadable[name] = error
+        if name in self._unloadable:
+            cause = self._unloadable[name]
+            reason = str(cause) if isinstance(cause, UserError) else reason_of(cause)
+            raise UnloadableError(f"{name} cannot be loaded: {reason}") from cause
         return self._matchers[name]
 
 

@@ -68,10 +68,8 @@ def _error(record: PairRecord) -> str:
 
 
 def left_out_line(left_out: Sequence[str]) -> str:
-    """Return a line with the matchers that did not run, by cause, and advice on weights; empty if all ran."""
-    advice = " (`python -m mkpc_kaggle weights fetch --out DIR` gets weights)"
-    has_advice = any(cause.startswith("no weights") for cause in left_out)
-    return f"left out, {'; '.join(left_out)}{advice * has_advice}" if left_out else ""
+    """Return a line with the matchers that did not run, by cause; empty if all ran."""
+    return f"left out, {'; '.join(left_out)}" if left_out else ""
 
 
 def unit_means(run: Run) -> list[tuple[str, int, float, float, float]]:

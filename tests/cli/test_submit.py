@@ -1,6 +1,7 @@
 """``make_submission.py`` as a person runs it: a process, real pictures, files on disk."""
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -8,9 +9,12 @@ import time
 from pathlib import Path
 
 import pytest
-from shared import problems_of, run_command, write_small_recipe
+from genuine import GENUINE
+from shared import DATA, needs_data, problems_of, run_command, write_small_recipe
 
 from mkpc_kaggle.demo import DemoSet
+from mkpc_kaggle.engine.records import read_records
+from mkpc_kaggle.engine.store import Store
 from mkpc_kaggle.errors import UserError
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -114,3 +118,23 @@ def test_a_signal_ends_the_reading_of_weights(
     assert capsys.readouterr().err == "error: interrupted\n"
     if command.startswith("submit"):
         assert problems_of(tmp_path / "submission.csv", demo.test_dir) == []
+
+
+@pytest.mark.genuine
+@needs_data
+def test_the_light_recipe_with_genuine_weights_matches_photographs_with_aliked_and_lightglue(tmp_path):
+    """On two pairs of three images of the competition."""
+    rows = (DATA / "test" / "test.csv").read_text(encoding="utf-8").splitlines()
+    (tmp_path / "test.csv").write_text("\n".join([rows[0], *rows[3:5]]), encoding="utf-8")
+    (tmp_path / "test_images").symlink_to(DATA / "test" / "test_images")
+    output = tmp_path / "submission.csv"
+    done = make(tmp_path, output, "light", "--no-report", "--weights", str(GENUINE))
+    assert done.returncode == 0, done.stderr
+    assert "2 of 2 pairs have an F" in done.stdout
+    assert not re.search("does without|units that failed|pairs with the fallback row", done.stdout + done.stderr)
+    with Store.read(tmp_path / "submission.work") as store:
+        units = [{unit.unit: unit.matches for unit in record.units} for record in read_records(store)]
+    for each in units:
+        counts = [count for unit, count in each.items() if ":aliked_lightglue@" in unit]
+        assert counts
+        assert min(counts) > 100

@@ -1,9 +1,13 @@
 """``python -m mkpc_kaggle weights``: what it prints and the status it ends with."""
 
+import io
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
+from checkpoints import FILES as FILES_OF_PAPER
+from checkpoints import write_checkpoints
 from shared import run_command
 from web import Site, serve
 from weight_files import DATA, OTHER, digest_of, line, put
@@ -38,12 +42,66 @@ def test_list_says_what_is_there_and_what_the_missing_would_enable(weights, caps
     assert len(lines) == 4
 
 
-def test_verify_lists_refused_files_and_fails(weights, capsys):
-    assert run_command("weights", "verify", "--weights", put(weights, "b.pt", b"what may be it")) == 0
+def checkpoint(**tensors: torch.Tensor) -> bytes:
+    stream = io.BytesIO()
+    torch.save(tensors, stream)
+    return stream.getvalue()
+
+
+@pytest.fixture
+def checkpoints(monkeypatch: pytest.MonkeyPatch) -> tuple[bytes, bytes]:
+    """Two checkpoints of a slot that no matcher uses, and lines of a manifest for them."""
+    one, other = checkpoint(a=torch.zeros(3)), checkpoint(a=torch.ones(3))
+    lines = line("one.pt", one), line("other.pt", other), line("new.pt", size=-1, digest=UNVERIFIED)
+    monkeypatch.setattr(store, "manifest", lambda: lines)
+    return one, other
+
+
+def test_verify_lists_refused_files_and_fails(tmp_path, checkpoints, capsys):
+    one, other = checkpoints
+    weights = put(put(put(tmp_path, "one.pt", one), "renamed.pt", other), "new.pt", checkpoint(b=torch.zeros(1)))
+    assert run_command("weights", "verify", "--weights", weights) == 0
     assert "3 files, 0 refused" in capsys.readouterr().out
-    put(weights, "a.pt", DATA)
+    put(weights, "other.pt", one)
     assert run_command("weights", "verify", "--weights", weights) == 1
-    assert "it has the bytes of sift.pt" in capsys.readouterr().out
+    assert "it has the bytes of one.pt" in capsys.readouterr().out
+
+
+def verified(capsys: pytest.CaptureFixture[str], weights: Path, status: int) -> dict[str, str]:
+    """Verify the weights; return the table's lines by the names of files."""
+    assert run_command("weights", "verify", "--weights", weights) == status
+    return {row.split()[0]: row for row in capsys.readouterr().out.splitlines() if row.split()}
+
+
+def test_verify_says_which_matchers_networks_a_file_fits(tmp_path, monkeypatch, capsys):
+    lines = write_checkpoints(tmp_path, FILES_OF_PAPER[:3])
+    monkeypatch.setattr(store, "manifest", lambda: lines)
+    rows = verified(capsys, tmp_path, 0)
+    assert [rows[file.name].split("fits ")[-1] for file in lines] == ["superglue", "superglue", "loftr"]
+
+
+def test_verify_refuses_a_file_with_the_manifests_digest_that_no_network_takes(tmp_path, monkeypatch, capsys):
+    names = tuple(line(f"{slot}.pt", checkpoint(a=torch.zeros(3)), slot=slot) for slot in ("dkm-outdoor", "xfeat"))
+    monkeypatch.setattr(store, "manifest", lambda: (*names, line("superpoint.pt", slot="superpoint")))
+    for file in names:
+        put(tmp_path, file.name, checkpoint(a=torch.zeros(3)))
+    rows = verified(capsys, put(tmp_path, "superpoint.pt"), 1)
+    assert "refused" in rows["dkm-outdoor.pt"]
+    assert "the weights for 'dkm-outdoor' do not fit the network: a, decoder." in rows["dkm-outdoor.pt"]
+    assert "cannot be read as a checkpoint" in rows["superpoint.pt"]
+    assert rows["xfeat.pt"].endswith("not tried in a network: xfeat_lighterglue also needs xfeat-lighterglue")
+    assert rows["3"].startswith("3 files, 2 refused")
+
+
+def test_a_file_is_not_refused_for_another_one_of_the_same_matcher(tmp_path, monkeypatch, capsys):
+    lines = write_checkpoints(tmp_path, FILES_OF_PAPER[:1])
+    wrong = checkpoint(a=torch.zeros(3))
+    put(tmp_path, "wrong.pt", wrong)
+    monkeypatch.setattr(store, "manifest", lambda: (*lines, line("wrong.pt", wrong, slot="superglue-outdoor")))
+    rows = verified(capsys, tmp_path, 1)
+    assert " good " in rows["superpoint_v1.pth"]
+    assert "not tried in a network: the weights for 'superglue-outdoor' do not" in rows["superpoint_v1.pth"]
+    assert " refused " in rows["wrong.pt"]
 
 
 def test_fetch_takes_files_slots_and_recipes(tmp_path, monkeypatch, capsys):

@@ -1,41 +1,48 @@
 """ALIKED and SIFT with LightGlue, from checkpoints in the public format, with stand-in weights."""
 
 import re
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from checkpoints import PublicFile, store_of
 from pictures import picture
 from torch import Tensor, nn
 
-from mkpc_kaggle.matchers.adapters.aliked import aliked_network
+from mkpc_kaggle.matchers.adapters import aliked_lightglue, sift_lightglue
+from mkpc_kaggle.matchers.adapters.aliked_lightglue import AlikedLightGlueOptions
 from mkpc_kaggle.matchers.contract import Colour, Placement, Precision
-from mkpc_kaggle.matchers.lightglue import light_glue
-from mkpc_kaggle.matchers.registry import load_matcher
-from mkpc_kaggle.matchers.sparse import KeypointOptions
+from mkpc_kaggle.matchers.networks.aliked import Aliked
+from mkpc_kaggle.matchers.networks.lightglue import LightGlue, LightGlueShape
+from mkpc_kaggle.matchers.registry import load_matcher, spec_of
 from mkpc_kaggle.weights import WeightStore
 
 
-def glue(**shape: Any) -> nn.Module:
-    return light_glue(2, input_dim=128, **shape)
+def glue(shape: LightGlueShape) -> nn.Module:
+    return LightGlue(replace(shape, layers=2))
 
 
 def old_names(state: dict[str, Tensor]) -> dict[str, Any]:
-    """As the public files name a layer's attentions; the thresholds are computed."""
-    pattern, kept = r"^transformers\.(\d+)\.(self|cross)_attn", state.keys() - {"confidence_thresholds"}
-    return {re.sub(pattern, r"\2_attn.\1", name): state[name] for name in kept}
+    """As the older public files name a layer's attentions, with their surplus entry."""
+    pattern = r"^transformers\.(\d+)\.(self|cross)_attn"
+    renamed = {re.sub(pattern, r"\2_attn.\1", name): tensor for name, tensor in state.items()}
+    return renamed | {"log_assignment.0.r": torch.zeros(1)}
 
 
-def without_the_grid(state: dict[str, Tensor]) -> dict[str, Any]:
-    return {name: tensor for name, tensor in state.items() if name != "dkd.hw_grid"}
+def published_aliked(state: dict[str, Tensor]) -> dict[str, Any]:
+    pattern = r"(block[34]\.conv[12])\.weight"
+    return {re.sub(pattern, r"\1.regular_conv.weight", name): x for name, x in state.items()}
 
 
-ALIKED, SIFT = partial(aliked_network, 2048), partial(glue, add_scale_ori=True)
+ALIKED, SIFT = partial(glue, aliked_lightglue.SHAPE), partial(glue, sift_lightglue.SHAPE)
+EVERY = {"depth_confidence": -1.0, "width_confidence": -1.0}  # all layers on all keypoints
+KEYPOINTS = partial(Aliked, 2048)
 FILES = (
-    PublicFile("a.pth", "aliked_lightglue", "aliked-n16", "aliked", ALIKED, without_the_grid),
-    PublicFile("b.pth", "aliked_lightglue", "aliked-lightglue", "lightglue", glue, old_names),
+    PublicFile("a.pth", "aliked_lightglue", "aliked-n16", "aliked", KEYPOINTS, published_aliked),
+    PublicFile("b.pth", "aliked_lightglue", "aliked-lightglue", "lightglue", ALIKED, old_names),
     PublicFile("c.pth", "sift_lightglue", "sift-lightglue", "lightglue", SIFT, old_names),
 )
 
@@ -47,8 +54,8 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> WeightStore:
 
 @pytest.mark.parametrize("name", ["aliked_lightglue", "sift_lightglue"])
 def test_a_picture_matches_itself_point_by_point(name, store):
-    matcher = load_matcher(name, store, KeypointOptions(features=300), Placement())
-    matcher._glue.conf.filter_threshold = 0.0
+    options = replace(spec_of(name, "test").options(), features=300, **EVERY, filter_threshold=0.0)
+    matcher = load_matcher(name, store, options, Placement())
     channels = 1 if matcher.spec.colour is Colour.GRAY else 3
     encodings = matcher.encode([picture(97, 131, channels=channels, multiple=32)])
     (matches,) = matcher.match(encodings, encodings)
@@ -59,12 +66,13 @@ def test_a_picture_matches_itself_point_by_point(name, store):
 
 @pytest.mark.parametrize("precision", Precision)
 def test_layers_compute_in_the_precision_that_is_asked_for(precision, store):
-    """LightGlue turns off any autocast around it: what counts is set around its layers."""
-    placement, seen = Placement(precision=precision), []
-    matcher = load_matcher("aliked_lightglue", store, KeypointOptions(), placement)
-    for part in ("posenc.Wr", "transformers.1.cross_attn.to_out", "transformers.1", "log_assignment.1"):
-        matcher._glue.get_submodule(part).register_forward_hook(lambda *call: seen.append(call[-1][0].dtype))
+    """Weights of the layers are rounded; positions, confidences and scores stay float32."""
+    options = AlikedLightGlueOptions(features=300)
+    matcher = load_matcher("aliked_lightglue", store, options, Placement(precision=precision))
+    state = matcher._glue.state_dict()
+    is_exact = re.compile(r"posenc|log_assignment|token_confidence|\.ffn\.1\.")  # and layer norms
+    expected = {name: torch.float32 if is_exact.search(name) else getattr(torch, precision) for name in state}
+    assert {name: tensor.dtype for name, tensor in state.items()} == expected
     encodings = matcher.encode([picture(64, 96, multiple=32)])
-    matcher.match(encodings, encodings)
-    exact = torch.float32
-    assert seen == [exact, exact, *2 * [getattr(torch, precision)], exact, exact]
+    (matches,) = matcher.match(encodings, encodings)
+    assert matches.scores.dtype == np.float32

@@ -1,14 +1,16 @@
 """``submission.ipynb`` as Kaggle runs it: the dataset folder, an image without our package, and no network."""
 
+import re
 import tomllib
 from pathlib import Path
 
 import nbformat
 import pytest
+from genuine import GENUINE
 from kaggle_image import environment, make_image, python_version, upload
 from offline_notebook import execute, needs_namespaces, pictures, printed
 from packaging.requirements import Requirement
-from shared import DATA, WEIGHTS, problems_of
+from shared import DATA, WEIGHTS, needs_data, problems_of
 
 from mkpc_kaggle.package.metadata import COMPETITION
 from mkpc_kaggle.package.package import Request, make_package
@@ -107,6 +109,21 @@ def test_a_commit_run_without_network_leaves_a_submission_and_shows_pairs(kaggle
     if WEIGHTS.is_dir():
         for told in ("3 files, 0 refused, 0 missing", "1:xfeat_lighterglue@1024 ", "1:aliked@1024 "):
             assert told in printed
+
+
+@pytest.mark.genuine
+@needs_namespaces
+@needs_data
+def test_the_packaged_notebook_with_genuine_weights_matches_with_aliked_and_lightglue(kaggle, tmp_path):
+    kaggle.add_test_side(DATA / "test", pairs=1)
+    kaggle.add_dataset(tmp_path / "package", (GENUINE,))
+    printed = kaggle.run()
+    assert "0 refused, 0 missing" in printed
+    assert "1 of 1 pairs have an F" in printed
+    assert "does without" not in printed
+    for unit in ("1:aliked_lightglue", "2:aliked_lightglue"):
+        assert re.search(rf"^{unit}@\d+ +1 +[1-9]", printed, re.MULTILINE), printed
+    assert kaggle.problems() == []
 
 
 @needs_namespaces

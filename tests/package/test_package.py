@@ -12,6 +12,8 @@ from zipfile import ZipFile
 
 import pytest
 import torch
+from checkpoints import FILES as FILES_OF_PAPER
+from checkpoints import write_checkpoints
 from kaggle_image import UNPACKED, environment, python_version, upload
 from shared import contents, run_command
 from weight_files import digest_of, line, put
@@ -186,6 +188,21 @@ def test_bad_requests_are_refused_before_anything_is_written(wanted, tmp_path):
         with pytest.raises(UserError, match=told):
             make_package(request)
     assert not wanted.out.exists()
+
+
+def test_weights_that_no_network_takes_are_refused_and_others_named_with_their_matchers(wanted, monkeypatch):
+    (weights,) = wanted.weights
+    (weights / "kept.pt").unlink()
+    lines = write_checkpoints(weights, FILES_OF_PAPER[:2])
+    monkeypatch.setattr(store, "manifest", lambda: lines)
+    package = make_package(replace(wanted, private=True))
+    notes = {item.name: item.note for item in package.dataset}
+    assert [notes[f"{file.name}.safetensors"] for file in lines] == ["fits superglue"] * 2
+    monkeypatch.setattr(store, "manifest", lambda: (*lines, line("free.pt", DATA, slot="dkm-outdoor")))
+    with pytest.raises(
+        UserError, match=r"another_name\.pt: the weights for 'dkm-outdoor' do not fit the network: a,"
+    ):
+        make_package(replace(wanted, private=True))
 
 
 def test_the_wheel_holds_what_a_run_needs_and_asks_for_what_is_bundled(tmp_path, wheels):

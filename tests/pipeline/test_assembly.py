@@ -1,19 +1,23 @@
 """Putting a run together: which units a recipe keeps here, and why others go or are refused."""
 
+import re
 from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
 
 import pytest
-from shared import WEIGHTS, needs_weights
+import torch
+from safetensors.torch import save_file
+from shared import WEIGHTS, needs_weights, problems_of, run_command
 from weight_files import digest_of
 
 from mkpc_kaggle import reconstruct
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.keys import Keys
-from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.errors import UserError, warn_once
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.matchers.contract import MatcherSpec
+from mkpc_kaggle.pipeline import availability
 from mkpc_kaggle.pipeline.assembly import Assembly, assemble
 from mkpc_kaggle.pipeline.availability import Licence
 from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher
@@ -42,7 +46,8 @@ def test_recipe_auto_leaves_out_the_units_whose_weights_are_missing():
     assembly = assemble("auto")
     others = [name for name in load_recipe("auto").matcher_names if name != "sift"]
     assert assembly.recipe.matcher_names == ("sift",)
-    assert assembly.left_out == (f"no weights: {', '.join(others)}",)
+    (told,) = assembly.left_out
+    assert told.startswith(f"no weights: {', '.join(others)} (")
     assert assembly.weight_files == {}
 
 
@@ -63,7 +68,8 @@ def test_recipes_take_what_is_there_and_fallbacks_stand_in_for_the_rest():
     assert set(first) == {"xfeat", "xfeat-lighterglue"} or set(sift) == {"xfeat", "xfeat-lighterglue"}
     light = assemble("light", weights=[WEIGHTS])
     assert light.recipe.matcher_names == ("xfeat_lighterglue", "sift", "aliked")
-    assert light.left_out == ("no weights: sift_lightglue, aliked_lightglue",)
+    command = "`python -m mkpc_kaggle weights fetch sift-lightglue aliked-lightglue --out DIR` gets weights"
+    assert light.left_out == (f"no weights: sift_lightglue, aliked_lightglue ({command})",)
     assert [unit.stage for unit in light.recipe.units] == [unit.stage for unit in load_recipe("light").units]
     assert light.recipe == light.recipe.with_fallbacks(())
 
@@ -85,7 +91,23 @@ def known_files(monkeypatch, tmp_path):
         (tmp_path / file.name).write_bytes(file.name.encode())
     others = [file for file in manifest() if file.slot not in {known.slot for known in files}]
     monkeypatch.setattr(weight_store, "manifest", lambda: (*files, *others))
+    monkeypatch.setattr(availability, "misfit", lambda *_: "")  # the files are only names
     return tmp_path
+
+
+def test_the_advice_of_recipe_auto_is_the_light_recipe_unless_its_weights_are_there(monkeypatch, tmp_path):
+    (told,) = assemble("auto").left_out
+    assert told.endswith("(`python -m mkpc_kaggle weights fetch light --out DIR` gets weights)")
+    light = load_recipe("light")
+    lines = []
+    for slot in availability.slots_of(light, light.matcher_names):
+        (tmp_path / slot).write_text(slot)
+        lines.append(WeightFile(slot, -1, digest_of(slot.encode()), "MIT", slot, "here"))
+    monkeypatch.setattr(weight_store, "manifest", lambda: (*lines, *manifest()))
+    monkeypatch.setattr(availability, "misfit", lambda *_: "")
+    (told,) = assemble("auto", weights=[tmp_path]).left_out
+    assert told.startswith("no weights: loma, ")
+    assert "fetch" not in told
 
 
 def test_a_permissive_run_leaves_out_of_recipe_auto_what_is_licensed_otherwise(known_files):
@@ -139,6 +161,108 @@ def test_recipe_auto_passes_damaged_weights_over(tmp_path, name):
     with pytest.warns(UserWarning, match=rf"(passed over|does without dkm): .*{name}"):
         assembly = assemble("auto", weights=[tmp_path])
     assert not {"dkm", "xfeat_lighterglue"} & set(assembly.recipe.matcher_names)
+
+
+@pytest.fixture
+def misfits(monkeypatch, tmp_path):
+    """A folder with files that have the manifest's digests, and that no network takes."""
+    warn_once.cache_clear()
+    names = {"aliked-n16": "a.safetensors", "superpoint": "p.safetensors", "superglue-outdoor": "g.safetensors"}
+    files = []
+    for slot, name in names.items():
+        save_file({"surplus.weight": torch.zeros(2)}, tmp_path / name)
+        data = (tmp_path / name).read_bytes()
+        files.append(WeightFile(name, len(data), digest_of(data), "MIT", slot, "here"))
+    others = [file for file in manifest() if file.slot not in names]
+    monkeypatch.setattr(weight_store, "manifest", lambda: (*files, *others))
+    return tmp_path
+
+
+DOES_WITHOUT = (
+    r"does without aliked: weights cannot be loaded \(the weights for 'aliked-n16' do not fit the network"
+)
+
+
+@pytest.mark.filterwarnings("ignore:.* does without superglue")
+def test_recipe_auto_leaves_out_weights_that_have_the_digest_and_do_not_fit(misfits):
+    with pytest.warns(UserWarning, match=DOES_WITHOUT):
+        assembly = assemble("auto", weights=[misfits])
+    assert assembly.recipe.matcher_names == ("sift",)
+    assert "weights cannot be loaded: superglue, aliked" in assembly.left_out
+
+
+@pytest.mark.filterwarnings("ignore:.* does without superglue")
+@pytest.mark.parametrize(
+    ("units", "expected"),
+    [
+        ([Unit(1, "aliked", 640, fallback="sift"), Unit(2, "sift", 640)], ["1:sift@640", "2:sift@640"]),
+        ([Unit(1, "aliked", 640), Unit(2, "sift", 640), Unit(1, "sift", 640)], ["1:sift@640", "2:sift@640"]),
+        ([Unit(1, "sift", 640), Unit(2, "aliked", 640, fallback="superglue")], ["1:sift@640"]),
+        ([Unit(1, "sift", 640), Unit(2, "aliked", 640, fallback="aliked_lightglue")], ["1:sift@640"]),
+    ],
+    ids=["fallback", "another unit sweeps", "a fallback that does not fit, either", "a fallback without weights"],
+)
+def test_a_named_recipe_runs_the_fallback_of_weights_that_do_not_fit_or_goes_on_without(misfits, units, expected):
+    with pytest.warns(UserWarning, match=DOES_WITHOUT):
+        assembly = assemble(Recipe(tuple(units)), weights=[misfits])
+    assert [unit.name for unit in assembly.recipe.units] == expected
+
+
+def test_a_recipe_without_a_unit_left_to_sweep_is_refused_with_the_reason(misfits):
+    recipe = Recipe((Unit(1, "aliked", 640), Unit(2, "sift", 640)), name="mine")
+    says = (
+        "recipe 'mine' has no unit left that can sweep all pairs: weights cannot be loaded: aliked .*'aliked-n16'"
+    )
+    with pytest.raises(UserError, match=says):
+        assemble(recipe, weights=[misfits])
+
+
+TWO_UNITS = """
+units = [
+    { stage = 1, matcher = "aliked", long_side = 320 },
+    { stage = 1, matcher = "sift", long_side = 320 },
+]
+"""
+
+
+def submitted(demo, tmp_path, recipe, weights):
+    """Submit with a recipe; "own" has ALIKED and SIFT. Return the exit status and the problems of the file."""
+    (tmp_path / "own.toml").write_text(TWO_UNITS)
+    output = tmp_path / "out" / "submission.csv"
+    chosen = tmp_path / "own.toml" if recipe == "own" else recipe
+    options = ("--output", output, "--recipe", chosen, "--weights", weights, "--workers", 0)
+    status = run_command("submit", "--test-dir", demo.test_dir, *options, "--no-report", "--no-scenes")
+    return status, problems_of(output, demo.test_dir)
+
+
+@pytest.mark.filterwarnings("default:.* does without")  # the command prints it
+@pytest.mark.parametrize("recipe", ["auto", "own"])
+def test_one_checkpoint_that_does_not_fit_ends_no_run(misfits, demo, tmp_path, recipe, capsys):
+    assert submitted(demo, tmp_path, recipe, misfits) == (0, [])
+    told = capsys.readouterr()
+    assert len(re.findall(DOES_WITHOUT, told.err)) == 1
+    assert "left out, " in told.out
+
+
+@pytest.mark.filterwarnings("default:.* does without")
+def test_match_does_without_a_checkpoint_that_does_not_fit_as_submit_does(misfits, demo, tmp_path, capsys):
+    (tmp_path / "own.toml").write_text(TWO_UNITS)
+    images = sorted((demo.test_dir / "test_images").rglob("*.png"))[:2]
+    assert run_command("match", *images, "--recipe", tmp_path / "own.toml", "--weights", misfits) == 0
+    told = capsys.readouterr()
+    assert re.search(DOES_WITHOUT, told.err)
+    assert "1:sift@320" in told.out
+    assert "aliked" not in told.out
+
+
+def test_a_matcher_that_only_a_worker_cannot_load_costs_its_units_and_is_told(
+    misfits, demo, tmp_path, monkeypatch, capsys
+):
+    """As with a damaged record, which shows when its numbers are read."""
+    monkeypatch.setattr(availability, "misfit", lambda *_: "")
+    assert submitted(demo, tmp_path, "own", misfits) == (0, [])
+    told = capsys.readouterr().out
+    assert "units that failed: 1\n  1:aliked@320: aliked cannot be loaded: the weights for 'aliked-n16'" in told
 
 
 def points_keys(assembly: Assembly) -> tuple[str, ...]:

@@ -291,3 +291,49 @@ def in_child(match):
     for matcher in (match, TwoStageMatcher(SIFT)):  # a new one would hang, too
         with pytest.raises(UserError, match="this process was forked after its parent had matched"):
             matcher(*pair())
+
+
+class Loader:
+    """Loads a matcher without matches, or raises the error of that name; counts the calls."""
+
+    def __init__(self, **errors):
+        self.errors = errors
+        self.calls = Counter()
+
+    def __call__(self, name):
+        self.calls[name] += 1
+        if name in self.errors:
+            raise self.errors[name]
+        return Scripted()
+
+
+TWO_MATCHERS = Recipe((Unit(1, "good", 320), Unit(1, "bad", 320), Unit(2, "bad", 320)))
+
+
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [
+        (UserError("the weights do not fit"), "bad cannot be loaded: the weights do not fit"),
+        (ValueError("no such layer"), "bad cannot be loaded: ValueError: no such layer"),
+    ],
+)
+def test_a_matcher_that_cannot_be_loaded_costs_its_units_alone_and_is_tried_once(error, told):
+    load = Loader(bad=error)
+    pipeline = Pipeline(TWO_MATCHERS, load, minibatch=2)
+    pipeline.load()
+    pairs = [PairMatch(images=tuple(map(Image.of_array, pair()))) for _ in range(3)]
+    for match in pipeline.match(pairs, TWO_MATCHERS.units):
+        assert [result.failure for result in match.results] == ["", told, told]
+    assert load.calls == {"good": 1, "bad": 1}
+
+
+def test_a_pipeline_without_a_matcher_that_can_be_loaded_raises_the_first_error():
+    load = Loader(good=UserError("first"), bad=UserError("second"))
+    with pytest.raises(UserError, match="first"):
+        Pipeline(TWO_MATCHERS, load).load()
+
+
+@pytest.mark.parametrize("error", [MemoryError("weights"), RuntimeError("CUDA error: no device")])
+def test_want_of_memory_or_of_a_device_is_not_the_matchers_fault(error):
+    with pytest.raises(type(error)):
+        Pipeline(TWO_MATCHERS, Loader(bad=error)).load()

@@ -5,23 +5,31 @@ A new matcher is one line in ``MATCHERS``.
 
 import copy
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache, partial
 from typing import Any
 
 import numpy as np
-from kornia.feature import XFeat
 from torch import nn
 
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
-from mkpc_kaggle.matchers.adapters import dkm, roma, sift_lightglue, xfeat_lighterglue
-from mkpc_kaggle.matchers.adapters.aliked import AlikedMatcher, aliked_encoder, aliked_network
+from mkpc_kaggle.matchers.adapters import (
+    aliked_lightglue,
+    dkm,
+    roma,
+    sift_lightglue,
+    xfeat_lighterglue,
+)
+from mkpc_kaggle.matchers.adapters.aliked import AlikedMatcher, aliked_encoder
 from mkpc_kaggle.matchers.adapters.loma import LomaAdapter, LomaOptions
 from mkpc_kaggle.matchers.adapters.superglue import SuperGlueMatcher
 from mkpc_kaggle.matchers.contract import Colour, Picture, Placement
 from mkpc_kaggle.matchers.dense import DenseMatcher
-from mkpc_kaggle.matchers.lightglue import LightGlueMatcher, light_glue
+from mkpc_kaggle.matchers.lightglue import LightGlueMatcher
+from mkpc_kaggle.matchers.networks.aliked import Aliked
 from mkpc_kaggle.matchers.networks.aspanformer import AspanFormer
 from mkpc_kaggle.matchers.networks.dkm import DKM
+from mkpc_kaggle.matchers.networks.lightglue import Adaptation, LightGlue, LightGlueShape
 from mkpc_kaggle.matchers.networks.loftr import Loftr
 from mkpc_kaggle.matchers.networks.loma import Loma, Variant
 from mkpc_kaggle.matchers.networks.placement import prepared
@@ -43,11 +51,11 @@ def standin(name: str, make: Callable[..., nn.Module], *settings: Any, **named: 
 
 
 def ours(placement: Placement, *network: Any, **named: Any) -> Any:
-    return prepared(kornias(*network, **named), placement)
+    return prepared(unprepared(*network, **named), placement)
 
 
-def kornias(*network: Any, **named: Any) -> Any:
-    """A network of kornia's, which its matcher will move."""
+def unprepared(*network: Any, **named: Any) -> Any:
+    """A network that its matcher prepares."""
     return copy.deepcopy(standin(*network, **named))
 
 
@@ -86,11 +94,12 @@ def aliked_matcher(placement: Placement, keypoints: int = 200) -> AlikedMatcher:
     return AlikedMatcher(aliked_keypoints(placement, keypoints)[0])
 
 
-Keypoints = tuple[Encode, dict[str, Any]]  # and the shape of LightGlue for them
+Keypoints = tuple[Encode, LightGlueShape]  # and the shape of LightGlue for them
 
 
 def aliked_keypoints(placement: Placement, keypoints: int) -> Keypoints:
-    return aliked_encoder(kornias("aliked", aliked_network, keypoints), placement), {"input_dim": 128}
+    network = unprepared("aliked", Aliked, keypoints)
+    return aliked_encoder(network, placement), aliked_lightglue.SHAPE
 
 
 def sift_keypoints(placement: Placement, keypoints: int) -> Keypoints:
@@ -98,7 +107,8 @@ def sift_keypoints(placement: Placement, keypoints: int) -> Keypoints:
 
 
 def xfeat_keypoints(placement: Placement, keypoints: int) -> Keypoints:
-    network = XFeat(top_k=keypoints, detection_threshold=0.0)
+    network = xfeat_lighterglue.xfeat_network(keypoints)
+    network.detection_threshold = 0.0
     network.net = filled(network.net, "xfeat")
     return xfeat_lighterglue.xfeat_encoder(network, keypoints, placement), xfeat_lighterglue.SHAPE
 
@@ -114,7 +124,8 @@ def lightglue_matcher(
     name: str, placement: Placement, keypoints: int = 200, layers: int = 2, threshold: float = 0.0
 ) -> LightGlueMatcher:
     encode, shape = KEYPOINTS[name](placement, keypoints)
-    network = kornias("lightglue", light_glue, layers, filter_threshold=threshold, **shape)
+    every = Adaptation(depth=-1, width=-1, threshold=threshold)
+    network = unprepared("lightglue", LightGlue, replace(shape, layers=layers), every)
     return LightGlueMatcher(spec_of(name, "test"), encode, network, placement)
 
 

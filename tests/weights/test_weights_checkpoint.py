@@ -53,6 +53,23 @@ def test_every_file_format_gives_the_same_plain_tensors(tmp_path, save, wrapped)
     assert_same({name: loaded[name] for name in TENSORS}, TENSORS)
 
 
+@pytest.mark.parametrize("save", [torch.save, save_legacy, save_file])
+def test_on_the_device_meta_a_file_gives_names_shapes_and_types(tmp_path, save):
+    path = tmp_path / ("x.safetensors" if save is save_file else "x.pt")
+    save(TENSORS, path)
+    with torch.device("meta"):
+        loaded = load_tensors(path, "meta")
+    assert {name: loaded[name].device.type for name in loaded} == dict.fromkeys(TENSORS, "meta")
+    expected = {name: (tensor.shape, tensor.dtype) for name, tensor in TENSORS.items()}
+    assert {name: (tensor.shape, tensor.dtype) for name, tensor in loaded.items()} == expected
+
+
+@pytest.mark.parametrize("wrapper", ["state_dict", "extractor"])
+def test_tensors_in_a_wrapper_are_found(tmp_path, wrapper):
+    torch.save({wrapper: TENSORS, "epoch": 3}, tmp_path / "x.pt")
+    assert_same(load_tensors(tmp_path / "x.pt"), TENSORS)
+
+
 @pytest.mark.filterwarnings("ignore::UserWarning")  # of torch, on prototypes
 @pytest.mark.parametrize("save", [torch.save, save_legacy])
 def test_anything_but_a_table_of_plain_tensors_is_refused(tmp_path, save):

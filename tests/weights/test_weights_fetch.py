@@ -11,7 +11,9 @@ from weight_files import DATA, digest_of, line, put
 
 from mkpc_kaggle.weights import UNVERIFIED, WeightFile, fetch
 from mkpc_kaggle.weights.fetch import ATTEMPTS, BLOCK_BYTES, Fetched, FetchOutcome, choose
+from mkpc_kaggle.weights.wheel import Wheels
 
+NO_WHEELS = Wheels(Path("no such directory"))
 BIG = bytes(range(256)) * 1000
 CUT = 100_000
 
@@ -26,7 +28,7 @@ def site(monkeypatch: pytest.MonkeyPatch) -> Iterator[Site]:
 def get(site: Site, directory: Path, file: WeightFile | None = None, pauses: list[float] | None = None) -> Fetched:
     """Download without a pause between attempts; ``pauses`` takes the seconds that there would have been."""
     wanted = replace(file or line(data=BIG), source=f"{site.url} (renamed)")
-    return fetch.fetch(wanted, directory, wait=([] if pauses is None else pauses).append)
+    return fetch.fetch(wanted, directory, NO_WHEELS, wait=([] if pauses is None else pauses).append)
 
 
 def names_in(directory: Path) -> list[str]:
@@ -90,7 +92,7 @@ def test_only_errors_that_pass_are_waited_for(site, tmp_path, status, requests):
 
 def test_what_cannot_be_reached_or_written_is_told(site, tmp_path):
     pauses = []
-    gone = fetch.fetch(replace(line(), source="http://127.0.0.1:9/a.bin"), tmp_path, wait=pauses.append)
+    gone = fetch.fetch(replace(line(), source="http://127.0.0.1:9/a.bin"), tmp_path, NO_WHEELS, wait=pauses.append)
     assert (gone.outcome, len(pauses)) == (FetchOutcome.FAILED, ATTEMPTS - 1)
     assert "127.0.0.1:9" in gone.note
     site.redirect = "file:///etc/hostname"
@@ -133,7 +135,7 @@ ANSWERS = {
 def test_a_server_that_lies_or_wanders_is_a_failure(monkeypatch, tmp_path, answer):
     monkeypatch.setenv("no_proxy", "127.0.0.1")
     with serve_bytes(answer) as url:
-        failed = fetch.fetch(replace(line(), source=url), tmp_path, wait=lambda _: None)
+        failed = fetch.fetch(replace(line(), source=url), tmp_path, NO_WHEELS, wait=lambda _: None)
     assert failed.outcome is FetchOutcome.FAILED
     assert not failed.path.exists()
 
@@ -158,7 +160,7 @@ SOURCES = ["https://drive.google.com/file/d/1", "a.ckpt of a.tar, https://x.org/
 
 @pytest.mark.parametrize("source", SOURCES)
 def test_what_cannot_be_downloaded_as_it_is_is_for_the_user(tmp_path, source):
-    by_hand = fetch.fetch(line(source=source), tmp_path)
+    by_hand = fetch.fetch(line(source=source), tmp_path, NO_WHEELS)
     assert by_hand.outcome is FetchOutcome.BY_HAND
     assert by_hand.note == f"get it from {source} and save it as {tmp_path / 'a.bin'}"
 
@@ -166,6 +168,7 @@ def test_what_cannot_be_downloaded_as_it_is_is_for_the_user(tmp_path, source):
 def test_of_alternatives_the_one_that_is_there_is_chosen_then_one_from_the_web(tmp_path):
     files = [line("a", source="by hand"), line("b", source="https://x.org/b"), line("c", source="by hand")]
     assert choose(files, tmp_path).name == "b"
+    assert choose([files[0], line("d", source="by hand wheel:some-weights==1.0/d.pt")], tmp_path).name == "d"
     assert choose(files[::2], tmp_path).name == "a"
     put(tmp_path, "c", DATA)
     assert choose(files, tmp_path).name == "c"

@@ -1,6 +1,7 @@
 """Where weight files are searched, and that they are what the manifest says; the manifest itself."""
 
 import os
+import pickle
 import re
 from pathlib import Path
 from zipfile import ZipFile
@@ -64,6 +65,14 @@ def test_a_renamed_file_is_found_by_its_size_and_digest(tmp_path, monkeypatch):
     found = WeightStore([tmp_path], [line()]).find("slot")
     assert (found.path.name, found.state, found.note) == ("model", State.GOOD, "it is a.bin")
     assert "long.pth" not in {path.name for path in read}
+
+
+def test_a_store_that_is_sent_to_a_worker_digests_no_file_again(tmp_path, monkeypatch):
+    weights = WeightStore([put(tmp_path)], [line()])
+    assert weights.find("slot") is not None
+    sent = pickle.dumps(weights)
+    monkeypatch.setattr(store, "digest_of", None)
+    assert pickle.loads(sent).find("slot") == weights.find("slot")
 
 
 def test_links_to_directories_are_followed_once(tmp_path):
@@ -146,11 +155,15 @@ def test_a_manifest_that_cannot_be_read_is_passed_over(tmp_path, text):
 SHA256 = "sha256:" + "0f" * 32
 
 
+# Files whose matchers are the next to come.
+AHEAD = {"disk", "disk-lightglue", "superpoint-lightglue"}
+
+
 def test_the_manifest_has_every_slot_of_every_matcher():
     slots = {file.slot for file in manifest()}
     specs = [spec_of(name, "test") for name in matcher_names()]
     assert slots.issuperset(slot for spec in specs for slot in spec.slots_for(spec.options()))
-    assert all(any(spec.uses(slot) for spec in specs) for slot in slots)
+    assert {slot for slot in slots if not any(spec.uses(slot) for spec in specs)} <= AHEAD
 
 
 def test_a_manifest_reads_as_written():

@@ -1,15 +1,43 @@
-"""ALIKED keypoints (Zhao et al. 2023, kornia's network) with mutual nearest neighbours."""
+"""ALIKED keypoints (Zhao et al. 2023) with mutual nearest neighbours."""
 
-from kornia.feature import ALIKED
-from torch import Tensor
+from dataclasses import dataclass
+from enum import StrEnum
 
-from mkpc_kaggle.matchers.contract import MatcherSpec, Placement
+from mkpc_kaggle.config import SHARE, check_ranges
+from mkpc_kaggle.matchers.contract import MatcherSpec, Placement, Precision
 from mkpc_kaggle.matchers.neighbours import NeighbourMatcher
+from mkpc_kaggle.matchers.networks.aliked import Aliked, own_name
+from mkpc_kaggle.matchers.networks.placement import prepared
 from mkpc_kaggle.matchers.sparse import Encode, KeypointOptions, keypoint_encoder
 from mkpc_kaggle.weights import WeightStore, load_into
 
-SLOT = "aliked-n16"
-SPEC = MatcherSpec("aliked", KeypointOptions, multiple=32, slots=(SLOT,))
+
+class AlikedVariant(StrEnum):
+    """The published networks with 128 channels; n16rot was trained with rotated images."""
+
+    N16 = "n16"
+    N16ROT = "n16rot"
+    N32 = "n32"
+
+
+# Places around a keypoint from which its descriptor is read.
+POSITIONS = {AlikedVariant.N16: 16, AlikedVariant.N16ROT: 16, AlikedVariant.N32: 32}
+SLOT = "aliked-{variant}"
+
+
+@dataclass(frozen=True)
+class AlikedOptions(KeypointOptions):
+    """``ratio``: the maximum distance ratio of the nearest to the second nearest neighbour; 1: any."""
+
+    variant: AlikedVariant = AlikedVariant.N16
+    ratio: float = 1.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_ranges(self, ratio=SHARE)
+
+
+SPEC = MatcherSpec("aliked", AlikedOptions, multiple=32, slots=(SLOT,))
 
 
 class AlikedMatcher(NeighbourMatcher):
@@ -17,28 +45,26 @@ class AlikedMatcher(NeighbourMatcher):
 
     spec = SPEC
 
-    def __init__(self, encode: Encode) -> None:
+    def __init__(self, encode: Encode, ratio: float = 1.0) -> None:
         self.encode = encode
+        self.ratio = ratio
 
 
-def aliked_network(features: int) -> ALIKED:
-    return ALIKED(SLOT, max_num_keypoints=features, detection_threshold=0.0)  # keypoints of any score
-
-
-def aliked_encoder(network: ALIKED, placement: Placement) -> Encode:
-    def detect(images: Tensor) -> list[tuple[Tensor, Tensor]]:
-        return [(each.keypoints, each.descriptors) for each in network(images)]
-
-    in_float32 = Placement(placement.device)  # half precision changes three quarters of the keypoints
-    return keypoint_encoder(network, network.score_head, detect, in_float32)
-
-
-def load_encoder(weights: WeightStore, features: int, placement: Placement) -> Encode:
+def load_encoder(weights: WeightStore, features: int, variant: AlikedVariant, placement: Placement) -> Encode:
     """Load ALIKED's encoder, which all matchers of ALIKED keypoints share."""
-    network = aliked_network(features)
-    load_into(network, weights.load(SLOT), unused=r"dkd\.hw_grid", what=SLOT)  # a constant
+    slot = SLOT.format(variant=variant)
+    network = Aliked(features, POSITIONS[variant])
+    tensors = {own_name(name): tensor for name, tensor in weights.load(slot).items()}
+    load_into(network, tensors, what=slot)
     return aliked_encoder(network, placement)
 
 
-def load(weights: WeightStore, options: KeypointOptions, placement: Placement) -> AlikedMatcher:
-    return AlikedMatcher(load_encoder(weights, options.features, placement))
+def aliked_encoder(network: Aliked, placement: Placement) -> Encode:
+    # Float32 in any precision: in half precision three quarters of the keypoints change.
+    in_float32 = Placement(placement.device, Precision.FLOAT32)
+    return keypoint_encoder(prepared(network, in_float32), in_float32)
+
+
+def load(weights: WeightStore, options: AlikedOptions, placement: Placement) -> AlikedMatcher:
+    encode = load_encoder(weights, options.features, options.variant, placement)
+    return AlikedMatcher(encode, options.ratio)

@@ -18,8 +18,8 @@ def load(weights: WeightStore, options: TrainedOptions, placement: Placement) ->
     own, backbone = SPEC.slots_for(options)
     with torch.device("meta"):
         network = RoMa()
-    tensors = {f"dinov2.{name}": tensor for name, tensor in weights.load(backbone).items()}
-    load_into(network, tensors | weights.load(own), what=f"{own} with {backbone}")
+    load_into(network.dinov2, weights.load(backbone), what=backbone)
+    load_into(network, weights.load(own), unused=r"dinov2\.", what=own)
     first_pass = FIRST_PASSES[options.training]
     return DenseMatcher(
         SPEC, prepared(network, placement), placement.device, multiple=PATCH, first_pass=first_pass

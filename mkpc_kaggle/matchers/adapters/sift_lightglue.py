@@ -9,17 +9,18 @@ from torch.nn import functional
 
 from mkpc_kaggle.matchers.adapters.sift import root_sift
 from mkpc_kaggle.matchers.contract import Colour, MatcherSpec, Picture, Placement
-from mkpc_kaggle.matchers.lightglue import LightGlueMatcher, load_lightglue
-from mkpc_kaggle.matchers.sparse import Encode, KeypointOptions, Keypoints
+from mkpc_kaggle.matchers.lightglue import LightGlueMatcher, LightGlueOptions, load_lightglue
+from mkpc_kaggle.matchers.networks.lightglue import LightGlueShape
+from mkpc_kaggle.matchers.sparse import Encode, Keypoints
 from mkpc_kaggle.weights import WeightStore
 
 
 @dataclass(frozen=True)
-class SiftLightGlueOptions(KeypointOptions):
+class SiftLightGlueOptions(LightGlueOptions):
     features: int = 4096  # as in the published evaluation
 
 
-SHAPE = {"input_dim": 128, "add_scale_ori": True}
+SHAPE = LightGlueShape(descriptor=128, positions=4)
 SPEC = MatcherSpec("sift_lightglue", SiftLightGlueOptions, Colour.GRAY, slots=("sift-lightglue",))
 SHIFT_PX = 0.25  # OpenCV's offset if precise upscaling is off, as in the published evaluation
 
@@ -48,4 +49,4 @@ def sift_encoder(features: int, device: str) -> Encode:
 
 def load(weights: WeightStore, options: SiftLightGlueOptions, placement: Placement) -> LightGlueMatcher:
     encode = sift_encoder(options.features, placement.device)
-    return load_lightglue(SPEC, encode, weights, placement, **SHAPE)
+    return load_lightglue(SPEC, encode, weights, options, placement, SHAPE)

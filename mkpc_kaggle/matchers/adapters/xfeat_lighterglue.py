@@ -1,28 +1,55 @@
-"""XFeat keypoints matched by LighterGlue (Potje et al. 2024; kornia's networks)."""
+"""XFeat keypoints (kornia's network) matched by LighterGlue (Potje et al. 2024)."""
 
+from dataclasses import dataclass
+
+import torch
 from kornia.feature import XFeat
-from torch import Tensor
+from torch import Tensor, nn
 
 from mkpc_kaggle.matchers.contract import MatcherSpec, Placement
-from mkpc_kaggle.matchers.lightglue import LightGlueMatcher, load_lightglue
-from mkpc_kaggle.matchers.sparse import Encode, KeypointOptions, keypoint_encoder
+from mkpc_kaggle.matchers.dtypes import check_finite
+from mkpc_kaggle.matchers.lightglue import LightGlueMatcher, LightGlueOptions, load_lightglue
+from mkpc_kaggle.matchers.networks.lightglue import LightGlueShape
+from mkpc_kaggle.matchers.networks.placement import autocast, fold_norms
+from mkpc_kaggle.matchers.sparse import Encode, keypoint_encoder
 from mkpc_kaggle.weights import WeightStore, load_into
 
-SHAPE = {"input_dim": 64, "descriptor_dim": 96, "num_heads": 1}  # a narrow LightGlue
-SPEC = MatcherSpec("xfeat_lighterglue", KeypointOptions, multiple=32, slots=("xfeat", "xfeat-lighterglue"))
+
+@dataclass(frozen=True)
+class LighterGlueOptions(LightGlueOptions):
+    """As published, LighterGlue prunes keypoints, and runs all its layers."""
+
+    depth_confidence: float = -1.0
+    width_confidence: float = 0.95
+
+
+SHAPE = LightGlueShape(descriptor=64, width=96, heads=1)  # a narrow LightGlue
+SPEC = MatcherSpec("xfeat_lighterglue", LighterGlueOptions, multiple=32, slots=("xfeat", "xfeat-lighterglue"))
+
+
+def xfeat_network(features: int) -> XFeat:
+    network = XFeat(top_k=features)
+    # For semi-dense matching only; some checkpoints do not have it.
+    network.net.fine_matcher = nn.Identity()  # type: ignore[assignment]
+    return network
 
 
 def xfeat_encoder(network: XFeat, features: int, placement: Placement) -> Encode:
+    """Return the encoder of a loaded network, which raises if its features are not finite."""
+    fold_norms(network.eval())
+    network.to(placement.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+    network.net.register_forward_hook(lambda *call: check_finite("features of xfeat", call[-1]))
+
     def detect(images: Tensor) -> list[tuple[Tensor, Tensor]]:
-        found = network.detectAndCompute(images, top_k=features)
+        with autocast(placement):
+            found = network.detectAndCompute(images, top_k=features)
         return [(each["keypoints"], each["descriptors"]) for each in found]
 
-    return keypoint_encoder(network, network.net, detect, placement)
+    return keypoint_encoder(detect, placement)
 
 
-def load(weights: WeightStore, options: KeypointOptions, placement: Placement) -> LightGlueMatcher:
-    network = XFeat(top_k=options.features)
-    # The fine matcher is for semi-dense matching only; some checkpoints do not have it.
+def load(weights: WeightStore, options: LighterGlueOptions, placement: Placement) -> LightGlueMatcher:
+    network = xfeat_network(options.features)
     load_into(network.net, weights.load("xfeat"), unused=r"fine_matcher\.", what="xfeat")
     encode = xfeat_encoder(network, options.features, placement)
-    return load_lightglue(SPEC, encode, weights, placement, **SHAPE)
+    return load_lightglue(SPEC, encode, weights, options, placement, SHAPE)

@@ -45,7 +45,9 @@ def fold_norms(network: nn.Module) -> None:
 def autocast(placement: Placement) -> torch.autocast:
     """Return an autocast for libraries' networks; PyTorch chooses the operators that run in half precision."""
     enabled = placement.precision is not Precision.FLOAT32
-    return torch.autocast(torch.device(placement.device).type, dtype_of(placement), enabled)
+    device = torch.device(placement.device).type
+    # Nothing is computed on the device "meta", which has no autocast.
+    return torch.autocast("cpu" if device == "meta" else device, dtype_of(placement), enabled)
 
 
 def dtype_of(placement: Placement) -> torch.dtype:

@@ -1,0 +1,62 @@
+"""SuperPoint keypoints (DeTone et al. 2018) matched by LightGlue (Lindenberger et al. 2023).
+
+SuperPoint's weights are for noncommercial research; LightGlue's are not.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+
+from mkpc_kaggle.config import AT_LEAST_0, SHARE, check_ranges
+from mkpc_kaggle.matchers.contract import Colour, MatcherSpec, Picture, Placement
+from mkpc_kaggle.matchers.lightglue import LightGlueMatcher, LightGlueOptions, load_lightglue
+from mkpc_kaggle.matchers.networks.lightglue import LightGlueShape
+from mkpc_kaggle.matchers.networks.placement import prepared
+from mkpc_kaggle.matchers.networks.superpoint import SuperPoint
+from mkpc_kaggle.matchers.sparse import Encode, Keypoints, image_batch
+from mkpc_kaggle.weights import WeightStore, load_into
+
+
+@dataclass(frozen=True)
+class SuperPointLightGlueOptions(LightGlueOptions):
+    """With the settings of SuperPoint in LightGlue's published evaluation.
+
+    ``nms_radius``: half the suppression window, in pixels. Keypoints score above ``keypoint_threshold``.
+    """
+
+    nms_radius: int = 4
+    keypoint_threshold: float = 0.0005
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_ranges(self, nms_radius=AT_LEAST_0, keypoint_threshold=SHARE)
+
+
+SHAPE = LightGlueShape(descriptor=256)
+# No padding to a multiple: SuperPoint ignores the rows and columns beyond a multiple of 8.
+SPEC = MatcherSpec(
+    "superpoint_lightglue",
+    SuperPointLightGlueOptions,
+    Colour.GRAY,
+    slots=("superpoint", "superpoint-lightglue"),
+)
+
+
+def superpoint_encoder(network: SuperPoint, device: str) -> Encode:
+    @torch.inference_mode()
+    def encode(pictures: Sequence[Picture]) -> list[Keypoints]:
+        found = network(image_batch(pictures, device))
+        return [
+            Keypoints.on_content(each.points, each.descriptors, picture.content)
+            for each, picture in zip(found, pictures, strict=True)
+        ]
+
+    return encode
+
+
+def load(weights: WeightStore, options: SuperPointLightGlueOptions, placement: Placement) -> LightGlueMatcher:
+    network = SuperPoint(options.nms_radius, options.keypoint_threshold, options.features)
+    load_into(network, weights.load("superpoint"), what="superpoint")
+    encode = superpoint_encoder(prepared(network, placement), placement.device)
+    return load_lightglue(SPEC, encode, weights, options, placement, SHAPE)
