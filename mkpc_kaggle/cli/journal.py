@@ -50,7 +50,7 @@ def run(arguments: argparse.Namespace) -> None:
         read_log(arguments.work_dir)  # refuses a directory without a run
         with Store.open(arguments.work_dir) as store:
             freed = store.prune(Table.of(store).keys)
-        print(f"{freed / 1e6:.1f} MB are free again")
+        print(f"{freed / 1e6:.2f} MB are free again")
         return
     log = read_log(arguments.work_dir)
     written = write_csv(log, arguments.csv) if arguments.csv else []

@@ -190,9 +190,7 @@ def unblocked(descriptors: Sequence[int] = (1, 2)) -> Iterator[None]:
             stream.flush()
             sink = os.dup(number)
             raw = io.BufferedWriter(Queued(sink, _printer))
-            queued = io.TextIOWrapper(
-                raw, stream.encoding, stream.errors, write_through=True, line_buffering=True
-            )
+            queued = io.TextIOWrapper(raw, stream.encoding, stream.errors, write_through=True, line_buffering=True)
             setattr(sys, name, queued)
             file = ended.enter_context(TemporaryFile())
             os.dup2(file.fileno(), number)

@@ -36,10 +36,10 @@ class Phase(IntEnum):
 class MatchJob:
     """Run missing ``units`` on the pairs at ``indices``: one pair, or a minibatch on a GPU.
 
-    ``expected`` are the expected seconds of each unit per pair. A unit begins only if it is expected to end within
-    ``seconds`` of the job's start. ``known`` are each pair's points of stage 1, for critical regions, and ``crops``
-    their keys. ``upcoming`` are the images that will probably be matched next. ``is_retry`` states that the work
-    lost a worker before.
+    ``expected`` are the expected seconds of each unit per pair. A unit begins only if it is expected to
+    end within ``seconds`` of the job's start. ``known`` are each pair's points of stage 1, for critical
+    regions, and ``crops`` their keys. ``upcoming`` are the images that will probably be matched next.
+    ``is_retry`` states that the work lost a worker before.
     """
 
     phase: Phase

@@ -52,7 +52,6 @@ from mkpc_kaggle.engine.schedule import (
     outlook,
     scene_patience,
     upcoming_pairs,
-    waiting_batches,
 )
 from mkpc_kaggle.engine.state import EXPORT, State
 from mkpc_kaggle.engine.store import Kind, Result, Store, from_bytes
@@ -142,9 +141,7 @@ class Engine:
         about = self.store.about(jobs)
         data = self.store.data(key for key in about if about[key] is None)
         self._found = {**about, **data}
-        self._features = {
-            key: FeatureJob(key, do) for key, do in jobs.items() if key not in self._found
-        }
+        self._features = {key: FeatureJob(key, do) for key, do in jobs.items() if key not in self._found}
         self._loop()
         self._features = {}
         return self._found
@@ -231,9 +228,7 @@ class Engine:
             self._fall_back()
             if not self._hand_out(now):
                 return
-            if now - self._published > max(
-                PUBLISH_INTERVAL_S, self.budget.writing / PUBLISH_SHARE
-            ):
+            if now - self._published > max(PUBLISH_INTERVAL_S, self.budget.writing / PUBLISH_SHARE):
                 self._publish()
             limits = [place.limit for place in self.site.places if place.limit > now]
             self.site.wait(min([self.budget.stop_waiting, *limits, inf]))
@@ -302,9 +297,10 @@ class Engine:
         if now >= self._until:
             return None
         work = next_work(state, self.costs, self.budget, self.crew, now)
-        if work.match is not None and work.phase is not Phase.SWEEP:
-            self._explain_phase(state, work, now)
-        self._shown = work
+        if work.match is not None:
+            self._shown = work
+            if work.phase is not Phase.SWEEP:
+                self._explain_phase(state, work, now)
         return work
 
     def _explain_phase(self, state: State, work: NextWork, now: float) -> None:
@@ -410,9 +406,7 @@ class Engine:
         self._progress.note(f"batch {batch}: reconstructing its cameras from {len(pairs)} pairs")
         source = self.store.source([key for pair in pairs for key in pair.points.values()])
         contents = tuple(state.contents(index) for index in indices)
-        return SceneJob(
-            batch, key, pairs, contents, state.request.recipe, source, matches, export
-        )
+        return SceneJob(batch, key, pairs, contents, state.request.recipe, source, matches, export)
 
     def _time_limit(self, job: Job, now: float) -> float:
         """Return the seconds after which a worker counts as hung, from measured costs or from the time left."""
@@ -502,10 +496,7 @@ class Engine:
     def _take_points(self, job: MatchJob, answer: Sequence[Outcome]) -> None:
         state = self.state
         assert state is not None
-        results = [
-            state.results_of(outcome, crops)
-            for outcome, crops in zip(answer, job.crops, strict=True)
-        ]
+        results = [state.results_of(outcome, crops) for outcome, crops in zip(answer, job.crops, strict=True)]
         self.store.put(result for rows in results for result in rows)
         state.end(state.matching, job.indices)
         for outcome, rows in zip(answer, results, strict=True):
@@ -725,11 +716,7 @@ def extra_pairs_of(pairs: Sequence[Pair], config: SceneConfig | None) -> list[Pa
         return []
     extra: list[tuple[float, Pair]] = []
     for batch, indices in batches_of(pairs).items():
-        files = list(
-            dict.fromkeys(
-                file for index in indices for file in (pairs[index].file0, pairs[index].file1)
-            )
-        )
+        files = list(dict.fromkeys(file for index in indices for file in (pairs[index].file0, pairs[index].file1)))
         number = {file: index for index, file in enumerate(files)}
         ends = [(number[pairs[index].file0], number[pairs[index].file1]) for index in indices]
         distinct = len({tuple(sorted(pair)) for pair in ends})

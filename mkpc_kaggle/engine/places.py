@@ -1,7 +1,7 @@
 """Places of workers. A place has one worker at a time, and is closed after it loses three workers in a row.
 
-:attr:`Place.limit` comes from ``_time_limit`` of :mod:`loop`. :meth:`Place._fail` kills a worker that has not answered
-by this limit: the worker's process gets SIGKILL.
+What ends a hung worker: the loop sets :attr:`Place.limit` from measured costs (``Engine._time_limit``). By
+:meth:`Place.poll`, a worker that has not answered by then is killed: its process gets SIGKILL.
 """
 
 import os
@@ -128,9 +128,7 @@ class Site:
 
     matching_cores = 0  # that are used by the workers of matching on this machine
 
-    def __init__(
-        self, clock: Callable[[], float], *, threads: bool = False, log: Path | None = None
-    ) -> None:
+    def __init__(self, clock: Callable[[], float], *, threads: bool = False, log: Path | None = None) -> None:
         self._clock = clock
         self._bell: queue.SimpleQueue[None] = queue.SimpleQueue()
         self._worker = ThreadWorker if threads else ProcessWorker
@@ -139,12 +137,10 @@ class Site:
         estimators = 1 if threads else max(1, self._cores // CORES_PER_ESTIMATOR)
         make = partial(light_runner, in_process=not threads)
         self.places = [
-            Place(f"estimates {n}", partial(self._make, "estimates", make), Work.LIGHT)
-            for n in range(estimators)
+            Place(f"estimates {n}", partial(self._make, "estimates", make), Work.LIGHT) for n in range(estimators)
         ]
         self.places += [
-            Place("scenes" if n == 0 else f"scenes {n}", self.scene_worker, Work.SCENE)
-            for n in range(self._cores)
+            Place("scenes" if n == 0 else f"scenes {n}", self.scene_worker, Work.SCENE) for n in range(self._cores)
         ]
         self.fallback: list[Place] = []
 

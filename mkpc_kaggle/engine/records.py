@@ -154,9 +154,7 @@ class SceneRecord:
     choices: Mapping[str, Choice] = field(default_factory=dict, compare=False)
 
     @classmethod
-    def of(
-        cls, batch: str, found: Sequence[Reconstruction], seconds: float = 0.0
-    ) -> "SceneRecord":
+    def of(cls, batch: str, found: Sequence[Reconstruction], seconds: float = 0.0) -> "SceneRecord":
         models = models_of(found)
         reasons = dict.fromkeys(each.failure for each in found if each.failure)
         return cls(
@@ -170,19 +168,14 @@ class SceneRecord:
         )
 
     @classmethod
-    def of_solution(
-        cls, batch: str, answer: Solution, contents: Sequence[str], seconds: float
-    ) -> "SceneRecord":
+    def of_solution(cls, batch: str, answer: Solution, contents: Sequence[str], seconds: float) -> "SceneRecord":
         """Return the record of an answer; ``contents`` are those of the pairs, in the answer's order."""
         record = cls.of(batch, answer.reconstructions, seconds)
         return replace(record, choices=dict(zip(contents, answer.choices, strict=True)))
 
     def to_json(self) -> dict[str, Any]:
         """Return the record as JSON values."""
-        choices = {
-            contents: [str(choice.reason), _numbers(choice.F)]
-            for contents, choice in self.choices.items()
-        }
+        choices = {contents: [str(choice.reason), _numbers(choice.F)] for contents, choice in self.choices.items()}
         return {
             "batch": self.batch,
             "images": self.images,
@@ -198,8 +191,7 @@ class SceneRecord:
     def of_json(cls, about: Mapping[str, Any]) -> "SceneRecord":
         """Invert :meth:`to_json`."""
         choices = {
-            contents: Choice(_matrix(F), Reason(reason))
-            for contents, (reason, F) in about["choices"].items()
+            contents: Choice(_matrix(F), Reason(reason)) for contents, (reason, F) in about["choices"].items()
         }
         models = tuple(_model_of_json(model) for model in about["models"])
         return cls(**{**about, "models": models, "choices": choices})
@@ -289,10 +281,7 @@ def read_records(store: Store, table: Table | None = None) -> list[PairRecord]:
     keys = [key for row in rows for key in [*row.points, row.estimate] if key]
     about = store.about(keys)
     scenes = read_scenes(store, table)
-    return [
-        _pair_record(index, row, table, about, scenes.get(row.batch))
-        for index, row in enumerate(rows)
-    ]
+    return [_pair_record(index, row, table, about, scenes.get(row.batch)) for index, row in enumerate(rows)]
 
 
 def read_points(store: Store, table: Table, index: int) -> dict[str, Matches]:
@@ -413,9 +402,7 @@ def results(directory: Path | str) -> Results:
     from pandas import DataFrame  # importing it takes half a second
 
     pairs = DataFrame([_pair_row(record) for record in records])
-    units = [
-        {"pair": record.pair.id, **asdict(unit)} for record in records for unit in record.units
-    ]
+    units = [{"pair": record.pair.id, **asdict(unit)} for record in records for unit in record.units]
     return Results(pairs, DataFrame(units), DataFrame(list(_camera_rows(scenes.values()))))
 
 
@@ -544,5 +531,3 @@ def _evenly(points: NDArray[np.float64]) -> NDArray[np.float64]:
     count = min(MAX_DRAWN_POINTS, len(points))
     chosen = np.linspace(0, len(points) - 1, count).round().astype(int)
     return np.asarray(points[chosen])
-
-

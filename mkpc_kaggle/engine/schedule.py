@@ -203,9 +203,7 @@ def match_job(view: View, phase: Phase, missing: Mask, ready: Mask) -> MatchJob:
         alike = order[(missing[order] == missing[first]).all(1)]
     indices = tuple(alike[:size].tolist())
     # A cost is learnt from one unit, and a job of several units takes a small share of the time.
-    seconds = [
-        view.costs.mean(unit.name) if view.costs.is_known(unit.name) else inf for unit in units
-    ]
+    seconds = [view.costs.mean(unit.name) if view.costs.is_known(unit.name) else inf for unit in units]
     fits = np.cumsum(seconds) * len(indices) < JOB_SHARE * view.left
     units = units[: 1 if alone else max(1, int(fits.sum()))]
     expected = tuple(view.costs.mean(unit.name) for unit in units)
@@ -247,9 +245,7 @@ def lacking_estimates(state: State) -> Mask:
     return np.asarray(lacking)
 
 
-def scenes_due(
-    view: View, first: NDArray[Any], estimates: NDArray[Any], *, is_matching: bool
-) -> tuple[str, ...]:
+def scenes_due(view: View, first: NDArray[Any], estimates: NDArray[Any], *, is_matching: bool) -> tuple[str, ...]:
     """Return the batches to reconstruct now; batches without any scene come first.
 
     A batch's first scene waits for the units that fit in time, later scenes for all units until matching ends.
@@ -272,9 +268,7 @@ def scenes_due(
         numbers = state.batch_of[waited]
         counts[has_scene] = np.bincount(numbers[numbers >= 0], minlength=len(state.batches))
     order = sorted(waiting, key=state.scenes.__contains__)
-    return tuple(
-        batch for batch in order if not counts[batch in state.scenes][state.batches[batch]]
-    )
+    return tuple(batch for batch in order if not counts[batch in state.scenes][state.batches[batch]])
 
 
 def waiting_batches(state: State, crew: Crew) -> list[str]:
@@ -283,9 +277,7 @@ def waiting_batches(state: State, crew: Crew) -> list[str]:
     if not stale or not crew.scenes:
         return []
     matches = state.matches_of_batches()
-    return [
-        batch for batch, number in state.batches.items() if batch in stale and matches[number]
-    ]
+    return [batch for batch, number in state.batches.items() if batch in stale and matches[number]]
 
 
 def estimates_reserve(view: View) -> float:

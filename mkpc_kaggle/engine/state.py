@@ -50,19 +50,19 @@ EXPORT = "export "  # prefix of the keys of marks, which are names of batches
 class State:
     """Arrays for N pairs and the U units of a recipe, in their order. The first ``rows`` pairs have a row.
 
-    ``points`` (N, U): keys of the points in use, "" if none. ``has`` (N, U): there are some. ``current`` (N, U):
-    they are today's. ``matches`` (N, U): their number. ``estimates`` (N,): keys of the estimates in use; ``estimated`` (N,): they are today's.
-    ``inliers`` (N,), the F ``own`` (N, 3, 3) and ``has_own`` (N,) are of the estimate in use. ``skipped`` (N, U):
-    units that this run tries no more. ``matching`` (N,) and ``estimating`` (N,): pairs of jobs under way.
+    Of a pair's units (N, U): ``points``, the keys of the points in use, "" if none; ``has``, there are some;
+    ``current``, they are today's; ``matches``, their number; ``skipped``, this run tries the unit no more.
 
-    ``batches`` maps a batch's name to its number, ``batch_of`` (N,) has the number of each pair, -1 without one.
-    ``scenes`` has the scene in use of each batch, ``stale`` the batches whose scene is not today's, and
+    Of a pair (N,): ``estimates``, the key of the estimate in use; ``estimated``, it is today's; ``inliers``,
+    the F ``own`` (N, 3, 3) and ``has_own``, it is no fallback. ``matching`` and ``estimating`` are the pairs of
+    jobs under way. ``by_scene`` (N, 3, 3) and ``scene_source`` are the F that the scene in use gives, if any.
+
+    Of a batch: ``batches`` has its number by name, ``members`` its pairs; ``batch_of`` (N,) is -1 for a pair
+    without one. ``scenes`` has the scenes in use, ``stale`` the batches whose scene is not today's, and
     ``reconstructing`` those under way.
     """
 
-    def __init__(
-        self, request: Request, extra: Sequence[Pair], batches: Mapping[str, Sequence[int]]
-    ) -> None:
+    def __init__(self, request: Request, extra: Sequence[Pair], batches: Mapping[str, Sequence[int]]) -> None:
         self.request = request
         self.pairs = [*request.pairs, *extra]
         self.rows = len(request.pairs)
@@ -151,11 +151,11 @@ class State:
         rows = []
         points = self.points.tolist()
         for index, pair in enumerate(self.pairs):
-            failure = ""
+            reason = ""
             if unread := self.tries.given_up.get(("pair", index)):
-                failure = unread.message
+                reason = unread.message
             elif index in failures and not any(points[index]):
-                failure = next(iter(failures[index].values()))
+                reason = next(iter(failures[index].values()))
             rows.append(
                 Row(
                     pair.id,
@@ -167,7 +167,7 @@ class State:
                     self.estimates[index],
                     sources[index],
                     failures.get(index, {}),
-                    failure,
+                    reason,
                 )
             )
         units = [(unit.name, unit.stage) for unit in self.units]
@@ -253,9 +253,7 @@ class State:
         self._restore_estimates(store, known, old)
         self._restore_scenes(store, former, digests)
 
-    def _restore_points(
-        self, store: Store, known: list[int], old: Mapping[int, Row], units: list[str]
-    ) -> None:
+    def _restore_points(self, store: Store, known: list[int], old: Mapping[int, Row], units: list[str]) -> None:
         # Stage 1 first, because the keys of stage 2 depend on it.
         for stage in (False, True):
             numbers = np.flatnonzero(self.is_crop == stage).tolist()
@@ -280,9 +278,7 @@ class State:
                     self._use_points(index, number, used, about[used]["matches"])
                     self.current[index, number] = is_current
 
-    def _restore_estimates(
-        self, store: Store, known: list[int], old: Mapping[int, Row]
-    ) -> None:
+    def _restore_estimates(self, store: Store, known: list[int], old: Mapping[int, Row]) -> None:
         today = {index: self.estimate_key(index) for index in known if self.has[index].any()}
         others = {index: row.estimate for index, row in old.items() if row.estimate}
         about = store.about([*today.values(), *others.values()])

@@ -112,9 +112,7 @@ class Store:
             lock = directory / LOCK_NAME
             for path in (lock, store.path):
                 if path.exists() and not path.is_file():
-                    raise UserError(
-                        f"{path} is not a regular file; remove it, or name another --work-dir"
-                    )
+                    raise UserError(f"{path} is not a regular file; remove it, or name another --work-dir")
             with undamaged(lock, "remove it"):
                 # A separate file, so that others can read the store during a run.
                 store._lock = opened.enter_context(closing(connected(lock)))

@@ -77,9 +77,7 @@ class MatchRunner:
     :class:`mkpc_kaggle.errors.UserError` if none can be loaded.
     """
 
-    def __init__(
-        self, make_pipeline: Callable[[], "Pipeline"], *, threads: int = 0, share: int = 1
-    ) -> None:
+    def __init__(self, make_pipeline: Callable[[], "Pipeline"], *, threads: int = 0, share: int = 1) -> None:
         if threads or share > 1:
             import cv2
             import torch
@@ -180,9 +178,7 @@ def do_light_job(job: Job) -> tuple[Estimated, ...] | Found:
     return tuple(estimate_pair(pair, results, job.recipe) for pair, results in results_of(job))
 
 
-def estimate_pair(
-    pair: PairInputs, results: tuple[UnitResult, ...], recipe: Recipe
-) -> Estimated:
+def estimate_pair(pair: PairInputs, results: tuple[UnitResult, ...], recipe: Recipe) -> Estimated:
     """Estimate F of a pair, or E with intrinsics, from its points of all units."""
     start = time.perf_counter()
     sizes = tuple(image.size for image in pair.images)
@@ -230,6 +226,5 @@ def results_of(
     keys = [key for pair in job.pairs for key in pair.points.values()]
     points = job.source.matches(keys)
     return [
-        (pair, tuple(UnitResult(unit, points[key]) for unit, key in pair.points.items()))
-        for pair in job.pairs
+        (pair, tuple(UnitResult(unit, points[key]) for unit, key in pair.points.items())) for pair in job.pairs
     ]

@@ -119,9 +119,7 @@ def test_a_listed_image_is_set_upright_and_scored_as_it_is_stored(demo, scenes, 
 
 def test_the_estimate_of_a_pair_depends_on_its_cameras():
     keys, pair = Keys(()), Pair("p", "b", "0", "1")
-    digests = [
-        keys.of_estimate(replace(pair, intrinsics=both), ["points"]) for both in (None, (K, K), (K, K + 1))
-    ]
+    digests = [keys.of_estimate(replace(pair, intrinsics=both), ["points"]) for both in (None, (K, K), (K, K + 1))]
     assert len(set(digests)) == 3
 
 

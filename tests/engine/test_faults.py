@@ -4,6 +4,7 @@ import os
 import pty
 import random
 import signal
+import sqlite3
 import subprocess
 import sys
 import termios
@@ -113,6 +114,34 @@ def test_a_run_whose_store_is_full_keeps_its_results_in_memory(pairs, undisturbe
     resumed = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
     assert resumed.ending is Ending.COMPLETE
     assert matrices(resumed) == matrices(undisturbed)
+
+
+def test_an_error_of_the_disk_when_points_are_read_costs_a_job_and_the_run_goes_on(
+    pairs, undisturbed, tmp_path, monkeypatch
+):
+    errors, data = iter([sqlite3.OperationalError("disk I/O error")]), Store.data
+
+    def failing(store: Store, keys: Any) -> dict[str, bytes]:
+        for error in errors:
+            raise error
+        return data(store, keys)
+
+    monkeypatch.setattr(Store, "data", failing)
+    report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
+    assert report.ending is Ending.COMPLETE
+    assert any("disk I/O error" in fault for fault in report.faults)
+    assert matrices(report) == matrices(undisturbed)
+
+
+def test_an_error_of_the_disk_at_the_start_is_no_bad_input(demo, small_recipe, tmp_path, monkeypatch):
+    def failing(*_: Any) -> dict[str, Any]:
+        raise sqlite3.OperationalError("disk I/O error")
+
+    monkeypatch.setattr(Store, "about", failing)
+    output = tmp_path / "submission.csv"
+    with pytest.raises(sqlite3.OperationalError):  # a traceback, status 1
+        main(["submit", *arguments_of(demo, small_recipe, output), "--workers", "0"])
+    assert submission_problems(output, [pair.id for pair in read_test_side(demo.test_dir)]) == []
 
 
 def test_a_submission_that_the_disk_does_not_take_is_told_and_the_exit_status_is_one(

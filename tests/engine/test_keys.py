@@ -38,7 +38,7 @@ def test_estimates_and_scenes_have_a_digest_of_their_settings(changes, estimates
 @pytest.mark.parametrize(
     ("slot", "changed"), [("xfeat", [True, False, True]), ("aliked-n16", [False, True, True])]
 )
-def test_other_weights_of_a_matcher_change_its_points_and_those_of_stage_2_that_come_from_them(monkeypatch, slot, changed):
+def test_other_weights_change_the_points_of_their_units_and_of_stage_2(monkeypatch, slot, changed):
     units = Unit(1, "xfeat_lighterglue", 640), Unit(1, "aliked_lightglue", 640), Unit(2, "sift", 640)
     assembly = replace(assemble(CLASSICAL), recipe=replace(CLASSICAL, units=units))
 
@@ -69,9 +69,7 @@ OTHERS = {  # and whether the points of stage 1 and stage 2, the estimate and th
 
 @pytest.mark.parametrize(("other", "changed"), OTHERS.values(), ids=OTHERS)
 def test_a_key_is_the_digest_of_all_inputs_of_a_result(other, changed):
-    def chain(
-        digest="d", first="", turns=(0, 0), intrinsics=None, first_is_last=False, **settings
-    ) -> list[str]:
+    def chain(digest="d", first="", turns=(0, 0), intrinsics=None, first_is_last=False, **settings) -> list[str]:
         keys = Keys(("u", "v"), **{"mkpc": "m", "estimate": "e", "scene": "s"} | settings)
         pair = Pair("p", "b", "0.png", "1.png", intrinsics, turns)
         images = replace(IMAGES[0], digest=digest), IMAGES[1]

@@ -28,8 +28,9 @@ from mkpc_kaggle.engine.jobs import Cause, Failure, MatchJob, Phase
 from mkpc_kaggle.engine.keys import Keys
 from mkpc_kaggle.engine.loop import Engine
 from mkpc_kaggle.engine.request import Ending, Request
-from mkpc_kaggle.engine.schedule import Crew, NextWork, next_work, outlook, prefix_that_fits, View
+from mkpc_kaggle.engine.schedule import Crew, NextWork, View, next_work, outlook, prefix_that_fits
 from mkpc_kaggle.engine.state import State
+from mkpc_kaggle.engine.store import Kind, Store
 from mkpc_kaggle.recipe import Unit
 
 DIED = Failure(Cause.DIED, "signal SIGKILL")
@@ -117,7 +118,8 @@ def test_the_schedule_has_no_memory_and_changes_nothing():
     run.learn(*UNITS)
     before = {name: np.copy(value) for name, value in vars(run.state).items() if isinstance(value, np.ndarray)}
     first, second = run.next_work(), run.next_work()
-    assert (first.match.indices, first.match.units, first.fit) == (second.match.indices, second.match.units, second.fit)
+    assert first.match.indices == second.match.indices
+    assert (first.match.units, first.fit) == (second.match.units, second.fit)
     for name, value in before.items():
         np.testing.assert_array_equal(getattr(run.state, name), value)
 
@@ -398,6 +400,29 @@ def test_scenes_at_several_places_take_less_time_and_end_as_at_one():
     assert four.report.seconds < 0.6 * one.report.seconds
     written = [[record.chosen_fundamental.tobytes() for record in ran.report.records] for ran in (one, four)]
     assert written[0] == written[1]
+
+
+def test_the_loop_reads_nothing_back_but_the_points_that_crops_come_from(monkeypatch):
+    read, is_looping, loop = [], [], Engine._loop
+
+    def noted(engine: Engine) -> None:
+        is_looping.append(True)
+        loop(engine)
+        is_looping.clear()
+
+    def columns(store: Store, column: str, keys: Iterable[str]) -> Iterable[tuple[str, object]]:
+        asked = list(keys)
+        if is_looping and asked:
+            read.append((column, store.of_kind(Kind.POINTS).keys() >= set(asked)))
+        return whole(store, column, asked)
+
+    whole = Store._columns
+    monkeypatch.setattr(Engine, "_loop", noted)
+    monkeypatch.setattr(Store, "_columns", columns)
+    ran = simulate(Scenario(40, (1.0, 1.0), 1, math.inf, misses=0, batches=4))
+    assert len(ran.scenes) >= 4
+    assert set(read) == {("data", True)}
+    assert len(read) <= 40, "once for the unit of stage 2 on each pair"
 
 
 def test_reading_how_a_run_ended_changes_nothing():

@@ -258,5 +258,6 @@ def test_regions_of_ones_own_take_the_place_of_mkpcs(demo, scenes, small_recipe,
         assert ([region.box for region in record.regions] == [*boxes]) == bool(options)
         assert ({region.reason for region in record.regions} == {RegionReason.GIVEN}) == bool(options)
         with closing(sqlite3.connect(tmp_path / "run" / "journal.sqlite")) as database:
-            assert database.execute("SELECT count(*) FROM result WHERE kind = 'points'").fetchone() == (rows,)  # other regions, others
+            count = "SELECT count(*) FROM result WHERE kind = 'points'"
+            assert database.execute(count).fetchone() == (rows,)  # other regions, others
     np.testing.assert_array_equal(found.points0, match.matches.points0)

@@ -35,9 +35,7 @@ def a_run(directory: Path, count: int = 12) -> list[Pair]:
 
 def empty_store(work_dir: Path, pairs: list[Pair], **about: object) -> Store:
     store = Store.open(work_dir)
-    rows = [
-        Row(pair.id, pair.group, *pair.names, 0, 0, "", [], "", "fallback", {}, "") for pair in pairs
-    ]
+    rows = [Row(pair.id, pair.group, *pair.names, 0, 0, "", [], "", "fallback", {}, "") for pair in pairs]
     facts = About({**THREE_UNITS.table(), "name": "three"}, **about)
     written = np.tile(FALLBACK_FUNDAMENTAL, (len(pairs), 1, 1))
     store.put([Table(facts, [], len(pairs), rows, {}, written).to_result()])

@@ -375,6 +375,7 @@ class Ran:
     last_job: float
     scenes: tuple[SceneRun, ...]
     stale: set[str]
+    keys: list[list[str]]  # of the points and the estimate of each pair
 
     @property
     def work_left(self) -> bool:
@@ -421,6 +422,7 @@ def simulate(scenario: Scenario, store: Store | None = None, until: float = math
         site.last_job,
         tuple(site.scenes),
         set(state.stale),
+        [[*points, state.estimates[index]] for index, points in enumerate(state.points.tolist())],
     )
 
 
@@ -440,4 +442,4 @@ def sweep_seconds(scenario: Scenario) -> float:
 
 def without_records(ran: Ran) -> Ran:
     """Return the run without its records: a thousand runs with theirs would fill the memory."""
-    return replace(ran, report=replace(ran.report, records=()), scenes=())
+    return replace(ran, report=replace(ran.report, records=()), scenes=(), keys=[])
