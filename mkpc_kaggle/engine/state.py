@@ -86,6 +86,8 @@ class State:
         self.scene_source = np.full(count, FALLBACK)
         self.images: dict[str, BatchImage] = {}
         self._contents = [""] * count
+        self._rows: list[Row | None] = [None] * count  # of the table of pairs
+        self._new = set(range(count))  # rows that have changed since the last table
         self.tries = Tries()
         self.batches = {name: number for number, name in enumerate(batches)}
         self.members = [np.asarray(members, int) for members in batches.values()]
@@ -141,39 +143,35 @@ class State:
         return np.asarray(self.current[rows].all(1) & self.estimated[rows])
 
     def table(self) -> Table:
-        """Return the table of pairs."""
-        sources = [SOURCES[number] for number in self.sources] + [""] * len(self.pairs)
-        failures: dict[int, dict[str, str]] = {}
-        for item, failure in list(self.tries.given_up.items()):
-            match item:
-                case ("unit", int(index), str(unit)) if failure.cause is Cause.UNIT_RAISED:
-                    failures.setdefault(index, {})[unit] = failure.message
-        rows = []
-        points = self.points.tolist()
-        for index, pair in enumerate(self.pairs):
-            reason = ""
-            if unread := self.tries.given_up.get(("pair", index)):
-                reason = unread.message
-            elif index in failures and not any(points[index]):
-                reason = next(iter(failures[index].values()))
-            rows.append(
-                Row(
-                    pair.id,
-                    pair.group,
-                    *self.names[index],
-                    *pair.turns,
-                    self.contents(index),
-                    points[index],
-                    self.estimates[index],
-                    sources[index],
-                    failures.get(index, {}),
-                    reason,
-                )
-            )
+        """Return the table of pairs. Only rows that have changed since the last table are made anew."""
+        sources = self.sources
+        for index in self._new:
+            source = SOURCES[sources[index]] if index < self.rows else ""
+            self._rows[index] = self._row(index, source)
+        self._new.clear()
         units = [(unit.name, unit.stage) for unit in self.units]
-        about = self.request.about
-        keys = dict(self.scene_keys)
-        return Table(about, units, self.rows, rows, keys, self.fundamentals)
+        rows = [row for row in self._rows if row is not None]
+        scenes = dict(self.scene_keys)
+        return Table(self.request.about, units, self.rows, rows, scenes, self.fundamentals)
+
+    def _row(self, index: int, source: str) -> Row:
+        pair = self.pairs[index]
+        given_up = self.tries.given_up
+        failures = {}
+        for unit in self.units:
+            failure = given_up.get(("unit", index, unit.name))
+            if failure is not None and failure.cause is Cause.UNIT_RAISED:
+                failures[unit.name] = failure.message
+        points = self.points[index].tolist()
+        reason = ""
+        if unread := given_up.get(("pair", index)):
+            reason = unread.message
+        elif failures and not any(points):
+            reason = next(iter(failures.values()))
+        contents = self.contents(index)
+        names = self.names[index]
+        estimate = self.estimates[index]
+        return Row(pair.id, pair.group, *names, *pair.turns, contents, points, estimate, source, failures, reason)
 
     # Keys of today
 
@@ -456,6 +454,7 @@ class State:
         self.scenes[batch] = record
         self.scene_keys[batch] = key
         members = self.members[self.batches[batch]]
+        self._new.update(members.tolist())
         self.scene_source[members] = FALLBACK
         for index in members.tolist():
             choice = record.choices.get(self.contents(index))
@@ -465,6 +464,8 @@ class State:
                 self.scene_source[index] = SCENE if choice.from_scene else PAIR
 
     def _changed(self, index: int) -> None:
+        """Note that a pair has other points, or another estimate, than before."""
+        self._new.add(index)
         self.stale.update([self.pairs[index].group] if self.batch_of[index] >= 0 else [])
 
     # Jobs and failures
@@ -483,10 +484,12 @@ class State:
         self.tries.given_up[item] = failure
         match item:
             case ("unit", index, unit):
+                self._new.add(index)
                 self.skipped[self._twins.get(index, [index]), self.number_of[unit]] = True
             case ("matcher", unit):
                 self.skipped[:, self.number_of[unit]] = True
             case ("pair", index):
+                self._new.add(index)
                 self.skipped[index] = True
 
     def given_up_units(self) -> Iterator[str]:
@@ -499,6 +502,7 @@ class State:
     def forget_failures(self) -> None:
         """Forget what the devices so far could not do: another one takes over."""
         self.tries = Tries()
+        self._new.update(range(len(self.pairs)))
         self.skipped[:] = False
         self.matching[:] = False
 
