@@ -30,15 +30,15 @@ GENUINE = $(shell awk '/ wheel:/ && $$2 ~ /^[0-9]+$$/ { print $$1 }' weights_man
 .PHONY: demo test weights ray hostile oldest newest install lint tests clean
 
 demo: install
-	$(BIN)/python -m mkpc_kaggle demo --out $(DEMO)
+	$(BIN)/mkpc demo --out $(DEMO)
 	$(BIN)/python make_submission.py --test-dir $(DEMO)/test --recipe auto --output $(DEMO)/submission.csv
-	$(BIN)/python -m mkpc_kaggle check $(DEMO)/submission.csv --test-dir $(DEMO)/test
+	$(BIN)/mkpc check $(DEMO)/submission.csv --test-dir $(DEMO)/test
 	$(BIN)/python make_submission.py --test-dir $(DEMO)/test --recipe auto --mode whole-images \
 	    --output $(DEMO)/single_stage.csv
-	$(BIN)/python -m mkpc_kaggle match $(DEMO)/train/courtyard/images/courtyard_0005.jpg \
+	$(BIN)/mkpc match $(DEMO)/train/courtyard/images/courtyard_0005.jpg \
 	    $(DEMO)/train/courtyard/images/courtyard_0000.jpg --out $(DEMO)/pair.png
 	@echo
-	@$(BIN)/python -m mkpc_kaggle validate --train-dir $(DEMO)/train --truth $(DEMO)/test_truth.csv \
+	@$(BIN)/mkpc validate --train-dir $(DEMO)/train --truth $(DEMO)/test_truth.csv \
 	    --submission $(DEMO)/single_stage.csv --submission $(DEMO)/submission.csv
 	@echo "submission: $(DEMO)/submission.csv   figure: $(DEMO)/pair.png"
 

@@ -30,9 +30,9 @@ from torch import nn
 
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
 from mkpc_kaggle.matchers.adapters.loma import LomaAdapter, LomaOptions
-from mkpc_kaggle.matchers.adapters.roma import FIRST_PASSES, PATCH, SPEC
+from mkpc_kaggle.matchers.adapters.roma import PATCH, SPEC, RomaOptions
 from mkpc_kaggle.matchers.adapters.sift import SiftMatcher, SiftOptions
-from mkpc_kaggle.matchers.contract import Colour, Matcher, Picture, Placement, Precision, Training
+from mkpc_kaggle.matchers.contract import Colour, Matcher, Picture, Placement, Precision
 from mkpc_kaggle.matchers.dense import DenseMatcher
 from mkpc_kaggle.matchers.networks.loftr import Loftr
 from mkpc_kaggle.matchers.networks.loma import Loma, Variant
@@ -75,8 +75,8 @@ def loma(variant: Variant, placement: Placement) -> LomaAdapter:
 
 
 def roma(placement: Placement) -> DenseMatcher:
-    network, first_pass = random_network(RoMa, placement), FIRST_PASSES[Training.OUTDOOR]
-    return DenseMatcher(SPEC, network, placement.device, multiple=PATCH, first_pass=first_pass)
+    network = random_network(RoMa, placement)
+    return DenseMatcher(SPEC, network, RomaOptions(), placement.device, multiple=PATCH)
 
 
 def with_lightglue(name: str, layers: int, keypoints: int = KEYPOINTS) -> Callable[[Placement], Matcher[Any]]:
@@ -95,7 +95,7 @@ CASES = {
     "loma, b128": Case(partial(loma, Variant.B128), SPARSE),
     "loma, b": Case(partial(loma, Variant.B), SPARSE),
     **{name: Case(MATCHERS[name], SEMI_DENSE) for name in ("loftr", "quadtree", "aspanformer")},
-    "dkm": Case(partial(light_matchers.dkm_matcher, make=DenseMatcher), Size(720, 540)),
+    "dkm": Case(partial(light_matchers.dkm_matcher, matches=5000), Size(720, 540)),
     "roma": Case(roma, Size(864, 864)),
 }
 

@@ -31,7 +31,7 @@ from benchmarks.estimation import Known, batch_pair, compare, draws_parser, extr
 from benchmarks.pycolmap_alone import matched
 from mkpc_kaggle.geometry.coordinates import Matrix3
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.recipe import CameraSharing, SceneConfig
+from mkpc_kaggle.recipe import CameraModel, CameraSharing, SceneConfig
 from mkpc_kaggle.scene import colmap, keypoints
 from mkpc_kaggle.scene.reconstruct import reconstruct_batch
 from mkpc_kaggle.scene.reconstruction import MIN_IMAGES
@@ -70,13 +70,12 @@ def matches_of(known: Known, source: str, databases: Path) -> Matches:
 
 
 @contextmanager
-def stages(cell: float, error: float, camera: str, mapper: str) -> Iterator[None]:
+def stages(cell: float, error: float, mapper: str) -> Iterator[None]:
     """Exchange the stages of :mod:`mkpc_kaggle.scene` within the context."""
     with ExitStack() as stack:
         stack.enter_context(patch.object(keypoints, "CELL_PX", cell or UNMERGED_PX))
         trials = colmap.MAX_TRIALS if error < COLMAP_ERROR_PX else COLMAP_TRIALS
-        model = "SIMPLE_PINHOLE" if camera == "pinhole" else "SIMPLE_RADIAL"
-        stack.enter_context(patch.multiple(colmap, MAX_ERROR_PX=error, MAX_TRIALS=trials, CAMERA_MODEL=model))
+        stack.enter_context(patch.multiple(colmap, MAX_ERROR_PX=error, MAX_TRIALS=trials))
         if mapper == "incremental":
             stack.enter_context(patch.object(pycolmap, "GlobalPipeline", incremental))
         yield
@@ -90,12 +89,13 @@ def incremental(_: Any, database: Any, manager: Any) -> Any:
 def by_stages(row: str, databases: Path, pairs: Sequence[Known], every: Sequence[Known]) -> list[Matrix3 | None]:
     """Return each pair's F from a row's scene, else the pair's own: an estimator of `benchmarks.estimation`."""
     source, cell, error, camera, mapper = row.split("/")
-    config = SceneConfig(cameras=CameraSharing.IMAGE)
+    model = CameraModel.SIMPLE_PINHOLE if camera == "pinhole" else CameraModel.SIMPLE_RADIAL
+    config = SceneConfig(cameras=CameraSharing.IMAGE, camera_model=model)
     batch = [
         replace(batch_pair(known.true, known.found, known.F), tracks=matches_of(known, source, databases))
         for known in (*pairs, *extra_of(pairs, every, config))
     ]
-    with stages(float(cell), float(error), camera, mapper):
+    with stages(float(cell), float(error), mapper):
         choices = reconstruct_batch(batch, config).choices[: len(pairs)]
     return [known.F if choice.F is None else choice.F for known, choice in zip(pairs, choices, strict=True)]
 

@@ -21,6 +21,7 @@ from mkpc_kaggle.geometry.robust import RobustConfig
 
 DIRECTORY = Path(__file__).resolve().parent / "recipes"
 MAX_SIDE_PX = 99_999
+TABLES = ("mkpc", "magsac", "focal", "matchers", "scene")  # of settings
 AREA = re.compile(r"[1-9]\d{0,4}x[1-9]\d{0,4}", re.ASCII)
 
 
@@ -83,15 +84,28 @@ class CameraSharing(StrEnum):
     FOLDER = "folder"  # all: a scene's images are in one folder
 
 
+class CameraModel(StrEnum):
+    """COLMAP's camera models of perspective lenses. F of a pair needs one without distortion."""
+
+    SIMPLE_PINHOLE = "SIMPLE_PINHOLE"
+    PINHOLE = "PINHOLE"
+    SIMPLE_RADIAL = "SIMPLE_RADIAL"
+    RADIAL = "RADIAL"
+    OPENCV = "OPENCV"
+    FULL_OPENCV = "FULL_OPENCV"
+
+
 @dataclass(frozen=True)
 class SceneConfig:
     """Settings of :mod:`mkpc_kaggle.scene`, table ``[scene]`` of a recipe."""
 
     pairs_per_image: float = 10.0  # a batch with fewer gets extra pairs, used only for its scene; 0: none
     cameras: CameraSharing = CameraSharing.AUTO
+    camera_model: CameraModel = CameraModel.SIMPLE_PINHOLE
+    threads: int = 1  # of the mapper; with more, the last digits vary from run to run
 
     def __post_init__(self) -> None:
-        check_ranges(self, pairs_per_image=AT_LEAST_0)
+        check_ranges(self, pairs_per_image=AT_LEAST_0, threads=AT_LEAST_1)
 
 
 @dataclass(frozen=True)
@@ -175,9 +189,43 @@ class Recipe:
     def table(self) -> dict[str, Any]:
         """Return the table that :func:`recipe_of` reads, as JSON values."""
         values = asdict(self)
-        return {
-            name: values[name] for name in ("description", "units", "mkpc", "magsac", "focal", "matchers", "scene")
-        }
+        values["units"] = list(values["units"])
+        return {name: values[name] for name in ("description", "units", *TABLES)}
+
+
+def with_settings(recipe: Recipe, settings: Mapping[str, Any]) -> Recipe:
+    """Return the recipe with other settings, by dotted key, such as ``matchers.loftr.threshold``.
+
+    A missing table is added, as in a file. Raises :class:`UserError` for a key or a value that a
+    file may not have.
+    """
+    table = recipe.table()
+    for key, value in settings.items():
+        *names, last = key.split(".")
+        if not names or names[0] not in TABLES:
+            known = ", ".join(TABLES)
+            raise UserError(f"--set {key}: expected TABLE.KEY=VALUE; the tables are {known}")
+        place = table
+        for name in names:
+            if place.get(name) is None:
+                place[name] = {}
+            place = place[name]
+            if not isinstance(place, dict):
+                raise UserError(f"--set {key}: {name} is a key, not a table of keys")
+        place[last] = value
+    return recipe_of(table, recipe.name)
+
+
+def parse_setting(text: str) -> tuple[str, Any]:
+    """Return the key and the value of ``TABLE.KEY=VALUE``; a value that is not TOML is a text."""
+    key, separator, value = text.partition("=")
+    if not separator:
+        raise UserError(f"--set {text}: expected TABLE.KEY=VALUE, such as magsac.threshold=0.3")
+    try:
+        parsed = tomllib.loads(f"value = {value}")
+    except (ValueError, RecursionError):
+        return key.strip(), value.strip()
+    return key.strip(), parsed["value"]
 
 
 def split_mode(text: str) -> tuple[str, Mode]:
@@ -197,8 +245,9 @@ def parse_recipe(text: str, name: str) -> Recipe:
 def recipe_of(table: Mapping[str, Any], name: str) -> Recipe:
     """Return the recipe of a TOML file's or a journal's table. Raise :class:`UserError` if it is invalid."""
     where = f"recipe {name!r}"
-    check_keys(table, ("description", "units", "mkpc", "magsac", "focal", "matchers", "scene"), where)
-    units, matchers = table.get("units", []), table.get("matchers", {})
+    check_keys(table, ("description", "units", *TABLES), where)
+    units = table.get("units", [])
+    matchers = table.get("matchers", {})
     if not isinstance(units, list) or not isinstance(matchers, dict):
         raise UserError(f"{where}: units must be a list of tables, and matchers a table")
 

@@ -64,8 +64,8 @@ def inner(parser):
 def commands(page: Path) -> Iterator[tuple[str, list[str]]]:
     """Each command of ours on a page, and the options that it is given there."""
     text = page.read_text(encoding="utf-8").replace("\\\n", " ")
-    for line in re.findall(r"(?:(?:python -m mkpc_kaggle|mkpc) [a-z]|make_submission\.py )[^`\n#;]*", text):
-        name = "submit" if line.startswith("make") else line.removeprefix("python -m ").split()[1]
+    for line in re.findall(r"(?:(?<![\w/-])mkpc [a-z]|make_submission\.py )[^`\n#;]*", text):
+        name = "submit" if line.startswith("make") else line.split()[1]
         yield name, re.findall(r"(?<= )--[a-z0-9-]+", line)
 
 

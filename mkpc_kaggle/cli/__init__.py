@@ -1,4 +1,4 @@
-"""The command line: ``python -m mkpc_kaggle COMMAND`` and ``make_submission.py``."""
+"""The command line: ``mkpc COMMAND``, ``python -m mkpc_kaggle COMMAND``, ``make_submission.py``."""
 
 import argparse
 import errno
@@ -14,6 +14,7 @@ from io import TextIOWrapper
 from pathlib import Path
 from typing import NoReturn
 
+from mkpc_kaggle.cli.help import HelpFormatter
 from mkpc_kaggle.version import __version__
 
 COMMANDS = {
@@ -21,7 +22,7 @@ COMMANDS = {
     "match": "two images -> F, counts, a figure",
     "reconstruct": "a folder of images -> cameras, a COLMAP database, models",
     "validate": "a directory with known poses -> mAA and pose AUC of a recipe",
-    "recipes": "list recipes, their units and missing weights",
+    "recipes": "list recipes; with a name, its units and missing weights",
     "weights": "list, verify, fetch and convert weight files",
     "check": "compare a submission.csv with the competition's format",
     "journal": "a run's journal -> overview, tables for pandas, report.html",
@@ -64,7 +65,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         warnings.showwarning = lambda message, *_, **__: warn(str(message))
         try:
             given = sys.argv[1:] if arguments is None else list(arguments)
-            parsed = make_parser(given).parse_args(given)
+            parser = make_parser(given)
+            if not given:
+                parser.print_help()
+                return 0
+            parsed = parser.parse_args(given)
             try:
                 Path.cwd()  # relative paths are undefined without it
             except OSError as error:
@@ -94,11 +99,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def make_parser(arguments: Sequence[str] = tuple(COMMANDS)) -> argparse.ArgumentParser:
     """Return the parser for these arguments. Import only the commands that they name: imports take time."""
     text = "Two-stage image matching with Matching Key-Points Crop, offline, inside a time budget."
-    parser = argparse.ArgumentParser("mkpc_kaggle", description=text, epilog="COMMAND --help has the options.")
+    epilog = "mkpc COMMAND --help has the options of a command."
+    parser = argparse.ArgumentParser("mkpc", description=text, epilog=epilog, formatter_class=HelpFormatter)
     parser.add_argument("--version", action="version", version=__version__)
-    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
     for name, summary in COMMANDS.items():
-        sub = commands.add_parser(name, help=summary, formatter_class=argparse.RawDescriptionHelpFormatter)
+        sub = commands.add_parser(name, help=summary, formatter_class=HelpFormatter)
         if name in arguments:
             command = import_module(f"mkpc_kaggle.cli.{name}")
             sub.description = command.HELP

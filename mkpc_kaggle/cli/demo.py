@@ -10,9 +10,9 @@ HELP = """\
 Render scenes of stone walls and painted boxes with known cameras, in the competition's layout: DIR/train with
 poses, DIR/test without poses, and DIR/test_truth.csv to score a submission:
 
-  python -m mkpc_kaggle demo --out demo
+  mkpc demo --out demo
   python make_submission.py --test-dir demo/test
-  python -m mkpc_kaggle validate --train-dir demo/train --submission submission.csv --truth demo/test_truth.csv
+  mkpc validate --train-dir demo/train --submission submission.csv --truth demo/test_truth.csv
 """
 
 

@@ -4,17 +4,25 @@ import argparse
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 from mkpc_kaggle.cli import options
-from mkpc_kaggle.data.outputs import require_apart
+from mkpc_kaggle.data.outputs import replacing, require_apart
 from mkpc_kaggle.engine.console import unblocked
+from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
+from mkpc_kaggle.pipeline.pair import PairMatch
 from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher, to_image
 from mkpc_kaggle.reporting.figures import draw_pair, require_format, save
 
 HELP = """\
-Match two images. Print the fundamental matrix (x1^T F x0 = 0, pixel centres at integers), the number of matches
-of each unit, and the critical regions. --out draws the matches, the clusters and the critical regions. Points are
-in pixels of the stored files, without the EXIF orientation; figures are upright.
+Match two images. Print the fundamental matrix F (x1^T F x0 = 0, pixel centres at integers), the
+number of matches of each unit, and the critical regions. Points are in pixels of the stored
+files, without the EXIF orientation; figures are upright.
+
+  --out   draws the matches, the clusters and the critical regions
+  --save  writes the arrays points0 and points1 (N x 2), scores (N), inliers (N, true or false)
+          and F (3 x 3), for numpy.load
 """
 
 
@@ -23,32 +31,69 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("image0", type=Path)
     parser.add_argument("image1", type=Path)
     parser.add_argument("--out", type=Path, metavar="FIG.png", help="draw the pair; the suffix sets the format")
+    text = "save the points, scores, inliers and F as arrays"
+    parser.add_argument("--save", type=Path, metavar="FILE.npz", help=text)
     options.add_matching(parser)
 
 
 def run(arguments: argparse.Namespace) -> None:
     inputs = [arguments.image0, arguments.image1, Path(arguments.recipe)]
-    require_apart({"--out": arguments.out}, inputs, weights=arguments.weights)
+    files = {"--out": arguments.out, "--save": arguments.save}
+    require_apart(files, inputs, weights=arguments.weights)
     if arguments.out is not None:
         require_format(arguments.out)
+    if arguments.save is not None and arguments.save.suffix != ".npz":
+        raise UserError(f"--save {arguments.save}: the name must end in .npz")
     images = to_image(arguments.image0), to_image(arguments.image1)
-    given = {name: getattr(arguments, name) for name in ("weights", "device", "precision", "licence")}
-    matcher = TwoStageMatcher(arguments.recipe, **given)
+    matcher = TwoStageMatcher(
+        arguments.recipe,
+        weights=arguments.weights,
+        device=arguments.device,
+        precision=arguments.precision,
+        licence=arguments.licence,
+        settings=options.settings_of(arguments),
+    )
     match = matcher(*images)
+    print("\n".join(_lines(match, matcher.recipe.name)))
+    if arguments.out is not None:
+        save(draw_pair(*images, match, matcher.recipe.mkpc), arguments.out)
+        print(f"figure: {arguments.out}")
+    if arguments.save is not None:
+        with writing(f"--save {arguments.save}"):
+            save_arrays(match, arguments.save)
+        print(f"arrays: {arguments.save}")
+
+
+def save_arrays(match: PairMatch, path: Path) -> None:
+    """Write points (N, 2) float32 of both images, scores (N,), inliers (N,) bool and F (3, 3)."""
+    matches = match.matches
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as stream:
+        np.savez(
+            stream.buffer,
+            points0=matches.points0,
+            points1=matches.points1,
+            scores=matches.scores,
+            inliers=match.estimate.inliers,
+            F=match.estimate.matrix,
+        )
+
+
+def _lines(match: PairMatch, recipe: str) -> list[str]:
+    """Return the result as lines: F, counts, the units, the critical regions."""
     found = match.estimate
-    lines = [" ".join(f"{value: .9e}" for value in row) for row in found.matrix]
+    lines = [f"F, by recipe {recipe}; x1^T F x0 = 0 in pixels of the stored files:"]
+    lines += [" ".join(f"{value: .9e}" for value in row) for row in found.matrix]
     lines += [f"this is the fallback: {found.failure}"] if found.failure else []
     lines.append(f"{len(match.matches)} matches, {found.inlier_count} inliers")
     verdict = "the images overlap" if found.stats.support >= MIN_SUPPORT else "the images may not overlap"
     lines.append(f"{found.stats.support:.1f} times the inliers expected by chance: {verdict}")
     for result in match.results:
-        counts = f"{len(result.matches):>6} matches  {result.seconds:.2f} s  {result.failure or result.note}"
-        lines.append(f"  {result.unit.name:<30}{counts}")
+        counts = f"{len(result.matches):>6} matches  {result.seconds:.2f} s"
+        remark = result.failure or result.note
+        lines.append(f"  {result.unit.name:<30}{counts}  {remark}".rstrip())
     for number, region in enumerate(match.regions or ()):
         box = region.box
         where = f"x {box.left}..{box.right - 1}, y {box.top}..{box.bottom - 1}"
-        lines.append(f"image {number}: {region.reason}, {where}")
-    print("\n".join(lines))
-    if arguments.out is not None:
-        save(draw_pair(*images, match, matcher.recipe.mkpc), arguments.out)
-        print(f"figure: {arguments.out}")
+        lines.append(f"image {number}: critical region {where} ({region.reason})")
+    return lines

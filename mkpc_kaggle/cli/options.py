@@ -5,6 +5,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from math import inf
 from pathlib import Path
+from typing import Any
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.budget import Budget, monotonic_of, parse_duration
@@ -14,7 +15,7 @@ from mkpc_kaggle.engine.request import RunReport
 from mkpc_kaggle.engine.session import Interrupt, Session
 from mkpc_kaggle.pipeline.assembly import Assembly, assemble
 from mkpc_kaggle.pipeline.availability import Licence
-from mkpc_kaggle.recipe import Mode
+from mkpc_kaggle.recipe import Mode, parse_setting
 from mkpc_kaggle.reporting.summary import left_out_line
 
 
@@ -28,6 +29,9 @@ def add_matching(parser: argparse.ArgumentParser) -> None:
     add("--device", default="auto", help="cpu, cuda, cuda:N, or auto (the default): all GPUs, else the CPU")
     text = "of the networks; auto: half precision if the device computes faster with it (default: float32)"
     add("--precision", default="float32", choices=["float32", "auto", "bfloat16", "float16"], help=text)
+    text = """another value of a recipe's setting, such as matchers.loftr.threshold=0.3; may be
+        repeated. docs/recipes.md lists the settings"""
+    add("--set", action="append", default=[], metavar="TABLE.KEY=VALUE", help=text)
 
 
 def add_weights(parser: argparse.ArgumentParser) -> None:
@@ -53,11 +57,23 @@ def add_run(parser: argparse.ArgumentParser, time_limit: str | None) -> None:
     add("--explain", action="store_true", help="print the plan at the end: what, when and why")
 
 
+def settings_of(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Return the settings of ``--set`` by dotted key; the last value of a key counts."""
+    return dict(map(parse_setting, arguments.set))
+
+
 def assembly_of(arguments: argparse.Namespace, recipe: str, mode: str, interrupt: Interrupt) -> Assembly:
-    given = {name: getattr(arguments, name) for name in ("weights", "device", "precision")}
-    licence, scenes = Licence(arguments.licence), arguments.reconstruct
     with interrupt.raising():  # computing the digests of large files takes long
-        return assemble(recipe, **given, mode=Mode(mode), licence=licence, scenes=scenes)
+        return assemble(
+            recipe,
+            weights=arguments.weights,
+            device=arguments.device,
+            precision=arguments.precision,
+            mode=Mode(mode),
+            licence=Licence(arguments.licence),
+            scenes=arguments.reconstruct,
+            settings=settings_of(arguments),
+        )
 
 
 def budget_of(arguments: argparse.Namespace) -> Budget:
@@ -77,7 +93,7 @@ def watched_session(arguments: argparse.Namespace, work_dir: Path, interrupt: In
 def say_start(what: str, assembly: Assembly, work_dir: Path) -> None:
     """Print the input, the recipe and the omitted matchers."""
     header = f"{what}, recipe {assembly.recipe.name}, {assembly.placement}, journal in {work_dir}"
-    say("\n".join(filter(None, [header, left_out_line(assembly.left_out)])))
+    say("\n".join(filter(None, [header, left_out_line(assembly.recipe, assembly.left_out)])))
 
 
 def finish(session: Session, page: Path | None, pairs: Sequence[Pair]) -> int:

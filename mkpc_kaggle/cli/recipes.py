@@ -3,29 +3,50 @@
 import argparse
 
 from mkpc_kaggle.cli import options
-from mkpc_kaggle.pipeline.availability import unavailable
-from mkpc_kaggle.recipe import load_recipe, recipe_names
+from mkpc_kaggle.pipeline.availability import UnavailableReason, unavailable
+from mkpc_kaggle.recipe import Recipe, load_recipe, recipe_names
 from mkpc_kaggle.weights import WeightStore
 
 HELP = """\
-List the recipes: their units in order of importance, and missing weight files. A unit is printed as
-stage:matcher@size, with its maximum number of matches. The size is the view's long side, or a height x width: the
-view gets this area at its own aspect ratio, or exactly this height and width ("!").
-A custom recipe is a TOML file in the format of the package's recipes: --recipe FILE.toml.
+List the recipes, one per line. With a name or a file, list its units in order of importance, and the
+matchers that cannot run here.
+
+A unit is printed as stage:matcher@size, with its maximum number of matches. The size is the view's long
+side, or a height x width: the view gets this area at its own aspect ratio, or exactly this height and
+width ("!"). A custom recipe is a TOML file in the format of the package's recipes: --recipe FILE.toml.
 """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    text = "list the units of this recipe"
+    parser.add_argument("name", nargs="?", metavar="NAME|FILE.toml", help=text)
     options.add_weights(parser)
 
 
 def run(arguments: argparse.Namespace) -> None:
     store = WeightStore(arguments.weights)
+    if arguments.name is not None:
+        recipe = load_recipe(arguments.name)
+        print("\n".join(unit_lines(recipe, unavailable(recipe, store))))
+        return
+    rows = [("recipe", "runs here", "matchers")]
     for name in recipe_names():
         recipe = load_recipe(name)
-        print(f"{name}: {recipe.description}")
-        for unit in recipe.units:
-            fallback = f"  (or {unit.fallback}, if its weights are missing)" if unit.fallback else ""
-            print(f"    {unit.name}  at most {unit.max_matches}{fallback}")
-        reasons = [f"    {matcher}: {reason}" for matcher, reason in unavailable(recipe, store).items()]
-        print("\n".join(reasons or ["    all weights are available"]))
+        missing = unavailable(recipe, store)
+        present = sum(matcher not in missing for matcher in recipe.matcher_names)
+        count = f"{present} of {len(recipe.matcher_names)}"
+        rows.append((name, count, recipe.description))
+    options.print_table(rows)
+    print("\n`mkpc recipes NAME` lists the units and the missing weights of a recipe.")
+
+
+def unit_lines(recipe: Recipe, missing: dict[str, UnavailableReason]) -> list[str]:
+    """Return lines: the description, each unit, and why matchers of the recipe cannot run here."""
+    lines = [f"{recipe.name}: {recipe.description}"]
+    for unit in recipe.units:
+        fallback = f", or {unit.fallback} if its weights are missing" if unit.fallback else ""
+        lines.append(f"  {unit.name:<30}at most {unit.max_matches} matches{fallback}")
+    if not missing:
+        return [*lines, "all weights are available"]
+    lines.append(f"missing; `mkpc weights fetch {recipe.name} --out weights` gets the weights:")
+    return [*lines, *(f"  {matcher}: {reason}" for matcher, reason in missing.items())]

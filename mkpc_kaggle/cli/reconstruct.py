@@ -12,10 +12,10 @@ from mkpc_kaggle.engine.console import say
 from mkpc_kaggle.engine.session import interruptible
 from mkpc_kaggle.recipe import CameraSharing
 from mkpc_kaggle.reconstruction.directory import output_directory, require_directory_apart
-from mkpc_kaggle.reconstruction.folder import read_folder, read_pair_list
+from mkpc_kaggle.reconstruction.folder import batch_names, read_folder, read_pair_list
 from mkpc_kaggle.reconstruction.outputs import FORMS, Cameras, write_tables
 from mkpc_kaggle.reconstruction.run import FolderResult, for_cameras, reconstruct_folder
-from mkpc_kaggle.reporting.summary import trouble, weakest_line
+from mkpc_kaggle.reporting.summary import pending_lines, trouble, weakest_line
 
 HELP = """\
 Match the images of a folder with the engine that makes submissions, and reconstruct their cameras. Each folder
@@ -87,24 +87,26 @@ def run(arguments: argparse.Namespace) -> int:
         result = reconstruct_folder(root, datasets, assembly, session, out, **given)
         unwritten, failed = result.report.unwritten, trouble(result.report)
         session.status = int(bool(failed or unwritten)) or session.status
-        lines = [*options.plan_lines(arguments, result.report), *_lines(result), failed, unwritten]
+        lines = [*options.plan_lines(arguments, result.report), *_lines(result, root), failed, unwritten]
         say("\n".join(filter(None, [*lines, f"results: {out}"])))
         page = out / "report.html" if result.pairs else None
         return options.finish(session, page, result.pairs)
 
 
-def _lines(result: FolderResult) -> Iterator[str]:
+def _lines(result: FolderResult, root: Path) -> Iterator[str]:
     """Yield lines about the run, each dataset and the errors."""
     report = result.report
     ended = f"{report.ending} after {format_duration(report.seconds)}"
     yield f"{len(result.pairs)} pairs: {ended}; {report.units_run} units run, {report.estimated} F estimated"
     reasons = {scene.batch: scene.failure for scene in report.scenes}
+    batches = batch_names(root, result.cameras)
     for name, found in result.cameras.items():
         models = Counter(placed[0] for placed in found.values() if placed)
         sizes = ", ".join(str(models[number]) for number in sorted(models))
-        why = f"models of {sizes}" if models else reasons.get(name, "too few pairs, or too little time")
-        yield f"{name}: {models.total()} of {len(found)} images have a camera: {why}"
+        why = f"models of {sizes}" if models else reasons.get(batches[name], "too few pairs, or too little time")
+        yield f"{batches[name]}: {models.total()} of {len(found)} images have a camera: {why}"
     yield from weakest_line(report.scenes)
+    yield from pending_lines(report)
     unreadable = {record.failure for record in report.records if record.reached and not record.units}
     yield from (f"cannot be read: {failure}" for failure in sorted(unreadable)[:MAX_LINES])
     yield from (f"fault: {fault}" for fault in report.faults[:MAX_LINES])

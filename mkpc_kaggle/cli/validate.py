@@ -36,7 +36,7 @@ from mkpc_kaggle.reporting.summary import left_out_line, summary, trouble
 
 # Defaults of the matching options.
 MATCHING = dict.fromkeys(("work_dir", "compare", "units", "method", "threshold", "regions"))
-MATCHING |= {"recipe": "auto", "mode": "two-stage"}
+MATCHING |= {"recipe": "auto", "mode": "two-stage", "set": []}
 HELP = """\
 Run a recipe on a train side with the engine that makes submissions, and score it as the competition does. A
 train side has calibration.csv, pair_covisibility.csv and images/ in each scene, and scaling_factors.csv next to
@@ -176,7 +176,10 @@ def _match_and_score(
             validations.append(validation)
             report = validation.report
             assert report is not None
-            lines = [*filter(None, [left_out_line(assembly.left_out)]), *options.plan_lines(arguments, report)]
+            lines = [
+                *filter(None, [left_out_line(assembly.recipe, assembly.left_out)]),
+                *options.plan_lines(arguments, report),
+            ]
             lines += [summary(report), "", f"recipe {validation.recipe}"]
             say("\n".join([*lines, *score_table(validation), *step_gains(validation)]))
             # The page draws inliers of F, but the pairs of a list have E.

@@ -143,6 +143,6 @@ def files_of(name: str, store: WeightStore) -> list[list[WeightFile]]:
         recipe = load_recipe(name)
         return [store.alternatives(slot) for slot in slots_of(recipe, recipe.matcher_names)]
     raise UserError(
-        f"{name!r} is neither a file of the manifest (python -m mkpc_kaggle weights list names them), nor a slot "
+        f"{name!r} is neither a file of the manifest (mkpc weights list names them), nor a slot "
         f"({', '.join(slots)}), nor a recipe ({', '.join(recipe_names())})"
     )

@@ -11,8 +11,13 @@ from typing import TextIO
 from mkpc_kaggle.errors import UserError
 
 # Suffixes of each option's results. In an input directory, a file with one of them is an earlier result.
-RESULTS = {"--output": (".csv",), "--json": (".json",), "--report": (".html", ".htm")}
-RESULTS["--out"] = (".png", ".jpg", ".pdf", ".svg")
+RESULTS = {
+    "--output": (".csv",),
+    "--json": (".json",),
+    "--report": (".html", ".htm"),
+    "--out": (".png", ".jpg", ".pdf", ".svg"),
+    "--save": (".npz",),
+}
 UNFINISHED: set[Path] = set()  # temporary files of this process
 
 

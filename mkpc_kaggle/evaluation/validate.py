@@ -154,10 +154,7 @@ def validate(
         if not (in_metres := isfinite(scene.metres_per_unit)):
             with Store.read(session.work_dir) as store:
                 table = Table.of(store)
-                pairs = [
-                    with_matching(*each, store, table)
-                    for each in zip(pairs, scene.pairs, strict=True)
-                ]
+                pairs = [with_matching(*each, store, table) for each in zip(pairs, scene.pairs, strict=True)]
         scored.append(SceneScore(scene.name, tuple(pairs), in_metres))
     return Validation(assembly.recipe.name, tuple(scored), report, steps)
 

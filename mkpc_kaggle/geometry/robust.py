@@ -22,7 +22,6 @@ from mkpc_kaggle.geometry.two_view import Vectors, robust_costs, sampson
 # F of a pure sideways motion, [e_x]_x: finite, rank 2; the epipolar lines are the image rows.
 FALLBACK_FUNDAMENTAL: Matrix3 = np.array([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 FALLBACK_FUNDAMENTAL.setflags(write=False)
-CONFIDENCE = 0.99999  # probability that no better model remains
 FARTHEST = 1e9  # baselines; farther points do not count as in front of a camera
 
 
@@ -50,12 +49,14 @@ class RobustConfig:
     method: Method = Method.MAGSAC
     threshold: float = 0.2  # pixels of the stored image
     max_iterations: int = 50_000
+    confidence: float = 0.99999  # probability that no better model remains, where iterations stop
     permutations: int = 8  # number of fixed permutations; the first keeps the order of the matches
     threshold_side: int = 0  # if not 0, the threshold is in pixels of the image resized to this long side
     every_match: bool = False  # keep exact duplicates, and estimate from the fewest matches that OpenCV accepts
 
     def __post_init__(self) -> None:
         check_ranges(self, threshold=POSITIVE, max_iterations=Range(1, 10**6))
+        check_ranges(self, confidence=Range(0, 1, "()"))
         check_ranges(self, permutations=Range(1, 100), threshold_side=Range(0, 99_999))
 
     def in_stored_pixels(
@@ -143,7 +144,11 @@ def consensus(
     if count < (solver.minimal if config.every_match else solver.min_matches):
         return Estimate.failed(model, count, f"too few distinct matches for {model}: {count}")
     method = cv2.USAC_MAGSAC if config.method is Method.MAGSAC else cv2.RANSAC
-    settings = {"method": method, "confidence": CONFIDENCE, "maxIters": config.max_iterations}
+    settings = {
+        "method": method,
+        "confidence": config.confidence,
+        "maxIters": config.max_iterations,
+    }
     if intrinsics is not None and model is ModelKind.E:
         points0, points1 = calibrate(points0, intrinsics[0]), calibrate(points1, intrinsics[1])
         settings["focal"] = float(np.mean([K[axis, axis] for K in intrinsics for axis in (0, 1)]))

@@ -2,20 +2,46 @@
 
 import zlib
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
 
+from mkpc_kaggle.config import AT_LEAST_1, SHARE, Range, check_ranges
 from mkpc_kaggle.geometry.coordinates import Size, from_normalised
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.matchers.contract import MatcherSpec, PairwiseMatcher, Picture
+from mkpc_kaggle.matchers.contract import MatcherSpec, PairwiseMatcher, Picture, TrainedOptions
 from mkpc_kaggle.matchers.dtypes import check_finite
 from mkpc_kaggle.matchers.networks.dense_sampling import sample_matches
 from mkpc_kaggle.matchers.networks.dense_warp import DenseFeatures, DenseNetwork
 from mkpc_kaggle.matchers.networks.pixels import network_input
 
-THRESHOLD = 0.05  # certainties above it count as 1, as published
 MIN_SIDE_PX = 8  # of the images in the second pass
+
+
+@dataclass(frozen=True)
+class DenseOptions(TrainedOptions):
+    """The options of a dense matcher, with the defaults of DKM's publication."""
+
+    matches: int = 5000  # the maximum number of sampled matches of a pair
+    threshold: float = 0.05  # certainties above it count as 1
+    passes: int = 0  # 2: first on smaller pictures, then on the unit's; 0: as published
+    first_pass: float = 0.625  # scale of the sides in the first of two passes
+
+    def __post_init__(self) -> None:
+        check_ranges(self, matches=AT_LEAST_1, threshold=SHARE, passes=Range(0, 2))
+        check_ranges(self, first_pass=Range(0, 1, "(]"))
+
+    @property
+    def published_passes(self) -> int:
+        """The number of passes that the authors published for this training."""
+        return 1
+
+    @property
+    def first_scale(self) -> float | None:
+        """The scale of the first of two passes; ``None`` for one pass."""
+        passes = self.passes or self.published_passes
+        return self.first_pass if passes == 2 else None
 
 
 class DenseEncoding(NamedTuple):
@@ -29,23 +55,24 @@ class DenseEncoding(NamedTuple):
 class DenseMatcher(PairwiseMatcher[DenseEncoding]):
     """A dense matcher. A match's score is its certainty; the random seed depends on the two pictures alone.
 
-    Pictures and pairs are processed one by one, so that results do not depend on the batch. ``first_pass``
-    scales the first of two passes; None means one pass. Sides in the first pass are multiples of ``multiple``.
+    Pictures and pairs are processed one by one, so that results do not depend on the batch. Sides in the first
+    pass are multiples of ``multiple``.
     """
-
-    matches = 5000  # the maximum per pair
 
     def __init__(
         self,
         spec: MatcherSpec,
         network: DenseNetwork,
+        options: DenseOptions,
         device: str,
         *,
         multiple: int = 1,
-        first_pass: float | None = None,
     ) -> None:
-        self.spec, self.device = spec, device
-        self._network, self._multiple, self._first_pass = network, multiple, first_pass
+        self.spec = spec
+        self.device = device
+        self._network = network
+        self._options = options
+        self._multiple = multiple
 
     @torch.inference_mode()
     def encode(self, pictures: Sequence[Picture]) -> list[DenseEncoding]:
@@ -56,14 +83,20 @@ class DenseMatcher(PairwiseMatcher[DenseEncoding]):
         # The network accepts any size, so padding is cut off.
         content = picture.pixels[:height, :width].copy()
         pixels = torch.from_numpy(content).permute(2, 0, 1)[None]  # (1, 3, H, W)
-        share, multiple = self._first_pass or 1, self._multiple
-        rows, columns = (multiple * max(1, round(side * share / multiple)) for side in (height, width))
-        first = network_input(pixels, (rows, columns)).to(self.device)
+        first_scale = self._options.first_scale
+        first_size = self._first_size(picture.content, first_scale or 1.0)
+        first = network_input(pixels, first_size).to(self.device)
         second = None
-        if self._first_pass:
+        if first_scale is not None:
             size = max(MIN_SIDE_PX, height), max(MIN_SIDE_PX, width)
             second = network_input(pixels, size).to(self.device)
         return DenseEncoding(self._network.encode(first, second), picture.content, zlib.crc32(content.data))
+
+    def _first_size(self, content: Size, scale: float) -> tuple[int, int]:
+        """Return the height and width of the first pass's picture, multiples of ``multiple``."""
+        multiple = self._multiple
+        rows, columns = (multiple * max(1, round(side * scale / multiple)) for side in reversed(content))
+        return rows, columns
 
     def _match(self, first: DenseEncoding, second: DenseEncoding) -> Matches:
         warps = self._network.match(first.features, second.features)
@@ -73,7 +106,7 @@ class DenseMatcher(PairwiseMatcher[DenseEncoding]):
         # PyTorch's CPU generator uses 32 bits of a seed, so the two checksums are combined into 32 bits.
         seed = zlib.crc32(second.checksum.to_bytes(4), first.checksum)
         generator = torch.Generator(warp.device).manual_seed(seed)
-        index = sample_matches(warp, certainty, self.matches, THRESHOLD, generator)
+        index = sample_matches(warp, certainty, self._options.matches, self._options.threshold, generator)
         points = warp[index].cpu().numpy()
         return Matches(
             from_normalised(points[:, :2], first.content),

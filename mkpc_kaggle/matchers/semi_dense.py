@@ -1,11 +1,13 @@
 """The adapter of semi-dense networks, which encodes each picture and matches the coarse cells of a pair."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from mkpc_kaggle.config import SHARE, check_ranges
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Size, from_corner
 from mkpc_kaggle.geometry.matches import Matches
@@ -19,6 +21,16 @@ from mkpc_kaggle.weights import WeightStore, load_into
 
 PREFIX = "matcher."  # of parameter names in the published training checkpoints
 TRANSPORT = "coarse_matching.bin_score"  # a parameter that only checkpoints with optimal transport have
+
+
+@dataclass(frozen=True)
+class SemiDenseOptions(TrainedOptions):
+    """The options of a semi-dense matcher, with the defaults of the published evaluations."""
+
+    threshold: float = 0.2  # the minimum confidence of a match, after the dual softmax
+
+    def __post_init__(self) -> None:
+        check_ranges(self, threshold=SHARE)
 
 
 class SemiDenseEncoding(NamedTuple):
@@ -67,7 +79,7 @@ def load_semi_dense(
     spec: MatcherSpec,
     network: SemiDenseNetwork,
     weights: WeightStore,
-    options: TrainedOptions,
+    options: SemiDenseOptions,
     placement: Placement,
     *,
     unused: str = "$^",
@@ -85,4 +97,5 @@ def load_semi_dense(
             "trained with it (LoFTR's are called outdoor_ds and indoor_ds_new, not outdoor_ot and indoor_ot)"
         )
     load_into(network, tensors, what=slot, unused=rf".*pos_encoding\.pe$|{unused}")
+    network.threshold = options.threshold
     return SemiDenseMatcher(prepared(network, placement), spec, placement.device)

@@ -108,7 +108,7 @@ def _good_file(store: WeightStore, slot: str) -> FoundFile | None:
         refusals = "; ".join(f"{refused.path}: {refused.note}" for refused in search.refused)
         raise UserError(
             f"no good file for {slot!r}. Found {refusals}. Fetch it again "
-            f"(python -m mkpc_kaggle weights fetch {slot} --out DIR), or remove it from the directory."
+            f"(mkpc weights fetch {slot} --out DIR), or remove it from the directory."
         )
     return search.found
 

@@ -85,6 +85,6 @@ def find_checkout() -> Path:
     if not (root / NOTEBOOK).is_file():
         raise UserError(
             f"mkpc_kaggle was installed in {root} without its sources, which `package` needs to build the wheel: "
-            "clone the repository and run `python -m mkpc_kaggle package` in the clone"
+            "clone the repository and run `mkpc package` in the clone"
         )
     return root

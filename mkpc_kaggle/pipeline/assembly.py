@@ -4,6 +4,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from mkpc_kaggle.errors import warn_once
@@ -12,7 +13,7 @@ from mkpc_kaggle.matchers.registry import load_matcher, require_matchers
 from mkpc_kaggle.pipeline.availability import FAULTS, Licence, left_out, options_of, refusal, slots_of, unavailable
 from mkpc_kaggle.pipeline.devices import AUTO, gpus_of, require_device, resolve_placement
 from mkpc_kaggle.pipeline.stages import ENCODING_CACHE_BYTES, GivenRegions, Pipeline
-from mkpc_kaggle.recipe import Mode, Recipe, Unit, load_recipe
+from mkpc_kaggle.recipe import Mode, Recipe, Unit, load_recipe, with_settings
 from mkpc_kaggle.weights import FoundFile, State, WeightStore
 
 CACHE_SHARE = 0.25  # of a GPU's free memory, for the cached encodings of all workers on it
@@ -106,12 +107,14 @@ def assemble(
     scenes: bool | None = None,
     licence: Licence = Licence.ANY,
     matchers: Mapping[str, Matcher[Any]] | None = None,
+    settings: Mapping[str, Any] = MappingProxyType({}),
 ) -> Assembly:
     """Check recipe, options, licences, weights, device and precision before any work, and return the assembly.
 
     A fallback replaces an unavailable matcher. Without one, recipe ``auto`` drops its units, and so
     does every recipe if the matcher cannot be loaded. ``scenes`` switches the reconstruction of
-    batches on or off; ``None`` follows the recipe. Raises :class:`UserError`, also if weights of a
+    batches on or off; ``None`` follows the recipe. ``settings`` replace the recipe's, see
+    :func:`mkpc_kaggle.recipe.with_settings`. Raises :class:`UserError`, also if weights of a
     recipe other than ``auto`` are missing or not permitted, and if no unit of stage 1 remains.
     """
     if not isinstance(recipe, Recipe | str):
@@ -119,6 +122,8 @@ def assemble(
     own = require_matchers(matchers or {})
     store = WeightStore(weights)
     written = load_recipe(recipe) if isinstance(recipe, str) else recipe
+    if settings:
+        written = with_settings(written, settings)
     reasons = unavailable(written, store, licence, own)
     chosen = written.with_fallbacks(reasons)
     lacking = {name: reasons[name] for name in chosen.matcher_names if name in reasons}
@@ -143,5 +148,5 @@ def assemble(
     made = Assembly(chosen, store, resolve_placement(device, precision), texts, own, device)
     unverified = (file.path.name for file in made.weight_files.values() if file.state is State.UNVERIFIED)
     if listed := ", ".join(sorted(unverified)):
-        warn_once(f"weights not verified: {listed}; `python -m mkpc_kaggle weights verify` says why")
+        warn_once(f"weights not verified: {listed}; `mkpc weights verify` says why")
     return made

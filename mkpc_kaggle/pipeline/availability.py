@@ -152,7 +152,7 @@ def left_out(
         if is_auto:
             light = load_recipe("light")
             slots = ["light"] if set(slots) & set(slots_of(light, light.matcher_names)) else []
-        command = f"python -m mkpc_kaggle weights fetch {' '.join(slots)} --out DIR"
+        command = f"mkpc weights fetch {' '.join(slots)} --out DIR"
         texts.append(f"{kind}: {', '.join(names)}" + (f" (`{command}` gets weights)" if slots else ""))
     return tuple(texts)
 

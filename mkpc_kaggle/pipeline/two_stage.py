@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -26,7 +27,8 @@ class TwoStageMatcher:
 
     ``recipe`` is a :class:`Recipe`, a recipe's name, or a path to a TOML file. ``weights`` are directories to
     search for weights. ``licence`` "permissive" refuses weights that forbid some uses. ``matchers`` maps names in
-    the recipe's units to your own matchers. Raises :class:`UserError` for an unknown name and for missing weights.
+    the recipe's units to your own matchers. ``settings`` replace the recipe's, by dotted key, such as
+    ``{"matchers.loftr.threshold": 0.3}``. Raises :class:`UserError` for an unknown name and for missing weights.
     """
 
     def __init__(
@@ -38,12 +40,19 @@ class TwoStageMatcher:
         precision: str = "float32",
         licence: Licence | str = Licence.ANY,
         matchers: Mapping[str, Matcher[Any]] | None = None,
+        settings: Mapping[str, Any] = MappingProxyType({}),
     ) -> None:
-        where, allowed = map(Path, weights), Licence(licence)
         assembly = assemble(
-            recipe, weights=where, device=device, precision=precision, licence=allowed, matchers=matchers
+            recipe,
+            weights=map(Path, weights),
+            device=device,
+            precision=precision,
+            licence=Licence(licence),
+            matchers=matchers,
+            settings=settings,
         )
-        self.recipe, self._pipeline = assembly.recipe, assembly.pipeline()
+        self.recipe = assembly.recipe
+        self._pipeline = assembly.pipeline()
 
     def __call__(
         self,

@@ -16,7 +16,7 @@ from mkpc_kaggle.engine.loop import Engine
 from mkpc_kaggle.engine.session import Session, request_of
 from mkpc_kaggle.engine.store import Source
 from mkpc_kaggle.pipeline.assembly import Assembly
-from mkpc_kaggle.reconstruction.folder import Datasets, Ends
+from mkpc_kaggle.reconstruction.folder import Datasets, Ends, batch_names
 from mkpc_kaggle.scene.likeness import FEATURE_SETTINGS, PARTNERS, Partners, local_features, most_alike, shortlist
 
 IMAGES_AT_A_TIME = 100  # whose features are in memory
@@ -58,15 +58,16 @@ def choose_pairs(
         if listed is None:
             indices = shortlist(partners) if is_large else combinations(range(len(files)), 2)
             ends[name] = [(files[i], files[j]) for i, j in indices]
-    names = {file: name for name, files in datasets.items() for file in files}
+    batches = batch_names(root, datasets)
+    names = {file: batches[name] for name, files in datasets.items() for file in files}
     turns = find_turns(engine, near, names, root, assembly, session)
-    return [pair_of(name, a, b, turns.get(a, 0), turns.get(b, 0)) for name in ends for a, b in ends[name]]
+    return [pair_of(batches[name], a, b, turns.get(a, 0), turns.get(b, 0)) for name in ends for a, b in ends[name]]
 
 
-def pair_of(dataset: str, a: Path, b: Path, *turns: int) -> Pair:
-    """Return the pair of two images of a dataset, matched with these counter-clockwise quarter turns."""
+def pair_of(batch: str, a: Path, b: Path, *turns: int) -> Pair:
+    """Return the pair of two images of a batch, matched with these counter-clockwise quarter turns."""
     suffix = f" turned {turns[0]} {turns[1]}" if any(turns) else ""
-    return Pair(f"{dataset}/{a.stem}/{b.stem}{suffix}", dataset, str(a), str(b), turns=(turns[0], turns[1]))
+    return Pair(f"{batch}/{a.stem}/{b.stem}{suffix}", batch, str(a), str(b), turns=(turns[0], turns[1]))
 
 
 def find_partners(engine: Engine, dataset: str, files: Sequence[Path], count: int) -> Partners:
@@ -80,7 +81,7 @@ def find_partners(engine: Engine, dataset: str, files: Sequence[Path], count: in
         source = engine.store.source(keys)
         known = engine.look({key: partial(compare, source, keys, count)}).get(key)
     if known is None:
-        warn(f"the images of {dataset} were not compared")
+        warn(f"the images of {files[0].parent} were not compared")
     partners: Partners = [[] for _ in files] if known is None else known
     return partners
 
@@ -108,7 +109,7 @@ def find_turns(
 ) -> dict[Path, int]:
     """Return the counter-clockwise quarter turns that set images upright; upright images are left out.
 
-    ``names`` has the dataset of each image. First all images are matched unturned, then images with few inliers in
+    ``names`` has the batch of each image. First all images are matched unturned, then images with few inliers in
     the other three orientations. An image gets its best orientation if that gains enough inliers with similar
     images, as turned so far.
     """

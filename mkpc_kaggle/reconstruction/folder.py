@@ -2,7 +2,7 @@
 
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from mkpc_kaggle.data.competition import CONTROL, IMAGE_SUFFIXES
@@ -41,6 +41,17 @@ def read_folder(root: Path) -> Datasets:
         name = next(iter(datasets.values()))[0].name
         raise UserError(f"{root} has a single image, {name}: there is nothing to match")
     return dict(sorted(datasets.items()))
+
+
+def batch_names(root: Path, datasets: Iterable[str]) -> dict[str, str]:
+    """Return the name of each dataset in messages and reports: its path, and for "." the root's own name."""
+    names = {name: name for name in datasets}
+    if "." in names:
+        own = root.resolve().name or "images"  # the root of the file system has no name
+        while own in names:
+            own += "_"
+        names["."] = own
+    return names
 
 
 def _is_image(name: str) -> bool:

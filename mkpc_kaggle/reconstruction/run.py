@@ -17,7 +17,7 @@ from mkpc_kaggle.pipeline.assembly import Assembly, assemble
 from mkpc_kaggle.pipeline.pair import PairMatch
 from mkpc_kaggle.recipe import CameraSharing, Recipe, SceneConfig
 from mkpc_kaggle.reconstruction.choice import MAX_IMAGES, choose_pairs
-from mkpc_kaggle.reconstruction.folder import Datasets, Ends
+from mkpc_kaggle.reconstruction.folder import Datasets, Ends, batch_names
 from mkpc_kaggle.reconstruction.outputs import Cameras
 from mkpc_kaggle.scene.likeness import PARTNERS, local_features, most_alike, shortlist
 from mkpc_kaggle.scene.reconstruct import models_of, reconstruct_sharing
@@ -66,10 +66,11 @@ def reconstruct_folder(
             with writing(f"--out {out}"):
                 publish(standing[0])
         pairs = choose_pairs(engine, root, datasets, assembly, session, listed=listed, rotations=rotations)
-        exports = {name: out / name for name in datasets}
+        batches = batch_names(root, datasets)
+        exports = {batches[name]: out / name for name in datasets}
 
         def write(results: State) -> None:
-            standing[:] = [cameras_of(datasets, str(root), results)]
+            standing[:] = [cameras_of(datasets, root, results)]
             publish(standing[0])
 
         engine.ask(request_of(pairs, assembly, session, str(root), exports=exports, publish=write))
@@ -77,15 +78,17 @@ def reconstruct_folder(
     return FolderResult(report, tuple(pairs), *standing)
 
 
-def cameras_of(datasets: Datasets, root: str, results: State) -> Cameras:
+def cameras_of(datasets: Datasets, root: Path, results: State) -> Cameras:
     """Return the camera of each image. Identical files share one camera, from the largest model that has it."""
     cameras: dict[str, Mapping[Path, tuple[int, RegisteredImage] | None]] = {}
     known_digests = results.digests
+    batches = batch_names(root, datasets)
     for name, files in datasets.items():
-        models = results.scenes[name].models if name in results.scenes else ()
+        scene = results.scenes.get(batches[name])
+        models = () if scene is None else scene.models
         placed = [(number, found) for number, model in enumerate(models) for found in model.images]
         known = {found.image.digest: (number, found) for number, found in reversed(placed)}
-        digests = {file: known_digests.get(name_below(root, str(file)), "") for file in files}
+        digests = {file: known_digests.get(name_below(str(root), str(file)), "") for file in files}
         cameras[name] = {file: known.get(digests[file]) for file in files}
     return cameras
 

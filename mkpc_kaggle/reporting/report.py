@@ -18,6 +18,7 @@ from mkpc_kaggle.data.images import Image
 from mkpc_kaggle.data.outputs import replacing
 from mkpc_kaggle.engine.budget import format_duration
 from mkpc_kaggle.errors import UserError, printable, writing
+from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
 from mkpc_kaggle.pipeline.pair import PairMatch
 from mkpc_kaggle.pipeline.two_stage import to_image
 from mkpc_kaggle.reporting.figures import draw_cameras, draw_pair, draw_strip, encode
@@ -25,6 +26,7 @@ from mkpc_kaggle.reporting.run_log import RunLog, read_log
 from mkpc_kaggle.reporting.summary import (
     facts,
     headline,
+    is_doubtful,
     left_out_line,
     seconds_by_part,
     trouble,
@@ -48,7 +50,7 @@ def report_run(work_dir: Path, path: Path, ends: float, pairs: Sequence[Pair] = 
     program's time ends at ``ends``, in seconds of the monotonic clock. ``pairs`` are the pairs of the run.
     Never raises: a failed report must not change the exit status of a successful run.
     """
-    later = f"python -m mkpc_kaggle journal {work_dir} --report {path}"
+    later = f"mkpc journal {work_dir} --report {path}"
     left = ends - time.monotonic()
     if left < WRITING_S + WRITING_S_PER_PAIR * len(pairs):
         return f"no report, the time is up; later: {later}"
@@ -92,7 +94,7 @@ def report_page(log: RunLog, pairs: Sequence[Pair] = (), *, undrawn: str = "") -
         verdict=headline(log),
         trouble=trouble(log),
         facts=facts(log),
-        left_out=left_out_line(log.about.left_out),
+        left_out=left_out_line(log.recipe, log.about.left_out),
         failed=failed,
         failures=Counter(reason for *_, reason in failed).most_common(),
         unit_failures=[(reason,) for reason in unit_reasons(log)],
@@ -100,7 +102,12 @@ def report_page(log: RunLog, pairs: Sequence[Pair] = (), *, undrawn: str = "") -
         weakest=[(_picture(sources.get(record.pair.id), match), record) for record, match in log.weakest],
         scenes=[*_scenes(log)],
         choices=Counter(str(record.scene.reason) for record in log.records if record.scene).most_common(),
-        sigmas=[(name, 100 * of.centre, of.rotation, of.focal) for name, of in weakest_cameras(log.scenes)],
+        sigmas=[
+            (name, 100 * of.centre, of.rotation, of.focal) if of else (name, "unknown", "", "")
+            for name, of in weakest_cameras(log.scenes)
+        ],
+        is_doubtful=is_doubtful,
+        min_support=MIN_SUPPORT,
         cameras=[
             (f"{scene.batch}, model {number}", _data_uri(draw_cameras(scene, number), "png"))
             for scene in ([] if undrawn else largest)

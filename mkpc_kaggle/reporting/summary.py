@@ -1,5 +1,6 @@
 """One-screen summary of a run: results, costs, failed pairs."""
 
+import textwrap
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -11,12 +12,16 @@ import numpy as np
 from mkpc_kaggle.engine.budget import format_duration
 from mkpc_kaggle.engine.records import PairRecord, SceneRecord
 from mkpc_kaggle.engine.request import Ending, RunReport
+from mkpc_kaggle.engine.scenes import NOT_RECONSTRUCTED
 from mkpc_kaggle.geometry.critical_region import RegionReason
 from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
+from mkpc_kaggle.pipeline.availability import UnavailableKind
+from mkpc_kaggle.recipe import Recipe
 from mkpc_kaggle.reporting.run_log import SECONDS, RunLog
 from mkpc_kaggle.scene.reconstruction import Sigmas
 
 MAX_LINES = 8  # per list
+WIDTH = 100  # of a line, in characters
 
 Run: TypeAlias = RunReport | RunLog
 
@@ -33,7 +38,8 @@ def summary(report: RunReport) -> str:
 def overview(log: RunLog) -> str:
     """Return the summary of a journal."""
     about = f"recipe {log.recipe.name}, {log.about.device}, {len(log.events)} events"
-    return "\n".join(filter(None, [headline(log), about, left_out_line(log.about.left_out), *_lines(log)]))
+    left_out = left_out_line(log.recipe, log.about.left_out)
+    return "\n".join(filter(None, [headline(log), about, left_out, *_lines(log)]))
 
 
 def headline(run: Run) -> str:
@@ -67,9 +73,33 @@ def _error(record: PairRecord) -> str:
     return next((unit.failure for unit in record.units if unit.failure and not unit.matches), "")
 
 
-def left_out_line(left_out: Sequence[str]) -> str:
-    """Return a line with the matchers that did not run, by cause; empty if all ran."""
-    return f"left out, {'; '.join(left_out)}" if left_out else ""
+MAX_NAMED = 3  # matchers in one line
+
+
+def left_out_line(recipe: Recipe, left_out: Sequence[str]) -> str:
+    """Return a line on the matchers of the recipe that do not run, with advice; empty if all run.
+
+    ``left_out`` has a text for each cause. Missing weights are the normal case, so many matchers without are only
+    counted; `mkpc recipes NAME` lists them.
+    """
+    others = [cause for cause in left_out if not cause.startswith(UnavailableKind.NO_WEIGHTS)]
+    missing = [cause for cause in left_out if cause.startswith(UnavailableKind.NO_WEIGHTS)]
+    parts = [f"left out, {cause}" for cause in others]
+    if missing and set(recipe.matcher_names) == {"sift"}:
+        parts.append("RootSIFT only; `mkpc weights fetch light --out weights` adds learned matchers")
+    elif missing and missing[0].count(",") < MAX_NAMED:
+        parts += [f"left out, {cause}" for cause in missing]
+    elif missing:
+        name = recipe.name.partition(" ")[0]  # without the mode
+        count = plural(sum(cause.count(",") + 1 for cause in missing), "matcher")
+        parts.append(f"{count} without weights; `mkpc recipes {name}` lists them")
+    return "; ".join(parts)
+
+
+def plural(count: int, noun: str) -> str:
+    """Return the count with its noun, such as "1 batch" or "2 batches"."""
+    ending = "" if count == 1 else "es" if noun.endswith("ch") else "s"
+    return f"{count} {noun}{ending}"
 
 
 def unit_means(run: Run) -> list[tuple[str, int, float, float, float]]:
@@ -102,15 +132,15 @@ def facts(run: Run) -> Iterator[tuple[str, str, str]]:
     yield "pairs with an F", f"{len(solved)} of {len(records)}", from_where
     if inliers := [record.inliers for record in solved]:
         yield "inliers of a pair", f"{median(inliers):.0f}", f"the median; the minimum is {min(inliers)}"
-        overlapping = sum(record.overlaps for record in solved)
-        threshold = f"at least {MIN_SUPPORT:g} times the inliers expected by chance"
+        overlapping = sum(not is_doubtful(record) for record in solved)
+        threshold = f"{MIN_SUPPORT:g} times the inliers expected by chance, or two cameras that agree"
         yield "overlapping pairs", f"{overlapping} of {len(solved)}", threshold
     if regions := Counter(region.reason for record in records for region in record.regions or ()):
         counts = ", ".join(f"{count} {reason}" for reason, count in regions.most_common())
         yield "critical regions", f"{regions[RegionReason.CROPPED]} of {regions.total()}", counts
     if scenes:
         placed, images = sum(scene.registered for scene in scenes), sum(scene.images for scene in scenes)
-        yield "images with a camera", f"{placed} of {images}", f"in {len(scenes)} batches"
+        yield "images with a camera", f"{placed} of {images}", f"in {plural(len(scenes), 'batch')}"
 
 
 def _lines(run: Run) -> Iterator[str]:
@@ -122,10 +152,17 @@ def _lines(run: Run) -> Iterator[str]:
         yield f"{name:<30}{pairs:>7}{matches:>9.0f}{inliers:>9.0f}{seconds:>9.2f}"
     count = max(1, len(run.records))
     parts = (f"{name} {seconds / count:.3f}" for name, seconds in seconds_by_part(run).items())
-    yield f"seconds a pair: {', '.join(parts)}"
+    yield from textwrap.wrap(f"seconds a pair: {', '.join(parts)}", WIDTH, subsequent_indent="  ")
     yield from weakest_line(run.scenes)
-    no_scene = [f"{scene.batch}: {scene.failure}" for scene in run.scenes if scene.failure]
-    failed = [f"{record.pair.id}: {record.failure}" for record in run.records if not record.is_solved]
+    yield from pending_lines(run)
+    no_scene = [
+        f"{scene.batch}: {scene.failure}"
+        for scene in run.scenes
+        if scene.failure and scene.failure != NOT_RECONSTRUCTED
+    ]
+    failed = [
+        f"{record.pair.id}: {record.failure}" for record in run.records if record.reached and not record.is_solved
+    ]
     yield from _list("batches without a scene", no_scene)
     yield from _list("pairs with the fallback row", failed)
     yield from _list("units that failed", unit_reasons(run))
@@ -133,18 +170,45 @@ def _lines(run: Run) -> Iterator[str]:
     yield from _list("faults", run.faults)
 
 
+def pending_lines(run: Run) -> Iterator[str]:
+    """Yield a line on pairs and batches that the run did not reach, and how to continue."""
+    pairs = sum(not record.reached and not record.is_solved for record in run.records)
+    batches = sum(scene.failure == NOT_RECONSTRUCTED for scene in run.scenes)
+    left = [plural(count, noun) for count, noun in ((pairs, "pair"), (batches, "batch")) if count]
+    what = f"{' and '.join(left)} left" if left else ""
+    if run.ending == Ending.INTERRUPTED:
+        yield "; ".join(filter(None, ["interrupted", what, "run the same command to continue"]))
+    elif what:
+        yield f"{what}; run the same command to continue"
+
+
+def is_doubtful(record: PairRecord) -> bool:
+    """Return whether the two images may show different things.
+
+    Few inliers decide only where the scene does not: two cameras that agree have settled it.
+    """
+    return not record.overlaps and record.source != "scene"
+
+
 def weakest_line(scenes: Sequence[SceneRecord]) -> Iterator[str]:
     """Yield a line with the weakest cameras, if any is known."""
-    named = [f"{Path(name).name} ({100 * sigmas.centre:.2g} %)" for name, sigmas in weakest_cameras(scenes)[:3]]
+    named = []
+    for name, sigmas in weakest_cameras(scenes)[:3]:
+        error = f"{100 * sigmas.centre:.2g} %" if sigmas else "unknown"
+        named.append(f"{Path(name).name} ({error})")
     if named:
         yield f"weakest cameras, with the error of the centre: {', '.join(named)}"
 
 
-def weakest_cameras(scenes: Sequence[SceneRecord]) -> list[tuple[str, Sigmas]]:
-    """Return (image name, sigmas) of each camera, the largest expected error of the centre first."""
-    placed = (found for scene in scenes for model in scene.models for found in model.images)
+def weakest_cameras(scenes: Sequence[SceneRecord]) -> list[tuple[str, Sigmas | tuple[()]]]:
+    """Return (image name, sigmas) of each camera, the largest expected error of the centre first.
+
+    Cameras with unknown sigmas are the most doubtful ones, so they come before all others.
+    """
+    placed = [found for scene in scenes for model in scene.models for found in model.images]
+    unknown = [(found.image.name, found.sigmas) for found in placed if not found.sigmas]
     known = [(found.image.name, found.sigmas) for found in placed if found.sigmas]
-    return sorted(known, key=lambda each: -each[1].centre)
+    return [*unknown, *sorted(known, key=lambda each: -each[1].centre)]
 
 
 def _list(title: str, items: Sequence[str]) -> Iterator[str]:

@@ -19,6 +19,7 @@ import pycolmap
 
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Points, Size
+from mkpc_kaggle.recipe import CameraModel, SceneConfig
 from mkpc_kaggle.scene.export import DATABASE, FORMER, MODELS, PART
 from mkpc_kaggle.scene.keypoints import Index, scene_keypoints
 from mkpc_kaggle.scene.reconstruction import MIN_IMAGES, Reconstruction, RegisteredImage, SfmModel, filter_models
@@ -32,10 +33,9 @@ MAX_TRIALS = 300  # RANSAC trials per edge; more trials find the same inliers at
 LARGE = 100  # images; all tracks cost too much in larger scenes and improve smaller ones
 TRACKS_PER_IMAGE = 200  # the longest tracks, from which the global mapper starts in a large scene
 SEED = 0
-CAMERA_MODEL = "SIMPLE_PINHOLE"  # a radial camera does not improve focal lengths (docs/results.md)
 
 
-def structure_from_motion(graph: ViewGraph, shared: SharedIntrinsics) -> Reconstruction:
+def structure_from_motion(graph: ViewGraph, shared: SharedIntrinsics, config: SceneConfig) -> Reconstruction:
     """Return pycolmap's reconstruction of a view graph, with any number of models.
 
     Each image has its own camera, except images with ``shared`` intrinsics. The initial focal length is the shared
@@ -44,11 +44,17 @@ def structure_from_motion(graph: ViewGraph, shared: SharedIntrinsics) -> Reconst
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
     pycolmap.set_random_seed(SEED)
     with pycolmap.Database.open(":memory:") as database:
-        _fill(database, graph, shared)
-        return run_mapper(database, graph)
+        _fill(database, graph, shared, config.camera_model)
+        return run_mapper(database, graph, config.threads)
 
 
-def write_files(directory: Path, graph: ViewGraph, shared: SharedIntrinsics, models: Sequence[SfmModel]) -> None:
+def write_files(
+    directory: Path,
+    graph: ViewGraph,
+    shared: SharedIntrinsics,
+    models: Sequence[SfmModel],
+    camera_model: CameraModel = CameraModel.SIMPLE_PINHOLE,
+) -> None:
     """Write COLMAP's files: the database and one folder per model.
 
     A temporary folder in ``directory`` holds the files until all are complete. Then they replace earlier files. A
@@ -60,7 +66,7 @@ def write_files(directory: Path, graph: ViewGraph, shared: SharedIntrinsics, mod
     with TemporaryDirectory(prefix=PART, dir=directory) as name:
         made = Path(name)
         with pycolmap.Database.open(str(made / DATABASE)) as database:
-            _fill(database, graph, shared)
+            _fill(database, graph, shared, camera_model)
         for number, model in enumerate(models):
             kept = {each.image.name for each in model.images}
             for frame in [frame for frame in model.colmap.frames.values() if frame.has_pose()]:
@@ -79,11 +85,11 @@ def write_files(directory: Path, graph: ViewGraph, shared: SharedIntrinsics, mod
             (made / MODELS).rename(directory / MODELS)
 
 
-def _fill(database: Any, graph: ViewGraph, shared: SharedIntrinsics) -> None:
+def _fill(database: Any, graph: ViewGraph, shared: SharedIntrinsics, camera_model: CameraModel) -> None:
     """Write the images, cameras and keypoints, and each edge's matches and verified geometry."""
     keypoints, found = scene_keypoints(graph)
     with pycolmap.DatabaseTransaction(database):
-        cameras = _write_images(database, graph, keypoints, shared)
+        cameras = _write_images(database, graph, keypoints, shared, camera_model)
         geometries = verify(graph.edges, keypoints, found, cameras)
         for edge, matches, geometry in zip(graph.edges, found, geometries, strict=True):
             database.write_matches(edge.first + 1, edge.second + 1, matches)
@@ -91,7 +97,11 @@ def _fill(database: Any, graph: ViewGraph, shared: SharedIntrinsics) -> None:
 
 
 def _write_images(
-    database: Any, graph: ViewGraph, keypoints: Sequence[Points], shared: SharedIntrinsics
+    database: Any,
+    graph: ViewGraph,
+    keypoints: Sequence[Points],
+    shared: SharedIntrinsics,
+    camera_model: CameraModel,
 ) -> list[Any]:
     """Write images, frames, cameras and rigs. Return each image's camera.
 
@@ -104,7 +114,7 @@ def _write_images(
         key = number if focal is None else (image.size, focal)
         if key not in cameras:
             start = start_focal(image) if focal is None else focal
-            cameras[key] = _write_camera(database, number, image.size, start)
+            cameras[key] = _write_camera(database, number, camera_model, image.size, start)
         camera = cameras[key]
         taken = pycolmap.Image(
             name=image.name, camera_id=camera.camera_id, image_id=number, keypoints=np.zeros((0, 2))
@@ -118,9 +128,9 @@ def _write_images(
     return used
 
 
-def _write_camera(database: Any, number: int, size: Size, focal: float) -> Any:
+def _write_camera(database: Any, number: int, model: CameraModel, size: Size, focal: float) -> Any:
     """Write a camera with initial focal length ``focal``, and a rig with only this camera."""
-    camera = pycolmap.Camera.create_from_model_name(number, CAMERA_MODEL, focal, *size)
+    camera = pycolmap.Camera.create_from_model_name(number, model.value, focal, *size)
     camera.has_prior_focal_length = True  # a pair that E explains at this focal length counts as calibrated
     database.write_camera(camera, use_camera_id=True)
     rig = pycolmap.Rig(rig_id=number)
@@ -146,10 +156,10 @@ def verify(
     ]
 
 
-def run_mapper(database: Any, graph: ViewGraph) -> Reconstruction:
+def run_mapper(database: Any, graph: ViewGraph, threads: int) -> Reconstruction:
     """Run the global mapper on a filled database. Return its plausible models."""
     seed = {"random_seed": SEED}
-    common = seed | {"num_threads": 1}  # with more threads, the last digits vary
+    common = seed | {"num_threads": threads}
     parts = dict.fromkeys(("rotation_averaging", "global_positioning", "retriangulation"), seed)
     required = {"track_required_tracks_per_view": TRACKS_PER_IMAGE} if len(graph.images) > LARGE else {}
     mapper = {**common, **parts, **required}

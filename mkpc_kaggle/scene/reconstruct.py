@@ -1,7 +1,9 @@
 """Reconstruction of a batch: from pairs to cameras and a choice of F for each pair, all picklable."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
@@ -69,9 +71,11 @@ def reconstruct_sharing(
     returned. With a ``directory``, the graph is reconstructed as a whole, and COLMAP's files are written there.
     """
     if directory is None:
-        parts, make = graph.components(), reconstruct_component
+        parts = graph.components()
+        make = partial(reconstruct_component, config=config)
     else:
-        parts, make = (graph.strong,), reconstruct_connected
+        parts = (graph.strong,)
+        make = partial(reconstruct_connected, config=config)
     given = shared = given_intrinsics(graph.images, config)
     found = [make(part, shared) for part in parts]
     if config.cameras is CameraSharing.AUTO and (alike := shared_intrinsics(graph.images, models_of(found))):
@@ -82,30 +86,33 @@ def reconstruct_sharing(
     if directory is not None:
         from mkpc_kaggle.scene.colmap import write_files
 
-        write_files(directory, graph.strong, shared, models_of(found))
+        write_files(directory, graph.strong, shared, models_of(found), config.camera_model)
     if given:
         focals = {each.image.size: each.focal for model in reversed(models_of(found)) for each in model.images}
         shared = {image.digest: focals[image.size] for image in graph.images if image.size in focals}
     return found, shared
 
 
-def reconstruct_component(graph: ViewGraph, shared: SharedIntrinsics) -> Reconstruction:
+def reconstruct_component(graph: ViewGraph, shared: SharedIntrinsics, config: SceneConfig) -> Reconstruction:
     """Return the reconstruction of a connected graph, or the reason for its failure."""
     images, pairs = len(graph.images), len(graph.edges)
     if images < MIN_IMAGES:
         return Reconstruction(graph.names, failure=f"{images} images are connected; a scene needs {MIN_IMAGES}")
     if pairs < MIN_PAIRS_PER_IMAGE * images:
-        few = f"{pairs} pairs connect {images} images; a scene needs {MIN_PAIRS_PER_IMAGE:g} an image"
+        few = (
+            f"{pairs} matched pairs connect {images} images, and reliable cameras need "
+            f"{math.ceil(MIN_PAIRS_PER_IMAGE * images)}; more overlapping images would help"
+        )
         return Reconstruction(graph.names, failure=few)
-    return reconstruct_connected(graph, shared)
+    return reconstruct_connected(graph, shared, config)
 
 
-def reconstruct_connected(graph: ViewGraph, shared: SharedIntrinsics) -> Reconstruction:
+def reconstruct_connected(graph: ViewGraph, shared: SharedIntrinsics, config: SceneConfig) -> Reconstruction:
     """Return pycolmap's reconstruction of a graph, or the reason for its failure."""
     try:
         from mkpc_kaggle.scene.colmap import structure_from_motion
 
-        return structure_from_motion(graph, shared)
+        return structure_from_motion(graph, shared, config)
     except ImportError as error:
         return Reconstruction(graph.names, failure=f"pycolmap cannot be imported: {error}")
     except (RuntimeError, ValueError) as error:

@@ -25,7 +25,7 @@ CHECKPOINT_SUFFIXES = frozenset({".pth", ".pt", ".ckpt", ".safetensors", ".bin",
 MAX_UNKNOWN_SIZE_BYTES = 1 << 28  # weights of unknown size have about 50 MB; larger files are not read
 UNPACKED = (
     "this checkpoint was unpacked into a directory, as Kaggle does; it is read from there, but cannot be held "
-    "against the manifest's digest. Upload it as safetensors (python -m mkpc_kaggle weights convert)"
+    "against the manifest's digest. Upload it as safetensors (mkpc weights convert)"
 )
 
 

@@ -1,4 +1,5 @@
 import os
+import re
 import subprocess
 import sys
 import threading
@@ -10,9 +11,12 @@ import numpy as np
 import pytest
 from shared import run_command
 
+from mkpc_kaggle.cli import COMMANDS
 from mkpc_kaggle.data.competition import read_test_side, write_submission
 from mkpc_kaggle.demo import DemoSet
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
+from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher
+from mkpc_kaggle.recipe import recipe_names
 
 
 def test_importing_the_package_is_cheap_and_geometry_and_weights_bring_no_torch():
@@ -36,15 +40,45 @@ def test_a_reader_that_leaves_ends_the_command_quietly():
     assert (done.returncode, done.stderr) == (141, b"")
 
 
-def test_recipes_are_listed_with_what_they_lack(clean_environment, capsys):
+def test_recipes_are_listed_in_one_line_each(clean_environment, capsys):
     assert run_command("recipes") == 0
+    lines = capsys.readouterr().out.splitlines()
+    names = [line.split()[0] for line in lines[1 : len(recipe_names()) + 1]]
+    assert names == recipe_names()
+    (classical,) = (line for line in lines if line.startswith("classical"))
+    assert "1 of 1" in classical
+    assert max(map(len, lines)) <= 120
+
+
+def test_a_recipe_is_listed_with_its_units_and_missing_weights(clean_environment, capsys):
+    assert run_command("recipes", "best") == 0
+    lines = capsys.readouterr().out.splitlines()
+    unit = f"  {'2:superglue@1280':<30}at most 4096 matches, or aliked_lightglue if its weights are missing"
+    assert unit in lines
+    assert "  superglue: no weights (superpoint: superpoint_v1.pth" in "\n".join(lines)
+    assert run_command("recipes", "classical") == 0
+    assert "all weights are available" in capsys.readouterr().out
+
+
+def test_without_arguments_the_commands_are_printed(capsys):
+    assert run_command() == 0
     out = capsys.readouterr().out
-    light = out[out.index("light: ") :]
-    assert "xfeat_lighterglue: no weights (xfeat: xfeat.pt or xfeat_sparse_bnfolded.safetensors" in light
-    classical = out[out.index("classical: ") : out.index("light: ")]
-    assert "all weights are available" in classical
-    assert "    2:dkm@630x840  at most 4096\n" in out
-    assert "    1:aliked_lightglue@1024  at most 4096  (or aliked, if its weights are missing)\n" in light
+    assert out.startswith("usage: mkpc [-h] [--version] COMMAND ...")
+    for name, summary in COMMANDS.items():
+        assert re.search(rf"^  {name} +{re.escape(summary)}", out, re.M), name
+
+
+@pytest.mark.parametrize("width", [50, 90])
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_is_wrapped_to_the_terminal(command, width, monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", str(width))
+    with pytest.raises(SystemExit):
+        run_command(command, "--help")
+    lines = capsys.readouterr().out.splitlines()
+    usage = lines.index("")  # argparse does not break a long choice of the usage
+    too_long = [line for line in lines[usage:] if len(line) > width]
+    # Commands are not broken, so that they can be copied.
+    assert [line for line in too_long if not re.match(r" +(mkpc|python) ", line)] == []
 
 
 def test_check_tells_good_from_bad(demo, tmp_path, capsys):
@@ -68,10 +102,26 @@ def test_match_prints_f_and_draws_the_pair(demo, small_recipe, tmp_path, capsys)
     figure = tmp_path / "new" / "pair.png"
     assert run_command(*match_arguments(demo, small_recipe, figure)) == 0
     out = capsys.readouterr().out.splitlines()
-    F = np.array([[float(value) for value in line.split()] for line in out[:3]])
+    assert out[0] == "F, by recipe small; x1^T F x0 = 0 in pixels of the stored files:"
+    F = np.array([[float(value) for value in line.split()] for line in out[1:4]])
     assert np.linalg.norm(F) == pytest.approx(1)
+    assert [line for line in out if line != line.rstrip()] == []
     assert "1:sift@320" in "\n".join(out)
     assert cv2.imread(str(figure)).shape[1] > 1000
+
+
+def test_match_saves_arrays(demo, small_recipe, tmp_path):
+    images = sorted((demo.train_dir / "courtyard" / "images").iterdir())[:2]
+    saved = tmp_path / "new" / "pair.npz"
+    assert run_command("match", *images, "--recipe", small_recipe, "--save", saved) == 0
+    match = TwoStageMatcher(str(small_recipe))(*images)
+    with np.load(saved) as arrays:
+        assert set(arrays) == {"points0", "points1", "scores", "inliers", "F"}
+        np.testing.assert_array_equal(arrays["points0"], match.matches.points0)
+        np.testing.assert_array_equal(arrays["points1"], match.matches.points1)
+        np.testing.assert_array_equal(arrays["scores"], match.matches.scores)
+        np.testing.assert_array_equal(arrays["inliers"], match.estimate.inliers)
+        np.testing.assert_array_equal(arrays["F"], match.estimate.matrix)
 
 
 def test_matplotlib_leaves_nothing_where_home_cannot_be_written(demo, small_recipe, tmp_path):
@@ -99,4 +149,4 @@ def test_what_a_command_printed_has_been_flushed_when_it_ends_however_long_a_rea
     monkeypatch.setattr(sys, "stdout", stream := Flushed())
     assert run_command("recipes") == 0
     assert stream.whole == (stream.getvalue(), threading.main_thread())  # a thread would not be waited for
-    assert "auto: " in stream.getvalue()
+    assert "auto " in stream.getvalue()

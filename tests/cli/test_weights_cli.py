@@ -1,4 +1,4 @@
-"""``python -m mkpc_kaggle weights``: what it prints and the status it ends with."""
+"""``mkpc weights``: what it prints and the status it ends with."""
 
 import io
 from dataclasses import replace

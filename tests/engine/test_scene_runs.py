@@ -59,7 +59,7 @@ def test_pairs_get_the_f_of_their_scene_and_keep_their_own(tmp_path, monkeypatch
     assert np.array_equal(published[-1], [record.chosen_fundamental for record in report.records])
     log = read_log(tmp_path / "work")
     assert "pairs with an F: 6 of 6 (5 from scenes, 1 from their own matches)" in overview(log)
-    assert "images with a camera: 4 of 4 (in 1 batches)" in overview(log)
+    assert "images with a camera: 4 of 4 (in 1 batch)" in overview(log)
     assert "weakest cameras, with the error of the centre: 3.png (3 %), 2.png (2 %), 1.png (1 %)" in overview(log)
     assert report_page(log).index("3.png</td>") < report_page(log).index("2.png</td>")
     assert "both cameras are known" in report_page(log)

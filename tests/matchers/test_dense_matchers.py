@@ -10,7 +10,7 @@ from pictures import match_one, picture, same
 from standin import narrow_roma
 
 from mkpc_kaggle.matchers.contract import MatcherSpec, Placement
-from mkpc_kaggle.matchers.dense import DenseMatcher
+from mkpc_kaggle.matchers.dense import DenseMatcher, DenseOptions
 from mkpc_kaggle.matchers.networks.dense_sampling import sample_matches
 from mkpc_kaggle.matchers.networks.dense_warp import DenseWarp
 from mkpc_kaggle.matchers.networks.dkm import DKM
@@ -58,8 +58,7 @@ def test_points_of_either_picture_are_in_its_own_pixels():
     """Both show the same, at another size: places relative to the edges agree."""
     warps = identity_warp(40, 60, 0.3), identity_warp(80, 30, 0.9)
     network = SimpleNamespace(encode=lambda *_: None, match=lambda *_: warps)
-    matcher = DenseMatcher(MatcherSpec("given"), network, "cpu")
-    matcher.matches = 9999
+    matcher = DenseMatcher(MatcherSpec("given"), network, DenseOptions(matches=9999), "cpu")
     matches = match_one(matcher, picture(40, 60), picture(80, 30))
     assert len(matches) == 40 * 60 + 80 * 30
     expected = (matches.points0 + 0.5) * (30 / 60, 80 / 40) - 0.5
@@ -71,9 +70,12 @@ def test_points_of_either_picture_are_in_its_own_pixels():
     assert set(matches.scores.tolist()) == {float(np.float32(0.3)), float(np.float32(0.9))}
 
 
-@pytest.mark.parametrize(("first_pass", "sides"), [(0.648, (56, 84)), (None, (84, 126))])
-def test_sides_of_the_first_pass_are_multiples_of_14(first_pass, sides):
-    network, passes = ours(Placement(), "roma", narrow_roma), {"multiple": 14, "first_pass": first_pass}
-    (encoded,) = DenseMatcher(MatcherSpec("given"), network, "cpu", **passes).encode([picture(86, 130)])
+@pytest.mark.parametrize(("passes", "sides"), [(2, (56, 84)), (1, (84, 126))])
+def test_sides_of_the_first_pass_are_multiples_of_14(passes, sides):
+    network = ours(Placement(), "roma", narrow_roma)
+    options = DenseOptions(passes=passes, first_pass=0.648)
+    matcher = DenseMatcher(MatcherSpec("given"), network, options, "cpu", multiple=14)
+    (encoded,) = matcher.encode([picture(86, 130)])
     assert encoded.features.coarse.at(1).shape[2:] == sides
-    assert [each.at(1).shape[2:] for each in [encoded.features.fine] if each] == [(86, 130)] * bool(first_pass)
+    fine = [each.at(1).shape[2:] for each in [encoded.features.fine] if each]
+    assert fine == [(86, 130)] * (passes - 1)

@@ -1,4 +1,4 @@
-"""``python -m mkpc_kaggle package``: what lies in the two folders, and what must not."""
+"""``mkpc package``: what lies in the two folders, and what must not."""
 
 import io
 import json

@@ -68,7 +68,7 @@ def test_recipes_take_what_is_there_and_fallbacks_stand_in_for_the_rest():
     assert set(first) == {"xfeat", "xfeat-lighterglue"} or set(sift) == {"xfeat", "xfeat-lighterglue"}
     light = assemble("light", weights=[WEIGHTS])
     assert light.recipe.matcher_names == ("xfeat_lighterglue", "sift", "aliked")
-    command = "`python -m mkpc_kaggle weights fetch sift-lightglue aliked-lightglue --out DIR` gets weights"
+    command = "`mkpc weights fetch sift-lightglue aliked-lightglue --out DIR` gets weights"
     assert light.left_out == (f"no weights: sift_lightglue, aliked_lightglue ({command})",)
     assert [unit.stage for unit in light.recipe.units] == [unit.stage for unit in load_recipe("light").units]
     assert light.recipe == light.recipe.with_fallbacks(())
@@ -97,7 +97,7 @@ def known_files(monkeypatch, tmp_path):
 
 def test_the_advice_of_recipe_auto_is_the_light_recipe_unless_its_weights_are_there(monkeypatch, tmp_path):
     (told,) = assemble("auto").left_out
-    assert told.endswith("(`python -m mkpc_kaggle weights fetch light --out DIR` gets weights)")
+    assert told.endswith("(`mkpc weights fetch light --out DIR` gets weights)")
     light = load_recipe("light")
     lines = []
     for slot in availability.slots_of(light, light.matcher_names):

@@ -10,7 +10,7 @@ import pytest
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Size
-from mkpc_kaggle.reconstruction.folder import read_folder, read_pair_list
+from mkpc_kaggle.reconstruction.folder import batch_names, read_folder, read_pair_list
 from mkpc_kaggle.reconstruction.outputs import submission_rows
 from mkpc_kaggle.scene.reconstruction import RegisteredImage
 from mkpc_kaggle.scene.view_graph import BatchImage
@@ -89,3 +89,10 @@ def test_ids_and_rows_of_2025_are_unique(tmp_path):
     assert len({(row[1], row[3]) for row in rows}) == 5
     assert rows_of(root, ["x/1.png", "y/1.png"])[0][:2] == ("x_1.png", "x")
     assert np.all([row[2] == "cluster0" for row in rows])
+
+
+def test_the_images_of_the_root_have_the_name_of_its_folder(tmp_path):
+    root = tmp_path / "fountain"
+    assert batch_names(root, [".", "inner"]) == {".": "fountain", "inner": "inner"}
+    assert batch_names(root, [".", "fountain"]) == {".": "fountain_", "fountain": "fountain"}
+    assert batch_names(Path("/"), ["."]) == {".": "images"}

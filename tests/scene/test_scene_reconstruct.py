@@ -116,7 +116,9 @@ def test_a_pair_whose_matches_agree_on_something_else_keeps_its_own(scene):
 def test_too_few_pairs_or_matches_make_no_scene(scene):
     two = tuple(pair for pair in scene.pairs if pair.image0 == scene.pairs[0].image0)[:2]
     (found,) = reconstruct_batch(two, SceneConfig()).reconstructions
-    assert found.failure == "2 pairs connect 3 images; a scene needs 1.35 an image"
+    assert found.failure == (
+        "2 matched pairs connect 3 images, and reliable cameras need 5; more overlapping images would help"
+    )
     for none in ([], [pair_of("01", Matches.empty())]):
         assert reconstruct_batch(none, SceneConfig()).reconstructions == ()
 

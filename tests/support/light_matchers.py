@@ -24,7 +24,7 @@ from mkpc_kaggle.matchers.adapters.aliked import AlikedMatcher, aliked_encoder
 from mkpc_kaggle.matchers.adapters.loma import LomaAdapter, LomaOptions
 from mkpc_kaggle.matchers.adapters.superglue import SuperGlueMatcher
 from mkpc_kaggle.matchers.contract import Colour, Picture, Placement
-from mkpc_kaggle.matchers.dense import DenseMatcher
+from mkpc_kaggle.matchers.dense import DenseMatcher, DenseOptions
 from mkpc_kaggle.matchers.lightglue import LightGlueMatcher
 from mkpc_kaggle.matchers.networks.aliked import Aliked
 from mkpc_kaggle.matchers.networks.aspanformer import AspanFormer
@@ -68,21 +68,19 @@ def semi_dense_matcher(name, make, placement):
     return SemiDenseMatcher(ours(placement, name, make), spec_of(name, "test"), placement.device)
 
 
-class LightDense(DenseMatcher):
-    matches = 300
-
-
 class LightLoma(LomaAdapter):
     threshold = 0.0
 
 
-def dkm_matcher(placement: Placement, make: type[DenseMatcher] = LightDense) -> DenseMatcher:
-    return make(dkm.SPEC, ours(placement, "dkm", DKM), placement.device)
+def dkm_matcher(placement: Placement, matches: int = 300) -> DenseMatcher:
+    options = DenseOptions(matches=matches)
+    return DenseMatcher(dkm.SPEC, ours(placement, "dkm", DKM), options, placement.device)
 
 
 def roma_matcher(placement: Placement) -> DenseMatcher:
     network = ours(placement, "roma", narrow_roma)
-    return LightDense(roma.SPEC, network, placement.device, multiple=14, first_pass=0.648)
+    options = roma.RomaOptions(matches=300)
+    return DenseMatcher(roma.SPEC, network, options, placement.device, multiple=14)
 
 
 def loma_matcher(placement: Placement) -> LomaAdapter:

@@ -1,0 +1,119 @@
+"""The lines of a run's summary: doubts, weakest cameras, unfinished work, matchers that do not run."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from mkpc_kaggle.engine.scenes import NOT_RECONSTRUCTED
+
+from mkpc_kaggle.data.competition import Pair
+from mkpc_kaggle.engine.records import PairRecord, SceneRecord
+from mkpc_kaggle.engine.request import Ending, RunReport
+from mkpc_kaggle.geometry.cameras import Camera
+from mkpc_kaggle.geometry.coordinates import Size
+from mkpc_kaggle.geometry.robust import EstimateStats
+from mkpc_kaggle.recipe import Recipe, Unit
+from mkpc_kaggle.reporting.summary import (
+    is_doubtful,
+    left_out_line,
+    pending_lines,
+    plural,
+    summary,
+    weakest_cameras,
+    weakest_line,
+)
+from mkpc_kaggle.scene.choose import Choice, Reason
+from mkpc_kaggle.scene.reconstruction import RegisteredImage, SfmModel, Sigmas
+from mkpc_kaggle.scene.view_graph import BatchImage
+
+UNREACHED = PairRecord(0, Pair("a", "batch", "0.png", "1.png"))
+FEW_INLIERS = replace(UNREACHED, failure="", stats=EstimateStats(support=14.4))
+
+
+def camera(name: str, sigmas: Sigmas | tuple[()]) -> RegisteredImage:
+    pose = Camera(np.eye(3), np.eye(3), np.zeros(3))
+    return RegisteredImage(BatchImage(name, name, Size(80, 60)), pose, 50, sigmas)
+
+
+def scene(*cameras: RegisteredImage) -> SceneRecord:
+    return SceneRecord("batch", models=(SfmModel(cameras, np.zeros((0, 3)), 0.5),))
+
+
+def report(ending: Ending, *records: PairRecord, scenes: tuple[SceneRecord, ...] = ()) -> RunReport:
+    return RunReport(records, ending, 60.0, scenes=scenes)
+
+
+def test_a_pair_with_few_inliers_is_doubtful_unless_its_cameras_agree():
+    assert is_doubtful(FEW_INLIERS)
+    settled = replace(FEW_INLIERS, scene=Choice(np.eye(3), Reason.SCENE))
+    assert not is_doubtful(settled)
+    assert is_doubtful(replace(FEW_INLIERS, scene=Choice(None, Reason.CONTRADICTION)))
+
+
+def test_cameras_with_unknown_errors_are_the_weakest():
+    found = scene(
+        camera("known.png", Sigmas(0.1, 0.02, 1.0)),
+        camera("unknown.png", ()),
+        camera("worse.png", Sigmas(0.1, 0.03, 1.0)),
+    )
+    assert [name for name, _ in weakest_cameras([found])] == ["unknown.png", "worse.png", "known.png"]
+    (line,) = weakest_line([found])
+    assert line.endswith("unknown.png (unknown), worse.png (3 %), known.png (2 %)")
+
+
+def test_an_interrupted_run_says_how_to_continue_and_lists_no_failures():
+    pending = replace(scene(), failure=NOT_RECONSTRUCTED, models=())
+    stopped = report(Ending.INTERRUPTED, UNREACHED, UNREACHED, scenes=(pending,))
+    assert list(pending_lines(stopped)) == [
+        "interrupted; 2 pairs and 1 batch left; run the same command to continue"
+    ]
+    assert "not reached" not in summary(stopped)
+    assert NOT_RECONSTRUCTED not in summary(stopped)
+
+
+def test_a_run_whose_time_is_up_says_what_is_left():
+    late = report(Ending.TIME_IS_UP, UNREACHED, FEW_INLIERS)
+    assert list(pending_lines(late)) == ["1 pair left; run the same command to continue"]
+    assert list(pending_lines(report(Ending.COMPLETE, FEW_INLIERS))) == []
+
+
+@pytest.mark.parametrize(
+    ("matchers", "left_out", "line"),
+    [
+        (("sift", "loma"), (), ""),
+        (
+            ("sift",),
+            ("no weights: loma, roma",),
+            "RootSIFT only; `mkpc weights fetch light --out weights` adds learned matchers",
+        ),
+        (
+            ("sift", "loftr"),
+            ("no weights: loma (`mkpc weights fetch loma-b128 --out DIR` gets weights)",),
+            "left out, no weights: loma (`mkpc weights fetch loma-b128 --out DIR` gets weights)",
+        ),
+        (
+            ("sift", "loftr"),
+            ("no weights: loma, roma, dkm, superglue",),
+            "4 matchers without weights; `mkpc recipes auto` lists them",
+        ),
+        (
+            ("sift", "loftr"),
+            ("weights not permitted: superglue",),
+            "left out, weights not permitted: superglue",
+        ),
+    ],
+)
+def test_matchers_that_do_not_run_are_one_short_line(matchers, left_out, line):
+    units = tuple(Unit(1, matcher, 640) for matcher in matchers)
+    assert left_out_line(Recipe(units, "auto (stage-1)"), left_out) == line
+
+
+def test_counts_are_in_the_singular_and_the_plural():
+    assert [plural(count, "batch") for count in (0, 1, 2)] == ["0 batches", "1 batch", "2 batches"]
+    assert plural(2, "pair") == "2 pairs"
+
+
+def test_no_line_of_the_summary_is_longer_than_100_characters():
+    lines = summary(report(Ending.COMPLETE, FEW_INLIERS)).splitlines()
+    assert any(line.startswith("seconds a pair: wait for decoding") for line in lines)
+    assert max(map(len, lines)) <= 100
