@@ -34,6 +34,7 @@ from mkpc_kaggle.engine.jobs import (
 from mkpc_kaggle.engine.places import LISTEN_S, START_TIMEOUT_S, Place, Site, Work
 from mkpc_kaggle.engine.records import (
     IMAGE,
+    NOT_RECONSTRUCTED,
     Event,
     EventKind,
     SceneRecord,
@@ -70,7 +71,6 @@ HASH_THREADS = 4
 MAX_FAILED_PAIRS = 2  # a unit that was given up on this many pairs and never ran is skipped on all
 MAX_ESTIMATES = 8  # pairs in a job of estimates
 MIN_PAIRS = 2  # the minimum to connect three images
-NOT_RECONSTRUCTED = "not reconstructed in time"
 
 
 class Engine:

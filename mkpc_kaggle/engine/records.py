@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 NOT_REACHED = "not reached in time"
+NOT_RECONSTRUCTED = "not reconstructed in time"
 NO_CAMERAS = "no matches connect its images"
 # Prefixes of keys: of a file by its name, of the facts about an image by the digest of its content.
 IMAGE = "image "

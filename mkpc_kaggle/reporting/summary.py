@@ -10,9 +10,8 @@ from typing import TypeAlias
 import numpy as np
 
 from mkpc_kaggle.engine.budget import format_duration
-from mkpc_kaggle.engine.records import PairRecord, SceneRecord
+from mkpc_kaggle.engine.records import NOT_RECONSTRUCTED, PairRecord, SceneRecord
 from mkpc_kaggle.engine.request import Ending, RunReport
-from mkpc_kaggle.engine.scenes import NOT_RECONSTRUCTED
 from mkpc_kaggle.geometry.critical_region import RegionReason
 from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
 from mkpc_kaggle.pipeline.availability import UnavailableKind
