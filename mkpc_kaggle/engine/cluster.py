@@ -73,7 +73,10 @@ class RaySite(Site):
             join(self._ray, self._cluster)
         machines = [node for node in self._ray.nodes() if node["Alive"] and node["Resources"].get("CPU", 0) >= 1]
         gpus = sum(int(node["Resources"].get("GPU", 0)) for node in machines)
+        # This machine is one of the cluster's: scenes beside its actors get the cores that these leave.
+        self.matching_cores = self._cores
         if gpus and self._assembly.device != "cpu":
+            self.matching_cores = gpus
             make = partial(MatchRunner, self._assembly.on("cuda:0").pipeline)
             for number in range(gpus):
                 self._add(f"gpu {number}", make, num_gpus=1)

@@ -270,10 +270,13 @@ class Engine:
                 if place.work is not Work.MATCH:
                     timeout = min(timeout, max(self.budget.silence, self._unknown(now)))
                 place.start(now, timeout)
-            if place.is_starting:
-                is_under_way = is_under_way or needs[place.work] > 0
-                needs[place.work] -= place.work is Work.SCENE
-            is_under_way = is_under_way or place.job is not None
+            if place.is_starting and needs[place.work] > 0:
+                is_under_way = True
+                if place.work is Work.SCENE:
+                    # A process for each scene. Matching and estimates share what there is.
+                    needs[place.work] -= 1
+            if place.job is not None:
+                is_under_way = True
         return is_under_way
 
     def _hand_out_pairs(self, work: NextWork | None, now: float) -> int:
@@ -285,7 +288,9 @@ class Engine:
         others = any(place.may_start(now) or place.is_starting for place in places)
         job = work.match
         while job is not None and idle:
-            self._give(idle.pop(), self._filled(job), now)
+            filled = self._filled(job)
+            if filled is not None:
+                self._give(idle.pop(0), filled, now)
             job = None
             if idle or others:
                 following = self._next_work(self.state, now)
@@ -344,9 +349,8 @@ class Engine:
         at_work = sum(place.job is not None for place in places)
         return min(len(due), self.site.scenes_at_a_time(is_matching=is_matching) - at_work)
 
-    def _give(self, place: Place, job: Job | None, now: float) -> None:
-        if job is not None:
-            place.submit(job, self._time_limit(job, now), now)
+    def _give(self, place: Place, job: Job, now: float) -> None:
+        place.submit(job, self._time_limit(job, now), now)
 
     def _filled(self, job: MatchJob) -> MatchJob | None:
         """Return the job with its pairs, and the points that their crops come from."""
@@ -472,7 +476,7 @@ class Engine:
             self._fault(text)
             self._lose_job(job, Failure(Cause.RAISED, text))
         if self.store.trouble:
-            trouble = f"the store cannot be written ({self.store.trouble})"
+            trouble = f"the journal cannot be written ({self.store.trouble})"
             self._fault(f"{trouble}; results stay in memory")
         if isinstance(job, SceneJob) and job.export is not None:
             self._publish()

@@ -90,7 +90,8 @@ class Store:
     def __init__(self, directory: Path) -> None:
         self.directory = directory
         self.path = directory / FILE_NAME
-        self.trouble = ""  # why the file takes no more results; they are in memory then
+        self.trouble = ""  # why the file took no more results, which are in memory then
+        self._has_file = True
         self._unsaved: dict[str, Result] = {}
         self._db = closed_connection()
         self._lock: sqlite3.Connection | None = None
@@ -226,7 +227,7 @@ class Store:
 
     def source(self, keys: Sequence[str]) -> "Source":
         """Return where a worker finds the points with these keys: in the file, or beside this value."""
-        if self.trouble:
+        if self._unsaved or not self._has_file:
             return Source(None, self.data(keys))
         return Source(self.directory, {})
 
@@ -255,6 +256,7 @@ class Store:
                 raise
             # A full disk has no room for SQLite's locks, either. What is there can be read.
             self.trouble = str(error)
+            self._has_file = False
             is_empty = not self.path.exists() or not self.path.stat().st_size
             self._db.close()
             file = ":memory:" if is_empty else self.path
