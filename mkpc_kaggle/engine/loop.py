@@ -105,6 +105,7 @@ class Engine:
         self._tries = Tries()  # of features; those of pairs are in the state
         self._features: dict[str, FeatureJob] = {}  # to compute
         self._found: dict[str, Any] = {}
+        self._refused: dict[str, str] = {}  # why a matcher cannot be loaded, by name
         self._until = inf
         self._published = budget.clock()
         self._publishing = threading.Lock()
@@ -153,6 +154,7 @@ class Engine:
         batches = batches_of([*request.pairs, *extra]) if config is not None else {}
         state = State(request, extra, batches)
         state.restore(self.store, self._digests(state))
+        self._leave_out(state)
         self.state = state
         self._resumed = int(state.complete.sum())
         self._explained = ""
@@ -451,21 +453,24 @@ class Engine:
             place.kill()  # pycolmap's memory does not return
 
     def _note_loaded(self, place: Place, answer: Loaded) -> None:
-        """Go on without the units whose matchers could not be loaded."""
+        """Go on without the matchers that could not be loaded, and say so once."""
         self._has_loaded = self._has_loaded or place.work is Work.MATCH
-        state = self.state
-        if state is None:
-            return
         for name, reason in answer.refused.items():
-            for unit in (unit for unit in state.units if unit.matcher == name):
-                item = ("matcher", unit.name)
-                if item not in state.tries.given_up:
-                    failure = Failure(Cause.REFUSED, reason)
-                    state.give_up(item, failure)
-                    text = f"{unit.name} is left out: {reason}"
-                    self.explain(text)
-                    self._fault(text)
-                    console.warn(text)
+            if name not in self._refused:
+                self._refused[name] = reason
+                text = f"{name} is left out: {reason}"
+                self.explain(text)
+                self._fault(text)
+                console.warn(text)
+        if self.state is not None:
+            self._leave_out(self.state)
+
+    def _leave_out(self, state: State) -> None:
+        """Skip the units whose matchers could not be loaded."""
+        for unit in state.units:
+            if unit.matcher in self._refused:
+                failure = Failure(Cause.REFUSED, self._refused[unit.matcher])
+                state.give_up(("matcher", unit.name), failure)
 
     def _save(self, job: Job, answer: Answer, seconds: float) -> None:
         """Save an answer. If it cannot be saved, only this job fails."""
@@ -618,6 +623,7 @@ class Engine:
             self.site.places += self.site.fallback
             self.site.fallback = []
             self.costs = Costs()
+            self._refused = {}
             self._explained = ""
             if self.state is not None:
                 self.state.forget_failures()

@@ -223,7 +223,7 @@ def test_a_matcher_that_a_worker_cannot_load_costs_its_units_alone_and_is_told_o
     use_places(monkeypatch, thread_place("cpu", RectifiedMatcher(), pipeline=partial(Pipeline, recipe, load)))
     report = run(pairs, recipe, RectifiedMatcher(), tmp_path / "work", more=[RectifiedMatcher(name="broken")])
     assert_as_if_nothing_had_failed(report, undisturbed)
-    assert report.faults == (f"{other.name} is left out: {told}",)
+    assert report.faults == (f"broken is left out: {told}",)
     assert capsys.readouterr().err.count(told) == 1
     assert {len(record.units) for record in report.records} == {3}
 
