@@ -94,8 +94,8 @@ class Engine:
         self.budget = budget
         self.interrupt = interrupt
         self.minibatch = minibatch
-        self.state: State | None = None
-        self.costs = Costs()
+        self.state: State | None = None  # until something is asked for
+        self.costs = Costs()  # by this run's answers: another machine may have made those of the store
         self.unwritten = ""
         self.faults: list[str] = []
         self.explanations: list[Event] = []
@@ -106,13 +106,13 @@ class Engine:
         self._features: dict[str, FeatureJob] = {}  # to compute
         self._found: dict[str, Any] = {}
         self._refused: dict[str, str] = {}  # why a matcher cannot be loaded, by name
-        self._until = inf
+        self._until = inf  # no job begins after this time, which is the end of a trial
         self._published = budget.clock()
-        self._publishing = threading.Lock()
+        self._publishing = threading.Lock()  # the watchdog publishes, too
         self._is_open = self._has_loaded = self._has_ended = self._is_announced = False
-        self._explained = ""
-        self._shown: NextWork | None = None
-        self._resumed = 0
+        self._explained = ""  # the phase that was explained last
+        self._shown: NextWork | None = None  # the phase of the bar, with its number of pairs
+        self._resumed = 0  # rows that earlier runs finished
 
     def __enter__(self) -> Self:
         return self
@@ -124,6 +124,7 @@ class Engine:
         """End all workers, and publish for the last time."""
         if self._has_ended:
             return
+        # First, because a worker that writes COLMAP's files must not do so after the last version.
         for place in [*self.site.places, *self.site.fallback]:
             place.kill()
         self.site.close()
@@ -140,6 +141,7 @@ class Engine:
     def look(self, jobs: Mapping[str, Callable[[], Any]]) -> dict[str, Any]:
         """Return features by key: JSON values, or bytes. Failed ones are left out."""
         about = self.store.about(jobs)
+        # What is no JSON value is data.
         data = self.store.data(key for key in about if about[key] is None)
         self._found = {**about, **data}
         self._features = {key: FeatureJob(key, do) for key, do in jobs.items() if key not in self._found}
@@ -153,7 +155,7 @@ class Engine:
         extra = extra_pairs_of(request.pairs, config)
         batches = batches_of([*request.pairs, *extra]) if config is not None else {}
         state = State(request, extra, batches)
-        state.restore(self.store, self._digests(state))
+        state.restore(self.store, self._digests(state))  # the only time that the store is read
         self._leave_out(state)
         self.state = state
         self._resumed = int(state.complete.sum())
@@ -162,6 +164,7 @@ class Engine:
         self._until = inf
         if share < 1:
             self._until = self.budget.clock() + share * self.budget.left()
+        # What is there is published before any work: a former F is better than the fallback.
         self._publish()
         self._loop()
 
@@ -225,6 +228,7 @@ class Engine:
 
     def _loop(self) -> None:
         while not self._is_over(now := self.budget.clock()):
+            # All answers first, so that idle workers get the best of what is known now.
             for place in self.site.places:
                 self._take_answer(place, now)
             self._fall_back()
@@ -256,6 +260,7 @@ class Engine:
         work: NextWork | None = None
         if self.state is not None:
             work = self._next_work(self.state, now)
+        # A finished run joins no cluster and starts no worker of matching.
         if work is not None and work.match is not None and not self._is_open:
             self.site.open()
             self._is_open = True
@@ -269,6 +274,7 @@ class Engine:
         for place in self.site.places:
             if place.may_start(now) and needs[place.work] > 0:
                 timeout = START_TIMEOUT_S
+                # Other workers load no matchers: one that takes long to start hangs.
                 if place.work is not Work.MATCH:
                     timeout = min(timeout, max(self.budget.silence, self._unknown(now)))
                 place.start(now, timeout)
@@ -294,6 +300,7 @@ class Engine:
             if filled is not None:
                 self._give(idle.pop(0), filled, now)
             job = None
+            # The next job is looked for only if somebody could do it.
             if idle or others:
                 following = self._next_work(self.state, now)
                 job = following.match if following is not None else None
@@ -329,6 +336,7 @@ class Engine:
         """Give features and estimates to idle workers. Return how many are left."""
         due = list(work.estimates) if work is not None else []
         for place in [place for place in self.site.of(Work.LIGHT) if place.is_idle]:
+            # Features first: pairs are chosen by them.
             if self._features:
                 key = next(iter(self._features))
                 self._give(place, self._features.pop(key), now)
@@ -359,6 +367,7 @@ class Engine:
         state = self.state
         assert state is not None
         state.begin(state.matching, job.indices)
+        # Crops come from points of today alone. Others may be of former settings.
         crops = [tuple(state.first_stage(index)) for index in job.indices]
         known: list[tuple[UnitResult, ...]] = [()] * len(crops)
         if any(unit.stage == 2 for unit in job.units):
@@ -368,7 +377,7 @@ class Engine:
                 self._lose_job(job, Failure(Cause.RAISED, f"the store cannot be read: {error}"))
                 return None
         else:
-            crops = [()] * len(crops)
+            crops = [()] * len(crops)  # no unit needs them
         upcoming = upcoming_pairs(state, job, self.minibatch)
         return replace(
             job,
@@ -403,6 +412,7 @@ class Engine:
 
     def _scene_job(self, state: State, batch: str) -> SceneJob:
         state.reconstructing.add(batch)
+        # Of the results in use now. If others come meanwhile, the scene is stale when it arrives.
         indices, key = state.scene_inputs(batch)
         pairs = tuple(state.inputs_of(index) for index in indices)
         matches = int(state.matches[indices].sum())
@@ -506,6 +516,7 @@ class Engine:
         state = self.state
         assert state is not None
         results = [state.results_of(outcome, crops) for outcome, crops in zip(answer, job.crops, strict=True)]
+        # First the store, in one transaction: what the state has is never lost.
         self.store.put(result for rows in results for result in rows)
         state.end(state.matching, job.indices)
         for outcome, rows in zip(answer, results, strict=True):
@@ -528,6 +539,7 @@ class Engine:
             state.take_estimate(each, result)
             self.costs.observe(ESTIMATE, each.seconds)
         self.estimated += len(answer)
+        # While pairs are matched, the bar shows those.
         if not state.matching.any():
             total = int(state.has[: state.rows].any(1).sum())
             done = total - int(lacking_estimates(state).sum())
@@ -538,6 +550,7 @@ class Engine:
         state = self.state
         assert state is not None
         rows = [state.scene_result(job, answer, seconds)]
+        # In the same transaction: the mark says that these files are of this scene.
         if job.export is not None:
             rows.append(Result(EXPORT + job.batch, Kind.EXPORT, job.key))
         self.store.put(rows)
@@ -600,6 +613,7 @@ class Engine:
         ((_, index, name),) = items
         state.give_up(items[0], failure)
         self.explain(f"{name} is skipped on pair {index} ({failure})")
+        # A unit that never ran on any pair would cost two workers for each.
         given_up = Counter(state.given_up_units())
         if given_up[name] >= MAX_FAILED_PAIRS and not self.costs.mean(name):
             state.give_up(("matcher", name), failure)
@@ -617,6 +631,7 @@ class Engine:
             self._fault(text)
             self.explain(text)
             console.warn(text)
+            # Their costs, losses and refusals say nothing about the other device.
             for place in places:
                 place.kill()
                 self.site.places.remove(place)
@@ -652,6 +667,7 @@ class Engine:
         start = self.budget.clock()
         if trouble := self.save_results():
             self._fault(trouble)
+        # A trial's pairs are not the run's, whose table stays until its own pairs are known.
         if not state.request.is_trial:
             self.store.put([state.table().to_result()])
         self._published = self.budget.clock()

@@ -260,7 +260,7 @@ class Table:
     def of(cls, store: Store) -> Self:
         """Return the store's table; without one, an empty table."""
         found = store.about([TABLE]).get(TABLE)
-        if found is None:
+        if found is None:  # the run has not published yet
             return cls()
         written = np.frombuffer(store.data([TABLE])[TABLE]).reshape(-1, 3, 3)
         units = [(name, stage) for name, stage in found["units"]]
@@ -322,7 +322,7 @@ def _pair_record(
     index: int, row: Row, table: Table, about: Mapping[str, Any], scene: SceneRecord | None
 ) -> PairRecord:
     estimate = about.get(row.estimate)
-    inliers: dict[str, int] = {}
+    inliers: dict[str, int] = {}  # by the key of points; newer points have none yet
     failure = row.failure or NOT_REACHED
     more: dict[str, Any] = {}
     if estimate is not None:

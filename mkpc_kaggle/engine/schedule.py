@@ -142,6 +142,7 @@ def phases_of(view: View, fit: int, connecting: Mask) -> NDArray[Any]:
 
 def sweeping_unit(state: State) -> int:
     """Return the number of the first unit that can run, of stage 1 if possible."""
+    # A unit of stage 2 without points of stage 1 looks at whole images.
     usable = np.flatnonzero(~state.unusable)
     first = usable[~state.is_crop[usable]]
     return int(next(iter([*first, *usable]), 0))
@@ -150,7 +151,7 @@ def sweeping_unit(state: State) -> int:
 def prefix_that_fits(view: View) -> int:
     """Return the length of the longest prefix of the recipe that all rows can have in the time left."""
     left = view.left * view.crew.matchers
-    if left <= 0:
+    if left <= 0:  # an unmeasured unit needs no time, but fits no more
         return 0
     return int(np.searchsorted(seconds_of_prefixes(view), left, side="right"))
 
@@ -190,12 +191,14 @@ def match_job(view: View, phase: Phase, missing: Mask, ready: Mask) -> MatchJob:
     """Return a job for the first pair, or on a GPU for a minibatch of pairs with the same missing units."""
     state = view.state
     order = state.order[ready[state.order]]
+    # Phase by phase in visiting order, in the end the weakest pairs first.
     if phase is Phase.FILL:
         order = order[np.argsort(state.inliers[order], kind="stable")]
     first = int(order[0])
     # Stage 1 first, because the crops come from its points.
     numbers = sorted(np.flatnonzero(missing[first]).tolist(), key=state.is_crop.__getitem__)
     units = [state.units[number] for number in numbers]
+    # What lost a worker before runs alone: pair by pair and unit by unit.
     alone = any(("unit", first, unit.name) in state.tries.alone for unit in units)
     size = 1 if alone else view.crew.minibatch
     alike = order[:1]
@@ -212,7 +215,7 @@ def match_job(view: View, phase: Phase, missing: Mask, ready: Mask) -> MatchJob:
 
 def upcoming_pairs(state: State, job: MatchJob, count: int) -> list[int]:
     """Return the pairs that will probably be matched after a job."""
-    if job.phase is Phase.FILL:
+    if job.phase is Phase.FILL:  # it depends on answers
         return []
     rank = int(np.flatnonzero(state.order == job.indices[-1])[0]) + 1
     following: list[int] = state.order[rank : rank + count].tolist()
@@ -237,7 +240,7 @@ def estimates_due(view: View, first: NDArray[Any]) -> NDArray[Any]:
 def lacking_estimates(state: State) -> Mask:
     """Return an (N,) mask of the rows whose estimate is not from the points in use."""
     lacking = state.has.any(1) & ~state.estimated
-    lacking[state.rows :] = False
+    lacking[state.rows :] = False  # extra pairs are for scenes alone
     for item in state.tries.given_up:
         match item:
             case ("estimate", int(index)):

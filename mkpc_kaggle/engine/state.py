@@ -69,7 +69,9 @@ class State:
         self.units = request.recipe.units
         self.number_of = {unit.name: number for number, unit in enumerate(self.units)}
         self.is_crop = np.array([unit.stage == 2 for unit in self.units], bool)
+        # Relative to the root, so that a folder that moved keeps its results.
         self.names = [names_of(pair, request.root) for pair in self.pairs]
+        # Pairs with a common image are visited together, since its encodings are cached.
         self.order = np.asarray(visiting_order(self.pairs), int)
         count = len(self.pairs)
         size = (count, len(self.units))
@@ -84,11 +86,12 @@ class State:
         self.inliers = np.zeros(count, int)
         self.by_scene = np.zeros((count, 3, 3))
         self.scene_source = np.full(count, FALLBACK)
-        self.images: dict[str, BatchImage] = {}
+        self.images: dict[str, BatchImage] = {}  # by name, once their contents are known
         self._contents = [""] * count
         self._rows: list[Row | None] = [None] * count  # of the table of pairs
         self._new = set(range(count))  # rows that have changed since the last table
         self.tries = Tries()
+        # A batch's scene has no row of its own, so batches have numbers for arrays.
         self.batches = {name: number for number, name in enumerate(batches)}
         self.members = [np.asarray(members, int) for members in batches.values()]
         self.batch_of = np.full(count, -1)
@@ -101,11 +104,12 @@ class State:
         # Rows with the same two images share their points and their estimate.
         alike: dict[Any, list[int]] = {}
         for index, pair in enumerate(self.pairs):
+            # With other intrinsics, it is another model that is estimated.
             known = pair.intrinsics and tuple(K.tobytes() for K in pair.intrinsics)
             alike.setdefault((self.names[index], pair.turns, known), []).append(index)
         self._alike = [group for group in alike.values() if len(group) > 1]
         self._twins = {index: group for group in self._alike for index in group}
-        self._pairs_of: dict[str, list[int]] = {}
+        self._pairs_of: dict[str, list[int]] = {}  # by the name of an image
         for index, names in enumerate(self.names):
             for name in dict.fromkeys(names):
                 self._pairs_of.setdefault(name, []).append(index)
@@ -222,9 +226,9 @@ class State:
 
     def matches_of_batches(self) -> NDArray[np.int_]:
         """Return the number of matches (B,) of each batch."""
-        found = np.zeros(len(self.batches) + 1, int)
-        np.add.at(found, self.batch_of, self.matches.sum(1))  # the last is for pairs of no batch
-        return found[:-1]
+        # The first place is for pairs of no batch.
+        found = np.bincount(self.batch_of + 1, self.matches.sum(1), minlength=len(self.batches) + 1)
+        return found[1:].astype(int)
 
     def inputs_of(self, index: int) -> PairInputs:
         """Return what an estimate or a scene is computed from."""
@@ -244,6 +248,7 @@ class State:
         """
         self.images = known_images(store, digests)
         former = Table.of(store)
+        # By contents and not by id: another table may name the same two images.
         rows = {row.contents: row for row in former.rows if row.contents}
         known = [index for index in range(len(self.pairs)) if self.images_of(index)]
         old = {index: rows[self.contents(index)] for index in known if self.contents(index) in rows}
@@ -271,6 +276,7 @@ class State:
             about = store.about([*today.values(), *filter(None, others.values())])
             for (index, number), key in today.items():
                 is_current = key in about
+                # Points of former settings are better than none.
                 used = key if is_current else others.get((index, number), "")
                 if used in about:
                     self._use_points(index, number, used, about[used]["matches"])
@@ -282,6 +288,7 @@ class State:
         about = store.about([*today.values(), *others.values()])
         for index, key in today.items():
             self.estimated[index] = key in about
+            # As long as the images are the same, the former F is better than the fallback.
             used = key if key in about else others.get(index, "")
             if used in about:
                 self._use_estimate(index, used, about[used])
@@ -322,6 +329,7 @@ class State:
         results = []
         for image, file in zip(images, outcome.files, strict=True):
             known = self.images.get(image.name)
+            # Most images are in many pairs, and are stored once.
             if known != image:
                 results += image_results(image, file)
             if known is not None and known.digest != image.digest:
@@ -334,13 +342,14 @@ class State:
             for number, key in enumerate(self.points[index])
             if self.current[index, number] and not self.is_crop[number]
         }
-        good = [found for found in outcome.found if not found.failure]
+        good = [found for found in outcome.found if not found.failure]  # failures are not stored
         for found in good:
             number = self.number_of[found.unit.name]
             if self.is_crop[number] and not are_valid:
                 continue
             keys = [first[n] for n in sorted(first)]
             key = self.key_of(index, number, images, keys)
+            # Units of stage 1 come first in an answer: those of stage 2 looked at crops from all of them.
             if not self.is_crop[number]:
                 first[number] = key
             regions = (outcome.regions or ()) if self.is_crop[number] else ()
@@ -373,6 +382,7 @@ class State:
                 number = self.number_of[result.about["unit"]]
                 self._use_points(index, number, result.key, result.about["matches"])
             self._check_crops(index)
+            # Another F, and another scene, can be computed now.
             if points:
                 self.estimated[index] = False
                 self._changed(index)

@@ -227,7 +227,9 @@ def with_regions(pair: PairMatch, recipe: Recipe, given: GivenRegions = MappingP
         first, second = (CriticalRegion(box, RegionReason.GIVEN) for box in boxes)
         return replace(pair, regions=(first, second))
     start = time.perf_counter()
-    matches = pair.matches[pair.in_stage(1)]
+    # In the recipe's order: after an interrupted run, units of stage 1 may have run in another.
+    ordered = sorted(pair.results, key=lambda result: recipe.units.index(result.unit))
+    matches = Matches.concatenate(result.matches for result in ordered if result.unit.stage == 1)
     region0, region1 = (
         critical_region(points, image.size, recipe.mkpc)
         for points, image in zip((matches.points0, matches.points1), pair.images, strict=True)
