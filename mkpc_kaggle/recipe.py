@@ -17,6 +17,7 @@ from mkpc_kaggle.errors import UserError, read_text
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
 from mkpc_kaggle.geometry.critical_region import MkpcConfig
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
+from mkpc_kaggle.geometry.intrinsics import read as read_intrinsics
 from mkpc_kaggle.geometry.robust import RobustConfig
 
 DIRECTORY = Path(__file__).resolve().parent / "recipes"
@@ -103,9 +104,11 @@ class SceneConfig:
     cameras: CameraSharing = CameraSharing.AUTO
     camera_model: CameraModel = CameraModel.SIMPLE_PINHOLE
     threads: int = 1  # of the mapper; with more, the last digits vary from run to run
+    intrinsics: str = ""  # known cameras, as lines of :mod:`mkpc_kaggle.geometry.intrinsics`
 
     def __post_init__(self) -> None:
         check_ranges(self, pairs_per_image=AT_LEAST_0, threads=AT_LEAST_1)
+        read_intrinsics(self.intrinsics)
 
 
 @dataclass(frozen=True)

@@ -43,13 +43,20 @@ def draw_gains(validations: Sequence["Validation"]) -> "Figure":
     figure, axes = _rows(names, f"gain of mAA over {first.recipe}, with 95 % intervals")
     for index, other in enumerate(others):
         found = [gain_of(other, first, name) for name in (*names, None)]
-        gains, low, high = np.array([(gain.gain, gain.low, gain.high) for gain in found]).T
-        y, style = _beside(len(found), index, len(others)), _style(index + 1)
+        gains = np.array([each.gain for each in found])
+        low = np.array([each.low for each in found])
+        high = np.array([each.high for each in found])
         axes.errorbar(
-            gains, y, xerr=(gains - low, high - gains), **style, linestyle="", capsize=4, label=other.recipe
+            gains,
+            _beside(len(found), index, len(others)),
+            xerr=(gains - low, high - gains),
+            **_style(index + 1),  # 0 is the style of the first recipe in the other figures
+            linestyle="",
+            capsize=4,
+            label=other.recipe,
         )
     axes.axvline(0, color="black", linewidth=1)
-    axes.set_xlabel("mAA gained; an interval that includes 0 proves nothing")
+    axes.set_xlabel("gain of mAA; an interval that includes 0 shows no difference")
     _legend_below(figure)
     return figure
 
@@ -60,7 +67,7 @@ def draw_errors(validations: Sequence["Validation"]) -> "Figure":
     for axes, (kind, unit, thresholds, limits) in zip(figure.subplots(1, 2, sharey=True), PANELS, strict=True):
         plain(axes, f"pairs with a {kind} error below x")
         axes.axvspan(
-            thresholds[0], thresholds[-1], color=DROPPED, alpha=0.2, linewidth=0, label="mAA's thresholds"
+            thresholds[0], thresholds[-1], color=DROPPED, alpha=0.2, linewidth=0, label="thresholds of the mAA"
         )
         for index, validation in enumerate(validations):
             # Failures are infinite: clipped beyond the right edge, so that the curve ends below 1.
@@ -92,8 +99,15 @@ def _beside(rows: int, index: int, count: int) -> NDArray[np.float64]:
 
 
 def _style(index: int) -> dict[str, Any]:
-    """Return the style of a recipe by its index, the same in all figures. There are 42, distinct in shape, too."""
-    return {"color": COLOURS[index % len(COLOURS)], "marker": MARKERS[index % len(MARKERS)], "markersize": 7}
+    """Return the style of a recipe by its index, the same in all figures.
+
+    Six colours and seven markers give 42 styles, so that shapes distinguish recipes for colour-blind readers.
+    """
+    return {
+        "color": COLOURS[index % len(COLOURS)],
+        "marker": MARKERS[index % len(MARKERS)],
+        "markersize": 7,
+    }
 
 
 def _legend_below(figure: "Figure") -> None:

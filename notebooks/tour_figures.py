@@ -1,4 +1,4 @@
-"""One figure for each step of the method, for a single pair."""
+"""Figures for the steps of the method, on one pair."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -89,7 +89,7 @@ def draw_clusters(images: Images, points: tuple[Points, Points], clusters: tuple
             _dots(axes, xy[found.labels == label], COLOURS[rank % len(COLOURS)])
         for label in _by_size(found):
             _tag(axes, xy[found.labels == label], str(found.sizes[label]))
-        counts = f"numbers: their points; {len(noise)} points are noise"
+        counts = f"numbers: points of each cluster; {len(noise)} points are noise"
         _title(axes, f"image {number}, clusters found: {len(found.sizes)}\n{counts}")
     return figure
 
@@ -105,8 +105,9 @@ def draw_sizes(clusters: tuple[Clusters, Clusters], config: MkpcConfig) -> "Figu
 
 
 def _size_bars(axes: "Axes", clusters: Clusters, config: MkpcConfig) -> None:
-    sizes, kept = clusters.sizes[_by_size(clusters)], len(clusters.kept)
-    axes.set_xlabel("clusters by size; green: kept; orange, hatched: dropped")
+    sizes = clusters.sizes[_by_size(clusters)]
+    kept = len(clusters.kept)
+    axes.set_xlabel("clusters, by size; green: kept; orange and hatched: dropped")
     axes.set_ylabel("points")
     if not len(sizes):
         axes.set(xticks=[], yticks=[])
@@ -114,17 +115,19 @@ def _size_bars(axes: "Axes", clusters: Clusters, config: MkpcConfig) -> None:
     ranks = np.arange(1, len(sizes) + 1)
     for part, colour, hatch in ((slice(kept), INLIER, ""), (slice(kept, None), OUTLIER, "//")):
         bars = axes.bar(ranks[part], sizes[part], color=colour, hatch=hatch, edgecolor="white", width=0.7)
+        # More than ten labels of two lines would overlap.
         shares = [f"\n{size / sizes[0]:.3f}" if len(sizes) <= 10 else "" for size in sizes]
         labels = [f"{size}{share}" for size, share in zip(sizes[part], shares[part], strict=True)]
         axes.bar_label(bars, labels, padding=3, fontsize=9, bbox=_PAPER)
     axes.axhline(config.share * sizes[0], color="black", linewidth=1.2, linestyle="--")
+    # A logarithmic scale, because the largest cluster may have a hundred times the points of a dropped one.
     axes.set(yscale="log", ylim=(1, 8 * sizes[0]), xticks=ranks)
 
 
 def _limit(clusters: Clusters, config: MkpcConfig) -> str:
     if not len(clusters.sizes):
         return ""
-    return f"\ndashed: {config.share:g} of the largest, {config.share * clusters.sizes.max():.1f} points"
+    return f"\ndashed: {config.share:g} of the largest cluster, {config.share * clusters.sizes.max():.1f} points"
 
 
 def draw_boxes(
@@ -136,28 +139,32 @@ def draw_boxes(
         kept = xy[found.in_kept]
         _crosses(axes, xy[~found.in_kept], OUTLIER)
         _dots(axes, kept, INLIER)
-        title = f"image {number}: nothing kept, so no box"
+        title = f"image {number}: no kept points, so no box"
         if len(kept):
             tight = expand_box(kept, image.size, 1, 1)
             wide = expand_box(kept, image.size, config.expand_x, config.expand_y)
             add_box(axes, wide)
             add_box(axes, tight, edgecolor="white", linestyle="--", linewidth=1.5)
-            title = f"image {number}: dashed, kept points, {tight.size.width} x {tight.size.height}\n"
-            title += f"yellow, expanded, {wide.size.width} x {wide.size.height}"
+            title = f"image {number}, dashed: box of the kept points, {tight.size.width} x {tight.size.height}\n"
+            title += f"yellow: expanded box, {wide.size.width} x {wide.size.height}"
         _title(axes, title)
     return figure
 
 
 def draw_views(images: Images, regions: tuple[CriticalRegion, CriticalRegion], unit: Unit) -> "Figure":
     """Draw a unit's view of each whole image and of its critical region, with their scales."""
-    pairs = [(Box.whole(image.size), region.box) for image, region in zip(images, regions, strict=True)]
-    boxes = [*pairs[0], *pairs[1]]
-    views = [unit.view(box, 1) for box in boxes]
-    pictures = [Image("", view.render(images[index // 2].pixels)) for index, view in enumerate(views)]
+    pictures: list[Image] = []
+    titles: list[str] = []
+    for number, (image, region) in enumerate(zip(images, regions, strict=True)):
+        # A region that is not cropped has a reason, such as too few points.
+        crop = "crop" if region.reason == "cropped" else f"crop ({region.reason})"
+        for what, box in (("whole", Box.whole(image.size)), (crop, region.box)):
+            view = unit.view(box, 1)
+            pictures.append(Image("", view.render(image.pixels)))
+            titles.append(f"image {number}, {what}\nscaled by {view.scale[0]:.2f}")
     figure, row = side_by_side(pictures, title_lines=2)
-    names = [("whole", f"crop ({region.reason})" if region.reason != "cropped" else "crop") for region in regions]
-    for index, (axes, view, what) in enumerate(zip(row, views, [*names[0], *names[1]], strict=True)):
-        _title(axes, f"image {index // 2}, {what}\n{view.scale[0]:.2f} times enlarged")
+    for axes, title in zip(row, titles, strict=True):
+        _title(axes, title)
     return figure
 
 
@@ -205,7 +212,7 @@ def draw_epipolar(
         size = images[1].size
         axes.set(xlim=(-0.5, size.width - 0.5), ylim=(size.height - 0.5, -0.5))
         known = "\nwhite, dashed: the true lines" if truth is not None else ""
-        _title(axes, f"image 1: lines of {name}{known}")
+        _title(axes, f"image 1: lines by {name}{known}")
     return figure
 
 
@@ -216,7 +223,7 @@ def draw_plane(images: Images, matches: Matches, homography: Estimate, threshold
         _dots(axes, points[homography.inliers], COLOURS[0])
         _crosses(axes, points[~homography.inliers], OUTLIER)
     explained = f"{homography.inlier_count} of {len(matches)} inliers of F"
-    _title(row[0], f"blue: {explained}\nfit one plane to {threshold:g} pixels")
+    _title(row[0], f"blue: {explained}\nwithin {threshold:g} pixels of one plane")
     _title(row[1], "orange crosses: off the plane")
     return figure
 
@@ -228,7 +235,7 @@ def draw_pose_errors(errors: Mapping[str, PoseError]) -> "Figure":
     for axes, kind, title in zip(
         panels, ("rotation", "translation_angle"), ("rotation", "direction of translation"), strict=True
     ):
-        plain(axes, f"error of the {title}, in degrees")
+        plain(axes, f"error of the {title} (degrees)")
         angles = np.array([getattr(error, kind) for error in errors.values()])
         known = np.isfinite(angles)
         names = [short(name, 40) for name in errors]
@@ -257,8 +264,10 @@ def connect(axes: "Sequence[Axes]", matches: Matches, inliers: NDArray[np.bool_]
     """Draw a sample of the matches from one picture to the other. Return a description of the sample."""
     from matplotlib.patches import ConnectionPatch
 
-    drawn = sample(~inliers, MAX_OUTLIERS), sample(inliers, MAX_INLIERS)
-    for indices, colour, width in ((drawn[0], OUTLIER, 0.5), (drawn[1], INLIER, 0.7)):
+    outliers_drawn = sample(~inliers, MAX_OUTLIERS)
+    inliers_drawn = sample(inliers, MAX_INLIERS)
+    # Inliers last, so that they are on top.
+    for indices, colour, width in ((outliers_drawn, OUTLIER, 0.5), (inliers_drawn, INLIER, 0.7)):
         for panel, points in zip(axes, (matches.points0, matches.points1), strict=True):
             panel.scatter(points[indices, 0], points[indices, 1], s=6, c=colour, linewidths=0)
         style = {"coordsA": "data", "coordsB": "data", "color": colour, "linewidth": width, "alpha": 0.6}
@@ -266,7 +275,7 @@ def connect(axes: "Sequence[Axes]", matches: Matches, inliers: NDArray[np.bool_]
             ends = matches.points0[index], matches.points1[index]
             line = ConnectionPatch(*ends, axesA=axes[0], axesB=axes[1], **style)
             axes[0].figure.add_artist(line)
-    return f"{len(drawn[1])} inliers (green) and {len(drawn[0])} outliers (orange) drawn"
+    return f"{len(inliers_drawn)} inliers (green) and {len(outliers_drawn)} outliers (orange) drawn"
 
 
 def add_box(axes: "Axes", box: Box, **style: Any) -> None:
@@ -317,6 +326,7 @@ def _line(axes: "Axes", F: Matrix3, point: Points, **style: Any) -> None:
     a, b, c = F @ np.append(point.astype(np.float64), 1)
     normal = a * a + b * b
     if normal > 0:
+        # The point of the line nearest to the origin; the line may be vertical.
         foot = np.array([-a * c / normal, -b * c / normal])
         axes.axline(tuple(foot), tuple(foot + (b, -a) / np.sqrt(normal)), **style)
 

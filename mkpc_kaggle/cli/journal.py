@@ -12,6 +12,7 @@ from mkpc_kaggle.engine.store import Store
 from mkpc_kaggle.reporting.report import write_report
 from mkpc_kaggle.reporting.run_log import read_log, write_csv
 from mkpc_kaggle.reporting.summary import overview
+from mkpc_kaggle.reporting.verdict import write_summary
 
 HELP = """\
 Show the journal of a run, also while it is running. DIR is the run's work directory, NAME.work next to the
@@ -57,5 +58,5 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.report:
         pairs = read_test_side(arguments.test_dir) if arguments.test_dir else ()
         write_report(log, arguments.report, pairs)
-        written.append(arguments.report)
+        written += filter(None, [arguments.report, write_summary(log, arguments.report)])
     print("\n".join(map(str, written)) or overview(log))

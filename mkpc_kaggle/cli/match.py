@@ -45,6 +45,7 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.save is not None and arguments.save.suffix != ".npz":
         raise UserError(f"--save {arguments.save}: the name must end in .npz")
     images = to_image(arguments.image0), to_image(arguments.image1)
+    # After the images: a wrong path should not wait for weights to be digested.
     matcher = TwoStageMatcher(
         arguments.recipe,
         weights=arguments.weights,

@@ -28,16 +28,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--wheels", type=Path, metavar="DIR", help="take wheels from DIR, without a network")
     text = "include weights that must not be redistributed; the dataset must then stay private"
     add("--private", action="store_true", help=text)
+    text = "attach ALIKED and LightGlue from Kaggle Models to the notebook: nothing to download or upload"
+    add("--models", action="store_true", help=text)
     text = """Kaggle's latest image (the default), the image of the kernel's first version, or this image
         (`kaggle kernels pull NAME/mkpc-submission -m` prints the image of a version as docker_image)"""
     add("--image", default=LATEST, metavar="latest|original|NAME@sha256:DIGEST", help=text)
 
 
 def run(arguments: argparse.Namespace) -> None:
-    out, private, image = arguments.out, arguments.private, arguments.image
-    pythons = tuple(version.strip() for version in arguments.python.split(","))
-    weights = tuple(arguments.weights)
-    package = make_package(Request(out, arguments.owner, weights, pythons, arguments.wheels, private, image))
+    out: Path = arguments.out
+    request = Request(
+        out,
+        arguments.owner,
+        weights=tuple(arguments.weights),
+        pythons=tuple(version.strip() for version in arguments.python.split(",")),
+        wheels=arguments.wheels,
+        private=arguments.private,
+        image=arguments.image,
+        models=arguments.models,
+    )
+    package = make_package(request)
     for folder, items in (("dataset", package.dataset), ("kernel", package.kernel)):
         rows = [(item.name, str(item.source.stat().st_size), item.licence or "-", item.note) for item in items]
         total = f"{len(rows)} files", str(sum(int(size) for _, size, *_ in rows)), "", ""
@@ -46,7 +56,7 @@ def run(arguments: argparse.Namespace) -> None:
         print()
     if package.restricted:
         names = ", ".join(f"{item.name} ({item.licence})" for item in package.restricted)
-        print(f"{_PRIVATE if private else _LEFT_OUT}: {names}\n")
+        print(f"{_PRIVATE if arguments.private else _LEFT_OUT}: {names}\n")
     print(_NEXT.format(out=out))
 
 

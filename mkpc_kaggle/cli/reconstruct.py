@@ -7,13 +7,17 @@ from dataclasses import replace
 from pathlib import Path
 
 from mkpc_kaggle.cli import options
+from mkpc_kaggle.data.masks import Masks
 from mkpc_kaggle.engine.budget import format_duration
 from mkpc_kaggle.engine.console import say
 from mkpc_kaggle.engine.session import interruptible
 from mkpc_kaggle.recipe import CameraSharing
+from mkpc_kaggle.reconstruction.coordinates import forget_coordinates, keep_coordinates
 from mkpc_kaggle.reconstruction.directory import output_directory, require_directory_apart
 from mkpc_kaggle.reconstruction.folder import batch_names, read_folder, read_pair_list
+from mkpc_kaggle.reconstruction.layout import write_layouts
 from mkpc_kaggle.reconstruction.outputs import FORMS, Cameras, write_tables
+from mkpc_kaggle.reconstruction.priors import read_intrinsics_table
 from mkpc_kaggle.reconstruction.run import FolderResult, for_cameras, reconstruct_folder
 from mkpc_kaggle.reporting.summary import pending_lines, trouble, weakest_line
 
@@ -25,12 +29,14 @@ may be mixed: each scene becomes a model, and unrelated images get no camera.
 OUT gets a folder for each folder in DIR, with:
   database.db     COLMAP's: cameras, images, keypoints, matches, verified two-view geometries
   models/0, 1...  COLMAP's binary models, the largest first
+  images/         links to the images, or copies where links fail
+  sparse/0, 1...  the models with plain file names and colours, as gsplat, nerfstudio and others read them
 and for all datasets together:
   cameras.csv     image, model, K, R, t: X_cam = R X + t, (0, 0) is the first pixel's centre; numbers joined by ;
                   and the uncertainty of each camera: rotation_sigma (degrees), centre_sigma (of the model's size),
                   focal_sigma (percent); see docs/running.md
   submission.csv  with --format
-  report.html     the run, with the cameras and points of each model
+  report.html     the run, with an interactive view of each scene; summary.json has the same facts
   work/           the journal: after a kill, the same command resumes the run and makes the same files
 
 Points refer to the pixels of the stored file, as COLMAP reads it, without the EXIF orientation. A file that EXIF
@@ -40,6 +46,9 @@ the focal lengths of EXIF.
 OUT must be empty or the result of an earlier run of this command. Complete new results replace former results; a
 link or a file of yours at the path of a result is refused. At the end, unchanged results that only an earlier run
 made are removed. Other files remain.
+
+If images were added or removed since the last complete run, the cameras keep its coordinates; with --fresh they
+do not.
 
 All pairs of up to 100 images are matched; in larger datasets, each image is matched with the 20 most similar.
 
@@ -60,6 +69,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     text = """images of one size in a folder that share a camera: if their focal lengths agree (auto), none
         (image), or all (folder)"""
     add("--camera", choices=list(map(str, CameraSharing)), help=text)
+    text = """known cameras, a table with the columns image (a path, a name or a pattern such as 'drone*.jpg'),
+        model (COLMAP's: SIMPLE_PINHOLE, OPENCV, ...), parameters (in COLMAP's order, separated by blanks) and
+        sigma (of the focal length, in percent, or fixed)"""
+    add("--intrinsics", type=Path, metavar="FILE.csv", help=text)
+    text = "masks named as COLMAP's, MASKS/a.jpg.png for a.jpg; points on black pixels are left out"
+    add("--masks", type=Path, metavar="MASKS", help=text)
     add("--fresh", action="store_true", help="delete the journal of an earlier run in OUT/work")
     parser.set_defaults(reconstruct=True)
 
@@ -67,7 +82,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     root, out, work_dir = arguments.images, arguments.out, arguments.out / "work"
     datasets = read_folder(root)
-    require_directory_apart(out, filter(None, [root, arguments.pairs, Path(arguments.recipe)]), arguments.weights)
+    files = [file for found in datasets.values() for file in found]
+    known = "" if arguments.intrinsics is None else read_intrinsics_table(arguments.intrinsics, root, files)
+    masks = Masks() if arguments.masks is None else Masks.of_folder(arguments.masks, root, files)
+    inputs = [root, arguments.pairs, Path(arguments.recipe), arguments.intrinsics, arguments.masks]
+    require_directory_apart(out, filter(None, inputs), arguments.weights)
     listed = None if arguments.pairs is None else read_pair_list(arguments.pairs, root, datasets)
     with (
         interruptible() as interrupt,
@@ -75,19 +94,31 @@ def run(arguments: argparse.Namespace) -> int:
         output_directory(out, datasets, arguments.format),
     ):
         session.status = 1  # until a model exists
+        if arguments.fresh:
+            forget_coordinates(out, datasets)
 
         def publish(cameras: Cameras) -> None:
             write_tables(out, cameras, root, arguments.format)
             session.status = int(not any(any(found.values()) for found in cameras.values()))
 
         assembly = options.assembly_of(arguments, arguments.recipe, arguments.mode, interrupt)
-        assembly = replace(assembly, recipe=for_cameras(assembly.recipe, arguments.camera))
+        recipe = for_cameras(assembly.recipe, arguments.camera, known)
+        assembly = replace(assembly, recipe=recipe, masks=masks)
         options.say_start(f"{sum(map(len, datasets.values()))} images", assembly, work_dir)
         given = {"listed": listed, "rotations": arguments.rotations, "publish": publish}
         result = reconstruct_folder(root, datasets, assembly, session, out, **given)
         unwritten, failed = result.report.unwritten, trouble(result.report)
         session.status = int(bool(failed or unwritten)) or session.status
-        lines = [*options.plan_lines(arguments, result.report), *_lines(result, root), failed, unwritten]
+        layouts = write_layouts(out, root, datasets, session.must_end())
+        kept = keep_coordinates(out, root, result)
+        lines = [
+            *options.plan_lines(arguments, result.report),
+            *_lines(result, root),
+            *layouts,
+            *kept,
+            failed,
+            unwritten,
+        ]
         say("\n".join(filter(None, [*lines, f"results: {out}"])))
         page = out / "report.html" if result.pairs else None
         return options.finish(session, page, result.pairs)

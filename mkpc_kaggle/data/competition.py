@@ -13,8 +13,9 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache
+from io import TextIOBase
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TextIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,10 +25,14 @@ from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Matrix3
 
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
 SUBMISSION_COLUMNS = ("sample_id", "fundamental_matrix")
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 
-MAX_LINE = 1 << 24  # characters of a row; other files may have lines of gigabytes
+MAX_COLUMNS = 1000  # of a table; pandas takes minutes for a hundred thousand
+MAX_LINE = 1 << 20  # characters of a row; other files may have lines of gigabytes
 CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")  # characters that end lines or control a terminal
 # Names that are empty, "." or "..", or contain a Windows drive, a slash or a control character.
 NOT_PLAIN = re.compile(rf"^\.{{0,2}}$|^[A-Za-z]:|[/\\]|{CONTROL.pattern}")
@@ -181,27 +186,124 @@ def read_rows(path: Path, columns: Sequence[str], *, only: bool = False) -> Iter
 
     ``only`` requires that the file has no other columns. Raises :class:`UserError` for an unusable file.
     """
+    table = read_table(path, columns, only=only)
+    # Lists of str: iterating over pandas' own strings takes ten times as long.
+    cells = [table[column].tolist() for column in columns]
+    for line, *row in zip(table.index.tolist(), *cells, strict=True):
+        yield f"{path}, line {line}", row
+
+
+def read_table(path: Path, columns: Sequence[str], *, only: bool = False) -> "DataFrame":
+    """Return a CSV file with its text unchanged: ids such as "007", "1e3" and "NA" are no numbers.
+
+    The index is the line of the file where a row ends. Empty rows are skipped. ``only`` requires that the file has
+    no columns except ``columns``. Raises :class:`UserError` for a file that is not a regular table with these
+    columns.
+    """
+    import pandas as pd  # the import takes most of a second
+
     try:
         if path.exists() and not path.is_file():
             raise UserError(f"{path} is not a regular file")
         with path.open(encoding="utf-8-sig", newline="") as stream:
-            table = csv.reader(iter(lambda: stream.readline(MAX_LINE), ""))
-            header = next(filter(None, table), [])
-            found = ", ".join(header)[:200] or "nothing"
-            if missing := [column for column in columns if column not in header]:
-                raise UserError(f"{path} lacks the columns {', '.join(missing)}; it has {found}")
-            if only and header != list(columns):
-                raise UserError(f"{path}: the header is {found}, not {', '.join(columns)}")
-            indices = [header.index(column) for column in columns]
-            for row in filter(None, table):
-                where = f"{path}, line {table.line_num}"
-                if len(row) != len(header):
-                    raise UserError(f"{where}: {len(row)} cells, the header has {len(header)}")
-                yield where, [row[index] for index in indices]
+            skipped = _skip_to_header(path, stream)
+            lines = _LimitedLines(stream)
+            rows = pd.read_csv(
+                lines,
+                # The header is read as a row, so that pandas refuses rows with more cells.
+                header=None,
+                dtype=str,
+                keep_default_na=False,
+                # Empty lines stay until the lines are counted.
+                skip_blank_lines=False,
+            )
     except FileNotFoundError as error:
         raise UserError(f"{path}: no such file") from error
-    except (OSError, ValueError, csv.Error) as error:
+    except pd.errors.EmptyDataError:
+        raise UserError(f"{path} lacks the columns {', '.join(columns)}; it has nothing") from None
+    except pd.errors.ParserError as error:
+        raise UserError(_refusal(path, error, skipped)) from error
+    except (OSError, ValueError) as error:
         raise UserError(f"{path} cannot be read as a table: {error}") from error
+    rows.index = np.arange(skipped + 1, skipped + len(rows) + 1)
+    if lines.has_quotes:  # quoted cells may have line breaks
+        breaks = rows.apply(lambda column: column.str.count("\n")).sum(axis=1)
+        rows.index += breaks.cumsum().astype(int)
+    return _with_header(path, rows[(rows != "").any(axis=1)], columns, only)
+
+
+def _skip_to_header(path: Path, stream: TextIO) -> int:
+    """Move to the first line that is not empty. Return the number of empty lines before it."""
+    skipped = 0
+    position = stream.tell()
+    while (line := stream.readline(MAX_LINE)) and not line.strip("\r\n"):
+        skipped += 1
+        position = stream.tell()
+    if line.count(",") >= MAX_COLUMNS:
+        raise UserError(f"{path} has {line.count(',') + 1} columns; at most {MAX_COLUMNS} are read")
+    stream.seek(position)
+    return skipped
+
+
+def _with_header(path: Path, rows: "DataFrame", columns: Sequence[str], only: bool) -> "DataFrame":
+    """Return the rows below the header. Raise :class:`UserError` if columns or cells are missing."""
+    header = list(rows.iloc[0])
+    found = ", ".join(header)[:200]
+    if missing := [column for column in columns if column not in header]:
+        raise UserError(f"{path} lacks the columns {', '.join(missing)}; it has {found}")
+    if only and header != list(columns):
+        raise UserError(f"{path}: the header is {found}, not {', '.join(columns)}")
+    table = rows.iloc[1:]
+    # pandas fills the end of a short row with empty cells.
+    if (table.iloc[:, -1] == "").any():
+        _require_cells(path, len(header))
+    # Of columns with the same name, the first one counts.
+    firsts = [header.index(column) for column in columns]
+    return table.iloc[:, firsts].set_axis(list(columns), axis=1)
+
+
+def _require_cells(path: Path, count: int) -> None:
+    """Raise :class:`UserError` for the first row without ``count`` cells."""
+    with path.open(encoding="utf-8-sig", newline="") as stream:
+        table = csv.reader(stream)
+        for row in filter(None, table):
+            if len(row) != count:
+                where = f"{path}, line {table.line_num}"
+                raise UserError(f"{where}: {len(row)} cells, the header has {count}")
+
+
+def _refusal(path: Path, error: Exception, skipped: int) -> str:
+    """Return the message for a table that pandas refuses, after ``skipped`` empty lines."""
+    counts = re.search(r"Expected (\d+) fields in line (\d+), saw (\d+)", str(error))
+    if counts is None:
+        return f"{path} cannot be read as a table: {error}"
+    expected, line, saw = counts.groups()
+    return f"{path}, line {skipped + int(line)}: {saw} cells, the header has {expected}"
+
+
+class _LimitedLines(TextIOBase):
+    """A text stream for pandas that refuses lines of more than ``MAX_LINE`` characters, and NUL characters.
+
+    pandas would hold such a line in memory several times, and would cut a cell off at a NUL.
+    """
+
+    def __init__(self, stream: TextIO) -> None:
+        super().__init__()
+        self._stream = stream
+        self._length = 0  # of the line that the last part ends with
+        self.has_quotes = False
+
+    def read(self, size: int | None = -1, /) -> str:
+        text = self._stream.read(min(size, MAX_LINE) if size and size > 0 else MAX_LINE)
+        if "\0" in text:
+            raise ValueError("line contains NUL")
+        self.has_quotes |= '"' in text
+        lengths = [len(part) for part in text.split("\n")]
+        lengths[0] += self._length
+        self._length = lengths[-1]
+        if max(lengths) > MAX_LINE:
+            raise ValueError(f"a line of more than {MAX_LINE} characters")
+        return text
 
 
 def plain_name(name: str, where: str) -> str:

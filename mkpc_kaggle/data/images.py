@@ -127,6 +127,15 @@ def read_exif(data: bytes, size: Size) -> tuple[int, float]:
     return TURNS.get(tags.get(ORIENTATION, 1), 0), focal if focal / max(size) in FOCALS else 0.0
 
 
+def read_size(path: Path) -> Size | None:
+    """Return the size of a picture from its head, in stored pixels; ``None`` if it is unreadable."""
+    with suppress(Exception), warnings.catch_warnings():  # Pillow raises errors of any type
+        warnings.filterwarnings("ignore", module="PIL")
+        with PIL.Image.open(path, formats=("JPEG", "PNG")) as picture:
+            return Size(*picture.size)
+    return None
+
+
 def content_digest(path: Path) -> str:
     """Return the digest of a file. Raise ``OSError`` or ``ValueError`` if it cannot be read."""
     if not path.is_file():

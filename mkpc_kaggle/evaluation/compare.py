@@ -40,39 +40,53 @@ def paired_difference(scenes: Sequence[Paired]) -> Difference:
     Sources: Rubin 1981 (exponential weights); Owen 2007 (products of weights).
     """
     generator = np.random.default_rng(0)
-    gains = [np.asarray(second, np.float64) - np.asarray(first, np.float64) for first, second, _ in scenes]
-    means = [_resampled_means(gain, scene[2], generator) for gain, scene in zip(gains, scenes, strict=True)]
-    low, high = np.quantile(np.mean(means, axis=0), [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
-    return Difference(mean(float(gain.mean()) for gain in gains), float(low), float(high))
+    means: list[float] = []
+    resampled: list[NDArray[np.float64]] = []
+    for first, second, images in scenes:
+        gains = np.asarray(second, np.float64) - np.asarray(first, np.float64)
+        means.append(float(gains.mean()))
+        resampled.append(_resampled_means(gains, images, generator))
+    # Scenes count equally, whatever their number of pairs, as in the mAA.
+    overall = np.mean(resampled, axis=0)
+    low, high = np.quantile(overall, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
+    return Difference(mean(means), float(low), float(high))
 
 
 def _resampled_means(
     gains: NDArray[np.float64], images: Sequence[tuple[str, str]], generator: np.random.Generator
 ) -> NDArray[np.float64]:
     """Return weighted means (RESAMPLES,) of the gains (P,), one for each random draw of image weights."""
-    _, ends = np.unique(np.array(images), return_inverse=True)
-    ends = ends.reshape(-1, 2)
-    table = np.zeros((2, ends.max() + 1, ends.max() + 1))  # by two images: sum of gains, number of pairs
-    np.add.at(table[0], (ends[:, 0], ends[:, 1]), gains)
-    np.add.at(table[1], (ends[:, 0], ends[:, 1]), 1.0)
-    weights = generator.exponential(size=(RESAMPLES, table.shape[1]))
-    total, count = ((weights @ each * weights).sum(axis=1) for each in table)
+    names, ends = np.unique(np.array(images), return_inverse=True)
+    first, second = ends.reshape(-1, 2).T
+    # Two tables by image and image, so that one product gives all resamples.
+    gain_sums = np.zeros((len(names), len(names)))
+    pair_counts = np.zeros((len(names), len(names)))
+    np.add.at(gain_sums, (first, second), gains)
+    np.add.at(pair_counts, (first, second), 1.0)
+    weights = generator.exponential(size=(RESAMPLES, len(names)))
+    total = (weights @ gain_sums * weights).sum(axis=1)
+    count = (weights @ pair_counts * weights).sum(axis=1)
     return np.asarray(total / count)
 
 
 def gain_of(other: Validation, first: Validation, scene: str | None = None) -> Difference:
     """Return the gain in mAA of ``other`` over ``first`` on the same pairs, in a scene or averaged over scenes."""
-    both = zip(first.scenes, other.scenes, strict=True)
-    return paired_difference(
-        [(a.accuracies(), b.accuracies(), a.images) for a, b in both if scene in (None, a.scene)]
-    )
+    paired: list[Paired] = []
+    for before, after in zip(first.scenes, other.scenes, strict=True):
+        if scene in (None, before.scene):
+            paired.append((before.accuracies(), after.accuracies(), before.images))
+    return paired_difference(paired)
 
 
 def seconds_per_pair(validation: Validation) -> float:
     """Return the mean seconds per pair of units, clustering and last estimate in the journal; NaN if unknown."""
-    records = validation.report.records if validation.report else ()
-    seconds = (r.encode_seconds + r.match_seconds + r.cluster_seconds + r.estimate_seconds for r in records)
-    return mean(seconds) if records else nan
+    if validation.report is None or not validation.report.records:
+        return nan
+    # Not the decoding: it runs in parallel with matching.
+    return mean(
+        record.encode_seconds + record.match_seconds + record.cluster_seconds + record.estimate_seconds
+        for record in validation.report.records
+    )
 
 
 def comparison_table(validations: Sequence[Validation]) -> list[str]:
@@ -82,20 +96,24 @@ def comparison_table(validations: Sequence[Validation]) -> list[str]:
     lines += [f"{run.recipe:<40}{run.maa():>9.4f}{seconds_per_pair(run):>16.3f}" for run in validations]
     counts = {scene.scene: len(scene.pairs) for scene in first.scenes}
     for other in others:
-        lines += ["", f"{other.recipe} against {first.recipe}: gain of mAA, {LEVEL:.0%} interval"]
-        for name in (*counts, None):
-            count = counts[name] if name else sum(counts.values())
-            lines.append(f"{name or 'mean over scenes':<20}{count:>6}  {gain_of(other, first, name)}")
+        lines.append("")
+        lines.append(f"{other.recipe} against {first.recipe}: gain of mAA, {LEVEL:.0%} interval")
+        for name, count in counts.items():
+            lines.append(f"{name:<20}{count:>6}  {gain_of(other, first, name)}")
+        total = sum(counts.values())
+        lines.append(f"{'mean over scenes':<20}{total:>6}  {gain_of(other, first)}")
     return lines
 
 
 def step_gains(validation: Validation) -> list[str]:
     """Return a line per step with the mean gain in mAA over the previous step. Skip scenes without metres."""
     scenes = [scene for scene in validation.scenes if scene.in_metres]
+    if not scenes:
+        return []
     lines = []
-    for steps in pairwise(validation.steps if scenes else ()):
-        first, second = steps
-        difference = paired_difference([(s.accuracies(first), s.accuracies(second), s.images) for s in scenes])
+    for first, second in pairwise(validation.steps):
+        paired = [(each.accuracies(first), each.accuracies(second), each.images) for each in scenes]
+        difference = paired_difference(paired)
         lines.append(f"gain of {second} over the step before, {LEVEL:.0%} interval: {difference}")
     return lines
 

@@ -10,7 +10,7 @@ from enum import StrEnum
 from math import isfinite, nan
 from pathlib import Path
 from statistics import mean
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from scipy.spatial.transform import Rotation
 
@@ -27,6 +27,9 @@ from mkpc_kaggle.geometry.metrics import AUC_THRESHOLDS, PoseError
 from mkpc_kaggle.geometry.robust import Method, RobustConfig
 from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.recipe import Recipe
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 MAX_NAMES = 5  # of samples to list in a line
 MATCHING = ("precision", "matching_score")
@@ -233,21 +236,39 @@ def score_table(validation: Validation) -> list[str]:
     The columns are the mAA after each step, and the pose AUC after the last step. Lists of pairs also have
     precision and matching score. The last line names samples without a row, if any.
     """
-    several, is_list = len(validation.steps) > 1, not all(scene.in_metres for scene in validation.scenes)
-    heads = [*(validation.steps if several else ["mAA"]), *(f"AUC {angle:.0f}" for angle in AUC_THRESHOLDS)]
-    heads += ["precis.", "m.score"] if is_list else []
-    lines = [f"{'scene':<20}{'pairs':>6}" + "".join(f"{head:>9}" for head in heads)]
-    rows: list[tuple[str, SceneScore | Validation]] = [(scene.scene, scene) for scene in validation.scenes]
-    for name, scores in [*rows, ("mean over scenes", validation)]:
-        accuracies = map(scores.maa, validation.steps or [None])
-        values = (*accuracies, *map(scores.auc, AUC_THRESHOLDS), *(scores.matching if is_list else ()))
+    table = score_frame(validation)
+    figures = table.drop(columns=["scene", "pairs"])
+    lines = [f"{'scene':<20}{'pairs':>6}" + "".join(f"{head:>9}" for head in figures)]
+    for name, count, values in zip(table["scene"], table["pairs"], figures.to_numpy(), strict=True):
         cells = (f"{value:>9.4f}" if isfinite(value) else f"{'-':>9}" for value in values)
-        lines.append(f"{name:<20}{len(scores.errors):>6}" + "".join(cells))
+        lines.append(f"{name:<20}{count:>6}" + "".join(cells))
     if missing := validation.missing:
         more = f" and {len(missing) - MAX_NAMES} more" if len(missing) > MAX_NAMES else ""
         names = ", ".join(missing[:MAX_NAMES]) + more
         lines.append(f"{len(missing)} samples have no row and count as failed: {names}")
+    several = len(validation.steps) > 1
     return ["mAA after each step, AUC after the last:", *lines] if several else lines
+
+
+def score_frame(validation: Validation) -> "DataFrame":
+    """Return the scores as a table: a row for each scene and one for their mean, NaN for unknown figures.
+
+    The columns are the scene, its number of pairs, and the figures of :func:`score_table`.
+    """
+    from pandas import DataFrame  # the import takes most of a second
+
+    is_list = not all(scene.in_metres for scene in validation.scenes)
+    steps = validation.steps if len(validation.steps) > 1 else ["mAA"]
+    heads = [*map(str, steps), *(f"AUC {angle:.0f}" for angle in AUC_THRESHOLDS)]
+    heads += ["precis.", "m.score"] if is_list else []
+    named: list[tuple[str, SceneScore | Validation]] = [(scene.scene, scene) for scene in validation.scenes]
+    rows = []
+    for name, scores in [*named, ("mean over scenes", validation)]:
+        accuracies = map(scores.maa, validation.steps or [None])
+        areas = map(scores.auc, AUC_THRESHOLDS)
+        matching = scores.matching if is_list else ()
+        rows.append((name, len(scores.errors), *accuracies, *areas, *matching))
+    return DataFrame(rows, columns=["scene", "pairs", *heads])
 
 
 def to_json(validation: Validation) -> dict[str, Any]:

@@ -1,4 +1,7 @@
-"""The registry of matchers: each file of ``adapters/`` is a matcher, with a ``SPEC`` and a ``load``."""
+"""The registry of matchers: each file of ``adapters/`` is a matcher, with a ``SPEC`` and a ``load``.
+
+Matchers of the library vismatch are named ``vismatch:NAME``.
+"""
 
 import pkgutil
 from collections.abc import Mapping
@@ -10,6 +13,8 @@ from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.matchers import adapters
 from mkpc_kaggle.matchers.contract import Matcher, MatcherSpec, Placement
 from mkpc_kaggle.weights import WeightStore
+
+VISMATCH = "vismatch:"  # begins the names of vismatch's matchers, which need no file in ``adapters/``
 
 
 class UnusableError(UserError):
@@ -55,9 +60,14 @@ def misfit(name: str, weights: WeightStore, options: Any) -> str:
 
 
 def _imported(name: str, where: str) -> Any:
-    if name not in matcher_names():
-        raise UserError(f"{where}: unknown matcher {name!r}; known: {', '.join(matcher_names())}")
+    is_vismatch = name.startswith(VISMATCH)
+    if not is_vismatch and name not in matcher_names():
+        known = ", ".join(matcher_names())
+        raise UserError(f"{where}: unknown matcher {name!r}; known: {known}, {VISMATCH}NAME")
     try:
+        if is_vismatch:
+            module = import_module("mkpc_kaggle.matchers.vismatch")
+            return module.adapter_of(name.removeprefix(VISMATCH))
         return import_module(f"{adapters.__name__}.{name}")
     except Exception as error:  # any error at import affects this matcher only
         message = f"matcher {name} cannot be used here ({type(error).__name__}: {error})"

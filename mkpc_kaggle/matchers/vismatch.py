@@ -1,19 +1,69 @@
 """Adapter of vismatch's matchers (https://github.com/gmberton/vismatch, version 1.4).
 
+A recipe's unit names one as ``matcher = "vismatch:NAME"``. vismatch itself downloads the weights of a matcher
+when it is first loaded, so the first run needs internet.
+
 vismatch's ``get_matcher(NAME)`` returns a callable that maps two images to a dict. The adapter reads
 ``matched_kpts0`` and ``matched_kpts1``, (N, 2) pixels (x, y) before vismatch's RANSAC, and
-``matched_confidences``, (N,) or ``None``. It does not import vismatch.
+``matched_confidences``, (N,) or ``None``.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib import import_module
 from typing import Any
 
 import numpy as np
 import torch
 
+from mkpc_kaggle.config import AT_LEAST_1, check_ranges
 from mkpc_kaggle.geometry.coordinates import from_corner
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.matchers.contract import MatcherSpec, PairwiseMatcher, Picture
+from mkpc_kaggle.matchers.contract import MatcherSpec, PairwiseMatcher, Picture, Placement
+from mkpc_kaggle.matchers.registry import VISMATCH
+from mkpc_kaggle.weights import WeightStore
+
+LICENCE = "see vismatch"  # its matchers have many licences, which it does not state as data
+
+
+@dataclass(frozen=True)
+class VismatchOptions:
+    """The options of a unit ``vismatch:NAME``; the defaults suit matchers of whole-pixel keypoints."""
+
+    corner: bool = False  # True: the origin of points is the image's top-left corner
+    multiple: int = 1  # the sides of views are padded to multiples of this
+    keypoints: int = 2048  # vismatch's max_num_keypoints
+
+    def __post_init__(self) -> None:
+        check_ranges(self, multiple=AT_LEAST_1, keypoints=AT_LEAST_1)
+
+
+@dataclass(frozen=True)
+class Adapter:
+    """One of vismatch's matchers, with the interface of a module of ``adapters/``."""
+
+    name: str  # vismatch's, without the prefix
+
+    @property
+    def SPEC(self) -> MatcherSpec:  # noqa: N802  the name of a module's constant
+        return MatcherSpec(f"{VISMATCH}{self.name}", VismatchOptions, licences=(LICENCE,))
+
+    def load(self, weights: WeightStore, options: VismatchOptions, placement: Placement) -> "VismatchMatcher":
+        vismatch = import_module("vismatch")
+        matcher = vismatch.get_matcher(self.name, device=placement.device, max_num_keypoints=options.keypoints)
+        return VismatchMatcher(
+            matcher,
+            f"{VISMATCH}{self.name}",
+            corner=options.corner,
+            multiple=options.multiple,
+            licences=(LICENCE,),
+        )
+
+
+def adapter_of(name: str) -> Adapter:
+    """Return the adapter of vismatch's matcher ``name``. Raise ``ImportError`` without vismatch."""
+    import_module("vismatch")
+    return Adapter(name)
 
 
 class VismatchMatcher(PairwiseMatcher[Picture]):

@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.version import __version__
@@ -12,6 +12,8 @@ DATASET_SLUG = "mkpc-kaggle"
 KERNEL_TITLE = "MKPC submission"
 KERNEL_SLUG = KERNEL_TITLE.lower().replace(" ", "-")  # Kaggle derives the slug from the title; both must agree
 LATEST, ORIGINAL = "latest", "original"
+# ALIKED-n16 and its LightGlue on Kaggle Models: the store finds the files below /kaggle/input by their digests.
+MODELS = ("oldufo/aliked/pyTorch/aliked-n16/1", "oldufo/lightglue/pyTorch/aliked/1")
 
 
 def check_owner(owner: str) -> None:
@@ -38,8 +40,12 @@ def dataset_metadata(owner: str, licences: Iterable[str]) -> str:
     )
 
 
-def kernel_metadata(owner: str, notebook: str, image: str) -> str:
-    """Return ``kernel-metadata.json``: two T4 GPUs, internet off, the competition and our dataset attached.
+def kernel_metadata(
+    owner: str, notebook: str, image: str, *, has_gpu: bool = True, models: Sequence[str] = ()
+) -> str:
+    """Return ``kernel-metadata.json``: internet off, the competition, our dataset and ``models`` attached.
+
+    With ``has_gpu``, the notebook asks for two T4 GPUs. Without weights they would idle and use up the quota.
 
     ``image`` is ``latest``, ``original`` (the image of the kernel's first version), or an image with the digest
     that ``kaggle kernels pull -m`` reports. Raises :class:`UserError` for other values.
@@ -55,17 +61,41 @@ def kernel_metadata(owner: str, notebook: str, image: str) -> str:
             "language": "python",
             "kernel_type": "notebook",
             "is_private": True,
-            "enable_gpu": True,
-            "machine_shape": "NvidiaTeslaT4",
+            "enable_gpu": has_gpu,
+            **({"machine_shape": "NvidiaTeslaT4"} if has_gpu else {}),
             "docker_image_pinning_type": ORIGINAL if pinned else image,
             **pinned,
             "enable_internet": False,
             "competition_sources": [COMPETITION],
             "dataset_sources": [f"{owner}/{DATASET_SLUG}"],
             "kernel_sources": [],
-            "model_sources": [],
+            "model_sources": list(models),
         }
     )
+
+
+def dataset_page(licences: Iterable[str]) -> str:
+    """Return the dataset's ``README.md``. The project's own has pictures and links that Kaggle cannot show."""
+    named = ", ".join(sorted(set(licences))) or "none, this dataset has no weights"
+    return f"""\
+# MKPC Kaggle {__version__}
+
+The notebook `{KERNEL_SLUG}` uses these files to make a submission to the Image Matching Challenge 2022 without
+internet.
+
+| file | content |
+| --- | --- |
+| `mkpc_kaggle-*.whl` | the package: two-stage image matching with Matching Key-Points Crop |
+| other `*.whl` | packages that may be missing on Kaggle; each has its licence inside |
+| `requirements.txt` | the versions that the notebook installs |
+| `*.safetensors` | weights of image matchers, converted from the published checkpoints |
+| `weights_manifest.txt` | size, digest, licence and source of each weight file |
+
+The package is under Apache-2.0. Licences of the weights: {named}.
+
+Add this dataset and the competition to the notebook under *Add Input*, switch the internet off, save a version.
+`mkpc package` in the project's repository makes these files.
+"""
 
 
 def _json(table: dict[str, object]) -> str:

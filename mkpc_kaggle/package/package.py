@@ -7,7 +7,14 @@ from tempfile import TemporaryDirectory
 
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.package.files import Item, choose_weights, refuse_other_files, write_files
-from mkpc_kaggle.package.metadata import LATEST, check_owner, dataset_metadata, kernel_metadata
+from mkpc_kaggle.package.metadata import (
+    LATEST,
+    MODELS,
+    check_owner,
+    dataset_metadata,
+    dataset_page,
+    kernel_metadata,
+)
 from mkpc_kaggle.package.wheels import PYTHONS, build_wheel, collect_wheels, install_lines, licence_of, pins
 from mkpc_kaggle.weights import WeightStore
 from mkpc_kaggle.weights.manifest import MANIFEST
@@ -24,6 +31,7 @@ class Request:
     wheels: Path | None = None  # a directory of wheels, used instead of pip's index
     private: bool = False  # include weights whose licence forbids redistribution
     image: str = LATEST  # a Kaggle image, see :func:`kernel_metadata`
+    models: bool = False  # attach ALIKED and LightGlue from Kaggle Models
 
 
 @dataclass(frozen=True)
@@ -55,12 +63,19 @@ def make_package(request: Request) -> Package:
             (staging / name).write_text(content, encoding="utf-8", newline="\n")
             return Item(name, staging / name)
 
-        kernel_items = (
-            text("kernel-metadata.json", kernel_metadata(request.owner, NOTEBOOK.name, request.image)),
-            Item(NOTEBOOK.name, checkout / NOTEBOOK),
-        )
         chosen = choose_weights(WeightStore(request.weights), checkout, staging, private=request.private)
         licences = [item.licence for item in chosen.items]
+        kernel_json = kernel_metadata(
+            request.owner,
+            NOTEBOOK.name,
+            request.image,
+            has_gpu=bool(chosen.items) or request.models,
+            models=MODELS if request.models else (),
+        )
+        kernel_items = (
+            text("kernel-metadata.json", kernel_json),
+            Item(NOTEBOOK.name, checkout / NOTEBOOK),
+        )
         own = build_wheel(checkout, staging / "own")
         others = collect_wheels(
             pins(checkout), request.pythons, staging / "others", kept=dataset, wheels=request.wheels
@@ -69,7 +84,8 @@ def make_package(request: Request) -> Package:
             text("dataset-metadata.json", dataset_metadata(request.owner, licences)),
             *(Item(path.name, path, licence_of(path)) for path in (own, *others)),
             text("requirements.txt", "\n".join(install_lines(own, others)) + "\n"),
-            *(Item(name, checkout / name) for name in ("README.md", "LICENSE")),
+            text("README.md", dataset_page(licences)),
+            Item("LICENSE", checkout / "LICENSE"),
             text(MANIFEST, chosen.manifest),
             *chosen.licence_texts,
             *chosen.items,

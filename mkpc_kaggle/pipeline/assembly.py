@@ -7,6 +7,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+from mkpc_kaggle.data.masks import Masks
 from mkpc_kaggle.errors import warn_once
 from mkpc_kaggle.matchers.contract import Matcher, Placement, Precision
 from mkpc_kaggle.matchers.registry import load_matcher, require_matchers
@@ -32,6 +33,7 @@ class Assembly:
     device: str = AUTO  # as named by the user
     sharing: int = 1  # workers on the placement's device
     regions: GivenRegions = field(default_factory=dict)  # replace MKPC's regions
+    masks: Masks = field(default_factory=Masks)
 
     @property
     def devices(self) -> tuple[str, ...]:
@@ -69,6 +71,7 @@ class Assembly:
             cache_bytes=cache_bytes,
             load_float32=None if exact == self.placement else lambda name: self._load(name, exact),
             regions=self.regions,
+            masks=self.masks,
         )
 
     def unit_settings(self, unit: Unit) -> dict[str, Any]:
@@ -80,6 +83,7 @@ class Assembly:
             "options": None if name in self.matchers else asdict(options_of(self.recipe, name)),
             "precision": self.placement.precision,
             "weights": {slot: file.digest for slot, file in self.weight_files.items() if slot in slots},
+            **({"masks": self.masks.digests} if self.masks.files else {}),
         }
 
     @property

@@ -13,7 +13,7 @@ from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.matchers.contract import Matcher
 from mkpc_kaggle.matchers.failures import reason_of
 from mkpc_kaggle.matchers.registry import UnusableError, matcher_names, misfit, spec_of
-from mkpc_kaggle.recipe import Recipe, load_recipe
+from mkpc_kaggle.recipe import Recipe, load_recipe, recipe_names
 from mkpc_kaggle.weights import FoundFile, WeightStore, load_tensors
 
 PERMISSIVE_TAGS = frozenset({"Apache-2.0", "BSD-3-Clause", "MIT"})
@@ -132,7 +132,13 @@ def refusal(recipe: Recipe, reasons: Mapping[str, UnavailableReason]) -> UserErr
         return UserError(f"{what}. Take a recipe without them, such as permissive, or --recipe auto.")
     if kind is UnavailableKind.NO_WEIGHTS:
         what = f"recipe {recipe.name!r} needs weights that were not found: {those}"
-        return UserError(f"{what}. Name their directory with --weights, or use --recipe auto, which needs none.")
+        is_ours = recipe.name in recipe_names()
+        slots = dict.fromkeys(slot for reason in reasons.values() for slot in reason.slots)
+        command = f"mkpc weights fetch {recipe.name if is_ours else ' '.join(slots)} --out DIR"
+        return UserError(
+            f"{what}. Name their directory with --weights, get them with `{command}`, or use --recipe "
+            "auto, which needs none."
+        )
     what = f"recipe {recipe.name!r} has no unit left that can sweep all pairs: {kind}: {those}"
     return UserError(f"{what}. Use --recipe auto, which does without these matchers.")
 

@@ -17,6 +17,7 @@ import PIL.Image
 
 from mkpc_kaggle.data.competition import Pair, read_rows
 from mkpc_kaggle.data.images import ByteCache, Image
+from mkpc_kaggle.data.masks import MaskReader, Masks
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Box, View
 from mkpc_kaggle.geometry.critical_region import CriticalRegion, RegionReason, critical_region
@@ -42,7 +43,8 @@ class Pipeline:
     ``load(name)`` returns a matcher. If half precision overflows, ``load_float32(name)`` replaces the matcher
     permanently. ``minibatch`` is the number of pairs to match at a time, and of views of one shape to encode. A
     unit that runs out of memory halves its minibatch from then on. Encodings of whole images, which many pairs
-    share, are cached up to ``cache_bytes``. ``regions`` replace MKPC's critical regions.
+    share, are cached up to ``cache_bytes``. ``regions`` replace MKPC's critical regions. Matches with a point that
+    ``masks`` leave out are dropped.
     """
 
     def __init__(
@@ -54,7 +56,9 @@ class Pipeline:
         cache_bytes: int = ENCODING_CACHE_BYTES,
         load_float32: Callable[[str], Matcher[Any]] | None = None,
         regions: GivenRegions = MappingProxyType({}),
+        masks: Masks | None = None,
     ) -> None:
+        self._masks = MaskReader(masks or Masks())
         self.recipe, self.minibatch, self.regions = recipe, minibatch, regions
         self._load, self._load_float32 = load, load_float32
         self._minibatches: dict[Unit, int] = {}
@@ -162,15 +166,21 @@ class Pipeline:
         return [
             UnitResult(
                 unit,
-                matches.to_image(*both).best(unit.max_matches),
+                self._unmasked(matches.to_image(*both), pair.images).best(unit.max_matches),
                 (encoded - start) / len(pairs),
                 (matched - encoded) / len(pairs),
                 warm_up=warm_up,
                 note=self._notes.get(unit.matcher, ""),
                 keypoints=len(getattr(encoding, "points", ())),
             )
-            for matches, both, encoding in zip(found, views, encodings[::2], strict=True)
+            for matches, both, encoding, pair in zip(found, views, encodings[::2], pairs, strict=True)
         ]
+
+    def _unmasked(self, matches: Matches, images: Sequence[Image]) -> Matches:
+        """Return the matches with both points on pixels that the images' masks leave."""
+        first, second = images
+        shown = self._masks.shows(first.name, matches.points0, first.size)
+        return matches[shown & self._masks.shows(second.name, matches.points1, second.size)]
 
     def _encode(self, unit: Unit, wanted: Sequence[tuple[Image, View]]) -> list[Any]:
         """Return the encodings of views: cached ones, and the others computed one shape at a time."""

@@ -1,14 +1,15 @@
 """The Python API: two images in, matches and two-view model out."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
-from mkpc_kaggle.data.images import Image, Unreadable, read_image
+from mkpc_kaggle.data.images import Image, ImageStore, Unreadable, read_image
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Box, Matrix3, Pixels
 from mkpc_kaggle.geometry.robust import ModelKind
@@ -18,12 +19,19 @@ from mkpc_kaggle.pipeline.availability import Licence
 from mkpc_kaggle.pipeline.pair import PairMatch, with_estimate
 from mkpc_kaggle.recipe import Recipe
 
+ImageSource: TypeAlias = str | Path | Pixels | Image
+
 
 class TwoStageMatcher:
-    """Matcher of one pair at a time::
+    """Matcher of pairs of images::
 
         match = TwoStageMatcher("classical")("a.jpg", "b.jpg")
         F, points0 = match.estimate.matrix, match.inliers.points0
+
+    or of many pairs with images in common::
+
+        for match in matcher.match_pairs([("a.jpg", "b.jpg"), ("a.jpg", "c.jpg")]):
+            print(match.estimate.inlier_count)
 
     ``recipe`` is a :class:`Recipe`, a recipe's name, or a path to a TOML file. ``weights`` are directories to
     search for weights. ``licence`` "permissive" refuses weights that forbid some uses. ``matchers`` maps names in
@@ -56,8 +64,8 @@ class TwoStageMatcher:
 
     def __call__(
         self,
-        image0: str | Path | Pixels | Image,
-        image1: str | Path | Pixels | Image,
+        image0: ImageSource,
+        image1: ImageSource,
         *,
         model: ModelKind | str = ModelKind.F,
         intrinsics: tuple[Matrix3, Matrix3] | None = None,
@@ -79,14 +87,31 @@ class TwoStageMatcher:
         (pair,) = self._pipeline.match([PairMatch(images=images)], self.recipe.units)
         return with_estimate(pair, self.recipe, ModelKind(model), intrinsics)
 
+    def match_pairs(self, pairs: Iterable[tuple[ImageSource, ImageSource]]) -> Iterator[PairMatch]:
+        """Yield the match of each pair, as a call does for one pair.
 
-def to_image(source: str | Path | Pixels | Image) -> Image:
-    """Return the image of a path or of an array. Raise :class:`UserError` for an unreadable file."""
+        An image that appears in several pairs is decoded and encoded once, while the caches have room: sort the
+        pairs by their first image. Raises :class:`UserError` for an unreadable image.
+        """
+        self._pipeline.regions = {}
+        with closing(ImageStore()) as store:
+            for first, second in pairs:
+                images = to_image(first, store), to_image(second, store)
+                (pair,) = self._pipeline.match([PairMatch(images=images)], self.recipe.units)
+                yield with_estimate(pair, self.recipe)
+
+
+def to_image(source: ImageSource, store: ImageStore | None = None) -> Image:
+    """Return the image of a path or of an array. Raise :class:`UserError` for an unreadable file.
+
+    Paths are decoded by ``store``, if given, which remembers them.
+    """
     if isinstance(source, Image):
         return source
     if isinstance(source, np.ndarray):
         return Image.of_array(source)
-    image = read_image(Path(source))
+    path = Path(source)
+    image = read_image(path) if store is None else store.get(path)
     if isinstance(image, Unreadable):
         raise UserError(str(image))
     return replace(image, name=image.version)  # the name identifies the content: a file may change between calls

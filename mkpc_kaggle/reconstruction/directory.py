@@ -1,5 +1,6 @@
 """The output directory of ``reconstruct``: rules for writing, replacing and removing its files."""
 
+import hashlib
 import json
 import os
 import re
@@ -9,16 +10,21 @@ from contextlib import contextmanager, suppress
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
 
+from mkpc_kaggle.data.competition import IMAGE_SUFFIXES
 from mkpc_kaggle.data.outputs import lies_in, replacing, weights_of_environment
 from mkpc_kaggle.engine.console import warn
 from mkpc_kaggle.errors import UserError, writing
-from mkpc_kaggle.scene.export import DATABASE, MODEL_FILES, MODELS, PART
+from mkpc_kaggle.scene.align import REFERENCE
+from mkpc_kaggle.scene.export import DATABASE, IMAGES, MODEL_FILES, MODELS, PART, SPARSE
 from mkpc_kaggle.weights.manifest import digest_of
 
-WORK, TABLES = "work", ("cameras.csv", "submission.csv", "report.html")
-RESERVED = {DATABASE, MODELS, WORK, *TABLES}  # names that no dataset may have
+WORK, TABLES = "work", ("cameras.csv", "submission.csv", "report.html", "summary.json")
+RESERVED = {DATABASE, MODELS, SPARSE, WORK, *TABLES}  # names that no dataset may have
+FILES = (DATABASE, MODELS, SPARSE, IMAGES, REFERENCE)  # of each dataset
 MARK = f"{WORK}/results.json"  # digests of results by path; "" if their run did not end
 MODEL_FILE = re.compile(rf"\d+(/({'|'.join(map(re.escape, MODEL_FILES))}))?")
+IMAGE_FILE = re.compile(rf"[^/]+({'|'.join(map(re.escape, IMAGE_SUFFIXES))})", re.IGNORECASE)
+CONTENTS = {MODELS: MODEL_FILE, SPARSE: MODEL_FILE, IMAGES: IMAGE_FILE}  # the paths in folders of results
 
 
 @contextmanager
@@ -30,7 +36,9 @@ def output_directory(out: Path, datasets: Iterable[str], form: str | None = None
     result also raises it.
     """
     results = [name for name in TABLES if form or name != "submission.csv"]
-    results += [str(PurePosixPath(name, each)) for name in datasets for each in (DATABASE, MODELS)]
+    names = list(datasets)
+    inner = {str(PurePosixPath(name, each)) for name in names for each in FILES}
+    results += sorted(each for each in inner if not holds_dataset(each, names))
     with writing(f"--out {out}"):
         marked = _read_mark(out)
         if strange := next(_in_the_way(out, results, marked), None):
@@ -49,6 +57,11 @@ def output_directory(out: Path, datasets: Iterable[str], form: str | None = None
                 _remove(out / name)
         after = {name: digest for name in results if (digest := _digest(out / name))}
         _write_mark(out, {name: known[name] if after[name] == before[name] else after[name] for name in after})
+
+
+def holds_dataset(result: str, datasets: Iterable[str]) -> bool:
+    """Return whether a dataset lies at the path of a result: one that is called ``images``."""
+    return any(PurePosixPath(name).is_relative_to(result) for name in datasets)
 
 
 def require_directory_apart(out: Path, inputs: Iterable[Path], weights: Iterable[Path]) -> None:
@@ -80,12 +93,12 @@ def _in_the_way(out: Path, results: Iterable[str], marked: Mapping[str, str] | N
         yield from (path for path in out.rglob("[!.]*") if path.is_symlink() or not path.is_dir())
     for name in results:
         path = out / name
-        is_result = name in (marked or ()) and (path.is_dir() if path.name == MODELS else path.is_file())
+        is_result = name in (marked or ()) and (path.is_dir() if path.name in CONTENTS else path.is_file())
         if not _is_inside(out, name) or (path.exists() and not is_result):
             yield path
         yield from path.parent.glob(f"{DATABASE}-*")  # another program has the database open
-        for each in path.rglob("*") if path.name == MODELS else ():
-            if not MODEL_FILE.fullmatch(each.relative_to(path).as_posix()):
+        for each in path.rglob("*") if path.name in CONTENTS else ():
+            if not CONTENTS[path.name].fullmatch(each.relative_to(path).as_posix()):
                 yield each
 
 
@@ -97,8 +110,19 @@ def _is_inside(out: Path, name: str) -> bool:
 
 
 def _digest(path: Path) -> str:
-    """Return the digest of a file or a folder; "" if it does not exist."""
+    """Return the digest of a file or a folder; "" if it does not exist. Photographs are not read."""
+    if path.name == IMAGES and path.is_dir():
+        lines = sorted(f"{each.name} {_version(each)}\n" for each in path.iterdir())
+        return hashlib.sha256("".join(lines).encode("utf-8", "surrogateescape")).hexdigest()
     return digest_of(path) if path.exists() else ""
+
+
+def _version(path: Path) -> str:
+    """Return the target of a link, or the size and time of a file."""
+    if path.is_symlink():
+        return str(path.readlink())
+    status = path.stat()
+    return f"{status.st_size} {status.st_mtime_ns}"
 
 
 def _remove(path: Path) -> None:

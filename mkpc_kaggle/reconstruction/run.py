@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.data.images import Image, ImageStore, Unreadable
@@ -24,6 +24,9 @@ from mkpc_kaggle.scene.reconstruct import models_of, reconstruct_sharing
 from mkpc_kaggle.scene.reconstruction import RegisteredImage, SfmModel
 from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair, ViewGraph, tracks_of
 
+if TYPE_CHECKING:
+    from mkpc_kaggle.reporting.view import View
+
 
 @dataclass(frozen=True)
 class FolderResult:
@@ -32,13 +35,20 @@ class FolderResult:
     cameras: Cameras
 
 
-def for_cameras(recipe: Recipe, sharing: str | None = None) -> Recipe:
+def for_cameras(recipe: Recipe, sharing: str | None = None, intrinsics: str = "") -> Recipe:
     """Return the recipe without extra pairs and without steps that only improve the F of single pairs.
 
-    ``sharing`` is a :class:`CameraSharing`; ``None`` keeps the recipe's.
+    ``sharing`` is a :class:`CameraSharing`, and ``intrinsics`` are known cameras as in :class:`SceneConfig`.
+    Without them, the recipe's are kept.
     """
-    scene = replace(recipe.scene or SceneConfig(), pairs_per_image=0.0)
-    return replace(recipe, focal=None, scene=replace(scene, cameras=CameraSharing(sharing or scene.cameras)))
+    scene = recipe.scene or SceneConfig()
+    scene = replace(
+        scene,
+        pairs_per_image=0.0,
+        cameras=CameraSharing(sharing or scene.cameras),
+        intrinsics=intrinsics or scene.intrinsics,
+    )
+    return replace(recipe, focal=None, scene=scene)
 
 
 def reconstruct_folder(
@@ -93,6 +103,21 @@ def cameras_of(datasets: Datasets, root: Path, results: State) -> Cameras:
     return cameras
 
 
+class Models(tuple[SfmModel, ...]):
+    """The models of :func:`reconstruct`, the largest first, which a notebook can show."""
+
+    __slots__ = ()
+
+    def show(self, *, metres_per_unit: float | None = None) -> "View":
+        """Return an interactive view of cameras and points, the last value of a notebook's cell.
+
+        With ``metres_per_unit``, the scale of a single model, a bar shows a length.
+        """
+        from mkpc_kaggle.reporting.view import show  # jinja2 is slow to import
+
+        return show(self, metres_per_unit=metres_per_unit)
+
+
 def reconstruct(
     images: Iterable[str | Path],
     recipe: Recipe | str = "auto",
@@ -100,7 +125,7 @@ def reconstruct(
     weights: Iterable[str | Path] = (),
     device: str = "auto",
     matchers: Mapping[str, Matcher[Any]] | None = None,
-) -> tuple[SfmModel, ...]:
+) -> Models:
     """Return the models of the images at these paths, the largest first; no model if too few images match.
 
     This is the command ``reconstruct`` in this process, without budget and journal. Cameras refer to the stored
@@ -126,4 +151,4 @@ def reconstruct(
         image0, image1 = (BatchImage(im.name, im.version, im.size, im.focal) for im in match.images)
         pairs.append(BatchPair(image0, image1, match.matches, None, tracks_of(match.results)))
     found, _ = reconstruct_sharing(ViewGraph.of_pairs(pairs), assembly.recipe.scene or SceneConfig())
-    return models_of(found)
+    return Models(models_of(found))

@@ -1,4 +1,4 @@
-"""``report.html``: a self-contained page about a run, built from its journal.
+"""``report.html``: a self-contained page about a run, built from its journal, and ``summary.json`` next to it.
 
 Drawings need matplotlib, and pictures of pairs also need the images. The page states why drawings are missing.
 """
@@ -6,8 +6,9 @@ Drawings need matplotlib, and pictures of pairs also need the images. The page s
 import base64
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from statistics import median
@@ -17,11 +18,13 @@ from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.data.images import Image
 from mkpc_kaggle.data.outputs import replacing
 from mkpc_kaggle.engine.budget import format_duration
+from mkpc_kaggle.engine.records import PairRecord
 from mkpc_kaggle.errors import UserError, printable, writing
 from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
 from mkpc_kaggle.pipeline.pair import PairMatch
 from mkpc_kaggle.pipeline.two_stage import to_image
 from mkpc_kaggle.reporting.figures import draw_cameras, draw_pair, draw_strip, encode
+from mkpc_kaggle.reporting.points import clouds_of
 from mkpc_kaggle.reporting.run_log import RunLog, read_log
 from mkpc_kaggle.reporting.summary import (
     facts,
@@ -29,18 +32,21 @@ from mkpc_kaggle.reporting.summary import (
     is_doubtful,
     left_out_line,
     seconds_by_part,
-    trouble,
     unit_means,
     unit_reasons,
     weakest_cameras,
 )
+from mkpc_kaggle.reporting.verdict import doubt, inlier_histogram, verdict, write_summary
+from mkpc_kaggle.reporting.view import View, picture_at, style_and_script, template, view_of, view_part
 
 if TYPE_CHECKING:
+    from markupsafe import Markup
     from matplotlib.figure import Figure
 
 WRITING_S, WRITING_S_PER_PAIR = 0.6, 0.0002  # time to write a page without drawings
 DRAWING_S = 5.0  # drawings start only if more time is left
 MAX_SCENES, MAX_MODELS = 12, 8  # number of drawn scenes, and of drawn models per scene
+MAX_ROWS = 2000  # of the table of pairs
 
 
 def report_run(work_dir: Path, path: Path, ends: float, pairs: Sequence[Pair] = ()) -> str:
@@ -57,6 +63,7 @@ def report_run(work_dir: Path, path: Path, ends: float, pairs: Sequence[Pair] = 
     try:
         log = read_log(work_dir)
         write_report(log, path, pairs, undrawn="little time was left; the journal command draws them")
+        write_summary(log, path)
         if left > DRAWING_S:
             write_report(log, path, pairs)
     except Exception as error:
@@ -80,19 +87,21 @@ def report_page(log: RunLog, pairs: Sequence[Pair] = (), *, undrawn: str = "") -
     """
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
+    readable = () if undrawn else pairs  # a late page reads no images
     if not undrawn and find_spec("matplotlib") is None:
         undrawn = "matplotlib is not installed: pip install 'mkpc-kaggle[plots]'"
     sources = {} if undrawn else {pair.id: pair for pair in pairs}
-    largest = sorted(log.scenes, key=lambda scene: -scene.registered)[:MAX_SCENES]
     failed = [
         (record.pair.id, record.pair.group, record.failure) for record in log.records if not record.is_solved
     ]
+    histogram = inlier_histogram(log.records)
     pages = Environment(loader=PackageLoader("mkpc_kaggle.reporting"), autoescape=True, undefined=StrictUndefined)
     return pages.get_template("report.html").render(
         log=log,
         duration=format_duration,
-        verdict=headline(log),
-        trouble=trouble(log),
+        assets=assets(),
+        headline=headline(log),
+        found=verdict(log),
         facts=facts(log),
         left_out=left_out_line(log.recipe, log.about.left_out),
         failed=failed,
@@ -108,15 +117,85 @@ def report_page(log: RunLog, pairs: Sequence[Pair] = (), *, undrawn: str = "") -
         ],
         is_doubtful=is_doubtful,
         min_support=MIN_SUPPORT,
-        cameras=[
-            (f"{scene.batch}, model {number}", _data_uri(draw_cameras(scene, number), "png"))
-            for scene in ([] if undrawn else largest)
-            for number in range(min(len(scene.models), MAX_MODELS))
-        ],
+        views=[*_views(log, readable, is_drawn=not undrawn)],
+        pair_rows=pair_rows(log.records)[:MAX_ROWS],
+        more_pairs=max(0, len(log.records) - MAX_ROWS),
+        histogram=histogram,
+        histogram_most=max(1, *(count for _, count in histogram)),
         units=[(*means, means[1] * means[-1]) for means in unit_means(log)],
         parts=[(name, total, total / len(log.records)) for name, total in seconds_by_part(log).items() if total],
         undrawn=undrawn,
     )
+
+
+def assets() -> "Markup":
+    """Return the styles and scripts of a page, which are the same in all pages."""
+    from markupsafe import Markup
+
+    return Markup(f"<script>\n{template('report.js')}</script>\n") + style_and_script()
+
+
+def pair_rows(records: Sequence[PairRecord]) -> list[tuple[str | int | float, ...]]:
+    """Return id, matches, inliers, overlap, source of F and doubt of each pair, the fewest inliers first."""
+    weakest_first = sorted(records, key=lambda record: (record.inliers, record.index))
+    return [
+        (
+            record.pair.id,
+            record.matches,
+            record.inliers,
+            round(record.stats.support, 1),
+            record.source,
+            doubt(record) or ("" if record.is_solved else record.failure),
+        )
+        for record in weakest_first
+    ]
+
+
+def _views(log: RunLog, pairs: Sequence[Pair], *, is_drawn: bool) -> Iterator[tuple[str, "Markup"]]:
+    """Yield the title and the view of each of the largest scenes; pictures replace a view without scripts."""
+    largest = sorted(log.scenes, key=lambda scene: -scene.registered)[:MAX_SCENES]
+    for scene in (scene for scene in largest if scene.models):
+        paths = {file.name: file for pair in pairs if pair.group == scene.batch for file in pair.images}
+        pictures = [
+            (f"{scene.batch}, model {number}", _data_uri(draw_cameras(scene, number), "png"))
+            for number in range(min(len(scene.models), MAX_MODELS) if is_drawn else 0)
+        ]
+
+        def read(name: str, paths: Mapping[str, Path] = paths) -> Image | None:
+            path = paths.get(Path(name).name)
+            return None if path is None else picture_at(str(path))
+
+        partners = partners_of([record for record in log.records if record.pair.group == scene.batch])
+        models = scene.models
+        clouds = clouds_of(scene, log.path.parent.parent)
+        if clouds:
+            models = tuple(replace(each, points=cloud.points) for each, cloud in zip(models, clouds, strict=True))
+        part = view_part(
+            models,
+            scene.batch,
+            read=read,
+            partners=partners,
+            pictures=pictures,
+            colours=[cloud.colours for cloud in clouds],
+        )
+        yield scene.batch, part
+
+
+def show_run(work_dir: str | Path, pairs: Sequence[Pair] = ()) -> View:
+    """Return the view of the scenes of a run; ``pairs`` have the paths of the images.
+
+    Raises :class:`UserError` if the journal is missing or damaged.
+    """
+    return view_of(_views(read_log(Path(work_dir)), pairs, is_drawn=False))
+
+
+def partners_of(records: Iterable[PairRecord]) -> dict[str, list[tuple[str, int, int]]]:
+    """Return the partners of each image: name, inliers and matches of the pair, the most inliers first."""
+    partners: dict[str, list[tuple[str, int, int]]] = {}
+    for record in records:
+        for name, other in (record.pair.names, record.pair.names[::-1]):
+            partners.setdefault(name, []).append((other, record.inliers, record.matches))
+    return {name: sorted(found, key=lambda each: -each[1]) for name, found in partners.items()}
 
 
 def _picture(source: Pair | None, match: PairMatch) -> str:
@@ -141,12 +220,13 @@ def _images(pair: Pair) -> tuple[Image, Image]:
 
 
 def _scenes(log: RunLog) -> Iterator[tuple[object, ...]]:
-    """Yield a row per batch: name, images, registered images, points, focals, seconds, pairs, failure."""
+    """Yield a row per batch: name, images, registered, points, focals, reprojection, seconds, pairs, failure."""
     counts = Counter(record.pair.group for record in log.records if record.source == "scene")
     for each in log.scenes:
         focals = [found.focal for model in each.models for found in model.images]
         spread = f"{median(focals):.0f} ({min(focals):.0f} to {max(focals):.0f})" if focals else ""
-        placed = each.batch, each.images, each.registered, each.points, spread
+        errors = ", ".join(f"{model.reprojection_error:.2f}" for model in each.models)
+        placed = each.batch, each.images, each.registered, each.points, spread, errors
         yield (*placed, each.seconds, counts[each.batch], each.failure)
 
 

@@ -95,6 +95,23 @@ def left_out_line(recipe: Recipe, left_out: Sequence[str]) -> str:
     return "; ".join(parts)
 
 
+def advice(log: RunLog) -> list[str]:
+    """Return sentences on what to add: weights, if only RootSIFT ran, or images, if no pair overlaps."""
+    found = []
+    ran = {unit.unit for record in log.records for unit in record.units}
+    has_missing = any(cause.startswith(UnavailableKind.NO_WEIGHTS) for cause in log.about.left_out)
+    if has_missing and all(name.partition(":")[2].startswith("sift@") for name in ran):
+        found.append(
+            "No weights were found, so only RootSIFT ran. Add weights to the dataset "
+            "(`mkpc package --weights DIR`), or ALIKED and LightGlue from Kaggle Models."
+        )
+    if not any(record.is_solved and not is_doubtful(record) for record in log.records):
+        found.append(
+            "No pair overlaps. Check that the input is the right test set and that its images can be read."
+        )
+    return found
+
+
 def plural(count: int, noun: str) -> str:
     """Return the count with its noun, such as "1 batch" or "2 batches"."""
     ending = "" if count == 1 else "es" if noun.endswith("ch") else "s"
@@ -151,7 +168,7 @@ def _lines(run: Run) -> Iterator[str]:
         yield f"{name:<30}{pairs:>7}{matches:>9.0f}{inliers:>9.0f}{seconds:>9.2f}"
     count = max(1, len(run.records))
     parts = (f"{name} {seconds / count:.3f}" for name, seconds in seconds_by_part(run).items())
-    yield from textwrap.wrap(f"seconds a pair: {', '.join(parts)}", WIDTH, subsequent_indent="  ")
+    yield from wrapped(f"seconds a pair: {', '.join(parts)}")
     yield from weakest_line(run.scenes)
     yield from pending_lines(run)
     no_scene = [
@@ -167,6 +184,11 @@ def _lines(run: Run) -> Iterator[str]:
     yield from _list("units that failed", unit_reasons(run))
     yield from _list("units that ran otherwise than written", unit_reasons(run, "note"))
     yield from _list("faults", run.faults)
+
+
+def wrapped(text: str) -> list[str]:
+    """Return the text as lines of up to ``WIDTH`` characters; names of files stay whole."""
+    return textwrap.wrap(text, WIDTH, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
 
 
 def pending_lines(run: Run) -> Iterator[str]:
@@ -196,7 +218,7 @@ def weakest_line(scenes: Sequence[SceneRecord]) -> Iterator[str]:
         error = f"{100 * sigmas.centre:.2g} %" if sigmas else "unknown"
         named.append(f"{Path(name).name} ({error})")
     if named:
-        yield f"weakest cameras, with the error of the centre: {', '.join(named)}"
+        yield from wrapped(f"weakest cameras, with the error of the centre: {', '.join(named)}")
 
 
 def weakest_cameras(scenes: Sequence[SceneRecord]) -> list[tuple[str, Sigmas | tuple[()]]]:

@@ -19,8 +19,10 @@ import pycolmap
 
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Points, Size
+from mkpc_kaggle.geometry.intrinsics import KnownCamera
 from mkpc_kaggle.recipe import CameraModel, SceneConfig
 from mkpc_kaggle.scene.export import DATABASE, FORMER, MODELS, PART
+from mkpc_kaggle.scene.focal_lengths import apply_known_cameras
 from mkpc_kaggle.scene.keypoints import Index, scene_keypoints
 from mkpc_kaggle.scene.reconstruction import MIN_IMAGES, Reconstruction, RegisteredImage, SfmModel, filter_models
 from mkpc_kaggle.scene.shared_intrinsics import SharedIntrinsics, start_focal
@@ -39,7 +41,7 @@ def structure_from_motion(graph: ViewGraph, shared: SharedIntrinsics, config: Sc
     """Return pycolmap's reconstruction of a view graph, with any number of models.
 
     Each image has its own camera, except images with ``shared`` intrinsics. The initial focal length is the shared
-    one or EXIF's. All focal lengths are refined.
+    one, the user's or EXIF's. All focal lengths are refined, unless the user knows them exactly.
     """
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
     pycolmap.set_random_seed(SEED)
@@ -114,7 +116,8 @@ def _write_images(
         key = number if focal is None else (image.size, focal)
         if key not in cameras:
             start = start_focal(image) if focal is None else focal
-            cameras[key] = _write_camera(database, number, camera_model, image.size, start)
+            known = graph.known.get(image.digest)
+            cameras[key] = _write_camera(database, number, camera_model, image.size, start, known)
         camera = cameras[key]
         taken = pycolmap.Image(
             name=image.name, camera_id=camera.camera_id, image_id=number, keypoints=np.zeros((0, 2))
@@ -128,9 +131,14 @@ def _write_images(
     return used
 
 
-def _write_camera(database: Any, number: int, model: CameraModel, size: Size, focal: float) -> Any:
-    """Write a camera with initial focal length ``focal``, and a rig with only this camera."""
-    camera = pycolmap.Camera.create_from_model_name(number, model.value, focal, *size)
+def _write_camera(
+    database: Any, number: int, model: CameraModel, size: Size, focal: float, known: KnownCamera | None
+) -> Any:
+    """Write a camera, the user's or one with initial focal length ``focal``, and a rig with only this camera."""
+    name = model.value if known is None else known.model
+    camera = pycolmap.Camera.create_from_model_name(number, name, focal, *size)
+    if known is not None:
+        camera.params = list(known.parameters)
     camera.has_prior_focal_length = True  # a pair that E explains at this focal length counts as calibrated
     database.write_camera(camera, use_camera_id=True)
     rig = pycolmap.Rig(rig_id=number)
@@ -163,16 +171,27 @@ def run_mapper(database: Any, graph: ViewGraph, threads: int) -> Reconstruction:
     parts = dict.fromkeys(("rotation_averaging", "global_positioning", "retriangulation"), seed)
     required = {"track_required_tracks_per_view": TRACKS_PER_IMAGE} if len(graph.images) > LARGE else {}
     mapper = {**common, **parts, **required}
+    exact = [digest for digest, known in graph.known.items() if not known.sigma]
+    if len(exact) == len(graph.images):
+        mapper["bundle_adjustment"] = {"refine_focal_length": False, "refine_extra_params": False}
     limits = {"min_model_size": MIN_IMAGES, "min_num_matches": MIN_MATCHES}
     manager = pycolmap.ReconstructionManager()
     options = pycolmap.GlobalPipelineOptions({**common, **limits, "mapper": mapper})
     pycolmap.GlobalPipeline(options, database, manager).run()
-    models = filter_models([_sfm_model(manager.get(number), graph) for number in range(manager.size())])
+    found = [manager.get(number) for number in range(manager.size())]
+    for model in found:
+        apply_known_cameras(model, known_by_name(graph))
+    models = filter_models([_sfm_model(model, graph) for model in found])
     return Reconstruction(graph.names, models, "" if models else "the matches gave no plausible model")
 
 
+def known_by_name(graph: ViewGraph) -> dict[str, KnownCamera]:
+    """Return the user's cameras by image name."""
+    return {image.name: graph.known[image.digest] for image in graph.images if image.digest in graph.known}
+
+
 def _sfm_model(found: Any, graph: ViewGraph) -> SfmModel:
-    images, sigmas = [], camera_sigmas(found)
+    images, sigmas = [], camera_sigmas(found, known_by_name(graph))
     for number in sorted(found.reg_image_ids()):
         image = found.images[number]
         pose, K = np.asarray(image.cam_from_world().matrix()), np.array(image.camera.calibration_matrix())
@@ -180,7 +199,8 @@ def _sfm_model(found: Any, graph: ViewGraph) -> SfmModel:
         camera = Camera(K, pose[:, :3].copy(), pose[:, 3].copy())
         known = graph.images[number - 1], camera, int(image.num_points3D), sigmas.get(image.name, ())
         images.append(RegisteredImage(*known))
-    points = np.array([found.points3D[number].xyz for number in sorted(found.point3D_ids())], np.float64)
-    points = points.reshape(-1, 3)
+    tracks = {number: found.points3D[number].track.length() for number in sorted(found.point3D_ids())}
+    longest_first = sorted(tracks, key=lambda number: -tracks[number])
+    points = np.array([found.points3D[number].xyz for number in longest_first], np.float64).reshape(-1, 3)
     error = float(found.compute_mean_reprojection_error()) if len(points) else 0.0
     return SfmModel(tuple(images), points[np.isfinite(points).all(axis=1)], error, found)

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 DATABASE, MODELS = "database.db", "models"
+IMAGES, SPARSE = "images", "sparse"  # as other programs expect them
 MODEL_FILES = ("cameras.bin", "frames.bin", "images.bin", "points3D.bin", "rigs.bin")
 FORMER = "former"  # folder of the models being replaced
 PART = ".mkpc-new-"  # prefix of temporary folders for new files

@@ -7,8 +7,10 @@ from functools import partial
 from pathlib import Path
 
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
+from mkpc_kaggle.geometry.intrinsics import read as read_intrinsics
 from mkpc_kaggle.geometry.robust import RobustConfig
 from mkpc_kaggle.recipe import CameraSharing, SceneConfig
+from mkpc_kaggle.scene.align import align, read_reference
 from mkpc_kaggle.scene.choose import Choice, Reason, choose, estimate_at_known_focals
 from mkpc_kaggle.scene.reconstruction import MIN_IMAGES, Reconstruction, SfmModel
 from mkpc_kaggle.scene.shared_intrinsics import SharedIntrinsics, given_intrinsics, shared_intrinsics
@@ -68,17 +70,20 @@ def reconstruct_sharing(
 
     If images seem to share a camera, a second reconstruction shares intrinsics. It is kept unless images then see
     fewer points. If the recipe shares cameras, the first reconstruction does too. The refined focal lengths are
-    returned. With a ``directory``, the graph is reconstructed as a whole, and COLMAP's files are written there.
+    returned. With a ``directory``, the graph is reconstructed as a whole, moved onto the cameras of the last
+    complete run, and COLMAP's files are written there.
     """
+    graph = graph.with_intrinsics(read_intrinsics(config.intrinsics))
     if directory is None:
         parts = graph.components()
         make = partial(reconstruct_component, config=config)
     else:
         parts = (graph.strong,)
         make = partial(reconstruct_connected, config=config)
-    given = shared = given_intrinsics(graph.images, config)
+    free = [image for image in graph.images if image.digest not in graph.known]
+    given = shared = given_intrinsics(free, config)
     found = [make(part, shared) for part in parts]
-    if config.cameras is CameraSharing.AUTO and (alike := shared_intrinsics(graph.images, models_of(found))):
+    if config.cameras is CameraSharing.AUTO and (alike := shared_intrinsics(free, models_of(found))):
         again = [make(part, alike) for part in parts]
         before, after = (sum(each.observations for each in made) for made in (found, again))
         if after >= MIN_OBSERVATIONS * before:
@@ -86,10 +91,11 @@ def reconstruct_sharing(
     if directory is not None:
         from mkpc_kaggle.scene.colmap import write_files
 
+        found = align(found, read_reference(directory))
         write_files(directory, graph.strong, shared, models_of(found), config.camera_model)
     if given:
         focals = {each.image.size: each.focal for model in reversed(models_of(found)) for each in model.images}
-        shared = {image.digest: focals[image.size] for image in graph.images if image.size in focals}
+        shared = {image.digest: focals[image.size] for image in free if image.size in focals}
     return found, shared
 
 

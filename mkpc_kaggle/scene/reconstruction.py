@@ -13,6 +13,7 @@ from mkpc_kaggle.scene.view_graph import BatchImage
 
 MIN_IMAGES = 3  # in a model
 MIN_POINTS = 30  # seen by a plausible image
+MAX_POINTS = 20_000  # of a model, for pictures and views: the points of the longest tracks
 FOCALS = Range(0.3, 5.0)  # plausible focal lengths, in long sides of the image
 
 
@@ -46,7 +47,7 @@ class RegisteredImage:
 class SfmModel:
     """Cameras and points (P, 3) float64 in one world frame; ``reprojection_error`` is the mean in pixels.
 
-    ``colmap`` is pycolmap's model, which is not pickled.
+    The points of the longest tracks come first. ``colmap`` is pycolmap's model, which is not pickled.
     """
 
     images: tuple[RegisteredImage, ...]

@@ -29,7 +29,10 @@ def start_focal(image: BatchImage) -> float:
 
 
 def given_intrinsics(images: Sequence[BatchImage], config: SceneConfig) -> SharedIntrinsics:
-    """Return one initial focal length for all images of a size, if the recipe shares cameras."""
+    """Return one initial focal length for all images of a size, if the recipe shares cameras.
+
+    The ``images`` are those whose intrinsics the user does not know, as in :func:`shared_intrinsics`.
+    """
     if config.cameras is not CameraSharing.FOLDER:
         return {}
     starts = {}
@@ -45,7 +48,9 @@ def shared_intrinsics(images: Sequence[BatchImage], models: Sequence[SfmModel]) 
     All images of the size, registered or not, share the median focal length. Exceptions are images that see many
     points at another focal length, since they have another zoom.
     """
-    registered = {found.image.digest: found for model in reversed(models) for found in model.images}
+    free = {image.digest for image in images}
+    placed = (found for model in reversed(models) for found in model.images)
+    registered = {found.image.digest: found for found in placed if found.image.digest in free}
     shared: dict[str, float] = {}
     for size in {found.image.size for found in registered.values()}:
         alike = [found for found in registered.values() if found.image.size == size]

@@ -4,6 +4,8 @@ All cameras together fix the origin, orientation and scale. So errors that a sim
 not count (the S-transformation of Baarda 1981). The noise of keypoints is estimated from the residuals.
 """
 
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -11,6 +13,7 @@ import pycolmap
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
+from mkpc_kaggle.geometry.intrinsics import KnownCamera
 from mkpc_kaggle.geometry.two_view import cross_matrix
 from mkpc_kaggle.scene.reconstruction import Sigmas
 
@@ -18,14 +21,20 @@ MAX_IMAGES = 200  # of a model; memory is quadratic and time cubic in the number
 DAMPED = pycolmap.BACovarianceOptions({"damping": 1e-3})  # the world is free, so the normal equations are singular
 
 
-def camera_sigmas(found: Any) -> dict[str, Sigmas]:
-    """Return the sigmas of registered images in pycolmap's reconstruction, by name; empty if unknown."""
+def camera_sigmas(found: Any, known: Mapping[str, KnownCamera] = MappingProxyType({})) -> dict[str, Sigmas]:
+    """Return the sigmas of registered images in pycolmap's reconstruction, by name; empty if unknown.
+
+    ``known`` are the user's cameras by image name: exact ones, and priors that add to the images' information.
+    """
     images = [image for _, image in sorted(found.images.items()) if image.has_pose and image.num_points3D]
     if not 1 < len(images) <= MAX_IMAGES:
         return {}
     config = pycolmap.BundleAdjustmentConfig()
     for number in (ids := [image.image_id for image in images]):
         config.add_image(number)
+    for image in images:
+        if image.name in known and not known[image.name].sigma:
+            config.set_constant_cam_intrinsics(image.camera_id)
     ceres = {"use_gpu": False, "solver_options": {"max_num_iterations": 0, "num_threads": 1}}
     options = pycolmap.BundleAdjustmentOptions({"print_summary": False, "ceres": ceres})
     adjuster: Any = pycolmap.create_default_ceres_bundle_adjuster(options, config, found)
@@ -37,13 +46,27 @@ def camera_sigmas(found: Any) -> dict[str, Sigmas]:
     poses = np.block([[solved.get_cam_cross_cov_from_world(i, j) for j in ids] for i in ids])
     if not np.isfinite(poses).all():  # of a degenerate model
         return {}
-    cameras = (image.camera for image in images)
-    focals = [solved.get_other_params_cov(each.params)[0, 0] / each.mean_focal_length() ** 2 for each in cameras]
+    focals = []
+    for image in images:
+        prior = known.get(image.name)
+        if prior is not None and not prior.sigma:
+            focals.append(0.0)
+            continue
+        camera = image.camera
+        focals.append(solved.get_other_params_cov(camera.params)[0, 0] / camera.mean_focal_length() ** 2)
     variances = _pose_variances([image.cam_from_world().matrix() for image in images], poses)
     noise = 2 * fit.initial_cost / redundancy  # variance of a keypoint's coordinate, square pixels
     sigmas = np.sqrt(noise * np.column_stack([variances, focals])) * [np.degrees(1), 1, 100]
+    for row, image in zip(sigmas, images, strict=True):
+        if image.name in known and known[image.name].sigma:
+            row[2] = combined(row[2], known[image.name].sigma)
     rows = (Sigmas(*(float(f"{value:.4g}") for value in row)) for row in sigmas)  # later digits vary between calls
     return dict(zip((image.name for image in images), rows, strict=True))
+
+
+def combined(sigma: float, prior: float) -> float:
+    """Return the standard deviation of the weighted mean of two independent values with these deviations."""
+    return float((sigma**-2 + prior**-2) ** -0.5) if sigma > 0 else 0.0
 
 
 def _pose_variances(poses: list[NDArray[np.float64]], covariance: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,13 +1,14 @@
 """The view graph of a batch: its distinct images, and the matches between them."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from mkpc_kaggle.geometry.coordinates import Matrix3, Size
+from mkpc_kaggle.geometry.intrinsics import KnownCamera, Rows, camera_of
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.pipeline.pair import UnitResult
 
@@ -54,10 +55,11 @@ class Edge:
 
 @dataclass(frozen=True, eq=False)
 class ViewGraph:
-    """Distinct images, and their edges, sorted by image indices."""
+    """Distinct images, and their edges, sorted by image indices. ``known`` has the user's cameras, by digest."""
 
     images: tuple[BatchImage, ...]
     edges: tuple[Edge, ...]
+    known: Mapping[str, KnownCamera] = field(default_factory=dict)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -66,7 +68,8 @@ class ViewGraph:
     @property
     def strong(self) -> "ViewGraph":
         """The graph with only the edges that have at least ``MIN_MATCHES`` matches."""
-        return ViewGraph(self.images, tuple(edge for edge in self.edges if len(edge.matches) >= MIN_MATCHES))
+        edges = (edge for edge in self.edges if len(edge.matches) >= MIN_MATCHES)
+        return replace(self, edges=tuple(edges))
 
     @classmethod
     def of_pairs(cls, pairs: Sequence[BatchPair]) -> "ViewGraph":
@@ -91,6 +94,11 @@ class ViewGraph:
         edges = tuple(Edge(*ends, Matches.concatenate(parts[ends])) for ends in sorted(parts))
         return cls(tuple(images.values()), edges)
 
+    def with_intrinsics(self, rows: Rows) -> "ViewGraph":
+        """Return the graph with the user's cameras of the images that the rows name."""
+        found = {image.digest: camera_of(rows, image.name) for image in self.images}
+        return replace(self, known={digest: camera for digest, camera in found.items() if camera is not None})
+
     def components(self) -> tuple["ViewGraph", ...]:
         """Return the components connected by strong edges, ordered by first image."""
         strong = self.strong.edges
@@ -104,7 +112,8 @@ class ViewGraph:
             index = {image: number for number, image in enumerate(members)}
             inside = [edge for edge in strong if labels[edge.first] == label]
             edges = tuple(Edge(index[edge.first], index[edge.second], edge.matches) for edge in inside)
-            found.append(ViewGraph(tuple(self.images[image] for image in members), edges))
+            images = tuple(self.images[image] for image in members)
+            found.append(replace(self, images=images, edges=edges))
         return tuple(found)
 
 

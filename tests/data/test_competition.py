@@ -8,7 +8,13 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from mkpc_kaggle.data import competition
-from mkpc_kaggle.data.competition import read_submission, read_test_side, read_train_side, write_submission
+from mkpc_kaggle.data.competition import (
+    read_rows,
+    read_submission,
+    read_test_side,
+    read_train_side,
+    write_submission,
+)
 from mkpc_kaggle.errors import UserError
 
 HEADER = "sample_id,batch_id,image_1_id,image_2_id"
@@ -183,3 +189,37 @@ def test_each_problem_of_a_submission_is_the_only_one_found(tmp_path, content, s
     assert len(competition.submission_problems(tmp_path / "x.csv", ["a", "b"])) == 3, "all are told at once"
     (problem,) = competition.submission_problems(tmp_path / "y.csv", ["a"])
     assert "no such file" in problem
+
+
+@pytest.mark.parametrize(
+    ("content", "rows"),
+    [
+        ("\n\nid,value\n007,NA\n\n1e3,\n", [("line 4", ["007", "NA"]), ("line 6", ["1e3", ""])]),
+        ('id,value\n"a\nb",2\nc,3\n', [("line 3", ["a\nb", "2"]), ("line 4", ["c", "3"])]),
+        ("id,other,value,value\n 1,x,2 ,y\n", [("line 2", [" 1", "2 "])]),
+        ("\ufeffvalue,id\r\n#2,'1'\r\n", [("line 2", ["'1'", "#2"])]),
+    ],
+)
+def test_cells_are_the_text_of_the_file_with_its_lines(tmp_path, content, rows):
+    path = tmp_path / "table.csv"
+    path.write_bytes(content.encode())
+    found = list(read_rows(path, ("id", "value")))
+    assert found == [(f"{path}, {where}", cells) for where, cells in rows]
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        ("id,value" + ",more" * 2000, "has 2002 columns; at most 1000 are read"),
+        ("id,value\n1," + "2" * (1 << 21), "a line of more than 1048576 characters"),
+        ("id,value\n1,2\0", "line contains NUL"),
+        ('id,value\n1,"2', "cannot be read as a table: .*EOF inside string"),
+        ("\n\nid,value\n1,2,3", "line 4: 3 cells, the header has 2"),
+        ("id,value\n1,2\n3", "line 3: 1 cells, the header has 2"),
+    ],
+)
+def test_a_table_that_pandas_would_guess_at_is_refused(tmp_path, content, says):
+    path = tmp_path / "table.csv"
+    path.write_text(content)
+    with pytest.raises(UserError, match=says):
+        list(read_rows(path, ("id", "value")))

@@ -20,12 +20,14 @@ import sys
 sys.modules["kornia"] = None
 from mkpc_kaggle.cli import main
 from mkpc_kaggle.pipeline.assembly import assemble
+from mkpc_kaggle.recipe import Recipe, Unit
 
 main(["weights", "list"])
-main(["recipes"])
+main(["recipes", "auto"])
 assembly = assemble("auto")
 print(assembly.recipe.matcher_names, "xfeat_lighterglue" in str(assembly.left_out))
-print(assemble("light").recipe.matcher_names)
+units = [Unit(1, "sift", 640), Unit(1, "xfeat_lighterglue", 640)]
+print(assemble(Recipe(tuple(units), "mine")).recipe.matcher_names)
 """
 
 
@@ -60,8 +62,8 @@ def test_without_kornia_its_matchers_alone_are_lost(clean_environment):
     done = subprocess.run([sys.executable, "-c", WITHOUT_KORNIA], capture_output=True, text=True, check=False)
     assert "superglue_outdoor.pth" in done.stdout, done.stderr
     assert "\nweights: matcher xfeat_lighterglue cannot be used here (ModuleNotFoundError" in done.stdout
-    assert "    xfeat_lighterglue: cannot be used here (ModuleNotFoundError" in done.stdout
+    assert "  xfeat_lighterglue: cannot be used here (ModuleNotFoundError" in done.stdout
     assert "('sift',) True" in done.stdout
     assert "recipe auto does without xfeat_lighterglue: cannot be used here (ModuleNotFoundError" in done.stderr
-    assert "recipe light does without xfeat_lighterglue: cannot be used here (ModuleNotFoundError" in done.stderr
+    assert "recipe mine does without xfeat_lighterglue: cannot be used here (ModuleNotFoundError" in done.stderr
     assert done.stdout.endswith("('sift',)\n")

@@ -1,18 +1,23 @@
 """LoFTR, QuadTree and ASpanFormer: properties of the networks, and the matchers from public checkpoints."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
 from checkpoints import PublicFile, store_of, wrapped
-from light_matchers import MATCHERS
+from light_matchers import MATCHERS, standin
 from pictures import picture
 
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.matchers.adapters import loftr
 from mkpc_kaggle.matchers.contract import Placement
 from mkpc_kaggle.matchers.networks.adaptive_span import CELLS_AT_ONCE, span_attention
+from mkpc_kaggle.matchers.networks.aspanformer import AspanFormer
 from mkpc_kaggle.matchers.networks.coarse_matching import coarse_matches
 from mkpc_kaggle.matchers.networks.loftr import Loftr
+from mkpc_kaggle.matchers.networks.quadtree import Quadtree
+from mkpc_kaggle.matchers.registry import load_matcher, spec_of
 
 
 @pytest.mark.parametrize("held", [0, 2**20])
@@ -68,3 +73,20 @@ def test_points_of_image_0_are_centres_of_cells_within_the_border_of_the_content
     np.testing.assert_array_equal(cells % 1, 0)
     border = matcher._network.border
     assert (cells >= border).all() and (cells < np.array([17, 13]) - border).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "make"), [("loftr", Loftr), ("quadtree", Quadtree), ("aspanformer", AspanFormer)]
+)
+def test_the_threshold_of_the_options_decides_which_cells_match(name, make):
+    state = standin(name, make).state_dict()
+    weights = SimpleNamespace(load=lambda slot: dict(state))
+    counts = []
+    for threshold in (0.0, 1.0):
+        options = spec_of(name, "test").options(threshold=threshold)
+        matcher = load_matcher(name, weights, options, Placement())
+        view = picture(64, 96, channels=1, multiple=matcher.spec.multiple)
+        (matches,) = matcher.match(matcher.encode([view]), matcher.encode([view]))
+        counts.append(len(matches))
+        assert (matches.scores > threshold).all()
+    assert counts[0] > counts[1] == 0

@@ -31,11 +31,22 @@ def test_the_tour_runs_on_a_train_side_without_a_network(demo, tmp_path):
         PYTHONPATH=PATHS,
         MKPC_TRAIN_DIR=str(demo.train_dir),
         MKPC_PAIR="courtyard;courtyard_0006-courtyard_0001",
+        MKPC_HELPED_PAIR="courtyard;courtyard_0004-courtyard_0001",
         MKPC_OTHER_PAIR="courtyard;courtyard_0003-courtyard_0000",
     )
     executed = execute(TOUR, tmp_path / "executed.ipynb", sys.executable, tmp_path, variables)
-    assert pictures(executed) == figures_of(executed) == 16
+    assert pictures(executed) == figures_of(executed) == 18
     assert printed(executed) == ""
+
+
+@needs_namespaces
+def test_the_tour_takes_two_photographs_without_truth(demo, tmp_path):
+    recipe = write_recipe(tmp_path / "tour.toml", (1, 480), (2, 640), more="[magsac]\npermutations = 1")
+    photographs = sorted((demo.train_dir / "courtyard" / "images").iterdir())[:2]
+    variables = environment(MKPC_RECIPE=str(recipe), PYTHONPATH=PATHS, MKPC_PHOTOS=",".join(map(str, photographs)))
+    executed = execute(TOUR, tmp_path / "executed.ipynb", sys.executable, tmp_path, variables)
+    assert pictures(executed) == 9, "images, stage 1, four of MKPC, stage 2, both, epipolar lines"
+    assert "The tour of your photographs ends here." in printed(executed)
 
 
 def test_the_tour_is_committed_with_all_its_pictures_and_nothing_else():
@@ -62,5 +73,6 @@ def test_without_a_train_side_recipes_are_compared_on_the_demo_set(small_recipe,
     assert "courtyard              4 pairs" in text
     assert "small against small (stage-1): gain of mAA, 95% interval" in text
     assert text.count("mean over scenes         4") == 3
+    assert "On these 4 pairs, small " in text
     assert text.count(": covisibility 0.") == 3
     assert pictures(executed) == 3 + 3, "scores, gains, errors; the hardest pairs"

@@ -56,6 +56,11 @@ class Kaggle:
     def figures(self) -> int:
         return pictures(nbformat.read(self.executed, as_version=4))
 
+    def pages(self) -> str:
+        cells = nbformat.read(self.executed, as_version=4).cells
+        shown = [output for cell in cells for output in cell.get("outputs", [])]
+        return "".join(output.get("data", {}).get("text/html", "") for output in shown)
+
     def problems(self) -> list[str]:
         return problems_of(self.working / "submission.csv", self.test_dir)
 
@@ -94,8 +99,9 @@ def test_a_commit_run_without_network_leaves_a_submission_and_shows_pairs(kaggle
     other.mkdir(parents=True)
     (other / "mkpc_kaggle-0.0.9-py3-none-any.whl").touch()
     printed = kaggle.run()
-    assert f"not taken    {other} (version 0.0.9)" in printed
-    assert "left out, no weights: loma, superglue, loftr" in printed
+    assert f"not used     {other} (version 0.0.9)" in printed
+    advice = "`mkpc recipes auto` lists them" if WEIGHTS.is_dir() else "RootSIFT only; "
+    assert advice in printed
     assert kaggle.problems() == []
     assert "good: 1 rows" in printed
     assert "recipe auto" in printed
@@ -106,6 +112,7 @@ def test_a_commit_run_without_network_leaves_a_submission_and_shows_pairs(kaggle
     assert (kaggle.root / "temp" / "submission.work" / "journal.sqlite").is_file()
     assert not list(kaggle.working.rglob("journal*")), "what lies here is published"
     assert kaggle.figures() == 1, "the pair"
+    assert "&lt;title&gt;auto: 1 pairs&lt;/title&gt;" in kaggle.pages(), "the report, in an iframe"
     if WEIGHTS.is_dir():
         for told in ("3 files, 0 refused, 0 missing", "1:xfeat_lighterglue@1024 ", "1:aliked@1024 "):
             assert told in printed
@@ -116,9 +123,12 @@ def test_a_commit_run_without_network_leaves_a_submission_and_shows_pairs(kaggle
 @needs_data
 def test_the_packaged_notebook_with_genuine_weights_matches_with_aliked_and_lightglue(kaggle, tmp_path):
     kaggle.add_test_side(DATA / "test", pairs=1)
-    kaggle.add_dataset(tmp_path / "package", (GENUINE,))
+    (tmp_path / "weights").mkdir()
+    for name in ("aliked-n16.pth", "aliked_lightglue.pth"):  # fewer units: the test is to stay quick
+        (tmp_path / "weights" / name).symlink_to(GENUINE / name)
+    kaggle.add_dataset(tmp_path / "package", (tmp_path / "weights",))
     printed = kaggle.run()
-    assert "0 refused, 0 missing" in printed
+    assert "2 files, 0 refused, 0 missing" in printed
     assert "1 of 1 pairs have an F" in printed
     assert "does without" not in printed
     for unit in ("1:aliked_lightglue", "2:aliked_lightglue"):

@@ -139,10 +139,34 @@ def test_the_kernel_runs_on_a_gpu_without_internet_on_the_latest_image_or_one_by
     assert (pinned["docker_image_pinning_type"], pinned["docker_image"]) == ("original", image)
     assert 6 <= len(dataset["title"]) <= 50 and 20 <= len(dataset["subtitle"]) <= 80  # Kaggle's limits
     assert (kernel["enable_gpu"], kernel["enable_internet"]) == (True, False)
+    assert kernel["model_sources"] == []
     assert kernel["dataset_sources"] == [dataset["id"]] == ["someone/mkpc-kaggle"]
     assert kernel["id"] == "someone/" + kernel["title"].lower().replace(" ", "-")
     code = (out / "kernel" / kernel["code_file"]).read_bytes()
     assert code == (find_checkout() / "notebooks" / "submission.ipynb").read_bytes()
+
+
+def test_without_weights_the_notebook_asks_for_no_gpu(wanted):
+    make_package(replace(wanted, weights=()))
+    kernel = metadata_of(wanted.out)[1]
+    assert kernel["enable_gpu"] is False
+    assert "machine_shape" not in kernel
+
+
+def test_matchers_may_come_from_kaggle_models(wanted):
+    make_package(replace(wanted, weights=(), models=True))
+    kernel = metadata_of(wanted.out)[1]
+    assert kernel["model_sources"] == [
+        "oldufo/aliked/pyTorch/aliked-n16/1",
+        "oldufo/lightglue/pyTorch/aliked/1",
+    ]
+    assert kernel["enable_gpu"] is True
+
+
+def test_the_page_of_the_dataset_has_no_links_that_lead_nowhere(out):
+    page = (out / "dataset" / "README.md").read_text(encoding="utf-8")
+    assert "Licences of the weights: MIT." in page
+    assert "](" not in page
 
 
 def test_the_same_request_gives_the_same_bytes_and_leaves_files_alone(wanted, out):

@@ -293,6 +293,28 @@ def in_child(match):
             matcher(*pair())
 
 
+def test_pairs_with_a_common_image_encode_it_once_and_match_as_single_pairs(tmp_path):
+    paths = [tmp_path / f"{name}.png" for name in "abc"]
+    photograph = load_sample_image("china.jpg")
+    for shift, path in enumerate(paths):
+        cv2.imwrite(str(path), photograph[20:300, 30 * shift :][:, :400])
+    pairs = [(paths[0], paths[1]), (paths[0], paths[2]), (paths[1], paths[2])]
+    alone = [TwoStageMatcher(SIFT)(*pair) for pair in pairs]
+
+    counting = CountingSift()
+    found = list(TwoStageMatcher(SIFT, matchers={"sift": counting}).match_pairs(pairs))
+    assert counting.seen.total() == 3
+    for match, expected in zip(found, alone, strict=True):
+        assert_array_equal(match.matches.points0, expected.matches.points0)
+        assert_array_equal(match.estimate.matrix, expected.estimate.matrix)
+
+
+def test_match_pairs_names_an_unreadable_image(tmp_path):
+    (tmp_path / "a.png").write_bytes(b"")
+    with pytest.raises(UserError, match="the file is empty"):
+        next(TwoStageMatcher(SIFT).match_pairs([(tmp_path / "a.png", tmp_path / "a.png")]))
+
+
 class Loader:
     """Loads a matcher without matches, or raises the error of that name; counts the calls."""
 

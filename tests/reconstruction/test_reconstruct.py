@@ -243,6 +243,7 @@ def test_the_command_writes_tables_models_a_database_and_a_page(demo, small_reci
     options = ["--recipe", small_recipe, "--format", "imc2025", "--workers", 0]
     assert run_command("reconstruct", images, "--out", out, *options) == 0
     results = {"cameras.csv", "submission.csv", "database.db", "models/0/images.bin", "report.html"}
+    results |= {"sparse/0/points3D.bin", "summary.json", *(f"images/{path.name}" for path in images.iterdir())}
     assert results <= contents(out).keys()
     with (out / "submission.csv").open() as stream:
         assert [row["image"] for row in csv.DictReader(stream)] == sorted(path.name for path in images.iterdir())
@@ -341,9 +342,11 @@ def test_python_gives_models_reads_each_image_once_and_estimates_nothing_unused(
 
     monkeypatch.setattr(images, "read_image", read_counted)
     monkeypatch.setattr(pair, "estimate", lambda *_, **__: pytest.fail("unused"))
-    (first,) = reconstruct(folder.iterdir(), RECIPE, device="cpu", matchers={"synthetic": MixedMatcher()})
+    models = reconstruct(folder.iterdir(), RECIPE, device="cpu", matchers={"synthetic": MixedMatcher()})
+    (first,) = models
     assert sorted(read) == sorted(folder.iterdir())
     assert len(first.images) == FIRST
     truth = MixedMatcher().scenes[0].cameras
+    assert all(f"{number:02}.png" in models.show().page for number in range(FIRST))
     for found in first.images:
         assert found.focal == pytest.approx(truth["00" + Path(found.image.name).stem].K[0, 0], rel=0.03)

@@ -1,6 +1,7 @@
 """The journal command and report.html, on journals with known contents."""
 
 import csv
+import json
 import os
 import re
 import sys
@@ -10,6 +11,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from browser import needs_browser, opened_browser
 from rectified import THREE_UNITS, RectifiedMatcher, run, write_pairs
 from shared import run_command
 
@@ -109,10 +111,11 @@ def test_the_page_begins_with_the_verdict_has_pictures_inside_and_asks_for_nothi
     assert report_run(tmp_path / "work", page, inf, pairs) == f"report: {page}"
     text = page.read_text(encoding="utf-8")
     assert re.search("<h1>Complete after .*: 11 of 12 pairs have an F</h1>", text)
-    titles = ["Missing results", "The weakest pairs", "Where the time went", "What made this"]
+    titles = ["Missing results", "The weakest pairs", "Pairs", "Where the time went", "What made this"]
     assert re.findall("<h2>(.*?)</h2>", text) == titles
     assert text.count("<img ") == 11, "the pairs with an F"
-    assert "<script" not in text
+    assert "With the fallback: 1 pairs; the reasons are below." in text
+    assert re.findall("<script[^>]*>", text) == ["<script>", "<script>"], "both inside the page"
     assert all(source.startswith("data:image/") for source in re.findall(r"\b(?:src|href)\s*=\s*.(\S*)", text))
     assert not re.search(r"url\(|@import", text)
     assert "the file is empty" in text
@@ -123,6 +126,32 @@ def test_the_page_begins_with_the_verdict_has_pictures_inside_and_asks_for_nothi
         assert (len(match.matches), match.estimate.inlier_count) == (record.matches, record.inliers)
 
 
+def test_the_summary_has_the_facts_of_the_page_for_programs(tmp_path):
+    pairs = a_run(tmp_path)
+    report_run(tmp_path / "work", tmp_path / "report.html", inf, pairs)
+    table = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
+    assert table["format"] == "mkpc summary 1"
+    assert table["verdict"].startswith("11 of 12 pairs have an F; with the fallback: 1 pairs")
+    assert (table["pairs"]["count"], table["pairs"]["with_f"]) == (12, 11)
+    assert table["pairs"]["sources"] == {"fallback": 1, "pair": 11}
+    records = read_log(tmp_path / "work").records
+    assert table["pairs"]["inliers_minimum"] == min(record.inliers for record in records if record.is_solved)
+    assert sum(table["pairs"]["inliers_histogram"].values()) == 12
+    assert [unit["pairs"] for unit in table["units"]] == [11, 11, 11]
+
+
+@pytest.mark.parametrize("make", MINE.values(), ids=MINE)
+def test_a_summary_replaces_nothing_but_a_summary(tmp_path, make):
+    empty_journal(tmp_path, []).close()
+    make(tmp_path / "page.summary.json")
+    before = os.lstat(tmp_path / "page.summary.json")
+    identity = before.st_ino, before.st_mtime_ns
+    assert run_command("journal", tmp_path, "--report", tmp_path / "page.html") == 2
+    after = os.lstat(tmp_path / "page.summary.json")
+    assert (after.st_ino, after.st_mtime_ns) == identity
+    assert read_log(tmp_path).records == ()
+
+
 def test_what_comes_from_files_is_escaped(tmp_path):
     pairs = [Pair(EVIL, EVIL, f"{EVIL.replace('/', '')}.png", "b.png")]
     with empty_store(tmp_path, pairs, device=EVIL, left_out=(EVIL,), versions={EVIL: EVIL}) as store:
@@ -131,7 +160,8 @@ def test_what_comes_from_files_is_escaped(tmp_path):
     log = read_log(tmp_path)
     for known in ((), pairs):
         text = report_page(log, known)
-        assert "<script" not in text
+        assert EVIL not in text
+        assert text.count("<script") == 2, "the page's own"
         assert "&lt;script&gt;" in text
     assert EVIL in overview(log)
 
@@ -147,6 +177,38 @@ def test_without_matplotlib_the_page_has_tables_and_says_so(tmp_path, monkeypatc
     assert "matplotlib is not installed" in text
     assert "<img" not in text
     assert pairs[0].id in text
+
+
+@needs_browser
+@pytest.mark.parametrize("width", [1280, 400])
+def test_pairs_sort_and_filter_and_pictures_enlarge(tmp_path, width):
+    pairs = a_run(tmp_path, 6)
+    page = tmp_path / "report.html"
+    report_run(tmp_path / "work", page, inf, pairs)
+    rows = "[...document.querySelectorAll('table.sortable tbody tr')]"
+    with opened_browser() as browser:
+        browser.open(page, width)
+        for kind in ("ascending", "descending"):
+            browser.value("document.querySelectorAll('table.sortable th button')[2].click()")
+            inliers = browser.value(f"{rows}.map((row) => Number(row.cells[2].textContent))")
+            assert inliers == sorted(inliers, reverse=kind == "descending")
+            assert browser.value("document.querySelectorAll('table.sortable th')[2].ariaSort") == kind
+        filled = "document.querySelector('input[type=search]')"
+        browser.value(f"{filled}.value = 'FALLBACK {pairs[1].id}'; {filled}.oninput()")
+        shown = browser.value(f"{rows}.filter((row) => !row.hidden).map((row) => row.cells[0].textContent)")
+        assert shown == [pairs[1].id]
+        browser.value("document.querySelector('figure img').click()")
+        assert browser.value("document.querySelector('dialog').open")
+        assert browser.value("document.querySelector('dialog img').naturalWidth") > 100
+        browser.value("document.querySelector('dialog').click()")
+        assert not browser.value("document.querySelector('dialog').open")
+        wide = (
+            "[...document.querySelectorAll('body *')].filter((e) => e.getBoundingClientRect().right > innerWidth)"
+        )
+        outside = f"{wide}.filter((e) => !e.closest('.wide, .rows')).map((e) => e.outerHTML.slice(0, 200))"
+        assert browser.value(outside) == []
+        assert browser.value("document.documentElement.scrollWidth") <= width
+        assert browser.errors == []
 
 
 def test_a_late_report_leaves_out_drawings_then_itself(tmp_path, monkeypatch):

@@ -68,10 +68,6 @@ def semi_dense_matcher(name, make, placement):
     return SemiDenseMatcher(ours(placement, name, make), spec_of(name, "test"), placement.device)
 
 
-class LightLoma(LomaAdapter):
-    threshold = 0.0
-
-
 def dkm_matcher(placement: Placement, matches: int = 300) -> DenseMatcher:
     options = DenseOptions(matches=matches)
     return DenseMatcher(dkm.SPEC, ours(placement, "dkm", DKM), options, placement.device)
@@ -84,8 +80,8 @@ def roma_matcher(placement: Placement) -> DenseMatcher:
 
 
 def loma_matcher(placement: Placement) -> LomaAdapter:
-    options = LomaOptions(Variant.B128, max_keypoints=200)
-    return LightLoma(ours(placement, "loma", Loma, Variant.B128), options, placement.device)
+    options = LomaOptions(Variant.B128, max_keypoints=200, threshold=0.0)
+    return LomaAdapter(ours(placement, "loma", Loma, Variant.B128), options, placement.device)
 
 
 def aliked_matcher(placement: Placement, keypoints: int = 200) -> AlikedMatcher:

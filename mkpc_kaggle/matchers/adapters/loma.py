@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import torch
 
-from mkpc_kaggle.config import AT_LEAST_1, check_ranges
+from mkpc_kaggle.config import AT_LEAST_1, POSITIVE, SHARE, check_ranges
 from mkpc_kaggle.geometry.coordinates import Size, from_normalised
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import MatcherSpec, PairwiseMatcher, Picture, Placement
@@ -19,18 +19,17 @@ from mkpc_kaggle.weights import WeightStore, load_into
 PATCH = 14  # pixels; the side of the descriptor's input is a multiple of it
 
 
-DESCRIPTOR_SCALE = 784 / 1024  # side of the descriptor's square input over the view's longer side, as released
-
-
 @dataclass(frozen=True)
 class LomaOptions:
     """The released settings, for views with a long side of 1024 pixels."""
 
     variant: Variant = Variant.B
     max_keypoints: int = 2048
+    threshold: float = 0.1  # the minimum score of a match
+    descriptor_scale: float = 784 / 1024  # side of the descriptor's square input over the longer side
 
     def __post_init__(self) -> None:
-        check_ranges(self, max_keypoints=AT_LEAST_1)
+        check_ranges(self, max_keypoints=AT_LEAST_1, threshold=SHARE, descriptor_scale=POSITIVE)
 
 
 SPEC = MatcherSpec("loma", LomaOptions, slots=("loma-{variant}",))
@@ -48,7 +47,6 @@ class LomaAdapter(PairwiseMatcher[LomaEncoding]):
     """
 
     spec = SPEC
-    threshold = 0.1  # scores of matches are above this, as released
 
     def __init__(self, network: Loma, options: LomaOptions, device: str) -> None:
         self.options = options
@@ -65,7 +63,7 @@ class LomaAdapter(PairwiseMatcher[LomaEncoding]):
         if min(detected) == 0:
             descriptor, _ = WIDTHS[self.options.variant]
             return LomaKeypoints(*(torch.zeros(0, width, device=self.device) for width in (2, descriptor)))
-        side = PATCH * max(1, round(DESCRIPTOR_SCALE * long_side / PATCH))
+        side = PATCH * max(1, round(self.options.descriptor_scale * long_side / PATCH))
         # Cut off the padding, which would change the descriptors.
         pixels = torch.from_numpy(picture.pixels[: content.height, : content.width].copy()).permute(2, 0, 1)[None]
         to_detect = resized(pixels, (detected.height, detected.width)).to(self.device)
@@ -73,7 +71,7 @@ class LomaAdapter(PairwiseMatcher[LomaEncoding]):
         return self._network.encode(to_detect, to_describe, self.options.max_keypoints)
 
     def _match(self, first: LomaEncoding, second: LomaEncoding) -> Matches:
-        found = self._network.matcher(first.keypoints, second.keypoints, self.threshold)
+        found = self._network.matcher(first.keypoints, second.keypoints, self.options.threshold)
         points0, points1 = (
             from_normalised(encoding.keypoints.points[index].cpu().numpy(), encoding.content)
             for encoding, index in ((first, found.index0), (second, found.index1))

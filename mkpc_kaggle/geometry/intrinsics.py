@@ -1,0 +1,116 @@
+"""Intrinsics that the user knows: COLMAP's camera models, exact or with a standard deviation.
+
+Parameters have COLMAP's order and units: pixels, with (0, 0) the corner of the top-left pixel, not its centre.
+"""
+
+import fnmatch
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from math import isfinite
+from types import MappingProxyType
+
+# Parameters of the models that a perspective camera with a usual lens needs.
+MODELS: Mapping[str, tuple[str, ...]] = MappingProxyType(
+    {
+        "SIMPLE_PINHOLE": ("f", "cx", "cy"),
+        "PINHOLE": ("fx", "fy", "cx", "cy"),
+        "SIMPLE_RADIAL": ("f", "cx", "cy", "k"),
+        "RADIAL": ("f", "cx", "cy", "k1", "k2"),
+        "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
+        "FULL_OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    }
+)
+FIXED = "fixed"
+MAX_SIGMA = 100.0  # percent; a wider prior states nothing
+
+
+@dataclass(frozen=True)
+class KnownCamera:
+    """A camera model with parameters, and the standard deviation of its focal length in percent; 0: exact.
+
+    An exact camera is not refined at all. Raises ``ValueError`` for values that no camera has.
+    """
+
+    model: str
+    parameters: tuple[float, ...]
+    sigma: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.model not in MODELS:
+            raise ValueError(f"unknown camera model {self.model!r}; known: {', '.join(MODELS)}")
+        names = MODELS[self.model]
+        if len(self.parameters) != len(names):
+            raise ValueError(f"{self.model} has {len(names)} parameters ({', '.join(names)})")
+        if not all(map(isfinite, self.parameters)):
+            raise ValueError("a parameter is not finite")
+        focal_count = sum(name.startswith("f") for name in names)
+        if min(self.parameters[: focal_count + 2]) <= 0:
+            raise ValueError("focal lengths and the principal point must be positive")
+        if not 0 <= self.sigma <= MAX_SIGMA:
+            raise ValueError(
+                f"a standard deviation must be {FIXED!r}, or above 0 and at most {MAX_SIGMA:g} percent"
+            )
+
+    @property
+    def focal(self) -> float:
+        """The mean focal length in pixels."""
+        names = MODELS[self.model]
+        focals = [value for name, value in zip(names, self.parameters, strict=True) if name.startswith("f")]
+        return sum(focals) / len(focals)
+
+    @property
+    def principal_point(self) -> tuple[float, float]:
+        """The point (cx, cy); the centre of the top-left pixel is (0.5, 0.5)."""
+        at = MODELS[self.model].index("cx")
+        return self.parameters[at], self.parameters[at + 1]
+
+
+Rows = Sequence[tuple[str, KnownCamera]]  # a name or a pattern of images, and their camera
+
+
+def parse_row(pattern: str, model: str, parameters: str, sigma: str) -> tuple[str, KnownCamera]:
+    """Return a row of a table from its cells. Raises ``ValueError`` with the reason."""
+    if not pattern.strip():
+        raise ValueError("the name of the image is missing")
+    if sigma.strip() != FIXED and float(sigma) <= 0:
+        raise ValueError(f"a standard deviation must be {FIXED!r} or a number of percent above 0, not {sigma!r}")
+    percent = 0.0 if sigma.strip() == FIXED else float(sigma)
+    return pattern.strip(), KnownCamera(model.strip(), tuple(map(float, parameters.split())), percent)
+
+
+def written(rows: Rows) -> str:
+    """Return rows as text, a line each, for the settings of a run."""
+    lines = (
+        "\t".join(
+            [
+                pattern,
+                known.model,
+                " ".join(map(repr, map(float, known.parameters))),
+                repr(float(known.sigma)) if known.sigma else FIXED,
+            ]
+        )
+        for pattern, known in rows
+    )
+    return "\n".join(lines)
+
+
+def read(text: str) -> Rows:
+    """Return the rows of :func:`written`. Raises ``ValueError`` for other text."""
+    rows = []
+    for line in text.splitlines():
+        cells = line.split("\t")
+        if len(cells) != 4:
+            raise ValueError(f"expected name, model, parameters and sigma, separated by tabs, found {line!r}")
+        rows.append(parse_row(*cells))
+    return rows
+
+
+def camera_of(rows: Rows, name: str) -> KnownCamera | None:
+    """Return the camera of the first row that names an image: by path, by file name, or by a pattern of these."""
+    base = name.rpartition("/")[2]
+    matching = (known for pattern, known in rows if pattern in (name, base) or _matches(pattern, name, base))
+    return next(matching, None)
+
+
+def _matches(pattern: str, name: str, base: str) -> bool:
+    return fnmatch.fnmatchcase(name, pattern) or fnmatch.fnmatchcase(base, pattern)

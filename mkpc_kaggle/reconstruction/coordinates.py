@@ -1,0 +1,66 @@
+"""The coordinates of a folder that grows: which cameras a later run keeps, and by how much they moved."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from mkpc_kaggle.data.outputs import replacing
+from mkpc_kaggle.engine.request import Ending
+from mkpc_kaggle.geometry.cameras import Camera
+from mkpc_kaggle.reconstruction.folder import batch_names
+from mkpc_kaggle.reconstruction.run import FolderResult
+from mkpc_kaggle.scene.align import (
+    MIN_COMMON,
+    REFERENCE,
+    Cameras,
+    moved_by,
+    read_reference,
+    size_of,
+    write_reference,
+)
+
+STILL = 1e-6  # of the model's size; smaller movements are rounding
+
+
+def forget_coordinates(out: Path, datasets: Iterable[str]) -> None:
+    """Remove the cameras of the last complete run, so that the next models have new coordinates."""
+    for dataset in datasets:
+        (out / dataset / REFERENCE).unlink(missing_ok=True)
+
+
+def keep_coordinates(out: Path, root: Path, result: FolderResult) -> Iterator[str]:
+    """Save the cameras of a complete run for the next run. Yield a line per dataset whose earlier cameras moved.
+
+    A run that was ended early saves nothing, so that it ends as an undisturbed run when it is resumed.
+    """
+    if result.report.ending != Ending.COMPLETE:
+        return
+    batches = batch_names(root, result.cameras)
+    for dataset, cameras in result.cameras.items():
+        models: dict[int, dict[str, Camera]] = {}
+        for file, placed in cameras.items():
+            if placed is not None:
+                number, found = placed
+                models.setdefault(number, {})[file.relative_to(root).as_posix()] = found.camera
+        yield from moved_lines(
+            batches[dataset], read_reference(out / dataset), [models[number] for number in sorted(models)]
+        )
+        if models:
+            with replacing(out / dataset / REFERENCE) as stream:
+                write_reference(stream, [models[number] for number in sorted(models)])
+
+
+def moved_lines(batch: str, earlier: Iterable[Cameras], models: Sequence[Cameras]) -> Iterator[str]:
+    """Yield a line for each earlier model whose cameras are in a model now, and have moved."""
+    for former in earlier:
+        now = max(models, key=lambda model: len(model.keys() & former.keys()), default={})
+        names = sorted(now.keys() & former.keys())
+        if len(names) < MIN_COMMON:
+            continue
+        targets = [former[name] for name in names]
+        moved = moved_by([now[name] for name in names], targets) / size_of(targets)
+        if moved.max() > STILL:
+            middle, most = 100 * np.median(moved), 100 * moved.max()
+            text = f"{len(names)} cameras keep the coordinates of the last run and moved by {middle:.2g} %"
+            yield f"{batch}: {text} of the model's size (the median; {most:.2g} % at most)"

@@ -1,0 +1,130 @@
+"""The folders ``images`` and ``sparse`` of a dataset, which gsplat, nerfstudio and Gaussian splatting read.
+
+``images`` has links to the photographs, or copies where the file system has no links. ``sparse/0`` is the largest
+model in COLMAP's format, with plain file names and with the colours of points.
+"""
+
+import os
+import shutil
+import signal
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from math import inf
+from multiprocessing import get_context
+from pathlib import Path, PurePosixPath
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from mkpc_kaggle.reconstruction.directory import holds_dataset
+from mkpc_kaggle.scene.export import FORMER, IMAGES, MODELS, PART, SPARSE
+
+Datasets = Mapping[str, Sequence[Path]]
+
+
+def write_layouts(out: Path, root: Path, datasets: Datasets, ends: float) -> Iterator[str]:
+    """Write the folders of each dataset until ``ends``, in seconds of the monotonic clock. Yield the problems."""
+    for dataset, files in datasets.items():
+        directory = out / dataset
+        if holds_dataset(str(PurePosixPath(dataset, IMAGES)), datasets):
+            yield f"{directory / IMAGES} belongs to another dataset, so {directory / SPARSE} has no images"
+            continue
+        left = max(0.0, ends - time.monotonic())
+        names = {file.relative_to(root).as_posix(): file.name for file in files}
+        try:
+            write_images(directory, files)
+            failure = write_sparse(directory, names, None if ends == inf else left)
+        except OSError as error:
+            failure = f"{error.strerror}: {error.filename}"
+        if failure:
+            yield f"{directory / SPARSE} was not written: {failure}; the same command writes it"
+
+
+def write_images(directory: Path, files: Sequence[Path]) -> None:
+    """Make ``images``: a link to each file, or a copy. Remove links to other files. Raises ``OSError``."""
+    folder = directory / IMAGES
+    folder.mkdir(parents=True, exist_ok=True)
+    names = {file.name for file in files}
+    for former in folder.iterdir():
+        if former.is_symlink() and former.name not in names:
+            former.unlink()
+    for file in files:
+        _link(folder / file.name, file.resolve())
+
+
+def _link(path: Path, file: Path) -> None:
+    """Make ``path`` a link to ``file``, or a copy of it; one that is up to date stays."""
+    if path.is_symlink():
+        if path.readlink() == file:
+            return
+        path.unlink()
+    elif path.exists() and _version(path) == _version(file):
+        return
+    with suppress(OSError):  # an old copy exists, or the file system has no links
+        path.symlink_to(file)
+        return
+    part = path.with_name(f"{PART}{path.name}")
+    shutil.copy2(file, part)
+    part.replace(path)
+
+
+def _version(path: Path) -> tuple[int, int]:
+    status = path.stat()
+    return status.st_size, status.st_mtime_ns
+
+
+def write_sparse(directory: Path, names: Mapping[str, str], seconds: float | None) -> str:
+    """Make ``sparse`` from ``models`` and ``images``. Return why that failed, or an empty string.
+
+    ``names`` maps an image's name in a model to its name in ``images``. A separate process does the work, since
+    pycolmap may end it; the process is ended after ``seconds``, unless ``None``.
+    """
+    context = get_context("spawn")
+    receiver, sender = context.Pipe(duplex=False)
+    process = context.Process(target=_write_sparse_to, args=(sender, directory, dict(names)), daemon=True)
+    process.start()
+    sender.close()
+    try:
+        if not receiver.poll(seconds):
+            return "the time is up"
+        with suppress(EOFError):
+            return str(receiver.recv())
+        process.join()
+        return f"its process ended with status {process.exitcode}"
+    finally:
+        process.kill()
+        process.join()
+        receiver.close()
+
+
+def _write_sparse_to(sender: Any, directory: Path, names: Mapping[str, str]) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # of the terminal; the parent decides
+    try:
+        convert_models(directory, names)
+        sender.send("")
+    except Exception as error:  # any error of pycolmap
+        sender.send(str(error))
+
+
+def convert_models(directory: Path, names: Mapping[str, str]) -> None:
+    """Write ``sparse`` in this process. The complete folder replaces an earlier one."""
+    import pycolmap
+
+    pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
+    with TemporaryDirectory(prefix=PART, dir=directory) as name:
+        made = Path(name)
+        (made / SPARSE).mkdir()
+        for folder in sorted((directory / MODELS).glob("[0-9]*")):
+            model = pycolmap.Reconstruction(folder)
+            for image in model.images.values():
+                image.name = names.get(image.name, image.name)
+            model.extract_colors_for_all_images(directory / IMAGES)
+            (made / SPARSE / folder.name).mkdir()
+            model.write(made / SPARSE / folder.name)
+        for path in filter(Path.is_file, (made / SPARSE).rglob("*")):
+            with path.open("rb") as stream:  # a power failure must not leave empty files under their names
+                os.fsync(stream.fileno())
+        if (directory / SPARSE).exists():
+            (directory / SPARSE).rename(made / FORMER)
+        if any((made / SPARSE).iterdir()):
+            (made / SPARSE).rename(directory / SPARSE)

@@ -1,0 +1,228 @@
+"""The verdict on a run: one sentence at the head of its report, and ``summary.json`` for programs."""
+
+import json
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+
+from mkpc_kaggle.data.outputs import replacing
+from mkpc_kaggle.engine.records import PairRecord, SceneRecord
+from mkpc_kaggle.errors import UserError, printable, writing
+from mkpc_kaggle.reporting.run_log import RunLog
+from mkpc_kaggle.reporting.summary import headline, is_doubtful, seconds_by_part, trouble, unit_means, unit_reasons
+from mkpc_kaggle.scene.choose import Reason
+from mkpc_kaggle.scene.reconstruction import RegisteredImage
+from mkpc_kaggle.version import __version__
+
+FORMAT = "mkpc summary 1"  # increase the number if a key changes its meaning or disappears
+MAX_NAMED = 3  # images in a sentence
+MAX_CENTRE_SIGMA = 0.02  # of the model's size; a camera with a larger expected error is uncertain
+MAX_REPROJECTION_PX = 1.5  # verified matches are within 2 px
+# Bounds of the histogram of inliers; the last bin is open.
+INLIER_BINS = (0, 1, 10, 20, 50, 100, 200, 500, 1000, 2000)
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The facts of a run in a sentence, and each problem with its remedy."""
+
+    text: str
+    problems: tuple[str, ...]
+
+    def __str__(self) -> str:
+        return "; ".join((self.text, *(self.problems or ("nothing looks wrong",))))
+
+
+def verdict(log: RunLog) -> Verdict:
+    """Return the verdict: about cameras if images were to be reconstructed together, else about pairs."""
+    problems = list(filter(None, [trouble(log)]))
+    reconstructed = [scene for scene in log.scenes if scene.models]
+    if not log.scenes:
+        problems += _pair_problems(log.records)
+        return Verdict(_with_an_f(log.records), tuple(problems))
+    placed = sum(scene.registered for scene in log.scenes)
+    images = sum(scene.images for scene in log.scenes)
+    text = f"{placed} of {images} images have a camera"
+    if reconstructed:
+        text += f"; reprojection {_reprojection(reconstructed):.2f} px"
+    problems += [problem for scene in log.scenes for problem in _scene_problems(scene, log)]
+    return Verdict(text, tuple(problems))
+
+
+def doubt(record: PairRecord) -> str:
+    """Return why a pair may show different things, or an empty string.
+
+    Matches that contradict the cameras are doubtful, too.
+    """
+    if record.scene is not None and record.scene.reason is Reason.CONTRADICTION:
+        return "its matches contradict the cameras"
+    if record.is_solved and is_doubtful(record):
+        return f"{record.stats.support:.1f} times the inliers by chance"
+    return ""
+
+
+def inlier_histogram(records: Sequence[PairRecord]) -> list[tuple[str, int]]:
+    """Return the number of reached pairs in each range of inliers, as (range, count)."""
+    inliers = [record.inliers for record in records if record.reached]
+    counts, _ = np.histogram(inliers, [*INLIER_BINS, np.inf])
+    names = ["0", *(f"{low} to {high - 1}" for low, high in pairwise(INLIER_BINS[1:]))]
+    return list(zip([*names, f"{INLIER_BINS[-1]} or more"], counts.tolist(), strict=True))
+
+
+def _with_an_f(records: Sequence[PairRecord]) -> str:
+    return f"{sum(record.is_solved for record in records)} of {len(records)} pairs have an F"
+
+
+def _pair_problems(records: Sequence[PairRecord]) -> Iterator[str]:
+    if late := sum(not record.reached for record in records):
+        yield f"not reached in time: {late} pairs; give the run more time, or a smaller recipe"
+    if lost := sum(record.reached and not record.is_solved for record in records):
+        yield f"with the fallback: {lost} pairs; the reasons are below"
+    if doubtful := sum(bool(doubt(record)) for record in records):
+        yield f"perhaps of different things: {doubtful} pairs; look at them below"
+
+
+def _scene_problems(scene: SceneRecord, log: RunLog) -> Iterator[str]:
+    where = f"{scene.batch}: " if len(log.scenes) > 1 else ""
+    if not scene.models:
+        yield f"{where}no cameras, {scene.failure}: photographs that overlap more are needed"
+        return
+    known = {Path(found.image.name).name for model in scene.models for found in model.images}
+    records = [record for record in log.records if record.pair.group == scene.batch]
+    missing = sorted({name for record in records for name in record.pair.names} - known)
+    if missing:
+        yield f"{where}no camera for {_named(missing)}: add photographs between these and the others"
+    if len(scene.models) > 1:
+        sizes = ", ".join(str(len(model.images)) for model in scene.models)
+        yield f"{where}the images form {len(scene.models)} models of {sizes}: add photographs that connect them"
+    uncertain = sorted({Path(found.image.name).name for found in _cameras(scene) if _is_uncertain(found)})
+    if uncertain:
+        yield f"{where}uncertain cameras: {_named(uncertain)}; add photographs of the same things"
+    worst = max(model.reprojection_error for model in scene.models)
+    if worst > MAX_REPROJECTION_PX:
+        yield f"{where}a mean reprojection error of {worst:.1f} px is large: the lens may be distorted"
+
+
+def _cameras(scene: SceneRecord) -> Iterator[RegisteredImage]:
+    return (found for model in scene.models for found in model.images)
+
+
+def _is_uncertain(found: RegisteredImage) -> bool:
+    return not found.sigmas or found.sigmas.centre > MAX_CENTRE_SIGMA
+
+
+def _named(names: Sequence[str]) -> str:
+    """Return up to ``MAX_NAMED`` names and the number of the others."""
+    more = len(names) - MAX_NAMED
+    return ", ".join(names[:MAX_NAMED]) + (f" and {more} more" if more > 0 else "")
+
+
+def _reprojection(scenes: Sequence[SceneRecord]) -> float:
+    """Return the mean reprojection error of all models in pixels, each weighted by its observations."""
+    models = [model for scene in scenes for model in scene.models]
+    weights = [max(1, sum(found.points for found in model.images)) for model in models]
+    return float(np.average([model.reprojection_error for model in models], weights=weights))
+
+
+def write_summary(log: RunLog, page: Path) -> Path | None:
+    """Write the facts of :func:`summary_table` as JSON next to the report ``page``. Return the path.
+
+    ``report.html`` has ``summary.json``, another page NAME.html has NAME.summary.json; a page without the suffix
+    of HTML, such as a device, has none. Raises :class:`UserError` if a file of another kind is in the way.
+    """
+    if page.suffix.lower() not in (".html", ".htm"):
+        return None
+    path = page.with_name("summary.json" if page.stem == "report" else f"{page.stem}.summary.json")
+    if (path.exists() or path.is_symlink()) and not _is_summary(path):
+        raise UserError(f"{path} is in the way and is not a summary of a run; move it")
+    with writing(f"the summary {path}"), replacing(path) as stream:
+        stream.write(printable(json.dumps(summary_table(log), indent=1, ensure_ascii=False, allow_nan=False)))
+        stream.write("\n")
+    return path
+
+
+def _is_summary(path: Path) -> bool:
+    if path.is_symlink() or not path.is_file():
+        return False
+    with suppress(OSError, ValueError, AttributeError, RecursionError):
+        return str(json.loads(path.read_text(encoding="utf-8")).get("format", "")).startswith("mkpc summary ")
+    return False
+
+
+def summary_table(log: RunLog) -> dict[str, Any]:
+    """Return the facts of the report as JSON values; ``format`` names the version of the keys."""
+    found = verdict(log)
+    inliers = [record.inliers for record in log.records if record.is_solved]
+    return {
+        "format": FORMAT,
+        "program": __version__,
+        "recipe": log.recipe.name,
+        "verdict": str(found),
+        "problems": [*found.problems],
+        "headline": headline(log),
+        "ending": str(log.ending),
+        "seconds": _number(log.seconds),
+        "pairs": {
+            "count": len(log.records),
+            "with_f": len(inliers),
+            "sources": dict(sorted(Counter(record.source for record in log.records).items())),
+            "doubtful": [record.pair.id for record in log.records if doubt(record)],
+            "inliers_median": _number(median(inliers)) if inliers else None,
+            "inliers_minimum": min(inliers, default=None),
+            "inliers_histogram": dict(inlier_histogram(log.records)),
+        },
+        "scenes": [_scene_table(scene) for scene in log.scenes],
+        "units": [
+            {
+                "unit": name,
+                "pairs": pairs,
+                "matches": _number(matches),
+                "inliers": _number(kept),
+                "seconds": _number(s),
+            }
+            for name, pairs, matches, kept, s in unit_means(log)
+        ],
+        "seconds_by_part": {name: _number(seconds) for name, seconds in seconds_by_part(log).items()},
+        "unit_failures": unit_reasons(log),
+        "left_out": [*log.about.left_out],
+        "faults": log.faults,
+        "versions": dict(log.about.versions),
+    }
+
+
+def _scene_table(scene: SceneRecord) -> dict[str, Any]:
+    return {
+        "batch": scene.batch,
+        "images": scene.images,
+        "cameras": scene.registered,
+        "points": scene.points,
+        "seconds": _number(scene.seconds),
+        "failure": scene.failure,
+        "models": [
+            {
+                "reprojection_px": _number(model.reprojection_error),
+                "cameras": [
+                    {
+                        "image": found.image.name,
+                        "focal_px": _number(found.focal),
+                        "points": found.points,
+                        "sigmas": found.sigmas._asdict() if found.sigmas else None,
+                    }
+                    for found in model.images
+                ],
+            }
+            for model in scene.models
+        ],
+    }
+
+
+def _number(value: float) -> float | None:
+    """Return a number with six digits; JSON has neither infinity nor NaN."""
+    return float(f"{value:.6g}") if np.isfinite(value) else None

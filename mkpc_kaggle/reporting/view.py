@@ -1,0 +1,301 @@
+"""An interactive view of cameras and points, for ``report.html`` and for notebooks.
+
+One part of a page, without libraries and requests: a 2D canvas, drawn by ``templates/view.js``. Points have 16-bit
+coordinates and 8-bit colours, in base64.
+"""
+
+import base64
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from html import escape
+from importlib.resources import files
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mkpc_kaggle.data.images import Image, read_image
+from mkpc_kaggle.data.outputs import replacing
+from mkpc_kaggle.errors import writing
+from mkpc_kaggle.geometry.cameras import Camera
+from mkpc_kaggle.geometry.coordinates import Pixels
+from mkpc_kaggle.scene.reconstruction import MAX_POINTS, RegisteredImage, SfmModel
+
+if TYPE_CHECKING:
+    from markupsafe import Markup
+
+MAX_PICTURES = 200  # images that are read per scene, for thumbnails and for colours of points
+THUMBNAIL_PX = 320  # the longer side
+JPEG_QUALITY = 70
+FAR = 4.0  # half sizes of the scene; the limit of drawn points
+GREY = 150  # points outside all known pictures
+STEPS = 32767  # of a 16-bit coordinate
+FRUSTUM_SHARE = 0.4  # size of a frustum over the distance to the nearest camera
+MIN_FRUSTUM, MAX_FRUSTUM = 0.02, 0.08  # in half sizes of the scene
+FRAME_HEIGHT_PX = 760  # of the view in a notebook
+
+Reader: TypeAlias = Callable[[str], Image | None]  # the picture of an image, by its name in the scene
+Colours: TypeAlias = Sequence[NDArray[np.uint8]]
+Partner: TypeAlias = tuple[str, int, int]  # another image of a pair, the pair's inliers and matches
+Partners: TypeAlias = Mapping[str, Sequence[Partner]]  # by name of the image
+
+
+@dataclass(frozen=True)
+class View:
+    """A page with the view of a scene, which notebooks show in a sandboxed frame."""
+
+    page: str  # a complete HTML document
+
+    def _repr_html_(self) -> str:
+        """Return a frame with the page. Its scripts run, and have no access to the notebook."""
+        style = f"width: 100%; height: {FRAME_HEIGHT_PX}px; border: 0"
+        return f'<iframe sandbox="allow-scripts" style="{style}" srcdoc="{escape(self.page)}"></iframe>'
+
+    def save(self, path: str | Path) -> None:
+        """Write the page. Raises :class:`mkpc_kaggle.errors.UserError` if that fails."""
+        with writing(f"the view {path}"), replacing(Path(path)) as stream:
+            stream.write(self.page)
+
+
+def show(models: Iterable[SfmModel], *, metres_per_unit: float | None = None) -> View:
+    """Return the view of models from :func:`mkpc_kaggle.reconstruct`, whose image names are paths.
+
+    With ``metres_per_unit``, the scale of the largest model, a bar shows a length in metres.
+    """
+    part = view_part([*models], "the scene", read=picture_at, metres_per_unit=metres_per_unit)
+    return view_of([("", part)])
+
+
+def view_of(parts: Iterable[tuple[str, "Markup"]]) -> View:
+    """Return the view of scenes, given the title and the part of the page of each."""
+    style = "body { margin: 0; padding: .5rem; background: #fff; font: 1rem/1.5 system-ui, sans-serif; }"
+    title = '<meta charset="utf-8"><title>Cameras and points</title>'
+    head = f"{title}\n<style>{style}</style>{style_and_script()}"
+    body = "".join(f"<h3>{escape(name)}</h3>{part}" if name else part for name, part in parts)
+    return View(f'<!doctype html>\n<html lang="en"><head>{head}</head><body>{body}</body></html>')
+
+
+def picture_at(path: str) -> Image | None:
+    """Return the image at a path, or ``None`` if it is unreadable."""
+    image = read_image(Path(path))
+    return image if isinstance(image, Image) else None
+
+
+def style_and_script() -> "Markup":
+    """Return the style and the script of views, once per page; the script starts when the page is complete."""
+    from markupsafe import Markup
+
+    style, script = template("view.css"), template("view.js")
+    start = 'document.addEventListener("DOMContentLoaded", () => {\n'
+    return Markup(f"<style>\n{style}</style>\n<script>\n{start}{script}}});\n</script>\n")
+
+
+def view_part(
+    models: Sequence[SfmModel],
+    title: str,
+    *,
+    read: Reader = lambda _: None,
+    partners: Partners | None = None,
+    pictures: Sequence[tuple[str, str]] = (),
+    colours: Colours = (),
+    metres_per_unit: float | None = None,
+) -> "Markup":
+    """Return the part of a page with the view of a scene's models.
+
+    ``read`` returns pictures, which colour the points of models without ``colours``. ``pictures`` are captions and
+    URIs of pictures that a browser without scripts shows instead. All text is escaped.
+    """
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+    from markupsafe import Markup
+
+    if not any(model.images for model in models):
+        return Markup("<p>No cameras.</p>")
+    pages = Environment(loader=PackageLoader("mkpc_kaggle.reporting"), autoescape=True, undefined=StrictUndefined)
+    data = view_data(models, read=read, partners=partners or {}, colours=colours, metres_per_unit=metres_per_unit)
+    return Markup(pages.get_template("view.html").render(data=data, title=title, pictures=pictures))
+
+
+def view_data(
+    models: Sequence[SfmModel],
+    *,
+    read: Reader,
+    partners: Partners,
+    colours: Colours = (),
+    metres_per_unit: float | None = None,
+) -> dict[str, Any]:
+    """Return the data that ``view.js`` reads, as JSON values.
+
+    ``colours`` has the colours (P, 3) of each model's points, or is empty. Each model is in its own frame: x
+    right, y down, z ahead of the mean camera, and most points within 1 of the origin. Models stand side by side,
+    since their relative scale and position are unknown.
+    """
+    shown = list(models)
+    pictures = _pictures(shown, read)
+    frames = [_Frame.of(model) for model in shown]
+    given: Sequence[NDArray[np.uint8] | None] = colours or [None] * len(shown)
+    is_measured = metres_per_unit is not None and len(shown) == 1
+    return {
+        "models": [_model(*each, pictures, partners) for each in zip(shown, frames, given, strict=True)],
+        "metres": metres_per_unit / frames[0].scale if is_measured and metres_per_unit else None,
+    }
+
+
+@dataclass(frozen=True, eq=False)
+class _Frame:
+    """The similarity from a model's world to the view's: ``scale`` * axes @ (X - centre).
+
+    ``extent`` has the half sizes of the model in the view, at most 1.
+    """
+
+    axes: NDArray[np.float64]  # (3, 3): rows right, down, ahead in the model's world
+    centre: NDArray[np.float64]
+    scale: float
+    extent: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, model: SfmModel) -> "_Frame":
+        cameras = [found.camera for found in model.images]
+        _, down, ahead = np.mean([camera.R for camera in cameras], axis=0)
+        if np.linalg.norm(down) < 1e-6:  # cameras of all orientations have no common vertical
+            down = cameras[0].R[1]
+        down = down / np.linalg.norm(down)
+        ahead = ahead - ahead @ down * down
+        if np.linalg.norm(ahead) < 0.1:  # cameras around an object look in all directions
+            ahead = cameras[0].R[2] - cameras[0].R[2] @ down * down
+        ahead = ahead / max(float(np.linalg.norm(ahead)), 1e-9)
+        axes = np.stack([np.cross(down, ahead), down, ahead])
+
+        centres = np.array([camera.centre for camera in cameras]) @ axes.T
+        low, high = centres.min(axis=0), centres.max(axis=0)
+        if len(model.points):
+            inner = np.percentile(model.points @ axes.T, (3, 97), axis=0)
+            low, high = np.minimum(low, inner[0]), np.maximum(high, inner[1])
+        size = float((high - low).max()) or 1.0
+        return cls(axes, axes.T @ (low + high) / 2, 2 / size, (high - low) / size)
+
+    def place(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.asarray(self.scale * (points - self.centre) @ self.axes.T)
+
+
+def _model(
+    model: SfmModel,
+    frame: _Frame,
+    known: NDArray[np.uint8] | None,
+    pictures: Mapping[str, Pixels],
+    partners: Partners,
+) -> dict[str, Any]:
+    points = model.points[:MAX_POINTS]
+    placed = frame.place(points)
+    near = np.abs(placed).max(axis=1, initial=0) < FAR
+    colours = known[:MAX_POINTS] if known is not None else point_colours(points, model.images, pictures)
+    reach = float(np.abs(placed[near]).max(initial=1e-6))
+    steps = np.round(placed[near] * (STEPS / reach)).astype("<i2")
+    centres = frame.place(np.array([found.camera.centre for found in model.images]))
+    return {
+        "count": int(near.sum()),
+        "range": reach,
+        "points": _base64(steps.tobytes()),
+        "colours": _base64(colours[near].tobytes()),
+        "extent": _rounded(frame.extent),
+        "frustum": _frustum_size(centres),
+        "cameras": [_camera(found, frame, pictures, partners) for found in model.images],
+    }
+
+
+def _camera(
+    found: RegisteredImage, frame: _Frame, pictures: Mapping[str, Pixels], partners: Partners
+) -> dict[str, Any]:
+    camera, size, name = found.camera, found.image.size, found.image.name
+    sigmas = found.sigmas and (found.sigmas.rotation, 100 * found.sigmas.centre, found.sigmas.focal)
+    return {
+        "name": Path(name).name,
+        "centre": _rounded(frame.place(camera.centre[None])[0]),
+        "R": [_rounded(row) for row in camera.R @ frame.axes.T],
+        "wide": size.width / (2 * camera.K[0, 0]),  # tangents of half the angles of view
+        "high": size.height / (2 * camera.K[1, 1]),
+        "pixels": [*size],
+        "points": found.points,
+        "sigmas": [float(f"{value:.2g}") for value in sigmas] or None,
+        "pairs": [*partners.get(Path(name).name, ())],
+        "thumbnail": _thumbnail(pictures[name]) if name in pictures else "",
+    }
+
+
+def point_colours(
+    points: NDArray[np.float64], images: Sequence[RegisteredImage], pictures: Mapping[str, Pixels]
+) -> NDArray[np.uint8]:
+    """Return the colours (P, 3) of points, each from the nearest camera with the point in its picture.
+
+    The nearest camera sees a point of a surface more probably than a farther one. ``pictures`` are by image name
+    and may be smaller than the images.
+    """
+    colours = np.full((len(points), 3), GREY, np.uint8)
+    nearest = np.full(len(points), np.inf)
+    for found in images:
+        picture = pictures.get(found.image.name)
+        if picture is None:
+            continue
+        pixels, depths = _projected(found.camera, points)
+        height, width = picture.shape[:2]
+        scale = width / found.image.size.width, height / found.image.size.height
+        columns, rows = np.floor((pixels + 0.5) * scale).T
+        inside = (depths > 0) & (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
+        distances = np.linalg.norm(points - found.camera.centre, axis=1)
+        chosen = inside & (distances < nearest)
+        nearest[chosen] = distances[chosen]
+        colours[chosen] = picture[rows[chosen].astype(int), columns[chosen].astype(int)]
+    return colours
+
+
+def _projected(camera: Camera, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return pixels (P, 2) and depths (P,); pixels are not finite in the camera's plane."""
+    rays = points @ camera.R.T + camera.t
+    homogeneous = rays @ camera.K.T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return homogeneous[:, :2] / homogeneous[:, 2:], rays[:, 2]
+
+
+def _pictures(models: Sequence[SfmModel], read: Reader) -> dict[str, Pixels]:
+    """Return the readable pictures by image name, reduced to thumbnails; of many, only the first."""
+    names = dict.fromkeys(found.image.name for model in models for found in model.images)
+    pictures = {}
+    for name in [*names][:MAX_PICTURES]:
+        image = read(name)
+        if image is not None:
+            scale = min(1.0, THUMBNAIL_PX / max(image.size))
+            reduced = cv2.resize(image.pixels, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+            pictures[name] = np.asarray(reduced, np.uint8)
+    return pictures
+
+
+def _thumbnail(pixels: Pixels) -> str:
+    bgr = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)
+    _, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    return f"data:image/jpeg;base64,{_base64(data.tobytes())}"
+
+
+def _frustum_size(centres: NDArray[np.float64]) -> float:
+    """Return the size of frusta that neither overlap nor vanish, from the distances of neighbours."""
+    if len(centres) < 2:
+        return MAX_FRUSTUM
+    distances = np.linalg.norm(centres[:, None] - centres, axis=2)
+    np.fill_diagonal(distances, np.inf)
+    spacing = float(np.median(distances.min(axis=1)))
+    return float(np.clip(FRUSTUM_SHARE * spacing, MIN_FRUSTUM, MAX_FRUSTUM))
+
+
+def _rounded(values: NDArray[np.float64]) -> list[float]:
+    return [round(float(value), 6) for value in values]
+
+
+def _base64(data: bytes) -> str:
+    return base64.b64encode(data).decode()
+
+
+@cache
+def template(name: str) -> str:
+    """Return the text of a file in ``templates/``."""
+    return files("mkpc_kaggle.reporting").joinpath("templates", name).read_text(encoding="utf-8")

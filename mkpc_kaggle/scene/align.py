@@ -1,0 +1,166 @@
+"""Coordinates that stay: a new reconstruction moved onto the cameras of an earlier one.
+
+A reconstruction is known up to a similarity. Programs that use earlier coordinates can use a larger
+folder if its common cameras stay where they were.
+"""
+
+import json
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.distance import pdist
+
+from mkpc_kaggle.geometry.cameras import Camera
+from mkpc_kaggle.geometry.coordinates import Matrix3
+from mkpc_kaggle.scene.reconstruction import Reconstruction, SfmModel
+
+REFERENCE = ".mkpc-reference.json"  # in the folder of a dataset's files: its cameras at the end of the last run
+MIN_COMMON = 3  # cameras
+STILL = 1e-9  # of a similarity's numbers
+OUTLIER = 4.0  # times the median distance: a camera that the two reconstructions place differently
+
+Cameras: TypeAlias = Mapping[str, Camera]  # of one model, by image name
+
+
+@dataclass(frozen=True, eq=False)
+class Similarity:
+    """X_new = scale * R X_old + t."""
+
+    scale: float
+    R: Matrix3
+    t: NDArray[np.float64]
+
+    @property
+    def is_identity(self) -> bool:
+        """True if the similarity changes rounding alone, which would change bytes of files."""
+        return bool(
+            abs(self.scale - 1) < STILL
+            and np.abs(self.R - np.eye(3)).max() < STILL
+            and np.abs(self.t).max() < STILL
+        )
+
+    def of_points(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return points (N, 3) in the new world."""
+        return np.asarray(self.scale * points @ self.R.T + self.t)
+
+    def of_camera(self, camera: Camera) -> Camera:
+        R = camera.R @ self.R.T
+        centre = self.of_points(camera.centre[None])[0]
+        return Camera(camera.K, R, -R @ centre)
+
+
+def find_similarity(cameras: Sequence[Camera], targets: Sequence[Camera]) -> Similarity | None:
+    """Return the similarity that moves cameras onto their targets; ``None`` without ``MIN_COMMON`` usable pairs.
+
+    Rotations determine the rotation, so centres on a line are enough. Medians give a first estimate, then least
+    squares without the cameras that are far from their targets.
+    """
+    if len(cameras) < MIN_COMMON:
+        return None
+    turns = [target.R.T @ camera.R for camera, target in zip(cameras, targets, strict=True)]
+    R = _mean_rotation(turns)
+    centres = _centres(cameras) @ R.T
+    goals = _centres(targets)
+    scale = _median_scale(centres, goals)
+    if scale is None:
+        return None
+    # Medians tolerate cameras that the two reconstructions place differently.
+    offset = np.median(goals - scale * centres, axis=0)
+    distances = np.linalg.norm(scale * centres + offset - goals, axis=1)
+    near = distances <= OUTLIER * np.median(distances)
+    if near.sum() < MIN_COMMON:  # of three cameras, none can be called wrong
+        near[:] = True
+    return _least_squares(R, centres[near], goals[near])
+
+
+def moved_by(cameras: Sequence[Camera], targets: Sequence[Camera]) -> NDArray[np.float64]:
+    """Return the distance (N,) of each camera's centre from its target's."""
+    centres, goals = _centres(cameras), _centres(targets)
+    return np.asarray(np.linalg.norm(centres - goals, axis=1))
+
+
+def size_of(cameras: Sequence[Camera]) -> float:
+    """Return the size of a model: the RMS distance of its cameras from their mean."""
+    return float(np.sqrt(_centres(cameras).var(axis=0).sum()))
+
+
+def _mean_rotation(rotations: Sequence[Matrix3]) -> Matrix3:
+    """Return the rotation nearest to the mean."""
+    U, _, Vt = np.linalg.svd(np.sum(rotations, axis=0))
+    return np.asarray(U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt)
+
+
+def _median_scale(centres: NDArray[np.float64], goals: NDArray[np.float64]) -> float | None:
+    """Return the median ratio of distances between goals and between centres; ``None`` for a single centre."""
+    before = pdist(centres)
+    after = pdist(goals)
+    apart = before > 0
+    return float(np.median(after[apart] / before[apart])) if apart.any() else None
+
+
+def _least_squares(R: Matrix3, centres: NDArray[np.float64], goals: NDArray[np.float64]) -> Similarity | None:
+    """Return the similarity with rotation ``R`` that moves the rotated centres (N, 3) to their goals."""
+    centre = centres.mean(axis=0)
+    goal = goals.mean(axis=0)
+    spread = centres - centre
+    variance = float((spread**2).sum())
+    if variance == 0:
+        return None
+    scale = float((spread * (goals - goal)).sum()) / variance
+    # A scale that is not positive would turn the model inside out.
+    return Similarity(scale, R, goal - scale * centre) if scale > 0 else None
+
+
+def _centres(cameras: Sequence[Camera]) -> NDArray[np.float64]:
+    return np.array([camera.centre for camera in cameras]).reshape(-1, 3)
+
+
+def align(reconstructions: Sequence[Reconstruction], reference: Sequence[Cameras]) -> list[Reconstruction]:
+    """Return the reconstructions, each model moved onto the earlier model with the most common images."""
+
+    def aligned(model: SfmModel) -> SfmModel:
+        cameras = {found.image.name: found.camera for found in model.images}
+        earlier = max(reference, key=lambda former: len(cameras.keys() & former.keys()), default={})
+        names = sorted(cameras.keys() & earlier.keys())
+        found = find_similarity([cameras[name] for name in names], [earlier[name] for name in names])
+        return model if found is None or found.is_identity else transformed(model, found)
+
+    return [replace(each, models=tuple(map(aligned, each.models))) for each in reconstructions]
+
+
+def transformed(model: SfmModel, similarity: Similarity) -> SfmModel:
+    """Return the model in another world. pycolmap's model is changed in place."""
+    if model.colmap is not None:
+        import pycolmap
+
+        rotation = pycolmap.Rotation3d(similarity.R)
+        model.colmap.transform(pycolmap.Sim3d(similarity.scale, rotation, similarity.t))
+    images = tuple(replace(found, camera=similarity.of_camera(found.camera)) for found in model.images)
+    return replace(model, images=images, points=similarity.of_points(model.points))
+
+
+def write_reference(stream: Any, models: Sequence[Cameras]) -> None:
+    """Write the cameras of models as JSON: R and t of each image."""
+    rows = [{name: [*camera.R.ravel(), *camera.t] for name, camera in model.items()} for model in models]
+    json.dump(rows, stream, sort_keys=True)
+
+
+def read_reference(directory: Path) -> list[Cameras]:
+    """Return the cameras of each model of the last complete run, with K the identity; empty if unknown."""
+    models: list[Cameras] = []
+    with suppress(OSError, ValueError, TypeError, AttributeError, RecursionError):
+        for row in json.loads((directory / REFERENCE).read_text(encoding="utf-8")):
+            cameras = {}
+            for name, values in row.items():
+                numbers = np.array(values, np.float64)
+                if numbers.shape != (12,) or not np.isfinite(numbers).all():
+                    return []
+                R, t = np.split(numbers, [9])
+                cameras[name] = Camera(np.eye(3), R.reshape(3, 3), t)
+            models.append(cameras)
+    return models

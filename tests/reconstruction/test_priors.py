@@ -1,0 +1,162 @@
+"""The options --intrinsics and --masks of ``reconstruct``: what is refused, changed and computed again."""
+
+import csv
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from shared import run_command
+from test_reconstruct import FIRST, RECIPE, MixedMatcher, cameras, contents, write_flat
+
+from benchmarks.synthetic_scene import SIZE
+from mkpc_kaggle.data.masks import MaskReader, Masks
+from mkpc_kaggle.engine.budget import Budget
+from mkpc_kaggle.engine.session import Interrupt, Session
+from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.geometry.intrinsics import KnownCamera, read
+from mkpc_kaggle.pipeline.assembly import assemble
+from mkpc_kaggle.reconstruction.folder import read_folder
+from mkpc_kaggle.reconstruction.priors import read_intrinsics_table
+from mkpc_kaggle.reconstruction.run import FolderResult, for_cameras, reconstruct_folder
+
+HEAD = "image,model,parameters,sigma\n"
+
+
+def run(
+    root: Path, out: Path, matcher: MixedMatcher | None = None, *, known: str = "", masks: Masks | None = None
+) -> FolderResult:
+    session = Session(out / "work", Budget(0.0, float("inf")), Interrupt(), progress=False, workers=0)
+    assembly = assemble(RECIPE, matchers={"synthetic": matcher or MixedMatcher()}, device="cpu")
+    assembly = replace(assembly, recipe=for_cameras(assembly.recipe, None, known), masks=masks or Masks())
+    return reconstruct_folder(root, read_folder(root), assembly, session, out)
+
+
+def write_masks(folder: Path, root: Path, left: int = 400) -> Path:
+    """Write masks that leave the columns from ``left`` on."""
+    folder.mkdir(exist_ok=True)
+    mask = np.zeros((SIZE.height, SIZE.width), np.uint8)
+    mask[:, left:] = 1
+    for image in root.iterdir():
+        cv2.imwrite(str(folder / f"{image.name}.png"), mask)
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("table", "reason"),
+    [
+        ("", "lacks the columns"),
+        (HEAD, "has no rows"),
+        (HEAD + "00.png,PINHOLE,1 2 3,fixed\n", "line 2: PINHOLE has 4 parameters"),
+        (HEAD + "00.png,PINHOLE\n", "line 2: 2 cells"),
+        (HEAD + "none*.png,SIMPLE_PINHOLE,900 400 300,fixed\n", "line 2: 'none*.png' is the camera of no image"),
+        (HEAD + "*,SIMPLE_PINHOLE,900 400 300,2\n00.png,SIMPLE_PINHOLE,900 400 300,2\n", "line 3: '00.png' is"),
+        (
+            HEAD + "00.png,SIMPLE_PINHOLE,9 400 300,fixed\n",
+            "line 2: a focal length of 9 px is implausible for 00.png",
+        ),
+        (HEAD + "00.png,SIMPLE_PINHOLE,900 4000 300,fixed\n", "line 2: the principal point 4000, 300 is outside"),
+        ("\xff\x00", "lacks the columns"),
+        (None, "no such file"),
+    ],
+)
+def test_a_bad_table_of_intrinsics_is_one_line_and_nothing_is_touched(tmp_path, capsys, table, reason):
+    root, out, file = write_flat(tmp_path / "images", 3), tmp_path / "out", tmp_path / "known.csv"
+    if table is not None:
+        file.write_text(table)
+    before = contents(tmp_path)
+    assert run_command("reconstruct", root, "--out", out, "--intrinsics", file) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert reason in line
+    assert contents(tmp_path) == before
+    assert not out.exists()
+
+
+BAD_MASKS = {
+    "no such directory": lambda folder, root: None,
+    "has no mask of any image: 00.png.png would be the first": lambda folder, root: folder.mkdir(),
+    "it is no picture": lambda folder, root: (write_masks(folder, root) / "01.png.png").write_bytes(b"no"),
+    "not a regular file": lambda folder, root: (
+        (write_masks(folder, root) / "01.png.png").unlink(),
+        (folder / "01.png.png").mkdir(),
+    ),
+    "has 9 x 9 pixels, its image 800 x 600": lambda folder, root: cv2.imwrite(
+        str(write_masks(folder, root) / "02.png.png"), np.ones((9, 9))
+    ),
+}
+
+
+@pytest.mark.parametrize("reason", BAD_MASKS)
+def test_bad_masks_are_one_line_and_nothing_is_touched(tmp_path, capsys, reason):
+    root, out = write_flat(tmp_path / "images", 3), tmp_path / "out"
+    BAD_MASKS[reason](tmp_path / "masks", root)
+    assert run_command("reconstruct", root, "--out", out, "--masks", tmp_path / "masks") == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert reason in line
+    assert not out.exists()
+
+
+def test_masks_among_the_images_are_refused(tmp_path):
+    root = write_flat(tmp_path / "images", 3)
+    with pytest.raises(UserError, match="masks count as images"):
+        Masks.of_folder(root, root, root.iterdir())
+
+
+def test_black_pixels_of_a_mask_are_left_out(tmp_path):
+    root = write_flat(tmp_path / "images", 2)
+    masks = Masks.of_folder(write_masks(tmp_path / "masks", root), root, root.iterdir())
+    image = str(root / "00.png")
+    points = np.array([[399.4, 10], [399.6, 10], [799.4, 599.4], [0, 0]], np.float32)
+    assert MaskReader(masks).shows(image, points, SIZE).tolist() == [False, True, True, False]
+    assert MaskReader(masks).shows("another", points, SIZE).all()
+
+
+def test_masked_matches_are_dropped_before_the_best_are_chosen(tmp_path):
+    root, out = write_flat(tmp_path / "images", FIRST), tmp_path / "out"
+    masks = Masks.of_folder(write_masks(tmp_path / "masks", root, 300), root, root.iterdir())
+    free = run(root, tmp_path / "free")
+    result = run(root, out, masks=masks)
+    for record, other in zip(result.report.records, free.report.records, strict=True):
+        assert 0 < record.matches < other.matches
+    assert len(cameras(result)) == FIRST
+
+
+def test_another_mask_is_matched_again_and_other_intrinsics_are_not(tmp_path):
+    root, out = write_flat(tmp_path / "images", FIRST), tmp_path / "out"
+    run(root, out)
+    before = contents(out)
+    table = tmp_path / "known.csv"
+    truth = MixedMatcher().scenes[0].cameras["0000"].K
+    table.write_text(f"{HEAD}00.png,SIMPLE_PINHOLE,{truth[0, 0]} 400 300,fixed\n")
+    known = read_intrinsics_table(table, root, sorted(root.iterdir()))
+    matcher = MixedMatcher()
+    result = run(root, out, matcher, known=known)
+    assert matcher.calls == [], "intrinsics change scenes alone"
+    assert cameras(result)["00.png"].focal == pytest.approx(truth[0, 0], abs=1e-9)
+    assert contents(out) != before
+    folder = write_masks(tmp_path / "masks", root, 200)
+    expected = FIRST * (FIRST - 1) // 2
+    for _ in range(2):
+        masks = Masks.of_folder(folder, root, root.iterdir())
+        for calls in (expected, 0):
+            matcher = MixedMatcher()
+            run(root, out, matcher, known=known, masks=masks)
+            assert len(matcher.calls) == calls
+        write_masks(folder, root, 250)
+    run(root, out)
+    assert contents(out) == before, "without the options, the first results again"
+
+
+def test_the_table_is_read_in_the_order_of_its_rows(tmp_path):
+    root = write_flat(tmp_path / "in" / "set", 3).parent
+    file = tmp_path / "known.csv"
+    with file.open("w", newline="") as stream:
+        rows = [
+            ("set/00.png", "OPENCV", "900 901 400 300 .1 0 0 0", "fixed"),
+            ("*", "SIMPLE_PINHOLE", "850 400 300", "5"),
+        ]
+        csv.writer(stream).writerows([HEAD.strip().split(","), *rows])
+    known = read(read_intrinsics_table(file, root, sorted(root.rglob("*.png"))))
+    assert known[0] == ("set/00.png", KnownCamera("OPENCV", (900, 901, 400, 300, 0.1, 0, 0, 0)))
+    assert known[1] == ("*", KnownCamera("SIMPLE_PINHOLE", (850, 400, 300), 5.0))
