@@ -142,7 +142,7 @@ def test_the_summary_has_the_facts_of_the_page_for_programs(tmp_path):
 
 @pytest.mark.parametrize("make", MINE.values(), ids=MINE)
 def test_a_summary_replaces_nothing_but_a_summary(tmp_path, make):
-    empty_journal(tmp_path, []).close()
+    empty_store(tmp_path, []).close()
     make(tmp_path / "page.summary.json")
     before = os.lstat(tmp_path / "page.summary.json")
     identity = before.st_ino, before.st_mtime_ns
