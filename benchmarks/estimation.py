@@ -30,7 +30,8 @@ import numpy as np
 
 from mkpc_kaggle.config import from_table
 from mkpc_kaggle.data.competition import TrainScene, TruePair, read_train_side
-from mkpc_kaggle.engine.journal_reader import JournalReader
+from mkpc_kaggle.engine.records import Table, read_images, read_points, read_records
+from mkpc_kaggle.engine.store import Store
 from mkpc_kaggle.evaluation.compare import Difference, paired_difference
 from mkpc_kaggle.evaluation.validate import error_of
 from mkpc_kaggle.geometry.coordinates import Matrix3
@@ -126,14 +127,15 @@ def extra_of(pairs: Sequence[Known], every: Sequence[Known], config: SceneConfig
 
 def read_journal(directory: Path) -> tuple[str, dict[str, tuple[PairMatch, Matrix3 | None]]]:
     """Return the recipe's name, and each pair's matches and own F by pair id."""
-    with JournalReader(directory) as journal:
-        table = dict(journal.about().recipe)
+    with Store.read(directory) as store:
+        published = Table.of(store)
+        table = dict(published.about.recipe)
         recipe = recipe_of(table, table.pop("name"))
         units, found = {unit.name: unit for unit in recipe.units}, {}
-        for record in (record for record in journal.records() if record.units):
-            inputs, images = journal.inputs(record.index), journal.images(record.index)
-            points = journal.points(inputs.values())
-            results = tuple(UnitResult(units[name], points[revision]) for name, revision in inputs.items())
+        for record in (record for record in read_records(store, published) if record.units):
+            images = read_images(store, published.rows[record.index])
+            points = read_points(store, published, record.index)
+            results = tuple(UnitResult(units[name], matches) for name, matches in points.items())
             match = PairMatch(results, sizes=tuple(image.size for image in images))
             found[record.pair.id] = match, None if record.failure else record.pair_fundamental
     return recipe.name, found

@@ -7,6 +7,8 @@ from pathlib import Path
 from mkpc_kaggle.data.competition import read_test_side, test_side
 from mkpc_kaggle.data.outputs import require_apart
 from mkpc_kaggle.engine.console import unblocked
+from mkpc_kaggle.engine.records import Table
+from mkpc_kaggle.engine.store import Store
 from mkpc_kaggle.reporting.report import write_report
 from mkpc_kaggle.reporting.run_log import read_log, write_csv
 from mkpc_kaggle.reporting.summary import overview
@@ -25,6 +27,9 @@ submission. Without options, print an overview of one screen.
   regions.csv  per image (0 or 1) and pair: the critical region's box and the reason for it
   events.csv   times of starts, plans, scenes, faults, ends
 
+--prune removes the results that the last run did not use: those of former recipes, settings, images and rows. If
+they are asked for again, they are computed again. It prints the size that it sets free.
+
 Exit status: 0 done, 2 the journal does not exist, or a file cannot be written.
 """
 
@@ -34,12 +39,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("work_dir", type=Path, metavar="DIR")
     parser.add_argument("--csv", type=Path, metavar="OUT", help="write tables to this directory")
     parser.add_argument("--report", type=Path, metavar="FILE.html", help="write a page with pictures")
+    text = "remove the results that the last run did not use"
+    parser.add_argument("--prune", action="store_true", help=text)
     parser.add_argument("--test-dir", type=Path, metavar="DIR", help="the images that the report draws")
 
 
 def run(arguments: argparse.Namespace) -> None:
     inputs = test_side(arguments.test_dir) if arguments.test_dir else []
     require_apart({"--report": arguments.report}, inputs, arguments.work_dir)
+    if arguments.prune:
+        read_log(arguments.work_dir)  # refuses a directory without a run
+        with Store.open(arguments.work_dir) as store:
+            freed = store.prune(Table.of(store).keys)
+        print(f"{freed / 1e6:.2f} MB are free again")
+        return
     log = read_log(arguments.work_dir)
     written = write_csv(log, arguments.csv) if arguments.csv else []
     if arguments.report:

@@ -1,1 +1,1 @@
-"""The run engine: budget, journal, jobs and workers."""
+"""The run engine: budget, store, schedule, loop and workers."""

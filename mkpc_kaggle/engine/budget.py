@@ -8,6 +8,9 @@ from dataclasses import dataclass, field
 from math import inf, sqrt
 from statistics import fmean, median_low
 
+import numpy as np
+from numpy.typing import NDArray
+
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.recipe import Unit
 
@@ -17,6 +20,10 @@ MAX_WRITE_SHARE = 0.05  # maximum share of the limit for the forecast of a write
 MAX_SILENCE_S, MIN_SILENCE_S, SILENCE_SHARE = 60.0, 5.0, 0.02  # of a worker; the share is of the limit
 WINDOW = 64  # number of latest measurements in the mean
 MARGIN, MIN_MARGIN = 0.4, 0.01  # of a forecast from one measurement; sqrt(n) times smaller from n
+SCENE_START_S = 3.0  # start-up time of a scene's process
+SCENE_MATCH_S = 5e-4  # per match of a reconstruction: initial forecast, and lower bound for a hang
+SCENE_MARGIN = 1.5  # factor on a forecast from earlier scenes' matches
+ESTIMATE = "estimate"  # the name of the cost of an estimate
 MAX_STEP_BACK_S = 60.0  # of the wall clock, between --started-at and the start
 
 
@@ -96,20 +103,25 @@ class Budget:
 
 
 class Costs:
-    """Seconds of a unit on a pair, by name.
+    """Seconds of a unit on a pair, by name, of the estimate of a pair, and of a scene.
 
     A worker's first run of a unit is a warm-up. Its time is used as mean until another run, never as forecast.
     """
 
     def __init__(self) -> None:
         self._measured: dict[str, deque[float]] = {}
+        self._means: dict[str, float] = {}  # of the latest measurements
         self._warm_up: dict[str, float] = {}
+        self._scene_seconds = 0.0  # of this run's scenes, without their start
+        self._scene_matches = 0
 
     def observe(self, unit: str, seconds: float, *, warm_up: bool = False) -> None:
         if warm_up:
             self._warm_up[unit] = seconds
         else:
-            self._measured.setdefault(unit, deque(maxlen=WINDOW)).append(seconds)
+            latest = self._measured.setdefault(unit, deque(maxlen=WINDOW))
+            latest.append(seconds)
+            self._means[unit] = fmean(latest)
 
     def is_known(self, unit: str) -> bool:
         """Return whether a run after the warm-up was measured."""
@@ -117,8 +129,8 @@ class Costs:
 
     def mean(self, unit: str) -> float:
         """Return the expected seconds on a pair; 0 if nothing is known."""
-        if unit in self._measured:
-            return fmean(self._measured[unit])
+        if unit in self._means:
+            return self._means[unit]
         return self._warm_up.get(unit, 0.0)
 
     def forecast(self, unit: str) -> float:
@@ -126,6 +138,17 @@ class Costs:
         if not self.is_known(unit):
             return 0.0
         return self.mean(unit) * (1 + max(MIN_MARGIN, MARGIN / sqrt(len(self._measured[unit]))))
+
+    def observe_scene(self, matches: int, seconds: float) -> None:
+        self._scene_seconds += max(0.0, seconds - SCENE_START_S)
+        self._scene_matches += matches
+
+    def scenes(self, matches: NDArray[np.int_]) -> NDArray[np.float64]:
+        """Return the seconds that scenes with so many matches will probably take, each alone."""
+        rate = SCENE_MATCH_S
+        if self._scene_matches:
+            rate = SCENE_MARGIN * self._scene_seconds / self._scene_matches
+        return np.asarray(SCENE_START_S + matches * rate)
 
     def warm_up(self, units: Iterable[Unit]) -> float:
         """Return the longest warm-up of these units, in seconds, by the latest of each unit."""

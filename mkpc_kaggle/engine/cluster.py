@@ -1,7 +1,7 @@
 """Workers on a Ray cluster. Ray places an actor on each GPU, or on each machine if no GPU is used.
 
 The test set and the weights must have the same paths on every machine, as with a shared file system. If the
-main machine or Ray's head node fails, rerun the command to resume from the journal.
+main machine or Ray's head node fails, rerun the command to resume from the store.
 """
 
 import os
@@ -47,9 +47,14 @@ class RaySite(Site):
     """
 
     def __init__(
-        self, assembly: Assembly, cluster: str, clock: Callable[[], float], folders: Iterable[Path]
+        self,
+        assembly: Assembly,
+        cluster: str,
+        clock: Callable[[], float],
+        folders: Iterable[Path],
+        log: Path | None = None,
     ) -> None:
-        super().__init__(clock)
+        super().__init__(clock, log=log)
         # Ray reads these on import. It must not report usage, or start a cluster after its shutdown.
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
         os.environ.setdefault("RAY_ENABLE_AUTO_CONNECT", "0")
@@ -68,7 +73,10 @@ class RaySite(Site):
             join(self._ray, self._cluster)
         machines = [node for node in self._ray.nodes() if node["Alive"] and node["Resources"].get("CPU", 0) >= 1]
         gpus = sum(int(node["Resources"].get("GPU", 0)) for node in machines)
+        # This machine is one of the cluster's: scenes beside its actors get the cores that these leave.
+        self.matching_cores = self._cores
         if gpus and self._assembly.device != "cpu":
+            self.matching_cores = gpus
             make = partial(MatchRunner, self._assembly.on("cuda:0").pipeline)
             for number in range(gpus):
                 self._add(f"gpu {number}", make, num_gpus=1)

@@ -1,29 +1,33 @@
 """The only module that prints during a run: lines, warnings, progress. Printing never raises or blocks the run.
 
 A pipe without a reader or a stopped terminal (Ctrl-S) blocks a write forever, and with it every thread that waits
-for the stream's lock. A lost terminal (EIO), a full disk or a closed stream makes a write fail. Native libraries
-write to the descriptors directly: libjpeg and libpng print warnings while OpenCV decodes a photograph. So threads
-relay all output to descriptors 1 and 2, in the program and in worker processes.
+for the stream's lock. A lost terminal (EIO), a full disk or a closed stream makes a write fail. So one thread
+prints, from a bounded queue. Native libraries write to the descriptors directly: libjpeg and libpng print warnings
+while OpenCV decodes a photograph. Their text goes to a file.
 """
 
+import io
 import multiprocessing
 import os
 import queue
-import select
+import shutil
 import sys
 import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from math import isfinite
-from typing import NoReturn, TextIO
+from pathlib import Path
+from tempfile import TemporaryFile
+from typing import Any, NoReturn, TextIO
 
 from mkpc_kaggle.engine.budget import Budget, format_duration
 
 LINE_INTERVAL_S = 30.0  # between lines of progress if a line cannot be redrawn in place
 MAX_WAITING = 1000  # writes, which a busy progress line makes in a few minutes
-MAX_BYTES = 4096  # per read
+MAX_NATIVE_BYTES = 4096  # printed at the end, of what native libraries wrote
 DRAIN_S = 2.0  # maximum wait at the end for the remaining text to be printed
+BAR = "{desc}: {n_fmt}/{total_fmt} [{elapsed}<{remaining}, {pace}]"
 
 
 def say(text: str) -> None:
@@ -52,25 +56,53 @@ class Progress:
     """
 
     def __init__(self, budget: Budget, stream: TextIO | None) -> None:
-        self._budget, self._stream = budget, stream
-        self._erase = "\r\x1b[K" if is_terminal(stream) and "JPY_PARENT_PID" not in os.environ else ""
-        self._phase = self._line = ""
-        self._written = budget.clock()
+        self._budget = budget
+        self._stream = stream
+        is_redrawn = is_terminal(stream) and "JPY_PARENT_PID" not in os.environ
+        self._erase = "\r\x1b[K" if is_redrawn else ""
+        self._phase = ""
+        self._line = ""
+        self._first = 0  # pairs that were done when the phase began
+        self._began = self._written = budget.clock()
 
     def show(self, phase: str, done: int, total: int) -> None:
         """Show progress after a job. A phase without pairs is not shown."""
         if not total:
             return
-        began, self._phase = phase != self._phase, phase
-        if began and self._erase:
-            self.close()
-        count = f"{total} pairs" if began else f"{done} of {total} pairs"
-        left = f", budget left {format_duration(self._budget.left())}" if isfinite(self._budget.time_limit) else ""
-        self._line = f"{phase}: {count}{left}"
+        now = self._budget.clock()
+        is_new = phase != self._phase
+        if is_new:
+            if self._erase:
+                self.close()
+            self._phase = phase
+            self._first = done
+            self._began = now
+        self._line = self._text(done, total, now)
         if self._erase:
-            _print(self._erase + self._line, self._stream, end="")
-        elif began or self._budget.clock() - self._written >= LINE_INTERVAL_S:
+            width = shutil.get_terminal_size().columns
+            _print(self._erase + self._line[: width - 1], self._stream, end="")
+        elif is_new or now - self._written >= LINE_INTERVAL_S:
             self.close()
+
+    def _text(self, done: int, total: int, now: float) -> str:
+        """Return text such as ``sweep: 84/304 [02:10<05:40, 1.5 s/pair]``."""
+        from tqdm import tqdm
+
+        seconds = now - self._began
+        count = done - self._first
+        pace = f"{seconds / count:.2g} s/pair" if count and seconds else "? s/pair"
+        text: str = tqdm.format_meter(
+            done,
+            total,
+            seconds,
+            rate=count / seconds if count and seconds else None,
+            prefix=str(self._phase),
+            bar_format=BAR,
+            pace=pace,  # type: ignore[call-arg]  # a value for the format, which the stubs lack
+        )
+        if isfinite(self._budget.time_limit):
+            text += f", budget left {format_duration(self._budget.left())}"
+        return text
 
     def note(self, text: str) -> None:
         _print(self._erase + text, self._stream)
@@ -80,24 +112,132 @@ class Progress:
         """End the redrawn line on a terminal, or print the pending line elsewhere."""
         if self._line:
             _print("" if self._erase else self._line, self._stream)
-            self._line, self._written = "", self._budget.clock()
+            self._line = ""
+            self._written = self._budget.clock()
+
+
+class Printer:
+    """The printing thread, with a bounded queue of (descriptor, bytes). Text is dropped if the queue is full."""
+
+    def __init__(self) -> None:
+        self._waiting: queue.Queue[tuple[int, bytes]] = queue.Queue(MAX_WAITING)
+        self._thread = threading.Thread(target=self._print, name="print", daemon=True)
+        self._thread.start()
+
+    def put(self, descriptor: int, data: bytes) -> None:
+        with suppress(queue.Full):
+            self._waiting.put_nowait((descriptor, data))
+
+    def drain(self, until: float) -> bool:
+        """Wait until all text is printed, at most until ``until`` on the monotonic clock. Return whether it is."""
+        while self._waiting.unfinished_tasks:
+            if time.monotonic() >= until:
+                return False
+            time.sleep(0.002)
+        return True
+
+    def _print(self) -> None:
+        while True:
+            descriptor, data = self._waiting.get()
+            with suppress(OSError):  # lost terminal, or full disk
+                while data:
+                    data = data[os.write(descriptor, data) :]
+            self._waiting.task_done()
+
+
+class Queued(io.RawIOBase):
+    """The binary file below a text stream whose text the printing thread prints to ``descriptor``."""
+
+    def __init__(self, descriptor: int, printer: Printer) -> None:
+        self._descriptor = descriptor
+        self._printer = printer
+
+    def writable(self) -> bool:
+        return True
+
+    def write(self, data: Any) -> int:
+        text = bytes(data)
+        self._printer.put(self._descriptor, text)
+        return len(text)
+
+    def isatty(self) -> bool:
+        return os.isatty(self._descriptor)
+
+    def fileno(self) -> int:
+        return self._descriptor
+
+
+_printer: Printer | None = None  # of this process, once something is printed by it
+_native: list[int] = []  # descriptors that native libraries write to, while streams are queued
 
 
 @contextmanager
 def unblocked(descriptors: Sequence[int] = (1, 2)) -> Iterator[None]:
-    """Relay ``sys.stdout`` and ``sys.stderr``, so that writes never block. Print the remaining text at the end.
+    """Print ``sys.stdout`` and ``sys.stderr`` by a thread, so that writes never block.
 
-    Streams at other descriptors, such as a notebook's, are not changed.
+    Text of native libraries is printed at the end, or goes to the file of :func:`log_native`. Streams at other
+    descriptors, such as a notebook's, are not changed.
     """
+    global _printer  # noqa: PLW0603  one thread for the process
+    occupy_standard_descriptors()
     with ExitStack() as ended:
-        for stream in (sys.stdout, sys.stderr):
+        for name in ("stdout", "stderr"):
+            stream = getattr(sys, name)
             number = _descriptor(stream)
-            if number in descriptors and number not in _relays:
-                stream.flush()
-                _relays[number] = Relay(number)
-                ended.callback(_relays[number].close)
+            if number not in descriptors or number in _native:
+                continue
+            _printer = _printer or Printer()
+            stream.flush()
+            sink = os.dup(number)
+            raw = io.BufferedWriter(Queued(sink, _printer))
+            queued = io.TextIOWrapper(raw, stream.encoding, stream.errors, write_through=True, line_buffering=True)
+            setattr(sys, name, queued)
+            file = ended.enter_context(TemporaryFile())
+            os.dup2(file.fileno(), number)
+            _native.append(number)
+            ended.callback(_restore, name, stream, number, sink, file)
         ended.callback(drain)
         yield
+
+
+def _restore(name: str, stream: TextIO, number: int, sink: int, file: Any) -> None:
+    """Restore a stream and its descriptor, unless the file still blocks, since later writes would block, too."""
+    assert _printer is not None
+    setattr(sys, name, stream)
+    file.seek(0)
+    if text := file.read(MAX_NATIVE_BYTES):
+        _printer.put(sink, text)
+    if _printer.drain(time.monotonic() + DRAIN_S / 10):
+        with suppress(OSError):  # closed by the program
+            os.dup2(sink, number)
+            os.close(sink)
+    _native.remove(number)
+
+
+def occupy_standard_descriptors() -> None:
+    """Open the null device at descriptors up to 2 that are closed: no other file may get their numbers."""
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            lowest = os.open(os.devnull, os.O_RDWR)  # this number, as those below are open
+            os.set_inheritable(lowest, True)  # by worker processes
+
+
+def log_native(path: Path) -> None:
+    """Let native libraries write to a file from now on, while :func:`unblocked` is active."""
+    with suppress(OSError):  # a full disk
+        append_to(path, _native)
+
+
+def append_to(path: Path | str, descriptors: Sequence[int]) -> None:
+    """Let these descriptors append to a file. Raise ``OSError`` if it cannot be opened."""
+    if descriptors:
+        file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o666)
+        for number in descriptors:
+            os.dup2(file, number)
+        if file not in descriptors:
+            os.close(file)
 
 
 def drain(seconds: float = DRAIN_S) -> None:
@@ -107,8 +247,8 @@ def drain(seconds: float = DRAIN_S) -> None:
         for stream in filter(None, (sys.stdout, sys.stderr)):
             with suppress(OSError, ValueError):
                 stream.flush()
-        for relay in list(_relays.values()):
-            relay.drain(until)
+        if _printer is not None:
+            _printer.drain(until)
 
     until = time.monotonic() + seconds
     thread = threading.Thread(target=flush, name="flush", daemon=True)
@@ -125,9 +265,9 @@ def leave(status: int, seconds: float = DRAIN_S) -> NoReturn:
 
 
 def is_terminal(stream: TextIO | None) -> bool:
-    """Return whether a stream writes to a terminal, directly or through a relay."""
+    """Return whether a stream writes to a terminal, directly or through the printing thread."""
     descriptor = _descriptor(stream)
-    return os.isatty(_relays[descriptor].sink if descriptor in _relays else descriptor)
+    return descriptor >= 0 and os.isatty(descriptor)
 
 
 def _descriptor(stream: TextIO | None) -> int:
@@ -135,53 +275,3 @@ def _descriptor(stream: TextIO | None) -> int:
     with suppress(OSError, ValueError, AttributeError):
         return stream.fileno() if stream is not None and sys.platform != "win32" else -1
     return -1
-
-
-class Relay:
-    """A relay from a descriptor to its original file, ``sink``: one thread reads, another prints.
-
-    Text is dropped if the queue between the threads is full, or if the file refuses the write.
-    """
-
-    def __init__(self, descriptor: int) -> None:
-        self._descriptor, self.sink = descriptor, os.dup(descriptor)
-        self._source, pipe = os.pipe()
-        os.dup2(pipe, descriptor)
-        os.close(pipe)
-        self._reading = threading.Lock()
-        self._waiting: queue.Queue[bytes] = queue.Queue(MAX_WAITING)
-        for work in (self._read, self._print):
-            threading.Thread(target=work, name=f"relay {descriptor}", daemon=True).start()
-
-    def drain(self, until: float) -> bool:
-        """Wait until all text is printed, at most until ``until`` on the monotonic clock. Return whether it is."""
-        while time.monotonic() < until:
-            with self._reading:
-                if not select.select([self._source], [], [], 0)[0] and not self._waiting.unfinished_tasks:
-                    return True
-            time.sleep(0.002)
-        return False
-
-    def close(self) -> None:
-        """Restore the descriptor's file, unless the file still blocks, since later writes would block, too."""
-        if self.drain(time.monotonic() + DRAIN_S / 10):
-            os.dup2(self.sink, self._descriptor)
-            del _relays[self._descriptor]
-
-    def _read(self) -> None:
-        data = b"some"
-        while data:  # until no process holds the other end of the pipe
-            select.select([self._source], [], [])
-            with self._reading, suppress(queue.Full):
-                data = os.read(self._source, MAX_BYTES)
-                self._waiting.put_nowait(data)
-
-    def _print(self) -> None:
-        while data := self._waiting.get():
-            with suppress(OSError):  # lost terminal, or full disk
-                while data:
-                    data = data[os.write(self.sink, data) :]
-            self._waiting.task_done()
-
-
-_relays: dict[int, Relay] = {}  # of this process, by descriptor

@@ -1,24 +1,22 @@
-"""Messages between the engine and its workers: four kinds of jobs and their answers; the record of lost jobs."""
+"""Messages between the loop and its workers: four kinds of jobs, their answers, failures, the memory of tries."""
 
 from collections import Counter
-from collections.abc import Callable, Hashable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from dataclasses import dataclass, field
 from enum import IntEnum, StrEnum
 from pathlib import Path
-from typing import Generic, TypeVar
+from typing import Any
 
 from mkpc_kaggle.data.competition import Pair
+from mkpc_kaggle.engine.keys import Images
+from mkpc_kaggle.engine.store import Source
 from mkpc_kaggle.geometry.coordinates import Matrix3
-from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import NO_STATS, EstimateStats
 from mkpc_kaggle.pipeline.pair import Regions, UnitResult
 from mkpc_kaggle.recipe import Recipe, Unit
 from mkpc_kaggle.scene.reconstruct import Solution
-from mkpc_kaggle.scene.view_graph import BatchImage
 
 MAX_TRIES = 2  # of an item in its own job
-
-Item = TypeVar("Item", bound=Hashable)
 
 
 class Phase(IntEnum):
@@ -34,23 +32,14 @@ class Phase(IntEnum):
         return self.name.lower()
 
 
-@dataclass(frozen=True)
-class WantedPair:
-    """A pair of the request, with the names of its images and the digest of its estimate's settings."""
-
-    pair: Pair
-    names: tuple[str, str]
-    settings: str
-    has_row: bool = True
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class MatchJob:
     """Run missing ``units`` on the pairs at ``indices``: one pair, or a minibatch on a GPU.
 
-    ``expected`` are the expected seconds of each unit per pair. A unit begins only if it is expected to end within
-    ``seconds`` of the job's start. ``known`` are each pair's points of stage 1, for critical regions. ``upcoming``
-    are the images that will probably be matched next. ``is_retry`` states that the work lost a worker before.
+    ``expected`` are the expected seconds of each unit per pair. A unit begins only if it is expected to
+    end within ``seconds`` of the job's start. ``known`` are each pair's points of stage 1, for critical
+    regions, and ``crops`` their keys. ``upcoming`` are the images that will probably be matched next.
+    ``is_retry`` states that the work lost a worker before.
     """
 
     phase: Phase
@@ -59,79 +48,88 @@ class MatchJob:
     expected: tuple[float, ...]
     seconds: float
     is_retry: bool = False
-    pairs: tuple[WantedPair, ...] = ()
+    pairs: tuple[Pair, ...] = ()
+    names: tuple[tuple[str, str], ...] = ()
     known: tuple[tuple[UnitResult, ...], ...] = ()
+    crops: tuple[tuple[str, ...], ...] = ()
     upcoming: tuple[Path, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
-class PairPoints:
-    """References to a pair's current points: each unit with its row's revision, in the recipe's order."""
+class PairInputs:
+    """What a pair's estimate, or a scene, is computed from: its images, and the keys of its points by unit.
+
+    The units are in the recipe's order. ``own`` is for a scene: F from the pair's own matches.
+    """
 
     index: int
-    images: tuple[BatchImage, BatchImage]
-    units: tuple[tuple[Unit, int], ...]
+    images: Images
+    points: Mapping[Unit, str]
     intrinsics: tuple[Matrix3, Matrix3] | None = None
-    own: Matrix3 | None = None  # for a scene: F from the pair's own matches
-
-    @property
-    def revisions(self) -> tuple[int, ...]:
-        return tuple(revision for _, revision in self.units)
-
-
-PointSource = Path | dict[int, Matches]  # the journal's directory, or the points by revision
+    own: Matrix3 | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class EstimateJob:
     """Estimate F of each pair, or E if the pair has intrinsics."""
 
-    pairs: tuple[PairPoints, ...]
+    pairs: tuple[PairInputs, ...]
     recipe: Recipe
-    source: PointSource
+    source: Source
     is_retry: bool = False
 
 
 @dataclass(frozen=True, eq=False)
 class SceneJob:
-    """Reconstruct a batch from ``matches`` matches of the revisions ``inputs``. ``export`` is for COLMAP's files.
+    """Reconstruct a batch, from ``matches`` matches. ``export`` is for COLMAP's files.
 
-    The answer is a :class:`Solution`, with choices in the order of the pairs.
+    The answer is a :class:`Solution`, with choices in the order of the pairs, which have ``contents``.
     """
 
     batch: str
-    pairs: tuple[PairPoints, ...]
+    key: str
+    pairs: tuple[PairInputs, ...]
+    contents: tuple[str, ...]
     recipe: Recipe
-    source: PointSource
-    inputs: str = ""
+    source: Source
     matches: int = 0
     export: Path | None = None
     is_retry: bool = True  # a crash of pycolmap counts against the batch, not against its place
 
 
-@dataclass(frozen=True)
-class LookJob:
-    """Compute the features of an image or of a dataset, as bytes, by calling ``do``."""
+@dataclass(frozen=True, eq=False)
+class FeatureJob:
+    """Compute features of an image or of a folder by calling ``do``: bytes, or a JSON value."""
 
-    key: tuple[str, str]  # digest of the contents, digest of the settings
-    do: Callable[[], bytes]
+    key: str
+    do: Callable[[], Any]
     is_retry: bool = True
 
 
-Job = MatchJob | EstimateJob | SceneJob | LookJob
+Job = MatchJob | EstimateJob | SceneJob | FeatureJob
 
 
 @dataclass(frozen=True)
 class Loaded:
-    """A worker's first answer: the worker is ready for jobs."""
+    """A worker's first answer: the worker is ready for jobs.
+
+    ``refused`` has the reason for each matcher that could not be loaded.
+    """
+
+    refused: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """Result of a job for a pair, as rows of the table ``points``. ``failure`` names an unreadable image."""
+    """What a job found on a pair. ``failure`` names an unreadable image.
+
+    ``images`` have the digests of the matched contents, and ``files`` the size in bytes and the time of change in
+    nanoseconds of each file before it was read.
+    """
 
     index: int
-    images: tuple[BatchImage, ...] = ()
+    images: Images | tuple[()] = ()
+    files: tuple[tuple[int, int], ...] = ()
     found: tuple[UnitResult, ...] = ()
     regions: Regions | None = None
     failure: str = ""
@@ -141,16 +139,23 @@ class Outcome:
 
 @dataclass(frozen=True, eq=False)
 class Estimated:
-    """The estimate of a pair from the point revisions ``inputs``; ``inliers`` has a count for each revision."""
+    """The estimate of a pair from the points with these keys; ``inliers`` has a count for each key."""
 
     index: int
-    inputs: tuple[int, ...]
+    points: tuple[str, ...]
     inliers: tuple[int, ...]
     F: Matrix3
     failure: str = ""
     magsac: Matrix3 | None = None
     stats: EstimateStats = NO_STATS
     seconds: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """The answer to a feature job."""
+
+    value: Any
 
 
 class Cause(StrEnum):
@@ -163,6 +168,8 @@ class Cause(StrEnum):
     DEVICE = "the device failed"
     OUT_OF_MEMORY = "out of memory"
     RAISED = "the worker failed"
+    UNIT_RAISED = "the matcher failed"
+    UNREADABLE = "an image cannot be read"
 
 
 @dataclass(frozen=True)
@@ -176,31 +183,33 @@ class Failure:
         return f"{self.cause}: {self.message}" if self.message else str(self.cause)
 
 
-class Losses(Generic[Item]):
-    """Items of lost jobs. Each is retried in its own job, and skipped when that job is lost for the second time.
+# The answer to a match job or an estimate job has a value for each pair, in order.
+Answer = Loaded | tuple[Outcome, ...] | tuple[Estimated, ...] | Solution | Found | Failure
 
-    ``alone`` are the items to retry in their own jobs. ``skipped`` has the failure of each skipped item.
+
+class Tries:
+    """The only memory of failures, for one run: nothing of it is stored, so the next run tries everything again.
+
+    An item of a lost job is retried in its own job (``alone``), and given up when that job is lost for the second
+    time. ``given_up`` has the reason of each item. Items are tuples: ("unit", pair, unit), ("matcher", unit),
+    ("pair", pair), ("estimate", pair), ("scene", batch, key), ("scenes",) and ("features", key).
     """
 
     def __init__(self) -> None:
-        self.alone: set[Item] = set()
-        self.skipped: dict[Item, Failure] = {}
-        self._tries: Counter[Item] = Counter()
+        self.alone: set[Hashable] = set()
+        self.given_up: dict[Hashable, Failure] = {}
+        self._counts: Counter[Hashable] = Counter()
 
-    def add(self, lost: Sequence[Item], failure: Failure) -> bool:
-        """Record the items of a lost job. Return whether it had a single item, which is now skipped."""
-        self.alone.update(lost)
-        if len(lost) != 1:
+    def lose(self, items: Sequence[Hashable], failure: Failure) -> bool:
+        """Record the items of a lost job. Return whether it had a single item, which is now given up."""
+        self.alone.update(items)
+        if len(items) != 1:
             return False
-        self._tries[lost[0]] += 1
-        if self._tries[lost[0]] < MAX_TRIES:
+        self._counts[items[0]] += 1
+        if self._counts[items[0]] < MAX_TRIES:
             return False
-        self.skipped[lost[0]] = failure
+        self.given_up[items[0]] = failure
         return True
-
-
-# The answer to a match job or an estimate job has a value for each pair, in order.
-Answer = Loaded | tuple[Outcome, ...] | tuple[Estimated, ...] | Solution | bytes | Failure
 
 
 def visiting_order(pairs: Sequence[Pair]) -> list[int]:

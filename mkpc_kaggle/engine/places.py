@@ -1,7 +1,7 @@
 """Places of workers. A place has one worker at a time, and is closed after it loses three workers in a row.
 
-:attr:`Place.limit` comes from :meth:`Engine._time_limit`. :meth:`Place._fail` kills a worker that has not answered
-by this limit: the worker's process gets SIGKILL.
+What ends a hung worker: the loop sets :attr:`Place.limit` from measured costs (``Engine._time_limit``). By
+:meth:`Place.poll`, a worker that has not answered by then is killed: its process gets SIGKILL.
 """
 
 import os
@@ -12,10 +12,11 @@ from dataclasses import dataclass
 from enum import StrEnum
 from functools import partial
 from math import inf
+from pathlib import Path
 
 from mkpc_kaggle.engine.jobs import Answer, Cause, Failure, Job, Loaded
 from mkpc_kaggle.engine.process import ProcessWorker, ThreadWorker
-from mkpc_kaggle.engine.worker import MatchRunner, light_runner, scene_runner
+from mkpc_kaggle.engine.worker import Maker, MatchRunner, light_runner, scene_runner
 from mkpc_kaggle.pipeline.assembly import Assembly
 
 START_TIMEOUT_S = 300.0  # for a worker to load its matchers, which is slow from a network disk
@@ -119,23 +120,45 @@ class Place:
 
 
 class Site:
-    """The places of a run. Matching may run on other machines; estimates and scenes run next to the journal.
+    """The places of a run. Matching may run on other machines; estimates and scenes run next to the store.
 
     ``fallback`` are the matching places that take over when all others are closed. Workers call ``ring`` when an
-    answer is ready.
+    answer is ready, and their processes print to ``log``.
     """
 
-    def __init__(self, clock: Callable[[], float], *, threads: bool = False) -> None:
+    matching_cores = 0  # that are used by the workers of matching on this machine
+
+    def __init__(self, clock: Callable[[], float], *, threads: bool = False, log: Path | None = None) -> None:
         self._clock = clock
         self._bell: queue.SimpleQueue[None] = queue.SimpleQueue()
         self._worker = ThreadWorker if threads else ProcessWorker
-        estimators = 1 if threads else max(1, (os.cpu_count() or 1) // CORES_PER_ESTIMATOR)
+        self._log = log
+        self._cores = cores()
+        estimators = 1 if threads else max(1, self._cores // CORES_PER_ESTIMATOR)
+        make = partial(light_runner, in_process=not threads)
         self.places = [
-            Place(f"estimates {n}", lambda: self._worker("estimates", light_runner, self.ring), Work.LIGHT)
-            for n in range(estimators)
+            Place(f"estimates {n}", partial(self._make, "estimates", make), Work.LIGHT) for n in range(estimators)
         ]
-        self.places.append(Place("scenes", self.scene_worker, Work.SCENE))
+        self.places += [
+            Place("scenes" if n == 0 else f"scenes {n}", self.scene_worker, Work.SCENE) for n in range(self._cores)
+        ]
         self.fallback: list[Place] = []
+
+    def _make(self, name: str, make: Maker) -> ThreadWorker:
+        worker = self._worker(name, make, self.ring)
+        worker.log = self._log
+        return worker
+
+    def scenes_at_a_time(self, *, is_matching: bool) -> int:
+        """Return for how many scenes there are cores: those that matching leaves free, at least one."""
+        return max(1, self._cores - self.matching_cores * is_matching)
+
+    def printed(self) -> Path | None:
+        """Return the file of what workers printed, if they printed anything."""
+        with suppress(OSError):
+            if self._log is not None and self._log.stat().st_size:
+                return self._log
+        return None
 
     def of(self, work: Work) -> list[Place]:
         return [place for place in self.places if place.work is work]
@@ -145,7 +168,9 @@ class Site:
 
     def scene_worker(self) -> ThreadWorker:
         """Return a worker for a scene, always in a process, since pycolmap may crash."""
-        return ProcessWorker("scene", scene_runner, self.ring)
+        worker = ProcessWorker("scene", scene_runner, self.ring)
+        worker.log = self._log
+        return worker
 
     def ring(self) -> None:
         self._bell.put(None)
@@ -162,22 +187,38 @@ class Site:
 class LocalSite(Site):
     """Places of this machine: ``workers`` processes, by default one per device; 0: a thread of this process."""
 
-    def __init__(self, assembly: Assembly, workers: int | None, clock: Callable[[], float]) -> None:
-        super().__init__(clock, threads=workers == 0)
+    def __init__(
+        self,
+        assembly: Assembly,
+        workers: int | None,
+        clock: Callable[[], float],
+        log: Path | None = None,
+    ) -> None:
+        super().__init__(clock, threads=workers == 0, log=log)
+        devices = assembly.devices
+        # On a CPU, the workers share all cores. A GPU keeps one core busy.
+        self.matching_cores = self._cores
         if workers == 0:
             self.places.append(self._place("this process", assembly))
             return
         # On a CPU, one process uses all threads. Two with half the threads each are faster (recipe light, two
         # cores: a sweep of 22 s, not 31 s). But they need twice the memory, and change networks' last bits.
-        devices = assembly.devices
         used = [devices[number % len(devices)] for number in range(workers or len(devices))]
         for number, device in enumerate(used):
             count = used.count(device)
             name = device if count == 1 else f"{device} {number}"
             self.places.append(self._place(name, assembly.on(device, count), len(used)))
         if devices != ("cpu",):
+            self.matching_cores = len(used)
             self.fallback = [self._place("cpu", assembly.on_cpu())]
 
     def _place(self, name: str, assembly: Assembly, share: int = 1) -> Place:
         make = partial(MatchRunner, assembly.pipeline, share=share)
-        return Place(name, lambda: self._worker(f"mkpc {name}", make, self.ring))
+        return Place(name, partial(self._make, f"mkpc {name}", make))
+
+
+def cores() -> int:
+    """Return the number of cores that this process may use, which in a container are fewer than there are."""
+    if hasattr(os, "sched_getaffinity"):  # not on macOS and Windows
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1

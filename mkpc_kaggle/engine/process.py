@@ -19,9 +19,10 @@ from contextlib import ExitStack, suppress
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
+from pathlib import Path
 from typing import cast
 
-from mkpc_kaggle.engine.console import unblocked
+from mkpc_kaggle.engine.console import append_to
 from mkpc_kaggle.engine.jobs import Answer, Cause, Failure, Job
 from mkpc_kaggle.engine.worker import Executor, Maker, Message, Runner, failure_of
 
@@ -43,6 +44,8 @@ class ThreadWorker:
     A thread cannot contain a matcher that hangs or crashes, and cannot recover from a failed device. Both need
     processes.
     """
+
+    log: Path | None = None  # of native libraries' text, for a process; None: it is dropped
 
     def __init__(self, name: str, make: Maker, on_answer: Callable[[], None]) -> None:
         self.name, self._on_answer = name, on_answer
@@ -98,7 +101,7 @@ class ProcessWorker(ThreadWorker):
     def _exchange(self, message: Message) -> Answer:
         """Return the answer to a message, or a :class:`Failure` that states how the process ended."""
         if self._process is None:
-            self._process, self._pipe = spawn(self.name)
+            self._process, self._pipe = spawn(self.name, self.log)
             if self._killed:  # before the process existed
                 self._process.kill()
         try:
@@ -116,8 +119,8 @@ class ProcessWorker(ThreadWorker):
         return answer
 
 
-def spawn(name: str) -> tuple[SpawnProcess, Connection]:
-    """Start a process that serves the other end of the returned pipe.
+def spawn(name: str, log: Path | None = None) -> tuple[SpawnProcess, Connection]:
+    """Start a process that serves the other end of the returned pipe. What it prints is appended to ``log``.
 
     The new process has :data:`WORKER_ENVIRONMENT`, except variables that the user has set. This process does not
     keep the variables, since its OpenMP library is already loaded. The new process ignores SIGTERM and Ctrl-C,
@@ -125,7 +128,7 @@ def spawn(name: str) -> tuple[SpawnProcess, Connection]:
     """
     context = multiprocessing.get_context("spawn")
     pipe, its_pipe = context.Pipe()
-    process = context.Process(target=serve, args=(its_pipe,), name=name, daemon=True)
+    process = context.Process(target=serve, args=(its_pipe, log), name=name, daemon=True)
     resource_tracker.ensure_running()  # if started with the first process, it would unblock the signals
     with its_pipe, _environment, ExitStack() as restored:
         for variable in WORKER_ENVIRONMENT.keys() - os.environ.keys():
@@ -138,15 +141,20 @@ def spawn(name: str) -> tuple[SpawnProcess, Connection]:
     return process, pipe
 
 
-def serve(pipe: Connection) -> None:
+def serve(pipe: Connection, log: Path | None = None) -> None:
     """Answer messages in a worker process, one after another; the first is the maker of the runner."""
+    # A file never blocks a library that prints, as a pipe without a reader does.
+    try:
+        append_to(log or os.devnull, (1, 2))
+    except OSError:  # a full disk
+        append_to(os.devnull, (1, 2))
 
     def make() -> Runner:
         return cast(Maker, pipe.recv())()  # unpickling may raise, which is an answer, too
 
     end_with_parent()
     executor, message = Executor(), make
-    with unblocked(), suppress(EOFError, OSError):  # the parent has ended
+    with suppress(EOFError, OSError):  # the parent has ended
         while True:
             pipe.send(executor.answer(message))
             message = pipe.recv()

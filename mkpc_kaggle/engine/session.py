@@ -1,4 +1,4 @@
-"""Assembly of a run: journal, site, engine, signal handling, and the end at the time limit."""
+"""Assembly of a run: store, site, engine, signal handling, and the end at the time limit."""
 
 import platform
 import shutil
@@ -23,17 +23,19 @@ from mkpc_kaggle.data.outputs import remove_unfinished, replacing
 from mkpc_kaggle.engine import console
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.cluster import RaySite
-from mkpc_kaggle.engine.engine import Engine
-from mkpc_kaggle.engine.journal import Journal
-from mkpc_kaggle.engine.journal_reader import About, Event, EventKind
+from mkpc_kaggle.engine.keys import Keys
+from mkpc_kaggle.engine.loop import Engine, note_event
 from mkpc_kaggle.engine.places import LISTEN_S, LocalSite
-from mkpc_kaggle.engine.request import Request, RunReport, Standing
-from mkpc_kaggle.engine.settings import Settings
+from mkpc_kaggle.engine.records import About, Event, EventKind
+from mkpc_kaggle.engine.request import Request, RunReport
+from mkpc_kaggle.engine.state import State
+from mkpc_kaggle.engine.store import Store
 from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.version import __version__
 
+LOG_NAME = "workers.log"  # in the work directory: what native libraries print
 EXIT_S = 0.2  # for the system to end a process
 REPORT_S = 2.0  # for an interrupted program's report; enough for the tables
 
@@ -136,9 +138,9 @@ class Session:
 def submit(pairs: Sequence[Pair], assembly: Assembly, session: Session, output: Path, root: str = "") -> RunReport:
     """Match all pairs. ``output`` always has a row for each pair, with the fallback F if necessary."""
 
-    def publish(standing: Standing) -> None:
+    def publish(state: State) -> None:
         ids = (pair.id for pair in pairs)
-        write_submission(output, dict(zip(ids, standing.fundamentals, strict=True)))
+        write_submission(output, dict(zip(ids, state.fundamentals, strict=True)))
 
     return run_pairs(pairs, assembly, session, root, publish=publish)
 
@@ -183,9 +185,9 @@ def _identity(path: Path) -> tuple[int, int]:
 def run_pairs(
     pairs: Sequence[Pair], assembly: Assembly, session: Session, root: str = "", **more: Any
 ) -> RunReport:
-    """Run the recipe on all pairs. In the journal, an image's name is its path below ``root``.
+    """Run the recipe on all pairs. In the store, an image's name is its path below ``root``.
 
-    ``more`` are other fields of the request. Raises :class:`mkpc_kaggle.errors.UserError` if the journal cannot be
+    ``more`` are other fields of the request. Raises :class:`mkpc_kaggle.errors.UserError` if the store cannot be
     used or a matcher cannot be loaded.
     """
     folders = dict.fromkeys(path.parent for pair in pairs for path in pair.images)
@@ -210,24 +212,28 @@ def request_of(
         "SQLite": sqlite3.sqlite_version,
     }
     about = About(table, str(assembly.placement), limit, assembly.left_out, versions)
-    return Request(pairs, recipe, Settings.of(assembly), root, about=about, **more)
+    return Request(pairs, recipe, Keys.of(assembly), root, about=about, **more)
 
 
 @contextmanager
 def opened_engine(assembly: Assembly, session: Session, folders: Iterable[Path] = ()) -> Iterator[Engine]:
-    """Open an engine and its journal. On leaving, end the workers and publish the last results.
+    """Open an engine and its store. On leaving, end the workers and publish the last results.
 
     ``folders`` hold the images, and must exist on every machine.
     """
-    budget, workers = session.budget, session.workers
-    with Journal(session.work_dir, fresh=session.fresh) as journal:
-        journal.note(Event(EventKind.START, budget.spent(), ""))
+    budget = session.budget
+    workers = session.workers
+    with Store.open(session.work_dir, fresh=session.fresh) as store:
+        log = session.work_dir / LOG_NAME
+        with suppress(OSError):
+            log.unlink(missing_ok=True)
+        console.log_native(log)
+        note_event(store, Event(EventKind.START, budget.spent(), ""))
         engine = Engine(
-            request_of((), assembly, session),
-            RaySite(assembly, workers, budget.clock, folders)
+            RaySite(assembly, workers, budget.clock, folders, log)
             if isinstance(workers, str)
-            else LocalSite(assembly, workers, budget.clock),
-            journal,
+            else LocalSite(assembly, workers, budget.clock, log),
+            store,
             budget,
             interrupt=session.interrupt,
             progress=session.progress,
@@ -236,4 +242,4 @@ def opened_engine(assembly: Assembly, session: Session, folders: Iterable[Path] 
         session.save = engine.save_results
         with engine:
             yield engine
-        journal.note(Event(EventKind.END, budget.spent(), engine.ending))
+        note_event(store, Event(EventKind.END, budget.spent(), engine.ending))

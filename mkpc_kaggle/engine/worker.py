@@ -3,11 +3,12 @@
 Importing this module does not import torch, which only matching needs.
 
 Threads: one matching process uses all cores, and N processes share the cores. A process for estimates or scenes
-has one thread. On a Ray cluster without GPUs, a machine's actor has one thread per CPU.
+has one thread. On a Ray cluster without GPUs, a machine's actor has one thread per CPU. A worker that is a thread
+of the user's process leaves the process's limits as they are.
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
@@ -21,16 +22,15 @@ from mkpc_kaggle.engine.jobs import (
     Estimated,
     EstimateJob,
     Failure,
+    FeatureJob,
+    Found,
     Job,
     Loaded,
-    LookJob,
     MatchJob,
     Outcome,
-    PairPoints,
+    PairInputs,
     SceneJob,
-    WantedPair,
 )
-from mkpc_kaggle.engine.journal_reader import JournalReader
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import ModelKind
@@ -63,7 +63,7 @@ class Executor:
                 is_device = isinstance(error, failures.DeviceError)
                 return Failure(Cause.DEVICE if is_device else Cause.REFUSED, str(error))
             return failure_of(error)
-        return Loaded()
+        return Loaded(getattr(self._run, "refused", {}))
 
 
 def failure_of(error: Exception) -> Failure:
@@ -73,7 +73,8 @@ def failure_of(error: Exception) -> Failure:
 class MatchRunner:
     """A runner of match jobs with ``threads`` threads, or as one of ``share`` processes that share the cores.
 
-    Raises :class:`mkpc_kaggle.errors.UserError` if the matchers cannot be loaded.
+    ``refused`` has the reason for each matcher that cannot be loaded: the run goes on without its units. Raises
+    :class:`mkpc_kaggle.errors.UserError` if none can be loaded.
     """
 
     def __init__(self, make_pipeline: Callable[[], "Pipeline"], *, threads: int = 0, share: int = 1) -> None:
@@ -86,7 +87,9 @@ class MatchRunner:
             cv2.setNumThreads(threads)
         self._pipeline = make_pipeline()
         self._pipeline.load()
+        self.refused = self._pipeline.unloadable
         self._images = ImageStore()
+        self._files: dict[Path, tuple[int, int]] = {}
 
     def __call__(self, job: Job) -> tuple[Outcome, ...]:
         """Match the pairs of a job with each unit that is expected to end in time."""
@@ -97,61 +100,103 @@ class MatchRunner:
         def may_start(unit: Unit) -> bool:
             return time.monotonic() + expected[unit] < deadline
 
-        opened = [self._open(each, known) for each, known in zip(job.pairs, job.known, strict=True)]
+        self._look_at(path for pair in job.pairs for path in pair.images)
+        opened = [self._open(job, number) for number in range(len(job.pairs))]
+        self._look_at(job.upcoming)
         self._images.prefetch(job.upcoming)
-        matched = iter(self._pipeline.match([pair for pair in opened if not pair.failure], job.units, may_start))
-        pairs = (pair if pair.failure else next(matched) for pair in opened)
-        return tuple(_outcome(*each) for each in zip(job.indices, job.pairs, pairs, job.known, strict=True))
+        readable = [pair for pair in opened if not pair.failure]
+        matched = iter(self._pipeline.match(readable, job.units, may_start))
+        done = [pair if pair.failure else next(matched) for pair in opened]
+        return tuple(self._outcome(job, number, pair) for number, pair in enumerate(done))
 
-    def _open(self, wanted: WantedPair, known: tuple[UnitResult, ...]) -> PairMatch:
-        """Return the pair with its images; ``failure`` names an unreadable image."""
-        start, files = time.perf_counter(), zip(wanted.pair.images, wanted.pair.turns, strict=True)
+    def _look_at(self, paths: Iterable[Path]) -> None:
+        """Note size and time of files before they are read, so that a later change is never missed."""
+        for path in paths:
+            if path not in self._files:
+                self._files[path] = file_state(path)
+
+    def _open(self, job: MatchJob, number: int) -> PairMatch:
+        """Return a pair with its images; ``failure`` names an unreadable image."""
+        start = time.perf_counter()
+        pair = job.pairs[number]
+        files = zip(pair.images, pair.turns, strict=True)
         images = [self._images.get(path).turned(turns) for path, turns in files]
         seconds = time.perf_counter() - start
         readable = tuple(image for image in images if isinstance(image, Image))
         failure = next((str(image) for image in images if not isinstance(image, Image)), "")
-        return PairMatch(known, images=() if failure else readable, failure=failure, decode_seconds=seconds)
+        return PairMatch(
+            job.known[number],
+            images=() if failure else readable,
+            failure=failure,
+            decode_seconds=seconds,
+        )
+
+    def _outcome(self, job: MatchJob, number: int, pair: PairMatch) -> Outcome:
+        """Return the new results of a pair, and its images with the digests of the matched contents."""
+        if pair.failure:
+            return Outcome(job.indices[number], failure=pair.failure)
+        image0, image1 = (
+            BatchImage(name, image.version, image.size, image.focal)
+            for name, image in zip(job.names[number], pair.images, strict=True)
+        )
+        return Outcome(
+            job.indices[number],
+            (image0, image1),
+            tuple(self._files[path] for path in job.pairs[number].images),
+            pair.results[len(job.known[number]) :],
+            pair.regions,
+            "",
+            pair.decode_seconds,
+            pair.cluster_seconds,
+        )
 
 
-def _outcome(index: int, wanted: WantedPair, pair: PairMatch, known: tuple[object, ...]) -> Outcome:
-    """Return the new results of a pair, and its images with the digests of the matched contents."""
-    images = tuple(
-        BatchImage(name, image.version, image.size, image.focal)
-        for name, image in zip(wanted.names, pair.images, strict=False)  # no images if one is unreadable
-    )
-    found, seconds = pair.results[len(known) :], (pair.decode_seconds, pair.cluster_seconds)
-    return Outcome(index, images, found, pair.regions, pair.failure, *seconds)
+def file_state(path: Path) -> tuple[int, int]:
+    """Return the size of a file in bytes and its time of change in nanoseconds; zeros if it is missing."""
+    try:
+        status = path.stat()
+    except (OSError, ValueError):
+        return 0, 0
+    return status.st_size, status.st_mtime_ns
 
 
-def light_runner() -> Runner:
-    """Return the runner of estimates and image features, without torch and with one thread."""
-    import cv2
-    from threadpoolctl import threadpool_limits  # comes with scikit-learn
+def light_runner(*, in_process: bool = True) -> Runner:
+    """Return the runner of estimates and image features, without torch; a process of its own has one thread."""
+    if in_process:
+        import cv2
+        from threadpoolctl import threadpool_limits  # comes with scikit-learn
 
-    cv2.setNumThreads(1)
-    threadpool_limits(1)
+        cv2.setNumThreads(1)
+        threadpool_limits(1)
     return do_light_job
 
 
-def do_light_job(job: Job) -> tuple[Estimated, ...] | bytes:
-    if isinstance(job, LookJob):
-        return job.do()
+def do_light_job(job: Job) -> tuple[Estimated, ...] | Found:
+    if isinstance(job, FeatureJob):
+        return Found(job.do())
     assert isinstance(job, EstimateJob)
     return tuple(estimate_pair(pair, results, job.recipe) for pair, results in results_of(job))
 
 
-def estimate_pair(pair: PairPoints, results: tuple[UnitResult, ...], recipe: Recipe) -> Estimated:
+def estimate_pair(pair: PairInputs, results: tuple[UnitResult, ...], recipe: Recipe) -> Estimated:
     """Estimate F of a pair, or E with intrinsics, from its points of all units."""
     start = time.perf_counter()
-    sizes, focals = tuple(image.size for image in pair.images), tuple(image.focal for image in pair.images)
+    sizes = tuple(image.size for image in pair.images)
+    focals = tuple(image.focal for image in pair.images)
     match = PairMatch(results, sizes=sizes, focals=focals)
     model = ModelKind.F if pair.intrinsics is None else ModelKind.E
     found = with_estimate(match, recipe, model, pair.intrinsics).estimate
     ends = np.cumsum([len(result.matches) for result in results])[:-1]
     inliers = tuple(int(mask.sum()) for mask in np.split(found.inliers, ends))
-    seconds = time.perf_counter() - start
     return Estimated(
-        pair.index, pair.revisions, inliers, found.matrix, found.failure, found.magsac, found.stats, seconds
+        pair.index,
+        tuple(pair.points.values()),
+        inliers,
+        found.matrix,
+        found.failure,
+        found.magsac,
+        found.stats,
+        time.perf_counter() - start,
     )
 
 
@@ -163,20 +208,23 @@ def reconstruct(job: Job) -> Solution:
     """Return the reconstructions of a batch, and a choice for each pair. pycolmap may end the process."""
     assert isinstance(job, SceneJob) and job.recipe.scene is not None
     pairs = [batch_pair(*each) for each in results_of(job)]
-    return reconstruct_batch(pairs, job.recipe.scene, job.recipe.focal, job.recipe.magsac, job.export)
+    recipe = job.recipe
+    return reconstruct_batch(pairs, job.recipe.scene, recipe.focal, recipe.magsac, job.export)
 
 
-def batch_pair(pair: PairPoints, results: tuple[UnitResult, ...]) -> BatchPair:
+def batch_pair(pair: PairInputs, results: tuple[UnitResult, ...]) -> BatchPair:
     """Return a pair of a batch with its points; images are named by their file names."""
     image0, image1 = (replace(image, name=Path(image.name).name) for image in pair.images)
     matches = Matches.concatenate(result.matches for result in results)
     return BatchPair(image0, image1, matches, pair.own, tracks_of(results))
 
 
-def results_of(job: EstimateJob | SceneJob) -> list[tuple[PairPoints, tuple[UnitResult, ...]]]:
+def results_of(
+    job: EstimateJob | SceneJob,
+) -> list[tuple[PairInputs, tuple[UnitResult, ...]]]:
     """Return each pair of a job with the points of its units."""
-    points = job.source
-    if isinstance(points, Path):
-        with JournalReader(points, check=False) as journal:
-            points = journal.points([revision for pair in job.pairs for revision in pair.revisions])
-    return [(pair, tuple(UnitResult(unit, points[row]) for unit, row in pair.units)) for pair in job.pairs]
+    keys = [key for pair in job.pairs for key in pair.points.values()]
+    points = job.source.matches(keys)
+    return [
+        (pair, tuple(UnitResult(unit, points[key]) for unit, key in pair.points.items())) for pair in job.pairs
+    ]

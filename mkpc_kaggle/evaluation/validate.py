@@ -15,9 +15,10 @@ from typing import TYPE_CHECKING, Any
 from scipy.spatial.transform import Rotation
 
 from mkpc_kaggle.data.competition import TrainScene, TruePair, read_rows, read_submission
-from mkpc_kaggle.engine.journal_reader import JournalReader, PairRecord
+from mkpc_kaggle.engine.records import PairRecord, Table, read_points
 from mkpc_kaggle.engine.request import RunReport
 from mkpc_kaggle.engine.session import Session, run_pairs
+from mkpc_kaggle.engine.store import Store
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry import metrics
 from mkpc_kaggle.geometry.coordinates import Matrix3
@@ -154,17 +155,18 @@ def validate(
     for scene in scenes:
         pairs = [score_record(true, next(records), scene, steps, in_front) for true in scene.pairs]
         if not (in_metres := isfinite(scene.metres_per_unit)):
-            with JournalReader(session.work_dir) as journal:
-                pairs = [with_matching(*each, journal) for each in zip(pairs, scene.pairs, strict=True)]
+            with Store.read(session.work_dir) as store:
+                table = Table.of(store)
+                pairs = [with_matching(*each, store, table) for each in zip(pairs, scene.pairs, strict=True)]
         scored.append(SceneScore(scene.name, tuple(pairs), in_metres))
     return Validation(assembly.recipe.name, tuple(scored), report, steps)
 
 
-def with_matching(pair: PairScore, true: TruePair, journal: JournalReader) -> PairScore:
+def with_matching(pair: PairScore, true: TruePair, store: Store, table: Table) -> PairScore:
     """Return the score with ``matching`` set; the matching score is NaN if numbers of keypoints are unknown."""
     assert pair.record is not None
-    points = journal.points(journal.inputs(pair.record.index).values())
-    matches, units = Matches.concatenate(points.values()), pair.record.units
+    matches = Matches.concatenate(read_points(store, table, pair.record.index).values())
+    units = pair.record.units
     correct = metrics.correct_matches(matches, true.camera0, true.camera1).sum()
     is_known = all(unit.keypoints or not unit.matches for unit in units)
     score = correct / max(sum(unit.keypoints for unit in units), 1) if is_known else nan

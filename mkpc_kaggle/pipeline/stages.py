@@ -79,6 +79,14 @@ class Pipeline:
         if not self._matchers:
             raise next(iter(self._unloadable.values()))
 
+    @property
+    def unloadable(self) -> dict[str, str]:
+        """The reason for each matcher that could not be loaded."""
+        return {
+            name: str(error) if isinstance(error, UserError) else reason_of(error)
+            for name, error in self._unloadable.items()
+        }
+
     def match(
         self, pairs: Sequence[PairMatch], units: Iterable[Unit], may_start: Callable[[Unit], bool] = lambda _: True
     ) -> list[PairMatch]:
@@ -229,7 +237,9 @@ def with_regions(pair: PairMatch, recipe: Recipe, given: GivenRegions = MappingP
         first, second = (CriticalRegion(box, RegionReason.GIVEN) for box in boxes)
         return replace(pair, regions=(first, second))
     start = time.perf_counter()
-    matches = pair.matches[pair.in_stage(1)]
+    # In the recipe's order: after an interrupted run, units of stage 1 may have run in another.
+    ordered = sorted(pair.results, key=lambda result: recipe.units.index(result.unit))
+    matches = Matches.concatenate(result.matches for result in ordered if result.unit.stage == 1)
     region0, region1 = (
         critical_region(points, image.size, recipe.mkpc)
         for points, image in zip((matches.points0, matches.points1), pair.images, strict=True)

@@ -3,7 +3,6 @@
 The orientation of an image is found by matching four rotations of the image with its most similar images.
 """
 
-import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -12,14 +11,15 @@ from pathlib import Path
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.console import warn
-from mkpc_kaggle.engine.engine import Engine
-from mkpc_kaggle.engine.journal_reader import JournalReader
+from mkpc_kaggle.engine.keys import digest
+from mkpc_kaggle.engine.loop import Engine
 from mkpc_kaggle.engine.session import Session, request_of
-from mkpc_kaggle.engine.settings import digest
+from mkpc_kaggle.engine.store import Source
 from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.reconstruction.folder import Datasets, Ends, batch_names
 from mkpc_kaggle.scene.likeness import FEATURE_SETTINGS, PARTNERS, Partners, local_features, most_alike, shortlist
 
+IMAGES_AT_A_TIME = 100  # whose features are in memory
 MAX_IMAGES = 100  # with more, each image has a shortlist instead of all pairs
 TRIAL_SHARE = 0.25  # of the time left, for trials of unturned images, and then for trials of turned images
 TURN_PARTNERS = 4  # similar images per image, to find its orientation
@@ -74,27 +74,34 @@ def find_partners(engine: Engine, dataset: str, files: Sequence[Path], count: in
     """Return the indices of the ``count`` images most similar to each image; empty if the comparison failed."""
     found = engine.digest_files({str(file): file for file in files})
     digests = [found.get(str(file), "") for file in files]
-    key = digest(digests), digest([FEATURE_SETTINGS, count])
-    comparison = {key: partial(compare, engine.journal.path.parent, digests, count)}
-    if (known := engine.journal.feature(*key)) is None:
-        engine.look(
-            {(found[str(a)], FEATURE_SETTINGS): partial(local_features, a) for a in files if str(a) in found}
-        )
-        known = engine.look(comparison).get(key)
+    keys = [features_key(each) for each in digests]
+    key = digest([digests, FEATURE_SETTINGS, count])
+    if (known := engine.known(key)) is None:
+        engine.look({features_key(found[str(a)]): partial(local_features, a) for a in files if str(a) in found})
+        source = engine.store.source(keys)
+        known = engine.look({key: partial(compare, source, keys, count)}).get(key)
     if known is None:
         warn(f"the images of {files[0].parent} were not compared")
-    partners: Partners = [[] for _ in files] if known is None else json.loads(known)
+    partners: Partners = [[] for _ in files] if known is None else known
     return partners
 
 
-def compare(directory: Path, digests: Sequence[str], count: int) -> bytes:
-    """Return :func:`most_alike` as JSON for the images with these digests; a journal has their features."""
-    with JournalReader(directory, check=False) as journal:
+def features_key(content: str) -> str:
+    """Return the key of an image's features."""
+    return digest([FEATURE_SETTINGS, content])
 
-        def features() -> Iterable[bytes]:
-            return (journal.feature(digest, FEATURE_SETTINGS) or b"" for digest in digests)
 
-        return json.dumps(most_alike(features, count)).encode()
+def compare(source: Source, keys: Sequence[str], count: int) -> Partners:
+    """Return :func:`most_alike` for the images with these features in a store."""
+
+    def features() -> Iterable[bytes]:
+        # In parts: those of all images of a large folder would fill the memory.
+        for start in range(0, len(keys), IMAGES_AT_A_TIME):
+            part = keys[start : start + IMAGES_AT_A_TIME]
+            found = source.data(part)
+            yield from (found.get(key, b"") for key in part)
+
+    return most_alike(features, count)
 
 
 def find_turns(
@@ -120,7 +127,8 @@ def find_turns(
         keys = sorted({relative(a, times, b) for a in few for times in tried for b in near[a]})
         if keys:
             pairs = [pair_of(names[a], a, b, times, 0) for a, times, b in keys]
-            engine.ask(request_of(pairs, trial, session, str(root)), TRIAL_SHARE)
+            engine.ask(request_of(pairs, trial, session, str(root), is_trial=True), TRIAL_SHARE)
+            assert engine.state is not None
             found |= zip(keys, engine.state.inliers.tolist(), strict=True)
     for a in near:
         counts = [inliers(a, times) for times in range(4)]

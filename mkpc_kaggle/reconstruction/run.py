@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.data.images import Image, ImageStore, Unreadable
-from mkpc_kaggle.engine.engine import name_below
-from mkpc_kaggle.engine.request import RunReport, Standing
+from mkpc_kaggle.engine.request import RunReport
 from mkpc_kaggle.engine.session import Session, opened_engine, request_of
+from mkpc_kaggle.engine.state import State, name_below
 from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.matchers.contract import Matcher
 from mkpc_kaggle.pipeline.assembly import Assembly, assemble
@@ -79,7 +79,7 @@ def reconstruct_folder(
         batches = batch_names(root, datasets)
         exports = {batches[name]: out / name for name in datasets}
 
-        def write(results: Standing) -> None:
+        def write(results: State) -> None:
             standing[:] = [cameras_of(datasets, root, results)]
             publish(standing[0])
 
@@ -88,16 +88,17 @@ def reconstruct_folder(
     return FolderResult(report, tuple(pairs), *standing)
 
 
-def cameras_of(datasets: Datasets, root: Path, results: Standing) -> Cameras:
+def cameras_of(datasets: Datasets, root: Path, results: State) -> Cameras:
     """Return the camera of each image. Identical files share one camera, from the largest model that has it."""
     cameras: dict[str, Mapping[Path, tuple[int, RegisteredImage] | None]] = {}
+    known_digests = results.digests
     batches = batch_names(root, datasets)
     for name, files in datasets.items():
         scene = results.scenes.get(batches[name])
         models = () if scene is None else scene.models
         placed = [(number, found) for number, model in enumerate(models) for found in model.images]
         known = {found.image.digest: (number, found) for number, found in reversed(placed)}
-        digests = {file: results.digests.get(name_below(str(root), str(file)), "") for file in files}
+        digests = {file: known_digests.get(name_below(str(root), str(file)), "") for file in files}
         cameras[name] = {file: known.get(digests[file]) for file in files}
     return cameras
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from mkpc_kaggle.data.competition import evenly_spread
 from mkpc_kaggle.data.images import Image
 from mkpc_kaggle.data.outputs import replacing
-from mkpc_kaggle.engine.journal_reader import SceneRecord
+from mkpc_kaggle.engine.records import SceneRecord
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Box, View
 from mkpc_kaggle.geometry.critical_region import CriticalRegion, MkpcConfig, find_clusters

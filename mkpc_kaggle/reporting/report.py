@@ -18,7 +18,7 @@ from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.data.images import Image
 from mkpc_kaggle.data.outputs import replacing
 from mkpc_kaggle.engine.budget import format_duration
-from mkpc_kaggle.engine.journal_reader import PairRecord
+from mkpc_kaggle.engine.records import PairRecord
 from mkpc_kaggle.errors import UserError, printable, writing
 from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
 from mkpc_kaggle.pipeline.pair import PairMatch

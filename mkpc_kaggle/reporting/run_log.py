@@ -8,17 +8,21 @@ from pathlib import Path
 
 from mkpc_kaggle.data.outputs import replacing, require_table
 from mkpc_kaggle.engine.budget import format_duration
-from mkpc_kaggle.engine.journal_reader import (
+from mkpc_kaggle.engine.records import (
     About,
     Event,
     EventKind,
-    JournalReader,
     PairRecord,
     SceneRecord,
+    Table,
     UnitRecord,
-    undamaged,
+    read_events,
+    read_points,
+    read_records,
+    read_scenes,
 )
-from mkpc_kaggle.errors import writing
+from mkpc_kaggle.engine.store import Store
+from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import Estimate, ModelKind, sampson_distances
 from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
@@ -67,28 +71,33 @@ class RunLog:
 
 
 def read_log(directory: Path) -> RunLog:
-    """Read the journal of a work directory, during a run or after it.
+    """Read the store of a work directory, during a run or after it.
 
     Raises :class:`UserError` if the journal is missing, or if this version cannot read it.
     """
-    with JournalReader(directory) as journal, undamaged(journal.path):
-        about, records = journal.about(), tuple(journal.records())
-        table = dict(about.recipe)
+    with Store.read(directory) as store:
+        published = Table.of(store)
+        records = tuple(read_records(store, published))
+        table = dict(published.about.recipe)
+        if not table:
+            raise UserError(f"{directory}: the run has not begun, or was stopped at its start")
         recipe = recipe_of(table, table.pop("name"))
         touched = sorted((record for record in records if record.units), key=lambda r: (r.inliers, r.index))
         units = {unit.name: unit for unit in recipe.units}
 
         def weak(record: PairRecord) -> tuple[PairRecord, PairMatch]:
-            inputs, F = journal.inputs(record.index), record.pair_fundamental
-            points = journal.points(inputs.values())
-            results = tuple(UnitResult(units[name], points[inputs[name]]) for name in inputs)
-            distances = sampson_distances(F, Matches.concatenate(points.values()))
+            F = record.pair_fundamental
+            points = read_points(store, published, record.index)
+            results = tuple(UnitResult(units[name], found) for name, found in points.items())
+            distances = sampson_distances(F, Matches.concatenate(each.matches for each in results))
             inliers = (distances < recipe.magsac.threshold) & (not record.failure)
             estimate = Estimate(ModelKind.F, F, inliers, record.failure)
             return record, PairMatch(results, record.regions, estimate)
 
-        weakest, scenes = tuple(map(weak, touched[:MAX_DRAWN_PAIRS])), tuple(journal.scenes().values())
-        return RunLog(journal.path, about, recipe, records, journal.events(), weakest, scenes)
+        weakest = tuple(map(weak, touched[:MAX_DRAWN_PAIRS]))
+        scenes = tuple(read_scenes(store, published).values())
+        events = read_events(store)
+        return RunLog(store.path, published.about, recipe, records, events, weakest, scenes)
 
 
 def write_csv(log: RunLog, directory: Path) -> list[Path]:

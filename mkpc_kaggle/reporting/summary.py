@@ -10,9 +10,8 @@ from typing import TypeAlias
 import numpy as np
 
 from mkpc_kaggle.engine.budget import format_duration
-from mkpc_kaggle.engine.journal_reader import PairRecord, SceneRecord
+from mkpc_kaggle.engine.records import NOT_RECONSTRUCTED, PairRecord, SceneRecord
 from mkpc_kaggle.engine.request import Ending, RunReport
-from mkpc_kaggle.engine.scenes import NOT_RECONSTRUCTED
 from mkpc_kaggle.geometry.critical_region import RegionReason
 from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
 from mkpc_kaggle.pipeline.availability import UnavailableKind
@@ -30,7 +29,9 @@ def summary(report: RunReport) -> str:
     """Return the summary at the end of a run."""
     resumed = f", {report.resumed} of them from earlier runs" if report.resumed else ""
     done = f"; {report.units_run} units run, {report.estimated} F estimated"
-    return "\n".join(filter(None, [headline(report) + resumed + done, *_lines(report), trouble(report)]))
+    printed = f"messages of image and device libraries: {report.log}" if report.log else ""
+    lines = [headline(report) + resumed + done, *_lines(report), printed, trouble(report)]
+    return "\n".join(filter(None, lines))
 
 
 def overview(log: RunLog) -> str:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from mkpc_kaggle.data.outputs import replacing
-from mkpc_kaggle.engine.journal_reader import PairRecord, SceneRecord
+from mkpc_kaggle.engine.records import PairRecord, SceneRecord
 from mkpc_kaggle.errors import UserError, printable, writing
 from mkpc_kaggle.reporting.run_log import RunLog
 from mkpc_kaggle.reporting.summary import headline, is_doubtful, seconds_by_part, trouble, unit_means, unit_reasons

@@ -13,7 +13,8 @@ from genuine import GENUINE
 from shared import DATA, needs_data, problems_of, run_command, write_small_recipe
 
 from mkpc_kaggle.demo import DemoSet
-from mkpc_kaggle.engine.journal_reader import JournalReader
+from mkpc_kaggle.engine.records import read_records
+from mkpc_kaggle.engine.store import Store
 from mkpc_kaggle.errors import UserError
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -131,8 +132,8 @@ def test_the_light_recipe_with_genuine_weights_matches_photographs_with_aliked_a
     assert done.returncode == 0, done.stderr
     assert "2 of 2 pairs have an F" in done.stdout
     assert not re.search("does without|units that failed|pairs with the fallback row", done.stdout + done.stderr)
-    with JournalReader(tmp_path / "submission.work") as journal:
-        units = [{unit.unit: unit.matches for unit in record.units} for record in journal.records()]
+    with Store.read(tmp_path / "submission.work") as store:
+        units = [{unit.unit: unit.matches for unit in record.units} for record in read_records(store)]
     for each in units:
         counts = [count for unit, count in each.items() if ":aliked_lightglue@" in unit]
         assert counts

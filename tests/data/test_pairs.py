@@ -11,7 +11,7 @@ from shared import scores_of
 
 from mkpc_kaggle.data.competition import Pair, read_train_side
 from mkpc_kaggle.data.pairs import parse_line, read_pairs
-from mkpc_kaggle.engine.settings import Settings
+from mkpc_kaggle.engine.keys import Keys
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.evaluation.validate import error_of
 from mkpc_kaggle.geometry.cameras import Camera, fundamental_of_cameras
@@ -118,8 +118,8 @@ def test_a_listed_image_is_set_upright_and_scored_as_it_is_stored(demo, scenes, 
 
 
 def test_the_estimate_of_a_pair_depends_on_its_cameras():
-    settings, pair = Settings((), "estimate", ""), Pair("p", "b", "0", "1")
-    digests = [settings.of_estimate(replace(pair, intrinsics=both)) for both in (None, (K, K), (K, K + 1))]
+    keys, pair = Keys(()), Pair("p", "b", "0", "1")
+    digests = [keys.of_estimate(replace(pair, intrinsics=both), ["points"]) for both in (None, (K, K), (K, K + 1))]
     assert len(set(digests)) == 3
 
 

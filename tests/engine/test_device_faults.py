@@ -2,6 +2,8 @@
 
 import threading
 from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import pytest
@@ -25,6 +27,8 @@ from mkpc_kaggle.engine.request import Ending, RunReport
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.matchers.failures import DeviceError, FailureKind, failure_of, reason_of
 from mkpc_kaggle.pipeline.assembly import Assembly, assemble
+from mkpc_kaggle.pipeline.stages import Pipeline
+from mkpc_kaggle.recipe import Unit
 
 COUNT = 12
 VICTIM = 3  # brightness 13
@@ -197,6 +201,31 @@ def test_workers_that_cannot_be_loaded_end_the_run_before_any_work(run_at, error
 
     with pytest.raises(UserError, match=f"no worker could be started: cpu: {told}"):
         run_at(thread_place("cpu", RectifiedMatcher(), pipeline=fail))
+
+
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [
+        (UserError("the weights do not fit"), "the weights do not fit"),
+        (ValueError("no such layer"), "ValueError: no such layer"),
+    ],
+)
+def test_a_matcher_that_a_worker_cannot_load_costs_its_units_alone_and_is_told_once(
+    pairs, undisturbed, tmp_path, monkeypatch, capsys, error, told
+):
+    def load(name: str) -> RectifiedMatcher:
+        if name == "broken":
+            raise error
+        return RectifiedMatcher()
+
+    other = Unit(1, "broken", 120)
+    recipe = replace(THREE_UNITS, units=(SWEEP, other, SECOND, THIRD))
+    use_places(monkeypatch, thread_place("cpu", RectifiedMatcher(), pipeline=partial(Pipeline, recipe, load)))
+    report = run(pairs, recipe, RectifiedMatcher(), tmp_path / "work", more=[RectifiedMatcher(name="broken")])
+    assert_as_if_nothing_had_failed(report, undisturbed)
+    assert report.faults == (f"broken is left out: {told}",)
+    assert capsys.readouterr().err.count(told) == 1
+    assert {len(record.units) for record in report.records} == {3}
 
 
 def test_a_worker_that_cannot_be_started_again_ends_the_run_with_every_row_there(run_at):

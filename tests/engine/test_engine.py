@@ -10,9 +10,11 @@ import pytest
 from rectified import SECOND, SWEEP, THIRD, THREE_UNITS, RectifiedMatcher, matrices, run, write_pairs
 
 from mkpc_kaggle.engine.budget import Budget
-from mkpc_kaggle.engine.journal_reader import JournalReader, PairRecord
-from mkpc_kaggle.engine.request import Ending, Standing
+from mkpc_kaggle.engine.records import PairRecord, read_records
+from mkpc_kaggle.engine.request import Ending
 from mkpc_kaggle.engine.session import Interrupt, Session, opened_engine
+from mkpc_kaggle.engine.state import State
+from mkpc_kaggle.engine.store import Store
 from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.pipeline.stages import Pipeline
 
@@ -51,8 +53,8 @@ def test_a_run_without_a_limit_gives_every_pair_every_unit(tmp_path):
 def test_every_published_version_is_whole_and_the_first_comes_before_any_work(tmp_path):
     matcher, published = RectifiedMatcher(), []
 
-    def publish(standing: Standing) -> None:
-        published.append((standing.fundamentals, len(matcher.calls)))
+    def publish(state: State) -> None:
+        published.append((state.fundamentals, len(matcher.calls)))
 
     run(write_pairs(tmp_path, 5), THREE_UNITS, matcher, tmp_path / "work", publish=publish)
     assert published[0][1] == 0
@@ -82,21 +84,21 @@ def test_a_finished_run_loads_no_matcher_again(tmp_path, monkeypatch):
     pairs = write_pairs(tmp_path, 3)
     once = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
     loaded = []
-    monkeypatch.setattr(Pipeline, "load", loaded.append)
+    monkeypatch.setattr(Pipeline, "load", lambda *_: loaded.append(1))
     twice = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
     assert not loaded
     assert matrices(once) == matrices(twice)
     assert twice.resumed == 3
 
 
-def test_a_run_that_ends_before_it_asks_leaves_the_journal_as_it_was(tmp_path):
+def test_a_run_that_ends_before_it_asks_leaves_the_store_as_it_was(tmp_path):
     run(write_pairs(tmp_path, 3), THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
     assembly = assemble(THREE_UNITS, matchers={"rectified": RectifiedMatcher()}, device="cpu")
     session = Session(tmp_path / "work", Budget(0.0), Interrupt(), progress=False)
     with opened_engine(assembly, session) as engine:
         assert engine.look({}) == {}
-    with JournalReader(tmp_path / "work") as journal:
-        assert [len(record.units) for record in journal.records()] == [3, 3, 3]
+    with Store.read(tmp_path / "work") as store:
+        assert [len(record.units) for record in read_records(store)] == [3, 3, 3]
 
 
 @pytest.mark.parametrize(("limit", "ending"), [(5.0, Ending.TIME_IS_UP), (math.inf, Ending.INTERRUPTED)])

@@ -1,12 +1,11 @@
-"""A journal outlives a change of the estimation: F and cameras are made anew of its points."""
+"""A store outlives a change of the estimation: F and cameras are made anew of its points."""
 
 import os
 import signal
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,8 +13,8 @@ from rectified import RectifiedMatcher, run
 from synthetic import QUICK, RECIPE, SyntheticMatcher, synthetic_pairs
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine.journal import Journal
 from mkpc_kaggle.engine.request import Ending
+from mkpc_kaggle.engine.store import Kind, Result, Store
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.robust import Method
 from mkpc_kaggle.pipeline.stages import Pipeline
@@ -54,7 +53,7 @@ def test_a_run_that_goes_on_from_another_estimation_ends_with_the_bytes_of_a_fre
     journal = tmp_path / "scene"
     for path in (tmp_path / "images").iterdir():
         path.unlink()  # no image is read
-    monkeypatch.setattr(Pipeline, "load", lambda _: pytest.fail("no matcher is loaded"))
+    monkeypatch.setattr(Pipeline, "load", lambda *_: pytest.fail("no matcher is loaded"))
     for name, recipe in [*ESTIMATIONS.items()][1:]:
         written, report = submission(pairs, recipe, journal, NoMatcher(name="synthetic"))
         assert written == fresh[name], name
@@ -65,20 +64,19 @@ def test_a_run_that_goes_on_from_another_estimation_ends_with_the_bytes_of_a_fre
 
 
 def die_at_a_write(pairs: Sequence[Pair], recipe: Recipe, work_dir: Path, *, after: bool) -> None:
-    """Go on, until this process kills itself at the first write to the journal: before it, or after it."""
+    """Go on, until this process kills itself at the first write to the store: before it, or after it."""
 
-    def save(name: str) -> Callable[..., None]:
-        whole = getattr(Journal, name)
+    put = Store.put
 
-        def save_and_die(*arguments: Any) -> None:
-            if after:
-                whole(*arguments)
+    def put_and_die(store: Store, results: Iterable[Result]) -> None:
+        rows = list(results)
+        is_due = any(row.kind in (Kind.ESTIMATE, Kind.SCENE) for row in rows)
+        if after or not is_due:
+            put(store, rows)
+        if is_due:
             os.kill(os.getpid(), signal.SIGKILL)
 
-        return save_and_die
-
-    for name in ("save_estimates", "save_scene"):
-        setattr(Journal, name, save(name))
+    Store.put = put_and_die
     submission(pairs, recipe, work_dir, NoMatcher(name="synthetic"))
 
 
@@ -102,7 +100,7 @@ def test_the_file_has_the_former_f_until_another_is_there(tmp_path):
     pairs, versions = synthetic_pairs(tmp_path / "images", 4), []
     first = run(pairs, RECIPE, SyntheticMatcher(images=4), tmp_path / "work")
     other = replace(RECIPE, magsac=replace(QUICK, threshold=1.0))
-    publish = lambda standing: versions.append(standing.fundamentals)  # noqa: E731
+    publish = lambda state: versions.append(state.fundamentals)  # noqa: E731
     last = run(pairs, other, SyntheticMatcher(images=4), tmp_path / "work", publish=publish)
     assert np.array_equal(versions[0], [record.chosen_fundamental for record in first.records])
     assert all(record.source == "scene" for record in last.records)

@@ -4,6 +4,7 @@ import os
 import pty
 import random
 import signal
+import sqlite3
 import subprocess
 import sys
 import termios
@@ -16,17 +17,17 @@ from typing import Any
 import pytest
 from faulty import FaultyMatcher, die, exhaust_memory
 from processes import started_with
-from rectified import THREE_UNITS, RectifiedMatcher, matrices, run
+from rectified import THREE_UNITS, RectifiedMatcher, matrices, run, write_pairs
 from shared import write_small_recipe
 
 from mkpc_kaggle.cli import main
 from mkpc_kaggle.data.competition import read_test_side, submission_problems
 from mkpc_kaggle.demo import DemoSet
-from mkpc_kaggle.engine import engine, session, worker
-from mkpc_kaggle.engine.journal import Journal
-from mkpc_kaggle.engine.journal_reader import JournalReader
-from mkpc_kaggle.engine.plan import Plan
+from mkpc_kaggle.engine import loop, session, worker
+from mkpc_kaggle.engine.records import read_records
 from mkpc_kaggle.engine.request import Ending
+from mkpc_kaggle.engine.state import State
+from mkpc_kaggle.engine.store import Store
 from mkpc_kaggle.reporting.run_log import read_log
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -59,7 +60,8 @@ def test_a_worker_lost_once_costs_time_alone(pairs, undisturbed, tmp_path, fault
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_a_resumed_run_while_an_image_is_digested(pairs, tmp_path, monkeypatch, number):
+def test_a_signal_ends_a_resumed_run_while_an_image_is_digested(tmp_path, monkeypatch, number):
+    pairs = write_pairs(tmp_path / "images", 12)
     run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
     first, released, digested = iter([number]), threading.Event(), []
 
@@ -70,7 +72,9 @@ def test_a_signal_ends_a_resumed_run_while_an_image_is_digested(pairs, tmp_path,
             digested.append(path)
         return "changed"
 
-    monkeypatch.setattr(engine, "content_digest", digest)
+    monkeypatch.setattr(loop, "content_digest", digest)
+    for path in (tmp_path / "images").iterdir():
+        os.utime(path, (0, 0))  # the same content, which only a digest can tell
     with session.interruptible() as interrupt:
         report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work", interrupt=interrupt)
     assert digested == [], "the run ends before that digest"
@@ -79,30 +83,30 @@ def test_a_signal_ends_a_resumed_run_while_an_image_is_digested(pairs, tmp_path,
 
 
 def test_an_error_of_the_engine_itself_leaves_the_latest_version_behind(pairs, tmp_path, monkeypatch):
-    on_result, taken, published = Plan.on_result, [], []
+    take, taken, published = State.take, [], []
 
-    def fail_later(plan: Plan, *arguments: Any) -> None:
-        taken.append(plan)
-        if len(taken) > 1:
+    def fail_later(state: State, *arguments: Any) -> None:
+        taken.append(state)
+        if len(taken) > 2:
             raise KeyError("a bug")
-        on_result(plan, *arguments)
+        take(state, *arguments)
 
-    monkeypatch.setattr(Plan, "on_result", fail_later)
+    monkeypatch.setattr(State, "take", fail_later)
     with pytest.raises(KeyError, match="a bug"):
         run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work", publish=published.append)
     assert len(published[-1].fundamentals) == 12
-    with JournalReader(tmp_path / "work") as journal:
-        assert [bool(record.units) for record in journal.records()] == [True, True] + [False] * 10
+    with Store.read(tmp_path / "work") as store:
+        assert [bool(record.units) for record in read_records(store)] == [True, True] + [False] * 10
 
 
-def test_a_run_whose_journal_is_full_keeps_its_results_in_memory(pairs, undisturbed, tmp_path, monkeypatch):
-    make = Journal.__init__
+def test_a_run_whose_store_is_full_keeps_its_results_in_memory(pairs, undisturbed, tmp_path, monkeypatch):
+    prepare = Store._prepare
 
-    def small(self: Journal, *rest: Any, **more: Any) -> None:
-        make(self, *rest, **more)
-        self._db.execute("PRAGMA max_page_count = 60")
+    def small(self: Store) -> None:
+        prepare(self)
+        self._db.execute("PRAGMA max_page_count = 20")
 
-    monkeypatch.setattr(Journal, "__init__", small)
+    monkeypatch.setattr(Store, "_prepare", small)
     report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
     assert any("is full" in fault for fault in report.faults)
     assert matrices(report) == matrices(undisturbed)
@@ -110,6 +114,34 @@ def test_a_run_whose_journal_is_full_keeps_its_results_in_memory(pairs, undistur
     resumed = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
     assert resumed.ending is Ending.COMPLETE
     assert matrices(resumed) == matrices(undisturbed)
+
+
+def test_an_error_of_the_disk_when_points_are_read_costs_a_job_and_the_run_goes_on(
+    pairs, undisturbed, tmp_path, monkeypatch
+):
+    errors, data = iter([sqlite3.OperationalError("disk I/O error")]), Store.data
+
+    def failing(store: Store, keys: Any) -> dict[str, bytes]:
+        for error in errors:
+            raise error
+        return data(store, keys)
+
+    monkeypatch.setattr(Store, "data", failing)
+    report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
+    assert report.ending is Ending.COMPLETE
+    assert any("disk I/O error" in fault for fault in report.faults)
+    assert matrices(report) == matrices(undisturbed)
+
+
+def test_an_error_of_the_disk_at_the_start_is_no_bad_input(demo, small_recipe, tmp_path, monkeypatch):
+    def failing(*_: Any) -> dict[str, Any]:
+        raise sqlite3.OperationalError("disk I/O error")
+
+    monkeypatch.setattr(Store, "about", failing)
+    output = tmp_path / "submission.csv"
+    with pytest.raises(sqlite3.OperationalError):  # a traceback, status 1
+        main(["submit", *arguments_of(demo, small_recipe, output), "--workers", "0"])
+    assert submission_problems(output, [pair.id for pair in read_test_side(demo.test_dir)]) == []
 
 
 def test_a_submission_that_the_disk_does_not_take_is_told_and_the_exit_status_is_one(
@@ -216,24 +248,24 @@ sys.path[:0] = {path!r}
 from pathlib import Path
 from rectified import THREE_UNITS, RectifiedMatcher, run, write_pairs
 from mkpc_kaggle.engine.budget import Budget
-from mkpc_kaggle.engine.journal import Journal
 from mkpc_kaggle.engine.places import LocalSite
+from mkpc_kaggle.engine.state import State
 
 budget = Budget(time.monotonic(), 1000.0)
-wait, save, saved = LocalSite.wait, Journal.save_estimates, []
-def noted(self, estimates):
-    save(self, estimates)
-    saved.extend(estimates)
+wait, take, saved = LocalSite.wait, State.take_estimate, []
+def noted(self, *estimate):
+    take(self, *estimate)
+    saved.append(estimate)
 def stuck(self, until):
     if len(saved) < 2:
         return wait(self, until)
     budget.time_limit = budget.spent() + 1
     time.sleep(1000)
-Journal.save_estimates, LocalSite.wait = noted, stuck
+State.take_estimate, LocalSite.wait = noted, stuck
 home = Path(sys.argv[1])
 pairs = write_pairs(home / "pairs", 40)
-def publish(standing):
-    (home / "out").write_text(str(len(set(map(bytes, standing.fundamentals)))))
+def publish(state):
+    (home / "out").write_text(str(len(set(map(bytes, state.fundamentals)))))
 run(pairs, THREE_UNITS, RectifiedMatcher(), home / "work", budget=budget, publish=publish, is_watched=True)
 """
 

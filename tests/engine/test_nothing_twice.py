@@ -1,5 +1,6 @@
 """Nothing is computed twice: what runs after a change, and that the result has the bytes of a fresh run."""
 
+import math
 import os
 import random
 import re
@@ -8,16 +9,21 @@ import signal
 import subprocess
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from faulty import FaultyMatcher, lack_an_image
+from rectified import THREE_UNITS, RectifiedMatcher, matrices, run
+from simulator import Scenario, memory_store, simulate
 
 from mkpc_kaggle.cli import main
 from mkpc_kaggle.demo import DemoSet
+from mkpc_kaggle.engine.request import Ending
 
 FIRST, SECOND, THIRD = (
     '{ stage = 1, matcher = "sift", long_side = 320 }',
@@ -123,6 +129,59 @@ def test_what_runs_after_a_change_and_the_bytes_are_those_of_a_fresh_run(room: R
     assert again == room.run("fresh.csv")
 
 
+@pytest.mark.parametrize("seed", range(20))
+def test_a_simulated_run_cut_by_its_limit_at_a_random_moment_and_finished_later_has_all_keys_of_a_fresh_one(seed):
+    rng = np.random.default_rng(seed)
+    costs = tuple(rng.uniform(0.2, 2.0, rng.integers(3, 6)).tolist())  # units of stage 1, 2, 1, ...
+    whole = Scenario(40, costs, 1, math.inf, warm_up=0, misses=0, batches=2, seed=seed)
+    store, fresh = memory_store(), simulate(whole)
+    cut = simulate(replace(whole, limit=float(rng.uniform(0.2, 1.2)) * whole.work), store)
+    finished = simulate(whole, store)
+    assert finished.report.ending is fresh.report.ending is Ending.COMPLETE
+    assert finished.keys == fresh.keys
+    assert finished.stale == set()
+    assert cut.keys != fresh.keys or cut.report.ending is Ending.COMPLETE
+
+
+def test_points_of_stage_2_are_computed_again_when_the_pair_has_new_points_of_stage_1():
+    """The limit leaves time for two of three units on all pairs, and the second looks at crops of the first."""
+    whole = Scenario(60, (1.0, 1.0, 1.0), 1, math.inf, spread=0.1, warm_up=0, misses=0)
+    store = memory_store()
+    cut = simulate(replace(whole, limit=150.0), store)
+    units = Counter(len(record.units) for record in cut.report.records)
+    assert units[2] > 20
+    assert units[3] > 0
+    finished = simulate(whole, store)
+    assert finished.keys == simulate(whole).keys
+    assert finished.report.units_run >= 2 * units[2], "the third unit, and the second on its crops"
+
+
+@pytest.mark.parametrize("moments", [4, pytest.param(20, marks=pytest.mark.slow)])
+def test_a_run_cut_by_its_limit_at_a_random_moment_and_finished_later_has_the_bytes_of_an_undisturbed_one(
+    pairs, undisturbed, tmp_path, moments
+):
+    rng = random.Random(moments)
+    for number in range(moments):
+        slow = RectifiedMatcher(seconds=0.05)
+        run(pairs, THREE_UNITS, slow, tmp_path / str(number), limit=rng.uniform(2.2, 3.8))
+        report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / str(number))
+        assert report.ending is Ending.COMPLETE
+        assert matrices(report) == matrices(undisturbed)
+        found = [[(unit.unit, unit.matches) for unit in record.units] for record in report.records]
+        assert found == [[(unit.unit, unit.matches) for unit in record.units] for record in undisturbed.records]
+
+
+def test_what_raised_is_run_again_by_the_next_run_and_nothing_else(pairs, undisturbed, tmp_path):
+    failed = run(pairs, THREE_UNITS, FaultyMatcher(fault=lack_an_image, above=100), tmp_path / "work")
+    assert failed.ending is Ending.COMPLETE
+    told = [(record.index, unit.unit) for record in failed.records for unit in record.units if unit.failure]
+    assert told == [(3, unit.name) for unit in THREE_UNITS.units[1:]]
+    mended = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
+    assert mended.units_run == 2
+    assert matrices(mended) == matrices(undisturbed)
+    assert not [unit.failure for record in mended.records for unit in record.units if unit.failure]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("change", CHANGES)
 def test_ten_kills_after_a_change_leave_the_same_bytes(room: Room, change: str) -> None:
@@ -134,6 +193,22 @@ def test_ten_kills_after_a_change_leave_the_same_bytes(room: Room, change: str) 
         os.kill(running.pid, signal.SIGKILL)
         running.wait()
     assert room.run() == room.run("fresh.csv")
+
+
+def test_a_prune_frees_the_results_of_former_settings_and_keeps_those_of_the_last_run(room: Room, capsys) -> None:
+    room.units(FIRST, SECOND, more="[matchers.sift]\nratio = 0.75")
+    last = room.run()
+    capsys.readouterr()
+    store = room.home / "a.work" / "journal.sqlite"
+    before = store.stat().st_size
+    assert main(["journal", str(store.parent), "--prune"]) == 0
+    (freed,) = re.findall(r"(\d+\.\d\d) MB are free again", capsys.readouterr().out)
+    assert float(freed) == round((before - store.stat().st_size) / 1e6, 2) > 0
+    assert room.run() == last
+    assert "0 units run, 0 F estimated" in capsys.readouterr().out
+    room.units(FIRST, SECOND)
+    room.run()
+    assert f"{2 * BEFORE} units run" in capsys.readouterr().out
 
 
 def test_images_added_to_a_folder_are_matched_with_each_other_and_with_the_former(

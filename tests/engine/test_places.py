@@ -4,6 +4,7 @@ import threading
 from types import SimpleNamespace
 
 import pytest
+from rectified import THREE_UNITS, RectifiedMatcher, run, write_pairs
 
 from mkpc_kaggle.engine import places
 from mkpc_kaggle.engine.jobs import Cause, Failure, Loaded, MatchJob, Phase
@@ -16,7 +17,7 @@ RAISED, NO_MEMORY = Failure(Cause.RAISED), Failure(Cause.OUT_OF_MEMORY)
 
 
 def job(*, is_retry=False):
-    return MatchJob(Phase.DEEPEN, (0,), (), (), 1.0, is_retry)
+    return MatchJob(Phase.DEEPEN, (0,), (), (), 1.0, is_retry=is_retry)
 
 
 def place_of(waiting):
@@ -85,7 +86,46 @@ def test_an_answer_that_is_there_counts_though_its_time_is_over():
 def test_the_workers_of_a_machine_share_its_cores_on_gpus_too(monkeypatch, devices, workers, shares):
     made = SimpleNamespace(pipeline=None)
     assembly = SimpleNamespace(devices=devices, on=lambda *_: made, on_cpu=lambda: made)
-    monkeypatch.setattr(places, "ProcessWorker", lambda name, make, ring: make.keywords["share"])
+    worker = lambda name, make, ring: SimpleNamespace(share=make.keywords["share"])  # noqa: E731
+    monkeypatch.setattr(places, "ProcessWorker", worker)
     site = LocalSite(assembly, workers, lambda: 0.0)
-    assert [place.make() for place in site.of(Work.MATCH)] == shares
-    assert [place.make() for place in site.fallback] == [1] * (devices != ("cpu",))
+    assert [place.make().share for place in site.of(Work.MATCH)] == shares
+    assert [place.make().share for place in site.fallback] == [1] * (devices != ("cpu",))
+
+
+@pytest.mark.parametrize(
+    ("cores", "devices", "workers", "scenes"),
+    [
+        (8, ("cpu",), None, (1, 8)),
+        (8, ("cuda:0",), None, (7, 8)),
+        (8, ("cuda:0", "cuda:1"), None, (6, 8)),
+        (1, ("cuda:0",), None, (1, 1)),
+    ],
+)
+def test_scenes_have_the_cores_that_matching_leaves_free_and_estimates_those_of_the_container(
+    monkeypatch, cores, devices, workers, scenes
+):
+    made = SimpleNamespace(pipeline=None)
+    assembly = SimpleNamespace(devices=devices, on=lambda *_: made, on_cpu=lambda: made)
+    monkeypatch.setattr(places.os, "sched_getaffinity", lambda _: set(range(cores)))
+    monkeypatch.setattr(places.os, "cpu_count", lambda: 64)  # of the whole machine
+    site = LocalSite(assembly, workers, lambda: 0.0)
+    at_a_time = [site.scenes_at_a_time(is_matching=is_matching) for is_matching in (True, False)]
+    assert tuple(at_a_time) == scenes
+    assert len(site.of(Work.SCENE)) == cores
+    assert len(site.of(Work.LIGHT)) == max(1, cores // 4)
+
+
+def test_workers_in_threads_leave_the_limits_of_the_users_process_as_they_are(tmp_path):
+    import cv2
+    from threadpoolctl import threadpool_info, threadpool_limits
+
+    former = cv2.getNumThreads()
+    cv2.setNumThreads(3)
+    try:
+        with threadpool_limits(2):
+            run(write_pairs(tmp_path, 2), THREE_UNITS, RectifiedMatcher(), tmp_path / "work", workers=0)
+            assert cv2.getNumThreads() == 3
+            assert 2 in [pool["num_threads"] for pool in threadpool_info()]
+    finally:
+        cv2.setNumThreads(former)

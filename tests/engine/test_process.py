@@ -18,6 +18,7 @@ from faulty import choose_scene_for_all_but_the_first, on_fork, runner
 
 from mkpc_kaggle.engine.jobs import Cause, Failure, Loaded, SceneJob
 from mkpc_kaggle.engine.process import WORKER_ENVIRONMENT, ProcessWorker
+from mkpc_kaggle.engine.store import Source
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.recipe import Recipe, SceneConfig, Unit
@@ -29,7 +30,7 @@ IMAGES = (BatchImage("a", "a", Size(80, 72)), BatchImage("b", "b", Size(80, 72))
 POINTS = np.random.default_rng(1).uniform(0, 70, (50_000, 2)).astype(np.float32)
 MATCHES = Matches(POINTS, POINTS, POINTS[:, 0])
 SCENES = Recipe((Unit(1, "m", 80),), scene=SceneConfig())
-LARGE = SceneJob("one", (0,), (BatchPair(*IMAGES, MATCHES, None, {"m": MATCHES}),), SCENES)
+LARGE = SceneJob("one", "key", (BatchPair(*IMAGES, MATCHES),), ("ab",), SCENES, Source(None, {}))
 
 
 class Worker(ProcessWorker):

@@ -23,20 +23,25 @@ def no_notebook(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_terminal_has_a_line_for_each_phase() -> None:
     stream = Terminal()
-    progress = Progress(Budget(0.0, 100.0, VirtualClock()), stream)
+    clock = VirtualClock()
+    progress = Progress(Budget(0.0, 100.0, clock), stream)
     progress.show(Phase.SWEEP, 8, 8)
     for done in (1, 2):
         progress.show(Phase.DEEPEN, done, 8)
+        clock.now = 10.0
     progress.close()
     shown = [line.split("\r\x1b[K")[-1] for line in stream.getvalue().split("\n")[:-1]]
-    assert shown == [f"{text} pairs, budget left 1m38s" for text in ("sweep: 8", "deepen: 2 of 8")]
+    assert shown == [
+        "sweep: 8/8 [00:00<?, ? s/pair], budget left 1m38s",
+        "deepen: 2/8 [00:10<01:00, 10 s/pair], budget left 1m28s",
+    ]
 
 
 def test_the_terminal_that_a_notebook_gives_its_commands_has_lines(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("JPY_PARENT_PID", "1")
     stream = Terminal()
     Progress(Budget(0.0, clock=VirtualClock()), stream).show(Phase.SWEEP, 1, 5)
-    assert stream.getvalue() == "sweep: 5 pairs\n"
+    assert stream.getvalue() == "sweep: 1/5 [00:00<?, ? s/pair]\n"
 
 
 def test_lines_come_when_a_phase_begins_now_and_then_and_in_the_end() -> None:
@@ -50,8 +55,10 @@ def test_lines_come_when_a_phase_begins_now_and_then_and_in_the_end() -> None:
     progress.show(Phase.DEEPEN, 2, 2)
     progress.close()
     progress.close()
-    sweep = ["sweep: 100 pairs", *(f"sweep: {done} of 100 pairs" for done in (31, 61, 91))]
-    assert stream.getvalue().splitlines() == [*sweep, "deepen: 2 pairs", "deepen: 2 of 2 pairs"]
+    times = ["31/100 [00:30<01:09, 1 s/pair]", "61/100 [01:00<00:39, 1 s/pair]", "91/100 [01:30<00:09, 1 s/pair]"]
+    deepen = ["deepen: 1/2 [00:00<?, ? s/pair]", "deepen: 2/2 [00:29<00:00, 29 s/pair]"]
+    sweep = ["sweep: 1/100 [00:00<?, ? s/pair]", *(f"sweep: {text}" for text in times)]
+    assert stream.getvalue().splitlines() == [*sweep, *deepen]
 
 
 @pytest.mark.parametrize("stream", [StringIO(), Terminal()])

@@ -26,8 +26,9 @@ from synthetic import SyntheticMatcher, synthetic_pairs
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.jobs import SceneJob
-from mkpc_kaggle.engine.journal import Journal
+from mkpc_kaggle.engine.records import Table, read_images
 from mkpc_kaggle.engine.request import Ending
+from mkpc_kaggle.engine.store import Store
 from mkpc_kaggle.engine.worker import batch_pair, results_of
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.recipe import SceneConfig
@@ -48,7 +49,7 @@ def own_matrices(pairs: list[Pair], directory: Path) -> list[bytes]:
 def test_pairs_get_the_f_of_their_scene_and_keep_their_own(tmp_path, monkeypatch):
     scenes_by(monkeypatch, choose_scene_for_all_but_the_first, process=True)
     pairs, published = batch_pairs(tmp_path / "images"), []
-    publish = lambda standing: published.append(standing.fundamentals)  # noqa: E731
+    publish = lambda state: published.append(state.fundamentals)  # noqa: E731
     report = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work", publish=publish)
     assert report.ending is Ending.COMPLETE
     assert [record.source for record in report.records] == ["pair"] + ["scene"] * 5
@@ -65,7 +66,7 @@ def test_pairs_get_the_f_of_their_scene_and_keep_their_own(tmp_path, monkeypatch
     assert all(len(match.results[0].matches) for _, match in log.weakest), "what is drawn keeps its points"
 
 
-def test_a_focal_length_of_exif_goes_to_the_pairs_the_journal_and_the_scene(tmp_path, monkeypatch):
+def test_a_focal_length_of_exif_goes_to_the_pairs_the_store_and_the_scene(tmp_path, monkeypatch):
     pairs, jobs = batch_pairs(tmp_path / "images", 3), list[SceneJob]()
 
     def note(job: SceneJob) -> Solution:
@@ -77,8 +78,9 @@ def test_a_focal_length_of_exif_goes_to_the_pairs_the_journal_and_the_scene(tmp_
     reports = []
     for name, expected in (("without", [(0, 0)] * 3), ("with", [(told, 0), (told, 0), (0, 0)])):
         reports.append(run(pairs, recipe, RectifiedMatcher(), tmp_path / name))
-        with Journal(tmp_path / name) as journal:
-            focals = [tuple(image.focal for image in journal.images(position)) for position in range(3)]
+        with Store.read(tmp_path / name) as store:
+            rows = Table.of(store).rows
+            focals = [tuple(image.focal for image in read_images(store, row)) for row in rows]
         assert focals == expected
         set_exif(pairs[0].images[0], tA405=28)
     assert not np.array_equal(*(report.records[0].pair_fundamental for report in reports))
@@ -174,7 +176,7 @@ def test_a_run_that_goes_on_reconstructs_only_the_batch_whose_image_was_replaced
     assert matrices(again) == own_matrices(pairs, tmp_path / "alone")
 
 
-def test_a_model_that_no_table_can_hold_costs_its_scene_alone(tmp_path, monkeypatch):
+def test_a_model_that_the_store_cannot_hold_costs_its_scene_alone(tmp_path, monkeypatch):
     def with_a_wrong_error(job: SceneJob) -> Solution:
         found = choose_scene_for_all_but_the_first(job)
         (reconstruction,) = found.reconstructions
@@ -186,7 +188,7 @@ def test_a_model_that_no_table_can_hold_costs_its_scene_alone(tmp_path, monkeypa
     pairs = batch_pairs(tmp_path / "images")
     report = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
     assert report.ending is Ending.COMPLETE
-    assert "a result cannot be saved: NOT NULL constraint failed: model.reprojection_error" in report.faults
+    assert "a result cannot be saved: CHECK constraint failed: json_valid(about)" in report.faults
     assert [record.source for record in report.records] == ["pair"] * 6
     scenes_by(monkeypatch, choose_scene_for_all_but_the_first)
     assert run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work").faults == ()

@@ -53,6 +53,35 @@ def test_native_code_that_complains_to_a_pipe_without_a_reader_does_not_wait(des
     os.close(reader)
 
 
+LOGS = """
+import os, sys, threading
+from pathlib import Path
+from mkpc_kaggle.engine.process import ProcessWorker
+
+def complain():
+    os.write(1, b"libpng warning, ")
+    os.write(2, b"libjpeg: premature end")
+
+if __name__ == "__main__":
+    answers = threading.Semaphore(0)
+    worker = ProcessWorker("decoder", complain, answers.release)
+    worker.log = Path(sys.argv[1])
+    worker.start()
+    answers.acquire()
+    worker.kill()
+"""
+
+
+def test_what_native_code_of_a_worker_writes_is_in_a_file_of_the_run(tmp_path):
+    script = tmp_path / "logs.py"
+    script.write_text(LOGS)
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    command = [sys.executable, script, tmp_path / "workers.log"]
+    done = subprocess.run(command, env=environment, capture_output=True, check=True)
+    assert (done.stdout, done.stderr) == (b"", b"")
+    assert (tmp_path / "workers.log").read_bytes() == b"libpng warning, libjpeg: premature end"
+
+
 def test_what_native_code_writes_is_printed(tmp_path):
     script = "import os\nfrom mkpc_kaggle.engine.console import unblocked\nwith unblocked():\n"
     script += "    os.write(2, b'libjpeg: premature end')\nprint('later', flush=True)\nos.write(2, b', again')"
@@ -63,9 +92,9 @@ def test_what_native_code_writes_is_printed(tmp_path):
 
 
 def test_text_that_a_stream_cannot_encode_and_a_closed_file_end_nothing(tmp_path):
-    script = "import os, sys\nfrom mkpc_kaggle.engine.console import say, unblocked\nwith unblocked():\n"
+    script = "import os, sys\nfrom mkpc_kaggle.engine.console import drain, say, unblocked\nwith unblocked():\n"
     script += "    say('\u00e9')\n    sys.stdout.buffer.write(b'bytes, ')\n    say('text')\n"
-    script += "    os.close(1)\n    say('lost')"
+    script += "    drain()\n    os.close(sys.stdout.fileno())\n    say('lost')"
     environment = os.environ | {"PYTHONPATH": str(ROOT), "PYTHONIOENCODING": "ascii", "PYTHONUTF8": "0"}
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, check=True, env=environment)
     assert done.stdout == b"bytes, text\n"

@@ -19,7 +19,8 @@ from mkpc_kaggle import TwoStageMatcher
 from mkpc_kaggle.data.competition import read_train_side
 from mkpc_kaggle.data.images import read_image
 from mkpc_kaggle.data.pairs import read_pairs
-from mkpc_kaggle.engine.journal_reader import JournalReader
+from mkpc_kaggle.engine.records import Table, read_points, read_records
+from mkpc_kaggle.engine.store import Store
 from mkpc_kaggle.evaluation.validate import by_protocol
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Box, Size
@@ -38,8 +39,8 @@ def listed(file: Path, root: Path, recipe: Path) -> list[object]:
     return ["--pairs", file, "--image-root", root, "--recipe", recipe]
 
 
-def matches_of(journal: JournalReader, position: int) -> Matches:
-    return Matches.concatenate(journal.points(journal.inputs(position).values()).values())
+def matches_of(store: Store, position: int) -> Matches:
+    return Matches.concatenate(read_points(store, Table.of(store), position).values())
 
 
 OUTDOORS = ["castle_p19", "fountain_p11", "herz_jesus_p8", "reichstag_26"]
@@ -67,9 +68,9 @@ def test_an_independent_evaluation_of_the_same_matches_agrees(scenes, pairs, uni
     scores = scores_of(tmp_path / "s.json", *options, "--protocol", "superglue", "--work-dir", tmp_path)
     side = max(side for stage, side in units if stage == 1)
     expected = []
-    with JournalReader(tmp_path) as journal:
-        for line, true, record in zip(lines, truths, journal.records(), strict=True):
-            matches = matches_of(journal, record.index)
+    with Store.read(tmp_path) as store:
+        for line, true, record in zip(lines, truths, read_records(store), strict=True):
+            matches = matches_of(store, record.index)
             keypoints = sum(unit.keypoints for unit in record.units)
             points = matches.points0.astype(float), matches.points1.astype(float)
             sizes = [read_image(path).size for path in true.pair.images]
@@ -252,10 +253,11 @@ def test_regions_of_ones_own_take_the_place_of_mkpcs(demo, scenes, small_recipe,
     given = ["--regions", tmp_path / "regions.csv"]
     for options, rows in ((given, 2), ([], 3), (given, 3)):
         assert run_command(*command, "--work-dir", tmp_path / "run", *options) == 0
-        with JournalReader(tmp_path / "run") as journal:
-            (record,), found = journal.records(), matches_of(journal, 0)
+        with Store.read(tmp_path / "run") as store:
+            (record,), found = read_records(store), matches_of(store, 0)
         assert ([region.box for region in record.regions] == [*boxes]) == bool(options)
         assert ({region.reason for region in record.regions} == {RegionReason.GIVEN}) == bool(options)
         with closing(sqlite3.connect(tmp_path / "run" / "journal.sqlite")) as database:
-            assert database.execute("SELECT count(*) FROM points").fetchone() == (rows,)  # other regions, others
+            count = "SELECT count(*) FROM result WHERE kind = 'points'"
+            assert database.execute(count).fetchone() == (rows,)  # other regions, others
     np.testing.assert_array_equal(found.points0, match.matches.points0)

@@ -9,7 +9,7 @@ from shared import run_command, scores_of
 from mkpc_kaggle.data import competition
 from mkpc_kaggle.data.competition import Pair, TrainScene, TruePair, read_test_side, read_train_side
 from mkpc_kaggle.demo import DemoSet
-from mkpc_kaggle.engine.journal_reader import PairRecord
+from mkpc_kaggle.engine.records import PairRecord
 from mkpc_kaggle.evaluation.validate import SceneScore, Step, score_record, score_submission, score_table
 from mkpc_kaggle.geometry.cameras import Camera, fundamental_of_cameras
 from mkpc_kaggle.geometry.metrics import AUC_THRESHOLDS
@@ -68,7 +68,7 @@ def test_a_failed_pair_counts_as_failed_even_where_the_fallback_happens_to_be_ri
     scene = TrainScene("s", 1.0, (true,))
     record = PairRecord(0, true.pair, failure="too few matches")
     failed = score_record(true, record, scene, [Step.MAGSAC])
-    right = score_record(true, PairRecord(0, true.pair, failure=""), scene)
+    right = score_record(true, PairRecord(0, true.pair, failure="", source="pair"), scene)
     assert SceneScore("s", (right, failed, right)).maa() == pytest.approx(2 / 3)
     assert failed.error.rotation == failed.steps[Step.MAGSAC].rotation == np.inf
     assert right.error.angle < 1e-6

@@ -11,7 +11,8 @@ from shared import problems_of, run_command
 from standin import narrow_roma, scene
 
 from mkpc_kaggle.data.competition import read_submission
-from mkpc_kaggle.engine.journal_reader import JournalReader
+from mkpc_kaggle.engine.records import read_records
+from mkpc_kaggle.engine.store import Store
 from mkpc_kaggle.matchers.adapters import roma
 
 LONG, AREA = ("long_side = 209", "long_side = 150"), ('area = "96x128"', 'area = "70x90"')
@@ -58,8 +59,8 @@ def test_odd_small_and_blank_pictures_go_through(clean_environment, monkeypatch,
     for F in read_submission(output).values():
         strengths = np.linalg.svd(F, compute_uv=False)
         assert strengths[2] < 1e-6 * strengths[0] < 1e6 * strengths[1]
-    with JournalReader(tmp_path / "out.work") as journal:
-        found = {(record.index, unit.stage): unit for record in journal.records() for unit in record.units}
+    with Store.read(tmp_path / "out.work") as store:
+        found = {(record.index, unit.stage): unit for record in read_records(store) for unit in record.units}
     assert found.keys() == {(pair, stage) for pair in range(3) for stage in (1, 2)}
     assert {unit.failure for unit in found.values()} == {""}
     assert found[0, 1].matches >= 8

@@ -12,14 +12,17 @@ from shared import WEIGHTS, needs_weights, problems_of, run_command
 from weight_files import digest_of
 
 from mkpc_kaggle import reconstruct
-from mkpc_kaggle.engine.settings import Settings
+from mkpc_kaggle.data.competition import Pair
+from mkpc_kaggle.engine.keys import Keys
 from mkpc_kaggle.errors import UserError, warn_once
+from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.matchers.contract import MatcherSpec
 from mkpc_kaggle.pipeline import availability
-from mkpc_kaggle.pipeline.assembly import assemble
+from mkpc_kaggle.pipeline.assembly import Assembly, assemble
 from mkpc_kaggle.pipeline.availability import Licence
 from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher
 from mkpc_kaggle.recipe import Recipe, Unit, load_recipe
+from mkpc_kaggle.scene.view_graph import BatchImage
 from mkpc_kaggle.weights import WeightFile
 from mkpc_kaggle.weights import store as weight_store
 from mkpc_kaggle.weights.manifest import manifest
@@ -264,10 +267,20 @@ def test_a_matcher_that_only_a_worker_cannot_load_costs_its_units_and_is_told(
     assert "units that failed: 1\n  1:aliked@320: aliked cannot be loaded: the weights for 'aliked-n16'" in told
 
 
+def points_keys(assembly: Assembly) -> tuple[str, ...]:
+    """The keys of the units' points on a pair."""
+    keys, pair = Keys.of(assembly), Pair("p", "b", "0.png", "1.png")
+    images = tuple(BatchImage(name, name, Size(80, 60)) for name in ("0.png", "1.png"))
+    stages = [unit.stage for unit in assembly.recipe.units]
+    first = [keys.of_points(n, pair, images, []) for n, stage in enumerate(stages) if stage == 1]
+    crops = keys.crops_of(pair, first)
+    return tuple(keys.of_points(n, pair, images, crops * (stage - 1)) for n, stage in enumerate(stages))
+
+
 def test_a_units_digest_has_all_that_decides_its_points():
     plain = load_recipe("classical")
     first, second, third = plain.units
-    units = [Settings.of(assemble(plain)).units]
+    units = [points_keys(assemble(plain))]
     for other in (
         replace(plain, units=(replace(first, tracks=False), second, third)),  # no point depends on it
         replace(plain, magsac=replace(plain.magsac, threshold=1.0)),
@@ -275,8 +288,8 @@ def test_a_units_digest_has_all_that_decides_its_points():
         replace(plain, mkpc=replace(plain.mkpc, eps=0.1)),
         replace(plain, matchers={"sift": {"ratio": 0.7}}),
     ):
-        units.append(Settings.of(assemble(other)).units)
+        units.append(points_keys(assemble(other)))
     assert units[0] == units[1] == units[2]
     changed = [[one != two for one, two in zip(units[0][: len(other)], other, strict=True)] for other in units[3:]]
     assert changed == [[False, True], [False, True, False], [True] * 3]
-    assert not set(units[0]) & set(Settings.of(assemble(plain, precision="bfloat16")).units)
+    assert not set(units[0]) & set(points_keys(assemble(plain, precision="bfloat16")))

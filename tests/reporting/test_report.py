@@ -16,9 +16,10 @@ from rectified import THREE_UNITS, RectifiedMatcher, run, write_pairs
 from shared import run_command
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine.jobs import WantedPair
-from mkpc_kaggle.engine.journal import Journal
-from mkpc_kaggle.engine.journal_reader import About, Event, EventKind
+from mkpc_kaggle.engine.loop import note_event
+from mkpc_kaggle.engine.records import About, Event, EventKind, Row, Table
+from mkpc_kaggle.engine.store import Store
+from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 from mkpc_kaggle.reporting.report import DRAWING_S, report_page, report_run
 from mkpc_kaggle.reporting.run_log import read_log
 from mkpc_kaggle.reporting.summary import overview
@@ -34,11 +35,13 @@ def a_run(directory: Path, count: int = 12) -> list[Pair]:
     return pairs
 
 
-def empty_journal(work_dir: Path, pairs: list[Pair], **about: object) -> Journal:
-    journal = Journal(work_dir)
-    wanted = [WantedPair(pair, pair.names, "F") for pair in pairs]
-    journal.want(wanted, [], {}, About({**THREE_UNITS.table(), "name": "three"}, **about))
-    return journal
+def empty_store(work_dir: Path, pairs: list[Pair], **about: object) -> Store:
+    store = Store.open(work_dir)
+    rows = [Row(pair.id, pair.group, *pair.names, 0, 0, "", [], "", "fallback", {}, "") for pair in pairs]
+    facts = About({**THREE_UNITS.table(), "name": "three"}, **about)
+    written = np.tile(FALLBACK_FUNDAMENTAL, (len(pairs), 1, 1))
+    store.put([Table(facts, [], len(pairs), rows, {}, written).to_result()])
+    return store
 
 
 def test_a_run_exports_tables_that_a_reader_of_csv_files_understands(tmp_path, capsys):
@@ -73,7 +76,7 @@ def test_a_run_exports_tables_that_a_reader_of_csv_files_understands(tmp_path, c
 
 
 def test_an_export_that_cannot_be_written_is_refused(tmp_path, capsys):
-    empty_journal(tmp_path, []).close()
+    empty_store(tmp_path, []).close()
     (tmp_path / "file").touch()
     assert run_command("journal", tmp_path, "--csv", tmp_path / "file" / "x") == 2
     assert "cannot be written" in capsys.readouterr().err
@@ -93,7 +96,7 @@ MINE = {
 
 @pytest.mark.parametrize("make", MINE.values(), ids=MINE)
 def test_an_export_replaces_nothing_but_its_own_tables(tmp_path, make, capsys):
-    empty_journal(tmp_path, []).close()
+    empty_store(tmp_path, []).close()
     (tmp_path / "csv").mkdir()
     make(tmp_path / "csv" / "units.csv")
     assert run_command("journal", tmp_path, "--csv", tmp_path / "csv") == 2
@@ -139,7 +142,7 @@ def test_the_summary_has_the_facts_of_the_page_for_programs(tmp_path):
 
 @pytest.mark.parametrize("make", MINE.values(), ids=MINE)
 def test_a_summary_replaces_nothing_but_a_summary(tmp_path, make):
-    empty_journal(tmp_path, []).close()
+    empty_store(tmp_path, []).close()
     make(tmp_path / "page.summary.json")
     before = os.lstat(tmp_path / "page.summary.json")
     identity = before.st_ino, before.st_mtime_ns
@@ -151,9 +154,9 @@ def test_a_summary_replaces_nothing_but_a_summary(tmp_path, make):
 
 def test_what_comes_from_files_is_escaped(tmp_path):
     pairs = [Pair(EVIL, EVIL, f"{EVIL.replace('/', '')}.png", "b.png")]
-    with empty_journal(tmp_path, pairs, device=EVIL, left_out=(EVIL,), versions={EVIL: EVIL}) as journal:
+    with empty_store(tmp_path, pairs, device=EVIL, left_out=(EVIL,), versions={EVIL: EVIL}) as store:
         for kind in EventKind:
-            journal.note(Event(kind, 1.0, EVIL))
+            note_event(store, Event(kind, 1.0, EVIL))
     log = read_log(tmp_path)
     for known in ((), pairs):
         text = report_page(log, known)

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine.journal_reader import PairRecord, SceneRecord
+from mkpc_kaggle.engine.records import NOT_RECONSTRUCTED, PairRecord, SceneRecord
 from mkpc_kaggle.engine.request import Ending, RunReport
-from mkpc_kaggle.engine.scenes import NOT_RECONSTRUCTED
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.robust import EstimateStats
@@ -45,7 +44,7 @@ def report(ending: Ending, *records: PairRecord, scenes: tuple[SceneRecord, ...]
 
 def test_a_pair_with_few_inliers_is_doubtful_unless_its_cameras_agree():
     assert is_doubtful(FEW_INLIERS)
-    settled = replace(FEW_INLIERS, scene=Choice(np.eye(3), Reason.SCENE))
+    settled = replace(FEW_INLIERS, scene=Choice(np.eye(3), Reason.SCENE), source="scene")
     assert not is_doubtful(settled)
     assert is_doubtful(replace(FEW_INLIERS, scene=Choice(None, Reason.CONTRADICTION)))
 

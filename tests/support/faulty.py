@@ -174,8 +174,8 @@ def thread_place(
 def use_places(monkeypatch: pytest.MonkeyPatch, *used: Place, fallback: Sequence[Place] = ()) -> None:
     """Let runs match at these places, and look every hundredth of a second for answers, without a pause."""
 
-    def site_of(assembly: Assembly, _: int, clock: Callable[[], float]) -> LocalSite:
-        site = LocalSite(assembly, 0, clock)
+    def site_of(assembly: Assembly, _: int, clock: Callable[[], float], log: Path) -> LocalSite:
+        site = LocalSite(assembly, 0, clock, log)
         site.places = [*(place for place in site.places if place.work is not Work.MATCH), *used]
         site.fallback = list(fallback)
         return site

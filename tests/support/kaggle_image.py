@@ -12,7 +12,8 @@ from zipfile import ZipFile, is_zipfile
 
 BESIDE = ("matplotlib", "ipykernel", "nbclient", "nbformat")
 UNPACKED = (".zip", ".tar", ".gz", ".pt", ".pth", ".ckpt")  # Kaggle unpacks archives, as torch's checkpoints are
-PACKAGES = ("numpy", "scipy", "scikit-learn", "opencv-python-headless", "torch", "pandas", "pip", *BESIDE)
+PACKAGES = ("numpy", "scipy", "scikit-learn", "opencv-python-headless", "torch", "pip")
+PACKAGES += ("pandas", "tqdm", *BESIDE)
 
 
 def upload(folder: Path, mount: Path) -> None:

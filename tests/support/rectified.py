@@ -111,9 +111,10 @@ def run(
     output: Path | None = None,
     workers: int | str | None = 0,
     is_watched: bool = False,
+    more: Sequence[RectifiedMatcher] = (),
 ) -> RunReport:
-    """Run the recipe with that matcher; the submission is written to ``output``, or given to ``publish``."""
-    assembly = assemble(recipe, matchers={matcher.name: matcher}, device="cpu")
+    """Run the recipe with these matchers; the submission is written to ``output``, or given to ``publish``."""
+    assembly = assemble(recipe, matchers={each.name: each for each in (matcher, *more)}, device="cpu")
     budget = budget or Budget(time.monotonic(), limit)
     session = Session(work_dir, budget, interrupt or Interrupt(), progress=False, workers=workers)
     with session.watched() if is_watched else nullcontext():

@@ -17,9 +17,8 @@ from typing import Any
 import numpy as np
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine import budget, jobs, plan, scenes
-from mkpc_kaggle.engine.budget import Budget
-from mkpc_kaggle.engine.engine import Engine
+from mkpc_kaggle.engine import budget, jobs, loop, schedule
+from mkpc_kaggle.engine.budget import SCENE_MARGIN, SCENE_START_S, Budget
 from mkpc_kaggle.engine.jobs import (
     Answer,
     Cause,
@@ -32,12 +31,12 @@ from mkpc_kaggle.engine.jobs import (
     Outcome,
     SceneJob,
 )
-from mkpc_kaggle.engine.journal import Journal
+from mkpc_kaggle.engine.keys import Keys
+from mkpc_kaggle.engine.loop import Engine
 from mkpc_kaggle.engine.places import Place, Site, Work
-from mkpc_kaggle.engine.plan import RESERVE_SHARE
 from mkpc_kaggle.engine.request import Ending, Request, RunReport
-from mkpc_kaggle.engine.scenes import FORECAST_MARGIN, START_S
-from mkpc_kaggle.engine.settings import Settings
+from mkpc_kaggle.engine.schedule import RESERVE_SHARE
+from mkpc_kaggle.engine.store import SCHEMA, Store, connected
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
@@ -57,15 +56,15 @@ POINTS = Matches(np.zeros((MATCHES, 2)), np.zeros((MATCHES, 2)), np.zeros(MATCHE
 SWEEP_SHARE = 0.7  # of the limit, within which the sweep is said to fit
 
 MECHANISMS: dict[str, tuple[tuple[object, str, object], ...]] = {  # changes that switch each of them off
-    "reserve for scenes": ((plan, "RESERVE_SHARE", 0.0),),
-    "margin of scenes": ((scenes, "FORECAST_MARGIN", 1.0),),
+    "reserve for scenes": ((schedule, "RESERVE_SHARE", 0.0),),
+    "margin of scenes": ((budget, "SCENE_MARGIN", 1.0),),
     "margin of units": ((budget, "MARGIN", 0.0), (budget, "MIN_MARGIN", 0.0)),
     "latest costs": ((budget, "WINDOW", 10**9),),
-    "short jobs": ((plan, "JOB_SHARE", math.inf),),
-    "connect share": ((plan, "CONNECT_SHARE", 1.0),),
-    "patience": ((plan, "HANG_FACTOR", math.inf),),
+    "short jobs": ((schedule, "JOB_SHARE", math.inf),),
+    "connect share": ((schedule, "CONNECT_SHARE", 1.0),),
+    "patience": ((schedule, "HANG_FACTOR", math.inf),),
     "second try": ((jobs, "MAX_TRIES", 1),),
-    "end of tries": ((plan, "MAX_FAILED_PAIRS", 10**9),),
+    "end of tries": ((loop, "MAX_FAILED_PAIRS", 10**9),),
 }
 
 
@@ -107,6 +106,7 @@ class Scenario:
     pairs_per_image: float = 0.0
     scene_seconds: float = 0.06
     scene_faults: float = 0.0
+    scene_places: int = 1
     seed: int = 0
     never: str = ""  # the matcher whose worker dies whenever it runs
 
@@ -118,8 +118,8 @@ class Scenario:
         return Recipe(tuple(units), scene=scene)
 
     @property
-    def settings(self) -> Settings:
-        return Settings(tuple(unit.name for unit in self.recipe.units), "estimate", "scene")
+    def keys(self) -> Keys:
+        return Keys(tuple(unit.name for unit in self.recipe.units), "mkpc", "estimate", "scene")
 
     @property
     def work(self) -> float:
@@ -134,7 +134,7 @@ class Scenario:
     @property
     def longest_scenes(self) -> float:
         """Seconds that all scenes take on average, if all is slow from the first moment on."""
-        return max(1.0, self.drift) * (self.batches * START_S + self.pairs * self.scene_seconds)
+        return max(1.0, self.drift) * (self.batches * SCENE_START_S + self.pairs * self.scene_seconds)
 
 
 def random_scenario(seed: int, pairs: int) -> Scenario:
@@ -214,8 +214,12 @@ class SimulatedSite(Site):
         self.rng, self._scene_rng = (np.random.default_rng(seed) for seed in (scenario.seed, [scenario.seed, 1]))
         makers = [(f"place {n}", self.match_worker, Work.MATCH) for n in range(scenario.workers)]
         makers.append(("estimates", lambda: SimulatedWorker(self, self.estimate), Work.LIGHT))
-        makers.append(("scenes", self.scene_worker, Work.SCENE))
+        for number in range(scenario.scene_places):
+            makers.append((f"scenes {number}", self.scene_worker, Work.SCENE))
         self.places = [Place(*maker) for maker in makers]
+
+    def scenes_at_a_time(self, *, is_matching: bool) -> int:
+        return self.scenario.scene_places
 
     def match_worker(self) -> "SimulatedWorker":
         return SimulatedWorker(self, partial(self.match, set()), RESTART_S)
@@ -273,8 +277,9 @@ class SimulatedSite(Site):
                 spent += took
                 rows.append(UnitResult(unit, POINTS, 0.0, took, warm_up=unit.name not in warm))
                 warm.add(unit.name)
-        images = [tuple(BatchImage(name, name, SIZE) for name in wanted.names) for wanted in job.pairs]
-        return spent, tuple(map(Outcome, job.indices, images, map(tuple, found))), 0.0
+        images = [tuple(BatchImage(name, name, SIZE) for name in names) for names in job.names]
+        files = [((0, 0), (0, 0))] * len(images)
+        return spent, tuple(map(Outcome, job.indices, images, files, map(tuple, found))), 0.0
 
     def estimate(self, job: EstimateJob) -> Drawn:
         """Draw an answer: each pair has from 20 to 79 inliers by its number."""
@@ -282,15 +287,15 @@ class SimulatedSite(Site):
             return 0.0 if self.rng.random() < 0.5 else math.inf, Failure(Cause.DIED), 0.0
         estimates = []
         for pair in job.pairs:
-            inliers = (20 + pair.index % 60,) * len(pair.units)
-            values = pair.index, pair.revisions, inliers, FALLBACK_FUNDAMENTAL
+            inliers = (20 + pair.index % 60,) * len(pair.points)
+            values = pair.index, tuple(pair.points.values()), inliers, FALLBACK_FUNDAMENTAL
             estimates.append(Estimated(*values, seconds=ESTIMATE_S))
         return ESTIMATE_S * len(estimates), tuple(estimates), 0.0
 
     def reconstruct(self, job: SceneJob) -> Drawn:
         scenario, rng, begun = self.scenario, self._scene_rng, self.clock.now
         spread = math.exp(0.3 * rng.normal() - 0.3**2 / 2)
-        spent = (START_S + spread * scenario.scene_seconds * len(job.pairs)) * self.drift(begun)
+        spent = (SCENE_START_S + spread * scenario.scene_seconds * len(job.pairs)) * self.drift(begun)
         answer: Answer = Solution((), (Choice(FALLBACK_FUNDAMENTAL, Reason.SCENE),) * len(job.pairs))
         if is_faulty := rng.random() < scenario.scene_faults:
             answer = Failure(Cause.DIED, "signal SIGSEGV")
@@ -336,14 +341,14 @@ class SimulatedWorker:
             site.faults += max(0.0, min(lost, site.stop - self._begun))
 
 
-def memory_journal() -> Journal:
-    """A journal that leaves no file."""
+def memory_store() -> Store:
+    """A store that leaves no file."""
     with TemporaryDirectory() as directory:
-        journal = Journal(Path(directory))
-        journal._continue_in_memory("")
-        for connection in (journal._file, journal._lock, journal._db):
-            weakref.finalize(journal, connection.close)  # since 3.13, Python warns of open connections
-        return journal
+        store = Store(Path(directory))
+        store._db = connected(":memory:")
+        store._db.execute(SCHEMA)
+        weakref.finalize(store, store._db.close)  # since 3.13, Python warns of open connections
+        return store
 
 
 @dataclass(frozen=True)
@@ -370,13 +375,14 @@ class Ran:
     last_job: float
     scenes: tuple[SceneRun, ...]
     stale: set[str]
+    keys: list[list[str]]  # of the points and the estimate of each pair
 
     @property
     def work_left(self) -> bool:
         return self.report.ending is not Ending.COMPLETE
 
 
-def simulate(scenario: Scenario, journal: Journal | None = None, until: float = math.inf) -> Ran:
+def simulate(scenario: Scenario, store: Store | None = None, until: float = math.inf) -> Ran:
     """Run a scenario through the real engine, until it ends or is interrupted."""
     clock = VirtualClock()
     time = Budget(0.0, scenario.limit, clock)
@@ -385,9 +391,8 @@ def simulate(scenario: Scenario, journal: Journal | None = None, until: float = 
     pairs = [Pair(str(n), f"{int(n * share):03d}", f"{n:07d}", "b") for n in range(scenario.pairs)]
     published: list[int] = []
     interrupt = threading.Event()
-    journal = memory_journal() if journal is None else journal
-    nothing = Request((), scenario.recipe, scenario.settings)
-    engine = Engine(nothing, site, journal, time, interrupt=interrupt, progress=False)
+    store = memory_store() if store is None else store
+    engine = Engine(site, store, time, interrupt=interrupt, progress=False)
 
     def wait(moment: float) -> None:
         whole_wait(min(moment, until))
@@ -396,10 +401,11 @@ def simulate(scenario: Scenario, journal: Journal | None = None, until: float = 
 
     whole_wait, site.wait = site.wait, wait
     with engine:
-        publish = lambda standing: published.append(len(standing.fundamentals))  # noqa: E731
-        engine.ask(replace(nothing, pairs=pairs, publish=publish))
+        publish = lambda state: published.append(len(state.fundamentals))  # noqa: E731
+        engine.ask(Request(pairs, scenario.recipe, scenario.keys, publish=publish))
         report = engine.report()
-    swept = int(engine.state.had[: scenario.pairs].any(1).sum())
+    state = engine.state
+    swept = int(state.has[: scenario.pairs].any(1).sum())
     sweep_fits = sweep_seconds(scenario) < SWEEP_SHARE * scenario.limit
     given = len(site.of(Work.MATCH)) * (site.stop - RESTART_S) - site.faults
     faulty = {scene.batch for scene in site.scenes if scene.is_faulty}
@@ -410,12 +416,13 @@ def simulate(scenario: Scenario, journal: Journal | None = None, until: float = 
         (site.kept + site.for_scenes) / given,
         max(0.0, clock.now - scenario.limit),
         sum(length != scenario.pairs for length in published) + (scenario.pairs - swept if sweep_fits else 0),
-        len(set(engine.scenes.batches) - faulty - made),
-        FORECAST_MARGIN * scenario.longest_scenes < RESERVE_SHARE * scenario.limit
+        len(set(state.batches) - faulty - made),
+        SCENE_MARGIN * scenario.longest_scenes < RESERVE_SHARE * scenario.limit
         and not any(math.isinf(scene.seconds) for scene in site.scenes),
         site.last_job,
         tuple(site.scenes),
-        set(engine.scenes.batches) - journal.current_scenes(),
+        set(state.stale),
+        [[*points, state.estimates[index]] for index, points in enumerate(state.points.tolist())],
     )
 
 
@@ -435,4 +442,4 @@ def sweep_seconds(scenario: Scenario) -> float:
 
 def without_records(ran: Ran) -> Ran:
     """Return the run without its records: a thousand runs with theirs would fill the memory."""
-    return replace(ran, report=replace(ran.report, records=()), scenes=())
+    return replace(ran, report=replace(ran.report, records=()), scenes=(), keys=[])

@@ -1,0 +1,99 @@
+"""Keys: the digest of everything that a result was computed from.
+
+A result is up to date exactly if it is stored under the key that a computation today would have. Nothing else
+says so. Each kind has a version of its algorithm: increase it if the same inputs give other results.
+"""
+
+import hashlib
+import json
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from typing import Any
+
+import cv2
+
+from mkpc_kaggle.data.competition import Pair
+from mkpc_kaggle.geometry.coordinates import Box
+from mkpc_kaggle.pipeline.assembly import Assembly
+from mkpc_kaggle.pipeline.stages import GivenRegions
+from mkpc_kaggle.scene.view_graph import BatchImage
+
+# Versions of the algorithms.
+POINTS = 2
+ESTIMATE = 3
+SCENE = 3
+
+Images = tuple[BatchImage, BatchImage]
+
+
+def digest(value: Any) -> str:
+    """Return the digest of a value of JSON types, as 32 hexadecimal digits."""
+    text = json.dumps(value, sort_keys=True, default=str)
+    return hashlib.blake2b(text.encode("utf-8", "backslashreplace"), digest_size=16).hexdigest()
+
+
+def text_digest(lines: Iterable[str]) -> str:
+    """Return the digest of texts without line breaks, much faster than :func:`digest`."""
+    text = "\n".join(lines)
+    return hashlib.blake2b(text.encode("utf-8", "backslashreplace"), digest_size=16).hexdigest()
+
+
+@dataclass(frozen=True)
+class Keys:
+    """The keys of a recipe's results, from digests of its settings.
+
+    ``units`` has a digest for each unit, in the recipe's order. ``regions`` replace MKPC's regions of some pairs.
+    """
+
+    units: tuple[str, ...]
+    mkpc: str = ""
+    estimate: str = ""
+    scene: str = ""
+    regions: GivenRegions | None = None
+
+    @classmethod
+    def of(cls, assembly: Assembly) -> "Keys":
+        recipe = assembly.recipe
+        units = tuple(digest([POINTS, assembly.unit_settings(unit)]) for unit in recipe.units)
+        magsac = asdict(recipe.magsac)
+        focal = recipe.focal and asdict(recipe.focal)
+        estimate = digest([ESTIMATE, magsac, focal, cv2.__version__])
+        scene = recipe.scene and asdict(recipe.scene)
+        tracks = [unit.name for unit in recipe.units if unit.tracks]
+        return cls(
+            units,
+            digest(asdict(recipe.mkpc)),
+            estimate,
+            digest([SCENE, scene, tracks, estimate, version("pycolmap")]),
+            assembly.regions,
+        )
+
+    def of_points(self, unit: int, pair: Pair, images: Images, first: Sequence[str]) -> str:
+        """Return the key of a unit's points on a pair.
+
+        ``first`` are the keys of the points that the pair's crops come from; empty for a unit of stage 1.
+        """
+        image0, image1 = images
+        turns = map(str, pair.turns)
+        return text_digest([self.units[unit], image0.digest, image1.digest, *turns, *first])
+
+    def crops_of(self, pair: Pair, first: Sequence[str]) -> list[str]:
+        """Return what decides a pair's crops: the given regions, or [mkpc] and the keys of stage 1."""
+        boxes = (self.regions or {}).get((pair.file0, pair.file1))
+        if boxes is None:
+            return [self.mkpc, *first]
+        return ["given", *map(_text_of, boxes)]
+
+    def of_estimate(self, pair: Pair, points: Sequence[str]) -> str:
+        """Return the key of a pair's estimate from its points, in the recipe's order."""
+        known = [] if pair.intrinsics is None else [K.tobytes().hex() for K in pair.intrinsics]
+        return text_digest([self.estimate, *known, "points", *points])
+
+    def of_scene(self, inputs: Sequence[Sequence[Any]]) -> str:
+        """Return the key of a scene. Each input is a pair: names, digests, keys of its points and estimate."""
+        return digest([self.scene, inputs])
+
+
+def _text_of(box: Box) -> str:
+    return f"{box.left} {box.top} {box.right} {box.bottom}"

@@ -1,0 +1,344 @@
+"""What to do next, by one priority order over the state of all pairs.
+
+:func:`next_work` is a pure function. It has no queue and no memory: it looks at the state, the costs and the time
+left whenever a worker is idle.
+
+Two rules decide that a unit no longer fits in time: :func:`prefix_that_fits` for all pairs, and
+:class:`mkpc_kaggle.engine.worker.MatchRunner` for the units of a job that ran out of time.
+"""
+
+from dataclasses import dataclass, field
+from math import inf, isfinite
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mkpc_kaggle.engine.budget import (
+    ESTIMATE,
+    SCENE_MATCH_S,
+    SCENE_START_S,
+    Budget,
+    Costs,
+    format_duration,
+)
+from mkpc_kaggle.engine.jobs import MatchJob, Phase
+from mkpc_kaggle.engine.state import Mask, State
+
+CONNECT_SHARE = 0.1  # of the time after the sweep, for extra pairs
+JOB_SHARE = 0.01  # maximum share of the time left for a job of several units
+HANG_FACTOR = 30.0  # a job that takes this multiple of its measured cost hangs
+FILL = int(Phase.FILL)
+NEVER = int(Phase.NEVER)
+RESERVE_SHARE = 0.2  # maximum share of the limit that is reserved for estimates and scenes
+
+
+@dataclass(frozen=True)
+class Crew:
+    """The workers of a run: how many match, estimate and reconstruct at a time.
+
+    ``minibatch`` is the number of pairs in a job of matching. ``can_match`` is false if no worker is left for it,
+    and ``scenes`` is 0 if none is left for them.
+    """
+
+    matchers: int = 1
+    estimators: int = 1
+    scenes: int = 1
+    minibatch: int = 1
+    can_match: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class NextWork:
+    """What idle workers should do now: the next job of matching, all estimates and all scenes that are due.
+
+    ``done`` of ``total`` pairs are finished in the ``phase``. The first ``fit`` units of the recipe fit for all
+    pairs. ``stop`` is the time after which no unit may run.
+    """
+
+    match: MatchJob | None
+    estimates: tuple[int, ...]
+    scenes: tuple[str, ...]
+    phase: Phase
+    done: int
+    total: int
+    fit: int
+    stop: float
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """What the rules below look at, computed once: the state and what follows from it at one moment."""
+
+    state: State
+    costs: Costs
+    budget: Budget
+    crew: Crew
+    now: float
+    missing: Mask = field(init=False)  # (N, U)
+    stop: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "missing", self.state.missing)
+        reserve = estimates_reserve(self) + scenes_reserve(self)
+        longest = RESERVE_SHARE * self.budget.time_limit
+        object.__setattr__(self, "stop", self.budget.stop_units - min(reserve, longest))
+
+    @property
+    def left(self) -> float:
+        return max(0.0, self.stop - self.now)
+
+
+def next_work(state: State, costs: Costs, budget: Budget, crew: Crew, now: float) -> NextWork:
+    """Return what to do next."""
+    view = View(state, costs, budget, crew, now)
+    fit = prefix_that_fits(view)
+    connecting = pairs_to_connect(view)
+    phases = phases_of(view, fit, connecting)
+    # A unit that would not end in time does not begin. An unmeasured unit may.
+    wanted = phases.copy(order="F")
+    for number, unit in enumerate(state.units):
+        if costs.mean(unit.name) >= view.stop - now:
+            wanted[:, number] = NEVER
+    first = wanted.min(1)
+    best = np.where(state.matching, np.int8(NEVER), first)
+    phase = Phase(int(best.min(initial=NEVER)))
+    match = None
+    if phase is not Phase.NEVER and crew.can_match:
+        match = match_job(view, phase, wanted <= phase, best == phase)
+    is_matching = match is not None or bool(state.matching.any())
+    estimates = estimates_due(view, first)
+    scenes = scenes_due(view, first, estimates, is_matching=is_matching)
+    # The share of the phase that is done. Pairs under way are not done.
+    pairs = phases[: state.rows]
+    total = state.rows
+    if phase is Phase.CONNECT:
+        pairs = phases[state.rows :]
+        total = int(connecting.sum())
+    pending = int((pairs.min(1) <= phase).sum()) if pairs.size else 0
+    order = tuple(estimates.tolist())
+    return NextWork(match, order, scenes, phase, total - pending, total, fit, view.stop)
+
+
+# Matching
+
+
+def phases_of(view: View, fit: int, connecting: Mask) -> NDArray[Any]:
+    """Return the phase (N, U) of each pair's missing units; ``NEVER`` for the other units."""
+    state = view.state
+    phases = np.full(view.missing.shape, NEVER, np.int8, order="F")
+    rows = phases[: state.rows]
+    for number in range(len(state.units)):
+        rows[:, number] = Phase.DEEPEN if number < fit else FILL
+        if state.is_crop[number]:
+            # Points from older crops are worth more than none: better crops come last.
+            rows[state.has[: state.rows, number], number] = FILL
+    sweep = sweeping_unit(state)
+    rows[:, sweep] = Phase.SWEEP
+    phases[state.rows :, sweep][connecting] = Phase.CONNECT
+    phases[~view.missing] = NEVER
+    return phases
+
+
+def sweeping_unit(state: State) -> int:
+    """Return the number of the first unit that can run, of stage 1 if possible."""
+    # A unit of stage 2 without points of stage 1 looks at whole images.
+    usable = np.flatnonzero(~state.unusable)
+    first = usable[~state.is_crop[usable]]
+    return int(next(iter([*first, *usable]), 0))
+
+
+def prefix_that_fits(view: View) -> int:
+    """Return the length of the longest prefix of the recipe that all rows can have in the time left."""
+    left = view.left * view.crew.matchers
+    if left <= 0:  # an unmeasured unit needs no time, but fits no more
+        return 0
+    return int(np.searchsorted(seconds_of_prefixes(view), left, side="right"))
+
+
+def seconds_of_prefixes(view: View) -> NDArray[np.float64]:
+    """Return the seconds (U,) of one worker for what rows miss of each prefix of the recipe."""
+    state = view.state
+    missing = view.missing[: state.rows]
+    forecasts = np.array([view.costs.forecast(unit.name) for unit in state.units])
+    count = len(state.units)
+    seconds = missing.sum(0) * forecasts
+    # New points of stage 1 give new crops, so the units of stage 2 run again in the same prefix.
+    missed = np.full(state.rows, count)  # the first missing unit of stage 1
+    for number in np.flatnonzero(~state.is_crop)[::-1].tolist():
+        missed[missing[:, number]] = number
+    for number in np.flatnonzero(state.is_crop).tolist():
+        again = state.current[: state.rows, number] & (missed < count)
+        prefixes = np.maximum(missed[again], number)
+        seconds += np.bincount(prefixes, minlength=count) * forecasts[number]
+    return np.asarray(np.cumsum(seconds))
+
+
+def pairs_to_connect(view: View) -> Mask:
+    """Return an (N - rows,) mask of the extra pairs that fit in a tenth of the time, the most useful first."""
+    state = view.state
+    count = len(state.pairs) - state.rows
+    if not count:
+        return np.zeros(0, bool)
+    sweep = sweeping_unit(state)
+    had = state.current[state.rows :, sweep]
+    seconds = view.costs.forecast(state.units[sweep].name) / view.crew.matchers
+    most = CONNECT_SHARE * (view.left + had.sum() * seconds)
+    return np.asarray(np.arange(1, count + 1) * seconds <= most)
+
+
+def match_job(view: View, phase: Phase, missing: Mask, ready: Mask) -> MatchJob:
+    """Return a job for the first pair, or on a GPU for a minibatch of pairs with the same missing units."""
+    state = view.state
+    order = state.order[ready[state.order]]
+    # Phase by phase in visiting order, in the end the weakest pairs first.
+    if phase is Phase.FILL:
+        order = order[np.argsort(state.inliers[order], kind="stable")]
+    first = int(order[0])
+    # Stage 1 first, because the crops come from its points.
+    numbers = sorted(np.flatnonzero(missing[first]).tolist(), key=state.is_crop.__getitem__)
+    units = [state.units[number] for number in numbers]
+    # What lost a worker before runs alone: pair by pair and unit by unit.
+    alone = any(("unit", first, unit.name) in state.tries.alone for unit in units)
+    size = 1 if alone else view.crew.minibatch
+    alike = order[:1]
+    if size > 1:
+        alike = order[(missing[order] == missing[first]).all(1)]
+    indices = tuple(alike[:size].tolist())
+    # A cost is learnt from one unit, and a job of several units takes a small share of the time.
+    seconds = [view.costs.mean(unit.name) if view.costs.is_known(unit.name) else inf for unit in units]
+    fits = np.cumsum(seconds) * len(indices) < JOB_SHARE * view.left
+    units = units[: 1 if alone else max(1, int(fits.sum()))]
+    expected = tuple(view.costs.mean(unit.name) for unit in units)
+    return MatchJob(phase, indices, tuple(units), expected, view.left, is_retry=alone)
+
+
+def upcoming_pairs(state: State, job: MatchJob, count: int) -> list[int]:
+    """Return the pairs that will probably be matched after a job."""
+    if job.phase is Phase.FILL:  # it depends on answers
+        return []
+    rank = int(np.flatnonzero(state.order == job.indices[-1])[0]) + 1
+    following: list[int] = state.order[rank : rank + count].tolist()
+    return following
+
+
+# Estimates and scenes
+
+
+def estimates_due(view: View, first: NDArray[Any]) -> NDArray[Any]:
+    """Return the rows to estimate now: first rows without an F, then rows with all units that fit in time.
+
+    ``first`` (N,) is the phase of each pair's next unit.
+    """
+    state = view.state
+    is_settled = (first >= FILL) & ~state.matching
+    due = lacking_estimates(state) & ~state.estimating & (is_settled | ~state.has_own)
+    order = state.order[due[state.order]]
+    return np.asarray(order[np.argsort(state.has_own[order], kind="stable")])
+
+
+def lacking_estimates(state: State) -> Mask:
+    """Return an (N,) mask of the rows whose estimate is not from the points in use."""
+    lacking = state.has.any(1) & ~state.estimated
+    lacking[state.rows :] = False  # extra pairs are for scenes alone
+    for item in state.tries.given_up:
+        match item:
+            case ("estimate", int(index)):
+                lacking[index] = False
+    return np.asarray(lacking)
+
+
+def scenes_due(view: View, first: NDArray[Any], estimates: NDArray[Any], *, is_matching: bool) -> tuple[str, ...]:
+    """Return the batches to reconstruct now; batches without any scene come first.
+
+    A batch's first scene waits for the units that fit in time, later scenes for all units until matching ends.
+    """
+    state = view.state
+    waiting = waiting_batches(state, view.crew)
+    if not waiting:
+        return ()
+    pending = state.estimating.copy()
+    pending[estimates] = True
+    if is_matching:
+        busy = pending | state.matching
+        waits = {False: busy | (first < FILL), True: busy | (first < NEVER)}
+    else:
+        # Near the end it is too late to wait for estimates.
+        waits = dict.fromkeys((False, True), pending & (view.now < view.stop))
+    # The number of pairs of each batch that are waited for, for a first and for a later scene.
+    counts = {}
+    for has_scene, waited in waits.items():
+        numbers = state.batch_of[waited]
+        counts[has_scene] = np.bincount(numbers[numbers >= 0], minlength=len(state.batches))
+    order = sorted(waiting, key=state.scenes.__contains__)
+    return tuple(batch for batch in order if not counts[batch in state.scenes][state.batches[batch]])
+
+
+def waiting_batches(state: State, crew: Crew) -> list[str]:
+    """Return the batches to reconstruct at some time, in their order."""
+    stale = state.stale - state.reconstructing
+    if not stale or not crew.scenes:
+        return []
+    matches = state.matches_of_batches()
+    return [batch for batch, number in state.batches.items() if batch in stale and matches[number]]
+
+
+def estimates_reserve(view: View) -> float:
+    """Return the seconds that the lacking estimates will probably take."""
+    count = int(lacking_estimates(view.state).sum())
+    return view.costs.mean(ESTIMATE) * count / view.crew.estimators
+
+
+def scenes_reserve(view: View) -> float:
+    """Return the seconds that the pending reconstructions will probably take, several at a time."""
+    state = view.state
+    if not state.stale or not view.crew.scenes:
+        return 0.0
+    stale = [state.batches[batch] for batch in state.stale]
+    forecasts = view.costs.scenes(state.matches_of_batches()[stale])
+    return float(max(forecasts.max(), forecasts.sum() / view.crew.scenes))
+
+
+# Time limits of jobs, and texts
+
+
+def match_patience(costs: Costs, job: MatchJob) -> float | None:
+    """Return the seconds after which a job counts as hung, warm-up included; ``None`` if a cost is unknown."""
+    if not all(costs.is_known(unit.name) for unit in job.units):
+        return None
+    expected = len(job.indices) * sum(costs.mean(unit.name) for unit in job.units)
+    return HANG_FACTOR * expected + costs.warm_up(job.units)
+
+
+def estimate_patience(costs: Costs, count: int) -> float | None:
+    return HANG_FACTOR * count * costs.mean(ESTIMATE) or None
+
+
+def scene_patience(costs: Costs, matches: int) -> float:
+    forecast = float(costs.scenes(np.array([matches]))[0])
+    return HANG_FACTOR * max(forecast, SCENE_START_S + SCENE_MATCH_S * matches)
+
+
+def is_complete(state: State, crew: Crew) -> bool:
+    """Whether all rows have all results that this run can compute, and so do all batches."""
+    if state.missing[: state.rows].any() or lacking_estimates(state).any():
+        return False
+    return not waiting_batches(state, crew)
+
+
+def outlook(state: State, costs: Costs, budget: Budget, crew: Crew, now: float) -> str:
+    """Return how long all missing units would take, and how many units fit in the time left.
+
+    Empty until each unit was measured.
+    """
+    usable = [unit for unit, lost in zip(state.units, state.unusable, strict=True) if not lost]
+    if not all(costs.is_known(unit.name) for unit in usable):
+        return ""
+    view = View(state, costs, budget, crew, now)
+    seconds = seconds_of_prefixes(view)[-1] / crew.matchers
+    text = f"all units on all pairs would take {format_duration(seconds)}"
+    if not isfinite(view.stop):
+        return f"{text}; there is no time limit"
+    fit = min(prefix_that_fits(view), len(usable))
+    left = format_duration(view.left)
+    return f"{text}; {fit} of {len(usable)} units fit in the remaining {left}"

@@ -1,0 +1,434 @@
+"""The schedule's decisions, and the engine on a virtual clock."""
+
+import math
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
+from statistics import mean, median
+
+import numpy as np
+import pytest
+from rectified import SECOND, SWEEP, THIRD, THREE_UNITS
+from simulator import (
+    Scenario,
+    SimulatedSite,
+    SimulatedWorker,
+    VirtualClock,
+    memory_store,
+    random_scenario,
+    simulate,
+    switch_off,
+    without_records,
+)
+
+from mkpc_kaggle.data.competition import Pair
+from mkpc_kaggle.engine.budget import Budget, Costs
+from mkpc_kaggle.engine.jobs import Cause, Failure, MatchJob, Phase
+from mkpc_kaggle.engine.keys import Keys
+from mkpc_kaggle.engine.loop import Engine
+from mkpc_kaggle.engine.request import Ending, Request
+from mkpc_kaggle.engine.schedule import Crew, NextWork, View, next_work, outlook, prefix_that_fits
+from mkpc_kaggle.engine.state import State
+from mkpc_kaggle.engine.store import Kind, Store
+from mkpc_kaggle.recipe import Unit
+
+DIED = Failure(Cause.DIED, "signal SIGKILL")
+UNITS = THREE_UNITS.units
+
+
+class Run:
+    """A state without a store, and workers whose units take a second each: what the schedule gives them."""
+
+    def __init__(
+        self,
+        count: int = 40,
+        limit: float = math.inf,
+        extra: int = 0,
+        had: Sequence[Sequence[Unit]] = (),
+        minibatch: int = 1,
+    ) -> None:
+        """``had`` are the units that the first pairs have had. Extra pairs are for scenes alone."""
+        pairs = [Pair(f"{n:03d}", "", f"{n:03d}.png", f"{n:03d}b.png") for n in range(count + extra)]
+        request = Request(pairs[:count], THREE_UNITS, Keys(tuple(unit.name for unit in UNITS)))
+        self.state = State(request, pairs[count:], {})
+        self.costs, self.budget = Costs(), Budget(0.0, limit, lambda: 0.0)
+        self.crew = Crew(minibatch=minibatch)
+        for index, units in enumerate(had):
+            self.have(index, units)
+
+    def have(self, index: int, units: Iterable[Unit]) -> None:
+        """Give the pair points of these units; other crops make those of stage 2 out of date."""
+        state = self.state
+        numbers = [UNITS.index(unit) for unit in units]
+        if any(UNITS[number].stage == 1 for number in numbers):
+            state.current[index, state.is_crop] = False
+        state.has[index, numbers] = state.current[index, numbers] = True
+
+    def learn(self, *units: Unit) -> None:
+        for unit in units:
+            self.costs.observe(unit.name, 1.0)
+
+    def next_work(self, now: float = 0.0) -> NextWork:
+        return next_work(self.state, self.costs, self.budget, self.crew, now)
+
+    def next(self, now: float = 0.0) -> MatchJob | None:
+        """The next job of matching, which is under way then."""
+        job = self.next_work(now).match
+        if job is not None:
+            self.state.begin(self.state.matching, job.indices)
+        return job
+
+    def finish(self, job: MatchJob, inliers: Callable[[int], int] = lambda _: 50) -> float:
+        """Every unit of a job took a second. Return the seconds of the job."""
+        self.state.end(self.state.matching, job.indices)
+        for index in job.indices:
+            self.have(index, job.units)
+            self.state.inliers[index] = inliers(index)
+            self.learn(*job.units)
+        return float(len(job.indices) * len(job.units))
+
+    def jobs(self, inliers: Callable[[int], int] = lambda _: 50) -> Iterator[MatchJob]:
+        """All jobs of a worker, each of which comes back before the next is planned."""
+        now = 0.0
+        while (job := self.next(now)) is not None:
+            yield job
+            now += self.finish(job, inliers)
+
+    @property
+    def is_complete(self) -> bool:
+        return not self.state.missing[: self.state.rows].any()
+
+
+def explained(texts: Iterable[object], text: str) -> bool:
+    return any(text in str(explanation) for explanation in texts)
+
+
+def test_the_phases_follow_each_other_and_every_pair_has_every_unit():
+    run = Run(extra=3)
+    phases = [job.phase for job in run.jobs()]
+    assert phases == sorted(phases, key=list(Phase).index)
+    assert run.is_complete
+    assert run.state.current[:40].all()
+    assert run.state.current[40:].sum(1).tolist() == [1, 1, 1]
+
+
+def test_the_schedule_has_no_memory_and_changes_nothing():
+    run = Run(9, limit=100.0, extra=3, had=[(SWEEP,), (SWEEP, THIRD)])
+    run.learn(*UNITS)
+    before = {name: np.copy(value) for name, value in vars(run.state).items() if isinstance(value, np.ndarray)}
+    first, second = run.next_work(), run.next_work()
+    assert first.match.indices == second.match.indices
+    assert (first.match.units, first.fit) == (second.match.units, second.fit)
+    for name, value in before.items():
+        np.testing.assert_array_equal(getattr(run.state, name), value)
+
+
+def test_no_pair_is_in_two_jobs_at_a_time_and_a_cost_is_learnt_from_one_unit():
+    run = Run(9)
+    jobs = []
+    while (job := run.next()) is not None:
+        jobs.append(job)
+    assert sorted(index for job in jobs for index in job.indices) == list(range(9))
+    assert {job.units for job in jobs} == {(SWEEP,)}
+
+
+def test_a_minibatch_has_pairs_that_lack_the_same_units():
+    run = Run(9, had=[(SWEEP,), (SWEEP, THIRD), (SWEEP,)], minibatch=4)
+    run.learn(*UNITS)
+    jobs = [run.next() for _ in range(4)]
+    assert [job.indices for job in jobs] == [(3, 4, 5, 6), (7, 8), (0, 2), (1,)]
+    assert [job.units for job in jobs] == [(SWEEP,), (SWEEP,), (THIRD, SECOND), (SECOND,)], "stage 1 first"
+
+
+def test_a_unit_that_was_lost_before_is_alone_in_its_job():
+    run = Run(3, had=[(SWEEP,)] * 3)
+    run.learn(*UNITS)
+    run.state.tries.alone.add(("unit", 0, SECOND.name))
+    assert [(job.units, job.is_retry) for job in (run.next(), run.next())] == [
+        ((THIRD,), True),
+        ((THIRD, SECOND), False),
+    ]
+
+
+def test_better_crops_come_after_all_units_that_fit_and_with_them_the_prefix_takes_longer():
+    run = Run(3, limit=100.0, had=[(SWEEP, SECOND)] * 3)
+    run.learn(*UNITS)
+    seconds = [view_of(run).left, 3 * 1.01 * 1.0]
+    assert prefix_that_fits(view_of(run)) == 3 and seconds[0] > 2 * seconds[1]
+    jobs = list(run.jobs())
+    assert [(job.units, job.phase) for job in jobs[:3]] == [((THIRD,), Phase.DEEPEN)] * 3
+    assert [(job.units, job.phase) for job in jobs[3:]] == [((SECOND,), Phase.FILL)] * 3
+    # The third unit costs every pair two seconds: its own and that of the new crops.
+    tight = Run(30, limit=60.0, had=[(SWEEP, SECOND)] * 30)
+    tight.learn(*UNITS)
+    assert prefix_that_fits(view_of(tight)) == 2
+
+
+def view_of(run: Run) -> View:
+    return View(run.state, run.costs, run.budget, run.crew, 0.0)
+
+
+def test_a_first_unit_that_never_runs_leaves_the_sweep_to_the_next_of_stage_1():
+    run = Run(5)
+    run.state.give_up(("matcher", SWEEP.name), DIED)
+    jobs = list(run.jobs())
+    assert [job.units[0] for job in jobs if job.phase is Phase.SWEEP] == [THIRD] * 5
+
+
+def test_nothing_is_told_of_costs_before_all_units_were_measured():
+    run = Run(limit=1000.0, had=[(SWEEP,)] * 40)
+    told = lambda: outlook(run.state, run.costs, run.budget, run.crew, 0.0)  # noqa: E731
+    run.learn(SWEEP, THIRD)
+    assert told() == ""
+    run.learn(SECOND)
+    assert told().startswith("all units on all pairs would take 1m52s; 3 of 3 units fit in the remaining ")
+
+
+@pytest.mark.parametrize("reserve", [0, 100])
+def test_a_unit_begins_only_if_it_ends_before_the_time_reserved_for_estimates_and_scenes(reserve):
+    run = Run(3, limit=100.0, had=[(SWEEP,)] * 3)
+    run.learn(*UNITS)
+    for _ in range(reserve):
+        run.costs.observe("estimate", 5.0)
+    now = run.budget.stop_units - 10.0
+    assert (run.next(now) is None) == bool(reserve)
+
+
+def test_units_that_do_not_fit_for_all_go_to_the_weakest_pairs_in_the_time_left():
+    run = Run(60, limit=100.0)
+    jobs = list(run.jobs(inliers=lambda index: index))
+    filled = [index for job in jobs if job.phase is Phase.FILL for index in job.indices]
+    assert filled == sorted(filled)
+    assert filled[0] < 3
+    assert not run.is_complete
+
+
+def test_pairs_for_the_scenes_alone_take_a_tenth_of_the_time_left_at_most():
+    run = Run(6, limit=100.0, extra=80)
+    jobs = list(run.jobs())
+    assert run.state.current[:6].all()
+    assert {job.units for job in jobs if job.phase is Phase.CONNECT} == {(SWEEP,)}
+    had = np.flatnonzero(run.state.current[6:].any(1)).tolist()
+    assert had == list(range(len(had))), "the most useful first"
+    assert 5 < len(had) < 10
+    assert run.is_complete
+
+
+def test_two_workers_fit_more_units_than_one():
+    run = Run(40, limit=100.0)
+    run.finish(MatchJob(Phase.SWEEP, (0,), UNITS, (1.0,) * 3, math.inf))
+    fits = []
+    for run.crew in (Crew(1), Crew(2)):
+        fits.append(run.next_work().fit)
+    assert fits[0] < fits[1] == 3
+
+
+def test_a_first_scene_waits_for_the_units_that_fit_and_a_later_scene_for_all():
+    run = Run(6, limit=1000.0, had=[(SWEEP,)] * 6)
+    pairs = run.state.request.pairs
+    run.state = State(run.state.request, [], {"": list(range(len(pairs)))})
+    for index in range(6):
+        run.have(index, (SWEEP, SECOND))
+        run.state.matches[index] = 50
+    run.state.estimated[:] = run.state.has_own[:] = True
+    run.learn(SWEEP, SECOND)
+    for _ in range(1000):  # the third unit does not fit for all
+        run.costs.observe(THIRD.name, 400.0)
+    assert run.next_work().scenes == ("",)
+    run.state.scenes[""] = None
+    assert run.next_work().scenes == ()
+    run.crew = replace(run.crew, can_match=False)
+    assert run.next_work().scenes == ("",)
+
+
+# The engine on a virtual clock
+
+
+def test_more_time_never_means_fewer_units():
+    runs = [simulate(Scenario(40, (1.0, 1.0, 1.0), 1, limit, misses=0)) for limit in (40.0, 80.0, 120.0, 999.0)]
+    units = [sum(len(record.units) for record in ran.report.records) for ran in runs]
+    assert units == sorted(units)
+    assert 0 < units[0] < 40 < units[1] < units[-1] == 120
+    assert all(ran.late == ran.lost == 0 for ran in runs)
+
+
+def test_random_runs_are_never_late_never_lose_a_row_and_use_their_time():
+    runs = [without_records(simulate(random_scenario(seed, pairs=150))) for seed in range(8)]
+    assert max(run.late for run in runs) == 0
+    assert sum(run.lost for run in runs) == 0
+    fit = [run for run in runs if run.scenes_fit]
+    assert sum(run.missed for run in fit) <= 0.03 * sum(run.scenario.batches for run in fit)
+    used = [run.utilisation for run in runs if run.work_left]
+    assert median(used) > 0.97
+    assert mean(used) > 0.94
+
+
+ABLATIONS = {  # a scenario that each mechanism of the plan serves
+    "reserve for scenes": Scenario(600, (1.0,), 1, 500.0, warm_up=1, batches=2, scene_seconds=0.05),
+    "margin of scenes": Scenario(400, (1.0,), 1, 500.0, warm_up=1, batches=8, scene_seconds=0.18),
+    "margin of units": Scenario(150, (1.0,) * 4, 1, 500.0, warm_up=1, spread=1.0),
+    "connect share": Scenario(100, (1.0,) * 3, 1, 300.0, warm_up=1, batches=2, pairs_per_image=6.0),
+    "short jobs": Scenario(100, (1.0,) * 8, 2, 300.0, warm_up=1, spread=0.5, crashes=0.01),
+    "patience": Scenario(150, (1.0, 1.0), 1, 400.0, warm_up=1, hangs=0.01, misses=0, seed=1),
+    "second try": Scenario(100, (1.0,), 1, 600.0, warm_up=1, crashes=0.05),
+    "end of tries": Scenario(100, (0.5, 1.0, 1.0), 1, 300.0, warm_up=1, never="m1"),
+}
+
+
+@pytest.mark.parametrize("mechanism", ABLATIONS)
+def test_a_mechanism_that_is_off_costs_units_or_scenes(monkeypatch, mechanism):
+    def gained() -> tuple[int, int]:
+        ran = simulate(ABLATIONS[mechanism])
+        return -ran.missed, sum(len(record.units) for record in ran.report.records)
+
+    whole = gained()
+    switch_off(mechanism, monkeypatch.setattr)
+    assert gained() < whole
+
+
+def test_planning_a_job_does_not_take_much_longer_for_many_pairs():
+    seconds_per_pair = []
+    for count in (100, 1_000):
+        start = time.thread_time()  # whatever else the machine does
+        simulate(Scenario(count, (0.1, 0.5, 0.5), 2, count))
+        seconds_per_pair.append((time.thread_time() - start) / count)
+    few, many = seconds_per_pair
+    assert many < 5 * few
+
+
+def test_scenes_are_done_in_parallel_with_matching_and_the_last_in_the_time_reserved_for_it():
+    ran = simulate(Scenario(600, (0.5, 1.0, 1.0), 1, 1200.0, warm_up=1, batches=6, scene_seconds=0.3))
+    assert ran.late == ran.lost == ran.missed == 0
+    assert ran.work_left
+    assert len({scene.batch for scene in ran.scenes}) == 6
+    assert sum(scene.begun + scene.seconds < ran.last_job for scene in ran.scenes) >= 5
+    assert ran.utilisation > 0.95
+
+
+def test_a_scene_that_hangs_is_ended_and_the_others_have_their_turn():
+    ran = simulate(Scenario(900, (0.5, 1.0), 1, 7200.0, batches=9, scene_faults=0.4, seed=3))
+    assert any(scene.seconds == math.inf for scene in ran.scenes)
+    assert ran.late == ran.lost == ran.missed == 0
+    assert any("the worker hung" in fault for fault in ran.report.faults)
+
+
+@pytest.mark.parametrize("moment", [50, 450, 850])
+def test_a_run_killed_at_any_moment_leaves_no_scene_out_of_date_when_it_resumes(moment):
+    scenario = Scenario(300, (0.5, 1.0), 1, 3600.0, batches=3, pairs_per_image=1.0, misses=0)
+    store = memory_store()
+    simulate(scenario, store, until=moment)
+    ran = simulate(scenario, store)
+    assert ran.report.ending is Ending.COMPLETE
+    assert ran.stale == set()
+    assert sum(len(record.units) for record in ran.report.records) == 600
+
+
+def test_time_reserved_for_scenes_is_used_for_units_when_they_need_less():
+    ran = simulate(Scenario(600, (0.1, 0.2, 0.3), 1, 280.0, warm_up=1, batches=1))
+    assert ran.work_left
+    assert ran.report.seconds > 275.0
+
+
+def test_a_job_of_an_earlier_request_is_saved_before_the_next_request_begins():
+    scenario = Scenario(10, (10.0,), 1, 1000.0, spread=0, misses=0, warm_up=0)
+    clock, nothing = VirtualClock(), Request((), scenario.recipe, scenario.keys)
+    time = Budget(0.0, scenario.limit, clock)
+    site = SimulatedSite(scenario, clock, time.stop_units)
+    pairs = [Pair(str(n), "", str(n), "b") for n in range(10)]
+    with Engine(site, memory_store(), time, interrupt=threading.Event(), progress=False) as engine:
+        engine.ask(replace(nothing, pairs=pairs), share=0.05)  # it ends amid the fifth pair
+        assert engine.state.has.sum() == 5
+        engine.ask(replace(nothing, pairs=pairs[4:6]))
+        report = engine.report()
+    assert (report.ending, report.units_run) == (Ending.COMPLETE, 6), "five, and the sixth"
+
+
+def test_scenes_that_never_begin_are_named_and_the_run_ends(monkeypatch):
+    monkeypatch.setattr(
+        SimulatedSite, "scene_worker", lambda site: SimulatedWorker(site, site.reconstruct, math.inf)
+    )
+    ran = simulate(Scenario(300, (0.5, 1.0), 1, 900.0, batches=3, misses=0))
+    assert ran.late == 0
+    assert explained(ran.report.faults, "scenes 0: the worker hung: no answer for ")
+    assert all(scene.failure for scene in ran.report.scenes)
+
+
+def test_a_lost_job_comes_back_as_single_units_and_a_unit_lost_twice_is_skipped_for_its_pair():
+    lost = []
+
+    class FailingSite(SimulatedSite):
+        def match(self, warm, job):
+            if job.indices == (2,) and any(unit.name == units[2].name for unit in job.units):
+                lost.append(([unit.name for unit in job.units], job.is_retry))
+                return 1.0, DIED, 1.0
+            return super().match(warm, job)
+
+    scenario = Scenario(4, (1.0,) * 3, 1, math.inf, spread=0, misses=0)
+    units = scenario.recipe.units
+    engine, report = ran_at(FailingSite, scenario)
+    assert lost == [(["1:m2@100", "2:m1@100"], False), (["1:m2@100"], True), (["1:m2@100"], True)]
+    assert engine.state.tries.given_up == {("unit", 2, "1:m2@100"): DIED}
+    assert explained(report.explanations, "1:m2@100 is skipped on pair 2 (the worker died: signal SIGKILL)")
+    assert report.ending is Ending.COMPLETE
+    assert engine.state.current.tolist() == [[True] * 3] * 2 + [[True, True, False], [True] * 3]
+
+
+def ran_at(site_class, scenario):
+    clock = VirtualClock()
+    time = Budget(0.0, scenario.limit, clock)
+    pairs = [Pair(str(n), "", str(n), "b") for n in range(scenario.pairs)]
+    site = site_class(scenario, clock, time.stop_units)
+    with Engine(site, memory_store(), time, interrupt=threading.Event(), progress=False) as engine:
+        engine.ask(Request(pairs, scenario.recipe, scenario.keys))
+        return engine, engine.report()
+
+
+def test_a_unit_that_never_ran_is_skipped_on_all_pairs_after_two():
+    scenario = Scenario(200, (1.0,) * 3, 1, math.inf, misses=0, never="m1")
+    engine, report = ran_at(SimulatedSite, scenario)
+    assert engine.state.unusable.tolist() == [False, True, False]
+    assert report.ending is Ending.COMPLETE
+    assert explained(report.explanations, "2:m1@100 is skipped on all pairs: it never ran")
+    assert sum("lost" in fault for fault in report.faults) == 1, "the same text is told once"
+
+
+def test_scenes_at_several_places_take_less_time_and_end_as_at_one():
+    scenario = Scenario(600, (0.1,), 1, math.inf, warm_up=1, batches=12, scene_seconds=0.3, misses=0)
+    one, four = (simulate(replace(scenario, scene_places=places)) for places in (1, 4))
+    assert one.missed == four.missed == 0
+    assert four.report.seconds < 0.6 * one.report.seconds
+    written = [[record.chosen_fundamental.tobytes() for record in ran.report.records] for ran in (one, four)]
+    assert written[0] == written[1]
+
+
+def test_the_loop_reads_nothing_back_but_the_points_that_crops_come_from(monkeypatch):
+    read, is_looping, loop = [], [], Engine._loop
+
+    def noted(engine: Engine) -> None:
+        is_looping.append(True)
+        loop(engine)
+        is_looping.clear()
+
+    def columns(store: Store, column: str, keys: Iterable[str]) -> Iterable[tuple[str, object]]:
+        asked = list(keys)
+        if is_looping and asked:
+            read.append((column, store.of_kind(Kind.POINTS).keys() >= set(asked)))
+        return whole(store, column, asked)
+
+    whole = Store._columns
+    monkeypatch.setattr(Engine, "_loop", noted)
+    monkeypatch.setattr(Store, "_columns", columns)
+    ran = simulate(Scenario(40, (1.0, 1.0), 1, math.inf, misses=0, batches=4))
+    assert len(ran.scenes) >= 4
+    assert set(read) == {("data", True)}
+    assert len(read) <= 40, "once for the unit of stage 2 on each pair"
+
+
+def test_reading_how_a_run_ended_changes_nothing():
+    scenario = Scenario(40, (1.0, 1.0), 1, 60.0, misses=0, batches=2)
+    engine, report = ran_at(SimulatedSite, scenario)
+    before = set(engine.state.stale), dict(engine.state.tries.given_up), engine.state.missing.tolist()
+    endings = {engine.ending for _ in range(3)}
+    assert endings == {report.ending}
+    assert before == (set(engine.state.stale), dict(engine.state.tries.given_up), engine.state.missing.tolist())

@@ -1,0 +1,373 @@
+"""The store: what is put is read again, damage has a name, a full disk costs nothing, the rest can be pruned."""
+
+import os
+import sqlite3
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rectified import SECOND, SWEEP, THIRD, THREE_UNITS
+
+from mkpc_kaggle.data.competition import Pair
+from mkpc_kaggle.engine.jobs import Estimated, Outcome, SceneJob
+from mkpc_kaggle.engine.keys import Keys
+from mkpc_kaggle.engine.loop import batches_of
+from mkpc_kaggle.engine.records import (
+    IMAGE,
+    About,
+    SceneRecord,
+    Table,
+    file_result,
+    read_points,
+    read_records,
+    read_scenes,
+    results,
+)
+from mkpc_kaggle.engine.request import Request
+from mkpc_kaggle.engine.state import State
+from mkpc_kaggle.engine.store import FILE_NAME, Kind, Result, Source, Store, to_bytes
+from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.geometry.cameras import Camera
+from mkpc_kaggle.geometry.coordinates import Box, Size
+from mkpc_kaggle.geometry.critical_region import CriticalRegion, RegionReason
+from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.pipeline.pair import UnitResult
+from mkpc_kaggle.recipe import Recipe, SceneConfig, Unit
+from mkpc_kaggle.scene.choose import Choice, Reason
+from mkpc_kaggle.scene.reconstruct import Solution
+from mkpc_kaggle.scene.reconstruction import Reconstruction, RegisteredImage, SfmModel, Sigmas
+from mkpc_kaggle.scene.view_graph import BatchImage
+
+F = np.arange(1.0, 10.0).reshape(3, 3)
+REGIONS = (
+    CriticalRegion(Box(1, 2, 30, 40), RegionReason.CROPPED, 3, 2),
+    CriticalRegion(Box(0, 0, 5, 6), RegionReason.TOO_SMALL),
+)
+RECIPE = replace(THREE_UNITS, units=(SWEEP, SECOND), scene=SceneConfig(pairs_per_image=0))
+CAMERA = Camera(np.diag([500.0, 500, 1]), np.eye(3)[[1, 0, 2]], np.array([0.0, 0.0, 1.0]))
+
+
+def pair_of(number: int) -> Pair:
+    """A pair of a batch, with its own image and a common one."""
+    return Pair(f"p{number}", "one", f"{number}.png", "c.png")
+
+
+def keys_of(recipe: Recipe, **other: str) -> Keys:
+    units = tuple(unit.name for unit in recipe.units)
+    return Keys(units, **{"mkpc": "m", "estimate": "e", "scene": "s"} | other)
+
+
+class Room:
+    """A store, and the state of a run of some pairs, whose answers are given by the test."""
+
+    def __init__(self, store: Store) -> None:
+        self.store = store
+        self.ask()
+
+    def ask(self, recipe: Recipe = RECIPE, count: int = 3, pairs: list[Pair] | None = None, **other: str) -> None:
+        """Begin a run, as the loop does. ``other`` are other settings."""
+        pairs = pairs or [pair_of(number) for number in range(count)]
+        request = Request(pairs, recipe, keys_of(recipe, **other), about=About({"name": "x"}))
+        self.state = State(request, [], batches_of(pairs))
+        about = self.store.of_kind(Kind.IMAGE)
+        names = {key.removeprefix(IMAGE): key for key in about if key.startswith(IMAGE)}
+        self.state.restore(self.store, {name: about[key]["digest"] for name, key in names.items()})
+
+    def match(self, index: int, *units: Unit, digest: str = "") -> None:
+        """Save points of a pair whose first image has this content, by default its own."""
+        matches = matches_of(index)
+        name0, name1 = self.state.names[index]
+        images = BatchImage(name0, digest or name0, Size(80, 60)), BatchImage(name1, "common", Size(80, 60), 99.0)
+        found = tuple(UnitResult(unit, matches, 0.5, 0.25) for unit in units)
+        outcome = Outcome(index, images, ((1, 1), (2, 2)), found, REGIONS, "", 0.1, 0.2)
+        rows = self.state.results_of(outcome, self.state.first_stage(index))
+        self.store.put(rows)
+        self.state.take(outcome, rows)
+
+    def estimate(self, index: int) -> None:
+        keys = tuple(self.state.inputs_of(index).points.values())
+        each = Estimated(index, keys, tuple(range(7, 7 + len(keys))), F, magsac=2 * F)
+        row = self.state.estimate_result(each)
+        self.store.put([row])
+        self.state.take_estimate(each, row)
+
+    def reconstruct(self) -> None:
+        state = self.state
+        indices, key = state.scene_inputs("one")
+        sigmas = {"0.png": Sigmas(0.1, 0.02, 3.0), "1.png": ()}
+        placed = [RegisteredImage(BatchImage(name, "d", Size(80, 60)), CAMERA, 9, sigmas[name]) for name in sigmas]
+        model = SfmModel(tuple(placed), np.array([[0.0, 0.0, 5.0]]), 0.7)
+        choices = [Choice(3 * F, Reason.SCENE), *[Choice(None, Reason.UNREGISTERED)] * (len(indices) - 1)]
+        answer = Solution((Reconstruction(tuple(sigmas), (model,)),), tuple(choices))
+        pairs = tuple(map(state.inputs_of, indices))
+        contents = tuple(map(state.contents, indices))
+        job = SceneJob("one", key, pairs, contents, RECIPE, Source(None, {}))
+        self.store.put([state.scene_result(job, answer, 1.5)])
+        state.use_scene("one", key, SceneRecord.of_solution("one", answer, contents, 1.5))
+        state.stale.discard("one")
+
+    def publish(self) -> None:
+        self.store.put([self.state.table().to_result()])
+
+    def replace(self, name: str) -> None:
+        """Give an image another content, as the next start of a run notices."""
+        self.store.put([file_result(name, "new", (3, 3))])
+        self.ask()
+
+    @property
+    def standing(self) -> tuple[int, int, bool]:
+        """The number of pairs with points of today, of estimates of today, and whether the scene is."""
+        return int(self.state.current.any(1).sum()), int(self.state.estimated.sum()), not self.state.stale
+
+
+def matches_of(index: int) -> Matches:
+    rng = np.random.default_rng(index)
+    return Matches(rng.random((30, 2)), rng.random((30, 2)), rng.random(30))
+
+
+@pytest.fixture
+def room(tmp_path: Path) -> Iterator[Room]:
+    with Store.open(tmp_path) as store:
+        yield Room(store)
+
+
+@pytest.fixture
+def whole(room: Room) -> Room:
+    """Two of three pairs with points, estimates and a scene."""
+    for index in (0, 1):
+        room.match(index, SWEEP, SECOND)
+        room.estimate(index)
+    room.reconstruct()
+    room.publish()
+    return room
+
+
+def test_what_is_put_is_read_after_opening_again(whole: Room, tmp_path: Path) -> None:
+    before = read_records(whole.store), read_scenes(whole.store)
+    whole.store.close()
+    with Store.open(tmp_path) as again:
+        records, scenes = read_records(again), read_scenes(again)
+        assert [record.source for record in records] == ["scene", "pair", "fallback"]
+        found = [(unit.unit, unit.matches, unit.inliers) for unit in records[1].units]
+        assert found == [(SWEEP.name, 30, 7), (SECOND.name, 30, 8)]
+        assert records[0].regions == REGIONS
+        assert np.array_equal(records[0].chosen_fundamental, 3 * F)
+        assert np.array_equal(records[0].magsac_fundamental, 2 * F)
+        assert scenes == before[1]
+        (model,), (known,) = scenes["one"].models, before[1]["one"].models
+        assert (model.points.tolist(), model.reprojection_error) == ([[0.0, 0.0, 5.0]], 0.7)
+        for image, other in zip(model.images, known.images, strict=True):
+            assert (image.image, image.points, image.sigmas) == (other.image, other.points, other.sigmas)
+            for part in ("K", "R", "t"):
+                assert np.array_equal(getattr(image.camera, part), getattr(other.camera, part))
+        assert [record.units for record in records] == [record.units for record in before[0]]
+        points = read_points(again, Table.of(again), 0)
+        assert to_bytes(points[SWEEP.name]) == to_bytes(matches_of(0))
+        assert Table.of(again).about.recipe == {"name": "x"}
+
+
+def test_results_are_data_frames_of_pairs_units_and_cameras(whole: Room, tmp_path: Path) -> None:
+    pairs, units, cameras = results(tmp_path)
+    assert pairs["pair"].tolist() == ["p0", "p1", "p2"]
+    assert pairs["source"].tolist() == ["scene", "pair", "fallback"]
+    assert pairs[["f11", "f33"]].iloc[0].tolist() == [3.0, 27.0]
+    assert units.groupby("unit")["inliers"].sum().to_dict() == {SWEEP.name: 14, SECOND.name: 16}
+    assert cameras[["image", "focal"]].to_numpy().tolist() == [["0.png", 500.0], ["1.png", 500.0]]
+    assert cameras["centre_sigma"].isna().tolist() == [False, True]
+
+
+CHANGES = {  # and: pairs with points of before, with an estimate of today, and whether the scene is today's
+    "nothing": (lambda room: room.ask(), (2, 2, True)),
+    "unit added": (lambda room: room.ask(replace(RECIPE, units=(SWEEP, SECOND, SECOND_360))), (2, 2, True)),
+    "unit removed": (lambda room: room.ask(replace(RECIPE, units=(SWEEP,))), (2, 0, False)),
+    "threshold": (lambda room: room.ask(estimate="other"), (2, 0, True)),  # until there are other estimates
+    "scene": (lambda room: room.ask(scene="other"), (2, 2, False)),
+    "crops": (lambda room: room.ask(mkpc="other"), (2, 2, True)),  # until the others are there
+    "pair added": (lambda room: room.ask(count=4), (2, 2, True)),
+    "content": (lambda room: room.replace("0.png"), (1, 1, False)),
+    "content of second images": (lambda room: room.replace("c.png"), (0, 0, False)),
+    "more points": (lambda room: room.match(2, SWEEP), (3, 2, False)),
+}
+SECOND_360 = replace(SECOND, long_side=360)
+
+
+@pytest.mark.parametrize(("change", "standing"), CHANGES.values(), ids=CHANGES)
+def test_a_result_is_of_today_if_it_is_stored_under_the_key_of_today(whole: Room, change, standing) -> None:
+    change(whole)
+    assert whole.standing == standing
+
+
+def test_new_points_of_stage_1_make_those_of_stage_2_out_of_date_but_they_stay_in_use(room: Room) -> None:
+    recipe = replace(RECIPE, units=(SWEEP, SECOND, THIRD))
+    room.ask(recipe)
+    room.match(0, SWEEP, SECOND)
+    assert room.state.current[0].tolist() == [True, True, False]
+    room.match(0, THIRD)
+    assert room.state.current[0].tolist() == [True, False, True]
+    assert room.state.has[0].all()
+    room.publish()
+    room.ask(recipe)  # the same after a restart
+    assert room.state.current[0].tolist() == [True, False, True]
+    assert room.state.has[0].all()
+    room.match(0, SECOND)
+    assert room.state.current[0].all()
+
+
+def test_an_image_that_is_put_back_has_its_results_again(whole: Room) -> None:
+    whole.replace("0.png")
+    assert whole.standing == (1, 1, False)
+    whole.store.put([file_result("0.png", "0.png", (4, 4))])
+    whole.ask()
+    assert whole.standing == (2, 2, True)
+
+
+def test_former_results_are_of_today_again_when_the_former_settings_return(whole: Room) -> None:
+    whole.ask(replace(RECIPE, units=(SWEEP,)), estimate="other", scene="other")
+    for index in (0, 1):
+        whole.estimate(index)
+    whole.reconstruct()
+    whole.publish()
+    whole.ask()
+    assert whole.standing == (2, 2, True)
+
+
+def test_the_f_of_before_stays_until_there_is_one_of_today_but_not_for_another_image(whole: Room) -> None:
+    whole.ask(estimate="other", scene="other")
+    assert whole.state.has_own.tolist() == [True, True, False]
+    assert set(whole.state.scenes) == {"one"}
+    whole.match(0, SWEEP, SECOND, digest="new")
+    assert whole.state.has_own.tolist() == [False, True, False]
+    whole.publish()
+    whole.ask(estimate="other", scene="other")
+    assert whole.state.scenes == {}
+
+
+def test_rows_of_the_same_images_share_their_points_and_turned_images_are_others(room: Room) -> None:
+    pairs = [pair_of(0), pair_of(1), replace(pair_of(0), id="again")]
+    room.ask(pairs=pairs)
+    room.state.begin(room.state.matching, [0])
+    assert room.state.matching.tolist() == [True, False, True]
+    room.match(0, SWEEP)
+    assert room.state.current[:, 0].tolist() == [True, False, True]
+    room.ask(pairs=[replace(pairs[0], turns=(1, 0))])
+    assert not room.state.current.any()
+
+
+def test_results_are_put_all_or_none(room: Room) -> None:
+    with pytest.raises(sqlite3.IntegrityError):
+        room.store.put([Result("a", Kind.SCENE, 1.0), Result("b", Kind.SCENE, np.nan)])
+    assert room.store.about(["a", "b"]) == {}
+
+
+def test_what_a_full_disk_refuses_is_in_memory_and_written_when_there_is_room(tmp_path: Path) -> None:
+    rows = [Result(f"key {n}", Kind.POINTS, n, bytes(600)) for n in range(200)]
+    with Store.open(tmp_path) as store:
+        (pages,) = store._db.execute("PRAGMA page_count").fetchone()
+        store._db.execute(f"PRAGMA max_page_count = {pages + 5}")
+        for row in rows:
+            store.put([row])
+        assert "full" in store.trouble
+        assert store.about(row.key for row in rows) == {row.key: row.about for row in rows}
+        assert store.source([rows[-1].key]).data([rows[-1].key]) == {rows[-1].key: rows[-1].data}
+        store._db.execute("PRAGMA max_page_count = 100000")
+    with Store.read(tmp_path) as again:
+        assert len(again.data(row.key for row in rows)) == 200
+
+
+def test_a_prune_removes_what_the_table_of_pairs_does_not_name(whole: Room, tmp_path: Path) -> None:
+    named = set(Table.of(whole.store).keys)
+    unnamed = Result("unnamed", Kind.POINTS, {}, bytes(1 << 20))
+    features = Result("features", Kind.FEATURES, None, b"kept")
+    whole.store.put([unnamed, features])
+    whole.store.close()
+    before = (tmp_path / FILE_NAME).stat().st_size
+    with Store.open(tmp_path) as store:
+        freed = store.prune(Table.of(store).keys)
+    assert freed >= 1 << 20
+    assert (tmp_path / FILE_NAME).stat().st_size == before - freed
+    with Store.read(tmp_path) as store:
+        kinds = (Kind.POINTS, Kind.ESTIMATE, Kind.SCENE)
+        assert {key for kind in kinds for key in store.of_kind(kind)} == named
+        assert store.data(["features"]) == {"features": b"kept"}
+
+
+DAMAGES = [
+    ("PRAGMA ignore_check_constraints = ON; UPDATE result SET about = '{'", "CHECK constraint failed"),
+    ("PRAGMA writable_schema = ON; UPDATE sqlite_master SET sql = 'x' WHERE name = 'result'", "malformed"),
+]
+
+
+@pytest.mark.parametrize(("damage", "told"), DAMAGES)
+def test_damage_is_what_sqlite_calls_damage(whole: Room, tmp_path: Path, damage: str, told: str) -> None:
+    whole.store.close()
+    with closing(sqlite3.connect(tmp_path / FILE_NAME)) as db:
+        db.executescript(damage)
+    with pytest.raises(UserError, match=rf"journal\.sqlite is damaged \(.*{told}.*delete it with --fresh"):
+        Store.open(tmp_path)
+    with Store.open(tmp_path, fresh=True) as store:
+        assert store.of_kind(Kind.POINTS) == {}
+
+
+def test_a_bug_in_a_reader_is_no_damage(whole: Room, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mkpc_kaggle.engine.records.Row", lambda *_: None)
+    with pytest.raises(AttributeError):
+        read_records(whole.store)
+
+
+def test_an_error_of_the_disk_is_no_damage_and_no_bad_input(whole: Room, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Failing:
+        def execute(self, *_: object) -> None:
+            error = sqlite3.OperationalError("disk I/O error")
+            error.sqlite_errorcode = sqlite3.SQLITE_IOERR_READ
+            raise error
+
+    monkeypatch.setattr(whole.store, "_unsaved", {})
+    whole.store._db, healthy = Failing(), whole.store._db
+    with pytest.raises(sqlite3.OperationalError, match="disk I/O error"):
+        whole.store.about(["key"])
+    whole.store._db = healthy
+
+
+def test_a_store_of_another_format_and_an_old_sqlite_are_refused_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with closing(sqlite3.connect(tmp_path / FILE_NAME)) as db:
+        db.execute("CREATE TABLE run (key TEXT PRIMARY KEY, value TEXT NOT NULL)")  # as format 10
+        db.execute("PRAGMA user_version = 15")
+    with pytest.raises(UserError, match=r"another version of this program \(its format is not \d+\).*--fresh"):
+        Store.open(tmp_path)
+    Store.open(tmp_path, fresh=True).close()
+    monkeypatch.setattr(sqlite3, "sqlite_version_info", (3, 36, 0))
+    with pytest.raises(UserError, match=r"Python needs 3\.37 or newer"):
+        Store.open(tmp_path)
+
+
+def test_files_in_the_place_of_the_store_or_its_lock_are_named(tmp_path: Path) -> None:
+    for number, name in enumerate(("journal.lock", "journal.sqlite")):
+        directory = tmp_path / str(number)
+        directory.mkdir()
+        os.mkfifo(directory / name)
+        with pytest.raises(UserError, match=f"{name} is not a regular file"):
+            Store.open(directory)
+    (tmp_path / "journal.lock").write_bytes(b"not a database" * 100)
+    with pytest.raises(UserError, match=r"journal\.lock is damaged .*remove it"):
+        Store.open(tmp_path)
+
+
+def test_a_store_in_use_is_refused(tmp_path: Path) -> None:
+    with Store.open(tmp_path), pytest.raises(UserError, match="is another run using it"):
+        Store.open(tmp_path)
+
+
+def test_a_refused_store_holds_no_lock_and_no_file(tmp_path: Path) -> None:
+    Store.open(tmp_path).close()
+    (tmp_path / FILE_NAME).write_bytes(b"not a database" * 100)
+    with pytest.raises(UserError) as caught:
+        Store.open(tmp_path)
+    assert caught  # as a notebook keeps the last traceback
+    open_files = [str(link.readlink()) for link in Path("/proc/self/fd").iterdir() if link.is_symlink()]
+    assert not [name for name in open_files if name.startswith(str(tmp_path))]
+    Store.open(tmp_path, fresh=True).close()
