@@ -367,6 +367,8 @@ class Engine:
         state = self.state
         assert state is not None
         state.begin(state.matching, job.indices)
+        if job.phase is Phase.FILL:
+            state.begin(state.filling, job.indices)
         # Crops come from points of today alone. Others may be of former settings.
         crops = [tuple(state.first_stage(index)) for index in job.indices]
         known: list[tuple[UnitResult, ...]] = [()] * len(crops)
@@ -519,6 +521,7 @@ class Engine:
         # First the store, in one transaction: what the state has is never lost.
         self.store.put(result for rows in results for result in rows)
         state.end(state.matching, job.indices)
+        state.end(state.filling, job.indices)
         for outcome, rows in zip(answer, results, strict=True):
             state.take(outcome, rows)
             for found in outcome.found:
@@ -588,6 +591,7 @@ class Engine:
             case MatchJob():
                 assert state is not None
                 state.end(state.matching, job.indices)
+                state.end(state.filling, job.indices)
                 self._lose_points(state, job, failure)
             case EstimateJob():
                 assert state is not None

@@ -108,7 +108,7 @@ def next_work(state: State, costs: Costs, budget: Budget, crew: Crew, now: float
         match = match_job(view, phase, wanted <= phase, best == phase)
     is_matching = match is not None or bool(state.matching.any())
     estimates = estimates_due(view, first)
-    scenes = scenes_due(view, first, estimates, is_matching=is_matching)
+    scenes = scenes_due(view, phase, first, estimates, is_matching=is_matching)
     # The share of the phase that is done. Pairs under way are not done.
     pairs = phases[: state.rows]
     total = state.rows
@@ -248,7 +248,9 @@ def lacking_estimates(state: State) -> Mask:
     return np.asarray(lacking)
 
 
-def scenes_due(view: View, first: NDArray[Any], estimates: NDArray[Any], *, is_matching: bool) -> tuple[str, ...]:
+def scenes_due(
+    view: View, phase: Phase, first: NDArray[Any], estimates: NDArray[Any], *, is_matching: bool
+) -> tuple[str, ...]:
     """Return the batches to reconstruct now; batches without any scene come first.
 
     A batch's first scene waits for the units that fit in time, later scenes for all units until matching ends.
@@ -260,8 +262,14 @@ def scenes_due(view: View, first: NDArray[Any], estimates: NDArray[Any], *, is_m
     pending = state.estimating.copy()
     pending[estimates] = True
     if is_matching:
-        busy = pending | state.matching
-        waits = {False: busy | (first < FILL), True: busy | (first < NEVER)}
+        early = first < FILL
+        if phase < FILL:
+            early |= pending | state.matching
+        else:
+            # Some pair of a batch is at work all the time now. A first scene takes what there is: any
+            # scene is better than none, and tells what the others will cost.
+            early |= (pending & ~state.has_own) | (state.matching & ~state.filling)
+        waits = {False: early, True: pending | state.matching | (first < NEVER)}
     else:
         # Near the end it is too late to wait for estimates.
         waits = dict.fromkeys((False, True), pending & (view.now < view.stop))

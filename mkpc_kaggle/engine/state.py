@@ -55,7 +55,7 @@ class State:
 
     Of a pair (N,): ``estimates``, the key of the estimate in use; ``estimated``, it is today's; ``inliers``,
     the F ``own`` (N, 3, 3) and ``has_own``, it is no fallback. ``matching`` and ``estimating`` are the pairs of
-    jobs under way. ``by_scene`` (N, 3, 3) and ``scene_source`` are the F that the scene in use gives, if any.
+    jobs under way, and ``filling`` those in the last phase. ``by_scene`` (N, 3, 3) and ``scene_source`` are the F that the scene in use gives, if any.
 
     Of a batch: ``batches`` has its number by name, ``members`` its pairs; ``batch_of`` (N,) is -1 for a pair
     without one. ``scenes`` has the scenes in use, ``stale`` the batches whose scene is not today's, and
@@ -82,7 +82,7 @@ class State:
         self.estimates = np.full(count, "", object)
         self.own = np.tile(FALLBACK_FUNDAMENTAL, (count, 1, 1))
         self.estimated, self.has_own = (np.zeros(count, bool) for _ in range(2))
-        self.matching, self.estimating = (np.zeros(count, bool) for _ in range(2))
+        self.matching, self.filling, self.estimating = (np.zeros(count, bool) for _ in range(3))
         self.inliers = np.zeros(count, int)
         self.by_scene = np.zeros((count, 3, 3))
         self.scene_source = np.full(count, FALLBACK)
@@ -514,7 +514,7 @@ class State:
         self.tries = Tries()
         self._new.update(range(len(self.pairs)))
         self.skipped[:] = False
-        self.matching[:] = False
+        self.matching[:] = self.filling[:] = False
 
     @property
     def unusable(self) -> Mask:

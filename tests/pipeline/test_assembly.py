@@ -263,8 +263,9 @@ def test_a_matcher_that_only_a_worker_cannot_load_costs_its_units_and_is_told(
     """As with a damaged record, which shows when its numbers are read."""
     monkeypatch.setattr(availability, "misfit", lambda *_: "")
     assert submitted(demo, tmp_path, "own", misfits) == (0, [])
-    told = capsys.readouterr().out
-    assert "units that failed: 1\n  1:aliked@320: aliked cannot be loaded: the weights for 'aliked-n16'" in told
+    told = capsys.readouterr()
+    assert told.err.count("aliked is left out: the weights for 'aliked-n16'") == 1
+    assert "faults: 1\n  aliked is left out: the weights for 'aliked-n16'" in told.out
 
 
 def points_keys(assembly: Assembly) -> tuple[str, ...]:
