@@ -55,7 +55,8 @@ class State:
 
     Of a pair (N,): ``estimates``, the key of the estimate in use; ``estimated``, it is today's; ``inliers``,
     the F ``own`` (N, 3, 3) and ``has_own``, it is no fallback. ``matching`` and ``estimating`` are the pairs of
-    jobs under way, and ``filling`` those in the last phase. ``by_scene`` (N, 3, 3) and ``scene_source`` are the F that the scene in use gives, if any.
+    jobs under way, and ``filling`` those in the last phase. ``by_scene`` (N, 3, 3) and ``scene_source`` are the
+    F that the scene in use gives, if any.
 
     Of a batch: ``batches`` has its number by name, ``members`` its pairs; ``batch_of`` (N,) is -1 for a pair
     without one. ``scenes`` has the scenes in use, ``stale`` the batches whose scene is not today's, and

@@ -238,7 +238,7 @@ def test_a_program_leaves_without_what_an_interpreter_does_at_its_end():
     late = "import atexit; atexit.register(print, 'late'); "
     done = python(late + "from mkpc_kaggle.cli import program; program(['recipes'])")
     assert (done.returncode, done.stderr) == (0, "")
-    assert "auto: " in done.stdout
+    assert "auto " in done.stdout
     assert "late" not in done.stdout
 
 
