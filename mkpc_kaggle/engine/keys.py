@@ -1,7 +1,8 @@
 """Keys: the digest of everything that a result was computed from.
 
-A result is up to date exactly if it is stored under the key that a computation today would have. Nothing else
-says so. Each kind has a version of its algorithm: increase it if the same inputs give other results.
+A result is up to date exactly if it is stored under the key that a computation today would have.
+Nothing else says so. Each kind has a version of its algorithm: increase it if the same inputs give
+other results.
 """
 
 import hashlib
@@ -91,7 +92,9 @@ class Keys:
         return text_digest([self.estimate, *known, "points", *points])
 
     def of_scene(self, inputs: Sequence[Sequence[Any]]) -> str:
-        """Return the key of a scene. Each input is a pair: names, digests, keys of its points and estimate."""
+        """Return the key of a scene. Each input is a pair: names, digests, keys of its points and
+        estimate.
+        """
         return digest([self.scene, inputs])
 
 
