@@ -65,11 +65,6 @@ class Masks:
         """Return the digest of an image's mask; empty without a mask."""
         return self.files.get(image, ("", ""))[1]
 
-    @property
-    def digests(self) -> list[str]:
-        """The images with a mask and the digests of the masks, for the settings of a run."""
-        return [f"{Path(image).name} {digest}" for image, (_, digest) in sorted(self.files.items())]
-
 
 def _require_usable(path: Path, image: Path) -> None:
     if not path.is_file():

@@ -103,7 +103,6 @@ class Assembly:
             "weights": {
                 slot: file.digest for slot, file in self.weight_files.items() if slot in slots
             },
-            **({"masks": self.masks.digests} if self.masks.files else {}),
         }
 
     @property

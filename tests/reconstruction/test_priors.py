@@ -77,7 +77,7 @@ def write_masks(folder: Path, root: Path, left: int = 400) -> Path:
             HEAD + "00.png,SIMPLE_PINHOLE,900 4000 300,fixed\n",
             "line 2: the principal point 4000, 300 is outside",
         ),
-        ("\xff\x00", "lacks the columns"),
+        ("\xff\x00", "line contains NUL"),
         (None, "no such file"),
     ],
 )
@@ -168,6 +168,10 @@ def test_another_mask_is_matched_again_and_other_intrinsics_are_not(tmp_path):
             run(root, out, matcher, known=known, masks=masks)
             assert len(matcher.calls) == calls
         write_masks(folder, root, 250)
+    cv2.imwrite(str(folder / "00.png.png"), np.ones((SIZE.height, SIZE.width), np.uint8))
+    matcher = MixedMatcher()
+    run(root, out, matcher, known=known, masks=Masks.of_folder(folder, root, root.iterdir()))
+    assert len(matcher.calls) == FIRST - 1, "the pairs of the image whose mask changed"
     run(root, out)
     assert contents(out) == before, "without the options, the first results again"
 
