@@ -1,9 +1,11 @@
-"""Accuracy by time limit: mAA of scenes at limits of 1, 2, 4, 8 and 16 times the sweep's time, on the real clock.
+"""Accuracy by time limit: mAA of scenes at limits of 1, 2, 4, 8 and 16 times the sweep's time, on
+the real clock.
 
 python -m benchmarks.anytime --train-dir DIR --out FIGURE.png [--recipes classical light] [--runs 2] [-- OPTION...]
 
-OPTIONs are options of `validate`, such as `--scenes A,B`. The sweep is a run of the recipe's first unit alone,
-timed from process start to end. *Early* is the minimum time between a process's end and its limit; negative: late.
+OPTIONs are options of `validate`, such as `--scenes A,B`. The sweep is a run of the recipe's first
+unit alone, timed from process start to end. *Early* is the minimum time between a process's end and
+its limit; negative: late.
 """
 
 import argparse
@@ -25,13 +27,23 @@ def timed(arguments: list[str]) -> tuple[float, float]:
     with TemporaryDirectory() as directory:
         result = Path(directory) / "scores.json"
         start = time.monotonic()
-        command = [sys.executable, "-m", "mkpc_kaggle", "validate", "--json", str(result), *arguments]
+        command = [
+            sys.executable,
+            "-m",
+            "mkpc_kaggle",
+            "validate",
+            "--json",
+            str(result),
+            *arguments,
+        ]
         subprocess.run(command, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         return json.loads(result.read_text())["mAA"], time.monotonic() - start
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--train-dir", required=True)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--recipes", nargs="+", default=["classical", "light"])
@@ -45,12 +57,16 @@ def main() -> None:
         _, sweep = timed([*side, "--no-scenes", "--units", load_recipe(recipe).units[0].name])
         means = []
         for factor in FACTORS:
-            runs = [timed([*side, "--time-limit", f"{factor * sweep:.1f}"]) for _ in range(given.runs)]
+            runs = [
+                timed([*side, "--time-limit", f"{factor * sweep:.1f}"]) for _ in range(given.runs)
+            ]
             early = min(factor * sweep - seconds for _, seconds in runs)
             means.append(sum(maa for maa, _ in runs) / len(runs))
             scores = " ".join(f"{maa:.3f}" for maa, _ in runs)
             print(f"{recipe:12}{factor * sweep:9.1f}s{early:7.1f}s  {scores}", flush=True)
-        axes.plot([*map(str, FACTORS)], means, "o-", label=f"{recipe}: the sweep takes {sweep:.0f} s")
+        axes.plot(
+            [*map(str, FACTORS)], means, "o-", label=f"{recipe}: the sweep takes {sweep:.0f} s"
+        )
     axes.set(ylim=(0, 1), xlabel="time limit / sweep")
     axes.legend(fontsize=8, frameon=False)
     save(axes.figure, given.out)

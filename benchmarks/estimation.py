@@ -1,4 +1,5 @@
-"""Scores of F by MAGSAC, with a prior on focal lengths, and from a batch's cameras, on the same matches.
+"""Scores of F by MAGSAC, with a prior on focal lengths, and from a batch's cameras, on the same
+matches.
 
 python -m benchmarks.estimation --train-dir DIR --journals DIR [DIR ...] [--scenes NAME ...]
     [--estimates NAME ...] [--thresholds PIXELS ...] [--settings TOML ...]
@@ -7,11 +8,12 @@ python -m benchmarks.estimation --train-dir DIR --journals DIR [DIR ...] [--scen
 Journals, the work directories of `validate`, provide the matches and each pair's own F. A journal made with
 ``--min-covisibility 0`` also has the extra pairs that a scene may add; they are not scored.
 
-The unit of evidence is a draw: some or all images of a scene, and a share of their pairs. The output has a table
-for each journal and share. Each row has an estimate's mAA by scene, gain over the first estimate, and CPU seconds
-per pair or batch. Intervals resample images if each scene has one draw, and draws otherwise; the mean's
-interval then also resamples scenes. ``--settings`` gives a row for each line of a recipe's table [scene], such as
-"cameras = 'image'". ``--thresholds`` replaces the rows by two rows for each threshold of MAGSAC.
+The unit of evidence is a draw: some or all images of a scene, and a share of their pairs. The
+output has a table for each journal and share. Each row has an estimate's mAA by scene, gain over
+the first estimate, and CPU seconds per pair or batch. Intervals resample images if each scene has
+one draw, and draws otherwise; the mean's interval then also resamples scenes. ``--settings`` gives
+a row for each line of a recipe's table [scene], such as "cameras = 'image'". ``--thresholds``
+replaces the rows by two rows for each threshold of MAGSAC.
 """
 
 import argparse
@@ -63,7 +65,8 @@ class Known:
         return self.true.pair.names
 
 
-# Returns the F of the pairs in the first list; the second list has all pairs of their images in the journal.
+# Returns the F of the pairs in the first list; the second list has all pairs of their images in the
+# journal.
 Estimator: TypeAlias = Callable[[Sequence[Known], Sequence[Known]], Sequence[Matrix3 | None]]
 
 
@@ -99,19 +102,25 @@ PAIR_ESTIMATORS: dict[str, Estimator] = {
 
 
 def by_scene(settings: str, pairs: Sequence[Known], every: Sequence[Known]) -> list[Matrix3 | None]:
-    """Return the F of pairs reconstructed as one batch, together with the first unit's matches of extra pairs."""
+    """Return the F of pairs reconstructed as one batch, together with the first unit's matches of
+    extra pairs.
+    """
     config = from_table(SceneConfig, tomllib.loads(settings), settings)
     batch = [batch_pair(pair.true, pair.found, pair.F) for pair in pairs]
     for extra in extra_of(pairs, every, config):
         batch.append(batch_pair(extra.true, replace(extra.found, results=extra.found.results[:1])))
     choices = reconstruct_batch(batch, config).choices[: len(pairs)]
-    return [pair.F if choice.F is None else choice.F for pair, choice in zip(pairs, choices, strict=True)]
+    return [
+        pair.F if choice.F is None else choice.F
+        for pair, choice in zip(pairs, choices, strict=True)
+    ]
 
 
 def batch_pair(true: TruePair, found: PairMatch, F: Matrix3 | None = None) -> BatchPair:
     """Return a pair as the input of a reconstruction."""
     image0, image1 = (
-        BatchImage(name, name, size) for name, size in zip(true.pair.names, found.sizes, strict=True)
+        BatchImage(name, name, size)
+        for name, size in zip(true.pair.names, found.sizes, strict=True)
     )
     return BatchPair(image0, image1, found.matches, F, tracks_of(found.results))
 
@@ -119,7 +128,10 @@ def batch_pair(true: TruePair, found: PairMatch, F: Matrix3 | None = None) -> Ba
 def extra_of(pairs: Sequence[Known], every: Sequence[Known], config: SceneConfig) -> list[Known]:
     """Return the extra pairs that the engine would add."""
     names = list(dict.fromkeys(name for pair in pairs for name in pair.names))
-    ends = [(names.index(first), names.index(second)) for first, second in (pair.names for pair in pairs)]
+    ends = [
+        (names.index(first), names.index(second))
+        for first, second in (pair.names for pair in pairs)
+    ]
     chosen = extra_pairs(len(names), ends, config.pairs_per_image)
     wanted = {frozenset((names[first], names[second])) for first, second in chosen}
     return [pair for pair in every if frozenset(pair.names) in wanted]
@@ -143,14 +155,18 @@ def read_journal(directory: Path) -> tuple[str, dict[str, tuple[PairMatch, Matri
 
 @dataclass(frozen=True, eq=False)
 class Score:
-    """Result of an estimate on a draw of a scene: accuracies of the pairs, images of the pairs, total seconds."""
+    """Result of an estimate on a draw of a scene: accuracies of the pairs, images of the pairs,
+    total seconds.
+    """
 
     accuracies: list[float]
     images: list[tuple[str, str]]
     seconds: float
 
 
-def score(make: Estimator, pairs: Sequence[Known], every: Sequence[Known], scene: TrainScene) -> Score:
+def score(
+    make: Estimator, pairs: Sequence[Known], every: Sequence[Known], scene: TrainScene
+) -> Score:
     start = time.process_time()
     matrices = make(pairs, every)
     seconds = time.process_time() - start
@@ -161,8 +177,12 @@ def score(make: Estimator, pairs: Sequence[Known], every: Sequence[Known], scene
     return Score([*map(pair_accuracy, errors)], [pair.names for pair in pairs], seconds)
 
 
-def drawn(every: Sequence[Known], images: int, share: float, seed: int) -> tuple[list[Known], list[Known]]:
-    """Draw random images, or all if ``images`` is 0. Return a share of their scored pairs, and all their pairs."""
+def drawn(
+    every: Sequence[Known], images: int, share: float, seed: int
+) -> tuple[list[Known], list[Known]]:
+    """Draw random images, or all if ``images`` is 0. Return a share of their scored pairs, and all
+    their pairs.
+    """
     generator = np.random.default_rng(seed)
     names = sorted({name for pair in every for name in pair.names})
     chosen = set(generator.permutation(names)[: images or None].tolist())
@@ -177,22 +197,36 @@ Draws: TypeAlias = Mapping[str, Sequence[Mapping[str, Score]]]
 
 
 def difference(draws: Draws, first: str, second: str) -> Difference:
-    """Return the gain of the second estimate over the first, with its interval over images or over draws."""
-    both = [(scene, each[first], each[second]) for scene, scores in draws.items() for each in scores]
+    """Return the gain of the second estimate over the first, with its interval over images or over
+    draws.
+    """
+    both = [
+        (scene, each[first], each[second]) for scene, scores in draws.items() for each in scores
+    ]
     if len(both) == len(draws):
         return paired_difference([(a.accuracies, b.accuracies, a.images) for _, a, b in both])
-    firsts, seconds = [mean(a.accuracies) for _, a, _ in both], [mean(b.accuracies) for *_, b in both]
-    return paired_difference([(firsts, seconds, [(scene, f"draw {n}") for n, (scene, *_) in enumerate(both)])])
+    firsts, seconds = (
+        [mean(a.accuracies) for _, a, _ in both],
+        [mean(b.accuracies) for *_, b in both],
+    )
+    return paired_difference(
+        [(firsts, seconds, [(scene, f"draw {n}") for n, (scene, *_) in enumerate(both)])]
+    )
 
 
 def table(title: str, draws: Draws, names: Sequence[str]) -> list[str]:
-    """Return a Markdown table. A second row per estimate has gains by scene; lines below have gains by draw."""
+    """Return a Markdown table. A second row per estimate has gains by scene; lines below have gains
+    by draw.
+    """
     counts = [f"{name} ({len(scores)})" for name, scores in draws.items()]
     lines = [f"| {title} | {' | '.join(counts)} | mean | gain over the first | seconds |"]
     lines.append("|" + " --- |" * (len(counts) + 4))
     by_draw = []
     for name in names:
-        maas = {scene: [mean(each[name].accuracies) for each in scores] for scene, scores in draws.items()}
+        maas = {
+            scene: [mean(each[name].accuracies) for each in scores]
+            for scene, scores in draws.items()
+        }
         means = [mean(values) for values in maas.values()]
         spent = [each[name] for scores in draws.values() for each in scores]
         runs = len(spent) if name.startswith(SCENE) else sum(len(each.accuracies) for each in spent)
@@ -202,7 +236,9 @@ def table(title: str, draws: Draws, names: Sequence[str]) -> list[str]:
             f"| {name} | {' | '.join(cells)} | {gain} | {sum(each.seconds for each in spent) / runs:.2f} |"
         )
         if gain:
-            gains = [str(difference({scene: scores}, names[0], name)) for scene, scores in draws.items()]
+            gains = [
+                str(difference({scene: scores}, names[0], name)) for scene, scores in draws.items()
+            ]
             lines.append(f"| its gain | {' | '.join(gains)} | | | |")
         for scene, values in maas.items():
             first = [mean(each[names[0]].accuracies) for each in draws[scene]]
@@ -223,22 +259,34 @@ def main() -> None:
     arguments = parser.parse_args()
     estimators = {name: PAIR_ESTIMATORS[name] for name in arguments.estimates if name != SCENE}
     if arguments.thresholds:
-        estimators = {name: make for pixels in arguments.thresholds for name, make in by_threshold(pixels).items()}
+        estimators = {
+            name: make
+            for pixels in arguments.thresholds
+            for name, make in by_threshold(pixels).items()
+        }
     elif SCENE in arguments.estimates:
         settings = arguments.settings
-        estimators |= {f"{SCENE}, {line}" if line else SCENE: partial(by_scene, line) for line in settings}
+        estimators |= {
+            f"{SCENE}, {line}" if line else SCENE: partial(by_scene, line) for line in settings
+        }
     compare(estimators, arguments)
 
 
 def draws_parser(description: str) -> argparse.ArgumentParser:
     """Return a parser of the options that choose journals, scenes and draws."""
-    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=description, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--train-dir", type=Path, required=True)
     parser.add_argument("--journals", type=Path, nargs="+", required=True)
     parser.add_argument("--scenes", nargs="*", default=())
-    parser.add_argument("--images", nargs="+", type=int, default=[0], help="of a draw; 0, the default: all")
+    parser.add_argument(
+        "--images", nargs="+", type=int, default=[0], help="of a draw; 0, the default: all"
+    )
     parser.add_argument("--shares", nargs="+", type=float, default=[1.0])
-    parser.add_argument("--seeds", type=int, default=1, help="draws of each number of images and share")
+    parser.add_argument(
+        "--seeds", type=int, default=1, help="draws of each number of images and share"
+    )
     return parser
 
 
@@ -246,15 +294,29 @@ def compare(estimators: Mapping[str, Estimator], arguments: argparse.Namespace) 
     """Print a table of the estimators' scores for each journal and share."""
     for directory in arguments.journals:
         recipe, journal = read_journal(directory)
-        done: dict[float, dict[str, list[dict[str, Score]]]] = defaultdict(lambda: defaultdict(list))
-        for scene in read_train_side(arguments.train_dir, scenes=arguments.scenes, min_covisibility=0):
-            every = [Known(true, *journal[true.pair.id]) for true in scene.pairs if true.pair.id in journal]
-            plan = [*product(arguments.shares, arguments.images, range(arguments.seeds))] if every else []
+        done: dict[float, dict[str, list[dict[str, Score]]]] = defaultdict(
+            lambda: defaultdict(list)
+        )
+        for scene in read_train_side(
+            arguments.train_dir, scenes=arguments.scenes, min_covisibility=0
+        ):
+            every = [
+                Known(true, *journal[true.pair.id])
+                for true in scene.pairs
+                if true.pair.id in journal
+            ]
+            plan = (
+                [*product(arguments.shares, arguments.images, range(arguments.seeds))]
+                if every
+                else []
+            )
             for share, images, seed in plan:
                 if seed and not images and share == 1:
                     continue  # all images of a scene make a single draw
                 pairs, inside = drawn(every, images, share, seed)
-                scores = {name: score(make, pairs, inside, scene) for name, make in estimators.items()}
+                scores = {
+                    name: score(make, pairs, inside, scene) for name, make in estimators.items()
+                }
                 done[share][scene.name].append(scores)
         for share, draws in done.items():
             title = f"{recipe}, {share:.0%} of the pairs"

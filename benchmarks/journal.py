@@ -1,7 +1,8 @@
-"""The loop's own cost: CPU of the parent for a pair, size of the store, seconds of a start from it, memory.
+"""The loop's own cost: CPU of the parent for a pair, size of the store, seconds of a start from it,
+memory.
 
-Workers are simulated on a virtual clock, so that all CPU time is the loop's: the schedule, keys, state, store,
-publications of the submission's F, estimates and scenes. The store is a real file.
+Workers are simulated on a virtual clock, so that all CPU time is the loop's: the schedule, keys,
+state, store, publications of the submission's F, estimates and scenes. The store is a real file.
 
 python -m benchmarks.journal [--pairs 10000] [--units 5] [--batches 40] [--matches 2000]
 """
@@ -26,7 +27,9 @@ from tests.support.simulator import Scenario, simulate
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--pairs", type=int, default=10_000)
     parser.add_argument("--units", type=int, default=5)
     parser.add_argument("--batches", type=int, default=40)
@@ -48,7 +51,9 @@ def main() -> None:
         with Store.open(Path(directory)) as store:
             state = restored(scenario, store)
         resuming, resuming_cpu = time.perf_counter() - started, time.process_time() - cpu
-    what = f"{int(state.complete.sum())} pairs, {arguments.units} units of {arguments.matches} matches"
+    what = (
+        f"{int(state.complete.sum())} pairs, {arguments.units} units of {arguments.matches} matches"
+    )
     print(f"{what}, {len(ran.scenes)} scenes: {ran.report.ending}")
     print(f"CPU: {1e3 * seconds / arguments.pairs:.2f} ms a pair; store: {size / 1e6:.0f} MB")
     print(
@@ -63,7 +68,9 @@ def restored(scenario: Scenario, store: Store) -> State:
     pairs = [Pair(str(n), f"{int(n * share):03d}", f"{n:07d}", "b") for n in range(scenario.pairs)]
     state = State(Request(pairs, scenario.recipe, scenario.keys), [], batches_of(pairs))
     known = store.of_kind(Kind.IMAGE)
-    digests = {key.removeprefix(IMAGE): known[key]["digest"] for key in known if key.startswith(IMAGE)}
+    digests = {
+        key.removeprefix(IMAGE): known[key]["digest"] for key in known if key.startswith(IMAGE)
+    }
     state.restore(store, digests)
     return state
 

@@ -22,7 +22,9 @@ THRESHOLDS = "0.025;0.05;0.1;0.2;0.5;1.0"
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--train-dir", type=Path, required=True)
     parser.add_argument("--unrelated", type=Path, nargs="*", default=[])
     parser.add_argument("--out", type=Path, required=True)
@@ -32,7 +34,9 @@ def main() -> None:
     rows = []
     for scene in read_train_side(arguments.train_dir, scenes=SCENES, min_covisibility=0):
         ends = [
-            end for true in scene.pairs for end in zip(true.pair.images, (true.camera0, true.camera1), strict=True)
+            end
+            for true in scene.pairs
+            for end in zip(true.pair.images, (true.camera0, true.camera1), strict=True)
         ]
         for file, camera in sorted(dict(ends).items()):
             shutil.copy(file, folder)
@@ -40,7 +44,9 @@ def main() -> None:
             rows.append(("mixed", scene.name, Path(file).name, *pose))
     for path in arguments.unrelated:
         shutil.copy(path, folder)
-        rows.append(("mixed", OUTLIERS, path.name, joined(np.full(9, np.nan)), joined(np.full(3, np.nan))))
+        rows.append(
+            ("mixed", OUTLIERS, path.name, joined(np.full(9, np.nan)), joined(np.full(3, np.nan)))
+        )
     tables = (
         ("train_labels.csv", [POSE_COLUMNS, *rows]),
         (

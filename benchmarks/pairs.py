@@ -2,10 +2,10 @@
 
 python -m benchmarks.pairs [--rounds 3] [--only loftr,roma] [--precision bfloat16]
 
-Each round encodes and matches both images with one matcher after the other; times are medians of the rounds.
-kornia's LoFTR is measured too. The memory is the peak of a separate process, including Python and PyTorch. Weights
-are stand-ins or random, and matchers detect the maximum number of keypoints. Views have the sizes of the recipes.
-Set ``THP_MEM_ALLOC_ENABLE=1``, as workers do.
+Each round encodes and matches both images with one matcher after the other; times are medians of
+the rounds. kornia's LoFTR is measured too. The memory is the peak of a separate process, including
+Python and PyTorch. Weights are stand-ins or random, and matchers detect the maximum number of
+keypoints. Views have the sizes of the recipes. Set ``THP_MEM_ALLOC_ENABLE=1``, as workers do.
 """
 
 import argparse
@@ -56,7 +56,9 @@ class Case:
 
 
 def random_network(make: Callable[[], nn.Module], placement: Placement) -> Any:
-    """Return the network with random weights that keep activations of order 1; stand-in weights take minutes."""
+    """Return the network with random weights that keep activations of order 1; stand-in weights
+    take minutes.
+    """
     with torch.device("meta"):
         network = make()
     network.to_empty(device="cpu")
@@ -79,8 +81,12 @@ def roma(placement: Placement) -> DenseMatcher:
     return DenseMatcher(SPEC, network, RomaOptions(), placement.device, multiple=PATCH)
 
 
-def with_lightglue(name: str, layers: int, keypoints: int = KEYPOINTS) -> Callable[[Placement], Matcher[Any]]:
-    return partial(light_matchers.lightglue_matcher, name, keypoints=keypoints, layers=layers, threshold=0.1)
+def with_lightglue(
+    name: str, layers: int, keypoints: int = KEYPOINTS
+) -> Callable[[Placement], Matcher[Any]]:
+    return partial(
+        light_matchers.lightglue_matcher, name, keypoints=keypoints, layers=layers, threshold=0.1
+    )
 
 
 SPARSE, SEMI_DENSE = Size(1024, 768), Size(840, 630)
@@ -101,7 +107,9 @@ CASES = {
 
 
 def photographs(size: Size) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Return two images (H, W, 3) RGB; the second is the first shifted by 16 pixels right and 8 down."""
+    """Return two images (H, W, 3) RGB; the second is the first shifted by 16 pixels right and 8
+    down.
+    """
     resized = cv2.resize(load_sample_images().images[0], size, interpolation=cv2.INTER_AREA)
     return resized, np.roll(resized, (8, 16), axis=(0, 1))
 
@@ -109,7 +117,9 @@ def photographs(size: Size) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
 def pictures_of(size: Size, colour: Colour, multiple: int) -> list[Picture]:
     view = View.fit(Box.whole(size), long_side=max(size), multiple=multiple)
     gray = colour is Colour.GRAY
-    shown = [cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY) if gray else pixels for pixels in photographs(size)]
+    shown = [
+        cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY) if gray else pixels for pixels in photographs(size)
+    ]
     return [Picture(view.render(pixels), view) for pixels in shown]
 
 
@@ -117,7 +127,9 @@ def run_of(case: Case, placement: Placement) -> Run:
     matcher = case.make(placement)
     pictures = pictures_of(case.size, matcher.spec.colour, matcher.spec.multiple)
     return lambda: len(
-        matcher.match(*([encoded] for picture in pictures for encoded in matcher.encode([picture])))[0]
+        matcher.match(
+            *([encoded] for picture in pictures for encoded in matcher.encode([picture]))
+        )[0]
     )
 
 
@@ -125,11 +137,15 @@ def kornias_loftr(placement: Placement) -> Run:
     """Return a run of kornia's LoFTR in float32, with our weights."""
     network = LoFTR(pretrained=None).eval()
     network.load_state_dict({**network.state_dict(), **filled(Loftr(), "loftr").state_dict()})
-    image0, image1 = (image_batch([each], "cpu") for each in pictures_of(SEMI_DENSE, Colour.GRAY, 8))
+    image0, image1 = (
+        image_batch([each], "cpu") for each in pictures_of(SEMI_DENSE, Colour.GRAY, 8)
+    )
     return lambda: len(network({"image0": image0, "image1": image1})["keypoints0"])
 
 
-RUNS: dict[str, Callable[[Placement], Run]] = {name: partial(run_of, case) for name, case in CASES.items()}
+RUNS: dict[str, Callable[[Placement], Run]] = {
+    name: partial(run_of, case) for name, case in CASES.items()
+}
 RUNS["kornia's loftr"] = kornias_loftr
 SIZES = {name: case.size for name, case in CASES.items()}
 SIZES["kornia's loftr"] = SEMI_DENSE
@@ -142,7 +158,9 @@ def seconds_of(run: Run) -> float:
 
 
 def high_water() -> int:
-    """Return the peak memory of this process in kilobytes; ``getrusage`` may report the parent's peak."""
+    """Return the peak memory of this process in kilobytes; ``getrusage`` may report the parent's
+    peak.
+    """
     kilobytes = re.search(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text())
     assert kilobytes is not None
     return int(kilobytes[1])
@@ -150,19 +168,35 @@ def high_water() -> int:
 
 def peak_memory(name: str, precision: str) -> float:
     """Return the peak memory of a separate process, in GB."""
-    arguments = [sys.executable, "-m", "benchmarks.pairs", "--memory-of", name, "--precision", precision]
-    return int(subprocess.run(arguments, check=True, capture_output=True, text=True).stdout) * 1024 / 1e9
+    arguments = [
+        sys.executable,
+        "-m",
+        "benchmarks.pairs",
+        "--memory-of",
+        name,
+        "--precision",
+        precision,
+    ]
+    return (
+        int(subprocess.run(arguments, check=True, capture_output=True, text=True).stdout)
+        * 1024
+        / 1e9
+    )
 
 
 @torch.inference_mode()
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--precision", choices=list(Precision), default=Precision.FLOAT32)
     parser.add_argument(
         "--only", default=",".join(RUNS), metavar="NAMES", help="matchers, by parts of their names"
     )
-    parser.add_argument("--memory-of", metavar="NAME", help="run this matcher once and print the process's peak")
+    parser.add_argument(
+        "--memory-of", metavar="NAME", help="run this matcher once and print the process's peak"
+    )
     arguments = parser.parse_args()
     placement = Placement(precision=Precision(arguments.precision))
     if arguments.memory_of:
@@ -170,7 +204,9 @@ def main() -> None:
         print(high_water())
         return
     wanted = arguments.only.split(",")
-    runs = {name: make(placement) for name, make in RUNS.items() if any(part in name for part in wanted)}
+    runs = {
+        name: make(placement) for name, make in RUNS.items() if any(part in name for part in wanted)
+    }
     found = {name: run() for name, run in runs.items()}
     times: dict[str, list[float]] = {name: [] for name in runs}
     for _ in range(arguments.rounds):

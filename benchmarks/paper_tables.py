@@ -41,25 +41,42 @@ def recipe_of(table: str, row: str, method: str, given: argparse.Namespace) -> R
         units = [replace(own, stage=1)] if own else [*whole.units]
     else:
         parts = enumerate(row.split(" + "), start=1)
-        units = [sized(whole.units[0], stage, side) for stage, sides in parts for side in sides.split(",")]
-    known = {unit.name: unit for unit in (replace(each, matcher=given.matcher or each.matcher) for each in units)}
-    recipe = replace(whole, units=tuple(known.values()), matchers={} if given.matcher else whole.matchers)
+        units = [
+            sized(whole.units[0], stage, side)
+            for stage, sides in parts
+            for side in sides.split(",")
+        ]
+    known = {
+        unit.name: unit
+        for unit in (replace(each, matcher=given.matcher or each.matcher) for each in units)
+    }
+    recipe = replace(
+        whole, units=tuple(known.values()), matchers={} if given.matcher else whole.matchers
+    )
     if table != "imc" and given.protocol in PROTOCOLS:
         recipe = by_protocol(recipe, given.protocol)
-    return replace(recipe, name=f"{row} {method}", magsac=replace(recipe.magsac, method=Method(method)))
+    return replace(
+        recipe, name=f"{row} {method}", magsac=replace(recipe.magsac, method=Method(method))
+    )
 
 
 def sized(unit: Unit, stage: int, side: str) -> Unit:
     """Return the unit with another long side, or stretched to a width x height."""
     width, _, height = side.partition("x")
     area = f"{height}x{width}" if height else ""
-    return replace(unit, stage=stage, long_side=0 if area else int(side), area=area, stretch=bool(area))
+    return replace(
+        unit, stage=stage, long_side=0 if area else int(side), area=area, stretch=bool(area)
+    )
 
 
 def table(name: str, given: argparse.Namespace) -> Iterator[str]:
     """Yield the lines of the table in Markdown, each row after its run."""
     scenes, is_imc, differences = scenes_of(name, given), name == "imc", []
-    ours = ["mAA"] if is_imc else [*(f"AUC {limit:g}" for limit in AUC_THRESHOLDS), "precision", "matching score"]
+    ours = (
+        ["mAA"]
+        if is_imc
+        else [*(f"AUC {limit:g}" for limit in AUC_THRESHOLDS), "precision", "matching score"]
+    )
     heads = [
         *ours,
         *(f"published {head}" for head in (["public", "private"] if is_imc else ours[:3])),
@@ -72,7 +89,11 @@ def table(name: str, given: argparse.Namespace) -> Iterator[str]:
             assembly = assemble(recipe_of(name, row, method, given), weights=given.weights)
             scores = run(name, assembly, scenes, given)
             assert scores.report is not None
-            own = [scores.maa()] * 2 if is_imc else [100 * scores.auc(limit) for limit in AUC_THRESHOLDS]
+            own = (
+                [scores.maa()] * 2
+                if is_imc
+                else [100 * scores.auc(limit) for limit in AUC_THRESHOLDS]
+            )
             differences.append([mine - other for mine, other in zip(own, published, strict=True)])
             cells = own[:1] if is_imc else [*own, *(100 * share for share in scores.matching)]
             cells = [f"{cell:.{4 if is_imc else 2}f}" for cell in cells]
@@ -87,7 +108,9 @@ def scenes_of(name: str, given: argparse.Namespace) -> tuple[TrainScene, ...]:
     return (read_pairs(*vars(given)[name], most=given.pairs),)
 
 
-def run(name: str, assembly: Assembly, scenes: tuple[TrainScene, ...], given: argparse.Namespace) -> Validation:
+def run(
+    name: str, assembly: Assembly, scenes: tuple[TrainScene, ...], given: argparse.Namespace
+) -> Validation:
     root, in_front = str(vars(given)[name][-1]), given.protocol in PROTOCOLS
     with interruptible() as interrupt:
         session = Session(given.out / name, Budget(time.monotonic()), interrupt, workers=None)
@@ -98,7 +121,9 @@ def run(name: str, assembly: Assembly, scenes: tuple[TrainScene, ...], given: ar
 
 
 def main(arguments: list[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--weights", type=Path, action="append", default=[])
     parser.add_argument("--yfcc", type=Path, nargs=2, metavar=("LIST", "IMAGES"))
@@ -106,7 +131,9 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--imc", type=Path, nargs=1, metavar="TRAIN_DIR")
     rows = sorted({row for rows in TABLES.values() for row, *_ in rows})
     parser.add_argument("--rows", nargs="+", choices=rows, help="default: all")
-    parser.add_argument("--pairs", type=int, help="of each list or scene, evenly spread; default: all")
+    parser.add_argument(
+        "--pairs", type=int, help="of each list or scene, evenly spread; default: all"
+    )
     parser.add_argument(
         "--protocol", choices=[*PROTOCOLS, "none"], default="superglue", help="none: as the recipe"
     )

@@ -3,9 +3,10 @@
 python -m benchmarks.pycolmap_alone --train-dir DIR [--scenes NAME ...] [--mappers incremental global]
     [--one-camera]
 
-DIR is a train side in the layout of the Image Matching Challenge 2022. All settings are pycolmap's defaults,
-except the camera: one SIMPLE_RADIAL per image, or per scene with ``--one-camera``. A pair fails if no
-model has both images. The output is the mAA over all pairs with a covisibility of at least 0.1, and CPU seconds.
+DIR is a train side in the layout of the Image Matching Challenge 2022. All settings are pycolmap's
+defaults, except the camera: one SIMPLE_RADIAL per image, or per scene with ``--one-camera``. A pair
+fails if no model has both images. The output is the mAA over all pairs with a covisibility of at
+least 0.1, and CPU seconds.
 """
 
 import argparse
@@ -86,7 +87,9 @@ def run(scene: TrainScene, images: Path, mappers: list[str], one_camera: bool) -
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--train-dir", type=Path, required=True)
     parser.add_argument("--scenes", nargs="*", default=())
     parser.add_argument(
@@ -99,7 +102,12 @@ def main() -> None:
         f"{'scene':20}{'mapper':13}{'pairs':>6}{'mAA':>9}{'lost':>8}{'match s':>10}{'map s':>9}  images of models"
     )
     for scene in read_train_side(arguments.train_dir, scenes=arguments.scenes):
-        run(scene, arguments.train_dir / scene.name / "images", arguments.mappers, arguments.one_camera)
+        run(
+            scene,
+            arguments.train_dir / scene.name / "images",
+            arguments.mappers,
+            arguments.one_camera,
+        )
 
 
 if __name__ == "__main__":

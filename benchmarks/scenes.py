@@ -2,9 +2,10 @@
 
 python -m benchmarks.scenes [26:304 100:2000] [--world front|street]
 
-Each size is images:pairs and runs in a separate process, as in the engine. With `front`, all images see one
-facade; with `street`, images see only nearby facades. `verify` and `map` are CPU seconds. Errors of the
-relative rotation and of the direction of translation are in degrees, medians over pairs.
+Each size is images:pairs and runs in a separate process, as in the engine. With `front`, all images
+see one facade; with `street`, images see only nearby facades. `verify` and `map` are CPU seconds.
+Errors of the relative rotation and of the direction of translation are in degrees, medians over
+pairs.
 """
 
 import argparse
@@ -27,7 +28,9 @@ from mkpc_kaggle.scene.reconstruct import Solution, reconstruct_batch
 
 def row(size: str, world: str) -> str:
     images, pairs = map(int, size.split(":"))
-    scene = street(images, pairs) if world == "street" else synthetic_scene(images, pairs, points=2500)
+    scene = (
+        street(images, pairs) if world == "street" else synthetic_scene(images, pairs, points=2500)
+    )
     seconds: Counter[str] = Counter()
     for name in ("verify", "run_mapper"):
         setattr(colmap, name, timed(getattr(colmap, name), name, seconds))
@@ -59,26 +62,39 @@ def timed(function: Callable[..., Any], name: str, seconds: Counter[str]) -> Cal
 
 
 def errors(solution: Solution, scene: SyntheticScene) -> list[tuple[float, float]]:
-    """Return rotation and translation direction errors, in degrees, of each pair with an F from the scene."""
+    """Return rotation and translation direction errors, in degrees, of each pair with an F from the
+    scene.
+    """
     angles = []
     registered = registered_images(solution)
     for pair, choice in zip(scene.pairs, solution.choices, strict=True):
         if choice.from_scene:
-            R, t = relative_pose(registered[pair.image0.digest].camera, registered[pair.image1.digest].camera)
+            R, t = relative_pose(
+                registered[pair.image0.digest].camera, registered[pair.image1.digest].camera
+            )
             true_R, true_t = relative_pose(*scene.true_cameras(pair))
-            cosines = (np.trace(R @ true_R.T) - 1) / 2, t @ true_t / np.linalg.norm(t) / np.linalg.norm(true_t)
+            cosines = (
+                (np.trace(R @ true_R.T) - 1) / 2,
+                t @ true_t / np.linalg.norm(t) / np.linalg.norm(true_t),
+            )
             rotation, direction = np.degrees(np.arccos(np.clip(cosines, -1, 1)))
             angles.append((float(rotation), float(direction)))
     return angles
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("sizes", nargs="*", default=["26:304", "100:800"])
     parser.add_argument("--world", choices=["front", "street"], default="street")
     arguments = parser.parse_args()
     heads = ("matches", "verify", "map", "all s", "MB", "placed")
-    print(f"{'images':>7}{'pairs':>7}" + "".join(f"{head:>9}" for head in heads) + "  rotation  direction")
+    print(
+        f"{'images':>7}{'pairs':>7}"
+        + "".join(f"{head:>9}" for head in heads)
+        + "  rotation  direction"
+    )
     for size in arguments.sizes:
         with ProcessPoolExecutor(1, get_context("spawn")) as pool:
             print(pool.submit(row, size, arguments.world).result(), flush=True)

@@ -38,8 +38,12 @@ def timeline(scenario: Scenario) -> None:
         print(f"{begun:>7}  batch {scene.batch} is reconstructed until {ended}")
     units = Counter(len(record.units) for record in ran.report.records)
     had = ", ".join(f"{pairs} pairs with {count} units" for count, pairs in sorted(units.items()))
-    print(f"{format_duration(ran.report.seconds):>7}  {ran.report.ending}: {had}; {ran.missed} scenes missed")
-    print(f"workers busy: {ran.utilisation:.4f} of their time; late: {ran.late:.0f} s; rows lost: {ran.lost}")
+    print(
+        f"{format_duration(ran.report.seconds):>7}  {ran.report.ending}: {had}; {ran.missed} scenes missed"
+    )
+    print(
+        f"workers busy: {ran.utilisation:.4f} of their time; late: {ran.late:.0f} s; rows lost: {ran.lost}"
+    )
 
 
 def summary(runs: list[Ran]) -> None:
@@ -52,20 +56,30 @@ def summary(runs: list[Ran]) -> None:
     batches, missed = sum(run.scenario.batches for run in fit), sum(run.missed for run in fit)
     print(f"scenes: {len(fit)} scenarios in which they fit, {missed} of {batches} batches missed")
     low, middle = np.percentile(busy or [math.nan], [5, 50])
-    print(f"utilisation: median {middle:.4f}, mean {np.mean(busy or [math.nan]):.4f}, 5th percentile {low:.4f}")
+    print(
+        f"utilisation: median {middle:.4f}, mean {np.mean(busy or [math.nan]):.4f}, 5th percentile {low:.4f}"
+    )
     for run in sorted((run for run in runs if run.work_left), key=lambda run: run.utilisation)[:5]:
         print(f"  {run.utilisation:.4f} {run.scenario}")
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--scenarios", type=int, default=1000)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--pairs", type=int, default=1000, help="on average; the scale of a run (default: 1000)")
-    parser.add_argument("--without", choices=MECHANISMS, action="append", default=[], help="may be repeated")
+    parser.add_argument(
+        "--pairs", type=int, default=1000, help="on average; the scale of a run (default: 1000)"
+    )
+    parser.add_argument(
+        "--without", choices=MECHANISMS, action="append", default=[], help="may be repeated"
+    )
     parser.add_argument("--costs", type=float, nargs="+")
     parser.add_argument("--batches", type=int, default=15)
-    parser.add_argument("--scene-seconds", type=float, default=Scenario.scene_seconds, help="for each pair")
+    parser.add_argument(
+        "--scene-seconds", type=float, default=Scenario.scene_seconds, help="for each pair"
+    )
     parser.add_argument("--limit", type=parse_duration, default=parse_duration("8h45m"))
     parser.add_argument("--workers", type=int, default=1)
     arguments = parser.parse_args()

@@ -3,7 +3,8 @@
 python -m benchmarks.stages --train-dir DIR --journals DIR --databases DIR [--scenes NAME ...]
     [--images 18] [--seeds 4] [--cells MATCHES/CELL/ERROR/CAMERA/MAPPER ...]
 
-Each row of the table is a pipeline of these stages. The first row, ``all/0.75/2/pinhole/global``, is ours.
+Each row of the table is a pipeline of these stages. The first row, ``all/0.75/2/pinhole/global``,
+is ours.
 
 - MATCHES: ``all`` in the journal, of some units such as ``1:sift@1536+1:aliked@1024``, or by ``COLMAP``
 - CELL: size in pixels of the cells in which keypoints are merged; ``0``: no merging
@@ -11,8 +12,8 @@ Each row of the table is a pipeline of these stages. The first row, ``all/0.75/2
 - CAMERA: ``pinhole`` or ``radial``
 - MAPPER: ``global`` or ``incremental``
 
-COLMAP's SIFT features and matches of a scene are stored in DATABASES/SCENE.db. The other options and the table are
-the same as in `benchmarks.estimation`. Each image has its own camera.
+COLMAP's SIFT features and matches of a scene are stored in DATABASES/SCENE.db. The other options
+and the table are the same as in `benchmarks.estimation`. Each image has its own camera.
 """
 
 from collections.abc import Iterator, Sequence
@@ -42,8 +43,12 @@ COLMAP_ERROR_PX, COLMAP_TRIALS = 4.0, 10_000
 
 
 @cache
-def of_colmap(database: Path, images: Path) -> tuple[dict[str, Any], dict[tuple[str, str], NDArray[np.uint32]]]:
-    """Return COLMAP's keypoints (K, 2) by image name, and matches (M, 2), as keypoint indices, by name pair."""
+def of_colmap(
+    database: Path, images: Path
+) -> tuple[dict[str, Any], dict[tuple[str, str], NDArray[np.uint32]]]:
+    """Return COLMAP's keypoints (K, 2) by image name, and matches (M, 2), as keypoint indices, by
+    name pair.
+    """
     if not database.exists():
         part = database.with_suffix(".part")
         part.unlink(missing_ok=True)
@@ -51,14 +56,21 @@ def of_colmap(database: Path, images: Path) -> tuple[dict[str, Any], dict[tuple[
         part.rename(database)
     with pycolmap.Database.open(str(database)) as found:
         names = {image.image_id: image.name for image in found.read_all_images()}
-        points = {name: found.read_keypoints(number)[:, :2] - colmap.CENTRE_PX for number, name in names.items()}
+        points = {
+            name: found.read_keypoints(number)[:, :2] - colmap.CENTRE_PX
+            for number, name in names.items()
+        }
         ends = [(i, j) for i in names for j in names if i < j and found.exists_matches(i, j)]
         return points, {(names[i], names[j]): found.read_matches(i, j) for i, j in ends}
 
 
 def matches_of(known: Known, source: str, databases: Path) -> Matches:
     if source != "COLMAP":
-        chosen = [each for each in known.found.results if source == "all" or each.unit.name in source.split("+")]
+        chosen = [
+            each
+            for each in known.found.results
+            if source == "all" or each.unit.name in source.split("+")
+        ]
         return Matches.concatenate(each.matches for each in chosen)
     first, second = known.true.pair.images
     points, found = of_colmap(databases / f"{first.parent.parent.name}.db", first.parent)
@@ -66,7 +78,9 @@ def matches_of(known: Known, source: str, databases: Path) -> Matches:
         index = found[second.name, first.name][:, ::-1]
     else:
         index = found.get((first.name, second.name), np.zeros((0, 2), np.uint32))
-    return Matches(points[first.name][index[:, 0]], points[second.name][index[:, 1]], np.ones(len(index)))
+    return Matches(
+        points[first.name][index[:, 0]], points[second.name][index[:, 1]], np.ones(len(index))
+    )
 
 
 @contextmanager
@@ -82,22 +96,39 @@ def stages(cell: float, error: float, mapper: str) -> Iterator[None]:
 
 
 def incremental(_: Any, database: Any, manager: Any) -> Any:
-    settings = {"random_seed": 0, "num_threads": 1, "extract_colors": False, "min_model_size": MIN_IMAGES}
-    return pycolmap.IncrementalPipeline(pycolmap.IncrementalPipelineOptions(settings), database, manager)
+    settings = {
+        "random_seed": 0,
+        "num_threads": 1,
+        "extract_colors": False,
+        "min_model_size": MIN_IMAGES,
+    }
+    return pycolmap.IncrementalPipeline(
+        pycolmap.IncrementalPipelineOptions(settings), database, manager
+    )
 
 
-def by_stages(row: str, databases: Path, pairs: Sequence[Known], every: Sequence[Known]) -> list[Matrix3 | None]:
-    """Return each pair's F from a row's scene, else the pair's own: an estimator of `benchmarks.estimation`."""
+def by_stages(
+    row: str, databases: Path, pairs: Sequence[Known], every: Sequence[Known]
+) -> list[Matrix3 | None]:
+    """Return each pair's F from a row's scene, else the pair's own: an estimator of
+    `benchmarks.estimation`.
+    """
     source, cell, error, camera, mapper = row.split("/")
     model = CameraModel.SIMPLE_PINHOLE if camera == "pinhole" else CameraModel.SIMPLE_RADIAL
     config = SceneConfig(cameras=CameraSharing.IMAGE, camera_model=model)
     batch = [
-        replace(batch_pair(known.true, known.found, known.F), tracks=matches_of(known, source, databases))
+        replace(
+            batch_pair(known.true, known.found, known.F),
+            tracks=matches_of(known, source, databases),
+        )
         for known in (*pairs, *extra_of(pairs, every, config))
     ]
     with stages(float(cell), float(error), mapper):
         choices = reconstruct_batch(batch, config).choices[: len(pairs)]
-    return [known.F if choice.F is None else choice.F for known, choice in zip(pairs, choices, strict=True)]
+    return [
+        known.F if choice.F is None else choice.F
+        for known, choice in zip(pairs, choices, strict=True)
+    ]
 
 
 def main() -> None:
@@ -106,7 +137,10 @@ def main() -> None:
     parser.add_argument("--cells", nargs="+", default=[OURS, COLMAP])
     arguments = parser.parse_args()
     arguments.databases.mkdir(parents=True, exist_ok=True)
-    compare({f"scene, {row}": partial(by_stages, row, arguments.databases) for row in arguments.cells}, arguments)
+    compare(
+        {f"scene, {row}": partial(by_stages, row, arguments.databases) for row in arguments.cells},
+        arguments,
+    )
 
 
 if __name__ == "__main__":

@@ -41,7 +41,9 @@ class SyntheticScene:
         return fundamental_of_cameras(*self.true_cameras(pair))
 
     def median_distance(self, F: Matrix3, pair: BatchPair) -> float:
-        """Return the median Sampson distance, in pixels, of a pair's true correspondences under ``F``."""
+        """Return the median Sampson distance, in pixels, of a pair's true correspondences under
+        ``F``.
+        """
         points = [project(camera, self.world[:400]) for camera in self.true_cameras(pair)]
         return float(np.median(sampson_distances(F, Matches(*points, np.ones(len(points[0]))))))
 
@@ -57,7 +59,8 @@ def synthetic_scene(
     prefix: str = "",
     focals: Sequence[float] = (),
 ) -> SyntheticScene:
-    """Return a scene of cameras on an arc in front of a facade, with ``pairs`` random pairs or all pairs.
+    """Return a scene of cameras on an arc in front of a facade, with ``pairs`` random pairs or all
+    pairs.
 
     ``noise`` is the detector's standard deviation in pixels per coordinate: one number, or one for each image. A
     point has the same error in all pairs of the image, except for a deviation of 0.05 pixels. ``outliers`` is the
@@ -77,13 +80,17 @@ def synthetic_scene(
 def street(
     images: int, pairs: int, *, noise: float = 0.4, outliers: float = 0.25, seed: int = 0
 ) -> SyntheticScene:
-    """Return a scene of one image per metre along a loop of facades; neighbours have up to 290 matches."""
+    """Return a scene of one image per metre along a loop of facades; neighbours have up to 290
+    matches.
+    """
     rng = np.random.default_rng(seed)
     radius = images / (2 * np.pi)
     angles = 2 * np.pi * np.arange(images) / images
     count = round(2 * np.pi * (radius + 20) * 44)
     around, height = rng.uniform(0, 2 * np.pi, count), rng.uniform(-7, 7, count)
-    bays = np.where(np.floor(around * (radius + 20) / 3) % 2 == 0, 0.0, 2.0) + rng.uniform(0, 1, count)
+    bays = np.where(np.floor(around * (radius + 20) / 3) % 2 == 0, 0.0, 2.0) + rng.uniform(
+        0, 1, count
+    )
     distance = radius + 20 + bays
     world = np.column_stack([distance * np.sin(around), height, distance * np.cos(around)])
     cameras = [
@@ -111,35 +118,50 @@ def batch_of(
     most: int | None = None,
 ) -> SyntheticScene:
     """Return the scene of these cameras and of the pairs with the image indices ``ends``."""
-    images = tuple(BatchImage(f"{prefix}{n:04}", f"digest of {prefix}{n:04}", SIZE) for n in range(len(cameras)))
+    images = tuple(
+        BatchImage(f"{prefix}{n:04}", f"digest of {prefix}{n:04}", SIZE)
+        for n in range(len(cameras))
+    )
     noises = np.broadcast_to(noise, len(cameras)).tolist()
     seen = [see(rng, camera, world, own) for camera, own in zip(cameras, noises, strict=True)]
     pairs = tuple(
-        BatchPair(images[first], images[second], match(rng, seen[first], seen[second], outliers, most))
+        BatchPair(
+            images[first], images[second], match(rng, seen[first], seen[second], outliers, most)
+        )
         for first, second in ends
     )
-    return SyntheticScene(images, pairs, dict(zip((i.name for i in images), cameras, strict=True)), world)
+    return SyntheticScene(
+        images, pairs, dict(zip((i.name for i in images), cameras, strict=True)), world
+    )
 
 
 def front(rng: np.random.Generator, count: int) -> np.ndarray:
-    """Return (count, 3) world points of a facade with bays: x to the right, y down, z away from the cameras."""
+    """Return (count, 3) world points of a facade with bays: x to the right, y down, z away from the
+    cameras.
+    """
     x, y = rng.uniform(-8, 8, count), rng.uniform(-4, 4, count)
     bays = np.where(np.floor(x / 2) % 2 == 0, 0.0, 2.0)
     return np.column_stack([x, y, bays + rng.uniform(0, 1.0, count)])
 
 
 def arc_camera(rng: np.random.Generator, where: float) -> Camera:
-    """Return a camera at ``where`` (0 to 1) on an 80-degree arc about the facade, with a random focal length."""
+    """Return a camera at ``where`` (0 to 1) on an 80-degree arc about the facade, with a random
+    focal length.
+    """
     angle = np.radians(80) * (where - 0.5) + rng.normal(0, 0.02)
     distance = rng.uniform(11, 15)
-    centre = np.array([distance * np.sin(angle), rng.normal(0, 0.5), 1.5 - distance * np.cos(angle)])
+    centre = np.array(
+        [distance * np.sin(angle), rng.normal(0, 0.5), 1.5 - distance * np.cos(angle)]
+    )
     target = np.array([rng.normal(0, 1), rng.normal(0, 0.5), 1.5])
     ahead = (target - centre) / np.linalg.norm(target - centre)
     return pointed(centre, ahead, max(SIZE) * np.exp(rng.normal(np.log(1.1), 0.2)))
 
 
 def looking(centre: np.ndarray, angle: float, focal: float) -> Camera:
-    """Return a level camera whose viewing direction has this angle, in radians, about the vertical axis."""
+    """Return a level camera whose viewing direction has this angle, in radians, about the vertical
+    axis.
+    """
     return pointed(centre, np.array([np.sin(angle), 0.0, np.cos(angle)]), focal)
 
 
@@ -171,9 +193,13 @@ def see(rng: np.random.Generator, camera: Camera, world: np.ndarray, noise: floa
     return numbers, found[numbers]
 
 
-def match(rng: np.random.Generator, first: Seen, second: Seen, outliers: float, most: int | None) -> Matches:
+def match(
+    rng: np.random.Generator, first: Seen, second: Seen, outliers: float, most: int | None
+) -> Matches:
     """Return matches of about half the points that both images share; some matches are wrong."""
-    common, places0, places1 = np.intersect1d(first[0], second[0], assume_unique=True, return_indices=True)
+    common, places0, places1 = np.intersect1d(
+        first[0], second[0], assume_unique=True, return_indices=True
+    )
     kept = np.flatnonzero(rng.random(len(common)) < 0.5)[:most]
     points0 = first[1][places0[kept]] + rng.normal(0, 0.05, (len(kept), 2))
     wrong = rng.random(len(kept)) < outliers

@@ -1,9 +1,11 @@
-"""The paper's Table 1 at equal inference count: units on whole images against the two stages, with one matcher.
+"""The paper's Table 1 at equal inference count: units on whole images against the two stages, with
+one matcher.
 
 python -m benchmarks.table1 --matcher sift --out DIR [-- --train-dir DIR --pairs-per-scene 10 ...]
 
-The layouts become recipes in OUT. `validate --compare` compares them, with the options after ``--``. Recipes
-share a journal, so that common units run once. After a kill, rerun the command to resume.
+The layouts become recipes in OUT. `validate --compare` compares them, with the options after
+``--``. Recipes share a journal, so that common units run once. After a kill, rerun the command to
+resume.
 """
 
 import argparse
@@ -24,7 +26,8 @@ LAYOUTS = {  # numbers of units on whole images and on critical regions
     "six": (6, 0),
     "three + three": (3, 3),
 }
-CONTRASTS = (("three", "one + two", "two + one"), ("six", "three + three"))  # the others against the first
+# The others against the first
+CONTRASTS = (("three", "one + two", "two + one"), ("six", "three + three"))
 
 
 def recipe(matcher: str, layout: str) -> str:
@@ -39,7 +42,9 @@ def recipe(matcher: str, layout: str) -> str:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--matcher", choices=list(LONG_SIDES), required=True)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("options", nargs="*")
@@ -50,7 +55,9 @@ def main() -> int:
     status = 0
     for layouts in CONTRASTS:
         files = [str(given.out / f"{layout}.toml") for layout in layouts]
-        status |= mkpc(["validate", "--compare", *files, "--work-dir", str(given.out), *given.options])
+        status |= mkpc(
+            ["validate", "--compare", *files, "--work-dir", str(given.out), *given.options]
+        )
     return status
 
 

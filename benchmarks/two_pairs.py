@@ -2,8 +2,8 @@
 
     python -m benchmarks.two_pairs demo/train --out pair.png
 
-The modes have the same recipe, RootSIFT without weights. "both stages" and "whole images" run the same number of
-units.
+The modes have the same recipe, RootSIFT without weights. "both stages" and "whole images" run the
+same number of units.
 """
 
 import argparse
@@ -28,15 +28,21 @@ MODES = {
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("train_dir", type=Path, help="of the demo set")
-    parser.add_argument("--out", type=Path, required=True, metavar="FIG.png", help="draw the first pair")
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="FIG.png", help="draw the first pair"
+    )
     arguments = parser.parse_args()
     (scene,) = read_train_side(arguments.train_dir, scenes=["market"], min_covisibility=0.0)
     known = {true.pair.id: true for true in scene.pairs}
     recipe = load_recipe(RECIPE)
     matchers = {name: TwoStageMatcher(recipe.in_mode(mode)) for name, mode in MODES.items()}
-    print("Error of the pose in degrees (rotation, direction of translation), with and without the crop")
+    print(
+        "Error of the pose in degrees (rotation, direction of translation), with and without the crop"
+    )
     figure = None
     for name, reason in PAIRS.items():
         true = known[name]
@@ -44,9 +50,13 @@ def main() -> None:
         print(f"{name}: {reason}")
         for mode, matcher in matchers.items():
             match = matcher(*images)
-            error = pose_error(match.estimate.matrix, true.camera0, true.camera1, scene.metres_per_unit)
+            error = pose_error(
+                match.estimate.matrix, true.camera0, true.camera1, scene.metres_per_unit
+            )
             inliers = match.estimate.inlier_count
-            print(f"  {mode:<14}{error.rotation:7.2f}{error.translation_angle:7.2f}{inliers:7} inliers")
+            print(
+                f"  {mode:<14}{error.rotation:7.2f}{error.translation_angle:7.2f}{inliers:7} inliers"
+            )
         figure = figure or draw_pair(*images, match, recipe.mkpc)  # of both stages, the last mode
     save(figure, arguments.out)
 

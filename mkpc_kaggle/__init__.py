@@ -1,7 +1,7 @@
 """Offline two-stage image matching with Matching Key-Points Crop (MKPC).
 
-Importing this package is cheap and has no side effect: no torch, no network, no global switch. The names
-below are imported when they are first used.
+Importing this package is cheap and has no side effect: no torch, no network, no global switch. The
+names below are imported when they are first used.
 """
 
 from importlib import import_module

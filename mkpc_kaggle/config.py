@@ -21,11 +21,15 @@ def from_table(cls: type[Config], table: Mapping[str, Any], where: str) -> Confi
     """
     known: dict[str, Field[Any]] = {field.name: field for field in fields(cls)}  # type: ignore[arg-type]
     check_keys(table, known, where)
-    required = [name for name, field in known.items() if field.default is field.default_factory is MISSING]
+    required = [
+        name for name, field in known.items() if field.default is field.default_factory is MISSING
+    ]
     if missing := [name for name in required if name not in table]:
         raise UserError(f"{where}: missing keys {', '.join(map(repr, missing))}")
     hints = get_type_hints(cls)
-    values = {key: convert(value, hints[key], f"{where}, key {key!r}") for key, value in table.items()}
+    values = {
+        key: convert(value, hints[key], f"{where}, key {key!r}") for key, value in table.items()
+    }
     try:
         return cls(**values)
     except ValueError as error:
@@ -42,10 +46,14 @@ def check_keys(table: Mapping[str, Any], known: Iterable[str], where: str) -> No
 
 
 def convert(value: Any, kind: type, where: str) -> Any:
-    """Return ``value`` as ``kind`` (int, float, bool, str or an enum of strings), or raise :class:`UserError`."""
+    """Return ``value`` as ``kind`` (int, float, bool, str or an enum of strings), or raise
+    :class:`UserError`.
+    """
     if issubclass(kind, StrEnum):
         if value not in list(kind):
-            raise UserError(f"{where}: {value!r} is none of {', '.join(repr(str(member)) for member in kind)}")
+            raise UserError(
+                f"{where}: {value!r} is none of {', '.join(repr(str(member)) for member in kind)}"
+            )
         return kind(value)
     if type(value) is int and abs(value) > MAX_INTEGER:
         raise UserError(f"{where}: an integer of more than 64 bits")
@@ -58,7 +66,9 @@ def convert(value: Any, kind: type, where: str) -> Any:
 
 @dataclass(frozen=True)
 class Range:
-    """Finite numbers from ``low`` to ``high``; ``bounds`` is "[]", "(]", "[)" or "()", in interval notation."""
+    """Finite numbers from ``low`` to ``high``; ``bounds`` is "[]", "(]", "[)" or "()", in interval
+    notation.
+    """
 
     low: float
     high: float = inf

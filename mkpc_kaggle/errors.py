@@ -10,7 +10,9 @@ MAX_TEXT_BYTES = 1 << 24
 
 
 class UserError(Exception):
-    """A problem that the user can correct. The message states the problem, its location and the next step."""
+    """A problem that the user can correct. The message states the problem, its location and the
+    next step.
+    """
 
 
 @cache
@@ -25,7 +27,9 @@ def read_text(path: Path) -> str:
         if path.exists() and not path.is_file():
             raise UserError(f"{path} cannot be read: not a regular file")
         if path.exists() and (size := path.stat().st_size) > MAX_TEXT_BYTES:
-            raise UserError(f"{path} cannot be read: {size} bytes, at most {MAX_TEXT_BYTES} are; split it")
+            raise UserError(
+                f"{path} cannot be read: {size} bytes, at most {MAX_TEXT_BYTES} are; split it"
+            )
         return path.read_text(encoding="utf-8-sig")
     except OSError as error:
         raise UserError(f"{path} cannot be read: {error.strerror}") from error
@@ -39,7 +43,9 @@ def shown(name: object) -> str:
 
 
 def printable(text: str) -> str:
-    """Return ``text`` with escapes for characters that UTF-8 cannot encode. Paths may contain these characters."""
+    """Return ``text`` with escapes for characters that UTF-8 cannot encode. Paths may contain these
+    characters.
+    """
     return text.encode("utf-8", "backslashreplace").decode()
 
 

@@ -1,4 +1,5 @@
-"""Recipes: units (a matcher on one kind of view) in order of importance, and settings of all later steps.
+"""Recipes: units (a matcher on one kind of view) in order of importance, and settings of all later
+steps.
 
 A recipe is a TOML file: ``mkpc_kaggle/recipes/NAME.toml`` or a custom file.
 """
@@ -12,7 +13,15 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from mkpc_kaggle.config import AT_LEAST_0, AT_LEAST_1, Config, Range, check_keys, check_ranges, from_table
+from mkpc_kaggle.config import (
+    AT_LEAST_0,
+    AT_LEAST_1,
+    Config,
+    Range,
+    check_keys,
+    check_ranges,
+    from_table,
+)
 from mkpc_kaggle.errors import UserError, read_text
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
 from mkpc_kaggle.geometry.critical_region import MkpcConfig
@@ -31,7 +40,8 @@ class Mode(StrEnum):
 
     TWO_STAGE = "two-stage"  # as written: stage 2 on the critical regions
     STAGE_1 = "stage-1"  # the units of stage 1 alone
-    WHOLE_IMAGES = "whole-images"  # every unit on whole images: the naive ensemble of equal inference count
+    # Every unit on whole images: the naive ensemble of equal inference count
+    WHOLE_IMAGES = "whole-images"
 
 
 @dataclass(frozen=True)
@@ -42,14 +52,18 @@ class Unit:
     matcher: str
     long_side: int = 0  # pixels of a view's longer side, or 0 with ``area``
     max_matches: int = 4096  # the matches with the highest scores
-    area: str = ""  # height x width, such as "540x720": the area of a view, which keeps its aspect ratio
+    # Height x width, such as "540x720": the area of a view, which keeps its aspect ratio
+    area: str = ""
     stretch: bool = False  # True: a view gets exactly the height and width of ``area``
     fallback: str = ""  # the matcher to use if ``matcher`` is unavailable
     antialias: bool = True  # False: shrink views bilinearly, without averaging areas
-    tracks: bool = True  # False: scenes use the unit's matches only if the pair's other units have fewer than 50
+    # False: scenes use the unit's matches only if the pair's other units have fewer than 50
+    tracks: bool = True
 
     def __post_init__(self) -> None:
-        check_ranges(self, stage=Range(1, 2), long_side=Range(0, MAX_SIDE_PX), max_matches=AT_LEAST_1)
+        check_ranges(
+            self, stage=Range(1, 2), long_side=Range(0, MAX_SIDE_PX), max_matches=AT_LEAST_1
+        )
         if bool(self.long_side) == bool(self.area):
             raise ValueError("either long_side or area must be given, and not both")
         if self.area and not AREA.fullmatch(self.area):
@@ -59,7 +73,9 @@ class Unit:
 
     @cached_property  # used often by plans
     def name(self) -> str:
-        """Name such as ``2:sift@1280`` or ``1:dkm@540x720``; "!" means stretched. Unique in a recipe."""
+        """Name such as ``2:sift@1280`` or ``1:dkm@540x720``; "!" means stretched. Unique in a
+        recipe.
+        """
         return f"{self.stage}:{self.matcher}@{self.long_side or self.area}{'!' if self.stretch else ''}"
 
     @property
@@ -73,7 +89,9 @@ class Unit:
         if self.stretch:
             view = View.stretched(crop, size=Size(width, height), multiple=multiple, turns=turns)
         else:
-            view = View.fit(crop, long_side=self.long_side, area=width * height, multiple=multiple, turns=turns)
+            view = View.fit(
+                crop, long_side=self.long_side, area=width * height, multiple=multiple, turns=turns
+            )
         return replace(view, antialias=self.antialias)
 
 
@@ -100,7 +118,8 @@ class CameraModel(StrEnum):
 class SceneConfig:
     """Settings of :mod:`mkpc_kaggle.scene`, table ``[scene]`` of a recipe."""
 
-    pairs_per_image: float = 10.0  # a batch with fewer gets extra pairs, used only for its scene; 0: none
+    # A batch with fewer gets extra pairs, used only for its scene; 0: none
+    pairs_per_image: float = 10.0
     cameras: CameraSharing = CameraSharing.AUTO
     camera_model: CameraModel = CameraModel.SIMPLE_PINHOLE
     threads: int = 1  # of the mapper; with more, the last digits vary from run to run
@@ -115,7 +134,8 @@ class SceneConfig:
 class Recipe:
     """Units in order of importance, and the settings of MKPC, MAGSAC, the matchers and scenes.
 
-    Raises :class:`UserError` if a unit is repeated, or the first unit, which sweeps all pairs, is not of stage 1.
+    Raises :class:`UserError` if a unit is repeated, or the first unit, which sweeps all pairs, is
+    not of stage 1.
     """
 
     units: tuple[Unit, ...]
@@ -149,16 +169,25 @@ class Recipe:
         return replace(self, units=tuple(filter(wanted, self.units)))
 
     def with_units(self, names: Sequence[str]) -> "Recipe":
-        """Return the recipe with only these units, in this order. Raise :class:`UserError` for an unknown one."""
+        """Return the recipe with only these units, in this order. Raise :class:`UserError` for an
+        unknown one.
+        """
         known = {unit.name: unit for unit in self.units}
         for name in names:
             if name not in known:
-                raise UserError(f"recipe {self.name!r} has no unit {name!r}; it has {', '.join(known)}")
+                raise UserError(
+                    f"recipe {self.name!r} has no unit {name!r}; it has {', '.join(known)}"
+                )
         return replace(self, units=tuple(known[name] for name in names))
 
     def with_fallbacks(self, unavailable: Container[str]) -> "Recipe":
-        """Return the recipe with fallbacks in place of ``unavailable`` matchers; remove the other fallbacks."""
-        units = (u.with_fallback if u.matcher in unavailable else replace(u, fallback="") for u in self.units)
+        """Return the recipe with fallbacks in place of ``unavailable`` matchers; remove the other
+        fallbacks.
+        """
+        units = (
+            u.with_fallback if u.matcher in unavailable else replace(u, fallback="")
+            for u in self.units
+        )
         return replace(self, units=tuple(units))
 
     def without(self, matchers: Container[str]) -> "Recipe":
@@ -178,13 +207,16 @@ class Recipe:
         name = f"{self.name} ({mode})"
         if mode is Mode.STAGE_1:
             return replace(self.only(lambda unit: unit.stage == 1), name=name)
-        whole: dict[str, Unit] = {}  # a unit of both stages runs once: a second run would find the same matches
+        # A unit of both stages runs once: a second run would find the same matches
+        whole: dict[str, Unit] = {}
         for unit in (replace(unit, stage=1) for unit in self.units):
             whole.setdefault(unit.name, unit)
         return replace(self, name=name, units=tuple(whole.values()))
 
     def with_scenes(self, on: bool | None) -> "Recipe":
-        """Return the recipe with the reconstruction of batches switched on or off; ``None``: no change."""
+        """Return the recipe with the reconstruction of batches switched on or off; ``None``: no
+        change.
+        """
         if on is None or on == (self.scene is not None):
             return self
         return replace(self, scene=SceneConfig() if on else None)
@@ -241,12 +273,15 @@ def parse_recipe(text: str, name: str) -> Recipe:
     """Parse a recipe from TOML text. Raise :class:`UserError` if it is invalid."""
     try:
         return recipe_of(tomllib.loads(text), name)
-    except (ValueError, RecursionError) as error:  # numbers of thousands of digits, deeply nested tables
+    # Numbers of thousands of digits, deeply nested tables
+    except (ValueError, RecursionError) as error:
         raise UserError(f"recipe {name!r} is not valid TOML: {error}") from error
 
 
 def recipe_of(table: Mapping[str, Any], name: str) -> Recipe:
-    """Return the recipe of a TOML file's or a journal's table. Raise :class:`UserError` if it is invalid."""
+    """Return the recipe of a TOML file's or a journal's table. Raise :class:`UserError` if it is
+    invalid.
+    """
     where = f"recipe {name!r}"
     check_keys(table, ("description", "units", *TABLES), where)
     units = table.get("units", [])
@@ -259,7 +294,10 @@ def recipe_of(table: Mapping[str, Any], name: str) -> Recipe:
         return None if value is None else from_table(cls, value, f"{where}, table [{key}]")
 
     return Recipe(
-        tuple(from_table(Unit, unit, f"{where}, unit {number}") for number, unit in enumerate(units, start=1)),
+        tuple(
+            from_table(Unit, unit, f"{where}, unit {number}")
+            for number, unit in enumerate(units, start=1)
+        ),
         name,
         description=str(table.get("description", "")),
         mkpc=settings(MkpcConfig, "mkpc") or MkpcConfig(),
@@ -276,9 +314,13 @@ def recipe_names() -> list[str]:
 
 
 def load_recipe(name: str) -> Recipe:
-    """Return the recipe of this name or ``.toml`` file. Raise :class:`UserError` if it does not exist."""
+    """Return the recipe of this name or ``.toml`` file. Raise :class:`UserError` if it does not
+    exist.
+    """
     known = recipe_names()
     if name not in known and not name.endswith(".toml"):
-        raise UserError(f"unknown recipe {name!r}; known: {', '.join(known)}, or a path that ends in .toml")
+        raise UserError(
+            f"unknown recipe {name!r}; known: {', '.join(known)}, or a path that ends in .toml"
+        )
     path = DIRECTORY / f"{name}.toml" if name in known else Path(name)
     return parse_recipe(read_text(path), path.stem)

@@ -26,7 +26,9 @@ PANELS = (  # of draw_errors: kind, unit, thresholds of the mAA, limits of x
 
 def draw_scores(validations: Sequence["Validation"]) -> "Figure":
     """Draw the mAA of each recipe, one row per scene and one for their mean."""
-    figure, axes = _rows([scene.scene for scene in validations[0].scenes], "mAA of each scene, by recipe")
+    figure, axes = _rows(
+        [scene.scene for scene in validations[0].scenes], "mAA of each scene, by recipe"
+    )
     for index, validation in enumerate(validations):
         values = [*(scene.maa() for scene in validation.scenes), validation.maa()]
         y = _beside(len(values), index, len(validations))
@@ -37,7 +39,9 @@ def draw_scores(validations: Sequence["Validation"]) -> "Figure":
 
 
 def draw_gains(validations: Sequence["Validation"]) -> "Figure":
-    """Draw the gain of each recipe over the first, with its interval, one row per scene and one for their mean."""
+    """Draw the gain of each recipe over the first, with its interval, one row per scene and one for
+    their mean.
+    """
     first, *others = validations
     names = [scene.scene for scene in first.scenes]
     figure, axes = _rows(names, f"gain of mAA over {first.recipe}, with 95 % intervals")
@@ -64,14 +68,23 @@ def draw_gains(validations: Sequence["Validation"]) -> "Figure":
 def draw_errors(validations: Sequence["Validation"]) -> "Figure":
     """Draw the share of pairs with an error below x, for rotation and for translation."""
     figure = new_figure(9, 4.2)
-    for axes, (kind, unit, thresholds, limits) in zip(figure.subplots(1, 2, sharey=True), PANELS, strict=True):
+    for axes, (kind, unit, thresholds, limits) in zip(
+        figure.subplots(1, 2, sharey=True), PANELS, strict=True
+    ):
         plain(axes, f"pairs with a {kind} error below x")
         axes.axvspan(
-            thresholds[0], thresholds[-1], color=DROPPED, alpha=0.2, linewidth=0, label="thresholds of the mAA"
+            thresholds[0],
+            thresholds[-1],
+            color=DROPPED,
+            alpha=0.2,
+            linewidth=0,
+            label="thresholds of the mAA",
         )
         for index, validation in enumerate(validations):
             # Failures are infinite: clipped beyond the right edge, so that the curve ends below 1.
-            errors = np.clip([getattr(error, kind) for error in validation.errors], limits[0], 2 * limits[1])
+            errors = np.clip(
+                [getattr(error, kind) for error in validation.errors], limits[0], 2 * limits[1]
+            )
             style = {"color": _style(index)["color"], "linestyle": DASHES[index % len(DASHES)]}
             axes.ecdf(errors, **style, linewidth=2, label=validation.recipe)
         axes.set(xscale="log", xlim=limits, ylim=(0, 1.01), xlabel=f"{kind} error in {unit}")
@@ -94,14 +107,17 @@ def _rows(scenes: Sequence[str], title: str) -> "tuple[Figure, Axes]":
 
 
 def _beside(rows: int, index: int, count: int) -> NDArray[np.float64]:
-    """Return the (rows,) y coordinates of the marks of recipe ``index`` of the ``count`` in each row."""
+    """Return the (rows,) y coordinates of the marks of recipe ``index`` of the ``count`` in each
+    row.
+    """
     return np.arange(rows, dtype=np.float64) + 0.5 * ((index + 0.5) / count - 0.5)
 
 
 def _style(index: int) -> dict[str, Any]:
     """Return the style of a recipe by its index, the same in all figures.
 
-    Six colours and seven markers give 42 styles, so that shapes distinguish recipes for colour-blind readers.
+    Six colours and seven markers give 42 styles, so that shapes distinguish recipes for
+    colour-blind readers.
     """
     return {
         "color": COLOURS[index % len(COLOURS)],

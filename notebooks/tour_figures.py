@@ -50,7 +50,9 @@ def read_true_pair(directory: Path, pair: str) -> tuple[TrainScene, TruePair]:
     (scene,) = read_train_side(directory, scenes=[pair.partition(";")[0]], min_covisibility=0.0)
     known = {true.pair.id: true for true in scene.pairs}
     if pair not in known:
-        raise UserError(f"{directory}: unknown pair {pair!r}; known: {', '.join(list(known)[:3])}, ...")
+        raise UserError(
+            f"{directory}: unknown pair {pair!r}; known: {', '.join(list(known)[:3])}, ..."
+        )
     return scene, known[pair]
 
 
@@ -67,19 +69,31 @@ def draw_stage(images: Images, match: PairMatch, stage: int) -> "Figure":
     mask = match.in_stage(stage)
     inliers = match.estimate.inliers[mask]
     regions = match.regions if stage == 2 else None
-    boxes = [region.box for region in regions] if regions else [Box.whole(image.size) for image in images]
+    boxes = (
+        [region.box for region in regions]
+        if regions
+        else [Box.whole(image.size) for image in images]
+    )
     figure, row = side_by_side([_cut(image, box) for image, box in zip(images, boxes, strict=True)])
     # The figure shows the crop alone, so the points move by its offset.
     shift0, shift1 = (np.array([box.left, box.top], np.float32) for box in boxes)
     found = match.matches[mask]
-    drawn = connect(row, Matches(found.points0 - shift0, found.points1 - shift1, found.scores), inliers)
-    what = "on the crops" if any(region.reason == "cropped" for region in regions or ()) else "on the whole images"
+    drawn = connect(
+        row, Matches(found.points0 - shift0, found.points1 - shift1, found.scores), inliers
+    )
+    what = (
+        "on the crops"
+        if any(region.reason == "cropped" for region in regions or ())
+        else "on the whole images"
+    )
     counts = f"{len(found)} matches, {np.count_nonzero(inliers)} inliers"
     _title(row[0], f"stage {stage}, {what}: {counts}; {drawn}")
     return figure
 
 
-def draw_clusters(images: Images, points: tuple[Points, Points], clusters: tuple[Clusters, Clusters]) -> "Figure":
+def draw_clusters(
+    images: Images, points: tuple[Points, Points], clusters: tuple[Clusters, Clusters]
+) -> "Figure":
     """Draw all clusters of each image, one colour each, with their sizes; noise as grey crosses."""
     figure, row = side_by_side(images, title_lines=2)
     for number, (axes, xy, found) in enumerate(zip(row, points, clusters, strict=True)):
@@ -114,13 +128,16 @@ def _size_bars(axes: "Axes", clusters: Clusters, config: MkpcConfig) -> None:
         return
     ranks = np.arange(1, len(sizes) + 1)
     for part, colour, hatch in ((slice(kept), INLIER, ""), (slice(kept, None), OUTLIER, "//")):
-        bars = axes.bar(ranks[part], sizes[part], color=colour, hatch=hatch, edgecolor="white", width=0.7)
+        bars = axes.bar(
+            ranks[part], sizes[part], color=colour, hatch=hatch, edgecolor="white", width=0.7
+        )
         # More than ten labels of two lines would overlap.
         shares = [f"\n{size / sizes[0]:.3f}" if len(sizes) <= 10 else "" for size in sizes]
         labels = [f"{size}{share}" for size, share in zip(sizes[part], shares[part], strict=True)]
         axes.bar_label(bars, labels, padding=3, fontsize=9, bbox=_PAPER)
     axes.axhline(config.share * sizes[0], color="black", linewidth=1.2, linestyle="--")
-    # A logarithmic scale, because the largest cluster may have a hundred times the points of a dropped one.
+    # A logarithmic scale, because the largest cluster may have a hundred times the points of a
+    # dropped one.
     axes.set(yscale="log", ylim=(1, 8 * sizes[0]), xticks=ranks)
 
 
@@ -131,11 +148,18 @@ def _limit(clusters: Clusters, config: MkpcConfig) -> str:
 
 
 def draw_boxes(
-    images: Images, points: tuple[Points, Points], clusters: tuple[Clusters, Clusters], config: MkpcConfig
+    images: Images,
+    points: tuple[Points, Points],
+    clusters: tuple[Clusters, Clusters],
+    config: MkpcConfig,
 ) -> "Figure":
-    """Draw the bounding box of the kept clusters, without and with expansion; dropped points as crosses."""
+    """Draw the bounding box of the kept clusters, without and with expansion; dropped points as
+    crosses.
+    """
     figure, row = side_by_side(images, title_lines=2)
-    for number, (axes, image, xy, found) in enumerate(zip(row, images, points, clusters, strict=True)):
+    for number, (axes, image, xy, found) in enumerate(
+        zip(row, images, points, clusters, strict=True)
+    ):
         kept = xy[found.in_kept]
         _crosses(axes, xy[~found.in_kept], OUTLIER)
         _dots(axes, kept, INLIER)
@@ -151,7 +175,9 @@ def draw_boxes(
     return figure
 
 
-def draw_views(images: Images, regions: tuple[CriticalRegion, CriticalRegion], unit: Unit) -> "Figure":
+def draw_views(
+    images: Images, regions: tuple[CriticalRegion, CriticalRegion], unit: Unit
+) -> "Figure":
     """Draw a unit's view of each whole image and of its critical region, with their scales."""
     pictures: list[Image] = []
     titles: list[str] = []
@@ -169,7 +195,9 @@ def draw_views(images: Images, regions: tuple[CriticalRegion, CriticalRegion], u
 
 
 def draw_both(images: Images, match: PairMatch) -> "Figure":
-    """Draw the points of both stages on the whole images: inliers in the colour of their stage, outliers grey."""
+    """Draw the points of both stages on the whole images: inliers in the colour of their stage,
+    outliers grey.
+    """
     figure, row = side_by_side(images, title_lines=2)
     inliers = match.estimate.inliers
     for axes, points in zip(row, (match.matches.points0, match.matches.points1), strict=True):
@@ -195,7 +223,8 @@ def draw_epipolar(
     truth: Matrix3 | None = None,
     count: int = 6,
 ) -> "Figure":
-    """Draw ``count`` points of image 0 and their epipolar lines in image 1 by each F; the true lines are dashed.
+    """Draw ``count`` points of image 0 and their epipolar lines in image 1 by each F; the true
+    lines are dashed.
 
     The points are matches, far from each other. Image 1 also shows their matched points.
     """
@@ -216,7 +245,9 @@ def draw_epipolar(
     return figure
 
 
-def draw_plane(images: Images, matches: Matches, homography: Estimate, threshold: float) -> "Figure":
+def draw_plane(
+    images: Images, matches: Matches, homography: Estimate, threshold: float
+) -> "Figure":
     """Draw the inliers of an F: on the plane of a homography, and off it."""
     figure, row = side_by_side(images, title_lines=2)
     for axes, points in zip(row, (matches.points0, matches.points1), strict=True):
@@ -233,13 +264,18 @@ def draw_pose_errors(errors: Mapping[str, PoseError]) -> "Figure":
     figure = new_figure(WIDTH, 1.0 + 0.4 * len(errors))
     panels = figure.subplots(1, 2, sharey=True)
     for axes, kind, title in zip(
-        panels, ("rotation", "translation_angle"), ("rotation", "direction of translation"), strict=True
+        panels,
+        ("rotation", "translation_angle"),
+        ("rotation", "direction of translation"),
+        strict=True,
     ):
         plain(axes, f"error of the {title} (degrees)")
         angles = np.array([getattr(error, kind) for error in errors.values()])
         known = np.isfinite(angles)
         names = [short(name, 40) for name in errors]
-        bars = axes.barh(names, np.where(known, angles, 0), color=list(COLOURS[: len(names)]), height=0.6)
+        bars = axes.barh(
+            names, np.where(known, angles, 0), color=list(COLOURS[: len(names)]), height=0.6
+        )
         labels = [f"{angle:.2f}" if ok else "no F" for angle, ok in zip(angles, known, strict=True)]
         axes.bar_label(bars, labels, padding=3)
         axes.margins(x=0.15)
@@ -261,7 +297,9 @@ def side_by_side(images: Sequence[Image], title_lines: int = 1) -> "tuple[Figure
 
 
 def connect(axes: "Sequence[Axes]", matches: Matches, inliers: NDArray[np.bool_]) -> str:
-    """Draw a sample of the matches from one picture to the other. Return a description of the sample."""
+    """Draw a sample of the matches from one picture to the other. Return a description of the
+    sample.
+    """
     from matplotlib.patches import ConnectionPatch
 
     outliers_drawn = sample(~inliers, MAX_OUTLIERS)
@@ -270,7 +308,13 @@ def connect(axes: "Sequence[Axes]", matches: Matches, inliers: NDArray[np.bool_]
     for indices, colour, width in ((outliers_drawn, OUTLIER, 0.5), (inliers_drawn, INLIER, 0.7)):
         for panel, points in zip(axes, (matches.points0, matches.points1), strict=True):
             panel.scatter(points[indices, 0], points[indices, 1], s=6, c=colour, linewidths=0)
-        style = {"coordsA": "data", "coordsB": "data", "color": colour, "linewidth": width, "alpha": 0.6}
+        style = {
+            "coordsA": "data",
+            "coordsB": "data",
+            "color": colour,
+            "linewidth": width,
+            "alpha": 0.6,
+        }
         for index in indices:
             ends = matches.points0[index], matches.points1[index]
             line = ConnectionPatch(*ends, axesA=axes[0], axesB=axes[1], **style)
@@ -318,11 +362,22 @@ def _numbered(axes: "Axes", points: Points) -> None:
     for index, (x, y) in enumerate(points):
         colour = COLOURS[index % len(COLOURS)]
         axes.scatter(x, y, s=130, c=colour, edgecolors="white", linewidths=1, zorder=3)
-        axes.text(x, y, str(index + 1), color="white", fontsize=8, ha="center", va="center_baseline", zorder=4)
+        axes.text(
+            x,
+            y,
+            str(index + 1),
+            color="white",
+            fontsize=8,
+            ha="center",
+            va="center_baseline",
+            zorder=4,
+        )
 
 
 def _line(axes: "Axes", F: Matrix3, point: Points, **style: Any) -> None:
-    """Draw the epipolar line of a point of image 0 on image 1: a x + b y + c = 0 with (a, b, c) = F x."""
+    """Draw the epipolar line of a point of image 0 on image 1: a x + b y + c = 0 with (a, b, c) = F
+    x.
+    """
     a, b, c = F @ np.append(point.astype(np.float64), 1)
     normal = a * a + b * b
     if normal > 0:

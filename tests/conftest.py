@@ -15,13 +15,15 @@ from mkpc_kaggle.engine.request import RunReport
 from mkpc_kaggle.package.wheels import BUNDLED
 from mkpc_kaggle.weights import store as weight_store
 
-# Before torch is imported, here and in the processes of the tests: their tensors are small, and on a busy machine
-# threads wait for each other more than they work.
+# Before torch is imported, here and in the processes of the tests: their tensors are small, and on
+# a busy machine threads wait for each other more than they work.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 
 # How long an example takes is the machine's affair; tests that are about time measure it.
-settings.register_profile("any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.register_profile(
+    "any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow]
+)
 settings.load_profile("any machine")
 
 
@@ -47,7 +49,9 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> DemoSet:
 
 @pytest.fixture(scope="session")
 def pairs(tmp_path_factory: pytest.TempPathFactory) -> "list[Pair]":
-    """Twelve pairs of flat images, which the matcher of :mod:`rectified` tells apart by their brightness."""
+    """Twelve pairs of flat images, which the matcher of :mod:`rectified` tells apart by their
+    brightness.
+    """
     from rectified import write_pairs
 
     return write_pairs(tmp_path_factory.mktemp("pairs"), 12)

@@ -29,8 +29,12 @@ def texts_of(source: str) -> Iterator[str]:
 
 
 def everything_said() -> str:
-    sources = [path.read_text(encoding="utf-8") for path in sorted((ROOT / "mkpc_kaggle").rglob("*.py"))]
-    cells = json.loads((ROOT / "notebooks" / "submission.ipynb").read_text(encoding="utf-8"))["cells"]
+    sources = [
+        path.read_text(encoding="utf-8") for path in sorted((ROOT / "mkpc_kaggle").rglob("*.py"))
+    ]
+    cells = json.loads((ROOT / "notebooks" / "submission.ipynb").read_text(encoding="utf-8"))[
+        "cells"
+    ]
     code = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
     python = [TransformerManager().transform_cell(text) for text in code]
     return "\n".join(text for source in [*sources, *python] for text in texts_of(source))
@@ -44,8 +48,12 @@ def pattern_of(message: str) -> str:
 
 def test_every_message_of_the_troubleshooting_page_is_one_of_the_programs():
     """They are in backticks in the first column of its table."""
-    rows = re.findall(r"^\| (.*?) \|", (ROOT / "docs" / "troubleshooting.md").read_text(encoding="utf-8"), re.M)
-    known = [text for row in rows for text in re.findall(r"`([^`]+)`", row) if not text.startswith("--")]
+    rows = re.findall(
+        r"^\| (.*?) \|", (ROOT / "docs" / "troubleshooting.md").read_text(encoding="utf-8"), re.M
+    )
+    known = [
+        text for row in rows for text in re.findall(r"`([^`]+)`", row) if not text.startswith("--")
+    ]
     said = everything_said()
     assert len(known) > 25
     assert [message for message in known if not re.search(pattern_of(message), said)] == []
@@ -57,7 +65,11 @@ def options_of(parser: argparse.ArgumentParser) -> set[str]:
 
 def inner(parser):
     """The parsers of its commands, by name."""
-    groups = [action.choices for action in parser._actions if isinstance(action, argparse._SubParsersAction)]
+    groups = [
+        action.choices
+        for action in parser._actions
+        if isinstance(action, argparse._SubParsersAction)
+    ]
     return {name: each for choices in groups for name, each in choices.items()}
 
 
@@ -103,8 +115,12 @@ def test_a_folder_uses_those_above_it_and_never_those_below():
     folders = re.findall(r"^\| `(\w+)/` \|", page, re.M)
     order = ["errors", "version", "config", folders[0], "recipe", *folders[1:]]
     package = ROOT / "mkpc_kaggle"
-    assert {path.name for path in package.iterdir() if (path / "__init__.py").is_file()} == set(folders)
+    assert {path.name for path in package.iterdir() if (path / "__init__.py").is_file()} == set(
+        folders
+    )
     for path in package.glob("*/**/*.py"):
         layer = order.index(path.relative_to(package).parts[0])
-        used = re.findall(r"^\s*(?:from|import) mkpc_kaggle\b\.?(\w*)", path.read_text(encoding="utf-8"), re.M)
+        used = re.findall(
+            r"^\s*(?:from|import) mkpc_kaggle\b\.?(\w*)", path.read_text(encoding="utf-8"), re.M
+        )
         assert [name for name in used if name not in order[: layer + 1]] == [], path

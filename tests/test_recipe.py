@@ -12,7 +12,15 @@ from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.robust import Method, RobustConfig
 from mkpc_kaggle.matchers.registry import matcher_names, spec_of
 from mkpc_kaggle.pipeline.availability import options_of
-from mkpc_kaggle.recipe import Mode, Recipe, Unit, load_recipe, parse_recipe, recipe_names, split_mode
+from mkpc_kaggle.recipe import (
+    Mode,
+    Recipe,
+    Unit,
+    load_recipe,
+    parse_recipe,
+    recipe_names,
+    split_mode,
+)
 from mkpc_kaggle.weights.manifest import manifest
 
 SIFT = 'units = [{ stage = 1, matcher = "sift", long_side = 640 }]\n'
@@ -38,7 +46,9 @@ def test_a_recipe_of_the_package_loads_with_options_for_every_matcher(name):
         assert recipe.in_mode(mode).units[0] == recipe.units[0]
         assert mode is Mode.TWO_STAGE or {unit.stage for unit in recipe.in_mode(mode).units} == {1}
     paper = name.startswith(("yfcc", "scannet", "imc2022"))
-    assert ((recipe.focal is None), recipe.magsac.permutations) == ((True, 8) if paper else (False, 1))
+    assert ((recipe.focal is None), recipe.magsac.permutations) == (
+        (True, 8) if paper else (False, 1)
+    )
 
 
 def test_whatever_matchers_are_left_of_recipe_auto_the_first_unit_can_sweep():
@@ -63,9 +73,19 @@ def test_recipes_for_every_user_name_no_weights_for_noncommercial_use_but_with_a
 
 
 def test_fallbacks_take_the_places_of_matchers_that_are_unfit_and_are_forgotten_otherwise():
-    recipe = Recipe((Unit(1, "a", 640), Unit(1, "b", 640, fallback="c"), Unit(2, "b", 800, 9, fallback="c")))
-    assert recipe.with_fallbacks({"b", "a"}).units == (Unit(1, "a", 640), Unit(1, "c", 640), Unit(2, "c", 800, 9))
-    assert recipe.with_fallbacks({"c"}).units == (Unit(1, "a", 640), Unit(1, "b", 640), Unit(2, "b", 800, 9))
+    recipe = Recipe(
+        (Unit(1, "a", 640), Unit(1, "b", 640, fallback="c"), Unit(2, "b", 800, 9, fallback="c"))
+    )
+    assert recipe.with_fallbacks({"b", "a"}).units == (
+        Unit(1, "a", 640),
+        Unit(1, "c", 640),
+        Unit(2, "c", 800, 9),
+    )
+    assert recipe.with_fallbacks({"c"}).units == (
+        Unit(1, "a", 640),
+        Unit(1, "b", 640),
+        Unit(2, "b", 800, 9),
+    )
 
 
 def test_a_recipe_reads_as_written():
@@ -95,19 +115,30 @@ def test_a_unit_shows_a_crop_at_its_size():
 
 def unit(**changes):
     keys = {"stage": 1, "matcher": '"sift"', "long_side": 640} | changes
-    return f"{{ {', '.join(f'{key} = {value}' for key, value in keys.items() if value is not None)} }}"
+    return (
+        f"{{ {', '.join(f'{key} = {value}' for key, value in keys.items() if value is not None)} }}"
+    )
 
 
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("colour = 1\n" + SIFT, r"'colour'; known keys: description, units, mkpc, magsac, focal, matchers, scene"),
-        (units(unit(longside=640)), r"unit 1.*'longside'.*stage, matcher, long_side, max_matches, area"),
+        (
+            "colour = 1\n" + SIFT,
+            r"'colour'; known keys: description, units, mkpc, magsac, focal, matchers, scene",
+        ),
+        (
+            units(unit(longside=640)),
+            r"unit 1.*'longside'.*stage, matcher, long_side, max_matches, area",
+        ),
         (SIFT + "[mkpc]\nepsilon = 1\n", r"\[mkpc\].*'epsilon'.*eps, min_samples, share, expand_x"),
         (units(unit(stage=None)), r"unit 1: missing keys 'stage'"),
         ("", "no units"),
         ("units = [", "not valid TOML"),
-        (SIFT + "[mkpc]\nmin_samples = 5.0\n", r"\[mkpc\], key 'min_samples': expected int, got 5.0"),
+        (
+            SIFT + "[mkpc]\nmin_samples = 5.0\n",
+            r"\[mkpc\], key 'min_samples': expected int, got 5.0",
+        ),
         (SIFT + '[magsac]\nmethod = "MAGSAC"\n', r"'MAGSAC' is none of 'magsac', 'ransac'"),
         (units(unit(stage="true")), r"key 'stage': expected int, got True"),
         ('units = "sift"\n', "units|unit 1"),
@@ -120,7 +151,10 @@ def unit(**changes):
         (units(unit(max_matches=0)), r"max_matches must be in \[1, inf\), not 0"),
         (units(unit(stretch="true")), "stretch needs an area"),
         *[
-            (units(unit(long_side=None, area=f'"{area}"')), f'height x width such as "540x720", not {area!r}')
+            (
+                units(unit(long_side=None, area=f'"{area}"')),
+                f'height x width such as "540x720", not {area!r}',
+            )
             for area in ("540", "540x0", "540 x 720", "640x100000")
         ],
         (SIFT + "[mkpc]\neps = nan\n", r"table \[mkpc\]: .*eps must be in \[1e-06, inf\), not nan"),
@@ -134,7 +168,10 @@ def test_a_recipe_that_makes_no_run_is_refused_in_words_that_help(text, says):
 
 def test_options_that_a_matcher_does_not_have_are_refused():
     for text, says in (
-        ("[matchers.sift]\nkeypoints = 1\n", r"\[matchers.sift\].*'keypoints'.*features, ratio, contrast"),
+        (
+            "[matchers.sift]\nkeypoints = 1\n",
+            r"\[matchers.sift\].*'keypoints'.*features, ratio, contrast",
+        ),
         ("[matchers]\nsift = 3\n", "matchers"),
     ):
         with pytest.raises(UserError, match=says):
@@ -145,7 +182,9 @@ def test_options_that_a_matcher_does_not_have_are_refused():
 
 def test_a_recipe_is_found_by_its_name_or_path_and_nowhere_else(tmp_path):
     (tmp_path / "my own.toml").write_bytes(b"\xef\xbb\xbf" + SIFT.encode())
-    assert load_recipe(str(tmp_path / "my own.toml")) == Recipe((Unit(1, "sift", 640),), name="my own")
+    assert load_recipe(str(tmp_path / "my own.toml")) == Recipe(
+        (Unit(1, "sift", 640),), name="my own"
+    )
     (tmp_path / "a.toml").mkdir()
     (tmp_path / "b.toml").write_bytes(SIFT.encode() + b"# caf\xe9\n")
     os.mkfifo(tmp_path / "pipe.toml")
@@ -161,7 +200,13 @@ def test_a_recipe_is_found_by_its_name_or_path_and_nowhere_else(tmp_path):
             load_recipe(str(name))
 
 
-NAMES = ((1, "sift", 640), (2, "sift", 640), (2, "aliked", 800), (1, "aliked", 640), (2, "sift", 320))
+NAMES = (
+    (1, "sift", 640),
+    (2, "sift", 640),
+    (2, "aliked", 800),
+    (1, "aliked", 640),
+    (2, "sift", 320),
+)
 ALL = Recipe(tuple(Unit(*name) for name in NAMES), name="all", mkpc=MkpcConfig(eps=0.1))
 
 
@@ -170,7 +215,12 @@ def test_modes_keep_stage_1_or_show_every_unit_the_whole_image_and_none_twice():
     stage_1, whole = ALL.in_mode(Mode.STAGE_1), ALL.in_mode(Mode.WHOLE_IMAGES)
     assert [unit.name for unit in stage_1.units] == ["1:sift@640", "1:aliked@640"]
     assert (stage_1.name, stage_1.mkpc) == ("all (stage-1)", ALL.mkpc)
-    assert [unit.name for unit in whole.units] == ["1:sift@640", "1:aliked@800", "1:aliked@640", "1:sift@320"]
+    assert [unit.name for unit in whole.units] == [
+        "1:sift@640",
+        "1:aliked@800",
+        "1:aliked@640",
+        "1:sift@320",
+    ]
 
 
 def test_a_choice_is_a_recipe_and_perhaps_a_mode():

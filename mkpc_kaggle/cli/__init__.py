@@ -35,14 +35,18 @@ EXIT_INTERRUPTED = 128 + 2  # a shell's status for SIGINT
 
 
 def program(arguments: Sequence[str] | None = None) -> NoReturn:
-    """Run a command and end the process at once: an orderly interpreter exit takes a second or longer."""
+    """Run a command and end the process at once: an orderly interpreter exit takes a second or
+    longer.
+    """
     try:  # Ctrl-C during slow imports is not an error
         from mkpc_kaggle.engine.console import leave
 
         former = os.environ.get("MPLCONFIGDIR")
         status = main(arguments)
-        if (made := os.environ.get("MPLCONFIGDIR")) != former:  # set by matplotlib if it cannot write below HOME
-            shutil.rmtree(str(made), ignore_errors=True)  # matplotlib removes it only in an orderly exit
+        # Set by matplotlib if it cannot write below HOME
+        if (made := os.environ.get("MPLCONFIGDIR")) != former:
+            # Matplotlib removes it only in an orderly exit
+            shutil.rmtree(str(made), ignore_errors=True)
     except KeyboardInterrupt:
         os._exit(EXIT_INTERRUPTED)
     leave(status)
@@ -51,15 +55,16 @@ def program(arguments: Sequence[str] | None = None) -> NoReturn:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command. Return the exit status.
 
-    0: done; 1: a check failed; 2: bad input; 130, 143: ended by a signal; 141: the reader of the output closed the
-    pipe. The time limit counts from the call, before the slow imports.
+    0: done; 1: a check failed; 2: bad input; 130, 143: ended by a signal; 141: the reader of the
+    output closed the pipe. The time limit counts from the call, before the slow imports.
     """
     started = time.monotonic()
     from mkpc_kaggle.engine.console import complain, warn
     from mkpc_kaggle.errors import UserError
 
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, TextIOWrapper):  # paths and ids may have characters that the terminal cannot encode
+        # Paths and ids may have characters that the terminal cannot encode
+        if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
     with ExitStack() as printing, warnings.catch_warnings():
         warnings.showwarning = lambda message, *_, **__: warn(str(message))
@@ -73,7 +78,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             try:
                 Path.cwd()  # relative paths are undefined without it
             except OSError as error:
-                raise UserError(f"the current directory is gone ({error.strerror}); change to another") from error
+                raise UserError(
+                    f"the current directory is gone ({error.strerror}); change to another"
+                ) from error
             parsed.started = started
             printing.enter_context(parsed.printing())
             status = int(parsed.run(parsed) or 0)
@@ -97,10 +104,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def make_parser(arguments: Sequence[str] = tuple(COMMANDS)) -> argparse.ArgumentParser:
-    """Return the parser for these arguments. Import only the commands that they name: imports take time."""
+    """Return the parser for these arguments. Import only the commands that they name: imports take
+    time.
+    """
     text = "Two-stage image matching with Matching Key-Points Crop, offline, inside a time budget."
     epilog = "mkpc COMMAND --help has the options of a command."
-    parser = argparse.ArgumentParser("mkpc", description=text, epilog=epilog, formatter_class=HelpFormatter)
+    parser = argparse.ArgumentParser(
+        "mkpc", description=text, epilog=epilog, formatter_class=HelpFormatter
+    )
     parser.add_argument("--version", action="version", version=__version__)
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
     for name, summary in COMMANDS.items():

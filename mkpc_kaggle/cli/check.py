@@ -21,6 +21,10 @@ def run(arguments: argparse.Namespace) -> int:
     pairs = read_test_side(arguments.test_dir)
     problems = submission_problems(arguments.submission, [pair.id for pair in pairs])
     more = [f"... and {len(problems) - MAX_LINES} more"] if len(problems) > MAX_LINES else []
-    verdict = f"{arguments.submission}: {len(problems)} problems" if problems else f"good: {len(pairs)} rows"
+    verdict = (
+        f"{arguments.submission}: {len(problems)} problems"
+        if problems
+        else f"good: {len(pairs)} rows"
+    )
     print("\n".join([*problems[:MAX_LINES], *more, verdict]))
     return 1 if problems else 0

@@ -17,7 +17,9 @@ poses, DIR/test without poses, and DIR/test_truth.csv to score a submission:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--out", type=Path, default=Path("demo"), metavar="DIR", help="default: demo")
+    parser.add_argument(
+        "--out", type=Path, default=Path("demo"), metavar="DIR", help="default: demo"
+    )
     parser.add_argument("--seed", type=int, default=0, help="seed of the rendered scenes")
 
 
@@ -26,4 +28,6 @@ def run(arguments: argparse.Namespace) -> None:
         raise UserError("--seed: give 0 or more")
     with writing(f"--out {arguments.out}"):
         demo = write_demo(arguments.out, seed=arguments.seed)
-    print(f"train side: {demo.train_dir}\ntest side: {demo.test_dir}\ntruth of the test side: {demo.truth_csv}")
+    print(
+        f"train side: {demo.train_dir}\ntest side: {demo.test_dir}\ntruth of the test side: {demo.truth_csv}"
+    )

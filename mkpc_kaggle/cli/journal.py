@@ -35,13 +35,18 @@ Exit status: 0 done, 2 the journal does not exist, or a file cannot be written.
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.set_defaults(printing=partial(unblocked, [2]))  # stderr, where image decoders print warnings
+    # Stderr, where image decoders print warnings
+    parser.set_defaults(printing=partial(unblocked, [2]))
     parser.add_argument("work_dir", type=Path, metavar="DIR")
     parser.add_argument("--csv", type=Path, metavar="OUT", help="write tables to this directory")
-    parser.add_argument("--report", type=Path, metavar="FILE.html", help="write a page with pictures")
+    parser.add_argument(
+        "--report", type=Path, metavar="FILE.html", help="write a page with pictures"
+    )
     text = "remove the results that the last run did not use"
     parser.add_argument("--prune", action="store_true", help=text)
-    parser.add_argument("--test-dir", type=Path, metavar="DIR", help="the images that the report draws")
+    parser.add_argument(
+        "--test-dir", type=Path, metavar="DIR", help="the images that the report draws"
+    )
 
 
 def run(arguments: argparse.Namespace) -> None:

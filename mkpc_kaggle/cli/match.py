@@ -27,10 +27,13 @@ files, without the EXIF orientation; figures are upright.
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.set_defaults(printing=partial(unblocked, [2]))  # stderr, where image decoders print warnings
+    # Stderr, where image decoders print warnings
+    parser.set_defaults(printing=partial(unblocked, [2]))
     parser.add_argument("image0", type=Path)
     parser.add_argument("image1", type=Path)
-    parser.add_argument("--out", type=Path, metavar="FIG.png", help="draw the pair; the suffix sets the format")
+    parser.add_argument(
+        "--out", type=Path, metavar="FIG.png", help="draw the pair; the suffix sets the format"
+    )
     text = "save the points, scores, inliers and F as arrays"
     parser.add_argument("--save", type=Path, metavar="FILE.npz", help=text)
     options.add_matching(parser)
@@ -87,7 +90,9 @@ def _lines(match: PairMatch, recipe: str) -> list[str]:
     lines += [" ".join(f"{value: .9e}" for value in row) for row in found.matrix]
     lines += [f"this is the fallback: {found.failure}"] if found.failure else []
     lines.append(f"{len(match.matches)} matches, {found.inlier_count} inliers")
-    verdict = "the images overlap" if found.stats.support >= MIN_SUPPORT else "the images may not overlap"
+    verdict = (
+        "the images overlap" if found.stats.support >= MIN_SUPPORT else "the images may not overlap"
+    )
     lines.append(f"{found.stats.support:.1f} times the inliers expected by chance: {verdict}")
     for result in match.results:
         counts = f"{len(result.matches):>6} matches  {result.seconds:.2f} s"

@@ -21,22 +21,40 @@ from mkpc_kaggle.reporting.summary import left_out_line
 
 def add_matching(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("--recipe", default="auto", metavar="NAME|FILE.toml", help="default: auto, every matcher with its weights")
+    add(
+        "--recipe",
+        default="auto",
+        metavar="NAME|FILE.toml",
+        help="default: auto, every matcher with its weights",
+    )
     add_weights(parser)
     text = """permissive: only weights under Apache-2.0, BSD-3-Clause or MIT. Recipe auto omits other weights, and
         units run their fallback; any other recipe that needs them is refused (default: any)"""
     add("--licence", choices=list(map(str, Licence)), default="any", help=text)
-    add("--device", default="auto", help="cpu, cuda, cuda:N, or auto (the default): all GPUs, else the CPU")
+    add(
+        "--device",
+        default="auto",
+        help="cpu, cuda, cuda:N, or auto (the default): all GPUs, else the CPU",
+    )
     text = "of the networks; auto: half precision if the device computes faster with it (default: float32)"
-    add("--precision", default="float32", choices=["float32", "auto", "bfloat16", "float16"], help=text)
+    add(
+        "--precision",
+        default="float32",
+        choices=["float32", "auto", "bfloat16", "float16"],
+        help=text,
+    )
     text = """another value of a recipe's setting, such as matchers.loftr.threshold=0.3; may be
         repeated. docs/recipes.md lists the settings"""
     add("--set", action="append", default=[], metavar="TABLE.KEY=VALUE", help=text)
 
 
 def add_weights(parser: argparse.ArgumentParser) -> None:
-    text = "directory of weight files; may be repeated. Also searched: $MKPC_WEIGHTS and /kaggle/input"
-    parser.add_argument("--weights", action="append", default=[], type=Path, metavar="DIR", help=text)
+    text = (
+        "directory of weight files; may be repeated. Also searched: $MKPC_WEIGHTS and /kaggle/input"
+    )
+    parser.add_argument(
+        "--weights", action="append", default=[], type=Path, metavar="DIR", help=text
+    )
 
 
 def add_run(parser: argparse.ArgumentParser, time_limit: str | None) -> None:
@@ -62,7 +80,9 @@ def settings_of(arguments: argparse.Namespace) -> dict[str, Any]:
     return dict(map(parse_setting, arguments.set))
 
 
-def assembly_of(arguments: argparse.Namespace, recipe: str, mode: str, interrupt: Interrupt) -> Assembly:
+def assembly_of(
+    arguments: argparse.Namespace, recipe: str, mode: str, interrupt: Interrupt
+) -> Assembly:
     with interrupt.raising():  # computing the digests of large files takes long
         return assemble(
             recipe,
@@ -77,13 +97,21 @@ def assembly_of(arguments: argparse.Namespace, recipe: str, mode: str, interrupt
 
 
 def budget_of(arguments: argparse.Namespace) -> Budget:
-    started = arguments.started if arguments.started_at is None else monotonic_of(arguments.started_at)
-    return Budget(started, inf if arguments.time_limit is None else parse_duration(arguments.time_limit))
+    started = (
+        arguments.started if arguments.started_at is None else monotonic_of(arguments.started_at)
+    )
+    return Budget(
+        started, inf if arguments.time_limit is None else parse_duration(arguments.time_limit)
+    )
 
 
 @contextmanager
-def watched_session(arguments: argparse.Namespace, work_dir: Path, interrupt: Interrupt) -> Iterator[Session]:
-    """Open a session with these options, whose watchdog ends the program in time even if the run hangs."""
+def watched_session(
+    arguments: argparse.Namespace, work_dir: Path, interrupt: Interrupt
+) -> Iterator[Session]:
+    """Open a session with these options, whose watchdog ends the program in time even if the run
+    hangs.
+    """
     budget, fresh, workers = budget_of(arguments), arguments.fresh, arguments.workers
     with Session(work_dir, budget, interrupt, fresh, workers=workers).watched() as session:
         yield session
@@ -97,7 +125,9 @@ def say_start(what: str, assembly: Assembly, work_dir: Path) -> None:
 
 
 def finish(session: Session, page: Path | None, pairs: Sequence[Pair]) -> int:
-    """Write a run's report to ``page``, if given. Return a received signal's exit status, else the session's."""
+    """Write a run's report to ``page``, if given. Return a received signal's exit status, else the
+    session's.
+    """
     from mkpc_kaggle.reporting.report import report_run
 
     if page is not None:
@@ -114,4 +144,6 @@ def print_table(rows: Sequence[tuple[str, ...]]) -> None:
     """Print rows of equal length in aligned columns."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:
-        print("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+        print(
+            "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+        )

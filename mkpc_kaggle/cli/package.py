@@ -24,7 +24,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--out", type=Path, required=True, metavar="DIR", help="the directory for the two folders")
     add("--owner", required=True, metavar="NAME", help="your user name on Kaggle")
     options.add_weights(parser)
-    add("--python", default=",".join(PYTHONS), metavar="VERSIONS", help="of the wheels (default: %(default)s)")
+    add(
+        "--python",
+        default=",".join(PYTHONS),
+        metavar="VERSIONS",
+        help="of the wheels (default: %(default)s)",
+    )
     add("--wheels", type=Path, metavar="DIR", help="take wheels from DIR, without a network")
     text = "include weights that must not be redistributed; the dataset must then stay private"
     add("--private", action="store_true", help=text)
@@ -49,7 +54,10 @@ def run(arguments: argparse.Namespace) -> None:
     )
     package = make_package(request)
     for folder, items in (("dataset", package.dataset), ("kernel", package.kernel)):
-        rows = [(item.name, str(item.source.stat().st_size), item.licence or "-", item.note) for item in items]
+        rows = [
+            (item.name, str(item.source.stat().st_size), item.licence or "-", item.note)
+            for item in items
+        ]
         total = f"{len(rows)} files", str(sum(int(size) for _, size, *_ in rows)), "", ""
         print(out / folder)
         options.print_table([("file", "bytes", "licence", ""), *rows, total])
@@ -60,7 +68,9 @@ def run(arguments: argparse.Namespace) -> None:
     print(_NEXT.format(out=out))
 
 
-_LEFT_OUT = "Left out, because their licences do not clearly allow redistribution (--private includes them)"
+_LEFT_OUT = (
+    "Left out, because their licences do not clearly allow redistribution (--private includes them)"
+)
 _PRIVATE = """\
 Included, although their licences do not clearly allow redistribution. Keep the dataset private on Kaggle, do not
 share it, and check what the licences say about competitions"""

@@ -60,12 +60,27 @@ MAX_LINES = 20  # printed of each list
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("images", type=Path, metavar="DIR", help="png, jpg or jpeg files, or folders of them")
-    add("--out", type=Path, required=True, metavar="OUT", help="empty, or with the results of an earlier run")
+    add(
+        "--out",
+        type=Path,
+        required=True,
+        metavar="OUT",
+        help="empty, or with the results of an earlier run",
+    )
     options.add_matching(parser)
     options.add_run(parser, time_limit=None)
-    add("--pairs", type=Path, metavar="FILE", help="match only these: two paths below DIR per line, as in hloc")
+    add(
+        "--pairs",
+        type=Path,
+        metavar="FILE",
+        help="match only these: two paths below DIR per line, as in hloc",
+    )
     add("--format", choices=FORMS, help="also write submission.csv; imc2023 is also for 2024")
-    add("--rotations", action="store_true", help="try images without matches turned by 90, 180 and 270 degrees")
+    add(
+        "--rotations",
+        action="store_true",
+        help="try images without matches turned by 90, 180 and 270 degrees",
+    )
     text = """images of one size in a folder that share a camera: if their focal lengths agree (auto), none
         (image), or all (folder)"""
     add("--camera", choices=list(map(str, CameraSharing)), help=text)
@@ -83,7 +98,11 @@ def run(arguments: argparse.Namespace) -> int:
     root, out, work_dir = arguments.images, arguments.out, arguments.out / "work"
     datasets = read_folder(root)
     files = [file for found in datasets.values() for file in found]
-    known = "" if arguments.intrinsics is None else read_intrinsics_table(arguments.intrinsics, root, files)
+    known = (
+        ""
+        if arguments.intrinsics is None
+        else read_intrinsics_table(arguments.intrinsics, root, files)
+    )
     masks = Masks() if arguments.masks is None else Masks.of_folder(arguments.masks, root, files)
     inputs = [root, arguments.pairs, Path(arguments.recipe), arguments.intrinsics, arguments.masks]
     require_directory_apart(out, filter(None, inputs), arguments.weights)
@@ -134,10 +153,16 @@ def _lines(result: FolderResult, root: Path) -> Iterator[str]:
     for name, found in result.cameras.items():
         models = Counter(placed[0] for placed in found.values() if placed)
         sizes = ", ".join(str(models[number]) for number in sorted(models))
-        why = f"models of {sizes}" if models else reasons.get(batches[name], "too few pairs, or too little time")
+        why = (
+            f"models of {sizes}"
+            if models
+            else reasons.get(batches[name], "too few pairs, or too little time")
+        )
         yield f"{batches[name]}: {models.total()} of {len(found)} images have a camera: {why}"
     yield from weakest_line(report.scenes)
     yield from pending_lines(report)
-    unreadable = {record.failure for record in report.records if record.reached and not record.units}
+    unreadable = {
+        record.failure for record in report.records if record.reached and not record.units
+    }
     yield from (f"cannot be read: {failure}" for failure in sorted(unreadable)[:MAX_LINES])
     yield from (f"fault: {fault}" for fault in report.faults[:MAX_LINES])

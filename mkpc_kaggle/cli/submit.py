@@ -25,7 +25,13 @@ without an F), or the last version of the file could not be written; an earlier 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("--test-dir", type=Path, required=True, metavar="DIR", help="holds test.csv and test_images/")
+    add(
+        "--test-dir",
+        type=Path,
+        required=True,
+        metavar="DIR",
+        help="holds test.csv and test_images/",
+    )
     add("--output", type=Path, default=Path("submission.csv"), help="default: submission.csv")
     options.add_matching(parser)
     text = """reconstruct the pairs of a batch together and take F from the cameras (default: the recipe's choice;
@@ -33,7 +39,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         and compare published stereo scores with --no-scenes only"""
     add("--scenes", dest="reconstruct", action=argparse.BooleanOptionalAction, help=text)
     options.add_run(parser, time_limit="8h45m")
-    add("--work-dir", type=Path, metavar="DIR", help="for the journal; default: NAME.work next to the output")
+    add(
+        "--work-dir",
+        type=Path,
+        metavar="DIR",
+        help="for the journal; default: NAME.work next to the output",
+    )
     add("--fresh", action="store_true", help="delete the journal of an earlier run")
     text = "a page about the run; default: NAME.html next to the output"
     add("--report", type=Path, metavar="FILE.html", help=text)
@@ -43,18 +54,27 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     output: Path = arguments.output
     work_dir: Path = arguments.work_dir or output.parent / f"{output.stem}.work"
-    page = None if arguments.no_report else arguments.report or output.parent / f"{output.stem}.html"
+    page = (
+        None if arguments.no_report else arguments.report or output.parent / f"{output.stem}.html"
+    )
     files = {"--output": output, "--report": page}
-    require_apart(files, [*test_side(arguments.test_dir), Path(arguments.recipe)], work_dir, arguments.weights)
+    require_apart(
+        files, [*test_side(arguments.test_dir), Path(arguments.recipe)], work_dir, arguments.weights
+    )
     with interruptible() as interrupt:
         pairs = read_test_side(arguments.test_dir)
-        # first_version precedes the watchdog: a run that starts after its limit must leave a complete file.
-        with first_version(pairs, output), options.watched_session(arguments, work_dir, interrupt) as session:
+        # first_version precedes the watchdog: a run that starts after its limit must leave a
+        # complete file.
+        with (
+            first_version(pairs, output),
+            options.watched_session(arguments, work_dir, interrupt) as session,
+        ):
             assembly = options.assembly_of(arguments, arguments.recipe, arguments.mode, interrupt)
             options.say_start(f"{len(pairs)} pairs", assembly, work_dir)
             report = submit(pairs, assembly, session, output, str(test_side(arguments.test_dir)[1]))
             session.status = int(bool(report.unwritten or trouble(report)))
             unwritten = f" is not the last version: {report.unwritten}" if report.unwritten else ""
             lines = [*options.plan_lines(arguments, report), summary(report)]
-            say("\n".join([*lines, f"submission: {output}{unwritten}"]))  # now: drawing may exceed the time limit
+            # Now: drawing may exceed the time limit
+            say("\n".join([*lines, f"submission: {output}{unwritten}"]))
             return options.finish(session, page, pairs)

@@ -68,16 +68,30 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--image-root", type=Path, metavar="DIR", help="where the images of --pairs lie")
     add("--scenes", default="", metavar="A,B", help="of --train-dir; default: all")
     add("--pairs-per-scene", type=int, metavar="N", help="evenly spread; default: all")
-    add("--min-covisibility", type=float, default=0.1, help="of --train-dir; default: 0.1, as in the competition")
+    add(
+        "--min-covisibility",
+        type=float,
+        default=0.1,
+        help="of --train-dir; default: 0.1, as in the competition",
+    )
     options.add_matching(parser)
     text = "F from each pair's matches alone, even if the recipe reconstructs scenes"
     add("--no-scenes", dest="reconstruct", action="store_const", const=False, help=text)
-    add("--units", metavar="A,B", help="only these, in this order, such as 1:sift@1536; default: the recipe's")
+    add(
+        "--units",
+        metavar="A,B",
+        help="only these, in this order, such as 1:sift@1536; default: the recipe's",
+    )
     text = """run these instead of --recipe and --mode, and give the gain of each over the first with its 95 %%
         interval; such as classical:whole-images classical"""
     add("--compare", nargs="+", metavar="RECIPE[:MODE]", help=text)
     add("--method", choices=list(map(str, Method)), help="default: the recipe's")
-    add("--threshold", type=float, metavar="PIXELS", help="of the method; for E divided by the mean focal length")
+    add(
+        "--threshold",
+        type=float,
+        metavar="PIXELS",
+        help="of the method; for E divided by the mean focal length",
+    )
     text = "settings of a published evaluation, see docs/benchmarks.md; --method and --threshold change them"
     add("--protocol", choices=list(PROTOCOLS), help=text)
     text = "the matches choose between E's two rotations, as with --protocol; default: the one nearer to the truth"
@@ -89,18 +103,39 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     text = """keep the journal there and resume from it; report.html (with --compare, a page for each recipe) shows
         the run (not with --pairs); default: a temporary directory"""
     add("--work-dir", type=Path, metavar="DIR", help=text)
-    add("--submission", action="append", type=Path, metavar="CSV", help="score it, match nothing; may be repeated")
-    add("--truth", type=Path, metavar="CSV", help="the pairs of its samples; `demo` writes an example")
+    add(
+        "--submission",
+        action="append",
+        type=Path,
+        metavar="CSV",
+        help="score it, match nothing; may be repeated",
+    )
+    add(
+        "--truth",
+        type=Path,
+        metavar="CSV",
+        help="the pairs of its samples; `demo` writes an example",
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:
     _require_a_whole(arguments)
     if arguments.imc2025 is not None:
         for submission in arguments.submission:
-            say("\n".join([str(submission), *score_lines(score_imc2025(arguments.imc2025, submission))]))
+            say(
+                "\n".join(
+                    [str(submission), *score_lines(score_imc2025(arguments.imc2025, submission))]
+                )
+            )
         return 0
     root = arguments.train_dir or arguments.image_root
-    inputs = [root, arguments.pairs, arguments.truth, arguments.regions, *(arguments.submission or ())]
+    inputs = [
+        root,
+        arguments.pairs,
+        arguments.truth,
+        arguments.regions,
+        *(arguments.submission or ()),
+    ]
     require_apart({"--json": arguments.json}, filter(None, inputs), arguments.work_dir)
     scenes: Sequence[TrainScene]
     most, least = arguments.pairs_per_scene, arguments.min_covisibility
@@ -113,7 +148,9 @@ def run(arguments: argparse.Namespace) -> int:
         status, figures = _score(arguments, scenes)
     else:
         with tempfile.TemporaryDirectory(prefix="mkpc-") as temporary:
-            status, figures = _match_and_score(arguments, scenes, root, arguments.work_dir or Path(temporary))
+            status, figures = _match_and_score(
+                arguments, scenes, root, arguments.work_dir or Path(temporary)
+            )
     if figures is not None and arguments.json is not None:
         with writing(f"--json {arguments.json}"):
             arguments.json.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
@@ -126,24 +163,38 @@ def _require_a_whole(given: argparse.Namespace) -> None:
     matches = any(getattr(given, name) != default for name, default in MATCHING.items())
     matching = ", ".join(f"--{name.replace('_', '-')}" for name in MATCHING)
     for is_wrong, message in (
-        (given.imc2025 and (given.truth or not scored), "--imc2025 needs --submission, and no --truth"),
+        (
+            given.imc2025 and (given.truth or not scored),
+            "--imc2025 needs --submission, and no --truth",
+        ),
         (not given.imc2025 and scored != bool(given.truth), "--submission and --truth go together"),
         (scored and matches, f"--submission matches nothing: it goes without {matching}"),
         (given.imc2025 and given.json, "--imc2025 only prints the score: it goes without --json"),
-        ((given.pairs is None) != (given.image_root is None), "--pairs and --image-root go together"),
+        (
+            (given.pairs is None) != (given.image_root is None),
+            "--pairs and --image-root go together",
+        ),
         (scored and given.pairs, "--submission needs a --train-dir: it scores in metres"),
         (given.protocol and not given.pairs, "--protocol needs --pairs: it is of E"),
         (given.in_front and not given.pairs, "--in-front needs --pairs: it is of E"),
         (given.pairs and given.compare, "--compare needs a --train-dir: it scores in metres"),
-        (given.compare and given.units, "--units chooses from one recipe; --compare takes recipes as they are"),
+        (
+            given.compare and given.units,
+            "--units chooses from one recipe; --compare takes recipes as they are",
+        ),
         (given.compare and len(given.compare) < 2, "--compare needs two recipes or more"),
-        (given.pairs_per_scene is not None and given.pairs_per_scene < 1, "--pairs-per-scene: give 1 or more"),
+        (
+            given.pairs_per_scene is not None and given.pairs_per_scene < 1,
+            "--pairs-per-scene: give 1 or more",
+        ),
     ):
         if is_wrong:
             raise UserError(message)
 
 
-def _score(arguments: argparse.Namespace, scenes: Sequence[TrainScene]) -> tuple[int, dict[str, Any] | None]:
+def _score(
+    arguments: argparse.Namespace, scenes: Sequence[TrainScene]
+) -> tuple[int, dict[str, Any] | None]:
     """Print the scores of submissions. Return the exit status and all numbers for ``--json``."""
     figures = []
     for submission in arguments.submission:
@@ -156,7 +207,8 @@ def _score(arguments: argparse.Namespace, scenes: Sequence[TrainScene]) -> tuple
 def _match_and_score(
     arguments: argparse.Namespace, scenes: Sequence[TrainScene], root: Path, work_dir: Path
 ) -> tuple[int, dict[str, Any] | None]:
-    """Run a recipe, or compare several recipes, which share a journal so that common units run once.
+    """Run a recipe, or compare several recipes, which share a journal so that common units run
+    once.
 
     Return the exit status and all numbers for ``--json``; ``None`` if a comparison is incomplete.
     """
@@ -168,9 +220,13 @@ def _match_and_score(
     budget = options.budget_of(arguments)
     with interruptible() as interrupt, Session(work_dir, budget, interrupt).watched() as watched:
         watched.save = lambda: "the time limit passed before the scores were printed"
-        assemblies = [replace(_assemble(arguments, interrupt, *choice), regions=regions) for choice in choices]
+        assemblies = [
+            replace(_assemble(arguments, interrupt, *choice), regions=regions) for choice in choices
+        ]
         for number, assembly in enumerate(assemblies):
-            session = Session(work_dir, options.budget_of(arguments), interrupt, workers=arguments.workers)
+            session = Session(
+                work_dir, options.budget_of(arguments), interrupt, workers=arguments.workers
+            )
             in_front = arguments.in_front or arguments.protocol is not None
             validation = validate(scenes, assembly, session, str(root), in_front=in_front)
             validations.append(validation)
@@ -189,7 +245,9 @@ def _match_and_score(
             session.status = max(status, bool(trouble(report)))
             status = options.finish(session, page, pairs)
             if compared and report.ending != Ending.COMPLETE:
-                say("nothing is compared until all is done; with a --work-dir, the same command resumes")
+                say(
+                    "nothing is compared until all is done; with a --work-dir, the same command resumes"
+                )
                 return status or 1, None
     if not compared:
         return status, to_json(validations[0])
@@ -197,7 +255,9 @@ def _match_and_score(
     return status, comparison_json(validations)
 
 
-def _assemble(arguments: argparse.Namespace, interrupt: Interrupt, name: str, mode: str) -> Assembly:
+def _assemble(
+    arguments: argparse.Namespace, interrupt: Interrupt, name: str, mode: str
+) -> Assembly:
     """Return the assembly of a recipe, as changed by the command's options."""
     assembly = options.assembly_of(arguments, name, mode, interrupt)
     recipe = assembly.recipe

@@ -37,19 +37,35 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     actions = parser.add_subparsers(required=True, metavar="ACTION")
     parsers = {}
     for name, act, description in (
-        ("list", _list, "List the slots, the weights that matchers ask for, with licence, matchers and files."),
+        (
+            "list",
+            _list,
+            "List the slots, the weights that matchers ask for, with licence, matchers and files.",
+        ),
         ("verify", _verify, _VERIFY),
         ("fetch", _fetch, _FETCH),
-        ("convert", _convert, "Write a checkpoint's tensors as safetensors; print the manifest's line for it."),
+        (
+            "convert",
+            _convert,
+            "Write a checkpoint's tensors as safetensors; print the manifest's line for it.",
+        ),
     ):
-        parsers[name] = actions.add_parser(name, description=description, help=description.partition(".")[0])
+        parsers[name] = actions.add_parser(
+            name, description=description, help=description.partition(".")[0]
+        )
         parsers[name].set_defaults(act=act)
     for name in ("list", "verify"):
         options.add_weights(parsers[name])
-    parsers["verify"].add_argument("--manifest", type=Path, metavar="FILE", help="check every file of this one")
+    parsers["verify"].add_argument(
+        "--manifest", type=Path, metavar="FILE", help="check every file of this one"
+    )
     text = "default: all weights of recipe auto"
-    parsers["fetch"].add_argument("names", nargs="*", default=["auto"], metavar="NAME|SLOT|RECIPE", help=text)
-    parsers["fetch"].add_argument("--out", type=Path, required=True, metavar="DIR", help="directory for the files")
+    parsers["fetch"].add_argument(
+        "names", nargs="*", default=["auto"], metavar="NAME|SLOT|RECIPE", help=text
+    )
+    parsers["fetch"].add_argument(
+        "--out", type=Path, required=True, metavar="DIR", help="directory for the files"
+    )
     parsers["convert"].add_argument("file", type=Path, metavar="FILE")
     parsers["convert"].add_argument("--out", type=Path, required=True, metavar="X.safetensors")
 
@@ -72,7 +88,9 @@ def _list(arguments: argparse.Namespace) -> None:
         search = store.search(files)
         missing = f"missing: {' or '.join(file.name for file in files)}"
         where = [str(search.found.path) if search.found else missing]
-        where += [f"refused: {file.path}: {file.note}" for file in search.refused if not search.found]
+        where += [
+            f"refused: {file.path}: {file.note}" for file in search.refused if not search.found
+        ]
         users = [spec.name for spec in specs if spec.uses(slot)]
         rows.append((slot, files[0].licence, ", ".join(users) or "-", "; ".join(where)))
     options.print_table(rows)
@@ -83,7 +101,9 @@ def _verify(arguments: argparse.Namespace) -> int:
     wanted = read_manifest(arguments.manifest) if arguments.manifest else None
     store = WeightStore(arguments.weights, wanted)
     searches = [store.search([file]) for file in wanted or ()]
-    looked_for = [file for search in searches for file in ([search.found] if search.found else search.refused)]
+    looked_for = [
+        file for search in searches for file in ([search.found] if search.found else search.refused)
+    ]
     files = store.verify() if wanted is None else looked_for
     files = [tried(found, store) for found in files]
     there = {found.file for found in files}

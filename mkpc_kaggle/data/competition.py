@@ -33,7 +33,8 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 
 MAX_COLUMNS = 1000  # of a table; pandas takes minutes for a hundred thousand
 MAX_LINE = 1 << 20  # characters of a row; other files may have lines of gigabytes
-CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")  # characters that end lines or control a terminal
+# Characters that end lines or control a terminal
+CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")
 # Names that are empty, "." or "..", or contain a Windows drive, a slash or a control character.
 NOT_PLAIN = re.compile(rf"^\.{{0,2}}$|^[A-Za-z]:|[/\\]|{CONTROL.pattern}")
 
@@ -44,7 +45,8 @@ class Pair:
     group: str  # its batch or scene
     file0: str  # paths of the images; text saves memory, since a table may have a million rows
     file1: str
-    intrinsics: tuple[Matrix3, Matrix3] | None = field(default=None, compare=False)  # given: E is estimated
+    # Given: E is estimated
+    intrinsics: tuple[Matrix3, Matrix3] | None = field(default=None, compare=False)
     turns: tuple[int, int] = (0, 0)  # counter-clockwise quarter turns of each image before matching
 
     @property
@@ -86,16 +88,22 @@ def read_test_side(directory: Path) -> tuple[Pair, ...]:
     path, images = test_side(directory)
     pairs: dict[str, Pair] = {}
     files = cache(lambda batch: image_files(images / batch))
-    for where, (sample, *ids) in read_rows(path, ("sample_id", "batch_id", "image_1_id", "image_2_id")):
+    for where, (sample, *ids) in read_rows(
+        path, ("sample_id", "batch_id", "image_1_id", "image_2_id")
+    ):
         if sample in pairs:
             raise UserError(f"{where}: the sample_id {sample!r} is not unique")
         if CONTROL.search(sample):
-            raise UserError(f"{where}: the sample_id {sample!r} has control characters: no submission can hold it")
+            raise UserError(
+                f"{where}: the sample_id {sample!r} has control characters: no submission can hold it"
+            )
         batch, first, second = (plain_name(name, where) for name in ids)
         # A large table names a batch in thousands of rows: interning shares one string.
         pairs[sample] = Pair(sample, sys.intern(batch), files(batch)(first), files(batch)(second))
     if not images.is_dir():
-        raise UserError(f"{images}: no such directory; --test-dir must hold test.csv and test_images/")
+        raise UserError(
+            f"{images}: no such directory; --test-dir must hold test.csv and test_images/"
+        )
     if not pairs:
         raise UserError(f"{path} has no rows, so no pair can be matched")
     return tuple(pairs.values())
@@ -108,25 +116,37 @@ def read_train_side(
     min_covisibility: float = 0.1,
     pairs_per_scene: int | None = None,
 ) -> tuple[TrainScene, ...]:
-    """Return the named scenes, or all, with up to ``pairs_per_scene`` pairs spread evenly over a scene's table.
+    """Return the named scenes, or all, with up to ``pairs_per_scene`` pairs spread evenly over a
+    scene's table.
 
     Raises :class:`UserError` for missing files and scenes, and for malformed cells.
     """
     rows = read_rows(directory / "scaling_factors.csv", ("scene", "scaling_factor"))
-    metres = {plain_name(scene, where): float(*_numbers(cell, where, 1)) for where, (scene, cell) in rows}
+    metres = {
+        plain_name(scene, where): float(*_numbers(cell, where, 1)) for where, (scene, cell) in rows
+    }
     wanted = list(scenes) or sorted(name for name in metres if (directory / name).is_dir())
     if not wanted:
         raise UserError(f"{directory} has none of the scenes of its scaling_factors.csv")
     if unknown := [name for name in wanted if name not in metres]:
-        raise UserError(f"{directory}: unknown scene {unknown[0]!r}; known: {', '.join(sorted(metres))}")
-    return tuple(_read_scene(directory / name, metres[name], min_covisibility, pairs_per_scene) for name in wanted)
+        raise UserError(
+            f"{directory}: unknown scene {unknown[0]!r}; known: {', '.join(sorted(metres))}"
+        )
+    return tuple(
+        _read_scene(directory / name, metres[name], min_covisibility, pairs_per_scene)
+        for name in wanted
+    )
 
 
-def _read_scene(directory: Path, metres: float, min_covisibility: float, most: int | None) -> TrainScene:
+def _read_scene(
+    directory: Path, metres: float, min_covisibility: float, most: int | None
+) -> TrainScene:
     cameras: dict[str, Camera] = {}
     columns = ("image_id", "camera_intrinsics", "rotation_matrix", "translation_vector")
     for where, (image, *cells) in read_rows(directory / "calibration.csv", columns):
-        K, R, t = (_numbers(cell, where, count) for cell, count in zip(cells, (9, 9, 3), strict=True))
+        K, R, t = (
+            _numbers(cell, where, count) for cell, count in zip(cells, (9, 9, 3), strict=True)
+        )
         cameras[plain_name(image, where)] = Camera(K.reshape(3, 3), R.reshape(3, 3), t)
     path, images, pairs = directory / "pair_covisibility.csv", image_files(directory / "images"), []
     for where, (key, cell) in read_rows(path, ("pair", "covisibility")):
@@ -143,7 +163,9 @@ def _read_scene(directory: Path, metres: float, min_covisibility: float, most: i
 
 
 def write_submission(path: Path, rows: Mapping[str, Matrix3]) -> None:
-    """Write a row for each sample. If writing fails, leave an existing file unchanged and raise ``OSError``."""
+    """Write a row for each sample. If writing fails, leave an existing file unchanged and raise
+    ``OSError``.
+    """
     with replacing(path) as stream:
         table = csv.writer(stream, lineterminator="\n")
         table.writerow(SUBMISSION_COLUMNS)
@@ -181,7 +203,9 @@ def submission_problems(path: Path, sample_ids: Sequence[str]) -> list[str]:
     return problems
 
 
-def read_rows(path: Path, columns: Sequence[str], *, only: bool = False) -> Iterator[tuple[str, list[str]]]:
+def read_rows(
+    path: Path, columns: Sequence[str], *, only: bool = False
+) -> Iterator[tuple[str, list[str]]]:
     """Yield each row of a CSV file as its location, for messages, and its cells in ``columns``.
 
     ``only`` requires that the file has no other columns. Raises :class:`UserError` for an unusable file.
@@ -196,9 +220,9 @@ def read_rows(path: Path, columns: Sequence[str], *, only: bool = False) -> Iter
 def read_table(path: Path, columns: Sequence[str], *, only: bool = False) -> "DataFrame":
     """Return a CSV file with its text unchanged: ids such as "007", "1e3" and "NA" are no numbers.
 
-    The index is the line of the file where a row ends. Empty rows are skipped. ``only`` requires that the file has
-    no columns except ``columns``. Raises :class:`UserError` for a file that is not a regular table with these
-    columns.
+    The index is the line of the file where a row ends. Empty rows are skipped. ``only`` requires
+    that the file has no columns except ``columns``. Raises :class:`UserError` for a file that is
+    not a regular table with these columns.
     """
     import pandas as pd  # the import takes most of a second
 
@@ -282,7 +306,8 @@ def _refusal(path: Path, error: Exception, skipped: int) -> str:
 
 
 class _LimitedLines(TextIOBase):
-    """A text stream for pandas that refuses lines of more than ``MAX_LINE`` characters, and NUL characters.
+    """A text stream for pandas that refuses lines of more than ``MAX_LINE`` characters, and NUL
+    characters.
 
     pandas would hold such a line in memory several times, and would cut a cell off at a NUL.
     """
@@ -307,9 +332,13 @@ class _LimitedLines(TextIOBase):
 
 
 def plain_name(name: str, where: str) -> str:
-    """Return ``name`` if it is a plain file name. Raise :class:`UserError` if it may leave its directory."""
+    """Return ``name`` if it is a plain file name. Raise :class:`UserError` if it may leave its
+    directory.
+    """
     if NOT_PLAIN.search(name):
-        raise UserError(f"{where}: the id {name!r} is not a plain name, so it cannot name a file here")
+        raise UserError(
+            f"{where}: the id {name!r} is not a plain name, so it cannot name a file here"
+        )
     return name
 
 
@@ -320,10 +349,15 @@ def evenly_spread(items: Sequence[Any], most: int | None) -> list[Any]:
 
 
 def image_files(directory: Path) -> Callable[[str], str]:
-    """List a directory. Return a function from image id to path; an unknown id gives a path of a missing png."""
+    """List a directory. Return a function from image id to path; an unknown id gives a path of a
+    missing png.
+    """
     known: dict[str, str] = {}
-    with suppress(OSError, ValueError):  # the directory is missing, or its name is too long or not encodable
-        images = sorted(path for path in directory.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES)
+    # The directory is missing, or its name is too long or not encodable
+    with suppress(OSError, ValueError):
+        images = sorted(
+            path for path in directory.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES
+        )
         known = {path.stem: str(path) for path in reversed(images)}
     return lambda name: known.get(name) or f"{directory}{os.sep}{name}.png"
 

@@ -1,4 +1,5 @@
-"""Images: decoded once, in the background. An unreadable file gives a value with the reason, not an exception.
+"""Images: decoded once, in the background. An unreadable file gives a value with the reason, not an
+exception.
 
 EXIF gives the orientation of the stored pixels, and the focal length as COLMAP computes it. Source:
 ``Bitmap::ExifFocalLength`` of COLMAP 4.2, without COLMAP's table of sensors.
@@ -26,14 +27,17 @@ from mkpc_kaggle.config import Range
 from mkpc_kaggle.errors import shown
 from mkpc_kaggle.geometry.coordinates import Pixels, Size
 
-MAX_ASPECT = 32  # ratio of the sides; a longer image's views would be a few pixels high or exceed the memory
+# Ratio of the sides; a longer image's views would be a few pixels high or exceed the memory
+MAX_ASPECT = 32
 
 ORIENTATION, DIRECTORY, FOCAL_MM = 0x0112, 0x8769, 0x920A  # tags of EXIF
 PLANE_RESOLUTION, PLANE_UNIT, FOCAL_35MM = 0xA20E, 0xA210, 0xA405
 FILM_MM = 43.27  # diagonal of 35 mm film
 UNITS_MM: dict[float, float] = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
-FOCALS = Range(0.2, 20.0)  # in long sides of the image; a focal length outside this range counts as unknown
-# Counter-clockwise quarter turns that set pixels upright, by EXIF orientation; mirrored pixels stay mirrored.
+# In long sides of the image; a focal length outside this range counts as unknown
+FOCALS = Range(0.2, 20.0)
+# Counter-clockwise quarter turns that set pixels upright, by EXIF orientation; mirrored pixels stay
+# mirrored.
 TURNS: dict[float, int] = {3: 2, 4: 2, 5: 3, 6: 3, 7: 1, 8: 1}
 
 
@@ -49,9 +53,18 @@ class Image:
 
     @classmethod
     def of_array(cls, array: Pixels) -> "Image":
-        """Wrap a uint8 array (H, W, 3) RGB or (H, W) gray, named by its digest. Raise ``ValueError`` otherwise."""
-        if array.dtype != np.uint8 or array.ndim < 2 or array.shape[2:] not in ((), (3,)) or not array.size:
-            raise ValueError(f"an image is uint8 (H, W) or (H, W, 3), not {array.dtype} {array.shape}")
+        """Wrap a uint8 array (H, W, 3) RGB or (H, W) gray, named by its digest. Raise
+        ``ValueError`` otherwise.
+        """
+        if (
+            array.dtype != np.uint8
+            or array.ndim < 2
+            or array.shape[2:] not in ((), (3,))
+            or not array.size
+        ):
+            raise ValueError(
+                f"an image is uint8 (H, W) or (H, W, 3), not {array.dtype} {array.shape}"
+            )
         pixels = np.ascontiguousarray(np.stack([array] * 3, axis=2) if array.ndim == 2 else array)
         return cls(f"{_content_digest(pixels)} {pixels.shape}", pixels)
 
@@ -82,7 +95,8 @@ class Unreadable:
 
 
 def read_image(path: Path) -> Image | Unreadable:
-    """Decode a file's stored pixels to RGB; return failures, never raise. Divide 16-bit values by 256.
+    """Decode a file's stored pixels to RGB; return failures, never raise. Divide 16-bit values by
+    256.
 
     OpenCV decides whether a damaged file is readable: version 5 refuses a truncated file.
     """
@@ -91,36 +105,49 @@ def read_image(path: Path) -> Image | Unreadable:
         if path.exists() and not path.is_file():  # a pipe or a device may never end
             return Unreadable(name, "cannot be read: not a regular file")
         data = np.fromfile(path, np.uint8)
-        bgr = cv2.imdecode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION) if data.size else None
+        bgr = (
+            cv2.imdecode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+            if data.size
+            else None
+        )
     except FileNotFoundError:
         return Unreadable(name, "no such file")
     except (OSError, ValueError, MemoryError, cv2.error) as error:
         return Unreadable(name, f"cannot be read: {error}")
     if bgr is None:
-        cause = "not a picture, or cut off: it cannot be decoded" if data.size else "the file is empty"
+        cause = (
+            "not a picture, or cut off: it cannot be decoded" if data.size else "the file is empty"
+        )
         return Unreadable(name, cause)
     height, width = bgr.shape[:2]
     if max(height, width) > MAX_ASPECT * min(height, width):
-        return Unreadable(name, f"{width} x {height} pixels: one side is more than {MAX_ASPECT} times the other")
+        return Unreadable(
+            name, f"{width} x {height} pixels: one side is more than {MAX_ASPECT} times the other"
+        )
     turns, focal = read_exif(data.tobytes(), Size(width, height))
     pixels = np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
     return Image(name, pixels, _content_digest(data), focal, turns)
 
 
 def read_exif(data: bytes, size: Size) -> tuple[int, float]:
-    """Return the counter-clockwise quarter turns that set an image upright, and its focal length in pixels.
+    """Return the counter-clockwise quarter turns that set an image upright, and its focal length in
+    pixels.
 
     ``data`` has the file's bytes; ``size`` is in pixels. Both results are 0 if unknown. Damaged EXIF is ignored.
     """
     tags: dict[int, float] = {}
-    with suppress(Exception), warnings.catch_warnings():  # Pillow raises errors of any type for a damaged file
+    # Pillow raises errors of any type for a damaged file
+    with suppress(Exception), warnings.catch_warnings():
         warnings.filterwarnings("ignore", module="PIL")
-        # OpenCV already rotates TIFF. Pillow would decode all pixels of a PNG, since EXIF may come after them.
+        # OpenCV already rotates TIFF. Pillow would decode all pixels of a PNG, since EXIF may come
+        # after them.
         with PIL.Image.open(BytesIO(data), formats=("JPEG", "PNG", "WEBP")) as picture:
             if picture.format != "PNG" or b"eXIf" in data:
                 exif = picture.getexif()
                 found = {**exif, **exif.get_ifd(DIRECTORY)}
-                tags = {tag: float(value) for tag, value in found.items() if isinstance(value, Real)}
+                tags = {
+                    tag: float(value) for tag, value in found.items() if isinstance(value, Real)
+                }
     unit = UNITS_MM.get(tags.get(PLANE_UNIT, 0), inf)
     focal = tags.get(FOCAL_35MM, 0.0) / FILM_MM * hypot(*size)
     focal = focal or tags.get(FOCAL_MM, 0.0) * tags.get(PLANE_RESOLUTION, 0.0) / unit
@@ -170,7 +197,9 @@ class ByteCache:
 
 
 class ImageStore:
-    """Images by path, decoded in the background. The most recently used are cached. Not thread-safe."""
+    """Images by path, decoded in the background. The most recently used are cached. Not
+    thread-safe.
+    """
 
     def __init__(self, limit_bytes: int = 512 << 20) -> None:
         self._images = ByteCache(limit_bytes)

@@ -1,4 +1,6 @@
-"""Masks of images, as COLMAP reads them: ``DIR/a.jpg.png`` masks ``a.jpg``, and black pixels are left out."""
+"""Masks of images, as COLMAP reads them: ``DIR/a.jpg.png`` masks ``a.jpg``, and black pixels are
+left out.
+"""
 
 import hashlib
 from collections.abc import Iterable, Mapping
@@ -26,17 +28,21 @@ class Masks:
 
     @classmethod
     def of_folder(cls, directory: Path, root: Path, images: Iterable[Path]) -> "Masks":
-        """Return the masks below ``directory`` of images below ``root``; an image without a mask is used whole.
+        """Return the masks below ``directory`` of images below ``root``; an image without a mask is
+        used whole.
 
-        Raises :class:`UserError` for a directory that is missing, lies below ``root`` or has no masks of these
-        images. Raises it also for a mask that is unreadable or not as large as its image.
+        Raises :class:`UserError` for a directory that is missing, lies below ``root`` or has no
+        masks of these images. Raises it also for a mask that is unreadable or not as large as its
+        image.
         """
         if not directory.is_dir():
             raise UserError(
                 f"{directory}: no such directory; --masks names a directory with files such as a.jpg{SUFFIX}"
             )
         if lies_in(directory, root):
-            raise UserError(f"--masks {directory} lies in {root}, so masks count as images; move it elsewhere")
+            raise UserError(
+                f"--masks {directory} lies in {root}, so masks count as images; move it elsewhere"
+            )
         files: dict[str, tuple[str, str]] = {}
         first = None
         for image in images:
@@ -44,20 +50,20 @@ class Masks:
             path = directory / f"{image.relative_to(root).as_posix()}{SUFFIX}"
             if path.exists():  # as in COLMAP, an image without a mask is used whole
                 _require_usable(path, image)
-                files[str(image)] = str(path), hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest()
+                files[str(image)] = (
+                    str(path),
+                    hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest(),
+                )
         if not files:
-            expected = f"{first.relative_to(root).as_posix()}{SUFFIX}" if first else f"a.jpg{SUFFIX}"
+            expected = (
+                f"{first.relative_to(root).as_posix()}{SUFFIX}" if first else f"a.jpg{SUFFIX}"
+            )
             raise UserError(f"{directory} has no mask of any image: {expected} would be the first")
         return cls(files)
 
     def digest(self, image: str) -> str:
         """Return the digest of an image's mask; empty without a mask."""
         return self.files.get(image, ("", ""))[1]
-
-    @property
-    def digests(self) -> list[str]:
-        """The images with a mask and the digests of the masks, for the settings of a run."""
-        return [f"{Path(image).name} {digest}" for image, (_, digest) in sorted(self.files.items())]
 
 
 def _require_usable(path: Path, image: Path) -> None:
@@ -66,14 +72,22 @@ def _require_usable(path: Path, image: Path) -> None:
     mask, size = read_mask(path), read_size(image)
     if size is not None and size != (mask.shape[1], mask.shape[0]):
         found = f"{mask.shape[1]} x {mask.shape[0]}"
-        raise UserError(f"{path} has {found} pixels, its image {size.width} x {size.height}; make them equal")
+        raise UserError(
+            f"{path} has {found} pixels, its image {size.width} x {size.height}; make them equal"
+        )
 
 
 def read_mask(path: Path) -> NDArray[np.bool_]:
-    """Return the mask (H, W) of a file, False where it is black. Raises :class:`UserError` if it is unreadable."""
+    """Return the mask (H, W) of a file, False where it is black. Raises :class:`UserError` if it is
+    unreadable.
+    """
     try:
         data = np.fromfile(path, np.uint8)
-        pixels = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION) if data.size else None
+        pixels = (
+            cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+            if data.size
+            else None
+        )
     except (OSError, ValueError, MemoryError, cv2.error) as error:
         raise UserError(f"the mask {path} cannot be read: {error}") from error
     if pixels is None:
@@ -91,7 +105,8 @@ class MaskReader:
     def shows(self, image: str, points: Points, size: Size) -> NDArray[np.bool_]:
         """Return which points (N, 2) of an image its mask leaves; all without a mask.
 
-        Raises :class:`UserError` for a mask that has changed since the run began: unreadable, or of another size.
+        Raises :class:`UserError` for a mask that has changed since the run began: unreadable, or of
+        another size.
         """
         if image not in self._masks.files:
             return np.ones(len(points), bool)

@@ -10,7 +10,8 @@ from typing import TextIO
 
 from mkpc_kaggle.errors import UserError
 
-# Suffixes of each option's results. In an input directory, a file with one of them is an earlier result.
+# Suffixes of each option's results. In an input directory, a file with one of them is an earlier
+# result.
 RESULTS = {
     "--output": (".csv",),
     "--json": (".json",),
@@ -27,7 +28,8 @@ def require_apart(
     work_dir: Path | None = None,
     weights: Iterable[Path] = (),
 ) -> None:
-    """Raise :class:`UserError` for outputs that would overwrite an input, another output or the journal.
+    """Raise :class:`UserError` for outputs that would overwrite an input, another output or the
+    journal.
 
     ``outputs`` are files, by option; ``inputs`` and ``weights`` are files and directories. A new file may lie in
     an input directory. ``--json`` and ``--report`` overwrite only files with their own suffix.
@@ -38,18 +40,34 @@ def require_apart(
         is_result = path.suffix.lower() in RESULTS[option]
         if not path.name or os.path.isdir(path):  # noqa: PTH112  Path raises for a name that is too long
             raise UserError(f"{option} {str(path)!r} is a directory; name a file")
-        lost = [f"{other} {there}" for other, there in files.items() if other != option and same_file(path, there)]
+        lost = [
+            f"{other} {there}"
+            for other, there in files.items()
+            if other != option and same_file(path, there)
+        ]
         if work_dir is not None:
             is_journal = path.name.startswith("journal.") and same_file(path.parent, work_dir)
-            lost += [f"the work directory {work_dir}"] if is_journal or lies_in(work_dir, path) else []
+            lost += (
+                [f"the work directory {work_dir}"] if is_journal or lies_in(work_dir, path) else []
+            )
         precious = [*inputs, *weights, *weights_of_environment()] if os.path.lexists(path) else []
-        lost += [f"the input {p}" for p in precious if same_file(path, p) or (lies_in(path, p) and not is_result)]
+        lost += [
+            f"the input {p}"
+            for p in precious
+            if same_file(path, p) or (lies_in(path, p) and not is_result)
+        ]
         if lost:
             raise UserError(f"{option} {path} would be written over {lost[0]}; name another file")
         if option in ("--json", "--report") and not is_result and os.path.isfile(path):  # noqa: PTH113
-            raise UserError(f"{option} {path} exists and is not a {RESULTS[option][0]} file; name another file")
-    if work_dir is not None and (source := next((each for each in inputs if lies_in(work_dir, each)), None)):
-        raise UserError(f"--work-dir {work_dir} would be written over the input {source}; name another place")
+            raise UserError(
+                f"{option} {path} exists and is not a {RESULTS[option][0]} file; name another file"
+            )
+    if work_dir is not None and (
+        source := next((each for each in inputs if lies_in(work_dir, each)), None)
+    ):
+        raise UserError(
+            f"--work-dir {work_dir} would be written over the input {source}; name another place"
+        )
 
 
 def require_table(path: Path, columns: Iterable[str]) -> None:
@@ -70,7 +88,9 @@ def weights_of_environment() -> list[Path]:
 
 def lies_in(path: Path, directory: Path) -> bool:
     """Return whether ``path`` is ``directory`` or lies in it, with links resolved."""
-    return any(same_file(place, directory) for place in (path, *Path(os.path.realpath(path)).parents))
+    return any(
+        same_file(place, directory) for place in (path, *Path(os.path.realpath(path)).parents)
+    )
 
 
 def same_file(path: Path, other: Path) -> bool:

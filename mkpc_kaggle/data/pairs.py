@@ -1,9 +1,10 @@
 """Lists of pairs with known poses, in the format of SuperGlue's evaluation.
 
-One line per pair: ``name0 name1 turns0 turns1 K0 K1 T_0to1``, separated by blanks. Names are paths under the image
-root. ``turns`` are the counter-clockwise quarter turns that set an image upright, after its EXIF rotation. K (9
-numbers) and T (16) are row-major and refer to the stored pixels; X_1 = R X_0 + t with T = [R t; 0 1].
-A ``.npz`` file, or a directory of them, is a list of MegaDepth-1500 in LoFTR's format ``scene_info``.
+One line per pair: ``name0 name1 turns0 turns1 K0 K1 T_0to1``, separated by blanks. Names are paths
+under the image root. ``turns`` are the counter-clockwise quarter turns that set an image upright,
+after its EXIF rotation. K (9 numbers) and T (16) are row-major and refer to the stored pixels; X_1
+= R X_0 + t with T = [R t; 0 1]. A ``.npz`` file, or a directory of them, is a list of
+MegaDepth-1500 in LoFTR's format ``scene_info``.
 """
 
 import pickle
@@ -38,7 +39,11 @@ def read_pairs(file: Path, image_root: Path, *, most: int | None = None) -> Trai
     if not image_root.is_dir():
         raise UserError(f"--image-root {image_root}: no such directory")
     infos = sorted(file.glob("*.npz")) if file.is_dir() else [file] if file.suffix == ".npz" else []
-    lines = chain.from_iterable(map(lines_of_scene_info, infos)) if infos else read_text(file).splitlines()
+    lines = (
+        chain.from_iterable(map(lines_of_scene_info, infos))
+        if infos
+        else read_text(file).splitlines()
+    )
     numbered = ((number, line) for number, line in enumerate(lines, start=1) if line.split())
     pairs = [parse_line(line, file, number, image_root) for number, line in numbered]
     if not pairs:
@@ -47,43 +52,59 @@ def read_pairs(file: Path, image_root: Path, *, most: int | None = None) -> Trai
 
 
 def parse_line(line: str, file: Path, number: int, image_root: Path) -> TruePair:
-    """Return the pair of a line. Raise :class:`UserError` with its location and the expected format."""
+    """Return the pair of a line. Raise :class:`UserError` with its location and the expected
+    format.
+    """
     cells, where = line.split(), f"{file}, line {number}"
     if len(cells) != FIELDS:
         raise UserError(f"{where}: expected {FIELDS} fields, {EXPECTED}, found {len(cells)}")
     for name in (names := cells[:2]):
         path = PureWindowsPath(name)  # the strictest rules: drives and backslashes count too
         if path.anchor or ".." in path.parts or "\0" in name:
-            raise UserError(f"{where}: {name!r} points outside the image root; expected a path without ..")
+            raise UserError(
+                f"{where}: {name!r} points outside the image root; expected a path without .."
+            )
     try:
         turns0, turns1 = turns = int(cells[2]), int(cells[3])
         numbers = np.array(list(map(float, cells[4:])))
     except ValueError as error:
-        raise UserError(f"{where}: expected numbers for turns, K0, K1 and T_0to1: {error}") from error
+        raise UserError(
+            f"{where}: expected numbers for turns, K0, K1 and T_0to1: {error}"
+        ) from error
     K0, K1, T = numbers[:9].reshape(3, 3), numbers[9:18].reshape(3, 3), numbers[18:].reshape(4, 4)
     R, t = T[:3, :3], T[:3, 3]
-    has_focals = all(min(K[0, 0], K[1, 1]) > 0 and (K[1, 0], *K[2]) == (0, 0, 0, 1) for K in (K0, K1))
-    with np.errstate(over="ignore", invalid="ignore"):  # the loop below checks that the numbers are finite
+    has_focals = all(
+        min(K[0, 0], K[1, 1]) > 0 and (K[1, 0], *K[2]) == (0, 0, 0, 1) for K in (K0, K1)
+    )
+    # The loop below checks that the numbers are finite
+    with np.errstate(over="ignore", invalid="ignore"):
         is_rotation = np.abs(R @ R.T - np.eye(3)).max() < MAX_SKEWNESS and np.linalg.det(R) > 0
     for holds, expected in (
-        ({turns0, turns1} <= {0, 1, 2, 3}, f"0, 1, 2 or 3 quarter turns, found {cells[2]} and {cells[3]}"),
+        (
+            {turns0, turns1} <= {0, 1, 2, 3},
+            f"0, 1, 2 or 3 quarter turns, found {cells[2]} and {cells[3]}",
+        ),
         (np.isfinite(numbers).all(), "finite numbers for K0, K1 and T_0to1"),
         (has_focals, "K0 and K1 = fx s cx 0 fy cy 0 0 1 with positive fx and fy"),
         (is_rotation and tuple(T[3]) == (0, 0, 0, 1), "T_0to1 = [R t; 0 0 0 1] with R a rotation"),
     ):
         if not holds:
             raise UserError(f"{where}: expected {expected}")
-    labels = (f"{name} turned {times}" if times else name for name, times in zip(names, turns, strict=True))
+    labels = (
+        f"{name} turned {times}" if times else name
+        for name, times in zip(names, turns, strict=True)
+    )
     file0, file1 = (str(image_root / name) for name in names)
     pair = Pair(f"{number}: {' '.join(labels)}", file.stem, file0, file1, (K0, K1), turns)
     return TruePair(pair, Camera(K0, np.eye(3), np.zeros(3)), Camera(K1, R, t), nan)
 
 
 def lines_of_scene_info(file: Path) -> Iterator[str]:
-    """Yield a line of the list for each pair of a ``scene_info`` file, without executing the file's code.
+    """Yield a line of the list for each pair of a ``scene_info`` file, without executing the file's
+    code.
 
-    A pair has two indices into ``image_paths``, ``intrinsics`` (3, 3) and ``poses`` (4, 4), world to camera.
-    Raises :class:`UserError` for any other file.
+    A pair has two indices into ``image_paths``, ``intrinsics`` (3, 3) and ``poses`` (4, 4), world
+    to camera. Raises :class:`UserError` for any other file.
     """
     try:
         with zipfile.ZipFile(file) as archive:
@@ -92,7 +113,9 @@ def lines_of_scene_info(file: Path) -> Iterator[str]:
         for (i, j), *_ in infos:
             T = np.asarray(poses[j], float) @ np.linalg.inv(np.asarray(poses[i], float))
             numbers = np.concatenate([np.ravel(matrix) for matrix in (Ks[i], Ks[j], T)])
-            yield " ".join([str(paths[i]), str(paths[j]), "0 0", *(f"{number:.17g}" for number in numbers)])
+            yield " ".join(
+                [str(paths[i]), str(paths[j]), "0 0", *(f"{number:.17g}" for number in numbers)]
+            )
     except Exception as error:  # a pickle may raise anything
         raise UserError(f"{file} is not a scene_info of MegaDepth: {error}") from error
 
@@ -105,7 +128,8 @@ class _Arrays(pickle.Unpickler):
 
 
 def _array(archive: zipfile.ZipFile, name: str) -> Any:
-    stream = BytesIO(archive.open(name).read(1 << 28))  # a longer array is cut off, so that reading it fails
+    # A longer array is cut off, so that reading it fails
+    stream = BytesIO(archive.open(name).read(1 << 28))
     try:
         return np.lib.format.read_array(stream, allow_pickle=False)
     except ValueError:  # an array of objects: its header has been read, and its pickle follows

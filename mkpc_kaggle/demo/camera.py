@@ -1,7 +1,8 @@
-"""Pinhole cameras with image sizes, projection between world points and pixels, and covisibility of two views.
+"""Pinhole cameras with image sizes, projection between world points and pixels, and covisibility of
+two views.
 
-Pixel centres are at integer coordinates: (0, 0) is the centre of the top-left pixel, x to the right, y down.
-The world has z up; a camera looks along its +z. `X_cam = R X + t`.
+Pixel centres are at integer coordinates: (0, 0) is the centre of the top-left pixel, x to the
+right, y down. The world has z up; a camera looks along its +z. `X_cam = R X + t`.
 """
 
 from dataclasses import dataclass, replace
@@ -30,7 +31,8 @@ class SizedCamera(Camera):
 def look_at(
     position: ArrayLike, target: ArrayLike, focal: float, size: tuple[int, int], roll: float = 0.0
 ) -> SizedCamera:
-    """Return a camera at `position` whose image of `size` (width, height) has `target` at its centre.
+    """Return a camera at `position` whose image of `size` (width, height) has `target` at its
+    centre.
 
     `focal` is in pixels. `roll`, in degrees, turns the camera clockwise about its axis. Position and target are
     world points (3,), neither above the other.
@@ -41,15 +43,17 @@ def look_at(
     down = np.cross(forward, right)
     cos, sin = np.cos(np.radians(roll)), np.sin(np.radians(roll))
     R = np.stack([cos * right + sin * down, cos * down - sin * right, forward])
-    K = np.array([[focal, 0, (size[0] - 1) / 2], [0, focal, (size[1] - 1) / 2], [0, 0, 1]], dtype=np.float64)
+    K = np.array(
+        [[focal, 0, (size[0] - 1) / 2], [0, focal, (size[1] - 1) / 2], [0, 0, 1]], dtype=np.float64
+    )
     return SizedCamera(K, R, -R @ centre, *size)
 
 
 def resized(camera: SizedCamera, scale: float) -> SizedCamera:
     """Return the camera of the image resized by `scale`: `x' = (x + 0.5) * scale - 0.5`.
 
-    Sides are rounded to whole pixels, but K has the exact scale. So the image loses or gains up to half a pixel on
-    the right and at the bottom.
+    Sides are rounded to whole pixels, but K has the exact scale. So the image loses or gains up to
+    half a pixel on the right and at the bottom.
     """
     to_resized = np.array([[scale, 0, (scale - 1) / 2], [0, scale, (scale - 1) / 2], [0, 0, 1]])
     width, height = (max(1, round(side * scale)) for side in (camera.width, camera.height))
@@ -57,7 +61,9 @@ def resized(camera: SizedCamera, scale: float) -> SizedCamera:
 
 
 def project(camera: SizedCamera, points: Floats) -> tuple[Floats, Floats]:
-    """Project world points (N, 3) to pixels (N, 2) and depths (N,). Pixels of depth <= 0 are undefined."""
+    """Project world points (N, 3) to pixels (N, 2) and depths (N,). Pixels of depth <= 0 are
+    undefined.
+    """
     image = (points @ camera.R.T + camera.t) @ camera.K.T
     depth = image[:, 2]
     return image[:, :2] / np.where(depth == 0, np.finfo(np.float64).tiny, depth)[:, None], depth
@@ -70,19 +76,28 @@ def unproject(camera: SizedCamera, pixels: Floats, depth: Floats) -> Floats:
 
 
 def visible_mask(
-    first: SizedCamera, first_depth: FloatImage, second: SizedCamera, second_depth: FloatImage, step: int = 1
+    first: SizedCamera,
+    first_depth: FloatImage,
+    second: SizedCamera,
+    second_depth: FloatImage,
+    step: int = 1,
 ) -> NDArray[np.bool_]:
-    """Return a bool mask, True where `second` shows the same point, at every `step`-th pixel of `first`.
+    """Return a bool mask, True where `second` shows the same point, at every `step`-th pixel of
+    `first`.
 
-    Depths are (H, W) float32 in metres, and inf for the sky, which is never shared. A point is not visible outside
-    the second image, behind the second camera, or behind a nearer surface.
+    Depths are (H, W) float32 in metres, and inf for the sky, which is never shared. A point is not
+    visible outside the second image, behind the second camera, or behind a nearer surface.
     """
     y, x = np.mgrid[0 : first.height : step, 0 : first.width : step]
     depth = first_depth[::step, ::step].astype(np.float64)
     is_surface = np.isfinite(depth)
     corners = np.column_stack([x.ravel(), y.ravel()]).astype(np.float64)
-    pixels, expected = project(second, unproject(first, corners, np.where(is_surface, depth, 1.0).ravel()))
-    inside = (pixels >= 0).all(axis=1) & (pixels <= (second.width - 1, second.height - 1)).all(axis=1)
+    pixels, expected = project(
+        second, unproject(first, corners, np.where(is_surface, depth, 1.0).ravel())
+    )
+    inside = (pixels >= 0).all(axis=1) & (pixels <= (second.width - 1, second.height - 1)).all(
+        axis=1
+    )
     inside &= expected > 0
     maps = np.where(inside[:, None], pixels, 0).astype(np.float32).reshape(*x.shape, 2)
     found = cv2.remap(np.float32(1) / second_depth, maps[..., 0], maps[..., 1], cv2.INTER_LINEAR)
@@ -93,7 +108,9 @@ def visible_mask(
 def covisibility(
     first: SizedCamera, first_depth: FloatImage, second: SizedCamera, second_depth: FloatImage
 ) -> float:
-    """Return the smaller fraction of one view visible in the other, in [0, 1]; the order does not matter."""
+    """Return the smaller fraction of one view visible in the other, in [0, 1]; the order does not
+    matter.
+    """
     ways = ((first, first_depth, second, second_depth), (second, second_depth, first, first_depth))
     return min(float(visible_mask(*way, STEP_PX).mean()) for way in ways)
 

@@ -22,8 +22,8 @@ MIN_DEPTH = 1e-3  # metres
 class Surface:
     """The points `origin + u edge_u + v edge_v` for u, v in [0, 1], each (3,) float64 in metres.
 
-    The texture is (H, W, 3) uint8 BGR, with its first row at v = 0. A surface is visible only from its front,
-    where `edge_u` points right and `edge_v` down.
+    The texture is (H, W, 3) uint8 BGR, with its first row at v = 0. A surface is visible only from
+    its front, where `edge_u` points right and `edge_v` down.
     """
 
     origin: Floats
@@ -45,7 +45,8 @@ class Surface:
 
 
 def render(surfaces: Sequence[Surface], camera: SizedCamera) -> tuple[FloatImage, FloatImage]:
-    """Render an image (H, W, 3) float32 BGR in 0..255, and depth (H, W) float32 along the camera's axis.
+    """Render an image (H, W, 3) float32 BGR in 0..255, and depth (H, W) float32 along the camera's
+    axis.
 
     Depth is measured at pixel centres, in metres. The sky's depth is inf.
     """
@@ -61,7 +62,13 @@ def render(surfaces: Sequence[Surface], camera: SizedCamera) -> tuple[FloatImage
         A = np.linalg.inv(fine.K @ fine.R @ axes).astype(np.float32)
         y, x = (axis.astype(np.float32) for axis in np.ogrid[rows, columns])
         u, v, inverse = (row[0] * x + (row[1] * y + row[2]) for row in A)
-        hit = (inverse > nearness[rows, columns]) & (u >= 0) & (u <= inverse) & (v >= 0) & (v <= inverse)
+        hit = (
+            (inverse > nearness[rows, columns])
+            & (u >= 0)
+            & (u <= inverse)
+            & (v >= 0)
+            & (v <= inverse)
+        )
         if hit.any():
             np.copyto(nearness[rows, columns], inverse, where=hit)
             np.divide(1, inverse, out=inverse, where=hit)
@@ -76,8 +83,12 @@ def render(surfaces: Sequence[Surface], camera: SizedCamera) -> tuple[FloatImage
 
 
 def _extent(surface: Surface, camera: SizedCamera) -> tuple[slice, slice]:
-    """Return the rows and columns that a surface can touch; all if the surface reaches behind the camera."""
-    corners = [surface.origin + i * surface.edge_u + j * surface.edge_v for i in (0, 1) for j in (0, 1)]
+    """Return the rows and columns that a surface can touch; all if the surface reaches behind the
+    camera.
+    """
+    corners = [
+        surface.origin + i * surface.edge_u + j * surface.edge_v for i in (0, 1) for j in (0, 1)
+    ]
     pixels, depth = project(camera, np.array(corners))
     size = (camera.width, camera.height)
     if (depth < MIN_DEPTH).any():

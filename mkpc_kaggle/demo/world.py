@@ -32,19 +32,28 @@ SHOTS = (
 )
 
 
-def build_world(name: str, *, seed: int = 0, image_scale: float = 1.0) -> tuple[list[Surface], list[SizedCamera]]:
-    """Return the surfaces and cameras of a world, in metres. Only the name and the seed decide its content."""
+def build_world(
+    name: str, *, seed: int = 0, image_scale: float = 1.0
+) -> tuple[list[Surface], list[SizedCamera]]:
+    """Return the surfaces and cameras of a world, in metres. Only the name and the seed decide its
+    content.
+    """
     rng = np.random.default_rng([seed, *name.encode()])
     surfaces, cameras = _surfaces(rng), []
     for position, target, focal, size, roll in SHOTS:
-        eye, towards = np.add(position, rng.uniform(-0.15, 0.15, 3)), np.add(target, rng.uniform(-0.3, 0.3, 3))
+        eye, towards = (
+            np.add(position, rng.uniform(-0.15, 0.15, 3)),
+            np.add(target, rng.uniform(-0.3, 0.3, 3)),
+        )
         camera = look_at(eye, towards, focal * max(size), size, roll + rng.uniform(-2, 2))
         cameras.append(resized(camera, image_scale))
     return surfaces, cameras
 
 
 def _surfaces(rng: np.random.Generator) -> list[Surface]:
-    """Return surfaces in metres: x points east, y north (the north wall is at 20), z up from the ground."""
+    """Return surfaces in metres: x points east, y north (the north wall is at 20), z up from the
+    ground.
+    """
     surfaces = [
         quad((-20, 20, 0), (20, 20, 0), (-20, -14, 0), paint(rng, 40, 34, PAVING, is_stone=True)),
         quad((-14, 20, 10), (14, 20, 10), (-14, 20, 0), facade(rng, 28, 10, STONE)),
@@ -53,7 +62,10 @@ def _surfaces(rng: np.random.Generator) -> list[Surface]:
     ]
     for x, y in product(COLUMNS_X_M, ROWS_Y_M):
         if rng.random() < 0.65:
-            centre, size = np.array([x, y]) + rng.uniform(-1, 1, 2), rng.uniform(MIN_BOX_M, MAX_BOX_M)
+            centre, size = (
+                np.array([x, y]) + rng.uniform(-1, 1, 2),
+                rng.uniform(MIN_BOX_M, MAX_BOX_M),
+            )
             surfaces += box(rng, centre, size, rng.uniform(-45, 45))
     return surfaces
 
@@ -79,16 +91,26 @@ def box(rng: np.random.Generator, centre: Floats, size: Floats, yaw: float) -> l
     ]
 
 
-def quad(top_left: ArrayLike, top_right: ArrayLike, bottom_left: ArrayLike, picture: Picture) -> Surface:
+def quad(
+    top_left: ArrayLike, top_right: ArrayLike, bottom_left: ArrayLike, picture: Picture
+) -> Surface:
     """Return the rectangle with these corners (3,), named as seen from the front."""
     corner = np.asarray(top_left, dtype=np.float64)
-    return Surface(corner, np.subtract(top_right, corner), np.subtract(bottom_left, corner), picture)
+    return Surface(
+        corner, np.subtract(top_right, corner), np.subtract(bottom_left, corner), picture
+    )
 
 
 def paint(
-    rng: np.random.Generator, width_m: float, height_m: float, colour: Colour, *, is_stone: bool = False
+    rng: np.random.Generator,
+    width_m: float,
+    height_m: float,
+    colour: Colour,
+    *,
+    is_stone: bool = False,
 ) -> Picture:
-    """Draw a dead-leaves texture (Lee, Mumford and Huang 2001): shapes of all sizes in tones of the colour.
+    """Draw a dead-leaves texture (Lee, Mumford and Huang 2001): shapes of all sizes in tones of the
+    colour.
 
     The shapes are upright rectangles for stone, rotated ellipses with stronger tones for paint.
     """
@@ -99,12 +121,16 @@ def paint(
     count = width * height // 60
     # The density of sizes falls with their third power, so the texture looks alike at every scale.
     lengths = np.sort(3 / np.sqrt(rng.uniform((3 / (max_side_m * scale)) ** 2, 1, count)))[::-1]
-    sides = lengths[:, None] * np.column_stack([np.ones(count), rng.uniform(0.3, 0.6 if is_stone else 1, count)])
+    sides = lengths[:, None] * np.column_stack(
+        [np.ones(count), rng.uniform(0.3, 0.6 if is_stone else 1, count)]
+    )
     centres, angles = rng.uniform((0, 0), (width, height), (count, 2)), rng.uniform(0, 180, count)
     tones = np.array(colour) * (
         1 + rng.normal(0, contrast, (count, 1)) + rng.normal(0, 0.2 * contrast, (count, 3))
     )
-    for centre, side, angle, tone in zip(centres, sides, angles, tones.clip(8, 250).tolist(), strict=True):
+    for centre, side, angle, tone in zip(
+        centres, sides, angles, tones.clip(8, 250).tolist(), strict=True
+    ):
         if is_stone:
             low, high = (centre - side / 2).astype(int), (centre + side / 2).astype(int)
             cv2.rectangle(picture, low, high, tone, -1)

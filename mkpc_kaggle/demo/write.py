@@ -20,7 +20,9 @@ from mkpc_kaggle.geometry.cameras import fundamental_of_cameras
 MIN_COVISIBILITY = 0.1  # minimum of a pair that the competition scores
 TEST_PAIRS = 8  # per scene
 MARK = "demo.txt"
-MARK_TEXT = "Rendered by mkpc_kaggle. The command `demo` replaces train/, test/ and test_truth.csv.\n"
+MARK_TEXT = (
+    "Rendered by mkpc_kaggle. The command `demo` replaces train/, test/ and test_truth.csv.\n"
+)
 
 
 @dataclass(frozen=True)
@@ -81,12 +83,16 @@ def write_demo(
 
 
 def _claim(demo: DemoSet) -> None:
-    """Mark the directory as a demo set. Raise :class:`UserError` if it has data that `demo` did not write."""
+    """Mark the directory as a demo set. Raise :class:`UserError` if it has data that `demo` did not
+    write.
+    """
     mark = demo.root / MARK
     is_ours = mark.is_file() and mark.read_text(errors="replace") == MARK_TEXT
     for path in () if is_ours else (mark, demo.train_dir, demo.test_dir, demo.truth_csv):
         if os.path.lexists(path):
-            raise UserError(f"{path} is in the way: `demo` did not write it; name an empty directory")
+            raise UserError(
+                f"{path} is in the way: `demo` did not write it; name an empty directory"
+            )
     demo.root.mkdir(parents=True, exist_ok=True)
     mark.write_text(MARK_TEXT)
 
@@ -98,33 +104,51 @@ def take_photographs(scene: str, seed: int, image_scale: float) -> list[Photogra
     for number, camera in enumerate(cameras):
         image, depth = render(surfaces, camera)
         rng = np.random.default_rng([seed, number, *scene.encode()])
-        photographs.append(Photograph(f"{scene}_{number:04d}", camera, _developed(image, rng), depth))
+        photographs.append(
+            Photograph(f"{scene}_{number:04d}", camera, _developed(image, rng), depth)
+        )
     return photographs
 
 
 def _developed(image: FloatImage, rng: np.random.Generator) -> Picture:
     """Convert an image (H, W, 3) float32 in 0..255 to uint8, with exposure, tint and noise."""
-    gain, gamma, balance = rng.uniform(0.75, 1.25), rng.uniform(0.85, 1.2), rng.uniform(0.93, 1.07, 3)
+    gain, gamma, balance = (
+        rng.uniform(0.75, 1.25),
+        rng.uniform(0.85, 1.2),
+        rng.uniform(0.93, 1.07, 3),
+    )
     light = np.clip(image * (balance * gain / 255).astype(np.float32), 0, 1) ** np.float32(gamma)
     blurred = cv2.GaussianBlur(light, (5, 5), float(rng.uniform(0.3, 0.7)))
-    noise = np.float32(rng.uniform(0.006, 0.016)) * rng.standard_normal(light.shape, dtype=np.float32)
+    noise = np.float32(rng.uniform(0.006, 0.016)) * rng.standard_normal(
+        light.shape, dtype=np.float32
+    )
     return np.asarray(np.clip((blurred + noise) * 255, 0, 255).round(), dtype=np.uint8)
 
 
 def _selected(pairs: Sequence[DemoPair]) -> list[DemoPair]:
     """Select the test pairs among scored pairs, spread evenly over the ranks of covisibility."""
-    scored = sorted((p for p in pairs if p.covisibility >= MIN_COVISIBILITY), key=lambda p: p.covisibility)
+    scored = sorted(
+        (p for p in pairs if p.covisibility >= MIN_COVISIBILITY), key=lambda p: p.covisibility
+    )
     chosen = np.linspace(0, len(scored) - 1, min(TEST_PAIRS, len(scored))).round().astype(int)
     return [scored[index] for index in chosen]
 
 
 def _write_train(
-    directory: Path, metres_per_unit: float, photographs: Sequence[Photograph], pairs: Sequence[DemoPair]
+    directory: Path,
+    metres_per_unit: float,
+    photographs: Sequence[Photograph],
+    pairs: Sequence[DemoPair],
 ) -> None:
     for each in photographs:
-        _write_image(directory / "images" / f"{each.name}.jpg", each.picture, cv2.IMWRITE_JPEG_QUALITY, 95)
+        _write_image(
+            directory / "images" / f"{each.name}.jpg", each.picture, cv2.IMWRITE_JPEG_QUALITY, 95
+        )
     header = "image_id,camera_intrinsics,rotation_matrix,translation_vector"
-    cameras = ((each.name, each.camera.K, each.camera.R, each.camera.t / metres_per_unit) for each in photographs)
+    cameras = (
+        (each.name, each.camera.K, each.camera.R, each.camera.t / metres_per_unit)
+        for each in photographs
+    )
     rows = (",".join([name, *map(_numbers, matrices)]) for name, *matrices in cameras)
     _write_rows(directory / "calibration.csv", header, rows)
     lines = []
@@ -134,8 +158,12 @@ def _write_train(
     _write_rows(directory / "pair_covisibility.csv", "pair,covisibility,fundamental_matrix", lines)
 
 
-def _write_test(directory: Path, scene: str, pairs: Sequence[DemoPair], seed: int) -> Iterator[tuple[str, str]]:
-    """Write the images of one batch. Yield each pair's row of test.csv and its row of test_truth.csv."""
+def _write_test(
+    directory: Path, scene: str, pairs: Sequence[DemoPair], seed: int
+) -> Iterator[tuple[str, str]]:
+    """Write the images of one batch. Yield each pair's row of test.csv and its row of
+    test_truth.csv.
+    """
     batch = _digest(f"{seed}/{scene}")[:8]
     photographs = {each.name: each for pair in pairs for each in pair[:2]}
     hidden = {name: _digest(f"{seed}/{scene}/{name}")[:32] for name in photographs}

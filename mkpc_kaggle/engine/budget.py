@@ -17,7 +17,8 @@ from mkpc_kaggle.recipe import Unit
 SUMMARY_FACTOR = 5  # a report may take this many times as long as writing the submission
 WRITE_MARGIN = 1.5  # the next write may take this many times as long as the median of the latest
 MAX_WRITE_SHARE = 0.05  # maximum share of the limit for the forecast of a write
-MAX_SILENCE_S, MIN_SILENCE_S, SILENCE_SHARE = 60.0, 5.0, 0.02  # of a worker; the share is of the limit
+# Of a worker; the share is of the limit
+MAX_SILENCE_S, MIN_SILENCE_S, SILENCE_SHARE = 60.0, 5.0, 0.02
 WINDOW = 64  # number of latest measurements in the mean
 MARGIN, MIN_MARGIN = 0.4, 0.01  # of a forecast from one measurement; sqrt(n) times smaller from n
 SCENE_START_S = 3.0  # start-up time of a scene's process
@@ -28,10 +29,16 @@ MAX_STEP_BACK_S = 60.0  # of the wall clock, between --started-at and the start
 
 
 def parse_duration(text: str) -> float:
-    """Return the seconds of ``8h45m``, ``90m``, ``60s`` or a number. Raise :class:`UserError` for other text."""
-    parts = re.fullmatch(r"(?:(\d+)h)?(?:(\d+)m)?(?:(\d+(?:\.\d+)?)s)?|(\d+(?:\.\d+)?)", text.strip())
+    """Return the seconds of ``8h45m``, ``90m``, ``60s`` or a number. Raise :class:`UserError` for
+    other text.
+    """
+    parts = re.fullmatch(
+        r"(?:(\d+)h)?(?:(\d+)m)?(?:(\d+(?:\.\d+)?)s)?|(\d+(?:\.\d+)?)", text.strip()
+    )
     if parts is None or not any(parts.groups()):
-        raise UserError(f"{text!r} is not a duration; write it as 8h45m, 90m, 60s or a number of seconds")
+        raise UserError(
+            f"{text!r} is not a duration; write it as 8h45m, 90m, 60s or a number of seconds"
+        )
     hours, minutes, seconds, number = (float(part or 0) for part in parts.groups())
     if not (total := hours * 3600 + minutes * 60 + seconds + number):
         raise UserError("a time limit of 0 leaves no time to work")
@@ -50,8 +57,8 @@ def format_duration(seconds: float) -> str:
 class Budget:
     """The time of a run since ``started``, in seconds of ``clock``, which never jumps.
 
-    No unit runs after ``stop_units``, and the run stops waiting for workers at ``stop_waiting``. Writing of the
-    final submission starts at ``final_write``. The process ends before ``limit``.
+    No unit runs after ``stop_units``, and the run stops waiting for workers at ``stop_waiting``.
+    Writing of the final submission starts at ``final_write``. The process ends before ``limit``.
     """
 
     started: float
@@ -64,7 +71,9 @@ class Budget:
 
     @property
     def writing(self) -> float:
-        """Seconds allowed for the next write, by the median of the latest writes, which ignores a slow one."""
+        """Seconds allowed for the next write, by the median of the latest writes, which ignores a
+        slow one.
+        """
         median = median_low(self._writes) if self._writes else 0.0
         return min(WRITE_MARGIN * median, MAX_WRITE_SHARE * self.time_limit)
 
@@ -105,7 +114,8 @@ class Budget:
 class Costs:
     """Seconds of a unit on a pair, by name, of the estimate of a pair, and of a scene.
 
-    A worker's first run of a unit is a warm-up. Its time is used as mean until another run, never as forecast.
+    A worker's first run of a unit is a warm-up. Its time is used as mean until another run, never
+    as forecast.
     """
 
     def __init__(self) -> None:
@@ -134,7 +144,9 @@ class Costs:
         return self._warm_up.get(unit, 0.0)
 
     def forecast(self, unit: str) -> float:
-        """Return the mean plus a margin that shrinks with more measurements; 0 without measurements."""
+        """Return the mean plus a margin that shrinks with more measurements; 0 without
+        measurements.
+        """
         if not self.is_known(unit):
             return 0.0
         return self.mean(unit) * (1 + max(MIN_MARGIN, MARGIN / sqrt(len(self._measured[unit]))))
@@ -156,11 +168,12 @@ class Costs:
 
 
 def monotonic_of(epoch: float) -> float:
-    """Return the monotonic clock's time at the wall-clock time ``epoch``, given in seconds since 1970.
+    """Return the monotonic clock's time at the wall-clock time ``epoch``, given in seconds since
+    1970.
 
-    A run calls this once, at its start, so later jumps of the wall clock do not move the limit. A time less than
-    a minute ahead counts as now, because the clock was probably set back. Raises :class:`UserError` for a later
-    time.
+    A run calls this once, at its start, so later jumps of the wall clock do not move the limit. A
+    time less than a minute ahead counts as now, because the clock was probably set back. Raises
+    :class:`UserError` for a later time.
     """
     ago = time.time() - epoch
     if not -MAX_STEP_BACK_S < ago < inf:

@@ -1,7 +1,7 @@
 """Workers on a Ray cluster. Ray places an actor on each GPU, or on each machine if no GPU is used.
 
-The test set and the weights must have the same paths on every machine, as with a shared file system. If the
-main machine or Ray's head node fails, rerun the command to resume from the store.
+The test set and the weights must have the same paths on every machine, as with a shared file
+system. If the main machine or Ray's head node fails, rerun the command to resume from the store.
 """
 
 import os
@@ -42,8 +42,8 @@ def parse_workers(text: str) -> int | str:
 class RaySite(Site):
     """Places on the machines of a cluster, which :meth:`open` joins; see :func:`join`.
 
-    Each machine must have the weights, and the ``folders`` with the images. Raises :class:`UserError` if Ray is
-    not installed.
+    Each machine must have the weights, and the ``folders`` with the images. Raises
+    :class:`UserError` if Ray is not installed.
     """
 
     def __init__(
@@ -55,7 +55,8 @@ class RaySite(Site):
         log: Path | None = None,
     ) -> None:
         super().__init__(clock, log=log)
-        # Ray reads these on import. It must not report usage, or start a cluster after its shutdown.
+        # Ray reads these on import. It must not report usage, or start a cluster after its
+        # shutdown.
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
         os.environ.setdefault("RAY_ENABLE_AUTO_CONNECT", "0")
         try:
@@ -64,16 +65,25 @@ class RaySite(Site):
             told = '--workers ray needs Ray, which is not installed: pip install "mkpc-kaggle[ray]"'
             raise UserError(told) from error
         self._ray, self._has_joined = ray, False
-        self._assembly, self._cluster, self._needed = assembly, cluster, (*assembly.weight_paths, *folders)
+        self._assembly, self._cluster, self._needed = (
+            assembly,
+            cluster,
+            (*assembly.weight_paths, *folders),
+        )
         self._workers: list[RayWorker] = []
 
     def open(self) -> None:
         self._has_joined = not self._ray.is_initialized()
         if self._has_joined:
             join(self._ray, self._cluster)
-        machines = [node for node in self._ray.nodes() if node["Alive"] and node["Resources"].get("CPU", 0) >= 1]
+        machines = [
+            node
+            for node in self._ray.nodes()
+            if node["Alive"] and node["Resources"].get("CPU", 0) >= 1
+        ]
         gpus = sum(int(node["Resources"].get("GPU", 0)) for node in machines)
-        # This machine is one of the cluster's: scenes beside its actors get the cores that these leave.
+        # This machine is one of the cluster's: scenes beside its actors get the cores that these
+        # leave.
         self.matching_cores = self._cores
         if gpus and self._assembly.device != "cpu":
             self.matching_cores = gpus
@@ -101,14 +111,18 @@ class RaySite(Site):
         make = partial(make_alike, make, __version__, self._needed)
 
         def worker() -> RayWorker:
-            self._workers.append(RayWorker(name, make, self.ring, self._ray, {"num_cpus": 0, **where}))
+            self._workers.append(
+                RayWorker(name, make, self.ring, self._ray, {"num_cpus": 0, **where})
+            )
             return self._workers[-1]
 
         self.places.append(Place(name, worker))
 
 
 class RayWorker(ThreadWorker):
-    """A worker in a Ray actor with the resources ``where``. The thread waits for the actor's answers."""
+    """A worker in a Ray actor with the resources ``where``. The thread waits for the actor's
+    answers.
+    """
 
     _actor: Any = None
 
@@ -120,7 +134,8 @@ class RayWorker(ThreadWorker):
 
     def kill(self) -> None:
         super().kill()
-        with suppress(self._ray.exceptions.RayError, ValueError):  # the cluster may be gone, and the actor, too
+        # The cluster may be gone, and the actor, too
+        with suppress(self._ray.exceptions.RayError, ValueError):
             if self._actor is not None:
                 self._ray.kill(self._actor)
 
@@ -141,13 +156,19 @@ class RayWorker(ThreadWorker):
 
 
 def make_alike(make: Maker, version: str, paths: tuple[Path, ...]) -> Runner:
-    """Return ``make()`` on a machine of the cluster. Raise :class:`UserError` if version or paths differ."""
+    """Return ``make()`` on a machine of the cluster. Raise :class:`UserError` if version or paths
+    differ.
+    """
     host = socket.gethostname()
     if version != __version__:
-        raise UserError(f"mkpc-kaggle is {__version__} on {host} and {version} here: install the same on both")
+        raise UserError(
+            f"mkpc-kaggle is {__version__} on {host} and {version} here: install the same on both"
+        )
     for path in paths:
         if not path.exists():
-            raise UserError(f"{host} lacks {path}: test set and weights must have the same paths on every machine")
+            raise UserError(
+                f"{host} lacks {path}: test set and weights must have the same paths on every machine"
+            )
     return make()
 
 

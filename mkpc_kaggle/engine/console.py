@@ -1,9 +1,11 @@
-"""The only module that prints during a run: lines, warnings, progress. Printing never raises or blocks the run.
+"""The only module that prints during a run: lines, warnings, progress. Printing never raises or
+blocks the run.
 
-A pipe without a reader or a stopped terminal (Ctrl-S) blocks a write forever, and with it every thread that waits
-for the stream's lock. A lost terminal (EIO), a full disk or a closed stream makes a write fail. So one thread
-prints, from a bounded queue. Native libraries write to the descriptors directly: libjpeg and libpng print warnings
-while OpenCV decodes a photograph. Their text goes to a file.
+A pipe without a reader or a stopped terminal (Ctrl-S) blocks a write forever, and with it every
+thread that waits for the stream's lock. A lost terminal (EIO), a full disk or a closed stream makes
+a write fail. So one thread prints, from a bounded queue. Native libraries write to the descriptors
+directly: libjpeg and libpng print warnings while OpenCV decodes a photograph. Their text goes to a
+file.
 """
 
 import io
@@ -49,10 +51,11 @@ def _print(text: str, stream: TextIO | None, end: str = "\n") -> None:
 
 
 class Progress:
-    """Progress of a phase in pairs: a line redrawn in place on a terminal, occasional lines elsewhere.
+    """Progress of a phase in pairs: a line redrawn in place on a terminal, occasional lines
+    elsewhere.
 
-    A notebook's ``!command`` has a terminal, but Jupyter stores all its text, including every state of a redrawn
-    line. Jupyter sets JPY_PARENT_PID for these processes.
+    A notebook's ``!command`` has a terminal, but Jupyter stores all its text, including every state
+    of a redrawn line. Jupyter sets JPY_PARENT_PID for these processes.
     """
 
     def __init__(self, budget: Budget, stream: TextIO | None) -> None:
@@ -117,7 +120,9 @@ class Progress:
 
 
 class Printer:
-    """The printing thread, with a bounded queue of (descriptor, bytes). Text is dropped if the queue is full."""
+    """The printing thread, with a bounded queue of (descriptor, bytes). Text is dropped if the
+    queue is full.
+    """
 
     def __init__(self) -> None:
         self._waiting: queue.Queue[tuple[int, bytes]] = queue.Queue(MAX_WAITING)
@@ -129,7 +134,9 @@ class Printer:
             self._waiting.put_nowait((descriptor, data))
 
     def drain(self, until: float) -> bool:
-        """Wait until all text is printed, at most until ``until`` on the monotonic clock. Return whether it is."""
+        """Wait until all text is printed, at most until ``until`` on the monotonic clock. Return
+        whether it is.
+        """
         while self._waiting.unfinished_tasks:
             if time.monotonic() >= until:
                 return False
@@ -175,8 +182,8 @@ _native: list[int] = []  # descriptors that native libraries write to, while str
 def unblocked(descriptors: Sequence[int] = (1, 2)) -> Iterator[None]:
     """Print ``sys.stdout`` and ``sys.stderr`` by a thread, so that writes never block.
 
-    Text of native libraries is printed at the end, or goes to the file of :func:`log_native`. Streams at other
-    descriptors, such as a notebook's, are not changed.
+    Text of native libraries is printed at the end, or goes to the file of :func:`log_native`.
+    Streams at other descriptors, such as a notebook's, are not changed.
     """
     global _printer  # noqa: PLW0603  one thread for the process
     occupy_standard_descriptors()
@@ -190,7 +197,9 @@ def unblocked(descriptors: Sequence[int] = (1, 2)) -> Iterator[None]:
             stream.flush()
             sink = os.dup(number)
             raw = io.BufferedWriter(Queued(sink, _printer))
-            queued = io.TextIOWrapper(raw, stream.encoding, stream.errors, write_through=True, line_buffering=True)
+            queued = io.TextIOWrapper(
+                raw, stream.encoding, stream.errors, write_through=True, line_buffering=True
+            )
             setattr(sys, name, queued)
             file = ended.enter_context(TemporaryFile())
             os.dup2(file.fileno(), number)
@@ -201,7 +210,9 @@ def unblocked(descriptors: Sequence[int] = (1, 2)) -> Iterator[None]:
 
 
 def _restore(name: str, stream: TextIO, number: int, sink: int, file: Any) -> None:
-    """Restore a stream and its descriptor, unless the file still blocks, since later writes would block, too."""
+    """Restore a stream and its descriptor, unless the file still blocks, since later writes would
+    block, too.
+    """
     assert _printer is not None
     setattr(sys, name, stream)
     file.seek(0)
@@ -215,7 +226,9 @@ def _restore(name: str, stream: TextIO, number: int, sink: int, file: Any) -> No
 
 
 def occupy_standard_descriptors() -> None:
-    """Open the null device at descriptors up to 2 that are closed: no other file may get their numbers."""
+    """Open the null device at descriptors up to 2 that are closed: no other file may get their
+    numbers.
+    """
     for number in range(3):
         try:
             os.fstat(number)
@@ -257,7 +270,9 @@ def drain(seconds: float = DRAIN_S) -> None:
 
 
 def leave(status: int, seconds: float = DRAIN_S) -> NoReturn:
-    """End the process and its children, even if stopped (SIGSTOP). Print remaining text for up to ``seconds``."""
+    """End the process and its children, even if stopped (SIGSTOP). Print remaining text for up to
+    ``seconds``.
+    """
     for child in multiprocessing.active_children():
         child.kill()
     drain(seconds)

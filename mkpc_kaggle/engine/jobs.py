@@ -1,4 +1,6 @@
-"""Messages between the loop and its workers: four kinds of jobs, their answers, failures, the memory of tries."""
+"""Messages between the loop and its workers: four kinds of jobs, their answers, failures, the
+memory of tries.
+"""
 
 from collections import Counter
 from collections.abc import Callable, Hashable, Mapping, Sequence
@@ -57,7 +59,8 @@ class MatchJob:
 
 @dataclass(frozen=True, eq=False)
 class PairInputs:
-    """What a pair's estimate, or a scene, is computed from: its images, and the keys of its points by unit.
+    """What a pair's estimate, or a scene, is computed from: its images, and the keys of its points
+    by unit.
 
     The units are in the recipe's order. ``own`` is for a scene: F from the pair's own matches.
     """
@@ -83,7 +86,8 @@ class EstimateJob:
 class SceneJob:
     """Reconstruct a batch, from ``matches`` matches. ``export`` is for COLMAP's files.
 
-    The answer is a :class:`Solution`, with choices in the order of the pairs, which have ``contents``.
+    The answer is a :class:`Solution`, with choices in the order of the pairs, which have
+    ``contents``.
     """
 
     batch: str
@@ -188,11 +192,13 @@ Answer = Loaded | tuple[Outcome, ...] | tuple[Estimated, ...] | Solution | Found
 
 
 class Tries:
-    """The only memory of failures, for one run: nothing of it is stored, so the next run tries everything again.
+    """The only memory of failures, for one run: nothing of it is stored, so the next run tries
+    everything again.
 
-    An item of a lost job is retried in its own job (``alone``), and given up when that job is lost for the second
-    time. ``given_up`` has the reason of each item. Items are tuples: ("unit", pair, unit), ("matcher", unit),
-    ("pair", pair), ("estimate", pair), ("scene", batch, key), ("scenes",) and ("features", key).
+    An item of a lost job is retried in its own job (``alone``), and given up when that job is lost
+    for the second time. ``given_up`` has the reason of each item. Items are tuples: ("unit", pair,
+    unit), ("matcher", unit), ("pair", pair), ("estimate", pair), ("scene", batch, key), ("scenes",)
+    and ("features", key).
     """
 
     def __init__(self) -> None:
@@ -201,7 +207,9 @@ class Tries:
         self._counts: Counter[Hashable] = Counter()
 
     def lose(self, items: Sequence[Hashable], failure: Failure) -> bool:
-        """Record the items of a lost job. Return whether it had a single item, which is now given up."""
+        """Record the items of a lost job. Return whether it had a single item, which is now given
+        up.
+        """
         self.alone.update(items)
         if len(items) != 1:
             return False
@@ -213,6 +221,8 @@ class Tries:
 
 
 def visiting_order(pairs: Sequence[Pair]) -> list[int]:
-    """Return pair indices in an order that puts pairs with a common image together, for encoding cache hits."""
+    """Return pair indices in an order that puts pairs with a common image together, for encoding
+    cache hits.
+    """
     keys = [(pair.group, pair.file0, pair.file1) for pair in pairs]
     return sorted(range(len(pairs)), key=keys.__getitem__)

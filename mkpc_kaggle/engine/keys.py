@@ -1,19 +1,21 @@
 """Keys: the digest of everything that a result was computed from.
 
-A result is up to date exactly if it is stored under the key that a computation today would have. Nothing else
-says so. Each kind has a version of its algorithm: increase it if the same inputs give other results.
+A result is up to date exactly if it is stored under the key that a computation today would have.
+Nothing else says so. Each kind has a version of its algorithm: increase it if the same inputs give
+other results.
 """
 
 import hashlib
 import json
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from typing import Any
 
 import cv2
 
 from mkpc_kaggle.data.competition import Pair
+from mkpc_kaggle.data.masks import Masks
 from mkpc_kaggle.geometry.coordinates import Box
 from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.pipeline.stages import GivenRegions
@@ -43,7 +45,8 @@ def text_digest(lines: Iterable[str]) -> str:
 class Keys:
     """The keys of a recipe's results, from digests of its settings.
 
-    ``units`` has a digest for each unit, in the recipe's order. ``regions`` replace MKPC's regions of some pairs.
+    ``units`` has a digest for each unit, in the recipe's order. ``regions`` replace MKPC's regions
+    of some pairs. ``masks`` are of single images.
     """
 
     units: tuple[str, ...]
@@ -51,6 +54,7 @@ class Keys:
     estimate: str = ""
     scene: str = ""
     regions: GivenRegions | None = None
+    masks: Masks = field(default_factory=Masks)
 
     @classmethod
     def of(cls, assembly: Assembly) -> "Keys":
@@ -67,6 +71,7 @@ class Keys:
             estimate,
             digest([SCENE, scene, tracks, estimate, version("pycolmap")]),
             assembly.regions,
+            assembly.masks,
         )
 
     def of_points(self, unit: int, pair: Pair, images: Images, first: Sequence[str]) -> str:
@@ -76,7 +81,12 @@ class Keys:
         """
         image0, image1 = images
         turns = map(str, pair.turns)
-        return text_digest([self.units[unit], image0.digest, image1.digest, *turns, *first])
+        # A pair without masks has the key that it would have without the option.
+        masks = [self.masks.digest(file) for file in (pair.file0, pair.file1)]
+        masked = ["masks", *masks] if any(masks) else []
+        return text_digest(
+            [self.units[unit], image0.digest, image1.digest, *turns, *masked, *first]
+        )
 
     def crops_of(self, pair: Pair, first: Sequence[str]) -> list[str]:
         """Return what decides a pair's crops: the given regions, or [mkpc] and the keys of stage 1."""
@@ -91,7 +101,9 @@ class Keys:
         return text_digest([self.estimate, *known, "points", *points])
 
     def of_scene(self, inputs: Sequence[Sequence[Any]]) -> str:
-        """Return the key of a scene. Each input is a pair: names, digests, keys of its points and estimate."""
+        """Return the key of a scene. Each input is a pair: names, digests, keys of its points and
+        estimate.
+        """
         return digest([self.scene, inputs])
 
 

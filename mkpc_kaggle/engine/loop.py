@@ -1,4 +1,6 @@
-"""The loop of a run, on one thread. It gives jobs to workers, saves their answers, and publishes results."""
+"""The loop of a run, on one thread. It gives jobs to workers, saves their answers, and publishes
+results.
+"""
 
 import sqlite3
 import sys
@@ -95,7 +97,8 @@ class Engine:
         self.interrupt = interrupt
         self.minibatch = minibatch
         self.state: State | None = None  # until something is asked for
-        self.costs = Costs()  # by this run's answers: another machine may have made those of the store
+        # By this run's answers: another machine may have made those of the store
+        self.costs = Costs()
         self.unwritten = ""
         self.faults: list[str] = []
         self.explanations: list[Event] = []
@@ -144,13 +147,17 @@ class Engine:
         # What is no JSON value is data.
         data = self.store.data(key for key in about if about[key] is None)
         self._found = {**about, **data}
-        self._features = {key: FeatureJob(key, do) for key, do in jobs.items() if key not in self._found}
+        self._features = {
+            key: FeatureJob(key, do) for key, do in jobs.items() if key not in self._found
+        }
         self._loop()
         self._features = {}
         return self._found
 
     def ask(self, request: Request, share: float = 1.0) -> None:
-        """Compute the missing results of a request. No job begins after ``share`` of the remaining time."""
+        """Compute the missing results of a request. No job begins after ``share`` of the remaining
+        time.
+        """
         config = request.recipe.scene
         extra = extra_pairs_of(request.pairs, config)
         batches = batches_of([*request.pairs, *extra]) if config is not None else {}
@@ -202,7 +209,9 @@ class Engine:
         return digests
 
     def _digests(self, state: State) -> dict[str, str]:
-        """Return the known digests of images, by name. Digest a file again if its size or time has changed."""
+        """Return the known digests of images, by name. Digest a file again if its size or time has
+        changed.
+        """
         files: dict[str, Path] = {}
         for pair, names in zip(state.pairs, state.names, strict=True):
             files |= zip(names, pair.images, strict=True)
@@ -256,7 +265,9 @@ class Engine:
         )
 
     def _hand_out(self, now: float) -> bool:
-        """Give jobs to idle workers, and start workers for further jobs. Return whether any is under way."""
+        """Give jobs to idle workers, and start workers for further jobs. Return whether any is
+        under way.
+        """
         work: NextWork | None = None
         if self.state is not None:
             work = self._next_work(self.state, now)
@@ -307,7 +318,9 @@ class Engine:
         return int(job is not None)
 
     def _next_work(self, state: State, now: float) -> NextWork | None:
-        """Return what to do next; ``None`` if the time of a trial is over. Explain a change of the phase."""
+        """Return what to do next; ``None`` if the time of a trial is over. Explain a change of the
+        phase.
+        """
         if now >= self._until:
             return None
         work = next_work(state, self.costs, self.budget, self.crew, now)
@@ -318,7 +331,9 @@ class Engine:
         return work
 
     def _explain_phase(self, state: State, work: NextWork, now: float) -> None:
-        """Explain a change of the phase or of the units that fit. Announce the outlook once it is measured."""
+        """Explain a change of the phase or of the units that fit. Announce the outlook once it is
+        measured.
+        """
         fitting = f"{work.phase} {work.fit if work.phase is Phase.DEEPEN else ''}"
         if fitting == self._explained and self._is_announced:
             return
@@ -374,7 +389,10 @@ class Engine:
         known: list[tuple[UnitResult, ...]] = [()] * len(crops)
         if any(unit.stage == 2 for unit in job.units):
             try:
-                known = [self._points_of(index, keys) for index, keys in zip(job.indices, crops, strict=True)]
+                known = [
+                    self._points_of(index, keys)
+                    for index, keys in zip(job.indices, crops, strict=True)
+                ]
             except (sqlite3.Error, KeyError) as error:  # a disk that fails
                 self._lose_job(job, Failure(Cause.RAISED, f"the store cannot be read: {error}"))
                 return None
@@ -393,7 +411,9 @@ class Engine:
     def _points_of(self, index: int, keys: Sequence[str]) -> tuple[UnitResult, ...]:
         assert self.state is not None
         data = self.store.data(keys)
-        units = {key: unit for unit, key in self.state.inputs_of(index).points.items()} if keys else {}
+        units = (
+            {key: unit for unit, key in self.state.inputs_of(index).points.items()} if keys else {}
+        )
         return tuple(UnitResult(units[key], from_bytes(data[key])) for key in keys)
 
     def _estimate_job(self, state: State, due: Sequence[int]) -> EstimateJob:
@@ -427,7 +447,9 @@ class Engine:
         return SceneJob(batch, key, pairs, contents, state.request.recipe, source, matches, export)
 
     def _time_limit(self, job: Job, now: float) -> float:
-        """Return the seconds after which a worker counts as hung, from measured costs or from the time left."""
+        """Return the seconds after which a worker counts as hung, from measured costs or from the
+        time left.
+        """
         patience: float | None = None
         match job:
             case MatchJob():
@@ -504,7 +526,9 @@ class Engine:
                 assert isinstance(answer, Found)
                 value = answer.value
                 is_data = isinstance(value, bytes)
-                row = Result(job.key, Kind.FEATURES, None if is_data else value, value if is_data else b"")
+                row = Result(
+                    job.key, Kind.FEATURES, None if is_data else value, value if is_data else b""
+                )
                 self.store.put([row])
                 self._found[job.key] = value
             case MatchJob():
@@ -517,7 +541,10 @@ class Engine:
     def _take_points(self, job: MatchJob, answer: Sequence[Outcome]) -> None:
         state = self.state
         assert state is not None
-        results = [state.results_of(outcome, crops) for outcome, crops in zip(answer, job.crops, strict=True)]
+        results = [
+            state.results_of(outcome, crops)
+            for outcome, crops in zip(answer, job.crops, strict=True)
+        ]
         # First the store, in one transaction: what the state has is never lost.
         self.store.put(result for rows in results for result in rows)
         state.end(state.matching, job.indices)
@@ -624,7 +651,9 @@ class Engine:
             self.explain(f"{name} is skipped on all pairs: it never ran ({failure})")
 
     def _fall_back(self) -> None:
-        """Continue on the fallback places once all matching places are closed, or every unit is skipped."""
+        """Continue on the fallback places once all matching places are closed, or every unit is
+        skipped.
+        """
         places = self.site.of(Work.MATCH)
         is_closed = self._is_open and all(place.closed for place in places)
         nothing_runs = self.state is not None and bool(self.state.unusable.all())
@@ -652,7 +681,9 @@ class Engine:
     # Results
 
     def save_results(self) -> str:
-        """Write the results unless the run has ended. Return why that failed, or an empty text. Thread-safe."""
+        """Write the results unless the run has ended. Return why that failed, or an empty text.
+        Thread-safe.
+        """
         with self._publishing:
             state = self.state
             if state is not None and not self._has_ended:
@@ -729,7 +760,9 @@ def scene_records(state: State) -> tuple[SceneRecord, ...]:
 
 
 def batches_of(pairs: Iterable[Pair]) -> dict[str, list[int]]:
-    """Return the pair indices of each batch that can be reconstructed: two or more pairs without intrinsics."""
+    """Return the pair indices of each batch that can be reconstructed: two or more pairs without
+    intrinsics.
+    """
     batches: dict[str, list[int]] = {}
     for index, pair in enumerate(pairs):
         if pair.intrinsics is None:
@@ -746,7 +779,11 @@ def extra_pairs_of(pairs: Sequence[Pair], config: SceneConfig | None) -> list[Pa
         return []
     extra: list[tuple[float, Pair]] = []
     for batch, indices in batches_of(pairs).items():
-        files = list(dict.fromkeys(file for index in indices for file in (pairs[index].file0, pairs[index].file1)))
+        files = list(
+            dict.fromkeys(
+                file for index in indices for file in (pairs[index].file0, pairs[index].file1)
+            )
+        )
         number = {file: index for index, file in enumerate(files)}
         ends = [(number[pairs[index].file0], number[pairs[index].file1]) for index in indices]
         distinct = len({tuple(sorted(pair)) for pair in ends})

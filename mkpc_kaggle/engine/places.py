@@ -1,7 +1,9 @@
-"""Places of workers. A place has one worker at a time, and is closed after it loses three workers in a row.
+"""Places of workers. A place has one worker at a time, and is closed after it loses three workers
+in a row.
 
-What ends a hung worker: the loop sets :attr:`Place.limit` from measured costs (``Engine._time_limit``). By
-:meth:`Place.poll`, a worker that has not answered by then is killed: its process gets SIGKILL.
+What ends a hung worker: the loop sets :attr:`Place.limit` from measured costs
+(``Engine._time_limit``). By :meth:`Place.poll`, a worker that has not answered by then is killed:
+its process gets SIGKILL.
 """
 
 import os
@@ -20,7 +22,8 @@ from mkpc_kaggle.engine.worker import Maker, MatchRunner, light_runner, scene_ru
 from mkpc_kaggle.pipeline.assembly import Assembly
 
 START_TIMEOUT_S = 300.0  # for a worker to load its matchers, which is slow from a network disk
-RESTART_PAUSE_S = 1.0  # times the number of workers lost in a row; short memory may become free meanwhile
+# Times the number of workers lost in a row; short memory may become free meanwhile
+RESTART_PAUSE_S = 1.0
 MAX_LOSSES = 3  # number of workers lost in a row, without an answer between, that closes a place
 LISTEN_S = 0.2  # interval between checks for an interrupt
 CORES_PER_ESTIMATOR = 4
@@ -60,7 +63,9 @@ class Place:
     @property
     def is_starting(self) -> bool:
         """Return whether a worker is loading, or will be started again after a pause."""
-        return not self.is_loaded and not self.closed and (self.worker is not None or self.losses > 0)
+        return (
+            not self.is_loaded and not self.closed and (self.worker is not None or self.losses > 0)
+        )
 
     def may_start(self, now: float) -> bool:
         return self.worker is None and not self.closed and now >= self.limit
@@ -78,7 +83,9 @@ class Place:
         self.worker.submit(job)
 
     def poll(self, now: float) -> Answer | None:
-        """Return the worker's answer, or a :class:`Failure` if it hangs; ``None`` while it computes."""
+        """Return the worker's answer, or a :class:`Failure` if it hangs; ``None`` while it
+        computes.
+        """
         if self.worker is None:
             return None
         answer = self.worker.answer()
@@ -103,10 +110,15 @@ class Place:
     def _fail(self, failure: Failure, now: float) -> None:
         """End the worker, unless only its job failed.
 
-        After an out-of-memory error, memory stays fragmented. A failed device keeps failing. Lack of memory does
-        not count against the place, nor does a death or a hang on a job that has already lost a worker.
+        After an out-of-memory error, memory stays fragmented. A failed device keeps failing. Lack
+        of memory does not count against the place, nor does a death or a hang on a job that has
+        already lost a worker.
         """
-        is_retry = self.job is not None and self.job.is_retry and failure.cause in (Cause.DIED, Cause.TIMED_OUT)
+        is_retry = (
+            self.job is not None
+            and self.job.is_retry
+            and failure.cause in (Cause.DIED, Cause.TIMED_OUT)
+        )
         if self.is_loaded and failure.cause in (Cause.RAISED, Cause.OUT_OF_MEMORY):
             self.losses = 0
             if failure.cause is Cause.RAISED:
@@ -120,7 +132,8 @@ class Place:
 
 
 class Site:
-    """The places of a run. Matching may run on other machines; estimates and scenes run next to the store.
+    """The places of a run. Matching may run on other machines; estimates and scenes run next to the
+    store.
 
     ``fallback`` are the matching places that take over when all others are closed. Workers call ``ring`` when an
     answer is ready, and their processes print to ``log``.
@@ -128,7 +141,9 @@ class Site:
 
     matching_cores = 0  # that are used by the workers of matching on this machine
 
-    def __init__(self, clock: Callable[[], float], *, threads: bool = False, log: Path | None = None) -> None:
+    def __init__(
+        self, clock: Callable[[], float], *, threads: bool = False, log: Path | None = None
+    ) -> None:
         self._clock = clock
         self._bell: queue.SimpleQueue[None] = queue.SimpleQueue()
         self._worker = ThreadWorker if threads else ProcessWorker
@@ -137,10 +152,12 @@ class Site:
         estimators = 1 if threads else max(1, self._cores // CORES_PER_ESTIMATOR)
         make = partial(light_runner, in_process=not threads)
         self.places = [
-            Place(f"estimates {n}", partial(self._make, "estimates", make), Work.LIGHT) for n in range(estimators)
+            Place(f"estimates {n}", partial(self._make, "estimates", make), Work.LIGHT)
+            for n in range(estimators)
         ]
         self.places += [
-            Place("scenes" if n == 0 else f"scenes {n}", self.scene_worker, Work.SCENE) for n in range(self._cores)
+            Place("scenes" if n == 0 else f"scenes {n}", self.scene_worker, Work.SCENE)
+            for n in range(self._cores)
         ]
         self.fallback: list[Place] = []
 
@@ -150,7 +167,9 @@ class Site:
         return worker
 
     def scenes_at_a_time(self, *, is_matching: bool) -> int:
-        """Return for how many scenes there are cores: those that matching leaves free, at least one."""
+        """Return for how many scenes there are cores: those that matching leaves free, at least
+        one.
+        """
         return max(1, self._cores - self.matching_cores * is_matching)
 
     def printed(self) -> Path | None:
@@ -176,7 +195,9 @@ class Site:
         self._bell.put(None)
 
     def wait(self, until: float) -> None:
-        """Wait until an answer or an interrupt may have arrived, at most until ``until`` on the engine's clock."""
+        """Wait until an answer or an interrupt may have arrived, at most until ``until`` on the
+        engine's clock.
+        """
         with suppress(queue.Empty):
             self._bell.get(timeout=max(0.0, min(LISTEN_S, until - self._clock())))
 
@@ -185,7 +206,9 @@ class Site:
 
 
 class LocalSite(Site):
-    """Places of this machine: ``workers`` processes, by default one per device; 0: a thread of this process."""
+    """Places of this machine: ``workers`` processes, by default one per device; 0: a thread of this
+    process.
+    """
 
     def __init__(
         self,
@@ -201,8 +224,9 @@ class LocalSite(Site):
         if workers == 0:
             self.places.append(self._place("this process", assembly))
             return
-        # On a CPU, one process uses all threads. Two with half the threads each are faster (recipe light, two
-        # cores: a sweep of 22 s, not 31 s). But they need twice the memory, and change networks' last bits.
+        # On a CPU, one process uses all threads. Two with half the threads each are faster (recipe
+        # light, two cores: a sweep of 22 s, not 31 s). But they need twice the memory, and change
+        # networks' last bits.
         used = [devices[number % len(devices)] for number in range(workers or len(devices))]
         for number, device in enumerate(used):
             count = used.count(device)
@@ -218,7 +242,9 @@ class LocalSite(Site):
 
 
 def cores() -> int:
-    """Return the number of cores that this process may use, which in a container are fewer than there are."""
+    """Return the number of cores that this process may use, which in a container are fewer than
+    there are.
+    """
     if hasattr(os, "sched_getaffinity"):  # not on macOS and Windows
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1

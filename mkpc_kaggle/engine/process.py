@@ -1,11 +1,12 @@
 """Workers on this machine: in a thread of the engine's process, or in separate processes.
 
-No call of the engine blocks: each worker has a thread for blocking calls. A worker process shares no lock, gets
-nothing large through its start-up pipe, and is alone in holding its end of the message pipe. So it may die, be
-stopped or be killed at any moment: reads and writes that wait for it end with it.
+No call of the engine blocks: each worker has a thread for blocking calls. A worker process shares
+no lock, gets nothing large through its start-up pipe, and is alone in holding its end of the
+message pipe. So it may die, be stopped or be killed at any moment: reads and writes that wait for
+it end with it.
 
-Process pools of the package pebble were rejected. They time jobs by the wall clock, and a worker killed during an
-answer keeps the lock of all others.
+Process pools of the package pebble were rejected. They time jobs by the wall clock, and a worker
+killed during an answer keeps the lock of all others.
 """
 
 import ctypes
@@ -29,20 +30,26 @@ from mkpc_kaggle.engine.worker import Executor, Maker, Message, Runner, failure_
 # For PyTorch, which reads these once. OpenMP threads that wait for each other then sleep; by default they spin
 # and keep the cores from decoding, MAGSAC and other processes. On Linux, tensors of 2 MiB or more use huge pages:
 # with small pages, allocating a feature map takes as long as some convolutions.
-WORKER_ENVIRONMENT = {"OMP_WAIT_POLICY": "PASSIVE", "GOMP_SPINCOUNT": "0", "THP_MEM_ALLOC_ENABLE": "1"}
+WORKER_ENVIRONMENT = {
+    "OMP_WAIT_POLICY": "PASSIVE",
+    "GOMP_SPINCOUNT": "0",
+    "THP_MEM_ALLOC_ENABLE": "1",
+}
 _environment = threading.Lock()
 PR_SET_PDEATHSIG = 1  # of Linux's prctl
 EXIT_TIMEOUT_S = 5.0  # for a process to end after its pipe has closed
 
 
 class ThreadWorker:
-    """A worker that does one job at a time in a thread of this process. No call blocks, even if the worker hangs.
+    """A worker that does one job at a time in a thread of this process. No call blocks, even if the
+    worker hangs.
 
-    The first answer, to the runner's maker, is :class:`Loaded` or :class:`Failure`. Then each job gets one answer.
-    The thread calls ``on_answer`` after each. A worker is not used again after ``kill`` or a failure of its place.
+    The first answer, to the runner's maker, is :class:`Loaded` or :class:`Failure`. Then each job
+    gets one answer. The thread calls ``on_answer`` after each. A worker is not used again after
+    ``kill`` or a failure of its place.
 
-    A thread cannot contain a matcher that hangs or crashes, and cannot recover from a failed device. Both need
-    processes.
+    A thread cannot contain a matcher that hangs or crashes, and cannot recover from a failed
+    device. Both need processes.
     """
 
     log: Path | None = None  # of native libraries' text, for a process; None: it is dropped
@@ -111,7 +118,11 @@ class ProcessWorker(ThreadWorker):
             self._process.join(timeout=EXIT_TIMEOUT_S)
             self._pipe.close()
             code = self._process.exitcode
-            how = f"exit status {code}" if code is None or code >= 0 else f"signal {signal.Signals(-code).name}"
+            how = (
+                f"exit status {code}"
+                if code is None or code >= 0
+                else f"signal {signal.Signals(-code).name}"
+            )
             return Failure(Cause.DIED, how)
         except Exception as error:  # an object that cannot be pickled
             self._process.kill()
@@ -120,16 +131,19 @@ class ProcessWorker(ThreadWorker):
 
 
 def spawn(name: str, log: Path | None = None) -> tuple[SpawnProcess, Connection]:
-    """Start a process that serves the other end of the returned pipe. What it prints is appended to ``log``.
+    """Start a process that serves the other end of the returned pipe. What it prints is appended to
+    ``log``.
 
-    The new process has :data:`WORKER_ENVIRONMENT`, except variables that the user has set. This process does not
-    keep the variables, since its OpenMP library is already loaded. The new process ignores SIGTERM and Ctrl-C,
-    which a terminal sends to all processes: the parent handles both signals and ends the process.
+    The new process has :data:`WORKER_ENVIRONMENT`, except variables that the user has set. This
+    process does not keep the variables, since its OpenMP library is already loaded. The new process
+    ignores SIGTERM and Ctrl-C, which a terminal sends to all processes: the parent handles both
+    signals and ends the process.
     """
     context = multiprocessing.get_context("spawn")
     pipe, its_pipe = context.Pipe()
     process = context.Process(target=serve, args=(its_pipe, log), name=name, daemon=True)
-    resource_tracker.ensure_running()  # if started with the first process, it would unblock the signals
+    # If started with the first process, it would unblock the signals
+    resource_tracker.ensure_running()
     with its_pipe, _environment, ExitStack() as restored:
         for variable in WORKER_ENVIRONMENT.keys() - os.environ.keys():
             os.environ[variable] = WORKER_ENVIRONMENT[variable]

@@ -1,7 +1,8 @@
-"""What a run has found, for reports: records of pairs, units and scenes, and the same as DataFrames.
+"""What a run has found, for reports: records of pairs, units and scenes, and the same as
+DataFrames.
 
-The latest version of the results is the table of pairs. It names the results that each pair has, and the F that
-was written; nothing else decides what is written.
+The latest version of the results is the table of pairs. It names the results that each pair has,
+and the F that was written; nothing else decides what is written.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -138,11 +139,12 @@ class PairRecord:
 
 @dataclass(frozen=True)
 class SceneRecord:
-    """The reconstruction of a batch: numbers of images, registered images and points, and the models.
+    """The reconstruction of a batch: numbers of images, registered images and points, and the
+    models.
 
-    The largest model comes first. Each model has up to ``MAX_DRAWN_POINTS`` of its points, evenly chosen. Without
-    a model, ``failure`` is the reason. ``choices`` has the choice for each pair, by the contents of its images
-    (:func:`contents_of`).
+    The largest model comes first. Each model has up to ``MAX_DRAWN_POINTS`` of its points, evenly
+    chosen. Without a model, ``failure`` is the reason. ``choices`` has the choice for each pair, by
+    the contents of its images (:func:`contents_of`).
     """
 
     batch: str
@@ -169,14 +171,21 @@ class SceneRecord:
         )
 
     @classmethod
-    def of_solution(cls, batch: str, answer: Solution, contents: Sequence[str], seconds: float) -> "SceneRecord":
-        """Return the record of an answer; ``contents`` are those of the pairs, in the answer's order."""
+    def of_solution(
+        cls, batch: str, answer: Solution, contents: Sequence[str], seconds: float
+    ) -> "SceneRecord":
+        """Return the record of an answer; ``contents`` are those of the pairs, in the answer's
+        order.
+        """
         record = cls.of(batch, answer.reconstructions, seconds)
         return replace(record, choices=dict(zip(contents, answer.choices, strict=True)))
 
     def to_json(self) -> dict[str, Any]:
         """Return the record as JSON values."""
-        choices = {contents: [str(choice.reason), _numbers(choice.F)] for contents, choice in self.choices.items()}
+        choices = {
+            contents: [str(choice.reason), _numbers(choice.F)]
+            for contents, choice in self.choices.items()
+        }
         return {
             "batch": self.batch,
             "images": self.images,
@@ -192,7 +201,8 @@ class SceneRecord:
     def of_json(cls, about: Mapping[str, Any]) -> "SceneRecord":
         """Invert :meth:`to_json`."""
         choices = {
-            contents: Choice(_matrix(F), Reason(reason)) for contents, (reason, F) in about["choices"].items()
+            contents: Choice(_matrix(F), Reason(reason))
+            for contents, (reason, F) in about["choices"].items()
         }
         models = tuple(_model_of_json(model) for model in about["models"])
         return cls(**{**about, "models": models, "choices": choices})
@@ -207,7 +217,8 @@ def contents_of(images: Sequence[BatchImage], turns: Sequence[int]) -> str:
 
 
 class Row(NamedTuple):
-    """A pair in the table. ``points`` are the keys of its units' points, empty for a unit without points.
+    """A pair in the table. ``points`` are the keys of its units' points, empty for a unit without
+    points.
 
     ``failures`` are the reasons why units raised, by unit; ``failure`` is why the pair has no points.
     """
@@ -235,8 +246,8 @@ class Row(NamedTuple):
 class Table:
     """The version of the results that was published last.
 
-    The first ``count`` rows are those of the test set, the others pairs for scenes alone. ``scenes`` has the key
-    of each batch's scene. ``written`` (count, 3, 3) is the F of each row.
+    The first ``count`` rows are those of the test set, the others pairs for scenes alone.
+    ``scenes`` has the key of each batch's scene. ``written`` (count, 3, 3) is the F of each row.
     """
 
     about: About = field(default_factory=About)
@@ -282,7 +293,10 @@ def read_records(store: Store, table: Table | None = None) -> list[PairRecord]:
     keys = [key for row in rows for key in [*row.points, row.estimate] if key]
     about = store.about(keys)
     scenes = read_scenes(store, table)
-    return [_pair_record(index, row, table, about, scenes.get(row.batch)) for index, row in enumerate(rows)]
+    return [
+        _pair_record(index, row, table, about, scenes.get(row.batch))
+        for index, row in enumerate(rows)
+    ]
 
 
 def read_points(store: Store, table: Table, index: int) -> dict[str, Matches]:
@@ -403,12 +417,16 @@ def results(directory: Path | str) -> Results:
     from pandas import DataFrame  # importing it takes half a second
 
     pairs = DataFrame([_pair_row(record) for record in records])
-    units = [{"pair": record.pair.id, **asdict(unit)} for record in records for unit in record.units]
+    units = [
+        {"pair": record.pair.id, **asdict(unit)} for record in records for unit in record.units
+    ]
     return Results(pairs, DataFrame(units), DataFrame(list(_camera_rows(scenes.values()))))
 
 
 def _pair_row(record: PairRecord) -> dict[str, Any]:
-    F = {f"f{n // 3 + 1}{n % 3 + 1}": value for n, value in enumerate(record.chosen_fundamental.flat)}
+    F = {
+        f"f{n // 3 + 1}{n % 3 + 1}": value for n, value in enumerate(record.chosen_fundamental.flat)
+    }
     return {
         "pair": record.pair.id,
         "group": record.pair.group,

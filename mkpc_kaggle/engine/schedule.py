@@ -1,7 +1,7 @@
 """What to do next, by one priority order over the state of all pairs.
 
-:func:`next_work` is a pure function. It has no queue and no memory: it looks at the state, the costs and the time
-left whenever a worker is idle.
+:func:`next_work` is a pure function. It has no queue and no memory: it looks at the state, the
+costs and the time left whenever a worker is idle.
 
 Two rules decide that a unit no longer fits in time: :func:`prefix_that_fits` for all pairs, and
 :class:`mkpc_kaggle.engine.worker.MatchRunner` for the units of a job that ran out of time.
@@ -50,7 +50,8 @@ class Crew:
 
 @dataclass(frozen=True, eq=False)
 class NextWork:
-    """What idle workers should do now: the next job of matching, all estimates and all scenes that are due.
+    """What idle workers should do now: the next job of matching, all estimates and all scenes that
+    are due.
 
     ``done`` of ``total`` pairs are finished in the ``phase``. The first ``fit`` units of the recipe fit for all
     pairs. ``stop`` is the time after which no unit may run.
@@ -68,7 +69,9 @@ class NextWork:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """What the rules below look at, computed once: the state and what follows from it at one moment."""
+    """What the rules below look at, computed once: the state and what follows from it at one
+    moment.
+    """
 
     state: State
     costs: Costs
@@ -149,7 +152,9 @@ def sweeping_unit(state: State) -> int:
 
 
 def prefix_that_fits(view: View) -> int:
-    """Return the length of the longest prefix of the recipe that all rows can have in the time left."""
+    """Return the length of the longest prefix of the recipe that all rows can have in the time
+    left.
+    """
     left = view.left * view.crew.matchers
     if left <= 0:  # an unmeasured unit needs no time, but fits no more
         return 0
@@ -175,7 +180,9 @@ def seconds_of_prefixes(view: View) -> NDArray[np.float64]:
 
 
 def pairs_to_connect(view: View) -> Mask:
-    """Return an (N - rows,) mask of the extra pairs that fit in a tenth of the time, the most useful first."""
+    """Return an (N - rows,) mask of the extra pairs that fit in a tenth of the time, the most
+    useful first.
+    """
     state = view.state
     count = len(state.pairs) - state.rows
     if not count:
@@ -188,7 +195,9 @@ def pairs_to_connect(view: View) -> Mask:
 
 
 def match_job(view: View, phase: Phase, missing: Mask, ready: Mask) -> MatchJob:
-    """Return a job for the first pair, or on a GPU for a minibatch of pairs with the same missing units."""
+    """Return a job for the first pair, or on a GPU for a minibatch of pairs with the same missing
+    units.
+    """
     state = view.state
     order = state.order[ready[state.order]]
     # Phase by phase in visiting order, in the end the weakest pairs first.
@@ -206,7 +215,9 @@ def match_job(view: View, phase: Phase, missing: Mask, ready: Mask) -> MatchJob:
         alike = order[(missing[order] == missing[first]).all(1)]
     indices = tuple(alike[:size].tolist())
     # A cost is learnt from one unit, and a job of several units takes a small share of the time.
-    seconds = [view.costs.mean(unit.name) if view.costs.is_known(unit.name) else inf for unit in units]
+    seconds = [
+        view.costs.mean(unit.name) if view.costs.is_known(unit.name) else inf for unit in units
+    ]
     fits = np.cumsum(seconds) * len(indices) < JOB_SHARE * view.left
     units = units[: 1 if alone else max(1, int(fits.sum()))]
     expected = tuple(view.costs.mean(unit.name) for unit in units)
@@ -226,7 +237,8 @@ def upcoming_pairs(state: State, job: MatchJob, count: int) -> list[int]:
 
 
 def estimates_due(view: View, first: NDArray[Any]) -> NDArray[Any]:
-    """Return the rows to estimate now: first rows without an F, then rows with all units that fit in time.
+    """Return the rows to estimate now: first rows without an F, then rows with all units that fit
+    in time.
 
     ``first`` (N,) is the phase of each pair's next unit.
     """
@@ -253,7 +265,8 @@ def scenes_due(
 ) -> tuple[str, ...]:
     """Return the batches to reconstruct now; batches without any scene come first.
 
-    A batch's first scene waits for the units that fit in time, later scenes for all units until matching ends.
+    A batch's first scene waits for the units that fit in time, later scenes for all units until
+    matching ends.
     """
     state = view.state
     waiting = waiting_batches(state, view.crew)
@@ -279,7 +292,9 @@ def scenes_due(
         numbers = state.batch_of[waited]
         counts[has_scene] = np.bincount(numbers[numbers >= 0], minlength=len(state.batches))
     order = sorted(waiting, key=state.scenes.__contains__)
-    return tuple(batch for batch in order if not counts[batch in state.scenes][state.batches[batch]])
+    return tuple(
+        batch for batch in order if not counts[batch in state.scenes][state.batches[batch]]
+    )
 
 
 def waiting_batches(state: State, crew: Crew) -> list[str]:
@@ -311,7 +326,9 @@ def scenes_reserve(view: View) -> float:
 
 
 def match_patience(costs: Costs, job: MatchJob) -> float | None:
-    """Return the seconds after which a job counts as hung, warm-up included; ``None`` if a cost is unknown."""
+    """Return the seconds after which a job counts as hung, warm-up included; ``None`` if a cost is
+    unknown.
+    """
     if not all(costs.is_known(unit.name) for unit in job.units):
         return None
     expected = len(job.indices) * sum(costs.mean(unit.name) for unit in job.units)

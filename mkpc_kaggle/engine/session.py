@@ -41,7 +41,9 @@ REPORT_S = 2.0  # for an interrupted program's report; enough for the tables
 
 
 class Interrupt(threading.Event):
-    """Event that is set when the run must end early. ``signal`` is the number of the signal received, or 0."""
+    """Event that is set when the run must end early. ``signal`` is the number of the signal
+    received, or 0.
+    """
 
     signal = 0
     raises = False
@@ -95,15 +97,19 @@ class Session:
     status: int = 0
 
     def must_end(self) -> float:
-        """Return the deadline of the report on the monotonic clock, when the watchdog ends the process."""
+        """Return the deadline of the report on the monotonic clock, when the watchdog ends the
+        process.
+        """
         return time.monotonic() + REPORT_S if self.interrupt.signal else self.budget.final_write
 
     @contextmanager
     def watched(self) -> Iterator[Self]:
-        """Run a watchdog: before the limit, it writes the submission and ends a program that has not ended yet.
+        """Run a watchdog: before the limit, it writes the submission and ends a program that has
+        not ended yet.
 
-        The watchdog is a thread, so it works even if other threads hang, unless one of them holds the GIL. Only a
-        matcher in the program's own process can hold it. Worker processes end with the program.
+        The watchdog is a thread, so it works even if other threads hang, unless one of them holds
+        the GIL. Only a matcher in the program's own process can hold it. Worker processes end with
+        the program.
         """
         over = threading.Event()
         if isfinite(self.budget.time_limit):
@@ -115,7 +121,8 @@ class Session:
 
     def _watch(self, over: threading.Event) -> None:
         budget = self.budget
-        while (left := budget.final_write - budget.clock()) > 0:  # the deadline moves as the run measures costs
+        # The deadline moves as the run measures costs
+        while (left := budget.final_write - budget.clock()) > 0:
             if over.wait(min(left, LISTEN_S)):
                 return
         trouble = "the time limit passed before the last results were written"
@@ -135,7 +142,9 @@ class Session:
         console.leave(128 + self.interrupt.signal if self.interrupt.signal else status, EXIT_S / 4)
 
 
-def submit(pairs: Sequence[Pair], assembly: Assembly, session: Session, output: Path, root: str = "") -> RunReport:
+def submit(
+    pairs: Sequence[Pair], assembly: Assembly, session: Session, output: Path, root: str = ""
+) -> RunReport:
     """Match all pairs. ``output`` always has a row for each pair, with the fallback F if necessary."""
 
     def publish(state: State) -> None:
@@ -147,10 +156,11 @@ def submit(pairs: Sequence[Pair], assembly: Assembly, session: Session, output: 
 
 @contextmanager
 def first_version(pairs: Sequence[Pair], output: Path) -> Iterator[None]:
-    """Write fallback rows, unless the file is complete, before using weights, devices or images, which may hang.
+    """Write fallback rows, unless the file is complete, before using weights, devices or images,
+    which may hang.
 
-    If the run is refused before its first own results, restore the former file, or remove the new one. Raises
-    :class:`mkpc_kaggle.errors.UserError` if ``output`` cannot be written.
+    If the run is refused before its first own results, restore the former file, or remove the new
+    one. Raises :class:`mkpc_kaggle.errors.UserError` if ``output`` cannot be written.
     """
     if output.is_char_device() or output.is_block_device():
         raise UserError(f"--output {output} is a device; name a file")
@@ -161,7 +171,8 @@ def first_version(pairs: Sequence[Pair], output: Path) -> Iterator[None]:
             TemporaryFile(dir=output.parent).close()
             if not output.exists() or (output.is_file() and submission_problems(output, ids)):
                 if output.is_file():
-                    former = closed.enter_context(output.open("rb"))  # the open file outlives its name
+                    # The open file outlives its name
+                    former = closed.enter_context(output.open("rb"))
                 write_submission(output, dict.fromkeys(ids, FALLBACK_FUNDAMENTAL))
                 ours = _identity(output)
         try:
@@ -177,7 +188,9 @@ def first_version(pairs: Sequence[Pair], output: Path) -> Iterator[None]:
 
 
 def _identity(path: Path) -> tuple[int, int]:
-    """Identify a version of a file by inode and time, since a new file may reuse a deleted file's inode."""
+    """Identify a version of a file by inode and time, since a new file may reuse a deleted file's
+    inode.
+    """
     status = path.stat()
     return status.st_ino, status.st_mtime_ns
 
@@ -216,7 +229,9 @@ def request_of(
 
 
 @contextmanager
-def opened_engine(assembly: Assembly, session: Session, folders: Iterable[Path] = ()) -> Iterator[Engine]:
+def opened_engine(
+    assembly: Assembly, session: Session, folders: Iterable[Path] = ()
+) -> Iterator[Engine]:
     """Open an engine and its store. On leaving, end the workers and publish the last results.
 
     ``folders`` hold the images, and must exist on every machine.

@@ -1,8 +1,10 @@
-"""The state of a run: arrays over pairs and units, read from the store once and updated from answers.
+"""The state of a run: arrays over pairs and units, read from the store once and updated from
+answers.
 
-A pair keeps the points and the F that it has until those of today's key exist. So for each pair and unit the state
-has the key of the points in use, and whether that is today's key. A stage-2 unit looks at crops that come from the
-pair's stage-1 points: new points of stage 1 change its key, and its points are computed again.
+A pair keeps the points and the F that it has until those of today's key exist. So for each pair and
+unit the state has the key of the points in use, and whether that is today's key. A stage-2 unit
+looks at crops that come from the pair's stage-1 points: new points of stage 1 change its key, and
+its points are computed again.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -48,22 +50,25 @@ EXPORT = "export "  # prefix of the keys of marks, which are names of batches
 
 
 class State:
-    """Arrays for N pairs and the U units of a recipe, in their order. The first ``rows`` pairs have a row.
+    """Arrays for N pairs and the U units of a recipe, in their order. The first ``rows`` pairs have
+    a row.
 
     Of a pair's units (N, U): ``points``, the keys of the points in use, "" if none; ``has``, there are some;
     ``current``, they are today's; ``matches``, their number; ``skipped``, this run tries the unit no more.
 
-    Of a pair (N,): ``estimates``, the key of the estimate in use; ``estimated``, it is today's; ``inliers``,
-    the F ``own`` (N, 3, 3) and ``has_own``, it is no fallback. ``matching`` and ``estimating`` are the pairs of
-    jobs under way, and ``filling`` those in the last phase. ``by_scene`` (N, 3, 3) and ``scene_source`` are the
-    F that the scene in use gives, if any.
+    Of a pair (N,): ``estimates``, the key of the estimate in use; ``estimated``, it is today's;
+    ``inliers``, the F ``own`` (N, 3, 3) and ``has_own``, it is no fallback. ``matching`` and
+    ``estimating`` are the pairs of jobs under way, and ``filling`` those in the last phase.
+    ``by_scene`` (N, 3, 3) and ``scene_source`` are the F that the scene in use gives, if any.
 
     Of a batch: ``batches`` has its number by name, ``members`` its pairs; ``batch_of`` (N,) is -1 for a pair
     without one. ``scenes`` has the scenes in use, ``stale`` the batches whose scene is not today's, and
     ``reconstructing`` those under way.
     """
 
-    def __init__(self, request: Request, extra: Sequence[Pair], batches: Mapping[str, Sequence[int]]) -> None:
+    def __init__(
+        self, request: Request, extra: Sequence[Pair], batches: Mapping[str, Sequence[int]]
+    ) -> None:
         self.request = request
         self.pairs = [*request.pairs, *extra]
         self.rows = len(request.pairs)
@@ -148,7 +153,9 @@ class State:
         return np.asarray(self.current[rows].all(1) & self.estimated[rows])
 
     def table(self) -> Table:
-        """Return the table of pairs. Only rows that have changed since the last table are made anew."""
+        """Return the table of pairs. Only rows that have changed since the last table are made
+        anew.
+        """
         sources = self.sources
         for index in self._new:
             source = SOURCES[sources[index]] if index < self.rows else ""
@@ -176,7 +183,18 @@ class State:
         contents = self.contents(index)
         names = self.names[index]
         estimate = self.estimates[index]
-        return Row(pair.id, pair.group, *names, *pair.turns, contents, points, estimate, source, failures, reason)
+        return Row(
+            pair.id,
+            pair.group,
+            *names,
+            *pair.turns,
+            contents,
+            points,
+            estimate,
+            source,
+            failures,
+            reason,
+        )
 
     # Keys of today
 
@@ -188,7 +206,9 @@ class State:
         return ()
 
     def first_stage(self, index: int) -> list[str]:
-        """Return the keys of a pair's points of stage 1, if they are today's, in the recipe's order."""
+        """Return the keys of a pair's points of stage 1, if they are today's, in the recipe's
+        order.
+        """
         chosen = ~self.is_crop & self.current[index]
         return [key for key in self.points[index][chosen] if key]
 
@@ -243,7 +263,8 @@ class State:
     # Reading the store, once
 
     def restore(self, store: Store, digests: Mapping[str, str]) -> None:
-        """Find today's results, and those of the former table of pairs that stand in for missing ones.
+        """Find today's results, and those of the former table of pairs that stand in for missing
+        ones.
 
         ``digests`` are those of the images' contents, by name, as far as they are known.
         """
@@ -257,7 +278,9 @@ class State:
         self._restore_estimates(store, known, old)
         self._restore_scenes(store, former, digests)
 
-    def _restore_points(self, store: Store, known: list[int], old: Mapping[int, Row], units: list[str]) -> None:
+    def _restore_points(
+        self, store: Store, known: list[int], old: Mapping[int, Row], units: list[str]
+    ) -> None:
         # Stage 1 first, because the keys of stage 2 depend on it.
         for stage in (False, True):
             numbers = np.flatnonzero(self.is_crop == stage).tolist()
@@ -319,7 +342,8 @@ class State:
     # Answers
 
     def results_of(self, outcome: Outcome, crops: Sequence[str]) -> list[Result]:
-        """Return the new results of a pair, and its images, as rows of the store. Changes the images alone.
+        """Return the new results of a pair, and its images, as rows of the store. Changes the
+        images alone.
 
         ``crops`` are the keys of the points of stage 1 that the job had.
         """
@@ -350,7 +374,8 @@ class State:
                 continue
             keys = [first[n] for n in sorted(first)]
             key = self.key_of(index, number, images, keys)
-            # Units of stage 1 come first in an answer: those of stage 2 looked at crops from all of them.
+            # Units of stage 1 come first in an answer: those of stage 2 looked at crops from all of
+            # them.
             if not self.is_crop[number]:
                 first[number] = key
             regions = (outcome.regions or ()) if self.is_crop[number] else ()
@@ -394,7 +419,9 @@ class State:
         self.matches[index, number] = matches
 
     def _check_crops(self, index: int) -> None:
-        """Mark points of stage 2 whose crops come from other points of stage 1 than there are today."""
+        """Mark points of stage 2 whose crops come from other points of stage 1 than there are
+        today.
+        """
         images = self.images_of(index)
         if not images:
             return
@@ -440,7 +467,9 @@ class State:
         return Result(key, Kind.ESTIMATE, about)
 
     def take_estimate(self, each: Estimated, result: Result) -> None:
-        """Use an estimate, even if its pair has newer points meanwhile: it is newer than the one before."""
+        """Use an estimate, even if its pair has newer points meanwhile: it is newer than the one
+        before.
+        """
         for index in self._twins.get(each.index, [each.index]):
             if self.has[index].any():  # its images are as they were
                 self._use_estimate(index, result.key, result.about)
@@ -520,7 +549,9 @@ class State:
     @property
     def unusable(self) -> Mask:
         """(U,): units that no worker can run."""
-        return np.array([("matcher", unit.name) in self.tries.given_up for unit in self.units], bool)
+        return np.array(
+            [("matcher", unit.name) in self.tries.given_up for unit in self.units], bool
+        )
 
 
 def names_of(pair: Pair, root: str) -> tuple[str, str]:

@@ -1,8 +1,9 @@
 """The store of a run: an SQLite file that has each result under the digest of its inputs.
 
-There is one table. ``about`` is JSON, all that reports need; ``data`` are a unit's points. Results under keys that
-nobody asks for stay until they are pruned or the run starts with --fresh. The parent alone writes, one transaction
-for each answer. It reads the store once, at its start, and keeps its state in memory (:mod:`state`).
+There is one table. ``about`` is JSON, all that reports need; ``data`` are a unit's points. Results
+under keys that nobody asks for stay until they are pruned or the run starts with --fresh. The
+parent alone writes, one transaction for each answer. It reads the store once, at its start, and
+keeps its state in memory (:mod:`state`).
 """
 
 import json
@@ -68,7 +69,8 @@ class Result:
 
 @contextmanager
 def undamaged(path: Path, advice: str = "delete it with --fresh") -> Iterator[None]:
-    """Convert SQLite's report of a damaged file, or of one that cannot be used, to a :class:`UserError`.
+    """Convert SQLite's report of a damaged file, or of one that cannot be used, to a
+    :class:`UserError`.
 
     Everything else is a fault of the machine or of the program, and stays as it is.
     """
@@ -100,8 +102,8 @@ class Store:
     def open(cls, directory: Path, *, fresh: bool = False) -> Self:
         """Return a store to write, created if missing. No other run can open it at the same time.
 
-        Raises :class:`UserError` if the directory is not writable or in use, and for a damaged file or a file
-        of an earlier format.
+        Raises :class:`UserError` if the directory is not writable or in use, and for a damaged file
+        or a file of an earlier format.
         """
         if sqlite3.sqlite_version_info < MIN_SQLITE:
             raise UserError(
@@ -113,7 +115,9 @@ class Store:
             lock = directory / LOCK_NAME
             for path in (lock, store.path):
                 if path.exists() and not path.is_file():
-                    raise UserError(f"{path} is not a regular file; remove it, or name another --work-dir")
+                    raise UserError(
+                        f"{path} is not a regular file; remove it, or name another --work-dir"
+                    )
             with undamaged(lock, "remove it"):
                 # A separate file, so that others can read the store during a run.
                 store._lock = opened.enter_context(closing(connected(lock)))
@@ -166,7 +170,8 @@ class Store:
     def put(self, results: Iterable[Result]) -> None:
         """Save results, all or none. Results that the file does not take wait in memory.
 
-        Raises ``sqlite3.IntegrityError`` for results that the table cannot hold, such as a number that is NaN.
+        Raises ``sqlite3.IntegrityError`` for results that the table cannot hold, such as a number
+        that is NaN.
         """
         new = {result.key: result for result in results}
         waiting = self._unsaved | new
@@ -193,7 +198,9 @@ class Store:
             self._db.execute("DELETE FROM result WHERE key = ?", [printable(key)])
 
     def prune(self, named: Iterable[str]) -> int:
-        """Remove points, estimates and scenes whose keys are not ``named``. Return the bytes set free."""
+        """Remove points, estimates and scenes whose keys are not ``named``. Return the bytes set
+        free.
+        """
         before = self.path.stat().st_size
         with undamaged(self.path):
             self._db.execute("CREATE TEMPORARY TABLE named (key TEXT PRIMARY KEY)")
@@ -226,7 +233,9 @@ class Store:
         return found | {each.key: each.about for each in unsaved}
 
     def source(self, keys: Sequence[str]) -> "Source":
-        """Return where a worker finds the points with these keys: in the file, or beside this value."""
+        """Return where a worker finds the points with these keys: in the file, or beside this
+        value.
+        """
         if self._unsaved or not self._has_file:
             return Source(None, self.data(keys))
         return Source(self.directory, {})
@@ -260,7 +269,9 @@ class Store:
             is_empty = not self.path.exists() or not self.path.stat().st_size
             self._db.close()
             file = ":memory:" if is_empty else self.path
-            self._db = opened.enter_context(closing(connected(file, "" if is_empty else "immutable=1")))
+            self._db = opened.enter_context(
+                closing(connected(file, "" if is_empty else "immutable=1"))
+            )
             if is_empty:
                 self._db.execute(SCHEMA)
             else:

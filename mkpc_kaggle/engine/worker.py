@@ -2,9 +2,9 @@
 
 Importing this module does not import torch, which only matching needs.
 
-Threads: one matching process uses all cores, and N processes share the cores. A process for estimates or scenes
-has one thread. On a Ray cluster without GPUs, a machine's actor has one thread per CPU. A worker that is a thread
-of the user's process leaves the process's limits as they are.
+Threads: one matching process uses all cores, and N processes share the cores. A process for
+estimates or scenes has one thread. On a Ray cluster without GPUs, a machine's actor has one thread
+per CPU. A worker that is a thread of the user's process leaves the process's limits as they are.
 """
 
 import time
@@ -49,7 +49,9 @@ Message = Maker | Job  # to a worker; the first is the maker of the worker's run
 
 
 class Executor:
-    """The worker's side in any process. The first message makes the runner; all others are jobs. Never raises."""
+    """The worker's side in any process. The first message makes the runner; all others are jobs.
+    Never raises.
+    """
 
     _run: Runner | None = None
 
@@ -71,13 +73,16 @@ def failure_of(error: Exception) -> Failure:
 
 
 class MatchRunner:
-    """A runner of match jobs with ``threads`` threads, or as one of ``share`` processes that share the cores.
+    """A runner of match jobs with ``threads`` threads, or as one of ``share`` processes that share
+    the cores.
 
     ``refused`` has the reason for each matcher that cannot be loaded: the run goes on without its units. Raises
     :class:`mkpc_kaggle.errors.UserError` if none can be loaded.
     """
 
-    def __init__(self, make_pipeline: Callable[[], "Pipeline"], *, threads: int = 0, share: int = 1) -> None:
+    def __init__(
+        self, make_pipeline: Callable[[], "Pipeline"], *, threads: int = 0, share: int = 1
+    ) -> None:
         if threads or share > 1:
             import cv2
             import torch
@@ -132,7 +137,9 @@ class MatchRunner:
         )
 
     def _outcome(self, job: MatchJob, number: int, pair: PairMatch) -> Outcome:
-        """Return the new results of a pair, and its images with the digests of the matched contents."""
+        """Return the new results of a pair, and its images with the digests of the matched
+        contents.
+        """
         if pair.failure:
             return Outcome(job.indices[number], failure=pair.failure)
         image0, image1 = (
@@ -152,7 +159,9 @@ class MatchRunner:
 
 
 def file_state(path: Path) -> tuple[int, int]:
-    """Return the size of a file in bytes and its time of change in nanoseconds; zeros if it is missing."""
+    """Return the size of a file in bytes and its time of change in nanoseconds; zeros if it is
+    missing.
+    """
     try:
         status = path.stat()
     except (OSError, ValueError):
@@ -161,7 +170,9 @@ def file_state(path: Path) -> tuple[int, int]:
 
 
 def light_runner(*, in_process: bool = True) -> Runner:
-    """Return the runner of estimates and image features, without torch; a process of its own has one thread."""
+    """Return the runner of estimates and image features, without torch; a process of its own has
+    one thread.
+    """
     if in_process:
         import cv2
         from threadpoolctl import threadpool_limits  # comes with scikit-learn
@@ -205,7 +216,9 @@ def scene_runner() -> Runner:
 
 
 def reconstruct(job: Job) -> Solution:
-    """Return the reconstructions of a batch, and a choice for each pair. pycolmap may end the process."""
+    """Return the reconstructions of a batch, and a choice for each pair. pycolmap may end the
+    process.
+    """
     assert isinstance(job, SceneJob) and job.recipe.scene is not None
     pairs = [batch_pair(*each) for each in results_of(job)]
     recipe = job.recipe
@@ -226,5 +239,6 @@ def results_of(
     keys = [key for pair in job.pairs for key in pair.points.values()]
     points = job.source.matches(keys)
     return [
-        (pair, tuple(UnitResult(unit, points[key]) for unit, key in pair.points.items())) for pair in job.pairs
+        (pair, tuple(UnitResult(unit, points[key]) for unit, key in pair.points.items()))
+        for pair in job.pairs
     ]

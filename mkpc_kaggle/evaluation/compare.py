@@ -21,7 +21,9 @@ Paired: TypeAlias = tuple[Sequence[float], Sequence[float], Sequence[tuple[str, 
 
 @dataclass(frozen=True)
 class Difference:
-    """The gain of the second of two recipes over the first, and its confidence interval at :data:`LEVEL`."""
+    """The gain of the second of two recipes over the first, and its confidence interval at
+    :data:`LEVEL`.
+    """
 
     gain: float
     low: float
@@ -32,12 +34,14 @@ class Difference:
 
 
 def paired_difference(scenes: Sequence[Paired]) -> Difference:
-    """Return the gain, averaged over each scene's pairs and then over scenes, with its confidence interval.
+    """Return the gain, averaged over each scene's pairs and then over scenes, with its confidence
+    interval.
 
-    Pairs that share an image are not independent. So the bootstrap resamples images, not pairs: each image of a
-    scene gets a random weight, and the product of two image weights is a pair's weight. Scenes are not resampled.
-    The same input gives the same interval. If pairs share no image, the interval is up to 1.7 times too wide.
-    Sources: Rubin 1981 (exponential weights); Owen 2007 (products of weights).
+    Pairs that share an image are not independent. So the bootstrap resamples images, not pairs:
+    each image of a scene gets a random weight, and the product of two image weights is a pair's
+    weight. Scenes are not resampled. The same input gives the same interval. If pairs share no
+    image, the interval is up to 1.7 times too wide. Sources: Rubin 1981 (exponential weights); Owen
+    2007 (products of weights).
     """
     generator = np.random.default_rng(0)
     means: list[float] = []
@@ -55,7 +59,9 @@ def paired_difference(scenes: Sequence[Paired]) -> Difference:
 def _resampled_means(
     gains: NDArray[np.float64], images: Sequence[tuple[str, str]], generator: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Return weighted means (RESAMPLES,) of the gains (P,), one for each random draw of image weights."""
+    """Return weighted means (RESAMPLES,) of the gains (P,), one for each random draw of image
+    weights.
+    """
     names, ends = np.unique(np.array(images), return_inverse=True)
     first, second = ends.reshape(-1, 2).T
     # Two tables by image and image, so that one product gives all resamples.
@@ -70,7 +76,9 @@ def _resampled_means(
 
 
 def gain_of(other: Validation, first: Validation, scene: str | None = None) -> Difference:
-    """Return the gain in mAA of ``other`` over ``first`` on the same pairs, in a scene or averaged over scenes."""
+    """Return the gain in mAA of ``other`` over ``first`` on the same pairs, in a scene or averaged
+    over scenes.
+    """
     paired: list[Paired] = []
     for before, after in zip(first.scenes, other.scenes, strict=True):
         if scene in (None, before.scene):
@@ -79,21 +87,30 @@ def gain_of(other: Validation, first: Validation, scene: str | None = None) -> D
 
 
 def seconds_per_pair(validation: Validation) -> float:
-    """Return the mean seconds per pair of units, clustering and last estimate in the journal; NaN if unknown."""
+    """Return the mean seconds per pair of units, clustering and last estimate in the journal; NaN
+    if unknown.
+    """
     if validation.report is None or not validation.report.records:
         return nan
     # Not the decoding: it runs in parallel with matching.
     return mean(
-        record.encode_seconds + record.match_seconds + record.cluster_seconds + record.estimate_seconds
+        record.encode_seconds
+        + record.match_seconds
+        + record.cluster_seconds
+        + record.estimate_seconds
         for record in validation.report.records
     )
 
 
 def comparison_table(validations: Sequence[Validation]) -> list[str]:
-    """Return lines: each recipe's mAA and seconds per pair, then its gain over the first, by scene and overall."""
+    """Return lines: each recipe's mAA and seconds per pair, then its gain over the first, by scene
+    and overall.
+    """
     first, *others = validations
     lines = [f"{'recipe':<40}{'mAA':>9}{'seconds a pair':>16}"]
-    lines += [f"{run.recipe:<40}{run.maa():>9.4f}{seconds_per_pair(run):>16.3f}" for run in validations]
+    lines += [
+        f"{run.recipe:<40}{run.maa():>9.4f}{seconds_per_pair(run):>16.3f}" for run in validations
+    ]
     counts = {scene.scene: len(scene.pairs) for scene in first.scenes}
     for other in others:
         lines.append("")
@@ -106,7 +123,9 @@ def comparison_table(validations: Sequence[Validation]) -> list[str]:
 
 
 def step_gains(validation: Validation) -> list[str]:
-    """Return a line per step with the mean gain in mAA over the previous step. Skip scenes without metres."""
+    """Return a line per step with the mean gain in mAA over the previous step. Skip scenes without
+    metres.
+    """
     scenes = [scene for scene in validation.scenes if scene.in_metres]
     if not scenes:
         return []
@@ -130,5 +149,7 @@ def comparison_json(validations: Sequence[Validation]) -> dict[str, Any]:
     gains = []
     for other in others:
         scenes = [{"scene": scene.scene, **gain(other, scene.scene)} for scene in first.scenes]
-        gains.append({"recipe": other.recipe, "against": first.recipe, **gain(other), "scenes": scenes})
+        gains.append(
+            {"recipe": other.recipe, "against": first.recipe, **gain(other), "scenes": scenes}
+        )
     return {"recipes": runs, "level": LEVEL, "gains": gains}

@@ -1,4 +1,5 @@
-"""The score of the Image Matching Challenge 2025, for clusters of mixed images and for their cameras.
+"""The score of the Image Matching Challenge 2025, for clusters of mixed images and for their
+cameras.
 
 ``train_labels.csv`` has ``dataset,scene,image,rotation_matrix,translation_vector``, ``train_thresholds.csv`` has
 ``dataset,scene,thresholds``; numbers in a cell are joined by ``;``, and poses map world to camera. An image of
@@ -27,7 +28,8 @@ MIN_SPREAD = 1e-12  # sum of squared distances from the mean; centres with a sma
 MAX_NUMBER = 1e12  # in a cell; keeps squares of derived numbers finite
 
 Points = NDArray[np.float64]  # (N, 3)
-Centres = Mapping[str, Points]  # camera centre (3,) by image, in a scene or cluster; NaN without a camera
+# Camera centre (3,) by image, in a scene or cluster; NaN without a camera
+Centres = Mapping[str, Points]
 Parts = Mapping[str, Centres]  # the scenes or the clusters of a dataset, by name
 
 
@@ -49,34 +51,45 @@ class DatasetScore:
 def score_imc2025(directory: Path, submission: Path) -> list[DatasetScore]:
     """Return the submission's score for each dataset of the train side in ``directory``.
 
-    Raises :class:`UserError` for unreadable files, for numbers that cannot be scored, and for a missing, unknown
-    or repeated image or dataset.
+    Raises :class:`UserError` for unreadable files, for numbers that cannot be scored, and for a
+    missing, unknown or repeated image or dataset.
     """
     labels, path = directory / "train_labels.csv", directory / "train_thresholds.csv"
     truth, found, thresholds = _centres(labels), _centres(submission), _thresholds(path)
     for name, scenes in truth.items():
-        placed = {image: centre for scene in scenes.keys() - {OUTLIERS} for image, centre in scenes[scene].items()}
+        placed = {
+            image: centre
+            for scene in scenes.keys() - {OUTLIERS}
+            for image, centre in scenes[scene].items()
+        }
         if unplaced := [image for image, centre in placed.items() if not np.isfinite(centre).all()]:
             image = shown(f"{name}/{unplaced[0]}")
             raise UserError(f"{labels}: {image} has no pose, and is not of the scene {OUTLIERS}")
         images, given = (
-            {image for part in parts.values() for image in part} for parts in (scenes, found.get(name, {}))
+            {image for part in parts.values() for image in part}
+            for parts in (scenes, found.get(name, {}))
         )
         if wrong := images ^ given:
             message = f"{len(wrong)} images of {name} are missing or unknown, such as {min(wrong)}"
             raise UserError(f"{submission}: {shown(message)}")
-        if lacking := [scene for scene in scenes if scene not in (OUTLIERS, *thresholds.get(name, ()))]:
+        if lacking := [
+            scene for scene in scenes if scene not in (OUTLIERS, *thresholds.get(name, ()))
+        ]:
             raise UserError(f"{path} has no thresholds of {shown(f'{name}/{lacking[0]}')}")
     for file, named in ((submission, found), (path, thresholds)):
         if unknown := named.keys() - truth.keys():
             raise UserError(f"{file}: {labels} lacks the dataset {min(unknown)!r}")
-    return [score_dataset(name, scenes, found[name], thresholds.get(name, {})) for name, scenes in truth.items()]
+    return [
+        score_dataset(name, scenes, found[name], thresholds.get(name, {}))
+        for name, scenes in truth.items()
+    ]
 
 
 def score_dataset(
     name: str, scenes: Parts, clusters: Parts, thresholds: Mapping[str, Sequence[float] | Points]
 ) -> DatasetScore:
-    """Return the score of a dataset. Each scene takes the cluster with most of its images; mAA decides ties.
+    """Return the score of a dataset. Each scene takes the cluster with most of its images; mAA
+    decides ties.
 
     The mAA's numerators and denominators are summed over the scenes before the division.
     """
@@ -91,16 +104,21 @@ def score_dataset(
         overlap, count, size = max(choices, key=lambda each: each[:2], default=(0, 0, 0))
         accurate, possible = accurate + count, possible + len(limits) * max(len(centres) - FREE, 0)
         common, taken = common + overlap, taken + size
-    return DatasetScore(name, accurate / possible if possible else 0.0, common / taken if taken else 0.0)
+    return DatasetScore(
+        name, accurate / possible if possible else 0.0, common / taken if taken else 0.0
+    )
 
 
 def accurate_images(truth: Centres, cluster: Centres, thresholds: Sequence[float] | Points) -> int:
-    """Return the number of images beyond ``FREE`` whose centre is within a threshold, summed over thresholds.
+    """Return the number of images beyond ``FREE`` whose centre is within a threshold, summed over
+    thresholds.
 
-    For each threshold, the best similarity of three images is refitted to its inliers. Inliers are images whose
-    transformed cluster centre is within the threshold of the scene's.
+    For each threshold, the best similarity of three images is refitted to its inliers. Inliers are
+    images whose transformed cluster centre is within the threshold of the scene's.
     """
-    common = sorted(name for name in truth.keys() & cluster.keys() if np.isfinite(cluster[name]).all())
+    common = sorted(
+        name for name in truth.keys() & cluster.keys() if np.isfinite(cluster[name]).all()
+    )
     if len(common) < FREE:
         return 0
     source, target = (np.array([centres[name] for name in common]) for centres in (cluster, truth))
@@ -118,7 +136,8 @@ def accurate_images(truth: Centres, cluster: Centres, thresholds: Sequence[float
 
 
 def residuals(source: Points, target: Points, fitted: NDArray[np.intp]) -> NDArray[np.float64]:
-    """Fit a similarity to each row of indices, ``fitted`` (B, k), and return the distances (B, N) from ``target``.
+    """Fit a similarity to each row of indices, ``fitted`` (B, k), and return the distances (B, N)
+    from ``target``.
 
     Distances are NaN if the fitted sources coincide.
 
@@ -168,7 +187,9 @@ def _centres(path: Path) -> dict[str, dict[str, dict[str, Points]]]:
         seen.add((dataset, image))
         R, t = (_numbers(cell, where) for cell in cells)
         if (len(R), len(t)) != (9, 3):
-            raise UserError(f"{where}: expected 9 and 3 numbers joined by ';', found {len(R)} and {len(t)}")
+            raise UserError(
+                f"{where}: expected 9 and 3 numbers joined by ';', found {len(R)} and {len(t)}"
+            )
         found.setdefault(dataset, {}).setdefault(scene, {})[image] = -R.reshape(3, 3).T @ t
     if not found:
         raise UserError(f"{path} has no rows to score")
@@ -176,7 +197,9 @@ def _centres(path: Path) -> dict[str, dict[str, dict[str, Points]]]:
 
 
 def _numbers(cell: str, where: str) -> Points:
-    """Return the numbers of a cell, which may be NaN. Raise :class:`UserError` for a malformed or huge number."""
+    """Return the numbers of a cell, which may be NaN. Raise :class:`UserError` for a malformed or
+    huge number.
+    """
     try:
         found = np.array([float(part) for part in cell.split(";")])
     except ValueError as error:

@@ -1,6 +1,7 @@
 """Runs of the engine on pairs with known cameras, and their scores.
 
-A train side is scored by the competition's rules, a list of pairs by the rules of SuperGlue and LoFTR.
+A train side is scored by the competition's rules, a list of pairs by the rules of SuperGlue and
+LoFTR.
 """
 
 import json
@@ -81,7 +82,9 @@ class SceneScore:
 
     def accuracies(self, step: Step | None = None) -> list[float]:
         """Return the accuracy of each pair after a step, by default the last."""
-        return [metrics.pair_accuracy(pair.steps[step] if step else pair.error) for pair in self.pairs]
+        return [
+            metrics.pair_accuracy(pair.steps[step] if step else pair.error) for pair in self.pairs
+        ]
 
     def maa(self, step: Step | None = None) -> float:
         """Return the mean of :meth:`accuracies`: the mAA of the Image Matching Challenge 2022."""
@@ -92,14 +95,17 @@ class SceneScore:
 
     @property
     def matching(self) -> list[float]:
-        return [mean(column) for column in zip(*(pair.matching for pair in self.pairs), strict=True)]
+        return [
+            mean(column) for column in zip(*(pair.matching for pair in self.pairs), strict=True)
+        ]
 
 
 @dataclass(frozen=True)
 class Validation:
     """The scores of all scenes under one recipe.
 
-    A submission scored from its file has no ``report`` and no ``steps``; ``missing`` lists samples without a row.
+    A submission scored from its file has no ``report`` and no ``steps``; ``missing`` lists samples
+    without a row.
     """
 
     recipe: str
@@ -109,7 +115,9 @@ class Validation:
     missing: tuple[str, ...] = ()
 
     def maa(self, step: Step | None = None) -> float:
-        """Return the competition's figure: the mean of the scenes' mAA after a step, by default the last."""
+        """Return the competition's figure: the mean of the scenes' mAA after a step, by default the
+        last.
+        """
         return mean(scene.maa(step) for scene in self.scenes)
 
     def auc(self, threshold: float) -> float:
@@ -117,7 +125,9 @@ class Validation:
 
     @property
     def matching(self) -> list[float]:
-        return [mean(column) for column in zip(*(scene.matching for scene in self.scenes), strict=True)]
+        return [
+            mean(column) for column in zip(*(scene.matching for scene in self.scenes), strict=True)
+        ]
 
     @property
     def errors(self) -> list[PoseError]:
@@ -127,26 +137,39 @@ class Validation:
 def by_protocol(recipe: Recipe, protocol: str) -> Recipe:
     """Return the recipe with the settings of a protocol.
 
-    Scoring by a protocol also sets ``in_front`` of :func:`validate`. SuperGlue's threshold is in pixels of the
-    resized image, whose long side is the largest of stage 1.
+    Scoring by a protocol also sets ``in_front`` of :func:`validate`. SuperGlue's threshold is in
+    pixels of the resized image, whose long side is the largest of stage 1.
     """
     units = tuple(replace(unit, antialias=False) for unit in recipe.units)
-    sides = [unit.long_side or max(map(int, unit.area.split("x"))) for unit in units if unit.stage == 1]
-    magsac = replace(PROTOCOLS[protocol], threshold_side=max(sides) if protocol == "superglue" else 0)
+    sides = [
+        unit.long_side or max(map(int, unit.area.split("x"))) for unit in units if unit.stage == 1
+    ]
+    magsac = replace(
+        PROTOCOLS[protocol], threshold_side=max(sides) if protocol == "superglue" else 0
+    )
     return replace(recipe, units=units, magsac=magsac, focal=None, scene=None)
 
 
 def validate(
-    scenes: Sequence[TrainScene], assembly: Assembly, session: Session, root: str = "", *, in_front: bool = False
+    scenes: Sequence[TrainScene],
+    assembly: Assembly,
+    session: Session,
+    root: str = "",
+    *,
+    in_front: bool = False,
 ) -> Validation:
-    """Run the recipe on the pairs of all scenes, whose images lie below ``root``, and score the results.
+    """Run the recipe on the pairs of all scenes, whose images lie below ``root``, and score the
+    results.
 
     With ``in_front``, the inliers of an E select one of its two rotations.
     """
-    report = run_pairs([true.pair for scene in scenes for true in scene.pairs], assembly, session, root=root)
+    report = run_pairs(
+        [true.pair for scene in scenes for true in scene.pairs], assembly, session, root=root
+    )
     prior = assembly.recipe.focal is not None
     made = {  # with known focal lengths, E has no step before the prior
-        Step.MAGSAC: not prior or any(record.magsac_fundamental is not None for record in report.records),
+        Step.MAGSAC: not prior
+        or any(record.magsac_fundamental is not None for record in report.records),
         Step.PRIOR: prior,
         Step.SCENE: any(record.scene is not None for record in report.records),
     }
@@ -157,13 +180,18 @@ def validate(
         if not (in_metres := isfinite(scene.metres_per_unit)):
             with Store.read(session.work_dir) as store:
                 table = Table.of(store)
-                pairs = [with_matching(*each, store, table) for each in zip(pairs, scene.pairs, strict=True)]
+                pairs = [
+                    with_matching(*each, store, table)
+                    for each in zip(pairs, scene.pairs, strict=True)
+                ]
         scored.append(SceneScore(scene.name, tuple(pairs), in_metres))
     return Validation(assembly.recipe.name, tuple(scored), report, steps)
 
 
 def with_matching(pair: PairScore, true: TruePair, store: Store, table: Table) -> PairScore:
-    """Return the score with ``matching`` set; the matching score is NaN if numbers of keypoints are unknown."""
+    """Return the score with ``matching`` set; the matching score is NaN if numbers of keypoints are
+    unknown.
+    """
     assert pair.record is not None
     matches = Matches.concatenate(read_points(store, table, pair.record.index).values())
     units = pair.record.units
@@ -174,7 +202,11 @@ def with_matching(pair: PairScore, true: TruePair, store: Store, table: Table) -
 
 
 def score_record(
-    true: TruePair, record: PairRecord, scene: TrainScene, steps: Sequence[Step] = (), in_front: bool = False
+    true: TruePair,
+    record: PairRecord,
+    scene: TrainScene,
+    steps: Sequence[Step] = (),
+    in_front: bool = False,
 ) -> PairScore:
     """Return the score of a pair's record. An F from the fallback counts as a failure."""
     rotation = Rotation.from_rotvec(record.stats.rotation).as_matrix() if in_front else None
@@ -186,13 +218,17 @@ def score_record(
     }
     errors = {step: error_of(matrix, true, scene, rotation) for step, matrix in matrices.items()}
     made = {step: errors[step] for step in steps}
-    return PairScore(true.pair.id, true.pair.names, true.covisibility, errors[Step.SCENE], record, made)
+    return PairScore(
+        true.pair.id, true.pair.names, true.covisibility, errors[Step.SCENE], record, made
+    )
 
 
 def error_of(
     matrix: Matrix3 | None, true: TruePair, scene: TrainScene, rotation: Matrix3 | None = None
 ) -> PoseError:
-    """Return the error of a pair's F, or of its E with a given rotation. It is infinite without a matrix."""
+    """Return the error of a pair's F, or of its E with a given rotation. It is infinite without a
+    matrix.
+    """
     if matrix is None:
         return PoseError.failed()
     camera0, camera1 = true.camera0, true.camera1
@@ -233,8 +269,8 @@ def score_submission(submission: Path, truth: Path, scenes: Sequence[TrainScene]
 def score_table(validation: Validation) -> list[str]:
     """Return a row for each scene and a row of their mean, with a dash for unknown figures.
 
-    The columns are the mAA after each step, and the pose AUC after the last step. Lists of pairs also have
-    precision and matching score. The last line names samples without a row, if any.
+    The columns are the mAA after each step, and the pose AUC after the last step. Lists of pairs
+    also have precision and matching score. The last line names samples without a row, if any.
     """
     table = score_frame(validation)
     figures = table.drop(columns=["scene", "pairs"])
@@ -251,7 +287,8 @@ def score_table(validation: Validation) -> list[str]:
 
 
 def score_frame(validation: Validation) -> "DataFrame":
-    """Return the scores as a table: a row for each scene and one for their mean, NaN for unknown figures.
+    """Return the scores as a table: a row for each scene and one for their mean, NaN for unknown
+    figures.
 
     The columns are the scene, its number of pairs, and the figures of :func:`score_table`.
     """
@@ -261,7 +298,9 @@ def score_frame(validation: Validation) -> "DataFrame":
     steps = validation.steps if len(validation.steps) > 1 else ["mAA"]
     heads = [*map(str, steps), *(f"AUC {angle:.0f}" for angle in AUC_THRESHOLDS)]
     heads += ["precis.", "m.score"] if is_list else []
-    named: list[tuple[str, SceneScore | Validation]] = [(scene.scene, scene) for scene in validation.scenes]
+    named: list[tuple[str, SceneScore | Validation]] = [
+        (scene.scene, scene) for scene in validation.scenes
+    ]
     rows = []
     for name, scores in [*named, ("mean over scenes", validation)]:
         accuracies = map(scores.maa, validation.steps or [None])
@@ -272,7 +311,9 @@ def score_frame(validation: Validation) -> "DataFrame":
 
 
 def to_json(validation: Validation) -> dict[str, Any]:
-    """Return all figures as JSON values: overall, per scene and per pair; null for non-finite numbers."""
+    """Return all figures as JSON values: overall, per scene and per pair; null for non-finite
+    numbers.
+    """
     steps, report = validation.steps, validation.report
     figures = {
         "recipe": validation.recipe,
@@ -280,11 +321,16 @@ def to_json(validation: Validation) -> dict[str, Any]:
         **_scores_json(validation, steps),
         "seconds": report and report.seconds,
         "scenes": [
-            {"scene": scene.scene, **_scores_json(scene, steps), "pairs": [*map(_pair_json, scene.pairs)]}
+            {
+                "scene": scene.scene,
+                **_scores_json(scene, steps),
+                "pairs": [*map(_pair_json, scene.pairs)],
+            }
             for scene in validation.scenes
         ],
     }
-    values: dict[str, Any] = json.loads(json.dumps(figures), parse_constant=lambda _: None)  # NaN and infinity
+    # NaN and infinity
+    values: dict[str, Any] = json.loads(json.dumps(figures), parse_constant=lambda _: None)
     return values
 
 
@@ -305,7 +351,9 @@ def _pair_json(pair: PairScore) -> dict[str, Any]:
         "translation_error_metres": pair.error.translation,
         "translation_error_degrees": pair.error.translation_angle,
         **dict(zip(MATCHING, pair.matching, strict=True)),
-        "accuracy_by_step": {step: metrics.pair_accuracy(error) for step, error in pair.steps.items()},
+        "accuracy_by_step": {
+            step: metrics.pair_accuracy(error) for step, error in pair.steps.items()
+        },
     }
     if (record := pair.record) is not None:
         values |= {"failure": record.failure, "inliers": record.inliers}

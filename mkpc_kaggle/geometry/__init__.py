@@ -1,1 +1,3 @@
-"""Points, boxes, clusters, two-view geometry and scores. Uses NumPy, OpenCV, SciPy and scikit-learn, not torch."""
+"""Points, boxes, clusters, two-view geometry and scores. Uses NumPy, OpenCV, SciPy and
+scikit-learn, not torch.
+"""

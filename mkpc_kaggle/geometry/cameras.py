@@ -13,7 +13,9 @@ MIN_BASELINE = 1e-9  # world units; closer cameras have the same centre
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A calibrated camera: K (3, 3) in pixels; R (3, 3) and t (3,) map world to camera, X_cam = R X + t."""
+    """A calibrated camera: K (3, 3) in pixels; R (3, 3) and t (3,) map world to camera, X_cam = R X
+    + t.
+    """
 
     K: Matrix3
     R: Matrix3

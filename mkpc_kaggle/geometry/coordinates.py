@@ -1,11 +1,13 @@
 """Boxes and views: the only code that converts pixel coordinates.
 
-Pixel centres are at integers: the centre of the top-left pixel is (0, 0), x runs right, y runs down, and an
-image of width w covers [-0.5, w - 0.5). A resize by s gives ``x_view = (x + 0.5) * s - 0.5``. Each
-axis has its own s, computed from the *actual* sizes. A crop subtracts an integer offset. A quarter turn swaps the
-axes and flips one of them. Padding is added right and bottom, so coordinates do not change.
+Pixel centres are at integers: the centre of the top-left pixel is (0, 0), x runs right, y runs
+down, and an image of width w covers [-0.5, w - 0.5). A resize by s gives ``x_view = (x + 0.5) * s -
+0.5``. Each axis has its own s, computed from the *actual* sizes. A crop subtracts an integer
+offset. A quarter turn swaps the axes and flips one of them. Padding is added right and bottom, so
+coordinates do not change.
 
-Networks use other conventions: :func:`from_corner` and :func:`from_normalised` convert to this convention.
+Networks use other conventions: :func:`from_corner` and :func:`from_normalised` convert to this
+convention.
 """
 
 from dataclasses import dataclass
@@ -52,14 +54,22 @@ class Box:
         return self.size.width * self.size.height
 
     def contains(self, points: NDArray[np.floating]) -> NDArray[np.bool_]:
-        """Return an (N,) mask of the points (N, 2), in image pixels, on the box's pixels; False for NaN."""
+        """Return an (N,) mask of the points (N, 2), in image pixels, on the box's pixels; False for
+        NaN.
+        """
         x, y = points[:, 0], points[:, 1]
-        return (x >= self.left - 0.5) & (x < self.right - 0.5) & (y >= self.top - 0.5) & (y < self.bottom - 0.5)
+        return (
+            (x >= self.left - 0.5)
+            & (x < self.right - 0.5)
+            & (y >= self.top - 0.5)
+            & (y < self.bottom - 0.5)
+        )
 
 
 @dataclass(frozen=True)
 class View:
-    """A matcher's input: a crop of an image, rotated by quarter turns, resized, and padded right and bottom.
+    """A matcher's input: a crop of an image, rotated by quarter turns, resized, and padded right
+    and bottom.
 
     Image pixels are pixels of the file as stored, ignoring EXIF orientation.
     """
@@ -71,11 +81,14 @@ class View:
     antialias: bool = True  # average areas where the crop shrinks
 
     @classmethod
-    def fit(cls, crop: Box, *, long_side: int = 0, area: int = 0, multiple: int = 1, turns: int = 0) -> "View":
-        """Return the view of ``crop`` with a longer side of ``long_side`` pixels, or with about ``area`` pixels.
+    def fit(
+        cls, crop: Box, *, long_side: int = 0, area: int = 0, multiple: int = 1, turns: int = 0
+    ) -> "View":
+        """Return the view of ``crop`` with a longer side of ``long_side`` pixels, or with about
+        ``area`` pixels.
 
-        The aspect ratio is kept to the nearest pixel. Both sides are padded up to a multiple of ``multiple``, as
-        in :meth:`stretched`.
+        The aspect ratio is kept to the nearest pixel. Both sides are padded up to a multiple of
+        ``multiple``, as in :meth:`stretched`.
         """
         scale = long_side / max(crop.size) if long_side else sqrt(area / crop.area)
         width, height = (max(1, round(side * scale)) for side in _turned_size(crop.size, turns))
@@ -83,7 +96,9 @@ class View:
 
     @classmethod
     def stretched(cls, crop: Box, *, size: Size, multiple: int = 1, turns: int = 0) -> "View":
-        """Return the view of ``crop``, turned and then resized to exactly ``size``, ignoring the aspect ratio."""
+        """Return the view of ``crop``, turned and then resized to exactly ``size``, ignoring the
+        aspect ratio.
+        """
         padded = Size(*(ceil(side / multiple) * multiple for side in size))
         return cls(crop, size, padded, turns)
 
@@ -101,30 +116,41 @@ class View:
 
     def to_image(self, points: NDArray[np.floating]) -> NDArray[np.float64]:
         """Convert (N, 2) view pixels to (N, 2) image pixels, the inverse of :meth:`from_image`."""
-        offset, turned = np.array([self.crop.left, self.crop.top]), _turned_size(self.crop.size, self.turns)
+        offset, turned = (
+            np.array([self.crop.left, self.crop.top]),
+            _turned_size(self.crop.size, self.turns),
+        )
         stored = _turned((np.asarray(points, np.float64) + 0.5) / self.scale, -self.turns, turned)
         return np.asarray(stored - 0.5 + offset, np.float64)
 
     def holds(self, points: NDArray[np.floating]) -> NDArray[np.bool_]:
-        """Return an (N,) mask of the points (N, 2), in view pixels, on content, not on padding; False for NaN."""
+        """Return an (N,) mask of the points (N, 2), in view pixels, on content, not on padding;
+        False for NaN.
+        """
         return Box.whole(self.content).contains(points)
 
     def render(self, image: Pixels) -> Pixels:
         """Render the view of a uint8 image (H, W) or (H, W, 3), with ``padded`` height and width.
 
-        Padding is black. Shrinking averages areas to avoid aliasing, unless ``antialias`` is off. All other
-        resizing is bilinear. Both methods use the half-pixel convention of this module.
+        Padding is black. Shrinking averages areas to avoid aliasing, unless ``antialias`` is off.
+        All other resizing is bilinear. Both methods use the half-pixel convention of this module.
         """
         crop = self.crop
         cut = image[crop.top : crop.bottom, crop.left : crop.right]
         if min(crop.left, crop.top) < 0 or cut.shape[1::-1] != crop.size:
-            raise ValueError(f"{crop} leaves the image of {image.shape[1]} x {image.shape[0]} pixels")
+            raise ValueError(
+                f"{crop} leaves the image of {image.shape[1]} x {image.shape[0]} pixels"
+            )
         # OpenCV's codes turn clockwise; code 0 is one quarter turn.
         picture = cv2.rotate(cut, 3 - self.turns) if self.turns else cut
         # Shrink first, then enlarge: INTER_AREA averages areas only if neither axis grows.
         turned = _turned_size(crop.size, self.turns)
         shrunk = Size(*map(min, self.content, turned)) if self.antialias else turned
-        picture = cv2.resize(picture, shrunk, interpolation=cv2.INTER_AREA) if shrunk != turned else picture
+        picture = (
+            cv2.resize(picture, shrunk, interpolation=cv2.INTER_AREA)
+            if shrunk != turned
+            else picture
+        )
         if shrunk != self.content:
             picture = cv2.resize(picture, self.content, interpolation=cv2.INTER_LINEAR)
         right = self.padded.width - self.content.width
@@ -137,14 +163,18 @@ def _turned_size(size: Size, turns: int) -> Size:
 
 
 def _turned(points: NDArray[np.float64], turns: int, size: Size) -> NDArray[np.float64]:
-    """Rotate (N, 2) points, relative to the top-left corner of a picture of ``size``, like ``np.rot90``."""
+    """Rotate (N, 2) points, relative to the top-left corner of a picture of ``size``, like
+    ``np.rot90``.
+    """
     (x, y), (width, height) = points.T, size
     quarters = (x, y), (y, width - x), (width - x, height - y), (height - y, x)
     return np.stack(quarters[turns % 4], axis=1)
 
 
 def from_corner(points: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Move the origin of (N, 2) pixels from the image's top-left corner to the centre of the top-left pixel."""
+    """Move the origin of (N, 2) pixels from the image's top-left corner to the centre of the
+    top-left pixel.
+    """
     return points - np.float32(0.5)
 
 

@@ -1,8 +1,9 @@
-"""The critical region of an image: Matching Key-Points Crop (the paper's Algorithm 1) and Crop Area Expansion.
+"""The critical region of an image: Matching Key-Points Crop (the paper's Algorithm 1) and Crop Area
+Expansion.
 
-For each image separately: normalise the matched points of stage 1 by width and height, cluster them, and keep the
-large clusters. The bounding box of the kept points, scaled about its centre, is the critical region. If this box
-is unreliable, the region is the whole image, with the reason.
+For each image separately: normalise the matched points of stage 1 by width and height, cluster
+them, and keep the large clusters. The bounding box of the kept points, scaled about its centre, is
+the critical region. If this box is unreliable, the region is the whole image, with the reason.
 """
 
 from dataclasses import dataclass
@@ -14,7 +15,8 @@ from numpy.typing import NDArray
 from mkpc_kaggle.config import AT_LEAST_1, POSITIVE, SHARE, Range, check_ranges
 from mkpc_kaggle.geometry.coordinates import Box, Points, Size
 
-MERGE_ABOVE = 2000  # points; DBSCAN stores each point's neighbours, so dense points take quadratic memory
+# Points; DBSCAN stores each point's neighbours, so dense points take quadratic memory
+MERGE_ABOVE = 2000
 CELLS_PER_EPS = 10
 
 
@@ -31,12 +33,16 @@ class MkpcConfig:
     min_side: int = 32  # of a crop, in pixels
 
     def __post_init__(self) -> None:
-        check_ranges(self, eps=Range(1e-6), min_samples=Range(1, 100), share=SHARE, min_clustered=SHARE)
+        check_ranges(
+            self, eps=Range(1e-6), min_samples=Range(1, 100), share=SHARE, min_clustered=SHARE
+        )
         check_ranges(self, expand_x=POSITIVE, expand_y=POSITIVE, min_side=AT_LEAST_1)
 
 
 class RegionReason(StrEnum):
-    """Origin of a region: ``CROPPED``, ``GIVEN`` by the user, or the reason for taking the whole image."""
+    """Origin of a region: ``CROPPED``, ``GIVEN`` by the user, or the reason for taking the whole
+    image.
+    """
 
     CROPPED = "cropped"
     GIVEN = "given"
@@ -71,7 +77,8 @@ class Clusters:
 
 
 def critical_region(points: Points, size: Size, config: MkpcConfig) -> CriticalRegion:
-    """Return the critical region of an image of ``size`` with matched ``points``, (N, 2) float32 in image pixels.
+    """Return the critical region of an image of ``size`` with matched ``points``, (N, 2) float32 in
+    image pixels.
 
     Ignores points that are not finite or not on the image. Never raises.
     """
@@ -92,7 +99,8 @@ def critical_region(points: Points, size: Size, config: MkpcConfig) -> CriticalR
 
 
 def find_clusters(points: Points, size: Size, config: MkpcConfig) -> Clusters:
-    """Cluster matched points, (N, 2) float32 in image pixels, by DBSCAN, and select the clusters to keep.
+    """Cluster matched points, (N, 2) float32 in image pixels, by DBSCAN, and select the clusters to
+    keep.
 
     Coordinates are normalised by the image's width and height.
     """
@@ -105,7 +113,8 @@ def find_clusters(points: Points, size: Size, config: MkpcConfig) -> Clusters:
 def dbscan(points: NDArray[np.float64], *, eps: float, min_samples: int) -> NDArray[np.intp]:
     """Return the labels (N,) of scikit-learn's DBSCAN for ``points`` (N, 2), -1 for noise.
 
-    Above ``MERGE_ABOVE`` points, the points in each cell of side eps / 10 become one weighted mean point.
+    Above ``MERGE_ABOVE`` points, the points in each cell of side eps / 10 become one weighted mean
+    point.
     """
     from sklearn.cluster import DBSCAN  # the import takes a second
 
@@ -117,15 +126,18 @@ def dbscan(points: NDArray[np.float64], *, eps: float, min_samples: int) -> NDAr
         _, cell, counts = np.unique(corners, axis=0, return_inverse=True, return_counts=True)
         cell = cell.ravel()  # NumPy 2.0.0 returns a column
         points = np.column_stack([np.bincount(cell, along) / counts for along in points.T])
-    found = DBSCAN(eps=eps, min_samples=min_samples, algorithm="kd_tree").fit(points, sample_weight=counts)
+    found = DBSCAN(eps=eps, min_samples=min_samples, algorithm="kd_tree").fit(
+        points, sample_weight=counts
+    )
     return np.asarray(found.labels_[cell], np.intp)
 
 
 def keep_clusters(sizes: NDArray[np.intp], share: float) -> NDArray[np.intp]:
-    """Return the labels of the clusters to keep, largest first; ``sizes`` (K,) is the number of points per label.
+    """Return the labels of the clusters to keep, largest first; ``sizes`` (K,) is the number of
+    points per label.
 
-    Keeps clusters with at least ``share`` of the largest cluster's points. Clusters of equal size keep their
-    order.
+    Keeps clusters with at least ``share`` of the largest cluster's points. Clusters of equal size
+    keep their order.
     """
     by_size = np.argsort(-sizes, kind="stable")
     kept: NDArray[np.intp] = by_size[sizes[by_size] / sizes.max(initial=1) >= share]
@@ -133,10 +145,11 @@ def keep_clusters(sizes: NDArray[np.intp], share: float) -> NDArray[np.intp]:
 
 
 def expand_box(points: Points, size: Size, expand_x: float, expand_y: float) -> Box:
-    """Return the bounding box of ``points``, scaled about its centre and clipped (Crop Area Expansion).
+    """Return the bounding box of ``points``, scaled about its centre and clipped (Crop Area
+    Expansion).
 
-    Before scaling, the box spans whole pixels, [min, max + 1), so it includes the last row and column.
-    Scaled edges are rounded outwards.
+    Before scaling, the box spans whole pixels, [min, max + 1), so it includes the last row and
+    column. Scaled edges are rounded outwards.
     """
     low = np.floor(points.min(axis=0).astype(np.float64) + 0.5)
     high = np.floor(points.max(axis=0).astype(np.float64) + 0.5) + 1

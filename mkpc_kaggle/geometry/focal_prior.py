@@ -1,21 +1,21 @@
 """F of a pair under a prior on the focal lengths of its two cameras.
 
-With known principal points, the seven degrees of freedom of F are a relative pose and two focal lengths. The prior
-favours plausible focal lengths. The search minimises the negative log posterior of the pose and of log f0 and
-log f1:
+With known principal points, the seven degrees of freedom of F are a relative pose and two focal
+lengths. The prior favours plausible focal lengths. The search minimises the negative log posterior
+of the pose and of log f0 and log f1:
 
     sum_n rho(r_n / scale) + sum_i (log f_i - log g_i)^2 / (2 sigma_i^2),     rho(x) = x^2 / (2 (1 + x^2)),
 
-r is the Sampson distance in pixels (:mod:`mkpc_kaggle.geometry.two_view`), g the expected focal length, and rho
-the loss of Geman and McClure (1985). An outlier costs 0.5, as much as a log focal length that is one sigma
-off. The prior matters only if the matches do not determine the focal lengths. A match whose point lies behind a
-camera is an outlier, too.
+r is the Sampson distance in pixels (:mod:`mkpc_kaggle.geometry.two_view`), g the expected focal
+length, and rho the loss of Geman and McClure (1985). An outlier costs 0.5, as much as a log focal
+length that is one sigma off. The prior matters only if the matches do not determine the focal
+lengths. A match whose point lies behind a camera is an outlier, too.
 
-The search is local and has several starts: MAGSAC's F, and MAGSAC's E at several focal lengths, each from
-a different subset of the matches. Short searches on few matches rank the starts, and the best are refined.
-MAGSAC's own F wins if it costs much less. Then no plausible focal lengths explain the matches, for example because
-the principal points are off-centre. The two rotations of an E have the same F and the same derivatives, so one
-start covers both.
+The search is local and has several starts: MAGSAC's F, and MAGSAC's E at several focal lengths,
+each from a different subset of the matches. Short searches on few matches rank the starts, and the
+best are refined. MAGSAC's own F wins if it costs much less. Then no plausible focal lengths explain
+the matches, for example because the principal points are off-centre. The two rotations of an E have
+the same F and the same derivatives, so one start covers both.
 """
 
 from collections.abc import Sequence
@@ -43,20 +43,27 @@ from mkpc_kaggle.geometry.robust import (
 from mkpc_kaggle.geometry.two_view import Problem, TwoView, Vectors, robust_costs, sampson
 
 ESSENTIAL_STARTS = 5  # estimates of E, at evenly spaced quantiles of the prior on focal lengths
-ESSENTIAL_SHARE, MIN_ESSENTIAL = 0.25, 50  # share and minimum number of matches for each estimate of E
+# Share and minimum number of matches for each estimate of E
+ESSENTIAL_SHARE, MIN_ESSENTIAL = 0.25, 50
 ESSENTIAL_THRESHOLD_PX, ESSENTIAL_ITERATIONS = 0.4, 300
-ROUGH_SCALES, FINE_SCALES = (4.0,), (2.0, 1.0)  # multiples of the scale, in order; a wide loss has few minima
-ROUGH_MATCHES, FINE_MATCHES = 300, 1000  # maximum numbers, evenly spaced; results are scored on all matches
+# Multiples of the scale, in order; a wide loss has few minima
+ROUGH_SCALES, FINE_SCALES = (4.0,), (2.0, 1.0)
+# Maximum numbers, evenly spaced; results are scored on all matches
+ROUGH_MATCHES, FINE_MATCHES = 300, 1000
 FINE_STARTS = 2  # number of rough results to refine
 FREE_COST = 10.0  # penalty of MAGSAC's own F, which need not have plausible focal lengths
-FOCAL_RATIO, FOCAL_SIGMA = 1.1, 0.4  # expected focal length over the long side; standard deviation of its log
+# Expected focal length over the long side; standard deviation of its log
+FOCAL_RATIO, FOCAL_SIGMA = 1.1, 0.4
 EXIF_SIGMA = 0.05  # standard deviation of the log of EXIF's focal length
-LOG_FOCAL_GRID = (-0.7, -0.35, 0.0, 0.35, 0.7)  # values of log f / g to decompose MAGSAC's F; the best is a start
+# Values of log f / g to decompose MAGSAC's F; the best is a start
+LOG_FOCAL_GRID = (-0.7, -0.35, 0.0, 0.35, 0.7)
 
 
 @dataclass(frozen=True)
 class FocalConfig:
-    """Settings of :func:`estimate_with_prior`, table ``[focal]`` of a recipe. Without the table, F is MAGSAC's."""
+    """Settings of :func:`estimate_with_prior`, table ``[focal]`` of a recipe. Without the table, F
+    is MAGSAC's.
+    """
 
     scale: float = 0.35  # scale of the loss, in pixels
 
@@ -71,14 +78,18 @@ class FocalPrior:
 
     @classmethod
     def of_image(cls, size: Size, exif_focal: float = 0.0) -> "FocalPrior":
-        """Return the prior for an image, which is weak without EXIF's focal length ``exif_focal`` in pixels."""
+        """Return the prior for an image, which is weak without EXIF's focal length ``exif_focal``
+        in pixels.
+        """
         if exif_focal:
             return cls.of_focal(exif_focal, EXIF_SIGMA, size)
         return cls.of_focal(FOCAL_RATIO * max(size), FOCAL_SIGMA, size)
 
     @classmethod
     def of_focal(cls, focal: float, sigma: float, size: Size) -> "FocalPrior":
-        """Return the prior for a focal length in pixels, with the principal point at the image's centre."""
+        """Return the prior for a focal length in pixels, with the principal point at the image's
+        centre.
+        """
         centre = (size.width - 1) / 2, (size.height - 1) / 2
         return cls(np.array([[focal, 0, centre[0]], [0, focal, centre[1]], [0, 0, 1]]), sigma)
 
@@ -105,20 +116,28 @@ Priors = tuple[FocalPrior, FocalPrior]
 
 
 def estimate_with_prior(
-    matches: Matches, priors: Priors, magsac: RobustConfig, config: FocalConfig, model: ModelKind = ModelKind.F
+    matches: Matches,
+    priors: Priors,
+    magsac: RobustConfig,
+    config: FocalConfig,
+    model: ModelKind = ModelKind.F,
 ) -> Estimate:
-    """Estimate F, or E if K is known, from ``matches`` in image pixels, as the candidate of lowest cost.
+    """Estimate F, or E if K is known, from ``matches`` in image pixels, as the candidate of lowest
+    cost.
 
-    Inliers have a Sampson distance below MAGSAC's threshold. MAGSAC's own F is a candidate, so F never costs
-    more. Six distinct matches are enough. The same input gives the same bytes.
+    Inliers have a Sampson distance below MAGSAC's threshold. MAGSAC's own F is a candidate, so F
+    never costs more. Six distinct matches are enough. The same input gives the same bytes.
     """
     distinct = DistinctMatches.of(matches)
-    with np.errstate(all="ignore"):  # extreme coordinates may overflow; a candidate of non-finite cost loses
+    # Extreme coordinates may overflow; a candidate of non-finite cost loses
+    with np.errstate(all="ignore"):
         search = _Search(distinct, priors, config.scale)
         free, starts, failures = search.starts(magsac)
         if model is ModelKind.E:
             free = []
-        candidates = [found for found in (*free, *search.refined(starts)) if np.isfinite(found.cost)]
+        candidates = [
+            found for found in (*free, *search.refined(starts)) if np.isfinite(found.cost)
+        ]
         if not candidates:
             reasons = "; ".join(dict.fromkeys(failures)) or "no candidate has a finite cost"
             return Estimate.failed(model, len(matches), reasons)
@@ -128,12 +147,18 @@ def estimate_with_prior(
         finite = [found for found in free if np.isfinite(found.cost)]
         plain = min(finite, key=lambda found: found.cost, default=None)
     magsac_fundamental = unit_norm(search.for_pixels(plain.fundamental)) if plain else None
-    told = EstimateStats(len(candidates), best.cost, plain.cost if plain else 0.0, search.focals(best))
-    return Estimate(model, unit_norm(matrix), distinct.mask_of_all(inliers), "", magsac_fundamental, told)
+    told = EstimateStats(
+        len(candidates), best.cost, plain.cost if plain else 0.0, search.focals(best)
+    )
+    return Estimate(
+        model, unit_norm(matrix), distinct.mask_of_all(inliers), "", magsac_fundamental, told
+    )
 
 
 class _Candidate(NamedTuple):
-    """An F (3, 3) for rays. ``cost`` includes FREE_COST for MAGSAC's own F, and the prior's cost for others."""
+    """An F (3, 3) for rays. ``cost`` includes FREE_COST for MAGSAC's own F, and the prior's cost
+    for others.
+    """
 
     fundamental: Matrix3
     cost: float
@@ -151,13 +176,17 @@ class _Search:
         self._many, self._few = self._sample(FINE_MATCHES), self._sample(ROUGH_MATCHES)
 
     def _sample(self, most: int) -> Problem:
-        """Return the problem of up to ``most`` evenly spaced matches, weighted to represent all matches."""
+        """Return the problem of up to ``most`` evenly spaced matches, weighted to represent all
+        matches.
+        """
         count = len(self.rays[0])
         few = np.linspace(0, count - 1, min(count, most)).astype(int)
         return Problem(self.rays[0][few], self.rays[1][few], self._sigmas, count / max(len(few), 1))
 
     def starts(self, magsac: RobustConfig) -> tuple[list[_Candidate], list[TwoView], list[str]]:
-        """Return MAGSAC's candidates for F, the starts from these and from E, and reasons for missing starts."""
+        """Return MAGSAC's candidates for F, the starts from these and from E, and reasons for
+        missing starts.
+        """
         free, starts, failures, count = [], [], [], len(self.rays[0])
         for number in range(magsac.permutations):
             plain = self._consensus(permutation(number, count), magsac)
@@ -168,11 +197,18 @@ class _Search:
                 free.append(_Candidate(F, self._cost(F, starts[-1]) + FREE_COST))
             else:
                 failures.append(plain.failure)
-        config = replace(magsac, threshold=ESSENTIAL_THRESHOLD_PX, max_iterations=ESSENTIAL_ITERATIONS)
+        config = replace(
+            magsac, threshold=ESSENTIAL_THRESHOLD_PX, max_iterations=ESSENTIAL_ITERATIONS
+        )
         for number in range(ESSENTIAL_STARTS):
-            part = permutation(number + 1, count)[: max(MIN_ESSENTIAL, round(ESSENTIAL_SHARE * count))]
+            part = permutation(number + 1, count)[
+                : max(MIN_ESSENTIAL, round(ESSENTIAL_SHARE * count))
+            ]
             logs = NormalDist().inv_cdf((number + 0.5) / ESSENTIAL_STARTS) * self._sigmas
-            K0, K1 = (prior.scaled(float(np.exp(log))) for prior, log in zip(self._priors, logs, strict=True))
+            K0, K1 = (
+                prior.scaled(float(np.exp(log)))
+                for prior, log in zip(self._priors, logs, strict=True)
+            )
             essential = self._consensus(part, config, (K0, K1))
             if essential.ok:
                 starts.append(replace(TwoView.nearest(essential.matrix), logs=logs))
@@ -186,7 +222,10 @@ class _Search:
         rough.sort(key=lambda view: self._many.cost(view, self._scale))
         fine = [self._searched(self._many, view, FINE_SCALES) for view in rough[:FINE_STARTS]]
         costs = [self._cost(view.fundamental, view) + self._all.prior_cost(view) for view in fine]
-        return [_Candidate(view.fundamental, cost, view.logs) for view, cost in zip(fine, costs, strict=True)]
+        return [
+            _Candidate(view.fundamental, cost, view.logs)
+            for view, cost in zip(fine, costs, strict=True)
+        ]
 
     def focals(self, found: _Candidate) -> tuple[float, float]:
         """Return both focal lengths in pixels; 0 for MAGSAC's own F."""
@@ -200,9 +239,14 @@ class _Search:
         return self._priors[1].to_ray.T @ F @ self._priors[0].to_ray
 
     def _consensus(
-        self, chosen: NDArray[np.intp], config: RobustConfig, intrinsics: tuple[Matrix3, Matrix3] | None = None
+        self,
+        chosen: NDArray[np.intp],
+        config: RobustConfig,
+        intrinsics: tuple[Matrix3, Matrix3] | None = None,
     ) -> Estimate:
-        """Estimate F, or E with ``intrinsics``, by MAGSAC on the chosen matches, in the given order."""
+        """Estimate F, or E with ``intrinsics``, by MAGSAC on the chosen matches, in the given
+        order.
+        """
         points0, points1 = self._distinct.points0[chosen], self._distinct.points1[chosen]
         model = ModelKind.E if intrinsics else ModelKind.F
         return consensus(points0, points1, replace(config, permutations=1), model, intrinsics)
@@ -214,13 +258,17 @@ class _Search:
         return min(views, key=lambda view: self._few.cost(view, ROUGH_SCALES[0] * self._scale))
 
     def _searched(self, problem: Problem, view: TwoView, factors: Sequence[float]) -> TwoView:
-        """Return the local minimum near ``view``, with the loss scaled by each of ``factors`` in turn."""
+        """Return the local minimum near ``view``, with the loss scaled by each of ``factors`` in
+        turn.
+        """
         for factor in factors:
             view = problem.fit(view, factor * self._scale)
         return view
 
     def _cost(self, F: Matrix3, view: TwoView) -> float:
-        """Return the cost of an F for rays on all matches. Points behind a camera of ``view`` are outliers."""
+        """Return the cost of an F for rays on all matches. Points behind a camera of ``view`` are
+        outliers.
+        """
         saved = 0.5 - robust_costs(sampson(F, *self.rays), self._scale)
         signs = (views.depth_signs(*self.rays, 3 * self._scale) for views in (view, view.twisted))
         behind = min(saved[both * sign <= 0].sum() for both in signs for sign in (1, -1))

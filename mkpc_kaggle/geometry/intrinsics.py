@@ -1,6 +1,7 @@
 """Intrinsics that the user knows: COLMAP's camera models, exact or with a standard deviation.
 
-Parameters have COLMAP's order and units: pixels, with (0, 0) the corner of the top-left pixel, not its centre.
+Parameters have COLMAP's order and units: pixels, with (0, 0) the corner of the top-left pixel, not
+its centre.
 """
 
 import fnmatch
@@ -26,7 +27,8 @@ MAX_SIGMA = 100.0  # percent; a wider prior states nothing
 
 @dataclass(frozen=True)
 class KnownCamera:
-    """A camera model with parameters, and the standard deviation of its focal length in percent; 0: exact.
+    """A camera model with parameters, and the standard deviation of its focal length in percent; 0:
+    exact.
 
     An exact camera is not refined at all. Raises ``ValueError`` for values that no camera has.
     """
@@ -55,7 +57,11 @@ class KnownCamera:
     def focal(self) -> float:
         """The mean focal length in pixels."""
         names = MODELS[self.model]
-        focals = [value for name, value in zip(names, self.parameters, strict=True) if name.startswith("f")]
+        focals = [
+            value
+            for name, value in zip(names, self.parameters, strict=True)
+            if name.startswith("f")
+        ]
         return sum(focals) / len(focals)
 
     @property
@@ -73,9 +79,13 @@ def parse_row(pattern: str, model: str, parameters: str, sigma: str) -> tuple[st
     if not pattern.strip():
         raise ValueError("the name of the image is missing")
     if sigma.strip() != FIXED and float(sigma) <= 0:
-        raise ValueError(f"a standard deviation must be {FIXED!r} or a number of percent above 0, not {sigma!r}")
+        raise ValueError(
+            f"a standard deviation must be {FIXED!r} or a number of percent above 0, not {sigma!r}"
+        )
     percent = 0.0 if sigma.strip() == FIXED else float(sigma)
-    return pattern.strip(), KnownCamera(model.strip(), tuple(map(float, parameters.split())), percent)
+    return pattern.strip(), KnownCamera(
+        model.strip(), tuple(map(float, parameters.split())), percent
+    )
 
 
 def written(rows: Rows) -> str:
@@ -100,15 +110,21 @@ def read(text: str) -> Rows:
     for line in text.splitlines():
         cells = line.split("\t")
         if len(cells) != 4:
-            raise ValueError(f"expected name, model, parameters and sigma, separated by tabs, found {line!r}")
+            raise ValueError(
+                f"expected name, model, parameters and sigma, separated by tabs, found {line!r}"
+            )
         rows.append(parse_row(*cells))
     return rows
 
 
 def camera_of(rows: Rows, name: str) -> KnownCamera | None:
-    """Return the camera of the first row that names an image: by path, by file name, or by a pattern of these."""
+    """Return the camera of the first row that names an image: by path, by file name, or by a
+    pattern of these.
+    """
     base = name.rpartition("/")[2]
-    matching = (known for pattern, known in rows if pattern in (name, base) or _matches(pattern, name, base))
+    matching = (
+        known for pattern, known in rows if pattern in (name, base) or _matches(pattern, name, base)
+    )
     return next(matching, None)
 
 

@@ -33,7 +33,9 @@ class Matches:
 
     @classmethod
     def empty(cls) -> "Matches":
-        return cls(np.zeros((0, 2), np.float32), np.zeros((0, 2), np.float32), np.zeros(0, np.float32))
+        return cls(
+            np.zeros((0, 2), np.float32), np.zeros((0, 2), np.float32), np.zeros(0, np.float32)
+        )
 
     @classmethod
     def concatenate(cls, parts: Iterable["Matches"]) -> "Matches":
@@ -52,7 +54,9 @@ class Matches:
         return Matches(self.points0[index], self.points1[index], self.scores[index])
 
     def best(self, most: int) -> "Matches":
-        """Return up to ``most`` matches of highest score, in their present order; of equal scores, the earlier."""
+        """Return up to ``most`` matches of highest score, in their present order; of equal scores,
+        the earlier.
+        """
         if len(self) <= most:
             return self
         chosen = np.argsort(-self.scores, kind="stable")[:most]
@@ -61,9 +65,12 @@ class Matches:
     def to_image(self, view0: View, view1: View) -> "Matches":
         """Convert matches in view pixels to image pixels.
 
-        Drops matches with a non-finite point or score, and matches with a point outside its view's content.
+        Drops matches with a non-finite point or score, and matches with a point outside its view's
+        content.
         """
-        kept = self[view0.holds(self.points0) & view1.holds(self.points1) & np.isfinite(self.scores)]
+        kept = self[
+            view0.holds(self.points0) & view1.holds(self.points1) & np.isfinite(self.scores)
+        ]
         return Matches(
             view0.to_image(kept.points0).astype(np.float32),
             view1.to_image(kept.points1).astype(np.float32),

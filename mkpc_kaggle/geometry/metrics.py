@@ -15,11 +15,13 @@ from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import calibrate, homogeneous
 from mkpc_kaggle.geometry.two_view import cross_matrix
 
-# The competition's rules. The i-th rotation threshold, degrees, goes with the i-th translation threshold, metres.
+# The competition's rules. The i-th rotation threshold, degrees, goes with the i-th translation
+# threshold, metres.
 ROTATION_THRESHOLDS = np.linspace(1, 10, 10)
 TRANSLATION_THRESHOLDS = np.geomspace(0.2, 5, 10)
 AUC_THRESHOLDS = (5.0, 10.0, 20.0)  # degrees
-CORRECT = 5e-4  # a correct match's maximum sum of both squared epipolar distances, on the planes z = 1
+# A correct match's maximum sum of both squared epipolar distances, on the planes z = 1
+CORRECT = 5e-4
 
 
 @dataclass(frozen=True)
@@ -28,7 +30,8 @@ class PoseError:
 
     rotation: float  # degrees
     translation_angle: float  # degrees, at most 90, since F leaves the sign open
-    translation: float  # metres, after scaling to the true length; NaN if the scale of the world is unknown
+    # Metres, after scaling to the true length; NaN if the scale of the world is unknown
+    translation: float
 
     @classmethod
     def failed(cls) -> "PoseError":
@@ -48,21 +51,28 @@ class PoseError:
 
 
 def pose_error(
-    F: Matrix3, camera0: Camera, camera1: Camera, metres_per_unit: float, rotation: Matrix3 | None = None
+    F: Matrix3,
+    camera0: Camera,
+    camera1: Camera,
+    metres_per_unit: float,
+    rotation: Matrix3 | None = None,
 ) -> PoseError:
     """Return the pose error of F, or of F's translation with a given ``rotation``.
 
-    A submission has no points to select one of F's two rotations. So by default the rotation nearer to the truth
-    counts. The sign of the translation is ignored.
+    A submission has no points to select one of F's two rotations. So by default the rotation nearer
+    to the truth counts. The sign of the translation is ignored.
     """
     R, t = relative_pose(camera0, camera1)
-    # Two rotations, and a direction (3, 1) of unknown sign (Hartley and Zisserman, Multiple View Geometry, 9.6.2).
+    # Two rotations, and a direction (3, 1) of unknown sign (Hartley and Zisserman, Multiple View
+    # Geometry, 9.6.2).
     *both, column = cv2.decomposeEssentialMat(camera1.K.T @ F @ camera0.K)
     rotations = both if rotation is None else [rotation]
     direction = np.ravel(column).astype(np.float64)
     length = float(np.linalg.norm(t))
     cosine = abs(float(direction @ t)) / max(length, np.finfo(float).tiny)
-    apart = min(float(np.linalg.norm(direction * length - t)), float(np.linalg.norm(direction * length + t)))
+    apart = min(
+        float(np.linalg.norm(direction * length - t)), float(np.linalg.norm(direction * length + t))
+    )
     return PoseError(
         rotation=min(rotation_angle(np.asarray(candidate) @ R.T) for candidate in rotations),
         translation_angle=float(np.degrees(np.arccos(min(cosine, 1.0)))),
@@ -78,7 +88,8 @@ def rotation_angle(R: Matrix3) -> float:
 
 
 def pair_accuracy(error: PoseError) -> float:
-    """Return the share of the ten threshold pairs that a pair's error meets. A scene's mAA is the mean over pairs.
+    """Return the share of the ten threshold pairs that a pair's error meets. A scene's mAA is the
+    mean over pairs.
 
     Source: evaluation page of the Image Matching Challenge 2022.
     """
@@ -90,18 +101,23 @@ def correct_matches(matches: Matches, camera0: Camera, camera1: Camera) -> NDArr
     """Return an (N,) mask of the matches that fit the true cameras within :data:`CORRECT`."""
     R, t = relative_pose(camera0, camera1)
     E = cross_matrix(t) @ R
-    x0, x1 = homogeneous(calibrate(matches.points0, camera0.K)), homogeneous(calibrate(matches.points1, camera1.K))
+    x0, x1 = (
+        homogeneous(calibrate(matches.points0, camera0.K)),
+        homogeneous(calibrate(matches.points1, camera1.K)),
+    )
     lines0, lines1 = x1 @ E, x0 @ E.T
-    with np.errstate(divide="ignore", invalid="ignore"):  # with equal camera centres, no match is correct
+    # With equal camera centres, no match is correct
+    with np.errstate(divide="ignore", invalid="ignore"):
         inverse = 1 / (lines0[:, :2] ** 2).sum(axis=1) + 1 / (lines1[:, :2] ** 2).sum(axis=1)
         return np.asarray((x1 * lines1).sum(axis=1) ** 2 * inverse < CORRECT)
 
 
 def pose_auc(errors: Sequence[PoseError], threshold: float) -> float:
-    """Return the normalised area, 0 to 1, under the recall curve of angular errors up to ``threshold`` degrees.
+    """Return the normalised area, 0 to 1, under the recall curve of angular errors up to
+    ``threshold`` degrees.
 
-    The curve is piecewise linear through the sorted points (error_i, i / n), as in SuperGlue's evaluation. NaN
-    without pairs.
+    The curve is piecewise linear through the sorted points (error_i, i / n), as in SuperGlue's
+    evaluation. NaN without pairs.
     """
     if not errors:
         return float("nan")

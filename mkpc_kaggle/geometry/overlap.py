@@ -1,8 +1,9 @@
-"""Test whether two images overlap: compare the inliers of their F with the inliers of shuffled matches.
+"""Test whether two images overlap: compare the inliers of their F with the inliers of shuffled
+matches.
 
-The number of inliers alone proves nothing: among thousands of wrong matches, hundreds agree with some F. Shuffling
-gives each point of image 0 the partner of another point. The inliers of shuffled matches are the number expected
-by chance for the same points and density.
+The number of inliers alone proves nothing: among thousands of wrong matches, hundreds agree with
+some F. Shuffling gives each point of image 0 the partner of another point. The inliers of shuffled
+matches are the number expected by chance for the same points and density.
 """
 
 import numpy as np
@@ -15,11 +16,13 @@ from mkpc_kaggle.geometry.two_view import sampson
 AGREEMENT_PX = 1.0  # maximum Sampson distance of a match that agrees with F
 FREE_MATCHES = 7  # F has seven degrees of freedom, so it can fit any seven matches
 MAX_SHUFFLES, SHUFFLED_MATCHES = 20, 20_000  # number of shuffles, and of shuffled matches in total
-MIN_SUPPORT = 20.0  # fewer than 1 in 100 pairs without overlap reach it; docs/results.md has the error rates
+# Fewer than 1 in 100 pairs without overlap reach it; docs/results.md has the error rates
+MIN_SUPPORT = 20.0
 
 
 def support(F: Matrix3, matches: Matches) -> float:
-    """Return the number of matches (image pixels) that agree with F, over the number expected by chance.
+    """Return the number of matches (image pixels) that agree with F, over the number expected by
+    chance.
 
     Duplicates count once. At a ratio of ``MIN_SUPPORT`` or more, the two images probably overlap.
     """

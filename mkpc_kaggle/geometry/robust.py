@@ -1,7 +1,7 @@
 """Two-view models from matches: F, E or H by MAGSAC++.
 
-An estimate always has a matrix. If no model is found, it holds the reason and the fallback matrix, which is finite
-and of the right rank. So a submission is always complete.
+An estimate always has a matrix. If no model is found, it holds the reason and the fallback matrix,
+which is finite and of the right rank. So a submission is always complete.
 """
 
 from collections.abc import Callable, Sequence
@@ -42,8 +42,9 @@ class Method(StrEnum):
 class RobustConfig:
     """Settings of :func:`estimate`, table ``[magsac]`` of a recipe.
 
-    Depending on the order of the matches, the estimator may stop before it finds the best model. So it runs on
-    several permutations. The model with the lowest robust cost at twice the threshold wins.
+    Depending on the order of the matches, the estimator may stop before it finds the best model. So
+    it runs on several permutations. The model with the lowest robust cost at twice the threshold
+    wins.
     """
 
     method: Method = Method.MAGSAC
@@ -51,8 +52,10 @@ class RobustConfig:
     max_iterations: int = 50_000
     confidence: float = 0.99999  # probability that no better model remains, where iterations stop
     permutations: int = 8  # number of fixed permutations; the first keeps the order of the matches
-    threshold_side: int = 0  # if not 0, the threshold is in pixels of the image resized to this long side
-    every_match: bool = False  # keep exact duplicates, and estimate from the fewest matches that OpenCV accepts
+    # If not 0, the threshold is in pixels of the image resized to this long side
+    threshold_side: int = 0
+    # Keep exact duplicates, and estimate from the fewest matches that OpenCV accepts
+    every_match: bool = False
 
     def __post_init__(self) -> None:
         check_ranges(self, threshold=POSITIVE, max_iterations=Range(1, 10**6))
@@ -62,20 +65,29 @@ class RobustConfig:
     def in_stored_pixels(
         self, sizes: Sequence[Size], intrinsics: tuple[Matrix3, Matrix3] | None = None
     ) -> "RobustConfig":
-        """Return settings with the threshold in stored pixels, at the same ratio to the mean focal length."""
+        """Return settings with the threshold in stored pixels, at the same ratio to the mean focal
+        length.
+        """
         if not self.threshold_side:
             return self
-        scales = np.array([View.fit(Box.whole(size), long_side=self.threshold_side).scale for size in sizes])
+        scales = np.array(
+            [View.fit(Box.whole(size), long_side=self.threshold_side).scale for size in sizes]
+        )
         focals = np.array([K.diagonal()[:2] for K in intrinsics or 2 * [np.eye(3)]])
-        return replace(self, threshold=self.threshold * focals.sum() / (focals * scales).sum(), threshold_side=0)
+        return replace(
+            self,
+            threshold=self.threshold * focals.sum() / (focals * scales).sum(),
+            threshold_side=0,
+        )
 
 
 @dataclass(frozen=True)
 class EstimateStats:
     """Statistics of an estimate, for the diagnosis of bad pairs.
 
-    A cost is the sum of the robust costs of the distinct matches, at most 0.5 each. Under a prior on focal
-    lengths, it also includes the cost of the prior, or the penalty for an F without focal lengths.
+    A cost is the sum of the robust costs of the distinct matches, at most 0.5 each. Under a prior
+    on focal lengths, it also includes the cost of the prior, or the penalty for an F without focal
+    lengths.
     """
 
     candidates: int = 0  # number of compared models
@@ -83,7 +95,8 @@ class EstimateStats:
     magsac_cost: float = 0.0  # of MAGSAC's own F; 0 without one
     focals: tuple[float, float] = (0.0, 0.0)  # in pixels, of both images; 0 if unknown
     support: float = 0.0  # see :mod:`mkpc_kaggle.geometry.overlap`
-    rotation: tuple[float, ...] = (0.0, 0.0, 0.0)  # of an E, chosen by inliers, see :func:`rotation_in_front`
+    # Of an E, chosen by inliers, see :func:`rotation_in_front`
+    rotation: tuple[float, ...] = (0.0, 0.0, 0.0)
 
 
 NO_STATS = EstimateStats()
@@ -92,7 +105,8 @@ NO_STATS = EstimateStats()
 @dataclass(frozen=True, eq=False)
 class Estimate:
     model: ModelKind
-    matrix: Matrix3  # finite, of unit Frobenius norm; for F, x1^T F x0 = 0 in homogeneous image pixels
+    # Finite, of unit Frobenius norm; for F, x1^T F x0 = 0 in homogeneous image pixels
+    matrix: Matrix3
     inliers: NDArray[np.bool_]  # (N,) mask of the given matches within the threshold
     failure: str = ""  # the reason if ``matrix`` is the fallback
     magsac: Matrix3 | None = None  # under a prior on focal lengths, MAGSAC's own F, if any
@@ -120,13 +134,15 @@ def estimate(
 ) -> Estimate:
     """Estimate a two-view model from ``matches`` (image pixels).
 
-    Ignores non-finite points and, by default, exact duplicates. Duplicates of an inlier are inliers. E needs both
-    camera matrices (3, 3): the points are calibrated, and the threshold is divided by the mean focal length.
-    Raises ``ValueError`` for E without intrinsics, but never because of the points. The same input gives the same
-    bytes.
+    Ignores non-finite points and, by default, exact duplicates. Duplicates of an inlier are
+    inliers. E needs both camera matrices (3, 3): the points are calibrated, and the threshold is
+    divided by the mean focal length. Raises ``ValueError`` for E without intrinsics, but never
+    because of the points. The same input gives the same bytes.
     """
     if model is ModelKind.E and intrinsics is None:
-        raise ValueError("an essential matrix needs the intrinsics, the camera matrix K of both images")
+        raise ValueError(
+            "an essential matrix needs the intrinsics, the camera matrix K of both images"
+        )
     distinct = DistinctMatches.of(matches, merge=not config.every_match)
     found = consensus(distinct.points0, distinct.points1, config, model, intrinsics)
     return replace(found, inliers=distinct.mask_of_all(found.inliers))
@@ -139,7 +155,9 @@ def consensus(
     model: ModelKind,
     intrinsics: tuple[Matrix3, Matrix3] | None = None,
 ) -> Estimate:
-    """Estimate a model as :func:`estimate` does, from finite points (N, 2) without merging duplicates."""
+    """Estimate a model as :func:`estimate` does, from finite points (N, 2) without merging
+    duplicates.
+    """
     count, threshold, solver = len(points0), config.threshold, _SOLVERS[model]
     if count < (solver.minimal if config.every_match else solver.min_matches):
         return Estimate.failed(model, count, f"too few distinct matches for {model}: {count}")
@@ -158,29 +176,43 @@ def consensus(
     for number in range(config.permutations):
         order = permutation(number, count)
         try:
-            matrix, mask = solver.find(points0[order], points1[order], ransacReprojThreshold=threshold, **settings)
+            matrix, mask = solver.find(
+                points0[order], points1[order], ransacReprojThreshold=threshold, **settings
+            )
         except cv2.error as error:  # it may reject points in one order and accept them in another
             failure = f"OpenCV refused the points: {error.err}"
             continue
-        if matrix is None or matrix.shape != (3, 3) or not np.isfinite(matrix).all() or not matrix.any():
+        if (
+            matrix is None
+            or matrix.shape != (3, 3)
+            or not np.isfinite(matrix).all()
+            or not matrix.any()
+        ):
             continue
         with np.errstate(over="ignore", invalid="ignore"):  # points may be any numbers
-            cost = float(np.sum(robust_costs(solver.distances(matrix, points0, points1), 2 * threshold)))
-        # The number of inliers does not decide: MAGSAC scores distances up to several times the threshold.
+            cost = float(
+                np.sum(robust_costs(solver.distances(matrix, points0, points1), 2 * threshold))
+            )
+        # The number of inliers does not decide: MAGSAC scores distances up to several times the
+        # threshold.
         if best is None or cost < lowest:
             best, inliers[order], lowest = matrix, mask.ravel().astype(bool), cost
         candidates += 1
     if best is None:
         return Estimate.failed(model, count, failure)
     if not inliers.any():
-        return Estimate.failed(model, count, f"no {model} has inliers among {count} distinct matches")
+        return Estimate.failed(
+            model, count, f"no {model} has inliers among {count} distinct matches"
+        )
     known = lowest if np.isfinite(lowest) else 0.0
     return Estimate(model, unit_norm(best), inliers, stats=EstimateStats(candidates, known, known))
 
 
 @dataclass(frozen=True, eq=False)
 class DistinctMatches:
-    """The distinct finite matches of N, in order of first appearance; all finite matches without ``merge``."""
+    """The distinct finite matches of N, in order of first appearance; all finite matches without
+    ``merge``.
+    """
 
     points0: Vectors  # (M, 2)
     points1: Vectors
@@ -213,8 +245,12 @@ def calibrate(points: NDArray[np.floating], K: Matrix3) -> Vectors:
     return np.asarray(mapped[:, :2] / mapped[:, 2:])
 
 
-def rotation_in_front(E: Matrix3, matches: Matches, intrinsics: tuple[Matrix3, Matrix3]) -> list[float]:
-    """Return the rotation of E with most points in front of both cameras, as a rotation vector (3,) in radians."""
+def rotation_in_front(
+    E: Matrix3, matches: Matches, intrinsics: tuple[Matrix3, Matrix3]
+) -> list[float]:
+    """Return the rotation of E with most points in front of both cameras, as a rotation vector (3,)
+    in radians.
+    """
     x0, x1 = calibrate(matches.points0, intrinsics[0]), calibrate(matches.points1, intrinsics[1])
     _, R, *_ = cv2.recoverPose(E, x0, x1, np.eye(3), FARTHEST)
     rotation: list[float] = Rotation.from_matrix(R).as_rotvec().tolist()
@@ -226,7 +262,9 @@ def sampson_distances(F: Matrix3, matches: Matches) -> Vectors:
 
     Source: Hartley and Zisserman, Multiple View Geometry, 11.4.3.
     """
-    return _epipolar_distances(F, matches.points0.astype(np.float64), matches.points1.astype(np.float64))
+    return _epipolar_distances(
+        F, matches.points0.astype(np.float64), matches.points1.astype(np.float64)
+    )
 
 
 def permutation(number: int, count: int) -> NDArray[np.intp]:
@@ -245,7 +283,9 @@ def _epipolar_distances(matrix: Matrix3, points0: Vectors, points1: Vectors) -> 
 
 
 def _transfer_distances(matrix: Matrix3, points0: Vectors, points1: Vectors) -> Vectors:
-    """Return (N,) distances between the second image's points and the first image's points, mapped by H."""
+    """Return (N,) distances between the second image's points and the first image's points, mapped
+    by H.
+    """
     return np.asarray(np.hypot(*(cv2.perspectiveTransform(points0[None], matrix)[0] - points1).T))
 
 
@@ -257,16 +297,22 @@ class _Solver(NamedTuple):
     distances: Callable[[Matrix3, Vectors, Vectors], Vectors]
 
 
-def _find_essential(points0: Vectors, points1: Vectors, confidence: float, focal: float, **settings: Any) -> Any:
+def _find_essential(
+    points0: Vectors, points1: Vectors, confidence: float, focal: float, **settings: Any
+) -> Any:
     # MAGSAC integrates its score up to a fixed number of pixels, so it needs points in pixels.
     scale = focal if settings["method"] == cv2.USAC_MAGSAC else 1.0
     settings["threshold"] = scale * settings.pop("ransacReprojThreshold")
     K = np.diag([scale, scale, 1.0])
-    stacked, mask = cv2.findEssentialMat(scale * points0, scale * points1, K, prob=confidence, **settings)
+    stacked, mask = cv2.findEssentialMat(
+        scale * points0, scale * points1, K, prob=confidence, **settings
+    )
     if stacked is None or len(stacked) <= 3:
         return stacked, mask
     solutions = np.split(stacked, len(stacked) // 3)  # five points have up to ten
-    return max(solutions, key=lambda E: cv2.recoverPose(E, points0, points1, np.eye(3), FARTHEST)[0]), mask
+    return max(
+        solutions, key=lambda E: cv2.recoverPose(E, points0, points1, np.eye(3), FARTHEST)[0]
+    ), mask
 
 
 _SOLVERS = {

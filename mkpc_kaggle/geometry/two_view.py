@@ -1,13 +1,15 @@
-"""Two views as rotation, translation direction and focal lengths, fitted to matches with a robust loss.
+"""Two views as rotation, translation direction and focal lengths, fitted to matches with a robust
+loss.
 
-A ray y = (u, v, g) holds a pixel's offset (u, v) from the principal point and the expected focal length g. Two
-views satisfy
+A ray y = (u, v, g) holds a pixel's offset (u, v) from the principal point and the expected focal
+length g. Two views satisfy
 
     F = diag(1, 1, f1 / g1) [t]x R diag(1, 1, f0 / g0),     y1^T F y0 = 0,
 
-since K^-1 = diag(1, 1, f) / f. The Sampson distance is r = y1^T F y0 / s (Sampson, 1982; Hartley and Zisserman,
-Multiple View Geometry, 11.4.3). s is the norm of the gradient of y1^T F y0 in the four pixel coordinates, so r is
-in pixels. With P = diag(1, 1, 0), the derivative of r with respect to F is
+since K^-1 = diag(1, 1, f) / f. The Sampson distance is r = y1^T F y0 / s (Sampson, 1982; Hartley
+and Zisserman, Multiple View Geometry, 11.4.3). s is the norm of the gradient of y1^T F y0 in the
+four pixel coordinates, so r is in pixels. With P = diag(1, 1, 0), the derivative of r with respect
+to F is
 
     dr = (a^T dF y0 + y1^T dF b) / s,     a = y1 - (r / s) P F y0,     b = -(r / s) P F^T y1.
 """
@@ -27,13 +29,16 @@ MIN_GAIN = 1e-3  # stop after a smaller decrease of the cost; an outlier costs 0
 MIN_DAMPING, FIRST_DAMPING, MAX_DAMPING = 1e-9, 1e-3, 1e6
 MAX_LOG_FOCAL = 2.0  # of |log f / g|: a factor of 7.4
 TINY = float(np.finfo(np.float64).tiny)
-CROSS: NDArray[np.float64] = np.swapaxes(np.cross(np.eye(3)[:, None], np.eye(3)), 1, 2)  # [e_k]x of the three axes
+# [e_k]x of the three axes
+CROSS: NDArray[np.float64] = np.swapaxes(np.cross(np.eye(3)[:, None], np.eye(3)), 1, 2)
 CROSS.setflags(write=False)
 
 
 @dataclass(frozen=True, eq=False)
 class TwoView:
-    """Two views with X_1 = R X_0 + t and |t| = 1, t (3,); ``logs`` (2,) are log f / g of both cameras."""
+    """Two views with X_1 = R X_0 + t and |t| = 1, t (3,); ``logs`` (2,) are log f / g of both
+    cameras.
+    """
 
     R: Matrix3
     t: Vectors
@@ -41,7 +46,8 @@ class TwoView:
 
     @classmethod
     def nearest(cls, F: Matrix3, log0: float = 0.0, log1: float = 0.0) -> "TwoView":
-        """Return the views with log f / g of ``log0`` and ``log1`` whose E is nearest to the E of F.
+        """Return the views with log f / g of ``log0`` and ``log1`` whose E is nearest to the E of
+        F.
 
         Four combinations of rotation and sign of t have the same F; the result is one of them. Raises
         ``LinAlgError`` if F is not finite.
@@ -60,20 +66,30 @@ class TwoView:
         return TwoView((2 * np.outer(self.t, self.t) - np.eye(3)) @ self.R, self.t, self.logs)
 
     def depth_signs(self, rays0: Vectors, rays1: Vectors, error: float) -> NDArray[np.float64]:
-        """Return (N,) signs: 1 for a point in front of both cameras, -1 behind both, 0 in front of only one.
+        """Return (N,) signs: 1 for a point in front of both cameras, -1 behind both, 0 in front of
+        only one.
 
-        The point is the least-squares solution of X_1 = R X_0 + t along the rays. With -t the signs are opposite.
-        The sign is NaN if the rays are parallel within ``error`` pixels: the point may be at infinity.
+        The point is the least-squares solution of X_1 = R X_0 + t along the rays. With -t the signs
+        are opposite. The sign is NaN if the rays are parallel within ``error`` pixels: the point
+        may be at infinity.
         """
         ratio0, ratio1 = np.exp(self.logs)
         a, b = (rays0 * (1, 1, ratio0)) @ self.R.T, rays1 * (1, 1, ratio1)
-        aa, bb, ab, at, bt = _row_dots(a, a), _row_dots(b, b), _row_dots(a, b), a @ self.t, b @ self.t
+        aa, bb, ab, at, bt = (
+            _row_dots(a, a),
+            _row_dots(b, b),
+            _row_dots(a, b),
+            a @ self.t,
+            b @ self.t,
+        )
         signs = (np.sign(ab * bt - bb * at) + np.sign(aa * bt - ab * at)) / 2
         apart = np.sqrt(np.maximum(aa * bb - ab**2, 0) / aa) > error  # in pixels, as b is
         return np.where(apart, signs, np.nan)
 
     def tangent(self) -> NDArray[np.float64]:
-        """Return the (9, 7) Jacobian of F's elements, by rotation (3), t on the sphere (2) and logs (2)."""
+        """Return the (9, 7) Jacobian of F's elements, by rotation (3), t on the sphere (2) and logs
+        (2).
+        """
         F, factors = self.fundamental, _focal_factors(self.logs)
         turns = cross_matrix(self.t) @ CROSS @ self.R * factors
         shifts = np.tensordot(self._tangent_basis().T, CROSS, 1) @ self.R * factors
@@ -85,7 +101,9 @@ class TwoView:
         """Return the views after a step (7,) along the columns of :meth:`tangent`."""
         t = self.t + self._tangent_basis() @ step[3:5]
         return TwoView(
-            Rotation.from_rotvec(step[:3]).as_matrix() @ self.R, t / np.linalg.norm(t), self.logs + step[5:]
+            Rotation.from_rotvec(step[:3]).as_matrix() @ self.R,
+            t / np.linalg.norm(t),
+            self.logs + step[5:],
         )
 
     def _tangent_basis(self) -> NDArray[np.float64]:
@@ -97,7 +115,8 @@ class TwoView:
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """A fit to rays (N, 3) of equal ``weight``; ``sigmas`` (2,) are standard deviations of log f / g.
+    """A fit to rays (N, 3) of equal ``weight``; ``sigmas`` (2,) are standard deviations of log f /
+    g.
 
     A sigma of 0 fixes the focal length of that camera.
     """
@@ -108,7 +127,9 @@ class Problem:
     weight: float = 1.0
 
     def cost(self, view: TwoView, scale: float) -> float:
-        """Return :meth:`prior_cost` plus the weighted sum of the robust costs of the Sampson distances."""
+        """Return :meth:`prior_cost` plus the weighted sum of the robust costs of the Sampson
+        distances.
+        """
         distances = sampson(view.fundamental, self.rays0, self.rays1)
         return self.weight * float(np.sum(robust_costs(distances, scale))) + self.prior_cost(view)
 
@@ -117,13 +138,17 @@ class Problem:
         return 0.5 * float(self._precisions @ view.logs**2)
 
     def fit(self, start: TwoView, scale: float) -> TwoView:
-        """Return a local minimum of :meth:`cost` near ``start``, by iteratively reweighted Levenberg-Marquardt."""
+        """Return a local minimum of :meth:`cost` near ``start``, by iteratively reweighted
+        Levenberg-Marquardt.
+        """
         view, cost, damping = start, self.cost(start, scale), FIRST_DAMPING
         for _ in range(MAX_STEPS):
             gradient, curvature = self._derivatives(view, scale)
             while damping < MAX_DAMPING:
                 moved = view.moved(self._step(gradient, curvature, damping))
-                moved_cost = self.cost(moved, scale) if np.abs(moved.logs).max() < MAX_LOG_FOCAL else np.inf
+                moved_cost = (
+                    self.cost(moved, scale) if np.abs(moved.logs).max() < MAX_LOG_FOCAL else np.inf
+                )
                 if moved_cost < cost:
                     break
                 damping *= 10
@@ -173,7 +198,9 @@ class Problem:
 
 
 def robust_costs(distances: Vectors, scale: float) -> Vectors:
-    """Return x^2 / (2 (1 + x^2)), x = distance / scale (Geman and McClure, 1985). An outlier costs 0.5."""
+    """Return x^2 / (2 (1 + x^2)), x = distance / scale (Geman and McClure, 1985). An outlier costs
+    0.5.
+    """
     return np.asarray(0.5 - 0.5 / (1 + np.square(distances / scale)))
 
 
@@ -184,7 +211,9 @@ def sampson(F: Matrix3, rays0: Vectors, rays1: Vectors) -> Vectors:
 
 
 def _lines(F: Matrix3, rays0: Vectors, rays1: Vectors) -> tuple[Vectors, Vectors, Vectors]:
-    """Return the epipolar lines (N, 3) in both images, and the norm (N,) of the gradient of y1^T F y0."""
+    """Return the epipolar lines (N, 3) in both images, and the norm (N,) of the gradient of y1^T F
+    y0.
+    """
     lines0, lines1 = rays1 @ F, rays0 @ F.T
     squares = _row_dots(lines0[:, :2], lines0[:, :2]) + _row_dots(lines1[:, :2], lines1[:, :2])
     return lines0, lines1, np.sqrt(squares) + TINY

@@ -1,8 +1,8 @@
 """The interface of matchers: pictures are encoded one by one, then encodings are matched in pairs.
 
-One contract serves sparse, semi-dense and dense networks. ``encode`` computes everything that depends on one
-picture alone: keypoints and descriptors, or a backbone's feature maps. Encodings of whole images are cached,
-because many pairs share them. ``match`` computes the rest.
+One contract serves sparse, semi-dense and dense networks. ``encode`` computes everything that
+depends on one picture alone: keypoints and descriptors, or a backbone's feature maps. Encodings of
+whole images are cached, because many pairs share them. ``match`` computes the rest.
 """
 
 import re
@@ -78,10 +78,12 @@ class MatcherSpec:
     """The description of a matcher, known before it is loaded."""
 
     name: str
-    options: type = NoOptions  # a frozen dataclass; a recipe's table [matchers.NAME] sets its fields
+    # A frozen dataclass; a recipe's table [matchers.NAME] sets its fields
+    options: type = NoOptions
     colour: Colour = Colour.RGB
     multiple: int = 1  # the sides of pictures are padded to multiples of this
-    slots: tuple[str, ...] = ()  # of the manifest; ``{name}`` stands for the value of option ``name``
+    # Of the manifest; ``{name}`` stands for the value of option ``name``
+    slots: tuple[str, ...] = ()
     licences: tuple[str, ...] = ()  # licence tags of weights outside the manifest
 
     def slots_for(self, options: Any) -> tuple[str, ...]:
@@ -107,7 +109,8 @@ class MatcherSpec:
 class Picture:
     """A matcher's input: the ``pixels`` of a ``view``, uint8, (H, W, 3) RGB or (H, W) gray.
 
-    The image fills the top-left ``content``. The rest is padding, where a matcher must return no points.
+    The image fills the top-left ``content``. The rest is padding, where a matcher must return no
+    points.
     """
 
     pixels: Pixels
@@ -130,12 +133,14 @@ class Matcher(Protocol[Encoding]):
     def encode(self, pictures: Sequence[Picture]) -> Sequence[Encoding]:
         """Encode pictures of one shape.
 
-        Encodings are dataclasses, tuples or lists of arrays, whose bytes the cache counts. An array must not
-        be a view of a larger one, which the cache would keep in memory.
+        Encodings are dataclasses, tuples or lists of arrays, whose bytes the cache counts. An array
+        must not be a view of a larger one, which the cache would keep in memory.
         """
         ...
 
-    def match(self, encodings0: Sequence[Encoding], encodings1: Sequence[Encoding]) -> Sequence[Matches]:
+    def match(
+        self, encodings0: Sequence[Encoding], encodings1: Sequence[Encoding]
+    ) -> Sequence[Matches]:
         """Return the matches of each pair of encodings, in view pixels. A pair may have none."""
         ...
 
@@ -143,7 +148,9 @@ class Matcher(Protocol[Encoding]):
 class PairwiseMatcher(Generic[Encoding]):
     """A matcher that matches pairs one by one, so that results do not depend on the minibatch."""
 
-    def match(self, encodings0: Sequence[Encoding], encodings1: Sequence[Encoding]) -> list[Matches]:
+    def match(
+        self, encodings0: Sequence[Encoding], encodings1: Sequence[Encoding]
+    ) -> list[Matches]:
         import torch  # here: the import takes seconds, and specs need no torch
 
         with torch.inference_mode():

@@ -1,4 +1,6 @@
-"""The adapter of dense networks, which encodes each picture and samples matches from a pair's warps."""
+"""The adapter of dense networks, which encodes each picture and samples matches from a pair's
+warps.
+"""
 
 import zlib
 from collections.abc import Sequence
@@ -53,10 +55,11 @@ class DenseEncoding(NamedTuple):
 
 
 class DenseMatcher(PairwiseMatcher[DenseEncoding]):
-    """A dense matcher. A match's score is its certainty; the random seed depends on the two pictures alone.
+    """A dense matcher. A match's score is its certainty; the random seed depends on the two
+    pictures alone.
 
-    Pictures and pairs are processed one by one, so that results do not depend on the batch. Sides in the first
-    pass are multiples of ``multiple``.
+    Pictures and pairs are processed one by one, so that results do not depend on the batch. Sides
+    in the first pass are multiples of ``multiple``.
     """
 
     def __init__(
@@ -90,12 +93,16 @@ class DenseMatcher(PairwiseMatcher[DenseEncoding]):
         if first_scale is not None:
             size = max(MIN_SIDE_PX, height), max(MIN_SIDE_PX, width)
             second = network_input(pixels, size).to(self.device)
-        return DenseEncoding(self._network.encode(first, second), picture.content, zlib.crc32(content.data))
+        return DenseEncoding(
+            self._network.encode(first, second), picture.content, zlib.crc32(content.data)
+        )
 
     def _first_size(self, content: Size, scale: float) -> tuple[int, int]:
         """Return the height and width of the first pass's picture, multiples of ``multiple``."""
         multiple = self._multiple
-        rows, columns = (multiple * max(1, round(side * scale / multiple)) for side in reversed(content))
+        rows, columns = (
+            multiple * max(1, round(side * scale / multiple)) for side in reversed(content)
+        )
         return rows, columns
 
     def _match(self, first: DenseEncoding, second: DenseEncoding) -> Matches:
@@ -103,10 +110,13 @@ class DenseMatcher(PairwiseMatcher[DenseEncoding]):
         warp = torch.cat([dense.warp.reshape(-1, 4) for dense in warps])
         certainty = torch.cat([dense.certainty.flatten() for dense in warps])
         check_finite(f"certainties of {self.spec.name}", certainty, warp)
-        # PyTorch's CPU generator uses 32 bits of a seed, so the two checksums are combined into 32 bits.
+        # PyTorch's CPU generator uses 32 bits of a seed, so the two checksums are combined into 32
+        # bits.
         seed = zlib.crc32(second.checksum.to_bytes(4), first.checksum)
         generator = torch.Generator(warp.device).manual_seed(seed)
-        index = sample_matches(warp, certainty, self._options.matches, self._options.threshold, generator)
+        index = sample_matches(
+            warp, certainty, self._options.matches, self._options.threshold, generator
+        )
         points = warp[index].cpu().numpy()
         return Matches(
             from_normalised(points[:, :2], first.content),

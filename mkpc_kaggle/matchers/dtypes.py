@@ -21,7 +21,9 @@ def exact_float32() -> Iterator[None]:
     import torch
 
     cudnn, product = torch.backends.cudnn, torch.backends.cuda.matmul
-    settings: tuple[Any, ...] = (cudnn.conv, product) if hasattr(cudnn, "conv") else (cudnn, product)
+    settings: tuple[Any, ...] = (
+        (cudnn.conv, product) if hasattr(cudnn, "conv") else (cudnn, product)
+    )
     # The setting's name and value since PyTorch 2.9, and before.
     name, exact = ("fp32_precision", "ieee") if hasattr(cudnn, "conv") else ("allow_tf32", False)
     former = [getattr(setting, name) for setting in settings]
@@ -41,12 +43,17 @@ def check_finite(what: str, *values: Any) -> None:
     costs one pass over the tensors and one synchronisation with the device.
     """
     arrays = arrays_of(values)
-    tensors = [array for array in arrays if hasattr(array, "is_floating_point") and array.is_floating_point()]
+    tensors = [
+        array
+        for array in arrays
+        if hasattr(array, "is_floating_point") and array.is_floating_point()
+    ]
     if not tensors:
         return
     import torch
 
-    # A sum is infinite or NaN if any of its terms is. Half precision is summed in float32 to prevent overflow.
+    # A sum is infinite or NaN if any of its terms is. Half precision is summed in float32 to
+    # prevent overflow.
     sums = [tensor.sum(dtype=torch.float32) for tensor in tensors]
     if not bool(torch.stack(sums).isfinite().all()):
         raise NonFiniteError(f"{what} are not finite")

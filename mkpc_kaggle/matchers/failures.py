@@ -1,4 +1,5 @@
-"""Kinds of matcher errors: out of memory, a failed device, or a pair that the matcher cannot process.
+"""Kinds of matcher errors: out of memory, a failed device, or a pair that the matcher cannot
+process.
 
 The text of an error decides its kind, since types differ between versions: a failed kernel raises a plain
 ``RuntimeError`` up to PyTorch 2.7 and a ``torch.AcceleratorError`` since 2.8. After most device errors every
@@ -11,8 +12,9 @@ from enum import Enum, auto
 
 from mkpc_kaggle.errors import UserError
 
-# The sources, in order: Python, PyTorch and the CUDA runtime; PyTorch on a CPU and OpenCV; cuBLAS and cuDNN 9;
-# PyTorch's search for a convolution that fits into the free memory, in its current wording and in that until 1.13.
+# The sources, in order: Python, PyTorch and the CUDA runtime; PyTorch on a CPU and OpenCV; cuBLAS
+# and cuDNN 9; PyTorch's search for a convolution that fits into the free memory, in its current
+# wording and in that until 1.13.
 _OUT_OF_MEMORY = re.compile(
     "MemoryError|OutOfMemory|out of memory|can't allocate memory|Insufficient memory|Failed to allocate"
     "|_STATUS_ALLOC_FAILED|ALLOCATION_FAILED|unable to find an engine|Unable to find a valid cuDNN algorithm"
@@ -23,7 +25,8 @@ _DEVICE = re.compile(
 )
 
 
-matched_in: set[int] = set()  # ids of this process and of the ancestors it was forked from, if they matched pairs
+# Ids of this process and of the ancestors it was forked from, if they matched pairs
+matched_in: set[int] = set()
 
 
 class FailureKind(Enum):
@@ -53,7 +56,8 @@ def reason_of(error: BaseException) -> str:
 def require_unforked() -> None:
     """Raise :class:`UserError` in a child that was forked after its parent had matched pairs.
 
-    A forked child inherits no threads of PyTorch and OpenCV but waits for them, even with a new matcher.
+    A forked child inherits no threads of PyTorch and OpenCV but waits for them, even with a new
+    matcher.
     """
     matched_in.add(os.getpid())
     if len(matched_in) > 1:

@@ -39,7 +39,9 @@ class LightGlueOptions(KeypointOptions):
     def __post_init__(self) -> None:
         super().__post_init__()
         share = Range(-1, 1)
-        check_ranges(self, depth_confidence=share, width_confidence=share, filter_threshold=Range(0, 1))
+        check_ranges(
+            self, depth_confidence=share, width_confidence=share, filter_threshold=Range(0, 1)
+        )
 
     @property
     def adaptation(self) -> Adaptation:
@@ -49,7 +51,9 @@ class LightGlueOptions(KeypointOptions):
 class LightGlueMatcher(PairwiseMatcher[Keypoints]):
     """LightGlue on an encoder's keypoints. Scores are LightGlue's."""
 
-    def __init__(self, spec: MatcherSpec, encode: Encode, glue: LightGlue, placement: Placement) -> None:
+    def __init__(
+        self, spec: MatcherSpec, encode: Encode, glue: LightGlue, placement: Placement
+    ) -> None:
         self.spec = spec
         self.placement = placement
         self.encode = encode
@@ -67,7 +71,9 @@ class LightGlueMatcher(PairwiseMatcher[Keypoints]):
 
 
 def _positions(keypoints: Keypoints) -> Tensor:
-    """Return what LightGlue knows of each keypoint's place, (K, 2), or (K, 4) with scale and orientation."""
+    """Return what LightGlue knows of each keypoint's place, (K, 2), or (K, 4) with scale and
+    orientation.
+    """
     points = normalised(keypoints.points, *keypoints.content)
     if keypoints.scales is None or keypoints.orientations is None:
         return points

@@ -14,7 +14,8 @@ BLOCK_ROWS = 2048
 
 @dataclass(frozen=True)
 class Neighbours:
-    """M mutual pairs: ``index0``, ``index1`` (M,) int64, ``similarity`` (M,) cosine in -1..1, ``ratio`` (M,).
+    """M mutual pairs: ``index0``, ``index1`` (M,) int64, ``similarity`` (M,) cosine in -1..1,
+    ``ratio`` (M,).
 
     A ratio is the nearest over the second nearest distance, the larger one of the two directions.
     """
@@ -32,14 +33,19 @@ class NeighbourMatcher(PairwiseMatcher[Keypoints]):
 
     def _match(self, first: Keypoints, second: Keypoints) -> Matches:
         pairs = mutual_neighbours(first.descriptors, second.descriptors, self.ratio)
-        return matches_of(first.points, second.points, pairs.index0, pairs.index1, self._scores(pairs))
+        return matches_of(
+            first.points, second.points, pairs.index0, pairs.index1, self._scores(pairs)
+        )
 
     def _scores(self, pairs: Neighbours) -> Tensor:
         return pairs.similarity
 
 
-def mutual_neighbours(descriptors0: Tensor, descriptors1: Tensor, max_ratio: float = 1.0) -> Neighbours:
-    """Pair unit descriptors (N, D) and (M, D) that are each other's nearest, in the order of the first image.
+def mutual_neighbours(
+    descriptors0: Tensor, descriptors1: Tensor, max_ratio: float = 1.0
+) -> Neighbours:
+    """Pair unit descriptors (N, D) and (M, D) that are each other's nearest, in the order of the
+    first image.
 
     Ties go to the lower index. A missing second neighbour counts as one at the maximum distance.
     Pairs with a ratio above ``max_ratio`` are dropped.
@@ -48,7 +54,8 @@ def mutual_neighbours(descriptors0: Tensor, descriptors1: Tensor, max_ratio: flo
         nothing = descriptors0.new_zeros(0)
         return Neighbours(nothing.long(), nothing.long(), nothing, nothing)
     similarity, ratio0, nearest0 = _nearest(descriptors0, descriptors1)
-    index0 = (ratio0 <= max_ratio).nonzero()[:, 0]  # few pass a low ratio; only these need the other direction
+    # Few pass a low ratio; only these need the other direction
+    index0 = (ratio0 <= max_ratio).nonzero()[:, 0]
     index1 = nearest0[index0]
     _, ratio1, nearest1 = _nearest(descriptors1[index1], descriptors0)
     ratio = torch.maximum(ratio0[index0], ratio1)
@@ -57,14 +64,19 @@ def mutual_neighbours(descriptors0: Tensor, descriptors1: Tensor, max_ratio: flo
 
 
 def _nearest(queries: Tensor, keys: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return each query's highest similarity, distance ratio and index of the nearest key, all (N,)."""
+    """Return each query's highest similarity, distance ratio and index of the nearest key, all
+    (N,).
+    """
     parts = []
     for block in torch.split(queries, BLOCK_ROWS):
         similarity = block @ keys.T  # (rows, M)
         best, index = similarity.max(dim=1)
         similarity.scatter_(1, index[:, None], -1.0)
         second = similarity.amax(dim=1)
-        # Distances of unit vectors are sqrt(2 - 2 s); the ratio of two neighbours at distance 0 is 1.
-        parts.append((best, ((1 - best).clamp(min=1e-12) / (1 - second).clamp(min=1e-12)).sqrt(), index))
+        # Distances of unit vectors are sqrt(2 - 2 s); the ratio of two neighbours at distance 0 is
+        # 1.
+        parts.append(
+            (best, ((1 - best).clamp(min=1e-12) / (1 - second).clamp(min=1e-12)).sqrt(), index)
+        )
     best, ratio, index = map(torch.cat, zip(*parts, strict=True))
     return best, ratio, index

@@ -1,4 +1,5 @@
-"""The registry of matchers: each file of ``adapters/`` is a matcher, with a ``SPEC`` and a ``load``.
+"""The registry of matchers: each file of ``adapters/`` is a matcher, with a ``SPEC`` and a
+``load``.
 
 Matchers of the library vismatch are named ``vismatch:NAME``.
 """
@@ -14,11 +15,14 @@ from mkpc_kaggle.matchers import adapters
 from mkpc_kaggle.matchers.contract import Matcher, MatcherSpec, Placement
 from mkpc_kaggle.weights import WeightStore
 
-VISMATCH = "vismatch:"  # begins the names of vismatch's matchers, which need no file in ``adapters/``
+# Begins the names of vismatch's matchers, which need no file in ``adapters/``
+VISMATCH = "vismatch:"
 
 
 class UnusableError(UserError):
-    """Error for a matcher that cannot be imported on this machine; ``__cause__`` is the error of the import."""
+    """Error for a matcher that cannot be imported on this machine; ``__cause__`` is the error of
+    the import.
+    """
 
 
 @cache
@@ -28,7 +32,8 @@ def matcher_names() -> tuple[str, ...]:
 
 
 def spec_of(name: str, where: str) -> MatcherSpec:
-    """Import a matcher and return its spec. Error messages start with ``where``, the source of the name.
+    """Import a matcher and return its spec. Error messages start with ``where``, the source of the
+    name.
 
     Raises :class:`UserError` for an unknown name, :class:`UnusableError` if the import fails.
     """
@@ -36,8 +41,12 @@ def spec_of(name: str, where: str) -> MatcherSpec:
     return spec
 
 
-def load_matcher(name: str, weights: WeightStore, options: Any, placement: Placement) -> Matcher[Any]:
-    """Return the matcher, ready to run. Raise :class:`UserError` if its weights are missing or damaged."""
+def load_matcher(
+    name: str, weights: WeightStore, options: Any, placement: Placement
+) -> Matcher[Any]:
+    """Return the matcher, ready to run. Raise :class:`UserError` if its weights are missing or
+    damaged.
+    """
     matcher: Matcher[Any] = _imported(name, "load").load(weights, options, placement)
     return matcher
 
@@ -75,7 +84,9 @@ def _imported(name: str, where: str) -> Any:
 
 
 def require_matchers(matchers: Mapping[str, Matcher[Any]]) -> Mapping[str, Matcher[Any]]:
-    """Return the user's matchers if they are a mapping from names to matchers, else raise ``TypeError``."""
+    """Return the user's matchers if they are a mapping from names to matchers, else raise
+    ``TypeError``.
+    """
     if not isinstance(matchers, Mapping):
         raise TypeError(f"matchers are a mapping from names to matchers, not {matchers!r}")
     for name, matcher in matchers.items():

@@ -1,4 +1,6 @@
-"""The adapter of semi-dense networks, which encodes each picture and matches the coarse cells of a pair."""
+"""The adapter of semi-dense networks, which encodes each picture and matches the coarse cells of a
+pair.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,7 +13,13 @@ from mkpc_kaggle.config import SHARE, check_ranges
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Size, from_corner
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.matchers.contract import MatcherSpec, PairwiseMatcher, Picture, Placement, TrainedOptions
+from mkpc_kaggle.matchers.contract import (
+    MatcherSpec,
+    PairwiseMatcher,
+    Picture,
+    Placement,
+    TrainedOptions,
+)
 from mkpc_kaggle.matchers.networks.fine_matching import COARSE_STRIDE
 from mkpc_kaggle.matchers.networks.placement import prepared
 from mkpc_kaggle.matchers.networks.resnet_fpn import FeatureMaps
@@ -20,7 +28,8 @@ from mkpc_kaggle.matchers.sparse import image_batch
 from mkpc_kaggle.weights import WeightStore, load_into
 
 PREFIX = "matcher."  # of parameter names in the published training checkpoints
-TRANSPORT = "coarse_matching.bin_score"  # a parameter that only checkpoints with optimal transport have
+# A parameter that only checkpoints with optimal transport have
+TRANSPORT = "coarse_matching.bin_score"
 
 
 @dataclass(frozen=True)
@@ -69,9 +78,14 @@ class SemiDenseMatcher(PairwiseMatcher[SemiDenseEncoding]):
 
     def _match(self, first: SemiDenseEncoding, second: SemiDenseEncoding) -> Matches:
         masks = first.mask, second.mask
-        # No masks for pictures without padding: even a mask that is True everywhere can change rounding.
-        found = self._network.match(first.maps, second.maps, None if all(mask.all() for mask in masks) else masks)
-        points0, points1 = (from_corner(points.float().cpu().numpy()) for points in (found.points0, found.points1))
+        # No masks for pictures without padding: even a mask that is True everywhere can change
+        # rounding.
+        found = self._network.match(
+            first.maps, second.maps, None if all(mask.all() for mask in masks) else masks
+        )
+        points0, points1 = (
+            from_corner(points.float().cpu().numpy()) for points in (found.points0, found.points1)
+        )
         return Matches(points0, points1, found.coarse.scores.float().cpu().numpy())
 
 
@@ -84,10 +98,11 @@ def load_semi_dense(
     *,
     unused: str = "$^",
 ) -> SemiDenseMatcher:
-    """Load the published checkpoint into a network, and remove the training wrapper's prefix from names.
+    """Load the published checkpoint into a network, and remove the training wrapper's prefix from
+    names.
 
-    Names that match ``unused`` are ignored, and so are position tables, which the network computes. Raises
-    :class:`UserError` for weights that were trained with optimal transport.
+    Names that match ``unused`` are ignored, and so are position tables, which the network computes.
+    Raises :class:`UserError` for weights that were trained with optimal transport.
     """
     (slot,) = spec.slots_for(options)
     tensors = {name.removeprefix(PREFIX): tensor for name, tensor in weights.load(slot).items()}

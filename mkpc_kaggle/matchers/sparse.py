@@ -1,4 +1,6 @@
-"""Shared parts of keypoint matchers: keypoints of a picture, encoders, matches from pairs of indices."""
+"""Shared parts of keypoint matchers: keypoints of a picture, encoders, matches from pairs of
+indices.
+"""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -26,9 +28,11 @@ class KeypointOptions:
 
 @dataclass(frozen=True, eq=False)
 class Keypoints:
-    """K keypoints of one picture: ``points`` (K, 2) float32 in view pixels, unit ``descriptors`` (K, D).
+    """K keypoints of one picture: ``points`` (K, 2) float32 in view pixels, unit ``descriptors``
+    (K, D).
 
-    If the detector has them: ``scales`` (K,), diameters in view pixels, and ``orientations`` (K,), radians.
+    If the detector has them: ``scales`` (K,), diameters in view pixels, and ``orientations`` (K,),
+    radians.
     """
 
     points: Tensor
@@ -38,8 +42,12 @@ class Keypoints:
     orientations: Tensor | None = None
 
     @classmethod
-    def on_content(cls, points: Tensor, descriptors: Tensor, content: Size, *shapes: Tensor) -> "Keypoints":
-        """Return the keypoints on the content, none on the padding; ``shapes``: scales and orientations."""
+    def on_content(
+        cls, points: Tensor, descriptors: Tensor, content: Size, *shapes: Tensor
+    ) -> "Keypoints":
+        """Return the keypoints on the content, none on the padding; ``shapes``: scales and
+        orientations.
+        """
         upper = points.new_tensor(content) - 0.5
         kept = ((points >= -0.5) & (points < upper)).all(dim=1)
         return cls(points[kept], descriptors[kept], content, *(shape[kept] for shape in shapes))
@@ -65,13 +73,21 @@ def keypoint_encoder(detect: Detector, placement: Placement) -> Encode:
     return encode
 
 
-def matches_of(points0: Tensor, points1: Tensor, index0: Tensor, index1: Tensor, scores: Tensor) -> Matches:
-    """Return the matches that pair point ``index0[i]`` of one picture with ``index1[i]`` of the other."""
-    return Matches(points0[index0].cpu().numpy(), points1[index1].cpu().numpy(), scores.cpu().numpy())
+def matches_of(
+    points0: Tensor, points1: Tensor, index0: Tensor, index1: Tensor, scores: Tensor
+) -> Matches:
+    """Return the matches that pair point ``index0[i]`` of one picture with ``index1[i]`` of the
+    other.
+    """
+    return Matches(
+        points0[index0].cpu().numpy(), points1[index1].cpu().numpy(), scores.cpu().numpy()
+    )
 
 
 def image_batch(pictures: Sequence[Picture], device: str) -> Tensor:
-    """Convert pictures of one shape to float32 in [0, 1]: (B, 3, H, W) for RGB, (B, 1, H, W) for gray."""
+    """Convert pictures of one shape to float32 in [0, 1]: (B, 3, H, W) for RGB, (B, 1, H, W) for
+    gray.
+    """
     stacked = np.stack([picture.pixels for picture in pictures])
     batch = torch.from_numpy(stacked).to(device)
     batch = batch[:, None] if stacked.ndim == 3 else batch.permute(0, 3, 1, 2)

@@ -1,7 +1,7 @@
 """Adapter of vismatch's matchers (https://github.com/gmberton/vismatch, version 1.4).
 
-A recipe's unit names one as ``matcher = "vismatch:NAME"``. vismatch itself downloads the weights of a matcher
-when it is first loaded, so the first run needs internet.
+A recipe's unit names one as ``matcher = "vismatch:NAME"``. vismatch itself downloads the weights of
+a matcher when it is first loaded, so the first run needs internet.
 
 vismatch's ``get_matcher(NAME)`` returns a callable that maps two images to a dict. The adapter reads
 ``matched_kpts0`` and ``matched_kpts1``, (N, 2) pixels (x, y) before vismatch's RANSAC, and
@@ -48,9 +48,13 @@ class Adapter:
     def SPEC(self) -> MatcherSpec:  # noqa: N802  the name of a module's constant
         return MatcherSpec(f"{VISMATCH}{self.name}", VismatchOptions, licences=(LICENCE,))
 
-    def load(self, weights: WeightStore, options: VismatchOptions, placement: Placement) -> "VismatchMatcher":
+    def load(
+        self, weights: WeightStore, options: VismatchOptions, placement: Placement
+    ) -> "VismatchMatcher":
         vismatch = import_module("vismatch")
-        matcher = vismatch.get_matcher(self.name, device=placement.device, max_num_keypoints=options.keypoints)
+        matcher = vismatch.get_matcher(
+            self.name, device=placement.device, max_num_keypoints=options.keypoints
+        )
         return VismatchMatcher(
             matcher,
             f"{VISMATCH}{self.name}",
@@ -67,7 +71,8 @@ def adapter_of(name: str) -> Adapter:
 
 
 class VismatchMatcher(PairwiseMatcher[Picture]):
-    """A vismatch matcher for :class:`mkpc_kaggle.TwoStageMatcher`; ``name`` as in the recipe's units.
+    """A vismatch matcher for :class:`mkpc_kaggle.TwoStageMatcher`; ``name`` as in the recipe's
+    units.
 
     With ``corner``, the origin of points is the image's top-left corner, as in RoMa, DKM and LoMa; otherwise it is
     the centre of the top-left pixel. Sides are padded to multiples of ``multiple``, because many matchers resize
@@ -94,10 +99,20 @@ class VismatchMatcher(PairwiseMatcher[Picture]):
 
     def _match(self, picture0: Picture, picture1: Picture) -> Matches:
         # (3, H, W) float32 in 0..1, padding included, so the sides are multiples.
-        both = (torch.from_numpy(each.pixels).permute(2, 0, 1).float() / 255 for each in (picture0, picture1))
+        both = (
+            torch.from_numpy(each.pixels).permute(2, 0, 1).float() / 255
+            for each in (picture0, picture1)
+        )
         found = self._matcher(*both)
-        points = [np.asarray(found[f"matched_kpts{number}"], np.float32).reshape(-1, 2) for number in (0, 1)]
+        points = [
+            np.asarray(found[f"matched_kpts{number}"], np.float32).reshape(-1, 2)
+            for number in (0, 1)
+        ]
         points0, points1 = map(from_corner, points) if self._corner else points
         confidences = found.get("matched_confidences")
-        scores = np.ones(len(points0), np.float32) if confidences is None else np.asarray(confidences, np.float32)
+        scores = (
+            np.ones(len(points0), np.float32)
+            if confidences is None
+            else np.asarray(confidences, np.float32)
+        )
         return Matches(points0, points1, scores)

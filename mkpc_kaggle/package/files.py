@@ -11,7 +11,9 @@ from mkpc_kaggle.pipeline.availability import fit_of
 from mkpc_kaggle.weights import FoundFile, State, WeightFile, WeightStore
 from mkpc_kaggle.weights.checkpoint import convert
 
-HEADER = "# The weights of this dataset; the columns are name, bytes, digest, licence, slot, source.\n"
+HEADER = (
+    "# The weights of this dataset; the columns are name, bytes, digest, licence, slot, source.\n"
+)
 
 
 @dataclass(frozen=True)
@@ -25,7 +27,9 @@ class Item:
 
 
 def refuse_other_files(directory: Path, items: Sequence[Item]) -> None:
-    """Raise :class:`UserError` if the folder has files that are not in ``items``: they would be uploaded too."""
+    """Raise :class:`UserError` if the folder has files that are not in ``items``: they would be
+    uploaded too.
+    """
     names = {name for item in items for name in (item.name, f".{item.name}.part")}
     others = sorted({path.name for path in directory.glob("*")} - names)
     if others:
@@ -36,7 +40,8 @@ def refuse_other_files(directory: Path, items: Sequence[Item]) -> None:
 
 
 def write_files(directory: Path, items: Sequence[Item]) -> tuple[Item, ...]:
-    """Write the items into the folder, except identical existing files. Return the items with their new paths.
+    """Write the items into the folder, except identical existing files. Return the items with their
+    new paths.
 
     Raises :class:`UserError` if a file cannot be written. A repeated call resumes.
     """
@@ -57,7 +62,9 @@ def write_files(directory: Path, items: Sequence[Item]) -> tuple[Item, ...]:
 
 @dataclass(frozen=True)
 class ChosenWeights:
-    """The files to include, the texts of their licences, and the files that must not be redistributed."""
+    """The files to include, the texts of their licences, and the files that must not be
+    redistributed.
+    """
 
     items: tuple[Item, ...]
     manifest: str  # a line per item
@@ -65,8 +72,11 @@ class ChosenWeights:
     restricted: tuple[Item, ...]  # excluded unless the package is private
 
 
-def choose_weights(store: WeightStore, checkout: Path, staging: Path, *, private: bool) -> ChosenWeights:
-    """Choose the file of each slot in the store, as safetensors, since Kaggle would unpack a torch checkpoint.
+def choose_weights(
+    store: WeightStore, checkout: Path, staging: Path, *, private: bool
+) -> ChosenWeights:
+    """Choose the file of each slot in the store, as safetensors, since Kaggle would unpack a torch
+    checkpoint.
 
     Conversions are written to ``staging``. A licence allows redistribution if the checkout has its
     text. Raises :class:`UserError` if a slot has only damaged files, or a checkpoint cannot be read
@@ -80,7 +90,10 @@ def choose_weights(store: WeightStore, checkout: Path, staging: Path, *, private
     notes = [_note(found, store) for found in shipped]
     files = [_as_safetensors(found, staging) for found in shipped]
     return ChosenWeights(
-        tuple(Item(file.name, path, file.licence, note) for (file, path), note in zip(files, notes, strict=True)),
+        tuple(
+            Item(file.name, path, file.licence, note)
+            for (file, path), note in zip(files, notes, strict=True)
+        ),
         HEADER + "".join(f"{file.line}\n" for file, _ in files),
         tuple(Item(path.name, path) for path in sorted(texts) if path.name != "LICENSE"),
         tuple(Item(found.file.name, found.path, found.file.licence) for found in restricted),
@@ -88,7 +101,9 @@ def choose_weights(store: WeightStore, checkout: Path, staging: Path, *, private
 
 
 def licence_text(checkout: Path, tag: str) -> Path | None:
-    """Return the path of a licence's text if the checkout has it. ``tag`` is its name in the manifest."""
+    """Return the path of a licence's text if the checkout has it. ``tag`` is its name in the
+    manifest.
+    """
     texts = {path.stem: path for path in (checkout / "licences").glob("*.txt")}
     return (texts | {"Apache-2.0": checkout / "LICENSE"}).get(tag)
 
@@ -97,7 +112,9 @@ def _note(found: FoundFile, store: WeightStore) -> str:
     """Return a note on digest and networks. Raise :class:`UserError` if no network takes the file."""
     fit = fit_of(found, store)
     if fit.is_refused:
-        raise UserError(f"{found.path}: {fit.text}. Remove it from the directory, or fetch the right file.")
+        raise UserError(
+            f"{found.path}: {fit.text}. Remove it from the directory, or fetch the right file."
+        )
     verified = "" if found.state is State.GOOD else "its original is not verified"
     return "; ".join(filter(None, [verified, fit.text]))
 
@@ -117,6 +134,7 @@ def _as_safetensors(found: FoundFile, staging: Path) -> tuple[WeightFile, Path]:
     """Return the manifest line and path of a file as safetensors, converted if necessary."""
     if found.path.suffix == ".safetensors":
         return replace(found.file, size=found.path.stat().st_size, digest=found.digest), found.path
-    # The full name, with its suffix: the manifest may list another conversion under the shorter name.
+    # The full name, with its suffix: the manifest may list another conversion under the shorter
+    # name.
     path = staging / f"{found.file.name}.safetensors"
     return convert(found.path, path, found.file), path

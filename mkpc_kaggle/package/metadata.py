@@ -1,4 +1,6 @@
-"""The JSON files that the ``kaggle`` command reads (its docs/datasets_metadata.md and kernels_metadata.md)."""
+"""The JSON files that the ``kaggle`` command reads (its docs/datasets_metadata.md and
+kernels_metadata.md).
+"""
 
 import json
 import re
@@ -10,9 +12,11 @@ from mkpc_kaggle.version import __version__
 COMPETITION = "image-matching-challenge-2022"
 DATASET_SLUG = "mkpc-kaggle"
 KERNEL_TITLE = "MKPC submission"
-KERNEL_SLUG = KERNEL_TITLE.lower().replace(" ", "-")  # Kaggle derives the slug from the title; both must agree
+# Kaggle derives the slug from the title; both must agree
+KERNEL_SLUG = KERNEL_TITLE.lower().replace(" ", "-")
 LATEST, ORIGINAL = "latest", "original"
-# ALIKED-n16 and its LightGlue on Kaggle Models: the store finds the files below /kaggle/input by their digests.
+# ALIKED-n16 and its LightGlue on Kaggle Models: the store finds the files below /kaggle/input by
+# their digests.
 MODELS = ("oldufo/aliked/pyTorch/aliked-n16/1", "oldufo/lightglue/pyTorch/aliked/1")
 
 
@@ -26,7 +30,9 @@ def check_owner(owner: str) -> None:
 
 
 def dataset_metadata(owner: str, licences: Iterable[str]) -> str:
-    """Return ``dataset-metadata.json``. Kaggle allows one licence per dataset; the description lists all."""
+    """Return ``dataset-metadata.json``. Kaggle allows one licence per dataset; the description
+    lists all.
+    """
     return _json(
         {
             "id": f"{owner}/{DATASET_SLUG}",
@@ -43,15 +49,21 @@ def dataset_metadata(owner: str, licences: Iterable[str]) -> str:
 def kernel_metadata(
     owner: str, notebook: str, image: str, *, has_gpu: bool = True, models: Sequence[str] = ()
 ) -> str:
-    """Return ``kernel-metadata.json``: internet off, the competition, our dataset and ``models`` attached.
+    """Return ``kernel-metadata.json``: internet off, the competition, our dataset and ``models``
+    attached.
 
-    With ``has_gpu``, the notebook asks for two T4 GPUs. Without weights they would idle and use up the quota.
+    With ``has_gpu``, the notebook asks for two T4 GPUs. Without weights they would idle and use up
+    the quota.
 
     ``image`` is ``latest``, ``original`` (the image of the kernel's first version), or an image with the digest
     that ``kaggle kernels pull -m`` reports. Raises :class:`UserError` for other values.
     """
-    if image not in (LATEST, ORIGINAL) and not re.fullmatch(r"[\w./:-]+@sha256:[0-9a-f]{64}", image):
-        raise UserError(f"--image {image}: give {LATEST}, {ORIGINAL}, or an image as NAME@sha256:DIGEST")
+    if image not in (LATEST, ORIGINAL) and not re.fullmatch(
+        r"[\w./:-]+@sha256:[0-9a-f]{64}", image
+    ):
+        raise UserError(
+            f"--image {image}: give {LATEST}, {ORIGINAL}, or an image as NAME@sha256:DIGEST"
+        )
     pinned = {"docker_image": image} if "@" in image else {}
     return _json(
         {
@@ -75,7 +87,9 @@ def kernel_metadata(
 
 
 def dataset_page(licences: Iterable[str]) -> str:
-    """Return the dataset's ``README.md``. The project's own has pictures and links that Kaggle cannot show."""
+    """Return the dataset's ``README.md``. The project's own has pictures and links that Kaggle
+    cannot show.
+    """
     named = ", ".join(sorted(set(licences))) or "none, this dataset has no weights"
     return f"""\
 # MKPC Kaggle {__version__}

@@ -15,7 +15,14 @@ from mkpc_kaggle.package.metadata import (
     dataset_page,
     kernel_metadata,
 )
-from mkpc_kaggle.package.wheels import PYTHONS, build_wheel, collect_wheels, install_lines, licence_of, pins
+from mkpc_kaggle.package.wheels import (
+    PYTHONS,
+    build_wheel,
+    collect_wheels,
+    install_lines,
+    licence_of,
+    pins,
+)
 from mkpc_kaggle.weights import WeightStore
 from mkpc_kaggle.weights.manifest import MANIFEST
 
@@ -44,14 +51,19 @@ class Package:
 
 
 def make_package(request: Request) -> Package:
-    """Write the folders of dataset and kernel, and return their files. The same request gives the same bytes.
+    """Write the folders of dataset and kernel, and return their files. The same request gives the
+    same bytes.
 
-    Raises :class:`UserError` before anything is written: if the package runs outside a checkout, a folder has
-    other files, weights are damaged, or wheels cannot be built or found.
+    Raises :class:`UserError` before anything is written: if the package runs outside a checkout, a
+    folder has other files, weights are damaged, or wheels cannot be built or found.
     """
     check_owner(request.owner)
-    if wrong := [python for python in request.pythons if not re.fullmatch(r"3\.[0-9]{1,2}", python)]:
-        raise UserError(f"--python {wrong[0][:20]!r}: expected versions of Python 3 such as {','.join(PYTHONS)}")
+    if wrong := [
+        python for python in request.pythons if not re.fullmatch(r"3\.[0-9]{1,2}", python)
+    ]:
+        raise UserError(
+            f"--python {wrong[0][:20]!r}: expected versions of Python 3 such as {','.join(PYTHONS)}"
+        )
     if request.wheels is not None and not request.wheels.is_dir():
         raise UserError(f"--wheels {request.wheels}: no such directory")
     checkout = find_checkout()
@@ -63,7 +75,9 @@ def make_package(request: Request) -> Package:
             (staging / name).write_text(content, encoding="utf-8", newline="\n")
             return Item(name, staging / name)
 
-        chosen = choose_weights(WeightStore(request.weights), checkout, staging, private=request.private)
+        chosen = choose_weights(
+            WeightStore(request.weights), checkout, staging, private=request.private
+        )
         licences = [item.licence for item in chosen.items]
         kernel_json = kernel_metadata(
             request.owner,
@@ -92,11 +106,17 @@ def make_package(request: Request) -> Package:
         )
         refuse_other_files(dataset, dataset_items)
         refuse_other_files(kernel, kernel_items)
-        return Package(write_files(dataset, dataset_items), write_files(kernel, kernel_items), chosen.restricted)
+        return Package(
+            write_files(dataset, dataset_items),
+            write_files(kernel, kernel_items),
+            chosen.restricted,
+        )
 
 
 def find_checkout() -> Path:
-    """Return the checkout that this package runs from. Raise :class:`UserError` for an installed wheel."""
+    """Return the checkout that this package runs from. Raise :class:`UserError` for an installed
+    wheel.
+    """
     root = Path(__file__).resolve().parents[2]
     if not (root / NOTEBOOK).is_file():
         raise UserError(

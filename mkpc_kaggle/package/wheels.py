@@ -1,4 +1,6 @@
-"""Our wheel, built from the checkout, and wheels of dependencies that may be missing in Kaggle's image."""
+"""Our wheel, built from the checkout, and wheels of dependencies that may be missing in Kaggle's
+image.
+"""
 
 import zipfile
 from collections.abc import Iterable, Sequence
@@ -15,7 +17,8 @@ from mkpc_kaggle.weights.wheel import run_pip
 
 # Direct and indirect dependencies that may be missing or too old in Kaggle's image.
 BUNDLED = ("kornia", "kornia-rs", "pycolmap", "safetensors")
-PYTHONS = ("3.11", "3.12", "3.13", "3.14")  # of Kaggle's current, older pinned and probable next images
+# Of Kaggle's current, older pinned and probable next images
+PYTHONS = ("3.11", "3.12", "3.13", "3.14")
 PLATFORMS = ("manylinux_2_28_x86_64", "manylinux_2_17_x86_64", "manylinux2014_x86_64")
 
 
@@ -27,11 +30,15 @@ def pins(checkout: Path) -> tuple[str, ...]:
 
 
 def install_lines(own: Path, wheels: Iterable[Path]) -> tuple[str, ...]:
-    """Return the notebook's requirements: our wheel, and the version ranges that wheels set for bundled packages.
+    """Return the notebook's requirements: our wheel, and the version ranges that wheels set for
+    bundled packages.
 
-    If the image has a version within the range, pip keeps it, even without a wheel for the image's Python.
+    If the image has a version within the range, pip keeps it, even without a wheel for the image's
+    Python.
     """
-    lines = (line for wheel in (own, *wheels) for line in _metadata(wheel).get_all("Requires-Dist", []))
+    lines = (
+        line for wheel in (own, *wheels) for line in _metadata(wheel).get_all("Requires-Dist", [])
+    )
     bundled = {
         f"{canonicalize_name(need.name)}{need.specifier}"
         for need in map(Requirement, lines)
@@ -41,7 +48,9 @@ def install_lines(own: Path, wheels: Iterable[Path]) -> tuple[str, ...]:
 
 
 def build_wheel(checkout: Path, directory: Path) -> Path:
-    """Build our wheel into the directory; the same sources give the same bytes. Raises :class:`UserError`."""
+    """Build our wheel into the directory; the same sources give the same bytes. Raises
+    :class:`UserError`.
+    """
     # If hatchling is not installed, pip downloads it for the build.
     isolation = ["--no-build-isolation"] if find_spec("hatchling") else []
     failure = run_pip("wheel", "--no-deps", *isolation, "--wheel-dir", directory, checkout)
@@ -51,12 +60,18 @@ def build_wheel(checkout: Path, directory: Path) -> Path:
 
 
 def collect_wheels(
-    requirements: Sequence[str], pythons: Iterable[str], directory: Path, *, kept: Path, wheels: Path | None
+    requirements: Sequence[str],
+    pythons: Iterable[str],
+    directory: Path,
+    *,
+    kept: Path,
+    wheels: Path | None,
 ) -> list[Path]:
-    """Collect the wheels of these requirements for Python versions such as ``3.11``, ordered by name.
+    """Collect the wheels of these requirements for Python versions such as ``3.11``, ordered by
+    name.
 
-    The source is the directory ``wheels``, if given. Otherwise ``kept``, the output of an earlier run, is tried
-    before pip's index. Raises :class:`UserError` if a wheel is not found.
+    The source is the directory ``wheels``, if given. Otherwise ``kept``, the output of an earlier
+    run, is tried before pip's index. Raises :class:`UserError` if a wheel is not found.
     """
     local = ("--no-index", "--find-links", str(wheels or kept))
     sources = [local] if wheels else [local, ()]
@@ -64,7 +79,11 @@ def collect_wheels(
     options = ["--only-binary=:all:", "--no-deps", *platforms, "--dest", str(directory)]
     for python in pythons:
         for source in sources:
-            if not (failure := run_pip("download", *options, "--python-version", python, *source, *requirements)):
+            if not (
+                failure := run_pip(
+                    "download", *options, "--python-version", python, *source, *requirements
+                )
+            ):
                 break
         else:
             raise UserError(

@@ -11,7 +11,15 @@ from mkpc_kaggle.data.masks import Masks
 from mkpc_kaggle.errors import warn_once
 from mkpc_kaggle.matchers.contract import Matcher, Placement, Precision
 from mkpc_kaggle.matchers.registry import load_matcher, require_matchers
-from mkpc_kaggle.pipeline.availability import FAULTS, Licence, left_out, options_of, refusal, slots_of, unavailable
+from mkpc_kaggle.pipeline.availability import (
+    FAULTS,
+    Licence,
+    left_out,
+    options_of,
+    refusal,
+    slots_of,
+    unavailable,
+)
 from mkpc_kaggle.pipeline.devices import AUTO, gpus_of, require_device, resolve_placement
 from mkpc_kaggle.pipeline.stages import ENCODING_CACHE_BYTES, GivenRegions, Pipeline
 from mkpc_kaggle.recipe import Mode, Recipe, Unit, load_recipe, with_settings
@@ -28,7 +36,8 @@ class Assembly:
     recipe: Recipe
     weights: WeightStore
     placement: Placement
-    left_out: tuple[str, ...] = ()  # the recipe's unavailable matchers, grouped by cause, for messages
+    # The recipe's unavailable matchers, grouped by cause, for messages
+    left_out: tuple[str, ...] = ()
     matchers: Mapping[str, Matcher[Any]] = field(default_factory=dict)  # the user's ready matchers
     device: str = AUTO  # as named by the user
     sharing: int = 1  # workers on the placement's device
@@ -38,7 +47,9 @@ class Assembly:
     @property
     def devices(self) -> tuple[str, ...]:
         device = self.placement.device
-        return ("cpu",) if device == "cpu" else tuple(f"cuda:{number}" for number in gpus_of(device))
+        return (
+            ("cpu",) if device == "cpu" else tuple(f"cuda:{number}" for number in gpus_of(device))
+        )
 
     @property
     def minibatch(self) -> int:
@@ -58,7 +69,10 @@ class Assembly:
         """
         device = self.placement.device
         require_device(device)
-        exact, cache_bytes = replace(self.placement, precision=Precision.FLOAT32), ENCODING_CACHE_BYTES
+        exact, cache_bytes = (
+            replace(self.placement, precision=Precision.FLOAT32),
+            ENCODING_CACHE_BYTES,
+        )
         if device != "cpu":
             import torch
 
@@ -79,11 +93,16 @@ class Assembly:
         name = unit.matcher
         slots = slots_of(self.recipe, {name} - self.matchers.keys())
         return {
-            "unit": {key: value for key, value in asdict(unit).items() if key not in ("fallback", "tracks")},
+            "unit": {
+                key: value
+                for key, value in asdict(unit).items()
+                if key not in ("fallback", "tracks")
+            },
             "options": None if name in self.matchers else asdict(options_of(self.recipe, name)),
             "precision": self.placement.precision,
-            "weights": {slot: file.digest for slot, file in self.weight_files.items() if slot in slots},
-            **({"masks": self.masks.digests} if self.masks.files else {}),
+            "weights": {
+                slot: file.digest for slot, file in self.weight_files.items() if slot in slots
+            },
         }
 
     @property
@@ -93,7 +112,9 @@ class Assembly:
     @cached_property
     def weight_files(self) -> dict[str, FoundFile]:
         """The weight files of the recipe's matchers, by slot."""
-        slots = slots_of(self.recipe, [name for name in self.recipe.matcher_names if name not in self.matchers])
+        slots = slots_of(
+            self.recipe, [name for name in self.recipe.matcher_names if name not in self.matchers]
+        )
         return {slot: file for slot in slots if (file := self.weights.find(slot))}
 
     def _load(self, name: str, placement: Placement) -> Matcher[Any]:
@@ -113,7 +134,8 @@ def assemble(
     matchers: Mapping[str, Matcher[Any]] | None = None,
     settings: Mapping[str, Any] = MappingProxyType({}),
 ) -> Assembly:
-    """Check recipe, options, licences, weights, device and precision before any work, and return the assembly.
+    """Check recipe, options, licences, weights, device and precision before any work, and return
+    the assembly.
 
     A fallback replaces an unavailable matcher. Without one, recipe ``auto`` drops its units, and so
     does every recipe if the matcher cannot be loaded. ``scenes`` switches the reconstruction of
@@ -150,7 +172,9 @@ def assemble(
     texts = left_out(written, omitted, is_auto=recipe == AUTO)
     chosen = chosen.without(lacking).with_scenes(scenes).in_mode(mode)
     made = Assembly(chosen, store, resolve_placement(device, precision), texts, own, device)
-    unverified = (file.path.name for file in made.weight_files.values() if file.state is State.UNVERIFIED)
+    unverified = (
+        file.path.name for file in made.weight_files.values() if file.state is State.UNVERIFIED
+    )
     if listed := ", ".join(sorted(unverified)):
         warn_once(f"weights not verified: {listed}; `mkpc weights verify` says why")
     return made

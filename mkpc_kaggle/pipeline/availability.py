@@ -31,12 +31,15 @@ class UnavailableKind(StrEnum):
     UNREADABLE = "weights cannot be loaded"
 
 
-FAULTS = (UnavailableKind.NOT_IMPORTABLE, UnavailableKind.UNREADABLE)  # the other kinds are the user's choices
+# The other kinds are the user's choices
+FAULTS = (UnavailableKind.NOT_IMPORTABLE, UnavailableKind.UNREADABLE)
 
 
 @dataclass(frozen=True)
 class UnavailableReason:
-    """Reason why a matcher is unavailable; ``detail`` is the error, the licences, or the missing files."""
+    """Reason why a matcher is unavailable; ``detail`` is the error, the licences, or the missing
+    files.
+    """
 
     kind: UnavailableKind
     detail: str
@@ -64,8 +67,12 @@ def unavailable(
             spec = own[name].spec if name in own else spec_of(name, f"recipe {recipe.name!r}")
             options = None if name in own else options_of(recipe, name)
         except UnusableError as error:
-            return UnavailableReason(UnavailableKind.NOT_IMPORTABLE, reason_of(error.__cause__ or error))
-        found = {slot: store.find(slot) for slot in (() if name in own else spec.slots_for(options))}
+            return UnavailableReason(
+                UnavailableKind.NOT_IMPORTABLE, reason_of(error.__cause__ or error)
+            )
+        found = {
+            slot: store.find(slot) for slot in (() if name in own else spec.slots_for(options))
+        }
         files = [file for file in found.values() if file is not None]
         missing = tuple(slot for slot, file in found.items() if file is None)
         lines = chain((file.file for file in files), *map(store.alternatives, missing))
@@ -73,13 +80,18 @@ def unavailable(
         if others and licence is Licence.PERMISSIVE:
             return UnavailableReason(UnavailableKind.NOT_PERMITTED, ", ".join(sorted(others)))
         if missing:
-            names = (f"{slot}: {' or '.join(file.name for file in store.alternatives(slot))}" for slot in missing)
+            names = (
+                f"{slot}: {' or '.join(file.name for file in store.alternatives(slot))}"
+                for slot in missing
+            )
             return UnavailableReason(UnavailableKind.NO_WEIGHTS, "; ".join(names), missing)
         if files and (problem := misfit(name, store, options)):
             return UnavailableReason(UnavailableKind.UNREADABLE, problem)
         return None
 
-    names = dict.fromkeys(name for unit in recipe.units for name in (unit.matcher, unit.fallback) if name)
+    names = dict.fromkeys(
+        name for unit in recipe.units for name in (unit.matcher, unit.fallback) if name
+    )
     return {name: reason for name in names if (reason := reason_for(name)) is not None}
 
 
@@ -124,12 +136,18 @@ def fit_of(found: FoundFile, store: WeightStore) -> Fit:
 
 
 def refusal(recipe: Recipe, reasons: Mapping[str, UnavailableReason]) -> UserError:
-    """Return an error that names the matchers unavailable for the first kind of reason, and the remedy."""
+    """Return an error that names the matchers unavailable for the first kind of reason, and the
+    remedy.
+    """
     kind = next(iter(reasons.values())).kind
-    those = "; ".join(f"{name} ({reason.detail})" for name, reason in reasons.items() if reason.kind is kind)
+    those = "; ".join(
+        f"{name} ({reason.detail})" for name, reason in reasons.items() if reason.kind is kind
+    )
     if kind is UnavailableKind.NOT_PERMITTED:
         what = f"--licence permissive refuses recipe {recipe.name!r} for the weights of {those}"
-        return UserError(f"{what}. Take a recipe without them, such as permissive, or --recipe auto.")
+        return UserError(
+            f"{what}. Take a recipe without them, such as permissive, or --recipe auto."
+        )
     if kind is UnavailableKind.NO_WEIGHTS:
         what = f"recipe {recipe.name!r} needs weights that were not found: {those}"
         is_ours = recipe.name in recipe_names()
@@ -159,7 +177,9 @@ def left_out(
             light = load_recipe("light")
             slots = ["light"] if set(slots) & set(slots_of(light, light.matcher_names)) else []
         command = f"mkpc weights fetch {' '.join(slots)} --out DIR"
-        texts.append(f"{kind}: {', '.join(names)}" + (f" (`{command}` gets weights)" if slots else ""))
+        texts.append(
+            f"{kind}: {', '.join(names)}" + (f" (`{command}` gets weights)" if slots else "")
+        )
     return tuple(texts)
 
 
@@ -170,7 +190,9 @@ def options_of(recipe: Recipe, name: str) -> Any:
 
 
 def slots_of(recipe: Recipe, names: Iterable[str]) -> tuple[str, ...]:
-    """Return the distinct slots of a recipe's named matchers. Skip matchers that cannot be imported."""
+    """Return the distinct slots of a recipe's named matchers. Skip matchers that cannot be
+    imported.
+    """
     slots: list[str] = []
     for name in names:
         with suppress(UnusableError):

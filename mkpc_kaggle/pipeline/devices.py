@@ -14,7 +14,8 @@ AUTO = "auto"
 ADVICE = "on Kaggle choose the accelerator GPU T4 x2, elsewhere try --device cpu"
 PROBE_TIMEOUT_S = 120.0  # for a process that computes on each GPU
 TENSOR_CORES = (7, 0)  # the lowest compute capability that is faster in half precision
-# Runs in a separate process: a CUDA context takes hundreds of MB of a GPU, and the workers' parent needs none.
+# Runs in a separate process: a CUDA context takes hundreds of MB of a GPU, and the workers' parent
+# needs none.
 ASK_CAPABILITIES = """
 import json, torch
 gpus, errors = range(torch.cuda.device_count()), []
@@ -31,9 +32,11 @@ print(json.dumps([torch.cuda.get_device_capability(gpu) for gpu in gpus]))
 
 
 def resolve_placement(device: str, precision: str) -> Placement:
-    """Return the placement that the user named. ``auto`` means all GPUs ("cuda"), or "cpu" if no GPU computes.
+    """Return the placement that the user named. ``auto`` means all GPUs ("cuda"), or "cpu" if no
+    GPU computes.
 
-    Raises :class:`UserError` for an unknown name or a missing GPU, ``TypeError`` if ``device`` is not a string.
+    Raises :class:`UserError` for an unknown name or a missing GPU, ``TypeError`` if ``device`` is
+    not a string.
     """
     if not isinstance(device, str):
         raise TypeError(f"a device is text such as 'cuda:0', not {device!r}")
@@ -49,11 +52,15 @@ def resolve_placement(device: str, precision: str) -> Placement:
         gpus_of(device)
     if precision not in (AUTO, *Precision):
         raise UserError(f"unknown precision {precision!r}; known: auto, {', '.join(Precision)}")
-    return Placement(device, fastest_precision(device) if precision == AUTO else Precision(precision))
+    return Placement(
+        device, fastest_precision(device) if precision == AUTO else Precision(precision)
+    )
 
 
 def fastest_precision(device: str) -> Precision:
-    """Return half precision if the CPU, or every GPU of the device, has units for it; otherwise float32."""
+    """Return half precision if the CPU, or every GPU of the device, has units for it; otherwise
+    float32.
+    """
     import torch
 
     if device.startswith("cuda"):
@@ -62,11 +69,17 @@ def fastest_precision(device: str) -> Precision:
         return Precision.FLOAT16 if able else Precision.FLOAT32
     # Older versions of PyTorch do not report capabilities; then float32 is safe.
     flags: dict[str, Any] = getattr(torch.cpu, "get_capabilities", dict)()
-    return Precision.BFLOAT16 if flags.get("avx512_bf16") or flags.get("amx_bf16") else Precision.FLOAT32
+    return (
+        Precision.BFLOAT16
+        if flags.get("avx512_bf16") or flags.get("amx_bf16")
+        else Precision.FLOAT32
+    )
 
 
 def gpus_of(device: str) -> list[int]:
-    """Return the numbers of the GPUs that ``cuda`` or ``cuda:N`` names. Counting GPUs creates no CUDA context."""
+    """Return the numbers of the GPUs that ``cuda`` or ``cuda:N`` names. Counting GPUs creates no
+    CUDA context.
+    """
     import torch
 
     kind, _, number = device.partition(":")
@@ -74,7 +87,9 @@ def gpus_of(device: str) -> list[int]:
     if kind != "cuda" or (device != kind and not number.isdecimal()):
         raise UserError(f"unknown device {device!r}; known: auto, cpu, cuda, cuda:N")
     if not count:
-        raise UserError(f"--device {device}: this machine has no GPU that PyTorch can use; {ADVICE}")
+        raise UserError(
+            f"--device {device}: this machine has no GPU that PyTorch can use; {ADVICE}"
+        )
     if number and int(number) >= count:
         known = ", ".join(f"cuda:{index}" for index in range(count))
         raise UserError(f"--device {device}: this machine has only {known}")
@@ -83,10 +98,14 @@ def gpus_of(device: str) -> list[int]:
 
 @cache
 def gpu_capabilities() -> list[tuple[int, int]]:
-    """Return the compute capability of each GPU, such as (7, 5). Raise :class:`UserError` if no GPU computes."""
+    """Return the compute capability of each GPU, such as (7, 5). Raise :class:`UserError` if no GPU
+    computes.
+    """
     command, timeout = [sys.executable, "-c", ASK_CAPABILITIES], PROBE_TIMEOUT_S
     try:
-        asked = subprocess.run(command, input="", capture_output=True, text=True, check=True, timeout=timeout)
+        asked = subprocess.run(
+            command, input="", capture_output=True, text=True, check=True, timeout=timeout
+        )
         return [(major, minor) for major, minor in json.loads(asked.stdout.splitlines()[-1])]
     except subprocess.CalledProcessError as error:
         reason = error.stderr.strip()[-300:] or f"exit status {error.returncode}"
@@ -98,7 +117,8 @@ def gpu_capabilities() -> list[tuple[int, int]]:
 def require_device(device: str) -> None:
     """Run a product and a convolution on the device. Raise :class:`DeviceError` if either fails.
 
-    PyTorch also lists GPUs for which its build or cuDNN has no kernels, so only a kernel that runs is proof.
+    PyTorch also lists GPUs for which its build or cuDNN has no kernels, so only a kernel that runs
+    is proof.
     """
     if device == "cpu":
         return

@@ -38,10 +38,12 @@ class UnitResult:
 
 @dataclass(frozen=True, eq=False)
 class PairMatch:
-    results: tuple[UnitResult, ...] = ()  # in the order of execution; once estimated, in the recipe's order
+    # In the order of execution; once estimated, in the recipe's order
+    results: tuple[UnitResult, ...] = ()
     regions: Regions | None = None  # None until a unit of stage 2 needs them
     estimate: Estimate = NOT_ESTIMATED
-    images: tuple[Image, ...] = ()  # both, while units run; afterwards only ``sizes`` and ``focals`` remain
+    # Both, while units run; afterwards only ``sizes`` and ``focals`` remain
+    images: tuple[Image, ...] = ()
     sizes: tuple[Size, ...] = ()
     focals: tuple[float, ...] = ()
     failure: str = ""  # the image that cannot be read
@@ -71,8 +73,8 @@ def with_estimate(
 ) -> PairMatch:
     """Return the pair with a two-view model estimated from all matches.
 
-    The matches are sorted in the recipe's order, because MAGSAC's result depends on it. The recipe's focal prior,
-    if any, uses the images' sizes and EXIF, or ``intrinsics`` if given.
+    The matches are sorted in the recipe's order, because MAGSAC's result depends on it. The
+    recipe's focal prior, if any, uses the images' sizes and EXIF, or ``intrinsics`` if given.
     """
     results = tuple(sorted(pair.results, key=lambda result: recipe.units.index(result.unit)))
     matches = Matches.concatenate(result.matches for result in results)

@@ -1,6 +1,7 @@
 """The two-stage pipeline on a chunk of pairs.
 
-Stage 1 matches whole images, MKPC finds the critical region of each image, and stage 2 matches the crops.
+Stage 1 matches whole images, MKPC finds the critical region of each image, and stage 2 matches the
+crops.
 """
 
 import time
@@ -88,9 +89,13 @@ class Pipeline:
         }
 
     def match(
-        self, pairs: Sequence[PairMatch], units: Iterable[Unit], may_start: Callable[[Unit], bool] = lambda _: True
+        self,
+        pairs: Sequence[PairMatch],
+        units: Iterable[Unit],
+        may_start: Callable[[Unit], bool] = lambda _: True,
     ) -> list[PairMatch]:
-        """Run each unit on the pairs that have no result of it: stage 1, the critical regions, stage 2.
+        """Run each unit on the pairs that have no result of it: stage 1, the critical regions,
+        stage 2.
 
         ``may_start(unit)`` is called before each minibatch of a unit; False stops the unit. If a matcher raises,
         the minibatch's pairs run one by one, and a pair that raises again gets a result with this failure. Raises
@@ -109,7 +114,11 @@ class Pipeline:
 
     def _run(self, unit: Unit, pairs: list[PairMatch], may_start: Callable[[Unit], bool]) -> None:
         """Add the unit's results to the pairs, in place."""
-        waiting = [n for n, pair in enumerate(pairs) if unit not in (result.unit for result in pair.results)]
+        waiting = [
+            n
+            for n, pair in enumerate(pairs)
+            if unit not in (result.unit for result in pair.results)
+        ]
         while waiting and may_start(unit):
             numbers = waiting[: self._minibatches.get(unit, self.minibatch)]
             results = self._run_minibatch(unit, [pairs[number] for number in numbers])
@@ -118,23 +127,32 @@ class Pipeline:
             waiting = waiting[len(results) :]
 
     def _run_minibatch(self, unit: Unit, pairs: list[PairMatch]) -> list[UnitResult]:
-        """Return the unit's result on each pair, or an empty list to retry in float32 or on fewer pairs."""
+        """Return the unit's result on each pair, or an empty list to retry in float32 or on fewer
+        pairs.
+        """
         try:
             return self._match(unit, pairs)
         except Exception as error:
             failure = failure_of(error)
-            if isinstance(error, NonFiniteError) and self._fall_back_to_float32(unit.matcher, error):
+            if isinstance(error, NonFiniteError) and self._fall_back_to_float32(
+                unit.matcher, error
+            ):
                 return []
             if failure is FailureKind.RAISED and len(pairs) == 1:
                 reason = str(error) if isinstance(error, UnloadableError) else reason_of(error)
                 return [UnitResult(unit, Matches.empty(), failure=reason)]
-            if failure is FailureKind.RAISED:  # one by one, and again if the matcher falls back to float32
-                alone = (self._run_minibatch(unit, [pair]) or self._run_minibatch(unit, [pair]) for pair in pairs)
+            # One by one, and again if the matcher falls back to float32
+            if failure is FailureKind.RAISED:
+                alone = (
+                    self._run_minibatch(unit, [pair]) or self._run_minibatch(unit, [pair])
+                    for pair in pairs
+                )
                 return list(chain.from_iterable(alone))
             if failure is FailureKind.DEVICE or len(pairs) == 1:
                 error.add_note(f"in {unit.name}")
                 raise
-        # After the handler, because inside it the traceback keeps the minibatch's tensors in memory.
+        # After the handler, because inside it the traceback keeps the minibatch's tensors in
+        # memory.
         import torch
 
         torch.cuda.empty_cache()  # cuBLAS and cuDNN cannot use PyTorch's cached memory
@@ -155,7 +173,9 @@ class Pipeline:
         matcher = self._matcher(unit.matcher)
         views = [views_of(unit, matcher.spec.multiple, pair) for pair in pairs]
         start = time.perf_counter()
-        shown = [zip(pair.images, both, strict=True) for pair, both in zip(pairs, views, strict=True)]
+        shown = [
+            zip(pair.images, both, strict=True) for pair, both in zip(pairs, views, strict=True)
+        ]
         encodings = self._encode(unit, list(chain.from_iterable(shown)))
         encoded = time.perf_counter()
         with exact_float32():
@@ -173,7 +193,9 @@ class Pipeline:
                 note=self._notes.get(unit.matcher, ""),
                 keypoints=len(getattr(encoding, "points", ())),
             )
-            for matches, both, encoding, pair in zip(found, views, encodings[::2], pairs, strict=True)
+            for matches, both, encoding, pair in zip(
+                found, views, encodings[::2], pairs, strict=True
+            )
         ]
 
     def _unmasked(self, matches: Matches, images: Sequence[Image]) -> Matches:
@@ -188,13 +210,18 @@ class Pipeline:
         is_gray = matcher.spec.colour is Colour.GRAY
         keys = [(unit.matcher, image.name, view) for image, view in wanted]
         known = {key: self._encodings.get(key) for key in keys}
-        missing = {key: image for key, (image, _) in zip(keys, wanted, strict=True) if known[key] is None}
+        missing = {
+            key: image for key, (image, _) in zip(keys, wanted, strict=True) if known[key] is None
+        }
         size = self._minibatches.get(unit, self.minibatch)
         for shape in dict.fromkeys(view.padded for _, _, view in missing):
             alike = [key for key in missing if key[2].padded == shape]
             for part in (alike[start : start + size] for start in range(0, len(alike), size)):
                 pixels = [missing[key].gray if is_gray else missing[key].pixels for key in part]
-                pictures = [Picture(key[2].render(shown), key[2]) for key, shown in zip(part, pixels, strict=True)]
+                pictures = [
+                    Picture(key[2].render(shown), key[2])
+                    for key, shown in zip(part, pixels, strict=True)
+                ]
                 with exact_float32():
                     encodings = matcher.encode(pictures)
                 check_finite(f"features of {unit.matcher}", list(encodings))
@@ -228,11 +255,17 @@ def views_of(unit: Unit, multiple: int, pair: PairMatch) -> tuple[View, ...]:
     """Return the unit's views of both images: whole images in stage 1, critical regions in stage 2."""
     crops = [region.box for region in pair.regions or ()] if unit.stage == 2 else []
     boxes = crops or [Box.whole(image.size) for image in pair.images]
-    return tuple(unit.view(box, multiple, im.turns) for box, im in zip(boxes, pair.images, strict=True))
+    return tuple(
+        unit.view(box, multiple, im.turns) for box, im in zip(boxes, pair.images, strict=True)
+    )
 
 
-def with_regions(pair: PairMatch, recipe: Recipe, given: GivenRegions = MappingProxyType({})) -> PairMatch:
-    """Return the pair with each image's critical region: the user's, or MKPC's from the matches of stage 1."""
+def with_regions(
+    pair: PairMatch, recipe: Recipe, given: GivenRegions = MappingProxyType({})
+) -> PairMatch:
+    """Return the pair with each image's critical region: the user's, or MKPC's from the matches of
+    stage 1.
+    """
     if (boxes := given.get(tuple(image.name for image in pair.images))) is not None:
         first, second = (CriticalRegion(box, RegionReason.GIVEN) for box in boxes)
         return replace(pair, regions=(first, second))
@@ -260,15 +293,22 @@ def read_regions(file: Path, image_root: Path, pairs: Iterable[Pair]) -> GivenRe
             box0, box1 = (Box(*map(int, cell.split())) for cell in cells)
         except (ValueError, TypeError) as error:
             found = f"{cells[0]!r} and {cells[1]!r}"
-            raise UserError(f"{where}: expected left, top, right and bottom of a box, found {found}") from error
+            raise UserError(
+                f"{where}: expected left, top, right and bottom of a box, found {found}"
+            ) from error
         boxes[str(image_root / name0), str(image_root / name1)] = box0, box1
     for pair in pairs:
         if (files := (pair.file0, pair.file1)) not in boxes:
             raise UserError(f"{file} has no regions of the pair {pair.id}")
         for path, box in zip(files, boxes[files], strict=True):
             # Only the head of the file is read.
-            with suppress(OSError, PIL.Image.DecompressionBombError), PIL.Image.open(path) as picture:
+            with (
+                suppress(OSError, PIL.Image.DecompressionBombError),
+                PIL.Image.open(path) as picture,
+            ):
                 if box.right > picture.width or box.bottom > picture.height:
                     size = f"{picture.width} x {picture.height} pixels"
-                    raise UserError(f"{file}: a box ends at {box.right}, {box.bottom}, beyond {path} of {size}")
+                    raise UserError(
+                        f"{file}: a box ends at {box.right}, {box.bottom}, beyond {path} of {size}"
+                    )
     return boxes

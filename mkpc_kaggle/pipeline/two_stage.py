@@ -77,11 +77,13 @@ class TwoStageMatcher:
         stage 2 fail if a box extends beyond its image. Points, boxes and F are in pixels of the stored files; EXIF
         only turns the matchers' views upright. If no model is found, ``estimate.failure`` has the reason.
 
-        Raises ``ValueError`` for model E without intrinsics and :class:`UserError` for an unreadable image. Memory
-        and device errors are not caught.
+        Raises ``ValueError`` for model E without intrinsics and :class:`UserError` for an
+        unreadable image. Memory and device errors are not caught.
         """
         if ModelKind(model) is ModelKind.E and intrinsics is None:
-            raise ValueError("model E needs intrinsics=(K0, K1), the camera matrices of both images in pixels")
+            raise ValueError(
+                "model E needs intrinsics=(K0, K1), the camera matrices of both images in pixels"
+            )
         images = to_image(image0), to_image(image1)
         self._pipeline.regions = {tuple(image.name for image in images): regions} if regions else {}
         (pair,) = self._pipeline.match([PairMatch(images=images)], self.recipe.units)
@@ -90,8 +92,9 @@ class TwoStageMatcher:
     def match_pairs(self, pairs: Iterable[tuple[ImageSource, ImageSource]]) -> Iterator[PairMatch]:
         """Yield the match of each pair, as a call does for one pair.
 
-        An image that appears in several pairs is decoded and encoded once, while the caches have room: sort the
-        pairs by their first image. Raises :class:`UserError` for an unreadable image.
+        An image that appears in several pairs is decoded and encoded once, while the caches have
+        room: sort the pairs by their first image. Raises :class:`UserError` for an unreadable
+        image.
         """
         self._pipeline.regions = {}
         with closing(ImageStore()) as store:
@@ -114,4 +117,5 @@ def to_image(source: ImageSource, store: ImageStore | None = None) -> Image:
     image = read_image(path) if store is None else store.get(path)
     if isinstance(image, Unreadable):
         raise UserError(str(image))
-    return replace(image, name=image.version)  # the name identifies the content: a file may change between calls
+    # The name identifies the content: a file may change between calls
+    return replace(image, name=image.version)

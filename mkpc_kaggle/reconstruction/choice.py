@@ -1,6 +1,7 @@
 """Choice of the pairs of a folder: images to match with each other, and their orientations.
 
-The orientation of an image is found by matching four rotations of the image with its most similar images.
+The orientation of an image is found by matching four rotations of the image with its most similar
+images.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -17,17 +18,26 @@ from mkpc_kaggle.engine.session import Session, request_of
 from mkpc_kaggle.engine.store import Source
 from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.reconstruction.folder import Datasets, Ends, batch_names
-from mkpc_kaggle.scene.likeness import FEATURE_SETTINGS, PARTNERS, Partners, local_features, most_alike, shortlist
+from mkpc_kaggle.scene.likeness import (
+    FEATURE_SETTINGS,
+    PARTNERS,
+    Partners,
+    local_features,
+    most_alike,
+    shortlist,
+)
 
 IMAGES_AT_A_TIME = 100  # whose features are in memory
 MAX_IMAGES = 100  # with more, each image has a shortlist instead of all pairs
-TRIAL_SHARE = 0.25  # of the time left, for trials of unturned images, and then for trials of turned images
+# Of the time left, for trials of unturned images, and then for trials of turned images
+TRIAL_SHARE = 0.25
 TURN_PARTNERS = 4  # similar images per image, to find its orientation
 MANY_INLIERS = 100  # with one partner; an image with this number counts as upright
 MIN_INLIERS = 30  # of a turned image
 MIN_GAIN = 2.0  # inliers of a turned image relative to the unturned image
 
-Key = tuple[Path, int, Path]  # an image, its quarter turns, and an unturned image with a greater name
+# An image, its quarter turns, and an unturned image with a greater name
+Key = tuple[Path, int, Path]
 Near = Mapping[Path, Sequence[Path]]  # the most similar images of each image
 
 
@@ -41,7 +51,8 @@ def choose_pairs(
     listed: Sequence[Ends] | None,
     rotations: bool,
 ) -> list[Pair]:
-    """Return the pairs of all datasets: as ``listed``, all pairs of up to ``MAX_IMAGES`` images, or a shortlist.
+    """Return the pairs of all datasets: as ``listed``, all pairs of up to ``MAX_IMAGES`` images, or
+    a shortlist.
 
     With ``rotations``, images are turned by :func:`find_turns`.
     """
@@ -54,30 +65,46 @@ def choose_pairs(
         count = PARTNERS if is_large else TURN_PARTNERS
         partners = find_partners(engine, name, files, count) if is_large or may_lie else []
         if may_lie:
-            near |= {a: [files[j] for j in partners[i][:TURN_PARTNERS]] for i, a in enumerate(files)}
+            near |= {
+                a: [files[j] for j in partners[i][:TURN_PARTNERS]] for i, a in enumerate(files)
+            }
         if listed is None:
             indices = shortlist(partners) if is_large else combinations(range(len(files)), 2)
             ends[name] = [(files[i], files[j]) for i, j in indices]
     batches = batch_names(root, datasets)
     names = {file: batches[name] for name, files in datasets.items() for file in files}
     turns = find_turns(engine, near, names, root, assembly, session)
-    return [pair_of(batches[name], a, b, turns.get(a, 0), turns.get(b, 0)) for name in ends for a, b in ends[name]]
+    return [
+        pair_of(batches[name], a, b, turns.get(a, 0), turns.get(b, 0))
+        for name in ends
+        for a, b in ends[name]
+    ]
 
 
 def pair_of(batch: str, a: Path, b: Path, *turns: int) -> Pair:
     """Return the pair of two images of a batch, matched with these counter-clockwise quarter turns."""
     suffix = f" turned {turns[0]} {turns[1]}" if any(turns) else ""
-    return Pair(f"{batch}/{a.stem}/{b.stem}{suffix}", batch, str(a), str(b), turns=(turns[0], turns[1]))
+    return Pair(
+        f"{batch}/{a.stem}/{b.stem}{suffix}", batch, str(a), str(b), turns=(turns[0], turns[1])
+    )
 
 
 def find_partners(engine: Engine, dataset: str, files: Sequence[Path], count: int) -> Partners:
-    """Return the indices of the ``count`` images most similar to each image; empty if the comparison failed."""
+    """Return the indices of the ``count`` images most similar to each image; empty if the
+    comparison failed.
+    """
     found = engine.digest_files({str(file): file for file in files})
     digests = [found.get(str(file), "") for file in files]
     keys = [features_key(each) for each in digests]
     key = digest([digests, FEATURE_SETTINGS, count])
     if (known := engine.known(key)) is None:
-        engine.look({features_key(found[str(a)]): partial(local_features, a) for a in files if str(a) in found})
+        engine.look(
+            {
+                features_key(found[str(a)]): partial(local_features, a)
+                for a in files
+                if str(a) in found
+            }
+        )
         source = engine.store.source(keys)
         known = engine.look({key: partial(compare, source, keys, count)}).get(key)
     if known is None:
@@ -105,9 +132,15 @@ def compare(source: Source, keys: Sequence[str], count: int) -> Partners:
 
 
 def find_turns(
-    engine: Engine, near: Near, names: Mapping[Path, str], root: Path, assembly: Assembly, session: Session
+    engine: Engine,
+    near: Near,
+    names: Mapping[Path, str],
+    root: Path,
+    assembly: Assembly,
+    session: Session,
 ) -> dict[Path, int]:
-    """Return the counter-clockwise quarter turns that set images upright; upright images are left out.
+    """Return the counter-clockwise quarter turns that set images upright; upright images are left
+    out.
 
     ``names`` has the batch of each image. First all images are matched unturned, then images with few inliers in
     the other three orientations. An image gets its best orientation if that gains enough inliers with similar
@@ -119,8 +152,12 @@ def find_turns(
     turns: dict[Path, int] = {}
 
     def inliers(a: Path, times: int) -> int:
-        """Return the most inliers of ``a``, turned ``times`` quarters, with a similar image as turned so far."""
-        return max((found.get(relative(a, times - turns.get(b, 0), b), 0) for b in near[a]), default=0)
+        """Return the most inliers of ``a``, turned ``times`` quarters, with a similar image as
+        turned so far.
+        """
+        return max(
+            (found.get(relative(a, times - turns.get(b, 0), b), 0) for b in near[a]), default=0
+        )
 
     for tried in ((0,), (1, 2, 3)):
         few = [a for a in near if inliers(a, 0) < MANY_INLIERS]

@@ -1,4 +1,6 @@
-"""The coordinates of a folder that grows: which cameras a later run keeps, and by how much they moved."""
+"""The coordinates of a folder that grows: which cameras a later run keeps, and by how much they
+moved.
+"""
 
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -30,9 +32,11 @@ def forget_coordinates(out: Path, datasets: Iterable[str]) -> None:
 
 
 def keep_coordinates(out: Path, root: Path, result: FolderResult) -> Iterator[str]:
-    """Save the cameras of a complete run for the next run. Yield a line per dataset whose earlier cameras moved.
+    """Save the cameras of a complete run for the next run. Yield a line per dataset whose earlier
+    cameras moved.
 
-    A run that was ended early saves nothing, so that it ends as an undisturbed run when it is resumed.
+    A run that was ended early saves nothing, so that it ends as an undisturbed run when it is
+    resumed.
     """
     if result.report.ending != Ending.COMPLETE:
         return
@@ -44,7 +48,9 @@ def keep_coordinates(out: Path, root: Path, result: FolderResult) -> Iterator[st
                 number, found = placed
                 models.setdefault(number, {})[file.relative_to(root).as_posix()] = found.camera
         yield from moved_lines(
-            batches[dataset], read_reference(out / dataset), [models[number] for number in sorted(models)]
+            batches[dataset],
+            read_reference(out / dataset),
+            [models[number] for number in sorted(models)],
         )
         if models:
             with replacing(out / dataset / REFERENCE) as stream:

@@ -24,16 +24,17 @@ FILES = (DATABASE, MODELS, SPARSE, IMAGES, REFERENCE)  # of each dataset
 MARK = f"{WORK}/results.json"  # digests of results by path; "" if their run did not end
 MODEL_FILE = re.compile(rf"\d+(/({'|'.join(map(re.escape, MODEL_FILES))}))?")
 IMAGE_FILE = re.compile(rf"[^/]+({'|'.join(map(re.escape, IMAGE_SUFFIXES))})", re.IGNORECASE)
-CONTENTS = {MODELS: MODEL_FILE, SPARSE: MODEL_FILE, IMAGES: IMAGE_FILE}  # the paths in folders of results
+# The paths in folders of results
+CONTENTS = {MODELS: MODEL_FILE, SPARSE: MODEL_FILE, IMAGES: IMAGE_FILE}
 
 
 @contextmanager
 def output_directory(out: Path, datasets: Iterable[str], form: str | None = None) -> Iterator[None]:
     """Reserve ``out`` for a run's results. At the end, remove results that only earlier runs made.
 
-    With a ``form``, ``submission.csv`` is a result. A result that was changed after its run is not removed. Raise
-    :class:`UserError` if ``out`` is neither empty nor marked by a run. A link or another file at the path of a
-    result also raises it.
+    With a ``form``, ``submission.csv`` is a result. A result that was changed after its run is not
+    removed. Raise :class:`UserError` if ``out`` is neither empty nor marked by a run. A link or
+    another file at the path of a result also raises it.
     """
     results = [name for name in TABLES if form or name != "submission.csv"]
     names = list(datasets)
@@ -56,7 +57,10 @@ def output_directory(out: Path, datasets: Iterable[str], form: str | None = None
             if known[name] and known[name] == _digest(out / name):
                 _remove(out / name)
         after = {name: digest for name in results if (digest := _digest(out / name))}
-        _write_mark(out, {name: known[name] if after[name] == before[name] else after[name] for name in after})
+        _write_mark(
+            out,
+            {name: known[name] if after[name] == before[name] else after[name] for name in after},
+        )
 
 
 def holds_dataset(result: str, datasets: Iterable[str]) -> bool:
@@ -68,8 +72,12 @@ def require_directory_apart(out: Path, inputs: Iterable[Path], weights: Iterable
     """Raise :class:`UserError` if ``out`` contains an input or weights, or lies in an input."""
     inputs = list(inputs)
     for place in (*inputs, *weights, *weights_of_environment()):
-        if os.path.lexists(place) and (lies_in(place, out) or (place in inputs and lies_in(out, place))):
-            raise UserError(f"--out {out} and the input {place} are in each other's way; name another place")
+        if os.path.lexists(place) and (
+            lies_in(place, out) or (place in inputs and lies_in(out, place))
+        ):
+            raise UserError(
+                f"--out {out} and the input {place} are in each other's way; name another place"
+            )
 
 
 def _read_mark(out: Path) -> dict[str, str] | None:
@@ -87,13 +95,19 @@ def _write_mark(out: Path, known: Mapping[str, str]) -> None:
         json.dump(known, stream, indent=1, sort_keys=True)
 
 
-def _in_the_way(out: Path, results: Iterable[str], marked: Mapping[str, str] | None) -> Iterator[Path]:
-    """Yield the user's links and files at the paths of results; in an unmarked directory, all links and files."""
+def _in_the_way(
+    out: Path, results: Iterable[str], marked: Mapping[str, str] | None
+) -> Iterator[Path]:
+    """Yield the user's links and files at the paths of results; in an unmarked directory, all links
+    and files.
+    """
     if marked is None:
         yield from (path for path in out.rglob("[!.]*") if path.is_symlink() or not path.is_dir())
     for name in results:
         path = out / name
-        is_result = name in (marked or ()) and (path.is_dir() if path.name in CONTENTS else path.is_file())
+        is_result = name in (marked or ()) and (
+            path.is_dir() if path.name in CONTENTS else path.is_file()
+        )
         if not _is_inside(out, name) or (path.exists() and not is_result):
             yield path
         yield from path.parent.glob(f"{DATABASE}-*")  # another program has the database open
@@ -103,10 +117,14 @@ def _in_the_way(out: Path, results: Iterable[str], marked: Mapping[str, str] | N
 
 
 def _is_inside(out: Path, name: str) -> bool:
-    """Return whether ``name``, a path relative to ``out``, stays in ``out`` and passes through no link."""
+    """Return whether ``name``, a path relative to ``out``, stays in ``out`` and passes through no
+    link.
+    """
     root = Path(os.path.realpath(out))
     path = root / name
-    return path.is_relative_to(root) and os.path.realpath(path) == str(path) and not path.is_symlink()
+    return (
+        path.is_relative_to(root) and os.path.realpath(path) == str(path) and not path.is_symlink()
+    )
 
 
 def _digest(path: Path) -> str:

@@ -10,24 +10,30 @@ from mkpc_kaggle.engine.console import warn
 from mkpc_kaggle.errors import UserError, printable, read_text
 from mkpc_kaggle.reconstruction.directory import RESERVED
 
-Datasets = Mapping[str, Sequence[Path]]  # images of each folder, by the folder's path below the root
+# Images of each folder, by the folder's path below the root
+Datasets = Mapping[str, Sequence[Path]]
 Ends = tuple[Path, Path]
 
 
 def read_folder(root: Path) -> Datasets:
-    """Return the datasets, sorted by name: each folder with images below ``root``, and ``root`` itself as ".".
+    """Return the datasets, sorted by name: each folder with images below ``root``, and ``root``
+    itself as ".".
 
-    Hidden files and folders are skipped with a warning. Raises :class:`UserError` if no dataset has two images, if
-    images of a dataset differ only in the suffix, or if a name cannot be used in result files.
+    Hidden files and folders are skipped with a warning. Raises :class:`UserError` if no dataset has
+    two images, if images of a dataset differ only in the suffix, or if a name cannot be used in
+    result files.
     """
     if not root.is_dir():
-        raise UserError(f"{root}: no such directory; name a folder of images, or of folders of images")
+        raise UserError(
+            f"{root}: no such directory; name a folder of images, or of folders of images"
+        )
     datasets, hidden, seen = {}, list[Path](), {root.resolve()}
     for place, folders, names in os.walk(root, onerror=_refuse_unreadable, followlinks=True):
         folder, images = Path(place), sorted(filter(_is_image, names))
         hidden += [folder / name for name in (*folders, *images) if name.startswith(".")]
         inner = [folder / name for name in sorted(folders) if not name.startswith(".")]
-        folders[:] = [each.name for each in inner if each.resolve() not in seen]  # links may form a cycle
+        # Links may form a cycle
+        folders[:] = [each.name for each in inner if each.resolve() not in seen]
         seen.update(each.resolve() for each in inner)
         files = [folder / name for name in images if not name.startswith(".")]
         if files:
@@ -36,7 +42,9 @@ def read_folder(root: Path) -> Datasets:
     if hidden:
         warn(f"{len(hidden)} hidden files or folders are passed over, the first is {hidden[0]}")
     if not datasets:
-        raise UserError(f"{root} has no images: name a folder with {', '.join(IMAGE_SUFFIXES)} files")
+        raise UserError(
+            f"{root} has no images: name a folder with {', '.join(IMAGE_SUFFIXES)} files"
+        )
     if all(len(files) < 2 for files in datasets.values()):
         name = next(iter(datasets.values()))[0].name
         raise UserError(f"{root} has a single image, {name}: there is nothing to match")
@@ -44,7 +52,9 @@ def read_folder(root: Path) -> Datasets:
 
 
 def batch_names(root: Path, datasets: Iterable[str]) -> dict[str, str]:
-    """Return the name of each dataset in messages and reports: its path, and for "." the root's own name."""
+    """Return the name of each dataset in messages and reports: its path, and for "." the root's own
+    name.
+    """
     names = {name: name for name in datasets}
     if "." in names:
         own = root.resolve().name or "images"  # the root of the file system has no name
@@ -59,11 +69,15 @@ def _is_image(name: str) -> bool:
 
 
 def _require_usable(folder: Path, root: Path, files: Sequence[Path]) -> None:
-    """Raise :class:`UserError` if the name of a folder or an image cannot be used in tables and databases."""
+    """Raise :class:`UserError` if the name of a folder or an image cannot be used in tables and
+    databases.
+    """
     parts = folder.relative_to(root).parts or (root.resolve().name,)
     for name in (*parts, *(path.name for path in files)):
         if CONTROL.search(name) or printable(name) != name:
-            raise UserError(f"{folder}: the name {name!r} has characters that are no text; rename it")
+            raise UserError(
+                f"{folder}: the name {name!r} has characters that are no text; rename it"
+            )
     if reserved := RESERVED.intersection(map(str.lower, folder.relative_to(root).parts)):
         raise UserError(f"{folder}: results are called {min(reserved)}; rename that folder")
     stems: dict[str, Path] = {}
@@ -77,7 +91,8 @@ def _refuse_unreadable(error: OSError) -> None:
 
 
 def read_pair_list(path: Path, root: Path, datasets: Datasets) -> list[Ends]:
-    """Return the pairs of a list in hloc's format: one line per pair, two image paths below ``root``.
+    """Return the pairs of a list in hloc's format: one line per pair, two image paths below
+    ``root``.
 
     Raises :class:`UserError` for a line that does not name two images of one dataset.
     """
@@ -87,10 +102,15 @@ def read_pair_list(path: Path, root: Path, datasets: Datasets) -> list[Ends]:
         text = line.strip()
         if not text:
             continue
-        ways = ((root / text[: gap.start()], root / text[gap.end() :]) for gap in re.finditer(r"\s+", text))
+        ways = (
+            (root / text[: gap.start()], root / text[gap.end() :])
+            for gap in re.finditer(r"\s+", text)
+        )
         ends = [sorted(two) for two in ways if known.issuperset(two)]  # names may have blanks
         if len(ends) != 1 or ends[0][0] == ends[0][1] or ends[0][0].parent != ends[0][1].parent:
-            raise UserError(f"{path}, line {number}: expected two images of one dataset of {root}, found {line!r}")
+            raise UserError(
+                f"{path}, line {number}: expected two images of one dataset of {root}, found {line!r}"
+            )
         found.append((ends[0][0], ends[0][1]))
     if not found:
         raise UserError(f"{path} has no pairs")

@@ -1,4 +1,5 @@
-"""The folders ``images`` and ``sparse`` of a dataset, which gsplat, nerfstudio and Gaussian splatting read.
+"""The folders ``images`` and ``sparse`` of a dataset, which gsplat, nerfstudio and Gaussian
+splatting read.
 
 ``images`` has links to the photographs, or copies where the file system has no links. ``sparse/0`` is the largest
 model in COLMAP's format, with plain file names and with the colours of points.
@@ -23,7 +24,9 @@ Datasets = Mapping[str, Sequence[Path]]
 
 
 def write_layouts(out: Path, root: Path, datasets: Datasets, ends: float) -> Iterator[str]:
-    """Write the folders of each dataset until ``ends``, in seconds of the monotonic clock. Yield the problems."""
+    """Write the folders of each dataset until ``ends``, in seconds of the monotonic clock. Yield
+    the problems.
+    """
     for dataset, files in datasets.items():
         directory = out / dataset
         if holds_dataset(str(PurePosixPath(dataset, IMAGES)), datasets):
@@ -41,7 +44,9 @@ def write_layouts(out: Path, root: Path, datasets: Datasets, ends: float) -> Ite
 
 
 def write_images(directory: Path, files: Sequence[Path]) -> None:
-    """Make ``images``: a link to each file, or a copy. Remove links to other files. Raises ``OSError``."""
+    """Make ``images``: a link to each file, or a copy. Remove links to other files. Raises
+    ``OSError``.
+    """
     folder = directory / IMAGES
     folder.mkdir(parents=True, exist_ok=True)
     names = {file.name for file in files}
@@ -81,7 +86,9 @@ def write_sparse(directory: Path, names: Mapping[str, str], seconds: float | Non
     """
     context = get_context("spawn")
     receiver, sender = context.Pipe(duplex=False)
-    process = context.Process(target=_write_sparse_to, args=(sender, directory, dict(names)), daemon=True)
+    process = context.Process(
+        target=_write_sparse_to, args=(sender, directory, dict(names)), daemon=True
+    )
     process.start()
     sender.close()
     try:
@@ -122,7 +129,8 @@ def convert_models(directory: Path, names: Mapping[str, str]) -> None:
             (made / SPARSE / folder.name).mkdir()
             model.write(made / SPARSE / folder.name)
         for path in filter(Path.is_file, (made / SPARSE).rglob("*")):
-            with path.open("rb") as stream:  # a power failure must not leave empty files under their names
+            # A power failure must not leave empty files under their names
+            with path.open("rb") as stream:
                 os.fsync(stream.fileno())
         if (directory / SPARSE).exists():
             (directory / SPARSE).rename(made / FORMER)

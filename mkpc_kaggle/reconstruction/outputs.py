@@ -1,4 +1,6 @@
-"""Tables of cameras: ``cameras.csv``, and submissions to the Image Matching Challenges of 2023 to 2025."""
+"""Tables of cameras: ``cameras.csv``, and submissions to the Image Matching Challenges of 2023 to
+2025.
+"""
 
 import csv
 from collections.abc import Iterator, Mapping, Sequence
@@ -22,7 +24,9 @@ FORMS = (  # of a submission
 
 
 def write_tables(out: Path, cameras: Cameras, root: Path, form: str | None) -> None:
-    """Write ``cameras.csv``, and ``submission.csv`` if a form is given. Raise ``OSError`` if that fails."""
+    """Write ``cameras.csv``, and ``submission.csv`` if a form is given. Raise ``OSError`` if that
+    fails.
+    """
     tables = {"cameras.csv": camera_rows(cameras, root)}
     if form is not None:
         tables["submission.csv"] = submission_rows(form, cameras, root)
@@ -32,7 +36,8 @@ def write_tables(out: Path, cameras: Cameras, root: Path, form: str | None) -> N
 
 
 def camera_rows(cameras: Cameras, root: Path) -> Iterator[Sequence[str]]:
-    """Yield a header, and a row per image with a camera: path below ``root``, model, K, R, t, and ``Sigmas``.
+    """Yield a header, and a row per image with a camera: path below ``root``, model, K, R, t, and
+    ``Sigmas``.
 
     The centre of an image's first pixel is (0, 0); X_cam = R X + t. Unknown sigmas are empty cells.
     """
@@ -46,9 +51,13 @@ def camera_rows(cameras: Cameras, root: Path) -> Iterator[Sequence[str]]:
 
 
 def submission_rows(form: str, cameras: Cameras, root: Path) -> Iterator[Sequence[str]]:
-    """Yield a header, and a row for each image, in the folder's order. Append ``_`` to repeated ids and names."""
+    """Yield a header, and a row for each image, in the folder's order. Append ``_`` to repeated ids
+    and names.
+    """
     of_2025 = form == "imc2025"
-    heads = ("image_id", "dataset", "scene", "image") if of_2025 else ("image_path", "dataset", "scene")
+    heads = (
+        ("image_id", "dataset", "scene", "image") if of_2025 else ("image_path", "dataset", "scene")
+    )
     yield *heads, "rotation_matrix", "translation_vector"
     ids, names = set[str](), set(cameras) - {"."}
     for dataset, found in cameras.items():

@@ -38,7 +38,9 @@ def read_intrinsics_table(file: Path, root: Path, images: Iterable[Path]) -> str
             _require_fit(known, image, where[number])
     for number, (pattern, _) in enumerate(rows):
         if number not in used:
-            raise UserError(f"{where[number]}: {pattern!r} is the camera of no image; earlier rows come first")
+            raise UserError(
+                f"{where[number]}: {pattern!r} is the camera of no image; earlier rows come first"
+            )
     return written(rows)
 
 

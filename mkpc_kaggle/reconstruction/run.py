@@ -36,7 +36,8 @@ class FolderResult:
 
 
 def for_cameras(recipe: Recipe, sharing: str | None = None, intrinsics: str = "") -> Recipe:
-    """Return the recipe without extra pairs and without steps that only improve the F of single pairs.
+    """Return the recipe without extra pairs and without steps that only improve the F of single
+    pairs.
 
     ``sharing`` is a :class:`CameraSharing`, and ``intrinsics`` are known cameras as in :class:`SceneConfig`.
     Without them, the recipe's are kept.
@@ -62,20 +63,25 @@ def reconstruct_folder(
     rotations: bool = False,
     publish: Callable[[Cameras], None] = lambda _: None,
 ) -> FolderResult:
-    """Match the pairs that :func:`choose_pairs` returns for the datasets below ``root``; reconstruct each dataset.
+    """Match the pairs that :func:`choose_pairs` returns for the datasets below ``root``;
+    reconstruct each dataset.
 
-    COLMAP's files are in ``out``, in a folder with the dataset's name. With ``rotations``, images without matches
-    are turned. A scene's process writes these files before the journal records the scene, so that a resumed run
-    makes missing files. ``publish`` is called with the cameras so far: initially with no cameras, then after each
-    scene.
+    COLMAP's files are in ``out``, in a folder with the dataset's name. With ``rotations``, images
+    without matches are turned. A scene's process writes these files before the journal records the
+    scene, so that a resumed run makes missing files. ``publish`` is called with the cameras so far:
+    initially with no cameras, then after each scene.
     """
     assembly = replace(assembly, recipe=for_cameras(assembly.recipe))
-    with opened_engine(assembly, session, [files[0].parent for files in datasets.values()]) as engine:
+    with opened_engine(
+        assembly, session, [files[0].parent for files in datasets.values()]
+    ) as engine:
         standing: list[Cameras] = [{name: dict.fromkeys(files) for name, files in datasets.items()}]
         if not (out / "cameras.csv").exists():
             with writing(f"--out {out}"):
                 publish(standing[0])
-        pairs = choose_pairs(engine, root, datasets, assembly, session, listed=listed, rotations=rotations)
+        pairs = choose_pairs(
+            engine, root, datasets, assembly, session, listed=listed, rotations=rotations
+        )
         batches = batch_names(root, datasets)
         exports = {batches[name]: out / name for name in datasets}
 
@@ -89,7 +95,9 @@ def reconstruct_folder(
 
 
 def cameras_of(datasets: Datasets, root: Path, results: State) -> Cameras:
-    """Return the camera of each image. Identical files share one camera, from the largest model that has it."""
+    """Return the camera of each image. Identical files share one camera, from the largest model
+    that has it.
+    """
     cameras: dict[str, Mapping[Path, tuple[int, RegisteredImage] | None]] = {}
     known_digests = results.digests
     batches = batch_names(root, datasets)
@@ -126,11 +134,12 @@ def reconstruct(
     device: str = "auto",
     matchers: Mapping[str, Matcher[Any]] | None = None,
 ) -> Models:
-    """Return the models of the images at these paths, the largest first; no model if too few images match.
+    """Return the models of the images at these paths, the largest first; no model if too few images
+    match.
 
-    This is the command ``reconstruct`` in this process, without budget and journal. Cameras refer to the stored
-    pixels of the files, as COLMAP reads them. Raises :class:`UserError` for a recipe that cannot run here, and for
-    an unreadable image.
+    This is the command ``reconstruct`` in this process, without budget and journal. Cameras refer
+    to the stored pixels of the files, as COLMAP reads them. Raises :class:`UserError` for a recipe
+    that cannot run here, and for an unreadable image.
     """
     assembly = assemble(recipe, weights=map(Path, weights), device=device, matchers=matchers)
     assembly = replace(assembly, recipe=for_cameras(assembly.recipe))
@@ -147,8 +156,12 @@ def reconstruct(
         features = list(map(local_features, files))
         ends = shortlist(most_alike(lambda: features, PARTNERS))
     for path0, path1 in ((files[i], files[j]) for i, j in ends):
-        (match,) = pipeline.match([PairMatch(images=(opened(path0), opened(path1)))], assembly.recipe.units)
+        (match,) = pipeline.match(
+            [PairMatch(images=(opened(path0), opened(path1)))], assembly.recipe.units
+        )
         image0, image1 = (BatchImage(im.name, im.version, im.size, im.focal) for im in match.images)
         pairs.append(BatchPair(image0, image1, match.matches, None, tracks_of(match.results)))
-    found, _ = reconstruct_sharing(ViewGraph.of_pairs(pairs), assembly.recipe.scene or SceneConfig())
+    found, _ = reconstruct_sharing(
+        ViewGraph.of_pairs(pairs), assembly.recipe.scene or SceneConfig()
+    )
     return Models(models_of(found))

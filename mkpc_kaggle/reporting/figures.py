@@ -30,12 +30,16 @@ MAX_INLIERS, MAX_OUTLIERS = 150, 50  # maximum numbers of lines in a legible fig
 
 
 def draw_pair(image0: Image, image1: Image, match: PairMatch, config: MkpcConfig) -> "Figure":
-    """Draw the matches of all units and the critical regions, and below them the clusters of stage 1."""
+    """Draw the matches of all units and the critical regions, and below them the clusters of stage
+    1.
+    """
     figure = new_figure(12, 9)
     panels = figure.subplot_mosaic([["matches", "matches"], ["0", "1"]])
     counts = f"{len(match.matches)} matches, {match.estimate.inlier_count} inliers"
     drawn = draw_matches(panels["matches"], (image0, image1), match)
-    panels["matches"].set_title("; ".join(filter(None, [counts, match.estimate.failure, drawn])), loc="left")
+    panels["matches"].set_title(
+        "; ".join(filter(None, [counts, match.estimate.failure, drawn])), loc="left"
+    )
     for side, image in enumerate((image0, image1)):
         _draw_clusters(panels[str(side)], image, match, config, side)
     return figure
@@ -52,7 +56,8 @@ def draw_strip(images: tuple[Image, Image], match: PairMatch) -> "Figure":
 
 
 def draw_matches(axes: "Axes", images: tuple[Image, Image], match: PairMatch) -> str:
-    """Draw the images side by side, matches as lines, and critical regions as boxes. Return a caption.
+    """Draw the images side by side, matches as lines, and critical regions as boxes. Return a
+    caption.
 
     Of many matches, an even sample is drawn. In axes coordinates, each image is one unit high.
     """
@@ -72,13 +77,17 @@ def draw_matches(axes: "Axes", images: tuple[Image, Image], match: PairMatch) ->
     lines, inliers = np.stack(ends, axis=1), match.estimate.inliers
     chosen = sample(inliers, MAX_INLIERS), sample(~inliers, MAX_OUTLIERS)
     for some, colour, thickness in ((chosen[1], OUTLIER, 0.6), (chosen[0], INLIER, 1.0)):
-        axes.add_collection(LineCollection([*lines[some]], colors=colour, linewidths=thickness, alpha=0.75))
+        axes.add_collection(
+            LineCollection([*lines[some]], colors=colour, linewidths=thickness, alpha=0.75)
+        )
         x, y = lines[some].reshape(-1, 2).T
         axes.scatter(x, y, s=5, color=colour, linewidths=0)
     return f"{len(chosen[0])} inliers (green) and {len(chosen[1])} outliers (orange) drawn"
 
 
-def _draw_clusters(axes: "Axes", image: Image, match: PairMatch, config: MkpcConfig, side: int) -> None:
+def _draw_clusters(
+    axes: "Axes", image: Image, match: PairMatch, config: MkpcConfig, side: int
+) -> None:
     _show(axes, image, match.regions and match.regions[side])
     axes.set(xticks=[], yticks=[])
     if match.regions is None:
@@ -112,9 +121,14 @@ def _show(
     width, height = view.content
     axes.imshow(view.render(image.pixels), extent=(left, left + scale * width, scale * height, 0))
     if region is not None:
-        (x0, y0), (x1, y1) = (region.box.left, region.box.top), (region.box.right, region.box.bottom)
+        (x0, y0), (x1, y1) = (
+            (region.box.left, region.box.top),
+            (region.box.right, region.box.bottom),
+        )
         corners = view.from_image(np.array([(x0, y0), (x0, y1), (x1, y1), (x1, y0)]) - 0.5) + 0.5
-        axes.add_patch(Polygon(scale * corners + (left, 0), fill=False, edgecolor=REGION, linewidth=2.5))
+        axes.add_patch(
+            Polygon(scale * corners + (left, 0), fill=False, edgecolor=REGION, linewidth=2.5)
+        )
 
 
 def _upright(image: Image) -> View:
@@ -123,16 +137,21 @@ def _upright(image: Image) -> View:
 
 
 def draw_cameras(scene: SceneRecord, number: int = 0) -> "Figure":
-    """Draw a model's cameras and points, in model units, from above and the side; number 0 is the largest.
+    """Draw a model's cameras and points, in model units, from above and the side; number 0 is the
+    largest.
 
-    An arrow shows the viewing direction of a camera. Up is the images' mean up direction, and ahead is the mean
-    viewing direction. Points far from nearly all others are left out. Without cameras, the figure is only text.
+    An arrow shows the viewing direction of a camera. Up is the images' mean up direction, and ahead
+    is the mean viewing direction. Points far from nearly all others are left out. Without cameras,
+    the figure is only text.
     """
     figure = new_figure(8.4, 4.0)
     if not scene.models:
         figure.text(0.5, 0.5, f"no cameras: {scene.failure}", ha="center", wrap=True)
         return figure
-    cloud, cameras = scene.models[number].points, [found.camera for found in scene.models[number].images]
+    cloud, cameras = (
+        scene.models[number].points,
+        [found.camera for found in scene.models[number].images],
+    )
     centres, looks = np.array([(camera.centre, camera.R[2]) for camera in cameras]).swapaxes(0, 1)
     _, down, forward = np.mean([camera.R for camera in cameras], axis=0)
     up = -down / np.linalg.norm(down)
@@ -146,7 +165,10 @@ def draw_cameras(scene: SceneRecord, number: int = 0) -> "Figure":
         x, y = centres @ across, centres @ upward
         near = _near(cloud @ across) & _near(cloud @ upward)
         panel.scatter(cloud[near] @ across, cloud[near] @ upward, s=2, color=DROPPED, linewidths=0)
-        ends, style = (arrow * looks @ across, arrow * looks @ upward), {"width": 0.004, "color": COLOURS[0]}
+        ends, style = (
+            (arrow * looks @ across, arrow * looks @ upward),
+            {"width": 0.004, "color": COLOURS[0]},
+        )
         panel.quiver(x, y, *ends, angles="xy", scale_units="xy", scale=1, **style)
         panel.scatter(x, y, s=14, color=OUTLIER, linewidths=0, zorder=3)
         panel.set_aspect("equal", adjustable="datalim")
@@ -178,7 +200,9 @@ def require_format(path: Path) -> None:
 
 
 def save(figure: "Figure", path: Path) -> None:
-    """Write a figure in the format of the path's suffix. Raises :class:`UserError` if writing fails."""
+    """Write a figure in the format of the path's suffix. Raises :class:`UserError` if writing
+    fails.
+    """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with replacing(path) as stream:
@@ -190,7 +214,9 @@ def save(figure: "Figure", path: Path) -> None:
 def encode(figure: "Figure", kind: str, dpi: int = DPI) -> bytes:
     """Return the encoded figure; ``kind`` is "png" for lines and text, or "jpeg" for photographs."""
     stream = BytesIO()
-    figure.savefig(stream, format=kind, dpi=dpi, pil_kwargs={"quality": 82} if kind == "jpeg" else None)
+    figure.savefig(
+        stream, format=kind, dpi=dpi, pil_kwargs={"quality": 82} if kind == "jpeg" else None
+    )
     return stream.getvalue()
 
 

@@ -1,6 +1,7 @@
 """Points of a reconstruction from COLMAP's ``points3D.bin``, with colours, without pycolmap.
 
-pycolmap may end the process, so a report does not import it. Source: COLMAP's description of its binary format.
+pycolmap may end the process, so a report does not import it. Source: COLMAP's description of its
+binary format.
 """
 
 import struct
@@ -36,7 +37,9 @@ def clouds_of(scene: SceneRecord, out: Path) -> Sequence[Cloud]:
     """
     for folder in (out / scene.batch / SPARSE, out / SPARSE):
         with suppress(OSError, struct.error, ValueError):
-            found = [read_points(folder / str(n) / "points3D.bin") for n in range(len(scene.models))]
+            found = [
+                read_points(folder / str(n) / "points3D.bin") for n in range(len(scene.models))
+            ]
             # A killed run may have left the files of an earlier scene.
             if sum(count for _, count in found) == scene.points:
                 return [cloud for cloud, _ in found]
@@ -46,7 +49,8 @@ def clouds_of(scene: SceneRecord, out: Path) -> Sequence[Cloud]:
 def read_points(path: Path) -> tuple[Cloud, int]:
     """Return up to ``MAX_POINTS`` points of a file, and the number of all its points.
 
-    Raises ``OSError`` if the file cannot be read, ``struct.error`` or ``ValueError`` if it is damaged.
+    Raises ``OSError`` if the file cannot be read, ``struct.error`` or ``ValueError`` if it is
+    damaged.
     """
     data = path.read_bytes()
     (count,) = COUNT.unpack_from(data)

@@ -1,6 +1,7 @@
 """``report.html``: a self-contained page about a run, built from its journal, and ``summary.json`` next to it.
 
-Drawings need matplotlib, and pictures of pairs also need the images. The page states why drawings are missing.
+Drawings need matplotlib, and pictures of pairs also need the images. The page states why drawings
+are missing.
 """
 
 import base64
@@ -37,7 +38,14 @@ from mkpc_kaggle.reporting.summary import (
     weakest_cameras,
 )
 from mkpc_kaggle.reporting.verdict import doubt, inlier_histogram, verdict, write_summary
-from mkpc_kaggle.reporting.view import View, picture_at, style_and_script, template, view_of, view_part
+from mkpc_kaggle.reporting.view import (
+    View,
+    picture_at,
+    style_and_script,
+    template,
+    view_of,
+    view_part,
+)
 
 if TYPE_CHECKING:
     from markupsafe import Markup
@@ -50,11 +58,13 @@ MAX_ROWS = 2000  # of the table of pairs
 
 
 def report_run(work_dir: Path, path: Path, ends: float, pairs: Sequence[Pair] = ()) -> str:
-    """Write the report of a run that has just ended. Return a line with the path, or the reason for no report.
+    """Write the report of a run that has just ended. Return a line with the path, or the reason for
+    no report.
 
-    The page is first written without drawings, so that it exists even if the program ends while drawing. The
-    program's time ends at ``ends``, in seconds of the monotonic clock. ``pairs`` are the pairs of the run.
-    Never raises: a failed report must not change the exit status of a successful run.
+    The page is first written without drawings, so that it exists even if the program ends while
+    drawing. The program's time ends at ``ends``, in seconds of the monotonic clock. ``pairs`` are
+    the pairs of the run. Never raises: a failed report must not change the exit status of a
+    successful run.
     """
     later = f"mkpc journal {work_dir} --report {path}"
     left = ends - time.monotonic()
@@ -62,7 +72,9 @@ def report_run(work_dir: Path, path: Path, ends: float, pairs: Sequence[Pair] = 
         return f"no report, the time is up; later: {later}"
     try:
         log = read_log(work_dir)
-        write_report(log, path, pairs, undrawn="little time was left; the journal command draws them")
+        write_report(
+            log, path, pairs, undrawn="little time was left; the journal command draws them"
+        )
         write_summary(log, path)
         if left > DRAWING_S:
             write_report(log, path, pairs)
@@ -72,7 +84,9 @@ def report_run(work_dir: Path, path: Path, ends: float, pairs: Sequence[Pair] = 
 
 
 def write_report(log: RunLog, path: Path, pairs: Sequence[Pair] = (), *, undrawn: str = "") -> None:
-    """Write the page of :func:`report_page`. Raise :class:`UserError` if ``path`` cannot be written."""
+    """Write the page of :func:`report_page`. Raise :class:`UserError` if ``path`` cannot be
+    written.
+    """
     text = report_page(log, pairs, undrawn=undrawn)
     with writing(f"the report {path}"):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -92,10 +106,14 @@ def report_page(log: RunLog, pairs: Sequence[Pair] = (), *, undrawn: str = "") -
         undrawn = "matplotlib is not installed: pip install 'mkpc-kaggle[plots]'"
     sources = {} if undrawn else {pair.id: pair for pair in pairs}
     failed = [
-        (record.pair.id, record.pair.group, record.failure) for record in log.records if not record.is_solved
+        (record.pair.id, record.pair.group, record.failure)
+        for record in log.records
+        if not record.is_solved
     ]
     histogram = inlier_histogram(log.records)
-    pages = Environment(loader=PackageLoader("mkpc_kaggle.reporting"), autoescape=True, undefined=StrictUndefined)
+    pages = Environment(
+        loader=PackageLoader("mkpc_kaggle.reporting"), autoescape=True, undefined=StrictUndefined
+    )
     return pages.get_template("report.html").render(
         log=log,
         duration=format_duration,
@@ -108,9 +126,13 @@ def report_page(log: RunLog, pairs: Sequence[Pair] = (), *, undrawn: str = "") -
         failures=Counter(reason for *_, reason in failed).most_common(),
         unit_failures=[(reason,) for reason in unit_reasons(log)],
         sources=sources,
-        weakest=[(_picture(sources.get(record.pair.id), match), record) for record, match in log.weakest],
+        weakest=[
+            (_picture(sources.get(record.pair.id), match), record) for record, match in log.weakest
+        ],
         scenes=[*_scenes(log)],
-        choices=Counter(str(record.scene.reason) for record in log.records if record.scene).most_common(),
+        choices=Counter(
+            str(record.scene.reason) for record in log.records if record.scene
+        ).most_common(),
         sigmas=[
             (name, 100 * of.centre, of.rotation, of.focal) if of else (name, "unknown", "", "")
             for name, of in weakest_cameras(log.scenes)
@@ -123,7 +145,11 @@ def report_page(log: RunLog, pairs: Sequence[Pair] = (), *, undrawn: str = "") -
         histogram=histogram,
         histogram_most=max(1, *(count for _, count in histogram)),
         units=[(*means, means[1] * means[-1]) for means in unit_means(log)],
-        parts=[(name, total, total / len(log.records)) for name, total in seconds_by_part(log).items() if total],
+        parts=[
+            (name, total, total / len(log.records))
+            for name, total in seconds_by_part(log).items()
+            if total
+        ],
         undrawn=undrawn,
     )
 
@@ -136,7 +162,9 @@ def assets() -> "Markup":
 
 
 def pair_rows(records: Sequence[PairRecord]) -> list[tuple[str | int | float, ...]]:
-    """Return id, matches, inliers, overlap, source of F and doubt of each pair, the fewest inliers first."""
+    """Return id, matches, inliers, overlap, source of F and doubt of each pair, the fewest inliers
+    first.
+    """
     weakest_first = sorted(records, key=lambda record: (record.inliers, record.index))
     return [
         (
@@ -152,10 +180,14 @@ def pair_rows(records: Sequence[PairRecord]) -> list[tuple[str | int | float, ..
 
 
 def _views(log: RunLog, pairs: Sequence[Pair], *, is_drawn: bool) -> Iterator[tuple[str, "Markup"]]:
-    """Yield the title and the view of each of the largest scenes; pictures replace a view without scripts."""
+    """Yield the title and the view of each of the largest scenes; pictures replace a view without
+    scripts.
+    """
     largest = sorted(log.scenes, key=lambda scene: -scene.registered)[:MAX_SCENES]
     for scene in (scene for scene in largest if scene.models):
-        paths = {file.name: file for pair in pairs if pair.group == scene.batch for file in pair.images}
+        paths = {
+            file.name: file for pair in pairs if pair.group == scene.batch for file in pair.images
+        }
         pictures = [
             (f"{scene.batch}, model {number}", _data_uri(draw_cameras(scene, number), "png"))
             for number in range(min(len(scene.models), MAX_MODELS) if is_drawn else 0)
@@ -165,11 +197,16 @@ def _views(log: RunLog, pairs: Sequence[Pair], *, is_drawn: bool) -> Iterator[tu
             path = paths.get(Path(name).name)
             return None if path is None else picture_at(str(path))
 
-        partners = partners_of([record for record in log.records if record.pair.group == scene.batch])
+        partners = partners_of(
+            [record for record in log.records if record.pair.group == scene.batch]
+        )
         models = scene.models
         clouds = clouds_of(scene, log.path.parent.parent)
         if clouds:
-            models = tuple(replace(each, points=cloud.points) for each, cloud in zip(models, clouds, strict=True))
+            models = tuple(
+                replace(each, points=cloud.points)
+                for each, cloud in zip(models, clouds, strict=True)
+            )
         part = view_part(
             models,
             scene.batch,
@@ -190,7 +227,9 @@ def show_run(work_dir: str | Path, pairs: Sequence[Pair] = ()) -> View:
 
 
 def partners_of(records: Iterable[PairRecord]) -> dict[str, list[tuple[str, int, int]]]:
-    """Return the partners of each image: name, inliers and matches of the pair, the most inliers first."""
+    """Return the partners of each image: name, inliers and matches of the pair, the most inliers
+    first.
+    """
     partners: dict[str, list[tuple[str, int, int]]] = {}
     for record in records:
         for name, other in (record.pair.names, record.pair.names[::-1]):
@@ -215,12 +254,16 @@ def weak_figure(log: RunLog, match: PairMatch, source: Pair) -> "Figure":
 
 
 def _images(pair: Pair) -> tuple[Image, Image]:
-    first, second = (to_image(path).turned(turns) for path, turns in zip(pair.images, pair.turns, strict=True))
+    first, second = (
+        to_image(path).turned(turns) for path, turns in zip(pair.images, pair.turns, strict=True)
+    )
     return first, second
 
 
 def _scenes(log: RunLog) -> Iterator[tuple[object, ...]]:
-    """Yield a row per batch: name, images, registered, points, focals, reprojection, seconds, pairs, failure."""
+    """Yield a row per batch: name, images, registered, points, focals, reprojection, seconds,
+    pairs, failure.
+    """
     counts = Counter(record.pair.group for record in log.records if record.source == "scene")
     for each in log.scenes:
         focals = [found.focal for model in each.models for found in model.images]

@@ -67,7 +67,11 @@ class RunLog:
 
     def of_kind(self, kind: str) -> list[tuple[str, str]]:
         """Return the time and the text of each event of a kind."""
-        return [(format_duration(event.seconds), event.text) for event in self.events if event.kind == kind]
+        return [
+            (format_duration(event.seconds), event.text)
+            for event in self.events
+            if event.kind == kind
+        ]
 
 
 def read_log(directory: Path) -> RunLog:
@@ -82,7 +86,9 @@ def read_log(directory: Path) -> RunLog:
         if not table:
             raise UserError(f"{directory}: the run has not begun, or was stopped at its start")
         recipe = recipe_of(table, table.pop("name"))
-        touched = sorted((record for record in records if record.units), key=lambda r: (r.inliers, r.index))
+        touched = sorted(
+            (record for record in records if record.units), key=lambda r: (r.inliers, r.index)
+        )
         units = {unit.name: unit for unit in recipe.units}
 
         def weak(record: PairRecord) -> tuple[PairRecord, PairMatch]:
@@ -103,13 +109,21 @@ def read_log(directory: Path) -> RunLog:
 def write_csv(log: RunLog, directory: Path) -> list[Path]:
     """Write the tables pairs.csv, units.csv, regions.csv and events.csv. Return their paths.
 
-    An existing file is replaced only if it is a table with the same columns. Otherwise, and if a table cannot be
-    written, raises :class:`UserError`.
+    An existing file is replaced only if it is a table with the same columns. Otherwise, and if a
+    table cannot be written, raises :class:`UserError`.
     """
     stats = "stats.support", "stats.candidates", "stats.cost", "stats.magsac_cost"
     values = attrgetter("failure", "source", "matches", "inliers", "overlaps", *SECONDS, *stats)
     pairs = (
-        (r.index, r.pair.id, r.pair.group, *r.pair.names, *values(r), *r.stats.focals, *r.chosen_fundamental.flat)
+        (
+            r.index,
+            r.pair.id,
+            r.pair.group,
+            *r.pair.names,
+            *values(r),
+            *r.stats.focals,
+            *r.chosen_fundamental.flat,
+        )
         for r in log.records
     )
     units = ((r.index, *astuple(unit)) for r in log.records for unit in r.units)
@@ -121,7 +135,10 @@ def write_csv(log: RunLog, directory: Path) -> list[Path]:
     tables = {
         "pairs": (PAIR_HEADS.split(), pairs),
         "units": (["pair", *UnitRecord.__annotations__], units),
-        "regions": (["pair", "image", "left", "top", "right", "bottom", "reason", "clusters", "kept"], regions),
+        "regions": (
+            ["pair", "image", "left", "top", "right", "bottom", "reason", "clusters", "kept"],
+            regions,
+        ),
         "events": (["kind", "seconds", "text"], map(astuple, log.events)),
     }
     with writing(f"--csv {directory}"):

@@ -43,14 +43,17 @@ def overview(log: RunLog) -> str:
 
 def headline(run: Run) -> str:
     """Return a line: how the run ended, its duration, and the number of pairs with an F."""
-    count = f"{sum(record.is_solved for record in run.records)} of {len(run.records)} pairs have an F"
+    count = (
+        f"{sum(record.is_solved for record in run.records)} of {len(run.records)} pairs have an F"
+    )
     return f"{run.ending} after {format_duration(run.seconds)}: {count}"
 
 
 def trouble(run: Run) -> str:
     """Return why a run with a complete file failed, or an empty string.
 
-    A pair without an F counts only if an error is the cause, rather than few matches or little time.
+    A pair without an F counts only if an error is the cause, rather than few matches or little
+    time.
     """
     if run.ending in (Ending.NO_WORKER, Ending.NOTHING_RUNS):
         return f"the run failed: {run.ending}, the faults say why; the same command resumes"
@@ -60,7 +63,9 @@ def trouble(run: Run) -> str:
         return ""
     ((reason, count),) = reasons.most_common(1)
     share = f"{reasons.total()} of {len(reached)} pairs"
-    return f"the run failed: errors left {share} without an F, {count} of them with this one: {reason}"
+    return (
+        f"the run failed: errors left {share} without an F, {count} of them with this one: {reason}"
+    )
 
 
 def _error(record: PairRecord) -> str:
@@ -85,7 +90,9 @@ def left_out_line(recipe: Recipe, left_out: Sequence[str]) -> str:
     missing = [cause for cause in left_out if cause.startswith(UnavailableKind.NO_WEIGHTS)]
     parts = [f"left out, {cause}" for cause in others]
     if missing and set(recipe.matcher_names) == {"sift"}:
-        parts.append("RootSIFT only; `mkpc weights fetch light --out weights` adds learned matchers")
+        parts.append(
+            "RootSIFT only; `mkpc weights fetch light --out weights` adds learned matchers"
+        )
     elif missing and missing[0].count(",") < MAX_NAMED:
         parts += [f"left out, {cause}" for cause in missing]
     elif missing:
@@ -96,7 +103,9 @@ def left_out_line(recipe: Recipe, left_out: Sequence[str]) -> str:
 
 
 def advice(log: RunLog) -> list[str]:
-    """Return sentences on what to add: weights, if only RootSIFT ran, or images, if no pair overlaps."""
+    """Return sentences on what to add: weights, if only RootSIFT ran, or images, if no pair
+    overlaps.
+    """
     found = []
     ran = {unit.unit for record in log.records for unit in record.units}
     has_missing = any(cause.startswith(UnavailableKind.NO_WEIGHTS) for cause in log.about.left_out)
@@ -128,39 +137,62 @@ def unit_means(run: Run) -> list[tuple[str, int, float, float, float]]:
 
 
 def unit_reasons(run: Run, field: str = "failure") -> list[str]:
-    """Return the units' failures, or another ``field``, with numbers of pairs, the most frequent first."""
+    """Return the units' failures, or another ``field``, with numbers of pairs, the most frequent
+    first.
+    """
     units = (unit for record in run.records for unit in record.units)
-    counts = Counter(f"{unit.unit}: {getattr(unit, field)}" for unit in units if getattr(unit, field))
+    counts = Counter(
+        f"{unit.unit}: {getattr(unit, field)}" for unit in units if getattr(unit, field)
+    )
     return [f"{reason} ({count} pairs)" for reason, count in counts.most_common()]
 
 
 def seconds_by_part(run: Run) -> dict[str, float]:
     """Return the total seconds of all pairs for each part of the work."""
-    return {name: sum(getattr(record, field) for record in run.records) for field, name in SECONDS.items()}
+    return {
+        name: sum(getattr(record, field) for record in run.records)
+        for field, name in SECONDS.items()
+    }
 
 
 def facts(run: Run) -> Iterator[tuple[str, str, str]]:
     """Yield the most important facts as (name, value, remark)."""
     records, scenes = run.records, run.scenes
-    solved, sources = [record for record in records if record.is_solved], Counter(each.source for each in records)
+    solved, sources = (
+        [record for record in records if record.is_solved],
+        Counter(each.source for each in records),
+    )
     parts = (("scene", "from scenes"), ("pair", "from their own matches"), ("fallback", "fallback"))
-    from_where = ", ".join(f"{sources[source]} {what}" for source, what in parts if source in sources)
+    from_where = ", ".join(
+        f"{sources[source]} {what}" for source, what in parts if source in sources
+    )
     yield "pairs with an F", f"{len(solved)} of {len(records)}", from_where
     if inliers := [record.inliers for record in solved]:
-        yield "inliers of a pair", f"{median(inliers):.0f}", f"the median; the minimum is {min(inliers)}"
+        yield (
+            "inliers of a pair",
+            f"{median(inliers):.0f}",
+            f"the median; the minimum is {min(inliers)}",
+        )
         overlapping = sum(not is_doubtful(record) for record in solved)
-        threshold = f"{MIN_SUPPORT:g} times the inliers expected by chance, or two cameras that agree"
+        threshold = (
+            f"{MIN_SUPPORT:g} times the inliers expected by chance, or two cameras that agree"
+        )
         yield "overlapping pairs", f"{overlapping} of {len(solved)}", threshold
     if regions := Counter(region.reason for record in records for region in record.regions or ()):
         counts = ", ".join(f"{count} {reason}" for reason, count in regions.most_common())
         yield "critical regions", f"{regions[RegionReason.CROPPED]} of {regions.total()}", counts
     if scenes:
-        placed, images = sum(scene.registered for scene in scenes), sum(scene.images for scene in scenes)
+        placed, images = (
+            sum(scene.registered for scene in scenes),
+            sum(scene.images for scene in scenes),
+        )
         yield "images with a camera", f"{placed} of {images}", f"in {plural(len(scenes), 'batch')}"
 
 
 def _lines(run: Run) -> Iterator[str]:
-    """Yield the facts, means of units, seconds and weakest cameras, then lists of failures, units and faults."""
+    """Yield the facts, means of units, seconds and weakest cameras, then lists of failures, units
+    and faults.
+    """
     yield from (f"{name}: {value} ({remark})" for name, value, remark in facts(run))
     if means := unit_means(run):
         yield f"{'unit':<30}{'pairs':>7}{'matches':>9}{'inliers':>9}{'seconds':>9}"
@@ -177,7 +209,9 @@ def _lines(run: Run) -> Iterator[str]:
         if scene.failure and scene.failure != NOT_RECONSTRUCTED
     ]
     failed = [
-        f"{record.pair.id}: {record.failure}" for record in run.records if record.reached and not record.is_solved
+        f"{record.pair.id}: {record.failure}"
+        for record in run.records
+        if record.reached and not record.is_solved
     ]
     yield from _list("batches without a scene", no_scene)
     yield from _list("pairs with the fallback row", failed)
@@ -188,7 +222,9 @@ def _lines(run: Run) -> Iterator[str]:
 
 def wrapped(text: str) -> list[str]:
     """Return the text as lines of up to ``WIDTH`` characters; names of files stay whole."""
-    return textwrap.wrap(text, WIDTH, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
+    return textwrap.wrap(
+        text, WIDTH, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False
+    )
 
 
 def pending_lines(run: Run) -> Iterator[str]:

@@ -16,7 +16,14 @@ from mkpc_kaggle.data.outputs import replacing
 from mkpc_kaggle.engine.records import PairRecord, SceneRecord
 from mkpc_kaggle.errors import UserError, printable, writing
 from mkpc_kaggle.reporting.run_log import RunLog
-from mkpc_kaggle.reporting.summary import headline, is_doubtful, seconds_by_part, trouble, unit_means, unit_reasons
+from mkpc_kaggle.reporting.summary import (
+    headline,
+    is_doubtful,
+    seconds_by_part,
+    trouble,
+    unit_means,
+    unit_reasons,
+)
 from mkpc_kaggle.scene.choose import Reason
 from mkpc_kaggle.scene.reconstruction import RegisteredImage
 from mkpc_kaggle.version import __version__
@@ -41,7 +48,9 @@ class Verdict:
 
 
 def verdict(log: RunLog) -> Verdict:
-    """Return the verdict: about cameras if images were to be reconstructed together, else about pairs."""
+    """Return the verdict: about cameras if images were to be reconstructed together, else about
+    pairs.
+    """
     problems = list(filter(None, [trouble(log)]))
     reconstructed = [scene for scene in log.scenes if scene.models]
     if not log.scenes:
@@ -102,7 +111,9 @@ def _scene_problems(scene: SceneRecord, log: RunLog) -> Iterator[str]:
     if len(scene.models) > 1:
         sizes = ", ".join(str(len(model.images)) for model in scene.models)
         yield f"{where}the images form {len(scene.models)} models of {sizes}: add photographs that connect them"
-    uncertain = sorted({Path(found.image.name).name for found in _cameras(scene) if _is_uncertain(found)})
+    uncertain = sorted(
+        {Path(found.image.name).name for found in _cameras(scene) if _is_uncertain(found)}
+    )
     if uncertain:
         yield f"{where}uncertain cameras: {_named(uncertain)}; add photographs of the same things"
     worst = max(model.reprojection_error for model in scene.models)
@@ -125,14 +136,17 @@ def _named(names: Sequence[str]) -> str:
 
 
 def _reprojection(scenes: Sequence[SceneRecord]) -> float:
-    """Return the mean reprojection error of all models in pixels, each weighted by its observations."""
+    """Return the mean reprojection error of all models in pixels, each weighted by its
+    observations.
+    """
     models = [model for scene in scenes for model in scene.models]
     weights = [max(1, sum(found.points for found in model.images)) for model in models]
     return float(np.average([model.reprojection_error for model in models], weights=weights))
 
 
 def write_summary(log: RunLog, page: Path) -> Path | None:
-    """Write the facts of :func:`summary_table` as JSON next to the report ``page``. Return the path.
+    """Write the facts of :func:`summary_table` as JSON next to the report ``page``. Return the
+    path.
 
     ``report.html`` has ``summary.json``, another page NAME.html has NAME.summary.json; a page without the suffix
     of HTML, such as a device, has none. Raises :class:`UserError` if a file of another kind is in the way.
@@ -143,7 +157,9 @@ def write_summary(log: RunLog, page: Path) -> Path | None:
     if (path.exists() or path.is_symlink()) and not _is_summary(path):
         raise UserError(f"{path} is in the way and is not a summary of a run; move it")
     with writing(f"the summary {path}"), replacing(path) as stream:
-        stream.write(printable(json.dumps(summary_table(log), indent=1, ensure_ascii=False, allow_nan=False)))
+        stream.write(
+            printable(json.dumps(summary_table(log), indent=1, ensure_ascii=False, allow_nan=False))
+        )
         stream.write("\n")
     return path
 
@@ -152,7 +168,9 @@ def _is_summary(path: Path) -> bool:
     if path.is_symlink() or not path.is_file():
         return False
     with suppress(OSError, ValueError, AttributeError, RecursionError):
-        return str(json.loads(path.read_text(encoding="utf-8")).get("format", "")).startswith("mkpc summary ")
+        return str(json.loads(path.read_text(encoding="utf-8")).get("format", "")).startswith(
+            "mkpc summary "
+        )
     return False
 
 
@@ -189,7 +207,9 @@ def summary_table(log: RunLog) -> dict[str, Any]:
             }
             for name, pairs, matches, kept, s in unit_means(log)
         ],
-        "seconds_by_part": {name: _number(seconds) for name, seconds in seconds_by_part(log).items()},
+        "seconds_by_part": {
+            name: _number(seconds) for name, seconds in seconds_by_part(log).items()
+        },
         "unit_failures": unit_reasons(log),
         "left_out": [*log.about.left_out],
         "faults": log.faults,

@@ -1,7 +1,7 @@
 """An interactive view of cameras and points, for ``report.html`` and for notebooks.
 
-One part of a page, without libraries and requests: a 2D canvas, drawn by ``templates/view.js``. Points have 16-bit
-coordinates and 8-bit colours, in base64.
+One part of a page, without libraries and requests: a 2D canvas, drawn by ``templates/view.js``.
+Points have 16-bit coordinates and 8-bit colours, in base64.
 """
 
 import base64
@@ -37,7 +37,8 @@ FRUSTUM_SHARE = 0.4  # size of a frustum over the distance to the nearest camera
 MIN_FRUSTUM, MAX_FRUSTUM = 0.02, 0.08  # in half sizes of the scene
 FRAME_HEIGHT_PX = 760  # of the view in a notebook
 
-Reader: TypeAlias = Callable[[str], Image | None]  # the picture of an image, by its name in the scene
+# The picture of an image, by its name in the scene
+Reader: TypeAlias = Callable[[str], Image | None]
 Colours: TypeAlias = Sequence[NDArray[np.uint8]]
 Partner: TypeAlias = tuple[str, int, int]  # another image of a pair, the pair's inliers and matches
 Partners: TypeAlias = Mapping[str, Sequence[Partner]]  # by name of the image
@@ -85,7 +86,9 @@ def picture_at(path: str) -> Image | None:
 
 
 def style_and_script() -> "Markup":
-    """Return the style and the script of views, once per page; the script starts when the page is complete."""
+    """Return the style and the script of views, once per page; the script starts when the page is
+    complete.
+    """
     from markupsafe import Markup
 
     style, script = template("view.css"), template("view.js")
@@ -113,8 +116,12 @@ def view_part(
 
     if not any(model.images for model in models):
         return Markup("<p>No cameras.</p>")
-    pages = Environment(loader=PackageLoader("mkpc_kaggle.reporting"), autoescape=True, undefined=StrictUndefined)
-    data = view_data(models, read=read, partners=partners or {}, colours=colours, metres_per_unit=metres_per_unit)
+    pages = Environment(
+        loader=PackageLoader("mkpc_kaggle.reporting"), autoescape=True, undefined=StrictUndefined
+    )
+    data = view_data(
+        models, read=read, partners=partners or {}, colours=colours, metres_per_unit=metres_per_unit
+    )
     return Markup(pages.get_template("view.html").render(data=data, title=title, pictures=pictures))
 
 
@@ -138,7 +145,9 @@ def view_data(
     given: Sequence[NDArray[np.uint8] | None] = colours or [None] * len(shown)
     is_measured = metres_per_unit is not None and len(shown) == 1
     return {
-        "models": [_model(*each, pictures, partners) for each in zip(shown, frames, given, strict=True)],
+        "models": [
+            _model(*each, pictures, partners) for each in zip(shown, frames, given, strict=True)
+        ],
         "metres": metres_per_unit / frames[0].scale if is_measured and metres_per_unit else None,
     }
 
@@ -190,7 +199,9 @@ def _model(
     points = model.points[:MAX_POINTS]
     placed = frame.place(points)
     near = np.abs(placed).max(axis=1, initial=0) < FAR
-    colours = known[:MAX_POINTS] if known is not None else point_colours(points, model.images, pictures)
+    colours = (
+        known[:MAX_POINTS] if known is not None else point_colours(points, model.images, pictures)
+    )
     reach = float(np.abs(placed[near]).max(initial=1e-6))
     steps = np.round(placed[near] * (STEPS / reach)).astype("<i2")
     centres = frame.place(np.array([found.camera.centre for found in model.images]))
@@ -227,10 +238,11 @@ def _camera(
 def point_colours(
     points: NDArray[np.float64], images: Sequence[RegisteredImage], pictures: Mapping[str, Pixels]
 ) -> NDArray[np.uint8]:
-    """Return the colours (P, 3) of points, each from the nearest camera with the point in its picture.
+    """Return the colours (P, 3) of points, each from the nearest camera with the point in its
+    picture.
 
-    The nearest camera sees a point of a surface more probably than a farther one. ``pictures`` are by image name
-    and may be smaller than the images.
+    The nearest camera sees a point of a surface more probably than a farther one. ``pictures`` are
+    by image name and may be smaller than the images.
     """
     colours = np.full((len(points), 3), GREY, np.uint8)
     nearest = np.full(len(points), np.inf)
@@ -250,7 +262,9 @@ def point_colours(
     return colours
 
 
-def _projected(camera: Camera, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _projected(
+    camera: Camera, points: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return pixels (P, 2) and depths (P,); pixels are not finite in the camera's plane."""
     rays = points @ camera.R.T + camera.t
     homogeneous = rays @ camera.K.T
@@ -266,7 +280,9 @@ def _pictures(models: Sequence[SfmModel], read: Reader) -> dict[str, Pixels]:
         image = read(name)
         if image is not None:
             scale = min(1.0, THUMBNAIL_PX / max(image.size))
-            reduced = cv2.resize(image.pixels, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+            reduced = cv2.resize(
+                image.pixels, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA
+            )
             pictures[name] = np.asarray(reduced, np.uint8)
     return pictures
 

@@ -1,1 +1,3 @@
-"""Reconstruction of a batch: keypoints from all matches, models by pycolmap, and the choice of each pair's F."""
+"""Reconstruction of a batch: keypoints from all matches, models by pycolmap, and the choice of each
+pair's F.
+"""

@@ -19,7 +19,8 @@ from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Matrix3
 from mkpc_kaggle.scene.reconstruction import Reconstruction, SfmModel
 
-REFERENCE = ".mkpc-reference.json"  # in the folder of a dataset's files: its cameras at the end of the last run
+# In the folder of a dataset's files: its cameras at the end of the last run
+REFERENCE = ".mkpc-reference.json"
 MIN_COMMON = 3  # cameras
 STILL = 1e-9  # of a similarity's numbers
 OUTLIER = 4.0  # times the median distance: a camera that the two reconstructions place differently
@@ -55,10 +56,11 @@ class Similarity:
 
 
 def find_similarity(cameras: Sequence[Camera], targets: Sequence[Camera]) -> Similarity | None:
-    """Return the similarity that moves cameras onto their targets; ``None`` without ``MIN_COMMON`` usable pairs.
+    """Return the similarity that moves cameras onto their targets; ``None`` without ``MIN_COMMON``
+    usable pairs.
 
-    Rotations determine the rotation, so centres on a line are enough. Medians give a first estimate, then least
-    squares without the cameras that are far from their targets.
+    Rotations determine the rotation, so centres on a line are enough. Medians give a first
+    estimate, then least squares without the cameras that are far from their targets.
     """
     if len(cameras) < MIN_COMMON:
         return None
@@ -96,15 +98,21 @@ def _mean_rotation(rotations: Sequence[Matrix3]) -> Matrix3:
 
 
 def _median_scale(centres: NDArray[np.float64], goals: NDArray[np.float64]) -> float | None:
-    """Return the median ratio of distances between goals and between centres; ``None`` for a single centre."""
+    """Return the median ratio of distances between goals and between centres; ``None`` for a single
+    centre.
+    """
     before = pdist(centres)
     after = pdist(goals)
     apart = before > 0
     return float(np.median(after[apart] / before[apart])) if apart.any() else None
 
 
-def _least_squares(R: Matrix3, centres: NDArray[np.float64], goals: NDArray[np.float64]) -> Similarity | None:
-    """Return the similarity with rotation ``R`` that moves the rotated centres (N, 3) to their goals."""
+def _least_squares(
+    R: Matrix3, centres: NDArray[np.float64], goals: NDArray[np.float64]
+) -> Similarity | None:
+    """Return the similarity with rotation ``R`` that moves the rotated centres (N, 3) to their
+    goals.
+    """
     centre = centres.mean(axis=0)
     goal = goals.mean(axis=0)
     spread = centres - centre
@@ -120,14 +128,20 @@ def _centres(cameras: Sequence[Camera]) -> NDArray[np.float64]:
     return np.array([camera.centre for camera in cameras]).reshape(-1, 3)
 
 
-def align(reconstructions: Sequence[Reconstruction], reference: Sequence[Cameras]) -> list[Reconstruction]:
-    """Return the reconstructions, each model moved onto the earlier model with the most common images."""
+def align(
+    reconstructions: Sequence[Reconstruction], reference: Sequence[Cameras]
+) -> list[Reconstruction]:
+    """Return the reconstructions, each model moved onto the earlier model with the most common
+    images.
+    """
 
     def aligned(model: SfmModel) -> SfmModel:
         cameras = {found.image.name: found.camera for found in model.images}
         earlier = max(reference, key=lambda former: len(cameras.keys() & former.keys()), default={})
         names = sorted(cameras.keys() & earlier.keys())
-        found = find_similarity([cameras[name] for name in names], [earlier[name] for name in names])
+        found = find_similarity(
+            [cameras[name] for name in names], [earlier[name] for name in names]
+        )
         return model if found is None or found.is_identity else transformed(model, found)
 
     return [replace(each, models=tuple(map(aligned, each.models))) for each in reconstructions]
@@ -140,18 +154,24 @@ def transformed(model: SfmModel, similarity: Similarity) -> SfmModel:
 
         rotation = pycolmap.Rotation3d(similarity.R)
         model.colmap.transform(pycolmap.Sim3d(similarity.scale, rotation, similarity.t))
-    images = tuple(replace(found, camera=similarity.of_camera(found.camera)) for found in model.images)
+    images = tuple(
+        replace(found, camera=similarity.of_camera(found.camera)) for found in model.images
+    )
     return replace(model, images=images, points=similarity.of_points(model.points))
 
 
 def write_reference(stream: Any, models: Sequence[Cameras]) -> None:
     """Write the cameras of models as JSON: R and t of each image."""
-    rows = [{name: [*camera.R.ravel(), *camera.t] for name, camera in model.items()} for model in models]
+    rows = [
+        {name: [*camera.R.ravel(), *camera.t] for name, camera in model.items()} for model in models
+    ]
     json.dump(rows, stream, sort_keys=True)
 
 
 def read_reference(directory: Path) -> list[Cameras]:
-    """Return the cameras of each model of the last complete run, with K the identity; empty if unknown."""
+    """Return the cameras of each model of the last complete run, with K the identity; empty if
+    unknown.
+    """
     models: list[Cameras] = []
     with suppress(OSError, ValueError, TypeError, AttributeError, RecursionError):
         for row in json.loads((directory / REFERENCE).read_text(encoding="utf-8")):

@@ -19,7 +19,8 @@ CONTRADICTION_MATCHES = 30  # minimum number of matches that agree with the pair
 CONTRADICTION_SHARE = 0.05  # minimum share of these matches that must agree with the scene's F
 FOCAL_SIGMA = 0.1  # standard deviation of the logarithm of the scene's focal lengths
 
-ModelImages: TypeAlias = Mapping[str, RegisteredImage]  # the registered images of a model, by digest
+# The registered images of a model, by digest
+ModelImages: TypeAlias = Mapping[str, RegisteredImage]
 
 
 class Reason(StrEnum):
@@ -37,7 +38,8 @@ class Reason(StrEnum):
 class Choice:
     """The F chosen for a pair, (3, 3) of unit norm with x1^T F x0 = 0.
 
-    F is the scene's, or the pair's at the scene's focal lengths. ``None`` means that the pair keeps its F.
+    F is the scene's, or the pair's at the scene's focal lengths. ``None`` means that the pair keeps
+    its F.
     """
 
     F: Matrix3 | None
@@ -49,7 +51,9 @@ class Choice:
 
 
 def choose(pair: BatchPair, models: Sequence[ModelImages]) -> Choice:
-    """Return the F from a pair's cameras, in the first model with both cameras, or the reason for no F."""
+    """Return the F from a pair's cameras, in the first model with both cameras, or the reason for
+    no F.
+    """
     digests = pair.image0.digest, pair.image1.digest
     if digests[0] == digests[1]:
         return Choice(None, Reason.SAME_IMAGE)
@@ -65,10 +69,11 @@ def choose(pair: BatchPair, models: Sequence[ModelImages]) -> Choice:
 
 
 def contradicts(F: Matrix3, pair: BatchPair) -> bool:
-    """Return whether far fewer of the pair's matches agree with the scene's F than with the pair's own F.
+    """Return whether far fewer of the pair's matches agree with the scene's F than with the pair's
+    own F.
 
-    The pair's F normally agrees with more matches. On a repetitive facade, a wrong F may agree with many times
-    more matches, so only a tiny share counts against the scene.
+    The pair's F normally agrees with more matches. On a repetitive facade, a wrong F may agree with
+    many times more matches, so only a tiny share counts against the scene.
     """
     if pair.pair_fundamental is None:
         return False
@@ -82,7 +87,8 @@ def contradicts(F: Matrix3, pair: BatchPair) -> bool:
 def estimate_at_known_focals(
     pair: BatchPair, focals: Mapping[str, float], config: FocalConfig, magsac: RobustConfig
 ) -> Matrix3 | None:
-    """Return F (3, 3) from a pair's matches, with the scene's focal lengths ``focals``, in pixels by digest.
+    """Return F (3, 3) from a pair's matches, with the scene's focal lengths ``focals``, in pixels
+    by digest.
 
     Return ``None`` if neither image has a known focal length or the matches give no F.
     """

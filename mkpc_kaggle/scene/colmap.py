@@ -1,8 +1,8 @@
 """Structure from motion by pycolmap: from a view graph to cameras and points.
 
-pycolmap can abort the process (failed assertion, out of memory), and the global mapper has no time limit. Once
-pycolmap is imported, a SIGTERM ends the process with a stack trace on stderr. To survive
-this, run pycolmap in a separate process. Only :func:`write_files` writes to disk.
+pycolmap can abort the process (failed assertion, out of memory), and the global mapper has no time
+limit. Once pycolmap is imported, a SIGTERM ends the process with a stack trace on stderr. To
+survive this, run pycolmap in a separate process. Only :func:`write_files` writes to disk.
 
 Source: Pan et al. 2024 (the global mapper).
 """
@@ -24,24 +24,34 @@ from mkpc_kaggle.recipe import CameraModel, SceneConfig
 from mkpc_kaggle.scene.export import DATABASE, FORMER, MODELS, PART
 from mkpc_kaggle.scene.focal_lengths import apply_known_cameras
 from mkpc_kaggle.scene.keypoints import Index, scene_keypoints
-from mkpc_kaggle.scene.reconstruction import MIN_IMAGES, Reconstruction, RegisteredImage, SfmModel, filter_models
+from mkpc_kaggle.scene.reconstruction import (
+    MIN_IMAGES,
+    Reconstruction,
+    RegisteredImage,
+    SfmModel,
+    filter_models,
+)
 from mkpc_kaggle.scene.shared_intrinsics import SharedIntrinsics, start_focal
 from mkpc_kaggle.scene.uncertainty import camera_sigmas
 from mkpc_kaggle.scene.view_graph import MIN_MATCHES, Edge, ViewGraph
 
 CENTRE_PX = 0.5  # in COLMAP the top-left pixel's centre is (0.5, 0.5), here it is (0, 0)
-MAX_ERROR_PX = 2.0  # of a verified match; 1 px loses accuracy on tourist photographs, 4 px on repeated windows
+# Of a verified match; 1 px loses accuracy on tourist photographs, 4 px on repeated windows
+MAX_ERROR_PX = 2.0
 MAX_TRIALS = 300  # RANSAC trials per edge; more trials find the same inliers at five times the cost
 LARGE = 100  # images; all tracks cost too much in larger scenes and improve smaller ones
 TRACKS_PER_IMAGE = 200  # the longest tracks, from which the global mapper starts in a large scene
 SEED = 0
 
 
-def structure_from_motion(graph: ViewGraph, shared: SharedIntrinsics, config: SceneConfig) -> Reconstruction:
+def structure_from_motion(
+    graph: ViewGraph, shared: SharedIntrinsics, config: SceneConfig
+) -> Reconstruction:
     """Return pycolmap's reconstruction of a view graph, with any number of models.
 
-    Each image has its own camera, except images with ``shared`` intrinsics. The initial focal length is the shared
-    one, the user's or EXIF's. All focal lengths are refined, unless the user knows them exactly.
+    Each image has its own camera, except images with ``shared`` intrinsics. The initial focal
+    length is the shared one, the user's or EXIF's. All focal lengths are refined, unless the user
+    knows them exactly.
     """
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
     pycolmap.set_random_seed(SEED)
@@ -59,8 +69,8 @@ def write_files(
 ) -> None:
     """Write COLMAP's files: the database and one folder per model.
 
-    A temporary folder in ``directory`` holds the files until all are complete. Then they replace earlier files. A
-    model's files contain only its plausible images.
+    A temporary folder in ``directory`` holds the files until all are complete. Then they replace
+    earlier files. A model's files contain only its plausible images.
     """
     directory.mkdir(parents=True, exist_ok=True)
     for left in directory.glob(f"{PART}*"):  # of a killed process
@@ -78,7 +88,8 @@ def write_files(
             folder.mkdir(parents=True)
             model.colmap.write(folder)
         for path in filter(Path.is_file, made.rglob("*")):
-            with path.open("rb") as stream:  # a power failure must not leave empty files under their names
+            # A power failure must not leave empty files under their names
+            with path.open("rb") as stream:
                 os.fsync(stream.fileno())
         (made / DATABASE).replace(directory / DATABASE)
         if (directory / MODELS).exists():
@@ -87,7 +98,9 @@ def write_files(
             (made / MODELS).rename(directory / MODELS)
 
 
-def _fill(database: Any, graph: ViewGraph, shared: SharedIntrinsics, camera_model: CameraModel) -> None:
+def _fill(
+    database: Any, graph: ViewGraph, shared: SharedIntrinsics, camera_model: CameraModel
+) -> None:
     """Write the images, cameras and keypoints, and each edge's matches and verified geometry."""
     keypoints, found = scene_keypoints(graph)
     with pycolmap.DatabaseTransaction(database):
@@ -107,7 +120,8 @@ def _write_images(
 ) -> list[Any]:
     """Write images, frames, cameras and rigs. Return each image's camera.
 
-    Images and frames have the image's index plus one as id. Cameras and rigs have the id of their first image.
+    Images and frames have the image's index plus one as id. Cameras and rigs have the id of their
+    first image.
     """
     cameras: dict[object, Any] = {}
     used = []
@@ -132,14 +146,22 @@ def _write_images(
 
 
 def _write_camera(
-    database: Any, number: int, model: CameraModel, size: Size, focal: float, known: KnownCamera | None
+    database: Any,
+    number: int,
+    model: CameraModel,
+    size: Size,
+    focal: float,
+    known: KnownCamera | None,
 ) -> Any:
-    """Write a camera, the user's or one with initial focal length ``focal``, and a rig with only this camera."""
+    """Write a camera, the user's or one with initial focal length ``focal``, and a rig with only
+    this camera.
+    """
     name = model.value if known is None else known.model
     camera = pycolmap.Camera.create_from_model_name(number, name, focal, *size)
     if known is not None:
         camera.params = list(known.parameters)
-    camera.has_prior_focal_length = True  # a pair that E explains at this focal length counts as calibrated
+    # A pair that E explains at this focal length counts as calibrated
+    camera.has_prior_focal_length = True
     database.write_camera(camera, use_camera_id=True)
     rig = pycolmap.Rig(rig_id=number)
     rig.add_ref_sensor(camera.sensor_id)
@@ -169,7 +191,9 @@ def run_mapper(database: Any, graph: ViewGraph, threads: int) -> Reconstruction:
     seed = {"random_seed": SEED}
     common = seed | {"num_threads": threads}
     parts = dict.fromkeys(("rotation_averaging", "global_positioning", "retriangulation"), seed)
-    required = {"track_required_tracks_per_view": TRACKS_PER_IMAGE} if len(graph.images) > LARGE else {}
+    required = (
+        {"track_required_tracks_per_view": TRACKS_PER_IMAGE} if len(graph.images) > LARGE else {}
+    )
     mapper = {**common, **parts, **required}
     exact = [digest for digest, known in graph.known.items() if not known.sigma]
     if len(exact) == len(graph.images):
@@ -182,25 +206,43 @@ def run_mapper(database: Any, graph: ViewGraph, threads: int) -> Reconstruction:
     for model in found:
         apply_known_cameras(model, known_by_name(graph))
     models = filter_models([_sfm_model(model, graph) for model in found])
-    return Reconstruction(graph.names, models, "" if models else "the matches gave no plausible model")
+    return Reconstruction(
+        graph.names, models, "" if models else "the matches gave no plausible model"
+    )
 
 
 def known_by_name(graph: ViewGraph) -> dict[str, KnownCamera]:
     """Return the user's cameras by image name."""
-    return {image.name: graph.known[image.digest] for image in graph.images if image.digest in graph.known}
+    return {
+        image.name: graph.known[image.digest]
+        for image in graph.images
+        if image.digest in graph.known
+    }
 
 
 def _sfm_model(found: Any, graph: ViewGraph) -> SfmModel:
     images, sigmas = [], camera_sigmas(found, known_by_name(graph))
     for number in sorted(found.reg_image_ids()):
         image = found.images[number]
-        pose, K = np.asarray(image.cam_from_world().matrix()), np.array(image.camera.calibration_matrix())
+        pose, K = (
+            np.asarray(image.cam_from_world().matrix()),
+            np.array(image.camera.calibration_matrix()),
+        )
         K[:2, 2] -= CENTRE_PX
         camera = Camera(K, pose[:, :3].copy(), pose[:, 3].copy())
-        known = graph.images[number - 1], camera, int(image.num_points3D), sigmas.get(image.name, ())
+        known = (
+            graph.images[number - 1],
+            camera,
+            int(image.num_points3D),
+            sigmas.get(image.name, ()),
+        )
         images.append(RegisteredImage(*known))
-    tracks = {number: found.points3D[number].track.length() for number in sorted(found.point3D_ids())}
+    tracks = {
+        number: found.points3D[number].track.length() for number in sorted(found.point3D_ids())
+    }
     longest_first = sorted(tracks, key=lambda number: -tracks[number])
-    points = np.array([found.points3D[number].xyz for number in longest_first], np.float64).reshape(-1, 3)
+    points = np.array([found.points3D[number].xyz for number in longest_first], np.float64).reshape(
+        -1, 3
+    )
     error = float(found.compute_mean_reprojection_error()) if len(points) else 0.0
     return SfmModel(tuple(images), points[np.isfinite(points).all(axis=1)], error, found)

@@ -20,10 +20,12 @@ def extra_pairs(image_count: int, pairs: Sequence[Ends], per_image: float) -> li
     """
     if image_count > MAX_IMAGES:
         return []
-    linked = np.eye(image_count, dtype=bool)  # (N, N); each image is linked to its partners and itself
+    # (N, N); each image is linked to its partners and itself
+    linked = np.eye(image_count, dtype=bool)
     for first, second in pairs:
         linked[first, second] = linked[second, first] = True
-    common = linked.astype(np.float32) @ linked.astype(np.float32)  # (N, N): partners in common; exact below 2**24
+    # (N, N): partners in common; exact below 2**24
+    common = linked.astype(np.float32) @ linked.astype(np.float32)
     degrees = linked.sum(1)
     wanted = min(ceil(per_image * image_count), image_count * (image_count - 1) // 2)
     extra: list[Ends] = []

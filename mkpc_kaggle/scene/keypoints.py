@@ -1,7 +1,9 @@
-"""Keypoints of images, merged from the matches of all pairs: points less than a pixel apart are one keypoint.
+"""Keypoints of images, merged from the matches of all pairs: points less than a pixel apart are one
+keypoint.
 
-The position of a point varies by a fraction of a pixel between pairs, resolutions and matchers. Structure from
-motion tracks a point through several pairs, so its positions in an image must become one keypoint.
+The position of a point varies by a fraction of a pixel between pairs, resolutions and matchers.
+Structure from motion tracks a point through several pairs, so its positions in an image must become
+one keypoint.
 """
 
 import numpy as np
@@ -17,25 +19,34 @@ Index = NDArray[np.uint32]  # (M, 2): indices of the matched keypoints in both i
 
 
 def scene_keypoints(graph: ViewGraph) -> tuple[list[Points], list[Index]]:
-    """Return the keypoints of each image, (K, 2) float32 in image pixels, and the matches of each edge."""
+    """Return the keypoints of each image, (K, 2) float32 in image pixels, and the matches of each
+    edge.
+    """
     parts: list[list[Points]] = [[] for _ in graph.images]
     for edge in graph.edges:
         parts[edge.first].append(edge.matches.points0)
         parts[edge.second].append(edge.matches.points1)
-    merged = [merge_points(np.concatenate([np.zeros((0, 2), np.float32), *part]), CELL_PX) for part in parts]
+    merged = [
+        merge_points(np.concatenate([np.zeros((0, 2), np.float32), *part]), CELL_PX)
+        for part in parts
+    ]
     indices = [
         iter(np.split(index, np.cumsum([len(points) for points in part])[:-1]))
         for (_, index), part in zip(merged, parts, strict=True)
     ]
-    matches = [np.stack([next(indices[edge.first]), next(indices[edge.second])], axis=1) for edge in graph.edges]
+    matches = [
+        np.stack([next(indices[edge.first]), next(indices[edge.second])], axis=1)
+        for edge in graph.edges
+    ]
     return [points for points, _ in merged], list(map(one_to_one, matches))
 
 
 def merge_points(points: Points, cell: float) -> tuple[Points, NDArray[np.intp]]:
-    """Return each cell's float32 mean (K, 2) of the points (N, 2), and the index (N,) of each point's mean.
+    """Return each cell's float32 mean (K, 2) of the points (N, 2), and the index (N,) of each
+    point's mean.
 
-    A grid separates close points on the two sides of a cell border. So a second grid, shifted by half a cell,
-    merges the means from the first grid.
+    A grid separates close points on the two sides of a cell border. So a second grid, shifted by
+    half a cell, merges the means from the first grid.
     """
     total: NDArray[np.float64] = points.astype(np.float64)
     weight: NDArray[np.float64] = np.ones(len(points))
@@ -53,7 +64,8 @@ def merge_points(points: Points, cell: float) -> tuple[Points, NDArray[np.intp]]
 def one_to_one(index: NDArray[np.intp]) -> Index:
     """Select matches (M, 2) of (N, 2) so that each keypoint is used at most once.
 
-    Of conflicting matches, at most one is correct. The more frequent match wins, then the earlier one.
+    Of conflicting matches, at most one is correct. The more frequent match wins, then the earlier
+    one.
     """
     distinct, first, count = np.unique(index, axis=0, return_index=True, return_counts=True)
     order = np.lexsort((first, -count))

@@ -1,7 +1,9 @@
-"""Similarity of images by VLAD descriptors of RootSIFT, to choose each image's partners in a large folder.
+"""Similarity of images by VLAD descriptors of RootSIFT, to choose each image's partners in a large
+folder.
 
-All recipes use RootSIFT: it needs no weights, works with dense matchers, and does not depend on the orientation of
-an image. Source: Jegou et al. 2010; normalisation by Arandjelovic and Zisserman 2013.
+All recipes use RootSIFT: it needs no weights, works with dense matchers, and does not depend on the
+orientation of an image. Source: Jegou et al. 2010; normalisation by Arandjelovic and Zisserman
+2013.
 """
 
 import warnings
@@ -28,12 +30,16 @@ SCALE = np.float32(255)  # of descriptors stored as bytes
 
 
 def shortlist(partners: Partners) -> list[tuple[int, int]]:
-    """Return the sorted, distinct pairs of images and their partners, each with the smaller index first."""
+    """Return the sorted, distinct pairs of images and their partners, each with the smaller index
+    first.
+    """
     return sorted({(min(i, j), max(i, j)) for i, others in enumerate(partners) for j in others})
 
 
 def local_features(path: Path) -> bytes:
-    """Return the RootSIFT descriptors of an image, 128 bytes each; empty if the image is unreadable."""
+    """Return the RootSIFT descriptors of an image, 128 bytes each; empty if the image is
+    unreadable.
+    """
     image, found = read_image(path), None
     if isinstance(image, Image):
         scale = SIDE_PX / max(image.size)
@@ -43,7 +49,8 @@ def local_features(path: Path) -> bytes:
 
 
 def most_alike(features: Callable[[], Iterable[bytes]], count: int) -> list[list[int]]:
-    """Return, for each image, the indices of the ``count`` images with the most similar :func:`local_features`.
+    """Return, for each image, the indices of the ``count`` images with the most similar
+    :func:`local_features`.
 
     ``features`` is called once per pass, so it can stream. An image without features is similar to no other image.
     """
@@ -59,7 +66,9 @@ def most_alike(features: Callable[[], Iterable[bytes]], count: int) -> list[list
     table = np.stack([vlad(found, words) for found in map(_unpacked, features())])
     similarity = table @ table.T
     np.fill_diagonal(similarity, -np.inf)
-    near: list[list[int]] = np.argsort(-similarity, axis=1, kind="stable")[:, :-1][:, :count].tolist()
+    near: list[list[int]] = np.argsort(-similarity, axis=1, kind="stable")[:, :-1][
+        :, :count
+    ].tolist()
     return near
 
 
@@ -69,7 +78,9 @@ def _unpacked(features: bytes) -> NDArray[np.float32]:
 
 
 def vlad(descriptors: NDArray[np.float32], words: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the unit-length VLAD (W * D,) of descriptors (K, D) over words (W, D); zeros if K is 0."""
+    """Return the unit-length VLAD (W * D,) of descriptors (K, D) over words (W, D); zeros if K is
+    0.
+    """
     sums = np.zeros_like(words)
     if len(descriptors):
         nearest, _ = vq(descriptors, words)

@@ -13,17 +13,23 @@ from mkpc_kaggle.recipe import CameraSharing, SceneConfig
 from mkpc_kaggle.scene.align import align, read_reference
 from mkpc_kaggle.scene.choose import Choice, Reason, choose, estimate_at_known_focals
 from mkpc_kaggle.scene.reconstruction import MIN_IMAGES, Reconstruction, SfmModel
-from mkpc_kaggle.scene.shared_intrinsics import SharedIntrinsics, given_intrinsics, shared_intrinsics
+from mkpc_kaggle.scene.shared_intrinsics import (
+    SharedIntrinsics,
+    given_intrinsics,
+    shared_intrinsics,
+)
 from mkpc_kaggle.scene.view_graph import BatchPair, ViewGraph
 
 MIN_PAIRS_PER_IMAGE = 1.35  # connected pairs; with fewer, cameras are poorly constrained
-KEEPS_ITS_F = Reason.SCENE, Reason.SAME_IMAGE, Reason.CONTRADICTION  # not re-estimated at other focal lengths
+# Not re-estimated at other focal lengths
+KEEPS_ITS_F = Reason.SCENE, Reason.SAME_IMAGE, Reason.CONTRADICTION
 MIN_OBSERVATIONS = 0.99  # share of the observations before sharing; with fewer, sharing is dropped
 
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """The reconstructions of a batch's components, and a choice for each pair, in the order of the pairs.
+    """The reconstructions of a batch's components, and a choice for each pair, in the order of the
+    pairs.
 
     Images with the same content have the name of the first of them.
     """
@@ -45,12 +51,13 @@ def reconstruct_batch(
     lengths, unless the pair contradicts the scene. ``magsac`` has default settings if ``None``. With a directory
     ``export``, the batch is reconstructed as a whole, and COLMAP's files are written there.
 
-    A missing result has a reason; bad matches never raise. Reconstruction takes seconds to minutes and may end the
-    process, see :mod:`mkpc_kaggle.scene.colmap`.
+    A missing result has a reason; bad matches never raise. Reconstruction takes seconds to minutes
+    and may end the process, see :mod:`mkpc_kaggle.scene.colmap`.
     """
     found, shared = reconstruct_sharing(ViewGraph.of_pairs(pairs), config, export)
     models = [{image.image.digest: image for image in model.images} for model in models_of(found)]
-    focals = dict(shared)  # from the first model with the image, else from the image's shared camera
+    # From the first model with the image, else from the image's shared camera
+    focals = dict(shared)
     for model in reversed(models):
         focals |= {digest: image.focal for digest, image in model.items()}
     choices = []
@@ -68,10 +75,10 @@ def reconstruct_sharing(
 ) -> tuple[list[Reconstruction], SharedIntrinsics]:
     """Return the reconstruction of each component, and the shared intrinsics of the images.
 
-    If images seem to share a camera, a second reconstruction shares intrinsics. It is kept unless images then see
-    fewer points. If the recipe shares cameras, the first reconstruction does too. The refined focal lengths are
-    returned. With a ``directory``, the graph is reconstructed as a whole, moved onto the cameras of the last
-    complete run, and COLMAP's files are written there.
+    If images seem to share a camera, a second reconstruction shares intrinsics. It is kept unless
+    images then see fewer points. If the recipe shares cameras, the first reconstruction does too.
+    The refined focal lengths are returned. With a ``directory``, the graph is reconstructed as a
+    whole, moved onto the cameras of the last complete run, and COLMAP's files are written there.
     """
     graph = graph.with_intrinsics(read_intrinsics(config.intrinsics))
     if directory is None:
@@ -83,7 +90,9 @@ def reconstruct_sharing(
     free = [image for image in graph.images if image.digest not in graph.known]
     given = shared = given_intrinsics(free, config)
     found = [make(part, shared) for part in parts]
-    if config.cameras is CameraSharing.AUTO and (alike := shared_intrinsics(free, models_of(found))):
+    if config.cameras is CameraSharing.AUTO and (
+        alike := shared_intrinsics(free, models_of(found))
+    ):
         again = [make(part, alike) for part in parts]
         before, after = (sum(each.observations for each in made) for made in (found, again))
         if after >= MIN_OBSERVATIONS * before:
@@ -94,16 +103,24 @@ def reconstruct_sharing(
         found = align(found, read_reference(directory))
         write_files(directory, graph.strong, shared, models_of(found), config.camera_model)
     if given:
-        focals = {each.image.size: each.focal for model in reversed(models_of(found)) for each in model.images}
+        focals = {
+            each.image.size: each.focal
+            for model in reversed(models_of(found))
+            for each in model.images
+        }
         shared = {image.digest: focals[image.size] for image in free if image.size in focals}
     return found, shared
 
 
-def reconstruct_component(graph: ViewGraph, shared: SharedIntrinsics, config: SceneConfig) -> Reconstruction:
+def reconstruct_component(
+    graph: ViewGraph, shared: SharedIntrinsics, config: SceneConfig
+) -> Reconstruction:
     """Return the reconstruction of a connected graph, or the reason for its failure."""
     images, pairs = len(graph.images), len(graph.edges)
     if images < MIN_IMAGES:
-        return Reconstruction(graph.names, failure=f"{images} images are connected; a scene needs {MIN_IMAGES}")
+        return Reconstruction(
+            graph.names, failure=f"{images} images are connected; a scene needs {MIN_IMAGES}"
+        )
     if pairs < MIN_PAIRS_PER_IMAGE * images:
         few = (
             f"{pairs} matched pairs connect {images} images, and reliable cameras need "
@@ -113,7 +130,9 @@ def reconstruct_component(graph: ViewGraph, shared: SharedIntrinsics, config: Sc
     return reconstruct_connected(graph, shared, config)
 
 
-def reconstruct_connected(graph: ViewGraph, shared: SharedIntrinsics, config: SceneConfig) -> Reconstruction:
+def reconstruct_connected(
+    graph: ViewGraph, shared: SharedIntrinsics, config: SceneConfig
+) -> Reconstruction:
     """Return pycolmap's reconstruction of a graph, or the reason for its failure."""
     try:
         from mkpc_kaggle.scene.colmap import structure_from_motion

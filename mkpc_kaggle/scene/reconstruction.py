@@ -27,7 +27,8 @@ class Sigmas(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class RegisteredImage:
-    """An image with its camera, in the model's world units; ``points`` is the number of visible points.
+    """An image with its camera, in the model's world units; ``points`` is the number of visible
+    points.
 
     ``sigmas`` is empty if unknown.
     """
@@ -45,9 +46,11 @@ class RegisteredImage:
 
 @dataclass(frozen=True, eq=False)
 class SfmModel:
-    """Cameras and points (P, 3) float64 in one world frame; ``reprojection_error`` is the mean in pixels.
+    """Cameras and points (P, 3) float64 in one world frame; ``reprojection_error`` is the mean in
+    pixels.
 
-    The points of the longest tracks come first. ``colmap`` is pycolmap's model, which is not pickled.
+    The points of the longest tracks come first. ``colmap`` is pycolmap's model, which is not
+    pickled.
     """
 
     images: tuple[RegisteredImage, ...]
@@ -63,7 +66,8 @@ class SfmModel:
 class Reconstruction:
     """Result for a connected component of a batch: image names, and models, the largest first.
 
-    An image may be in several models. ``failure`` is the reason for a component without models, else empty.
+    An image may be in several models. ``failure`` is the reason for a component without models,
+    else empty.
     """
 
     names: tuple[str, ...]
@@ -82,7 +86,9 @@ class Reconstruction:
 
 
 def filter_models(models: Sequence[SfmModel]) -> tuple[SfmModel, ...]:
-    """Remove implausible cameras, then models with too few images. Return the rest, the largest first."""
+    """Remove implausible cameras, then models with too few images. Return the rest, the largest
+    first.
+    """
     cleaned = [replace(model, images=tuple(filter(is_plausible, model.images))) for model in models]
     kept = [model for model in cleaned if len(model.images) >= MIN_IMAGES]
     return tuple(sorted(kept, key=lambda model: (-len(model.images), -len(model.points))))
@@ -91,4 +97,6 @@ def filter_models(models: Sequence[SfmModel]) -> tuple[SfmModel, ...]:
 def is_plausible(found: RegisteredImage) -> bool:
     camera = found.camera
     is_finite = all(np.isfinite(part).all() for part in (camera.K, camera.R, camera.t))
-    return is_finite and found.focal / max(found.image.size) in FOCALS and found.points >= MIN_POINTS
+    return (
+        is_finite and found.focal / max(found.image.size) in FOCALS and found.points >= MIN_POINTS
+    )

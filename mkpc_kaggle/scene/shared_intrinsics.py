@@ -1,8 +1,9 @@
 """Shared intrinsics of images from one camera at one zoom, detected by their focal lengths.
 
-An image's own focal length is ambiguous with the distance to the scene, and poorly constrained by few points. If
-most images of one size agree on the focal length, one camera is assumed. A second reconstruction then has shared
-intrinsics. If the user declares one camera, the first reconstruction already has shared intrinsics.
+An image's own focal length is ambiguous with the distance to the scene, and poorly constrained by
+few points. If most images of one size agree on the focal length, one camera is assumed. A second
+reconstruction then has shared intrinsics. If the user declares one camera, the first reconstruction
+already has shared intrinsics.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,7 +18,8 @@ from mkpc_kaggle.scene.view_graph import BatchImage
 
 TOLERANCE = 0.02  # maximum relative deviation of agreeing focal lengths from the median
 MIN_ALIKE = 5  # registered images of one size
-ZOOM_POINTS = 0.5  # share of the median number of points; an image with more that disagrees has another zoom
+# Share of the median number of points; an image with more that disagrees has another zoom
+ZOOM_POINTS = 0.5
 
 # By image digest: the focal length, in pixels, of the camera that images of one size share.
 SharedIntrinsics: TypeAlias = Mapping[str, float]
@@ -31,7 +33,8 @@ def start_focal(image: BatchImage) -> float:
 def given_intrinsics(images: Sequence[BatchImage], config: SceneConfig) -> SharedIntrinsics:
     """Return one initial focal length for all images of a size, if the recipe shares cameras.
 
-    The ``images`` are those whose intrinsics the user does not know, as in :func:`shared_intrinsics`.
+    The ``images`` are those whose intrinsics the user does not know, as in
+    :func:`shared_intrinsics`.
     """
     if config.cameras is not CameraSharing.FOLDER:
         return {}
@@ -43,10 +46,11 @@ def given_intrinsics(images: Sequence[BatchImage], config: SceneConfig) -> Share
 
 
 def shared_intrinsics(images: Sequence[BatchImage], models: Sequence[SfmModel]) -> SharedIntrinsics:
-    """Return, for each image size, the focal length on which more than half of the registered images agree.
+    """Return, for each image size, the focal length on which more than half of the registered
+    images agree.
 
-    All images of the size, registered or not, share the median focal length. Exceptions are images that see many
-    points at another focal length, since they have another zoom.
+    All images of the size, registered or not, share the median focal length. Exceptions are images
+    that see many points at another focal length, since they have another zoom.
     """
     free = {image.digest for image in images}
     placed = (found for model in reversed(models) for found in model.images)
@@ -59,5 +63,9 @@ def shared_intrinsics(images: Sequence[BatchImage], models: Sequence[SfmModel]) 
         if len(alike) >= MIN_ALIKE and len(near) > len(alike) / 2:
             many = ZOOM_POINTS * float(np.median([found.points for found in alike]))
             zoomed = {found.image for found in alike if found not in near and found.points >= many}
-            shared |= {image.digest: focal for image in images if image.size == size and image not in zoomed}
+            shared |= {
+                image.digest: focal
+                for image in images
+                if image.size == size and image not in zoomed
+            }
     return shared

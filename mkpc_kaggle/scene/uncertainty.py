@@ -1,7 +1,8 @@
 """Uncertainty of a reconstruction's cameras, from the covariance of bundle adjustment.
 
-All cameras together fix the origin, orientation and scale. So errors that a similarity of the world explains do
-not count (the S-transformation of Baarda 1981). The noise of keypoints is estimated from the residuals.
+All cameras together fix the origin, orientation and scale. So errors that a similarity of the world
+explains do not count (the S-transformation of Baarda 1981). The noise of keypoints is estimated
+from the residuals.
 """
 
 from collections.abc import Mapping
@@ -18,15 +19,21 @@ from mkpc_kaggle.geometry.two_view import cross_matrix
 from mkpc_kaggle.scene.reconstruction import Sigmas
 
 MAX_IMAGES = 200  # of a model; memory is quadratic and time cubic in the number of images
-DAMPED = pycolmap.BACovarianceOptions({"damping": 1e-3})  # the world is free, so the normal equations are singular
+# The world is free, so the normal equations are singular
+DAMPED = pycolmap.BACovarianceOptions({"damping": 1e-3})
 
 
-def camera_sigmas(found: Any, known: Mapping[str, KnownCamera] = MappingProxyType({})) -> dict[str, Sigmas]:
-    """Return the sigmas of registered images in pycolmap's reconstruction, by name; empty if unknown.
+def camera_sigmas(
+    found: Any, known: Mapping[str, KnownCamera] = MappingProxyType({})
+) -> dict[str, Sigmas]:
+    """Return the sigmas of registered images in pycolmap's reconstruction, by name; empty if
+    unknown.
 
     ``known`` are the user's cameras by image name: exact ones, and priors that add to the images' information.
     """
-    images = [image for _, image in sorted(found.images.items()) if image.has_pose and image.num_points3D]
+    images = [
+        image for _, image in sorted(found.images.items()) if image.has_pose and image.num_points3D
+    ]
     if not 1 < len(images) <= MAX_IMAGES:
         return {}
     config = pycolmap.BundleAdjustmentConfig()
@@ -53,31 +60,45 @@ def camera_sigmas(found: Any, known: Mapping[str, KnownCamera] = MappingProxyTyp
             focals.append(0.0)
             continue
         camera = image.camera
-        focals.append(solved.get_other_params_cov(camera.params)[0, 0] / camera.mean_focal_length() ** 2)
+        focals.append(
+            solved.get_other_params_cov(camera.params)[0, 0] / camera.mean_focal_length() ** 2
+        )
     variances = _pose_variances([image.cam_from_world().matrix() for image in images], poses)
     noise = 2 * fit.initial_cost / redundancy  # variance of a keypoint's coordinate, square pixels
     sigmas = np.sqrt(noise * np.column_stack([variances, focals])) * [np.degrees(1), 1, 100]
     for row, image in zip(sigmas, images, strict=True):
         if image.name in known and known[image.name].sigma:
             row[2] = combined(row[2], known[image.name].sigma)
-    rows = (Sigmas(*(float(f"{value:.4g}") for value in row)) for row in sigmas)  # later digits vary between calls
+    # Later digits vary between calls
+    rows = (Sigmas(*(float(f"{value:.4g}") for value in row)) for row in sigmas)
     return dict(zip((image.name for image in images), rows, strict=True))
 
 
 def combined(sigma: float, prior: float) -> float:
-    """Return the standard deviation of the weighted mean of two independent values with these deviations."""
+    """Return the standard deviation of the weighted mean of two independent values with these
+    deviations.
+    """
     return float((sigma**-2 + prior**-2) ** -0.5) if sigma > 0 else 0.0
 
 
-def _pose_variances(poses: list[NDArray[np.float64]], covariance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return variances (N, 2) of rotations, in radians, and centres, in model sizes; ``poses`` are [R | t]."""
+def _pose_variances(
+    poses: list[NDArray[np.float64]], covariance: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return variances (N, 2) of rotations, in radians, and centres, in model sizes; ``poses`` are
+    [R | t].
+    """
     centres = np.array([-pose[:, :3].T @ pose[:, 3] for pose in poses])
     size = np.sqrt(centres.var(axis=0).sum())
     moves, similarities = [], []  # Jacobians of angles and centres by pose, and by world similarity
     for pose, centre in zip(poses, (centres - centres.mean(axis=0)) / size, strict=True):
-        R, t, zero = pose[:, :3], pose[:, 3], np.zeros((3, 4))  # COLMAP's parameters are half angles and t
-        moves.append(np.vstack([2 * np.eye(3, 6), -R.T @ np.hstack([2 * cross_matrix(t), np.eye(3)]) / size]))
-        similarities.append(np.block([[-R, zero], [-cross_matrix(centre), np.eye(3), centre[:, None]]]))
+        # COLMAP's parameters are half angles and t
+        R, t, zero = pose[:, :3], pose[:, 3], np.zeros((3, 4))
+        moves.append(
+            np.vstack([2 * np.eye(3, 6), -R.T @ np.hstack([2 * cross_matrix(t), np.eye(3)]) / size])
+        )
+        similarities.append(
+            np.block([[-R, zero], [-cross_matrix(centre), np.eye(3), centre[:, None]]])
+        )
     basis, _ = np.linalg.qr(np.vstack(similarities))
     change = block_diag(*moves)
     change -= basis @ (basis.T @ change)

@@ -13,14 +13,16 @@ from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.pipeline.pair import UnitResult
 
 MIN_MATCHES = 15  # of a connecting edge; also the minimum number of inliers of a verified edge
-MIN_TRACK_MATCHES = 50  # from units that make tracks; with fewer, a pair uses the matches of all units
+# From units that make tracks; with fewer, a pair uses the matches of all units
+MIN_TRACK_MATCHES = 50
 
 
 @dataclass(frozen=True)
 class BatchImage:
     """An image of a batch, with the ``digest`` of its content and its ``size`` in pixels.
 
-    Images with equal digests count as one image. ``focal`` is EXIF's focal length in pixels, 0 if unknown.
+    Images with equal digests count as one image. ``focal`` is EXIF's focal length in pixels, 0 if
+    unknown.
     """
 
     name: str
@@ -55,7 +57,9 @@ class Edge:
 
 @dataclass(frozen=True, eq=False)
 class ViewGraph:
-    """Distinct images, and their edges, sorted by image indices. ``known`` has the user's cameras, by digest."""
+    """Distinct images, and their edges, sorted by image indices. ``known`` has the user's cameras,
+    by digest.
+    """
 
     images: tuple[BatchImage, ...]
     edges: tuple[Edge, ...]
@@ -75,8 +79,8 @@ class ViewGraph:
     def of_pairs(cls, pairs: Sequence[BatchPair]) -> "ViewGraph":
         """Return the graph of a batch's pairs.
 
-        Pairs of the same two images, in either order, become one edge. A pair of an image with itself, and a
-        pair without matches, make no edge.
+        Pairs of the same two images, in either order, become one edge. A pair of an image with
+        itself, and a pair without matches, make no edge.
         """
         images: dict[str, BatchImage] = {}
         for image in (image for pair in pairs for image in (pair.image0, pair.image1)):
@@ -97,7 +101,9 @@ class ViewGraph:
     def with_intrinsics(self, rows: Rows) -> "ViewGraph":
         """Return the graph with the user's cameras of the images that the rows name."""
         found = {image.digest: camera_of(rows, image.name) for image in self.images}
-        return replace(self, known={digest: camera for digest, camera in found.items() if camera is not None})
+        return replace(
+            self, known={digest: camera for digest, camera in found.items() if camera is not None}
+        )
 
     def components(self) -> tuple["ViewGraph", ...]:
         """Return the components connected by strong edges, ordered by first image."""
@@ -111,7 +117,9 @@ class ViewGraph:
             members = np.flatnonzero(labels == label).tolist()
             index = {image: number for number, image in enumerate(members)}
             inside = [edge for edge in strong if labels[edge.first] == label]
-            edges = tuple(Edge(index[edge.first], index[edge.second], edge.matches) for edge in inside)
+            edges = tuple(
+                Edge(index[edge.first], index[edge.second], edge.matches) for edge in inside
+            )
             images = tuple(self.images[image] for image in members)
             found.append(replace(self, images=images, edges=edges))
         return tuple(found)
@@ -120,4 +128,8 @@ class ViewGraph:
 def tracks_of(results: Sequence[UnitResult]) -> Matches:
     """Return the matches from units that make tracks, or all matches if these are few."""
     tracks = Matches.concatenate(result.matches for result in results if result.unit.tracks)
-    return tracks if len(tracks) >= MIN_TRACK_MATCHES else Matches.concatenate(each.matches for each in results)
+    return (
+        tracks
+        if len(tracks) >= MIN_TRACK_MATCHES
+        else Matches.concatenate(each.matches for each in results)
+    )

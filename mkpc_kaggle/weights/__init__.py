@@ -1,7 +1,17 @@
-"""Weight files: the manifest; finding, verifying, loading, fetching, converting. The import brings no torch."""
+"""Weight files: the manifest; finding, verifying, loading, fetching, converting. The import brings
+no torch.
+"""
 
 from mkpc_kaggle.weights.checkpoint import load_into, load_tensors
 from mkpc_kaggle.weights.manifest import UNVERIFIED, WeightFile
 from mkpc_kaggle.weights.store import FoundFile, State, WeightStore
 
-__all__ = ["UNVERIFIED", "FoundFile", "State", "WeightFile", "WeightStore", "load_into", "load_tensors"]
+__all__ = [
+    "UNVERIFIED",
+    "FoundFile",
+    "State",
+    "WeightFile",
+    "WeightStore",
+    "load_into",
+    "load_tensors",
+]

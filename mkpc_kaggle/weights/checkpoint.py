@@ -1,4 +1,6 @@
-"""Checkpoint files: loading tensors without running code, filling networks, conversion to safetensors."""
+"""Checkpoint files: loading tensors without running code, filling networks, conversion to
+safetensors.
+"""
 
 import re
 import zipfile
@@ -16,8 +18,10 @@ if TYPE_CHECKING:
     import torch
     from torch import nn
 
-WRAPPERS = ("state_dict", "extractor")  # entries that hold the tensors, of training checkpoints and of DISK
-COUNTER = re.compile(r"(.*\.)?num_batches_tracked")  # of a batch norm, used in training only; old files have none
+# Entries that hold the tensors, of training checkpoints and of DISK
+WRAPPERS = ("state_dict", "extractor")
+# Of a batch norm, used in training only; old files have none
+COUNTER = re.compile(r"(.*\.)?num_batches_tracked")
 MAX_EXPANSION = 4  # bytes of tensors per byte of the file; some tensors share their bytes
 
 
@@ -44,7 +48,8 @@ def load_tensors(path: Path, device: str = "cpu") -> "dict[str, torch.Tensor]":
     import torch
 
     try:
-        with torch.device("cpu"):  # inside another device's context, torch puts tensors of old checkpoints there
+        # Inside another device's context, torch puts tensors of old checkpoints there
+        with torch.device("cpu"):
             table = _load_table(path, is_mapped=device == "meta")
         _require_plain(table, path)
     except Exception as error:
@@ -64,17 +69,24 @@ def load_into(
     """
     own = network.state_dict()
     odd = [
-        name for name in own.keys() ^ tensors.keys() if not re.match(unused, name) and not COUNTER.fullmatch(name)
+        name
+        for name in own.keys() ^ tensors.keys()
+        if not re.match(unused, name) and not COUNTER.fullmatch(name)
     ]
     odd += [name for name in own.keys() & tensors.keys() if own[name].shape != tensors[name].shape]
     if odd:
-        raise UserError(f"the weights for {what!r} do not fit the network: {', '.join(sorted(odd)[:5])}")
+        raise UserError(
+            f"the weights for {what!r} do not fit the network: {', '.join(sorted(odd)[:5])}"
+        )
     fitting = {name: tensor.to(own[name].dtype) for name, tensor in tensors.items() if name in own}
-    network.load_state_dict({**own, **fitting}, assign=any(tensor.is_meta for tensor in own.values()))
+    network.load_state_dict(
+        {**own, **fitting}, assign=any(tensor.is_meta for tensor in own.values())
+    )
 
 
 def convert(source: Path, target: Path, known: WeightFile | None = None) -> WeightFile:
-    """Write contiguous copies of the tensors of ``source`` to ``target``; return the target's manifest line.
+    """Write contiguous copies of the tensors of ``source`` to ``target``; return the target's
+    manifest line.
 
     ``known`` is the manifest line of the source, by default found by digest, then by name. Raises
     :class:`UserError` if the source cannot be read, the target cannot be written, or its name does not end in
@@ -100,7 +112,9 @@ def convert(source: Path, target: Path, known: WeightFile | None = None) -> Weig
         raise UserError(f"{target} cannot be written: {error}") from error
     known = known or _line_of(source) or WeightFile(source.name, -1, UNVERIFIED, "?", "?", "")
     origin = f"{known.name} ({digest_of(source)}) with the same tensor names"
-    return WeightFile(target.name, target.stat().st_size, digest_of(target), known.licence, known.slot, origin)
+    return WeightFile(
+        target.name, target.stat().st_size, digest_of(target), known.licence, known.slot, origin
+    )
 
 
 def _line_of(source: Path) -> WeightFile | None:
@@ -121,13 +135,20 @@ def is_unpacked_from(directory: Path, file: WeightFile) -> bool:
 
 
 def _require_plain(table: Mapping[Any, Any], path: Path) -> None:
-    """Raise ``ValueError`` unless all entries are named dense tensors, together not much larger than the file."""
+    """Raise ``ValueError`` unless all entries are named dense tensors, together not much larger
+    than the file.
+    """
     import torch
 
     for name, value in table.items():
-        plain = isinstance(value, torch.Tensor) and (value.layout, value.device.type) == (torch.strided, "cpu")
+        plain = isinstance(value, torch.Tensor) and (value.layout, value.device.type) == (
+            torch.strided,
+            "cpu",
+        )
         if not plain or not isinstance(name, str) or value.is_quantized or value.is_nested:
-            raise ValueError(f"entry {name!r} is not a plain named tensor; save the network's state_dict alone")
+            raise ValueError(
+                f"entry {name!r} is not a plain named tensor; save the network's state_dict alone"
+            )
     file_bytes = sum(file.stat().st_size for file in (path, *path.rglob("*")) if file.is_file())
     if sum(tensor.nbytes for tensor in table.values()) > MAX_EXPANSION * file_bytes:
         raise ValueError("its tensors are larger than the file")

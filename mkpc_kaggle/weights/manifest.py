@@ -45,7 +45,9 @@ def parse_manifest(text: str, where: str = "the weights manifest") -> tuple[Weig
     """Parse all lines of a manifest; raise :class:`UserError` with the number of an invalid line."""
     numbered = enumerate(text.splitlines(), start=1)
     lines = ((number, line.partition("#")[0].split(maxsplit=5)) for number, line in numbered)
-    return tuple(_parse_line(columns, f"{where}, line {number}") for number, columns in lines if columns)
+    return tuple(
+        _parse_line(columns, f"{where}, line {number}") for number, columns in lines if columns
+    )
 
 
 def read_manifest(path: Path) -> tuple[WeightFile, ...]:
@@ -55,7 +57,9 @@ def read_manifest(path: Path) -> tuple[WeightFile, ...]:
 
 @cache
 def manifest() -> tuple[WeightFile, ...]:
-    """Return the package's manifest: inside the package in a wheel, next to the package in a checkout."""
+    """Return the package's manifest: inside the package in a wheel, next to the package in a
+    checkout.
+    """
     package = Path(__file__).resolve().parents[1]
     for path in (package / MANIFEST, package.parent / MANIFEST):
         if path.is_file():
@@ -64,7 +68,9 @@ def manifest() -> tuple[WeightFile, ...]:
 
 
 def pin(file: WeightFile, path: Path) -> None:
-    """Add the line of ``file``, with the size and digest of ``path``, to the manifest next to ``path``."""
+    """Add the line of ``file``, with the size and digest of ``path``, to the manifest next to
+    ``path``.
+    """
     pinned = replace(file, size=path.stat().st_size, digest=digest_of(path))
     own = path.with_name(MANIFEST)
     former = own.read_text(encoding="utf-8") if own.is_file() else ""
@@ -88,7 +94,8 @@ def digest_of(path: Path) -> str:
 
 
 @cache
-def _file_digest(path: Path, _size: int, _modified_ns: int) -> str:  # size and time are part of the cache's key
+# Size and time are part of the cache's key
+def _file_digest(path: Path, _size: int, _modified_ns: int) -> str:
     with path.open("rb") as stream:
         return f"sha256:{hashlib.file_digest(stream, 'sha256').hexdigest()}"
 
@@ -102,5 +109,7 @@ def _parse_line(columns: list[str], where: str) -> WeightFile:
     if size != "?" and not re.fullmatch("[0-9]{1,18}", size):
         raise UserError(f"{where}: bytes must be a number or '?', not {size[:20]!r}")
     if not DIGEST.fullmatch(digest):
-        raise UserError(f"{where}: digest must be 'sha256:' with 64 hex digits or '{UNVERIFIED}', not {digest!r}")
+        raise UserError(
+            f"{where}: digest must be 'sha256:' with 64 hex digits or '{UNVERIFIED}', not {digest!r}"
+        )
     return WeightFile(name, -1 if size == "?" else int(size), digest, licence, slot, source.strip())

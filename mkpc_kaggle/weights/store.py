@@ -14,15 +14,24 @@ from typing import TYPE_CHECKING
 from mkpc_kaggle.data.outputs import weights_of_environment
 from mkpc_kaggle.errors import UserError, warn_once
 from mkpc_kaggle.weights.checkpoint import is_unpacked_from, load_tensors
-from mkpc_kaggle.weights.manifest import MANIFEST, UNVERIFIED, WeightFile, digest_of, manifest, read_manifest
+from mkpc_kaggle.weights.manifest import (
+    MANIFEST,
+    UNVERIFIED,
+    WeightFile,
+    digest_of,
+    manifest,
+    read_manifest,
+)
 
 if TYPE_CHECKING:
     import torch
 
 KAGGLE_INPUT = Path("/kaggle/input")
-IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png"})  # a competition's input has thousands of images
+# A competition's input has thousands of images
+IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png"})
 CHECKPOINT_SUFFIXES = frozenset({".pth", ".pt", ".ckpt", ".safetensors", ".bin", ".pkl", ""})
-MAX_UNKNOWN_SIZE_BYTES = 1 << 28  # weights of unknown size have about 50 MB; larger files are not read
+# Weights of unknown size have about 50 MB; larger files are not read
+MAX_UNKNOWN_SIZE_BYTES = 1 << 28
 UNPACKED = (
     "this checkpoint was unpacked into a directory, as Kaggle does; it is read from there, but cannot be held "
     "against the manifest's digest. Upload it as safetensors (mkpc weights convert)"
@@ -65,18 +74,24 @@ class Search:
 
 
 class WeightStore:
-    """Weight files in search directories: ``--weights``, then ``$MKPC_WEIGHTS``, then ``/kaggle/input/**``.
+    """Weight files in search directories: ``--weights``, then ``$MKPC_WEIGHTS``, then
+    ``/kaggle/input/**``.
 
-    Files are compared with the lines ``files``. By default, the lines are from the package's manifest and from
-    manifests in the search directories, which list weights that ``package`` converted.
+    Files are compared with the lines ``files``. By default, the lines are from the package's
+    manifest and from manifests in the search directories, which list weights that ``package``
+    converted.
     """
 
-    def __init__(self, directories: Iterable[Path] = (), files: Sequence[WeightFile] | None = None) -> None:
+    def __init__(
+        self, directories: Iterable[Path] = (), files: Sequence[WeightFile] | None = None
+    ) -> None:
         given = list(directories)
         for directory in given:
             if not directory.is_dir():
                 raise UserError(f"--weights {directory}: no such directory")
-        self.directories = given + weights_of_environment() + ([KAGGLE_INPUT] if KAGGLE_INPUT.is_dir() else [])
+        self.directories = (
+            given + weights_of_environment() + ([KAGGLE_INPUT] if KAGGLE_INPUT.is_dir() else [])
+        )
         self._given_files = files
         self._device = "cpu"
         self._chosen: dict[str, FoundFile] = {}  # by slot; they replace the results of searches
@@ -91,8 +106,8 @@ class WeightStore:
     def files(self) -> tuple[WeightFile, ...]:
         """The lines to compare with, one per name; the package's manifest comes first.
 
-        If the package's manifest has no digest for a file, a manifest in the search directories supplies it: the
-        digest of the first download.
+        If the package's manifest has no digest for a file, a manifest in the search directories
+        supplies it: the digest of the first download.
         """
         if self._given_files is not None:
             return tuple(self._given_files)
@@ -127,7 +142,9 @@ class WeightStore:
         found = self.find(slot)
         if found is None:
             names = " or ".join(file.name for file in self.alternatives(slot))
-            raise UserError(f"no weights for {slot!r}: {names} not found (searched {self.searched})")
+            raise UserError(
+                f"no weights for {slot!r}: {names} not found (searched {self.searched})"
+            )
         return load_tensors(found.path, self._device)
 
     def on_meta(self, *chosen: FoundFile) -> "WeightStore":
@@ -141,21 +158,27 @@ class WeightStore:
         return other
 
     def search(self, lines: Sequence[WeightFile]) -> Search:
-        """Return the first usable file for these lines. Results are cached and sent to workers with the store."""
+        """Return the first usable file for these lines. Results are cached and sent to workers with
+        the store.
+        """
         key = tuple(lines)
         if key not in self._searches:
-            judged: dict[Path, FoundFile] = {}  # by path; comparison by digest replaces comparison by name
+            # By path; comparison by digest replaces comparison by name
+            judged: dict[Path, FoundFile] = {}
             for file in self._candidates(lines):
                 judged[file.path] = file
                 if file.usable:
                     break
             found = next((file for file in judged.values() if file.usable), None)
-            self._searches[key] = Search(found, tuple(file for file in judged.values() if not file.usable))
+            self._searches[key] = Search(
+                found, tuple(file for file in judged.values() if not file.usable)
+            )
         return self._searches[key]
 
     def verify(self) -> list[FoundFile]:
         """Return all files whose name or digest is in the manifest, sorted by path."""
-        found = {file.path: file for file in reversed([*self._candidates(self.files)])}  # the first per path
+        # The first per path
+        found = {file.path: file for file in reversed([*self._candidates(self.files)])}
         return [found[path] for path in sorted(found)]
 
     def _candidates(self, lines: Sequence[WeightFile]) -> Iterator[FoundFile]:
@@ -174,7 +197,8 @@ class WeightStore:
             directories = (path for path in self._walked[1] if is_unpacked_from(path, file))
             yield from (judge(directory, file) for directory in directories)
 
-    # Indexes of the files: a directory may have a hundred thousand, the manifest has dozens of lines.
+    # Indexes of the files: a directory may have a hundred thousand, the manifest has dozens of
+    # lines.
 
     @cached_property
     def _by_name(self) -> dict[str, list[Path]]:
@@ -195,9 +219,11 @@ class WeightStore:
 
     @cached_property
     def _walked(self) -> tuple[dict[Path, int], list[Path]]:
-        """Size in bytes of each file except images, shallow files first (-1: not regular); unpacked checkpoints.
+        """Size in bytes of each file except images, shallow files first (-1: not regular); unpacked
+        checkpoints.
 
-        Links are followed, since Kaggle mounts inputs by links. No directory is visited twice, so cycles end.
+        Links are followed, since Kaggle mounts inputs by links. No directory is visited twice, so
+        cycles end.
         """
         sizes: dict[Path, int] = {}
         unpacked: list[Path] = []
@@ -205,7 +231,10 @@ class WeightStore:
         for root in self.directories:
             files: list[Path] = []
             for folder, folders, names in os.walk(root, followlinks=True):
-                place, is_checkpoint = os.path.realpath(folder), "data" in folders and "data.pkl" in names
+                place, is_checkpoint = (
+                    os.path.realpath(folder),
+                    "data" in folders and "data.pkl" in names,
+                )
                 if place in entered or is_checkpoint:
                     folders.clear()  # os.walk skips the subfolders
                 if is_checkpoint and place not in entered:
@@ -220,7 +249,9 @@ class WeightStore:
 
 
 def judge(path: Path, file: WeightFile, files: Iterable[WeightFile] = ()) -> FoundFile:
-    """Compare the file, or unpacked checkpoint, at ``path`` with ``file``; ``files`` is the whole manifest."""
+    """Compare the file, or unpacked checkpoint, at ``path`` with ``file``; ``files`` is the whole
+    manifest.
+    """
     try:
         unpacked = (path / "data.pkl").is_file()
         if path.is_dir() and not unpacked:
@@ -243,13 +274,18 @@ def judge(path: Path, file: WeightFile, files: Iterable[WeightFile] = ()) -> Fou
     elif 0 <= file.size != size:
         note = wrong_size
     elif file.digest == UNVERIFIED:
-        state, note = State.UNVERIFIED, f"the manifest has no digest for it; this file's is {digest}"
+        state, note = (
+            State.UNVERIFIED,
+            f"the manifest has no digest for it; this file's is {digest}",
+        )
     else:
         note = f"its digest is {digest}, the manifest says {file.digest}: damaged, or another file"
     return FoundFile(file, path, state, digest, note)
 
 
 def _may_be(size: int, file: WeightFile, files: Iterable[WeightFile]) -> bool:
-    """Return whether a file of ``size`` bytes may have the content of ``file`` or of one of ``files``."""
+    """Return whether a file of ``size`` bytes may have the content of ``file`` or of one of
+    ``files``.
+    """
     may_be_any = size <= MAX_UNKNOWN_SIZE_BYTES and any(line.size < 0 for line in files)
     return file.size < 0 or may_be_any or size in (file.size, *(line.size for line in files))

@@ -27,7 +27,9 @@ def test_importing_the_package_is_cheap_and_geometry_and_weights_bring_no_torch(
         "[importlib.import_module(f'{g.__name__}.{m.name}') for m in pkgutil.iter_modules(g.__path__)]\n"
         "print('torch' in sys.modules)"
     )
-    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    out = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    ).stdout
     assert out.split() == ["[]", "False"]
 
 
@@ -127,8 +129,15 @@ def test_match_saves_arrays(demo, small_recipe, tmp_path):
 def test_matplotlib_leaves_nothing_where_home_cannot_be_written(demo, small_recipe, tmp_path):
     (tmp_path / "tmp").mkdir()
     home = {"HOME": "/proc/home", "XDG_CONFIG_HOME": "/proc/home", "TMPDIR": str(tmp_path / "tmp")}
-    command = [sys.executable, "-m", "mkpc_kaggle", *match_arguments(demo, small_recipe, tmp_path / "pair.png")]
-    environment = {name: value for name, value in os.environ.items() if name != "MPLCONFIGDIR"} | home
+    command = [
+        sys.executable,
+        "-m",
+        "mkpc_kaggle",
+        *match_arguments(demo, small_recipe, tmp_path / "pair.png"),
+    ]
+    environment = {
+        name: value for name, value in os.environ.items() if name != "MPLCONFIGDIR"
+    } | home
     subprocess.run(command, env=environment, check=True)
     assert list((tmp_path / "tmp").iterdir()) == []
 
@@ -141,12 +150,15 @@ def test_match_draws_a_pair_that_has_nothing_in_common(clean_environment, tmp_pa
     assert figure.exists()
 
 
-def test_what_a_command_printed_has_been_flushed_when_it_ends_however_long_a_reader_takes(monkeypatch):
+def test_what_a_command_printed_has_been_flushed_when_it_ends_however_long_a_reader_takes(
+    monkeypatch,
+):
     class Flushed(StringIO):
         def flush(self) -> None:
             self.whole = self.getvalue(), threading.current_thread()
 
     monkeypatch.setattr(sys, "stdout", stream := Flushed())
     assert run_command("recipes") == 0
-    assert stream.whole == (stream.getvalue(), threading.main_thread())  # a thread would not be waited for
+    # A thread would not be waited for
+    assert stream.whole == (stream.getvalue(), threading.main_thread())
     assert "auto " in stream.getvalue()

@@ -1,4 +1,6 @@
-"""What each command refuses: in one line, with status 2, before any work, and without a change to a file."""
+"""What each command refuses: in one line, with status 2, before any work, and without a change to a
+file.
+"""
 
 import shutil
 from pathlib import Path
@@ -28,11 +30,23 @@ REFUSALS = [
     (f"{SUBMIT} --output link.csv", "would be written over the input demo/test/test.csv"),
     (f"{SUBMIT} --output hard.csv", "would be written over the input demo/test/test.csv"),
     (f"{SUBMIT} --output w/m.pth --weights w", "would be written over the input w"),
-    (f"{SUBMIT} --work-dir demo/test/test_images", "would be written over the input demo/test/test_images"),
-    (f"{SUBMIT} --recipe small.toml --output small.toml", "would be written over the input small.toml"),
+    (
+        f"{SUBMIT} --work-dir demo/test/test_images",
+        "would be written over the input demo/test/test_images",
+    ),
+    (
+        f"{SUBMIT} --recipe small.toml --output small.toml",
+        "would be written over the input small.toml",
+    ),
     (f"{SUBMIT} --output s.html", "would be written over --report"),
-    (f"{SUBMIT} --output w/journal.sqlite --work-dir w", "would be written over the work directory"),
-    ("validate --train-dir demo/train --json demo/train/scaling_factors.csv", "would be written over the input"),
+    (
+        f"{SUBMIT} --output w/journal.sqlite --work-dir w",
+        "would be written over the work directory",
+    ),
+    (
+        "validate --train-dir demo/train --json demo/train/scaling_factors.csv",
+        "would be written over the input",
+    ),
     ("validate --train-dir demo/train --json x.png", "exists and is not a .json file"),
     ("journal w --report w/journal.sqlite", "would be written over the work directory"),
     ("journal w --report x.png", "exists and is not a .html file"),
@@ -42,11 +56,17 @@ REFUSALS = [
     ("match x.png y.png --save pair.npy", "the name must end in .npz"),
     (f"{SUBMIT} --set foo", "--set foo: expected TABLE.KEY=VALUE"),
     (f"{SUBMIT} --set sift.ratio=1", "the tables are mkpc, magsac, focal, matchers, scene"),
-    (f"{SUBMIT} --set mkpc.epsilon=1", "table [mkpc] has the unknown key 'epsilon'; known keys: eps, "),
+    (
+        f"{SUBMIT} --set mkpc.epsilon=1",
+        "table [mkpc] has the unknown key 'epsilon'; known keys: eps, ",
+    ),
     (f"{SUBMIT} --set mkpc.eps=0", "table [mkpc]: eps must be in [1e-06, inf)"),
     (f"{SUBMIT} --set mkpc.eps.x=0", "--set mkpc.eps.x: eps is a key, not a table"),
     (f"{SUBMIT} --set matchers.sift=3", "table [matchers.sift] must be a table, not 3"),
-    (f"{SUBMIT} --set matchers.loftr.threshold=2", "[matchers.loftr]: threshold must be in [0, 1], not 2"),
+    (
+        f"{SUBMIT} --set matchers.loftr.threshold=2",
+        "[matchers.loftr]: threshold must be in [0, 1], not 2",
+    ),
     (f"{SUBMIT} --set matchers.abacus.beads=2", "unknown matcher 'abacus'"),
     (f"{SUBMIT} --set scene.threads=many", "key 'threads': expected int, got 'many'"),
     (f"{SUBMIT} --set scene.cameras=1", "1 is none of 'auto', "),
@@ -63,13 +83,21 @@ def test_what_cannot_be_done_is_refused_in_one_line_before_any_work(
 ):
     shutil.copytree(demo.test_dir, "demo/test")
     Path("demo/train").mkdir()
-    inputs = ("demo/train/scaling_factors.csv", "x.png", "w/m.pth", "users/train/a.csv", "truth/test_truth.csv")
+    inputs = (
+        "demo/train/scaling_factors.csv",
+        "x.png",
+        "w/m.pth",
+        "users/train/a.csv",
+        "truth/test_truth.csv",
+    )
     for name in inputs:
         Path(name).parent.mkdir(parents=True, exist_ok=True)
         Path(name).write_text("precious")
     Path("link.csv").symlink_to("demo/test/test.csv")
     Path("hard.csv").hardlink_to("demo/test/test.csv")
-    monkeypatch.setattr(write, "build_world", lambda *_, **__: pytest.fail("rendered before it was refused"))
+    monkeypatch.setattr(
+        write, "build_world", lambda *_, **__: pytest.fail("rendered before it was refused")
+    )
     before = contents(tmp_path)
     assert main(command.split()) == 2
     captured = capsys.readouterr()

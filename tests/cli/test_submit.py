@@ -27,7 +27,9 @@ def command(test_dir: Path, output: Path, recipe: Path | str, *more: str) -> lis
 
 def make(*paths: Path | str) -> subprocess.CompletedProcess[str]:
     environment = {name: value for name, value in os.environ.items() if name != "MKPC_WEIGHTS"}
-    return subprocess.run(command(*paths), capture_output=True, text=True, env=environment, check=False)
+    return subprocess.run(
+        command(*paths), capture_output=True, text=True, env=environment, check=False
+    )
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +44,17 @@ def made(
 
 def submit(test_dir: Path, output: Path, recipe: Path, *more: str) -> int:
     """Submit in this process."""
-    options = ("--test-dir", test_dir, "--output", output, "--recipe", recipe, "--no-report", "--workers", 0)
+    options = (
+        "--test-dir",
+        test_dir,
+        "--output",
+        output,
+        "--recipe",
+        recipe,
+        "--no-report",
+        "--workers",
+        0,
+    )
     return run_command("submit", *options, *more)
 
 
@@ -59,7 +71,9 @@ def test_a_submission_is_made_resumed_and_made_again_from_nothing(demo, small_re
     assert output.read_bytes() == written
 
 
-def test_a_killed_run_goes_on_and_ends_with_the_bytes_of_an_undisturbed_one(demo, small_recipe, made, tmp_path):
+def test_a_killed_run_goes_on_and_ends_with_the_bytes_of_an_undisturbed_one(
+    demo, small_recipe, made, tmp_path
+):
     output = tmp_path / "submission.csv"
     begun = command(demo.test_dir, output, small_recipe, "--no-report")
     running = subprocess.Popen(begun, stderr=subprocess.PIPE, text=True)
@@ -85,7 +99,9 @@ OF_ANOTHER = "sample_id,fundamental_matrix\nof another test set,0 0 0 0 0 0 0 0 
 
 
 @pytest.mark.parametrize("former", [None, "", OF_ANOTHER])
-def test_a_whole_submission_is_there_before_weights_and_devices_are_looked_at(demo, tmp_path, monkeypatch, former):
+def test_a_whole_submission_is_there_before_weights_and_devices_are_looked_at(
+    demo, tmp_path, monkeypatch, former
+):
     def look(*_, **__):
         assert problems_of(output, demo.test_dir) == []
         raise UserError("the disk with the weights cannot be read")
@@ -100,7 +116,9 @@ def test_a_whole_submission_is_there_before_weights_and_devices_are_looked_at(de
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("command", ["submit --test-dir {test}", "reconstruct {test}/test_images --out out"])
+@pytest.mark.parametrize(
+    "command", ["submit --test-dir {test}", "reconstruct {test}/test_images --out out"]
+)
 def test_a_signal_ends_the_reading_of_weights(
     demo, tmp_path, clean_environment, monkeypatch, number, command, capsys
 ):
@@ -112,8 +130,11 @@ def test_a_signal_ends_the_reading_of_weights(
 
     monkeypatch.setattr("mkpc_kaggle.weights.store.digest_of", read_for_long)
     (tmp_path / "weights").mkdir()
-    (tmp_path / "weights" / "superglue_outdoor.pth").touch()  # whose size the manifest does not have
-    status = run_command(*command.format(test=demo.test_dir).split(), "--recipe", "auto", "--weights", "weights")
+    # Whose size the manifest does not have
+    (tmp_path / "weights" / "superglue_outdoor.pth").touch()
+    status = run_command(
+        *command.format(test=demo.test_dir).split(), "--recipe", "auto", "--weights", "weights"
+    )
     assert status == 128 + number
     assert capsys.readouterr().err == "error: interrupted\n"
     if command.startswith("submit"):
@@ -122,7 +143,9 @@ def test_a_signal_ends_the_reading_of_weights(
 
 @pytest.mark.genuine
 @needs_data
-def test_the_light_recipe_with_genuine_weights_matches_photographs_with_aliked_and_lightglue(tmp_path):
+def test_the_light_recipe_with_genuine_weights_matches_photographs_with_aliked_and_lightglue(
+    tmp_path,
+):
     """On two pairs of three images of the competition."""
     rows = (DATA / "test" / "test.csv").read_text(encoding="utf-8").splitlines()
     (tmp_path / "test.csv").write_text("\n".join([rows[0], *rows[3:5]]), encoding="utf-8")
@@ -131,9 +154,13 @@ def test_the_light_recipe_with_genuine_weights_matches_photographs_with_aliked_a
     done = make(tmp_path, output, "light", "--no-report", "--weights", str(GENUINE))
     assert done.returncode == 0, done.stderr
     assert "2 of 2 pairs have an F" in done.stdout
-    assert not re.search("does without|units that failed|pairs with the fallback row", done.stdout + done.stderr)
+    assert not re.search(
+        "does without|units that failed|pairs with the fallback row", done.stdout + done.stderr
+    )
     with Store.read(tmp_path / "submission.work") as store:
-        units = [{unit.unit: unit.matches for unit in record.units} for record in read_records(store)]
+        units = [
+            {unit.unit: unit.matches for unit in record.units} for record in read_records(store)
+        ]
     for each in units:
         counts = [count for unit, count in each.items() if ":aliked_lightglue@" in unit]
         assert counts

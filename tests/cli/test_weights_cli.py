@@ -59,7 +59,11 @@ def checkpoints(monkeypatch: pytest.MonkeyPatch) -> tuple[bytes, bytes]:
 
 def test_verify_lists_refused_files_and_fails(tmp_path, checkpoints, capsys):
     one, other = checkpoints
-    weights = put(put(put(tmp_path, "one.pt", one), "renamed.pt", other), "new.pt", checkpoint(b=torch.zeros(1)))
+    weights = put(
+        put(put(tmp_path, "one.pt", one), "renamed.pt", other),
+        "new.pt",
+        checkpoint(b=torch.zeros(1)),
+    )
     assert run_command("weights", "verify", "--weights", weights) == 0
     assert "3 files, 0 refused" in capsys.readouterr().out
     put(weights, "other.pt", one)
@@ -77,19 +81,35 @@ def test_verify_says_which_matchers_networks_a_file_fits(tmp_path, monkeypatch, 
     lines = write_checkpoints(tmp_path, FILES_OF_PAPER[:3])
     monkeypatch.setattr(store, "manifest", lambda: lines)
     rows = verified(capsys, tmp_path, 0)
-    assert [rows[file.name].split("fits ")[-1] for file in lines] == ["superglue", "superglue", "loftr"]
+    assert [rows[file.name].split("fits ")[-1] for file in lines] == [
+        "superglue",
+        "superglue",
+        "loftr",
+    ]
 
 
-def test_verify_refuses_a_file_with_the_manifests_digest_that_no_network_takes(tmp_path, monkeypatch, capsys):
-    names = tuple(line(f"{slot}.pt", checkpoint(a=torch.zeros(3)), slot=slot) for slot in ("dkm-outdoor", "xfeat"))
-    monkeypatch.setattr(store, "manifest", lambda: (*names, line("superpoint.pt", slot="superpoint")))
+def test_verify_refuses_a_file_with_the_manifests_digest_that_no_network_takes(
+    tmp_path, monkeypatch, capsys
+):
+    names = tuple(
+        line(f"{slot}.pt", checkpoint(a=torch.zeros(3)), slot=slot)
+        for slot in ("dkm-outdoor", "xfeat")
+    )
+    monkeypatch.setattr(
+        store, "manifest", lambda: (*names, line("superpoint.pt", slot="superpoint"))
+    )
     for file in names:
         put(tmp_path, file.name, checkpoint(a=torch.zeros(3)))
     rows = verified(capsys, put(tmp_path, "superpoint.pt"), 1)
     assert "refused" in rows["dkm-outdoor.pt"]
-    assert "the weights for 'dkm-outdoor' do not fit the network: a, decoder." in rows["dkm-outdoor.pt"]
+    assert (
+        "the weights for 'dkm-outdoor' do not fit the network: a, decoder."
+        in rows["dkm-outdoor.pt"]
+    )
     assert "cannot be read as a checkpoint" in rows["superpoint.pt"]
-    assert rows["xfeat.pt"].endswith("not tried in a network: xfeat_lighterglue also needs xfeat-lighterglue")
+    assert rows["xfeat.pt"].endswith(
+        "not tried in a network: xfeat_lighterglue also needs xfeat-lighterglue"
+    )
     assert rows["3"].startswith("3 files, 2 refused")
 
 
@@ -97,10 +117,15 @@ def test_a_file_is_not_refused_for_another_one_of_the_same_matcher(tmp_path, mon
     lines = write_checkpoints(tmp_path, FILES_OF_PAPER[:1])
     wrong = checkpoint(a=torch.zeros(3))
     put(tmp_path, "wrong.pt", wrong)
-    monkeypatch.setattr(store, "manifest", lambda: (*lines, line("wrong.pt", wrong, slot="superglue-outdoor")))
+    monkeypatch.setattr(
+        store, "manifest", lambda: (*lines, line("wrong.pt", wrong, slot="superglue-outdoor"))
+    )
     rows = verified(capsys, tmp_path, 1)
     assert " good " in rows["superpoint_v1.pth"]
-    assert "not tried in a network: the weights for 'superglue-outdoor' do not" in rows["superpoint_v1.pth"]
+    assert (
+        "not tried in a network: the weights for 'superglue-outdoor' do not"
+        in rows["superpoint_v1.pth"]
+    )
     assert " refused " in rows["wrong.pt"]
 
 
@@ -110,9 +135,14 @@ def test_fetch_takes_files_slots_and_recipes(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("no_proxy", "127.0.0.1")
     with serve(Site(DATA)) as site:
         sources = site.url, "by hand", site.url
-        web = [replace(file, source=source) for file, source in zip(FILES[:3], sources, strict=True)]
+        web = [
+            replace(file, source=source) for file, source in zip(FILES[:3], sources, strict=True)
+        ]
         monkeypatch.setattr(store, "manifest", lambda: web)
-        assert run_command("weights", "fetch", "sift.pt", "sift", recipe, "--out", tmp_path / "out") == 0
+        assert (
+            run_command("weights", "fetch", "sift.pt", "sift", recipe, "--out", tmp_path / "out")
+            == 0
+        )
         out = capsys.readouterr().out
         assert len(site.asked) == 2
         assert run_command("weights", "fetch", "a.pt", "sift", "--out", tmp_path / "out") == 1
@@ -126,12 +156,16 @@ def test_fetch_takes_files_slots_and_recipes(tmp_path, monkeypatch, capsys):
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == there
 
 
-def test_the_first_download_of_a_file_without_a_digest_is_accepted_from_then_on(tmp_path, monkeypatch, capsys):
+def test_the_first_download_of_a_file_without_a_digest_is_accepted_from_then_on(
+    tmp_path, monkeypatch, capsys
+):
     monkeypatch.setenv("no_proxy", "127.0.0.1")
     out = tmp_path / "out"
     fetch = ["weights", "fetch", "b.pt", "--out", out]
     with serve(Site(DATA)) as site:
-        monkeypatch.setattr(store, "manifest", lambda: (replace(FILES[2], licence="own", source=site.url),))
+        monkeypatch.setattr(
+            store, "manifest", lambda: (replace(FILES[2], licence="own", source=site.url),)
+        )
         assert run_command(*fetch) == 0
         (pinned,) = store.WeightStore([out]).files
         assert (pinned.size, pinned.digest, pinned.licence) == (len(DATA), digest_of(DATA), "own")

@@ -42,11 +42,15 @@ def train(tmp_path):
     """A train side by hand: scene ``s`` with images a, b, c, d and six pairs."""
     (tmp_path / "s" / "images").mkdir(parents=True)
     (tmp_path / "s" / "images" / "a.JPG").touch()
-    cameras = [f"{name},2 0 1 0 2 1 0 0 1,1 0 0 0 1 0 0 0 1,{x} 0 0" for x, name in enumerate("abcd")]
+    cameras = [
+        f"{name},2 0 1 0 2 1 0 0 1,1 0 0 0 1 0 0 0 1,{x} 0 0" for x, name in enumerate("abcd")
+    ]
     lines = ["image_id,camera_intrinsics,rotation_matrix,translation_vector", *cameras]
     (tmp_path / "s" / "calibration.csv").write_text("\n".join(lines) + "\n")
     pairs = ["b-a,0.9", "c-a,0.1", "c-b,0.5", "d-a,0.09", "d-b,0.3", "d-c,0.7"]
-    (tmp_path / "s" / "pair_covisibility.csv").write_text("\n".join(["pair,covisibility", *pairs]) + "\n")
+    (tmp_path / "s" / "pair_covisibility.csv").write_text(
+        "\n".join(["pair,covisibility", *pairs]) + "\n"
+    )
     (tmp_path / "scaling_factors.csv").write_text("scene,scaling_factor\ns,2.5\nabsent,1\n")
     return tmp_path
 
@@ -75,7 +79,10 @@ def test_pairs_and_columns_come_in_any_order_and_ids_stay_the_text_that_they_are
         (b"\x89PNG\r\n\x1a\n\xff\xfe\x00", "cannot be read as a table"),
         (HEADER.encode() + b"\ns,b,1,2\n\nt,b,1,2,3,4\n", "line 4: 6 cells, the header has 4"),
         (HEADER.encode() + b"\ns,b,1\n", "line 2: 3 cells, the header has 4"),
-        (HEADER.encode() + b"\ns,b,1,2\nt,b,1,3\ns,b,2,3\n", "line 4: the sample_id 's' is not unique"),
+        (
+            HEADER.encode() + b"\ns,b,1,2\nt,b,1,3\ns,b,2,3\n",
+            "line 4: the sample_id 's' is not unique",
+        ),
         (HEADER.encode() + "\na\u2028b,b,1,2\n".encode(), "has control characters"),
     ],
 )
@@ -129,7 +136,13 @@ TRAIN_REFUSALS = [  # file, text, what replaces it, options, message
     ("s/calibration.csv", "", "", {"scenes": ["s", "x"]}, "unknown scene 'x'; known: absent, s"),
     ("s/calibration.csv", "", "", {"scenes": ["absent"]}, "calibration.csv: no such file"),
     ("s/calibration.csv", "", "", {"min_covisibility": 1.1}, "covisibility.csv has no pair with"),
-    ("s/calibration.csv", "2 0 1 0 2 1 0 0 1", "2 0 1 0 2 1 0 0", {}, "expected 9 numbers, found 8 words"),
+    (
+        "s/calibration.csv",
+        "2 0 1 0 2 1 0 0 1",
+        "2 0 1 0 2 1 0 0",
+        {},
+        "expected 9 numbers, found 8 words",
+    ),
     ("s/calibration.csv", ",rotation_matrix", ",rotation", {}, "lacks the columns rotation_matrix"),
     ("s/pair_covisibility.csv", "c-b", "c-x", {}, "'c-x'"),
     ("s/pair_covisibility.csv", "c-b,0.5", "c-b,many", {}, "many"),
@@ -159,7 +172,9 @@ def test_a_submission_keeps_its_numbers_and_their_order(tmp_path):
         assert_allclose(read[name], F, rtol=1e-11, atol=0)
     assert competition.submission_problems(tmp_path / "submission.csv", list(rows)) == []
     write_submission(tmp_path / "x.csv", {"b": EYE, "a": -EYE / 2})
-    expected = b"sample_id,fundamental_matrix\nb,1 0 0 0 1 0 0 0 1\na,-0.5 -0 -0 -0 -0.5 -0 -0 -0 -0.5\n"
+    expected = (
+        b"sample_id,fundamental_matrix\nb,1 0 0 0 1 0 0 0 1\na,-0.5 -0 -0 -0 -0.5 -0 -0 -0 -0.5\n"
+    )
     with (tmp_path / "x.csv").open("rb") as former:
         write_submission(tmp_path / "x.csv", {"b": EYE})
         assert former.read() == expected, "a file is replaced, not overwritten"
@@ -175,9 +190,18 @@ def test_a_submission_keeps_its_numbers_and_their_order(tmp_path):
         ("sample_id,fundamental_matrix\na,{F}\nb,{F}\nc,{F}\n", "not in test.csv, the first is c"),
         ("sample_id,fundamental_matrix\nb,{F}\na,{F}\n", "not in the order of test.csv"),
         ("sample_id,fundamental_matrix\na,{F}\nb,{F}\nb,{F}\n", "twice"),
-        ("sample_id,fundamental_matrix\na,{F}\nb,1 2 3 4 5 6 7 8\n", "b: expected 9 numbers, found 8 words"),
-        ("sample_id,fundamental_matrix\na,{F}\nb,1 2 3 4 5 6 7 8 nan\n", "b: the matrix is zero, or a number"),
-        ("sample_id,fundamental_matrix\na,{F}\nb,0 0 0 0 0 0 0 0 0\n", "b: the matrix is zero, or a number"),
+        (
+            "sample_id,fundamental_matrix\na,{F}\nb,1 2 3 4 5 6 7 8\n",
+            "b: expected 9 numbers, found 8 words",
+        ),
+        (
+            "sample_id,fundamental_matrix\na,{F}\nb,1 2 3 4 5 6 7 8 nan\n",
+            "b: the matrix is zero, or a number",
+        ),
+        (
+            "sample_id,fundamental_matrix\na,{F}\nb,0 0 0 0 0 0 0 0 0\n",
+            "b: the matrix is zero, or a number",
+        ),
         ("\0\0\0", "lacks the columns|cannot be read"),
     ],
 )
@@ -186,7 +210,9 @@ def test_each_problem_of_a_submission_is_the_only_one_found(tmp_path, content, s
     (problem,) = competition.submission_problems(tmp_path / "x.csv", ["a", "b"])
     assert re.search(says, problem)
     (tmp_path / "x.csv").write_text("sample_id,fundamental_matrix\nb,1\na,0 0 0 0 0 0 0 0 0\n")
-    assert len(competition.submission_problems(tmp_path / "x.csv", ["a", "b"])) == 3, "all are told at once"
+    assert len(competition.submission_problems(tmp_path / "x.csv", ["a", "b"])) == 3, (
+        "all are told at once"
+    )
     (problem,) = competition.submission_problems(tmp_path / "y.csv", ["a"])
     assert "no such file" in problem
 

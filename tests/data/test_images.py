@@ -1,4 +1,6 @@
-"""Decoding: what is read, what is unreadable and why, and the store that does it once; EXIF as COLMAP has it."""
+"""Decoding: what is read, what is unreadable and why, and the store that does it once; EXIF as
+COLMAP has it.
+"""
 
 import os
 import threading
@@ -13,20 +15,34 @@ from exif_files import set_exif, tiff, with_tiff
 from numpy.testing import assert_array_equal
 
 from mkpc_kaggle.data import images
-from mkpc_kaggle.data.images import ByteCache, Image, ImageStore, Unreadable, content_digest, read_exif, read_image
+from mkpc_kaggle.data.images import (
+    ByteCache,
+    Image,
+    ImageStore,
+    Unreadable,
+    content_digest,
+    read_exif,
+    read_image,
+)
 from mkpc_kaggle.geometry.coordinates import Size
 
 
 def write(path, pixels, *options):
-    order = {4: cv2.COLOR_RGBA2BGRA, 3: cv2.COLOR_RGB2BGR}.get(pixels.shape[2] if pixels.ndim == 3 else 1)
-    done, data = cv2.imencode(path.suffix, pixels if order is None else cv2.cvtColor(pixels, order), options)
+    order = {4: cv2.COLOR_RGBA2BGRA, 3: cv2.COLOR_RGB2BGR}.get(
+        pixels.shape[2] if pixels.ndim == 3 else 1
+    )
+    done, data = cv2.imencode(
+        path.suffix, pixels if order is None else cv2.cvtColor(pixels, order), options
+    )
     assert done
     path.write_bytes(data.tobytes())
     return path
 
 
 def noise(*shape, kind=np.uint8):
-    return np.random.default_rng(0).integers(0, np.iinfo(kind).max, shape, dtype=kind, endpoint=True)
+    return np.random.default_rng(0).integers(
+        0, np.iinfo(kind).max, shape, dtype=kind, endpoint=True
+    )
 
 
 def reason(path):
@@ -44,7 +60,11 @@ def test_a_png_has_three_channels_of_eight_bits(tmp_path, shape, kind):
     image = read_image(write(tmp_path / "a.png", pixels))
     bytes_ = (pixels // (256 if kind is np.uint16 else 1)).reshape(*shape[:2], -1)[..., :3]
     assert_array_equal(image.pixels, np.broadcast_to(bytes_, (*shape[:2], 3)))
-    assert (image.name, image.size, image.pixels.dtype) == (str(tmp_path / "a.png"), shape[1::-1], np.uint8)
+    assert (image.name, image.size, image.pixels.dtype) == (
+        str(tmp_path / "a.png"),
+        shape[1::-1],
+        np.uint8,
+    )
     assert len(shape) == 3 or (image.gray == bytes_[..., 0]).all()
 
 
@@ -63,7 +83,10 @@ def test_a_file_that_is_not_a_picture_has_its_reason(tmp_path):
     assert isinstance(read_image(write(tmp_path / "strip.png", noise(10, 300))), Image)
     assert "cannot be read" in reason(tmp_path / "directory.png")
     assert reason(tmp_path / "none.png") == "no such file"
-    assert str(read_image(tmp_path / os.fsdecode(b"\xff.png"))) == f"{tmp_path}/\\udcff.png: no such file"
+    assert (
+        str(read_image(tmp_path / os.fsdecode(b"\xff.png")))
+        == f"{tmp_path}/\\udcff.png: no such file"
+    )
     for name in ("pipe.png", "device.png"):
         assert reason(tmp_path / name) == "cannot be read: not a regular file"
 
@@ -72,8 +95,16 @@ def test_an_array_is_named_by_its_content_and_shape_or_refused():
     pixels = noise(6, 4, 3)
     name = Image.of_array(pixels).name
     assert name == Image.of_array(pixels.copy()).name
-    assert name not in (Image.of_array(pixels.reshape(4, 6, 3)).name, Image.of_array(255 - pixels).name)
-    wrong = [((4, 4, 4), "uint8"), ((2, 4, 4, 3), "uint8"), ((0, 4, 3), "uint8"), ((4, 4, 3), "float32")]
+    assert name not in (
+        Image.of_array(pixels.reshape(4, 6, 3)).name,
+        Image.of_array(255 - pixels).name,
+    )
+    wrong = [
+        ((4, 4, 4), "uint8"),
+        ((2, 4, 4, 3), "uint8"),
+        ((0, 4, 3), "uint8"),
+        ((4, 4, 3), "float32"),
+    ]
     for shape, kind in wrong:
         with pytest.raises(ValueError, match=rf"not {kind} \({shape[0]},"):
             Image.of_array(np.zeros(shape, kind))
@@ -109,7 +140,8 @@ def test_a_file_is_decoded_once_unless_it_made_room_or_is_unreadable(decoded):
         for name in ("a", "b", "c", "a", "d", "a", "b", "bad", "bad"):
             store.get(Path(name))
     assert [path.name for path in decoded] == ["a", "b", "c", "d", "b", "bad", "bad"]
-    with closing(ImageStore(limit_bytes=299)) as small:  # an image above the limit is handed out all the same
+    # An image above the limit is handed out all the same
+    with closing(ImageStore(limit_bytes=299)) as small:
         assert [small.get(Path("a")).name for _ in range(2)] == ["a", "a"]
     assert len(decoded) == 9
 
@@ -142,7 +174,9 @@ PIXELS = noise(40, 60, 3)
 @pytest.mark.parametrize("orientation", range(1, 9))
 @pytest.mark.parametrize("suffix", [".jpg", ".png"])
 @pytest.mark.parametrize("order", "<>")
-def test_stored_pixels_are_read_and_views_set_upright_as_by_opencv(tmp_path, orientation, suffix, order):
+def test_stored_pixels_are_read_and_views_set_upright_as_by_opencv(
+    tmp_path, orientation, suffix, order
+):
     path = set_exif(write(tmp_path / f"a{suffix}", PIXELS), orientation, order=order)
     image = read_image(path)
     stored = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
@@ -156,7 +190,10 @@ POSSIBLE = [  # a focal length for film of 35 mm; a focal length, a resolution, 
     {"tA405": 28},
     {"tA405": 28, "t920A": (42, 10), "tA20E": (250, 1), "tA210": 2},
     {"tA405": 0, "t920A": (42, 10), "tA20E": (250, 1), "tA210": 2},
-    *({"t920A": (42, 10), "tA20E": by, "tA210": n} for n, by in ((3, (100, 1)), (4, (101, 10)), (5, (10, 1001)))),
+    *(
+        {"t920A": (42, 10), "tA20E": by, "tA210": n}
+        for n, by in ((3, (100, 1)), (4, (101, 10)), (5, (10, 1001)))
+    ),
     {"t920A": (42, 10), "tA20E": (250, 1), "tA210": 1},
     {},
 ]
@@ -168,7 +205,9 @@ def test_the_focal_length_is_that_of_colmap(tmp_path, tags, order):
     path = set_exif(write(tmp_path / "a.jpg", PIXELS), 6, order=order, **tags)
     camera = pycolmap.infer_camera_from_image(path)
     image = read_image(path)
-    assert image.focal == pytest.approx(camera.focal_length if camera.has_prior_focal_length else 0, rel=1e-6)
+    assert image.focal == pytest.approx(
+        camera.focal_length if camera.has_prior_focal_length else 0, rel=1e-6
+    )
 
 
 IMPOSSIBLE = [

@@ -1,4 +1,6 @@
-"""Files that a command writes: whole or not at all, never over an input, and nothing is left beside them."""
+"""Files that a command writes: whole or not at all, never over an input, and nothing is left beside
+them.
+"""
 
 import os
 from pathlib import Path

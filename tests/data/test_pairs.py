@@ -28,7 +28,10 @@ CAMERA = Camera(K, R, np.array([0.2, -0.1, 0.5]))
 def test_a_line_is_what_was_written():
     first = Camera(K, R, np.array([1.0, 2, 3]))
     true = parse_line(line_of(("a/b.jpg", "c.png"), (first, CAMERA), (3, 1)), *WHERE)
-    assert (true.pair.images, true.pair.turns) == ((Path("images/a/b.jpg"), Path("images/c.png")), (3, 1))
+    assert (true.pair.images, true.pair.turns) == (
+        (Path("images/a/b.jpg"), Path("images/c.png")),
+        (3, 1),
+    )
     assert true.pair.id == "7: a/b.jpg turned 3 c.png turned 1"
     np.testing.assert_array_equal(true.camera0.K, K)
     found = fundamental_of_cameras(true.camera0, true.camera1)
@@ -53,7 +56,18 @@ def test_a_malformed_line_is_named_with_what_was_expected(line, expected):
 
 
 @pytest.mark.parametrize(
-    "name", ["/etc/passwd", "../a.jpg", "a/../../b.jpg", "..", "//host/a", "..\\a", "a\\..\\b", "\\a", "C:\\a"]
+    "name",
+    [
+        "/etc/passwd",
+        "../a.jpg",
+        "a/../../b.jpg",
+        "..",
+        "//host/a",
+        "..\\a",
+        "a\\..\\b",
+        "\\a",
+        "C:\\a",
+    ],
 )
 def test_no_name_leads_out_of_the_image_root(name):
     for names in (f"{name} ok.jpg", f"ok.jpg {name}"):
@@ -94,12 +108,18 @@ def test_the_true_matrix_has_no_error(demo, scenes, tmp_path):
         assert all(path.is_file() for path in true.pair.images)
 
 
-def test_a_listed_image_is_set_upright_and_scored_as_it_is_stored(demo, scenes, small_recipe, tmp_path):
-    """Images stored on their sides, with cameras to match, score as the upright images do; a missing one fails."""
+def test_a_listed_image_is_set_upright_and_scored_as_it_is_stored(
+    demo, scenes, small_recipe, tmp_path
+):
+    """Images stored on their sides, with cameras to match, score as the upright images do; a
+    missing one fails.
+    """
     lines, true = [], max(scenes[0].pairs, key=lambda true: true.covisibility)
     for number, turns in enumerate([(1, 3), (2, 0), (3, 3)]):
         names, cameras = [], []
-        for quarters, path, camera in zip(turns, true.pair.images, (true.camera0, true.camera1), strict=True):
+        for quarters, path, camera in zip(
+            turns, true.pair.images, (true.camera0, true.camera1), strict=True
+        ):
             names.append(f"{number}-{path.stem}.png")
             upright = cv2.imread(str(path))
             cv2.imwrite(str(tmp_path / names[-1]), np.rot90(upright, -quarters))
@@ -107,7 +127,16 @@ def test_a_listed_image_is_set_upright_and_scored_as_it_is_stored(demo, scenes, 
         lines.append(line_of((names[0], names[1]), (cameras[0], cameras[1]), turns))
     lines.append(line_of(("missing.jpg", "none.jpg"), (true.camera0, true.camera1)))
     (tmp_path / "list.txt").write_text("\n\n".join(lines))
-    options = "--pairs", tmp_path / "list.txt", "--image-root", tmp_path, "--method", "ransac", "--threshold", 1
+    options = (
+        "--pairs",
+        tmp_path / "list.txt",
+        "--image-root",
+        tmp_path,
+        "--method",
+        "ransac",
+        "--threshold",
+        1,
+    )
     scores = scores_of(tmp_path / "scores.json", *options, "--recipe", small_recipe)
     *found, missing = scores["scenes"][0]["pairs"]
     assert max(pair["rotation_error_degrees"] for pair in found) < 5
@@ -119,7 +148,10 @@ def test_a_listed_image_is_set_upright_and_scored_as_it_is_stored(demo, scenes, 
 
 def test_the_estimate_of_a_pair_depends_on_its_cameras():
     keys, pair = Keys(()), Pair("p", "b", "0", "1")
-    digests = [keys.of_estimate(replace(pair, intrinsics=both), ["points"]) for both in (None, (K, K), (K, K + 1))]
+    digests = [
+        keys.of_estimate(replace(pair, intrinsics=both), ["points"])
+        for both in (None, (K, K), (K, K + 1))
+    ]
     assert len(set(digests)) == 3
 
 

@@ -37,7 +37,13 @@ def blobs():
     return cv2.resize(noise, (512, 512), interpolation=cv2.INTER_CUBIC)
 
 
-def upright(left: tuple[float, float], right: tuple[float, float], low: float, high: float, texture: np.ndarray):
+def upright(
+    left: tuple[float, float],
+    right: tuple[float, float],
+    low: float,
+    high: float,
+    texture: np.ndarray,
+):
     return quad((*left, high), (*right, high), (*left, low), texture)
 
 
@@ -51,7 +57,9 @@ def test_a_view_warped_by_depth_falls_on_the_other():
     ]
     first = look_at((-1, 0, 1), (0, 10, 1), 420, (400, 300), roll=5)
     second = look_at((1.5, 1, 1.5), (0, 10, 1), 380, (300, 400), roll=-12)
-    (image_a, depth_a), (image_b, depth_b) = (render(surfaces, camera) for camera in (first, second))
+    (image_a, depth_a), (image_b, depth_b) = (
+        render(surfaces, camera) for camera in (first, second)
+    )
     y, x = np.nonzero(visible_mask(first, depth_a, second, depth_b))
     points = unproject(first, np.column_stack([x, y]).astype(float), depth_a[y, x].astype(float))
     pixels, _ = project(second, points)
@@ -64,13 +72,17 @@ def test_a_view_warped_by_depth_falls_on_the_other():
 
     assert len(y) > 0.3 * depth_a.size
     assert difference((0, 0)) < 1
-    assert min(difference(shift) for shift in ((0.5, 0), (-0.5, 0), (0, 0.5), (0, -0.5))) > 3 * difference((0, 0))
+    assert min(
+        difference(shift) for shift in ((0.5, 0), (-0.5, 0), (0, 0.5), (0, -0.5))
+    ) > 3 * difference((0, 0))
 
 
 def test_two_views_share_half_of_a_wall_and_neither_sky_nor_what_a_screen_hides():
     # A view is 10 m wide at the wall; half of that is a baseline of 5 m.
     a, b = (look_at((x, 0, 0), (x, 10, 0), 200, (200, 150)) for x in (0.0, 5.0))
-    wall, screen = (upright((x - w, y), (x + w, y), -50, 50, blobs()) for x, y, w in ((0, 10, 50), (5, 2, 2)))
+    wall, screen = (
+        upright((x - w, y), (x + w, y), -50, 50, blobs()) for x, y, w in ((0, 10, 50), (5, 2, 2))
+    )
     for surfaces, shared in (([wall], 0.5), ([wall, screen], 0), ([], 0)):
         (_, depth_a), (_, depth_b) = (render(surfaces, camera) for camera in (a, b))
         assert covisibility(a, depth_a, b, depth_b) == pytest.approx(shared, abs=0.02)
@@ -87,9 +99,16 @@ def test_fundamental_matrices_and_pictures_are_those_of_the_cameras(small_demo, 
     for row in rows(train / "pair_covisibility.csv"):
         F = fundamental_of_cameras(*(cameras[name] for name in row["pair"].split("-")))
         np.testing.assert_allclose(numbers(row["fundamental_matrix"], 3, 3), F, atol=1e-9)
-    for name, camera in zip(sorted(cameras), build_world(scene_name, image_scale=SCALE)[1], strict=True):
-        np.testing.assert_allclose([*cameras[name].K, *cameras[name].R], [*camera.K, *camera.R], atol=1e-9)
-        assert cv2.imread(str(train / "images" / f"{name}.jpg")).shape[1::-1] == (camera.width, camera.height)
+    for name, camera in zip(
+        sorted(cameras), build_world(scene_name, image_scale=SCALE)[1], strict=True
+    ):
+        np.testing.assert_allclose(
+            [*cameras[name].K, *cameras[name].R], [*camera.K, *camera.R], atol=1e-9
+        )
+        assert cv2.imread(str(train / "images" / f"{name}.jpg")).shape[1::-1] == (
+            camera.width,
+            camera.height,
+        )
 
 
 def test_the_test_side_has_covisible_pairs_of_renamed_train_images(small_demo):
@@ -98,7 +117,9 @@ def test_the_test_side_has_covisible_pairs_of_renamed_train_images(small_demo):
     for row, truth in zip(samples, truths, strict=True):
         batch, *hidden = row["batch_id"], row["image_1_id"], row["image_2_id"]
         names = truth["image_1_id"], truth["image_2_id"]
-        assert row["sample_id"] == truth["sample_id"] == f"{truth['scene']};{batch};{'-'.join(hidden)}"
+        assert (
+            row["sample_id"] == truth["sample_id"] == f"{truth['scene']};{batch};{'-'.join(hidden)}"
+        )
         train = small_demo.train_dir / truth["scene"]
         table = rows(train / "pair_covisibility.csv")
         (pair,) = (each for each in table if set(each["pair"].split("-")) == set(names))

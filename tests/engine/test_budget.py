@@ -3,19 +3,36 @@ import time
 
 import pytest
 
-from mkpc_kaggle.engine.budget import WINDOW, Budget, Costs, format_duration, monotonic_of, parse_duration
+from mkpc_kaggle.engine.budget import (
+    WINDOW,
+    Budget,
+    Costs,
+    format_duration,
+    monotonic_of,
+    parse_duration,
+)
 from mkpc_kaggle.errors import UserError
 
 
 @pytest.mark.parametrize(
     ("text", "seconds"),
-    [("8h45m", 31500), ("90m", 5400), ("60s", 60), ("60", 60), ("1h", 3600), ("1h2m3s", 3723), ("2.5s", 2.5)],
+    [
+        ("8h45m", 31500),
+        ("90m", 5400),
+        ("60s", 60),
+        ("60", 60),
+        ("1h", 3600),
+        ("1h2m3s", 3723),
+        ("2.5s", 2.5),
+    ],
 )
 def test_durations_are_read(text: str, seconds: float) -> None:
     assert parse_duration(text) == seconds
 
 
-@pytest.mark.parametrize("text", ["", "h", "8 hours", "-5s", "1m1h", "0", "0s", "nan", "9:00", "8h45", "1h30m20"])
+@pytest.mark.parametrize(
+    "text", ["", "h", "8 hours", "-5s", "1m1h", "0", "0s", "nan", "9:00", "8h45", "1h30m20"]
+)
 def test_what_is_not_a_duration_is_refused(text: str) -> None:
     with pytest.raises(UserError):
         parse_duration(text)

@@ -28,10 +28,14 @@ def test_other_forms_are_refused_with_those_that_there_are(text: str) -> None:
     assert all(form in told for form in ("a number of processes", "ray (", "ray://HOST:PORT")), told
 
 
-def test_without_ray_it_says_how_to_install_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_ray_it_says_how_to_install_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(UserError, match=r'pip install "mkpc-kaggle\[ray\]"'):
-        run(write_pairs(tmp_path, 1), THREE_UNITS, RectifiedMatcher(), tmp_path / "w", workers="ray")
+        run(
+            write_pairs(tmp_path, 1), THREE_UNITS, RectifiedMatcher(), tmp_path / "w", workers="ray"
+        )
 
 
 @pytest.mark.parametrize("port", [1, 99999])

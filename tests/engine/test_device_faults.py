@@ -1,4 +1,6 @@
-"""Devices that fail, memory that is short, workers that are lost: what counts against what, what takes over."""
+"""Devices that fail, memory that is short, workers that are lost: what counts against what, what
+takes over.
+"""
 
 import threading
 from collections.abc import Callable, Sequence
@@ -37,7 +39,9 @@ VICTIM = 3  # brightness 13
 def test_what_errors_mean():
     import torch
 
-    cuda = "CUDA error: {}\nCUDA kernel errors might be asynchronously reported at some other API call"
+    cuda = (
+        "CUDA error: {}\nCUDA kernel errors might be asynchronously reported at some other API call"
+    )
     messages = {
         FailureKind.OUT_OF_MEMORY: [
             "[enforce fail at alloc_cpu.cpp:117] err == 0. DefaultCPUAllocator: can't allocate memory",
@@ -59,7 +63,10 @@ def test_what_errors_mean():
     }
     for kind, texts in messages.items():
         assert {failure_of(RuntimeError(text)) for text in texts} == {kind}
-    for error in (MemoryError(), torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB.")):
+    for error in (
+        MemoryError(),
+        torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB."),
+    ):
         assert failure_of(error) is FailureKind.OUT_OF_MEMORY
     assert failure_of(ValueError("no points")) is failure_of(AssertionError()) is FailureKind.RAISED
     illegal = RuntimeError(cuda.format("an illegal memory access was encountered"))
@@ -91,14 +98,18 @@ def assert_as_if_nothing_had_failed(report: RunReport, undisturbed: RunReport) -
         [RectifiedMatcher(matches=lambda _: exhaust_gpu())],
     ],
 )
-def test_the_cpu_takes_over_when_the_last_gpu_fails_or_has_no_memory_for_any_unit(run_at, undisturbed, gpus):
+def test_the_cpu_takes_over_when_the_last_gpu_fails_or_has_no_memory_for_any_unit(
+    run_at, undisturbed, gpus
+):
     places = [thread_place(f"cuda:{number}", matcher) for number, matcher in enumerate(gpus)]
     report = run_at(*places, fallback=[thread_place("cpu", RectifiedMatcher())])
     assert_as_if_nothing_had_failed(report, undisturbed)
 
 
 def test_a_device_that_fails_once_costs_a_worker_and_no_unit(run_at, undisturbed, tmp_path):
-    report = run_at(thread_place("cuda:0", FaultyMatcher(fault=break_device, once=tmp_path / "broken")))
+    report = run_at(
+        thread_place("cuda:0", FaultyMatcher(fault=break_device, once=tmp_path / "broken"))
+    )
     assert report.faults == (
         f"a job was lost on cuda:0: the device failed: RuntimeError: {BROKEN}, in 1:rectified@96",
     )
@@ -113,7 +124,9 @@ def test_a_pair_at_which_a_device_fails_is_done_by_a_healthy_one(run_at, undistu
     assert_as_if_nothing_had_failed(report, undisturbed)
 
 
-def test_a_device_without_kernels_leaves_the_work_to_the_cpu_and_a_line(run_at, undisturbed, capsys):
+def test_a_device_without_kernels_leaves_the_work_to_the_cpu_and_a_line(
+    run_at, undisturbed, capsys
+):
     assembly = assemble(THREE_UNITS, matchers={"rectified": RectifiedMatcher()}, device="cpu")
     gpu = thread_place("cuda:99", RectifiedMatcher(), pipeline=assembly.on("cuda:99").pipeline)
     report = run_at(gpu, fallback=[thread_place("cpu", RectifiedMatcher())])
@@ -135,7 +148,9 @@ def test_a_worker_that_hangs_keeps_no_job_from_the_others(run_at, undisturbed):
         return 150
 
     matchers = [RectifiedMatcher(matches=answer) for answer in (wait_for_others, note)]
-    report = run_at(*(thread_place(f"cuda:{number}", matcher) for number, matcher in enumerate(matchers)))
+    report = run_at(
+        *(thread_place(f"cuda:{number}", matcher) for number, matcher in enumerate(matchers))
+    )
     assert_as_if_nothing_had_failed(report, undisturbed)
 
 
@@ -145,7 +160,10 @@ def test_a_unit_too_large_for_the_memory_is_skipped_on_that_pair_alone_and_tried
     report = run_at(thread_place("cuda:0", FaultyMatcher(fault=exhaust_gpu, above=100)))
     assert report.ending is Ending.COMPLETE
     memory = "out of memory: RuntimeError: CUDA out of memory. Tried to allocate 20.00 GiB, in {0}"
-    told = [f"{unit.name} is skipped on pair {VICTIM} ({memory.format(unit.name)})" for unit in (THIRD, SECOND)]
+    told = [
+        f"{unit.name} is skipped on pair {VICTIM} ({memory.format(unit.name)})"
+        for unit in (THIRD, SECOND)
+    ]
     assert [event.text for event in report.explanations if "skipped" in event.text] == told
     assert [unit.unit for unit in report.records[VICTIM].units] == [SWEEP.name]
     assert report.records[VICTIM].inliers > 100, "it keeps the F that it has"
@@ -164,24 +182,34 @@ def test_a_minibatch_that_memory_is_too_short_for_is_halved_once_and_no_worker_l
     assert report.faults == ()
     assert_as_if_nothing_had_failed(report, undisturbed)
     too_large = [size for size in matcher.sizes if size > 2]
-    assert len(too_large) == 2 * len(THREE_UNITS.units), "seven or eight, and three or four: once a unit"
+    assert len(too_large) == 2 * len(THREE_UNITS.units), (
+        "seven or eight, and three or four: once a unit"
+    )
 
 
 @pytest.mark.parametrize(
     ("fault", "told"),
     [
-        (lack_an_image, "errors left 8 of 8 pairs without an F, 8 of them with this one: KeyError: 'image 7'"),
+        (
+            lack_an_image,
+            "errors left 8 of 8 pairs without an F, 8 of them with this one: KeyError: 'image 7'",
+        ),
         (break_device, "no worker left, the faults say why; the same command resumes"),
         (exhaust_gpu, "every unit was skipped, the faults say why; the same command resumes"),
     ],
 )
-def test_a_run_that_failed_has_exit_status_one_and_a_line(demo, tmp_path, monkeypatch, capsys, fault, told):
+def test_a_run_that_failed_has_exit_status_one_and_a_line(
+    demo, tmp_path, monkeypatch, capsys, fault, told
+):
     matcher = RectifiedMatcher(matches=lambda _: fault())
     use_places(monkeypatch, thread_place("this process", matcher))
     made = assemble(THREE_UNITS, matchers={matcher.name: matcher}, device="cpu")
     monkeypatch.setattr(options, "assemble", lambda *_, **__: made)
     output = tmp_path / "submission.csv"
-    assert main(["submit", "--test-dir", str(demo.test_dir), "--output", str(output), "--no-report"]) == 1
+    assert (
+        main(["submit", "--test-dir", str(demo.test_dir), "--output", str(output), "--no-report"])
+        == 1
+    )
     assert f"the run failed: {told}" in capsys.readouterr().out
     assert submission_problems(output, [pair.id for pair in read_test_side(demo.test_dir)]) == []
 
@@ -190,7 +218,10 @@ def test_a_run_that_failed_has_exit_status_one_and_a_line(demo, tmp_path, monkey
     ("error", "told"),
     [
         (DeviceError("cuda:0 cannot be used"), "the device failed: cuda:0 cannot be used"),
-        (UserError("weights of another network"), "the matchers cannot be loaded: weights of another network"),
+        (
+            UserError("weights of another network"),
+            "the matchers cannot be loaded: weights of another network",
+        ),
         (ValueError("no such layer"), "the worker failed: ValueError: no such layer"),
         (MemoryError("weights"), "out of memory: MemoryError: weights"),
     ],
@@ -220,8 +251,13 @@ def test_a_matcher_that_a_worker_cannot_load_costs_its_units_alone_and_is_told_o
 
     other = Unit(1, "broken", 120)
     recipe = replace(THREE_UNITS, units=(SWEEP, other, SECOND, THIRD))
-    use_places(monkeypatch, thread_place("cpu", RectifiedMatcher(), pipeline=partial(Pipeline, recipe, load)))
-    report = run(pairs, recipe, RectifiedMatcher(), tmp_path / "work", more=[RectifiedMatcher(name="broken")])
+    use_places(
+        monkeypatch,
+        thread_place("cpu", RectifiedMatcher(), pipeline=partial(Pipeline, recipe, load)),
+    )
+    report = run(
+        pairs, recipe, RectifiedMatcher(), tmp_path / "work", more=[RectifiedMatcher(name="broken")]
+    )
     assert_as_if_nothing_had_failed(report, undisturbed)
     assert report.faults == (f"broken is left out: {told}",)
     assert capsys.readouterr().err.count(told) == 1

@@ -7,7 +7,16 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from rectified import SECOND, SWEEP, THIRD, THREE_UNITS, RectifiedMatcher, matrices, run, write_pairs
+from rectified import (
+    SECOND,
+    SWEEP,
+    THIRD,
+    THREE_UNITS,
+    RectifiedMatcher,
+    matrices,
+    run,
+    write_pairs,
+)
 
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.records import PairRecord, read_records
@@ -74,7 +83,9 @@ def test_an_interrupted_run_goes_on_where_it_was_and_ends_with_the_same_bytes(tm
     second = RectifiedMatcher()
     resumed = run(pairs, THREE_UNITS, second, tmp_path / "work")
     assert matrices(resumed) == matrices(undisturbed)
-    assert [units(record) for record in resumed.records] == [units(record) for record in undisturbed.records]
+    assert [units(record) for record in resumed.records] == [
+        units(record) for record in undisturbed.records
+    ]
     again = [call for call, count in Counter(first.calls[:25] + second.calls).items() if count > 1]
     assert len(again) <= 3, "only the job that was under way runs twice"
     assert second.calls
@@ -101,7 +112,9 @@ def test_a_run_that_ends_before_it_asks_leaves_the_store_as_it_was(tmp_path):
         assert [len(record.units) for record in read_records(store)] == [3, 3, 3]
 
 
-@pytest.mark.parametrize(("limit", "ending"), [(5.0, Ending.TIME_IS_UP), (math.inf, Ending.INTERRUPTED)])
+@pytest.mark.parametrize(
+    ("limit", "ending"), [(5.0, Ending.TIME_IS_UP), (math.inf, Ending.INTERRUPTED)]
+)
 def test_a_unit_that_never_returns_holds_the_run_neither_past_its_limit_nor_after_an_interrupt(
     tmp_path, limit, ending
 ):
@@ -114,7 +127,9 @@ def test_a_unit_that_never_returns_holds_the_run_neither_past_its_limit_nor_afte
 
     matcher, pairs = RectifiedMatcher(matches=after_calls(5, hang)), write_pairs(tmp_path, 12)
     try:
-        report = run(pairs, THREE_UNITS, matcher, tmp_path / "work", limit=limit, interrupt=interrupt)
+        report = run(
+            pairs, THREE_UNITS, matcher, tmp_path / "work", limit=limit, interrupt=interrupt
+        )
         assert not released.is_set(), "the run ends while the unit is under way"
         assert report.ending is ending
         assert len(report.records) == 12

@@ -29,7 +29,9 @@ ESTIMATIONS = {  # in their order each is made of the journal of the one before
     "threshold": replace(ALONE, magsac=replace(QUICK, threshold=1.0)),
     "RANSAC": replace(ALONE, magsac=replace(QUICK, method=Method.RANSAC)),
     "prior": replace(ALONE, focal=FocalConfig()),
-    "another scene": replace(RECIPE, focal=FocalConfig(scale=0.2), scene=SceneConfig(cameras=CameraSharing.IMAGE)),
+    "another scene": replace(
+        RECIPE, focal=FocalConfig(scale=0.2), scene=SceneConfig(cameras=CameraSharing.IMAGE)
+    ),
 }
 
 
@@ -38,7 +40,9 @@ class NoMatcher(RectifiedMatcher):
         raise AssertionError("nothing is matched")
 
 
-def submission(pairs: Sequence[Pair], recipe: Recipe, work_dir: Path, matcher: RectifiedMatcher | None = None):
+def submission(
+    pairs: Sequence[Pair], recipe: Recipe, work_dir: Path, matcher: RectifiedMatcher | None = None
+):
     """The bytes of the file, and the report."""
     output = work_dir.with_suffix(".csv")
     report = run(pairs, recipe, matcher or SyntheticMatcher(images=4), work_dir, output=output)
@@ -46,9 +50,13 @@ def submission(pairs: Sequence[Pair], recipe: Recipe, work_dir: Path, matcher: R
     return output.read_bytes(), report
 
 
-def test_a_run_that_goes_on_from_another_estimation_ends_with_the_bytes_of_a_fresh_one(tmp_path, monkeypatch):
+def test_a_run_that_goes_on_from_another_estimation_ends_with_the_bytes_of_a_fresh_one(
+    tmp_path, monkeypatch
+):
     pairs = synthetic_pairs(tmp_path / "images", 4)
-    fresh = {name: submission(pairs, recipe, tmp_path / name)[0] for name, recipe in ESTIMATIONS.items()}
+    fresh = {
+        name: submission(pairs, recipe, tmp_path / name)[0] for name, recipe in ESTIMATIONS.items()
+    }
     assert len(set(fresh.values())) >= 5
     journal = tmp_path / "scene"
     for path in (tmp_path / "images").iterdir():
@@ -64,7 +72,9 @@ def test_a_run_that_goes_on_from_another_estimation_ends_with_the_bytes_of_a_fre
 
 
 def die_at_a_write(pairs: Sequence[Pair], recipe: Recipe, work_dir: Path, *, after: bool) -> None:
-    """Go on, until this process kills itself at the first write to the store: before it, or after it."""
+    """Go on, until this process kills itself at the first write to the store: before it, or after
+    it.
+    """
 
     put = Store.put
 
@@ -89,11 +99,15 @@ def test_a_run_that_is_killed_while_it_estimates_anew_ends_with_the_same_bytes(t
     for number in range(kills):
         settings = {"after": bool(number % 2)}
         arguments = pairs, other, tmp_path / "work"
-        process = get_context("spawn").Process(target=die_at_a_write, args=arguments, kwargs=settings)
+        process = get_context("spawn").Process(
+            target=die_at_a_write, args=arguments, kwargs=settings
+        )
         process.start()
         process.join()
         assert process.exitcode == -signal.SIGKILL
-    assert submission(pairs, other, tmp_path / "work", NoMatcher(name="synthetic"))[0] == undisturbed
+    assert (
+        submission(pairs, other, tmp_path / "work", NoMatcher(name="synthetic"))[0] == undisturbed
+    )
 
 
 def test_the_file_has_the_former_f_until_another_is_there(tmp_path):

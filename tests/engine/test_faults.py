@@ -37,7 +37,9 @@ PATHS = [str(ROOT), str(ROOT / "tests" / "support")]
 def test_worker_processes_give_the_bytes_of_a_run_in_this_process_and_estimate_f_themselves(
     pairs, undisturbed, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(worker, "estimate_pair", lambda *_: pytest.fail("F is estimated in the parent"))
+    monkeypatch.setattr(
+        worker, "estimate_pair", lambda *_: pytest.fail("F is estimated in the parent")
+    )
     report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work", workers=2)
     assert report.ending is Ending.COMPLETE
     assert report.faults == ()
@@ -82,7 +84,9 @@ def test_a_signal_ends_a_resumed_run_while_an_image_is_digested(tmp_path, monkey
     assert (report.ending, interrupt.signal) == (Ending.INTERRUPTED, number)
 
 
-def test_an_error_of_the_engine_itself_leaves_the_latest_version_behind(pairs, tmp_path, monkeypatch):
+def test_an_error_of_the_engine_itself_leaves_the_latest_version_behind(
+    pairs, tmp_path, monkeypatch
+):
     take, taken, published = State.take, [], []
 
     def fail_later(state: State, *arguments: Any) -> None:
@@ -99,7 +103,9 @@ def test_an_error_of_the_engine_itself_leaves_the_latest_version_behind(pairs, t
         assert [bool(record.units) for record in read_records(store)] == [True, True] + [False] * 10
 
 
-def test_a_run_whose_store_is_full_keeps_its_results_in_memory(pairs, undisturbed, tmp_path, monkeypatch):
+def test_a_run_whose_store_is_full_keeps_its_results_in_memory(
+    pairs, undisturbed, tmp_path, monkeypatch
+):
     prepare = Store._prepare
 
     def small(self: Store) -> None:
@@ -133,7 +139,9 @@ def test_an_error_of_the_disk_when_points_are_read_costs_a_job_and_the_run_goes_
     assert matrices(report) == matrices(undisturbed)
 
 
-def test_an_error_of_the_disk_at_the_start_is_no_bad_input(demo, small_recipe, tmp_path, monkeypatch):
+def test_an_error_of_the_disk_at_the_start_is_no_bad_input(
+    demo, small_recipe, tmp_path, monkeypatch
+):
     def failing(*_: Any) -> dict[str, Any]:
         raise sqlite3.OperationalError("disk I/O error")
 
@@ -163,11 +171,21 @@ def test_a_submission_that_the_disk_does_not_take_is_told_and_the_exit_status_is
 
 
 def arguments_of(demo: DemoSet, recipe: Path, output: Path) -> list[str]:
-    return ["--test-dir", str(demo.test_dir), "--no-report", "--output", str(output), "--recipe", str(recipe)]
+    return [
+        "--test-dir",
+        str(demo.test_dir),
+        "--no-report",
+        "--output",
+        str(output),
+        "--recipe",
+        str(recipe),
+    ]
 
 
 def on_a_terminal(command: list[str], *, is_stopped: bool = False, is_read: bool = False) -> int:
-    """On a terminal that is stopped, as after Ctrl-S, or that goes away, where ``is_read`` with its first text."""
+    """On a terminal that is stopped, as after Ctrl-S, or that goes away, where ``is_read`` with its
+    first text.
+    """
     ours, its = pty.openpty()
     if is_stopped:
         termios.tcflow(its, termios.TCOOFF)
@@ -288,7 +306,9 @@ if __name__ == "__main__":
 """
 
 
-@pytest.mark.parametrize("moments", [2, pytest.param(20, marks=[pytest.mark.slow, pytest.mark.timeout(1200)])])
+@pytest.mark.parametrize(
+    "moments", [2, pytest.param(20, marks=[pytest.mark.slow, pytest.mark.timeout(1200)])]
+)
 def test_a_parent_killed_at_any_moment_leaves_a_whole_file_no_orphans_and_a_run_to_resume(
     pairs, undisturbed, tmp_path, moments
 ):
@@ -302,7 +322,9 @@ def test_a_parent_killed_at_any_moment_leaves_a_whole_file_no_orphans_and_a_run_
         running.send_signal(signal.SIGKILL)
         running.wait()
         if (tmp_path / "submission.csv").exists():
-            assert submission_problems(tmp_path / "submission.csv", [pair.id for pair in pairs]) == []
+            assert (
+                submission_problems(tmp_path / "submission.csv", [pair.id for pair in pairs]) == []
+            )
         while started_with(mark):  # they end soon
             time.sleep(0.05)
     assert subprocess.run([sys.executable, str(script), str(tmp_path)], check=False).returncode == 0
@@ -329,14 +351,17 @@ def stuck(body: str) -> subprocess.CompletedProcess[str]:
 
 
 def test_a_child_that_was_stopped_does_not_outlive_the_watchdog():
-    child = "multiprocessing.get_context('fork').Process(target=time.sleep, args=[600], daemon=True)"
+    child = (
+        "multiprocessing.get_context('fork').Process(target=time.sleep, args=[600], daemon=True)"
+    )
     done = stuck(
         f"child = {child}; child.start(); os.kill(child.pid, signal.SIGSTOP); print(child.pid, flush=True)"
     )
     assert done.returncode == 1  # nothing was written
     assert "the time limit passed before the first results were written" in done.stderr
     status = Path(f"/proc/{done.stdout.strip()}/stat")
-    while status.exists() and status.read_text().split()[2] != "Z":  # dead, though nobody has asked of it yet
+    # Dead, though nobody has asked of it yet
+    while status.exists() and status.read_text().split()[2] != "Z":
         time.sleep(0.05)
 
 
@@ -354,11 +379,15 @@ def test_the_watchdog_leaves_though_writing_hangs_and_keeps_the_status_of_the_ru
 
 def test_the_watchdog_leaves_no_unfinished_file(tmp_path):
     report = f"replacing(Path({str(tmp_path / 'report.html')!r}))"
-    body = f"from mkpc_kaggle.data.outputs import replacing, Path; open = {report}; open.__enter__()"
+    body = (
+        f"from mkpc_kaggle.data.outputs import replacing, Path; open = {report}; open.__enter__()"
+    )
     assert stuck(f"session.save = lambda: ''; {body}").returncode == 0
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_limit_of_ten_million_years_is_none():
-    done = python(GUARDED.format(limit=359999999996400, body="time.sleep(0.5); print('ended by itself')"))
+    done = python(
+        GUARDED.format(limit=359999999996400, body="time.sleep(0.5); print('ended by itself')")
+    )
     assert (done.returncode, done.stdout, done.stderr) == (0, "ended by itself\n", "")

@@ -29,8 +29,12 @@ BOXES = (Box(0, 0, 9, 9), Box(0, 0, 8, 8))
         ({"mkpc": replace(CLASSICAL.mkpc, eps=0.1)}, False, False),
     ],
 )
-def test_estimates_and_scenes_have_a_digest_of_their_settings(changes, estimates_differ, scenes_differ):
-    former, new = (Keys.of(assemble(recipe)) for recipe in (CLASSICAL, replace(CLASSICAL, **changes)))
+def test_estimates_and_scenes_have_a_digest_of_their_settings(
+    changes, estimates_differ, scenes_differ
+):
+    former, new = (
+        Keys.of(assemble(recipe)) for recipe in (CLASSICAL, replace(CLASSICAL, **changes))
+    )
     assert (former.estimate != new.estimate) == estimates_differ
     assert (former.scene != new.scene) == scenes_differ
 
@@ -39,11 +43,18 @@ def test_estimates_and_scenes_have_a_digest_of_their_settings(changes, estimates
     ("slot", "changed"), [("xfeat", [True, False, True]), ("aliked-n16", [False, True, True])]
 )
 def test_other_weights_change_the_points_of_their_units_and_of_stage_2(monkeypatch, slot, changed):
-    units = Unit(1, "xfeat_lighterglue", 640), Unit(1, "aliked_lightglue", 640), Unit(2, "sift", 640)
+    units = (
+        Unit(1, "xfeat_lighterglue", 640),
+        Unit(1, "aliked_lightglue", 640),
+        Unit(2, "sift", 640),
+    )
     assembly = replace(assemble(CLASSICAL), recipe=replace(CLASSICAL, units=units))
 
     def digests(**other: str) -> tuple[str, ...]:
-        slots = dict.fromkeys(("xfeat", "xfeat-lighterglue", "aliked-n16", "aliked-lightglue"), "same") | other
+        slots = (
+            dict.fromkeys(("xfeat", "xfeat-lighterglue", "aliked-n16", "aliked-lightglue"), "same")
+            | other
+        )
         files = {name: SimpleNamespace(digest=digest) for name, digest in slots.items()}
         monkeypatch.setattr(Assembly, "weight_files", files)
         keys, pair = Keys.of(assembly), Pair("p", "b", "0.png", "1.png")
@@ -54,7 +65,8 @@ def test_other_weights_change_the_points_of_their_units_and_of_stage_2(monkeypat
     assert [former != new for former, new in pairs] == changed
 
 
-OTHERS = {  # and whether the points of stage 1 and stage 2, the estimate and the scene then have other keys
+# And whether the points of stage 1 and stage 2, the estimate and the scene then have other keys
+OTHERS = {
     "nothing": ({}, (False, False, False, False)),
     "content": ({"digest": "other"}, (True, True, True, True)),
     "turns": ({"turns": (0, 1)}, (True, True, True, True)),
@@ -69,7 +81,9 @@ OTHERS = {  # and whether the points of stage 1 and stage 2, the estimate and th
 
 @pytest.mark.parametrize(("other", "changed"), OTHERS.values(), ids=OTHERS)
 def test_a_key_is_the_digest_of_all_inputs_of_a_result(other, changed):
-    def chain(digest="d", first="", turns=(0, 0), intrinsics=None, first_is_last=False, **settings) -> list[str]:
+    def chain(
+        digest="d", first="", turns=(0, 0), intrinsics=None, first_is_last=False, **settings
+    ) -> list[str]:
         keys = Keys(("u", "v"), **{"mkpc": "m", "estimate": "e", "scene": "s"} | settings)
         pair = Pair("p", "b", "0.png", "1.png", intrinsics, turns)
         images = replace(IMAGES[0], digest=digest), IMAGES[1]

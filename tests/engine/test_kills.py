@@ -1,4 +1,6 @@
-"""Workers that are killed or stopped at random moments from their fork to their answers cost a run nothing."""
+"""Workers that are killed or stopped at random moments from their fork to their answers cost a run
+nothing.
+"""
 
 import multiprocessing
 import os
@@ -31,10 +33,11 @@ QUICK = replace(RECIPE, magsac=RobustConfig(max_iterations=1000, permutations=1)
 
 
 class DoomedWorker(ProcessWorker):
-    """Gets a signal when its process has computed for so long: the machine's other load does not move that moment.
+    """Gets a signal when its process has computed for so long: the machine's other load does not
+    move that moment.
 
-    The moments are drawn from the ``lives``, in seconds, of the workers of an undisturbed run. What comes after a
-    disturbed worker is spared, so that no reconstruction is lost twice.
+    The moments are drawn from the ``lives``, in seconds, of the workers of an undisturbed run. What
+    comes after a disturbed worker is spared, so that no reconstruction is lost twice.
     """
 
     rng: ClassVar = random.Random(0)
@@ -72,12 +75,15 @@ class DoomedWorker(ProcessWorker):
         super().kill()
 
     def on_fork(self, pid: int) -> None:
-        self.clock = (~pid << 3) | 2  # of the processor time of another process, as clock_getcpuclockid has it
+        # Of the processor time of another process, as clock_getcpuclockid has it
+        self.clock = (~pid << 3) | 2
         if self.place in self.spared:
             self.spared.remove(self.place)
         elif self.kind in self.lives:
             moment = self.rng.uniform(0.0, self.lives[self.kind])
-            threading.Thread(target=self._disturb, args=(os.pidfd_open(pid), moment), daemon=True).start()
+            threading.Thread(
+                target=self._disturb, args=(os.pidfd_open(pid), moment), daemon=True
+            ).start()
 
     def _disturb(self, process: int, moment: float) -> None:
         number = next(self.signals)
@@ -125,19 +131,25 @@ def matrices(report: RunReport, batches: set[str], pairs: list[Pair]) -> list[by
     ]
 
 
-@pytest.mark.parametrize("moments", [6, pytest.param(40, marks=[pytest.mark.slow, pytest.mark.timeout(1200)])])
+@pytest.mark.parametrize(
+    "moments", [6, pytest.param(40, marks=[pytest.mark.slow, pytest.mark.timeout(1200)])]
+)
 def test_a_run_whose_workers_are_killed_and_stopped_at_random_moments_ends_as_the_undisturbed_one(
     tmp_path, monkeypatch, forks, moments
 ):
     names = map(str, range(BATCHES))
-    pairs = [pair for name in names for pair in synthetic_pairs(tmp_path / "images" / name, batch=name)]
+    pairs = [
+        pair for name in names for pair in synthetic_pairs(tmp_path / "images" / name, batch=name)
+    ]
     budget = Budget(0.0, inf, VirtualClock())
     monkeypatch.setattr(places, "ProcessWorker", DoomedWorker)
     monkeypatch.setattr(places, "RESTART_PAUSE_S", 0.0)
     monkeypatch.setattr(session, "LocalSite", PatientSite)
 
     def run_whole(name: str) -> RunReport:
-        report = run(pairs, QUICK, SyntheticMatcher(), tmp_path / name, budget=budget, workers=WORKERS)
+        report = run(
+            pairs, QUICK, SyntheticMatcher(), tmp_path / name, budget=budget, workers=WORKERS
+        )
         assert report.ending is Ending.COMPLETE, report.faults
         assert all(record.units for record in report.records)
         for process in multiprocessing.active_children():
@@ -148,14 +160,22 @@ def test_a_run_whose_workers_are_killed_and_stopped_at_random_moments_ends_as_th
     undisturbed = run_whole("undisturbed")
     assert undisturbed.faults == ()
     for worker in DoomedWorker.known.values():
-        DoomedWorker.lives[worker.kind] = max(DoomedWorker.lives.get(worker.kind, 0.0), worker.computed)
+        DoomedWorker.lives[worker.kind] = max(
+            DoomedWorker.lives.get(worker.kind, 0.0), worker.computed
+        )
     compared = 0
     while len(DoomedWorker.sent) < moments:
         report = run_whole(f"disturbed {len(DoomedWorker.sent)}")
-        skipped = {event.text.split()[4] for event in report.explanations if " is skipped on pair " in event.text}
+        skipped = {
+            event.text.split()[4]
+            for event in report.explanations
+            if " is skipped on pair " in event.text
+        }
         given_up = {pairs[int(index)].group for index in skipped}
         intact = {pair.group for pair in pairs} - given_up
-        assert matrices(report, intact, pairs) == matrices(undisturbed, intact, pairs), report.faults
+        assert matrices(report, intact, pairs) == matrices(undisturbed, intact, pairs), (
+            report.faults
+        )
         compared += len(intact)
     assert {number for _, number in DoomedWorker.sent} == {signal.SIGKILL, signal.SIGSTOP}
     assert {kind for kind, _ in DoomedWorker.sent} == {"mkpc", "estimates", "scene"}

@@ -1,4 +1,6 @@
-"""Nothing is computed twice: what runs after a change, and that the result has the bytes of a fresh run."""
+"""Nothing is computed twice: what runs after a change, and that the result has the bytes of a fresh
+run.
+"""
 
 import math
 import os
@@ -102,9 +104,15 @@ def replace_an_image(room: Room) -> None:
 
 CHANGES: dict[str, tuple[Callable[[Room], None], Callable[[Room], int]]] = {
     "nothing": (lambda room: None, lambda room: 0),
-    "a unit added": (lambda room: room.units(FIRST, SECOND, SECOND.replace("400", "360")), lambda room: BEFORE),
+    "a unit added": (
+        lambda room: room.units(FIRST, SECOND, SECOND.replace("400", "360")),
+        lambda room: BEFORE,
+    ),
     "a unit removed": (lambda room: room.units(FIRST), lambda room: 0),
-    "a unit of stage 1 added": (lambda room: room.units(FIRST, SECOND, THIRD), lambda room: 2 * BEFORE),
+    "a unit of stage 1 added": (
+        lambda room: room.units(FIRST, SECOND, THIRD),
+        lambda room: 2 * BEFORE,
+    ),
     "another threshold": (
         lambda room: room.units(FIRST, SECOND, more="threshold = 1.0"),
         lambda room: 0,
@@ -120,7 +128,9 @@ CHANGES: dict[str, tuple[Callable[[Room], None], Callable[[Room], int]]] = {
 
 
 @pytest.mark.parametrize("change", CHANGES)
-def test_what_runs_after_a_change_and_the_bytes_are_those_of_a_fresh_run(room: Room, change: str, capsys) -> None:
+def test_what_runs_after_a_change_and_the_bytes_are_those_of_a_fresh_run(
+    room: Room, change: str, capsys
+) -> None:
     make, units = CHANGES[change]
     make(room)
     again = room.run()
@@ -130,7 +140,9 @@ def test_what_runs_after_a_change_and_the_bytes_are_those_of_a_fresh_run(room: R
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_a_simulated_run_cut_by_its_limit_at_a_random_moment_and_finished_later_has_all_keys_of_a_fresh_one(seed):
+def test_a_simulated_run_cut_by_its_limit_at_a_random_moment_and_finished_later_has_all_keys_of_a_fresh_one(
+    seed,
+):
     rng = np.random.default_rng(seed)
     costs = tuple(rng.uniform(0.2, 2.0, rng.integers(3, 6)).tolist())  # units of stage 1, 2, 1, ...
     whole = Scenario(40, costs, 1, math.inf, warm_up=0, misses=0, batches=2, seed=seed)
@@ -144,7 +156,9 @@ def test_a_simulated_run_cut_by_its_limit_at_a_random_moment_and_finished_later_
 
 
 def test_points_of_stage_2_are_computed_again_when_the_pair_has_new_points_of_stage_1():
-    """The limit leaves time for two of three units on all pairs, and the second looks at crops of the first."""
+    """The limit leaves time for two of three units on all pairs, and the second looks at crops of
+    the first.
+    """
     whole = Scenario(60, (1.0, 1.0, 1.0), 1, math.inf, spread=0.1, warm_up=0, misses=0)
     store = memory_store()
     cut = simulate(replace(whole, limit=150.0), store)
@@ -168,13 +182,22 @@ def test_a_run_cut_by_its_limit_at_a_random_moment_and_finished_later_has_the_by
         assert report.ending is Ending.COMPLETE
         assert matrices(report) == matrices(undisturbed)
         found = [[(unit.unit, unit.matches) for unit in record.units] for record in report.records]
-        assert found == [[(unit.unit, unit.matches) for unit in record.units] for record in undisturbed.records]
+        assert found == [
+            [(unit.unit, unit.matches) for unit in record.units] for record in undisturbed.records
+        ]
 
 
 def test_what_raised_is_run_again_by_the_next_run_and_nothing_else(pairs, undisturbed, tmp_path):
-    failed = run(pairs, THREE_UNITS, FaultyMatcher(fault=lack_an_image, above=100), tmp_path / "work")
+    failed = run(
+        pairs, THREE_UNITS, FaultyMatcher(fault=lack_an_image, above=100), tmp_path / "work"
+    )
     assert failed.ending is Ending.COMPLETE
-    told = [(record.index, unit.unit) for record in failed.records for unit in record.units if unit.failure]
+    told = [
+        (record.index, unit.unit)
+        for record in failed.records
+        for unit in record.units
+        if unit.failure
+    ]
     assert told == [(3, unit.name) for unit in THREE_UNITS.units[1:]]
     mended = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
     assert mended.units_run == 2
@@ -185,7 +208,10 @@ def test_what_raised_is_run_again_by_the_next_run_and_nothing_else(pairs, undist
 @pytest.mark.slow
 @pytest.mark.parametrize("change", CHANGES)
 def test_ten_kills_after_a_change_leave_the_same_bytes(room: Room, change: str) -> None:
-    rng, command = random.Random(change), [sys.executable, "-m", "mkpc_kaggle", *room.command("a.csv")]
+    rng, command = (
+        random.Random(change),
+        [sys.executable, "-m", "mkpc_kaggle", *room.command("a.csv")],
+    )
     CHANGES[change][0](room)
     for _ in range(10):
         running = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
@@ -195,7 +221,9 @@ def test_ten_kills_after_a_change_leave_the_same_bytes(room: Room, change: str) 
     assert room.run() == room.run("fresh.csv")
 
 
-def test_a_prune_frees_the_results_of_former_settings_and_keeps_those_of_the_last_run(room: Room, capsys) -> None:
+def test_a_prune_frees_the_results_of_former_settings_and_keeps_those_of_the_last_run(
+    room: Room, capsys
+) -> None:
     room.units(FIRST, SECOND, more="[matchers.sift]\nratio = 0.75")
     last = room.run()
     capsys.readouterr()

@@ -40,7 +40,9 @@ def place_of(waiting):
         ([LOST] * 3, True, False),  # it is the job that other workers were lost at
     ],
 )
-def test_three_workers_lost_in_a_row_with_no_answer_between_close_a_place(answers, is_retry, is_closed):
+def test_three_workers_lost_in_a_row_with_no_answer_between_close_a_place(
+    answers, is_retry, is_closed
+):
     waiting = []
     place = place_of(waiting)
     for answer in answers:
@@ -83,7 +85,9 @@ def test_an_answer_that_is_there_counts_though_its_time_is_over():
         (("cuda:0", "cuda:1"), 4, [4] * 4),
     ],
 )
-def test_the_workers_of_a_machine_share_its_cores_on_gpus_too(monkeypatch, devices, workers, shares):
+def test_the_workers_of_a_machine_share_its_cores_on_gpus_too(
+    monkeypatch, devices, workers, shares
+):
     made = SimpleNamespace(pipeline=None)
     assembly = SimpleNamespace(devices=devices, on=lambda *_: made, on_cpu=lambda: made)
     worker = lambda name, make, ring: SimpleNamespace(share=make.keywords["share"])  # noqa: E731
@@ -124,7 +128,13 @@ def test_workers_in_threads_leave_the_limits_of_the_users_process_as_they_are(tm
     cv2.setNumThreads(3)
     try:
         with threadpool_limits(2):
-            run(write_pairs(tmp_path, 2), THREE_UNITS, RectifiedMatcher(), tmp_path / "work", workers=0)
+            run(
+                write_pairs(tmp_path, 2),
+                THREE_UNITS,
+                RectifiedMatcher(),
+                tmp_path / "work",
+                workers=0,
+            )
             assert cv2.getNumThreads() == 3
             assert 2 in [pool["num_threads"] for pool in threadpool_info()]
     finally:

@@ -1,4 +1,6 @@
-"""Whatever becomes of a worker's process, and however large its job is, no call blocks and the reason is told."""
+"""Whatever becomes of a worker's process, and however large its job is, no call blocks and the
+reason is told.
+"""
 
 import multiprocessing
 import os
@@ -120,7 +122,9 @@ if __name__ == "__main__":
 @pytest.mark.parametrize("is_stopped", [False, True])
 def test_a_worker_at_work_ends_with_its_parent_and_prints_nothing(tmp_path, is_stopped):
     script = tmp_path / "orphan.py"  # a file, since its children import it
-    script.write_text(ORPHAN.format(path=[str(ROOT), str(Path(__file__).parent), str(ROOT / "tests" / "support")]))
+    script.write_text(
+        ORPHAN.format(path=[str(ROOT), str(Path(__file__).parent), str(ROOT / "tests" / "support")])
+    )
     mark, home = tmp_path / "hangs", {**os.environ, "MKPC_TEST_HOME": str(tmp_path)}
     parent = subprocess.Popen([sys.executable, str(script)], env=home, stderr=subprocess.PIPE)
     while not (mark.exists() and mark.read_text()):
@@ -160,9 +164,13 @@ if __name__ == "__main__":
 """
 
 
-def test_the_first_worker_of_a_program_hears_no_ctrl_c_and_is_told_not_to_spin_and_to_use_huge_pages(tmp_path):
+def test_the_first_worker_of_a_program_hears_no_ctrl_c_and_is_told_not_to_spin_and_to_use_huge_pages(
+    tmp_path,
+):
     script = tmp_path / "starts.py"
     script.write_text(STARTS)
-    environment = {name: value for name, value in os.environ.items() if name not in WORKER_ENVIRONMENT}
+    environment = {
+        name: value for name, value in os.environ.items() if name not in WORKER_ENVIRONMENT
+    }
     environment |= {"GOMP_SPINCOUNT": "7", "PYTHONPATH": str(ROOT)}
     subprocess.run([sys.executable, script], env=environment, check=True)

@@ -37,7 +37,9 @@ def test_a_terminal_has_a_line_for_each_phase() -> None:
     ]
 
 
-def test_the_terminal_that_a_notebook_gives_its_commands_has_lines(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_terminal_that_a_notebook_gives_its_commands_has_lines(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setenv("JPY_PARENT_PID", "1")
     stream = Terminal()
     Progress(Budget(0.0, clock=VirtualClock()), stream).show(Phase.SWEEP, 1, 5)
@@ -55,7 +57,11 @@ def test_lines_come_when_a_phase_begins_now_and_then_and_in_the_end() -> None:
     progress.show(Phase.DEEPEN, 2, 2)
     progress.close()
     progress.close()
-    times = ["31/100 [00:30<01:09, 1 s/pair]", "61/100 [01:00<00:39, 1 s/pair]", "91/100 [01:30<00:09, 1 s/pair]"]
+    times = [
+        "31/100 [00:30<01:09, 1 s/pair]",
+        "61/100 [01:00<00:39, 1 s/pair]",
+        "91/100 [01:30<00:09, 1 s/pair]",
+    ]
     deepen = ["deepen: 1/2 [00:00<?, ? s/pair]", "deepen: 2/2 [00:29<00:00, 29 s/pair]"]
     sweep = ["sweep: 1/100 [00:00<?, ? s/pair]", *(f"sweep: {text}" for text in times)]
     assert stream.getvalue().splitlines() == [*sweep, *deepen]

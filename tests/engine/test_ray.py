@@ -28,13 +28,16 @@ from mkpc_kaggle.pipeline.assembly import Assembly
 ray = pytest.importorskip("ray", reason="Ray is not installed: pip install 'mkpc-kaggle[ray]'")
 
 TESTS = Path(__file__).parents[1]
-IMPORTED = [str(TESTS.parent), str(TESTS / "engine"), str(TESTS / "support")]  # what machines can import
+# What machines can import
+IMPORTED = [str(TESTS.parent), str(TESTS / "engine"), str(TESTS / "support")]
 STORE_BYTES = 80 << 20
 
 
 @dataclass
 class DoomedMatcher(RectifiedMatcher):
-    """Marks that it has begun on the machine ``node``, where it never ends; elsewhere it waits for that."""
+    """Marks that it has begun on the machine ``node``, where it never ends; elsewhere it waits for
+    that.
+    """
 
     node: str = ""
     mark: Path = Path()
@@ -63,7 +66,9 @@ def cluster() -> Iterator[Any]:
     patch.undo()
 
 
-def test_actors_give_the_bytes_of_a_run_in_one_process_though_an_actor_dies(cluster, pairs, undisturbed, tmp_path):
+def test_actors_give_the_bytes_of_a_run_in_one_process_though_an_actor_dies(
+    cluster, pairs, undisturbed, tmp_path
+):
     matcher = FaultyMatcher(fault=die, once=tmp_path / "died")
     report = run(pairs, THREE_UNITS, matcher, tmp_path / "w", workers=f"ray://{cluster.address}")
     assert report.ending is Ending.COMPLETE
@@ -95,14 +100,24 @@ def test_a_machine_that_lacks_the_weights_or_the_test_set_is_named_when_the_run_
     lacking = [Pair("a", "a", str(missing / "a.png"), str(missing / "b.png"))]
     for asked, weights in ((lacking, ()), (pairs, (missing,))):
         monkeypatch.setattr(Assembly, "weight_paths", weights)
-        with pytest.raises(UserError, match=rf"lacks {missing}: test set and weights must have the same paths"):
-            run(asked, THREE_UNITS, RectifiedMatcher(), tmp_path / asked[0].id, workers=f"ray://{cluster.address}")
+        with pytest.raises(
+            UserError, match=rf"lacks {missing}: test set and weights must have the same paths"
+        ):
+            run(
+                asked,
+                THREE_UNITS,
+                RectifiedMatcher(),
+                tmp_path / asked[0].id,
+                workers=f"ray://{cluster.address}",
+            )
 
 
 def test_batches_are_reconstructed_on_the_cluster_to_the_same_bytes(cluster, tmp_path):
     batch = synthetic_pairs(tmp_path / "images")
     here = run(batch, SYNTHETIC, SyntheticMatcher(), tmp_path / "here")
-    report = run(batch, SYNTHETIC, SyntheticMatcher(), tmp_path / "w", workers=f"ray://{cluster.address}")
+    report = run(
+        batch, SYNTHETIC, SyntheticMatcher(), tmp_path / "w", workers=f"ray://{cluster.address}"
+    )
     assert report.faults == ()
     assert [record.source for record in report.records] == ["scene"] * len(batch)
     chosen = [[record.chosen_fundamental for record in each.records] for each in (report, here)]

@@ -60,10 +60,15 @@ def test_pairs_get_the_f_of_their_scene_and_keep_their_own(tmp_path, monkeypatch
     log = read_log(tmp_path / "work")
     assert "pairs with an F: 6 of 6 (5 from scenes, 1 from their own matches)" in overview(log)
     assert "images with a camera: 4 of 4 (in 1 batch)" in overview(log)
-    assert "weakest cameras, with the error of the centre: 3.png (3 %), 2.png (2 %), 1.png (1 %)" in overview(log)
+    assert (
+        "weakest cameras, with the error of the centre: 3.png (3 %), 2.png (2 %), 1.png (1 %)"
+        in overview(log)
+    )
     assert report_page(log).index("3.png</td>") < report_page(log).index("2.png</td>")
     assert "both cameras are known" in report_page(log)
-    assert all(len(match.results[0].matches) for _, match in log.weakest), "what is drawn keeps its points"
+    assert all(len(match.results[0].matches) for _, match in log.weakest), (
+        "what is drawn keeps its points"
+    )
 
 
 def test_a_focal_length_of_exif_goes_to_the_pairs_the_store_and_the_scene(tmp_path, monkeypatch):
@@ -93,7 +98,10 @@ def test_a_focal_length_of_exif_goes_to_the_pairs_the_store_and_the_scene(tmp_pa
     [
         (partial(befall, die), "the worker died: signal SIGKILL"),
         (partial(befall, lack_an_image), "the worker failed: KeyError: 'image 7'"),
-        (partial(befall, exhaust_memory), "out of memory: MemoryError: Unable to allocate 2.00 GiB"),
+        (
+            partial(befall, exhaust_memory),
+            "out of memory: MemoryError: Unable to allocate 2.00 GiB",
+        ),
     ],
 )
 def test_a_reconstruction_that_is_lost_costs_its_scene_alone_is_named_and_tried_again_by_the_next_run(
@@ -124,7 +132,10 @@ def test_a_scene_process_that_cannot_be_started_costs_its_scene_alone(tmp_path, 
     monkeypatch.setattr("multiprocessing.context.SpawnProcess.start", no_memory)
     report = run(batch_pairs(tmp_path / "images"), RECIPE, RectifiedMatcher(), tmp_path / "work")
     assert report.ending is Ending.COMPLETE
-    assert "scenes: the worker could not be started: [Errno 12] Cannot allocate memory" in report.faults
+    assert (
+        "scenes: the worker could not be started: [Errno 12] Cannot allocate memory"
+        in report.faults
+    )
 
 
 def test_a_run_reconstructs_the_true_cameras_and_a_gigabyte_is_enough(tmp_path, monkeypatch):
@@ -134,14 +145,24 @@ def test_a_run_reconstructs_the_true_cameras_and_a_gigabyte_is_enough(tmp_path, 
     assert report.faults == ()
     assert [record.source for record in report.records] == ["scene"] * 15
     pairs = zip(report.records, matcher.scene.pairs, strict=True)
-    assert max(matcher.scene.median_distance(record.chosen_fundamental, pair) for record, pair in pairs) < 0.5
+    assert (
+        max(
+            matcher.scene.median_distance(record.chosen_fundamental, pair) for record, pair in pairs
+        )
+        < 0.5
+    )
 
 
 def test_a_death_within_pycolmap_costs_the_scene_alone_and_leaves_no_files(tmp_path, monkeypatch):
     (tmp_path / "temporary").mkdir()
     monkeypatch.setenv("TMPDIR", str(tmp_path / "temporary"))
     scenes_by(monkeypatch, die_within_pycolmap, process=True)
-    report = run(synthetic_pairs(tmp_path / "images", 4), SYNTHETIC, SyntheticMatcher(images=4), tmp_path / "work")
+    report = run(
+        synthetic_pairs(tmp_path / "images", 4),
+        SYNTHETIC,
+        SyntheticMatcher(images=4),
+        tmp_path / "work",
+    )
     assert report.ending is Ending.COMPLETE
     assert [record.source for record in report.records] == ["pair"] * 6
     assert report.scenes[0].failure
@@ -163,7 +184,9 @@ def test_the_scene_of_a_run_is_made_of_tracks_and_judged_by_all_matches(tmp_path
     assert all(0 < len(pair.tracks) < len(pair.matches) for pair in given)
 
 
-def test_a_run_that_goes_on_reconstructs_only_the_batch_whose_image_was_replaced(tmp_path, monkeypatch, capsys):
+def test_a_run_that_goes_on_reconstructs_only_the_batch_whose_image_was_replaced(
+    tmp_path, monkeypatch, capsys
+):
     scenes_by(monkeypatch, choose_scene_for_all_but_the_first)
     pairs = batch_pairs(tmp_path / "images") + batch_pairs(tmp_path / "others", 3, "two")
     run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
@@ -172,7 +195,10 @@ def test_a_run_that_goes_on_reconstructs_only_the_batch_whose_image_was_replaced
     again = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
     assert "their 3 pairs are matched again" in capsys.readouterr().err
     assert [record.source for record in again.records] == ["pair"] * 6 + ["pair", "scene", "scene"]
-    assert {scene.batch: bool(scene.failure) for scene in again.scenes} == {"one": True, "two": False}
+    assert {scene.batch: bool(scene.failure) for scene in again.scenes} == {
+        "one": True,
+        "two": False,
+    }
     assert matrices(again) == own_matrices(pairs, tmp_path / "alone")
 
 

@@ -38,7 +38,9 @@ UNITS = THREE_UNITS.units
 
 
 class Run:
-    """A state without a store, and workers whose units take a second each: what the schedule gives them."""
+    """A state without a store, and workers whose units take a second each: what the schedule gives
+    them.
+    """
 
     def __init__(
         self,
@@ -49,7 +51,9 @@ class Run:
         minibatch: int = 1,
     ) -> None:
         """``had`` are the units that the first pairs have had. Extra pairs are for scenes alone."""
-        pairs = [Pair(f"{n:03d}", "", f"{n:03d}.png", f"{n:03d}b.png") for n in range(count + extra)]
+        pairs = [
+            Pair(f"{n:03d}", "", f"{n:03d}.png", f"{n:03d}b.png") for n in range(count + extra)
+        ]
         request = Request(pairs[:count], THREE_UNITS, Keys(tuple(unit.name for unit in UNITS)))
         self.state = State(request, pairs[count:], {})
         self.costs, self.budget = Costs(), Budget(0.0, limit, lambda: 0.0)
@@ -116,7 +120,11 @@ def test_the_phases_follow_each_other_and_every_pair_has_every_unit():
 def test_the_schedule_has_no_memory_and_changes_nothing():
     run = Run(9, limit=100.0, extra=3, had=[(SWEEP,), (SWEEP, THIRD)])
     run.learn(*UNITS)
-    before = {name: np.copy(value) for name, value in vars(run.state).items() if isinstance(value, np.ndarray)}
+    before = {
+        name: np.copy(value)
+        for name, value in vars(run.state).items()
+        if isinstance(value, np.ndarray)
+    }
     first, second = run.next_work(), run.next_work()
     assert first.match.indices == second.match.indices
     assert (first.match.units, first.fit) == (second.match.units, second.fit)
@@ -138,7 +146,9 @@ def test_a_minibatch_has_pairs_that_lack_the_same_units():
     run.learn(*UNITS)
     jobs = [run.next() for _ in range(4)]
     assert [job.indices for job in jobs] == [(3, 4, 5, 6), (7, 8), (0, 2), (1,)]
-    assert [job.units for job in jobs] == [(SWEEP,), (SWEEP,), (THIRD, SECOND), (SECOND,)], "stage 1 first"
+    assert [job.units for job in jobs] == [(SWEEP,), (SWEEP,), (THIRD, SECOND), (SECOND,)], (
+        "stage 1 first"
+    )
 
 
 def test_a_unit_that_was_lost_before_is_alone_in_its_job():
@@ -182,7 +192,9 @@ def test_nothing_is_told_of_costs_before_all_units_were_measured():
     run.learn(SWEEP, THIRD)
     assert told() == ""
     run.learn(SECOND)
-    assert told().startswith("all units on all pairs would take 1m52s; 3 of 3 units fit in the remaining ")
+    assert told().startswith(
+        "all units on all pairs would take 1m52s; 3 of 3 units fit in the remaining "
+    )
 
 
 @pytest.mark.parametrize("reserve", [0, 100])
@@ -246,7 +258,10 @@ def test_a_first_scene_waits_for_the_units_that_fit_and_a_later_scene_for_all():
 
 
 def test_more_time_never_means_fewer_units():
-    runs = [simulate(Scenario(40, (1.0, 1.0, 1.0), 1, limit, misses=0)) for limit in (40.0, 80.0, 120.0, 999.0)]
+    runs = [
+        simulate(Scenario(40, (1.0, 1.0, 1.0), 1, limit, misses=0))
+        for limit in (40.0, 80.0, 120.0, 999.0)
+    ]
     units = [sum(len(record.units) for record in ran.report.records) for ran in runs]
     assert units == sorted(units)
     assert 0 < units[0] < 40 < units[1] < units[-1] == 120
@@ -298,7 +313,9 @@ def test_planning_a_job_does_not_take_much_longer_for_many_pairs():
 
 
 def test_scenes_are_done_in_parallel_with_matching_and_the_last_in_the_time_reserved_for_it():
-    ran = simulate(Scenario(600, (0.5, 1.0, 1.0), 1, 1200.0, warm_up=1, batches=6, scene_seconds=0.3))
+    ran = simulate(
+        Scenario(600, (0.5, 1.0, 1.0), 1, 1200.0, warm_up=1, batches=6, scene_seconds=0.3)
+    )
     assert ran.late == ran.lost == ran.missed == 0
     assert ran.work_left
     assert len({scene.batch for scene in ran.scenes}) == 6
@@ -346,7 +363,9 @@ def test_a_job_of_an_earlier_request_is_saved_before_the_next_request_begins():
 
 def test_scenes_that_never_begin_are_named_and_the_run_ends(monkeypatch):
     monkeypatch.setattr(
-        SimulatedSite, "scene_worker", lambda site: SimulatedWorker(site, site.reconstruct, math.inf)
+        SimulatedSite,
+        "scene_worker",
+        lambda site: SimulatedWorker(site, site.reconstruct, math.inf),
     )
     ran = simulate(Scenario(300, (0.5, 1.0), 1, 900.0, batches=3, misses=0))
     assert ran.late == 0
@@ -369,7 +388,9 @@ def test_a_lost_job_comes_back_as_single_units_and_a_unit_lost_twice_is_skipped_
     engine, report = ran_at(FailingSite, scenario)
     assert lost == [(["1:m2@100", "2:m1@100"], False), (["1:m2@100"], True), (["1:m2@100"], True)]
     assert engine.state.tries.given_up == {("unit", 2, "1:m2@100"): DIED}
-    assert explained(report.explanations, "1:m2@100 is skipped on pair 2 (the worker died: signal SIGKILL)")
+    assert explained(
+        report.explanations, "1:m2@100 is skipped on pair 2 (the worker died: signal SIGKILL)"
+    )
     assert report.ending is Ending.COMPLETE
     assert engine.state.current.tolist() == [[True] * 3] * 2 + [[True, True, False], [True] * 3]
 
@@ -394,11 +415,16 @@ def test_a_unit_that_never_ran_is_skipped_on_all_pairs_after_two():
 
 
 def test_scenes_at_several_places_take_less_time_and_end_as_at_one():
-    scenario = Scenario(600, (0.1,), 1, math.inf, warm_up=1, batches=12, scene_seconds=0.3, misses=0)
+    scenario = Scenario(
+        600, (0.1,), 1, math.inf, warm_up=1, batches=12, scene_seconds=0.3, misses=0
+    )
     one, four = (simulate(replace(scenario, scene_places=places)) for places in (1, 4))
     assert one.missed == four.missed == 0
     assert four.report.seconds < 0.6 * one.report.seconds
-    written = [[record.chosen_fundamental.tobytes() for record in ran.report.records] for ran in (one, four)]
+    written = [
+        [record.chosen_fundamental.tobytes() for record in ran.report.records]
+        for ran in (one, four)
+    ]
     assert written[0] == written[1]
 
 
@@ -428,7 +454,15 @@ def test_the_loop_reads_nothing_back_but_the_points_that_crops_come_from(monkeyp
 def test_reading_how_a_run_ended_changes_nothing():
     scenario = Scenario(40, (1.0, 1.0), 1, 60.0, misses=0, batches=2)
     engine, report = ran_at(SimulatedSite, scenario)
-    before = set(engine.state.stale), dict(engine.state.tries.given_up), engine.state.missing.tolist()
+    before = (
+        set(engine.state.stale),
+        dict(engine.state.tries.given_up),
+        engine.state.missing.tolist(),
+    )
     endings = {engine.ending for _ in range(3)}
     assert endings == {report.ending}
-    assert before == (set(engine.state.stale), dict(engine.state.tries.given_up), engine.state.missing.tolist())
+    assert before == (
+        set(engine.state.stale),
+        dict(engine.state.tries.given_up),
+        engine.state.missing.tolist(),
+    )

@@ -1,4 +1,6 @@
-"""The store: what is put is read again, damage has a name, a full disk costs nothing, the rest can be pruned."""
+"""The store: what is put is read again, damage has a name, a full disk costs nothing, the rest can
+be pruned.
+"""
 
 import os
 import sqlite3
@@ -67,7 +69,9 @@ class Room:
         self.store = store
         self.ask()
 
-    def ask(self, recipe: Recipe = RECIPE, count: int = 3, pairs: list[Pair] | None = None, **other: str) -> None:
+    def ask(
+        self, recipe: Recipe = RECIPE, count: int = 3, pairs: list[Pair] | None = None, **other: str
+    ) -> None:
         """Begin a run, as the loop does. ``other`` are other settings."""
         pairs = pairs or [pair_of(number) for number in range(count)]
         request = Request(pairs, recipe, keys_of(recipe, **other), about=About({"name": "x"}))
@@ -80,7 +84,10 @@ class Room:
         """Save points of a pair whose first image has this content, by default its own."""
         matches = matches_of(index)
         name0, name1 = self.state.names[index]
-        images = BatchImage(name0, digest or name0, Size(80, 60)), BatchImage(name1, "common", Size(80, 60), 99.0)
+        images = (
+            BatchImage(name0, digest or name0, Size(80, 60)),
+            BatchImage(name1, "common", Size(80, 60), 99.0),
+        )
         found = tuple(UnitResult(unit, matches, 0.5, 0.25) for unit in units)
         outcome = Outcome(index, images, ((1, 1), (2, 2)), found, REGIONS, "", 0.1, 0.2)
         rows = self.state.results_of(outcome, self.state.first_stage(index))
@@ -98,9 +105,15 @@ class Room:
         state = self.state
         indices, key = state.scene_inputs("one")
         sigmas = {"0.png": Sigmas(0.1, 0.02, 3.0), "1.png": ()}
-        placed = [RegisteredImage(BatchImage(name, "d", Size(80, 60)), CAMERA, 9, sigmas[name]) for name in sigmas]
+        placed = [
+            RegisteredImage(BatchImage(name, "d", Size(80, 60)), CAMERA, 9, sigmas[name])
+            for name in sigmas
+        ]
         model = SfmModel(tuple(placed), np.array([[0.0, 0.0, 5.0]]), 0.7)
-        choices = [Choice(3 * F, Reason.SCENE), *[Choice(None, Reason.UNREGISTERED)] * (len(indices) - 1)]
+        choices = [
+            Choice(3 * F, Reason.SCENE),
+            *[Choice(None, Reason.UNREGISTERED)] * (len(indices) - 1),
+        ]
         answer = Solution((Reconstruction(tuple(sigmas), (model,)),), tuple(choices))
         pairs = tuple(map(state.inputs_of, indices))
         contents = tuple(map(state.contents, indices))
@@ -119,8 +132,14 @@ class Room:
 
     @property
     def standing(self) -> tuple[int, int, bool]:
-        """The number of pairs with points of today, of estimates of today, and whether the scene is."""
-        return int(self.state.current.any(1).sum()), int(self.state.estimated.sum()), not self.state.stale
+        """The number of pairs with points of today, of estimates of today, and whether the scene
+        is.
+        """
+        return (
+            int(self.state.current.any(1).sum()),
+            int(self.state.estimated.sum()),
+            not self.state.stale,
+        )
 
 
 def matches_of(index: int) -> Matches:
@@ -160,7 +179,11 @@ def test_what_is_put_is_read_after_opening_again(whole: Room, tmp_path: Path) ->
         (model,), (known,) = scenes["one"].models, before[1]["one"].models
         assert (model.points.tolist(), model.reprojection_error) == ([[0.0, 0.0, 5.0]], 0.7)
         for image, other in zip(model.images, known.images, strict=True):
-            assert (image.image, image.points, image.sigmas) == (other.image, other.points, other.sigmas)
+            assert (image.image, image.points, image.sigmas) == (
+                other.image,
+                other.points,
+                other.sigmas,
+            )
             for part in ("K", "R", "t"):
                 assert np.array_equal(getattr(image.camera, part), getattr(other.camera, part))
         assert [record.units for record in records] == [record.units for record in before[0]]
@@ -179,11 +202,16 @@ def test_results_are_data_frames_of_pairs_units_and_cameras(whole: Room, tmp_pat
     assert cameras["centre_sigma"].isna().tolist() == [False, True]
 
 
-CHANGES = {  # and: pairs with points of before, with an estimate of today, and whether the scene is today's
+# And: pairs with points of before, with an estimate of today, and whether the scene is today's
+CHANGES = {
     "nothing": (lambda room: room.ask(), (2, 2, True)),
-    "unit added": (lambda room: room.ask(replace(RECIPE, units=(SWEEP, SECOND, SECOND_360))), (2, 2, True)),
+    "unit added": (
+        lambda room: room.ask(replace(RECIPE, units=(SWEEP, SECOND, SECOND_360))),
+        (2, 2, True),
+    ),
     "unit removed": (lambda room: room.ask(replace(RECIPE, units=(SWEEP,))), (2, 0, False)),
-    "threshold": (lambda room: room.ask(estimate="other"), (2, 0, True)),  # until there are other estimates
+    # Until there are other estimates
+    "threshold": (lambda room: room.ask(estimate="other"), (2, 0, True)),
     "scene": (lambda room: room.ask(scene="other"), (2, 2, False)),
     "crops": (lambda room: room.ask(mkpc="other"), (2, 2, True)),  # until the others are there
     "pair added": (lambda room: room.ask(count=4), (2, 2, True)),
@@ -195,12 +223,16 @@ SECOND_360 = replace(SECOND, long_side=360)
 
 
 @pytest.mark.parametrize(("change", "standing"), CHANGES.values(), ids=CHANGES)
-def test_a_result_is_of_today_if_it_is_stored_under_the_key_of_today(whole: Room, change, standing) -> None:
+def test_a_result_is_of_today_if_it_is_stored_under_the_key_of_today(
+    whole: Room, change, standing
+) -> None:
     change(whole)
     assert whole.standing == standing
 
 
-def test_new_points_of_stage_1_make_those_of_stage_2_out_of_date_but_they_stay_in_use(room: Room) -> None:
+def test_new_points_of_stage_1_make_those_of_stage_2_out_of_date_but_they_stay_in_use(
+    room: Room,
+) -> None:
     recipe = replace(RECIPE, units=(SWEEP, SECOND, THIRD))
     room.ask(recipe)
     room.match(0, SWEEP, SECOND)
@@ -234,7 +266,9 @@ def test_former_results_are_of_today_again_when_the_former_settings_return(whole
     assert whole.standing == (2, 2, True)
 
 
-def test_the_f_of_before_stays_until_there_is_one_of_today_but_not_for_another_image(whole: Room) -> None:
+def test_the_f_of_before_stays_until_there_is_one_of_today_but_not_for_another_image(
+    whole: Room,
+) -> None:
     whole.ask(estimate="other", scene="other")
     assert whole.state.has_own.tolist() == [True, True, False]
     assert set(whole.state.scenes) == {"one"}
@@ -245,7 +279,9 @@ def test_the_f_of_before_stays_until_there_is_one_of_today_but_not_for_another_i
     assert whole.state.scenes == {}
 
 
-def test_rows_of_the_same_images_share_their_points_and_turned_images_are_others(room: Room) -> None:
+def test_rows_of_the_same_images_share_their_points_and_turned_images_are_others(
+    room: Room,
+) -> None:
     pairs = [pair_of(0), pair_of(1), replace(pair_of(0), id="again")]
     room.ask(pairs=pairs)
     room.state.begin(room.state.matching, [0])
@@ -262,7 +298,9 @@ def test_results_are_put_all_or_none(room: Room) -> None:
     assert room.store.about(["a", "b"]) == {}
 
 
-def test_what_a_full_disk_refuses_is_in_memory_and_written_when_there_is_room(tmp_path: Path) -> None:
+def test_what_a_full_disk_refuses_is_in_memory_and_written_when_there_is_room(
+    tmp_path: Path,
+) -> None:
     rows = [Result(f"key {n}", Kind.POINTS, n, bytes(600)) for n in range(200)]
     with Store.open(tmp_path) as store:
         (pages,) = store._db.execute("PRAGMA page_count").fetchone()
@@ -295,17 +333,27 @@ def test_a_prune_removes_what_the_table_of_pairs_does_not_name(whole: Room, tmp_
 
 
 DAMAGES = [
-    ("PRAGMA ignore_check_constraints = ON; UPDATE result SET about = '{'", "CHECK constraint failed"),
-    ("PRAGMA writable_schema = ON; UPDATE sqlite_master SET sql = 'x' WHERE name = 'result'", "malformed"),
+    (
+        "PRAGMA ignore_check_constraints = ON; UPDATE result SET about = '{'",
+        "CHECK constraint failed",
+    ),
+    (
+        "PRAGMA writable_schema = ON; UPDATE sqlite_master SET sql = 'x' WHERE name = 'result'",
+        "malformed",
+    ),
 ]
 
 
 @pytest.mark.parametrize(("damage", "told"), DAMAGES)
-def test_damage_is_what_sqlite_calls_damage(whole: Room, tmp_path: Path, damage: str, told: str) -> None:
+def test_damage_is_what_sqlite_calls_damage(
+    whole: Room, tmp_path: Path, damage: str, told: str
+) -> None:
     whole.store.close()
     with closing(sqlite3.connect(tmp_path / FILE_NAME)) as db:
         db.executescript(damage)
-    with pytest.raises(UserError, match=rf"journal\.sqlite is damaged \(.*{told}.*delete it with --fresh"):
+    with pytest.raises(
+        UserError, match=rf"journal\.sqlite is damaged \(.*{told}.*delete it with --fresh"
+    ):
         Store.open(tmp_path)
     with Store.open(tmp_path, fresh=True) as store:
         assert store.of_kind(Kind.POINTS) == {}
@@ -317,7 +365,9 @@ def test_a_bug_in_a_reader_is_no_damage(whole: Room, monkeypatch: pytest.MonkeyP
         read_records(whole.store)
 
 
-def test_an_error_of_the_disk_is_no_damage_and_no_bad_input(whole: Room, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_error_of_the_disk_is_no_damage_and_no_bad_input(
+    whole: Room, monkeypatch: pytest.MonkeyPatch
+) -> None:
     class Failing:
         def execute(self, *_: object) -> None:
             error = sqlite3.OperationalError("disk I/O error")
@@ -337,7 +387,9 @@ def test_a_store_of_another_format_and_an_old_sqlite_are_refused_in_one_line(
     with closing(sqlite3.connect(tmp_path / FILE_NAME)) as db:
         db.execute("CREATE TABLE run (key TEXT PRIMARY KEY, value TEXT NOT NULL)")  # as format 10
         db.execute("PRAGMA user_version = 15")
-    with pytest.raises(UserError, match=r"another version of this program \(its format is not \d+\).*--fresh"):
+    with pytest.raises(
+        UserError, match=r"another version of this program \(its format is not \d+\).*--fresh"
+    ):
         Store.open(tmp_path)
     Store.open(tmp_path, fresh=True).close()
     monkeypatch.setattr(sqlite3, "sqlite_version_info", (3, 36, 0))
@@ -368,6 +420,8 @@ def test_a_refused_store_holds_no_lock_and_no_file(tmp_path: Path) -> None:
     with pytest.raises(UserError) as caught:
         Store.open(tmp_path)
     assert caught  # as a notebook keeps the last traceback
-    open_files = [str(link.readlink()) for link in Path("/proc/self/fd").iterdir() if link.is_symlink()]
+    open_files = [
+        str(link.readlink()) for link in Path("/proc/self/fd").iterdir() if link.is_symlink()
+    ]
     assert not [name for name in open_files if name.startswith(str(tmp_path))]
     Store.open(tmp_path, fresh=True).close()

@@ -1,4 +1,6 @@
-"""Standard streams that are not read, or that a library uses in its own way, cost neither time nor a job."""
+"""Standard streams that are not read, or that a library uses in its own way, cost neither time nor
+a job.
+"""
 
 import os
 import subprocess
@@ -37,12 +39,16 @@ if __name__ == "__main__":
 
 @pytest.mark.parametrize("in_worker", [False, True])
 @pytest.mark.parametrize("descriptor", [1, 2])
-def test_native_code_that_complains_to_a_pipe_without_a_reader_does_not_wait(descriptor, in_worker, tmp_path):
+def test_native_code_that_complains_to_a_pipe_without_a_reader_does_not_wait(
+    descriptor, in_worker, tmp_path
+):
     script, (reader, pipe), (told, done) = tmp_path / "complains.py", os.pipe(), os.pipe()
     script.write_text(COMPLAINS.format(descriptor=descriptor, in_worker=in_worker, done=done))
     given = {"stdout": pipe} if descriptor == 1 else {"stderr": pipe}
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    with subprocess.Popen([sys.executable, script], env=environment, pass_fds=[done], **given) as process:
+    with subprocess.Popen(
+        [sys.executable, script], env=environment, pass_fds=[done], **given
+    ) as process:
         os.close(done)
         os.close(pipe)
         timer = threading.Timer(60, process.kill)
@@ -86,7 +92,10 @@ def test_what_native_code_writes_is_printed(tmp_path):
     script = "import os\nfrom mkpc_kaggle.engine.console import unblocked\nwith unblocked():\n"
     script += "    os.write(2, b'libjpeg: premature end')\nprint('later', flush=True)\nos.write(2, b', again')"
     done = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, check=True, env=os.environ | {"PYTHONPATH": str(ROOT)}
+        [sys.executable, "-c", script],
+        capture_output=True,
+        check=True,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
     )
     assert done.stderr == b"libjpeg: premature end, again"
 
@@ -95,6 +104,12 @@ def test_text_that_a_stream_cannot_encode_and_a_closed_file_end_nothing(tmp_path
     script = "import os, sys\nfrom mkpc_kaggle.engine.console import drain, say, unblocked\nwith unblocked():\n"
     script += "    say('\u00e9')\n    sys.stdout.buffer.write(b'bytes, ')\n    say('text')\n"
     script += "    drain()\n    os.close(sys.stdout.fileno())\n    say('lost')"
-    environment = os.environ | {"PYTHONPATH": str(ROOT), "PYTHONIOENCODING": "ascii", "PYTHONUTF8": "0"}
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, check=True, env=environment)
+    environment = os.environ | {
+        "PYTHONPATH": str(ROOT),
+        "PYTHONIOENCODING": "ascii",
+        "PYTHONUTF8": "0",
+    }
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, check=True, env=environment
+    )
     assert done.stdout == b"bytes, text\n"

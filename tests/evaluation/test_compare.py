@@ -41,14 +41,18 @@ def test_the_interval_holds_the_truth_where_a_gain_is_of_images():
         scenes = []
         for gain in (0.08, 0.0):
             image = generator.normal(gain / 2, 0.1, 16)
-            scenes.append((np.zeros(120), image[ends].sum(axis=1) + generator.normal(0, 0.2, 120), names))
+            scenes.append(
+                (np.zeros(120), image[ends].sum(axis=1) + generator.normal(0, 0.2, 120), names)
+            )
         difference = paired_difference(scenes)
         held += difference.low <= 0.04 <= difference.high
     assert 0.88 <= held / trials <= 0.99
 
 
 def compare(demo: DemoSet, *more: str) -> int:
-    return run_command("validate", "--train-dir", demo.train_dir, "--pairs-per-scene", 4, "--workers", 0, *more)
+    return run_command(
+        "validate", "--train-dir", demo.train_dir, "--pairs-per-scene", 4, "--workers", 0, *more
+    )
 
 
 def test_a_recipe_against_its_units_on_whole_images(demo, small_recipe, tmp_path, capsys):
@@ -72,11 +76,19 @@ def test_a_recipe_against_its_units_on_whole_images(demo, small_recipe, tmp_path
     assert again.split("seconds a pair\n")[-1] == table
 
 
-def test_a_comparison_of_runs_that_failed_or_ended_early_has_their_status(demo, small_recipe, tmp_path, capsys):
+def test_a_comparison_of_runs_that_failed_or_ended_early_has_their_status(
+    demo, small_recipe, tmp_path, capsys
+):
     train = shutil.copytree(demo.train_dir, tmp_path / "train")
     for image in train.rglob("*.jpg"):
         image.write_bytes(b"no picture")
-    compared = ["--pairs-per-scene", "2", "--compare", f"{small_recipe}:stage-1", f"{small_recipe}:whole-images"]
+    compared = [
+        "--pairs-per-scene",
+        "2",
+        "--compare",
+        f"{small_recipe}:stage-1",
+        f"{small_recipe}:whole-images",
+    ]
     assert run_command("validate", "--train-dir", train, *compared) == 1
     printed = capsys.readouterr().out
     assert printed.count("the run failed: errors left 2 of 2 pairs without an F") == 2
@@ -91,7 +103,9 @@ def test_what_recipes_have_in_common_is_matched_once(demo, small_recipe, tmp_pat
     other, third, text = tmp_path / "other.toml", tmp_path / "third.toml", small_recipe.read_text()
     third.write_text(f"{text}threshold = 1.0\n")
     other.write_text(text.replace("400", "440") + "\n[focal]\nscale = 0.3\n")
-    assert compare(demo, "--compare", small_recipe, third, other, "--work-dir", tmp_path / "work") == 0
+    assert (
+        compare(demo, "--compare", small_recipe, third, other, "--work-dir", tmp_path / "work") == 0
+    )
     printed = capsys.readouterr().out
     assert re.findall(r"(\d+) units run", printed) == ["8", "0", "4"], "each common unit runs once"
     shared = printed.split("recipe other")[-1]

@@ -48,12 +48,15 @@ NO_POSE = np.full(3, np.nan)
     [
         ({"a": A, "b": B}, [moved(B, 0.001), moved(A, 50)], 1, 1),
         ({"a": A, "b": some(B, 0, 10)}, [moved(A) | moved(some(B, 0, 10), seed=9)], 1, 0.5),
-        ({"a": A}, [moved(some(A, 6, 10)), moved(some(A, 0, 6))], 3 / 7, 1),  # of a split scene the largest part
+        # Of a split scene the largest part
+        ({"a": A}, [moved(some(A, 6, 10)), moved(some(A, 0, 6))], 3 / 7, 1),
         ({"a": A}, [WRONG, moved(some(A, 0, 5))], 2 / 7, 1),  # of equal parts the more accurate
         ({"a": some(A, 0, 8), "outliers": OUTLIERS}, [moved(some(A, 0, 8)) | OUTLIERS], 1, 0.8),
         ({"a": A}, [moved(some(A, 0, 3))], 0, 1),  # three images fit any similarity
-        ({"a": A}, [moved(some(A, 0, 6)) | moved(some(A, 6, 10), 0.6)], 3 / 7, 1),  # a part at a wrong scale
-        ({"a": A}, [moved(OFF | {"a1": A["a1"] + [0, 0.08, 0]})], 6 / 7, 1),  # without the first two thresholds
+        # A part at a wrong scale
+        ({"a": A}, [moved(some(A, 0, 6)) | moved(some(A, 6, 10), 0.6)], 3 / 7, 1),
+        # Without the first two thresholds
+        ({"a": A}, [moved(OFF | {"a1": A["a1"] + [0, 0.08, 0]})], 6 / 7, 1),
         ({"a": A}, [moved(OFF | {"a1": A["a1"] + [0, 5, 0]})], 5 / 7, 1),
         ({"a": A, "b": B}, [moved(B)], 23 / (7 + 23), 1),  # scenes are pooled, not averaged
         ({"a": A}, [dict.fromkeys(A, NO_POSE)], 0, 1),
@@ -79,10 +82,15 @@ POSE = "1;0;0;0;1;0;0;0;1"
 
 
 def write_truth(directory: Path) -> Path:
-    rows = [f"set,{name[0]},{name}.png,{POSE},{';'.join(map(str, -c))}\n" for name, c in scene("a", 6).items()]
+    rows = [
+        f"set,{name[0]},{name}.png,{POSE},{';'.join(map(str, -c))}\n"
+        for name, c in scene("a", 6).items()
+    ]
     rows.append(f"set,outliers,x.png,{';'.join(['nan'] * 9)},nan;nan;nan\n")
     (directory / "train_labels.csv").write_text(LABELS + "".join(rows))
-    (directory / "train_thresholds.csv").write_text("dataset,scene,thresholds\nset,a,0.025;0.05;0.1;0.2;0.5;1\n")
+    (directory / "train_thresholds.csv").write_text(
+        "dataset,scene,thresholds\nset,a,0.025;0.05;0.1;0.2;0.5;1\n"
+    )
     return directory
 
 
@@ -94,22 +102,54 @@ ROW = f"set,a,a0.png,{POSE}"
     ("table", "before", "after", "told"),
     [
         ("train_labels", POSE, HUGE, "line 2: '1e308;.*' has a number beyond 1e\\+12"),
-        ("train_labels", POSE, POSE.replace("1", "nan", 1), "labels.csv: set/a0.png has no pose, and is not"),
+        (
+            "train_labels",
+            POSE,
+            POSE.replace("1", "nan", 1),
+            "labels.csv: set/a0.png has no pose, and is not",
+        ),
         ("train_labels", None, LABELS, "train_labels.csv has no rows"),
         ("train_thresholds", "set,a,", "set,b,", "has no thresholds of set/a"),
-        ("train_thresholds", "0.5;", "nan;", "line 2: expected 3 positive thresholds or more, found '0.025;.*nan"),
-        ("train_thresholds", "set,a", "set,a,1;2;3\nset,a", "line 3: the scene set/a is there twice"),
-        ("train_thresholds", "set,a", "other,a,1;2;3\nset,a", "train_labels.csv lacks the dataset 'other'"),
-        ("submission", ROW, f"other,a,a0.png,{POSE},0;0;0\n{ROW}", "submission.csv: .* lacks the dataset 'other'"),
+        (
+            "train_thresholds",
+            "0.5;",
+            "nan;",
+            "line 2: expected 3 positive thresholds or more, found '0.025;.*nan",
+        ),
+        (
+            "train_thresholds",
+            "set,a",
+            "set,a,1;2;3\nset,a",
+            "line 3: the scene set/a is there twice",
+        ),
+        (
+            "train_thresholds",
+            "set,a",
+            "other,a,1;2;3\nset,a",
+            "train_labels.csv lacks the dataset 'other'",
+        ),
+        (
+            "submission",
+            ROW,
+            f"other,a,a0.png,{POSE},0;0;0\n{ROW}",
+            "submission.csv: .* lacks the dataset 'other'",
+        ),
         ("submission", None, LABELS, "submission.csv has no rows"),
-        ("submission", "outliers,x", "outliers,y", "2 images of set are missing or unknown, such as x"),
+        (
+            "submission",
+            "outliers,x",
+            "outliers,y",
+            "2 images of set are missing or unknown, such as x",
+        ),
         ("submission", "set,a,a0.png", "set,a,a1.png", "the image set/a1.png is there twice"),
         ("submission", POSE, "1;0;0", "expected 9 and 3 numbers joined by ';', found 3 and 3"),
         ("submission", POSE, "north", "'north' is not a list of numbers joined by ';'"),
         ("submission", "rotation_matrix", "R", "lacks the columns rotation_matrix"),
     ],
 )
-def test_a_table_that_cannot_be_scored_is_refused_in_one_line(tmp_path, capsys, table, before, after, told):
+def test_a_table_that_cannot_be_scored_is_refused_in_one_line(
+    tmp_path, capsys, table, before, after, told
+):
     home = write_truth(tmp_path)
     submission = home / "submission.csv"
     submission.write_text((home / "train_labels.csv").read_text())
@@ -120,11 +160,15 @@ def test_a_table_that_cannot_be_scored_is_refused_in_one_line(tmp_path, capsys, 
     assert re.search(told, line)
 
 
-def test_the_command_scores_a_file_and_a_dataset_of_outliers_alone_needs_no_thresholds(tmp_path, capsys):
+def test_the_command_scores_a_file_and_a_dataset_of_outliers_alone_needs_no_thresholds(
+    tmp_path, capsys
+):
     home = write_truth(tmp_path)
     with (home / "train_labels.csv").open("a") as stream:
         stream.write(f"a\x1b[2Jb,outliers,x.png,{';'.join(['nan'] * 9)},nan;nan;nan\n")
-    assert run_command("validate", "--imc2025", home, "--submission", home / "train_labels.csv") == 0
+    assert (
+        run_command("validate", "--imc2025", home, "--submission", home / "train_labels.csv") == 0
+    )
     rows = [line.split() for line in capsys.readouterr().out.splitlines()]
     assert rows[2:] == [
         ["set", "1.0000", "1.0000", "1.0000"],

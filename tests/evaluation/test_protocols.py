@@ -47,7 +47,9 @@ OUTDOORS = ["castle_p19", "fountain_p11", "herz_jesus_p8", "reichstag_26"]
 
 
 def precise(camera: Camera) -> Camera:
-    """The camera with a rotation of all digits: with six, the angle from a trace is wrong by up to 0.1 degrees."""
+    """The camera with a rotation of all digits: with six, the angle from a trace is wrong by up to
+    0.1 degrees.
+    """
     return replace(camera, R=Rotation.from_matrix(camera.R).as_matrix())
 
 
@@ -60,12 +62,17 @@ def test_an_independent_evaluation_of_the_same_matches_agrees(scenes, pairs, uni
     train = DATA / "train"
     read = read_train_side(train, scenes=scenes, pairs_per_scene=pairs)
     truths = [true for scene in read for true in scene.pairs]
-    sharp = [replace(true, camera0=precise(true.camera0), camera1=precise(true.camera1)) for true in truths]
+    sharp = [
+        replace(true, camera0=precise(true.camera0), camera1=precise(true.camera1))
+        for true in truths
+    ]
     lines = [line_of_pair(true, train) for true in sharp]
     (tmp_path / "list.txt").write_text("\n".join(lines))
     recipe = write_recipe(tmp_path / "recipe.toml", *units)
     options = listed(tmp_path / "list.txt", train, recipe)
-    scores = scores_of(tmp_path / "s.json", *options, "--protocol", "superglue", "--work-dir", tmp_path)
+    scores = scores_of(
+        tmp_path / "s.json", *options, "--protocol", "superglue", "--work-dir", tmp_path
+    )
     side = max(side for stage, side in units if stage == 1)
     expected = []
     with Store.read(tmp_path) as store:
@@ -76,13 +83,18 @@ def test_an_independent_evaluation_of_the_same_matches_agrees(scenes, pairs, uni
             sizes = [read_image(path).size for path in true.pair.images]
             expected.append(evaluate(line, points, keypoints, sizes, side))
             if (R := expected[-1]["R"]) is not None:
-                np.testing.assert_allclose(Rotation.from_rotvec(record.stats.rotation).as_matrix(), R, atol=1e-6)
+                np.testing.assert_allclose(
+                    Rotation.from_rotvec(record.stats.rotation).as_matrix(), R, atol=1e-6
+                )
                 residual = expected[-1]["t"] @ record.pair_fundamental  # t is E's left null vector
                 np.testing.assert_allclose(residual, 0, atol=1e-6)
     (scene,) = scores["scenes"]
     own = {"rotation": "rotation_error_degrees", "translation": "translation_error_degrees"}
     for key in ("rotation", "translation", "precision", "matching_score"):
-        found = [np.inf if pair[own.get(key, key)] is None else pair[own.get(key, key)] for pair in scene["pairs"]]
+        found = [
+            np.inf if pair[own.get(key, key)] is None else pair[own.get(key, key)]
+            for pair in scene["pairs"]
+        ]
         np.testing.assert_allclose(found, [pair[key] for pair in expected], atol=1e-6, err_msg=key)
         if key not in own:
             assert scores[key] == pytest.approx(np.mean(found), abs=1e-9)
@@ -93,7 +105,9 @@ def test_an_independent_evaluation_of_the_same_matches_agrees(scenes, pairs, uni
 
 
 @pytest.mark.parametrize(("side", "width"), [(None, 1600), (1200, 1200), (0, 640)])
-def test_the_threshold_that_reaches_opencv_is_a_pixel_of_the_resized_picture(side, width, monkeypatch, tmp_path):
+def test_the_threshold_that_reaches_opencv_is_a_pixel_of_the_resized_picture(
+    side, width, monkeypatch, tmp_path
+):
     """The stored images are 640 and 500 pixels wide, and resized to the same long side."""
     small = Camera(np.diag([500 / 640, 500 / 640, 1]) @ K, CAMERAS[1].R, CAMERAS[1].t)
     for name, shape in (("a.png", (480, 640)), ("b.png", (375, 500))):
@@ -125,12 +139,16 @@ def test_five_matches_are_enough_for_an_essential_matrix_and_duplicates_count():
     x0, x1 = ((each[:, :2] / each[:, 2:]).astype(np.float32) for each in projected)
     five, config = Matches(x0, x1, np.ones(5)), RobustConfig(Method.RANSAC, 1.0, permutations=1)
     every = replace(config, every_match=True)
-    assert estimate(five, config, ModelKind.E, (K, K)).failure == "too few distinct matches for E: 5"
+    assert (
+        estimate(five, config, ModelKind.E, (K, K)).failure == "too few distinct matches for E: 5"
+    )
     found = estimate(five, every, ModelKind.E, (K, K))
     assert found.matrix.shape == (3, 3)
     assert found.inlier_count == 5
     twice = Matches.concatenate([five[:4], five[:4]])
-    assert "too few distinct matches for E: 4" in estimate(twice, config, ModelKind.E, (K, K)).failure
+    assert (
+        "too few distinct matches for E: 4" in estimate(twice, config, ModelKind.E, (K, K)).failure
+    )
     assert "too few" not in estimate(twice, every, ModelKind.E, (K, K)).failure
 
 
@@ -144,7 +162,9 @@ def test_the_points_in_front_of_both_cameras_choose_between_the_two_rotations_of
     assert min(each[:, 2].min() for each in projected) > 0
     x0, x1 = (each[:, :2] / each[:, 2:] for each in projected)
     recipe = by_protocol(Recipe((Unit(1, "sift", 640),)), "superglue")
-    found = UnitResult(recipe.units[0], Matches(x0.astype(np.float32), x1.astype(np.float32), np.ones(40)))
+    found = UnitResult(
+        recipe.units[0], Matches(x0.astype(np.float32), x1.astype(np.float32), np.ones(40))
+    )
     pair = PairMatch((found,), sizes=(Size(640, 480), Size(640, 480)))
     result = with_estimate(pair, recipe, ModelKind.E, (K, K)).estimate
     rotation = Rotation.from_rotvec(result.stats.rotation).as_matrix()
@@ -159,16 +179,26 @@ def scenes(demo):
 
 
 def write_scene_info(path: Path, scenes, root: Path) -> Path:
-    """As numpy writes arrays of objects; images without a camera, and more than the two indices in a pair."""
+    """As numpy writes arrays of objects; images without a camera, and more than the two indices in
+    a pair.
+    """
     truths = [true for scene in scenes for true in scene.pairs]
-    images = [each for true in truths for each in zip(true.pair.images, (true.camera0, true.camera1), strict=True)]
+    images = [
+        each
+        for true in truths
+        for each in zip(true.pair.images, (true.camera0, true.camera1), strict=True)
+    ]
     poses = np.array([None] * (len(images) + 1), object)
     paths, Ks = poses.copy(), poses.copy()
     infos = np.array([None] * (len(images) // 2), object)
     for number, (file, camera) in enumerate(images):
         paths[number + 1], Ks[number + 1] = str(file.relative_to(root)), camera.K
         poses[number + 1] = np.vstack([np.column_stack([camera.R, camera.t]), [0, 0, 0, 1]])
-        infos[number // 2] = (number - number % 2 + 1, number - number % 2 + 2), 0.5, np.zeros((1, 4))
+        infos[number // 2] = (
+            (number - number % 2 + 1, number - number % 2 + 2),
+            0.5,
+            np.zeros((1, 4)),
+        )
     np.savez(path, pair_infos=infos, image_paths=paths, intrinsics=Ks, poses=poses)
     return path
 
@@ -215,17 +245,33 @@ BAD = {
     "no pairs": ("pairs.txt", lambda path: path.write_text("a b\n"), "expected 38 fields"),
     "an empty directory": ("pairs", Path.mkdir, "cannot be read"),
     "no columns": ("regions.csv", table("1,2", "a,b"), "lacks the columns image_0"),
-    "no row of a pair": ("regions.csv", table("A,C,0 0 9 9,0 0 9 9"), "has no regions of the pair 1: "),
-    "a box outside": ("regions.csv", table("A,B,0 0 9 9,0 0 9 9999"), "a box ends at 9, 9999, beyond .* pixels"),
+    "no row of a pair": (
+        "regions.csv",
+        table("A,C,0 0 9 9,0 0 9 9"),
+        "has no regions of the pair 1: ",
+    ),
+    "a box outside": (
+        "regions.csv",
+        table("A,B,0 0 9 9,0 0 9 9999"),
+        "a box ends at 9, 9999, beyond .* pixels",
+    ),
     "words": ("regions.csv", table("A,B,0 0 x 9,0 0 9 9"), "line 2: expected left, .* '0 0 x 9'"),
-    "an empty box": ("regions.csv", table("A,B,9 0 9 9,0 0 9 9"), "line 2: expected left, .* '9 0 9 9'"),
+    "an empty box": (
+        "regions.csv",
+        table("A,B,9 0 9 9,0 0 9 9"),
+        "line 2: expected left, .* '9 0 9 9'",
+    ),
 }
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_bad_lists_and_regions_get_one_line_and_exit_2(name, demo, scenes, small_recipe, tmp_path, capsys):
+def test_bad_lists_and_regions_get_one_line_and_exit_2(
+    name, demo, scenes, small_recipe, tmp_path, capsys
+):
     file, write, told = BAD[name]
-    one = write_list(tmp_path / "list.txt", [replace(scenes[0], pairs=scenes[0].pairs[:1])], demo.train_dir)
+    one = write_list(
+        tmp_path / "list.txt", [replace(scenes[0], pairs=scenes[0].pairs[:1])], demo.train_dir
+    )
     write(tmp_path / file)
     source, regions = tmp_path / file, []
     if file == "regions.csv":
@@ -241,7 +287,10 @@ def test_bad_lists_and_regions_get_one_line_and_exit_2(name, demo, scenes, small
 def test_regions_of_ones_own_take_the_place_of_mkpcs(demo, scenes, small_recipe, tmp_path):
     true = max(scenes[0].pairs, key=lambda true: true.covisibility)
     sizes = [read_image(path).size for path in true.pair.images]
-    boxes = Box(0, 0, sizes[0].width // 2, sizes[0].height), Box(7, 0, sizes[1].width, sizes[1].height - 3)
+    boxes = (
+        Box(0, 0, sizes[0].width // 2, sizes[0].height),
+        Box(7, 0, sizes[1].width, sizes[1].height - 3),
+    )
     match = TwoStageMatcher(str(small_recipe))(*true.pair.images, regions=boxes)
     second = match.matches[match.in_stage(2)]
     assert len(second)
@@ -256,7 +305,9 @@ def test_regions_of_ones_own_take_the_place_of_mkpcs(demo, scenes, small_recipe,
         with Store.read(tmp_path / "run") as store:
             (record,), found = read_records(store), matches_of(store, 0)
         assert ([region.box for region in record.regions] == [*boxes]) == bool(options)
-        assert ({region.reason for region in record.regions} == {RegionReason.GIVEN}) == bool(options)
+        assert ({region.reason for region in record.regions} == {RegionReason.GIVEN}) == bool(
+            options
+        )
         with closing(sqlite3.connect(tmp_path / "run" / "journal.sqlite")) as database:
             count = "SELECT count(*) FROM result WHERE kind = 'points'"
             assert database.execute(count).fetchone() == (rows,)  # other regions, others

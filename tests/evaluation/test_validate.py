@@ -10,7 +10,13 @@ from mkpc_kaggle.data import competition
 from mkpc_kaggle.data.competition import Pair, TrainScene, TruePair, read_test_side, read_train_side
 from mkpc_kaggle.demo import DemoSet
 from mkpc_kaggle.engine.records import PairRecord
-from mkpc_kaggle.evaluation.validate import SceneScore, Step, score_record, score_submission, score_table
+from mkpc_kaggle.evaluation.validate import (
+    SceneScore,
+    Step,
+    score_record,
+    score_submission,
+    score_table,
+)
 from mkpc_kaggle.geometry.cameras import Camera, fundamental_of_cameras
 from mkpc_kaggle.geometry.metrics import AUC_THRESHOLDS
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
@@ -25,30 +31,51 @@ def true_matrices(demo: DemoSet) -> dict[str, np.ndarray]:
             cameras[first, second] = true.camera0, true.camera1
             cameras[second, first] = true.camera1, true.camera0
     rows = (line.split(",") for line in demo.truth_csv.read_text().splitlines()[1:])
-    return {sample: fundamental_of_cameras(*cameras[first, second]) for sample, _, first, second in rows}
+    return {
+        sample: fundamental_of_cameras(*cameras[first, second]) for sample, _, first, second in rows
+    }
 
 
 def test_the_true_matrices_score_one_whatever_the_order_of_the_images(demo, tmp_path):
     truth = true_matrices(demo)
     assert list(truth) == [pair.id for pair in read_test_side(demo.test_dir)]
     competition.write_submission(tmp_path / "true.csv", truth)
-    scored = score_submission(tmp_path / "true.csv", demo.truth_csv, read_train_side(demo.train_dir))
+    scored = score_submission(
+        tmp_path / "true.csv", demo.truth_csv, read_train_side(demo.train_dir)
+    )
     assert scored.maa() == 1
-    assert [scored.auc(threshold) for threshold in AUC_THRESHOLDS] == pytest.approx([1, 1, 1], abs=1e-3)
+    assert [scored.auc(threshold) for threshold in AUC_THRESHOLDS] == pytest.approx(
+        [1, 1, 1], abs=1e-3
+    )
     assert sum(len(scene.pairs) for scene in scored.scenes) == 8
     lines = score_table(scored)
     assert lines[1].split()[1:3] == ["8", "1.0000"]
-    competition.write_submission(tmp_path / "fallback.csv", dict.fromkeys(truth, FALLBACK_FUNDAMENTAL))
-    scored = score_submission(tmp_path / "fallback.csv", demo.truth_csv, read_train_side(demo.train_dir))
+    competition.write_submission(
+        tmp_path / "fallback.csv", dict.fromkeys(truth, FALLBACK_FUNDAMENTAL)
+    )
+    scored = score_submission(
+        tmp_path / "fallback.csv", demo.truth_csv, read_train_side(demo.train_dir)
+    )
     assert scored.maa() < 0.2
 
 
-def test_samples_that_a_submission_has_no_row_for_count_as_failed_and_are_named(demo, tmp_path, capsys):
+def test_samples_that_a_submission_has_no_row_for_count_as_failed_and_are_named(
+    demo, tmp_path, capsys
+):
     truth = true_matrices(demo)
     some, whole, out = tmp_path / "some.csv", tmp_path / "whole.csv", tmp_path / "scores.json"
     competition.write_submission(some, dict(list(truth.items())[:2]))
     competition.write_submission(whole, truth)
-    score = ["validate", "--train-dir", demo.train_dir, "--truth", demo.truth_csv, "--json", out, "--submission"]
+    score = [
+        "validate",
+        "--train-dir",
+        demo.train_dir,
+        "--truth",
+        demo.truth_csv,
+        "--json",
+        out,
+        "--submission",
+    ]
     assert run_command(*score, some) == 0
     lacking = list(truth)[2:]
     printed = capsys.readouterr().out
@@ -75,7 +102,9 @@ def test_a_failed_pair_counts_as_failed_even_where_the_fallback_happens_to_be_ri
 
 
 def on_demo(demo, recipe, *options):
-    return scores_of(recipe.with_suffix(".json"), "--train-dir", demo.train_dir, "--recipe", recipe, *options)
+    return scores_of(
+        recipe.with_suffix(".json"), "--train-dir", demo.train_dir, "--recipe", recipe, *options
+    )
 
 
 def test_each_step_of_the_estimate_has_a_column(demo, small_recipe, capsys):
@@ -97,7 +126,9 @@ def test_each_step_of_the_estimate_has_a_column(demo, small_recipe, capsys):
         assert pair["accuracy_by_step"]["MAGSAC"] == former["accuracy_by_step"]["MAGSAC"]
 
 
-def test_a_work_directory_keeps_the_journal_and_a_report_that_shows_the_pairs(demo, small_recipe, tmp_path):
+def test_a_work_directory_keeps_the_journal_and_a_report_that_shows_the_pairs(
+    demo, small_recipe, tmp_path
+):
     options = ["--pairs-per-scene", 2, "--mode", "whole-images", "--units", "1:sift@400"]
     scores = on_demo(demo, small_recipe, *options, "--work-dir", tmp_path / "work")
     assert [set(pair["matches"]) for pair in scores["scenes"][0]["pairs"]] == [{"1:sift@400"}] * 2
@@ -116,7 +147,9 @@ main(["validate", "--train-dir", {train!r}, "--recipe", "classical", "--time-lim
 
 def test_a_validation_that_hangs_ends_at_its_limit(demo):
     code = HANGS.format(train=str(demo.train_dir))
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=300)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=300
+    )
     assert done.returncode == 1
     assert done.stderr.endswith("error: the time limit passed before the scores were printed\n")
 
@@ -125,16 +158,28 @@ def test_a_validation_that_hangs_ends_at_its_limit(demo):
     ("options", "told"),
     [
         (["--train-dir", "T", "--submission", "x.csv"], "go together"),
-        (["--train-dir", "T", "--recipe", "R", "--units", "sift"], "no unit 'sift'; it has 1:sift@320, 2:"),
+        (
+            ["--train-dir", "T", "--recipe", "R", "--units", "sift"],
+            "no unit 'sift'; it has 1:sift@320, 2:",
+        ),
         (["--train-dir", "T", "--recipe", "classical", "--threshold", "0"], "threshold must be in"),
         (["--pairs", "a.txt"], "go together"),
         (["--pairs", "a.txt", "--image-root", ".", "--compare", "a", "b"], "needs a --train-dir"),
         (["--train-dir", ".", "--image-root", "."], "go together"),
         (["--imc2025", "."], "--imc2025 needs --submission, and no --truth"),
-        (["--train-dir", "T", "--compare", "classical", "clasical:stage-1"], "unknown recipe 'clasical'"),
+        (
+            ["--train-dir", "T", "--compare", "classical", "clasical:stage-1"],
+            "unknown recipe 'clasical'",
+        ),
         (["--train-dir", "T", "--compare", "classical"], "two recipes"),
-        (["--train-dir", "T", "--submission", "a", "--truth", "b", "--recipe", "nonsense"], "it goes without"),
-        (["--train-dir", "T", "--submission", "a", "--truth", "b", "--units", "1:sift@320"], "it goes without"),
+        (
+            ["--train-dir", "T", "--submission", "a", "--truth", "b", "--recipe", "nonsense"],
+            "it goes without",
+        ),
+        (
+            ["--train-dir", "T", "--submission", "a", "--truth", "b", "--units", "1:sift@320"],
+            "it goes without",
+        ),
     ],
 )
 def test_options_that_make_no_validation_are_refused(demo, small_recipe, options, told, capsys):

@@ -1,4 +1,6 @@
-"""Boxes and views: the maps are each other's inverse, and the rendered pixels are where the maps say."""
+"""Boxes and views: the maps are each other's inverse, and the rendered pixels are where the maps
+say.
+"""
 
 import numpy as np
 import pytest
@@ -20,7 +22,9 @@ def boxes(draw):
 @st.composite
 def views(draw):
     content = Size(draw(SIDES), draw(SIDES))
-    padded = Size(content.width + draw(st.integers(0, 40)), content.height + draw(st.integers(0, 40)))
+    padded = Size(
+        content.width + draw(st.integers(0, 40)), content.height + draw(st.integers(0, 40))
+    )
     return View(draw(boxes()), content, padded, draw(TURNS))
 
 
@@ -32,7 +36,9 @@ RENDERED = {
     "cropped and shrunk": View.fit(Box(13, 8, 90, 65), long_side=51, multiple=32),
     "enlarged along x, shrunk along y": View(Box.whole(IMAGE), Size(240, 40), Size(240, 40)),
     "shrunk along x, enlarged along y": View(Box.whole(IMAGE), Size(60, 170), Size(64, 192)),
-    "cropped and turned by three quarters": View(Box(13, 8, 90, 65), Size(80, 48), Size(96, 48), turns=3),
+    "cropped and turned by three quarters": View(
+        Box(13, 8, 90, 65), Size(80, 48), Size(96, 48), turns=3
+    ),
 }
 
 
@@ -47,7 +53,9 @@ def test_there_and_back_is_the_identity(view, seed):
 @given(turns=TURNS, scale=st.sampled_from([1, 2]), seed=st.integers(0, 2**32 - 1))
 @settings(max_examples=50, deadline=None)
 def test_a_turned_view_is_the_view_of_the_turned_picture(turns, scale, seed):
-    """One grey level a pixel: each pixel of the view has the level of the stored pixel that it comes from."""
+    """One grey level a pixel: each pixel of the view has the level of the stored pixel that it
+    comes from.
+    """
     stored = np.random.default_rng(seed).permutation(6 * 8).reshape(6, 8).astype(np.uint8)
     view = View.fit(Box(1, 2, 8, 5), long_side=7 * scale, multiple=4, turns=turns)
     upright = np.ascontiguousarray(np.rot90(stored[2:5, 1:8], turns))
@@ -60,9 +68,16 @@ def test_a_turned_view_is_the_view_of_the_turned_picture(turns, scale, seed):
         assert_array_equal(stored[y0, x0], upright.ravel())
 
 
-@given(crop=boxes(), long_side=SIDES, area=st.integers(1, 2_000_000), multiple=st.sampled_from([1, 8, 14, 32]))
+@given(
+    crop=boxes(),
+    long_side=SIDES,
+    area=st.integers(1, 2_000_000),
+    multiple=st.sampled_from([1, 8, 14, 32]),
+)
 @settings(max_examples=150, deadline=None)
-def test_a_view_keeps_the_aspect_to_the_nearest_pixel_and_pads_to_the_multiple(crop, long_side, area, multiple):
+def test_a_view_keeps_the_aspect_to_the_nearest_pixel_and_pads_to_the_multiple(
+    crop, long_side, area, multiple
+):
     fitted = View.fit(crop, long_side=long_side, multiple=multiple)
     assert max(fitted.content) == long_side
     of_area = View.fit(crop, area=area, multiple=multiple)
@@ -127,9 +142,13 @@ def test_shrinking_averages_what_would_alias(content):
     assert abs(picture - 127.5).max() < 30
 
 
-@pytest.mark.parametrize(("size", "shape"), [((1, 1), (90, 90)), ((900, 1), (1, 90)), ((1, 3), (90, 30))])
+@pytest.mark.parametrize(
+    ("size", "shape"), [((1, 1), (90, 90)), ((900, 1), (1, 90)), ((1, 3), (90, 30))]
+)
 def test_images_one_pixel_wide_or_high_are_rendered(size, shape):
-    picture = View.fit(Box.whole(Size(*size)), long_side=90).render(np.full(size[::-1], 200, np.uint8))
+    picture = View.fit(Box.whole(Size(*size)), long_side=90).render(
+        np.full(size[::-1], 200, np.uint8)
+    )
     assert picture.shape == shape
     assert (picture == 200).all()
 

@@ -1,4 +1,6 @@
-"""The critical region: the paper's Algorithm 1 and Crop Area Expansion, to the letter; DBSCAN of merged points."""
+"""The critical region: the paper's Algorithm 1 and Crop Area Expansion, to the letter; DBSCAN of
+merged points.
+"""
 
 from itertools import product
 
@@ -12,7 +14,12 @@ from sklearn.cluster import DBSCAN
 
 from mkpc_kaggle.geometry import critical_region as regions
 from mkpc_kaggle.geometry.coordinates import Box, Size
-from mkpc_kaggle.geometry.critical_region import MkpcConfig, RegionReason, critical_region, expand_box
+from mkpc_kaggle.geometry.critical_region import (
+    MkpcConfig,
+    RegionReason,
+    critical_region,
+    expand_box,
+)
 
 SQUARE = Size(1000, 1000)
 PAPER = MkpcConfig()
@@ -41,12 +48,25 @@ def region(*parts, size=SQUARE, config=BARE):
         (np.zeros((0, 2), np.float32), RegionReason.TOO_FEW_POINTS, 0, 0),
         (block(100, 100, 101, 101, 4), RegionReason.TOO_FEW_POINTS, 0, 0),
         (lone(30), RegionReason.NO_CLUSTER, 0, 0),
-        (np.concatenate([block(100, 100, 133, 133, 5), lone(21)]), RegionReason.TOO_SCATTERED, 1, 1),
+        (
+            np.concatenate([block(100, 100, 133, 133, 5), lone(21)]),
+            RegionReason.TOO_SCATTERED,
+            1,
+            1,
+        ),
         (block(100, 100, 132, 130, 50), RegionReason.TOO_SMALL, 1, 1),
         (block(100, 100, 132, 131, 50), RegionReason.CROPPED, 1, 1),
         (np.concatenate([block(100, 100, 133, 133, 5), lone(20)]), RegionReason.CROPPED, 1, 1),
     ],
-    ids=["empty", "few", "no cluster", "scattered", "one row too small", "of least side", "just clustered enough"],
+    ids=[
+        "empty",
+        "few",
+        "no cluster",
+        "scattered",
+        "one row too small",
+        "of least side",
+        "just clustered enough",
+    ],
 )
 def test_every_outcome_has_its_reason_and_only_one_is_a_crop(points, reason, clusters, kept):
     got = critical_region(points, SQUARE, PAPER)
@@ -59,11 +79,18 @@ def test_the_share_is_compared_to_the_letter():
         share, largest, least = percent / 100, 100 * hundreds, percent * hundreds
         assert least / largest >= share  # Algorithm 1's own words
         assert len(regions.keep_clusters(np.array([largest, least]), share)) == 2, (least, largest)
-        assert len(regions.keep_clusters(np.array([largest, least - 1]), share)) == 1, (least, largest)
+        assert len(regions.keep_clusters(np.array([largest, least - 1]), share)) == 1, (
+            least,
+            largest,
+        )
 
 
 def test_clusters_are_kept_down_to_the_share_largest_first_and_equal_ones_in_their_order():
-    for sizes, kept in ([4, 100, 6, 5, 3, 50], [1, 5, 2, 3]), ([7, 9, 7, 9], [1, 3, 0, 2]), ([], []):
+    for sizes, kept in (
+        ([4, 100, 6, 5, 3, 50], [1, 5, 2, 3]),
+        ([7, 9, 7, 9], [1, 3, 0, 2]),
+        ([], []),
+    ):
         assert_array_equal(regions.keep_clusters(np.array(sizes, int), 0.05), kept)
 
 
@@ -74,7 +101,8 @@ def test_clusters_tell_their_points_from_noise_and_those_that_are_kept():
     assert_array_equal(clusters.labels, [0] * 5 + [-1] * 3 + [1] * 101)
     assert_array_equal(clusters.kept, [1])  # 5 / 101 < 0.05
     assert_array_equal(clusters.in_kept, [False] * 8 + [True] * 101)
-    assert critical_region(points, SQUARE, BARE).box == Box(100, 100, 141, 141)  # noise and the rest are outside
+    # Noise and the rest are outside
+    assert critical_region(points, SQUARE, BARE).box == Box(100, 100, 141, 141)
 
 
 def test_x_is_normalised_by_the_width_and_y_by_the_height():
@@ -83,21 +111,30 @@ def test_x_is_normalised_by_the_width_and_y_by_the_height():
     for shift, last_label in [((40, 0), 0), ((60, 0), 1), ((0, 9), 0), ((0, 20), 1)]:
         points = np.concatenate([stack, stack + np.float32(shift)])
         assert regions.find_clusters(points, size, PAPER).labels.max() == last_label
-        assert regions.find_clusters(points[:, ::-1], Size(200, 1000), PAPER).labels.max() == last_label
+        assert (
+            regions.find_clusters(points[:, ::-1], Size(200, 1000), PAPER).labels.max()
+            == last_label
+        )
 
 
 def test_the_box_grows_about_its_centre_and_holds_the_pixels_that_the_points_lie_on():
-    assert expand_box(np.array([(99.5, 100.49), (130.49, 131.4)]), SQUARE, 1.0, 1.0) == Box(100, 100, 131, 132)
+    assert expand_box(np.array([(99.5, 100.49), (130.49, 131.4)]), SQUARE, 1.0, 1.0) == Box(
+        100, 100, 131, 132
+    )
     points = np.array([(200, 300), (399, 331)], np.float32)
     assert expand_box(points, SQUARE, 1.05, 1.0) == Box(195, 300, 405, 332)
     assert expand_box(points[:, ::-1], SQUARE, 1.0, 1.05) == Box(300, 195, 332, 405)
     # 101 columns grow by 2.525 on either side: edges are rounded outwards
-    assert expand_box(np.array([(200, 300), (300, 331)], np.float32), SQUARE, 1.05, 1.0) == Box(197, 300, 304, 332)
+    assert expand_box(np.array([(200, 300), (300, 331)], np.float32), SQUARE, 1.05, 1.0) == Box(
+        197, 300, 304, 332
+    )
 
 
 def test_points_that_are_not_finite_or_not_on_the_image_are_ignored():
     clustered = block(100, 100, 130, 130, 10)
-    junk = np.array([(np.nan, 5), (5, np.inf), (-np.inf, np.nan), (1000, 5), (5, 999.5), (-0.75, 5)], np.float32)
+    junk = np.array(
+        [(np.nan, 5), (5, np.inf), (-np.inf, np.nan), (1000, 5), (5, 999.5), (-0.75, 5)], np.float32
+    )
     assert region(clustered, np.repeat(junk, 30, axis=0)) == region(clustered)
     assert region(np.repeat(junk, 30, axis=0)).reason is RegionReason.TOO_FEW_POINTS
 
@@ -116,7 +153,10 @@ def test_points_that_are_not_finite_or_not_on_the_image_are_ignored():
 @settings(max_examples=150, deadline=None)
 def test_the_box_is_on_the_image_and_holds_every_kept_point(seed, size, config):
     rng = np.random.default_rng(seed)
-    clumps = [rng.normal(rng.random(2), rng.choice([1e-3, 0.02]), (rng.integers(1, 60), 2)) for _ in range(4)]
+    clumps = [
+        rng.normal(rng.random(2), rng.choice([1e-3, 0.02]), (rng.integers(1, 60), 2))
+        for _ in range(4)
+    ]
     points = (np.concatenate([*clumps, rng.uniform(-0.2, 1.2, (8, 2))]) * size).astype(np.float32)
     got = critical_region(points, size, config)
     box = got.box
@@ -140,7 +180,9 @@ def clumps(rng, n):
     """Six clumps of many widths, farther apart than eps, and a little noise."""
     corner = np.stack([np.arange(6) % 3, np.arange(6) // 3], axis=1) * 0.3 + 0.15
     clump = rng.integers(6, size=n)
-    points = corner[clump] + rng.normal(size=(n, 2)) * (10.0 ** np.linspace(-4, -1.7, 6))[clump, None]
+    points = (
+        corner[clump] + rng.normal(size=(n, 2)) * (10.0 ** np.linspace(-4, -1.7, 6))[clump, None]
+    )
     points[:5] = [(0.95, 0.1 + 0.2 * i) for i in range(5)]
     return points
 

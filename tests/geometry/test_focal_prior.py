@@ -1,4 +1,6 @@
-"""F under a prior on focal lengths: nearer to the truth than MAGSAC alone, and always a value with its reason."""
+"""F under a prior on focal lengths: nearer to the truth than MAGSAC alone, and always a value with
+its reason.
+"""
 
 import numpy as np
 import pytest
@@ -34,7 +36,9 @@ def seen(cameras, n=200, noise=0.0, outliers=0, seed=0, depth=(4, 9)):
     X = rng.uniform((-1.5, -1.2, depth[0]), (1.5, 1.2, depth[1]), (n, 3))
     points = [project(view, X) + rng.normal(scale=noise, size=(n, 2)) for view in cameras]
     wild = [rng.uniform(0, SIZE, (outliers, 2)) for _ in range(2)]
-    return Matches(*(np.vstack(both) for both in zip(points, wild, strict=True)), np.ones(n + outliers))
+    return Matches(
+        *(np.vstack(both) for both in zip(points, wild, strict=True)), np.ones(n + outliers)
+    )
 
 
 def with_prior(matches, priors=WEAK, magsac=MAGSAC, config=CONFIG, model=ModelKind.F):
@@ -61,7 +65,11 @@ def test_few_noisy_matches_have_a_better_pose_the_more_is_known_of_the_focal_len
     for seed in range(6):
         matches = seen(CAMERAS, 30, 0.2, 20, seed, depth=(5, 6))
         known = with_prior(matches, sure)
-        for result, errors in ((estimate(matches, MAGSAC), alone), (with_prior(matches), weakly), (known, surely)):
+        for result, errors in (
+            (estimate(matches, MAGSAC), alone),
+            (with_prior(matches), weakly),
+            (known, surely),
+        ):
             errors.append(pose_error(result.matrix, *CAMERAS, 1.0).angle)
     assert np.median(weakly) < 0.7 * np.median(alone)
     assert np.median(surely) < 0.7 * np.median(weakly)
@@ -74,14 +82,19 @@ def test_known_cameras_of_two_focal_lengths_and_any_centre_give_their_essential_
     matches = seen((first, second), 100, 0.2, 40)
     result = with_prior(matches, (FocalPrior(K0, 0), FocalPrior(second.K, 0)), model=ModelKind.E)
     assert result.ok
-    assert_allclose(np.linalg.svd(result.matrix, compute_uv=False), np.array([1, 1, 0]) / np.sqrt(2), atol=1e-9)
+    assert_allclose(
+        np.linalg.svd(result.matrix, compute_uv=False), np.array([1, 1, 0]) / np.sqrt(2), atol=1e-9
+    )
     assert pose_error(result.matrix, first.calibrated, second.calibrated, 1.0).angle < 2
     assert result.inlier_count > 0
     assert result.magsac is None
 
 
 def test_a_principal_point_far_off_leaves_magsac_its_matrix():
-    cropped = camera(700.0, centre=(-900, 1500)), camera(800.0, 0.3, (-2.0, 0.3, 0.5), centre=(2500, -800))
+    cropped = (
+        camera(700.0, centre=(-900, 1500)),
+        camera(800.0, 0.3, (-2.0, 0.3, 0.5), centre=(2500, -800)),
+    )
     rng = np.random.default_rng(0)
     X = rng.uniform((-4, -4, 4), (4, 4, 9), (400, 3))
     matches = Matches(*(project(view, X) for view in cropped), np.ones(400))
@@ -99,7 +112,9 @@ def degenerate():
     return {
         "a pure rotation": seen((camera(1100), camera(1100, 0.1)), 80, 0.1),
         "one plane": Matches(*(project(view, X) for view in CAMERAS), np.ones(80)),
-        "a line": Matches(np.column_stack([along, along]), np.column_stack([along, 2 * along]), np.ones(40)),
+        "a line": Matches(
+            np.column_stack([along, along]), np.column_stack([along, 2 * along]), np.ones(40)
+        ),
         "six": seen(CAMERAS, 6),
         "five": seen(CAMERAS, 5),
         "none": Matches.empty(),
@@ -128,6 +143,12 @@ def test_magsac_wins_over_focal_lengths_that_are_too_implausible():
 
 def test_matches_of_points_behind_the_cameras_cost_as_outliers():
     X = np.random.default_rng(1).uniform((-1.5, -1.2, -9), (1.5, 1.2, -4), (60, 3))
-    before, behind = seen(CAMERAS, 200, 0.05), Matches(*(project(view, X) for view in CAMERAS), np.ones(60))
-    costs = [with_prior(matches).stats.cost for matches in (before, Matches.concatenate([before, behind]))]
+    before, behind = (
+        seen(CAMERAS, 200, 0.05),
+        Matches(*(project(view, X) for view in CAMERAS), np.ones(60)),
+    )
+    costs = [
+        with_prior(matches).stats.cost
+        for matches in (before, Matches.concatenate([before, behind]))
+    ]
     assert costs[1] - costs[0] == pytest.approx(60 / 2, rel=0.1)

@@ -25,7 +25,12 @@ def places(matches):
 
 @pytest.mark.parametrize(
     ("shape0", "shape1", "shape_scores"),
-    [((2, 2), (3, 2), (3,)), ((3, 3), (3, 2), (3,)), ((3, 2), (3, 2), (3, 1)), ((3, 2), (6,), (3,))],
+    [
+        ((2, 2), (3, 2), (3,)),
+        ((3, 3), (3, 2), (3,)),
+        ((3, 2), (3, 2), (3, 1)),
+        ((3, 2), (6,), (3,)),
+    ],
 )
 def test_shapes_that_disagree_are_an_error(shape0, shape1, shape_scores):
     with pytest.raises(ValueError, match="shape"):
@@ -35,7 +40,12 @@ def test_shapes_that_disagree_are_an_error(shape0, shape1, shape_scores):
 def test_empty_is_legal_everywhere():
     empty, size = Matches.empty(), Size(40, 30)
     view = View.fit(Box.whole(size), long_side=64)
-    results = [empty, Matches([], [], []), Matches.concatenate([]), Matches.concatenate([empty, empty])]
+    results = [
+        empty,
+        Matches([], [], []),
+        Matches.concatenate([]),
+        Matches.concatenate([empty, empty]),
+    ]
     results += [empty.best(0), scored([1, 2]).best(0), empty.to_image(view, view), empty[:]]
     for result in results:
         assert result.points0.shape == result.points1.shape == (0, 2)
@@ -43,7 +53,9 @@ def test_empty_is_legal_everywhere():
 
 
 def test_concatenation_keeps_every_match_in_order_duplicates_too():
-    together = Matches.concatenate(iter([scored([1, 1]), Matches.empty(), scored([1]), scored([1, 1])]))
+    together = Matches.concatenate(
+        iter([scored([1, 1]), Matches.empty(), scored([1]), scored([1, 1])])
+    )
     assert places(together) == [0, 1, 0, 0, 1]
 
 
@@ -71,7 +83,9 @@ def test_the_way_out_of_a_matcher_drops_padding_outside_and_not_finite_and_maps_
         ((3, 3), (5, 5), INF),
         ((40, 20), (14, 10), -3),  # kept: a low score is a score
     ]
-    out = Matches(*(np.array(column, np.float32) for column in zip(*rows, strict=True))).to_image(view0, view1)
+    out = Matches(*(np.array(column, np.float32) for column in zip(*rows, strict=True))).to_image(
+        view0, view1
+    )
     assert_allclose(out.points0, [(10, 20), (49.375, 39.375), (29.75, 29.75)], atol=1e-5)
     assert_allclose(out.points1, [(0.5, 0.5), (58.5, 58.5), (28.5, 20.5)], atol=1e-5)
     assert_array_equal(out.scores, np.array([0.9, 0.1, -3], np.float32))

@@ -11,7 +11,13 @@ from hypothesis import strategies as st
 from mkpc_kaggle.geometry import metrics
 from mkpc_kaggle.geometry.cameras import Camera, fundamental_of_cameras, relative_pose
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.geometry.metrics import PoseError, pair_accuracy, pose_auc, pose_error, rotation_angle
+from mkpc_kaggle.geometry.metrics import (
+    PoseError,
+    pair_accuracy,
+    pose_auc,
+    pose_error,
+    rotation_angle,
+)
 
 SEEDS = st.integers(0, 2**32 - 1)
 
@@ -47,18 +53,25 @@ def errors(*angles):
         (10.001, 0, 0.0),
         (0, 4.999, 0.1),
         (0, 5.001, 0.0),
-        (4.5, 0.2 * 25 ** (6.5 / 9), 0.3),  # both of one threshold pair have to be met: the translation decides
+        # Both of one threshold pair have to be met: the translation decides
+        (4.5, 0.2 * 25 ** (6.5 / 9), 0.3),
         (7.5, 0.5, 0.3),  # here the rotation
         (inf, inf, 0.0),
     ],
 )
-def test_the_accuracy_of_a_pair_counts_the_threshold_pairs_that_it_meets(rotation, translation, accuracy):
-    assert pair_accuracy(PoseError(rotation, 0.0, translation)) == pytest.approx(accuracy, abs=1e-12)
+def test_the_accuracy_of_a_pair_counts_the_threshold_pairs_that_it_meets(
+    rotation, translation, accuracy
+):
+    assert pair_accuracy(PoseError(rotation, 0.0, translation)) == pytest.approx(
+        accuracy, abs=1e-12
+    )
 
 
 @pytest.mark.parametrize("degrees", [0, 1e-6, 1, 90, 179, 180 - 1e-6, 180])
 def test_the_rotation_angle_is_precise_at_both_ends(degrees):
-    assert rotation_angle(rotation((-1, 1, 0.1), degrees)) == pytest.approx(degrees, rel=1e-6, abs=1e-13)
+    assert rotation_angle(rotation((-1, 1, 0.1), degrees)) == pytest.approx(
+        degrees, rel=1e-6, abs=1e-13
+    )
 
 
 @given(seed=SEEDS)
@@ -72,7 +85,9 @@ def test_the_fundamental_matrix_of_two_cameras_meets_the_epipolar_constraint(see
     lines = x0 @ F.T
     residual = np.abs(np.sum(x1 * lines, axis=1))
     assert (residual < 1e-9 * np.linalg.norm(F)).all()
-    assert np.abs(np.sum(x1[::-1] * lines, axis=1)).max() > 1e-6 * np.linalg.norm(lines, axis=1).max()
+    assert (
+        np.abs(np.sum(x1[::-1] * lines, axis=1)).max() > 1e-6 * np.linalg.norm(lines, axis=1).max()
+    )
     assert np.linalg.norm(F) == pytest.approx(1, abs=1e-12)
     assert np.linalg.svd(F, compute_uv=False)[2] < 1e-12
 
@@ -80,11 +95,14 @@ def test_the_fundamental_matrix_of_two_cameras_meets_the_epipolar_constraint(see
 @pytest.mark.parametrize("degrees", [0.5, 3.0, 20.0])
 @pytest.mark.parametrize("seed", range(4))
 def test_a_rotation_about_the_baseline_is_an_error_of_rotation_alone(seed, degrees):
-    # Camera 1 turns about the direction of t, so that t stays; F's other rotation is 180 - degrees off.
+    # Camera 1 turns about the direction of t, so that t stays; F's other rotation is 180 - degrees
+    # off.
     first, second = random_cameras(seed)
     R, t = relative_pose(first, second)
     wrong = Camera(second.K, rotation(t, degrees) @ R, t)
-    error = pose_error(fundamental_of_cameras(Camera(first.K, np.eye(3), np.zeros(3)), wrong), first, second, 1.0)
+    error = pose_error(
+        fundamental_of_cameras(Camera(first.K, np.eye(3), np.zeros(3)), wrong), first, second, 1.0
+    )
     assert error.rotation == pytest.approx(degrees, rel=1e-5)
     assert error.translation_angle < 1e-4
     assert error.translation < 1e-5
@@ -101,7 +119,9 @@ def test_the_translation_is_scaled_to_metres_and_its_sign_is_free(seed, degrees,
     R, t = relative_pose(first, second)
     across = np.cross(t, (1.0, 2.0, 3.0))
     wrong = Camera(second.K, R, rotation(across, degrees) @ t * 7)  # its length is not known from F
-    error = pose_error(fundamental_of_cameras(Camera(first.K, np.eye(3), np.zeros(3)), wrong), first, second, 2.5)
+    error = pose_error(
+        fundamental_of_cameras(Camera(first.K, np.eye(3), np.zeros(3)), wrong), first, second, 2.5
+    )
     assert error.translation_angle == pytest.approx(expected, rel=1e-5, abs=1e-4)
     chord = 2 * np.linalg.norm(t) * np.sin(np.radians(expected) / 2)
     assert error.translation == pytest.approx(2.5 * chord, rel=1e-5, abs=1e-5)
@@ -114,7 +134,8 @@ def test_the_translation_is_scaled_to_metres_and_its_sign_is_free(seed, degrees,
         ((5,), 10, 0.75),  # a triangle of 5 x 1 / 2 and a rectangle of 5 x 1
         ((8, 2), 10, (0.5 + 4.5 + 2) / 10),  # 2 x .5 / 2, then 6 x (.5 + 1) / 2, then 2 x 1
         ((2, 8, 30, inf), 10, (0.25 + 2.25 + 1) / 10),
-        ((4, 1, 4), 5, (1 / 6 + 3 * 0.5 + 1) / 5),  # two of one size: the curve steps to 2/3, then to 1
+        # Two of one size: the curve steps to 2/3, then to 1
+        ((4, 1, 4), 5, (1 / 6 + 3 * 0.5 + 1) / 5),
         ((0, 10), 5, 0.5),
         ((0, 3), 5, (3 * 0.75 + 2) / 5),
         ((0, 0, 0), 20, 1),
@@ -123,7 +144,9 @@ def test_the_translation_is_scaled_to_metres_and_its_sign_is_free(seed, degrees,
 )
 def test_the_pose_auc_is_the_area_computed_by_hand(angles, threshold, area):
     assert pose_auc(errors(*angles), threshold) == pytest.approx(area)
-    assert pose_auc([PoseError(1e-9, angle, 9.0) for angle in angles], threshold) == pytest.approx(area)
+    assert pose_auc([PoseError(1e-9, angle, 9.0) for angle in angles], threshold) == pytest.approx(
+        area
+    )
     assert isnan(pose_auc([], threshold))
 
 
@@ -133,7 +156,10 @@ def test_a_matrix_of_a_file_that_does_not_rotate_raises_nothing(R):
 
 
 def test_matches_are_correct_within_superglues_distance_of_both_epipolar_lines():
-    K = np.diag([800.0, 800, 1])  # cameras beside each other: a line is a row, and 2 (dy / 800)^2 the distance
+    # Cameras beside each other: a line is a row, and 2 (dy / 800)^2 the distance
+    K = np.diag([800.0, 800, 1])
     cameras = Camera(K, np.eye(3), np.zeros(3)), Camera(K, np.eye(3), np.array([1.0, 0, 0]))
-    matches = Matches(np.array([(5, 0), (5, 0), (5, 0)]), np.array([(90, 12.6), (7, -12.7), (0, 0)]), np.ones(3))
+    matches = Matches(
+        np.array([(5, 0), (5, 0), (5, 0)]), np.array([(90, 12.6), (7, -12.7), (0, 0)]), np.ones(3)
+    )
     assert metrics.correct_matches(matches, *cameras).tolist() == [True, False, True]

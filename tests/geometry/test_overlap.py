@@ -14,7 +14,9 @@ def rectified(right, wrong, seed=0, box=(800, 600)):
     """Matches along rows, whose F is the fallback, and wild ones."""
     rng = np.random.default_rng(seed)
     points0 = rng.uniform(0, box, (right + wrong, 2))
-    points1 = points0 + np.column_stack([rng.uniform(0, 50, right + wrong), np.zeros(right + wrong)])
+    points1 = points0 + np.column_stack(
+        [rng.uniform(0, 50, right + wrong), np.zeros(right + wrong)]
+    )
     points1[right:] = rng.uniform(0, box, (wrong, 2))
     return Matches(points0, points1, np.ones(right + wrong))
 
@@ -38,7 +40,9 @@ def test_thousands_of_inliers_in_one_spot_say_nothing():
 
 def test_duplicates_count_once_and_few_matches_never_tell():
     matches = rectified(200, 60)
-    once, thrice = (support(FALLBACK_FUNDAMENTAL, Matches.concatenate([matches] * n)) for n in (1, 3))
+    once, thrice = (
+        support(FALLBACK_FUNDAMENTAL, Matches.concatenate([matches] * n)) for n in (1, 3)
+    )
     assert once == thrice
     for count in (0, 1, 7):
         assert support(FALLBACK_FUNDAMENTAL, rectified(count, 0)) == 0

@@ -1,4 +1,6 @@
-"""Two-view estimates: the truth where it can be found, else a value with its reason, and always the same bytes."""
+"""Two-view estimates: the truth where it can be found, else a value with its reason, and always the
+same bytes.
+"""
 
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
@@ -16,7 +18,13 @@ from mkpc_kaggle.geometry import robust
 from mkpc_kaggle.geometry.cameras import Camera, fundamental_of_cameras
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.metrics import pose_error
-from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, Method, ModelKind, RobustConfig, estimate
+from mkpc_kaggle.geometry.robust import (
+    FALLBACK_FUNDAMENTAL,
+    Method,
+    ModelKind,
+    RobustConfig,
+    estimate,
+)
 
 DEFAULT = RobustConfig()
 WIDTH, HEIGHT = 1024, 768
@@ -88,10 +96,12 @@ def test_the_fundamental_matrix_is_found_among_outliers(seed, method):
     result = estimate(matches, RobustConfig(method=method))
     assert_agrees(result, truth)
     assert np.linalg.svd(result.matrix, compute_uv=False)[2] < 1e-9
-    assert robust.sampson_distances(result.matrix, seen(seed + 10, 1)).max() > 1  # another scene's match
+    # Another scene's match
+    assert robust.sampson_distances(result.matrix, seen(seed + 10, 1)).max() > 1
     fresh = seen(seed, 500)[180:]
     distances = robust.sampson_distances(result.matrix, fresh)
-    assert np.median(distances) < 0.07  # MAGSAC++ is a weighted mean of near samples: RANSAC here is below 0.001
+    # MAGSAC++ is a weighted mean of near samples: RANSAC here is below 0.001
+    assert np.median(distances) < 0.07
     assert distances.max() < 0.35
 
 
@@ -114,14 +124,18 @@ def test_magsac_finds_the_pose_of_noisy_matches_at_a_threshold_of_a_pixel():
         noise = np.random.default_rng(seed).normal(0, 0.5, (2, *matches.points0.shape))
         noisy = Matches(matches.points0 + noise[0], matches.points1 + noise[1], matches.scores)
         result = estimated(ModelKind.E, noisy, RobustConfig(threshold=1.0, permutations=1), seed)
-        errors.append(pose_error(result.matrix, *(camera.calibrated for camera in cameras(seed)), 1.0).angle)
-    assert np.median(errors) < 0.4  # degrees; 0.9 in units of the focal length, where the score has no scale
+        errors.append(
+            pose_error(result.matrix, *(camera.calibrated for camera in cameras(seed)), 1.0).angle
+        )
+    # Degrees; 0.9 in units of the focal length, where the score has no scale
+    assert np.median(errors) < 0.4
 
 
 def test_sampson_distance_is_in_pixels_and_the_same_in_either_order():
     matches = Matches(np.array([(10, 20), (30, 40)]), np.array([(500, 20), (7, 43)]), np.ones(2))
     assert_allclose(robust.sampson_distances(FALLBACK_FUNDAMENTAL, matches), [0, 3 / np.sqrt(2)])
-    twice = FALLBACK_FUNDAMENTAL @ np.diag([1, 0.5, 1])  # the second image is half as high: y1 = y0 / 2
+    # The second image is half as high: y1 = y0 / 2
+    twice = FALLBACK_FUNDAMENTAL @ np.diag([1, 0.5, 1])
     matches = Matches(np.array([(10, 20)]), np.array([(500, 13)]), np.ones(1))
     distance = 3 / np.sqrt(1 + 0.5**2)
     assert_allclose(robust.sampson_distances(twice, matches), [distance])
@@ -147,11 +161,16 @@ def test_repetitions_are_inliers_like_the_first_and_what_is_not_finite_is_set_as
     clean = estimated(model, matches, seed=1)
     assert_agrees(clean, truth)
     again = np.random.default_rng(4).integers(0, 300, 900)
-    bad = [Matches(np.full((50, 2), a), np.full((50, 2), b), np.ones(50)) for a, b in [(np.nan, 5), (5, np.inf)]]
+    bad = [
+        Matches(np.full((50, 2), a), np.full((50, 2), b), np.ones(50))
+        for a, b in [(np.nan, 5), (5, np.inf)]
+    ]
     more = estimated(model, Matches.concatenate([bad[0], matches, bad[1], matches[again]]), seed=1)
     assert_array_equal(more.matrix, clean.matrix)
     none = np.zeros(50, bool)
-    assert_array_equal(more.inliers, np.concatenate([none, clean.inliers, none, clean.inliers[again]]))
+    assert_array_equal(
+        more.inliers, np.concatenate([none, clean.inliers, none, clean.inliers[again]])
+    )
 
 
 @pytest.mark.parametrize("method", Method)
@@ -166,16 +185,25 @@ def test_the_same_input_gives_the_same_bytes_whatever_else_goes_on(model, method
         cv2.setRNGSeed(rng_seed)
         assert [as_bytes(estimated(model, matches, config)) for matches in inputs[:3]] == alone[:3]
     with ThreadPoolExecutor(4) as threads:
-        together = list(threads.map(lambda matches: as_bytes(estimated(model, matches, config)), inputs))
+        together = list(
+            threads.map(lambda matches: as_bytes(estimated(model, matches, config)), inputs)
+        )
     assert together == alone
 
 
 ANY_FLOAT = st.floats(width=32)
-CORNERS = st.sampled_from(np.array([0, 1, -1, 2, 100, 1e-20, 1e10, 1e18, 1e20, 3e38], np.float32).tolist())
+CORNERS = st.sampled_from(
+    np.array([0, 1, -1, 2, 100, 1e-20, 1e10, 1e18, 1e20, 3e38], np.float32).tolist()
+)
 PIXELS = st.integers(0, 5).map(float)
 
 
-@given(data=st.data(), n=st.integers(0, 24), model=st.sampled_from(ModelKind), method=st.sampled_from(Method))
+@given(
+    data=st.data(),
+    n=st.integers(0, 24),
+    model=st.sampled_from(ModelKind),
+    method=st.sampled_from(Method),
+)
 @settings(max_examples=150, deadline=None)
 def test_whatever_the_points_are_the_answer_is_an_estimate(data, n, model, method):
     elements = data.draw(st.sampled_from([ANY_FLOAT, CORNERS, PIXELS]))
@@ -194,7 +222,9 @@ def test_whatever_the_points_are_the_answer_is_an_estimate(data, n, model, metho
 
 
 @pytest.mark.parametrize("refused", [1, 3])
-def test_a_refusal_by_opencv_costs_its_permutation_and_is_the_reason_where_all_are_refused(refused, monkeypatch):
+def test_a_refusal_by_opencv_costs_its_permutation_and_is_the_reason_where_all_are_refused(
+    refused, monkeypatch
+):
     calls = []
 
     def find(*points, **settings):
@@ -205,7 +235,11 @@ def test_a_refusal_by_opencv_costs_its_permutation_and_is_the_reason_where_all_a
             raise error
         return cv2.findFundamentalMat(*points, **settings)
 
-    monkeypatch.setitem(robust._SOLVERS, ModelKind.F, robust._SOLVERS[ModelKind.F]._replace(find=find))
+    monkeypatch.setitem(
+        robust._SOLVERS, ModelKind.F, robust._SOLVERS[ModelKind.F]._replace(find=find)
+    )
     found = estimate(seen(0, 60), RobustConfig(permutations=3))
     assert len(calls) == 3
-    assert found.failure == ("" if refused == 1 else "OpenCV refused the points: sample_size <= points_size_")
+    assert found.failure == (
+        "" if refused == 1 else "OpenCV refused the points: sample_size <= points_size_"
+    )

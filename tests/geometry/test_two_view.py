@@ -20,7 +20,9 @@ def random_view(seed, logs=(0.2, -0.3)):
 
 def rays(seed, n=60):
     rng = np.random.default_rng(seed)
-    return tuple(np.column_stack([rng.normal(size=(n, 2)) * 300, np.full(n, g)]) for g in (900.0, 800.0))
+    return tuple(
+        np.column_stack([rng.normal(size=(n, 2)) * 300, np.full(n, g)]) for g in (900.0, 800.0)
+    )
 
 
 @pytest.mark.parametrize("k", range(7))
@@ -45,7 +47,9 @@ def test_a_fit_never_costs_more_and_leaves_known_focal_lengths_alone(sigmas):
 
 
 def rays_of(points, view):
-    """Rays (N, 3) of points (N, 3) in camera 0's world, for both images of a view with focal lengths of 1000."""
+    """Rays (N, 3) of points (N, 3) in camera 0's world, for both images of a view with focal
+    lengths of 1000.
+    """
     both = points, points @ view.R.T + view.t
     return tuple(
         np.column_stack([1000 * np.exp(log) * x[:, :2] / x[:, 2:], np.full(len(x), 1000.0)])

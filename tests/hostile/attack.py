@@ -1,4 +1,6 @@
-"""One hostile case: a room with an input, the command in it as a separate process, and the allowed results."""
+"""One hostile case: a room with an input, the command in it as a separate process, and the allowed
+results.
+"""
 
 import os
 import shlex
@@ -23,8 +25,14 @@ MEMORY_KIB = 4 << 20
 HANGS_S = 600
 REFUSED = (2,)
 EITHER = (0, 1, 2)  # a valid result, a result that states what is missing, or a clear refusal
-CRASHES = ("Traceback (most recent call last)", "Fatal Python error", "Segmentation fault", "core dumped")
-MISTYPED = ("expected one argument", "unrecognized arguments", "arguments are required")  # a mistake of the case
+CRASHES = (
+    "Traceback (most recent call last)",
+    "Fatal Python error",
+    "Segmentation fault",
+    "core dumped",
+)
+# A mistake of the case
+MISTYPED = ("expected one argument", "unrecognized arguments", "arguments are required")
 ENDED_BY_ITSELF = (0, 1, 128 + signal.SIGINT, 128 + signal.SIGTERM)
 TOO_LATE = "the time limit passed before the first results"
 MARK = "MKPC_HOSTILE_CASE"
@@ -57,7 +65,8 @@ class Case:
     env: dict[str, str] = field(default_factory=dict)
     limits: str = "-c 0"
     submission: bool = True
-    stderr: Callable[[], int] | None = None  # opens the descriptor that the command writes to; else the log
+    # Opens the descriptor that the command writes to; else the log
+    stderr: Callable[[], int] | None = None
 
     @property
     def id(self) -> str:
@@ -77,15 +86,28 @@ def attack(case: Case, room: Path) -> None:
         status, output = _wait(process, room)
         faults += _faults(case, status, output, room)
         faults += [f"left running: {line}" for line in _orphans(mark)]
-        was_interrupted = status not in (0, 1) and output.strip() in ("", "error: interrupted")  # at its start
-        if case.submission and not was_interrupted and "submit" in command and status in ENDED_BY_ITSELF:
-            faults += [f"submission: {problem}" for problem in problems_of(room / "out" / "s.csv", room / "D")]
+        # At its start
+        was_interrupted = status not in (0, 1) and output.strip() in ("", "error: interrupted")
+        if (
+            case.submission
+            and not was_interrupted
+            and "submit" in command
+            and status in ENDED_BY_ITSELF
+        ):
+            faults += [
+                f"submission: {problem}"
+                for problem in problems_of(room / "out" / "s.csv", room / "D")
+            ]
         if status in (0, 1) and "reconstruct" in command and TOO_LATE not in output:
             faults += _result_faults(room / "out" / "o", status)
     after = _snapshot(room)
-    faults += [f"changed: {name}" for name in sorted(before | after) if before.get(name) != after.get(name)]
+    faults += [
+        f"changed: {name}" for name in sorted(before | after) if before.get(name) != after.get(name)
+    ]
     if faults:
-        pytest.fail("\n".join([case.id, case.command, *faults, f"output:\n{output[-3000:]}"]), pytrace=False)
+        pytest.fail(
+            "\n".join([case.id, case.command, *faults, f"output:\n{output[-3000:]}"]), pytrace=False
+        )
 
 
 def prepared(command: str, room: Path) -> int:
@@ -94,12 +116,22 @@ def prepared(command: str, room: Path) -> int:
 
 
 def _start(
-    command: str, room: Path, env: dict[str, str], limits: str = "-c 0", stderr: Callable[[], int] | None = None
+    command: str,
+    room: Path,
+    env: dict[str, str],
+    limits: str = "-c 0",
+    stderr: Callable[[], int] | None = None,
 ) -> "subprocess.Popen[bytes]":
     limited = ["sh", "-c", f'ulimit -d {MEMORY_KIB}; ulimit {limits}; exec "$@"', "sh"]
-    own = {"PATH": os.defpath, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": "1"}
+    own = {
+        "PATH": os.defpath,
+        "PYTHONPATH": str(ROOT),
+        "OMP_NUM_THREADS": "1",
+        "PYTHONDONTWRITEBYTECODE": "1",
+    }
     own |= {"HOME": str(room / "home"), "TMPDIR": str(room / "tmp"), "no_proxy": "*"}
-    own["MPLCONFIGDIR"] = str(Path(tempfile.gettempdir()) / "hostile-matplotlib")  # its list of fonts is slow
+    # Its list of fonts is slow
+    own["MPLCONFIGDIR"] = str(Path(tempfile.gettempdir()) / "hostile-matplotlib")
     with (room / "out" / "log").open("ab") as log:
         return subprocess.Popen(
             [*limited, sys.executable, "-m", "mkpc_kaggle", *shlex.split(command)],

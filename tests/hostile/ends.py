@@ -11,12 +11,34 @@ from room import CALIBRATION, SUBMIT, makes, options, written
 
 WITHOUT_LIMIT = SUBMIT.replace(" --time-limit 5m", "").replace(" --workers 0", "")
 NONSENSE = {
-    "--time-limit": ["0", "-1", "nan", "inf", "''", "1d", "0x1", "1h1h", "'\uff11s s'", "1e400", "8h4", "+6"],
+    "--time-limit": [
+        "0",
+        "-1",
+        "nan",
+        "inf",
+        "''",
+        "1d",
+        "0x1",
+        "1h1h",
+        "'\uff11s s'",
+        "1e400",
+        "8h4",
+        "+6",
+    ],
     "--started-at": ["nan", "-inf", "1e400", "abc", "99999999999", "''"],
     "--workers": ["-1", "''", "1.5", "99999999999999999999", "ray://", "\u0663x"],
     "--device": ["foo", "cuda:99", "''", "cpu:0", "cuda:-1", "meta"],
     "--mode": ["foo", "''"],
-    "--recipe": ["foo", "''", "../quick", "D/test.csv", "/dev/null", "quick.toml/x.toml", "D", "x" * 5000],
+    "--recipe": [
+        "foo",
+        "''",
+        "../quick",
+        "D/test.csv",
+        "/dev/null",
+        "quick.toml/x.toml",
+        "D",
+        "x" * 5000,
+    ],
     "--weights": ["foo", "D/test.csv", "/dev/null"],
     "--test-dir": ["d" * 5000],
 }
@@ -63,10 +85,19 @@ def signals() -> Iterator[Case]:
         acts |= {f"to all after {after} s": sends(name, after, group=True) for after in SOON[::2]}
         acts["twice"] = sends(name, 3.0, 0.2)
         for when, act in acts.items():
-            yield Case("signals", f"{name} {when}", f"{WORKING} 1", statuses=STATUSES[name], act=act)
+            yield Case(
+                "signals", f"{name} {when}", f"{WORKING} 1", statuses=STATUSES[name], act=act
+            )
     for name, status in CRUEL.items():
         act = sends(name, 4.0)
-        yield Case("signals", f"{name} and once more", f"{WORKING} 1", statuses=(status, 0), act=act, then=AGAIN)
+        yield Case(
+            "signals",
+            f"{name} and once more",
+            f"{WORKING} 1",
+            statuses=(status, 0),
+            act=act,
+            then=AGAIN,
+        )
 
 
 LIMITED = f"{WITHOUT_LIMIT} --workers 1 --time-limit"
@@ -78,17 +109,41 @@ CASES = [
     *(
         case
         for option, values in NONSENSE.items()
-        for case in options("limits", SUBMIT, {f"{option} {value[:20]}": f"{option}={value}" for value in values})
+        for case in options(
+            "limits", SUBMIT, {f"{option} {value[:20]}": f"{option}={value}" for value in values}
+        )
     ),
     *options("limits", LIMITED, {f"--time-limit {value}": value for value in SHORT}, (0, 1)),
     *options("limits", LIMITED, {f"--time-limit {value}": value for value in LONG}, (0,)),
-    *options("limits", WORKING, {f"5s with {n} workers": f"{n} --time-limit 5s" for n in (0, 2)}, (0, 1)),
+    *options(
+        "limits", WORKING, {f"5s with {n} workers": f"{n} --time-limit 5s" for n in (0, 2)}, (0, 1)
+    ),
     *options("arguments", VALIDATE, SCENES),
     *makes("arguments", VALIDATE, CAMERAS, (0,)),
     *makes("arguments", SCORE, SUBMISSIONS, (0,)),
-    *makes("arguments", "check sub.csv --test-dir D", {"a checked submission of NaN": SUBMITTED_NAN}, (1,)),
-    Case("arguments", "a name that clears the screen", "match 'a\x1b[2J\n' b", statuses=REFUSED, says=CLEARED),
-    Case("arguments", "an empty submission", SCORE, written("sub.csv", ""), REFUSED, "lacks the columns"),
-    Case("arguments", "an owner that is a path", "package --out out/p --owner ../x", statuses=REFUSED),
+    *makes(
+        "arguments",
+        "check sub.csv --test-dir D",
+        {"a checked submission of NaN": SUBMITTED_NAN},
+        (1,),
+    ),
+    Case(
+        "arguments",
+        "a name that clears the screen",
+        "match 'a\x1b[2J\n' b",
+        statuses=REFUSED,
+        says=CLEARED,
+    ),
+    Case(
+        "arguments",
+        "an empty submission",
+        SCORE,
+        written("sub.csv", ""),
+        REFUSED,
+        "lacks the columns",
+    ),
+    Case(
+        "arguments", "an owner that is a path", "package --out out/p --owner ../x", statuses=REFUSED
+    ),
     *signals(),
 ]

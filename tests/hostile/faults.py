@@ -24,7 +24,10 @@ FAULTS = {  # and a part of the output
     "prints bytes": ("sys.stdout.reconfigure(); sys.stdout.buffer.write(b'arrived\\n')", "arrived"),
     "ends its process": ("os._exit(3)", "2 units run"),
     "meets an illegal instruction": ("os.kill(os.getpid(), signal.SIGILL)", "2 units run"),
-    "prints no text": ("sys.stdout.write(b'x')", "TypeError: write() argument must be str, not bytes (2 pairs)"),
+    "prints no text": (
+        "sys.stdout.write(b'x')",
+        "TypeError: write() argument must be str, not bytes (2 pairs)",
+    ),
 }
 ENV = {"PYTHONPATH": f"lib:{ROOT}"}
 FINDING = "import mkpc_kaggle.matchers.adapters as known\nknown.__path__.append('lib')\n"
@@ -33,19 +36,38 @@ UNITS = f"units = [{UNIT.format(1).replace('sift', 'faulty')}, {UNIT.format(1)}]
 
 
 def with_matcher(fault: str) -> Make:
-    texts = {"lib/faulty.py": MATCHER.format(fault=fault), "lib/sitecustomize.py": FINDING, "quick.toml": UNITS}
+    texts = {
+        "lib/faulty.py": MATCHER.format(fault=fault),
+        "lib/sitecustomize.py": FINDING,
+        "quick.toml": UNITS,
+    }
     return lambda room: [written(name, text)(room) for name, text in texts.items()]
 
 
 CHANGED = resumed(written("I/0.png", encoded(".png", picture(2))))
 CASES = [
     *(
-        Case("faults", f"the first matcher {name}", IN_WORKER, with_matcher(fault), says=says, env=ENV)
+        Case(
+            "faults",
+            f"the first matcher {name}",
+            IN_WORKER,
+            with_matcher(fault),
+            says=says,
+            env=ENV,
+        )
         for name, (fault, says) in FAULTS.items()
     ),
-    Case("faults", "no file above 20 kB", SUBMIT, says="2 of 2 pairs have an F", limits="-f 40"),  # of 512 bytes
+    # Of 512 bytes
+    Case("faults", "no file above 20 kB", SUBMIT, says="2 of 2 pairs have an F", limits="-f 40"),
     *(
-        Case("faults", f"again, no file above {kib} kB", RECONSTRUCT, CHANGED, EITHER, limits=f"-f {2 * kib}")
+        Case(
+            "faults",
+            f"again, no file above {kib} kB",
+            RECONSTRUCT,
+            CHANGED,
+            EITHER,
+            limits=f"-f {2 * kib}",
+        )
         for kib in (4, 20, 100)
     ),
 ]

@@ -7,7 +7,19 @@ from pathlib import Path
 
 import numpy as np
 from attack import EITHER, REFUSED, Case
-from room import HEADER, RECIPE, RECONSTRUCT, REPORTED, SUBMIT, TABLE, UNIT, makes, replaced, resumed, written
+from room import (
+    HEADER,
+    RECIPE,
+    RECONSTRUCT,
+    REPORTED,
+    SUBMIT,
+    TABLE,
+    UNIT,
+    makes,
+    replaced,
+    resumed,
+    written,
+)
 from weight_bombs import AUTO, CONVERT, NAME, SEARCH
 
 INSTEAD = {  # of a file
@@ -64,7 +76,9 @@ GOOD_RECIPES = {
 }
 IMAGES = {
     "a link to another image": lambda path: path.symlink_to(path.with_name("z.png")),
-    "a name in another case": lambda path: shutil.copy(path.with_name("z.png"), path.with_name("X.PNG")),
+    "a name in another case": lambda path: shutil.copy(
+        path.with_name("z.png"), path.with_name("X.PNG")
+    ),
 }
 
 
@@ -99,6 +113,13 @@ CASES = [
     Case("tables", "5,000 pairs of no images", SUBMIT, written("D/test.csv", NO_IMAGES), (1,)),
     Case("tables", "a batch that the locale lacks", SUBMIT, ACCENTED, says="1 of 2 pairs", env=C),
     *makes("recipes", SUBMIT, tables_of("quick.toml", RECIPES)),
-    Case("recipes", "17 MiB", SUBMIT, written("quick.toml", "#" * (17 << 20)), REFUSED, "at most 16777216 are"),
+    Case(
+        "recipes",
+        "17 MiB",
+        SUBMIT,
+        written("quick.toml", "#" * (17 << 20)),
+        REFUSED,
+        "at most 16777216 are",
+    ),
     *makes("recipes", SUBMIT, tables_of("quick.toml", GOOD_RECIPES), (0,)),
 ]

@@ -1,4 +1,5 @@
-"""Folders of images to reconstruct: odd names, results in the way, commands given again after a change.
+"""Folders of images to reconstruct: odd names, results in the way, commands given again after a
+change.
 
 tests/reconstruction has more directories of results and lists of pairs.
 """
@@ -9,7 +10,17 @@ from pathlib import Path
 
 from attack import EITHER, Case, Make, nothing
 from ends import ENDS, STATUSES, sends
-from room import IMAGES_TO, RECIPE, RECONSTRUCT, encoded, makes, options, picture, resumed, write_images
+from room import (
+    IMAGES_TO,
+    RECIPE,
+    RECONSTRUCT,
+    encoded,
+    makes,
+    options,
+    picture,
+    resumed,
+    write_images,
+)
 
 OUTS = {
     "in the images": "I",
@@ -40,12 +51,16 @@ ODD = {
     "an ending alone": lambda folder: (folder / ".png").write_bytes(encoded(".png")),
     "links that go round": lambda folder: (folder / "round").symlink_to("."),
     "folders 50 deep": lambda folder: write_images(folder.joinpath(*"abcde" * 10)),
-    "ids that meet": lambda folder: [write_images(folder / name) for name in ("a_b", "a/b", "I", "a/b/c")],
+    "ids that meet": lambda folder: [
+        write_images(folder / name) for name in ("a_b", "a/b", "I", "a/b/c")
+    ],
 }
 JOURNAL = ("out", "o", "work", "journal.sqlite")
 CHANGES = {  # between two runs
     "an ending that was changed": lambda room: (room / "I/0.png").rename(room / "I/0.jpeg"),
-    "an image that was changed": lambda room: (room / "I/0.png").write_bytes(encoded(".png", picture(50))),
+    "an image that was changed": lambda room: (room / "I/0.png").write_bytes(
+        encoded(".png", picture(50))
+    ),
     "an image that was removed": lambda room: (room / "I/0.png").unlink(),
     "a dataset more": lambda room: write_images(room / "I/more"),
     "no database": lambda room: (room / "out/o/database.db").unlink(),
@@ -85,6 +100,16 @@ CASES = [
     *makes("folders", TO_TABLES, names(GOOD_NAMES), (0,)),
     *makes("folders", TO_TABLES, below("I", ALIKE)),
     *makes("folders", TO_TABLES, below("I", ODD), (0,)),
-    *makes("folders", RECONSTRUCT, {f"again: {name}": resumed(make) for name, make in CHANGES.items()}, EITHER),
-    *(Case("folders", f"{n} after 4 s", RECONSTRUCT, nothing, (1, *STATUSES[n]), act=sends(n, 4.0)) for n in ENDS),
+    *makes(
+        "folders",
+        RECONSTRUCT,
+        {f"again: {name}": resumed(make) for name, make in CHANGES.items()},
+        EITHER,
+    ),
+    *(
+        Case(
+            "folders", f"{n} after 4 s", RECONSTRUCT, nothing, (1, *STATUSES[n]), act=sends(n, 4.0)
+        )
+        for n in ENDS
+    ),
 ]

@@ -14,8 +14,12 @@ DAMAGES = {
     "its second half": lambda data: data[len(data) // 2 :],
     "bytes after its end": lambda data: data + b"\0" * 10_000,
     "zeros for its middle": lambda data: data[:200] + bytes(len(data) - 400) + data[-200:],
-    "bits turned in the middle": lambda data: data[:500] + bytes(255 - b for b in data[500:600]) + data[600:],
-    "another size in its head": lambda data: data.replace(struct.pack(">I", 160), struct.pack(">I", 60_000), 2),
+    "bits turned in the middle": lambda data: (
+        data[:500] + bytes(255 - b for b in data[500:600]) + data[600:]
+    ),
+    "another size in its head": lambda data: data.replace(
+        struct.pack(">I", 160), struct.pack(">I", 60_000), 2
+    ),
     "text": lambda _: b"this is no image\n" * 100,
 }
 
@@ -39,8 +43,12 @@ ODD = {
     "2^31 - 1 pixels a side": lambda: png(2**31 - 1, 2**31 - 1),
     "20,000 black pixels a side": lambda: png(20_000, 20_000, rows(20_000, 20_000, 1), depth=1),
     "1 x 60,000 pixels": lambda: encoded(".jpg", cv2.resize(picture(0), (1, 60_000))),
-    "a tag of no end": lambda: encoded(".jpg")[:2] + b"\xff\xe1\xff\xffExif\0\0II*\0\x08\0\0\0" + b"\xff" * 50_000,
-    "a text of 200 MB": lambda: png(9, 9, chunk(b"zTXt", b"a\0\0" + zlib.compress(bytes(2 * 10**8))), rows(9, 9)),
+    "a tag of no end": lambda: (
+        encoded(".jpg")[:2] + b"\xff\xe1\xff\xffExif\0\0II*\0\x08\0\0\0" + b"\xff" * 50_000
+    ),
+    "a text of 200 MB": lambda: png(
+        9, 9, chunk(b"zTXt", b"a\0\0" + zlib.compress(bytes(2 * 10**8))), rows(9, 9)
+    ),
     "an HDR image by another name": lambda: encoded(".hdr", picture(0).astype(np.float32) * 1e30),
 }
 
@@ -59,5 +67,10 @@ DAMAGED = {
 CASES = [
     *makes("images", SUBMIT, DAMAGED, (0,), says="pairs have an F"),
     *makes("images", REPORTED, {name: at(X, make) for name, make in ODD.items()}, (0,)),
-    *makes("images", TURNING, {f"{name}, a folder": at("I/0.png", make) for name, make in ODD.items()}, (0, 1)),
+    *makes(
+        "images",
+        TURNING,
+        {f"{name}, a folder": at("I/0.png", make) for name, make in ODD.items()},
+        (0, 1),
+    ),
 ]

@@ -1,4 +1,6 @@
-"""Paths where no result can be written, or that hold precious files; tests/cli/test_refusals.py has more."""
+"""Paths where no result can be written, or that hold precious files; tests/cli/test_refusals.py has
+more.
+"""
 
 import os
 from collections.abc import Callable
@@ -54,7 +56,10 @@ DEMOS_OVER = {  # in the folder U of the user
 
 def in_folder(table: dict[str, Callable[[Path], object]]) -> dict[str, Make]:
     """Return how to put the results of a finished run, and a folder U of the user, into the room."""
-    makings = {name: lambda room, m=make: [(room / "U").mkdir(), m(room / "U")] for name, make in table.items()}
+    makings = {
+        name: lambda room, m=make: [(room / "U").mkdir(), m(room / "U")]
+        for name, make in table.items()
+    }
     return {name: resumed(make) for name, make in makings.items()}
 
 
@@ -65,7 +70,12 @@ CASES = [
     *options("outputs", TO, ODD, (0,), submission=False),
     *makes("outputs", f"{TO} out/s.csv", IN_THE_WAY),
     *makes("outputs", f"{TO} out/s.csv", REPLACED, (0,)),
-    Case("outputs", "text that the terminal has not", f"{TO} out/s.csv", env={"PYTHONIOENCODING": "ascii"}),
+    Case(
+        "outputs",
+        "text that the terminal has not",
+        f"{TO} out/s.csv",
+        env={"PYTHONIOENCODING": "ascii"},
+    ),
     Case("outputs", "the C locale", f"{TO} out/\u00e9.csv", env={"LC_ALL": "C"}, submission=False),
     *options("figures", MATCH, FIGURES),
     Case("figures", "capitals", f"{MATCH} out/a.PNG"),

@@ -1,4 +1,6 @@
-"""The room of a case before anything hostile is in it: a test side, a train side, a folder of images, a recipe."""
+"""The room of a case before anything hostile is in it: a test side, a train side, a folder of
+images, a recipe.
+"""
 
 import shutil
 import tempfile
@@ -18,7 +20,8 @@ UNIT = '{{ stage = {}, matcher = "sift", long_side = 200, max_matches = 500 }}'
 SETTINGS = "[matchers.sift]\nfeatures = 500\n[magsac]\npermutations = 1\n"
 RECIPE = f"units = [{UNIT.format(1)}, {UNIT.format(2)}]\n{SETTINGS}"
 CALIBRATION = "image_id,camera_intrinsics,rotation_matrix,translation_vector\n" + "".join(
-    f"{name},200 0 80 0 200 80 0 0 1,1 0 0 0 1 0 0 0 1,{shift} 0 0\n" for shift, name in enumerate("xyz")
+    f"{name},200 0 80 0 200 80 0 0 1,1 0 0 0 1 0 0 0 1,{shift} 0 0\n"
+    for shift, name in enumerate("xyz")
 )
 TEXTS = {
     "D/test.csv": TABLE,
@@ -35,12 +38,15 @@ REPORTED = SUBMIT.replace(" --no-report", "")
 IMAGES_TO = "reconstruct I --recipe quick.toml --workers 0 --time-limit 5m --out"
 RECONSTRUCT = f"{IMAGES_TO} out/o"
 SIDE = 160
-DEPTHS = (1.0, 2.0, 3.0, 1.5, 2.5)  # inverse depths of five bands of rows: the views are of no plane
+# Inverse depths of five bands of rows: the views are of no plane
+DEPTHS = (1.0, 2.0, 3.0, 1.5, 2.5)
 
 
 @cache
 def picture(shift: int) -> NDArray[np.uint8]:
-    """Return the view of a camera that has moved to the right by that many pixels of the farthest band."""
+    """Return the view of a camera that has moved to the right by that many pixels of the farthest
+    band.
+    """
     noise = np.random.default_rng(0).integers(0, 256, (SIDE, 3 * SIDE, 3)).astype(np.float32)
     rough = sum(cv2.GaussianBlur(noise, (0, 0), width) * width for width in (1.5, 4.0))
     whole = cv2.normalize(rough, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
@@ -105,18 +111,33 @@ def replaced(name: str, make: Callable[[Path], object]) -> Make:
 
 
 def written(name: str, data: bytes | str) -> Make:
-    return replaced(name, lambda path: path.write_bytes(data.encode() if isinstance(data, str) else data))
+    return replaced(
+        name, lambda path: path.write_bytes(data.encode() if isinstance(data, str) else data)
+    )
 
 
 def makes(
-    group: str, command: str, table: Mapping[str, Make], statuses: tuple[int, ...] = REFUSED, **more: Any
+    group: str,
+    command: str,
+    table: Mapping[str, Make],
+    statuses: tuple[int, ...] = REFUSED,
+    **more: Any,
 ) -> list[Case]:
-    """Return a case for each change of the room, by its name; ``more`` are further fields of the cases."""
+    """Return a case for each change of the room, by its name; ``more`` are further fields of the
+    cases.
+    """
     return [Case(group, name, command, make, statuses, **more) for name, make in table.items()]
 
 
 def options(
-    group: str, command: str, table: Mapping[str, str], statuses: tuple[int, ...] = REFUSED, **more: Any
+    group: str,
+    command: str,
+    table: Mapping[str, str],
+    statuses: tuple[int, ...] = REFUSED,
+    **more: Any,
 ) -> list[Case]:
     """Return a case for each end of the command, by its name."""
-    return [Case(group, name, f"{command} {end}", statuses=statuses, **more) for name, end in table.items()]
+    return [
+        Case(group, name, f"{command} {end}", statuses=statuses, **more)
+        for name, end in table.items()
+    ]

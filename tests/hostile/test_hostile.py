@@ -1,4 +1,6 @@
-"""The standing attack: the real command on hostile inputs, each case in its own process (see ``attack``)."""
+"""The standing attack: the real command on hostile inputs, each case in its own process (see
+``attack``).
+"""
 
 import shutil
 from pathlib import Path
@@ -17,8 +19,11 @@ from room import write_template
 
 SOURCES = (files, images, outputs, ends, faults, weight_bombs, folders, unread)
 ALL = [case for source in SOURCES for case in source.CASES]
-QUICK = {case.group: case for case in reversed(ALL)}.values()  # the first of each group runs with the other tests
-MARKED = [pytest.param(case, id=case.id, marks=() if case in QUICK else pytest.mark.slow) for case in ALL]
+# The first of each group runs with the other tests
+QUICK = {case.group: case for case in reversed(ALL)}.values()
+MARKED = [
+    pytest.param(case, id=case.id, marks=() if case in QUICK else pytest.mark.slow) for case in ALL
+]
 
 
 @pytest.fixture(scope="session")

@@ -17,8 +17,14 @@ COMMANDS = {  # and the end of its work
     "submit in its own process": (SUBMIT, "complete after"),
     "submit in a worker": (SUBMIT.replace("--workers 0", "--workers 1"), "complete after"),
     "submit with a report": (REPORTED, "complete after"),
-    "reconstruct": (f"{IMAGES_TO} out/o".replace("I", FOLDER, 1).replace("rs 0", "rs 1"), "complete after"),
-    "match": (f"match {FOLDER}/x.png {FOLDER}/y.png --recipe quick.toml --out out/p.png", "figure: out/p.png"),
+    "reconstruct": (
+        f"{IMAGES_TO} out/o".replace("I", FOLDER, 1).replace("rs 0", "rs 1"),
+        "complete after",
+    ),
+    "match": (
+        f"match {FOLDER}/x.png {FOLDER}/y.png --recipe quick.toml --out out/p.png",
+        "figure: out/p.png",
+    ),
     "a page from a journal": (JOURNAL, "out/r.html"),
 }
 
@@ -51,9 +57,20 @@ def full_pipe() -> int:
     return pipe
 
 
-COMPLAINTS = {"a short colour profile": short_profile, "bytes between a photograph's restarts": extra_restart}
+COMPLAINTS = {
+    "a short colour profile": short_profile,
+    "bytes between a photograph's restarts": extra_restart,
+}
 CASES = [
-    Case("unread", f"{name}: {complaint}", command, complained_of(make, command), (0, 1), says, stderr=full_pipe)
+    Case(
+        "unread",
+        f"{name}: {complaint}",
+        command,
+        complained_of(make, command),
+        (0, 1),
+        says,
+        stderr=full_pipe,
+    )
     for complaint, make in COMPLAINTS.items()
     for name, (command, says) in COMMANDS.items()
 ]

@@ -45,11 +45,18 @@ def cases() -> Iterator[Case]:
         yield Case("weights", f"{name}, old format", CONVERT, written("a.pt", data), REFUSED)
     for name, data in SAFETENSORS.items():
         convert = CONVERT.replace("a.pt", "a.safetensors")
-        yield Case("weights", f"safetensors: {name}", convert, written("a.safetensors", data), REFUSED)
+        yield Case(
+            "weights", f"safetensors: {name}", convert, written("a.safetensors", data), REFUSED
+        )
     bomb = written(f"weights/deep/{NAME}", archive(PICKLES["a bytearray of 6 GB"]))
     yield Case("weights", f"{NAME} is a bomb", AUTO, bomb, says=NAME)
-    for name, make in {"a bomb": bomb, "cut off": written(f"weights/deep/{NAME}", b"cut off")}.items():
-        yield Case("weights", f"{NAME} is {name}, verified", f"weights verify {SEARCH}", make, (1,), NAME)
+    for name, make in {
+        "a bomb": bomb,
+        "cut off": written(f"weights/deep/{NAME}", b"cut off"),
+    }.items():
+        yield Case(
+            "weights", f"{NAME} is {name}, verified", f"weights verify {SEARCH}", make, (1,), NAME
+        )
 
 
 CASES = [*cases()]

@@ -21,8 +21,12 @@ from mkpc_kaggle.matchers.networks.warp_refiner import WarpEstimate, identity_ma
 @torch.inference_mode()
 def test_corrections_are_in_pixels_of_the_query_however_large_the_support_is(monkeypatch):
     network = DKM()
-    monkeypatch.setattr(network.decoder.conv_refiner["8"], "forward", lambda *_: torch.ones(1, 3, 6, 8))
-    query, support = (network.encode(torch.zeros(1, 3, *size)).coarse for size in ((48, 64), (72, 40)))
+    monkeypatch.setattr(
+        network.decoder.conv_refiner["8"], "forward", lambda *_: torch.ones(1, 3, 6, 8)
+    )
+    query, support = (
+        network.encode(torch.zeros(1, 3, *size)).coarse for size in ((48, 64), (72, 40))
+    )
     estimate = WarpEstimate(torch.zeros(1, 2, 6, 8), torch.zeros(1, 1, 6, 8))
     for other in (query, support):
         flow = network.decoder.correct(estimate, query, other, 8).flow

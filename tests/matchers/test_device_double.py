@@ -10,13 +10,16 @@ from torch.nn.attention import SDPBackend, sdpa_kernel
 
 from mkpc_kaggle.matchers.contract import Placement, arrays_of
 
-PAIRS = {"superglue": 3, "aliked_lightglue": 3, "xfeat_lighterglue": 3}  # in a minibatch; of others 1
+# In a minibatch; of others 1
+PAIRS = {"superglue": 3, "aliked_lightglue": 3, "xfeat_lighterglue": 3}
 
 
 def matched(name, device):
     """The points (M, 4) of each pair of a minibatch."""
     matcher, numbers = MATCHERS[name](Placement(device)), range(PAIRS.get(name, 1))
-    pictures = [[picture(matcher.spec.colour, number, shift) for number in numbers] for shift in (SHIFT, 0)]
+    pictures = [
+        [picture(matcher.spec.colour, number, shift) for number in numbers] for shift in (SHIFT, 0)
+    ]
     encodings = [matcher.encode(side) for side in pictures]
     tensors = [array for array in arrays_of(encodings) if isinstance(array, torch.Tensor)]
     assert {tensor.device for tensor in tensors} == {torch.device(device)}
@@ -26,10 +29,13 @@ def matched(name, device):
 
 @pytest.mark.parametrize("name", MATCHERS)
 def test_a_matcher_finds_on_a_gpu_what_it_finds_on_the_cpu(name):
-    with sdpa_kernel(SDPBackend.MATH):  # as the double has attention: another order of sums chooses other anchors
+    # As the double has attention: another order of sums chooses other anchors
+    with sdpa_kernel(SDPBackend.MATH):
         expected = matched(name, "cpu")
     assert sum(map(len, expected)) > 0
     with DeviceDouble(2) as double:
         found = matched(name, "cuda:1")  # not the default one
         assert double.operators > 0
-    assert min(agreement(a, b, 0.05, torch.inf) for a, b in zip(found, expected, strict=True)) >= 0.98
+    assert (
+        min(agreement(a, b, 0.05, torch.inf) for a, b in zip(found, expected, strict=True)) >= 0.98
+    )

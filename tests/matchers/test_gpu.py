@@ -1,4 +1,6 @@
-"""What a run asks of GPUs, shown on machines without: which there are, in which precision, with how much cache."""
+"""What a run asks of GPUs, shown on machines without: which there are, in which precision, with how
+much cache.
+"""
 
 import time
 from dataclasses import dataclass
@@ -18,7 +20,12 @@ from mkpc_kaggle.matchers.dtypes import check_finite, exact_float32
 from mkpc_kaggle.matchers.failures import DeviceError
 from mkpc_kaggle.pipeline import devices
 from mkpc_kaggle.pipeline.assembly import assemble
-from mkpc_kaggle.pipeline.devices import fastest_precision, gpu_capabilities, require_device, resolve_placement
+from mkpc_kaggle.pipeline.devices import (
+    fastest_precision,
+    gpu_capabilities,
+    require_device,
+    resolve_placement,
+)
 from mkpc_kaggle.pipeline.pair import PairMatch
 from mkpc_kaggle.pipeline.stages import Pipeline
 from mkpc_kaggle.recipe import Recipe, Unit
@@ -59,7 +66,9 @@ def test_gpus_on_which_nothing_can_be_computed_leave_the_work_to_the_cpu(monkeyp
     gpu_capabilities.cache_clear()
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(devices, "ASK_CAPABILITIES", "raise SystemExit('no kernel image')")
-    told = r"the CPU does the work: .*\(no kernel image\); on Kaggle choose the accelerator GPU T4 x2"
+    told = (
+        r"the CPU does the work: .*\(no kernel image\); on Kaggle choose the accelerator GPU T4 x2"
+    )
     with pytest.warns(UserWarning, match=told):
         assert str(assemble("classical").placement) == "device cpu in float32"
 
@@ -120,7 +129,9 @@ def works() -> list[PairMatch]:
     return [PairMatch(images=(images[0], other)) for other in images[1:]]
 
 
-@pytest.mark.skipif(not hasattr(torch.backends.cudnn, "conv"), reason="PyTorch before 2.9 has other names for it")
+@pytest.mark.skipif(
+    not hasattr(torch.backends.cudnn, "conv"), reason="PyTorch before 2.9 has other names for it"
+)
 def test_matchers_run_without_tf32_and_the_process_keeps_its_settings():
     before, own = settings(), Own(1.0)
     Pipeline(RECIPE, lambda name: own).match(works(), RECIPE.units)
@@ -140,10 +151,14 @@ def test_features_that_are_not_finite_load_the_matcher_in_float32_and_are_an_err
     note = "own runs in float32, for in half precision features of own are not finite"
     assert {(work.results[0].failure, work.results[0].note) for work in done} == {("", note)}
     failed = Pipeline(RECIPE, lambda name: Own(float("nan"))).match(works(), RECIPE.units)
-    assert {work.results[0].failure for work in failed} == {"NonFiniteError: features of own are not finite"}
+    assert {work.results[0].failure for work in failed} == {
+        "NonFiniteError: features of own are not finite"
+    }
 
 
 def test_finite_numbers_pass_however_large_their_sum_and_whatever_holds_them():
-    check_finite("maps", Maps(torch.full((9, 9), 65504.0, dtype=torch.float16), (torch.arange(3),)), [])
+    check_finite(
+        "maps", Maps(torch.full((9, 9), 65504.0, dtype=torch.float16), (torch.arange(3),)), []
+    )
     with pytest.raises(NonFiniteError, match="maps are not finite"):
         check_finite("maps", [Maps(torch.zeros(2), (torch.tensor([0.0, -torch.inf]),))])

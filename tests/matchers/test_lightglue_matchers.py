@@ -71,7 +71,10 @@ def test_layers_compute_in_the_precision_that_is_asked_for(precision, store):
     matcher = load_matcher("aliked_lightglue", store, options, Placement(precision=precision))
     state = matcher._glue.state_dict()
     is_exact = re.compile(r"posenc|log_assignment|token_confidence|\.ffn\.1\.")  # and layer norms
-    expected = {name: torch.float32 if is_exact.search(name) else getattr(torch, precision) for name in state}
+    expected = {
+        name: torch.float32 if is_exact.search(name) else getattr(torch, precision)
+        for name in state
+    }
     assert {name: tensor.dtype for name, tensor in state.items()} == expected
     encodings = matcher.encode([picture(64, 96, multiple=32)])
     (matches,) = matcher.match(encodings, encodings)

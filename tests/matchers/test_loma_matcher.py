@@ -24,7 +24,9 @@ OPTIONS = LomaOptions(Variant.B128, max_keypoints=200)
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> WeightStore:
-    return store_of(tmp_path_factory.mktemp("weights"), [file for file in FILES if file.matcher == "loma"])
+    return store_of(
+        tmp_path_factory.mktemp("weights"), [file for file in FILES if file.matcher == "loma"]
+    )
 
 
 @pytest.fixture(scope="module")
@@ -53,11 +55,18 @@ def test_padding_changes_nothing_and_tiny_pictures_have_no_matches(matcher):
     assert torch.equal(plain.keypoints.points, padded.keypoints.points)
     assert torch.equal(plain.keypoints.descriptors, padded.keypoints.descriptors)
     assert encoding_bytes(plain) == 200 * (2 + 128) * 4
-    tiny = [matcher.encode([as_picture(scene(*size, channels=3))])[0] for size in ((7, 90), (1, 1), (90, 5))]
-    assert [len(matches) for matches in matcher.match([*tiny, plain, tiny[0]], [plain] * 3 + tiny[:2])] == [0] * 5
+    tiny = [
+        matcher.encode([as_picture(scene(*size, channels=3))])[0]
+        for size in ((7, 90), (1, 1), (90, 5))
+    ]
+    assert [
+        len(matches) for matches in matcher.match([*tiny, plain, tiny[0]], [plain] * 3 + tiny[:2])
+    ] == [0] * 5
 
 
-def test_a_checkpoint_with_a_surplus_is_refused_and_half_precision_and_deeper_training_load(store, network):
+def test_a_checkpoint_with_a_surplus_is_refused_and_half_precision_and_deeper_training_load(
+    store, network
+):
     good = store.load("loma-b128")
     surplus = {"_descriptor.surplus": torch.ones(1)}
     with pytest.raises(UserError, match="'loma-b128' do not fit the network"):

@@ -10,7 +10,13 @@ from standin import scene
 from synthetic import QUICK
 from torch.nn import functional
 
-from mkpc_kaggle.matchers.contract import Colour, NonFiniteError, Placement, arrays_of, encoding_bytes
+from mkpc_kaggle.matchers.contract import (
+    Colour,
+    NonFiniteError,
+    Placement,
+    arrays_of,
+    encoding_bytes,
+)
 from mkpc_kaggle.matchers.dtypes import check_finite
 from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher
 from mkpc_kaggle.recipe import Recipe, Unit
@@ -34,7 +40,9 @@ def test_matches_lie_on_the_pictures_whatever_their_sizes(matcher, sizes):
     shown = [picture(matcher, *size, f"{size}") for size in sizes]
     encodings = [matcher.encode([each])[0] for each in shown]
     (matches,) = matcher.match(encodings[:1], encodings[1:])
-    assert all(part.dtype == np.float32 for part in (matches.points0, matches.points1, matches.scores))
+    assert all(
+        part.dtype == np.float32 for part in (matches.points0, matches.points1, matches.scores)
+    )
     assert ((matches.scores >= 0) & (matches.scores <= 1.0001)).all()
     # A window may reach over the edge by a few pixels.
     for points, size in zip((matches.points0, matches.points1), sizes, strict=True):
@@ -56,7 +64,9 @@ def test_the_same_pair_gives_the_same_bytes_whatever_ran_before(matcher):
 
 
 def test_an_encoding_keeps_no_more_memory_than_is_counted_and_nothing_gives_nothing(matcher):
-    for encoding in matcher.encode([picture(matcher, 64, 96, name) for name in ("scene", "another")]):
+    for encoding in matcher.encode(
+        [picture(matcher, 64, 96, name) for name in ("scene", "another")]
+    ):
         kept = sum(tensor.untyped_storage().nbytes() for tensor in arrays_of(encoding))
         assert encoding_bytes(encoding) == kept > 0
     assert list(matcher.match([], [])) == []
@@ -75,7 +85,9 @@ def overflow(monkeypatch):
     """Let all linear maps and convolutions overflow from now on, as in half precision they may."""
     for name in ("linear", "conv1d", "conv2d"):
         exact = getattr(functional, name)
-        monkeypatch.setattr(functional, name, lambda *args, exact=exact, **more: exact(*args, **more) * torch.inf)
+        monkeypatch.setattr(
+            functional, name, lambda *args, exact=exact, **more: exact(*args, **more) * torch.inf
+        )
 
 
 def test_overflow_is_an_error_and_never_a_lack_of_keypoints_or_matches(matcher, monkeypatch):

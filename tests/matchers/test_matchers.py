@@ -1,4 +1,6 @@
-"""Every matcher against pictures whose correspondence is known, and against pictures that have none."""
+"""Every matcher against pictures whose correspondence is known, and against pictures that have
+none.
+"""
 
 from functools import cache
 
@@ -21,9 +23,14 @@ from mkpc_kaggle.weights import WeightStore, load_into
 SIZE = Size(256, 192)
 every_matcher = pytest.mark.parametrize(
     "name",
-    ["sift", pytest.param("aliked", marks=needs_weights), pytest.param("xfeat_lighterglue", marks=needs_weights)],
+    [
+        "sift",
+        pytest.param("aliked", marks=needs_weights),
+        pytest.param("xfeat_lighterglue", marks=needs_weights),
+    ],
 )
-# The median error in pixels that a matcher may have; XFeat's keypoints are whole pixels of its cells.
+# The median error in pixels that a matcher may have; XFeat's keypoints are whole pixels of its
+# cells.
 WITHIN = {"sift": 0.4, "aliked": 1.0, "xfeat_lighterglue": 1.5}
 
 
@@ -51,7 +58,9 @@ def photograph():
 @cache
 def matcher_of(name):
     options = spec_of(name, "test").options(features=1000)
-    return load_matcher(name, WeightStore([WEIGHTS] if WEIGHTS.is_dir() else []), options, Placement())
+    return load_matcher(
+        name, WeightStore([WEIGHTS] if WEIGHTS.is_dir() else []), options, Placement()
+    )
 
 
 def match_photograph(name, pixels):
@@ -72,7 +81,9 @@ def offsets(matches, H):
 @pytest.mark.parametrize("kind", MAPS)
 def test_matches_follow_the_known_map(name, kind):
     H = MAPS[kind]
-    matches = match_photograph(name, cv2.warpPerspective(photograph(), H, SIZE, flags=cv2.INTER_AREA))
+    matches = match_photograph(
+        name, cv2.warpPerspective(photograph(), H, SIZE, flags=cv2.INTER_AREA)
+    )
     assert len(matches) >= 60
     errors = np.hypot(*offsets(matches, H).T)
     assert np.median(errors) < WITHIN[name]
@@ -81,7 +92,9 @@ def test_matches_follow_the_known_map(name, kind):
         assert Box.whole(SIZE).contains(points).all()
     if kind == "rotated":
         is_sure = matches.scores > np.median(matches.scores)
-        assert np.mean(errors[is_sure] < 3) >= np.mean(errors[~is_sure] < 3), "surer matches are better matches"
+        assert np.mean(errors[is_sure] < 3) >= np.mean(errors[~is_sure] < 3), (
+            "surer matches are better matches"
+        )
 
 
 def test_sift_puts_its_points_where_they_are_at_every_scale():
@@ -100,7 +113,11 @@ def test_all_names_and_shapes_of_a_checkpoint_must_fit_but_those_that_are_not_us
     whole = {name: torch.ones_like(tensor) for name, tensor in network.state_dict().items()}
     part = {name: tensor for name, tensor in whole.items() if name != "1.bias"}
     surplus, misshapen = {"2.bias": torch.ones(2)}, {"0.weight": torch.ones(3, 2)}
-    for wrong, says in ((whole | surplus, r"2\.bias"), (part, r"1\.bias"), (whole | misshapen, r"0\.weight")):
+    for wrong, says in (
+        (whole | surplus, r"2\.bias"),
+        (part, r"1\.bias"),
+        (whole | misshapen, r"0\.weight"),
+    ):
         with pytest.raises(UserError, match=f"'w' do not fit the network: {says}"):
             load_into(network, wrong, unused="nothing", what="w")
     load_into(network, part | surplus, unused=r"1\.bias|2\.", what="w")

@@ -19,7 +19,9 @@ def related(seed, n, m, dimension=16):
     rng = np.random.default_rng(seed)
     first, second = unit(rng, n, dimension), unit(rng, m, dimension)
     common = min(n, m) // 2
-    second[:common] = first[rng.permutation(n)[:common]] + 0.05 * rng.normal(size=(common, dimension))
+    second[:common] = first[rng.permutation(n)[:common]] + 0.05 * rng.normal(
+        size=(common, dimension)
+    )
     return first, second / np.linalg.norm(second, axis=1, keepdims=True)
 
 
@@ -45,9 +47,13 @@ def found(first, second, dtype=torch.float64):
 @pytest.mark.parametrize(("n", "m"), [(1, 1), (1, 9), (9, 1), (2, 2), (150, 61), (61, 150)])
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 1e-4), (torch.float64, 1e-9)])
 @pytest.mark.parametrize("rows", [7, 61, 4096])
-def test_they_are_those_of_brute_force_in_blocks_of_any_size(n, m, dtype, tolerance, rows, monkeypatch):
+def test_they_are_those_of_brute_force_in_blocks_of_any_size(
+    n, m, dtype, tolerance, rows, monkeypatch
+):
     monkeypatch.setattr(neighbours, "BLOCK_ROWS", rows)
-    got, expected = (of(*related(n, n, m)) for of in (lambda *both: found(*both, dtype), brute_force))
+    got, expected = (
+        of(*related(n, n, m)) for of in (lambda *both: found(*both, dtype), brute_force)
+    )
     for index, truth in zip(got[:2], expected[:2], strict=True):
         assert_array_equal(index, truth)
     for value, truth in zip(got[2:], expected[2:], strict=True):

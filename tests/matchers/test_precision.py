@@ -34,7 +34,11 @@ def matches_of(name, precision=Precision.FLOAT32, noise=0):
 @pytest.mark.parametrize("precision", [Precision.BFLOAT16, Precision.FLOAT16])
 @pytest.mark.parametrize("name", NAMES)
 def test_matches_move_less_than_by_noise(name, precision):
-    exact, half, disturbed = matches_of(name), matches_of(name, precision), matches_of(name, noise=1)
+    exact, half, disturbed = (
+        matches_of(name),
+        matches_of(name, precision),
+        matches_of(name, noise=1),
+    )
     assert len(exact) > 20
     assert agreement(exact, half, within=0.25) > agreement(exact, disturbed, within=0.25)
     assert not torch.equal(exact, half)

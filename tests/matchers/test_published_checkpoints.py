@@ -31,7 +31,9 @@ class Published:
         return self
 
     def load(self, slot: str) -> dict[str, Tensor]:
-        return {name: torch.empty(shape, device="meta") for name, shape in self.tables[slot].items()}
+        return {
+            name: torch.empty(shape, device="meta") for name, shape in self.tables[slot].items()
+        }
 
 
 def problem_of(matcher: str, tables: Mapping[str, Shapes]) -> str:
@@ -69,7 +71,9 @@ class Glue:
         table |= {"posenc.Wr.weight": (width // self.heads // 2, self.position)}
         for n in range(self.layers):
             own, cross = f"transformers.{n}.self_attn", f"transformers.{n}.cross_attn"
-            table |= linear(f"{own}.Wqkv", 3 * width, width) | linear(f"{own}.out_proj", width, width)
+            table |= linear(f"{own}.Wqkv", 3 * width, width) | linear(
+                f"{own}.out_proj", width, width
+            )
             for part in ("to_qk", "to_v", "to_out"):
                 table |= linear(f"{cross}.{part}", width, width)
             for block in (own, cross):
@@ -116,11 +120,14 @@ NUMBERS = {f"log_assignment.{n}.r": (1,) for n in range(9)}
 
 def lighterglue() -> dict[str, tuple[int, ...]]:
     """With the extractor that it was trained with, of which no matcher needs anything."""
-    return with_prefix("matcher.", with_old_names(XFEAT.shapes())) | with_prefix("extractor.model.net.", xfeat())
+    return with_prefix("matcher.", with_old_names(XFEAT.shapes())) | with_prefix(
+        "extractor.model.net.", xfeat()
+    )
 
 
 Tables = dict[str, Shapes]  # by slot
-SPARSE: dict[str, tuple[str, Callable[[], Tables], int]] = {  # the matcher, its checkpoints, entries of the last
+# The matcher, its checkpoints, entries of the last
+SPARSE: dict[str, tuple[str, Callable[[], Tables], int]] = {
     "aliked-n16.pth": ("aliked", lambda: {"aliked-n16": aliked()}, 76),
     "aliked_lightglue.pth": (
         "aliked_lightglue",
@@ -154,7 +161,9 @@ def test_a_lightglue_and_its_detector_load_whatever_their_names_and_leftovers(na
     assert problem_of(matcher, tables) == ""
 
 
-@pytest.mark.parametrize("lost", ["log_assignment.8.matchability.bias", "transformers.3.self_attn.Wqkv.weight"])
+@pytest.mark.parametrize(
+    "lost", ["log_assignment.8.matchability.bias", "transformers.3.self_attn.Wqkv.weight"]
+)
 def test_a_lightglue_without_an_entry_that_it_needs_is_refused_by_its_name(lost):
     table = {name: shape for name, shape in SIFT.shapes().items() if name != lost}
     assert lost in problem_of("sift_lightglue", {"sift-lightglue": table})
@@ -169,7 +178,10 @@ def semi_dense(network: str, *path: str) -> Callable[[], Shapes]:
 
 
 def superglue(training: str) -> Callable[[], Tables]:
-    return lambda: {"superpoint": golden_shapes("superpoint"), f"superglue-{training}": golden_shapes("superglue")}
+    return lambda: {
+        "superpoint": golden_shapes("superpoint"),
+        f"superglue-{training}": golden_shapes("superglue"),
+    }
 
 
 def loma(variant: str, table: str) -> Callable[[], Tables]:
@@ -203,8 +215,16 @@ for _training in ("outdoor", "indoor"):
     GOLDEN_LISTS |= {
         f"superglue_{_training}.pth": ("superglue", superglue(_training), 339),
         f"roma_{_training}.pth": ("roma", roma(_training), 603),
-        f"DKMv3_{_training}.pth": ("dkm", lambda t=_training: {f"dkm-{t}": golden_shapes("dkm")}, 813),
-        f"LoFTR {_training}": ("loftr", lambda t=_training: {f"loftr-{t}": semi_dense("loftr")()}, 212),
+        f"DKMv3_{_training}.pth": (
+            "dkm",
+            lambda t=_training: {f"dkm-{t}": golden_shapes("dkm")},
+            813,
+        ),
+        f"LoFTR {_training}": (
+            "loftr",
+            lambda t=_training: {f"loftr-{t}": semi_dense("loftr")()},
+            212,
+        ),
         f"quadtree_{_training}.ckpt": (
             "quadtree",
             lambda t=_training: {f"quadtree-{t}": semi_dense("quadtree")()},
@@ -227,7 +247,11 @@ def test_every_known_list_of_entries_loads(name):
     assert problem_of(matcher, tables) == ""
 
 
-ONE_EACH = [name for name in GOLDEN_LISTS if "indoor" not in name and name not in ("loma_B.pt", "loma_R.pth")]
+ONE_EACH = [
+    name
+    for name in GOLDEN_LISTS
+    if "indoor" not in name and name not in ("loma_B.pt", "loma_R.pth")
+]
 
 
 @needs_golden
@@ -235,7 +259,11 @@ ONE_EACH = [name for name in GOLDEN_LISTS if "indoor" not in name and name not i
 def test_counters_of_batch_norms_may_be_missing_and_nothing_else(name):
     matcher, make, _ = GOLDEN_LISTS[name]
     tables = {
-        slot: {entry: shape for entry, shape in table.items() if not entry.endswith("num_batches_tracked")}
+        slot: {
+            entry: shape
+            for entry, shape in table.items()
+            if not entry.endswith("num_batches_tracked")
+        }
         for slot, table in make().items()
     }
     assert problem_of(matcher, tables) == ""

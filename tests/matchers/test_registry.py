@@ -1,4 +1,6 @@
-"""The registry: a matcher is imported when it is asked for, and a broken import costs that matcher alone."""
+"""The registry: a matcher is imported when it is asked for, and a broken import costs that matcher
+alone.
+"""
 
 import subprocess
 import sys
@@ -53,17 +55,30 @@ def test_the_template_of_a_matcher_is_a_matcher(more_matchers):
 
 def test_a_broken_matcher_is_told_with_its_reason_and_costs_no_other(more_matchers):
     (more_matchers / "broken.py").write_text("from json import no_such_thing\nSPEC = None\n")
-    with pytest.raises(UserError, match=r"my recipe: matcher broken cannot be used here \(ImportError: .*no_such"):
+    with pytest.raises(
+        UserError, match=r"my recipe: matcher broken cannot be used here \(ImportError: .*no_such"
+    ):
         spec_of("broken", "my recipe")
     assert spec_of("sift", "test").name == "sift"
 
 
 def test_without_kornia_its_matchers_alone_are_lost(clean_environment):
-    done = subprocess.run([sys.executable, "-c", WITHOUT_KORNIA], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", WITHOUT_KORNIA], capture_output=True, text=True, check=False
+    )
     assert "superglue_outdoor.pth" in done.stdout, done.stderr
-    assert "\nweights: matcher xfeat_lighterglue cannot be used here (ModuleNotFoundError" in done.stdout
+    assert (
+        "\nweights: matcher xfeat_lighterglue cannot be used here (ModuleNotFoundError"
+        in done.stdout
+    )
     assert "  xfeat_lighterglue: cannot be used here (ModuleNotFoundError" in done.stdout
     assert "('sift',) True" in done.stdout
-    assert "recipe auto does without xfeat_lighterglue: cannot be used here (ModuleNotFoundError" in done.stderr
-    assert "recipe mine does without xfeat_lighterglue: cannot be used here (ModuleNotFoundError" in done.stderr
+    assert (
+        "recipe auto does without xfeat_lighterglue: cannot be used here (ModuleNotFoundError"
+        in done.stderr
+    )
+    assert (
+        "recipe mine does without xfeat_lighterglue: cannot be used here (ModuleNotFoundError"
+        in done.stderr
+    )
     assert done.stdout.endswith("('sift',)\n")

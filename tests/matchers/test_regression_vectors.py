@@ -16,19 +16,25 @@ from pictures import agreement
 from mkpc_kaggle.matchers.contract import Placement
 
 DATA = Path(__file__).parent / "matches.npz"
-NAMES = [name for name in MATCHERS if name != "sift_lightglue"]  # SIFT differs between versions of OpenCV
-SAME = 0.95  # of the matches: a threshold or a tie within rounding may fall the other way on another processor
+# SIFT differs between versions of OpenCV
+NAMES = [name for name in MATCHERS if name != "sift_lightglue"]
+# Of the matches: a threshold or a tie within rounding may fall the other way on another processor
+SAME = 0.95
 TOLERANCES = np.array([0.5, *4 * [0.05], 2e-3])  # pair, pixels, score; a row is within all of them
 
 
 def found(name):
     """The matches (M, 6) of two pairs: number of the pair, points, score."""
     matcher = MATCHERS[name](Placement())
-    sides = [[picture(matcher.spec.colour, number, shift) for number in (0, 1)] for shift in (SHIFT, 0)]
+    sides = [
+        [picture(matcher.spec.colour, number, shift) for number in (0, 1)] for shift in (SHIFT, 0)
+    ]
     encodings = [[matcher.encode([shown])[0] for shown in side] for side in sides]
     return np.concatenate(
         [
-            np.column_stack([np.full(len(matches), pair), matches.points0, matches.points1, matches.scores])
+            np.column_stack(
+                [np.full(len(matches), pair), matches.points0, matches.points1, matches.scores]
+            )
             for pair, matches in enumerate(matcher.match(*encodings))
         ]
     )

@@ -1,4 +1,6 @@
-"""LoFTR, QuadTree and ASpanFormer: properties of the networks, and the matchers from public checkpoints."""
+"""LoFTR, QuadTree and ASpanFormer: properties of the networks, and the matchers from public
+checkpoints.
+"""
 
 from types import SimpleNamespace
 
@@ -29,10 +31,14 @@ def test_matches_are_the_mutual_maxima_of_both_softmaxes(monkeypatch, held):
     matches = coarse_matches(grid0, grid1, 0.5, 0.02, 0, None)
     similarity = (grid0.flatten(0, 1).double() @ grid1.flatten(0, 1).double().mT) * 0.5
     confidence = similarity.softmax(0) * similarity.softmax(1)
-    mutual = (confidence == confidence.amax(0, keepdim=True)) & (confidence == confidence.amax(1, keepdim=True))
+    mutual = (confidence == confidence.amax(0, keepdim=True)) & (
+        confidence == confidence.amax(1, keepdim=True)
+    )
     expected = (mutual & (confidence > 0.02)).nonzero()
     torch.testing.assert_close(torch.stack([matches.index0, matches.index1], dim=1), expected)
-    torch.testing.assert_close(matches.scores.double(), confidence[tuple(expected.T)], rtol=1e-5, atol=0)
+    torch.testing.assert_close(
+        matches.scores.double(), confidence[tuple(expected.T)], rtol=1e-5, atol=0
+    )
 
 
 def test_span_attention_in_chunks_is_that_of_the_whole(monkeypatch):
@@ -49,12 +55,16 @@ def test_span_attention_in_chunks_is_that_of_the_whole(monkeypatch):
         assert whole.isfinite().all()
         with monkeypatch.context() as patch:
             patch.setitem(CELLS_AT_ONCE, "cpu", 5)
-            torch.testing.assert_close(span_attention(q, k, v, samples, 2, mask), whole, rtol=1e-4, atol=1e-5)
+            torch.testing.assert_close(
+                span_attention(q, k, v, samples, 2, mask), whole, rtol=1e-4, atol=1e-5
+            )
 
 
 def test_weights_with_optimal_transport_are_refused_with_what_to_take_instead(tmp_path):
     surplus = {"coarse_matching.bin_score": torch.ones(())}
-    file = PublicFile("x.ckpt", "loftr", "loftr-outdoor", "loftr", Loftr, lambda state: wrapped(state | surplus))
+    file = PublicFile(
+        "x.ckpt", "loftr", "loftr-outdoor", "loftr", Loftr, lambda state: wrapped(state | surplus)
+    )
     store = store_of(tmp_path, [file])
     with pytest.raises(UserError, match=r"'loftr-outdoor' match by optimal transport.*outdoor_ds"):
         loftr.load(store, loftr.SPEC.options(), Placement())

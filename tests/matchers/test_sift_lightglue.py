@@ -30,19 +30,35 @@ def test_keypoints_and_log_assignment_are_the_golden_ones():
     encodings = matcher.encode([as_picture(golden[f"image{number}"].numpy()) for number in (0, 1)])
     for number, keypoints in enumerate(encodings):
         parts = {"keypoints": keypoints.points + 0.25}  # OpenCV's offset
-        parts |= {"scales": keypoints.scales, "oris": keypoints.orientations, "descriptors": keypoints.descriptors}
-        expected = np.hstack([golden[f"{part}{number}"].reshape(len(keypoints), -1) for part in parts])
+        parts |= {
+            "scales": keypoints.scales,
+            "oris": keypoints.orientations,
+            "descriptors": keypoints.descriptors,
+        }
+        expected = np.hstack(
+            [golden[f"{part}{number}"].reshape(len(keypoints), -1) for part in parts]
+        )
         own = np.hstack([part.reshape(len(keypoints), -1) for part in parts.values()])
         off = np.abs(own[np.lexsort(own[:, :2].T)] - expected[np.lexsort(expected[:, :2].T)])
-        assert (off < 1e-5 + 1e-6 * np.abs(expected)).mean() > 0.998, "OpenCV 4.8 rounds some elsewhere"
+        assert (off < 1e-5 + 1e-6 * np.abs(expected)).mean() > 0.998, (
+            "OpenCV 4.8 rounds some elsewhere"
+        )
         assert off.max() < 2e-3
-    names = {"points": "keypoints", "scales": "scales", "orientations": "oris", "descriptors": "descriptors"}
+    names = {
+        "points": "keypoints",
+        "scales": "scales",
+        "orientations": "oris",
+        "descriptors": "descriptors",
+    }
     given = []
     for number, each in enumerate(encodings):
-        parts = {own: golden[f"{name}{number}"] - 0.25 * (own == "points") for own, name in names.items()}
+        parts = {
+            own: golden[f"{name}{number}"] - 0.25 * (own == "points") for own, name in names.items()
+        }
         given.append([replace(each, **parts)])
     assert len(matcher.match(*given)[0]) == len(golden["matches"]) == 0
-    # Down to -38. The golden values are up to 2e-4 from those in float64, so the tolerance is relative, too.
+    # Down to -38. The golden values are up to 2e-4 from those in float64, so the tolerance is
+    # relative, too.
     expected = golden["log_assignment"][: found[0].shape[0], : found[0].shape[1]]
     assert_allclose(found[0], expected, rtol=1e-4, atol=1e-4)
 

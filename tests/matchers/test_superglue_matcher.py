@@ -1,4 +1,6 @@
-"""SuperPoint and SuperGlue: the matcher from checkpoints in the public format, and its parts by hand."""
+"""SuperPoint and SuperGlue: the matcher from checkpoints in the public format, and its parts by
+hand.
+"""
 
 import pytest
 import torch
@@ -15,22 +17,30 @@ from mkpc_kaggle.weights import WeightStore
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> WeightStore:
-    return store_of(tmp_path_factory.mktemp("weights"), [file for file in FILES if file.matcher == "superglue"])
+    return store_of(
+        tmp_path_factory.mktemp("weights"), [file for file in FILES if file.matcher == "superglue"]
+    )
 
 
-def test_indoor_weights_are_another_slot_and_another_networks_checkpoint_is_refused(store, tmp_path):
+def test_indoor_weights_are_another_slot_and_another_networks_checkpoint_is_refused(
+    store, tmp_path
+):
     indoor = superglue.SuperGlueOptions(training=Training.INDOOR)
     assert superglue.SPEC.slots_for(indoor) == ("superpoint", "superglue-indoor")
     with pytest.raises(UserError, match="superglue-indoor"):
         superglue.load(store, indoor, Placement())
-    wrong = store_of(tmp_path, [PublicFile("x.pth", "superglue", "superpoint", "superglue", SuperGlue)])
+    wrong = store_of(
+        tmp_path, [PublicFile("x.pth", "superglue", "superpoint", "superglue", SuperGlue)]
+    )
     with pytest.raises(UserError, match="'superpoint' do not fit the network"):
         superglue.load(wrong, superglue.SuperGlueOptions(), Placement())
 
 
 @pytest.mark.parametrize("spread", [1, 300])
 @pytest.mark.parametrize("bin_score", [-50.0, 90.0])
-def test_a_plan_spreads_the_mass_of_each_keypoint_however_far_apart_the_scores_are(bin_score, spread):
+def test_a_plan_spreads_the_mass_of_each_keypoint_however_far_apart_the_scores_are(
+    bin_score, spread
+):
     scores = spread * torch.randn(2, 60, 80, generator=torch.Generator().manual_seed(0))
     plan = log_optimal_transport(scores, torch.tensor(bin_score), 20).exp()
     masses = torch.tensor([*80 * [1.0], 60.0]).expand(2, -1)

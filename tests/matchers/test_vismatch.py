@@ -16,7 +16,9 @@ from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher
 from mkpc_kaggle.recipe import Recipe, Unit, parse_recipe
 
 PICTURE = scene(160, 200, 3)
-POINTS = np.stack(np.meshgrid(np.arange(8.0, 120, 8), np.arange(8.0, 88, 8)), axis=-1).reshape(-1, 2)
+POINTS = np.stack(np.meshgrid(np.arange(8.0, 120, 8), np.arange(8.0, 88, 8)), axis=-1).reshape(
+    -1, 2
+)
 SHIFTED = np.add(POINTS, (3, 2))
 
 
@@ -30,13 +32,21 @@ class Vismatch:
     def __call__(self, *images: torch.Tensor) -> dict:
         assert self.skip_ransac, "a homography would be fitted to the matches"
         self.seen += images
-        points = {f"matched_kpts{side}": of + self.offset for side, of in enumerate((POINTS, SHIFTED))}
-        return points | {"matched_confidences": self.confidences, "inlier_kpts0": np.empty((0, 2)), "H": None}
+        points = {
+            f"matched_kpts{side}": of + self.offset for side, of in enumerate((POINTS, SHIFTED))
+        }
+        return points | {
+            "matched_confidences": self.confidences,
+            "inlier_kpts0": np.empty((0, 2)),
+            "H": None,
+        }
 
 
 @pytest.mark.parametrize("corner", [False, True])
 @pytest.mark.parametrize("confidences", [None, np.linspace(0, 1, len(POINTS))])
-def test_points_are_pixels_from_the_first_ones_centre_and_confidences_are_scores(corner, confidences):
+def test_points_are_pixels_from_the_first_ones_centre_and_confidences_are_scores(
+    corner, confidences
+):
     matcher = VismatchMatcher(Vismatch(corner, confidences), corner=corner)
     matches = match_one(matcher, as_picture(PICTURE), as_picture(PICTURE))
     assert_allclose(matches.points0, POINTS, atol=1e-4)
@@ -48,9 +58,13 @@ def test_images_are_rgb_in_0_to_1_and_padded_to_the_multiple_in_both_stages():
     standin, recipe = Vismatch(), Recipe((Unit(1, "own", 200), Unit(2, "own", 160)))
     matchers = {"own": VismatchMatcher(standin, "own", multiple=64)}
     found = TwoStageMatcher(recipe, matchers=matchers)(PICTURE, PICTURE)
-    assert [(result.failure, len(result.matches) > 20) for result in found.results] == [("", True)] * 2
+    assert [(result.failure, len(result.matches) > 20) for result in found.results] == [
+        ("", True)
+    ] * 2
     assert [tuple(image.shape) for image in standin.seen[:2]] == [(3, 192, 256)] * 2
-    assert torch.equal(standin.seen[0][:, :160, :200], torch.from_numpy(PICTURE).permute(2, 0, 1) / 255)
+    assert torch.equal(
+        standin.seen[0][:, :160, :200], torch.from_numpy(PICTURE).permute(2, 0, 1) / 255
+    )
 
 
 def test_a_recipe_names_a_matcher_of_vismatch(monkeypatch):

@@ -6,12 +6,20 @@ from pathlib import Path
 
 import nbformat
 from kaggle_image import environment
-from offline_notebook import execute, needs_namespaces, outputs, pictures, printed, with_pictures_alone
+from offline_notebook import (
+    execute,
+    needs_namespaces,
+    outputs,
+    pictures,
+    printed,
+    with_pictures_alone,
+)
 from shared import write_recipe
 
 ROOT = Path(__file__).resolve().parents[2]
 TOUR = ROOT / "notebooks" / "mkpc_tour.ipynb"
-PATHS = os.pathsep.join([str(ROOT), str(TOUR.parent)])  # Jupyter starts a kernel in the folder of its notebook
+# Jupyter starts a kernel in the folder of its notebook
+PATHS = os.pathsep.join([str(ROOT), str(TOUR.parent)])
 SETTINGS = {  # as a user would edit them
     '"classical:whole-images", "classical"': '"small.toml:stage-1", "small.toml"',
     "SCENES = []": 'SCENES = ["courtyard"]',
@@ -20,12 +28,16 @@ SETTINGS = {  # as a user would edit them
 
 
 def figures_of(notebook: nbformat.NotebookNode) -> int:
-    return sum(cell.source.count("show(figures.") for cell in notebook.cells if cell.cell_type == "code")
+    return sum(
+        cell.source.count("show(figures.") for cell in notebook.cells if cell.cell_type == "code"
+    )
 
 
 @needs_namespaces
 def test_the_tour_runs_on_a_train_side_without_a_network(demo, tmp_path):
-    recipe = write_recipe(tmp_path / "tour.toml", (1, 480), (2, 640), more="[magsac]\npermutations = 1\n[scene]")
+    recipe = write_recipe(
+        tmp_path / "tour.toml", (1, 480), (2, 640), more="[magsac]\npermutations = 1\n[scene]"
+    )
     variables = environment(
         MKPC_RECIPE=str(recipe),
         PYTHONPATH=PATHS,
@@ -41,9 +53,13 @@ def test_the_tour_runs_on_a_train_side_without_a_network(demo, tmp_path):
 
 @needs_namespaces
 def test_the_tour_takes_two_photographs_without_truth(demo, tmp_path):
-    recipe = write_recipe(tmp_path / "tour.toml", (1, 480), (2, 640), more="[magsac]\npermutations = 1")
+    recipe = write_recipe(
+        tmp_path / "tour.toml", (1, 480), (2, 640), more="[magsac]\npermutations = 1"
+    )
     photographs = sorted((demo.train_dir / "courtyard" / "images").iterdir())[:2]
-    variables = environment(MKPC_RECIPE=str(recipe), PYTHONPATH=PATHS, MKPC_PHOTOS=",".join(map(str, photographs)))
+    variables = environment(
+        MKPC_RECIPE=str(recipe), PYTHONPATH=PATHS, MKPC_PHOTOS=",".join(map(str, photographs))
+    )
     executed = execute(TOUR, tmp_path / "executed.ipynb", sys.executable, tmp_path, variables)
     assert pictures(executed) == 9, "images, stage 1, four of MKPC, stage 2, both, epipolar lines"
     assert "The tour of your photographs ends here." in printed(executed)

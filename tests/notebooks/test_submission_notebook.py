@@ -25,7 +25,9 @@ def image(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 class Kaggle:
-    """A copy of Kaggle's directories: ``input`` with the competition and our dataset, and ``working``."""
+    """A copy of Kaggle's directories: ``input`` with the competition and our dataset, and
+    ``working``.
+    """
 
     def __init__(self, root: Path, image: Path, wheels: Path) -> None:
         self.root = root
@@ -80,9 +82,13 @@ IMAGES = [  # of Kaggle's: Python, OpenCV, torch, NumPy
 
 @pytest.mark.parametrize(("python", "opencv", "torch", "numpy"), IMAGES)
 def test_every_image_has_what_the_package_takes_from_it(python, opencv, torch, numpy):
-    project = tomllib.loads((NOTEBOOKS[0].parents[1] / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    project = tomllib.loads(
+        (NOTEBOOKS[0].parents[1] / "pyproject.toml").read_text(encoding="utf-8")
+    )["project"]
     taken = {need.name: need for need in map(Requirement, project["dependencies"])}
-    for name, _, version in (pin.partition("==") for pin in VERSIONS.format(opencv, torch, numpy).split()):
+    for name, _, version in (
+        pin.partition("==") for pin in VERSIONS.format(opencv, torch, numpy).split()
+    ):
         assert version in taken[name].specifier, name
     assert python in PYTHONS
 
@@ -114,17 +120,24 @@ def test_a_commit_run_without_network_leaves_a_submission_and_shows_pairs(kaggle
     assert kaggle.figures() == 1, "the pair"
     assert "&lt;title&gt;auto: 1 pairs&lt;/title&gt;" in kaggle.pages(), "the report, in an iframe"
     if WEIGHTS.is_dir():
-        for told in ("3 files, 0 refused, 0 missing", "1:xfeat_lighterglue@1024 ", "1:aliked@1024 "):
+        for told in (
+            "3 files, 0 refused, 0 missing",
+            "1:xfeat_lighterglue@1024 ",
+            "1:aliked@1024 ",
+        ):
             assert told in printed
 
 
 @pytest.mark.genuine
 @needs_namespaces
 @needs_data
-def test_the_packaged_notebook_with_genuine_weights_matches_with_aliked_and_lightglue(kaggle, tmp_path):
+def test_the_packaged_notebook_with_genuine_weights_matches_with_aliked_and_lightglue(
+    kaggle, tmp_path
+):
     kaggle.add_test_side(DATA / "test", pairs=1)
     (tmp_path / "weights").mkdir()
-    for name in ("aliked-n16.pth", "aliked_lightglue.pth"):  # fewer units: the test is to stay quick
+    # Fewer units: the test is to stay quick
+    for name in ("aliked-n16.pth", "aliked_lightglue.pth"):
         (tmp_path / "weights" / name).symlink_to(GENUINE / name)
     kaggle.add_dataset(tmp_path / "package", (tmp_path / "weights",))
     printed = kaggle.run()
@@ -156,12 +169,15 @@ def test_a_failed_run_fails_the_notebook_but_not_the_hidden_rerun(kaggle, demo, 
 def test_what_pip_says_is_stated_with_the_advice_where_no_wheel_fits(kaggle, demo, tmp_path):
     kaggle.add_test_side(demo.test_dir, pairs=1)
     kaggle.add_dataset(tmp_path / "package")
-    kaggle.image = make_image(tmp_path / "image")  # other tests have installed into the shared image
+    # Other tests have installed into the shared image
+    kaggle.image = make_image(tmp_path / "image")
     (wheel,) = kaggle.dataset.glob("pycolmap-*.whl")
     wheel.rename(wheel.with_name("pycolmap-4.2.1-cp27-cp27m-manylinux_2_28_x86_64.whl"))
     with pytest.raises(AssertionError, match="ERROR: ") as stopped:
         kaggle.run()
-    told = "no wheel of pycolmap is for Python {0}: package again with --python {0}".format(python_version())
+    told = "no wheel of pycolmap is for Python {0}: package again with --python {0}".format(
+        python_version()
+    )
     assert told in str(stopped.value)
 
 
@@ -176,5 +192,7 @@ def test_notebooks_are_committed_in_one_form_with_pictures_at_most(path):
     shown = [output for cell in code for output in cell.outputs]
     assert all(cell.execution_count is None for cell in code)
     assert not shown or path.stem == "mkpc_tour"
-    assert all((each["output_type"], *each["data"]) == ("display_data", "image/jpeg") for each in shown)
+    assert all(
+        (each["output_type"], *each["data"]) == ("display_data", "image/jpeg") for each in shown
+    )
     assert set(notebook.metadata) == {"kernelspec", "language_info"}

@@ -73,7 +73,9 @@ def out(made: tuple[Path, Package]) -> Path:
 
 
 def metadata_of(out: Path) -> tuple[dict[str, Any], dict[str, Any]]:
-    dataset, kernel = ((out / name / f"{name}-metadata.json").read_text() for name in ("dataset", "kernel"))
+    dataset, kernel = (
+        (out / name / f"{name}-metadata.json").read_text() for name in ("dataset", "kernel")
+    )
     return json.loads(dataset), json.loads(kernel)
 
 
@@ -81,7 +83,13 @@ def test_a_licence_tag_leads_to_no_text_but_those_of_licences():
     checkout = find_checkout()
     assert licence_text(checkout, "MIT") == checkout / "licences" / "MIT.txt"
     assert licence_text(checkout, "Apache-2.0") == checkout / "LICENSE"
-    for tag in ("../requirements-dev", "../licences/MIT", str(checkout / "licences" / "MIT"), "", "no-such"):
+    for tag in (
+        "../requirements-dev",
+        "../licences/MIT",
+        str(checkout / "licences" / "MIT"),
+        "",
+        "no-such",
+    ):
         assert licence_text(checkout, tag) is None
 
 
@@ -95,20 +103,34 @@ def test_the_dataset_holds_wheels_weights_and_their_licences(made):
     assert not [name for name in names if name.startswith("kept.pt")]
     assert [item.name for item in package.restricted] == ["kept.pt"]
     assert "MIT" in metadata_of(out)[0]["description"]
-    assert metadata_of(out)[0]["title"] == f"MKPC Kaggle {__version__}"  # two datasets can be told apart
+    # Two datasets can be told apart
+    assert metadata_of(out)[0]["title"] == f"MKPC Kaggle {__version__}"
     assert {item.name: item.licence for item in package.dataset}["free.pt.safetensors"] == "MIT"
 
 
-def test_weights_survive_the_upload_and_are_held_against_the_datasets_manifest(out, tmp_path, capsys):
+def test_weights_survive_the_upload_and_are_held_against_the_datasets_manifest(
+    out, tmp_path, capsys
+):
     dataset = out / "dataset"
     assert not [path for path in dataset.iterdir() if path.suffix in UNPACKED]
     mount = tmp_path / "input" / "datasets" / "someone" / "mkpc-kaggle"
     upload(dataset, mount)
     (told,) = read_manifest(mount / "weights_manifest.txt")
     data = (mount / "free.pt.safetensors").read_bytes()
-    assert (told.name, told.size, told.digest) == ("free.pt.safetensors", len(data), digest_of(data))
+    assert (told.name, told.size, told.digest) == (
+        "free.pt.safetensors",
+        len(data),
+        digest_of(data),
+    )
     assert (told.licence, told.slot) == ("MIT", "free")
-    verify = ["weights", "verify", "--weights", tmp_path / "input", "--manifest", mount / "weights_manifest.txt"]
+    verify = [
+        "weights",
+        "verify",
+        "--weights",
+        tmp_path / "input",
+        "--manifest",
+        mount / "weights_manifest.txt",
+    ]
     assert run_command(*verify) == 0
     assert "1 files, 0 refused, 0 missing" in capsys.readouterr().out
     (mount / "free.pt.safetensors").unlink()
@@ -116,7 +138,9 @@ def test_weights_survive_the_upload_and_are_held_against_the_datasets_manifest(o
     assert "missing" in capsys.readouterr().out
 
 
-def test_what_the_image_has_is_used_where_it_satisfies_even_without_a_wheel_for_its_python(out, tmp_path):
+def test_what_the_image_has_is_used_where_it_satisfies_even_without_a_wheel_for_its_python(
+    out, tmp_path
+):
     dataset = out / "dataset"
     lines = (dataset / "requirements.txt").read_text().splitlines()
     assert lines[0].startswith("mkpc-kaggle==")
@@ -124,20 +148,32 @@ def test_what_the_image_has_is_used_where_it_satisfies_even_without_a_wheel_for_
     assert "kornia>=0.9" in lines
     for path in dataset.glob("[!k]*.whl"):
         (tmp_path / path.name).symlink_to(path)
-    dry = [sys.executable, "-m", "pip", "install", "--dry-run", "--no-index", "--no-deps", "--find-links"]
+    dry = [
+        sys.executable,
+        "-m",
+        "pip",
+        "install",
+        "--dry-run",
+        "--no-index",
+        "--no-deps",
+        "--find-links",
+    ]
     command = [*dry, str(tmp_path), *lines[1:]]
     done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment())
     assert done.returncode == 0, done.stderr
 
 
-def test_the_kernel_runs_on_a_gpu_without_internet_on_the_latest_image_or_one_by_its_digest(out, wanted):
+def test_the_kernel_runs_on_a_gpu_without_internet_on_the_latest_image_or_one_by_its_digest(
+    out, wanted
+):
     dataset, kernel = metadata_of(out)
     assert (kernel["docker_image_pinning_type"], kernel.get("docker_image", "")) == ("latest", "")
     image = f"gcr.io/kaggle/python@sha256:{'0a' * 32}"
     make_package(replace(wanted, image=image))
     pinned = metadata_of(wanted.out)[1]
     assert (pinned["docker_image_pinning_type"], pinned["docker_image"]) == ("original", image)
-    assert 6 <= len(dataset["title"]) <= 50 and 20 <= len(dataset["subtitle"]) <= 80  # Kaggle's limits
+    # Kaggle's limits
+    assert 6 <= len(dataset["title"]) <= 50 and 20 <= len(dataset["subtitle"]) <= 80
     assert (kernel["enable_gpu"], kernel["enable_internet"]) == (True, False)
     assert kernel["model_sources"] == []
     assert kernel["dataset_sources"] == [dataset["id"]] == ["someone/mkpc-kaggle"]
@@ -175,12 +211,16 @@ def test_the_same_request_gives_the_same_bytes_and_leaves_files_alone(wanted, ou
     former = {path: path.stat().st_mtime_ns for path in wanted.out.rglob("*") if path.is_file()}
     (wanted.out / "dataset" / "free.pt.safetensors").write_bytes(b"broken off")
     make_package(wanted)
-    written = [path.name for path, modified in former.items() if path.stat().st_mtime_ns != modified]
+    written = [
+        path.name for path, modified in former.items() if path.stat().st_mtime_ns != modified
+    ]
     assert written == ["free.pt.safetensors"]
     assert contents(wanted.out) == contents(out)
 
 
-def test_a_private_package_has_all_weights_and_a_public_one_refuses_to_be_laid_over_it(wanted, capsys):
+def test_a_private_package_has_all_weights_and_a_public_one_refuses_to_be_laid_over_it(
+    wanted, capsys
+):
     arguments = ["package", "--owner", "someone", "--out", wanted.out, "--python", python_version()]
     arguments += ["--wheels", wanted.wheels, "--weights", wanted.weights[0]]
     assert run_command(*arguments, "--private") == 0
@@ -201,7 +241,9 @@ def test_bad_requests_are_refused_before_anything_is_written(wanted, tmp_path):
     empty.mkdir()
     bad = {
         "cannot be a Kaggle user name": replace(wanted, owner="some one"),
-        "give latest, original, or an image as NAME@sha256:DIGEST": replace(wanted, image="python@sha256:12"),
+        "give latest, original, or an image as NAME@sha256:DIGEST": replace(
+            wanted, image="python@sha256:12"
+        ),
         "no such directory": replace(wanted, wheels=tmp_path / "nowhere"),
         f"for Python {python_version()}": replace(wanted, wheels=empty),
         "--python '2.7': expected versions of Python 3": replace(wanted, pythons=("2.7",)),
@@ -214,7 +256,9 @@ def test_bad_requests_are_refused_before_anything_is_written(wanted, tmp_path):
     assert not wanted.out.exists()
 
 
-def test_weights_that_no_network_takes_are_refused_and_others_named_with_their_matchers(wanted, monkeypatch):
+def test_weights_that_no_network_takes_are_refused_and_others_named_with_their_matchers(
+    wanted, monkeypatch
+):
     (weights,) = wanted.weights
     (weights / "kept.pt").unlink()
     lines = write_checkpoints(weights, FILES_OF_PAPER[:2])
@@ -222,16 +266,21 @@ def test_weights_that_no_network_takes_are_refused_and_others_named_with_their_m
     package = make_package(replace(wanted, private=True))
     notes = {item.name: item.note for item in package.dataset}
     assert [notes[f"{file.name}.safetensors"] for file in lines] == ["fits superglue"] * 2
-    monkeypatch.setattr(store, "manifest", lambda: (*lines, line("free.pt", DATA, slot="dkm-outdoor")))
+    monkeypatch.setattr(
+        store, "manifest", lambda: (*lines, line("free.pt", DATA, slot="dkm-outdoor"))
+    )
     with pytest.raises(
-        UserError, match=r"another_name\.pt: the weights for 'dkm-outdoor' do not fit the network: a,"
+        UserError,
+        match=r"another_name\.pt: the weights for 'dkm-outdoor' do not fit the network: a,",
     ):
         make_package(replace(wanted, private=True))
 
 
 def test_the_wheel_holds_what_a_run_needs_and_asks_for_what_is_bundled(tmp_path, wheels):
     wheel = build_wheel(find_checkout(), tmp_path)
-    asked = [line.replace("_", "-").partition(">=")[0] for line in install_lines(wheel, wheels.iterdir())]
+    asked = [
+        line.replace("_", "-").partition(">=")[0] for line in install_lines(wheel, wheels.iterdir())
+    ]
     pinned = [pin.partition("==") for pin in pins(find_checkout())]
     bundled = sorted(name.replace("_", "-") for name, _, version in pinned if version)
     assert sorted(asked[1:]) == sorted(BUNDLED) == bundled

@@ -1,4 +1,6 @@
-"""DKM and RoMa against golden files: the estimates at every stride, the warp, and the matches drawn from it."""
+"""DKM and RoMa against golden files: the estimates at every stride, the warp, and the matches drawn
+from it.
+"""
 
 import json
 from functools import cache, partial
@@ -9,13 +11,19 @@ import pytest
 import torch
 from golden import GOLDEN, Stage, Within, compared, golden_arrays, in_order, ready, seeded_tensor
 
-from mkpc_kaggle.matchers.networks.dense_sampling import balancing_weights, density, draw, sample_matches
+from mkpc_kaggle.matchers.networks.dense_sampling import (
+    balancing_weights,
+    density,
+    draw,
+    sample_matches,
+)
 from mkpc_kaggle.matchers.networks.dense_warp import dense_warp
 from mkpc_kaggle.matchers.networks.dkm import DKM
 from mkpc_kaggle.matchers.networks.pixels import network_input
 from mkpc_kaggle.matchers.networks.roma import RoMa
 
-MODES = {"threshold_balanced": 0.05, "balanced": 1.0}  # of sampling, by the golden files' names: the threshold
+# Of sampling, by the golden files' names: the threshold
+MODES = {"threshold_balanced": 0.05, "balanced": 1.0}
 
 
 def state_of(shapes, gains, default, prefix=""):
@@ -28,7 +36,9 @@ def state_of(shapes, gains, default, prefix=""):
 
 @cache
 def network_of(name):
-    shapes, gains = (json.loads((GOLDEN / name / f"{file}.json").read_text()) for file in ("shapes", "gains"))
+    shapes, gains = (
+        json.loads((GOLDEN / name / f"{file}.json").read_text()) for file in ("shapes", "gains")
+    )
     default = gains["default"]
     if name == "dkm":
         return ready(DKM(), state_of(shapes, gains["prefixes"], default))
@@ -43,13 +53,17 @@ def tolerances_of(name):
 
 
 def computed(name, images, fine_images=(None, None), *, symmetric=True):
-    """Return estimates at all strides and the final warp, by the golden files' names; "up_" in the second pass.
+    """Return estimates at all strides and the final warp, by the golden files' names; "up_" in the
+    second pass.
 
     The golden networks run the directions one after the other. Here they are one batch.
     """
     network = network_of(name)
     features = [network.encode(*versions) for versions in zip(images, fine_images, strict=True)]
-    correct, found = network.decoder.correct, {stride: [] for stride in network.decoder.conv_refiner}
+    correct, found = (
+        network.decoder.correct,
+        {stride: [] for stride in network.decoder.conv_refiner},
+    )
 
     def recording(estimate, query, support, stride):
         found[str(stride)].append(correct(estimate, query, support, stride))
@@ -66,7 +80,9 @@ def computed(name, images, fine_images=(None, None), *, symmetric=True):
                 continue  # the second pass begins at stride 8
             of_pass = estimates if stride == "16" else estimates[number :: len(passes)]
             values[f"{prefix}flow{stride}"] = torch.cat([estimate.flow for estimate in of_pass])
-            values[f"{prefix}cert{stride}"] = torch.cat([estimate.certainty for estimate in of_pass])
+            values[f"{prefix}cert{stride}"] = torch.cat(
+                [estimate.certainty for estimate in of_pass]
+            )
     for part in ("warp", "certainty"):
         values[f"{passes[-1]}{part}"] = torch.cat([getattr(warp, part) for warp in warps], 2)
     return values
@@ -76,14 +92,19 @@ def dense_stages(name, case, values):
     """Compare all values that a golden file has; of some batches it has the first item only."""
     golden = golden_arrays(name, case)
     shown = {key: value[: len(golden[key])] for key, value in values.items() if key in golden}
-    assert any(key.endswith("warp") for key in shown) and any(key.endswith("certainty") for key in shown)
+    assert any(key.endswith("warp") for key in shown) and any(
+        key.endswith("certainty") for key in shown
+    )
     yield from compared(shown, golden, tolerances_of(name))
 
 
 def second_pass(values, *plain):
     """Return the second pass's values alone; ``plain`` are named without "up_" in the file."""
     values = {name: value for name, value in values.items() if name.startswith("up_")}
-    return {name.removeprefix("up_") if name[3:] in plain else name: value for name, value in values.items()}
+    return {
+        name.removeprefix("up_") if name[3:] in plain else name: value
+        for name, value in values.items()
+    }
 
 
 def batch_of(pixels):
@@ -113,7 +134,9 @@ def dkm_one_way():
 
 
 def roma_upsample():
-    values = computed("roma", images_of("roma", "rsA", "rsB"), images_of("roma", "imA", "imB", size=(168, 168)))
+    values = computed(
+        "roma", images_of("roma", "rsA", "rsB"), images_of("roma", "imA", "imB", size=(168, 168))
+    )
     return second_pass(values, "warp", "certainty")
 
 
@@ -124,24 +147,38 @@ def roma_one_way():
 
 
 def sampling_stages(name, suffix=""):
-    golden, main, tolerances = golden_arrays(name, "sampling"), golden_arrays(name, "main"), tolerances_of(name)
+    golden, main, tolerances = (
+        golden_arrays(name, "sampling"),
+        golden_arrays(name, "main"),
+        tolerances_of(name),
+    )
     number, seed = (int(golden.get(key, value)) for key, value in (("num", 1000), ("seed", 1234)))
     warp, certainty = main["warp"].reshape(-1, 4), main["certainty"].flatten()
     for mode, threshold in MODES.items():
-        index = sample_matches(warp, certainty, number, threshold, torch.Generator().manual_seed(seed))
+        index = sample_matches(
+            warp, certainty, number, threshold, torch.Generator().manual_seed(seed)
+        )
         weights = certainty.masked_fill(certainty > threshold, 1)
-        # Rounding orders near ties of the second draw. The set of its matches is 3.5e-4 from another one, and
-        # rounding changes weights by 1e-5.
+        # Rounding orders near ties of the second draw. The set of its matches is 3.5e-4 from
+        # another one, and rounding changes weights by 1e-5.
         got = in_order(torch.column_stack((warp[index], weights[index])))
         expected = [golden[f"{mode}{suffix}__{part}"] for part in ("matches", "certainty")]
-        yield Stage(f"{mode}__matches", got, in_order(torch.column_stack(expected)), Within(relative=1e-4))
+        yield Stage(
+            f"{mode}__matches", got, in_order(torch.column_stack(expected)), Within(relative=1e-4)
+        )
     weights = certainty.masked_fill(certainty > MODES["threshold_balanced"], 1)
     yield Stage("good_index", draw(weights, golden["noise1"], 4 * number), golden["good_index"])
     good, evenness = warp[golden["good_index"]], balancing_weights(golden["density"])
-    values = {"good_matches": good, "good_certainty": weights[golden["good_index"]], "balance_p": evenness}
+    values = {
+        "good_matches": good,
+        "good_certainty": weights[golden["good_index"]],
+        "balance_p": evenness,
+    }
     values |= dict.fromkeys(("density", "density_exact"), density(good))
     yield from compared(values, golden, tolerances)
-    yield Stage("balanced_index", draw(evenness, golden["noise2"], number), golden["balanced_index"])
+    yield Stage(
+        "balanced_index", draw(evenness, golden["noise2"], number), golden["balanced_index"]
+    )
 
 
 VALUES = {  # by network and golden file

@@ -13,13 +13,23 @@ from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.matchers.contract import Placement
 from mkpc_kaggle.matchers.networks.dad import select_keypoints
 from mkpc_kaggle.matchers.networks.loma import UNUSED, Loma, Variant, detector_size, parameter_name
-from mkpc_kaggle.matchers.networks.loma_matcher import LAYERS, LomaKeypoints, LomaMatcher, log_scores
+from mkpc_kaggle.matchers.networks.loma_matcher import (
+    LAYERS,
+    LomaKeypoints,
+    LomaMatcher,
+    log_scores,
+)
 from mkpc_kaggle.matchers.networks.pixels import resized
 from mkpc_kaggle.matchers.networks.placement import prepared
 from mkpc_kaggle.weights import load_into
 
 TOLERANCES = {"score_map": 1e-4, "keypoints": 1e-6, "dense_descriptors": 2e-4, "descriptors": 2e-4}
-TOLERANCES |= {"similarity": 1e-3, "scores": 1e-4, "matching_scores": 1e-4, "dense_probs": Within(relative=1e-4)}
+TOLERANCES |= {
+    "similarity": 1e-3,
+    "scores": 1e-4,
+    "matching_scores": 1e-4,
+    "dense_probs": Within(relative=1e-4),
+}
 
 
 @cache
@@ -32,10 +42,18 @@ def whole(variant):
 
 @cache
 def matcher(variant):
-    descriptors, width = {"B128": (128, 256), "B": (256, 256), "L": (256, 512), "G": (256, 1024)}[variant]
+    descriptors, width = {"B128": (128, 256), "B": (256, 256), "L": (256, 512), "G": (256, 1024)}[
+        variant
+    ]
     network = LomaMatcher(descriptors, width)
-    names = ((parameter_name(n), t) for n, t in standin_state("loma", variant, not_prefix="_d").items())
-    fitting = {name.removeprefix("matcher."): tensor for name, tensor in names if not re.match(UNUSED, name)}
+    names = (
+        (parameter_name(n), t) for n, t in standin_state("loma", variant, not_prefix="_d").items()
+    )
+    fitting = {
+        name.removeprefix("matcher."): tensor
+        for name, tensor in names
+        if not re.match(UNUSED, name)
+    }
     load_into(network, fitting, what="golden")
     return prepared(network, Placement())
 
@@ -52,7 +70,9 @@ def matcher_values(matcher, image0, image1, threshold):
         matcher(image0, image1, threshold)
     similarity = matcher.similarity(calls[0][1], len(image0.points))
     scores = log_scores(similarity)
-    return {"similarity": similarity, "scores": scores.exp()} | assignment_values(scores[0], threshold)
+    return {"similarity": similarity, "scores": scores.exp()} | assignment_values(
+        scores[0], threshold
+    )
 
 
 def detector_stages(case):
@@ -87,7 +107,12 @@ def resize_stages():
             yield Stage(f"{name} size", torch.tensor(wanted[::-1]), torch.tensor(size))
             got = (resized(batch_of(source), size) * 255).round()
             yield Stage(name, got, batch_of(expected).float(), 1)
-            yield Stage(f"{name}, share", (got != batch_of(expected)).float().mean(), torch.tensor(0.0), 0.02)
+            yield Stage(
+                f"{name}, share",
+                (got != batch_of(expected)).float().mean(),
+                torch.tensor(0.0),
+                0.02,
+            )
     exact = resized(batch_of(golden["detector_48"]), golden["detector_48"].shape[:2])
     yield Stage("detector_48_float", exact[0], golden["detector_48_float"], 1e-7)
     for width, height, long_side, *expected in golden["size_table"].tolist():
@@ -102,7 +127,10 @@ def descriptor_stages(variant, case):
     rows, columns = ((2 * torch.arange(side) + 1) / side - 1 for side in image.shape[2:])
     pixels = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), dim=2)[::3, ::3]
     dense = descriptor(image, pixels.reshape(1, -1, 2)).mT.unflatten(2, pixels.shape[:2])[:, ::32]
-    values = {"dense_descriptors": dense, "descriptors": descriptor(image, golden["keypoints"][None])}
+    values = {
+        "dense_descriptors": dense,
+        "descriptors": descriptor(image, golden["keypoints"][None]),
+    }
     yield from compared(values, golden, TOLERANCES)
 
 
@@ -111,8 +139,14 @@ def matcher_stages(case):
     batched = golden["keypoints0"].ndim == 3
     first, *others = (round(threshold, 3) for threshold in golden["thresholds"].tolist())
     for pair in range(len(golden["keypoints0"]) if batched else 1):
-        arrays = {n: value[pair] if batched and n != "thresholds" else value for n, value in golden.items()}
-        sides = [LomaKeypoints(arrays[f"keypoints{side}"], arrays[f"descriptors{side}"]) for side in (0, 1)]
+        arrays = {
+            n: value[pair] if batched and n != "thresholds" else value
+            for n, value in golden.items()
+        }
+        sides = [
+            LomaKeypoints(arrays[f"keypoints{side}"], arrays[f"descriptors{side}"])
+            for side in (0, 1)
+        ]
         values = matcher_values(matcher(case.split("_")[0].upper()), *sides, first)
         log_plan = values["scores"][0].log()
         for threshold in others:
@@ -129,7 +163,9 @@ def pipeline_stages(case, variant):
     for index in (0, 1):
         pixels = images[f"image{index}"]
         size = detector_size(Size(pixels.shape[1], pixels.shape[0]), int(golden["detector_size"]))
-        assert (1, 3, size.height, size.width) == tuple(golden[f"detector_input_shape{index}"].tolist())
+        assert (1, 3, size.height, size.width) == tuple(
+            golden[f"detector_input_shape{index}"].tolist()
+        )
         seen = [image_of(resized_by_pil(pixels, shape)) for shape in (size[::-1], (side, side))]
         keypoints = network.encode(*seen, number)
         found.append(keypoints)
@@ -143,8 +179,13 @@ def pipeline_stages(case, variant):
     points = []
     for index, of in enumerate((matches.index0, matches.index1)):
         pixels = images[f"image{index}"]
-        points.append((found[index].points[of] + 1) / 2 * torch.tensor([pixels.shape[1], pixels.shape[0]]))
-    mine, theirs = torch.cat(points, dim=1), torch.cat([golden["points0"], golden["points1"]], dim=1)
+        points.append(
+            (found[index].points[of] + 1) / 2 * torch.tensor([pixels.shape[1], pixels.shape[0]])
+        )
+    mine, theirs = (
+        torch.cat(points, dim=1),
+        torch.cat([golden["points0"], golden["points1"]], dim=1),
+    )
     yield Stage("points", mine, theirs, 1e-3)
 
 

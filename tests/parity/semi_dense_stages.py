@@ -6,7 +6,16 @@ from dataclasses import replace
 from functools import cache, partial
 
 import torch
-from golden import GOLDEN, Within, compared, golden_arrays, ready, recorded, seeded_tensor, standin_state
+from golden import (
+    GOLDEN,
+    Within,
+    compared,
+    golden_arrays,
+    ready,
+    recorded,
+    seeded_tensor,
+    standin_state,
+)
 
 from mkpc_kaggle.matchers.contract import Training
 from mkpc_kaggle.matchers.networks.aspanformer import AspanFormer
@@ -23,7 +32,9 @@ ASPANFORMER = {"coarse": 1e-4, "m?conf": Within(1e-6, relative=2e-3), "mkpts": 1
 def confidence_of(network, grid0, grid1, masks):
     """Return the full confidence matrix (1, L, S) of grids (1, h, w, 256)."""
     masks = masks or [torch.ones(grid.shape[:3], dtype=torch.bool) for grid in (grid0, grid1)]
-    features0, features1 = (grid.flatten(0, 2) for grid in (grid0 * network.similarity_scale, grid1))
+    features0, features1 = (
+        grid.flatten(0, 2) for grid in (grid0 * network.similarity_scale, grid1)
+    )
     cells = Cells(features0, features1, *(mask.flatten() for mask in masks))
     return torch.cat(list(half_log_confidences(cells)))[None].mul(2).exp()
 
@@ -31,7 +42,8 @@ def confidence_of(network, grid0, grid1, masks):
 def computed(network, images, masks, scales, coarse_scales=None):
     """Return what all stages compute of images (N, 1, H, W), by name.
 
-    Points are multiplied by ``scales`` (N, 2) of either side, coarse ones by ``coarse_scales`` if given.
+    Points are multiplied by ``scales`` (N, 2) of either side, coarse ones by ``coarse_scales`` if
+    given.
     """
     given = images, masks, scales, coarse_scales
     found = []
@@ -49,7 +61,11 @@ def computed_of_pair(network, images, masks, scales, coarse_scales):
     transformed = zip(calls[0][1], maps, strict=True)
     grids = [tokens.reshape(len(tokens), *own.coarse.shape[2:], 256) for tokens, own in transformed]
     coarse, confidence = matches.coarse, confidence_of(network, *grids, masks)
-    values = {"conf": confidence, "conf_rowmax": confidence.amax(2), "conf_colmax": confidence.amax(1)}
+    values = {
+        "conf": confidence,
+        "conf_rowmax": confidence.amax(2),
+        "conf_colmax": confidence.amax(1),
+    }
     values |= {"i_ids": coarse.index0, "j_ids": coarse.index1, "mconf": coarse.scores}
     for side, grid in enumerate(grids):
         points = cell_points((coarse.index0, coarse.index1)[side], grid.shape[2])
@@ -67,12 +83,16 @@ def masks_and_scales(golden):
 
 @cache
 def standin(network):
-    """QuadTree's coarse level computes in float64: in float32 rounding decides near ties of its key cells."""
+    """QuadTree's coarse level computes in float64: in float32 rounding decides near ties of its key
+    cells.
+    """
     made = ready(network(), standin_state(network.__name__.lower()))
     if network is Quadtree:
         made.backbone.double()
         made.loftr_coarse.double()
-        made.fine_preprocess.register_forward_pre_hook(lambda _, given: tuple(part.float() for part in given))
+        made.fine_preprocess.register_forward_pre_hook(
+            lambda _, given: tuple(part.float() for part in given)
+        )
     return made
 
 
@@ -88,14 +108,18 @@ def loftr_stages(network, case, tolerances):
 
 
 class Evaluated(AspanFormer):
-    """As in a published evaluation: one scale (y, x) for positions, the global level of a size (rows, columns)."""
+    """As in a published evaluation: one scale (y, x) for positions, the global level of a size
+    (rows, columns).
+    """
 
     def __init__(self, scale, coarsest, training=Training.OUTDOOR):
         super().__init__(training)
         self.scale, self.coarsest = scale, coarsest
 
     def side(self, coarse, mask):
-        rows, columns = (side // of for side, of in zip(coarse.shape[2:], self.coarsest, strict=True))
+        rows, columns = (
+            side // of for side, of in zip(coarse.shape[2:], self.coarsest, strict=True)
+        )
         return replace(super().side(coarse, mask), factor=(rows, columns))
 
     def position_scale(self, height, width):
@@ -120,7 +144,9 @@ def aspanformer_state():
 
 
 def thinned(name, value):
-    """Return the part of a value that a file keeps: ``_cK`` each K-th channel, ``_rowsK`` each K-th row."""
+    """Return the part of a value that a file keeps: ``_cK`` each K-th channel, ``_rowsK`` each K-th
+    row.
+    """
     kind, step = re.fullmatch(r".*_(c|rows)(\d+)", name).groups()
     return value[..., :: int(step)] if kind == "c" else value[:, :: int(step)]
 
@@ -136,13 +162,19 @@ def aspanformer_stages(case, make):
     coarse_scales = None
     if masks is None:  # in online mode coarse points are reported before the last rescaling
         shapes = [(o.shape, r.shape) for o, r in zip(originals, images, strict=True)]
-        coarse_scales, scales = scales, [torch.tensor([[o[3] / r[3], o[2] / r[2]]]) for o, r in shapes]
+        coarse_scales, scales = (
+            scales,
+            [torch.tensor([[o[3] / r[3], o[2] / r[2]]]) for o, r in shapes],
+        )
     network = ready(make(), aspanformer_state())
     network.threshold = 1e-3
     values = computed(network, images, masks, scales, coarse_scales)
-    for side, (old, new) in enumerate((("conf_rowmax", "conf_row_max"), ("conf_colmax", "conf_col_max"))):
+    for side, (old, new) in enumerate(
+        (("conf_rowmax", "conf_row_max"), ("conf_colmax", "conf_col_max"))
+    ):
         values[new] = values.pop(old)
-        if masks:  # where all is padding the reference has about 1 / (L S), and this network nothing
+        # Where all is padding the reference has about 1 / (L S), and this network nothing
+        if masks:
             golden[new] = golden[new] * masks[side].flatten(1)
     for name in golden:
         whole = re.sub(r"_final(?=\d)", "", re.sub(r"_(c|rows)\d+$", "", name))
@@ -167,4 +199,7 @@ CASES = {
     for network, cases, tolerances in FAMILY
     for case in cases
 }
-CASES |= {f"aspanformer {case}": partial(aspanformer_stages, case, make) for case, make in ASPANFORMERS.items()}
+CASES |= {
+    f"aspanformer {case}": partial(aspanformer_stages, case, make)
+    for case, make in ASPANFORMERS.items()
+}

@@ -33,8 +33,16 @@ def superpoint_stages(case):
     scores = score_map(logits)
     suppressed = suppress_non_maxima(scores, network.nms_radius)
     (found,) = network(image)
-    got = {"conv4b_relu": features[0], "logits": logits[0], "descriptor_raw": field[0], "score_map": scores[0]}
-    got |= {"dense_descriptors": functional.normalize(field[0], dim=0), "score_map_nms": suppressed[0]}
+    got = {
+        "conv4b_relu": features[0],
+        "logits": logits[0],
+        "descriptor_raw": field[0],
+        "score_map": scores[0],
+    }
+    got |= {
+        "dense_descriptors": functional.normalize(field[0], dim=0),
+        "score_map_nms": suppressed[0],
+    }
     got |= {"keypoints": found.points, "scores": found.scores, "descriptors": found.descriptors.T}
     yield from compared(got, golden, SUPERPOINT)
     if "score_map_nms" in golden:
@@ -51,8 +59,14 @@ def suppression_stages():
 
 
 def golden_pairs(golden):
-    """Yield the keypoints of both images of each pair of a file, with the file's arrays of that pair."""
-    arrays = {n: x for n, x in golden.items() if isinstance(x, torch.Tensor) and not n.startswith("image_size")}
+    """Yield the keypoints of both images of each pair of a file, with the file's arrays of that
+    pair.
+    """
+    arrays = {
+        n: x
+        for n, x in golden.items()
+        if isinstance(x, torch.Tensor) and not n.startswith("image_size")
+    }
     if arrays["keypoints0"].ndim == 2:
         arrays = {name: value[None] for name, value in arrays.items()}
     for pair in range(len(arrays["keypoints0"])):
@@ -70,7 +84,9 @@ def golden_pairs(golden):
 
 
 def assignment_values(log_scores, threshold, suffix=""):
-    """Return, by keypoint of either image, its match and the score of any mutual pair; as a batch of one."""
+    """Return, by keypoint of either image, its match and the score of any mutual pair; as a batch
+    of one.
+    """
     found, every, values = mutual_matches(log_scores, threshold), mutual_matches(log_scores, 0), {}
     for side, count in enumerate(log_scores.shape):
         matches, scores = torch.full((1, count), -1), torch.zeros(1, count)
@@ -96,18 +112,26 @@ def superglue_stages(case):
         scores, log_plan = plan_of(network, image0, image1)
         found, plan = network(image0, image1), log_plan[:-1, :-1]
         again = mutual_matches(plan, network.match_threshold)
-        yield Stage("pairs", torch.stack([found.index0, found.index1]), torch.stack([again.index0, again.index1]))
+        yield Stage(
+            "pairs",
+            torch.stack([found.index0, found.index1]),
+            torch.stack([again.index0, again.index1]),
+        )
         values = {"score_matrix": scores, "log_assignment": log_plan}
         for threshold in ("0.0", "0.5"):
             values |= assignment_values(plan, float(threshold), f"_threshold{threshold}")
-        yield from compared(values | assignment_values(plan, network.match_threshold), arrays, SUPERGLUE)
+        yield from compared(
+            values | assignment_values(plan, network.match_threshold), arrays, SUPERGLUE
+        )
 
 
 def sinkhorn_stages():
     golden = golden_arrays("superglue", "sinkhorn")
     for iterations in (1, 2, 5, 20, 100):
         got = log_optimal_transport(golden["score_matrix"], golden["bin_score"], iterations)
-        yield Stage(f"log_assignment_{iterations}", got, golden[f"log_assignment_{iterations}"], 1e-5)
+        yield Stage(
+            f"log_assignment_{iterations}", got, golden[f"log_assignment_{iterations}"], 1e-5
+        )
 
 
 CASES = {

@@ -1,6 +1,7 @@
 """Every network against golden files of its reference.
 
-A row of ``CASES`` is a network with a golden file. Its function yields the stages with their tolerances.
+A row of ``CASES`` is a network with a golden file. Its function yields the stages with their
+tolerances.
 """
 
 import dense_stages
@@ -13,7 +14,10 @@ from golden import assert_stages, needs_golden
 
 FAST = sparse_stages.CASES | semi_dense_stages.CASES | dense_stages.CASES | loma_stages.CASES
 CASES = [pytest.param(stages, id=name) for name, stages in FAST.items()]
-CASES += [pytest.param(stages, id=name, marks=pytest.mark.slow) for name, stages in loma_stages.SLOW.items()]
+CASES += [
+    pytest.param(stages, id=name, marks=pytest.mark.slow)
+    for name, stages in loma_stages.SLOW.items()
+]
 
 
 @needs_golden

@@ -35,7 +35,9 @@ def own(*licences):
     return {"own": SimpleNamespace(spec=MatcherSpec("own", licences=licences))}
 
 
-@pytest.mark.parametrize("bad", [{"recipe": 5}, {"device": 0}, {"matchers": [1]}, {"matchers": {"own": object()}}])
+@pytest.mark.parametrize(
+    "bad", [{"recipe": 5}, {"device": 0}, {"matchers": [1]}, {"matchers": {"own": object()}}]
+)
 def test_what_is_of_a_wrong_type_is_named(bad):
     for call in (TwoStageMatcher, partial(reconstruct, [])):
         with pytest.raises(TypeError, match=r"(recipe|device|matcher).* not |has no `spec`"):
@@ -53,7 +55,8 @@ def test_recipe_auto_leaves_out_the_units_whose_weights_are_missing():
 
 def test_a_named_recipe_without_its_weights_is_refused_with_the_file_names():
     with pytest.raises(
-        UserError, match=r"needs weights.*aliked-n16\.pth or .*--weights.*`mkpc weights fetch light --out"
+        UserError,
+        match=r"needs weights.*aliked-n16\.pth or .*--weights.*`mkpc weights fetch light --out",
     ):
         assemble("light")
     for recipe in ("permissive", "best"):
@@ -72,7 +75,9 @@ def test_recipes_take_what_is_there_and_fallbacks_stand_in_for_the_rest():
     assert light.recipe.matcher_names == ("sift", "aliked")
     command = "`mkpc weights fetch aliked-lightglue --out DIR` gets weights"
     assert light.left_out == (f"no weights: aliked_lightglue ({command})",)
-    assert [unit.stage for unit in light.recipe.units] == [unit.stage for unit in load_recipe("light").units]
+    assert [unit.stage for unit in light.recipe.units] == [
+        unit.stage for unit in load_recipe("light").units
+    ]
     assert light.recipe == light.recipe.with_fallbacks(())
 
 
@@ -97,7 +102,9 @@ def known_files(monkeypatch, tmp_path):
     return tmp_path
 
 
-def test_the_advice_of_recipe_auto_is_the_light_recipe_unless_its_weights_are_there(monkeypatch, tmp_path):
+def test_the_advice_of_recipe_auto_is_the_light_recipe_unless_its_weights_are_there(
+    monkeypatch, tmp_path
+):
     (told,) = assemble("auto").left_out
     assert told.endswith("(`mkpc weights fetch light --out DIR` gets weights)")
     light = load_recipe("light")
@@ -117,17 +124,24 @@ def test_a_permissive_run_leaves_out_of_recipe_auto_what_is_licensed_otherwise(k
     assert every.recipe.matcher_names == ("superglue", "loftr", "sift", "dkm")
     some = assemble("auto", weights=[known_files], licence=Licence.PERMISSIVE)
     assert some.recipe.matcher_names == ("loftr", "sift", "dkm")
-    assert some.left_out[1].startswith("weights not permitted: superglue, superpoint_lightglue, aspanformer")
+    assert some.left_out[1].startswith(
+        "weights not permitted: superglue, superpoint_lightglue, aspanformer"
+    )
     assert set(some.weight_files) == {"loftr-outdoor", "dkm-outdoor"}
 
 
 @pytest.mark.filterwarnings("ignore:weights not verified")
-def test_a_fallback_stands_in_for_a_matcher_whose_weights_are_not_permitted_or_not_there(known_files):
+def test_a_fallback_stands_in_for_a_matcher_whose_weights_are_not_permitted_or_not_there(
+    known_files,
+):
     recipe = Recipe((Unit(1, "superglue", 640, fallback="loftr"), Unit(2, "dkm", area="90x120")))
     every = assemble(recipe, weights=[known_files])
     assert (every.recipe.matcher_names, every.left_out) == (("superglue", "dkm"), ())
     some = assemble(recipe, weights=[known_files], licence=Licence.PERMISSIVE)
-    assert (some.recipe.matcher_names, some.left_out) == (("loftr", "dkm"), ("weights not permitted: superglue",))
+    assert (some.recipe.matcher_names, some.left_out) == (
+        ("loftr", "dkm"),
+        ("weights not permitted: superglue",),
+    )
     (known_files / "sp.pth").unlink()
     assert assemble(recipe, weights=[known_files]).recipe == some.recipe
 
@@ -169,7 +183,11 @@ def test_recipe_auto_passes_damaged_weights_over(tmp_path, name):
 def misfits(monkeypatch, tmp_path):
     """A folder with files that have the manifest's digests, and that no network takes."""
     warn_once.cache_clear()
-    names = {"aliked-n16": "a.safetensors", "superpoint": "p.safetensors", "superglue-outdoor": "g.safetensors"}
+    names = {
+        "aliked-n16": "a.safetensors",
+        "superpoint": "p.safetensors",
+        "superglue-outdoor": "g.safetensors",
+    }
     files = []
     for slot, name in names.items():
         save_file({"surplus.weight": torch.zeros(2)}, tmp_path / name)
@@ -181,7 +199,8 @@ def misfits(monkeypatch, tmp_path):
 
 
 DOES_WITHOUT = (
-    r"does without aliked: weights cannot be loaded \(the weights for 'aliked-n16' do not fit the network"
+    r"does without aliked: weights cannot be loaded "
+    r"\(the weights for 'aliked-n16' do not fit the network"
 )
 
 
@@ -197,14 +216,30 @@ def test_recipe_auto_leaves_out_weights_that_have_the_digest_and_do_not_fit(misf
 @pytest.mark.parametrize(
     ("units", "expected"),
     [
-        ([Unit(1, "aliked", 640, fallback="sift"), Unit(2, "sift", 640)], ["1:sift@640", "2:sift@640"]),
-        ([Unit(1, "aliked", 640), Unit(2, "sift", 640), Unit(1, "sift", 640)], ["1:sift@640", "2:sift@640"]),
+        (
+            [Unit(1, "aliked", 640, fallback="sift"), Unit(2, "sift", 640)],
+            ["1:sift@640", "2:sift@640"],
+        ),
+        (
+            [Unit(1, "aliked", 640), Unit(2, "sift", 640), Unit(1, "sift", 640)],
+            ["1:sift@640", "2:sift@640"],
+        ),
         ([Unit(1, "sift", 640), Unit(2, "aliked", 640, fallback="superglue")], ["1:sift@640"]),
-        ([Unit(1, "sift", 640), Unit(2, "aliked", 640, fallback="aliked_lightglue")], ["1:sift@640"]),
+        (
+            [Unit(1, "sift", 640), Unit(2, "aliked", 640, fallback="aliked_lightglue")],
+            ["1:sift@640"],
+        ),
     ],
-    ids=["fallback", "another unit sweeps", "a fallback that does not fit, either", "a fallback without weights"],
+    ids=[
+        "fallback",
+        "another unit sweeps",
+        "a fallback that does not fit, either",
+        "a fallback without weights",
+    ],
 )
-def test_a_named_recipe_runs_the_fallback_of_weights_that_do_not_fit_or_goes_on_without(misfits, units, expected):
+def test_a_named_recipe_runs_the_fallback_of_weights_that_do_not_fit_or_goes_on_without(
+    misfits, units, expected
+):
     with pytest.warns(UserWarning, match=DOES_WITHOUT):
         assembly = assemble(Recipe(tuple(units)), weights=[misfits])
     assert [unit.name for unit in assembly.recipe.units] == expected
@@ -213,7 +248,8 @@ def test_a_named_recipe_runs_the_fallback_of_weights_that_do_not_fit_or_goes_on_
 def test_a_recipe_without_a_unit_left_to_sweep_is_refused_with_the_reason(misfits):
     recipe = Recipe((Unit(1, "aliked", 640), Unit(2, "sift", 640)), name="mine")
     says = (
-        "recipe 'mine' has no unit left that can sweep all pairs: weights cannot be loaded: aliked .*'aliked-n16'"
+        "recipe 'mine' has no unit left that can sweep all pairs: "
+        "weights cannot be loaded: aliked .*'aliked-n16'"
     )
     with pytest.raises(UserError, match=says):
         assemble(recipe, weights=[misfits])
@@ -228,12 +264,16 @@ units = [
 
 
 def submitted(demo, tmp_path, recipe, weights):
-    """Submit with a recipe; "own" has ALIKED and SIFT. Return the exit status and the problems of the file."""
+    """Submit with a recipe; "own" has ALIKED and SIFT. Return the exit status and the problems of
+    the file.
+    """
     (tmp_path / "own.toml").write_text(TWO_UNITS)
     output = tmp_path / "out" / "submission.csv"
     chosen = tmp_path / "own.toml" if recipe == "own" else recipe
     options = ("--output", output, "--recipe", chosen, "--weights", weights, "--workers", 0)
-    status = run_command("submit", "--test-dir", demo.test_dir, *options, "--no-report", "--no-scenes")
+    status = run_command(
+        "submit", "--test-dir", demo.test_dir, *options, "--no-report", "--no-scenes"
+    )
     return status, problems_of(output, demo.test_dir)
 
 
@@ -247,10 +287,14 @@ def test_one_checkpoint_that_does_not_fit_ends_no_run(misfits, demo, tmp_path, r
 
 
 @pytest.mark.filterwarnings("default:.* does without")
-def test_match_does_without_a_checkpoint_that_does_not_fit_as_submit_does(misfits, demo, tmp_path, capsys):
+def test_match_does_without_a_checkpoint_that_does_not_fit_as_submit_does(
+    misfits, demo, tmp_path, capsys
+):
     (tmp_path / "own.toml").write_text(TWO_UNITS)
     images = sorted((demo.test_dir / "test_images").rglob("*.png"))[:2]
-    assert run_command("match", *images, "--recipe", tmp_path / "own.toml", "--weights", misfits) == 0
+    assert (
+        run_command("match", *images, "--recipe", tmp_path / "own.toml", "--weights", misfits) == 0
+    )
     told = capsys.readouterr()
     assert re.search(DOES_WITHOUT, told.err)
     assert "1:sift@320" in told.out
@@ -275,7 +319,9 @@ def points_keys(assembly: Assembly) -> tuple[str, ...]:
     stages = [unit.stage for unit in assembly.recipe.units]
     first = [keys.of_points(n, pair, images, []) for n, stage in enumerate(stages) if stage == 1]
     crops = keys.crops_of(pair, first)
-    return tuple(keys.of_points(n, pair, images, crops * (stage - 1)) for n, stage in enumerate(stages))
+    return tuple(
+        keys.of_points(n, pair, images, crops * (stage - 1)) for n, stage in enumerate(stages)
+    )
 
 
 def test_a_units_digest_has_all_that_decides_its_points():
@@ -283,14 +329,19 @@ def test_a_units_digest_has_all_that_decides_its_points():
     first, second, third = plain.units
     units = [points_keys(assemble(plain))]
     for other in (
-        replace(plain, units=(replace(first, tracks=False), second, third)),  # no point depends on it
+        # No point depends on it
+        replace(plain, units=(replace(first, tracks=False), second, third)),
         replace(plain, magsac=replace(plain.magsac, threshold=1.0)),
-        replace(plain, units=(first, second)),  # the regions of stage 2 depend on all units of stage 1
+        # The regions of stage 2 depend on all units of stage 1
+        replace(plain, units=(first, second)),
         replace(plain, mkpc=replace(plain.mkpc, eps=0.1)),
         replace(plain, matchers={"sift": {"ratio": 0.7}}),
     ):
         units.append(points_keys(assemble(other)))
     assert units[0] == units[1] == units[2]
-    changed = [[one != two for one, two in zip(units[0][: len(other)], other, strict=True)] for other in units[3:]]
+    changed = [
+        [one != two for one, two in zip(units[0][: len(other)], other, strict=True)]
+        for other in units[3:]
+    ]
     assert changed == [[False, True], [False, True, False], [True] * 3]
     assert not set(units[0]) & set(points_keys(assemble(plain, precision="bfloat16")))

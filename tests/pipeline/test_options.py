@@ -1,4 +1,6 @@
-"""Every option of a published method decides over results, so it is part of the settings of its units."""
+"""Every option of a published method decides over results, so it is part of the settings of its
+units.
+"""
 
 from typing import Any
 

@@ -1,4 +1,6 @@
-"""The two stages on pictures whose correspondence is known, with real and with misbehaving matchers."""
+"""The two stages on pictures whose correspondence is known, with real and with misbehaving
+matchers.
+"""
 
 import multiprocessing
 import warnings
@@ -31,7 +33,8 @@ from mkpc_kaggle.recipe import Recipe, Unit
 
 SIZE = Size(480, 360)
 CORNER0, CORNER1, SCALE = (60, 130), (170, 50), 1.2
-SHIFT = (0.5 - np.array(CORNER0)) * SCALE - 0.5 + CORNER1  # image 0 -> image 1, pixel centres at integers
+# Image 0 -> image 1, pixel centres at integers
+SHIFT = (0.5 - np.array(CORNER0)) * SCALE - 0.5 + CORNER1
 SIFT = Recipe((Unit(1, "sift", 480),))
 TWO_STAGES = Recipe((Unit(1, "sift", 480), Unit(2, "sift", 440)))
 
@@ -41,7 +44,9 @@ pytestmark = pytest.mark.usefixtures("nowhere_else")
 
 @cache
 def pair():
-    """Two gray canvases with the same photograph, 230 x 180 and ``SCALE`` times that, elsewhere on each."""
+    """Two gray canvases with the same photograph, 230 x 180 and ``SCALE`` times that, elsewhere on
+    each.
+    """
     photograph = load_sample_image("china.jpg")[20:380, 60:520]
     canvases = []
     for (left, top), scale in ((CORNER0, 1), (CORNER1, SCALE)):
@@ -154,7 +159,9 @@ def test_a_photograph_on_its_side_gives_the_same_matches_in_its_stored_pixels(tm
         cv2.imwrite(str(paths[-1]), stored[..., ::-1])
         set_exif(paths[-1], orientation)
         size = Size(*stored.shape[1::-1])
-        views.append(View.fit(Box.whole(size), long_side=max(SIZE), turns=TURNS.get(orientation, 0)))
+        views.append(
+            View.fit(Box.whole(size), long_side=max(SIZE), turns=TURNS.get(orientation, 0))
+        )
     found, expected = TwoStageMatcher(TWO_STAGES)(*paths), two_stage_match()
     first, second = (
         Matches(views[0].from_image(m.points0), views[1].from_image(m.points1), m.scores)
@@ -207,10 +214,14 @@ def test_regions_come_from_stage_1_alone():
 
 
 def test_a_minibatch_gives_what_pairs_give_alone():
-    alone, together = (pipeline(TWO_STAGES, minibatch=size).match(works(3), TWO_STAGES.units) for size in (1, 4))
+    alone, together = (
+        pipeline(TWO_STAGES, minibatch=size).match(works(3), TWO_STAGES.units) for size in (1, 4)
+    )
     for single, other in zip(alone, together, strict=True):
         assert single.regions == other.regions
-        assert all(same(a.matches, b.matches) for a, b in zip(single.results, other.results, strict=True))
+        assert all(
+            same(a.matches, b.matches) for a, b in zip(single.results, other.results, strict=True)
+        )
 
 
 def test_whole_images_are_encoded_once_and_crops_for_each_pair():
@@ -238,7 +249,9 @@ def test_a_matcher_that_finds_nothing_has_not_failed_and_the_one_that_answers_to
         def match(self, encodings0, encodings1):
             return []
 
-    match = own(Unit(1, "none", 480), Unit(2, "short", 480), none=Scripted(), short=Short())(*pair())
+    match = own(Unit(1, "none", 480), Unit(2, "short", 480), none=Scripted(), short=Short())(
+        *pair()
+    )
     assert match.results[0].failure == ""
     assert "ValueError" in match.results[1].failure
     assert "too few" in match.estimate.failure
@@ -247,7 +260,9 @@ def test_a_matcher_that_finds_nothing_has_not_failed_and_the_one_that_answers_to
 
 @pytest.mark.parametrize("error", [RuntimeError("out of luck"), cv2.error("no"), ValueError()])
 def test_a_matcher_that_raises_costs_its_unit_and_the_run_goes_on(error):
-    match = own(Unit(1, "bad", 480), Unit(1, "sift", 480), Unit(2, "bad", 480), bad=Scripted(error))(*pair())
+    match = own(
+        Unit(1, "bad", 480), Unit(1, "sift", 480), Unit(2, "bad", 480), bad=Scripted(error)
+    )(*pair())
     assert [bool(result.failure) for result in match.results] == [True, False, True]
     assert match.results[0].failure == f"{type(error).__name__}: {error}"
     assert len(match.results[0].matches) == 0
@@ -264,12 +279,22 @@ def test_a_pair_at_which_a_matcher_raises_costs_the_others_of_its_minibatch_noth
     images = [Image(str(n), np.full((72, 80, 3), 10 + n, np.uint8)) for n in range(8)]
     runner = Pipeline(Recipe((SWEEP,)), {"rectified": matcher}.__getitem__, minibatch=8)
     done = runner.match([PairMatch(images=(each, each)) for each in images], [SWEEP])
-    assert [work.results[0].failure for work in done] == ["", "", "RuntimeError: no mood", *[""] * 5]
+    assert [work.results[0].failure for work in done] == [
+        "",
+        "",
+        "RuntimeError: no mood",
+        *[""] * 5,
+    ]
     assert [len(work.results[0].matches) > 0 for work in done] == [True, True, False, *[True] * 5]
 
 
 @pytest.mark.parametrize(
-    "error", [MemoryError("full"), RuntimeError("CUDA error: unspecified launch failure"), KeyboardInterrupt("x")]
+    "error",
+    [
+        MemoryError("full"),
+        RuntimeError("CUDA error: unspecified launch failure"),
+        KeyboardInterrupt("x"),
+    ],
 )
 def test_memory_devices_and_interrupts_are_not_failures_of_a_matcher(error):
     with pytest.raises(type(error), match=str(error)):
@@ -281,7 +306,8 @@ def test_a_matcher_in_a_forked_child_says_that_it_was_forked():
     match(*pair())
     child = multiprocessing.get_context("fork").Process(target=in_child, args=(match,))
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # of Python 3.12: forks of processes with threads
+        # Of Python 3.12: forks of processes with threads
+        warnings.simplefilter("ignore", DeprecationWarning)
         child.start()
     child.join()
     assert child.exitcode == 0

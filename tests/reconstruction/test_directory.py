@@ -41,7 +41,10 @@ def out(tmp_path: Path) -> Path:
 IN_THE_WAY = {
     "an exported model": ("a/models/0/points.ply", Path.touch),
     "an open database": ("a/database.db-wal", Path.touch),
-    "a dataset's file that no run has made": ("c/database.db", lambda path: write(path.parent, [path.name])),
+    "a dataset's file that no run has made": (
+        "c/database.db",
+        lambda path: write(path.parent, [path.name]),
+    ),
     "a link for work": ("work", lambda path: path.symlink_to("../images")),
     "a link for a dataset": ("b", lambda path: path.symlink_to("../images")),
     "a pipe for a table": ("report.html", os.mkfifo),
@@ -61,7 +64,9 @@ def test_a_link_or_a_file_of_the_users_in_the_place_of_a_result_is_refused(tmp_p
     assert files_of(tmp_path) == before
 
 
-@pytest.mark.parametrize("name", ["notes.txt", "work/journal.sqlite", "work/results.json", "database.db", "link"])
+@pytest.mark.parametrize(
+    "name", ["notes.txt", "work/journal.sqlite", "work/results.json", "database.db", "link"]
+)
 def test_a_directory_that_is_neither_empty_nor_ours_is_refused(tmp_path, name):
     write(tmp_path / "out", [name])
     if name == "link":
@@ -116,7 +121,10 @@ def test_a_directory_that_cannot_be_written_is_found_before_any_work(tmp_path, o
     (tmp_path / "file").touch()
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "loop").symlink_to("loop")
-    with pytest.raises(UserError, match="cannot be written"), output_directory(tmp_path / out, datasets):
+    with (
+        pytest.raises(UserError, match="cannot be written"),
+        output_directory(tmp_path / out, datasets),
+    ):
         raise AssertionError
 
 
@@ -134,7 +142,9 @@ def test_nothing_that_is_read_lies_in_the_directory_of_results(tmp_path, monkeyp
 
 
 def test_former_files_stay_until_the_new_ones_are_whole(tmp_path, monkeypatch):
-    """A disk that is full while models are written costs neither the former models nor the former database."""
+    """A disk that is full while models are written costs neither the former models nor the former
+    database.
+    """
     write(tmp_path, FILES, "former")
 
     def write_files(is_full: bool) -> None:
@@ -151,7 +161,11 @@ def test_former_files_stay_until_the_new_ones_are_whole(tmp_path, monkeypatch):
         write_files(is_full=True)
     assert files_of(tmp_path) == dict.fromkeys(FILES, "former")
     synced = set()
-    monkeypatch.setattr(os, "fsync", lambda number: synced.add(Path(f"/proc/self/fd/{number}").readlink().name))
+    monkeypatch.setattr(
+        os, "fsync", lambda number: synced.add(Path(f"/proc/self/fd/{number}").readlink().name)
+    )
     write_files(is_full=False)
-    assert synced == {"database.db", *MODEL_FILES}, "a power failure leaves no empty file under its name"
+    assert synced == {"database.db", *MODEL_FILES}, (
+        "a power failure leaves no empty file under its name"
+    )
     assert {(tmp_path / "models" / "0" / name).read_text() for name in MODEL_FILES} == {"new"}

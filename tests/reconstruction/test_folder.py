@@ -1,4 +1,6 @@
-"""Names of files and folders as they come: taken, passed over with a line, or refused; never a traceback."""
+"""Names of files and folders as they come: taken, passed over with a line, or refused; never a
+traceback.
+"""
 
 import os
 from collections.abc import Iterable
@@ -32,7 +34,9 @@ def names_of(root: Path) -> dict[str, list[str]]:
 NO_TEXT = os.fsdecode(b"caf\xe9")
 
 
-@pytest.mark.parametrize("name", ["a\n.jpg", "a\x1b[2J.jpg", f"{NO_TEXT}.jpg", f"{NO_TEXT}/a.jpg", "x\ty/a.jpg"])
+@pytest.mark.parametrize(
+    "name", ["a\n.jpg", "a\x1b[2J.jpg", f"{NO_TEXT}.jpg", f"{NO_TEXT}/a.jpg", "x\ty/a.jpg"]
+)
 def test_names_that_are_no_text_are_refused_by_their_folder(tmp_path, name):
     with pytest.raises(UserError, match="has characters that are no text; rename it"):
         read_folder(written(tmp_path, "b.jpg", "c.jpg", name))
@@ -47,9 +51,13 @@ def test_folders_that_are_called_as_results_are_refused_at_once(tmp_path, name):
 
 
 def test_what_is_hidden_is_passed_over_with_a_line(tmp_path, capsys):
-    root = written(tmp_path, "f0.jpg", "f1.jpg", "._f0.jpg", ".thumbnails/f0.jpg", "a/._x.jpg", ".DS_Store")
+    root = written(
+        tmp_path, "f0.jpg", "f1.jpg", "._f0.jpg", ".thumbnails/f0.jpg", "a/._x.jpg", ".DS_Store"
+    )
     assert names_of(root) == {".": ["f0.jpg", "f1.jpg"]}
-    assert f"3 hidden files or folders are passed over, the first is {root}" in capsys.readouterr().err
+    assert (
+        f"3 hidden files or folders are passed over, the first is {root}" in capsys.readouterr().err
+    )
 
 
 def test_folders_are_datasets_also_through_links_and_links_that_go_round_end(tmp_path):
@@ -67,7 +75,8 @@ def test_names_in_a_list_of_pairs_may_have_blanks(tmp_path):
     assert [(a.name, b.name) for a, b in found] == [("a b.png", "c.png"), ("a b.png", "d e f.png")]
     written(root, "a", "a.png", "a.png b.png", "b.png c.png")
     (tmp_path / "pairs.txt").write_text("a.png b.png c.png\n")
-    with pytest.raises(UserError, match="expected two images of one dataset"):  # it can be read in two ways
+    # It can be read in two ways
+    with pytest.raises(UserError, match="expected two images of one dataset"):
         read_pair_list(tmp_path / "pairs.txt", root, read_folder(root))
 
 

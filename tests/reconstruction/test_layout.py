@@ -20,7 +20,9 @@ from mkpc_kaggle.scene.align import REFERENCE
 
 @dataclass
 class Splats:
-    """What gsplat's loader of COLMAP's files keeps: names, paths, K, poses, points and their colours."""
+    """What gsplat's loader of COLMAP's files keeps: names, paths, K, poses, points and their
+    colours.
+    """
 
     names: list[str]
     paths: list[Path]
@@ -31,7 +33,8 @@ class Splats:
 
 
 def load_as_gsplat(data_dir: Path) -> Splats:
-    """Read a folder by gsplat's rules: the binary files in sparse/0, and each image below images/ by its name.
+    """Read a folder by gsplat's rules: the binary files in sparse/0, and each image below images/
+    by its name.
 
     The layout of the files is COLMAP's, from its documentation.
     """
@@ -119,7 +122,11 @@ def test_links_follow_the_folder_and_nothing_of_the_users_is_removed(tmp_path):
     write_images(out, files)
     (out / "images" / "mine.txt").write_text("mine")
     write_images(out, files[1:])
-    assert sorted(path.name for path in (out / "images").iterdir()) == ["01.png", "02.png", "mine.txt"]
+    assert sorted(path.name for path in (out / "images").iterdir()) == [
+        "01.png",
+        "02.png",
+        "mine.txt",
+    ]
     assert (out / "images" / "01.png").readlink() == files[1].resolve()
     moved = files[1].rename(tmp_path / "01.png")
     write_images(out, [moved, files[2]])
@@ -181,6 +188,8 @@ def test_a_folder_that_grew_keeps_its_coordinates(tmp_path):
     model = pycolmap.Reconstruction(out / "models" / "0")
     poses = {image.name: image.cam_from_world().matrix() for image in model.images.values()}
     for name, found in new.items():
-        np.testing.assert_allclose(poses[name][:, 3], found.camera.t, atol=1e-9, err_msg="files and tables agree")
+        np.testing.assert_allclose(
+            poses[name][:, 3], found.camera.t, atol=1e-9, err_msg="files and tables agree"
+        )
     forget_coordinates(out, ["."])
     assert not (out / REFERENCE).exists()

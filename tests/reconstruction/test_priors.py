@@ -1,4 +1,6 @@
-"""The options --intrinsics and --masks of ``reconstruct``: what is refused, changed and computed again."""
+"""The options --intrinsics and --masks of ``reconstruct``: what is refused, changed and computed
+again.
+"""
 
 import csv
 from dataclasses import replace
@@ -25,11 +27,20 @@ HEAD = "image,model,parameters,sigma\n"
 
 
 def run(
-    root: Path, out: Path, matcher: MixedMatcher | None = None, *, known: str = "", masks: Masks | None = None
+    root: Path,
+    out: Path,
+    matcher: MixedMatcher | None = None,
+    *,
+    known: str = "",
+    masks: Masks | None = None,
 ) -> FolderResult:
-    session = Session(out / "work", Budget(0.0, float("inf")), Interrupt(), progress=False, workers=0)
+    session = Session(
+        out / "work", Budget(0.0, float("inf")), Interrupt(), progress=False, workers=0
+    )
     assembly = assemble(RECIPE, matchers={"synthetic": matcher or MixedMatcher()}, device="cpu")
-    assembly = replace(assembly, recipe=for_cameras(assembly.recipe, None, known), masks=masks or Masks())
+    assembly = replace(
+        assembly, recipe=for_cameras(assembly.recipe, None, known), masks=masks or Masks()
+    )
     return reconstruct_folder(root, read_folder(root), assembly, session, out)
 
 
@@ -50,18 +61,29 @@ def write_masks(folder: Path, root: Path, left: int = 400) -> Path:
         (HEAD, "has no rows"),
         (HEAD + "00.png,PINHOLE,1 2 3,fixed\n", "line 2: PINHOLE has 4 parameters"),
         (HEAD + "00.png,PINHOLE\n", "line 2: 2 cells"),
-        (HEAD + "none*.png,SIMPLE_PINHOLE,900 400 300,fixed\n", "line 2: 'none*.png' is the camera of no image"),
-        (HEAD + "*,SIMPLE_PINHOLE,900 400 300,2\n00.png,SIMPLE_PINHOLE,900 400 300,2\n", "line 3: '00.png' is"),
+        (
+            HEAD + "none*.png,SIMPLE_PINHOLE,900 400 300,fixed\n",
+            "line 2: 'none*.png' is the camera of no image",
+        ),
+        (
+            HEAD + "*,SIMPLE_PINHOLE,900 400 300,2\n00.png,SIMPLE_PINHOLE,900 400 300,2\n",
+            "line 3: '00.png' is",
+        ),
         (
             HEAD + "00.png,SIMPLE_PINHOLE,9 400 300,fixed\n",
             "line 2: a focal length of 9 px is implausible for 00.png",
         ),
-        (HEAD + "00.png,SIMPLE_PINHOLE,900 4000 300,fixed\n", "line 2: the principal point 4000, 300 is outside"),
-        ("\xff\x00", "lacks the columns"),
+        (
+            HEAD + "00.png,SIMPLE_PINHOLE,900 4000 300,fixed\n",
+            "line 2: the principal point 4000, 300 is outside",
+        ),
+        ("\xff\x00", "line contains NUL"),
         (None, "no such file"),
     ],
 )
-def test_a_bad_table_of_intrinsics_is_one_line_and_nothing_is_touched(tmp_path, capsys, table, reason):
+def test_a_bad_table_of_intrinsics_is_one_line_and_nothing_is_touched(
+    tmp_path, capsys, table, reason
+):
     root, out, file = write_flat(tmp_path / "images", 3), tmp_path / "out", tmp_path / "known.csv"
     if table is not None:
         file.write_text(table)
@@ -76,7 +98,9 @@ def test_a_bad_table_of_intrinsics_is_one_line_and_nothing_is_touched(tmp_path, 
 BAD_MASKS = {
     "no such directory": lambda folder, root: None,
     "has no mask of any image: 00.png.png would be the first": lambda folder, root: folder.mkdir(),
-    "it is no picture": lambda folder, root: (write_masks(folder, root) / "01.png.png").write_bytes(b"no"),
+    "it is no picture": lambda folder, root: (write_masks(folder, root) / "01.png.png").write_bytes(
+        b"no"
+    ),
     "not a regular file": lambda folder, root: (
         (write_masks(folder, root) / "01.png.png").unlink(),
         (folder / "01.png.png").mkdir(),
@@ -144,6 +168,10 @@ def test_another_mask_is_matched_again_and_other_intrinsics_are_not(tmp_path):
             run(root, out, matcher, known=known, masks=masks)
             assert len(matcher.calls) == calls
         write_masks(folder, root, 250)
+    cv2.imwrite(str(folder / "00.png.png"), np.ones((SIZE.height, SIZE.width), np.uint8))
+    matcher = MixedMatcher()
+    run(root, out, matcher, known=known, masks=Masks.of_folder(folder, root, root.iterdir()))
+    assert len(matcher.calls) == FIRST - 1, "the pairs of the image whose mask changed"
     run(root, out)
     assert contents(out) == before, "without the options, the first results again"
 

@@ -1,4 +1,6 @@
-"""Folders of images in, cameras out: COLMAP's files, tables, several models, images that lie on a side."""
+"""Folders of images in, cameras out: COLMAP's files, tables, several models, images that lie on a
+side.
+"""
 
 import csv
 import hashlib
@@ -45,7 +47,9 @@ FIRST, SECOND, OTHERS = 6, 4, 1  # images of two scenes, and of none
 
 @dataclass
 class MixedMatcher(SyntheticMatcher):
-    """Two scenes, and images of neither; between what has nothing in common it finds a few wrong matches."""
+    """Two scenes, and images of neither; between what has nothing in common it finds a few wrong
+    matches.
+    """
 
     @cached_property
     def scenes(self) -> tuple[SyntheticScene, SyntheticScene]:
@@ -57,9 +61,13 @@ class MixedMatcher(SyntheticMatcher):
         for scene, start, count in ((self.scenes[0], 0, FIRST), (self.scenes[1], FIRST, SECOND)):
             if start <= first < second < start + count:
                 names = [f"{first - start:04}", f"{second - start:04}"]
-                (found,) = (p.matches for p in scene.pairs if [p.image0.name, p.image1.name] == names)
+                (found,) = (
+                    p.matches for p in scene.pairs if [p.image0.name, p.image1.name] == names
+                )
                 return found  # views are upright and as large as the images
-        return Matches(*np.random.default_rng([first, second]).uniform(10, 500, (2, 25, 2)), np.ones(25))
+        return Matches(
+            *np.random.default_rng([first, second]).uniform(10, 500, (2, 25, 2)), np.ones(25)
+        )
 
 
 def write_flat(folder: Path, count: int = FIRST + SECOND + OTHERS) -> Path:
@@ -69,7 +77,9 @@ def write_flat(folder: Path, count: int = FIRST + SECOND + OTHERS) -> Path:
     return folder
 
 
-def run(root: Path, out: Path, matcher: SyntheticMatcher | None = None, **options: object) -> FolderResult:
+def run(
+    root: Path, out: Path, matcher: SyntheticMatcher | None = None, **options: object
+) -> FolderResult:
     matcher = matcher or MixedMatcher()
     budget = Budget(time.monotonic(), float("inf"))
     session = Session(out / "work", budget, Interrupt(), progress=False, workers=0)
@@ -89,7 +99,9 @@ def cameras(result: FolderResult) -> Mapping[str, RegisteredImage]:
 
 
 def contents(out: Path) -> dict[str, str]:
-    """What a run left, but for its journal; of a database its rows, since SQLite counts who has opened it."""
+    """What a run left, but for its journal; of a database its rows, since SQLite counts who has
+    opened it.
+    """
     found = {}
     for path in sorted(out.rglob("*")):
         if path.suffix == ".db":
@@ -103,7 +115,9 @@ def contents(out: Path) -> dict[str, str]:
 def test_mixed_scenes_are_a_model_each_and_foreign_images_are_in_none(mixed):
     out, result = mixed
     models = [pycolmap.Reconstruction(out / "models" / str(number)) for number in range(2)]
-    names = [sorted(image.name for image in model.images.values() if image.has_pose) for model in models]
+    names = [
+        sorted(image.name for image in model.images.values() if image.has_pose) for model in models
+    ]
     assert names == [[f"{n:02}.png" for n in range(6)], [f"{n:02}.png" for n in range(6, 10)]]
     assert not (out / "models" / "2").exists()
     assert sorted(cameras(result)) == sorted(names[0] + names[1])
@@ -116,12 +130,20 @@ def test_the_cameras_are_those_of_the_models_and_right(mixed):
     model = pycolmap.Reconstruction(out / "models" / "0")
     rows = {row[0]: row for row in camera_rows(result.cameras, out.parent / "images")}
     for image in model.images.values():
-        K, R, t, *sigmas = (np.array([float(x) for x in cell.split(";")]) for cell in rows[image.name][2:])
-        np.testing.assert_allclose(R.reshape(3, 3), image.cam_from_world().matrix()[:, :3], atol=1e-9)
+        K, R, t, *sigmas = (
+            np.array([float(x) for x in cell.split(";")]) for cell in rows[image.name][2:]
+        )
+        np.testing.assert_allclose(
+            R.reshape(3, 3), image.cam_from_world().matrix()[:, :3], atol=1e-9
+        )
         np.testing.assert_allclose(t, image.cam_from_world().matrix()[:, 3], atol=1e-9)
-        np.testing.assert_allclose(K.reshape(3, 3)[:2, 2] + 0.5, image.camera.calibration_matrix()[:2, 2])
+        np.testing.assert_allclose(
+            K.reshape(3, 3)[:2, 2] + 0.5, image.camera.calibration_matrix()[:2, 2]
+        )
         assert K[0] == pytest.approx(truth["00" + image.name[:2]].K[0, 0], rel=0.03)
-        assert [0 < sigma < most for (sigma,), most in zip(sigmas, (0.3, 0.03, 2), strict=True)] == [True] * 3
+        assert [
+            0 < sigma < most for (sigma,), most in zip(sigmas, (0.3, 0.03, 2), strict=True)
+        ] == [True] * 3
 
 
 ORIENTATIONS = (1, 6, 8, 3, 6, 1)  # of the images of a phone, by EXIF
@@ -142,16 +164,22 @@ def test_colmap_goes_on_with_photographs_that_exif_turns(tmp_path):
     assert model.num_reg_images() == FIRST
     pycolmap.undistort_images(tmp_path / "flat", out / "models" / "0", root)
     for name, size in sizes.items():
-        picture = cv2.imread(str(tmp_path / "flat" / "images" / name), cv2.IMREAD_IGNORE_ORIENTATION)
+        picture = cv2.imread(
+            str(tmp_path / "flat" / "images" / name), cv2.IMREAD_IGNORE_ORIENTATION
+        )
         assert picture.shape[1::-1] == size
     flattened = pycolmap.Reconstruction(tmp_path / "flat" / "sparse")
-    undistorted = {image.name: (image.camera.width, image.camera.height) for image in flattened.images.values()}
+    undistorted = {
+        image.name: (image.camera.width, image.camera.height) for image in flattened.images.values()
+    }
     assert undistorted == sizes
     truth = MixedMatcher().scenes[0].cameras
     for number, record in enumerate(cameras(result).values()):
         stored = turned_camera(truth[f"{number:04}"], -TURNS.get(ORIENTATIONS[number], 0), SIZE)
         expected = stored.R @ truth["0000"].R.T
-        np.testing.assert_allclose(record.camera.R @ cameras(result)["00.png"].camera.R.T, expected, atol=0.01)
+        np.testing.assert_allclose(
+            record.camera.R @ cameras(result)["00.png"].camera.R.T, expected, atol=0.01
+        )
 
 
 def test_results_that_were_removed_are_made_again_and_an_image_that_was_absent_comes_back(tmp_path):
@@ -172,7 +200,9 @@ def test_results_that_were_removed_are_made_again_and_an_image_that_was_absent_c
 
 def test_a_folder_in_the_folder_is_a_dataset_and_files_of_one_content_share_a_camera(tmp_path):
     write_flat(tmp_path / "images" / "a", 5)
-    (tmp_path / "images" / "a" / "copy.png").write_bytes((tmp_path / "images" / "a" / "00.png").read_bytes())
+    (tmp_path / "images" / "a" / "copy.png").write_bytes(
+        (tmp_path / "images" / "a" / "00.png").read_bytes()
+    )
     write_flat(tmp_path / "images" / "b", 1)
     (tmp_path / "images" / "a" / "broken.jpg").write_bytes(b"no picture")
     (tmp_path / "images" / "notes.txt").write_text("not an image")
@@ -187,7 +217,9 @@ def test_a_folder_in_the_folder_is_a_dataset_and_files_of_one_content_share_a_ca
     ]
     assert rows[0][4:] == rows[6][4:]
     assert rows[-1][4:] == (";".join(["nan"] * 9), "nan;nan;nan")
-    earlier = {row[0]: row for row in submission_rows("imc2023", result.cameras, tmp_path / "images")}
+    earlier = {
+        row[0]: row for row in submission_rows("imc2023", result.cameras, tmp_path / "images")
+    }
     assert earlier["a/00.png"][1:3] == ("a", "a")
     assert earlier["b/00.png"][3:] == ("1;0;0;0;1;0;0;0;1", "0;0;0")
 
@@ -195,14 +227,18 @@ def test_a_folder_in_the_folder_is_a_dataset_and_files_of_one_content_share_a_ca
 def test_only_listed_pairs_are_matched(tmp_path):
     root = write_flat(tmp_path / "images" / "set", 4).parent
     wanted = list(combinations(range(4), 2))[:5]
-    (tmp_path / "pairs.txt").write_text("".join(f"set/{j:02}.png set/{i:02}.png\n\n" for i, j in wanted))
+    (tmp_path / "pairs.txt").write_text(
+        "".join(f"set/{j:02}.png set/{i:02}.png\n\n" for i, j in wanted)
+    )
     matcher = MixedMatcher()
     listed = read_pair_list(tmp_path / "pairs.txt", root, read_folder(root))
     run(root, tmp_path / "out", matcher, listed=listed)
     assert sorted(matcher.calls) == wanted
     for line in ("set/00.png", "set/00.png set/00.png", "set/00.png set/09.png", "x y z", ""):
         (tmp_path / "pairs.txt").write_text(line)
-        with pytest.raises(UserError, match=r"expected two images of one dataset" if line else "has no pairs"):
+        with pytest.raises(
+            UserError, match=r"expected two images of one dataset" if line else "has no pairs"
+        ):
             read_pair_list(tmp_path / "pairs.txt", root, read_folder(root))
 
 
@@ -238,15 +274,22 @@ def test_a_folder_without_a_readable_image_says_so_and_fails(tmp_path, capsys):
 
 def test_the_command_writes_tables_models_a_database_and_a_page(demo, small_recipe, tmp_path):
     images, out = demo.train_dir / "courtyard" / "images", tmp_path / "out"
-    text = small_recipe.read_text()  # the matches at 320 and 400 pixels are too few with some versions of OpenCV
+    # The matches at 320 and 400 pixels are too few with some versions of OpenCV
+    text = small_recipe.read_text()
     small_recipe.write_text(text.replace("320", "480").replace("400", "640"))
     options = ["--recipe", small_recipe, "--format", "imc2025", "--workers", 0]
     assert run_command("reconstruct", images, "--out", out, *options) == 0
     results = {"cameras.csv", "submission.csv", "database.db", "models/0/images.bin", "report.html"}
-    results |= {"sparse/0/points3D.bin", "summary.json", *(f"images/{path.name}" for path in images.iterdir())}
+    results |= {
+        "sparse/0/points3D.bin",
+        "summary.json",
+        *(f"images/{path.name}" for path in images.iterdir()),
+    }
     assert results <= contents(out).keys()
     with (out / "submission.csv").open() as stream:
-        assert [row["image"] for row in csv.DictReader(stream)] == sorted(path.name for path in images.iterdir())
+        assert [row["image"] for row in csv.DictReader(stream)] == sorted(
+            path.name for path in images.iterdir()
+        )
 
 
 def photographs(folder: Path, count: int) -> list[Path]:
@@ -257,7 +300,9 @@ def photographs(folder: Path, count: int) -> list[Path]:
         picture = load_sample_image(name)[..., ::-1]
         for number in range(count):
             paths.append(folder / f"{name[:-4]}{number}.png")
-            cv2.imwrite(str(paths[-1]), picture[20 + number : 360 + number, 12 * number : 12 * number + 420])
+            cv2.imwrite(
+                str(paths[-1]), picture[20 + number : 360 + number, 12 * number : 12 * number + 420]
+            )
     return paths
 
 
@@ -299,7 +344,12 @@ def test_images_that_lie_on_a_side_are_found(tmp_path):
         cv2.imwrite(str(path), np.rot90(cv2.imread(str(path)), -times))
     (tmp_path / "images" / "broken.png").write_bytes(b"no picture")
     result = run(tmp_path / "images", tmp_path / "out", UprightSift(), rotations=True)
-    found = {path: t for pair in result.pairs for path, t in zip(pair.images, pair.turns, strict=True) if t}
+    found = {
+        path: t
+        for pair in result.pairs
+        for path, t in zip(pair.images, pair.turns, strict=True)
+        if t
+    }
     assert found == turned
 
 
@@ -315,7 +365,9 @@ def test_what_was_turned_comes_back_in_the_pixels_of_its_file(tmp_path, monkeypa
     assert found["02.png"].R[0] @ downs[0] < -0.9  # the right border of the file is up
     truth = MixedMatcher().scenes[0].cameras["0002"]
     assert found["02.png"].K[0, 0] == pytest.approx(truth.K[0, 0], rel=0.03)
-    image = pycolmap.Reconstruction(tmp_path / "out" / "models" / "0").find_image_with_name("02.png")
+    image = pycolmap.Reconstruction(tmp_path / "out" / "models" / "0").find_image_with_name(
+        "02.png"
+    )
     assert (image.camera.width, image.camera.height) == (SIZE.height, SIZE.width)
 
 
@@ -333,7 +385,9 @@ def test_the_tables_are_there_at_first_and_again_after_each_scene(tmp_path):
     assert steps in ([(0, 0), (4, 0), (4, 4)], [(0, 0), (0, 4), (4, 4)])
 
 
-def test_python_gives_models_reads_each_image_once_and_estimates_nothing_unused(tmp_path, monkeypatch):
+def test_python_gives_models_reads_each_image_once_and_estimates_nothing_unused(
+    tmp_path, monkeypatch
+):
     folder, read = write_flat(tmp_path / "images", FIRST), list[Path]()
 
     def read_counted(path: Path) -> Image | Unreadable:
@@ -342,11 +396,15 @@ def test_python_gives_models_reads_each_image_once_and_estimates_nothing_unused(
 
     monkeypatch.setattr(images, "read_image", read_counted)
     monkeypatch.setattr(pair, "estimate", lambda *_, **__: pytest.fail("unused"))
-    models = reconstruct(folder.iterdir(), RECIPE, device="cpu", matchers={"synthetic": MixedMatcher()})
+    models = reconstruct(
+        folder.iterdir(), RECIPE, device="cpu", matchers={"synthetic": MixedMatcher()}
+    )
     (first,) = models
     assert sorted(read) == sorted(folder.iterdir())
     assert len(first.images) == FIRST
     truth = MixedMatcher().scenes[0].cameras
     assert all(f"{number:02}.png" in models.show().page for number in range(FIRST))
     for found in first.images:
-        assert found.focal == pytest.approx(truth["00" + Path(found.image.name).stem].K[0, 0], rel=0.03)
+        assert found.focal == pytest.approx(
+            truth["00" + Path(found.image.name).stem].K[0, 0], rel=0.03
+        )

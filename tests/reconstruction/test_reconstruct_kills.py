@@ -1,4 +1,6 @@
-"""A run over folders of images that is killed at random moments ends with the files of the undisturbed one."""
+"""A run over folders of images that is killed at random moments ends with the files of the
+undisturbed one.
+"""
 
 import random
 import shutil
@@ -30,7 +32,14 @@ def test_a_run_that_is_killed_at_random_moments_ends_with_the_same_files(demo, t
     def begin(out: str) -> "subprocess.Popen[bytes]":
         recipe = str(tmp_path / "small.toml")
         options = ["--recipe", recipe, "--rotations", "--format", "imc2025", "--workers", "1"]
-        command = ["-m", "mkpc_kaggle", "reconstruct", str(tmp_path / "images"), "--out", str(tmp_path / out)]
+        command = [
+            "-m",
+            "mkpc_kaggle",
+            "reconstruct",
+            str(tmp_path / "images"),
+            "--out",
+            str(tmp_path / out),
+        ]
         return subprocess.Popen([sys.executable, *command, *options], stdout=subprocess.DEVNULL)
 
     def files_of(out: str) -> dict[str, str]:

@@ -19,7 +19,9 @@ from mkpc_kaggle.scene.reconstruction import RegisteredImage, SfmModel
 from mkpc_kaggle.scene.view_graph import BatchImage
 
 SIZES = Size(120, 80), Size(60, 90)
-IMAGES = tuple(Image.of_array(np.full((size.height, size.width, 3), 90, np.uint8)) for size in SIZES)
+IMAGES = tuple(
+    Image.of_array(np.full((size.height, size.width, 3), 90, np.uint8)) for size in SIZES
+)
 UNITS = Unit(1, "sift", 100), Unit(2, "sift", 100)
 REGIONS = (
     CriticalRegion(Box(20, 10, 60, 30), RegionReason.CROPPED, 1, 1),
@@ -35,7 +37,9 @@ def some(n):
 
 def test_points_of_stage_2_are_drawn_where_they_are_on_the_crop():
     results = tuple(UnitResult(unit, some(n)) for unit, n in zip(UNITS, (0, 20), strict=True))
-    match = PairMatch(results, REGIONS, Estimate(ModelKind.F, FALLBACK_FUNDAMENTAL, np.ones(20, bool)))
+    match = PairMatch(
+        results, REGIONS, Estimate(ModelKind.F, FALLBACK_FUNDAMENTAL, np.ones(20, bool))
+    )
     left, right = figures.draw_stage(IMAGES, match, 2).axes
     assert left.images[0].get_array().shape[:2] == (20, 40)
     xy = np.concatenate([dots.get_offsets() for dots in left.collections])
@@ -44,11 +48,15 @@ def test_points_of_stage_2_are_drawn_where_they_are_on_the_crop():
 
 
 def test_cameras_are_seen_from_above_and_from_the_side_with_the_points_before_them():
-    """Two cameras two units apart look along the world's x axis, its z axis is up; a wall is ten units ahead."""
+    """Two cameras two units apart look along the world's x axis, its z axis is up; a wall is ten
+    units ahead.
+    """
     R = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
     cameras = [Camera(np.eye(3), R, -R @ (0.0, 2.0 * n, 1.0)) for n in (0, 1)]
     wall = np.array([(10.0, y, z) for y in range(5) for z in range(8)])
-    images = tuple(RegisteredImage(BatchImage("a.png", "a", Size(80, 60)), camera, 9) for camera in cameras)
+    images = tuple(
+        RegisteredImage(BatchImage("a.png", "a", Size(80, 60)), camera, 9) for camera in cameras
+    )
     above, side = draw_cameras(SceneRecord("batch", models=(SfmModel(images, wall, 0.5),))).axes
     (cloud, _, centres), (seen, _, points) = ([*panel.collections] for panel in (above, side))
     assert np.ptp(centres.get_offsets(), axis=0).tolist() == [2, 0]
@@ -66,8 +74,11 @@ def test_a_strip_shows_both_images_upright_at_one_height_with_matches_where_they
     found = Estimate(ModelKind.F, np.eye(3), np.array([True]))
     figure = draw_strip((lying, square), PairMatch((UnitResult(UNITS[0], matches),), None, found))
     drawn = cv2.imdecode(np.frombuffer(encode(figure, "jpeg"), np.uint8), cv2.IMREAD_COLOR)
-    assert drawn.shape[:2] == pytest.approx((480, 960 + 480), abs=1)  # older versions of matplotlib round down
+    # Older versions of matplotlib round down
+    assert drawn.shape[:2] == pytest.approx((480, 960 + 480), abs=1)
     assert drawn[400, 100].min() > 200
     assert drawn[400, 1400].max() < 50
-    ends = [dots.get_offsets() for dots in figure.axes[0].collections if len(dots.get_offsets()) > 1]
+    ends = [
+        dots.get_offsets() for dots in figure.axes[0].collections if len(dots.get_offsets()) > 1
+    ]
     np.testing.assert_allclose(np.concatenate(ends), [[0.1, 0.1], [2 + 0.5, 0.5]])

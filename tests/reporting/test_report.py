@@ -28,7 +28,9 @@ EVIL = '<script>alert("$x$")</script>'
 
 
 def a_run(directory: Path, count: int = 12) -> list[Pair]:
-    """A run over pairs of which the second cannot be read; its work directory is ``directory``/work."""
+    """A run over pairs of which the second cannot be read; its work directory is
+    ``directory``/work.
+    """
     pairs = write_pairs(directory / "images", count)
     pairs[1].images[1].write_bytes(b"")
     run(pairs, THREE_UNITS, RectifiedMatcher(), directory / "work")
@@ -37,7 +39,10 @@ def a_run(directory: Path, count: int = 12) -> list[Pair]:
 
 def empty_store(work_dir: Path, pairs: list[Pair], **about: object) -> Store:
     store = Store.open(work_dir)
-    rows = [Row(pair.id, pair.group, *pair.names, 0, 0, "", [], "", "fallback", {}, "") for pair in pairs]
+    rows = [
+        Row(pair.id, pair.group, *pair.names, 0, 0, "", [], "", "fallback", {}, "")
+        for pair in pairs
+    ]
     facts = About({**THREE_UNITS.table(), "name": "three"}, **about)
     written = np.tile(FALLBACK_FUNDAMENTAL, (len(pairs), 1, 1))
     store.put([Table(facts, [], len(pairs), rows, {}, written).to_result()])
@@ -59,18 +64,23 @@ def test_a_run_exports_tables_that_a_reader_of_csv_files_understands(tmp_path, c
         inliers = [int(unit["inliers"]) for unit in tables["units"] if unit["pair"] == row["pair"]]
         assert sum(inliers) == int(row["inliers"])
         assert (row["image1"], row["overlaps"]) == (record.pair.names[1], str(record.overlaps))
-    assert np.linalg.matrix_rank(read_log(tmp_path / "work").records[1].chosen_fundamental) == 2, "the fallback"
+    assert np.linalg.matrix_rank(read_log(tmp_path / "work").records[1].chosen_fundamental) == 2, (
+        "the fallback"
+    )
     assert len(tables["units"]) == 3 * 11
     assert len(tables["regions"]) == 2 * 11
     assert {event["kind"] for event in tables["events"]} >= {"start", "end"}
-    assert run_command("journal", tmp_path / "work", "--csv", tmp_path / "csv") == 0, "its own are replaced"
+    assert run_command("journal", tmp_path / "work", "--csv", tmp_path / "csv") == 0, (
+        "its own are replaced"
+    )
     capsys.readouterr()
     assert run_command("journal", tmp_path / "work") == 0
     out = capsys.readouterr().out
     assert re.search("complete after .*: 11 of 12 pairs have an F", out)
     assert "the file is empty" in out
     assert len(out.splitlines()) < 20
-    run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")  # a resumed run is a second session
+    # A resumed run is a second session
+    run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
     kinds = [event.kind for event in read_log(tmp_path / "work").events]
     assert [kind for kind in kinds if kind in ("start", "end")] == ["start", "end"] * 2
 
@@ -111,12 +121,21 @@ def test_the_page_begins_with_the_verdict_has_pictures_inside_and_asks_for_nothi
     assert report_run(tmp_path / "work", page, inf, pairs) == f"report: {page}"
     text = page.read_text(encoding="utf-8")
     assert re.search("<h1>Complete after .*: 11 of 12 pairs have an F</h1>", text)
-    titles = ["Missing results", "The weakest pairs", "Pairs", "Where the time went", "What made this"]
+    titles = [
+        "Missing results",
+        "The weakest pairs",
+        "Pairs",
+        "Where the time went",
+        "What made this",
+    ]
     assert re.findall("<h2>(.*?)</h2>", text) == titles
     assert text.count("<img ") == 11, "the pairs with an F"
     assert "With the fallback: 1 pairs; the reasons are below." in text
     assert re.findall("<script[^>]*>", text) == ["<script>", "<script>"], "both inside the page"
-    assert all(source.startswith("data:image/") for source in re.findall(r"\b(?:src|href)\s*=\s*.(\S*)", text))
+    assert all(
+        source.startswith("data:image/")
+        for source in re.findall(r"\b(?:src|href)\s*=\s*.(\S*)", text)
+    )
     assert not re.search(r"url\(|@import", text)
     assert "the file is empty" in text
     assert "Drawings are missing" not in text
@@ -135,7 +154,9 @@ def test_the_summary_has_the_facts_of_the_page_for_programs(tmp_path):
     assert (table["pairs"]["count"], table["pairs"]["with_f"]) == (12, 11)
     assert table["pairs"]["sources"] == {"fallback": 1, "pair": 11}
     records = read_log(tmp_path / "work").records
-    assert table["pairs"]["inliers_minimum"] == min(record.inliers for record in records if record.is_solved)
+    assert table["pairs"]["inliers_minimum"] == min(
+        record.inliers for record in records if record.is_solved
+    )
     assert sum(table["pairs"]["inliers_histogram"].values()) == 12
     assert [unit["pairs"] for unit in table["units"]] == [11, 11, 11]
 
@@ -154,7 +175,9 @@ def test_a_summary_replaces_nothing_but_a_summary(tmp_path, make):
 
 def test_what_comes_from_files_is_escaped(tmp_path):
     pairs = [Pair(EVIL, EVIL, f"{EVIL.replace('/', '')}.png", "b.png")]
-    with empty_store(tmp_path, pairs, device=EVIL, left_out=(EVIL,), versions={EVIL: EVIL}) as store:
+    with empty_store(
+        tmp_path, pairs, device=EVIL, left_out=(EVIL,), versions={EVIL: EVIL}
+    ) as store:
         for kind in EventKind:
             note_event(store, Event(kind, 1.0, EVIL))
     log = read_log(tmp_path)
@@ -192,19 +215,22 @@ def test_pairs_sort_and_filter_and_pictures_enlarge(tmp_path, width):
             browser.value("document.querySelectorAll('table.sortable th button')[2].click()")
             inliers = browser.value(f"{rows}.map((row) => Number(row.cells[2].textContent))")
             assert inliers == sorted(inliers, reverse=kind == "descending")
-            assert browser.value("document.querySelectorAll('table.sortable th')[2].ariaSort") == kind
+            assert (
+                browser.value("document.querySelectorAll('table.sortable th')[2].ariaSort") == kind
+            )
         filled = "document.querySelector('input[type=search]')"
         browser.value(f"{filled}.value = 'FALLBACK {pairs[1].id}'; {filled}.oninput()")
-        shown = browser.value(f"{rows}.filter((row) => !row.hidden).map((row) => row.cells[0].textContent)")
+        shown = browser.value(
+            f"{rows}.filter((row) => !row.hidden).map((row) => row.cells[0].textContent)"
+        )
         assert shown == [pairs[1].id]
         browser.value("document.querySelector('figure img').click()")
         assert browser.value("document.querySelector('dialog').open")
         assert browser.value("document.querySelector('dialog img').naturalWidth") > 100
         browser.value("document.querySelector('dialog').click()")
         assert not browser.value("document.querySelector('dialog').open")
-        wide = (
-            "[...document.querySelectorAll('body *')].filter((e) => e.getBoundingClientRect().right > innerWidth)"
-        )
+        every = "[...document.querySelectorAll('body *')]"
+        wide = f"{every}.filter((e) => e.getBoundingClientRect().right > innerWidth)"
         outside = f"{wide}.filter((e) => !e.closest('.wide, .rows')).map((e) => e.outerHTML.slice(0, 200))"
         assert browser.value(outside) == []
         assert browser.value("document.documentElement.scrollWidth") <= width
@@ -237,7 +263,9 @@ def test_a_report_that_fails_is_a_line_and_leaves_the_page_without_drawings(tmp_
 def test_the_command_draws_a_page_with_the_images_of_a_test_side(tmp_path):
     pairs = write_pairs(tmp_path / "test_images" / "set", 2)
     rows = [f"{pair.id},set,{pair.images[0].stem},{pair.images[1].stem}" for pair in pairs]
-    (tmp_path / "test.csv").write_text("\n".join(["sample_id,batch_id,image_1_id,image_2_id", *rows]))
+    (tmp_path / "test.csv").write_text(
+        "\n".join(["sample_id,batch_id,image_1_id,image_2_id", *rows])
+    )
     run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
     page = tmp_path / "report.html"
     for more, told in (["--test-dir", tmp_path], "<img"), ([], "where the images are is not known"):

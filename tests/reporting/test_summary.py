@@ -55,7 +55,11 @@ def test_cameras_with_unknown_errors_are_the_weakest():
         camera("unknown.png", ()),
         camera("worse.png", Sigmas(0.1, 0.03, 1.0)),
     )
-    assert [name for name, _ in weakest_cameras([found])] == ["unknown.png", "worse.png", "known.png"]
+    assert [name for name, _ in weakest_cameras([found])] == [
+        "unknown.png",
+        "worse.png",
+        "known.png",
+    ]
     lines = list(weakest_line([found]))
     assert max(map(len, lines)) <= 100
     text = " ".join(line.strip() for line in lines)

@@ -28,7 +28,9 @@ CAMERAS = 5
 def a_model(folder: Path, points: int = 2000, cameras: int = CAMERAS) -> SfmModel:
     """Cameras in a row that look at a wall; the wall is red to the left and blue to the right."""
     rng = np.random.default_rng(0)
-    cloud = np.column_stack([rng.uniform(-3, 3, points), rng.uniform(-2, 2, points), np.full(points, WALL)])
+    cloud = np.column_stack(
+        [rng.uniform(-3, 3, points), rng.uniform(-2, 2, points), np.full(points, WALL)]
+    )
     K = np.array([[400.0, 0, 199.5], [0, 400.0, 149.5], [0, 0, 1]])
     placed = []
     for number in range(cameras):
@@ -41,7 +43,9 @@ def a_model(folder: Path, points: int = 2000, cameras: int = CAMERAS) -> SfmMode
         cv2.imwrite(str(path), pixels)
         camera = Camera(K, np.eye(3), np.array([-x, 0.0, 0.0]))
         sigmas = Sigmas(0.01, 0.002 * (1 + number), 0.3) if number else ()
-        placed.append(RegisteredImage(BatchImage(str(path), str(number), SIZE), camera, points, sigmas))
+        placed.append(
+            RegisteredImage(BatchImage(str(path), str(number), SIZE), camera, points, sigmas)
+        )
     return SfmModel(tuple(placed), cloud, 0.3)
 
 
@@ -56,10 +60,13 @@ def test_points_keep_their_shape_and_cameras_their_place_among_them(tmp_path):
     (shown,) = view_data([model], read=lambda _: None, partners={})["models"]
     points, _ = decoded(shown)
     scale = np.ptp(points[:, 0]) / np.ptp(model.points[:, 0])
-    offset = points[0] - scale * model.points[0]  # the cameras look along z: the frame is not rotated
+    # The cameras look along z: the frame is not rotated
+    offset = points[0] - scale * model.points[0]
     np.testing.assert_allclose(points, scale * model.points + offset, atol=1e-4)
     for camera, found in zip(shown["cameras"], model.images, strict=True):
-        np.testing.assert_allclose(camera["centre"], scale * found.camera.centre + offset, atol=1e-4)
+        np.testing.assert_allclose(
+            camera["centre"], scale * found.camera.centre + offset, atol=1e-4
+        )
         assert camera["wide"] == pytest.approx(0.5)
     assert np.abs(points).max() <= 1.1
 
@@ -68,21 +75,34 @@ def test_only_the_longest_tracks_are_kept(tmp_path):
     model = a_model(tmp_path, points=MAX_POINTS + 500)
     data = view_data([model], read=lambda _: None, partners={})
     assert data["models"][0]["count"] == MAX_POINTS
-    assert len(data["models"][0]["points"]) + len(data["models"][0]["colours"]) == 4 * 3 * MAX_POINTS
+    assert (
+        len(data["models"][0]["points"]) + len(data["models"][0]["colours"]) == 4 * 3 * MAX_POINTS
+    )
 
 
 def test_points_have_the_colours_of_the_images(tmp_path):
     model = a_model(tmp_path)
-    pictures = {found.image.name: cv2.imread(found.image.name)[:, :, ::-1] for found in model.images}
+    pictures = {
+        found.image.name: cv2.imread(found.image.name)[:, :, ::-1] for found in model.images
+    }
     colours = point_colours(model.points, model.images, pictures)
     sides = np.abs(model.points[:, 0]) > 0.1
     is_left = model.points[:, 0] < 0
-    np.testing.assert_array_equal(colours[sides & is_left], np.tile([255, 0, 0], (np.sum(sides & is_left), 1)))
-    np.testing.assert_array_equal(colours[sides & ~is_left], np.tile([0, 0, 255], (np.sum(sides & ~is_left), 1)))
+    np.testing.assert_array_equal(
+        colours[sides & is_left], np.tile([255, 0, 0], (np.sum(sides & is_left), 1))
+    )
+    np.testing.assert_array_equal(
+        colours[sides & ~is_left], np.tile([0, 0, 255], (np.sum(sides & ~is_left), 1))
+    )
 
 
 def test_points_and_colours_come_from_the_files_of_a_reconstruction(tmp_path):
-    settings = {"num_rigs": 1, "num_cameras_per_rig": 1, "num_frames_per_rig": 5, "num_points3D": 40}
+    settings = {
+        "num_rigs": 1,
+        "num_cameras_per_rig": 1,
+        "num_frames_per_rig": 5,
+        "num_points3D": 40,
+    }
     model = pycolmap.synthesize_dataset(pycolmap.SyntheticDatasetOptions(settings))
     for number, point in model.points3D.items():
         point.color = np.array([number, 2 * number, 3 * number], np.uint8)
@@ -111,7 +131,10 @@ def test_a_view_of_degenerate_models_is_still_data(tmp_path):
         made = SfmModel(images, points, 0.0)
         (shown,) = view_data([made], read=lambda _: None, partners={})["models"]
         values = [
-            number for camera in shown["cameras"] for row in (camera["centre"], *camera["R"]) for number in row
+            number
+            for camera in shown["cameras"]
+            for row in (camera["centre"], *camera["R"])
+            for number in row
         ]
         assert np.isfinite(values).all()
 
@@ -127,7 +150,9 @@ def test_names_from_files_are_escaped(tmp_path):
     model = a_model(tmp_path, cameras=2)
     evil = "</script><script>alert(1)</script>"
     image = replace(model.images[0].image, name=evil)
-    page = show([replace(model, images=(replace(model.images[0], image=image), model.images[1]))]).page
+    page = show(
+        [replace(model, images=(replace(model.images[0], image=image), model.images[1]))]
+    ).page
     assert "<script>alert" not in page
     assert page.count("</script>") == 2, "of the data, and of the program"
 
@@ -226,7 +251,9 @@ def test_the_view_turns_and_zooms_by_touch(browser, page, width):
     states = [browser.value(PIXELS)]
     browser.touch([(x, y)], [(x + 30, y)], [(x + 60, y + 10)])
     states.append(browser.value(PIXELS))
-    browser.touch([(x - 30, y), (x + 30, y)], [(x - 50, y), (x + 50, y)], [(x - 70, y), (x + 70, y)])
+    browser.touch(
+        [(x - 30, y), (x + 30, y)], [(x - 50, y), (x + 50, y)], [(x - 70, y), (x + 70, y)]
+    )
     states.append(browser.value(PIXELS))
     assert len({total for total, _ in states}) == len(states)
     assert states[2][1] > states[1][1], "spread fingers enlarge"

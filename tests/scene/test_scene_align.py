@@ -21,7 +21,9 @@ from mkpc_kaggle.scene.reconstruction import Reconstruction, RegisteredImage, Sf
 from mkpc_kaggle.scene.view_graph import BatchImage
 
 WORLD = Similarity(
-    3.5, Rotation.from_euler("xyz", [20, -60, 130], degrees=True).as_matrix(), np.array([1.0, -2, 5])
+    3.5,
+    Rotation.from_euler("xyz", [20, -60, 130], degrees=True).as_matrix(),
+    np.array([1.0, -2, 5]),
 )
 
 
@@ -30,12 +32,16 @@ def cameras_of(count: int, *, on_a_line: bool = False) -> dict[str, Camera]:
     rotations = Rotation.from_rotvec(rng.normal(0, 0.3, (count, 3))).as_matrix()
     centres = rng.normal(0, 1, (count, 3)) * ((1, 0, 0) if on_a_line else (1, 1, 1))
     return {
-        f"{n}.png": Camera(np.eye(3), R, -R @ c) for n, (R, c) in enumerate(zip(rotations, centres, strict=True))
+        f"{n}.png": Camera(np.eye(3), R, -R @ c)
+        for n, (R, c) in enumerate(zip(rotations, centres, strict=True))
     }
 
 
 def model_of(cameras: dict[str, Camera]) -> SfmModel:
-    images = [RegisteredImage(BatchImage(name, name, Size(10, 10)), each, 50) for name, each in cameras.items()]
+    images = [
+        RegisteredImage(BatchImage(name, name, Size(10, 10)), each, 50)
+        for name, each in cameras.items()
+    ]
     return SfmModel(tuple(images), np.random.default_rng(2).normal(0, 1, (40, 3)), 0.3)
 
 
@@ -70,14 +76,21 @@ def test_each_model_is_moved_onto_the_earlier_model_of_its_images():
     cameras = cameras_of(7)
     first = {name: cameras[name] for name in ("0.png", "1.png", "2.png", "3.png")}
     second = {name: cameras[name] for name in ("4.png", "5.png", "6.png")}
-    reference = [second, {name: WORLD.of_camera(camera) for name, camera in first.items() if name != "3.png"}]
+    reference = [
+        second,
+        {name: WORLD.of_camera(camera) for name, camera in first.items() if name != "3.png"},
+    ]
     (made,) = align([Reconstruction((), (model_of(first), model_of(second)))], reference)
     model = made.models[0]
     for found in model.images:
-        np.testing.assert_allclose(found.camera.t, WORLD.of_camera(first[found.image.name]).t, atol=1e-9)
+        np.testing.assert_allclose(
+            found.camera.t, WORLD.of_camera(first[found.image.name]).t, atol=1e-9
+        )
     ray = model_of(first).points @ first["3.png"].R.T + first["3.png"].t
     moved = model.points @ model.images[3].camera.R.T + model.images[3].camera.t
-    np.testing.assert_allclose(moved, WORLD.scale * ray, atol=1e-9, err_msg="points move with the cameras")
+    np.testing.assert_allclose(
+        moved, WORLD.scale * ray, atol=1e-9, err_msg="points move with the cameras"
+    )
     np.testing.assert_allclose(made.models[1].images[0].camera.t, second["4.png"].t, atol=1e-9)
 
 

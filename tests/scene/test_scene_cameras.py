@@ -1,4 +1,6 @@
-"""The focal lengths that cameras start with, by EXIF or not, and the cameras that images are told to share."""
+"""The focal lengths that cameras start with, by EXIF or not, and the cameras that images are told
+to share.
+"""
 
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +17,9 @@ from mkpc_kaggle.scene.reconstruct import reconstruct_batch, reconstruct_sharing
 from mkpc_kaggle.scene.shared_intrinsics import given_intrinsics
 from mkpc_kaggle.scene.view_graph import BatchImage, ViewGraph
 
-IMAGES = [BatchImage(f"{n}", f"{n}", SIZE, focal) for n, focal in enumerate((0.0, 900.0, 1000.0, 1040.0))]
+IMAGES = [
+    BatchImage(f"{n}", f"{n}", SIZE, focal) for n, focal in enumerate((0.0, 900.0, 1000.0, 1040.0))
+]
 TALL = BatchImage("tall", "tall", Size(*reversed(SIZE)))
 GUESS = 1.1 * max(SIZE)
 
@@ -52,12 +56,16 @@ def test_a_focal_length_of_exif_is_not_fixed():
     def told(image):
         return replace(image, focal=1.08 * float(scene.cameras[image.name].K[0, 0]))
 
-    pairs = [replace(pair, image0=told(pair.image0), image1=told(pair.image1)) for pair in scene.pairs]
+    pairs = [
+        replace(pair, image0=told(pair.image0), image1=told(pair.image1)) for pair in scene.pairs
+    ]
     solution = reconstruct_batch(pairs, config("image"))
     found = registered_images(solution)
     assert len(found) == 5
     for image in scene.images:
-        assert found[image.digest].focal == pytest.approx(scene.cameras[image.name].K[0, 0], rel=0.03)
+        assert found[image.digest].focal == pytest.approx(
+            scene.cameras[image.name].K[0, 0], rel=0.03
+        )
 
 
 def test_images_that_one_camera_took_have_one_focal_length_however_few_they_are():
@@ -65,7 +73,9 @@ def test_images_that_one_camera_took_have_one_focal_length_however_few_they_are(
     graph = ViewGraph.of_pairs(scene.pairs)
     alone, together = (reconstruct_sharing(graph, config(name)) for name in ("image", "folder"))
     assert alone[1] == {}
-    focals = [[image.focal for image in found[0].models[0].images] for found, _ in (alone, together)]
+    focals = [
+        [image.focal for image in found[0].models[0].images] for found, _ in (alone, together)
+    ]
     assert len(set(focals[0])) == len(focals[0]) == 4
     assert focals[1] == pytest.approx([focals[1][0]] * 4)
     assert focals[1][0] == pytest.approx(900, rel=0.03)

@@ -10,7 +10,12 @@ from benchmarks.synthetic_scene import SIZE, SyntheticScene, synthetic_scene
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.scene.choose import Choice, Reason, choose
 from mkpc_kaggle.scene.reconstruct import models_of
-from mkpc_kaggle.scene.reconstruction import Reconstruction, RegisteredImage, SfmModel, filter_models
+from mkpc_kaggle.scene.reconstruction import (
+    Reconstruction,
+    RegisteredImage,
+    SfmModel,
+    filter_models,
+)
 from mkpc_kaggle.scene.view_graph import BatchImage
 
 
@@ -62,4 +67,7 @@ def test_a_model_that_is_too_small_is_left_out(scene):
 
 def test_the_models_of_all_components_are_numbered_by_size(scene):
     small, large = (model(dict(list(scene.cameras.items())[:count])) for count in (3, 4))
-    assert models_of([Reconstruction(("a",), (small,)), Reconstruction(("b",), (large,))]) == (large, small)
+    assert models_of([Reconstruction(("a",), (small,)), Reconstruction(("b",), (large,))]) == (
+        large,
+        small,
+    )

@@ -47,7 +47,12 @@ def test_a_sparse_batch_has_a_scene_by_pairs_that_no_row_names(tmp_path):
     assert [record.source for record in report.records] == ["scene"] * 5
     true = [matcher.scene.pairs[list(combinations(range(6), 2)).index(ends)] for ends in CHAIN]
     found = zip(report.records, true, strict=True)
-    assert max(matcher.scene.median_distance(record.chosen_fundamental, pair) for record, pair in found) < 0.5
+    assert (
+        max(
+            matcher.scene.median_distance(record.chosen_fundamental, pair) for record, pair in found
+        )
+        < 0.5
+    )
     assert len(matcher.calls) == 12, "two pairs an image"
     assert set(published) == {5}
     assert len(read_log(tmp_path / "work").records) == 5

@@ -16,7 +16,9 @@ SCENE = synthetic_scene(6, points=500)
 NAMES = [image.name for image in SCENE.images]
 
 
-def reconstructed(rows: list[tuple[str, KnownCamera]], sharing: CameraSharing = CameraSharing.AUTO) -> SfmModel:
+def reconstructed(
+    rows: list[tuple[str, KnownCamera]], sharing: CameraSharing = CameraSharing.AUTO
+) -> SfmModel:
     config = SceneConfig(cameras=sharing, intrinsics=written(rows))
     found, _ = reconstruct_sharing(ViewGraph.of_pairs(SCENE.pairs), config)
     (model,) = models_of(found)
@@ -25,12 +27,17 @@ def reconstructed(rows: list[tuple[str, KnownCamera]], sharing: CameraSharing = 
 
 def true_camera(name: str, factor: float = 1.0, sigma: float = 0.0) -> tuple[str, KnownCamera]:
     K = SCENE.cameras[name].K
-    return name, KnownCamera("SIMPLE_PINHOLE", (factor * K[0, 0], K[0, 2] + 0.5, K[1, 2] + 0.5), sigma)
+    return name, KnownCamera(
+        "SIMPLE_PINHOLE", (factor * K[0, 0], K[0, 2] + 0.5, K[1, 2] + 0.5), sigma
+    )
 
 
 def focals(model: SfmModel) -> dict[str, float]:
     """The focal length of each image over the true one."""
-    return {found.image.name: found.focal / SCENE.cameras[found.image.name].K[0, 0] for found in model.images}
+    return {
+        found.image.name: found.focal / SCENE.cameras[found.image.name].K[0, 0]
+        for found in model.images
+    }
 
 
 @pytest.fixture(scope="module")
@@ -52,14 +59,19 @@ def test_intrinsics_that_are_all_exact_leave_less_uncertainty(free):
     model = reconstructed([true_camera(name) for name in NAMES])
     assert focals(model) == pytest.approx(dict.fromkeys(NAMES, 1.0), abs=1e-9)
     for field in ("rotation", "centre"):
-        known, unknown = (np.mean([getattr(each.sigmas, field) for each in made.images]) for made in (model, free))
+        known, unknown = (
+            np.mean([getattr(each.sigmas, field) for each in made.images]) for made in (model, free)
+        )
         assert known < unknown
 
 
 def test_a_prior_pulls_a_focal_length_as_far_as_its_deviation_allows(free):
     name = NAMES[2]
     start = focals(free)[name]
-    pulled = {sigma: focals(reconstructed([true_camera(name, 1.1, sigma)]))[name] for sigma in (0.01, 100.0)}
+    pulled = {
+        sigma: focals(reconstructed([true_camera(name, 1.1, sigma)]))[name]
+        for sigma in (0.01, 100.0)
+    }
     assert pulled[0.01] == pytest.approx(1.1, abs=2e-3)
     assert pulled[100.0] == pytest.approx(start, abs=2e-3)
     model = reconstructed([true_camera(name, 1.0, 0.1)])
@@ -69,7 +81,10 @@ def test_a_prior_pulls_a_focal_length_as_far_as_its_deviation_allows(free):
 
 def test_distortion_is_part_of_verification_and_of_the_model(tmp_path):
     known = [
-        (name, KnownCamera("OPENCV", (K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5, 1e-4, 0, 0, 0)))
+        (
+            name,
+            KnownCamera("OPENCV", (K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5, 1e-4, 0, 0, 0)),
+        )
         for name, K in ((name, SCENE.cameras[name].K) for name in NAMES)
     ]
     config = SceneConfig(intrinsics=written(known))
@@ -87,7 +102,9 @@ def test_distortion_is_part_of_verification_and_of_the_model(tmp_path):
 def test_a_row_names_an_image_by_its_path_its_name_or_a_pattern():
     rows = [
         parse_row(pattern, "SIMPLE_PINHOLE", f"{focal} 10 10", "fixed")
-        for focal, pattern in enumerate(("set/a.jpg", "b.jpg", "[c].jpg", "set/*", "*.png"), start=1)
+        for focal, pattern in enumerate(
+            ("set/a.jpg", "b.jpg", "[c].jpg", "set/*", "*.png"), start=1
+        )
     ]
     names = ["set/a.jpg", "x/b.jpg", "[c].jpg", "c.jpg", "set/z.jpg", "y/z.png", "z.jpg"]
     found = [camera_of(rows, name) for name in names]

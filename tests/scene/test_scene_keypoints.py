@@ -30,13 +30,19 @@ def pair(names: str, found: Matches) -> BatchPair:
     return BatchPair(image(names[0]), image(names[1]), found)
 
 
-@given(arrays(np.float32, st.tuples(st.integers(0, 60), st.just(2)), elements=st.floats(-5, 5, width=32)))
+@given(
+    arrays(
+        np.float32, st.tuples(st.integers(0, 60), st.just(2)), elements=st.floats(-5, 5, width=32)
+    )
+)
 def test_a_keypoint_is_the_mean_of_its_points_and_near_each_of_them(points):
     keypoints, place = merge_points(points, 0.75)
     assert len(place) == len(points)
     assert set(place.tolist()) == set(range(len(keypoints)))
     for number, keypoint in enumerate(keypoints):
-        np.testing.assert_allclose(keypoint, points[place == number].astype(float).mean(axis=0), atol=1e-5)
+        np.testing.assert_allclose(
+            keypoint, points[place == number].astype(float).mean(axis=0), atol=1e-5
+        )
     if len(points):  # two cells, shifted against each other, are 1.5 cells wide at most
         assert np.abs(points - keypoints[place]).max() <= 1.5 * 0.75 + 1e-5
 
@@ -81,12 +87,17 @@ def test_a_graph_is_made_of_a_pairs_tracks_where_it_has_some():
 
 def test_components_are_connected_by_pairs_with_enough_matches():
     def edge(first: int, second: int, count: int) -> Edge:
-        return Edge(first, second, Matches(np.zeros((count, 2)), np.zeros((count, 2)), np.zeros(count)))
+        return Edge(
+            first, second, Matches(np.zeros((count, 2)), np.zeros((count, 2)), np.zeros(count))
+        )
 
     edges = (edge(1, 3, 20), edge(1, 4, 20), edge(3, 5, 4), edge(5, 6, 15))
     found = ViewGraph(tuple(map(image, "ABCDEFGH")), edges).components()
     assert ["".join(each.name for each in graph.images) for graph in found] == ["BDE", "FG"]
-    assert [[(e.first, e.second) for e in graph.edges] for graph in found] == [[(0, 1), (0, 2)], [(0, 1)]]
+    assert [[(e.first, e.second) for e in graph.edges] for graph in found] == [
+        [(0, 1), (0, 2)],
+        [(0, 1)],
+    ]
     assert ViewGraph((image("A"),), ()).components() == ()
     assert ViewGraph((), ()).components() == ()
 
@@ -95,7 +106,10 @@ def results_of(*counts: int) -> list[UnitResult]:
     """Of a unit whose matches make no tracks, and of a unit whose matches do, that many each."""
     rows = [np.arange(2 * count, dtype=np.float32).reshape(count, 2) for count in counts]
     units = (Unit(1, "coarse", 640, tracks=False), Unit(1, "fine", 640))
-    return [UnitResult(unit, Matches(row, row, np.zeros(len(row)))) for unit, row in zip(units, rows, strict=True)]
+    return [
+        UnitResult(unit, Matches(row, row, np.zeros(len(row))))
+        for unit, row in zip(units, rows, strict=True)
+    ]
 
 
 @pytest.mark.parametrize(("fine", "used"), [(50, 50), (49, 79), (0, 30)])

@@ -1,4 +1,6 @@
-"""Reconstruction of small synthetic scenes: right cameras, the same bytes, and a reason whenever there is none."""
+"""Reconstruction of small synthetic scenes: right cameras, the same bytes, and a reason whenever
+there is none.
+"""
 
 import pickle
 import sys
@@ -7,7 +9,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.synthetic_scene import SIZE, SyntheticScene, front, match, registered_images, see, synthetic_scene
+from benchmarks.synthetic_scene import (
+    SIZE,
+    SyntheticScene,
+    front,
+    match,
+    registered_images,
+    see,
+    synthetic_scene,
+)
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import RobustConfig
@@ -28,7 +38,9 @@ def pair_of(names: str, matches: Matches) -> BatchPair:
 
 
 def distances(solution: Solution, scene: SyntheticScene) -> list[float]:
-    """How far true correspondences are from the F that each pair got, in pixels; infinite without an F."""
+    """How far true correspondences are from the F that each pair got, in pixels; infinite without
+    an F.
+    """
     return [
         np.inf if choice.F is None else scene.median_distance(choice.F, pair)
         for choice, pair in zip(solution.choices, scene.pairs, strict=True)
@@ -52,12 +64,16 @@ def test_cameras_are_right_in_spite_of_noise_and_wrong_matches(scene):
 
 def test_the_same_batch_gives_the_same_bytes_through_a_pipe_too(scene):
     piped = pickle.loads(pickle.dumps(scene.pairs))
-    first, again = (pickle.dumps(reconstruct_batch(pairs, SceneConfig())) for pairs in (scene.pairs, piped))
+    first, again = (
+        pickle.dumps(reconstruct_batch(pairs, SceneConfig())) for pairs in (scene.pairs, piped)
+    )
     assert first == again
 
 
 def test_points_of_a_dense_matcher_make_tracks(scene):
-    """Each pair has other points of the surface: a keypoint of two pairs is a coincidence within a cell."""
+    """Each pair has other points of the surface: a keypoint of two pairs is a coincidence within a
+    cell.
+    """
     rng, pairs = np.random.default_rng(3), []
     for pair in scene.pairs:
         world = front(rng, 8000)
@@ -103,7 +119,9 @@ def test_two_places_in_a_batch_are_two_scenes(scene):
 
 
 def test_a_pair_whose_matches_agree_on_something_else_keeps_its_own(scene):
-    """As on a facade that repeats itself; whether it is right nobody knows, so the pair's own F stays."""
+    """As on a facade that repeats itself; whether it is right nobody knows, so the pair's own F
+    stays.
+    """
     pair = scene.pairs[-1]
     shifted = replace(pair.matches, points1=pair.matches.points0 + np.array([0, 90], np.float32))
     columns = np.array([[0, 0, 1], [0, 0, 0], [-1, 0, 0]]) / np.sqrt(2)
@@ -130,14 +148,17 @@ DEGENERATE = {
     "one point": (np.full((60, 2), 50.0), np.full((60, 2), 60.0)),
     "a line": (LINE, LINE + 5),
     "the same places": (POINTS, POINTS),
-    "a homography": (POINTS, POINTS[:, ::-1] * 0.9 + 20),  # of a plane, or a camera that only turned
+    # Of a plane, or a camera that only turned
+    "a homography": (POINTS, POINTS[:, ::-1] * 0.9 + 20),
 }
 
 
 @pytest.mark.parametrize("kind", DEGENERATE)
 def test_degenerate_matches_give_a_reason(kind):
     matches = Matches(*DEGENERATE[kind], np.ones(60))
-    solution = reconstruct_batch([pair_of(names, matches) for names in ("01", "12", "02", "23")], SceneConfig())
+    solution = reconstruct_batch(
+        [pair_of(names, matches) for names in ("01", "12", "02", "23")], SceneConfig()
+    )
     (found,) = solution.reconstructions
     assert found.models or found.failure
     for choice in solution.choices:

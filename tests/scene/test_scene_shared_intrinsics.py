@@ -28,10 +28,14 @@ def images(count: int, size: Size = WIDE, prefix: str = "") -> list[BatchImage]:
     return [BatchImage(f"{prefix}{number}", f"{prefix}{number}", size) for number in range(count)]
 
 
-def model(registered: Sequence[BatchImage], focals: Sequence[float], points: Sequence[int] = ()) -> SfmModel:
+def model(
+    registered: Sequence[BatchImage], focals: Sequence[float], points: Sequence[int] = ()
+) -> SfmModel:
     found = [
         RegisteredImage(image, Camera(np.diag([focal, focal, 1.0]), np.eye(3), np.zeros(3)), seen)
-        for image, focal, seen in zip(registered, focals, points or [100] * len(focals), strict=True)
+        for image, focal, seen in zip(
+            registered, focals, points or [100] * len(focals), strict=True
+        )
     ]
     return SfmModel(tuple(found), np.zeros((0, 3)), 0.5)
 
@@ -46,7 +50,8 @@ def shared(*focals: float, points: Sequence[int] = ()) -> dict[str, float]:
     ("focals", "points", "expected"),
     [
         ((838, 839, 840, 841, 842), (), dict.fromkeys("01234", 840)),
-        # With few points, an image shares the camera whatever its focal length; with many, it had another zoom.
+        # With few points, an image shares the camera whatever its focal length; with many, it had
+        # another zoom.
         ((838, 840, 841, 2900, 880), (100, 100, 100, 4, 49), dict.fromkeys("01234", 841)),
         ((838, 840, 841, 420, 842), (100, 100, 100, 90, 100), dict.fromkeys("0124", 840)),
         ((), (), {}),
@@ -67,7 +72,12 @@ def test_an_image_without_a_camera_shares_that_of_its_size():
 
 
 def focals_of(solution: Solution) -> list[float]:
-    return [found.focal for each in solution.reconstructions for model in each.models for found in model.images]
+    return [
+        found.focal
+        for each in solution.reconstructions
+        for model in each.models
+        for found in model.images
+    ]
 
 
 def mean_angle(solution: Solution, scene: SyntheticScene) -> float:
@@ -75,8 +85,12 @@ def mean_angle(solution: Solution, scene: SyntheticScene) -> float:
     angles, registered = [], registered_images(solution)
     for pair in scene.pairs:
         found_cameras = [registered[image.digest].camera for image in (pair.image0, pair.image1)]
-        found, wanted = (relative_pose(*both)[1] for both in (found_cameras, scene.true_cameras(pair)))
-        angles.append(np.degrees(np.arccos(found @ wanted / np.linalg.norm(found) / np.linalg.norm(wanted))))
+        found, wanted = (
+            relative_pose(*both)[1] for both in (found_cameras, scene.true_cameras(pair))
+        )
+        angles.append(
+            np.degrees(np.arccos(found @ wanted / np.linalg.norm(found) / np.linalg.norm(wanted)))
+        )
     return float(np.mean(angles))
 
 
@@ -100,7 +114,9 @@ def test_shared_intrinsics_stay_unless_they_explain_fewer_points_and_the_files_a
     assert len(set(focals_of(reconstruct_batch(scene.pairs, CONFIG)))) == cameras
     (found,), _ = reconstruct_sharing(ViewGraph.of_pairs(scene.pairs), CONFIG, tmp_path)
     written = pycolmap.Reconstruction(tmp_path / "models" / "0").cameras.values()
-    assert {camera.focal_length for camera in written} == {image.focal for image in found.models[0].images}
+    assert {camera.focal_length for camera in written} == {
+        image.focal for image in found.models[0].images
+    }
     with pycolmap.Database.open(str(tmp_path / "database.db")) as database:
         assert (len(written), database.num_cameras()) == (cameras, cameras)
 

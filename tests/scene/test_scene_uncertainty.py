@@ -1,4 +1,6 @@
-"""The errors to expect of cameras: true on scenes with known cameras, in any world, larger for few points."""
+"""The errors to expect of cameras: true on scenes with known cameras, in any world, larger for few
+points.
+"""
 
 import numpy as np
 import pycolmap
@@ -18,15 +20,23 @@ def model_of(scene: SyntheticScene) -> SfmModel:
 
 
 def errors_over_sigmas(model: SfmModel, scene: SyntheticScene) -> np.ndarray:
-    """Of each image: the errors of rotation, centre and focal length in the frame of all cameras, (N, 3)."""
+    """Of each image: the errors of rotation, centre and focal length in the frame of all cameras,
+    (N, 3).
+    """
     true = [scene.cameras[found.image.name] for found in model.images]
     cameras = [found.camera for found in model.images]
-    world = Rotation.from_matrix([a.R.T @ b.R for a, b in zip(cameras, true, strict=True)]).mean().as_matrix()
+    world = (
+        Rotation.from_matrix([a.R.T @ b.R for a, b in zip(cameras, true, strict=True)])
+        .mean()
+        .as_matrix()
+    )
     centres, places = (np.array([-c.R.T @ c.t for c in each]) for each in (cameras, true))
     centres, places = centres - centres.mean(axis=0), (places - places.mean(axis=0)) @ world.T
     size = np.sqrt((centres**2).sum(axis=1).mean())
     places *= (centres * places).sum() / (places**2).sum()
-    turns = Rotation.from_matrix([a.R @ world @ b.R.T for a, b in zip(cameras, true, strict=True)]).magnitude()
+    turns = Rotation.from_matrix(
+        [a.R @ world @ b.R.T for a, b in zip(cameras, true, strict=True)]
+    ).magnitude()
     errors = [
         np.degrees(turns),
         np.linalg.norm(centres - places, axis=1) / size,
@@ -47,7 +57,9 @@ def test_they_are_the_same_in_another_world():
     model = model_of(synthetic_scene(6, points=400))
     before = camera_sigmas(model.colmap)
     moved = pycolmap.Reconstruction(model.colmap)
-    moved.transform(pycolmap.Sim3d(3.0, pycolmap.Rotation3d(np.array([0.3, -0.2, 0.1])), np.array([5.0, -2, 1])))
+    moved.transform(
+        pycolmap.Sim3d(3.0, pycolmap.Rotation3d(np.array([0.3, -0.2, 0.1])), np.array([5.0, -2, 1]))
+    )
     after = camera_sigmas(moved)
     assert [*after] == [*before]
     np.testing.assert_allclose([*after.values()], [*before.values()], rtol=1e-3)

@@ -1,4 +1,6 @@
-"""A page in headless Chromium, driven by the DevTools protocol over a pipe; no package is needed for it."""
+"""A page in headless Chromium, driven by the DevTools protocol over a pipe; no package is needed
+for it.
+"""
 
 import base64
 import json
@@ -14,11 +16,19 @@ from typing import Any
 
 import pytest
 
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), "")
+CHROMIUM = next(
+    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), ""
+)
 needs_browser = pytest.mark.skipif(
     not CHROMIUM or not shutil.which("bash"), reason="no Chromium here: apt-get install chromium"
 )
-OPTIONS = ("--headless=new", "--no-sandbox", "--disable-gpu", "--no-first-run", "--remote-debugging-pipe")
+OPTIONS = (
+    "--headless=new",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--no-first-run",
+    "--remote-debugging-pipe",
+)
 SETTLE_S = 0.4  # after an event: the page draws in the next frame
 LOADING_S = 60.0
 
@@ -30,7 +40,9 @@ class Page:
         self._to, self._from, self._number = send, receive, 0
         self.errors: list[str] = []  # of the console, and exceptions
         self.requests: list[str] = []  # addresses that the page asked for
-        (target,) = (each for each in self._ask("Target.getTargets")["targetInfos"] if each["type"] == "page")
+        (target,) = (
+            each for each in self._ask("Target.getTargets")["targetInfos"] if each["type"] == "page"
+        )
         attached = self._ask("Target.attachToTarget", targetId=target["targetId"], flatten=True)
         self._session = attached["sessionId"]
         for domain in ("Page", "Runtime", "Log", "Network"):
@@ -90,7 +102,9 @@ class Page:
     def _ask(self, method: str, session: str = "", **parameters: Any) -> dict[str, Any]:
         self._number += 1
         message = {"id": self._number, "method": method, "params": parameters}
-        self._to.write(json.dumps(message | ({"sessionId": session} if session else {})).encode() + b"\0")
+        self._to.write(
+            json.dumps(message | ({"sessionId": session} if session else {})).encode() + b"\0"
+        )
         self._to.flush()
         while (answer := self._read()).get("id") != self._number:
             self._note(answer)
@@ -123,9 +137,21 @@ def opened_browser() -> Iterator[Page]:
     with TemporaryDirectory(ignore_cleanup_errors=True) as home:
         # The browser reads commands from descriptor 3 and writes answers to 4.
         line = f'exec "$@" 3<&{commands} 4>&{answers}'
-        words = ["bash", "-c", line, "bash", CHROMIUM, *OPTIONS, f"--user-data-dir={home}", "about:blank"]
+        words = [
+            "bash",
+            "-c",
+            line,
+            "bash",
+            CHROMIUM,
+            *OPTIONS,
+            f"--user-data-dir={home}",
+            "about:blank",
+        ]
         browser = subprocess.Popen(
-            words, pass_fds=(commands, answers), stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL
+            words,
+            pass_fds=(commands, answers),
+            stderr=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
         )
         os.close(commands)
         os.close(answers)

@@ -1,4 +1,6 @@
-"""Stand-in checkpoints of the paper's matchers in the public files' own formats, and a manifest that they fit."""
+"""Stand-in checkpoints of the paper's matchers in the public files' own formats, and a manifest
+that they fit.
+"""
 
 import hashlib
 from collections.abc import Callable, Iterable
@@ -30,7 +32,10 @@ def wrapped(state: dict[str, Tensor]) -> dict[str, Any]:
 
 def wrapped_aspanformer(state: dict[str, Tensor]) -> dict[str, Any]:
     """With the offsets that the published network keeps and does not read."""
-    offsets = {f"loftr_coarse.layers.{index}.attention.sample_offset": torch.ones(64, 2) for index in range(4)}
+    offsets = {
+        f"loftr_coarse.layers.{index}.attention.sample_offset": torch.ones(64, 2)
+        for index in range(4)
+    }
     return wrapped(state | offsets)
 
 
@@ -40,7 +45,11 @@ def roma_alone(state: dict[str, Tensor]) -> dict[str, Any]:
 
 def dinov2_alone(state: dict[str, Tensor]) -> dict[str, Any]:
     """The backbone has a file of its own."""
-    return {name.removeprefix("dinov2."): tensor for name, tensor in state.items() if name.startswith("dinov2.")}
+    return {
+        name.removeprefix("dinov2."): tensor
+        for name, tensor in state.items()
+        if name.startswith("dinov2.")
+    }
 
 
 def published_loma(state: dict[str, Tensor]) -> dict[str, Any]:
@@ -53,7 +62,9 @@ def published_loma(state: dict[str, Tensor]) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class PublicFile:
-    """One public checkpoint: its matcher, its slot of the manifest, the network that it fills, its layout."""
+    """One public checkpoint: its matcher, its slot of the manifest, the network that it fills, its
+    layout.
+    """
 
     name: str
     matcher: str
@@ -67,23 +78,40 @@ FILES = (
     PublicFile("superpoint_v1.pth", "superglue", "superpoint", "superpoint", SuperPoint),
     PublicFile("superglue_outdoor.pth", "superglue", "superglue-outdoor", "superglue", SuperGlue),
     PublicFile("outdoor_ds.ckpt", "loftr", "loftr-outdoor", "loftr", Loftr, wrapped),
-    PublicFile("quadtree_outdoor.ckpt", "quadtree", "quadtree-outdoor", "quadtree", Quadtree, wrapped),
-    PublicFile("aspan.pt", "aspanformer", "aspanformer-outdoor", "aspanformer", AspanFormer, wrapped_aspanformer),
+    PublicFile(
+        "quadtree_outdoor.ckpt", "quadtree", "quadtree-outdoor", "quadtree", Quadtree, wrapped
+    ),
+    PublicFile(
+        "aspan.pt",
+        "aspanformer",
+        "aspanformer-outdoor",
+        "aspanformer",
+        AspanFormer,
+        wrapped_aspanformer,
+    ),
     PublicFile("DKMv3_outdoor.pth", "dkm", "dkm-outdoor", "dkm", DKM),
     # Narrow ones, which load where ``adapters.roma.RoMa`` is ``narrow_roma``, too.
     PublicFile("roma_outdoor.pth", "roma", "roma-outdoor", "roma", narrow_roma, roma_alone),
-    PublicFile("dinov2_vitl14_pretrain.pth", "roma", "dinov2-vitl14", "roma", narrow_roma, dinov2_alone),
-    PublicFile("loma_B128.pth", "loma", "loma-b128", "loma", lambda: Loma(Variant.B128), published_loma),
+    PublicFile(
+        "dinov2_vitl14_pretrain.pth", "roma", "dinov2-vitl14", "roma", narrow_roma, dinov2_alone
+    ),
+    PublicFile(
+        "loma_B128.pth", "loma", "loma-b128", "loma", lambda: Loma(Variant.B128), published_loma
+    ),
 )
 
 
-def write_checkpoints(directory: Path, files: Iterable[PublicFile] = FILES) -> tuple[WeightFile, ...]:
+def write_checkpoints(
+    directory: Path, files: Iterable[PublicFile] = FILES
+) -> tuple[WeightFile, ...]:
     lines = []
     for file in files:
         path = directory / file.name
         torch.save(file.layout(standin_state(file.network(), STAND_INS[file.standin])), path)
         digest = f"sha256:{hashlib.sha256(path.read_bytes()).hexdigest()}"
-        lines.append(WeightFile(file.name, path.stat().st_size, digest, "none", file.slot, "made by tests"))
+        lines.append(
+            WeightFile(file.name, path.stat().st_size, digest, "none", file.slot, "made by tests")
+        )
     return tuple(lines)
 
 
@@ -92,5 +120,9 @@ def store_of(directory: Path, files: Iterable[PublicFile]) -> WeightStore:
 
 
 def use_manifest(monkeypatch: pytest.MonkeyPatch, lines: tuple[WeightFile, ...]) -> None:
-    """Runs that are begun from now on hold their weights against these lines instead of the package's own."""
-    monkeypatch.setattr(assembly, "WeightStore", lambda directories: WeightStore(directories, lines))
+    """Runs that are begun from now on hold their weights against these lines instead of the
+    package's own.
+    """
+    monkeypatch.setattr(
+        assembly, "WeightStore", lambda directories: WeightStore(directories, lines)
+    )

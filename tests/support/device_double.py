@@ -1,17 +1,20 @@
-"""A simulated GPU: tensors say ``cuda:N`` and are computed on the CPU; devices that meet raise, as on a GPU.
+"""A simulated GPU: tensors say ``cuda:N`` and are computed on the CPU; devices that meet raise, as
+on a GPU.
 
     with DeviceDouble(count=2):
         network.to("cuda:1")(image.to("cuda:1"))
 
-It works with a CPU build of PyTorch. To PyTorch's own code a tagged tensor lies on ``meta:N``, for which every
-build has a guard; all that Python can ask it says ``cuda:N``, and all operators come to :meth:`DeviceDouble.run`.
+It works with a CPU build of PyTorch. To PyTorch's own code a tagged tensor lies on ``meta:N``, for
+which every build has a guard; all that Python can ask it says ``cuda:N``, and all operators come to
+:meth:`DeviceDouble.run`.
 
 What raises :class:`MixedDevicesError`: an operator on tensors of two devices, but for a CPU tensor of no
 dimensions and for CPU indices into a tagged tensor, which a GPU takes as well; a generator of another device.
 ``.numpy()`` of a tagged tensor is the TypeError that it is on a GPU. What it cannot show: a GPU's rounding, its
 memory, its speed, half precision.
 
-Enter it in the thread that computes; networks that were moved within it are of no use outside of it.
+Enter it in the thread that computes; networks that were moved within it are of no use outside of
+it.
 """
 
 from __future__ import annotations
@@ -39,7 +42,11 @@ class Tagged(torch.Tensor):
     @staticmethod
     def __new__(cls, held, where):
         device = torch.device("meta", where.index)
-        layout = {"strides": held.stride(), "storage_offset": held.storage_offset(), "dtype": held.dtype}
+        layout = {
+            "strides": held.stride(),
+            "storage_offset": held.storage_offset(),
+            "dtype": held.dtype,
+        }
         made = torch.Tensor._make_wrapper_subclass(cls, held.shape, **layout, device=device)
         made.held, made.place = held, where
         return made
@@ -123,7 +130,11 @@ class DeviceDouble(TorchDispatchMode):
         yield torch, "Generator", Generator
         # Tagged tensors cannot be inference tensors: such have no version, which their views want.
         grads = []
-        yield torch.inference_mode, "__enter__", lambda mode: grads.append(torch.set_grad_enabled(False))
+        yield (
+            torch.inference_mode,
+            "__enter__",
+            lambda mode: grads.append(torch.set_grad_enabled(False)),
+        )
         yield torch.inference_mode, "__exit__", lambda mode, *error: grads.pop().__exit__(*error)
         yield torch.amp.autocast_mode, "is_autocast_available", lambda kind: True
         yield torch.cuda.amp.common, "amp_definitely_not_available", lambda: False
@@ -132,10 +143,16 @@ class DeviceDouble(TorchDispatchMode):
         return self.run(func, args, kwargs or {})
 
     def run(self, func, args, kwargs):
-        """One operator: on CPU tensors as it is, on tagged ones with their values, its results tagged anew."""
-        tensors = [each for each in tree_flatten((args, kwargs))[0] if isinstance(each, torch.Tensor)]
+        """One operator: on CPU tensors as it is, on tagged ones with their values, its results
+        tagged anew.
+        """
+        tensors = [
+            each for each in tree_flatten((args, kwargs))[0] if isinstance(each, torch.Tensor)
+        ]
         tagged = [each for each in tensors if isinstance(each, Tagged)]
-        wanted = None if kwargs.get("device") is None else self.known(torch.device(kwargs["device"]))
+        wanted = (
+            None if kwargs.get("device") is None else self.known(torch.device(kwargs["device"]))
+        )
         if not tagged and (wanted is None or wanted.type == "cpu"):
             return func(*args, **kwargs)
         name = func._schema.name.removeprefix("aten::")
@@ -149,15 +166,23 @@ class DeviceDouble(TorchDispatchMode):
         held = {id(each.held): each for each in tagged}
         if wanted is not None:
             kwargs = {**kwargs, "device": torch.device("cpu")}
-        inner_args, inner_kwargs = tree_map(lambda x: x.held if isinstance(x, Tagged) else x, (args, kwargs))
+        inner_args, inner_kwargs = tree_map(
+            lambda x: x.held if isinstance(x, Tagged) else x, (args, kwargs)
+        )
         out = func(*inner_args, **inner_kwargs)
         for each in tagged:
-            assert each.held.shape == each.shape, f"{name} changed a shape in place: the double cannot follow"
+            assert each.held.shape == each.shape, (
+                f"{name} changed a shape in place: the double cannot follow"
+            )
         if name in ("copy_", "set_"):
             return args[0]
 
         def tag(value):
-            if not isinstance(value, torch.Tensor) or isinstance(value, Tagged) or where.type == "cpu":
+            if (
+                not isinstance(value, torch.Tensor)
+                or isinstance(value, Tagged)
+                or where.type == "cpu"
+            ):
                 return value
             return held[id(value)] if id(value) in held else Tagged(value, where)
 
@@ -179,11 +204,15 @@ class DeviceDouble(TorchDispatchMode):
             return wanted or tagged[0].device
         free = [each for each in tensors if not isinstance(each, Tagged) and each.dim() == 0]
         if name in INDEXING and isinstance(args[0], Tagged):
-            free += [index for index in args[1] if index is not None and not isinstance(index, Tagged)]
+            free += [
+                index for index in args[1] if index is not None and not isinstance(index, Tagged)
+            ]
         met = {each.device for each in tensors if not any(each is other for other in free)}
         if len(met) > 1:
             found = ", ".join(sorted(map(str, met)))
-            raise MixedDevicesError(f"{name}: expected all tensors to be on the same device, but found {found}")
+            raise MixedDevicesError(
+                f"{name}: expected all tensors to be on the same device, but found {found}"
+            )
         return wanted or (tagged[0].device if tagged else torch.device("cpu"))
 
     def _check_generator(self, name, generator, where):

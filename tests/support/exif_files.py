@@ -9,8 +9,12 @@ import PIL.Image
 Value = int | str | tuple[int, int]  # a pair is a fraction
 
 
-def set_exif(path: Path, orientation: int | None = None, *, order: str = "<", **tags: Value) -> Path:
-    """Write EXIF into a JPEG or PNG file: an orientation, and tags of the EXIF directory such as ``tA405=28``."""
+def set_exif(
+    path: Path, orientation: int | None = None, *, order: str = "<", **tags: Value
+) -> Path:
+    """Write EXIF into a JPEG or PNG file: an orientation, and tags of the EXIF directory such as
+    ``tA405=28``.
+    """
     path.write_bytes(with_tiff(path.read_bytes(), tiff(orientation, order, **tags)))
     return path
 
@@ -28,6 +32,18 @@ def tiff(orientation: int | None = None, order: str = "<", **tags: Value) -> byt
 def with_tiff(data: bytes, part: bytes) -> bytes:
     """Return the bytes of a JPEG or PNG file with these tags."""
     if data[:2] == b"\xff\xd8":
-        return data[:2] + b"\xff\xe1" + struct.pack(">H", len(part) + 8) + b"Exif\0\0" + part + data[2:]
-    chunk = struct.pack(">I", len(part)) + b"eXIf" + part + struct.pack(">I", zlib.crc32(b"eXIf" + part))
+        return (
+            data[:2]
+            + b"\xff\xe1"
+            + struct.pack(">H", len(part) + 8)
+            + b"Exif\0\0"
+            + part
+            + data[2:]
+        )
+    chunk = (
+        struct.pack(">I", len(part))
+        + b"eXIf"
+        + part
+        + struct.pack(">I", zlib.crc32(b"eXIf" + part))
+    )
     return data[:33] + chunk + data[33:]  # after the header

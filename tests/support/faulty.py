@@ -60,11 +60,15 @@ def exhaust_gpu() -> None:
 
 
 def break_device() -> NoReturn:
-    raise RuntimeError(f"{BROKEN}\nCUDA kernel errors might be asynchronously reported at some other API call")
+    raise RuntimeError(
+        f"{BROKEN}\nCUDA kernel errors might be asynchronously reported at some other API call"
+    )
 
 
 def breaks_after(pairs: int) -> Callable[[int], int]:
-    """Answers of a matcher whose device fails after so many pairs, and then at everything in this process."""
+    """Answers of a matcher whose device fails after so many pairs, and then at everything in this
+    process.
+    """
     calls = count()
     return lambda _: 150 if next(calls) < pairs else break_device()
 
@@ -121,7 +125,9 @@ def runner(run: Callable[[SceneJob], Solution]) -> Callable[[SceneJob], Solution
 def scenes_by(
     monkeypatch: pytest.MonkeyPatch, make: Callable[[SceneJob], Solution], *, process: bool = False
 ) -> None:
-    """Let ``make`` reconstruct batches, in a thread of this process or, as real runs do, in a process."""
+    """Let ``make`` reconstruct batches, in a thread of this process or, as real runs do, in a
+    process.
+    """
     if process:
         monkeypatch.setattr(places, "scene_runner", partial(runner, make))
     else:
@@ -137,7 +143,8 @@ def choose_scene_for_all_but_the_first(job: SceneJob) -> Solution:
     camera = Camera(np.eye(3), np.eye(3), np.zeros(3))
     images = (BatchImage(name, name, Size(80, 72)) for name in names)
     registered = tuple(
-        RegisteredImage(each, camera, 99, Sigmas(0.1, 0.01 * n, 2.0)) for n, each in enumerate(images)
+        RegisteredImage(each, camera, 99, Sigmas(0.1, 0.01 * n, 2.0))
+        for n, each in enumerate(images)
     )
     points = np.zeros((job.matches, 3))
     return Solution((Reconstruction(names, (SfmModel(registered, points, 0.5),)),), choices)
@@ -164,15 +171,24 @@ def scene_in_a_gigabyte(job: SceneJob) -> Solution:
 
 
 def thread_place(
-    name: str, matcher: RectifiedMatcher, minibatch: int = 1, pipeline: Callable[[], Pipeline] | None = None
+    name: str,
+    matcher: RectifiedMatcher,
+    minibatch: int = 1,
+    pipeline: Callable[[], Pipeline] | None = None,
 ) -> Place:
     """Where workers are threads of this process, with that matcher, or that pipeline."""
     make = partial(Pipeline, THREE_UNITS, {matcher.name: matcher}.__getitem__, minibatch=minibatch)
-    return Place(name, partial(ThreadWorker, name, partial(MatchRunner, pipeline or make), lambda: None))
+    return Place(
+        name, partial(ThreadWorker, name, partial(MatchRunner, pipeline or make), lambda: None)
+    )
 
 
-def use_places(monkeypatch: pytest.MonkeyPatch, *used: Place, fallback: Sequence[Place] = ()) -> None:
-    """Let runs match at these places, and look every hundredth of a second for answers, without a pause."""
+def use_places(
+    monkeypatch: pytest.MonkeyPatch, *used: Place, fallback: Sequence[Place] = ()
+) -> None:
+    """Let runs match at these places, and look every hundredth of a second for answers, without a
+    pause.
+    """
 
     def site_of(assembly: Assembly, _: int, clock: Callable[[], float], log: Path) -> LocalSite:
         site = LocalSite(assembly, 0, clock, log)

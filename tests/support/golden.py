@@ -1,4 +1,6 @@
-"""Golden vectors beside the repository, ``../shared/golden``; tests that need them are skipped without them."""
+"""Golden vectors beside the repository, ``../shared/golden``; tests that need them are skipped
+without them.
+"""
 
 import re
 import runpy
@@ -31,7 +33,9 @@ def golden_arrays(network, case):
 
 @cache
 def recipe(path):
-    """The names that a recipe of weights defines; it puts its own folder on the path, which is taken off again."""
+    """The names that a recipe of weights defines; it puts its own folder on the path, which is
+    taken off again.
+    """
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "path", [*sys.path])
         return runpy.run_path(str(path))
@@ -39,13 +43,17 @@ def recipe(path):
 
 @lru_cache(maxsize=1)  # the largest have a gigabyte
 def standin_state(network, *which, **part):
-    """The stand-in checkpoint that the folder's ``standin.py`` makes, or that part of it, as tensors."""
+    """The stand-in checkpoint that the folder's ``standin.py`` makes, or that part of it, as
+    tensors.
+    """
     values = recipe(GOLDEN / network / "standin.py")["standin_state_dict"](*which, **part)
     return {name: torch.from_numpy(np.asarray(value)) for name, value in values.items()}
 
 
 def seeded_tensor(name, shape, gain=1.0):
-    return torch.from_numpy(recipe(GOLDEN / "seeded_weights.py")["seeded_tensor"](name, shape, gain))
+    return torch.from_numpy(
+        recipe(GOLDEN / "seeded_weights.py")["seeded_tensor"](name, shape, gain)
+    )
 
 
 @contextmanager
@@ -64,7 +72,9 @@ def ready(network, state):
 
 @dataclass(frozen=True)
 class Within:
-    """The allowed difference: a number, plus a part of each value, plus a part of the largest value."""
+    """The allowed difference: a number, plus a part of each value, plus a part of the largest
+    value.
+    """
 
     absolute: float = 0.0
     relative: float = 0.0
@@ -72,11 +82,17 @@ class Within:
 
     def of(self, expected):
         sizes = expected.double().abs()
-        return self.absolute + self.relative * sizes + self.share * (sizes.max() if sizes.numel() else 0)
+        return (
+            self.absolute
+            + self.relative * sizes
+            + self.share * (sizes.max() if sizes.numel() else 0)
+        )
 
 
 class Stage(NamedTuple):
-    """The value that a network computed at one stage, the expected value, and their allowed difference."""
+    """The value that a network computed at one stage, the expected value, and their allowed
+    difference.
+    """
 
     name: str
     got: torch.Tensor
@@ -85,9 +101,13 @@ class Stage(NamedTuple):
 
     @property
     def excess(self):
-        """Return by how much the difference exceeds the allowed one: infinite for other shapes, kinds, or NaN."""
+        """Return by how much the difference exceeds the allowed one: infinite for other shapes,
+        kinds, or NaN.
+        """
         got, expected = self.got, self.expected
-        alike = got.shape == expected.shape and got.is_floating_point() == expected.is_floating_point()
+        alike = (
+            got.shape == expected.shape and got.is_floating_point() == expected.is_floating_point()
+        )
         if not alike or not got.isfinite().all():
             return float("inf")
         within = self.within if isinstance(self.within, Within) else Within(self.within)
@@ -104,7 +124,9 @@ def compared(values, golden, tolerances, suffix=""):
     assert len(names) >= 2
     for name in names:
         expected = golden[f"{name}{suffix}"]
-        within = next((value for pattern, value in tolerances.items() if re.match(pattern, name)), 0.0)
+        within = next(
+            (value for pattern, value in tolerances.items() if re.match(pattern, name)), 0.0
+        )
         yield Stage(f"{name}{suffix}", values[name].reshape(expected.shape), expected, within)
 
 
@@ -116,4 +138,6 @@ def in_order(rows):
 def assert_stages(stages):
     """All stages within their tolerances; the message starts with the first stage that is off."""
     off = [stage for stage in stages if stage.excess > 0]
-    assert not off, "; ".join(f"{stage.name} exceeds its tolerance by {stage.excess:.2g}" for stage in off)
+    assert not off, "; ".join(
+        f"{stage.name} exceeds its tolerance by {stage.excess:.2g}" for stage in off
+    )

@@ -1,4 +1,6 @@
-"""A stand-in for Kaggle's image, an environment with its packages and none of ours; and Kaggle's uploads."""
+"""A stand-in for Kaggle's image, an environment with its packages and none of ours; and Kaggle's
+uploads.
+"""
 
 import os
 import re
@@ -11,13 +13,16 @@ from pathlib import Path
 from zipfile import ZipFile, is_zipfile
 
 BESIDE = ("matplotlib", "ipykernel", "nbclient", "nbformat")
-UNPACKED = (".zip", ".tar", ".gz", ".pt", ".pth", ".ckpt")  # Kaggle unpacks archives, as torch's checkpoints are
+# Kaggle unpacks archives, as torch's checkpoints are
+UNPACKED = (".zip", ".tar", ".gz", ".pt", ".pth", ".ckpt")
 PACKAGES = ("numpy", "scipy", "scikit-learn", "opencv-python-headless", "torch", "pip")
 PACKAGES += ("pandas", "tqdm", *BESIDE)
 
 
 def upload(folder: Path, mount: Path) -> None:
-    """What Kaggle makes of an uploaded folder: sub-folders are dropped, archives become directories."""
+    """What Kaggle makes of an uploaded folder: sub-folders are dropped, archives become
+    directories.
+    """
     mount.mkdir(parents=True)
     for path in folder.iterdir():
         if path.suffix in UNPACKED and is_zipfile(path):
@@ -58,7 +63,9 @@ def closure(names: Sequence[str]) -> dict[str, Distribution]:
 
 
 def pack_wheel(name: str, directory: Path) -> Path:
-    """The wheel that an installed distribution came from, but for the order and dates of its entries."""
+    """The wheel that an installed distribution came from, but for the order and dates of its
+    entries.
+    """
     installed = distribution(name)
     tags = re.findall(r"^Tag: (.*)$", installed.read_text("WHEEL") or "", re.MULTILINE)
     columns = zip(*(tag.split("-") for tag in tags), strict=True)
@@ -68,13 +75,19 @@ def pack_wheel(name: str, directory: Path) -> Path:
     written_by_pip = ("INSTALLER", "REQUESTED", "direct_url.json")
     with ZipFile(path, "w") as archive:
         for file in installed.files or ():
-            if file.parts[0] != ".." and "__pycache__" not in file.parts and file.name not in written_by_pip:
+            if (
+                file.parts[0] != ".."
+                and "__pycache__" not in file.parts
+                and file.name not in written_by_pip
+            ):
                 archive.write(Path(str(installed.locate_file(file))), str(file))
     return path
 
 
 def environment(**more: str) -> dict[str, str]:
-    """This process's environment without what leads to its own packages, or tells that a test is running."""
+    """This process's environment without what leads to its own packages, or tells that a test is
+    running.
+    """
     hidden = ("PYTHONPATH", "VIRTUAL_ENV", "MKPC_WEIGHTS", "PYTEST_CURRENT_TEST")
     kept = {name: value for name, value in os.environ.items() if name not in hidden}
     return {**kept, "PYTHONNOUSERSITE": "1", **more}

@@ -1,4 +1,5 @@
-"""All matchers of learned features with stand-in weights and no files; in light configurations by default.
+"""All matchers of learned features with stand-in weights and no files; in light configurations by
+default.
 
 A new matcher is one line in ``MATCHERS``.
 """

@@ -1,6 +1,7 @@
 """Notebooks executed from a clean kernel in a network namespace without interfaces.
 
-As a program it executes a notebook in place and keeps its pictures: ``offline_notebook.py NOTEBOOK``.
+As a program it executes a notebook in place and keeps its pictures: ``offline_notebook.py
+NOTEBOOK``.
 """
 
 import os
@@ -29,29 +30,42 @@ finally:
     nbformat.write(notebook, sys.argv[2])
 """
 OFFLINE = ("unshare", "--map-root-user", "--net")
-HAS_NAMESPACES = shutil.which("unshare") and subprocess.run([*OFFLINE, "true"], check=False).returncode == 0
-needs_namespaces = pytest.mark.skipif(not HAS_NAMESPACES, reason="unshare --net is not permitted here")
+HAS_NAMESPACES = (
+    shutil.which("unshare") and subprocess.run([*OFFLINE, "true"], check=False).returncode == 0
+)
+needs_namespaces = pytest.mark.skipif(
+    not HAS_NAMESPACES, reason="unshare --net is not permitted here"
+)
 
 
 def execute(
     notebook: Path, executed: Path, python: str | Path, working: Path, variables: Mapping[str, str]
 ) -> nbformat.NotebookNode:
-    """Run ``notebook`` in ``working`` under that interpreter; the executed notebook, also in ``executed``."""
+    """Run ``notebook`` in ``working`` under that interpreter; the executed notebook, also in
+    ``executed``.
+    """
     command = [*OFFLINE, str(python), "-c", EXECUTE, str(notebook), str(executed)]
     # Not under pytest's own directory: the path of a socket may have no more than 107 characters.
     with TemporaryDirectory(prefix="mkpc-") as runtime:
         env = {**variables, "JUPYTER_RUNTIME_DIR": runtime}
-        done = subprocess.run(command, capture_output=True, text=True, env=env, cwd=working, check=False)
+        done = subprocess.run(
+            command, capture_output=True, text=True, env=env, cwd=working, check=False
+        )
     assert done.returncode == 0, done.stderr
     return nbformat.read(executed, as_version=4)
 
 
 def printed(notebook: nbformat.NotebookNode) -> str:
-    return "".join(output["text"] for output in outputs(notebook) if output["output_type"] == "stream")
+    return "".join(
+        output["text"] for output in outputs(notebook) if output["output_type"] == "stream"
+    )
 
 
 def pictures(notebook: nbformat.NotebookNode) -> int:
-    return sum(bool({"image/png", "image/jpeg"} & set(output.get("data", {}))) for output in outputs(notebook))
+    return sum(
+        bool({"image/png", "image/jpeg"} & set(output.get("data", {})))
+        for output in outputs(notebook)
+    )
 
 
 def outputs(notebook: nbformat.NotebookNode) -> list[nbformat.NotebookNode]:
@@ -77,7 +91,9 @@ def with_pictures_alone(notebook: nbformat.NotebookNode) -> nbformat.NotebookNod
 
 def main(path: Path) -> None:
     with TemporaryDirectory() as directory:
-        executed = execute(path, Path(directory) / "executed.ipynb", sys.executable, path.parent, os.environ)
+        executed = execute(
+            path, Path(directory) / "executed.ipynb", sys.executable, path.parent, os.environ
+        )
     path.write_text(nbformat.writes(with_pictures_alone(executed)) + "\n", encoding="utf-8")
 
 

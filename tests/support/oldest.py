@@ -1,7 +1,8 @@
-"""Prints the lowest versions that ``pyproject.toml`` declares, ``name==version`` a line, for ``make oldest``.
+"""Prints the lowest versions that ``pyproject.toml`` declares, ``name==version`` a line, for ``make
+oldest``.
 
-Arguments name extras to add. ``torch`` is left out, since few indexes have CPU builds of its old versions, and so
-is what has no lower bound, such as type stubs.
+Arguments name extras to add. ``torch`` is left out, since few indexes have CPU builds of its old
+versions, and so is what has no lower bound, such as type stubs.
 """
 
 import re

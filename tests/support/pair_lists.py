@@ -21,7 +21,9 @@ def turned_camera(camera: Camera, turns: int, size: Size) -> Camera:
     return camera
 
 
-def line_of(names: tuple[str, str], cameras: tuple[Camera, Camera], turns: tuple[int, int] = (0, 0)) -> str:
+def line_of(
+    names: tuple[str, str], cameras: tuple[Camera, Camera], turns: tuple[int, int] = (0, 0)
+) -> str:
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = relative_pose(*cameras)
     numbers = np.concatenate([cameras[0].K.ravel(), cameras[1].K.ravel(), T.ravel()])

@@ -20,14 +20,19 @@ def picture(
     multiple: int = 1,
     padding: tuple[int, int] = (0, 0),
 ) -> Picture:
-    """The scene of that name, one to one, with at least that padding on the right and at the bottom."""
+    """The scene of that name, one to one, with at least that padding on the right and at the
+    bottom.
+    """
     pixels = scene(height, width, channels, name)
     return as_picture(pixels if channels == 3 else pixels[..., 0], multiple, padding)
 
 
 def as_picture(pixels: np.ndarray, multiple: int = 1, padding: tuple[int, int] = (0, 0)) -> Picture:
     content = Size(pixels.shape[1], pixels.shape[0])
-    sides = [-(-(side + more) // multiple) * multiple for side, more in zip(content, padding, strict=True)]
+    sides = [
+        -(-(side + more) // multiple) * multiple
+        for side, more in zip(content, padding, strict=True)
+    ]
     view = View(Box.whole(content), content, Size(*sides))
     return Picture(view.render(np.ascontiguousarray(pixels)), view)
 

@@ -4,7 +4,9 @@ from pathlib import Path
 
 
 def started_with(mark: str) -> dict[int, str]:
-    """The commands of the processes, by id, that have that text in their environment, which children inherit."""
+    """The commands of the processes, by id, that have that text in their environment, which
+    children inherit.
+    """
     found = {}
     for process in Path("/proc").glob("[0-9]*"):
         try:

@@ -61,10 +61,16 @@ class RectifiedMatcher:
         rng = np.random.default_rng(seen0.brightness + 1000 * max(seen0.view.content))
         points0 = rng.uniform(4, 60, (count, 2))
         points1 = points0 + np.column_stack([rng.uniform(0, 15, count), np.zeros(count)])
-        return Matches(seen0.view.from_image(points0), seen1.view.from_image(points1), rng.uniform(size=count))
+        return Matches(
+            seen0.view.from_image(points0), seen1.view.from_image(points1), rng.uniform(size=count)
+        )
 
 
-SWEEP, SECOND, THIRD = Unit(1, "rectified", 96), Unit(2, "rectified", 128), Unit(1, "rectified", 160)
+SWEEP, SECOND, THIRD = (
+    Unit(1, "rectified", 96),
+    Unit(2, "rectified", 128),
+    Unit(1, "rectified", 160),
+)
 THREE_UNITS = Recipe((SWEEP, SECOND, THIRD))
 SIZE = Size(80, 72)
 
@@ -89,7 +95,9 @@ def number_of(seen: Seen) -> int:
     return seen.brightness // 10 - 1
 
 
-def batch_pairs(directory: Path, images: int = 4, batch: str = "one", size: Size = SIZE) -> list[Pair]:
+def batch_pairs(
+    directory: Path, images: int = 4, batch: str = "one", size: Size = SIZE
+) -> list[Pair]:
     directory.mkdir(parents=True, exist_ok=True)
     paths = [directory / f"{number}.png" for number in range(images)]
     for number, path in enumerate(paths):
@@ -113,8 +121,12 @@ def run(
     is_watched: bool = False,
     more: Sequence[RectifiedMatcher] = (),
 ) -> RunReport:
-    """Run the recipe with these matchers; the submission is written to ``output``, or given to ``publish``."""
-    assembly = assemble(recipe, matchers={each.name: each for each in (matcher, *more)}, device="cpu")
+    """Run the recipe with these matchers; the submission is written to ``output``, or given to
+    ``publish``.
+    """
+    assembly = assemble(
+        recipe, matchers={each.name: each for each in (matcher, *more)}, device="cpu"
+    )
     budget = budget or Budget(time.monotonic(), limit)
     session = Session(work_dir, budget, interrupt or Interrupt(), progress=False, workers=workers)
     with session.watched() if is_watched else nullcontext():

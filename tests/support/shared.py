@@ -1,4 +1,6 @@
-"""What tests share: the material beside the repository, in ``../shared``, commands, recipes and folders."""
+"""What tests share: the material beside the repository, in ``../shared``, commands, recipes and
+folders.
+"""
 
 import json
 from pathlib import Path
@@ -18,7 +20,11 @@ needs_weights = pytest.mark.skipif(not WEIGHTS.is_dir(), reason=f"no checkpoints
 
 
 def contents(directory: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(directory)): path.read_bytes() for path in directory.rglob("*") if path.is_file()}
+    return {
+        str(path.relative_to(directory)): path.read_bytes()
+        for path in directory.rglob("*")
+        if path.is_file()
+    }
 
 
 def run_command(*words: object) -> int:
@@ -31,14 +37,18 @@ def problems_of(submission: Path, test_dir: Path) -> list[str]:
 
 
 def scores_of(out: Path, *options: object) -> dict[str, Any]:
-    """Run ``validate`` with these options in this process; return what it writes to the JSON file ``out``."""
+    """Run ``validate`` with these options in this process; return what it writes to the JSON file
+    ``out``.
+    """
     assert run_command("validate", "--workers", 0, "--json", out, *options) == 0
     return json.loads(out.read_text())
 
 
 def write_recipe(path: Path, *units: tuple[int, int], more: str = "") -> Path:
     """Write a recipe with a unit of SIFT for each stage and long side."""
-    texts = [f'{{ stage = {stage}, matcher = "sift", long_side = {side} }}' for stage, side in units]
+    texts = [
+        f'{{ stage = {stage}, matcher = "sift", long_side = {side} }}' for stage, side in units
+    ]
     path.write_text(f"units = [{', '.join(texts)}]\n{more}")
     return path
 

@@ -1,7 +1,8 @@
 """The engine on a virtual clock: random runs without images, and how well each used its time.
 
-The plan and the engine are the real ones. Workers are simulated: costs of units are random, with drifts, stalls,
-crashes, hangs and wrong first estimates. Reconstructions of batches crash, run out of memory and hang as well.
+The plan and the engine are the real ones. Workers are simulated: costs of units are random, with
+drifts, stalls, crashes, hangs and wrong first estimates. Reconstructions of batches crash, run out
+of memory and hang as well.
 """
 
 import math
@@ -55,7 +56,8 @@ MATCHES = 200  # that a unit finds
 POINTS = Matches(np.zeros((MATCHES, 2)), np.zeros((MATCHES, 2)), np.zeros(MATCHES))
 SWEEP_SHARE = 0.7  # of the limit, within which the sweep is said to fit
 
-MECHANISMS: dict[str, tuple[tuple[object, str, object], ...]] = {  # changes that switch each of them off
+# Changes that switch each of them off
+MECHANISMS: dict[str, tuple[tuple[object, str, object], ...]] = {
     "reserve for scenes": ((schedule, "RESERVE_SHARE", 0.0),),
     "margin of scenes": ((budget, "SCENE_MARGIN", 1.0),),
     "margin of units": ((budget, "MARGIN", 0.0), (budget, "MIN_MARGIN", 0.0)),
@@ -76,12 +78,13 @@ def switch_off(mechanism: str, change: Callable[[object, str, object], None] = s
 
 @dataclass(frozen=True)
 class Scenario:
-    """The circumstances of a run: costs in seconds of a unit on a pair, faults in probabilities per unit and pair.
+    """The circumstances of a run: costs in seconds of a unit on a pair, faults in probabilities per
+    unit and pair.
 
-    A worker dies at the start of any job, hangs, or answers late with probability ``job_faults``. ``spread`` is
-    the sigma of lognormal costs. Views of a share ``misses`` of the pairs are not cached and cost ``miss_factor``
-    times as much. ``warm_up`` are the extra seconds of a unit's first run on a worker. After the share ``turn`` of
-    the limit, costs are ``drift`` times as high.
+    A worker dies at the start of any job, hangs, or answers late with probability ``job_faults``.
+    ``spread`` is the sigma of lognormal costs. Views of a share ``misses`` of the pairs are not
+    cached and cost ``miss_factor`` times as much. ``warm_up`` are the extra seconds of a unit's
+    first run on a worker. After the share ``turn`` of the limit, costs are ``drift`` times as high.
 
     With 0 ``batches``, there are no scenes. Each image but one is in a single pair; if ``pairs_per_image`` is
     above 1, the run adds pairs. A scene takes ``scene_seconds`` per pair. It crashes, runs out of memory or hangs
@@ -134,7 +137,9 @@ class Scenario:
     @property
     def longest_scenes(self) -> float:
         """Seconds that all scenes take on average, if all is slow from the first moment on."""
-        return max(1.0, self.drift) * (self.batches * SCENE_START_S + self.pairs * self.scene_seconds)
+        return max(1.0, self.drift) * (
+            self.batches * SCENE_START_S + self.pairs * self.scene_seconds
+        )
 
 
 def random_scenario(seed: int, pairs: int) -> Scenario:
@@ -193,15 +198,17 @@ class SceneRun:
     is_faulty: bool
 
 
-Drawn = tuple[float, Answer, float]  # seconds until the answer, the answer, seconds of an injected fault
+# Seconds until the answer, the answer, seconds of an injected fault
+Drawn = tuple[float, Answer, float]
 
 
 class SimulatedSite(Site):
     """Workers that take their time on the virtual clock alone.
 
-    Of their seconds until ``stop``, ``kept`` went into jobs that came back in time. ``faults`` are what injected
-    faults take from any plan: the unit that a crash cut short, a hang for as long as a stall takes, the start of
-    a new worker. ``for_scenes`` are the seconds in which workers were idle and a scene was under way.
+    Of their seconds until ``stop``, ``kept`` went into jobs that came back in time. ``faults`` are
+    what injected faults take from any plan: the unit that a crash cut short, a hang for as long as
+    a stall takes, the start of a new worker. ``for_scenes`` are the seconds in which workers were
+    idle and a scene was under way.
     """
 
     def __init__(self, scenario: Scenario, clock: VirtualClock, stop: float) -> None:
@@ -210,8 +217,13 @@ class SimulatedSite(Site):
         self.kept = self.faults = self.last_job = self.for_scenes = 0.0
         self.scenes: list[SceneRun] = []
         self.workers: set[SimulatedWorker] = set()
-        self.costs = {unit.name: cost for unit, cost in zip(scenario.recipe.units, scenario.costs, strict=True)}
-        self.rng, self._scene_rng = (np.random.default_rng(seed) for seed in (scenario.seed, [scenario.seed, 1]))
+        self.costs = {
+            unit.name: cost
+            for unit, cost in zip(scenario.recipe.units, scenario.costs, strict=True)
+        }
+        self.rng, self._scene_rng = (
+            np.random.default_rng(seed) for seed in (scenario.seed, [scenario.seed, 1])
+        )
         makers = [(f"place {n}", self.match_worker, Work.MATCH) for n in range(scenario.workers)]
         makers.append(("estimates", lambda: SimulatedWorker(self, self.estimate), Work.LIGHT))
         for number in range(scenario.scene_places):
@@ -241,16 +253,22 @@ class SimulatedSite(Site):
 
     def unit_seconds(self, unit: Unit, now: float) -> float:
         scenario, rng = self.scenario, self.rng
-        seconds = self.costs[unit.name] * math.exp(scenario.spread * rng.normal() - scenario.spread**2 / 2)
+        seconds = self.costs[unit.name] * math.exp(
+            scenario.spread * rng.normal() - scenario.spread**2 / 2
+        )
         missed = rng.random() < scenario.misses
         return seconds * (scenario.miss_factor if missed else 1.0) * self.drift(now)
 
     def stall_seconds(self, unit: Unit, now: float) -> float:
-        """Return the seconds that a stall of a unit takes on an uncached view, at the costs of this time."""
+        """Return the seconds that a stall of a unit takes on an uncached view, at the costs of this
+        time.
+        """
         return STALL * self.costs[unit.name] * max(1.0, self.scenario.miss_factor) * self.drift(now)
 
     def match(self, warm: set[str], job: MatchJob) -> Drawn:
-        """Draw the answer of a worker that ran the units of ``warm`` before; none begins after ``job.seconds``."""
+        """Draw the answer of a worker that ran the units of ``warm`` before; none begins after
+        ``job.seconds``.
+        """
         scenario, rng, begun, spent = self.scenario, self.rng, self.clock.now, 0.0
         expected = dict(zip(job.units, job.expected, strict=True))
         if rng.random() < scenario.job_faults:
@@ -273,7 +291,11 @@ class SimulatedSite(Site):
                 if fate < scenario.crashes or unit.matcher == scenario.never:
                     return spent + took / 2, Failure(Cause.DIED), took / 2
                 if fate < scenario.crashes + scenario.hangs:
-                    return math.inf, Failure(Cause.TIMED_OUT), self.stall_seconds(unit, begun + spent)
+                    return (
+                        math.inf,
+                        Failure(Cause.TIMED_OUT),
+                        self.stall_seconds(unit, begun + spent),
+                    )
                 spent += took
                 rows.append(UnitResult(unit, POINTS, 0.0, took, warm_up=unit.name not in warm))
                 warm.add(unit.name)
@@ -295,8 +317,12 @@ class SimulatedSite(Site):
     def reconstruct(self, job: SceneJob) -> Drawn:
         scenario, rng, begun = self.scenario, self._scene_rng, self.clock.now
         spread = math.exp(0.3 * rng.normal() - 0.3**2 / 2)
-        spent = (SCENE_START_S + spread * scenario.scene_seconds * len(job.pairs)) * self.drift(begun)
-        answer: Answer = Solution((), (Choice(FALLBACK_FUNDAMENTAL, Reason.SCENE),) * len(job.pairs))
+        spent = (SCENE_START_S + spread * scenario.scene_seconds * len(job.pairs)) * self.drift(
+            begun
+        )
+        answer: Answer = Solution(
+            (), (Choice(FALLBACK_FUNDAMENTAL, Reason.SCENE),) * len(job.pairs)
+        )
         if is_faulty := rng.random() < scenario.scene_faults:
             answer = Failure(Cause.DIED, "signal SIGSEGV")
             spent *= (0.5, 0.3, math.inf)[rng.integers(3)]
@@ -307,7 +333,9 @@ class SimulatedSite(Site):
 class SimulatedWorker:
     """A worker whose answer is drawn when a job is submitted, and given when its time has come."""
 
-    def __init__(self, site: SimulatedSite, draw: Callable[[Any], Drawn], start_s: float = 0.0) -> None:
+    def __init__(
+        self, site: SimulatedSite, draw: Callable[[Any], Drawn], start_s: float = 0.0
+    ) -> None:
         self.ready = math.inf
         self._site, self._draw, self._start_s = site, draw, start_s
         self._answer: Answer = Loaded()
@@ -415,7 +443,8 @@ def simulate(scenario: Scenario, store: Store | None = None, until: float = math
         report,
         (site.kept + site.for_scenes) / given,
         max(0.0, clock.now - scenario.limit),
-        sum(length != scenario.pairs for length in published) + (scenario.pairs - swept if sweep_fits else 0),
+        sum(length != scenario.pairs for length in published)
+        + (scenario.pairs - swept if sweep_fits else 0),
         len(set(state.batches) - faulty - made),
         SCENE_MARGIN * scenario.longest_scenes < RESERVE_SHARE * scenario.limit
         and not any(math.isinf(scene.seconds) for scene in site.scenes),
@@ -427,10 +456,11 @@ def simulate(scenario: Scenario, store: Store | None = None, until: float = math
 
 
 def sweep_seconds(scenario: Scenario) -> float:
-    """Return the expected seconds of the sweep, with its drift, stalls, warm-ups, crashes and hangs.
+    """Return the expected seconds of the sweep, with its drift, stalls, warm-ups, crashes and
+    hangs.
 
-    The rest of the limit is for more faults than expected. A fault takes a worker's start and warm-up, and a hang
-    also takes as long as a stall.
+    The rest of the limit is for more faults than expected. A fault takes a worker's start and
+    warm-up, and a hang also takes as long as a stall.
     """
     unit = scenario.costs[0] * scenario.cached * max(1.0, scenario.drift)
     start = RESTART_S + scenario.warm_up

@@ -1,6 +1,8 @@
-"""Stand-in weights that come from code alone: of no use in earnest, but networks respond to texture and match.
+"""Stand-in weights that come from code alone: of no use in earnest, but networks respond to texture
+and match.
 
-Every number is made of bytes of SHAKE-256 of a name, so that no generator of numpy's or torch's can change it.
+Every number is made of bytes of SHAKE-256 of a name, so that no generator of numpy's or torch's can
+change it.
 """
 
 import hashlib
@@ -33,15 +35,32 @@ class StandIn:
 
 # Found by trial: with them a picture and its shifted copy have matches, and not everything matches.
 SUPERGLUE = {"kenc.encoder.12.weight": 0.3, "kenc.encoder.12.bias": 0.1, "final_proj.weight": 5.0}
-SUPERGLUE |= {"*.attn.proj.[01].weight": 16.0, "*.mlp.0.weight": 8.0, "*.mlp.3.weight": 0.1, "*.mlp.3.bias": 0.01}
+SUPERGLUE |= {
+    "*.attn.proj.[01].weight": 16.0,
+    "*.mlp.0.weight": 8.0,
+    "*.mlp.3.weight": 0.1,
+    "*.mlp.3.bias": 0.01,
+}
 LIGHTGLUE = {"input_proj.weight": 16.0, "transformers.*.ffn.3.*": 0.1, "*.final_proj.weight": 4.0}
 ASPANFORMER = {"*.layer3_outconv.weight": 2.0, "*.flow_decoder.2.weight": 0.3}
-ROMA = {"*.gamma": 10.0, "*.cls_token": 10.0, "*.pos_embed": 40.0, "*.conv_refiner.*.out_conv.weight": 10.0}
-# Features of coarse strides are not of one place, so that shifted pictures would have little in common.
-LOMA = {"*decoder.layers.[48].out_conv.*": 0.05, "matcher.posenc.Wr.weight": 3.0, "matcher.*.ffn.3.weight": 0.1}
+ROMA = {
+    "*.gamma": 10.0,
+    "*.cls_token": 10.0,
+    "*.pos_embed": 40.0,
+    "*.conv_refiner.*.out_conv.weight": 10.0,
+}
+# Features of coarse strides are not of one place, so that shifted pictures would have little in
+# common.
+LOMA = {
+    "*decoder.layers.[48].out_conv.*": 0.05,
+    "matcher.posenc.Wr.weight": 3.0,
+    "matcher.*.ffn.3.weight": 0.1,
+}
 LOMA |= {"matcher.*.Wqkv.weight": 1.4, "matcher.*.to_qk.weight": 1.4}
 STAND_INS = {
-    "superpoint": StandIn(3.0, {"conv1a.weight": 2.0, "convPb.weight": 2.0}, {"convPb.bias[64]": 7.0}),
+    "superpoint": StandIn(
+        3.0, {"conv1a.weight": 2.0, "convPb.weight": 2.0}, {"convPb.bias[64]": 7.0}
+    ),
     "superglue": StandIn(1.0, SUPERGLUE, {"bin_score": 45.0}),
     "loftr": StandIn(2.0, {"backbone.layer3_outconv.weight": 0.9}),
     "quadtree": StandIn(2.0, {"backbone.layer3_outconv.weight": 1.8, "*.attn.py_att.weight": 4.0}),
@@ -50,13 +69,21 @@ STAND_INS = {
     "xfeat": StandIn(2.0),
     "lightglue": StandIn(1.0, LIGHTGLUE),
     "roma": StandIn(1.5, ROMA),
-    "dkm": StandIn(1.5, {"*.terminal_module.*.weight": 2.0, "*.conv_refiner.*.out_conv.weight": 2.0}),
+    "dkm": StandIn(
+        1.5, {"*.terminal_module.*.weight": 2.0, "*.conv_refiner.*.out_conv.weight": 2.0}
+    ),
     "loma": StandIn(2.0, LOMA),
 }
 
 
 # RoMa with fewer channels, a thirtieth of its size: most of what is left is VGG.
-REFINERS = {16: (64, 16, 7, 369), 8: (48, 8, 3, 153), 4: (32, 8, 2, 97), 2: (16, 4, None, 36), 1: (9, 6, None, 24)}
+REFINERS = {
+    16: (64, 16, 7, 369),
+    8: (48, 8, 3, 153),
+    4: (32, 8, 2, 97),
+    2: (16, 4, None, 36),
+    1: (9, 6, None, 24),
+}
 REFINERS = {stride: WarpRefinerShape(*shape) for stride, shape in REFINERS.items()}
 
 
@@ -69,15 +96,17 @@ def narrow_roma() -> RoMa:
 def uniform(name: str, shape: Sequence[int] = ()) -> np.ndarray:
     """float64 in (-1, 1), 2^16 different values, as the name has it."""
     count = int(np.prod(shape, dtype=int))
-    whole = np.frombuffer(hashlib.shake_256(name.encode()).digest(2 * count), "<u2").astype(np.float64)
+    whole = np.frombuffer(hashlib.shake_256(name.encode()).digest(2 * count), "<u2").astype(
+        np.float64
+    )
     return ((2 * whole + 1) / 2**16 - 1).reshape(shape)
 
 
 def value_of(name: str, shape: Sequence[int], gain: float) -> np.ndarray:
     """The value of one parameter or buffer.
 
-    Maps have no mean, so that a flat input leaves them silent, and the variance ``gain`` / fan-in. Norms are
-    nearly neutral, with positive variances; biases are small.
+    Maps have no mean, so that a flat input leaves them silent, and the variance ``gain`` / fan-in.
+    Norms are nearly neutral, with positive variances; biases are small.
     """
     numbers = uniform(name, shape)
     if len(shape) > 1:
@@ -97,7 +126,9 @@ def standin_state(network: nn.Module, standin: StandIn) -> dict[str, Tensor]:
         if not tensor.is_floating_point():
             state[name] = torch.zeros_like(tensor)
             continue
-        scale = np.prod([factor for pattern, factor in standin.scales.items() if fnmatchcase(name, pattern)])
+        scale = np.prod(
+            [factor for pattern, factor in standin.scales.items() if fnmatchcase(name, pattern)]
+        )
         value = scale * value_of(name, tuple(tensor.shape), standin.gain)
         state[name] = torch.from_numpy(np.asarray(value, np.float32))
     for name, value in standin.values.items():
@@ -112,7 +143,9 @@ def filled(network: nn.Module, name: str) -> nn.Module:
 
 
 def scene(height: int, width: int, channels: int = 1, name: str = "scene") -> np.ndarray:
-    """A picture with texture at all scales, (height, width, channels) uint8; exact, for it is made of integers."""
+    """A picture with texture at all scales, (height, width, channels) uint8; exact, for it is made
+    of integers.
+    """
     total = np.zeros((height, width, channels), int)
     for cell in (3, 8, 24):
         rows, columns = -(-height // cell), -(-width // cell)

@@ -11,7 +11,9 @@ from socketserver import BaseRequestHandler, TCPServer, ThreadingTCPServer
 
 @dataclass
 class Site:
-    """What the server does; it may be changed between requests. ``asked`` gets each request's Range header."""
+    """What the server does; it may be changed between requests. ``asked`` gets each request's Range
+    header.
+    """
 
     data: bytes
     breaks: list[int] = field(default_factory=list)  # bytes after which the first connections break
@@ -30,7 +32,9 @@ class _Handler(BaseHTTPRequestHandler):
         site = self.site
         site.asked.append(self.headers.get("Range", ""))
         if site.redirect:
-            self.wfile.write(b"HTTP/1.1 302 Found\r\nLocation: " + site.redirect.encode() + b"\r\n\r\n")
+            self.wfile.write(
+                b"HTTP/1.1 302 Found\r\nLocation: " + site.redirect.encode() + b"\r\n\r\n"
+            )
         elif site.statuses:
             self.send_error(site.statuses.pop(0))
         else:
@@ -41,7 +45,9 @@ class _Handler(BaseHTTPRequestHandler):
         body = site.data[start:]
         self.send_response(206 if start else 200)
         if start:
-            self.send_header("Content-Range", f"bytes {start}-{len(site.data) - 1}/{len(site.data)}")
+            self.send_header(
+                "Content-Range", f"bytes {start}-{len(site.data) - 1}/{len(site.data)}"
+            )
         if site.length != 0:
             self.send_header("Content-Length", str(site.length or len(body)))
         self.end_headers()
@@ -56,7 +62,9 @@ class _Handler(BaseHTTPRequestHandler):
 
 @contextmanager
 def serve(site: Site) -> Iterator[Site]:
-    with _running(ThreadingHTTPServer(("127.0.0.1", 0), type("Handler", (_Handler,), {"site": site}))) as site.url:
+    with _running(
+        ThreadingHTTPServer(("127.0.0.1", 0), type("Handler", (_Handler,), {"site": site}))
+    ) as site.url:
         yield site
 
 

@@ -1,4 +1,6 @@
-"""What the tests of weights share: lines of a manifest, files that fit them, and no other place to search."""
+"""What the tests of weights share: lines of a manifest, files that fit them, and no other place to
+search.
+"""
 
 import hashlib
 from pathlib import Path
@@ -22,7 +24,9 @@ def line(
     slot: str = "slot",
     source: str = "somewhere",
 ) -> WeightFile:
-    return WeightFile(name, len(data) if size is None else size, digest or digest_of(data), "MIT", slot, source)
+    return WeightFile(
+        name, len(data) if size is None else size, digest or digest_of(data), "MIT", slot, source
+    )
 
 
 def put(directory: Path, name: str = "a.bin", data: bytes = DATA) -> Path:

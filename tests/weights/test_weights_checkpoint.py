@@ -27,7 +27,11 @@ from mkpc_kaggle.weights import checkpoint, load_tensors
 from mkpc_kaggle.weights.checkpoint import convert
 from mkpc_kaggle.weights.manifest import UNVERIFIED, WeightFile
 
-TENSORS = {"a.weight": torch.arange(6.0).reshape(2, 3), "a.count": torch.tensor(7), "b": torch.zeros(0)}
+TENSORS = {
+    "a.weight": torch.arange(6.0).reshape(2, 3),
+    "a.count": torch.tensor(7),
+    "b": torch.zeros(0),
+}
 save_legacy = partial(torch.save, _use_new_zipfile_serialization=False)
 
 
@@ -39,12 +43,17 @@ def assert_same(loaded: dict[str, torch.Tensor], wanted: dict[str, torch.Tensor]
     assert list(loaded) == list(wanted)
     for name, tensor in wanted.items():
         found = loaded[name]
-        assert (found.dtype, found.stride(), found.requires_grad) == (tensor.dtype, tensor.stride(), False)
+        assert (found.dtype, found.stride(), found.requires_grad) == (
+            tensor.dtype,
+            tensor.stride(),
+            False,
+        )
         assert torch.equal(found, tensor)
 
 
 @pytest.mark.parametrize(
-    ("save", "wrapped"), [(torch.save, 0), (torch.save, 1), (save_legacy, 0), (save_legacy, 1), (save_file, 0)]
+    ("save", "wrapped"),
+    [(torch.save, 0), (torch.save, 1), (save_legacy, 0), (save_legacy, 1), (save_file, 0)],
 )
 def test_every_file_format_gives_the_same_plain_tensors(tmp_path, save, wrapped):
     path = tmp_path / ("x.safetensors" if save is save_file else "x.pt")
@@ -76,8 +85,14 @@ def test_anything_but_a_table_of_plain_tensors_is_refused(tmp_path, save):
     ones, base = torch.ones(2, 3), torch.zeros(10_000)
     odd = [ones, [ones], {"state_dict": 3}, {3: ones}, {"x": ones.to_sparse()}]
     odd += [{"x": ones.to_sparse_csr()}, {"x": ones.to("meta")}]
-    odd += [{"x": torch.quantize_per_tensor(ones, 0.1, 0, torch.quint8)}, {"x": torch.zeros(1).expand(1_000_000)}]
-    odd += [{"x": torch.nested.nested_tensor([ones[0], ones[1, :2]])}, {str(n): base for n in range(100)}]
+    odd += [
+        {"x": torch.quantize_per_tensor(ones, 0.1, 0, torch.quint8)},
+        {"x": torch.zeros(1).expand(1_000_000)},
+    ]
+    odd += [
+        {"x": torch.nested.nested_tensor([ones[0], ones[1, :2]])},
+        {str(n): base for n in range(100)},
+    ]
     for value in odd:
         save(value, tmp_path / "x.pt")
         with pytest.raises(UserError, match=r"x\.pt cannot be read as a checkpoint: .*"):
@@ -114,15 +129,28 @@ def framework(monkeypatch):
     return module
 
 
-def training_checkpoint(framework: types.ModuleType, state: dict[str, torch.Tensor]) -> dict[str, Any]:
+def training_checkpoint(
+    framework: types.ModuleType, state: dict[str, torch.Tensor]
+) -> dict[str, Any]:
     return {
         "epoch": 3,
         "pytorch-lightning_version": "1.3.5",
-        "callbacks": {framework.Checkpoint: framework.Checkpoint(), "sizes": {1, 2}, "z": 1 + 2j, "b": b"x"},
+        "callbacks": {
+            framework.Checkpoint: framework.Checkpoint(),
+            "sizes": {1, 2},
+            "z": 1 + 2j,
+            "b": b"x",
+        },
         "optimizer_states": [{"state": {0: {"step": 3, "mean": torch.ones(2)}}}],
         "hyper_parameters": Namespace(a=[1, 2], b=framework.schedule),
         "lr_schedulers": [{"milestones": Counter([8, 12, 12])}],
-        "misc": [framework.Slotted(), torch.float32, torch.Size([2]), torch.device("cpu"), Path("/x")],
+        "misc": [
+            framework.Slotted(),
+            torch.float32,
+            torch.Size([2]),
+            torch.device("cpu"),
+            Path("/x"),
+        ],
         "state_dict": state,
     }
 
@@ -133,7 +161,12 @@ def test_a_training_checkpoint_with_unknown_classes_gives_its_tensors_but_not_in
     base = torch.arange(24.0).reshape(4, 6)
     network = nn.Sequential(nn.Linear(3, 2), nn.BatchNorm1d(2))
     state = OrderedDict(network.state_dict())
-    state |= {"shared": base, "columns": base.t(), "strided": base[::2, 1::3], "empty": torch.zeros(0, 3)}
+    state |= {
+        "shared": base,
+        "columns": base.t(),
+        "strided": base[::2, 1::3],
+        "empty": torch.zeros(0, 3),
+    }
     state |= {"parameter": nn.Parameter(torch.ones(3)), "complex": torch.tensor([1 + 2j])}
     for dtype in (torch.bfloat16, torch.float16, torch.int64, torch.uint8, torch.bool):
         state[f"{dtype}"] = torch.tensor([[0, 1, 1], [1, 0, 0]]).to(dtype)
@@ -168,11 +201,15 @@ def nasty(sentinel: Path) -> dict[str, object]:
         "os.system": Call(os.system, command),
         "builtins.eval": Call(eval, f"__import__('pathlib').Path({str(sentinel)!r}).touch()"),
         "os.mkdir": Call(os.mkdir, str(sentinel)),
-        "builtins.getattr": Call(operator.call, Call(getattr, Call(__import__, "os"), "system"), command),
+        "builtins.getattr": Call(
+            operator.call, Call(getattr, Call(__import__, "os"), "system"), command
+        ),
         "torch.load": Call(torch.load, str(hidden), "cpu", Call(__import__, "pickle")),
         "torch.save": Call(torch.save, 1, str(sentinel)),
         "state": Call(types.SimpleNamespace, state={"x": Call(os.system, command)}),
-        "rebuild": Call(torch._utils._rebuild_parameter, Call(os.system, command), False, OrderedDict()),
+        "rebuild": Call(
+            torch._utils._rebuild_parameter, Call(os.system, command), False, OrderedDict()
+        ),
     }
 
 
@@ -189,14 +226,17 @@ def test_a_malicious_pickle_runs_nothing(tmp_path, save):
             except UserError as refusal:
                 assert path.name in str(refusal)
             assert not sentinel.exists(), name
-        with contextlib.suppress(Exception):  # the bombs would go off; some fail after they have run
+        # The bombs would go off; some fail after they have run
+        with contextlib.suppress(Exception):
             pickle.loads(pickle.dumps(bomb, protocol=2))
         assert sentinel.exists(), name
         sentinel.rmdir() if sentinel.is_dir() else sentinel.unlink()
 
 
 def with_pickle(path: Path, change: Callable[[bytes], bytes]) -> Path:
-    """A checkpoint with an unknown object beside its tensors, as torch writes it, its pickle changed."""
+    """A checkpoint with an unknown object beside its tensors, as torch writes it, its pickle
+    changed.
+    """
     torch.save({"state_dict": TENSORS, "options": Namespace()}, path)
     with zipfile.ZipFile(path) as archive:
         records = {name: archive.read(name) for name in archive.namelist()}
@@ -211,7 +251,9 @@ def test_records_that_unpack_to_more_than_the_file_or_overlap_are_refused(tmp_pa
     assert load_tensors(path).keys() == TENSORS.keys()
     with zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("x/big", bytes(1_000_000))
-    with pytest.raises(UserError, match=r"x\.pt cannot be read .* records are compressed or overlap"):
+    with pytest.raises(
+        UserError, match=r"x\.pt cannot be read .* records are compressed or overlap"
+    ):
         load_tensors(path)
     with_pickle(path, bytes)
     with zipfile.ZipFile(path, "a") as archive:
@@ -241,7 +283,12 @@ def test_a_damaged_pickle_gives_tensors_or_a_refusal(tmp_path_factory, changes):
 
 def test_every_tensor_comes_through_whatever_it_shares(tmp_path):
     base = torch.arange(12.0).reshape(3, 4)
-    tensors = {"net.base": base, "net.turned": base.t(), "net.same": base, "net.count": torch.tensor([3])}
+    tensors = {
+        "net.base": base,
+        "net.turned": base.t(),
+        "net.same": base,
+        "net.count": torch.tensor([3]),
+    }
     tensors |= {"net.half": torch.tensor(0.5, dtype=torch.bfloat16)}
     torch.save({"state_dict": tensors, "epoch": 3}, tmp_path / "x.ckpt")
     line = convert(tmp_path / "x.ckpt", tmp_path / "new" / "x.safetensors")
@@ -276,7 +323,11 @@ def test_what_cannot_be_converted_is_stated(tmp_path):
     for file, result, message in (
         ("x.pt", "x.bin", r"x\.bin: the name must end in \.safetensors"),
         ("gone.pt", "x.safetensors", r"gone\.pt cannot be read"),
-        ("odd.pt", "x.safetensors", r"odd\.pt: safetensors has no type for tensors of torch\.complex32"),
+        (
+            "odd.pt",
+            "x.safetensors",
+            r"odd\.pt: safetensors has no type for tensors of torch\.complex32",
+        ),
         ("x.pt", "x.pt/x.safetensors", r"x\.safetensors cannot be written"),
     ):
         with pytest.raises(UserError, match=message):

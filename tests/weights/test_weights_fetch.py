@@ -25,8 +25,12 @@ def site(monkeypatch: pytest.MonkeyPatch) -> Iterator[Site]:
         yield site
 
 
-def get(site: Site, directory: Path, file: WeightFile | None = None, pauses: list[float] | None = None) -> Fetched:
-    """Download without a pause between attempts; ``pauses`` takes the seconds that there would have been."""
+def get(
+    site: Site, directory: Path, file: WeightFile | None = None, pauses: list[float] | None = None
+) -> Fetched:
+    """Download without a pause between attempts; ``pauses`` takes the seconds that there would have
+    been.
+    """
     wanted = replace(file or line(data=BIG), source=f"{site.url} (renamed)")
     return fetch.fetch(wanted, directory, NO_WHEELS, wait=([] if pauses is None else pauses).append)
 
@@ -56,7 +60,8 @@ def test_another_call_goes_on_where_the_last_one_gave_up(site, tmp_path):
     assert f"{CUT} of {len(BIG)} bytes" in failed.note
     assert (len(site.asked), pauses) == (ATTEMPTS, [1, 2, 4, 8])
     assert names_in(tmp_path) == ["a.bin.part"]
-    with serve(Site(b"", redirect=site.url)) as front:  # a redirection keeps the part that is asked for
+    # A redirection keeps the part that is asked for
+    with serve(Site(b"", redirect=site.url)) as front:
         assert get(front, tmp_path).outcome is FetchOutcome.FETCHED
     assert (tmp_path / "a.bin").read_bytes() == BIG
     assert site.sent == len(BIG)
@@ -87,12 +92,16 @@ def test_only_errors_that_pass_are_waited_for(site, tmp_path, status, requests):
     fetched = get(site, tmp_path)
     assert len(site.asked) == requests
     assert fetched.outcome is (FetchOutcome.FAILED if requests == 1 else FetchOutcome.FETCHED)
-    assert requests == 2 or (f"the server says {status}" in fetched.note and names_in(tmp_path) == [])
+    assert requests == 2 or (
+        f"the server says {status}" in fetched.note and names_in(tmp_path) == []
+    )
 
 
 def test_what_cannot_be_reached_or_written_is_told(site, tmp_path):
     pauses = []
-    gone = fetch.fetch(replace(line(), source="http://127.0.0.1:9/a.bin"), tmp_path, NO_WHEELS, wait=pauses.append)
+    gone = fetch.fetch(
+        replace(line(), source="http://127.0.0.1:9/a.bin"), tmp_path, NO_WHEELS, wait=pauses.append
+    )
     assert (gone.outcome, len(pauses)) == (FetchOutcome.FAILED, ATTEMPTS - 1)
     assert "127.0.0.1:9" in gone.note
     site.redirect = "file:///etc/hostname"
@@ -155,7 +164,12 @@ def test_what_is_not_the_part_is_replaced(site, tmp_path, make):
     assert (tmp_path / "precious").read_bytes() == DATA
 
 
-SOURCES = ["https://drive.google.com/file/d/1", "a.ckpt of a.tar, https://x.org/a.tar", "ftp://x/a", "file:///a"]
+SOURCES = [
+    "https://drive.google.com/file/d/1",
+    "a.ckpt of a.tar, https://x.org/a.tar",
+    "ftp://x/a",
+    "file:///a",
+]
 
 
 @pytest.mark.parametrize("source", SOURCES)
@@ -166,9 +180,16 @@ def test_what_cannot_be_downloaded_as_it_is_is_for_the_user(tmp_path, source):
 
 
 def test_of_alternatives_the_one_that_is_there_is_chosen_then_one_from_the_web(tmp_path):
-    files = [line("a", source="by hand"), line("b", source="https://x.org/b"), line("c", source="by hand")]
+    files = [
+        line("a", source="by hand"),
+        line("b", source="https://x.org/b"),
+        line("c", source="by hand"),
+    ]
     assert choose(files, tmp_path).name == "b"
-    assert choose([files[0], line("d", source="by hand wheel:some-weights==1.0/d.pt")], tmp_path).name == "d"
+    assert (
+        choose([files[0], line("d", source="by hand wheel:some-weights==1.0/d.pt")], tmp_path).name
+        == "d"
+    )
     assert choose(files[::2], tmp_path).name == "a"
     put(tmp_path, "c", DATA)
     assert choose(files, tmp_path).name == "c"

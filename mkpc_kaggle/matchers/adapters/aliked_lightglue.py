@@ -17,9 +17,13 @@ class AlikedLightGlueOptions(LightGlueOptions):
 
 
 SHAPE = LightGlueShape(descriptor=128)
-SPEC = MatcherSpec("aliked_lightglue", AlikedLightGlueOptions, multiple=32, slots=(SLOT, "aliked-lightglue"))
+SPEC = MatcherSpec(
+    "aliked_lightglue", AlikedLightGlueOptions, multiple=32, slots=(SLOT, "aliked-lightglue")
+)
 
 
-def load(weights: WeightStore, options: AlikedLightGlueOptions, placement: Placement) -> LightGlueMatcher:
+def load(
+    weights: WeightStore, options: AlikedLightGlueOptions, placement: Placement
+) -> LightGlueMatcher:
     encode = load_encoder(weights, options.features, options.variant, placement)
     return load_lightglue(SPEC, encode, weights, options, placement, SHAPE)

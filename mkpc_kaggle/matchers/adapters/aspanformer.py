@@ -6,7 +6,11 @@ from mkpc_kaggle.matchers.semi_dense import SemiDenseMatcher, SemiDenseOptions, 
 from mkpc_kaggle.weights import WeightStore
 
 SPEC = MatcherSpec(
-    "aspanformer", SemiDenseOptions, Colour.GRAY, AspanFormer.multiple, slots=("aspanformer-{training}",)
+    "aspanformer",
+    SemiDenseOptions,
+    Colour.GRAY,
+    AspanFormer.multiple,
+    slots=("aspanformer-{training}",),
 )
 
 

@@ -1,4 +1,6 @@
-"""DISK keypoints (Tyszkiewicz et al. 2020, kornia's network) matched by LightGlue (Lindenberger et al. 2023)."""
+"""DISK keypoints (Tyszkiewicz et al. 2020, kornia's network) matched by LightGlue (Lindenberger et
+al. 2023).
+"""
 
 import torch
 from kornia.feature import DISK
@@ -13,7 +15,9 @@ from mkpc_kaggle.matchers.sparse import Encode, keypoint_encoder
 from mkpc_kaggle.weights import WeightStore, load_into
 
 SHAPE = LightGlueShape(descriptor=128)
-SPEC = MatcherSpec("disk_lightglue", LightGlueOptions, multiple=16, slots=("disk", "disk-lightglue"))
+SPEC = MatcherSpec(
+    "disk_lightglue", LightGlueOptions, multiple=16, slots=("disk", "disk-lightglue")
+)
 
 
 def disk_encoder(network: DISK, features: int, placement: Placement) -> Encode:

@@ -6,7 +6,8 @@ from mkpc_kaggle.matchers.networks.dkm import DKM
 from mkpc_kaggle.matchers.networks.placement import prepared
 from mkpc_kaggle.weights import WeightStore, load_into
 
-# Published: one pass at 540 x 720 (indoors 480 x 640), or two passes, the second at up to 864 x 1152.
+# Published: one pass at 540 x 720 (indoors 480 x 640), or two passes, the second at up to 864 x
+# 1152.
 SPEC = MatcherSpec("dkm", DenseOptions, slots=("dkm-{training}",))
 
 

@@ -5,7 +5,9 @@ from mkpc_kaggle.matchers.networks.loftr import Loftr
 from mkpc_kaggle.matchers.semi_dense import SemiDenseMatcher, SemiDenseOptions, load_semi_dense
 from mkpc_kaggle.weights import WeightStore
 
-SPEC = MatcherSpec("loftr", SemiDenseOptions, Colour.GRAY, Loftr.multiple, slots=("loftr-{training}",))
+SPEC = MatcherSpec(
+    "loftr", SemiDenseOptions, Colour.GRAY, Loftr.multiple, slots=("loftr-{training}",)
+)
 
 
 def load(weights: WeightStore, options: SemiDenseOptions, placement: Placement) -> SemiDenseMatcher:

@@ -1,4 +1,6 @@
-"""LoMa (Nordström et al. 2026): keypoints matched by a transformer, the strongest sparse matcher here."""
+"""LoMa (Nordström et al. 2026): keypoints matched by a transformer, the strongest sparse matcher
+here.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,7 +12,14 @@ from mkpc_kaggle.config import AT_LEAST_1, POSITIVE, SHARE, check_ranges
 from mkpc_kaggle.geometry.coordinates import Size, from_normalised
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import MatcherSpec, PairwiseMatcher, Picture, Placement
-from mkpc_kaggle.matchers.networks.loma import UNUSED, WIDTHS, Loma, Variant, detector_size, parameter_name
+from mkpc_kaggle.matchers.networks.loma import (
+    UNUSED,
+    WIDTHS,
+    Loma,
+    Variant,
+    detector_size,
+    parameter_name,
+)
 from mkpc_kaggle.matchers.networks.loma_matcher import LomaKeypoints
 from mkpc_kaggle.matchers.networks.pixels import resized
 from mkpc_kaggle.matchers.networks.placement import prepared
@@ -26,7 +35,8 @@ class LomaOptions:
     variant: Variant = Variant.B
     max_keypoints: int = 2048
     threshold: float = 0.1  # the minimum score of a match
-    descriptor_scale: float = 784 / 1024  # side of the descriptor's square input over the longer side
+    # Side of the descriptor's square input over the longer side
+    descriptor_scale: float = 784 / 1024
 
     def __post_init__(self) -> None:
         check_ranges(self, max_keypoints=AT_LEAST_1, threshold=SHARE, descriptor_scale=POSITIVE)
@@ -62,10 +72,14 @@ class LomaAdapter(PairwiseMatcher[LomaEncoding]):
         detected = detector_size(content, long_side)
         if min(detected) == 0:
             descriptor, _ = WIDTHS[self.options.variant]
-            return LomaKeypoints(*(torch.zeros(0, width, device=self.device) for width in (2, descriptor)))
+            return LomaKeypoints(
+                *(torch.zeros(0, width, device=self.device) for width in (2, descriptor))
+            )
         side = PATCH * max(1, round(self.options.descriptor_scale * long_side / PATCH))
         # Cut off the padding, which would change the descriptors.
-        pixels = torch.from_numpy(picture.pixels[: content.height, : content.width].copy()).permute(2, 0, 1)[None]
+        pixels = torch.from_numpy(picture.pixels[: content.height, : content.width].copy()).permute(
+            2, 0, 1
+        )[None]
         to_detect = resized(pixels, (detected.height, detected.width)).to(self.device)
         to_describe = resized(pixels, (side, side)).to(self.device)
         return self._network.encode(to_detect, to_describe, self.options.max_keypoints)

@@ -5,7 +5,9 @@ from mkpc_kaggle.matchers.networks.quadtree import Quadtree
 from mkpc_kaggle.matchers.semi_dense import SemiDenseMatcher, SemiDenseOptions, load_semi_dense
 from mkpc_kaggle.weights import WeightStore
 
-SPEC = MatcherSpec("quadtree", SemiDenseOptions, Colour.GRAY, Quadtree.multiple, slots=("quadtree-{training}",))
+SPEC = MatcherSpec(
+    "quadtree", SemiDenseOptions, Colour.GRAY, Quadtree.multiple, slots=("quadtree-{training}",)
+)
 
 
 def load(weights: WeightStore, options: SemiDenseOptions, placement: Placement) -> SemiDenseMatcher:

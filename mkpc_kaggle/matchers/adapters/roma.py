@@ -1,4 +1,6 @@
-"""RoMa (Edstedt et al. 2024): DKM's warps from DINOv2's features, the best single matcher in our benchmark."""
+"""RoMa (Edstedt et al. 2024): DKM's warps from DINOv2's features, the best single matcher in our
+benchmark.
+"""
 
 from dataclasses import dataclass
 
@@ -11,7 +13,8 @@ from mkpc_kaggle.matchers.networks.placement import prepared
 from mkpc_kaggle.matchers.networks.roma import RoMa
 from mkpc_kaggle.weights import WeightStore, load_into
 
-# Published: passes at 560 x 560 and 864 x 864, as in a stretched unit of 864 x 864; indoors one at 560 x 560.
+# Published: passes at 560 x 560 and 864 x 864, as in a stretched unit of 864 x 864; indoors one at
+# 560 x 560.
 PUBLISHED_PASSES = {Training.OUTDOOR: 2, Training.INDOOR: 1}
 
 
@@ -35,4 +38,6 @@ def load(weights: WeightStore, options: RomaOptions, placement: Placement) -> De
         network = RoMa()
     load_into(network.dinov2, weights.load(backbone), what=backbone)
     load_into(network, weights.load(own), unused=r"dinov2\.", what=own)
-    return DenseMatcher(SPEC, prepared(network, placement), options, placement.device, multiple=PATCH)
+    return DenseMatcher(
+        SPEC, prepared(network, placement), options, placement.device, multiple=PATCH
+    )

@@ -44,7 +44,9 @@ class SiftMatcher(NeighbourMatcher):
         self.device = device
         # Without precise upscaling, OpenCV shifts every point by a quarter of a pixel.
         self._sift = cv2.SIFT_create(  # type: ignore[attr-defined]  # missing in OpenCV's stubs
-            options.features, contrastThreshold=options.contrast_threshold, enable_precise_upscale=True
+            options.features,
+            contrastThreshold=options.contrast_threshold,
+            enable_precise_upscale=True,
         )
 
     def encode(self, pictures: Sequence[Picture]) -> list[Keypoints]:
@@ -53,7 +55,9 @@ class SiftMatcher(NeighbourMatcher):
     def _encode(self, picture: Picture) -> Keypoints:
         found, descriptors = self._sift.detectAndCompute(picture.pixels, None)
         points = np.array([keypoint.pt for keypoint in found], np.float32).reshape(-1, 2)
-        descriptors = np.zeros((0, 128), np.float32) if descriptors is None else root_sift(descriptors)
+        descriptors = (
+            np.zeros((0, 128), np.float32) if descriptors is None else root_sift(descriptors)
+        )
         return Keypoints.on_content(
             torch.from_numpy(points).to(self.device),
             torch.from_numpy(descriptors).to(self.device),
@@ -65,7 +69,9 @@ class SiftMatcher(NeighbourMatcher):
 
 
 def root_sift(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Map SIFT descriptors (K, 128) to float32 unit vectors, whose dot product is the Hellinger kernel."""
+    """Map SIFT descriptors (K, 128) to float32 unit vectors, whose dot product is the Hellinger
+    kernel.
+    """
     sums = np.maximum(descriptors.sum(axis=1, keepdims=True), np.finfo(np.float32).tiny)
     return np.asarray(np.sqrt(descriptors / sums), np.float32)
 

@@ -1,4 +1,6 @@
-"""SuperPoint keypoints matched by SuperGlue, as in the MKPC paper. Both weights are for noncommercial research."""
+"""SuperPoint keypoints matched by SuperGlue, as in the MKPC paper. Both weights are for
+noncommercial research.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,7 +9,14 @@ import torch
 
 from mkpc_kaggle.config import AT_LEAST_0, AT_LEAST_1, SHARE, check_ranges
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.matchers.contract import Colour, MatcherSpec, PairwiseMatcher, Picture, Placement, TrainedOptions
+from mkpc_kaggle.matchers.contract import (
+    Colour,
+    MatcherSpec,
+    PairwiseMatcher,
+    Picture,
+    Placement,
+    TrainedOptions,
+)
 from mkpc_kaggle.matchers.networks.placement import prepared
 from mkpc_kaggle.matchers.networks.superglue import SuperGlue
 from mkpc_kaggle.matchers.networks.superpoint import SuperPoint, SuperPointKeypoints
@@ -35,7 +44,9 @@ class SuperGlueOptions(TrainedOptions):
 
 
 # No padding to a multiple: SuperPoint ignores the rows and columns beyond a multiple of 8.
-SPEC = MatcherSpec("superglue", SuperGlueOptions, Colour.GRAY, slots=("superpoint", "superglue-{training}"))
+SPEC = MatcherSpec(
+    "superglue", SuperGlueOptions, Colour.GRAY, slots=("superpoint", "superglue-{training}")
+)
 
 
 class SuperGlueMatcher(PairwiseMatcher[SuperPointKeypoints]):
@@ -54,7 +65,9 @@ class SuperGlueMatcher(PairwiseMatcher[SuperPointKeypoints]):
 
     def _match(self, keypoints0: SuperPointKeypoints, keypoints1: SuperPointKeypoints) -> Matches:
         found = self._superglue(keypoints0, keypoints1)
-        return matches_of(keypoints0.points, keypoints1.points, found.index0, found.index1, found.scores)
+        return matches_of(
+            keypoints0.points, keypoints1.points, found.index0, found.index1, found.scores
+        )
 
 
 def load(weights: WeightStore, options: SuperGlueOptions, placement: Placement) -> SuperGlueMatcher:
@@ -62,4 +75,6 @@ def load(weights: WeightStore, options: SuperGlueOptions, placement: Placement) 
     superglue = SuperGlue(options.sinkhorn_iterations, options.match_threshold)
     for network, slot in zip((superpoint, superglue), SPEC.slots_for(options), strict=True):
         load_into(network, weights.load(slot), what=slot)
-    return SuperGlueMatcher(prepared(superpoint, placement), prepared(superglue, placement), placement.device)
+    return SuperGlueMatcher(
+        prepared(superpoint, placement), prepared(superglue, placement), placement.device
+    )

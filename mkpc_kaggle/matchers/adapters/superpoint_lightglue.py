@@ -55,7 +55,9 @@ def superpoint_encoder(network: SuperPoint, device: str) -> Encode:
     return encode
 
 
-def load(weights: WeightStore, options: SuperPointLightGlueOptions, placement: Placement) -> LightGlueMatcher:
+def load(
+    weights: WeightStore, options: SuperPointLightGlueOptions, placement: Placement
+) -> LightGlueMatcher:
     network = SuperPoint(options.nms_radius, options.keypoint_threshold, options.features)
     load_into(network, weights.load("superpoint"), what="superpoint")
     encode = superpoint_encoder(prepared(network, placement), placement.device)

@@ -24,7 +24,9 @@ class LighterGlueOptions(LightGlueOptions):
 
 
 SHAPE = LightGlueShape(descriptor=64, width=96, heads=1)  # a narrow LightGlue
-SPEC = MatcherSpec("xfeat_lighterglue", LighterGlueOptions, multiple=32, slots=("xfeat", "xfeat-lighterglue"))
+SPEC = MatcherSpec(
+    "xfeat_lighterglue", LighterGlueOptions, multiple=32, slots=("xfeat", "xfeat-lighterglue")
+)
 
 
 def xfeat_network(features: int) -> XFeat:
@@ -48,7 +50,9 @@ def xfeat_encoder(network: XFeat, features: int, placement: Placement) -> Encode
     return keypoint_encoder(detect, placement)
 
 
-def load(weights: WeightStore, options: LighterGlueOptions, placement: Placement) -> LightGlueMatcher:
+def load(
+    weights: WeightStore, options: LighterGlueOptions, placement: Placement
+) -> LightGlueMatcher:
     network = xfeat_network(options.features)
     load_into(network.net, weights.load("xfeat"), unused=r"fine_matcher\.", what="xfeat")
     encode = xfeat_encoder(network, options.features, placement)

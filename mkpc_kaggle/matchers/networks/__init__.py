@@ -1,1 +1,3 @@
-"""Networks written from their papers: plain PyTorch modules that load the public checkpoints unchanged."""
+"""Networks written from their papers: plain PyTorch modules that load the public checkpoints
+unchanged.
+"""

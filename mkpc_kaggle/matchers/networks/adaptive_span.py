@@ -1,14 +1,21 @@
-"""Attention to keys around the target of a predicted flow, spaced more widely where the flow is uncertain.
+"""Attention to keys around the target of a predicted flow, spaced more widely where the flow is
+uncertain.
 
-Source: Chen et al., "ASpanFormer: Detector-Free Image Matching with Adaptive Span Transformer", 2022, section 3.
-A "cell" here is a 2x2 block of queries, which share 8 x 8 samples of the key map.
+Source: Chen et al., "ASpanFormer: Detector-Free Image Matching with Adaptive Span Transformer",
+2022, section 3. A "cell" here is a 2x2 block of queries, which share 8 x 8 samples of the key map.
 """
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-from mkpc_kaggle.matchers.networks.grids import as_grid, as_map, mask_valid, mean_pool, to_2x2_blocks
+from mkpc_kaggle.matchers.networks.grids import (
+    as_grid,
+    as_map,
+    mask_valid,
+    mean_pool,
+    to_2x2_blocks,
+)
 
 RADIUS = 5.0  # of a span, in standard deviations of the flow
 SIDE = 8  # samples on each axis
@@ -17,15 +24,18 @@ MASKED = -1e8  # a finite logit: attention is uniform if all keys are masked
 
 
 def adaptive_span(flow: Tensor, factor: int) -> Tensor:
-    """Map a flow (N, h, w, 4) to samples (N, P, 64, 2) for the P cells of the level pooled by ``factor``.
+    """Map a flow (N, h, w, 4) to samples (N, P, 64, 2) for the P cells of the level pooled by
+    ``factor``.
 
-    A flow is the target (x, y), in coarse cells of the other image, and two log-variances. Samples cover two
-    radii, with a step of at least one; x varies slowest. As published, centres are in units of the level, but
-    steps are not. The origin is the key map's corner: a sample (x, y) reads around index (x - 0.5, y - 0.5).
+    A flow is the target (x, y), in coarse cells of the other image, and two log-variances. Samples
+    cover two radii, with a step of at least one; x varies slowest. As published, centres are in
+    units of the level, but steps are not. The origin is the key map's corner: a sample (x, y) reads
+    around index (x - 0.5, y - 0.5).
     """
     deviation = torch.exp(flow[..., 2:] / 2) * RADIUS
     steps = (2 * deviation / SIDE).clamp(min=1.0)
-    pooled = mean_pool(torch.cat([flow[..., :2] / factor, steps], dim=-1), 2 * factor).flatten(1, 2)  # (N, P, 4)
+    # (N, P, 4)
+    pooled = mean_pool(torch.cat([flow[..., :2] / factor, steps], dim=-1), 2 * factor).flatten(1, 2)
     axis = torch.arange(SIDE, dtype=pooled.dtype, device=pooled.device) - (SIDE - 1) / 2
     return pooled[:, :, None, :2] + torch.cartesian_prod(axis, axis) * pooled[:, :, None, 2:]
 
@@ -40,8 +50,12 @@ def sample_usable(samples: Tensor, mask: Tensor, key_size: tuple[int, int], fact
     return read_samples(valid, samples, key_size, mode="nearest")[:, 0] == 1
 
 
-def read_samples(maps: Tensor, samples: Tensor, key_size: tuple[int, int], mode: str = "bilinear") -> Tensor:
-    """Return the values (N, C, P, 64) of maps (N, C, h, w) at samples (N, P, 64, 2), zero outside the maps."""
+def read_samples(
+    maps: Tensor, samples: Tensor, key_size: tuple[int, int], mode: str = "bilinear"
+) -> Tensor:
+    """Return the values (N, C, P, 64) of maps (N, C, h, w) at samples (N, P, 64, 2), zero outside
+    the maps.
+    """
     size = samples.new_tensor([key_size[1], key_size[0]])
     return functional.grid_sample(maps, samples / (size / 2) - 1, mode=mode, align_corners=False)
 
@@ -49,7 +63,8 @@ def read_samples(maps: Tensor, samples: Tensor, key_size: tuple[int, int], mode:
 def span_attention(
     q: Tensor, k: Tensor, v: Tensor, samples: Tensor, heads: int, usable: Tensor | None = None
 ) -> Tensor:
-    """Attend from queries (N, h, w, C) to keys and values (N, h_key, w_key, C) at samples (N, h w / 4, 64, 2).
+    """Attend from queries (N, h, w, C) to keys and values (N, h_key, w_key, C) at samples (N, h w /
+    4, 64, 2).
 
     Return messages (N, h, w, C). A sample outside the key map has a zero key and value, and counts unless
     ``usable`` excludes it. Messages ordered by cell, four queries each, are read as rows of the map without
@@ -60,7 +75,8 @@ def span_attention(
     messages = []
     at_once = CELLS_AT_ONCE.get(q.device.type, 256)
     for part in (slice(start, start + at_once) for start in range(0, cells.shape[1], at_once)):
-        read = as_grid(read_samples(maps, samples[:, part], key_size)).to(q.dtype)  # (N, p, 64, 2 C)
+        # (N, p, 64, 2 C)
+        read = as_grid(read_samples(maps, samples[:, part], key_size)).to(q.dtype)
         excluded = None if usable is None else ~usable[:, part].flatten(0, 1)
         found = _attend_cells(cells[:, part].flatten(0, 1), read.flatten(0, 1), heads, excluded)
         messages.append(found.view_as(cells[:, part]))
@@ -68,7 +84,9 @@ def span_attention(
 
 
 def _attend_cells(queries: Tensor, read: Tensor, heads: int, excluded: Tensor | None) -> Tensor:
-    """Return messages (p, 4, C) to scaled queries from samples (p, 64, 2 C), except from ``excluded`` (p, 64)."""
+    """Return messages (p, 4, C) to scaled queries from samples (p, 64, 2 C), except from
+    ``excluded`` (p, 64).
+    """
     keys, values = (half.chunk(heads, dim=-1) for half in read.chunk(2, dim=-1))
     found = []
     # Head by head: batched products of all heads would first copy the samples.

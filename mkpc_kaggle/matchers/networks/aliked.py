@@ -1,10 +1,10 @@
 """ALIKED: Zhao et al., "ALIKED: A Lighter Keypoint and Descriptor Extraction Network via Deformable
 Transformation", IEEE Transactions on Instrumentation and Measurement 2023.
 
-Four scales are joined at full size. Every pixel has a score; descriptors are read at offsets around each keypoint.
-The joined map is never stored: scores need 8 channels of it, and descriptors a few thousand pixels.
-Parameter names match the public checkpoints, except for ``regular_conv`` (see :func:`own_name`).
-For inference only.
+Four scales are joined at full size. Every pixel has a score; descriptors are read at offsets around
+each keypoint. The joined map is never stored: scores need 8 channels of it, and descriptors a few
+thousand pixels. Parameter names match the public checkpoints, except for ``regular_conv`` (see
+:func:`own_name`). For inference only.
 """
 
 from collections.abc import Callable
@@ -14,11 +14,17 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mkpc_kaggle.matchers.dtypes import check_finite
-from mkpc_kaggle.matchers.networks.bilinear import DeformableConv2d, corners, table_of, weighted_rows
+from mkpc_kaggle.matchers.networks.bilinear import (
+    DeformableConv2d,
+    corners,
+    table_of,
+    weighted_rows,
+)
 from mkpc_kaggle.matchers.networks.grids import as_grid, pointwise
 from mkpc_kaggle.matchers.networks.layers import ExactConv2d, in_strips, linear
 
-# The same for all published variants: channels of the four scales; the last is also the descriptors'.
+# The same for all published variants: channels of the four scales; the last is also the
+# descriptors'.
 CHANNELS = (16, 32, 64, 128)
 RADIUS = 2  # of suppression and of refinement, in pixels
 TEMPERATURE = 0.1  # of the softmax in the refinement window
@@ -57,14 +63,15 @@ class Aliked(nn.Module):
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # missing in torch's stubs
 
     def forward(self, images: Tensor) -> list[tuple[Tensor, Tensor]]:
-        """Return each image's K keypoints, best first: points (K, 2) float32, x and y in pixels with centres at
-        integers, and unit descriptors (K, 128) float32.
+        """Return each image's K keypoints, best first: points (K, 2) float32, x and y in pixels
+        with centres at integers, and unit descriptors (K, 128) float32.
 
         Images (B, 3, H, W) float32 RGB in [0, 1], sides multiples of 32.
         """
         maps = self.maps(images)
         points = [
-            refined_maxima(scores, strict_maxima(scores, self.max_keypoints)) for scores in self.score_map(maps)
+            refined_maxima(scores, strict_maxima(scores, self.max_keypoints))
+            for scores in self.score_map(maps)
         ]
         counts = [len(each) for each in points]
         image = torch.arange(len(points), device=images.device).repeat_interleave(
@@ -74,8 +81,11 @@ class Aliked(nn.Module):
         return list(zip(points, torch.split(descriptors, counts), strict=True))
 
     def maps(self, images: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return the input (B, c1, H, W) of the part at stride 1, and the parts at strides 2, 8 and 32."""
-        # Channels first: with three channels the convolution is faster; its result is channels last.
+        """Return the input (B, c1, H, W) of the part at stride 1, and the parts at strides 2, 8 and
+        32.
+        """
+        # Channels first: with three channels the convolution is faster; its result is channels
+        # last.
         x1 = self.block1(images.contiguous().to(self.conv1.weight.dtype))
         x2 = self.block2(functional.avg_pool2d(x1, 2))
         x3 = self.block3(functional.avg_pool2d(x2, 4))
@@ -151,14 +161,18 @@ class JoinedMap:
         parts = [torch.selu_(pointwise(self._conv1, full.index_select(0, pixels)).float())]
         for table, size in zip(tables, self._sizes, strict=True):
             # Both maps share the centres of their corner pixels.
-            ratio = positions.new_tensor([(size[1] - 1) / (width - 1), (size[0] - 1) / (height - 1)])
+            ratio = positions.new_tensor(
+                [(size[1] - 1) / (width - 1), (size[0] - 1) / (height - 1)]
+            )
             parts.append(weighted_rows(table, *corners(positions * ratio, image, size)))
         return functional.normalize(torch.cat(parts, dim=1), dim=1)
 
     def sampled(self, positions: Tensor, image: Tensor) -> Tensor:
         """Sample at positions (Q, 2) of the images ``image`` (Q,): (Q, C) float32, zero outside."""
         pixels, weights = corners(positions, image, self.size)  # (Q, 4)
-        blocks = zip(*(torch.split(values, POSITIONS_AT_ONCE) for values in (pixels, weights)), strict=True)
+        blocks = zip(
+            *(torch.split(values, POSITIONS_AT_ONCE) for values in (pixels, weights)), strict=True
+        )
         return torch.cat(
             [
                 torch.einsum("qkc,qk->qc", self.at(some.flatten()).view(len(some), 4, -1), shares)
@@ -187,11 +201,14 @@ class DescriptorHead(nn.Module):
             return points.new_zeros(0, self.agg_weights.shape[2])
         height, width = joined.size
         corner = (points.long() - 1).clamp_(min=0)
-        corner = torch.minimum(corner, corner.new_tensor([width - PATCH - 1, height - PATCH - 1]))  # as trained
+        # As trained
+        corner = torch.minimum(corner, corner.new_tensor([width - PATCH - 1, height - PATCH - 1]))
         steps = torch.arange(PATCH, device=points.device)
         rows = (image * height + corner[:, 1])[:, None] + steps  # (K, 3)
         patches = (rows * width)[:, :, None] + (corner[:, :1] + steps)[:, None]  # (K, 3, 3)
-        offsets = self.offsets(joined.at(patches.flatten()).view(len(points), -1), max(height, width) / 4)
+        offsets = self.offsets(
+            joined.at(patches.flatten()).view(len(points), -1), max(height, width) / 4
+        )
 
         positions = (points[:, None] + offsets).flatten(0, 1)  # (K M, 2)
         read = joined.sampled(positions, image.repeat_interleave(offsets.shape[1]))  # (K M, C)
@@ -201,7 +218,8 @@ class DescriptorHead(nn.Module):
     def offsets(self, patches: Tensor, reach: float) -> Tensor:
         """Map patches (K, 9 C), row by row, to (x, y) offsets (K, M, 2) in pixels."""
         whole, bias, last, last_bias = (
-            self.offset_conv.get_parameter(name) for name in ("0.weight", "0.bias", "2.weight", "2.bias")
+            self.offset_conv.get_parameter(name)
+            for name in ("0.weight", "0.bias", "2.weight", "2.bias")
         )
         hidden = torch.selu_(linear(patches, whole.permute(0, 2, 3, 1).flatten(1), bias))
         moved = linear(hidden, last.flatten(1), last_bias).clamp_(-reach, reach)
@@ -214,7 +232,9 @@ def enlarged(maps: Tensor, size: torch.Size) -> Tensor:
 
 
 def strict_maxima(scores: Tensor, count: int) -> Tensor:
-    """Return the best strict maxima of a map (H, W), best first: (K,) int64. Published code keeps more."""
+    """Return the best strict maxima of a map (H, W), best first: (K,) int64. Published code keeps
+    more.
+    """
     peaks = scores == functional.max_pool2d(scores[None], 2 * RADIUS + 1, 1, RADIUS)[0]
     inner = torch.zeros_like(peaks)
     inner[RADIUS:-RADIUS, RADIUS:-RADIUS] = True
@@ -225,7 +245,9 @@ def strict_maxima(scores: Tensor, count: int) -> Tensor:
 
 
 def refined_maxima(scores: Tensor, index: Tensor) -> Tensor:
-    """Move the maxima (K,) of a map (H, W) by a softmax's mean offset in their windows: (K, 2), x and y."""
+    """Move the maxima (K,) of a map (H, W) by a softmax's mean offset in their windows: (K, 2), x
+    and y.
+    """
     shares = torch.softmax(windows(scores, index) / TEMPERATURE, dim=1)  # (K, 25)
     steps = torch.arange(-RADIUS, RADIUS + 1, device=scores.device).float()
     offsets = shares @ torch.cartesian_prod(steps, steps).flip(1)

@@ -7,9 +7,21 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mkpc_kaggle.matchers.contract import Training
-from mkpc_kaggle.matchers.networks.adaptive_span import MASKED, adaptive_span, sample_usable, span_attention
+from mkpc_kaggle.matchers.networks.adaptive_span import (
+    MASKED,
+    adaptive_span,
+    sample_usable,
+    span_attention,
+)
 from mkpc_kaggle.matchers.networks.fine_matching import COARSE_STRIDE
-from mkpc_kaggle.matchers.networks.grids import Perceptron, as_grid, as_map, mask_valid, mean_pool, pointwise
+from mkpc_kaggle.matchers.networks.grids import (
+    Perceptron,
+    as_grid,
+    as_map,
+    mask_valid,
+    mean_pool,
+    pointwise,
+)
 from mkpc_kaggle.matchers.networks.layers import ExactConv1d
 from mkpc_kaggle.matchers.networks.linear_attention import Masks
 from mkpc_kaggle.matchers.networks.position import FIXED_DECAY, sine_positions
@@ -59,16 +71,23 @@ class ChannelNorm(nn.Module):
 
 
 def global_attention(
-    q: Tensor, k: Tensor, v: Tensor, temperature: Tensor | float, masks: tuple[Tensor | None, Tensor | None]
+    q: Tensor,
+    k: Tensor,
+    v: Tensor,
+    temperature: Tensor | float,
+    masks: tuple[Tensor | None, Tensor | None],
 ) -> Tensor:
-    """Return messages (N, h, w, C) to queries of this shape, from keys and values (N, h_key, w_key, C).
+    """Return messages (N, h, w, C) to queries of this shape, from keys and values (N, h_key, w_key,
+    C).
 
     A masked query gets the mean of all values, as published.
     """
     queries, keys, values = (
-        x.flatten(1, 2).view(len(x), -1, HEADS, x.shape[3] // HEADS).transpose(1, 2) for x in (q, k, v)
+        x.flatten(1, 2).view(len(x), -1, HEADS, x.shape[3] // HEADS).transpose(1, 2)
+        for x in (q, k, v)
     )  # (N, heads, cells, D)
-    logits = queries @ keys.transpose(2, 3) * (temperature * queries.shape[3] ** -0.5)  # (N, heads, L, S)
+    # (N, heads, L, S)
+    logits = queries @ keys.transpose(2, 3) * (temperature * queries.shape[3] ** -0.5)
     if masks[0] is not None and masks[1] is not None:
         valid = masks[0][:, None, :, None] & masks[1][:, None, None, :]
         logits.masked_fill_(~valid, MASKED)
@@ -77,7 +96,9 @@ def global_attention(
 
 
 class CrossLayer(nn.Module):
-    """Projections for cross-attention between images, and the update of ``width`` features by a message."""
+    """Projections for cross-attention between images, and the update of ``width`` features by a
+    message.
+    """
 
     def __init__(self, width: int, hidden: int, kernel: int) -> None:
         super().__init__()
@@ -93,11 +114,17 @@ class CrossLayer(nn.Module):
 
     def projected(self, own: Side, other: Side) -> tuple[Tensor, Tensor, Tensor]:
         """Return queries of ``own``, and keys and values of ``other``, each (N, h, w, 256)."""
-        return pointwise(self.q_proj, own.visual), pointwise(self.k_proj, other.visual), other.values(self.v_proj)
+        return (
+            pointwise(self.q_proj, own.visual),
+            pointwise(self.k_proj, other.visual),
+            other.values(self.v_proj),
+        )
 
     def updated(self, features: Tensor, message: Tensor) -> Tensor:
         """Map features (N, h, w, width) and a message (N, h, w, 256) to new features."""
-        merged: Tensor = self.norm2(self.merge_f(torch.cat([features, self.norm1(message)], dim=-1)))
+        merged: Tensor = self.norm2(
+            self.merge_f(torch.cat([features, self.norm1(message)], dim=-1))
+        )
         return merged.add_(features)
 
 
@@ -109,7 +136,9 @@ class InitialLayer(CrossLayer):
         self.merge_head = nn.Conv1d(TOP, TOP, 1, bias=False)
 
     def forward(self, own: Side, other: Side) -> Tensor:
-        """Return the updated visual features (N, rows, columns, 256) of ``own`` at the global level."""
+        """Return the updated visual features (N, rows, columns, 256) of ``own`` at the global
+        level.
+        """
         masks = own.pooled_mask, other.pooled_mask
         message = global_attention(*self.projected(own, other), 1.0, masks)
         return self.updated(own.visual, pointwise(self.merge_head, message))
@@ -134,7 +163,9 @@ class InitialStage(nn.Module):
     def _enlarged(self, side: Side, pooled: Tensor) -> Side:
         decoupled = as_map(pointwise(self.decoupler, pooled))
         size = side.visual.shape[1:3]
-        large = as_grid(functional.interpolate(decoupled, size=size, mode="bilinear", align_corners=False))
+        large = as_grid(
+            functional.interpolate(decoupled, size=size, mode="bilinear", align_corners=False)
+        )
         visual, flow = torch.split(large, [TOP, FLOW], dim=-1)
         added = pointwise(self.up_merge, torch.cat([side.visual, visual], dim=-1))
         return replace(side, visual=added.add_(side.visual), flow=flow)
@@ -152,10 +183,16 @@ class HierarchicalAttention(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.temp = nn.Parameter(torch.ones(()))
-        self.merge_head = Perceptron(nn.Conv1d(3 * TOP, TOP, 1, bias=False), nn.Conv1d(TOP, TOP, 1, bias=False))
+        self.merge_head = Perceptron(
+            nn.Conv1d(3 * TOP, TOP, 1, bias=False), nn.Conv1d(TOP, TOP, 1, bias=False)
+        )
 
-    def forward(self, q: Tensor, k: Tensor, v: Tensor, flow: Tensor, own: Side, other: Side) -> Tensor:
-        """Map queries and flow of ``own``, keys and values of ``other`` to a message (N, h, w, 256)."""
+    def forward(
+        self, q: Tensor, k: Tensor, v: Tensor, flow: Tensor, own: Side, other: Side
+    ) -> Tensor:
+        """Map queries and flow of ``own``, keys and values of ``other`` to a message (N, h, w,
+        256).
+        """
         coarse = global_attention(
             mean_pool(q, own.factor),
             mean_pool(k, other.factor),
@@ -165,21 +202,31 @@ class HierarchicalAttention(nn.Module):
         )  # (N, h / rows, w / columns, 256)
         half, full = (_span_message(q, k, v, flow, factor, own.mask) for factor in (2, 1))
         size = (q.shape[1], q.shape[2])
-        enlarged = (as_grid(functional.interpolate(as_map(grid), size=size)) for grid in (coarse, half))
+        enlarged = (
+            as_grid(functional.interpolate(as_map(grid), size=size)) for grid in (coarse, half)
+        )
         merged: Tensor = self.merge_head(torch.cat([*enlarged, full], dim=-1))
         return merged
 
 
-def _span_message(q: Tensor, k: Tensor, v: Tensor, flow: Tensor, factor: int, mask: Tensor | None) -> Tensor:
-    """Return the message (N, h / factor, w / factor, 256) of the adaptive-span level pooled by ``factor``."""
+def _span_message(
+    q: Tensor, k: Tensor, v: Tensor, flow: Tensor, factor: int, mask: Tensor | None
+) -> Tensor:
+    """Return the message (N, h / factor, w / factor, 256) of the adaptive-span level pooled by
+    ``factor``.
+    """
     q, k, v = mean_pool(q, factor), mean_pool(k, factor), mean_pool(v, factor)
     samples = adaptive_span(flow, factor)
-    usable = None if mask is None else sample_usable(samples, mask, (k.shape[1], k.shape[2]), factor)
+    usable = (
+        None if mask is None else sample_usable(samples, mask, (k.shape[1], k.shape[2]), factor)
+    )
     return span_attention(q, k, v, samples, HEADS, usable)
 
 
 class AspanBlock(CrossLayer):
-    """A block that decodes the flow and updates both features along it; the last updates only the visual ones."""
+    """A block that decodes the flow and updates both features along it; the last updates only the
+    visual ones.
+    """
 
     def __init__(self, last: bool) -> None:
         super().__init__(TOP if last else TOP + FLOW, TOP + FLOW, kernel=3)
@@ -190,14 +237,18 @@ class AspanBlock(CrossLayer):
         self.attention = HierarchicalAttention()
 
     def decode_flow(self, own: Side, other: Side) -> Tensor:
-        """Return (N, h, w, 4): target (x, y) in coarse cells, from the corner of ``other``, and log-variances."""
+        """Return (N, h, w, 4): target (x, y) in coarse cells, from the corner of ``other``, and
+        log-variances.
+        """
         raw = self.flow_decoder(own.flow)
         size = raw.new_tensor([other.visual.shape[2], other.visual.shape[1]])
         return torch.cat([raw[..., :2].sigmoid() * size, raw[..., 2:]], dim=-1)
 
     def forward(self, own: Side, other: Side) -> Side:
         """Return ``own``, updated."""
-        message = self.attention(*self.projected(own, other), self.decode_flow(own, other), own, other)
+        message = self.attention(
+            *self.projected(own, other), self.decode_flow(own, other), own, other
+        )
         both = own.visual if self.last else torch.cat([own.visual, own.flow], dim=-1)
         updated = self.updated(both, message)
         flow = own.flow if self.last else updated[..., TOP:]
@@ -226,9 +277,9 @@ class AspanTransformer(nn.Module):
 class AspanFormer(SemiDenseNetwork):
     """ASpanFormer. Sides are multiples of 32; the two images may differ in size.
 
-    The positions of every image are stretched to ``train_size`` (height, width). Indoor weights were published for
-    480 x 640 only, without a border, with unscaled positions and a global level of 15 x 20 cells. At this size
-    our scaling and pooling are the same.
+    The positions of every image are stretched to ``train_size`` (height, width). Indoor weights
+    were published for 480 x 640 only, without a border, with unscaled positions and a global level
+    of 15 x 20 cells. At this size our scaling and pooling are the same.
     """
 
     multiple = 32
@@ -246,17 +297,22 @@ class AspanFormer(SemiDenseNetwork):
     def similarity_scale(self) -> Tensor:
         return self.coarse_matching.get_parameter("temperature") / TOP
 
-    def transform(self, coarse0: Tensor, coarse1: Tensor, masks: Masks | None = None) -> tuple[Tensor, Tensor]:
+    def transform(
+        self, coarse0: Tensor, coarse1: Tensor, masks: Masks | None = None
+    ) -> tuple[Tensor, Tensor]:
         mask0, mask1 = masks or (None, None)
         grid0, grid1 = self.loftr_coarse(self.side(coarse0, mask0), self.side(coarse1, mask1))
         return grid0, grid1
 
     def side(self, coarse: Tensor, mask: Tensor | None) -> Side:
-        """Return the transformer's input for an image: its coarse map (N, 256, h, w) with positions added."""
+        """Return the transformer's input for an image: its coarse map (N, 256, h, w) with positions
+        added.
+        """
         grid = as_grid(coarse)
         height, width = grid.shape[1:3]
         scale = self.position_scale(height, width)
-        positions = sine_positions(height, width, FIXED_DECAY, scale, grid.device)[None]  # (1, h, w, 256)
+        # (1, h, w, 256)
+        positions = sine_positions(height, width, FIXED_DECAY, scale, grid.device)[None]
         visual = (grid + positions).contiguous()
         projected = pointwise(self.loftr_coarse.pos_transform, positions)
         return Side(visual, visual.new_empty(0), projected, POOLING, mask)

@@ -1,7 +1,7 @@
 """Bilinear samples of tables of pixels, and a deformable convolution on them (Dai et al. 2017).
 
-A table (P, C) holds the pixels of B maps of one size, map by map and row by row: a channels-last batch as rows.
-Positions are (x, y) in pixels of their map.
+A table (P, C) holds the pixels of B maps of one size, map by map and row by row: a channels-last
+batch as rows. Positions are (x, y) in pixels of their map.
 """
 
 import torch
@@ -20,7 +20,8 @@ def table_of(maps: Tensor) -> Tensor:
 
 
 def corners(positions: Tensor, image: Tensor, size: torch.Size) -> tuple[Tensor, Tensor]:
-    """Return the pixels (Q, 4) int64 around positions (Q, 2) in maps ``image`` (Q,), and their weights (Q, 4).
+    """Return the pixels (Q, 4) int64 around positions (Q, 2) in maps ``image`` (Q,), and their
+    weights (Q, 4).
 
     Pixels outside the map, of ``size`` (h, w), have the weight 0 and the index of another pixel.
     """
@@ -30,7 +31,9 @@ def corners(positions: Tensor, image: Tensor, size: torch.Size) -> tuple[Tensor,
     rows = [(first + row * width, weight) for row, weight in neighbours(y, height)]
     columns = neighbours(x, width)
     index = torch.stack([row + column for row, _ in rows for column, _ in columns], dim=1)
-    return index, torch.stack([along_y * along_x for _, along_y in rows for _, along_x in columns], dim=1)
+    return index, torch.stack(
+        [along_y * along_x for _, along_y in rows for _, along_x in columns], dim=1
+    )
 
 
 def neighbours(positions: Tensor, length: int) -> list[tuple[Tensor, Tensor]]:
@@ -41,7 +44,10 @@ def neighbours(positions: Tensor, length: int) -> list[tuple[Tensor, Tensor]]:
     before = positions.floor()
     share = positions - before
     return [
-        (pixel.clamp(0, length - 1).nan_to_num(0).long(), weight.masked_fill((pixel < 0) | (pixel >= length), 0))
+        (
+            pixel.clamp(0, length - 1).nan_to_num(0).long(),
+            weight.masked_fill((pixel < 0) | (pixel >= length), 0),
+        )
         for pixel, weight in ((before, 1 - share), (before + 1, share))
     ]
 
@@ -52,7 +58,9 @@ def weighted_rows(table: Tensor, index: Tensor, weights: Tensor) -> Tensor:
 
 
 def sampled(maps: Tensor, positions: Tensor, image: Tensor) -> Tensor:
-    """Sample maps (B, C, h, w) at positions (Q, 2) of the maps ``image`` (Q,): (Q, C) float32, zero outside."""
+    """Sample maps (B, C, h, w) at positions (Q, 2) of the maps ``image`` (Q,): (Q, C) float32, zero
+    outside.
+    """
     return weighted_rows(table_of(maps), *corners(positions, image, maps.shape[2:]))
 
 
@@ -67,12 +75,17 @@ class DeformableConv2d(nn.Conv2d):
         """Map (B, C, h, w) to (B, out_channels, h, w), like ``x``."""
         batch, _, height, width = x.shape
         reach = max(height, width) / 4
-        offsets = as_grid(self.offset_conv(x.float())).clamp(-reach, reach)  # (B, h, w, 18): y, x by tap
+        # (B, h, w, 18): y, x by tap
+        offsets = as_grid(self.offset_conv(x.float())).clamp(-reach, reach)
         rows, columns = (torch.arange(n, device=x.device) for n in (height, width))
-        taps = torch.cartesian_prod(*2 * [torch.arange(KERNEL, device=x.device) - 1]).flip(1)  # (9, 2): x, y
-        pixels = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), dim=2)[:, :, None]  # (h, w, 1, 2)
-        positions = offsets.view(batch, height, width, -1, 2).flip(4) + (pixels + taps)  # (B, h, w, 9, 2)
+        # (9, 2): x, y
+        taps = torch.cartesian_prod(*2 * [torch.arange(KERNEL, device=x.device) - 1]).flip(1)
+        # (h, w, 1, 2)
+        pixels = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), dim=2)[:, :, None]
+        # (B, h, w, 9, 2)
+        positions = offsets.view(batch, height, width, -1, 2).flip(4) + (pixels + taps)
         image = torch.arange(batch, device=x.device).repeat_interleave(height * width * KERNEL**2)
-        seen = sampled(x, positions.flatten(0, 3), image).view(batch, height, width, -1)  # (B, h, w, 9 C)
+        # (B, h, w, 9 C)
+        seen = sampled(x, positions.flatten(0, 3), image).view(batch, height, width, -1)
         weight = self.weight.permute(0, 2, 3, 1).flatten(1)  # (out, 9 C)
         return as_map(linear(seen, weight, self.bias)).to(x.dtype)

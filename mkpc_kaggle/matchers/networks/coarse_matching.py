@@ -1,8 +1,8 @@
 """Matches of coarse cells: dual softmax, mutual nearest neighbours, threshold and border.
 
-Source: Sun et al. 2021, section 3.3. The matrix of all pairs of cells is stored only if it is small: at
-1600 x 1200 pixels it would take 3.6 GB. Otherwise blocks of rows are computed twice, first for the sums of the
-softmaxes, then for the maximum of each row and column.
+Source: Sun et al. 2021, section 3.3. The matrix of all pairs of cells is stored only if it is
+small: at 1600 x 1200 pixels it would take 3.6 GB. Otherwise blocks of rows are computed twice,
+first for the sums of the softmaxes, then for the maximum of each row and column.
 """
 
 from collections.abc import Iterable, Iterator
@@ -19,16 +19,26 @@ HELD_FLOATS = 2**25  # of the largest stored matrix: 128 MiB; 640 x 480 pixels n
 
 
 def coarse_matches(
-    grid0: Tensor, grid1: Tensor, scale: float | Tensor, threshold: float, border: int, masks: Masks | None
+    grid0: Tensor,
+    grid1: Tensor,
+    scale: float | Tensor,
+    threshold: float,
+    border: int,
+    masks: Masks | None,
 ) -> Assignment:
     """Match grids (h0, w0, C) and (h1, w1, C); similarities are ``scale`` times dot products.
 
-    A match has a confidence above ``threshold``, the best of its row and column, border cells included. Then
-    matches with a cell within ``border`` of the content's border are dropped. ``masks`` (h, w) bool are True at
-    content. Indices of matched cells count row by row in the cell's own grid.
+    A match has a confidence above ``threshold``, the best of its row and column, border cells
+    included. Then matches with a cell within ``border`` of the content's border are dropped.
+    ``masks`` (h, w) bool are True at content. Indices of matched cells count row by row in the
+    cell's own grid.
     """
-    mask0, mask1 = masks or (grid0.new_ones(grid.shape[:2], dtype=torch.bool) for grid in (grid0, grid1))
-    cells = Cells(grid0.flatten(0, 1) * scale, grid1.flatten(0, 1), mask0.flatten(), mask1.flatten())
+    mask0, mask1 = masks or (
+        grid0.new_ones(grid.shape[:2], dtype=torch.bool) for grid in (grid0, grid1)
+    )
+    cells = Cells(
+        grid0.flatten(0, 1) * scale, grid1.flatten(0, 1), mask0.flatten(), mask1.flatten()
+    )
     best0, partner, best1 = row_and_column_maxima(cells)
     inner0, inner1 = inner_cells(mask0, border), inner_cells(mask1, border)
     confidence = torch.exp(2 * best0)
@@ -46,9 +56,13 @@ class Cells(NamedTuple):
     content1: Tensor
 
     def similarity(self) -> Iterator[Tensor]:
-        """Yield dot products in blocks of rows (l, S) float32, minus infinity where either cell is padding."""
+        """Yield dot products in blocks of rows (l, S) float32, minus infinity where either cell is
+        padding.
+        """
         rows = ROWS_AT_ONCE.get(self.features0.device.type, 256)
-        blocks = zip(torch.split(self.features0.float(), rows), torch.split(self.content0, rows), strict=True)
+        blocks = zip(
+            torch.split(self.features0.float(), rows), torch.split(self.content0, rows), strict=True
+        )
         keys = self.features1.float()
         for features, content in blocks:
             products = linear(features, keys)
@@ -58,11 +72,14 @@ class Cells(NamedTuple):
 
 
 def half_log_sums(blocks: Iterable[Tensor]) -> tuple[Tensor, Tensor]:
-    """Return half the logsumexp of each row (L,) and of each column (S,) of a matrix in blocks of rows (l, S)."""
+    """Return half the logsumexp of each row (L,) and of each column (S,) of a matrix in blocks of
+    rows (l, S).
+    """
     rows_and_columns = [(block.logsumexp(dim=1), block.logsumexp(dim=0)) for block in blocks]
     over_rows, of_blocks = (list(sums) for sums in zip(*rows_and_columns, strict=True))
     over_columns = torch.stack(of_blocks).logsumexp(dim=0)
-    # The logarithm for a row of padding is minus infinity. Clamping prevents NaN in later differences.
+    # The logarithm for a row of padding is minus infinity. Clamping prevents NaN in later
+    # differences.
     finite = torch.finfo(torch.float32).min
     return torch.cat(over_rows).clamp_(min=finite).div_(2), over_columns.clamp_(min=finite).div_(2)
 
@@ -94,7 +111,9 @@ def row_and_column_maxima(cells: Cells) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def inner_cells(mask: Tensor, border: int) -> Tensor:
-    """Return (h w,) bool: True at cells of the content (h, w) that are at least ``border`` from its edge."""
+    """Return (h w,) bool: True at cells of the content (h, w) that are at least ``border`` from its
+    edge.
+    """
     h, w = mask.shape
     bottom, right = mask.sum(dim=0).amax() - border, mask.sum(dim=1).amax() - border
     row, column = torch.arange(h, device=mask.device)[:, None], torch.arange(w, device=mask.device)

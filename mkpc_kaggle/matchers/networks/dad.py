@@ -1,7 +1,8 @@
-"""DaD, a keypoint detector (Edstedt et al. 2025, arXiv 2503.07347): a map of logits and its strongest maxima.
+"""DaD, a keypoint detector (Edstedt et al. 2025, arXiv 2503.07347): a map of logits and its
+strongest maxima.
 
-Normalised coordinates: (x, y) in [-1, 1], where +-1 are the outer edges of an image. Parameter names match the
-public checkpoint. For inference only.
+Normalised coordinates: (x, y) in [-1, 1], where +-1 are the outer edges of an image. Parameter
+names match the public checkpoint. For inference only.
 """
 
 from collections.abc import Iterator
@@ -28,7 +29,8 @@ class Dad(nn.Module):
         self.eval().requires_grad_(False)
 
     def forward(self, image: Tensor, number: int) -> list[Tensor]:
-        """Return up to ``number`` points for each of the images (B, 3, H, W), RGB in 0..1, sides at least 8.
+        """Return up to ``number`` points for each of the images (B, 3, H, W), RGB in 0..1, sides at
+        least 8.
 
         In training, sides were multiples of 8, and the longer one was 1024.
         """
@@ -49,9 +51,11 @@ class Dad(nn.Module):
 
 
 def select_keypoints(logits: Tensor, number: int) -> Tensor:
-    """Return the ``number`` highest maxima over 3 x 3 pixels of a map (H, W). All equal maxima of a window count.
+    """Return the ``number`` highest maxima over 3 x 3 pixels of a map (H, W). All equal maxima of a
+    window count.
 
-    Points (K, 2) are float32, normalised, the most probable first, and up to half a pixel beyond the edges.
+    Points (K, 2) are float32, normalised, the most probable first, and up to half a pixel beyond
+    the edges.
     """
     height, width = logits.shape
     probability = logits.flatten().softmax(dim=0).view(1, height, width)
@@ -64,13 +68,15 @@ def select_keypoints(logits: Tensor, number: int) -> Tensor:
 
 
 def subpixel_offsets(logits: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
-    """Return offsets (K, 2) float32 in pixels, within -1..1: softmax means around pixels (K,) of a map (H, W).
+    """Return offsets (K, 2) float32 in pixels, within -1..1: softmax means around pixels (K,) of a
+    map (H, W).
 
     As in training, logits beyond the map are 0.
     """
     padded = functional.pad(logits, (1, 1, 1, 1))
     steps = torch.arange(3, device=logits.device)
-    windows = padded[(rows[:, None] + steps)[:, :, None], (columns[:, None] + steps)[:, None]]  # (K, 3, 3)
+    # (K, 3, 3)
+    windows = padded[(rows[:, None] + steps)[:, :, None], (columns[:, None] + steps)[:, None]]
     shares = (windows.flatten(1) / TEMPERATURE).softmax(dim=1).view_as(windows)
     moves = steps.float() - 1
     return torch.stack([shares.sum(dim=1) @ moves, shares.sum(dim=2) @ moves], dim=1)

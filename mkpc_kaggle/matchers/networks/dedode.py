@@ -1,4 +1,5 @@
-"""DeDoDe descriptors (Edstedt et al. 2024, arXiv 2308.08479) as in LoMa: a dense map, sampled at keypoints.
+"""DeDoDe descriptors (Edstedt et al. 2024, arXiv 2308.08479) as in LoMa: a dense map, sampled at
+keypoints.
 
 The decoder, which DaD shares, runs from coarse to fine. At each stride, a refiner reads the features and the
 coarser stride's context, adds to the prediction and outputs a context. Predictions are float32 in any precision.
@@ -39,9 +40,13 @@ SHAPES = {  # by stride
 
 
 class DedodeRefiner(nn.Module):
-    """1x1 convolutions of features and context, then alternating depthwise 5x5 and 1x1 convolutions."""
+    """1x1 convolutions of features and context, then alternating depthwise 5x5 and 1x1
+    convolutions.
+    """
 
-    def __init__(self, shape: DedodeRefinerShape, context: int, prediction: int, blocks: int) -> None:
+    def __init__(
+        self, shape: DedodeRefinerShape, context: int, prediction: int, blocks: int
+    ) -> None:
         super().__init__()
         width = shape.hidden
         self.features = shape.features
@@ -51,12 +56,16 @@ class DedodeRefiner(nn.Module):
         self.out_conv = ExactConv2d(width, prediction + shape.context, 1)
 
     def entry(self, features: Tensor) -> Tensor:
-        """Return the first convolution (B, hidden, h, w) of features (B, C, h, w), without the context."""
+        """Return the first convolution (B, hidden, h, w) of features (B, C, h, w), without the
+        context.
+        """
         weight, bias = (self.block1.get_parameter(f"0.{name}") for name in ("weight", "bias"))
         return functional.conv2d(features.to(weight.dtype), weight[:, : self.features], bias)
 
     def mixed(self, entry: Tensor, context: Tensor | None) -> Tensor:
-        """Add the coarser context to an :meth:`entry`, in place, and return the mixed map (B, hidden, h, w)."""
+        """Add the coarser context to an :meth:`entry`, in place, and return the mixed map (B,
+        hidden, h, w).
+        """
         first, norm, relu, mix = self.block1
         if context is not None:
             # A 1x1 convolution and enlargement commute; the small map is cheaper.
@@ -66,7 +75,9 @@ class DedodeRefiner(nn.Module):
         return mixed
 
     def hidden(self, mixed: Tensor) -> Tensor:
-        """Return the scaled sum (B, hidden, h, w) of a :meth:`mixed` map and the blocks' output for it."""
+        """Return the scaled sum (B, hidden, h, w) of a :meth:`mixed` map and the blocks' output for
+        it.
+        """
         reach = REACH * len(self.hidden_blocks)
         return in_strips(self._hidden, mixed, reach=reach, channels=mixed.shape[1])
 
@@ -81,7 +92,9 @@ class DedodeRefiner(nn.Module):
 
 
 class DedodeDecoder(nn.Module):
-    """A decoder to ``prediction`` channels with ``blocks`` per refiner. Predictions are upsampled in ``mode``."""
+    """A decoder to ``prediction`` channels with ``blocks`` per refiner. Predictions are upsampled
+    in ``mode``.
+    """
 
     def __init__(self, strides: Sequence[int], prediction: int, blocks: int, mode: str) -> None:
         super().__init__()
@@ -98,7 +111,8 @@ class DedodeDecoder(nn.Module):
         return refiner
 
     def forward(self, levels: Iterable[Tensor]) -> tuple[Tensor, Tensor]:
-        """Return the prediction (B, prediction, h, w) of stride 2, and the hidden map (B, 32, H, W) of stride 1.
+        """Return the prediction (B, prediction, h, w) of stride 2, and the hidden map (B, 32, H, W)
+        of stride 1.
 
         ``levels`` yields the features from fine to coarse, so that only one level is in memory at a time.
         """
@@ -124,21 +138,27 @@ class Dedode(nn.Module):
     def __init__(self, channels: int, *, with_vit: bool) -> None:
         super().__init__()
         self.encoder = VggAndVit() if with_vit else Vgg(VGG19)
-        self.decoder = DedodeDecoder((14, 8, 4, 2, 1) if with_vit else (8, 4, 2, 1), channels, BLOCKS, "bilinear")
+        self.decoder = DedodeDecoder(
+            (14, 8, 4, 2, 1) if with_vit else (8, 4, 2, 1), channels, BLOCKS, "bilinear"
+        )
         self.eval().requires_grad_(False)
 
     def forward(self, image: Tensor, points: Tensor) -> Tensor:
-        """Return descriptors (B, K, D) float32, of any length, at points (B, K, 2) of images (B, 3, H, W) in 0..1.
+        """Return descriptors (B, K, D) float32, of any length, at points (B, K, 2) of images (B, 3,
+        H, W) in 0..1.
 
-        The images' colours are not normalised. Beyond the image, descriptors fade to 0 within a pixel.
+        The images' colours are not normalised. Beyond the image, descriptors fade to 0 within a
+        pixel.
         """
         prediction, hidden = self.decoder(self.encoder.levels(image))
         # The full-resolution map is never computed, only its two parts at the points.
         head = self.decoder.at(1).out_conv
         weight, bias = (
-            parameter[: self.decoder.prediction] for parameter in (head.weight, head.get_parameter("bias"))
+            parameter[: self.decoder.prediction]
+            for parameter in (head.weight, head.get_parameter("bias"))
         )
-        read = functional.grid_sample(hidden.float(), points[:, None], align_corners=False)[:, :, 0]  # (B, 32, K)
+        # (B, 32, K)
+        read = functional.grid_sample(hidden.float(), points[:, None], align_corners=False)[:, :, 0]
         indices, shares = nearest_pixels(points, hidden.shape[2:])
         enlarged = read_enlarged(prediction, indices, shares, hidden.shape[2:])
         fine = functional.linear(read.mT, weight.flatten(1))
@@ -146,7 +166,8 @@ class Dedode(nn.Module):
 
 
 def nearest_pixels(points: Tensor, size: torch.Size) -> tuple[Tensor, Tensor]:
-    """Return the four pixels (B, K, 4, 2) (column, row) around points (B, K, 2), and bilinear weights (B, K, 4).
+    """Return the four pixels (B, K, 4, 2) (column, row) around points (B, K, 2), and bilinear
+    weights (B, K, 4).
 
     Pixels outside an image of ``size`` (height, width) have weight 0.
     """
@@ -161,9 +182,12 @@ def nearest_pixels(points: Tensor, size: torch.Size) -> tuple[Tensor, Tensor]:
 
 
 def read_enlarged(x: Tensor, pixels: Tensor, shares: Tensor, size: torch.Size) -> Tensor:
-    """Return sums (B, K, C) of pixels, weighted by ``shares``, of a map (B, C, h, w) enlarged to ``size``."""
+    """Return sums (B, K, C) of pixels, weighted by ``shares``, of a map (B, C, h, w) enlarged to
+    ``size``.
+    """
     centres = (2 * pixels + 1) / pixels.new_tensor([size[1], size[0]]) - 1
-    read = functional.grid_sample(x, centres, padding_mode="border", align_corners=False)  # (B, C, K, 4)
+    # (B, C, K, 4)
+    read = functional.grid_sample(x, centres, padding_mode="border", align_corners=False)
     return (read * shares[:, None]).sum(dim=3).mT
 
 

@@ -1,6 +1,7 @@
 """Dense warps, shared by DKM and RoMa: every pixel's position in the other image, and a certainty.
 
-Normalised coordinates as in warp_refiner. Source: Edstedt et al. 2023, "DKM", section 3.4, and its published code.
+Normalised coordinates as in warp_refiner. Source: Edstedt et al. 2023, "DKM", section 3.4, and its
+published code.
 """
 
 import math
@@ -17,7 +18,9 @@ from mkpc_kaggle.matchers.networks.warp_refiner import WarpEstimate, identity_ma
 
 
 class Pyramid(NamedTuple):
-    """Features (B, C, h, w) of B images at strides 1, 2, 4, 8 and maybe more, in the network's precision."""
+    """Features (B, C, h, w) of B images at strides 1, 2, 4, 8 and maybe more, in the network's
+    precision.
+    """
 
     levels: tuple[Tensor, ...]
 
@@ -26,7 +29,8 @@ class Pyramid(NamedTuple):
 
 
 class DenseFeatures(NamedTuple):
-    """Features of B images: ``coarse`` for the first pass, ``fine`` of larger images for the second.
+    """Features of B images: ``coarse`` for the first pass, ``fine`` of larger images for the
+    second.
 
     ``coefficients``: (B, n, width) for each Gaussian process of the network, with these images as the support.
     """
@@ -37,8 +41,9 @@ class DenseFeatures(NamedTuple):
 
 
 class DenseWarp(NamedTuple):
-    """Warps of B pairs, float32, on either image's grid. ``warp`` (B, H, W, 4) has (x, y) in the first, then the
-    second image, in [-1, 1]. ``certainty`` (B, H, W) is in [0, 1], and 0 where the target is outside.
+    """Warps of B pairs, float32, on either image's grid. ``warp`` (B, H, W, 4) has (x, y) in the
+    first, then the second image, in [-1, 1]. ``certainty`` (B, H, W) is in [0, 1], and 0 where the
+    target is outside.
     """
 
     warp: Tensor
@@ -53,7 +58,9 @@ class WarpDecoder(nn.Module, ABC):
     """A decoder from the features of two images to the flow between them."""
 
     def forward(self, query: DenseFeatures, support: DenseFeatures) -> tuple[WarpEstimate, Tensor]:
-        """Return the last pass's flow from query to support at stride 1, and the first pass's logits at 16."""
+        """Return the last pass's flow from query to support at stride 1, and the first pass's
+        logits at 16.
+        """
         estimate = self.coarse_estimate(query, support)
         logits = estimate.certainty
         estimate = self.refine(estimate, query.coarse, support.coarse)
@@ -64,7 +71,9 @@ class WarpDecoder(nn.Module, ABC):
     def refine(self, estimate: WarpEstimate, query: Pyramid, support: Pyramid) -> WarpEstimate:
         """Refine an estimate of any size down to stride 1."""
         for stride in (8, 4, 2, 1):
-            estimate = self.correct(estimate.resized(query.at(stride).shape[2:]), query, support, stride)
+            estimate = self.correct(
+                estimate.resized(query.at(stride).shape[2:]), query, support, stride
+            )
         return estimate
 
     @abstractmethod
@@ -72,7 +81,9 @@ class WarpDecoder(nn.Module, ABC):
         """Return the refined estimate at stride 16."""
 
     @abstractmethod
-    def correct(self, estimate: WarpEstimate, query: Pyramid, support: Pyramid, stride: int) -> WarpEstimate:
+    def correct(
+        self, estimate: WarpEstimate, query: Pyramid, support: Pyramid, stride: int
+    ) -> WarpEstimate:
         """Correct an estimate, at the size of a stride's features, with that stride's refiner."""
 
 
@@ -83,17 +94,25 @@ class DenseNetwork(nn.Module, ABC):
 
     @abstractmethod
     def encode(self, image: Tensor, fine: Tensor | None = None) -> DenseFeatures:
-        """Encode images (B, 3, H, W) from :func:`pixels.network_input`; ``fine``: larger, for a second pass."""
+        """Encode images (B, 3, H, W) from :func:`pixels.network_input`; ``fine``: larger, for a
+        second pass.
+        """
 
     def match(self, first: DenseFeatures, second: DenseFeatures) -> tuple[DenseWarp, DenseWarp]:
-        """Return the warps of B pairs on the first and on the second image's grid. Sizes may differ."""
+        """Return the warps of B pairs on the first and on the second image's grid. Sizes may
+        differ.
+        """
         # Sequential: one batch of both directions would take twice the memory and the same time.
-        forward, backward = (dense_warp(*self.decoder(*both)) for both in ((first, second), (second, first)))
+        forward, backward = (
+            dense_warp(*self.decoder(*both)) for both in ((first, second), (second, first))
+        )
         return forward, backward.swapped()
 
 
 def dense_warp(estimate: WarpEstimate, coarse_logits: Tensor) -> DenseWarp:
-    """Return the warp on the query's grid; ``coarse_logits`` (B, 1, h, w): the first pass's at stride 16."""
+    """Return the warp on the query's grid; ``coarse_logits`` (B, 1, h, w): the first pass's at
+    stride 16.
+    """
     flow, logits = estimate.flow, estimate.certainty
     # Subtract half of the negative coarse logits.
     doubts = resize(coarse_logits, logits.shape[2:]).clamp(max=0)
@@ -108,7 +127,8 @@ TEMPERATURE, NOISE_VARIANCE = 0.2, 0.1
 
 
 class GaussianProcess(nn.Module):
-    """A Gaussian process from the support's features to its pixels' coordinates, embedded in ``width`` channels.
+    """A Gaussian process from the support's features to its pixels' coordinates, embedded in
+    ``width`` channels.
 
     Source: Edstedt et al. 2023, section 3.2.
     """
@@ -141,16 +161,18 @@ def coefficients(y: Tensor, values: Tensor) -> Tensor:
     check_finite("coarse features", y)
     covariance = kernel(y, y)
     covariance.diagonal(dim1=1, dim2=2).add_(NOISE_VARIANCE)
-    # The matrix is positive definite. LU costs twice as much; batched LU is broken in PyTorch's MKL builds.
+    # The matrix is positive definite. LU costs twice as much; batched LU is broken in PyTorch's MKL
+    # builds.
     factor = torch.linalg.cholesky(covariance)
     return torch.cholesky_solve(values.expand(len(y), -1, -1), factor)
 
 
 def kernel(x: Tensor, y: Tensor) -> Tensor:
-    """Return exp((cosine - 1) / T), (B, n, m) float32, of all pairs of rows of x (B, n, C) and y (B, m, C).
+    """Return exp((cosine - 1) / T), (B, n, m) float32, of all pairs of rows of x (B, n, C) and y
+    (B, m, C).
 
-    Computed in float64: the inverse of a covariance amplifies rounding errors about fifteen times, and so do the
-    refiners. A pair of 540 x 720 pixels takes 0.1 s on a CPU and 40 ms on a T4.
+    Computed in float64: the inverse of a covariance amplifies rounding errors about fifteen times,
+    and so do the refiners. A pair of 540 x 720 pixels takes 0.1 s on a CPU and 40 ms on a T4.
     """
     x, y = x.double(), y.double()
     norms = (x.norm(dim=2)[:, :, None] * y.norm(dim=2)[:, None]).add_(1e-6)

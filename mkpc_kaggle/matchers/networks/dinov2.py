@@ -1,6 +1,8 @@
-"""DINOv2's vision transformer: Oquab et al., "DINOv2: Learning Robust Visual Features without Supervision", 2023.
+"""DINOv2's vision transformer: Oquab et al., "DINOv2: Learning Robust Visual Features without
+Supervision", 2023.
 
-This version has no register tokens. Parameter names match the public checkpoints. For inference only.
+This version has no register tokens. Parameter names match the public checkpoints. For inference
+only.
 """
 
 from math import isqrt
@@ -27,7 +29,8 @@ class DinoV2(nn.Module):
         super().__init__()
         self.cls_token = nn.Parameter(torch.zeros(1, 1, WIDTH))
         self.pos_embed = nn.Parameter(torch.zeros(1, 1 + POSITIONS**2, WIDTH))
-        self.mask_token = nn.Parameter(torch.zeros(1, WIDTH))  # for training only; checkpoints have it
+        # For training only; checkpoints have it
+        self.mask_token = nn.Parameter(torch.zeros(1, WIDTH))
         self.patch_embed = nn.ModuleDict({"proj": nn.Conv2d(3, WIDTH, PATCH, PATCH)})
         blocks = (VitBlock(WIDTH, HEADS, EPSILON, bias=True, scaled=True) for _ in range(BLOCKS))
         self.blocks = nn.ModuleList(blocks)
@@ -41,32 +44,40 @@ class DinoV2(nn.Module):
             embed(image.to(self.patch_embed.get_parameter("proj.weight").dtype)).float()
         )  # (B, h, w, C)
         classes = self.cls_token.expand(len(image), -1, -1)
-        tokens = torch.cat([classes, patches.flatten(1, 2)], dim=1).add_(self.positions(*patches.shape[1:3]))
+        tokens = torch.cat([classes, patches.flatten(1, 2)], dim=1).add_(
+            self.positions(*patches.shape[1:3])
+        )
         for block in self.blocks:
             tokens = block(tokens)
         normed: Tensor = self.norm(tokens)
         return as_map(normed[:, 1:].reshape(patches.shape))
 
     def positions(self, height: int, width: int) -> Tensor:
-        """Return the positional embeddings (1, 1 + h w, C) of a grid of patches, the class token's first.
+        """Return the positional embeddings (1, 1 + h w, C) of a grid of patches, the class token's
+        first.
 
-        The stored grid is resampled by factors slightly above the ratios of the sides, as in training.
+        The stored grid is resampled by factors slightly above the ratios of the sides, as in
+        training.
         """
         side = isqrt(self.pos_embed.shape[1])
         if (height, width) == (side, side):
             return self.pos_embed
         stored = as_map(self.pos_embed[:, 1:].reshape(1, side, side, -1))  # (1, C, side, side)
         factors = (height + OFFSET) / side, (width + OFFSET) / side
-        resampled = functional.interpolate(stored, scale_factor=factors, mode="bicubic", align_corners=False)
+        resampled = functional.interpolate(
+            stored, scale_factor=factors, mode="bicubic", align_corners=False
+        )
         assert resampled.shape[2:] == (height, width)
         return torch.cat([self.pos_embed[:, :1], as_grid(resampled).flatten(1, 2)], dim=1)
 
 
 class VitBlock(nn.Module):
-    """Self-attention, then a perceptron, each with a norm before it and a residual (Dosovitskiy et al. 2021, 3.1).
+    """Self-attention, then a perceptron, each with a norm before it and a residual (Dosovitskiy et
+    al. 2021, 3.1).
 
-    Sums and norms are float32; the added terms are computed in the precision of the layers' weights.
-    The norms use ``epsilon``. If ``scaled``, each added term has a learned factor per channel.
+    Sums and norms are float32; the added terms are computed in the precision of the layers'
+    weights. The norms use ``epsilon``. If ``scaled``, each added term has a learned factor per
+    channel.
     """
 
     def __init__(self, width: int, heads: int, epsilon: float, *, bias: bool, scaled: bool) -> None:
@@ -85,7 +96,9 @@ class VitBlock(nn.Module):
 
 
 class VitAttention(nn.Module):
-    """Self-attention of all tokens. With ``bias``, the projection to queries, keys and values has one."""
+    """Self-attention of all tokens. With ``bias``, the projection to queries, keys and values has
+    one.
+    """
 
     def __init__(self, width: int, heads: int, bias: bool) -> None:
         super().__init__()
@@ -95,7 +108,8 @@ class VitAttention(nn.Module):
 
     def forward(self, tokens: Tensor) -> Tensor:
         """Map (B, n, C) to (B, n, C) in the weights' precision."""
-        projected = self.qkv(tokens.to(self.qkv.weight.dtype))  # (B, n, 3 C): queries, then keys, then values
+        # (B, n, 3 C): queries, then keys, then values
+        projected = self.qkv(tokens.to(self.qkv.weight.dtype))
         split = projected.view(*projected.shape[:2], 3, self.heads, -1).permute(
             2, 0, 3, 1, 4
         )  # (3, B, heads, n, D)

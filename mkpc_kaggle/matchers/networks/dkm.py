@@ -1,9 +1,10 @@
-"""DKM v3: Edstedt et al., "DKM: Dense Kernelized Feature Matching for Geometry Estimation", CVPR 2023.
+"""DKM v3: Edstedt et al., "DKM: Dense Kernelized Feature Matching for Geometry Estimation", CVPR
+2023.
 
-Every pixel of each image gets a position in the other image and a certainty. Images of a pair may differ in size;
-the published code needs equal sizes. Correlation windows and corrections are in pixels of the query.
-Coordinates are normalised: (x, y) in [-1, 1], where +-1 are the outer edges of an image (see warp_refiner).
-Parameter names match the public checkpoints. For inference only.
+Every pixel of each image gets a position in the other image and a certainty. Images of a pair may
+differ in size; the published code needs equal sizes. Correlation windows and corrections are in
+pixels of the query. Coordinates are normalised: (x, y) in [-1, 1], where +-1 are the outer edges of
+an image (see warp_refiner). Parameter names match the public checkpoints. For inference only.
 """
 
 import torch
@@ -54,8 +55,12 @@ class DkmDecoder(WarpDecoder):
         super().__init__()
         self.embedding_decoder = EmbeddingDecoder()
         self.gps = nn.ModuleDict({str(s): GaussianProcess(POSTERIOR) for s in STRIDES})
-        self.proj = nn.ModuleDict({"16": nn.Conv2d(1024, FEATURES, 1), "32": nn.Conv2d(2048, FEATURES, 1)})
-        self.conv_refiner = nn.ModuleDict({str(s): WarpRefiner(shape) for s, shape in SHAPES.items()})
+        self.proj = nn.ModuleDict(
+            {"16": nn.Conv2d(1024, FEATURES, 1), "32": nn.Conv2d(2048, FEATURES, 1)}
+        )
+        self.conv_refiner = nn.ModuleDict(
+            {str(s): WarpRefiner(shape) for s, shape in SHAPES.items()}
+        )
 
     def projected(self, pyramid: Pyramid) -> Pyramid:
         """Return the pyramid of all six strides, projected to 512 channels at strides 16 and 32."""
@@ -79,8 +84,12 @@ class DkmDecoder(WarpDecoder):
             estimate, context = self.embedding_decoder(stride, posterior, features, context)
         return self.correct(estimate, first, second, STRIDES[-1])
 
-    def correct(self, estimate: WarpEstimate, query: Pyramid, support: Pyramid, stride: int) -> WarpEstimate:
-        corrections = self.conv_refiner[str(stride)](query.at(stride), support.at(stride), estimate.flow)
+    def correct(
+        self, estimate: WarpEstimate, query: Pyramid, support: Pyramid, stride: int
+    ) -> WarpEstimate:
+        corrections = self.conv_refiner[str(stride)](
+            query.at(stride), support.at(stride), estimate.flow
+        )
         return refined(estimate, corrections, stride, query.at(1).shape[2:])
 
 
@@ -89,7 +98,9 @@ class EmbeddingDecoder(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.feat_input_modules = nn.ModuleDict({str(s): nn.Conv2d(FEATURES, 256, 1) for s in STRIDES})
+        self.feat_input_modules = nn.ModuleDict(
+            {str(s): nn.Conv2d(FEATURES, 256, 1) for s in STRIDES}
+        )
         self.rrb_d = nn.ModuleDict({str(s): ResidualRefinement(256 + POSTERIOR) for s in STRIDES})
         self.cab = nn.ModuleDict({str(s): ChannelAttention() for s in STRIDES})
         self.rrb_u = nn.ModuleDict({str(s): ResidualRefinement(WIDTH) for s in STRIDES})
@@ -98,7 +109,9 @@ class EmbeddingDecoder(nn.Module):
     def forward(
         self, stride: int, posterior: Tensor, features: Tensor, context: Tensor
     ) -> tuple[WarpEstimate, Tensor]:
-        """Map posterior, features and context (B, 256 / 512 / 384, h, w) to the estimate and the next context."""
+        """Map posterior, features and context (B, 256 / 512 / 384, h, w) to the estimate and the
+        next context.
+        """
         at = str(stride)
         own = self.feat_input_modules[at](features)
         embedded = torch.cat([own, posterior.to(own.dtype)], dim=1)  # (B, 512, h, w)
@@ -134,13 +147,15 @@ class ChannelAttention(nn.Module):
 
     def forward(self, context: Tensor, embedded: Tensor) -> Tensor:
         """Map two maps (B, 384, h, w) to (B, 384, h, w)."""
-        means = torch.cat([context, embedded], dim=1).mean(dim=(2, 3), keepdim=True)  # (B, 768, 1, 1)
+        # (B, 768, 1, 1)
+        means = torch.cat([context, embedded], dim=1).mean(dim=(2, 3), keepdim=True)
         weights = self.conv2(self.conv1(means).relu_()).sigmoid_()
         return torch.addcmul(context, weights, embedded)
 
 
 class Bottleneck(nn.Module):
-    """1x1, 3x3 and 1x1 convolutions with a shortcut, which is a 1x1 convolution where the shape changes.
+    """1x1, 3x3 and 1x1 convolutions with a shortcut, which is a 1x1 convolution where the shape
+    changes.
 
     Written here because offline installs have no torchvision. The 3x3 convolution has the stride.
     """
@@ -188,7 +203,8 @@ class ResNet50(nn.Module):
     def forward(self, image: Tensor) -> tuple[Tensor, ...]:
         """Return features at strides 2, 4, 8, 16 and 32 of images (B, 3, H, W) of any size.
 
-        Features are (B, C, h, w) with C = 64, 256, 512, 1024, 2048; every halving of a side rounds up.
+        Features are (B, C, h, w) with C = 64, 256, 512, 1024, 2048; every halving of a side rounds
+        up.
         """
         levels = [functional.relu_(self.bn1(self.conv1(image)))]
         x = functional.max_pool2d(levels[0], 3, stride=2, padding=1)

@@ -44,12 +44,15 @@ class FinePreprocess(nn.Module):
 
 
 def cell_points(cells: Tensor, width: int) -> Tensor:
-    """Return top-left corners (M, 2) float32, (x, y) in pixels, of cells (M,) in a map of ``width`` columns."""
+    """Return top-left corners (M, 2) float32, (x, y) in pixels, of cells (M,) in a map of ``width``
+    columns.
+    """
     return torch.stack([cells % width, cells // width], dim=1).float() * COARSE_STRIDE
 
 
 def cut_windows(fine: Tensor, cells: Tensor) -> Tensor:
-    """Cut row-major windows (M, 25, C) float32 around coarse cells (M,) from a fine map (1, C, Hf, Wf).
+    """Cut row-major windows (M, 25, C) float32 around coarse cells (M,) from a fine map (1, C, Hf,
+    Wf).
 
     A window is centred on its coarse cell's top-left fine cell, and is zero outside the map.
     """
@@ -62,17 +65,25 @@ def cut_windows(fine: Tensor, cells: Tensor) -> Tensor:
     columns = (cells % coarse_width * step)[:, None, None] + around  # (M, 1, 5)
     # Centres are at multiples of the step, so windows exceed the map at the top and left only.
     index = rows.clamp(min=0) * width + columns.clamp(min=0)  # (M, 5, 5)
-    windows = grid.reshape(-1, channels).index_select(0, index.flatten()).float().view(-1, SIDE * SIDE, channels)
+    windows = (
+        grid.reshape(-1, channels)
+        .index_select(0, index.flatten())
+        .float()
+        .view(-1, SIDE * SIDE, channels)
+    )
     return windows.masked_fill_(((rows < 0) | (columns < 0)).flatten(1)[..., None], 0.0)
 
 
 def expected_offset(windows0: Tensor, windows1: Tensor) -> Tensor:
-    """Return the mean offset (M, 2) float32, (x, y) in -1..1, between windows (M, 25, C) of both images.
+    """Return the mean offset (M, 2) float32, (x, y) in -1..1, between windows (M, 25, C) of both
+    images.
 
-    The centre of window 0 is compared with each cell of window 1; a softmax gives the offset's distribution.
+    The centre of window 0 is compared with each cell of window 1; a softmax gives the offset's
+    distribution.
     """
     logits = (windows1 @ windows0[:, CENTRE, :, None])[..., 0] / windows0.shape[2] ** 0.5  # (M, 25)
     axis = torch.linspace(-1.0, 1.0, SIDE, device=logits.device)
-    offsets = torch.stack([axis.repeat(SIDE), axis.repeat_interleave(SIDE)], dim=1)  # (25, 2): (x, y)
+    # (25, 2): (x, y)
+    offsets = torch.stack([axis.repeat(SIDE), axis.repeat_interleave(SIDE)], dim=1)
     mean: Tensor = logits.softmax(dim=1) @ offsets
     return mean

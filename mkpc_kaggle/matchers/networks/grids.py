@@ -27,16 +27,20 @@ def mean_pool(grid: Tensor, factor: int | tuple[int, int]) -> Tensor:
 
 
 def to_2x2_blocks(grid: Tensor) -> Tensor:
-    """Map (..., h, w, E) to (..., h/2 * w/2, 4, E): 2x2 blocks row by row, and cells row by row within a block."""
+    """Map (..., h, w, E) to (..., h/2 * w/2, 4, E): 2x2 blocks row by row, and cells row by row
+    within a block.
+    """
     *lead, h, w, width = grid.shape
-    cells = grid.reshape(*lead, h // 2, 2, w // 2, 2, width).transpose(-4, -3)  # (..., h/2, w/2, 2, 2, E)
+    # (..., h/2, w/2, 2, 2, E)
+    cells = grid.reshape(*lead, h // 2, 2, w // 2, 2, width).transpose(-4, -3)
     return cells.reshape(*lead, h * w // 4, 4, width)
 
 
 def from_2x2_blocks(cells: Tensor, h: int, w: int) -> Tensor:
     """Map (..., h/2 * w/2, 4, E) to (..., h, w, E): undo :func:`to_2x2_blocks`."""
     *lead, _, _, width = cells.shape
-    rows = cells.reshape(*lead, h // 2, w // 2, 2, 2, width).transpose(-4, -3)  # (..., h/2, 2, w/2, 2, E)
+    # (..., h/2, 2, w/2, 2, E)
+    rows = cells.reshape(*lead, h // 2, w // 2, 2, 2, width).transpose(-4, -3)
     return rows.reshape(*lead, h, w, width)
 
 

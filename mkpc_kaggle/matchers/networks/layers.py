@@ -1,7 +1,8 @@
-"""Linear maps, attention, convolutions in strips and mutual matches, fast on CPUs; for inference only.
+"""Linear maps, attention, convolutions in strips and mutual matches, fast on CPUs; for inference
+only.
 
-A weight may have half precision (see ``placement``). The product is then computed in half precision, and a linear
-map converts the result back to the input's precision.
+A weight may have half precision (see ``placement``). The product is then computed in half
+precision, and a linear map converts the result back to the input's precision.
 """
 
 from collections.abc import Callable
@@ -16,16 +17,20 @@ IMAGES = range(16, 65)  # on one thread PyTorch uses oneDNN's convolution from 1
 
 
 def linear(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
-    """Map (..., C_in) to (..., C_out): multiply by ``weight`` (C_out, C_in), and add ``bias`` (C_out,)."""
+    """Map (..., C_in) to (..., C_out): multiply by ``weight`` (C_out, C_in), and add ``bias``
+    (C_out,).
+    """
     if weight.dtype != x.dtype:
         return functional.linear(x.to(weight.dtype), weight, bias).to(x.dtype)
     if x.device.type != "cpu" or weight.dtype != torch.float32 or x.numel() == 0:
         return functional.linear(x, weight, bias)
-    # In float32 oneDNN's 1x1 convolution is as fast as MKL's matrix product on Intel, twice as fast on AMD.
+    # In float32 oneDNN's 1x1 convolution is as fast as MKL's matrix product on Intel, twice as fast
+    # on AMD.
     rows = x.numel() // x.shape[-1]
     images = next((count for count in IMAGES if rows % count == 0), 1)
     seen = x.reshape(images, 1, rows // images, -1).permute(0, 3, 1, 2)  # channels last
-    mapped = functional.conv2d(seen, weight[:, :, None, None], bias)  # (images, C_out, 1, rows / images)
+    # (images, C_out, 1, rows / images)
+    mapped = functional.conv2d(seen, weight[:, :, None, None], bias)
     return mapped.permute(0, 2, 3, 1).reshape(*x.shape[:-1], -1)
 
 
@@ -37,7 +42,9 @@ class Linear(nn.Linear):
 
 
 class Exact:
-    """A mark of layers that output or select coordinates. These layers stay float32 in any precision."""
+    """A mark of layers that output or select coordinates. These layers stay float32 in any
+    precision.
+    """
 
 
 class ExactLinear(Exact, Linear):
@@ -53,7 +60,9 @@ class ExactConv2d(Exact, nn.Conv2d):
 
 
 def depthwise_block(inputs: int, outputs: int) -> nn.Sequential:
-    """Make a depthwise 5x5 convolution of ``inputs`` channels, then a 1x1 convolution of ``outputs``."""
+    """Make a depthwise 5x5 convolution of ``inputs`` channels, then a 1x1 convolution of
+    ``outputs``.
+    """
     return nn.Sequential(
         nn.Conv2d(inputs, outputs, 5, padding=2, groups=inputs),
         nn.BatchNorm2d(outputs),
@@ -76,12 +85,15 @@ def attention(q: Tensor, k: Tensor, v: Tensor, precision: torch.dtype) -> Tensor
     return functional.scaled_dot_product_attention(queries, keys, values).to(q.dtype)
 
 
-def in_strips(function: Callable[[Tensor], Tensor], x: Tensor, *, reach: int, channels: int) -> Tensor:
-    """Map (B, C, H, W) to (B, C', H, W) by ``function``; on a CPU, in strips of rows that fit the cache.
+def in_strips(
+    function: Callable[[Tensor], Tensor], x: Tensor, *, reach: int, channels: int
+) -> Tensor:
+    """Map (B, C, H, W) to (B, C', H, W) by ``function``; on a CPU, in strips of rows that fit the
+    cache.
 
-    A row of the result depends on ``reach`` rows above and below it. ``channels``: the maximum number of channels
-    inside the function. The function must not change ``x``. Strips overlap by the reach, so that zero padding at
-    their edges has no effect.
+    A row of the result depends on ``reach`` rows above and below it. ``channels``: the maximum
+    number of channels inside the function. The function must not change ``x``. Strips overlap by
+    the reach, so that zero padding at their edges has no effect.
     """
     batch, _, height, width = x.shape
     rows = max(1, 4 * reach, STRIP_FLOATS // (batch * channels * width))
@@ -95,7 +107,9 @@ def in_strips(function: Callable[[Tensor], Tensor], x: Tensor, *, reach: int, ch
 
 
 class Assignment(NamedTuple):
-    """M matches by ascending ``index0``: indices (M,) int64 of keypoints or cells, ``scores`` (M,) in 0..1."""
+    """M matches by ascending ``index0``: indices (M,) int64 of keypoints or cells, ``scores`` (M,)
+    in 0..1.
+    """
 
     index0: Tensor
     index1: Tensor
@@ -108,8 +122,11 @@ class Assignment(NamedTuple):
 
 
 def mutual_matches(log_scores: Tensor, threshold: float) -> Assignment:
-    """Return pairs of keypoints that are mutually best in ``log_scores`` (N0, N1), scored above the threshold."""
-    (best0, partner0), partner1 = log_scores.max(dim=1), log_scores.argmax(dim=0)  # (N0,) twice, (N1,)
+    """Return pairs of keypoints that are mutually best in ``log_scores`` (N0, N1), scored above the
+    threshold.
+    """
+    # (N0,) twice, (N1,)
+    (best0, partner0), partner1 = log_scores.max(dim=1), log_scores.argmax(dim=0)
     index0, scores = torch.arange(len(partner0), device=log_scores.device), best0.exp()
     kept = (partner1[partner0] == index0) & (scores > threshold)
     return Assignment(index0[kept], partner0[kept], scores[kept])

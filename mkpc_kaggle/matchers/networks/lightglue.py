@@ -1,7 +1,8 @@
-"""LightGlue: Lindenberger, Sarlin, Pollefeys, "LightGlue: Local Feature Matching at Light Speed", ICCV 2023.
+"""LightGlue: Lindenberger, Sarlin, Pollefeys, "LightGlue: Local Feature Matching at Light Speed",
+ICCV 2023.
 
-The keypoints of both images share one tensor (1, N, d), N = N0 + N1; only attention separates the images.
-Parameter names match the public checkpoints. For inference only.
+The keypoints of both images share one tensor (1, N, d), N = N0 + N1; only attention separates the
+images. Parameter names match the public checkpoints. For inference only.
 """
 
 import math
@@ -41,7 +42,8 @@ class LightGlueShape:
 
 @dataclass(frozen=True)
 class Adaptation:
-    """Settings of early stopping and pruning (section 3.3 of the paper), and the threshold of matches.
+    """Settings of early stopping and pruning (section 3.3 of the paper), and the threshold of
+    matches.
 
     Stop after a layer if more than the share ``depth`` of keypoints is confident. Drop confident keypoints that
     match with a probability of at most 1 - ``width``. Negative: never. Matches score above ``threshold``.
@@ -82,7 +84,9 @@ def update(width: int) -> nn.Sequential:
 
 
 class SelfAttention(nn.Module):
-    """Messages between the keypoints of one image. ``Wqkv`` outputs are ordered by head, channel, then q, k, v."""
+    """Messages between the keypoints of one image. ``Wqkv`` outputs are ordered by head, channel,
+    then q, k, v.
+    """
 
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()
@@ -122,7 +126,8 @@ class CrossAttention(nn.Module):
         qk0, qk1 = qk[:, :, :n0], qk[:, :, n0:]
         v0, v1 = v[:, :, :n0], v[:, :, n0:]
         precision = self.to_out.weight.dtype
-        # Two products with a fused softmax are faster than one product whose result both directions read.
+        # Two products with a fused softmax are faster than one product whose result both directions
+        # read.
         outputs = [attention(qk0, qk1, v1, precision), attention(qk1, qk0, v0, precision)]
         return updated(x, outputs, self.to_out, self.ffn)
 
@@ -259,18 +264,24 @@ class LightGlue(nn.Module):
         kept = self.assignment(layer).match_probability(x) > 1 - self.adaptation.width
         if confidence is not None:
             kept |= confidence <= self._threshold(layer)
-        for image, is_image_pruned in zip((slice(None, n0), slice(n0, None)), is_pruned, strict=True):
+        for image, is_image_pruned in zip(
+            (slice(None, n0), slice(n0, None)), is_pruned, strict=True
+        ):
             if not is_image_pruned:
                 kept[image] = True
         return kept.nonzero()[:, 0]
 
     def _threshold(self, layer: int) -> float:
-        """Return the confidence from which a keypoint is sure: it falls with the layer, as published."""
+        """Return the confidence from which a keypoint is sure: it falls with the layer, as
+        published.
+        """
         return 0.8 + 0.1 * math.exp(-4.0 * layer / len(self.transformers))
 
 
 def log_scores(similarity: Tensor) -> Tensor:
-    """Return the logarithm (..., N0, N1) of the product of two softmaxes, one over each image's keypoints."""
+    """Return the logarithm (..., N0, N1) of the product of two softmaxes, one over each image's
+    keypoints.
+    """
     return similarity.log_softmax(dim=-2).add_(similarity.log_softmax(dim=-1))
 
 

@@ -1,4 +1,5 @@
-"""The transformer with linear attention: LoFTR's coarse one, and the fine one of LoFTR and its descendants.
+"""The transformer with linear attention: LoFTR's coarse one, and the fine one of LoFTR and its
+descendants.
 
 Sources: Sun et al. 2021, section 3.2; Katharopoulos et al. 2020 (linear attention).
 """
@@ -13,8 +14,11 @@ from mkpc_kaggle.matchers.networks.layers import Linear
 Masks = tuple[Tensor, Tensor]
 
 
-def linear_attention(q: Tensor, k: Tensor, v: Tensor, heads: int, masks: Masks | None = None) -> Tensor:
-    """Map queries (N, L, C), keys and values (N, S, C) to (N, L, C). Each head has consecutive channels.
+def linear_attention(
+    q: Tensor, k: Tensor, v: Tensor, heads: int, masks: Masks | None = None
+) -> Tensor:
+    """Map queries (N, L, C), keys and values (N, S, C) to (N, L, C). Each head has consecutive
+    channels.
 
     ``masks`` of queries (N, L) and of keys (N, S) are True at content. A masked query's output is zero, and a
     masked key has no effect. ``q`` and ``k`` are overwritten.
@@ -23,7 +27,8 @@ def linear_attention(q: Tensor, k: Tensor, v: Tensor, heads: int, masks: Masks |
     if masks is not None:
         q, k = q.mul_(masks[0][..., None]), k.mul_(masks[1][..., None])
     width = q.shape[2] // heads
-    q, k, v = (x.view(*x.shape[:2], heads, width).transpose(1, 2) for x in (q, k, v))  # (N, heads, L or S, D)
+    # (N, heads, L or S, D)
+    q, k, v = (x.view(*x.shape[:2], heads, width).transpose(1, 2) for x in (q, k, v))
     total = q @ k.sum(dim=2)[..., None]  # (N, heads, L, 1)
     attended: Tensor = q @ (k.transpose(2, 3) @ v) / (total + 1e-6)  # (N, heads, L, D)
     return attended.transpose(1, 2).flatten(2)
@@ -39,12 +44,16 @@ class EncoderLayer(nn.Module):
         self.k_proj = Linear(width, width, bias=False)
         self.v_proj = Linear(width, width, bias=False)
         self.merge = Linear(width, width, bias=False)
-        self.mlp = Perceptron(Linear(2 * width, 2 * width, bias=False), Linear(2 * width, width, bias=False))
+        self.mlp = Perceptron(
+            Linear(2 * width, 2 * width, bias=False), Linear(2 * width, width, bias=False)
+        )
         self.norm1 = nn.LayerNorm(width)
         self.norm2 = nn.LayerNorm(width)
 
     def forward(self, x: Tensor, source: Tensor, masks: Masks | None = None) -> Tensor:
-        """Map tokens (N, L, C) and source (N, S, C), with their masks (N, L) and (N, S), to (N, L, C)."""
+        """Map tokens (N, L, C) and source (N, S, C), with their masks (N, L) and (N, S), to (N, L,
+        C).
+        """
         # One cast instead of one per projection.
         seen = x.to(self.q_proj.weight.dtype)
         other = seen if source is x else source.to(seen.dtype)
@@ -66,11 +75,18 @@ class LinearTransformer(nn.Module):
         self.layers = nn.ModuleList(EncoderLayer(width, heads) for _ in range(2 * cycles))
 
     def forward(self, x0: Tensor, x1: Tensor, masks: Masks | None = None) -> tuple[Tensor, Tensor]:
-        """Map (N, L, C) and (N, S, C), with masks (N, L) and (N, S), True at content, to the same shapes."""
+        """Map (N, L, C) and (N, S, C), with masks (N, L) and (N, S), True at content, to the same
+        shapes.
+        """
         own0 = own1 = cross0 = cross1 = None
         if masks is not None:
             mask0, mask1 = masks
-            own0, own1, cross0, cross1 = (mask0, mask0), (mask1, mask1), (mask0, mask1), (mask1, mask0)
+            own0, own1, cross0, cross1 = (
+                (mask0, mask0),
+                (mask1, mask1),
+                (mask0, mask1),
+                (mask1, mask0),
+            )
         for index, layer in enumerate(self.layers):
             if index % 2 == 0:
                 x0, x1 = layer(x0, x0, own0), layer(x1, x1, own1)

@@ -1,4 +1,6 @@
-"""LoFTR with dual softmax (Sun et al., "LoFTR: Detector-Free Local Feature Matching with Transformers", 2021)."""
+"""LoFTR with dual softmax (Sun et al., "LoFTR: Detector-Free Local Feature Matching with
+Transformers", 2021).
+"""
 
 from torch import Tensor
 
@@ -12,7 +14,8 @@ from mkpc_kaggle.matchers.networks.semi_dense import HEADS, SemiDenseNetwork
 class Loftr(SemiDenseNetwork):
     """LoFTR. Sides are multiples of 8; the two images may differ in size.
 
-    Indoor weights were trained later, with the corrected position encoding, and were published with border 0.
+    Indoor weights were trained later, with the corrected position encoding, and were published with
+    border 0.
     """
 
     multiple = 8
@@ -23,7 +26,9 @@ class Loftr(SemiDenseNetwork):
         if training is Training.INDOOR:
             self.decay, self.border = FIXED_DECAY, 0
 
-    def transform(self, coarse0: Tensor, coarse1: Tensor, masks: Masks | None = None) -> tuple[Tensor, Tensor]:
+    def transform(
+        self, coarse0: Tensor, coarse1: Tensor, masks: Masks | None = None
+    ) -> tuple[Tensor, Tensor]:
         grid0, grid1 = with_positions(coarse0, self.decay), with_positions(coarse1, self.decay)
         flat_masks = None if masks is None else (masks[0].flatten(1), masks[1].flatten(1))
         tokens0, tokens1 = self.loftr_coarse(grid0.flatten(1, 2), grid1.flatten(1, 2), flat_masks)

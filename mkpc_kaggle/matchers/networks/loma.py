@@ -1,7 +1,8 @@
-"""LoMa (Nordström et al. 2026, arXiv 2604.04931): DaD keypoints, DeDoDe descriptors, a LightGlue-like matcher.
+"""LoMa (Nordström et al. 2026, arXiv 2604.04931): DaD keypoints, DeDoDe descriptors, a
+LightGlue-like matcher.
 
-One public checkpoint has all three. Variants differ in the descriptor and in the matcher's width. For inference
-only.
+One public checkpoint has all three. Variants differ in the descriptor and in the matcher's width.
+For inference only.
 """
 
 from enum import StrEnum
@@ -45,21 +46,26 @@ class Loma(nn.Module):
     def encode(self, detected: Tensor, described: Tensor, number: int) -> LomaKeypoints:
         """Return up to ``number`` keypoints of one image, strongest first.
 
-        The image is given at two sizes, for the detector and the descriptor, each (1, 3, H, W) RGB in 0..1.
+        The image is given at two sizes, for the detector and the descriptor, each (1, 3, H, W) RGB
+        in 0..1.
         """
         (points,) = self.detector(detected, number)
         return LomaKeypoints(points, self.descriptor(described, points[None])[0])
 
 
 def parameter_name(published: str) -> str:
-    """Return our name of a published parameter: of ``_detector``, of ``_descriptor``, or else of the matcher."""
+    """Return our name of a published parameter: of ``_detector``, of ``_descriptor``, or else of
+    the matcher.
+    """
     return published[1:] if published.startswith("_") else f"matcher.{published}"
 
 
 def detector_size(image: Size, long_side: int) -> Size:
-    """Return the detector's input size: ``image`` scaled to ``long_side``, then rounded down to multiples of 8.
+    """Return the detector's input size: ``image`` scaled to ``long_side``, then rounded down to
+    multiples of 8.
 
-    As in training, if rounding errors put the longer side just below ``long_side``, it loses 8 pixels.
+    As in training, if rounding errors put the longer side just below ``long_side``, it loses 8
+    pixels.
     """
     scale = long_side / max(image)
     return Size(*(8 * int(scale * side / 8) for side in image))

@@ -1,7 +1,8 @@
-"""LoMa's matcher (Nordström et al. 2026, arXiv 2604.04931): all layers of LightGlue (Lindenberger et al. 2023).
+"""LoMa's matcher (Nordström et al. 2026, arXiv 2604.04931): all layers of LightGlue (Lindenberger
+et al. 2023).
 
-The keypoints of both images share one tensor (1, N, d), N = N0 + N1; only attention separates the images.
-Parameter names match the public checkpoints. For inference only.
+The keypoints of both images share one tensor (1, N, d), N = N0 + N1; only attention separates the
+images. Parameter names match the public checkpoints. For inference only.
 """
 
 from typing import NamedTuple
@@ -27,16 +28,20 @@ class LomaKeypoints(NamedTuple):
 
 
 class LomaMatcher(nn.Module):
-    """A matcher with ``descriptor`` input channels and ``width`` inner channels. Of a checkpoint's assignment
-    layers, it uses only the last.
+    """A matcher with ``descriptor`` input channels and ``width`` inner channels. Of a checkpoint's
+    assignment layers, it uses only the last.
     """
 
     def __init__(self, descriptor: int, width: int) -> None:
         super().__init__()
         self.input_proj = nn.Identity() if descriptor == width else Linear(descriptor, width)
         self.posenc = RotaryEmbedding(2, HEAD)
-        self.transformers = nn.ModuleList(TransformerLayer(width, width // HEAD) for _ in range(LAYERS))
-        self.log_assignment = nn.ModuleDict({str(LAYERS - 1): nn.ModuleDict({"final_proj": Linear(width, width)})})
+        self.transformers = nn.ModuleList(
+            TransformerLayer(width, width // HEAD) for _ in range(LAYERS)
+        )
+        self.log_assignment = nn.ModuleDict(
+            {str(LAYERS - 1): nn.ModuleDict({"final_proj": Linear(width, width)})}
+        )
         self.eval().requires_grad_(False)
 
     def forward(self, image0: LomaKeypoints, image1: LomaKeypoints, threshold: float) -> Assignment:

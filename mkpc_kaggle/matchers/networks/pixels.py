@@ -10,12 +10,14 @@ MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet's colour
 def resized(pixels: Tensor, size: tuple[int, int]) -> Tensor:
     """Resize images (B, C, H, W) uint8 on the CPU to (B, C, *size) float32 in 0..1.
 
-    Bicubic with antialiasing in 8 bits, the width first, as in training with Pillow up to version 12. About
-    1 % of the values differ from Pillow's, by one or two grey levels. Pillow 13 resizes a shrinking height before
-    a growing width; then at least 20 % of the values differ.
+    Bicubic with antialiasing in 8 bits, the width first, as in training with Pillow up to version
+    12. About 1 % of the values differ from Pillow's, by one or two grey levels. Pillow 13 resizes a
+    shrinking height before a growing width; then at least 20 % of the values differ.
     """
     if pixels.shape[2:] != size:
-        pixels = functional.interpolate(pixels, size, mode="bicubic", antialias=True, align_corners=False)
+        pixels = functional.interpolate(
+            pixels, size, mode="bicubic", antialias=True, align_corners=False
+        )
     return pixels.float().div_(255)
 
 

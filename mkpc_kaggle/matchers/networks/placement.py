@@ -19,9 +19,9 @@ Layer = nn.Linear | nn.Conv1d | nn.Conv2d
 def prepared(network: Network, placement: Placement) -> Network:
     """Prepare the network in place, and return it; checkpoints cannot be loaded afterwards.
 
-    The weights of convolutions and linear layers, except :class:`Exact` ones, and the maps between convolutions
-    get the placement's precision. All else stays float32: sums of transformers, softmax, optimal transport,
-    coordinates.
+    The weights of convolutions and linear layers, except :class:`Exact` ones, and the maps between
+    convolutions get the placement's precision. All else stays float32: sums of transformers,
+    softmax, optimal transport, coordinates.
     """
     fold_norms(network)
     for layer in network.modules():
@@ -32,18 +32,24 @@ def prepared(network: Network, placement: Placement) -> Network:
 
 
 def fold_norms(network: nn.Module) -> None:
-    """Fold every batch norm into the convolution before it, in float64 with one rounding at the end."""
+    """Fold every batch norm into the convolution before it, in float64 with one rounding at the
+    end.
+    """
     for parent in list(network.modules()):
         for (conv_name, conv), (norm_name, norm) in pairwise(list(parent.named_children())):
             if isinstance(norm, Norm):
                 assert isinstance(conv, nn.Conv1d | nn.Conv2d)
                 precision = conv.weight.dtype
-                setattr(parent, conv_name, fuse_conv_bn_eval(conv.double(), norm.double()).to(precision))
+                setattr(
+                    parent, conv_name, fuse_conv_bn_eval(conv.double(), norm.double()).to(precision)
+                )
                 setattr(parent, norm_name, nn.Identity())
 
 
 def autocast(placement: Placement) -> torch.autocast:
-    """Return an autocast for libraries' networks; PyTorch chooses the operators that run in half precision."""
+    """Return an autocast for libraries' networks; PyTorch chooses the operators that run in half
+    precision.
+    """
     enabled = placement.precision is not Precision.FLOAT32
     device = torch.device(placement.device).type
     # Nothing is computed on the device "meta", which has no autocast.

@@ -1,6 +1,7 @@
 """LoFTR with quadtree attention in its coarse transformer.
 
-Sources: Tang et al., "QuadTree Attention for Vision Transformers", 2022 (type B); Sun et al. 2021 (LoFTR).
+Sources: Tang et al., "QuadTree Attention for Vision Transformers", 2022 (type B); Sun et al. 2021
+(LoFTR).
 """
 
 from functools import partial
@@ -32,25 +33,32 @@ TOPKS = {Training.OUTDOOR: (16, 8), Training.INDOOR: (32, 16)}
 
 
 def attend(q: Tensor, k: Tensor, v: Tensor, keep: int) -> tuple[Tensor, Tensor]:
-    """Attend from P cells of G queries each, (B, P, G, D), to the cell's own keys and values (B, P, S, D).
+    """Attend from P cells of G queries each, (B, P, G, D), to the cell's own keys and values (B, P,
+    S, D).
 
-    Return messages (B, P, G, D) and the indices (B, P, G, keep) int64, below S, of the highest attention.
+    Return messages (B, P, G, D) and the indices (B, P, G, keep) int64, below S, of the highest
+    attention.
     """
     logits = (q * q.shape[-1] ** -0.5) @ k.transpose(-1, -2)  # (B, P, G, S)
     kept = logits.topk(min(keep, logits.shape[-1]), dim=-1, sorted=False).indices
     return logits.softmax(dim=-1) @ v, kept
 
 
-def attend_children(q: Tensor, k: Tensor, v: Tensor, parents: Tensor, keep: int) -> tuple[Tensor, Tensor]:
-    """Attend at a finer level from queries (B, h, w, D) to part of the keys and values (B, h_key, w_key, D).
+def attend_children(
+    q: Tensor, k: Tensor, v: Tensor, parents: Tensor, keep: int
+) -> tuple[Tensor, Tensor]:
+    """Attend at a finer level from queries (B, h, w, D) to part of the keys and values (B, h_key,
+    w_key, D).
 
-    A 2x2 block of queries attends to the children of ``parents`` (B, h w / 4, K) int64, key cells of the coarser
-    level. Children of one parent are adjacent in memory, for one read. Return messages and indices as
-    :func:`attend` does; indices count this level's key cells row by row.
+    A 2x2 block of queries attends to the children of ``parents`` (B, h w / 4, K) int64, key cells
+    of the coarser level. Children of one parent are adjacent in memory, for one read. Return
+    messages and indices as :func:`attend` does; indices count this level's key cells row by row.
     """
     w_key = k.shape[2]
     candidates = partial(_children_of, parents=parents)
-    message, kept = attend(to_2x2_blocks(q), candidates(to_2x2_blocks(k)), candidates(to_2x2_blocks(v)), keep)
+    message, kept = attend(
+        to_2x2_blocks(q), candidates(to_2x2_blocks(k)), candidates(to_2x2_blocks(v)), keep
+    )
     parent = parents[:, :, None].expand(-1, -1, 4, -1).gather(3, kept // 4)  # (B, P, 4, keep)
     row = parent // (w_key // 2) * 2 + kept % 4 // 2
     column = parent % (w_key // 2) * 2 + kept % 2
@@ -58,18 +66,24 @@ def attend_children(q: Tensor, k: Tensor, v: Tensor, parents: Tensor, keep: int)
 
 
 def _children_of(cells: Tensor, parents: Tensor) -> Tensor:
-    """Gather the children (B, P, 4 K, D) of ``parents`` (B, P, K), parent by parent, from cells (B, S, 4, D)."""
+    """Gather the children (B, P, 4 K, D) of ``parents`` (B, P, K), parent by parent, from cells (B,
+    S, 4, D).
+    """
     batch, count, four, width = cells.shape
     offset = torch.arange(batch, device=cells.device)[:, None, None] * count
     found = cells.reshape(-1, four * width).index_select(0, (parents + offset).flatten())
     return found.view(batch, parents.shape[1], -1, width)
 
 
-def quadtree_attention(q: Tensor, k: Tensor, v: Tensor, shares: Tensor, topks: tuple[int, int]) -> Tensor:
-    """Map queries (B, h, w, D), keys and values (B, h_key, w_key, D) of B heads to messages (B, h, w, D).
+def quadtree_attention(
+    q: Tensor, k: Tensor, v: Tensor, shares: Tensor, topks: tuple[int, int]
+) -> Tensor:
+    """Map queries (B, h, w, D), keys and values (B, h_key, w_key, D) of B heads to messages (B, h,
+    w, D).
 
-    Sides are multiples of 4. The coarsest of three levels of mean pooling attends to all key cells. A finer level
-    attends to the children of its parent's ``topks`` best cells. ``shares`` (3,) weight the levels' messages.
+    Sides are multiples of 4. The coarsest of three levels of mean pooling attends to all key cells.
+    A finer level attends to the children of its parent's ``topks`` best cells. ``shares`` (3,)
+    weight the levels' messages.
     """
     (q0, k0, v0), (q1, k1, v1) = ([mean_pool(x, factor) for x in (q, k, v)] for factor in (4, 2))
     batch, h0, w0, width = q0.shape
@@ -93,7 +107,8 @@ class QuadtreeAttention(nn.Module):
         self.q_proj = nn.Conv2d(width, width, 1, bias=False)
         self.k_proj = nn.Conv2d(width, width, 1, bias=False)
         self.v_proj = nn.Conv2d(width, width, 1, bias=False)
-        self.py_att = nn.ParameterDict({"weight": torch.ones(LEVELS)})  # the levels' shares before the softmax
+        # The levels' shares before the softmax
+        self.py_att = nn.ParameterDict({"weight": torch.ones(LEVELS)})
         self.proj = Linear(width, width)
 
     def forward(self, x: Tensor, source: Tensor) -> Tensor:
@@ -107,7 +122,8 @@ class QuadtreeAttention(nn.Module):
         at_once = 1 if x.device.type == "cpu" else len(q)
         parts = zip(*(torch.split(y, at_once) for y in (q, k, v)), strict=True)
         message = torch.cat([quadtree_attention(q, k, v, shares, self.topks) for q, k, v in parts])
-        merged = message.view(-1, self.heads, *message.shape[1:]).permute(0, 2, 3, 1, 4).flatten(3)  # (N, h, w, C)
+        # (N, h, w, C)
+        merged = message.view(-1, self.heads, *message.shape[1:]).permute(0, 2, 3, 1, 4).flatten(3)
         out: Tensor = self.proj(merged)
         return out
 
@@ -122,7 +138,9 @@ class ConvolutionalMlp(nn.Module):
     def __init__(self, width: int, hidden: int) -> None:
         super().__init__()
         self.fc1 = Linear(width, hidden)
-        self.dwconv = nn.ModuleDict({"dwconv": nn.Conv2d(hidden, hidden, 3, padding=1, groups=hidden)})
+        self.dwconv = nn.ModuleDict(
+            {"dwconv": nn.Conv2d(hidden, hidden, 3, padding=1, groups=hidden)}
+        )
         self.fc2 = Linear(hidden, width)
 
     def forward(self, grid: Tensor) -> Tensor:
@@ -151,7 +169,9 @@ class QuadtreeLayer(nn.Module):
 
 
 class QuadtreeTransformer(nn.Module):
-    """Alternating self- and cross-attention. Both images share each layer, which updates both at once."""
+    """Alternating self- and cross-attention. Both images share each layer, which updates both at
+    once.
+    """
 
     def __init__(self, topks: tuple[int, int]) -> None:
         super().__init__()
@@ -165,7 +185,8 @@ class QuadtreeTransformer(nn.Module):
 
 
 class Quadtree(SemiDenseNetwork):
-    """LoFTR with quadtree attention. Sides are multiples of 32. The published code needs two images of one size.
+    """LoFTR with quadtree attention. Sides are multiples of 32. The published code needs two images
+    of one size.
 
     As published, masks apply to the matching of coarse cells only, not to attention.
     """
@@ -175,7 +196,9 @@ class Quadtree(SemiDenseNetwork):
     def __init__(self, training: Training = Training.OUTDOOR) -> None:
         super().__init__(QuadtreeTransformer(TOPKS[training]))
 
-    def transform(self, coarse0: Tensor, coarse1: Tensor, masks: Masks | None = None) -> tuple[Tensor, Tensor]:
+    def transform(
+        self, coarse0: Tensor, coarse1: Tensor, masks: Masks | None = None
+    ) -> tuple[Tensor, Tensor]:
         grids = with_positions(coarse0, FIXED_DECAY), with_positions(coarse1, FIXED_DECAY)
         grid0, grid1 = self.loftr_coarse(*grids)
         return grid0, grid1

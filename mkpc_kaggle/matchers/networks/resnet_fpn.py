@@ -1,4 +1,5 @@
-"""ResNet with a feature pyramid, of LoFTR and its descendants: maps at 1/8 and 1/2 of the image size.
+"""ResNet with a feature pyramid, of LoFTR and its descendants: maps at 1/8 and 1/2 of the image
+size.
 
 Source: Sun et al. 2021 (LoFTR), section 3.1; layer names as in the public checkpoints.
 """
@@ -13,7 +14,8 @@ STEM, MIDDLE, TOP, FINE = 128, 196, 256, 128  # channels at 1/2, 1/4 and 1/8, an
 
 
 class FeatureMaps(NamedTuple):
-    """Maps of B images of H x W pixels: ``coarse`` (B, 256, H/8, W/8) and ``fine`` (B, 128, H/2, W/2).
+    """Maps of B images of H x W pixels: ``coarse`` (B, 256, H/8, W/8) and ``fine`` (B, 128, H/2,
+    W/2).
 
     Both have the precision of the backbone's weights.
     """
@@ -23,7 +25,9 @@ class FeatureMaps(NamedTuple):
 
 
 class ResidualBlock(nn.Module):
-    """Two 3x3 convolutions with a shortcut, which is a strided 1x1 convolution where the size changes."""
+    """Two 3x3 convolutions with a shortcut, which is a strided 1x1 convolution where the size
+    changes.
+    """
 
     def __init__(self, inputs: int, outputs: int, stride: int = 1) -> None:
         super().__init__()
@@ -54,7 +58,9 @@ def smoothing(inputs: int, outputs: int) -> nn.Sequential:
 
 
 class ResNetFpn(nn.Module):
-    """The backbone: gray images (B, 1, H, W), float32 in [0, 1], sides multiples of 8 -> :class:`FeatureMaps`."""
+    """The backbone: gray images (B, 1, H, W), float32 in [0, 1], sides multiples of 8 ->
+    :class:`FeatureMaps`.
+    """
 
     def __init__(self) -> None:
         super().__init__()
@@ -76,8 +82,10 @@ class ResNetFpn(nn.Module):
         half = self.layer1(functional.relu_(self.bn1(self.conv1(image))))  # (B, 128, H/2, W/2)
         quarter = self.layer2(half)  # (B, 196, H/4, W/4)
         coarse = self.layer3_outconv(self.layer3(quarter))  # (B, 256, H/8, W/8)
-        merged = self.layer2_outconv2(self.layer2_outconv(quarter).add_(_doubled(coarse)))  # (B, 196, H/4, W/4)
-        fine = self.layer1_outconv2(self.layer1_outconv(half).add_(_doubled(merged)))  # (B, 128, H/2, W/2)
+        # (B, 196, H/4, W/4)
+        merged = self.layer2_outconv2(self.layer2_outconv(quarter).add_(_doubled(coarse)))
+        # (B, 128, H/2, W/2)
+        fine = self.layer1_outconv2(self.layer1_outconv(half).add_(_doubled(merged)))
         return FeatureMaps(coarse, fine)
 
 

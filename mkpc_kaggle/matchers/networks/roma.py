@@ -1,9 +1,10 @@
 """RoMa: Edstedt et al., "RoMa: Robust Dense Feature Matching", CVPR 2024.
 
-DKM with other features. The coarse features are DINOv2's, one per patch of 14 x 14 pixels. Checkpoints name this
-stride 16; displacements count a patch as 16 pixels. The two images may differ in size.
-Coordinates are normalised: (x, y) in [-1, 1], where +-1 are the outer edges of an image (see warp_refiner).
-Parameter names match the public checkpoints, DINOv2's under the prefix "dinov2.". For inference only.
+DKM with other features. The coarse features are DINOv2's, one per patch of 14 x 14 pixels.
+Checkpoints name this stride 16; displacements count a patch as 16 pixels. The two images may differ
+in size. Coordinates are normalised: (x, y) in [-1, 1], where +-1 are the outer edges of an image
+(see warp_refiner). Parameter names match the public checkpoints, DINOv2's under the prefix
+"dinov2.". For inference only.
 """
 
 from collections.abc import Sequence
@@ -52,11 +53,15 @@ class RoMa(DenseNetwork):
         self.eval().requires_grad_(False)
 
     def encode(self, image: Tensor, fine: Tensor | None = None) -> DenseFeatures:
-        """Encode images with sides that are multiples of 14; sides for a second pass are at least 8."""
+        """Encode images with sides that are multiples of 14; sides for a second pass are at least
+        8.
+        """
         vgg = self.encoder["cnn"]
         coarse = self.decoder.projected([*vgg(image), self.dinov2(image)])
         coefficients = self.decoder.process.regress(coarse.at(COARSEST))
-        return DenseFeatures(coarse, (coefficients,), None if fine is None else self.decoder.projected(vgg(fine)))
+        return DenseFeatures(
+            coarse, (coefficients,), None if fine is None else self.decoder.projected(vgg(fine))
+        )
 
 
 class RomaDecoder(WarpDecoder):
@@ -66,8 +71,12 @@ class RomaDecoder(WarpDecoder):
         inputs = dict(zip((1, 2, 4, 8, COARSEST), (*WIDTHS, coarse_features), strict=True))
         self.embedding_decoder = AnchorDecoder(2 * width)
         self.gps = nn.ModuleDict({str(COARSEST): GaussianProcess(width)})
-        self.proj = nn.ModuleDict({str(s): Projection(inputs[s], shape.features) for s, shape in REFINERS.items()})
-        self.conv_refiner = nn.ModuleDict({str(s): WarpRefiner(shape) for s, shape in REFINERS.items()})
+        self.proj = nn.ModuleDict(
+            {str(s): Projection(inputs[s], shape.features) for s, shape in REFINERS.items()}
+        )
+        self.conv_refiner = nn.ModuleDict(
+            {str(s): WarpRefiner(shape) for s, shape in REFINERS.items()}
+        )
 
     def projected(self, levels: Sequence[Tensor]) -> Pyramid:
         """Return features at strides 1, 2, 4, ..., projected to the decoder's channels."""
@@ -82,9 +91,13 @@ class RomaDecoder(WarpDecoder):
     def coarse_estimate(self, query: DenseFeatures, support: DenseFeatures) -> WarpEstimate:
         features = query.coarse.at(COARSEST)
         posterior = self.process(features, support.coarse.at(COARSEST), *support.coefficients)
-        return self.correct(self.embedding_decoder(posterior, features), query.coarse, support.coarse, COARSEST)
+        return self.correct(
+            self.embedding_decoder(posterior, features), query.coarse, support.coarse, COARSEST
+        )
 
-    def correct(self, estimate: WarpEstimate, query: Pyramid, support: Pyramid, stride: int) -> WarpEstimate:
+    def correct(
+        self, estimate: WarpEstimate, query: Pyramid, support: Pyramid, stride: int
+    ) -> WarpEstimate:
         size = query.at(1).shape[2:]
         refiner = self.conv_refiner[str(stride)]
         corrections = refiner(query.at(stride), support.at(stride), estimate.flow, stretch(size))
@@ -107,7 +120,9 @@ class Projection(nn.Sequential):
 
 
 def stretch(size: torch.Size) -> float:
-    """Return the factor of displacements for an image (H, W). It keeps their scale in pixels at any size."""
+    """Return the factor of displacements for an image (H, W). It keeps their scale in pixels at any
+    size.
+    """
     return DISPLACEMENT * sqrt(size.numel()) / TRAINED_SIDE
 
 
@@ -121,7 +136,9 @@ class AnchorDecoder(nn.Module):
         self.to_out = ExactLinear(width, SIDE**2 + 1)
 
     def forward(self, posterior: Tensor, features: Tensor) -> WarpEstimate:
-        """Map posterior (B, C, h, w) and features (B, C', h, w), C + C' = width, to the first estimate."""
+        """Map posterior (B, C, h, w) and features (B, C', h, w), C + C' = width, to the first
+        estimate.
+        """
         x = torch.cat([tokens(posterior), tokens(features)], dim=2)  # (B, h w, C + C')
         for block in self.blocks:
             x = block(x)
@@ -132,10 +149,11 @@ class AnchorDecoder(nn.Module):
 
 
 def anchor_mean(logits: Tensor) -> Tensor:
-    """Return the mean position (..., 2) of the best anchor by logits (..., 4096) and of its four neighbours.
+    """Return the mean position (..., 2) of the best anchor by logits (..., 4096) and of its four
+    neighbours.
 
-    Anchors are weighted by probability. As in training, neighbours are 1 or 64 indices away, also across the ends
-    of rows; indices are clamped to the first and last anchor.
+    Anchors are weighted by probability. As in training, neighbours are 1 or 64 indices away, also
+    across the ends of rows; indices are clamped to the first and last anchor.
     """
     best = logits.argmax(dim=-1, keepdim=True)
     offsets = torch.tensor([-1, 0, 1, -SIDE, SIDE], device=logits.device)

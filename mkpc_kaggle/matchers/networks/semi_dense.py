@@ -1,6 +1,7 @@
 """The shared parts of LoFTR, QuadTree and ASpanFormer: all except their coarse transformers.
 
-In order: backbone, coarse transformer, dual softmax of all pairs of coarse cells, refinement in fine windows.
+In order: backbone, coarse transformer, dual softmax of all pairs of coarse cells, refinement in
+fine windows.
 """
 
 from abc import ABC, abstractmethod
@@ -52,7 +53,9 @@ class SemiDenseNetwork(nn.Module, ABC):
         return 1 / (TOP * TEMPERATURE)
 
     @abstractmethod
-    def transform(self, coarse0: Tensor, coarse1: Tensor, masks: Masks | None = None) -> tuple[Tensor, Tensor]:
+    def transform(
+        self, coarse0: Tensor, coarse1: Tensor, masks: Masks | None = None
+    ) -> tuple[Tensor, Tensor]:
         """Transform the coarse maps (N, 256, h, w) of both images to grids (N, h, w, 256)."""
 
     def encode(self, image: Tensor) -> FeatureMaps:
@@ -68,17 +71,29 @@ class SemiDenseNetwork(nn.Module, ABC):
         check_finite("coarse features", *grids)
         (grid0,), (grid1,) = grids  # (h, w, 256)
         content = None if masks is None else (masks[0][0], masks[1][0])
-        coarse = coarse_matches(grid0, grid1, self.similarity_scale, self.threshold, self.border, content)
+        coarse = coarse_matches(
+            grid0, grid1, self.similarity_scale, self.threshold, self.border, content
+        )
         offsets = self.refine(coarse, features0.fine, features1.fine, grid0, grid1)
-        points0, points1 = cell_points(coarse.index0, grid0.shape[1]), cell_points(coarse.index1, grid1.shape[1])
+        points0, points1 = (
+            cell_points(coarse.index0, grid0.shape[1]),
+            cell_points(coarse.index1, grid1.shape[1]),
+        )
         return SemiDenseMatches(coarse, points0, points1 + offsets * REACH)
 
-    def refine(self, coarse: Assignment, fine0: Tensor, fine1: Tensor, grid0: Tensor, grid1: Tensor) -> Tensor:
-        """Return offsets (M, 2) of matches from their cells' corners in image 1, in units of :data:`REACH`."""
+    def refine(
+        self, coarse: Assignment, fine0: Tensor, fine1: Tensor, grid0: Tensor, grid1: Tensor
+    ) -> Tensor:
+        """Return offsets (M, 2) of matches from their cells' corners in image 1, in units of
+        :data:`REACH`.
+        """
         found = []
-        for cells in zip(*(torch.split(x, WINDOWS_AT_ONCE) for x in (coarse.index0, coarse.index1)), strict=True):
+        for cells in zip(
+            *(torch.split(x, WINDOWS_AT_ONCE) for x in (coarse.index0, coarse.index1)), strict=True
+        ):
             windows0, windows1 = (
-                self.fine_preprocess(cut_windows(fine, some), grid.flatten(0, 1)[some])  # (m, 25, 128)
+                # (m, 25, 128)
+                self.fine_preprocess(cut_windows(fine, some), grid.flatten(0, 1)[some])
                 for fine, some, grid in zip((fine0, fine1), cells, (grid0, grid1), strict=True)
             )
             found.append(expected_offset(*self.loftr_fine(windows0, windows1)))

@@ -1,8 +1,9 @@
-"""SuperGlue (Sarlin et al. 2020, arXiv 1911.11763): matches of two sets of keypoints with descriptors.
+"""SuperGlue (Sarlin et al. 2020, arXiv 1911.11763): matches of two sets of keypoints with
+descriptors.
 
-Parameter names match ``superglue_outdoor.pth`` and ``superglue_indoor.pth``; their terms (noncommercial research)
-apply to every use. The keypoints of both images share one tensor (1, N, 256), N = N0 + N1: all layers act on rows,
-and only attention separates the images.
+Parameter names match ``superglue_outdoor.pth`` and ``superglue_indoor.pth``; their terms
+(noncommercial research) apply to every use. The keypoints of both images share one tensor (1, N,
+256), N = N0 + N1: all layers act on rows, and only attention separates the images.
 """
 
 import math
@@ -35,9 +36,11 @@ class Pointwise(nn.Conv1d):
 
 
 def pointwise_network(*channels: int) -> nn.Sequential:
-    """Make linear maps between these numbers of channels, with batch norm and ReLU between the maps.
+    """Make linear maps between these numbers of channels, with batch norm and ReLU between the
+    maps.
 
-    Inputs are (..., C). Fold the norms first: a batch norm would take another axis for the channels.
+    Inputs are (..., C). Fold the norms first: a batch norm would take another axis for the
+    channels.
     """
     steps: list[nn.Module] = []
     for width_in, width_out in pairwise(channels[:-1]):
@@ -46,31 +49,38 @@ def pointwise_network(*channels: int) -> nn.Sequential:
 
 
 class SuperGlueAttention(nn.Module):
-    """Attention with four heads of 64 channels. In the checkpoint channel c belongs to head ``c mod 4``."""
+    """Attention with four heads of 64 channels. In the checkpoint channel c belongs to head ``c mod
+    4``.
+    """
 
     def __init__(self) -> None:
         super().__init__()
-        self.proj = nn.ModuleList(Pointwise(CHANNELS, CHANNELS) for _ in range(3))  # query, key, value
+        # Query, key, value
+        self.proj = nn.ModuleList(Pointwise(CHANNELS, CHANNELS) for _ in range(3))
         self.merge = Pointwise(CHANNELS, CHANNELS)
 
     def forward(self, x: Tensor, n0: int, *, cross: bool) -> Tensor:
-        """Return messages (1, N, 256) to the keypoints ``x`` (1, N, 256); the first ``n0`` belong to image 0.
+        """Return messages (1, N, 256) to the keypoints ``x`` (1, N, 256); the first ``n0`` belong
+        to image 0.
 
-        Messages come from keypoints of the same image, or with ``cross`` from keypoints of the other image.
+        Messages come from keypoints of the same image, or with ``cross`` from keypoints of the
+        other image.
         """
         # Reordering channels by head costs less in the weights than in all keypoints.
         maps = cast("Iterable[nn.Conv1d]", self.proj)
         weight = torch.cat([_by_head(each.weight[:, :, 0]) for each in maps])  # (768, 256)
         bias = torch.cat([_by_head(each.get_parameter("bias")) for each in maps])
         projected = linear(x, weight, bias)  # (1, N, 768)
-        heads = projected.view(*x.shape[:2], 3, HEADS, -1).permute(2, 0, 3, 1, 4)  # (3, 1, 4, N, 64)
+        # (3, 1, 4, N, 64)
+        heads = projected.view(*x.shape[:2], 3, HEADS, -1).permute(2, 0, 3, 1, 4)
         (query0, key0, value0), (query1, key1, value1) = heads[..., :n0, :], heads[..., n0:, :]
         if cross:
             key0, key1, value0, value1 = key1, key0, value1, value0
         precision = self.merge.weight.dtype
         output0 = attention(query0, key0, value0, precision)  # (1, 4, N0, 64)
         output1 = attention(query1, key1, value1, precision)  # (1, 4, N1, 64)
-        output = torch.cat([output0.transpose(1, 2), output1.transpose(1, 2)], dim=1).flatten(2)  # (1, N, 256)
+        # (1, N, 256)
+        output = torch.cat([output0.transpose(1, 2), output1.transpose(1, 2)], dim=1).flatten(2)
         return linear(output, _by_head(self.merge.weight[:, :, 0].T).T, self.merge.bias)
 
 
@@ -140,23 +150,27 @@ def _by_head(rows: Tensor) -> Tensor:
 
 
 def normalise_points(points: Tensor, size: Size) -> Tensor:
-    """Return points from the image's middle, in units of 0.7 times the image's longer side, float32."""
+    """Return points from the image's middle, in units of 0.7 times the image's longer side,
+    float32.
+    """
     middle = torch.tensor([size.width / 2, size.height / 2], device=points.device)
     return (points.float() - middle) / (0.7 * max(size))
 
 
 def log_optimal_transport(scores: Tensor, bin_score: Tensor, iterations: int) -> Tensor:
-    """Return the logarithms of Sinkhorn's plan (B, m + 1, n + 1) float32 for scores (B, m, n); dustbins are last.
+    """Return the logarithms of Sinkhorn's plan (B, m + 1, n + 1) float32 for scores (B, m, n);
+    dustbins are last.
 
-    Each keypoint has mass 1. The other image's dustbin can take the mass of all keypoints. An iteration scales the
-    rows to their masses, then the columns.
+    Each keypoint has mass 1. The other image's dustbin can take the mass of all keypoints. An
+    iteration scales the rows to their masses, then the columns.
 
     Adding the potentials u and v to the scores keeps all values in float32's range.
     """
     batch, m, n = scores.shape
     couplings = bin_score.float().expand(batch, m + 1, n + 1).clone()
     couplings[:, :m, :n] = scores
-    rows, columns = couplings.new_zeros(m + 1), couplings.new_zeros(n + 1)  # logarithms of the masses
+    # Logarithms of the masses
+    rows, columns = couplings.new_zeros(m + 1), couplings.new_zeros(n + 1)
     rows[m], columns[n] = math.log(n), math.log(m)
     v = torch.zeros_like(couplings[:, 0])
     for _ in range(iterations):

@@ -1,8 +1,9 @@
-"""SuperPoint (DeTone et al. 2018, arXiv 1712.07629): keypoints of a gray image and their descriptors.
+"""SuperPoint (DeTone et al. 2018, arXiv 1712.07629): keypoints of a gray image and their
+descriptors.
 
-Parameter names match ``superpoint_v1.pth``; its terms (noncommercial research) apply to every use. The computation
-is the one published with SuperGlue's weights, including an error in the sampling of descriptors. Pixel centres are
-at integers, as everywhere in the package.
+Parameter names match ``superpoint_v1.pth``; its terms (noncommercial research) apply to every use.
+The computation is the one published with SuperGlue's weights, including an error in the sampling of
+descriptors. Pixel centres are at integers, as everywhere in the package.
 """
 
 from typing import NamedTuple
@@ -32,7 +33,8 @@ class SuperPointKeypoints(NamedTuple):
 
 
 class SuperPoint(nn.Module):
-    """A shared trunk of eight convolutions, a detector head (Pa, Pb) and a descriptor head (Da, Db).
+    """A shared trunk of eight convolutions, a detector head (Pa, Pb) and a descriptor head (Da,
+    Db).
 
     ``nms_radius``: half the suppression window, in pixels. Scores are above ``keypoint_threshold``.
     ``max_keypoints``: the number to keep, -1 for all. ``border``: the width in pixels of a margin without
@@ -41,7 +43,11 @@ class SuperPoint(nn.Module):
     """
 
     def __init__(
-        self, nms_radius: int = 4, keypoint_threshold: float = 0.005, max_keypoints: int = -1, border: int = 4
+        self,
+        nms_radius: int = 4,
+        keypoint_threshold: float = 0.005,
+        max_keypoints: int = -1,
+        border: int = 4,
     ) -> None:
         super().__init__()
         self.nms_radius = nms_radius
@@ -65,7 +71,8 @@ class SuperPoint(nn.Module):
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # missing in torch's stubs
 
     def forward(self, image: Tensor) -> list[SuperPointKeypoints]:
-        """Return the keypoints of each of the images (B, 1, H, W), gray in 0..1; none if a side is below 8.
+        """Return the keypoints of each of the images (B, 1, H, W), gray in 0..1; none if a side is
+        below 8.
 
         Rows and columns beyond the last multiple of 8 have no keypoints.
         """
@@ -85,15 +92,23 @@ class SuperPoint(nn.Module):
         return found
 
     def features(self, image: Tensor) -> Tensor:
-        """Return the trunk's output (B, 128, h, w) for (B, 1, H, W), with h = floor(H / 8), w = floor(W / 8)."""
+        """Return the trunk's output (B, 128, h, w) for (B, 1, H, W), with h = floor(H / 8), w =
+        floor(W / 8).
+        """
         x = image.to(self.conv1a.weight.dtype)
-        for first, second in ((self.conv1a, self.conv1b), (self.conv2a, self.conv2b), (self.conv3a, self.conv3b)):
+        for first, second in (
+            (self.conv1a, self.conv1b),
+            (self.conv2a, self.conv2b),
+            (self.conv3a, self.conv3b),
+        ):
             # Pool first, so that the ReLU has a quarter of the values.
             x = torch.relu_(functional.max_pool2d(second(torch.relu_(first(x))), 2))
         return torch.relu_(self.conv4b(torch.relu_(self.conv4a(x))))
 
     def logits(self, features: Tensor) -> Tensor:
-        """Return logits (B, 65, h, w) of detection: a cell's 64 pixels row by row, then "no keypoint"."""
+        """Return logits (B, 65, h, w) of detection: a cell's 64 pixels row by row, then "no
+        keypoint".
+        """
         logits: Tensor = self.convPb(torch.relu_(self.convPa(features)))
         return logits
 
@@ -103,7 +118,9 @@ class SuperPoint(nn.Module):
         return field
 
     def select_keypoints(self, scores: Tensor) -> tuple[Tensor, Tensor]:
-        """Select points (K, 2) float32, (x, y) in pixels, and scores (K,) of one suppressed score map (8h, 8w)."""
+        """Select points (K, 2) float32, (x, y) in pixels, and scores (K,) of one suppressed score
+        map (8h, 8w).
+        """
         border, (height, width) = self.border, scores.shape
         inner = scores[border : max(height - border, 0), border : max(width - border, 0)]
         rows, columns = torch.nonzero(inner > self.keypoint_threshold, as_tuple=True)
@@ -124,10 +141,11 @@ def score_map(logits: Tensor) -> Tensor:
 
 
 def suppress_non_maxima(scores: Tensor, radius: int) -> Tensor:
-    """Set non-negative ``scores`` (B, H, W) to 0 unless they are the maximum of their square window.
+    """Set non-negative ``scores`` (B, H, W) to 0 unless they are the maximum of their square
+    window.
 
-    All equal maxima in one window are kept. Two rounds recover points that only suppressed points exceed. The
-    result is neither that of greedy suppression nor its fixed point.
+    All equal maxima in one window are kept. Two rounds recover points that only suppressed points
+    exceed. The result is neither that of greedy suppression nor its fixed point.
     """
     kept = scores == window_maximum(scores, radius)
     for _ in range(SUPPRESSION_ROUNDS):
@@ -138,21 +156,25 @@ def suppress_non_maxima(scores: Tensor, radius: int) -> Tensor:
 
 
 def window_maximum(values: Tensor, radius: int) -> Tensor:
-    """Return the maximum over (2 radius + 1)^2 pixels around each of ``values`` (B, H, W), axis by axis."""
+    """Return the maximum over (2 radius + 1)^2 pixels around each of ``values`` (B, H, W), axis by
+    axis.
+    """
     window = 2 * radius + 1
     columns = functional.max_pool2d(values[:, None], (window, 1), 1, (radius, 0))
     return functional.max_pool2d(columns, (1, window), 1, (0, radius))[:, 0]
 
 
 def sample_descriptors(field: Tensor, points: Tensor) -> Tensor:
-    """Return unit descriptors (K, D) float32 at ``points`` (K, 2), from the cells' vectors ``field`` (D, h, w).
+    """Return unit descriptors (K, D) float32 at ``points`` (K, 2), from the cells' vectors
+    ``field`` (D, h, w).
 
-    The centre of cell j is at pixel 8 j + 3.5. The divisor below shifts a point by up to half a cell, as in
-    SuperGlue's training. Cells beyond the field are zero.
+    The centre of cell j is at pixel 8 j + 3.5. The divisor below shifts a point by up to half a
+    cell, as in SuperGlue's training. Cells beyond the field are zero.
     """
     h, w = field.shape[1:]
     extent = points.new_tensor([CELL * w - 4.5, CELL * h - 4.5])
-    grid = (points - 3.5) / extent * 2 - 1  # (K, 2); -1 is the first cell's centre, 1 the last one's
+    # (K, 2); -1 is the first cell's centre, 1 the last one's
+    grid = (points - 3.5) / extent * 2 - 1
     cells = functional.normalize(field.float(), dim=0)
     sampled = functional.grid_sample(
         cells[None], grid[None, None], mode="bilinear", align_corners=True

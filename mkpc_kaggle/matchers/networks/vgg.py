@@ -1,7 +1,8 @@
-"""VGG with batch norms as a pyramid of features: Simonyan and Zisserman, "Very Deep Convolutional Networks", 2015.
+"""VGG with batch norms as a pyramid of features: Simonyan and Zisserman, "Very Deep Convolutional
+Networks", 2015.
 
-Written here because offline installs have no torchvision. Layers are numbered as in the usual classifiers, so the
-parameter names are ``layers.N``. For inference in evaluation mode only.
+Written here because offline installs have no torchvision. Layers are numbered as in the usual
+classifiers, so the parameter names are ``layers.N``. For inference in evaluation mode only.
 """
 
 from collections.abc import Iterator, Sequence
@@ -24,7 +25,13 @@ class Vgg(nn.Module):
         levels: list[list[nn.Module]] = []
         for count, (narrow, wide) in zip(convolutions, pairwise((3, *WIDTHS)), strict=True):
             widths = pairwise((narrow, *[wide] * count))
-            levels.append([layer for width_in, width_out in widths for layer in convolution(width_in, width_out)])
+            levels.append(
+                [
+                    layer
+                    for width_in, width_out in widths
+                    for layer in convolution(width_in, width_out)
+                ]
+            )
         layers = levels[0]
         for level in levels[1:]:
             layers += [nn.MaxPool2d(2), *level]
@@ -32,7 +39,8 @@ class Vgg(nn.Module):
         self.convolutions = tuple(convolutions)
 
     def forward(self, image: Tensor) -> list[Tensor]:
-        """Return features (B, C, h, w) at strides 1, 2, 4 and 8 of images (B, 3, H, W), before the next pooling.
+        """Return features (B, C, h, w) at strides 1, 2, 4 and 8 of images (B, 3, H, W), before the
+        next pooling.
 
         Sides of images are at least 8; every halving rounds down.
         """
@@ -52,4 +60,8 @@ class Vgg(nn.Module):
 
 
 def convolution(width_in: int, width_out: int) -> tuple[nn.Module, ...]:
-    return nn.Conv2d(width_in, width_out, 3, padding=1), nn.BatchNorm2d(width_out), nn.ReLU(inplace=True)
+    return (
+        nn.Conv2d(width_in, width_out, 3, padding=1),
+        nn.BatchNorm2d(width_out),
+        nn.ReLU(inplace=True),
+    )

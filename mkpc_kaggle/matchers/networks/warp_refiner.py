@@ -1,7 +1,8 @@
-"""The warp refiners of DKM and RoMa, and their local correlation (Edstedt et al. 2023, section 3.3).
+"""The warp refiners of DKM and RoMa, and their local correlation (Edstedt et al. 2023, section
+3.3).
 
-Normalised coordinates are (x, y) in [-1, 1]; +-1 are the outer edges of an image. In an image of w x h the centre
-of pixel (column j, row i) is ((2 j + 1) / w - 1, (2 i + 1) / h - 1).
+Normalised coordinates are (x, y) in [-1, 1]; +-1 are the outer edges of an image. In an image of w
+x h the centre of pixel (column j, row i) is ((2 j + 1) / w - 1, (2 i + 1) / h - 1).
 """
 
 from math import ceil
@@ -18,7 +19,9 @@ HIDDEN_BLOCKS = 8
 
 
 class WarpRefinerShape(NamedTuple):
-    """Channels of either image, of the embedded displacement and of hidden maps; ``radius`` of the correlation."""
+    """Channels of either image, of the embedded displacement and of hidden maps; ``radius`` of the
+    correlation.
+    """
 
     features: int
     embedding: int
@@ -36,8 +39,8 @@ SHAPES = {  # by stride
 
 
 class WarpEstimate(NamedTuple):
-    """An estimate, float32: ``flow`` (B, 2, h, w), each pixel's position in the other image, normalised and
-    unclamped; ``certainty`` (B, 1, h, w), logits.
+    """An estimate, float32: ``flow`` (B, 2, h, w), each pixel's position in the other image,
+    normalised and unclamped; ``certainty`` (B, 1, h, w), logits.
     """
 
     flow: Tensor
@@ -61,10 +64,12 @@ class WarpRefiner(nn.Module):
         self.disp_emb = ExactConv2d(2, shape.embedding, 1)
 
     def forward(self, query: Tensor, support: Tensor, flow: Tensor, stretch: float = 1) -> Tensor:
-        """Return corrections (B, 3, h, w) of a flow (B, 2, h, w), from features (B, C, h, w) and (B, C, h', w').
+        """Return corrections (B, 3, h, w) of a flow (B, 2, h, w), from features (B, C, h, w) and
+        (B, C, h', w').
 
-        Displacements are multiplied by ``stretch`` before they are embedded. Channel 0 corrects the certainty's
-        logit; 1 and 2 correct x and y, in eighths of a query pixel at this stride (see :func:`refined`).
+        Displacements are multiplied by ``stretch`` before they are embedded. Channel 0 corrects the
+        certainty's logit; 1 and 2 correct x and y, in eighths of a query pixel at this stride (see
+        :func:`refined`).
         """
         x = self._look(query, support, flow, stretch)  # (B, inputs, h, w)
         for depthwise, norm, _, mix in (self.block1, *self.hidden_blocks):
@@ -75,7 +80,11 @@ class WarpRefiner(nn.Module):
 
     def _look(self, query: Tensor, support: Tensor, flow: Tensor, stretch: float) -> Tensor:
         seen = functional.grid_sample(
-            support.float(), as_grid(flow), mode="bilinear", padding_mode="zeros", align_corners=False
+            support.float(),
+            as_grid(flow),
+            mode="bilinear",
+            padding_mode="zeros",
+            align_corners=False,
         )
         parts = [query, seen, self.disp_emb(stretch * (flow - identity_map(flow)))]
         if self.radius is not None:
@@ -85,31 +94,40 @@ class WarpRefiner(nn.Module):
         return looks.contiguous(memory_format=torch.channels_last)
 
 
-def refined(estimate: WarpEstimate, corrections: Tensor, stride: int, full: torch.Size) -> WarpEstimate:
-    """Apply a refiner's corrections to the estimate; ``full`` (H, W): the query image's size in this pass."""
+def refined(
+    estimate: WarpEstimate, corrections: Tensor, stride: int, full: torch.Size
+) -> WarpEstimate:
+    """Apply a refiner's corrections to the estimate; ``full`` (H, W): the query image's size in
+    this pass.
+    """
     height, width = full
-    unit = corrections.new_tensor([stride / (4 * width), stride / (4 * height)])  # an eighth of a pixel
+    # An eighth of a pixel
+    unit = corrections.new_tensor([stride / (4 * width), stride / (4 * height)])
     flow = estimate.flow + corrections[:, 1:] * unit[:, None, None]
     return WarpEstimate(flow, estimate.certainty + corrections[:, :1])
 
 
 def local_correlation(query: Tensor, support: Tensor, flow: Tensor, radius: int) -> Tensor:
-    """Return dot products, over sqrt(C), of each query pixel's features with the support's around its target.
+    """Return dot products, over sqrt(C), of each query pixel's features with the support's around
+    its target.
 
-    (B, C, h, w), (B, C, h', w') and (B, 2, h, w) give (B, (2 radius + 1)^2, h, w), float32, windows row by row.
-    Window steps are one pixel of the query: 2 / w and 2 / h. The support is zero outside, bilinear between pixels.
+    (B, C, h, w), (B, C, h', w') and (B, 2, h, w) give (B, (2 radius + 1)^2, h, w), float32, windows
+    row by row. Window steps are one pixel of the query: 2 / w and 2 / h. The support is zero
+    outside, bilinear between pixels.
 
-    The product with a bilinear sample is the bilinear sample of products. So products are computed with all pixels
-    that a window covers, and then interpolated.
+    The product with a bilinear sample is the bilinear sample of products. So products are computed
+    with all pixels that a window covers, and then interpolated.
     """
     size, size1 = query.shape[2:], support.shape[2:]
-    targets = ((as_grid(flow).reshape(-1, 2) + 1) * flow.new_tensor(size1[::-1]) - 1) / 2  # (P, 2) pixels
+    # (P, 2) pixels
+    targets = ((as_grid(flow).reshape(-1, 2) + 1) * flow.new_tensor(size1[::-1]) - 1) / 2
     (columns, along_x), (rows, along_y) = (
         taps(targets[:, axis], length1, length1 / length, radius)
         for axis, length, length1 in ((0, size[1], size1[1]), (1, size[0], size1[0]))
     )
     image = torch.arange(len(query), device=flow.device).repeat_interleave(size.numel())  # (P,)
-    index = ((image[:, None] * size1[0] + rows) * size1[1])[:, :, None] + columns[:, None]  # (P, Ky, Kx)
+    # (P, Ky, Kx)
+    index = ((image[:, None] * size1[0] + rows) * size1[1])[:, :, None] + columns[:, None]
 
     queries, keys = (as_grid(features.float()).flatten(0, 2) for features in (query, support))
     products = _products(queries, keys, index.flatten(1)).view_as(index)
@@ -118,9 +136,11 @@ def local_correlation(query: Tensor, support: Tensor, flow: Tensor, radius: int)
 
 
 def taps(targets: Tensor, length: int, step: float, radius: int) -> tuple[Tensor, Tensor]:
-    """Return the pixels (P, K) int64 that the windows of P targets (P,) cover on one axis, and their weights.
+    """Return the pixels (P, K) int64 that the windows of P targets (P,) cover on one axis, and
+    their weights.
 
-    Weights (P, 2 radius + 1, K) interpolate linearly at each step of a window. Pixels outside the axis get zero.
+    Weights (P, 2 radius + 1, K) interpolate linearly at each step of a window. Pixels outside the
+    axis get zero.
     """
     steps = torch.arange(-radius, radius + 1, device=targets.device) * step
     first = (targets - radius * step).floor()
