@@ -38,7 +38,8 @@ def test_list_says_what_is_there_and_what_the_missing_would_enable(weights, caps
     assert lines[1].split() == ["sift", "MIT", "-", str(weights / "sift.pt")]
     users = ["aliked,", "aliked_lightglue"]
     assert lines[2].split() == ["aliked-n16", "MIT", *users, str(weights / "renamed.pt")]
-    assert lines[3].split() == ["superpoint", "MIT", "superglue", "missing:", "lost.pt"]
+    users = ["superglue,", "superpoint_lightglue"]
+    assert lines[3].split() == ["superpoint", "MIT", *users, "missing:", "lost.pt"]
     assert len(lines) == 4
 
 
