@@ -166,6 +166,8 @@ class Engine:
         self._leave_out(state)
         self.state = state
         self._resumed = int(state.complete.sum())
+        if self._resumed:
+            self._progress.note(f"{self._resumed} of {state.rows} pairs are there")
         self._explained = ""
         self._is_announced = False
         self._until = inf
