@@ -12,10 +12,12 @@ import io
 import multiprocessing
 import os
 import queue
+import select
 import shutil
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from math import isfinite
@@ -28,6 +30,7 @@ from mkpc_kaggle.engine.budget import Budget, format_duration
 LINE_INTERVAL_S = 30.0  # between lines of progress if a line cannot be redrawn in place
 MAX_WAITING = 1000  # writes, which a busy progress line makes in a few minutes
 MAX_NATIVE_BYTES = 4096  # printed at the end, of what native libraries wrote
+RETRY_S = 0.05  # between looks at a descriptor that accepts no text
 DRAIN_S = 2.0  # maximum wait at the end for the remaining text to be printed
 BAR = "{desc}: {n_fmt}/{total_fmt} [{elapsed}<{remaining}, {pace}]"
 
@@ -144,12 +147,38 @@ class Printer:
         return True
 
     def _print(self) -> None:
+        pending: dict[int, deque[bytes]] = {}
         while True:
-            descriptor, data = self._waiting.get()
-            with suppress(OSError):  # lost terminal, or full disk
-                while data:
-                    data = data[os.write(descriptor, data) :]
-            self._waiting.task_done()
+            with suppress(queue.Empty):
+                # Look again from time to time whether a blocked descriptor accepts text.
+                descriptor, data = self._waiting.get(timeout=RETRY_S if pending else None)
+                pending.setdefault(descriptor, deque()).append(data)
+            for descriptor in list(pending):
+                self._write(descriptor, pending[descriptor])
+                if not pending[descriptor]:
+                    del pending[descriptor]
+
+    def _write(self, descriptor: int, texts: deque[bytes]) -> None:
+        """Write and remove texts until the descriptor would block: a reader of stderr that does not
+        read must not hold back stdout.
+        """
+        while texts and (len(texts) > MAX_WAITING or _accepts(descriptor)):
+            data = texts.popleft()
+            rest = b""
+            if len(texts) < MAX_WAITING:  # else the oldest text is dropped
+                with suppress(OSError):  # lost terminal, or full disk
+                    rest = data[os.write(descriptor, data[: select.PIPE_BUF]) :]
+            if rest:
+                texts.appendleft(rest)
+            else:
+                self._waiting.task_done()
+
+
+def _accepts(descriptor: int) -> bool:
+    """Return whether a write of up to ``PIPE_BUF`` bytes does not block; also if it would fail."""
+    poll = select.poll()
+    poll.register(descriptor, select.POLLOUT)
+    return bool(poll.poll(0))
 
 
 class Queued(io.RawIOBase):

@@ -21,7 +21,10 @@ def load(weights, options, placement):
     return Faulty(options, placement.device)
 """
 FAULTS = {  # and a part of the output
-    "prints bytes": ("sys.stdout.reconfigure(); sys.stdout.buffer.write(b'arrived\\n')", "arrived"),
+    "prints bytes": (
+        "sys.stdout.reconfigure(); sys.stdout.buffer.write(b'arrived\\n')",
+        "messages of image and device libraries: out/s.work/workers.log",
+    ),
     "ends its process": ("os._exit(3)", "2 units run"),
     "meets an illegal instruction": ("os.kill(os.getpid(), signal.SIGILL)", "2 units run"),
     "prints no text": (
