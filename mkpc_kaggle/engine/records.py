@@ -5,6 +5,7 @@ The latest version of the results is the table of pairs. It names the results th
 and the F that was written; nothing else decides what is written.
 """
 
+from base64 import b64decode, b64encode
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from enum import StrEnum
@@ -38,7 +39,7 @@ NO_CAMERAS = "no matches connect its images"
 # Prefixes of keys: of a file by its name, of the facts about an image by the digest of its content.
 IMAGE = "image "
 CONTENT = "content "
-MAX_DRAWN_POINTS = 300  # per model, evenly chosen
+MAX_DRAWN_POINTS = 5000  # per model, of the longest tracks; 60 kB each
 
 
 class EventKind(StrEnum):
@@ -142,9 +143,9 @@ class SceneRecord:
     """The reconstruction of a batch: numbers of images, registered images and points, and the
     models.
 
-    The largest model comes first. Each model has up to ``MAX_DRAWN_POINTS`` of its points, evenly
-    chosen. Without a model, ``failure`` is the reason. ``choices`` has the choice for each pair, by
-    the contents of its images (:func:`contents_of`).
+    The largest model comes first. Each model has up to ``MAX_DRAWN_POINTS`` of its points, of the
+    longest tracks, rounded to float32. Without a model, ``failure`` is the reason. ``choices`` has
+    the choice for each pair, by the contents of its images (:func:`contents_of`).
     """
 
     batch: str
@@ -167,7 +168,7 @@ class SceneRecord:
             sum(len(model.points) for model in models),
             seconds,
             "" if models else "; ".join(reasons) or NO_CAMERAS,
-            tuple(replace(model, points=_evenly(model.points)) for model in models),
+            tuple(replace(model, points=_drawn(model.points)) for model in models),
         )
 
     @classmethod
@@ -528,7 +529,7 @@ def _model_to_json(model: SfmModel) -> dict[str, Any]:
     ]
     return {
         "reprojection_error": float(model.reprojection_error),
-        "points": model.points.ravel().tolist(),
+        "points": _text_of_points(model.points),
         "images": images,
     }
 
@@ -542,11 +543,18 @@ def _model_of_json(about: Mapping[str, Any]) -> SfmModel:
         sigmas = Sigmas(*each["sigmas"]) if each["sigmas"] else ()
         camera = Camera(K, R, np.array(each["t"], float))
         images.append(RegisteredImage(image, camera, each["points"], sigmas))
-    points = np.array(about["points"], float).reshape(-1, 3)
+    points = _points_of_text(about["points"])
     return SfmModel(tuple(images), points, about["reprojection_error"])
 
 
-def _evenly(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    count = min(MAX_DRAWN_POINTS, len(points))
-    chosen = np.linspace(0, len(points) - 1, count).round().astype(int)
-    return np.asarray(points[chosen])
+def _drawn(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the points to store. A record is the same before it is stored and afterwards."""
+    return _points_of_text(_text_of_points(points[:MAX_DRAWN_POINTS]))
+
+
+def _text_of_points(points: NDArray[np.float64]) -> str:
+    return b64encode(points.astype("<f4").tobytes()).decode("ascii")
+
+
+def _points_of_text(text: str) -> NDArray[np.float64]:
+    return np.frombuffer(b64decode(text), "<f4").reshape(-1, 3).astype(np.float64)
