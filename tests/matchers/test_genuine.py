@@ -83,7 +83,7 @@ def golden_keypoints(detector: str, pair: int, side: int) -> Keypoints:
 @pytest.mark.parametrize(
     ("detector", "matcher", "least", "mean"),
     # The original ALIKED also keeps keypoints on the flanks of stronger ones.
-    [("aliked", "aliked", 0.65, 0.95), ("xfeat", "xfeat_lighterglue", 0.99, 0.999)],
+    [("aliked", "aliked", 0.65, 0.94), ("xfeat", "xfeat_lighterglue", 0.99, 0.999)],
 )
 def test_keypoints_and_descriptors_are_the_originals(detector, matcher, least, mean):
     shares = []
