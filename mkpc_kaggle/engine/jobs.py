@@ -59,8 +59,7 @@ class MatchJob:
 
 @dataclass(frozen=True, eq=False)
 class PairInputs:
-    """What a pair's estimate, or a scene, is computed from: its images, and the keys of its points
-    by unit.
+    """Inputs of a pair's estimate or of a scene: its images, and the keys of its points by unit.
 
     The units are in the recipe's order. ``own`` is for a scene: F from the pair's own matches.
     """
@@ -125,7 +124,7 @@ class Loaded:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What a job found on a pair. ``failure`` names an unreadable image.
+    """Result of a job on one pair. ``failure`` names an unreadable image.
 
     ``images`` have the digests of the matched contents, and ``files`` the size in bytes and the time of change in
     nanoseconds of each file before it was read.

@@ -173,7 +173,7 @@ class Engine:
         self._until = inf
         if share < 1:
             self._until = self.budget.clock() + share * self.budget.left()
-        # What is there is published before any work: a former F is better than the fallback.
+        # Publish existing results before any work: a former F is better than the fallback.
         self._publish()
         self._loop()
 
@@ -222,7 +222,7 @@ class Engine:
         touched = {}
         for name, facts in known.items():
             now = file_state(files[name])
-            # A missing file keeps its results: perhaps nothing has to be matched.
+            # A missing file keeps its results: perhaps nothing must be matched.
             if any(now) and now != tuple(facts["file"]):
                 touched[name] = now
         found = self.digest_files({name: files[name] for name in touched})

@@ -173,7 +173,7 @@ class Site:
         return max(1, self._cores - self.matching_cores * is_matching)
 
     def printed(self) -> Path | None:
-        """Return the file of what workers printed, if they printed anything."""
+        """Return the log file of the workers' output, if it is not empty."""
         with suppress(OSError):
             if self._log is not None and self._log.stat().st_size:
                 return self._log

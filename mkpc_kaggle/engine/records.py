@@ -1,5 +1,4 @@
-"""What a run has found, for reports: records of pairs, units and scenes, and the same as
-DataFrames.
+"""Results of a run, for reports: records of pairs, units and scenes, and the same as DataFrames.
 
 The latest version of the results is the table of pairs. It names the results that each pair has,
 and the F that was written; nothing else decides what is written.

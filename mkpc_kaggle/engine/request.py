@@ -1,4 +1,4 @@
-"""What a run is asked for, and its final report."""
+"""The request of a run, and its final report."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field

@@ -50,8 +50,7 @@ class Crew:
 
 @dataclass(frozen=True, eq=False)
 class NextWork:
-    """What idle workers should do now: the next job of matching, all estimates and all scenes that
-    are due.
+    """Work for idle workers: the next job of matching, and all estimates and scenes that are due.
 
     ``done`` of ``total`` pairs are finished in the ``phase``. The first ``fit`` units of the recipe fit for all
     pairs. ``stop`` is the time after which no unit may run.
@@ -69,9 +68,7 @@ class NextWork:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """What the rules below look at, computed once: the state and what follows from it at one
-    moment.
-    """
+    """Inputs of the rules below at one moment: the state, and values computed from it once."""
 
     state: State
     costs: Costs

@@ -69,10 +69,8 @@ class Assembly:
         """
         device = self.placement.device
         require_device(device)
-        exact, cache_bytes = (
-            replace(self.placement, precision=Precision.FLOAT32),
-            ENCODING_CACHE_BYTES,
-        )
+        exact = replace(self.placement, precision=Precision.FLOAT32)
+        cache_bytes = ENCODING_CACHE_BYTES
         if device != "cpu":
             import torch
 
