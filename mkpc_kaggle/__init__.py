@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any
 from mkpc_kaggle.version import __version__
 
 if TYPE_CHECKING:
-    from mkpc_kaggle.engine.records import results
     from mkpc_kaggle.pipeline.pair import PairMatch
     from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher
     from mkpc_kaggle.recipe import Recipe
     from mkpc_kaggle.reconstruction.run import reconstruct
+    from mkpc_kaggle.reporting.notebook import results
 
 __all__ = ["PairMatch", "Recipe", "TwoStageMatcher", "__version__", "reconstruct", "results"]
 
@@ -23,7 +23,7 @@ _MODULES = {
     "TwoStageMatcher": "pipeline.two_stage",
     "Recipe": "recipe",
     "reconstruct": "reconstruction.run",
-    "results": "engine.records",
+    "results": "reporting.notebook",
 }
 
 

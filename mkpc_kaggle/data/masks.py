@@ -31,17 +31,18 @@ class Masks:
         """Return the masks below ``directory`` of images below ``root``; an image without a mask is
         used whole.
 
-        Raises :class:`UserError` for a directory that is missing, lies below ``root`` or has no
-        masks of these images. Raises it also for a mask that is unreadable or not as large as its
-        image.
+        Raises :class:`UserError` for a directory that is missing, has images of the run or no masks
+        of these images. Raises it also for a mask that is unreadable or not as large as its image.
         """
         if not directory.is_dir():
             raise UserError(
                 f"{directory}: no such directory; --masks names a directory with files such as a.jpg{SUFFIX}"
             )
-        if lies_in(directory, root):
+        images = list(images)
+        # Each folder once: resolving links takes long.
+        if any(lies_in(folder, directory) for folder in {image.parent for image in images}):
             raise UserError(
-                f"--masks {directory} lies in {root}, so masks count as images; move it elsewhere"
+                f"--masks {directory} has images of the run, so masks count as images; move it elsewhere"
             )
         files: dict[str, tuple[str, str]] = {}
         first = None

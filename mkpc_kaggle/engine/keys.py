@@ -24,7 +24,7 @@ from mkpc_kaggle.scene.view_graph import BatchImage
 # Versions of the algorithms.
 POINTS = 2
 ESTIMATE = 3
-SCENE = 3
+SCENE = 4
 
 Images = tuple[BatchImage, BatchImage]
 

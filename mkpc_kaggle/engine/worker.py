@@ -220,14 +220,24 @@ def reconstruct(job: Job) -> Solution:
     process.
     """
     assert isinstance(job, SceneJob) and job.recipe.scene is not None
-    pairs = [batch_pair(*each) for each in results_of(job)]
+    keeps_paths = job.export is not None
+    pairs = [batch_pair(*each, keeps_paths=keeps_paths) for each in results_of(job)]
     recipe = job.recipe
     return reconstruct_batch(pairs, job.recipe.scene, recipe.focal, recipe.magsac, job.export)
 
 
-def batch_pair(pair: PairInputs, results: tuple[UnitResult, ...]) -> BatchPair:
-    """Return a pair of a batch with its points; images are named by their file names."""
-    image0, image1 = (replace(image, name=Path(image.name).name) for image in pair.images)
+def batch_pair(
+    pair: PairInputs, results: tuple[UnitResult, ...], *, keeps_paths: bool
+) -> BatchPair:
+    """Return a pair of a batch with its points.
+
+    Images have their file names, or with ``keeps_paths`` their paths below the root, as in COLMAP's
+    files, in tables of intrinsics and in the cameras of an earlier run.
+    """
+    image0, image1 = (
+        image if keeps_paths else replace(image, name=Path(image.name).name)
+        for image in pair.images
+    )
     matches = Matches.concatenate(result.matches for result in results)
     return BatchPair(image0, image1, matches, pair.own, tracks_of(results))
 

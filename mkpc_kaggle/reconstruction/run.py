@@ -1,6 +1,7 @@
 """Reconstruction of a folder in a run of the engine, or of a few images in this process."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
@@ -8,10 +9,13 @@ from typing import TYPE_CHECKING, Any
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.data.images import Image, ImageStore, Unreadable
+from mkpc_kaggle.data.masks import Masks
 from mkpc_kaggle.engine.request import RunReport
 from mkpc_kaggle.engine.session import Session, opened_engine, request_of
 from mkpc_kaggle.engine.state import State, name_below
 from mkpc_kaggle.errors import UserError, writing
+from mkpc_kaggle.geometry.intrinsics import camera_of, written
+from mkpc_kaggle.geometry.intrinsics import read as read_rows_of
 from mkpc_kaggle.matchers.contract import Matcher
 from mkpc_kaggle.pipeline.assembly import Assembly, assemble
 from mkpc_kaggle.pipeline.pair import PairMatch
@@ -19,6 +23,7 @@ from mkpc_kaggle.recipe import CameraSharing, Recipe, SceneConfig
 from mkpc_kaggle.reconstruction.choice import MAX_IMAGES, choose_pairs
 from mkpc_kaggle.reconstruction.folder import Datasets, Ends, batch_names
 from mkpc_kaggle.reconstruction.outputs import Cameras
+from mkpc_kaggle.reconstruction.priors import read_intrinsics_table
 from mkpc_kaggle.scene.likeness import PARTNERS, local_features, most_alike, shortlist
 from mkpc_kaggle.scene.reconstruct import models_of, reconstruct_sharing
 from mkpc_kaggle.scene.reconstruction import RegisteredImage, SfmModel
@@ -133,17 +138,64 @@ def reconstruct(
     weights: Iterable[str | Path] = (),
     device: str = "auto",
     matchers: Mapping[str, Matcher[Any]] | None = None,
+    masks: str | Path | None = None,
+    intrinsics: str | Path | None = None,
 ) -> Models:
     """Return the models of the images at these paths, the largest first; no model if too few images
     match.
 
-    This is the command ``reconstruct`` in this process, without budget and journal. Cameras refer
-    to the stored pixels of the files, as COLMAP reads them. Raises :class:`UserError` for a recipe
-    that cannot run here, and for an unreadable image.
+    This is the command ``reconstruct`` in this process, without budget and journal. ``masks`` is a
+    directory, and ``intrinsics`` a table, as for the command; their paths are relative to the common
+    directory of the images. Cameras refer to the stored pixels of the files, as COLMAP reads them.
+    Raises :class:`UserError` for a recipe that cannot run here, for unusable masks or intrinsics, and
+    for an unreadable image.
     """
+    files = sorted(map(Path, images))
+    # Bad files are refused before weights are loaded, which takes long.
+    given_masks, known = priors_of(files, masks, intrinsics)
     assembly = assemble(recipe, weights=map(Path, weights), device=device, matchers=matchers)
-    assembly = replace(assembly, recipe=for_cameras(assembly.recipe))
-    pipeline, store, files = assembly.pipeline(), ImageStore(), sorted(map(Path, images))
+    assembly = replace(
+        assembly,
+        recipe=for_cameras(assembly.recipe, intrinsics=known),
+        masks=given_masks or assembly.masks,
+    )
+    pairs = [
+        BatchPair(*map(batch_image, match.images), match.matches, None, tracks_of(match.results))
+        for match in matched_pairs(files, assembly)
+    ]
+    found, _ = reconstruct_sharing(
+        ViewGraph.of_pairs(pairs), assembly.recipe.scene or SceneConfig()
+    )
+    return Models(models_of(found))
+
+
+def priors_of(
+    files: Sequence[Path], masks: str | Path | None, intrinsics: str | Path | None
+) -> tuple[Masks | None, str]:
+    """Return the masks of a directory, and the rows of a table for ``[scene] intrinsics``.
+
+    Names in both are relative to the common directory of the files. Raises :class:`UserError` for
+    unusable ones.
+    """
+    if not files:
+        return None, ""
+    root = Path(os.path.commonpath([file.parent for file in files]))
+    given = None if masks is None else Masks.of_folder(Path(masks), root, files)
+    if intrinsics is None:
+        return given, ""
+    rows = read_rows_of(read_intrinsics_table(Path(intrinsics), root, files))
+    # The images of the view graph have their whole paths as names, so each gets a row with its path.
+    known = {str(file): camera_of(rows, file.relative_to(root).as_posix()) for file in files}
+    return given, written([(name, camera) for name, camera in known.items() if camera is not None])
+
+
+def matched_pairs(files: Sequence[Path], assembly: Assembly) -> Iterator[PairMatch]:
+    """Yield the matches of all pairs of up to ``MAX_IMAGES`` files, or of a shortlist.
+
+    Raises :class:`UserError` for an unreadable image.
+    """
+    pipeline = assembly.pipeline()
+    store = ImageStore()
 
     def opened(path: Path) -> Image:
         image = store.get(path)
@@ -151,17 +203,14 @@ def reconstruct(
             raise UserError(str(image))
         return image
 
-    pairs, ends = [], list(combinations(range(len(files)), 2))
+    ends = list(combinations(range(len(files)), 2))
     if len(files) > MAX_IMAGES:
         features = list(map(local_features, files))
         ends = shortlist(most_alike(lambda: features, PARTNERS))
-    for path0, path1 in ((files[i], files[j]) for i, j in ends):
-        (match,) = pipeline.match(
-            [PairMatch(images=(opened(path0), opened(path1)))], assembly.recipe.units
-        )
-        image0, image1 = (BatchImage(im.name, im.version, im.size, im.focal) for im in match.images)
-        pairs.append(BatchPair(image0, image1, match.matches, None, tracks_of(match.results)))
-    found, _ = reconstruct_sharing(
-        ViewGraph.of_pairs(pairs), assembly.recipe.scene or SceneConfig()
-    )
-    return Models(models_of(found))
+    for i, j in ends:
+        pair = PairMatch(images=(opened(files[i]), opened(files[j])))
+        yield from pipeline.match([pair], assembly.recipe.units)
+
+
+def batch_image(image: Image) -> BatchImage:
+    return BatchImage(image.name, image.version, image.size, image.focal)

@@ -7,7 +7,7 @@ are missing.
 import base64
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from importlib.util import find_spec
@@ -39,6 +39,7 @@ from mkpc_kaggle.reporting.summary import (
 )
 from mkpc_kaggle.reporting.verdict import doubt, inlier_histogram, verdict, write_summary
 from mkpc_kaggle.reporting.view import (
+    Reader,
     View,
     picture_at,
     style_and_script,
@@ -46,6 +47,7 @@ from mkpc_kaggle.reporting.view import (
     view_of,
     view_part,
 )
+from mkpc_kaggle.scene.export import IMAGES
 
 if TYPE_CHECKING:
     from markupsafe import Markup
@@ -102,6 +104,11 @@ def report_page(log: RunLog, pairs: Sequence[Pair] = (), *, undrawn: str = "") -
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     readable = () if undrawn else pairs  # a late page reads no images
+
+    def read_in(batch: str) -> Reader:
+        files = [file for pair in readable if pair.group == batch for file in pair.images]
+        return reader_of({file.name: file for file in files})
+
     if not undrawn and find_spec("matplotlib") is None:
         undrawn = "matplotlib is not installed: pip install 'mkpc-kaggle[plots]'"
     sources = {} if undrawn else {pair.id: pair for pair in pairs}
@@ -139,7 +146,7 @@ def report_page(log: RunLog, pairs: Sequence[Pair] = (), *, undrawn: str = "") -
         ],
         is_doubtful=is_doubtful,
         min_support=MIN_SUPPORT,
-        views=[*_views(log, readable, is_drawn=not undrawn)],
+        views=[*_views(log, read_in, is_drawn=not undrawn)],
         pair_rows=pair_rows(log.records)[:MAX_ROWS],
         more_pairs=max(0, len(log.records) - MAX_ROWS),
         histogram=histogram,
@@ -179,51 +186,79 @@ def pair_rows(records: Sequence[PairRecord]) -> list[tuple[str | int | float, ..
     ]
 
 
-def _views(log: RunLog, pairs: Sequence[Pair], *, is_drawn: bool) -> Iterator[tuple[str, "Markup"]]:
-    """Yield the title and the view of each of the largest scenes; pictures replace a view without
-    scripts.
+def _views(
+    log: RunLog, read_in: Callable[[str], Reader], *, is_drawn: bool
+) -> Iterator[tuple[str, "Markup"]]:
+    """Yield the title and the view of each of the largest scenes.
+
+    ``read_in`` returns the reader of a batch's images. If ``is_drawn``, pictures replace a view
+    without scripts.
     """
     largest = sorted(log.scenes, key=lambda scene: -scene.registered)[:MAX_SCENES]
     for scene in (scene for scene in largest if scene.models):
-        paths = {
-            file.name: file for pair in pairs if pair.group == scene.batch for file in pair.images
-        }
-        pictures = [
-            (f"{scene.batch}, model {number}", _data_uri(draw_cameras(scene, number), "png"))
-            for number in range(min(len(scene.models), MAX_MODELS) if is_drawn else 0)
-        ]
-
-        def read(name: str, paths: Mapping[str, Path] = paths) -> Image | None:
-            path = paths.get(Path(name).name)
-            return None if path is None else picture_at(str(path))
-
-        partners = partners_of(
-            [record for record in log.records if record.pair.group == scene.batch]
-        )
+        pictures = []
+        for number in range(min(len(scene.models), MAX_MODELS) if is_drawn else 0):
+            figure = draw_cameras(scene, number)
+            pictures.append((f"{scene.batch}, model {number}", _data_uri(figure, "png")))
         models = scene.models
+        # COLMAP's files have more points than the journal, and their colours.
         clouds = clouds_of(scene, log.path.parent.parent)
         if clouds:
             models = tuple(
                 replace(each, points=cloud.points)
                 for each, cloud in zip(models, clouds, strict=True)
             )
+        records = [record for record in log.records if record.pair.group == scene.batch]
         part = view_part(
             models,
             scene.batch,
-            read=read,
-            partners=partners,
+            read=read_in(scene.batch),
+            partners=partners_of(records),
             pictures=pictures,
             colours=[cloud.colours for cloud in clouds],
         )
         yield scene.batch, part
 
 
-def show_run(work_dir: str | Path, pairs: Sequence[Pair] = ()) -> View:
-    """Return the view of the scenes of a run; ``pairs`` have the paths of the images.
+def reader_of(paths: Mapping[str, Path]) -> Reader:
+    """Return a reader of images by their file names; an image without a path is unknown."""
 
-    Raises :class:`UserError` if the journal is missing or damaged.
+    def read(name: str) -> Image | None:
+        path = paths.get(Path(name).name)
+        return None if path is None else picture_at(str(path))
+
+    return read
+
+
+def show_run(work_dir: Path, root: Path | None = None) -> View:
+    """Return the view of the scenes of a run. Its images lie below ``root``.
+
+    Without ``root``, only ``reconstruct`` has images: the links next to its models. Raises
+    :class:`UserError` if the journal is missing or damaged.
     """
-    return view_of(_views(read_log(Path(work_dir)), pairs, is_drawn=False))
+    log = read_log(work_dir)
+
+    def read_in(batch: str) -> Reader:
+        if root is None:
+            return reader_of(linked_images(log.path.parent.parent, batch))
+        files = {
+            file
+            for record in log.records
+            if record.pair.group == batch
+            for file in (record.pair.file0, record.pair.file1)
+        }
+        return reader_of({Path(file).name: root / file for file in files})
+
+    return view_of(_views(log, read_in, is_drawn=False))
+
+
+def linked_images(out: Path, batch: str) -> dict[str, Path]:
+    """Return the images of a dataset in the results of ``reconstruct``, by file name."""
+    # The images that lie directly in DIR have their folder in OUT itself.
+    for folder in (out / batch / IMAGES, out / IMAGES):
+        if folder.is_dir():
+            return {file.name: file for file in folder.iterdir()}
+    return {}
 
 
 def partners_of(records: Iterable[PairRecord]) -> dict[str, list[tuple[str, int, int]]]:

@@ -111,7 +111,9 @@ def test_pycolmap_reads_each_model_with_plain_names(laid_out):
         model = pycolmap.Reconstruction(out / "set" / "sparse" / str(number))
         original = pycolmap.Reconstruction(out / "set" / "models" / str(number))
         names = {image.name for image in model.images.values()}
-        assert names == {Path(image.name).name for image in original.images.values()}
+        assert {f"set/{name}" for name in names} == {
+            image.name for image in original.images.values()
+        }, "the models for COLMAP have paths below the folder"
         assert model.num_points3D() == original.num_points3D()
 
 
@@ -170,26 +172,32 @@ def test_a_folder_called_images_below_another_dataset_keeps_its_place(tmp_path):
     assert not (tmp_path / "out" / "images" / "00.png").exists()
 
 
-def test_a_folder_that_grew_keeps_its_coordinates(tmp_path):
-    root, out = write_flat(tmp_path / "images", FIRST), tmp_path / "out"
-    away = (root / "05.png").rename(tmp_path / "05.png")
+@pytest.mark.parametrize("dataset", [".", "set"])
+def test_a_folder_that_grew_keeps_its_coordinates(tmp_path, dataset):
+    root = tmp_path / "images"
+    out = tmp_path / "out"
+    folder = write_flat(root / dataset, FIRST)
+    away = (folder / "05.png").rename(tmp_path / "05.png")
     before = run(root, out)
     assert list(keep_coordinates(out, root, before)) == [], "nothing to compare with"
-    away.rename(root / "05.png")
+    away.rename(folder / "05.png")
     after = run(root, out)
     (line,) = keep_coordinates(out, root, after)
-    assert line.startswith("images: 5 cameras keep the coordinates of the last run and moved by ")
+    name = "images" if dataset == "." else dataset
+    assert line.startswith(f"{name}: 5 cameras keep the coordinates of the last run and moved by ")
     old, new = cameras(before), cameras(after)
     assert (len(old), len(new)) == (5, 6)
     size = np.std([each.camera.centre for each in old.values()], axis=0).max()
     for name, found in old.items():
         np.testing.assert_allclose(new[name].camera.centre, found.camera.centre, atol=0.02 * size)
         np.testing.assert_allclose(new[name].camera.R, found.camera.R, atol=0.02)
-    model = pycolmap.Reconstruction(out / "models" / "0")
-    poses = {image.name: image.cam_from_world().matrix() for image in model.images.values()}
+    model = pycolmap.Reconstruction(out / dataset / "models" / "0")
+    poses = {
+        Path(image.name).name: image.cam_from_world().matrix() for image in model.images.values()
+    }
     for name, found in new.items():
         np.testing.assert_allclose(
             poses[name][:, 3], found.camera.t, atol=1e-9, err_msg="files and tables agree"
         )
-    forget_coordinates(out, ["."])
-    assert not (out / REFERENCE).exists()
+    forget_coordinates(out, [dataset])
+    assert not (out / dataset / REFERENCE).exists()

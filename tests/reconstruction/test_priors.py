@@ -21,7 +21,13 @@ from mkpc_kaggle.geometry.intrinsics import KnownCamera, read
 from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.reconstruction.folder import read_folder
 from mkpc_kaggle.reconstruction.priors import read_intrinsics_table
-from mkpc_kaggle.reconstruction.run import FolderResult, for_cameras, reconstruct_folder
+from mkpc_kaggle.reconstruction.run import (
+    FolderResult,
+    Models,
+    for_cameras,
+    reconstruct,
+    reconstruct_folder,
+)
 
 HEAD = "image,model,parameters,sigma\n"
 
@@ -123,8 +129,14 @@ def test_bad_masks_are_one_line_and_nothing_is_touched(tmp_path, capsys, reason)
 
 def test_masks_among_the_images_are_refused(tmp_path):
     root = write_flat(tmp_path / "images", 3)
+    folder = write_masks(root / "masks", root)
+    found = [file for files in read_folder(root).values() for file in files]
     with pytest.raises(UserError, match="masks count as images"):
-        Masks.of_folder(root, root, root.iterdir())
+        Masks.of_folder(folder, root, found)
+    # A hidden folder is no dataset, so its masks are no images.
+    hidden = folder.rename(root / ".masks")
+    found = [file for files in read_folder(root).values() for file in files]
+    assert len(Masks.of_folder(hidden, root, found).files) == 3
 
 
 def test_black_pixels_of_a_mask_are_left_out(tmp_path):
@@ -188,3 +200,49 @@ def test_the_table_is_read_in_the_order_of_its_rows(tmp_path):
     known = read(read_intrinsics_table(file, root, sorted(root.rglob("*.png"))))
     assert known[0] == ("set/00.png", KnownCamera("OPENCV", (900, 901, 400, 300, 0.1, 0, 0, 0)))
     assert known[1] == ("*", KnownCamera("SIMPLE_PINHOLE", (850, 400, 300), 5.0))
+
+
+def test_a_row_with_a_path_is_the_camera_of_that_image_alone(tmp_path):
+    root = tmp_path / "images"
+    for name in ("a", "b"):
+        write_flat(root / name, FIRST)
+    # Other contents: files with the same content share a camera.
+    for number, image in enumerate(sorted((root / "b").iterdir())):
+        cv2.imwrite(str(image), cv2.imread(str(image)), [cv2.IMWRITE_PNG_COMPRESSION, 1])
+        assert image.read_bytes() != (root / "a" / image.name).read_bytes(), number
+    table = tmp_path / "known.csv"
+    table.write_text(f"{HEAD}a/00.png,SIMPLE_PINHOLE,901 400 300,fixed\n")
+    known = read_intrinsics_table(table, root, sorted(root.rglob("*.png")))
+    result = run(root, tmp_path / "out", known=known)
+    focals = {
+        name: next(placed[1].focal for file, placed in found.items() if file.name == "00.png")
+        for name, found in result.cameras.items()
+    }
+    assert focals["a"] == pytest.approx(901, abs=1e-9)
+    assert abs(focals["b"] - 901) > 1
+
+
+def test_python_takes_masks_and_intrinsics_as_the_command_does(tmp_path):
+    root = tmp_path / "images"
+    files = sorted(write_flat(root / "set", FIRST).iterdir())
+    table = tmp_path / "known.csv"
+    table.write_text(f"{HEAD}00.png,SIMPLE_PINHOLE,901 400 300,fixed\n")
+
+    def models(**priors: object) -> Models:
+        given = {"synthetic": MixedMatcher()}
+        return reconstruct(files, RECIPE, device="cpu", matchers=given, **priors)
+
+    (free,) = models()
+    masks = write_masks(tmp_path / "masks", root / "set", 300)
+    (found,) = models(masks=masks, intrinsics=table)
+    focals = {Path(each.image.name).name: each.focal for each in found.images}
+    assert focals["00.png"] == pytest.approx(901, abs=1e-9)
+    assert {each.image.name for each in found.images} == set(map(str, files)), "names are paths"
+    # Half the pixels are masked, so there are fewer points.
+    assert 0 < len(found.points) < 0.9 * len(free.points)
+    for name, reason in (("masks", "has no mask"), ("intrinsics", "lacks the columns")):
+        (tmp_path / "empty").mkdir(exist_ok=True)
+        (tmp_path / "empty.csv").touch()
+        bad = tmp_path / ("empty" if name == "masks" else "empty.csv")
+        with pytest.raises(UserError, match=reason):
+            models(**{name: bad})

@@ -25,7 +25,7 @@ from sklearn.datasets import load_sample_image
 from synthetic import QUICK, SyntheticMatcher
 
 from benchmarks.synthetic_scene import SIZE, SyntheticScene, synthetic_scene
-from mkpc_kaggle import reconstruct
+from mkpc_kaggle import reconstruct, results
 from mkpc_kaggle.data import images
 from mkpc_kaggle.data.images import TURNS, Image, Unreadable, read_image
 from mkpc_kaggle.engine.budget import Budget
@@ -36,6 +36,7 @@ from mkpc_kaggle.pipeline import pair
 from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.recipe import Recipe, Unit
 from mkpc_kaggle.reconstruction.folder import read_folder, read_pair_list
+from mkpc_kaggle.reconstruction.layout import write_images
 from mkpc_kaggle.reconstruction.outputs import Cameras, camera_rows, submission_rows
 from mkpc_kaggle.reconstruction.run import FolderResult, for_cameras, reconstruct_folder
 from mkpc_kaggle.scene.likeness import local_features, most_alike, shortlist
@@ -144,6 +145,23 @@ def test_the_cameras_are_those_of_the_models_and_right(mixed):
         assert [
             0 < sigma < most for (sigma,), most in zip(sigmas, (0.3, 0.03, 2), strict=True)
         ] == [True] * 3
+
+
+def test_a_notebook_shows_the_results_with_and_without_their_images(mixed):
+    out, _ = mixed
+    root = out.parent / "images"
+    tables = results(out / "work")
+    pairs, _, found = tables
+    assert (len(pairs), len(found)) == (55, 10)
+    names = [f"{number:02}.png" for number in range(10)]
+    for folder, pictures in ((None, 0), (root, 10)):
+        page = tables.show(folder).page
+        assert all(name in page for name in names)
+        assert page.count("data:image/jpeg") == pictures
+    # The command links the images; this run did not.
+    write_images(out, sorted(root.iterdir()))
+    assert tables.show().page.count("data:image/jpeg") == 10
+    assert "iframe" in tables.show()._repr_html_()
 
 
 ORIENTATIONS = (1, 6, 8, 3, 6, 1)  # of the images of a phone, by EXIF

@@ -1,0 +1,157 @@
+"""Seconds of ``reconstruct`` beside pycolmap alone, on the same folders of images.
+
+    python -m benchmarks.folder_seconds --images DIR... [--code NAME=CHECKOUT...] [--rounds N]
+        [--mappers incremental global] [--recipe NAME]
+
+The programs alternate. Each runs in a separate process with one thread per library. Its seconds are
+CPU seconds of that process and of all processes that it started. pycolmap has its default settings,
+and one SIMPLE_PINHOLE camera per image as ``reconstruct`` has. ``reconstruct`` also writes its
+tables and its report. ``--code`` adds other versions of this package, such as
+``before=../checkout``.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+HERE = Path(__file__).resolve().parents[1]
+# A library with more threads waits actively, which would count as work.
+ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+ALONE = "from benchmarks.folder_seconds import pycolmap_alone; pycolmap_alone(*__import__('sys').argv[1:])"
+
+
+@dataclass(frozen=True)
+class Program:
+    """A way to get cameras: a name for the table, and a command that takes a folder and an output."""
+
+    name: str
+    command: tuple[str, ...]
+    checkout: Path = HERE
+
+    def seconds(self, images: Path, out: Path) -> float:
+        """Run the program. Return CPU seconds, with those of all processes that it waited for."""
+        command = [part.format(images=images, out=out) for part in self.command]
+        environment = {**os.environ, **ONE_THREAD, "PYTHONPATH": str(self.checkout)}
+        # From the checkout, because Python imports from the working directory first.
+        process = subprocess.Popen(
+            command,
+            env=environment,
+            cwd=self.checkout,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        _, status, used = os.wait4(process.pid, 0)
+        process.returncode = os.waitstatus_to_exitcode(status)
+        if process.returncode:
+            raise SystemExit(f"{self.name}: exit status {process.returncode} on {images}")
+        return used.ru_utime + used.ru_stime
+
+
+def pycolmap_alone(images: str, out: str, mapper: str) -> None:
+    """Reconstruct a folder with pycolmap's features, exhaustive matching and mapper."""
+    import pycolmap
+
+    pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
+    database = Path(out) / "database.db"
+    Path(out).mkdir(parents=True, exist_ok=True)
+    reader = pycolmap.ImageReaderOptions({"camera_model": "SIMPLE_PINHOLE"})
+    pycolmap.extract_features(
+        database,
+        images,
+        camera_mode=pycolmap.CameraMode.PER_IMAGE,
+        reader_options=reader,
+        extraction_options=pycolmap.FeatureExtractionOptions({"num_threads": 1}),
+        device=pycolmap.Device.cpu,
+    )
+    matching = pycolmap.FeatureMatchingOptions({"num_threads": 1})
+    pycolmap.match_exhaustive(database, matching, device=pycolmap.Device.cpu)
+    matched = time.process_time()
+    if mapper == "incremental":
+        options = pycolmap.IncrementalPipelineOptions({"num_threads": 1})
+        models = pycolmap.incremental_mapping(database, images, out, options)
+    else:
+        global_options = pycolmap.GlobalPipelineOptions({"num_threads": 1})
+        models = pycolmap.global_mapping(database, images, out, global_options)
+    placed = {image for model in models.values() for image in model.reg_image_ids()}
+    facts = {"cameras": len(placed), "mapping": time.process_time() - matched}
+    (Path(out) / "facts.json").write_text(json.dumps(facts))
+
+
+def facts_of(out: Path) -> tuple[int, float]:
+    """Return the number of cameras, and the seconds of mapping, from the results in ``out``."""
+    if (out / "facts.json").exists():
+        facts = json.loads((out / "facts.json").read_text())
+        return facts["cameras"], facts["mapping"]
+    if (out / "summary.json").exists():
+        scenes = json.loads((out / "summary.json").read_text())["scenes"]
+        return sum(scene["cameras"] for scene in scenes), sum(scene["seconds"] for scene in scenes)
+    # Versions before the summary.
+    with (out / "cameras.csv").open() as stream:
+        return len(stream.readlines()) - 1, float("nan")
+
+
+def programs_of(arguments: argparse.Namespace) -> list[Program]:
+    python = sys.executable
+    alone = [
+        Program(f"pycolmap, {mapper}", (python, "-c", ALONE, "{images}", "{out}", mapper))
+        for mapper in arguments.mappers
+    ]
+    command = (python, "-m", "mkpc_kaggle", "reconstruct", "{images}", "--out", "{out}")
+    command += ("--recipe", arguments.recipe)
+    ours = [Program("reconstruct", command)]
+    for each in arguments.code:
+        name, _, checkout = each.partition("=")
+        ours.append(Program(f"reconstruct, {name}", command, Path(checkout).resolve()))
+    return [*alone, *ours]
+
+
+def measure(programs: Sequence[Program], folder: Path, rounds: int) -> None:
+    """Print a row per program: mean and range of its CPU seconds, cameras, seconds of mapping."""
+    used: dict[str, list[float]] = {program.name: [] for program in programs}
+    found: dict[str, tuple[int, float]] = {}
+    for _ in range(rounds):
+        for program in programs:
+            with tempfile.TemporaryDirectory() as name:
+                out = Path(name) / "out"
+                used[program.name].append(program.seconds(folder.resolve(), out))
+                found[program.name] = facts_of(out)
+    for program in programs:
+        seconds = used[program.name]
+        cameras, mapping = found[program.name]
+        print(
+            f"{folder.parent.name + '/' + folder.name:<28}{program.name:<26}{np.mean(seconds):>8.1f}"
+            f"{min(seconds):>8.1f}{max(seconds):>8.1f}{mapping:>9.1f}{cameras:>9}",
+            flush=True,
+        )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--images", type=Path, nargs="+", required=True)
+    parser.add_argument("--code", nargs="*", default=[], metavar="NAME=CHECKOUT")
+    parser.add_argument("--rounds", type=int, default=2)
+    parser.add_argument(
+        "--mappers", nargs="*", default=["incremental", "global"], help="of pycolmap alone"
+    )
+    parser.add_argument("--recipe", default="auto")
+    arguments = parser.parse_args()
+    print(
+        f"{'folder':<28}{'program':<26}{'CPU s':>8}{'min':>8}{'max':>8}{'mapping':>9}{'cameras':>9}"
+    )
+    for folder in arguments.images:
+        measure(programs_of(arguments), folder, arguments.rounds)
+
+
+if __name__ == "__main__":
+    main()

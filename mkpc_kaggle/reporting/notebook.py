@@ -1,0 +1,35 @@
+"""A run in a notebook: its results as pandas tables, and the interactive view of its scenes."""
+
+from pathlib import Path
+
+from mkpc_kaggle.engine.records import Results
+from mkpc_kaggle.engine.records import results as read_results
+from mkpc_kaggle.reporting.view import View
+
+
+class RunResults(Results):
+    """The tables ``pairs``, ``units`` and ``cameras`` of a run, which can also show its scenes."""
+
+    directory: Path  # the work directory
+
+    def show(self, root: str | Path | None = None) -> View:
+        """Return the view of all scenes, the last value of a notebook's cell.
+
+        ``root`` is the directory of the images: that of ``test.csv``, or DIR of ``reconstruct``.
+        Without it, the results of ``reconstruct`` still have their images; other views have none.
+        Raises :class:`mkpc_kaggle.errors.UserError` if the journal is missing or damaged.
+        """
+        from mkpc_kaggle.reporting.report import show_run  # jinja2 is slow to import
+
+        return show_run(self.directory, None if root is None else Path(root))
+
+
+def results(directory: str | Path) -> RunResults:
+    """Return the results in a work directory (NAME.work), during a run or after it.
+
+    Raises :class:`mkpc_kaggle.errors.UserError` if the store is missing, damaged, or of another
+    format.
+    """
+    found = RunResults(*read_results(directory))
+    found.directory = Path(directory)
+    return found
