@@ -159,10 +159,10 @@ def reconstruct(
         recipe=for_cameras(assembly.recipe, intrinsics=known),
         masks=given_masks or assembly.masks,
     )
-    pairs = [
-        BatchPair(*map(batch_image, match.images), match.matches, None, tracks_of(match.results))
-        for match in matched_pairs(files, assembly)
-    ]
+    pairs = []
+    for match in matched_pairs(files, assembly):
+        image0, image1 = map(batch_image, match.images)
+        pairs.append(BatchPair(image0, image1, match.matches, None, tracks_of(match.results)))
     found, _ = reconstruct_sharing(
         ViewGraph.of_pairs(pairs), assembly.recipe.scene or SceneConfig()
     )
