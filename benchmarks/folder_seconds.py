@@ -115,23 +115,22 @@ def programs_of(arguments: argparse.Namespace) -> list[Program]:
 
 
 def measure(programs: Sequence[Program], folder: Path, rounds: int) -> None:
-    """Print a row per program: mean and range of its CPU seconds, cameras, seconds of mapping."""
+    """Print a row per program and round: CPU seconds, seconds of mapping, cameras; then the means."""
     used: dict[str, list[float]] = {program.name: [] for program in programs}
-    found: dict[str, tuple[int, float]] = {}
-    for _ in range(rounds):
+    for number in range(1, rounds + 1):
         for program in programs:
             with tempfile.TemporaryDirectory() as name:
                 out = Path(name) / "out"
-                used[program.name].append(program.seconds(folder.resolve(), out))
-                found[program.name] = facts_of(out)
-    for program in programs:
-        seconds = used[program.name]
-        cameras, mapping = found[program.name]
-        print(
-            f"{folder.parent.name + '/' + folder.name:<28}{program.name:<26}{np.mean(seconds):>8.1f}"
-            f"{min(seconds):>8.1f}{max(seconds):>8.1f}{mapping:>9.1f}{cameras:>9}",
-            flush=True,
-        )
+                seconds = program.seconds(folder.resolve(), out)
+                cameras, mapping = facts_of(out)
+            used[program.name].append(seconds)
+            print(
+                f"{folder.parent.name + '/' + folder.name:<28}{program.name:<26}{number:>6}"
+                f"{seconds:>8.1f}{mapping:>9.1f}{cameras:>9}",
+                flush=True,
+            )
+    means = ", ".join(f"{name} {np.mean(seconds):.1f}" for name, seconds in used.items())
+    print(f"means: {means}", flush=True)
 
 
 def main() -> None:

@@ -32,6 +32,8 @@ from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair, ViewGraph, track
 if TYPE_CHECKING:
     from mkpc_kaggle.reporting.view import View
 
+AUTO = "auto"  # the recipe of all matchers whose weights are found
+
 
 @dataclass(frozen=True)
 class FolderResult:
@@ -44,8 +46,9 @@ def for_cameras(recipe: Recipe, sharing: str | None = None, intrinsics: str = ""
     """Return the recipe without extra pairs and without steps that only improve the F of single
     pairs.
 
-    ``sharing`` is a :class:`CameraSharing`, and ``intrinsics`` are known cameras as in :class:`SceneConfig`.
-    Without them, the recipe's are kept.
+    Recipe ``auto`` without weights keeps its first unit alone. ``sharing`` is a
+    :class:`CameraSharing`, and ``intrinsics`` are known cameras as in :class:`SceneConfig`. Without
+    them, the recipe's are kept.
     """
     scene = recipe.scene or SceneConfig()
     scene = replace(
@@ -54,7 +57,12 @@ def for_cameras(recipe: Recipe, sharing: str | None = None, intrinsics: str = ""
         cameras=CameraSharing(sharing or scene.cameras),
         intrinsics=intrinsics or scene.intrinsics,
     )
-    return replace(recipe, focal=None, scene=scene)
+    units = recipe.units
+    # More views by RootSIFT give the same cameras at three times the cost. A recipe that the user
+    # names runs as it is written.
+    if recipe.name == AUTO and recipe.matcher_names == ("sift",):
+        units = units[:1]
+    return replace(recipe, units=units, focal=None, scene=scene)
 
 
 def reconstruct_folder(

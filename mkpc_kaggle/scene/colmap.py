@@ -10,6 +10,7 @@ Source: Pan et al. 2024 (the global mapper).
 import os
 import shutil
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -18,12 +19,12 @@ import numpy as np
 import pycolmap
 
 from mkpc_kaggle.geometry.cameras import Camera
-from mkpc_kaggle.geometry.coordinates import Points, Size
+from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.intrinsics import KnownCamera
 from mkpc_kaggle.recipe import CameraModel, SceneConfig
 from mkpc_kaggle.scene.export import DATABASE, FORMER, MODELS, PART
 from mkpc_kaggle.scene.focal_lengths import apply_known_cameras
-from mkpc_kaggle.scene.keypoints import Index, scene_keypoints
+from mkpc_kaggle.scene.keypoints import MergedGraph
 from mkpc_kaggle.scene.reconstruction import (
     MIN_IMAGES,
     Reconstruction,
@@ -33,7 +34,7 @@ from mkpc_kaggle.scene.reconstruction import (
 )
 from mkpc_kaggle.scene.shared_intrinsics import SharedIntrinsics, start_focal
 from mkpc_kaggle.scene.uncertainty import camera_sigmas
-from mkpc_kaggle.scene.view_graph import MIN_MATCHES, Edge, ViewGraph
+from mkpc_kaggle.scene.view_graph import MIN_MATCHES, ViewGraph
 
 CENTRE_PX = 0.5  # in COLMAP the top-left pixel's centre is (0.5, 0.5), here it is (0, 0)
 # Of a verified match; 1 px loses accuracy on tourist photographs, 4 px on repeated windows
@@ -45,7 +46,7 @@ SEED = 0
 
 
 def structure_from_motion(
-    graph: ViewGraph, shared: SharedIntrinsics, config: SceneConfig
+    merged: MergedGraph, shared: SharedIntrinsics, config: SceneConfig
 ) -> Reconstruction:
     """Return pycolmap's reconstruction of a view graph, with any number of models.
 
@@ -56,13 +57,13 @@ def structure_from_motion(
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
     pycolmap.set_random_seed(SEED)
     with pycolmap.Database.open(":memory:") as database:
-        _fill(database, graph, shared, config.camera_model)
-        return run_mapper(database, graph, config.threads)
+        _fill(database, merged, shared, config.camera_model)
+        return run_mapper(database, merged.graph, config.threads)
 
 
 def write_files(
     directory: Path,
-    graph: ViewGraph,
+    merged: MergedGraph,
     shared: SharedIntrinsics,
     models: Sequence[SfmModel],
     camera_model: CameraModel = CameraModel.SIMPLE_PINHOLE,
@@ -78,7 +79,7 @@ def write_files(
     with TemporaryDirectory(prefix=PART, dir=directory) as name:
         made = Path(name)
         with pycolmap.Database.open(str(made / DATABASE)) as database:
-            _fill(database, graph, shared, camera_model)
+            _fill(database, merged, shared, camera_model)
         for number, model in enumerate(models):
             kept = {each.image.name for each in model.images}
             for frame in [frame for frame in model.colmap.frames.values() if frame.has_pose()]:
@@ -99,33 +100,31 @@ def write_files(
 
 
 def _fill(
-    database: Any, graph: ViewGraph, shared: SharedIntrinsics, camera_model: CameraModel
+    database: Any, merged: MergedGraph, shared: SharedIntrinsics, camera_model: CameraModel
 ) -> None:
     """Write the images, cameras and keypoints, and each edge's matches and verified geometry."""
-    keypoints, found = scene_keypoints(graph)
     with pycolmap.DatabaseTransaction(database):
-        cameras = _write_images(database, graph, keypoints, shared, camera_model)
-        geometries = verify(graph.edges, keypoints, found, cameras)
-        for edge, matches, geometry in zip(graph.edges, found, geometries, strict=True):
+        cameras = _write_images(database, merged, shared, camera_model)
+        geometries = verify(merged, cameras)
+        edges = merged.graph.edges
+        for edge, matches, geometry in zip(edges, merged.matches, geometries, strict=True):
             database.write_matches(edge.first + 1, edge.second + 1, matches)
             database.write_two_view_geometry(edge.first + 1, edge.second + 1, geometry)
 
 
 def _write_images(
-    database: Any,
-    graph: ViewGraph,
-    keypoints: Sequence[Points],
-    shared: SharedIntrinsics,
-    camera_model: CameraModel,
+    database: Any, merged: MergedGraph, shared: SharedIntrinsics, camera_model: CameraModel
 ) -> list[Any]:
     """Write images, frames, cameras and rigs. Return each image's camera.
 
     Images and frames have the image's index plus one as id. Cameras and rigs have the id of their
     first image.
     """
+    graph = merged.graph
     cameras: dict[object, Any] = {}
     used = []
-    for number, (image, points) in enumerate(zip(graph.images, keypoints, strict=True), start=1):
+    images = zip(graph.images, merged.keypoints, strict=True)
+    for number, (image, points) in enumerate(images, start=1):
         focal = shared.get(image.digest)
         key = number if focal is None else (image.size, focal)
         if key not in cameras:
@@ -169,21 +168,38 @@ def _write_camera(
     return camera
 
 
-def verify(
-    edges: Sequence[Edge], keypoints: Sequence[Points], matches: Sequence[Index], cameras: list[Any]
-) -> list[Any]:
-    """Return the epipolar geometry of each edge, with its inliers."""
+def verify(merged: MergedGraph, cameras: Sequence[Any]) -> list[Any]:
+    """Return the two-view geometry of each edge, with its inliers, for the ``cameras`` of the
+    images.
+
+    Geometries that are known for the same two cameras are not estimated again.
+    """
     ransac = {"max_error": MAX_ERROR_PX, "max_num_trials": MAX_TRIALS, "random_seed": SEED}
     # COLMAP takes matches without motion for a watermark, but nearby views have many of these.
     settings = {"ransac": ransac, "min_num_inliers": MIN_MATCHES, "detect_watermark": False}
     options = pycolmap.TwoViewGeometryOptions(settings)
-    points = [found.astype(np.float64) + CENTRE_PX for found in keypoints]
+    points = [found.astype(np.float64) + CENTRE_PX for found in merged.keypoints]
+    versions = [(camera.model, *camera.params) for camera in cameras]
 
-    views = list(zip(cameras, points, strict=True))
-    return [
-        pycolmap.estimate_two_view_geometry(*views[edge.first], *views[edge.second], index, options)
-        for edge, index in zip(edges, matches, strict=True)
-    ]
+    def estimate(number: int) -> None:
+        edge = merged.graph.edges[number]
+        key = (number, versions[edge.first], versions[edge.second])
+        if key not in merged.geometries:
+            merged.geometries[key] = pycolmap.estimate_two_view_geometry(
+                cameras[edge.first],
+                points[edge.first],
+                cameras[edge.second],
+                points[edge.second],
+                merged.matches[number],
+                options,
+            )
+        found[number] = merged.geometries[key]
+
+    found: list[Any] = [None] * len(merged.graph.edges)
+    # On all cores: an edge starts from the same seed in every thread, so results are the same.
+    with ThreadPoolExecutor() as pool:
+        list(pool.map(estimate, range(len(found))))
+    return found
 
 
 def run_mapper(database: Any, graph: ViewGraph, threads: int) -> Reconstruction:

@@ -6,6 +6,10 @@ Structure from motion tracks a point through several pairs, so its positions in 
 one keypoint.
 """
 
+from collections.abc import Hashable
+from functools import cached_property
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,6 +20,34 @@ CELL_PX = 0.75  # points of an image in one cell of this size are one keypoint
 
 
 Index = NDArray[np.uint32]  # (M, 2): indices of the matched keypoints in both images of an edge
+
+
+class MergedGraph:
+    """A view graph with the keypoints of its images, and all that was computed from these.
+
+    The same graph is reconstructed with separate and with shared intrinsics, and then exported. So
+    keypoints are merged once, and ``geometries`` has the two-view geometries that are verified so
+    far, by edge and by its cameras.
+    """
+
+    def __init__(self, graph: ViewGraph) -> None:
+        self.graph = graph
+        self.geometries: dict[Hashable, Any] = {}
+
+    @property
+    def keypoints(self) -> list[Points]:
+        """The keypoints (K, 2) of each image."""
+        return self._merged[0]
+
+    @property
+    def matches(self) -> list[Index]:
+        """The matches (M, 2) of each edge, as indices of keypoints."""
+        return self._merged[1]
+
+    # A graph that is too small to be reconstructed needs none.
+    @cached_property
+    def _merged(self) -> tuple[list[Points], list[Index]]:
+        return scene_keypoints(self.graph)
 
 
 def scene_keypoints(graph: ViewGraph) -> tuple[list[Points], list[Index]]:

@@ -12,6 +12,7 @@ from mkpc_kaggle.geometry.robust import RobustConfig
 from mkpc_kaggle.recipe import CameraSharing, SceneConfig
 from mkpc_kaggle.scene.align import align, read_reference
 from mkpc_kaggle.scene.choose import Choice, Reason, choose, estimate_at_known_focals
+from mkpc_kaggle.scene.keypoints import MergedGraph
 from mkpc_kaggle.scene.reconstruction import MIN_IMAGES, Reconstruction, SfmModel
 from mkpc_kaggle.scene.shared_intrinsics import (
     SharedIntrinsics,
@@ -82,10 +83,10 @@ def reconstruct_sharing(
     """
     graph = graph.with_intrinsics(read_intrinsics(config.intrinsics))
     if directory is None:
-        parts = graph.components()
+        parts = tuple(map(MergedGraph, graph.components()))
         make = partial(reconstruct_component, config=config)
     else:
-        parts = (graph.strong,)
+        parts = (MergedGraph(graph.strong),)
         make = partial(reconstruct_connected, config=config)
     free = [image for image in graph.images if image.digest not in graph.known]
     given = shared = given_intrinsics(free, config)
@@ -101,7 +102,7 @@ def reconstruct_sharing(
         from mkpc_kaggle.scene.colmap import write_files
 
         found = align(found, read_reference(directory))
-        write_files(directory, graph.strong, shared, models_of(found), config.camera_model)
+        write_files(directory, parts[0], shared, models_of(found), config.camera_model)
     if given:
         focals = {
             each.image.size: each.focal
@@ -113,9 +114,10 @@ def reconstruct_sharing(
 
 
 def reconstruct_component(
-    graph: ViewGraph, shared: SharedIntrinsics, config: SceneConfig
+    merged: MergedGraph, shared: SharedIntrinsics, config: SceneConfig
 ) -> Reconstruction:
     """Return the reconstruction of a connected graph, or the reason for its failure."""
+    graph = merged.graph
     images, pairs = len(graph.images), len(graph.edges)
     if images < MIN_IMAGES:
         return Reconstruction(
@@ -127,21 +129,22 @@ def reconstruct_component(
             f"{math.ceil(MIN_PAIRS_PER_IMAGE * images)}; more overlapping images would help"
         )
         return Reconstruction(graph.names, failure=few)
-    return reconstruct_connected(graph, shared, config)
+    return reconstruct_connected(merged, shared, config)
 
 
 def reconstruct_connected(
-    graph: ViewGraph, shared: SharedIntrinsics, config: SceneConfig
+    merged: MergedGraph, shared: SharedIntrinsics, config: SceneConfig
 ) -> Reconstruction:
     """Return pycolmap's reconstruction of a graph, or the reason for its failure."""
+    names = merged.graph.names
     try:
         from mkpc_kaggle.scene.colmap import structure_from_motion
 
-        return structure_from_motion(graph, shared, config)
+        return structure_from_motion(merged, shared, config)
     except ImportError as error:
-        return Reconstruction(graph.names, failure=f"pycolmap cannot be imported: {error}")
+        return Reconstruction(names, failure=f"pycolmap cannot be imported: {error}")
     except (RuntimeError, ValueError) as error:
-        return Reconstruction(graph.names, failure=f"pycolmap failed: {error}")
+        return Reconstruction(names, failure=f"pycolmap failed: {error}")
 
 
 def models_of(reconstructions: Sequence[Reconstruction]) -> tuple[SfmModel, ...]:

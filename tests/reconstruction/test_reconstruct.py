@@ -32,6 +32,7 @@ from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.session import Interrupt, Session
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.matchers.adapters.sift import SiftMatcher, SiftOptions
 from mkpc_kaggle.pipeline import pair
 from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.recipe import Recipe, Unit
@@ -162,6 +163,21 @@ def test_a_notebook_shows_the_results_with_and_without_their_images(mixed):
     write_images(out, sorted(root.iterdir()))
     assert tables.show().page.count("data:image/jpeg") == 10
     assert "iframe" in tables.show()._repr_html_()
+
+
+@pytest.mark.parametrize(
+    ("name", "more", "units"),
+    [
+        ("auto", {}, ["1:sift@1536"]),
+        ("classical", {}, ["1:sift@1536", "2:sift@1440", "1:sift@1280"]),
+        ("auto", {"loma": SiftMatcher(SiftOptions(), "cpu")}, None),
+    ],
+)
+def test_without_weights_one_unit_of_rootsift_runs(nowhere_else, name, more, units):
+    """A recipe that the user names, and one with other matchers, runs as it is written."""
+    recipe = assemble(name, device="cpu", matchers=more).recipe
+    kept = [unit.name for unit in for_cameras(recipe).units]
+    assert kept == (units or [unit.name for unit in recipe.units])
 
 
 ORIENTATIONS = (1, 6, 8, 3, 6, 1)  # of the images of a phone, by EXIF

@@ -13,6 +13,7 @@ from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.recipe import Recipe, SceneConfig, Unit
 from mkpc_kaggle.reconstruction.run import for_cameras
 from mkpc_kaggle.scene.colmap import write_files
+from mkpc_kaggle.scene.keypoints import MergedGraph
 from mkpc_kaggle.scene.reconstruct import reconstruct_batch, reconstruct_sharing
 from mkpc_kaggle.scene.shared_intrinsics import given_intrinsics
 from mkpc_kaggle.scene.view_graph import BatchImage, ViewGraph
@@ -33,7 +34,7 @@ def config(cameras: str) -> SceneConfig:
 def focals_of(directory: Path, settings: SceneConfig) -> list[float]:
     """The focal length that each image's camera starts with, and the number of cameras."""
     graph = ViewGraph((*IMAGES, TALL), ())
-    write_files(directory, graph, given_intrinsics(graph.images, settings), [])
+    write_files(directory, MergedGraph(graph), given_intrinsics(graph.images, settings), [])
     with pycolmap.Database.open(str(directory / "database.db")) as database:
         known = {camera.camera_id: camera.focal_length for camera in database.read_all_cameras()}
         return [*(known[image.camera_id] for image in database.read_all_images()), len(known)]

@@ -3,8 +3,12 @@ there is none.
 """
 
 import pickle
+import sqlite3
 import sys
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -21,7 +25,7 @@ from benchmarks.synthetic_scene import (
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import RobustConfig
-from mkpc_kaggle.recipe import SceneConfig
+from mkpc_kaggle.recipe import CameraSharing, SceneConfig
 from mkpc_kaggle.scene import colmap
 from mkpc_kaggle.scene.choose import Reason
 from mkpc_kaggle.scene.reconstruct import Solution, reconstruct_batch
@@ -180,3 +184,26 @@ def test_a_missing_or_broken_pycolmap_is_a_reason(scene, monkeypatch, is_missing
     told = "pycolmap cannot be imported" if is_missing else "pycolmap failed: disk I/O error"
     assert told in solution.reconstructions[0].failure
     assert {choice.reason for choice in solution.choices} == {Reason.UNREGISTERED}
+
+
+def test_an_edge_is_verified_once_for_the_same_cameras_on_any_number_of_threads(
+    scene, monkeypatch, tmp_path
+):
+    calls = []
+    estimate = colmap.pycolmap.estimate_two_view_geometry
+
+    def counted(*arguments: object) -> object:
+        calls.append(arguments)
+        return estimate(*arguments)
+
+    monkeypatch.setattr(colmap.pycolmap, "estimate_two_view_geometry", counted)
+    written = []
+    for threads in (1, 4):
+        monkeypatch.setattr(colmap, "ThreadPoolExecutor", partial(ThreadPoolExecutor, threads))
+        calls.clear()
+        out = tmp_path / str(threads)
+        reconstruct_batch(scene.pairs, SceneConfig(cameras=CameraSharing.IMAGE), export=out)
+        assert len(calls) == len(scene.pairs)
+        with closing(sqlite3.connect(out / "database.db")) as database:
+            written.append([*database.iterdump()])
+    assert written[0] == written[1]
