@@ -10,6 +10,8 @@ alternate in one process. The ratio of CPU seconds is the result: seconds alone 
 machine.
 
 *Complete* runs all layers on all keypoints; *early* has the published early stopping and pruning.
+One pair runs before the measured ones: a first call prepares a library's kernels. Set
+``THP_MEM_ALLOC_ENABLE=1``, as workers do.
 """
 
 import argparse
@@ -17,6 +19,7 @@ import sys
 import time
 from collections import defaultdict
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -28,7 +31,7 @@ from kornia.feature import ALIKED
 from torch import Tensor, nn
 
 from mkpc_kaggle.config import from_table
-from mkpc_kaggle.data.competition import read_train_side
+from mkpc_kaggle.data.competition import Pair, read_train_side
 from mkpc_kaggle.data.images import Image, read_image
 from mkpc_kaggle.geometry.coordinates import Box, View
 from mkpc_kaggle.matchers.contract import Picture, Placement
@@ -56,16 +59,65 @@ EARLY = {
 }
 
 
-class Times:
-    """CPU seconds of this process by row and side."""
+class Record:
+    """What was measured: CPU seconds of this process by row and side, and shares of equal results by
+    row.
+    """
 
     def __init__(self) -> None:
         self.seconds: dict[tuple[str, str], float] = defaultdict(float)
+        self.equal: dict[str, list[float]] = defaultdict(list)
 
     def run(self, row: str, side: str, call: Callable[[], Any]) -> Any:
         start = time.process_time()
         found = call()
         self.seconds[row, side] += time.process_time() - start
+        return found
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A matcher of ours and the published networks, each *complete* and *early*.
+
+    ``aliked`` is kornia's network, beside which our ALIKED is measured; ``None`` for XFeat.
+    """
+
+    matcher: str
+    ours: dict[str, Any]
+    theirs: dict[str, nn.Module]
+    aliked: nn.Module | None
+
+    @classmethod
+    def load(cls, matcher: str, weights: WeightStore, make: type[nn.Module]) -> "Comparison":
+        settings = {"complete": COMPLETE, "early": EARLY[matcher]}
+        slot = spec_of(matcher, "benchmark").slots[-1]
+        theirs = {
+            kind: published_glue(make, weights, slot, SHAPES[matcher] | of_kind)
+            for kind, of_kind in settings.items()
+        }
+        ours = {kind: loaded(matcher, weights, of_kind) for kind, of_kind in settings.items()}
+        aliked = kornias_aliked(weights) if matcher == "aliked_lightglue" else None
+        return cls(matcher, ours, theirs, aliked)
+
+    def measure(self, pair: Pair, record: Record) -> None:
+        first, second = (self.encoded(picture_of(path), record) for path in pair.images)
+        data = {"image0": glue_input(first), "image1": glue_input(second)}
+        for kind, ours in self.ours.items():
+            row = f"{self.matcher}, {kind}"
+            (own,) = record.run(row, "ours", partial(ours.match, [first], [second]))
+            published = record.run(row, "theirs", partial(self.theirs[kind], data))
+            record.equal[row].append(same_matches(own, published, (first, second)))
+
+    def encoded(self, picture: Picture, record: Record) -> Keypoints:
+        """Return a picture's keypoints by our encoder."""
+        encoder = self.ours["early"]
+        if self.aliked is None:
+            (found,) = encoder.encode([picture])
+            return found
+        (found,) = record.run("aliked", "ours", partial(encoder.encode, [picture]))
+        batch = image_batch([picture], "cpu")
+        (other,) = record.run("aliked", "theirs", partial(self.aliked, batch))
+        record.equal["aliked"].append(same_points(found.points, other.keypoints))
         return found
 
 
@@ -146,34 +198,19 @@ def main() -> None:
     store = WeightStore([given.weights])
     name, make = original_lightglue()
     (scene,) = read_train_side(given.train_dir, scenes=[given.scene], pairs_per_scene=given.pairs)
-    times = Times()
-    equal: dict[str, list[float]] = defaultdict(list)
+    record = Record()
     with torch.inference_mode():
-        aliked = kornias_aliked(store)
-        for matcher, shape in SHAPES.items():
-            slot = spec_of(matcher, "benchmark").slots[-1]
-            settings = {"complete": COMPLETE, "early": EARLY[matcher]}
-            theirs = {
-                kind: published_glue(make, store, slot, shape | of_kind)
-                for kind, of_kind in settings.items()
-            }
-            ours = {kind: loaded(matcher, store, of_kind) for kind, of_kind in settings.items()}
+        for matcher in SHAPES:
+            comparison = Comparison.load(matcher, store, make)
+            comparison.measure(scene.pairs[0].pair, Record())
             for true in scene.pairs:
-                first, second = (
-                    encoded(matcher, ours["early"], path, aliked, times, equal)
-                    for path in true.pair.images
-                )
-                data = {"image0": glue_input(first), "image1": glue_input(second)}
-                for kind in settings:
-                    row = f"{matcher}, {kind}"
-                    (own,) = times.run(row, "ours", partial(ours[kind].match, [first], [second]))
-                    published = times.run(row, "theirs", partial(theirs[kind], data))
-                    equal[row].append(same_matches(own, published, (first, second)))
+                comparison.measure(true.pair, record)
     print(f"{len(scene.pairs)} pairs of {given.scene}, one thread, 2,048 keypoints a picture\n")
     print("| | beside | CPU s, theirs | CPU s, ours | ratio | equal |")
     print("| --- | --- | --- | --- | --- | --- |")
-    for row, shares in equal.items():
-        own, other = times.seconds[row, "ours"], times.seconds[row, "theirs"]
+    for row, shares in record.equal.items():
+        own = record.seconds[row, "ours"]
+        other = record.seconds[row, "theirs"]
         count = len(shares)
         beside = "kornia" if row == "aliked" else name
         print(
@@ -185,26 +222,6 @@ def main() -> None:
 def loaded(matcher: str, store: WeightStore, settings: dict[str, float]) -> Any:
     options = from_table(spec_of(matcher, "benchmark").options, settings, "benchmark")
     return load_matcher(matcher, store, options, Placement())
-
-
-def encoded(
-    matcher: str,
-    ours: Any,
-    path: Path,
-    aliked: nn.Module,
-    times: Times,
-    equal: dict[str, list[float]],
-) -> Keypoints:
-    """Return a picture's keypoints by our encoder; measure ALIKED's beside kornia's."""
-    picture = picture_of(path)
-    if matcher != "aliked_lightglue":
-        (found,) = ours.encode([picture])
-    else:
-        (found,) = times.run("aliked", "ours", lambda: ours.encode([picture]))
-        batch = image_batch([picture], "cpu")
-        (other,) = times.run("aliked", "theirs", lambda: aliked(batch))
-        equal["aliked"].append(same_points(found.points, other.keypoints))
-    return found
 
 
 if __name__ == "__main__":
