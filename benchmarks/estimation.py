@@ -2,7 +2,7 @@
 matches.
 
 python -m benchmarks.estimation --train-dir DIR --journals DIR [DIR ...] [--scenes NAME ...]
-    [--estimates NAME ...] [--thresholds PIXELS ...] [--settings TOML ...]
+    [--estimates NAME ...] [--thresholds PIXELS ...] [--settings TOML ...] [--units A,B ...]
     [--images 18 24] [--shares 1 0.3 0.12] [--seeds 8]
 
 Journals, the work directories of `validate`, provide the matches and each pair's own F. A journal made with
@@ -12,8 +12,10 @@ The unit of evidence is a draw: some or all images of a scene, and a share of th
 output has a table for each journal and share. Each row has an estimate's mAA by scene, gain over
 the first estimate, and CPU seconds per pair or batch. Intervals resample images if each scene has
 one draw, and draws otherwise; the mean's interval then also resamples scenes. ``--settings`` gives
-a row for each line of a recipe's table [scene], such as "cameras = 'image'". ``--thresholds``
-replaces the rows by two rows for each threshold of MAGSAC.
+a row for each line of a recipe's table [scene], such as "cameras = 'image'". ``--units`` gives a
+row for each choice of the journal's units, such as ``1:sift@1536,1:aliked_lightglue@1024-``; a unit
+with a minus connects images but makes no tracks. F of a pair is then estimated anew, from these
+units. ``--thresholds`` replaces the rows by two rows for each threshold of MAGSAC.
 """
 
 import argparse
@@ -99,6 +101,28 @@ PAIR_ESTIMATORS: dict[str, Estimator] = {
     "prior": by_pair(with_prior),
     OWN: lambda pairs, _: [pair.F for pair in pairs],
 }
+
+
+def with_units(known: Known, choice: str) -> Known:
+    """Return the pair with the results of the chosen units, in their order, and F from them.
+
+    Raises :class:`KeyError` for a unit that the journal does not have.
+    """
+    by_name = {result.unit.name: result for result in known.found.results}
+    results = []
+    for name in choice.split(","):
+        result = by_name[name.removesuffix("-")]
+        makes_tracks = result.unit.tracks and not name.endswith("-")
+        results.append(replace(result, unit=replace(result.unit, tracks=makes_tracks)))
+    found = replace(known.found, results=tuple(results))
+    made = with_prior(found)
+    return Known(known.true, found, made.matrix if made.ok else None)
+
+
+def of_units(choice: str, make: Estimator) -> Estimator:
+    """Return the estimator on the matches of the chosen units."""
+    chosen = cache(partial(with_units, choice=choice))
+    return lambda pairs, every: make([*map(chosen, pairs)], [*map(chosen, every)])
 
 
 def by_scene(settings: str, pairs: Sequence[Known], every: Sequence[Known]) -> list[Matrix3 | None]:
@@ -256,6 +280,7 @@ def main() -> None:
     names = [*PAIR_ESTIMATORS, SCENE]
     parser.add_argument("--estimates", nargs="+", choices=names, default=names)
     parser.add_argument("--settings", nargs="+", default=[""], metavar="TOML")
+    parser.add_argument("--units", nargs="+", default=(), metavar="A,B")
     arguments = parser.parse_args()
     estimators = {name: PAIR_ESTIMATORS[name] for name in arguments.estimates if name != SCENE}
     if arguments.thresholds:
@@ -268,6 +293,12 @@ def main() -> None:
         settings = arguments.settings
         estimators |= {
             f"{SCENE}, {line}" if line else SCENE: partial(by_scene, line) for line in settings
+        }
+    if arguments.units:
+        estimators = {
+            f"{name}, {choice}": of_units(choice, make)
+            for name, make in estimators.items()
+            for choice in arguments.units
         }
     compare(estimators, arguments)
 

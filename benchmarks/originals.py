@@ -140,7 +140,8 @@ def published_glue(
 ) -> nn.Module:
     """Return the published network with the weights of a slot."""
     tensors = {layer_name(name): tensor for name, tensor in weights.load(slot).items()}
-    glue = make(None, flash=False, **settings).eval()
+    # As published. It would switch off PyTorch's fast attention for the whole process with flash=False.
+    glue = make(None, flash=True, **settings).eval()
     # Surplus entries are allowed: LighterGlue's file also has the extractor that it was trained with.
     missing, _ = glue.load_state_dict(tensors, strict=False)
     assert set(missing) <= {"confidence_thresholds"}, missing

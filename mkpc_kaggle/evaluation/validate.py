@@ -6,7 +6,7 @@ LoFTR.
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import astuple, dataclass, field, replace
 from enum import StrEnum
 from math import isfinite, nan
 from pathlib import Path
@@ -358,5 +358,8 @@ def _pair_json(pair: PairScore) -> dict[str, Any]:
     if (record := pair.record) is not None:
         values |= {"failure": record.failure, "inliers": record.inliers}
         values["matches"] = {unit.unit: unit.matches for unit in record.units}
-        values["regions"] = [str(region.reason) for region in record.regions or ()]
+        regions = record.regions or ()
+        values["regions"] = [str(region.reason) for region in regions]
+        # Left, top, right, bottom, in pixels of the image.
+        values["boxes"] = [astuple(region.box) for region in regions]
     return values

@@ -1,9 +1,10 @@
+import json
 import pickle
 import re
 import sqlite3
 import zipfile
 from contextlib import closing
-from dataclasses import replace
+from dataclasses import astuple, replace
 from pathlib import Path
 
 import cv2
@@ -300,8 +301,10 @@ def test_regions_of_ones_own_take_the_place_of_mkpcs(demo, scenes, small_recipe,
     table(f"{','.join(one.read_text().split()[:2])},{cells}")(tmp_path / "regions.csv")
     command = ["validate", "--workers", 0, *listed(one, demo.train_dir, small_recipe)]
     given = ["--regions", tmp_path / "regions.csv"]
+    scores = tmp_path / "scores.json"
     for options, rows in ((given, 2), ([], 3), (given, 3)):
-        assert run_command(*command, "--work-dir", tmp_path / "run", *options) == 0
+        run_options = ["--work-dir", tmp_path / "run", "--json", scores, *options]
+        assert run_command(*command, *run_options) == 0
         with Store.read(tmp_path / "run") as store:
             (record,), found = read_records(store), matches_of(store, 0)
         assert ([region.box for region in record.regions] == [*boxes]) == bool(options)
@@ -312,3 +315,5 @@ def test_regions_of_ones_own_take_the_place_of_mkpcs(demo, scenes, small_recipe,
             count = "SELECT count(*) FROM result WHERE kind = 'points'"
             assert database.execute(count).fetchone() == (rows,)  # other regions, others
     np.testing.assert_array_equal(found.points0, match.matches.points0)
+    (scored,) = json.loads(scores.read_text())["scenes"][0]["pairs"]
+    assert scored["boxes"] == [list(astuple(box)) for box in boxes]
