@@ -16,11 +16,11 @@ from pathlib import Path
 import numpy as np
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine.loop import batches_of
-from mkpc_kaggle.engine.records import IMAGE
+from mkpc_kaggle.engine.image_files import stored_digests
 from mkpc_kaggle.engine.request import Request
+from mkpc_kaggle.engine.restore import restore
 from mkpc_kaggle.engine.state import State
-from mkpc_kaggle.engine.store import Kind, Store
+from mkpc_kaggle.engine.store import Store
 from mkpc_kaggle.geometry.matches import Matches
 from tests.support import simulator
 from tests.support.simulator import Scenario, simulate
@@ -66,12 +66,8 @@ def restored(scenario: Scenario, store: Store) -> State:
     """Return the state that a resumed run of the scenario starts with."""
     share = max(1, scenario.batches) / scenario.pairs
     pairs = [Pair(str(n), f"{int(n * share):03d}", f"{n:07d}", "b") for n in range(scenario.pairs)]
-    state = State(Request(pairs, scenario.recipe, scenario.keys), [], batches_of(pairs))
-    known = store.of_kind(Kind.IMAGE)
-    digests = {
-        key.removeprefix(IMAGE): known[key]["digest"] for key in known if key.startswith(IMAGE)
-    }
-    state.restore(store, digests)
+    state = State(Request(pairs, scenario.recipe, scenario.keys))
+    restore(state, store, stored_digests(store, [name for names in state.names for name in names]))
     return state
 
 

@@ -14,16 +14,22 @@ from numpy.typing import NDArray
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.recipe import Unit
 
-SUMMARY_FACTOR = 5  # a report may take this many times as long as writing the submission
-WRITE_MARGIN = 1.5  # the next write may take this many times as long as the median of the latest
+# The final report may take five times as long as writing the submission.
+SUMMARY_FACTOR = 5
+# The next write may take 1.5 times the median of the latest writes.
+WRITE_MARGIN = 1.5
 MAX_WRITE_SHARE = 0.05  # maximum share of the limit for the forecast of a write
-# Of a worker; the share is of the limit
+# Silence of a worker; the share is of the limit.
 MAX_SILENCE_S, MIN_SILENCE_S, SILENCE_SHARE = 60.0, 5.0, 0.02
-WINDOW = 64  # number of latest measurements in the mean
-MARGIN, MIN_MARGIN = 0.4, 0.01  # of a forecast from one measurement; sqrt(n) times smaller from n
+# Number of the latest measurements in the mean: costs drift when a GPU heats up or a disk is shared.
+WINDOW = 64
+# Margin of a forecast from one measurement, sqrt(n) times smaller from n measurements.
+MARGIN, MIN_MARGIN = 0.4, 0.01
 SCENE_START_S = 3.0  # start-up time of a scene's process
-SCENE_MATCH_S = 5e-4  # per match of a reconstruction: initial forecast, and lower bound for a hang
-SCENE_MARGIN = 1.5  # factor on a forecast from earlier scenes' matches
+# Per match of a reconstruction: the initial forecast, and a lower bound for the limit of a hang.
+SCENE_MATCH_S = 5e-4
+# Factor on a forecast from earlier scenes: their time depends on more than their matches.
+SCENE_MARGIN = 1.5
 ESTIMATE = "estimate"  # the name of the cost of an estimate
 MAX_STEP_BACK_S = 60.0  # of the wall clock, between --started-at and the start
 
@@ -64,6 +70,7 @@ class Budget:
     started: float
     time_limit: float = inf
     clock: Callable[[], float] = time.monotonic
+    # Five, so that the median ignores two slow writes
     _writes: deque[float] = field(default_factory=lambda: deque(maxlen=5))
 
     def note_write(self, seconds: float) -> None:
@@ -80,12 +87,16 @@ class Budget:
     @property
     def reserve(self) -> float:
         """Seconds at the end in which no unit runs."""
+        # At least 1.5 s for the ends of processes, even in runs of a minute.
         return min(max(1.5, 0.005 * self.time_limit), 60.0)
 
     @property
     def silence(self) -> float:
         """Seconds beyond the expected time after which a silent worker counts as hung."""
         return min(MAX_SILENCE_S, max(MIN_SILENCE_S, SILENCE_SHARE * self.time_limit))
+
+    # Backwards from the limit: half of the reserve for the last answers, a quarter for the report, a
+    # quarter for the last version; the measured writes are added.
 
     @property
     def stop_units(self) -> float:
@@ -119,8 +130,14 @@ class Costs:
     """
 
     def __init__(self) -> None:
+        self.forget()
+
+    def forget(self) -> None:
+        """Forget all measurements: another device takes over."""
         self._measured: dict[str, deque[float]] = {}
-        self._means: dict[str, float] = {}  # of the latest measurements
+        # Of the latest measurements, since a mean of 64 values for each plan would take longer than
+        # the plan.
+        self._means: dict[str, float] = {}
         self._warm_up: dict[str, float] = {}
         self._scene_seconds = 0.0  # of this run's scenes, without their start
         self._scene_matches = 0
@@ -156,7 +173,8 @@ class Costs:
         self._scene_matches += matches
 
     def scenes(self, matches: NDArray[np.int_]) -> NDArray[np.float64]:
-        """Return the seconds that scenes with so many matches will probably take, each alone."""
+        """Return the expected seconds of scenes with these numbers of matches, each alone."""
+        # The matches of all scenes together, because small ones are mostly start-up time.
         rate = SCENE_MATCH_S
         if self._scene_matches:
             rate = SCENE_MARGIN * self._scene_seconds / self._scene_matches

@@ -26,7 +26,7 @@ from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.version import __version__
 
 FORMS = "a number of processes, ray (this machine's cluster, or a new one for this run), ray://HOST:PORT"
-REACH_TIMEOUT_S = 5.0
+REACH_TIMEOUT_S = 5.0  # for a head node to accept a connection
 
 
 def parse_workers(text: str) -> int | str:
@@ -64,15 +64,15 @@ class RaySite(Site):
         except ModuleNotFoundError as error:
             told = '--workers ray needs Ray, which is not installed: pip install "mkpc-kaggle[ray]"'
             raise UserError(told) from error
-        self._ray, self._has_joined = ray, False
-        self._assembly, self._cluster, self._needed = (
-            assembly,
-            cluster,
-            (*assembly.weight_paths, *folders),
-        )
+        self._ray = ray
+        self._has_joined = False
+        self._assembly = assembly
+        self._cluster = cluster
+        self._needed = (*assembly.weight_paths, *folders)
         self._workers: list[RayWorker] = []
 
     def open(self) -> None:
+        # A program that has joined a cluster itself keeps it after the run.
         self._has_joined = not self._ray.is_initialized()
         if self._has_joined:
             join(self._ray, self._cluster)
@@ -82,8 +82,7 @@ class RaySite(Site):
             if node["Alive"] and node["Resources"].get("CPU", 0) >= 1
         ]
         gpus = sum(int(node["Resources"].get("GPU", 0)) for node in machines)
-        # This machine is one of the cluster's: scenes beside its actors get the cores that these
-        # leave.
+        # This machine belongs to the cluster, so scenes get only the cores that its actors leave.
         self.matching_cores = self._cores
         if gpus and self._assembly.device != "cpu":
             self.matching_cores = gpus
@@ -108,10 +107,12 @@ class RaySite(Site):
 
     def _add(self, name: str, make: Maker, **where: float) -> None:
         """Add a place for workers that need these resources of Ray."""
+        # Checked on the machine, since other versions or files would give other results silently.
         make = partial(make_alike, make, __version__, self._needed)
 
         def worker() -> RayWorker:
             self._workers.append(
+                # Ray reserves a CPU for each actor by default, also for an actor with a GPU.
                 RayWorker(name, make, self.ring, self._ray, {"num_cpus": 0, **where})
             )
             return self._workers[-1]

@@ -1,5 +1,4 @@
-"""The only module that prints during a run: lines, warnings, progress. Printing never raises or
-blocks the run.
+"""The only module that prints during a run: lines, warnings, progress. Printing never raises or blocks the run.
 
 A pipe without a reader or a stopped terminal (Ctrl-S) blocks a write forever, and with it every
 thread that waits for the stream's lock. A lost terminal (EIO), a full disk or a closed stream makes
@@ -27,27 +26,30 @@ from typing import Any, NoReturn, TextIO
 
 from mkpc_kaggle.engine.budget import Budget, format_duration
 
-LINE_INTERVAL_S = 30.0  # between lines of progress if a line cannot be redrawn in place
+# Between lines of progress, where a line cannot be redrawn in place.
+LINE_INTERVAL_S = 30.0
+BAR = "{desc}: {n_fmt}/{total_fmt} [{elapsed}<{remaining}, {pace}]"  # of tqdm
 MAX_WAITING = 1000  # writes, which a busy progress line makes in a few minutes
-MAX_NATIVE_BYTES = 4096  # printed at the end, of what native libraries wrote
+# Of the text of native libraries, printed at the end: a warning for each photograph would hide the rest.
+MAX_NATIVE_BYTES = 4096
 RETRY_S = 0.05  # between looks at a descriptor that accepts no text
 DRAIN_S = 2.0  # maximum wait at the end for the remaining text to be printed
-BAR = "{desc}: {n_fmt}/{total_fmt} [{elapsed}<{remaining}, {pace}]"
 
 
 def say(text: str) -> None:
-    _print(text, sys.stdout)
+    print_to(sys.stdout, text)
 
 
 def warn(text: str) -> None:
-    _print(f"warning: {text}", sys.stderr)
+    print_to(sys.stderr, f"warning: {text}")
 
 
 def complain(text: str) -> None:
-    _print(f"error: {text}", sys.stderr)
+    print_to(sys.stderr, f"error: {text}")
 
 
-def _print(text: str, stream: TextIO | None, end: str = "\n") -> None:
+def print_to(stream: TextIO | None, text: str, end: str = "\n") -> None:
+    """Print a text if that is possible; ``None`` is no stream."""
     with suppress(OSError, ValueError):  # lost terminal, full disk, or closed stream
         if stream is not None:
             print(text, file=stream, flush=True, end=end)
@@ -65,7 +67,7 @@ class Progress:
         self._budget = budget
         self._stream = stream
         is_redrawn = is_terminal(stream) and "JPY_PARENT_PID" not in os.environ
-        self._erase = "\r\x1b[K" if is_redrawn else ""
+        self._erase = "\r\x1b[K" if is_redrawn else ""  # to the line's start, and clear it
         self._phase = ""
         self._line = ""
         self._first = 0  # pairs that were done when the phase began
@@ -85,17 +87,19 @@ class Progress:
             self._began = now
         self._line = self._text(done, total, now)
         if self._erase:
+            # A wrapped line could not be erased; the width may change during the run.
             width = shutil.get_terminal_size().columns
-            _print(self._erase + self._line[: width - 1], self._stream, end="")
+            print_to(self._stream, self._erase + self._line[: width - 1], end="")
         elif is_new or now - self._written >= LINE_INTERVAL_S:
             self.close()
 
     def _text(self, done: int, total: int, now: float) -> str:
         """Return text such as ``sweep: 84/304 [02:10<05:40, 1.5 s/pair]``."""
-        from tqdm import tqdm
+        from tqdm import tqdm  # commands without a run do not need it
 
         seconds = now - self._began
         count = done - self._first
+        # Resumed pairs say nothing about the pace.
         pace = f"{seconds / count:.2g} s/pair" if count and seconds else "? s/pair"
         text: str = tqdm.format_meter(
             done,
@@ -104,20 +108,20 @@ class Progress:
             rate=count / seconds if count and seconds else None,
             prefix=str(self._phase),
             bar_format=BAR,
-            pace=pace,  # type: ignore[call-arg]  # a value for the format, which the stubs lack
+            pace=pace,  # type: ignore[call-arg]  # a value for the format; missing in the stubs
         )
         if isfinite(self._budget.time_limit):
             text += f", budget left {format_duration(self._budget.left())}"
         return text
 
     def note(self, text: str) -> None:
-        _print(self._erase + text, self._stream)
+        print_to(self._stream, self._erase + text)
         self._line = "" if self._erase else self._line
 
     def close(self) -> None:
         """End the redrawn line on a terminal, or print the pending line elsewhere."""
         if self._line:
-            _print("" if self._erase else self._line, self._stream)
+            print_to(self._stream, "" if self._erase else self._line)
             self._line = ""
             self._written = self._budget.clock()
 
@@ -133,7 +137,7 @@ class Printer:
         self._thread.start()
 
     def put(self, descriptor: int, data: bytes) -> None:
-        with suppress(queue.Full):
+        with suppress(queue.Full):  # without a reader for minutes
             self._waiting.put_nowait((descriptor, data))
 
     def drain(self, until: float) -> bool:
@@ -147,6 +151,7 @@ class Printer:
         return True
 
     def _print(self) -> None:
+        # By descriptor, because stdout and stderr may have different readers.
         pending: dict[int, deque[bytes]] = {}
         while True:
             with suppress(queue.Empty):
@@ -167,6 +172,7 @@ class Printer:
             rest = b""
             if len(texts) < MAX_WAITING:  # else the oldest text is dropped
                 with suppress(OSError):  # lost terminal, or full disk
+                    # A pipe that accepts text has room for PIPE_BUF bytes, and perhaps not for more.
                     rest = data[os.write(descriptor, data[: select.PIPE_BUF]) :]
             if rest:
                 texts.appendleft(rest)
@@ -224,12 +230,13 @@ def unblocked(descriptors: Sequence[int] = (1, 2)) -> Iterator[None]:
                 continue
             _printer = _printer or Printer()
             stream.flush()
-            sink = os.dup(number)
+            sink = os.dup(number)  # the stream's file, once its number is taken by the other
             raw = io.BufferedWriter(Queued(sink, _printer))
             queued = io.TextIOWrapper(
                 raw, stream.encoding, stream.errors, write_through=True, line_buffering=True
             )
             setattr(sys, name, queued)
+            # From here on, native libraries write to a file, which never blocks.
             file = ended.enter_context(TemporaryFile())
             os.dup2(file.fileno(), number)
             _native.append(number)
@@ -293,6 +300,7 @@ def drain(seconds: float = DRAIN_S) -> None:
             _printer.drain(until)
 
     until = time.monotonic() + seconds
+    # In a thread, because flushing a blocked stream waits for its lock.
     thread = threading.Thread(target=flush, name="flush", daemon=True)
     thread.start()
     thread.join(seconds)
@@ -302,6 +310,7 @@ def leave(status: int, seconds: float = DRAIN_S) -> NoReturn:
     """End the process and its children, even if stopped (SIGSTOP). Print remaining text for up to
     ``seconds``.
     """
+    # SIGKILL also ends stopped children, which would hold the terminal.
     for child in multiprocessing.active_children():
         child.kill()
     drain(seconds)

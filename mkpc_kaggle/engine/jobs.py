@@ -1,5 +1,7 @@
-"""Messages between the loop and its workers: four kinds of jobs, their answers, failures, the
-memory of tries.
+"""Messages between the loop and its workers: four kinds of jobs, their answers, and failures.
+
+Messages are pickled, so none has a connection, a lock, or a large array that the worker can read
+itself.
 """
 
 from collections import Counter
@@ -18,16 +20,23 @@ from mkpc_kaggle.pipeline.pair import Regions, UnitResult
 from mkpc_kaggle.recipe import Recipe, Unit
 from mkpc_kaggle.scene.reconstruct import Solution
 
-MAX_TRIES = 2  # of an item in its own job
+# Of an item in its own job. One loss may have its cause elsewhere, such as short memory; a third try
+# would rarely help and costs a worker's start.
+MAX_TRIES = 2
 
 
 class Phase(IntEnum):
     """Priorities of matching, the most urgent first."""
 
-    SWEEP = 0  # the first unit on all pairs
-    CONNECT = 1  # the first unit on extra pairs of batches with few pairs
-    DEEPEN = 2  # the longest prefix of the recipe's units with enough time for all pairs
-    FILL = 3  # the remaining units, weakest pairs first
+    # The first unit on all pairs
+    SWEEP = 0
+    # The first unit on extra pairs, of batches with few pairs
+    CONNECT = 1
+    # The longest prefix of the recipe's units with enough time for all pairs
+    DEEPEN = 2
+    # The remaining units, weakest pairs first
+    FILL = 3
+    # The unit does not fit in the time left, or its points are already today's
     NEVER = 4
 
     def __str__(self) -> str:
@@ -50,6 +59,7 @@ class MatchJob:
     expected: tuple[float, ...]
     seconds: float
     is_retry: bool = False
+    # The schedule leaves the rest empty: :meth:`mkpc_kaggle.engine.matching.Matching.fill` adds it.
     pairs: tuple[Pair, ...] = ()
     names: tuple[tuple[str, str], ...] = ()
     known: tuple[tuple[UnitResult, ...], ...] = ()
@@ -67,6 +77,7 @@ class PairInputs:
     index: int
     images: Images
     points: Mapping[Unit, str]
+    # An E is estimated if both are known.
     intrinsics: tuple[Matrix3, Matrix3] | None = None
     own: Matrix3 | None = None
 
@@ -97,7 +108,8 @@ class SceneJob:
     source: Source
     matches: int = 0
     export: Path | None = None
-    is_retry: bool = True  # a crash of pycolmap counts against the batch, not against its place
+    # A crash of pycolmap counts against the batch, not against its place.
+    is_retry: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,6 +118,7 @@ class FeatureJob:
 
     key: str
     do: Callable[[], Any]
+    # An image that crashes its decoder counts against itself, not against the place.
     is_retry: bool = True
 
 
@@ -124,13 +137,12 @@ class Loaded:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """Result of a job on one pair. ``failure`` names an unreadable image.
+    """Result of a match job on one pair. ``failure`` names an unreadable image.
 
     ``images`` have the digests of the matched contents, and ``files`` the size in bytes and the time of change in
     nanoseconds of each file before it was read.
     """
 
-    index: int
     images: Images | tuple[()] = ()
     files: tuple[tuple[int, int], ...] = ()
     found: tuple[UnitResult, ...] = ()
@@ -144,7 +156,6 @@ class Outcome:
 class Estimated:
     """The estimate of a pair from the points with these keys; ``inliers`` has a count for each key."""
 
-    index: int
     points: tuple[str, ...]
     inliers: tuple[int, ...]
     F: Matrix3
@@ -186,7 +197,7 @@ class Failure:
         return f"{self.cause}: {self.message}" if self.message else str(self.cause)
 
 
-# The answer to a match job or an estimate job has a value for each pair, in order.
+# The answer to a match job or an estimate job has a value for each pair, in the order of the job.
 Answer = Loaded | tuple[Outcome, ...] | tuple[Estimated, ...] | Solution | Found | Failure
 
 
@@ -210,6 +221,7 @@ class Tries:
         up.
         """
         self.alone.update(items)
+        # With several items, the cause is unknown: no try is counted.
         if len(items) != 1:
             return False
         self._counts[items[0]] += 1
@@ -223,5 +235,6 @@ def visiting_order(pairs: Sequence[Pair]) -> list[int]:
     """Return pair indices in an order that puts pairs with a common image together, for encoding
     cache hits.
     """
+    # The group first: a batch that is finished early gets its scene early.
     keys = [(pair.group, pair.file0, pair.file1) for pair in pairs]
     return sorted(range(len(pairs)), key=keys.__getitem__)

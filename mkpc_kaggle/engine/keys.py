@@ -21,7 +21,8 @@ from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.pipeline.stages import GivenRegions
 from mkpc_kaggle.scene.view_graph import BatchImage
 
-# Versions of the algorithms.
+# Versions of the algorithms, each in the digests of its kind. With a wrong version, old results would
+# pass as today's, which no later check notices.
 POINTS = 2
 ESTIMATE = 3
 SCENE = 4
@@ -31,6 +32,7 @@ Images = tuple[BatchImage, BatchImage]
 
 def digest(value: Any) -> str:
     """Return the digest of a value of JSON types, as 32 hexadecimal digits."""
+    # Sorted, since the order of a TOML file's keys means nothing. Paths and enums are texts.
     text = json.dumps(value, sort_keys=True, default=str)
     return hashlib.blake2b(text.encode("utf-8", "backslashreplace"), digest_size=16).hexdigest()
 
@@ -60,10 +62,13 @@ class Keys:
     def of(cls, assembly: Assembly) -> "Keys":
         recipe = assembly.recipe
         units = tuple(digest([POINTS, assembly.unit_settings(unit)]) for unit in recipe.units)
+        # All settings of a table: a new setting changes the keys, which costs a rerun but no wrong result.
         magsac = asdict(recipe.magsac)
         focal = recipe.focal and asdict(recipe.focal)
+        # MAGSAC comes from OpenCV, and other versions of it may give another F.
         estimate = digest([ESTIMATE, magsac, focal, cv2.__version__])
         scene = recipe.scene and asdict(recipe.scene)
+        # The units that make tracks: a unit's points do not depend on it, but scenes do.
         tracks = [unit.name for unit in recipe.units if unit.tracks]
         return cls(
             units,
@@ -97,6 +102,7 @@ class Keys:
 
     def of_estimate(self, pair: Pair, points: Sequence[str]) -> str:
         """Return the key of a pair's estimate from its points, in the recipe's order."""
+        # As bytes, because a decimal text may not name each float exactly.
         known = [] if pair.intrinsics is None else [K.tobytes().hex() for K in pair.intrinsics]
         return text_digest([self.estimate, *known, "points", *points])
 
@@ -104,6 +110,7 @@ class Keys:
         """Return the key of a scene. Each input is a pair: names, digests, keys of its points and
         estimate.
         """
+        # Names count here: images with equal contents are one image of a scene, with one name.
         return digest([self.scene, inputs])
 
 

@@ -1,9 +1,9 @@
 """Places of workers. A place has one worker at a time, and is closed after it loses three workers
 in a row.
 
-What ends a hung worker: the loop sets :attr:`Place.limit` from measured costs
-(``Engine._time_limit``). By :meth:`Place.poll`, a worker that has not answered by then is killed:
-its process gets SIGKILL.
+A hung worker ends here: the loop sets :attr:`Place.limit` from measured costs
+(``Engine._time_limit``), and :meth:`Place.poll` kills a worker that has not answered by then. Its
+process gets SIGKILL.
 """
 
 import os
@@ -22,10 +22,12 @@ from mkpc_kaggle.engine.worker import Maker, MatchRunner, light_runner, scene_ru
 from mkpc_kaggle.pipeline.assembly import Assembly
 
 START_TIMEOUT_S = 300.0  # for a worker to load its matchers, which is slow from a network disk
-# Times the number of workers lost in a row; short memory may become free meanwhile
+# Times the number of workers lost in a row: scarce memory may become free meanwhile.
 RESTART_PAUSE_S = 1.0
-MAX_LOSSES = 3  # number of workers lost in a row, without an answer between, that closes a place
-LISTEN_S = 0.2  # interval between checks for an interrupt
+# A place is closed after this number of workers lost in a row, without an answer between.
+MAX_LOSSES = 3
+LISTEN_S = 0.2  # between checks for an interrupt, since a signal does not ring
+# An estimate takes a fraction of a pair's matching on a CPU; on a GPU, the other cores decode images.
 CORES_PER_ESTIMATOR = 4
 
 
@@ -54,7 +56,7 @@ class Place:
     losses: int = 0
     closed: str = ""
     since: float = 0.0
-    limit: float = -inf
+    limit: float = -inf  # in the past: a worker may start at once
 
     @property
     def is_idle(self) -> bool:
@@ -72,14 +74,17 @@ class Place:
 
     def start(self, now: float, timeout: float = START_TIMEOUT_S) -> None:
         """Start a worker. Its first answer says whether it is loaded."""
-        self.since, self.limit = now, now + timeout
+        self.since = now
+        self.limit = now + timeout
         self.worker = self.make()
         self.worker.start()
 
     def submit(self, job: Job, time_limit: float, now: float) -> None:
         """Hand a job to the idle worker."""
         assert self.worker is not None
-        self.job, self.since, self.limit = job, now, now + time_limit
+        self.job = job
+        self.since = now
+        self.limit = now + time_limit
         self.worker.submit(job)
 
     def poll(self, now: float) -> Answer | None:
@@ -88,12 +93,13 @@ class Place:
         """
         if self.worker is None:
             return None
+        # An answer counts even after the limit: its work is done.
         answer = self.worker.answer()
         if answer is None and now >= self.limit:
             answer = Failure(Cause.TIMED_OUT, f"no answer for {now - self.since:.0f} s")
         if answer is None:
             return None
-        self.limit = inf
+        self.limit = inf  # an idle worker may wait as long as it likes
         if isinstance(answer, Failure):
             self._fail(answer, now)
         elif isinstance(answer, Loaded):
@@ -105,7 +111,9 @@ class Place:
     def kill(self) -> None:
         if self.worker is not None:
             self.worker.kill()
-            self.worker, self.is_loaded, self.limit = None, False, -inf
+            self.worker = None
+            self.is_loaded = False
+            self.limit = -inf
 
     def _fail(self, failure: Failure, now: float) -> None:
         """End the worker, unless only its job failed.
@@ -114,6 +122,7 @@ class Place:
         of memory does not count against the place, nor does a death or a hang on a job that has
         already lost a worker.
         """
+        # The job is the suspect if it has lost a worker before.
         is_retry = (
             self.job is not None
             and self.job.is_retry
@@ -125,6 +134,7 @@ class Place:
                 return
         elif not is_retry:
             self.losses += 1
+            # A refusal is an answer of the configuration, which no other worker would change.
             if self.losses >= MAX_LOSSES or failure.cause is Cause.REFUSED:
                 self.closed = f"{self.name}: {failure}"
         self.kill()
@@ -145,10 +155,12 @@ class Site:
         self, clock: Callable[[], float], *, threads: bool = False, log: Path | None = None
     ) -> None:
         self._clock = clock
+        # One queue for all workers, so the loop waits for whichever answers first.
         self._bell: queue.SimpleQueue[None] = queue.SimpleQueue()
         self._worker = ThreadWorker if threads else ProcessWorker
         self._log = log
         self._cores = cores()
+        # In this process, a second thread would take its time from the thread that matches.
         estimators = 1 if threads else max(1, self._cores // CORES_PER_ESTIMATOR)
         make = partial(light_runner, in_process=not threads)
         self.places = [
@@ -167,14 +179,12 @@ class Site:
         return worker
 
     def scenes_at_a_time(self, *, is_matching: bool) -> int:
-        """Return for how many scenes there are cores: those that matching leaves free, at least
-        one.
-        """
+        """Return the number of cores for scenes: the ones that matching leaves free, at least one."""
         return max(1, self._cores - self.matching_cores * is_matching)
 
     def printed(self) -> Path | None:
         """Return the log file of the workers' output, if it is not empty."""
-        with suppress(OSError):
+        with suppress(OSError):  # it does not exist if nothing was printed
             if self._log is not None and self._log.stat().st_size:
                 return self._log
         return None

@@ -35,7 +35,7 @@ WORKER_ENVIRONMENT = {
     "GOMP_SPINCOUNT": "0",
     "THP_MEM_ALLOC_ENABLE": "1",
 }
-_environment = threading.Lock()
+_environment = threading.Lock()  # two threads may start processes at a time
 PR_SET_PDEATHSIG = 1  # of Linux's prctl
 EXIT_TIMEOUT_S = 5.0  # for a process to end after its pipe has closed
 
@@ -59,7 +59,7 @@ class ThreadWorker:
         self._executor = Executor()
         self._messages: queue.SimpleQueue[Message | None] = queue.SimpleQueue()
         self._answers: queue.SimpleQueue[Answer] = queue.SimpleQueue()
-        self._killed = False
+        self._killed = False  # it may be killed while its process is still starting
         self.thread = threading.Thread(target=self._live, name=name, daemon=True)
         self._messages.put(make)
 
@@ -107,6 +107,7 @@ class ProcessWorker(ThreadWorker):
 
     def _exchange(self, message: Message) -> Answer:
         """Return the answer to a message, or a :class:`Failure` that states how the process ended."""
+        # The first message starts the process, in this thread: a start takes seconds.
         if self._process is None:
             self._process, self._pipe = spawn(self.name, self.log)
             if self._killed:  # before the process existed
@@ -115,6 +116,7 @@ class ProcessWorker(ThreadWorker):
             self._pipe.send(message)
             answer: Answer = self._pipe.recv()
         except (EOFError, OSError):
+            # The pipe closes before the exit status exists.
             self._process.join(timeout=EXIT_TIMEOUT_S)
             self._pipe.close()
             code = self._process.exitcode
@@ -131,7 +133,7 @@ class ProcessWorker(ThreadWorker):
 
 
 def spawn(name: str, log: Path | None = None) -> tuple[SpawnProcess, Connection]:
-    """Start a process that serves the other end of the returned pipe. What it prints is appended to
+    """Start a process that serves the other end of the returned pipe. Its output is appended to
     ``log``.
 
     The new process has :data:`WORKER_ENVIRONMENT`, except variables that the user has set. This
@@ -139,6 +141,7 @@ def spawn(name: str, log: Path | None = None) -> tuple[SpawnProcess, Connection]
     ignores SIGTERM and Ctrl-C, which a terminal sends to all processes: the parent handles both
     signals and ends the process.
     """
+    # Not by fork: CUDA does not survive it, nor do locks that other threads hold.
     context = multiprocessing.get_context("spawn")
     pipe, its_pipe = context.Pipe()
     process = context.Process(target=serve, args=(its_pipe, log), name=name, daemon=True)
@@ -167,7 +170,8 @@ def serve(pipe: Connection, log: Path | None = None) -> None:
         return cast(Maker, pipe.recv())()  # unpickling may raise, which is an answer, too
 
     end_with_parent()
-    executor, message = Executor(), make
+    executor = Executor()
+    message = make  # the first; its result is the runner
     with suppress(EOFError, OSError):  # the parent has ended
         while True:
             pipe.send(executor.answer(message))

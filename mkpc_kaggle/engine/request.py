@@ -63,4 +63,4 @@ class RunReport:
     scenes: tuple[SceneRecord, ...] = ()
     units_run: int = 0
     estimated: int = 0
-    log: Path | None = None  # what workers' libraries printed, if anything
+    log: Path | None = None  # the output of workers' libraries, if any

@@ -7,30 +7,29 @@ Two rules decide that a unit no longer fits in time: :func:`prefix_that_fits` fo
 :class:`mkpc_kaggle.engine.worker.MatchRunner` for the units of a job that ran out of time.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cached_property
 from math import inf, isfinite
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mkpc_kaggle.engine.budget import (
-    ESTIMATE,
-    SCENE_MATCH_S,
-    SCENE_START_S,
-    Budget,
-    Costs,
-    format_duration,
-)
+from mkpc_kaggle.engine.budget import ESTIMATE, Budget, Costs, format_duration
 from mkpc_kaggle.engine.jobs import MatchJob, Phase
 from mkpc_kaggle.engine.state import Mask, State
 
-CONNECT_SHARE = 0.1  # of the time after the sweep, for extra pairs
-JOB_SHARE = 0.01  # maximum share of the time left for a job of several units
-HANG_FACTOR = 30.0  # a job that takes this multiple of its measured cost hangs
+# Maximum share of the time after the sweep for extra pairs: they only serve scenes.
+CONNECT_SHARE = 0.1
+# Maximum share of the time left for a job of several units. A longer job would delay scenes that wait
+# for its pair, and a lost job repeats all of its units.
+JOB_SHARE = 0.01
+# Maximum share of the limit that is reserved for estimates and scenes: a wrong forecast must not stop
+# the matching, on which every row depends.
+RESERVE_SHARE = 0.2
+# Phases in arrays are plain integers.
 FILL = int(Phase.FILL)
 NEVER = int(Phase.NEVER)
-RESERVE_SHARE = 0.2  # maximum share of the limit that is reserved for estimates and scenes
 
 
 @dataclass(frozen=True)
@@ -53,7 +52,7 @@ class NextWork:
     """Work for idle workers: the next job of matching, and all estimates and scenes that are due.
 
     ``done`` of ``total`` pairs are finished in the ``phase``. The first ``fit`` units of the recipe fit for all
-    pairs. ``stop`` is the time after which no unit may run.
+    pairs.
     """
 
     match: MatchJob | None
@@ -63,7 +62,6 @@ class NextWork:
     done: int
     total: int
     fit: int
-    stop: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,14 +73,18 @@ class View:
     budget: Budget
     crew: Crew
     now: float
-    missing: Mask = field(init=False)  # (N, U)
-    stop: float = field(init=False)
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "missing", self.state.missing)
+    @cached_property
+    def missing(self) -> Mask:
+        """(N, U): see :attr:`State.missing`."""
+        return self.state.missing
+
+    @cached_property
+    def stop(self) -> float:
+        """The time after which no unit may run, so that estimates and scenes have theirs."""
         reserve = estimates_reserve(self) + scenes_reserve(self)
         longest = RESERVE_SHARE * self.budget.time_limit
-        object.__setattr__(self, "stop", self.budget.stop_units - min(reserve, longest))
+        return self.budget.stop_units - min(reserve, longest)
 
     @property
     def left(self) -> float:
@@ -95,16 +97,18 @@ def next_work(state: State, costs: Costs, budget: Budget, crew: Crew, now: float
     fit = prefix_that_fits(view)
     connecting = pairs_to_connect(view)
     phases = phases_of(view, fit, connecting)
-    # A unit that would not end in time does not begin. An unmeasured unit may.
+    # A unit that would not end in time does not begin. An unmeasured unit may: its cost is 0 so far.
     wanted = phases.copy(order="F")
     for number, unit in enumerate(state.units):
         if costs.mean(unit.name) >= view.stop - now:
             wanted[:, number] = NEVER
+    # The most urgent phase of each pair, and of the pairs that no worker has now
     first = wanted.min(1)
     best = np.where(state.matching, np.int8(NEVER), first)
     phase = Phase(int(best.min(initial=NEVER)))
     match = None
     if phase is not Phase.NEVER and crew.can_match:
+        # A job takes the units of its phase and of earlier phases, which other pairs have finished.
         match = match_job(view, phase, wanted <= phase, best == phase)
     is_matching = match is not None or bool(state.matching.any())
     estimates = estimates_due(view, first)
@@ -117,7 +121,7 @@ def next_work(state: State, costs: Costs, budget: Budget, crew: Crew, now: float
         total = int(connecting.sum())
     pending = int((pairs.min(1) <= phase).sum()) if pairs.size else 0
     order = tuple(estimates.tolist())
-    return NextWork(match, order, scenes, phase, total - pending, total, fit, view.stop)
+    return NextWork(match, order, scenes, phase, total - pending, total, fit)
 
 
 # Matching
@@ -133,6 +137,7 @@ def phases_of(view: View, fit: int, connecting: Mask) -> NDArray[Any]:
         if state.is_crop[number]:
             # Points from older crops are worth more than none: better crops come last.
             rows[state.has[: state.rows, number], number] = FILL
+    # Last, since the sweep may be any unit of the prefix.
     sweep = sweeping_unit(state)
     rows[:, sweep] = Phase.SWEEP
     phases[state.rows :, sweep][connecting] = Phase.CONNECT
@@ -159,8 +164,9 @@ def prefix_that_fits(view: View) -> int:
 
 
 def seconds_of_prefixes(view: View) -> NDArray[np.float64]:
-    """Return the seconds (U,) of one worker for what rows miss of each prefix of the recipe."""
+    """Return the seconds (U,) of one worker for the missing units of each prefix of the recipe."""
     state = view.state
+    # Extra pairs are left out: they have a share of the time, not a claim.
     missing = view.missing[: state.rows]
     forecasts = np.array([view.costs.forecast(unit.name) for unit in state.units])
     count = len(state.units)
@@ -185,6 +191,7 @@ def pairs_to_connect(view: View) -> Mask:
     if not count:
         return np.zeros(0, bool)
     sweep = sweeping_unit(state)
+    # A share of the time after the sweep, as it was before the first extra pair.
     had = state.current[state.rows :, sweep]
     seconds = view.costs.forecast(state.units[sweep].name) / view.crew.matchers
     most = CONNECT_SHARE * (view.left + had.sum() * seconds)
@@ -197,21 +204,21 @@ def match_job(view: View, phase: Phase, missing: Mask, ready: Mask) -> MatchJob:
     """
     state = view.state
     order = state.order[ready[state.order]]
-    # Phase by phase in visiting order, in the end the weakest pairs first.
+    # In visiting order, for the cache of encodings; in the last phase the weakest pairs first.
     if phase is Phase.FILL:
         order = order[np.argsort(state.inliers[order], kind="stable")]
     first = int(order[0])
     # Stage 1 first, because the crops come from its points.
     numbers = sorted(np.flatnonzero(missing[first]).tolist(), key=state.is_crop.__getitem__)
     units = [state.units[number] for number in numbers]
-    # What lost a worker before runs alone: pair by pair and unit by unit.
+    # A unit that lost a worker before runs alone, so that another loss has one cause.
     alone = any(("unit", first, unit.name) in state.tries.alone for unit in units)
     size = 1 if alone else view.crew.minibatch
     alike = order[:1]
     if size > 1:
         alike = order[(missing[order] == missing[first]).all(1)]
     indices = tuple(alike[:size].tolist())
-    # A cost is learnt from one unit, and a job of several units takes a small share of the time.
+    # An unmeasured unit counts as infinitely long, so its cost is learnt from a job of one unit.
     seconds = [
         view.costs.mean(unit.name) if view.costs.is_known(unit.name) else inf for unit in units
     ]
@@ -223,7 +230,8 @@ def match_job(view: View, phase: Phase, missing: Mask, ready: Mask) -> MatchJob:
 
 def upcoming_pairs(state: State, job: MatchJob, count: int) -> list[int]:
     """Return the pairs that will probably be matched after a job."""
-    if job.phase is Phase.FILL:  # it depends on answers
+    # In the last phase, the order depends on inliers that come meanwhile.
+    if job.phase is Phase.FILL:
         return []
     rank = int(np.flatnonzero(state.order == job.indices[-1])[0]) + 1
     following: list[int] = state.order[rank : rank + count].tolist()
@@ -240,6 +248,8 @@ def estimates_due(view: View, first: NDArray[Any]) -> NDArray[Any]:
     ``first`` (N,) is the phase of each pair's next unit.
     """
     state = view.state
+    # A settled pair gets no other unit soon. A pair without an F is estimated at once: any F is better
+    # than the fallback.
     is_settled = (first >= FILL) & ~state.matching
     due = lacking_estimates(state) & ~state.estimating & (is_settled | ~state.has_own)
     order = state.order[due[state.order]]
@@ -276,8 +286,8 @@ def scenes_due(
         if phase < FILL:
             early |= pending | state.matching
         else:
-            # Some pair of a batch is at work all the time now. A first scene takes what there is: any
-            # scene is better than none, and tells what the others will cost.
+            # Some pair of a batch is at work all the time now. A first scene takes the present points:
+            # any scene is better than none, and its time helps to forecast the others.
             early |= (pending & ~state.has_own) | (state.matching & ~state.filling)
         waits = {False: early, True: pending | state.matching | (first < NEVER)}
     else:
@@ -304,13 +314,13 @@ def waiting_batches(state: State, crew: Crew) -> list[str]:
 
 
 def estimates_reserve(view: View) -> float:
-    """Return the seconds that the lacking estimates will probably take."""
+    """Return the expected seconds of the pending estimates."""
     count = int(lacking_estimates(view.state).sum())
     return view.costs.mean(ESTIMATE) * count / view.crew.estimators
 
 
 def scenes_reserve(view: View) -> float:
-    """Return the seconds that the pending reconstructions will probably take, several at a time."""
+    """Return the expected seconds of the pending reconstructions, several at a time."""
     state = view.state
     if not state.stale or not view.crew.scenes:
         return 0.0
@@ -319,26 +329,7 @@ def scenes_reserve(view: View) -> float:
     return float(max(forecasts.max(), forecasts.sum() / view.crew.scenes))
 
 
-# Time limits of jobs, and texts
-
-
-def match_patience(costs: Costs, job: MatchJob) -> float | None:
-    """Return the seconds after which a job counts as hung, warm-up included; ``None`` if a cost is
-    unknown.
-    """
-    if not all(costs.is_known(unit.name) for unit in job.units):
-        return None
-    expected = len(job.indices) * sum(costs.mean(unit.name) for unit in job.units)
-    return HANG_FACTOR * expected + costs.warm_up(job.units)
-
-
-def estimate_patience(costs: Costs, count: int) -> float | None:
-    return HANG_FACTOR * count * costs.mean(ESTIMATE) or None
-
-
-def scene_patience(costs: Costs, matches: int) -> float:
-    forecast = float(costs.scenes(np.array([matches]))[0])
-    return HANG_FACTOR * max(forecast, SCENE_START_S + SCENE_MATCH_S * matches)
+# The end, and the outlook
 
 
 def is_complete(state: State, crew: Crew) -> bool:

@@ -24,9 +24,9 @@ from mkpc_kaggle.engine import console
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.cluster import RaySite
 from mkpc_kaggle.engine.keys import Keys
-from mkpc_kaggle.engine.loop import Engine, note_event
+from mkpc_kaggle.engine.loop import Engine
 from mkpc_kaggle.engine.places import LISTEN_S, LocalSite
-from mkpc_kaggle.engine.records import About, Event, EventKind
+from mkpc_kaggle.engine.records import About, EventKind
 from mkpc_kaggle.engine.request import Request, RunReport
 from mkpc_kaggle.engine.state import State
 from mkpc_kaggle.engine.store import Store
@@ -35,7 +35,7 @@ from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.version import __version__
 
-LOG_NAME = "workers.log"  # in the work directory: what native libraries print
+LOG_NAME = "workers.log"  # in the work directory, for the output of native libraries
 EXIT_S = 0.2  # for the system to end a process
 REPORT_S = 2.0  # for an interrupted program's report; enough for the tables
 
@@ -65,7 +65,7 @@ def interruptible() -> Iterator[Interrupt]:
     with ExitStack() as restored:
 
         def note(number: int, _: FrameType | None) -> None:
-            restored.close()
+            restored.close()  # first, so that a second signal ends even a hung program
             interrupt.signal = number
             interrupt.set()
             if interrupt.raises:
@@ -130,12 +130,14 @@ class Session:
         def write() -> None:
             nonlocal trouble
             trouble = self.save()
+            # A report that is cut off would lie next to the submission.
             with suppress(OSError):
                 remove_unfinished()  # for example, an unfinished report
 
         writer = threading.Thread(target=write, name="final write", daemon=True)
         writer.start()  # the disk may hang
         writer.join(max(EXIT_S, budget.limit - budget.clock() - EXIT_S))
+        # Not exit(): its handlers wait for threads, and one of them hangs.
         if trouble:
             console.complain(trouble)
         status = self.status or int(bool(trouble))
@@ -164,11 +166,13 @@ def first_version(pairs: Sequence[Pair], output: Path) -> Iterator[None]:
     """
     if output.is_char_device() or output.is_block_device():
         raise UserError(f"--output {output} is a device; name a file")
-    ours, former, ids = None, None, [pair.id for pair in pairs]
+    ours = None  # the version that is written here
+    former = None  # the file that was there before
+    ids = [pair.id for pair in pairs]
     with ExitStack() as closed:
         with writing(f"--output {output}"):
             output.parent.mkdir(parents=True, exist_ok=True)
-            TemporaryFile(dir=output.parent).close()
+            TemporaryFile(dir=output.parent).close()  # before hours of work, not after them
             if not output.exists() or (output.is_file() and submission_problems(output, ids)):
                 if output.is_file():
                     # The open file outlives its name
@@ -213,10 +217,12 @@ def request_of(
     pairs: Sequence[Pair], assembly: Assembly, session: Session, root: str = "", **more: Any
 ) -> Request:
     """Return a request for these pairs; ``more`` are other fields of the request."""
-    budget, recipe = session.budget, assembly.recipe
+    budget = session.budget
+    recipe = assembly.recipe
     limit = budget.time_limit if isfinite(budget.time_limit) else None
     table = {**recipe.table(), "name": recipe.name}
-    versions = {  # of software that may change the results
+    # For readers of a report. Keys have only the versions that change a kind of result for sure.
+    versions = {
         "mkpc_kaggle": __version__,
         "Python": platform.python_version(),
         "PyTorch": metadata.version("torch"),
@@ -240,10 +246,10 @@ def opened_engine(
     workers = session.workers
     with Store.open(session.work_dir, fresh=session.fresh) as store:
         log = session.work_dir / LOG_NAME
+        # The summary names the file if this run wrote to it.
         with suppress(OSError):
             log.unlink(missing_ok=True)
         console.log_native(log)
-        note_event(store, Event(EventKind.START, budget.spent(), ""))
         engine = Engine(
             RaySite(assembly, workers, budget.clock, folders, log)
             if isinstance(workers, str)
@@ -254,7 +260,9 @@ def opened_engine(
             progress=session.progress,
             minibatch=assembly.minibatch,
         )
+        engine.log.note(EventKind.START)
         session.save = engine.save_results
         with engine:
             yield engine
-        note_event(store, Event(EventKind.END, budget.spent(), engine.ending))
+        # Only without an error. Reports call a session without this event "not ended".
+        engine.log.note(EventKind.END, engine.ending)

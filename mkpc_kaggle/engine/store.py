@@ -1,9 +1,9 @@
 """The store of a run: an SQLite file that has each result under the digest of its inputs.
 
 There is one table. ``about`` is JSON, all that reports need; ``data`` are a unit's points. Results
-under keys that nobody asks for stay until they are pruned or the run starts with --fresh. The
-parent alone writes, one transaction for each answer. It reads the store once, at its start, and
-keeps its state in memory (:mod:`state`).
+under unused keys stay until they are pruned or the run starts with --fresh. The parent alone
+writes, one transaction for each answer. It reads the store once, at its start, and keeps its state
+in memory (:mod:`state`).
 """
 
 import json
@@ -21,9 +21,11 @@ import numpy as np
 from mkpc_kaggle.errors import UserError, printable, writing
 from mkpc_kaggle.geometry.matches import Matches
 
-FORMAT = 16
-FILE_NAME = "journal.sqlite"
+FORMAT = 17  # increase it when a kind of result is stored differently: nothing is converted
+FILE_NAME = "journal.sqlite"  # named in the documentation, and in scripts of users
 LOCK_NAME = "journal.lock"
+# STRICT refuses values of a wrong type, and json_valid refuses numbers that are not JSON, such as NaN.
+# Both would be noticed only when a report is made.
 SCHEMA = """
 CREATE TABLE result (
     key TEXT PRIMARY KEY,
@@ -34,11 +36,12 @@ CREATE TABLE result (
 """
 MIN_SQLITE = (3, 37, 0)  # STRICT tables
 MAX_KEYS = 500  # in a query; SQLite allows 999 values
-TABLE = "table of pairs"  # the key of the latest run's table
 
-# SQLite's primary result codes. Only the first two mean damage.
-CORRUPT = {11, 26}
+# SQLite's primary result codes. Only CORRUPT means damage, for which the advice is to delete the file:
+# wrong advice costs the user hours of results.
+CORRUPT = {11, 26}  # a malformed file, and a file that is no database
 UNUSABLE = {3, 5, 6, 8, 14}  # no permission, busy, locked, read only, cannot be opened
+CANNOT_OPEN = 14
 
 
 class Kind(StrEnum):
@@ -48,12 +51,13 @@ class Kind(StrEnum):
     ESTIMATE = "estimate"  # of a pair
     SCENE = "scene"  # of a batch
     FEATURES = "features"  # of an image, or of the images of a folder
-    IMAGE = "image"  # what is known of a file, by its name
+    IMAGE = "image"  # a file's digest by its name, or facts about a content
     EXPORT = "export"  # the scene whose files a directory has, by batch
     EVENT = "event"
     TABLE = "table"
 
 
+# The other kinds are small, or no table of pairs names them.
 PRUNED = (Kind.POINTS, Kind.ESTIMATE, Kind.SCENE)
 
 
@@ -77,6 +81,7 @@ def undamaged(path: Path, advice: str = "delete it with --fresh") -> Iterator[No
     try:
         yield
     except sqlite3.DatabaseError as error:
+        # The low byte is the primary code; the higher bytes are details of it.
         code = getattr(error, "sqlite_errorcode", 0) & 0xFF
         if code in UNUSABLE:
             text = f"{path} cannot be used: {error}; is another run using it?"
@@ -92,9 +97,9 @@ class Store:
     def __init__(self, directory: Path) -> None:
         self.directory = directory
         self.path = directory / FILE_NAME
-        self.trouble = ""  # why the file took no more results, which are in memory then
-        self._has_file = True
-        self._unsaved: dict[str, Result] = {}
+        self.trouble = ""  # the reason why results stay in memory, if they do
+        self._has_file = True  # false if the disk was full already at the start
+        self._unsaved: dict[str, Result] = {}  # results that the file did not take
         self._db = closed_connection()
         self._lock: sqlite3.Connection | None = None
 
@@ -121,13 +126,15 @@ class Store:
             with undamaged(lock, "remove it"):
                 # A separate file, so that others can read the store during a run.
                 store._lock = opened.enter_context(closing(connected(lock)))
+                # SQLite releases the lock with the process, however it ends.
                 store._lock.execute("BEGIN EXCLUSIVE")
             if fresh:
+                # A write-ahead log of a former file would be applied to the new one.
                 for ending in ("", "-journal", "-wal", "-shm"):
                     directory.joinpath(FILE_NAME + ending).unlink(missing_ok=True)
             with undamaged(store.path):
                 store._open_file(opened)
-            opened.pop_all()
+            opened.pop_all()  # all is open: nothing is closed on leaving
         return store
 
     @classmethod
@@ -145,6 +152,7 @@ class Store:
         mode = "mode=ro" if is_writable else "mode=ro&immutable=1"
         with ExitStack() as opened, undamaged(store.path):
             store._db = opened.enter_context(closing(connected(store.path, mode, timeout=5.0)))
+            # One transaction for all reads: the run may publish meanwhile.
             store._db.execute("BEGIN")
             if check:
                 store._check()
@@ -173,10 +181,12 @@ class Store:
         Raises ``sqlite3.IntegrityError`` for results that the table cannot hold, such as a number
         that is NaN.
         """
+        # Waiting results are tried again with each later one: the disk may have room again.
         new = {result.key: result for result in results}
         waiting = self._unsaved | new
         if not waiting:
             return
+        # Names may have lone surrogates, from bytes that are no UTF-8; SQLite takes none.
         rows = [
             (printable(each.key), each.kind, printable(json.dumps(each.about)), each.data)
             for each in waiting.values()
@@ -184,6 +194,7 @@ class Store:
         try:
             with self._db:
                 self._db.execute("BEGIN")
+                # REPLACE: a table of pairs and the facts of a file have the same key each time.
                 self._db.executemany("REPLACE INTO result VALUES (?, ?, ?, ?)", rows)
         except sqlite3.OperationalError as error:  # a full disk
             self.trouble = str(error)
@@ -192,7 +203,7 @@ class Store:
             self._unsaved = {}
 
     def remove(self, key: str) -> None:
-        """Remove a result, if it is there."""
+        """Remove a result, if it exists."""
         self._unsaved.pop(key, None)
         with suppress(sqlite3.OperationalError):  # a full disk
             self._db.execute("DELETE FROM result WHERE key = ?", [printable(key)])
@@ -203,12 +214,14 @@ class Store:
         """
         before = self.path.stat().st_size
         with undamaged(self.path):
+            # In a table, since a query takes less than a thousand values.
             self._db.execute("CREATE TEMPORARY TABLE named (key TEXT PRIMARY KEY)")
             rows = [(key,) for key in named]
             self._db.executemany("INSERT OR IGNORE INTO named VALUES (?)", rows)
             marks = ", ".join("?" * len(PRUNED))
             unnamed = "key NOT IN (SELECT key FROM named)"
             self._db.execute(f"DELETE FROM result WHERE kind IN ({marks}) AND {unnamed}", PRUNED)
+            # Deleted rows leave free pages, which VACUUM removes; the log is as large as the rest.
             self._db.execute("VACUUM")
             self._db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
         return before - self.path.stat().st_size
@@ -216,7 +229,7 @@ class Store:
     # Reading
 
     def about(self, keys: Iterable[str]) -> dict[str, Any]:
-        """Return what is known about the results with these keys, if they exist, by key."""
+        """Return the JSON values about the results with these keys, if they exist, by key."""
         return {key: json.loads(about) for key, about in self._columns("about", keys)}
 
     def data(self, keys: Iterable[str]) -> dict[str, bytes]:
@@ -224,7 +237,7 @@ class Store:
         return dict(self._columns("data", keys))
 
     def of_kind(self, kind: Kind) -> dict[str, Any]:
-        """Return what is known about all results of a kind, by key, in the order of writing."""
+        """Return the JSON values about all results of a kind, by key, in the order of writing."""
         query = "SELECT key, about FROM result WHERE kind = ? ORDER BY rowid"
         with undamaged(self.path):
             rows = self._db.execute(query, [kind]).fetchall()
@@ -233,15 +246,17 @@ class Store:
         return found | {each.key: each.about for each in unsaved}
 
     def source(self, keys: Sequence[str]) -> "Source":
-        """Return where a worker finds the points with these keys: in the file, or beside this
+        """Return where a worker finds the points with these keys: in the file, or in the returned
         value.
         """
+        # Workers read the file themselves: points of a scene may be hundreds of MB.
         if self._unsaved or not self._has_file:
             return Source(None, self.data(keys))
         return Source(self.directory, {})
 
     def _columns(self, column: str, keys: Iterable[str]) -> Iterator[tuple[str, Any]]:
         asked = list(dict.fromkeys(keys))
+        # Unsaved results are newer than the rows of the file.
         stored = [key for key in asked if key not in self._unsaved]
         for start in range(0, len(stored), MAX_KEYS):
             part = [printable(key) for key in stored[start : start + MAX_KEYS]]
@@ -261,9 +276,9 @@ class Store:
             self._db = opened.enter_context(closing(connected(self.path)))
             self._prepare()
         except sqlite3.OperationalError as error:
-            if getattr(error, "sqlite_errorcode", 0) & 0xFF in UNUSABLE - {14}:
+            if getattr(error, "sqlite_errorcode", 0) & 0xFF in UNUSABLE - {CANNOT_OPEN}:
                 raise
-            # A full disk has no room for SQLite's locks, either. What is there can be read.
+            # A full disk has no room for SQLite's locks, either. Its files can be read.
             self.trouble = str(error)
             self._has_file = False
             is_empty = not self.path.exists() or not self.path.stat().st_size
@@ -279,7 +294,9 @@ class Store:
 
     def _prepare(self) -> None:
         if self._db.execute("SELECT 1 FROM sqlite_master").fetchone() is None:
+            # Readers do not block the writer, and a commit is one append.
             self._db.execute("PRAGMA journal_mode = WAL")
+            # In one transaction, so that no file has the table and not its format.
             self._db.executescript(f"BEGIN; {SCHEMA}; PRAGMA user_version = {FORMAT}; COMMIT;")
         else:
             self._check()
@@ -294,6 +311,7 @@ class Store:
                 f"{self.path} was written by another version of this program (its format is not "
                 f"{FORMAT}). Use that version, delete it with --fresh, or name another --work-dir."
             )
+        # quick_check reads all pages, but does not compare the table with its index.
         trouble = self._db.execute("PRAGMA quick_check(1)").fetchone()[0]
         if trouble != "ok":
             raise UserError(f"{self.path} is damaged ({trouble}); delete it with --fresh")
@@ -301,7 +319,10 @@ class Store:
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """Where a worker reads data: the store of a directory, or ``held`` if the store takes no more."""
+    """Where a worker reads data: the store of a directory, or ``held`` if the store takes no more.
+
+    A worker gets this in place of the data, and only this: it never writes.
+    """
 
     directory: Path | None
     held: dict[str, bytes]
@@ -322,7 +343,7 @@ class Source:
 def connected(path: Path | str, options: str = "", timeout: float = 1.0) -> sqlite3.Connection:
     """Return a connection without Python's implicit transactions.
 
-    ``path`` is a file, or ":memory:". ``options`` are those of the file's SQLite URI.
+    ``path`` is a file, or ":memory:". ``options`` belong to the file's SQLite URI.
     """
     uri = f"{path.resolve().as_uri()}?{options}" if isinstance(path, Path) else f"file:{path}"
     return sqlite3.connect(uri, uri=True, timeout=timeout, isolation_level=None)
@@ -337,6 +358,7 @@ def closed_connection() -> sqlite3.Connection:
 
 def to_bytes(matches: Matches) -> bytes:
     """Return the bytes of x0, y0, x1, y1 and score of each match, as little-endian float32."""
+    # Exact, because workers return float32.
     columns = [matches.points0, matches.points1, matches.scores]
     return np.column_stack(columns).astype("<f4").tobytes()
 

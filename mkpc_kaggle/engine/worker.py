@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 
 from mkpc_kaggle.data.images import Image, ImageStore
+from mkpc_kaggle.engine.image_files import file_state
 from mkpc_kaggle.engine.jobs import (
     Answer,
     Cause,
@@ -61,6 +62,7 @@ class Executor:
                 return self._run(cast(Job, message))
             self._run = cast(Maker, message)()
         except Exception as error:
+            # Before the first job, a user error means that the worker can never load.
             if self._run is None and isinstance(error, UserError):
                 is_device = isinstance(error, failures.DeviceError)
                 return Failure(Cause.DEVICE if is_device else Cause.REFUSED, str(error))
@@ -76,13 +78,14 @@ class MatchRunner:
     """A runner of match jobs with ``threads`` threads, or as one of ``share`` processes that share
     the cores.
 
-    ``refused`` has the reason for each matcher that cannot be loaded: the run goes on without its units. Raises
+    ``refused`` has the reason for each matcher that cannot be loaded: the run continues without its units. Raises
     :class:`mkpc_kaggle.errors.UserError` if none can be loaded.
     """
 
     def __init__(
         self, make_pipeline: Callable[[], "Pipeline"], *, threads: int = 0, share: int = 1
     ) -> None:
+        # Alone on a machine, a process uses all cores by default.
         if threads or share > 1:
             import cv2
             import torch
@@ -94,11 +97,13 @@ class MatchRunner:
         self._pipeline.load()
         self.refused = self._pipeline.unloadable
         self._images = ImageStore()
+        # As of the first look at each file, in this worker
         self._files: dict[Path, tuple[int, int]] = {}
 
     def __call__(self, job: Job) -> tuple[Outcome, ...]:
         """Match the pairs of a job with each unit that is expected to end in time."""
         assert isinstance(job, MatchJob)
+        # Durations and not moments in the job: other machines have other clocks.
         deadline = time.monotonic() + job.seconds
         expected = dict(zip(job.units, job.expected, strict=True))
 
@@ -107,8 +112,10 @@ class MatchRunner:
 
         self._look_at(path for pair in job.pairs for path in pair.images)
         opened = [self._open(job, number) for number in range(len(job.pairs))]
+        # Decoding the next pairs' images takes place while a GPU matches.
         self._look_at(job.upcoming)
         self._images.prefetch(job.upcoming)
+        # An unreadable image fails its pair alone, not the minibatch.
         readable = [pair for pair in opened if not pair.failure]
         matched = iter(self._pipeline.match(readable, job.units, may_start))
         done = [pair if pair.failure else next(matched) for pair in opened]
@@ -141,16 +148,15 @@ class MatchRunner:
         contents.
         """
         if pair.failure:
-            return Outcome(job.indices[number], failure=pair.failure)
+            return Outcome(failure=pair.failure)
         image0, image1 = (
             BatchImage(name, image.version, image.size, image.focal)
             for name, image in zip(job.names[number], pair.images, strict=True)
         )
         return Outcome(
-            job.indices[number],
             (image0, image1),
             tuple(self._files[path] for path in job.pairs[number].images),
-            pair.results[len(job.known[number]) :],
+            pair.results[len(job.known[number]) :],  # without the known points of stage 1
             pair.regions,
             "",
             pair.decode_seconds,
@@ -158,21 +164,11 @@ class MatchRunner:
         )
 
 
-def file_state(path: Path) -> tuple[int, int]:
-    """Return the size of a file in bytes and its time of change in nanoseconds; zeros if it is
-    missing.
-    """
-    try:
-        status = path.stat()
-    except (OSError, ValueError):
-        return 0, 0
-    return status.st_size, status.st_mtime_ns
-
-
 def light_runner(*, in_process: bool = True) -> Runner:
-    """Return the runner of estimates and image features, without torch; a process of its own has
-    one thread.
+    """Return the runner of estimates and image features, without torch; a separate process has one
+    thread.
     """
+    # The user's own process keeps its thread limits.
     if in_process:
         import cv2
         from threadpoolctl import threadpool_limits  # comes with scikit-learn
@@ -192,15 +188,16 @@ def do_light_job(job: Job) -> tuple[Estimated, ...] | Found:
 def estimate_pair(pair: PairInputs, results: tuple[UnitResult, ...], recipe: Recipe) -> Estimated:
     """Estimate F of a pair, or E with intrinsics, from its points of all units."""
     start = time.perf_counter()
+    # From the digested contents, so the images are not decoded again.
     sizes = tuple(image.size for image in pair.images)
     focals = tuple(image.focal for image in pair.images)
     match = PairMatch(results, sizes=sizes, focals=focals)
     model = ModelKind.F if pair.intrinsics is None else ModelKind.E
     found = with_estimate(match, recipe, model, pair.intrinsics).estimate
+    # The inliers of each unit, by the bounds of its matches among all
     ends = np.cumsum([len(result.matches) for result in results])[:-1]
     inliers = tuple(int(mask.sum()) for mask in np.split(found.inliers, ends))
     return Estimated(
-        pair.index,
         tuple(pair.points.values()),
         inliers,
         found.matrix,

@@ -5,7 +5,6 @@ from io import StringIO
 import pytest
 from simulator import VirtualClock
 
-from mkpc_kaggle.engine import console
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.console import LINE_INTERVAL_S, Progress
 from mkpc_kaggle.engine.jobs import Phase
@@ -18,7 +17,8 @@ class Terminal(StringIO):
 @pytest.fixture(autouse=True)
 def no_notebook(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("JPY_PARENT_PID", raising=False)
-    monkeypatch.setattr(console, "is_terminal", lambda stream: isinstance(stream, Terminal))
+    is_terminal = lambda stream: isinstance(stream, Terminal)  # noqa: E731
+    monkeypatch.setattr("mkpc_kaggle.engine.console.is_terminal", is_terminal)
 
 
 def test_a_terminal_has_a_line_for_each_phase() -> None:

@@ -31,7 +31,7 @@ from mkpc_kaggle.engine.request import Ending, Request
 from mkpc_kaggle.engine.schedule import Crew, NextWork, View, next_work, outlook, prefix_that_fits
 from mkpc_kaggle.engine.state import State
 from mkpc_kaggle.engine.store import Kind, Store
-from mkpc_kaggle.recipe import Unit
+from mkpc_kaggle.recipe import SceneConfig, Unit
 
 DIED = Failure(Cause.DIED, "signal SIGKILL")
 UNITS = THREE_UNITS.units
@@ -55,7 +55,7 @@ class Run:
             Pair(f"{n:03d}", "", f"{n:03d}.png", f"{n:03d}b.png") for n in range(count + extra)
         ]
         request = Request(pairs[:count], THREE_UNITS, Keys(tuple(unit.name for unit in UNITS)))
-        self.state = State(request, pairs[count:], {})
+        self.state = State(request, pairs[count:])
         self.costs, self.budget = Costs(), Budget(0.0, limit, lambda: 0.0)
         self.crew = Crew(minibatch=minibatch)
         for index, units in enumerate(had):
@@ -238,8 +238,8 @@ def test_two_workers_fit_more_units_than_one():
 
 def test_a_first_scene_waits_for_the_units_that_fit_and_a_later_scene_for_all():
     run = Run(6, limit=1000.0, had=[(SWEEP,)] * 6)
-    pairs = run.state.request.pairs
-    run.state = State(run.state.request, [], {"": list(range(len(pairs)))})
+    request = run.state.request
+    run.state = State(replace(request, recipe=replace(THREE_UNITS, scene=SceneConfig())))
     for index in range(6):
         run.have(index, (SWEEP, SECOND))
         run.state.matches[index] = 50

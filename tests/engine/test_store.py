@@ -14,23 +14,22 @@ import pytest
 from rectified import SECOND, SWEEP, THIRD, THREE_UNITS
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine.jobs import Estimated, Outcome, SceneJob
+from mkpc_kaggle.engine.budget import Budget, Costs
+from mkpc_kaggle.engine.console import Progress
+from mkpc_kaggle.engine.dataframes import results
+from mkpc_kaggle.engine.image_files import file_result, stored_digests
+from mkpc_kaggle.engine.jobs import Estimated, MatchJob, Outcome, Phase
 from mkpc_kaggle.engine.keys import Keys
-from mkpc_kaggle.engine.loop import batches_of
-from mkpc_kaggle.engine.records import (
-    IMAGE,
-    About,
-    SceneRecord,
-    Table,
-    file_result,
-    read_points,
-    read_records,
-    read_scenes,
-    results,
-)
+from mkpc_kaggle.engine.light import Estimating
+from mkpc_kaggle.engine.matching import Matching
+from mkpc_kaggle.engine.publication import Publication
+from mkpc_kaggle.engine.reconstructing import Reconstructing
+from mkpc_kaggle.engine.records import About, Table, read_points, read_records, read_scenes
 from mkpc_kaggle.engine.request import Request
+from mkpc_kaggle.engine.restore import restore
+from mkpc_kaggle.engine.run import EventLog, Run
 from mkpc_kaggle.engine.state import State
-from mkpc_kaggle.engine.store import FILE_NAME, Kind, Result, Source, Store, to_bytes
+from mkpc_kaggle.engine.store import FILE_NAME, Kind, Result, Store, to_bytes
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Box, Size
@@ -75,10 +74,12 @@ class Room:
         """Begin a run, as the loop does. ``other`` are other settings."""
         pairs = pairs or [pair_of(number) for number in range(count)]
         request = Request(pairs, recipe, keys_of(recipe, **other), about=About({"name": "x"}))
-        self.state = State(request, [], batches_of(pairs))
-        about = self.store.of_kind(Kind.IMAGE)
-        names = {key.removeprefix(IMAGE): key for key in about if key.startswith(IMAGE)}
-        self.state.restore(self.store, {name: about[key]["digest"] for name, key in names.items()})
+        self.state = State(request)
+        names = [name for names in self.state.names for name in names]
+        restore(self.state, self.store, stored_digests(self.store, names))
+        budget = Budget(0.0)
+        log = EventLog(self.store, budget)
+        self.run = Run(self.state, self.store, Costs(), budget, log, Progress(budget, None))
 
     def match(self, index: int, *units: Unit, digest: str = "") -> None:
         """Save points of a pair whose first image has this content, by default its own."""
@@ -89,21 +90,20 @@ class Room:
             BatchImage(name1, "common", Size(80, 60), 99.0),
         )
         found = tuple(UnitResult(unit, matches, 0.5, 0.25) for unit in units)
-        outcome = Outcome(index, images, ((1, 1), (2, 2)), found, REGIONS, "", 0.1, 0.2)
-        rows = self.state.results_of(outcome, self.state.first_stage(index))
-        self.store.put(rows)
-        self.state.take(outcome, rows)
+        outcome = Outcome(images, ((1, 1), (2, 2)), found, REGIONS, "", 0.1, 0.2)
+        crops = (tuple(self.state.first_stage(index)),)
+        job = MatchJob(Phase.SWEEP, (index,), units, (0.0,) * len(units), 0.0, crops=crops)
+        Matching(self.run).save(job, [outcome], 0.5)
 
     def estimate(self, index: int) -> None:
         keys = tuple(self.state.inputs_of(index).points.values())
-        each = Estimated(index, keys, tuple(range(7, 7 + len(keys))), F, magsac=2 * F)
-        row = self.state.estimate_result(each)
-        self.store.put([row])
-        self.state.take_estimate(each, row)
+        each = Estimated(keys, tuple(range(7, 7 + len(keys))), F, magsac=2 * F)
+        estimating = Estimating(self.run)
+        estimating.save(estimating.job([index]), [each], 0.5)
 
     def reconstruct(self) -> None:
         state = self.state
-        indices, key = state.scene_inputs("one")
+        indices, _ = state.scene_inputs("one")
         sigmas = {"0.png": Sigmas(0.1, 0.02, 3.0), "1.png": ()}
         placed = [
             RegisteredImage(BatchImage(name, "d", Size(80, 60)), CAMERA, 9, sigmas[name])
@@ -115,15 +115,11 @@ class Room:
             *[Choice(None, Reason.UNREGISTERED)] * (len(indices) - 1),
         ]
         answer = Solution((Reconstruction(tuple(sigmas), (model,)),), tuple(choices))
-        pairs = tuple(map(state.inputs_of, indices))
-        contents = tuple(map(state.contents, indices))
-        job = SceneJob("one", key, pairs, contents, RECIPE, Source(None, {}))
-        self.store.put([state.scene_result(job, answer, 1.5)])
-        state.use_scene("one", key, SceneRecord.of_solution("one", answer, contents, 1.5))
-        state.stale.discard("one")
+        reconstructing = Reconstructing(self.run)
+        reconstructing.save(reconstructing.job("one"), answer, 1.5)
 
     def publish(self) -> None:
-        self.store.put([self.state.table().to_result()])
+        Publication(self.state, self.store, self.run.budget, self.run.log).publish()
 
     def replace(self, name: str) -> None:
         """Give an image another content, as the next start of a run notices."""

@@ -16,8 +16,8 @@ from rectified import THREE_UNITS, RectifiedMatcher, run, write_pairs
 from shared import run_command
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine.loop import note_event
 from mkpc_kaggle.engine.records import About, Event, EventKind, Row, Table
+from mkpc_kaggle.engine.run import note_event
 from mkpc_kaggle.engine.store import Store
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 from mkpc_kaggle.reporting.report import DRAWING_S, report_page, report_run

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine import budget, jobs, loop, schedule
+from mkpc_kaggle.engine import budget, jobs, light, matching, reconstructing, schedule
 from mkpc_kaggle.engine.budget import SCENE_MARGIN, SCENE_START_S, Budget
 from mkpc_kaggle.engine.jobs import (
     Answer,
@@ -64,9 +64,11 @@ MECHANISMS: dict[str, tuple[tuple[object, str, object], ...]] = {
     "latest costs": ((budget, "WINDOW", 10**9),),
     "short jobs": ((schedule, "JOB_SHARE", math.inf),),
     "connect share": ((schedule, "CONNECT_SHARE", 1.0),),
-    "patience": ((schedule, "HANG_FACTOR", math.inf),),
+    "patience": tuple(
+        (kind, "HANG_FACTOR", math.inf) for kind in (matching, light, reconstructing)
+    ),
     "second try": ((jobs, "MAX_TRIES", 1),),
-    "end of tries": ((loop, "MAX_FAILED_PAIRS", 10**9),),
+    "end of tries": ((matching, "MAX_FAILED_PAIRS", 10**9),),
 }
 
 
@@ -301,7 +303,7 @@ class SimulatedSite(Site):
                 warm.add(unit.name)
         images = [tuple(BatchImage(name, name, SIZE) for name in names) for names in job.names]
         files = [((0, 0), (0, 0))] * len(images)
-        return spent, tuple(map(Outcome, job.indices, images, files, map(tuple, found))), 0.0
+        return spent, tuple(map(Outcome, images, files, map(tuple, found))), 0.0
 
     def estimate(self, job: EstimateJob) -> Drawn:
         """Draw an answer: each pair has from 20 to 79 inliers by its number."""
@@ -310,8 +312,8 @@ class SimulatedSite(Site):
         estimates = []
         for pair in job.pairs:
             inliers = (20 + pair.index % 60,) * len(pair.points)
-            values = pair.index, tuple(pair.points.values()), inliers, FALLBACK_FUNDAMENTAL
-            estimates.append(Estimated(*values, seconds=ESTIMATE_S))
+            points = tuple(pair.points.values())
+            estimates.append(Estimated(points, inliers, FALLBACK_FUNDAMENTAL, seconds=ESTIMATE_S))
         return ESTIMATE_S * len(estimates), tuple(estimates), 0.0
 
     def reconstruct(self, job: SceneJob) -> Drawn:

@@ -1,0 +1,112 @@
+"""Image files: the digest of each file's content, and the facts about each content.
+
+The store remembers a file's size, time of change and digest under its name. A file is digested
+again only if its size or time has changed. A fresh run digests nothing: the worker that decodes an
+image returns its digest.
+"""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from mkpc_kaggle.data.images import content_digest
+from mkpc_kaggle.engine.codec import IMAGE
+from mkpc_kaggle.engine.store import Kind, Result, Store
+from mkpc_kaggle.scene.view_graph import BatchImage
+
+# Prefixes of keys. Facts have the content's digest, since a file's name may get another content.
+FILE = "image "
+CONTENT = "content "
+HASH_THREADS = 4  # a network disk answers several reads at a time
+CHECK_S = 0.2  # between checks whether the time is over
+
+
+class Digests(NamedTuple):
+    """The digest of each known file's content, by name; ``changed`` are the names with another
+    content than stored.
+    """
+
+    by_name: dict[str, str]
+    changed: set[str]
+
+
+def file_state(path: Path) -> tuple[int, int]:
+    """Return the size of a file in bytes and its time of change in nanoseconds; zeros if it is
+    missing.
+    """
+    try:
+        status = path.stat()
+    except (OSError, ValueError):
+        return 0, 0
+    return status.st_size, status.st_mtime_ns
+
+
+def update_digests(store: Store, files: Mapping[str, Path], is_over: Callable[[], bool]) -> Digests:
+    """Digest the known files whose size or time has changed, and store the new digests."""
+    known = _stored_files(store, files)
+    touched: dict[str, tuple[int, int]] = {}
+    for name, facts in known.items():
+        now = file_state(files[name])
+        # A missing file keeps its results: perhaps nothing must be matched.
+        if any(now) and now != tuple(facts["file"]):
+            touched[name] = now
+    found = digest_files({name: files[name] for name in touched}, is_over)
+    store.put(file_result(name, digest, touched[name]) for name, digest in found.items())
+    digests = {name: facts["digest"] for name, facts in known.items()}
+    changed = {name for name, digest in found.items() if digest != digests[name]}
+    return Digests(digests | found, changed)
+
+
+def digest_files(files: Mapping[str, Path], is_over: Callable[[], bool]) -> dict[str, str]:
+    """Return the digest of each file's content by name, without files that cannot be read."""
+    # Threads, since both reading and hashing release the interpreter lock.
+    pool = ThreadPoolExecutor(HASH_THREADS)
+    futures = {name: pool.submit(content_digest, path) for name, path in files.items()}
+    pending = set(futures.values())
+    while pending and not is_over():
+        _, pending = wait(pending, CHECK_S)
+    # Do not wait for the threads at work: a file of many GB takes long.
+    pool.shutdown(wait=False, cancel_futures=True)
+    return {
+        name: future.result()
+        for name, future in futures.items()
+        if future.done() and not future.cancelled() and not future.exception()
+    }
+
+
+def stored_digests(store: Store, names: Iterable[str]) -> dict[str, str]:
+    """Return the stored digests of these files' contents, by name."""
+    return {name: facts["digest"] for name, facts in _stored_files(store, names).items()}
+
+
+def _stored_files(store: Store, names: Iterable[str]) -> dict[str, dict[str, Any]]:
+    about = store.about(FILE + name for name in names)
+    return {key.removeprefix(FILE): facts for key, facts in about.items()}
+
+
+def known_images(store: Store, digests: Mapping[str, str]) -> dict[str, BatchImage]:
+    """Return the images whose contents have stored facts, by name."""
+    about = store.about(CONTENT + digest for digest in digests.values())
+    images = {}
+    for name, digest in digests.items():
+        if facts := about.get(CONTENT + digest):
+            # Files with equal contents share their facts, but not their names.
+            images[name] = IMAGE.of_json({**facts, "name": name})
+    return images
+
+
+def image_results(image: BatchImage, file: tuple[int, int]) -> list[Result]:
+    """Return the digest of an image's file, and the facts about its content, as rows of the store."""
+    content = Result(CONTENT + image.digest, Kind.IMAGE, IMAGE.to_json(image))
+    return [file_result(image.name, image.digest, file), content]
+
+
+def file_result(name: str, digest: str, file: tuple[int, int]) -> Result:
+    """Return a file's digest, with its :func:`file_state`, as a row of the store."""
+    return Result(FILE + name, Kind.IMAGE, {"digest": digest, "file": list(file)})
+
+
+def contents_of(images: Sequence[BatchImage], turns: Sequence[int]) -> str:
+    """Return a text that identifies the contents of a pair's images, and their quarter turns."""
+    return " ".join([*(image.digest for image in images), *map(str, turns)])

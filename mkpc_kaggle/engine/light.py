@@ -1,0 +1,133 @@
+"""Light work, without torch: estimates of pairs, and features of images."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from mkpc_kaggle.engine.budget import ESTIMATE
+from mkpc_kaggle.engine.jobs import Estimated, EstimateJob, Failure, FeatureJob, Found, Tries
+from mkpc_kaggle.engine.records import ESTIMATED
+from mkpc_kaggle.engine.run import HANG_FACTOR, Run
+from mkpc_kaggle.engine.schedule import lacking_estimates
+from mkpc_kaggle.engine.store import Kind, Result, Store
+
+# In a job. More pairs would make the last F of a run wait for each other; single pairs, each with a
+# message and a transaction, would cost the loop more.
+MAX_PAIRS = 8
+
+
+class Estimating:
+    """Jobs that estimate F of a few pairs each."""
+
+    def __init__(self, run: Run) -> None:
+        self._run = run
+
+    def job(self, due: Sequence[int]) -> EstimateJob:
+        """Return a job for the first pairs that are due. A pair whose job was lost is alone in its
+        job.
+        """
+        run = self._run
+        state = run.state
+        alone = {index for index in due if ("estimate", index) in state.tries.alone}
+        is_retry = due[0] in alone
+        chosen = [due[0]]
+        if not is_retry:
+            chosen = [index for index in due if index not in alone][:MAX_PAIRS]
+        begun: list[int] = []
+        for index in chosen:
+            # One estimate serves all rows with the same images.
+            if not state.estimating[index]:
+                state.begin(state.estimating, [index])
+                begun.append(index)
+        pairs = tuple(state.inputs_of(index) for index in begun)
+        return EstimateJob(pairs, state.request.recipe, run.source(pairs), is_retry)
+
+    def patience(self, job: EstimateJob) -> float | None:
+        # Without a measurement the mean is 0.
+        return HANG_FACTOR * len(job.pairs) * self._run.costs.mean(ESTIMATE) or None
+
+    def save(self, job: EstimateJob, answer: Sequence[Estimated], seconds: float) -> None:
+        run = self._run
+        state = run.state
+        # Under the key of the points that the worker read, which may be older than the state's.
+        results = []
+        for pair, found in zip(job.pairs, answer, strict=True):
+            key = state.request.keys.of_estimate(state.pairs[pair.index], found.points)
+            results.append(Result(key, Kind.ESTIMATE, ESTIMATED.to_json(found)))
+        run.store.put(results)
+        state.end(state.estimating, (pair.index for pair in job.pairs))
+        for pair, found, result in zip(job.pairs, answer, results, strict=True):
+            self._use(pair.index, result)
+            run.costs.observe(ESTIMATE, found.seconds)
+        run.log.estimated += len(answer)
+        # While pairs are matched, the bar shows those.
+        if not state.matching.any():
+            total = int(state.has[: state.rows].any(1).sum())
+            pending = int(lacking_estimates(state).sum())
+            run.progress.show("estimate", total - pending, total)
+
+    def _use(self, index: int, result: Result) -> None:
+        """Use an estimate, even if its pair has newer points meanwhile: the former estimate is
+        older still.
+        """
+        state = self._run.state
+        for each in state.alike(index):
+            # Without points, an image has changed since, and the estimate belongs to its former
+            # content.
+            if state.has[each].any():
+                state.use_estimate(each, result.key, result.about)
+                state.estimated[each] = state.estimate_key(each) == result.key
+                state.note_change(each)
+
+    def lose(self, job: EstimateJob, failure: Failure) -> None:
+        run = self._run
+        state = run.state
+        indices = [pair.index for pair in job.pairs]
+        state.end(state.estimating, indices)
+        if state.tries.lose([("estimate", index) for index in indices], failure):
+            run.log.explain(f"pair {indices[0]} keeps the F it has: {failure}")
+
+
+class Features:
+    """Features of images by key: the ones ``found``, and the jobs ``pending``.
+
+    They come before any pair: similar images and orientations decide which pairs there are.
+    """
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self._tries = Tries()  # the tries of pairs belong to a request's state
+        self.found: dict[str, Any] = {}
+        self.pending: dict[str, FeatureJob] = {}
+
+    def ask(self, jobs: Mapping[str, Callable[[], Any]]) -> None:
+        """Find features in the store; the others become pending."""
+        about = self._store.about(jobs)
+        # Features that are no JSON value are data.
+        data = self._store.data(key for key in about if about[key] is None)
+        self.found = {**about, **data}
+        self.pending = {
+            key: FeatureJob(key, do) for key, do in jobs.items() if key not in self.found
+        }
+
+    def next(self) -> FeatureJob:
+        """Return the next pending job, which is under way then."""
+        # In the order of asking: a dict keeps it.
+        return self.pending.pop(next(iter(self.pending)))
+
+    def patience(self, job: FeatureJob) -> None:
+        """Return ``None``: the cost of an arbitrary function is unknown."""
+
+    def save(self, job: FeatureJob, answer: Found, seconds: float) -> None:
+        value = answer.value
+        # Keypoints and descriptors are bytes; partners of images are JSON.
+        if isinstance(value, bytes):
+            result = Result(job.key, Kind.FEATURES, None, value)
+        else:
+            result = Result(job.key, Kind.FEATURES, value)
+        self._store.put([result])
+        self.found[job.key] = value
+
+    def lose(self, job: FeatureJob, failure: Failure) -> None:
+        # A feature lost twice is left out; its image is only compared with no others.
+        if not self._tries.lose([("features", job.key)], failure):
+            self.pending[job.key] = job

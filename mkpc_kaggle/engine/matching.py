@@ -1,0 +1,231 @@
+"""Matching: the schedule's jobs with their inputs, explained phases, results and losses."""
+
+import sqlite3
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+
+from mkpc_kaggle.engine.image_files import image_results
+from mkpc_kaggle.engine.jobs import Cause, Failure, MatchJob, Outcome, Phase
+from mkpc_kaggle.engine.records import UNIT_FACTS, UnitFacts
+from mkpc_kaggle.engine.run import HANG_FACTOR, Run
+from mkpc_kaggle.engine.schedule import Crew, NextWork, outlook, upcoming_pairs
+from mkpc_kaggle.engine.store import Kind, Result, from_bytes, to_bytes
+from mkpc_kaggle.pipeline.pair import UnitResult
+
+# A unit that was given up on this number of pairs, and never ran, is skipped on all pairs.
+MAX_FAILED_PAIRS = 2
+
+
+class Matching:
+    """Jobs that run units on a pair, or on a minibatch of pairs."""
+
+    def __init__(self, run: Run) -> None:
+        self._run = run
+        self._shown: NextWork | None = None  # the phase of the bar, with its number of pairs
+        self._explained = ""  # the phase that was explained last
+        self._is_announced = False  # the outlook, once all costs were measured
+
+    # Before a job
+
+    def explain(self, work: NextWork, crew: Crew, now: float) -> None:
+        """Explain a change of the phase or of the units that fit. Announce the outlook once it is
+        measured.
+        """
+        run = self._run
+        self._shown = work
+        # During the sweep, only one cost is measured.
+        if work.phase is Phase.SWEEP:
+            return
+        # In other phases, the number of units that fit changes with each pair.
+        fitting = f"{work.phase} {work.fit if work.phase is Phase.DEEPEN else ''}"
+        if fitting == self._explained and self._is_announced:
+            return
+        # Nothing is announced before it is measured.
+        text = outlook(run.state, run.costs, run.budget, crew, now)
+        if not text:
+            fitting = f"{work.phase}, unmeasured"
+        if fitting != self._explained:
+            run.log.explain(f"{work.phase}: {text or 'not all units were measured yet'}")
+            self._explained = fitting
+        if text and not self._is_announced:
+            run.progress.note(text)
+            self._is_announced = True
+
+    def forget(self) -> None:
+        """Explain the phase again, since another device takes over."""
+        self._explained = ""
+
+    def fill(self, job: MatchJob, minibatch: int) -> MatchJob | None:
+        """Return the schedule's job with its pairs, and the points that their crops come from.
+
+        Return ``None`` if the points cannot be read: the job is lost then.
+        """
+        state = self._run.state
+        state.begin(state.matching, job.indices)
+        if job.phase is Phase.FILL:
+            state.begin(state.filling, job.indices)
+        # Units of stage 1 look at whole images and need no points.
+        known: list[tuple[UnitResult, ...]] = [()] * len(job.indices)
+        crops: list[tuple[str, ...]] = [()] * len(job.indices)
+        if any(unit.stage == 2 for unit in job.units):
+            # Crops come from points of today alone. Others may be of former settings.
+            crops = [tuple(state.first_stage(index)) for index in job.indices]
+            inputs = zip(job.indices, crops, strict=True)
+            try:
+                known = [self._points_of(index, keys) for index, keys in inputs]
+            except (sqlite3.Error, KeyError) as error:  # a disk that fails
+                self.lose(job, Failure(Cause.RAISED, f"the store cannot be read: {error}"))
+                return None
+        upcoming = upcoming_pairs(state, job, minibatch)
+        return replace(
+            job,
+            pairs=tuple(state.pairs[index] for index in job.indices),
+            names=tuple(state.names[index] for index in job.indices),
+            known=tuple(known),
+            crops=tuple(crops),
+            upcoming=tuple(path for index in upcoming for path in state.pairs[index].images),
+        )
+
+    def _points_of(self, index: int, keys: Sequence[str]) -> tuple[UnitResult, ...]:
+        if not keys:
+            return ()
+        # The only read of the loop: the arrays of all points would not fit in memory.
+        data = self._run.store.data(keys)
+        units = {key: unit for unit, key in self._run.state.inputs_of(index).points.items()}
+        return tuple(UnitResult(units[key], from_bytes(data[key])) for key in keys)
+
+    def patience(self, job: MatchJob) -> float | None:
+        """Return the seconds after which a job counts as hung, warm-up included; ``None`` if a cost
+        is unknown.
+        """
+        costs = self._run.costs
+        # A warm-up alone says little: it may take a hundred times as long as a later run, or less.
+        if not all(costs.is_known(unit.name) for unit in job.units):
+            return None
+        expected = len(job.indices) * sum(costs.mean(unit.name) for unit in job.units)
+        return HANG_FACTOR * expected + costs.warm_up(job.units)
+
+    # Answers
+
+    def save(self, job: MatchJob, answer: Sequence[Outcome], seconds: float) -> None:
+        run = self._run
+        results = [
+            self._results(index, outcome, crops)
+            for index, outcome, crops in zip(job.indices, answer, job.crops, strict=True)
+        ]
+        # First the store, in one transaction: results in the state are never lost.
+        run.store.put(result for rows in results for result in rows)
+        self._end(job)
+        for index, outcome, rows in zip(job.indices, answer, results, strict=True):
+            self._use(index, outcome, rows)
+            for found in outcome.found:
+                run.costs.observe(found.unit.name, found.seconds, warm_up=found.warm_up)
+                run.log.units_run += 1
+        if (work := self._shown) is not None:
+            # The schedule counted the finished pairs before this answer.
+            done = min(work.total, work.done + len(job.indices))
+            run.progress.show(str(work.phase), done, work.total)
+
+    def _results(self, index: int, outcome: Outcome, crops: Sequence[str]) -> list[Result]:
+        """Return the new points of a pair, and its images, as rows of the store.
+
+        Changes the state's images alone. ``crops`` are the keys of the points of stage 1 that the
+        job had.
+        """
+        state = self._run.state
+        images = outcome.images
+        if not images:
+            return []
+        results = self._use_images(outcome)
+        # If an image changed while the job ran, the crops come from points of its former content.
+        are_valid = state.first_stage(index) == list(crops)
+        # The keys of stage 1 by unit, since crops depend on them in the recipe's order.
+        first = {
+            number: key
+            for number, key in enumerate(state.points[index])
+            if state.current[index, number] and not state.is_crop[number]
+        }
+        # Failures are not stored: the next run tries them again.
+        good = [found for found in outcome.found if not found.failure]
+        for found in good:
+            number = state.number_of[found.unit.name]
+            is_crop = state.is_crop[number]
+            if is_crop and not are_valid:
+                continue  # the unit stays missing and runs again
+            key = state.key_of(index, number, images, [first[n] for n in sorted(first)])
+            # An answer has stage 1 first: its units of stage 2 looked at crops from all of stage 1.
+            if not is_crop:
+                first[number] = key
+            facts = UNIT_FACTS.to_json(_facts(found, outcome, len(good)))
+            results.append(Result(key, Kind.POINTS, facts, to_bytes(found.matches)))
+        return results
+
+    def _use_images(self, outcome: Outcome) -> list[Result]:
+        """Use the images of an answer, and return the new ones as rows of the store."""
+        state = self._run.state
+        results = []
+        for image, file in zip(outcome.images, outcome.files, strict=True):
+            # Most images are in many pairs, and are stored once.
+            if state.images.get(image.name) != image:
+                results += image_results(image, file)
+            state.use_image(image)
+        return results
+
+    def _use(self, index: int, outcome: Outcome, results: Sequence[Result]) -> None:
+        """Use the points of an answer, on all rows with the same images."""
+        state = self._run.state
+        points = [result for result in results if result.kind is Kind.POINTS]
+        for each in state.alike(index):
+            # An unreadable image stays unreadable in this run, and a matcher that raised raises again.
+            if outcome.failure:
+                state.give_up(("pair", each), Failure(Cause.UNREADABLE, outcome.failure))
+            for found in outcome.found:
+                if found.failure:
+                    failure = Failure(Cause.UNIT_RAISED, found.failure)
+                    state.give_up(("unit", each, found.unit.name), failure)
+            for result in points:
+                number = state.number_of[result.about["unit"]]
+                state.use_points(each, number, result.key, result.about["matches"])
+            if points:
+                state.note_points(each)
+
+    def lose(self, job: MatchJob, failure: Failure) -> None:
+        run = self._run
+        state = run.state
+        self._end(job)
+        items = [("unit", index, unit.name) for index in job.indices for unit in job.units]
+        if failure.cause is Cause.DEVICE:  # counts against the worker's place, not the unit
+            state.tries.alone.update(items)
+            return
+        if not state.tries.lose(items, failure):
+            return
+        ((_, index, name),) = items  # only a single item is given up
+        state.give_up(items[0], failure)
+        run.log.explain(f"{name} is skipped on pair {index} ({failure})")
+        # A unit that never ran on any pair would cost two workers for each.
+        given_up = Counter(state.given_up_units())
+        if given_up[name] >= MAX_FAILED_PAIRS and not run.costs.mean(name):
+            state.give_up(("matcher", name), failure)
+            run.log.explain(f"{name} is skipped on all pairs: it never ran ({failure})")
+
+    def _end(self, job: MatchJob) -> None:
+        state = self._run.state
+        state.end(state.matching, job.indices)
+        state.end(state.filling, job.indices)
+
+
+def _facts(found: UnitResult, outcome: Outcome, units: int) -> UnitFacts:
+    """Return the facts about one of the ``units`` of an answer."""
+    return UnitFacts(
+        unit=found.unit.name,
+        matches=len(found.matches),
+        keypoints=found.keypoints,
+        # The pair's own seconds are shared by the units of a job.
+        decode_seconds=outcome.decode_seconds / units,
+        cluster_seconds=outcome.cluster_seconds / units,
+        encode_seconds=found.encode_seconds,
+        match_seconds=found.match_seconds,
+        note=found.note,
+        regions=(outcome.regions or ()) if found.unit.stage == 2 else (),
+    )

@@ -1,0 +1,116 @@
+"""Publication: versions of the results, in the request's own files and as the table of pairs."""
+
+import threading
+
+from mkpc_kaggle.engine.budget import Budget
+from mkpc_kaggle.engine.jobs import Cause
+from mkpc_kaggle.engine.records import Row, Table
+from mkpc_kaggle.engine.run import EventLog
+from mkpc_kaggle.engine.state import SOURCES, State
+from mkpc_kaggle.engine.store import Store
+
+INTERVAL_S = 30.0  # between versions: a run that is killed loses at most this from its submission
+TIME_SHARE = 0.05  # maximum share of the time for writing versions, if a disk is slow
+
+
+class Publication:
+    """The versions of a request's results. The loop publishes; the watchdog may save the last
+    version from its own thread.
+    """
+
+    def __init__(self, state: State, store: Store, budget: Budget, log: EventLog) -> None:
+        self._state = state
+        self._store = store
+        self._budget = budget
+        self._log = log
+        self._lock = threading.Lock()
+        self._has_ended = False
+        self._published = budget.clock()
+        self._rows: list[Row | None] = [None] * len(state.pairs)
+        self.unwritten = ""  # why the latest version could not be written
+
+    def is_due(self, now: float) -> bool:
+        interval = max(INTERVAL_S, self._budget.writing / TIME_SHARE)
+        return now - self._published > interval
+
+    def publish(self) -> None:
+        """Write the results, and the table of pairs that names them."""
+        state = self._state
+        # Without pairs, as in a folder of one image, no file of the request changes.
+        if not state.rows:
+            return
+        start = self._budget.clock()
+        if trouble := self.save():
+            self._log.fault(trouble)
+        # A trial's pairs are not the run's, whose table stays until its own pairs are known.
+        if not state.request.is_trial:
+            self._store.put([self.table().to_result()])
+        # The measured time decides when the last version is written.
+        self._published = self._budget.clock()
+        self._budget.note_write(self._published - start)
+
+    def save(self) -> str:
+        """Write the results unless the run has ended. Return why that failed, or an empty text."""
+        # The loop and the watchdog would write the same temporary file.
+        with self._lock:
+            if not self._has_ended:
+                try:
+                    self._state.request.publish(self._state)
+                    self.unwritten = ""
+                # A full disk must not end the run; other errors are bugs and do.
+                except OSError as error:
+                    self.unwritten = f"the results cannot be written: {error}"
+        return self.unwritten
+
+    def end(self) -> None:
+        """Publish the last version. After it, the watchdog writes no other."""
+        self.publish()
+        self._has_ended = True
+
+    def table(self) -> Table:
+        """Return the table of pairs. Only rows that have changed since the last table are built
+        again.
+        """
+        state = self._state
+        sources = state.sources
+        for index in state.changed:
+            # An extra pair has no row in the submission, and so no written F.
+            source = SOURCES[sources[index]] if index < state.rows else ""
+            self._rows[index] = _row(state, index, source)
+        state.changed.clear()
+        units = [(unit.name, unit.stage) for unit in state.units]
+        rows = [row for row in self._rows if row is not None]
+        scenes = dict(state.scene_keys)
+        return Table(state.request.about, units, state.rows, rows, scenes, state.fundamentals)
+
+
+def _row(state: State, index: int, source: str) -> Row:
+    pair = state.pairs[index]
+    image0, image1 = state.names[index]
+    points = state.points[index].tolist()
+    given_up = state.tries.given_up
+    # Lost workers are faults of the run; a row has the errors that matchers raised on its pair.
+    failures = {}
+    for unit in state.units:
+        failure = given_up.get(("unit", index, unit.name))
+        if failure is not None and failure.cause is Cause.UNIT_RAISED:
+            failures[unit.name] = failure.message
+    reason = ""
+    if unread := given_up.get(("pair", index)):
+        reason = unread.message
+    elif failures and not any(points):
+        reason = next(iter(failures.values()))
+    return Row(
+        id=pair.id,
+        batch=pair.group,
+        image0=image0,
+        image1=image1,
+        turns0=pair.turns[0],
+        turns1=pair.turns[1],
+        contents=state.contents(index),
+        points=points,
+        estimate=state.estimates[index],
+        source=source,
+        failures=failures,
+        failure=reason,
+    )

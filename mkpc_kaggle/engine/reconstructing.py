@@ -1,0 +1,101 @@
+"""Scenes of batches: their jobs, time limits, results and losses."""
+
+import numpy as np
+
+from mkpc_kaggle.engine.budget import SCENE_MATCH_S, SCENE_START_S
+from mkpc_kaggle.engine.jobs import Failure, SceneJob
+from mkpc_kaggle.engine.records import NOT_RECONSTRUCTED, SCENE, EventKind, SceneRecord
+from mkpc_kaggle.engine.restore import EXPORT
+from mkpc_kaggle.engine.run import HANG_FACTOR, Run
+from mkpc_kaggle.engine.state import State
+from mkpc_kaggle.engine.store import Kind, Result
+from mkpc_kaggle.scene.reconstruct import Solution
+
+
+class Reconstructing:
+    """Jobs that reconstruct a batch each."""
+
+    def __init__(self, run: Run) -> None:
+        self._run = run
+
+    def job(self, batch: str) -> SceneJob:
+        """Return the job of a batch, from the results in use now.
+
+        If its pairs get other results meanwhile, the scene is stale when it arrives.
+        """
+        run = self._run
+        state = run.state
+        # Not removed from the stale batches yet: the job may be lost.
+        state.reconstructing.add(batch)
+        indices, key = state.scene_inputs(batch)
+        pairs = tuple(state.inputs_of(index) for index in indices)
+        export = state.request.exports.get(batch)
+        if export is not None:
+            # From now on the files may be replaced, so they belong to no stored scene.
+            run.store.remove(EXPORT + batch)
+        run.progress.note(f"batch {batch}: reconstructing its cameras from {len(pairs)} pairs")
+        return SceneJob(
+            batch,
+            key,
+            pairs,
+            contents=tuple(state.contents(index) for index in indices),
+            recipe=state.request.recipe,
+            source=run.source(pairs),
+            matches=int(state.matches[indices].sum()),
+            export=export,
+        )
+
+    def patience(self, job: SceneJob) -> float:
+        forecast = float(self._run.costs.scenes(np.array([job.matches]))[0])
+        # Small scenes measured so far say little about the time of a large one.
+        return HANG_FACTOR * max(forecast, SCENE_START_S + SCENE_MATCH_S * job.matches)
+
+    def save(self, job: SceneJob, answer: Solution, seconds: float) -> None:
+        """Save and use a scene, even if it is stale: the former scene is older still."""
+        run = self._run
+        state = run.state
+        choices = dict(zip(job.contents, answer.choices, strict=True))
+        record = SceneRecord.of(job.batch, answer.reconstructions, seconds, choices)
+        images = [image for pair in job.pairs for image in pair.images]
+        # With them, a former scene is known to be of the present images, without reading its points.
+        digests = {image.name: image.digest for image in images}
+        about = {"scene": SCENE.to_json(record), "digests": digests}
+        rows = [Result(job.key, Kind.SCENE, about)]
+        # In the same transaction, a mark: these files belong to this scene.
+        if job.export is not None:
+            rows.append(Result(EXPORT + job.batch, Kind.EXPORT, job.key))
+        run.store.put(rows)
+        # The time of the loop, with the process's start: the forecast needs both.
+        run.costs.observe_scene(job.matches, seconds)
+        state.reconstructing.discard(job.batch)
+        state.use_scene(job.batch, job.key, record)
+        # Otherwise pairs have got other results meanwhile, and the batch stays stale.
+        if state.scene_inputs(job.batch)[1] == job.key:
+            state.stale.discard(job.batch)
+        text = f"{record.registered} of {record.images} images"
+        run.log.note(EventKind.SCENE, f"{job.batch}: {text}")
+        run.progress.note(f"batch {job.batch}: {text} have a camera")
+
+    def lose(self, job: SceneJob, failure: Failure) -> None:
+        run = self._run
+        state = run.state
+        run.log.fault(f"batch {job.batch} was not reconstructed: {failure}")
+        state.reconstructing.discard(job.batch)
+        if state.tries.lose([("scene", job.batch, job.key)], failure):
+            # The batch becomes stale again when its inputs change.
+            state.stale.discard(job.batch)
+
+
+def scene_records(state: State) -> tuple[SceneRecord, ...]:
+    """Return the scene of each batch, in order; ``failure`` is the reason for a missing scene."""
+    everywhere = state.tries.given_up.get(("scenes",))
+    reason = str(everywhere) if everywhere else NOT_RECONSTRUCTED
+    reasons = dict.fromkeys(state.batches, reason)
+    for item, failure in state.tries.given_up.items():
+        match item:
+            case ("scene", str(batch), _):
+                reasons[batch] = str(failure)
+    return tuple(
+        state.scenes.get(batch) or SceneRecord(batch, failure=reasons[batch])
+        for batch in state.batches
+    )

@@ -1,0 +1,116 @@
+"""Reading the store, once: a new state gets the results of today, and former results that stand in
+for missing ones.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from mkpc_kaggle.engine.image_files import known_images
+from mkpc_kaggle.engine.records import SCENE, Row, Table
+from mkpc_kaggle.engine.state import State
+from mkpc_kaggle.engine.store import Store
+from mkpc_kaggle.scene.export import has_files
+
+EXPORT = "export "  # prefix of the keys of marks; a mark names the scene of a batch's files
+
+
+def restore(state: State, store: Store, digests: Mapping[str, str]) -> None:
+    """Find today's results, and for missing ones the results of the former table of pairs.
+
+    ``digests`` are the known digests of the images' contents, by name.
+    """
+    state.images = known_images(store, digests)
+    former = Table.of(store)
+    # By contents and not by id: another test set may name the same two images.
+    rows = {row.contents: row for row in former.rows if row.contents}
+    known = [index for index in range(len(state.pairs)) if state.images_of(index)]
+    old = {index: rows[state.contents(index)] for index in known if state.contents(index) in rows}
+    units = [name for name, _ in former.units]
+    # Stage 1 first, because the keys of stage 2 depend on it. Then estimates, then scenes, for the
+    # same reason.
+    for stage in (False, True):
+        numbers = np.flatnonzero(state.is_crop == stage).tolist()
+        _restore_points(state, store, known, numbers, _former_points(state, old, units, numbers))
+    _restore_estimates(state, store, known, old)
+    _restore_scenes(state, store, former, digests)
+
+
+def _former_points(
+    state: State, old: Mapping[int, Row], units: list[str], numbers: list[int]
+) -> dict[tuple[int, int], str]:
+    """Return the keys of the former points of pairs and units, if any."""
+    found = {}
+    for index, row in old.items():
+        by_unit = dict(zip(units, row.points, strict=True))
+        for number in numbers:
+            if key := by_unit.get(state.units[number].name):
+                found[index, number] = key
+    return found
+
+
+def _restore_points(
+    state: State,
+    store: Store,
+    known: list[int],
+    numbers: list[int],
+    former: Mapping[tuple[int, int], str],
+) -> None:
+    # All keys first, because one query for thousands of keys is much faster than one for each.
+    today: dict[tuple[int, int], str] = {}
+    for index in known:
+        images = state.images_of(index)
+        assert images
+        first = state.first_stage(index)
+        for number in numbers:
+            today[index, number] = state.key_of(index, number, images, first)
+    about = store.about([*today.values(), *former.values()])
+    for (index, number), key in today.items():
+        is_current = key in about
+        # Points of former settings are better than none.
+        used = key if is_current else former.get((index, number), "")
+        if used in about:
+            state.use_points(index, number, used, about[used]["matches"])
+            state.current[index, number] = is_current
+
+
+def _restore_estimates(
+    state: State, store: Store, known: list[int], old: Mapping[int, Row]
+) -> None:
+    # From the points in use: an estimate from former points is up to date until others replace them.
+    today = {index: state.estimate_key(index) for index in known if state.has[index].any()}
+    former = {index: row.estimate for index, row in old.items() if row.estimate}
+    about = store.about([*today.values(), *former.values()])
+    for index, key in today.items():
+        state.estimated[index] = key in about
+        # As long as the images are the same, the former F is better than the fallback.
+        used = key if key in about else former.get(index, "")
+        if used in about:
+            state.use_estimate(index, used, about[used])
+
+
+def _restore_scenes(state: State, store: Store, former: Table, digests: Mapping[str, str]) -> None:
+    today = {batch: state.scene_inputs(batch)[1] for batch in state.batches}
+    about = store.about([*today.values(), *former.scenes.values()])
+    marks = store.about(EXPORT + batch for batch in state.request.exports)
+    for batch, key in today.items():
+        used = key if key in about else former.scenes.get(batch, "")
+        if used not in about:
+            continue  # the batch stays stale
+        record = SCENE.of_json(about[used]["scene"])
+        if directory := state.request.exports.get(batch):
+            # A scene without its COLMAP files is made again.
+            has_mark = marks.get(EXPORT + batch) == used
+            if not has_mark or not has_files(directory, len(record.models)):
+                continue
+        if _has_images(about[used], digests):
+            state.use_scene(batch, used, record)
+            if used == key:
+                state.stale.discard(batch)
+
+
+def _has_images(about: Mapping[str, Any], digests: Mapping[str, str]) -> bool:
+    """Return whether no known image of a scene has changed since; else it must not stand in."""
+    contents = about["digests"]
+    return all(digests.get(name, content) == content for name, content in contents.items())

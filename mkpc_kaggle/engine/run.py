@@ -1,0 +1,82 @@
+"""The common part of all kinds of work: the run's state, store, costs, and events.
+
+Each kind has a file, from its jobs to their results: :mod:`matching`, :mod:`light`
+(estimates, features of images) and :mod:`reconstructing`.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from secrets import token_hex
+from typing import Any, Protocol
+
+from mkpc_kaggle.engine.budget import Budget, Costs
+from mkpc_kaggle.engine.console import Progress
+from mkpc_kaggle.engine.jobs import Failure, PairInputs
+from mkpc_kaggle.engine.records import EVENT, Event, EventKind
+from mkpc_kaggle.engine.state import State
+from mkpc_kaggle.engine.store import Kind, Result, Source, Store
+
+# A job that takes this multiple of its measured cost hangs. Stalls of twenty times the cost, as in the
+# simulator, must not cost a worker.
+HANG_FACTOR = 30.0
+
+
+class EventLog:
+    """The events and counts of this program, for its final report."""
+
+    def __init__(self, store: Store, budget: Budget) -> None:
+        self._store = store
+        self._budget = budget
+        self.faults: list[str] = []
+        self.plans: list[Event] = []
+        self.units_run = 0
+        self.estimated = 0
+
+    def note(self, kind: EventKind, text: str = "") -> Event:
+        event = Event(kind, self._budget.spent(), text)
+        note_event(self._store, event)
+        return event
+
+    def explain(self, text: str) -> None:
+        """Record a decision."""
+        self.plans.append(self.note(EventKind.PLAN, text))
+
+    def fault(self, text: str) -> None:
+        """Record a fault, once for each text: a broken disk would fill the store with them."""
+        if text not in self.faults:
+            self.faults.append(text)
+            self.note(EventKind.FAULT, text)
+
+
+def note_event(store: Store, event: Event) -> None:
+    # A random key, since several programs may write events of the same second to one store.
+    store.put([Result(f"event {token_hex(8)}", Kind.EVENT, EVENT.to_json(event))])
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A request's state, and where its results, costs and messages go."""
+
+    state: State
+    store: Store
+    costs: Costs
+    budget: Budget
+    log: EventLog
+    progress: Progress
+
+    def source(self, pairs: Sequence[PairInputs]) -> Source:
+        """Return where a worker finds the points of these pairs."""
+        return self.store.source([key for pair in pairs for key in pair.points.values()])
+
+
+class JobHandler(Protocol):
+    """The part of a kind of work that the loop calls for any job; each kind also makes its jobs."""
+
+    def patience(self, job: Any) -> float | None:
+        """Return the seconds after which a job counts as hung; ``None`` if its cost is unknown."""
+
+    def save(self, job: Any, answer: Any, seconds: float) -> None:
+        """Save the answer to a job that took ``seconds``: first in the store, then in the state."""
+
+    def lose(self, job: Any, failure: Failure) -> None:
+        """Let a lost job be tried again, item by item. Give up an item that was lost twice."""
