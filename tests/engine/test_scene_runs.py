@@ -173,7 +173,7 @@ def test_the_scene_of_a_run_is_made_of_tracks_and_judged_by_all_matches(tmp_path
     given: list[BatchPair] = []
 
     def note(job: SceneJob) -> Solution:
-        given[:] = [batch_pair(*each) for each in results_of(job)]
+        given[:] = [batch_pair(*each, keeps_paths=False) for each in results_of(job)]
         return choose_scene_for_all_but_the_first(job)
 
     scenes_by(monkeypatch, note)
