@@ -281,7 +281,11 @@ def scenes_due(
         return ()
     pending = state.estimating.copy()
     pending[estimates] = True
-    if is_matching:
+    if view.now >= view.stop:
+        # No unit begins any more, and it is too late to wait for estimates. A hung job may last until
+        # the end, so a first scene does not wait for its pairs.
+        waits = {False: np.zeros_like(pending), True: state.matching}
+    elif is_matching:
         early = first < FILL
         if phase < FILL:
             early |= pending | state.matching
@@ -291,8 +295,7 @@ def scenes_due(
             early |= (pending & ~state.has_own) | (state.matching & ~state.filling)
         waits = {False: early, True: pending | state.matching | (first < NEVER)}
     else:
-        # Near the end it is too late to wait for estimates.
-        waits = dict.fromkeys((False, True), pending & (view.now < view.stop))
+        waits = {False: pending, True: pending}
     # The number of pairs of each batch that are waited for, for a first and for a later scene.
     counts = {}
     for has_scene, waited in waits.items():

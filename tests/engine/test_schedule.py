@@ -254,6 +254,23 @@ def test_a_first_scene_waits_for_the_units_that_fit_and_a_later_scene_for_all():
     assert run.next_work().scenes == ("",)
 
 
+def test_a_first_scene_does_not_wait_for_a_job_that_hangs_until_the_end():
+    run = Run(6, limit=1000.0)
+    request = replace(run.state.request, recipe=replace(THREE_UNITS, scene=SceneConfig()))
+    run.state = State(request)
+    for index in range(5):
+        run.have(index, UNITS)
+        run.state.matches[index] = 50
+    run.state.estimated[:] = run.state.has_own[:] = True
+    run.learn(*UNITS)
+    run.state.begin(run.state.matching, [5])
+    stop = view_of(run).stop
+    assert run.next_work(stop - 1.0).scenes == ()
+    assert run.next_work(stop).scenes == ("",)
+    run.state.scenes[""] = None  # a later scene needs all points
+    assert run.next_work(stop).scenes == ()
+
+
 # The engine on a virtual clock
 
 
