@@ -28,7 +28,7 @@ MARGIN, MIN_MARGIN = 0.4, 0.01
 SCENE_START_S = 3.0  # start-up time of a scene's process
 # Per match of a reconstruction: the initial forecast, and a lower bound for the limit of a hang.
 SCENE_MATCH_S = 5e-4
-# Factor on a forecast from earlier scenes: their time depends on more than their matches.
+# Factor on a forecast: the time of scenes depends on more than their matches.
 SCENE_MARGIN = 1.5
 ESTIMATE = "estimate"  # the name of the cost of an estimate
 MAX_STEP_BACK_S = 60.0  # of the wall clock, between --started-at and the start
@@ -177,8 +177,8 @@ class Costs:
         # The matches of all scenes together, because small ones are mostly start-up time.
         rate = SCENE_MATCH_S
         if self._scene_matches:
-            rate = SCENE_MARGIN * self._scene_seconds / self._scene_matches
-        return np.asarray(SCENE_START_S + matches * rate)
+            rate = self._scene_seconds / self._scene_matches
+        return np.asarray(SCENE_START_S + matches * SCENE_MARGIN * rate)
 
     def warm_up(self, units: Iterable[Unit]) -> float:
         """Return the longest warm-up of these units, in seconds, by the latest of each unit."""

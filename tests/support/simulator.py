@@ -49,7 +49,7 @@ from mkpc_kaggle.scene.view_graph import BatchImage
 
 RESTART_S = 8.0
 ESTIMATE_S = 0.1  # of a pair
-WAKE_S = 5.0  # the longest wait; the real loop wakes every 0.2 s, and may give out other work then
+WAKE_S = 1.0  # the longest wait; the real loop wakes every 0.2 s, and may give out other work then
 STALL = 20.0  # how many times as long a unit takes that stalls
 SIZE = Size(640, 480)
 MATCHES = 200  # that a unit finds
