@@ -9,7 +9,8 @@ from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import PairwiseMatcher
 from mkpc_kaggle.matchers.sparse import Keypoints, matches_of
 
-BLOCK_ROWS = 2048
+BLOCK_ROWS = 512  # a block of 512 x 8,000 similarities fits the cache
+GROUP = 64  # keys
 
 
 @dataclass(frozen=True)
@@ -67,16 +68,25 @@ def _nearest(queries: Tensor, keys: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return each query's highest similarity, distance ratio and index of the nearest key, all
     (N,).
     """
+    rest = -len(keys) % GROUP
+    filled = torch.cat([keys, keys.new_zeros(rest, keys.shape[1])])
     parts = []
     for block in torch.split(queries, BLOCK_ROWS):
-        similarity = block @ keys.T  # (rows, M)
-        best, index = similarity.max(dim=1)
-        similarity.scatter_(1, index[:, None], -1.0)
-        second = similarity.amax(dim=1)
+        similarity = block @ filled.T  # (rows, M)
+        similarity[:, len(keys) :] = -1.0
+        # Only the maximum of each group is taken over all keys: a search for its index is slow.
+        groups = similarity.unflatten(1, (-1, GROUP))
+        highest = groups.amax(dim=2)
+        best, group = highest.max(dim=1)
+        inside = groups.gather(1, group[:, None, None].expand(-1, 1, GROUP))[:, 0]
+        offset = inside.argmax(dim=1)
+        # The second nearest is in the same group or has the maximum of another group.
+        inside.scatter_(1, offset[:, None], -1.0)
+        highest.scatter_(1, group[:, None], -1.0)
+        second = torch.maximum(inside.amax(dim=1), highest.amax(dim=1))
         # Distances of unit vectors are sqrt(2 - 2 s); the ratio of two neighbours at distance 0 is
         # 1.
-        parts.append(
-            (best, ((1 - best).clamp(min=1e-12) / (1 - second).clamp(min=1e-12)).sqrt(), index)
-        )
+        ratio = ((1 - best).clamp(min=1e-12) / (1 - second).clamp(min=1e-12)).sqrt()
+        parts.append((best, ratio, group * GROUP + offset))
     best, ratio, index = map(torch.cat, zip(*parts, strict=True))
     return best, ratio, index
