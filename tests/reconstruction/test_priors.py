@@ -3,21 +3,24 @@ again.
 """
 
 import csv
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from rectified import Seen
 from shared import run_command
 from test_reconstruct import FIRST, RECIPE, MixedMatcher, cameras, contents, write_flat
 
 from benchmarks.synthetic_scene import SIZE
 from mkpc_kaggle.data.masks import MaskReader, Masks
 from mkpc_kaggle.engine.budget import Budget
+from mkpc_kaggle.engine.request import Ending
 from mkpc_kaggle.engine.session import Interrupt, Session
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.intrinsics import KnownCamera, read
+from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.reconstruction.folder import read_folder
 from mkpc_kaggle.reconstruction.priors import read_intrinsics_table
@@ -39,9 +42,15 @@ def run(
     *,
     known: str = "",
     masks: Masks | None = None,
+    interrupt: Interrupt | None = None,
+    budget: Budget | None = None,
 ) -> FolderResult:
     session = Session(
-        out / "work", Budget(0.0, float("inf")), Interrupt(), progress=False, workers=0
+        out / "work",
+        budget or Budget(0.0, float("inf")),
+        interrupt or Interrupt(),
+        progress=False,
+        workers=0,
     )
     assembly = assemble(RECIPE, matchers={"synthetic": matcher or MixedMatcher()}, device="cpu")
     assembly = replace(
@@ -186,6 +195,81 @@ def test_another_mask_is_matched_again_and_other_intrinsics_are_not(tmp_path):
     assert len(matcher.calls) == FIRST - 1, "the pairs of the image whose mask changed"
     run(root, out)
     assert contents(out) == before, "without the options, the first results again"
+
+
+@dataclass
+class StoppingMatcher(MixedMatcher):
+    """Ends the run, by Ctrl-C or by its time limit, while it matches a pair."""
+
+    last: int = 0  # the number of that pair
+    interrupt: Interrupt = field(default_factory=Interrupt)
+    seconds: float = 0.0
+    is_late: bool = False
+
+    def _match(self, seen0: Seen, seen1: Seen) -> Matches:
+        found = super()._match(seen0, seen1)
+        if len(self.calls) == self.last:
+            if self.is_late:
+                self.seconds = 1000.0
+            else:
+                self.interrupt.set()
+        return found
+
+
+@pytest.mark.parametrize("is_late", [False, True])
+def test_a_run_with_priors_that_was_ended_early_continues_to_the_same_bytes(tmp_path, is_late):
+    root, out = write_flat(tmp_path / "images", FIRST), tmp_path / "out"
+    table = tmp_path / "known.csv"
+    table.write_text(
+        f"{HEAD}00.png,SIMPLE_PINHOLE,901 400 300,fixed\n*,SIMPLE_PINHOLE,900 400 300,9\n"
+    )
+    known = read_intrinsics_table(table, root, sorted(root.iterdir()))
+    folder = write_masks(tmp_path / "masks", root, 200)
+    masks = Masks.of_folder(folder, root, root.iterdir())
+    whole = MixedMatcher()
+    run(root, tmp_path / "whole", whole, known=known, masks=masks)
+    calls = 0
+    for last in (1, 4, 7):
+        matcher = StoppingMatcher(last=last, is_late=is_late)
+        budget = Budget(0.0, 500.0, clock=lambda matcher=matcher: matcher.seconds)
+        result = run(
+            root,
+            out,
+            matcher,
+            known=known,
+            masks=masks,
+            interrupt=matcher.interrupt,
+            budget=budget if is_late else None,
+        )
+        assert result.report.ending == (Ending.TIME_IS_UP if is_late else Ending.INTERRUPTED)
+        calls += len(matcher.calls)
+    matcher = MixedMatcher()
+    run(root, out, matcher, known=known, masks=masks)
+    assert contents(out) == contents(tmp_path / "whole")
+    # A pair that was under way when the run ended is matched again, and no other.
+    assert calls + len(matcher.calls) <= len(whole.calls) + 3
+
+
+IN_OUT = {
+    "--intrinsics": lambda out: out / "cameras.csv",
+    "--masks": lambda out: out / "images",
+}
+
+
+@pytest.mark.parametrize("option", IN_OUT)
+def test_priors_in_the_directory_of_results_are_refused_and_stay(tmp_path, capsys, option):
+    root, out = write_flat(tmp_path / "images", 3), tmp_path / "out"
+    given = IN_OUT[option](out)
+    out.mkdir()
+    if option == "--masks":
+        write_masks(given, root)
+    else:
+        given.write_text(f"{HEAD}*,SIMPLE_PINHOLE,900 400 300,fixed\n")
+    before = contents(tmp_path)
+    assert run_command("reconstruct", root, "--out", out, option, given) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "are in each other's way" in line
+    assert contents(tmp_path) == before
 
 
 def test_the_table_is_read_in_the_order_of_its_rows(tmp_path):

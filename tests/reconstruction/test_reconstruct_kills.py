@@ -1,12 +1,15 @@
-"""A run over folders of images that is killed at random moments ends with the files of the
-undisturbed one.
+"""A run over folders of images that is ended at random moments, in any way, ends with the files of
+the undisturbed one.
 """
 
+import csv
 import random
 import shutil
+import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -14,43 +17,61 @@ import pytest
 from shared import write_recipe
 from test_reconstruct import contents
 
-ROUNDS, KILLS = 4, 5  # of each round, before the run that nobody disturbs
+from mkpc_kaggle.demo import DemoSet
+
+ROUNDS, ENDS = 4, 5  # of each round, before the run that nobody disturbs
+SIGNALS = (signal.SIGKILL, signal.SIGINT, signal.SIGTERM)
+
+
+def write_inputs(demo: DemoSet, home: Path) -> None:
+    """Write two datasets, an image of which lies on a side, masks of one, and a table of cameras."""
+    scene = demo.train_dir / "courtyard"
+    images = sorted((scene / "images").iterdir())
+    for name, files in (("a", images[:4]), ("b", images)):
+        (home / "images" / name).mkdir(parents=True)
+        for file in files:
+            shutil.copy(file, home / "images" / name)
+    lying = home / "images" / "b" / images[4].name
+    cv2.imwrite(str(lying), np.rot90(cv2.imread(str(lying))))
+    (home / "masks" / "a").mkdir(parents=True)
+    for file in images[:4]:
+        mask = np.full(cv2.imread(str(file)).shape[:2], 255, np.uint8)
+        mask[:40] = 0
+        cv2.imwrite(str(home / "masks" / "a" / f"{file.name}.png"), mask)
+    with (scene / "calibration.csv").open() as stream:
+        K = np.array(next(csv.DictReader(stream))["camera_intrinsics"].split(), float).reshape(3, 3)
+    camera = f"SIMPLE_PINHOLE,{K[0, 0]} {K[0, 2] + 0.5} {K[1, 2] + 0.5}"
+    rows = (f"a/{images[0].name},{camera},fixed", f"a/*,{camera},5")
+    (home / "known.csv").write_text("\n".join(["image,model,parameters,sigma", *rows, ""]))
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
-def test_a_run_that_is_killed_at_random_moments_ends_with_the_same_files(demo, tmp_path):
-    """Two datasets; in one of them an image lies on a side."""
-    images = sorted((demo.train_dir / "courtyard" / "images").iterdir())
-    for name, files in (("a", images[:3]), ("b", images)):
-        (tmp_path / "images" / name).mkdir(parents=True)
-        for file in files:
-            shutil.copy(file, tmp_path / "images" / name)
-    lying = tmp_path / "images" / "b" / images[4].name
-    cv2.imwrite(str(lying), np.rot90(cv2.imread(str(lying))))
+def test_a_run_that_is_ended_at_random_moments_ends_with_the_same_files(demo, tmp_path):
+    write_inputs(demo, tmp_path)
+    write_recipe(tmp_path / "small.toml", (1, 480), (2, 640))
 
-    def begin(out: str) -> "subprocess.Popen[bytes]":
-        recipe = str(tmp_path / "small.toml")
-        options = ["--recipe", recipe, "--rotations", "--format", "imc2025", "--workers", "1"]
-        command = [
-            "-m",
-            "mkpc_kaggle",
-            "reconstruct",
-            str(tmp_path / "images"),
-            "--out",
-            str(tmp_path / out),
-        ]
-        return subprocess.Popen([sys.executable, *command, *options], stdout=subprocess.DEVNULL)
+    def begin(out: str, *more: str) -> "subprocess.Popen[bytes]":
+        options = ["--recipe", str(tmp_path / "small.toml"), "--rotations", "--workers", "1"]
+        options += ["--masks", str(tmp_path / "masks"), "--format", "imc2025"]
+        options += ["--intrinsics", str(tmp_path / "known.csv"), *more]
+        command = ["reconstruct", str(tmp_path / "images"), "--out", str(tmp_path / out)]
+        return subprocess.Popen(
+            [sys.executable, "-m", "mkpc_kaggle", *command, *options],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
 
     def files_of(out: str) -> dict[str, str]:
         found = contents(tmp_path / out)
         del found["report.html"], found["summary.json"]  # they tell of times
         return found
 
-    write_recipe(tmp_path / "small.toml", (1, 320), (2, 400))
+    inputs = contents(tmp_path)
     start = time.monotonic()
     assert begin("undisturbed").wait() == 0
-    whole_s, expected, rng = time.monotonic() - start, files_of("undisturbed"), random.Random(0)
+    whole_s = time.monotonic() - start
+    expected = files_of("undisturbed")
     assert {
         "a/database.db",
         "b/models/0/points3D.bin",
@@ -58,16 +79,24 @@ def test_a_run_that_is_killed_at_random_moments_ends_with_the_same_files(demo, t
         "cameras.csv",
         "submission.csv",
     } <= expected.keys()
-    kills = 0
+    rng = random.Random(0)
+    ended = 0
     for number in range(ROUNDS):
-        for _ in range(KILLS):
-            process = begin(f"out{number}")
+        out = f"out{number}"
+        for _ in range(ENDS):
+            seconds = rng.uniform(0.0, 0.6 * whole_s)
+            way = rng.choice([*SIGNALS, None])
+            if way is None:
+                ended += begin(out, "--time-limit", f"{max(2.0, seconds):.0f}s").wait() != 0
+                continue
+            process = begin(out)
             try:
-                process.wait(rng.uniform(0.0, 0.6 * whole_s))
+                process.wait(seconds)
             except subprocess.TimeoutExpired:
-                process.kill()
-                kills += 1
+                process.send_signal(way)
+                ended += 1
             process.wait()
-        assert begin(f"out{number}").wait() == 0
-        assert files_of(f"out{number}") == expected
-    assert kills >= ROUNDS
+        assert begin(out).wait() == 0
+        assert files_of(out) == expected
+    assert ended >= ROUNDS
+    assert {name: text for name, text in contents(tmp_path).items() if name in inputs} == inputs
