@@ -1,5 +1,6 @@
 """Figures of pairs, with matches, clusters and critical regions, and of a scene's cameras."""
 
+from collections.abc import Sequence
 from io import BytesIO
 from math import sqrt
 from pathlib import Path
@@ -13,9 +14,11 @@ from mkpc_kaggle.data.images import Image
 from mkpc_kaggle.data.outputs import replacing
 from mkpc_kaggle.engine.records import SceneRecord
 from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Box, View
 from mkpc_kaggle.geometry.critical_region import CriticalRegion, MkpcConfig, find_clusters
 from mkpc_kaggle.pipeline.pair import PairMatch
+from mkpc_kaggle.scene.reconstruction import SfmModel
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -25,16 +28,20 @@ if TYPE_CHECKING:
 INLIER, OUTLIER, REGION, DROPPED = "#009E73", "#D55E00", "#F0E442", "#999999"
 COLOURS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#56B4E9", "#CC79A7")
 DPI = 110
-STRIP_HEIGHT_PX, MAX_STRIP_PX = 480, 2_000_000
-MAX_INLIERS, MAX_OUTLIERS = 150, 50  # maximum numbers of lines in a legible figure
+STRIP_HEIGHT_PX = 480
+MAX_STRIP_PX = 2_000_000  # a panorama would otherwise make a picture of many megabytes
+# Maximum numbers of lines in a legible figure
+MAX_INLIERS = 150
+MAX_OUTLIERS = 50
 
 
 def draw_pair(image0: Image, image1: Image, match: PairMatch, config: MkpcConfig) -> "Figure":
     """Draw the matches of all units and the critical regions, and below them the clusters of stage
     1.
     """
-    figure = new_figure(12, 9)
+    figure = new_figure(12, 9)  # inches: legible on a screen of 1,320 pixels
     panels = figure.subplot_mosaic([["matches", "matches"], ["0", "1"]])
+    # The title joins what is known: a failure is empty for most pairs.
     counts = f"{len(match.matches)} matches, {match.estimate.inlier_count} inliers"
     drawn = draw_matches(panels["matches"], (image0, image1), match)
     panels["matches"].set_title(
@@ -50,6 +57,7 @@ def draw_strip(images: tuple[Image, Image], match: PairMatch) -> "Figure":
     aspect = sum(view.content.width / view.content.height for view in map(_upright, images))
     height = min(STRIP_HEIGHT_PX, sqrt(MAX_STRIP_PX / aspect)) / DPI
     figure = new_figure(aspect * height, height)
+    # The constrained layout would leave a margin for text that a strip does not have.
     figure.set_layout_engine("none")
     draw_matches(figure.add_axes((0, 0, 1, 1)), images, match)
     return figure
@@ -69,20 +77,24 @@ def draw_matches(axes: "Axes", images: tuple[Image, Image], match: PairMatch) ->
         view = _upright(images[side])
         width, height = view.content
         _show(axes, images[side], match.regions and match.regions[side], 1 / height, left)
+        # (0, 0) is the centre of a pixel, and the corner of the picture
         ends.append((view.from_image(points) + 0.5) / height + (left, 0))
         left += width / height
+        # A gap between the images, below the lines
         axes.axvline(left, color="white", linewidth=4, zorder=0.5)
     axes.set(xlim=(0, left), ylim=(1, 0))
     axes.axis("off")
-    lines, inliers = np.stack(ends, axis=1), match.estimate.inliers
-    chosen = sample(inliers, MAX_INLIERS), sample(~inliers, MAX_OUTLIERS)
-    for some, colour, thickness in ((chosen[1], OUTLIER, 0.6), (chosen[0], INLIER, 1.0)):
+    lines = np.stack(ends, axis=1)
+    inliers = sample(match.estimate.inliers, MAX_INLIERS)
+    outliers = sample(~match.estimate.inliers, MAX_OUTLIERS)
+    # Inliers last: they lie above the others.
+    for some, colour, thickness in ((outliers, OUTLIER, 0.6), (inliers, INLIER, 1.0)):
         axes.add_collection(
             LineCollection([*lines[some]], colors=colour, linewidths=thickness, alpha=0.75)
         )
         x, y = lines[some].reshape(-1, 2).T
         axes.scatter(x, y, s=5, color=colour, linewidths=0)
-    return f"{len(chosen[0])} inliers (green) and {len(chosen[1])} outliers (orange) drawn"
+    return f"{len(inliers)} inliers (green) and {len(outliers)} outliers (orange) drawn"
 
 
 def _draw_clusters(
@@ -94,6 +106,7 @@ def _draw_clusters(
         axes.set_title("no stage 2: no critical region", loc="left")
         return
     region = match.regions[side]
+    # Clusters are not stored. The same points give the same clusters as in the run.
     stage1 = match.matches[match.in_stage(1)]
     points = stage1.points1 if side else stage1.points0
     clusters = find_clusters(points, image.size, config)
@@ -121,11 +134,15 @@ def _show(
     width, height = view.content
     axes.imshow(view.render(image.pixels), extent=(left, left + scale * width, scale * height, 0))
     if region is not None:
-        (x0, y0), (x1, y1) = (
-            (region.box.left, region.box.top),
-            (region.box.right, region.box.bottom),
-        )
-        corners = view.from_image(np.array([(x0, y0), (x0, y1), (x1, y1), (x1, y0)]) - 0.5) + 0.5
+        box = region.box
+        ends = [
+            (box.left, box.top),
+            (box.left, box.bottom),
+            (box.right, box.bottom),
+            (box.right, box.top),
+        ]
+        # A box has borders of pixels, a view maps centres. A view may be turned.
+        corners = view.from_image(np.array(ends) - 0.5) + 0.5
         axes.add_patch(
             Polygon(scale * corners + (left, 0), fill=False, edgecolor=REGION, linewidth=2.5)
         )
@@ -148,43 +165,63 @@ def draw_cameras(scene: SceneRecord, number: int = 0) -> "Figure":
     if not scene.models:
         figure.text(0.5, 0.5, f"no cameras: {scene.failure}", ha="center", wrap=True)
         return figure
-    cloud, cameras = (
-        scene.models[number].points,
-        [found.camera for found in scene.models[number].images],
-    )
-    centres, looks = np.array([(camera.centre, camera.R[2]) for camera in cameras]).swapaxes(0, 1)
+    model = scene.models[number]
+    right, up, ahead = _upright_axes([found.camera for found in model.images])
+    from_above, from_the_side = figure.subplots(1, 2)
+    _draw_projected(from_above, "above", model, np.column_stack([right, ahead]))
+    _draw_projected(from_the_side, "the side", model, np.column_stack([ahead, up]))
+    return figure
+
+
+def _upright_axes(cameras: Sequence[Camera]) -> NDArray[np.float64]:
+    """Return the unit vectors (3, 3) right, up and ahead of the mean camera, in the model's world."""
+    # A model's axes are arbitrary, but photographs are mostly taken upright.
     _, down, forward = np.mean([camera.R for camera in cameras], axis=0)
     up = -down / np.linalg.norm(down)
     ahead = forward - forward @ up * up
     ahead /= np.linalg.norm(ahead)
-    right = np.cross(ahead, up)
+    return np.stack([np.cross(ahead, up), up, ahead])
+
+
+def _draw_projected(panel: "Axes", name: str, model: SfmModel, axes: NDArray[np.float64]) -> None:
+    """Draw a model's cameras and points as seen from ``name``, projected on ``axes`` (3, 2)."""
+    cameras = [found.camera for found in model.images]
+    plain(panel, f"{len(cameras)} cameras from {name}")
+    points = model.points @ axes
+    # A few points of wrong matches lie far away and would shrink all others.
+    near = _near(points[:, 0]) & _near(points[:, 1])
+    panel.scatter(*points[near].T, s=2, color=DROPPED, linewidths=0)
+    centres = np.array([camera.centre for camera in cameras])
+    # Cameras at one point still have arrows.
     arrow = 0.12 * (np.ptp(centres, axis=0).max() or 1.0)
-    sides = (("above", right, ahead), ("the side", ahead, up))
-    for panel, (name, across, upward) in zip(figure.subplots(1, 2), sides, strict=True):
-        plain(panel, f"{len(cameras)} cameras from {name}")
-        x, y = centres @ across, centres @ upward
-        near = _near(cloud @ across) & _near(cloud @ upward)
-        panel.scatter(cloud[near] @ across, cloud[near] @ upward, s=2, color=DROPPED, linewidths=0)
-        ends, style = (
-            (arrow * looks @ across, arrow * looks @ upward),
-            {"width": 0.004, "color": COLOURS[0]},
-        )
-        panel.quiver(x, y, *ends, angles="xy", scale_units="xy", scale=1, **style)
-        panel.scatter(x, y, s=14, color=OUTLIER, linewidths=0, zorder=3)
-        panel.set_aspect("equal", adjustable="datalim")
-        panel.margins(0.1)
-    return figure
+    looks = arrow * np.array([camera.R[2] for camera in cameras])
+    panel.quiver(
+        *(centres @ axes).T,
+        *(looks @ axes).T,
+        angles="xy",
+        scale_units="xy",
+        scale=1,
+        width=0.004,
+        color=COLOURS[0],
+    )
+    # Above the arrows and the points
+    panel.scatter(*(centres @ axes).T, s=14, color=OUTLIER, linewidths=0, zorder=3)
+    # One scale for both axes, and the panel filled
+    panel.set_aspect("equal", adjustable="datalim")
+    panel.margins(0.1)
 
 
 def _near(values: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return a mask of the values in or near the range of nearly all values."""
     low, high = np.percentile(values, (3, 97)) if len(values) else (0.0, 0.0)
+    # 40 % beyond the range on both sides
     near: NDArray[np.bool_] = np.abs(values - (low + high) / 2) <= 0.7 * (high - low)
     return near
 
 
 def new_figure(width: float, height: float) -> "Figure":
     """Return an empty figure of this size in inches. Raise :class:`UserError` without matplotlib."""
+    # Without pyplot, which would choose a window system and keep all figures in memory.
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
@@ -194,6 +231,7 @@ def new_figure(width: float, height: float) -> "Figure":
 
 def require_format(path: Path) -> None:
     """Raise :class:`UserError` if matplotlib is missing or does not support the suffix as a format."""
+    # Before hours of matching, and not after them
     formats = new_figure(1, 1).canvas.get_supported_filetypes().keys() - {"pgf"}  # pgf needs LaTeX
     if path.suffix[1:].lower() not in formats:
         raise UserError(f"the figure {path} needs a suffix: one of {', '.join(sorted(formats))}")
@@ -214,9 +252,9 @@ def save(figure: "Figure", path: Path) -> None:
 def encode(figure: "Figure", kind: str, dpi: int = DPI) -> bytes:
     """Return the encoded figure; ``kind`` is "png" for lines and text, or "jpeg" for photographs."""
     stream = BytesIO()
-    figure.savefig(
-        stream, format=kind, dpi=dpi, pil_kwargs={"quality": 82} if kind == "jpeg" else None
-    )
+    # Photographs as PNG would be many times as large.
+    options = {"quality": 82} if kind == "jpeg" else None
+    figure.savefig(stream, format=kind, dpi=dpi, pil_kwargs=options)
     return stream.getvalue()
 
 

@@ -58,6 +58,7 @@ def read_points(path: Path) -> tuple[Cloud, int]:
         raise ValueError(f"{path} is cut off")
     rows = []
     at = COUNT.size
+    # Rows have different lengths, so numpy cannot read them at once.
     for _ in range(count):
         rows.append(POINT.unpack_from(data, at))
         at += POINT.size + OBSERVATION_BYTES * rows[-1][-1]

@@ -13,12 +13,13 @@ from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from statistics import median
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.data.images import Image
 from mkpc_kaggle.data.outputs import replacing
 from mkpc_kaggle.engine.budget import format_duration
+from mkpc_kaggle.engine.console import Progress
 from mkpc_kaggle.engine.records import PairRecord
 from mkpc_kaggle.errors import UserError, printable, writing
 from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
@@ -44,6 +45,7 @@ from mkpc_kaggle.reporting.view import (
     picture_at,
     style_and_script,
     template,
+    templates,
     view_of,
     view_part,
 )
@@ -53,13 +55,23 @@ if TYPE_CHECKING:
     from markupsafe import Markup
     from matplotlib.figure import Figure
 
-WRITING_S, WRITING_S_PER_PAIR = 0.6, 0.0002  # time to write a page without drawings
+# Time to write a page without drawings
+WRITING_S = 0.6
+WRITING_S_PER_PAIR = 0.0002
 DRAWING_S = 5.0  # drawings start only if more time is left
-MAX_SCENES, MAX_MODELS = 12, 8  # number of drawn scenes, and of drawn models per scene
+# Drawn scenes, and drawn models per scene: with all points, each view adds 240 kB to the page.
+MAX_SCENES = 12
+MAX_MODELS = 8
 MAX_ROWS = 2000  # of the table of pairs
 
 
-def report_run(work_dir: Path, path: Path, ends: float, pairs: Sequence[Pair] = ()) -> str:
+def report_run(
+    work_dir: Path,
+    path: Path,
+    ends: float,
+    pairs: Sequence[Pair] = (),
+    progress: Progress | None = None,
+) -> str:
     """Write the report of a run that has just ended. Return a line with the path, or the reason for
     no report.
 
@@ -68,103 +80,171 @@ def report_run(work_dir: Path, path: Path, ends: float, pairs: Sequence[Pair] = 
     the pairs of the run. Never raises: a failed report must not change the exit status of a
     successful run.
     """
+    # The command that makes the report later is part of each line about a report that is missing.
     later = f"mkpc journal {work_dir} --report {path}"
     left = ends - time.monotonic()
     if left < WRITING_S + WRITING_S_PER_PAIR * len(pairs):
         return f"no report, the time is up; later: {later}"
+    # Any error, also of matplotlib, of fonts and of a damaged journal
     try:
         log = read_log(work_dir)
+        # Drawings fail most easily: their page replaces one that is there already.
         write_report(
             log, path, pairs, undrawn="little time was left; the journal command draws them"
         )
         write_summary(log, path)
         if left > DRAWING_S:
-            write_report(log, path, pairs)
+            write_report(log, path, pairs, progress=progress)
     except Exception as error:
         return f"warning: no report, or a report without drawings ({error}); later: {later}"
     return f"report: {path}"
 
 
-def write_report(log: RunLog, path: Path, pairs: Sequence[Pair] = (), *, undrawn: str = "") -> None:
+def write_report(
+    log: RunLog,
+    path: Path,
+    pairs: Sequence[Pair] = (),
+    *,
+    undrawn: str = "",
+    progress: Progress | None = None,
+) -> None:
     """Write the page of :func:`report_page`. Raise :class:`UserError` if ``path`` cannot be
     written.
     """
-    text = report_page(log, pairs, undrawn=undrawn)
+    # The page is complete before the former one is replaced.
+    text = report_page(log, pairs, undrawn=undrawn, progress=progress)
     with writing(f"the report {path}"):
         path.parent.mkdir(parents=True, exist_ok=True)
         with replacing(path) as stream:
             stream.write(printable(text))
 
 
-def report_page(log: RunLog, pairs: Sequence[Pair] = (), *, undrawn: str = "") -> str:
+def report_page(
+    log: RunLog,
+    pairs: Sequence[Pair] = (),
+    *,
+    undrawn: str = "",
+    progress: Progress | None = None,
+) -> str:
     """Return the HTML document. The template escapes all text from files.
 
-    ``pairs`` have the image paths for drawings. ``undrawn`` is the reason for a page without drawings.
+    ``pairs`` have the image paths for drawings. ``undrawn`` is the reason for a page without
+    drawings. ``progress`` shows the pictures of pairs that are drawn.
     """
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
-    readable = () if undrawn else pairs  # a late page reads no images
-
-    def read_in(batch: str) -> Reader:
-        files = [file for pair in readable if pair.group == batch for file in pair.images]
-        return reader_of({file.name: file for file in files})
-
+    # An optional dependency: tables and views need no matplotlib.
     if not undrawn and find_spec("matplotlib") is None:
         undrawn = "matplotlib is not installed: pip install 'mkpc-kaggle[plots]'"
-    sources = {} if undrawn else {pair.id: pair for pair in pairs}
+    sections = {
+        **_head(log),
+        **_missing(log),
+        **_scene_section(log, () if undrawn else pairs, is_drawn=not undrawn),
+        **_weakest_section(log, {} if undrawn else {pair.id: pair for pair in pairs}, progress),
+        **_pair_section(log),
+        **_seconds_section(log),
+    }
+    page = templates().get_template("report.html")
+    return page.render(log=log, duration=format_duration, undrawn=undrawn, **sections)
+
+
+def _head(log: RunLog) -> dict[str, Any]:
+    """Return the values of the page's head: the verdict, and the facts as tiles."""
+    return {
+        "assets": assets(),
+        "headline": headline(log),
+        "found": verdict(log),
+        "facts": facts(log),
+        "left_out": left_out_line(log.recipe, log.about.left_out),
+    }
+
+
+def _missing(log: RunLog) -> dict[str, Any]:
+    """Return the pairs without an F, and the units that failed, with the reasons."""
+    # The template lists all of them, and counts their reasons only where several share one.
     failed = [
         (record.pair.id, record.pair.group, record.failure)
         for record in log.records
         if not record.is_solved
     ]
-    histogram = inlier_histogram(log.records)
-    pages = Environment(
-        loader=PackageLoader("mkpc_kaggle.reporting"), autoescape=True, undefined=StrictUndefined
-    )
-    return pages.get_template("report.html").render(
-        log=log,
-        duration=format_duration,
-        assets=assets(),
-        headline=headline(log),
-        found=verdict(log),
-        facts=facts(log),
-        left_out=left_out_line(log.recipe, log.about.left_out),
-        failed=failed,
-        failures=Counter(reason for *_, reason in failed).most_common(),
-        unit_failures=[(reason,) for reason in unit_reasons(log)],
-        sources=sources,
-        weakest=[
-            (_picture(sources.get(record.pair.id), match), record) for record, match in log.weakest
-        ],
-        scenes=[*_scenes(log)],
-        choices=Counter(
-            str(record.scene.reason) for record in log.records if record.scene
-        ).most_common(),
-        sigmas=[
+    return {
+        "failed": failed,
+        "failures": Counter(reason for *_, reason in failed).most_common(),
+        "unit_failures": [(reason,) for reason in unit_reasons(log)],
+    }
+
+
+def _scene_section(log: RunLog, pairs: Sequence[Pair], *, is_drawn: bool) -> dict[str, Any]:
+    """Return the views and tables of scenes. ``pairs`` have the paths of images, if any are read."""
+
+    def read_in(batch: str) -> Reader:
+        files = [file for pair in pairs if pair.group == batch for file in pair.images]
+        return reader_of({file.name: file for file in files})
+
+    # Rows whose F is not the scene's have a reason, such as images without a camera.
+    choices = Counter(str(record.scene.reason) for record in log.records if record.scene)
+    return {
+        # Lists, because the template asks for their lengths
+        "scenes": [*_scenes(log)],
+        "choices": choices.most_common(),
+        "sigmas": [
             (name, 100 * of.centre, of.rotation, of.focal) if of else (name, "unknown", "", "")
             for name, of in weakest_cameras(log.scenes)
         ],
-        is_doubtful=is_doubtful,
-        min_support=MIN_SUPPORT,
-        views=[*_views(log, read_in, is_drawn=not undrawn)],
-        pair_rows=pair_rows(log.records)[:MAX_ROWS],
-        more_pairs=max(0, len(log.records) - MAX_ROWS),
-        histogram=histogram,
-        histogram_most=max(1, *(count for _, count in histogram)),
-        units=[(*means, means[1] * means[-1]) for means in unit_means(log)],
-        parts=[
+        "views": [*_views(log, read_in, is_drawn=is_drawn)],
+    }
+
+
+def _weakest_section(
+    log: RunLog, sources: Mapping[str, Pair], progress: Progress | None
+) -> dict[str, Any]:
+    """Return the weakest pairs with their pictures; ``sources`` has the pairs with paths, by id."""
+    weakest = []
+    for number, (record, match) in enumerate(log.weakest, start=1):
+        weakest.append((_picture(sources.get(record.pair.id), match), record))
+        # Reading and drawing large photographs takes a second for each pair.
+        if progress is not None and sources:
+            progress.show("drawing", number, len(log.weakest))
+    # The next text begins a new line.
+    if progress is not None:
+        progress.close()
+    return {
+        "weakest": weakest,
+        "sources": sources,
+        "is_doubtful": is_doubtful,
+        "min_support": MIN_SUPPORT,
+    }
+
+
+def _pair_section(log: RunLog) -> dict[str, Any]:
+    """Return the rows of the table of pairs, and the histogram of their inliers."""
+    histogram = inlier_histogram(log.records)
+    return {
+        # More rows make browsers slow; the journal command exports all.
+        "pair_rows": pair_rows(log.records)[:MAX_ROWS],
+        "more_pairs": max(0, len(log.records) - MAX_ROWS),
+        "histogram": histogram,
+        # At least 1, since widths are relative to it
+        "histogram_most": max(1, *(count for _, count in histogram)),
+    }
+
+
+def _seconds_section(log: RunLog) -> dict[str, Any]:
+    """Return the mean and total seconds of units, and of the parts of the work."""
+    return {
+        "units": [(*means, means[1] * means[-1]) for means in unit_means(log)],
+        "parts": [
             (name, total, total / len(log.records))
             for name, total in seconds_by_part(log).items()
+            # A part that no pair has needs no row.
             if total
         ],
-        undrawn=undrawn,
-    )
+    }
 
 
 def assets() -> "Markup":
     """Return the styles and scripts of a page, which are the same in all pages."""
     from markupsafe import Markup
 
+    # All from this package, so nothing in it needs escaping
     return Markup(f"<script>\n{template('report.js')}</script>\n") + style_and_script()
 
 
@@ -172,6 +252,7 @@ def pair_rows(records: Sequence[PairRecord]) -> list[tuple[str | int | float, ..
     """Return id, matches, inliers, overlap, source of F and doubt of each pair, the fewest inliers
     first.
     """
+    # The first rows of a long table are those to look at.
     weakest_first = sorted(records, key=lambda record: (record.inliers, record.index))
     return [
         (
@@ -195,7 +276,10 @@ def _views(
     without scripts.
     """
     largest = sorted(log.scenes, key=lambda scene: -scene.registered)[:MAX_SCENES]
-    for scene in (scene for scene in largest if scene.models):
+    for scene in largest:
+        # Its reason is in the table of scenes.
+        if not scene.models:
+            continue
         pictures = []
         for number in range(min(len(scene.models), MAX_MODELS) if is_drawn else 0):
             figure = draw_cameras(scene, number)
@@ -208,6 +292,7 @@ def _views(
                 replace(each, points=cloud.points)
                 for each, cloud in zip(models, clouds, strict=True)
             )
+        # A click on a camera lists the pairs of its image.
         records = [record for record in log.records if record.pair.group == scene.batch]
         part = view_part(
             models,
@@ -224,6 +309,7 @@ def reader_of(paths: Mapping[str, Path]) -> Reader:
     """Return a reader of images by their file names; an image without a path is unknown."""
 
     def read(name: str) -> Image | None:
+        # A scene names its images by file names, or by paths below the folder.
         path = paths.get(Path(name).name)
         return None if path is None else picture_at(str(path))
 
@@ -240,6 +326,7 @@ def show_run(work_dir: Path, root: Path | None = None) -> View:
 
     def read_in(batch: str) -> Reader:
         if root is None:
+            # The journal is in OUT/work.
             return reader_of(linked_images(log.path.parent.parent, batch))
         files = {
             file
@@ -249,6 +336,7 @@ def show_run(work_dir: Path, root: Path | None = None) -> View:
         }
         return reader_of({Path(file).name: root / file for file in files})
 
+    # A notebook runs scripts, so there are no pictures in place of the view.
     return view_of(_views(log, read_in, is_drawn=False))
 
 
@@ -267,6 +355,7 @@ def partners_of(records: Iterable[PairRecord]) -> dict[str, list[tuple[str, int,
     """
     partners: dict[str, list[tuple[str, int, int]]] = {}
     for record in records:
+        # A pair counts for both of its images.
         for name, other in (record.pair.names, record.pair.names[::-1]):
             partners.setdefault(name, []).append((other, record.inliers, record.matches))
     return {name: sorted(found, key=lambda each: -each[1]) for name, found in partners.items()}
@@ -275,6 +364,7 @@ def partners_of(records: Iterable[PairRecord]) -> dict[str, list[tuple[str, int,
 def _picture(source: Pair | None, match: PairMatch) -> str:
     """Return a pair's picture as a data URI, empty if an image is unknown or unreadable."""
     if source is not None:
+        # The table then says that the image cannot be read any more.
         with suppress(UserError):
             return _data_uri(draw_strip(_images(source), match), "jpeg")
     return ""
@@ -289,6 +379,7 @@ def weak_figure(log: RunLog, match: PairMatch, source: Pair) -> "Figure":
 
 
 def _images(pair: Pair) -> tuple[Image, Image]:
+    # As the run turned them, so that points fit
     first, second = (
         to_image(path).turned(turns) for path, turns in zip(pair.images, pair.turns, strict=True)
     )
@@ -302,7 +393,9 @@ def _scenes(log: RunLog) -> Iterator[tuple[object, ...]]:
     counts = Counter(record.pair.group for record in log.records if record.source == "scene")
     for each in log.scenes:
         focals = [found.focal for model in each.models for found in model.images]
+        # A wide spread of focal lengths in photographs of one camera is a sign of wrong cameras.
         spread = f"{median(focals):.0f} ({min(focals):.0f} to {max(focals):.0f})" if focals else ""
+        # Of each model: one of several may be wrong.
         errors = ", ".join(f"{model.reprojection_error:.2f}" for model in each.models)
         placed = each.batch, each.images, each.registered, each.points, spread, errors
         yield (*placed, each.seconds, counts[each.batch], each.failure)

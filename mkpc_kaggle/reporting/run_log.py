@@ -1,10 +1,11 @@
 """The data of a run for reports: a snapshot of the journal, and tables as CSV files."""
 
 import csv
+from collections.abc import Iterable, Iterator
 from dataclasses import astuple, dataclass
 from itertools import chain
-from operator import attrgetter
 from pathlib import Path
+from typing import Any
 
 from mkpc_kaggle.data.outputs import replacing, require_table
 from mkpc_kaggle.engine.budget import format_duration
@@ -38,6 +39,7 @@ SECONDS = {  # fields of a pair's record, and their names in reports
 }
 PAIR_HEADS = f"""pair id group image0 image1 failure source matches inliers overlaps {" ".join(SECONDS)}
     support candidates cost magsac_cost focal0 focal1 f11 f12 f13 f21 f22 f23 f31 f32 f33"""
+REGION_HEADS = "pair image left top right bottom reason clusters kept"
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +55,7 @@ class RunLog:
     @property
     def ending(self) -> str:
         """The ending of the last session."""
+        # Only the last event counts: a resumed run has the ends of former sessions.
         ends = (event.text for event in self.events[-1:] if event.kind == EventKind.END)
         return next(ends, "not ended (at work, or killed)")
 
@@ -83,23 +86,29 @@ def read_log(directory: Path) -> RunLog:
         published = Table.of(store)
         records = tuple(read_records(store, published))
         table = dict(published.about.recipe)
+        # A store that was opened, and then ended by a signal before the first publication
         if not table:
             raise UserError(f"{directory}: the run has not begun, or was stopped at its start")
+        # The recipe as it ran: its file may have changed since.
         recipe = recipe_of(table, table.pop("name"))
+        # The index settles ties, so that equal runs draw the same pairs.
         touched = sorted(
             (record for record in records if record.units), key=lambda r: (r.inliers, r.index)
         )
         units = {unit.name: unit for unit in recipe.units}
 
+        # The journal has points and F, from which the inliers follow as in the run.
         def weak(record: PairRecord) -> tuple[PairRecord, PairMatch]:
             F = record.pair_fundamental
             points = read_points(store, published, record.index)
             results = tuple(UnitResult(units[name], found) for name, found in points.items())
             distances = sampson_distances(F, Matches.concatenate(each.matches for each in results))
+            # The fallback fits some matches by chance.
             inliers = (distances < recipe.magsac.threshold) & (not record.failure)
             estimate = Estimate(ModelKind.F, F, inliers, record.failure)
             return record, PairMatch(results, record.regions, estimate)
 
+        # Their points alone are read: those of all pairs may be gigabytes.
         weakest = tuple(map(weak, touched[:MAX_DRAWN_PAIRS]))
         scenes = tuple(read_scenes(store, published).values())
         events = read_events(store)
@@ -112,41 +121,54 @@ def write_csv(log: RunLog, directory: Path) -> list[Path]:
     An existing file is replaced only if it is a table with the same columns. Otherwise, and if a
     table cannot be written, raises :class:`UserError`.
     """
-    stats = "stats.support", "stats.candidates", "stats.cost", "stats.magsac_cost"
-    values = attrgetter("failure", "source", "matches", "inliers", "overlaps", *SECONDS, *stats)
-    pairs = (
-        (
-            r.index,
-            r.pair.id,
-            r.pair.group,
-            *r.pair.names,
-            *values(r),
-            *r.stats.focals,
-            *r.chosen_fundamental.flat,
-        )
-        for r in log.records
-    )
-    units = ((r.index, *astuple(unit)) for r in log.records for unit in r.units)
-    regions = (
-        (r.index, image, *astuple(region.box), region.reason, region.clusters, region.kept)
-        for r in log.records
-        for image, region in enumerate(r.regions or ())
-    )
-    tables = {
-        "pairs": (PAIR_HEADS.split(), pairs),
-        "units": (["pair", *UnitRecord.__annotations__], units),
-        "regions": (
-            ["pair", "image", "left", "top", "right", "bottom", "reason", "clusters", "kept"],
-            regions,
+    tables: dict[str, tuple[list[str], Iterable[Iterable[Any]]]] = {
+        "pairs": (PAIR_HEADS.split(), map(_pair_cells, log.records)),
+        "units": (
+            ["pair", *UnitRecord.__annotations__],
+            ((record.index, *astuple(unit)) for record in log.records for unit in record.units),
         ),
+        "regions": (REGION_HEADS.split(), _region_rows(log.records)),
         "events": (["kind", "seconds", "text"], map(astuple, log.events)),
     }
     with writing(f"--csv {directory}"):
         directory.mkdir(parents=True, exist_ok=True)
         files = {directory / f"{name}.csv": table for name, table in tables.items()}
+        # All before the first is written: a refused export leaves all files as they were.
         for path, (heads, _) in files.items():
             require_table(path, heads)
         for path, (heads, rows) in files.items():
             with replacing(path) as stream:
                 csv.writer(stream, lineterminator="\n").writerows(chain([heads], rows))
     return list(files)
+
+
+def _pair_cells(record: PairRecord) -> tuple[Any, ...]:
+    """Return the cells of a pair, in the order of ``PAIR_HEADS``."""
+    stats = record.stats
+    return (
+        record.index,
+        record.pair.id,
+        record.pair.group,
+        *record.pair.names,
+        record.failure,
+        record.source,
+        record.matches,
+        record.inliers,
+        record.overlaps,
+        *(getattr(record, name) for name in SECONDS),
+        stats.support,
+        stats.candidates,
+        stats.cost,
+        stats.magsac_cost,
+        *stats.focals,
+        *record.chosen_fundamental.flat,
+    )
+
+
+def _region_rows(records: Iterable[PairRecord]) -> Iterator[tuple[Any, ...]]:
+    """Yield a row per image of the pairs with critical regions, in the order of ``REGION_HEADS``."""
+    for record in records:
+        # A pair without a unit of stage 2 has none.
+        for image, region in enumerate(record.regions or ()):
+            counts = (region.reason, region.clusters, region.kept)
+            yield (record.index, image, *astuple(region.box), *counts)

@@ -19,8 +19,9 @@ from mkpc_kaggle.recipe import Recipe
 from mkpc_kaggle.reporting.run_log import SECONDS, RunLog
 from mkpc_kaggle.scene.reconstruction import Sigmas
 
-MAX_LINES = 8  # per list
+MAX_LINES = 8  # per list; the summary is one screen
 WIDTH = 100  # of a line, in characters
+MAX_NAMED = 3  # matchers or cameras in one line
 
 Run: TypeAlias = RunReport | RunLog
 
@@ -29,6 +30,7 @@ def summary(report: RunReport) -> str:
     """Return the summary at the end of a run."""
     resumed = f", {report.resumed} of them from earlier runs" if report.resumed else ""
     done = f"; {report.units_run} units run, {report.estimated} F estimated"
+    # Of libjpeg, CUDA and others: they would tear the progress bar.
     printed = f"messages of image and device libraries: {report.log}" if report.log else ""
     lines = [headline(report) + resumed + done, *_lines(report), printed, trouble(report)]
     return "\n".join(filter(None, lines))
@@ -55,10 +57,12 @@ def trouble(run: Run) -> str:
     A pair without an F counts only if an error is the cause, rather than few matches or little
     time.
     """
+    # Nothing could run, so counts of pairs would say nothing.
     if run.ending in (Ending.NO_WORKER, Ending.NOTHING_RUNS):
         return f"the run failed: {run.ending}, the faults say why; the same command resumes"
     reached = [record for record in run.records if record.reached]
     reasons = Counter(filter(None, map(_error, reached)))
+    # Single unreadable images are normal; most pairs without an F are not.
     if 2 * reasons.total() <= len(reached):
         return ""
     ((reason, count),) = reasons.most_common(1)
@@ -74,10 +78,8 @@ def _error(record: PairRecord) -> str:
         return ""
     if not record.units:
         return record.failure
+    # A unit that ran and found nothing is no error: the images may not overlap.
     return next((unit.failure for unit in record.units if unit.failure and not unit.matches), "")
-
-
-MAX_NAMED = 3  # matchers in one line
 
 
 def left_out_line(recipe: Recipe, left_out: Sequence[str]) -> str:
@@ -89,6 +91,7 @@ def left_out_line(recipe: Recipe, left_out: Sequence[str]) -> str:
     others = [cause for cause in left_out if not cause.startswith(UnavailableKind.NO_WEIGHTS)]
     missing = [cause for cause in left_out if cause.startswith(UnavailableKind.NO_WEIGHTS)]
     parts = [f"left out, {cause}" for cause in others]
+    # The recipe named other matchers, so their list would tell the user nothing to do.
     if missing and set(recipe.matcher_names) == {"sift"}:
         parts.append(
             "RootSIFT only; `mkpc weights fetch light --out weights` adds learned matchers"
@@ -107,6 +110,7 @@ def advice(log: RunLog) -> list[str]:
     overlaps.
     """
     found = []
+    # What ran, and not what the recipe names: a matcher may have failed to load.
     ran = {unit.unit for record in log.records for unit in record.units}
     has_missing = any(cause.startswith(UnavailableKind.NO_WEIGHTS) for cause in log.about.left_out)
     if has_missing and all(name.partition(":")[2].startswith("sift@") for name in ran):
@@ -123,12 +127,15 @@ def advice(log: RunLog) -> list[str]:
 
 def plural(count: int, noun: str) -> str:
     """Return the count with its noun, such as "1 batch" or "2 batches"."""
-    ending = "" if count == 1 else "es" if noun.endswith("ch") else "s"
+    if count == 1:
+        return f"{count} {noun}"
+    ending = "es" if noun.endswith("ch") else "s"  # batches, matches
     return f"{count} {noun}{ending}"
 
 
 def unit_means(run: Run) -> list[tuple[str, int, float, float, float]]:
     """Return a row per unit: name, number of pairs, and mean matches, inliers and seconds."""
+    # By name, in the order in which units first appear: that of the recipe
     results: dict[str, list[tuple[float, float, float]]] = {}
     for unit in (unit for record in run.records for unit in record.units):
         values = unit.matches, unit.inliers, unit.encode_seconds + unit.match_seconds
@@ -157,11 +164,11 @@ def seconds_by_part(run: Run) -> dict[str, float]:
 
 def facts(run: Run) -> Iterator[tuple[str, str, str]]:
     """Yield the most important facts as (name, value, remark)."""
-    records, scenes = run.records, run.scenes
-    solved, sources = (
-        [record for record in records if record.is_solved],
-        Counter(each.source for each in records),
-    )
+    records = run.records
+    scenes = run.scenes
+    solved = [record for record in records if record.is_solved]
+    sources = Counter(record.source for record in records)
+    # The best source first
     parts = (("scene", "from scenes"), ("pair", "from their own matches"), ("fallback", "fallback"))
     from_where = ", ".join(
         f"{sources[source]} {what}" for source, what in parts if source in sources
@@ -182,10 +189,8 @@ def facts(run: Run) -> Iterator[tuple[str, str, str]]:
         counts = ", ".join(f"{count} {reason}" for reason, count in regions.most_common())
         yield "critical regions", f"{regions[RegionReason.CROPPED]} of {regions.total()}", counts
     if scenes:
-        placed, images = (
-            sum(scene.registered for scene in scenes),
-            sum(scene.images for scene in scenes),
-        )
+        placed = sum(scene.registered for scene in scenes)
+        images = sum(scene.images for scene in scenes)
         yield "images with a camera", f"{placed} of {images}", f"in {plural(len(scenes), 'batch')}"
 
 
@@ -198,11 +203,13 @@ def _lines(run: Run) -> Iterator[str]:
         yield f"{'unit':<30}{'pairs':>7}{'matches':>9}{'inliers':>9}{'seconds':>9}"
     for name, pairs, matches, inliers, seconds in means:
         yield f"{name:<30}{pairs:>7}{matches:>9.0f}{inliers:>9.0f}{seconds:>9.2f}"
-    count = max(1, len(run.records))
+    count = max(1, len(run.records))  # a run without pairs has a summary, too
+    # A mean per pair compares runs of different lengths.
     parts = (f"{name} {seconds / count:.3f}" for name, seconds in seconds_by_part(run).items())
     yield from wrapped(f"seconds a pair: {', '.join(parts)}")
     yield from weakest_line(run.scenes)
     yield from pending_lines(run)
+    # Batches that were not reached are in the line before.
     no_scene = [
         f"{scene.batch}: {scene.failure}"
         for scene in run.scenes
@@ -215,6 +222,7 @@ def _lines(run: Run) -> Iterator[str]:
     ]
     yield from _list("batches without a scene", no_scene)
     yield from _list("pairs with the fallback row", failed)
+    # Last, since they may be many
     yield from _list("units that failed", unit_reasons(run))
     yield from _list("units that ran otherwise than written", unit_reasons(run, "note"))
     yield from _list("faults", run.faults)
@@ -222,17 +230,22 @@ def _lines(run: Run) -> Iterator[str]:
 
 def wrapped(text: str) -> list[str]:
     """Return the text as lines of up to ``WIDTH`` characters; names of files stay whole."""
-    return textwrap.wrap(
-        text, WIDTH, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False
+    # A number stays with its unit.
+    joined = text.replace(" %", "\N{NO-BREAK SPACE}%")
+    lines = textwrap.wrap(
+        joined, WIDTH, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False
     )
+    return [line.replace("\N{NO-BREAK SPACE}%", " %") for line in lines]
 
 
 def pending_lines(run: Run) -> Iterator[str]:
     """Yield a line on pairs and batches that the run did not reach, and how to continue."""
+    # A pair may have an F from a scene without being matched.
     pairs = sum(not record.reached and not record.is_solved for record in run.records)
     batches = sum(scene.failure == NOT_RECONSTRUCTED for scene in run.scenes)
     left = [plural(count, noun) for count, noun in ((pairs, "pair"), (batches, "batch")) if count]
     what = f"{' and '.join(left)} left" if left else ""
+    # Also with nothing left: a publication may have been interrupted.
     if run.ending == Ending.INTERRUPTED:
         yield "; ".join(filter(None, ["interrupted", what, "run the same command to continue"]))
     elif what:
@@ -250,7 +263,8 @@ def is_doubtful(record: PairRecord) -> bool:
 def weakest_line(scenes: Sequence[SceneRecord]) -> Iterator[str]:
     """Yield a line with the weakest cameras, if any is known."""
     named = []
-    for name, sigmas in weakest_cameras(scenes)[:3]:
+    # Enough to see whether one camera is worse than all others; the report has them all.
+    for name, sigmas in weakest_cameras(scenes)[:MAX_NAMED]:
         error = f"{100 * sigmas.centre:.2g} %" if sigmas else "unknown"
         named.append(f"{Path(name).name} ({error})")
     if named:
@@ -262,6 +276,7 @@ def weakest_cameras(scenes: Sequence[SceneRecord]) -> list[tuple[str, Sigmas | t
 
     Cameras with unknown sigmas are the most doubtful ones, so they come before all others.
     """
+    # An image of several models has a camera in each.
     placed = [found for scene in scenes for model in scene.models for found in model.images]
     unknown = [(found.image.name, found.sigmas) for found in placed if not found.sigmas]
     known = [(found.image.name, found.sigmas) for found in placed if found.sigmas]

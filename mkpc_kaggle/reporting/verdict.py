@@ -51,13 +51,17 @@ def verdict(log: RunLog) -> Verdict:
     """Return the verdict: about cameras if images were to be reconstructed together, else about
     pairs.
     """
+    # A failed run first: all other problems may follow from it.
     problems = list(filter(None, [trouble(log)]))
+    # A mean over scenes without models would divide by zero.
     reconstructed = [scene for scene in log.scenes if scene.models]
+    # Without scenes, pairs are all that the run was asked for.
     if not log.scenes:
         problems += _pair_problems(log.records)
         return Verdict(_with_an_f(log.records), tuple(problems))
     placed = sum(scene.registered for scene in log.scenes)
     images = sum(scene.images for scene in log.scenes)
+    # Even without any camera, since that is the answer to what was asked
     text = f"{placed} of {images} images have a camera"
     if reconstructed:
         text += f"; reprojection {_reprojection(reconstructed):.2f} px"
@@ -70,6 +74,7 @@ def doubt(record: PairRecord) -> str:
 
     Matches that contradict the cameras are doubtful, too.
     """
+    # The cameras agree with many pairs, this pair's matches with themselves alone.
     if record.scene is not None and record.scene.reason is Reason.CONTRADICTION:
         return "its matches contradict the cameras"
     if record.is_solved and is_doubtful(record):
@@ -79,6 +84,7 @@ def doubt(record: PairRecord) -> str:
 
 def inlier_histogram(records: Sequence[PairRecord]) -> list[tuple[str, int]]:
     """Return the number of reached pairs in each range of inliers, as (range, count)."""
+    # A pair that was not reached has no inliers yet, and is no weak pair.
     inliers = [record.inliers for record in records if record.reached]
     counts, _ = np.histogram(inliers, [*INLIER_BINS, np.inf])
     names = ["0", *(f"{low} to {high - 1}" for low, high in pairwise(INLIER_BINS[1:]))]
@@ -99,12 +105,14 @@ def _pair_problems(records: Sequence[PairRecord]) -> Iterator[str]:
 
 
 def _scene_problems(scene: SceneRecord, log: RunLog) -> Iterator[str]:
+    # A folder without subfolders has one scene, whose name says nothing.
     where = f"{scene.batch}: " if len(log.scenes) > 1 else ""
     if not scene.models:
         yield f"{where}no cameras, {scene.failure}: photographs that overlap more are needed"
         return
     known = {Path(found.image.name).name for model in scene.models for found in model.images}
     records = [record for record in log.records if record.pair.group == scene.batch]
+    # The record of a scene has no list of its images without a camera; its pairs name them.
     missing = sorted({name for record in records for name in record.pair.names} - known)
     if missing:
         yield f"{where}no camera for {_named(missing)}: add photographs between these and the others"
@@ -116,6 +124,7 @@ def _scene_problems(scene: SceneRecord, log: RunLog) -> Iterator[str]:
     )
     if uncertain:
         yield f"{where}uncertain cameras: {_named(uncertain)}; add photographs of the same things"
+    # Verified matches fit within 2 px, so a large mean is no matter of a few wrong matches.
     worst = max(model.reprojection_error for model in scene.models)
     if worst > MAX_REPROJECTION_PX:
         yield f"{where}a mean reprojection error of {worst:.1f} px is large: the lens may be distorted"
@@ -126,6 +135,7 @@ def _cameras(scene: SceneRecord) -> Iterator[RegisteredImage]:
 
 
 def _is_uncertain(found: RegisteredImage) -> bool:
+    # Bundle adjustment does not determine a camera without sigmas.
     return not found.sigmas or found.sigmas.centre > MAX_CENTRE_SIGMA
 
 
@@ -140,6 +150,7 @@ def _reprojection(scenes: Sequence[SceneRecord]) -> float:
     observations.
     """
     models = [model for scene in scenes for model in scene.models]
+    # A model without points has no error, and a weight that is not 0: the sum must not vanish.
     weights = [max(1, sum(found.points for found in model.images)) for model in models]
     return float(np.average([model.reprojection_error for model in models], weights=weights))
 
@@ -151,8 +162,10 @@ def write_summary(log: RunLog, page: Path) -> Path | None:
     ``report.html`` has ``summary.json``, another page NAME.html has NAME.summary.json; a page without the suffix
     of HTML, such as a device, has none. Raises :class:`UserError` if a file of another kind is in the way.
     """
+    # A device such as /dev/stdout takes the page alone.
     if page.suffix.lower() not in (".html", ".htm"):
         return None
+    # Several reports may lie in one folder, each with its summary.
     path = page.with_name("summary.json" if page.stem == "report" else f"{page.stem}.summary.json")
     if (path.exists() or path.is_symlink()) and not _is_summary(path):
         raise UserError(f"{path} is in the way and is not a summary of a run; move it")
@@ -165,8 +178,10 @@ def write_summary(log: RunLog, page: Path) -> Path | None:
 
 
 def _is_summary(path: Path) -> bool:
+    # Before it is opened: a pipe would block, and a link may lead anywhere.
     if path.is_symlink() or not path.is_file():
         return False
+    # A file that is not JSON is not ours.
     with suppress(OSError, ValueError, AttributeError, RecursionError):
         return str(json.loads(path.read_text(encoding="utf-8")).get("format", "")).startswith(
             "mkpc summary "
@@ -177,7 +192,6 @@ def _is_summary(path: Path) -> bool:
 def summary_table(log: RunLog) -> dict[str, Any]:
     """Return the facts of the report as JSON values; ``format`` names the version of the keys."""
     found = verdict(log)
-    inliers = [record.inliers for record in log.records if record.is_solved]
     return {
         "format": FORMAT,
         "program": __version__,
@@ -187,26 +201,9 @@ def summary_table(log: RunLog) -> dict[str, Any]:
         "headline": headline(log),
         "ending": str(log.ending),
         "seconds": _number(log.seconds),
-        "pairs": {
-            "count": len(log.records),
-            "with_f": len(inliers),
-            "sources": dict(sorted(Counter(record.source for record in log.records).items())),
-            "doubtful": [record.pair.id for record in log.records if doubt(record)],
-            "inliers_median": _number(median(inliers)) if inliers else None,
-            "inliers_minimum": min(inliers, default=None),
-            "inliers_histogram": dict(inlier_histogram(log.records)),
-        },
+        "pairs": _pairs_table(log.records),
         "scenes": [_scene_table(scene) for scene in log.scenes],
-        "units": [
-            {
-                "unit": name,
-                "pairs": pairs,
-                "matches": _number(matches),
-                "inliers": _number(kept),
-                "seconds": _number(s),
-            }
-            for name, pairs, matches, kept, s in unit_means(log)
-        ],
+        "units": _units_table(log),
         "seconds_by_part": {
             name: _number(seconds) for name, seconds in seconds_by_part(log).items()
         },
@@ -215,6 +212,35 @@ def summary_table(log: RunLog) -> dict[str, Any]:
         "faults": log.faults,
         "versions": dict(log.about.versions),
     }
+
+
+def _pairs_table(records: Sequence[PairRecord]) -> dict[str, Any]:
+    inliers = [record.inliers for record in records if record.is_solved]
+    return {
+        "count": len(records),
+        "with_f": len(inliers),
+        # Sorted, so that equal runs give equal files
+        "sources": dict(sorted(Counter(record.source for record in records).items())),
+        "doubtful": [record.pair.id for record in records if doubt(record)],
+        # Not 0, which would be a measurement
+        "inliers_median": _number(median(inliers)) if inliers else None,
+        "inliers_minimum": min(inliers, default=None),
+        "inliers_histogram": dict(inlier_histogram(records)),
+    }
+
+
+def _units_table(log: RunLog) -> list[dict[str, Any]]:
+    """Return the means of each unit over the pairs that it ran on."""
+    return [
+        {
+            "unit": name,
+            "pairs": pairs,
+            "matches": _number(matches),
+            "inliers": _number(inliers),
+            "seconds": _number(seconds),
+        }
+        for name, pairs, matches, inliers, seconds in unit_means(log)
+    ]
 
 
 def _scene_table(scene: SceneRecord) -> dict[str, Any]:
@@ -233,6 +259,7 @@ def _scene_table(scene: SceneRecord) -> dict[str, Any]:
                         "image": found.image.name,
                         "focal_px": _number(found.focal),
                         "points": found.points,
+                        # Keys with units are in docs/running.md
                         "sigmas": found.sigmas._asdict() if found.sigmas else None,
                     }
                     for found in model.images

@@ -25,6 +25,7 @@ from mkpc_kaggle.geometry.coordinates import Pixels
 from mkpc_kaggle.scene.reconstruction import MAX_POINTS, RegisteredImage, SfmModel
 
 if TYPE_CHECKING:
+    from jinja2 import Environment
     from markupsafe import Markup
 
 MAX_PICTURES = 200  # images that are read per scene, for thumbnails and for colours of points
@@ -91,7 +92,9 @@ def style_and_script() -> "Markup":
     """
     from markupsafe import Markup
 
-    style, script = template("view.css"), template("view.js")
+    style = template("view.css")
+    script = template("view.js")
+    # The script comes before the views, whose canvases it looks for.
     start = 'document.addEventListener("DOMContentLoaded", () => {\n'
     return Markup(f"<style>\n{style}</style>\n<script>\n{start}{script}}});\n</script>\n")
 
@@ -111,18 +114,26 @@ def view_part(
     ``read`` returns pictures, which colour the points of models without ``colours``. ``pictures`` are captions and
     URIs of pictures that a browser without scripts shows instead. All text is escaped.
     """
-    from jinja2 import Environment, PackageLoader, StrictUndefined
     from markupsafe import Markup
 
     if not any(model.images for model in models):
         return Markup("<p>No cameras.</p>")
-    pages = Environment(
-        loader=PackageLoader("mkpc_kaggle.reporting"), autoescape=True, undefined=StrictUndefined
-    )
     data = view_data(
         models, read=read, partners=partners or {}, colours=colours, metres_per_unit=metres_per_unit
     )
-    return Markup(pages.get_template("view.html").render(data=data, title=title, pictures=pictures))
+    part = templates().get_template("view.html")
+    return Markup(part.render(data=data, title=title, pictures=pictures))
+
+
+@cache
+def templates() -> "Environment":
+    """Return the templates of pages, which escape all values."""
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    # A misspelt name is an error, and not an empty place on the page.
+    return Environment(
+        loader=PackageLoader("mkpc_kaggle.reporting"), autoescape=True, undefined=StrictUndefined
+    )
 
 
 def view_data(
@@ -139,17 +150,15 @@ def view_data(
     right, y down, z ahead of the mean camera, and most points within 1 of the origin. Models stand side by side,
     since their relative scale and position are unknown.
     """
-    shown = list(models)
-    pictures = _pictures(shown, read)
-    frames = [_Frame.of(model) for model in shown]
-    given: Sequence[NDArray[np.uint8] | None] = colours or [None] * len(shown)
-    is_measured = metres_per_unit is not None and len(shown) == 1
-    return {
-        "models": [
-            _model(*each, pictures, partners) for each in zip(shown, frames, given, strict=True)
-        ],
-        "metres": metres_per_unit / frames[0].scale if is_measured and metres_per_unit else None,
-    }
+    pictures = _pictures(models, read)
+    frames = [_Frame.of(model) for model in models]
+    given: Sequence[NDArray[np.uint8] | None] = colours or [None] * len(models)
+    rows = [_model(*each, pictures, partners) for each in zip(models, frames, given, strict=True)]
+    metres = None
+    # Models side by side have a scale of their own each, and one bar cannot measure both.
+    if metres_per_unit and len(models) == 1:
+        metres = metres_per_unit / frames[0].scale
+    return {"models": rows, "metres": metres}
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,11 +186,14 @@ class _Frame:
         ahead = ahead / max(float(np.linalg.norm(ahead)), 1e-9)
         axes = np.stack([np.cross(down, ahead), down, ahead])
 
-        centres = np.array([camera.centre for camera in cameras]) @ axes.T
-        low, high = centres.min(axis=0), centres.max(axis=0)
+        # All cameras are in the view, and all points but those far from nearly all others.
+        inner = np.array([camera.centre for camera in cameras]) @ axes.T
         if len(model.points):
-            inner = np.percentile(model.points @ axes.T, (3, 97), axis=0)
-            low, high = np.minimum(low, inner[0]), np.maximum(high, inner[1])
+            bounds = np.percentile(model.points @ axes.T, (3, 97), axis=0)
+            inner = np.vstack([inner, bounds])
+        low = inner.min(axis=0)
+        high = inner.max(axis=0)
+        # A single camera without points has no extent.
         size = float((high - low).max()) or 1.0
         return cls(axes, axes.T @ (low + high) / 2, 2 / size, (high - low) / size)
 
@@ -199,9 +211,10 @@ def _model(
     points = model.points[:MAX_POINTS]
     placed = frame.place(points)
     near = np.abs(placed).max(axis=1, initial=0) < FAR
-    colours = (
-        known[:MAX_POINTS] if known is not None else point_colours(points, model.images, pictures)
-    )
+    # A model in memory, or in a journal, has no colours.
+    found = point_colours(points, model.images, pictures) if known is None else known
+    colours = found[:MAX_POINTS]
+    # The largest coordinate has the largest step, whatever the model's size.
     reach = float(np.abs(placed[near]).max(initial=1e-6))
     steps = np.round(placed[near] * (STEPS / reach)).astype("<i2")
     centres = frame.place(np.array([found.camera.centre for found in model.images]))
@@ -219,9 +232,12 @@ def _model(
 def _camera(
     found: RegisteredImage, frame: _Frame, pictures: Mapping[str, Pixels], partners: Partners
 ) -> dict[str, Any]:
-    camera, size, name = found.camera, found.image.size, found.image.name
+    camera = found.camera
+    size = found.image.size
+    name = found.image.name
     sigmas = found.sigmas and (found.sigmas.rotation, 100 * found.sigmas.centre, found.sigmas.focal)
     return {
+        # Names in a scene are paths below the folder, or whole paths.
         "name": Path(name).name,
         "centre": _rounded(frame.place(camera.centre[None])[0]),
         "R": [_rounded(row) for row in camera.R @ frame.axes.T],
@@ -253,6 +269,7 @@ def point_colours(
         pixels, depths = _projected(found.camera, points)
         height, width = picture.shape[:2]
         scale = width / found.image.size.width, height / found.image.size.height
+        # (0, 0) is the centre of the first pixel of the image, which the picture reduces.
         columns, rows = np.floor((pixels + 0.5) * scale).T
         inside = (depths > 0) & (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
         distances = np.linalg.norm(points - found.camera.centre, axis=1)
@@ -279,6 +296,7 @@ def _pictures(models: Sequence[SfmModel], read: Reader) -> dict[str, Pixels]:
     for name in [*names][:MAX_PICTURES]:
         image = read(name)
         if image is not None:
+            # A small image is not enlarged.
             scale = min(1.0, THUMBNAIL_PX / max(image.size))
             reduced = cv2.resize(
                 image.pixels, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA
@@ -299,6 +317,7 @@ def _frustum_size(centres: NDArray[np.float64]) -> float:
         return MAX_FRUSTUM
     distances = np.linalg.norm(centres[:, None] - centres, axis=2)
     np.fill_diagonal(distances, np.inf)
+    # The median, because two photographs from one place would hide all frusta.
     spacing = float(np.median(distances.min(axis=1)))
     return float(np.clip(FRUSTUM_SHARE * spacing, MIN_FRUSTUM, MAX_FRUSTUM))
 
