@@ -1,6 +1,7 @@
 """Options shared by several commands, and tables for the terminal."""
 
 import argparse
+import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from math import inf
@@ -10,7 +11,7 @@ from typing import Any
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.budget import Budget, monotonic_of, parse_duration
 from mkpc_kaggle.engine.cluster import parse_workers
-from mkpc_kaggle.engine.console import drain, say, unblocked
+from mkpc_kaggle.engine.console import Progress, drain, say, unblocked
 from mkpc_kaggle.engine.request import RunReport
 from mkpc_kaggle.engine.session import Interrupt, Session
 from mkpc_kaggle.pipeline.assembly import Assembly, assemble
@@ -131,7 +132,8 @@ def finish(session: Session, page: Path | None, pairs: Sequence[Pair]) -> int:
     from mkpc_kaggle.reporting.report import report_run
 
     if page is not None:
-        say(report_run(session.work_dir, page, session.must_end(), pairs))
+        progress = Progress(session.budget, sys.stderr)
+        say(report_run(session.work_dir, page, session.must_end(), pairs, progress))
     return 128 + session.interrupt.signal if session.interrupt.signal else session.status
 
 

@@ -13,7 +13,11 @@ from mkpc_kaggle.engine.console import say
 from mkpc_kaggle.engine.session import interruptible
 from mkpc_kaggle.recipe import CameraSharing
 from mkpc_kaggle.reconstruction.coordinates import forget_coordinates, keep_coordinates
-from mkpc_kaggle.reconstruction.directory import output_directory, require_directory_apart
+from mkpc_kaggle.reconstruction.directory import (
+    WORK,
+    output_directory,
+    require_directory_apart,
+)
 from mkpc_kaggle.reconstruction.folder import batch_names, read_folder, read_pair_list
 from mkpc_kaggle.reconstruction.layout import write_layouts
 from mkpc_kaggle.reconstruction.outputs import FORMS, Cameras, write_tables
@@ -95,14 +99,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    root, out, work_dir = arguments.images, arguments.out, arguments.out / "work"
+    root = arguments.images
+    out = arguments.out
+    work_dir = out / WORK
     datasets = read_folder(root)
     files = [file for found in datasets.values() for file in found]
-    known = (
-        ""
-        if arguments.intrinsics is None
-        else read_intrinsics_table(arguments.intrinsics, root, files)
-    )
+    # All inputs are read and checked before OUT is touched.
+    known = ""
+    if arguments.intrinsics is not None:
+        known = read_intrinsics_table(arguments.intrinsics, root, files)
     masks = Masks() if arguments.masks is None else Masks.of_folder(arguments.masks, root, files)
     inputs = [root, arguments.pairs, Path(arguments.recipe), arguments.intrinsics, arguments.masks]
     require_directory_apart(out, filter(None, inputs), arguments.weights)
@@ -123,22 +128,31 @@ def run(arguments: argparse.Namespace) -> int:
         assembly = options.assembly_of(arguments, arguments.recipe, arguments.mode, interrupt)
         recipe = for_cameras(assembly.recipe, arguments.camera, known)
         assembly = replace(assembly, recipe=recipe, masks=masks)
-        options.say_start(f"{sum(map(len, datasets.values()))} images", assembly, work_dir)
-        given = {"listed": listed, "rotations": arguments.rotations, "publish": publish}
-        result = reconstruct_folder(root, datasets, assembly, session, out, **given)
-        unwritten, failed = result.report.unwritten, trouble(result.report)
-        session.status = int(bool(failed or unwritten)) or session.status
-        layouts = write_layouts(out, root, datasets, session.must_end())
-        kept = keep_coordinates(out, root, result)
-        lines = [
-            *options.plan_lines(arguments, result.report),
-            *_lines(result, root),
-            *layouts,
-            *kept,
-            failed,
-            unwritten,
+        options.say_start(f"{len(files)} images", assembly, work_dir)
+        result = reconstruct_folder(
+            root,
+            datasets,
+            assembly,
+            session,
+            out,
+            listed=listed,
+            rotations=arguments.rotations,
+            publish=publish,
+        )
+        # A run that failed has failed even if an earlier one has left a model.
+        if trouble(result.report) or result.report.unwritten:
+            session.status = 1
+        if any(any(found.values()) for found in result.cameras.values()):
+            say("writing images/ and sparse/ for other programs")
+        problems = [
+            *write_layouts(out, root, datasets, session.must_end()),
+            *keep_coordinates(out, root, result),
+            trouble(result.report),
+            result.report.unwritten,
         ]
+        lines = [*options.plan_lines(arguments, result.report), *_lines(result, root), *problems]
         say("\n".join(filter(None, [*lines, f"results: {out}"])))
+        # Without pairs there is nothing to report.
         page = out / "report.html" if result.pairs else None
         return options.finish(session, page, result.pairs)
 
@@ -148,6 +162,7 @@ def _lines(result: FolderResult, root: Path) -> Iterator[str]:
     report = result.report
     ended = f"{report.ending} after {format_duration(report.seconds)}"
     yield f"{len(result.pairs)} pairs: {ended}; {report.units_run} units run, {report.estimated} F estimated"
+    # Of the datasets that the run reached
     reasons = {scene.batch: scene.failure for scene in report.scenes}
     batches = batch_names(root, result.cameras)
     for name, found in result.cameras.items():
@@ -161,6 +176,7 @@ def _lines(result: FolderResult, root: Path) -> Iterator[str]:
         yield f"{batches[name]}: {models.total()} of {len(found)} images have a camera: {why}"
     yield from weakest_line(report.scenes)
     yield from pending_lines(report)
+    # An image that cannot be read fails in all of its pairs, with one text.
     unreadable = {
         record.failure for record in report.records if record.reached and not record.units
     }

@@ -28,6 +28,8 @@ from mkpc_kaggle.engine.budget import Budget, format_duration
 
 # Between lines of progress, where a line cannot be redrawn in place.
 LINE_INTERVAL_S = 30.0
+WAIT_S = 5.0  # shorter waits are not shown
+REDRAW_S = 1.0  # between counts of the seconds of a wait
 BAR = "{desc}: {n_fmt}/{total_fmt} [{elapsed}<{remaining}, {pace}]"  # of tqdm
 MAX_WAITING = 1000  # writes, which a busy progress line makes in a few minutes
 # Of the text of native libraries, printed at the end: a warning for each photograph would hide the rest.
@@ -113,6 +115,26 @@ class Progress:
         if isfinite(self._budget.time_limit):
             text += f", budget left {format_duration(self._budget.left())}"
         return text
+
+    @property
+    def is_shown(self) -> bool:
+        return self._stream is not None
+
+    def wait(self, text: str, since: float) -> None:
+        """Show how long something has taken that has no count, once it has taken ``WAIT_S``."""
+        now = self._budget.clock()
+        interval = REDRAW_S if self._erase else LINE_INTERVAL_S
+        if now - since < WAIT_S or now - max(since, self._written) < interval:
+            return
+        self._written = now
+        line = f"{text} [{format_duration(now - since)}]"
+        if self._erase:
+            width = shutil.get_terminal_size().columns
+            print_to(self._stream, self._erase + line[: width - 1], end="")
+            # The next phase begins on a new line.
+            self._line = line
+        else:
+            print_to(self._stream, line)
 
     def note(self, text: str) -> None:
         print_to(self._stream, self._erase + text)

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from mkpc_kaggle.engine import console
-from mkpc_kaggle.engine.budget import Budget, Costs
+from mkpc_kaggle.engine.budget import Budget, Costs, format_duration
 from mkpc_kaggle.engine.console import Progress
 from mkpc_kaggle.engine.image_files import digest_files, update_digests
 from mkpc_kaggle.engine.jobs import (
@@ -89,6 +89,7 @@ class Engine:
         self._features = Features(store)
         self._asked: Asked | None = None  # the latest request
         self._refused: dict[str, str] = {}  # why a matcher cannot be loaded, by name
+        self._looking_since = 0.0  # the features of a large folder are many short jobs
         self._is_open = False  # the places for matching exist
         self._has_loaded = False  # some worker of matching was ready
         self._has_ended = False
@@ -126,6 +127,7 @@ class Engine:
     def look(self, jobs: Mapping[str, Callable[[], Any]]) -> dict[str, Any]:
         """Return features by key: JSON values, or bytes. Failed ones are left out."""
         self._features.ask(jobs)
+        self._looking_since = self.budget.clock()
         self._loop()
         self._features.pending = {}  # the time is over, or the run was interrupted
         return self._features.found
@@ -225,7 +227,29 @@ class Engine:
                 self._asked.publication.publish()
             # Until an answer, or until a worker must have answered or may be restarted.
             limits = [place.limit for place in self.site.places if place.limit > now]
+            waits = self._waits() if self._progress.is_shown else []
+            if waits:
+                # The longest stands for all. The line counts its seconds.
+                since, text = min(waits)
+                self._progress.wait(text, since)
             self.site.wait(min([self.budget.stop_waiting, *limits, inf]))
+
+    def _waits(self) -> list[tuple[float, str]]:
+        """Return what is under way and has no bar: the time of its beginning, and a text."""
+        waits = []
+        # While pairs are matched, the bar shows those.
+        is_matching = self.state is not None and bool(self.state.matching.any())
+        for place in self.site.places if not is_matching else []:
+            if place.is_starting and place.work is Work.MATCH:
+                waits.append((place.since, "loading the matchers"))
+            elif isinstance(place.job, FeatureJob):
+                count = len(self._features.pending) + 1
+                waits.append((self._looking_since, f"features of images: {count} pending"))
+            elif isinstance(place.job, SceneJob) and self._asked is not None:
+                about = format_duration(self._asked.reconstructing.forecast(place.job))
+                text = f"batch {place.job.batch}: reconstructing its cameras, about {about}"
+                waits.append((place.since, text))
+        return waits
 
     def _is_over(self) -> bool:
         return self.interrupt.is_set() or self.budget.clock() >= self.budget.stop_waiting

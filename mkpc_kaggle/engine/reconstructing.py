@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from mkpc_kaggle.engine.budget import SCENE_MATCH_S, SCENE_START_S
+from mkpc_kaggle.engine.budget import SCENE_MATCH_S, SCENE_START_S, format_duration
 from mkpc_kaggle.engine.jobs import Failure, SceneJob
 from mkpc_kaggle.engine.records import NOT_RECONSTRUCTED, SCENE, EventKind, SceneRecord
 from mkpc_kaggle.engine.restore import EXPORT
@@ -33,8 +33,7 @@ class Reconstructing:
         if export is not None:
             # From now on the files may be replaced, so they belong to no stored scene.
             run.store.remove(EXPORT + batch)
-        run.progress.note(f"batch {batch}: reconstructing its cameras from {len(pairs)} pairs")
-        return SceneJob(
+        job = SceneJob(
             batch,
             key,
             pairs,
@@ -44,11 +43,19 @@ class Reconstructing:
             matches=int(state.matches[indices].sum()),
             export=export,
         )
+        about = format_duration(self.forecast(job))
+        text = f"reconstructing its cameras from {len(pairs)} pairs, about {about}"
+        run.progress.note(f"batch {batch}: {text}")
+        return job
+
+    def forecast(self, job: SceneJob) -> float:
+        """Return the expected seconds of a job, by the scenes of this run so far."""
+        return float(self._run.costs.scenes(np.array([job.matches]))[0])
 
     def patience(self, job: SceneJob) -> float:
-        forecast = float(self._run.costs.scenes(np.array([job.matches]))[0])
         # Small scenes measured so far say little about the time of a large one.
-        return HANG_FACTOR * max(forecast, SCENE_START_S + SCENE_MATCH_S * job.matches)
+        unmeasured = SCENE_START_S + SCENE_MATCH_S * job.matches
+        return HANG_FACTOR * max(self.forecast(job), unmeasured)
 
     def save(self, job: SceneJob, answer: Solution, seconds: float) -> None:
         """Save and use a scene, even if it is stale: the former scene is older still."""

@@ -67,6 +67,24 @@ def test_lines_come_when_a_phase_begins_now_and_then_and_in_the_end() -> None:
     assert stream.getvalue().splitlines() == [*sweep, *deepen]
 
 
+def test_a_wait_is_counted_on_a_terminal_and_a_line_now_and_then_elsewhere() -> None:
+    terminal, file, clock = Terminal(), StringIO(), VirtualClock()
+    shown = [Progress(Budget(0.0, clock=clock), stream) for stream in (terminal, file)]
+    for _ in range(70):
+        for progress in shown:
+            progress.wait("batch a: reconstructing its cameras, about 1m10s", 0.0)
+        clock.now += 1
+    assert terminal.getvalue().count("\r\x1b[K") == 65, "the first five seconds are not shown"
+    assert terminal.getvalue().split("\r\x1b[K")[-1] == (
+        "batch a: reconstructing its cameras, about 1m10s [1m09s]"
+    )
+    assert [line[-7:] for line in file.getvalue().splitlines()] == ["[30.0s]", "[1m00s]"]
+    for progress in shown:
+        progress.show(Phase.SWEEP, 1, 2)
+        progress.close()
+    assert terminal.getvalue().splitlines()[-1].endswith("sweep: 1/2 [00:00<?, ? s/pair]")
+
+
 @pytest.mark.parametrize("stream", [StringIO(), Terminal()])
 def test_a_note_is_a_line_of_its_own(stream: StringIO) -> None:
     progress = Progress(Budget(0.0, clock=VirtualClock()), stream)
