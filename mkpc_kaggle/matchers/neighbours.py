@@ -75,7 +75,7 @@ def _nearest(queries: Tensor, keys: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         similarity = block @ filled.T  # (rows, M)
         similarity[:, len(keys) :] = -1.0
         # Only the maximum of each group is taken over all keys: a search for its index is slow.
-        groups = similarity.unflatten(1, (-1, GROUP))
+        groups = similarity.view(len(block), len(filled) // GROUP, GROUP)
         highest = groups.amax(dim=2)
         best, group = highest.max(dim=1)
         inside = groups.gather(1, group[:, None, None].expand(-1, 1, GROUP))[:, 0]

@@ -9,6 +9,7 @@ from dataclasses import replace
 from functools import partial
 from itertools import combinations
 from pathlib import Path
+from types import MappingProxyType
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.console import warn
@@ -61,6 +62,7 @@ def choose_pairs(
     for name, files in datasets.items():
         ends[name] = [two for two in listed or () if two[0].parent == files[0].parent]
         is_large = listed is None and len(files) > MAX_IMAGES
+        # Only images with partners can be compared in several orientations.
         may_lie = rotations and (bool(ends[name]) if listed else len(files) > 1)
         count = PARTNERS if is_large else TURN_PARTNERS
         partners = find_partners(engine, name, files, count) if is_large or may_lie else []
@@ -93,6 +95,7 @@ def find_partners(engine: Engine, dataset: str, files: Sequence[Path], count: in
     """Return the indices of the ``count`` images most similar to each image; empty if the
     comparison failed.
     """
+    # By contents, so that a folder that moved is not compared again
     found = engine.digest_files({str(file): file for file in files})
     digests = [found.get(str(file), "") for file in files]
     keys = [features_key(each) for each in digests]
@@ -107,6 +110,7 @@ def find_partners(engine: Engine, dataset: str, files: Sequence[Path], count: in
         )
         source = engine.store.source(keys)
         known = engine.look({key: partial(compare, source, keys, count)}).get(key)
+    # The time is over, or the comparison failed twice. Then no image has partners.
     if known is None:
         warn(f"the images of {files[0].parent} were not compared")
     partners: Partners = [[] for _ in files] if known is None else known
@@ -147,34 +151,44 @@ def find_turns(
     images, as turned so far.
     """
     recipe = assembly.recipe
+    # One unit is enough to see whether an image matches at all.
     trial = replace(assembly, recipe=replace(recipe, units=recipe.units[:1], scene=None))
     found: dict[Key, int] = {}
-    turns: dict[Path, int] = {}
-
-    def inliers(a: Path, times: int) -> int:
-        """Return the most inliers of ``a``, turned ``times`` quarters, with a similar image as
-        turned so far.
-        """
-        return max(
-            (found.get(relative(a, times - turns.get(b, 0), b), 0) for b in near[a]), default=0
-        )
-
     for tried in ((0,), (1, 2, 3)):
-        few = [a for a in near if inliers(a, 0) < MANY_INLIERS]
+        # Most images are upright, and these need no other orientation.
+        few = [a for a in near if most_inliers(found, near[a], a, 0) < MANY_INLIERS]
         keys = sorted({relative(a, times, b) for a in few for times in tried for b in near[a]})
         if keys:
             pairs = [pair_of(names[a], a, b, times, 0) for a, times, b in keys]
             engine.ask(request_of(pairs, trial, session, str(root), is_trial=True), TRIAL_SHARE)
             assert engine.state is not None
             found |= zip(keys, engine.state.inliers.tolist(), strict=True)
+    turns: dict[Path, int] = {}
     for a in near:
-        counts = [inliers(a, times) for times in range(4)]
+        counts = [most_inliers(found, near[a], a, times, turns) for times in range(4)]
         best = max(range(4), key=counts.__getitem__)
+        # A matcher that tolerates rotations finds some inliers in all orientations.
         if counts[0] < MANY_INLIERS and counts[best] >= max(MIN_INLIERS, MIN_GAIN * counts[0]):
             turns[a] = best
     return turns
 
 
+def most_inliers(
+    found: Mapping[Key, int],
+    others: Iterable[Path],
+    a: Path,
+    times: int,
+    turns: Mapping[Path, int] = MappingProxyType({}),
+) -> int:
+    """Return the most inliers of ``a``, turned by ``times`` quarters, with one of the others.
+
+    ``turns`` are the orientations of the others that are known so far.
+    """
+    counts = (found.get(relative(a, times - turns.get(b, 0), b), 0) for b in others)
+    return max(counts, default=0)
+
+
 def relative(a: Path, times: int, b: Path) -> Key:
     """Return the key of image ``a``, turned by ``times`` quarters, and the unturned image ``b``."""
+    # Both images turned alike match as both unturned, so only the difference counts.
     return (a, times % 4, b) if a < b else (b, -times % 4, a)

@@ -28,6 +28,7 @@ STILL = 1e-6  # of the model's size; smaller movements are rounding
 def forget_coordinates(out: Path, datasets: Iterable[str]) -> None:
     """Remove the cameras of the last complete run, so that the next models have new coordinates."""
     for dataset in datasets:
+        # A first run has none.
         (out / dataset / REFERENCE).unlink(missing_ok=True)
 
 
@@ -38,6 +39,7 @@ def keep_coordinates(out: Path, root: Path, result: FolderResult) -> Iterator[st
     A run that was ended early saves nothing, so that it ends as an undisturbed run when it is
     resumed.
     """
+    # Cameras of half the pairs are no coordinates to keep.
     if result.report.ending != Ending.COMPLETE:
         return
     batches = batch_names(root, result.cameras)
@@ -47,11 +49,13 @@ def keep_coordinates(out: Path, root: Path, result: FolderResult) -> Iterator[st
             if placed is not None:
                 number, found = placed
                 models.setdefault(number, {})[file.relative_to(root).as_posix()] = found.camera
+        # Before they are replaced
         yield from moved_lines(
             batches[dataset],
             read_reference(out / dataset),
             [models[number] for number in sorted(models)],
         )
+        # Without any model, the cameras of the last run stay for the next one.
         if models:
             with replacing(out / dataset / REFERENCE) as stream:
                 write_reference(stream, [models[number] for number in sorted(models)])
@@ -60,6 +64,7 @@ def keep_coordinates(out: Path, root: Path, result: FolderResult) -> Iterator[st
 def moved_lines(batch: str, earlier: Iterable[Cameras], models: Sequence[Cameras]) -> Iterator[str]:
     """Yield a line for each earlier model whose cameras are in a model now, and have moved."""
     for former in earlier:
+        # A model may have split, or joined another one.
         now = max(models, key=lambda model: len(model.keys() & former.keys()), default={})
         names = sorted(now.keys() & former.keys())
         if len(names) < MIN_COMMON:
@@ -67,6 +72,7 @@ def moved_lines(batch: str, earlier: Iterable[Cameras], models: Sequence[Cameras
         targets = [former[name] for name in names]
         moved = moved_by([now[name] for name in names], targets) / size_of(targets)
         if moved.max() > STILL:
-            middle, most = 100 * np.median(moved), 100 * moved.max()
+            middle = 100 * np.median(moved)
+            most = 100 * moved.max()
             text = f"{len(names)} cameras keep the coordinates of the last run and moved by {middle:.2g} %"
             yield f"{batch}: {text} of the model's size (the median; {most:.2g} % at most)"

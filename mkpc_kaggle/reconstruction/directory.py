@@ -18,7 +18,8 @@ from mkpc_kaggle.scene.align import REFERENCE
 from mkpc_kaggle.scene.export import DATABASE, IMAGES, MODEL_FILES, MODELS, PART, SPARSE
 from mkpc_kaggle.weights.manifest import digest_of
 
-WORK, TABLES = "work", ("cameras.csv", "submission.csv", "report.html", "summary.json")
+WORK = "work"
+TABLES = ("cameras.csv", "submission.csv", "report.html", "summary.json")
 RESERVED = {DATABASE, MODELS, SPARSE, WORK, *TABLES}  # names that no dataset may have
 FILES = (DATABASE, MODELS, SPARSE, IMAGES, REFERENCE)  # of each dataset
 MARK = f"{WORK}/results.json"  # digests of results by path; "" if their run did not end
@@ -38,6 +39,7 @@ def output_directory(out: Path, datasets: Iterable[str], form: str | None = None
     """
     results = [name for name in TABLES if form or name != "submission.csv"]
     names = list(datasets)
+    # Each dataset has its files in a folder of OUT with its name.
     inner = {str(PurePosixPath(name, each)) for name in names for each in FILES}
     results += sorted(each for each in inner if not holds_dataset(each, names))
     with writing(f"--out {out}"):
@@ -46,13 +48,16 @@ def output_directory(out: Path, datasets: Iterable[str], form: str | None = None
             message = f"--out {out}: {strange} is in the way, it was not made by this command"
             raise UserError(f"{message}; move it, or name an empty directory")
         known = dict.fromkeys(results, "") | (marked or {})
+        # Before the first result: after a kill, its files are known as ours.
         _write_mark(out, known)
+        # A folder that cannot be written is found now, and not after hours.
         for folder in {(out / name).parent for name in results}:
             folder.mkdir(parents=True, exist_ok=True)
             TemporaryDirectory(prefix=PART, dir=folder).cleanup()
         before = {name: _digest(out / name) for name in results}
     yield
     with writing(f"--out {out}"):
+        # Results of datasets that are gone, unless the user has changed them
         for name in known.keys() - results:
             if known[name] and known[name] == _digest(out / name):
                 _remove(out / name)
@@ -71,6 +76,7 @@ def holds_dataset(result: str, datasets: Iterable[str]) -> bool:
 def require_directory_apart(out: Path, inputs: Iterable[Path], weights: Iterable[Path]) -> None:
     """Raise :class:`UserError` if ``out`` contains an input or weights, or lies in an input."""
     inputs = list(inputs)
+    # Weights may lie around OUT, as in a home directory; an input folder may not.
     for place in (*inputs, *weights, *weights_of_environment()):
         if os.path.lexists(place) and (
             lies_in(place, out) or (place in inputs and lies_in(out, place))
@@ -82,6 +88,7 @@ def require_directory_apart(out: Path, inputs: Iterable[Path], weights: Iterable
 
 def _read_mark(out: Path) -> dict[str, str] | None:
     """Return the digests of earlier results, or ``None`` if no run has marked the directory."""
+    # A damaged mark marks nothing.
     with suppress(OSError, ValueError, AttributeError, RecursionError):
         if _is_inside(out, MARK):
             known = json.loads((out / MARK).read_text()).items()
@@ -101,6 +108,7 @@ def _in_the_way(
     """Yield the user's links and files at the paths of results; in an unmarked directory, all links
     and files.
     """
+    # Hidden files, such as those of file managers, are in nobody's way.
     if marked is None:
         yield from (path for path in out.rglob("[!.]*") if path.is_symlink() or not path.is_dir())
     for name in results:
@@ -129,6 +137,7 @@ def _is_inside(out: Path, name: str) -> bool:
 
 def _digest(path: Path) -> str:
     """Return the digest of a file or a folder; "" if it does not exist. Photographs are not read."""
+    # The photographs of a large folder are gigabytes, so their links or times stand for them.
     if path.name == IMAGES and path.is_dir():
         lines = sorted(f"{each.name} {_version(each)}\n" for each in path.iterdir())
         return hashlib.sha256("".join(lines).encode("utf-8", "surrogateescape")).hexdigest()
@@ -145,6 +154,7 @@ def _version(path: Path) -> str:
 
 def _remove(path: Path) -> None:
     shutil.rmtree(path) if path.is_dir() else path.unlink()
+    # The folder of a dataset that is gone
     for folder in path.parents:
         with suppress(OSError):  # the folder is not empty
             folder.rmdir()

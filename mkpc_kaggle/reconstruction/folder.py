@@ -27,9 +27,14 @@ def read_folder(root: Path) -> Datasets:
         raise UserError(
             f"{root}: no such directory; name a folder of images, or of folders of images"
         )
-    datasets, hidden, seen = {}, list[Path](), {root.resolve()}
+    datasets = {}
+    hidden: list[Path] = []
+    seen = {root.resolve()}
+    # A folder that cannot be read is an error: a part of the images would be missing silently.
     for place, folders, names in os.walk(root, onerror=_refuse_unreadable, followlinks=True):
-        folder, images = Path(place), sorted(filter(_is_image, names))
+        folder = Path(place)
+        # Sorted, since the order of a file system is arbitrary and decides bytes of results
+        images = sorted(filter(_is_image, names))
         hidden += [folder / name for name in (*folders, *images) if name.startswith(".")]
         inner = [folder / name for name in sorted(folders) if not name.startswith(".")]
         # Links may form a cycle
@@ -45,6 +50,7 @@ def read_folder(root: Path) -> Datasets:
         raise UserError(
             f"{root} has no images: name a folder with {', '.join(IMAGE_SUFFIXES)} files"
         )
+    # Other datasets of a single image are listed without a camera.
     if all(len(files) < 2 for files in datasets.values()):
         name = next(iter(datasets.values()))[0].name
         raise UserError(f"{root} has a single image, {name}: there is nothing to match")
@@ -72,6 +78,7 @@ def _require_usable(folder: Path, root: Path, files: Sequence[Path]) -> None:
     """Raise :class:`UserError` if the name of a folder or an image cannot be used in tables and
     databases.
     """
+    # The root's own name stands for "." in reports.
     parts = folder.relative_to(root).parts or (root.resolve().name,)
     for name in (*parts, *(path.name for path in files)):
         if CONTROL.search(name) or printable(name) != name:
@@ -80,6 +87,7 @@ def _require_usable(folder: Path, root: Path, files: Sequence[Path]) -> None:
             )
     if reserved := RESERVED.intersection(map(str.lower, folder.relative_to(root).parts)):
         raise UserError(f"{folder}: results are called {min(reserved)}; rename that folder")
+    # Names of pairs, and ids of some submissions, have no suffix.
     stems: dict[str, Path] = {}
     for path in files:
         if (other := stems.setdefault(path.stem, path)) is not path:
@@ -106,7 +114,8 @@ def read_pair_list(path: Path, root: Path, datasets: Datasets) -> list[Ends]:
             (root / text[: gap.start()], root / text[gap.end() :])
             for gap in re.finditer(r"\s+", text)
         )
-        ends = [sorted(two) for two in ways if known.issuperset(two)]  # names may have blanks
+        # Names may have blanks, so each blank may be the border.
+        ends = [sorted(two) for two in ways if known.issuperset(two)]
         if len(ends) != 1 or ends[0][0] == ends[0][1] or ends[0][0].parent != ends[0][1].parent:
             raise UserError(
                 f"{path}, line {number}: expected two images of one dataset of {root}, found {line!r}"
@@ -114,4 +123,5 @@ def read_pair_list(path: Path, root: Path, datasets: Datasets) -> list[Ends]:
         found.append((ends[0][0], ends[0][1]))
     if not found:
         raise UserError(f"{path} has no pairs")
+    # hloc's lists may name a pair in both orders.
     return list(dict.fromkeys(found))

@@ -27,6 +27,7 @@ def write_layouts(out: Path, root: Path, datasets: Datasets, ends: float) -> Ite
     """Write the folders of each dataset until ``ends``, in seconds of the monotonic clock. Yield
     the problems.
     """
+    # A folder that fails is a line, and the others are still written.
     for dataset, files in datasets.items():
         directory = out / dataset
         if holds_dataset(str(PurePosixPath(dataset, IMAGES)), datasets):
@@ -50,6 +51,7 @@ def write_images(directory: Path, files: Sequence[Path]) -> None:
     folder = directory / IMAGES
     folder.mkdir(parents=True, exist_ok=True)
     names = {file.name for file in files}
+    # Files that are no links may be the user's.
     for former in folder.iterdir():
         if former.is_symlink() and former.name not in names:
             former.unlink()
@@ -62,12 +64,14 @@ def _link(path: Path, file: Path) -> None:
     if path.is_symlink():
         if path.readlink() == file:
             return
+        # Of an image that has moved
         path.unlink()
     elif path.exists() and _version(path) == _version(file):
         return
     with suppress(OSError):  # an old copy exists, or the file system has no links
         path.symlink_to(file)
         return
+    # A copy that was cut off must not look like an image.
     part = path.with_name(f"{PART}{path.name}")
     shutil.copy2(file, part)
     part.replace(path)
@@ -84,12 +88,14 @@ def write_sparse(directory: Path, names: Mapping[str, str], seconds: float | Non
     ``names`` maps an image's name in a model to its name in ``images``. A separate process does the work, since
     pycolmap may end it; the process is ended after ``seconds``, unless ``None``.
     """
+    # A fork would copy the threads' locks of a parent that may hold them.
     context = get_context("spawn")
     receiver, sender = context.Pipe(duplex=False)
     process = context.Process(
         target=_write_sparse_to, args=(sender, directory, dict(names)), daemon=True
     )
     process.start()
+    # The child's end alone stays open, so its death ends the wait.
     sender.close()
     try:
         if not receiver.poll(seconds):
@@ -123,6 +129,7 @@ def convert_models(directory: Path, names: Mapping[str, str]) -> None:
         (made / SPARSE).mkdir()
         for folder in sorted((directory / MODELS).glob("[0-9]*")):
             model = pycolmap.Reconstruction(folder)
+            # Before colours are read: images/ has plain names.
             for image in model.images.values():
                 image.name = names.get(image.name, image.name)
             model.extract_colors_for_all_images(directory / IMAGES)
@@ -134,5 +141,6 @@ def convert_models(directory: Path, names: Mapping[str, str]) -> None:
                 os.fsync(stream.fileno())
         if (directory / SPARSE).exists():
             (directory / SPARSE).rename(made / FORMER)
+        # A dataset without cameras has no folder, which other programs would take for an empty model.
         if any((made / SPARSE).iterdir()):
             (made / SPARSE).rename(directory / SPARSE)

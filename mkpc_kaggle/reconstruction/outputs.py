@@ -59,7 +59,8 @@ def submission_rows(form: str, cameras: Cameras, root: Path) -> Iterator[Sequenc
         ("image_id", "dataset", "scene", "image") if of_2025 else ("image_path", "dataset", "scene")
     )
     yield *heads, "rotation_matrix", "translation_vector"
-    ids, names = set[str](), set(cameras) - {"."}
+    ids = set[str]()
+    names = set(cameras) - {"."}
     for dataset, found in cameras.items():
         folder = _unused(root.resolve().name, names) if dataset == "." else dataset
         parts = folder.split("/")  # dataset/scene/images in 2023, dataset/images in 2024
@@ -74,6 +75,7 @@ def submission_rows(form: str, cameras: Cameras, root: Path) -> Iterator[Sequenc
 
 
 def joined(numbers: NDArray[np.float64]) -> str:
+    # Twelve digits: later ones are rounding.
     return ";".join(f"{value:.12g}" for value in numbers.ravel())
 
 

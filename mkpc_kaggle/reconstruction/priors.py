@@ -19,6 +19,7 @@ def read_intrinsics_table(file: Path, root: Path, images: Iterable[Path]) -> str
     :class:`UserError` for a malformed row, a row that names no image, and a camera that does not fit its image.
     """
     rows: list[tuple[str, KnownCamera]] = []
+    # The file and line of each row, for messages
     where: list[str] = []
     for place, cells in read_rows(file, COLUMNS):
         try:
@@ -33,9 +34,11 @@ def read_intrinsics_table(file: Path, root: Path, images: Iterable[Path]) -> str
         name = image.relative_to(root).as_posix()
         known = camera_of(rows, name)
         if known is not None:
+            # By identity, because two rows may have equal cameras
             number = next(n for n, (_, camera) in enumerate(rows) if camera is known)
             used.add(number)
             _require_fit(known, image, where[number])
+    # A misspelt name would silently have no effect.
     for number, (pattern, _) in enumerate(rows):
         if number not in used:
             raise UserError(
@@ -49,11 +52,13 @@ def _require_fit(known: KnownCamera, image: Path, where: str) -> None:
     size = read_size(image)
     if size is None:  # an unreadable image is reported by the run
         return
+    # Such as millimetres in place of pixels
     if known.focal / max(size) not in FOCALS:
         raise UserError(
             f"{where}: a focal length of {known.focal:g} px is implausible for {image.name} "
             f"of {size.width} x {size.height} pixels"
         )
+    # The most frequent mistake: a calibration at another resolution
     x, y = known.principal_point
     if x >= size.width or y >= size.height:
         raise UserError(

@@ -53,6 +53,7 @@ def for_cameras(recipe: Recipe, sharing: str | None = None, intrinsics: str = ""
     scene = recipe.scene or SceneConfig()
     scene = replace(
         scene,
+        # The folder has its pairs already.
         pairs_per_image=0.0,
         cameras=CameraSharing(sharing or scene.cameras),
         intrinsics=intrinsics or scene.intrinsics,
@@ -89,20 +90,24 @@ def reconstruct_folder(
         assembly, session, [files[0].parent for files in datasets.values()]
     ) as engine:
         standing: list[Cameras] = [{name: dict.fromkeys(files) for name, files in datasets.items()}]
+        # The tables of an earlier run are worth more than empty ones.
         if not (out / "cameras.csv").exists():
             with writing(f"--out {out}"):
                 publish(standing[0])
         pairs = choose_pairs(
             engine, root, datasets, assembly, session, listed=listed, rotations=rotations
         )
+        # Reports call the images directly below the root by the root's name.
         batches = batch_names(root, datasets)
         exports = {batches[name]: out / name for name in datasets}
 
+        # Called by the engine's publications, and by the watchdog at the end of the time
         def write(results: State) -> None:
             standing[:] = [cameras_of(datasets, root, results)]
             publish(standing[0])
 
         engine.ask(request_of(pairs, assembly, session, str(root), exports=exports, publish=write))
+        # Within the context: afterwards the store is closed.
         report = engine.report()
     return FolderResult(report, tuple(pairs), *standing)
 
@@ -112,11 +117,13 @@ def cameras_of(datasets: Datasets, root: Path, results: State) -> Cameras:
     that has it.
     """
     cameras: dict[str, Mapping[Path, tuple[int, RegisteredImage] | None]] = {}
+    # A file that was not read has no digest, and no camera.
     known_digests = results.digests
     batches = batch_names(root, datasets)
     for name, files in datasets.items():
         scene = results.scenes.get(batches[name])
         models = () if scene is None else scene.models
+        # The largest model is the first, so it comes last into the dictionary and stays there.
         placed = [(number, found) for number, model in enumerate(models) for found in model.images]
         known = {found.image.digest: (number, found) for number, found in reversed(placed)}
         digests = {file: known_digests.get(name_below(str(root), str(file)), "") for file in files}
@@ -159,7 +166,7 @@ def reconstruct(
     for an unreadable image.
     """
     files = sorted(map(Path, images))
-    # Bad files are refused before weights are loaded, which takes long.
+    # Before weights are loaded, which takes long
     given_masks, known = priors_of(files, masks, intrinsics)
     assembly = assemble(recipe, weights=map(Path, weights), device=device, matchers=matchers)
     assembly = replace(
@@ -187,6 +194,7 @@ def priors_of(
     """
     if not files:
         return None, ""
+    # As the command's DIR, if all images are in one folder
     root = Path(os.path.commonpath([file.parent for file in files]))
     given = None if masks is None else Masks.of_folder(Path(masks), root, files)
     if intrinsics is None:
@@ -205,12 +213,14 @@ def matched_pairs(files: Sequence[Path], assembly: Assembly) -> Iterator[PairMat
     pipeline = assembly.pipeline()
     store = ImageStore()
 
+    # A few images of a notebook: one that is missing is a mistake, and no reason to go on without it.
     def opened(path: Path) -> Image:
         image = store.get(path)
         if isinstance(image, Unreadable):
             raise UserError(str(image))
         return image
 
+    # As in the command
     ends = list(combinations(range(len(files)), 2))
     if len(files) > MAX_IMAGES:
         features = list(map(local_features, files))

@@ -190,13 +190,15 @@ def _draw_projected(panel: "Axes", name: str, model: SfmModel, axes: NDArray[np.
     points = model.points @ axes
     # A few points of wrong matches lie far away and would shrink all others.
     near = _near(points[:, 0]) & _near(points[:, 1])
-    panel.scatter(*points[near].T, s=2, color=DROPPED, linewidths=0)
+    panel.scatter(points[near, 0], points[near, 1], s=2, color=DROPPED, linewidths=0)
     centres = np.array([camera.centre for camera in cameras])
     # Cameras at one point still have arrows.
     arrow = 0.12 * (np.ptp(centres, axis=0).max() or 1.0)
     looks = arrow * np.array([camera.R[2] for camera in cameras])
+    x, y = (centres @ axes).T
     panel.quiver(
-        *(centres @ axes).T,
+        x,
+        y,
         *(looks @ axes).T,
         angles="xy",
         scale_units="xy",
@@ -205,7 +207,7 @@ def _draw_projected(panel: "Axes", name: str, model: SfmModel, axes: NDArray[np.
         color=COLOURS[0],
     )
     # Above the arrows and the points
-    panel.scatter(*(centres @ axes).T, s=14, color=OUTLIER, linewidths=0, zorder=3)
+    panel.scatter(x, y, s=14, color=OUTLIER, linewidths=0, zorder=3)
     # One scale for both axes, and the panel filled
     panel.set_aspect("equal", adjustable="datalim")
     panel.margins(0.1)

@@ -66,6 +66,7 @@ def find_similarity(cameras: Sequence[Camera], targets: Sequence[Camera]) -> Sim
         return None
     turns = [target.R.T @ camera.R for camera, target in zip(cameras, targets, strict=True)]
     R = _mean_rotation(turns)
+    # From here on, only scale and offset are unknown.
     centres = _centres(cameras) @ R.T
     goals = _centres(targets)
     scale = _median_scale(centres, goals)
@@ -82,7 +83,8 @@ def find_similarity(cameras: Sequence[Camera], targets: Sequence[Camera]) -> Sim
 
 def moved_by(cameras: Sequence[Camera], targets: Sequence[Camera]) -> NDArray[np.float64]:
     """Return the distance (N,) of each camera's centre from its target's."""
-    centres, goals = _centres(cameras), _centres(targets)
+    centres = _centres(cameras)
+    goals = _centres(targets)
     return np.asarray(np.linalg.norm(centres - goals, axis=1))
 
 
@@ -94,6 +96,7 @@ def size_of(cameras: Sequence[Camera]) -> float:
 def _mean_rotation(rotations: Sequence[Matrix3]) -> Matrix3:
     """Return the rotation nearest to the mean."""
     U, _, Vt = np.linalg.svd(np.sum(rotations, axis=0))
+    # Without the determinant it could be a reflection.
     return np.asarray(U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt)
 
 
@@ -101,6 +104,7 @@ def _median_scale(centres: NDArray[np.float64], goals: NDArray[np.float64]) -> f
     """Return the median ratio of distances between goals and between centres; ``None`` for a single
     centre.
     """
+    # Distances do not depend on the offset, which comes later.
     before = pdist(centres)
     after = pdist(goals)
     apart = before > 0
@@ -137,6 +141,7 @@ def align(
 
     def aligned(model: SfmModel) -> SfmModel:
         cameras = {found.image.name: found.camera for found in model.images}
+        # Of several models, each may belong to another earlier one.
         earlier = max(reference, key=lambda former: len(cameras.keys() & former.keys()), default={})
         names = sorted(cameras.keys() & earlier.keys())
         found = find_similarity(
@@ -150,6 +155,7 @@ def align(
 def transformed(model: SfmModel, similarity: Similarity) -> SfmModel:
     """Return the model in another world. pycolmap's model is changed in place."""
     if model.colmap is not None:
+        # Heavy, and only where a model of it exists
         import pycolmap
 
         rotation = pycolmap.Rotation3d(similarity.R)
@@ -172,6 +178,7 @@ def read_reference(directory: Path) -> list[Cameras]:
     """Return the cameras of each model of the last complete run, with K the identity; empty if
     unknown.
     """
+    # A missing or damaged file costs the coordinates and not the run.
     models: list[Cameras] = []
     with suppress(OSError, ValueError, TypeError, AttributeError, RecursionError):
         for row in json.loads((directory / REFERENCE).read_text(encoding="utf-8")):

@@ -55,6 +55,7 @@ def choose(pair: BatchPair, models: Sequence[ModelImages]) -> Choice:
     no F.
     """
     digests = pair.image0.digest, pair.image1.digest
+    # Two copies of a file have one camera, and no epipolar geometry.
     if digests[0] == digests[1]:
         return Choice(None, Reason.SAME_IMAGE)
     model = next((model for model in models if model.keys() >= set(digests)), None)
@@ -64,6 +65,7 @@ def choose(pair: BatchPair, models: Sequence[ModelImages]) -> Choice:
     try:
         F = fundamental_of_cameras(*(model[digest].camera for digest in digests))
     except ValueError:
+        # The pair's own F may still describe the matches.
         return Choice(None, Reason.SAME_CENTRE)
     return Choice(None, Reason.CONTRADICTION) if contradicts(F, pair) else Choice(F, Reason.SCENE)
 
@@ -95,6 +97,7 @@ def estimate_at_known_focals(
     images = pair.image0, pair.image1
     if not any(image.digest in focals for image in images):
         return None
+    # An image outside the scene keeps the usual prior.
     first, second = (
         FocalPrior.of_focal(focals[image.digest], FOCAL_SIGMA, image.size)
         if image.digest in focals

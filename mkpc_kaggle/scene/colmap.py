@@ -54,6 +54,7 @@ def structure_from_motion(
     length is the shared one, the user's or EXIF's. All focal lengths are refined, unless the user
     knows them exactly.
     """
+    # Its warnings about single images would fill the log.
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
     pycolmap.set_random_seed(SEED)
     with pycolmap.Database.open(":memory:") as database:
@@ -82,6 +83,7 @@ def write_files(
             _fill(database, merged, shared, camera_model)
         for number, model in enumerate(models):
             kept = {each.image.name for each in model.images}
+            # A list, because frames are removed from what is iterated
             for frame in [frame for frame in model.colmap.frames.values() if frame.has_pose()]:
                 if model.colmap.images[frame.frame_id].name not in kept:
                     model.colmap.deregister_frame(frame.frame_id)
@@ -92,6 +94,7 @@ def write_files(
             # A power failure must not leave empty files under their names
             with path.open("rb") as stream:
                 os.fsync(stream.fileno())
+        # Only renames from here on: a kill leaves complete files, of one run or of two.
         (made / DATABASE).replace(directory / DATABASE)
         if (directory / MODELS).exists():
             (directory / MODELS).rename(made / FORMER)
@@ -103,6 +106,7 @@ def _fill(
     database: Any, merged: MergedGraph, shared: SharedIntrinsics, camera_model: CameraModel
 ) -> None:
     """Write the images, cameras and keypoints, and each edge's matches and verified geometry."""
+    # One transaction: a commit for each edge would wait for the disk.
     with pycolmap.DatabaseTransaction(database):
         cameras = _write_images(database, merged, shared, camera_model)
         geometries = verify(merged, cameras)
@@ -126,12 +130,14 @@ def _write_images(
     images = zip(graph.images, merged.keypoints, strict=True)
     for number, (image, points) in enumerate(images, start=1):
         focal = shared.get(image.digest)
+        # Images of two sizes never share, even at one focal length.
         key = number if focal is None else (image.size, focal)
         if key not in cameras:
             start = start_focal(image) if focal is None else focal
             known = graph.known.get(image.digest)
             cameras[key] = _write_camera(database, number, camera_model, image.size, start, known)
         camera = cameras[key]
+        # The keypoints are in the table of keypoints.
         taken = pycolmap.Image(
             name=image.name, camera_id=camera.camera_id, image_id=number, keypoints=np.zeros((0, 2))
         )
@@ -206,14 +212,17 @@ def run_mapper(database: Any, graph: ViewGraph, threads: int) -> Reconstruction:
     """Run the global mapper on a filled database. Return its plausible models."""
     seed = {"random_seed": SEED}
     common = seed | {"num_threads": threads}
+    # Each part has a random generator of its own.
     parts = dict.fromkeys(("rotation_averaging", "global_positioning", "retriangulation"), seed)
     required = (
         {"track_required_tracks_per_view": TRACKS_PER_IMAGE} if len(graph.images) > LARGE else {}
     )
     mapper = {**common, **parts, **required}
+    # With some exact cameras, the others must still be refined: those are restored afterwards.
     exact = [digest for digest, known in graph.known.items() if not known.sigma]
     if len(exact) == len(graph.images):
         mapper["bundle_adjustment"] = {"refine_focal_length": False, "refine_extra_params": False}
+    # Smaller models are dropped later anyway.
     limits = {"min_model_size": MIN_IMAGES, "min_num_matches": MIN_MATCHES}
     manager = pycolmap.ReconstructionManager()
     options = pycolmap.GlobalPipelineOptions({**common, **limits, "mapper": mapper})
@@ -237,28 +246,30 @@ def known_by_name(graph: ViewGraph) -> dict[str, KnownCamera]:
 
 
 def _sfm_model(found: Any, graph: ViewGraph) -> SfmModel:
-    images, sigmas = [], camera_sigmas(found, known_by_name(graph))
+    images = []
+    sigmas = camera_sigmas(found, known_by_name(graph))
+    # Sorted, because pycolmap's containers have no fixed order
     for number in sorted(found.reg_image_ids()):
         image = found.images[number]
-        pose, K = (
-            np.asarray(image.cam_from_world().matrix()),
-            np.array(image.camera.calibration_matrix()),
-        )
+        pose = np.asarray(image.cam_from_world().matrix())
+        K = np.array(image.camera.calibration_matrix())
         K[:2, 2] -= CENTRE_PX
+        # Copies: the views would keep pycolmap's memory.
         camera = Camera(K, pose[:, :3].copy(), pose[:, 3].copy())
-        known = (
-            graph.images[number - 1],
-            camera,
-            int(image.num_points3D),
-            sigmas.get(image.name, ()),
+        images.append(
+            RegisteredImage(
+                graph.images[number - 1],
+                camera,
+                int(image.num_points3D),
+                sigmas.get(image.name, ()),
+            )
         )
-        images.append(RegisteredImage(*known))
     tracks = {
         number: found.points3D[number].track.length() for number in sorted(found.point3D_ids())
     }
+    # The sort is stable: of equally long tracks, the point with the lower id.
     longest_first = sorted(tracks, key=lambda number: -tracks[number])
-    points = np.array([found.points3D[number].xyz for number in longest_first], np.float64).reshape(
-        -1, 3
-    )
+    points = np.array([found.points3D[number].xyz for number in longest_first], np.float64)
+    points = points.reshape(-1, 3)  # also without any point
     error = float(found.compute_mean_reprojection_error()) if len(points) else 0.0
     return SfmModel(tuple(images), points[np.isfinite(points).all(axis=1)], error, found)

@@ -28,8 +28,10 @@ def apply_known_cameras(found: Any, known: Mapping[str, KnownCamera]) -> None:
     ]
     if not placed:
         return
+    # Without the user's knowledge, which is to be weighed against it
     sigmas = camera_sigmas(found)
     for image in placed:
+        # Bundle adjustment does not determine this focal length: the user's counts alone.
         sigma = sigmas[image.name].focal if image.name in sigmas else np.inf
         set_camera(found.cameras[image.camera_id], known[image.name], sigma)
     config = pycolmap.BundleAdjustmentConfig()
@@ -41,6 +43,7 @@ def apply_known_cameras(found: Any, known: Mapping[str, KnownCamera]) -> None:
     solver = {"max_num_iterations": MAX_ITERATIONS, "num_threads": 1}
     ceres = {
         "use_gpu": False,
+        # A few wrong tracks remain in any model.
         "loss_function_type": "HUBER",
         "loss_function_scale": 1.0,
         "solver_options": solver,
@@ -56,7 +59,7 @@ def set_camera(camera: Any, known: KnownCamera, sigma: float) -> None:
     if not known.sigma:
         camera.params = list(known.parameters)
         return
-    # Of the user's value
+    # Of the user's value; in logarithms, where a deviation in percent has no direction
     weight = sigma**2 / (sigma**2 + known.sigma**2) if np.isfinite(sigma) else 1.0
     focal = np.exp((1 - weight) * np.log(camera.mean_focal_length()) + weight * np.log(known.focal))
     params = np.array(camera.params)

@@ -54,6 +54,7 @@ def scene_keypoints(graph: ViewGraph) -> tuple[list[Points], list[Index]]:
     """Return the keypoints of each image, (K, 2) float32 in image pixels, and the matches of each
     edge.
     """
+    # The points of each image, edge by edge
     parts: list[list[Points]] = [[] for _ in graph.images]
     for edge in graph.edges:
         parts[edge.first].append(edge.matches.points0)
@@ -66,6 +67,7 @@ def scene_keypoints(graph: ViewGraph) -> tuple[list[Points], list[Index]]:
         iter(np.split(index, np.cumsum([len(points) for points in part])[:-1]))
         for (_, index), part in zip(merged, parts, strict=True)
     ]
+    # The same order as above, so the next part of an image belongs to this edge.
     matches = [
         np.stack([next(indices[edge.first]), next(indices[edge.second])], axis=1)
         for edge in graph.edges
@@ -86,7 +88,7 @@ def merge_points(points: Points, cell: float) -> tuple[Points, NDArray[np.intp]]
     for shift in (0.0, 0.5):
         cells = np.floor(total / weight[:, None] / cell + shift).astype(np.int64)
         distinct, inverse = np.unique(cells, axis=0, return_inverse=True)
-        inverse = inverse.ravel()
+        inverse = inverse.ravel()  # its shape differs between versions of numpy
         total = np.column_stack([np.bincount(inverse, column, len(distinct)) for column in total.T])
         weight = np.bincount(inverse, weight, len(distinct)).astype(np.float64)
         index = inverse[index]
@@ -100,6 +102,7 @@ def one_to_one(index: NDArray[np.intp]) -> Index:
     one.
     """
     distinct, first, count = np.unique(index, axis=0, return_index=True, return_counts=True)
+    # The last key is the first to sort by.
     order = np.lexsort((first, -count))
     taken0: set[int] = set()
     taken1: set[int] = set()

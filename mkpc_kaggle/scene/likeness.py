@@ -40,7 +40,9 @@ def local_features(path: Path) -> bytes:
     """Return the RootSIFT descriptors of an image, 128 bytes each; empty if the image is
     unreadable.
     """
-    image, found = read_image(path), None
+    image = read_image(path)
+    found = None
+    # An unreadable image is reported when its pairs are matched.
     if isinstance(image, Image):
         scale = SIDE_PX / max(image.size)
         gray = cv2.resize(image.gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)

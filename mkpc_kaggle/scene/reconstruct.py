@@ -19,7 +19,7 @@ from mkpc_kaggle.scene.shared_intrinsics import (
     given_intrinsics,
     shared_intrinsics,
 )
-from mkpc_kaggle.scene.view_graph import BatchPair, ViewGraph
+from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair, ViewGraph
 
 MIN_PAIRS_PER_IMAGE = 1.35  # connected pairs; with fewer, cameras are poorly constrained
 # Not re-estimated at other focal lengths
@@ -61,6 +61,7 @@ def reconstruct_batch(
     focals = dict(shared)
     for model in reversed(models):
         focals |= {digest: image.focal for digest, image in model.items()}
+    # A reason for each pair, also for those without an F
     choices = []
     for pair in pairs:
         choice = choose(pair, models)
@@ -83,11 +84,14 @@ def reconstruct_sharing(
     """
     graph = graph.with_intrinsics(read_intrinsics(config.intrinsics))
     if directory is None:
+        # Each component alone, since a bad one may make the mapper fail
         parts = tuple(map(MergedGraph, graph.components()))
         make = partial(reconstruct_component, config=config)
     else:
+        # COLMAP's database holds all images of a folder.
         parts = (MergedGraph(graph.strong),)
         make = partial(reconstruct_connected, config=config)
+    # The user's cameras are neither compared nor shared.
     free = [image for image in graph.images if image.digest not in graph.known]
     given = shared = given_intrinsics(free, config)
     found = [make(part, shared) for part in parts]
@@ -95,22 +99,28 @@ def reconstruct_sharing(
         alike := shared_intrinsics(free, models_of(found))
     ):
         again = [make(part, alike) for part in parts]
+        # Images of two cameras that are forced into one lose points.
         before, after = (sum(each.observations for each in made) for made in (found, again))
         if after >= MIN_OBSERVATIONS * before:
             found, shared = again, alike
     if directory is not None:
         from mkpc_kaggle.scene.colmap import write_files
 
+        # Before the files are written, so that files and results agree
         found = align(found, read_reference(directory))
         write_files(directory, parts[0], shared, models_of(found), config.camera_model)
+    # Images without a camera have the refined focal length, and not the one it began with.
     if given:
-        focals = {
-            each.image.size: each.focal
-            for model in reversed(models_of(found))
-            for each in model.images
-        }
-        shared = {image.digest: focals[image.size] for image in free if image.size in focals}
+        shared = refined_intrinsics(free, models_of(found))
     return found, shared
+
+
+def refined_intrinsics(
+    images: Sequence[BatchImage], models: Sequence[SfmModel]
+) -> SharedIntrinsics:
+    """Return the focal length of each image, by the largest model with an image of its size."""
+    focals = {each.image.size: each.focal for model in reversed(models) for each in model.images}
+    return {image.digest: focals[image.size] for image in images if image.size in focals}
 
 
 def reconstruct_component(
@@ -118,7 +128,8 @@ def reconstruct_component(
 ) -> Reconstruction:
     """Return the reconstruction of a connected graph, or the reason for its failure."""
     graph = merged.graph
-    images, pairs = len(graph.images), len(graph.edges)
+    images = len(graph.images)
+    pairs = len(graph.edges)
     if images < MIN_IMAGES:
         return Reconstruction(
             graph.names, failure=f"{images} images are connected; a scene needs {MIN_IMAGES}"
@@ -137,7 +148,9 @@ def reconstruct_connected(
 ) -> Reconstruction:
     """Return pycolmap's reconstruction of a graph, or the reason for its failure."""
     names = merged.graph.names
+    # Only a batch is lost: pairs keep their own F.
     try:
+        # Here, because pycolmap may be missing and is slow to import
         from mkpc_kaggle.scene.colmap import structure_from_motion
 
         return structure_from_motion(merged, shared, config)

@@ -56,6 +56,7 @@ def shared_intrinsics(images: Sequence[BatchImage], models: Sequence[SfmModel]) 
     placed = (found for model in reversed(models) for found in model.images)
     registered = {found.image.digest: found for found in placed if found.image.digest in free}
     shared: dict[str, float] = {}
+    # Crops and turned images of one camera have other intrinsics.
     for size in {found.image.size for found in registered.values()}:
         alike = [found for found in registered.values() if found.image.size == size]
         focal = float(np.median([found.focal for found in alike]))

@@ -53,16 +53,7 @@ def camera_sigmas(
     poses = np.block([[solved.get_cam_cross_cov_from_world(i, j) for j in ids] for i in ids])
     if not np.isfinite(poses).all():  # of a degenerate model
         return {}
-    focals = []
-    for image in images:
-        prior = known.get(image.name)
-        if prior is not None and not prior.sigma:
-            focals.append(0.0)
-            continue
-        camera = image.camera
-        focals.append(
-            solved.get_other_params_cov(camera.params)[0, 0] / camera.mean_focal_length() ** 2
-        )
+    focals = [_focal_variance(image.camera, known.get(image.name), solved) for image in images]
     variances = _pose_variances([image.cam_from_world().matrix() for image in images], poses)
     noise = 2 * fit.initial_cost / redundancy  # variance of a keypoint's coordinate, square pixels
     sigmas = np.sqrt(noise * np.column_stack([variances, focals])) * [np.degrees(1), 1, 100]
@@ -72,6 +63,15 @@ def camera_sigmas(
     # Later digits vary between calls
     rows = (Sigmas(*(float(f"{value:.4g}") for value in row)) for row in sigmas)
     return dict(zip((image.name for image in images), rows, strict=True))
+
+
+def _focal_variance(camera: Any, known: KnownCamera | None, solved: Any) -> float:
+    """Return the variance of the logarithm of a focal length, for keypoints of unit noise."""
+    # An exact camera is no parameter, so it has no covariance.
+    if known is not None and not known.sigma:
+        return 0.0
+    variance = solved.get_other_params_cov(camera.params)[0, 0]
+    return float(variance / camera.mean_focal_length() ** 2)
 
 
 def combined(sigma: float, prior: float) -> float:
@@ -89,10 +89,14 @@ def _pose_variances(
     """
     centres = np.array([-pose[:, :3].T @ pose[:, 3] for pose in poses])
     size = np.sqrt(centres.var(axis=0).sum())
-    moves, similarities = [], []  # Jacobians of angles and centres by pose, and by world similarity
+    # Jacobians of angles and centres: by the parameters of each pose, and by a similarity of the world
+    moves = []
+    similarities = []
+    zero = np.zeros((3, 4))  # neither the offset nor the scale of the world turns a camera
     for pose, centre in zip(poses, (centres - centres.mean(axis=0)) / size, strict=True):
         # COLMAP's parameters are half angles and t
-        R, t, zero = pose[:, :3], pose[:, 3], np.zeros((3, 4))
+        R = pose[:, :3]
+        t = pose[:, 3]
         moves.append(
             np.vstack([2 * np.eye(3, 6), -R.T @ np.hstack([2 * cross_matrix(t), np.eye(3)]) / size])
         )

@@ -82,17 +82,21 @@ class ViewGraph:
         Pairs of the same two images, in either order, become one edge. A pair of an image with
         itself, and a pair without matches, make no edge.
         """
+        # The first image with a content stands for all of them.
         images: dict[str, BatchImage] = {}
         for image in (image for pair in pairs for image in (pair.image0, pair.image1)):
             images.setdefault(image.digest, image)
         index = {digest: number for number, digest in enumerate(images)}
         parts: dict[tuple[int, int], list[Matches]] = {}
         for pair in pairs:
-            first, second = index[pair.image0.digest], index[pair.image1.digest]
+            first = index[pair.image0.digest]
+            second = index[pair.image1.digest]
             tracks = pair.matches if pair.tracks is None else pair.tracks
+            # Of either order, so that both become one edge
             if first > second:
                 first, second = second, first
                 tracks = Matches(tracks.points1, tracks.points0, tracks.scores)
+            # Matches of an image with a copy of itself say nothing about cameras.
             if first < second and len(tracks):
                 parts.setdefault((first, second), []).append(tracks)
         edges = tuple(Edge(*ends, Matches.concatenate(parts[ends])) for ends in sorted(parts))
@@ -100,6 +104,7 @@ class ViewGraph:
 
     def with_intrinsics(self, rows: Rows) -> "ViewGraph":
         """Return the graph with the user's cameras of the images that the rows name."""
+        # By contents: a copy under another name is the same photograph.
         found = {image.digest: camera_of(rows, image.name) for image in self.images}
         return replace(
             self, known={digest: camera for digest, camera in found.items() if camera is not None}
@@ -107,13 +112,16 @@ class ViewGraph:
 
     def components(self) -> tuple["ViewGraph", ...]:
         """Return the components connected by strong edges, ordered by first image."""
+        # A few wrong matches must not join two scenes.
         strong = self.strong.edges
         ends = np.array([(edge.first, edge.second) for edge in strong], np.intp).reshape(-1, 2)
         shape = (len(self.images), len(self.images))
         adjacency = coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=shape)
         _, labels = connected_components(adjacency, directed=False)
         found = []
+        # Images without a strong edge are in no component.
         for label in dict.fromkeys(labels[np.sort(ends[:, 0])].tolist()):
+            # Images are numbered anew within a component.
             members = np.flatnonzero(labels == label).tolist()
             index = {image: number for number, image in enumerate(members)}
             inside = [edge for edge in strong if labels[edge.first] == label]
@@ -128,8 +136,7 @@ class ViewGraph:
 def tracks_of(results: Sequence[UnitResult]) -> Matches:
     """Return the matches from units that make tracks, or all matches if these are few."""
     tracks = Matches.concatenate(result.matches for result in results if result.unit.tracks)
-    return (
-        tracks
-        if len(tracks) >= MIN_TRACK_MATCHES
-        else Matches.concatenate(each.matches for each in results)
-    )
+    if len(tracks) >= MIN_TRACK_MATCHES:
+        return tracks
+    # Any connection is better than none.
+    return Matches.concatenate(each.matches for each in results)
