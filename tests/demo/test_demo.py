@@ -14,6 +14,7 @@ from mkpc_kaggle.demo.render import render
 from mkpc_kaggle.demo.world import SCENES, build_world, quad
 from mkpc_kaggle.geometry.cameras import Camera, fundamental_of_cameras
 
+# Scenes at a fifth of their size: nothing below depends on resolution.
 SCALE = 0.2
 
 
@@ -55,13 +56,14 @@ def test_a_view_warped_by_depth_falls_on_the_other():
         upright((2, 12), (8, 7), -3, 5, texture),
         upright((-0.5, 6), (1, 5.5), -2, 1, texture),
     ]
+    # Rolled, and of different aspects, so that exchanged axes show.
     first = look_at((-1, 0, 1), (0, 10, 1), 420, (400, 300), roll=5)
     second = look_at((1.5, 1, 1.5), (0, 10, 1), 380, (300, 400), roll=-12)
-    (image_a, depth_a), (image_b, depth_b) = (
-        render(surfaces, camera) for camera in (first, second)
-    )
+    image_a, depth_a = render(surfaces, first)
+    image_b, depth_b = render(surfaces, second)
     y, x = np.nonzero(visible_mask(first, depth_a, second, depth_b))
-    points = unproject(first, np.column_stack([x, y]).astype(float), depth_a[y, x].astype(float))
+    pixels_a = np.column_stack([x, y]).astype(float)
+    points = unproject(first, pixels_a, depth_a[y, x].astype(float))
     pixels, _ = project(second, points)
 
     def difference(shift: tuple[float, float]) -> float:
@@ -72,19 +74,21 @@ def test_a_view_warped_by_depth_falls_on_the_other():
 
     assert len(y) > 0.3 * depth_a.size
     assert difference((0, 0)) < 1
-    assert min(
-        difference(shift) for shift in ((0.5, 0), (-0.5, 0), (0, 0.5), (0, -0.5))
-    ) > 3 * difference((0, 0))
+    # Half a pixel is the error of a renderer whose pixel centres are not at integers.
+    for shift in ((0.5, 0), (-0.5, 0), (0, 0.5), (0, -0.5)):
+        assert difference(shift) > 3 * difference((0, 0))
 
 
-def test_two_views_share_half_of_a_wall_and_neither_sky_nor_what_a_screen_hides():
+def test_covisibility_counts_the_shared_half_of_a_wall_but_no_sky_and_no_hidden_points():
     # A view is 10 m wide at the wall; half of that is a baseline of 5 m.
     a, b = (look_at((x, 0, 0), (x, 10, 0), 200, (200, 150)) for x in (0.0, 5.0))
-    wall, screen = (
-        upright((x - w, y), (x + w, y), -50, 50, blobs()) for x, y, w in ((0, 10, 50), (5, 2, 2))
-    )
+    wall = upright((-50, 10), (50, 10), -50, 50, blobs())
+    # 2 m before the second camera, it fills that view.
+    screen = upright((3, 2), (7, 2), -50, 50, blobs())
     for surfaces, shared in (([wall], 0.5), ([wall, screen], 0), ([], 0)):
-        (_, depth_a), (_, depth_b) = (render(surfaces, camera) for camera in (a, b))
+        _, depth_a = render(surfaces, a)
+        _, depth_b = render(surfaces, b)
+        # A view has 200 columns, so a border that is one column off costs 0.005.
         assert covisibility(a, depth_a, b, depth_b) == pytest.approx(shared, abs=0.02)
         assert covisibility(a, depth_a, b, depth_b) == covisibility(b, depth_b, a, depth_a)
 
@@ -94,44 +98,47 @@ def test_fundamental_matrices_and_pictures_are_those_of_the_cameras(small_demo, 
     train = small_demo.train_dir / scene_name
     cameras = {}
     for row in rows(train / "calibration.csv"):
-        K, R = (numbers(row[name], 3, 3) for name in ("camera_intrinsics", "rotation_matrix"))
-        cameras[row["image_id"]] = Camera(K, R, numbers(row["translation_vector"], 3))
+        K = numbers(row["camera_intrinsics"], 3, 3)
+        R = numbers(row["rotation_matrix"], 3, 3)
+        t = numbers(row["translation_vector"], 3)
+        cameras[row["image_id"]] = Camera(K, R, t)
     for row in rows(train / "pair_covisibility.csv"):
-        F = fundamental_of_cameras(*(cameras[name] for name in row["pair"].split("-")))
+        name0, name1 = row["pair"].split("-")
+        F = fundamental_of_cameras(cameras[name0], cameras[name1])
+
         np.testing.assert_allclose(numbers(row["fundamental_matrix"], 3, 3), F, atol=1e-9)
-    for name, camera in zip(
-        sorted(cameras), build_world(scene_name, image_scale=SCALE)[1], strict=True
-    ):
-        np.testing.assert_allclose(
-            [*cameras[name].K, *cameras[name].R], [*camera.K, *camera.R], atol=1e-9
-        )
-        assert cv2.imread(str(train / "images" / f"{name}.jpg")).shape[1::-1] == (
-            camera.width,
-            camera.height,
-        )
+    _, placed = build_world(scene_name, image_scale=SCALE)
+    for name, camera in zip(sorted(cameras), placed, strict=True):
+        np.testing.assert_allclose(cameras[name].K, camera.K, atol=1e-9)
+        np.testing.assert_allclose(cameras[name].R, camera.R, atol=1e-9)
+        picture = cv2.imread(str(train / "images" / f"{name}.jpg"))
+        assert picture.shape[1::-1] == (camera.width, camera.height)
 
 
 def test_the_test_side_has_covisible_pairs_of_renamed_train_images(small_demo):
-    samples, truths = rows(small_demo.test_dir / "test.csv"), rows(small_demo.truth_csv)
+    samples = rows(small_demo.test_dir / "test.csv")
+    truths = rows(small_demo.truth_csv)
     assert len({row["sample_id"] for row in samples}) == 8 * len(SCENES)
     for row, truth in zip(samples, truths, strict=True):
-        batch, *hidden = row["batch_id"], row["image_1_id"], row["image_2_id"]
-        names = truth["image_1_id"], truth["image_2_id"]
-        assert (
-            row["sample_id"] == truth["sample_id"] == f"{truth['scene']};{batch};{'-'.join(hidden)}"
-        )
+        batch = row["batch_id"]
+        hidden = [row["image_1_id"], row["image_2_id"]]
+        names = [truth["image_1_id"], truth["image_2_id"]]
+        assert row["sample_id"] == truth["sample_id"]
+        assert row["sample_id"] == f"{truth['scene']};{batch};{'-'.join(hidden)}"
         train = small_demo.train_dir / truth["scene"]
         table = rows(train / "pair_covisibility.csv")
         (pair,) = (each for each in table if set(each["pair"].split("-")) == set(names))
+        # The competition's lower limit.
         assert float(pair["covisibility"]) >= 0.1
         for image, name in zip(hidden, names, strict=True):
             png = cv2.imread(str(small_demo.test_dir / "test_images" / batch / f"{image}.png"))
             jpg = cv2.imread(str(train / "images" / f"{name}.jpg"))
             assert png.shape == jpg.shape
+            # Grey levels of JPEG's loss: the train side is stored as JPEG, the test side as PNG.
             assert np.abs(png.astype(int) - jpg).mean() < 6, "the same picture"
 
 
-def test_same_seed_same_bytes_whatever_the_other_scenes(tmp_path, small_demo):
+def test_a_scene_has_the_same_bytes_with_and_without_the_other_scenes(tmp_path, small_demo):
     alone = write_demo(tmp_path, scenes=["market"], image_scale=SCALE)
     assert [path.name for path in alone.train_dir.iterdir() if path.is_dir()] == ["market"]
     assert contents(alone.train_dir / "market") == contents(small_demo.train_dir / "market")

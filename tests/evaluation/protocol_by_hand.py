@@ -14,20 +14,22 @@ def evaluate(line, points, keypoints, sizes, side):
     """Return pose, errors in degrees, precision and matching score of a pair of a list."""
     numbers = np.array(line.split()[4:], float)
     Ks, T = numbers[:18].reshape(2, 3, 3), numbers[18:].reshape(4, 4)
-    rays = [
-        np.column_stack([x, np.ones(len(x))]) @ np.linalg.inv(K).T
-        for K, x in zip(Ks, points, strict=True)
-    ]
-    scales = [[round(pixels * side / max(size)) / pixels for pixels in size] for size in sizes]
-    R, t = in_front(
-        [p[:, :2] for p in rays], 1 / np.mean([K.diagonal()[:2] for K in Ks] * np.array(scales))
-    )
+    rays = []
+    focals = []
+    for K, x, size in zip(Ks, points, sizes, strict=True):
+        rays.append(np.column_stack([x, np.ones(len(x))]) @ np.linalg.inv(K).T)
+        # SuperGlue's script rounds the sides of the resized picture and scales K by the result.
+        scale = [round(pixels * side / max(size)) / pixels for pixels in size]
+        focals.append(K.diagonal()[:2] * scale)
+    # A pixel over the mean of the four focal lengths.
+    R, t = in_front([p[:, :2] for p in rays], 1 / np.mean(focals))
     E = np.cross(np.eye(3), T[:3, 3]) @ T[:3, :3]
-    lines = rays[1] @ E, rays[0] @ E.T
-    distances = [
-        np.sum(rays[1] * lines[1], axis=1) ** 2 / np.sum(line[:, :2] ** 2, axis=1) for line in lines
-    ]
-    correct = np.sum(distances, axis=0) < 5e-4
+    lines0 = rays[1] @ E
+    lines1 = rays[0] @ E.T
+    residual = np.sum(rays[1] * lines1, axis=1) ** 2
+    distance0 = residual / np.sum(lines0[:, :2] ** 2, axis=1)
+    distance1 = residual / np.sum(lines1[:, :2] ** 2, axis=1)
+    correct = distance0 + distance1 < 5e-4
     return {
         "R": R,
         "t": t,
@@ -42,14 +44,18 @@ def in_front(rays, threshold):
     """Return the rotation and the unit translation of E that put most inliers in front of both
     cameras.
     """
+    if len(rays[0]) < 5:
+        return None, None
     known = {"method": cv2.RANSAC, "prob": 0.99999, "threshold": threshold}
-    stacked, mask = (
-        cv2.findEssentialMat(*rays, np.eye(3), **known) if len(rays[0]) >= 5 else (None, None)
-    )
-    found = [] if stacked is None else np.split(stacked, len(stacked) // 3)
-    poses = [cv2.recoverPose(E, *rays, np.eye(3), 1e9, mask=mask.copy())[:3] for E in found]
-    count, R, t = max(poses, key=lambda pose: pose[0], default=(0, None, None))
-    return (R, t.ravel()) if count else (None, None)
+    stacked, mask = cv2.findEssentialMat(*rays, np.eye(3), **known)
+    if stacked is None:
+        return None, None
+    best = (0, None, None)
+    for E in np.split(stacked, len(stacked) // 3):  # five points have up to ten solutions
+        count, R, t, _ = cv2.recoverPose(E, *rays, np.eye(3), 1e9, mask=mask.copy())[:4]
+        if count > best[0]:
+            best = (count, R, t.ravel())
+    return best[1:]
 
 
 def angle(cosine):
@@ -61,5 +67,7 @@ def auc(errors, limit):
     degrees.
     """
     x = np.sort([0.0, *(error for error in errors if error < limit)])
-    areas = np.append(np.arange(len(x) - 1) + 0.5, len(x) - 1) * np.diff(x, append=limit)
-    return areas.sum() / (limit * len(errors))
+    found = len(x) - 1
+    # Trapezoids between the errors, then a rectangle up to the limit.
+    heights = np.append(np.arange(found) + 0.5, found)
+    return (heights * np.diff(x, append=limit)).sum() / (limit * len(errors))

@@ -16,14 +16,17 @@ PAIRS = [*combinations("abcdef", 2)]
 tenths = st.lists(st.integers(0, 10).map(lambda count: count / 10), min_size=1, max_size=len(PAIRS))
 
 
-def test_scenes_count_alike_however_many_pairs_they_have():
-    difference = paired_difference([([0.0] * 9, [0.2] * 9, PAIRS[:9]), ([0.0], [0.4], PAIRS[:1])])
+def test_scenes_have_equal_weights_regardless_of_their_number_of_pairs():
+    large = ([0.0] * 9, [0.2] * 9, PAIRS[:9])
+    small = ([0.0], [0.4], PAIRS[:1])
+    difference = paired_difference([large, small])
+    # Over the ten pairs, the mean would be 0.22.
     assert (difference.gain, difference.low, difference.high) == pytest.approx((0.3, 0.3, 0.3))
 
 
 @settings(max_examples=30, deadline=None)
 @given(st.lists(tenths, min_size=1, max_size=3), st.randoms(use_true_random=False))
-def test_the_interval_holds_the_gain_and_turns_with_it(firsts, random):
+def test_the_interval_holds_the_gain_and_changes_its_sign_with_exchanged_recipes(firsts, random):
     scenes = [(first, random.sample(first, len(first)), PAIRS[: len(first)]) for first in firsts]
     one = paired_difference(scenes)
     assert one == paired_difference(scenes)
@@ -32,30 +35,33 @@ def test_the_interval_holds_the_gain_and_turns_with_it(firsts, random):
     assert (other.gain, other.low, other.high) == pytest.approx((-one.gain, -one.high, -one.low))
 
 
-def test_the_interval_holds_the_truth_where_a_gain_is_of_images():
+def test_95_percent_intervals_hold_the_true_gain_if_gains_depend_on_images():
     """Two scenes of 16 images, all pairs. A pair gains the sum of its images' gains, and noise."""
-    generator, held, trials = np.random.default_rng(7), 0, 60
+    generator = np.random.default_rng(7)
+    held = 0
+    trials = 60
     ends = [*combinations(range(16), 2)]
     names = [(str(a), str(b)) for a, b in ends]
     for _ in range(trials):
         scenes = []
         for gain in (0.08, 0.0):
             image = generator.normal(gain / 2, 0.1, 16)
-            scenes.append(
-                (np.zeros(120), image[ends].sum(axis=1) + generator.normal(0, 0.2, 120), names)
-            )
+            of_pairs = image[ends].sum(axis=1) + generator.normal(0, 0.2, 120)
+            scenes.append((np.zeros(120), of_pairs, names))
         difference = paired_difference(scenes)
         held += difference.low <= 0.04 <= difference.high
+    # Pairs that share an image are not independent: resampling pairs gives too narrow intervals.
     assert 0.88 <= held / trials <= 0.99
 
 
 def compare(demo: DemoSet, *more: str) -> int:
-    return run_command(
-        "validate", "--train-dir", demo.train_dir, "--pairs-per-scene", 4, "--workers", 0, *more
-    )
+    few = ["--train-dir", demo.train_dir, "--pairs-per-scene", 4, "--workers", 0]
+    return run_command("validate", *few, *more)
 
 
-def test_a_recipe_against_its_units_on_whole_images(demo, small_recipe, tmp_path, capsys):
+def test_a_comparison_prints_the_gain_and_its_second_run_prints_it_without_matching(
+    demo, small_recipe, tmp_path, capsys
+):
     out = tmp_path / "scores.json"
     compared = f"{small_recipe}:whole-images", str(small_recipe)
     arguments = ["--compare", *compared, "--work-dir", tmp_path / "work"]
@@ -82,17 +88,13 @@ def test_a_comparison_of_runs_that_failed_or_ended_early_has_their_status(
     train = shutil.copytree(demo.train_dir, tmp_path / "train")
     for image in train.rglob("*.jpg"):
         image.write_bytes(b"no picture")
-    compared = [
-        "--pairs-per-scene",
-        "2",
-        "--compare",
-        f"{small_recipe}:stage-1",
-        f"{small_recipe}:whole-images",
-    ]
+    recipes = [f"{small_recipe}:stage-1", f"{small_recipe}:whole-images"]
+    compared = ["--pairs-per-scene", "2", "--compare", *recipes]
     assert run_command("validate", "--train-dir", train, *compared) == 1
     printed = capsys.readouterr().out
     assert printed.count("the run failed: errors left 2 of 2 pairs without an F") == 2
     assert "gain of mAA" in printed
+    # A second is over before the first pair is matched, so there is nothing to compare.
     assert compare(demo, *compared, "--time-limit", "1s") == 1
     printed = capsys.readouterr().out
     assert "nothing is compared" in printed
@@ -100,12 +102,13 @@ def test_a_comparison_of_runs_that_failed_or_ended_early_has_their_status(
 
 
 def test_what_recipes_have_in_common_is_matched_once(demo, small_recipe, tmp_path, capsys):
-    other, third, text = tmp_path / "other.toml", tmp_path / "third.toml", small_recipe.read_text()
-    third.write_text(f"{text}threshold = 1.0\n")
+    text = small_recipe.read_text()
+    third = tmp_path / "third.toml"
+    third.write_text(f"{text}threshold = 1.0\n")  # the last table is [magsac]
+    other = tmp_path / "other.toml"
     other.write_text(text.replace("400", "440") + "\n[focal]\nscale = 0.3\n")
-    assert (
-        compare(demo, "--compare", small_recipe, third, other, "--work-dir", tmp_path / "work") == 0
-    )
+    recipes = [small_recipe, third, other]
+    assert compare(demo, "--compare", *recipes, "--work-dir", tmp_path / "work") == 0
     printed = capsys.readouterr().out
     assert re.findall(r"(\d+) units run", printed) == ["8", "0", "4"], "each common unit runs once"
     shared = printed.split("recipe other")[-1]

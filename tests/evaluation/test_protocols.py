@@ -33,6 +33,7 @@ from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult, with_estimate
 from mkpc_kaggle.recipe import Recipe, Unit
 
 K = np.array([[800.0, 0, 320], [0, 800, 240], [0, 0, 1]])
+# Side by side, with a little forward motion, so that both epipoles are in no picture.
 CAMERAS = Camera(K, np.eye(3), np.zeros(3)), Camera(K, np.eye(3), np.array([1.0, 0, 0.1]))
 
 
@@ -57,23 +58,24 @@ def precise(camera: Camera) -> Camera:
 @needs_data
 @pytest.mark.parametrize(
     ("scenes", "pairs", "units"),
+    # One unit as in SuperGlue's ScanNet evaluation, and several sizes with crops as in the paper.
     [(["scannet_samples"], 8, [(1, 640)]), (OUTDOORS, 1, [(1, 480), (1, 640), (2, 480)])],
 )
 def test_an_independent_evaluation_of_the_same_matches_agrees(scenes, pairs, units, tmp_path):
     train = DATA / "train"
     read = read_train_side(train, scenes=scenes, pairs_per_scene=pairs)
     truths = [true for scene in read for true in scene.pairs]
-    sharp = [
-        replace(true, camera0=precise(true.camera0), camera1=precise(true.camera1))
-        for true in truths
-    ]
-    lines = [line_of_pair(true, train) for true in sharp]
+    lines = []
+    for true in truths:
+        sharp = replace(true, camera0=precise(true.camera0), camera1=precise(true.camera1))
+        lines.append(line_of_pair(sharp, train))
     (tmp_path / "list.txt").write_text("\n".join(lines))
     recipe = write_recipe(tmp_path / "recipe.toml", *units)
     options = listed(tmp_path / "list.txt", train, recipe)
     scores = scores_of(
         tmp_path / "s.json", *options, "--protocol", "superglue", "--work-dir", tmp_path
     )
+    # The threshold is a pixel of the largest picture of stage 1.
     side = max(side for stage, side in units if stage == 1)
     expected = []
     with Store.read(tmp_path) as store:
@@ -82,20 +84,19 @@ def test_an_independent_evaluation_of_the_same_matches_agrees(scenes, pairs, uni
             keypoints = sum(unit.keypoints for unit in record.units)
             points = matches.points0.astype(float), matches.points1.astype(float)
             sizes = [read_image(path).size for path in true.pair.images]
-            expected.append(evaluate(line, points, keypoints, sizes, side))
-            if (R := expected[-1]["R"]) is not None:
-                np.testing.assert_allclose(
-                    Rotation.from_rotvec(record.stats.rotation).as_matrix(), R, atol=1e-6
-                )
-                residual = expected[-1]["t"] @ record.pair_fundamental  # t is E's left null vector
+            by_hand = evaluate(line, points, keypoints, sizes, side)
+            expected.append(by_hand)
+            if by_hand["R"] is not None:
+                own_R = Rotation.from_rotvec(record.stats.rotation).as_matrix()
+                np.testing.assert_allclose(own_R, by_hand["R"], atol=1e-6)
+                residual = by_hand["t"] @ record.pair_fundamental  # t is E's left null vector
                 np.testing.assert_allclose(residual, 0, atol=1e-6)
     (scene,) = scores["scenes"]
     own = {"rotation": "rotation_error_degrees", "translation": "translation_error_degrees"}
     for key in ("rotation", "translation", "precision", "matching_score"):
-        found = [
-            np.inf if pair[own.get(key, key)] is None else pair[own.get(key, key)]
-            for pair in scene["pairs"]
-        ]
+        values = [pair[own.get(key, key)] for pair in scene["pairs"]]
+        # JSON has no infinity: an error of a failed pair is null.
+        found = [np.inf if value is None else value for value in values]
         np.testing.assert_allclose(found, [pair[key] for pair in expected], atol=1e-6, err_msg=key)
         if key not in own:
             assert scores[key] == pytest.approx(np.mean(found), abs=1e-9)
@@ -123,6 +124,7 @@ def test_the_threshold_that_reaches_opencv_is_a_pixel_of_the_resized_picture(
         return find(*points, **settings)
 
     monkeypatch.setattr(cv2, "findEssentialMat", noted)
+    # The largest side of stage 1 counts; a crop of 2000 has pixels of another size.
     units = (Unit(1, "rectified", 1200), Unit(1, "rectified", 1600), Unit(2, "rectified", 2000))
     recipe = by_protocol(Recipe(units), "superglue")
     if side is not None:
@@ -138,22 +140,23 @@ def test_five_matches_are_enough_for_an_essential_matrix_and_duplicates_count():
     points = generator.uniform((-1, -1, 3), (1, 1, 6), (5, 3))
     projected = [(points + camera.t) @ K.T for camera in CAMERAS]
     x0, x1 = ((each[:, :2] / each[:, 2:]).astype(np.float32) for each in projected)
-    five, config = Matches(x0, x1, np.ones(5)), RobustConfig(Method.RANSAC, 1.0, permutations=1)
+    five = Matches(x0, x1, np.ones(5))
+    config = RobustConfig(Method.RANSAC, 1.0, permutations=1)
+    # SuperGlue's evaluation passes all matches to OpenCV, which needs five.
     every = replace(config, every_match=True)
-    assert (
-        estimate(five, config, ModelKind.E, (K, K)).failure == "too few distinct matches for E: 5"
-    )
+    alone = estimate(five, config, ModelKind.E, (K, K))
+    assert alone.failure == "too few distinct matches for E: 5"
     found = estimate(five, every, ModelKind.E, (K, K))
     assert found.matrix.shape == (3, 3)
     assert found.inlier_count == 5
+    # Eight matches, four of them distinct.
     twice = Matches.concatenate([five[:4], five[:4]])
-    assert (
-        "too few distinct matches for E: 4" in estimate(twice, config, ModelKind.E, (K, K)).failure
-    )
+    distinct = estimate(twice, config, ModelKind.E, (K, K))
+    assert "too few distinct matches for E: 4" in distinct.failure
     assert "too few" not in estimate(twice, every, ModelKind.E, (K, K)).failure
 
 
-def test_the_points_in_front_of_both_cameras_choose_between_the_two_rotations_of_e():
+def test_points_in_front_of_both_cameras_decide_which_rotation_of_e_is_scored():
     """Matches of the twisted pair have the same E as the truth, whose rotation they do not have."""
     t = CAMERAS[1].t
     twisted = 2 * np.outer(t, t) / (t @ t) - np.eye(3)
@@ -163,13 +166,13 @@ def test_the_points_in_front_of_both_cameras_choose_between_the_two_rotations_of
     assert min(each[:, 2].min() for each in projected) > 0
     x0, x1 = (each[:, :2] / each[:, 2:] for each in projected)
     recipe = by_protocol(Recipe((Unit(1, "sift", 640),)), "superglue")
-    found = UnitResult(
-        recipe.units[0], Matches(x0.astype(np.float32), x1.astype(np.float32), np.ones(40))
-    )
+    matches = Matches(x0.astype(np.float32), x1.astype(np.float32), np.ones(40))
+    found = UnitResult(recipe.units[0], matches)
     pair = PairMatch((found,), sizes=(Size(640, 480), Size(640, 480)))
     result = with_estimate(pair, recipe, ModelKind.E, (K, K)).estimate
     rotation = Rotation.from_rotvec(result.stats.rotation).as_matrix()
     calibrated = [camera.calibrated for camera in CAMERAS]
+    # E alone allows both rotations, and the nearer to the truth would hide a wrong choice.
     assert pose_error(result.matrix, *calibrated, 1.0).rotation < 0.1
     assert pose_error(result.matrix, *calibrated, 1.0, rotation).rotation > 179
 
@@ -183,23 +186,21 @@ def write_scene_info(path: Path, scenes, root: Path) -> Path:
     """As numpy writes arrays of objects; images without a camera, and more than the two indices in
     a pair.
     """
-    truths = [true for scene in scenes for true in scene.pairs]
-    images = [
-        each
-        for true in truths
-        for each in zip(true.pair.images, (true.camera0, true.camera1), strict=True)
-    ]
+    images = []
+    for scene in scenes:
+        for true in scene.pairs:
+            images += zip(true.pair.images, (true.camera0, true.camera1), strict=True)
     poses = np.array([None] * (len(images) + 1), object)
-    paths, Ks = poses.copy(), poses.copy()
+    paths = poses.copy()
+    Ks = poses.copy()
     infos = np.array([None] * (len(images) // 2), object)
-    for number, (file, camera) in enumerate(images):
-        paths[number + 1], Ks[number + 1] = str(file.relative_to(root)), camera.K
-        poses[number + 1] = np.vstack([np.column_stack([camera.R, camera.t]), [0, 0, 0, 1]])
-        infos[number // 2] = (
-            (number - number % 2 + 1, number - number % 2 + 2),
-            0.5,
-            np.zeros((1, 4)),
-        )
+    # Image 0 has no camera, as images without a depth map in MegaDepth.
+    for number, (file, camera) in enumerate(images, 1):
+        paths[number] = str(file.relative_to(root))
+        Ks[number] = camera.K
+        poses[number] = np.vstack([np.column_stack([camera.R, camera.t]), [0, 0, 0, 1]])
+    for number in range(len(infos)):
+        infos[number] = ((2 * number + 1, 2 * number + 2), 0.5, np.zeros((1, 4)))
     np.savez(path, pair_infos=infos, image_paths=paths, intrinsics=Ks, poses=poses)
     return path
 
@@ -219,12 +220,15 @@ def test_megadepths_files_are_read_as_the_list_that_they_stand_for(demo, scenes,
 
 
 class Run:
+    """An object whose pickle calls a function when it is read."""
+
     def __reduce__(self):
         return print, ("executed",)
 
 
 def pickled(data: bytes):
     """Write a scene_info whose arrays of objects are this pickle."""
+    # An .npy header, padded to 128 bytes with its magic number and its length.
     header = b"{'descr': '|O', 'fortran_order': False, 'shape': (1,), }".ljust(117) + b"\n"
 
     def write(path: Path) -> None:
@@ -270,24 +274,30 @@ def test_bad_lists_and_regions_get_one_line_and_exit_2(
     name, demo, scenes, small_recipe, tmp_path, capsys
 ):
     file, write, told = BAD[name]
-    one = write_list(
-        tmp_path / "list.txt", [replace(scenes[0], pairs=scenes[0].pairs[:1])], demo.train_dir
-    )
-    write(tmp_path / file)
-    source, regions = tmp_path / file, []
+    first_pair = replace(scenes[0], pairs=scenes[0].pairs[:1])
+    one = write_list(tmp_path / "list.txt", [first_pair], demo.train_dir)
+    source = tmp_path / file
+    write(source)
+    regions = []
     if file == "regions.csv":
-        source.write_text(source.read_text().replace("A,B", ",".join(one.read_text().split()[:2])))
-        source, regions = one, ["--regions", source]
+        names = ",".join(one.read_text().split()[:2])
+        source.write_text(source.read_text().replace("A,B", names))
+        regions = ["--regions", source]
+        source = one
     assert run_command("validate", *listed(source, demo.train_dir, small_recipe), *regions) == 2
     out, err = capsys.readouterr()
+    # NumPy's own reader would run the code of a pickle.
     assert "executed" not in out
     (line,) = err.splitlines()
     assert re.search(told, line)
 
 
-def test_regions_of_ones_own_take_the_place_of_mkpcs(demo, scenes, small_recipe, tmp_path):
+def test_given_regions_replace_mkpcs_and_are_part_of_the_key_of_stage_2(
+    demo, scenes, small_recipe, tmp_path
+):
     true = max(scenes[0].pairs, key=lambda true: true.covisibility)
     sizes = [read_image(path).size for path in true.pair.images]
+    # Boxes that MKPC would not find: a left half, and one without a few rows and columns.
     boxes = (
         Box(0, 0, sizes[0].width // 2, sizes[0].height),
         Box(7, 0, sizes[1].width, sizes[1].height - 3),
@@ -302,18 +312,20 @@ def test_regions_of_ones_own_take_the_place_of_mkpcs(demo, scenes, small_recipe,
     command = ["validate", "--workers", 0, *listed(one, demo.train_dir, small_recipe)]
     given = ["--regions", tmp_path / "regions.csv"]
     scores = tmp_path / "scores.json"
+    # Rows of points: other regions add one of stage 2, and the former one is used again.
     for options, rows in ((given, 2), ([], 3), (given, 3)):
         run_options = ["--work-dir", tmp_path / "run", "--json", scores, *options]
         assert run_command(*command, *run_options) == 0
         with Store.read(tmp_path / "run") as store:
-            (record,), found = read_records(store), matches_of(store, 0)
-        assert ([region.box for region in record.regions] == [*boxes]) == bool(options)
-        assert ({region.reason for region in record.regions} == {RegionReason.GIVEN}) == bool(
-            options
-        )
+            (record,) = read_records(store)
+            found = matches_of(store, 0)
+        is_given = bool(options)
+        assert ([region.box for region in record.regions] == [*boxes]) == is_given
+        reasons = {region.reason for region in record.regions}
+        assert (reasons == {RegionReason.GIVEN}) == is_given
         with closing(sqlite3.connect(tmp_path / "run" / "journal.sqlite")) as database:
             count = "SELECT count(*) FROM result WHERE kind = 'points'"
-            assert database.execute(count).fetchone() == (rows,)  # other regions, others
+            assert database.execute(count).fetchone() == (rows,)
     np.testing.assert_array_equal(found.points0, match.matches.points0)
     (scored,) = json.loads(scores.read_text())["scenes"][0]["pairs"]
     assert scored["boxes"] == [list(astuple(box)) for box in boxes]

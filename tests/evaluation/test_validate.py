@@ -27,7 +27,9 @@ def true_matrices(demo: DemoSet) -> dict[str, np.ndarray]:
     cameras = {}
     for scene in read_train_side(demo.train_dir, min_covisibility=0):
         for true in scene.pairs:
-            first, second = true.pair.images[0].stem, true.pair.images[1].stem
+            first = true.pair.images[0].stem
+            second = true.pair.images[1].stem
+            # The test side may have the two images in the other order.
             cameras[first, second] = true.camera0, true.camera1
             cameras[second, first] = true.camera1, true.camera0
     rows = (line.split(",") for line in demo.truth_csv.read_text().splitlines()[1:])
@@ -40,30 +42,27 @@ def test_the_true_matrices_score_one_whatever_the_order_of_the_images(demo, tmp_
     truth = true_matrices(demo)
     assert list(truth) == [pair.id for pair in read_test_side(demo.test_dir)]
     competition.write_submission(tmp_path / "true.csv", truth)
-    scored = score_submission(
-        tmp_path / "true.csv", demo.truth_csv, read_train_side(demo.train_dir)
-    )
+    train = read_train_side(demo.train_dir)
+    scored = score_submission(tmp_path / "true.csv", demo.truth_csv, train)
     assert scored.maa() == 1
-    assert [scored.auc(threshold) for threshold in AUC_THRESHOLDS] == pytest.approx(
-        [1, 1, 1], abs=1e-3
-    )
+    # The file has twelve digits, so errors are not exactly 0.
+    aucs = [scored.auc(threshold) for threshold in AUC_THRESHOLDS]
+    assert aucs == pytest.approx([1, 1, 1], abs=1e-3)
     assert sum(len(scene.pairs) for scene in scored.scenes) == 8
     lines = score_table(scored)
     assert lines[1].split()[1:3] == ["8", "1.0000"]
-    competition.write_submission(
-        tmp_path / "fallback.csv", dict.fromkeys(truth, FALLBACK_FUNDAMENTAL)
-    )
-    scored = score_submission(
-        tmp_path / "fallback.csv", demo.truth_csv, read_train_side(demo.train_dir)
-    )
+    fallbacks = dict.fromkeys(truth, FALLBACK_FUNDAMENTAL)
+    competition.write_submission(tmp_path / "fallback.csv", fallbacks)
+    scored = score_submission(tmp_path / "fallback.csv", demo.truth_csv, train)
+    # The fallback is the F of a sideways motion, so its score need not be 0.
     assert scored.maa() < 0.2
 
 
-def test_samples_that_a_submission_has_no_row_for_count_as_failed_and_are_named(
-    demo, tmp_path, capsys
-):
+def test_samples_without_a_row_count_as_failed_and_are_named(demo, tmp_path, capsys):
     truth = true_matrices(demo)
-    some, whole, out = tmp_path / "some.csv", tmp_path / "whole.csv", tmp_path / "scores.json"
+    some = tmp_path / "some.csv"
+    whole = tmp_path / "whole.csv"
+    out = tmp_path / "scores.json"
     competition.write_submission(some, dict(list(truth.items())[:2]))
     competition.write_submission(whole, truth)
     score = [
@@ -80,6 +79,7 @@ def test_samples_that_a_submission_has_no_row_for_count_as_failed_and_are_named(
     lacking = list(truth)[2:]
     printed = capsys.readouterr().out
     assert "6 samples have no row and count as failed: " in printed
+    # Five are named at most, so that a wrong file does not fill the screen.
     assert sum(sample in printed for sample in lacking) == 5
     figures = json.loads(out.read_text())
     assert figures["mAA"] == 2 / 8
@@ -90,7 +90,8 @@ def test_samples_that_a_submission_has_no_row_for_count_as_failed_and_are_named(
 
 def test_a_failed_pair_counts_as_failed_even_where_the_fallback_happens_to_be_right():
     eye = np.eye(3)
-    camera0, camera1 = Camera(eye, eye, np.zeros(3)), Camera(eye, eye, np.array([1.0, 0, 0]))
+    camera0 = Camera(eye, eye, np.zeros(3))
+    camera1 = Camera(eye, eye, np.array([1.0, 0, 0]))  # the fallback's motion
     true = TruePair(Pair("p", "s", "a", "b"), camera0, camera1, 0.5)
     scene = TrainScene("s", 1.0, (true,))
     record = PairRecord(0, true.pair, failure="too few matches")
@@ -118,6 +119,7 @@ def test_each_step_of_the_estimate_has_a_column(demo, small_recipe, capsys):
     assert list(by_step) == ["MAGSAC", "+ prior", "+ scene"]
     assert by_step["MAGSAC"] == pytest.approx(plain["mAA"])
     assert by_step["+ scene"] == scores["mAA"]
+    # The table and the JSON file are written by two functions.
     cells = "".join(f"{value:>9.4f}" for value in by_step.values())
     assert f"{'mean over scenes':<20}{len(scores['scenes'][0]['pairs']):>6}{cells}" in printed
     gain = by_step["+ prior"] - by_step["MAGSAC"]
@@ -137,6 +139,7 @@ def test_a_work_directory_keeps_the_journal_and_a_report_that_shows_the_pairs(
     assert len(read_log(tmp_path / "work").records) == 2
 
 
+# The command has 8 s, and the patched validation never returns.
 HANGS = """
 import time
 from mkpc_kaggle.cli import main, validate
@@ -147,9 +150,9 @@ main(["validate", "--train-dir", {train!r}, "--recipe", "classical", "--time-lim
 
 def test_a_validation_that_hangs_ends_at_its_limit(demo):
     code = HANGS.format(train=str(demo.train_dir))
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=300
-    )
+    command = [sys.executable, "-c", code]
+    # 300 s are for the imports of a busy machine; the assertions do not depend on them.
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
     assert done.returncode == 1
     assert done.stderr.endswith("error: the time limit passed before the scores were printed\n")
 

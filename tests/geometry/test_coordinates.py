@@ -15,19 +15,22 @@ SIDES, TURNS = st.integers(1, 3000), st.integers(0, 3)
 
 @st.composite
 def boxes(draw):
-    left, top = draw(st.integers(-500, 3000)), draw(st.integers(-500, 3000))
+    left = draw(st.integers(-500, 3000))
+    top = draw(st.integers(-500, 3000))
     return Box(left, top, left + draw(SIDES), top + draw(SIDES))
 
 
 @st.composite
 def views(draw):
+    # Any aspect: the scales of x and y are two numbers.
     content = Size(draw(SIDES), draw(SIDES))
-    padded = Size(
-        content.width + draw(st.integers(0, 40)), content.height + draw(st.integers(0, 40))
-    )
+    right = draw(st.integers(0, 40))
+    bottom = draw(st.integers(0, 40))
+    padded = Size(content.width + right, content.height + bottom)
     return View(draw(boxes()), content, padded, draw(TURNS))
 
 
+# Odd and prime, so that no scale is a whole number.
 IMAGE = Size(107, 71)
 RENDERED = {
     "enlarged": View.fit(Box.whole(IMAGE), long_side=250),
@@ -44,8 +47,9 @@ RENDERED = {
 
 @given(view=views(), seed=st.integers(0, 2**32 - 1))
 @settings(max_examples=150, deadline=None)
-def test_there_and_back_is_the_identity(view, seed):
+def test_a_view_maps_points_there_and_back(view, seed):
     points = np.random.default_rng(seed).uniform(-4000, 4000, (20, 2))
+    # Rounding alone: coordinates of 4000 are scaled by up to 3000 and back.
     assert_allclose(view.to_image(view.from_image(points)), points, rtol=0, atol=1e-7)
     assert_allclose(view.from_image(view.to_image(points)), points, rtol=0, atol=1e-7)
 
@@ -56,12 +60,15 @@ def test_a_turned_view_is_the_view_of_the_turned_picture(turns, scale, seed):
     """One grey level a pixel: each pixel of the view has the level of the stored pixel that it
     comes from.
     """
-    stored = np.random.default_rng(seed).permutation(6 * 8).reshape(6, 8).astype(np.uint8)
+    levels = np.random.default_rng(seed).permutation(6 * 8)
+    stored = levels.reshape(6, 8).astype(np.uint8)
     view = View.fit(Box(1, 2, 8, 5), long_side=7 * scale, multiple=4, turns=turns)
     upright = np.ascontiguousarray(np.rot90(stored[2:5, 1:8], turns))
-    expected = View.fit(Box.whole(Size(*upright.shape[::-1])), long_side=7 * scale, multiple=4)
+    whole = Box.whole(Size(*upright.shape[::-1]))
+    expected = View.fit(whole, long_side=7 * scale, multiple=4)
     assert (view.content, view.padded) == (expected.content, expected.padded)
     assert_array_equal(view.render(stored), expected.render(upright))
+    # Only an unscaled pixel comes from one pixel.
     if scale == 1:
         y, x = np.indices(upright.shape).reshape(2, -1)
         x0, y0 = view.to_image(np.column_stack([x, y])).astype(int).T
@@ -80,16 +87,20 @@ def test_a_view_keeps_the_aspect_to_the_nearest_pixel_and_pads_to_the_multiple(
 ):
     fitted = View.fit(crop, long_side=long_side, multiple=multiple)
     assert max(fitted.content) == long_side
+    by_side = long_side / max(crop.size)
     of_area = View.fit(crop, area=area, multiple=multiple)
-    for view, scale in ((fitted, long_side / max(crop.size)), (of_area, (area / crop.area) ** 0.5)):
+    by_area = (area / crop.area) ** 0.5
+    for view, scale in ((fitted, by_side), (of_area, by_area)):
         assert view.crop == crop
         for side, content, padded in zip(crop.size, view.content, view.padded, strict=True):
+            # A crop of 1 x 3000 at a long side of 90 still has a column.
             assert abs(content - max(1, side * scale)) <= 0.5 + 1e-9 * side * scale
             assert padded % multiple == 0
             assert 0 <= padded - content < multiple
 
 
-def test_what_networks_count_otherwise_is_led_to_centres_at_integers():
+def test_corner_based_and_normalised_coordinates_become_centres_at_integers():
+    # Half a pixel at 640 pixels is a pixel and more in a photograph of 1600.
     corners = np.array([[0, 0], [0.5, 0.5], [30, 40]], np.float32)
     assert from_corner(corners).tolist() == [[-0.5, -0.5], [0, 0], [29.5, 39.5]]
     normalised = np.array([[-1, -1], [0, 0.5], [1, 1]], np.float32)
@@ -104,10 +115,13 @@ def test_a_spot_is_rendered_where_the_map_says(name, centre):
     view = RENDERED[name]
     x, y = np.meshgrid(np.arange(IMAGE.width), np.arange(IMAGE.height))
     squared = (x - centre[0]) ** 2 + (y - centre[1]) ** 2
-    picture = view.render(np.rint(255 * np.exp(-squared / (2 * 4.0**2))).astype(np.uint8))
+    # A sigma of 4 pixels: wide enough to be sampled well where the view shrinks.
+    spot = np.rint(255 * np.exp(-squared / (2 * 4.0**2))).astype(np.uint8)
+    picture = view.render(spot)
     assert picture.shape == (view.padded.height, view.padded.width)
     y, x = np.indices(picture.shape)
     centroid = np.average([x.ravel(), y.ravel()], axis=1, weights=picture.ravel())
+    # Grey levels are rounded. A map without the halves is off by at least 0.17 pixels.
     assert_allclose(centroid, view.from_image(np.array([centre]))[0], rtol=0, atol=0.04)
 
 
@@ -127,6 +141,7 @@ def test_a_crop_that_is_not_resized_is_copied_and_padded_with_black_right_and_bo
 def test_a_box_holds_the_points_on_its_pixels_half_open_and_never_nan():
     box = Box(2, 3, 10, 7)
     inside = [(1.5, 2.5), (2, 3), (9, 6), (np.nextafter(9.5, 0), np.nextafter(6.5, 0))]
+    # Adjacent boxes share no point, because a box is open to the right and at the bottom.
     outside = [(np.nextafter(1.5, 0), 4), (4, np.nextafter(2.5, 0)), (9.5, 4), (4, 6.5)]
     outside += [(np.nan, 4), (4, np.nan), (np.inf, 4), (4, -np.inf), (np.nan, np.nan)]
     assert box.contains(np.array(inside)).all()
@@ -136,9 +151,10 @@ def test_a_box_holds_the_points_on_its_pixels_half_open_and_never_nan():
 
 
 @pytest.mark.parametrize("content", [Size(64, 16), Size(64, 19), Size(32, 16), Size(90, 16)])
-def test_shrinking_averages_what_would_alias(content):
+def test_shrinking_averages_stripes_that_would_alias(content):
     stripes = np.tile(np.array([[0], [255]] * 32, np.uint8), (1, 64))
     picture = View(Box.whole(Size(64, 64)), content, content).render(stripes)
+    # Sampling without averaging gives 0 and 255, which are 127.5 away.
     assert abs(picture - 127.5).max() < 30
 
 
@@ -146,9 +162,8 @@ def test_shrinking_averages_what_would_alias(content):
     ("size", "shape"), [((1, 1), (90, 90)), ((900, 1), (1, 90)), ((1, 3), (90, 30))]
 )
 def test_images_one_pixel_wide_or_high_are_rendered(size, shape):
-    picture = View.fit(Box.whole(Size(*size)), long_side=90).render(
-        np.full(size[::-1], 200, np.uint8)
-    )
+    view = View.fit(Box.whole(Size(*size)), long_side=90)
+    picture = view.render(np.full(size[::-1], 200, np.uint8))
     assert picture.shape == shape
     assert (picture == 200).all()
 
@@ -157,6 +172,7 @@ def test_an_empty_box_or_a_crop_that_leaves_its_image_is_an_error():
     for corners in ((0, 0, 0, 5), (0, 3, 5, 2)):
         with pytest.raises(ValueError, match="empty box"):
             Box(*corners)
+    # NumPy would cut the first two silently and take the third from the other end.
     for corners in ((0, 0, 41, 30), (0, 0, 40, 31), (-9, -9, -1, -1)):
         with pytest.raises(ValueError, match="leaves the image of 40 x 30"):
             View.fit(Box(*corners), long_side=9).render(np.zeros((30, 40), np.uint8))

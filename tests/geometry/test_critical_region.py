@@ -1,6 +1,4 @@
-"""The critical region: the paper's Algorithm 1 and Crop Area Expansion, to the letter; DBSCAN of
-merged points.
-"""
+"""The critical region: the paper's Algorithm 1 and Crop Area Expansion; DBSCAN of merged points."""
 
 from itertools import product
 
@@ -56,6 +54,7 @@ def region(*parts, size=SQUARE, config=BARE):
         ),
         (block(100, 100, 132, 130, 50), RegionReason.TOO_SMALL, 1, 1),
         (block(100, 100, 132, 131, 50), RegionReason.CROPPED, 1, 1),
+        # 5 of 25 points are the 20 % that may be clustered at least.
         (np.concatenate([block(100, 100, 133, 133, 5), lone(20)]), RegionReason.CROPPED, 1, 1),
     ],
     ids=[
@@ -68,33 +67,38 @@ def region(*parts, size=SQUARE, config=BARE):
         "just clustered enough",
     ],
 )
-def test_every_outcome_has_its_reason_and_only_one_is_a_crop(points, reason, clusters, kept):
+def test_every_region_has_its_reason_and_is_the_whole_image_unless_cropped(
+    points, reason, clusters, kept
+):
     got = critical_region(points, SQUARE, PAPER)
     assert (got.reason, got.clusters, got.kept) == (reason, clusters, kept)
     assert (reason is RegionReason.CROPPED) == (got.box != Box.whole(SQUARE))
 
 
-def test_the_share_is_compared_to_the_letter():
+def test_a_cluster_of_exactly_the_share_is_kept_for_every_percentage():
+    # `size >= share * largest` differs from Algorithm 1 by rounding: 0.07 * 100 is above 7.
     for percent, hundreds in product(range(1, 100), (1, 7, 11)):
-        share, largest, least = percent / 100, 100 * hundreds, percent * hundreds
+        share = percent / 100
+        largest = 100 * hundreds
+        least = percent * hundreds
         assert least / largest >= share  # Algorithm 1's own words
-        assert len(regions.keep_clusters(np.array([largest, least]), share)) == 2, (least, largest)
-        assert len(regions.keep_clusters(np.array([largest, least - 1]), share)) == 1, (
-            least,
-            largest,
-        )
+        kept = regions.keep_clusters(np.array([largest, least]), share)
+        assert len(kept) == 2, (least, largest)
+        kept = regions.keep_clusters(np.array([largest, least - 1]), share)
+        assert len(kept) == 1, (least, largest)
 
 
 def test_clusters_are_kept_down_to_the_share_largest_first_and_equal_ones_in_their_order():
-    for sizes, kept in (
+    cases = [
         ([4, 100, 6, 5, 3, 50], [1, 5, 2, 3]),
         ([7, 9, 7, 9], [1, 3, 0, 2]),
         ([], []),
-    ):
+    ]
+    for sizes, kept in cases:
         assert_array_equal(regions.keep_clusters(np.array(sizes, int), 0.05), kept)
 
 
-def test_clusters_tell_their_points_from_noise_and_those_that_are_kept():
+def test_clusters_label_noise_and_mark_the_points_of_kept_clusters():
     points = np.concatenate([block(600, 600, 640, 640, 5), lone(3), block(100, 100, 140, 140, 101)])
     clusters = regions.find_clusters(points, SQUARE, PAPER)
     assert_array_equal(clusters.sizes, [5, 101])
@@ -108,33 +112,33 @@ def test_clusters_tell_their_points_from_noise_and_those_that_are_kept():
 def test_x_is_normalised_by_the_width_and_y_by_the_height():
     size = Size(1000, 200)  # eps is 50 pixels along x and 10 along y
     stack = np.repeat(np.array([[500, 100]], np.float32), 6, axis=0)
+    # One cluster if the two stacks are within eps of each other, else two.
     for shift, last_label in [((40, 0), 0), ((60, 0), 1), ((0, 9), 0), ((0, 20), 1)]:
         points = np.concatenate([stack, stack + np.float32(shift)])
-        assert regions.find_clusters(points, size, PAPER).labels.max() == last_label
-        assert (
-            regions.find_clusters(points[:, ::-1], Size(200, 1000), PAPER).labels.max()
-            == last_label
-        )
+        found = regions.find_clusters(points, size, PAPER)
+        assert found.labels.max() == last_label
+        found = regions.find_clusters(points[:, ::-1], Size(200, 1000), PAPER)
+        assert found.labels.max() == last_label
 
 
 def test_the_box_grows_about_its_centre_and_holds_the_pixels_that_the_points_lie_on():
-    assert expand_box(np.array([(99.5, 100.49), (130.49, 131.4)]), SQUARE, 1.0, 1.0) == Box(
-        100, 100, 131, 132
-    )
+    # Pixel centres are at integers: 99.5 belongs to pixel 100, and 130.49 to pixel 130.
+    points = np.array([(99.5, 100.49), (130.49, 131.4)])
+    assert expand_box(points, SQUARE, 1.0, 1.0) == Box(100, 100, 131, 132)
     points = np.array([(200, 300), (399, 331)], np.float32)
     assert expand_box(points, SQUARE, 1.05, 1.0) == Box(195, 300, 405, 332)
     assert expand_box(points[:, ::-1], SQUARE, 1.0, 1.05) == Box(300, 195, 332, 405)
     # 101 columns grow by 2.525 on either side: edges are rounded outwards
-    assert expand_box(np.array([(200, 300), (300, 331)], np.float32), SQUARE, 1.05, 1.0) == Box(
-        197, 300, 304, 332
-    )
+    points = np.array([(200, 300), (300, 331)], np.float32)
+    assert expand_box(points, SQUARE, 1.05, 1.0) == Box(197, 300, 304, 332)
 
 
 def test_points_that_are_not_finite_or_not_on_the_image_are_ignored():
     clustered = block(100, 100, 130, 130, 10)
-    junk = np.array(
-        [(np.nan, 5), (5, np.inf), (-np.inf, np.nan), (1000, 5), (5, 999.5), (-0.75, 5)], np.float32
-    )
+    # Pixels end at 999.5, so that point is the first outside.
+    outside = [(1000, 5), (5, 999.5), (-0.75, 5)]
+    junk = np.array([(np.nan, 5), (5, np.inf), (-np.inf, np.nan), *outside], np.float32)
+    # Thirty of each: enough for a cluster, if they counted.
     assert region(clustered, np.repeat(junk, 30, axis=0)) == region(clustered)
     assert region(np.repeat(junk, 30, axis=0)).reason is RegionReason.TOO_FEW_POINTS
 
@@ -153,11 +157,12 @@ def test_points_that_are_not_finite_or_not_on_the_image_are_ignored():
 @settings(max_examples=150, deadline=None)
 def test_the_box_is_on_the_image_and_holds_every_kept_point(seed, size, config):
     rng = np.random.default_rng(seed)
-    clumps = [
-        rng.normal(rng.random(2), rng.choice([1e-3, 0.02]), (rng.integers(1, 60), 2))
-        for _ in range(4)
-    ]
-    points = (np.concatenate([*clumps, rng.uniform(-0.2, 1.2, (8, 2))]) * size).astype(np.float32)
+    parts = [rng.uniform(-0.2, 1.2, (8, 2))]  # some outside of the image
+    for _ in range(4):
+        centre = rng.random(2)
+        spread = rng.choice([1e-3, 0.02])
+        parts.append(rng.normal(centre, spread, (rng.integers(1, 60), 2)))
+    points = (np.concatenate(parts) * size).astype(np.float32)
     got = critical_region(points, size, config)
     box = got.box
     assert 0 <= box.left < box.right <= size.width
@@ -178,11 +183,11 @@ EPS, MIN_SAMPLES = 0.05, 5
 
 def clumps(rng, n):
     """Six clumps of many widths, farther apart than eps, and a little noise."""
-    corner = np.stack([np.arange(6) % 3, np.arange(6) // 3], axis=1) * 0.3 + 0.15
+    centre = np.stack([np.arange(6) % 3, np.arange(6) // 3], axis=1) * 0.3 + 0.15
+    # From far below the side of a merged cell (a tenth of eps) to almost eps.
+    width = 10.0 ** np.linspace(-4, -1.7, 6)
     clump = rng.integers(6, size=n)
-    points = (
-        corner[clump] + rng.normal(size=(n, 2)) * (10.0 ** np.linspace(-4, -1.7, 6))[clump, None]
-    )
+    points = centre[clump] + rng.normal(size=(n, 2)) * width[clump, None]
     points[:5] = [(0.95, 0.1 + 0.2 * i) for i in range(5)]
     return points
 
@@ -199,6 +204,7 @@ def test_merged_points_have_scikit_learns_clusters(sample, count):
     # Only points at the edge of a cluster may differ; clusters have other numbers.
     both = np.unique(np.column_stack([merged, expected])[(merged >= 0) & (expected >= 0)], axis=0)
     assert len(both) == expected.max() + 1 == merged.max() + 1
+    # A merged point moves by up to a cell's diagonal, so some points at an edge become noise.
     assert np.mean((merged >= 0) != (expected >= 0)) < 0.002
 
 

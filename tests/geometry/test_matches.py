@@ -13,7 +13,7 @@ NAN, INF = np.nan, np.inf
 
 
 def scored(scores):
-    """The i-th match lies at (i, i): its place tells which match it was."""
+    """The i-th match lies at (i, i), so its point identifies it."""
     at = np.repeat(np.arange(len(scores))[:, None], 2, axis=1)
     return Matches(at, at, np.asarray(scores))
 
@@ -28,7 +28,7 @@ def places(matches):
     [
         ((2, 2), (3, 2), (3,)),
         ((3, 3), (3, 2), (3,)),
-        ((3, 2), (3, 2), (3, 1)),
+        ((3, 2), (3, 2), (3, 1)),  # NumPy would broadcast such scores to (3, 3)
         ((3, 2), (6,), (3,)),
     ],
 )
@@ -38,36 +38,41 @@ def test_shapes_that_disagree_are_an_error(shape0, shape1, shape_scores):
 
 
 def test_empty_is_legal_everywhere():
-    empty, size = Matches.empty(), Size(40, 30)
-    view = View.fit(Box.whole(size), long_side=64)
+    empty = Matches.empty()
+    view = View.fit(Box.whole(Size(40, 30)), long_side=64)
     results = [
         empty,
         Matches([], [], []),
         Matches.concatenate([]),
         Matches.concatenate([empty, empty]),
+        empty.best(0),
+        scored([1, 2]).best(0),
+        empty.to_image(view, view),
+        empty[:],
     ]
-    results += [empty.best(0), scored([1, 2]).best(0), empty.to_image(view, view), empty[:]]
     for result in results:
         assert result.points0.shape == result.points1.shape == (0, 2)
         assert result.scores.shape == (0,)
 
 
 def test_concatenation_keeps_every_match_in_order_duplicates_too():
-    together = Matches.concatenate(
-        iter([scored([1, 1]), Matches.empty(), scored([1]), scored([1, 1])])
-    )
+    parts = [scored([1, 1]), Matches.empty(), scored([1]), scored([1, 1])]
+    # An iterator: it can be read only once.
+    together = Matches.concatenate(iter(parts))
     assert places(together) == [0, 1, 0, 0, 1]
 
 
 @given(scores=st.lists(st.integers(0, 5), max_size=40), most=st.integers(0, 45))
 @settings(max_examples=100, deadline=None)
-def test_the_best_are_those_of_a_stable_sort(scores, most):
+def test_the_best_matches_are_the_first_of_a_stable_sort_in_their_own_order(scores, most):
+    # MAGSAC's result depends on the order, so the kept matches stay in theirs.
     by_score = sorted(range(len(scores)), key=lambda i: -scores[i])
     assert places(scored(scores).best(most)) == sorted(by_score[:most])
+    # NaN sorts last: a score that is unknown beats none.
     assert places(scored([NAN, 0.2, NAN, 0.1]).best(2)) == [1, 3]
 
 
-def test_the_way_out_of_a_matcher_drops_padding_outside_and_not_finite_and_maps_the_rest():
+def test_to_image_drops_points_on_padding_outside_or_not_finite_and_maps_the_rest():
     view0 = View(Box(10, 20, 50, 40), Size(80, 40), Size(96, 64))
     view1 = View(Box(0, 0, 60, 60), Size(30, 30), Size(32, 32))
     rows = [
@@ -83,9 +88,8 @@ def test_the_way_out_of_a_matcher_drops_padding_outside_and_not_finite_and_maps_
         ((3, 3), (5, 5), INF),
         ((40, 20), (14, 10), -3),  # kept: a low score is a score
     ]
-    out = Matches(*(np.array(column, np.float32) for column in zip(*rows, strict=True))).to_image(
-        view0, view1
-    )
+    columns = [np.array(column, np.float32) for column in zip(*rows, strict=True)]
+    out = Matches(*columns).to_image(view0, view1)
     assert_allclose(out.points0, [(10, 20), (49.375, 39.375), (29.75, 29.75)], atol=1e-5)
     assert_allclose(out.points1, [(0.5, 0.5), (58.5, 58.5), (28.5, 20.5)], atol=1e-5)
     assert_array_equal(out.scores, np.array([0.9, 0.1, -3], np.float32))

@@ -37,8 +37,9 @@ def cameras(seed):
     rng = np.random.default_rng(seed)
     K0 = np.array([[820.0, 0, 500], [0, 840, 390], [0, 0, 1]])
     K1 = np.array([[900.0, 0, 530], [0, 880, 370], [0, 0, 1]])
-    R0, R1 = (cv2.Rodrigues(rng.uniform(-0.15, 0.15, 3))[0] for _ in range(2))
-    t = np.array([1.0, rng.uniform(-0.5, 0.5), rng.uniform(-0.5, 0.5)])
+    R0 = cv2.Rodrigues(rng.uniform(-0.15, 0.15, 3))[0]
+    R1 = cv2.Rodrigues(rng.uniform(-0.15, 0.15, 3))[0]
+    t = np.array([1.0, *rng.uniform(-0.5, 0.5, 2)])
     return Camera(K0, R0, np.zeros(3)), Camera(K1, R1, t)
 
 
@@ -98,6 +99,7 @@ def test_the_fundamental_matrix_is_found_among_outliers(seed, method):
     assert np.linalg.svd(result.matrix, compute_uv=False)[2] < 1e-9
     # Another scene's match
     assert robust.sampson_distances(result.matrix, seen(seed + 10, 1)).max() > 1
+    # Points that the estimate has not seen: an F that only fits its own matches fails here.
     fresh = seen(seed, 500)[180:]
     distances = robust.sampson_distances(result.matrix, fresh)
     # MAGSAC++ is a weighted mean of near samples: RANSAC here is below 0.001
@@ -110,6 +112,7 @@ def test_the_essential_matrix_and_the_homography_of_a_plane_are_found_among_outl
     first, second = cameras(0)
     E = second.K.T @ fundamental_of_cameras(first, second) @ first.K
     E /= np.linalg.norm(E)
+    # The sign of E is free.
     assert min(np.linalg.norm(result.matrix - E), np.linalg.norm(result.matrix + E)) < 1e-3
     result = estimated(ModelKind.H, scene(0, plane=True)[0])
     fresh = seen(0, 500, plane=True)[180:]
@@ -119,20 +122,21 @@ def test_the_essential_matrix_and_the_homography_of_a_plane_are_found_among_outl
 
 def test_magsac_finds_the_pose_of_noisy_matches_at_a_threshold_of_a_pixel():
     errors = []
+    config = RobustConfig(threshold=1.0, permutations=1)
     for seed in range(12):
         matches, _ = scene(seed)
         noise = np.random.default_rng(seed).normal(0, 0.5, (2, *matches.points0.shape))
         noisy = Matches(matches.points0 + noise[0], matches.points1 + noise[1], matches.scores)
-        result = estimated(ModelKind.E, noisy, RobustConfig(threshold=1.0, permutations=1), seed)
-        errors.append(
-            pose_error(result.matrix, *(camera.calibrated for camera in cameras(seed)), 1.0).angle
-        )
+        result = estimated(ModelKind.E, noisy, config, seed)
+        first, second = cameras(seed)
+        errors.append(pose_error(result.matrix, first.calibrated, second.calibrated, 1.0).angle)
     # Degrees; 0.9 in units of the focal length, where the score has no scale
     assert np.median(errors) < 0.4
 
 
 def test_sampson_distance_is_in_pixels_and_the_same_in_either_order():
     matches = Matches(np.array([(10, 20), (30, 40)]), np.array([(500, 20), (7, 43)]), np.ones(2))
+    # The fallback's lines are rows. Three rows off, each image takes half of the correction.
     assert_allclose(robust.sampson_distances(FALLBACK_FUNDAMENTAL, matches), [0, 3 / np.sqrt(2)])
     # The second image is half as high: y1 = y0 / 2
     twice = FALLBACK_FUNDAMENTAL @ np.diag([1, 0.5, 1])
@@ -140,12 +144,15 @@ def test_sampson_distance_is_in_pixels_and_the_same_in_either_order():
     distance = 3 / np.sqrt(1 + 0.5**2)
     assert_allclose(robust.sampson_distances(twice, matches), [distance])
     swapped = Matches(matches.points1, matches.points0, np.ones(1))
+    # F has no scale: solvers return it at any.
     assert_allclose(robust.sampson_distances(1e-6 * twice.T, swapped), [distance])
     assert robust.sampson_distances(twice, Matches.empty()).shape == (0,)
 
 
 @pytest.mark.parametrize("model", ModelKind)
-def test_fewer_matches_than_a_model_needs_give_the_fallback_and_so_many_give_the_model(model):
+def test_a_model_needs_one_match_more_than_its_minimum_else_the_fallback_is_given(model):
+    # One more than the minimal sample of each solver (7, 5, 4): with a minimal sample alone,
+    # nothing would contradict a wrong match.
     fewest = {ModelKind.F: 8, ModelKind.E: 6, ModelKind.H: 5}[model]
     few = estimated(model, seen(0, fewest - 1))
     assert_fallback(few, model, fewest - 1)
@@ -156,31 +163,33 @@ def test_fewer_matches_than_a_model_needs_give_the_fallback_and_so_many_give_the
 
 
 @pytest.mark.parametrize("model", ModelKind)
-def test_repetitions_are_inliers_like_the_first_and_what_is_not_finite_is_set_aside(model):
+def test_repeated_matches_do_not_change_the_model_and_non_finite_ones_are_never_inliers(model):
     matches, truth = scene(1, plane=model is ModelKind.H)
     clean = estimated(model, matches, seed=1)
     assert_agrees(clean, truth)
+    # Units of several sizes find the same points: repetitions must not outvote other matches.
     again = np.random.default_rng(4).integers(0, 300, 900)
-    bad = [
-        Matches(np.full((50, 2), a), np.full((50, 2), b), np.ones(50))
-        for a, b in [(np.nan, 5), (5, np.inf)]
-    ]
-    more = estimated(model, Matches.concatenate([bad[0], matches, bad[1], matches[again]]), seed=1)
+    nan = Matches(np.full((50, 2), np.nan), np.full((50, 2), 5), np.ones(50))
+    infinite = Matches(np.full((50, 2), 5), np.full((50, 2), np.inf), np.ones(50))
+    more = estimated(model, Matches.concatenate([nan, matches, infinite, matches[again]]), seed=1)
     assert_array_equal(more.matrix, clean.matrix)
     none = np.zeros(50, bool)
-    assert_array_equal(
-        more.inliers, np.concatenate([none, clean.inliers, none, clean.inliers[again]])
-    )
+    expected = np.concatenate([none, clean.inliers, none, clean.inliers[again]])
+    assert_array_equal(more.inliers, expected)
 
 
 @pytest.mark.parametrize("method", Method)
 @pytest.mark.parametrize("model", ModelKind)
-def test_the_same_input_gives_the_same_bytes_whatever_else_goes_on(model, method):
-    plane, config = model is ModelKind.H, RobustConfig(method=method, max_iterations=2000)
+def test_the_same_input_gives_the_same_bytes_after_other_calls_and_beside_other_threads(
+    model, method
+):
+    plane = model is ModelKind.H
+    config = RobustConfig(method=method, max_iterations=2000)
     inputs = [scene(seed, plane)[0] for seed in SEEDS] * 2
     alone = [as_bytes(estimated(model, matches, config)) for matches in inputs]
     assert alone[:3] == alone[3:]
     assert len(set(alone)) == 3
+    # OpenCV has one generator of random numbers for each process.
     for rng_seed in (0, 12345):
         cv2.setRNGSeed(rng_seed)
         assert [as_bytes(estimated(model, matches, config)) for matches in inputs[:3]] == alone[:3]
@@ -192,9 +201,11 @@ def test_the_same_input_gives_the_same_bytes_whatever_else_goes_on(model, method
 
 
 ANY_FLOAT = st.floats(width=32)
+# Squares of 1e20 overflow float32, and those of 1e-20 vanish.
 CORNERS = st.sampled_from(
     np.array([0, 1, -1, 2, 100, 1e-20, 1e10, 1e18, 1e20, 3e38], np.float32).tolist()
 )
+# Few values, so that points coincide.
 PIXELS = st.integers(0, 5).map(float)
 
 
@@ -205,12 +216,13 @@ PIXELS = st.integers(0, 5).map(float)
     method=st.sampled_from(Method),
 )
 @settings(max_examples=150, deadline=None)
-def test_whatever_the_points_are_the_answer_is_an_estimate(data, n, model, method):
+def test_any_points_give_a_finite_matrix_of_norm_1_and_a_mask(data, n, model, method):
     elements = data.draw(st.sampled_from([ANY_FLOAT, CORNERS, PIXELS]))
     rows = data.draw(arrays(np.float32, (n, 4), elements=elements))
     if data.draw(st.booleans()):
         with np.errstate(all="ignore"):  # infinite is fine, too
-            rows[:, 1], rows[:, 3] = rows[:, 0], 2 * rows[:, 2]  # collinear
+            rows[:, 1] = rows[:, 0]
+            rows[:, 3] = 2 * rows[:, 2]  # collinear
     matches = Matches(rows[:, :2], rows[:, 2:], np.ones(n))
     result = estimated(model, matches, RobustConfig(method=method, max_iterations=100))
     assert result.matrix.shape == (3, 3)
@@ -222,7 +234,7 @@ def test_whatever_the_points_are_the_answer_is_an_estimate(data, n, model, metho
 
 
 @pytest.mark.parametrize("refused", [1, 3])
-def test_a_refusal_by_opencv_costs_its_permutation_and_is_the_reason_where_all_are_refused(
+def test_points_that_opencv_refuses_fail_one_permutation_and_the_estimate_if_all_are_refused(
     refused, monkeypatch
 ):
     calls = []
@@ -235,11 +247,9 @@ def test_a_refusal_by_opencv_costs_its_permutation_and_is_the_reason_where_all_a
             raise error
         return cv2.findFundamentalMat(*points, **settings)
 
-    monkeypatch.setitem(
-        robust._SOLVERS, ModelKind.F, robust._SOLVERS[ModelKind.F]._replace(find=find)
-    )
+    solver = robust._SOLVERS[ModelKind.F]._replace(find=find)
+    monkeypatch.setitem(robust._SOLVERS, ModelKind.F, solver)
     found = estimate(seen(0, 60), RobustConfig(permutations=3))
     assert len(calls) == 3
-    assert found.failure == (
-        "" if refused == 1 else "OpenCV refused the points: sample_size <= points_size_"
-    )
+    reason = "OpenCV refused the points: sample_size <= points_size_"
+    assert found.failure == ("" if refused == 1 else reason)

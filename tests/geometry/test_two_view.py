@@ -1,4 +1,4 @@
-"""Two views: F and its derivatives, the Sampson distance, and the way downhill."""
+"""Two views: F and its derivatives, the Sampson distance, and the descent to a minimum."""
 
 import numpy as np
 import pytest
@@ -20,16 +20,19 @@ def random_view(seed, logs=(0.2, -0.3)):
 
 def rays(seed, n=60):
     rng = np.random.default_rng(seed)
-    return tuple(
-        np.column_stack([rng.normal(size=(n, 2)) * 300, np.full(n, g)]) for g in (900.0, 800.0)
-    )
+    rays0 = np.column_stack([rng.normal(size=(n, 2)) * 300, np.full(n, 900.0)])
+    rays1 = np.column_stack([rng.normal(size=(n, 2)) * 300, np.full(n, 800.0)])
+    return rays0, rays1
 
 
+# Three of rotation, two of the direction of translation, two focal lengths.
 @pytest.mark.parametrize("k", range(7))
 def test_the_gradient_of_the_cost_is_that_of_finite_differences(k):
-    view, problem = random_view(1), Problem(*rays(1), np.array([0.4, 0.2]), weight=2.0)
+    view = random_view(1)
+    problem = Problem(*rays(1), np.array([0.4, 0.2]), weight=2.0)
     step = 1e-6 * np.eye(7)[k]
-    forth, back = (problem.cost(view.moved(way * step), 30.0) for way in (1, -1))
+    forth = problem.cost(view.moved(step), 30.0)
+    back = problem.cost(view.moved(-step), 30.0)
     gradient, curvature = problem._derivatives(view, 30.0)
     assert gradient[k] == pytest.approx((forth - back) / 2e-6, abs=1e-5)
     assert_allclose(curvature, curvature.T)
@@ -41,6 +44,7 @@ def test_a_fit_never_costs_more_and_leaves_known_focal_lengths_alone(sigmas):
     problem = Problem(*rays(5), np.array(sigmas))
     found = problem.fit(start, 50.0)
     assert problem.cost(found, 50.0) < problem.cost(start, 50.0)
+    # A sigma of 0 is a known focal length.
     assert_allclose(found.logs[np.array(sigmas) == 0], 0, atol=0)
     assert_allclose(found.R @ found.R.T, np.eye(3), atol=1e-12)
     assert np.linalg.norm(found.t) == pytest.approx(1)
@@ -50,21 +54,23 @@ def rays_of(points, view):
     """Rays (N, 3) of points (N, 3) in camera 0's world, for both images of a view with focal
     lengths of 1000.
     """
-    both = points, points @ view.R.T + view.t
-    return tuple(
-        np.column_stack([1000 * np.exp(log) * x[:, :2] / x[:, 2:], np.full(len(x), 1000.0)])
-        for x, log in zip(both, view.logs, strict=True)
-    )
+    rays = []
+    for x, log in zip((points, points @ view.R.T + view.t), view.logs, strict=True):
+        pixels = 1000 * np.exp(log) * x[:, :2] / x[:, 2:]
+        rays.append(np.column_stack([pixels, np.full(len(x), 1000.0)]))
+    return rays
 
 
-def test_points_are_in_front_of_both_cameras_behind_both_or_between():
+def test_depth_signs_are_1_in_front_of_both_cameras_minus_1_behind_both_and_0_between():
     turn = Rotation.from_rotvec([0, 0.2, 0]).as_matrix()
     view = TwoView(turn, unit([1, 0.1, 1]), np.array([0.2, -0.3]))
     points = np.random.default_rng(0).uniform((-1, -1, 3), (1, 1, 6), (50, 3))
     assert_allclose(sampson(view.fundamental, *rays_of(points, view)), 0, atol=1e-6)
     assert (view.depth_signs(*rays_of(points, view), 1.0) == 1).all()
-    assert (view.depth_signs(*rays_of(points * -1 - 2 * view.R.T @ view.t, view), 1.0) == -1).all()
+    behind = -points - 2 * view.R.T @ view.t
+    assert (view.depth_signs(*rays_of(behind, view), 1.0) == -1).all()
     between = np.array([[0.01, 0.02, -0.3]])  # behind camera 0, in front of camera 1
     assert (view.depth_signs(*rays_of(between, view), 1.0) == 0).all()
+    # The twisted pair has the same F, so only the depths tell the two apart.
     assert_allclose(view.twisted.fundamental, -view.fundamental, atol=1e-12)
     assert not (view.twisted.depth_signs(*rays_of(points, view), 1.0) > 0).any()
