@@ -24,12 +24,13 @@ def both(variant, positions):
 
 @pytest.mark.parametrize(("variant", "positions"), [("aliked-n16", 16), ("aliked-n32", 32)])
 @torch.inference_mode()
-def test_it_finds_what_kornias_finds(variant, positions):
+def test_aliked_finds_the_keypoints_and_descriptors_of_kornias(variant, positions):
     ours, theirs = both(variant, positions)
     images = image_batch([picture(96, 160), picture(96, 160, "another")], "cpu")
     for (keypoints, descriptors), expected in zip(ours(images), theirs(images), strict=True):
         assert len(keypoints) == expected.n > 100
         both_points = keypoints.double(), expected.keypoints.double()
+        # A near tie of the two weakest keypoints may fall the other way.
         assert agreement(*both_points, 0.01) > 0.99
         distances, nearest = torch.cdist(*both_points).min(dim=1)
         cosines = (descriptors * expected.descriptors[nearest]).sum(dim=1)[distances < 0.01]

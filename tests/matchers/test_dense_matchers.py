@@ -21,21 +21,23 @@ from mkpc_kaggle.matchers.networks.warp_refiner import WarpEstimate, identity_ma
 @torch.inference_mode()
 def test_corrections_are_in_pixels_of_the_query_however_large_the_support_is(monkeypatch):
     network = DKM()
-    monkeypatch.setattr(
-        network.decoder.conv_refiner["8"], "forward", lambda *_: torch.ones(1, 3, 6, 8)
-    )
-    query, support = (
-        network.encode(torch.zeros(1, 3, *size)).coarse for size in ((48, 64), (72, 40))
-    )
+    refiner = network.decoder.conv_refiner["8"]
+    monkeypatch.setattr(refiner, "forward", lambda *_: torch.ones(1, 3, 6, 8))
+    query = network.encode(torch.zeros(1, 3, 48, 64)).coarse
+    support = network.encode(torch.zeros(1, 3, 72, 40)).coarse
     estimate = WarpEstimate(torch.zeros(1, 2, 6, 8), torch.zeros(1, 1, 6, 8))
     for other in (query, support):
         flow = network.decoder.correct(estimate, query, other, 8).flow
+        # A grid of 6 x 8 cells spans 2 in each direction, and the correction is an eighth of a cell.
         torch.testing.assert_close(flow[0, :, 0, 0], torch.tensor([2 / 8, 2 / 6]) / 8)
 
 
-def test_what_has_no_weight_is_not_drawn():
-    warp, certainty, generator = torch.rand(100, 4), torch.ones(100), torch.Generator()
+def test_matches_without_certainty_are_never_drawn():
+    warp = torch.rand(100, 4)
+    certainty = torch.ones(100)
     certainty[10:] = 0
+    generator = torch.Generator()
+    # Fifty are asked for, and ten have a certainty.
     assert sorted(sample_matches(warp, certainty, 50, 0.05, generator).tolist()) == [*range(10)]
     assert len(sample_matches(warp, certainty * 0, 50, 0.05, generator)) == 0
     assert len(sample_matches(warp[:0], certainty[:0], 50, 0.05, generator)) == 0
@@ -46,6 +48,7 @@ def matcher() -> DenseMatcher:
     return dkm_matcher(Placement())
 
 
+# Dense networks resize the content alone: padding would enter the warp as a place to match.
 def test_padding_changes_nothing(matcher):
     plain = [picture(40, 56), picture(50, 36, "another")]
     padded = [picture(40, 56, padding=(13, 26)), picture(50, 36, "another", padding=(8, 16))]
@@ -60,6 +63,7 @@ def identity_warp(height: int, width: int, certainty: float) -> DenseWarp:
 
 def test_points_of_either_picture_are_in_its_own_pixels():
     """Both show the same, at another size: places relative to the edges agree."""
+    # Two certainties, so that a match shows which of the two warps it comes from.
     warps = identity_warp(40, 60, 0.3), identity_warp(80, 30, 0.9)
     network = SimpleNamespace(encode=lambda *_: None, match=lambda *_: warps)
     matcher = DenseMatcher(MatcherSpec("given"), network, DenseOptions(matches=9999), "cpu")
@@ -67,11 +71,12 @@ def test_points_of_either_picture_are_in_its_own_pixels():
     assert len(matches) == 40 * 60 + 80 * 30
     expected = (matches.points0 + 0.5) * (30 / 60, 80 / 40) - 0.5
     np.testing.assert_allclose(matches.points1, expected, atol=1e-4)
+    # A warp starts at whole pixels of its own picture.
     whole0 = np.abs(matches.points0 - np.rint(matches.points0)).max(axis=1) < 1e-4
     whole1 = np.abs(matches.points1 - np.rint(matches.points1)).max(axis=1) < 1e-4
     assert (whole0 | whole1).all()
     np.testing.assert_array_equal(matches.scores == np.float32(0.3), whole0)
-    assert set(matches.scores.tolist()) == {float(np.float32(0.3)), float(np.float32(0.9))}
+    assert set(np.unique(matches.scores)) == {np.float32(0.3), np.float32(0.9)}
 
 
 @pytest.mark.parametrize(("passes", "sides"), [(2, (56, 84)), (1, (84, 126))])
@@ -81,5 +86,6 @@ def test_sides_of_the_first_pass_are_multiples_of_14(passes, sides):
     matcher = DenseMatcher(MatcherSpec("given"), network, options, "cpu", multiple=14)
     (encoded,) = matcher.encode([picture(86, 130)])
     assert encoded.features.coarse.at(1).shape[2:] == sides
+    # DINOv2 needs patches of 14 pixels; the second pass has no DINOv2, and keeps the size.
     fine = [each.at(1).shape[2:] for each in [encoded.features.fine] if each]
     assert fine == [(86, 130)] * (passes - 1)

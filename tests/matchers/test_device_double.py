@@ -16,11 +16,12 @@ PAIRS = {"superglue": 3, "aliked_lightglue": 3, "xfeat_lighterglue": 3}
 
 def matched(name, device):
     """The points (M, 4) of each pair of a minibatch."""
-    matcher, numbers = MATCHERS[name](Placement(device)), range(PAIRS.get(name, 1))
-    pictures = [
-        [picture(matcher.spec.colour, number, shift) for number in numbers] for shift in (SHIFT, 0)
-    ]
-    encodings = [matcher.encode(side) for side in pictures]
+    matcher = MATCHERS[name](Placement(device))
+    encodings = []
+    for shift in (SHIFT, 0):
+        numbers = range(PAIRS.get(name, 1))
+        side = [picture(matcher.spec.colour, number, shift) for number in numbers]
+        encodings.append(matcher.encode(side))
     tensors = [array for array in arrays_of(encodings) if isinstance(array, torch.Tensor)]
     assert {tensor.device for tensor in tensors} == {torch.device(device)}
     found = matcher.match(*encodings)
@@ -36,6 +37,6 @@ def test_a_matcher_finds_on_a_gpu_what_it_finds_on_the_cpu(name):
     with DeviceDouble(2) as double:
         found = matched(name, "cuda:1")  # not the default one
         assert double.operators > 0
-    assert (
-        min(agreement(a, b, 0.05, torch.inf) for a, b in zip(found, expected, strict=True)) >= 0.98
-    )
+    # The double sums in another order, so a match at a threshold may come or go.
+    for ours, of_cpu in zip(found, expected, strict=True):
+        assert agreement(ours, of_cpu, 0.05, torch.inf) >= 0.98

@@ -1,6 +1,4 @@
-"""What a run asks of GPUs, shown on machines without: which there are, in which precision, with how
-much cache.
-"""
+"""GPUs of a run, shown on machines without one: which are used, in which precision."""
 
 import time
 from dataclasses import dataclass
@@ -41,6 +39,7 @@ def gpus_here(monkeypatch: pytest.MonkeyPatch, *capabilities: tuple[int, int]) -
 
 
 def test_a_missing_gpu_is_refused_and_half_precision_asks_every_gpu_that_the_run_uses(monkeypatch):
+    # A T4, whose tensor cores are fast in half precision, beside a P100, which has none.
     gpus_here(monkeypatch, (7, 5), (6, 0))
     assert resolve_placement("cuda:1", "float32").device == "cuda:1"
     with pytest.raises(UserError, match="--device cuda:2: this machine has only cuda:0, cuda:1"):
@@ -53,6 +52,7 @@ def test_the_parent_of_workers_never_initialises_cuda(monkeypatch):
     def refuse() -> None:
         raise AssertionError("CUDA was initialised in the parent")
 
+    # A process that has initialised CUDA holds memory on the GPU, and its forks cannot use it.
     monkeypatch.setattr(torch.cuda, "_lazy_init", refuse)
     gpus_here(monkeypatch, (7, 5), (7, 5))
     made = assemble("classical", device="cuda", precision="auto")
@@ -62,9 +62,10 @@ def test_the_parent_of_workers_never_initialises_cuda(monkeypatch):
     assert [place.name for place in site.of(Work.MATCH)] == ["cuda:0", "cuda:1"]
 
 
-def test_gpus_on_which_nothing_can_be_computed_leave_the_work_to_the_cpu(monkeypatch):
+def test_gpus_that_cannot_compute_leave_the_work_to_the_cpu(monkeypatch):
     gpu_capabilities.cache_clear()
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    # What torch raises on a GPU that its build does not support.
     monkeypatch.setattr(devices, "ASK_CAPABILITIES", "raise SystemExit('no kernel image')")
     told = (
         r"the CPU does the work: .*\(no kernel image\); on Kaggle choose the accelerator GPU T4 x2"
@@ -85,6 +86,7 @@ def test_a_device_that_multiplies_and_cannot_convolve_is_refused(monkeypatch):
     def convolve(*_: object) -> None:
         raise RuntimeError("cuDNN error: CUDNN_STATUS_EXECUTION_FAILED_CUDART")
 
+    # A driver that does not fit torch's build: products work, and cuDNN fails.
     with DeviceDouble(1) as double:
         require_device("cuda:0")
         assert double.operators > 0
@@ -124,6 +126,7 @@ class Own:
 
 
 def works() -> list[PairMatch]:
+    # Two pairs with a common first image, which is encoded once.
     rows = np.random.default_rng(0).integers(0, 255, (3, 48, 64, 3), np.uint8)
     images = [Image.of_array(pixels) for pixels in rows]
     return [PairMatch(images=(images[0], other)) for other in images[1:]]
@@ -133,8 +136,10 @@ def works() -> list[PairMatch]:
     not hasattr(torch.backends.cudnn, "conv"), reason="PyTorch before 2.9 has other names for it"
 )
 def test_matchers_run_without_tf32_and_the_process_keeps_its_settings():
-    before, own = settings(), Own(1.0)
+    before = settings()
+    own = Own(1.0)
     Pipeline(RECIPE, lambda name: own).match(works(), RECIPE.units)
+    # TF32 has ten bits of mantissa; matches would depend on the GPU.
     assert set(own.seen) == {("ieee", "ieee")}
     assert settings() == before
     with pytest.raises(ZeroDivisionError), exact_float32():
@@ -143,7 +148,8 @@ def test_matchers_run_without_tf32_and_the_process_keeps_its_settings():
 
 
 def test_features_that_are_not_finite_load_the_matcher_in_float32_and_are_an_error_there():
-    half, exact = Own(float("inf")), Own(1.0)
+    half = Own(float("inf"))
+    exact = Own(1.0)
     runner = Pipeline(RECIPE, lambda name: half, load_float32=lambda name: exact)
     with pytest.warns(RuntimeWarning, match="own runs in float32"):
         done = runner.match(works(), RECIPE.units)
@@ -151,14 +157,13 @@ def test_features_that_are_not_finite_load_the_matcher_in_float32_and_are_an_err
     note = "own runs in float32, for in half precision features of own are not finite"
     assert {(work.results[0].failure, work.results[0].note) for work in done} == {("", note)}
     failed = Pipeline(RECIPE, lambda name: Own(float("nan"))).match(works(), RECIPE.units)
-    assert {work.results[0].failure for work in failed} == {
-        "NonFiniteError: features of own are not finite"
-    }
+    failures = {work.results[0].failure for work in failed}
+    assert failures == {"NonFiniteError: features of own are not finite"}
 
 
-def test_finite_numbers_pass_however_large_their_sum_and_whatever_holds_them():
-    check_finite(
-        "maps", Maps(torch.full((9, 9), 65504.0, dtype=torch.float16), (torch.arange(3),)), []
-    )
+def test_finite_numbers_pass_the_check_even_if_their_sum_overflows():
+    # 65504 is the largest number of float16.
+    largest = torch.full((9, 9), 65504.0, dtype=torch.float16)
+    check_finite("maps", Maps(largest, (torch.arange(3),)), [])
     with pytest.raises(NonFiniteError, match="maps are not finite"):
         check_finite("maps", [Maps(torch.zeros(2), (torch.tensor([0.0, -torch.inf]),))])

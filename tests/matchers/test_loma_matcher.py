@@ -1,4 +1,4 @@
-"""LoMa as a matcher, and what its networks do beside the numbers of the golden files."""
+"""LoMa as a matcher, and properties of its networks that golden files do not show."""
 
 from types import SimpleNamespace
 
@@ -24,9 +24,8 @@ OPTIONS = LomaOptions(Variant.B128, max_keypoints=200)
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> WeightStore:
-    return store_of(
-        tmp_path_factory.mktemp("weights"), [file for file in FILES if file.matcher == "loma"]
-    )
+    files = [file for file in FILES if file.matcher == "loma"]
+    return store_of(tmp_path_factory.mktemp("weights"), files)
 
 
 @pytest.fixture(scope="module")
@@ -39,13 +38,14 @@ def network(matcher: LomaAdapter) -> Loma:
     return matcher._network
 
 
-def test_keypoints_are_where_the_detector_saw_them(matcher):
+def test_keypoints_are_at_the_place_of_a_dot(matcher):
     """A dot stays in its place when the detector's picture has other sides than the view."""
     pixels = np.full((101, 135, 3), 90, np.uint8)
     cv2.circle(pixels, (70, 40), 2, (250, 240, 230), -1)
     (encoded,) = matcher.encode([as_picture(pixels)])
     assert detector_size(Size(135, 101), 135) == (128, 96)
     points = loma.from_normalised(encoded.keypoints.points.numpy(), Size(135, 101))
+    # Twice the dot's radius. With the detector's sides instead of the view's: 4.1 pixels off.
     assert np.hypot(*(points - (70, 40)).T).min() < 4
 
 
@@ -54,14 +54,14 @@ def test_padding_changes_nothing_and_tiny_pictures_have_no_matches(matcher):
     plain, padded = matcher.encode([as_picture(pixels), as_picture(pixels, padding=(13, 26))])
     assert torch.equal(plain.keypoints.points, padded.keypoints.points)
     assert torch.equal(plain.keypoints.descriptors, padded.keypoints.descriptors)
+    # 200 keypoints, each with two coordinates and 128 numbers of four bytes.
     assert encoding_bytes(plain) == 200 * (2 + 128) * 4
-    tiny = [
-        matcher.encode([as_picture(scene(*size, channels=3))])[0]
-        for size in ((7, 90), (1, 1), (90, 5))
-    ]
-    assert [
-        len(matches) for matches in matcher.match([*tiny, plain, tiny[0]], [plain] * 3 + tiny[:2])
-    ] == [0] * 5
+    tiny = []
+    for size in ((7, 90), (1, 1), (90, 5)):
+        tiny += matcher.encode([as_picture(scene(*size, channels=3))])
+    # Rounded down to the detector's multiple, they have no rows or no columns.
+    found = matcher.match([*tiny, plain, tiny[0]], [plain] * 3 + tiny[:2])
+    assert [len(matches) for matches in found] == [0] * 5
 
 
 def test_a_checkpoint_with_a_surplus_is_refused_and_half_precision_and_deeper_training_load(
@@ -71,10 +71,12 @@ def test_a_checkpoint_with_a_surplus_is_refused_and_half_precision_and_deeper_tr
     surplus = {"_descriptor.surplus": torch.ones(1)}
     with pytest.raises(UserError, match="'loma-b128' do not fit the network"):
         loma.load(SimpleNamespace(load=lambda _: good | surplus), OPTIONS, Placement())
+    # Published variants have more layers than the matcher runs, and some are stored in bfloat16.
     name = "transformers.3.self_attn.Wqkv.weight"
     more = {name: good[name].bfloat16(), "transformers.9.self_attn.out_proj.bias": torch.ones(256)}
     loaded = loma.load(SimpleNamespace(load=lambda _: good | more), OPTIONS, Placement())._network
-    found, exact = (each.get_parameter(f"matcher.{name}") for each in (loaded, network))
+    found = loaded.get_parameter(f"matcher.{name}")
+    exact = network.get_parameter(f"matcher.{name}")
     assert torch.equal(found, exact.bfloat16().float())
 
 
@@ -82,7 +84,9 @@ def test_a_checkpoint_with_a_surplus_is_refused_and_half_precision_and_deeper_tr
 def test_strips_of_rows_give_what_the_whole_gives(network, monkeypatch):
     image = torch.from_numpy(scene(157, 83, channels=3)).permute(2, 0, 1)[None].float() / 255
     points = torch.rand(1, 50, 2, generator=torch.Generator().manual_seed(0)) * 2 - 1
-    logits, descriptors = network.detector.logits(image), network.descriptor(image, points)
+    logits = network.detector.logits(image)
+    descriptors = network.descriptor(image, points)
+    # Fifty rows of the first layer: strips meet within the picture, where they need a margin.
     monkeypatch.setattr(layers, "STRIP_FLOATS", 83 * 32 * 50)
     torch.testing.assert_close(network.detector.logits(image), logits, rtol=0, atol=1e-3)
     torch.testing.assert_close(network.descriptor(image, points), descriptors, rtol=0, atol=1e-3)

@@ -22,6 +22,7 @@ from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher
 from mkpc_kaggle.recipe import Recipe, Unit
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*is not verified")
+# Odd sides, a wide strip, and a picture of one column.
 SIZES = [((33, 47), (64, 48)), ((9, 120), (40, 40)), ((20, 1), (40, 50))]
 
 
@@ -40,9 +41,9 @@ def test_matches_lie_on_the_pictures_whatever_their_sizes(matcher, sizes):
     shown = [picture(matcher, *size, f"{size}") for size in sizes]
     encodings = [matcher.encode([each])[0] for each in shown]
     (matches,) = matcher.match(encodings[:1], encodings[1:])
-    assert all(
-        part.dtype == np.float32 for part in (matches.points0, matches.points1, matches.scores)
-    )
+    # A lossless copy for the store, which keeps float32.
+    for part in (matches.points0, matches.points1, matches.scores):
+        assert part.dtype == np.float32
     assert ((matches.scores >= 0) & (matches.scores <= 1.0001)).all()
     # A window may reach over the edge by a few pixels.
     for points, size in zip((matches.points0, matches.points1), sizes, strict=True):
@@ -55,6 +56,7 @@ def test_the_same_pair_gives_the_same_bytes_whatever_ran_before(matcher):
     shown = [picture(matcher, 64, 96, name) for name in ("scene", "scene", "another")]
     encodings = [matcher.encode([each])[0] for each in shown]
     (alone,) = matcher.match(encodings[:1], encodings[1:2])
+    # A matcher that draws from torch's global generator would now draw other numbers.
     torch.rand(5)
     other = matcher.match(encodings[2:], encodings[1:2])[0]
     (again,) = matcher.match(encodings[:1], encodings[1:2])
@@ -64,9 +66,9 @@ def test_the_same_pair_gives_the_same_bytes_whatever_ran_before(matcher):
 
 
 def test_an_encoding_keeps_no_more_memory_than_is_counted_and_nothing_gives_nothing(matcher):
-    for encoding in matcher.encode(
-        [picture(matcher, 64, 96, name) for name in ("scene", "another")]
-    ):
+    pictures_of_a_batch = [picture(matcher, 64, 96, name) for name in ("scene", "another")]
+    for encoding in matcher.encode(pictures_of_a_batch):
+        # A view of the whole batch's tensor would keep all of it, and the cache would count a part.
         kept = sum(tensor.untyped_storage().nbytes() for tensor in arrays_of(encoding))
         assert encoding_bytes(encoding) == kept > 0
     assert list(matcher.match([], [])) == []
@@ -83,17 +85,18 @@ def test_both_stages_run_with_an_odd_flat_picture(matcher):
 
 def overflow(monkeypatch):
     """Let all linear maps and convolutions overflow from now on, as in half precision they may."""
+
+    def infinite(exact):
+        return lambda *args, **more: exact(*args, **more) * torch.inf
+
     for name in ("linear", "conv1d", "conv2d"):
-        exact = getattr(functional, name)
-        monkeypatch.setattr(
-            functional, name, lambda *args, exact=exact, **more: exact(*args, **more) * torch.inf
-        )
+        monkeypatch.setattr(functional, name, infinite(getattr(functional, name)))
 
 
 def test_overflow_is_an_error_and_never_a_lack_of_keypoints_or_matches(matcher, monkeypatch):
     encodings = [matcher.encode([picture(matcher, 64, 96, name)]) for name in ("scene", "another")]
     overflow(monkeypatch)
-    if matcher.spec.name != "sift_lightglue":
+    if matcher.spec.name != "sift_lightglue":  # SIFT is no network
         with pytest.raises(NonFiniteError):
             check_finite("features", list(matcher.encode([picture(matcher, 64, 96)])))
     if matcher.spec.name != "aliked":  # nearest neighbours need no network

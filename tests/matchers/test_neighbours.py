@@ -17,22 +17,24 @@ def unit(rng, n, dimension=16):
 def related(seed, n, m, dimension=16):
     """Descriptors of two images, about half of them seen in both."""
     rng = np.random.default_rng(seed)
-    first, second = unit(rng, n, dimension), unit(rng, m, dimension)
+    first = unit(rng, n, dimension)
+    second = unit(rng, m, dimension)
     common = min(n, m) // 2
-    second[:common] = first[rng.permutation(n)[:common]] + 0.05 * rng.normal(
-        size=(common, dimension)
-    )
+    chosen = first[rng.permutation(n)[:common]]
+    second[:common] = chosen + 0.05 * rng.normal(size=(common, dimension))
     return first, second / np.linalg.norm(second, axis=1, keepdims=True)
 
 
 def brute_force(first, second):
     """index0, index1, similarity and ratio, from all distances."""
     distance = np.linalg.norm(first[:, None] - second[None], axis=2)
-    to1, to0 = distance.argmin(axis=1), distance.argmin(axis=0)
+    to1 = distance.argmin(axis=1)
+    to0 = distance.argmin(axis=0)
     index0 = np.array([i for i in range(len(first)) if to0[to1[i]] == i])
     index1 = to1[index0]
     ratios = []
     for i, j in zip(index0, index1, strict=True):
+        # Without a second neighbour: 2 is the largest distance of unit vectors.
         second_of_row = min(np.delete(distance[i], j), default=2.0)
         second_of_column = min(np.delete(distance[:, j], i), default=2.0)
         ratios.append(distance[i, j] / min(second_of_row, second_of_column))
@@ -44,16 +46,18 @@ def found(first, second, dtype=torch.float64):
     return tuple(tensor.numpy() for tensor in (got.index0, got.index1, got.similarity, got.ratio))
 
 
+# One and two descriptors have no second neighbour, or just one.
 @pytest.mark.parametrize(("n", "m"), [(1, 1), (1, 9), (9, 1), (2, 2), (150, 61), (61, 150)])
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 1e-4), (torch.float64, 1e-9)])
+# Blocks that end within, at and after the last row.
 @pytest.mark.parametrize("rows", [7, 61, 4096])
-def test_they_are_those_of_brute_force_in_blocks_of_any_size(
+def test_neighbours_are_those_of_brute_force_in_blocks_of_any_size(
     n, m, dtype, tolerance, rows, monkeypatch
 ):
     monkeypatch.setattr(neighbours, "BLOCK_ROWS", rows)
-    got, expected = (
-        of(*related(n, n, m)) for of in (lambda *both: found(*both, dtype), brute_force)
-    )
+    first, second = related(n, n, m)
+    got = found(first, second, dtype)
+    expected = brute_force(first, second)
     for index, truth in zip(got[:2], expected[:2], strict=True):
         assert_array_equal(index, truth)
     for value, truth in zip(got[2:], expected[2:], strict=True):
@@ -63,7 +67,8 @@ def test_they_are_those_of_brute_force_in_blocks_of_any_size(
 @pytest.mark.parametrize("max_ratio", [0.0, 0.3, 0.8])
 def test_a_maximum_ratio_drops_pairs_and_changes_no_others(max_ratio):
     descriptors = [torch.tensor(each) for each in related(3, 150, 61)]
-    every, kept = mutual_neighbours(*descriptors), mutual_neighbours(*descriptors, max_ratio)
+    every = mutual_neighbours(*descriptors)
+    kept = mutual_neighbours(*descriptors, max_ratio)
     passed = every.ratio <= max_ratio
     assert_array_equal(kept.index0, every.index0[passed])
     assert_array_equal(kept.index1, every.index1[passed])
@@ -73,11 +78,14 @@ def test_a_maximum_ratio_drops_pairs_and_changes_no_others(max_ratio):
 
 @pytest.mark.parametrize(("n", "m"), [(0, 0), (0, 5), (5, 0)])
 def test_no_descriptors_give_no_pairs(n, m):
+    # A blank picture has no keypoints, and torch's minimum of nothing is an error.
     assert [part.shape for part in found(np.zeros((n, 8)), np.zeros((m, 8)))] == [(0,)] * 4
 
 
 def test_a_pair_with_an_equal_rival_is_ambiguous():
-    x, y = [1.0, 0.0], [0.0, 1.0]
+    x = [1.0, 0.0]
+    y = [0.0, 1.0]
+    # At distance 0 the ratio is 0 / 0: repeated texture must not pass as a perfect match.
     assert_allclose(found(np.array([x, y]), np.array([x, x, y]))[3], [1, 0], atol=1e-5)
     near = [np.cos(0.1), np.sin(0.1)]
     assert_allclose(found(np.array([x]), np.array([near, near]))[3], [1])

@@ -15,9 +15,10 @@ from mkpc_kaggle.engine.records import read_records
 from mkpc_kaggle.engine.store import Store
 from mkpc_kaggle.matchers.adapters import roma
 
-LONG, AREA = ("long_side = 209", "long_side = 150"), ('area = "96x128"', 'area = "70x90"')
-# The sizes of the units of stages 1 and 2, which fit no network's multiple, and the matcher's
-# options.
+# The sizes of the units of stages 1 and 2, which fit no network's multiple.
+LONG = ("long_side = 209", "long_side = 150")
+AREA = ('area = "96x128"', 'area = "70x90"')
+# Sizes and options of each matcher.
 TRIALS = dict.fromkeys(("superglue", "loftr", "quadtree", "aspanformer"), (LONG, ""))
 TRIALS |= dict.fromkeys(("dkm", "roma"), (AREA, ""))
 TRIALS["loma"] = LONG, 'variant = "b128"\nmax_keypoints = 300'
@@ -30,16 +31,19 @@ def test_dir(tmp_path_factory):
     """
     directory = tmp_path_factory.mktemp("made")
     whole = scene(240, 240, channels=3)
-    pictures = {"landscape": whole[64:203, 16:225], "portrait": whole[16:225, 40:179]}
-    pictures |= {"small": whole[120:167, 80:113], "blank": np.zeros((131, 175, 3), np.uint8)}
+    pictures = {
+        "landscape": whole[64:203, 16:225],
+        "portrait": whole[16:225, 40:179],
+        "small": whole[120:167, 80:113],
+        "blank": np.zeros((131, 175, 3), np.uint8),
+    }
     (directory / "test_images" / "made").mkdir(parents=True)
     for name, pixels in pictures.items():
         cv2.imwrite(str(directory / "test_images" / "made" / f"{name}.png"), pixels)
     pairs = [("landscape", "portrait"), ("small", "landscape"), ("portrait", "blank")]
     rows = [f"made;{first}-{second},made,{first},{second}" for first, second in pairs]
-    (directory / "test.csv").write_text(
-        "\n".join(["sample_id,batch_id,image_1_id,image_2_id", *rows])
-    )
+    head = "sample_id,batch_id,image_1_id,image_2_id"
+    (directory / "test.csv").write_text("\n".join([head, *rows]))
     return directory
 
 
@@ -53,42 +57,38 @@ def test_odd_small_and_blank_pictures_go_through(
 ):
     checkpoints = write_checkpoints(tmp_path, [file for file in FILES if file.matcher == matcher])
     use_manifest(monkeypatch, checkpoints)
+    # The published width needs more time and memory than a test should.
     monkeypatch.setattr(roma, "RoMa", narrow_roma)
     sizes, options = TRIALS[matcher]
     options += FEW.get(matcher, "")
-    units = [
-        f'{{ stage = {n}, matcher = "{matcher}", {size} }}' for n, size in enumerate(sizes, start=1)
-    ]
-    magsac = "[magsac]\npermutations = 1\nmax_iterations = 2000"
-    (tmp_path / "r.toml").write_text(
-        f"units = [{', '.join(units)}]\n[matchers.{matcher}]\n{options}\n{magsac}"
-    )
-    output, given = tmp_path / "out.csv", ("--recipe", tmp_path / "r.toml", "--weights", tmp_path)
-    options = (
-        "--test-dir",
-        test_dir,
-        "--output",
-        output,
-        *given,
-        "--device",
-        "cpu",
-        "--workers",
-        0,
-    )
-    assert run_command("submit", "--no-report", *options) == 0
+    recipe = tmp_path / "r.toml"
+    recipe.write_text(f"""
+        units = [
+            {{ stage = 1, matcher = "{matcher}", {sizes[0]} }},
+            {{ stage = 2, matcher = "{matcher}", {sizes[1]} }},
+        ]
+        [matchers.{matcher}]
+        {options}
+        [magsac]
+        permutations = 1
+        max_iterations = 2000
+    """)
+    output = tmp_path / "out.csv"
+    given = ["--test-dir", test_dir, "--output", output, "--recipe", recipe, "--weights", tmp_path]
+    assert run_command("submit", "--no-report", *given, "--device", "cpu", "--workers", 0) == 0
     assert problems_of(output, test_dir) == []
+    # Every row is an F of rank 2, the fallback of the blank picture too.
     for F in read_submission(output).values():
         strengths = np.linalg.svd(F, compute_uv=False)
         assert strengths[2] < 1e-6 * strengths[0] < 1e6 * strengths[1]
     with Store.read(tmp_path / "out.work") as store:
-        found = {
-            (record.index, unit.stage): unit
-            for record in read_records(store)
-            for unit in record.units
-        }
+        found = {}
+        for record in read_records(store):
+            for unit in record.units:
+                found[record.index, unit.stage] = unit
     assert found.keys() == {(pair, stage) for pair in range(3) for stage in (1, 2)}
     assert {unit.failure for unit in found.values()} == {""}
     assert found[0, 1].matches >= 8
-    # Which have answers for all pixels, and keypoints on any picture
+    # Dense matchers have answers for all pixels, and LoMa has keypoints on any picture.
     if matcher not in {"dkm", "roma", "loma"}:
         assert found[2, 1].matches == found[2, 2].matches == 0

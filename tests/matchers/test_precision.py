@@ -21,7 +21,8 @@ NAMES = ["superglue", "loftr", "quadtree", "aspanformer", "roma", "loma", "xfeat
 @cache
 def matches_of(name, precision=Precision.FLOAT32, noise=0):
     """(M, 4): the points of both pictures; with noise, each value is changed by up to one."""
-    matcher, encodings = MATCHERS[name](Placement(precision=precision)), []
+    matcher = MATCHERS[name](Placement(precision=precision))
+    encodings = []
     for shift in (SHIFT, 0):
         shown = picture(matcher.spec.colour, 0, shift)
         change = np.random.default_rng(0).integers(-noise, noise + 1, shown.pixels.shape)
@@ -34,17 +35,18 @@ def matches_of(name, precision=Precision.FLOAT32, noise=0):
 @pytest.mark.parametrize("precision", [Precision.BFLOAT16, Precision.FLOAT16])
 @pytest.mark.parametrize("name", NAMES)
 def test_matches_move_less_than_by_noise(name, precision):
-    exact, half, disturbed = (
-        matches_of(name),
-        matches_of(name, precision),
-        matches_of(name, noise=1),
-    )
+    exact = matches_of(name)
+    half = matches_of(name, precision)
+    disturbed = matches_of(name, noise=1)
     assert len(exact) > 20
+    # A grey level is the noise that every photograph has.
     assert agreement(exact, half, within=0.25) > agreement(exact, disturbed, within=0.25)
+    # Equal matches would mean that the precision was ignored.
     assert not torch.equal(exact, half)
 
 
 def test_auto_takes_half_precision_where_the_processor_has_it(monkeypatch):
+    # Without such instructions, PyTorch emulates bfloat16 and is slower than in float32.
     for flags, expected in (
         ({"avx512_bf16": True}, Precision.BFLOAT16),
         ({"amx_bf16": True, "avx512_bf16": False}, Precision.BFLOAT16),

@@ -17,6 +17,7 @@ from mkpc_kaggle.matchers import adapters
 from mkpc_kaggle.matchers.registry import matcher_names, spec_of
 from mkpc_kaggle.recipe import Unit
 
+# In a process of its own, because imports of this one cannot be undone.
 WITHOUT_KORNIA = """
 import sys
 sys.modules["kornia"] = None
@@ -43,42 +44,34 @@ def more_matchers(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[P
         sys.modules.pop(f"{adapters.__name__}.{name}", None)
 
 
-def test_the_template_of_a_matcher_is_a_matcher(more_matchers):
+def test_the_matcher_of_contributing_md_runs_as_it_is_printed(more_matchers):
     page = (Path(__file__).parents[2] / "CONTRIBUTING.md").read_text(encoding="utf-8")
     (more_matchers / "orb.py").write_text(page.split("```python\n")[1].split("```")[0])
     image = load_sample_image("china.jpg")
     match = TwoStageMatcher(Recipe((Unit(1, "orb", 640), Unit(2, "orb", 640))))(image, image)
     assert match.estimate.inlier_count > 500
+    # Without keypoints, OpenCV returns None instead of descriptors.
     flat = np.zeros_like(image)
     assert not TwoStageMatcher(Recipe((Unit(1, "orb", 640),)))(image, flat).estimate.ok
 
 
-def test_a_broken_matcher_is_told_with_its_reason_and_costs_no_other(more_matchers):
+def test_a_matcher_whose_import_fails_is_refused_with_the_reason_and_others_work(more_matchers):
     (more_matchers / "broken.py").write_text("from json import no_such_thing\nSPEC = None\n")
-    with pytest.raises(
-        UserError, match=r"my recipe: matcher broken cannot be used here \(ImportError: .*no_such"
-    ):
+    says = r"my recipe: matcher broken cannot be used here \(ImportError: .*no_such"
+    with pytest.raises(UserError, match=says):
         spec_of("broken", "my recipe")
     assert spec_of("sift", "test").name == "sift"
 
 
 def test_without_kornia_its_matchers_alone_are_lost(clean_environment):
-    done = subprocess.run(
-        [sys.executable, "-c", WITHOUT_KORNIA], capture_output=True, text=True, check=False
-    )
+    command = [sys.executable, "-c", WITHOUT_KORNIA]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert "superglue_outdoor.pth" in done.stdout, done.stderr
-    assert (
-        "\nweights: matcher xfeat_lighterglue cannot be used here (ModuleNotFoundError"
-        in done.stdout
-    )
-    assert "  xfeat_lighterglue: cannot be used here (ModuleNotFoundError" in done.stdout
+    reason = "cannot be used here (ModuleNotFoundError"
+    # Each command that lists matchers says what is missing instead of leaving a gap.
+    assert f"\nweights: matcher xfeat_lighterglue {reason}" in done.stdout
+    assert f"  xfeat_lighterglue: {reason}" in done.stdout
     assert "('sift',) True" in done.stdout
-    assert (
-        "recipe auto does without xfeat_lighterglue: cannot be used here (ModuleNotFoundError"
-        in done.stderr
-    )
-    assert (
-        "recipe mine does without xfeat_lighterglue: cannot be used here (ModuleNotFoundError"
-        in done.stderr
-    )
+    assert f"recipe auto does without xfeat_lighterglue: {reason}" in done.stderr
+    assert f"recipe mine does without xfeat_lighterglue: {reason}" in done.stderr
     assert done.stdout.endswith("('sift',)\n")

@@ -26,18 +26,15 @@ TOLERANCES = np.array([0.5, *4 * [0.05], 2e-3])  # pair, pixels, score; a row is
 def found(name):
     """The matches (M, 6) of two pairs: number of the pair, points, score."""
     matcher = MATCHERS[name](Placement())
-    sides = [
-        [picture(matcher.spec.colour, number, shift) for number in (0, 1)] for shift in (SHIFT, 0)
-    ]
-    encodings = [[matcher.encode([shown])[0] for shown in side] for side in sides]
-    return np.concatenate(
-        [
-            np.column_stack(
-                [np.full(len(matches), pair), matches.points0, matches.points1, matches.scores]
-            )
-            for pair, matches in enumerate(matcher.match(*encodings))
-        ]
-    )
+    encodings = []
+    for shift in (SHIFT, 0):
+        side = [picture(matcher.spec.colour, number, shift) for number in (0, 1)]
+        encodings.append([matcher.encode([shown])[0] for shown in side])
+    rows = []
+    for pair, matches in enumerate(matcher.match(*encodings)):
+        number = np.full(len(matches), pair)
+        rows.append(np.column_stack([number, matches.points0, matches.points1, matches.scores]))
+    return np.concatenate(rows)
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -24,21 +24,22 @@ from mkpc_kaggle.matchers.registry import load_matcher, spec_of
 
 @pytest.mark.parametrize("held", [0, 2**20])
 def test_matches_are_the_mutual_maxima_of_both_softmaxes(monkeypatch, held):
+    # Seven of thirty rows at once: the last block is smaller.
     monkeypatch.setattr("mkpc_kaggle.matchers.networks.coarse_matching.ROWS_AT_ONCE", {"cpu": 7})
     monkeypatch.setattr("mkpc_kaggle.matchers.networks.coarse_matching.HELD_FLOATS", held)
     generator = torch.Generator().manual_seed(0)
-    grid0, grid1 = (torch.randn(5, width, 16, generator=generator) for width in (6, 7))
+    grid0 = torch.randn(5, 6, 16, generator=generator)
+    grid1 = torch.randn(5, 7, 16, generator=generator)
     matches = coarse_matches(grid0, grid1, 0.5, 0.02, 0, None)
+    # The whole matrix in float64, which the network never holds: it takes gigabytes.
     similarity = (grid0.flatten(0, 1).double() @ grid1.flatten(0, 1).double().mT) * 0.5
     confidence = similarity.softmax(0) * similarity.softmax(1)
-    mutual = (confidence == confidence.amax(0, keepdim=True)) & (
-        confidence == confidence.amax(1, keepdim=True)
-    )
-    expected = (mutual & (confidence > 0.02)).nonzero()
+    largest_of_column = confidence == confidence.amax(0, keepdim=True)
+    largest_of_row = confidence == confidence.amax(1, keepdim=True)
+    expected = (largest_of_column & largest_of_row & (confidence > 0.02)).nonzero()
     torch.testing.assert_close(torch.stack([matches.index0, matches.index1], dim=1), expected)
-    torch.testing.assert_close(
-        matches.scores.double(), confidence[tuple(expected.T)], rtol=1e-5, atol=0
-    )
+    scores = confidence[tuple(expected.T)]
+    torch.testing.assert_close(matches.scores.double(), scores, rtol=1e-5, atol=0)
 
 
 def test_span_attention_in_chunks_is_that_of_the_whole(monkeypatch):
@@ -49,18 +50,18 @@ def test_span_attention_in_chunks_is_that_of_the_whole(monkeypatch):
     samples = torch.rand(2, 6, 64, 2, generator=generator) * 30 - 10
     samples[0, 0, 0] = 1e12
     usable = torch.rand(2, 6, 64, generator=generator) > 0.3
-    usable[1, 2] = False
+    usable[1, 2] = False  # a query without any usable sample: its softmax is 0 / 0
     for mask in (None, usable):
         whole = span_attention(q, k, v, samples, 2, mask)
         assert whole.isfinite().all()
         with monkeypatch.context() as patch:
             patch.setitem(CELLS_AT_ONCE, "cpu", 5)
-            torch.testing.assert_close(
-                span_attention(q, k, v, samples, 2, mask), whole, rtol=1e-4, atol=1e-5
-            )
+            in_chunks = span_attention(q, k, v, samples, 2, mask)
+            torch.testing.assert_close(in_chunks, whole, rtol=1e-4, atol=1e-5)
 
 
 def test_weights_with_optimal_transport_are_refused_with_what_to_take_instead(tmp_path):
+    # LoFTR also publishes weights for optimal transport, which this entry reveals.
     surplus = {"coarse_matching.bin_score": torch.ones(())}
     file = PublicFile(
         "x.ckpt", "loftr", "loftr-outdoor", "loftr", Loftr, lambda state: wrapped(state | surplus)
@@ -76,9 +77,10 @@ def test_points_of_image_0_are_centres_of_cells_within_the_border_of_the_content
     padded = picture(97, 131, channels=1, multiple=matcher.spec.multiple, padding=(20, 40))
     whole = picture(97, 131, channels=1, multiple=matcher.spec.multiple)
     first, second = matcher.encode([padded]) + matcher.encode([whole])
-    assert first.mask.sum() == 13 * 17
+    assert first.mask.sum() == 13 * 17  # cells of 8 pixels that 97 x 131 pixels touch
     (matches,) = matcher.match([first], [second])
     assert len(matches) > 0
+    # An offset of half a cell would be four pixels.
     cells = (matches.points0 + 0.5) / 8
     np.testing.assert_array_equal(cells % 1, 0)
     border = matcher._network.border
@@ -92,6 +94,7 @@ def test_the_threshold_of_the_options_decides_which_cells_match(name, make):
     state = standin(name, make).state_dict()
     weights = SimpleNamespace(load=lambda slot: dict(state))
     counts = []
+    # A confidence is never above 1, so the second threshold leaves no match.
     for threshold in (0.0, 1.0):
         options = spec_of(name, "test").options(threshold=threshold)
         matcher = load_matcher(name, weights, options, Placement())

@@ -29,33 +29,30 @@ def test_keypoints_and_log_assignment_are_the_golden_ones():
     matcher = LightGlueMatcher(SPEC, sift_encoder(512, "cpu"), glue, Placement())
     encodings = matcher.encode([as_picture(golden[f"image{number}"].numpy()) for number in (0, 1)])
     for number, keypoints in enumerate(encodings):
-        parts = {"keypoints": keypoints.points + 0.25}  # OpenCV's offset
-        parts |= {
+        parts = {
+            "keypoints": keypoints.points + 0.25,  # OpenCV's offset
             "scales": keypoints.scales,
             "oris": keypoints.orientations,
             "descriptors": keypoints.descriptors,
         }
-        expected = np.hstack(
-            [golden[f"{part}{number}"].reshape(len(keypoints), -1) for part in parts]
-        )
-        own = np.hstack([part.reshape(len(keypoints), -1) for part in parts.values()])
+        count = len(keypoints)
+        expected = np.hstack([golden[f"{part}{number}"].reshape(count, -1) for part in parts])
+        own = np.hstack([part.reshape(count, -1) for part in parts.values()])
         off = np.abs(own[np.lexsort(own[:, :2].T)] - expected[np.lexsort(expected[:, :2].T)])
-        assert (off < 1e-5 + 1e-6 * np.abs(expected)).mean() > 0.998, (
-            "OpenCV 4.8 rounds some elsewhere"
-        )
+        is_close = off < 1e-5 + 1e-6 * np.abs(expected)
+        assert is_close.mean() > 0.998, "OpenCV 4.8 rounds some elsewhere"
         assert off.max() < 2e-3
-    names = {
-        "points": "keypoints",
-        "scales": "scales",
-        "orientations": "oris",
-        "descriptors": "descriptors",
-    }
+    # The network gets the golden keypoints themselves: those of two versions of OpenCV differ.
     given = []
     for number, each in enumerate(encodings):
-        parts = {
-            own: golden[f"{name}{number}"] - 0.25 * (own == "points") for own, name in names.items()
-        }
-        given.append([replace(each, **parts)])
+        exact = replace(
+            each,
+            points=golden[f"keypoints{number}"] - 0.25,
+            scales=golden[f"scales{number}"],
+            orientations=golden[f"oris{number}"],
+            descriptors=golden[f"descriptors{number}"],
+        )
+        given.append([exact])
     assert len(matcher.match(*given)[0]) == len(golden["matches"]) == 0
     # Down to -38. The golden values are up to 2e-4 from those in float64, so the tolerance is
     # relative, too.
@@ -67,18 +64,24 @@ def test_keypoints_and_log_assignment_are_the_golden_ones():
 def test_a_picture_matches_itself_turned_by_quarter_turns(turns):
     turned = as_picture(np.ascontiguousarray(np.rot90(PICTURE.pixels, turns)))
     matches = match_one(lightglue_matcher("sift_lightglue", Placement()), PICTURE, turned)
-    points, (width, height) = matches.points0, PICTURE.content
+    points = matches.points0
+    width, height = PICTURE.content
     for _ in range(turns):
-        points, width, height = np.stack([points[:, 1], width - 1 - points[:, 0]], 1), height, width
+        points = np.stack([points[:, 1], width - 1 - points[:, 0]], 1)
+        width, height = height, width
     offsets = matches.points1 - points
     assert len(matches) > 100
     assert np.mean(np.hypot(*offsets.T) < 1) > 0.9
+    # OpenCV's offset of a quarter pixel, uncorrected, turns with the picture: up to 0.5 apart.
     assert_allclose(np.median(offsets, axis=0), 0, atol=0.06)
 
 
 def test_a_pixel_has_one_keypoint_and_the_strongest_are_kept():
-    (few,), (many,) = (sift_encoder(features, "cpu")([PICTURE]) for features in (20, 500))
+    (few,) = sift_encoder(20, "cpu")([PICTURE])
+    (many,) = sift_encoder(500, "cpu")([PICTURE])
+    # OpenCV gives a point with two orientations twice.
     assert len(many) == len((many.points - 0.25).round().unique(dim=0)) > 100
     assert torch.cdist(few.points, many.points).min(dim=1).values.max() < 0.5
+    # Sixteen equal squares: OpenCV keeps all keypoints that are as strong as the weakest kept.
     equal = as_picture(np.tile(np.pad(np.full((6, 6), 255, np.uint8), 13), (4, 4)))
     assert len(sift_encoder(5, "cpu")([equal])[0]) == 5

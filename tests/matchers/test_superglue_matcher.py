@@ -17,9 +17,8 @@ from mkpc_kaggle.weights import WeightStore
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> WeightStore:
-    return store_of(
-        tmp_path_factory.mktemp("weights"), [file for file in FILES if file.matcher == "superglue"]
-    )
+    files = [file for file in FILES if file.matcher == "superglue"]
+    return store_of(tmp_path_factory.mktemp("weights"), files)
 
 
 def test_indoor_weights_are_another_slot_and_another_networks_checkpoint_is_refused(
@@ -29,13 +28,14 @@ def test_indoor_weights_are_another_slot_and_another_networks_checkpoint_is_refu
     assert superglue.SPEC.slots_for(indoor) == ("superpoint", "superglue-indoor")
     with pytest.raises(UserError, match="superglue-indoor"):
         superglue.load(store, indoor, Placement())
-    wrong = store_of(
-        tmp_path, [PublicFile("x.pth", "superglue", "superpoint", "superglue", SuperGlue)]
-    )
+    # Renamed files happen: SuperGlue's tensors in the place of SuperPoint's.
+    file = PublicFile("x.pth", "superglue", "superpoint", "superglue", SuperGlue)
+    wrong = store_of(tmp_path, [file])
     with pytest.raises(UserError, match="'superpoint' do not fit the network"):
         superglue.load(wrong, superglue.SuperGlueOptions(), Placement())
 
 
+# Exponentials of 300 overflow float32, so the plan must be computed with logarithms.
 @pytest.mark.parametrize("spread", [1, 300])
 @pytest.mark.parametrize("bin_score", [-50.0, 90.0])
 def test_a_plan_spreads_the_mass_of_each_keypoint_however_far_apart_the_scores_are(
@@ -43,14 +43,20 @@ def test_a_plan_spreads_the_mass_of_each_keypoint_however_far_apart_the_scores_a
 ):
     scores = spread * torch.randn(2, 60, 80, generator=torch.Generator().manual_seed(0))
     plan = log_optimal_transport(scores, torch.tensor(bin_score), 20).exp()
+    # A keypoint has a mass of 1, and the dustbin takes up to all 60 of the other image.
     masses = torch.tensor([*80 * [1.0], 60.0]).expand(2, -1)
     torch.testing.assert_close(plan.sum(dim=1), masses, rtol=1e-3, atol=1e-3)
 
 
 def test_the_threshold_is_strict_and_the_limit_keeps_the_strongest_in_order():
     scores = torch.zeros(16, 24)
-    scores[4, 4], scores[4, 19], scores[11, 4], scores[11, 19] = 0.25, 0.5, 0.75, 0.125
-    scores[12, 9], scores[9, 20] = 1, 1
+    scores[4, 4] = 0.25
+    scores[4, 19] = 0.5
+    scores[11, 4] = 0.75
+    scores[11, 19] = 0.125  # on the threshold
+    # Within the border of 4 pixels, but not of 3.
+    scores[12, 9] = 1
+    scores[9, 20] = 1
 
     def selected(**options):
         points, kept = SuperPoint(keypoint_threshold=0.125, **options).select_keypoints(scores)
@@ -58,12 +64,13 @@ def test_the_threshold_is_strict_and_the_limit_keeps_the_strongest_in_order():
         return points.tolist()
 
     in_rows = [[4, 4], [19, 4], [4, 11]]
+    # Keypoints are in the order of rows until the limit sorts them by score.
     assert selected() == selected(max_keypoints=3) == selected(max_keypoints=9) == in_rows
     assert selected(max_keypoints=2) == [[4, 11], [19, 4]]
     assert [20, 9] in selected(border=3)
 
 
-def test_a_batch_equals_its_images():
+def test_superpoint_finds_in_a_batch_what_it_finds_in_each_image():
     network = filled(SuperPoint(max_keypoints=20), "superpoint")
     batch = torch.rand(3, 1, 45, 62)
     for found, image in zip(network(batch), batch, strict=True):
@@ -72,5 +79,6 @@ def test_a_batch_equals_its_images():
         assert torch.equal(found.points, alone.points)
         assert len(alone.points) == 20
         assert (alone.scores.diff() <= 0).all()
+        # 45 x 62 pixels have 40 x 56 in whole cells of 8, of which the border of 4 is left out.
         assert ((alone.points >= 4) & (alone.points < torch.tensor([56 - 4, 40 - 4]))).all()
     assert network(batch[:0]) == []

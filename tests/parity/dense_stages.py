@@ -27,23 +27,26 @@ MODES = {"threshold_balanced": 0.05, "balanced": 1.0}
 
 
 def state_of(shapes, gains, default, prefix=""):
-    def gain(name):
+    state = {}
+    for name, shape in shapes.items():
+        # Of several prefixes that fit, the longest has the gain.
         fitting = [start for start in gains if name.startswith(start)]
-        return gains[max(fitting, key=len)] if fitting else default
-
-    return {prefix + name: seeded_tensor(name, shape, gain(name)) for name, shape in shapes.items()}
+        gain = gains[max(fitting, key=len)] if fitting else default
+        state[prefix + name] = seeded_tensor(name, shape, gain)
+    return state
 
 
 @cache
 def network_of(name):
-    shapes, gains = (
-        json.loads((GOLDEN / name / f"{file}.json").read_text()) for file in ("shapes", "gains")
-    )
+    shapes = json.loads((GOLDEN / name / "shapes.json").read_text())
+    gains = json.loads((GOLDEN / name / "gains.json").read_text())
     default = gains["default"]
     if name == "dkm":
         return ready(DKM(), state_of(shapes, gains["prefixes"], default))
+    # RoMa's checkpoint has no DINOv2, which is a file of its own.
     dinov2 = state_of(shapes["dinov2"], gains["dinov2"]["prefixes"], default, "dinov2.")
-    return ready(RoMa(), dinov2 | state_of(shapes["roma"], gains["roma"]["prefixes"], default))
+    roma = state_of(shapes["roma"], gains["roma"]["prefixes"], default)
+    return ready(RoMa(), dinov2 | roma)
 
 
 @cache
@@ -60,18 +63,18 @@ def computed(name, images, fine_images=(None, None), *, symmetric=True):
     """
     network = network_of(name)
     features = [network.encode(*versions) for versions in zip(images, fine_images, strict=True)]
-    correct, found = (
-        network.decoder.correct,
-        {stride: [] for stride in network.decoder.conv_refiner},
-    )
+    correct = network.decoder.correct
+    found = {stride: [] for stride in network.decoder.conv_refiner}
 
     def recording(estimate, query, support, stride):
-        found[str(stride)].append(correct(estimate, query, support, stride))
-        return found[str(stride)][-1]
+        corrected = correct(estimate, query, support, stride)
+        found[str(stride)].append(corrected)
+        return corrected
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(network.decoder, "correct", recording)
-        warps = network.match(*features) if symmetric else [dense_warp(*network.decoder(*features))]
+        one_way = () if symmetric else (dense_warp(*network.decoder(*features)),)
+        warps = one_way or network.match(*features)
     passes = ("",) if fine_images[0] is None else ("", "up_")
     values = {}
     for number, prefix in enumerate(passes):
@@ -79,10 +82,10 @@ def computed(name, images, fine_images=(None, None), *, symmetric=True):
             if stride == "16" and prefix:
                 continue  # the second pass begins at stride 8
             of_pass = estimates if stride == "16" else estimates[number :: len(passes)]
-            values[f"{prefix}flow{stride}"] = torch.cat([estimate.flow for estimate in of_pass])
-            values[f"{prefix}cert{stride}"] = torch.cat(
-                [estimate.certainty for estimate in of_pass]
-            )
+            flows = [estimate.flow for estimate in of_pass]
+            certainties = [estimate.certainty for estimate in of_pass]
+            values[f"{prefix}flow{stride}"] = torch.cat(flows)
+            values[f"{prefix}cert{stride}"] = torch.cat(certainties)
     for part in ("warp", "certainty"):
         values[f"{passes[-1]}{part}"] = torch.cat([getattr(warp, part) for warp in warps], 2)
     return values
@@ -92,19 +95,20 @@ def dense_stages(name, case, values):
     """Compare all values that a golden file has; of some batches it has the first item only."""
     golden = golden_arrays(name, case)
     shown = {key: value[: len(golden[key])] for key, value in values.items() if key in golden}
-    assert any(key.endswith("warp") for key in shown) and any(
-        key.endswith("certainty") for key in shown
-    )
+    # The result itself is among them: names that do not agree would compare nothing.
+    assert any(key.endswith("warp") for key in shown)
+    assert any(key.endswith("certainty") for key in shown)
     yield from compared(shown, golden, tolerances_of(name))
 
 
 def second_pass(values, *plain):
     """Return the second pass's values alone; ``plain`` are named without "up_" in the file."""
-    values = {name: value for name, value in values.items() if name.startswith("up_")}
-    return {
-        name.removeprefix("up_") if name[3:] in plain else name: value
-        for name, value in values.items()
-    }
+    found = {}
+    for name, value in values.items():
+        if name.startswith("up_"):
+            own = name.removeprefix("up_")
+            found[own if own in plain else name] = value
+    return found
 
 
 def batch_of(pixels):
@@ -112,7 +116,9 @@ def batch_of(pixels):
 
 
 def resized_by_pil(pixels, size):
-    resized = PIL.Image.fromarray(pixels.numpy()).resize(size[::-1], PIL.Image.Resampling.BICUBIC)
+    # The references resize with Pillow, whose bicubic filter is antialiased and torch's is not.
+    image = PIL.Image.fromarray(pixels.numpy())
+    resized = image.resize(size[::-1], PIL.Image.Resampling.BICUBIC)
     return torch.from_numpy(np.array(resized))
 
 
@@ -124,61 +130,61 @@ def images_of(name, *keys, size=None):
 
 
 def dkm_upsample():
-    pairs = ([f"{name}_{size}" for name in ("imA", "imB")] for size in ("96x128", "144x192"))
-    return computed("dkm", *(images_of("dkm", *keys) for keys in pairs))
+    coarse = images_of("dkm", "imA_96x128", "imB_96x128")
+    fine = images_of("dkm", "imA_144x192", "imB_144x192")
+    return computed("dkm", coarse, fine)
 
 
 def dkm_one_way():
-    coarse, fine = (images_of("dkm", "imA", "imB", size=size) for size in ((90, 118), (130, 170)))
-    return computed("dkm", coarse, symmetric=False) | computed("dkm", coarse, fine, symmetric=False)
+    # Sides that are no multiples of a stride: grids are rounded up.
+    coarse = images_of("dkm", "imA", "imB", size=(90, 118))
+    fine = images_of("dkm", "imA", "imB", size=(130, 170))
+    first = computed("dkm", coarse, symmetric=False)
+    return first | computed("dkm", coarse, fine, symmetric=False)
 
 
 def roma_upsample():
-    values = computed(
-        "roma", images_of("roma", "rsA", "rsB"), images_of("roma", "imA", "imB", size=(168, 168))
-    )
-    return second_pass(values, "warp", "certainty")
+    coarse = images_of("roma", "rsA", "rsB")
+    fine = images_of("roma", "imA", "imB", size=(168, 168))
+    return second_pass(computed("roma", coarse, fine), "warp", "certainty")
 
 
 def roma_one_way():
-    images, high = (images_of("roma", "imA", "imB", size=size) for size in ((112, 140), (150, 202)))
+    images = images_of("roma", "imA", "imB", size=(112, 140))
+    high = images_of("roma", "imA", "imB", size=(150, 202))
     values = computed("roma", images, symmetric=False)
     return values | second_pass(computed("roma", images, high, symmetric=False))
 
 
 def sampling_stages(name, suffix=""):
-    golden, main, tolerances = (
-        golden_arrays(name, "sampling"),
-        golden_arrays(name, "main"),
-        tolerances_of(name),
-    )
-    number, seed = (int(golden.get(key, value)) for key, value in (("num", 1000), ("seed", 1234)))
-    warp, certainty = main["warp"].reshape(-1, 4), main["certainty"].flatten()
+    golden = golden_arrays(name, "sampling")
+    main = golden_arrays(name, "main")
+    tolerances = tolerances_of(name)
+    number = int(golden.get("num", 1000))
+    seed = int(golden.get("seed", 1234))
+    warp = main["warp"].reshape(-1, 4)
+    certainty = main["certainty"].flatten()
     for mode, threshold in MODES.items():
-        index = sample_matches(
-            warp, certainty, number, threshold, torch.Generator().manual_seed(seed)
-        )
+        generator = torch.Generator().manual_seed(seed)
+        index = sample_matches(warp, certainty, number, threshold, generator)
         weights = certainty.masked_fill(certainty > threshold, 1)
         # Rounding orders near ties of the second draw. The set of its matches is 3.5e-4 from
         # another one, and rounding changes weights by 1e-5.
         got = in_order(torch.column_stack((warp[index], weights[index])))
-        expected = [golden[f"{mode}{suffix}__{part}"] for part in ("matches", "certainty")]
-        yield Stage(
-            f"{mode}__matches", got, in_order(torch.column_stack(expected)), Within(relative=1e-4)
-        )
+        parts = [golden[f"{mode}{suffix}__{part}"] for part in ("matches", "certainty")]
+        expected = in_order(torch.column_stack(parts))
+        yield Stage(f"{mode}__matches", got, expected, Within(relative=1e-4))
     weights = certainty.masked_fill(certainty > MODES["threshold_balanced"], 1)
-    yield Stage("good_index", draw(weights, golden["noise1"], 4 * number), golden["good_index"])
-    good, evenness = warp[golden["good_index"]], balancing_weights(golden["density"])
-    values = {
-        "good_matches": good,
-        "good_certainty": weights[golden["good_index"]],
-        "balance_p": evenness,
-    }
+    # Step by step, each from the golden values of the step before, so that near ties do not add up.
+    first = golden["good_index"]
+    yield Stage("good_index", draw(weights, golden["noise1"], 4 * number), first)
+    good = warp[first]
+    evenness = balancing_weights(golden["density"])
+    values = {"good_matches": good, "good_certainty": weights[first], "balance_p": evenness}
     values |= dict.fromkeys(("density", "density_exact"), density(good))
     yield from compared(values, golden, tolerances)
-    yield Stage(
-        "balanced_index", draw(evenness, golden["noise2"], number), golden["balanced_index"]
-    )
+    second = golden["balanced_index"]
+    yield Stage("balanced_index", draw(evenness, golden["noise2"], number), second)
 
 
 VALUES = {  # by network and golden file

@@ -23,8 +23,12 @@ from mkpc_kaggle.matchers.networks.pixels import resized
 from mkpc_kaggle.matchers.networks.placement import prepared
 from mkpc_kaggle.weights import load_into
 
-TOLERANCES = {"score_map": 1e-4, "keypoints": 1e-6, "dense_descriptors": 2e-4, "descriptors": 2e-4}
-TOLERANCES |= {
+# Above rounding in float32, and far below what another operation, order or padding changes.
+TOLERANCES = {
+    "score_map": 1e-4,
+    "keypoints": 1e-6,
+    "dense_descriptors": 2e-4,
+    "descriptors": 2e-4,
     "similarity": 1e-3,
     "scores": 1e-4,
     "matching_scores": 1e-4,
@@ -42,18 +46,14 @@ def whole(variant):
 
 @cache
 def matcher(variant):
-    descriptors, width = {"B128": (128, 256), "B": (256, 256), "L": (256, 512), "G": (256, 1024)}[
-        variant
-    ]
-    network = LomaMatcher(descriptors, width)
-    names = (
-        (parameter_name(n), t) for n, t in standin_state("loma", variant, not_prefix="_d").items()
-    )
-    fitting = {
-        name.removeprefix("matcher."): tensor
-        for name, tensor in names
-        if not re.match(UNUSED, name)
-    }
+    shapes = {"B128": (128, 256), "B": (256, 256), "L": (256, 512), "G": (256, 1024)}
+    network = LomaMatcher(*shapes[variant])
+    fitting = {}
+    # Without detector and descriptor ("_d..."), which take most of the memory.
+    for name, tensor in standin_state("loma", variant, not_prefix="_d").items():
+        own = parameter_name(name)
+        if not re.match(UNUSED, own):
+            fitting[own.removeprefix("matcher.")] = tensor
     load_into(network, fitting, what="golden")
     return prepared(network, Placement())
 
@@ -70,17 +70,21 @@ def matcher_values(matcher, image0, image1, threshold):
         matcher(image0, image1, threshold)
     similarity = matcher.similarity(calls[0][1], len(image0.points))
     scores = log_scores(similarity)
-    return {"similarity": similarity, "scores": scores.exp()} | assignment_values(
-        scores[0], threshold
-    )
+    values = {"similarity": similarity, "scores": scores.exp()}
+    return values | assignment_values(scores[0], threshold)
 
 
 def detector_stages(case):
-    golden, detector = golden_arrays("loma", f"detector_{case}"), whole(Variant.B128).detector
+    golden = golden_arrays("loma", f"detector_{case}")
+    detector = whole(Variant.B128).detector
     images = image_of(golden["image"])
-    logits, found = detector.logits(images), detector(images, golden["keypoints"].shape[-2])
-    values = {"score_map": logits, "dense_probs": logits.flatten(1).softmax(dim=1).view_as(logits)}
-    values["keypoints"] = torch.stack(found)
+    logits = detector.logits(images)
+    found = detector(images, golden["keypoints"].shape[-2])
+    values = {
+        "score_map": logits,
+        "dense_probs": logits.flatten(1).softmax(dim=1).view_as(logits),
+        "keypoints": torch.stack(found),
+    }
     yield from compared(values, golden, TOLERANCES)
 
 
@@ -90,7 +94,9 @@ def sampling_stages():
         found = select_keypoints(golden[f"{name}_map"], int(golden[f"{name}_asked"]))
         expected = golden[f"{name}_keypoints"]
         if name == "ties":
-            found, expected = in_order(found), in_order(expected)
+            # Equal scores: which comes first is the processor's affair.
+            found = in_order(found)
+            expected = in_order(expected)
         yield Stage(f"{name} points", found, expected, 1e-6)
 
 
@@ -106,13 +112,10 @@ def resize_stages():
                 wanted = detector_size(Size(source.shape[1], source.shape[0]), by_name)
             yield Stage(f"{name} size", torch.tensor(wanted[::-1]), torch.tensor(size))
             got = (resized(batch_of(source), size) * 255).round()
+            # The reference rounds to bytes: a value on a half may fall to either side.
             yield Stage(name, got, batch_of(expected).float(), 1)
-            yield Stage(
-                f"{name}, share",
-                (got != batch_of(expected)).float().mean(),
-                torch.tensor(0.0),
-                0.02,
-            )
+            differing = (got != batch_of(expected)).float().mean()
+            yield Stage(f"{name}, share", differing, torch.tensor(0.0), 0.02)
     exact = resized(batch_of(golden["detector_48"]), golden["detector_48"].shape[:2])
     yield Stage("detector_48_float", exact[0], golden["detector_48_float"], 1e-7)
     for width, height, long_side, *expected in golden["size_table"].tolist():
@@ -122,13 +125,14 @@ def resize_stages():
 
 def descriptor_stages(variant, case):
     """Yield descriptors at every third pixel of an image, and at its keypoints."""
-    golden, descriptor = golden_arrays("loma", f"descriptor_{case}"), whole(variant).descriptor
+    golden = golden_arrays("loma", f"descriptor_{case}")
+    descriptor = whole(variant).descriptor
     image = image_of(golden["image"])
     rows, columns = ((2 * torch.arange(side) + 1) / side - 1 for side in image.shape[2:])
     pixels = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), dim=2)[::3, ::3]
-    dense = descriptor(image, pixels.reshape(1, -1, 2)).mT.unflatten(2, pixels.shape[:2])[:, ::32]
+    dense = descriptor(image, pixels.reshape(1, -1, 2)).mT.unflatten(2, pixels.shape[:2])
     values = {
-        "dense_descriptors": dense,
+        "dense_descriptors": dense[:, ::32],  # as many channels as the file keeps
         "descriptors": descriptor(image, golden["keypoints"][None]),
     }
     yield from compared(values, golden, TOLERANCES)
@@ -138,16 +142,14 @@ def matcher_stages(case):
     golden = golden_arrays("loma", f"matcher_{case}")
     batched = golden["keypoints0"].ndim == 3
     first, *others = (round(threshold, 3) for threshold in golden["thresholds"].tolist())
+    variant = case.split("_")[0].upper()
     for pair in range(len(golden["keypoints0"]) if batched else 1):
-        arrays = {
-            n: value[pair] if batched and n != "thresholds" else value
-            for n, value in golden.items()
-        }
-        sides = [
-            LomaKeypoints(arrays[f"keypoints{side}"], arrays[f"descriptors{side}"])
-            for side in (0, 1)
-        ]
-        values = matcher_values(matcher(case.split("_")[0].upper()), *sides, first)
+        arrays = dict(golden)
+        if batched:
+            arrays = {name: value[pair] for name, value in golden.items() if name != "thresholds"}
+        image0 = LomaKeypoints(arrays["keypoints0"], arrays["descriptors0"])
+        image1 = LomaKeypoints(arrays["keypoints1"], arrays["descriptors1"])
+        values = matcher_values(matcher(variant), image0, image1, first)
         log_plan = values["scores"][0].log()
         for threshold in others:
             values |= assignment_values(log_plan, threshold, f"_threshold{threshold}")
@@ -156,9 +158,11 @@ def matcher_stages(case):
 
 
 def pipeline_stages(case, variant):
-    golden, network = golden_arrays("loma", case), whole(variant)
+    golden = golden_arrays("loma", case)
+    network = whole(variant)
     images = golden if "image0" in golden else golden_arrays("loma", "pipeline_b128")
-    side, number = int(golden["descriptor_side"]), int(golden["num_keypoints"])
+    side = int(golden["descriptor_side"])
+    number = int(golden["num_keypoints"])
     found = []
     for index in (0, 1):
         pixels = images[f"image{index}"]
@@ -178,15 +182,11 @@ def pipeline_stages(case, variant):
     matches = network.matcher(*found, threshold)
     points = []
     for index, of in enumerate((matches.index0, matches.index1)):
-        pixels = images[f"image{index}"]
-        points.append(
-            (found[index].points[of] + 1) / 2 * torch.tensor([pixels.shape[1], pixels.shape[0]])
-        )
-    mine, theirs = (
-        torch.cat(points, dim=1),
-        torch.cat([golden["points0"], golden["points1"]], dim=1),
-    )
-    yield Stage("points", mine, theirs, 1e-3)
+        height, width = images[f"image{index}"].shape[:2]
+        # The reference's points count from the corner of the image.
+        points.append((found[index].points[of] + 1) / 2 * torch.tensor([width, height]))
+    expected = torch.cat([golden["points0"], golden["points1"]], dim=1)
+    yield Stage("points", torch.cat(points, dim=1), expected, 1e-3)
 
 
 DETECTIONS = ("160x208", "157x203", "batch2_72x96")

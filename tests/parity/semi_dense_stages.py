@@ -24,6 +24,7 @@ from mkpc_kaggle.matchers.networks.fine_matching import cell_points
 from mkpc_kaggle.matchers.networks.loftr import Loftr
 from mkpc_kaggle.matchers.networks.quadtree import Quadtree
 
+# QuadTree's cells and ASpanFormer's positions depend on computed values: rounding adds up.
 LOFTR = {"coarse": 1e-4, "conf": 1e-4, "mconf": 1e-4, "mkpts1_f": 5e-4}
 QUADTREE = {"coarse": 1e-4, "conf": 2e-4, "mconf": 2e-4, "mkpts1_f": 2e-3}
 ASPANFORMER = {"coarse": 1e-4, "m?conf": Within(1e-6, relative=2e-3), "mkpts": 1e-2}
@@ -32,9 +33,8 @@ ASPANFORMER = {"coarse": 1e-4, "m?conf": Within(1e-6, relative=2e-3), "mkpts": 1
 def confidence_of(network, grid0, grid1, masks):
     """Return the full confidence matrix (1, L, S) of grids (1, h, w, 256)."""
     masks = masks or [torch.ones(grid.shape[:3], dtype=torch.bool) for grid in (grid0, grid1)]
-    features0, features1 = (
-        grid.flatten(0, 2) for grid in (grid0 * network.similarity_scale, grid1)
-    )
+    features0 = (grid0 * network.similarity_scale).flatten(0, 2)
+    features1 = grid1.flatten(0, 2)
     cells = Cells(features0, features1, *(mask.flatten() for mask in masks))
     return torch.cat(list(half_log_confidences(cells)))[None].mul(2).exp()
 
@@ -47,6 +47,7 @@ def computed(network, images, masks, scales, coarse_scales=None):
     """
     given = images, masks, scales, coarse_scales
     found = []
+    # The package matches one pair at a time; the references had batches.
     for number in range(len(images[0])):
         of_pair = (both and [each[number : number + 1] for each in both] for both in given)
         found.append(computed_of_pair(network, *of_pair))
@@ -60,13 +61,16 @@ def computed_of_pair(network, images, masks, scales, coarse_scales):
         matches = network.match(*maps, masks)
     transformed = zip(calls[0][1], maps, strict=True)
     grids = [tokens.reshape(len(tokens), *own.coarse.shape[2:], 256) for tokens, own in transformed]
-    coarse, confidence = matches.coarse, confidence_of(network, *grids, masks)
+    coarse = matches.coarse
+    confidence = confidence_of(network, *grids, masks)
     values = {
         "conf": confidence,
         "conf_rowmax": confidence.amax(2),
         "conf_colmax": confidence.amax(1),
+        "i_ids": coarse.index0,
+        "j_ids": coarse.index1,
+        "mconf": coarse.scores,
     }
-    values |= {"i_ids": coarse.index0, "j_ids": coarse.index1, "mconf": coarse.scores}
     for side, grid in enumerate(grids):
         points = cell_points((coarse.index0, coarse.index1)[side], grid.shape[2])
         values[f"coarse{side}"] = grid.flatten(1, 2)
@@ -103,6 +107,7 @@ def loftr_stages(network, case, tolerances):
     values = computed(standin(network), images, *masks_and_scales(golden))
     values["conf_rows"] = values["conf"][:, ::7]
     for side in ("coarse0", "coarse1"):
+        # The files keep every second or fourth channel.
         values[side] = values[side][..., :: 2 if case == "same_size" else 4]
     yield from compared(values, golden, tolerances)
 
@@ -114,12 +119,12 @@ class Evaluated(AspanFormer):
 
     def __init__(self, scale, coarsest, training=Training.OUTDOOR):
         super().__init__(training)
-        self.scale, self.coarsest = scale, coarsest
+        self.scale = scale
+        self.coarsest = coarsest
 
     def side(self, coarse, mask):
-        rows, columns = (
-            side // of for side, of in zip(coarse.shape[2:], self.coarsest, strict=True)
-        )
+        rows = coarse.shape[2] // self.coarsest[0]
+        columns = coarse.shape[3] // self.coarsest[1]
         return replace(super().side(coarse, mask), factor=(rows, columns))
 
     def position_scale(self, height, width):
@@ -161,17 +166,18 @@ def aspanformer_stages(case, make):
     masks, scales = masks_and_scales(golden)
     coarse_scales = None
     if masks is None:  # in online mode coarse points are reported before the last rescaling
-        shapes = [(o.shape, r.shape) for o, r in zip(originals, images, strict=True)]
-        coarse_scales, scales = (
-            scales,
-            [torch.tensor([[o[3] / r[3], o[2] / r[2]]]) for o, r in shapes],
-        )
+        coarse_scales = scales
+        scales = []
+        for original, resized in zip(originals, images, strict=True):
+            scale_x = original.shape[3] / resized.shape[3]
+            scale_y = original.shape[2] / resized.shape[2]
+            scales.append(torch.tensor([[scale_x, scale_y]]))
     network = ready(make(), aspanformer_state())
+    # Stand-in weights have low confidences; at the published threshold no match would be left.
     network.threshold = 1e-3
     values = computed(network, images, masks, scales, coarse_scales)
-    for side, (old, new) in enumerate(
-        (("conf_rowmax", "conf_row_max"), ("conf_colmax", "conf_col_max"))
-    ):
+    names = (("conf_rowmax", "conf_row_max"), ("conf_colmax", "conf_col_max"))
+    for side, (old, new) in enumerate(names):
         values[new] = values.pop(old)
         # Where all is padding the reference has about 1 / (L S), and this network nothing
         if masks:

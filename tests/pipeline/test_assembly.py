@@ -1,4 +1,4 @@
-"""Putting a run together: which units a recipe keeps here, and why others go or are refused."""
+"""Assembly of a run: the units that a recipe keeps, and the reasons of those that it leaves out."""
 
 import re
 from dataclasses import replace
@@ -38,7 +38,8 @@ def own(*licences):
 @pytest.mark.parametrize(
     "bad", [{"recipe": 5}, {"device": 0}, {"matchers": [1]}, {"matchers": {"own": object()}}]
 )
-def test_what_is_of_a_wrong_type_is_named(bad):
+def test_an_argument_of_a_wrong_type_is_named(bad):
+    # Such values fail deep in a worker otherwise, minutes later.
     for call in (TwoStageMatcher, partial(reconstruct, [])):
         with pytest.raises(TypeError, match=r"(recipe|device|matcher).* not |has no `spec`"):
             call(**({"recipe": "classical"} | bad))
@@ -54,10 +55,9 @@ def test_recipe_auto_leaves_out_the_units_whose_weights_are_missing():
 
 
 def test_a_named_recipe_without_its_weights_is_refused_with_the_file_names():
-    with pytest.raises(
-        UserError,
-        match=r"needs weights.*aliked-n16\.pth or .*--weights.*`mkpc weights fetch light --out",
-    ):
+    # The message ends with the command that gets the files.
+    says = r"needs weights.*aliked-n16\.pth or .*--weights.*`mkpc weights fetch light --out"
+    with pytest.raises(UserError, match=says):
         assemble("light")
     for recipe in ("permissive", "best"):
         with pytest.raises(UserError, match="needs weights"):
@@ -66,7 +66,8 @@ def test_a_named_recipe_without_its_weights_is_refused_with_the_file_names():
 
 @needs_weights
 def test_recipes_take_what_is_there_and_fallbacks_stand_in_for_the_rest():
-    auto, there = assemble("auto", weights=[WEIGHTS]), {"xfeat_lighterglue", "sift", "aliked"}
+    auto = assemble("auto", weights=[WEIGHTS])
+    there = {"xfeat_lighterglue", "sift", "aliked"}
     assert auto.recipe == load_recipe("auto").only(lambda unit: unit.matcher in there)
     assert set(auto.weight_files) == {"xfeat", "xfeat-lighterglue", "aliked-n16"}
     (xfeat,) = (unit for unit in auto.recipe.units if unit.matcher == "xfeat_lighterglue")
@@ -75,28 +76,29 @@ def test_recipes_take_what_is_there_and_fallbacks_stand_in_for_the_rest():
     assert light.recipe.matcher_names == ("sift", "aliked")
     command = "`mkpc weights fetch aliked-lightglue --out DIR` gets weights"
     assert light.left_out == (f"no weights: aliked_lightglue ({command})",)
-    assert [unit.stage for unit in light.recipe.units] == [
-        unit.stage for unit in load_recipe("light").units
-    ]
+    stages = [unit.stage for unit in light.recipe.units]
+    # ALIKED with mutual neighbours is the fallback of ALIKED + LightGlue, at the same stages.
+    assert stages == [unit.stage for unit in load_recipe("light").units]
     assert light.recipe == light.recipe.with_fallbacks(())
 
 
 @pytest.fixture
 def known_files(monkeypatch, tmp_path):
     """SuperGlue's, LoFTR's and DKM's weights are there, DKM's also for indoors, of unclear terms."""
-    files = [
-        WeightFile(name, -1, digest_of(name.encode()), licence, slot, "here")
-        for name, slot, licence in (
-            ("sp.pth", "superpoint", "Magic-Leap-noncommercial"),
-            ("sg.pth", "superglue-outdoor", "Magic-Leap-noncommercial"),
-            ("loftr.ckpt", "loftr-outdoor", "Apache-2.0"),
-            ("dkm.pth", "dkm-outdoor", "MIT"),
-            ("dkm_in.pth", "dkm-indoor", "unclear"),
-        )
+    known = [
+        ("sp.pth", "superpoint", "Magic-Leap-noncommercial"),
+        ("sg.pth", "superglue-outdoor", "Magic-Leap-noncommercial"),
+        ("loftr.ckpt", "loftr-outdoor", "Apache-2.0"),
+        ("dkm.pth", "dkm-outdoor", "MIT"),
+        ("dkm_in.pth", "dkm-indoor", "unclear"),
     ]
-    for file in files:
-        (tmp_path / file.name).write_bytes(file.name.encode())
-    others = [file for file in manifest() if file.slot not in {known.slot for known in files}]
+    files = []
+    for name, slot, licence in known:
+        data = name.encode()
+        (tmp_path / name).write_bytes(data)
+        files.append(WeightFile(name, -1, digest_of(data), licence, slot, "here"))
+    taken = {file.slot for file in files}
+    others = [file for file in manifest() if file.slot not in taken]
     monkeypatch.setattr(weight_store, "manifest", lambda: (*files, *others))
     monkeypatch.setattr(availability, "misfit", lambda *_: "")  # the files are only names
     return tmp_path
@@ -136,12 +138,12 @@ def test_a_fallback_stands_in_for_a_matcher_whose_weights_are_not_permitted_or_n
 ):
     recipe = Recipe((Unit(1, "superglue", 640, fallback="loftr"), Unit(2, "dkm", area="90x120")))
     every = assemble(recipe, weights=[known_files])
-    assert (every.recipe.matcher_names, every.left_out) == (("superglue", "dkm"), ())
+    assert every.recipe.matcher_names == ("superglue", "dkm")
+    assert every.left_out == ()
     some = assemble(recipe, weights=[known_files], licence=Licence.PERMISSIVE)
-    assert (some.recipe.matcher_names, some.left_out) == (
-        ("loftr", "dkm"),
-        ("weights not permitted: superglue",),
-    )
+    assert some.recipe.matcher_names == ("loftr", "dkm")
+    assert some.left_out == ("weights not permitted: superglue",)
+    # SuperGlue cannot run without SuperPoint.
     (known_files / "sp.pth").unlink()
     assert assemble(recipe, weights=[known_files]).recipe == some.recipe
 
@@ -152,7 +154,9 @@ def test_a_permissive_run_refuses_a_recipe_by_matcher_and_licence_and_says_what_
         TwoStageMatcher("imc2022", licence="permissive")
 
 
-def test_the_licence_of_the_file_counts_too(known_files):
+def test_a_file_whose_licence_is_unclear_is_refused_where_others_of_its_matcher_are_not(
+    known_files,
+):
     recipe = Recipe((Unit(1, "dkm", area="90x120"),), matchers={"dkm": {"training": "outdoor"}})
     assert assemble(recipe, weights=[known_files], licence=Licence.PERMISSIVE).left_out == ()
     indoors = replace(recipe, matchers={"dkm": {"training": "indoor"}})
@@ -161,8 +165,9 @@ def test_the_licence_of_the_file_counts_too(known_files):
         assemble(indoors, weights=[known_files], licence=Licence.PERMISSIVE)
 
 
-def test_the_licence_of_a_matcher_of_the_users_counts():
+def test_a_permissive_run_refuses_a_users_matcher_by_its_licence_tags():
     recipe = Recipe((Unit(1, "own", 480),))
+    # No tag is no claim: a user's own code needs no licence to be run by its author.
     for tags in ((), ("MIT",)):
         assert assemble(recipe, matchers=own(*tags), licence=Licence.PERMISSIVE).recipe == recipe
     with pytest.raises(UserError, match=r"own \(GPL\)"):
@@ -171,7 +176,7 @@ def test_the_licence_of_a_matcher_of_the_users_counts():
 
 @pytest.mark.filterwarnings("ignore:weights not verified")
 @pytest.mark.parametrize("name", ["xfeat_sparse_bnfolded.safetensors", "DKMv3_outdoor.pth"])
-def test_recipe_auto_passes_damaged_weights_over(tmp_path, name):
+def test_recipe_auto_leaves_out_matchers_with_damaged_weights(tmp_path, name):
     """The second has no digest in the manifest: it is found out when it is read."""
     (tmp_path / name).write_bytes(b"cut off")
     with pytest.warns(UserWarning, match=rf"(passed over|does without dkm): .*{name}"):
@@ -182,7 +187,7 @@ def test_recipe_auto_passes_damaged_weights_over(tmp_path, name):
 @pytest.fixture
 def misfits(monkeypatch, tmp_path):
     """A folder with files that have the manifest's digests, and that no network takes."""
-    warn_once.cache_clear()
+    warn_once.cache_clear()  # another test may have had the same warning
     names = {
         "aliked-n16": "a.safetensors",
         "superpoint": "p.safetensors",
@@ -246,6 +251,7 @@ def test_a_named_recipe_runs_the_fallback_of_weights_that_do_not_fit_or_goes_on_
 
 
 def test_a_recipe_without_a_unit_left_to_sweep_is_refused_with_the_reason(misfits):
+    # Without stage 1 there are no points from which a crop could come.
     recipe = Recipe((Unit(1, "aliked", 640), Unit(2, "sift", 640)), name="mine")
     says = (
         "recipe 'mine' has no unit left that can sweep all pairs: "
@@ -270,18 +276,19 @@ def submitted(demo, tmp_path, recipe, weights):
     (tmp_path / "own.toml").write_text(TWO_UNITS)
     output = tmp_path / "out" / "submission.csv"
     chosen = tmp_path / "own.toml" if recipe == "own" else recipe
-    options = ("--output", output, "--recipe", chosen, "--weights", weights, "--workers", 0)
-    status = run_command(
-        "submit", "--test-dir", demo.test_dir, *options, "--no-report", "--no-scenes"
-    )
+    options = ["--output", output, "--recipe", chosen, "--weights", weights, "--workers", 0]
+    options += ["--no-report", "--no-scenes"]
+    status = run_command("submit", "--test-dir", demo.test_dir, *options)
     return status, problems_of(output, demo.test_dir)
 
 
 @pytest.mark.filterwarnings("default:.* does without")  # the command prints it
 @pytest.mark.parametrize("recipe", ["auto", "own"])
 def test_one_checkpoint_that_does_not_fit_ends_no_run(misfits, demo, tmp_path, recipe, capsys):
+    # It did: a file with the manifest's digest was trusted to fit, and the run ended with status 2.
     assert submitted(demo, tmp_path, recipe, misfits) == (0, [])
     told = capsys.readouterr()
+    # Once for a run, not once for each worker.
     assert len(re.findall(DOES_WITHOUT, told.err)) == 1
     assert "left out, " in told.out
 
@@ -292,16 +299,15 @@ def test_match_does_without_a_checkpoint_that_does_not_fit_as_submit_does(
 ):
     (tmp_path / "own.toml").write_text(TWO_UNITS)
     images = sorted((demo.test_dir / "test_images").rglob("*.png"))[:2]
-    assert (
-        run_command("match", *images, "--recipe", tmp_path / "own.toml", "--weights", misfits) == 0
-    )
+    options = ["--recipe", tmp_path / "own.toml", "--weights", misfits]
+    assert run_command("match", *images, *options) == 0
     told = capsys.readouterr()
     assert re.search(DOES_WITHOUT, told.err)
     assert "1:sift@320" in told.out
     assert "aliked" not in told.out
 
 
-def test_a_matcher_that_only_a_worker_cannot_load_costs_its_units_and_is_told(
+def test_a_matcher_that_fails_to_load_in_a_worker_fails_its_units_and_is_reported_once(
     misfits, demo, tmp_path, monkeypatch, capsys
 ):
     """As with a damaged record, which shows when its numbers are read."""
@@ -314,17 +320,19 @@ def test_a_matcher_that_only_a_worker_cannot_load_costs_its_units_and_is_told(
 
 def points_keys(assembly: Assembly) -> tuple[str, ...]:
     """The keys of the units' points on a pair."""
-    keys, pair = Keys.of(assembly), Pair("p", "b", "0.png", "1.png")
+    keys = Keys.of(assembly)
+    pair = Pair("p", "b", "0.png", "1.png")
     images = tuple(BatchImage(name, name, Size(80, 60)) for name in ("0.png", "1.png"))
     stages = [unit.stage for unit in assembly.recipe.units]
     first = [keys.of_points(n, pair, images, []) for n, stage in enumerate(stages) if stage == 1]
     crops = keys.crops_of(pair, first)
-    return tuple(
-        keys.of_points(n, pair, images, crops * (stage - 1)) for n, stage in enumerate(stages)
-    )
+    found = []
+    for n, stage in enumerate(stages):
+        found.append(keys.of_points(n, pair, images, crops if stage == 2 else []))
+    return tuple(found)
 
 
-def test_a_units_digest_has_all_that_decides_its_points():
+def test_the_key_of_points_changes_with_every_setting_that_decides_them_and_no_other():
     plain = load_recipe("classical")
     first, second, third = plain.units
     units = [points_keys(assemble(plain))]
@@ -339,9 +347,10 @@ def test_a_units_digest_has_all_that_decides_its_points():
     ):
         units.append(points_keys(assemble(other)))
     assert units[0] == units[1] == units[2]
-    changed = [
-        [one != two for one, two in zip(units[0][: len(other)], other, strict=True)]
-        for other in units[3:]
-    ]
+    changed = []
+    for other in units[3:]:
+        both = zip(units[0][: len(other)], other, strict=True)
+        changed.append([one != two for one, two in both])
+    # Stage 1, stage 2, stage 1: fewer units of stage 1 and another eps change the crops alone.
     assert changed == [[False, True], [False, True, False], [True] * 3]
     assert not set(units[0]) & set(points_keys(assemble(plain, precision="bfloat16")))

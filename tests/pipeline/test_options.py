@@ -1,6 +1,4 @@
-"""Every option of a published method decides over results, so it is part of the settings of its
-units.
-"""
+"""Every option of a published method affects results, so it is part of the settings of its units."""
 
 from typing import Any
 
@@ -11,6 +9,8 @@ from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.recipe import Recipe, Unit, with_settings
 from mkpc_kaggle.weights import WeightStore
 
+# A key of points is made of these settings: an option that is missing from them would leave old
+# points in use. All values differ from the published defaults.
 OPTIONS = [
     ("sift", "ratio", 0.7),
     ("sift", "features", 500),
@@ -47,8 +47,10 @@ def settings_of(recipe: Recipe) -> dict[str, Any]:
 def test_an_option_changes_the_settings_of_its_unit(clean_environment, matcher, option, value):
     recipe = Recipe((Unit(1, matcher, 640),))
     changed = with_settings(recipe, {f"matchers.{matcher}.{option}": value})
-    former, new = settings_of(recipe), settings_of(changed)
+    former = settings_of(recipe)
+    new = settings_of(changed)
     assert former["options"][option] != new["options"][option] == value
+    # And nothing else: other results stay up to date.
     assert {**new, "options": former["options"]} == former
 
 
@@ -70,6 +72,7 @@ def test_an_option_changes_the_settings_of_its_unit(clean_environment, matcher, 
 def test_a_setting_of_a_later_step_changes_its_table_alone(key, value):
     recipe = Recipe((Unit(1, "sift", 640),)).with_scenes(True)
     table, _, name = key.partition(".")
-    former, new = recipe.table(), with_settings(recipe, {key: value}).table()
+    former = recipe.table()
+    new = with_settings(recipe, {key: value}).table()
     assert former[table].pop(name) != new[table].pop(name) == value
     assert former == new

@@ -1,6 +1,4 @@
-"""The two stages on pictures whose correspondence is known, with real and with misbehaving
-matchers.
-"""
+"""The two stages on pictures with known correspondences, by real and by misbehaving matchers."""
 
 import multiprocessing
 import warnings
@@ -47,13 +45,15 @@ def pair():
     """Two gray canvases with the same photograph, 230 x 180 and ``SCALE`` times that, elsewhere on
     each.
     """
+    # A part of each canvas: the rest is gray, so MKPC has something to crop.
     photograph = load_sample_image("china.jpg")[20:380, 60:520]
     canvases = []
     for (left, top), scale in ((CORNER0, 1), (CORNER1, SCALE)):
         size = (round(230 * scale), round(180 * scale))
         canvas = np.full((SIZE.height, SIZE.width, 3), 128, np.uint8)
-        shrunk = cv2.resize(photograph, size, interpolation=cv2.INTER_AREA)
-        canvas[top : top + size[1], left : left + size[0]] = shrunk
+        bottom = top + size[1]
+        right = left + size[0]
+        canvas[top:bottom, left:right] = cv2.resize(photograph, size, interpolation=cv2.INTER_AREA)
         canvases.append(canvas)
     return tuple(canvases)
 
@@ -68,6 +68,8 @@ def errors(matches):
 
 
 class Scripted:
+    """A matcher that finds nothing, or raises a given error."""
+
     spec = MatcherSpec("own")
 
     def __init__(self, error=None):
@@ -83,6 +85,8 @@ class Scripted:
 
 
 class CountingSift(SiftMatcher):
+    """SIFT that counts how often each part of an image is encoded."""
+
     def __init__(self):
         super().__init__(SiftOptions(), "cpu")
         self.seen = Counter()
@@ -102,16 +106,21 @@ def test_both_stages_give_matches_in_full_image_pixels():
     first, second = (result.matches for result in match.results)
     assert same(match.matches[match.in_stage(1)], first)
     assert same(match.matches[match.in_stage(2)], second)
-    sides = (second.points0, second.points1), (CORNER0, CORNER1), (1, SCALE)
-    for region, points, corner, scale in zip(match.regions, *sides, strict=True):
+    points = second.points0, second.points1
+    corners = CORNER0, CORNER1
+    for region, xy, corner, scale in zip(match.regions, points, corners, (1, SCALE), strict=True):
         assert region.reason == "cropped"
-        assert region.box.contains(points).all()
-        box = np.array([[region.box.left, region.box.top], [region.box.right, region.box.bottom]])
-        true = np.array([corner, corner + scale * np.array([230, 180])])
-        assert (abs(box - true) < 8 + 0.05 * 230 * scale).all(), "where the photograph is"
+        box = region.box
+        assert box.contains(xy).all()
+        # Keypoints lie a few pixels within the photograph, and CAE adds up to 5 % of its width.
+        tolerance = 8 + 0.05 * 230 * scale
+        assert np.abs(np.subtract((box.left, box.top), corner)).max() < tolerance
+        end = corner + scale * np.array([230, 180])
+        assert np.abs((box.right, box.bottom) - end).max() < tolerance
     assert len(match.inliers) == match.estimate.inlier_count > 100
     for result in match.results:
         assert len(result.matches) > 100
+        # A crop's offset or scale that is applied wrongly moves all points by pixels.
         assert np.median(errors(result.matches)) < 0.5
         assert np.mean(errors(result.matches) < 2) > 0.9
 
@@ -120,11 +129,12 @@ def test_a_prior_on_focal_lengths_goes_by_the_sizes_of_the_images_unless_the_cam
     focal = FocalConfig()
     matcher = TwoStageMatcher(replace(SIFT, focal=focal))
     K = np.array([[400.0, 0, 240], [0, 400, 180], [0, 0, 1]])
-    by_size = matcher(*pair())
     sizes = [Size(*image.shape[1::-1]) for image in pair()]
+    by_size = [FocalPrior.of_image(size) for size in sizes]
+    known = [FocalPrior(K, 0.0)] * 2  # a sigma of 0: certain
     for match, priors in [
-        (by_size, [FocalPrior.of_image(size) for size in sizes]),
-        (matcher(*pair(), intrinsics=(K, K)), [FocalPrior(K, 0.0)] * 2),
+        (matcher(*pair()), by_size),
+        (matcher(*pair(), intrinsics=(K, K)), known),
     ]:
         expected = estimate_with_prior(match.matches, tuple(priors), SIFT.magsac, focal)
         assert_array_equal(match.estimate.matrix, expected.matrix)
@@ -132,6 +142,7 @@ def test_a_prior_on_focal_lengths_goes_by_the_sizes_of_the_images_unless_the_cam
     with pytest.raises(ValueError, match="model E needs intrinsics"):
         matcher(*pair(), model=ModelKind.E)
     assert matcher(*pair(), model=ModelKind.E, intrinsics=(K, K)).estimate.ok
+    # A homography has no focal lengths, so no prior refines it.
     assert matcher(*pair(), model=ModelKind.H).estimate.magsac is None
 
 
@@ -152,21 +163,25 @@ def test_paths_arrays_and_images_give_the_same(tmp_path):
 
 
 def test_a_photograph_on_its_side_gives_the_same_matches_in_its_stored_pixels(tmp_path):
-    paths, views, orientations = [], [], (3, 8)
-    for number, (upright, orientation) in enumerate(zip(pair(), orientations, strict=True)):
-        paths.append(tmp_path / f"{number}.png")
-        stored = np.rot90(upright, -TURNS.get(orientation, 0))
-        cv2.imwrite(str(paths[-1]), stored[..., ::-1])
-        set_exif(paths[-1], orientation)
-        size = Size(*stored.shape[1::-1])
-        views.append(
-            View.fit(Box.whole(size), long_side=max(SIZE), turns=TURNS.get(orientation, 0))
-        )
-    found, expected = TwoStageMatcher(TWO_STAGES)(*paths), two_stage_match()
+    paths = []
+    views = []
+    # EXIF's orientations of a camera upside down and on its side.
+    for number, (upright, orientation) in enumerate(zip(pair(), (3, 8), strict=True)):
+        path = tmp_path / f"{number}.png"
+        turns = TURNS[orientation]
+        stored = np.rot90(upright, -turns)
+        cv2.imwrite(str(path), stored[..., ::-1])
+        set_exif(path, orientation)
+        paths.append(path)
+        whole = Box.whole(Size(*stored.shape[1::-1]))
+        views.append(View.fit(whole, long_side=max(SIZE), turns=turns))
+    found = TwoStageMatcher(TWO_STAGES)(*paths)
+    expected = two_stage_match()
     first, second = (
         Matches(views[0].from_image(m.points0), views[1].from_image(m.points1), m.scores)
         for m in (result.matches for result in found.results)
     )
+    # Stage 1 sees the same pixels. Crops of stored pixels may differ by a row or column.
     wanted = expected.results[0].matches
     assert_allclose([first.points0, first.points1], [wanted.points0, wanted.points1], atol=1e-3)
     assert len(second) > 100
@@ -186,6 +201,7 @@ def pipeline(recipe, matcher=None, **what):
 
 
 def test_results_are_in_the_order_of_the_recipe_whatever_was_run_first():
+    # MAGSAC's result depends on the order of the matches, and a resumed run has another one.
     recipe = Recipe((Unit(1, "sift", 480), Unit(2, "sift", 440), Unit(1, "sift", 360)))
     at_once = with_estimate(pipeline(recipe).match(works(), recipe.units)[0], recipe)
     runner, (work,) = pipeline(recipe), works()
@@ -198,7 +214,7 @@ def test_results_are_in_the_order_of_the_recipe_whatever_was_run_first():
     assert at_once.estimate.matrix.tobytes() == piecemeal.estimate.matrix.tobytes()
 
 
-def test_what_was_found_is_returned_when_no_unit_may_start():
+def test_results_so_far_are_returned_when_no_unit_may_start():
     (work,) = pipeline(TWO_STAGES).match(works(), TWO_STAGES.units, lambda unit: unit.stage == 1)
     assert [result.unit.stage for result in work.results] == [1]
     (none,) = pipeline(TWO_STAGES).match(works(), TWO_STAGES.units, lambda unit: False)
@@ -207,44 +223,48 @@ def test_what_was_found_is_returned_when_no_unit_may_start():
 
 
 def test_regions_come_from_stage_1_alone():
+    # Otherwise a repeated stage 2 would crop otherwise than the first one did.
     (work,) = pipeline(TWO_STAGES).match(works(), TWO_STAGES.units)
-    stray = Matches(*2 * [np.random.default_rng(0).uniform(0, 300, (999, 2))], np.ones(999))
+    points = np.random.default_rng(0).uniform(0, 300, (999, 2))
+    stray = Matches(points, points, np.ones(999))
     strayed = replace(work, results=(work.results[0], replace(work.results[1], matches=stray)))
     assert stages.with_regions(strayed, TWO_STAGES).regions == work.regions
 
 
 def test_a_minibatch_gives_what_pairs_give_alone():
-    alone, together = (
-        pipeline(TWO_STAGES, minibatch=size).match(works(3), TWO_STAGES.units) for size in (1, 4)
-    )
+    alone = pipeline(TWO_STAGES, minibatch=1).match(works(3), TWO_STAGES.units)
+    together = pipeline(TWO_STAGES, minibatch=4).match(works(3), TWO_STAGES.units)
     for single, other in zip(alone, together, strict=True):
         assert single.regions == other.regions
-        assert all(
-            same(a.matches, b.matches) for a, b in zip(single.results, other.results, strict=True)
-        )
+        for one, two in zip(single.results, other.results, strict=True):
+            assert same(one.matches, two.matches)
 
 
 def test_whole_images_are_encoded_once_and_crops_for_each_pair():
     sift = CountingSift()
     image0, image1 = works()[0].images
-    first, runner = PairMatch(images=(image0, image1)), pipeline(TWO_STAGES, sift)
+    first = PairMatch(images=(image0, image1))
+    runner = pipeline(TWO_STAGES, sift)
     done = runner.match([first, PairMatch(images=(image1, image0)), first], TWO_STAGES.units)
     runner.match(done, TWO_STAGES.units)  # a unit that a pair has had is not run again
     assert sift.seen.pop(Box.whole(SIZE)) == 2
+    # Two crops of each of three pairs.
     assert len(sift.seen) >= 2
     assert sift.seen.total() == 6
 
 
 def test_two_matchers_of_one_class_do_not_share_encodings_and_the_surest_matches_are_kept():
-    few, many = (SiftMatcher(SiftOptions(features=features), "cpu") for features in (30, 600))
+    few = SiftMatcher(SiftOptions(features=30), "cpu")
+    many = SiftMatcher(SiftOptions(features=600), "cpu")
     match = own(Unit(1, "few", 480), Unit(1, "many", 480), few=few, many=many)(*pair())
     alone = TwoStageMatcher(replace(SIFT, matchers={"sift": {"features": 600}}))(*pair())
     assert same(match.results[1].matches, alone.matches)
     assert same(own(Unit(1, "many", 480, 50), many=many)(*pair()).matches, alone.matches.best(50))
+    # OpenCV may keep one keypoint more, with a second orientation.
     assert 0 < len(match.results[0].matches) <= 31
 
 
-def test_a_matcher_that_finds_nothing_has_not_failed_and_the_one_that_answers_too_little_has():
+def test_no_matches_are_a_result_and_a_missing_answer_is_a_failure():
     class Short(Scripted):
         def match(self, encodings0, encodings1):
             return []
@@ -259,17 +279,16 @@ def test_a_matcher_that_finds_nothing_has_not_failed_and_the_one_that_answers_to
 
 
 @pytest.mark.parametrize("error", [RuntimeError("out of luck"), cv2.error("no"), ValueError()])
-def test_a_matcher_that_raises_costs_its_unit_and_the_run_goes_on(error):
-    match = own(
-        Unit(1, "bad", 480), Unit(1, "sift", 480), Unit(2, "bad", 480), bad=Scripted(error)
-    )(*pair())
+def test_a_matcher_that_raises_fails_its_units_and_the_others_run(error):
+    units = [Unit(1, "bad", 480), Unit(1, "sift", 480), Unit(2, "bad", 480)]
+    match = own(*units, bad=Scripted(error))(*pair())
     assert [bool(result.failure) for result in match.results] == [True, False, True]
     assert match.results[0].failure == f"{type(error).__name__}: {error}"
     assert len(match.results[0].matches) == 0
     assert match.estimate.ok
 
 
-def test_a_pair_at_which_a_matcher_raises_costs_the_others_of_its_minibatch_nothing():
+def test_if_a_matcher_raises_for_one_pair_the_others_of_its_minibatch_are_matched():
     def moody(brightness):
         if brightness == 12:
             raise RuntimeError("no mood")
@@ -279,13 +298,11 @@ def test_a_pair_at_which_a_matcher_raises_costs_the_others_of_its_minibatch_noth
     images = [Image(str(n), np.full((72, 80, 3), 10 + n, np.uint8)) for n in range(8)]
     runner = Pipeline(Recipe((SWEEP,)), {"rectified": matcher}.__getitem__, minibatch=8)
     done = runner.match([PairMatch(images=(each, each)) for each in images], [SWEEP])
-    assert [work.results[0].failure for work in done] == [
-        "",
-        "",
-        "RuntimeError: no mood",
-        *[""] * 5,
-    ]
-    assert [len(work.results[0].matches) > 0 for work in done] == [True, True, False, *[True] * 5]
+    failures = [work.results[0].failure for work in done]
+    assert failures == ["", "", "RuntimeError: no mood", *[""] * 5]
+    for work in done:
+        found = len(work.results[0].matches)
+        assert (found > 0) == (not work.results[0].failure)
 
 
 @pytest.mark.parametrize(
@@ -297,11 +314,13 @@ def test_a_pair_at_which_a_matcher_raises_costs_the_others_of_its_minibatch_noth
     ],
 )
 def test_memory_devices_and_interrupts_are_not_failures_of_a_matcher(error):
+    # A smaller minibatch, another device or the user decide about these, so they are raised.
     with pytest.raises(type(error), match=str(error)):
         own(Unit(1, "bad", 480), bad=Scripted(error))(*pair())
 
 
 def test_a_matcher_in_a_forked_child_says_that_it_was_forked():
+    # Threads of OpenCV and torch do not survive a fork: a child that matched waited for them forever.
     match = TwoStageMatcher(SIFT)
     match(*pair())
     child = multiprocessing.get_context("fork").Process(target=in_child, args=(match,))
@@ -327,6 +346,7 @@ def test_pairs_with_a_common_image_encode_it_once_and_match_as_single_pairs(tmp_
     pairs = [(paths[0], paths[1]), (paths[0], paths[2]), (paths[1], paths[2])]
     alone = [TwoStageMatcher(SIFT)(*pair) for pair in pairs]
 
+    # Three images in three pairs: six encodings without a cache.
     counting = CountingSift()
     found = list(TwoStageMatcher(SIFT, matchers={"sift": counting}).match_pairs(pairs))
     assert counting.seen.total() == 3
@@ -365,7 +385,8 @@ TWO_MATCHERS = Recipe((Unit(1, "good", 320), Unit(1, "bad", 320), Unit(2, "bad",
         (ValueError("no such layer"), "bad cannot be loaded: ValueError: no such layer"),
     ],
 )
-def test_a_matcher_that_cannot_be_loaded_costs_its_units_alone_and_is_tried_once(error, told):
+def test_a_matcher_that_cannot_be_loaded_fails_its_units_alone_and_is_tried_once(error, told):
+    # Loading may read gigabytes, so it is not repeated for each minibatch.
     load = Loader(bad=error)
     pipeline = Pipeline(TWO_MATCHERS, load, minibatch=2)
     pipeline.load()
@@ -382,6 +403,6 @@ def test_a_pipeline_without_a_matcher_that_can_be_loaded_raises_the_first_error(
 
 
 @pytest.mark.parametrize("error", [MemoryError("weights"), RuntimeError("CUDA error: no device")])
-def test_want_of_memory_or_of_a_device_is_not_the_matchers_fault(error):
+def test_errors_of_memory_or_of_a_device_while_loading_are_raised(error):
     with pytest.raises(type(error)):
         Pipeline(TWO_MATCHERS, Loader(bad=error)).load()
