@@ -1,4 +1,4 @@
-"""What tests share: a small rendered data set, and a matcher whose answers are known."""
+"""Shared fixtures: a small rendered data set, and a matcher whose answers are known."""
 
 import os
 from pathlib import Path
@@ -49,9 +49,7 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> DemoSet:
 
 @pytest.fixture(scope="session")
 def pairs(tmp_path_factory: pytest.TempPathFactory) -> "list[Pair]":
-    """Twelve pairs of flat images, which the matcher of :mod:`rectified` tells apart by their
-    brightness.
-    """
+    """Twelve pairs of flat images. The matcher of :mod:`rectified` knows them by their brightness."""
     from rectified import write_pairs
 
     return write_pairs(tmp_path_factory.mktemp("pairs"), 12)

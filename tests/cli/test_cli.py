@@ -20,20 +20,22 @@ from mkpc_kaggle.recipe import recipe_names
 
 
 def test_importing_the_package_is_cheap_and_geometry_and_weights_bring_no_torch():
+    # torch takes seconds to import, which `mkpc --help` and processes that estimate would all pay.
     code = (
         "import sys, pkgutil, importlib, mkpc_kaggle\n"
         "print([m for m in ('torch', 'cv2', 'numpy') if m in sys.modules])\n"
         "import mkpc_kaggle.geometry as g, mkpc_kaggle.weights\n"
-        "[importlib.import_module(f'{g.__name__}.{m.name}') for m in pkgutil.iter_modules(g.__path__)]\n"
+        "for module in pkgutil.iter_modules(g.__path__):\n"
+        "    importlib.import_module(f'{g.__name__}.{module.name}')\n"
         "print('torch' in sys.modules)"
     )
-    out = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True
-    ).stdout
-    assert out.split() == ["[]", "False"]
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["[]", "False"]
 
 
 def test_a_reader_that_leaves_ends_the_command_quietly():
+    # As `mkpc recipes | head -1`; 141 is the status that shells give to SIGPIPE.
     reader, writer = os.pipe()
     os.close(reader)
     with os.fdopen(writer, "wb") as out:
@@ -49,6 +51,7 @@ def test_recipes_are_listed_in_one_line_each(clean_environment, capsys):
     assert names == recipe_names()
     (classical,) = (line for line in lines if line.startswith("classical"))
     assert "1 of 1" in classical
+    # It was 100 lines of "at most 4096".
     assert max(map(len, lines)) <= 120
 
 
@@ -83,7 +86,9 @@ def test_help_is_wrapped_to_the_terminal(command, width, monkeypatch, capsys):
     assert [line for line in too_long if not re.match(r" +(mkpc|python) ", line)] == []
 
 
-def test_check_tells_good_from_bad(demo, tmp_path, capsys):
+def test_check_accepts_a_whole_submission_and_refuses_one_with_a_missing_row(
+    demo, tmp_path, capsys
+):
     ids = [pair.id for pair in read_test_side(demo.test_dir)]
     path = tmp_path / "submission.csv"
     write_submission(path, dict.fromkeys(ids, FALLBACK_FUNDAMENTAL))
@@ -107,6 +112,7 @@ def test_match_prints_f_and_draws_the_pair(demo, small_recipe, tmp_path, capsys)
     assert out[0] == "F, by recipe small; x1^T F x0 = 0 in pixels of the stored files:"
     F = np.array([[float(value) for value in line.split()] for line in out[1:4]])
     assert np.linalg.norm(F) == pytest.approx(1)
+    # Trailing blanks have been seen in this output.
     assert [line for line in out if line != line.rstrip()] == []
     assert "1:sift@320" in "\n".join(out)
     assert cv2.imread(str(figure)).shape[1] > 1000
@@ -116,6 +122,7 @@ def test_match_saves_arrays(demo, small_recipe, tmp_path):
     images = sorted((demo.train_dir / "courtyard" / "images").iterdir())[:2]
     saved = tmp_path / "new" / "pair.npz"
     assert run_command("match", *images, "--recipe", small_recipe, "--save", saved) == 0
+    # The command and the Python snippet of the README give the same F.
     match = TwoStageMatcher(str(small_recipe))(*images)
     with np.load(saved) as arrays:
         assert set(arrays) == {"points0", "points1", "scores", "inliers", "F"}
@@ -128,37 +135,32 @@ def test_match_saves_arrays(demo, small_recipe, tmp_path):
 
 def test_matplotlib_leaves_nothing_where_home_cannot_be_written(demo, small_recipe, tmp_path):
     (tmp_path / "tmp").mkdir()
-    home = {"HOME": "/proc/home", "XDG_CONFIG_HOME": "/proc/home", "TMPDIR": str(tmp_path / "tmp")}
-    command = [
-        sys.executable,
-        "-m",
-        "mkpc_kaggle",
-        *match_arguments(demo, small_recipe, tmp_path / "pair.png"),
-    ]
-    environment = {
-        name: value for name, value in os.environ.items() if name != "MPLCONFIGDIR"
-    } | home
-    subprocess.run(command, env=environment, check=True)
+    environment = dict(os.environ)
+    environment.pop("MPLCONFIGDIR", None)
+    # Nobody, not even root, makes a directory in /proc. Then matplotlib makes one in TMPDIR.
+    environment |= {"HOME": "/proc/home", "XDG_CONFIG_HOME": "/proc/home"}
+    environment["TMPDIR"] = str(tmp_path / "tmp")
+    arguments = match_arguments(demo, small_recipe, tmp_path / "pair.png")
+    subprocess.run([sys.executable, "-m", "mkpc_kaggle", *arguments], env=environment, check=True)
     assert list((tmp_path / "tmp").iterdir()) == []
 
 
 def test_match_draws_a_pair_that_has_nothing_in_common(clean_environment, tmp_path, capsys):
     cv2.imwrite(str(tmp_path / "a.png"), np.full((60, 90, 3), 127, np.uint8))
-    match, figure = ["match", *[tmp_path / "a.png"] * 2], tmp_path / "pair.png"
+    figure = tmp_path / "pair.png"
+    match = ["match", tmp_path / "a.png", tmp_path / "a.png"]
     assert run_command(*match, "--licence", "permissive", "--out", figure) == 0
     assert "this is the fallback: too few distinct matches" in capsys.readouterr().out
     assert figure.exists()
 
 
-def test_what_a_command_printed_has_been_flushed_when_it_ends_however_long_a_reader_takes(
-    monkeypatch,
-):
+def test_output_is_flushed_by_the_main_thread_before_a_command_ends(monkeypatch):
     class Flushed(StringIO):
         def flush(self) -> None:
             self.whole = self.getvalue(), threading.current_thread()
 
     monkeypatch.setattr(sys, "stdout", stream := Flushed())
     assert run_command("recipes") == 0
-    # A thread would not be waited for
+    # The process ends without waiting for its printing thread, and a slow reader would miss the end.
     assert stream.whole == (stream.getvalue(), threading.main_thread())
     assert "auto " in stream.getvalue()

@@ -1,4 +1,4 @@
-"""What each command refuses: in one line, with status 2, before any work, and without a change to a
+"""Refusals of each command: in one line, with status 2, before any work, and without a change to a
 file.
 """
 
@@ -13,6 +13,7 @@ from mkpc_kaggle.demo import write
 
 SUBMIT = "submit --test-dir demo/test"
 MATCH = "match x.png y.png --recipe classical --out"
+# The message begins with the option or the file, and says what to give instead.
 REFUSALS = [
     ("submit --test-dir nowhere", "test.csv: no such file"),
     (f"{SUBMIT} --recipe imaginary", "unknown recipe 'imaginary'; known: "),
@@ -78,7 +79,7 @@ REFUSALS = [
 
 
 @pytest.mark.parametrize(("command", "told"), REFUSALS)
-def test_what_cannot_be_done_is_refused_in_one_line_before_any_work(
+def test_a_command_that_cannot_work_is_refused_in_one_line_before_any_work(
     command, told, demo, small_recipe, clean_environment, tmp_path, monkeypatch, capsys
 ):
     shutil.copytree(demo.test_dir, "demo/test")
@@ -90,14 +91,17 @@ def test_what_cannot_be_done_is_refused_in_one_line_before_any_work(
         "users/train/a.csv",
         "truth/test_truth.csv",
     )
+    # No command may write over any of them, also through a symbolic or a hard link.
     for name in inputs:
         Path(name).parent.mkdir(parents=True, exist_ok=True)
         Path(name).write_text("precious")
     Path("link.csv").symlink_to("demo/test/test.csv")
     Path("hard.csv").hardlink_to("demo/test/test.csv")
-    monkeypatch.setattr(
-        write, "build_world", lambda *_, **__: pytest.fail("rendered before it was refused")
-    )
+
+    def too_late(*_: object, **__: object) -> None:
+        pytest.fail("rendered before it was refused")
+
+    monkeypatch.setattr(write, "build_world", too_late)
     before = contents(tmp_path)
     assert main(command.split()) == 2
     captured = capsys.readouterr()

@@ -26,10 +26,10 @@ def command(test_dir: Path, output: Path, recipe: Path | str, *more: str) -> lis
 
 
 def make(*paths: Path | str) -> subprocess.CompletedProcess[str]:
-    environment = {name: value for name, value in os.environ.items() if name != "MKPC_WEIGHTS"}
-    return subprocess.run(
-        command(*paths), capture_output=True, text=True, env=environment, check=False
-    )
+    environment = dict(os.environ)
+    environment.pop("MKPC_WEIGHTS", None)  # of the person who runs the tests
+    done = command(*paths)
+    return subprocess.run(done, capture_output=True, text=True, env=environment, check=False)
 
 
 @pytest.fixture(scope="module")
@@ -44,18 +44,8 @@ def made(
 
 def submit(test_dir: Path, output: Path, recipe: Path, *more: str) -> int:
     """Submit in this process."""
-    options = (
-        "--test-dir",
-        test_dir,
-        "--output",
-        output,
-        "--recipe",
-        recipe,
-        "--no-report",
-        "--workers",
-        0,
-    )
-    return run_command("submit", *options, *more)
+    paths = ["--test-dir", test_dir, "--output", output, "--recipe", recipe]
+    return run_command("submit", *paths, "--no-report", "--workers", 0, *more)
 
 
 def test_a_submission_is_made_resumed_and_made_again_from_nothing(demo, small_recipe, made, capsys):
@@ -67,11 +57,12 @@ def test_a_submission_is_made_resumed_and_made_again_from_nothing(demo, small_re
     assert "8 of them from earlier runs" in capsys.readouterr().out
     assert output.read_bytes() == written
     assert submit(demo.test_dir, output, small_recipe, "--fresh") == 0
+    # Two units on each of eight pairs.
     assert "16 units run" in capsys.readouterr().out
     assert output.read_bytes() == written
 
 
-def test_a_killed_run_goes_on_and_ends_with_the_bytes_of_an_undisturbed_one(
+def test_a_killed_run_resumes_and_ends_with_the_bytes_of_an_undisturbed_one(
     demo, small_recipe, made, tmp_path
 ):
     output = tmp_path / "submission.csv"
@@ -88,20 +79,23 @@ def test_a_killed_run_goes_on_and_ends_with_the_bytes_of_an_undisturbed_one(
     assert output.read_bytes() == made[1]
 
 
-def test_a_limit_that_is_over_at_the_start_leaves_a_whole_file_and_is_told(demo, tmp_path):
+def test_a_limit_that_is_over_at_the_start_leaves_a_whole_file_and_a_message(demo, tmp_path):
+    # Imports alone take longer than 0.1 s.
     made = make(demo.test_dir, tmp_path / "submission.csv", "classical", "--time-limit", "0.1s")
     assert made.returncode == 1
     assert "the time limit passed before the first results were written" in made.stderr
     assert problems_of(tmp_path / "submission.csv", demo.test_dir) == []
 
 
+# Without a file, with an empty one, and with the rows of another competition.
 OF_ANOTHER = "sample_id,fundamental_matrix\nof another test set,0 0 0 0 0 0 0 0 0\n"
 
 
 @pytest.mark.parametrize("former", [None, "", OF_ANOTHER])
-def test_a_whole_submission_is_there_before_weights_and_devices_are_looked_at(
+def test_a_whole_submission_exists_before_weights_and_devices_are_searched(
     demo, tmp_path, monkeypatch, former
 ):
+    # Weights on a slow disk, or a GPU's driver that hangs, must not cost the file.
     def look(*_, **__):
         assert problems_of(output, demo.test_dir) == []
         raise UserError("the disk with the weights cannot be read")
@@ -122,6 +116,7 @@ def test_a_whole_submission_is_there_before_weights_and_devices_are_looked_at(
 def test_a_signal_ends_the_reading_of_weights(
     demo, tmp_path, clean_environment, monkeypatch, number, command, capsys
 ):
+    # Digesting 3 GB of weights takes long on a slow disk, and Ctrl-C must work meanwhile.
     def read_for_long(path):
         os.kill(os.getpid(), number)
         for _ in range(100):
@@ -130,12 +125,11 @@ def test_a_signal_ends_the_reading_of_weights(
 
     monkeypatch.setattr("mkpc_kaggle.weights.store.digest_of", read_for_long)
     (tmp_path / "weights").mkdir()
-    # Whose size the manifest does not have
+    # The manifest does not have its size, so it must be digested.
     (tmp_path / "weights" / "superglue_outdoor.pth").touch()
-    status = run_command(
-        *command.format(test=demo.test_dir).split(), "--recipe", "auto", "--weights", "weights"
-    )
-    assert status == 128 + number
+    words = command.format(test=demo.test_dir).split()
+    status = run_command(*words, "--recipe", "auto", "--weights", "weights")
+    assert status == 128 + number  # as shells report a signal
     assert capsys.readouterr().err == "error: interrupted\n"
     if command.startswith("submit"):
         assert problems_of(tmp_path / "submission.csv", demo.test_dir) == []
@@ -154,14 +148,12 @@ def test_the_light_recipe_with_genuine_weights_matches_photographs_with_aliked_a
     done = make(tmp_path, output, "light", "--no-report", "--weights", str(GENUINE))
     assert done.returncode == 0, done.stderr
     assert "2 of 2 pairs have an F" in done.stdout
-    assert not re.search(
-        "does without|units that failed|pairs with the fallback row", done.stdout + done.stderr
-    )
+    faults = "does without|units that failed|pairs with the fallback row"
+    assert not re.search(faults, done.stdout + done.stderr)
     with Store.read(tmp_path / "submission.work") as store:
-        units = [
-            {unit.unit: unit.matches for unit in record.units} for record in read_records(store)
-        ]
-    for each in units:
-        counts = [count for unit, count in each.items() if ":aliked_lightglue@" in unit]
+        records = list(read_records(store))
+    for record in records:
+        counts = [unit.matches for unit in record.units if ":aliked_lightglue@" in unit.unit]
         assert counts
+        # Networks with wrong weights find a handful.
         assert min(counts) > 100

@@ -28,16 +28,15 @@ SETTINGS = {  # as a user would edit them
 
 
 def figures_of(notebook: nbformat.NotebookNode) -> int:
-    return sum(
-        cell.source.count("show(figures.") for cell in notebook.cells if cell.cell_type == "code"
-    )
+    code = [cell.source for cell in notebook.cells if cell.cell_type == "code"]
+    return sum(source.count("show(figures.") for source in code)
 
 
 @needs_namespaces
 def test_the_tour_runs_on_a_train_side_without_a_network(demo, tmp_path):
-    recipe = write_recipe(
-        tmp_path / "tour.toml", (1, 480), (2, 640), more="[magsac]\npermutations = 1\n[scene]"
-    )
+    # Two small units and one permutation: the figures are the same in number.
+    more = "[magsac]\npermutations = 1\n[scene]"
+    recipe = write_recipe(tmp_path / "tour.toml", (1, 480), (2, 640), more=more)
     variables = environment(
         MKPC_RECIPE=str(recipe),
         PYTHONPATH=PATHS,
@@ -53,9 +52,8 @@ def test_the_tour_runs_on_a_train_side_without_a_network(demo, tmp_path):
 
 @needs_namespaces
 def test_the_tour_takes_two_photographs_without_truth(demo, tmp_path):
-    recipe = write_recipe(
-        tmp_path / "tour.toml", (1, 480), (2, 640), more="[magsac]\npermutations = 1"
-    )
+    more = "[magsac]\npermutations = 1"
+    recipe = write_recipe(tmp_path / "tour.toml", (1, 480), (2, 640), more=more)
     photographs = sorted((demo.train_dir / "courtyard" / "images").iterdir())[:2]
     variables = environment(
         MKPC_RECIPE=str(recipe), PYTHONPATH=PATHS, MKPC_PHOTOS=",".join(map(str, photographs))
@@ -69,6 +67,7 @@ def test_the_tour_is_committed_with_all_its_pictures_and_nothing_else():
     tour = nbformat.read(TOUR, as_version=4)
     assert with_pictures_alone(tour) == tour
     assert pictures(tour) == figures_of(tour) == len(outputs(tour))
+    # Readers see the pictures without running it, and a clone stays small.
     assert 500_000 < TOUR.stat().st_size < 1_500_000
 
 
@@ -82,6 +81,7 @@ def test_without_a_train_side_recipes_are_compared_on_the_demo_set(small_recipe,
         cell.source = cell.source.replace(former, new)
     path = tmp_path / "validate.ipynb"
     nbformat.write(notebook, path)
+    # The demo set must come from the notebook itself.
     known = {name: value for name, value in environment().items() if name != "MKPC_TRAIN_DIR"}
     known |= {"PYTHONPATH": PATHS, "TMPDIR": str(tmp_path)}
     executed = execute(path, tmp_path / "executed.ipynb", sys.executable, tmp_path, known)

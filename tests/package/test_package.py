@@ -1,4 +1,4 @@
-"""``mkpc package``: what lies in the two folders, and what must not."""
+"""``mkpc package``: the content of the two folders, and files that must not be in them."""
 
 import io
 import json
@@ -33,7 +33,9 @@ def checkpoint(number: float) -> bytes:
     return stream.getvalue()
 
 
-DATA, OTHER = checkpoint(1), checkpoint(2)
+DATA = checkpoint(1)
+OTHER = checkpoint(2)
+# One file that may be published, one that may not, and one that is missing.
 FILES = (
     line("free.pt", DATA, slot="free"),
     replace(line("kept.pt", OTHER, slot="kept"), licence="Magic-Leap-noncommercial"),
@@ -51,7 +53,9 @@ def own_manifest(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 
 def request_of(directory: Path, wheels: Path) -> Request:
-    weights = put(put(directory / "weights", "another_name.pt", DATA), "kept.pt", OTHER)
+    # Renamed files are packaged under the manifest's name.
+    weights = put(directory / "weights", "another_name.pt", DATA)
+    put(weights, "kept.pt", OTHER)
     return Request(directory / "out", "someone", (weights,), (python_version(),), wheels)
 
 
@@ -62,7 +66,7 @@ def wanted(tmp_path: Path, wheels: Path) -> Request:
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory, wheels: Path) -> tuple[Path, Package]:
-    """The folder of a package that tests only read, and what it has."""
+    """The folder of a package that tests only read, and its list of files."""
     request = request_of(tmp_path_factory.mktemp("package"), wheels)
     return request.out, make_package(request)
 
@@ -73,28 +77,24 @@ def out(made: tuple[Path, Package]) -> Path:
 
 
 def metadata_of(out: Path) -> tuple[dict[str, Any], dict[str, Any]]:
-    dataset, kernel = (
-        (out / name / f"{name}-metadata.json").read_text() for name in ("dataset", "kernel")
-    )
+    dataset = (out / "dataset" / "dataset-metadata.json").read_text()
+    kernel = (out / "kernel" / "kernel-metadata.json").read_text()
     return json.loads(dataset), json.loads(kernel)
 
 
-def test_a_licence_tag_leads_to_no_text_but_those_of_licences():
+def test_a_licence_tag_names_a_text_of_licences_and_no_other_file():
+    # Tags come from a manifest that anybody may have written; the dataset may be public.
     checkout = find_checkout()
     assert licence_text(checkout, "MIT") == checkout / "licences" / "MIT.txt"
     assert licence_text(checkout, "Apache-2.0") == checkout / "LICENSE"
-    for tag in (
-        "../requirements-dev",
-        "../licences/MIT",
-        str(checkout / "licences" / "MIT"),
-        "",
-        "no-such",
-    ):
+    absolute = str(checkout / "licences" / "MIT")
+    for tag in ("../requirements-dev", "../licences/MIT", absolute, "", "no-such"):
         assert licence_text(checkout, tag) is None
 
 
 def test_the_dataset_holds_wheels_weights_and_their_licences(made):
-    (out, package), dataset = made, made[0] / "dataset"
+    out, package = made
+    dataset = out / "dataset"
     names = {path.name for path in dataset.iterdir()}
     assert {"LICENSE", "README.md", "MIT.txt", "weights_manifest.txt", "requirements.txt"} <= names
     wheels = {name.partition("-")[0] for name in names if name.endswith(".whl")}
@@ -103,7 +103,7 @@ def test_the_dataset_holds_wheels_weights_and_their_licences(made):
     assert not [name for name in names if name.startswith("kept.pt")]
     assert [item.name for item in package.restricted] == ["kept.pt"]
     assert "MIT" in metadata_of(out)[0]["description"]
-    # Two datasets can be told apart
+    # The version: two attached datasets differ at a glance.
     assert metadata_of(out)[0]["title"] == f"MKPC Kaggle {__version__}"
     assert {item.name: item.licence for item in package.dataset}["free.pt.safetensors"] == "MIT"
 
@@ -112,25 +112,17 @@ def test_weights_survive_the_upload_and_are_held_against_the_datasets_manifest(
     out, tmp_path, capsys
 ):
     dataset = out / "dataset"
+    # Kaggle unpacks archives, and a torch checkpoint is one.
     assert not [path for path in dataset.iterdir() if path.suffix in UNPACKED]
     mount = tmp_path / "input" / "datasets" / "someone" / "mkpc-kaggle"
     upload(dataset, mount)
     (told,) = read_manifest(mount / "weights_manifest.txt")
     data = (mount / "free.pt.safetensors").read_bytes()
-    assert (told.name, told.size, told.digest) == (
-        "free.pt.safetensors",
-        len(data),
-        digest_of(data),
-    )
+    assert told.name == "free.pt.safetensors"
+    assert (told.size, told.digest) == (len(data), digest_of(data))
     assert (told.licence, told.slot) == ("MIT", "free")
-    verify = [
-        "weights",
-        "verify",
-        "--weights",
-        tmp_path / "input",
-        "--manifest",
-        mount / "weights_manifest.txt",
-    ]
+    verify = ["weights", "verify", "--weights", tmp_path / "input"]
+    verify += ["--manifest", mount / "weights_manifest.txt"]
     assert run_command(*verify) == 0
     assert "1 files, 0 refused, 0 missing" in capsys.readouterr().out
     (mount / "free.pt.safetensors").unlink()
@@ -138,27 +130,19 @@ def test_weights_survive_the_upload_and_are_held_against_the_datasets_manifest(
     assert "missing" in capsys.readouterr().out
 
 
-def test_what_the_image_has_is_used_where_it_satisfies_even_without_a_wheel_for_its_python(
+def test_a_package_of_the_image_stays_if_its_version_fits_even_without_a_wheel_for_its_python(
     out, tmp_path
 ):
     dataset = out / "dataset"
     lines = (dataset / "requirements.txt").read_text().splitlines()
     assert lines[0].startswith("mkpc-kaggle==")
-    assert not [line for line in lines[1:] if "==" in line], "ranges: what satisfies them stays"
+    assert not [line for line in lines[1:] if "==" in line], "ranges, not pins"
     assert "kornia>=0.9" in lines
+    # kornia is installed here, so its wheel is not needed.
     for path in dataset.glob("[!k]*.whl"):
         (tmp_path / path.name).symlink_to(path)
-    dry = [
-        sys.executable,
-        "-m",
-        "pip",
-        "install",
-        "--dry-run",
-        "--no-index",
-        "--no-deps",
-        "--find-links",
-    ]
-    command = [*dry, str(tmp_path), *lines[1:]]
+    command = [sys.executable, "-m", "pip", "install", "--dry-run", "--no-index", "--no-deps"]
+    command += ["--find-links", str(tmp_path), *lines[1:]]
     done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment())
     assert done.returncode == 0, done.stderr
 
@@ -167,11 +151,13 @@ def test_the_kernel_runs_on_a_gpu_without_internet_on_the_latest_image_or_one_by
     out, wanted
 ):
     dataset, kernel = metadata_of(out)
-    assert (kernel["docker_image_pinning_type"], kernel.get("docker_image", "")) == ("latest", "")
+    assert kernel["docker_image_pinning_type"] == "latest"
+    assert not kernel.get("docker_image")
     image = f"gcr.io/kaggle/python@sha256:{'0a' * 32}"
     make_package(replace(wanted, image=image))
     pinned = metadata_of(wanted.out)[1]
-    assert (pinned["docker_image_pinning_type"], pinned["docker_image"]) == ("original", image)
+    assert pinned["docker_image_pinning_type"] == "original"
+    assert pinned["docker_image"] == image
     # Kaggle's limits
     assert 6 <= len(dataset["title"]) <= 50 and 20 <= len(dataset["subtitle"]) <= 80
     assert (kernel["enable_gpu"], kernel["enable_internet"]) == (True, False)
@@ -183,6 +169,7 @@ def test_the_kernel_runs_on_a_gpu_without_internet_on_the_latest_image_or_one_by
 
 
 def test_without_weights_the_notebook_asks_for_no_gpu(wanted):
+    # Hours of GPU are limited, and RootSIFT uses none.
     make_package(replace(wanted, weights=()))
     kernel = metadata_of(wanted.out)[1]
     assert kernel["enable_gpu"] is False
@@ -199,7 +186,8 @@ def test_matchers_may_come_from_kaggle_models(wanted):
     assert kernel["enable_gpu"] is True
 
 
-def test_the_page_of_the_dataset_has_no_links_that_lead_nowhere(out):
+def test_the_page_of_the_dataset_has_no_relative_links(out):
+    # It was the README, with broken pictures and links.
     page = (out / "dataset" / "README.md").read_text(encoding="utf-8")
     assert "Licences of the weights: MIT." in page
     assert "](" not in page
@@ -211,16 +199,16 @@ def test_the_same_request_gives_the_same_bytes_and_leaves_files_alone(wanted, ou
     former = {path: path.stat().st_mtime_ns for path in wanted.out.rglob("*") if path.is_file()}
     (wanted.out / "dataset" / "free.pt.safetensors").write_bytes(b"broken off")
     make_package(wanted)
-    written = [
-        path.name for path, modified in former.items() if path.stat().st_mtime_ns != modified
-    ]
+    written = []
+    # Weights are gigabytes: a file with the right bytes is not written again.
+    for path, modified in former.items():
+        if path.stat().st_mtime_ns != modified:
+            written.append(path.name)
     assert written == ["free.pt.safetensors"]
     assert contents(wanted.out) == contents(out)
 
 
-def test_a_private_package_has_all_weights_and_a_public_one_refuses_to_be_laid_over_it(
-    wanted, capsys
-):
+def test_a_private_package_has_all_weights_and_a_public_one_is_not_written_over_it(wanted, capsys):
     arguments = ["package", "--owner", "someone", "--out", wanted.out, "--python", python_version()]
     arguments += ["--wheels", wanted.wheels, "--weights", wanted.weights[0]]
     assert run_command(*arguments, "--private") == 0
@@ -239,16 +227,19 @@ def test_a_private_package_has_all_weights_and_a_public_one_refuses_to_be_laid_o
 def test_bad_requests_are_refused_before_anything_is_written(wanted, tmp_path):
     empty = tmp_path / "empty"
     empty.mkdir()
+    other_image = "python@sha256:12"
+    damaged = put(tmp_path / "damaged", "free.pt", DATA[:-1])
+    long = f"3.{'9' * 100}"
     bad = {
         "cannot be a Kaggle user name": replace(wanted, owner="some one"),
         "give latest, original, or an image as NAME@sha256:DIGEST": replace(
-            wanted, image="python@sha256:12"
+            wanted, image=other_image
         ),
         "no such directory": replace(wanted, wheels=tmp_path / "nowhere"),
         f"for Python {python_version()}": replace(wanted, wheels=empty),
         "--python '2.7': expected versions of Python 3": replace(wanted, pythons=("2.7",)),
-        f"--python '3.{'9' * 18}': expected": replace(wanted, pythons=(f"3.{'9' * 100}",)),
-        "truncated": replace(wanted, weights=(put(tmp_path / "damaged", "free.pt", DATA[:-1]),)),
+        f"--python '3.{'9' * 18}': expected": replace(wanted, pythons=(long,)),
+        "truncated": replace(wanted, weights=(damaged,)),
     }
     for told, request in bad.items():
         with pytest.raises(UserError, match=told):
@@ -266,21 +257,18 @@ def test_weights_that_no_network_takes_are_refused_and_others_named_with_their_m
     package = make_package(replace(wanted, private=True))
     notes = {item.name: item.note for item in package.dataset}
     assert [notes[f"{file.name}.safetensors"] for file in lines] == ["fits superglue"] * 2
-    monkeypatch.setattr(
-        store, "manifest", lambda: (*lines, line("free.pt", DATA, slot="dkm-outdoor"))
-    )
-    with pytest.raises(
-        UserError,
-        match=r"another_name\.pt: the weights for 'dkm-outdoor' do not fit the network: a,",
-    ):
+    misfit = line("free.pt", DATA, slot="dkm-outdoor")
+    monkeypatch.setattr(store, "manifest", lambda: (*lines, misfit))
+    says = r"another_name\.pt: the weights for 'dkm-outdoor' do not fit the network: a,"
+    # Before the upload of gigabytes, and not in the kernel's log.
+    with pytest.raises(UserError, match=says):
         make_package(replace(wanted, private=True))
 
 
 def test_the_wheel_holds_what_a_run_needs_and_asks_for_what_is_bundled(tmp_path, wheels):
     wheel = build_wheel(find_checkout(), tmp_path)
-    asked = [
-        line.replace("_", "-").partition(">=")[0] for line in install_lines(wheel, wheels.iterdir())
-    ]
+    lines = install_lines(wheel, wheels.iterdir())
+    asked = [line.replace("_", "-").partition(">=")[0] for line in lines]
     pinned = [pin.partition("==") for pin in pins(find_checkout())]
     bundled = sorted(name.replace("_", "-") for name, _, version in pinned if version)
     assert sorted(asked[1:]) == sorted(BUNDLED) == bundled
