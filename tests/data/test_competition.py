@@ -1,4 +1,4 @@
-"""Files of the competition: what is read, what is refused and in which words, what is written."""
+"""Files of the competition: reading, refusals with their words, writing."""
 
 import os
 import re
@@ -42,15 +42,14 @@ def train(tmp_path):
     """A train side by hand: scene ``s`` with images a, b, c, d and six pairs."""
     (tmp_path / "s" / "images").mkdir(parents=True)
     (tmp_path / "s" / "images" / "a.JPG").touch()
-    cameras = [
-        f"{name},2 0 1 0 2 1 0 0 1,1 0 0 0 1 0 0 0 1,{x} 0 0" for x, name in enumerate("abcd")
-    ]
-    lines = ["image_id,camera_intrinsics,rotation_matrix,translation_vector", *cameras]
+    lines = ["image_id,camera_intrinsics,rotation_matrix,translation_vector"]
+    for x, name in enumerate("abcd"):
+        lines.append(f"{name},2 0 1 0 2 1 0 0 1,1 0 0 0 1 0 0 0 1,{x} 0 0")
     (tmp_path / "s" / "calibration.csv").write_text("\n".join(lines) + "\n")
     pairs = ["b-a,0.9", "c-a,0.1", "c-b,0.5", "d-a,0.09", "d-b,0.3", "d-c,0.7"]
-    (tmp_path / "s" / "pair_covisibility.csv").write_text(
-        "\n".join(["pair,covisibility", *pairs]) + "\n"
-    )
+    lines = ["pair,covisibility", *pairs]
+    (tmp_path / "s" / "pair_covisibility.csv").write_text("\n".join(lines) + "\n")
+    # The competition's file lists scenes that a user may not have downloaded.
     (tmp_path / "scaling_factors.csv").write_text("scene,scaling_factor\ns,2.5\nabsent,1\n")
     return tmp_path
 
@@ -60,13 +59,16 @@ def keys(scene):
 
 
 def test_pairs_and_columns_come_in_any_order_and_ids_stay_the_text_that_they_are(side):
+    # Ids that pandas and spreadsheets read as numbers or as missing values.
     rows = ["0010,more,1e3,NA,007", "2,x,b,1,a", "1,x,b,2,z"]
     images = ["1e3/NA.png", "1e3/0010.Jpg", "1e3/00.png", "1e3/0010.txt"]
     home = side(*rows, header="image_2_id,more,batch_id,image_1_id,sample_id", images=images)
     pairs = read_test_side(home)
     assert [(pair.id, pair.group) for pair in pairs] == [("007", "1e3"), ("a", "b"), ("z", "b")]
     assert [image.name for image in pairs[0].images] == ["NA.png", "0010.Jpg"]
+    # A missing image costs its pairs, not the run.
     assert not pairs[1].images[0].is_file()
+    # Users name the folder of images as often as the folder above it.
     assert read_test_side(home / "test_images") == pairs
 
 
@@ -101,11 +103,12 @@ def test_a_directory_without_its_table_or_images_is_refused(side):
     (home / "test.csv").unlink()
     with pytest.raises(UserError, match=r"test\.csv: no such file"):
         read_test_side(home)
-    os.mkfifo(home / "test.csv")
+    os.mkfifo(home / "test.csv")  # opening a pipe waits for a writer that never comes
     with pytest.raises(UserError, match="is not a regular file"):
         read_test_side(home)
 
 
+# Ids become paths of images, and of files that a report writes.
 @pytest.mark.parametrize("name", ["", ".", "..", "../x", "/etc", "x\\y", "C:x", "a\x1bb", "a\x7f"])
 def test_an_id_that_is_not_a_plain_name_is_refused(side, name):
     for row in ("s,{},1,2", "s,b,{},2", "s,b,1,{}"):
@@ -114,7 +117,7 @@ def test_an_id_that_is_not_a_plain_name_is_refused(side, name):
             read_test_side(home)
 
 
-def test_a_train_side_by_hand_reads_as_written(train):
+def test_a_train_side_is_read_with_its_cameras_and_its_scale(train):
     (scene,) = read_train_side(train)
     assert (scene.name, scene.metres_per_unit) == ("s", 2.5)
     first = scene.pairs[0]
@@ -128,11 +131,12 @@ def test_pairs_below_the_covisibility_are_left_out_and_others_are_spread_over_th
     assert keys(*read_train_side(train)) == ["b-a", "c-a", "c-b", "d-b", "d-c"]
     assert keys(*read_train_side(train, min_covisibility=0.5)) == ["b-a", "c-b", "d-c"]
     assert len(keys(*read_train_side(train, min_covisibility=0))) == 6
+    # Evenly spread: the first rows of a table share an image.
     chosen = [keys(*read_train_side(train, pairs_per_scene=most)) for most in (1, 2, 3)]
     assert chosen == [["b-a"], ["b-a", "d-c"], ["b-a", "c-b", "d-c"]]
 
 
-TRAIN_REFUSALS = [  # file, text, what replaces it, options, message
+TRAIN_REFUSALS = [  # file, text, its replacement, options, message
     ("s/calibration.csv", "", "", {"scenes": ["s", "x"]}, "unknown scene 'x'; known: absent, s"),
     ("s/calibration.csv", "", "", {"scenes": ["absent"]}, "calibration.csv: no such file"),
     ("s/calibration.csv", "", "", {"min_covisibility": 1.1}, "covisibility.csv has no pair with"),
@@ -158,23 +162,28 @@ def test_a_train_side_that_cannot_be_read_is_refused_by_file(train, file, old, n
     (train / file).write_text(text.replace(old, new))
     with pytest.raises(UserError, match=re.escape(says)) as refused:
         read_train_side(train, **options)
+    # Without options the fault is in the file, and its name is half of the help.
     assert options or new == "" or file in str(refused.value)
 
 
 def test_a_submission_keeps_its_numbers_and_their_order(tmp_path):
     rng = np.random.default_rng(0)
     names = ["s;5-x", "s;3-x", "a,b", 'a"b', "NA", "a b"]
-    rows = {name: rng.normal(size=(3, 3)) * 10.0 ** rng.integers(-12, 12, (3, 3)) for name in names}
+    rows = {}
+    for name in names:
+        # F in pixels has elements of very different sizes.
+        magnitudes = 10.0 ** rng.integers(-12, 12, (3, 3))
+        rows[name] = rng.normal(size=(3, 3)) * magnitudes
     write_submission(tmp_path / "submission.csv", rows)
     read = read_submission(tmp_path / "submission.csv")
     assert list(read) == list(rows)
     for name, F in rows.items():
-        assert_allclose(read[name], F, rtol=1e-11, atol=0)
+        assert_allclose(read[name], F, rtol=1e-11, atol=0)  # written with twelve digits
     assert competition.submission_problems(tmp_path / "submission.csv", list(rows)) == []
     write_submission(tmp_path / "x.csv", {"b": EYE, "a": -EYE / 2})
-    expected = (
-        b"sample_id,fundamental_matrix\nb,1 0 0 0 1 0 0 0 1\na,-0.5 -0 -0 -0 -0.5 -0 -0 -0 -0.5\n"
-    )
+    expected = b"sample_id,fundamental_matrix\n"
+    expected += b"b,1 0 0 0 1 0 0 0 1\na,-0.5 -0 -0 -0 -0.5 -0 -0 -0 -0.5\n"
+    # A reader that has the file open, such as an upload, keeps a whole version.
     with (tmp_path / "x.csv").open("rb") as former:
         write_submission(tmp_path / "x.csv", {"b": EYE})
         assert former.read() == expected, "a file is replaced, not overwritten"
@@ -210,9 +219,8 @@ def test_each_problem_of_a_submission_is_the_only_one_found(tmp_path, content, s
     (problem,) = competition.submission_problems(tmp_path / "x.csv", ["a", "b"])
     assert re.search(says, problem)
     (tmp_path / "x.csv").write_text("sample_id,fundamental_matrix\nb,1\na,0 0 0 0 0 0 0 0 0\n")
-    assert len(competition.submission_problems(tmp_path / "x.csv", ["a", "b"])) == 3, (
-        "all are told at once"
-    )
+    problems = competition.submission_problems(tmp_path / "x.csv", ["a", "b"])
+    assert len(problems) == 3, "all at once"
     (problem,) = competition.submission_problems(tmp_path / "y.csv", ["a"])
     assert "no such file" in problem
 
@@ -245,6 +253,7 @@ def test_cells_are_the_text_of_the_file_with_its_lines(tmp_path, content, rows):
     ],
 )
 def test_a_table_that_pandas_would_guess_at_is_refused(tmp_path, content, says):
+    # pandas fills short rows, and takes the first columns of long rows as an index.
     path = tmp_path / "table.csv"
     path.write_text(content)
     with pytest.raises(UserError, match=says):

@@ -1,6 +1,4 @@
-"""Decoding: what is read, what is unreadable and why, and the store that does it once; EXIF as
-COLMAP has it.
-"""
+"""Decoding: pixels, reasons of unreadable files, the store that decodes once; EXIF as in COLMAP."""
 
 import os
 import threading
@@ -28,21 +26,18 @@ from mkpc_kaggle.geometry.coordinates import Size
 
 
 def write(path, pixels, *options):
-    order = {4: cv2.COLOR_RGBA2BGRA, 3: cv2.COLOR_RGB2BGR}.get(
-        pixels.shape[2] if pixels.ndim == 3 else 1
-    )
-    done, data = cv2.imencode(
-        path.suffix, pixels if order is None else cv2.cvtColor(pixels, order), options
-    )
+    channels = pixels.shape[2] if pixels.ndim == 3 else 1
+    order = {4: cv2.COLOR_RGBA2BGRA, 3: cv2.COLOR_RGB2BGR}.get(channels)
+    stored = pixels if order is None else cv2.cvtColor(pixels, order)
+    done, data = cv2.imencode(path.suffix, stored, options)
     assert done
     path.write_bytes(data.tobytes())
     return path
 
 
 def noise(*shape, kind=np.uint8):
-    return np.random.default_rng(0).integers(
-        0, np.iinfo(kind).max, shape, dtype=kind, endpoint=True
-    )
+    rng = np.random.default_rng(0)
+    return rng.integers(0, np.iinfo(kind).max, shape, dtype=kind, endpoint=True)
 
 
 def reason(path):
@@ -58,13 +53,13 @@ def reason(path):
 def test_a_png_has_three_channels_of_eight_bits(tmp_path, shape, kind):
     pixels = noise(*shape, kind=kind)
     image = read_image(write(tmp_path / "a.png", pixels))
-    bytes_ = (pixels // (256 if kind is np.uint16 else 1)).reshape(*shape[:2], -1)[..., :3]
+    # The upper byte of sixteen bits; without the fourth channel, which is transparency.
+    divisor = 256 if kind is np.uint16 else 1
+    bytes_ = (pixels // divisor).reshape(*shape[:2], -1)[..., :3]
     assert_array_equal(image.pixels, np.broadcast_to(bytes_, (*shape[:2], 3)))
-    assert (image.name, image.size, image.pixels.dtype) == (
-        str(tmp_path / "a.png"),
-        shape[1::-1],
-        np.uint8,
-    )
+    assert image.name == str(tmp_path / "a.png")
+    assert image.size == shape[1::-1]
+    assert image.pixels.dtype == np.uint8
     assert len(shape) == 3 or (image.gray == bytes_[..., 0]).all()
 
 
@@ -73,32 +68,31 @@ def test_a_file_that_is_not_a_picture_has_its_reason(tmp_path):
     (tmp_path / "text.png").write_text("no picture at all\n" * 100)
     (tmp_path / "directory.png").mkdir()
     os.mkfifo(tmp_path / "pipe.png")
-    (tmp_path / "device.png").symlink_to("/dev/zero")
+    (tmp_path / "device.png").symlink_to("/dev/zero")  # it never ends
     assert reason(tmp_path / "empty.png") == "the file is empty"
     assert "not a picture" in reason(tmp_path / "text.png")
     png = write(tmp_path / "cut.png", noise(64, 64, 3))
     png.write_bytes(png.read_bytes()[: png.stat().st_size // 2])
     assert "cut off" in reason(png)
+    # The limit is 32 : 1.
     assert "300 x 3 pixels" in reason(write(tmp_path / "line.png", noise(3, 300)))
     assert isinstance(read_image(write(tmp_path / "strip.png", noise(10, 300))), Image)
     assert "cannot be read" in reason(tmp_path / "directory.png")
     assert reason(tmp_path / "none.png") == "no such file"
-    assert (
-        str(read_image(tmp_path / os.fsdecode(b"\xff.png")))
-        == f"{tmp_path}/\\udcff.png: no such file"
-    )
+    # A name that is not UTF-8 must be printable.
+    not_text = read_image(tmp_path / os.fsdecode(b"\xff.png"))
+    assert str(not_text) == f"{tmp_path}/\\udcff.png: no such file"
     for name in ("pipe.png", "device.png"):
         assert reason(tmp_path / name) == "cannot be read: not a regular file"
 
 
 def test_an_array_is_named_by_its_content_and_shape_or_refused():
     pixels = noise(6, 4, 3)
+    # The name is the key of the cache of encodings.
     name = Image.of_array(pixels).name
     assert name == Image.of_array(pixels.copy()).name
-    assert name not in (
-        Image.of_array(pixels.reshape(4, 6, 3)).name,
-        Image.of_array(255 - pixels).name,
-    )
+    assert name != Image.of_array(pixels.reshape(4, 6, 3)).name
+    assert name != Image.of_array(255 - pixels).name
     wrong = [
         ((4, 4, 4), "uint8"),
         ((2, 4, 4, 3), "uint8"),
@@ -125,6 +119,7 @@ def decoded(monkeypatch):
 
 
 def test_prefetched_images_are_decoded_in_the_background(monkeypatch):
+    # 60 s only end a test that fails: nothing is decoded before `go`.
     go = threading.Event()
     image = Image("a", np.zeros((1, 1, 3), np.uint8))
     monkeypatch.setattr(images, "read_image", lambda path: image if go.wait(60) else None)
@@ -146,7 +141,7 @@ def test_a_file_is_decoded_once_unless_it_made_room_or_is_unreadable(decoded):
     assert len(decoded) == 9
 
 
-def test_a_cache_drops_what_was_used_least_recently():
+def test_a_cache_drops_the_entries_that_were_used_least_recently():
     cache = ByteCache(3)
     for key in "abc":
         cache.put(key, key, 1)
@@ -162,7 +157,7 @@ def test_a_cache_drops_what_was_used_least_recently():
 def test_the_digest_of_a_file_is_that_of_its_bytes(tmp_path):
     path = write(tmp_path / "a.png", noise(5, 7))
     version = read_image(path).version
-    os.utime(path, (1, 1))
+    os.utime(path, (1, 1))  # a copied or downloaded file has another time
     assert content_digest(path) == version
     write(path, noise(5, 7) + 1)
     assert content_digest(path) != version
@@ -183,6 +178,7 @@ def test_stored_pixels_are_read_and_views_set_upright_as_by_opencv(
     assert_array_equal(image.pixels, stored[..., ::-1])
     upright = cv2.imread(str(path))[..., ::-1]
     shown = np.rot90(image.pixels, image.turns)
+    # Four of the eight orientations are mirrored, which no camera writes: quarter turns remain.
     assert_array_equal(shown, upright[:, ::-1] if orientation in {2, 4, 5, 7} else upright)
 
 
@@ -204,12 +200,11 @@ POSSIBLE = [  # a focal length for film of 35 mm; a focal length, a resolution, 
 def test_the_focal_length_is_that_of_colmap(tmp_path, tags, order):
     path = set_exif(write(tmp_path / "a.jpg", PIXELS), 6, order=order, **tags)
     camera = pycolmap.infer_camera_from_image(path)
-    image = read_image(path)
-    assert image.focal == pytest.approx(
-        camera.focal_length if camera.has_prior_focal_length else 0, rel=1e-6
-    )
+    expected = camera.focal_length if camera.has_prior_focal_length else 0
+    assert read_image(path).focal == pytest.approx(expected, rel=1e-6)
 
 
+# Far from any lens, divisions by zero, and text.
 IMPOSSIBLE = [
     {"tA405": 65535},
     {"tA405": 1},
@@ -220,13 +215,14 @@ IMPOSSIBLE = [
 
 
 @pytest.mark.parametrize("tags", IMPOSSIBLE)
-def test_a_focal_length_or_an_orientation_that_cannot_be_is_unknown(tmp_path, tags):
+def test_an_impossible_focal_length_or_orientation_is_unknown(tmp_path, tags):
     image = read_image(set_exif(write(tmp_path / "a.jpg", PIXELS), 9, **tags))
     assert (image.focal, image.turns) == (0, 0)
 
 
-def test_damaged_exif_is_missing():
-    whole, rng = cv2.imencode(".jpg", PIXELS)[1].tobytes(), np.random.default_rng(0)
+def test_damaged_exif_raises_nothing_and_gives_possible_values():
+    whole = cv2.imencode(".jpg", PIXELS)[1].tobytes()
+    rng = np.random.default_rng(0)
     part = tiff(6, tA405=28, t920A=(4, 1))
     assert read_exif(with_tiff(whole, part), Size(60, 40)) == (3, pytest.approx(46.663, abs=1e-3))
     damaged = [part[:length] for length in range(len(part))]
@@ -237,4 +233,5 @@ def test_damaged_exif_is_missing():
     for data in damaged:
         turns, focal = read_exif(with_tiff(whole, data), Size(60, 40))
         assert turns in range(4)
+        # 0.2 and 20 long sides of 60 pixels.
         assert focal == 0 or 12 <= focal <= 1200

@@ -1,6 +1,4 @@
-"""Files that a command writes: whole or not at all, never over an input, and nothing is left beside
-them.
-"""
+"""Files that a command writes: whole or not at all, never over an input, without remains."""
 
 import os
 from pathlib import Path
@@ -15,14 +13,14 @@ def test_an_earlier_submission_among_the_weights_is_replaced(tmp_path):
     require_apart({"--output": tmp_path / "s.csv"}, [tmp_path])
 
 
-def test_nothing_is_left_of_a_file_that_cannot_be_finished(tmp_path):
+def test_no_file_remains_if_it_cannot_be_finished(tmp_path):
     with pytest.raises(RuntimeError), replacing(tmp_path / "submission.csv") as stream:
         stream.write("half")
         raise RuntimeError
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_a_killed_process_has_left_is_removed(tmp_path):
+def test_the_remains_of_a_killed_process_are_removed(tmp_path):
     kept = tmp_path / ".submission.csv.part"  # not ours
     for path in (tmp_path / ".submission.csv.0123abcd.part", kept):
         path.touch()
@@ -32,6 +30,7 @@ def test_what_a_killed_process_has_left_is_removed(tmp_path):
 
 
 def test_a_device_is_written_to_and_not_replaced():
+    # `--csv /dev/stdout` and terminals: a rename would replace the device by a file.
     ours, terminal = os.openpty()
     try:
         with replacing(Path(os.ttyname(terminal))) as stream:

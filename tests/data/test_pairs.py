@@ -1,4 +1,4 @@
-"""Lists of pairs: lines that are read or refused, and what ``validate`` makes of a list."""
+"""Lists of pairs: lines that are read or refused, and scores of a list."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -25,15 +25,14 @@ R = cv2.Rodrigues(np.array([0.1, -0.3, 0.2]))[0]
 CAMERA = Camera(K, R, np.array([0.2, -0.1, 0.5]))
 
 
-def test_a_line_is_what_was_written():
+def test_a_line_gives_the_images_turns_and_cameras_that_were_written():
     first = Camera(K, R, np.array([1.0, 2, 3]))
     true = parse_line(line_of(("a/b.jpg", "c.png"), (first, CAMERA), (3, 1)), *WHERE)
-    assert (true.pair.images, true.pair.turns) == (
-        (Path("images/a/b.jpg"), Path("images/c.png")),
-        (3, 1),
-    )
+    assert true.pair.images == (Path("images/a/b.jpg"), Path("images/c.png"))
+    assert true.pair.turns == (3, 1)
     assert true.pair.id == "7: a/b.jpg turned 3 c.png turned 1"
     np.testing.assert_array_equal(true.camera0.K, K)
+    # A list has the relative pose alone, so only F can be compared.
     found = fundamental_of_cameras(true.camera0, true.camera1)
     np.testing.assert_allclose(found, fundamental_of_cameras(first, CAMERA), atol=1e-15)
 
@@ -114,12 +113,13 @@ def test_a_listed_image_is_set_upright_and_scored_as_it_is_stored(
     """Images stored on their sides, with cameras to match, score as the upright images do; a
     missing one fails.
     """
-    lines, true = [], max(scenes[0].pairs, key=lambda true: true.covisibility)
+    true = max(scenes[0].pairs, key=lambda true: true.covisibility)
+    sides = list(zip(true.pair.images, (true.camera0, true.camera1), strict=True))
+    lines = []
     for number, turns in enumerate([(1, 3), (2, 0), (3, 3)]):
-        names, cameras = [], []
-        for quarters, path, camera in zip(
-            turns, true.pair.images, (true.camera0, true.camera1), strict=True
-        ):
+        names = []
+        cameras = []
+        for quarters, (path, camera) in zip(turns, sides, strict=True):
             names.append(f"{number}-{path.stem}.png")
             upright = cv2.imread(str(path))
             cv2.imwrite(str(tmp_path / names[-1]), np.rot90(upright, -quarters))
@@ -127,18 +127,11 @@ def test_a_listed_image_is_set_upright_and_scored_as_it_is_stored(
         lines.append(line_of((names[0], names[1]), (cameras[0], cameras[1]), turns))
     lines.append(line_of(("missing.jpg", "none.jpg"), (true.camera0, true.camera1)))
     (tmp_path / "list.txt").write_text("\n\n".join(lines))
-    options = (
-        "--pairs",
-        tmp_path / "list.txt",
-        "--image-root",
-        tmp_path,
-        "--method",
-        "ransac",
-        "--threshold",
-        1,
-    )
-    scores = scores_of(tmp_path / "scores.json", *options, "--recipe", small_recipe)
+    options = ["--pairs", tmp_path / "list.txt", "--image-root", tmp_path]
+    options += ["--recipe", small_recipe, "--method", "ransac", "--threshold", 1]
+    scores = scores_of(tmp_path / "scores.json", *options)
     *found, missing = scores["scenes"][0]["pairs"]
+    # A turn that was forgotten is an error of 90 degrees.
     assert max(pair["rotation_error_degrees"] for pair in found) < 5
     assert (missing["rotation_error_degrees"], scores["mAA"]) == (None, None)
     assert missing["pair"] == "7: missing.jpg none.jpg", "by its line"
@@ -147,11 +140,12 @@ def test_a_listed_image_is_set_upright_and_scored_as_it_is_stored(
 
 
 def test_the_estimate_of_a_pair_depends_on_its_cameras():
-    keys, pair = Keys(()), Pair("p", "b", "0", "1")
-    digests = [
-        keys.of_estimate(replace(pair, intrinsics=both), ["points"])
-        for both in (None, (K, K), (K, K + 1))
-    ]
+    keys = Keys(())
+    pair = Pair("p", "b", "0", "1")
+    digests = []
+    # A corrected list of cameras must not use the estimates of the former one.
+    for both in (None, (K, K), (K, K + 1)):
+        digests.append(keys.of_estimate(replace(pair, intrinsics=both), ["points"]))
     assert len(set(digests)) == 3
 
 

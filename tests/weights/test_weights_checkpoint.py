@@ -27,6 +27,7 @@ from mkpc_kaggle.weights import checkpoint, load_tensors
 from mkpc_kaggle.weights.checkpoint import convert
 from mkpc_kaggle.weights.manifest import UNVERIFIED, WeightFile
 
+# A matrix, a scalar and an empty tensor: formats store each in its own way.
 TENSORS = {
     "a.weight": torch.arange(6.0).reshape(2, 3),
     "a.count": torch.tensor(7),
@@ -43,11 +44,9 @@ def assert_same(loaded: dict[str, torch.Tensor], wanted: dict[str, torch.Tensor]
     assert list(loaded) == list(wanted)
     for name, tensor in wanted.items():
         found = loaded[name]
-        assert (found.dtype, found.stride(), found.requires_grad) == (
-            tensor.dtype,
-            tensor.stride(),
-            False,
-        )
+        assert found.dtype == tensor.dtype
+        assert found.stride() == tensor.stride()
+        assert not found.requires_grad
         assert torch.equal(found, tensor)
 
 
@@ -66,6 +65,7 @@ def test_every_file_format_gives_the_same_plain_tensors(tmp_path, save, wrapped)
 def test_on_the_device_meta_a_file_gives_names_shapes_and_types(tmp_path, save):
     path = tmp_path / ("x.safetensors" if save is save_file else "x.pt")
     save(TENSORS, path)
+    # So that a file is tried in its network without memory.
     with torch.device("meta"):
         loaded = load_tensors(path, "meta")
     assert {name: loaded[name].device.type for name in loaded} == dict.fromkeys(TENSORS, "meta")
@@ -82,15 +82,20 @@ def test_tensors_in_a_wrapper_are_found(tmp_path, wrapper):
 @pytest.mark.filterwarnings("ignore::UserWarning")  # of torch, on prototypes
 @pytest.mark.parametrize("save", [torch.save, save_legacy])
 def test_anything_but_a_table_of_plain_tensors_is_refused(tmp_path, save):
-    ones, base = torch.ones(2, 3), torch.zeros(10_000)
-    odd = [ones, [ones], {"state_dict": 3}, {3: ones}, {"x": ones.to_sparse()}]
-    odd += [{"x": ones.to_sparse_csr()}, {"x": ones.to("meta")}]
-    odd += [
+    ones = torch.ones(2, 3)
+    base = torch.zeros(10_000)
+    odd = [
+        ones,
+        [ones],
+        {"state_dict": 3},
+        {3: ones},
+        {"x": ones.to_sparse()},
+        {"x": ones.to_sparse_csr()},
+        {"x": ones.to("meta")},
         {"x": torch.quantize_per_tensor(ones, 0.1, 0, torch.quint8)},
-        {"x": torch.zeros(1).expand(1_000_000)},
-    ]
-    odd += [
         {"x": torch.nested.nested_tensor([ones[0], ones[1, :2]])},
+        # A few bytes that unpack to megabytes.
+        {"x": torch.zeros(1).expand(1_000_000)},
         {str(n): base for n in range(100)},
     ]
     for value in odd:
@@ -109,6 +114,7 @@ def test_a_file_that_is_not_a_checkpoint_is_refused_by_name(tmp_path, name, data
         load_tensors(tmp_path / name)
 
 
+# As PyTorch Lightning's checkpoints of LoFTR and others: callbacks and options of missing classes.
 FRAMEWORK = """
 class Checkpoint:
     def __init__(self): self.best, self.kind = {"score": 0.5}, Slotted()
@@ -167,13 +173,15 @@ def test_a_training_checkpoint_with_unknown_classes_gives_its_tensors_but_not_in
         "strided": base[::2, 1::3],
         "empty": torch.zeros(0, 3),
     }
-    state |= {"parameter": nn.Parameter(torch.ones(3)), "complex": torch.tensor([1 + 2j])}
+    state["parameter"] = nn.Parameter(torch.ones(3))
+    state["complex"] = torch.tensor([1 + 2j])
     for dtype in (torch.bfloat16, torch.float16, torch.int64, torch.uint8, torch.bool):
         state[f"{dtype}"] = torch.tensor([[0, 1, 1], [1, 0, 0]]).to(dtype)
     assert hasattr(network.state_dict(), "_metadata")
     torch.save(training_checkpoint(framework, state), tmp_path / "x.ckpt")
     save_legacy(training_checkpoint(framework, TENSORS), tmp_path / "old.ckpt")
     del sys.modules["training_framework"]
+    # torch refuses the file for its unknown classes, which the package maps to an inert one.
     with pytest.raises(pickle.UnpicklingError):
         torch.load(tmp_path / "x.ckpt", weights_only=True)
     loaded = load_tensors(tmp_path / "x.ckpt")
@@ -201,6 +209,7 @@ def nasty(sentinel: Path) -> dict[str, object]:
         "os.system": Call(os.system, command),
         "builtins.eval": Call(eval, f"__import__('pathlib').Path({str(sentinel)!r}).touch()"),
         "os.mkdir": Call(os.mkdir, str(sentinel)),
+        # By names that no list of forbidden functions has.
         "builtins.getattr": Call(
             operator.call, Call(getattr, Call(__import__, "os"), "system"), command
         ),
@@ -226,7 +235,7 @@ def test_a_malicious_pickle_runs_nothing(tmp_path, save):
             except UserError as refusal:
                 assert path.name in str(refusal)
             assert not sentinel.exists(), name
-        # The bombs would go off; some fail after they have run
+        # Proof that the bombs are live: pickle itself runs them. Some fail after they have run.
         with contextlib.suppress(Exception):
             pickle.loads(pickle.dumps(bomb, protocol=2))
         assert sentinel.exists(), name
@@ -234,9 +243,7 @@ def test_a_malicious_pickle_runs_nothing(tmp_path, save):
 
 
 def with_pickle(path: Path, change: Callable[[bytes], bytes]) -> Path:
-    """A checkpoint with an unknown object beside its tensors, as torch writes it, its pickle
-    changed.
-    """
+    """A checkpoint as torch writes it, with an unknown object and a changed pickle."""
     torch.save({"state_dict": TENSORS, "options": Namespace()}, path)
     with zipfile.ZipFile(path) as archive:
         records = {name: archive.read(name) for name in archive.namelist()}
@@ -251,16 +258,20 @@ def test_records_that_unpack_to_more_than_the_file_or_overlap_are_refused(tmp_pa
     assert load_tensors(path).keys() == TENSORS.keys()
     with zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("x/big", bytes(1_000_000))
-    with pytest.raises(
-        UserError, match=r"x\.pt cannot be read .* records are compressed or overlap"
-    ):
+    # torch writes no compressed record: one that is compressed may unpack to any size.
+    says = r"x\.pt cannot be read .* records are compressed or overlap"
+    with pytest.raises(UserError, match=says):
         load_tensors(path)
     with_pickle(path, bytes)
     with zipfile.ZipFile(path, "a") as archive:
         archive.writestr("x/big", bytes(20_000))
-        same, big = archive.infolist()[0], archive.getinfo("x/big")
-        same.header_offset, same.CRC = big.header_offset, big.CRC
-        same.file_size = same.compress_size = 20_000
+        # Two names of the same bytes, as in zip bombs that are not compressed.
+        big = archive.getinfo("x/big")
+        same = archive.infolist()[0]
+        same.header_offset = big.header_offset
+        same.CRC = big.CRC
+        same.file_size = 20_000
+        same.compress_size = 20_000
     with pytest.raises(UserError, match="compressed or overlap"):
         load_tensors(path)
 
@@ -281,15 +292,16 @@ def test_a_damaged_pickle_gives_tensors_or_a_refusal(tmp_path_factory, changes):
         assert "x.pt cannot be read as a checkpoint" in str(refusal)
 
 
-def test_every_tensor_comes_through_whatever_it_shares(tmp_path):
+def test_a_converted_checkpoint_has_every_tensor_even_if_tensors_share_bytes(tmp_path):
+    # safetensors refuses shared bytes, and tied weights are common.
     base = torch.arange(12.0).reshape(3, 4)
     tensors = {
         "net.base": base,
         "net.turned": base.t(),
         "net.same": base,
         "net.count": torch.tensor([3]),
+        "net.half": torch.tensor(0.5, dtype=torch.bfloat16),
     }
-    tensors |= {"net.half": torch.tensor(0.5, dtype=torch.bfloat16)}
     torch.save({"state_dict": tensors, "epoch": 3}, tmp_path / "x.ckpt")
     line = convert(tmp_path / "x.ckpt", tmp_path / "new" / "x.safetensors")
     data = (tmp_path / "new" / "x.safetensors").read_bytes()
@@ -302,11 +314,12 @@ def test_every_tensor_comes_through_whatever_it_shares(tmp_path):
     assert [path.name for path in (tmp_path / "new").iterdir()] == ["x.safetensors"]
 
 
-def test_the_line_takes_over_what_the_manifest_knows(tmp_path, monkeypatch):
+def test_the_line_of_a_converted_file_has_the_manifests_licence_and_slot(tmp_path, monkeypatch):
     torch.save({"a": torch.zeros(1)}, tmp_path / "x.pt")
     digest = digest_of((tmp_path / "x.pt").read_bytes())
     by_digest = WeightFile("known.pt", -1, digest, "MIT", "slot", "web")
     by_name = WeightFile("x.pt", -1, UNVERIFIED, "BSD", "other", "web")
+    # The name alone is no proof if the manifest has another digest.
     another = WeightFile("x.pt", -1, digest_of(b""), "BSD", "other", "web")
     told = []
     for files in ([by_name, by_digest], [by_name], [another]):
@@ -317,7 +330,7 @@ def test_the_line_takes_over_what_the_manifest_knows(tmp_path, monkeypatch):
 
 
 @pytest.mark.filterwarnings("ignore:ComplexHalf")
-def test_what_cannot_be_converted_is_stated(tmp_path):
+def test_a_file_that_cannot_be_converted_is_refused_with_the_reason(tmp_path):
     torch.save({"a": torch.zeros(1)}, tmp_path / "x.pt")
     torch.save({"a": torch.zeros(1).to(torch.complex32)}, tmp_path / "odd.pt")
     for file, result, message in (

@@ -1,4 +1,4 @@
-"""Where weight files are searched, and that they are what the manifest says; the manifest itself."""
+"""The search for weight files, their comparison with the manifest, and the manifest itself."""
 
 import os
 import pickle
@@ -28,10 +28,8 @@ def test_a_file_is_found_in_the_directory_and_below_it(tmp_path):
     assert found_by(WeightStore([put(tmp_path / "a")], [line()])) == tmp_path / "a" / "a.bin"
     put(tmp_path / "b" / "deep" / "deeper")
     found = WeightStore([tmp_path / "b"], [line()]).find("slot")
-    assert (found.path, found.digest) == (
-        tmp_path / "b" / "deep" / "deeper" / "a.bin",
-        digest_of(DATA),
-    )
+    assert found.path == tmp_path / "b" / "deep" / "deeper" / "a.bin"
+    assert found.digest == digest_of(DATA)
     put(tmp_path / "c" / "a.bin")  # Kaggle makes such directories of data sets of one file
     assert found_by(WeightStore([tmp_path / "c"], [line()])) == tmp_path / "c" / "a.bin" / "a.bin"
     with pytest.raises(UserError, match=r"--weights .*gone: no such directory"):
@@ -40,7 +38,9 @@ def test_a_file_is_found_in_the_directory_and_below_it(tmp_path):
 
 def test_directories_are_searched_in_order_then_the_environment_then_kaggle(tmp_path, monkeypatch):
     homes = [put(tmp_path / name) for name in ("one", "two", "three", "four", "kaggle")]
-    monkeypatch.setenv("MKPC_WEIGHTS", os.pathsep.join(map(str, [tmp_path / "gone", *homes[2:4]])))
+    # A directory of the environment may be missing, such as a drive that is not mounted.
+    listed = [tmp_path / "gone", *homes[2:4]]
+    monkeypatch.setenv("MKPC_WEIGHTS", os.pathsep.join(map(str, listed)))
     monkeypatch.setattr(store, "KAGGLE_INPUT", homes[4])
     for home in homes:
         assert found_by(WeightStore(homes[:2], [line()])) == home / "a.bin"
@@ -48,11 +48,10 @@ def test_directories_are_searched_in_order_then_the_environment_then_kaggle(tmp_
     assert WeightStore(homes[:2], [line()]).find("slot") is None
 
 
-def test_the_first_alternative_that_is_there_is_taken_and_missing_ones_are_all_named(tmp_path):
+def test_the_first_existing_alternative_is_taken_and_missing_ones_are_all_named(tmp_path):
     files = [line("a.bin"), line("b.bin", OTHER), line("c.bin", slot="other")]
-    with pytest.raises(
-        UserError, match=rf"'slot': a\.bin or b\.bin not found \(searched {tmp_path}\)"
-    ):
+    says = rf"'slot': a\.bin or b\.bin not found \(searched {tmp_path}\)"
+    with pytest.raises(UserError, match=says):
         WeightStore([tmp_path], files).load("slot")
     put(tmp_path, "renamed.bin", DATA)
     put(tmp_path, "b.bin", OTHER)
@@ -69,6 +68,7 @@ def test_a_renamed_file_is_found_by_its_size_and_digest(tmp_path, monkeypatch):
     put(tmp_path, "long.pth", DATA + b"!")
     found = WeightStore([tmp_path], [line()]).find("slot")
     assert (found.path.name, found.state, found.note) == ("model", State.GOOD, "it is a.bin")
+    # Another size cannot have the digest, so gigabytes stay unread.
     assert "long.pth" not in {path.name for path in read}
 
 
@@ -86,9 +86,9 @@ def test_links_to_directories_are_followed_once(tmp_path):
     (inside / "loop").symlink_to(tmp_path / "inside")
     (inside / "out").symlink_to(tmp_path / "outside")
     (inside / "file.pth").symlink_to(tmp_path / "outside" / "b.pth")
-    found = WeightStore(
-        [tmp_path / "inside"], [line("a.pth"), line("b.pth"), line("file.pth")]
-    ).verify()
+    files = [line("a.pth"), line("b.pth"), line("file.pth")]
+    # A link to a folder above would never end.
+    found = WeightStore([tmp_path / "inside"], files).verify()
     assert [file.path.name for file in found] == ["a.pth", "file.pth", "b.pth"]
 
 
@@ -97,15 +97,15 @@ def test_an_unpacked_checkpoint_is_found_and_read(tmp_path, outer):
     tensors = {"a": torch.arange(6.0).reshape(2, 3), "b": torch.tensor([1, 2])}
     torch.save({"state_dict": tensors, "epoch": 3}, tmp_path / "x.pth")
     file = line("x.pth", (tmp_path / "x.pth").read_bytes())
+    # Kaggle unpacks the archive that a checkpoint is, with or without its suffix in the folder's name.
     with ZipFile(tmp_path / "x.pth") as archive:
         archive.extractall(tmp_path / "input" / "someones" / outer)
     os.utime(tmp_path / "input" / "someones" / outer / "x" / "data.pkl", (0, 0))
     weights = WeightStore([tmp_path / "input"], [file])
     found = weights.find("slot")
-    assert (found.state, found.path) == (
-        State.UNVERIFIED,
-        tmp_path / "input" / "someones" / outer / "x",
-    )
+    # The digest of the file cannot be computed from its parts.
+    assert found.state is State.UNVERIFIED
+    assert found.path == tmp_path / "input" / "someones" / outer / "x"
     assert weights.load("slot").keys() == tensors.keys()
     assert found.digest in convert(found.path, tmp_path / "x.safetensors").source
     loaded = load_tensors(tmp_path / "x.safetensors")
@@ -120,10 +120,10 @@ def test_a_manifest_beside_weights_adds_lines_and_overrides_none(tmp_path, monke
     monkeypatch.setattr(store, "manifest", lambda: (line("a.bin"),))
     put(tmp_path / "deep", "b.bin", OTHER)
     lines = (line("a.bin", OTHER), line("b.bin", OTHER))
-    (tmp_path / "deep" / "weights_manifest.txt").write_text(
-        "".join(f"{file.line}\n" for file in lines)
-    )
+    text = "".join(f"{file.line}\n" for file in lines)
+    (tmp_path / "deep" / "weights_manifest.txt").write_text(text)
     weights = WeightStore([tmp_path])
+    # A dataset of somebody else cannot make its own "a.bin" a good one.
     assert weights.files == (line("a.bin"), line("b.bin", OTHER))
     assert found_by(weights).name == "b.bin"
 
@@ -137,27 +137,25 @@ def test_other_bytes_of_the_same_size_are_refused_with_both_digests(tmp_path):
         WeightStore([tmp_path], [line()]).load("slot")
 
 
-def test_after_a_bad_file_the_search_goes_on(tmp_path):
+def test_the_search_continues_after_a_bad_file(tmp_path):
     put(tmp_path / "one", "a.bin", DATA[:-1])
     path = put(tmp_path / "two", "renamed.bin", DATA) / "renamed.bin"
-    weights = WeightStore(
-        [tmp_path / "one", tmp_path / "two"], [line("a.bin"), line("b.bin", OTHER)]
-    )
-    with pytest.warns(
-        UserWarning, match=r"passed over: .*one/a\.bin: 20 bytes, the manifest says 21"
-    ):
+    folders = [tmp_path / "one", tmp_path / "two"]
+    weights = WeightStore(folders, [line("a.bin"), line("b.bin", OTHER)])
+    says = r"passed over: .*one/a\.bin: 20 bytes, the manifest says 21"
+    with pytest.warns(UserWarning, match=says):
         assert found_by(weights) == path
-    assert found_by(weights) == path  # told once
+    # A second warning would be an error here.
+    assert found_by(weights) == path
 
 
 @pytest.mark.parametrize("kind", ["pipe", "link"])
-def test_what_cannot_be_read_is_passed_over(tmp_path, kind):
+def test_a_pipe_or_a_broken_link_is_passed_over(tmp_path, kind):
     path = tmp_path / "a.bin"
     os.mkfifo(path) if kind == "pipe" else path.symlink_to(tmp_path / "nothing")
     weights = WeightStore([tmp_path], [line()])
-    with pytest.warns(
-        UserWarning, match=r"passed over: .*a\.bin: cannot be read: (No such|not a regular) file"
-    ):
+    says = r"passed over: .*a\.bin: cannot be read: (No such|not a regular) file"
+    with pytest.warns(UserWarning, match=says):
         assert weights.find("slot") is None
     assert [file.state for file in weights.verify()] == [State.REFUSED]
 
@@ -183,7 +181,8 @@ def test_the_manifest_has_every_slot_of_every_matcher():
 
 
 def test_a_manifest_reads_as_written():
-    text = f"# head\n\na.pt 12 {SHA256} MIT one  https://x/a.pt (a copy)  # why\n  b.pt ? unverified BSD two y\n"
+    text = f"# head\n\na.pt 12 {SHA256} MIT one  https://x/a.pt (a copy)  # why\n"
+    text += "  b.pt ? unverified BSD two y\n"
     files = parse_manifest(text)
     assert files == (
         WeightFile("a.pt", 12, SHA256, "MIT", "one", "https://x/a.pt (a copy)"),

