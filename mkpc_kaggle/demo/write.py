@@ -16,6 +16,7 @@ from mkpc_kaggle.demo.render import Picture, render
 from mkpc_kaggle.demo.world import SCENES, build_world
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.cameras import fundamental_of_cameras
+from mkpc_kaggle.progress import counted
 
 MIN_COVISIBILITY = 0.1  # minimum of a pair that the competition scores
 TEST_PAIRS = 8  # per scene
@@ -101,7 +102,7 @@ def take_photographs(scene: str, seed: int, image_scale: float) -> list[Photogra
     """Render the view of each camera of a scene, with its own exposure, tint and noise."""
     photographs = []
     surfaces, cameras = build_world(scene, seed=seed, image_scale=image_scale)
-    for number, camera in enumerate(cameras):
+    for number, camera in enumerate(counted(cameras, f"rendering {scene}", "image")):
         image, depth = render(surfaces, camera)
         rng = np.random.default_rng([seed, number, *scene.encode()])
         photographs.append(

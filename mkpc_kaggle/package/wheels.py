@@ -13,6 +13,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.progress import counted
 from mkpc_kaggle.weights.wheel import run_pip
 
 # Direct and indirect dependencies that may be missing or too old in Kaggle's image.
@@ -77,13 +78,11 @@ def collect_wheels(
     sources = [local] if wheels else [local, ()]
     platforms = [option for platform in PLATFORMS for option in ("--platform", platform)]
     options = ["--only-binary=:all:", "--no-deps", *platforms, "--dest", str(directory)]
-    for python in pythons:
+    for python in counted([*pythons], "wheels by pip", "Python"):
+        download = ("download", *options, "--python-version", python)
         for source in sources:
-            if not (
-                failure := run_pip(
-                    "download", *options, "--python-version", python, *source, *requirements
-                )
-            ):
+            failure = run_pip(*download, *source, *requirements)
+            if not failure:
                 break
         else:
             raise UserError(

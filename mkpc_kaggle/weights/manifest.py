@@ -10,18 +10,24 @@
 
 import errno
 import hashlib
+import os
 import re
 import stat
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
 from mkpc_kaggle.data.outputs import replacing
 from mkpc_kaggle.errors import UserError, read_text
+from mkpc_kaggle.progress import counted
 
 MANIFEST = "weights_manifest.txt"
 UNVERIFIED = "unverified"
 DIGEST = re.compile(rf"sha256:[0-9a-f]{{64}}|{UNVERIFIED}")
+BLOCK_BYTES = 1 << 20
+# Names a file in which processes that follow each other keep digests: 3 GB take half a minute
+DIGESTS = "MKPC_DIGESTS"
 
 
 @dataclass(frozen=True)
@@ -81,7 +87,8 @@ def pin(file: WeightFile, path: Path) -> None:
 def digest_of(path: Path) -> str:
     """Return ``sha256:<hex>`` of a file, or of the names and contents of all files in a directory.
 
-    The digest of a file is cached for the process. Raises ``OSError`` if a file cannot be read.
+    The digest of a file is cached for the process, and in the file that ``$MKPC_DIGESTS`` names.
+    Raises ``OSError`` if a file cannot be read.
     """
     if path.is_dir():
         files = sorted(file for file in path.rglob("*") if file.is_file())
@@ -95,9 +102,37 @@ def digest_of(path: Path) -> str:
 
 @cache
 # Size and time are part of the cache's key
-def _file_digest(path: Path, _size: int, _modified_ns: int) -> str:
+def _file_digest(path: Path, size: int, modified_ns: int) -> str:
+    key = f"{size} {modified_ns} {path}"
+    if found := _former_digests().get(key):
+        return found
+    digest = hashlib.sha256()
     with path.open("rb") as stream:
-        return f"sha256:{hashlib.file_digest(stream, 'sha256').hexdigest()}"
+        for start in counted(range(0, max(size, 1), BLOCK_BYTES), f"digest of {path.name}", "MiB"):
+            stream.seek(start)
+            digest.update(stream.read(BLOCK_BYTES))
+    found = f"sha256:{digest.hexdigest()}"
+    _keep_digest(f"{found} {key}")
+    return found
+
+
+def _former_digests() -> dict[str, str]:
+    """Return digests of earlier processes, by size, time of change and path."""
+    kept: dict[str, str] = {}
+    with suppress(OSError):
+        for line in Path(os.environ.get(DIGESTS, "")).read_bytes().splitlines():
+            digest, _, key = os.fsdecode(line).partition(" ")
+            kept[key] = digest
+    return kept
+
+
+def _keep_digest(line: str) -> None:
+    path = os.environ.get(DIGESTS)
+    if path:
+        with suppress(OSError):  # a full disk: the next process computes it again
+            Path(path).parent.mkdir(parents=True, exist_ok=True)
+            with Path(path).open("ab") as stream:
+                stream.write(os.fsencode(f"{line}\n"))
 
 
 def _parse_line(columns: list[str], where: str) -> WeightFile:

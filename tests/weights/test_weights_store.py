@@ -13,6 +13,7 @@ from weight_files import DATA, OTHER, digest_of, line, put
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.matchers.registry import matcher_names, spec_of
 from mkpc_kaggle.weights import UNVERIFIED, State, WeightStore, load_tensors, store
+from mkpc_kaggle.weights import manifest as manifest_module
 from mkpc_kaggle.weights.checkpoint import convert
 from mkpc_kaggle.weights.manifest import WeightFile, manifest, parse_manifest
 from mkpc_kaggle.weights.manifest import digest_of as file_digest
@@ -78,6 +79,21 @@ def test_a_store_that_is_sent_to_a_worker_digests_no_file_again(tmp_path, monkey
     sent = pickle.dumps(weights)
     monkeypatch.setattr(store, "digest_of", None)
     assert pickle.loads(sent).find("slot") == weights.find("slot")
+
+
+def test_processes_that_share_a_file_of_digests_read_a_weight_file_once(tmp_path, monkeypatch):
+    # The notebook verifies 3 GB of weights, and its run then asks for the same digests.
+    reads = []
+    monkeypatch.setattr(manifest_module, "counted", lambda blocks, *_: reads.append(1) or blocks)
+    monkeypatch.setenv("MKPC_DIGESTS", str(tmp_path / "new" / "digests.txt"))
+    path = put(tmp_path) / "a.bin"
+    for _ in range(2):
+        manifest_module._file_digest.cache_clear()  # as in another process
+        assert file_digest(path) == digest_of(DATA)
+    assert len(reads) == 1
+    put(tmp_path, data=OTHER)
+    os.utime(path, (1, 1))  # the size is the same
+    assert file_digest(path) == digest_of(OTHER)
 
 
 def test_links_to_directories_are_followed_once(tmp_path):

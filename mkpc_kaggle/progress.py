@@ -1,0 +1,43 @@
+"""Progress of waits outside of a run: rendering, pip, digests, drawing."""
+
+import os
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from typing import TypeVar
+
+LINE_INTERVAL_S = 30.0  # between lines where a line cannot be redrawn in place
+MAX_SILENCE_S = 1.0  # before a bar appears: shorter waits need none
+
+Item = TypeVar("Item")
+
+
+def is_redrawn() -> bool:
+    """Return whether a bar on stderr replaces its former state.
+
+    A notebook's ``!command`` has a terminal, but Jupyter stores every state of a redrawn line. It
+    sets JPY_PARENT_PID for these processes.
+    """
+    try:
+        is_terminal = sys.stderr is not None and sys.stderr.isatty()
+    except ValueError:  # a closed stream
+        return False
+    return is_terminal and "JPY_PARENT_PID" not in os.environ
+
+
+def counted(items: Sequence[Item], what: str, unit: str) -> Iterator[Item]:
+    """Yield the items and show how many are done, with the rate and the remaining time.
+
+    On a terminal this is a bar, elsewhere a line every half minute.
+    """
+    if is_redrawn():
+        from tqdm import tqdm
+
+        yield from tqdm(items, desc=what, unit=unit, delay=MAX_SILENCE_S, leave=False)
+        return
+    written = time.monotonic()
+    for done, item in enumerate(items):
+        if time.monotonic() - written >= LINE_INTERVAL_S:
+            print(f"{what}: {done}/{len(items)}", file=sys.stderr, flush=True)
+            written = time.monotonic()
+        yield item
