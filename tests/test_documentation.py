@@ -1,4 +1,4 @@
-"""What the pages say is what the program says: messages, commands and options."""
+"""The pages agree with the program: messages, commands, options and Python."""
 
 import argparse
 import ast
@@ -19,7 +19,7 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 
 
 def texts_of(source: str) -> Iterator[str]:
-    """The texts of a program, with {} for what is put into them; adjoining texts are joined."""
+    """The texts of a program, with {} for inserted values; adjoining texts are joined."""
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.JoinedStr):
             parts = [part.value if isinstance(part, ast.Constant) else "{}" for part in node.values]
@@ -29,13 +29,12 @@ def texts_of(source: str) -> Iterator[str]:
 
 
 def everything_said() -> str:
-    sources = [
-        path.read_text(encoding="utf-8") for path in sorted((ROOT / "mkpc_kaggle").rglob("*.py"))
-    ]
-    cells = json.loads((ROOT / "notebooks" / "submission.ipynb").read_text(encoding="utf-8"))[
-        "cells"
-    ]
+    modules = sorted((ROOT / "mkpc_kaggle").rglob("*.py"))
+    sources = [path.read_text(encoding="utf-8") for path in modules]
+    notebook = (ROOT / "notebooks" / "submission.ipynb").read_text(encoding="utf-8")
+    cells = json.loads(notebook)["cells"]
     code = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
+    # Cells have lines such as "!nvidia-smi", which are no Python.
     python = [TransformerManager().transform_cell(text) for text in code]
     return "\n".join(text for source in [*sources, *python] for text in texts_of(source))
 
@@ -48,13 +47,12 @@ def pattern_of(message: str) -> str:
 
 def test_every_message_of_the_troubleshooting_page_is_one_of_the_programs():
     """They are in backticks in the first column of its table."""
-    rows = re.findall(
-        r"^\| (.*?) \|", (ROOT / "docs" / "troubleshooting.md").read_text(encoding="utf-8"), re.M
-    )
-    known = [
-        text for row in rows for text in re.findall(r"`([^`]+)`", row) if not text.startswith("--")
-    ]
+    page = (ROOT / "docs" / "troubleshooting.md").read_text(encoding="utf-8")
+    known = []
+    for row in re.findall(r"^\| (.*?) \|", page, re.M):
+        known += [text for text in re.findall(r"`([^`]+)`", row) if not text.startswith("--")]
     said = everything_said()
+    # A page in another form would have no messages, and nothing to compare.
     assert len(known) > 25
     assert [message for message in known if not re.search(pattern_of(message), said)] == []
 
@@ -65,12 +63,11 @@ def options_of(parser: argparse.ArgumentParser) -> set[str]:
 
 def inner(parser):
     """The parsers of its commands, by name."""
-    groups = [
-        action.choices
-        for action in parser._actions
-        if isinstance(action, argparse._SubParsersAction)
-    ]
-    return {name: each for choices in groups for name, each in choices.items()}
+    found = {}
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            found |= action.choices
+    return found
 
 
 def commands(page: Path) -> Iterator[tuple[str, list[str]]]:
@@ -82,7 +79,7 @@ def commands(page: Path) -> Iterator[tuple[str, list[str]]]:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_pages_name_commands_and_options_that_there_are(page):
+def test_pages_name_only_commands_and_options_that_exist(page):
     known = inner(make_parser(list(COMMANDS)))
     for name, options in commands(page):
         assert name in known, name
@@ -115,12 +112,11 @@ def test_a_folder_uses_those_above_it_and_never_those_below():
     folders = re.findall(r"^\| `(\w+)/` \|", page, re.M)
     order = ["errors", "version", "config", "progress", folders[0], "recipe", *folders[1:]]
     package = ROOT / "mkpc_kaggle"
-    assert {path.name for path in package.iterdir() if (path / "__init__.py").is_file()} == set(
-        folders
-    )
+    found = {path.name for path in package.iterdir() if (path / "__init__.py").is_file()}
+    assert found == set(folders)
+    # Also imports within functions, which no import at the start would show.
+    importing = re.compile(r"^\s*(?:from|import) mkpc_kaggle\b\.?(\w*)", re.M)
     for path in package.glob("*/**/*.py"):
         layer = order.index(path.relative_to(package).parts[0])
-        used = re.findall(
-            r"^\s*(?:from|import) mkpc_kaggle\b\.?(\w*)", path.read_text(encoding="utf-8"), re.M
-        )
+        used = importing.findall(path.read_text(encoding="utf-8"))
         assert [name for name in used if name not in order[: layer + 1]] == [], path

@@ -1,4 +1,4 @@
-"""Recipes: the package's work, and a wrong recipe is refused in words that help."""
+"""Recipes: those of the package load, and a wrong recipe is refused with advice."""
 
 import os
 from itertools import combinations
@@ -45,13 +45,14 @@ def test_a_recipe_of_the_package_loads_with_options_for_every_matcher(name):
     for mode in Mode:
         assert recipe.in_mode(mode).units[0] == recipe.units[0]
         assert mode is Mode.TWO_STAGE or {unit.stage for unit in recipe.in_mode(mode).units} == {1}
+    # The paper's recipes estimate as the paper does; ours have a prior, and so need one permutation.
     paper = name.startswith(("yfcc", "scannet", "imc2022"))
-    assert ((recipe.focal is None), recipe.magsac.permutations) == (
-        (True, 8) if paper else (False, 1)
-    )
+    assert (recipe.focal is None) == paper
+    assert recipe.magsac.permutations == (8 if paper else 1)
 
 
-def test_whatever_matchers_are_left_of_recipe_auto_the_first_unit_can_sweep():
+def test_any_remaining_matchers_of_recipe_auto_begin_with_a_unit_of_stage_1():
+    # Users have any subset of the weights, and a run without a sweep has no F for any pair.
     recipe = load_recipe("auto")
     names = recipe.matcher_names
     assert set(matcher_names()) == set(names)
@@ -64,7 +65,7 @@ def test_whatever_matchers_are_left_of_recipe_auto_the_first_unit_can_sweep():
 
 @pytest.mark.parametrize("name", recipe_names())
 def test_recipes_for_every_user_name_no_weights_for_noncommercial_use_but_with_a_fallback(name):
-    """Those with such weights say so in the README: the paper's."""
+    # The README names the licences of the paper's recipes; in others they would be a surprise.
     recipe = load_recipe(name)
     slots = {file.slot for file in manifest() if "noncommercial" in file.licence}
     bound = {name for name in recipe.matcher_names if any(map(spec_of(name, "test").uses, slots))}
@@ -72,38 +73,36 @@ def test_recipes_for_every_user_name_no_weights_for_noncommercial_use_but_with_a
     assert bool(bound & free) == name.startswith(("yfcc", "scannet", "imc2022", "auto"))
 
 
-def test_fallbacks_take_the_places_of_matchers_that_are_unfit_and_are_forgotten_otherwise():
-    recipe = Recipe(
-        (Unit(1, "a", 640), Unit(1, "b", 640, fallback="c"), Unit(2, "b", 800, 9, fallback="c"))
-    )
-    assert recipe.with_fallbacks({"b", "a"}).units == (
-        Unit(1, "a", 640),
-        Unit(1, "c", 640),
-        Unit(2, "c", 800, 9),
-    )
-    assert recipe.with_fallbacks({"c"}).units == (
-        Unit(1, "a", 640),
-        Unit(1, "b", 640),
-        Unit(2, "b", 800, 9),
-    )
+def test_fallbacks_replace_unfit_matchers_and_disappear_otherwise():
+    first = Unit(1, "a", 640)
+    second = Unit(1, "b", 640, fallback="c")
+    third = Unit(2, "b", 800, 9, fallback="c")
+    recipe = Recipe((first, second, third))
+    replaced = recipe.with_fallbacks({"b", "a"})
+    assert replaced.units == (first, Unit(1, "c", 640), Unit(2, "c", 800, 9))
+    # A unit's key has no fallback: its results are the same with and without one.
+    kept = recipe.with_fallbacks({"c"})
+    assert kept.units == (first, Unit(1, "b", 640), Unit(2, "b", 800, 9))
 
 
 def test_a_recipe_reads_as_written():
     second = unit(stage=2, matcher='"x"', long_side=800, max_matches=5)
     third = unit(stage=2, matcher='"dkm"', long_side=None, area='"540x720"', stretch="true")
-    recipe = parse(
-        f'description = "two"\n{units(unit(), second, third)}'
-        + "[mkpc]\neps = 0.1\nmin_samples = 7\nexpand_x = 2\n"
-        + '[magsac]\nmethod = "ransac"\nthreshold = 1.5\n[focal]\nscale = 0.2\n[matchers.sift]\nfeatures = 10\n'
-    )
+    text = f'description = "two"\n{units(unit(), second, third)}'
+    text += "[mkpc]\neps = 0.1\nmin_samples = 7\nexpand_x = 2\n"
+    text += '[magsac]\nmethod = "ransac"\nthreshold = 1.5\n'
+    text += "[focal]\nscale = 0.2\n[matchers.sift]\nfeatures = 10\n"
+    recipe = parse(text)
     dkm = Unit(2, "dkm", area="540x720", stretch=True)
     assert recipe.units == (Unit(1, "sift", 640), Unit(2, "x", 800, 5), dkm)
     assert recipe.mkpc == MkpcConfig(eps=0.1, min_samples=7, expand_x=2.0)
+    # "2" and "2.0" are one setting: as an int it would have another key.
     assert type(recipe.mkpc.expand_x) is float
     assert recipe.magsac == RobustConfig(Method.RANSAC, threshold=1.5)
     assert recipe.focal == FocalConfig(scale=0.2)
     assert (recipe.name, recipe.description) == ("mine", "two")
-    assert (options_of(recipe, "sift").features, options_of(recipe, "sift").ratio) == (10, 0.8)
+    options = options_of(recipe, "sift")
+    assert (options.features, options.ratio) == (10, 0.8)
 
 
 def test_a_unit_shows_a_crop_at_its_size():
@@ -115,9 +114,8 @@ def test_a_unit_shows_a_crop_at_its_size():
 
 def unit(**changes):
     keys = {"stage": 1, "matcher": '"sift"', "long_side": 640} | changes
-    return (
-        f"{{ {', '.join(f'{key} = {value}' for key, value in keys.items() if value is not None)} }}"
-    )
+    lines = [f"{key} = {value}" for key, value in keys.items() if value is not None]
+    return f"{{ {', '.join(lines)} }}"
 
 
 @pytest.mark.parametrize(
@@ -161,7 +159,7 @@ def unit(**changes):
         (SIFT + "[magsac]\nthreshold = 0\n", r"threshold must be in \(0, inf\), not 0"),
     ],
 )
-def test_a_recipe_that_makes_no_run_is_refused_in_words_that_help(text, says):
+def test_a_wrong_recipe_is_refused_with_the_key_and_the_known_ones(text, says):
     with pytest.raises(UserError, match=f"'mine'.*{says}"):
         parse(text)
 
@@ -181,10 +179,10 @@ def test_options_that_a_matcher_does_not_have_are_refused():
 
 
 def test_a_recipe_is_found_by_its_name_or_path_and_nowhere_else(tmp_path):
+    # Editors on Windows write a byte order mark.
     (tmp_path / "my own.toml").write_bytes(b"\xef\xbb\xbf" + SIFT.encode())
-    assert load_recipe(str(tmp_path / "my own.toml")) == Recipe(
-        (Unit(1, "sift", 640),), name="my own"
-    )
+    found = load_recipe(str(tmp_path / "my own.toml"))
+    assert found == Recipe((Unit(1, "sift", 640),), name="my own")
     (tmp_path / "a.toml").mkdir()
     (tmp_path / "b.toml").write_bytes(SIFT.encode() + b"# caf\xe9\n")
     os.mkfifo(tmp_path / "pipe.toml")
@@ -212,18 +210,16 @@ ALL = Recipe(tuple(Unit(*name) for name in NAMES), name="all", mkpc=MkpcConfig(e
 
 def test_modes_keep_stage_1_or_show_every_unit_the_whole_image_and_none_twice():
     assert ALL.in_mode(Mode.TWO_STAGE) is ALL
-    stage_1, whole = ALL.in_mode(Mode.STAGE_1), ALL.in_mode(Mode.WHOLE_IMAGES)
+    stage_1 = ALL.in_mode(Mode.STAGE_1)
+    whole = ALL.in_mode(Mode.WHOLE_IMAGES)
     assert [unit.name for unit in stage_1.units] == ["1:sift@640", "1:aliked@640"]
     assert (stage_1.name, stage_1.mkpc) == ("all (stage-1)", ALL.mkpc)
-    assert [unit.name for unit in whole.units] == [
-        "1:sift@640",
-        "1:aliked@800",
-        "1:aliked@640",
-        "1:sift@320",
-    ]
+    # Both units of SIFT at 640 pixels would see the same pictures.
+    names = [unit.name for unit in whole.units]
+    assert names == ["1:sift@640", "1:aliked@800", "1:aliked@640", "1:sift@320"]
 
 
-def test_a_choice_is_a_recipe_and_perhaps_a_mode():
+def test_a_mode_follows_the_last_colon_of_a_choice_if_it_is_one():
     for text, recipe, mode in (
         ("classical", "classical", Mode.TWO_STAGE),
         ("my/own.toml:stage-1", "my/own.toml", Mode.STAGE_1),

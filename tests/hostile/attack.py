@@ -22,7 +22,7 @@ from shared import problems_of
 ROOT = Path(__file__).resolve().parents[2]
 # Of data, for each process; not of address space, of which CUDA builds of PyTorch reserve more.
 MEMORY_KIB = 4 << 20
-HANGS_S = 600
+HANGS_S = 600  # far above the slowest case on a busy machine
 REFUSED = (2,)
 EITHER = (0, 1, 2)  # a valid result, a result that states what is missing, or a clear refusal
 CRASHES = (
@@ -86,7 +86,7 @@ def attack(case: Case, room: Path) -> None:
         status, output = _wait(process, room)
         faults += _faults(case, status, output, room)
         faults += [f"left running: {line}" for line in _orphans(mark)]
-        # At its start
+        # A signal before the program reads its options leaves no file, and cannot.
         was_interrupted = status not in (0, 1) and output.strip() in ("", "error: interrupted")
         if (
             case.submission
@@ -105,9 +105,8 @@ def attack(case: Case, room: Path) -> None:
         f"changed: {name}" for name in sorted(before | after) if before.get(name) != after.get(name)
     ]
     if faults:
-        pytest.fail(
-            "\n".join([case.id, case.command, *faults, f"output:\n{output[-3000:]}"]), pytrace=False
-        )
+        lines = [case.id, case.command, *faults, f"output:\n{output[-3000:]}"]
+        pytest.fail("\n".join(lines), pytrace=False)
 
 
 def prepared(command: str, room: Path) -> int:
@@ -140,7 +139,7 @@ def _start(
             stdin=subprocess.DEVNULL,
             stdout=log,
             stderr=stderr() if stderr else subprocess.STDOUT,
-            start_new_session=True,
+            start_new_session=True,  # so that a case that hangs is killed with its workers
         )
 
 
@@ -184,6 +183,7 @@ def _result_faults(out: Path, status: int) -> Iterator[str]:
 
 def _orphans(mark: str) -> list[str]:
     """Kill the processes of the case that still run, and return their command lines."""
+    # Workers notice the death of their parent within seconds.
     for _ in range(600):
         if not (left := started_with(mark)):
             break

@@ -51,6 +51,7 @@ SCENES = {
 }
 HEADER = "sample_id,fundamental_matrix\n"
 SUBMITTED_NAN = written("sub.csv", f"{HEADER}1,nan nan nan nan nan nan nan nan nan\n")
+# Numbers that a competition's own reader may take, and that no score can use.
 SUBMISSIONS = {
     "a submission of NaN": SUBMITTED_NAN,
     "a submission of huge numbers": written("sub.csv", f"{HEADER}1,1e308 1e308 1 1 1 1 1 1 1\n"),
@@ -61,13 +62,14 @@ SHORT, LONG = ("1s", "0.001s", "3s"), ("99999999999h", "' 60s '")  # limits
 SOON = (0.6, 1.5, 3.0, 6.0)  # Python itself takes 0.1 s to start, more on a busy machine
 ENDS = {"SIGINT": 130, "SIGTERM": 143}
 STATUSES = {name: (0, status, -status + 128) for name, status in ENDS.items()}
+# Signals that the program does not handle: the kernel ends it, and the next run must resume.
 CRUEL = {"SIGKILL": -9, "SIGHUP": -1, "SIGQUIT": -3, "SIGUSR1": -10, "SIGXCPU": -24, "SIGSEGV": -11}
 AGAIN = SUBMIT.replace("quick.toml", "classical")
 WORKING = f"{WITHOUT_LIMIT.replace('quick.toml', 'classical')} --workers"
 
 
 def sends(name: str, *after: float, group: bool = False) -> Act:
-    """Send the signal after so many seconds, and again after each further time."""
+    """Send the signal after these seconds, and again after each further number of seconds."""
 
     def act(process: "subprocess.Popen[bytes]") -> None:
         for seconds in after:

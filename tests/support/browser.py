@@ -37,7 +37,9 @@ class Page:
     """A page with its console. Positions are in CSS pixels of the window."""
 
     def __init__(self, send: Any, receive: Any) -> None:
-        self._to, self._from, self._number = send, receive, 0
+        self._to = send
+        self._from = receive
+        self._number = 0
         self.errors: list[str] = []  # of the console, and exceptions
         self.requests: list[str] = []  # addresses that the page asked for
         (target,) = (
@@ -72,6 +74,7 @@ class Page:
     def drag(self, x: float, y: float, dx: float, dy: float = 0.0) -> None:
         self.mouse("moved", x, y)
         self.mouse("pressed", x, y, button="left", buttons=1, clickCount=1)
+        # Several moves, as a hand makes them: a page may ignore a single jump.
         for step in (0.25, 0.5, 0.75, 1.0):
             self.mouse("moved", x + step * dx, y + step * dy, button="left", buttons=1)
         self.mouse("released", x + dx, y + dy, button="left", clickCount=1)
@@ -102,9 +105,9 @@ class Page:
     def _ask(self, method: str, session: str = "", **parameters: Any) -> dict[str, Any]:
         self._number += 1
         message = {"id": self._number, "method": method, "params": parameters}
-        self._to.write(
-            json.dumps(message | ({"sessionId": session} if session else {})).encode() + b"\0"
-        )
+        if session:
+            message["sessionId"] = session
+        self._to.write(json.dumps(message).encode() + b"\0")  # a zero byte ends each message
         self._to.flush()
         while (answer := self._read()).get("id") != self._number:
             self._note(answer)

@@ -39,7 +39,7 @@ def die() -> None:
 
 
 def hang() -> None:
-    """Until it is killed; a file tells which process hangs."""
+    """Sleep until killed; a file has the id of the process."""
     (Path(os.environ["MKPC_TEST_HOME"]) / "hangs").write_text(str(os.getpid()))
     time.sleep(1000)
 
@@ -50,6 +50,7 @@ def lack_an_image() -> None:
 
 def exhaust_memory() -> None:
     """Ask for more than a limit allows, 64 MiB above what there is now."""
+    # A fixed limit would depend on what torch maps at its import.
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (used + (64 << 20), resource.RLIM_INFINITY))
     np.ones(1 << 28)
@@ -66,8 +67,9 @@ def break_device() -> NoReturn:
 
 
 def breaks_after(pairs: int) -> Callable[[int], int]:
-    """Answers of a matcher whose device fails after so many pairs, and then at everything in this
-    process.
+    """Answers of a matcher whose device fails after ``pairs`` pairs.
+
+    From then on it fails at everything in this process, as after a real CUDA error.
     """
     calls = count()
     return lambda _: 150 if next(calls) < pairs else break_device()
@@ -136,7 +138,7 @@ def scenes_by(
 
 
 def choose_scene_for_all_but_the_first(job: SceneJob) -> Solution:
-    """As a reconstruction would, without cameras; it makes as many points as there are matches."""
+    """Answer as a reconstruction would, with one point for each match."""
     by_scene = (Choice(SCENE_F, Reason.SCENE),) * (len(job.pairs) - 1)
     choices = (Choice(None, Reason.CONTRADICTION), *by_scene)
     names = tuple(sorted({image.name for pair in job.pairs for image in pair.images}))
@@ -157,7 +159,7 @@ def befall(fault: Callable[[], None], job: SceneJob) -> Solution:
 
 
 def die_within_pycolmap(job: SceneJob) -> Solution:
-    """When its database is written, and cameras are to be found."""
+    """Die after its database is written, when cameras are computed."""
     import pycolmap
 
     pycolmap.GlobalPipeline = lambda *_: die()

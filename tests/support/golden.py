@@ -1,6 +1,4 @@
-"""Golden vectors beside the repository, ``../shared/golden``; tests that need them are skipped
-without them.
-"""
+"""Golden vectors of ``../shared/golden``; tests that need them are skipped without them."""
 
 import re
 import runpy
@@ -82,11 +80,8 @@ class Within:
 
     def of(self, expected):
         sizes = expected.double().abs()
-        return (
-            self.absolute
-            + self.relative * sizes
-            + self.share * (sizes.max() if sizes.numel() else 0)
-        )
+        largest = sizes.max() if sizes.numel() else 0
+        return self.absolute + self.relative * sizes + self.share * largest
 
 
 class Stage(NamedTuple):
@@ -121,12 +116,11 @@ def compared(values, golden, tolerances, suffix=""):
     Tolerances are by patterns of names; of others the difference must be 0.
     """
     names = [name for name in values if f"{name}{suffix}" in golden]
-    assert len(names) >= 2
+    assert len(names) >= 2  # names that do not agree would compare nothing
     for name in names:
         expected = golden[f"{name}{suffix}"]
-        within = next(
-            (value for pattern, value in tolerances.items() if re.match(pattern, name)), 0.0
-        )
+        fitting = [value for pattern, value in tolerances.items() if re.match(pattern, name)]
+        within = fitting[0] if fitting else 0.0
         yield Stage(f"{name}{suffix}", values[name].reshape(expected.shape), expected, within)
 
 

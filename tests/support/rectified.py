@@ -1,7 +1,7 @@
 """A matcher whose answers are known, and runs of the engine with it.
 
-It sees every pair as rectified: a point of image 1 is the point of image 0 moved along its row, so that F is
-[e_x]_x, and each match that it gives is an inlier.
+It sees every pair as rectified: a point of image 1 is the point of image 0, moved along its row.
+So F is [e_x]_x, and each of its matches is an inlier.
 """
 
 import time
@@ -58,29 +58,29 @@ class RectifiedMatcher:
         self.calls.append((max(seen0.view.content), seen0.brightness))
         time.sleep(self.seconds)
         count = self.matches(seen0.brightness)
+        # Other points for each pair and unit, and the same in every run.
         rng = np.random.default_rng(seen0.brightness + 1000 * max(seen0.view.content))
         points0 = rng.uniform(4, 60, (count, 2))
         points1 = points0 + np.column_stack([rng.uniform(0, 15, count), np.zeros(count)])
-        return Matches(
-            seen0.view.from_image(points0), seen1.view.from_image(points1), rng.uniform(size=count)
-        )
+        scores = rng.uniform(size=count)
+        return Matches(seen0.view.from_image(points0), seen1.view.from_image(points1), scores)
 
 
-SWEEP, SECOND, THIRD = (
-    Unit(1, "rectified", 96),
-    Unit(2, "rectified", 128),
-    Unit(1, "rectified", 160),
-)
+# A unit of stage 2 between two of stage 1: the third changes the crops of the second.
+SWEEP = Unit(1, "rectified", 96)
+SECOND = Unit(2, "rectified", 128)
+THIRD = Unit(1, "rectified", 160)
 THREE_UNITS = Recipe((SWEEP, SECOND, THIRD))
 SIZE = Size(80, 72)
 
 
 def write_pairs(directory: Path, count: int) -> list[Pair]:
-    """Pairs of flat 80 x 72 images, each with a brightness of its own: 10, 11, ..."""
+    """Pairs of flat 80 x 72 images. Each pair has another brightness: 10, 11, ..."""
     pairs = []
     directory.mkdir(parents=True, exist_ok=True)
     for index in range(count):
         paths = [str(directory / f"{index:03d}_{side}.png") for side in (0, 1)]
+        # The brightness is all that the matcher knows of a pair.
         for path in paths:
             cv2.imwrite(path, np.full((72, 80, 3), 10 + index, np.uint8))
         pairs.append(Pair(f"set;{index:03d}", "set", *paths))

@@ -1,5 +1,5 @@
-"""Stand-in weights that come from code alone: of no use in earnest, but networks respond to texture
-and match.
+"""Stand-in weights made by code alone. They are useless for photographs, but networks respond to
+texture and match.
 
 Every number is made of bytes of SHAKE-256 of a name, so that no generator of numpy's or torch's can
 change it.
@@ -24,7 +24,7 @@ from mkpc_kaggle.matchers.networks.warp_refiner import WarpRefinerShape
 class StandIn:
     """How a network's stand-in weights depart from the rule of :func:`value_of`.
 
-    ``gain``: of all maps, beside their fan-in. ``scales``: factors of the parameters whose names match.
+    ``gain``: factor of all maps, besides their fan-in. ``scales``: factors of the parameters whose names match.
     ``values``: set for those parameters, or for single entries, ``"convPb.bias[64]"``.
     """
 
@@ -76,7 +76,7 @@ STAND_INS = {
 }
 
 
-# RoMa with fewer channels, a thirtieth of its size: most of what is left is VGG.
+# RoMa with fewer channels, a thirtieth of its size: most of the remaining weights are VGG's.
 REFINERS = {
     16: (64, 16, 7, 369),
     8: (48, 8, 3, 153),
