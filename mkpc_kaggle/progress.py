@@ -1,6 +1,7 @@
 """Progress of waits outside of a run: rendering, pip, digests, drawing."""
 
 import os
+import shutil
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -33,7 +34,11 @@ def counted(items: Sequence[Item], what: str, unit: str) -> Iterator[Item]:
     if is_redrawn():
         from tqdm import tqdm
 
-        yield from tqdm(items, desc=what, unit=unit, delay=MAX_SILENCE_S, leave=False)
+        # tqdm prints nothing on a terminal that states a width of 0, as those of `script` do.
+        columns = shutil.get_terminal_size().columns
+        yield from tqdm(
+            items, desc=what, unit=unit, delay=MAX_SILENCE_S, leave=False, ncols=columns
+        )
         return
     written = time.monotonic()
     for done, item in enumerate(items):
