@@ -34,11 +34,10 @@ def counted(items: Sequence[Item], what: str, unit: str) -> Iterator[Item]:
     if is_redrawn():
         from tqdm import tqdm
 
-        # tqdm prints nothing on a terminal that states a width of 0, as those of `script` do.
-        columns = shutil.get_terminal_size().columns
-        yield from tqdm(
-            items, desc=what, unit=unit, delay=MAX_SILENCE_S, leave=False, ncols=columns
-        )
+        # tqdm prints nothing on a terminal that states no size, as those of `script` do.
+        columns, rows = shutil.get_terminal_size()
+        size = {"ncols": columns, "nrows": rows}
+        yield from tqdm(items, desc=what, unit=unit, delay=MAX_SILENCE_S, leave=False, **size)
         return
     written = time.monotonic()
     for done, item in enumerate(items):

@@ -1,0 +1,32 @@
+"""Bars of waits outside of a run: redrawn on a terminal, lines elsewhere."""
+
+import os
+import sys
+from pathlib import Path
+
+from mkpc_kaggle import progress
+
+
+def test_a_terminal_shows_a_bar_even_if_it_states_no_size(monkeypatch):
+    ours, theirs = os.openpty()
+    os.set_blocking(ours, False)  # without a bar there is nothing to read
+    monkeypatch.delenv("JPY_PARENT_PID", raising=False)
+    monkeypatch.setattr(progress, "MAX_SILENCE_S", 0.0)
+    with Path(os.ttyname(theirs)).open("w") as stream, monkeypatch.context() as patch:
+        patch.setattr(sys, "stderr", stream)
+        assert list(progress.counted("abc", "letters", "letter")) == ["a", "b", "c"]
+    assert b"letters:" in os.read(ours, 1000)
+    os.close(ours)
+    os.close(theirs)
+
+
+def test_a_notebook_and_a_file_get_lines(monkeypatch, capsys):
+    monkeypatch.setattr(progress, "LINE_INTERVAL_S", 0.0)
+    assert list(progress.counted("abc", "letters", "letter")) == ["a", "b", "c"]
+    lines = capsys.readouterr().err.splitlines()
+    assert lines == ["letters: 0/3", "letters: 1/3", "letters: 2/3"]
+
+
+def test_short_waits_print_nothing(capsys):
+    list(progress.counted("abc", "letters", "letter"))
+    assert capsys.readouterr() == ("", "")
