@@ -32,7 +32,7 @@ from mkpc_kaggle.scene.view_graph import BatchImage
 
 TABLE = "table of pairs"  # the key of the table; each publication replaces the former one
 NOT_REACHED = "not reached in time"
-NOT_RECONSTRUCTED = "not reconstructed in time"
+NOT_RECONSTRUCTED = "not reconstructed yet"
 NO_CAMERAS = "no matches connect its images"
 MAX_DRAWN_POINTS = 5000  # of a model, which are 60 kB in the store and enough for a picture
 

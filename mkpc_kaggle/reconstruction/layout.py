@@ -99,7 +99,7 @@ def write_sparse(directory: Path, names: Mapping[str, str], seconds: float | Non
     sender.close()
     try:
         if not receiver.poll(seconds):
-            return "the time is up"
+            return "no time was left"
         with suppress(EOFError):
             return str(receiver.recv())
         process.join()

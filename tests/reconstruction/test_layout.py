@@ -158,7 +158,7 @@ def test_a_model_that_cannot_be_read_is_a_line_and_the_former_folder_stays(tmp_p
     (folder / "models" / "0" / "cameras.bin").write_text("damaged")
     assert write_sparse(folder, {}, None) != ""
     assert (folder / "sparse" / "0" / "points3D.bin").read_text() == "former"
-    assert write_sparse(out / "set", {}, 0.0) == "the time is up"
+    assert write_sparse(out / "set", {}, 0.0) == "no time was left"
 
 
 def test_a_folder_called_images_below_another_dataset_keeps_its_place(tmp_path):
