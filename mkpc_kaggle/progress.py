@@ -36,8 +36,15 @@ def counted(items: Sequence[Item], what: str, unit: str) -> Iterator[Item]:
 
         # tqdm prints nothing on a terminal that states no size, as those of `script` do.
         columns, rows = shutil.get_terminal_size()
-        size = {"ncols": columns, "nrows": rows}
-        yield from tqdm(items, desc=what, unit=unit, delay=MAX_SILENCE_S, leave=False, **size)
+        yield from tqdm(
+            items,
+            desc=what,
+            unit=unit,
+            delay=MAX_SILENCE_S,
+            leave=False,
+            ncols=columns,
+            nrows=rows,
+        )
         return
     written = time.monotonic()
     for done, item in enumerate(items):

@@ -1,6 +1,8 @@
 """Shared fixtures: a small rendered data set, and a matcher whose answers are known."""
 
 import os
+import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -12,7 +14,9 @@ from shared import write_small_recipe
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.demo import DemoSet, write_demo
 from mkpc_kaggle.engine.request import RunReport
-from mkpc_kaggle.package.wheels import BUNDLED
+from mkpc_kaggle.package import package
+from mkpc_kaggle.package.package import find_checkout
+from mkpc_kaggle.package.wheels import BUNDLED, build_wheel
 from mkpc_kaggle.weights import store as weight_store
 
 # Before torch is imported, here and in the processes of the tests: their tensors are small, and on
@@ -70,6 +74,20 @@ def wheels(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name in BUNDLED:
         pack_wheel(name, directory)
     return directory
+
+
+@pytest.fixture(scope="module")
+def built_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Let all packages of a module have one wheel of ours: pip takes seconds to build it."""
+    wheel = build_wheel(find_checkout(), tmp_path_factory.mktemp("own"))
+
+    def copied(_: Path, directory: Path) -> Path:
+        directory.mkdir(parents=True)
+        return Path(shutil.copy2(wheel, directory))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(package, "build_wheel", copied)
+        yield
 
 
 @pytest.fixture

@@ -24,6 +24,9 @@ def image(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_image(tmp_path_factory.mktemp("image"))
 
 
+pytestmark = pytest.mark.usefixtures("built_once")
+
+
 class Kaggle:
     """A copy of Kaggle's directories: ``input`` with the competition and our dataset, and
     ``working``.

@@ -44,7 +44,7 @@ FILES = (
 
 
 @pytest.fixture(scope="module", autouse=True)
-def own_manifest(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+def own_manifest(tmp_path_factory: pytest.TempPathFactory, built_once: None) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.delenv("MKPC_WEIGHTS", raising=False)
         patch.setattr(store, "KAGGLE_INPUT", tmp_path_factory.mktemp("kaggle"))
@@ -266,7 +266,10 @@ def test_weights_that_no_network_takes_are_refused_and_others_named_with_their_m
 
 
 def test_the_wheel_holds_what_a_run_needs_and_asks_for_what_is_bundled(tmp_path, wheels):
-    wheel = build_wheel(find_checkout(), tmp_path)
+    wheel = build_wheel(find_checkout(), tmp_path / "one")
+    # Times or the order of files would make each upload a new version of the dataset.
+    again = build_wheel(find_checkout(), tmp_path / "other")
+    assert wheel.read_bytes() == again.read_bytes()
     lines = install_lines(wheel, wheels.iterdir())
     asked = [line.replace("_", "-").partition(">=")[0] for line in lines]
     pinned = [pin.partition("==") for pin in pins(find_checkout())]
