@@ -1,4 +1,4 @@
-"""Progress of waits outside of a run: rendering, pip, digests, drawing."""
+"""Progress of waits outside of a run: rendering, pip and digests."""
 
 import os
 import shutil
