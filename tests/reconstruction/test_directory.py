@@ -30,6 +30,7 @@ def files_of(folder: Path) -> dict[str, str]:
 @pytest.fixture
 def out(tmp_path: Path) -> Path:
     """What a run has made of two datasets; and an image of the user's next to it."""
+    # Two datasets, called a and b
     with output_directory(tmp_path / "out", "ab", "imc2025"):
         for name in "ab":
             write(tmp_path / "out" / name, FILES)
@@ -69,6 +70,7 @@ def test_a_link_or_a_file_of_the_users_in_the_place_of_a_result_is_refused(tmp_p
 )
 def test_a_directory_that_is_neither_empty_nor_ours_is_refused(tmp_path, name):
     write(tmp_path / "out", [name])
+    # A link is not followed: it may lead anywhere.
     if name == "link":
         (tmp_path / "out" / "link").unlink()
         (tmp_path / "out" / "link").symlink_to(tmp_path)
@@ -78,6 +80,7 @@ def test_a_directory_that_is_neither_empty_nor_ours_is_refused(tmp_path, name):
 
 
 def test_results_that_only_earlier_runs_made_are_removed_when_the_run_has_ended(out, capsys):
+    # Next to results, and in a hidden folder that looks like one of ours
     write(out, ["notes.txt", "a/notes.txt", ".new-1/mine"], "the user's")
     with output_directory(out, ["a"]):
         assert (out / "b" / "database.db").exists()
@@ -94,6 +97,7 @@ def test_results_that_only_earlier_runs_made_are_removed_when_the_run_has_ended(
 
 def test_a_result_that_the_user_has_changed_is_not_removed(out):
     changed = ["submission.csv", "b/models/0/images.bin"]
+    # After the run, which knows the digests of its results
     write(out, changed, "the user's")
     for datasets, form in (("ab", "imc2025"), ("a", None), ("a", None)):
         with output_directory(out, datasets, form):
@@ -106,6 +110,7 @@ def test_a_result_that_the_user_has_changed_is_not_removed(out):
 @pytest.mark.parametrize("name", ["../images/database.db", "{}/images/database.db"])
 def test_a_name_in_a_mark_never_leads_out_of_the_directory(tmp_path, out, name):
     write(tmp_path / "images", ["database.db"])
+    # Somebody has written another path into our mark.
     marked = json.loads((out / MARK).read_text())
     (out / MARK).write_text(json.dumps(marked | {name.format(tmp_path): marked["a/database.db"]}))
     with output_directory(out, "ab", "imc2025"):
@@ -120,6 +125,7 @@ def test_a_name_in_a_mark_never_leads_out_of_the_directory(tmp_path, out, name):
 def test_a_directory_that_cannot_be_written_is_found_before_any_work(tmp_path, out, datasets):
     (tmp_path / "file").touch()
     os.mkfifo(tmp_path / "pipe")
+    # A link to itself leads nowhere.
     (tmp_path / "loop").symlink_to("loop")
     with (
         pytest.raises(UserError, match="cannot be written"),
@@ -138,6 +144,7 @@ def test_nothing_that_is_read_lies_in_the_directory_of_results(tmp_path, monkeyp
         require_directory_apart(Path("out"), [Path(place)], [])
     with pytest.raises(UserError, match="are in each other's way"):
         require_directory_apart(Path("out"), [], [Path(place)])
+    # The name of a recipe is no path.
     require_directory_apart(Path("out"), [Path("auto")], [])
 
 
@@ -160,6 +167,7 @@ def test_former_files_stay_until_the_new_ones_are_whole(tmp_path, monkeypatch):
     with pytest.raises(OSError, match="No space"):
         write_files(is_full=True)
     assert files_of(tmp_path) == dict.fromkeys(FILES, "former")
+    # Links of /proc name the files that are synced.
     synced = set()
     monkeypatch.setattr(
         os, "fsync", lambda number: synced.add(Path(f"/proc/self/fd/{number}").readlink().name)

@@ -47,11 +47,13 @@ def load_as_gsplat(data_dir: Path) -> Splats:
     by_camera = {}
     for _ in range(read("Q")[0]):
         number, model, _, _ = read("iiQQ")
+        # gsplat undistorts all others, which changes the images.
         assert model in (0, 1), "SIMPLE_PINHOLE or PINHOLE: no undistortion is needed"
         focals = read("d" if model == 0 else "dd")
         cx, cy = read("dd")
         by_camera[number] = np.array([[focals[0], 0, cx], [0, focals[-1], cy], [0, 0, 1]])
     stream.close()
+    # Each image: pose, camera, name, and its points, which are skipped
     stream = (folder / "images.bin").open("rb")
     found = {}
     for _ in range(read("Q")[0]):
@@ -60,12 +62,14 @@ def load_as_gsplat(data_dir: Path) -> Splats:
         while (letter := stream.read(1)) != b"\0":
             name += letter
         stream.seek(24 * read("Q")[0], os.SEEK_CUR)
+        # COLMAP's files have the real part first, pycolmap has it last.
         R = pycolmap.Rotation3d(np.array([x, y, z, w])).matrix()
         pose = np.block([[R, np.array(t)[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]])
         found[name.decode()] = pose, by_camera[camera]
     stream.close()
     stream = (folder / "points3D.bin").open("rb")
-    points, colours = [], []
+    points = []
+    colours = []
     for _ in range(read("Q")[0]):
         _, *position, red, green, blue, _ = read("Q3d3Bd")
         stream.seek(8 * read("Q")[0], os.SEEK_CUR)
@@ -95,6 +99,7 @@ def test_a_loader_by_the_rules_of_gsplat_finds_images_cameras_and_points(laid_ou
     for path in found.paths:
         assert path.read_bytes() == (root / "set" / path.name).read_bytes()
     truth = [MixedMatcher().scenes[0].cameras[f"{n:04}"] for n in range(FIRST)]
+    # Relative poses do not depend on the world's axes.
     turned = found.camera_to_world[3, :3, :3].T @ found.camera_to_world[0, :3, :3]
     np.testing.assert_allclose(turned, truth[3].R @ truth[0].R.T, atol=0.01)
     for K, camera in zip(found.intrinsics, truth, strict=True):
@@ -130,12 +135,14 @@ def test_links_follow_the_folder_and_nothing_of_the_users_is_removed(tmp_path):
         "mine.txt",
     ]
     assert (out / "images" / "01.png").readlink() == files[1].resolve()
+    # A link to the former path would lead nowhere.
     moved = files[1].rename(tmp_path / "01.png")
     write_images(out, [moved, files[2]])
     assert (out / "images" / "01.png").readlink() == moved.resolve()
 
 
 def test_where_links_fail_there_are_copies(tmp_path, monkeypatch):
+    # As on a file system without links, such as a USB stick's
     def refuse(*_: object) -> None:
         raise OSError(1, "Operation not permitted")
 
@@ -155,6 +162,7 @@ def test_a_model_that_cannot_be_read_is_a_line_and_the_former_folder_stays(tmp_p
     (folder / "models" / "0").mkdir(parents=True)
     (folder / "sparse" / "0").mkdir(parents=True)
     (folder / "sparse" / "0" / "points3D.bin").write_text("former")
+    # pycolmap ends its process on some damage; here it raises.
     (folder / "models" / "0" / "cameras.bin").write_text("damaged")
     assert write_sparse(folder, {}, None) != ""
     assert (folder / "sparse" / "0" / "points3D.bin").read_text() == "former"
@@ -162,6 +170,7 @@ def test_a_model_that_cannot_be_read_is_a_line_and_the_former_folder_stays(tmp_p
 
 
 def test_a_folder_called_images_below_another_dataset_keeps_its_place(tmp_path):
+    # OUT/images would be both a dataset and links.
     root = write_flat(tmp_path / "in", 4)
     write_flat(root / "images", 4)
     run(root, tmp_path / "out")
@@ -185,8 +194,10 @@ def test_a_folder_that_grew_keeps_its_coordinates(tmp_path, dataset):
     (line,) = keep_coordinates(out, root, after)
     name = "images" if dataset == "." else dataset
     assert line.startswith(f"{name}: 5 cameras keep the coordinates of the last run and moved by ")
-    old, new = cameras(before), cameras(after)
+    old = cameras(before)
+    new = cameras(after)
     assert (len(old), len(new)) == (5, 6)
+    # Cameras move a little, since there are more matches.
     size = np.std([each.camera.centre for each in old.values()], axis=0).max()
     for name, found in old.items():
         np.testing.assert_allclose(new[name].camera.centre, found.camera.centre, atol=0.02 * size)

@@ -63,6 +63,7 @@ def write_masks(folder: Path, root: Path, left: int = 400) -> Path:
     """Write masks that leave the columns from ``left`` on."""
     folder.mkdir(exist_ok=True)
     mask = np.zeros((SIZE.height, SIZE.width), np.uint8)
+    # 1 is nearly black, but not black.
     mask[:, left:] = 1
     for image in root.iterdir():
         cv2.imwrite(str(folder / f"{image.name}.png"), mask)
@@ -99,7 +100,9 @@ def write_masks(folder: Path, root: Path, left: int = 400) -> Path:
 def test_a_bad_table_of_intrinsics_is_one_line_and_nothing_is_touched(
     tmp_path, capsys, table, reason
 ):
-    root, out, file = write_flat(tmp_path / "images", 3), tmp_path / "out", tmp_path / "known.csv"
+    root = write_flat(tmp_path / "images", 3)
+    out = tmp_path / "out"
+    file = tmp_path / "known.csv"
     if table is not None:
         file.write_text(table)
     before = contents(tmp_path)
@@ -128,7 +131,8 @@ BAD_MASKS = {
 
 @pytest.mark.parametrize("reason", BAD_MASKS)
 def test_bad_masks_are_one_line_and_nothing_is_touched(tmp_path, capsys, reason):
-    root, out = write_flat(tmp_path / "images", 3), tmp_path / "out"
+    root = write_flat(tmp_path / "images", 3)
+    out = tmp_path / "out"
     BAD_MASKS[reason](tmp_path / "masks", root)
     assert run_command("reconstruct", root, "--out", out, "--masks", tmp_path / "masks") == 2
     (line,) = capsys.readouterr().err.splitlines()
@@ -138,6 +142,7 @@ def test_bad_masks_are_one_line_and_nothing_is_touched(tmp_path, capsys, reason)
 
 def test_masks_among_the_images_are_refused(tmp_path):
     root = write_flat(tmp_path / "images", 3)
+    # As a user may well put them
     folder = write_masks(root / "masks", root)
     found = [file for files in read_folder(root).values() for file in files]
     with pytest.raises(UserError, match="masks count as images"):
@@ -152,23 +157,27 @@ def test_black_pixels_of_a_mask_are_left_out(tmp_path):
     root = write_flat(tmp_path / "images", 2)
     masks = Masks.of_folder(write_masks(tmp_path / "masks", root), root, root.iterdir())
     image = str(root / "00.png")
+    # Pixels have their centres at integers: 399.4 is in column 399, and 399.6 in column 400.
     points = np.array([[399.4, 10], [399.6, 10], [799.4, 599.4], [0, 0]], np.float32)
     assert MaskReader(masks).shows(image, points, SIZE).tolist() == [False, True, True, False]
     assert MaskReader(masks).shows("another", points, SIZE).all()
 
 
 def test_masked_matches_are_dropped_before_the_best_are_chosen(tmp_path):
-    root, out = write_flat(tmp_path / "images", FIRST), tmp_path / "out"
+    root = write_flat(tmp_path / "images", FIRST)
+    out = tmp_path / "out"
     masks = Masks.of_folder(write_masks(tmp_path / "masks", root, 300), root, root.iterdir())
     free = run(root, tmp_path / "free")
     result = run(root, out, masks=masks)
     for record, other in zip(result.report.records, free.report.records, strict=True):
+        # Masks drop matches before the best are counted, so others may follow.
         assert 0 < record.matches < other.matches
     assert len(cameras(result)) == FIRST
 
 
 def test_another_mask_is_matched_again_and_other_intrinsics_are_not(tmp_path):
-    root, out = write_flat(tmp_path / "images", FIRST), tmp_path / "out"
+    root = write_flat(tmp_path / "images", FIRST)
+    out = tmp_path / "out"
     run(root, out)
     before = contents(out)
     table = tmp_path / "known.csv"
@@ -177,6 +186,7 @@ def test_another_mask_is_matched_again_and_other_intrinsics_are_not(tmp_path):
     known = read_intrinsics_table(table, root, sorted(root.iterdir()))
     matcher = MixedMatcher()
     result = run(root, out, matcher, known=known)
+    # The points do not depend on cameras.
     assert matcher.calls == [], "intrinsics change scenes alone"
     assert cameras(result)["00.png"].focal == pytest.approx(truth[0, 0], abs=1e-9)
     assert contents(out) != before
@@ -188,7 +198,9 @@ def test_another_mask_is_matched_again_and_other_intrinsics_are_not(tmp_path):
             matcher = MixedMatcher()
             run(root, out, matcher, known=known, masks=masks)
             assert len(matcher.calls) == calls
+        # Another mask under the same name
         write_masks(folder, root, 250)
+    # A mask without black pixels, of one image
     cv2.imwrite(str(folder / "00.png.png"), np.ones((SIZE.height, SIZE.width), np.uint8))
     matcher = MixedMatcher()
     run(root, out, matcher, known=known, masks=Masks.of_folder(folder, root, root.iterdir()))
@@ -218,7 +230,8 @@ class StoppingMatcher(MixedMatcher):
 
 @pytest.mark.parametrize("is_late", [False, True])
 def test_a_run_with_priors_that_was_ended_early_continues_to_the_same_bytes(tmp_path, is_late):
-    root, out = write_flat(tmp_path / "images", FIRST), tmp_path / "out"
+    root = write_flat(tmp_path / "images", FIRST)
+    out = tmp_path / "out"
     table = tmp_path / "known.csv"
     table.write_text(
         f"{HEAD}00.png,SIMPLE_PINHOLE,901 400 300,fixed\n*,SIMPLE_PINHOLE,900 400 300,9\n"
@@ -228,9 +241,11 @@ def test_a_run_with_priors_that_was_ended_early_continues_to_the_same_bytes(tmp_
     masks = Masks.of_folder(folder, root, root.iterdir())
     whole = MixedMatcher()
     run(root, tmp_path / "whole", whole, known=known, masks=masks)
+    # The calls of all runs that were ended
     calls = 0
     for last in (1, 4, 7):
         matcher = StoppingMatcher(last=last, is_late=is_late)
+        # The clock jumps when the matcher says so.
         budget = Budget(0.0, 500.0, clock=lambda matcher=matcher: matcher.seconds)
         result = run(
             root,
@@ -258,7 +273,9 @@ IN_OUT = {
 
 @pytest.mark.parametrize("option", IN_OUT)
 def test_priors_in_the_directory_of_results_are_refused_and_stay(tmp_path, capsys, option):
-    root, out = write_flat(tmp_path / "images", 3), tmp_path / "out"
+    root = write_flat(tmp_path / "images", 3)
+    out = tmp_path / "out"
+    # Both are names of results.
     given = IN_OUT[option](out)
     out.mkdir()
     if option == "--masks":
@@ -276,6 +293,7 @@ def test_the_table_is_read_in_the_order_of_its_rows(tmp_path):
     root = write_flat(tmp_path / "in" / "set", 3).parent
     file = tmp_path / "known.csv"
     with file.open("w", newline="") as stream:
+        # The first row that fits counts, so the pattern comes last.
         rows = [
             ("set/00.png", "OPENCV", "900 901 400 300 .1 0 0 0", "fixed"),
             ("*", "SIMPLE_PINHOLE", "850 400 300", "5"),
@@ -316,7 +334,9 @@ def test_python_takes_masks_and_intrinsics_as_the_command_does(tmp_path):
         given = {"synthetic": MixedMatcher()}
         return reconstruct(files, RECIPE, device="cpu", matchers=given, **priors)
 
+    # Without priors, to compare with
     (free,) = models()
+    # Names are relative to the images' own folder, as no other is known.
     masks = write_masks(tmp_path / "masks", root / "set", 300)
     (found,) = models(masks=masks, intrinsics=table)
     focals = {Path(each.image.name).name: each.focal for each in found.images}

@@ -44,6 +44,7 @@ from mkpc_kaggle.scene.likeness import local_features, most_alike, shortlist
 from mkpc_kaggle.scene.reconstruction import RegisteredImage
 
 RECIPE = for_cameras(Recipe((Unit(1, "synthetic", SIZE.width),), magsac=QUICK))
+# The brightness of a flat image is its number.
 FIRST, SECOND, OTHERS = 6, 4, 1  # images of two scenes, and of none
 
 
@@ -58,8 +59,10 @@ class MixedMatcher(SyntheticMatcher):
         return synthetic_scene(FIRST, points=500), synthetic_scene(SECOND, points=500, seed=7)
 
     def _match(self, seen0: Seen, seen1: Seen) -> Matches:
-        first, second = number_of(seen0), number_of(seen1)
+        first = number_of(seen0)
+        second = number_of(seen1)
         self.calls.append((first, second))
+        # Both in one scene: its matches. Otherwise a few wrong ones, as real matchers find.
         for scene, start, count in ((self.scenes[0], 0, FIRST), (self.scenes[1], FIRST, SECOND)):
             if start <= first < second < start + count:
                 names = [f"{first - start:04}", f"{second - start:04}"]
@@ -121,6 +124,7 @@ def test_mixed_scenes_are_a_model_each_and_foreign_images_are_in_none(mixed):
         sorted(image.name for image in model.images.values() if image.has_pose) for model in models
     ]
     assert names == [[f"{n:02}.png" for n in range(6)], [f"{n:02}.png" for n in range(6, 10)]]
+    # The foreign image has wrong matches with all others.
     assert not (out / "models" / "2").exists()
     assert sorted(cameras(result)) == sorted(names[0] + names[1])
     assert [model.num_points3D() > 100 for model in models] == [True, True]
@@ -180,11 +184,13 @@ def test_without_weights_one_unit_of_rootsift_runs(nowhere_else, name, more, uni
     assert kept == (units or [unit.name for unit in recipe.units])
 
 
+# Upright, on both sides, and upside down
 ORIENTATIONS = (1, 6, 8, 3, 6, 1)  # of the images of a phone, by EXIF
 
 
 def test_colmap_goes_on_with_photographs_that_exif_turns(tmp_path):
-    root, out = write_flat(tmp_path / "images", FIRST), tmp_path / "out"
+    root = write_flat(tmp_path / "images", FIRST)
+    out = tmp_path / "out"
     for number, orientation in enumerate(ORIENTATIONS):
         path = root / f"{number:02}.png"
         cv2.imwrite(str(path), np.rot90(flat(number, SIZE), -TURNS.get(orientation, 0)))
@@ -192,6 +198,7 @@ def test_colmap_goes_on_with_photographs_that_exif_turns(tmp_path):
     result = run(root, out)
     sizes = {f"{n:02}.png": SIZE if o in (1, 3) else SIZE[::-1] for n, o in enumerate(ORIENTATIONS)}
     assert {name: record.image.size for name, record in cameras(result).items()} == sizes
+    # COLMAP's own mapper, from our database and the user's photographs
     settings = {"min_model_size": 3, "random_seed": 0, "extract_colors": True, "num_threads": 1}
     options = pycolmap.IncrementalPipelineOptions(settings)
     (model,) = pycolmap.incremental_mapping(out / "database.db", root, tmp_path, options).values()
@@ -203,6 +210,7 @@ def test_colmap_goes_on_with_photographs_that_exif_turns(tmp_path):
         )
         assert picture.shape[1::-1] == size
     flattened = pycolmap.Reconstruction(tmp_path / "flat" / "sparse")
+    # Sizes by EXIF's orientation would be exchanged.
     undistorted = {
         image.name: (image.camera.width, image.camera.height) for image in flattened.images.values()
     }
@@ -217,9 +225,11 @@ def test_colmap_goes_on_with_photographs_that_exif_turns(tmp_path):
 
 
 def test_results_that_were_removed_are_made_again_and_an_image_that_was_absent_comes_back(tmp_path):
-    root, out = write_flat(tmp_path / "images", 4), tmp_path / "out"
+    root = write_flat(tmp_path / "images", 4)
+    out = tmp_path / "out"
     run(root, out)
     before = contents(out)
+    # The store still has the scene, but its files are gone.
     for removed in ("models/0/points3D.bin", "database.db"):
         (out / removed).unlink()
         matcher = MixedMatcher()
@@ -234,6 +244,7 @@ def test_results_that_were_removed_are_made_again_and_an_image_that_was_absent_c
 
 def test_a_folder_in_the_folder_is_a_dataset_and_files_of_one_content_share_a_camera(tmp_path):
     write_flat(tmp_path / "images" / "a", 5)
+    # The same content under another name
     (tmp_path / "images" / "a" / "copy.png").write_bytes(
         (tmp_path / "images" / "a" / "00.png").read_bytes()
     )
@@ -249,6 +260,7 @@ def test_a_folder_in_the_folder_is_a_dataset_and_files_of_one_content_share_a_ca
         ("a_copy.png", "a", "cluster0", "copy.png"),
         ("b_00.png", "b", "outliers", "00.png"),
     ]
+    # The copy has the camera of its original.
     assert rows[0][4:] == rows[6][4:]
     assert rows[-1][4:] == (";".join(["nan"] * 9), "nan;nan;nan")
     earlier = {
@@ -260,6 +272,7 @@ def test_a_folder_in_the_folder_is_a_dataset_and_files_of_one_content_share_a_ca
 
 def test_only_listed_pairs_are_matched(tmp_path):
     root = write_flat(tmp_path / "images" / "set", 4).parent
+    # In the other order, and with blank lines between
     wanted = list(combinations(range(4), 2))[:5]
     (tmp_path / "pairs.txt").write_text(
         "".join(f"set/{j:02}.png set/{i:02}.png\n\n" for i, j in wanted)
@@ -277,7 +290,8 @@ def test_only_listed_pairs_are_matched(tmp_path):
 
 
 def test_folders_that_cannot_be_reconstructed_get_one_line(tmp_path, capsys):
-    root, out = tmp_path / "images", tmp_path / "out"
+    root = tmp_path / "images"
+    out = tmp_path / "out"
 
     def refused(out: Path = out) -> str:
         assert run_command("reconstruct", root, "--out", out, "--recipe", "classical") == 2
@@ -307,7 +321,8 @@ def test_a_folder_without_a_readable_image_says_so_and_fails(tmp_path, capsys):
 
 
 def test_the_command_writes_tables_models_a_database_and_a_page(demo, small_recipe, tmp_path):
-    images, out = demo.train_dir / "courtyard" / "images", tmp_path / "out"
+    images = demo.train_dir / "courtyard" / "images"
+    out = tmp_path / "out"
     # The matches at 320 and 400 pixels are too few with some versions of OpenCV
     text = small_recipe.read_text()
     small_recipe.write_text(text.replace("320", "480").replace("400", "640"))
@@ -347,6 +362,7 @@ def test_a_shortlist_has_images_that_are_alike_and_none_that_cannot_be_read(tmp_
     assert pairs == sorted(set(pairs))
     assert all((i < 6) == (j < 6) and i < j for i, j in pairs)
     assert {place for pair in pairs for place in pair} == set(range(12))
+    # Without features, images are in the order of their names.
     nothing = [local_features(tmp_path / f"{number}.png") for number in range(3)]
     assert shortlist(most_alike(lambda: nothing, 1)) == [(0, 1), (0, 2)]
 
@@ -355,11 +371,13 @@ class UprightSift(SyntheticMatcher):
     """SIFT that takes every keypoint for upright, so that it knows no turned image again."""
 
     def encode(self, pictures):
-        sift, found = cv2.SIFT_create(1000), []
+        sift = cv2.SIFT_create(1000)
+        found = []
         for picture in pictures:
             gray = cv2.cvtColor(picture.pixels, cv2.COLOR_RGB2GRAY)
             keypoints = sift.detect(gray, None)
             for keypoint in keypoints:
+                # A descriptor that ignores the orientation matches no turned image.
                 keypoint.angle = 0
             found.append(sift.compute(gray, keypoints))
         return found
@@ -373,6 +391,7 @@ class UprightSift(SyntheticMatcher):
 
 def test_images_that_lie_on_a_side_are_found(tmp_path):
     paths = photographs(tmp_path / "images", 4)
+    # Some of both photographs, in all directions
     turned = {paths[1]: 1, paths[3]: 2, paths[6]: 3}
     for path, times in turned.items():
         cv2.imwrite(str(path), np.rot90(cv2.imread(str(path)), -times))
@@ -389,6 +408,7 @@ def test_images_that_lie_on_a_side_are_found(tmp_path):
 
 def test_what_was_turned_comes_back_in_the_pixels_of_its_file(tmp_path, monkeypatch):
     root = write_flat(tmp_path / "images", FIRST)
+    # Its file is turned, so the matcher sees it upright only after a turn.
     lying = root / "02.png"
     cv2.imwrite(str(lying), np.rot90(cv2.imread(str(lying)), -1))
     monkeypatch.setattr("mkpc_kaggle.reconstruction.choice.find_turns", lambda *_: {lying: 1})
@@ -415,6 +435,7 @@ def test_the_tables_are_there_at_first_and_again_after_each_scene(tmp_path):
         published.append({name: sum(map(bool, each.values())) for name, each in found.items()})
 
     run(tmp_path / "images", tmp_path / "out", publish=publish)
+    # Scenes of several datasets may end in either order.
     steps = list(dict.fromkeys(tuple(each.values()) for each in published))
     assert steps in ([(0, 0), (4, 0), (4, 4)], [(0, 0), (0, 4), (4, 4)])
 
@@ -422,18 +443,21 @@ def test_the_tables_are_there_at_first_and_again_after_each_scene(tmp_path):
 def test_python_gives_models_reads_each_image_once_and_estimates_nothing_unused(
     tmp_path, monkeypatch
 ):
-    folder, read = write_flat(tmp_path / "images", FIRST), list[Path]()
+    folder = write_flat(tmp_path / "images", FIRST)
+    read = list[Path]()
 
     def read_counted(path: Path) -> Image | Unreadable:
         read.append(path)
         return read_image(path)
 
     monkeypatch.setattr(images, "read_image", read_counted)
+    # F of single pairs is of no use here.
     monkeypatch.setattr(pair, "estimate", lambda *_, **__: pytest.fail("unused"))
     models = reconstruct(
         folder.iterdir(), RECIPE, device="cpu", matchers={"synthetic": MixedMatcher()}
     )
     (first,) = models
+    # Images are in several pairs each.
     assert sorted(read) == sorted(folder.iterdir())
     assert len(first.images) == FIRST
     truth = MixedMatcher().scenes[0].cameras

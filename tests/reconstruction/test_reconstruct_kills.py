@@ -31,16 +31,19 @@ def write_inputs(demo: DemoSet, home: Path) -> None:
         (home / "images" / name).mkdir(parents=True)
         for file in files:
             shutil.copy(file, home / "images" / name)
+    # It matches only after a turn.
     lying = home / "images" / "b" / images[4].name
     cv2.imwrite(str(lying), np.rot90(cv2.imread(str(lying))))
     (home / "masks" / "a").mkdir(parents=True)
     for file in images[:4]:
         mask = np.full(cv2.imread(str(file)).shape[:2], 255, np.uint8)
+        # The upper border of the images
         mask[:40] = 0
         cv2.imwrite(str(home / "masks" / "a" / f"{file.name}.png"), mask)
     with (scene / "calibration.csv").open() as stream:
         K = np.array(next(csv.DictReader(stream))["camera_intrinsics"].split(), float).reshape(3, 3)
     camera = f"SIMPLE_PINHOLE,{K[0, 0]} {K[0, 2] + 0.5} {K[1, 2] + 0.5}"
+    # One camera is exact, the others have priors; dataset b has none.
     rows = (f"a/{images[0].name},{camera},fixed", f"a/*,{camera},5")
     (home / "known.csv").write_text("\n".join(["image,model,parameters,sigma", *rows, ""]))
 
@@ -67,9 +70,11 @@ def test_a_run_that_is_ended_at_random_moments_ends_with_the_same_files(demo, tm
         del found["report.html"], found["summary.json"]  # they tell of times
         return found
 
+    # Before any run: there is no OUT yet.
     inputs = contents(tmp_path)
     start = time.monotonic()
     assert begin("undisturbed").wait() == 0
+    # The end of a run is anywhere within its usual time.
     whole_s = time.monotonic() - start
     expected = files_of("undisturbed")
     assert {
@@ -86,6 +91,7 @@ def test_a_run_that_is_ended_at_random_moments_ends_with_the_same_files(demo, tm
         for _ in range(ENDS):
             seconds = rng.uniform(0.0, 0.6 * whole_s)
             way = rng.choice([*SIGNALS, None])
+            # The run ends by itself.
             if way is None:
                 ended += begin(out, "--time-limit", f"{max(2.0, seconds):.0f}s").wait() != 0
                 continue

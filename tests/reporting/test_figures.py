@@ -31,6 +31,7 @@ REGIONS = (
 
 def some(n):
     """n matches in a corner of both images."""
+    # Within the critical region of the first image
     points = np.random.default_rng(n).uniform(21, 29, (n, 2))
     return Matches(points, points, np.ones(n))
 
@@ -41,6 +42,7 @@ def test_points_of_stage_2_are_drawn_where_they_are_on_the_crop():
         results, REGIONS, Estimate(ModelKind.F, FALLBACK_FUNDAMENTAL, np.ones(20, bool))
     )
     left, right = figures.draw_stage(IMAGES, match, 2).axes
+    # The first view is the crop, the second one the whole image.
     assert left.images[0].get_array().shape[:2] == (20, 40)
     xy = np.concatenate([dots.get_offsets() for dots in left.collections])
     np.testing.assert_allclose(xy, some(20).points0 - (20, 10))
@@ -51,6 +53,7 @@ def test_cameras_are_seen_from_above_and_from_the_side_with_the_points_before_th
     """Two cameras two units apart look along the world's x axis, its z axis is up; a wall is ten
     units ahead.
     """
+    # Rows: right, down, and ahead in the world
     R = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
     cameras = [Camera(np.eye(3), R, -R @ (0.0, 2.0 * n, 1.0)) for n in (0, 1)]
     wall = np.array([(10.0, y, z) for y in range(5) for z in range(8)])
@@ -68,6 +71,7 @@ def test_cameras_are_seen_from_above_and_from_the_side_with_the_points_before_th
 
 
 def test_a_strip_shows_both_images_upright_at_one_height_with_matches_where_they_are():
+    # 100 wide in its file, and 200 when it is upright
     lying = Image.of_array(np.full((200, 100, 3), 250, np.uint8)).turned(1)
     square = Image.of_array(np.full((300, 300, 3), 5, np.uint8))
     matches = Matches(np.array([[89.5, 9.5]]), np.array([[149.5, 149.5]]), np.ones(1))

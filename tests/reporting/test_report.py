@@ -24,6 +24,7 @@ from mkpc_kaggle.reporting.report import DRAWING_S, report_page, report_run
 from mkpc_kaggle.reporting.run_log import read_log
 from mkpc_kaggle.reporting.summary import overview
 
+# As a name of a file, and in all other texts that come from outside
 EVIL = '<script>alert("$x$")</script>'
 
 
@@ -32,6 +33,7 @@ def a_run(directory: Path, count: int = 12) -> list[Pair]:
     ``directory``/work.
     """
     pairs = write_pairs(directory / "images", count)
+    # The other images are read, and the run is complete.
     pairs[1].images[1].write_bytes(b"")
     run(pairs, THREE_UNITS, RectifiedMatcher(), directory / "work")
     return pairs
@@ -64,6 +66,7 @@ def test_a_run_exports_tables_that_a_reader_of_csv_files_understands(tmp_path, c
         inliers = [int(unit["inliers"]) for unit in tables["units"] if unit["pair"] == row["pair"]]
         assert sum(inliers) == int(row["inliers"])
         assert (row["image1"], row["overlaps"]) == (record.pair.names[1], str(record.overlaps))
+    # A row without matches is a valid F, too.
     assert np.linalg.matrix_rank(read_log(tmp_path / "work").records[1].chosen_fundamental) == 2, (
         "the fallback"
     )
@@ -81,6 +84,7 @@ def test_a_run_exports_tables_that_a_reader_of_csv_files_understands(tmp_path, c
     assert len(out.splitlines()) < 20
     # A resumed run is a second session
     run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
+    # Both sessions are in the journal, in their order.
     kinds = [event.kind for event in read_log(tmp_path / "work").events]
     assert [kind for kind in kinds if kind in ("start", "end")] == ["start", "end"] * 2
 
@@ -97,6 +101,7 @@ def test_an_export_that_cannot_be_written_is_refused(tmp_path, capsys):
 MINE = {
     "a table": lambda path: path.write_text("mine"),
     "a link to the journal": lambda path: path.symlink_to("../journal.sqlite"),
+    # A write through it would make the file.
     "a link to nothing": lambda path: path.symlink_to("nothing"),
     "a device": lambda path: path.symlink_to("/dev/zero"),
     "a pipe": os.mkfifo,
@@ -121,6 +126,7 @@ def test_the_page_begins_with_the_verdict_has_pictures_inside_and_asks_for_nothi
     assert report_run(tmp_path / "work", page, inf, pairs) == f"report: {page}"
     text = page.read_text(encoding="utf-8")
     assert re.search("<h1>Complete after .*: 11 of 12 pairs have an F</h1>", text)
+    # A run without scenes has no section on them.
     titles = [
         "Missing results",
         "The weakest pairs",
@@ -129,6 +135,7 @@ def test_the_page_begins_with_the_verdict_has_pictures_inside_and_asks_for_nothi
         "What made this",
     ]
     assert re.findall("<h2>(.*?)</h2>", text) == titles
+    # The pair that was not read has no picture.
     assert text.count("<img ") == 11, "the pairs with an F"
     assert "With the fallback: 1 pairs; the reasons are below." in text
     assert re.findall("<script[^>]*>", text) == ["<script>", "<script>"], "both inside the page"
@@ -139,6 +146,7 @@ def test_the_page_begins_with_the_verdict_has_pictures_inside_and_asks_for_nothi
     assert not re.search(r"url\(|@import", text)
     assert "the file is empty" in text
     assert "Drawings are missing" not in text
+    # Their inliers are computed again from the journal, and are those of the run.
     weakest = read_log(tmp_path / "work").weakest
     assert len(weakest) == 11
     for record, match in weakest:
@@ -165,6 +173,7 @@ def test_the_summary_has_the_facts_of_the_page_for_programs(tmp_path):
 def test_a_summary_replaces_nothing_but_a_summary(tmp_path, make):
     empty_store(tmp_path, []).close()
     make(tmp_path / "page.summary.json")
+    # Not what it contains: a pipe has no content to read.
     before = os.lstat(tmp_path / "page.summary.json")
     identity = before.st_ino, before.st_mtime_ns
     assert run_command("journal", tmp_path, "--report", tmp_path / "page.html") == 2
@@ -181,6 +190,7 @@ def test_what_comes_from_files_is_escaped(tmp_path):
         for kind in EventKind:
             note_event(store, Event(kind, 1.0, EVIL))
     log = read_log(tmp_path)
+    # With and without paths of images
     for known in ((), pairs):
         text = report_page(log, known)
         assert EVIL not in text
@@ -191,10 +201,12 @@ def test_what_comes_from_files_is_escaped(tmp_path):
 
 def test_without_matplotlib_the_page_has_tables_and_says_so(tmp_path, monkeypatch):
     pairs = a_run(tmp_path, 4)
+    # The images of the first pair alone are removed.
     kept = {image for pair in pairs[1:] for image in pair.images}
     for path in set(pairs[0].images) - kept:
         path.unlink()
     assert "an image cannot be read any more" in report_page(read_log(tmp_path / "work"), pairs)
+    # Python then finds no such module.
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     text = report_page(read_log(tmp_path / "work"), pairs)
     assert "matplotlib is not installed" in text
@@ -211,6 +223,7 @@ def test_pairs_sort_and_filter_and_pictures_enlarge(tmp_path, width):
     rows = "[...document.querySelectorAll('table.sortable tbody tr')]"
     with opened_browser() as browser:
         browser.open(page, width)
+        # The second click turns the order round.
         for kind in ("ascending", "descending"):
             browser.value("document.querySelectorAll('table.sortable th button')[2].click()")
             inliers = browser.value(f"{rows}.map((row) => Number(row.cells[2].textContent))")
@@ -218,6 +231,7 @@ def test_pairs_sort_and_filter_and_pictures_enlarge(tmp_path, width):
             assert (
                 browser.value("document.querySelectorAll('table.sortable th')[2].ariaSort") == kind
             )
+        # Words in any case and order
         filled = "document.querySelector('input[type=search]')"
         browser.value(f"{filled}.value = 'FALLBACK {pairs[1].id}'; {filled}.oninput()")
         shown = browser.value(
@@ -229,6 +243,7 @@ def test_pairs_sort_and_filter_and_pictures_enlarge(tmp_path, width):
         assert browser.value("document.querySelector('dialog img').naturalWidth") > 100
         browser.value("document.querySelector('dialog').click()")
         assert not browser.value("document.querySelector('dialog').open")
+        # Tables may be wider than the window in a frame that scrolls.
         every = "[...document.querySelectorAll('body *')]"
         wide = f"{every}.filter((e) => e.getBoundingClientRect().right > innerWidth)"
         outside = f"{wide}.filter((e) => !e.closest('.wide, .rows')).map((e) => e.outerHTML.slice(0, 200))"
@@ -238,6 +253,7 @@ def test_pairs_sort_and_filter_and_pictures_enlarge(tmp_path, width):
 
 
 def test_a_late_report_leaves_out_drawings_then_itself(tmp_path, monkeypatch):
+    # At time 0, so that the end of the time is the time left
     monkeypatch.setattr("mkpc_kaggle.reporting.report.time", SimpleNamespace(monotonic=lambda: 0.0))
     pairs = a_run(tmp_path, 3)
     path = tmp_path / "report.html"

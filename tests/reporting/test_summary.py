@@ -25,7 +25,9 @@ from mkpc_kaggle.scene.choose import Choice, Reason
 from mkpc_kaggle.scene.reconstruction import RegisteredImage, SfmModel, Sigmas
 from mkpc_kaggle.scene.view_graph import BatchImage
 
+# As a run leaves a pair that it had no time for
 UNREACHED = PairRecord(0, Pair("a", "batch", "0.png", "1.png"))
+# Support below 20: perhaps of different things
 FEW_INLIERS = replace(UNREACHED, failure="", stats=EstimateStats(support=14.4))
 
 
@@ -44,12 +46,14 @@ def report(ending: Ending, *records: PairRecord, scenes: tuple[SceneRecord, ...]
 
 def test_a_pair_with_few_inliers_is_doubtful_unless_its_cameras_agree():
     assert is_doubtful(FEW_INLIERS)
+    # The cameras agree with many pairs, so few inliers of one say nothing.
     settled = replace(FEW_INLIERS, scene=Choice(np.eye(3), Reason.SCENE), source="scene")
     assert not is_doubtful(settled)
     assert is_doubtful(replace(FEW_INLIERS, scene=Choice(None, Reason.CONTRADICTION)))
 
 
 def test_cameras_with_unknown_errors_are_the_weakest():
+    # Unknown errors are larger than any known one.
     found = scene(
         camera("known.png", Sigmas(0.1, 0.02, 1.0)),
         camera("unknown.png", ()),
@@ -67,6 +71,7 @@ def test_cameras_with_unknown_errors_are_the_weakest():
 
 
 def test_an_interrupted_run_says_how_to_continue_and_lists_no_failures():
+    # Its batch was never reconstructed.
     pending = replace(scene(), failure=NOT_RECONSTRUCTED, models=())
     stopped = report(Ending.INTERRUPTED, UNREACHED, UNREACHED, scenes=(pending,))
     assert list(pending_lines(stopped)) == [

@@ -28,6 +28,7 @@ CAMERAS = 5
 def a_model(folder: Path, points: int = 2000, cameras: int = CAMERAS) -> SfmModel:
     """Cameras in a row that look at a wall; the wall is red to the left and blue to the right."""
     rng = np.random.default_rng(0)
+    # All points in a plane, and the cameras in a row before it
     cloud = np.column_stack(
         [rng.uniform(-3, 3, points), rng.uniform(-2, 2, points), np.full(points, WALL)]
     )
@@ -37,6 +38,7 @@ def a_model(folder: Path, points: int = 2000, cameras: int = CAMERAS) -> SfmMode
         path = folder / f"{number}.png"
         pixels = np.zeros((SIZE.height, SIZE.width, 3), np.uint8)
         x = (number - (cameras - 1) / 2) / 2
+        # A pixel left of it sees the red half.
         left = int(199.5 + 400 * (0 - x) / WALL)  # of the wall's middle
         pixels[:, : max(left, 0)] = (0, 0, 255)
         pixels[:, max(left, 0) :] = (255, 0, 0)
@@ -59,6 +61,7 @@ def test_points_keep_their_shape_and_cameras_their_place_among_them(tmp_path):
     model = a_model(tmp_path)
     (shown,) = view_data([model], read=lambda _: None, partners={})["models"]
     points, _ = decoded(shown)
+    # A view has its own scale and origin.
     scale = np.ptp(points[:, 0]) / np.ptp(model.points[:, 0])
     # The cameras look along z: the frame is not rotated
     offset = points[0] - scale * model.points[0]
@@ -86,6 +89,7 @@ def test_points_have_the_colours_of_the_images(tmp_path):
         found.image.name: cv2.imread(found.image.name)[:, :, ::-1] for found in model.images
     }
     colours = point_colours(model.points, model.images, pictures)
+    # Near the border of the colours, a pixel decides.
     sides = np.abs(model.points[:, 0]) > 0.1
     is_left = model.points[:, 0] < 0
     np.testing.assert_array_equal(
@@ -106,6 +110,7 @@ def test_points_and_colours_come_from_the_files_of_a_reconstruction(tmp_path):
     model = pycolmap.synthesize_dataset(pycolmap.SyntheticDatasetOptions(settings))
     for number, point in model.points3D.items():
         point.color = np.array([number, 2 * number, 3 * number], np.uint8)
+        # Tracks of different lengths
         for element in point.track.elements[: number % 3]:
             model.delete_observation(element.image_id, element.point2D_idx)
     (tmp_path / "sparse" / "0").mkdir(parents=True)
@@ -126,6 +131,7 @@ def test_a_view_of_degenerate_models_is_still_data(tmp_path):
     model = a_model(tmp_path, cameras=3)
     at_one_point = tuple(replace(each, camera=model.images[0].camera) for each in model.images)
     upside_down = Camera(model.images[0].camera.K, np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
+    # No common vertical, and no common direction
     opposed = (model.images[0], replace(model.images[1], camera=upside_down))
     for images, points in ((at_one_point, np.zeros((0, 3))), (opposed, model.points)):
         made = SfmModel(images, points, 0.0)
@@ -148,6 +154,7 @@ def test_a_notebook_shows_the_view_in_a_frame_without_access_to_the_notebook(tmp
 
 def test_names_from_files_are_escaped(tmp_path):
     model = a_model(tmp_path, cameras=2)
+    # A name that ends the script of the data
     evil = "</script><script>alert(1)</script>"
     image = replace(model.images[0].image, name=evil)
     page = show(
@@ -179,6 +186,7 @@ def browser() -> Iterator[Page]:
 def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("view")
     model = a_model(folder)
+    # Two models stand side by side, without a bar.
     show([model, a_model(folder)], metres_per_unit=2.0).save(folder / "view.html")
     show([model], metres_per_unit=2.0).save(folder / "one.html")
     return folder / "view.html"
@@ -193,6 +201,7 @@ def middle(browser: Page) -> tuple[float, float]:
 
 def find_camera(browser: Page, x: float, y: float) -> tuple[float, float]:
     """Return a position below the middle at which the view names a camera."""
+    # Cameras are before the wall, so they are drawn lower.
     for dy in range(0, 260, 8):
         for dx in range(-160, 170, 8):
             browser.mouse("moved", x + dx, y + dy)
@@ -213,6 +222,7 @@ def test_the_view_draws_and_turns_zooms_and_moves_by_mouse(browser, page, width)
     browser.mouse("wheel", x, y, deltaX=0, deltaY=-200)
     browser.drag(x, y, 0, 40)
     states.append(browser.value(PIXELS))
+    # Keys turn, too; the button undoes all of it.
     browser.ask("Input.dispatchKeyEvent", type="keyDown", key="ArrowLeft")
     browser.value("document.querySelector('.reset').click()")
     browser.drag(x, y, 1)  # waits for a frame

@@ -20,6 +20,7 @@ from mkpc_kaggle.scene.align import (
 from mkpc_kaggle.scene.reconstruction import Reconstruction, RegisteredImage, SfmModel
 from mkpc_kaggle.scene.view_graph import BatchImage
 
+# Far from the identity in each of its parts
 WORLD = Similarity(
     3.5,
     Rotation.from_euler("xyz", [20, -60, 130], degrees=True).as_matrix(),
@@ -58,6 +59,7 @@ def test_a_similarity_is_found_even_from_cameras_on_a_line(on_a_line):
 def test_a_camera_that_is_elsewhere_does_not_move_the_others():
     cameras = [*cameras_of(8).values()]
     targets = [WORLD.of_camera(camera) for camera in cameras]
+    # Least squares over all cameras would spread this error over the others.
     targets[3] = Camera(np.eye(3), targets[3].R, targets[3].t + 5)
     found = find_similarity(cameras, targets)
     assert found is not None
@@ -76,6 +78,7 @@ def test_each_model_is_moved_onto_the_earlier_model_of_its_images():
     cameras = cameras_of(7)
     first = {name: cameras[name] for name in ("0.png", "1.png", "2.png", "3.png")}
     second = {name: cameras[name] for name in ("4.png", "5.png", "6.png")}
+    # In the other order, and one camera of the first model is new.
     reference = [
         second,
         {name: WORLD.of_camera(camera) for name, camera in first.items() if name != "3.png"},
@@ -86,6 +89,7 @@ def test_each_model_is_moved_onto_the_earlier_model_of_its_images():
         np.testing.assert_allclose(
             found.camera.t, WORLD.of_camera(first[found.image.name]).t, atol=1e-9
         )
+    # A point keeps its place in front of a camera, but for the scale.
     ray = model_of(first).points @ first["3.png"].R.T + first["3.png"].t
     moved = model.points @ model.images[3].camera.R.T + model.images[3].camera.t
     np.testing.assert_allclose(
@@ -95,13 +99,15 @@ def test_each_model_is_moved_onto_the_earlier_model_of_its_images():
 
 
 def test_a_reference_is_read_as_written_and_a_damaged_one_is_none(tmp_path: Path):
-    cameras, stream = cameras_of(3), StringIO()
+    cameras = cameras_of(3)
+    stream = StringIO()
     write_reference(stream, [cameras])
     (tmp_path / REFERENCE).write_text(stream.getvalue())
     (known,) = read_reference(tmp_path)
     for name, camera in known.items():
         np.testing.assert_array_equal(camera.R, cameras[name].R)
         np.testing.assert_array_equal(camera.t, cameras[name].t)
+    # No JSON, other JSON, too few numbers, no numbers, and nesting that no parser takes
     for damaged in ("", "[1]", '[{"a": [1]}]', '[{"a": ["x"]}]', "[" * 100_000):
         (tmp_path / REFERENCE).write_text(damaged)
         assert read_reference(tmp_path) == []

@@ -22,6 +22,7 @@ IMAGES = [
     BatchImage(f"{n}", f"{n}", SIZE, focal) for n, focal in enumerate((0.0, 900.0, 1000.0, 1040.0))
 ]
 TALL = BatchImage("tall", "tall", Size(*reversed(SIZE)))
+# Without EXIF
 GUESS = 1.1 * max(SIZE)
 
 
@@ -72,6 +73,7 @@ def test_a_focal_length_of_exif_is_not_fixed():
 def test_images_that_one_camera_took_have_one_focal_length_however_few_they_are():
     scene = synthetic_scene(4, points=500, focals=[900.0] * 4)
     graph = ViewGraph.of_pairs(scene.pairs)
+    # Four images: too few for the detection of a common focal length
     alone, together = (reconstruct_sharing(graph, config(name)) for name in ("image", "folder"))
     assert alone[1] == {}
     focals = [

@@ -21,6 +21,7 @@ CHAIN = [(0, 1), (1, 2), (2, 3), (3, 4), (4, 5)]
 def test_a_batch_gets_as_many_pairs_as_it_lacks_and_none_twice(images, wanted, seed):
     rng = np.random.default_rng(seed)
     every = list(combinations(range(images), 2))
+    # In either order, as a test set has them
     asked = [ends if rng.random() < 0.5 else ends[::-1] for ends in every if rng.random() < 0.4]
     chosen = extra_pairs(images, asked, wanted)
     known = {(min(ends), max(ends)) for ends in asked}
@@ -37,7 +38,9 @@ def test_images_in_few_pairs_come_first_and_get_partners_that_have_the_same_part
 
 
 def test_a_sparse_batch_has_a_scene_by_pairs_that_no_row_names(tmp_path):
-    every, matcher = synthetic_pairs(tmp_path / "images"), SyntheticMatcher()
+    every = synthetic_pairs(tmp_path / "images")
+    matcher = SyntheticMatcher()
+    # A chain: the mapper needs pairs across it.
     asked = [every[list(combinations(range(6), 2)).index(ends)] for ends in CHAIN]
     published: list[int] = []
     recipe = replace(RECIPE, scene=SceneConfig(pairs_per_image=2))
@@ -54,6 +57,7 @@ def test_a_sparse_batch_has_a_scene_by_pairs_that_no_row_names(tmp_path):
         < 0.5
     )
     assert len(matcher.calls) == 12, "two pairs an image"
+    # Extra pairs are in no result, table or report.
     assert set(published) == {5}
     assert len(read_log(tmp_path / "work").records) == 5
     assert run(asked, recipe, SyntheticMatcher(), tmp_path / "work").scenes == report.scenes

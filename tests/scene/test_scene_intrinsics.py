@@ -27,6 +27,7 @@ def reconstructed(
 
 def true_camera(name: str, factor: float = 1.0, sigma: float = 0.0) -> tuple[str, KnownCamera]:
     K = SCENE.cameras[name].K
+    # COLMAP's (0, 0) is the corner of the first pixel.
     return name, KnownCamera(
         "SIMPLE_PINHOLE", (factor * K[0, 0], K[0, 2] + 0.5, K[1, 2] + 0.5), sigma
     )
@@ -47,6 +48,7 @@ def free() -> SfmModel:
 
 @pytest.mark.parametrize("sharing", [CameraSharing.AUTO, CameraSharing.FOLDER])
 def test_exact_intrinsics_stay_and_have_no_uncertainty(free, sharing):
+    # Wrong by 2 %, so that it shows whether the mapper has refined them
     names = NAMES[:3]
     model = reconstructed([true_camera(name, 1.02) for name in names], sharing)
     for found in model.images:
@@ -68,12 +70,14 @@ def test_intrinsics_that_are_all_exact_leave_less_uncertainty(free):
 def test_a_prior_pulls_a_focal_length_as_far_as_its_deviation_allows(free):
     name = NAMES[2]
     start = focals(free)[name]
+    # A prior of 0.01 % decides alone, one of 100 % says nothing.
     pulled = {
         sigma: focals(reconstructed([true_camera(name, 1.1, sigma)]))[name]
         for sigma in (0.01, 100.0)
     }
     assert pulled[0.01] == pytest.approx(1.1, abs=2e-3)
     assert pulled[100.0] == pytest.approx(start, abs=2e-3)
+    # Two measurements together are better than the prior alone.
     model = reconstructed([true_camera(name, 1.0, 0.1)])
     (sigma,) = (found.sigmas.focal for found in model.images if found.image.name == name)
     assert 0 < sigma < 0.1
@@ -106,6 +110,7 @@ def test_a_row_names_an_image_by_its_path_its_name_or_a_pattern():
             ("set/a.jpg", "b.jpg", "[c].jpg", "set/*", "*.png"), start=1
         )
     ]
+    # [c].jpg is a name and a pattern; the first row that fits counts.
     names = ["set/a.jpg", "x/b.jpg", "[c].jpg", "c.jpg", "set/z.jpg", "y/z.png", "z.jpg"]
     found = [camera_of(rows, name) for name in names]
     assert [camera and camera.focal for camera in found] == [1, 2, 3, 3, 4, 5, None]

@@ -48,6 +48,7 @@ def test_a_keypoint_is_the_mean_of_its_points_and_near_each_of_them(points):
 
 
 def test_a_keypoint_is_matched_once_and_to_what_was_found_most_often():
+    # Keypoint 0 was matched to 6 twice, to 5 once. Both matches of 2 were found once.
     index = np.array([[0, 5], [0, 6], [0, 6], [1, 6], [2, 7], [2, 8]])
     assert one_to_one(index).tolist() == [[0, 6], [2, 7]]
     assert one_to_one(np.zeros((0, 2), np.intp)).shape == (0, 2)
@@ -62,14 +63,19 @@ def test_a_point_seen_in_two_pairs_is_one_keypoint():
     keypoints, found = scene_keypoints(ViewGraph(tuple(map(image, "ABC")), edges))
     assert list(map(len, keypoints)) == [2, 2, 1]
     first, second, third = (index.tolist() for index in found)
-    (a, b), (a2, c) = first[0], second[0]  # 10.5 is the border of a cell
+    # Their points lie on both sides of 10.5, the border of a cell.
+    a, b = first[0]
+    a2, c = second[0]
     assert a == a2
     assert third == [[b, c]]
     np.testing.assert_allclose(keypoints[0][a], [10.5, 9.95], atol=1e-5)
 
 
 def test_the_same_picture_under_two_names_is_one_image():
-    there, back, same = matches((1, 1, 2, 2)), matches((4, 4, 3, 3)), matches((1,) * 4)
+    # A and a are one image, so the second pair is the first one backwards.
+    there = matches((1, 1, 2, 2))
+    back = matches((4, 4, 3, 3))
+    same = matches((1,) * 4)
     graph = ViewGraph.of_pairs([pair("AB", there), pair("Ba", back), pair("Aa", same)])
     assert [found.name for found in graph.images] == ["A", "B"]
     assert [(edge.first, edge.second) for edge in graph.edges] == [(0, 1)]
@@ -78,8 +84,10 @@ def test_the_same_picture_under_two_names_is_one_image():
 
 
 def test_a_graph_is_made_of_a_pairs_tracks_where_it_has_some():
-    every, tracks = matches((1,) * 4, (2, 2, 3, 3), (4, 4, 5, 5)), matches((4, 4, 5, 5))
+    every = matches((1,) * 4, (2, 2, 3, 3), (4, 4, 5, 5))
+    tracks = matches((4, 4, 5, 5))
     pairs = [pair("AB", Matches.empty()), BatchPair(image("B"), image("A"), every, tracks=tracks)]
+    # The images of the graph begin with A, so the pair B, A is turned round.
     (edge,) = ViewGraph.of_pairs(pairs).edges
     assert edge.matches.points0.tolist() == [[5, 5]]
     assert edge.matches.points1.tolist() == [[4, 4]]
@@ -91,6 +99,7 @@ def test_components_are_connected_by_pairs_with_enough_matches():
             first, second, Matches(np.zeros((count, 2)), np.zeros((count, 2)), np.zeros(count))
         )
 
+    # Four matches are too few to connect 3 and 5; 15 are just enough.
     edges = (edge(1, 3, 20), edge(1, 4, 20), edge(3, 5, 4), edge(5, 6, 15))
     found = ViewGraph(tuple(map(image, "ABCDEFGH")), edges).components()
     assert ["".join(each.name for each in graph.images) for graph in found] == ["BDE", "FG"]

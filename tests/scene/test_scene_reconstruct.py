@@ -67,6 +67,7 @@ def test_cameras_are_right_in_spite_of_noise_and_wrong_matches(scene):
 
 
 def test_the_same_batch_gives_the_same_bytes_through_a_pipe_too(scene):
+    # As a worker's process receives them
     piped = pickle.loads(pickle.dumps(scene.pairs))
     first, again = (
         pickle.dumps(reconstruct_batch(pairs, SceneConfig())) for pairs in (scene.pairs, piped)
@@ -78,7 +79,8 @@ def test_points_of_a_dense_matcher_make_tracks(scene):
     """Each pair has other points of the surface: a keypoint of two pairs is a coincidence within a
     cell.
     """
-    rng, pairs = np.random.default_rng(3), []
+    rng = np.random.default_rng(3)
+    pairs = []
     for pair in scene.pairs:
         world = front(rng, 8000)
         seen = [see(rng, camera, world, 0.3) for camera in scene.true_cameras(pair)]
@@ -91,6 +93,7 @@ def test_points_of_a_dense_matcher_make_tracks(scene):
 
 @pytest.mark.parametrize("count", [3, 0])
 def test_a_pair_with_few_matches_or_none_gets_the_scenes_fundamental(scene, count):
+    # Its images have cameras by their other pairs.
     few = replace(scene.pairs[0], matches=scene.pairs[0].matches[:count])
     choice = reconstruct_batch((few, *scene.pairs[1:]), SceneConfig()).choices[0]
     assert choice.from_scene
@@ -101,6 +104,7 @@ def test_a_pair_that_the_scene_lacks_is_estimated_at_its_focal_lengths(scene):
     last = scene.images[-1]
     inside = [pair for pair in scene.pairs if last not in (pair.image0, pair.image1)]
     outside = next(pair for pair in scene.pairs if last in (pair.image0, pair.image1))
+    # Enough for an F at a known focal length
     few = replace(outside, matches=outside.matches[:14])  # too few to place the image
     pairs = (few, replace(few, matches=few.matches[:3]), *inside)
     magsac = RobustConfig(permutations=1, max_iterations=2000)
@@ -114,6 +118,7 @@ def test_a_pair_that_the_scene_lacks_is_estimated_at_its_focal_lengths(scene):
 
 
 def test_two_places_in_a_batch_are_two_scenes(scene):
+    # A row may name images of both places.
     other = synthetic_scene(4, points=500, seed=7, prefix="b")
     across = BatchPair(scene.images[0], other.images[0], Matches.empty())
     solution = reconstruct_batch((*scene.pairs, *other.pairs, across), SceneConfig())
@@ -128,6 +133,7 @@ def test_a_pair_whose_matches_agree_on_something_else_keeps_its_own(scene):
     """
     pair = scene.pairs[-1]
     shifted = replace(pair.matches, points1=pair.matches.points0 + np.array([0, 90], np.float32))
+    # F of a shift along y: its lines are the columns.
     columns = np.array([[0, 0, 1], [0, 0, 0], [-1, 0, 0]]) / np.sqrt(2)
     pairs = (*scene.pairs[:-1], replace(pair, matches=shifted, pair_fundamental=columns))
     solution = reconstruct_batch(pairs, SceneConfig(), FocalConfig())
@@ -136,6 +142,7 @@ def test_a_pair_whose_matches_agree_on_something_else_keeps_its_own(scene):
 
 
 def test_too_few_pairs_or_matches_make_no_scene(scene):
+    # Three images on a chain
     two = tuple(pair for pair in scene.pairs if pair.image0 == scene.pairs[0].image0)[:2]
     (found,) = reconstruct_batch(two, SceneConfig()).reconstructions
     assert found.failure == (
@@ -196,6 +203,7 @@ def test_an_edge_is_verified_once_for_the_same_cameras_on_any_number_of_threads(
         calls.append(arguments)
         return estimate(*arguments)
 
+    # The scene, and its files, ask for all geometries.
     monkeypatch.setattr(colmap.pycolmap, "estimate_two_view_geometry", counted)
     written = []
     for threads in (1, 4):

@@ -18,7 +18,8 @@ from mkpc_kaggle.scene.reconstruction import RegisteredImage, SfmModel
 from mkpc_kaggle.scene.shared_intrinsics import shared_intrinsics
 from mkpc_kaggle.scene.view_graph import BatchImage, ViewGraph
 
-WIDE, TALL = Size(800, 600), Size(600, 800)
+WIDE = Size(800, 600)
+TALL = Size(600, 800)
 FOCAL = 840.0
 CONFIG = SceneConfig()
 OWN = SceneConfig(cameras=CameraSharing.IMAGE)
@@ -55,9 +56,12 @@ def shared(*focals: float, points: Sequence[int] = ()) -> dict[str, float]:
         ((838, 840, 841, 2900, 880), (100, 100, 100, 4, 49), dict.fromkeys("01234", 841)),
         ((838, 840, 841, 420, 842), (100, 100, 100, 90, 100), dict.fromkeys("0124", 840)),
         ((), (), {}),
+        # Too few images to tell
         ((FOCAL,) * 4, (), {}),
+        # Two cameras with half of the images each
         ((840, 840, 840, 900, 900, 900), (), {}),
         ((600, 700, 840, 950, 1100), (), {}),
+        # What no camera has
         ((-840,) * 3 + (np.nan,) * 3, (), {}),
     ],
 )
@@ -82,7 +86,8 @@ def focals_of(solution: Solution) -> list[float]:
 
 def mean_angle(solution: Solution, scene: SyntheticScene) -> float:
     """Between the found and the true direction from one image to the other, in degrees."""
-    angles, registered = [], registered_images(solution)
+    angles = []
+    registered = registered_images(solution)
     for pair in scene.pairs:
         found_cameras = [registered[image.digest].camera for image in (pair.image0, pair.image1)]
         found, wanted = (
@@ -95,8 +100,10 @@ def mean_angle(solution: Solution, scene: SyntheticScene) -> float:
 
 
 def test_a_scene_with_shared_intrinsics_is_nearer_to_the_truth():
+    # Few points with much noise: focal lengths of single images are uncertain.
     scene = synthetic_scene(7, 12, points=250, noise=1.0, focals=[FOCAL] * 7, seed=1)
-    own, sharing = reconstruct_batch(scene.pairs, OWN), reconstruct_batch(scene.pairs, CONFIG)
+    own = reconstruct_batch(scene.pairs, OWN)
+    sharing = reconstruct_batch(scene.pairs, CONFIG)
     assert len(set(focals_of(own))) == 7
     (focal,) = set(focals_of(sharing))
     assert focal == pytest.approx(FOCAL, rel=0.01)
@@ -108,6 +115,7 @@ def test_shared_intrinsics_stay_unless_they_explain_fewer_points_and_the_files_a
     tmp_path, monkeypatch, least, cameras
 ):
     scene = synthetic_scene(6, points=300)
+    # The images have different focal lengths, so sharing loses points.
     everything = {image.digest: FOCAL for image in scene.images}
     monkeypatch.setattr("mkpc_kaggle.scene.reconstruct.shared_intrinsics", lambda *_: everything)
     monkeypatch.setattr("mkpc_kaggle.scene.reconstruct.MIN_OBSERVATIONS", least)

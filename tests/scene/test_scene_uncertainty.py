@@ -31,7 +31,9 @@ def errors_over_sigmas(model: SfmModel, scene: SyntheticScene) -> np.ndarray:
         .as_matrix()
     )
     centres, places = (np.array([-c.R.T @ c.t for c in each]) for each in (cameras, true))
-    centres, places = centres - centres.mean(axis=0), (places - places.mean(axis=0)) @ world.T
+    # A similarity of the world is no error.
+    centres = centres - centres.mean(axis=0)
+    places = (places - places.mean(axis=0)) @ world.T
     size = np.sqrt((centres**2).sum(axis=1).mean())
     places *= (centres * places).sum() / (places**2).sum()
     turns = Rotation.from_matrix(
@@ -47,6 +49,7 @@ def errors_over_sigmas(model: SfmModel, scene: SyntheticScene) -> np.ndarray:
 
 def test_errors_are_about_as_large_as_expected():
     """90 % of normal errors are below 1.645 sigma; of three dimensions, below 1.44 to 1.645."""
+    # 32 cameras; the bounds leave room for their number.
     scenes = [synthetic_scene(8, points=400, seed=seed) for seed in range(4)]
     ratios = np.concatenate([errors_over_sigmas(model_of(scene), scene) for scene in scenes])
     assert ((ratios < 1.645).mean(axis=0) > 0.7).all()
@@ -57,6 +60,7 @@ def test_they_are_the_same_in_another_world():
     model = model_of(synthetic_scene(6, points=400))
     before = camera_sigmas(model.colmap)
     moved = pycolmap.Reconstruction(model.colmap)
+    # Another scale, orientation and origin
     moved.transform(
         pycolmap.Sim3d(3.0, pycolmap.Rotation3d(np.array([0.3, -0.2, 0.1])), np.array([5.0, -2, 1]))
     )
