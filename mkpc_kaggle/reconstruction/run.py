@@ -63,7 +63,9 @@ def for_cameras(recipe: Recipe, sharing: str | None = None, intrinsics: str = ""
     # names runs as it is written.
     if recipe.name == AUTO and recipe.matcher_names == ("sift",):
         units = units[:1]
-    return replace(recipe, units=units, focal=None, scene=scene)
+    # F of a pair is for the report alone: its inliers, and doubts about the pair.
+    magsac = replace(recipe.magsac, permutations=1)
+    return replace(recipe, units=units, magsac=magsac, focal=None, scene=scene)
 
 
 def reconstruct_folder(

@@ -31,7 +31,9 @@ from mkpc_kaggle.data.images import TURNS, Image, Unreadable, read_image
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.session import Interrupt, Session
 from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.geometry.robust import RobustConfig
 from mkpc_kaggle.matchers.adapters.sift import SiftMatcher, SiftOptions
 from mkpc_kaggle.pipeline import pair
 from mkpc_kaggle.pipeline.assembly import assemble
@@ -182,6 +184,13 @@ def test_without_weights_one_unit_of_rootsift_runs(nowhere_else, name, more, uni
     recipe = assemble(name, device="cpu", matchers=more).recipe
     kept = [unit.name for unit in for_cameras(recipe).units]
     assert kept == (units or [unit.name for unit in recipe.units])
+
+
+def test_estimates_that_only_the_report_needs_are_the_cheap_ones():
+    recipe = Recipe((Unit(1, "sift", 640),), focal=FocalConfig(), magsac=RobustConfig())
+    assert recipe.magsac.permutations > 1
+    kept = for_cameras(recipe)
+    assert (kept.focal, kept.magsac.permutations) == (None, 1)
 
 
 # Upright, on both sides, and upside down
