@@ -64,7 +64,9 @@ def find_similarity(cameras: Sequence[Camera], targets: Sequence[Camera]) -> Sim
     """
     if len(cameras) < MIN_COMMON:
         return None
-    turns = [target.R.T @ camera.R for camera, target in zip(cameras, targets, strict=True)]
+    turns = []
+    for camera, target in zip(cameras, targets, strict=True):
+        turns.append(target.R.T @ camera.R)
     R = _mean_rotation(turns)
     # From here on, only scale and offset are unknown.
     centres = _centres(cameras) @ R.T
@@ -74,7 +76,8 @@ def find_similarity(cameras: Sequence[Camera], targets: Sequence[Camera]) -> Sim
         return None
     # Medians tolerate cameras that the two reconstructions place differently.
     offset = np.median(goals - scale * centres, axis=0)
-    distances = np.linalg.norm(scale * centres + offset - goals, axis=1)
+    missed = scale * centres + offset - goals
+    distances = np.linalg.norm(missed, axis=1)
     near = distances <= OUTLIER * np.median(distances)
     if near.sum() < MIN_COMMON:  # of three cameras, none can be called wrong
         near[:] = True
@@ -97,7 +100,8 @@ def _mean_rotation(rotations: Sequence[Matrix3]) -> Matrix3:
     """Return the rotation nearest to the mean."""
     U, _, Vt = np.linalg.svd(np.sum(rotations, axis=0))
     # Without the determinant it could be a reflection.
-    return np.asarray(U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt)
+    signs = np.diag([1, 1, np.linalg.det(U @ Vt)])
+    return np.asarray(U @ signs @ Vt)
 
 
 def _median_scale(centres: NDArray[np.float64], goals: NDArray[np.float64]) -> float | None:
@@ -123,7 +127,8 @@ def _least_squares(
     variance = float((spread**2).sum())
     if variance == 0:
         return None
-    scale = float((spread * (goals - goal)).sum()) / variance
+    covariance = float((spread * (goals - goal)).sum())
+    scale = covariance / variance
     # A scale that is not positive would turn the model inside out.
     return Similarity(scale, R, goal - scale * centre) if scale > 0 else None
 

@@ -27,11 +27,14 @@ def extra_pairs(image_count: int, pairs: Sequence[Ends], per_image: float) -> li
     # (N, N): partners in common; exact below 2**24
     common = linked.astype(np.float32) @ linked.astype(np.float32)
     degrees = linked.sum(1)
-    wanted = min(ceil(per_image * image_count), image_count * (image_count - 1) // 2)
+    all_pairs = image_count * (image_count - 1) // 2
+    wanted = min(ceil(per_image * image_count), all_pairs)
     extra: list[Ends] = []
     while (degrees.sum() - image_count) // 2 < wanted:
         image = int(np.where(degrees < image_count, degrees, image_count).argmin())
-        likeness = np.where(linked[image], -np.inf, common[image] * image_count - degrees)
+        # Partners in common decide, and degrees only between equals.
+        likeness = common[image] * image_count - degrees
+        likeness = np.where(linked[image], -np.inf, likeness)
         partner = int(likeness.argmax())
         for here, there in ((image, partner), (partner, image)):
             theirs = linked[there].nonzero()[0]

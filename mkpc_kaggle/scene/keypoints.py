@@ -59,20 +59,20 @@ def scene_keypoints(graph: ViewGraph) -> tuple[list[Points], list[Index]]:
     for edge in graph.edges:
         parts[edge.first].append(edge.matches.points0)
         parts[edge.second].append(edge.matches.points1)
-    merged = [
-        merge_points(np.concatenate([np.zeros((0, 2), np.float32), *part]), CELL_PX)
-        for part in parts
-    ]
-    indices = [
-        iter(np.split(index, np.cumsum([len(points) for points in part])[:-1]))
-        for (_, index), part in zip(merged, parts, strict=True)
-    ]
+    keypoints = []
+    indices = []
+    nothing = np.zeros((0, 2), np.float32)  # of an image without matches
+    for part in parts:
+        points, index = merge_points(np.concatenate([nothing, *part]), CELL_PX)
+        keypoints.append(points)
+        ends = np.cumsum([len(some) for some in part])[:-1]
+        indices.append(iter(np.split(index, ends)))
     # The same order as above, so the next part of an image belongs to this edge.
     matches = [
         np.stack([next(indices[edge.first]), next(indices[edge.second])], axis=1)
         for edge in graph.edges
     ]
-    return [points for points, _ in merged], list(map(one_to_one, matches))
+    return keypoints, list(map(one_to_one, matches))
 
 
 def merge_points(points: Points, cell: float) -> tuple[Points, NDArray[np.intp]]:
@@ -89,8 +89,10 @@ def merge_points(points: Points, cell: float) -> tuple[Points, NDArray[np.intp]]
         cells = np.floor(total / weight[:, None] / cell + shift).astype(np.int64)
         distinct, inverse = np.unique(cells, axis=0, return_inverse=True)
         inverse = inverse.ravel()  # its shape differs between versions of numpy
-        total = np.column_stack([np.bincount(inverse, column, len(distinct)) for column in total.T])
-        weight = np.bincount(inverse, weight, len(distinct)).astype(np.float64)
+        count = len(distinct)
+        sums = [np.bincount(inverse, column, count) for column in total.T]
+        total = np.column_stack(sums)
+        weight = np.bincount(inverse, weight, count).astype(np.float64)
         index = inverse[index]
     return (total / weight[:, None]).astype(np.float32), index
 
@@ -113,4 +115,5 @@ def one_to_one(index: NDArray[np.intp]) -> Index:
             taken0.add(i)
             taken1.add(j)
             kept.append(number)
-    return distinct[np.sort(np.array(kept, np.intp))].astype(np.uint32).reshape(-1, 2)
+    chosen = np.sort(np.array(kept, np.intp))
+    return distinct[chosen].astype(np.uint32).reshape(-1, 2)

@@ -47,7 +47,10 @@ def local_features(path: Path) -> bytes:
         scale = SIDE_PX / max(image.size)
         gray = cv2.resize(image.gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
         _, found = cv2.SIFT_create(FEATURES).detectAndCompute(gray, None)  # type: ignore[attr-defined]
-    return b"" if found is None else (SCALE * root_sift(found)).round().astype(np.uint8).tobytes()
+    if found is None:
+        return b""
+    scaled = SCALE * root_sift(found)
+    return scaled.round().astype(np.uint8).tobytes()
 
 
 def most_alike(features: Callable[[], Iterable[bytes]], count: int) -> list[list[int]]:
@@ -56,11 +59,16 @@ def most_alike(features: Callable[[], Iterable[bytes]], count: int) -> list[list
 
     ``features`` is called once per pass, so it can stream. An image without features is similar to no other image.
     """
-    share = MAX_TRAINING // max(1, sum(1 for _ in features()))
-    training = np.concatenate(
-        [found[:: max(1, len(found) // max(1, share))] for found in map(_unpacked, features())]
-    )
-    words = training[:: max(1, len(training) // WORDS)][:WORDS]
+    count_images = sum(1 for _ in features())
+    share = max(1, MAX_TRAINING // max(1, count_images))
+    parts = []
+    for found in map(_unpacked, features()):
+        step = max(1, len(found) // share)
+        parts.append(found[::step])
+    training = np.concatenate(parts)
+    # Evenly spread over the images, so that each kind of image has words
+    step = max(1, len(training) // WORDS)
+    words = training[::step][:WORDS]
     if len(words):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # about words without descriptors
@@ -68,9 +76,9 @@ def most_alike(features: Callable[[], Iterable[bytes]], count: int) -> list[list
     table = np.stack([vlad(found, words) for found in map(_unpacked, features())])
     similarity = table @ table.T
     np.fill_diagonal(similarity, -np.inf)
-    near: list[list[int]] = np.argsort(-similarity, axis=1, kind="stable")[:, :-1][
-        :, :count
-    ].tolist()
+    order = np.argsort(-similarity, axis=1, kind="stable")
+    # The last one is the image itself.
+    near: list[list[int]] = order[:, :-1][:, :count].tolist()
     return near
 
 
@@ -87,6 +95,9 @@ def vlad(descriptors: NDArray[np.float32], words: NDArray[np.float32]) -> NDArra
     if len(descriptors):
         nearest, _ = vq(descriptors, words)
         np.add.at(sums, nearest, descriptors - words[nearest])
-    sums /= np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), np.finfo(np.float32).tiny)
+    lengths = np.linalg.norm(sums, axis=1, keepdims=True)
+    # A word without descriptors has length 0.
+    sums /= np.maximum(lengths, np.finfo(np.float32).tiny)
     flat = np.sign(sums) * np.sqrt(np.abs(sums))
-    return np.asarray(flat.ravel() / max(float(np.linalg.norm(flat)), 1e-12), np.float32)
+    length = max(float(np.linalg.norm(flat)), 1e-12)
+    return np.asarray(flat.ravel() / length, np.float32)

@@ -61,12 +61,11 @@ def shared_intrinsics(images: Sequence[BatchImage], models: Sequence[SfmModel]) 
         alike = [found for found in registered.values() if found.image.size == size]
         focal = float(np.median([found.focal for found in alike]))
         near = [found for found in alike if abs(found.focal / focal - 1) < TOLERANCE]
-        if len(alike) >= MIN_ALIKE and len(near) > len(alike) / 2:
-            many = ZOOM_POINTS * float(np.median([found.points for found in alike]))
-            zoomed = {found.image for found in alike if found not in near and found.points >= many}
-            shared |= {
-                image.digest: focal
-                for image in images
-                if image.size == size and image not in zoomed
-            }
+        if len(alike) < MIN_ALIKE or len(near) <= len(alike) / 2:
+            continue
+        many = ZOOM_POINTS * float(np.median([found.points for found in alike]))
+        zoomed = {found.image for found in alike if found not in near and found.points >= many}
+        for image in images:
+            if image.size == size and image not in zoomed:
+                shared[image.digest] = focal
     return shared

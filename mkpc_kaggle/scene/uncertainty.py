@@ -42,7 +42,9 @@ def camera_sigmas(
     for image in images:
         if image.name in known and not known[image.name].sigma:
             config.set_constant_cam_intrinsics(image.camera_id)
-    ceres = {"use_gpu": False, "solver_options": {"max_num_iterations": 0, "num_threads": 1}}
+    # No iterations: the solver only evaluates the residuals of the model as it is.
+    solver = {"max_num_iterations": 0, "num_threads": 1}
+    ceres = {"use_gpu": False, "solver_options": solver}
     options = pycolmap.BundleAdjustmentOptions({"print_summary": False, "ceres": ceres})
     adjuster: Any = pycolmap.create_default_ceres_bundle_adjuster(options, config, found)
     fit = adjuster.solve().ceres_summary
@@ -93,17 +95,21 @@ def _pose_variances(
     moves = []
     similarities = []
     zero = np.zeros((3, 4))  # neither the offset nor the scale of the world turns a camera
-    for pose, centre in zip(poses, (centres - centres.mean(axis=0)) / size, strict=True):
+    placed = (centres - centres.mean(axis=0)) / size
+    for pose, centre in zip(poses, placed, strict=True):
         # COLMAP's parameters are half angles and t
         R = pose[:, :3]
         t = pose[:, 3]
-        moves.append(
-            np.vstack([2 * np.eye(3, 6), -R.T @ np.hstack([2 * cross_matrix(t), np.eye(3)]) / size])
-        )
-        similarities.append(
-            np.block([[-R, zero], [-cross_matrix(centre), np.eye(3), centre[:, None]]])
-        )
+        angles = 2 * np.eye(3, 6)
+        centre_moves = -R.T @ np.hstack([2 * cross_matrix(t), np.eye(3)]) / size
+        moves.append(np.vstack([angles, centre_moves]))
+        turned = [-R, zero]
+        shifted = [-cross_matrix(centre), np.eye(3), centre[:, None]]
+        similarities.append(np.block([turned, shifted]))
     basis, _ = np.linalg.qr(np.vstack(similarities))
     change = block_diag(*moves)
     change -= basis @ (basis.T @ change)
-    return np.asarray(((change @ covariance) * change).sum(axis=1).reshape(-1, 2, 3).sum(axis=2))
+    # The diagonal of change @ covariance @ change.T, without the rest of that matrix
+    variances = ((change @ covariance) * change).sum(axis=1)
+    # Three angles and three coordinates of each image
+    return np.asarray(variances.reshape(-1, 2, 3).sum(axis=2))

@@ -114,19 +114,21 @@ class ViewGraph:
         """Return the components connected by strong edges, ordered by first image."""
         # A few wrong matches must not join two scenes.
         strong = self.strong.edges
-        ends = np.array([(edge.first, edge.second) for edge in strong], np.intp).reshape(-1, 2)
-        shape = (len(self.images), len(self.images))
-        adjacency = coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=shape)
+        firsts = np.array([edge.first for edge in strong], np.intp)
+        seconds = np.array([edge.second for edge in strong], np.intp)
+        count = len(self.images)
+        adjacency = coo_array((np.ones(len(strong)), (firsts, seconds)), shape=(count, count))
         _, labels = connected_components(adjacency, directed=False)
         found = []
         # Images without a strong edge are in no component.
-        for label in dict.fromkeys(labels[np.sort(ends[:, 0])].tolist()):
+        for label in dict.fromkeys(labels[np.sort(firsts)].tolist()):
             # Images are numbered anew within a component.
             members = np.flatnonzero(labels == label).tolist()
             index = {image: number for number, image in enumerate(members)}
-            inside = [edge for edge in strong if labels[edge.first] == label]
             edges = tuple(
-                Edge(index[edge.first], index[edge.second], edge.matches) for edge in inside
+                Edge(index[edge.first], index[edge.second], edge.matches)
+                for edge in strong
+                if labels[edge.first] == label
             )
             images = tuple(self.images[image] for image in members)
             found.append(replace(self, images=images, edges=edges))
