@@ -33,6 +33,7 @@ FAULTS = {  # and a part of the output
     ),
 }
 ENV = {"PYTHONPATH": f"lib:{ROOT}"}
+# The package of adapters gets a second folder, as a user's own matcher would be found.
 FINDING = "import mkpc_kaggle.matchers.adapters as known\nknown.__path__.append('lib')\n"
 IN_WORKER = SUBMIT.replace("--workers 0", "--workers 1")
 UNITS = f"units = [{UNIT.format(1).replace('sift', 'faulty')}, {UNIT.format(1)}]"
@@ -60,7 +61,7 @@ CASES = [
         )
         for name, (fault, says) in FAULTS.items()
     ),
-    # Of 512 bytes
+    # `ulimit -f` counts blocks of 512 bytes; a file that reaches the limit fails as on a full disk.
     Case("faults", "no file above 20 kB", SUBMIT, says="2 of 2 pairs have an F", limits="-f 40"),
     *(
         Case(

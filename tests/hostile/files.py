@@ -24,14 +24,14 @@ from weight_bombs import AUTO, CONVERT, NAME, SEARCH
 
 INSTEAD = {  # of a file
     "a directory": Path.mkdir,
-    "a pipe": os.mkfifo,
+    "a pipe": os.mkfifo,  # opening it waits for a writer
     "a link to /dev/zero": lambda path: path.symlink_to("/dev/zero"),
     "a link to nothing": lambda path: path.symlink_to("nothing"),
     "noise": lambda path: path.write_bytes(np.random.default_rng(1).bytes(5000)),
     "a sparse file of 1 TB": lambda path: [path.touch(), os.truncate(path, 1 << 40)],
 }
 X = "D/test_images/b1/x.png"
-READ = {  # by its path: what reads it, and how that may end
+READ = {  # by its path: the command that reads it, and its allowed statuses
     "D/test.csv": (SUBMIT, REFUSED),
     X: (REPORTED, (0,)),
     "quick.toml": (SUBMIT, REFUSED),

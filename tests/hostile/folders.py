@@ -30,6 +30,7 @@ OUTS = {
     "in no name": "''",
     "in 300 characters": f"out/{'o' * 300}",
 }
+# Names go into tables, databases, links, HTML and command lines.
 GOOD_NAMES = {
     "hidden": b".thumbnails",
     "an image's": b"x.jpg",
@@ -41,6 +42,7 @@ GOOD_NAMES = {
     "other scripts": "\u202e\U0001f600\u0430e\u0301".encode(),
     "250 characters": b"n" * 250,
 }
+# A line of a table cannot hold them.
 BAD_NAMES = {"Latin 1": b"caf\xe9", "a line feed": b"a\nb", "a line separator": "a\u2028b".encode()}
 ALIKE = {
     "two of one stem": lambda folder: (folder / "0.jpg").write_bytes(encoded(".jpg")),

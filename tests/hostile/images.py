@@ -39,6 +39,7 @@ def rows(width: int, height: int, depth: int = 8) -> bytes:
     return chunk(b"IDAT", zlib.compress(bytes((1 + (width * depth + 7) // 8) * height)))
 
 
+# A decoder that believes the head of a file allocates the size that it claims.
 ODD = {
     "2^31 - 1 pixels a side": lambda: png(2**31 - 1, 2**31 - 1),
     "20,000 black pixels a side": lambda: png(20_000, 20_000, rows(20_000, 20_000, 1), depth=1),

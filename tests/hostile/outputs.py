@@ -19,6 +19,7 @@ REPLACED = {
     "a pipe for the partial file": lambda room: os.mkfifo(room / "out/.s.csv.part"),
     "a pipe for the report": lambda room: os.mkfifo(room / "out/s.html"),
 }
+# matplotlib adds a suffix where a name has none, and so wrote over a photograph.
 FIGURES = {
     "a photograph's name without its suffix": "D/test_images/b1/x",
     "the recipe's name without its suffix": "quick",

@@ -37,15 +37,16 @@ SUBMIT = "submit --test-dir D --recipe quick.toml --output out/s.csv --no-report
 REPORTED = SUBMIT.replace(" --no-report", "")
 IMAGES_TO = "reconstruct I --recipe quick.toml --workers 0 --time-limit 5m --out"
 RECONSTRUCT = f"{IMAGES_TO} out/o"
-SIDE = 160
+SIDE = 160  # small: a case is a process, and there are hundreds
 # Inverse depths of five bands of rows: the views are of no plane
 DEPTHS = (1.0, 2.0, 3.0, 1.5, 2.5)
 
 
 @cache
 def picture(shift: int) -> NDArray[np.uint8]:
-    """Return the view of a camera that has moved to the right by that many pixels of the farthest
-    band.
+    """Return the view of a camera that has moved to the right.
+
+    ``shift`` is its motion in pixels of the farthest band.
     """
     noise = np.random.default_rng(0).integers(0, 256, (SIDE, 3 * SIDE, 3)).astype(np.float32)
     rough = sum(cv2.GaussianBlur(noise, (0, 0), width) * width for width in (1.5, 4.0))
@@ -100,7 +101,7 @@ def resumed(change: Callable[[Path], object]) -> Make:
 
 
 def replaced(name: str, make: Callable[[Path], object]) -> Make:
-    """Replace a file of the room by what ``make`` puts there."""
+    """Replace a file of the room by the result of ``make``."""
 
     def replace(room: Path) -> None:
         (room / name).parent.mkdir(parents=True, exist_ok=True)

@@ -51,12 +51,14 @@ def complained_of(make: Callable[[int], bytes], command: str) -> Make:
 
 def full_pipe() -> int:
     """Return the write end of a pipe that is full; the other end stays open, and is not read."""
+    # 4096 bytes are the smallest pipe; the default holds all complaints of a run.
     _, pipe = os.pipe()
     fcntl.fcntl(pipe, fcntl.F_SETPIPE_SZ, 4096)
     os.write(pipe, bytes(4096))
     return pipe
 
 
+# libpng and libjpeg print to descriptor 2 themselves, past Python.
 COMPLAINTS = {
     "a short colour profile": short_profile,
     "bytes between a photograph's restarts": extra_restart,

@@ -12,6 +12,7 @@ NAME = "xfeat_sparse_bnfolded.safetensors"
 SEARCH = "--weights weights"
 AUTO = SUBMIT.replace("quick.toml", "auto") + f" {SEARCH} --mode stage-1"
 LENGTH = (6 * 10**9).to_bytes(8, "little")
+# A pickle is a program: some bytes of it ask for gigabytes, or for a depth that ends the process.
 PICKLES = {
     "lists of lists": b"\x80\x02" + b"]" * 500_000 + b"a" * 499_999 + b".",
     "a bytearray of 6 GB": b"\x80\x02cbuiltins\nbytearray\n\x8a\x08" + LENGTH + b"\x85R.",
@@ -20,6 +21,7 @@ PICKLES = {
     "a tensor of 6 GB": b"\x80\x02ctorch\nFloatTensor\n\x8a\x08" + LENGTH + b"\x85R.",
     "a call of the system": b"\x80\x02cposix\nsystem\nX\x10\x00\x00\x00touch out/called\x85R.",
 }
+# The head of a file has its own length, and shapes and offsets that nothing has checked.
 SAFETENSORS = {
     "a head of 2^63 bytes": (2**63).to_bytes(8, "little") + b"{}",
     "deep JSON": (200_000).to_bytes(8, "little") + b"[" * 200_000,

@@ -25,7 +25,7 @@ from mkpc_kaggle.weights import WeightFile, WeightStore
 
 
 def wrapped(state: dict[str, Tensor]) -> dict[str, Any]:
-    """As a training run saves its network: under a prefix, beside what else it wants to remember."""
+    """Return a state as a training run saves it: under a prefix, with counters of the training."""
     prefixed = {f"matcher.{name}": tensor for name, tensor in state.items()}
     return {"epoch": 29, "global_step": 12345, "state_dict": prefixed}
 
@@ -44,12 +44,12 @@ def roma_alone(state: dict[str, Tensor]) -> dict[str, Any]:
 
 
 def dinov2_alone(state: dict[str, Tensor]) -> dict[str, Any]:
-    """The backbone has a file of its own."""
-    return {
-        name.removeprefix("dinov2."): tensor
-        for name, tensor in state.items()
-        if name.startswith("dinov2.")
-    }
+    """Return the backbone, which is a separate file."""
+    found = {}
+    for name, tensor in state.items():
+        if name.startswith("dinov2."):
+            found[name.removeprefix("dinov2.")] = tensor
+    return found
 
 
 def published_loma(state: dict[str, Tensor]) -> dict[str, Any]:
@@ -120,9 +120,8 @@ def store_of(directory: Path, files: Iterable[PublicFile]) -> WeightStore:
 
 
 def use_manifest(monkeypatch: pytest.MonkeyPatch, lines: tuple[WeightFile, ...]) -> None:
-    """Runs that are begun from now on hold their weights against these lines instead of the
-    package's own.
-    """
+    """Let runs compare weights with these lines instead of the package's."""
+    # Stand-in files have other digests than the published ones.
     monkeypatch.setattr(
         assembly, "WeightStore", lambda directories: WeightStore(directories, lines)
     )

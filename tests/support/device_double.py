@@ -48,7 +48,8 @@ class Tagged(torch.Tensor):
             "dtype": held.dtype,
         }
         made = torch.Tensor._make_wrapper_subclass(cls, held.shape, **layout, device=device)
-        made.held, made.place = held, where
+        made.held = held
+        made.place = where
         return made
 
     __torch_function__ = torch._C._disabled_torch_function_impl
@@ -104,7 +105,7 @@ class DeviceDouble(TorchDispatchMode):
         stack.close()
 
     def _stand_ins(self):
-        """What PyTorch is asked about GPUs, beside operators."""
+        """Yield stand-ins of what PyTorch asks about GPUs, other than operators."""
         double = self
 
         class Generator(torch.Generator):
@@ -128,7 +129,7 @@ class DeviceDouble(TorchDispatchMode):
         }
         yield from ((torch.cuda, name, value) for name, value in values.items())
         yield torch, "Generator", Generator
-        # Tagged tensors cannot be inference tensors: such have no version, which their views want.
+        # Tagged tensors cannot be inference tensors, which lack the version that views need.
         grads = []
         yield (
             torch.inference_mode,
@@ -143,8 +144,9 @@ class DeviceDouble(TorchDispatchMode):
         return self.run(func, args, kwargs or {})
 
     def run(self, func, args, kwargs):
-        """One operator: on CPU tensors as it is, on tagged ones with their values, its results
-        tagged anew.
+        """Run one operator: on CPU tensors as it is, on tagged ones with their values.
+
+        Its results are tagged again.
         """
         tensors = [
             each for each in tree_flatten((args, kwargs))[0] if isinstance(each, torch.Tensor)
@@ -160,7 +162,7 @@ class DeviceDouble(TorchDispatchMode):
         if name == "_has_compatible_shallow_copy_type":
             return False
         if name == "_fused_sdp_choice":
-            return 0  # by its definition, whatever kernel a GPU would take
+            return 0  # by its definition: kernels of a GPU cannot run here
         where = self._device_of_result(name, args, tensors, tagged, wanted)
         self._check_generator(name, kwargs.get("generator"), where)
         held = {id(each.held): each for each in tagged}
@@ -202,6 +204,7 @@ class DeviceDouble(TorchDispatchMode):
             return args[0].device
         if name == "_to_copy":
             return wanted or tagged[0].device
+        # A GPU takes these from the CPU without an error.
         free = [each for each in tensors if not isinstance(each, Tagged) and each.dim() == 0]
         if name in INDEXING and isinstance(args[0], Tagged):
             free += [

@@ -32,18 +32,10 @@ def tiff(orientation: int | None = None, order: str = "<", **tags: Value) -> byt
 def with_tiff(data: bytes, part: bytes) -> bytes:
     """Return the bytes of a JPEG or PNG file with these tags."""
     if data[:2] == b"\xff\xd8":
-        return (
-            data[:2]
-            + b"\xff\xe1"
-            + struct.pack(">H", len(part) + 8)
-            + b"Exif\0\0"
-            + part
-            + data[2:]
-        )
-    chunk = (
-        struct.pack(">I", len(part))
-        + b"eXIf"
-        + part
-        + struct.pack(">I", zlib.crc32(b"eXIf" + part))
-    )
+        # The length of a segment counts its own two bytes and the six of the name.
+        length = struct.pack(">H", len(part) + 8)
+        return data[:2] + b"\xff\xe1" + length + b"Exif\0\0" + part + data[2:]
+    length = struct.pack(">I", len(part))
+    checksum = struct.pack(">I", zlib.crc32(b"eXIf" + part))
+    chunk = length + b"eXIf" + part + checksum
     return data[:33] + chunk + data[33:]  # after the header

@@ -20,9 +20,7 @@ PACKAGES += ("pandas", "tqdm", *BESIDE)
 
 
 def upload(folder: Path, mount: Path) -> None:
-    """What Kaggle makes of an uploaded folder: sub-folders are dropped, archives become
-    directories.
-    """
+    """Copy a folder as Kaggle uploads it: sub-folders are dropped, archives become directories."""
     mount.mkdir(parents=True)
     for path in folder.iterdir():
         if path.suffix in UNPACKED and is_zipfile(path):
@@ -34,6 +32,7 @@ def upload(folder: Path, mount: Path) -> None:
 
 def make_image(directory: Path) -> Path:
     """An environment with links to this interpreter's copies of the packages; its interpreter."""
+    # Links, because a copy of torch takes a minute and gigabytes.
     venv.create(directory, symlinks=True)
     site = next(directory.glob("lib/python*/site-packages"))
     for installed in closure(PACKAGES).values():
@@ -45,7 +44,7 @@ def make_image(directory: Path) -> Path:
 
 
 def closure(names: Sequence[str]) -> dict[str, Distribution]:
-    """The named distributions and all that they need, as far as they are here, by name."""
+    """Return the named distributions and the installed ones that they need, by name."""
     found = {}
     waiting = list(names)
     while waiting:
@@ -75,19 +74,15 @@ def pack_wheel(name: str, directory: Path) -> Path:
     written_by_pip = ("INSTALLER", "REQUESTED", "direct_url.json")
     with ZipFile(path, "w") as archive:
         for file in installed.files or ():
-            if (
-                file.parts[0] != ".."
-                and "__pycache__" not in file.parts
-                and file.name not in written_by_pip
-            ):
+            is_outside = file.parts[0] == ".."  # such as a program in bin
+            is_made = "__pycache__" in file.parts or file.name in written_by_pip
+            if not is_outside and not is_made:
                 archive.write(Path(str(installed.locate_file(file))), str(file))
     return path
 
 
 def environment(**more: str) -> dict[str, str]:
-    """This process's environment without what leads to its own packages, or tells that a test is
-    running.
-    """
+    """Return this process's environment without paths of its packages and without pytest's names."""
     hidden = ("PYTHONPATH", "VIRTUAL_ENV", "MKPC_WEIGHTS", "PYTEST_CURRENT_TEST")
     kept = {name: value for name, value in os.environ.items() if name not in hidden}
     return {**kept, "PYTHONNOUSERSITE": "1", **more}

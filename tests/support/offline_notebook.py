@@ -48,9 +48,8 @@ def execute(
     # Not under pytest's own directory: the path of a socket may have no more than 107 characters.
     with TemporaryDirectory(prefix="mkpc-") as runtime:
         env = {**variables, "JUPYTER_RUNTIME_DIR": runtime}
-        done = subprocess.run(
-            command, capture_output=True, text=True, env=env, cwd=working, check=False
-        )
+        settings = {"env": env, "cwd": working}
+        done = subprocess.run(command, capture_output=True, text=True, check=False, **settings)
     assert done.returncode == 0, done.stderr
     return nbformat.read(executed, as_version=4)
 
@@ -73,12 +72,12 @@ def outputs(notebook: nbformat.NotebookNode) -> list[nbformat.NotebookNode]:
 
 
 def with_pictures_alone(notebook: nbformat.NotebookNode) -> nbformat.NotebookNode:
-    """The form in which the tour is committed: its pictures, and nothing else that tells of a run."""
+    """Return the committed form of the tour: its pictures, and no other trace of a run."""
     kept = deepcopy(notebook)
     kept.metadata = {name: kept.metadata[name] for name in ("kernelspec", "language_info")}
     kept.metadata["language_info"] = {"name": "python"}
     for cell in kept.cells:
-        cell.metadata = {}
+        cell.metadata = {}  # times of the execution
         if cell.cell_type == "code":
             cell.execution_count = None
             cell.outputs = [

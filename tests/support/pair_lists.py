@@ -24,8 +24,11 @@ def turned_camera(camera: Camera, turns: int, size: Size) -> Camera:
 def line_of(
     names: tuple[str, str], cameras: tuple[Camera, Camera], turns: tuple[int, int] = (0, 0)
 ) -> str:
+    R, t = relative_pose(*cameras)
     T = np.eye(4)
-    T[:3, :3], T[:3, 3] = relative_pose(*cameras)
+    T[:3, :3] = R
+    T[:3, 3] = t
+    # 17 digits: the package must read the very cameras that the test has.
     numbers = np.concatenate([cameras[0].K.ravel(), cameras[1].K.ravel(), T.ravel()])
     return " ".join([*names, *map(str, turns), *(f"{number:.17g}" for number in numbers)])
 

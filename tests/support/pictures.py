@@ -29,10 +29,9 @@ def picture(
 
 def as_picture(pixels: np.ndarray, multiple: int = 1, padding: tuple[int, int] = (0, 0)) -> Picture:
     content = Size(pixels.shape[1], pixels.shape[0])
-    sides = [
-        -(-(side + more) // multiple) * multiple
-        for side, more in zip(content, padding, strict=True)
-    ]
+    sides = []
+    for side, more in zip(content, padding, strict=True):
+        sides.append(-(-(side + more) // multiple) * multiple)  # rounded up
     view = View(Box.whole(content), content, Size(*sides))
     return Picture(view.render(np.ascontiguousarray(pixels)), view)
 
@@ -48,7 +47,10 @@ def same(first: Matches, second: Matches) -> bool:
 
 
 def agreement(first: torch.Tensor, second: torch.Tensor, within: float, p: float = 2.0) -> float:
-    """The share of the rows of either that lie within that distance of a row of the other."""
+    """The share of the rows of either that lie within that distance of a row of the other.
+
+    Both directions count: a matcher with a few right matches, or with many more, does not agree.
+    """
     if not len(first) and not len(second):
         return 1.0
     near = torch.cdist(first, second, p=p) <= within

@@ -1,6 +1,4 @@
-"""What tests share: the material beside the repository, in ``../shared``, commands, recipes and
-folders.
-"""
+"""Shared helpers: the material of ``../shared``, commands, recipes and folders."""
 
 import json
 from pathlib import Path
@@ -40,6 +38,7 @@ def scores_of(out: Path, *options: object) -> dict[str, Any]:
     """Run ``validate`` with these options in this process; return what it writes to the JSON file
     ``out``.
     """
+    # In this process: a worker would import torch again for each test.
     assert run_command("validate", "--workers", 0, "--json", out, *options) == 0
     return json.loads(out.read_text())
 

@@ -47,7 +47,7 @@ from mkpc_kaggle.scene.choose import Choice, Reason
 from mkpc_kaggle.scene.reconstruct import Solution
 from mkpc_kaggle.scene.view_graph import BatchImage
 
-RESTART_S = 8.0
+RESTART_S = 8.0  # imports and loading of a worker, about as long as with torch
 ESTIMATE_S = 0.1  # of a pair
 WAKE_S = 1.0  # the longest wait; the real loop wakes every 0.2 s, and may give out other work then
 STALL = 20.0  # how many times as long a unit takes that stalls
@@ -147,6 +147,7 @@ class Scenario:
 def random_scenario(seed: int, pairs: int) -> Scenario:
     """Anything that happens: from an ample limit to a limit that the sweep alone fills."""
     rng = np.random.default_rng(seed)
+    # Costs of units differ by a factor of ten and more, as those of SIFT and dense networks do.
     costs = tuple(np.exp(rng.normal(-0.5, 0.8, rng.integers(1, 13))).tolist())
     troubled = rng.random() < 0.5
     scenario = Scenario(
@@ -215,17 +216,17 @@ class SimulatedSite(Site):
 
     def __init__(self, scenario: Scenario, clock: VirtualClock, stop: float) -> None:
         super().__init__(clock)
-        self.scenario, self.clock, self.stop = scenario, clock, stop
+        self.scenario = scenario
+        self.clock = clock
+        self.stop = stop
         self.kept = self.faults = self.last_job = self.for_scenes = 0.0
         self.scenes: list[SceneRun] = []
         self.workers: set[SimulatedWorker] = set()
-        self.costs = {
-            unit.name: cost
-            for unit, cost in zip(scenario.recipe.units, scenario.costs, strict=True)
-        }
-        self.rng, self._scene_rng = (
-            np.random.default_rng(seed) for seed in (scenario.seed, [scenario.seed, 1])
-        )
+        names = [unit.name for unit in scenario.recipe.units]
+        self.costs = dict(zip(names, scenario.costs, strict=True))
+        # Two generators: the number of scenes must not change the costs of units.
+        self.rng = np.random.default_rng(scenario.seed)
+        self._scene_rng = np.random.default_rng([scenario.seed, 1])
         makers = [(f"place {n}", self.match_worker, Work.MATCH) for n in range(scenario.workers)]
         makers.append(("estimates", lambda: SimulatedWorker(self, self.estimate), Work.LIGHT))
         for number in range(scenario.scene_places):
@@ -255,9 +256,9 @@ class SimulatedSite(Site):
 
     def unit_seconds(self, unit: Unit, now: float) -> float:
         scenario, rng = self.scenario, self.rng
-        seconds = self.costs[unit.name] * math.exp(
-            scenario.spread * rng.normal() - scenario.spread**2 / 2
-        )
+        # Lognormal with a mean of 1.
+        factor = math.exp(scenario.spread * rng.normal() - scenario.spread**2 / 2)
+        seconds = self.costs[unit.name] * factor
         missed = rng.random() < scenario.misses
         return seconds * (scenario.miss_factor if missed else 1.0) * self.drift(now)
 
@@ -285,12 +286,13 @@ class SimulatedSite(Site):
         for unit in sorted(job.units, key=lambda unit: unit.stage):
             for rows in found:
                 if spent + expected[unit] >= job.seconds:
-                    continue
+                    continue  # as a real worker, which begins no unit that would end too late
                 slow = STALL if rng.random() < scenario.stalls else 1.0
                 took = slow * self.unit_seconds(unit, begun + spent)
                 took += scenario.warm_up * (unit.name not in warm)
                 fate = rng.random()
                 if fate < scenario.crashes or unit.matcher == scenario.never:
+                    # In the middle of the unit, on average.
                     return spent + took / 2, Failure(Cause.DIED), took / 2
                 if fate < scenario.crashes + scenario.hangs:
                     return (
@@ -339,7 +341,9 @@ class SimulatedWorker:
         self, site: SimulatedSite, draw: Callable[[Any], Drawn], start_s: float = 0.0
     ) -> None:
         self.ready = math.inf
-        self._site, self._draw, self._start_s = site, draw, start_s
+        self._site = site
+        self._draw = draw
+        self._start_s = start_s
         self._answer: Answer = Loaded()
         self._begun = self._fault = 0.0
 

@@ -1,4 +1,4 @@
-"""A batch whose matches are those of known cameras, for runs with a real reconstruction."""
+"""A batch with matches of known cameras, for runs with a real reconstruction."""
 
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -18,11 +18,11 @@ RECIPE = Recipe((Unit(1, "synthetic", SIZE.width),), magsac=QUICK, scene=SceneCo
 
 @dataclass
 class SyntheticMatcher(RectifiedMatcher):
-    """Finds the matches of a synthetic scene in flat images, which it tells by their brightness."""
+    """Gives the matches of a synthetic scene; the brightness of a flat image is its number."""
 
     name: str = "synthetic"
     images: int = 6
-    points: int = field(default=400)
+    points: int = field(default=400)  # enough for a mapper, and mapped in a second
 
     @cached_property
     def scene(self) -> SyntheticScene:

@@ -1,6 +1,4 @@
-"""What the tests of weights share: lines of a manifest, files that fit them, and no other place to
-search.
-"""
+"""Helpers of the tests of weights: lines of a manifest, and files that fit them."""
 
 import hashlib
 from pathlib import Path
@@ -8,7 +6,7 @@ from pathlib import Path
 from mkpc_kaggle.weights import WeightFile
 
 DATA = b"these are the weights"
-OTHER = b"those were the weights"[:21]
+OTHER = b"those were the weights"[:21]  # of the same size: only a digest differs
 
 
 def digest_of(data: bytes) -> str:
