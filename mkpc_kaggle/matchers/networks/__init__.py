@@ -1,3 +1,1 @@
-"""Networks written from their papers: plain PyTorch modules that load the public checkpoints
-unchanged.
-"""
+"""Networks written from their papers: PyTorch modules that load the public checkpoints unchanged."""

@@ -4,7 +4,6 @@ from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
 from mkpc_kaggle.matchers.contract import Training
 from mkpc_kaggle.matchers.networks.adaptive_span import (
@@ -22,7 +21,7 @@ from mkpc_kaggle.matchers.networks.grids import (
     mean_pool,
     pointwise,
 )
-from mkpc_kaggle.matchers.networks.layers import ExactConv1d
+from mkpc_kaggle.matchers.networks.layers import ExactConv1d, resize
 from mkpc_kaggle.matchers.networks.linear_attention import Masks
 from mkpc_kaggle.matchers.networks.position import FIXED_DECAY, sine_positions
 from mkpc_kaggle.matchers.networks.resnet_fpn import TOP
@@ -30,14 +29,17 @@ from mkpc_kaggle.matchers.networks.semi_dense import SemiDenseNetwork
 
 HEADS = 8
 FLOW = 128  # channels of the flow feature, and of the projected positions
-INITIAL_LAYERS, BLOCKS = 2, 4
+INITIAL_LAYERS = 2  # of the initial stage
+BLOCKS = 4  # after it
 POOLING = (4, 4)  # rows and columns of the coarse map per cell of the global level
 
 
 @dataclass(frozen=True, eq=False)
 class Side:
-    """One image in the coarse transformer, with features ``visual`` (N, h, w, 256) and ``flow`` (N, h, w, 128).
-    ``positions`` (1, h, w, 128) are projected. ``mask`` is (N, h, w) bool or None.
+    """One image in the coarse transformer.
+
+    Features are ``visual`` (N, h, w, 256) and ``flow`` (N, h, w, 128). ``positions`` (1, h, w, 128)
+    are projected. ``mask`` is (N, h, w) bool or None.
     """
 
     visual: Tensor
@@ -48,13 +50,17 @@ class Side:
 
     def values(self, projection: nn.Conv1d) -> Tensor:
         """Return the joint projection (N, h, w, 256) of visual features and positions."""
+        # One table of positions serves all images of the batch.
         positions = self.positions.expand(len(self.visual), -1, -1, -1)
-        return pointwise(projection, torch.cat([self.visual, positions], dim=-1))
+        both = torch.cat([self.visual, positions], dim=-1)  # (N, h, w, 384), features first
+        return pointwise(projection, both)
 
     @property
     def pooled_mask(self) -> Tensor | None:
         """The mask (N, cells) of the global level, or None."""
-        return None if self.mask is None else mask_valid(self.mask, self.factor).flatten(1)
+        if self.mask is None:
+            return None
+        return mask_valid(self.mask, self.factor).flatten(1)
 
 
 class ChannelNorm(nn.Module):
@@ -67,7 +73,8 @@ class ChannelNorm(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         deviation, mean = torch.std_mean(x, dim=-1, keepdim=True)
-        return torch.addcmul(self.bias, (x - mean).div_(deviation.add_(1e-6)), self.affine)
+        normed = (x - mean).div_(deviation.add_(1e-6))
+        return torch.addcmul(self.bias, normed, self.affine)
 
 
 def global_attention(
@@ -77,27 +84,34 @@ def global_attention(
     temperature: Tensor | float,
     masks: tuple[Tensor | None, Tensor | None],
 ) -> Tensor:
-    """Return messages (N, h, w, C) to queries of this shape, from keys and values (N, h_key, w_key,
-    C).
+    """Return messages (N, h, w, C) to queries from keys and values (N, h_key, w_key, C).
 
-    A masked query gets the mean of all values, as published.
+    Queries have the messages' shape. A masked query gets the mean of all values, as published.
     """
-    queries, keys, values = (
-        x.flatten(1, 2).view(len(x), -1, HEADS, x.shape[3] // HEADS).transpose(1, 2)
-        for x in (q, k, v)
-    )  # (N, heads, cells, D)
-    # (N, heads, L, S)
-    logits = queries @ keys.transpose(2, 3) * (temperature * queries.shape[3] ** -0.5)
-    if masks[0] is not None and masks[1] is not None:
-        valid = masks[0][:, None, :, None] & masks[1][:, None, None, :]
+    queries = _tokens_by_head(q)  # (N, heads, L, D)
+    keys = _tokens_by_head(k)  # (N, heads, S, D)
+    values = _tokens_by_head(v)
+    scale = temperature * queries.shape[3] ** -0.5
+    logits = queries @ keys.transpose(2, 3) * scale  # (N, heads, L, S)
+    query_mask, key_mask = masks
+    if query_mask is not None and key_mask is not None:
+        valid = query_mask[:, None, :, None] & key_mask[:, None, None, :]
         logits.masked_fill_(~valid, MASKED)
     messages: Tensor = logits.softmax(dim=-1) @ values
     return messages.transpose(1, 2).reshape(q.shape)
 
 
+def _tokens_by_head(grid: Tensor) -> Tensor:
+    """Map (N, h, w, C) to (N, heads, h w, D), a view where the grid is contiguous."""
+    width = grid.shape[3] // HEADS
+    tokens = grid.flatten(1, 2).view(len(grid), -1, HEADS, width)
+    return tokens.transpose(1, 2)
+
+
 class CrossLayer(nn.Module):
-    """Projections for cross-attention between images, and the update of ``width`` features by a
-    message.
+    """Projections for cross-attention, and the update of ``width`` features by a message.
+
+    The coarse stage has no self-attention: all layers are between the two images.
     """
 
     def __init__(self, width: int, hidden: int, kernel: int) -> None:
@@ -122,9 +136,8 @@ class CrossLayer(nn.Module):
 
     def updated(self, features: Tensor, message: Tensor) -> Tensor:
         """Map features (N, h, w, width) and a message (N, h, w, 256) to new features."""
-        merged: Tensor = self.norm2(
-            self.merge_f(torch.cat([features, self.norm1(message)], dim=-1))
-        )
+        both = torch.cat([features, self.norm1(message)], dim=-1)
+        merged: Tensor = self.norm2(self.merge_f(both))
         return merged.add_(features)
 
 
@@ -136,10 +149,9 @@ class InitialLayer(CrossLayer):
         self.merge_head = nn.Conv1d(TOP, TOP, 1, bias=False)
 
     def forward(self, own: Side, other: Side) -> Tensor:
-        """Return the updated visual features (N, rows, columns, 256) of ``own`` at the global
-        level.
-        """
-        masks = own.pooled_mask, other.pooled_mask
+        """Return the updated features (N, rows, columns, 256) of ``own`` at the global level."""
+        masks = (own.pooled_mask, other.pooled_mask)
+        # Only the blocks learn a temperature.
         message = global_attention(*self.projected(own, other), 1.0, masks)
         return self.updated(own.visual, pointwise(self.merge_head, message))
 
@@ -154,26 +166,31 @@ class InitialStage(nn.Module):
         self.up_merge = nn.Conv2d(2 * TOP, TOP, 1)
 
     def forward(self, side0: Side, side1: Side) -> tuple[Side, Side]:
-        pooled0, pooled1 = _pooled(side0), _pooled(side1)
+        """Return both sides with updated visual features and with their first flow features."""
+        pooled0 = _pooled(side0)
+        pooled1 = _pooled(side1)
         for layer in self.layers_coarse:
-            visual0, visual1 = layer(pooled0, pooled1), layer(pooled1, pooled0)
-            pooled0, pooled1 = replace(pooled0, visual=visual0), replace(pooled1, visual=visual1)
+            # Both updates start from the features before the layer.
+            visual0 = layer(pooled0, pooled1)
+            visual1 = layer(pooled1, pooled0)
+            pooled0 = replace(pooled0, visual=visual0)
+            pooled1 = replace(pooled1, visual=visual1)
         return self._enlarged(side0, pooled0.visual), self._enlarged(side1, pooled1.visual)
 
     def _enlarged(self, side: Side, pooled: Tensor) -> Side:
-        decoupled = as_map(pointwise(self.decoupler, pooled))
-        size = side.visual.shape[1:3]
-        large = as_grid(
-            functional.interpolate(decoupled, size=size, mode="bilinear", align_corners=False)
-        )
-        visual, flow = torch.split(large, [TOP, FLOW], dim=-1)
-        added = pointwise(self.up_merge, torch.cat([side.visual, visual], dim=-1))
+        """Split pooled features into a visual and a flow part, and enlarge both to the side."""
+        decoupled = as_map(pointwise(self.decoupler, pooled))  # (N, 384, rows, columns)
+        large = resize(decoupled, side.visual.shape[1:3])
+        visual, flow = torch.split(as_grid(large), [TOP, FLOW], dim=-1)
+        both = torch.cat([side.visual, visual], dim=-1)
+        added = pointwise(self.up_merge, both)
         return replace(side, visual=added.add_(side.visual), flow=flow)
 
 
 def _pooled(side: Side) -> Side:
     """Pool features and positions to the global level. The mask is pooled where it is used."""
-    visual, positions = mean_pool(side.visual, side.factor), mean_pool(side.positions, side.factor)
+    visual = mean_pool(side.visual, side.factor)
+    positions = mean_pool(side.positions, side.factor)
     return replace(side, visual=visual, positions=positions)
 
 
@@ -184,14 +201,16 @@ class HierarchicalAttention(nn.Module):
         super().__init__()
         self.temp = nn.Parameter(torch.ones(()))
         self.merge_head = Perceptron(
-            nn.Conv1d(3 * TOP, TOP, 1, bias=False), nn.Conv1d(TOP, TOP, 1, bias=False)
+            nn.Conv1d(3 * TOP, TOP, 1, bias=False),
+            nn.Conv1d(TOP, TOP, 1, bias=False),
         )
 
     def forward(
         self, q: Tensor, k: Tensor, v: Tensor, flow: Tensor, own: Side, other: Side
     ) -> Tensor:
-        """Map queries and flow of ``own``, keys and values of ``other`` to a message (N, h, w,
-        256).
+        """Map queries and flow of ``own``, keys and values of ``other``, to a message.
+
+        The message is (N, h, w, 256), like the queries.
         """
         coarse = global_attention(
             mean_pool(q, own.factor),
@@ -200,59 +219,70 @@ class HierarchicalAttention(nn.Module):
             self.temp,
             (own.pooled_mask, other.pooled_mask),
         )  # (N, h / rows, w / columns, 256)
-        half, full = (_span_message(q, k, v, flow, factor, own.mask) for factor in (2, 1))
-        size = (q.shape[1], q.shape[2])
-        enlarged = (
-            as_grid(functional.interpolate(as_map(grid), size=size)) for grid in (coarse, half)
-        )
-        merged: Tensor = self.merge_head(torch.cat([*enlarged, full], dim=-1))
+        half = _span_message(q, k, v, flow, 2, own.mask)  # (N, h / 2, w / 2, 256)
+        full = _span_message(q, k, v, flow, 1, own.mask)  # (N, h, w, 256)
+        size = q.shape[1:3]
+        # Messages are enlarged to the nearest cell, unlike the initial stage's features.
+        levels = [_repeated(coarse, size), _repeated(half, size), full]
+        merged: Tensor = self.merge_head(torch.cat(levels, dim=-1))
         return merged
+
+
+def _repeated(grid: Tensor, size: torch.Size) -> Tensor:
+    """Enlarge a grid (N, h, w, C) to ``size`` by repeating its cells."""
+    return as_grid(resize(as_map(grid), size, "nearest"))
 
 
 def _span_message(
     q: Tensor, k: Tensor, v: Tensor, flow: Tensor, factor: int, mask: Tensor | None
 ) -> Tensor:
-    """Return the message (N, h / factor, w / factor, 256) of the adaptive-span level pooled by
-    ``factor``.
-    """
-    q, k, v = mean_pool(q, factor), mean_pool(k, factor), mean_pool(v, factor)
+    """Return the message (N, h / factor, w / factor, 256) of the span level pooled by ``factor``."""
+    q = mean_pool(q, factor)
+    k = mean_pool(k, factor)
+    v = mean_pool(v, factor)
     samples = adaptive_span(flow, factor)
-    usable = (
-        None if mask is None else sample_usable(samples, mask, (k.shape[1], k.shape[2]), factor)
-    )
+    usable = None
+    if mask is not None:
+        usable = sample_usable(samples, mask, (k.shape[1], k.shape[2]), factor)
     return span_attention(q, k, v, samples, HEADS, usable)
 
 
 class AspanBlock(CrossLayer):
-    """A block that decodes the flow and updates both features along it; the last updates only the
-    visual ones.
+    """A block that decodes the flow and updates visual and flow features along it.
+
+    The last block updates the visual features only: nothing reads a flow after it.
     """
 
     def __init__(self, last: bool) -> None:
         super().__init__(TOP if last else TOP + FLOW, TOP + FLOW, kernel=3)
         self.last = last
+        # Float32 in any precision: its outputs are positions.
         self.flow_decoder = Perceptron(
-            ExactConv1d(FLOW, FLOW // 2, 1, bias=False), ExactConv1d(FLOW // 2, 4, 1, bias=False)
+            ExactConv1d(FLOW, FLOW // 2, 1, bias=False),
+            ExactConv1d(FLOW // 2, 4, 1, bias=False),
         )
         self.attention = HierarchicalAttention()
 
     def decode_flow(self, own: Side, other: Side) -> Tensor:
-        """Return (N, h, w, 4): target (x, y) in coarse cells, from the corner of ``other``, and
-        log-variances.
+        """Return (N, h, w, 4): the target (x, y) in ``other``, and log-variances of x and y.
+
+        Targets are in coarse cells, from the corner of ``other``.
         """
         raw = self.flow_decoder(own.flow)
+        # x is a share of the other image's width, y of its height.
         size = raw.new_tensor([other.visual.shape[2], other.visual.shape[1]])
-        return torch.cat([raw[..., :2].sigmoid() * size, raw[..., 2:]], dim=-1)
+        target = raw[..., :2].sigmoid() * size
+        return torch.cat([target, raw[..., 2:]], dim=-1)
 
     def forward(self, own: Side, other: Side) -> Side:
         """Return ``own``, updated."""
-        message = self.attention(
-            *self.projected(own, other), self.decode_flow(own, other), own, other
-        )
-        both = own.visual if self.last else torch.cat([own.visual, own.flow], dim=-1)
+        q, k, v = self.projected(own, other)
+        message = self.attention(q, k, v, self.decode_flow(own, other), own, other)
+        if self.last:
+            return replace(own, visual=self.updated(own.visual, message))
+        both = torch.cat([own.visual, own.flow], dim=-1)  # (N, h, w, 384)
         updated = self.updated(both, message)
-        flow = own.flow if self.last else updated[..., TOP:]
-        return replace(own, visual=updated[..., :TOP], flow=flow)
+        return replace(own, visual=updated[..., :TOP], flow=updated[..., TOP:])
 
 
 class AspanTransformer(nn.Module):
@@ -270,7 +300,10 @@ class AspanTransformer(nn.Module):
         """Return the visual features of both images, each (N, h, w, 256)."""
         side0, side1 = self.ini_layer(side0, side1)
         for block in self.layers:
-            side0, side1 = block(side0, side1), block(side1, side0)
+            updated0 = block(side0, side1)
+            updated1 = block(side1, side0)  # from side0 before its update
+            side0 = updated0
+            side1 = updated1
         return side0.visual, side1.visual
 
 
@@ -289,7 +322,8 @@ class AspanFormer(SemiDenseNetwork):
         super().__init__(AspanTransformer())
         self.train_size = (832, 832)
         if training is Training.INDOOR:
-            self.train_size, self.border = (480, 640), 0
+            self.train_size = (480, 640)
+            self.border = 0
         self.coarse_matching = nn.ParameterDict({"temperature": torch.tensor(10.0)})
         self.eval().requires_grad_(False)
 
@@ -305,19 +339,22 @@ class AspanFormer(SemiDenseNetwork):
         return grid0, grid1
 
     def side(self, coarse: Tensor, mask: Tensor | None) -> Side:
-        """Return the transformer's input for an image: its coarse map (N, 256, h, w) with positions
-        added.
-        """
+        """Return an image's transformer input: its coarse map (N, 256, h, w) plus positions."""
         grid = as_grid(coarse)
         height, width = grid.shape[1:3]
         scale = self.position_scale(height, width)
-        # (1, h, w, 256)
-        positions = sine_positions(height, width, FIXED_DECAY, scale, grid.device)[None]
+        positions = sine_positions(height, width, FIXED_DECAY, scale, grid.device)
+        positions = positions[None]  # (1, h, w, 256)
+        # Contiguous, because attention reads the grid as tokens by ``view``.
         visual = (grid + positions).contiguous()
-        projected = pointwise(self.loftr_coarse.pos_transform, positions)
-        return Side(visual, visual.new_empty(0), projected, POOLING, mask)
+        projected = pointwise(self.loftr_coarse.pos_transform, positions)  # (1, h, w, 128)
+        flow = visual.new_empty(0)  # from the initial stage on
+        return Side(visual, flow, projected, POOLING, mask)
 
     def position_scale(self, height: int, width: int) -> tuple[float, float]:
         """Return the factors (y, x) that stretch a coarse map's positions to ``train_size``."""
+        # Each axis has its own factor, as in the published code's online mode.
         train_height, train_width = self.train_size
-        return train_height / (COARSE_STRIDE * height), train_width / (COARSE_STRIDE * width)
+        scale_y = train_height / (COARSE_STRIDE * height)
+        scale_x = train_width / (COARSE_STRIDE * width)
+        return scale_y, scale_x

@@ -20,20 +20,22 @@ def table_of(maps: Tensor) -> Tensor:
 
 
 def corners(positions: Tensor, image: Tensor, size: torch.Size) -> tuple[Tensor, Tensor]:
-    """Return the pixels (Q, 4) int64 around positions (Q, 2) in maps ``image`` (Q,), and their
-    weights (Q, 4).
+    """Return the four pixels (Q, 4) int64 around each position, and their weights (Q, 4).
 
-    Pixels outside the map, of ``size`` (h, w), have the weight 0 and the index of another pixel.
+    Positions (Q, 2) are in the maps ``image`` (Q,), of ``size`` (h, w). Pixels outside a map have
+    the weight 0 and the index of another pixel.
     """
     height, width = size
     x, y = positions.unbind(1)
-    first = image * (height * width)
-    rows = [(first + row * width, weight) for row, weight in neighbours(y, height)]
-    columns = neighbours(x, width)
-    index = torch.stack([row + column for row, _ in rows for column, _ in columns], dim=1)
-    return index, torch.stack(
-        [along_y * along_x for _, along_y in rows for _, along_x in columns], dim=1
-    )
+    first = image * (height * width)  # (Q,): the table's row of the map's first pixel
+    index: list[Tensor] = []
+    weights: list[Tensor] = []
+    for row, along_y in neighbours(y, height):
+        line = first + row * width
+        for column, along_x in neighbours(x, width):
+            index.append(line + column)
+            weights.append(along_y * along_x)
+    return torch.stack(index, dim=1), torch.stack(weights, dim=1)
 
 
 def neighbours(positions: Tensor, length: int) -> list[tuple[Tensor, Tensor]]:
@@ -43,25 +45,28 @@ def neighbours(positions: Tensor, length: int) -> list[tuple[Tensor, Tensor]]:
     """
     before = positions.floor()
     share = positions - before
-    return [
-        (
-            pixel.clamp(0, length - 1).nan_to_num(0).long(),
-            weight.masked_fill((pixel < 0) | (pixel >= length), 0),
-        )
-        for pixel, weight in ((before, 1 - share), (before + 1, share))
-    ]
+    found = []
+    for pixel, weight in ((before, 1 - share), (before + 1, share)):
+        outside = (pixel < 0) | (pixel >= length)
+        # The comparisons are false for NaN, whose weight thus stays NaN: it is reported later.
+        index = pixel.clamp(0, length - 1).nan_to_num(0).long()
+        found.append((index, weight.masked_fill(outside, 0)))
+    return found
 
 
 def weighted_rows(table: Tensor, index: Tensor, weights: Tensor) -> Tensor:
     """Sum weights (Q, K) times the rows ``index`` (Q, K) of a table (P, C) over K: (Q, C)."""
+    # One fused operator: the gathered rows (Q, K, C) are never stored.
     return functional.embedding_bag(index, table, mode="sum", per_sample_weights=weights)
 
 
 def sampled(maps: Tensor, positions: Tensor, image: Tensor) -> Tensor:
-    """Sample maps (B, C, h, w) at positions (Q, 2) of the maps ``image`` (Q,): (Q, C) float32, zero
-    outside.
+    """Sample maps (B, C, h, w) at positions (Q, 2) of the maps ``image`` (Q,).
+
+    Return (Q, C) float32, zero outside.
     """
-    return weighted_rows(table_of(maps), *corners(positions, image, maps.shape[2:]))
+    index, weights = corners(positions, image, maps.shape[2:])
+    return weighted_rows(table_of(maps), index, weights)
 
 
 class DeformableConv2d(nn.Conv2d):
@@ -69,23 +74,28 @@ class DeformableConv2d(nn.Conv2d):
 
     def __init__(self, channels: int, out_channels: int) -> None:
         super().__init__(channels, out_channels, KERNEL, padding=1, bias=False)
+        # Two offsets for each tap. They are positions, so the layer keeps float32.
         self.offset_conv = ExactConv2d(channels, 2 * KERNEL**2, KERNEL, padding=1)
 
     def forward(self, x: Tensor) -> Tensor:
         """Map (B, C, h, w) to (B, out_channels, h, w), like ``x``."""
         batch, _, height, width = x.shape
+        # As trained, a tap moves by at most a quarter of the longer side.
         reach = max(height, width) / 4
-        # (B, h, w, 18): y, x by tap
-        offsets = as_grid(self.offset_conv(x.float())).clamp(-reach, reach)
-        rows, columns = (torch.arange(n, device=x.device) for n in (height, width))
-        # (9, 2): x, y
-        taps = torch.cartesian_prod(*2 * [torch.arange(KERNEL, device=x.device) - 1]).flip(1)
-        # (h, w, 1, 2)
-        pixels = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), dim=2)[:, :, None]
-        # (B, h, w, 9, 2)
-        positions = offsets.view(batch, height, width, -1, 2).flip(4) + (pixels + taps)
+        moves = as_grid(self.offset_conv(x.float())).clamp(-reach, reach)  # (B, h, w, 18)
+        offsets = moves.view(batch, height, width, -1, 2).flip(4)  # y, x by tap -> x, y
+
+        steps = torch.arange(KERNEL, device=x.device) - 1
+        taps = torch.cartesian_prod(steps, steps).flip(1)  # (9, 2): x, y; row by row
+        columns = torch.arange(width, device=x.device)
+        rows = torch.arange(height, device=x.device)
+        pixels = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), dim=2)  # (h, w, 2)
+        # The integers are added before the offsets: their sum is exact.
+        positions = offsets + (pixels[:, :, None] + taps)  # (B, h, w, 9, 2)
+
+        # The convolution is a linear map of the nine samples of each pixel.
         image = torch.arange(batch, device=x.device).repeat_interleave(height * width * KERNEL**2)
-        # (B, h, w, 9 C)
-        seen = sampled(x, positions.flatten(0, 3), image).view(batch, height, width, -1)
-        weight = self.weight.permute(0, 2, 3, 1).flatten(1)  # (out, 9 C)
+        seen = sampled(x, positions.flatten(0, 3), image)  # (B h w 9, C)
+        seen = seen.view(batch, height, width, -1)  # (B, h, w, 9 C)
+        weight = self.weight.permute(0, 2, 3, 1).flatten(1)  # (out, 9 C): tap by tap, like samples
         return as_map(linear(seen, weight, self.bias)).to(x.dtype)

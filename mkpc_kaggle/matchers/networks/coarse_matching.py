@@ -33,16 +33,23 @@ def coarse_matches(
     ``masks`` (h, w) bool are True at content. Indices of matched cells count row by row in the
     cell's own grid.
     """
-    mask0, mask1 = masks or (
-        grid0.new_ones(grid.shape[:2], dtype=torch.bool) for grid in (grid0, grid1)
-    )
-    cells = Cells(
-        grid0.flatten(0, 1) * scale, grid1.flatten(0, 1), mask0.flatten(), mask1.flatten()
-    )
+    if masks is None:
+        mask0 = grid0.new_ones(grid0.shape[:2], dtype=torch.bool)
+        mask1 = grid1.new_ones(grid1.shape[:2], dtype=torch.bool)
+    else:
+        mask0, mask1 = masks
+    features0 = grid0.flatten(0, 1) * scale  # (L, C)
+    features1 = grid1.flatten(0, 1)  # (S, C)
+    cells = Cells(features0, features1, mask0.flatten(), mask1.flatten())
+
+    # The maxima include border cells, which therefore may suppress an inner cell, as published.
     best0, partner, best1 = row_and_column_maxima(cells)
-    inner0, inner1 = inner_cells(mask0, border), inner_cells(mask1, border)
+    inner0 = inner_cells(mask0, border)
+    inner1 = inner_cells(mask1, border)
     confidence = torch.exp(2 * best0)
-    kept = (confidence > threshold) & (best0 == best1[partner]) & inner0 & inner1[partner]
+    # Equality is exact: both maxima are read from the same number of the matrix.
+    is_mutual = best0 == best1[partner]
+    kept = (confidence > threshold) & is_mutual & inner0 & inner1[partner]
     cell0 = kept.nonzero()[:, 0]
     return Assignment(cell0, partner[cell0], confidence[cell0])
 
@@ -56,41 +63,48 @@ class Cells(NamedTuple):
     content1: Tensor
 
     def similarity(self) -> Iterator[Tensor]:
-        """Yield dot products in blocks of rows (l, S) float32, minus infinity where either cell is
-        padding.
-        """
+        """Yield dot products in blocks of rows (l, S) float32; minus infinity at padding."""
         rows = ROWS_AT_ONCE.get(self.features0.device.type, 256)
-        blocks = zip(
-            torch.split(self.features0.float(), rows), torch.split(self.content0, rows), strict=True
-        )
+        # In float32, since half precision has three digits and logits reach 100.
+        features = torch.split(self.features0.float(), rows)
+        contents = torch.split(self.content0, rows)
         keys = self.features1.float()
-        for features, content in blocks:
-            products = linear(features, keys)
+        for queries, content in zip(features, contents, strict=True):
+            products = linear(queries, keys)
             if not (content.all() and self.content1.all()):
-                products.masked_fill_(~(content[:, None] & self.content1), -torch.inf)
+                is_content = content[:, None] & self.content1
+                products.masked_fill_(~is_content, -torch.inf)
             yield products
 
 
 def half_log_sums(blocks: Iterable[Tensor]) -> tuple[Tensor, Tensor]:
-    """Return half the logsumexp of each row (L,) and of each column (S,) of a matrix in blocks of
-    rows (l, S).
+    """Return half the logsumexp of each row (L,) and column (S,) of a matrix.
+
+    The matrix comes in blocks of rows (l, S).
     """
-    rows_and_columns = [(block.logsumexp(dim=1), block.logsumexp(dim=0)) for block in blocks]
-    over_rows, of_blocks = (list(sums) for sums in zip(*rows_and_columns, strict=True))
-    over_columns = torch.stack(of_blocks).logsumexp(dim=0)
+    of_rows = []
+    of_columns = []
+    for block in blocks:
+        of_rows.append(block.logsumexp(dim=1))
+        of_columns.append(block.logsumexp(dim=0))
+    over_rows = torch.cat(of_rows)
+    over_columns = torch.stack(of_columns).logsumexp(dim=0)
     # The logarithm for a row of padding is minus infinity. Clamping prevents NaN in later
     # differences.
     finite = torch.finfo(torch.float32).min
-    return torch.cat(over_rows).clamp_(min=finite).div_(2), over_columns.clamp_(min=finite).div_(2)
+    half_rows = over_rows.clamp_(min=finite).div_(2)
+    half_columns = over_columns.clamp_(min=finite).div_(2)
+    return half_rows, half_columns
 
 
 def half_log_confidences(cells: Cells) -> Iterator[Tensor]:
     """Yield half the logarithm of the confidence, in blocks of rows (l, S).
 
-    The confidence is the product of the softmaxes over rows and columns.
-    Its logarithm is 2 s_ij - log sum_j exp s_ij - log sum_i exp s_ij.
+    The confidence is the product of the softmaxes over rows and columns. Its logarithm is 2 s_ij -
+    log sum_j exp s_ij - log sum_i exp s_ij. Half of it takes one pass less over the matrix.
     """
     small = len(cells.features0) * len(cells.features1) <= HELD_FLOATS
+    # A large matrix is computed twice instead of being stored.
     held = list(cells.similarity()) if small else None
     over_rows, over_columns = half_log_sums(held or cells.similarity())
     first = 0
@@ -102,20 +116,23 @@ def half_log_confidences(cells: Cells) -> Iterator[Tensor]:
 def row_and_column_maxima(cells: Cells) -> tuple[Tensor, Tensor, Tensor]:
     """Return each row's maximum (L,) and its column (L,), and each column's maximum (S,)."""
     of_rows = []
+    partners = []
     of_columns = cells.features1.new_full(cells.content1.shape, -torch.inf, dtype=torch.float32)
     for block in half_log_confidences(cells):
-        of_rows.append(block.max(dim=1))
+        best, partner = block.max(dim=1)
+        of_rows.append(best)
+        partners.append(partner)
         of_columns = torch.maximum(of_columns, block.amax(dim=0))
-    best, partner = (torch.cat(values) for values in zip(*of_rows, strict=True))
-    return best, partner, of_columns
+    return torch.cat(of_rows), torch.cat(partners), of_columns
 
 
 def inner_cells(mask: Tensor, border: int) -> Tensor:
-    """Return (h w,) bool: True at cells of the content (h, w) that are at least ``border`` from its
-    edge.
-    """
+    """Return (h w,) bool: True at cells of the content (h, w) at least ``border`` from its edge."""
     h, w = mask.shape
-    bottom, right = mask.sum(dim=0).amax() - border, mask.sum(dim=1).amax() - border
-    row, column = torch.arange(h, device=mask.device)[:, None], torch.arange(w, device=mask.device)
+    # The content is at the top left: its height and width are the longest column and row.
+    bottom = mask.sum(dim=0).amax() - border
+    right = mask.sum(dim=1).amax() - border
+    row = torch.arange(h, device=mask.device)[:, None]
+    column = torch.arange(w, device=mask.device)
     inner = (row >= border) & (row < bottom) & (column >= border) & (column < right)
     return (inner & mask).flatten()

@@ -1,5 +1,6 @@
-"""DaD, a keypoint detector (Edstedt et al. 2025, arXiv 2503.07347): a map of logits and its
-strongest maxima.
+"""DaD, a keypoint detector: the strongest maxima of a map of logits (Edstedt et al. 2025).
+
+arXiv 2503.07347, as used by LoMa.
 
 Normalised coordinates: (x, y) in [-1, 1], where +-1 are the outer edges of an image. Parameter
 names match the public checkpoint. For inference only.
@@ -29,10 +30,9 @@ class Dad(nn.Module):
         self.eval().requires_grad_(False)
 
     def forward(self, image: Tensor, number: int) -> list[Tensor]:
-        """Return up to ``number`` points for each of the images (B, 3, H, W), RGB in 0..1, sides at
-        least 8.
+        """Return up to ``number`` points for each of the images (B, 3, H, W), RGB in 0..1.
 
-        In training, sides were multiples of 8, and the longer one was 1024.
+        Sides are at least 8. In training they were multiples of 8, and the longer one was 1024.
         """
         maps = self.logits(image)
         check_finite("keypoint scores of loma", maps)
@@ -41,42 +41,50 @@ class Dad(nn.Module):
     def logits(self, image: Tensor) -> Tensor:
         """Return logits (B, H, W) float32."""
         prediction, hidden = self.decoder(self.levels(image))
+        # The context of the last stride, its other channel, has no reader.
         part = self.decoder.at(1).outputs(hidden)[:, :1]
         return resize(prediction, part.shape[2:], "bicubic").add_(part)[:, 0]
 
     def levels(self, image: Tensor) -> Iterator[Tensor]:
         """Return the features at strides 1, 2, 4 and 8."""
-        mean, std = (image.new_tensor(values)[:, None, None] for values in (MEAN, STD))
+        # The descriptor's input is not normalised, the detector's is.
+        mean = image.new_tensor(MEAN)[:, None, None]  # (3, 1, 1)
+        std = image.new_tensor(STD)[:, None, None]
         return self.encoder.levels((image - mean) / std)
 
 
 def select_keypoints(logits: Tensor, number: int) -> Tensor:
-    """Return the ``number`` highest maxima over 3 x 3 pixels of a map (H, W). All equal maxima of a
-    window count.
+    """Return the ``number`` highest maxima over 3 x 3 pixels of a map (H, W).
 
-    Points (K, 2) are float32, normalised, the most probable first, and up to half a pixel beyond
-    the edges.
+    All equal maxima of a window count. Points (K, 2) are float32, normalised, the most probable
+    first, and up to half a pixel beyond the edges.
     """
     height, width = logits.shape
+    # Over all pixels of the image, as in training.
     probability = logits.flatten().softmax(dim=0).view(1, height, width)
-    maxima = probability.where(probability == window_maximum(probability, 1), 0).flatten()
+    is_maximum = probability == window_maximum(probability, 1)
+    maxima = probability.where(is_maximum, 0).flatten()
     scores, pixels = maxima.topk(min(number, len(maxima)))
+    # The published code fills up with arbitrary pixels of probability 0.
     pixels = pixels[scores > 0]
-    rows, columns = pixels // width, pixels % width
-    places = torch.stack([columns, rows], dim=1) + subpixel_offsets(logits, rows, columns)
-    return (2 * places + 1) / places.new_tensor([width, height]) - 1
+    rows = pixels // width
+    columns = pixels % width
+    positions = torch.stack([columns, rows], dim=1) + subpixel_offsets(logits, rows, columns)
+    return (2 * positions + 1) / positions.new_tensor([width, height]) - 1
 
 
 def subpixel_offsets(logits: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
-    """Return offsets (K, 2) float32 in pixels, within -1..1: softmax means around pixels (K,) of a
-    map (H, W).
+    """Return offsets (K, 2) float32 in pixels, within -1..1, of pixels (K,) of a map (H, W).
 
-    As in training, logits beyond the map are 0.
+    They are means under a softmax of 3 x 3 logits. As in training, logits beyond the map are 0.
     """
     padded = functional.pad(logits, (1, 1, 1, 1))
     steps = torch.arange(3, device=logits.device)
-    # (K, 3, 3)
-    windows = padded[(rows[:, None] + steps)[:, :, None], (columns[:, None] + steps)[:, None]]
+    window_rows = (rows[:, None] + steps)[:, :, None]  # (K, 3, 1)
+    window_columns = (columns[:, None] + steps)[:, None]  # (K, 1, 3)
+    windows = padded[window_rows, window_columns]  # (K, 3, 3)
     shares = (windows.flatten(1) / TEMPERATURE).softmax(dim=1).view_as(windows)
     moves = steps.float() - 1
-    return torch.stack([shares.sum(dim=1) @ moves, shares.sum(dim=2) @ moves], dim=1)
+    x = shares.sum(dim=1) @ moves
+    y = shares.sum(dim=2) @ moves
+    return torch.stack([x, y], dim=1)

@@ -5,28 +5,32 @@ from torch import Generator, Tensor
 
 OVERSAMPLING = 4  # the factor before matches are balanced
 BANDWIDTH = 0.1  # of the density's kernel, in normalised coordinates
-MIN_DENSITY, LAST_RESORT = 10, 1e-7  # isolated matches are drawn only if no others remain
-BLOCK_FLOATS = 2**20
+# Published: a match of a lower density is drawn only if no others remain.
+MIN_DENSITY = 10
+LAST_RESORT = 1e-7  # the weight of these matches
+BLOCK_FLOATS = (
+    2**20
+)  # of all-pairs distances, 4 MiB: all of them would be 6.4 GB for 10,000 matches
 MIN_EXPONENT = -80  # exp of less is denormal: ten times slower, and adds nothing
 
 
 def sample_matches(
     warp: Tensor, certainty: Tensor, number: int, threshold: float, generator: Generator
 ) -> Tensor:
-    """Return indices (M,) int64 of up to ``number`` matches, drawn from a warp (N, 4) by finite
-    certainty (N,).
+    """Draw up to ``number`` matches from a warp (N, 4) by finite certainty (N,); return indices.
 
-    Certainties above ``threshold`` count as 1. Matches of certainty 0 are never drawn.
-    ``generator``, on the tensors' device, is the source of randomness.
+    Indices are (M,) int64. Certainties above ``threshold`` count as 1. Matches of certainty 0 are
+    never drawn. ``generator``, on the tensors' device, is the source of randomness.
     """
     weights = certainty.masked_fill(certainty > threshold, 1)
-    index = draw(
-        weights, torch.empty_like(weights).exponential_(generator=generator), number * OVERSAMPLING
-    )
+    # The noise of both draws is drawn in this order, as in the published code: the golden vectors
+    # have it.
+    noise = torch.empty_like(weights).exponential_(generator=generator)
+    index = draw(weights, noise, number * OVERSAMPLING)
+
     evenness = balancing_weights(density(warp[index]))
-    return index[
-        draw(evenness, torch.empty_like(evenness).exponential_(generator=generator), number)
-    ]
+    noise = torch.empty_like(evenness).exponential_(generator=generator)
+    return index[draw(evenness, noise, number)]
 
 
 def draw(weights: Tensor, noise: Tensor, number: int) -> Tensor:
@@ -40,19 +44,21 @@ def draw(weights: Tensor, noise: Tensor, number: int) -> Tensor:
 
 
 def density(points: Tensor) -> Tensor:
-    """Return (N,) sums of exp(-|p - q|^2 / (2 bandwidth^2)) over all points q, for each point p of
-    (N, D).
+    """Return a kernel density (N,) at each of the points (N, D).
+
+    It is the sum of exp(-|p - q|^2 / (2 bandwidth^2)) over all points q, p itself included.
     """
     density = points.new_empty(len(points))
     rows = max(1, BLOCK_FLOATS // max(1, len(points)))
-    for some, out in zip(torch.split(points, rows), torch.split(density, rows), strict=True):
+    # The parts of ``density`` are views, which each block fills.
+    parts = torch.split(density, rows)
+    for some, out in zip(torch.split(points, rows), parts, strict=True):
         exponents = torch.cdist(some, points).square_().div_(-2 * BANDWIDTH**2)
         torch.sum(exponents.clamp_(min=MIN_EXPONENT).exp_(), dim=1, out=out)
     return density
 
 
 def balancing_weights(density: Tensor) -> Tensor:
-    """Map densities (N,) to weights (N,): lower for higher densities, and almost 0 for isolated
-    points.
-    """
-    return (1 / (density + 1)).masked_fill_(density < MIN_DENSITY, LAST_RESORT)
+    """Map densities (N,) to weights (N,): low for high densities, almost 0 for isolated points."""
+    weights = 1 / (density + 1)
+    return weights.masked_fill_(density < MIN_DENSITY, LAST_RESORT)

@@ -23,24 +23,27 @@ def as_grid(feature_map: Tensor) -> Tensor:
 
 def mean_pool(grid: Tensor, factor: int | tuple[int, int]) -> Tensor:
     """Average blocks of ``factor`` (rows, columns); drop incomplete blocks at the right and bottom."""
-    return grid if factor == 1 else as_grid(functional.avg_pool2d(as_map(grid), factor))
+    if factor == 1:
+        return grid
+    return as_grid(functional.avg_pool2d(as_map(grid), factor))
 
 
 def to_2x2_blocks(grid: Tensor) -> Tensor:
-    """Map (..., h, w, E) to (..., h/2 * w/2, 4, E): 2x2 blocks row by row, and cells row by row
-    within a block.
+    """Map (..., h, w, E) to (..., h/2 * w/2, 4, E): blocks of 2x2 cells, row by row.
+
+    The four cells of a block are row by row, too.
     """
     *lead, h, w, width = grid.shape
-    # (..., h/2, w/2, 2, 2, E)
-    cells = grid.reshape(*lead, h // 2, 2, w // 2, 2, width).transpose(-4, -3)
-    return cells.reshape(*lead, h * w // 4, 4, width)
+    split = grid.reshape(*lead, h // 2, 2, w // 2, 2, width)
+    blocks = split.transpose(-4, -3)  # (..., h/2, w/2, 2, 2, E)
+    return blocks.reshape(*lead, h * w // 4, 4, width)
 
 
 def from_2x2_blocks(cells: Tensor, h: int, w: int) -> Tensor:
     """Map (..., h/2 * w/2, 4, E) to (..., h, w, E): undo :func:`to_2x2_blocks`."""
     *lead, _, _, width = cells.shape
-    # (..., h/2, 2, w/2, 2, E)
-    rows = cells.reshape(*lead, h // 2, w // 2, 2, 2, width).transpose(-4, -3)
+    blocks = cells.reshape(*lead, h // 2, w // 2, 2, 2, width)
+    rows = blocks.transpose(-4, -3)  # (..., h/2, 2, w/2, 2, E)
     return rows.reshape(*lead, h, w, width)
 
 
@@ -57,18 +60,25 @@ class Perceptron(nn.Module):
 
     def __init__(self, first: Layer, second: Layer) -> None:
         super().__init__()
+        # The checkpoints' names; "1" is the ReLU, which has no parameters.
         self.add_module("0", first)
         self.add_module("2", second)
 
     def forward(self, x: Tensor) -> Tensor:
         """Map (..., C) to (..., C_out)."""
-        first, second = self.get_parameter("0.weight"), self.get_parameter("2.weight")
+        # Checkpoints store pointwise layers as (out, in), (out, in, 1) or (out, in, 1, 1). All of
+        # them are matrices here.
+        first = self.get_parameter("0.weight")
+        second = self.get_parameter("2.weight")
         hidden = functional.relu_(linear(x.to(first.dtype), first.flatten(1)))
         if second.shape[2:] == (3, 3):
-            return as_grid(functional.conv2d(as_map(hidden), second, padding=1)).to(x.dtype)
+            mixed = functional.conv2d(as_map(hidden), second, padding=1)
+            return as_grid(mixed).to(x.dtype)
         return linear(hidden, second.flatten(1)).to(x.dtype)
 
 
 def mask_valid(mask: Tensor, factor: int | tuple[int, int]) -> Tensor:
     """Pool (N, h, w) bool: a block is valid only if all of its cells are valid."""
-    return functional.max_pool2d((~mask).float()[:, None], factor)[:, 0] == 0
+    # PyTorch pools no booleans: a block is invalid if its maximum of "is padding" is 1.
+    padding = (~mask).float()[:, None]
+    return functional.max_pool2d(padding, factor)[:, 0] == 0

@@ -1,8 +1,7 @@
-"""Linear maps, attention, convolutions in strips and mutual matches, fast on CPUs; for inference
-only.
+"""Linear maps, attention, convolutions in strips and mutual matches, fast on CPUs.
 
-A weight may have half precision (see ``placement``). The product is then computed in half
-precision, and a linear map converts the result back to the input's precision.
+For inference only. A weight may have half precision (see ``placement``). The product is then
+computed in half precision, and a linear map converts the result back to the input's precision.
 """
 
 from collections.abc import Callable
@@ -17,21 +16,23 @@ IMAGES = range(16, 65)  # on one thread PyTorch uses oneDNN's convolution from 1
 
 
 def linear(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
-    """Map (..., C_in) to (..., C_out): multiply by ``weight`` (C_out, C_in), and add ``bias``
-    (C_out,).
-    """
+    """Map (..., C_in) to (..., C_out) by ``weight`` (C_out, C_in) and ``bias`` (C_out,)."""
     if weight.dtype != x.dtype:
         return functional.linear(x.to(weight.dtype), weight, bias).to(x.dtype)
+    # Zero rows, of images without keypoints, cannot be split into images below.
     if x.device.type != "cpu" or weight.dtype != torch.float32 or x.numel() == 0:
         return functional.linear(x, weight, bias)
-    # In float32 oneDNN's 1x1 convolution is as fast as MKL's matrix product on Intel, twice as fast
-    # on AMD.
+
+    # In float32 oneDNN's 1x1 convolution is as fast as MKL's matrix product on Intel, and twice as
+    # fast on AMD. The rows become the pixels of ``images`` images with one line each.
     rows = x.numel() // x.shape[-1]
     images = next((count for count in IMAGES if rows % count == 0), 1)
-    seen = x.reshape(images, 1, rows // images, -1).permute(0, 3, 1, 2)  # channels last
-    # (images, C_out, 1, rows / images)
-    mapped = functional.conv2d(seen, weight[:, :, None, None], bias)
-    return mapped.permute(0, 2, 3, 1).reshape(*x.shape[:-1], -1)
+    lines = x.reshape(images, 1, rows // images, -1)  # (images, 1, rows / images, C_in)
+    pixels = lines.permute(0, 3, 1, 2)  # a view: channels last in memory, so nothing is copied
+    kernel = weight[:, :, None, None]  # (C_out, C_in, 1, 1)
+    mapped = functional.conv2d(pixels, kernel, bias)  # (images, C_out, 1, rows / images)
+    as_lines = mapped.permute(0, 2, 3, 1)
+    return as_lines.reshape(*x.shape[:-1], -1)
 
 
 class Linear(nn.Linear):
@@ -42,9 +43,7 @@ class Linear(nn.Linear):
 
 
 class Exact:
-    """A mark of layers that output or select coordinates. These layers stay float32 in any
-    precision.
-    """
+    """A mark of layers that output or select coordinates: they stay float32 in any precision."""
 
 
 class ExactLinear(Exact, Linear):
@@ -60,9 +59,11 @@ class ExactConv2d(Exact, nn.Conv2d):
 
 
 def depthwise_block(inputs: int, outputs: int) -> nn.Sequential:
-    """Make a depthwise 5x5 convolution of ``inputs`` channels, then a 1x1 convolution of
-    ``outputs``.
+    """Make a depthwise 5x5 convolution of ``inputs`` channels and a 1x1 convolution.
+
+    The depthwise one has ``outputs`` channels, a multiple of ``inputs``, and so has the other.
     """
+    # The order of DKM's and LoMa's checkpoints: 0 depthwise, 1 norm, 2 ReLU, 3 pointwise.
     return nn.Sequential(
         nn.Conv2d(inputs, outputs, 5, padding=2, groups=inputs),
         nn.BatchNorm2d(outputs),
@@ -72,8 +73,13 @@ def depthwise_block(inputs: int, outputs: int) -> nn.Sequential:
 
 
 def resize(x: Tensor, size: torch.Size, mode: str = "bilinear") -> Tensor:
-    """Resize (B, C, h, w) to (B, C, *size) with half-pixel centres, without antialiasing."""
-    return functional.interpolate(x, tuple(size), mode=mode, align_corners=False)
+    """Resize (B, C, h, w) to (B, C, *size) with half-pixel centres, without antialiasing.
+
+    ``mode``: "bilinear", "bicubic" or "nearest".
+    """
+    # PyTorch accepts no ``align_corners`` for "nearest".
+    align_corners = None if mode == "nearest" else False
+    return functional.interpolate(x, tuple(size), mode=mode, align_corners=align_corners)
 
 
 def attention(q: Tensor, k: Tensor, v: Tensor, precision: torch.dtype) -> Tensor:
@@ -81,34 +87,43 @@ def attention(q: Tensor, k: Tensor, v: Tensor, precision: torch.dtype) -> Tensor
 
     Products are computed in ``precision``, the softmax in float32.
     """
-    queries, keys, values = (x.to(precision) for x in (q, k, v))
-    return functional.scaled_dot_product_attention(queries, keys, values).to(q.dtype)
+    # Fused: the (L, S) logits, 67 MB at 2,048 keypoints and 4 heads, are never stored.
+    outputs = functional.scaled_dot_product_attention(
+        q.to(precision), k.to(precision), v.to(precision)
+    )
+    return outputs.to(q.dtype)
 
 
 def in_strips(
     function: Callable[[Tensor], Tensor], x: Tensor, *, reach: int, channels: int
 ) -> Tensor:
-    """Map (B, C, H, W) to (B, C', H, W) by ``function``; on a CPU, in strips of rows that fit the
-    cache.
+    """Map (B, C, H, W) to (B, C', H, W) by ``function``; on a CPU in strips that fit the cache.
 
     A row of the result depends on ``reach`` rows above and below it. ``channels``: the maximum
-    number of channels inside the function. The function must not change ``x``. Strips overlap by
-    the reach, so that zero padding at their edges has no effect.
+    number of channels inside the function. The function must not change ``x``, since strips
+    overlap.
     """
     batch, _, height, width = x.shape
-    rows = max(1, 4 * reach, STRIP_FLOATS // (batch * channels * width))
+    rows = STRIP_FLOATS // (batch * channels * width)
+    # Twice the reach is computed again for each strip: at most half of its rows.
+    rows = max(1, 4 * reach, rows)
     if x.is_cuda or rows >= height:
         return function(x)
     strips = []
     for top in range(0, height, rows):
-        bottom, first = min(top + rows, height), max(0, top - reach)
-        strips.append(function(x[:, :, first : bottom + reach])[:, :, top - first : bottom - first])
+        bottom = min(top + rows, height)
+        # The rows that zero padding at the strip's edges has changed are cut off again.
+        first = max(0, top - reach)
+        mapped = function(x[:, :, first : bottom + reach])
+        strips.append(mapped[:, :, top - first : bottom - first])
+    # Channels last, like the maps that ``function`` returns without strips.
     return torch.cat(strips, dim=2).contiguous(memory_format=torch.channels_last)
 
 
 class Assignment(NamedTuple):
-    """M matches by ascending ``index0``: indices (M,) int64 of keypoints or cells, ``scores`` (M,)
-    in 0..1.
+    """M matches by ascending ``index0``: indices (M,) int64 of keypoints or cells, and scores.
+
+    ``scores`` (M,) are float32 in 0..1.
     """
 
     index0: Tensor
@@ -122,11 +137,11 @@ class Assignment(NamedTuple):
 
 
 def mutual_matches(log_scores: Tensor, threshold: float) -> Assignment:
-    """Return pairs of keypoints that are mutually best in ``log_scores`` (N0, N1), scored above the
-    threshold.
-    """
-    # (N0,) twice, (N1,)
-    (best0, partner0), partner1 = log_scores.max(dim=1), log_scores.argmax(dim=0)
-    index0, scores = torch.arange(len(partner0), device=log_scores.device), best0.exp()
-    kept = (partner1[partner0] == index0) & (scores > threshold)
+    """Return the mutually best pairs of ``log_scores`` (N0, N1) with a score above ``threshold``."""
+    best0, partner0 = log_scores.max(dim=1)  # (N0,): the best score, and its keypoint in image 1
+    partner1 = log_scores.argmax(dim=0)  # (N1,)
+    scores = best0.exp()
+    index0 = torch.arange(len(partner0), device=log_scores.device)
+    is_mutual = partner1[partner0] == index0
+    kept = is_mutual & (scores > threshold)
     return Assignment(index0[kept], partner0[kept], scores[kept])

@@ -1,5 +1,7 @@
-"""LightGlue: Lindenberger, Sarlin, Pollefeys, "LightGlue: Local Feature Matching at Light Speed",
-ICCV 2023.
+"""LightGlue, a matcher of two sets of keypoints.
+
+Source: Lindenberger, Sarlin, Pollefeys, "LightGlue: Local Feature Matching at Light Speed", ICCV
+2023.
 
 The keypoints of both images share one tensor (1, N, d), N = N0 + N1; only attention separates the
 images. Parameter names match the public checkpoints. For inference only.
@@ -29,8 +31,8 @@ MIN_PRUNED_KEYPOINTS = {"cpu": 0, "cuda": 1024}
 class LightGlueShape:
     """Sizes of a published LightGlue.
 
-    ``descriptor`` and ``width``: channels of descriptors and inside the layers. ``positions``: values
-    per keypoint, x and y, or x, y, scale and orientation.
+    ``descriptor`` and ``width``: channels of descriptors and inside the layers. ``positions``:
+    values per keypoint, x and y, or x, y, scale and orientation.
     """
 
     descriptor: int
@@ -42,11 +44,11 @@ class LightGlueShape:
 
 @dataclass(frozen=True)
 class Adaptation:
-    """Settings of early stopping and pruning (section 3.3 of the paper), and the threshold of
-    matches.
+    """Settings of early stopping and pruning (section 3.3 of the paper), and of matches.
 
-    Stop after a layer if more than the share ``depth`` of keypoints is confident. Drop confident keypoints that
-    match with a probability of at most 1 - ``width``. Negative: never. Matches score above ``threshold``.
+    Stop after a layer if more than the share ``depth`` of keypoints is confident. Drop confident
+    keypoints that match with a probability of at most 1 - ``width``. Negative: never. Matches score
+    above ``threshold``.
     """
 
     depth: float = 0.95
@@ -59,6 +61,7 @@ class RotaryEmbedding(nn.Module):
 
     def __init__(self, positions: int, head: int) -> None:
         super().__init__()
+        # Float32 in any precision: bfloat16 would round positions to 8 bits.
         self.Wr = ExactLinear(positions, head // 2, bias=False)
 
     def forward(self, positions: Tensor) -> Tensor:
@@ -69,6 +72,7 @@ class RotaryEmbedding(nn.Module):
 
 def apply_rotary(x: Tensor, rotation: Tensor) -> Tensor:
     """Rotate pairs of channels of ``x`` (1, heads, N, head) by complex numbers (1, 1, N, head / 2)."""
+    # Channels 2 i and 2 i + 1 are the real and imaginary part: a rotation is one product.
     pairs = torch.view_as_complex(x.view(*x.shape[:3], -1, 2))
     return torch.view_as_real(pairs * rotation).flatten(3)
 
@@ -84,8 +88,9 @@ def update(width: int) -> nn.Sequential:
 
 
 class SelfAttention(nn.Module):
-    """Messages between the keypoints of one image. ``Wqkv`` outputs are ordered by head, channel,
-    then q, k, v.
+    """Messages between the keypoints of one image.
+
+    The outputs of ``Wqkv`` are ordered by head, then by channel, then q, k, v.
     """
 
     def __init__(self, width: int, heads: int) -> None:
@@ -97,14 +102,20 @@ class SelfAttention(nn.Module):
 
     def forward(self, x: Tensor, n0: int, rotation: Tensor) -> Tensor:
         """Map (1, N, d) to (1, N, d); the first ``n0`` of the N keypoints belong to image 0."""
-        # (1, heads, N, head, 3)
-        projected = self.Wqkv(x).view(*x.shape[:2], self.heads, -1, 3).transpose(1, 2)
-        q, k, v = (part.contiguous() for part in projected.unbind(4))
+        projected = self.Wqkv(x).view(*x.shape[:2], self.heads, -1, 3)
+        by_head = projected.transpose(1, 2)  # (1, heads, N, head, 3)
+        # Contiguous: a view as complex numbers needs adjacent pairs of channels.
+        q, k, v = (part.contiguous() for part in by_head.unbind(4))
+        # Values are not rotated: only the attention depends on positions.
         q = apply_rotary(q, rotation)
         k = apply_rotary(k, rotation)
         precision = self.out_proj.weight.dtype
-        images = (slice(None, n0), slice(n0, None))
-        outputs = [attention(q[:, :, of], k[:, :, of], v[:, :, of], precision) for of in images]
+        outputs = []
+        for image in (slice(None, n0), slice(n0, None)):
+            own_q = q[:, :, image]
+            own_k = k[:, :, image]
+            own_v = v[:, :, image]
+            outputs.append(attention(own_q, own_k, own_v, precision))
         return updated(x, outputs, self.out_proj, self.ffn)
 
 
@@ -121,20 +132,26 @@ class CrossAttention(nn.Module):
 
     def forward(self, x: Tensor, n0: int) -> Tensor:
         """Map (1, N, d) to (1, N, d); the first ``n0`` of the N keypoints belong to image 0."""
-        qk = self.to_qk(x).view(*x.shape[:2], self.heads, -1).transpose(1, 2)
-        v = self.to_v(x).view(*x.shape[:2], self.heads, -1).transpose(1, 2)
-        qk0, qk1 = qk[:, :, :n0], qk[:, :, n0:]
-        v0, v1 = v[:, :, :n0], v[:, :, n0:]
+        # One projection is both query and key, so similarities are the same in both directions.
+        by_head = (*x.shape[:2], self.heads, -1)
+        qk = self.to_qk(x).view(by_head).transpose(1, 2)  # (1, heads, N, head)
+        v = self.to_v(x).view(by_head).transpose(1, 2)
+        qk0 = qk[:, :, :n0]
+        qk1 = qk[:, :, n0:]
+        v0 = v[:, :, :n0]
+        v1 = v[:, :, n0:]
         precision = self.to_out.weight.dtype
         # Two products with a fused softmax are faster than one product whose result both directions
         # read.
-        outputs = [attention(qk0, qk1, v1, precision), attention(qk1, qk0, v0, precision)]
-        return updated(x, outputs, self.to_out, self.ffn)
+        message0 = attention(qk0, qk1, v1, precision)
+        message1 = attention(qk1, qk0, v0, precision)
+        return updated(x, [message0, message1], self.to_out, self.ffn)
 
 
 def updated(x: Tensor, outputs: list[Tensor], out: Linear, ffn: nn.Sequential) -> Tensor:
     """Update features (1, N, d) by the attention outputs (1, heads, Ni, head) of both images."""
-    output = torch.cat([each.transpose(1, 2) for each in outputs], dim=1).flatten(2)  # (1, N, d)
+    by_keypoint = [each.transpose(1, 2) for each in outputs]  # (1, Ni, heads, head)
+    output = torch.cat(by_keypoint, dim=1).flatten(2)  # (1, N, d)
     change: Tensor = ffn(torch.cat([x, out(output)], dim=2))
     return x + change
 
@@ -148,6 +165,7 @@ class TransformerLayer(nn.Module):
         self.cross_attn = CrossAttention(width, heads)
 
     def forward(self, x: Tensor, n0: int, rotation: Tensor) -> Tensor:
+        """Map (1, N, d) to (1, N, d); ``rotation`` is :class:`RotaryEmbedding`'s."""
         x = self.self_attn(x, n0, rotation)
         return self.cross_attn(x, n0)  # type: ignore[no-any-return]  # nn.Module's call is untyped
 
@@ -162,9 +180,11 @@ class MatchAssignment(nn.Module):
 
     def forward(self, x: Tensor, n0: int) -> Tensor:
         """Return the logarithms (N0, N1) of match probabilities, from features (1, N, d)."""
-        scaled = self.final_proj(x)[0] / x.shape[2] ** 0.25
-        similarity = scaled[:n0] @ scaled[n0:].T
+        # Both factors of a product are divided by d^(1/4), the product by sqrt(d).
+        scaled = self.final_proj(x)[0] / x.shape[2] ** 0.25  # (N, d)
+        similarity = scaled[:n0] @ scaled[n0:].T  # (N0, N1)
         certainty = functional.logsigmoid(self.matchability(x)[0, :, 0])  # (N,)
+        # Section 3.2 of the paper, in logarithms: dual softmax times both matchabilities.
         scores = log_scores(similarity)
         return scores + certainty[:n0, None] + certainty[n0:]
 
@@ -184,15 +204,20 @@ class LightGlue(nn.Module):
         self, shape: LightGlueShape, adaptation: Adaptation | None = None, *, adapts: bool = True
     ) -> None:
         super().__init__()
-        width, heads, layers = shape.width, shape.heads, shape.layers
+        width = shape.width
+        heads = shape.heads
+        layers = shape.layers
         self.adaptation = adaptation or Adaptation()
         self.adapts = adapts and max(self.adaptation.depth, self.adaptation.width) > 0
         is_identity = shape.descriptor == width
         self.input_proj = nn.Identity() if is_identity else Linear(shape.descriptor, width)
         self.posenc = RotaryEmbedding(shape.positions, width // heads)
         self.transformers = nn.ModuleList(TransformerLayer(width, heads) for _ in range(layers))
+        # A run that stops early needs the assignment of the layer at which it stops; pruning needs
+        # each layer's matchability.
         assignments = range(layers) if self.adapts else [layers - 1]
         self.log_assignment = nn.ModuleDict({str(i): MatchAssignment(width) for i in assignments})
+        # After the last layer nothing is decided, so it has no confidence.
         self.token_confidence = nn.ModuleList()
         for _ in range(layers - 1 if self.adapts else 0):
             confidence = nn.Sequential(ExactLinear(width, 1))
@@ -211,9 +236,10 @@ class LightGlue(nn.Module):
             return Assignment.empty(positions0.device)
         rotation = self.posenc(torch.cat([positions0, positions1])[None])
         x: Tensor = self.input_proj(torch.cat([descriptors0, descriptors1])[None])
-        # The numbers of the keypoints that are left, in the order of both images.
+        # The numbers of the remaining keypoints, in the order of both images.
         index = torch.arange(x.shape[1], device=x.device)
-        total, split = x.shape[1], n0
+        total = x.shape[1]
+        split = n0  # before pruning: the number of image 1's first keypoint
         last = len(self.transformers) - 1
         for layer, transformer in enumerate(self.transformers):
             x = transformer(x, n0, rotation)
@@ -225,14 +251,18 @@ class LightGlue(nn.Module):
                 break
             kept = self._kept(x, n0, confidence, layer)
             if kept is not None:
-                x, rotation, index = x[:, kept], rotation[:, :, kept], index[kept]
+                x = x[:, kept]
+                rotation = rotation[:, :, kept]
+                index = index[kept]
                 n0 = int((kept < n0).sum())
                 if n0 == 0 or n0 == len(index):
                     return Assignment.empty(x.device)
         scores = self.assignment(last)(x, n0)
         check_finite("scores of lightglue", scores)
         found = mutual_matches(scores, self.adaptation.threshold)
-        index0, index1 = index[:n0], index[n0:] - split
+        # Pruning keeps the order, so matches stay ascending in ``index0``.
+        index0 = index[:n0]
+        index1 = index[n0:] - split
         return Assignment(index0[found.index0], index1[found.index1], found.scores)
 
     def assignment(self, layer: int) -> MatchAssignment:
@@ -241,7 +271,7 @@ class LightGlue(nn.Module):
         return module
 
     def _confidence(self, x: Tensor, layer: int) -> Tensor | None:
-        """Return how sure each keypoint is of its match or its lack of one, (N,) in 0..1."""
+        """Return how sure each keypoint is of its match, or of having none: (N,) in 0..1."""
         if self.adaptation.depth <= 0:
             return None
         token = self.token_confidence[layer].get_submodule("token")
@@ -258,30 +288,27 @@ class LightGlue(nn.Module):
     def _kept(self, x: Tensor, n0: int, confidence: Tensor | None, layer: int) -> Tensor | None:
         """Return the indices of the keypoints to keep, or ``None`` if no image is pruned."""
         fewest = MIN_PRUNED_KEYPOINTS.get(x.device.type, 0)
-        is_pruned = [count > fewest for count in (n0, x.shape[1] - n0)]
-        if self.adaptation.width <= 0 or not any(is_pruned):
+        prunes0 = n0 > fewest
+        prunes1 = x.shape[1] - n0 > fewest
+        if self.adaptation.width <= 0 or not (prunes0 or prunes1):
             return None
         kept = self.assignment(layer).match_probability(x) > 1 - self.adaptation.width
+        # A keypoint that is still unsure may become a match in a later layer.
         if confidence is not None:
             kept |= confidence <= self._threshold(layer)
-        for image, is_image_pruned in zip(
-            (slice(None, n0), slice(n0, None)), is_pruned, strict=True
-        ):
-            if not is_image_pruned:
-                kept[image] = True
+        if not prunes0:
+            kept[:n0] = True
+        if not prunes1:
+            kept[n0:] = True
         return kept.nonzero()[:, 0]
 
     def _threshold(self, layer: int) -> float:
-        """Return the confidence from which a keypoint is sure: it falls with the layer, as
-        published.
-        """
+        """Return the confidence from which a keypoint is sure, as published: lower in later layers."""
         return 0.8 + 0.1 * math.exp(-4.0 * layer / len(self.transformers))
 
 
 def log_scores(similarity: Tensor) -> Tensor:
-    """Return the logarithm (..., N0, N1) of the product of two softmaxes, one over each image's
-    keypoints.
-    """
+    """Return the logarithm (..., N0, N1) of the dual softmax: one over each image's keypoints."""
     return similarity.log_softmax(dim=-2).add_(similarity.log_softmax(dim=-1))
 
 

@@ -1,5 +1,6 @@
-"""LoFTR with dual softmax (Sun et al., "LoFTR: Detector-Free Local Feature Matching with
-Transformers", 2021).
+"""LoFTR with dual softmax.
+
+Source: Sun et al., "LoFTR: Detector-Free Local Feature Matching with Transformers", 2021.
 """
 
 from torch import Tensor
@@ -22,14 +23,23 @@ class Loftr(SemiDenseNetwork):
 
     def __init__(self, training: Training = Training.OUTDOOR) -> None:
         super().__init__(LinearTransformer(TOP, HEADS, cycles=4))
+        # A wrong encoding loads without an error, and matches become worse.
         self.decay = ORIGINAL_DECAY
         if training is Training.INDOOR:
-            self.decay, self.border = FIXED_DECAY, 0
+            self.decay = FIXED_DECAY
+            self.border = 0
 
     def transform(
         self, coarse0: Tensor, coarse1: Tensor, masks: Masks | None = None
     ) -> tuple[Tensor, Tensor]:
-        grid0, grid1 = with_positions(coarse0, self.decay), with_positions(coarse1, self.decay)
-        flat_masks = None if masks is None else (masks[0].flatten(1), masks[1].flatten(1))
-        tokens0, tokens1 = self.loftr_coarse(grid0.flatten(1, 2), grid1.flatten(1, 2), flat_masks)
+        grid0 = with_positions(coarse0, self.decay)  # (N, h, w, 256)
+        grid1 = with_positions(coarse1, self.decay)
+        # Linear attention has no notion of rows and columns: cells become tokens (N, h w, 256).
+        flat_masks = None
+        if masks is not None:
+            mask0, mask1 = masks
+            flat_masks = (mask0.flatten(1), mask1.flatten(1))
+        cells0 = grid0.flatten(1, 2)
+        cells1 = grid1.flatten(1, 2)
+        tokens0, tokens1 = self.loftr_coarse(cells0, cells1, flat_masks)
         return tokens0.view_as(grid0), tokens1.view_as(grid1)

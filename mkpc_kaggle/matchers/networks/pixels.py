@@ -4,7 +4,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet's colours, in 0..1
+# Mean and standard deviation of ImageNet's red, green and blue, in 0..1.
+MEAN = (0.485, 0.456, 0.406)
+STD = (0.229, 0.224, 0.225)
 
 
 def resized(pixels: Tensor, size: tuple[int, int]) -> Tensor:
@@ -14,6 +16,7 @@ def resized(pixels: Tensor, size: tuple[int, int]) -> Tensor:
     12. About 1 % of the values differ from Pillow's, by one or two grey levels. Pillow 13 resizes a
     shrinking height before a growing width; then at least 20 % of the values differ.
     """
+    # An image of the right size keeps its pixels: Pillow does not filter it either.
     if pixels.shape[2:] != size:
         pixels = functional.interpolate(
             pixels, size, mode="bicubic", antialias=True, align_corners=False
@@ -26,5 +29,6 @@ def network_input(pixels: Tensor, size: tuple[int, int]) -> Tensor:
 
     For the second pass, call this with the original images again.
     """
-    mean, std = (torch.tensor(values)[:, None, None] for values in (MEAN, STD))
+    mean = torch.tensor(MEAN)[:, None, None]  # (3, 1, 1)
+    std = torch.tensor(STD)[:, None, None]
     return resized(pixels, size).sub_(mean).div_(std)

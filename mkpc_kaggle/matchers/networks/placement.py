@@ -8,12 +8,12 @@ from torch import nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from mkpc_kaggle.matchers.contract import Placement, Precision
+from mkpc_kaggle.matchers.networks.grids import Layer
 from mkpc_kaggle.matchers.networks.layers import Exact
 
 Network = TypeVar("Network", bound=nn.Module)
 
 Norm = nn.BatchNorm1d | nn.BatchNorm2d
-Layer = nn.Linear | nn.Conv1d | nn.Conv2d
 
 
 def prepared(network: Network, placement: Placement) -> Network:
@@ -23,6 +23,7 @@ def prepared(network: Network, placement: Placement) -> Network:
     convolutions get the placement's precision. All else stays float32: sums of transformers,
     softmax, optimal transport, coordinates.
     """
+    # Before the cast, so that folded weights are rounded to half precision once.
     fold_norms(network)
     for layer in network.modules():
         if isinstance(layer, Layer) and not isinstance(layer, Exact):
@@ -32,23 +33,25 @@ def prepared(network: Network, placement: Placement) -> Network:
 
 
 def fold_norms(network: nn.Module) -> None:
-    """Fold every batch norm into the convolution before it, in float64 with one rounding at the
-    end.
-    """
+    """Fold every batch norm into the convolution before it, in float64, rounded once at the end."""
+    # Lists, because the loop replaces modules. Children are in the order of their definition: in
+    # all networks a norm follows its convolution.
     for parent in list(network.modules()):
-        for (conv_name, conv), (norm_name, norm) in pairwise(list(parent.named_children())):
-            if isinstance(norm, Norm):
-                assert isinstance(conv, nn.Conv1d | nn.Conv2d)
-                precision = conv.weight.dtype
-                setattr(
-                    parent, conv_name, fuse_conv_bn_eval(conv.double(), norm.double()).to(precision)
-                )
-                setattr(parent, norm_name, nn.Identity())
+        children = list(parent.named_children())
+        for (conv_name, conv), (norm_name, norm) in pairwise(children):
+            if not isinstance(norm, Norm):
+                continue
+            assert isinstance(conv, nn.Conv1d | nn.Conv2d)
+            precision = conv.weight.dtype
+            folded = fuse_conv_bn_eval(conv.double(), norm.double())
+            setattr(parent, conv_name, folded.to(precision))
+            setattr(parent, norm_name, nn.Identity())
 
 
 def autocast(placement: Placement) -> torch.autocast:
-    """Return an autocast for libraries' networks; PyTorch chooses the operators that run in half
-    precision.
+    """Return an autocast for libraries' networks, whose layers :func:`prepared` cannot know.
+
+    PyTorch chooses the operators that run in half precision.
     """
     enabled = placement.precision is not Precision.FLOAT32
     device = torch.device(placement.device).type

@@ -1,5 +1,4 @@
-"""ResNet with a feature pyramid, of LoFTR and its descendants: maps at 1/8 and 1/2 of the image
-size.
+"""ResNet with a feature pyramid, of LoFTR and its descendants: maps at 1/8 and 1/2 of the image.
 
 Source: Sun et al. 2021 (LoFTR), section 3.1; layer names as in the public checkpoints.
 """
@@ -10,14 +9,17 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-STEM, MIDDLE, TOP, FINE = 128, 196, 256, 128  # channels at 1/2, 1/4 and 1/8, and of the fine output
+# Channels at 1/2, 1/4 and 1/8 of the image, and of the fine output.
+STEM = 128
+MIDDLE = 196
+TOP = 256
+FINE = 128
 
 
 class FeatureMaps(NamedTuple):
-    """Maps of B images of H x W pixels: ``coarse`` (B, 256, H/8, W/8) and ``fine`` (B, 128, H/2,
-    W/2).
+    """Maps of B images of H x W pixels, in the precision of the backbone's weights.
 
-    Both have the precision of the backbone's weights.
+    ``coarse`` is (B, 256, H/8, W/8), ``fine`` (B, 128, H/2, W/2).
     """
 
     coarse: Tensor
@@ -25,9 +27,7 @@ class FeatureMaps(NamedTuple):
 
 
 class ResidualBlock(nn.Module):
-    """Two 3x3 convolutions with a shortcut, which is a strided 1x1 convolution where the size
-    changes.
-    """
+    """Two 3x3 convolutions with a shortcut; a strided 1x1 convolution where the size changes."""
 
     def __init__(self, inputs: int, outputs: int, stride: int = 1) -> None:
         super().__init__()
@@ -44,7 +44,9 @@ class ResidualBlock(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """Map (B, inputs, h, w) to (B, outputs, h / stride, w / stride)."""
         y = functional.relu_(self.bn1(self.conv1(x)))
-        return functional.relu_(self.bn2(self.conv2(y)).add_(self.downsample(x)))
+        y = self.bn2(self.conv2(y))
+        # In place of ``y``, never of ``x``, which the feature pyramid still reads.
+        return functional.relu_(y.add_(self.downsample(x)))
 
 
 def smoothing(inputs: int, outputs: int) -> nn.Sequential:
@@ -58,8 +60,9 @@ def smoothing(inputs: int, outputs: int) -> nn.Sequential:
 
 
 class ResNetFpn(nn.Module):
-    """The backbone: gray images (B, 1, H, W), float32 in [0, 1], sides multiples of 8 ->
-    :class:`FeatureMaps`.
+    """The backbone: it maps gray images (B, 1, H, W) to :class:`FeatureMaps`.
+
+    Images are float32 in [0, 1]; their sides are multiples of 8.
     """
 
     def __init__(self) -> None:
@@ -82,12 +85,13 @@ class ResNetFpn(nn.Module):
         half = self.layer1(functional.relu_(self.bn1(self.conv1(image))))  # (B, 128, H/2, W/2)
         quarter = self.layer2(half)  # (B, 196, H/4, W/4)
         coarse = self.layer3_outconv(self.layer3(quarter))  # (B, 256, H/8, W/8)
-        # (B, 196, H/4, W/4)
-        merged = self.layer2_outconv2(self.layer2_outconv(quarter).add_(_doubled(coarse)))
-        # (B, 128, H/2, W/2)
-        fine = self.layer1_outconv2(self.layer1_outconv(half).add_(_doubled(merged)))
+        lateral = self.layer2_outconv(quarter).add_(_doubled(coarse))  # (B, 256, H/4, W/4)
+        merged = self.layer2_outconv2(lateral)  # (B, 196, H/4, W/4)
+        lateral = self.layer1_outconv(half).add_(_doubled(merged))  # (B, 196, H/2, W/2)
+        fine = self.layer1_outconv2(lateral)  # (B, 128, H/2, W/2)
         return FeatureMaps(coarse, fine)
 
 
 def _doubled(x: Tensor) -> Tensor:
+    # Corners are aligned here as in training, unlike everywhere else in these networks.
     return functional.interpolate(x, scale_factor=2.0, mode="bilinear", align_corners=True)

@@ -1,4 +1,6 @@
-"""RoMa: Edstedt et al., "RoMa: Robust Dense Feature Matching", CVPR 2024.
+"""RoMa, a dense matcher with features of DINOv2 and VGG-19.
+
+Source: Edstedt et al., "RoMa: Robust Dense Feature Matching", CVPR 2024.
 
 DKM with other features. The coarse features are DINOv2's, one per patch of 14 x 14 pixels.
 Checkpoints name this stride 16; displacements count a patch as 16 pixels. The two images may differ
@@ -35,11 +37,16 @@ from mkpc_kaggle.matchers.networks.warp_refiner import (
 )
 
 COARSEST = 16
+# DKM's, except for the last one: RoMa compares 9 projected channels, DKM the colours.
 REFINERS = SHAPES | {1: WarpRefinerShape(9, 6, None, 24)}
-DISPLACEMENT, TRAINED_SIDE = 1.25, 560  # the factor of displacements in a square image of this side
+DISPLACEMENT = 1.25  # the factor of displacements in a square image of the trained side
+TRAINED_SIDE = 560  # pixels
 
+# The coarse decoder.
 SIDE = 64  # of the grid of anchors, for any image shape
-BLOCKS, HEADS, EPSILON = 5, 8, 1e-5  # of the coarse decoder; EPSILON is for its norms
+BLOCKS = 5
+HEADS = 8
+EPSILON = 1e-5  # of its norms; DINOv2's have another
 
 
 class RoMa(DenseNetwork):
@@ -53,34 +60,36 @@ class RoMa(DenseNetwork):
         self.eval().requires_grad_(False)
 
     def encode(self, image: Tensor, fine: Tensor | None = None) -> DenseFeatures:
-        """Encode images with sides that are multiples of 14; sides for a second pass are at least
-        8.
-        """
+        """Encode images with sides that are multiples of 14; sides of ``fine`` are at least 8."""
         vgg = self.encoder["cnn"]
         coarse = self.decoder.projected([*vgg(image), self.dinov2(image)])
         coefficients = self.decoder.process.regress(coarse.at(COARSEST))
-        return DenseFeatures(
-            coarse, (coefficients,), None if fine is None else self.decoder.projected(vgg(fine))
-        )
+        # The second pass starts at stride 8 and needs no features of DINOv2.
+        second = None if fine is None else self.decoder.projected(vgg(fine))
+        return DenseFeatures(coarse, (coefficients,), second)
 
 
 class RomaDecoder(WarpDecoder):
     def __init__(self, coarse_features: int) -> None:
         super().__init__()
         width = REFINERS[COARSEST].features
-        inputs = dict(zip((1, 2, 4, 8, COARSEST), (*WIDTHS, coarse_features), strict=True))
+        strides = (1, 2, 4, 8, COARSEST)
+        inputs = dict(zip(strides, (*WIDTHS, coarse_features), strict=True))
         self.embedding_decoder = AnchorDecoder(2 * width)
         self.gps = nn.ModuleDict({str(COARSEST): GaussianProcess(width)})
-        self.proj = nn.ModuleDict(
-            {str(s): Projection(inputs[s], shape.features) for s, shape in REFINERS.items()}
-        )
-        self.conv_refiner = nn.ModuleDict(
-            {str(s): WarpRefiner(shape) for s, shape in REFINERS.items()}
-        )
+        self.proj = nn.ModuleDict()
+        self.conv_refiner = nn.ModuleDict()
+        for stride, shape in REFINERS.items():
+            self.proj[str(stride)] = Projection(inputs[stride], shape.features)
+            self.conv_refiner[str(stride)] = WarpRefiner(shape)
 
     def projected(self, levels: Sequence[Tensor]) -> Pyramid:
         """Return features at strides 1, 2, 4, ..., projected to the decoder's channels."""
-        return Pyramid(tuple(self.proj[str(2**i)](features) for i, features in enumerate(levels)))
+        projected = []
+        for power, features in enumerate(levels):
+            projection = self.proj[str(2**power)]
+            projected.append(projection(features))
+        return Pyramid(tuple(projected))
 
     @property
     def process(self) -> GaussianProcess:
@@ -90,18 +99,20 @@ class RomaDecoder(WarpDecoder):
 
     def coarse_estimate(self, query: DenseFeatures, support: DenseFeatures) -> WarpEstimate:
         features = query.coarse.at(COARSEST)
-        posterior = self.process(features, support.coarse.at(COARSEST), *support.coefficients)
-        return self.correct(
-            self.embedding_decoder(posterior, features), query.coarse, support.coarse, COARSEST
-        )
+        (coefficients,) = support.coefficients
+        posterior = self.process(features, support.coarse.at(COARSEST), coefficients)
+        first = self.embedding_decoder(posterior, features)
+        return self.correct(first, query.coarse, support.coarse, COARSEST)
 
     def correct(
         self, estimate: WarpEstimate, query: Pyramid, support: Pyramid, stride: int
     ) -> WarpEstimate:
         size = query.at(1).shape[2:]
         refiner = self.conv_refiner[str(stride)]
-        corrections = refiner(query.at(stride), support.at(stride), estimate.flow, stretch(size))
-        # In this network the certainty's correction comes last.
+        first = query.at(stride)
+        second = support.at(stride)
+        corrections = refiner(first, second, estimate.flow, stretch(size))
+        # In this network the certainty's correction comes last, in DKM first.
         return refined(estimate, corrections.roll(1, dims=1), stride, size)
 
 
@@ -115,14 +126,13 @@ class Projection(nn.Sequential):
         """Map (B, C, h, w) to (B, C', h, w), both channels last."""
         mix, norm = self
         assert isinstance(mix, nn.Conv2d)
-        projected: Tensor = norm(as_map(pointwise(mix, as_grid(features.to(mix.weight.dtype)))))
+        grid = as_grid(features.to(mix.weight.dtype))
+        projected: Tensor = norm(as_map(pointwise(mix, grid)))
         return projected
 
 
 def stretch(size: torch.Size) -> float:
-    """Return the factor of displacements for an image (H, W). It keeps their scale in pixels at any
-    size.
-    """
+    """Return the factor of displacements for an image (H, W): one scale in pixels at any size."""
     return DISPLACEMENT * sqrt(size.numel()) / TRAINED_SIDE
 
 
@@ -136,28 +146,34 @@ class AnchorDecoder(nn.Module):
         self.to_out = ExactLinear(width, SIDE**2 + 1)
 
     def forward(self, posterior: Tensor, features: Tensor) -> WarpEstimate:
-        """Map posterior (B, C, h, w) and features (B, C', h, w), C + C' = width, to the first
-        estimate.
+        """Return the first estimate from a posterior (B, C, h, w) and features (B, C', h, w).
+
+        C + C' is the decoder's width.
         """
         x = torch.cat([tokens(posterior), tokens(features)], dim=2)  # (B, h w, C + C')
         for block in self.blocks:
             x = block(x)
-        logits = self.to_out(x)  # (B, h w, 4097)
+        logits = self.to_out(x)  # (B, h w, 4097): the anchors, then the certainty
+        flow = anchor_mean(logits[..., :-1])  # (B, h w, 2)
+        certainty = logits[..., -1:]  # (B, h w, 1)
         size = posterior.shape[2:]
-        flow, certainty = anchor_mean(logits[..., :-1]), logits[..., -1:]
-        return WarpEstimate(*(each.mT.reshape(len(x), -1, *size) for each in (flow, certainty)))
+        return WarpEstimate(
+            flow.mT.reshape(len(x), -1, *size),
+            certainty.mT.reshape(len(x), -1, *size),
+        )
 
 
 def anchor_mean(logits: Tensor) -> Tensor:
-    """Return the mean position (..., 2) of the best anchor by logits (..., 4096) and of its four
-    neighbours.
+    """Return the mean position (..., 2) of the best anchor by logits (..., 4096) and its neighbours.
 
     Anchors are weighted by probability. As in training, neighbours are 1 or 64 indices away, also
     across the ends of rows; indices are clamped to the first and last anchor.
     """
     best = logits.argmax(dim=-1, keepdim=True)
     offsets = torch.tensor([-1, 0, 1, -SIDE, SIDE], device=logits.device)
+    # At the ends of the grid an anchor may be counted twice or three times, as in training.
     near = (best + offsets).clamp(0, SIDE**2 - 1)  # (..., 5)
-    places = as_grid(identity_map(logits.new_empty(SIDE, SIDE))).reshape(-1, 2)  # (4096, 2)
+    anchors = as_grid(identity_map(logits.new_empty(SIDE, SIDE))).reshape(-1, 2)  # (4096, 2)
+    # The softmax over five equals that over all anchors, divided by the five's sum.
     shares = logits.gather(-1, near).softmax(dim=-1)
-    return (shares[..., None] * places[near]).sum(dim=-2)
+    return (shares[..., None] * anchors[near]).sum(dim=-2)

@@ -25,14 +25,14 @@ from mkpc_kaggle.matchers.networks.resnet_fpn import FINE, TOP, FeatureMaps, Res
 
 HEADS = 8
 TEMPERATURE = 0.1  # of the dual softmax
-WINDOWS_AT_ONCE = 1024
+WINDOWS_AT_ONCE = 1024  # 13 MB of features per image; a pair may have 6,000 matches
 
 
 class SemiDenseNetwork(nn.Module, ABC):
     """A semi-dense network for inference only: in evaluation mode, without gradients.
 
-    ``multiple``: both sides of an image must be multiples of it. Confidences of matches exceed ``threshold``.
-    ``border``: the width, in coarse cells, of the margin that gets no matches.
+    ``multiple``: both sides of an image must be multiples of it. Confidences of matches exceed
+    ``threshold``. ``border``: the width, in coarse cells, of the margin that gets no matches.
     """
 
     multiple: int
@@ -50,6 +50,7 @@ class SemiDenseNetwork(nn.Module, ABC):
     @property
     def similarity_scale(self) -> float | Tensor:
         """Factor of the dot product of two coarse features before the dual softmax."""
+        # Each feature is divided by the square root of its number of channels.
         return 1 / (TOP * TEMPERATURE)
 
     @abstractmethod
@@ -75,26 +76,29 @@ class SemiDenseNetwork(nn.Module, ABC):
             grid0, grid1, self.similarity_scale, self.threshold, self.border, content
         )
         offsets = self.refine(coarse, features0.fine, features1.fine, grid0, grid1)
-        points0, points1 = (
-            cell_points(coarse.index0, grid0.shape[1]),
-            cell_points(coarse.index1, grid1.shape[1]),
-        )
-        return SemiDenseMatches(coarse, points0, points1 + offsets * REACH)
+        points0 = cell_points(coarse.index0, grid0.shape[1])
+        corners1 = cell_points(coarse.index1, grid1.shape[1])
+        # Only points of image 1 are refined (section 3.4 of the paper).
+        return SemiDenseMatches(coarse, points0, corners1 + offsets * REACH)
 
     def refine(
         self, coarse: Assignment, fine0: Tensor, fine1: Tensor, grid0: Tensor, grid1: Tensor
     ) -> Tensor:
-        """Return offsets (M, 2) of matches from their cells' corners in image 1, in units of
-        :data:`REACH`.
+        """Return offsets (M, 2) of matches in image 1, in units of :data:`REACH`.
+
+        Offsets are from the corners of the matches' cells.
         """
+        features0 = grid0.flatten(0, 1)  # (L, 256)
+        features1 = grid1.flatten(0, 1)  # (S, 256)
         found = []
-        for cells in zip(
-            *(torch.split(x, WINDOWS_AT_ONCE) for x in (coarse.index0, coarse.index1)), strict=True
-        ):
-            windows0, windows1 = (
-                # (m, 25, 128)
-                self.fine_preprocess(cut_windows(fine, some), grid.flatten(0, 1)[some])
-                for fine, some, grid in zip((fine0, fine1), cells, (grid0, grid1), strict=True)
-            )
-            found.append(expected_offset(*self.loftr_fine(windows0, windows1)))
+        parts = zip(
+            torch.split(coarse.index0, WINDOWS_AT_ONCE),
+            torch.split(coarse.index1, WINDOWS_AT_ONCE),
+            strict=True,
+        )
+        for cells0, cells1 in parts:
+            windows0 = self.fine_preprocess(cut_windows(fine0, cells0), features0[cells0])
+            windows1 = self.fine_preprocess(cut_windows(fine1, cells1), features1[cells1])
+            refined0, refined1 = self.loftr_fine(windows0, windows1)  # (m, 25, 128) each
+            found.append(expected_offset(refined0, refined1))
         return torch.cat(found)
