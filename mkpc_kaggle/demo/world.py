@@ -14,11 +14,24 @@ Colour = tuple[int, int, int]  # BGR
 SCENES = {"courtyard": 2.5, "market": 1.0}  # metres per unit of the written poses
 
 TEXELS = 72  # per metre
-STONE, BRICK, PLASTER, PAVING = (150, 175, 190), (85, 105, 165), (150, 200, 215), (128, 136, 140)
-GLASS, FRAME = (75, 70, 60), (205, 215, 220)
-WINDOW_M, WINDOW_STEP_M = (1.3, 1.9), 3.1
-COLUMNS_X_M, ROWS_Y_M = (-9.0, -4.5, 0.0, 4.5, 9.0), (9.0, 12.5, 16.0)  # of the boxes
-MIN_BOX_M, MAX_BOX_M = (1.0, 1.0, 1.0), (3.0, 3.0, 5.5)  # width, depth, height
+
+# Colours of the ground, the three walls and their windows.
+PAVING = (128, 136, 140)
+STONE = (150, 175, 190)
+BRICK = (85, 105, 165)
+PLASTER = (150, 200, 215)
+GLASS = (75, 70, 60)
+FRAME = (205, 215, 220)
+
+WINDOW_M = (1.3, 1.9)  # width, height
+WINDOW_STEP_M = 3.1  # between the left or lower edges of two windows
+# The grid of places for boxes, before each is moved by up to a metre.
+COLUMNS_X_M = (-9.0, -4.5, 0.0, 4.5, 9.0)
+ROWS_Y_M = (9.0, 12.5, 16.0)
+BOX_SHARE = 0.65  # of the places that have a box
+# Width, depth, height of a box.
+MIN_BOX_M = (1.0, 1.0, 1.0)
+MAX_BOX_M = (3.0, 3.0, 5.5)
 
 # Position and target in metres, focal length over the long side, size in pixels, roll in degrees.
 SHOTS = (
@@ -35,37 +48,43 @@ SHOTS = (
 def build_world(
     name: str, *, seed: int = 0, image_scale: float = 1.0
 ) -> tuple[list[Surface], list[SizedCamera]]:
-    """Return the surfaces and cameras of a world, in metres. Only the name and the seed decide its
-    content.
+    """Return the surfaces and cameras of a world, in metres.
+
+    Only the name and the seed decide its content.
     """
     rng = np.random.default_rng([seed, *name.encode()])
-    surfaces, cameras = _surfaces(rng), []
+    # All draws come from one generator: another order would change every world.
+    surfaces = _surfaces(rng)
+    cameras = []
     for position, target, focal, size, roll in SHOTS:
-        eye, towards = (
-            np.add(position, rng.uniform(-0.15, 0.15, 3)),
-            np.add(target, rng.uniform(-0.3, 0.3, 3)),
-        )
-        camera = look_at(eye, towards, focal * max(size), size, roll + rng.uniform(-2, 2))
+        eye = np.add(position, rng.uniform(-0.15, 0.15, 3))
+        towards = np.add(target, rng.uniform(-0.3, 0.3, 3))
+        turned = roll + rng.uniform(-2, 2)
+        camera = look_at(eye, towards, focal * max(size), size, turned)
         cameras.append(resized(camera, image_scale))
     return surfaces, cameras
 
 
 def _surfaces(rng: np.random.Generator) -> list[Surface]:
-    """Return surfaces in metres: x points east, y north (the north wall is at 20), z up from the
-    ground.
+    """Return surfaces in metres: x points east, y north, z up from the ground.
+
+    The ground comes first, then the north wall (at y = 20), the west wall, the east wall and boxes.
     """
+    paving = paint(rng, 40, 34, PAVING, is_stone=True)
+    north = facade(rng, 28, 10, STONE)
+    west = facade(rng, 34, 8.5, BRICK)
+    east = facade(rng, 22, 7.5, PLASTER)
+    # Corners: top left, top right, bottom left, as seen from the courtyard.
     surfaces = [
-        quad((-20, 20, 0), (20, 20, 0), (-20, -14, 0), paint(rng, 40, 34, PAVING, is_stone=True)),
-        quad((-14, 20, 10), (14, 20, 10), (-14, 20, 0), facade(rng, 28, 10, STONE)),
-        quad((-14, -14, 8.5), (-14, 20, 8.5), (-14, -14, 0), facade(rng, 34, 8.5, BRICK)),
-        quad((14, 20, 7.5), (14, -2, 7.5), (14, 20, 0), facade(rng, 22, 7.5, PLASTER)),
+        quad((-20, 20, 0), (20, 20, 0), (-20, -14, 0), paving),
+        quad((-14, 20, 10), (14, 20, 10), (-14, 20, 0), north),
+        quad((-14, -14, 8.5), (-14, 20, 8.5), (-14, -14, 0), west),
+        quad((14, 20, 7.5), (14, -2, 7.5), (14, 20, 0), east),
     ]
     for x, y in product(COLUMNS_X_M, ROWS_Y_M):
-        if rng.random() < 0.65:
-            centre, size = (
-                np.array([x, y]) + rng.uniform(-1, 1, 2),
-                rng.uniform(MIN_BOX_M, MAX_BOX_M),
-            )
+        if rng.random() < BOX_SHARE:
+            centre = np.array([x, y]) + rng.uniform(-1, 1, 2)
+            size = rng.uniform(MIN_BOX_M, MAX_BOX_M)
             surfaces += box(rng, centre, size, rng.uniform(-45, 45))
     return surfaces
 
@@ -76,19 +95,25 @@ def box(rng: np.random.Generator, centre: Floats, size: Floats, yaw: float) -> l
     `centre` is (x, y), `size` is (width, depth, height), `yaw` is in degrees.
     """
     width, depth, height = size.tolist()
-    cos, sin = np.cos(np.radians(yaw)), np.sin(np.radians(yaw))
-    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * (width / 2, depth / 2)
-    corners = corners @ np.array([[cos, sin], [-sin, cos]]) + centre
-    low, high = (np.column_stack([corners, np.full(4, z)]) for z in (0.0, height))
+    cos = np.cos(np.radians(yaw))
+    sin = np.sin(np.radians(yaw))
+    # The four corners (4, 2) of the ground plan, counter-clockwise from above.
+    signs = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+    turn = np.array([[cos, sin], [-sin, cos]])  # of rows
+    corners = signs * (width / 2, depth / 2) @ turn + centre
+    low = np.column_stack([corners, np.full(4, 0.0)])
+    high = np.column_stack([corners, np.full(4, height)])
+
+    # Colours of one box are tones of one colour.
     blue, green, red = rng.integers(60, 205, 3).tolist()
-    lid, *sides = (
-        paint(rng, width_m, height_m, (blue, green, red))
-        for width_m, height_m in ((width, depth), *2 * ((depth, height), (width, height)))
-    )
-    return [
-        quad(high[3], high[2], high[0], lid),
-        *(quad(high[i - 1], high[i], low[i - 1], side) for i, side in enumerate(sides)),
-    ]
+    colour = (blue, green, red)
+    lid = paint(rng, width, depth, colour)
+    found = [quad(high[3], high[2], high[0], lid)]
+    # Side i is between the corners i - 1 and i; the first is the one from corner 3 to corner 0.
+    for i, width_m in enumerate((depth, width, depth, width)):
+        side = paint(rng, width_m, height, colour)
+        found.append(quad(high[i - 1], high[i], low[i - 1], side))
+    return found
 
 
 def quad(
@@ -96,9 +121,9 @@ def quad(
 ) -> Surface:
     """Return the rectangle with these corners (3,), named as seen from the front."""
     corner = np.asarray(top_left, dtype=np.float64)
-    return Surface(
-        corner, np.subtract(top_right, corner), np.subtract(bottom_left, corner), picture
-    )
+    edge_u = np.subtract(top_right, corner)
+    edge_v = np.subtract(bottom_left, corner)
+    return Surface(corner, edge_u, edge_v, picture)
 
 
 def paint(
@@ -109,45 +134,74 @@ def paint(
     *,
     is_stone: bool = False,
 ) -> Picture:
-    """Draw a dead-leaves texture (Lee, Mumford and Huang 2001): shapes of all sizes in tones of the
-    colour.
+    """Draw a dead-leaves texture: shapes of all sizes in tones of the colour.
 
-    The shapes are upright rectangles for stone, rotated ellipses with stronger tones for paint.
+    Source: Lee, Mumford and Huang 2001. The shapes are upright rectangles for stone, rotated
+    ellipses with stronger tones for paint.
     """
-    scale = min(TEXELS, 2000 / max(width_m, height_m))
-    width, height = max(16, round(width_m * scale)), max(16, round(height_m * scale))
+    scale = min(TEXELS, 2000 / max(width_m, height_m))  # at most 2,000 pixels a side
+    width = max(16, round(width_m * scale))
+    height = max(16, round(height_m * scale))
     picture = np.full((height, width, 3), colour, dtype=np.uint8)
-    contrast, max_side_m = (0.06, 1.2) if is_stone else (0.4, 0.9)
     count = width * height // 60
-    # The density of sizes falls with their third power, so the texture looks alike at every scale.
-    lengths = np.sort(3 / np.sqrt(rng.uniform((3 / (max_side_m * scale)) ** 2, 1, count)))[::-1]
-    sides = lengths[:, None] * np.column_stack(
-        [np.ones(count), rng.uniform(0.3, 0.6 if is_stone else 1, count)]
-    )
-    centres, angles = rng.uniform((0, 0), (width, height), (count, 2)), rng.uniform(0, 180, count)
-    tones = np.array(colour) * (
-        1 + rng.normal(0, contrast, (count, 1)) + rng.normal(0, 0.2 * contrast, (count, 3))
-    )
-    for centre, side, angle, tone in zip(
-        centres, sides, angles, tones.clip(8, 250).tolist(), strict=True
-    ):
+    max_side_m = 1.2 if is_stone else 0.9
+    max_aspect = 0.6 if is_stone else 1
+    sides = _leaf_sides(rng, count, max_side_m * scale, max_aspect)
+    centres = rng.uniform((0, 0), (width, height), (count, 2))
+    angles = rng.uniform(0, 180, count)
+    tones = _leaf_tones(rng, count, colour, 0.06 if is_stone else 0.4)
+    for centre, side, angle, tone in zip(centres, sides, angles, tones, strict=True):
         if is_stone:
-            low, high = (centre - side / 2).astype(int), (centre + side / 2).astype(int)
+            low = (centre - side / 2).astype(int)
+            high = (centre + side / 2).astype(int)
             cv2.rectangle(picture, low, high, tone, -1)
         else:
             cv2.ellipse(picture, (centre, side, angle), tone, -1, cv2.LINE_AA)
     return picture
 
 
+def _leaf_sides(rng: np.random.Generator, count: int, max_side: float, max_aspect: float) -> Floats:
+    """Draw the sides (count, 2) of shapes in pixels, from three to ``max_side``, largest first.
+
+    Later shapes cover earlier ones, so small ones stay visible. Their density falls with the third
+    power of their size: the texture looks alike at every scale.
+    """
+    draws = rng.uniform((3 / max_side) ** 2, 1, count)
+    lengths = np.sort(3 / np.sqrt(draws))[::-1]
+    aspects = rng.uniform(0.3, max_aspect, count)
+    shapes = np.column_stack([np.ones(count), aspects])
+    return np.asarray(lengths[:, None] * shapes)
+
+
+def _leaf_tones(
+    rng: np.random.Generator, count: int, colour: Colour, contrast: float
+) -> list[list[float]]:
+    """Draw the BGR colours of shapes, which differ mostly in brightness and a little in hue."""
+    brightness = rng.normal(0, contrast, (count, 1))
+    hue = rng.normal(0, 0.2 * contrast, (count, 3))
+    tones = np.array(colour) * (1 + brightness + hue)
+    found: list[list[float]] = tones.clip(8, 250).tolist()
+    return found
+
+
 def facade(rng: np.random.Generator, width_m: float, height_m: float, colour: Colour) -> Picture:
     """Draw a stone wall with a grid of windows that differ only in brightness."""
     picture = paint(rng, width_m, height_m, colour, is_stone=True)
     scale = picture.shape[1] / width_m
-    w, h = int(WINDOW_M[0] * scale), int(WINDOW_M[1] * scale)
-    pane = cv2.resize(paint(rng, *WINDOW_M, GLASS), (w, h))
-    for z in np.arange(1.2, height_m - WINDOW_M[1], WINDOW_STEP_M):
-        for x in np.arange(1.2, width_m - WINDOW_M[0], WINDOW_STEP_M):
-            left, top = int(x * scale), picture.shape[0] - int(z * scale) - h
-            cv2.rectangle(picture, (left - 6, top - 6), (left + w + 5, top + h + 5), FRAME, -1)
-            picture[top : top + h, left : left + w] = np.clip(pane * rng.uniform(0.7, 1.6), 0, 255)
+    window_w, window_h = WINDOW_M
+    w = int(window_w * scale)
+    h = int(window_h * scale)
+    # One pane for all windows: repetition is what makes facades hard to match.
+    pane = cv2.resize(paint(rng, window_w, window_h, GLASS), (w, h))
+    # The first windows are 1.2 m above the ground and from the left edge.
+    for z in np.arange(1.2, height_m - window_h, WINDOW_STEP_M):
+        for x in np.arange(1.2, width_m - window_w, WINDOW_STEP_M):
+            left = int(x * scale)
+            top = picture.shape[0] - int(z * scale) - h  # rows run down, z runs up
+            # A frame of six pixels; OpenCV's rectangles include both corners.
+            first = (left - 6, top - 6)
+            last = (left + w + 5, top + h + 5)
+            cv2.rectangle(picture, first, last, FRAME, -1)
+            lit = np.clip(pane * rng.uniform(0.7, 1.6), 0, 255)
+            picture[top : top + h, left : left + w] = lit
     return picture

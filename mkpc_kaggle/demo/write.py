@@ -20,7 +20,7 @@ from mkpc_kaggle.progress import counted
 
 MIN_COVISIBILITY = 0.1  # minimum of a pair that the competition scores
 TEST_PAIRS = 8  # per scene
-MARK = "demo.txt"
+MARK = "demo.txt"  # the file that says that a directory is ours to overwrite
 MARK_TEXT = (
     "Rendered by mkpc_kaggle. The command `demo` replaces train/, test/ and test_truth.csv.\n"
 )
@@ -68,10 +68,10 @@ def write_demo(
     truths: list[str] = []
     for scene in scenes:
         photographs = take_photographs(scene, seed, image_scale)
-        pairs = [
-            DemoPair(b, a, covisibility(b.camera, b.depth, a.camera, a.depth))
-            for a, b in combinations(photographs, 2)
-        ]
+        pairs = []
+        for a, b in combinations(photographs, 2):
+            share = covisibility(b.camera, b.depth, a.camera, a.depth)
+            pairs.append(DemoPair(b, a, share))
         _write_train(demo.train_dir / scene, SCENES[scene], photographs, pairs)
         for sample, truth in _write_test(demo.test_dir, scene, _selected(pairs), seed):
             samples.append(sample)
@@ -84,17 +84,21 @@ def write_demo(
 
 
 def _claim(demo: DemoSet) -> None:
-    """Mark the directory as a demo set. Raise :class:`UserError` if it has data that `demo` did not
-    write.
+    """Mark the directory as a demo set.
+
+    Raises :class:`UserError` if it has data that `demo` did not write.
     """
     mark = demo.root / MARK
     is_ours = mark.is_file() and mark.read_text(errors="replace") == MARK_TEXT
-    for path in () if is_ours else (mark, demo.train_dir, demo.test_dir, demo.truth_csv):
-        if os.path.lexists(path):
-            raise UserError(
-                f"{path} is in the way: `demo` did not write it; name an empty directory"
-            )
+    if not is_ours:
+        for path in (mark, demo.train_dir, demo.test_dir, demo.truth_csv):
+            # ``exists`` is False for a broken link, which writing would follow.
+            if os.path.lexists(path):
+                raise UserError(
+                    f"{path} is in the way: `demo` did not write it; name an empty directory"
+                )
     demo.root.mkdir(parents=True, exist_ok=True)
+    # Before the data: a set that was cut half way is still known as ours.
     mark.write_text(MARK_TEXT)
 
 
@@ -105,34 +109,34 @@ def take_photographs(scene: str, seed: int, image_scale: float) -> list[Photogra
     for number, camera in enumerate(counted(cameras, f"rendering {scene}", "image")):
         image, depth = render(surfaces, camera)
         rng = np.random.default_rng([seed, number, *scene.encode()])
-        photographs.append(
-            Photograph(f"{scene}_{number:04d}", camera, _developed(image, rng), depth)
-        )
+        name = f"{scene}_{number:04d}"
+        photographs.append(Photograph(name, camera, _developed(image, rng), depth))
     return photographs
 
 
 def _developed(image: FloatImage, rng: np.random.Generator) -> Picture:
     """Convert an image (H, W, 3) float32 in 0..255 to uint8, with exposure, tint and noise."""
-    gain, gamma, balance = (
-        rng.uniform(0.75, 1.25),
-        rng.uniform(0.85, 1.2),
-        rng.uniform(0.93, 1.07, 3),
-    )
-    light = np.clip(image * (balance * gain / 255).astype(np.float32), 0, 1) ** np.float32(gamma)
+    gain = rng.uniform(0.75, 1.25)
+    gamma = rng.uniform(0.85, 1.2)
+    balance = rng.uniform(0.93, 1.07, 3)  # of blue, green and red
+    factors = (balance * gain / 255).astype(np.float32)
+    exposed = np.clip(image * factors, 0, 1)
+    light = exposed ** np.float32(gamma)
+    # The lens first, then the sensor: noise is not blurred.
     blurred = cv2.GaussianBlur(light, (5, 5), float(rng.uniform(0.3, 0.7)))
-    noise = np.float32(rng.uniform(0.006, 0.016)) * rng.standard_normal(
-        light.shape, dtype=np.float32
-    )
-    return np.asarray(np.clip((blurred + noise) * 255, 0, 255).round(), dtype=np.uint8)
+    sigma = np.float32(rng.uniform(0.006, 0.016))  # 1.5 to 4 of 255 grey levels
+    noise = sigma * rng.standard_normal(light.shape, dtype=np.float32)
+    levels = np.clip((blurred + noise) * 255, 0, 255)
+    return np.asarray(levels.round(), dtype=np.uint8)
 
 
 def _selected(pairs: Sequence[DemoPair]) -> list[DemoPair]:
     """Select the test pairs among scored pairs, spread evenly over the ranks of covisibility."""
-    scored = sorted(
-        (p for p in pairs if p.covisibility >= MIN_COVISIBILITY), key=lambda p: p.covisibility
-    )
-    chosen = np.linspace(0, len(scored) - 1, min(TEST_PAIRS, len(scored))).round().astype(int)
-    return [scored[index] for index in chosen]
+    scored = [pair for pair in pairs if pair.covisibility >= MIN_COVISIBILITY]
+    scored.sort(key=lambda pair: pair.covisibility)
+    count = min(TEST_PAIRS, len(scored))
+    ranks = np.linspace(0, len(scored) - 1, count).round().astype(int)
+    return [scored[rank] for rank in ranks]
 
 
 def _write_train(
@@ -141,41 +145,52 @@ def _write_train(
     photographs: Sequence[Photograph],
     pairs: Sequence[DemoPair],
 ) -> None:
+    """Write a scene's images, its cameras in the scene's own units, and its pairs."""
+    cameras = []
     for each in photographs:
-        _write_image(
-            directory / "images" / f"{each.name}.jpg", each.picture, cv2.IMWRITE_JPEG_QUALITY, 95
-        )
+        path = directory / "images" / f"{each.name}.jpg"
+        _write_image(path, each.picture, cv2.IMWRITE_JPEG_QUALITY, 95)
+        camera = each.camera
+        matrices = (camera.K, camera.R, camera.t / metres_per_unit)
+        cameras.append(",".join([each.name, *map(_numbers, matrices)]))
     header = "image_id,camera_intrinsics,rotation_matrix,translation_vector"
-    cameras = (
-        (each.name, each.camera.K, each.camera.R, each.camera.t / metres_per_unit)
-        for each in photographs
-    )
-    rows = (",".join([name, *map(_numbers, matrices)]) for name, *matrices in cameras)
-    _write_rows(directory / "calibration.csv", header, rows)
-    lines = []
+    _write_rows(directory / "calibration.csv", header, cameras)
+
+    rows = []
     for first, second, share in pairs:
         F = fundamental_of_cameras(first.camera, second.camera)
-        lines.append(f"{first.name}-{second.name},{share:.17g},{_numbers(F)}")
-    _write_rows(directory / "pair_covisibility.csv", "pair,covisibility,fundamental_matrix", lines)
+        rows.append(f"{first.name}-{second.name},{share:.17g},{_numbers(F)}")
+    header = "pair,covisibility,fundamental_matrix"
+    _write_rows(directory / "pair_covisibility.csv", header, rows)
 
 
 def _write_test(
     directory: Path, scene: str, pairs: Sequence[DemoPair], seed: int
 ) -> Iterator[tuple[str, str]]:
-    """Write the images of one batch. Yield each pair's row of test.csv and its row of
-    test_truth.csv.
+    """Write the images of one batch.
+
+    Yield each pair's row of test.csv and its row of test_truth.csv.
     """
+    # Ids of batches and images are digests: like the competition's, they say nothing of the order.
     batch = _digest(f"{seed}/{scene}")[:8]
-    photographs = {each.name: each for pair in pairs for each in pair[:2]}
+    photographs: dict[str, Photograph] = {}
+    for pair in pairs:
+        photographs[pair.first.name] = pair.first
+        photographs[pair.second.name] = pair.second
     hidden = {name: _digest(f"{seed}/{scene}/{name}")[:32] for name in photographs}
     for name, each in photographs.items():
         path = directory / "test_images" / batch / f"{hidden[name]}.png"
         _write_image(path, each.picture, cv2.IMWRITE_PNG_COMPRESSION, 1)
+
     for pair in pairs:
-        names = sorted((each.name for each in pair[:2]), key=hidden.__getitem__, reverse=True)
+        names = [pair.first.name, pair.second.name]
+        # The greater id comes first, as in the competition's files.
+        names.sort(key=hidden.__getitem__, reverse=True)
         ids = [hidden[name] for name in names]
         sample = f"{scene};{batch};{'-'.join(ids)}"
-        yield f"{sample},{batch},{','.join(ids)}", f"{sample},{scene},{','.join(names)}"
+        test_row = f"{sample},{batch},{','.join(ids)}"
+        truth_row = f"{sample},{scene},{','.join(names)}"
+        yield test_row, truth_row
 
 
 def _write_image(path: Path, picture: Picture, option: int, value: int) -> None:
@@ -188,6 +203,7 @@ def _write_image(path: Path, picture: Picture, option: int, value: int) -> None:
 
 def _write_rows(path: Path, header: str, rows: Iterable[str]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
+    # The same bytes on every system.
     path.write_text("\n".join([header, *rows]) + "\n", encoding="utf-8", newline="\n")
 
 

@@ -1,3 +1,1 @@
-"""Points, boxes, clusters, two-view geometry and scores. Uses NumPy, OpenCV, SciPy and
-scikit-learn, not torch.
-"""
+"""Points, boxes, clusters, two-view geometry and scores; imports no torch."""

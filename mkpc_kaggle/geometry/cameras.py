@@ -13,8 +13,9 @@ MIN_BASELINE = 1e-9  # world units; closer cameras have the same centre
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A calibrated camera: K (3, 3) in pixels; R (3, 3) and t (3,) map world to camera, X_cam = R X
-    + t.
+    """A calibrated camera.
+
+    K (3, 3) is in pixels. R (3, 3) and t (3,) map world to camera: X_cam = R X + t.
     """
 
     K: Matrix3
@@ -44,7 +45,12 @@ def fundamental_of_cameras(camera0: Camera, camera1: Camera) -> Matrix3:
     Raises ``ValueError`` if the two cameras have the same centre, since F is then undefined.
     """
     R, t = relative_pose(camera0, camera1)
-    if np.linalg.norm(t) < MIN_BASELINE * max(1.0, float(np.linalg.norm(camera0.t))):
+    # Far from the origin, t is a difference of large numbers and only as precise as these.
+    size = max(1.0, float(np.linalg.norm(camera0.t)))
+    if np.linalg.norm(t) < MIN_BASELINE * size:
         raise ValueError("the two cameras have one centre: F is not defined")
-    F = np.linalg.inv(camera1.K).T @ cross_matrix(t) @ R @ np.linalg.inv(camera0.K)
+    # Hartley and Zisserman, Multiple View Geometry, 9.6: E = [t]x R.
+    to_ray0 = np.linalg.inv(camera0.K)
+    to_ray1 = np.linalg.inv(camera1.K)
+    F = to_ray1.T @ cross_matrix(t) @ R @ to_ray0
     return np.asarray(F / np.linalg.norm(F))

@@ -54,22 +54,21 @@ class Box:
         return self.size.width * self.size.height
 
     def contains(self, points: NDArray[np.floating]) -> NDArray[np.bool_]:
-        """Return an (N,) mask of the points (N, 2), in image pixels, on the box's pixels; False for
-        NaN.
+        """Return an (N,) mask of the points (N, 2), in image pixels, on the box's pixels.
+
+        False for NaN.
         """
-        x, y = points[:, 0], points[:, 1]
-        return (
-            (x >= self.left - 0.5)
-            & (x < self.right - 0.5)
-            & (y >= self.top - 0.5)
-            & (y < self.bottom - 0.5)
-        )
+        x = points[:, 0]
+        y = points[:, 1]
+        # A pixel reaches half a pixel from its centre.
+        in_columns = (x >= self.left - 0.5) & (x < self.right - 0.5)
+        in_rows = (y >= self.top - 0.5) & (y < self.bottom - 0.5)
+        return in_columns & in_rows
 
 
 @dataclass(frozen=True)
 class View:
-    """A matcher's input: a crop of an image, rotated by quarter turns, resized, and padded right
-    and bottom.
+    """A matcher's input: a crop of an image, turned, resized, and padded right and bottom.
 
     Image pixels are pixels of the file as stored, ignoring EXIF orientation.
     """
@@ -84,23 +83,27 @@ class View:
     def fit(
         cls, crop: Box, *, long_side: int = 0, area: int = 0, multiple: int = 1, turns: int = 0
     ) -> "View":
-        """Return the view of ``crop`` with a longer side of ``long_side`` pixels, or with about
-        ``area`` pixels.
+        """Return the view of ``crop`` with a longer side of ``long_side``, or with about ``area``.
 
-        The aspect ratio is kept to the nearest pixel. Both sides are padded up to a multiple of
-        ``multiple``, as in :meth:`stretched`.
+        Both are in pixels. The aspect ratio is kept to the nearest pixel. Both sides are padded up
+        to a multiple of ``multiple``, as in :meth:`stretched`.
         """
         scale = long_side / max(crop.size) if long_side else sqrt(area / crop.area)
-        width, height = (max(1, round(side * scale)) for side in _turned_size(crop.size, turns))
+        turned = _turned_size(crop.size, turns)
+        # A thin crop keeps at least one row or column of pixels.
+        width = max(1, round(turned.width * scale))
+        height = max(1, round(turned.height * scale))
         return cls.stretched(crop, size=Size(width, height), multiple=multiple, turns=turns)
 
     @classmethod
     def stretched(cls, crop: Box, *, size: Size, multiple: int = 1, turns: int = 0) -> "View":
-        """Return the view of ``crop``, turned and then resized to exactly ``size``, ignoring the
-        aspect ratio.
+        """Return the view of ``crop``, turned and then resized to exactly ``size``.
+
+        The aspect ratio may change.
         """
-        padded = Size(*(ceil(side / multiple) * multiple for side in size))
-        return cls(crop, size, padded, turns)
+        padded_width = ceil(size.width / multiple) * multiple
+        padded_height = ceil(size.height / multiple) * multiple
+        return cls(crop, size, Size(padded_width, padded_height), turns)
 
     @property
     def scale(self) -> tuple[float, float]:
@@ -111,20 +114,22 @@ class View:
     def from_image(self, points: NDArray[np.floating]) -> NDArray[np.float64]:
         """Convert (N, 2) image pixels to (N, 2) view pixels."""
         offset = np.array([self.crop.left, self.crop.top])
-        turned = _turned(np.asarray(points, np.float64) - offset + 0.5, self.turns, self.crop.size)
+        # From the crop's corner: there, turns and scales need no half pixel.
+        from_crop = np.asarray(points, np.float64) - offset + 0.5
+        turned = _turned(from_crop, self.turns, self.crop.size)
         return np.asarray(turned * self.scale - 0.5, np.float64)
 
     def to_image(self, points: NDArray[np.floating]) -> NDArray[np.float64]:
         """Convert (N, 2) view pixels to (N, 2) image pixels, the inverse of :meth:`from_image`."""
-        offset, turned = (
-            np.array([self.crop.left, self.crop.top]),
-            _turned_size(self.crop.size, self.turns),
-        )
-        stored = _turned((np.asarray(points, np.float64) + 0.5) / self.scale, -self.turns, turned)
-        return np.asarray(stored - 0.5 + offset, np.float64)
+        offset = np.array([self.crop.left, self.crop.top])
+        turned_size = _turned_size(self.crop.size, self.turns)
+        turned = (np.asarray(points, np.float64) + 0.5) / self.scale
+        from_crop = _turned(turned, -self.turns, turned_size)
+        return np.asarray(from_crop - 0.5 + offset, np.float64)
 
     def holds(self, points: NDArray[np.floating]) -> NDArray[np.bool_]:
-        """Return an (N,) mask of the points (N, 2), in view pixels, on content, not on padding;
+        """Return an (N,) mask of the points (N, 2), in view pixels, on content, not on padding.
+
         False for NaN.
         """
         return Box.whole(self.content).contains(points)
@@ -137,6 +142,7 @@ class View:
         """
         crop = self.crop
         cut = image[crop.top : crop.bottom, crop.left : crop.right]
+        # A slice would silently be smaller, or count from the other end.
         if min(crop.left, crop.top) < 0 or cut.shape[1::-1] != crop.size:
             raise ValueError(
                 f"{crop} leaves the image of {image.shape[1]} x {image.shape[0]} pixels"
@@ -145,17 +151,20 @@ class View:
         picture = cv2.rotate(cut, 3 - self.turns) if self.turns else cut
         # Shrink first, then enlarge: INTER_AREA averages areas only if neither axis grows.
         turned = _turned_size(crop.size, self.turns)
-        shrunk = Size(*map(min, self.content, turned)) if self.antialias else turned
-        picture = (
-            cv2.resize(picture, shrunk, interpolation=cv2.INTER_AREA)
-            if shrunk != turned
-            else picture
-        )
+        shrunk = turned
+        if self.antialias:
+            width = min(self.content.width, turned.width)
+            height = min(self.content.height, turned.height)
+            shrunk = Size(width, height)
+        if shrunk != turned:
+            picture = cv2.resize(picture, shrunk, interpolation=cv2.INTER_AREA)
         if shrunk != self.content:
             picture = cv2.resize(picture, self.content, interpolation=cv2.INTER_LINEAR)
+
         right = self.padded.width - self.content.width
         bottom = self.padded.height - self.content.height
-        return np.pad(picture, ((0, bottom), (0, right)) + ((0, 0),) * (image.ndim - 2))
+        channels = ((0, 0),) * (image.ndim - 2)  # colours are not padded
+        return np.pad(picture, ((0, bottom), (0, right), *channels))
 
 
 def _turned_size(size: Size, turns: int) -> Size:
@@ -163,18 +172,19 @@ def _turned_size(size: Size, turns: int) -> Size:
 
 
 def _turned(points: NDArray[np.float64], turns: int, size: Size) -> NDArray[np.float64]:
-    """Rotate (N, 2) points, relative to the top-left corner of a picture of ``size``, like
-    ``np.rot90``.
+    """Rotate (N, 2) points like ``np.rot90`` rotates a picture of ``size``.
+
+    Points are relative to the picture's top-left corner.
     """
-    (x, y), (width, height) = points.T, size
-    quarters = (x, y), (y, width - x), (width - x, height - y), (height - y, x)
+    x, y = points.T
+    width, height = size
+    # After no, one, two and three counter-clockwise quarter turns.
+    quarters = [(x, y), (y, width - x), (width - x, height - y), (height - y, x)]
     return np.stack(quarters[turns % 4], axis=1)
 
 
 def from_corner(points: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Move the origin of (N, 2) pixels from the image's top-left corner to the centre of the
-    top-left pixel.
-    """
+    """Move the origin of (N, 2) pixels from the image's corner to the centre of its first pixel."""
     return points - np.float32(0.5)
 
 

@@ -1,9 +1,9 @@
-"""The critical region of an image: Matching Key-Points Crop (the paper's Algorithm 1) and Crop Area
-Expansion.
+"""The critical region of an image: Matching Key-Points Crop and Crop Area Expansion.
 
 For each image separately: normalise the matched points of stage 1 by width and height, cluster
 them, and keep the large clusters. The bounding box of the kept points, scaled about its centre, is
-the critical region. If this box is unreliable, the region is the whole image, with the reason.
+the critical region (the paper's Algorithm 1). If this box is unreliable, the region is the whole
+image, with the reason.
 """
 
 from dataclasses import dataclass
@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from mkpc_kaggle.config import AT_LEAST_1, POSITIVE, SHARE, Range, check_ranges
 from mkpc_kaggle.geometry.coordinates import Box, Points, Size
 
-# Points; DBSCAN stores each point's neighbours, so dense points take quadratic memory
+# Points. DBSCAN stores each point's neighbours, so dense points take quadratic memory.
 MERGE_ABOVE = 2000
-CELLS_PER_EPS = 10
+CELLS_PER_EPS = 10  # a merged point moves by less than a tenth of the radius on each axis
 
 
 @dataclass(frozen=True)
@@ -40,9 +40,7 @@ class MkpcConfig:
 
 
 class RegionReason(StrEnum):
-    """Origin of a region: ``CROPPED``, ``GIVEN`` by the user, or the reason for taking the whole
-    image.
-    """
+    """Origin of a region: ``CROPPED``, ``GIVEN`` by the user, or why it is the whole image."""
 
     CROPPED = "cropped"
     GIVEN = "given"
@@ -77,17 +75,19 @@ class Clusters:
 
 
 def critical_region(points: Points, size: Size, config: MkpcConfig) -> CriticalRegion:
-    """Return the critical region of an image of ``size`` with matched ``points``, (N, 2) float32 in
-    image pixels.
+    """Return the critical region of an image of ``size`` with matched ``points``.
 
-    Ignores points that are not finite or not on the image. Never raises.
+    Points are (N, 2) float32 in image pixels. Ignores points that are not finite or not on the
+    image. Never raises.
     """
     whole = Box.whole(size)
     points = points[whole.contains(points)]
+    # DBSCAN could find no cluster.
     if len(points) < config.min_samples:
         return CriticalRegion(whole, RegionReason.TOO_FEW_POINTS)
     clusters = find_clusters(points, size, config)
-    found, kept = len(clusters.sizes), len(clusters.kept)
+    found = len(clusters.sizes)
+    kept = len(clusters.kept)
     if not found:
         return CriticalRegion(whole, RegionReason.NO_CLUSTER)
     if clusters.sizes.sum() / len(points) < config.min_clustered:
@@ -99,10 +99,10 @@ def critical_region(points: Points, size: Size, config: MkpcConfig) -> CriticalR
 
 
 def find_clusters(points: Points, size: Size, config: MkpcConfig) -> Clusters:
-    """Cluster matched points, (N, 2) float32 in image pixels, by DBSCAN, and select the clusters to
-    keep.
+    """Cluster matched points by DBSCAN, and select the clusters to keep.
 
-    Coordinates are normalised by the image's width and height.
+    Points are (N, 2) float32 in image pixels. DBSCAN's are normalised by the image's width and
+    height, so that ``eps`` means the same for every image.
     """
     normalised = np.asarray(points, np.float64) / (size.width, size.height)
     labels = dbscan(normalised, eps=config.eps, min_samples=config.min_samples)
@@ -120,40 +120,45 @@ def dbscan(points: NDArray[np.float64], *, eps: float, min_samples: int) -> NDAr
 
     if not len(points):
         return np.zeros(0, np.intp)
-    cell, counts = np.arange(len(points)), np.ones(len(points), np.intp)
+    cell = np.arange(len(points))  # (N,): the row of each point's merged point
+    counts = np.ones(len(points), np.intp)
     if len(points) > MERGE_ABOVE:
         corners = np.floor(points * (CELLS_PER_EPS / eps))
         _, cell, counts = np.unique(corners, axis=0, return_inverse=True, return_counts=True)
         cell = cell.ravel()  # NumPy 2.0.0 returns a column
-        points = np.column_stack([np.bincount(cell, along) / counts for along in points.T])
-    found = DBSCAN(eps=eps, min_samples=min_samples, algorithm="kd_tree").fit(
-        points, sample_weight=counts
-    )
+        mean_x = np.bincount(cell, points[:, 0]) / counts
+        mean_y = np.bincount(cell, points[:, 1]) / counts
+        points = np.column_stack([mean_x, mean_y])
+    # ``min_samples`` counts weights, so a merged point counts as the points that it stands for.
+    algorithm = DBSCAN(eps=eps, min_samples=min_samples, algorithm="kd_tree")
+    found = algorithm.fit(points, sample_weight=counts)
     return np.asarray(found.labels_[cell], np.intp)
 
 
 def keep_clusters(sizes: NDArray[np.intp], share: float) -> NDArray[np.intp]:
-    """Return the labels of the clusters to keep, largest first; ``sizes`` (K,) is the number of
-    points per label.
+    """Return the labels of the clusters to keep, largest first.
 
-    Keeps clusters with at least ``share`` of the largest cluster's points. Clusters of equal size
-    keep their order.
+    ``sizes`` (K,) is the number of points per label. Keeps clusters with at least ``share`` of the
+    largest cluster's points. Clusters of equal size keep their order.
     """
     by_size = np.argsort(-sizes, kind="stable")
-    kept: NDArray[np.intp] = by_size[sizes[by_size] / sizes.max(initial=1) >= share]
+    # Sizes fall, so this is where Algorithm 1 stops at the first cluster that is too small.
+    ratios = sizes[by_size] / sizes.max(initial=1)
+    kept: NDArray[np.intp] = by_size[ratios >= share]
     return kept
 
 
 def expand_box(points: Points, size: Size, expand_x: float, expand_y: float) -> Box:
-    """Return the bounding box of ``points``, scaled about its centre and clipped (Crop Area
-    Expansion).
+    """Return the bounding box of ``points``, scaled about its centre and clipped to the image.
 
-    Before scaling, the box spans whole pixels, [min, max + 1), so it includes the last row and
-    column. Scaled edges are rounded outwards.
+    This is Crop Area Expansion. Before scaling, the box spans whole pixels, [min, max + 1), so it
+    includes the last row and column. Scaled edges are rounded outwards.
     """
+    # The pixel that contains x is floor(x + 0.5), since pixel centres are at integers.
     low = np.floor(points.min(axis=0).astype(np.float64) + 0.5)
     high = np.floor(points.max(axis=0).astype(np.float64) + 0.5) + 1
-    centre, half = (low + high) / 2, (high - low) / 2 * (expand_x, expand_y)
+    centre = (low + high) / 2
+    half = (high - low) / 2 * (expand_x, expand_y)
     left, top = np.maximum(np.floor(centre - half), 0).astype(int)
     right, bottom = np.minimum(np.ceil(centre + half), size).astype(int)
     return Box(int(left), int(top), int(right), int(bottom))

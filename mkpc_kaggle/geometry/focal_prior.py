@@ -4,9 +4,11 @@ With known principal points, the seven degrees of freedom of F are a relative po
 lengths. The prior favours plausible focal lengths. The search minimises the negative log posterior
 of the pose and of log f0 and log f1:
 
-    sum_n rho(r_n / scale) + sum_i (log f_i - log g_i)^2 / (2 sigma_i^2),     rho(x) = x^2 / (2 (1 + x^2)),
+    sum_n rho(r_n / scale) + sum_i (log f_i - log g_i)^2 / (2 sigma_i^2),
 
-r is the Sampson distance in pixels (:mod:`mkpc_kaggle.geometry.two_view`), g the expected focal
+    rho(x) = x^2 / (2 (1 + x^2)).
+
+r is the Sampson distance in pixels (:mod:`mkpc_kaggle.geometry.two_view`), g is the expected focal
 length, and rho the loss of Geman and McClure (1985). An outlier costs 0.5, as much as a log focal
 length that is one sigma off. The prior matters only if the matches do not determine the focal
 lengths. A match whose point lies behind a camera is an outlier, too.
@@ -43,26 +45,31 @@ from mkpc_kaggle.geometry.robust import (
 from mkpc_kaggle.geometry.two_view import Problem, TwoView, Vectors, robust_costs, sampson
 
 ESSENTIAL_STARTS = 5  # estimates of E, at evenly spaced quantiles of the prior on focal lengths
-# Share and minimum number of matches for each estimate of E
-ESSENTIAL_SHARE, MIN_ESSENTIAL = 0.25, 50
-ESSENTIAL_THRESHOLD_PX, ESSENTIAL_ITERATIONS = 0.4, 300
-# Multiples of the scale, in order; a wide loss has few minima
-ROUGH_SCALES, FINE_SCALES = (4.0,), (2.0, 1.0)
-# Maximum numbers, evenly spaced; results are scored on all matches
-ROUGH_MATCHES, FINE_MATCHES = 300, 1000
+# Share and minimum number of the matches for each of them.
+ESSENTIAL_SHARE = 0.25
+MIN_ESSENTIAL = 50
+ESSENTIAL_THRESHOLD_PX = 0.4
+ESSENTIAL_ITERATIONS = 300  # an estimate is only a start, so it may be rough
+# Multiples of the loss's scale, in order; a wide loss has few minima.
+ROUGH_SCALES = (4.0,)
+FINE_SCALES = (2.0, 1.0)
+# Maximum numbers of matches, evenly spaced; results are scored on all matches.
+ROUGH_MATCHES = 300
+FINE_MATCHES = 1000
 FINE_STARTS = 2  # number of rough results to refine
 FREE_COST = 10.0  # penalty of MAGSAC's own F, which need not have plausible focal lengths
-# Expected focal length over the long side; standard deviation of its log
-FOCAL_RATIO, FOCAL_SIGMA = 1.1, 0.4
+FOCAL_RATIO = 1.1  # expected focal length over the long side
+FOCAL_SIGMA = 0.4  # standard deviation of its log
 EXIF_SIGMA = 0.05  # standard deviation of the log of EXIF's focal length
-# Values of log f / g to decompose MAGSAC's F; the best is a start
+# Values of log f / g to decompose MAGSAC's F; the best is a start.
 LOG_FOCAL_GRID = (-0.7, -0.35, 0.0, 0.35, 0.7)
 
 
 @dataclass(frozen=True)
 class FocalConfig:
-    """Settings of :func:`estimate_with_prior`, table ``[focal]`` of a recipe. Without the table, F
-    is MAGSAC's.
+    """Settings of :func:`estimate_with_prior`, table ``[focal]`` of a recipe.
+
+    Without the table, F is MAGSAC's.
     """
 
     scale: float = 0.35  # scale of the loss, in pixels
@@ -73,13 +80,16 @@ class FocalConfig:
 
 @dataclass(frozen=True, eq=False)
 class FocalPrior:
+    """The expected focal length of a camera, as a matrix K, and how uncertain it is."""
+
     K: Matrix3  # in pixels
     sigma: float  # standard deviation of the log focal length; 0: known
 
     @classmethod
     def of_image(cls, size: Size, exif_focal: float = 0.0) -> "FocalPrior":
-        """Return the prior for an image, which is weak without EXIF's focal length ``exif_focal``
-        in pixels.
+        """Return the prior for an image; it is weak without EXIF's focal length.
+
+        ``exif_focal`` is in pixels, 0 if unknown.
         """
         if exif_focal:
             return cls.of_focal(exif_focal, EXIF_SIGMA, size)
@@ -87,11 +97,12 @@ class FocalPrior:
 
     @classmethod
     def of_focal(cls, focal: float, sigma: float, size: Size) -> "FocalPrior":
-        """Return the prior for a focal length in pixels, with the principal point at the image's
-        centre.
-        """
-        centre = (size.width - 1) / 2, (size.height - 1) / 2
-        return cls(np.array([[focal, 0, centre[0]], [0, focal, centre[1]], [0, 0, 1]]), sigma)
+        """Return the prior for a focal length in pixels; the principal point is the centre."""
+        # Pixel centres are at integers, so the middle of n pixels is at (n - 1) / 2.
+        centre_x = (size.width - 1) / 2
+        centre_y = (size.height - 1) / 2
+        K = np.array([[focal, 0, centre_x], [0, focal, centre_y], [0, 0, 1]])
+        return cls(K, sigma)
 
     @property
     def focal(self) -> float:
@@ -105,7 +116,9 @@ class FocalPrior:
 
     def scaled(self, factor: float) -> Matrix3:
         """Return K with the focal length times ``factor``."""
-        return np.asarray(self.K * np.array([[factor, factor, 1], [1, factor, 1], [1, 1, 1]]))
+        # The skew, too: it is a multiple of the focal length.
+        factors = np.array([[factor, factor, 1], [1, factor, 1], [1, 1, 1]])
+        return np.asarray(self.K * factors)
 
     def rays(self, points: Vectors) -> Vectors:
         """Convert (N, 2) pixels to (N, 3) rays."""
@@ -122,42 +135,39 @@ def estimate_with_prior(
     config: FocalConfig,
     model: ModelKind = ModelKind.F,
 ) -> Estimate:
-    """Estimate F, or E if K is known, from ``matches`` in image pixels, as the candidate of lowest
-    cost.
+    """Estimate F, or E if K is known, from ``matches`` in image pixels.
 
-    Inliers have a Sampson distance below MAGSAC's threshold. MAGSAC's own F is a candidate, so F
-    never costs more. Six distinct matches are enough. The same input gives the same bytes.
+    The result is the candidate of lowest cost. MAGSAC's own F is a candidate, so F never costs
+    more. Inliers have a Sampson distance below MAGSAC's threshold. Six distinct matches are enough.
+    The same input gives the same bytes.
     """
     distinct = DistinctMatches.of(matches)
-    # Extreme coordinates may overflow; a candidate of non-finite cost loses
+    # Extreme coordinates may overflow; a candidate of non-finite cost loses.
     with np.errstate(all="ignore"):
         search = _Search(distinct, priors, config.scale)
         free, starts, failures = search.starts(magsac)
+        # An F without focal lengths is no E.
         if model is ModelKind.E:
             free = []
-        candidates = [
-            found for found in (*free, *search.refined(starts)) if np.isfinite(found.cost)
-        ]
-        if not candidates:
+        plain = _cheapest(free)
+        candidates = _finite([*free, *search.refined(starts)])
+        best = _cheapest(candidates)
+        if best is None:
             reasons = "; ".join(dict.fromkeys(failures)) or "no candidate has a finite cost"
             return Estimate.failed(model, len(matches), reasons)
-        best = min(candidates, key=lambda found: found.cost)
         inliers = np.abs(sampson(best.fundamental, *search.rays)) < magsac.threshold
         matrix = best.fundamental if model is ModelKind.E else search.for_pixels(best.fundamental)
-        finite = [found for found in free if np.isfinite(found.cost)]
-        plain = min(finite, key=lambda found: found.cost, default=None)
-    magsac_fundamental = unit_norm(search.for_pixels(plain.fundamental)) if plain else None
-    told = EstimateStats(
-        len(candidates), best.cost, plain.cost if plain else 0.0, search.focals(best)
-    )
-    return Estimate(
-        model, unit_norm(matrix), distinct.mask_of_all(inliers), "", magsac_fundamental, told
-    )
+    magsac_cost = plain.cost if plain else 0.0
+    own = unit_norm(search.for_pixels(plain.fundamental)) if plain else None
+    stats = EstimateStats(len(candidates), best.cost, magsac_cost, search.focals(best))
+    all_inliers = distinct.mask_of_all(inliers)
+    return Estimate(model, unit_norm(matrix), all_inliers, magsac=own, stats=stats)
 
 
 class _Candidate(NamedTuple):
-    """An F (3, 3) for rays. ``cost`` includes FREE_COST for MAGSAC's own F, and the prior's cost
-    for others.
+    """An F (3, 3) for rays.
+
+    ``cost`` includes FREE_COST for MAGSAC's own F, and the prior's cost for others.
     """
 
     fundamental: Matrix3
@@ -165,67 +175,90 @@ class _Candidate(NamedTuple):
     logs: Vectors | None = None  # log f / g of both cameras; None for MAGSAC's own F
 
 
+def _finite(found: Sequence[_Candidate]) -> list[_Candidate]:
+    """Return the candidates of finite cost."""
+    return [each for each in found if np.isfinite(each.cost)]
+
+
+def _cheapest(found: Sequence[_Candidate]) -> _Candidate | None:
+    """Return the first candidate of lowest finite cost, if any."""
+    return min(_finite(found), key=lambda each: each.cost, default=None)
+
+
 class _Search:
     """Search for candidates on a pair's distinct matches, converted to ``rays``."""
 
     def __init__(self, distinct: DistinctMatches, priors: Priors, scale: float) -> None:
-        self._distinct, self._priors, self._scale = distinct, priors, scale
-        self.rays = priors[0].rays(distinct.points0), priors[1].rays(distinct.points1)
+        self._distinct = distinct
+        self._priors = priors
+        self._scale = scale
+        rays0 = priors[0].rays(distinct.points0)
+        rays1 = priors[1].rays(distinct.points1)
+        self.rays = (rays0, rays1)
         self._sigmas = np.array([prior.sigma for prior in priors])
+        # Searches run on samples, which cost a fraction; results are scored on all matches.
         self._all = Problem(*self.rays, self._sigmas)
-        self._many, self._few = self._sample(FINE_MATCHES), self._sample(ROUGH_MATCHES)
+        self._many = self._sample(FINE_MATCHES)
+        self._few = self._sample(ROUGH_MATCHES)
 
     def _sample(self, most: int) -> Problem:
-        """Return the problem of up to ``most`` evenly spaced matches, weighted to represent all
-        matches.
-        """
-        count = len(self.rays[0])
+        """Return the problem of up to ``most`` evenly spaced matches, weighted to represent all."""
+        rays0, rays1 = self.rays
+        count = len(rays0)
         few = np.linspace(0, count - 1, min(count, most)).astype(int)
-        return Problem(self.rays[0][few], self.rays[1][few], self._sigmas, count / max(len(few), 1))
+        weight = count / max(len(few), 1)
+        return Problem(rays0[few], rays1[few], self._sigmas, weight)
 
     def starts(self, magsac: RobustConfig) -> tuple[list[_Candidate], list[TwoView], list[str]]:
-        """Return MAGSAC's candidates for F, the starts from these and from E, and reasons for
-        missing starts.
+        """Return MAGSAC's candidates for F, all starts, and the reasons for missing starts.
+
+        Starts come from these candidates and from estimates of E.
         """
-        free, starts, failures, count = [], [], [], len(self.rays[0])
+        free: list[_Candidate] = []
+        starts: list[TwoView] = []
+        failures: list[str] = []
+        count = len(self.rays[0])
         for number in range(magsac.permutations):
             plain = self._consensus(permutation(number, count), magsac)
-            if plain.ok:
-                to_pixels = [np.linalg.inv(prior.to_ray) for prior in self._priors]
-                F = unit_norm(to_pixels[1].T @ plain.matrix @ to_pixels[0])
-                starts.append(self._decomposed(F))
-                free.append(_Candidate(F, self._cost(F, starts[-1]) + FREE_COST))
-            else:
+            if not plain.ok:
                 failures.append(plain.failure)
-        config = replace(
-            magsac, threshold=ESSENTIAL_THRESHOLD_PX, max_iterations=ESSENTIAL_ITERATIONS
-        )
+                continue
+            F = self._for_rays(plain.matrix)
+            view = self._decomposed(F)
+            starts.append(view)
+            free.append(_Candidate(F, self._cost(F, view) + FREE_COST))
         for number in range(ESSENTIAL_STARTS):
-            part = permutation(number + 1, count)[
-                : max(MIN_ESSENTIAL, round(ESSENTIAL_SHARE * count))
-            ]
+            # Another quantile of the prior, and another subset of the matches.
             logs = NormalDist().inv_cdf((number + 0.5) / ESSENTIAL_STARTS) * self._sigmas
-            K0, K1 = (
-                prior.scaled(float(np.exp(log)))
-                for prior, log in zip(self._priors, logs, strict=True)
-            )
-            essential = self._consensus(part, config, (K0, K1))
+            essential = self._essential(number + 1, logs, magsac)
             if essential.ok:
                 starts.append(replace(TwoView.nearest(essential.matrix), logs=logs))
             else:
                 failures.append(essential.failure)
         return free, starts, failures
 
+    def _essential(self, number: int, logs: Vectors, magsac: RobustConfig) -> Estimate:
+        """Estimate E at focal lengths of ``logs`` from part of the permutation ``number``."""
+        config = replace(
+            magsac, threshold=ESSENTIAL_THRESHOLD_PX, max_iterations=ESSENTIAL_ITERATIONS
+        )
+        count = len(self.rays[0])
+        size = max(MIN_ESSENTIAL, round(ESSENTIAL_SHARE * count))
+        prior0, prior1 = self._priors
+        K0 = prior0.scaled(float(np.exp(logs[0])))
+        K1 = prior1.scaled(float(np.exp(logs[1])))
+        return self._consensus(permutation(number, count)[:size], config, (K0, K1))
+
     def refined(self, starts: Sequence[TwoView]) -> list[_Candidate]:
         """Search from all starts. Return the best results, refined."""
         rough = [self._searched(self._few, start, ROUGH_SCALES) for start in starts]
         rough.sort(key=lambda view: self._many.cost(view, self._scale))
-        fine = [self._searched(self._many, view, FINE_SCALES) for view in rough[:FINE_STARTS]]
-        costs = [self._cost(view.fundamental, view) + self._all.prior_cost(view) for view in fine]
-        return [
-            _Candidate(view.fundamental, cost, view.logs)
-            for view, cost in zip(fine, costs, strict=True)
-        ]
+        found = []
+        for start in rough[:FINE_STARTS]:
+            view = self._searched(self._many, start, FINE_SCALES)
+            cost = self._cost(view.fundamental, view) + self._all.prior_cost(view)
+            found.append(_Candidate(view.fundamental, cost, view.logs))
+        return found
 
     def focals(self, found: _Candidate) -> tuple[float, float]:
         """Return both focal lengths in pixels; 0 for MAGSAC's own F."""
@@ -238,38 +271,50 @@ class _Search:
         """Convert an F for rays to an F for homogeneous pixels."""
         return self._priors[1].to_ray.T @ F @ self._priors[0].to_ray
 
+    def _for_rays(self, F: Matrix3) -> Matrix3:
+        """Convert an F for homogeneous pixels to an F for rays, of unit norm."""
+        to_pixel0 = np.linalg.inv(self._priors[0].to_ray)
+        to_pixel1 = np.linalg.inv(self._priors[1].to_ray)
+        return unit_norm(to_pixel1.T @ F @ to_pixel0)
+
     def _consensus(
         self,
         chosen: NDArray[np.intp],
         config: RobustConfig,
         intrinsics: tuple[Matrix3, Matrix3] | None = None,
     ) -> Estimate:
-        """Estimate F, or E with ``intrinsics``, by MAGSAC on the chosen matches, in the given
-        order.
-        """
-        points0, points1 = self._distinct.points0[chosen], self._distinct.points1[chosen]
+        """Estimate F, or E with ``intrinsics``, by MAGSAC on the chosen matches, in this order."""
+        points0 = self._distinct.points0[chosen]
+        points1 = self._distinct.points1[chosen]
         model = ModelKind.E if intrinsics else ModelKind.F
+        # The permutation is the caller's: each of its results is a start.
         return consensus(points0, points1, replace(config, permutations=1), model, intrinsics)
 
     def _decomposed(self, F: Matrix3) -> TwoView:
         """Decompose an F for rays into two views, with the best-fitting focal lengths of a grid."""
+        # A known focal length has one value.
         grid0, grid1 = (LOG_FOCAL_GRID if prior.sigma else (0.0,) for prior in self._priors)
         views = [TwoView.nearest(F, log0, log1) for log0 in grid0 for log1 in grid1]
-        return min(views, key=lambda view: self._few.cost(view, ROUGH_SCALES[0] * self._scale))
+        scale = ROUGH_SCALES[0] * self._scale
+        return min(views, key=lambda view: self._few.cost(view, scale))
 
     def _searched(self, problem: Problem, view: TwoView, factors: Sequence[float]) -> TwoView:
-        """Return the local minimum near ``view``, with the loss scaled by each of ``factors`` in
-        turn.
-        """
+        """Return the local minimum near ``view``, with the loss scaled by each factor in turn."""
+        # From a wide loss to a narrow one: with a narrow loss, a rough start has no gradient.
         for factor in factors:
             view = problem.fit(view, factor * self._scale)
         return view
 
     def _cost(self, F: Matrix3, view: TwoView) -> float:
-        """Return the cost of an F for rays on all matches. Points behind a camera of ``view`` are
-        outliers.
+        """Return the cost of an F for rays on all matches; points behind a camera are outliers.
+
+        ``view`` is one of the four poses of F. The one with the fewest points behind counts.
         """
-        saved = 0.5 - robust_costs(sampson(F, *self.rays), self._scale)
-        signs = (views.depth_signs(*self.rays, 3 * self._scale) for views in (view, view.twisted))
-        behind = min(saved[both * sign <= 0].sum() for both in signs for sign in (1, -1))
-        return float((0.5 - saved).sum() + behind)
+        saved = 0.5 - robust_costs(sampson(F, *self.rays), self._scale)  # against an outlier's 0.5
+        behind = []
+        for each in (view, view.twisted):
+            signs = each.depth_signs(*self.rays, 3 * self._scale)
+            # With -t all signs change. NaN, a point that may be at infinity, compares as False.
+            behind.append(saved[signs <= 0].sum())
+            behind.append(saved[-signs <= 0].sum())
+        return float((0.5 - saved).sum() + min(behind))

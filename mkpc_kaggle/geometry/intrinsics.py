@@ -27,10 +27,10 @@ MAX_SIGMA = 100.0  # percent; a wider prior states nothing
 
 @dataclass(frozen=True)
 class KnownCamera:
-    """A camera model with parameters, and the standard deviation of its focal length in percent; 0:
-    exact.
+    """A camera model with parameters, and its focal length's standard deviation in percent.
 
-    An exact camera is not refined at all. Raises ``ValueError`` for values that no camera has.
+    A standard deviation of 0 means exact: the camera is not refined at all. Raises ``ValueError``
+    for values that no camera has.
     """
 
     model: str
@@ -45,6 +45,7 @@ class KnownCamera:
             raise ValueError(f"{self.model} has {len(names)} parameters ({', '.join(names)})")
         if not all(map(isfinite, self.parameters)):
             raise ValueError("a parameter is not finite")
+        # One or two focal lengths come first, then the principal point; distortion may be negative.
         focal_count = sum(name.startswith("f") for name in names)
         if min(self.parameters[: focal_count + 2]) <= 0:
             raise ValueError("focal lengths and the principal point must be positive")
@@ -56,13 +57,8 @@ class KnownCamera:
     @property
     def focal(self) -> float:
         """The mean focal length in pixels."""
-        names = MODELS[self.model]
-        focals = [
-            value
-            for name, value in zip(names, self.parameters, strict=True)
-            if name.startswith("f")
-        ]
-        return sum(focals) / len(focals)
+        at = MODELS[self.model].index("cx")  # focal lengths come before it
+        return sum(self.parameters[:at]) / at
 
     @property
     def principal_point(self) -> tuple[float, float]:
@@ -83,24 +79,18 @@ def parse_row(pattern: str, model: str, parameters: str, sigma: str) -> tuple[st
             f"a standard deviation must be {FIXED!r} or a number of percent above 0, not {sigma!r}"
         )
     percent = 0.0 if sigma.strip() == FIXED else float(sigma)
-    return pattern.strip(), KnownCamera(
-        model.strip(), tuple(map(float, parameters.split())), percent
-    )
+    values = tuple(map(float, parameters.split()))
+    return pattern.strip(), KnownCamera(model.strip(), values, percent)
 
 
 def written(rows: Rows) -> str:
     """Return rows as text, a line each, for the settings of a run."""
-    lines = (
-        "\t".join(
-            [
-                pattern,
-                known.model,
-                " ".join(map(repr, map(float, known.parameters))),
-                repr(float(known.sigma)) if known.sigma else FIXED,
-            ]
-        )
-        for pattern, known in rows
-    )
+    lines = []
+    for pattern, known in rows:
+        # ``repr`` of a float keeps all digits, so :func:`read` returns the same numbers.
+        parameters = " ".join(repr(float(value)) for value in known.parameters)
+        sigma = repr(float(known.sigma)) if known.sigma else FIXED
+        lines.append("\t".join([pattern, known.model, parameters, sigma]))
     return "\n".join(lines)
 
 
@@ -118,15 +108,15 @@ def read(text: str) -> Rows:
 
 
 def camera_of(rows: Rows, name: str) -> KnownCamera | None:
-    """Return the camera of the first row that names an image: by path, by file name, or by a
-    pattern of these.
+    """Return the camera of the first row that names an image, or None.
+
+    A row names it by path, by file name, or by a pattern of these.
     """
     base = name.rpartition("/")[2]
-    matching = (
-        known for pattern, known in rows if pattern in (name, base) or _matches(pattern, name, base)
-    )
-    return next(matching, None)
-
-
-def _matches(pattern: str, name: str, base: str) -> bool:
-    return fnmatch.fnmatchcase(name, pattern) or fnmatch.fnmatchcase(base, pattern)
+    for pattern, known in rows:
+        # Equality first: a file may be called "photo [1].jpg", and as a pattern this is another.
+        if pattern in (name, base):
+            return known
+        if fnmatch.fnmatchcase(name, pattern) or fnmatch.fnmatchcase(base, pattern):
+            return known
+    return None

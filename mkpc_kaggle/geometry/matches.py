@@ -13,9 +13,9 @@ from mkpc_kaggle.geometry.coordinates import Points, View
 class Matches:
     """N corresponding points (x, y) with scores; pixel centres are at integers.
 
-    ``points0`` and ``points1`` are (N, 2) float32, ``scores`` is (N,) float32, higher is more certain. All methods
-    keep the matcher's order, since MAGSAC's result depends on it. Other dtypes are cast. Raises ``ValueError`` for
-    inconsistent shapes.
+    ``points0`` and ``points1`` are (N, 2) float32, ``scores`` is (N,) float32, higher is more
+    certain. All methods keep the matcher's order, since MAGSAC's result depends on it. Other dtypes
+    are cast. Raises ``ValueError`` for inconsistent shapes.
     """
 
     points0: Points
@@ -29,13 +29,12 @@ class Matches:
                 array = array.reshape(0, *width)
             if array.shape != (len(self.scores), *width):
                 raise ValueError(f"{name} has shape {array.shape}, scores {np.shape(self.scores)}")
-            object.__setattr__(self, name, array)
+            object.__setattr__(self, name, array)  # the class is frozen
 
     @classmethod
     def empty(cls) -> "Matches":
-        return cls(
-            np.zeros((0, 2), np.float32), np.zeros((0, 2), np.float32), np.zeros(0, np.float32)
-        )
+        points = np.zeros((0, 2), np.float32)
+        return cls(points, points, np.zeros(0, np.float32))
 
     @classmethod
     def concatenate(cls, parts: Iterable["Matches"]) -> "Matches":
@@ -43,8 +42,11 @@ class Matches:
         parts = list(parts)
         if not parts:
             return cls.empty()
-        columns = zip(*((part.points0, part.points1, part.scores) for part in parts), strict=True)
-        return cls(*map(np.concatenate, columns))
+        return cls(
+            np.concatenate([part.points0 for part in parts]),
+            np.concatenate([part.points1 for part in parts]),
+            np.concatenate([part.scores for part in parts]),
+        )
 
     def __len__(self) -> int:
         return len(self.scores)
@@ -54,13 +56,14 @@ class Matches:
         return Matches(self.points0[index], self.points1[index], self.scores[index])
 
     def best(self, most: int) -> "Matches":
-        """Return up to ``most`` matches of highest score, in their present order; of equal scores,
-        the earlier.
+        """Return up to ``most`` matches of highest score, in their present order.
+
+        Of equal scores, the earlier ones.
         """
         if len(self) <= most:
             return self
         chosen = np.argsort(-self.scores, kind="stable")[:most]
-        return self[np.sort(chosen)]
+        return self[np.sort(chosen)]  # back in the present order
 
     def to_image(self, view0: View, view1: View) -> "Matches":
         """Convert matches in view pixels to image pixels.
@@ -68,9 +71,9 @@ class Matches:
         Drops matches with a non-finite point or score, and matches with a point outside its view's
         content.
         """
-        kept = self[
-            view0.holds(self.points0) & view1.holds(self.points1) & np.isfinite(self.scores)
-        ]
+        on_content = view0.holds(self.points0) & view1.holds(self.points1)
+        kept = self[on_content & np.isfinite(self.scores)]
+        # Converted in float64: in float32, large images would lose digits at each step.
         return Matches(
             view0.to_image(kept.points0).astype(np.float32),
             view1.to_image(kept.points1).astype(np.float32),

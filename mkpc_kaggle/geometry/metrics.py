@@ -20,7 +20,7 @@ from mkpc_kaggle.geometry.two_view import cross_matrix
 ROTATION_THRESHOLDS = np.linspace(1, 10, 10)
 TRANSLATION_THRESHOLDS = np.geomspace(0.2, 5, 10)
 AUC_THRESHOLDS = (5.0, 10.0, 20.0)  # degrees
-# A correct match's maximum sum of both squared epipolar distances, on the planes z = 1
+# A correct match's maximum sum of both squared epipolar distances, on the planes z = 1.
 CORRECT = 5e-4
 
 
@@ -30,7 +30,7 @@ class PoseError:
 
     rotation: float  # degrees
     translation_angle: float  # degrees, at most 90, since F leaves the sign open
-    # Metres, after scaling to the true length; NaN if the scale of the world is unknown
+    # Metres, after scaling to the true length; NaN if the scale of the world is unknown.
     translation: float
 
     @classmethod
@@ -40,8 +40,9 @@ class PoseError:
     def __str__(self) -> str:
         if not isfinite(self.rotation):
             return "no pose"
-        metres, degrees = f"{self.translation:.2f} m", f"{self.translation_angle:.1f} degrees"
-        shift = metres if isfinite(self.translation) else degrees
+        shift = f"{self.translation_angle:.1f} degrees"
+        if isfinite(self.translation):
+            shift = f"{self.translation:.2f} m"
         return f"rotation {self.rotation:.1f} degrees off, translation {shift}"
 
     @property
@@ -70,11 +71,13 @@ def pose_error(
     direction = np.ravel(column).astype(np.float64)
     length = float(np.linalg.norm(t))
     cosine = abs(float(direction @ t)) / max(length, np.finfo(float).tiny)
-    apart = min(
-        float(np.linalg.norm(direction * length - t)), float(np.linalg.norm(direction * length + t))
-    )
+    # F leaves the length open, so the true one is taken.
+    scaled = direction * length
+    apart = float(np.linalg.norm(scaled - t))
+    apart = min(apart, float(np.linalg.norm(scaled + t)))  # the sign is open
+    angles = [rotation_angle(np.asarray(candidate) @ R.T) for candidate in rotations]
     return PoseError(
-        rotation=min(rotation_angle(np.asarray(candidate) @ R.T) for candidate in rotations),
+        rotation=min(angles),
         translation_angle=float(np.degrees(np.arccos(min(cosine, 1.0)))),
         translation=apart * metres_per_unit,
     )
@@ -84,14 +87,17 @@ def rotation_angle(R: Matrix3) -> float:
     """Return the angle of a rotation matrix in degrees, 0 to 180, precise at both ends."""
     # SciPy's Rotation raises if a file's matrix is not a rotation.
     skew = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-    return float(np.degrees(np.arctan2(np.linalg.norm(skew), np.trace(R) - 1)))
+    # |skew| = 2 sin, trace = 1 + 2 cos. The arccosine alone loses half of the digits near 0.
+    twice_sine = np.linalg.norm(skew)
+    twice_cosine = np.trace(R) - 1
+    return float(np.degrees(np.arctan2(twice_sine, twice_cosine)))
 
 
 def pair_accuracy(error: PoseError) -> float:
-    """Return the share of the ten threshold pairs that a pair's error meets. A scene's mAA is the
-    mean over pairs.
+    """Return the share of the ten threshold pairs that a pair's error meets.
 
-    Source: evaluation page of the Image Matching Challenge 2022.
+    A scene's mAA is the mean over pairs. Source: evaluation page of the Image Matching Challenge
+    2022.
     """
     meets = (error.rotation < ROTATION_THRESHOLDS) & (error.translation < TRANSLATION_THRESHOLDS)
     return float(np.mean(meets))
@@ -101,28 +107,32 @@ def correct_matches(matches: Matches, camera0: Camera, camera1: Camera) -> NDArr
     """Return an (N,) mask of the matches that fit the true cameras within :data:`CORRECT`."""
     R, t = relative_pose(camera0, camera1)
     E = cross_matrix(t) @ R
-    x0, x1 = (
-        homogeneous(calibrate(matches.points0, camera0.K)),
-        homogeneous(calibrate(matches.points1, camera1.K)),
-    )
-    lines0, lines1 = x1 @ E, x0 @ E.T
-    # With equal camera centres, no match is correct
+    x0 = homogeneous(calibrate(matches.points0, camera0.K))
+    x1 = homogeneous(calibrate(matches.points1, camera1.K))
+    lines0 = x1 @ E  # epipolar lines (N, 3) in image 0
+    lines1 = x0 @ E.T
+    # The squared distance of a point to its line is (x1^T E x0)^2 over the squared norm of the
+    # line's normal, in each image.
+    squared_normal0 = (lines0[:, :2] ** 2).sum(axis=1)
+    squared_normal1 = (lines1[:, :2] ** 2).sum(axis=1)
+    # With equal camera centres, no match is correct.
     with np.errstate(divide="ignore", invalid="ignore"):
-        inverse = 1 / (lines0[:, :2] ** 2).sum(axis=1) + 1 / (lines1[:, :2] ** 2).sum(axis=1)
-        return np.asarray((x1 * lines1).sum(axis=1) ** 2 * inverse < CORRECT)
+        inverse = 1 / squared_normal0 + 1 / squared_normal1
+        distances = (x1 * lines1).sum(axis=1) ** 2 * inverse
+        return np.asarray(distances < CORRECT)
 
 
 def pose_auc(errors: Sequence[PoseError], threshold: float) -> float:
-    """Return the normalised area, 0 to 1, under the recall curve of angular errors up to
-    ``threshold`` degrees.
+    """Return the area under the recall curve of angular errors up to ``threshold`` degrees.
 
-    The curve is piecewise linear through the sorted points (error_i, i / n), as in SuperGlue's
-    evaluation. NaN without pairs.
+    It is normalised to 0..1. The curve is piecewise linear through the sorted points (error_i, i /
+    n), as in SuperGlue's evaluation. NaN without pairs.
     """
     if not errors:
         return float("nan")
     angles = np.sort([0.0, *(error.angle for error in errors)])
     recall = np.arange(len(angles)) / len(errors)
+    # The curve ends at the threshold with the recall of the last error below it.
     last = int(np.searchsorted(angles, threshold))
     x = np.append(angles[:last], threshold)
     y = np.append(recall[:last], recall[last - 1])

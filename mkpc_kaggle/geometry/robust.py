@@ -52,9 +52,9 @@ class RobustConfig:
     max_iterations: int = 50_000
     confidence: float = 0.99999  # probability that no better model remains, where iterations stop
     permutations: int = 8  # number of fixed permutations; the first keeps the order of the matches
-    # If not 0, the threshold is in pixels of the image resized to this long side
+    # If not 0, the threshold is in pixels of the image resized to this long side.
     threshold_side: int = 0
-    # Keep exact duplicates, and estimate from the fewest matches that OpenCV accepts
+    # Keep exact duplicates, and estimate from the fewest matches that OpenCV accepts.
     every_match: bool = False
 
     def __post_init__(self) -> None:
@@ -65,20 +65,19 @@ class RobustConfig:
     def in_stored_pixels(
         self, sizes: Sequence[Size], intrinsics: tuple[Matrix3, Matrix3] | None = None
     ) -> "RobustConfig":
-        """Return settings with the threshold in stored pixels, at the same ratio to the mean focal
-        length.
+        """Return settings with the threshold in stored pixels.
+
+        Its ratio to the mean focal length is the same as in the resized images.
         """
         if not self.threshold_side:
             return self
-        scales = np.array(
-            [View.fit(Box.whole(size), long_side=self.threshold_side).scale for size in sizes]
-        )
-        focals = np.array([K.diagonal()[:2] for K in intrinsics or 2 * [np.eye(3)]])
-        return replace(
-            self,
-            threshold=self.threshold * focals.sum() / (focals * scales).sum(),
-            threshold_side=0,
-        )
+        views = [View.fit(Box.whole(size), long_side=self.threshold_side) for size in sizes]
+        scales = np.array([view.scale for view in views])  # (2, 2): x and y of both images
+        # Without intrinsics, all focal lengths count as equal.
+        matrices = intrinsics or (np.eye(3), np.eye(3))
+        focals = np.array([K.diagonal()[:2] for K in matrices])  # (2, 2)
+        stored = self.threshold * focals.sum() / (focals * scales).sum()
+        return replace(self, threshold=stored, threshold_side=0)
 
 
 @dataclass(frozen=True)
@@ -95,7 +94,7 @@ class EstimateStats:
     magsac_cost: float = 0.0  # of MAGSAC's own F; 0 without one
     focals: tuple[float, float] = (0.0, 0.0)  # in pixels, of both images; 0 if unknown
     support: float = 0.0  # see :mod:`mkpc_kaggle.geometry.overlap`
-    # Of an E, chosen by inliers, see :func:`rotation_in_front`
+    # Of an E, chosen by inliers, see :func:`rotation_in_front`.
     rotation: tuple[float, ...] = (0.0, 0.0, 0.0)
 
 
@@ -104,8 +103,10 @@ NO_STATS = EstimateStats()
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
+    """A model with its inliers, or the fallback with the reason."""
+
     model: ModelKind
-    # Finite, of unit Frobenius norm; for F, x1^T F x0 = 0 in homogeneous image pixels
+    # Finite, of unit Frobenius norm; for F, x1^T F x0 = 0 in homogeneous image pixels.
     matrix: Matrix3
     inliers: NDArray[np.bool_]  # (N,) mask of the given matches within the threshold
     failure: str = ""  # the reason if ``matrix`` is the fallback
@@ -155,64 +156,87 @@ def consensus(
     model: ModelKind,
     intrinsics: tuple[Matrix3, Matrix3] | None = None,
 ) -> Estimate:
-    """Estimate a model as :func:`estimate` does, from finite points (N, 2) without merging
-    duplicates.
-    """
-    count, threshold, solver = len(points0), config.threshold, _SOLVERS[model]
+    """Estimate a model as :func:`estimate` does, from finite points (N, 2), duplicates included."""
+    count = len(points0)
+    threshold = config.threshold
+    solver = _SOLVERS[model]
     if count < (solver.minimal if config.every_match else solver.min_matches):
         return Estimate.failed(model, count, f"too few distinct matches for {model}: {count}")
-    method = cv2.USAC_MAGSAC if config.method is Method.MAGSAC else cv2.RANSAC
-    settings = {
-        "method": method,
+    settings = _settings(config)
+    if intrinsics is not None and model is ModelKind.E:
+        points0 = calibrate(points0, intrinsics[0])
+        points1 = calibrate(points1, intrinsics[1])
+        focals = [K[axis, axis] for K in intrinsics for axis in (0, 1)]
+        settings["focal"] = float(np.mean(focals))
+        threshold /= settings["focal"]
+    settings["ransacReprojThreshold"] = threshold
+
+    found: list[_Found] = []
+    failure = f"no {model} fits {count} distinct matches"
+    for number in range(config.permutations):
+        try:
+            found += _model_of(solver, points0, points1, permutation(number, count), settings)
+        except cv2.error as error:  # it may reject points in one order and accept them in another
+            failure = f"OpenCV refused the points: {error.err}"
+    if not found:
+        return Estimate.failed(model, count, failure)
+    # The number of inliers does not decide: MAGSAC scores distances up to several times the
+    # threshold.
+    best = min(found, key=lambda each: each.cost)
+    if not best.inliers.any():
+        failure = f"no {model} has inliers among {count} distinct matches"
+        return Estimate.failed(model, count, failure)
+    known = best.cost if np.isfinite(best.cost) else 0.0
+    stats = EstimateStats(candidates=len(found), cost=known, magsac_cost=known)
+    return Estimate(model, unit_norm(best.matrix), best.inliers, stats=stats)
+
+
+def _settings(config: RobustConfig) -> dict[str, Any]:
+    """Return OpenCV's arguments that do not depend on the model."""
+    return {
+        "method": cv2.USAC_MAGSAC if config.method is Method.MAGSAC else cv2.RANSAC,
         "confidence": config.confidence,
         "maxIters": config.max_iterations,
     }
-    if intrinsics is not None and model is ModelKind.E:
-        points0, points1 = calibrate(points0, intrinsics[0]), calibrate(points1, intrinsics[1])
-        settings["focal"] = float(np.mean([K[axis, axis] for K in intrinsics for axis in (0, 1)]))
-        threshold /= settings["focal"]
-    best, inliers, lowest, candidates = None, np.zeros(count, bool), np.inf, 0
-    failure = f"no {model} fits {count} distinct matches"
-    for number in range(config.permutations):
-        order = permutation(number, count)
-        try:
-            matrix, mask = solver.find(
-                points0[order], points1[order], ransacReprojThreshold=threshold, **settings
-            )
-        except cv2.error as error:  # it may reject points in one order and accept them in another
-            failure = f"OpenCV refused the points: {error.err}"
-            continue
-        if (
-            matrix is None
-            or matrix.shape != (3, 3)
-            or not np.isfinite(matrix).all()
-            or not matrix.any()
-        ):
-            continue
-        with np.errstate(over="ignore", invalid="ignore"):  # points may be any numbers
-            cost = float(
-                np.sum(robust_costs(solver.distances(matrix, points0, points1), 2 * threshold))
-            )
-        # The number of inliers does not decide: MAGSAC scores distances up to several times the
-        # threshold.
-        if best is None or cost < lowest:
-            best, inliers[order], lowest = matrix, mask.ravel().astype(bool), cost
-        candidates += 1
-    if best is None:
-        return Estimate.failed(model, count, failure)
-    if not inliers.any():
-        return Estimate.failed(
-            model, count, f"no {model} has inliers among {count} distinct matches"
-        )
-    known = lowest if np.isfinite(lowest) else 0.0
-    return Estimate(model, unit_norm(best), inliers, stats=EstimateStats(candidates, known, known))
+
+
+class _Found(NamedTuple):
+    """OpenCV's model of one permutation, with the mask (N,) of its inliers."""
+
+    matrix: Matrix3
+    inliers: NDArray[np.bool_]
+    cost: float
+
+
+def _model_of(
+    solver: "_Solver",
+    points0: Vectors,
+    points1: Vectors,
+    order: NDArray[np.intp],
+    settings: dict[str, Any],
+) -> list[_Found]:
+    """Return OpenCV's model of the points in an order, if it finds one. May raise ``cv2.error``."""
+    matrix, mask = solver.find(points0[order], points1[order], **settings)
+    if not _is_model(matrix):
+        return []
+    inliers = np.zeros(len(order), bool)
+    inliers[order] = mask.ravel().astype(bool)  # back in the order of the points
+    with np.errstate(over="ignore", invalid="ignore"):  # points may be any numbers
+        distances = solver.distances(matrix, points0, points1)
+        costs = robust_costs(distances, 2 * settings["ransacReprojThreshold"])
+        return [_Found(matrix, inliers, float(np.sum(costs)))]
+
+
+def _is_model(matrix: Any) -> bool:
+    """Return whether OpenCV returned one finite matrix (3, 3) other than zero."""
+    if matrix is None or matrix.shape != (3, 3):
+        return False
+    return bool(np.isfinite(matrix).all() and matrix.any())
 
 
 @dataclass(frozen=True, eq=False)
 class DistinctMatches:
-    """The distinct finite matches of N, in order of first appearance; all finite matches without
-    ``merge``.
-    """
+    """The distinct finite matches of N, in order of first appearance."""
 
     points0: Vectors  # (M, 2)
     points1: Vectors
@@ -220,18 +244,24 @@ class DistinctMatches:
 
     @classmethod
     def of(cls, matches: Matches, *, merge: bool = True) -> "DistinctMatches":
+        """Return the distinct matches; without ``merge`` all finite matches."""
         pairs = np.hstack([matches.points0, matches.points1]).astype(np.float64)
         if not merge:
+            # A row's number makes it distinct.
             pairs = np.column_stack([pairs, np.arange(len(pairs))])
         finite = np.isfinite(pairs).all(axis=1)
         _, first, inverse = np.unique(pairs[finite], axis=0, return_index=True, return_inverse=True)
+        # NumPy's order is that of the values; MAGSAC needs that of the matches. ``rank`` is the row
+        # of each value in the order of first appearance.
+        rank = np.argsort(np.argsort(first))
         index = np.full(len(pairs), -1)
-        index[finite] = np.argsort(np.argsort(first))[inverse.ravel()]
+        index[finite] = rank[inverse.ravel()]
         pairs = pairs[finite][np.sort(first)]
         return cls(pairs[:, :2], pairs[:, 2:4], index)
 
     def mask_of_all(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Expand an (M,) mask of the distinct matches to an (N,) mask of all, duplicates included."""
+        # Index -1, of a match that is not finite, reads the appended False.
         return np.append(mask, False)[self.index]
 
 
@@ -248,10 +278,12 @@ def calibrate(points: NDArray[np.floating], K: Matrix3) -> Vectors:
 def rotation_in_front(
     E: Matrix3, matches: Matches, intrinsics: tuple[Matrix3, Matrix3]
 ) -> list[float]:
-    """Return the rotation of E with most points in front of both cameras, as a rotation vector (3,)
-    in radians.
+    """Return the rotation of E with most points in front of both cameras.
+
+    It is a rotation vector (3,) in radians.
     """
-    x0, x1 = calibrate(matches.points0, intrinsics[0]), calibrate(matches.points1, intrinsics[1])
+    x0 = calibrate(matches.points0, intrinsics[0])
+    x1 = calibrate(matches.points1, intrinsics[1])
     _, R, *_ = cv2.recoverPose(E, x0, x1, np.eye(3), FARTHEST)
     rotation: list[float] = Rotation.from_matrix(R).as_rotvec().tolist()
     return rotation
@@ -262,14 +294,16 @@ def sampson_distances(F: Matrix3, matches: Matches) -> Vectors:
 
     Source: Hartley and Zisserman, Multiple View Geometry, 11.4.3.
     """
-    return _epipolar_distances(
-        F, matches.points0.astype(np.float64), matches.points1.astype(np.float64)
-    )
+    points0 = matches.points0.astype(np.float64)
+    points1 = matches.points1.astype(np.float64)
+    return _epipolar_distances(F, points0, points1)
 
 
 def permutation(number: int, count: int) -> NDArray[np.intp]:
     """Return the fixed permutation ``number`` of ``count`` matches; number 0 keeps their order."""
-    return np.random.default_rng(number).permutation(count) if number else np.arange(count)
+    if number == 0:
+        return np.arange(count)
+    return np.random.default_rng(number).permutation(count)
 
 
 def homogeneous(points: NDArray[np.floating]) -> Vectors:
@@ -283,13 +317,14 @@ def _epipolar_distances(matrix: Matrix3, points0: Vectors, points1: Vectors) -> 
 
 
 def _transfer_distances(matrix: Matrix3, points0: Vectors, points1: Vectors) -> Vectors:
-    """Return (N,) distances between the second image's points and the first image's points, mapped
-    by H.
-    """
-    return np.asarray(np.hypot(*(cv2.perspectiveTransform(points0[None], matrix)[0] - points1).T))
+    """Return (N,) distances of the second image's points to the first's, mapped by H."""
+    mapped = cv2.perspectiveTransform(points0[None], matrix)[0]
+    return np.asarray(np.hypot(*(mapped - points1).T))
 
 
 class _Solver(NamedTuple):
+    """OpenCV's function for a model, with its limits and the residual."""
+
     minimal: int  # the fewest matches that OpenCV accepts
     min_matches: int  # more than a minimal sample, so that matches can contradict the model
     fallback: Matrix3
@@ -300,6 +335,7 @@ class _Solver(NamedTuple):
 def _find_essential(
     points0: Vectors, points1: Vectors, confidence: float, focal: float, **settings: Any
 ) -> Any:
+    """Find E from calibrated points (N, 2): return OpenCV's matrix and mask."""
     # MAGSAC integrates its score up to a fixed number of pixels, so it needs points in pixels.
     scale = focal if settings["method"] == cv2.USAC_MAGSAC else 1.0
     settings["threshold"] = scale * settings.pop("ransacReprojThreshold")
@@ -309,10 +345,14 @@ def _find_essential(
     )
     if stacked is None or len(stacked) <= 3:
         return stacked, mask
-    solutions = np.split(stacked, len(stacked) // 3)  # five points have up to ten
-    return max(
-        solutions, key=lambda E: cv2.recoverPose(E, points0, points1, np.eye(3), FARTHEST)[0]
-    ), mask
+
+    def in_front(E: Any) -> int:
+        """Count the points in front of both cameras."""
+        return int(cv2.recoverPose(E, points0, points1, np.eye(3), FARTHEST)[0])
+
+    # Five points have up to ten solutions, which OpenCV stacks.
+    solutions = np.split(stacked, len(stacked) // 3)
+    return max(solutions, key=in_front), mask
 
 
 _SOLVERS = {
