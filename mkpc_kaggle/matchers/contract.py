@@ -41,10 +41,8 @@ class Precision(StrEnum):
 class Placement:
     """A matcher's device, such as "cpu" or "cuda:0", and precision.
 
-    A matcher on the device "meta" has no numbers. It is loaded there to learn whether its weights
-    fit.
-
-    Softmax, optimal transport, least squares and coordinates are always float32.
+    Softmax, optimal transport, least squares and coordinates are always float32. A matcher on the
+    device "meta" has no numbers: it is loaded there to learn whether its weights fit.
     """
 
     device: str = "cpu"
@@ -78,11 +76,11 @@ class MatcherSpec:
     """The description of a matcher, known before it is loaded."""
 
     name: str
-    # A frozen dataclass; a recipe's table [matchers.NAME] sets its fields
+    # A frozen dataclass; a recipe's table [matchers.NAME] sets its fields.
     options: type = NoOptions
     colour: Colour = Colour.RGB
     multiple: int = 1  # the sides of pictures are padded to multiples of this
-    # Of the manifest; ``{name}`` stands for the value of option ``name``
+    # Of the manifest; ``{name}`` stands for the value of option ``name``.
     slots: tuple[str, ...] = ()
     licences: tuple[str, ...] = ()  # licence tags of weights outside the manifest
 
@@ -100,6 +98,7 @@ class MatcherSpec:
             # A template such as "loftr-{training}" becomes a pattern with the group "training".
             pattern = re.sub(r"\\{(\w+)\\}", r"(?P<\1>.+)", re.escape(own))
             if found := re.fullmatch(pattern, slot):
+                # The pattern also fits values that the option does not know.
                 with suppress(UserError):
                     return from_table(self.options, found.groupdict(), f"slot {slot}")
         return None
@@ -146,7 +145,10 @@ class Matcher(Protocol[Encoding]):
 
 
 class PairwiseMatcher(Generic[Encoding]):
-    """A matcher that matches pairs one by one, so that results do not depend on the minibatch."""
+    """A matcher that matches pairs one by one, so that results do not depend on the minibatch.
+
+    Subclasses define ``_match``, which returns the matches of one pair in view pixels.
+    """
 
     def match(
         self, encodings0: Sequence[Encoding], encodings1: Sequence[Encoding]
@@ -162,6 +164,7 @@ class PairwiseMatcher(Generic[Encoding]):
 
 def arrays_of(value: Any) -> Iterator[Any]:
     """Yield the arrays and tensors in nested dataclasses, tuples and lists."""
+    # NumPy's arrays and PyTorch's tensors alike, without importing torch.
     if hasattr(value, "nbytes"):
         yield value
     elif is_dataclass(value):
@@ -173,4 +176,5 @@ def arrays_of(value: Any) -> Iterator[Any]:
 
 
 def encoding_bytes(encoding: Any) -> int:
+    """Return the memory that an encoding's arrays take, in bytes."""
     return sum(array.nbytes for array in arrays_of(encoding))

@@ -1,6 +1,4 @@
-"""The adapter of dense networks, which encodes each picture and samples matches from a pair's
-warps.
-"""
+"""The adapter of dense networks: it encodes pictures, and samples matches from a pair's warps."""
 
 import zlib
 from collections.abc import Sequence
@@ -55,11 +53,11 @@ class DenseEncoding(NamedTuple):
 
 
 class DenseMatcher(PairwiseMatcher[DenseEncoding]):
-    """A dense matcher. A match's score is its certainty; the random seed depends on the two
-    pictures alone.
+    """A dense matcher; a match's score is its certainty.
 
-    Pictures and pairs are processed one by one, so that results do not depend on the batch. Sides
-    in the first pass are multiples of ``multiple``.
+    The random seed depends on the two pictures alone. Pictures and pairs are processed one by one,
+    so that results do not depend on the batch. Sides in the first pass are multiples of
+    ``multiple``.
     """
 
     def __init__(
@@ -91,21 +89,21 @@ class DenseMatcher(PairwiseMatcher[DenseEncoding]):
         first = network_input(pixels, first_size).to(self.device)
         second = None
         if first_scale is not None:
-            size = max(MIN_SIDE_PX, height), max(MIN_SIDE_PX, width)
+            # From the picture again, not from the smaller input of the first pass.
+            size = (max(MIN_SIDE_PX, height), max(MIN_SIDE_PX, width))
             second = network_input(pixels, size).to(self.device)
-        return DenseEncoding(
-            self._network.encode(first, second), picture.content, zlib.crc32(content.data)
-        )
+        features = self._network.encode(first, second)
+        return DenseEncoding(features, picture.content, zlib.crc32(content.data))
 
     def _first_size(self, content: Size, scale: float) -> tuple[int, int]:
         """Return the height and width of the first pass's picture, multiples of ``multiple``."""
         multiple = self._multiple
-        rows, columns = (
-            multiple * max(1, round(side * scale / multiple)) for side in reversed(content)
-        )
-        return rows, columns
+        rows = max(1, round(content.height * scale / multiple))
+        columns = max(1, round(content.width * scale / multiple))
+        return multiple * rows, multiple * columns
 
     def _match(self, first: DenseEncoding, second: DenseEncoding) -> Matches:
+        # Candidates come from the grids of both images.
         warps = self._network.match(first.features, second.features)
         warp = torch.cat([dense.warp.reshape(-1, 4) for dense in warps])
         certainty = torch.cat([dense.certainty.flatten() for dense in warps])

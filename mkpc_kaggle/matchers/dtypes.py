@@ -20,12 +20,19 @@ def exact_float32() -> Iterator[None]:
         return
     import torch
 
-    cudnn, product = torch.backends.cudnn, torch.backends.cuda.matmul
-    settings: tuple[Any, ...] = (
-        (cudnn.conv, product) if hasattr(cudnn, "conv") else (cudnn, product)
-    )
-    # The setting's name and value since PyTorch 2.9, and before.
-    name, exact = ("fp32_precision", "ieee") if hasattr(cudnn, "conv") else ("allow_tf32", False)
+    cudnn = torch.backends.cudnn
+    product = torch.backends.cuda.matmul
+    settings: tuple[Any, ...]
+    exact: Any
+    # The settings, their name and value since PyTorch 2.9, and before.
+    if hasattr(cudnn, "conv"):
+        settings = (cudnn.conv, product)
+        name = "fp32_precision"
+        exact = "ieee"
+    else:
+        settings = (cudnn, product)
+        name = "allow_tf32"
+        exact = False
     former = [getattr(setting, name) for setting in settings]
     try:
         for setting in settings:
@@ -39,15 +46,14 @@ def exact_float32() -> Iterator[None]:
 def check_finite(what: str, *values: Any) -> None:
     """Raise :class:`NonFiniteError` if a tensor in the values contains NaN or infinity.
 
-    ``what`` names the values in the message. They may be nested dataclasses and sequences. The check
-    costs one pass over the tensors and one synchronisation with the device.
+    ``what`` names the values in the message. They may be nested dataclasses and sequences. The
+    check costs one pass over the tensors and one synchronisation with the device.
     """
-    arrays = arrays_of(values)
-    tensors = [
-        array
-        for array in arrays
-        if hasattr(array, "is_floating_point") and array.is_floating_point()
-    ]
+    tensors = []
+    for array in arrays_of(values):
+        # NumPy's arrays do not have this method; integers are always finite.
+        if hasattr(array, "is_floating_point") and array.is_floating_point():
+            tensors.append(array)
     if not tensors:
         return
     import torch

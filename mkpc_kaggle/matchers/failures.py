@@ -1,9 +1,9 @@
-"""Kinds of matcher errors: out of memory, a failed device, or a pair that the matcher cannot
-process.
+"""Kinds of matcher errors: out of memory, a failed device, or a pair that fails.
 
-The text of an error decides its kind, since types differ between versions: a failed kernel raises a plain
-``RuntimeError`` up to PyTorch 2.7 and a ``torch.AcceleratorError`` since 2.8. After most device errors every
-further call in the process fails, and only a new process helps. After a memory error the process can continue.
+The text of an error decides its kind, since types differ between versions: a failed kernel raises a
+plain ``RuntimeError`` up to PyTorch 2.7 and a ``torch.AcceleratorError`` since 2.8. After most
+device errors every further call in the process fails, and only a new process helps. After a memory
+error the process can continue.
 """
 
 import os
@@ -25,7 +25,7 @@ _DEVICE = re.compile(
 )
 
 
-# Ids of this process and of the ancestors it was forked from, if they matched pairs
+# Ids of this process and of the ancestors it was forked from, if they matched pairs.
 matched_in: set[int] = set()
 
 
@@ -40,17 +40,23 @@ class DeviceError(UserError):
 
 
 def failure_of(error: BaseException) -> FailureKind:
+    """Return the kind of an error that a matcher raised."""
     reason = reason_of(error)
+    # First: "CUDA error: out of memory" is no failed device.
     if isinstance(error, MemoryError) or _OUT_OF_MEMORY.search(reason):
         return FailureKind.OUT_OF_MEMORY
-    return FailureKind.DEVICE if _DEVICE.search(reason) else FailureKind.RAISED
+    if _DEVICE.search(reason):
+        return FailureKind.DEVICE
+    return FailureKind.RAISED
 
 
 def reason_of(error: BaseException) -> str:
     """Return the error's type, text and notes, without the debugging advice that PyTorch appends."""
     text = str(error)
-    short = text.partition("\n")[0] if _DEVICE.search(text) else text
-    return ", ".join([f"{type(error).__name__}: {short}", *getattr(error, "__notes__", ())])
+    if _DEVICE.search(text):
+        text = text.partition("\n")[0]
+    notes = getattr(error, "__notes__", ())
+    return ", ".join([f"{type(error).__name__}: {text}", *notes])
 
 
 def require_unforked() -> None:
@@ -59,6 +65,7 @@ def require_unforked() -> None:
     A forked child inherits no threads of PyTorch and OpenCV but waits for them, even with a new
     matcher.
     """
+    # A fork copies the set, so a child finds its parent's id besides its own.
     matched_in.add(os.getpid())
     if len(matched_in) > 1:
         raise UserError(

@@ -28,8 +28,8 @@ class LightGlueOptions(KeypointOptions):
     """Settings of LightGlue, with the published defaults.
 
     ``depth_confidence``: the share of confident keypoints after which no further layer runs.
-    ``width_confidence``: confident keypoints that have no match with this probability are dropped. -1 turns either
-    off. ``filter_threshold``: matches score above it.
+    ``width_confidence``: confident keypoints that have no match with this probability are dropped.
+    -1 turns either off. ``filter_threshold``: matches score above it.
     """
 
     depth_confidence: float = 0.95
@@ -66,14 +66,14 @@ class LightGlueMatcher(PairwiseMatcher[Keypoints]):
             _positions(keypoints1),
             keypoints1.descriptors,
         )
-        points0, points1 = keypoints0.points, keypoints1.points
-        return matches_of(points0, points1, found.index0, found.index1, found.scores)
+        return matches_of(
+            keypoints0.points, keypoints1.points, found.index0, found.index1, found.scores
+        )
 
 
 def _positions(keypoints: Keypoints) -> Tensor:
-    """Return what LightGlue knows of each keypoint's place, (K, 2), or (K, 4) with scale and
-    orientation.
-    """
+    """Return the positions (K, 2) of keypoints, or (K, 4) with scales and orientations."""
+    # By the size of the content, without padding: LightGlue was trained on whole images.
     points = normalised(keypoints.points, *keypoints.content)
     if keypoints.scales is None or keypoints.orientations is None:
         return points
@@ -89,17 +89,19 @@ def load_lightglue(
     placement: Placement,
     shape: LightGlueShape,
 ) -> LightGlueMatcher:
-    """Load LightGlue from the weights of the spec's last slot, with as many layers as these have.
+    """Load LightGlue from the weights of the spec's last slot, with all layers of these weights.
 
     Weights without confidences run all their layers on all keypoints.
     """
     slot = spec.slots_for(options)[-1]
     tensors = {layer_name(name): tensor for name, tensor in weights.load(slot).items()}
+    # "transformers.8.self_attn...": the last number gives the layers. LighterGlue has fewer.
     layers = {int(name.split(".")[1]) for name in tensors if name.startswith("transformers.")}
     shape = replace(shape, layers=1 + max(layers, default=0))
     adapts = any(name.startswith("token_confidence.") for name in tensors)
     glue = LightGlue(shape, options.adaptation, adapts=adapts)
     unused = SURPLUS
+    # Without early stopping and pruning only the last layer's assignment is used.
     if not glue.adapts:
         unused += rf"|token_confidence\.|log_assignment\.(?!{shape.layers - 1}\.)"
     load_into(glue, tensors, unused=unused, what=slot)

@@ -15,10 +15,10 @@ GROUP = 64  # keys
 
 @dataclass(frozen=True)
 class Neighbours:
-    """M mutual pairs: ``index0``, ``index1`` (M,) int64, ``similarity`` (M,) cosine in -1..1,
-    ``ratio`` (M,).
+    """M mutual pairs: ``index0`` and ``index1`` (M,) int64, ``similarity`` and ``ratio`` (M,).
 
-    A ratio is the nearest over the second nearest distance, the larger one of the two directions.
+    A similarity is a cosine in -1..1. A ratio is the nearest over the second nearest distance, the
+    larger one of the two directions.
     """
 
     index0: Tensor
@@ -45,17 +45,17 @@ class NeighbourMatcher(PairwiseMatcher[Keypoints]):
 def mutual_neighbours(
     descriptors0: Tensor, descriptors1: Tensor, max_ratio: float = 1.0
 ) -> Neighbours:
-    """Pair unit descriptors (N, D) and (M, D) that are each other's nearest, in the order of the
-    first image.
+    """Pair unit descriptors (N, D) and (M, D) that are each other's nearest.
 
-    Ties go to the lower index. A missing second neighbour counts as one at the maximum distance.
-    Pairs with a ratio above ``max_ratio`` are dropped.
+    Pairs are in the order of the first image. Ties go to the lower index. A missing second
+    neighbour counts as one at the maximum distance. Pairs with a ratio above ``max_ratio`` are
+    dropped.
     """
     if len(descriptors0) == 0 or len(descriptors1) == 0:
         nothing = descriptors0.new_zeros(0)
         return Neighbours(nothing.long(), nothing.long(), nothing, nothing)
     similarity, ratio0, nearest0 = _nearest(descriptors0, descriptors1)
-    # Few pass a low ratio; only these need the other direction
+    # Few pass a low ratio; only these need the other direction.
     index0 = (ratio0 <= max_ratio).nonzero()[:, 0]
     index1 = nearest0[index0]
     _, ratio1, nearest1 = _nearest(descriptors1[index1], descriptors0)
@@ -65,20 +65,21 @@ def mutual_neighbours(
 
 
 def _nearest(queries: Tensor, keys: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return each query's highest similarity, distance ratio and index of the nearest key, all
-    (N,).
-    """
+    """Return the similarity, distance ratio and index of each query's nearest key, all (N,)."""
+    # Zeros complete the last group; below they get the lowest similarity.
     rest = -len(keys) % GROUP
     filled = torch.cat([keys, keys.new_zeros(rest, keys.shape[1])])
-    parts = []
+    similarities = []
+    ratios = []
+    indices = []
     for block in torch.split(queries, BLOCK_ROWS):
         similarity = block @ filled.T  # (rows, M)
         similarity[:, len(keys) :] = -1.0
         # Only the maximum of each group is taken over all keys: a search for its index is slow.
         groups = similarity.view(len(block), len(filled) // GROUP, GROUP)
-        highest = groups.amax(dim=2)
+        highest = groups.amax(dim=2)  # (rows, groups)
         best, group = highest.max(dim=1)
-        inside = groups.gather(1, group[:, None, None].expand(-1, 1, GROUP))[:, 0]
+        inside = groups.gather(1, group[:, None, None].expand(-1, 1, GROUP))[:, 0]  # (rows, GROUP)
         offset = inside.argmax(dim=1)
         # The second nearest is in the same group or has the maximum of another group.
         inside.scatter_(1, offset[:, None], -1.0)
@@ -86,7 +87,9 @@ def _nearest(queries: Tensor, keys: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         second = torch.maximum(inside.amax(dim=1), highest.amax(dim=1))
         # Distances of unit vectors are sqrt(2 - 2 s); the ratio of two neighbours at distance 0 is
         # 1.
-        ratio = ((1 - best).clamp(min=1e-12) / (1 - second).clamp(min=1e-12)).sqrt()
-        parts.append((best, ratio, group * GROUP + offset))
-    best, ratio, index = map(torch.cat, zip(*parts, strict=True))
-    return best, ratio, index
+        nearest = (1 - best).clamp(min=1e-12)
+        next_nearest = (1 - second).clamp(min=1e-12)
+        similarities.append(best)
+        ratios.append((nearest / next_nearest).sqrt())
+        indices.append(group * GROUP + offset)
+    return torch.cat(similarities), torch.cat(ratios), torch.cat(indices)

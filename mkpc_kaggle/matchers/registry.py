@@ -1,5 +1,4 @@
-"""The registry of matchers: each file of ``adapters/`` is a matcher, with a ``SPEC`` and a
-``load``.
+"""The registry of matchers: a file of ``adapters/`` is a matcher, with a ``SPEC`` and a ``load``.
 
 Matchers of the library vismatch are named ``vismatch:NAME``.
 """
@@ -15,14 +14,12 @@ from mkpc_kaggle.matchers import adapters
 from mkpc_kaggle.matchers.contract import Matcher, MatcherSpec, Placement
 from mkpc_kaggle.weights import WeightStore
 
-# Begins the names of vismatch's matchers, which need no file in ``adapters/``
+# Begins the names of vismatch's matchers, which need no file in ``adapters/``.
 VISMATCH = "vismatch:"
 
 
 class UnusableError(UserError):
-    """Error for a matcher that cannot be imported on this machine; ``__cause__`` is the error of
-    the import.
-    """
+    """Error for a matcher that cannot be imported here; ``__cause__`` is the import's error."""
 
 
 @cache
@@ -32,10 +29,10 @@ def matcher_names() -> tuple[str, ...]:
 
 
 def spec_of(name: str, where: str) -> MatcherSpec:
-    """Import a matcher and return its spec. Error messages start with ``where``, the source of the
-    name.
+    """Import a matcher and return its spec.
 
-    Raises :class:`UserError` for an unknown name, :class:`UnusableError` if the import fails.
+    Error messages start with ``where``, the source of the name. Raises :class:`UserError` for an
+    unknown name, :class:`UnusableError` if the import fails.
     """
     spec: MatcherSpec = _imported(name, where).SPEC
     return spec
@@ -44,8 +41,9 @@ def spec_of(name: str, where: str) -> MatcherSpec:
 def load_matcher(
     name: str, weights: WeightStore, options: Any, placement: Placement
 ) -> Matcher[Any]:
-    """Return the matcher, ready to run. Raise :class:`UserError` if its weights are missing or
-    damaged.
+    """Return the matcher, ready to run.
+
+    Raises :class:`UserError` if its weights are missing or damaged.
     """
     matcher: Matcher[Any] = _imported(name, "load").load(weights, options, placement)
     return matcher
@@ -54,7 +52,8 @@ def load_matcher(
 def misfit(name: str, weights: WeightStore, options: Any) -> str:
     """Return why the weights cannot be loaded into the matcher's networks, or an empty text.
 
-    This compares names and shapes on the device "meta", which takes no memory.
+    This compares names and shapes on the device "meta", which takes no memory. Only a
+    :class:`UserError` speaks against weights.
     """
     import torch
 
@@ -63,12 +62,16 @@ def misfit(name: str, weights: WeightStore, options: Any) -> str:
             load_matcher(name, weights.on_meta(), options, Placement("meta"))
     except UserError as error:
         return str(error)
-    except Exception:  # an adapter that computes while it loads; its worker finds out
+    except Exception:
+        # Says nothing of the weights: an adapter that computes while it loads fails on tensors
+        # without numbers. The run loads it on a device with numbers. If it fails there, too, the
+        # run reports that, and continues with the other matchers.
         return ""
     return ""
 
 
 def _imported(name: str, where: str) -> Any:
+    """Return the module of a matcher, or for vismatch an object with the same interface."""
     is_vismatch = name.startswith(VISMATCH)
     if not is_vismatch and name not in matcher_names():
         known = ", ".join(matcher_names())
@@ -78,15 +81,15 @@ def _imported(name: str, where: str) -> Any:
             module = import_module("mkpc_kaggle.matchers.vismatch")
             return module.adapter_of(name.removeprefix(VISMATCH))
         return import_module(f"{adapters.__name__}.{name}")
-    except Exception as error:  # any error at import affects this matcher only
+    # Any error, not only ImportError: a broken installation of a library raises all kinds, and
+    # only this matcher is affected.
+    except Exception as error:
         message = f"matcher {name} cannot be used here ({type(error).__name__}: {error})"
         raise UnusableError(f"{where}: {message}. `--recipe auto` does without it.") from error
 
 
 def require_matchers(matchers: Mapping[str, Matcher[Any]]) -> Mapping[str, Matcher[Any]]:
-    """Return the user's matchers if they are a mapping from names to matchers, else raise
-    ``TypeError``.
-    """
+    """Return the user's matchers. Raise ``TypeError`` unless they are a mapping from names."""
     if not isinstance(matchers, Mapping):
         raise TypeError(f"matchers are a mapping from names to matchers, not {matchers!r}")
     for name, matcher in matchers.items():

@@ -1,6 +1,4 @@
-"""The adapter of semi-dense networks, which encodes each picture and matches the coarse cells of a
-pair.
-"""
+"""The adapter of semi-dense networks: it encodes pictures, and matches a pair's coarse cells."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -28,7 +26,7 @@ from mkpc_kaggle.matchers.sparse import image_batch
 from mkpc_kaggle.weights import WeightStore, load_into
 
 PREFIX = "matcher."  # of parameter names in the published training checkpoints
-# A parameter that only checkpoints with optimal transport have
+# A parameter that only checkpoints with optimal transport have.
 TRANSPORT = "coarse_matching.bin_score"
 
 
@@ -51,11 +49,12 @@ class SemiDenseEncoding(NamedTuple):
     @property
     def mask(self) -> Tensor:
         """(1, h, w) bool, True for the coarse cells whose top-left pixel is content."""
-        height, width = (
-            torch.arange(count, device=self.maps.coarse.device) * COARSE_STRIDE < side
-            for count, side in zip(self.maps.coarse.shape[2:], reversed(self.content), strict=True)
-        )
-        return (height[:, None] & width)[None]
+        height, width = self.maps.coarse.shape[2:]
+        device = self.maps.coarse.device
+        # As published, the mask of the pixels is read at each cell's first pixel.
+        rows = torch.arange(height, device=device) * COARSE_STRIDE < self.content.height
+        columns = torch.arange(width, device=device) * COARSE_STRIDE < self.content.width
+        return (rows[:, None] & columns)[None]
 
 
 class SemiDenseMatcher(PairwiseMatcher[SemiDenseEncoding]):
@@ -69,23 +68,24 @@ class SemiDenseMatcher(PairwiseMatcher[SemiDenseEncoding]):
     @torch.inference_mode()
     def encode(self, pictures: Sequence[Picture]) -> list[SemiDenseEncoding]:
         maps = self._network.encode(image_batch(pictures, self.device))
-        # Copies: a view would keep the whole batch in memory.
-        singles = zip(torch.split(maps.coarse, 1), torch.split(maps.fine, 1), strict=True)
-        return [
-            SemiDenseEncoding(FeatureMaps(coarse.clone(), fine.clone()), picture.content)
-            for (coarse, fine), picture in zip(singles, pictures, strict=True)
-        ]
+        encodings = []
+        for index, picture in enumerate(pictures):
+            # Copies: a view would keep the whole batch in memory.
+            coarse = maps.coarse[index : index + 1].clone()
+            fine = maps.fine[index : index + 1].clone()
+            encodings.append(SemiDenseEncoding(FeatureMaps(coarse, fine), picture.content))
+        return encodings
 
     def _match(self, first: SemiDenseEncoding, second: SemiDenseEncoding) -> Matches:
-        masks = first.mask, second.mask
+        mask0 = first.mask
+        mask1 = second.mask
         # No masks for pictures without padding: even a mask that is True everywhere can change
         # rounding.
-        found = self._network.match(
-            first.maps, second.maps, None if all(mask.all() for mask in masks) else masks
-        )
-        points0, points1 = (
-            from_corner(points.float().cpu().numpy()) for points in (found.points0, found.points1)
-        )
+        is_whole = bool(mask0.all() and mask1.all())
+        found = self._network.match(first.maps, second.maps, None if is_whole else (mask0, mask1))
+        # The networks count pixels from the image's corner.
+        points0 = from_corner(found.points0.float().cpu().numpy())
+        points1 = from_corner(found.points1.float().cpu().numpy())
         return Matches(points0, points1, found.coarse.scores.float().cpu().numpy())
 
 
@@ -98,11 +98,11 @@ def load_semi_dense(
     *,
     unused: str = "$^",
 ) -> SemiDenseMatcher:
-    """Load the published checkpoint into a network, and remove the training wrapper's prefix from
-    names.
+    """Load the published checkpoint into a network.
 
-    Names that match ``unused`` are ignored, and so are position tables, which the network computes.
-    Raises :class:`UserError` for weights that were trained with optimal transport.
+    The training wrapper's prefix is removed from names. Names that match ``unused`` are ignored,
+    and so are position tables, which the network computes. Raises :class:`UserError` for weights
+    that were trained with optimal transport.
     """
     (slot,) = spec.slots_for(options)
     tensors = {name.removeprefix(PREFIX): tensor for name, tensor in weights.load(slot).items()}

@@ -1,18 +1,18 @@
-"""Shared parts of keypoint matchers: keypoints of a picture, encoders, matches from pairs of
-indices.
-"""
+"""Shared parts of keypoint matchers: keypoints of a picture, encoders, matches from indices."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from mkpc_kaggle.config import AT_LEAST_1, check_ranges
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import Picture, Placement
+from mkpc_kaggle.matchers.dtypes import check_finite
+from mkpc_kaggle.matchers.networks.placement import autocast
 
 # Images (B, 3, H, W) -> for each image, points (K, 2) in pixels and unit descriptors (K, D).
 Detector = Callable[[Tensor], Iterable[tuple[Tensor, Tensor]]]
@@ -20,6 +20,8 @@ Detector = Callable[[Tensor], Iterable[tuple[Tensor, Tensor]]]
 
 @dataclass(frozen=True)
 class KeypointOptions:
+    """The options of all matchers of keypoints."""
+
     features: int = 2048  # the number of strongest keypoints per picture
 
     def __post_init__(self) -> None:
@@ -28,10 +30,10 @@ class KeypointOptions:
 
 @dataclass(frozen=True, eq=False)
 class Keypoints:
-    """K keypoints of one picture: ``points`` (K, 2) float32 in view pixels, unit ``descriptors``
-    (K, D).
+    """K keypoints of one picture.
 
-    If the detector has them: ``scales`` (K,), diameters in view pixels, and ``orientations`` (K,),
+    ``points`` (K, 2) are float32 in view pixels, ``descriptors`` (K, D) unit vectors. If the
+    detector has them: ``scales`` (K,), diameters in view pixels, and ``orientations`` (K,),
     radians.
     """
 
@@ -45,12 +47,15 @@ class Keypoints:
     def on_content(
         cls, points: Tensor, descriptors: Tensor, content: Size, *shapes: Tensor
     ) -> "Keypoints":
-        """Return the keypoints on the content, none on the padding; ``shapes``: scales and
-        orientations.
+        """Return the keypoints on the content, none on the padding.
+
+        ``shapes``: scales and orientations, or nothing.
         """
+        # Pixel centres are at integers, so the first pixel begins at -0.5.
         upper = points.new_tensor(content) - 0.5
         kept = ((points >= -0.5) & (points < upper)).all(dim=1)
-        return cls(points[kept], descriptors[kept], content, *(shape[kept] for shape in shapes))
+        kept_shapes = [shape[kept] for shape in shapes]
+        return cls(points[kept], descriptors[kept], content, *kept_shapes)
 
     def __len__(self) -> int:
         return len(self.points)
@@ -64,31 +69,54 @@ def keypoint_encoder(detect: Detector, placement: Placement) -> Encode:
 
     @torch.inference_mode()
     def encode(pictures: Sequence[Picture]) -> list[Keypoints]:
-        found = list(detect(image_batch(pictures, placement.device)))
-        return [
-            Keypoints.on_content(points.float(), descriptors.float(), picture.content)
-            for (points, descriptors), picture in zip(found, pictures, strict=True)
-        ]
+        found = detect(image_batch(pictures, placement.device))
+        encodings = []
+        for (points, descriptors), picture in zip(found, pictures, strict=True):
+            # A library's network may return half precision.
+            on_content = Keypoints.on_content(points.float(), descriptors.float(), picture.content)
+            encodings.append(on_content)
+        return encodings
 
     return encode
+
+
+def library_encoder(
+    name: str, network: nn.Module, features: nn.Module, detect: Detector, placement: Placement
+) -> Encode:
+    """Return the encoder of a library's detector, such as kornia's.
+
+    ``detect`` runs the loaded ``network``, here in the placement's precision by autocast. Raises if
+    the output of its module ``features`` is not finite: detectors drop NaN scores in silence.
+    """
+    network.eval().to(placement.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+    features.register_forward_hook(lambda *call: check_finite(f"features of {name}", call[-1]))
+
+    def detect_in_precision(images: Tensor) -> Iterable[tuple[Tensor, Tensor]]:
+        with autocast(placement):
+            return detect(images)
+
+    return keypoint_encoder(detect_in_precision, placement)
 
 
 def matches_of(
     points0: Tensor, points1: Tensor, index0: Tensor, index1: Tensor, scores: Tensor
 ) -> Matches:
-    """Return the matches that pair point ``index0[i]`` of one picture with ``index1[i]`` of the
-    other.
-    """
+    """Return the matches of point ``index0[i]`` of one picture with ``index1[i]`` of the other."""
     return Matches(
-        points0[index0].cpu().numpy(), points1[index1].cpu().numpy(), scores.cpu().numpy()
+        points0[index0].cpu().numpy(),
+        points1[index1].cpu().numpy(),
+        scores.cpu().numpy(),
     )
 
 
 def image_batch(pictures: Sequence[Picture], device: str) -> Tensor:
-    """Convert pictures of one shape to float32 in [0, 1]: (B, 3, H, W) for RGB, (B, 1, H, W) for
-    gray.
+    """Convert pictures of one shape to float32 in [0, 1].
+
+    Return (B, 3, H, W) for RGB, (B, 1, H, W) for gray.
     """
     stacked = np.stack([picture.pixels for picture in pictures])
+    # As bytes, a quarter of the floats' traffic to a GPU.
     batch = torch.from_numpy(stacked).to(device)
-    batch = batch[:, None] if stacked.ndim == 3 else batch.permute(0, 3, 1, 2)
+    is_gray = stacked.ndim == 3
+    batch = batch[:, None] if is_gray else batch.permute(0, 3, 1, 2)
     return batch.float() / 255

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from mkpc_kaggle.config import AT_LEAST_1, check_ranges
 from mkpc_kaggle.geometry.coordinates import from_corner
@@ -71,13 +72,13 @@ def adapter_of(name: str) -> Adapter:
 
 
 class VismatchMatcher(PairwiseMatcher[Picture]):
-    """A vismatch matcher for :class:`mkpc_kaggle.TwoStageMatcher`; ``name`` as in the recipe's
-    units.
+    """A vismatch matcher for :class:`mkpc_kaggle.TwoStageMatcher`; ``name`` as in a recipe.
 
-    With ``corner``, the origin of points is the image's top-left corner, as in RoMa, DKM and LoMa; otherwise it is
-    the centre of the top-left pixel. Sides are padded to multiples of ``multiple``, because many matchers resize
-    other images, which makes points less accurate. Every pair is matched from pixels; features are not cached. A
-    match without a confidence has the score 1. vismatch's estimation of a homography is switched off.
+    With ``corner``, the origin of points is the image's top-left corner, as in RoMa, DKM and LoMa;
+    otherwise it is the centre of the top-left pixel. Sides are padded to multiples of ``multiple``,
+    because many matchers resize other images, which makes points less accurate. Every pair is
+    matched from pixels; features are not cached. A match without a confidence has the score 1.
+    vismatch's estimation of a homography is switched off.
     """
 
     def __init__(
@@ -99,20 +100,17 @@ class VismatchMatcher(PairwiseMatcher[Picture]):
 
     def _match(self, picture0: Picture, picture1: Picture) -> Matches:
         # (3, H, W) float32 in 0..1, padding included, so the sides are multiples.
-        both = (
-            torch.from_numpy(each.pixels).permute(2, 0, 1).float() / 255
-            for each in (picture0, picture1)
-        )
-        found = self._matcher(*both)
-        points = [
-            np.asarray(found[f"matched_kpts{number}"], np.float32).reshape(-1, 2)
-            for number in (0, 1)
-        ]
-        points0, points1 = map(from_corner, points) if self._corner else points
-        confidences = found.get("matched_confidences")
-        scores = (
-            np.ones(len(points0), np.float32)
-            if confidences is None
-            else np.asarray(confidences, np.float32)
-        )
-        return Matches(points0, points1, scores)
+        image0 = torch.from_numpy(picture0.pixels).permute(2, 0, 1).float() / 255
+        image1 = torch.from_numpy(picture1.pixels).permute(2, 0, 1).float() / 255
+        found = self._matcher(image0, image1)
+        points0 = self._points(found["matched_kpts0"])
+        points1 = self._points(found["matched_kpts1"])
+        scores = found.get("matched_confidences")
+        if scores is None:
+            scores = np.ones(len(points0))
+        return Matches(points0, points1, np.asarray(scores, np.float32))
+
+    def _points(self, keypoints: Any) -> NDArray[np.floating]:
+        """Return vismatch's keypoints as (N, 2) view pixels; without matches it may return (0,)."""
+        points = np.asarray(keypoints, np.float32).reshape(-1, 2)
+        return from_corner(points) if self._corner else points

@@ -20,7 +20,7 @@ class AlikedVariant(StrEnum):
     N32 = "n32"
 
 
-# Places around a keypoint from which its descriptor is read.
+# Points around a keypoint at which its descriptor is read.
 POSITIONS = {AlikedVariant.N16: 16, AlikedVariant.N16ROT: 16, AlikedVariant.N32: 32}
 SLOT = "aliked-{variant}"
 
@@ -62,6 +62,7 @@ def load_encoder(
 
 
 def aliked_encoder(network: Aliked, placement: Placement) -> Encode:
+    """Return the encoder of a loaded network."""
     # Float32 in any precision: in half precision three quarters of the keypoints change.
     in_float32 = Placement(placement.device, Precision.FLOAT32)
     return keypoint_encoder(prepared(network, in_float32), in_float32)

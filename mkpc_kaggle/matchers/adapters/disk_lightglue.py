@@ -1,17 +1,15 @@
-"""DISK keypoints (Tyszkiewicz et al. 2020, kornia's network) matched by LightGlue (Lindenberger et
-al. 2023).
+"""DISK keypoints (Tyszkiewicz et al. 2020) matched by LightGlue (Lindenberger et al. 2023).
+
+DISK's network is kornia's.
 """
 
-import torch
 from kornia.feature import DISK
 from torch import Tensor
 
 from mkpc_kaggle.matchers.contract import MatcherSpec, Placement
-from mkpc_kaggle.matchers.dtypes import check_finite
 from mkpc_kaggle.matchers.lightglue import LightGlueMatcher, LightGlueOptions, load_lightglue
 from mkpc_kaggle.matchers.networks.lightglue import LightGlueShape
-from mkpc_kaggle.matchers.networks.placement import autocast
-from mkpc_kaggle.matchers.sparse import Encode, keypoint_encoder
+from mkpc_kaggle.matchers.sparse import Encode, library_encoder
 from mkpc_kaggle.weights import WeightStore, load_into
 
 SHAPE = LightGlueShape(descriptor=128)
@@ -21,16 +19,12 @@ SPEC = MatcherSpec(
 
 
 def disk_encoder(network: DISK, features: int, placement: Placement) -> Encode:
-    """Return the encoder of a loaded network, which raises if its features are not finite."""
-    network.eval().to(placement.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
-    network.unet.register_forward_hook(lambda *call: check_finite("features of disk", call[-1]))
+    """Return the encoder of a loaded network, with up to ``features`` keypoints per picture."""
 
     def detect(images: Tensor) -> list[tuple[Tensor, Tensor]]:
-        with autocast(placement):
-            found = network(images, n=features)
-        return [(each.keypoints, each.descriptors) for each in found]
+        return [(each.keypoints, each.descriptors) for each in network(images, n=features)]
 
-    return keypoint_encoder(detect, placement)
+    return library_encoder("disk", network, network.unet, detect, placement)
 
 
 def load(weights: WeightStore, options: LightGlueOptions, placement: Placement) -> LightGlueMatcher:

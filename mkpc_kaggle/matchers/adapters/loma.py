@@ -1,6 +1,4 @@
-"""LoMa (Nordström et al. 2026): keypoints matched by a transformer, the strongest sparse matcher
-here.
-"""
+"""LoMa (Nordström et al. 2026): keypoints matched by a transformer, the strongest sparse matcher."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -35,7 +33,7 @@ class LomaOptions:
     variant: Variant = Variant.B
     max_keypoints: int = 2048
     threshold: float = 0.1  # the minimum score of a match
-    # Side of the descriptor's square input over the longer side
+    # Side of the descriptor's square input over the longer side.
     descriptor_scale: float = 784 / 1024
 
     def __post_init__(self) -> None:
@@ -46,6 +44,8 @@ SPEC = MatcherSpec("loma", LomaOptions, slots=("loma-{variant}",))
 
 
 class LomaEncoding(NamedTuple):
+    """A picture's keypoints, relative to its content."""
+
     keypoints: LomaKeypoints
     content: Size  # of the picture
 
@@ -68,33 +68,37 @@ class LomaAdapter(PairwiseMatcher[LomaEncoding]):
         return [LomaEncoding(self._keypoints(picture), picture.content) for picture in pictures]
 
     def _keypoints(self, picture: Picture) -> LomaKeypoints:
-        content, long_side = picture.content, max(picture.content)
+        content = picture.content
+        long_side = max(content)
         detected = detector_size(content, long_side)
+        # A side below 8 pixels.
         if min(detected) == 0:
             descriptor, _ = WIDTHS[self.options.variant]
-            return LomaKeypoints(
-                *(torch.zeros(0, width, device=self.device) for width in (2, descriptor))
-            )
+            no_points = torch.zeros(0, 2, device=self.device)
+            return LomaKeypoints(no_points, torch.zeros(0, descriptor, device=self.device))
+        # Square for any aspect ratio: the descriptor was trained so.
         side = PATCH * max(1, round(self.options.descriptor_scale * long_side / PATCH))
         # Cut off the padding, which would change the descriptors.
-        pixels = torch.from_numpy(picture.pixels[: content.height, : content.width].copy()).permute(
-            2, 0, 1
-        )[None]
+        shown = picture.pixels[: content.height, : content.width].copy()
+        pixels = torch.from_numpy(shown).permute(2, 0, 1)[None]  # (1, 3, H, W)
         to_detect = resized(pixels, (detected.height, detected.width)).to(self.device)
         to_describe = resized(pixels, (side, side)).to(self.device)
         return self._network.encode(to_detect, to_describe, self.options.max_keypoints)
 
     def _match(self, first: LomaEncoding, second: LomaEncoding) -> Matches:
         found = self._network.matcher(first.keypoints, second.keypoints, self.options.threshold)
-        points0, points1 = (
-            from_normalised(encoding.keypoints.points[index].cpu().numpy(), encoding.content)
-            for encoding, index in ((first, found.index0), (second, found.index1))
+        points0 = first.keypoints.points[found.index0].cpu().numpy()
+        points1 = second.keypoints.points[found.index1].cpu().numpy()
+        return Matches(
+            from_normalised(points0, first.content),
+            from_normalised(points1, second.content),
+            found.scores.cpu().numpy(),
         )
-        return Matches(points0, points1, found.scores.cpu().numpy())
 
 
 def load(weights: WeightStore, options: LomaOptions, placement: Placement) -> LomaAdapter:
     (slot,) = SPEC.slots_for(options)
+    # Without memory: the checkpoint's tensors become the parameters.
     with torch.device("meta"):
         network = Loma(options.variant)
     tensors = {parameter_name(name): tensor for name, tensor in weights.load(slot).items()}

@@ -1,6 +1,4 @@
-"""RoMa (Edstedt et al. 2024): DKM's warps from DINOv2's features, the best single matcher in our
-benchmark.
-"""
+"""RoMa (Edstedt et al. 2024): DKM's warps from DINOv2's features, the best matcher we measured."""
 
 from dataclasses import dataclass
 
@@ -34,9 +32,11 @@ SPEC = MatcherSpec("roma", RomaOptions, slots=("roma-{training}", "dinov2-vitl14
 
 def load(weights: WeightStore, options: RomaOptions, placement: Placement) -> DenseMatcher:
     own, backbone = SPEC.slots_for(options)
+    # Without memory: the checkpoints' tensors become the parameters.
     with torch.device("meta"):
         network = RoMa()
     load_into(network.dinov2, weights.load(backbone), what=backbone)
+    # RoMa's own file has no DINOv2: its parameters may be missing there.
     load_into(network, weights.load(own), unused=r"dinov2\.", what=own)
     return DenseMatcher(
         SPEC, prepared(network, placement), options, placement.device, multiple=PATCH

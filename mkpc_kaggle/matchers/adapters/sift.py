@@ -21,11 +21,11 @@ from mkpc_kaggle.weights import WeightStore
 
 @dataclass(frozen=True)
 class SiftOptions:
-    """``features``: strongest keypoints per picture. ``ratio``: the maximum distance ratio, in both directions."""
+    """Settings of OpenCV's SIFT and of the ratio test."""
 
-    features: int = 8000
-    ratio: float = 0.8
-    contrast_threshold: float = 0.04
+    features: int = 8000  # the strongest keypoints per picture
+    ratio: float = 0.8  # the maximum distance ratio, in both directions
+    contrast_threshold: float = 0.04  # OpenCV's default
 
     def __post_init__(self) -> None:
         check_ranges(self, features=AT_LEAST_1, ratio=SHARE, contrast_threshold=AT_LEAST_0)
@@ -55,12 +55,11 @@ class SiftMatcher(NeighbourMatcher):
     def _encode(self, picture: Picture) -> Keypoints:
         found, descriptors = self._sift.detectAndCompute(picture.pixels, None)
         points = np.array([keypoint.pt for keypoint in found], np.float32).reshape(-1, 2)
-        descriptors = (
-            np.zeros((0, 128), np.float32) if descriptors is None else root_sift(descriptors)
-        )
+        if descriptors is None:  # OpenCV's value for no keypoints
+            descriptors = np.zeros((0, 128), np.float32)
         return Keypoints.on_content(
             torch.from_numpy(points).to(self.device),
-            torch.from_numpy(descriptors).to(self.device),
+            torch.from_numpy(root_sift(descriptors)).to(self.device),
             picture.content,
         )
 
@@ -69,10 +68,13 @@ class SiftMatcher(NeighbourMatcher):
 
 
 def root_sift(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Map SIFT descriptors (K, 128) to float32 unit vectors, whose dot product is the Hellinger
-    kernel.
+    """Map SIFT descriptors (K, 128) to float32 unit vectors for the Hellinger kernel.
+
+    The kernel is their dot product.
     """
-    sums = np.maximum(descriptors.sum(axis=1, keepdims=True), np.finfo(np.float32).tiny)
+    # A descriptor of zeros stays zero.
+    tiny = np.finfo(np.float32).tiny
+    sums = np.maximum(descriptors.sum(axis=1, keepdims=True), tiny)
     return np.asarray(np.sqrt(descriptors / sums), np.float32)
 
 

@@ -17,6 +17,8 @@ from mkpc_kaggle.weights import WeightStore
 
 @dataclass(frozen=True)
 class SiftLightGlueOptions(LightGlueOptions):
+    """LightGlue's settings, with more keypoints than for other detectors."""
+
     features: int = 4096  # as in the published evaluation
 
 
@@ -35,23 +37,27 @@ def sift_encoder(features: int, device: str) -> Encode:
     sift = cv2.SIFT_create(features, 4, 0.0066667, 10)  # type: ignore[attr-defined]  # missing in stubs
 
     def encode(picture: Picture) -> Keypoints:
-        found, descriptors = sift.detectAndCompute(picture.pixels, None)
-        found = np.array([(*k.pt, k.size, np.radians(k.angle), k.response) for k in found]).reshape(
-            -1, 5
-        )
-        order = np.lexsort((found[:, 3], -found[:, 4]))  # by descending response, then by angle
-        _, first = np.unique(np.rint(found[order, :2] - 0.5), axis=0, return_index=True)
-        kept = np.sort(order[np.sort(first)[:features]])
-        x, y, sizes, angles, _ = torch.from_numpy(found[kept].astype(np.float32)).to(device).T
-        roots = (
-            np.zeros((0, 128), np.float32) if descriptors is None else root_sift(descriptors[kept])
-        )
-        unit = functional.normalize(torch.from_numpy(roots).to(device).clamp(min=1e-3), dim=1)
-        return Keypoints.on_content(
-            torch.stack([x, y], 1) - SHIFT_PX, unit, picture.content, sizes, angles
-        )
+        detected, descriptors = sift.detectAndCompute(picture.pixels, None)
+        if descriptors is None:  # OpenCV's value for no keypoints
+            descriptors = np.zeros((0, 128), np.float32)
+        rows = [(*each.pt, each.size, np.radians(each.angle), each.response) for each in detected]
+        found = np.array(rows).reshape(-1, 5)
 
-    return lambda pictures: list(map(encode, pictures))
+        # The first of each pixel in this order is the one to keep.
+        order = np.lexsort((found[:, 3], -found[:, 4]))  # by descending response, then by angle
+        pixels = np.rint(found[order, :2] - 0.5)  # the published rounding
+        _, first = np.unique(pixels, axis=0, return_index=True)
+        kept = np.sort(order[np.sort(first)[:features]])  # the strongest, in OpenCV's order
+
+        columns = torch.from_numpy(found[kept].astype(np.float32)).to(device).T
+        x, y, sizes, angles, _ = columns
+        points = torch.stack([x, y], 1) - SHIFT_PX
+        roots = torch.from_numpy(root_sift(descriptors[kept])).to(device)
+        # The published RootSIFT sets values below 1e-6 to 1e-6 before the square root.
+        unit = functional.normalize(roots.clamp(min=1e-3), dim=1)
+        return Keypoints.on_content(points, unit, picture.content, sizes, angles)
+
+    return lambda pictures: [encode(picture) for picture in pictures]
 
 
 def load(

@@ -1,5 +1,6 @@
-"""SuperPoint keypoints matched by SuperGlue, as in the MKPC paper. Both weights are for
-noncommercial research.
+"""SuperPoint keypoints matched by SuperGlue, as in the MKPC paper.
+
+Both weights are for noncommercial research.
 """
 
 from collections.abc import Sequence

@@ -3,18 +3,17 @@
 SuperPoint's weights are for noncommercial research; LightGlue's are not.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
-import torch
+from torch import Tensor
 
 from mkpc_kaggle.config import AT_LEAST_0, SHARE, check_ranges
-from mkpc_kaggle.matchers.contract import Colour, MatcherSpec, Picture, Placement
+from mkpc_kaggle.matchers.contract import Colour, MatcherSpec, Placement
 from mkpc_kaggle.matchers.lightglue import LightGlueMatcher, LightGlueOptions, load_lightglue
 from mkpc_kaggle.matchers.networks.lightglue import LightGlueShape
 from mkpc_kaggle.matchers.networks.placement import prepared
 from mkpc_kaggle.matchers.networks.superpoint import SuperPoint
-from mkpc_kaggle.matchers.sparse import Encode, Keypoints, image_batch
+from mkpc_kaggle.matchers.sparse import Encode, keypoint_encoder
 from mkpc_kaggle.weights import WeightStore, load_into
 
 
@@ -22,11 +21,11 @@ from mkpc_kaggle.weights import WeightStore, load_into
 class SuperPointLightGlueOptions(LightGlueOptions):
     """With the settings of SuperPoint in LightGlue's published evaluation.
 
-    ``nms_radius``: half the suppression window, in pixels. Keypoints score above ``keypoint_threshold``.
+    SuperGlue's evaluation has other settings.
     """
 
-    nms_radius: int = 4
-    keypoint_threshold: float = 0.0005
+    nms_radius: int = 4  # half the window of non-maximum suppression, in pixels
+    keypoint_threshold: float = 0.0005  # keypoints score above it
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -43,16 +42,13 @@ SPEC = MatcherSpec(
 )
 
 
-def superpoint_encoder(network: SuperPoint, device: str) -> Encode:
-    @torch.inference_mode()
-    def encode(pictures: Sequence[Picture]) -> list[Keypoints]:
-        found = network(image_batch(pictures, device))
-        return [
-            Keypoints.on_content(each.points, each.descriptors, picture.content)
-            for each, picture in zip(found, pictures, strict=True)
-        ]
+def superpoint_encoder(network: SuperPoint, placement: Placement) -> Encode:
+    """Return the encoder of a loaded network."""
 
-    return encode
+    def detect(images: Tensor) -> list[tuple[Tensor, Tensor]]:
+        return [(each.points, each.descriptors) for each in network(images)]
+
+    return keypoint_encoder(detect, placement)
 
 
 def load(
@@ -60,5 +56,5 @@ def load(
 ) -> LightGlueMatcher:
     network = SuperPoint(options.nms_radius, options.keypoint_threshold, options.features)
     load_into(network, weights.load("superpoint"), what="superpoint")
-    encode = superpoint_encoder(prepared(network, placement), placement.device)
+    encode = superpoint_encoder(prepared(network, placement), placement)
     return load_lightglue(SPEC, encode, weights, options, placement, SHAPE)

@@ -2,16 +2,14 @@
 
 from dataclasses import dataclass
 
-import torch
 from kornia.feature import XFeat
 from torch import Tensor, nn
 
 from mkpc_kaggle.matchers.contract import MatcherSpec, Placement
-from mkpc_kaggle.matchers.dtypes import check_finite
 from mkpc_kaggle.matchers.lightglue import LightGlueMatcher, LightGlueOptions, load_lightglue
 from mkpc_kaggle.matchers.networks.lightglue import LightGlueShape
-from mkpc_kaggle.matchers.networks.placement import autocast, fold_norms
-from mkpc_kaggle.matchers.sparse import Encode, keypoint_encoder
+from mkpc_kaggle.matchers.networks.placement import fold_norms
+from mkpc_kaggle.matchers.sparse import Encode, library_encoder
 from mkpc_kaggle.weights import WeightStore, load_into
 
 
@@ -30,6 +28,7 @@ SPEC = MatcherSpec(
 
 
 def xfeat_network(features: int) -> XFeat:
+    """Return kornia's network without weights."""
     network = XFeat(top_k=features)
     # For semi-dense matching only; some checkpoints do not have it.
     network.net.fine_matcher = nn.Identity()  # type: ignore[assignment]
@@ -37,17 +36,14 @@ def xfeat_network(features: int) -> XFeat:
 
 
 def xfeat_encoder(network: XFeat, features: int, placement: Placement) -> Encode:
-    """Return the encoder of a loaded network, which raises if its features are not finite."""
+    """Return the encoder of a loaded network, with up to ``features`` keypoints per picture."""
     fold_norms(network.eval())
-    network.to(placement.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
-    network.net.register_forward_hook(lambda *call: check_finite("features of xfeat", call[-1]))
 
     def detect(images: Tensor) -> list[tuple[Tensor, Tensor]]:
-        with autocast(placement):
-            found = network.detectAndCompute(images, top_k=features)
+        found = network.detectAndCompute(images, top_k=features)
         return [(each["keypoints"], each["descriptors"]) for each in found]
 
-    return keypoint_encoder(detect, placement)
+    return library_encoder("xfeat", network, network.net, detect, placement)
 
 
 def load(
