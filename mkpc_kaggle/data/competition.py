@@ -1,8 +1,8 @@
 """Files of the Image Matching Challenge 2022: the test side, the train side, submissions.
 
 A cell holds the numbers of a matrix or vector row by row, separated by blanks. A test image is
-``test_images/<batch_id>/<image_id>.png``, a train image ``<scene>/images/<image_id>.jpg``. Both sides accept
-png, jpg and jpeg. F of a pair satisfies x2^T F x1 = 0, where x1 is in the first image.
+``test_images/<batch_id>/<image_id>.png``, a train image ``<scene>/images/<image_id>.jpg``. Both
+sides accept png, jpg and jpeg. F of a pair satisfies x2^T F x1 = 0, where x1 is in the first image.
 """
 
 import csv
@@ -33,7 +33,7 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 
 MAX_COLUMNS = 1000  # of a table; pandas takes minutes for a hundred thousand
 MAX_LINE = 1 << 20  # characters of a row; other files may have lines of gigabytes
-# Characters that end lines or control a terminal
+# Characters that end lines or control a terminal.
 CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")
 # Names that are empty, "." or "..", or contain a Windows drive, a slash or a control character.
 NOT_PLAIN = re.compile(rf"^\.{{0,2}}$|^[A-Za-z]:|[/\\]|{CONTROL.pattern}")
@@ -41,11 +41,13 @@ NOT_PLAIN = re.compile(rf"^\.{{0,2}}$|^[A-Za-z]:|[/\\]|{CONTROL.pattern}")
 
 @dataclass(frozen=True, slots=True)
 class Pair:
+    """Two images to match."""
+
     id: str  # unique in a run
     group: str  # its batch or scene
     file0: str  # paths of the images; text saves memory, since a table may have a million rows
     file1: str
-    # Given: E is estimated
+    # If they are given, E is estimated instead of F.
     intrinsics: tuple[Matrix3, Matrix3] | None = field(default=None, compare=False)
     turns: tuple[int, int] = (0, 0)  # counter-clockwise quarter turns of each image before matching
 
@@ -55,11 +57,17 @@ class Pair:
 
     @property
     def names(self) -> tuple[str, str]:
-        return self.file0.rpartition(os.sep)[2], self.file1.rpartition(os.sep)[2]
+        """The file names, without folders."""
+        # Not by Path: a table may have a million rows.
+        name0 = self.file0.rpartition(os.sep)[2]
+        name1 = self.file1.rpartition(os.sep)[2]
+        return name0, name1
 
 
 @dataclass(frozen=True, eq=False)
 class TruePair:
+    """A pair with its true cameras."""
+
     pair: Pair
     camera0: Camera
     camera1: Camera
@@ -68,6 +76,8 @@ class TruePair:
 
 @dataclass(frozen=True, eq=False)
 class TrainScene:
+    """A scene with known cameras, for scores."""
+
     name: str
     metres_per_unit: float  # NaN if unknown
     pairs: tuple[TruePair, ...]
@@ -87,10 +97,9 @@ def read_test_side(directory: Path) -> tuple[Pair, ...]:
     """
     path, images = test_side(directory)
     pairs: dict[str, Pair] = {}
-    files = cache(lambda batch: image_files(images / batch))
-    for where, (sample, *ids) in read_rows(
-        path, ("sample_id", "batch_id", "image_1_id", "image_2_id")
-    ):
+    files = cache(lambda batch: image_files(images / batch))  # each folder is listed once
+    columns = ("sample_id", "batch_id", "image_1_id", "image_2_id")
+    for where, (sample, *ids) in read_rows(path, columns):
         if sample in pairs:
             raise UserError(f"{where}: the sample_id {sample!r} is not unique")
         if CONTROL.search(sample):
@@ -98,8 +107,9 @@ def read_test_side(directory: Path) -> tuple[Pair, ...]:
                 f"{where}: the sample_id {sample!r} has control characters: no submission can hold it"
             )
         batch, first, second = (plain_name(name, where) for name in ids)
+        path_of = files(batch)
         # A large table names a batch in thousands of rows: interning shares one string.
-        pairs[sample] = Pair(sample, sys.intern(batch), files(batch)(first), files(batch)(second))
+        pairs[sample] = Pair(sample, sys.intern(batch), path_of(first), path_of(second))
     if not images.is_dir():
         raise UserError(
             f"{images}: no such directory; --test-dir must hold test.csv and test_images/"
@@ -116,15 +126,16 @@ def read_train_side(
     min_covisibility: float = 0.1,
     pairs_per_scene: int | None = None,
 ) -> tuple[TrainScene, ...]:
-    """Return the named scenes, or all, with up to ``pairs_per_scene`` pairs spread evenly over a
-    scene's table.
+    """Return the named scenes, or all, with up to ``pairs_per_scene`` pairs each.
 
-    Raises :class:`UserError` for missing files and scenes, and for malformed cells.
+    Pairs are spread evenly over a scene's table. Raises :class:`UserError` for missing files and
+    scenes, and for malformed cells.
     """
+    metres = {}
     rows = read_rows(directory / "scaling_factors.csv", ("scene", "scaling_factor"))
-    metres = {
-        plain_name(scene, where): float(*_numbers(cell, where, 1)) for where, (scene, cell) in rows
-    }
+    for where, (scene, cell) in rows:
+        metres[plain_name(scene, where)] = float(*_numbers(cell, where, 1))
+    # The table may name scenes that were not downloaded.
     wanted = list(scenes) or sorted(name for name in metres if (directory / name).is_dir())
     if not wanted:
         raise UserError(f"{directory} has none of the scenes of its scaling_factors.csv")
@@ -138,17 +149,26 @@ def read_train_side(
     )
 
 
+def _read_cameras(path: Path) -> dict[str, Camera]:
+    """Return the cameras of a scene by image id."""
+    cameras: dict[str, Camera] = {}
+    columns = ("image_id", "camera_intrinsics", "rotation_matrix", "translation_vector")
+    for where, (image, *cells) in read_rows(path, columns):
+        K = _numbers(cells[0], where, 9).reshape(3, 3)
+        R = _numbers(cells[1], where, 9).reshape(3, 3)
+        t = _numbers(cells[2], where, 3)
+        cameras[plain_name(image, where)] = Camera(K, R, t)
+    return cameras
+
+
 def _read_scene(
     directory: Path, metres: float, min_covisibility: float, most: int | None
 ) -> TrainScene:
-    cameras: dict[str, Camera] = {}
-    columns = ("image_id", "camera_intrinsics", "rotation_matrix", "translation_vector")
-    for where, (image, *cells) in read_rows(directory / "calibration.csv", columns):
-        K, R, t = (
-            _numbers(cell, where, count) for cell, count in zip(cells, (9, 9, 3), strict=True)
-        )
-        cameras[plain_name(image, where)] = Camera(K.reshape(3, 3), R.reshape(3, 3), t)
-    path, images, pairs = directory / "pair_covisibility.csv", image_files(directory / "images"), []
+    """Return a scene with its pairs of at least ``min_covisibility``."""
+    cameras = _read_cameras(directory / "calibration.csv")
+    images = image_files(directory / "images")
+    path = directory / "pair_covisibility.csv"
+    pairs = []
     for where, (key, cell) in read_rows(path, ("pair", "covisibility")):
         covisibility = float(*_numbers(cell, where, 1))
         first, _, second = key.partition("-")
@@ -163,20 +183,24 @@ def _read_scene(
 
 
 def write_submission(path: Path, rows: Mapping[str, Matrix3]) -> None:
-    """Write a row for each sample. If writing fails, leave an existing file unchanged and raise
-    ``OSError``.
+    """Write a row for each sample.
+
+    If writing fails, an existing file stays unchanged, and ``OSError`` is raised.
     """
     with replacing(path) as stream:
         table = csv.writer(stream, lineterminator="\n")
         table.writerow(SUBMISSION_COLUMNS)
         for sample, F in rows.items():
-            table.writerow((sample, " ".join(f"{value:.12g}" for value in F.ravel().tolist())))
+            numbers = [f"{value:.12g}" for value in F.ravel().tolist()]
+            table.writerow((sample, " ".join(numbers)))
 
 
 def read_submission(path: Path) -> dict[str, Matrix3]:
     """Return F by sample id. Raise :class:`UserError` for a file that is not a submission."""
-    rows = read_rows(path, SUBMISSION_COLUMNS)
-    return {sample: _numbers(cell, where, 9).reshape(3, 3) for where, (sample, cell) in rows}
+    found = {}
+    for where, (sample, cell) in read_rows(path, SUBMISSION_COLUMNS):
+        found[sample] = _numbers(cell, where, 9).reshape(3, 3)
+    return found
 
 
 def submission_problems(path: Path, sample_ids: Sequence[str]) -> list[str]:
@@ -185,7 +209,9 @@ def submission_problems(path: Path, sample_ids: Sequence[str]) -> list[str]:
         rows = [cells for _, cells in read_rows(path, SUBMISSION_COLUMNS, only=True)]
     except UserError as error:
         return [str(error)]
-    found, problems = dict.fromkeys(sample for sample, _ in rows), []
+    problems = []
+    # Dictionaries keep the order, for messages that name the first, and find names quickly.
+    found = dict.fromkeys(sample for sample, _ in rows)
     wanted = dict.fromkeys(sample_ids)
     if missing := [sample for sample in wanted if sample not in found]:
         problems.append(f"{len(missing)} samples are missing, the first is {missing[0]}")
@@ -208,7 +234,8 @@ def read_rows(
 ) -> Iterator[tuple[str, list[str]]]:
     """Yield each row of a CSV file as its location, for messages, and its cells in ``columns``.
 
-    ``only`` requires that the file has no other columns. Raises :class:`UserError` for an unusable file.
+    ``only`` requires that the file has no other columns. Raises :class:`UserError` for an unusable
+    file.
     """
     table = read_table(path, columns, only=only)
     # Lists of str: iterating over pandas' own strings takes ten times as long.
@@ -227,6 +254,7 @@ def read_table(path: Path, columns: Sequence[str], *, only: bool = False) -> "Da
     import pandas as pd  # the import takes most of a second
 
     try:
+        # A pipe or a device may never end.
         if path.exists() and not path.is_file():
             raise UserError(f"{path} is not a regular file")
         with path.open(encoding="utf-8-sig", newline="") as stream:
@@ -249,11 +277,18 @@ def read_table(path: Path, columns: Sequence[str], *, only: bool = False) -> "Da
         raise UserError(_refusal(path, error, skipped)) from error
     except (OSError, ValueError) as error:
         raise UserError(f"{path} cannot be read as a table: {error}") from error
+    _number_lines(rows, skipped, lines.has_quotes)
+    is_filled = (rows != "").any(axis=1)
+    return _with_header(path, rows[is_filled], columns, only)
+
+
+def _number_lines(rows: "DataFrame", skipped: int, has_quotes: bool) -> None:
+    """Set the index to the line of the file where a row ends, after ``skipped`` empty lines."""
     rows.index = np.arange(skipped + 1, skipped + len(rows) + 1)
-    if lines.has_quotes:  # quoted cells may have line breaks
-        breaks = rows.apply(lambda column: column.str.count("\n")).sum(axis=1)
+    if has_quotes:  # quoted cells may have line breaks
+        in_cells = rows.apply(lambda column: column.str.count("\n"))
+        breaks = in_cells.sum(axis=1)
         rows.index += breaks.cumsum().astype(int)
-    return _with_header(path, rows[(rows != "").any(axis=1)], columns, only)
 
 
 def _skip_to_header(path: Path, stream: TextIO) -> int:
@@ -306,10 +341,10 @@ def _refusal(path: Path, error: Exception, skipped: int) -> str:
 
 
 class _LimitedLines(TextIOBase):
-    """A text stream for pandas that refuses lines of more than ``MAX_LINE`` characters, and NUL
-    characters.
+    """A text stream for pandas that refuses long lines and NUL characters.
 
-    pandas would hold such a line in memory several times, and would cut a cell off at a NUL.
+    pandas would hold a line of more than ``MAX_LINE`` characters in memory several times, and would
+    cut a cell off at a NUL.
     """
 
     def __init__(self, stream: TextIO) -> None:
@@ -323,6 +358,7 @@ class _LimitedLines(TextIOBase):
         if "\0" in text:
             raise ValueError("line contains NUL")
         self.has_quotes |= '"' in text
+        # A part may begin within a line, and end within another.
         lengths = [len(part) for part in text.split("\n")]
         lengths[0] += self._length
         self._length = lengths[-1]
@@ -332,8 +368,9 @@ class _LimitedLines(TextIOBase):
 
 
 def plain_name(name: str, where: str) -> str:
-    """Return ``name`` if it is a plain file name. Raise :class:`UserError` if it may leave its
-    directory.
+    """Return ``name`` if it is a plain file name.
+
+    Raises :class:`UserError` if it may lead out of its directory.
     """
     if NOT_PLAIN.search(name):
         raise UserError(
@@ -345,24 +382,27 @@ def plain_name(name: str, where: str) -> str:
 def evenly_spread(items: Sequence[Any], most: int | None) -> list[Any]:
     """Return up to ``most`` items, evenly spread from the first to the last."""
     count = len(items) if most is None else min(most, len(items))
-    return [items[index] for index in np.linspace(0, len(items) - 1, count).round().astype(int)]
+    indices = np.linspace(0, len(items) - 1, count).round().astype(int)
+    return [items[index] for index in indices]
 
 
 def image_files(directory: Path) -> Callable[[str], str]:
-    """List a directory. Return a function from image id to path; an unknown id gives a path of a
-    missing png.
+    """List a directory. Return a function from image id to path.
+
+    An unknown id gives the path of a missing png.
     """
     known: dict[str, str] = {}
-    # The directory is missing, or its name is too long or not encodable
+    # The directory is missing, or its name is too long or not encodable.
     with suppress(OSError, ValueError):
-        images = sorted(
-            path for path in directory.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES
-        )
-        known = {path.stem: str(path) for path in reversed(images)}
+        for path in sorted(directory.iterdir()):
+            # Of "a.jpg" and "a.png", the first one counts.
+            if path.suffix.lower() in IMAGE_SUFFIXES:
+                known.setdefault(path.stem, str(path))
     return lambda name: known.get(name) or f"{directory}{os.sep}{name}.png"
 
 
 def _numbers(cell: str, where: str, count: int) -> NDArray[np.float64]:
+    """Return the ``count`` numbers of a cell. Raise :class:`UserError` for any other cell."""
     parts = cell.split()
     with suppress(ValueError):
         if len(parts) == count:

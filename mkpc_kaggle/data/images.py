@@ -1,5 +1,4 @@
-"""Images: decoded once, in the background. An unreadable file gives a value with the reason, not an
-exception.
+"""Images: decoded once, in the background; an unreadable file is a value with the reason.
 
 EXIF gives the orientation of the stored pixels, and the focal length as COLMAP computes it. Source:
 ``Bitmap::ExifFocalLength`` of COLMAP 4.2, without COLMAP's table of sensors.
@@ -27,14 +26,19 @@ from mkpc_kaggle.config import Range
 from mkpc_kaggle.errors import shown
 from mkpc_kaggle.geometry.coordinates import Pixels, Size
 
-# Ratio of the sides; a longer image's views would be a few pixels high or exceed the memory
+# Ratio of the sides; a longer image's views would be a few pixels high or exceed the memory.
 MAX_ASPECT = 32
 
-ORIENTATION, DIRECTORY, FOCAL_MM = 0x0112, 0x8769, 0x920A  # tags of EXIF
-PLANE_RESOLUTION, PLANE_UNIT, FOCAL_35MM = 0xA20E, 0xA210, 0xA405
+# Tags of EXIF.
+ORIENTATION = 0x0112
+DIRECTORY = 0x8769  # of the tags below
+FOCAL_MM = 0x920A
+PLANE_RESOLUTION = 0xA20E  # pixels per unit of the sensor
+PLANE_UNIT = 0xA210
+FOCAL_35MM = 0xA405
 FILM_MM = 43.27  # diagonal of 35 mm film
-UNITS_MM: dict[float, float] = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
-# In long sides of the image; a focal length outside this range counts as unknown
+UNITS_MM: dict[float, float] = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # inch, cm, mm, micrometre
+# In long sides of the image; a focal length outside this range counts as unknown.
 FOCALS = Range(0.2, 20.0)
 # Counter-clockwise quarter turns that set pixels upright, by EXIF orientation; mirrored pixels stay
 # mirrored.
@@ -53,19 +57,19 @@ class Image:
 
     @classmethod
     def of_array(cls, array: Pixels) -> "Image":
-        """Wrap a uint8 array (H, W, 3) RGB or (H, W) gray, named by its digest. Raise
-        ``ValueError`` otherwise.
+        """Wrap a uint8 array (H, W, 3) RGB or (H, W) gray, named by its digest.
+
+        Raises ``ValueError`` for any other array.
         """
-        if (
-            array.dtype != np.uint8
-            or array.ndim < 2
-            or array.shape[2:] not in ((), (3,))
-            or not array.size
-        ):
+        has_shape = array.ndim >= 2 and array.shape[2:] in ((), (3,))
+        if array.dtype != np.uint8 or not has_shape or not array.size:
             raise ValueError(
                 f"an image is uint8 (H, W) or (H, W, 3), not {array.dtype} {array.shape}"
             )
-        pixels = np.ascontiguousarray(np.stack([array] * 3, axis=2) if array.ndim == 2 else array)
+        if array.ndim == 2:
+            array = np.stack([array] * 3, axis=2)
+        pixels = np.ascontiguousarray(array)
+        # Two arrays of other shapes may have the same bytes.
         return cls(f"{_content_digest(pixels)} {pixels.shape}", pixels)
 
     @property
@@ -84,6 +88,8 @@ class Image:
 
 @dataclass(frozen=True)
 class Unreadable:
+    """An image that cannot be decoded, and the reason."""
+
     name: str
     reason: str
 
@@ -95,30 +101,26 @@ class Unreadable:
 
 
 def read_image(path: Path) -> Image | Unreadable:
-    """Decode a file's stored pixels to RGB; return failures, never raise. Divide 16-bit values by
-    256.
+    """Decode a file's stored pixels to RGB; return failures, never raise.
 
-    OpenCV decides whether a damaged file is readable: version 5 refuses a truncated file.
+    16-bit values are divided by 256. OpenCV decides whether a damaged file is readable: version 5
+    refuses a truncated file.
     """
     name = str(path)
+    bgr = None
     try:
         if path.exists() and not path.is_file():  # a pipe or a device may never end
             return Unreadable(name, "cannot be read: not a regular file")
         data = np.fromfile(path, np.uint8)
-        bgr = (
-            cv2.imdecode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-            if data.size
-            else None
-        )
+        if data.size:  # OpenCV raises for an empty array
+            bgr = cv2.imdecode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     except FileNotFoundError:
         return Unreadable(name, "no such file")
     except (OSError, ValueError, MemoryError, cv2.error) as error:
         return Unreadable(name, f"cannot be read: {error}")
     if bgr is None:
-        cause = (
-            "not a picture, or cut off: it cannot be decoded" if data.size else "the file is empty"
-        )
-        return Unreadable(name, cause)
+        cause = "not a picture, or cut off: it cannot be decoded"
+        return Unreadable(name, cause if data.size else "the file is empty")
     height, width = bgr.shape[:2]
     if max(height, width) > MAX_ASPECT * min(height, width):
         return Unreadable(
@@ -130,28 +132,32 @@ def read_image(path: Path) -> Image | Unreadable:
 
 
 def read_exif(data: bytes, size: Size) -> tuple[int, float]:
-    """Return the counter-clockwise quarter turns that set an image upright, and its focal length in
-    pixels.
+    """Return the quarter turns that set an image upright, and its focal length in pixels.
 
-    ``data`` has the file's bytes; ``size`` is in pixels. Both results are 0 if unknown. Damaged EXIF is ignored.
+    Turns are counter-clockwise. ``data`` has the file's bytes; ``size`` is in pixels. Both results
+    are 0 if unknown. Damaged EXIF is ignored.
     """
     tags: dict[int, float] = {}
-    # Pillow raises errors of any type for a damaged file
+    # Pillow raises errors of any type for a damaged file.
     with suppress(Exception), warnings.catch_warnings():
         warnings.filterwarnings("ignore", module="PIL")
         # OpenCV already rotates TIFF. Pillow would decode all pixels of a PNG, since EXIF may come
         # after them.
-        with PIL.Image.open(BytesIO(data), formats=("JPEG", "PNG", "WEBP")) as picture:
+        formats = ("JPEG", "PNG", "WEBP")
+        with PIL.Image.open(BytesIO(data), formats=formats) as picture:
             if picture.format != "PNG" or b"eXIf" in data:
                 exif = picture.getexif()
-                found = {**exif, **exif.get_ifd(DIRECTORY)}
-                tags = {
-                    tag: float(value) for tag, value in found.items() if isinstance(value, Real)
-                }
-    unit = UNITS_MM.get(tags.get(PLANE_UNIT, 0), inf)
+                for tag, value in {**exif, **exif.get_ifd(DIRECTORY)}.items():
+                    if isinstance(value, Real):
+                        tags[tag] = float(value)
+    turns = TURNS.get(tags.get(ORIENTATION, 1), 0)
+    # In COLMAP's order: the equivalent focal length first, then the sensor's resolution. An unknown
+    # unit is infinite, which gives 0.
     focal = tags.get(FOCAL_35MM, 0.0) / FILM_MM * hypot(*size)
-    focal = focal or tags.get(FOCAL_MM, 0.0) * tags.get(PLANE_RESOLUTION, 0.0) / unit
-    return TURNS.get(tags.get(ORIENTATION, 1), 0), focal if focal / max(size) in FOCALS else 0.0
+    if not focal:
+        unit = UNITS_MM.get(tags.get(PLANE_UNIT, 0), inf)
+        focal = tags.get(FOCAL_MM, 0.0) * tags.get(PLANE_RESOLUTION, 0.0) / unit
+    return turns, focal if focal / max(size) in FOCALS else 0.0
 
 
 def read_size(path: Path) -> Size | None:
@@ -178,7 +184,9 @@ class ByteCache:
     """Cache of the most recently used values, up to ``limit`` bytes. Not thread-safe."""
 
     def __init__(self, limit: int) -> None:
-        self.limit, self.bytes = limit, 0
+        self.limit = limit
+        self.bytes = 0
+        # The least recently used comes first.
         self._entries: OrderedDict[Any, tuple[Any, int]] = OrderedDict()
 
     def get(self, key: Any) -> Any:
@@ -188,6 +196,7 @@ class ByteCache:
         return self._entries.get(key, (None,))[0]
 
     def put(self, key: Any, value: Any, size: int) -> None:
+        """Add or replace a value of ``size`` bytes; one larger than the limit is not kept."""
         self.bytes -= self._entries.pop(key, (value, 0))[1]
         if size <= self.limit:
             self._entries[key] = value, size
@@ -197,8 +206,9 @@ class ByteCache:
 
 
 class ImageStore:
-    """Images by path, decoded in the background. The most recently used are cached. Not
-    thread-safe.
+    """Images by path, decoded in the background; the most recently used are cached.
+
+    Not thread-safe.
     """
 
     def __init__(self, limit_bytes: int = 512 << 20) -> None:
@@ -215,7 +225,9 @@ class ImageStore:
     def get(self, path: Path) -> Image | Unreadable:
         """Wait until the image is decoded, then return it."""
         self.prefetch([path])
-        image: Image | Unreadable = self._images.get(path) or self._pending.pop(path).result()
+        image: Image | Unreadable | None = self._images.get(path)
+        if image is None:
+            image = self._pending.pop(path).result()
         if isinstance(image, Image):
             self._images.put(path, image, image.pixels.nbytes)
         return image

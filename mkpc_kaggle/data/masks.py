@@ -1,6 +1,4 @@
-"""Masks of images, as COLMAP reads them: ``DIR/a.jpg.png`` masks ``a.jpg``, and black pixels are
-left out.
-"""
+"""Masks of images, as COLMAP reads them: ``DIR/a.jpg.png`` masks ``a.jpg``; black is left out."""
 
 import hashlib
 from collections.abc import Iterable, Mapping
@@ -28,11 +26,11 @@ class Masks:
 
     @classmethod
     def of_folder(cls, directory: Path, root: Path, images: Iterable[Path]) -> "Masks":
-        """Return the masks below ``directory`` of images below ``root``; an image without a mask is
-        used whole.
+        """Return the masks below ``directory`` of images below ``root``.
 
-        Raises :class:`UserError` for a directory that is missing, has images of the run or no masks
-        of these images. Raises it also for a mask that is unreadable or not as large as its image.
+        An image without a mask is used whole. Raises :class:`UserError` for a directory that is
+        missing, has images of the run or no masks of these images. Raises it also for a mask that
+        is unreadable or not as large as its image.
         """
         if not directory.is_dir():
             raise UserError(
@@ -51,14 +49,11 @@ class Masks:
             path = directory / f"{image.relative_to(root).as_posix()}{SUFFIX}"
             if path.exists():  # as in COLMAP, an image without a mask is used whole
                 _require_usable(path, image)
-                files[str(image)] = (
-                    str(path),
-                    hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest(),
-                )
+                digest = hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest()
+                files[str(image)] = (str(path), digest)
         if not files:
-            expected = (
-                f"{first.relative_to(root).as_posix()}{SUFFIX}" if first else f"a.jpg{SUFFIX}"
-            )
+            name = first.relative_to(root).as_posix() if first else "a.jpg"
+            expected = f"{name}{SUFFIX}"
             raise UserError(f"{directory} has no mask of any image: {expected} would be the first")
         return cls(files)
 
@@ -68,9 +63,12 @@ class Masks:
 
 
 def _require_usable(path: Path, image: Path) -> None:
+    """Raise :class:`UserError` for a mask that is unreadable or not as large as its image."""
     if not path.is_file():
         raise UserError(f"{path} cannot be read: not a regular file")
-    mask, size = read_mask(path), read_size(image)
+    mask = read_mask(path)
+    size = read_size(image)
+    # An unreadable image is reported by the run.
     if size is not None and size != (mask.shape[1], mask.shape[0]):
         found = f"{mask.shape[1]} x {mask.shape[0]}"
         raise UserError(
@@ -79,16 +77,15 @@ def _require_usable(path: Path, image: Path) -> None:
 
 
 def read_mask(path: Path) -> NDArray[np.bool_]:
-    """Return the mask (H, W) of a file, False where it is black. Raises :class:`UserError` if it is
-    unreadable.
+    """Return the mask (H, W) of a file, False where it is black.
+
+    Raises :class:`UserError` if it is unreadable.
     """
+    pixels = None
     try:
         data = np.fromfile(path, np.uint8)
-        pixels = (
-            cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
-            if data.size
-            else None
-        )
+        if data.size:  # OpenCV raises for an empty array
+            pixels = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
     except (OSError, ValueError, MemoryError, cv2.error) as error:
         raise UserError(f"the mask {path} cannot be read: {error}") from error
     if pixels is None:
@@ -104,7 +101,7 @@ class MaskReader:
         self._cache = ByteCache(CACHE_BYTES)
 
     def shows(self, image: str, points: Points, size: Size) -> NDArray[np.bool_]:
-        """Return which points (N, 2) of an image its mask leaves; all without a mask.
+        """Return a mask (N,) of the points (N, 2) that an image's mask keeps; all without a mask.
 
         Raises :class:`UserError` for a mask that has changed since the run began: unreadable, or of
         another size.
@@ -120,4 +117,6 @@ class MaskReader:
             self._cache.put(image, mask, mask.nbytes)
         # (0, 0) is the centre of the first pixel; points on the border round to pixels outside.
         columns, rows = np.round(points).astype(np.intp).T
-        return np.asarray(mask[rows.clip(0, size.height - 1), columns.clip(0, size.width - 1)])
+        rows = rows.clip(0, size.height - 1)
+        columns = columns.clip(0, size.width - 1)
+        return np.asarray(mask[rows, columns])

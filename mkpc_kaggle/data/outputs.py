@@ -11,7 +11,7 @@ from typing import TextIO
 from mkpc_kaggle.errors import UserError
 
 # Suffixes of each option's results. In an input directory, a file with one of them is an earlier
-# result.
+# result, which may be replaced.
 RESULTS = {
     "--output": (".csv",),
     "--json": (".json",),
@@ -28,46 +28,55 @@ def require_apart(
     work_dir: Path | None = None,
     weights: Iterable[Path] = (),
 ) -> None:
-    """Raise :class:`UserError` for outputs that would overwrite an input, another output or the
-    journal.
+    """Raise :class:`UserError` for outputs that would overwrite an input or each other.
 
-    ``outputs`` are files, by option; ``inputs`` and ``weights`` are files and directories. A new file may lie in
-    an input directory. ``--json`` and ``--report`` overwrite only files with their own suffix.
+    The same error is raised for the journal in ``work_dir``. ``outputs`` are files, by option;
+    ``inputs`` and ``weights`` are files and directories. A new file may lie in an input directory.
+    ``--json`` and ``--report`` overwrite only files with their own suffix.
     """
     files = {option: path for option, path in outputs.items() if path is not None}
     inputs = list(inputs)
+    precious = [*inputs, *weights, *weights_of_environment()]
     for option, path in files.items():
         is_result = path.suffix.lower() in RESULTS[option]
         if not path.name or os.path.isdir(path):  # noqa: PTH112  Path raises for a name that is too long
             raise UserError(f"{option} {str(path)!r} is a directory; name a file")
-        lost = [
-            f"{other} {there}"
-            for other, there in files.items()
-            if other != option and same_file(path, there)
-        ]
-        if work_dir is not None:
-            is_journal = path.name.startswith("journal.") and same_file(path.parent, work_dir)
-            lost += (
-                [f"the work directory {work_dir}"] if is_journal or lies_in(work_dir, path) else []
-            )
-        precious = [*inputs, *weights, *weights_of_environment()] if os.path.lexists(path) else []
-        lost += [
-            f"the input {p}"
-            for p in precious
-            if same_file(path, p) or (lies_in(path, p) and not is_result)
-        ]
-        if lost:
-            raise UserError(f"{option} {path} would be written over {lost[0]}; name another file")
+        if lost := _lost(option, files, precious, work_dir):
+            raise UserError(f"{option} {path} would be written over {lost}; name another file")
         if option in ("--json", "--report") and not is_result and os.path.isfile(path):  # noqa: PTH113
             raise UserError(
                 f"{option} {path} exists and is not a {RESULTS[option][0]} file; name another file"
             )
-    if work_dir is not None and (
-        source := next((each for each in inputs if lies_in(work_dir, each)), None)
-    ):
-        raise UserError(
-            f"--work-dir {work_dir} would be written over the input {source}; name another place"
-        )
+    if work_dir is None:
+        return
+    for source in inputs:
+        if lies_in(work_dir, source):
+            raise UserError(
+                f"--work-dir {work_dir} would be written over the input {source}; "
+                "name another place"
+            )
+
+
+def _lost(
+    option: str, files: Mapping[str, Path], precious: Iterable[Path], work_dir: Path | None
+) -> str:
+    """Return the file or directory that an option's output would replace; empty if none."""
+    path = files[option]
+    for other, there in files.items():
+        if other != option and same_file(path, there):
+            return f"{other} {there}"
+    if work_dir is not None:
+        is_journal = path.name.startswith("journal.") and same_file(path.parent, work_dir)
+        if is_journal or lies_in(work_dir, path):
+            return f"the work directory {work_dir}"
+    # A new file takes nothing away from a directory.
+    if not os.path.lexists(path):
+        return ""
+    is_result = path.suffix.lower() in RESULTS[option]
+    for source in precious:
+        if same_file(path, source) or (lies_in(path, source) and not is_result):
+            return f"the input {source}"
+    return ""
 
 
 def require_table(path: Path, columns: Iterable[str]) -> None:
@@ -88,12 +97,12 @@ def weights_of_environment() -> list[Path]:
 
 def lies_in(path: Path, directory: Path) -> bool:
     """Return whether ``path`` is ``directory`` or lies in it, with links resolved."""
-    return any(
-        same_file(place, directory) for place in (path, *Path(os.path.realpath(path)).parents)
-    )
+    folders = Path(os.path.realpath(path)).parents
+    return any(same_file(each, directory) for each in (path, *folders))
 
 
 def same_file(path: Path, other: Path) -> bool:
+    """Return whether two paths name one file, with links resolved; the files may not exist yet."""
     with suppress(OSError):  # realpath for links, samefile for case-insensitive file systems
         return os.path.realpath(path) == os.path.realpath(other) or path.samefile(other)
     return False
@@ -103,8 +112,9 @@ def same_file(path: Path, other: Path) -> bool:
 def replacing(path: Path) -> Iterator[TextIO]:
     """Open a temporary file, which replaces ``path`` once the new file is complete and on disk.
 
-    The temporary file lies next to ``path``; files that a killed process left there are removed. A device such as
-    ``/dev/stdout`` is written directly. Raises ``OSError`` and removes the temporary file if writing fails.
+    The temporary file lies next to ``path``; files that a killed process left there are removed. A
+    device such as ``/dev/stdout`` is written directly. Raises ``OSError`` and removes the temporary
+    file if writing fails.
     """
     if path.is_char_device():
         with path.open("w", encoding="utf-8", newline="") as stream:
@@ -119,6 +129,7 @@ def replacing(path: Path) -> Iterator[TextIO]:
         with part.open("x", encoding="utf-8", newline="") as stream:  # "x" follows no link
             yield stream
             stream.flush()
+            # Before the renaming: after a power failure, the new name could have an empty file.
             os.fsync(stream.fileno())
         part.replace(path)
     finally:

@@ -2,14 +2,14 @@
 
 One line per pair: ``name0 name1 turns0 turns1 K0 K1 T_0to1``, separated by blanks. Names are paths
 under the image root. ``turns`` are the counter-clockwise quarter turns that set an image upright,
-after its EXIF rotation. K (9 numbers) and T (16) are row-major and refer to the stored pixels; X_1
-= R X_0 + t with T = [R t; 0 1]. A ``.npz`` file, or a directory of them, is a list of
+after its EXIF rotation. K (9 numbers) and T (16) are row-major and refer to the stored pixels. With
+T = [R t; 0 1], X_1 = R X_0 + t. A ``.npz`` file, or a directory of them, is a list of
 MegaDepth-1500 in LoFTR's format ``scene_info``.
 """
 
 import pickle
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from io import BytesIO
 from itertools import chain
 from math import nan
@@ -17,110 +17,138 @@ from pathlib import Path, PureWindowsPath
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mkpc_kaggle.data.competition import Pair, TrainScene, TruePair, evenly_spread
 from mkpc_kaggle.errors import UserError, read_text
 from mkpc_kaggle.geometry.cameras import Camera
+from mkpc_kaggle.geometry.coordinates import Matrix3
 
 FIELDS = 2 + 2 + 9 + 9 + 16
 EXPECTED = "name0 name1 turns0 turns1 K0 (9 numbers) K1 (9) T_0to1 (16)"
 MAX_SKEWNESS = 1e-3  # deviation of R R^T from the identity; files have poses of few digits
 # The only names that pickled arrays need. Any other name might run code.
-NAMES = {"ndarray": np.ndarray, "dtype": np.dtype, "encode": lambda text, _: text.encode("latin-1")}
-NAMES |= {"_reconstruct": np.empty(0).__reduce__()[0], "scalar": np.float64(0).__reduce__()[0]}
+NAMES = {
+    "ndarray": np.ndarray,
+    "dtype": np.dtype,
+    "encode": lambda text, _: text.encode("latin-1"),
+    # Their modules differ between NumPy 1 and 2, so they are taken from NumPy's own pickles.
+    "_reconstruct": np.empty(0).__reduce__()[0],
+    "scalar": np.float64(0).__reduce__()[0],
+}
 
 
 def read_pairs(file: Path, image_root: Path, *, most: int | None = None) -> TrainScene:
     """Return the pairs of a list as a scene of unknown scale, with intrinsics to estimate E.
 
-    ``most`` limits the pairs, which are then evenly spread. An unreadable image is not an error here. Raises
-    :class:`UserError` for a list without pairs and for a malformed line.
+    ``most`` limits the pairs, which are then evenly spread. An unreadable image is not an error
+    here. Raises :class:`UserError` for a list without pairs and for a malformed line.
     """
     if not image_root.is_dir():
         raise UserError(f"--image-root {image_root}: no such directory")
-    infos = sorted(file.glob("*.npz")) if file.is_dir() else [file] if file.suffix == ".npz" else []
-    lines = (
-        chain.from_iterable(map(lines_of_scene_info, infos))
-        if infos
-        else read_text(file).splitlines()
-    )
-    numbered = ((number, line) for number, line in enumerate(lines, start=1) if line.split())
-    pairs = [parse_line(line, file, number, image_root) for number, line in numbered]
+    pairs = []
+    for number, line in enumerate(_lines(file), start=1):
+        if line.split():
+            pairs.append(parse_line(line, file, number, image_root))
     if not pairs:
         raise UserError(f"{file} has no pairs; expected lines {EXPECTED}")
     return TrainScene(file.stem, nan, tuple(evenly_spread(pairs, most)))
 
 
+def _lines(file: Path) -> Iterable[str]:
+    """Return the lines of a list: a text file, a ``.npz`` file or a directory of these."""
+    infos = [file] if file.suffix == ".npz" else []
+    if file.is_dir():
+        infos = sorted(file.glob("*.npz"))
+    if infos:
+        return chain.from_iterable(map(lines_of_scene_info, infos))
+    return read_text(file).splitlines()
+
+
 def parse_line(line: str, file: Path, number: int, image_root: Path) -> TruePair:
-    """Return the pair of a line. Raise :class:`UserError` with its location and the expected
-    format.
+    """Return the pair of a line.
+
+    Raises :class:`UserError` with the line's location and the expected format.
     """
-    cells, where = line.split(), f"{file}, line {number}"
+    cells = line.split()
+    where = f"{file}, line {number}"
     if len(cells) != FIELDS:
         raise UserError(f"{where}: expected {FIELDS} fields, {EXPECTED}, found {len(cells)}")
-    for name in (names := cells[:2]):
+    names = cells[:2]
+    for name in names:
         path = PureWindowsPath(name)  # the strictest rules: drives and backslashes count too
         if path.anchor or ".." in path.parts or "\0" in name:
             raise UserError(
                 f"{where}: {name!r} points outside the image root; expected a path without .."
             )
     try:
-        turns0, turns1 = turns = int(cells[2]), int(cells[3])
-        numbers = np.array(list(map(float, cells[4:])))
+        turns = (int(cells[2]), int(cells[3]))
+        numbers = np.array([float(cell) for cell in cells[4:]])
     except ValueError as error:
         raise UserError(
             f"{where}: expected numbers for turns, K0, K1 and T_0to1: {error}"
         ) from error
-    K0, K1, T = numbers[:9].reshape(3, 3), numbers[9:18].reshape(3, 3), numbers[18:].reshape(4, 4)
-    R, t = T[:3, :3], T[:3, 3]
-    has_focals = all(
-        min(K[0, 0], K[1, 1]) > 0 and (K[1, 0], *K[2]) == (0, 0, 0, 1) for K in (K0, K1)
-    )
-    # The loop below checks that the numbers are finite
-    with np.errstate(over="ignore", invalid="ignore"):
-        is_rotation = np.abs(R @ R.T - np.eye(3)).max() < MAX_SKEWNESS and np.linalg.det(R) > 0
-    for holds, expected in (
-        (
-            {turns0, turns1} <= {0, 1, 2, 3},
-            f"0, 1, 2 or 3 quarter turns, found {cells[2]} and {cells[3]}",
-        ),
-        (np.isfinite(numbers).all(), "finite numbers for K0, K1 and T_0to1"),
-        (has_focals, "K0 and K1 = fx s cx 0 fy cy 0 0 1 with positive fx and fy"),
-        (is_rotation and tuple(T[3]) == (0, 0, 0, 1), "T_0to1 = [R t; 0 0 0 1] with R a rotation"),
-    ):
-        if not holds:
-            raise UserError(f"{where}: expected {expected}")
-    labels = (
-        f"{name} turned {times}" if times else name
-        for name, times in zip(names, turns, strict=True)
-    )
+    K0 = numbers[:9].reshape(3, 3)
+    K1 = numbers[9:18].reshape(3, 3)
+    T = numbers[18:].reshape(4, 4)
+    if problem := _problem(turns, K0, K1, T):
+        raise UserError(f"{where}: expected {problem}")
+    # Unique in a list that has the same images in several turns.
+    labels = []
+    for name, times in zip(names, turns, strict=True):
+        labels.append(f"{name} turned {times}" if times else name)
     file0, file1 = (str(image_root / name) for name in names)
     pair = Pair(f"{number}: {' '.join(labels)}", file.stem, file0, file1, (K0, K1), turns)
-    return TruePair(pair, Camera(K0, np.eye(3), np.zeros(3)), Camera(K1, R, t), nan)
+    # The first camera is the world.
+    camera0 = Camera(K0, np.eye(3), np.zeros(3))
+    camera1 = Camera(K1, T[:3, :3], T[:3, 3])
+    return TruePair(pair, camera0, camera1, nan)
+
+
+def _problem(turns: tuple[int, int], K0: Matrix3, K1: Matrix3, T: NDArray[np.float64]) -> str:
+    """Return the expected values of a line whose numbers no pair has; empty if they are right."""
+    if not {*turns} <= {0, 1, 2, 3}:
+        return f"0, 1, 2 or 3 quarter turns, found {turns[0]} and {turns[1]}"
+    if not all(np.isfinite(matrix).all() for matrix in (K0, K1, T)):
+        return "finite numbers for K0, K1 and T_0to1"
+    for K in (K0, K1):
+        is_triangular = (K[1, 0], *K[2]) == (0, 0, 0, 1)
+        if min(K[0, 0], K[1, 1]) <= 0 or not is_triangular:
+            return "K0 and K1 = fx s cx 0 fy cy 0 0 1 with positive fx and fy"
+    R = T[:3, :3]
+    with np.errstate(over="ignore", invalid="ignore"):  # of huge numbers
+        skewness = np.abs(R @ R.T - np.eye(3)).max()
+        is_rotation = skewness < MAX_SKEWNESS and np.linalg.det(R) > 0
+    if not is_rotation or tuple(T[3]) != (0, 0, 0, 1):
+        return "T_0to1 = [R t; 0 0 0 1] with R a rotation"
+    return ""
 
 
 def lines_of_scene_info(file: Path) -> Iterator[str]:
-    """Yield a line of the list for each pair of a ``scene_info`` file, without executing the file's
-    code.
+    """Yield a line of the list for each pair of a ``scene_info`` file.
 
-    A pair has two indices into ``image_paths``, ``intrinsics`` (3, 3) and ``poses`` (4, 4), world
-    to camera. Raises :class:`UserError` for any other file.
+    No code of the file is executed. A pair has two indices into ``image_paths``, ``intrinsics``
+    (3, 3) and ``poses`` (4, 4), world to camera. Raises :class:`UserError` for any other file.
     """
     try:
         with zipfile.ZipFile(file) as archive:
             names = ("pair_infos", "image_paths", "intrinsics", "poses")
             infos, paths, Ks, poses = (_array(archive, f"{name}.npy") for name in names)
         for (i, j), *_ in infos:
-            T = np.asarray(poses[j], float) @ np.linalg.inv(np.asarray(poses[i], float))
-            numbers = np.concatenate([np.ravel(matrix) for matrix in (Ks[i], Ks[j], T)])
-            yield " ".join(
-                [str(paths[i]), str(paths[j]), "0 0", *(f"{number:.17g}" for number in numbers)]
-            )
+            pose0 = np.asarray(poses[i], float)
+            pose1 = np.asarray(poses[j], float)
+            T = pose1 @ np.linalg.inv(pose0)  # from camera 0 to camera 1
+            matrices = [np.ravel(matrix) for matrix in (Ks[i], Ks[j], T)]
+            cells = [f"{number:.17g}" for number in np.concatenate(matrices)]
+            images = f"{paths[i]} {paths[j]}"
+            yield " ".join([images, "0 0", *cells])
     except Exception as error:  # a pickle may raise anything
         raise UserError(f"{file} is not a scene_info of MegaDepth: {error}") from error
 
 
 class _Arrays(pickle.Unpickler):
+    """An unpickler of arrays, which refuses everything else."""
+
     def find_class(self, module: str, name: str) -> Any:
         if module.partition(".")[0] not in ("numpy", "_codecs") or name not in NAMES:
             raise pickle.UnpicklingError(f"it names {module}.{name}, which no array needs")
@@ -128,7 +156,8 @@ class _Arrays(pickle.Unpickler):
 
 
 def _array(archive: zipfile.ZipFile, name: str) -> Any:
-    # A longer array is cut off, so that reading it fails
+    """Return an array of an archive, also one of objects."""
+    # A longer array is cut off, so that reading it fails.
     stream = BytesIO(archive.open(name).read(1 << 28))
     try:
         return np.lib.format.read_array(stream, allow_pickle=False)

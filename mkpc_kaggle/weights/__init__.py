@@ -1,5 +1,6 @@
-"""Weight files: the manifest; finding, verifying, loading, fetching, converting. The import brings
-no torch.
+"""Weight files: the manifest; finding, verifying, loading, fetching, converting.
+
+The import brings no torch.
 """
 
 from mkpc_kaggle.weights.checkpoint import load_into, load_tensors

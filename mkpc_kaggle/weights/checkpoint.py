@@ -1,6 +1,4 @@
-"""Checkpoint files: loading tensors without running code, filling networks, conversion to
-safetensors.
-"""
+"""Checkpoint files: loading tensors without running code, filling networks, conversion."""
 
 import re
 import zipfile
@@ -18,9 +16,9 @@ if TYPE_CHECKING:
     import torch
     from torch import nn
 
-# Entries that hold the tensors, of training checkpoints and of DISK
+# Entries that hold the tensors, of training checkpoints and of DISK.
 WRAPPERS = ("state_dict", "extractor")
-# Of a batch norm, used in training only; old files have none
+# Of a batch norm, used in training only; old files have none.
 COUNTER = re.compile(r"(.*\.)?num_batches_tracked")
 MAX_EXPANSION = 4  # bytes of tensors per byte of the file; some tensors share their bytes
 
@@ -48,13 +46,17 @@ def load_tensors(path: Path, device: str = "cpu") -> "dict[str, torch.Tensor]":
     import torch
 
     try:
-        # Inside another device's context, torch puts tensors of old checkpoints there
+        # Inside another device's context, torch puts tensors of old checkpoints there.
         with torch.device("cpu"):
             table = _load_table(path, is_mapped=device == "meta")
         _require_plain(table, path)
+    # Any error: a damaged file makes torch, zipfile and safetensors raise errors of many types.
     except Exception as error:
         raise UserError(f"{path} cannot be read as a checkpoint: {error}") from error
-    return {name: tensor.detach().to(device) for name, tensor in table.items()}
+    tensors = {}
+    for name, tensor in table.items():
+        tensors[name] = tensor.detach().to(device)  # without gradients, which parameters have
+    return tensors
 
 
 def load_into(
@@ -68,29 +70,31 @@ def load_into(
     not fit.
     """
     own = network.state_dict()
-    odd = [
-        name
-        for name in own.keys() ^ tensors.keys()
-        if not re.match(unused, name) and not COUNTER.fullmatch(name)
-    ]
-    odd += [name for name in own.keys() & tensors.keys() if own[name].shape != tensors[name].shape]
+    odd = []
+    for name in own.keys() ^ tensors.keys():  # missing or surplus
+        if not re.match(unused, name) and not COUNTER.fullmatch(name):
+            odd.append(name)
+    for name in own.keys() & tensors.keys():
+        if own[name].shape != tensors[name].shape:
+            odd.append(name)
     if odd:
         raise UserError(
             f"the weights for {what!r} do not fit the network: {', '.join(sorted(odd)[:5])}"
         )
-    fitting = {name: tensor.to(own[name].dtype) for name, tensor in tensors.items() if name in own}
-    network.load_state_dict(
-        {**own, **fitting}, assign=any(tensor.is_meta for tensor in own.values())
-    )
+    # Files in half precision are converted once, here.
+    fitting = {}
+    for name in own.keys() & tensors.keys():
+        fitting[name] = tensors[name].to(own[name].dtype)
+    is_meta = any(tensor.is_meta for tensor in own.values())
+    network.load_state_dict({**own, **fitting}, assign=is_meta)
 
 
 def convert(source: Path, target: Path, known: WeightFile | None = None) -> WeightFile:
-    """Write contiguous copies of the tensors of ``source`` to ``target``; return the target's
-    manifest line.
+    """Write copies of the tensors of ``source`` to ``target``; return the target's manifest line.
 
     ``known`` is the manifest line of the source, by default found by digest, then by name. Raises
-    :class:`UserError` if the source cannot be read, the target cannot be written, or its name does not end in
-    ``.safetensors``.
+    :class:`UserError` if the source cannot be read, the target cannot be written, or its name does
+    not end in ``.safetensors``.
     """
     if target.suffix != ".safetensors":
         raise UserError(f"--out {target}: the name must end in .safetensors")
@@ -104,7 +108,8 @@ def convert(source: Path, target: Path, known: WeightFile | None = None) -> Weig
         target.parent.mkdir(parents=True, exist_ok=True)
         part.unlink(missing_ok=True)  # it may be a link
         # safetensors refuses views and tensors that share their bytes.
-        save_file({name: tensor.contiguous().clone() for name, tensor in tensors.items()}, part)
+        copies = {name: tensor.contiguous().clone() for name, tensor in tensors.items()}
+        save_file(copies, part)
         part.replace(target)
     except KeyError as error:
         raise UserError(f"{source}: safetensors has no type for tensors of {error}") from error
@@ -118,11 +123,19 @@ def convert(source: Path, target: Path, known: WeightFile | None = None) -> Weig
 
 
 def _line_of(source: Path) -> WeightFile | None:
-    digest, lines = digest_of(source), manifest()
-    known = [file for file in lines if file.digest == digest]
-    known += [file for file in lines if (file.name, file.digest) == (source.name, UNVERIFIED)]
-    known += [file for file in lines if source.is_dir() and is_unpacked_from(source, file)]
-    return next(iter(known), None)
+    """Return the manifest line of a file: by digest, by name, or as an unpacked checkpoint."""
+    digest = digest_of(source)
+    lines = manifest()
+    for file in lines:
+        if file.digest == digest:
+            return file
+    for file in lines:
+        if file.name == source.name and file.digest == UNVERIFIED:
+            return file
+    for file in lines:
+        if source.is_dir() and is_unpacked_from(source, file):
+            return file
+    return None
 
 
 def is_unpacked_from(directory: Path, file: WeightFile) -> bool:
@@ -131,32 +144,40 @@ def is_unpacked_from(directory: Path, file: WeightFile) -> bool:
     Kaggle unpacks uploaded archives, and torch checkpoints are archives: ``NAME.pth`` becomes
     ``NAME/NAME/{data.pkl, data/, version, ...}``, with or without the suffix in the outer name.
     """
-    return bool({directory.name, directory.parent.name} & {file.name, Path(file.name).stem})
+    folder_names = {directory.name, directory.parent.name}
+    return bool(folder_names & {file.name, Path(file.name).stem})
 
 
 def _require_plain(table: Mapping[Any, Any], path: Path) -> None:
-    """Raise ``ValueError`` unless all entries are named dense tensors, together not much larger
-    than the file.
-    """
-    import torch
+    """Raise ``ValueError`` unless all entries are named dense tensors.
 
+    The same error is raised if they are much larger than the file.
+    """
     for name, value in table.items():
-        plain = isinstance(value, torch.Tensor) and (value.layout, value.device.type) == (
-            torch.strided,
-            "cpu",
-        )
-        if not plain or not isinstance(name, str) or value.is_quantized or value.is_nested:
+        if not isinstance(name, str) or not _is_dense(value):
             raise ValueError(
                 f"entry {name!r} is not a plain named tensor; save the network's state_dict alone"
             )
-    file_bytes = sum(file.stat().st_size for file in (path, *path.rglob("*")) if file.is_file())
+    files = [file for file in (path, *path.rglob("*")) if file.is_file()]
+    file_bytes = sum(file.stat().st_size for file in files)
+    # A few bytes may expand to a huge tensor, whose elements share one number.
     if sum(tensor.nbytes for tensor in table.values()) > MAX_EXPANSION * file_bytes:
         raise ValueError("its tensors are larger than the file")
+
+
+def _is_dense(value: Any) -> bool:
+    """Return whether a value is a plain tensor with numbers on the CPU."""
+    import torch
+
+    if not isinstance(value, torch.Tensor) or value.is_quantized or value.is_nested:
+        return False
+    return value.layout == torch.strided and value.device.type == "cpu"
 
 
 def _load_table(path: Path, *, is_mapped: bool = False) -> Mapping[Any, Any]:
     """Return the table of tensors. With ``is_mapped``, their numbers are read on first use."""
     if path.is_dir():
+        # torch reads archives only. Without mapping, as the archive is removed again.
         with TemporaryDirectory(prefix="mkpc-") as temporary:
             return _load_table(_pack(path, Path(temporary) / "checkpoint.pt"))
     if path.exists() and not path.is_file():
@@ -192,8 +213,9 @@ def _unpickle(path: Path, *, is_mapped: bool) -> object:
     """Return the contents of a torch checkpoint, with tensors on the CPU.
 
     Training frameworks pickle callbacks and settings whose classes are not installed here.
-    ``weights_only=True`` refuses them, so in archives their names are mapped to :class:`Inert`. Names of the
-    operating system are still refused. A checkpoint in the older format must not contain unknown names.
+    ``weights_only=True`` refuses them, so in archives their names are mapped to :class:`Inert`.
+    Names of the operating system are still refused. A checkpoint in the older format must not
+    contain unknown names.
     """
     import torch
     from torch.serialization import get_unsafe_globals_in_checkpoint, safe_globals
@@ -201,6 +223,7 @@ def _unpickle(path: Path, *, is_mapped: bool) -> object:
     if not zipfile.is_zipfile(path):
         return torch.load(path, map_location="cpu", weights_only=True)
     with zipfile.ZipFile(path) as archive:
+        # A zip bomb: a small file that would fill the memory.
         if sum(record.file_size for record in archive.infolist()) > path.stat().st_size:
             raise ValueError("its records are compressed or overlap, which torch never writes")
     with safe_globals([(Inert, name) for name in get_unsafe_globals_in_checkpoint(path)]):

@@ -1,11 +1,12 @@
 """The weights manifest: all files that matchers can use.
 
-``weights_manifest.txt`` has one line per file, with columns separated by blanks; ``#`` starts a comment::
+``weights_manifest.txt`` has one line per file, with columns separated by blanks; ``#`` starts a
+comment::
 
     name  bytes  digest  licence  slot  source
 
-``bytes`` is a number or ``?``. ``digest`` is ``sha256:<64 hex>`` or ``unverified``. Matchers request files by
-*slot*. Lines of one slot are alternatives: the first file that is found is used.
+``bytes`` is a number or ``?``. ``digest`` is ``sha256:<64 hex>`` or ``unverified``. Matchers request
+files by *slot*. Lines of one slot are alternatives: the first file that is found is used.
 """
 
 import errno
@@ -26,7 +27,7 @@ MANIFEST = "weights_manifest.txt"
 UNVERIFIED = "unverified"
 DIGEST = re.compile(rf"sha256:[0-9a-f]{{64}}|{UNVERIFIED}")
 BLOCK_BYTES = 1 << 20
-# Names a file in which processes that follow each other keep digests: 3 GB take half a minute
+# Names a file in which processes that follow each other keep digests: 3 GB take half a minute.
 DIGESTS = "MKPC_DIGESTS"
 
 
@@ -43,17 +44,21 @@ class WeightFile:
 
     @property
     def line(self) -> str:
+        """The line of a manifest, which :func:`parse_manifest` reads."""
         size = "?" if self.size < 0 else str(self.size)
-        return "  ".join((self.name, size, self.digest, self.licence, self.slot, self.source))
+        columns = (self.name, size, self.digest, self.licence, self.slot, self.source)
+        return "  ".join(columns)
 
 
 def parse_manifest(text: str, where: str = "the weights manifest") -> tuple[WeightFile, ...]:
     """Parse all lines of a manifest; raise :class:`UserError` with the number of an invalid line."""
-    numbered = enumerate(text.splitlines(), start=1)
-    lines = ((number, line.partition("#")[0].split(maxsplit=5)) for number, line in numbered)
-    return tuple(
-        _parse_line(columns, f"{where}, line {number}") for number, columns in lines if columns
-    )
+    files = []
+    for number, line in enumerate(text.splitlines(), start=1):
+        # The last column, the source, may contain blanks.
+        columns = line.partition("#")[0].split(maxsplit=5)
+        if columns:
+            files.append(_parse_line(columns, f"{where}, line {number}"))
+    return tuple(files)
 
 
 def read_manifest(path: Path) -> tuple[WeightFile, ...]:
@@ -63,9 +68,7 @@ def read_manifest(path: Path) -> tuple[WeightFile, ...]:
 
 @cache
 def manifest() -> tuple[WeightFile, ...]:
-    """Return the package's manifest: inside the package in a wheel, next to the package in a
-    checkout.
-    """
+    """Return the package's manifest: inside the package in a wheel, next to it in a checkout."""
     package = Path(__file__).resolve().parents[1]
     for path in (package / MANIFEST, package.parent / MANIFEST):
         if path.is_file():
@@ -74,9 +77,8 @@ def manifest() -> tuple[WeightFile, ...]:
 
 
 def pin(file: WeightFile, path: Path) -> None:
-    """Add the line of ``file``, with the size and digest of ``path``, to the manifest next to
-    ``path``.
-    """
+    """Add a line to the manifest next to ``path``: ``file`` with the size and digest of ``path``."""
+    # The whole text is written again: an append could be cut in the middle of a line.
     pinned = replace(file, size=path.stat().st_size, digest=digest_of(path))
     own = path.with_name(MANIFEST)
     former = own.read_text(encoding="utf-8") if own.is_file() else ""
@@ -91,18 +93,21 @@ def digest_of(path: Path) -> str:
     Raises ``OSError`` if a file cannot be read.
     """
     if path.is_dir():
-        files = sorted(file for file in path.rglob("*") if file.is_file())
-        lines = (f"{digest_of(file)[7:]} {file.relative_to(path).as_posix()}\n" for file in files)
+        lines = []
+        for file in sorted(file for file in path.rglob("*") if file.is_file()):
+            hexadecimal = digest_of(file).removeprefix("sha256:")
+            lines.append(f"{hexadecimal} {file.relative_to(path).as_posix()}\n")
         return f"sha256:{hashlib.sha256(''.join(lines).encode()).hexdigest()}"
     status = path.stat()
+    # A pipe or a device may never end.
     if not stat.S_ISREG(status.st_mode):
         raise OSError(errno.EINVAL, "not a regular file", str(path))
     return _file_digest(path.resolve(), status.st_size, status.st_mtime_ns)
 
 
 @cache
-# Size and time are part of the cache's key
 def _file_digest(path: Path, size: int, modified_ns: int) -> str:
+    """Return the digest of a file; size and time of change are part of the cache's key."""
     key = f"{size} {modified_ns} {path}"
     if found := _former_digests().get(key):
         return found
@@ -136,10 +141,13 @@ def _keep_digest(line: str) -> None:
 
 
 def _parse_line(columns: list[str], where: str) -> WeightFile:
+    """Return the file of a line's columns. Raise :class:`UserError` for an invalid column."""
     if len(columns) != 6:
         raise UserError(f"{where}: expected 6 columns, found {len(columns)}")
     name, size, digest, licence, slot, source = columns
-    if Path(name).name != name or name.startswith(".") or not "".join(columns).isprintable():
+    # A name must not lead out of the directory, nor hide, nor control a terminal.
+    is_plain = Path(name).name == name and not name.startswith(".")
+    if not is_plain or not "".join(columns).isprintable():
         raise UserError(f"{where}: {name!r} is not a plain file name")
     if size != "?" and not re.fullmatch("[0-9]{1,18}", size):
         raise UserError(f"{where}: bytes must be a number or '?', not {size[:20]!r}")
@@ -147,4 +155,5 @@ def _parse_line(columns: list[str], where: str) -> WeightFile:
         raise UserError(
             f"{where}: digest must be 'sha256:' with 64 hex digits or '{UNVERIFIED}', not {digest!r}"
         )
-    return WeightFile(name, -1 if size == "?" else int(size), digest, licence, slot, source.strip())
+    number = -1 if size == "?" else int(size)
+    return WeightFile(name, number, digest, licence, slot, source.strip())

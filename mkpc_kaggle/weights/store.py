@@ -27,10 +27,10 @@ if TYPE_CHECKING:
     import torch
 
 KAGGLE_INPUT = Path("/kaggle/input")
-# A competition's input has thousands of images
+# A competition's input has thousands of images.
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png"})
 CHECKPOINT_SUFFIXES = frozenset({".pth", ".pt", ".ckpt", ".safetensors", ".bin", ".pkl", ""})
-# Weights of unknown size have about 50 MB; larger files are not read
+# Weights of unknown size have about 50 MB; larger files are not read.
 MAX_UNKNOWN_SIZE_BYTES = 1 << 28
 UNPACKED = (
     "this checkpoint was unpacked into a directory, as Kaggle does; it is read from there, but cannot be held "
@@ -50,8 +50,9 @@ class State(StrEnum):
 class FoundFile:
     """A file that was compared with a line of the manifest.
 
-    ``path`` is a directory if the checkpoint is unpacked. ``digest`` is ``sha256:<hex>`` of the bytes, or
-    empty if the file is unreadable or its size is not in the manifest. ``note`` is the reason for the state.
+    ``path`` is a directory if the checkpoint is unpacked. ``digest`` is ``sha256:<hex>`` of the
+    bytes, or empty if the file is unreadable or its size is not in the manifest. ``note`` is the
+    reason for the state.
     """
 
     file: WeightFile
@@ -74,12 +75,11 @@ class Search:
 
 
 class WeightStore:
-    """Weight files in search directories: ``--weights``, then ``$MKPC_WEIGHTS``, then
-    ``/kaggle/input/**``.
+    """Weight files in the search directories.
 
-    Files are compared with the lines ``files``. By default, the lines are from the package's
-    manifest and from manifests in the search directories, which list weights that ``package``
-    converted.
+    These are ``--weights``, then ``$MKPC_WEIGHTS``, then ``/kaggle/input/**``. Files are compared
+    with the lines ``files``. By default, the lines are from the package's manifest and from
+    manifests in the search directories, which list weights that ``package`` converted.
     """
 
     def __init__(
@@ -89,9 +89,9 @@ class WeightStore:
         for directory in given:
             if not directory.is_dir():
                 raise UserError(f"--weights {directory}: no such directory")
-        self.directories = (
-            given + weights_of_environment() + ([KAGGLE_INPUT] if KAGGLE_INPUT.is_dir() else [])
-        )
+        self.directories = [*given, *weights_of_environment()]
+        if KAGGLE_INPUT.is_dir():
+            self.directories.append(KAGGLE_INPUT)
         self._given_files = files
         self._device = "cpu"
         self._chosen: dict[str, FoundFile] = {}  # by slot; they replace the results of searches
@@ -120,6 +120,7 @@ class WeightStore:
                 continue
             for file in here:
                 known = lines.setdefault(file.name, file)
+                # A digest of the package's manifest is never replaced.
                 if known.digest == UNVERIFIED:
                     lines[file.name] = replace(known, size=file.size, digest=file.digest)
         return tuple(lines.values())
@@ -152,33 +153,35 @@ class WeightStore:
 
         ``chosen`` are used for their slots instead of the files that a search would find.
         """
+        # A shallow copy shares the results of searches.
         other = copy.copy(self)
         other._device = "meta"
         other._chosen = {found.file.slot: found for found in chosen}
         return other
 
     def search(self, lines: Sequence[WeightFile]) -> Search:
-        """Return the first usable file for these lines. Results are cached and sent to workers with
-        the store.
+        """Return the first usable file for these lines.
+
+        Results are cached and sent to workers with the store.
         """
         key = tuple(lines)
         if key not in self._searches:
-            # By path; comparison by digest replaces comparison by name
+            # By path; comparison by digest replaces comparison by name.
             judged: dict[Path, FoundFile] = {}
             for file in self._candidates(lines):
                 judged[file.path] = file
                 if file.usable:
                     break
             found = next((file for file in judged.values() if file.usable), None)
-            self._searches[key] = Search(
-                found, tuple(file for file in judged.values() if not file.usable)
-            )
+            refused = tuple(file for file in judged.values() if not file.usable)
+            self._searches[key] = Search(found, refused)
         return self._searches[key]
 
     def verify(self) -> list[FoundFile]:
         """Return all files whose name or digest is in the manifest, sorted by path."""
-        # The first per path
-        found = {file.path: file for file in reversed([*self._candidates(self.files)])}
+        found: dict[Path, FoundFile] = {}
+        for file in self._candidates(self.files):
+            found.setdefault(file.path, file)  # the first per path
         return [found[path] for path in sorted(found)]
 
     def _candidates(self, lines: Sequence[WeightFile]) -> Iterator[FoundFile]:
@@ -186,16 +189,23 @@ class WeightStore:
         for file in lines:
             for path in self._by_name.get(file.name, ()):
                 yield judge(path, file, self.files)
-        for file in (line for line in lines if line.digest != UNVERIFIED):
+        # Renamed files. Only files of the right size are read.
+        sizes, unpacked = self._walked
+        for file in lines:
+            if file.digest == UNVERIFIED:
+                continue
             if file.size < 0:
                 alike = self._small_by_digest.get(file.digest, [])
             else:
-                alike = [path for path, size in self._walked[0].items() if size == file.size]
-            found = (judge(path, file) for path in alike)
-            yield from (each for each in found if each.state is State.GOOD)
+                alike = [path for path, size in sizes.items() if size == file.size]
+            for path in alike:
+                found = judge(path, file)
+                if found.state is State.GOOD:
+                    yield found
         for file in lines:
-            directories = (path for path in self._walked[1] if is_unpacked_from(path, file))
-            yield from (judge(directory, file) for directory in directories)
+            for directory in unpacked:
+                if is_unpacked_from(directory, file):
+                    yield judge(directory, file)
 
     # Indexes of the files: a directory may have a hundred thousand, the manifest has dozens of
     # lines.
@@ -219,11 +229,10 @@ class WeightStore:
 
     @cached_property
     def _walked(self) -> tuple[dict[Path, int], list[Path]]:
-        """Size in bytes of each file except images, shallow files first (-1: not regular); unpacked
-        checkpoints.
+        """The size in bytes of each file, shallow files first, and unpacked checkpoints.
 
-        Links are followed, since Kaggle mounts inputs by links. No directory is visited twice, so
-        cycles end.
+        Images are left out; a file that is not regular has size -1. Links are followed, since
+        Kaggle mounts inputs by links. No directory is visited twice, so cycles end.
         """
         sizes: dict[Path, int] = {}
         unpacked: list[Path] = []
@@ -231,17 +240,17 @@ class WeightStore:
         for root in self.directories:
             files: list[Path] = []
             for folder, folders, names in os.walk(root, followlinks=True):
-                place, is_checkpoint = (
-                    os.path.realpath(folder),
-                    "data" in folders and "data.pkl" in names,
-                )
-                if place in entered or is_checkpoint:
+                real = os.path.realpath(folder)
+                is_checkpoint = "data" in folders and "data.pkl" in names
+                if real in entered or is_checkpoint:
                     folders.clear()  # os.walk skips the subfolders
-                if is_checkpoint and place not in entered:
+                if is_checkpoint and real not in entered:
                     unpacked.append(Path(folder))  # an archive that Kaggle unpacked
-                elif place not in entered:
+                elif real not in entered:
                     files += [Path(folder, name) for name in names]
-                entered.add(place)
+                entered.add(real)
+            # Shallow files win over deep ones of the same name, and the order is the same on all
+            # file systems.
             for path in sorted(files, key=lambda path: (len(path.parts), path)):
                 if path.suffix.lower() not in IMAGE_SUFFIXES:
                     sizes[path] = path.stat().st_size if os.path.isfile(path) else -1  # noqa: PTH113  never raises
@@ -249,14 +258,16 @@ class WeightStore:
 
 
 def judge(path: Path, file: WeightFile, files: Iterable[WeightFile] = ()) -> FoundFile:
-    """Compare the file, or unpacked checkpoint, at ``path`` with ``file``; ``files`` is the whole
-    manifest.
+    """Compare the file, or unpacked checkpoint, at ``path`` with ``file``.
+
+    ``files`` is the whole manifest, to name another file that has these bytes.
     """
     try:
         unpacked = (path / "data.pkl").is_file()
         if path.is_dir() and not unpacked:
             return FoundFile(file, path, State.REFUSED, "", "it is a directory")
         size = path.stat().st_size
+        # Most wrong files have another size, and need not be read.
         wrong_size = f"{size} bytes, the manifest says {file.size}: truncated, or another file"
         if path.is_file() and not _may_be(size, file, files):
             return FoundFile(file, path, State.REFUSED, "", wrong_size)
@@ -264,28 +275,29 @@ def judge(path: Path, file: WeightFile, files: Iterable[WeightFile] = ()) -> Fou
     except OSError as error:
         return FoundFile(file, path, State.REFUSED, "", f"cannot be read: {error.strerror}")
     other = next((line.name for line in files if line.digest == digest), "")
-    state, note = State.REFUSED, ""
+    state = State.REFUSED
     if digest == file.digest:
-        state, note = State.GOOD, "" if path.name == file.name else f"it is {file.name}"
+        state = State.GOOD
+        note = "" if path.name == file.name else f"it is {file.name}"
     elif unpacked:
-        state, note = State.UNVERIFIED, UNPACKED
+        state = State.UNVERIFIED
+        note = UNPACKED
     elif other:
         note = f"it has the bytes of {other}"
     elif 0 <= file.size != size:
         note = wrong_size
     elif file.digest == UNVERIFIED:
-        state, note = (
-            State.UNVERIFIED,
-            f"the manifest has no digest for it; this file's is {digest}",
-        )
+        state = State.UNVERIFIED
+        note = f"the manifest has no digest for it; this file's is {digest}"
     else:
         note = f"its digest is {digest}, the manifest says {file.digest}: damaged, or another file"
     return FoundFile(file, path, state, digest, note)
 
 
 def _may_be(size: int, file: WeightFile, files: Iterable[WeightFile]) -> bool:
-    """Return whether a file of ``size`` bytes may have the content of ``file`` or of one of
-    ``files``.
-    """
-    may_be_any = size <= MAX_UNKNOWN_SIZE_BYTES and any(line.size < 0 for line in files)
-    return file.size < 0 or may_be_any or size in (file.size, *(line.size for line in files))
+    """Return whether a file of ``size`` bytes may have the content of one of the manifest's files."""
+    if file.size < 0 or size == file.size:
+        return True
+    sizes = [line.size for line in files]
+    has_unknown = any(known < 0 for known in sizes)
+    return size in sizes or (has_unknown and size <= MAX_UNKNOWN_SIZE_BYTES)

