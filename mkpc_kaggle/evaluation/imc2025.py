@@ -1,9 +1,8 @@
-"""The score of the Image Matching Challenge 2025, for clusters of mixed images and for their
-cameras.
+"""The score of the Image Matching Challenge 2025: clusters of mixed images, and their cameras.
 
-``train_labels.csv`` has ``dataset,scene,image,rotation_matrix,translation_vector``, ``train_thresholds.csv`` has
-``dataset,scene,thresholds``; numbers in a cell are joined by ``;``, and poses map world to camera. An image of
-``outliers`` belongs to no scene.
+``train_labels.csv`` has ``dataset,scene,image,rotation_matrix,translation_vector``,
+``train_thresholds.csv`` has ``dataset,scene,thresholds``. Numbers in a cell are joined by ``;``, and
+poses map world to camera. An image of ``outliers`` belongs to no scene.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -28,14 +27,18 @@ MIN_SPREAD = 1e-12  # sum of squared distances from the mean; centres with a sma
 MAX_NUMBER = 1e12  # in a cell; keeps squares of derived numbers finite
 
 Points = NDArray[np.float64]  # (N, 3)
-# Camera centre (3,) by image, in a scene or cluster; NaN without a camera
+# Camera centre (3,) by image, in a scene or cluster; NaN without a camera.
 Centres = Mapping[str, Points]
 Parts = Mapping[str, Centres]  # the scenes or the clusters of a dataset, by name
 
 
 @dataclass(frozen=True)
 class DatasetScore:
-    """``maa`` is pooled over scenes; ``clusterness`` is the share of correct images in the scenes' clusters."""
+    """The score of a dataset.
+
+    ``maa`` is pooled over scenes. ``clusterness`` is the share of correct images in the scenes'
+    clusters.
+    """
 
     dataset: str
     maa: float
@@ -54,77 +57,93 @@ def score_imc2025(directory: Path, submission: Path) -> list[DatasetScore]:
     Raises :class:`UserError` for unreadable files, for numbers that cannot be scored, and for a
     missing, unknown or repeated image or dataset.
     """
-    labels, path = directory / "train_labels.csv", directory / "train_thresholds.csv"
-    truth, found, thresholds = _centres(labels), _centres(submission), _thresholds(path)
+    labels = directory / "train_labels.csv"
+    path = directory / "train_thresholds.csv"
+    truth = _centres(labels)
+    found = _centres(submission)
+    thresholds = _thresholds(path)
     for name, scenes in truth.items():
-        placed = {
-            image: centre
-            for scene in scenes.keys() - {OUTLIERS}
-            for image, centre in scenes[scene].items()
-        }
-        if unplaced := [image for image, centre in placed.items() if not np.isfinite(centre).all()]:
-            image = shown(f"{name}/{unplaced[0]}")
-            raise UserError(f"{labels}: {image} has no pose, and is not of the scene {OUTLIERS}")
-        images, given = (
-            {image for part in parts.values() for image in part}
-            for parts in (scenes, found.get(name, {}))
-        )
-        if wrong := images ^ given:
+        _require_poses(labels, name, scenes)
+        if wrong := _images(scenes) ^ _images(found.get(name, {})):
             message = f"{len(wrong)} images of {name} are missing or unknown, such as {min(wrong)}"
             raise UserError(f"{submission}: {shown(message)}")
-        if lacking := [
-            scene for scene in scenes if scene not in (OUTLIERS, *thresholds.get(name, ()))
-        ]:
-            raise UserError(f"{path} has no thresholds of {shown(f'{name}/{lacking[0]}')}")
+        for scene in scenes:
+            if scene != OUTLIERS and scene not in thresholds.get(name, {}):
+                raise UserError(f"{path} has no thresholds of {shown(f'{name}/{scene}')}")
     for file, named in ((submission, found), (path, thresholds)):
         if unknown := named.keys() - truth.keys():
             raise UserError(f"{file}: {labels} lacks the dataset {min(unknown)!r}")
-    return [
-        score_dataset(name, scenes, found[name], thresholds.get(name, {}))
-        for name, scenes in truth.items()
-    ]
+    scores = []
+    for name, scenes in truth.items():
+        # A dataset of outliers only needs no thresholds.
+        scores.append(score_dataset(name, scenes, found[name], thresholds.get(name, {})))
+    return scores
+
+
+def _images(parts: Parts) -> set[str]:
+    """Return the images of all scenes or clusters."""
+    return {image for part in parts.values() for image in part}
+
+
+def _require_poses(labels: Path, name: str, scenes: Parts) -> None:
+    """Raise :class:`UserError` for an image of a scene without a pose."""
+    for scene, centres in scenes.items():
+        for image, centre in centres.items():
+            if scene != OUTLIERS and not np.isfinite(centre).all():
+                raise UserError(
+                    f"{labels}: {shown(f'{name}/{image}')} has no pose, "
+                    f"and is not of the scene {OUTLIERS}"
+                )
 
 
 def score_dataset(
     name: str, scenes: Parts, clusters: Parts, thresholds: Mapping[str, Sequence[float] | Points]
 ) -> DatasetScore:
-    """Return the score of a dataset. Each scene takes the cluster with most of its images; mAA
-    decides ties.
+    """Return the score of a dataset.
 
-    The mAA's numerators and denominators are summed over the scenes before the division.
+    Each scene takes the cluster with most of its images; mAA decides ties. The mAA's numerators and
+    denominators are summed over the scenes before the division.
     """
     accurate = possible = common = taken = 0
     for scene in scenes.keys() - {OUTLIERS}:
-        centres, limits = scenes[scene], thresholds[scene][SKIPPED_THRESHOLDS:]
-        choices = [
-            (len(shared), accurate_images(centres, cluster, limits), len(cluster))
-            for label, cluster in clusters.items()
-            if label != OUTLIERS and (shared := centres.keys() & cluster.keys())
-        ]
+        centres = scenes[scene]
+        limits = thresholds[scene][SKIPPED_THRESHOLDS:]
+        # Of each cluster: common images, accurate images, all images.
+        choices = []
+        for label, cluster in clusters.items():
+            shared = centres.keys() & cluster.keys()
+            if label != OUTLIERS and shared:
+                count = accurate_images(centres, cluster, limits)
+                choices.append((len(shared), count, len(cluster)))
         overlap, count, size = max(choices, key=lambda each: each[:2], default=(0, 0, 0))
-        accurate, possible = accurate + count, possible + len(limits) * max(len(centres) - FREE, 0)
-        common, taken = common + overlap, taken + size
-    return DatasetScore(
-        name, accurate / possible if possible else 0.0, common / taken if taken else 0.0
-    )
+        accurate += count
+        possible += len(limits) * max(len(centres) - FREE, 0)
+        common += overlap
+        taken += size
+    maa = accurate / possible if possible else 0.0
+    clusterness = common / taken if taken else 0.0
+    return DatasetScore(name, maa, clusterness)
 
 
 def accurate_images(truth: Centres, cluster: Centres, thresholds: Sequence[float] | Points) -> int:
-    """Return the number of images beyond ``FREE`` whose centre is within a threshold, summed over
-    thresholds.
+    """Return the number of accurate images beyond ``FREE``, summed over thresholds.
 
     For each threshold, the best similarity of three images is refitted to its inliers. Inliers are
     images whose transformed cluster centre is within the threshold of the scene's.
     """
-    common = sorted(
-        name for name in truth.keys() & cluster.keys() if np.isfinite(cluster[name]).all()
-    )
+    shared = truth.keys() & cluster.keys()
+    # In a fixed order, as the triplets may be a random sample.
+    common = sorted(name for name in shared if np.isfinite(cluster[name]).all())
     if len(common) < FREE:
         return 0
-    source, target = (np.array([centres[name] for name in common]) for centres in (cluster, truth))
-    tried, total = residuals(source, target, _triplets(len(common))), 0
+    source = np.array([cluster[name] for name in common])
+    target = np.array([truth[name] for name in common])
+    tried = residuals(source, target, _triplets(len(common)))  # (B, N)
+    total = 0
     for threshold in thresholds:
-        near = tried[(tried < threshold).sum(axis=1).argmax()] < threshold
+        most = (tried < threshold).sum(axis=1).argmax()
+        near = tried[most] < threshold
+        # At least the three images that any similarity fits.
         best = FREE
         for _ in range(REFINEMENTS):
             best = max(best, int(near.sum()))
@@ -136,26 +155,32 @@ def accurate_images(truth: Centres, cluster: Centres, thresholds: Sequence[float
 
 
 def residuals(source: Points, target: Points, fitted: NDArray[np.intp]) -> NDArray[np.float64]:
-    """Fit a similarity to each row of indices, ``fitted`` (B, k), and return the distances (B, N)
-    from ``target``.
+    """Fit a similarity to each row of indices ``fitted`` (B, k); return the distances (B, N).
 
-    Distances are NaN if the fitted sources coincide.
-
-    Source: Umeyama 1991, the solution of Horn's problem by a singular value decomposition.
+    Distances are from ``target``, of all transformed sources; they are NaN if the fitted sources
+    coincide. Source: Umeyama 1991, the solution of Horn's problem by a singular value
+    decomposition.
     """
-    x, y = source[fitted], target[fitted]
-    x_mean, y_mean = x.mean(axis=1, keepdims=True), y.mean(axis=1, keepdims=True)
-    U, S, Vt = np.linalg.svd(np.swapaxes(y - y_mean, 1, 2) @ (x - x_mean))
+    x = source[fitted]  # (B, k, 3)
+    y = target[fitted]
+    x_mean = x.mean(axis=1, keepdims=True)
+    y_mean = y.mean(axis=1, keepdims=True)
+    covariance = np.swapaxes(y - y_mean, 1, 2) @ (x - x_mean)  # (B, 3, 3)
+    U, S, Vt = np.linalg.svd(covariance)
+    # A reflection becomes a rotation by the sign of the smallest singular value.
     sign = np.sign(np.linalg.det(U @ Vt))
     U[:, :, 2] *= sign[:, None]
     S[:, 2] *= sign
     spread = ((x - x_mean) ** 2).sum(axis=(1, 2))
     scale = S.sum(axis=1) / np.where(spread < MIN_SPREAD, np.nan, spread)
-    moved = scale[:, None, None] * (source - x_mean) @ np.swapaxes(U @ Vt, 1, 2) + y_mean
+    R = U @ Vt  # (B, 3, 3)
+    scaled = scale[:, None, None] * (source - x_mean)  # (B, N, 3)
+    moved = scaled @ np.swapaxes(R, 1, 2) + y_mean
     return np.asarray(np.linalg.norm(moved - target, axis=2))
 
 
 def _triplets(count: int) -> NDArray[np.intp]:
+    """Return triplets (B, 3) of ``count`` images: all, or a random sample of them."""
     if count * (count - 1) * (count - 2) // 6 <= MAX_TRIPLETS:
         return np.array(list(combinations(range(count), 3)), np.intp)
     drawn = np.random.default_rng(0).random((MAX_TRIPLETS, count))
@@ -185,20 +210,23 @@ def _centres(path: Path) -> dict[str, dict[str, dict[str, Points]]]:
         if (dataset, image) in seen:
             raise UserError(f"{where}: the image {shown(f'{dataset}/{image}')} is there twice")
         seen.add((dataset, image))
+        # An image of an outlier or without a camera has NaN in every number.
         R, t = (_numbers(cell, where) for cell in cells)
         if (len(R), len(t)) != (9, 3):
             raise UserError(
                 f"{where}: expected 9 and 3 numbers joined by ';', found {len(R)} and {len(t)}"
             )
-        found.setdefault(dataset, {}).setdefault(scene, {})[image] = -R.reshape(3, 3).T @ t
+        scenes = found.setdefault(dataset, {})
+        scenes.setdefault(scene, {})[image] = -R.reshape(3, 3).T @ t  # the camera's centre
     if not found:
         raise UserError(f"{path} has no rows to score")
     return found
 
 
 def _numbers(cell: str, where: str) -> Points:
-    """Return the numbers of a cell, which may be NaN. Raise :class:`UserError` for a malformed or
-    huge number.
+    """Return the numbers of a cell, which may be NaN.
+
+    Raises :class:`UserError` for a malformed or huge number.
     """
     try:
         found = np.array([float(part) for part in cell.split(";")])

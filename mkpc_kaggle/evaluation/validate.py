@@ -33,8 +33,9 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 MAX_NAMES = 5  # of samples to list in a line
-MATCHING = ("precision", "matching_score")
+MATCHING = ("precision", "matching_score")  # the order of ``PairScore.matching``
 
+# OpenCV's RANSAC as in both published evaluations: 1 pixel, and 0.5 pixels for LoFTR.
 SUPERGLUE = RobustConfig(Method.RANSAC, 1.0, max_iterations=1000, permutations=1, every_match=True)
 PROTOCOLS = {"superglue": SUPERGLUE, "loftr": replace(SUPERGLUE, threshold=0.5)}
 
@@ -51,8 +52,9 @@ class Step(StrEnum):
 class PairScore:
     """One pair's error, infinite if the pair failed, and the pair's record if the engine ran.
 
-    ``steps`` has the error after each :class:`Step` of the run; the last equals ``error``. ``matching``, for pairs
-    of a list, is correct matches over all matches (precision) and over keypoints of image 0 (matching score).
+    ``steps`` has the error after each :class:`Step` of the run; the last equals ``error``.
+    ``matching``, for pairs of a list, is correct matches over all matches (precision) and over
+    keypoints of image 0 (matching score).
     """
 
     id: str
@@ -82,22 +84,22 @@ class SceneScore:
 
     def accuracies(self, step: Step | None = None) -> list[float]:
         """Return the accuracy of each pair after a step, by default the last."""
-        return [
-            metrics.pair_accuracy(pair.steps[step] if step else pair.error) for pair in self.pairs
-        ]
+        errors = [pair.steps[step] if step else pair.error for pair in self.pairs]
+        return [metrics.pair_accuracy(error) for error in errors]
 
     def maa(self, step: Step | None = None) -> float:
         """Return the mean of :meth:`accuracies`: the mAA of the Image Matching Challenge 2022."""
+        # Without metres, no translation error meets a threshold: 0 would be misleading.
         return mean(self.accuracies(step)) if self.in_metres else nan
 
     def auc(self, threshold: float) -> float:
+        """Return the pose AUC up to ``threshold`` degrees."""
         return metrics.pose_auc(self.errors, threshold)
 
     @property
     def matching(self) -> list[float]:
-        return [
-            mean(column) for column in zip(*(pair.matching for pair in self.pairs), strict=True)
-        ]
+        """The mean precision and the mean matching score of the pairs."""
+        return _column_means([pair.matching for pair in self.pairs])
 
 
 @dataclass(frozen=True)
@@ -115,23 +117,28 @@ class Validation:
     missing: tuple[str, ...] = ()
 
     def maa(self, step: Step | None = None) -> float:
-        """Return the competition's figure: the mean of the scenes' mAA after a step, by default the
-        last.
+        """Return the competition's figure: the mean of the scenes' mAA after a step.
+
+        By default after the last step.
         """
         return mean(scene.maa(step) for scene in self.scenes)
 
     def auc(self, threshold: float) -> float:
+        """Return the mean of the scenes' pose AUC up to ``threshold`` degrees."""
         return mean(scene.auc(threshold) for scene in self.scenes)
 
     @property
     def matching(self) -> list[float]:
-        return [
-            mean(column) for column in zip(*(scene.matching for scene in self.scenes), strict=True)
-        ]
+        """The means over scenes of precision and matching score."""
+        return _column_means([scene.matching for scene in self.scenes])
 
     @property
     def errors(self) -> list[PoseError]:
         return [error for scene in self.scenes for error in scene.errors]
+
+
+def _column_means(rows: Sequence[Sequence[float]]) -> list[float]:
+    return [mean(column) for column in zip(*rows, strict=True)]
 
 
 def by_protocol(recipe: Recipe, protocol: str) -> Recipe:
@@ -140,13 +147,16 @@ def by_protocol(recipe: Recipe, protocol: str) -> Recipe:
     Scoring by a protocol also sets ``in_front`` of :func:`validate`. SuperGlue's threshold is in
     pixels of the resized image, whose long side is the largest of stage 1.
     """
+    # Both published evaluations resize by OpenCV's bilinear filter, without antialiasing.
     units = tuple(replace(unit, antialias=False) for unit in recipe.units)
-    sides = [
-        unit.long_side or max(map(int, unit.area.split("x"))) for unit in units if unit.stage == 1
-    ]
-    magsac = replace(
-        PROTOCOLS[protocol], threshold_side=max(sides) if protocol == "superglue" else 0
-    )
+    magsac = PROTOCOLS[protocol]
+    if protocol == "superglue":
+        sides = []
+        for unit in units:
+            if unit.stage == 1:
+                sides.append(unit.long_side or max(map(int, unit.area.split("x"))))
+        magsac = replace(magsac, threshold_side=max(sides))
+    # A published evaluation estimates each pair by itself, and has no prior.
     return replace(recipe, units=units, magsac=magsac, focal=None, scene=None)
 
 
@@ -158,47 +168,58 @@ def validate(
     *,
     in_front: bool = False,
 ) -> Validation:
-    """Run the recipe on the pairs of all scenes, whose images lie below ``root``, and score the
-    results.
+    """Run the recipe on the pairs of all scenes, and score the results.
 
-    With ``in_front``, the inliers of an E select one of its two rotations.
+    Images lie below ``root``. With ``in_front``, the inliers of an E select one of its two
+    rotations.
     """
-    report = run_pairs(
-        [true.pair for scene in scenes for true in scene.pairs], assembly, session, root=root
-    )
-    prior = assembly.recipe.focal is not None
-    made = {  # with known focal lengths, E has no step before the prior
-        Step.MAGSAC: not prior
-        or any(record.magsac_fundamental is not None for record in report.records),
-        Step.PRIOR: prior,
-        Step.SCENE: any(record.scene is not None for record in report.records),
-    }
-    steps = tuple(step for step in Step if made[step])
-    records, scored = iter(report.records), []
+    pairs = [true.pair for scene in scenes for true in scene.pairs]
+    report = run_pairs(pairs, assembly, session, root=root)
+    steps = _steps(report, has_prior=assembly.recipe.focal is not None)
+    records = iter(report.records)  # in the order of the pairs
+    scored = []
     for scene in scenes:
-        pairs = [score_record(true, next(records), scene, steps, in_front) for true in scene.pairs]
-        if not (in_metres := isfinite(scene.metres_per_unit)):
+        scores = [score_record(true, next(records), scene, steps, in_front) for true in scene.pairs]
+        in_metres = isfinite(scene.metres_per_unit)
+        # A list of pairs: its evaluations publish precision and matching score, too.
+        if not in_metres:
             with Store.read(session.work_dir) as store:
                 table = Table.of(store)
-                pairs = [
-                    with_matching(*each, store, table)
-                    for each in zip(pairs, scene.pairs, strict=True)
-                ]
-        scored.append(SceneScore(scene.name, tuple(pairs), in_metres))
+                both = zip(scores, scene.pairs, strict=True)
+                scores = [with_matching(score, true, store, table) for score, true in both]
+        scored.append(SceneScore(scene.name, tuple(scores), in_metres))
     return Validation(assembly.recipe.name, tuple(scored), report, steps)
 
 
+def _steps(report: RunReport, *, has_prior: bool) -> tuple[Step, ...]:
+    """Return the steps that a run made."""
+    steps = []
+    # With known focal lengths, E has no step before the prior.
+    if not has_prior or any(each.magsac_fundamental is not None for each in report.records):
+        steps.append(Step.MAGSAC)
+    if has_prior:
+        steps.append(Step.PRIOR)
+    if any(each.scene is not None for each in report.records):
+        steps.append(Step.SCENE)
+    return tuple(steps)
+
+
 def with_matching(pair: PairScore, true: TruePair, store: Store, table: Table) -> PairScore:
-    """Return the score with ``matching`` set; the matching score is NaN if numbers of keypoints are
-    unknown.
+    """Return the score with ``matching`` set.
+
+    The matching score is NaN if numbers of keypoints are unknown.
     """
     assert pair.record is not None
     matches = Matches.concatenate(read_points(store, table, pair.record.index).values())
     units = pair.record.units
+    # All matches, not only inliers, as in SuperGlue's evaluation.
     correct = metrics.correct_matches(matches, true.camera0, true.camera1).sum()
+    # Dense matchers have matches and no keypoints.
     is_known = all(unit.keypoints or not unit.matches for unit in units)
-    score = correct / max(sum(unit.keypoints for unit in units), 1) if is_known else nan
-    return replace(pair, matching=(correct / max(len(matches), 1), score))
+    keypoints = sum(unit.keypoints for unit in units)
+    precision = correct / max(len(matches), 1)
+    score = correct / max(keypoints, 1) if is_known else nan
+    return replace(pair, matching=(precision, score))
 
 
 def score_record(
@@ -212,10 +233,13 @@ def score_record(
     rotation = Rotation.from_rotvec(record.stats.rotation).as_matrix() if in_front else None
     own = None if record.failure else record.pair_fundamental
     matrices = {
+        # Without a prior, the pair's F is MAGSAC's.
         Step.MAGSAC: record.magsac_fundamental if Step.PRIOR in steps else own,
         Step.PRIOR: own,
+        # The row of the submission: the scene's F, else the pair's.
         Step.SCENE: None if record.source == "fallback" else record.chosen_fundamental,
     }
+    # The last step's error is the pair's, also where a step was not made.
     errors = {step: error_of(matrix, true, scene, rotation) for step, matrix in matrices.items()}
     made = {step: errors[step] for step in steps}
     return PairScore(
@@ -226,23 +250,24 @@ def score_record(
 def error_of(
     matrix: Matrix3 | None, true: TruePair, scene: TrainScene, rotation: Matrix3 | None = None
 ) -> PoseError:
-    """Return the error of a pair's F, or of its E with a given rotation. It is infinite without a
-    matrix.
-    """
+    """Return the error of a pair's F, or of its E with a given rotation; infinite without one."""
     if matrix is None:
         return PoseError.failed()
-    camera0, camera1 = true.camera0, true.camera1
+    camera0 = true.camera0
+    camera1 = true.camera1
     if true.pair.intrinsics is not None:
-        camera0, camera1 = camera0.calibrated, camera1.calibrated
+        # The matrix is an E, the F of calibrated cameras.
+        camera0 = camera0.calibrated
+        camera1 = camera1.calibrated
     return metrics.pose_error(matrix, camera0, camera1, scene.metres_per_unit, rotation)
 
 
 def score_submission(submission: Path, truth: Path, scenes: Sequence[TrainScene]) -> Validation:
     """Score a submission whose samples are known pairs of a train side.
 
-    ``truth`` is a table ``sample_id,scene,image_1_id,image_2_id``, with the image names of the train side.
-    Samples missing from the table or the scenes are left out; samples missing from the submission count as failed.
-    Raises :class:`UserError` for unreadable files.
+    ``truth`` is a table ``sample_id,scene,image_1_id,image_2_id``, with the image names of the
+    train side. Samples missing from the table or the scenes are left out; samples missing from the
+    submission count as failed. Raises :class:`UserError` for unreadable files.
     """
     found = read_submission(submission)
     columns = ("sample_id", "scene", "image_1_id", "image_2_id")
@@ -250,17 +275,23 @@ def score_submission(submission: Path, truth: Path, scenes: Sequence[TrainScene]
     known: dict[str, tuple[str, Matrix3 | None]] = {}
     for _, (sample, scene, first, second) in read_rows(truth, columns):
         F = found.get(sample)
-        known[f"{scene};{first}-{second}"] = sample, F
-        known[f"{scene};{second}-{first}"] = sample, None if F is None else F.T
-    scored, missing = [], []
+        known[f"{scene};{first}-{second}"] = (sample, F)
+        # x2^T F x1 = x1^T F^T x2.
+        known[f"{scene};{second}-{first}"] = (sample, None if F is None else F.T)
+    scored = []
+    missing = []
     for there in scenes:
-        of_scene = [(true, *known[true.pair.id]) for true in there.pairs if true.pair.id in known]
-        missing += [sample for _, sample, F in of_scene if F is None]
-        pairs = tuple(
-            PairScore(true.pair.id, true.pair.names, true.covisibility, error_of(F, true, there))
-            for true, _, F in of_scene
-        )
-        scored += [SceneScore(there.name, pairs)] if pairs else []
+        pairs = []
+        for true in there.pairs:
+            if true.pair.id not in known:
+                continue
+            sample, F = known[true.pair.id]
+            if F is None:
+                missing.append(sample)
+            error = error_of(F, true, there)
+            pairs.append(PairScore(true.pair.id, true.pair.names, true.covisibility, error))
+        if pairs:
+            scored.append(SceneScore(there.name, tuple(pairs)))
     if len(missing) == sum(len(scene.pairs) for scene in scored):
         raise UserError(f"{truth} names no pair of the scenes that {submission} has a row for")
     return Validation(submission.name, tuple(scored), missing=tuple(missing))
@@ -275,7 +306,8 @@ def score_table(validation: Validation) -> list[str]:
     table = score_frame(validation)
     figures = table.drop(columns=["scene", "pairs"])
     lines = [f"{'scene':<20}{'pairs':>6}" + "".join(f"{head:>9}" for head in figures)]
-    for name, count, values in zip(table["scene"], table["pairs"], figures.to_numpy(), strict=True):
+    rows = zip(table["scene"], table["pairs"], figures.to_numpy(), strict=True)
+    for name, count, values in rows:
         cells = (f"{value:>9.4f}" if isfinite(value) else f"{'-':>9}" for value in values)
         lines.append(f"{name:<20}{count:>6}" + "".join(cells))
     if missing := validation.missing:
@@ -287,14 +319,15 @@ def score_table(validation: Validation) -> list[str]:
 
 
 def score_frame(validation: Validation) -> "DataFrame":
-    """Return the scores as a table: a row for each scene and one for their mean, NaN for unknown
-    figures.
+    """Return the scores as a table: a row for each scene and one for their mean.
 
-    The columns are the scene, its number of pairs, and the figures of :func:`score_table`.
+    The columns are the scene, its number of pairs, and the figures of :func:`score_table`; unknown
+    figures are NaN.
     """
     from pandas import DataFrame  # the import takes most of a second
 
     is_list = not all(scene.in_metres for scene in validation.scenes)
+    # A single step needs no name: the column is the mAA.
     steps = validation.steps if len(validation.steps) > 1 else ["mAA"]
     heads = [*map(str, steps), *(f"AUC {angle:.0f}" for angle in AUC_THRESHOLDS)]
     heads += ["precis.", "m.score"] if is_list else []
@@ -311,25 +344,24 @@ def score_frame(validation: Validation) -> "DataFrame":
 
 
 def to_json(validation: Validation) -> dict[str, Any]:
-    """Return all figures as JSON values: overall, per scene and per pair; null for non-finite
-    numbers.
+    """Return all figures as JSON values: overall, per scene and per pair.
+
+    Numbers that are not finite are null.
     """
-    steps, report = validation.steps, validation.report
+    steps = validation.steps
+    report = validation.report
+    scenes = []
+    for scene in validation.scenes:
+        pairs = [_pair_json(pair) for pair in scene.pairs]
+        scenes.append({"scene": scene.scene, **_scores_json(scene, steps), "pairs": pairs})
     figures = {
         "recipe": validation.recipe,
         "missing": validation.missing,
         **_scores_json(validation, steps),
         "seconds": report and report.seconds,
-        "scenes": [
-            {
-                "scene": scene.scene,
-                **_scores_json(scene, steps),
-                "pairs": [*map(_pair_json, scene.pairs)],
-            }
-            for scene in validation.scenes
-        ],
+        "scenes": scenes,
     }
-    # NaN and infinity
+    # Python writes NaN and Infinity, which JSON does not have.
     values: dict[str, Any] = json.loads(json.dumps(figures), parse_constant=lambda _: None)
     return values
 
@@ -355,6 +387,7 @@ def _pair_json(pair: PairScore) -> dict[str, Any]:
             step: metrics.pair_accuracy(error) for step, error in pair.steps.items()
         },
     }
+    # A submission from a file has no record.
     if (record := pair.record) is not None:
         values |= {"failure": record.failure, "inliers": record.inliers}
         values["matches"] = {unit.unit: unit.matches for unit in record.units}

@@ -14,6 +14,7 @@ from mkpc_kaggle.matchers.registry import load_matcher, require_matchers
 from mkpc_kaggle.pipeline.availability import (
     FAULTS,
     Licence,
+    UnavailableReason,
     left_out,
     options_of,
     refusal,
@@ -36,7 +37,7 @@ class Assembly:
     recipe: Recipe
     weights: WeightStore
     placement: Placement
-    # The recipe's unavailable matchers, grouped by cause, for messages
+    # The recipe's unavailable matchers, grouped by cause, for messages.
     left_out: tuple[str, ...] = ()
     matchers: Mapping[str, Matcher[Any]] = field(default_factory=dict)  # the user's ready matchers
     device: str = AUTO  # as named by the user
@@ -46,13 +47,15 @@ class Assembly:
 
     @property
     def devices(self) -> tuple[str, ...]:
+        """The devices of the placement, one by one: "cuda" means all GPUs."""
         device = self.placement.device
-        return (
-            ("cpu",) if device == "cpu" else tuple(f"cuda:{number}" for number in gpus_of(device))
-        )
+        if device == "cpu":
+            return ("cpu",)
+        return tuple(f"cuda:{number}" for number in gpus_of(device))
 
     @property
     def minibatch(self) -> int:
+        """The number of pairs to match at a time."""
         return CUDA_MINIBATCH if self.placement.device.startswith("cuda") else 1
 
     def on(self, device: str, sharing: int = 1) -> "Assembly":
@@ -69,11 +72,13 @@ class Assembly:
         """
         device = self.placement.device
         require_device(device)
+        # If half precision overflows, a matcher is loaded again with this placement.
         exact = replace(self.placement, precision=Precision.FLOAT32)
         cache_bytes = ENCODING_CACHE_BYTES
         if device != "cpu":
             import torch
 
+            # Of a GPU's own memory: encodings stay where they were computed.
             free, _ = torch.cuda.mem_get_info(device)  # most of the GPU is still free
             cache_bytes = int(free * CACHE_SHARE / self.sharing)
         return Pipeline(
@@ -89,18 +94,20 @@ class Assembly:
     def unit_settings(self, unit: Unit) -> dict[str, Any]:
         """Return all settings that determine a unit's points on given views, as JSON values."""
         name = unit.matcher
-        slots = slots_of(self.recipe, {name} - self.matchers.keys())
+        fields = asdict(unit)
+        # The matcher is settled, and scenes read the points without changing them.
+        del fields["fallback"], fields["tracks"]
+        weights = {}
+        for slot in slots_of(self.recipe, {name} - self.matchers.keys()):
+            if slot in self.weight_files:
+                weights[slot] = self.weight_files[slot].digest
+        # Nothing is known of the options of a user's matcher.
+        is_own = name in self.matchers
         return {
-            "unit": {
-                key: value
-                for key, value in asdict(unit).items()
-                if key not in ("fallback", "tracks")
-            },
-            "options": None if name in self.matchers else asdict(options_of(self.recipe, name)),
+            "unit": fields,
+            "options": None if is_own else asdict(options_of(self.recipe, name)),
             "precision": self.placement.precision,
-            "weights": {
-                slot: file.digest for slot, file in self.weight_files.items() if slot in slots
-            },
+            "weights": weights,
         }
 
     @property
@@ -110,12 +117,15 @@ class Assembly:
     @cached_property
     def weight_files(self) -> dict[str, FoundFile]:
         """The weight files of the recipe's matchers, by slot."""
-        slots = slots_of(
-            self.recipe, [name for name in self.recipe.matcher_names if name not in self.matchers]
-        )
-        return {slot: file for slot in slots if (file := self.weights.find(slot))}
+        names = [name for name in self.recipe.matcher_names if name not in self.matchers]
+        files = {}
+        for slot in slots_of(self.recipe, names):
+            if (file := self.weights.find(slot)) is not None:
+                files[slot] = file
+        return files
 
     def _load(self, name: str, placement: Placement) -> Matcher[Any]:
+        # The user's matcher has its own precision, and is not loaded twice.
         given = self.matchers.get(name)
         return given or load_matcher(name, self.weights, options_of(self.recipe, name), placement)
 
@@ -132,8 +142,7 @@ def assemble(
     matchers: Mapping[str, Matcher[Any]] | None = None,
     settings: Mapping[str, Any] = MappingProxyType({}),
 ) -> Assembly:
-    """Check recipe, options, licences, weights, device and precision before any work, and return
-    the assembly.
+    """Check recipe, options, licences, weights, device and precision; return the assembly.
 
     A fallback replaces an unavailable matcher. Without one, recipe ``auto`` drops its units, and so
     does every recipe if the matcher cannot be loaded. ``scenes`` switches the reconstruction of
@@ -149,30 +158,47 @@ def assemble(
     if settings:
         written = with_settings(written, settings)
     reasons = unavailable(written, store, licence, own)
-    chosen = written.with_fallbacks(reasons)
-    lacking = {name: reasons[name] for name in chosen.matcher_names if name in reasons}
-    faulty = {name for name, reason in reasons.items() if reason.kind in FAULTS}
-    refused = {
-        unit.matcher: reasons[unit.matcher]
-        for asked, unit in zip(written.units, chosen.units, strict=True)
-        if unit.matcher in reasons and not faulty & {asked.matcher, unit.matcher}
-    }
-    if refused and recipe != AUTO:
-        raise refusal(chosen, refused)
-    if not any(unit.stage == 1 and unit.matcher not in lacking for unit in chosen.units):
-        raise refusal(chosen, lacking)
-    for name in dict.fromkeys((*written.matcher_names, *chosen.matcher_names)):
-        if name in faulty:
-            warn_once(f"recipe {written.name} does without {name}: {reasons[name]}")
+    chosen = _without_unavailable(written, reasons, is_auto=recipe == AUTO)
     for name in sorted(chosen.matchers.keys() - own.keys() - reasons.keys()):
         options_of(chosen, name)  # check the options of unused matchers too
     omitted = {name: reasons[name] for name in written.matcher_names if name in reasons}
     texts = left_out(written, omitted, is_auto=recipe == AUTO)
-    chosen = chosen.without(lacking).with_scenes(scenes).in_mode(mode)
+    chosen = chosen.with_scenes(scenes).in_mode(mode)
     made = Assembly(chosen, store, resolve_placement(device, precision), texts, own, device)
-    unverified = (
-        file.path.name for file in made.weight_files.values() if file.state is State.UNVERIFIED
-    )
-    if listed := ", ".join(sorted(unverified)):
-        warn_once(f"weights not verified: {listed}; `mkpc weights verify` says why")
+    _warn_of_unverified(made.weight_files.values())
     return made
+
+
+def _without_unavailable(
+    written: Recipe, reasons: Mapping[str, UnavailableReason], *, is_auto: bool
+) -> Recipe:
+    """Return the recipe with fallbacks, without the units of unavailable matchers.
+
+    Raises :class:`UserError` if that would not be the recipe that the user asked for, or if no unit
+    of stage 1 remains.
+    """
+    chosen = written.with_fallbacks(reasons)
+    missing = {name: reasons[name] for name in chosen.matcher_names if name in reasons}
+    faulty = {name for name, reason in reasons.items() if reason.kind in FAULTS}
+    # A run does without a faulty matcher. Missing weights, and a licence that is not permitted, are
+    # the user's to settle, except for ``auto``, which takes the available weights.
+    refused = {}
+    for asked, unit in zip(written.units, chosen.units, strict=True):
+        if unit.matcher in reasons and not faulty & {asked.matcher, unit.matcher}:
+            refused[unit.matcher] = reasons[unit.matcher]
+    if refused and not is_auto:
+        raise refusal(chosen, refused)
+    if not any(unit.stage == 1 and unit.matcher not in missing for unit in chosen.units):
+        raise refusal(chosen, missing)
+    for name in dict.fromkeys((*written.matcher_names, *chosen.matcher_names)):
+        if name in faulty:
+            warn_once(f"recipe {written.name} does without {name}: {reasons[name]}")
+    return chosen.without(missing)
+
+
+def _warn_of_unverified(files: Iterable[FoundFile]) -> None:
+    """Warn of weights without a digest, if there are any."""
+    names = sorted(file.path.name for file in files if file.state is State.UNVERIFIED)
+    if names:
+        listed = ", ".join(names)
+        warn_once(f"weights not verified: {listed}; `mkpc weights verify` says why")

@@ -4,7 +4,6 @@ from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from enum import StrEnum
-from itertools import chain
 from types import MappingProxyType
 from typing import Any
 
@@ -20,25 +19,30 @@ PERMISSIVE_TAGS = frozenset({"Apache-2.0", "BSD-3-Clause", "MIT"})
 
 
 class Licence(StrEnum):
+    """The user's choice of weights by their licence."""
+
     ANY = "any"
     PERMISSIVE = "permissive"  # usable for any purpose: Apache-2.0, BSD-3-Clause, MIT
 
 
 class UnavailableKind(StrEnum):
+    """Causes, with the texts of messages."""
+
     NOT_IMPORTABLE = "cannot be used here"
     NOT_PERMITTED = "weights not permitted"
     NO_WEIGHTS = "no weights"
     UNREADABLE = "weights cannot be loaded"
 
 
-# The other kinds are the user's choices
+# The other kinds are the user's choices.
 FAULTS = (UnavailableKind.NOT_IMPORTABLE, UnavailableKind.UNREADABLE)
 
 
 @dataclass(frozen=True)
 class UnavailableReason:
-    """Reason why a matcher is unavailable; ``detail`` is the error, the licences, or the missing
-    files.
+    """Reason why a matcher is unavailable.
+
+    ``detail`` is the error, the licences, or the missing files.
     """
 
     kind: UnavailableKind
@@ -61,38 +65,57 @@ def unavailable(
     the manifest's digest may still not fit the network. Raises :class:`UserError` for an unknown
     matcher or option.
     """
+    names = [name for unit in recipe.units for name in (unit.matcher, unit.fallback) if name]
+    reasons = {}
+    for name in dict.fromkeys(names):
+        if name in own:
+            # A ready matcher has its weights; only licences count.
+            reason = _without_licence(set(own[name].spec.licences), licence)
+        else:
+            reason = _reason(name, recipe, store, licence)
+        if reason is not None:
+            reasons[name] = reason
+    return reasons
 
-    def reason_for(name: str) -> UnavailableReason | None:
-        try:
-            spec = own[name].spec if name in own else spec_of(name, f"recipe {recipe.name!r}")
-            options = None if name in own else options_of(recipe, name)
-        except UnusableError as error:
-            return UnavailableReason(
-                UnavailableKind.NOT_IMPORTABLE, reason_of(error.__cause__ or error)
-            )
-        found = {
-            slot: store.find(slot) for slot in (() if name in own else spec.slots_for(options))
-        }
-        files = [file for file in found.values() if file is not None]
-        missing = tuple(slot for slot, file in found.items() if file is None)
-        lines = chain((file.file for file in files), *map(store.alternatives, missing))
-        others = {*spec.licences, *(line.licence for line in lines)} - PERMISSIVE_TAGS
-        if others and licence is Licence.PERMISSIVE:
-            return UnavailableReason(UnavailableKind.NOT_PERMITTED, ", ".join(sorted(others)))
-        if missing:
-            names = (
-                f"{slot}: {' or '.join(file.name for file in store.alternatives(slot))}"
-                for slot in missing
-            )
-            return UnavailableReason(UnavailableKind.NO_WEIGHTS, "; ".join(names), missing)
-        if files and (problem := misfit(name, store, options)):
-            return UnavailableReason(UnavailableKind.UNREADABLE, problem)
+
+def _reason(
+    name: str, recipe: Recipe, store: WeightStore, licence: Licence
+) -> UnavailableReason | None:
+    """Return why a matcher cannot run here, or ``None``."""
+    try:
+        spec = spec_of(name, f"recipe {recipe.name!r}")
+        options = options_of(recipe, name)
+    except UnusableError as error:
+        detail = reason_of(error.__cause__ or error)
+        return UnavailableReason(UnavailableKind.NOT_IMPORTABLE, detail)
+    found = {slot: store.find(slot) for slot in spec.slots_for(options)}
+    missing = tuple(slot for slot, file in found.items() if file is None)
+
+    # Of missing files, too: nobody should fetch what the run would refuse.
+    licences = set(spec.licences)
+    for slot, file in found.items():
+        lines = store.alternatives(slot) if file is None else [file.file]
+        licences |= {line.licence for line in lines}
+    refused = _without_licence(licences, licence)
+    if refused is not None:
+        return refused
+    if missing:
+        texts = []
+        for slot in missing:
+            names = " or ".join(file.name for file in store.alternatives(slot))
+            texts.append(f"{slot}: {names}")
+        return UnavailableReason(UnavailableKind.NO_WEIGHTS, "; ".join(texts), missing)
+    if found and (problem := misfit(name, store, options)):
+        return UnavailableReason(UnavailableKind.UNREADABLE, problem)
+    return None
+
+
+def _without_licence(licences: set[str], licence: Licence) -> UnavailableReason | None:
+    """Return the reason if the user's choice of licences excludes one of these."""
+    others = licences - PERMISSIVE_TAGS
+    if not others or licence is not Licence.PERMISSIVE:
         return None
-
-    names = dict.fromkeys(
-        name for unit in recipe.units for name in (unit.matcher, unit.fallback) if name
-    )
-    return {name: reason for name in names if (reason := reason_for(name)) is not None}
+    return UnavailableReason(UnavailableKind.NOT_PERMITTED, ", ".join(sorted(others)))
 
 
 @dataclass(frozen=True)
@@ -113,6 +136,7 @@ def fit_of(found: FoundFile, store: WeightStore) -> Fit:
     fitting: list[str] = []
     untried: list[str] = []
     try:
+        # Also a file that no matcher uses must be readable.
         load_tensors(found.path, "meta")
         for name in matcher_names():
             with suppress(UnusableError):
@@ -120,8 +144,10 @@ def fit_of(found: FoundFile, store: WeightStore) -> Fit:
                 if (options := spec.options_for(slot)) is None:
                     continue
                 others = [other for other in spec.slots_for(options) if other != slot]
+                # A network of two files cannot be tried with one.
                 missing = [other for other in others if store.find(other) is None]
                 problem = "" if missing else misfit(name, store.on_meta(found), options)
+                # Another file of the matcher may be at fault; messages name the slot.
                 if repr(slot) in problem:
                     raise UserError(problem)
                 if missing or problem:
@@ -136,10 +162,9 @@ def fit_of(found: FoundFile, store: WeightStore) -> Fit:
 
 
 def refusal(recipe: Recipe, reasons: Mapping[str, UnavailableReason]) -> UserError:
-    """Return an error that names the matchers unavailable for the first kind of reason, and the
-    remedy.
-    """
+    """Return an error that names the matchers unavailable for the first reason, and the remedy."""
     kind = next(iter(reasons.values())).kind
+    # One kind at a time: each has another remedy.
     those = "; ".join(
         f"{name} ({reason.detail})" for name, reason in reasons.items() if reason.kind is kind
     )
@@ -150,6 +175,7 @@ def refusal(recipe: Recipe, reasons: Mapping[str, UnavailableReason]) -> UserErr
         )
     if kind is UnavailableKind.NO_WEIGHTS:
         what = f"recipe {recipe.name!r} needs weights that were not found: {those}"
+        # ``weights fetch`` knows the names of the package's recipes only.
         is_ours = recipe.name in recipe_names()
         slots = dict.fromkeys(slot for reason in reasons.values() for slot in reason.slots)
         command = f"mkpc weights fetch {recipe.name if is_ours else ' '.join(slots)} --out DIR"
@@ -167,31 +193,33 @@ def left_out(
     """Return a text for each kind of reason, such as "no weights: loma, superglue", for a summary.
 
     Missing weights come with the command that gets them. Recipe auto could use several GB under any
-    licence; the advice is then the recipe light, unless its weights are there.
+    licence; the advice is then the recipe light, unless its weights are available.
     """
     texts = []
     for kind in dict.fromkeys(reason.kind for reason in reasons.values()):
         names = [name for name, reason in reasons.items() if reason.kind is kind]
+        # Only missing weights have slots.
         slots = list(dict.fromkeys(slot for name in names for slot in reasons[name].slots))
         if is_auto:
             light = load_recipe("light")
             slots = ["light"] if set(slots) & set(slots_of(light, light.matcher_names)) else []
         command = f"mkpc weights fetch {' '.join(slots)} --out DIR"
-        texts.append(
-            f"{kind}: {', '.join(names)}" + (f" (`{command}` gets weights)" if slots else "")
-        )
+        text = f"{kind}: {', '.join(names)}"
+        texts.append(f"{text} (`{command}` gets weights)" if slots else text)
     return tuple(texts)
 
 
 def options_of(recipe: Recipe, name: str) -> Any:
     """Return the matcher's default options, overridden by the recipe's table ``[matchers.NAME]``."""
-    where, table = f"recipe {recipe.name!r}", recipe.matchers.get(name, {})
+    where = f"recipe {recipe.name!r}"
+    table = recipe.matchers.get(name, {})
     return from_table(spec_of(name, where).options, table, f"{where}, table [matchers.{name}]")
 
 
 def slots_of(recipe: Recipe, names: Iterable[str]) -> tuple[str, ...]:
-    """Return the distinct slots of a recipe's named matchers. Skip matchers that cannot be
-    imported.
+    """Return the distinct slots of a recipe's named matchers.
+
+    Matchers that cannot be imported are skipped.
     """
     slots: list[str] = []
     for name in names:

@@ -32,17 +32,17 @@ print(json.dumps([torch.cuda.get_device_capability(gpu) for gpu in gpus]))
 
 
 def resolve_placement(device: str, precision: str) -> Placement:
-    """Return the placement that the user named. ``auto`` means all GPUs ("cuda"), or "cpu" if no
-    GPU computes.
+    """Return the placement that the user named.
 
-    Raises :class:`UserError` for an unknown name or a missing GPU, ``TypeError`` if ``device`` is
-    not a string.
+    ``auto`` means all GPUs ("cuda"), or "cpu" if no GPU computes. Raises :class:`UserError` for an
+    unknown name or a missing GPU, ``TypeError`` if ``device`` is not a string.
     """
     if not isinstance(device, str):
         raise TypeError(f"a device is text such as 'cuda:0', not {device!r}")
     import torch
 
     if device == AUTO:
+        # PyTorch may see a GPU that its build cannot use, so one must compute first.
         try:
             device = "cuda" if torch.cuda.is_available() and gpu_capabilities() else "cpu"
         except UserError as error:
@@ -50,39 +50,34 @@ def resolve_placement(device: str, precision: str) -> Placement:
             device = "cpu"
     elif device != "cpu":
         gpus_of(device)
-    if precision not in (AUTO, *Precision):
+    if precision == AUTO:
+        return Placement(device, fastest_precision(device))
+    if precision not in list(Precision):
         raise UserError(f"unknown precision {precision!r}; known: auto, {', '.join(Precision)}")
-    return Placement(
-        device, fastest_precision(device) if precision == AUTO else Precision(precision)
-    )
+    return Placement(device, Precision(precision))
 
 
 def fastest_precision(device: str) -> Precision:
-    """Return half precision if the CPU, or every GPU of the device, has units for it; otherwise
-    float32.
-    """
+    """Return half precision if the CPU, or every GPU of the device, has units for it, else float32."""
     import torch
 
     if device.startswith("cuda"):
+        # One precision for the whole run.
         capabilities = gpu_capabilities()
         able = all(capabilities[gpu] >= TENSOR_CORES for gpu in gpus_of(device))
         return Precision.FLOAT16 if able else Precision.FLOAT32
     # Older versions of PyTorch do not report capabilities; then float32 is safe.
     flags: dict[str, Any] = getattr(torch.cpu, "get_capabilities", dict)()
-    return (
-        Precision.BFLOAT16
-        if flags.get("avx512_bf16") or flags.get("amx_bf16")
-        else Precision.FLOAT32
-    )
+    able = bool(flags.get("avx512_bf16") or flags.get("amx_bf16"))
+    return Precision.BFLOAT16 if able else Precision.FLOAT32
 
 
 def gpus_of(device: str) -> list[int]:
-    """Return the numbers of the GPUs that ``cuda`` or ``cuda:N`` names. Counting GPUs creates no
-    CUDA context.
-    """
+    """Return the numbers of the GPUs that ``cuda`` or ``cuda:N`` names."""
     import torch
 
     kind, _, number = device.partition(":")
+    # Counting creates no CUDA context: the workers' parent needs none.
     count = torch.cuda.device_count() if torch.cuda.is_available() else 0
     if kind != "cuda" or (device != kind and not number.isdecimal()):
         raise UserError(f"unknown device {device!r}; known: auto, cpu, cuda, cuda:N")
@@ -98,15 +93,18 @@ def gpus_of(device: str) -> list[int]:
 
 @cache
 def gpu_capabilities() -> list[tuple[int, int]]:
-    """Return the compute capability of each GPU, such as (7, 5). Raise :class:`UserError` if no GPU
-    computes.
+    """Return the compute capability of each GPU, such as (7, 5).
+
+    Raises :class:`UserError` if no GPU computes.
     """
-    command, timeout = [sys.executable, "-c", ASK_CAPABILITIES], PROBE_TIMEOUT_S
+    command = [sys.executable, "-c", ASK_CAPABILITIES]
+    timeout = PROBE_TIMEOUT_S
     try:
         asked = subprocess.run(
             command, input="", capture_output=True, text=True, check=True, timeout=timeout
         )
-        return [(major, minor) for major, minor in json.loads(asked.stdout.splitlines()[-1])]
+        answer = asked.stdout.splitlines()[-1]  # libraries may print lines before it
+        return [(major, minor) for major, minor in json.loads(answer)]
     except subprocess.CalledProcessError as error:
         reason = error.stderr.strip()[-300:] or f"exit status {error.returncode}"
     except subprocess.TimeoutExpired:

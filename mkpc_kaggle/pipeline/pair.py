@@ -15,6 +15,7 @@ from mkpc_kaggle.geometry.robust import Estimate, ModelKind, estimate, rotation_
 from mkpc_kaggle.recipe import Recipe, Unit
 
 Regions = tuple[CriticalRegion, CriticalRegion]
+# A complete value, so that an interrupted pair has a row like any other.
 NOT_ESTIMATED = Estimate.failed(ModelKind.F, 0, "not estimated yet")
 
 
@@ -33,16 +34,19 @@ class UnitResult:
 
     @property
     def seconds(self) -> float:
+        """The time of both steps."""
         return self.encode_seconds + self.match_seconds
 
 
 @dataclass(frozen=True, eq=False)
 class PairMatch:
-    # In the order of execution; once estimated, in the recipe's order
+    """A pair with its results so far; each step returns a new one."""
+
+    # In the order of execution; once estimated, in the recipe's order.
     results: tuple[UnitResult, ...] = ()
     regions: Regions | None = None  # None until a unit of stage 2 needs them
     estimate: Estimate = NOT_ESTIMATED
-    # Both, while units run; afterwards only ``sizes`` and ``focals`` remain
+    # Both, while units run; afterwards only ``sizes`` and ``focals`` remain.
     images: tuple[Image, ...] = ()
     sizes: tuple[Size, ...] = ()
     focals: tuple[float, ...] = ()
@@ -57,12 +61,14 @@ class PairMatch:
 
     @property
     def inliers(self) -> Matches:
+        """The matches within MAGSAC's threshold of the model."""
         return self.matches[self.estimate.inliers]
 
     def in_stage(self, stage: int) -> NDArray[np.bool_]:
         """Return the (N,) mask of the ``matches`` that units of this stage found."""
         chosen = [result.unit.stage == stage for result in self.results]
-        return np.repeat(np.array(chosen, bool), [len(result.matches) for result in self.results])
+        counts = [len(result.matches) for result in self.results]
+        return np.repeat(np.array(chosen, bool), counts)
 
 
 def with_estimate(
@@ -76,23 +82,37 @@ def with_estimate(
     The matches are sorted in the recipe's order, because MAGSAC's result depends on it. The
     recipe's focal prior, if any, uses the images' sizes and EXIF, or ``intrinsics`` if given.
     """
-    results = tuple(sorted(pair.results, key=lambda result: recipe.units.index(result.unit)))
+    ordered = sorted(pair.results, key=lambda result: recipe.units.index(result.unit))
+    results = tuple(ordered)
     matches = Matches.concatenate(result.matches for result in results)
     sizes = pair.sizes or tuple(image.size for image in pair.images)
     magsac = recipe.magsac.in_stored_pixels(sizes, intrinsics)
+    # The prior is on the focal lengths of F and E.
     if recipe.focal is None or model is ModelKind.H:
         found = estimate(matches, magsac, model, intrinsics)
     else:
-        focals = pair.focals or tuple(image.focal for image in pair.images)
-        told = zip(sizes, focals, strict=True)
-        known = [FocalPrior(K, 0.0) for K in intrinsics or ()]
-        first, second = known or [FocalPrior.of_image(size, focal) for size, focal in told]
+        if intrinsics is not None:
+            priors = [FocalPrior(K, 0.0) for K in intrinsics]  # known: no deviation
+        else:
+            focals = pair.focals or tuple(image.focal for image in pair.images)
+            both = zip(sizes, focals, strict=True)
+            priors = [FocalPrior.of_image(size, focal) for size, focal in both]
+        first, second = priors
         found = estimate_with_prior(matches, (first, second), magsac, recipe.focal, model)
     if found.ok and model is not ModelKind.H:
-        K0, K1 = intrinsics if intrinsics and model is ModelKind.E else (np.eye(3), np.eye(3))
-        F = np.linalg.inv(K1).T @ found.matrix @ np.linalg.inv(K0)
-        found = replace(found, stats=replace(found.stats, support=support(F, matches)))
-        if model is ModelKind.E and intrinsics and found.inliers.any():
-            rotation = tuple(rotation_in_front(found.matrix, matches[found.inliers], intrinsics))
-            found = replace(found, stats=replace(found.stats, rotation=rotation))
+        found = _with_stats(found, matches, intrinsics if model is ModelKind.E else None)
     return replace(pair, results=results, estimate=found)
+
+
+def _with_stats(
+    found: Estimate, matches: Matches, intrinsics: tuple[Matrix3, Matrix3] | None
+) -> Estimate:
+    """Return an F, or an E with ``intrinsics``, with its support, and for an E its rotation."""
+    K0, K1 = intrinsics or (np.eye(3), np.eye(3))
+    # The overlap test compares points in pixels, so an E becomes an F.
+    F = np.linalg.inv(K1).T @ found.matrix @ np.linalg.inv(K0)
+    stats = replace(found.stats, support=support(F, matches))
+    if intrinsics and found.inliers.any():
+        rotation = rotation_in_front(found.matrix, matches[found.inliers], intrinsics)
+        stats = replace(stats, rotation=tuple(rotation))
+    return replace(found, stats=stats)

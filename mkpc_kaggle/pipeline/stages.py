@@ -9,7 +9,6 @@ import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from itertools import chain
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -29,7 +28,7 @@ from mkpc_kaggle.matchers.failures import FailureKind, failure_of, reason_of, re
 from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
 from mkpc_kaggle.recipe import Recipe, Unit
 
-ENCODING_CACHE_BYTES = 2 << 30
+ENCODING_CACHE_BYTES = 2 << 30  # on a CPU; the assembly gives the size for a GPU
 
 GivenRegions = Mapping[tuple[str, ...], tuple[Box, Box]]  # by the names of both images
 
@@ -41,11 +40,11 @@ class UnloadableError(UserError):
 class Pipeline:
     """Pipeline that runs a recipe's units on chunks of pairs and loads each matcher on first use.
 
-    ``load(name)`` returns a matcher. If half precision overflows, ``load_float32(name)`` replaces the matcher
-    permanently. ``minibatch`` is the number of pairs to match at a time, and of views of one shape to encode. A
-    unit that runs out of memory halves its minibatch from then on. Encodings of whole images, which many pairs
-    share, are cached up to ``cache_bytes``. ``regions`` replace MKPC's critical regions. Matches with a point that
-    ``masks`` leave out are dropped.
+    ``load(name)`` returns a matcher. If half precision overflows, ``load_float32(name)`` replaces
+    the matcher permanently. ``minibatch`` is the number of pairs to match at a time, and of views
+    of one shape to encode. A unit that runs out of memory halves its minibatch from then on.
+    Encodings of whole images, which many pairs share, are cached up to ``cache_bytes``. ``regions``
+    replace MKPC's critical regions. Matches with a point that ``masks`` leave out are dropped.
     """
 
     def __init__(
@@ -60,10 +59,13 @@ class Pipeline:
         masks: Masks | None = None,
     ) -> None:
         self._masks = MaskReader(masks or Masks())
-        self.recipe, self.minibatch, self.regions = recipe, minibatch, regions
-        self._load, self._load_float32 = load, load_float32
-        self._minibatches: dict[Unit, int] = {}
-        self._ran: set[Unit] = set()
+        self.recipe = recipe
+        self.minibatch = minibatch
+        self.regions = regions
+        self._load = load
+        self._load_float32 = load_float32
+        self._minibatches: dict[Unit, int] = {}  # of units that ran out of memory
+        self._ran: set[Unit] = set()  # their times no longer include a warm-up
         self._matchers: dict[str, Matcher[Any]] = {}
         self._unloadable: dict[str, Exception] = {}  # by matcher; its units fail with the error
         self._notes: dict[str, str] = {}  # on matchers that fell back to float32
@@ -75,6 +77,7 @@ class Pipeline:
         Raises device and memory errors, and the first matcher's error if none can be loaded.
         """
         for name in self.recipe.matcher_names:
+            # Remembered in ``_unloadable``.
             with suppress(UnloadableError):
                 self._matcher(name)
         if not self._matchers:
@@ -83,10 +86,7 @@ class Pipeline:
     @property
     def unloadable(self) -> dict[str, str]:
         """The reason for each matcher that could not be loaded."""
-        return {
-            name: str(error) if isinstance(error, UserError) else reason_of(error)
-            for name, error in self._unloadable.items()
-        }
+        return {name: _text_of(error) for name, error in self._unloadable.items()}
 
     def match(
         self,
@@ -94,60 +94,65 @@ class Pipeline:
         units: Iterable[Unit],
         may_start: Callable[[Unit], bool] = lambda _: True,
     ) -> list[PairMatch]:
-        """Run each unit on the pairs that have no result of it: stage 1, the critical regions,
-        stage 2.
+        """Run each unit on the pairs that have no result of it.
 
-        ``may_start(unit)`` is called before each minibatch of a unit; False stops the unit. If a matcher raises,
-        the minibatch's pairs run one by one, and a pair that raises again gets a result with this failure. Raises
-        device errors, memory errors on a single pair (see :mod:`mkpc_kaggle.matchers.failures`), and
-        :class:`UserError` in a forked child.
+        First the units of stage 1, then the critical regions, then the units of stage 2.
+        ``may_start(unit)`` is called before each minibatch of a unit; False stops the unit. If a
+        matcher raises, the minibatch's pairs run one by one, and a pair that raises again gets a
+        result with this failure. Raises device errors, memory errors on a single pair (see
+        :mod:`mkpc_kaggle.matchers.failures`), and :class:`UserError` in a forked child.
         """
         require_unforked()
-        pairs, units = list(pairs), list(units)
-        for unit in (unit for unit in units if unit.stage == 1):
-            self._run(unit, pairs, may_start)
-        if any(unit.stage == 2 for unit in units):
+        # The caller's list stays as it is; ``_run`` replaces entries of this one.
+        pairs = list(pairs)
+        units = list(units)
+        for unit in units:
+            if unit.stage == 1:
+                self._run(unit, pairs, may_start)
+        crops = [unit for unit in units if unit.stage == 2]
+        if crops:
             pairs = [with_regions(pair, self.recipe, self.regions) for pair in pairs]
-        for unit in (unit for unit in units if unit.stage == 2):
+        for unit in crops:
             self._run(unit, pairs, may_start)
         return pairs
 
     def _run(self, unit: Unit, pairs: list[PairMatch], may_start: Callable[[Unit], bool]) -> None:
         """Add the unit's results to the pairs, in place."""
-        waiting = [
-            n
-            for n, pair in enumerate(pairs)
-            if unit not in (result.unit for result in pair.results)
-        ]
+        waiting = []
+        for number, pair in enumerate(pairs):
+            if unit not in (result.unit for result in pair.results):
+                waiting.append(number)
         while waiting and may_start(unit):
             numbers = waiting[: self._minibatches.get(unit, self.minibatch)]
             results = self._run_minibatch(unit, [pairs[number] for number in numbers])
+            # No results: the same pairs are tried again, in float32 or fewer at a time.
             for number, result in zip(numbers[: len(results)], results, strict=True):
                 pairs[number] = replace(pairs[number], results=(*pairs[number].results, result))
             waiting = waiting[len(results) :]
 
     def _run_minibatch(self, unit: Unit, pairs: list[PairMatch]) -> list[UnitResult]:
-        """Return the unit's result on each pair, or an empty list to retry in float32 or on fewer
-        pairs.
+        """Return the unit's result on each pair.
+
+        An empty list means: try again, in float32 or on fewer pairs.
         """
         try:
             return self._match(unit, pairs)
         except Exception as error:
             failure = failure_of(error)
-            if isinstance(error, NonFiniteError) and self._fall_back_to_float32(
-                unit.matcher, error
-            ):
+            # A NaN may also come from the pictures; then float32 raises again, and the pair fails.
+            is_overflow = isinstance(error, NonFiniteError)
+            if is_overflow and self._fall_back_to_float32(unit.matcher, error):
                 return []
             if failure is FailureKind.RAISED and len(pairs) == 1:
                 reason = str(error) if isinstance(error, UnloadableError) else reason_of(error)
                 return [UnitResult(unit, Matches.empty(), failure=reason)]
-            # One by one, and again if the matcher falls back to float32
             if failure is FailureKind.RAISED:
-                alone = (
-                    self._run_minibatch(unit, [pair]) or self._run_minibatch(unit, [pair])
-                    for pair in pairs
-                )
-                return list(chain.from_iterable(alone))
+                # One by one, and again if the matcher falls back to float32.
+                results = []
+                for pair in pairs:
+                    alone = self._run_minibatch(unit, [pair])
+                    results += alone or self._run_minibatch(unit, [pair])
+                return results
             if failure is FailureKind.DEVICE or len(pairs) == 1:
                 error.add_note(f"in {unit.name}")
                 raise
@@ -159,69 +164,78 @@ class Pipeline:
         self._minibatches[unit] = len(pairs) // 2
         return []
 
-    def _fall_back_to_float32(self, name: str, error: NonFiniteError) -> bool:
+    def _fall_back_to_float32(self, name: str, error: Exception) -> bool:
         """Switch the matcher to float32. Return False if it cannot switch or has switched before."""
         if self._load_float32 is None or name in self._notes:
             return False
         self._notes[name] = f"{name} runs in float32, for in half precision {error}"
         warnings.warn(self._notes[name], RuntimeWarning, stacklevel=2)
+        # Encodings in half precision would be matched in float32.
         self._encodings = ByteCache(self._encodings.limit)
         self._matchers[name] = self._load_float32(name)
         return True
 
     def _match(self, unit: Unit, pairs: list[PairMatch]) -> list[UnitResult]:
+        """Encode and match the unit's views of the pairs, in one minibatch."""
         matcher = self._matcher(unit.matcher)
         views = [views_of(unit, matcher.spec.multiple, pair) for pair in pairs]
         start = time.perf_counter()
-        shown = [
-            zip(pair.images, both, strict=True) for pair, both in zip(pairs, views, strict=True)
-        ]
-        encodings = self._encode(unit, list(chain.from_iterable(shown)))
+        shown: list[tuple[Image, View]] = []
+        for pair, both in zip(pairs, views, strict=True):
+            shown += zip(pair.images, both, strict=True)
+        encodings = self._encode(unit, shown)
         encoded = time.perf_counter()
+        firsts = encodings[::2]
         with exact_float32():
-            found = matcher.match(encodings[::2], encodings[1::2])
+            found = matcher.match(firsts, encodings[1::2])
         matched = time.perf_counter()
         warm_up = unit not in self._ran
         self._ran.add(unit)
-        return [
-            UnitResult(
+        results = []
+        for pair, both, encoding, matches in zip(pairs, views, firsts, found, strict=True):
+            in_image = self._unmasked(matches.to_image(*both), pair.images)
+            result = UnitResult(
                 unit,
-                self._unmasked(matches.to_image(*both), pair.images).best(unit.max_matches),
+                in_image.best(unit.max_matches),
                 (encoded - start) / len(pairs),
                 (matched - encoded) / len(pairs),
                 warm_up=warm_up,
                 note=self._notes.get(unit.matcher, ""),
                 keypoints=len(getattr(encoding, "points", ())),
             )
-            for matches, both, encoding, pair in zip(
-                found, views, encodings[::2], pairs, strict=True
-            )
-        ]
+            results.append(result)
+        return results
 
     def _unmasked(self, matches: Matches, images: Sequence[Image]) -> Matches:
         """Return the matches with both points on pixels that the images' masks leave."""
         first, second = images
-        shown = self._masks.shows(first.name, matches.points0, first.size)
-        return matches[shown & self._masks.shows(second.name, matches.points1, second.size)]
+        shown0 = self._masks.shows(first.name, matches.points0, first.size)
+        shown1 = self._masks.shows(second.name, matches.points1, second.size)
+        return matches[shown0 & shown1]
 
     def _encode(self, unit: Unit, wanted: Sequence[tuple[Image, View]]) -> list[Any]:
         """Return the encodings of views: cached ones, and the others computed one shape at a time."""
         matcher = self._matcher(unit.matcher)
         is_gray = matcher.spec.colour is Colour.GRAY
+        # Units of one matcher that see the same view share its encoding.
         keys = [(unit.matcher, image.name, view) for image, view in wanted]
+        # Held here, as the cache may drop an encoding before it is matched.
         known = {key: self._encodings.get(key) for key in keys}
-        missing = {
-            key: image for key, (image, _) in zip(keys, wanted, strict=True) if known[key] is None
-        }
+        missing: dict[tuple[str, str, View], Image] = {}  # a view of several pairs once
+        for key, (image, _) in zip(keys, wanted, strict=True):
+            if known[key] is None:
+                missing[key] = image
         size = self._minibatches.get(unit, self.minibatch)
+        # A minibatch is one tensor, so its views have one shape.
         for shape in dict.fromkeys(view.padded for _, _, view in missing):
             alike = [key for key in missing if key[2].padded == shape]
-            for part in (alike[start : start + size] for start in range(0, len(alike), size)):
-                pixels = [missing[key].gray if is_gray else missing[key].pixels for key in part]
-                pictures = [
-                    Picture(key[2].render(shown), key[2])
-                    for key, shown in zip(part, pixels, strict=True)
-                ]
+            for start in range(0, len(alike), size):
+                part = alike[start : start + size]
+                pictures = []
+                for key in part:
+                    view = key[2]
+                    pixels = missing[key].gray if is_gray else missing[key].pixels
+                    pictures.append(Picture(view.render(pixels), view))
                 with exact_float32():
                     encodings = matcher.encode(pictures)
                 check_finite(f"features of {unit.matcher}", list(encodings))
@@ -243,28 +257,33 @@ class Pipeline:
             except Exception as error:
                 if failure_of(error) is not FailureKind.RAISED:
                     raise
+                # Not tried again: reading gigabytes for each minibatch would fail each time.
                 self._unloadable[name] = error
         if name in self._unloadable:
             cause = self._unloadable[name]
-            reason = str(cause) if isinstance(cause, UserError) else reason_of(cause)
-            raise UnloadableError(f"{name} cannot be loaded: {reason}") from cause
+            raise UnloadableError(f"{name} cannot be loaded: {_text_of(cause)}") from cause
         return self._matchers[name]
+
+
+def _text_of(error: Exception) -> str:
+    """Return the reason of a load that failed; a message for users needs no type before it."""
+    return str(error) if isinstance(error, UserError) else reason_of(error)
 
 
 def views_of(unit: Unit, multiple: int, pair: PairMatch) -> tuple[View, ...]:
     """Return the unit's views of both images: whole images in stage 1, critical regions in stage 2."""
     crops = [region.box for region in pair.regions or ()] if unit.stage == 2 else []
     boxes = crops or [Box.whole(image.size) for image in pair.images]
-    return tuple(
-        unit.view(box, multiple, im.turns) for box, im in zip(boxes, pair.images, strict=True)
-    )
+    both = zip(boxes, pair.images, strict=True)
+    return tuple(unit.view(box, multiple, image.turns) for box, image in both)
 
 
 def with_regions(
     pair: PairMatch, recipe: Recipe, given: GivenRegions = MappingProxyType({})
 ) -> PairMatch:
-    """Return the pair with each image's critical region: the user's, or MKPC's from the matches of
-    stage 1.
+    """Return the pair with each image's critical region.
+
+    It is the user's, or MKPC's from the matches of stage 1.
     """
     if (boxes := given.get(tuple(image.name for image in pair.images))) is not None:
         first, second = (CriticalRegion(box, RegionReason.GIVEN) for box in boxes)
@@ -273,22 +292,24 @@ def with_regions(
     # In the recipe's order: after an interrupted run, units of stage 1 may have run in another.
     ordered = sorted(pair.results, key=lambda result: recipe.units.index(result.unit))
     matches = Matches.concatenate(result.matches for result in ordered if result.unit.stage == 1)
-    region0, region1 = (
-        critical_region(points, image.size, recipe.mkpc)
-        for points, image in zip((matches.points0, matches.points1), pair.images, strict=True)
-    )
-    return replace(pair, regions=(region0, region1), cluster_seconds=time.perf_counter() - start)
+    image0, image1 = pair.images
+    region0 = critical_region(matches.points0, image0.size, recipe.mkpc)
+    region1 = critical_region(matches.points1, image1.size, recipe.mkpc)
+    seconds = time.perf_counter() - start
+    return replace(pair, regions=(region0, region1), cluster_seconds=seconds)
 
 
 def read_regions(file: Path, image_root: Path, pairs: Iterable[Pair]) -> GivenRegions:
     """Return the stage-2 boxes of a table, keyed by the image files of a pair.
 
-    ``file`` has columns ``image_0,image_1,box_0,box_1``: paths under the root; left, top, right, bottom of boxes
-    in whole pixels of the stored image. Right and bottom are exclusive. Raises :class:`UserError` for a malformed
-    table, for a box that is malformed or extends beyond its image, and for a missing pair.
+    ``file`` has columns ``image_0,image_1,box_0,box_1``: paths under the root; left, top, right,
+    bottom of boxes in whole pixels of the stored image. Right and bottom are exclusive. Raises
+    :class:`UserError` for a malformed table, for a box that is malformed or extends beyond its
+    image, and for a missing pair.
     """
     boxes: dict[tuple[str, ...], tuple[Box, Box]] = {}
-    for where, (name0, name1, *cells) in read_rows(file, ("image_0", "image_1", "box_0", "box_1")):
+    columns = ("image_0", "image_1", "box_0", "box_1")
+    for where, (name0, name1, *cells) in read_rows(file, columns):
         try:
             box0, box1 = (Box(*map(int, cell.split())) for cell in cells)
         except (ValueError, TypeError) as error:
@@ -296,7 +317,8 @@ def read_regions(file: Path, image_root: Path, pairs: Iterable[Pair]) -> GivenRe
             raise UserError(
                 f"{where}: expected left, top, right and bottom of a box, found {found}"
             ) from error
-        boxes[str(image_root / name0), str(image_root / name1)] = box0, box1
+        boxes[str(image_root / name0), str(image_root / name1)] = (box0, box1)
+    # Checked now: an error in the middle of a run would cost hours.
     for pair in pairs:
         if (files := (pair.file0, pair.file1)) not in boxes:
             raise UserError(f"{file} has no regions of the pair {pair.id}")

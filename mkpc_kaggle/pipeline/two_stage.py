@@ -33,10 +33,11 @@ class TwoStageMatcher:
         for match in matcher.match_pairs([("a.jpg", "b.jpg"), ("a.jpg", "c.jpg")]):
             print(match.estimate.inlier_count)
 
-    ``recipe`` is a :class:`Recipe`, a recipe's name, or a path to a TOML file. ``weights`` are directories to
-    search for weights. ``licence`` "permissive" refuses weights that forbid some uses. ``matchers`` maps names in
-    the recipe's units to your own matchers. ``settings`` replace the recipe's, by dotted key, such as
-    ``{"matchers.loftr.threshold": 0.3}``. Raises :class:`UserError` for an unknown name and for missing weights.
+    ``recipe`` is a :class:`Recipe`, a recipe's name, or a path to a TOML file. ``weights`` are
+    directories to search for weights. ``licence`` "permissive" refuses weights that forbid some
+    uses. ``matchers`` maps names in the recipe's units to your own matchers. ``settings`` replace
+    the recipe's, by dotted key, such as ``{"matchers.loftr.threshold": 0.3}``. Raises
+    :class:`UserError` for an unknown name and for missing weights.
     """
 
     def __init__(
@@ -73,9 +74,10 @@ class TwoStageMatcher:
     ) -> PairMatch:
         """Match two images, given as paths or as uint8 arrays, (H, W, 3) RGB or (H, W) gray.
 
-        ``model`` E needs ``intrinsics``, the camera matrices in pixels. ``regions`` replace MKPC's boxes; units of
-        stage 2 fail if a box extends beyond its image. Points, boxes and F are in pixels of the stored files; EXIF
-        only turns the matchers' views upright. If no model is found, ``estimate.failure`` has the reason.
+        ``model`` E needs ``intrinsics``, the camera matrices in pixels. ``regions`` replace MKPC's
+        boxes; units of stage 2 fail if a box extends beyond its image. Points, boxes and F are in
+        pixels of the stored files; EXIF only turns the matchers' views upright. If no model is
+        found, ``estimate.failure`` has the reason.
 
         Raises ``ValueError`` for model E without intrinsics and :class:`UserError` for an
         unreadable image. Memory and device errors are not caught.
@@ -84,8 +86,11 @@ class TwoStageMatcher:
             raise ValueError(
                 "model E needs intrinsics=(K0, K1), the camera matrices of both images in pixels"
             )
-        images = to_image(image0), to_image(image1)
-        self._pipeline.regions = {tuple(image.name for image in images): regions} if regions else {}
+        images = (to_image(image0), to_image(image1))
+        # Set or cleared by each call: they are of this pair only.
+        self._pipeline.regions = {}
+        if regions:
+            self._pipeline.regions = {tuple(image.name for image in images): regions}
         (pair,) = self._pipeline.match([PairMatch(images=images)], self.recipe.units)
         return with_estimate(pair, self.recipe, ModelKind(model), intrinsics)
 
@@ -97,9 +102,10 @@ class TwoStageMatcher:
         image.
         """
         self._pipeline.regions = {}
+        # Closed also if the caller stops early: its thread would keep the process alive.
         with closing(ImageStore()) as store:
             for first, second in pairs:
-                images = to_image(first, store), to_image(second, store)
+                images = (to_image(first, store), to_image(second, store))
                 (pair,) = self._pipeline.match([PairMatch(images=images)], self.recipe.units)
                 yield with_estimate(pair, self.recipe)
 
@@ -117,5 +123,5 @@ def to_image(source: ImageSource, store: ImageStore | None = None) -> Image:
     image = read_image(path) if store is None else store.get(path)
     if isinstance(image, Unreadable):
         raise UserError(str(image))
-    # The name identifies the content: a file may change between calls
+    # The name identifies the content: a file may change between calls.
     return replace(image, name=image.version)
