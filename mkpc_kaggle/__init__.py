@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 __all__ = ["PairMatch", "Recipe", "TwoStageMatcher", "__version__", "reconstruct", "results"]
 
+# Imported on first use: torch alone takes seconds.
 _MODULES = {
     "PairMatch": "pipeline.pair",
     "TwoStageMatcher": "pipeline.two_stage",

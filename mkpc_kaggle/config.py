@@ -16,20 +16,23 @@ MAX_INTEGER = 2**63 - 1  # as in TOML
 def from_table(cls: type[Config], table: Mapping[str, Any], where: str) -> Config:
     """Build the dataclass ``cls`` from a TOML table.
 
-    ``where`` names the table in messages. Raises :class:`UserError` for an unknown key (with a list of the known
-    ones), a missing key, a wrong type, or a value that the dataclass refuses with a ``ValueError``.
+    ``where`` names the table in messages. Raises :class:`UserError` for an unknown key (with a list
+    of the known ones), a missing key, a wrong type, or a value that the dataclass refuses with a
+    ``ValueError``.
     """
     known: dict[str, Field[Any]] = {field.name: field for field in fields(cls)}  # type: ignore[arg-type]
     check_keys(table, known, where)
-    required = [
-        name for name, field in known.items() if field.default is field.default_factory is MISSING
-    ]
-    if missing := [name for name in required if name not in table]:
+    missing = []
+    for name, field in known.items():
+        is_required = field.default is MISSING and field.default_factory is MISSING
+        if is_required and name not in table:
+            missing.append(name)
+    if missing:
         raise UserError(f"{where}: missing keys {', '.join(map(repr, missing))}")
     hints = get_type_hints(cls)
-    values = {
-        key: convert(value, hints[key], f"{where}, key {key!r}") for key, value in table.items()
-    }
+    values = {}
+    for key, value in table.items():
+        values[key] = convert(value, hints[key], f"{where}, key {key!r}")
     try:
         return cls(**values)
     except ValueError as error:
@@ -46,19 +49,20 @@ def check_keys(table: Mapping[str, Any], known: Iterable[str], where: str) -> No
 
 
 def convert(value: Any, kind: type, where: str) -> Any:
-    """Return ``value`` as ``kind`` (int, float, bool, str or an enum of strings), or raise
-    :class:`UserError`.
+    """Return ``value`` as ``kind``: int, float, bool, str or an enum of strings.
+
+    Raises :class:`UserError` for a value of another type.
     """
     if issubclass(kind, StrEnum):
         if value not in list(kind):
-            raise UserError(
-                f"{where}: {value!r} is none of {', '.join(repr(str(member)) for member in kind)}"
-            )
+            known = ", ".join(repr(str(member)) for member in kind)
+            raise UserError(f"{where}: {value!r} is none of {known}")
         return kind(value)
     if type(value) is int and abs(value) > MAX_INTEGER:
         raise UserError(f"{where}: an integer of more than 64 bits")
     if kind is float and type(value) is int:
         return float(value)
+    # Not ``isinstance``: True is an int.
     if type(value) is not kind:
         raise UserError(f"{where}: expected {kind.__name__}, got {value!r}")
     return value
@@ -66,9 +70,7 @@ def convert(value: Any, kind: type, where: str) -> Any:
 
 @dataclass(frozen=True)
 class Range:
-    """Finite numbers from ``low`` to ``high``; ``bounds`` is "[]", "(]", "[)" or "()", in interval
-    notation.
-    """
+    """Finite numbers from ``low`` to ``high``; ``bounds`` is "[]", "(]", "[)" or "()"."""
 
     low: float
     high: float = inf
@@ -80,11 +82,15 @@ class Range:
         return above and below and isfinite(number)
 
     def __str__(self) -> str:
-        left, right = self.bounds[0], ")" if self.high == inf else self.bounds[1]
+        left = self.bounds[0]
+        right = self.bounds[1]
+        if self.high == inf:  # which is not in the range
+            right = ")"
         return f"{left}{self.low:g}, {self.high:g}{right}"
 
 
-AT_LEAST_0, AT_LEAST_1 = Range(0), Range(1)
+AT_LEAST_0 = Range(0)
+AT_LEAST_1 = Range(1)
 POSITIVE = Range(0, bounds="(]")
 SHARE = Range(0, 1)  # a fraction; also the range of scores
 

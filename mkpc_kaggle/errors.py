@@ -6,18 +6,20 @@ from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 
-MAX_TEXT_BYTES = 1 << 24
+MAX_TEXT_BYTES = 1 << 24  # a recipe, a list of pairs; a file given by mistake may have gigabytes
 
 
 class UserError(Exception):
-    """A problem that the user can correct. The message states the problem, its location and the
-    next step.
+    """A problem that the user can correct.
+
+    The message states the problem, its location and the next step.
     """
 
 
 @cache
 def warn_once(message: str) -> None:
     """Warn once per process and message."""
+    # The cache is the memory: the body runs once per message.
     warnings.warn(message, stacklevel=3)
 
 
@@ -39,13 +41,14 @@ def read_text(path: Path) -> str:
 
 def shown(name: object) -> str:
     """Return a name for messages. Escape control characters, which end lines and control terminals."""
-    return "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in str(name))
+    letters = []
+    for letter in str(name):
+        letters.append(letter if letter.isprintable() else repr(letter)[1:-1])
+    return "".join(letters)
 
 
 def printable(text: str) -> str:
-    """Return ``text`` with escapes for characters that UTF-8 cannot encode. Paths may contain these
-    characters.
-    """
+    """Return ``text`` with escapes for characters that UTF-8 cannot encode, as paths may have."""
     return text.encode("utf-8", "backslashreplace").decode()
 
 

@@ -1,5 +1,4 @@
-"""Recipes: units (a matcher on one kind of view) in order of importance, and settings of all later
-steps.
+"""Recipes: units (a matcher on one kind of view) by importance, and settings of all later steps.
 
 A recipe is a TOML file: ``mkpc_kaggle/recipes/NAME.toml`` or a custom file.
 """
@@ -40,7 +39,7 @@ class Mode(StrEnum):
 
     TWO_STAGE = "two-stage"  # as written: stage 2 on the critical regions
     STAGE_1 = "stage-1"  # the units of stage 1 alone
-    # Every unit on whole images: the naive ensemble of equal inference count
+    # Every unit on whole images: the naive ensemble of equal inference count.
     WHOLE_IMAGES = "whole-images"
 
 
@@ -52,12 +51,12 @@ class Unit:
     matcher: str
     long_side: int = 0  # pixels of a view's longer side, or 0 with ``area``
     max_matches: int = 4096  # the matches with the highest scores
-    # Height x width, such as "540x720": the area of a view, which keeps its aspect ratio
+    # Height x width, such as "540x720": the area of a view, which keeps its aspect ratio.
     area: str = ""
     stretch: bool = False  # True: a view gets exactly the height and width of ``area``
     fallback: str = ""  # the matcher to use if ``matcher`` is unavailable
     antialias: bool = True  # False: shrink views bilinearly, without averaging areas
-    # False: scenes use the unit's matches only if the pair's other units have fewer than 50
+    # False: scenes use the unit's matches only if the pair's other units have fewer than 50.
     tracks: bool = True
 
     def __post_init__(self) -> None:
@@ -73,10 +72,9 @@ class Unit:
 
     @cached_property  # used often by plans
     def name(self) -> str:
-        """Name such as ``2:sift@1280`` or ``1:dkm@540x720``; "!" means stretched. Unique in a
-        recipe.
-        """
-        return f"{self.stage}:{self.matcher}@{self.long_side or self.area}{'!' if self.stretch else ''}"
+        """Name such as ``2:sift@1280`` or ``1:dkm@540x720``, unique in a recipe; "!": stretched."""
+        stretched = "!" if self.stretch else ""
+        return f"{self.stage}:{self.matcher}@{self.long_side or self.area}{stretched}"
 
     @property
     def with_fallback(self) -> "Unit":
@@ -118,7 +116,7 @@ class CameraModel(StrEnum):
 class SceneConfig:
     """Settings of :mod:`mkpc_kaggle.scene`, table ``[scene]`` of a recipe."""
 
-    # A batch with fewer gets extra pairs, used only for its scene; 0: none
+    # A batch with fewer gets extra pairs, used only for its scene; 0: none.
     pairs_per_image: float = 10.0
     cameras: CameraSharing = CameraSharing.AUTO
     camera_model: CameraModel = CameraModel.SIMPLE_PINHOLE
@@ -153,8 +151,10 @@ class Recipe:
             raise UserError(f"{where} has no units")
         if self.units[0].stage != 1:
             raise UserError(f"{where}: the first unit sweeps all pairs, so it must have stage 1")
+        # A fallback may take the place of a unit, so it counts, too.
         names = [unit.name for unit in self.units]
         names += [unit.with_fallback.name for unit in self.units if unit.fallback]
+        # The name is the unit's key in journals.
         for name in names:
             if names.count(name) > 1:
                 raise UserError(f"{where} has the unit {name} twice")
@@ -169,8 +169,9 @@ class Recipe:
         return replace(self, units=tuple(filter(wanted, self.units)))
 
     def with_units(self, names: Sequence[str]) -> "Recipe":
-        """Return the recipe with only these units, in this order. Raise :class:`UserError` for an
-        unknown one.
+        """Return the recipe with only these units, in this order.
+
+        Raises :class:`UserError` for an unknown unit.
         """
         known = {unit.name: unit for unit in self.units}
         for name in names:
@@ -181,13 +182,11 @@ class Recipe:
         return replace(self, units=tuple(known[name] for name in names))
 
     def with_fallbacks(self, unavailable: Container[str]) -> "Recipe":
-        """Return the recipe with fallbacks in place of ``unavailable`` matchers; remove the other
-        fallbacks.
-        """
-        units = (
-            u.with_fallback if u.matcher in unavailable else replace(u, fallback="")
-            for u in self.units
-        )
+        """Return the recipe with fallbacks in place of ``unavailable`` matchers, and no others."""
+        units = []
+        for unit in self.units:
+            is_missing = unit.matcher in unavailable
+            units.append(unit.with_fallback if is_missing else replace(unit, fallback=""))
         return replace(self, units=tuple(units))
 
     def without(self, matchers: Container[str]) -> "Recipe":
@@ -198,7 +197,8 @@ class Recipe:
         """
         units = [unit for unit in self.units if unit.matcher not in matchers]
         sweeps = [unit for unit in units if unit.stage == 1][:1]
-        return replace(self, units=(*sweeps, *(unit for unit in units if unit not in sweeps)))
+        others = [unit for unit in units if unit not in sweeps]
+        return replace(self, units=(*sweeps, *others))
 
     def in_mode(self, mode: Mode) -> "Recipe":
         """Return the recipe for a :class:`Mode`."""
@@ -207,16 +207,15 @@ class Recipe:
         name = f"{self.name} ({mode})"
         if mode is Mode.STAGE_1:
             return replace(self.only(lambda unit: unit.stage == 1), name=name)
-        # A unit of both stages runs once: a second run would find the same matches
+        # A unit of both stages runs once: a second run would find the same matches.
         whole: dict[str, Unit] = {}
-        for unit in (replace(unit, stage=1) for unit in self.units):
-            whole.setdefault(unit.name, unit)
+        for unit in self.units:
+            of_stage_1 = replace(unit, stage=1)
+            whole.setdefault(of_stage_1.name, of_stage_1)
         return replace(self, name=name, units=tuple(whole.values()))
 
     def with_scenes(self, on: bool | None) -> "Recipe":
-        """Return the recipe with the reconstruction of batches switched on or off; ``None``: no
-        change.
-        """
+        """Return the recipe with scenes switched on or off; ``None``: no change."""
         if on is None or on == (self.scene is not None):
             return self
         return replace(self, scene=SceneConfig() if on else None)
@@ -240,14 +239,15 @@ def with_settings(recipe: Recipe, settings: Mapping[str, Any]) -> Recipe:
         if not names or names[0] not in TABLES:
             known = ", ".join(TABLES)
             raise UserError(f"--set {key}: expected TABLE.KEY=VALUE; the tables are {known}")
-        place = table
+        inner = table
         for name in names:
-            if place.get(name) is None:
-                place[name] = {}
-            place = place[name]
-            if not isinstance(place, dict):
+            if inner.get(name) is None:
+                inner[name] = {}
+            inner = inner[name]
+            if not isinstance(inner, dict):
                 raise UserError(f"--set {key}: {name} is a key, not a table of keys")
-        place[last] = value
+        inner[last] = value
+    # The same checks as for a file.
     return recipe_of(table, recipe.name)
 
 
@@ -259,6 +259,7 @@ def parse_setting(text: str) -> tuple[str, Any]:
     try:
         parsed = tomllib.loads(f"value = {value}")
     except (ValueError, RecursionError):
+        # Names need no quotes: matchers.aliked.variant=n32.
         return key.strip(), value.strip()
     return key.strip(), parsed["value"]
 
@@ -266,21 +267,25 @@ def parse_setting(text: str) -> tuple[str, Any]:
 def split_mode(text: str) -> tuple[str, Mode]:
     """Split ``RECIPE:MODE`` into the recipe's name or file, and the mode, by default two-stage."""
     name, _, mode = text.rpartition(":")
-    return (name, Mode(mode)) if name and mode in list(Mode) else (text, Mode.TWO_STAGE)
+    # A path may contain a colon.
+    if not name or mode not in list(Mode):
+        return text, Mode.TWO_STAGE
+    return name, Mode(mode)
 
 
 def parse_recipe(text: str, name: str) -> Recipe:
     """Parse a recipe from TOML text. Raise :class:`UserError` if it is invalid."""
     try:
         return recipe_of(tomllib.loads(text), name)
-    # Numbers of thousands of digits, deeply nested tables
+    # Numbers of thousands of digits, deeply nested tables.
     except (ValueError, RecursionError) as error:
         raise UserError(f"recipe {name!r} is not valid TOML: {error}") from error
 
 
 def recipe_of(table: Mapping[str, Any], name: str) -> Recipe:
-    """Return the recipe of a TOML file's or a journal's table. Raise :class:`UserError` if it is
-    invalid.
+    """Return the recipe of a TOML file's or a journal's table.
+
+    Raises :class:`UserError` if it is invalid.
     """
     where = f"recipe {name!r}"
     check_keys(table, ("description", "units", *TABLES), where)
@@ -293,11 +298,11 @@ def recipe_of(table: Mapping[str, Any], name: str) -> Recipe:
         value = table.get(key)  # a journal has None for a missing table
         return None if value is None else from_table(cls, value, f"{where}, table [{key}]")
 
+    parsed = []
+    for number, unit in enumerate(units, start=1):
+        parsed.append(from_table(Unit, unit, f"{where}, unit {number}"))
     return Recipe(
-        tuple(
-            from_table(Unit, unit, f"{where}, unit {number}")
-            for number, unit in enumerate(units, start=1)
-        ),
+        tuple(parsed),
         name,
         description=str(table.get("description", "")),
         mkpc=settings(MkpcConfig, "mkpc") or MkpcConfig(),
@@ -314,8 +319,9 @@ def recipe_names() -> list[str]:
 
 
 def load_recipe(name: str) -> Recipe:
-    """Return the recipe of this name or ``.toml`` file. Raise :class:`UserError` if it does not
-    exist.
+    """Return the recipe of this name or ``.toml`` file.
+
+    Raises :class:`UserError` if it does not exist.
     """
     known = recipe_names()
     if name not in known and not name.endswith(".toml"):

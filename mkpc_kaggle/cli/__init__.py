@@ -35,17 +35,15 @@ EXIT_INTERRUPTED = 128 + 2  # a shell's status for SIGINT
 
 
 def program(arguments: Sequence[str] | None = None) -> NoReturn:
-    """Run a command and end the process at once: an orderly interpreter exit takes a second or
-    longer.
-    """
+    """Run a command and end the process at once: an orderly exit takes a second or longer."""
     try:  # Ctrl-C during slow imports is not an error
         from mkpc_kaggle.engine.console import leave
 
         former = os.environ.get("MPLCONFIGDIR")
         status = main(arguments)
-        # Set by matplotlib if it cannot write below HOME
+        # Set by matplotlib if it cannot write below HOME. Matplotlib removes the directory only in
+        # an orderly exit.
         if (made := os.environ.get("MPLCONFIGDIR")) != former:
-            # Matplotlib removes it only in an orderly exit
             shutil.rmtree(str(made), ignore_errors=True)
     except KeyboardInterrupt:
         os._exit(EXIT_INTERRUPTED)
@@ -63,31 +61,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     from mkpc_kaggle.errors import UserError
 
     for stream in (sys.stdout, sys.stderr):
-        # Paths and ids may have characters that the terminal cannot encode
+        # Paths and ids may have characters that the terminal cannot encode.
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
+    # Leaving the stack ends the printing thread after the messages below.
     with ExitStack() as printing, warnings.catch_warnings():
+        # One line each, without the file and line that Python prints.
         warnings.showwarning = lambda message, *_, **__: warn(str(message))
         try:
             given = sys.argv[1:] if arguments is None else list(arguments)
-            parser = make_parser(given)
-            if not given:
-                parser.print_help()
-                return 0
-            parsed = parser.parse_args(given)
-            try:
-                Path.cwd()  # relative paths are undefined without it
-            except OSError as error:
-                raise UserError(
-                    f"the current directory is gone ({error.strerror}); change to another"
-                ) from error
-            parsed.started = started
-            printing.enter_context(parsed.printing())
-            status = int(parsed.run(parsed) or 0)
-            with suppress(OSError, ValueError):  # the disk is full, or the stream closed
-                if sys.stdout is not None:
-                    sys.stdout.flush()  # waits for a slow reader, except in a run
-            return status
+            return _run(given, started, printing)
         except UserError as error:
             complain(str(error))
             return EXIT_BAD_INPUT
@@ -97,15 +80,42 @@ def main(arguments: Sequence[str] | None = None) -> int:
         except BrokenPipeError:  # the reader closed the pipe, as `head` does
             return EXIT_BROKEN_PIPE
         except OSError as error:
+            # A path of the user's. Any other error is a fault of the program: a traceback.
             if error.errno != errno.ENAMETOOLONG:
                 raise
             complain(f"{error.strerror}: {str(error.filename)[:80]}...")
             return EXIT_BAD_INPUT
 
 
+def _run(given: Sequence[str], started: float, printing: ExitStack) -> int:
+    """Parse the arguments and run their command; without arguments, print the commands."""
+    from mkpc_kaggle.errors import UserError
+
+    parser = make_parser(given)
+    if not given:
+        parser.print_help()
+        return 0
+    parsed = parser.parse_args(given)
+    try:
+        Path.cwd()  # relative paths are undefined without it
+    except OSError as error:
+        raise UserError(
+            f"the current directory is gone ({error.strerror}); change to another"
+        ) from error
+    parsed.started = started
+    # After parsing: --help and errors in options need no printing thread.
+    printing.enter_context(parsed.printing())
+    status = int(parsed.run(parsed) or 0)
+    with suppress(OSError, ValueError):  # the disk is full, or the stream closed
+        if sys.stdout is not None:
+            sys.stdout.flush()  # waits for a slow reader, except in a run
+    return status
+
+
 def make_parser(arguments: Sequence[str] = tuple(COMMANDS)) -> argparse.ArgumentParser:
-    """Return the parser for these arguments. Import only the commands that they name: imports take
-    time.
+    """Return the parser for these arguments.
+
+    Only the commands that they name are imported: imports take time.
     """
     text = "Two-stage image matching with Matching Key-Points Crop, offline, inside a time budget."
     epilog = "mkpc COMMAND --help has the options of a command."

@@ -9,7 +9,7 @@ HELP = """\
 Compare a submission with test.csv: header, ids and their order, nine finite numbers per row.
 Exit status: 0 good, 1 not good (one problem per line), 2 the test side cannot be read.
 """
-MAX_LINES = 20
+MAX_LINES = 20  # of problems; a wrong file may have one in each of a hundred thousand rows
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -18,13 +18,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
+    # An unreadable test side is an error, an unreadable submission is a problem.
     pairs = read_test_side(arguments.test_dir)
     problems = submission_problems(arguments.submission, [pair.id for pair in pairs])
-    more = [f"... and {len(problems) - MAX_LINES} more"] if len(problems) > MAX_LINES else []
-    verdict = (
-        f"{arguments.submission}: {len(problems)} problems"
-        if problems
-        else f"good: {len(pairs)} rows"
-    )
-    print("\n".join([*problems[:MAX_LINES], *more, verdict]))
-    return 1 if problems else 0
+    if not problems:
+        print(f"good: {len(pairs)} rows")
+        return 0
+    lines = problems[:MAX_LINES]
+    if len(problems) > MAX_LINES:
+        lines.append(f"... and {len(problems) - MAX_LINES} more")
+    lines.append(f"{arguments.submission}: {len(problems)} problems")
+    print("\n".join(lines))
+    return 1

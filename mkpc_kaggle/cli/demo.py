@@ -24,10 +24,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
+    # NumPy takes no negative seed.
     if arguments.seed < 0:
         raise UserError("--seed: give 0 or more")
     with writing(f"--out {arguments.out}"):
         demo = write_demo(arguments.out, seed=arguments.seed)
-    print(
-        f"train side: {demo.train_dir}\ntest side: {demo.test_dir}\ntruth of the test side: {demo.truth_csv}"
-    )
+    # The directories that the commands of the help text take.
+    print(f"train side: {demo.train_dir}")
+    print(f"test side: {demo.test_dir}")
+    print(f"truth of the test side: {demo.truth_csv}")

@@ -35,7 +35,7 @@ Exit status: 0 done, 2 the journal does not exist, or a file cannot be written.
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    # Stderr, where image decoders print warnings
+    # Stderr, where image decoders print warnings.
     parser.set_defaults(printing=partial(unblocked, [2]))
     parser.add_argument("work_dir", type=Path, metavar="DIR")
     parser.add_argument("--csv", type=Path, metavar="OUT", help="write tables to this directory")
@@ -50,6 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
+    # The page must not be written over the test side, nor over the journal itself.
     inputs = test_side(arguments.test_dir) if arguments.test_dir else []
     require_apart({"--report": arguments.report}, inputs, arguments.work_dir)
     if arguments.prune:
@@ -61,7 +62,9 @@ def run(arguments: argparse.Namespace) -> None:
     log = read_log(arguments.work_dir)
     written = write_csv(log, arguments.csv) if arguments.csv else []
     if arguments.report:
+        # Without the test side, the page has no pictures.
         pairs = read_test_side(arguments.test_dir) if arguments.test_dir else ()
         write_report(log, arguments.report, pairs)
         written += filter(None, [arguments.report, write_summary(log, arguments.report)])
+    # The files that were written, else the overview.
     print("\n".join(map(str, written)) or overview(log))

@@ -27,7 +27,7 @@ files, without the EXIF orientation; figures are upright.
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    # Stderr, where image decoders print warnings
+    # Stderr, where image decoders print warnings.
     parser.set_defaults(printing=partial(unblocked, [2]))
     parser.add_argument("image0", type=Path)
     parser.add_argument("image1", type=Path)
@@ -43,11 +43,12 @@ def run(arguments: argparse.Namespace) -> None:
     inputs = [arguments.image0, arguments.image1, Path(arguments.recipe)]
     files = {"--out": arguments.out, "--save": arguments.save}
     require_apart(files, inputs, weights=arguments.weights)
+    # Before the work: a wrong suffix should not cost minutes of matching.
     if arguments.out is not None:
         require_format(arguments.out)
     if arguments.save is not None and arguments.save.suffix != ".npz":
         raise UserError(f"--save {arguments.save}: the name must end in .npz")
-    images = to_image(arguments.image0), to_image(arguments.image1)
+    images = (to_image(arguments.image0), to_image(arguments.image1))
     # After the images: a wrong path should not wait for weights to be digested.
     matcher = TwoStageMatcher(
         arguments.recipe,
@@ -72,6 +73,7 @@ def save_arrays(match: PairMatch, path: Path) -> None:
     """Write points (N, 2) float32 of both images, scores (N,), inliers (N,) bool and F (3, 3)."""
     matches = match.matches
     path.parent.mkdir(parents=True, exist_ok=True)
+    # NumPy needs bytes: ``buffer`` is the binary stream below the text stream.
     with replacing(path) as stream:
         np.savez(
             stream.buffer,
@@ -90,9 +92,9 @@ def _lines(match: PairMatch, recipe: str) -> list[str]:
     lines += [" ".join(f"{value: .9e}" for value in row) for row in found.matrix]
     lines += [f"this is the fallback: {found.failure}"] if found.failure else []
     lines.append(f"{len(match.matches)} matches, {found.inlier_count} inliers")
-    verdict = (
-        "the images overlap" if found.stats.support >= MIN_SUPPORT else "the images may not overlap"
-    )
+    verdict = "the images may not overlap"
+    if found.stats.support >= MIN_SUPPORT:
+        verdict = "the images overlap"
     lines.append(f"{found.stats.support:.1f} times the inliers expected by chance: {verdict}")
     for result in match.results:
         counts = f"{len(result.matches):>6} matches  {result.seconds:.2f} s"
@@ -100,6 +102,7 @@ def _lines(match: PairMatch, recipe: str) -> list[str]:
         lines.append(f"  {result.unit.name:<30}{counts}  {remark}".rstrip())
     for number, region in enumerate(match.regions or ()):
         box = region.box
+        # The last column and row of the box, as a person counts them.
         where = f"x {box.left}..{box.right - 1}, y {box.top}..{box.bottom - 1}"
         lines.append(f"image {number}: critical region {where} ({region.reason})")
     return lines

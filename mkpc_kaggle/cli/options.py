@@ -21,6 +21,7 @@ from mkpc_kaggle.reporting.summary import left_out_line
 
 
 def add_matching(parser: argparse.ArgumentParser) -> None:
+    """Add the options of matching: recipe, weights, device and settings."""
     add = parser.add_argument
     add(
         "--recipe",
@@ -50,6 +51,7 @@ def add_matching(parser: argparse.ArgumentParser) -> None:
 
 
 def add_weights(parser: argparse.ArgumentParser) -> None:
+    """Add ``--weights``."""
     text = (
         "directory of weight files; may be repeated. Also searched: $MKPC_WEIGHTS and /kaggle/input"
     )
@@ -59,6 +61,8 @@ def add_weights(parser: argparse.ArgumentParser) -> None:
 
 
 def add_run(parser: argparse.ArgumentParser, time_limit: str | None) -> None:
+    """Add the options of the engine; ``time_limit``: the default, ``None`` for no limit."""
+    # A run's reader may be slow or hang, so its lines go through the printing thread.
     parser.set_defaults(printing=unblocked)
     add = parser.add_argument
     text = """two-stage (the default): the recipe as written; stage-1: only its units of stage 1; whole-images:
@@ -73,17 +77,20 @@ def add_run(parser: argparse.ArgumentParser, time_limit: str | None) -> None:
         ray: use the Ray cluster of this machine, one worker per GPU, or per machine without GPUs; HOST:PORT as
         printed by `ray start --head`"""
     add("--workers", type=parse_workers, metavar="N|ray[://HOST:PORT]", help=text)
+    # At the end, because the plan changes with the measured costs.
     add("--explain", action="store_true", help="print the plan at the end: what, when and why")
 
 
 def settings_of(arguments: argparse.Namespace) -> dict[str, Any]:
     """Return the settings of ``--set`` by dotted key; the last value of a key counts."""
+    # A dictionary keeps the last value of a key.
     return dict(map(parse_setting, arguments.set))
 
 
 def assembly_of(
     arguments: argparse.Namespace, recipe: str, mode: str, interrupt: Interrupt
 ) -> Assembly:
+    """Return the assembly of a recipe with the command's options."""
     with interrupt.raising():  # computing the digests of large files takes long
         return assemble(
             recipe,
@@ -98,43 +105,53 @@ def assembly_of(
 
 
 def budget_of(arguments: argparse.Namespace) -> Budget:
-    started = (
-        arguments.started if arguments.started_at is None else monotonic_of(arguments.started_at)
-    )
-    return Budget(
-        started, inf if arguments.time_limit is None else parse_duration(arguments.time_limit)
-    )
+    """Return the budget, which counts from the program's start or from ``--started-at``."""
+    started = arguments.started
+    if arguments.started_at is not None:
+        started = monotonic_of(arguments.started_at)
+    limit = inf
+    if arguments.time_limit is not None:
+        limit = parse_duration(arguments.time_limit)
+    return Budget(started, limit)
 
 
 @contextmanager
 def watched_session(
     arguments: argparse.Namespace, work_dir: Path, interrupt: Interrupt
 ) -> Iterator[Session]:
-    """Open a session with these options, whose watchdog ends the program in time even if the run
-    hangs.
+    """Open a session with these options.
+
+    Its watchdog ends the program in time even if the run hangs.
     """
-    budget, fresh, workers = budget_of(arguments), arguments.fresh, arguments.workers
-    with Session(work_dir, budget, interrupt, fresh, workers=workers).watched() as session:
+    opened = Session(
+        work_dir, budget_of(arguments), interrupt, arguments.fresh, workers=arguments.workers
+    )
+    with opened.watched() as session:
         yield session
         drain()  # while the watchdog is active: the reader of the output may hang
 
 
 def say_start(what: str, assembly: Assembly, work_dir: Path) -> None:
     """Print the input, the recipe and the omitted matchers."""
+    # One call, so that no worker's line comes between.
     header = f"{what}, recipe {assembly.recipe.name}, {assembly.placement}, journal in {work_dir}"
-    say("\n".join(filter(None, [header, left_out_line(assembly.recipe, assembly.left_out)])))
+    left_out = left_out_line(assembly.recipe, assembly.left_out)
+    say("\n".join(filter(None, [header, left_out])))
 
 
 def finish(session: Session, page: Path | None, pairs: Sequence[Pair]) -> int:
-    """Write a run's report to ``page``, if given. Return a received signal's exit status, else the
-    session's.
+    """Write a run's report to ``page``, if given. Return the exit status.
+
+    It is that of a received signal, else the session's.
     """
     from mkpc_kaggle.reporting.report import report_run
 
     if page is not None:
         progress = Progress(session.budget, sys.stderr)
         say(report_run(session.work_dir, page, session.must_end(), pairs, progress))
-    return 128 + session.interrupt.signal if session.interrupt.signal else session.status
+    if session.interrupt.signal:
+        return 128 + session.interrupt.signal  # as shells do
+    return session.status
 
 
 def plan_lines(arguments: argparse.Namespace, report: RunReport) -> list[str]:
@@ -146,6 +163,5 @@ def print_table(rows: Sequence[tuple[str, ...]]) -> None:
     """Print rows of equal length in aligned columns."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:
-        print(
-            "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
-        )
+        cells = [cell.ljust(width) for cell, width in zip(row, widths, strict=True)]
+        print("  ".join(cells).rstrip())

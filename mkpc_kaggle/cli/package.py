@@ -54,14 +54,17 @@ def run(arguments: argparse.Namespace) -> None:
     )
     package = make_package(request)
     for folder, items in (("dataset", package.dataset), ("kernel", package.kernel)):
-        rows = [
-            (item.name, str(item.source.stat().st_size), item.licence or "-", item.note)
-            for item in items
-        ]
-        total = f"{len(rows)} files", str(sum(int(size) for _, size, *_ in rows)), "", ""
+        rows = [("file", "bytes", "licence", "")]
+        total = 0
+        for item in items:
+            size = item.source.stat().st_size
+            total += size
+            rows.append((item.name, str(size), item.licence or "-", item.note))
+        rows.append((f"{len(items)} files", str(total), "", ""))
         print(out / folder)
-        options.print_table([("file", "bytes", "licence", ""), *rows, total])
+        options.print_table(rows)
         print()
+    # Also with --private: then they are in the dataset, and the user must know.
     if package.restricted:
         names = ", ".join(f"{item.name} ({item.licence})" for item in package.restricted)
         print(f"{_PRIVATE if arguments.private else _LEFT_OUT}: {names}\n")

@@ -32,6 +32,7 @@ def run(arguments: argparse.Namespace) -> None:
     rows = [("recipe", "runs here", "matchers")]
     for name in recipe_names():
         recipe = load_recipe(name)
+        # The weights are also loaded on the device "meta": files of the right name may not fit.
         missing = unavailable(recipe, store)
         present = sum(matcher not in missing for matcher in recipe.matcher_names)
         count = f"{present} of {len(recipe.matcher_names)}"

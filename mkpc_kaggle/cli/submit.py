@@ -63,7 +63,7 @@ def run(arguments: argparse.Namespace) -> int:
     )
     with interruptible() as interrupt:
         pairs = read_test_side(arguments.test_dir)
-        # first_version precedes the watchdog: a run that starts after its limit must leave a
+        # The first version precedes the watchdog: a run that starts after its limit must leave a
         # complete file.
         with (
             first_version(pairs, output),
@@ -71,10 +71,12 @@ def run(arguments: argparse.Namespace) -> int:
         ):
             assembly = options.assembly_of(arguments, arguments.recipe, arguments.mode, interrupt)
             options.say_start(f"{len(pairs)} pairs", assembly, work_dir)
-            report = submit(pairs, assembly, session, output, str(test_side(arguments.test_dir)[1]))
+            _, images = test_side(arguments.test_dir)
+            report = submit(pairs, assembly, session, output, str(images))
             session.status = int(bool(report.unwritten or trouble(report)))
             unwritten = f" is not the last version: {report.unwritten}" if report.unwritten else ""
+            # A file that could not be replaced is an earlier version; it is complete, too.
             lines = [*options.plan_lines(arguments, report), summary(report)]
-            # Now: drawing may exceed the time limit
+            # Before the report: drawing may exceed the time limit.
             say("\n".join([*lines, f"submission: {output}{unwritten}"]))
             return options.finish(session, page, pairs)

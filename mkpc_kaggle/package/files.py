@@ -27,8 +27,9 @@ class Item:
 
 
 def refuse_other_files(directory: Path, items: Sequence[Item]) -> None:
-    """Raise :class:`UserError` if the folder has files that are not in ``items``: they would be
-    uploaded too.
+    """Raise :class:`UserError` if the folder has files that are not in ``items``.
+
+    They would be uploaded too.
     """
     names = {name for item in items for name in (item.name, f".{item.name}.part")}
     others = sorted({path.name for path in directory.glob("*")} - names)
@@ -40,15 +41,17 @@ def refuse_other_files(directory: Path, items: Sequence[Item]) -> None:
 
 
 def write_files(directory: Path, items: Sequence[Item]) -> tuple[Item, ...]:
-    """Write the items into the folder, except identical existing files. Return the items with their
-    new paths.
+    """Write the items into the folder; return them with their new paths.
 
-    Raises :class:`UserError` if a file cannot be written. A repeated call resumes.
+    Identical files are kept, so a repeated call resumes. Raises :class:`UserError` if a file cannot
+    be written.
     """
     try:
         directory.mkdir(parents=True, exist_ok=True)
         for item in items:
-            target, part = directory / item.name, directory / f".{item.name}.part"
+            target = directory / item.name
+            # Renamed when it is complete: a cut file would have the right name.
+            part = directory / f".{item.name}.part"
             part.unlink(missing_ok=True)
             if target.is_file() and filecmp.cmp(item.source, target, shallow=False):
                 continue
@@ -62,9 +65,7 @@ def write_files(directory: Path, items: Sequence[Item]) -> tuple[Item, ...]:
 
 @dataclass(frozen=True)
 class ChosenWeights:
-    """The files to include, the texts of their licences, and the files that must not be
-    redistributed.
-    """
+    """The files to include, their licences' texts, and the files that must not be redistributed."""
 
     items: tuple[Item, ...]
     manifest: str  # a line per item
@@ -75,41 +76,49 @@ class ChosenWeights:
 def choose_weights(
     store: WeightStore, checkout: Path, staging: Path, *, private: bool
 ) -> ChosenWeights:
-    """Choose the file of each slot in the store, as safetensors, since Kaggle would unpack a torch
-    checkpoint.
+    """Choose the file of each slot in the store, as safetensors.
 
-    Conversions are written to ``staging``. A licence allows redistribution if the checkout has its
-    text. Raises :class:`UserError` if a slot has only damaged files, or a checkpoint cannot be read
-    or fits no network.
+    Kaggle would unpack a torch checkpoint. Conversions are written to ``staging``. A licence allows
+    redistribution if the checkout has its text. Raises :class:`UserError` if a slot has only
+    damaged files, or a checkpoint cannot be read or fits no network.
     """
-    slots = dict.fromkeys(file.slot for file in store.files)
-    every = [found for found in (_good_file(store, slot) for slot in slots) if found is not None]
-    restricted = [found for found in every if licence_text(checkout, found.file.licence) is None]
-    shipped = [found for found in every if private or found not in restricted]
-    texts = {text for found in shipped if (text := licence_text(checkout, found.file.licence))}
+    shipped: list[FoundFile] = []
+    restricted: list[Item] = []
+    texts: set[Path] = set()
+    for slot in dict.fromkeys(file.slot for file in store.files):
+        found = _good_file(store, slot)
+        if found is None:
+            continue
+        text = licence_text(checkout, found.file.licence)
+        if text is None:
+            restricted.append(Item(found.file.name, found.path, found.file.licence))
+        elif text.name != "LICENSE":  # the package's own, which the dataset always has
+            texts.add(text)
+        if text is not None or private:
+            shipped.append(found)
+
+    # All are tried in their networks before the first is converted.
     notes = [_note(found, store) for found in shipped]
-    files = [_as_safetensors(found, staging) for found in shipped]
-    return ChosenWeights(
-        tuple(
-            Item(file.name, path, file.licence, note)
-            for (file, path), note in zip(files, notes, strict=True)
-        ),
-        HEADER + "".join(f"{file.line}\n" for file, _ in files),
-        tuple(Item(path.name, path) for path in sorted(texts) if path.name != "LICENSE"),
-        tuple(Item(found.file.name, found.path, found.file.licence) for found in restricted),
-    )
+    items: list[Item] = []
+    lines: list[str] = []
+    for found, note in zip(shipped, notes, strict=True):
+        file, path = _as_safetensors(found, staging)
+        items.append(Item(file.name, path, file.licence, note))
+        lines.append(f"{file.line}\n")
+    licence_texts = tuple(Item(path.name, path) for path in sorted(texts))
+    return ChosenWeights(tuple(items), HEADER + "".join(lines), licence_texts, tuple(restricted))
 
 
 def licence_text(checkout: Path, tag: str) -> Path | None:
-    """Return the path of a licence's text if the checkout has it. ``tag`` is its name in the
-    manifest.
-    """
+    """Return the path of a licence's text if the checkout has it; ``tag`` as in the manifest."""
     texts = {path.stem: path for path in (checkout / "licences").glob("*.txt")}
-    return (texts | {"Apache-2.0": checkout / "LICENSE"}).get(tag)
+    texts["Apache-2.0"] = checkout / "LICENSE"  # the package's own licence
+    return texts.get(tag)
 
 
 def _note(found: FoundFile, store: WeightStore) -> str:
     """Return a note on digest and networks. Raise :class:`UserError` if no network takes the file."""
+    # Now, and not after an upload of gigabytes.
     fit = fit_of(found, store)
     if fit.is_refused:
         raise UserError(
@@ -120,6 +129,10 @@ def _note(found: FoundFile, store: WeightStore) -> str:
 
 
 def _good_file(store: WeightStore, slot: str) -> FoundFile | None:
+    """Return a slot's file, or ``None`` without a file.
+
+    Raises :class:`UserError` if all of them are damaged: the dataset would be incomplete without a word.
+    """
     search = store.search(store.alternatives(slot))
     if search.found is None and search.refused:
         refusals = "; ".join(f"{refused.path}: {refused.note}" for refused in search.refused)
@@ -133,7 +146,9 @@ def _good_file(store: WeightStore, slot: str) -> FoundFile | None:
 def _as_safetensors(found: FoundFile, staging: Path) -> tuple[WeightFile, Path]:
     """Return the manifest line and path of a file as safetensors, converted if necessary."""
     if found.path.suffix == ".safetensors":
-        return replace(found.file, size=found.path.stat().st_size, digest=found.digest), found.path
+        # The manifest's line may have no size and digest.
+        size = found.path.stat().st_size
+        return replace(found.file, size=size, digest=found.digest), found.path
     # The full name, with its suffix: the manifest may list another conversion under the shorter
     # name.
     path = staging / f"{found.file.name}.safetensors"

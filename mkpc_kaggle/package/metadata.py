@@ -1,5 +1,6 @@
-"""The JSON files that the ``kaggle`` command reads (its docs/datasets_metadata.md and
-kernels_metadata.md).
+"""The JSON files that the ``kaggle`` command reads, and the dataset's page.
+
+Their format: docs/datasets_metadata.md and docs/kernels_metadata.md of the command.
 """
 
 import json
@@ -12,9 +13,11 @@ from mkpc_kaggle.version import __version__
 COMPETITION = "image-matching-challenge-2022"
 DATASET_SLUG = "mkpc-kaggle"
 KERNEL_TITLE = "MKPC submission"
-# Kaggle derives the slug from the title; both must agree
+# Kaggle derives the slug from the title; both must agree.
 KERNEL_SLUG = KERNEL_TITLE.lower().replace(" ", "-")
-LATEST, ORIGINAL = "latest", "original"
+# Values of ``docker_image_pinning_type``.
+LATEST = "latest"
+ORIGINAL = "original"
 # ALIKED-n16 and its LightGlue on Kaggle Models: the store finds the files below /kaggle/input by
 # their digests.
 MODELS = ("oldufo/aliked/pyTorch/aliked-n16/1", "oldufo/lightglue/pyTorch/aliked/1")
@@ -30,8 +33,9 @@ def check_owner(owner: str) -> None:
 
 
 def dataset_metadata(owner: str, licences: Iterable[str]) -> str:
-    """Return ``dataset-metadata.json``. Kaggle allows one licence per dataset; the description
-    lists all.
+    """Return ``dataset-metadata.json``.
+
+    Kaggle allows one licence per dataset; the description lists all.
     """
     return _json(
         {
@@ -49,22 +53,22 @@ def dataset_metadata(owner: str, licences: Iterable[str]) -> str:
 def kernel_metadata(
     owner: str, notebook: str, image: str, *, has_gpu: bool = True, models: Sequence[str] = ()
 ) -> str:
-    """Return ``kernel-metadata.json``: internet off, the competition, our dataset and ``models``
-    attached.
+    """Return ``kernel-metadata.json``: the competition, our dataset and ``models`` are attached.
 
-    With ``has_gpu``, the notebook asks for two T4 GPUs. Without weights they would idle and use up
-    the quota.
+    The internet is off. With ``has_gpu``, the notebook asks for two T4 GPUs. Without weights they
+    would idle and use up the quota.
 
-    ``image`` is ``latest``, ``original`` (the image of the kernel's first version), or an image with the digest
-    that ``kaggle kernels pull -m`` reports. Raises :class:`UserError` for other values.
+    ``image`` is ``latest``, ``original`` (the image of the kernel's first version), or an image
+    with the digest that ``kaggle kernels pull -m`` reports. Raises :class:`UserError` for other
+    values.
     """
-    if image not in (LATEST, ORIGINAL) and not re.fullmatch(
-        r"[\w./:-]+@sha256:[0-9a-f]{64}", image
-    ):
+    is_pinned = re.fullmatch(r"[\w./:-]+@sha256:[0-9a-f]{64}", image) is not None
+    if image not in (LATEST, ORIGINAL) and not is_pinned:
         raise UserError(
             f"--image {image}: give {LATEST}, {ORIGINAL}, or an image as NAME@sha256:DIGEST"
         )
-    pinned = {"docker_image": image} if "@" in image else {}
+    machine = {"machine_shape": "NvidiaTeslaT4"} if has_gpu else {}
+    pinned = {"docker_image": image} if is_pinned else {}
     return _json(
         {
             "id": f"{owner}/{KERNEL_SLUG}",
@@ -74,9 +78,10 @@ def kernel_metadata(
             "kernel_type": "notebook",
             "is_private": True,
             "enable_gpu": has_gpu,
-            **({"machine_shape": "NvidiaTeslaT4"} if has_gpu else {}),
-            "docker_image_pinning_type": ORIGINAL if pinned else image,
+            **machine,
+            "docker_image_pinning_type": ORIGINAL if is_pinned else image,
             **pinned,
+            # The rules of the competition.
             "enable_internet": False,
             "competition_sources": [COMPETITION],
             "dataset_sources": [f"{owner}/{DATASET_SLUG}"],
@@ -87,8 +92,9 @@ def kernel_metadata(
 
 
 def dataset_page(licences: Iterable[str]) -> str:
-    """Return the dataset's ``README.md``. The project's own has pictures and links that Kaggle
-    cannot show.
+    """Return the dataset's ``README.md``.
+
+    The project's own has pictures and links that Kaggle cannot show.
     """
     named = ", ".join(sorted(set(licences))) or "none, this dataset has no weights"
     return f"""\

@@ -6,7 +6,13 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.package.files import Item, choose_weights, refuse_other_files, write_files
+from mkpc_kaggle.package.files import (
+    ChosenWeights,
+    Item,
+    choose_weights,
+    refuse_other_files,
+    write_files,
+)
 from mkpc_kaggle.package.metadata import (
     LATEST,
     MODELS,
@@ -31,6 +37,8 @@ NOTEBOOK = Path("notebooks", "submission.ipynb")
 
 @dataclass(frozen=True)
 class Request:
+    """The options of the command ``package``."""
+
     out: Path
     owner: str  # a Kaggle user name
     weights: tuple[Path, ...] = ()  # directories
@@ -51,59 +59,23 @@ class Package:
 
 
 def make_package(request: Request) -> Package:
-    """Write the folders of dataset and kernel, and return their files. The same request gives the
-    same bytes.
+    """Write the folders of dataset and kernel, and return their files.
 
-    Raises :class:`UserError` before anything is written: if the package runs outside a checkout, a
-    folder has other files, weights are damaged, or wheels cannot be built or found.
+    The same request gives the same bytes. Raises :class:`UserError` before anything is written: if
+    the package runs outside a checkout, a folder has other files, weights are damaged, or wheels
+    cannot be built or found.
     """
-    check_owner(request.owner)
-    if wrong := [
-        python for python in request.pythons if not re.fullmatch(r"3\.[0-9]{1,2}", python)
-    ]:
-        raise UserError(
-            f"--python {wrong[0][:20]!r}: expected versions of Python 3 such as {','.join(PYTHONS)}"
-        )
-    if request.wheels is not None and not request.wheels.is_dir():
-        raise UserError(f"--wheels {request.wheels}: no such directory")
+    _check(request)
     checkout = find_checkout()
-    dataset, kernel = request.out / "dataset", request.out / "kernel"
+    dataset = request.out / "dataset"
+    kernel = request.out / "kernel"
     with TemporaryDirectory(prefix="mkpc-") as temporary:
         staging = Path(temporary)
-
-        def text(name: str, content: str) -> Item:
-            (staging / name).write_text(content, encoding="utf-8", newline="\n")
-            return Item(name, staging / name)
-
-        chosen = choose_weights(
-            WeightStore(request.weights), checkout, staging, private=request.private
-        )
-        licences = [item.licence for item in chosen.items]
-        kernel_json = kernel_metadata(
-            request.owner,
-            NOTEBOOK.name,
-            request.image,
-            has_gpu=bool(chosen.items) or request.models,
-            models=MODELS if request.models else (),
-        )
-        kernel_items = (
-            text("kernel-metadata.json", kernel_json),
-            Item(NOTEBOOK.name, checkout / NOTEBOOK),
-        )
-        own = build_wheel(checkout, staging / "own")
-        others = collect_wheels(
-            pins(checkout), request.pythons, staging / "others", kept=dataset, wheels=request.wheels
-        )
-        dataset_items = (
-            text("dataset-metadata.json", dataset_metadata(request.owner, licences)),
-            *(Item(path.name, path, licence_of(path)) for path in (own, *others)),
-            text("requirements.txt", "\n".join(install_lines(own, others)) + "\n"),
-            text("README.md", dataset_page(licences)),
-            Item("LICENSE", checkout / "LICENSE"),
-            text(MANIFEST, chosen.manifest),
-            *chosen.licence_texts,
-            *chosen.items,
-        )
+        store = WeightStore(request.weights)
+        chosen = choose_weights(store, checkout, staging, private=request.private)
+        kernel_items = _kernel_items(request, checkout, staging, has_weights=bool(chosen.items))
+        dataset_items = _dataset_items(request, checkout, staging, chosen, dataset)
+        # Both, before the first file is written.
         refuse_other_files(dataset, dataset_items)
         refuse_other_files(kernel, kernel_items)
         return Package(
@@ -113,9 +85,67 @@ def make_package(request: Request) -> Package:
         )
 
 
+def _check(request: Request) -> None:
+    """Raise :class:`UserError` for options that cannot be right, before any work."""
+    check_owner(request.owner)
+    for python in request.pythons:
+        if not re.fullmatch(r"3\.[0-9]{1,2}", python):
+            known = ",".join(PYTHONS)
+            raise UserError(
+                f"--python {python[:20]!r}: expected versions of Python 3 such as {known}"
+            )
+    if request.wheels is not None and not request.wheels.is_dir():
+        raise UserError(f"--wheels {request.wheels}: no such directory")
+
+
+def _kernel_items(
+    request: Request, checkout: Path, staging: Path, *, has_weights: bool
+) -> tuple[Item, ...]:
+    """Return the files of the kernel's folder."""
+    metadata = kernel_metadata(
+        request.owner,
+        NOTEBOOK.name,
+        request.image,
+        has_gpu=has_weights or request.models,
+        models=MODELS if request.models else (),
+    )
+    notebook = Item(NOTEBOOK.name, checkout / NOTEBOOK)
+    return (_text(staging, "kernel-metadata.json", metadata), notebook)
+
+
+def _dataset_items(
+    request: Request, checkout: Path, staging: Path, chosen: ChosenWeights, dataset: Path
+) -> tuple[Item, ...]:
+    """Return the files of the dataset's folder, for which wheels are built and collected."""
+    licences = [item.licence for item in chosen.items]
+    own = build_wheel(checkout, staging / "own")
+    others = collect_wheels(
+        pins(checkout), request.pythons, staging / "others", kept=dataset, wheels=request.wheels
+    )
+    requirements = "\n".join(install_lines(own, others)) + "\n"
+    return (
+        _text(staging, "dataset-metadata.json", dataset_metadata(request.owner, licences)),
+        *(Item(path.name, path, licence_of(path)) for path in (own, *others)),
+        _text(staging, "requirements.txt", requirements),
+        _text(staging, "README.md", dataset_page(licences)),
+        Item("LICENSE", checkout / "LICENSE"),
+        # The manifest of the converted files, which the store reads after the package's own.
+        _text(staging, MANIFEST, chosen.manifest),
+        *chosen.licence_texts,
+        *chosen.items,
+    )
+
+
+def _text(staging: Path, name: str, content: str) -> Item:
+    """Write a text to the staging folder, with the same bytes on every system."""
+    (staging / name).write_text(content, encoding="utf-8", newline="\n")
+    return Item(name, staging / name)
+
+
 def find_checkout() -> Path:
-    """Return the checkout that this package runs from. Raise :class:`UserError` for an installed
-    wheel.
+    """Return the checkout that this package runs from.
+
+    Raises :class:`UserError` for an installed wheel.
     """
     root = Path(__file__).resolve().parents[2]
     if not (root / NOTEBOOK).is_file():
