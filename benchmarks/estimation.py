@@ -1,12 +1,12 @@
-"""Scores of F by MAGSAC, with a prior on focal lengths, and from a batch's cameras, on the same
-matches.
+"""Scores of F by MAGSAC, with a prior on focal lengths, and from cameras, on the same matches.
 
 python -m benchmarks.estimation --train-dir DIR --journals DIR [DIR ...] [--scenes NAME ...]
     [--estimates NAME ...] [--thresholds PIXELS ...] [--settings TOML ...] [--units A,B ...]
     [--images 18 24] [--shares 1 0.3 0.12] [--seeds 8]
 
-Journals, the work directories of `validate`, provide the matches and each pair's own F. A journal made with
-``--min-covisibility 0`` also has the extra pairs that a scene may add; they are not scored.
+Journals, the work directories of `validate`, provide the matches and each pair's own F. A journal
+made with ``--min-covisibility 0`` also has the extra pairs that a scene may add; they are not
+scored.
 
 The unit of evidence is a draw: some or all images of a scene, and a share of their pairs. The
 output has a table for each journal and share. Each row has an estimate's mAA by scene, gain over
@@ -14,7 +14,7 @@ the first estimate, and CPU seconds per pair or batch. Intervals resample images
 one draw, and draws otherwise; the mean's interval then also resamples scenes. ``--settings`` gives
 a row for each line of a recipe's table [scene], such as "cameras = 'image'". ``--units`` gives a
 row for each choice of the journal's units, such as ``1:sift@1536,1:aliked_lightglue@1024-``; a unit
-with a minus connects images but makes no tracks. F of a pair is then estimated anew, from these
+with a minus connects images but makes no tracks. F of a pair is then estimated again, from these
 units. ``--thresholds`` replaces the rows by two rows for each threshold of MAGSAC.
 """
 
@@ -48,10 +48,12 @@ from mkpc_kaggle.scene.densify import extra_pairs
 from mkpc_kaggle.scene.reconstruct import reconstruct_batch
 from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair, tracks_of
 
-MIN_COVISIBILITY = 0.1  # of a scored pair
-MAGSAC = RobustConfig(permutations=1)
+MIN_COVISIBILITY = 0.1  # of a scored pair, as in the competition
+MAGSAC = RobustConfig(permutations=1)  # with a prior, the permutations are starts of a search
 FOCAL = FocalConfig()
-OWN, SCENE = "own F", "scene"
+# Names of estimates.
+OWN = "own F"
+SCENE = "scene"
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,12 +75,16 @@ Estimator: TypeAlias = Callable[[Sequence[Known], Sequence[Known]], Sequence[Mat
 
 
 def with_prior(found: PairMatch, magsac: RobustConfig = MAGSAC) -> Estimate:
+    """Estimate F with a prior that knows the images' sizes only, not their EXIF."""
     size0, size1 = found.sizes
-    priors = FocalPrior.of_image(size0), FocalPrior.of_image(size1)
+    priors = (FocalPrior.of_image(size0), FocalPrior.of_image(size1))
     return estimate_with_prior(found.matches, priors, magsac, FOCAL)
 
 
 def by_pair(make: Callable[[PairMatch], Estimate]) -> Estimator:
+    """Return the estimator of each pair by itself."""
+
+    # Draws have pairs in common.
     @cache
     def of_pair(known: Known) -> Matrix3 | None:
         found = make(known.found)
@@ -88,6 +94,7 @@ def by_pair(make: Callable[[PairMatch], Estimate]) -> Estimator:
 
 
 def by_threshold(pixels: float) -> dict[str, Estimator]:
+    """Return the estimators without and with a prior at a threshold."""
     magsac = replace(MAGSAC, threshold=pixels)
     return {
         f"MAGSAC, {pixels:g} px": by_pair(lambda found: estimate(found.matches, magsac)),
@@ -122,40 +129,49 @@ def with_units(known: Known, choice: str) -> Known:
 def of_units(choice: str, make: Estimator) -> Estimator:
     """Return the estimator on the matches of the chosen units."""
     chosen = cache(partial(with_units, choice=choice))
-    return lambda pairs, every: make([*map(chosen, pairs)], [*map(chosen, every)])
+
+    def estimator(pairs: Sequence[Known], every: Sequence[Known]) -> Sequence[Matrix3 | None]:
+        own = [chosen(pair) for pair in pairs]
+        others = [chosen(pair) for pair in every]
+        return make(own, others)
+
+    return estimator
 
 
 def by_scene(settings: str, pairs: Sequence[Known], every: Sequence[Known]) -> list[Matrix3 | None]:
-    """Return the F of pairs reconstructed as one batch, together with the first unit's matches of
-    extra pairs.
-    """
+    """Return the F of pairs reconstructed as one batch, together with extra pairs."""
     config = from_table(SceneConfig, tomllib.loads(settings), settings)
     batch = [batch_pair(pair.true, pair.found, pair.F) for pair in pairs]
     for extra in extra_of(pairs, every, config):
-        batch.append(batch_pair(extra.true, replace(extra.found, results=extra.found.results[:1])))
+        # The engine matches extra pairs by the first unit alone.
+        first = replace(extra.found, results=extra.found.results[:1])
+        batch.append(batch_pair(extra.true, first))
     choices = reconstruct_batch(batch, config).choices[: len(pairs)]
-    return [
-        pair.F if choice.F is None else choice.F
-        for pair, choice in zip(pairs, choices, strict=True)
-    ]
+    matrices = []
+    for pair, choice in zip(pairs, choices, strict=True):
+        # As in a submission: without an F from the scene, the pair keeps its own.
+        matrices.append(pair.F if choice.F is None else choice.F)
+    return matrices
 
 
 def batch_pair(true: TruePair, found: PairMatch, F: Matrix3 | None = None) -> BatchPair:
     """Return a pair as the input of a reconstruction."""
-    image0, image1 = (
-        BatchImage(name, name, size)
-        for name, size in zip(true.pair.names, found.sizes, strict=True)
-    )
+    name0, name1 = true.pair.names
+    size0, size1 = found.sizes
+    # The name stands for the digest of the content: a scene's images have different names.
+    image0 = BatchImage(name0, name0, size0)
+    image1 = BatchImage(name1, name1, size1)
     return BatchPair(image0, image1, found.matches, F, tracks_of(found.results))
 
 
 def extra_of(pairs: Sequence[Known], every: Sequence[Known], config: SceneConfig) -> list[Known]:
     """Return the extra pairs that the engine would add."""
     names = list(dict.fromkeys(name for pair in pairs for name in pair.names))
-    ends = [
-        (names.index(first), names.index(second))
-        for first, second in (pair.names for pair in pairs)
-    ]
+    number = {name: index for index, name in enumerate(names)}
+    ends = []
+    for pair in pairs:
+        first, second = pair.names
+        ends.append((number[first], number[second]))
     chosen = extra_pairs(len(names), ends, config.pairs_per_image)
     wanted = {frozenset((names[first], names[second])) for first, second in chosen}
     return [pair for pair in every if frozenset(pair.names) in wanted]
@@ -167,21 +183,24 @@ def read_journal(directory: Path) -> tuple[str, dict[str, tuple[PairMatch, Matri
         published = Table.of(store)
         table = dict(published.about.recipe)
         recipe = recipe_of(table, table.pop("name"))
-        units, found = {unit.name: unit for unit in recipe.units}, {}
-        for record in (record for record in read_records(store, published) if record.units):
+        units = {unit.name: unit for unit in recipe.units}
+        found = {}
+        for record in read_records(store, published):
+            # A pair that was never matched, or whose image is unreadable.
+            if not record.units:
+                continue
             images = read_images(store, published.rows[record.index])
             points = read_points(store, published, record.index)
             results = tuple(UnitResult(units[name], matches) for name, matches in points.items())
             match = PairMatch(results, sizes=tuple(image.size for image in images))
-            found[record.pair.id] = match, None if record.failure else record.pair_fundamental
+            F = None if record.failure else record.pair_fundamental
+            found[record.pair.id] = (match, F)
     return recipe.name, found
 
 
 @dataclass(frozen=True, eq=False)
 class Score:
-    """Result of an estimate on a draw of a scene: accuracies of the pairs, images of the pairs,
-    total seconds.
-    """
+    """Result of an estimate on a draw of a scene, with the images of its pairs and CPU seconds."""
 
     accuracies: list[float]
     images: list[tuple[str, str]]
@@ -191,28 +210,32 @@ class Score:
 def score(
     make: Estimator, pairs: Sequence[Known], every: Sequence[Known], scene: TrainScene
 ) -> Score:
+    """Return the score of an estimator on the pairs of a draw."""
     start = time.process_time()
     matrices = make(pairs, every)
     seconds = time.process_time() - start
-    errors = [
-        PoseError.failed() if F is None else error_of(F, pair.true, scene)
-        for F, pair in zip(matrices, pairs, strict=True)
-    ]
-    return Score([*map(pair_accuracy, errors)], [pair.names for pair in pairs], seconds)
+    accuracies = []
+    for F, pair in zip(matrices, pairs, strict=True):
+        error = PoseError.failed() if F is None else error_of(F, pair.true, scene)
+        accuracies.append(pair_accuracy(error))
+    return Score(accuracies, [pair.names for pair in pairs], seconds)
 
 
 def drawn(
     every: Sequence[Known], images: int, share: float, seed: int
 ) -> tuple[list[Known], list[Known]]:
-    """Draw random images, or all if ``images`` is 0. Return a share of their scored pairs, and all
-    their pairs.
+    """Draw random images, or all if ``images`` is 0.
+
+    Return a share of their scored pairs, and all their pairs.
     """
     generator = np.random.default_rng(seed)
+    # Sorted, because the order of a set differs between runs.
     names = sorted({name for pair in every for name in pair.names})
     chosen = set(generator.permutation(names)[: images or None].tolist())
     inside = [pair for pair in every if chosen >= set(pair.names)]
     scored = [pair for pair in inside if pair.true.covisibility >= MIN_COVISIBILITY]
-    kept = np.sort(generator.permutation(len(scored))[: round(share * len(scored))])
+    count = round(share * len(scored))
+    kept = np.sort(generator.permutation(len(scored))[:count])
     return [scored[index] for index in kept], inside
 
 
@@ -221,62 +244,75 @@ Draws: TypeAlias = Mapping[str, Sequence[Mapping[str, Score]]]
 
 
 def difference(draws: Draws, first: str, second: str) -> Difference:
-    """Return the gain of the second estimate over the first, with its interval over images or over
-    draws.
+    """Return the gain of the second estimate over the first.
+
+    Its interval is over images, or over draws if a scene has several.
     """
-    both = [
-        (scene, each[first], each[second]) for scene, scores in draws.items() for each in scores
-    ]
-    if len(both) == len(draws):
-        return paired_difference([(a.accuracies, b.accuracies, a.images) for _, a, b in both])
-    firsts, seconds = (
-        [mean(a.accuracies) for _, a, _ in both],
-        [mean(b.accuracies) for *_, b in both],
-    )
-    return paired_difference(
-        [(firsts, seconds, [(scene, f"draw {n}") for n, (scene, *_) in enumerate(both)])]
-    )
+    if all(len(scores) == 1 for scores in draws.values()):
+        single = []
+        for (only,) in draws.values():
+            before = only[first]
+            after = only[second]
+            single.append((before.accuracies, after.accuracies, before.images))
+        return paired_difference(single)
+    firsts = []
+    seconds = []
+    ends = []
+    for scene, scores in draws.items():
+        for each in scores:
+            # Scene and draw take the place of two images: both are resampled.
+            ends.append((scene, f"draw {len(ends)}"))
+            firsts.append(mean(each[first].accuracies))
+            seconds.append(mean(each[second].accuracies))
+    return paired_difference([(firsts, seconds, ends)])
 
 
 def table(title: str, draws: Draws, names: Sequence[str]) -> list[str]:
-    """Return a Markdown table. A second row per estimate has gains by scene; lines below have gains
-    by draw.
+    """Return a Markdown table.
+
+    A second row per estimate has gains by scene; lines below have gains by draw.
     """
     counts = [f"{name} ({len(scores)})" for name, scores in draws.items()]
     lines = [f"| {title} | {' | '.join(counts)} | mean | gain over the first | seconds |"]
     lines.append("|" + " --- |" * (len(counts) + 4))
     by_draw = []
     for name in names:
-        maas = {
-            scene: [mean(each[name].accuracies) for each in scores]
-            for scene, scores in draws.items()
-        }
+        maas = {}
+        for scene, scores in draws.items():
+            maas[scene] = [mean(each[name].accuracies) for each in scores]
         means = [mean(values) for values in maas.values()]
-        spent = [each[name] for scores in draws.values() for each in scores]
-        runs = len(spent) if name.startswith(SCENE) else sum(len(each.accuracies) for each in spent)
         cells = [f"{value:.3f}" for value in (*means, mean(means))]
         gain = "" if name == names[0] else str(difference(draws, names[0], name))
-        lines.append(
-            f"| {name} | {' | '.join(cells)} | {gain} | {sum(each.seconds for each in spent) / runs:.2f} |"
-        )
+        lines.append(f"| {name} | {' | '.join(cells)} | {gain} | {_seconds(draws, name):.2f} |")
         if gain:
-            gains = [
-                str(difference({scene: scores}, names[0], name)) for scene, scores in draws.items()
-            ]
+            gains = []
+            for scene, scores in draws.items():
+                gains.append(str(difference({scene: scores}, names[0], name)))
             lines.append(f"| its gain | {' | '.join(gains)} | | | |")
         for scene, values in maas.items():
             first = [mean(each[names[0]].accuracies) for each in draws[scene]]
-            shown = [
-                f"{value - other:+.3f}" if gain else f"{value:.3f}"
-                for value, other in zip(values, first, strict=True)
-            ]
+            shown = []
+            for value, other in zip(values, first, strict=True):
+                shown.append(f"{value - other:+.3f}" if gain else f"{value:.3f}")
             by_draw.append(f"{name}, {scene}: {', '.join(shown)}")
-    return lines + (["", *by_draw] if any(len(scores) > 1 for scores in draws.values()) else [])
+    if any(len(scores) > 1 for scores in draws.values()):
+        lines += ["", *by_draw]
+    return lines
+
+
+def _seconds(draws: Draws, name: str) -> float:
+    """Return an estimate's CPU seconds, per batch for scenes and per pair for all others."""
+    scores = [each[name] for draw in draws.values() for each in draw]
+    runs = len(scores)
+    if not name.startswith(SCENE):
+        runs = sum(len(each.accuracies) for each in scores)
+    return sum(each.seconds for each in scores) / runs
 
 
 def main() -> None:
     parser = draws_parser(__doc__ or "")
     parser.add_argument("--thresholds", type=float, nargs="+", default=())
+    # The first is the one that the others are compared with.
     names = [*PAIR_ESTIMATORS, SCENE]
     parser.add_argument("--estimates", nargs="+", choices=names, default=names)
     parser.add_argument("--settings", nargs="+", default=[""], metavar="TOML")
@@ -284,16 +320,13 @@ def main() -> None:
     arguments = parser.parse_args()
     estimators = {name: PAIR_ESTIMATORS[name] for name in arguments.estimates if name != SCENE}
     if arguments.thresholds:
-        estimators = {
-            name: make
-            for pixels in arguments.thresholds
-            for name, make in by_threshold(pixels).items()
-        }
+        estimators = {}
+        for pixels in arguments.thresholds:
+            estimators |= by_threshold(pixels)
     elif SCENE in arguments.estimates:
-        settings = arguments.settings
-        estimators |= {
-            f"{SCENE}, {line}" if line else SCENE: partial(by_scene, line) for line in settings
-        }
+        for line in arguments.settings:
+            name = f"{SCENE}, {line}" if line else SCENE
+            estimators[name] = partial(by_scene, line)
     if arguments.units:
         estimators = {
             f"{name}, {choice}": of_units(choice, make)
@@ -325,29 +358,26 @@ def compare(estimators: Mapping[str, Estimator], arguments: argparse.Namespace) 
     """Print a table of the estimators' scores for each journal and share."""
     for directory in arguments.journals:
         recipe, journal = read_journal(directory)
-        done: dict[float, dict[str, list[dict[str, Score]]]] = defaultdict(
-            lambda: defaultdict(list)
-        )
-        for scene in read_train_side(
-            arguments.train_dir, scenes=arguments.scenes, min_covisibility=0
-        ):
-            every = [
-                Known(true, *journal[true.pair.id])
-                for true in scene.pairs
-                if true.pair.id in journal
-            ]
-            plan = (
-                [*product(arguments.shares, arguments.images, range(arguments.seeds))]
-                if every
-                else []
-            )
+        # By share of the pairs, then by scene: the scores of each draw.
+        done: dict[float, dict[str, list[dict[str, Score]]]]
+        done = defaultdict(lambda: defaultdict(list))
+        # Pairs without overlap, too: a scene may match them.
+        scenes = read_train_side(arguments.train_dir, scenes=arguments.scenes, min_covisibility=0)
+        for scene in scenes:
+            every = []
+            for true in scene.pairs:
+                if true.pair.id in journal:
+                    every.append(Known(true, *journal[true.pair.id]))
+            if not every:  # the journal has other scenes
+                continue
+            plan = product(arguments.shares, arguments.images, range(arguments.seeds))
             for share, images, seed in plan:
                 if seed and not images and share == 1:
                     continue  # all images of a scene make a single draw
                 pairs, inside = drawn(every, images, share, seed)
-                scores = {
-                    name: score(make, pairs, inside, scene) for name, make in estimators.items()
-                }
+                scores = {}
+                for name, make in estimators.items():
+                    scores[name] = score(make, pairs, inside, scene)
                 done[share][scene.name].append(scores)
         for share, draws in done.items():
             title = f"{recipe}, {share:.0%} of the pairs"

@@ -38,7 +38,7 @@ class Program:
     checkout: Path = HERE
 
     def seconds(self, images: Path, out: Path) -> float:
-        """Run the program. Return CPU seconds, with those of all processes that it waited for."""
+        """Run the program. Return CPU seconds, with the seconds of all processes that it waited for."""
         command = [part.format(images=images, out=out) for part in self.command]
         environment = {**os.environ, **ONE_THREAD, "PYTHONPATH": str(self.checkout)}
         # From the checkout, because Python imports from the working directory first.
@@ -100,6 +100,7 @@ def facts_of(out: Path) -> tuple[int, float]:
 
 
 def programs_of(arguments: argparse.Namespace) -> list[Program]:
+    """Return the programs to compare: pycolmap alone first, then this package's versions."""
     python = sys.executable
     alone = [
         Program(f"pycolmap, {mapper}", (python, "-c", ALONE, "{images}", "{out}", mapper))
@@ -118,7 +119,9 @@ def measure(programs: Sequence[Program], folder: Path, rounds: int) -> None:
     """Print a row per program and round: CPU seconds, seconds of mapping, cameras; then the means."""
     used: dict[str, list[float]] = {program.name: [] for program in programs}
     for number in range(1, rounds + 1):
+        # In turns, so that other work on the machine meets all programs.
         for program in programs:
+            # A new folder each time: a second run would resume the first one.
             with tempfile.TemporaryDirectory() as name:
                 out = Path(name) / "out"
                 seconds = program.seconds(folder.resolve(), out)

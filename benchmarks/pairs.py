@@ -43,7 +43,7 @@ from tests.support import light_matchers
 from tests.support.light_matchers import MATCHERS
 from tests.support.standin import filled
 
-KEYPOINTS = 2048
+KEYPOINTS = 2048  # of every matcher of keypoints, so that their rows can be compared
 Run = Callable[[], int]  # runs once and returns the number of matches or keypoints
 
 
@@ -56,14 +56,14 @@ class Case:
 
 
 def random_network(make: Callable[[], nn.Module], placement: Placement) -> Any:
-    """Return the network with random weights that keep activations of order 1; stand-in weights
-    take minutes.
-    """
+    """Return the network with random weights that keep activations of order 1."""
+    # Stand-in weights of this size take minutes to make.
     with torch.device("meta"):
         network = make()
     network.to_empty(device="cpu")
     generator = torch.Generator().manual_seed(0)
     for name, tensor in network.state_dict().items():
+        # A sum of n products of order 1 grows with the square root of n.
         if tensor.ndim > 1:
             tensor.normal_(std=tensor[0].numel() ** -0.5, generator=generator)
         else:
@@ -84,12 +84,15 @@ def roma(placement: Placement) -> DenseMatcher:
 def with_lightglue(
     name: str, layers: int, keypoints: int = KEYPOINTS
 ) -> Callable[[Placement], Matcher[Any]]:
+    """Return the maker of a LightGlue matcher with stand-in weights."""
     return partial(
         light_matchers.lightglue_matcher, name, keypoints=keypoints, layers=layers, threshold=0.1
     )
 
 
-SPARSE, SEMI_DENSE = Size(1024, 768), Size(840, 630)
+# Views of matchers of keypoints, and of semi-dense ones, in the recipes.
+SPARSE = Size(1024, 768)
+SEMI_DENSE = Size(840, 630)
 CASES = {
     "sift": Case(lambda placement: SiftMatcher(SiftOptions(), "cpu"), Size(1280, 960)),
     "sift_lightglue": Case(with_lightglue("sift_lightglue", 9), SPARSE),
@@ -107,39 +110,45 @@ CASES = {
 
 
 def photographs(size: Size) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Return two images (H, W, 3) RGB; the second is the first shifted by 16 pixels right and 8
-    down.
-    """
+    """Return two images (H, W, 3) RGB; the second is the first, 16 pixels right and 8 down."""
     resized = cv2.resize(load_sample_images().images[0], size, interpolation=cv2.INTER_AREA)
     return resized, np.roll(resized, (8, 16), axis=(0, 1))
 
 
 def pictures_of(size: Size, colour: Colour, multiple: int) -> list[Picture]:
+    """Return the two images as a matcher's input."""
     view = View.fit(Box.whole(size), long_side=max(size), multiple=multiple)
-    gray = colour is Colour.GRAY
-    shown = [
-        cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY) if gray else pixels for pixels in photographs(size)
-    ]
-    return [Picture(view.render(pixels), view) for pixels in shown]
+    pictures = []
+    for rgb in photographs(size):
+        is_gray = colour is Colour.GRAY
+        pixels = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY) if is_gray else rgb
+        pictures.append(Picture(view.render(pixels), view))
+    return pictures
 
 
 def run_of(case: Case, placement: Placement) -> Run:
+    """Return the work on a pair of new images; the matcher is loaded before."""
     matcher = case.make(placement)
-    pictures = pictures_of(case.size, matcher.spec.colour, matcher.spec.multiple)
-    return lambda: len(
-        matcher.match(
-            *([encoded] for picture in pictures for encoded in matcher.encode([picture]))
-        )[0]
-    )
+    first, second = pictures_of(case.size, matcher.spec.colour, matcher.spec.multiple)
+
+    def run() -> int:
+        # One by one, as on a CPU.
+        encodings0 = matcher.encode([first])
+        encodings1 = matcher.encode([second])
+        return len(matcher.match(encodings0, encodings1)[0])
+
+    return run
 
 
 def kornias_loftr(placement: Placement) -> Run:
     """Return a run of kornia's LoFTR in float32, with our weights."""
     network = LoFTR(pretrained=None).eval()
-    network.load_state_dict({**network.state_dict(), **filled(Loftr(), "loftr").state_dict()})
-    image0, image1 = (
-        image_batch([each], "cpu") for each in pictures_of(SEMI_DENSE, Colour.GRAY, 8)
-    )
+    # Its table of positions is not in checkpoints, so it keeps its own.
+    weights = filled(Loftr(), "loftr").state_dict()
+    network.load_state_dict({**network.state_dict(), **weights})
+    first, second = pictures_of(SEMI_DENSE, Colour.GRAY, 8)
+    image0 = image_batch([first], "cpu")
+    image1 = image_batch([second], "cpu")
     return lambda: len(network({"image0": image0, "image1": image1})["keypoints0"])
 
 
@@ -158,9 +167,8 @@ def seconds_of(run: Run) -> float:
 
 
 def high_water() -> int:
-    """Return the peak memory of this process in kilobytes; ``getrusage`` may report the parent's
-    peak.
-    """
+    """Return the peak memory of this process in kilobytes."""
+    # ``getrusage`` may report the parent's peak.
     kilobytes = re.search(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text())
     assert kilobytes is not None
     return int(kilobytes[1])
@@ -168,20 +176,11 @@ def high_water() -> int:
 
 def peak_memory(name: str, precision: str) -> float:
     """Return the peak memory of a separate process, in GB."""
-    arguments = [
-        sys.executable,
-        "-m",
-        "benchmarks.pairs",
-        "--memory-of",
-        name,
-        "--precision",
-        precision,
-    ]
-    return (
-        int(subprocess.run(arguments, check=True, capture_output=True, text=True).stdout)
-        * 1024
-        / 1e9
-    )
+    # A peak never falls, so each matcher needs a process.
+    options = ["--memory-of", name, "--precision", precision]
+    command = [sys.executable, "-m", "benchmarks.pairs", *options]
+    done = subprocess.run(command, check=True, capture_output=True, text=True)
+    return int(done.stdout) * 1024 / 1e9
 
 
 @torch.inference_mode()
@@ -204,11 +203,14 @@ def main() -> None:
         print(high_water())
         return
     wanted = arguments.only.split(",")
-    runs = {
-        name: make(placement) for name, make in RUNS.items() if any(part in name for part in wanted)
-    }
+    runs = {}
+    for name, make in RUNS.items():
+        if any(part in name for part in wanted):
+            runs[name] = make(placement)
+    # The first run is not timed: it allocates memory and chooses kernels.
     found = {name: run() for name, run in runs.items()}
     times: dict[str, list[float]] = {name: [] for name in runs}
+    # In turns, so that other work on the machine meets all matchers.
     for _ in range(arguments.rounds):
         for name, run in runs.items():
             times[name].append(seconds_of(run))

@@ -28,6 +28,7 @@ Cameras = dict[str, Camera]
 
 def matched(database: Path, images: Path, one_camera: bool) -> None:
     """Write SIFT features of all images, and verified matches of all pairs, to the database."""
+    # COLMAP's own default; named, so that the table does not change with its version.
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model = "SIMPLE_RADIAL"
     pycolmap.extract_features(
@@ -44,20 +45,25 @@ def models(mapper: str, database: Path, images: Path, folder: Path) -> list[Came
     """Return the cameras of every model by image id, the largest model first."""
     mapping = pycolmap.incremental_mapping if mapper == "incremental" else pycolmap.global_mapping
     found = mapping(database, images, folder)
-    return sorted((cameras_of(model) for model in found.values()), key=len, reverse=True)
+    cameras = [cameras_of(model) for model in found.values()]
+    return sorted(cameras, key=len, reverse=True)
 
 
 def cameras_of(model: pycolmap.Reconstruction) -> Cameras:
+    """Return the cameras of a model by image id; distortion is left out, as F has none."""
     cameras = {}
     for number in model.reg_image_ids():
         image = model.images[number]
-        pose, K = image.cam_from_world().matrix(), image.camera.calibration_matrix()
+        pose = image.cam_from_world().matrix()
+        K = image.camera.calibration_matrix()
         K[:2, 2] -= CENTRE_PX
-        cameras[Path(image.name).stem] = Camera(K, pose[:, :3], pose[:, 3])
+        name = Path(image.name).stem
+        cameras[name] = Camera(K, pose[:, :3], pose[:, 3])
     return cameras
 
 
 def error_of(true: TruePair, found: list[Cameras], metres_per_unit: float) -> PoseError:
+    """Return the error of a pair's F from the first model that has both images."""
     names = [path.stem for path in true.pair.images]
     for cameras in found:
         if all(name in cameras for name in names):
@@ -67,8 +73,10 @@ def error_of(true: TruePair, found: list[Cameras], metres_per_unit: float) -> Po
 
 
 def run(scene: TrainScene, images: Path, mappers: list[str], one_camera: bool) -> None:
+    """Print a row for each mapper, on the same features and matches."""
     with tempfile.TemporaryDirectory() as name:
-        folder, database = Path(name), Path(name) / "database.db"
+        folder = Path(name)
+        database = folder / "database.db"
         begin = time.process_time()
         matched(database, images, one_camera)
         matching = time.process_time() - begin
@@ -76,6 +84,7 @@ def run(scene: TrainScene, images: Path, mappers: list[str], one_camera: bool) -
             begin = time.process_time()
             found = models(mapper, database, images, folder)
             errors = [error_of(true, found, scene.metres_per_unit) for true in scene.pairs]
+            # Pairs whose images are in no common model; they count as failed.
             lost = np.mean([not np.isfinite(error.rotation) for error in errors])
             sizes = ", ".join(str(len(cameras)) for cameras in found) or "none"
             maa = np.mean([*map(pair_accuracy, errors)])
@@ -97,17 +106,14 @@ def main() -> None:
     )
     parser.add_argument("--one-camera", action="store_true", help="that took all images of a scene")
     arguments = parser.parse_args()
+    # Its lines would be between the table's.
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
     print(
         f"{'scene':20}{'mapper':13}{'pairs':>6}{'mAA':>9}{'lost':>8}{'match s':>10}{'map s':>9}  images of models"
     )
     for scene in read_train_side(arguments.train_dir, scenes=arguments.scenes):
-        run(
-            scene,
-            arguments.train_dir / scene.name / "images",
-            arguments.mappers,
-            arguments.one_camera,
-        )
+        images = arguments.train_dir / scene.name / "images"
+        run(scene, images, arguments.mappers, arguments.one_camera)
 
 
 if __name__ == "__main__":

@@ -22,13 +22,14 @@ from PIL import Image
 from mkpc_kaggle.data.competition import read_train_side
 from mkpc_kaggle.evaluation.compare import paired_difference
 
+# Lower edges of bins; the last is the upper edge.
 COVISIBILITIES = (0.1, 0.2, 0.4, inf)
 SHARES = (0.0, 0.25, 0.5, 1.0, inf)  # the last bin has the pairs without a crop
 
 
 @dataclass(frozen=True)
 class Pair:
-    """A scored pair: the accuracy by each file, and what the bins are made of."""
+    """A scored pair: the accuracy by each file, and the values of the bins."""
 
     scene: str
     images: tuple[str, str]
@@ -48,21 +49,24 @@ def share_of(boxes: Sequence[Sequence[int]], sizes: Sequence[tuple[int, int]]) -
 def read_pairs(train_dir: Path, files: Sequence[Path]) -> list[Pair]:
     """Return the pairs that all files have."""
     figures = [json.loads(file.read_text(encoding="utf-8")) for file in files]
-    by_id = [
-        {pair["pair"]: pair for scene in each["scenes"] for pair in scene["pairs"]}
-        for each in figures
-    ]
+    by_id = []
+    for each in figures:
+        rows: dict[str, Any] = {}
+        for scene in each["scenes"]:
+            rows |= {pair["pair"]: pair for pair in scene["pairs"]}
+        by_id.append(rows)
+    names = [each["scene"] for each in figures[0]["scenes"]]
     pairs = []
-    for scene in read_train_side(
-        train_dir, scenes=[each["scene"] for each in figures[0]["scenes"]]
-    ):
+    for scene in read_train_side(train_dir, scenes=names):
         for true in scene.pairs:
-            rows = [table[true.pair.id] for table in by_id if true.pair.id in table]
-            if len(rows) < len(files):
+            # A file may be of a part of the pairs.
+            found = [table[true.pair.id] for table in by_id if true.pair.id in table]
+            if len(found) < len(files):
                 continue
-            boxes = next((row["boxes"] for row in rows if row["boxes"]), [])
+            # A recipe of stage 1 has no crops.
+            boxes = next((row["boxes"] for row in found if row["boxes"]), [])
             sizes = [Image.open(path).size for path in true.pair.images]
-            accuracies = tuple(last_accuracy(row) for row in rows)
+            accuracies = tuple(last_accuracy(row) for row in found)
             share = share_of(boxes, sizes)
             pairs.append(Pair(scene.name, true.pair.names, accuracies, true.covisibility, share))
     return pairs
@@ -83,9 +87,8 @@ def rows(
         if not inside:
             continue
         name = f"{low:g} to {high:g}" if high < inf else f"{low:g} and more"
-        maas = [
-            mean(pair.accuracies[n] for pair in inside) for n in range(len(inside[0].accuracies))
-        ]
+        by_file = zip(*(pair.accuracies for pair in inside), strict=True)
+        maas = [mean(accuracies) for accuracies in by_file]
         # Of the first file, the accuracy; of the others, the gain, too.
         cells = [f"{maas[0]:.3f}"]
         for number, maa in enumerate(maas[1:], start=1):

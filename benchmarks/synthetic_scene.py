@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import combinations, product
 
 import numpy as np
 
@@ -41,11 +41,14 @@ class SyntheticScene:
         return fundamental_of_cameras(*self.true_cameras(pair))
 
     def median_distance(self, F: Matrix3, pair: BatchPair) -> float:
-        """Return the median Sampson distance, in pixels, of a pair's true correspondences under
-        ``F``.
-        """
-        points = [project(camera, self.world[:400]) for camera in self.true_cameras(pair)]
-        return float(np.median(sampson_distances(F, Matches(*points, np.ones(len(points[0]))))))
+        """Return the median Sampson distance in pixels of true correspondences under ``F``."""
+        # Of points that the images need not see: F holds for them, too.
+        world = self.world[:400]
+        camera0, camera1 = self.true_cameras(pair)
+        points0 = project(camera0, world)
+        points1 = project(camera1, world)
+        true = Matches(points0, points1, np.ones(len(world)))
+        return float(np.median(sampson_distances(F, true)))
 
 
 def synthetic_scene(
@@ -59,12 +62,12 @@ def synthetic_scene(
     prefix: str = "",
     focals: Sequence[float] = (),
 ) -> SyntheticScene:
-    """Return a scene of cameras on an arc in front of a facade, with ``pairs`` random pairs or all
-    pairs.
+    """Return a scene of cameras on an arc in front of a facade, with ``pairs`` random pairs or all.
 
-    ``noise`` is the detector's standard deviation in pixels per coordinate: one number, or one for each image. A
-    point has the same error in all pairs of the image, except for a deviation of 0.05 pixels. ``outliers`` is the
-    share of wrong matches. Without ``focals``, in pixels, each camera has its own random focal length.
+    ``noise`` is the detector's standard deviation in pixels per coordinate: one number, or one for
+    each image. A point has the same error in all pairs of the image, except for a deviation of 0.05
+    pixels. ``outliers`` is the share of wrong matches. Without ``focals``, in pixels, each camera
+    has its own random focal length.
     """
     rng = np.random.default_rng(seed)
     world = front(rng, points)
@@ -73,37 +76,47 @@ def synthetic_scene(
         arc = [zoomed(camera, focal) for camera, focal in zip(arc, focals, strict=True)]
     ends = list(combinations(range(images), 2))
     if pairs is not None and pairs < len(ends):
-        ends = [ends[index] for index in np.sort(rng.choice(len(ends), pairs, replace=False))]
+        drawn = rng.choice(len(ends), pairs, replace=False)
+        ends = [ends[index] for index in np.sort(drawn)]
     return batch_of(rng, world, arc, ends, noise, outliers, prefix=prefix)
 
 
 def street(
     images: int, pairs: int, *, noise: float = 0.4, outliers: float = 0.25, seed: int = 0
 ) -> SyntheticScene:
-    """Return a scene of one image per metre along a loop of facades; neighbours have up to 290
-    matches.
+    """Return a scene of one image per metre along a loop of facades.
+
+    Images look outwards. Neighbours have up to 290 matches.
     """
     rng = np.random.default_rng(seed)
     radius = images / (2 * np.pi)
-    angles = 2 * np.pi * np.arange(images) / images
-    count = round(2 * np.pi * (radius + 20) * 44)
-    around, height = rng.uniform(0, 2 * np.pi, count), rng.uniform(-7, 7, count)
-    bays = np.where(np.floor(around * (radius + 20) / 3) % 2 == 0, 0.0, 2.0) + rng.uniform(
-        0, 1, count
-    )
-    distance = radius + 20 + bays
-    world = np.column_stack([distance * np.sin(around), height, distance * np.cos(around)])
-    cameras = [
-        looking(
-            np.array([radius * np.sin(angle), rng.normal(0, 0.2), radius * np.cos(angle)]),
-            angle + rng.normal(0, np.radians(4)),
-            max(SIZE) * np.exp(rng.normal(np.log(1.1), 0.1)),
-        )
-        for angle in angles
-    ]
-    near = ((step, first) for step in range(1, images) for first in range(images))
-    ends = [tuple(sorted((first, (first + step) % images))) for step, first in near][:pairs]
-    return batch_of(rng, world, cameras, sorted(set(ends)), noise, outliers, most=290)
+    wall = radius + 20  # the facades are 20 m away, with 44 points a metre
+    count = round(2 * np.pi * wall * 44)
+    around = rng.uniform(0, 2 * np.pi, count)
+    height = rng.uniform(-7, 7, count)
+    # Every second bay of 3 m is set back: points of one plane would leave F undetermined.
+    setback = np.where(np.floor(around * wall / 3) % 2 == 0, 0.0, 2.0)
+    distance = wall + (setback + rng.uniform(0, 1, count))
+    east = distance * np.sin(around)
+    north = distance * np.cos(around)
+    world = np.column_stack([east, height, north])
+    cameras = []
+    for angle in 2 * np.pi * np.arange(images) / images:
+        x = radius * np.sin(angle)
+        y = rng.normal(0, 0.2)
+        z = radius * np.cos(angle)
+        centre = np.array([x, y, z])
+        direction = angle + rng.normal(0, np.radians(4))
+        focal = max(SIZE) * np.exp(rng.normal(np.log(1.1), 0.1))
+        cameras.append(looking(centre, direction, focal))
+    # The nearest images first: all next neighbours, then the second next, ...
+    ends = []
+    for step, first in product(range(1, images), range(images)):
+        second = (first + step) % images
+        ends.append((min(first, second), max(first, second)))
+    # From half the loop on, the same pairs come again from the other side.
+    distinct = sorted(set(ends[:pairs]))
+    return batch_of(rng, world, cameras, distinct, noise, outliers, most=290)
 
 
 def batch_of(
@@ -118,78 +131,87 @@ def batch_of(
     most: int | None = None,
 ) -> SyntheticScene:
     """Return the scene of these cameras and of the pairs with the image indices ``ends``."""
-    images = tuple(
-        BatchImage(f"{prefix}{n:04}", f"digest of {prefix}{n:04}", SIZE)
-        for n in range(len(cameras))
-    )
+    names = [f"{prefix}{number:04}" for number in range(len(cameras))]
+    images = tuple(BatchImage(name, f"digest of {name}", SIZE) for name in names)
     noises = np.broadcast_to(noise, len(cameras)).tolist()
+    # Detected once per image: a point's error is the same in all pairs.
     seen = [see(rng, camera, world, own) for camera, own in zip(cameras, noises, strict=True)]
-    pairs = tuple(
-        BatchPair(
-            images[first], images[second], match(rng, seen[first], seen[second], outliers, most)
-        )
-        for first, second in ends
-    )
-    return SyntheticScene(
-        images, pairs, dict(zip((i.name for i in images), cameras, strict=True)), world
-    )
+    pairs = []
+    for first, second in ends:
+        matches = match(rng, seen[first], seen[second], outliers, most)
+        pairs.append(BatchPair(images[first], images[second], matches))
+    by_name = dict(zip(names, cameras, strict=True))
+    return SyntheticScene(images, tuple(pairs), by_name, world)
 
 
 def front(rng: np.random.Generator, count: int) -> np.ndarray:
-    """Return (count, 3) world points of a facade with bays: x to the right, y down, z away from the
-    cameras.
+    """Return world points (count, 3) of a facade with bays.
+
+    x is to the right, y down, z away from the cameras.
     """
-    x, y = rng.uniform(-8, 8, count), rng.uniform(-4, 4, count)
-    bays = np.where(np.floor(x / 2) % 2 == 0, 0.0, 2.0)
-    return np.column_stack([x, y, bays + rng.uniform(0, 1.0, count)])
+    x = rng.uniform(-8, 8, count)
+    y = rng.uniform(-4, 4, count)
+    setback = np.where(np.floor(x / 2) % 2 == 0, 0.0, 2.0)
+    return np.column_stack([x, y, setback + rng.uniform(0, 1.0, count)])
 
 
 def arc_camera(rng: np.random.Generator, where: float) -> Camera:
-    """Return a camera at ``where`` (0 to 1) on an 80-degree arc about the facade, with a random
-    focal length.
+    """Return a camera at ``where`` (0 to 1) on an 80-degree arc about the facade.
+
+    Its focal length is random, about 1.1 times the image's longer side.
     """
     angle = np.radians(80) * (where - 0.5) + rng.normal(0, 0.02)
     distance = rng.uniform(11, 15)
-    centre = np.array(
-        [distance * np.sin(angle), rng.normal(0, 0.5), 1.5 - distance * np.cos(angle)]
-    )
+    x = distance * np.sin(angle)
+    y = rng.normal(0, 0.5)
+    z = 1.5 - distance * np.cos(angle)  # the middle of the facade's depth is at 1.5
+    centre = np.array([x, y, z])
     target = np.array([rng.normal(0, 1), rng.normal(0, 0.5), 1.5])
     ahead = (target - centre) / np.linalg.norm(target - centre)
-    return pointed(centre, ahead, max(SIZE) * np.exp(rng.normal(np.log(1.1), 0.2)))
+    focal = max(SIZE) * np.exp(rng.normal(np.log(1.1), 0.2))
+    return pointed(centre, ahead, focal)
 
 
 def looking(centre: np.ndarray, angle: float, focal: float) -> Camera:
-    """Return a level camera whose viewing direction has this angle, in radians, about the vertical
-    axis.
-    """
-    return pointed(centre, np.array([np.sin(angle), 0.0, np.cos(angle)]), focal)
+    """Return a level camera that looks at an angle, in radians, about the vertical axis."""
+    ahead = np.array([np.sin(angle), 0.0, np.cos(angle)])
+    return pointed(centre, ahead, focal)
 
 
 def pointed(centre: np.ndarray, ahead: np.ndarray, focal: float) -> Camera:
     """Return an upright camera at ``centre`` that looks along the unit vector ``ahead``."""
-    right = np.cross([0.0, 1, 0], ahead)
+    right = np.cross([0.0, 1, 0], ahead)  # y is down
     right /= np.linalg.norm(right)
-    R = np.stack([right, np.cross(ahead, right), ahead])
-    return zoomed(Camera(np.eye(3), R, -R @ centre), focal)
+    down = np.cross(ahead, right)
+    R = np.stack([right, down, ahead])
+    camera = Camera(np.eye(3), R, -R @ centre)
+    return zoomed(camera, focal)
 
 
 def zoomed(camera: Camera, focal: float) -> Camera:
     """Return the camera with another focal length, in pixels."""
-    K = np.array([[focal, 0, SIZE.width / 2 - 0.5], [0, focal, SIZE.height / 2 - 0.5], [0, 0, 1]])
+    # Pixel centres are at integers, so the image's centre is half a pixel before the half size.
+    centre_x = SIZE.width / 2 - 0.5
+    centre_y = SIZE.height / 2 - 0.5
+    K = np.array([[focal, 0, centre_x], [0, focal, centre_y], [0, 0, 1]])
     return replace(camera, K=K)
 
 
 def project(camera: Camera, world: np.ndarray) -> np.ndarray:
     """Project (N, 3) world points to (N, 2) pixels."""
-    seen = (world @ camera.R.T + camera.t) @ camera.K.T
+    in_camera = world @ camera.R.T + camera.t
+    seen = in_camera @ camera.K.T
     return np.asarray(seen[:, :2] / seen[:, 2:])
 
 
 def see(rng: np.random.Generator, camera: Camera, world: np.ndarray, noise: float) -> Seen:
     """Detect the points that are in front of the camera and within the image."""
-    found = project(camera, world) + rng.normal(0, noise, (len(world), 2))
-    ahead = world @ camera.R[2] + camera.t[2] > 0
-    numbers = np.flatnonzero(Box.whole(SIZE).contains(found) & ahead)
+    # Noise for all points, also unseen ones: the draws do not depend on the camera.
+    errors = rng.normal(0, noise, (len(world), 2))
+    found = project(camera, world) + errors
+    depth = world @ camera.R[2] + camera.t[2]
+    is_inside = Box.whole(SIZE).contains(found)
+    numbers = np.flatnonzero(is_inside & (depth > 0))
     return numbers, found[numbers]
 
 
@@ -197,13 +219,18 @@ def match(
     rng: np.random.Generator, first: Seen, second: Seen, outliers: float, most: int | None
 ) -> Matches:
     """Return matches of about half the points that both images share; some matches are wrong."""
-    common, places0, places1 = np.intersect1d(
-        first[0], second[0], assume_unique=True, return_indices=True
+    numbers0, detected0 = first
+    numbers1, detected1 = second
+    common, index0, index1 = np.intersect1d(
+        numbers0, numbers1, assume_unique=True, return_indices=True
     )
     kept = np.flatnonzero(rng.random(len(common)) < 0.5)[:most]
-    points0 = first[1][places0[kept]] + rng.normal(0, 0.05, (len(kept), 2))
+    moves = rng.normal(0, 0.05, (len(kept), 2))
+    points0 = detected0[index0[kept]] + moves
+    # A wrong match is of another point that is matched, as repetitions give.
     wrong = rng.random(len(kept)) < outliers
     other = kept.copy()
     other[wrong] = rng.permutation(kept[wrong])
-    points1 = second[1][places1[other]] + rng.normal(0, 0.05, (len(kept), 2))
+    moves = rng.normal(0, 0.05, (len(kept), 2))
+    points1 = detected1[index1[other]] + moves
     return Matches(points0, points1, np.ones(len(kept)))

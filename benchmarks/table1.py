@@ -1,11 +1,10 @@
-"""The paper's Table 1 at equal inference count: units on whole images against the two stages, with
-one matcher.
+"""The paper's Table 1 at equal inference count: whole images against the two stages.
 
 python -m benchmarks.table1 --matcher sift --out DIR [-- --train-dir DIR --pairs-per-scene 10 ...]
 
-The layouts become recipes in OUT. `validate --compare` compares them, with the options after
-``--``. Recipes share a journal, so that common units run once. After a kill, rerun the command to
-resume.
+All units have one matcher. The layouts become recipes in OUT. `validate --compare` compares them,
+with the options after ``--``. Recipes share a journal, so that common units run once. After a kill,
+rerun the command to resume.
 """
 
 import argparse
@@ -18,7 +17,7 @@ LONG_SIDES = {  # in the order of use; all differ, since equal sizes would give 
     "aliked": (1024, 832, 640, 928, 736, 1120),
     "xfeat_lighterglue": (1024, 1280, 800, 1152, 896, 1408),
 }
-MORE = {"sift": ", max_matches = 8000"}
+MORE = {"sift": ", max_matches = 8000"}  # its number of keypoints
 LAYOUTS = {  # numbers of units on whole images and on critical regions
     "three": (3, 0),
     "one + two": (1, 2),
@@ -26,7 +25,7 @@ LAYOUTS = {  # numbers of units on whole images and on critical regions
     "six": (6, 0),
     "three + three": (3, 3),
 }
-# The others against the first
+# In each, the others are compared with the first.
 CONTRASTS = (("three", "one + two", "two + one"), ("six", "three + three"))
 
 
@@ -34,10 +33,12 @@ def recipe(matcher: str, layout: str) -> str:
     """Return the recipe of a layout as TOML; each pair's F is by MAGSAC alone."""
     whole, crops = LAYOUTS[layout]
     stages = (1,) * whole + (2,) * crops
-    units = (
-        f'{{ stage = {stage}, matcher = "{matcher}", long_side = {side}{MORE.get(matcher, "")} }}'
-        for stage, side in zip(stages, LONG_SIDES[matcher][: len(stages)], strict=True)
-    )
+    sides = LONG_SIDES[matcher][: len(stages)]
+    more = MORE.get(matcher, "")
+    units = []
+    for stage, side in zip(stages, sides, strict=True):
+        settings = f'stage = {stage}, matcher = "{matcher}", long_side = {side}{more}'
+        units.append(f"{{ {settings} }}")
     return f"units = [{', '.join(units)}]\n"
 
 
@@ -55,9 +56,8 @@ def main() -> int:
     status = 0
     for layouts in CONTRASTS:
         files = [str(given.out / f"{layout}.toml") for layout in layouts]
-        status |= mkpc(
-            ["validate", "--compare", *files, "--work-dir", str(given.out), *given.options]
-        )
+        command = ["validate", "--compare", *files, "--work-dir", str(given.out)]
+        status |= mkpc([*command, *given.options])
     return status
 
 

@@ -36,13 +36,13 @@ def main() -> None:
         "--out", type=Path, required=True, metavar="FIG.png", help="draw the first pair"
     )
     arguments = parser.parse_args()
+    # All pairs of the table, also pairs that the competition would not score.
     (scene,) = read_train_side(arguments.train_dir, scenes=["market"], min_covisibility=0.0)
     known = {true.pair.id: true for true in scene.pairs}
     recipe = load_recipe(RECIPE)
     matchers = {name: TwoStageMatcher(recipe.in_mode(mode)) for name, mode in MODES.items()}
-    print(
-        "Error of the pose in degrees (rotation, direction of translation), with and without the crop"
-    )
+    heads = "rotation, direction of translation"
+    print(f"Error of the pose in degrees ({heads}), with and without the crop")
     figure = None
     for name, reason in PAIRS.items():
         true = known[name]
@@ -50,13 +50,10 @@ def main() -> None:
         print(f"{name}: {reason}")
         for mode, matcher in matchers.items():
             match = matcher(*images)
-            error = pose_error(
-                match.estimate.matrix, true.camera0, true.camera1, scene.metres_per_unit
-            )
-            inliers = match.estimate.inlier_count
-            print(
-                f"  {mode:<14}{error.rotation:7.2f}{error.translation_angle:7.2f}{inliers:7} inliers"
-            )
+            F = match.estimate.matrix
+            error = pose_error(F, true.camera0, true.camera1, scene.metres_per_unit)
+            angles = f"{error.rotation:7.2f}{error.translation_angle:7.2f}"
+            print(f"  {mode:<14}{angles}{match.estimate.inlier_count:7} inliers")
         figure = figure or draw_pair(*images, match, recipe.mkpc)  # of both stages, the last mode
     save(figure, arguments.out)
 
