@@ -35,6 +35,7 @@ from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Box, Size
 from mkpc_kaggle.geometry.critical_region import CriticalRegion, RegionReason
 from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.recipe import Recipe, SceneConfig, Unit
 from mkpc_kaggle.scene.choose import Choice, Reason
@@ -80,6 +81,7 @@ class Room:
         budget = Budget(0.0)
         log = EventLog(self.store, budget)
         self.run = Run(self.state, self.store, Costs(), budget, log, Progress(budget, None))
+        self.publication = Publication(self.state, self.store, budget, log)
 
     def match(self, index: int, *units: Unit, digest: str = "") -> None:
         """Save points of a pair whose first image has this content, by default its own."""
@@ -119,7 +121,7 @@ class Room:
         reconstructing.save(reconstructing.job("one"), answer, 1.5)
 
     def publish(self) -> None:
-        Publication(self.state, self.store, self.run.budget, self.run.log).publish()
+        self.publication.publish()
 
     def replace(self, name: str) -> None:
         """Give an image another content, as the next start of a run notices."""
@@ -273,6 +275,20 @@ def test_the_f_of_before_stays_until_there_is_one_of_today_but_not_for_another_i
     whole.publish()
     whole.ask(estimate="other", scene="other")
     assert whole.state.scenes == {}
+
+
+def test_reports_show_the_f_that_was_written_last_and_decide_nothing_themselves(
+    whole: Room,
+) -> None:
+    whole.match(2, SWEEP)
+    whole.estimate(2)
+    record = read_records(whole.store)[2]
+    assert (record.source, record.units) == ("fallback", ())
+    assert np.array_equal(record.chosen_fundamental, FALLBACK_FUNDAMENTAL)
+    whole.publish()
+    record = read_records(whole.store)[2]
+    assert (record.source, len(record.units)) == ("pair", 1)
+    assert np.array_equal(record.chosen_fundamental, F)
 
 
 def test_rows_of_the_same_images_share_their_points_and_turned_images_are_others(
