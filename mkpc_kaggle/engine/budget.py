@@ -166,7 +166,9 @@ class Costs:
         """
         if not self.is_known(unit):
             return 0.0
-        return self.mean(unit) * (1 + max(MIN_MARGIN, MARGIN / sqrt(len(self._measured[unit]))))
+        count = len(self._measured[unit])
+        margin = max(MIN_MARGIN, MARGIN / sqrt(count))
+        return self.mean(unit) * (1 + margin)
 
     def observe_scene(self, matches: int, seconds: float) -> None:
         self._scene_seconds += max(0.0, seconds - SCENE_START_S)

@@ -128,7 +128,12 @@ class RayWorker(ThreadWorker):
     _actor: Any = None
 
     def __init__(
-        self, name: str, make: Maker, on_answer: Callable[[], None], ray: Any, where: dict[str, Any]
+        self,
+        name: str,
+        make: Maker,
+        on_answer: Callable[[], None],
+        ray: Any,
+        where: dict[str, Any],
     ) -> None:
         super().__init__(name, make, on_answer)
         self._ray, self._where = ray, where

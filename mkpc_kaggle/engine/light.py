@@ -128,6 +128,6 @@ class Features:
         self.found[job.key] = value
 
     def lose(self, job: FeatureJob, failure: Failure) -> None:
-        # A feature lost twice is left out; its image is only compared with no others.
+        # A feature lost twice is left out: its image is compared with no other.
         if not self._tries.lose([("features", job.key)], failure):
             self.pending[job.key] = job

@@ -92,7 +92,8 @@ class Matching:
             return ()
         # The only read of the loop: the arrays of all points would not fit in memory.
         data = self._run.store.data(keys)
-        units = {key: unit for unit, key in self._run.state.inputs_of(index).points.items()}
+        points = self._run.state.inputs_of(index).points
+        units = {key: unit for unit, key in points.items()}
         return tuple(UnitResult(units[key], from_bytes(data[key])) for key in keys)
 
     def patience(self, job: MatchJob) -> float | None:
@@ -103,7 +104,8 @@ class Matching:
         # A warm-up alone says little: it may take a hundred times as long as a later run, or less.
         if not all(costs.is_known(unit.name) for unit in job.units):
             return None
-        expected = len(job.indices) * sum(costs.mean(unit.name) for unit in job.units)
+        seconds = sum(costs.mean(unit.name) for unit in job.units)
+        expected = len(job.indices) * seconds
         return HANG_FACTOR * expected + costs.warm_up(job.units)
 
     # Answers
@@ -153,7 +155,8 @@ class Matching:
             is_crop = state.is_crop[number]
             if is_crop and not are_valid:
                 continue  # the unit stays missing and runs again
-            key = state.key_of(index, number, images, [first[n] for n in sorted(first)])
+            keys = [first[n] for n in sorted(first)]
+            key = state.key_of(index, number, images, keys)
             # An answer has stage 1 first: its units of stage 2 looked at crops from all of stage 1.
             if not is_crop:
                 first[number] = key

@@ -152,7 +152,11 @@ class Site:
     matching_cores = 0  # that are used by the workers of matching on this machine
 
     def __init__(
-        self, clock: Callable[[], float], *, threads: bool = False, log: Path | None = None
+        self,
+        clock: Callable[[], float],
+        *,
+        threads: bool = False,
+        log: Path | None = None,
     ) -> None:
         self._clock = clock
         # One queue for all workers, so the loop waits for whichever answers first.

@@ -293,13 +293,14 @@ class Table:
         found = store.about([TABLE]).get(TABLE)
         if found is None:
             return cls()
+        data = store.data([TABLE])[TABLE]
         return cls(
             about=ABOUT.of_json(found["about"]),
             units=[(name, stage) for name, stage in found["units"]],
             count=found["count"],
             rows=[Row(*row) for row in found["rows"]],
             scenes=found["scenes"],
-            written=np.frombuffer(store.data([TABLE])[TABLE]).reshape(-1, 3, 3),
+            written=np.frombuffer(data).reshape(-1, 3, 3),
         )
 
     @property
@@ -388,7 +389,11 @@ def read_events(store: Store) -> tuple[Event, ...]:
 
 
 def _pair_record(
-    index: int, row: Row, table: Table, about: Mapping[str, Any], scene: SceneRecord | None
+    index: int,
+    row: Row,
+    table: Table,
+    about: Mapping[str, Any],
+    scene: SceneRecord | None,
 ) -> PairRecord:
     # Without an estimate, the row's failure is the reason, or the time.
     own = NO_ESTIMATE

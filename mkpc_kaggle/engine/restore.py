@@ -26,7 +26,8 @@ def restore(state: State, store: Store, digests: Mapping[str, str]) -> None:
     # By contents and not by id: another test set may name the same two images.
     rows = {row.contents: row for row in former.rows if row.contents}
     known = [index for index in range(len(state.pairs)) if state.images_of(index)]
-    old = {index: rows[state.contents(index)] for index in known if state.contents(index) in rows}
+    contents = {index: state.contents(index) for index in known}
+    old = {index: rows[text] for index, text in contents.items() if text in rows}
     units = [name for name, _ in former.units]
     # Stage 1 first, because the keys of stage 2 depend on it. Then estimates, then scenes, for the
     # same reason.
@@ -38,7 +39,10 @@ def restore(state: State, store: Store, digests: Mapping[str, str]) -> None:
 
 
 def _former_points(
-    state: State, old: Mapping[int, Row], units: list[str], numbers: list[int]
+    state: State,
+    old: Mapping[int, Row],
+    units: list[str],
+    numbers: list[int],
 ) -> dict[tuple[int, int], str]:
     """Return the keys of the former points of pairs and units, if any."""
     found = {}
@@ -76,7 +80,10 @@ def _restore_points(
 
 
 def _restore_estimates(
-    state: State, store: Store, known: list[int], old: Mapping[int, Row]
+    state: State,
+    store: Store,
+    known: list[int],
+    old: Mapping[int, Row],
 ) -> None:
     # From the points in use: an estimate from former points is up to date until others replace them.
     today = {index: state.estimate_key(index) for index in known if state.has[index].any()}

@@ -209,7 +209,8 @@ def match_job(view: View, phase: Phase, missing: Mask, ready: Mask) -> MatchJob:
         order = order[np.argsort(state.inliers[order], kind="stable")]
     first = int(order[0])
     # Stage 1 first, because the crops come from its points.
-    numbers = sorted(np.flatnonzero(missing[first]).tolist(), key=state.is_crop.__getitem__)
+    numbers = np.flatnonzero(missing[first]).tolist()
+    numbers.sort(key=state.is_crop.__getitem__)
     units = [state.units[number] for number in numbers]
     # A unit that lost a worker before runs alone, so that another loss has one cause.
     alone = any(("unit", first, unit.name) in state.tries.alone for unit in units)
@@ -233,7 +234,8 @@ def upcoming_pairs(state: State, job: MatchJob, count: int) -> list[int]:
     # In the last phase, the order depends on inliers that come meanwhile.
     if job.phase is Phase.FILL:
         return []
-    rank = int(np.flatnonzero(state.order == job.indices[-1])[0]) + 1
+    last = job.indices[-1]
+    rank = int(np.flatnonzero(state.order == last)[0]) + 1
     following: list[int] = state.order[rank : rank + count].tolist()
     return following
 
@@ -268,7 +270,12 @@ def lacking_estimates(state: State) -> Mask:
 
 
 def scenes_due(
-    view: View, phase: Phase, first: NDArray[Any], estimates: NDArray[Any], *, is_matching: bool
+    view: View,
+    phase: Phase,
+    first: NDArray[Any],
+    estimates: NDArray[Any],
+    *,
+    is_matching: bool,
 ) -> tuple[str, ...]:
     """Return the batches to reconstruct now; batches without any scene come first.
 

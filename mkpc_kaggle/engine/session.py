@@ -145,7 +145,11 @@ class Session:
 
 
 def submit(
-    pairs: Sequence[Pair], assembly: Assembly, session: Session, output: Path, root: str = ""
+    pairs: Sequence[Pair],
+    assembly: Assembly,
+    session: Session,
+    output: Path,
+    root: str = "",
 ) -> RunReport:
     """Match all pairs. ``output`` always has a row for each pair, with the fallback F if necessary."""
 
@@ -200,7 +204,11 @@ def _identity(path: Path) -> tuple[int, int]:
 
 
 def run_pairs(
-    pairs: Sequence[Pair], assembly: Assembly, session: Session, root: str = "", **more: Any
+    pairs: Sequence[Pair],
+    assembly: Assembly,
+    session: Session,
+    root: str = "",
+    **more: Any,
 ) -> RunReport:
     """Run the recipe on all pairs. In the store, an image's name is its path below ``root``.
 
@@ -214,7 +222,11 @@ def run_pairs(
 
 
 def request_of(
-    pairs: Sequence[Pair], assembly: Assembly, session: Session, root: str = "", **more: Any
+    pairs: Sequence[Pair],
+    assembly: Assembly,
+    session: Session,
+    root: str = "",
+    **more: Any,
 ) -> Request:
     """Return a request for these pairs; ``more`` are other fields of the request."""
     budget = session.budget
@@ -236,7 +248,9 @@ def request_of(
 
 @contextmanager
 def opened_engine(
-    assembly: Assembly, session: Session, folders: Iterable[Path] = ()
+    assembly: Assembly,
+    session: Session,
+    folders: Iterable[Path] = (),
 ) -> Iterator[Engine]:
     """Open an engine and its store. On leaving, end the workers and publish the last results.
 

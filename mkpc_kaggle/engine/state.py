@@ -114,8 +114,10 @@ class State:
         for index, pair in enumerate(self.pairs):
             # With other intrinsics, another E is estimated.
             known = pair.intrinsics and tuple(K.tobytes() for K in pair.intrinsics)
-            alike.setdefault((self.names[index], pair.turns, known), []).append(index)
-        return {index: group for group in alike.values() if len(group) > 1 for index in group}
+            key = (self.names[index], pair.turns, known)
+            alike.setdefault(key, []).append(index)
+        groups = [group for group in alike.values() if len(group) > 1]
+        return {index: group for group in groups for index in group}
 
     # Results in use
 
@@ -154,7 +156,9 @@ class State:
     def matches_of_batches(self) -> NDArray[np.int_]:
         """Return the number of matches (B,) of each batch."""
         # The first bin counts pairs without a batch.
-        found = np.bincount(self.batch_of + 1, self.matches.sum(1), minlength=len(self.batches) + 1)
+        bins = self.batch_of + 1
+        matches = self.matches.sum(1)
+        found = np.bincount(bins, matches, minlength=len(self.batches) + 1)
         return found[1:].astype(int)
 
     # Keys of today
@@ -375,14 +379,16 @@ def extra_pairs_of(pairs: Sequence[Pair], config: SceneConfig | None) -> list[Pa
         return []
     extra: list[tuple[float, Pair]] = []
     for batch, indices in batches_of(pairs).items():
-        images = [file for index in indices for file in (pairs[index].file0, pairs[index].file1)]
+        of_batch = [pairs[index] for index in indices]
+        images = [file for pair in of_batch for file in (pair.file0, pair.file1)]
         files = list(dict.fromkeys(images))
         number = {file: index for index, file in enumerate(files)}
-        ends = [(number[pairs[index].file0], number[pairs[index].file1]) for index in indices]
+        ends = [(number[pair.file0], number[pair.file1]) for pair in of_batch]
         distinct = len({tuple(sorted(pair)) for pair in ends})
         more = extra_pairs(len(files), ends, config.pairs_per_image)
         for count, (i, j) in enumerate(more, start=distinct):
             name = f"{batch};{Path(files[i]).stem}-{Path(files[j]).stem}"
+            pair = Pair(name, batch, files[i], files[j])
             # Pairs per image of the batch before this pair is added: the order of all batches.
-            extra.append((count / len(files), Pair(name, batch, files[i], files[j])))
+            extra.append((count / len(files), pair))
     return [pair for _, pair in sorted(extra, key=lambda each: each[0])]

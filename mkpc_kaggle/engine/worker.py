@@ -83,7 +83,11 @@ class MatchRunner:
     """
 
     def __init__(
-        self, make_pipeline: Callable[[], "Pipeline"], *, threads: int = 0, share: int = 1
+        self,
+        make_pipeline: Callable[[], "Pipeline"],
+        *,
+        threads: int = 0,
+        share: int = 1,
     ) -> None:
         # Alone on a machine, a process uses all cores by default.
         if threads or share > 1:
@@ -195,8 +199,9 @@ def estimate_pair(pair: PairInputs, results: tuple[UnitResult, ...], recipe: Rec
     model = ModelKind.F if pair.intrinsics is None else ModelKind.E
     found = with_estimate(match, recipe, model, pair.intrinsics).estimate
     # The inliers of each unit, by the bounds of its matches among all
-    ends = np.cumsum([len(result.matches) for result in results])[:-1]
-    inliers = tuple(int(mask.sum()) for mask in np.split(found.inliers, ends))
+    counts = [len(result.matches) for result in results]
+    masks = np.split(found.inliers, np.cumsum(counts)[:-1])
+    inliers = tuple(int(mask.sum()) for mask in masks)
     return Estimated(
         tuple(pair.points.values()),
         inliers,
@@ -224,7 +229,10 @@ def reconstruct(job: Job) -> Solution:
 
 
 def batch_pair(
-    pair: PairInputs, results: tuple[UnitResult, ...], *, keeps_paths: bool
+    pair: PairInputs,
+    results: tuple[UnitResult, ...],
+    *,
+    keeps_paths: bool,
 ) -> BatchPair:
     """Return a pair of a batch with its points.
 
