@@ -20,6 +20,7 @@ from mkpc_kaggle.scene.reconstruction import RegisteredImage, Sigmas
 if TYPE_CHECKING:
     from pandas import DataFrame
 
+# pandas treats NaN as missing.
 UNKNOWN = Sigmas(np.nan, np.nan, np.nan)
 
 
@@ -90,6 +91,7 @@ def _unit_row(record: PairRecord, unit: UnitRecord) -> dict[str, Any]:
 
 def _camera_rows(scenes: Iterable[SceneRecord]) -> Iterator[dict[str, Any]]:
     for scene in scenes:
+        # Model 0 has the most images.
         for number, model in enumerate(scene.models):
             for found in model.images:
                 yield _camera_row(scene.batch, number, found)

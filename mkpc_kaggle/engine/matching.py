@@ -139,6 +139,7 @@ class Matching:
         images = outcome.images
         if not images:
             return []
+        # First, because the keys of the points depend on the images' contents.
         results = self._use_images(outcome)
         # If an image changed while the job ran, the crops come from points of its former content.
         are_valid = state.first_stage(index) == list(crops)

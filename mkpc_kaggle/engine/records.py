@@ -404,13 +404,7 @@ def _pair_record(
     # By the key of points: points that are newer than the estimate have no inliers yet.
     inliers = dict(zip(own.points, own.inliers, strict=True))
     facts_of = {key: UNIT_FACTS.of_json(about[key]) for key in row.points if key in about}
-    units = []
-    for (name, stage), key in zip(table.units, row.points, strict=True):
-        if key in facts_of:
-            units.append(UnitRecord.of(facts_of[key], stage, inliers.get(key, 0)))
-        # A unit without points either raised or was not reached; only failures are shown.
-        elif name in row.failures:
-            units.append(UnitRecord(name, stage, 0, 0, 0.0, 0.0, row.failures[name]))
+    units = _unit_records(row, table, facts_of, inliers)
     found = facts_of.values()
     # All units of stage 2 in one job have the same regions; later jobs may have others.
     regions = next((facts.regions for facts in found if facts.regions), None)
@@ -433,3 +427,21 @@ def _pair_record(
         source=row.source,
         chosen_fundamental=table.written[index],
     )
+
+
+def _unit_records(
+    row: Row,
+    table: Table,
+    facts_of: Mapping[str, UnitFacts],
+    inliers: Mapping[str, int],
+) -> list[UnitRecord]:
+    """Return the records of a pair's units; ``facts_of`` and ``inliers`` are by the key of points."""
+    units = []
+    for (name, stage), key in zip(table.units, row.points, strict=True):
+        if key in facts_of:
+            units.append(UnitRecord.of(facts_of[key], stage, inliers.get(key, 0)))
+        # A unit without points either raised or was not reached. Only failures are shown: their
+        # reason is in the row.
+        elif name in row.failures:
+            units.append(UnitRecord(name, stage, 0, 0, 0.0, 0.0, row.failures[name]))
+    return units

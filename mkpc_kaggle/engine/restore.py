@@ -61,6 +61,7 @@ def _restore_points(
     numbers: list[int],
     former: Mapping[tuple[int, int], str],
 ) -> None:
+    # Only pairs whose two images are known can have results.
     # All keys first, because one query for thousands of keys is much faster than one for each.
     today: dict[tuple[int, int], str] = {}
     for index in known:

@@ -288,30 +288,54 @@ def scenes_due(
         return ()
     pending = state.estimating.copy()
     pending[estimates] = True
+    for_first, for_later = pairs_to_await(view, phase, first, pending, is_matching=is_matching)
+    blocked = {
+        False: batches_with(state, for_first),
+        True: batches_with(state, for_later),
+    }
+    # Stable, so batches in the same position keep their order.
+    order = sorted(waiting, key=state.scenes.__contains__)
+    return tuple(
+        batch for batch in order if not blocked[batch in state.scenes][state.batches[batch]]
+    )
+
+
+def pairs_to_await(
+    view: View,
+    phase: Phase,
+    first: NDArray[Any],
+    pending: Mask,
+    *,
+    is_matching: bool,
+) -> tuple[Mask, Mask]:
+    """Return two masks (N,) of pairs to wait for: before a batch's first scene, and before a later
+    one.
+
+    ``pending`` (N,) are the pairs whose estimate is due or under way.
+    """
+    state = view.state
     if view.now >= view.stop:
         # No unit begins any more, and it is too late to wait for estimates. A hung job may last until
         # the end, so a first scene does not wait for its pairs.
-        waits = {False: np.zeros_like(pending), True: state.matching}
-    elif is_matching:
-        early = first < FILL
-        if phase < FILL:
-            early |= pending | state.matching
-        else:
-            # Some pair of a batch is at work all the time now. A first scene takes the present points:
-            # any scene is better than none, and its time helps to forecast the others.
-            early |= (pending & ~state.has_own) | (state.matching & ~state.filling)
-        waits = {False: early, True: pending | state.matching | (first < NEVER)}
+        return np.zeros_like(pending), state.matching
+    if not is_matching:
+        return pending, pending
+    for_first = first < FILL
+    if phase < FILL:
+        for_first |= pending | state.matching
     else:
-        waits = {False: pending, True: pending}
-    # The number of pairs of each batch that are waited for, for a first and for a later scene.
-    counts = {}
-    for has_scene, waited in waits.items():
-        numbers = state.batch_of[waited]
-        counts[has_scene] = np.bincount(numbers[numbers >= 0], minlength=len(state.batches))
-    order = sorted(waiting, key=state.scenes.__contains__)
-    return tuple(
-        batch for batch in order if not counts[batch in state.scenes][state.batches[batch]]
-    )
+        # Some pair of a batch is at work all the time now. A first scene takes the present points:
+        # any scene is better than none, and its time helps to forecast the others.
+        for_first |= (pending & ~state.has_own) | (state.matching & ~state.filling)
+    return for_first, pending | state.matching | (first < NEVER)
+
+
+def batches_with(state: State, pairs: Mask) -> Mask:
+    """Return a (B,) mask of the batches of these pairs."""
+    found = np.zeros(len(state.batches), bool)
+    numbers = state.batch_of[pairs]
+    found[numbers[numbers >= 0]] = True
+    return found
 
 
 def waiting_batches(state: State, crew: Crew) -> list[str]:
