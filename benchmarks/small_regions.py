@@ -1,10 +1,10 @@
 """Gains of mAA by covisibility and by size of the crop, from the figures of `validate`.
 
-python -m benchmarks.small_regions --train-dir DIR FIRST.json OTHER.json [OTHER.json ...]
+python -m benchmarks.small_regions --train-dir DIR FIGURES.json
 
-Each file comes from `validate --json`, on the same pairs. The first is what the others are compared
+The file comes from `validate --compare ... --json`. Its first recipe is what the others are compared
 with. The share of a crop is its area over its image's, of the smaller of the pair's two crops, in
-the first file that has crops. Intervals resample images.
+the first recipe that has crops. Intervals resample images.
 """
 
 import argparse
@@ -22,14 +22,13 @@ from PIL import Image
 from mkpc_kaggle.data.competition import read_train_side
 from mkpc_kaggle.evaluation.compare import paired_difference
 
-# Lower edges of bins; the last is the upper edge.
 COVISIBILITIES = (0.1, 0.2, 0.4, inf)
 SHARES = (0.0, 0.25, 0.5, 1.0, inf)  # the last bin has the pairs without a crop
 
 
 @dataclass(frozen=True)
 class Pair:
-    """A scored pair: the accuracy by each file, and the values of the bins."""
+    """A scored pair: the accuracy by each recipe, and what the bins are made of."""
 
     scene: str
     images: tuple[str, str]
@@ -46,27 +45,23 @@ def share_of(boxes: Sequence[Sequence[int]], sizes: Sequence[tuple[int, int]]) -
     return min(shares)
 
 
-def read_pairs(train_dir: Path, files: Sequence[Path]) -> list[Pair]:
-    """Return the pairs that all files have."""
-    figures = [json.loads(file.read_text(encoding="utf-8")) for file in files]
-    by_id = []
-    for each in figures:
-        rows: dict[str, Any] = {}
-        for scene in each["scenes"]:
-            rows |= {pair["pair"]: pair for pair in scene["pairs"]}
-        by_id.append(rows)
-    names = [each["scene"] for each in figures[0]["scenes"]]
+def read_pairs(train_dir: Path, recipes: Sequence[dict[str, Any]]) -> list[Pair]:
+    """Return the compared pairs, from the figures of each recipe."""
+    by_id = [
+        {pair["pair"]: pair for scene in figures["scenes"] for pair in scene["pairs"]}
+        for figures in recipes
+    ]
+    names = [scene["scene"] for scene in recipes[0]["scenes"]]
     pairs = []
     for scene in read_train_side(train_dir, scenes=names):
         for true in scene.pairs:
-            # A file may be of a part of the pairs.
-            found = [table[true.pair.id] for table in by_id if true.pair.id in table]
-            if len(found) < len(files):
+            # A comparison may have run on some of the pairs.
+            if true.pair.id not in by_id[0]:
                 continue
-            # A recipe of stage 1 has no crops.
-            boxes = next((row["boxes"] for row in found if row["boxes"]), [])
+            rows = [table[true.pair.id] for table in by_id]
+            boxes = next((row["boxes"] for row in rows if row["boxes"]), [])
             sizes = [Image.open(path).size for path in true.pair.images]
-            accuracies = tuple(last_accuracy(row) for row in found)
+            accuracies = tuple(last_accuracy(row) for row in rows)
             share = share_of(boxes, sizes)
             pairs.append(Pair(scene.name, true.pair.names, accuracies, true.covisibility, share))
     return pairs
@@ -87,9 +82,10 @@ def rows(
         if not inside:
             continue
         name = f"{low:g} to {high:g}" if high < inf else f"{low:g} and more"
-        by_file = zip(*(pair.accuracies for pair in inside), strict=True)
-        maas = [mean(accuracies) for accuracies in by_file]
-        # Of the first file, the accuracy; of the others, the gain, too.
+        maas = [
+            mean(pair.accuracies[n] for pair in inside) for n in range(len(inside[0].accuracies))
+        ]
+        # Of the first recipe, the accuracy; of the others, the gain, too.
         cells = [f"{maas[0]:.3f}"]
         for number, maa in enumerate(maas[1:], start=1):
             cells.append(f"{maa:.3f}, {gain(inside, number)}")
@@ -98,7 +94,7 @@ def rows(
 
 
 def gain(pairs: Sequence[Pair], number: int) -> str:
-    """Return the gain of a file over the first, with its interval over images."""
+    """Return the gain of a recipe over the first, with its interval over images."""
     before = [pair.accuracies[0] for pair in pairs]
     after = [pair.accuracies[number] for pair in pairs]
     # Images of two scenes may have one name.
@@ -113,16 +109,17 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--train-dir", type=Path, required=True)
-    parser.add_argument("files", type=Path, nargs="+")
+    parser.add_argument("figures", type=Path)
     given = parser.parse_args()
-    pairs = read_pairs(given.train_dir, given.files)
-    heads = " | ".join(file.stem for file in given.files)
+    recipes = json.loads(given.figures.read_text(encoding="utf-8"))["recipes"]
+    pairs = read_pairs(given.train_dir, recipes)
+    heads = " | ".join(each["recipe"] for each in recipes)
     for title, value, edges in (
         ("covisibility", lambda pair: pair.covisibility, COVISIBILITIES),
         ("share of the smaller crop", lambda pair: pair.share, SHARES),
     ):
         print(f"| {title} | pairs | {heads} |")
-        print("|" + " --- |" * (len(given.files) + 2))
+        print("|" + " --- |" * (len(recipes) + 2))
         print("\n".join(rows(pairs, value, edges)), end="\n\n")
 
 
