@@ -5,7 +5,7 @@ explains do not count (the S-transformation of Baarda 1981). The noise of keypoi
 from the residuals.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
 
@@ -36,17 +36,8 @@ def camera_sigmas(
     ]
     if not 1 < len(images) <= MAX_IMAGES:
         return {}
-    config = pycolmap.BundleAdjustmentConfig()
-    for number in (ids := [image.image_id for image in images]):
-        config.add_image(number)
-    for image in images:
-        if image.name in known and not known[image.name].sigma:
-            config.set_constant_cam_intrinsics(image.camera_id)
-    # No iterations: the solver only evaluates the residuals of the model as it is.
-    solver = {"max_num_iterations": 0, "num_threads": 1}
-    ceres = {"use_gpu": False, "solver_options": solver}
-    options = pycolmap.BundleAdjustmentOptions({"print_summary": False, "ceres": ceres})
-    adjuster: Any = pycolmap.create_default_ceres_bundle_adjuster(options, config, found)
+    ids = [image.image_id for image in images]
+    adjuster = _evaluator(found, images, known)
     fit = adjuster.solve().ceres_summary
     redundancy = fit.num_residuals - fit.num_effective_parameters + 7
     solved: Any = redundancy > 0 and pycolmap.estimate_ba_covariance(DAMPED, found, adjuster)
@@ -65,6 +56,21 @@ def camera_sigmas(
     # Later digits vary between calls
     rows = (Sigmas(*(float(f"{value:.4g}") for value in row)) for row in sigmas)
     return dict(zip((image.name for image in images), rows, strict=True))
+
+
+def _evaluator(found: Any, images: Sequence[Any], known: Mapping[str, KnownCamera]) -> Any:
+    """Return a bundle adjustment of the images that evaluates the model and leaves it as it is."""
+    config = pycolmap.BundleAdjustmentConfig()
+    for image in images:
+        config.add_image(image.image_id)
+        # The user's exact cameras are no parameters.
+        if image.name in known and not known[image.name].sigma:
+            config.set_constant_cam_intrinsics(image.camera_id)
+    # No iterations: the solver only evaluates the residuals.
+    solver = {"max_num_iterations": 0, "num_threads": 1}
+    ceres = {"use_gpu": False, "solver_options": solver}
+    options = pycolmap.BundleAdjustmentOptions({"print_summary": False, "ceres": ceres})
+    return pycolmap.create_default_ceres_bundle_adjuster(options, config, found)
 
 
 def _focal_variance(camera: Any, known: KnownCamera | None, solved: Any) -> float:
