@@ -55,6 +55,7 @@ If images were added or removed since the last complete run, the cameras keep it
 do not.
 
 All pairs of up to 100 images are matched; in larger datasets, each image is matched with the 20 most similar.
+Without weights, recipe auto runs one unit of RootSIFT here: more of its units give the same cameras.
 
 Exit status: 0 done; 1 no image has a camera, or the run failed; 2 bad input; 130 or 143 ended by a signal.
 """
@@ -95,6 +96,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     text = "masks named as COLMAP's, MASKS/a.jpg.png for a.jpg; points on black pixels are left out"
     add("--masks", type=Path, metavar="MASKS", help=text)
     add("--fresh", action="store_true", help="delete the journal of an earlier run in OUT/work")
+    # The recipe's scenes, even if its file has none
     parser.set_defaults(reconstruct=True)
 
 
