@@ -225,25 +225,19 @@ def _match_and_score(
     choices = [split_mode(text) for text in compared] or [(arguments.recipe, arguments.mode)]
     pairs = [true.pair for scene in scenes for true in scene.pairs]
     regions = {} if arguments.regions is None else read_regions(arguments.regions, root, pairs)
-    in_front = arguments.in_front or arguments.protocol is not None
     validations = []
     status = 0
     budget = options.budget_of(arguments)
     with interruptible() as interrupt, Session(work_dir, budget, interrupt).watched() as watched:
         watched.save = lambda: "the time limit passed before the scores were printed"
         # All of them first: a wrong name should not end a comparison after its first run.
-        assemblies = []
-        for choice in choices:
-            assembly = _assemble(arguments, interrupt, *choice)
-            assemblies.append(replace(assembly, regions=regions))
+        chosen = [_assemble(arguments, interrupt, *choice) for choice in choices]
+        assemblies = [replace(assembly, regions=regions) for assembly in chosen]
         for number, assembly in enumerate(assemblies):
             budget = options.budget_of(arguments)
             session = Session(work_dir, budget, interrupt, workers=arguments.workers)
-            validation = validate(scenes, assembly, session, str(root), in_front=in_front)
+            validation, report = _run_recipe(arguments, scenes, assembly, session)
             validations.append(validation)
-            report = validation.report
-            assert report is not None
-            say("\n".join(_run_lines(arguments, assembly, validation, report)))
             page = _page(arguments, work_dir, compared[number] if compared else "report")
             # The worst status of all runs.
             session.status = max(status, bool(trouble(report)))
@@ -270,16 +264,27 @@ def _page(arguments: argparse.Namespace, work_dir: Path, name: str) -> Path | No
     return work_dir / f"{plain}.html"
 
 
-def _run_lines(
-    arguments: argparse.Namespace, assembly: Assembly, validation: Validation, report: RunReport
-) -> list[str]:
-    """Return the text on one recipe's run: its summary and its scores."""
+def _run_recipe(
+    arguments: argparse.Namespace,
+    scenes: Sequence[TrainScene],
+    assembly: Assembly,
+    session: Session,
+) -> tuple[Validation, RunReport]:
+    """Run one recipe; print its summary and its scores."""
+    root = arguments.train_dir or arguments.image_root
+    # The published evaluations choose between the two rotations of E by the inliers.
+    in_front = arguments.in_front or arguments.protocol is not None
+    validation = validate(scenes, assembly, session, str(root), in_front=in_front)
+    report = validation.report
+    assert report is not None
     lines = []
     if left_out := left_out_line(assembly.recipe, assembly.left_out):
         lines.append(left_out)
     lines += options.plan_lines(arguments, report)
     lines += [summary(report), "", f"recipe {validation.recipe}"]
-    return [*lines, *score_table(validation), *step_gains(validation)]
+    lines += [*score_table(validation), *step_gains(validation)]
+    say("\n".join(lines))
+    return validation, report
 
 
 def _assemble(

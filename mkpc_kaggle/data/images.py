@@ -233,4 +233,5 @@ class ImageStore:
         return image
 
     def close(self) -> None:
+        """Stop decoding: images that wait are dropped, and the one in work is not waited for."""
         self._decoder.shutdown(wait=False, cancel_futures=True)

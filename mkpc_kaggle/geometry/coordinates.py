@@ -24,7 +24,9 @@ Matrix3 = NDArray[np.float64]  # (3, 3)
 
 
 class Size(NamedTuple):
-    width: int  # in pixels
+    """Width and height in pixels; the shape of an array has them in the other order."""
+
+    width: int
     height: int
 
 

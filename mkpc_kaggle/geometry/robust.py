@@ -34,6 +34,8 @@ class ModelKind(StrEnum):
 
 
 class Method(StrEnum):
+    """The robust estimator: MAGSAC++, or plain RANSAC for published evaluations with it."""
+
     MAGSAC = "magsac"
     RANSAC = "ransac"
 
@@ -266,6 +268,7 @@ class DistinctMatches:
 
 
 def unit_norm(matrix: Matrix3) -> Matrix3:
+    """Scale to unit Frobenius norm."""
     return np.asarray(matrix / np.linalg.norm(matrix))
 
 

@@ -30,6 +30,8 @@ matched_in: set[int] = set()
 
 
 class FailureKind(Enum):
+    """What an error of a matcher means for the run."""
+
     OUT_OF_MEMORY = auto()  # fewer pairs at a time may fit
     DEVICE = auto()  # this process can no longer compute; the pair is not the cause
     RAISED = auto()  # the matcher cannot process this pair

@@ -248,8 +248,8 @@ class Pipeline:
     def _matcher(self, name: str) -> Matcher[Any]:
         """Return the matcher, loaded on first use.
 
-        Raises :class:`UnloadableError` at every call if its first load failed, unless for want of
-        memory or of a device, which a new worker may have.
+        Raises :class:`UnloadableError` at every call after a first load that failed. Errors of
+        memory and of the device pass unchanged: a new worker may load the matcher.
         """
         if name not in self._matchers and name not in self._unloadable:
             try:

@@ -28,6 +28,8 @@ TRANSIENT_STATUSES = (408, 416, 425, 429, 500, 502, 503, 504)
 
 
 class FetchOutcome(StrEnum):
+    """How a download ended, as in messages. ``BY_HAND``: the source has no direct download."""
+
     FETCHED = "fetched"
     ALREADY_THERE = "already there"
     BY_HAND = "by hand"

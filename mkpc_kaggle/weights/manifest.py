@@ -132,6 +132,7 @@ def _former_digests() -> dict[str, str]:
 
 
 def _keep_digest(line: str) -> None:
+    """Append a line to the file that later processes read, if ``$MKPC_DIGESTS`` names one."""
     path = os.environ.get(DIGESTS)
     if path:
         with suppress(OSError):  # a full disk: the next process computes it again
