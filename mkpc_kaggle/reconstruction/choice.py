@@ -76,11 +76,11 @@ def choose_pairs(
     batches = batch_names(root, datasets)
     names = {file: batches[name] for name, files in datasets.items() for file in files}
     turns = find_turns(engine, near, names, root, assembly, session)
-    return [
-        pair_of(batches[name], a, b, turns.get(a, 0), turns.get(b, 0))
-        for name in ends
-        for a, b in ends[name]
-    ]
+    pairs = []
+    for name, pairs_of_dataset in ends.items():
+        for a, b in pairs_of_dataset:
+            pairs.append(pair_of(batches[name], a, b, turns.get(a, 0), turns.get(b, 0)))
+    return pairs
 
 
 def pair_of(batch: str, a: Path, b: Path, *turns: int) -> Pair:
@@ -100,14 +100,14 @@ def find_partners(engine: Engine, dataset: str, files: Sequence[Path], count: in
     digests = [found.get(str(file), "") for file in files]
     keys = [features_key(each) for each in digests]
     key = digest([digests, FEATURE_SETTINGS, count])
-    if (known := engine.known(key)) is None:
-        engine.look(
-            {
-                features_key(found[str(a)]): partial(local_features, a)
-                for a in files
-                if str(a) in found
-            }
-        )
+    known = engine.known(key)
+    if known is None:
+        # Features first: they stay if the comparison is interrupted.
+        missing = {}
+        for file in files:
+            if str(file) in found:
+                missing[features_key(found[str(file)])] = partial(local_features, file)
+        engine.look(missing)
         source = engine.store.source(keys)
         known = engine.look({key: partial(compare, source, keys, count)}).get(key)
     # The time is over, or the comparison failed twice. Then no image has partners.

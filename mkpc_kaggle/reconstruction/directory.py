@@ -61,11 +61,13 @@ def output_directory(out: Path, datasets: Iterable[str], form: str | None = None
         for name in known.keys() - results:
             if known[name] and known[name] == _digest(out / name):
                 _remove(out / name)
-        after = {name: digest for name in results if (digest := _digest(out / name))}
-        _write_mark(
-            out,
-            {name: known[name] if after[name] == before[name] else after[name] for name in after},
-        )
+        after = {}
+        for name in results:
+            digest = _digest(out / name)
+            # A result that this run left as it was may be the user's version of it.
+            if digest:
+                after[name] = known[name] if digest == before[name] else digest
+        _write_mark(out, after)
 
 
 def holds_dataset(result: str, datasets: Iterable[str]) -> bool:

@@ -42,12 +42,21 @@ def camera_rows(cameras: Cameras, root: Path) -> Iterator[Sequence[str]]:
     The centre of an image's first pixel is (0, 0); X_cam = R X + t. Unknown sigmas are empty cells.
     """
     yield "image", "model", "K", "R", "t", "rotation_sigma", "centre_sigma", "focal_sigma"
-    for file, placed in (item for found in cameras.values() for item in found.items()):
-        if placed is not None:
+    for files in cameras.values():
+        for file, placed in files.items():
+            if placed is None:
+                continue
             model, found = placed
-            parts = found.camera.K, found.camera.R, found.camera.t
+            camera = found.camera
             sigmas = [f"{value:g}" for value in found.sigmas] or [""] * 3
-            yield file.relative_to(root).as_posix(), str(model), *map(joined, parts), *sigmas
+            yield (
+                file.relative_to(root).as_posix(),
+                str(model),
+                joined(camera.K),
+                joined(camera.R),
+                joined(camera.t),
+                *sigmas,
+            )
 
 
 def submission_rows(form: str, cameras: Cameras, root: Path) -> Iterator[Sequence[str]]:
