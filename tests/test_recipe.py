@@ -129,6 +129,7 @@ def unit(**changes):
             units(unit(longside=640)),
             r"unit 1.*'longside'.*stage, matcher, long_side, max_matches, area",
         ),
+        # A mistyped key would otherwise leave the default in use, unseen.
         (SIFT + "[mkpc]\nepsilon = 1\n", r"\[mkpc\].*'epsilon'.*eps, min_samples, share, expand_x"),
         (units(unit(stage=None)), r"unit 1: missing keys 'stage'"),
         ("", "no units"),
@@ -140,7 +141,9 @@ def unit(**changes):
         (SIFT + '[magsac]\nmethod = "MAGSAC"\n', r"'MAGSAC' is none of 'magsac', 'ransac'"),
         (units(unit(stage="true")), r"key 'stage': expected int, got True"),
         ('units = "sift"\n', "units|unit 1"),
+        # The first unit sweeps all pairs, and no crop exists before it.
         (units(unit(stage=2)), "so it must have stage 1"),
+        # A unit's name is its name in tables and journals.
         (units(unit(), unit(max_matches=9)), "1:sift@640 twice"),
         (units(unit(), unit(matcher='"a"', fallback='"sift"')), "1:sift@640 twice"),
         (units(unit(long_side=-9)), r"unit 1: long_side must be in \[0, 99999\]"),

@@ -29,6 +29,7 @@ REFUSALS = [
     (f"{SUBMIT} --output {'s' * 300}.csv", "File name too long"),
     (f"{SUBMIT} --output demo/test/test.csv", "would be written over the input demo/test/test.csv"),
     (f"{SUBMIT} --output link.csv", "would be written over the input demo/test/test.csv"),
+    # The same file by another name: a comparison of paths would miss it.
     (f"{SUBMIT} --output hard.csv", "would be written over the input demo/test/test.csv"),
     (f"{SUBMIT} --output w/m.pth --weights w", "would be written over the input w"),
     (
@@ -55,6 +56,7 @@ REFUSALS = [
     (f"{MATCH} notes.xyz", "needs a suffix"),
     ("match x.png y.png --save x.png", "would be written over the input"),
     ("match x.png y.png --save pair.npy", "the name must end in .npz"),
+    # Settings have the same checks as a file of a recipe.
     (f"{SUBMIT} --set foo", "--set foo: expected TABLE.KEY=VALUE"),
     (f"{SUBMIT} --set sift.ratio=1", "the tables are mkpc, magsac, focal, matchers, scene"),
     (
@@ -72,6 +74,7 @@ REFUSALS = [
     (f"{SUBMIT} --set scene.threads=many", "key 'threads': expected int, got 'many'"),
     (f"{SUBMIT} --set scene.cameras=1", "1 is none of 'auto', "),
     (f"{SUBMIT} --set scene.camera_model=FISHEYE", "'FISHEYE' is none of 'SIMPLE_PINHOLE', "),
+    # Folders that hold data of somebody else.
     ("demo --out users", "users/train is in the way"),
     ("demo --out truth", "truth/test_truth.csv is in the way"),
     ("demo --out x.png", "cannot be written"),

@@ -41,6 +41,7 @@ def test_a_line_gives_the_images_turns_and_cameras_that_were_written():
     ("line", "expected"),
     [
         ("a b", "expected 38 fields, name0 name1 .* found 2"),
+        # SuperGlue's lists count quarter turns of EXIF.
         (f"a b 0 4 {EYE}", "expected 0, 1, 2 or 3 quarter turns, found 0 and 4"),
         (f"a b 0 0 {EYE}".replace("1 0 0 0 1", "1 0 x 0 1", 1), "expected numbers .*'x'"),
         (f"a b 0 0 {EYE}".replace("1 0 0 0 1", "1 0 nan 0 1", 1), "expected finite numbers"),
@@ -69,6 +70,7 @@ def test_a_malformed_line_is_named_with_what_was_expected(line, expected):
     ],
 )
 def test_no_name_leads_out_of_the_image_root(name):
+    # Lists are downloaded files, and a report shows the images that they name.
     for names in (f"{name} ok.jpg", f"ok.jpg {name}"):
         with pytest.raises(UserError, match=r"list.txt, line 7: .* points outside the image root"):
             parse_line(f"{names} 0 0 {EYE}", *WHERE)

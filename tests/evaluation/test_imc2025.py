@@ -106,6 +106,7 @@ ROW = f"set,a,a0.png,{POSE}"
 @pytest.mark.parametrize(
     ("table", "before", "after", "told"),
     [
+        # Squares of 1e308 overflow, and NumPy would warn in the middle of a score.
         ("train_labels", POSE, HUGE, "line 2: '1e308;.*' has a number beyond 1e\\+12"),
         (
             "train_labels",

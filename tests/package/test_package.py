@@ -139,7 +139,7 @@ def test_a_package_of_the_image_stays_if_its_version_fits_even_without_a_wheel_f
     assert not [line for line in lines[1:] if "==" in line], "ranges, not pins"
     assert "kornia>=0.9" in lines
     # kornia is installed here, so its wheel is not needed.
-    for path in dataset.glob("[!k]*.whl"):
+    for path in dataset.glob("[!k]*.whl"):  # all but kornia and kornia-rs
         (tmp_path / path.name).symlink_to(path)
     command = [sys.executable, "-m", "pip", "install", "--dry-run", "--no-index", "--no-deps"]
     command += ["--find-links", str(tmp_path), *lines[1:]]
@@ -219,6 +219,7 @@ def test_a_private_package_has_all_weights_and_a_public_one_is_not_written_over_
     assert torch.equal(load_tensors(kept)["a"], torch.full((3,), 2.0))
     assert run_command(*arguments) == 2
     assert "kept.pt.safetensors. Remove them" in capsys.readouterr().err
+    # The folder is uploaded as it is: a restricted file that stays there would be published.
     kept.unlink()
     assert run_command(*arguments) == 0
     assert "Left out" in capsys.readouterr().out

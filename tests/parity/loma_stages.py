@@ -116,8 +116,10 @@ def resize_stages():
             yield Stage(name, got, batch_of(expected).float(), 1)
             differing = (got != batch_of(expected)).float().mean()
             yield Stage(f"{name}, share", differing, torch.tensor(0.0), 0.02)
+    # A picture of the right size is not resized, only divided by 255.
     exact = resized(batch_of(golden["detector_48"]), golden["detector_48"].shape[:2])
     yield Stage("detector_48_float", exact[0], golden["detector_48_float"], 1e-7)
+    # Sizes decide where a keypoint lies, so they must agree to the pixel.
     for width, height, long_side, *expected in golden["size_table"].tolist():
         got = detector_size(Size(width, height), long_side)
         yield Stage(f"{width} x {height}", torch.tensor(got), torch.tensor(expected))

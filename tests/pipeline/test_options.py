@@ -54,6 +54,7 @@ def test_an_option_changes_the_settings_of_its_unit(clean_environment, matcher, 
     assert {**new, "options": former["options"]} == former
 
 
+# A changed threshold must not match pairs again: points do not depend on later steps.
 @pytest.mark.parametrize(
     ("key", "value"),
     [

@@ -27,7 +27,7 @@ OPTIONS = (
     "--no-sandbox",
     "--disable-gpu",
     "--no-first-run",
-    "--remote-debugging-pipe",
+    "--remote-debugging-pipe",  # no port that another test could take
 )
 SETTLE_S = 0.4  # after an event: the page draws in the next frame
 LOADING_S = 60.0

@@ -57,6 +57,7 @@ LOMA = {
     "matcher.*.ffn.3.weight": 0.1,
 }
 LOMA |= {"matcher.*.Wqkv.weight": 1.4, "matcher.*.to_qk.weight": 1.4}
+# Gains that keep the size of signals from layer to layer; without them deep maps die out.
 STAND_INS = {
     "superpoint": StandIn(
         3.0, {"conv1a.weight": 2.0, "convPb.weight": 2.0}, {"convPb.bias[64]": 7.0}

