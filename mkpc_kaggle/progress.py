@@ -34,7 +34,7 @@ def counted(items: Sequence[Item], what: str, unit: str) -> Iterator[Item]:
     if is_redrawn():
         from tqdm import tqdm
 
-        # tqdm prints nothing on a terminal that states no size, as those of `script` do.
+        # tqdm prints nothing on a terminal that states no size, such as `script`'s.
         columns, rows = shutil.get_terminal_size()
         yield from tqdm(
             items,

@@ -9,7 +9,7 @@ from mkpc_kaggle import progress
 
 def test_a_terminal_shows_a_bar_even_if_it_states_no_size(monkeypatch):
     ours, theirs = os.openpty()
-    os.set_blocking(ours, False)  # without a bar there is nothing to read
+    os.set_blocking(ours, False)  # a read must not wait for a bar
     monkeypatch.delenv("JPY_PARENT_PID", raising=False)
     monkeypatch.setattr(progress, "MAX_SILENCE_S", 0.0)
     with Path(os.ttyname(theirs)).open("w") as stream, monkeypatch.context() as patch:

@@ -1,4 +1,4 @@
-"""Recipes: those of the package load, and a wrong recipe is refused with advice."""
+"""Recipes of the package load, and a wrong recipe is refused with advice."""
 
 import os
 from itertools import combinations

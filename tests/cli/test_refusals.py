@@ -13,7 +13,7 @@ from mkpc_kaggle.demo import write
 
 SUBMIT = "submit --test-dir demo/test"
 MATCH = "match x.png y.png --recipe classical --out"
-# The message begins with the option or the file, and says what to give instead.
+# The message begins with the option or the file, and names the next step.
 REFUSALS = [
     ("submit --test-dir nowhere", "test.csv: no such file"),
     (f"{SUBMIT} --recipe imaginary", "unknown recipe 'imaginary'; known: "),

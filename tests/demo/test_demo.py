@@ -33,7 +33,7 @@ def numbers(text: str, *shape: int) -> np.ndarray:
 
 
 def blobs():
-    """Blobs of some 16 texels: the intensity changes fast enough to show half a pixel."""
+    """Blobs of about 16 texels: the intensity changes fast enough to show half a pixel."""
     noise = np.random.default_rng(0).uniform(0, 255, (32, 32, 3)).astype(np.uint8)
     return cv2.resize(noise, (512, 512), interpolation=cv2.INTER_CUBIC)
 

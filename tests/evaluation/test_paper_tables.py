@@ -24,7 +24,7 @@ def test_the_papers_tables_are_made_with_one_command(demo, tmp_path, capsys):
     imc = lines[6:]
     names = ["1600 ransac", "1600 magsac", "1200 + 1600 magsac", "mean difference"]
     assert [" ".join(row[:2]).strip() for row in yfcc[2:]] == names
-    # The paper's own row, beside which the measured one stands.
+    # The paper's figures, in separate columns.
     assert yfcc[2][7:] == ["37.73", "58.03", "74.57", "1"]
     assert [row[10] for row in yfcc[2:5]] == ["1", "0", "2"]  # the unit that two rows have ran once
     own = np.array([row[2:5] for row in yfcc[2:5]], float)

@@ -247,7 +247,7 @@ BAD = {
     "other arrays": ("pairs.npz", lambda path: np.savez(path, a=[1]), "pair_infos.npy"),
     "code": ("pairs.npz", pickled(pickle.dumps(Run())), "it names builtins.print"),
     "cut off": ("pairs.npz", pickled(pickle.dumps([1, 2])[:-3]), "is not a scene_info"),
-    # What a user gives by mistake: another text, a folder without files, a table of regions.
+    # Mistakes of users: another text, a folder without files, a table of regions.
     "no pairs": ("pairs.txt", lambda path: path.write_text("a b\n"), "expected 38 fields"),
     "an empty directory": ("pairs", Path.mkdir, "cannot be read"),
     "no columns": ("regions.csv", table("1,2", "a,b"), "lacks the columns image_0"),

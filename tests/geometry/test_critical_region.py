@@ -220,5 +220,5 @@ def test_many_points_are_merged_so_that_memory_stays_linear(monkeypatch):
     regions.dbscan(clumps(np.random.default_rng(2), 20_000), eps=EPS, min_samples=MIN_SAMPLES)
     [(cells, counts)] = seen
     assert counts.sum() == 20_000
-    # pi 10^2 cells, and those that the circle only touches
+    # pi 10^2 cells, and cells that the circle only touches
     assert KDTree(cells).query_ball_point(cells, EPS, return_length=True).max() < 450

@@ -28,7 +28,7 @@ def places(matches):
     [
         ((2, 2), (3, 2), (3,)),
         ((3, 3), (3, 2), (3,)),
-        ((3, 2), (3, 2), (3, 1)),  # NumPy would broadcast such scores to (3, 3)
+        ((3, 2), (3, 2), (3, 1)),  # NumPy would broadcast these scores to (3, 3)
         ((3, 2), (6,), (3,)),
     ],
 )

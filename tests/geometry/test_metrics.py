@@ -54,7 +54,7 @@ def errors(*angles):
         (10.001, 0, 0.0),
         (0, 4.999, 0.1),
         (0, 5.001, 0.0),
-        # Both of one threshold pair have to be met: the translation decides
+        # Both errors must meet a pair of thresholds: the translation decides
         (4.5, 0.2 * 25 ** (6.5 / 9), 0.3),
         (7.5, 0.5, 0.3),  # here the rotation
         (inf, inf, 0.0),
@@ -158,7 +158,7 @@ def test_a_matrix_that_is_no_rotation_has_an_angle_and_raises_nothing(R):
 
 
 def test_matches_are_correct_within_superglues_distance_of_both_epipolar_lines():
-    # Cameras beside each other: a line is a row, and 2 (dy / 800)^2 the distance
+    # Cameras side by side: a line is a row, and 2 (dy / 800)^2 the distance
     K = np.diag([800.0, 800, 1])
     cameras = Camera(K, np.eye(3), np.zeros(3)), Camera(K, np.eye(3), np.array([1.0, 0, 0]))
     points0 = np.array([(5, 0), (5, 0), (5, 0)])

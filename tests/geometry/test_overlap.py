@@ -1,4 +1,4 @@
-"""Support of an F: high for matches of one place, low for wrong matches, whatever their number."""
+"""Support of an F: high for matches of one place, low for any number of wrong matches."""
 
 import numpy as np
 import pytest

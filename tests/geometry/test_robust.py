@@ -157,7 +157,7 @@ def test_a_model_needs_one_match_more_than_its_minimum_else_the_fallback_is_give
     few = estimated(model, seen(0, fewest - 1))
     assert_fallback(few, model, fewest - 1)
     assert f"too few distinct matches for {model}: {fewest - 1}" in few.failure
-    few.matrix[:] = 7  # each fallback has a matrix of its own
+    few.matrix[:] = 7  # each fallback has its own matrix
     assert_fallback(estimated(model, Matches.empty()), model, 0)
     assert estimated(model, seen(0, fewest, plane=model is ModelKind.H)).ok
 
@@ -201,7 +201,7 @@ def test_the_same_input_gives_the_same_bytes_after_other_calls_and_beside_other_
 
 
 ANY_FLOAT = st.floats(width=32)
-# Squares of 1e20 overflow float32, and those of 1e-20 vanish.
+# Squares of 1e20 overflow float32, and squares of 1e-20 vanish.
 CORNERS = st.sampled_from(
     np.array([0, 1, -1, 2, 100, 1e-20, 1e10, 1e18, 1e20, 3e38], np.float32).tolist()
 )

@@ -71,6 +71,6 @@ def test_depth_signs_are_1_in_front_of_both_cameras_minus_1_behind_both_and_0_be
     assert (view.depth_signs(*rays_of(behind, view), 1.0) == -1).all()
     between = np.array([[0.01, 0.02, -0.3]])  # behind camera 0, in front of camera 1
     assert (view.depth_signs(*rays_of(between, view), 1.0) == 0).all()
-    # The twisted pair has the same F, so only the depths tell the two apart.
+    # The twisted pair has the same F, so only the depths differ.
     assert_allclose(view.twisted.fundamental, -view.fundamental, atol=1e-12)
     assert not (view.twisted.depth_signs(*rays_of(points, view), 1.0) > 0).any()

@@ -71,7 +71,7 @@ def test_points_of_either_picture_are_in_its_own_pixels():
     assert len(matches) == 40 * 60 + 80 * 30
     expected = (matches.points0 + 0.5) * (30 / 60, 80 / 40) - 0.5
     np.testing.assert_allclose(matches.points1, expected, atol=1e-4)
-    # A warp starts at whole pixels of its own picture.
+    # A warp starts at whole pixels of one picture.
     whole0 = np.abs(matches.points0 - np.rint(matches.points0)).max(axis=1) < 1e-4
     whole1 = np.abs(matches.points1 - np.rint(matches.points1)).max(axis=1) < 1e-4
     assert (whole0 | whole1).all()

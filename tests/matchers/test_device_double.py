@@ -1,4 +1,4 @@
-"""Every matcher on the device double: nothing mixes devices, and the matches are those of the CPU."""
+"""Every matcher on the device double: nothing mixes devices, and the CPU gives the same matches."""
 
 import numpy as np
 import pytest

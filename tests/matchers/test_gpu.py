@@ -39,7 +39,7 @@ def gpus_here(monkeypatch: pytest.MonkeyPatch, *capabilities: tuple[int, int]) -
 
 
 def test_a_missing_gpu_is_refused_and_half_precision_asks_every_gpu_that_the_run_uses(monkeypatch):
-    # A T4, whose tensor cores are fast in half precision, beside a P100, which has none.
+    # A T4, whose tensor cores are fast in half precision, and a P100, which has none.
     gpus_here(monkeypatch, (7, 5), (6, 0))
     assert resolve_placement("cuda:1", "float32").device == "cuda:1"
     with pytest.raises(UserError, match="--device cuda:2: this machine has only cuda:0, cuda:1"):
@@ -65,7 +65,7 @@ def test_the_parent_of_workers_never_initialises_cuda(monkeypatch):
 def test_gpus_that_cannot_compute_leave_the_work_to_the_cpu(monkeypatch):
     gpu_capabilities.cache_clear()
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    # What torch raises on a GPU that its build does not support.
+    # The error of torch on a GPU that its build does not support.
     monkeypatch.setattr(devices, "ASK_CAPABILITIES", "raise SystemExit('no kernel image')")
     told = (
         r"the CPU does the work: .*\(no kernel image\); on Kaggle choose the accelerator GPU T4 x2"

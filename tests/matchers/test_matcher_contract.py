@@ -1,4 +1,4 @@
-"""What the contract asks of every matcher, with stand-in weights."""
+"""The contract of every matcher, with stand-in weights."""
 
 import numpy as np
 import pictures

@@ -46,7 +46,7 @@ def test_matches_move_less_than_by_noise(name, precision):
 
 
 def test_auto_takes_half_precision_where_the_processor_has_it(monkeypatch):
-    # Without such instructions, PyTorch emulates bfloat16 and is slower than in float32.
+    # Without these instructions, PyTorch emulates bfloat16 and is slower than in float32.
     for flags, expected in (
         ({"avx512_bf16": True}, Precision.BFLOAT16),
         ({"amx_bf16": True, "avx512_bf16": False}, Precision.BFLOAT16),

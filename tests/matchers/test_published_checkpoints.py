@@ -1,7 +1,7 @@
-"""The entries of every published checkpoint, as far as they are known, load into the networks.
+"""The known entries of every published checkpoint load into the networks.
 
-Names and shapes alone, on the device "meta", beside what the files have too much: wrappers,
-counters, training's leftovers. The lists of ``shapes.json`` were made from the original networks.
+Names and shapes alone, on the device "meta", with surplus entries of the files: wrappers,
+counters, remains of the training. The lists of ``shapes.json`` were made from the original networks.
 """
 
 import json
@@ -22,7 +22,7 @@ Shapes = Mapping[str, tuple[int, ...]]
 
 
 class Published:
-    """A store of one checkpoint per slot, of which only names and shapes are known."""
+    """A store of one checkpoint per slot, with its names and shapes only."""
 
     def __init__(self, tables: Mapping[str, Shapes]) -> None:
         self.tables = tables
@@ -120,7 +120,7 @@ NUMBERS = {f"log_assignment.{n}.r": (1,) for n in range(9)}
 
 
 def lighterglue() -> dict[str, tuple[int, ...]]:
-    """With the extractor that it was trained with, of which no matcher needs anything."""
+    """With the extractor of its training, which no matcher needs."""
     matcher = with_prefix("matcher.", with_old_names(XFEAT.shapes()))
     return matcher | with_prefix("extractor.model.net.", xfeat())
 
@@ -256,7 +256,7 @@ ONE_EACH = [name for name in GOLDEN_LISTS if "indoor" not in name and name not i
 @pytest.mark.parametrize("name", ONE_EACH)
 def test_counters_of_batch_norms_may_be_missing_and_nothing_else(name):
     matcher, make, _ = GOLDEN_LISTS[name]
-    # PyTorch before 0.4.1 had no such counters, and inference does not use them.
+    # PyTorch before 0.4.1 had no counters, and inference does not use them.
     tables = {}
     for slot, table in make().items():
         kept = {entry for entry in table if not entry.endswith("num_batches_tracked")}

@@ -17,7 +17,7 @@ from mkpc_kaggle.matchers import adapters
 from mkpc_kaggle.matchers.registry import matcher_names, spec_of
 from mkpc_kaggle.recipe import Unit
 
-# In a process of its own, because imports of this one cannot be undone.
+# In a separate process, because imports of this one cannot be undone.
 WITHOUT_KORNIA = """
 import sys
 sys.modules["kornia"] = None
@@ -68,7 +68,7 @@ def test_without_kornia_its_matchers_alone_are_lost(clean_environment):
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert "superglue_outdoor.pth" in done.stdout, done.stderr
     reason = "cannot be used here (ModuleNotFoundError"
-    # Each command that lists matchers says what is missing instead of leaving a gap.
+    # Each command that lists matchers names the missing ones.
     assert f"\nweights: matcher xfeat_lighterglue {reason}" in done.stdout
     assert f"  xfeat_lighterglue: {reason}" in done.stdout
     assert "('sift',) True" in done.stdout

@@ -43,7 +43,7 @@ def test_matches_are_the_mutual_maxima_of_both_softmaxes(monkeypatch, held):
 
 
 def test_span_attention_in_chunks_is_that_of_the_whole(monkeypatch):
-    """With samples far outside, of which some are not usable."""
+    """With samples far outside. Some of them are not usable."""
     generator = torch.Generator().manual_seed(0)
     q = torch.randn(2, 4, 6, 16, generator=generator)
     k, v = torch.randn(2, 2, 5, 7, 16, generator=generator)

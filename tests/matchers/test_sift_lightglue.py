@@ -42,7 +42,7 @@ def test_keypoints_and_log_assignment_are_the_golden_ones():
         is_close = off < 1e-5 + 1e-6 * np.abs(expected)
         assert is_close.mean() > 0.998, "OpenCV 4.8 rounds some elsewhere"
         assert off.max() < 2e-3
-    # The network gets the golden keypoints themselves: those of two versions of OpenCV differ.
+    # The network gets the golden keypoints themselves: two versions of OpenCV find different ones.
     given = []
     for number, each in enumerate(encodings):
         exact = replace(
@@ -54,7 +54,7 @@ def test_keypoints_and_log_assignment_are_the_golden_ones():
         )
         given.append([exact])
     assert len(matcher.match(*given)[0]) == len(golden["matches"]) == 0
-    # Down to -38. The golden values are up to 2e-4 from those in float64, so the tolerance is
+    # Down to -38. The golden values differ by up to 2e-4 from values in float64, so the tolerance is
     # relative, too.
     expected = golden["log_assignment"][: found[0].shape[0], : found[0].shape[1]]
     assert_allclose(found[0], expected, rtol=1e-4, atol=1e-4)

@@ -79,6 +79,6 @@ def test_superpoint_finds_in_a_batch_what_it_finds_in_each_image():
         assert torch.equal(found.points, alone.points)
         assert len(alone.points) == 20
         assert (alone.scores.diff() <= 0).all()
-        # 45 x 62 pixels have 40 x 56 in whole cells of 8, of which the border of 4 is left out.
+        # 45 x 62 pixels have 40 x 56 in whole cells of 8, less the border of 4.
         assert ((alone.points >= 4) & (alone.points < torch.tensor([56 - 4, 40 - 4]))).all()
     assert network(batch[:0]) == []

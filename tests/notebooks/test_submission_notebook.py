@@ -95,8 +95,8 @@ def test_every_image_has_what_the_package_takes_from_it(python, opencv, torch, n
     assert python in PYTHONS
 
 
-# What the run prints with genuine weights, with stand-ins, and without weights. Each run of the
-# notebook takes half a minute, so there is one, with the best weights that are there.
+# Output of the run with genuine weights, with stand-ins, and without weights. Each run of the
+# notebook takes half a minute, so there is one, with the best available weights.
 PRINTED = {
     GENUINE: (
         "2 files, 0 refused, 0 missing",

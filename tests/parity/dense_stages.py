@@ -43,7 +43,7 @@ def network_of(name):
     default = gains["default"]
     if name == "dkm":
         return ready(DKM(), state_of(shapes, gains["prefixes"], default))
-    # RoMa's checkpoint has no DINOv2, which is a file of its own.
+    # RoMa's checkpoint has no DINOv2, which is a separate file.
     dinov2 = state_of(shapes["dinov2"], gains["dinov2"]["prefixes"], default, "dinov2.")
     roma = state_of(shapes["roma"], gains["roma"]["prefixes"], default)
     return ready(RoMa(), dinov2 | roma)
@@ -136,7 +136,7 @@ def dkm_upsample():
 
 
 def dkm_one_way():
-    # Sides that are no multiples of a stride: grids are rounded up.
+    # Sides that are not multiples of a stride: grids are rounded up.
     coarse = images_of("dkm", "imA", "imB", size=(90, 118))
     fine = images_of("dkm", "imA", "imB", size=(130, 170))
     first = computed("dkm", coarse, symmetric=False)

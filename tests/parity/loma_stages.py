@@ -134,7 +134,7 @@ def descriptor_stages(variant, case):
     pixels = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), dim=2)[::3, ::3]
     dense = descriptor(image, pixels.reshape(1, -1, 2)).mT.unflatten(2, pixels.shape[:2])
     values = {
-        "dense_descriptors": dense[:, ::32],  # as many channels as the file keeps
+        "dense_descriptors": dense[:, ::32],  # the channels that the file keeps
         "descriptors": descriptor(image, golden["keypoints"][None]),
     }
     yield from compared(values, golden, TOLERANCES)

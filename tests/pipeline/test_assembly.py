@@ -1,4 +1,4 @@
-"""Assembly of a run: the units that a recipe keeps, and the reasons of those that it leaves out."""
+"""Assembly of a run: the units that a recipe keeps, and the reasons why others are left out."""
 
 import re
 from dataclasses import replace
@@ -84,7 +84,7 @@ def test_recipes_take_what_is_there_and_fallbacks_stand_in_for_the_rest():
 
 @pytest.fixture
 def known_files(monkeypatch, tmp_path):
-    """SuperGlue's, LoFTR's and DKM's weights are there, DKM's also for indoors, of unclear terms."""
+    """SuperGlue's, LoFTR's and DKM's weights exist, DKM's also for indoors, of unclear terms."""
     known = [
         ("sp.pth", "superpoint", "Magic-Leap-noncommercial"),
         ("sg.pth", "superglue-outdoor", "Magic-Leap-noncommercial"),

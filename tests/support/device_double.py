@@ -8,9 +8,9 @@ It works with a CPU build of PyTorch. To PyTorch's own code a tagged tensor lies
 which every build has a guard; all that Python can ask it says ``cuda:N``, and all operators come to
 :meth:`DeviceDouble.run`.
 
-What raises :class:`MixedDevicesError`: an operator on tensors of two devices, but for a CPU tensor of no
+These raise :class:`MixedDevicesError`: an operator on tensors of two devices, but for a CPU tensor of no
 dimensions and for CPU indices into a tagged tensor, which a GPU takes as well; a generator of another device.
-``.numpy()`` of a tagged tensor is the TypeError that it is on a GPU. What it cannot show: a GPU's rounding, its
+``.numpy()`` of a tagged tensor is the TypeError that it is on a GPU. It cannot show a GPU's rounding, its
 memory, its speed, half precision.
 
 Enter it in the thread that computes; networks that were moved within it are of no use outside of
@@ -105,7 +105,7 @@ class DeviceDouble(TorchDispatchMode):
         stack.close()
 
     def _stand_ins(self):
-        """Yield stand-ins of what PyTorch asks about GPUs, other than operators."""
+        """Yield stand-ins of PyTorch's questions about GPUs, other than operators."""
         double = self
 
         class Generator(torch.Generator):
@@ -129,7 +129,7 @@ class DeviceDouble(TorchDispatchMode):
         }
         yield from ((torch.cuda, name, value) for name, value in values.items())
         yield torch, "Generator", Generator
-        # Tagged tensors cannot be inference tensors, which lack the version that views need.
+        # Tagged tensors cannot be inference tensors, which have no version, and views need one.
         grads = []
         yield (
             torch.inference_mode,

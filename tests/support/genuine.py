@@ -17,7 +17,7 @@ def genuine_files() -> list[WeightFile]:
 
 
 def why_not_there() -> str:
-    """Return the reason to skip tests with genuine weights, empty if all files are there."""
+    """Return the reason to skip tests with genuine weights, empty if no file is missing."""
     # Sizes alone: digests of 120 MB in each process of the tests would take seconds.
     sizes = {path.name: path.stat().st_size for path in GENUINE.glob("*") if path.is_file()}
     missing = [file.name for file in genuine_files() if sizes.get(file.name) != file.size]

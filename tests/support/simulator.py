@@ -147,7 +147,7 @@ class Scenario:
 def random_scenario(seed: int, pairs: int) -> Scenario:
     """Anything that happens: from an ample limit to a limit that the sweep alone fills."""
     rng = np.random.default_rng(seed)
-    # Costs of units differ by a factor of ten and more, as those of SIFT and dense networks do.
+    # Costs of units differ by a factor of ten and more, as SIFT's and dense networks' do.
     costs = tuple(np.exp(rng.normal(-0.5, 0.8, rng.integers(1, 13))).tolist())
     troubled = rng.random() < 0.5
     scenario = Scenario(

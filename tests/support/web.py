@@ -11,7 +11,7 @@ from socketserver import BaseRequestHandler, TCPServer, ThreadingTCPServer
 
 @dataclass
 class Site:
-    """What the server does; it may be changed between requests. ``asked`` gets each request's Range
+    """The behaviour of the server; it may be changed between requests. ``asked`` gets each request's Range
     header.
     """
 

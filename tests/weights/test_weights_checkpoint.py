@@ -201,7 +201,7 @@ class Call:
 
 
 def nasty(sentinel: Path) -> dict[str, object]:
-    """Calls that would make the sentinel file, by what they go through."""
+    """Calls that would make the sentinel file, by the names that they use."""
     command = f"touch {sentinel}"
     hidden = sentinel.with_name("hidden.pt")
     hidden.write_bytes(pickle.dumps(Call(os.system, command), protocol=2))

@@ -78,7 +78,7 @@ def test_a_part_of_another_version_is_detected_by_the_digest_and_removed(site, t
 
 
 def test_a_file_without_a_digest_is_never_resumed_and_its_digest_is_reported(site, tmp_path):
-    # Parts of two versions could not be told from one version.
+    # Parts of two versions would pass for one version.
     site.breaks = [CUT]
     fetched = get(site, tmp_path, line(size=-1, digest=UNVERIFIED))
     assert (fetched.outcome, site.asked) == (FetchOutcome.FETCHED, ["", ""])

@@ -31,7 +31,7 @@ def test_a_file_is_found_in_the_directory_and_below_it(tmp_path):
     found = WeightStore([tmp_path / "b"], [line()]).find("slot")
     assert found.path == tmp_path / "b" / "deep" / "deeper" / "a.bin"
     assert found.digest == digest_of(DATA)
-    put(tmp_path / "c" / "a.bin")  # Kaggle makes such directories of data sets of one file
+    put(tmp_path / "c" / "a.bin")  # Kaggle makes these directories of data sets of one file
     assert found_by(WeightStore([tmp_path / "c"], [line()])) == tmp_path / "c" / "a.bin" / "a.bin"
     with pytest.raises(UserError, match=r"--weights .*gone: no such directory"):
         WeightStore([tmp_path / "gone"])
