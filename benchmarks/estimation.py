@@ -58,7 +58,7 @@ SCENE = "scene"
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """A pair with its matches and its own F from a journal; F is ``None`` if the estimate failed."""
+    """A pair with its matches and its own F from a journal; F is ``None`` for a failed estimate."""
 
     true: TruePair
     found: PairMatch

@@ -31,14 +31,14 @@ ALONE = "from benchmarks.folder_seconds import pycolmap_alone; pycolmap_alone(*_
 
 @dataclass(frozen=True)
 class Program:
-    """A way to get cameras: a name for the table, and a command that takes a folder and an output."""
+    """A way to get cameras: its name in the table, and a command for a folder and an output."""
 
     name: str
     command: tuple[str, ...]
     checkout: Path = HERE
 
     def seconds(self, images: Path, out: Path) -> float:
-        """Run the program. Return CPU seconds, with the seconds of all processes that it waited for."""
+        """Run the program. Return CPU seconds, with those of all processes that it waited for."""
         command = [part.format(images=images, out=out) for part in self.command]
         environment = {**os.environ, **ONE_THREAD, "PYTHONPATH": str(self.checkout)}
         # From the checkout, because Python imports from the working directory first.
@@ -116,7 +116,7 @@ def programs_of(arguments: argparse.Namespace) -> list[Program]:
 
 
 def measure(programs: Sequence[Program], folder: Path, rounds: int) -> None:
-    """Print a row per program and round: CPU seconds, seconds of mapping, cameras; then the means."""
+    """Print a row per program and round: CPU seconds, mapping, cameras; then the means."""
     used: dict[str, list[float]] = {program.name: [] for program in programs}
     for number in range(1, rounds + 1):
         # In turns, so that other work on the machine meets all programs.

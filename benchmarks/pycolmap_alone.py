@@ -65,6 +65,7 @@ def cameras_of(model: pycolmap.Reconstruction) -> Cameras:
 def error_of(true: TruePair, found: list[Cameras], metres_per_unit: float) -> PoseError:
     """Return the error of a pair's F from the first model that has both images."""
     names = [path.stem for path in true.pair.images]
+    # The largest model comes first.
     for cameras in found:
         if all(name in cameras for name in names):
             F = fundamental_of_cameras(*(cameras[name] for name in names))

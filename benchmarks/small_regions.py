@@ -2,9 +2,9 @@
 
 python -m benchmarks.small_regions --train-dir DIR FIGURES.json
 
-The file comes from `validate --compare ... --json`. Its first recipe is what the others are compared
-with. The share of a crop is its area over its image's, of the smaller of the pair's two crops, in
-the first recipe that has crops. Intervals resample images.
+The file comes from `validate --compare ... --json`; the other recipes are compared with its first.
+The share of a crop is its area over its image's, of the smaller of the pair's two crops, in the
+first recipe that has crops. Intervals resample images.
 """
 
 import argparse
@@ -59,6 +59,7 @@ def read_pairs(train_dir: Path, recipes: Sequence[dict[str, Any]]) -> list[Pair]
             if true.pair.id not in by_id[0]:
                 continue
             rows = [table[true.pair.id] for table in by_id]
+            # Of a two-stage recipe: the baselines have no regions, and then no box is compared.
             boxes = next((row["boxes"] for row in rows if row["boxes"]), [])
             sizes = [Image.open(path).size for path in true.pair.images]
             accuracies = tuple(last_accuracy(row) for row in rows)
@@ -69,6 +70,7 @@ def read_pairs(train_dir: Path, recipes: Sequence[dict[str, Any]]) -> list[Pair]
 
 def last_accuracy(row: dict[str, Any]) -> float:
     """Return the accuracy after the last step of the estimate."""
+    # The keys are in the order of the run.
     return float(list(row["accuracy_by_step"].values())[-1])
 
 

@@ -40,7 +40,7 @@ def read_text(path: Path) -> str:
 
 
 def shown(name: object) -> str:
-    """Return a name for messages. Escape control characters, which end lines and control terminals."""
+    """Return a name for messages; control characters, which terminals obey, are escaped."""
     letters = []
     for letter in str(name):
         letters.append(letter if letter.isprintable() else repr(letter)[1:-1])

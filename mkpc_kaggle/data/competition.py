@@ -204,7 +204,7 @@ def read_submission(path: Path) -> dict[str, Matrix3]:
 
 
 def submission_problems(path: Path, sample_ids: Sequence[str]) -> list[str]:
-    """Return the problems of a submission, one sentence each; empty if the competition accepts it."""
+    """Return a submission's problems, one sentence each; empty if the competition accepts it."""
     try:
         rows = [cells for _, cells in read_rows(path, SUBMISSION_COLUMNS, only=True)]
     except UserError as error:
@@ -305,7 +305,7 @@ def _skip_to_header(path: Path, stream: TextIO) -> int:
 
 
 def _with_header(path: Path, rows: "DataFrame", columns: Sequence[str], only: bool) -> "DataFrame":
-    """Return the rows below the header. Raise :class:`UserError` if columns or cells are missing."""
+    """Return the rows below the header. Raise :class:`UserError` for missing columns or cells."""
     header = list(rows.iloc[0])
     found = ", ".join(header)[:200]
     if missing := [column for column in columns if column not in header]:

@@ -161,7 +161,7 @@ def read_exif(data: bytes, size: Size) -> tuple[int, float]:
 
 
 def read_size(path: Path) -> Size | None:
-    """Return the size of a picture from its head, in stored pixels; ``None`` if it is unreadable."""
+    """Return a picture's size from its head, in stored pixels; ``None`` if it is unreadable."""
     with suppress(Exception), warnings.catch_warnings():  # Pillow raises errors of any type
         warnings.filterwarnings("ignore", module="PIL")
         with PIL.Image.open(path, formats=("JPEG", "PNG")) as picture:

@@ -138,7 +138,7 @@ def step_gains(validation: Validation) -> list[str]:
 
 
 def comparison_json(validations: Sequence[Validation]) -> dict[str, Any]:
-    """Return all figures as JSON values: each validation, and each later one's gain over the first."""
+    """Return all figures as JSON values: validations, and gains of later ones over the first."""
     first, *others = validations
 
     def gain(other: Validation, name: str | None = None) -> dict[str, float]:

@@ -1,8 +1,8 @@
 """The score of the Image Matching Challenge 2025: clusters of mixed images, and their cameras.
 
 ``train_labels.csv`` has ``dataset,scene,image,rotation_matrix,translation_vector``,
-``train_thresholds.csv`` has ``dataset,scene,thresholds``. Numbers in a cell are joined by ``;``, and
-poses map world to camera. An image of ``outliers`` belongs to no scene.
+``train_thresholds.csv`` has ``dataset,scene,thresholds``. Numbers in a cell are joined by ``;``.
+Poses map world to camera. An image of ``outliers`` belongs to no scene.
 """
 
 from collections.abc import Iterator, Mapping, Sequence

@@ -32,7 +32,7 @@ class Size(NamedTuple):
 
 @dataclass(frozen=True)
 class Box:
-    """A half-open box of whole pixels: columns ``left <= x < right``, rows ``top <= y < bottom``."""
+    """A half-open box of whole pixels: ``left <= x < right``, ``top <= y < bottom``."""
 
     left: int
     top: int
@@ -191,5 +191,5 @@ def from_corner(points: NDArray[np.floating]) -> NDArray[np.floating]:
 
 
 def from_normalised(points: NDArray[np.floating], size: Size) -> NDArray[np.floating]:
-    """Convert (N, 2) coordinates, with +-1 at the outer edges of an image of ``size``, to pixels."""
+    """Convert (N, 2) coordinates, +-1 at the outer edges of an image of ``size``, to pixels."""
     return from_corner((points + 1) * np.array(size, points.dtype) / 2)

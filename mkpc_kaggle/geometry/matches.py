@@ -1,4 +1,4 @@
-"""Corresponding points of a pair; outside matchers, in full-image pixels. Zero matches are legal."""
+"""Corresponding points of a pair; outside matchers, in image pixels. Zero matches are legal."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass

@@ -262,7 +262,7 @@ class DistinctMatches:
         return cls(pairs[:, :2], pairs[:, 2:4], index)
 
     def mask_of_all(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Expand an (M,) mask of the distinct matches to an (N,) mask of all, duplicates included."""
+        """Expand a mask (M,) of the distinct matches to all N matches, duplicates included."""
         # Index -1, of a match that is not finite, reads the appended False.
         return np.append(mask, False)[self.index]
 
@@ -273,7 +273,7 @@ def unit_norm(matrix: Matrix3) -> Matrix3:
 
 
 def calibrate(points: NDArray[np.floating], K: Matrix3) -> Vectors:
-    """Convert (N, 2) pixels to (N, 2) coordinates in the plane z = 1 of the camera with matrix K."""
+    """Convert (N, 2) pixels to (N, 2) coordinates in the plane z = 1 of a camera with matrix K."""
     mapped = homogeneous(points) @ np.linalg.inv(K).T
     return np.asarray(mapped[:, :2] / mapped[:, 2:])
 

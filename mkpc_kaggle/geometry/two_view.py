@@ -191,7 +191,7 @@ class Problem:
         return np.array([1 / sigma**2 if sigma else 0.0 for sigma in self.sigmas])
 
     def _step(self, gradient: Vectors, curvature: NDArray[np.float64], damping: float) -> Vectors:
-        """Return the damped step (7,), or NaN for a singular system, so that the step is rejected."""
+        """Return the damped step (7,), or NaN, which is rejected, for a singular system."""
         free = self._free
         step = np.zeros(7)
         # Marquardt's scaling by the diagonal; MIN_DAMPING keeps a zero on it from being singular.
@@ -247,7 +247,7 @@ def sampson(F: Matrix3, rays0: Vectors, rays1: Vectors) -> Vectors:
 
 
 def _lines(F: Matrix3, rays0: Vectors, rays1: Vectors) -> tuple[Vectors, Vectors, Vectors]:
-    """Return the epipolar lines (N, 3) in both images, and the norm (N,) of y1^T F y0's gradient."""
+    """Return the epipolar lines (N, 3) in both images, and the norms (N,) of grad y1^T F y0."""
     lines0 = rays1 @ F
     lines1 = rays0 @ F.T
     normals0 = lines0[:, :2]

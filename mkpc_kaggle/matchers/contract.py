@@ -30,7 +30,7 @@ class Colour(StrEnum):
 
 
 class Precision(StrEnum):
-    """The precision of a network's convolutions and linear layers; the values are PyTorch's names."""
+    """The precision of a network's convolutions and linear layers, with PyTorch's names."""
 
     FLOAT32 = "float32"
     BFLOAT16 = "bfloat16"
@@ -93,7 +93,7 @@ class MatcherSpec:
         return self.options_for(slot) is not None
 
     def options_for(self, slot: str) -> Any:
-        """Return default options, except what the slot asks for, or ``None`` if no options use it."""
+        """Return default options with what the slot asks for; ``None`` if no options use it."""
         for own in self.slots:
             # A template such as "loftr-{training}" becomes a pattern with the group "training".
             pattern = re.sub(r"\\{(\w+)\\}", r"(?P<\1>.+)", re.escape(own))
@@ -124,7 +124,7 @@ Encoding = TypeVar("Encoding")
 
 
 class Matcher(Protocol[Encoding]):
-    """A loaded matcher. ``encode`` returns one item per picture, ``match`` one per pair, in order."""
+    """A loaded matcher. ``encode`` returns an item per picture, ``match`` per pair, in order."""
 
     @property
     def spec(self) -> MatcherSpec: ...

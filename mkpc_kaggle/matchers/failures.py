@@ -53,7 +53,7 @@ def failure_of(error: BaseException) -> FailureKind:
 
 
 def reason_of(error: BaseException) -> str:
-    """Return the error's type, text and notes, without the debugging advice that PyTorch appends."""
+    """Return the error's type, text and notes, without PyTorch's debugging advice."""
     text = str(error)
     if _DEVICE.search(text):
         text = text.partition("\n")[0]

@@ -109,6 +109,6 @@ def load_lightglue(
 
 
 def layer_name(name: str) -> str:
-    """Return the current name of a parameter from an older checkpoint or from a training wrapper."""
+    """Return the current name of a parameter of an older checkpoint or of a training wrapper."""
     own = name.removeprefix("matcher.")
     return re.sub(r"^(self|cross)_attn\.(\d+)\.", r"transformers.\2.\1_attn.", own)

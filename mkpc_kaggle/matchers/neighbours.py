@@ -28,7 +28,7 @@ class Neighbours:
 
 
 class NeighbourMatcher(PairwiseMatcher[Keypoints]):
-    """Mutual nearest neighbours whose distance ratio is at most ``ratio``, scored by their cosine."""
+    """Mutual nearest neighbours with a distance ratio up to ``ratio``, scored by their cosine."""
 
     ratio = 1.0
 

@@ -3,7 +3,7 @@
 A recipe's unit names one as ``matcher = "vismatch:NAME"``. vismatch itself downloads the weights of
 a matcher when it is first loaded, so the first run needs internet.
 
-vismatch's ``get_matcher(NAME)`` returns a callable that maps two images to a dict. The adapter reads
+vismatch's ``get_matcher(NAME)`` returns a callable that maps two images to a dict with
 ``matched_kpts0`` and ``matched_kpts1``, (N, 2) pixels (x, y) before vismatch's RANSAC, and
 ``matched_confidences``, (N,) or ``None``.
 """
@@ -29,7 +29,7 @@ LICENCE = "see vismatch"  # its matchers have many licences, which it does not s
 
 @dataclass(frozen=True)
 class VismatchOptions:
-    """The options of a unit ``vismatch:NAME``; the defaults suit matchers of whole-pixel keypoints."""
+    """The options of a unit ``vismatch:NAME``; the defaults suit keypoints in whole pixels."""
 
     corner: bool = False  # True: the origin of points is the image's top-left corner
     multiple: int = 1  # the sides of views are padded to multiples of this

@@ -117,7 +117,7 @@ def licence_text(checkout: Path, tag: str) -> Path | None:
 
 
 def _note(found: FoundFile, store: WeightStore) -> str:
-    """Return a note on digest and networks. Raise :class:`UserError` if no network takes the file."""
+    """Return a note on digest and networks. Raise :class:`UserError` if no network takes it."""
     # Now, and not after an upload of gigabytes.
     fit = fit_of(found, store)
     if fit.is_refused:

@@ -210,7 +210,7 @@ def left_out(
 
 
 def options_of(recipe: Recipe, name: str) -> Any:
-    """Return the matcher's default options, overridden by the recipe's table ``[matchers.NAME]``."""
+    """Return the matcher's options: defaults, overridden by the recipe's ``[matchers.NAME]``."""
     where = f"recipe {recipe.name!r}"
     table = recipe.matchers.get(name, {})
     return from_table(spec_of(name, where).options, table, f"{where}, table [matchers.{name}]")

@@ -58,7 +58,7 @@ def resolve_placement(device: str, precision: str) -> Placement:
 
 
 def fastest_precision(device: str) -> Precision:
-    """Return half precision if the CPU, or every GPU of the device, has units for it, else float32."""
+    """Return half precision if the CPU, or every GPU, has units for it, else float32."""
     import torch
 
     if device.startswith("cuda"):

@@ -165,7 +165,7 @@ class Pipeline:
         return []
 
     def _fall_back_to_float32(self, name: str, error: Exception) -> bool:
-        """Switch the matcher to float32. Return False if it cannot switch or has switched before."""
+        """Switch the matcher to float32. Return False if it cannot, or has switched before."""
         if self._load_float32 is None or name in self._notes:
             return False
         self._notes[name] = f"{name} runs in float32, for in half precision {error}"
@@ -214,7 +214,7 @@ class Pipeline:
         return matches[shown0 & shown1]
 
     def _encode(self, unit: Unit, wanted: Sequence[tuple[Image, View]]) -> list[Any]:
-        """Return the encodings of views: cached ones, and the others computed one shape at a time."""
+        """Return the encodings of views: cached, or computed one shape at a time."""
         matcher = self._matcher(unit.matcher)
         is_gray = matcher.spec.colour is Colour.GRAY
         # Units of one matcher that see the same view share its encoding.
@@ -271,7 +271,7 @@ def _text_of(error: Exception) -> str:
 
 
 def views_of(unit: Unit, multiple: int, pair: PairMatch) -> tuple[View, ...]:
-    """Return the unit's views of both images: whole images in stage 1, critical regions in stage 2."""
+    """Return the unit's views of both images: whole in stage 1, critical regions in stage 2."""
     crops = [region.box for region in pair.regions or ()] if unit.stage == 2 else []
     boxes = crops or [Box.whole(image.size) for image in pair.images]
     both = zip(boxes, pair.images, strict=True)

@@ -180,7 +180,7 @@ def _download(
 
 
 def _receive(url: str, part: Path, file: WeightFile) -> None:
-    """Request the missing bytes once. Raise ``OSError`` or another error if the connection breaks."""
+    """Request the missing bytes once. Raise ``OSError`` or another error for a lost connection."""
     most = _most_bytes(file)
     have = part.stat().st_size if part.exists() else 0
     headers = {"User-Agent": "mkpc_kaggle"}

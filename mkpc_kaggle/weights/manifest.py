@@ -5,8 +5,8 @@ comment::
 
     name  bytes  digest  licence  slot  source
 
-``bytes`` is a number or ``?``. ``digest`` is ``sha256:<64 hex>`` or ``unverified``. Matchers request
-files by *slot*. Lines of one slot are alternatives: the first file that is found is used.
+``bytes`` is a number or ``?``. ``digest`` is ``sha256:<64 hex>`` or ``unverified``. Matchers ask
+for files by *slot*. Lines of one slot are alternatives: the first file that is found is used.
 """
 
 import errno
@@ -51,7 +51,7 @@ class WeightFile:
 
 
 def parse_manifest(text: str, where: str = "the weights manifest") -> tuple[WeightFile, ...]:
-    """Parse all lines of a manifest; raise :class:`UserError` with the number of an invalid line."""
+    """Parse a manifest. Raise :class:`UserError` with the number of an invalid line."""
     files = []
     for number, line in enumerate(text.splitlines(), start=1):
         # The last column, the source, may contain blanks.
@@ -77,7 +77,7 @@ def manifest() -> tuple[WeightFile, ...]:
 
 
 def pin(file: WeightFile, path: Path) -> None:
-    """Add a line to the manifest next to ``path``: ``file`` with the size and digest of ``path``."""
+    """Add ``file``, with the size and digest of ``path``, to the manifest next to ``path``."""
     # The whole text is written again: an append could be cut in the middle of a line.
     pinned = replace(file, size=path.stat().st_size, digest=digest_of(path))
     own = path.with_name(MANIFEST)

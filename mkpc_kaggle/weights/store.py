@@ -295,7 +295,7 @@ def judge(path: Path, file: WeightFile, files: Iterable[WeightFile] = ()) -> Fou
 
 
 def _may_be(size: int, file: WeightFile, files: Iterable[WeightFile]) -> bool:
-    """Return whether a file of ``size`` bytes may have the content of one of the manifest's files."""
+    """Return whether a file of ``size`` bytes may be one of the manifest's files."""
     if file.size < 0 or size == file.size:
         return True
     sizes = [line.size for line in files]

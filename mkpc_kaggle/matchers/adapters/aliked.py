@@ -27,7 +27,7 @@ SLOT = "aliked-{variant}"
 
 @dataclass(frozen=True)
 class AlikedOptions(KeypointOptions):
-    """``ratio``: the maximum distance ratio of the nearest to the second nearest neighbour; 1: any."""
+    """``ratio``: the maximum ratio of the distances to the two nearest neighbours; 1: any."""
 
     variant: AlikedVariant = AlikedVariant.N16
     ratio: float = 1.0

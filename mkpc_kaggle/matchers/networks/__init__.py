@@ -1,1 +1,1 @@
-"""Networks written from their papers: PyTorch modules that load the public checkpoints unchanged."""
+"""Networks written from their papers. They load the public checkpoints unchanged."""

@@ -38,7 +38,7 @@ POSITIONS_AT_ONCE = 1024  # intermediate maps fit a CPU's cache
 class Aliked(nn.Module):
     """ALIKED. ``max_keypoints``: the number of strongest keypoints kept in each image.
 
-    ``positions``: points around a keypoint at which its descriptor is sampled, 16 or 32 as published.
+    ``positions``: points around a keypoint where its descriptor is sampled, 16 or 32 as published.
     """
 
     def __init__(self, max_keypoints: int, positions: int = 16) -> None:

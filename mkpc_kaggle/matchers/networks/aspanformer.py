@@ -1,4 +1,4 @@
-"""ASpanFormer (Chen et al., "Detector-Free Image Matching with Adaptive Span Transformer", 2022)."""
+"""ASpanFormer (Chen et al. 2022, "Detector-Free Image Matching with Adaptive Span Transformer")."""
 
 from dataclasses import dataclass, replace
 
@@ -236,7 +236,7 @@ def _repeated(grid: Tensor, size: torch.Size) -> Tensor:
 def _span_message(
     q: Tensor, k: Tensor, v: Tensor, flow: Tensor, factor: int, mask: Tensor | None
 ) -> Tensor:
-    """Return the message (N, h / factor, w / factor, 256) of the span level pooled by ``factor``."""
+    """Return messages (N, h / factor, w / factor, 256) of the span level pooled by ``factor``."""
     q = mean_pool(q, factor)
     k = mean_pool(k, factor)
     v = mean_pool(v, factor)

@@ -15,7 +15,7 @@ KERNEL = 3
 
 
 def table_of(maps: Tensor) -> Tensor:
-    """Map (B, C, h, w) to (B h w, C) float32; a view where the maps are float32 and channels last."""
+    """Map (B, C, h, w) to (B h w, C) float32; a view of maps in float32 and channels last."""
     return as_grid(maps).flatten(0, 2).float()
 
 

@@ -55,7 +55,7 @@ def coarse_matches(
 
 
 class Cells(NamedTuple):
-    """The L and S coarse cells of a pair: features (L, C) and (S, C), content (L,) and (S,) bool."""
+    """The coarse cells of a pair: features (L, C) and (S, C), content (L,) and (S,) bool."""
 
     features0: Tensor
     features1: Tensor

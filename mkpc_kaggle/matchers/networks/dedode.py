@@ -120,7 +120,7 @@ class DedodeDecoder(nn.Module):
         return refiner
 
     def forward(self, levels: Iterable[Tensor]) -> tuple[Tensor, Tensor]:
-        """Return stride 2's prediction (B, prediction, h, w) and stride 1's hidden map (B, 32, H, W).
+        """Return stride 2's prediction (B, n, h, w) and stride 1's hidden map (B, 32, H, W).
 
         The last step, stride 1's prediction, is left to the caller: a descriptor needs it at
         keypoints only. ``levels`` yields the features from fine to coarse, so that only one level

@@ -150,12 +150,12 @@ class GaussianProcess(nn.Module):
         self.pos_conv = ExactConv2d(2, width, 1)
 
     def regress(self, support: Tensor) -> Tensor:
-        """Map features (B, C, h', w') to the coefficients (B, n', width) of their kernels, float32."""
+        """Map features (B, C, h', w') to their kernels' coefficients (B, n', width), float32."""
         embedded = self.embed_coordinates(support)
         return coefficients(tokens(support), tokens(embedded))
 
     def forward(self, query: Tensor, support: Tensor, coefficients: Tensor) -> Tensor:
-        """Return the posterior mean (B, width, h, w), given features (B, C, h, w) and coefficients."""
+        """Return the posterior mean (B, width, h, w) for features (B, C, h, w) and coefficients."""
         mean = kernel(tokens(query), tokens(support)) @ coefficients  # (B, n, width)
         return mean.mT.reshape(len(query), -1, *query.shape[2:])
 

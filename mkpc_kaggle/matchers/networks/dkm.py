@@ -157,7 +157,7 @@ class ResidualRefinement(nn.Module):
 
 
 class ChannelAttention(nn.Module):
-    """Context plus embedding weighted per channel; the spatial means of both maps give the weights."""
+    """Context plus embedding, weighted per channel by the spatial means of both maps."""
 
     def __init__(self) -> None:
         super().__init__()

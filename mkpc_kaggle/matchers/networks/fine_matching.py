@@ -80,7 +80,7 @@ def cut_windows(fine: Tensor, cells: Tensor) -> Tensor:
 
 
 def expected_offset(windows0: Tensor, windows1: Tensor) -> Tensor:
-    """Return the mean offset (M, 2) float32, (x, y) in -1..1, from windows (M, 25, C) of both images.
+    """Return the mean offset (M, 2) float32, x and y in -1..1, from M pairs of windows (M, 25, C).
 
     The centre of window 0 is compared with each cell of window 1; a softmax gives the offset's
     distribution.

@@ -22,7 +22,7 @@ def as_grid(feature_map: Tensor) -> Tensor:
 
 
 def mean_pool(grid: Tensor, factor: int | tuple[int, int]) -> Tensor:
-    """Average blocks of ``factor`` (rows, columns); drop incomplete blocks at the right and bottom."""
+    """Average blocks of ``factor`` (rows, columns); drop incomplete ones at right and bottom."""
     if factor == 1:
         return grid
     return as_grid(functional.avg_pool2d(as_map(grid), factor))

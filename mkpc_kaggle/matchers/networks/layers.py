@@ -137,7 +137,7 @@ class Assignment(NamedTuple):
 
 
 def mutual_matches(log_scores: Tensor, threshold: float) -> Assignment:
-    """Return the mutually best pairs of ``log_scores`` (N0, N1) with a score above ``threshold``."""
+    """Return mutually best pairs of ``log_scores`` (N0, N1) with a score above ``threshold``."""
     best0, partner0 = log_scores.max(dim=1)  # (N0,): the best score, and its keypoint in image 1
     partner1 = log_scores.argmax(dim=0)  # (N1,)
     scores = best0.exp()

@@ -71,7 +71,7 @@ class RotaryEmbedding(nn.Module):
 
 
 def apply_rotary(x: Tensor, rotation: Tensor) -> Tensor:
-    """Rotate pairs of channels of ``x`` (1, heads, N, head) by complex numbers (1, 1, N, head / 2)."""
+    """Rotate channel pairs of ``x`` (1, heads, N, head) by complex numbers (1, 1, N, head / 2)."""
     # Channels 2 i and 2 i + 1 are the real and imaginary part: a rotation is one product.
     pairs = torch.view_as_complex(x.view(*x.shape[:3], -1, 2))
     return torch.view_as_real(pairs * rotation).flatten(3)
@@ -303,7 +303,7 @@ class LightGlue(nn.Module):
         return kept.nonzero()[:, 0]
 
     def _threshold(self, layer: int) -> float:
-        """Return the confidence from which a keypoint is sure, as published: lower in later layers."""
+        """Return the least confidence of a sure keypoint, as published: lower in later layers."""
         return 0.8 + 0.1 * math.exp(-4.0 * layer / len(self.transformers))
 
 

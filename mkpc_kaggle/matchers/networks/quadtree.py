@@ -191,7 +191,7 @@ class QuadtreeLayer(nn.Module):
 
 
 class QuadtreeTransformer(nn.Module):
-    """Alternating self- and cross-attention; a layer serves both images and updates both at once."""
+    """Alternating self- and cross-attention; each layer updates both images at once."""
 
     def __init__(self, topks: tuple[int, int]) -> None:
         super().__init__()

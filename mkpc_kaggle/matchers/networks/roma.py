@@ -164,7 +164,7 @@ class AnchorDecoder(nn.Module):
 
 
 def anchor_mean(logits: Tensor) -> Tensor:
-    """Return the mean position (..., 2) of the best anchor by logits (..., 4096) and its neighbours.
+    """Map logits (..., 4096) to the mean position (..., 2) of the best anchor and its neighbours.
 
     Anchors are weighted by probability. As in training, neighbours are 1 or 64 indices away, also
     across the ends of rows; indices are clamped to the first and last anchor.

@@ -25,7 +25,7 @@ LAYERS = 18  # of the graph network: self, cross, self, cross, ...
 
 
 class Pointwise(nn.Conv1d):
-    """A linear map of channels, (..., in) to (..., out), with a convolution's weight (out, in, 1)."""
+    """A linear map of channels, (..., in) to (..., out), with Conv1d's weight (out, in, 1)."""
 
     def __init__(self, channels_in: int, channels_out: int) -> None:
         super().__init__(channels_in, channels_out, kernel_size=1)
@@ -134,7 +134,7 @@ class SuperGlue(nn.Module):
         return mutual_matches(log_plan[0, :-1, :-1], self.match_threshold)
 
     def encoded(self, image: SuperPointKeypoints) -> Tensor:
-        """Return the graph network's input (1, N, 256): descriptors plus encoded points and scores."""
+        """Return the graph network's input (1, N, 256): descriptors plus encoded keypoints."""
         points = normalise_points(image.points, image.size)
         scores = image.scores.float()[:, None]
         positions = torch.cat([points, scores], dim=1)  # (N, 3)
@@ -143,7 +143,7 @@ class SuperGlue(nn.Module):
 
     @staticmethod
     def score_matrix(projected: Tensor, n0: int) -> Tensor:
-        """Return scaled inner products (1, N0, N1) float32 of projected features (1, N0 + N1, 256)."""
+        """Return scaled products (1, N0, N1) float32 of projected features (1, N0 + N1, 256)."""
         first = projected[:, :n0].float()
         second = projected[:, n0:].float()
         return (first @ second.mT) / math.sqrt(CHANNELS)

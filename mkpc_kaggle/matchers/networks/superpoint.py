@@ -114,7 +114,7 @@ class SuperPoint(nn.Module):
         return logits
 
     def descriptor_field(self, features: Tensor) -> Tensor:
-        """Return the descriptor head's output (B, 256, h, w): one vector per cell, of any length."""
+        """Return the descriptor head's output (B, 256, h, w): a vector per cell, of any length."""
         field: Tensor = self.convDb(torch.relu_(self.convDa(features)))
         return field
 

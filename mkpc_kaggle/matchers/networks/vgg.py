@@ -45,7 +45,7 @@ class Vgg(nn.Module):
         return list(self.levels(image))
 
     def levels(self, image: Tensor) -> Iterator[Tensor]:
-        """Yield the features of :meth:`forward` one by one, so that not all of them are in memory."""
+        """Yield the features of :meth:`forward` one by one, so that not all are in memory."""
         first = next(self.parameters())
         x = image.to(first.dtype).contiguous(memory_format=torch.channels_last)
         pools = [i for i, layer in enumerate(self.layers) if isinstance(layer, nn.MaxPool2d)]

@@ -57,7 +57,7 @@ class WarpEstimate(NamedTuple):
 
 
 class WarpRefiner(nn.Module):
-    """Alternating depthwise 5x5 and 1x1 convolutions of both images' features, aligned by the flow."""
+    """Depthwise 5x5 and 1x1 convolutions in turns, of both images' features aligned by the flow."""
 
     def __init__(self, shape: WarpRefinerShape) -> None:
         super().__init__()
@@ -186,7 +186,7 @@ def _products(queries: Tensor, keys: Tensor, index: Tensor) -> Tensor:
 
 
 def identity_map(like: Tensor) -> Tensor:
-    """Return (1, 2, h, w): the normalised pixel centres of a map (..., h, w), channel 0 x and 1 y."""
+    """Return (1, 2, h, w): the normalised pixel centres, x and y, of a map (..., h, w)."""
     height, width = like.shape[-2:]
     x = torch.linspace(1 / width - 1, 1 - 1 / width, width, device=like.device)
     y = torch.linspace(1 / height - 1, 1 - 1 / height, height, device=like.device)
