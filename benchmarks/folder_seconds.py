@@ -38,7 +38,7 @@ class Program:
     checkout: Path = HERE
 
     def seconds(self, images: Path, out: Path) -> float:
-        """Run the program. Return CPU seconds, with those of all processes that it waited for."""
+        """Run the program. Return the CPU seconds of it and of children that it waited for."""
         command = [part.format(images=images, out=out) for part in self.command]
         environment = {**os.environ, **ONE_THREAD, "PYTHONPATH": str(self.checkout)}
         # From the checkout, because Python imports from the working directory first.

@@ -28,7 +28,7 @@ SHARES = (0.0, 0.25, 0.5, 1.0, inf)  # the last bin has the pairs without a crop
 
 @dataclass(frozen=True)
 class Pair:
-    """A scored pair: the accuracy by each recipe, and what the bins are made of."""
+    """A scored pair: the accuracy by each recipe, and the values of the bins."""
 
     scene: str
     images: tuple[str, str]

@@ -93,7 +93,7 @@ class MatcherSpec:
         return self.options_for(slot) is not None
 
     def options_for(self, slot: str) -> Any:
-        """Return default options with what the slot asks for; ``None`` if no options use it."""
+        """Return options that use the slot, otherwise the defaults; ``None`` if none use it."""
         for own in self.slots:
             # A template such as "loftr-{training}" becomes a pattern with the group "training".
             pattern = re.sub(r"\\{(\w+)\\}", r"(?P<\1>.+)", re.escape(own))

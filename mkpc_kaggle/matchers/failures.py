@@ -30,7 +30,7 @@ matched_in: set[int] = set()
 
 
 class FailureKind(Enum):
-    """What an error of a matcher means for the run."""
+    """The consequence of a matcher's error for the run."""
 
     OUT_OF_MEMORY = auto()  # fewer pairs at a time may fit
     DEVICE = auto()  # this process can no longer compute; the pair is not the cause

@@ -3,7 +3,7 @@
 A recipe's unit names one as ``matcher = "vismatch:NAME"``. vismatch itself downloads the weights of
 a matcher when it is first loaded, so the first run needs internet.
 
-vismatch's ``get_matcher(NAME)`` returns a callable that maps two images to a dict with
+vismatch's ``get_matcher(NAME)`` returns a callable that maps two images to a dict. Its keys are
 ``matched_kpts0`` and ``matched_kpts1``, (N, 2) pixels (x, y) before vismatch's RANSAC, and
 ``matched_confidences``, (N,) or ``None``.
 """
