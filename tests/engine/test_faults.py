@@ -23,10 +23,10 @@ from shared import write_small_recipe
 from mkpc_kaggle.cli import main
 from mkpc_kaggle.data.competition import read_test_side, submission_problems
 from mkpc_kaggle.demo import DemoSet
-from mkpc_kaggle.engine import loop, session, worker
+from mkpc_kaggle.engine import image_files, session, worker
+from mkpc_kaggle.engine.matching import Matching
 from mkpc_kaggle.engine.records import read_records
 from mkpc_kaggle.engine.request import Ending
-from mkpc_kaggle.engine.state import State
 from mkpc_kaggle.engine.store import Store
 from mkpc_kaggle.reporting.run_log import read_log
 
@@ -74,7 +74,7 @@ def test_a_signal_ends_a_resumed_run_while_an_image_is_digested(tmp_path, monkey
             digested.append(path)
         return "changed"
 
-    monkeypatch.setattr(loop, "content_digest", digest)
+    monkeypatch.setattr(image_files, "content_digest", digest)
     for path in (tmp_path / "images").iterdir():
         os.utime(path, (0, 0))  # the same content, which only a digest can tell
     with session.interruptible() as interrupt:
@@ -87,15 +87,15 @@ def test_a_signal_ends_a_resumed_run_while_an_image_is_digested(tmp_path, monkey
 def test_an_error_of_the_engine_itself_leaves_the_latest_version_behind(
     pairs, tmp_path, monkeypatch
 ):
-    take, taken, published = State.take, [], []
+    use, used, published = Matching._use, [], []
 
-    def fail_later(state: State, *arguments: Any) -> None:
-        taken.append(state)
-        if len(taken) > 2:
+    def fail_later(matching: Matching, *arguments: Any) -> None:
+        used.append(matching)
+        if len(used) > 2:
             raise KeyError("a bug")
-        take(state, *arguments)
+        use(matching, *arguments)
 
-    monkeypatch.setattr(State, "take", fail_later)
+    monkeypatch.setattr(Matching, "_use", fail_later)
     with pytest.raises(KeyError, match="a bug"):
         run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work", publish=published.append)
     assert len(published[-1].fundamentals) == 12
@@ -267,19 +267,19 @@ from pathlib import Path
 from rectified import THREE_UNITS, RectifiedMatcher, run, write_pairs
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.places import LocalSite
-from mkpc_kaggle.engine.state import State
+from mkpc_kaggle.engine.light import Estimating
 
 budget = Budget(time.monotonic(), 1000.0)
-wait, take, saved = LocalSite.wait, State.take_estimate, []
+wait, use, saved = LocalSite.wait, Estimating._use, []
 def noted(self, *estimate):
-    take(self, *estimate)
+    use(self, *estimate)
     saved.append(estimate)
 def stuck(self, until):
     if len(saved) < 2:
         return wait(self, until)
     budget.time_limit = budget.spent() + 1
     time.sleep(1000)
-State.take_estimate, LocalSite.wait = noted, stuck
+Estimating._use, LocalSite.wait = noted, stuck
 home = Path(sys.argv[1])
 pairs = write_pairs(home / "pairs", 40)
 def publish(state):
