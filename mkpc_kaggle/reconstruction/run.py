@@ -59,8 +59,8 @@ def for_cameras(recipe: Recipe, sharing: str | None = None, intrinsics: str = ""
         intrinsics=intrinsics or scene.intrinsics,
     )
     units = recipe.units
-    # More views by RootSIFT give the same cameras at three times the cost. A recipe that the user
-    # names runs as it is written.
+    # More views by RootSIFT cost three times as much, and two scenes scored 0.981 and 0.651 with
+    # them, 0.985 and 0.637 without. A recipe that the user names runs as it is written.
     if recipe.name == AUTO and recipe.matcher_names == ("sift",):
         units = units[:1]
     # F of a pair is for the report alone: its inliers, and doubts about the pair.
