@@ -148,9 +148,7 @@ def main() -> None:
     )
     parser.add_argument("--recipe", default="auto")
     arguments = parser.parse_args()
-    print(
-        f"{'folder':<28}{'program':<26}{'CPU s':>8}{'min':>8}{'max':>8}{'mapping':>9}{'cameras':>9}"
-    )
+    print(f"{'folder':<28}{'program':<26}{'round':>6}{'CPU s':>8}{'mapping':>9}{'cameras':>9}")
     for folder in arguments.images:
         measure(programs_of(arguments), folder, arguments.rounds)
 

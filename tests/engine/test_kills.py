@@ -29,6 +29,8 @@ from mkpc_kaggle.engine.request import Ending, RunReport
 from mkpc_kaggle.geometry.robust import RobustConfig
 
 BATCHES = WORKERS = 3  # in a run so many scene workers and so many matching workers are disturbed
+SCENE = "scene"  # the name of all workers for scenes, on any place
+A_SCENE = "a scene of this run was disturbed"
 QUICK = replace(RECIPE, magsac=RobustConfig(max_iterations=1000, permutations=1))
 
 
@@ -36,8 +38,10 @@ class DoomedWorker(ProcessWorker):
     """Gets a signal when its process has computed for so long: the machine's other load does not
     move that moment.
 
-    The moments are drawn from the ``lives``, in seconds, of the workers of an undisturbed run. What
-    comes after a disturbed worker is spared, so that no reconstruction is lost twice.
+    The moments are drawn from the ``lives``, in seconds, of the workers of an undisturbed run. No
+    reconstruction may be lost twice, since it would be given up. Scenes run on several places, so a
+    lost one may be tried again on any of them: of a run's scenes, one is disturbed. On other places
+    the process after a disturbed one is spared.
     """
 
     rng: ClassVar = random.Random(0)
@@ -46,6 +50,7 @@ class DoomedWorker(ProcessWorker):
     spared: ClassVar[set[str]] = set()
     sent: ClassVar[list[tuple[str, signal.Signals]]] = []
     known: ClassVar[dict[str, "DoomedWorker"]] = {}
+    choosing: ClassVar = threading.Lock()  # two scenes may reach their moments together
 
     def __init__(self, name: str, *arguments: Any) -> None:
         super().__init__(f"{name}, {len(self.known)}", *arguments)
@@ -86,15 +91,23 @@ class DoomedWorker(ProcessWorker):
             ).start()
 
     def _disturb(self, process: int, moment: float) -> None:
+        try:
+            self._send(process, moment)
+        finally:
+            os.close(process)
+
+    def _send(self, process: int, moment: float) -> None:
         number = next(self.signals)
         with suppress(OSError):  # it has ended before
             while time.clock_gettime(self.clock) < moment:
                 time.sleep(0.001)
-            self.spared.add(self.place)
+            with self.choosing:
+                if self.kind == SCENE and A_SCENE in self.spared:
+                    return
+                self.spared.add(A_SCENE if self.kind == SCENE else self.place)
             signal.pidfd_send_signal(process, number)
             self.signal = number
             self.sent.append((self.kind, number))
-        os.close(process)
 
 
 class PatientSite(LocalSite):
@@ -147,6 +160,7 @@ def test_a_run_whose_workers_are_killed_and_stopped_at_random_moments_ends_as_th
     monkeypatch.setattr(session, "LocalSite", PatientSite)
 
     def run_whole(name: str) -> RunReport:
+        DoomedWorker.spared.discard(A_SCENE)
         report = run(
             pairs, QUICK, SyntheticMatcher(), tmp_path / name, budget=budget, workers=WORKERS
         )
@@ -178,5 +192,5 @@ def test_a_run_whose_workers_are_killed_and_stopped_at_random_moments_ends_as_th
         )
         compared += len(intact)
     assert {number for _, number in DoomedWorker.sent} == {signal.SIGKILL, signal.SIGSTOP}
-    assert {kind for kind, _ in DoomedWorker.sent} == {"mkpc", "estimates", "scene"}
+    assert {kind for kind, _ in DoomedWorker.sent} == {"mkpc", "estimates", SCENE}
     assert compared > 0
