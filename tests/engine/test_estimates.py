@@ -92,7 +92,8 @@ def die_at_a_write(pairs: Sequence[Pair], recipe: Recipe, work_dir: Path, *, aft
 
 @pytest.mark.parametrize("kills", [2, pytest.param(10, marks=pytest.mark.slow)])
 def test_a_run_that_is_killed_while_it_estimates_anew_ends_with_the_same_bytes(tmp_path, kills):
-    images = 7 if kills > 2 else 4  # 21 pairs are four jobs and a scene
+    # 36 pairs are five jobs and a scene: each second kill leaves one of them done.
+    images = 9 if kills > 2 else 4
     pairs, other = synthetic_pairs(tmp_path / "images", images), ESTIMATIONS["another scene"]
     undisturbed = submission(pairs, other, tmp_path / "fresh", SyntheticMatcher(images=images))[0]
     submission(pairs, RECIPE, tmp_path / "work", SyntheticMatcher(images=images))
