@@ -40,6 +40,7 @@ class Pair:
 def share_of(boxes: Sequence[Sequence[int]], sizes: Sequence[tuple[int, int]]) -> float:
     """Return the area of the smaller crop relative to its image, 1 without crops."""
     shares = [1.0]
+    # Not strict: a pair without crops has sizes, but no boxes.
     for (left, top, right, bottom), (width, height) in zip(boxes, sizes, strict=False):
         shares.append((right - left) * (bottom - top) / (width * height))
     return min(shares)

@@ -1,4 +1,7 @@
-"""Progress of waits outside of a run: rendering, pip and digests."""
+"""Progress of waits outside of a run: rendering, pip and digests.
+
+A run draws its own bar (:mod:`mkpc_kaggle.engine.console`), by the same rule.
+"""
 
 import os
 import shutil
@@ -13,17 +16,20 @@ MAX_SILENCE_S = 1.0  # before a bar appears: shorter waits need none
 Item = TypeVar("Item")
 
 
-def is_redrawn() -> bool:
-    """Return whether a bar on stderr replaces its former state.
+def is_redrawn(*, is_terminal: bool) -> bool:
+    """Return whether a bar replaces its former state on a stream.
 
     A notebook's ``!command`` has a terminal, but Jupyter stores every state of a redrawn line. It
     sets JPY_PARENT_PID for these processes.
     """
+    return is_terminal and "JPY_PARENT_PID" not in os.environ
+
+
+def _is_on_terminal() -> bool:
     try:
-        is_terminal = sys.stderr is not None and sys.stderr.isatty()
+        return sys.stderr is not None and sys.stderr.isatty()
     except ValueError:  # a closed stream
         return False
-    return is_terminal and "JPY_PARENT_PID" not in os.environ
 
 
 def counted(items: Sequence[Item], what: str, unit: str) -> Iterator[Item]:
@@ -31,7 +37,7 @@ def counted(items: Sequence[Item], what: str, unit: str) -> Iterator[Item]:
 
     On a terminal this is a bar, elsewhere a line every half minute.
     """
-    if is_redrawn():
+    if is_redrawn(is_terminal=_is_on_terminal()):
         from tqdm import tqdm
 
         # tqdm prints nothing on a terminal that states no size, such as `script`'s.

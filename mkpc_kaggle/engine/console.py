@@ -25,9 +25,8 @@ from tempfile import TemporaryFile
 from typing import Any, NoReturn, TextIO
 
 from mkpc_kaggle.engine.budget import Budget, format_duration
+from mkpc_kaggle.progress import LINE_INTERVAL_S, is_redrawn
 
-# Between lines of progress, where a line cannot be redrawn in place.
-LINE_INTERVAL_S = 30.0
 WAIT_S = 5.0  # shorter waits are not shown
 REDRAW_S = 1.0  # between counts of the seconds of a wait
 BAR = "{desc}: {n_fmt}/{total_fmt} [{elapsed}<{remaining}, {pace}]"  # of tqdm
@@ -60,16 +59,13 @@ def print_to(stream: TextIO | None, text: str, end: str = "\n") -> None:
 class Progress:
     """Progress of a phase in pairs: a line redrawn in place on a terminal, occasional lines
     elsewhere.
-
-    A notebook's ``!command`` has a terminal, but Jupyter stores all its text, including every state
-    of a redrawn line. Jupyter sets JPY_PARENT_PID for these processes.
     """
 
     def __init__(self, budget: Budget, stream: TextIO | None) -> None:
         self._budget = budget
         self._stream = stream
-        is_redrawn = is_terminal(stream) and "JPY_PARENT_PID" not in os.environ
-        self._erase = "\r\x1b[K" if is_redrawn else ""  # to the line's start, and clear it
+        # To the line's start, and clear it.
+        self._erase = "\r\x1b[K" if is_redrawn(is_terminal=is_terminal(stream)) else ""
         self._phase = ""
         self._line = ""
         self._first = 0  # pairs that were done when the phase began

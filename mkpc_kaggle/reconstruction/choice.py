@@ -126,7 +126,7 @@ def compare(source: Source, keys: Sequence[str], count: int) -> Partners:
     """Return :func:`most_alike` for the images with these features in a store."""
 
     def features() -> Iterable[bytes]:
-        # In parts: those of all images of a large folder would fill the memory.
+        # In parts: the features of all images of a large folder would fill the memory.
         for start in range(0, len(keys), IMAGES_AT_A_TIME):
             part = keys[start : start + IMAGES_AT_A_TIME]
             found = source.data(part)

@@ -61,7 +61,7 @@ def verdict(log: RunLog) -> Verdict:
         return Verdict(_with_an_f(log.records), tuple(problems))
     placed = sum(scene.registered for scene in log.scenes)
     images = sum(scene.images for scene in log.scenes)
-    # Even without any camera, since that is the answer to what was asked
+    # Also without any camera: this line answers the user's question.
     text = f"{placed} of {images} images have a camera"
     if reconstructed:
         text += f"; reprojection {_reprojection(reconstructed):.2f} px"
@@ -124,7 +124,7 @@ def _scene_problems(scene: SceneRecord, log: RunLog) -> Iterator[str]:
     )
     if uncertain:
         yield f"{where}uncertain cameras: {_named(uncertain)}; add photographs of the same things"
-    # Verified matches fit within 2 px, so a large mean is no matter of a few wrong matches.
+    # Verified matches fit within 2 px, so a few wrong matches do not explain a large mean.
     worst = max(model.reprojection_error for model in scene.models)
     if worst > MAX_REPROJECTION_PX:
         yield f"{where}a mean reprojection error of {worst:.1f} px is large: the lens may be distorted"

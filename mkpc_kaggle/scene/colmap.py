@@ -83,7 +83,7 @@ def write_files(
             _fill(database, merged, shared, camera_model)
         for number, model in enumerate(models):
             kept = {each.image.name for each in model.images}
-            # A list, because frames are removed from what is iterated
+            # A list, because the loop removes frames from the mapping.
             for frame in [frame for frame in model.colmap.frames.values() if frame.has_pose()]:
                 if model.colmap.images[frame.frame_id].name not in kept:
                     model.colmap.deregister_frame(frame.frame_id)
@@ -212,7 +212,7 @@ def run_mapper(database: Any, graph: ViewGraph, threads: int) -> Reconstruction:
     """Run the global mapper on a filled database. Return its plausible models."""
     seed = {"random_seed": SEED}
     common = seed | {"num_threads": threads}
-    # Each part has a random generator of its own.
+    # Each part has a separate random generator.
     parts = dict.fromkeys(("rotation_averaging", "global_positioning", "retriangulation"), seed)
     required = (
         {"track_required_tracks_per_view": TRACKS_PER_IMAGE} if len(graph.images) > LARGE else {}

@@ -6,8 +6,9 @@ import pytest
 from simulator import VirtualClock
 
 from mkpc_kaggle.engine.budget import Budget
-from mkpc_kaggle.engine.console import LINE_INTERVAL_S, Progress
+from mkpc_kaggle.engine.console import Progress
 from mkpc_kaggle.engine.jobs import Phase
+from mkpc_kaggle.progress import LINE_INTERVAL_S
 
 
 class Terminal(StringIO):

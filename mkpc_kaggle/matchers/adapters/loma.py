@@ -1,4 +1,4 @@
-"""LoMa (Nordström et al. 2026), the strongest sparse matcher: a transformer on keypoints."""
+"""LoMa (Nordström et al. 2026): keypoints matched by a transformer."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

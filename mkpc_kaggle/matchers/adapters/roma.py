@@ -1,4 +1,4 @@
-"""RoMa (Edstedt et al. 2024): DKM's warps from DINOv2's features, the best matcher we measured."""
+"""RoMa (Edstedt et al. 2024): DKM's warps from DINOv2's features."""
 
 from dataclasses import dataclass
 
