@@ -4,7 +4,7 @@ python -m benchmarks.anytime --train-dir DIR --out FIGURE.png [--recipes classic
 
 Limits are on the real clock. OPTIONs are options of `validate`, such as `--scenes A,B`. The sweep
 is a run of the recipe's first unit alone, timed from process start to end. *Early* is the minimum
-time between a process's end and its limit; negative: late.
+time between the end of a run and its limit; negative: late. Scoring comes after the run.
 """
 
 import argparse
@@ -12,7 +12,9 @@ import json
 import subprocess
 import sys
 import time
+from dataclasses import dataclass
 from pathlib import Path
+from statistics import fmean
 from tempfile import TemporaryDirectory
 
 from mkpc_kaggle.recipe import load_recipe
@@ -21,8 +23,17 @@ from mkpc_kaggle.reporting.figures import new_figure, plain, save
 FACTORS = (1, 2, 4, 8, 16)  # of the sweep's time
 
 
-def timed(arguments: list[str]) -> tuple[float, float]:
-    """Run `validate`. Return its mAA and the seconds of its process."""
+@dataclass(frozen=True)
+class Timed:
+    """A run of `validate`: its mAA, the seconds of the run, and those of its process."""
+
+    maa: float
+    run_seconds: float
+    process_seconds: float
+
+
+def timed(arguments: list[str]) -> Timed:
+    """Run `validate` and time it."""
     with TemporaryDirectory() as directory:
         result = Path(directory) / "scores.json"
         start = time.monotonic()
@@ -30,7 +41,9 @@ def timed(arguments: list[str]) -> tuple[float, float]:
         command = [sys.executable, "-m", "mkpc_kaggle", "validate", "--json", str(result)]
         command += arguments
         subprocess.run(command, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        return json.loads(result.read_text())["mAA"], time.monotonic() - start
+        seconds = time.monotonic() - start
+        figures = json.loads(result.read_text())
+        return Timed(figures["mAA"], figures["seconds"], seconds)
 
 
 def main() -> None:
@@ -49,15 +62,15 @@ def main() -> None:
         side = ["--train-dir", given.train_dir, "--recipe", recipe, *given.options]
         # The least that a run can do: no limit can be shorter.
         first_unit = load_recipe(recipe).units[0].name
-        _, sweep = timed([*side, "--no-scenes", "--units", first_unit])
+        sweep = timed([*side, "--no-scenes", "--units", first_unit]).process_seconds
         means = []
         for factor in FACTORS:
             limit = factor * sweep
             runs = [timed([*side, "--time-limit", f"{limit:.1f}"]) for _ in range(given.runs)]
             # The worst of the runs: being late once loses a submission.
-            early = min(limit - seconds for _, seconds in runs)
-            means.append(sum(maa for maa, _ in runs) / len(runs))
-            scores = " ".join(f"{maa:.3f}" for maa, _ in runs)
+            early = min(limit - run.run_seconds for run in runs)
+            means.append(fmean(run.maa for run in runs))
+            scores = " ".join(f"{run.maa:.3f}" for run in runs)
             print(f"{recipe:12}{limit:9.1f}s{early:7.1f}s  {scores}", flush=True)
         # As text, so that the factors are evenly spaced.
         factors = [str(factor) for factor in FACTORS]
