@@ -14,9 +14,10 @@ import multiprocessing
 import os
 import queue
 import signal
+import sys
 import threading
-from collections.abc import Callable
-from contextlib import ExitStack, suppress
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
@@ -147,7 +148,7 @@ def spawn(name: str, log: Path | None = None) -> tuple[SpawnProcess, Connection]
     process = context.Process(target=serve, args=(its_pipe, log), name=name, daemon=True)
     # If started with the first process, it would unblock the signals
     resource_tracker.ensure_running()
-    with its_pipe, _environment, ExitStack() as restored:
+    with its_pipe, _environment, _without_program(), ExitStack() as restored:
         for variable in WORKER_ENVIRONMENT.keys() - os.environ.keys():
             os.environ[variable] = WORKER_ENVIRONMENT[variable]
             restored.callback(os.environ.pop, variable)
@@ -156,6 +157,22 @@ def spawn(name: str, log: Path | None = None) -> tuple[SpawnProcess, Connection]
             restored.callback(signal.pthread_sigmask, signal.SIG_SETMASK, former)
         process.start()
     return process, pipe
+
+
+@contextmanager
+def _without_program() -> Iterator[None]:
+    """Hide the user's program from a new process.
+
+    It would run the program again, to find classes of its own there. A script that calls
+    :func:`mkpc_kaggle.reconstruct` without a guard would call it in each worker.
+    """
+    program = sys.modules["__main__"]
+    former = {name: vars(program).get(name) for name in ("__spec__", "__file__")}
+    vars(program).update(dict.fromkeys(former))
+    try:
+        yield
+    finally:
+        vars(program).update(former)
 
 
 def serve(pipe: Connection, log: Path | None = None) -> None:

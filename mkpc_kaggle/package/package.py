@@ -29,6 +29,7 @@ from mkpc_kaggle.package.wheels import (
     licence_of,
     pins,
 )
+from mkpc_kaggle.version import __version__
 from mkpc_kaggle.weights import WeightStore
 from mkpc_kaggle.weights.manifest import MANIFEST
 
@@ -143,14 +144,23 @@ def _text(staging: Path, name: str, content: str) -> Item:
 
 
 def find_checkout() -> Path:
-    """Return the checkout that this package runs from.
+    """Return the checkout that this package runs from, or else the current directory.
 
-    Raises :class:`UserError` for an installed wheel.
+    Raises :class:`UserError` if neither is a checkout of this version.
     """
-    root = Path(__file__).resolve().parents[2]
-    if not (root / NOTEBOOK).is_file():
+    ours = Path(__file__).resolve().parents[2]
+    if (ours / NOTEBOOK).is_file():
+        return ours
+    # The package was installed as a copy; README's commands run in the clone.
+    here = Path.cwd()
+    version = here / "mkpc_kaggle" / "version.py"
+    if (here / NOTEBOOK).is_file() and version.is_file():
+        if f'"{__version__}"' in version.read_text(encoding="utf-8"):
+            return here
         raise UserError(
-            f"mkpc_kaggle was installed in {root} without its sources, which `package` needs to build the wheel: "
-            "clone the repository and run `mkpc package` in the clone"
+            f"the clone in {here} has another version than the installed one, {__version__}: install it again"
         )
-    return root
+    raise UserError(
+        f"mkpc_kaggle is installed in {ours} without its sources, which `package` needs to build the wheel: "
+        "run `mkpc package` in a clone of the repository"
+    )

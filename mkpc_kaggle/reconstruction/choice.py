@@ -10,6 +10,7 @@ from functools import partial
 from itertools import combinations
 from pathlib import Path
 from types import MappingProxyType
+from typing import NamedTuple
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.console import warn
@@ -40,6 +41,16 @@ MIN_GAIN = 2.0  # inliers of a turned image relative to the unturned image
 # An image, its quarter turns, and an unturned image with a greater name
 Key = tuple[Path, int, Path]
 Near = Mapping[Path, Sequence[Path]]  # the most similar images of each image
+
+
+class Named(NamedTuple):
+    """An image's batch, and its name there, without suffix."""
+
+    batch: str
+    name: str
+
+
+Names = Mapping[Path, Named]
 
 
 def choose_pairs(
@@ -74,20 +85,26 @@ def choose_pairs(
             indices = shortlist(partners) if is_large else combinations(range(len(files)), 2)
             ends[name] = [(files[i], files[j]) for i, j in indices]
     batches = batch_names(root, datasets)
-    names = {file: batches[name] for name, files in datasets.items() for file in files}
+    names = {}
+    for name, files in datasets.items():
+        for file in files:
+            below = file.relative_to(root / name).with_suffix("").as_posix()
+            names[file] = Named(batches[name], below)
     turns = find_turns(engine, near, names, root, assembly, session)
-    pairs = []
-    for name, pairs_of_dataset in ends.items():
-        for a, b in pairs_of_dataset:
-            pairs.append(pair_of(batches[name], a, b, turns.get(a, 0), turns.get(b, 0)))
-    return pairs
+    return [
+        pair_of(names, a, b, turns.get(a, 0), turns.get(b, 0))
+        for pairs_of_dataset in ends.values()
+        for a, b in pairs_of_dataset
+    ]
 
 
-def pair_of(batch: str, a: Path, b: Path, *turns: int) -> Pair:
+def pair_of(names: Names, a: Path, b: Path, *turns: int) -> Pair:
     """Return the pair of two images of a batch, matched with these counter-clockwise quarter turns."""
+    batch, name0 = names[a]
+    _, name1 = names[b]
     suffix = f" turned {turns[0]} {turns[1]}" if any(turns) else ""
     return Pair(
-        f"{batch}/{a.stem}/{b.stem}{suffix}", batch, str(a), str(b), turns=(turns[0], turns[1])
+        f"{batch}/{name0}/{name1}{suffix}", batch, str(a), str(b), turns=(turns[0], turns[1])
     )
 
 
@@ -138,7 +155,7 @@ def compare(source: Source, keys: Sequence[str], count: int) -> Partners:
 def find_turns(
     engine: Engine,
     near: Near,
-    names: Mapping[Path, str],
+    names: Names,
     root: Path,
     assembly: Assembly,
     session: Session,
@@ -146,7 +163,7 @@ def find_turns(
     """Return the counter-clockwise quarter turns that set images upright; upright images are left
     out.
 
-    ``names`` has the batch of each image. First all images are matched unturned, then images with few inliers in
+    First all images are matched unturned, then images with few inliers in
     the other three orientations. An image gets its best orientation if that gains enough inliers with similar
     images, as turned so far.
     """
@@ -159,7 +176,7 @@ def find_turns(
         few = [a for a in near if most_inliers(found, near[a], a, 0) < MANY_INLIERS]
         keys = sorted({relative(a, times, b) for a in few for times in tried for b in near[a]})
         if keys:
-            pairs = [pair_of(names[a], a, b, times, 0) for a, times, b in keys]
+            pairs = [pair_of(names, a, b, times, 0) for a, times, b in keys]
             engine.ask(request_of(pairs, trial, session, str(root), is_trial=True), TRIAL_SHARE)
             assert engine.state is not None
             found |= zip(keys, engine.state.inliers.tolist(), strict=True)

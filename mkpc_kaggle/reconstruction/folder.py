@@ -87,11 +87,18 @@ def _require_usable(folder: Path, root: Path, files: Sequence[Path]) -> None:
             )
     if reserved := RESERVED.intersection(map(str.lower, folder.relative_to(root).parts)):
         raise UserError(f"{folder}: results are called {min(reserved)}; rename that folder")
+    require_distinct(files)
+
+
+def require_distinct(files: Iterable[Path]) -> None:
+    """Raise :class:`UserError` if two images of a folder differ only in the suffix."""
     # Names of pairs, and ids of some submissions, have no suffix.
-    stems: dict[str, Path] = {}
+    stems: dict[Path, Path] = {}
     for path in files:
-        if (other := stems.setdefault(path.stem, path)) is not path:
-            raise UserError(f"{folder} has both {other.name} and {path.name}; rename one of them")
+        if (other := stems.setdefault(path.with_suffix(""), path)) is not path:
+            raise UserError(
+                f"{path.parent} has both {other.name} and {path.name}; rename one of them"
+            )
 
 
 def _refuse_unreadable(error: OSError) -> None:

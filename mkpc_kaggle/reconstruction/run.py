@@ -1,38 +1,44 @@
-"""Reconstruction of a folder in a run of the engine, or of a few images in this process."""
+"""Reconstruction of a folder, or of the images of a Python program, in a run of the engine."""
 
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+import threading
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from itertools import combinations
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.data.images import Image, ImageStore, Unreadable
+from mkpc_kaggle.data.images import Unreadable, read_image
 from mkpc_kaggle.data.masks import Masks
+from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.request import RunReport
-from mkpc_kaggle.engine.session import Session, opened_engine, request_of
+from mkpc_kaggle.engine.session import (
+    Interrupt,
+    Session,
+    interruptible,
+    opened_engine,
+    request_of,
+)
 from mkpc_kaggle.engine.state import State, name_below
 from mkpc_kaggle.errors import UserError, writing
-from mkpc_kaggle.geometry.intrinsics import camera_of, written
-from mkpc_kaggle.geometry.intrinsics import read as read_rows_of
 from mkpc_kaggle.matchers.contract import Matcher
 from mkpc_kaggle.pipeline.assembly import Assembly, assemble
-from mkpc_kaggle.pipeline.pair import PairMatch
 from mkpc_kaggle.recipe import CameraSharing, Recipe, SceneConfig
-from mkpc_kaggle.reconstruction.choice import MAX_IMAGES, choose_pairs
-from mkpc_kaggle.reconstruction.folder import Datasets, Ends, batch_names
+from mkpc_kaggle.reconstruction.choice import choose_pairs
+from mkpc_kaggle.reconstruction.folder import Datasets, Ends, batch_names, require_distinct
 from mkpc_kaggle.reconstruction.outputs import Cameras
 from mkpc_kaggle.reconstruction.priors import read_intrinsics_table
-from mkpc_kaggle.scene.likeness import PARTNERS, local_features, most_alike, shortlist
-from mkpc_kaggle.scene.reconstruct import models_of, reconstruct_sharing
+from mkpc_kaggle.scene.export import MODELS
 from mkpc_kaggle.scene.reconstruction import RegisteredImage, SfmModel
-from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair, ViewGraph, tracks_of
 
 if TYPE_CHECKING:
     from mkpc_kaggle.reporting.view import View
 
 AUTO = "auto"  # the recipe of all matchers whose weights are found
+COLMAP = "colmap"  # in the work directory of :func:`reconstruct`, for COLMAP's files
 
 
 @dataclass(frozen=True)
@@ -157,80 +163,83 @@ def reconstruct(
     matchers: Mapping[str, Matcher[Any]] | None = None,
     masks: str | Path | None = None,
     intrinsics: str | Path | None = None,
+    progress: bool = True,
+    work_dir: str | Path | None = None,
 ) -> Models:
     """Return the models of the images at these paths, the largest first; no model if too few images
     match.
 
-    This is the command ``reconstruct`` in this process, without budget and journal. ``masks`` is a
-    directory, and ``intrinsics`` a table, as for the command; their paths are relative to the common
-    directory of the images. Cameras refer to the stored pixels of the files, as COLMAP reads them.
-    Raises :class:`UserError` for a recipe that cannot run here, for unusable masks or intrinsics, and
-    for an unreadable image.
+    This is a run of the command ``reconstruct`` on one set of images, without a time limit. Its
+    ``progress`` is shown on the standard error stream. ``work_dir`` keeps the journal and COLMAP's
+    files: after Ctrl-C, which raises ``KeyboardInterrupt``, the same call continues, and with more
+    images it matches only the new pairs. ``masks`` is a directory, and ``intrinsics`` a table, as for
+    the command; their paths are relative to the common directory of the images. ``matchers`` run in
+    this process, all others in processes of their own.
+
+    Cameras refer to the stored pixels of the files, as COLMAP reads them. ``colmap`` of a model is
+    pycolmap's. Raises :class:`UserError` for a recipe that cannot run here, for unusable masks or
+    intrinsics, and for an unreadable image.
     """
-    files = sorted(map(Path, images))
-    # Before weights are loaded, which takes long
-    given_masks, known = priors_of(files, masks, intrinsics)
+    # By absolute path, because the journal knows an image by its path below the common directory
+    given = {Path(image).absolute(): str(image) for image in images}
+    files = sorted(given)
+    if len(files) < 2:
+        return Models()
+    root = Path(os.path.commonpath([file.parent for file in files]))
+    require_distinct(files)
+    for file in files:
+        # A few images of a notebook: one that is missing is a mistake, and no reason to go on.
+        if isinstance(image := read_image(file), Unreadable):
+            raise UserError(str(image))
+    known = "" if intrinsics is None else read_intrinsics_table(Path(intrinsics), root, files)
     assembly = assemble(recipe, weights=map(Path, weights), device=device, matchers=matchers)
     assembly = replace(
         assembly,
         recipe=for_cameras(assembly.recipe, intrinsics=known),
-        masks=given_masks or assembly.masks,
+        masks=assembly.masks if masks is None else Masks.of_folder(Path(masks), root, files),
     )
-    pairs = []
-    for match in matched_pairs(files, assembly):
-        image0, image1 = map(batch_image, match.images)
-        pairs.append(BatchPair(image0, image1, match.matches, None, tracks_of(match.results)))
-    found, _ = reconstruct_sharing(
-        ViewGraph.of_pairs(pairs), assembly.recipe.scene or SceneConfig()
-    )
-    return Models(models_of(found))
+    with ExitStack() as closed:
+        if work_dir is None:
+            work_dir = closed.enter_context(TemporaryDirectory(prefix="mkpc-"))
+        directory = Path(work_dir)
+        session = Session(
+            directory,
+            Budget(time.monotonic()),
+            closed.enter_context(interruptible()) if is_main_thread() else Interrupt(),
+            progress=progress,
+            # Objects of the user's program may not exist in other processes.
+            workers=0 if matchers else None,
+        )
+        result = reconstruct_folder(root, {".": files}, assembly, session, directory / COLMAP)
+        if session.interrupt.is_set():
+            raise KeyboardInterrupt
+        from mkpc_kaggle.reporting.summary import trouble  # jinja2 is slow to import
+
+        if reason := trouble(result.report):
+            raise UserError(reason)
+        scenes = result.report.scenes
+        names = {name_below(str(root), str(file)): name for file, name in given.items()}
+        return Models(
+            _complete(model, directory / COLMAP / MODELS / str(number), names)
+            for scene in scenes
+            for number, model in enumerate(scene.models)
+        )
 
 
-def priors_of(
-    files: Sequence[Path], masks: str | Path | None, intrinsics: str | Path | None
-) -> tuple[Masks | None, str]:
-    """Return the masks of a directory, and the rows of a table for ``[scene] intrinsics``.
+def _complete(model: SfmModel, folder: Path, names: Mapping[str, str]) -> SfmModel:
+    """Return a model of the journal with all of its points, and with the user's names of images."""
+    import pycolmap
 
-    Names in both are relative to the common directory of the files. Raises :class:`UserError` for
-    unusable ones.
-    """
-    if not files:
-        return None, ""
-    # As the command's DIR, if all images are in one folder
-    root = Path(os.path.commonpath([file.parent for file in files]))
-    given = None if masks is None else Masks.of_folder(Path(masks), root, files)
-    if intrinsics is None:
-        return given, ""
-    rows = read_rows_of(read_intrinsics_table(Path(intrinsics), root, files))
-    # The images of the view graph have their whole paths as names, so each gets a row with its path.
-    known = {str(file): camera_of(rows, file.relative_to(root).as_posix()) for file in files}
-    return given, written([(name, camera) for name, camera in known.items() if camera is not None])
+    from mkpc_kaggle.scene.colmap import points_of
+
+    found = pycolmap.Reconstruction(folder)
+    images = []
+    for placed in model.images:
+        image = replace(placed.image, name=names[placed.image.name])
+        images.append(replace(placed, image=image))
+    return replace(model, images=tuple(images), points=points_of(found), colmap=found)
 
 
-def matched_pairs(files: Sequence[Path], assembly: Assembly) -> Iterator[PairMatch]:
-    """Yield the matches of all pairs of up to ``MAX_IMAGES`` files, or of a shortlist.
-
-    Raises :class:`UserError` for an unreadable image.
-    """
-    pipeline = assembly.pipeline()
-    store = ImageStore()
-
-    # A few images of a notebook: one that is missing is a mistake, and no reason to go on without it.
-    def opened(path: Path) -> Image:
-        image = store.get(path)
-        if isinstance(image, Unreadable):
-            raise UserError(str(image))
-        return image
-
-    # As in the command
-    ends = list(combinations(range(len(files)), 2))
-    if len(files) > MAX_IMAGES:
-        features = list(map(local_features, files))
-        ends = shortlist(most_alike(lambda: features, PARTNERS))
-    for i, j in ends:
-        pair = PairMatch(images=(opened(files[i]), opened(files[j])))
-        yield from pipeline.match([pair], assembly.recipe.units)
-
-
-def batch_image(image: Image) -> BatchImage:
-    return BatchImage(image.name, image.version, image.size, image.focal)
+def is_main_thread() -> bool:
+    """Return whether this is the thread that may handle signals."""
+    return threading.current_thread() is threading.main_thread()

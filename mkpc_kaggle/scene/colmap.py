@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import pycolmap
+from numpy.typing import NDArray
 
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Size
@@ -264,6 +265,12 @@ def _sfm_model(found: Any, graph: ViewGraph) -> SfmModel:
                 sigmas.get(image.name, ()),
             )
         )
+    error = float(found.compute_mean_reprojection_error()) if found.num_points3D() else 0.0
+    return SfmModel(tuple(images), points_of(found), error, found)
+
+
+def points_of(found: Any) -> NDArray[np.float64]:
+    """Return the finite points (P, 3) of pycolmap's model, those of the longest tracks first."""
     tracks = {
         number: found.points3D[number].track.length() for number in sorted(found.point3D_ids())
     }
@@ -271,5 +278,4 @@ def _sfm_model(found: Any, graph: ViewGraph) -> SfmModel:
     longest_first = sorted(tracks, key=lambda number: -tracks[number])
     points = np.array([found.points3D[number].xyz for number in longest_first], np.float64)
     points = points.reshape(-1, 3)  # also without any point
-    error = float(found.compute_mean_reprojection_error()) if len(points) else 0.0
-    return SfmModel(tuple(images), points[np.isfinite(points).all(axis=1)], error, found)
+    return points[np.isfinite(points).all(axis=1)]

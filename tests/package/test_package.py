@@ -20,6 +20,7 @@ from weight_files import digest_of, line, put
 
 from mkpc_kaggle import __version__
 from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.package import package
 from mkpc_kaggle.package.files import licence_text
 from mkpc_kaggle.package.package import Package, Request, find_checkout, make_package
 from mkpc_kaggle.package.wheels import BUNDLED, build_wheel, install_lines, pins
@@ -279,3 +280,21 @@ def test_the_wheel_holds_what_a_run_needs_and_asks_for_what_is_bundled(tmp_path,
     names = ZipFile(wheel).namelist()
     assert {"mkpc_kaggle/weights_manifest.txt", "mkpc_kaggle/recipes/auto.toml"} <= set(names)
     assert not [name for name in names if name.startswith(("tests/", "notebooks/"))]
+
+
+def test_an_installed_copy_packages_the_clone_that_it_is_called_in(tmp_path, monkeypatch):
+    clone = find_checkout()
+    site = tmp_path / "site-packages"
+    monkeypatch.setattr(package, "__file__", str(site / "mkpc_kaggle" / "package" / "package.py"))
+    monkeypatch.chdir(clone)
+    assert find_checkout() == clone
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(UserError, match="run `mkpc package` in a clone"):
+        find_checkout()
+    # A clone that was updated after the installation
+    (tmp_path / "notebooks").mkdir()
+    (tmp_path / "notebooks" / "submission.ipynb").touch()
+    (tmp_path / "mkpc_kaggle").mkdir()
+    (tmp_path / "mkpc_kaggle" / "version.py").write_text('__version__ = "99.0"\n')
+    with pytest.raises(UserError, match="another version"):
+        find_checkout()

@@ -25,9 +25,8 @@ from sklearn.datasets import load_sample_image
 from synthetic import QUICK, SyntheticMatcher
 
 from benchmarks.synthetic_scene import SIZE, SyntheticScene, synthetic_scene
-from mkpc_kaggle import reconstruct, results
-from mkpc_kaggle.data import images
-from mkpc_kaggle.data.images import TURNS, Image, Unreadable, read_image
+from mkpc_kaggle import results
+from mkpc_kaggle.data.images import TURNS
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.session import Interrupt, Session
 from mkpc_kaggle.errors import UserError
@@ -35,7 +34,6 @@ from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import RobustConfig
 from mkpc_kaggle.matchers.adapters.sift import SiftMatcher, SiftOptions
-from mkpc_kaggle.pipeline import pair
 from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.recipe import Recipe, Unit
 from mkpc_kaggle.reconstruction.folder import read_folder, read_pair_list
@@ -447,31 +445,3 @@ def test_the_tables_are_there_at_first_and_again_after_each_scene(tmp_path):
     # Scenes of several datasets may end in either order.
     steps = list(dict.fromkeys(tuple(each.values()) for each in published))
     assert steps in ([(0, 0), (4, 0), (4, 4)], [(0, 0), (0, 4), (4, 4)])
-
-
-def test_python_gives_models_reads_each_image_once_and_estimates_nothing_unused(
-    tmp_path, monkeypatch
-):
-    folder = write_flat(tmp_path / "images", FIRST)
-    read = list[Path]()
-
-    def read_counted(path: Path) -> Image | Unreadable:
-        read.append(path)
-        return read_image(path)
-
-    monkeypatch.setattr(images, "read_image", read_counted)
-    # F of single pairs is of no use here.
-    monkeypatch.setattr(pair, "estimate", lambda *_, **__: pytest.fail("unused"))
-    models = reconstruct(
-        folder.iterdir(), RECIPE, device="cpu", matchers={"synthetic": MixedMatcher()}
-    )
-    (first,) = models
-    # Images are in several pairs each.
-    assert sorted(read) == sorted(folder.iterdir())
-    assert len(first.images) == FIRST
-    truth = MixedMatcher().scenes[0].cameras
-    assert all(f"{number:02}.png" in models.show().page for number in range(FIRST))
-    for found in first.images:
-        assert found.focal == pytest.approx(
-            truth["00" + Path(found.image.name).stem].K[0, 0], rel=0.03
-        )

@@ -1,0 +1,161 @@
+"""``mkpc_kaggle.reconstruct``: a run of the engine, called from a program."""
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_reconstruct import FIRST, RECIPE, MixedMatcher, write_flat
+
+from mkpc_kaggle import reconstruct, results
+from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.reconstruction.run import Models
+
+PAIRS = FIRST * (FIRST - 1) // 2
+
+
+def models(files: Sequence[Path], matcher: MixedMatcher, **options: object) -> Models:
+    given = {"synthetic": matcher}
+    return reconstruct(files, RECIPE, device="cpu", matchers=given, **options)
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> list[Path]:
+    return sorted(write_flat(tmp_path / "images", FIRST).iterdir())
+
+
+def test_models_have_the_users_paths_all_points_and_pycolmaps_model(tmp_path, files, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    relative = [file.relative_to(tmp_path) for file in reversed(files)]
+    made = models(relative, MixedMatcher(), progress=False)
+    (model,) = made
+    assert {found.image.name for found in model.images} == set(map(str, relative))
+    truth = MixedMatcher().scenes[0].cameras
+    for found in model.images:
+        name = "00" + Path(found.image.name).stem
+        assert found.focal == pytest.approx(truth[name].K[0, 0], rel=0.03)
+    # The journal has fewer, and rounded.
+    assert len(model.points) == model.colmap.num_points3D()
+    known = {tuple(point.xyz) for point in model.colmap.points3D.values()}
+    assert set(map(tuple, model.points)) == known
+    page = made.show().page
+    assert all(file.name in page for file in relative)
+
+
+def test_progress_is_shown_and_can_be_switched_off(files, capfd):
+    models(files, MixedMatcher())
+    shown = capfd.readouterr()
+    assert f"{PAIRS}/{PAIRS}" in shown.err
+    assert not shown.out
+    models(files, MixedMatcher(), progress=False)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_work_directory_keeps_what_was_matched(tmp_path, files):
+    work = tmp_path / "work"
+    first = MixedMatcher()
+    before = models(files[:-1], first, work_dir=work, progress=False)
+    assert len(first.calls) == (FIRST - 1) * (FIRST - 2) // 2
+    again = MixedMatcher()
+    same = models(files[:-1], again, work_dir=work, progress=False)
+    assert not again.calls
+    np.testing.assert_array_equal(same[0].points, before[0].points)
+    more = MixedMatcher()
+    (grown,) = models(files, more, work_dir=work, progress=False)
+    assert sorted(more.calls) == [(number, FIRST - 1) for number in range(FIRST - 1)]
+    assert len(grown.images) == FIRST
+    assert len(results(work).pairs) == PAIRS
+
+
+class StoppedMatcher(MixedMatcher):
+    """Ctrl-C arrives while it matches its third pair."""
+
+    def _match(self, *seen: object) -> Matches:
+        if len(self.calls) == 2:
+            os.kill(os.getpid(), signal.SIGINT)
+        return super()._match(*seen)
+
+
+def test_after_ctrl_c_the_same_call_continues(tmp_path, files):
+    former = signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt):
+        models(files, StoppedMatcher(), work_dir=tmp_path / "work", progress=False)
+    assert signal.getsignal(signal.SIGINT) is former
+    rest = MixedMatcher()
+    (model,) = models(files, rest, work_dir=tmp_path / "work", progress=False)
+    assert 0 < len(rest.calls) < PAIRS
+    assert len(model.images) == FIRST
+
+
+def test_images_of_several_folders_are_one_set(tmp_path, files):
+    # The same name in both folders
+    moved = tmp_path / "images" / "more" / files[0].name
+    moved.parent.mkdir()
+    files[-1].rename(moved)
+    work = tmp_path / "work"
+    (model,) = models([*files[:-1], moved], MixedMatcher(), work_dir=work, progress=False)
+    assert str(moved) in {found.image.name for found in model.images}
+    assert results(work).pairs["pair"].is_unique
+
+
+@pytest.mark.parametrize(
+    ("spoil", "reason"),
+    [
+        (lambda folder: (folder / "01.png").write_bytes(b""), "the file is empty"),
+        (lambda folder: (folder / "01.png").unlink(), "01.png"),
+        (lambda folder: (folder / "01.png").rename(folder / "00.jpg"), "rename one of them"),
+    ],
+    ids=["empty", "missing", "alike"],
+)
+def test_an_image_that_cannot_be_used_is_an_error_before_any_work(
+    tmp_path: Path, files: list[Path], spoil: Callable[[Path], object], reason: str
+):
+    listed = [*files, tmp_path / "images" / "00.jpg"] if reason.startswith("rename") else files
+    spoil(tmp_path / "images")
+    matcher = MixedMatcher()
+    with pytest.raises(UserError, match=reason):
+        models([file for file in listed if file.exists() or "rename" not in reason], matcher)
+    assert not matcher.calls
+
+
+def test_fewer_than_two_images_have_no_model(files):
+    assert models([], MixedMatcher()) == ()
+    assert models(files[:1], MixedMatcher()) == ()
+
+
+def test_a_matcher_that_always_fails_is_an_error(files):
+    class Broken(MixedMatcher):
+        def _match(self, *_: object) -> Matches:
+            raise RuntimeError("out of order")
+
+    with pytest.raises(UserError, match="out of order"):
+        models(files, Broken(), progress=False)
+
+
+SCRIPT = """\
+from pathlib import Path
+
+from mkpc_kaggle import reconstruct
+from test_reconstruct import RECIPE, MixedMatcher
+
+given = {"synthetic": MixedMatcher()}
+models = reconstruct(Path("images").iterdir(), RECIPE, device="cpu", matchers=given, progress=False)
+print(len(models[0].images), "cameras")
+"""
+
+
+def test_a_script_needs_no_guard_although_scenes_are_computed_in_processes(tmp_path, files):
+    # Without it, each worker would run the script again.
+    script = tmp_path / "script.py"
+    script.write_text(SCRIPT)
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, sys.path))}
+    command = [sys.executable, script]
+    done = subprocess.run(
+        command, check=False, cwd=tmp_path, env=environment, capture_output=True, text=True
+    )
+    assert (done.stdout, done.returncode) == (f"{FIRST} cameras\n", 0), done.stderr
