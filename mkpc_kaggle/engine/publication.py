@@ -34,7 +34,10 @@ class Publication:
         return now - self._published > interval
 
     def publish(self) -> None:
-        """Write the results, and the table of pairs that names them."""
+        """Write the results, and the table of pairs that names them.
+
+        If the results cannot be written, a fault states why, and the next run writes them first.
+        """
         state = self._state
         # Without pairs, as in a folder of one image, no file of the request changes.
         if not state.rows:
@@ -42,6 +45,7 @@ class Publication:
         start = self._budget.clock()
         if trouble := self.save():
             self._log.fault(trouble)
+        # Also if the results were not written: a prune removes what the table does not name.
         # A trial's pairs are not the run's, whose table stays until its own pairs are known.
         if not state.request.is_trial:
             self._store.put([self.table().to_result()])

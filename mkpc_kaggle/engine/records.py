@@ -1,7 +1,8 @@
 """Records of a run, for reports: pairs, units, scenes and events.
 
-The table of pairs is the latest published version of the results. It names the results of each pair
-and has the F that was written. Nothing else decides which results reports show.
+The table of pairs is the latest version of the results. It names the results of each pair and has
+the F to write. Nothing else decides which results reports show. If the files of that version could
+not be written, an event states why.
 """
 
 from collections.abc import Mapping, Sequence

@@ -25,8 +25,9 @@ from mkpc_kaggle.data.competition import read_test_side, submission_problems
 from mkpc_kaggle.demo import DemoSet
 from mkpc_kaggle.engine import image_files, session, worker
 from mkpc_kaggle.engine.matching import Matching
-from mkpc_kaggle.engine.records import read_records
+from mkpc_kaggle.engine.records import Table, read_records
 from mkpc_kaggle.engine.request import Ending
+from mkpc_kaggle.engine.state import State
 from mkpc_kaggle.engine.store import Store
 from mkpc_kaggle.reporting.run_log import read_log
 
@@ -168,6 +169,28 @@ def test_a_submission_that_the_disk_does_not_take_is_told_and_the_exit_status_is
     assert main(["submit", *arguments_of(demo, small_recipe, output), "--workers", "0"]) == 1
     assert "is not the last version" in capsys.readouterr().out
     assert submission_problems(output, [pair.id for pair in read_test_side(demo.test_dir)]) == []
+
+
+def test_results_whose_file_cannot_be_written_stay_in_the_table_for_the_next_run(
+    pairs, undisturbed, tmp_path
+):
+    def full(_: State) -> None:
+        raise OSError(28, "No space left on device")
+
+    report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work", publish=full)
+    assert "No space left on device" in report.unwritten
+    assert report.faults == (report.unwritten,)
+    with Store.open(tmp_path / "work") as store:
+        store.prune(Table.of(store).keys)  # what no table names is lost here
+        assert [len(record.units) for record in read_records(store)] == [3] * 12
+    written: list[list[bytes]] = []
+
+    def note(state: State) -> None:
+        written.append([F.tobytes() for F in state.fundamentals])
+
+    resumed = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work", publish=note)
+    assert (resumed.units_run, resumed.estimated) == (0, 0)
+    assert written[0] == matrices(undisturbed), "before any work"
 
 
 def arguments_of(demo: DemoSet, recipe: Path, output: Path) -> list[str]:
