@@ -1,60 +1,127 @@
-"""Progress of waits outside of a run: rendering, pip and digests.
-
-A run draws its own bar (:mod:`mkpc_kaggle.engine.console`), by the same rule.
-"""
+"""Progress of a wait: a line that is drawn again on a terminal, and printed now and then elsewhere."""
 
 import os
 import shutil
 import sys
 import time
-from collections.abc import Iterator, Sequence
-from typing import TypeVar
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from math import inf
+from typing import TextIO, TypeVar
 
 LINE_INTERVAL_S = 30.0  # between lines where a line cannot be redrawn in place
-MAX_SILENCE_S = 1.0  # before a bar appears: shorter waits need none
+REDRAW_S = 0.2  # between redraws: a reader sees no more, and a terminal may be slow
+MAX_SILENCE_S = 1.0  # before a line about a wait: shorter waits need none
+ERASE = "\r\x1b[K"  # moves a terminal's cursor to the start of the line, and clears the line
+# Of tqdm; a bar of ten ASCII characters, since a terminal may know no others
+BAR = "|{bar:10a}| "
+METER = "{desc}: {n_fmt}/{total_fmt} %s[{elapsed}<{remaining}, {rate_fmt}]"
 
 Item = TypeVar("Item")
 
 
-def is_redrawn(*, is_terminal: bool) -> bool:
-    """Return whether a bar replaces its former state on a stream.
+class ProgressLine:
+    """The progress line of a stream. ``None`` is no stream: nothing is shown."""
 
-    A notebook's ``!command`` has a terminal, but Jupyter stores every state of a redrawn line. It
-    sets JPY_PARENT_PID for these processes.
-    """
-    return is_terminal and "JPY_PARENT_PID" not in os.environ
+    def __init__(self, stream: TextIO | None, clock: Callable[[], float] = time.monotonic) -> None:
+        self._stream = stream
+        self._clock = clock
+        # A notebook's `!command` has a terminal, but Jupyter stores every state of a redrawn line. It
+        # sets JPY_PARENT_PID for these processes.
+        self.is_redrawn = is_terminal(stream) and "JPY_PARENT_PID" not in os.environ
+        self._text = ""  # that is not shown yet
+        self._is_drawn = False  # a text is on the terminal's last line
+        self._shown = -inf
 
+    def show(self, text: str, *, is_new: bool = False) -> None:
+        """Replace the text: at once if ``is_new``, otherwise after an interval."""
+        if is_new and self.is_redrawn:
+            self.close()  # the former text stays, on the line above
+        self._text = text
+        if is_new or self.is_due:
+            self._write(text)
+            self._text = ""
 
-def _is_on_terminal() -> bool:
-    try:
-        return sys.stderr is not None and sys.stderr.isatty()
-    except ValueError:  # a closed stream
-        return False
+    @property
+    def is_due(self) -> bool:
+        """Whether the latest text has been there for the interval."""
+        interval = REDRAW_S if self.is_redrawn else LINE_INTERVAL_S
+        return self._clock() - self._shown >= interval
+
+    def note(self, text: str) -> None:
+        """Print a line that stays."""
+        self._erase()
+        print_to(self._stream, text)
+
+    def close(self) -> None:
+        """Show the latest text, which stays."""
+        if self._text:
+            self._write(self._text)
+            self._text = ""
+        if self._is_drawn:
+            print_to(self._stream, "")
+            self._is_drawn = False
+
+    def remove(self) -> None:
+        """Drop the text, and erase it on a terminal."""
+        self._text = ""
+        self._erase()
+
+    def _write(self, text: str) -> None:
+        if self.is_redrawn:
+            # A wrapped line could not be erased. The width may change at any time.
+            width = shutil.get_terminal_size().columns
+            print_to(self._stream, ERASE + text[: width - 1], end="")
+            self._is_drawn = True
+        else:
+            print_to(self._stream, text)
+        self._shown = self._clock()
+
+    def _erase(self) -> None:
+        if self._is_drawn:
+            print_to(self._stream, ERASE, end="")
+            self._is_drawn = False
+
+    def meter(
+        self, what: str, done: int, total: int, seconds: float, unit: str, first: int = 0
+    ) -> str:
+        """Return text such as ``sweep: 84/304 [02:10<05:40, 1.55s/pair]``, on a terminal with a bar.
+
+        The ``first`` items were done before these seconds, and say nothing about the rate.
+        """
+        from tqdm import tqdm  # most commands do not need it
+
+        count = done - first
+        rate = count / seconds if count and seconds else None
+        bar_format = METER % (BAR if self.is_redrawn else "")
+        return tqdm.format_meter(
+            done, total, seconds, prefix=what, unit=unit, rate=rate, bar_format=bar_format
+        )
 
 
 def counted(items: Sequence[Item], what: str, unit: str) -> Iterator[Item]:
-    """Yield the items and show how many are done, with the rate and the remaining time.
-
-    On a terminal this is a bar, elsewhere a line every half minute.
-    """
-    if is_redrawn(is_terminal=_is_on_terminal()):
-        from tqdm import tqdm
-
-        # tqdm prints nothing on a terminal that states no size, such as `script`'s.
-        columns, rows = shutil.get_terminal_size()
-        yield from tqdm(
-            items,
-            desc=what,
-            unit=unit,
-            delay=MAX_SILENCE_S,
-            leave=False,
-            ncols=columns,
-            nrows=rows,
-        )
-        return
-    written = time.monotonic()
+    """Yield the items and show how many are done, with the rate and the remaining time."""
+    line = ProgressLine(sys.stderr)
+    silence = MAX_SILENCE_S if line.is_redrawn else LINE_INTERVAL_S
+    began = time.monotonic()
     for done, item in enumerate(items):
-        if time.monotonic() - written >= LINE_INTERVAL_S:
-            print(f"{what}: {done}/{len(items)}", file=sys.stderr, flush=True)
-            written = time.monotonic()
+        seconds = time.monotonic() - began
+        if seconds >= silence:
+            line.show(line.meter(what, done, len(items), seconds, unit))
         yield item
+    line.remove()
+
+
+def print_to(stream: TextIO | None, text: str, end: str = "\n") -> None:
+    """Print a text if that is possible; ``None`` is no stream."""
+    with suppress(OSError, ValueError):  # lost terminal, full disk, or closed stream
+        if stream is not None:
+            print(text, file=stream, flush=True, end=end)
+
+
+def is_terminal(stream: TextIO | None) -> bool:
+    """Return whether a stream writes to a terminal, directly or through a printing thread."""
+    try:
+        return stream is not None and stream.isatty()
+    except ValueError:  # a closed stream
+        return False

@@ -1,4 +1,4 @@
-"""The only module that prints during a run: lines, warnings, progress. Printing never raises or blocks the run.
+"""Printing during a run: lines, warnings, progress. It never raises or blocks the run.
 
 A pipe without a reader or a stopped terminal (Ctrl-S) blocks a write forever, and with it every
 thread that waits for the stream's lock. A lost terminal (EIO), a full disk or a closed stream makes
@@ -12,7 +12,6 @@ import multiprocessing
 import os
 import queue
 import select
-import shutil
 import sys
 import threading
 import time
@@ -25,11 +24,9 @@ from tempfile import TemporaryFile
 from typing import Any, NoReturn, TextIO
 
 from mkpc_kaggle.engine.budget import Budget, format_duration
-from mkpc_kaggle.progress import LINE_INTERVAL_S, is_redrawn
+from mkpc_kaggle.progress import LINE_INTERVAL_S, ProgressLine, print_to
 
-WAIT_S = 5.0  # shorter waits are not shown
-REDRAW_S = 1.0  # between counts of the seconds of a wait
-BAR = "{desc}: {n_fmt}/{total_fmt} [{elapsed}<{remaining}, {pace}]"  # of tqdm
+WAIT_S = 5.0  # shorter waits are not shown on a terminal
 MAX_WAITING = 1000  # writes, which a busy progress line makes in a few minutes
 # Of the text of native libraries, printed at the end: a warning for each photograph would hide the rest.
 MAX_NATIVE_BYTES = 4096
@@ -49,99 +46,40 @@ def complain(text: str) -> None:
     print_to(sys.stderr, f"error: {text}")
 
 
-def print_to(stream: TextIO | None, text: str, end: str = "\n") -> None:
-    """Print a text if that is possible; ``None`` is no stream."""
-    with suppress(OSError, ValueError):  # lost terminal, full disk, or closed stream
-        if stream is not None:
-            print(text, file=stream, flush=True, end=end)
-
-
-class Progress:
-    """Progress of a phase in pairs: a line redrawn in place on a terminal, occasional lines
-    elsewhere.
+class Progress(ProgressLine):
+    """Progress of a run: the pairs of a phase that are done, or how long a wait takes that has no
+    count.
     """
 
     def __init__(self, budget: Budget, stream: TextIO | None) -> None:
+        super().__init__(stream, budget.clock)
         self._budget = budget
-        self._stream = stream
-        # To the line's start, and clear it.
-        self._erase = "\r\x1b[K" if is_redrawn(is_terminal=is_terminal(stream)) else ""
         self._phase = ""
-        self._line = ""
         self._first = 0  # pairs that were done when the phase began
-        self._began = self._written = budget.clock()
+        self._began = budget.clock()
+        self.is_shown = stream is not None
 
-    def show(self, phase: str, done: int, total: int) -> None:
-        """Show progress after a job. A phase without pairs is not shown."""
+    def count(self, phase: str, done: int, total: int) -> None:
+        """Show the pairs that are done, after a job. A phase without pairs is not shown."""
         if not total:
             return
         now = self._budget.clock()
         is_new = phase != self._phase
         if is_new:
-            if self._erase:
-                self.close()
             self._phase = phase
             self._first = done
             self._began = now
-        self._line = self._text(done, total, now)
-        if self._erase:
-            # A wrapped line could not be erased; the width may change during the run.
-            width = shutil.get_terminal_size().columns
-            print_to(self._stream, self._erase + self._line[: width - 1], end="")
-        elif is_new or now - self._written >= LINE_INTERVAL_S:
-            self.close()
-
-    def _text(self, done: int, total: int, now: float) -> str:
-        """Return text such as ``sweep: 84/304 [02:10<05:40, 1.5 s/pair]``."""
-        from tqdm import tqdm  # commands without a run do not need it
-
-        seconds = now - self._began
-        count = done - self._first
-        # Resumed pairs say nothing about the pace.
-        pace = f"{seconds / count:.2g} s/pair" if count and seconds else "? s/pair"
-        text: str = tqdm.format_meter(
-            done,
-            total,
-            seconds,
-            rate=count / seconds if count and seconds else None,
-            prefix=str(self._phase),
-            bar_format=BAR,
-            pace=pace,  # type: ignore[call-arg]  # a value for the format; missing in the stubs
-        )
+        text = self.meter(phase, done, total, now - self._began, "pair", first=self._first)
         if isfinite(self._budget.time_limit):
             text += f", budget left {format_duration(self._budget.left())}"
-        return text
-
-    @property
-    def is_shown(self) -> bool:
-        return self._stream is not None
+        self.show(text, is_new=is_new)
 
     def wait(self, text: str, since: float) -> None:
-        """Show how long something has taken that has no count, once it has taken ``WAIT_S``."""
-        now = self._budget.clock()
-        interval = REDRAW_S if self._erase else LINE_INTERVAL_S
-        if now - since < WAIT_S or now - max(since, self._written) < interval:
-            return
-        self._written = now
-        line = f"{text} [{format_duration(now - since)}]"
-        if self._erase:
-            width = shutil.get_terminal_size().columns
-            print_to(self._stream, self._erase + line[: width - 1], end="")
-            # The next phase begins on a new line.
-            self._line = line
-        else:
-            print_to(self._stream, line)
-
-    def note(self, text: str) -> None:
-        print_to(self._stream, self._erase + text)
-        self._line = "" if self._erase else self._line
-
-    def close(self) -> None:
-        """End the redrawn line on a terminal, or print the pending line elsewhere."""
-        if self._line:
-            print_to(self._stream, "" if self._erase else self._line)
-            self._line = ""
-            self._written = self._budget.clock()
+        """Show how long something takes that has no count. Short waits are not shown."""
+        seconds = self._budget.clock() - since
+        shortest = WAIT_S if self.is_redrawn else LINE_INTERVAL_S
+        if seconds >= shortest and self.is_due:
+            self._write(f"{text} [{format_duration(seconds)}]")
 
 
 class Printer:
@@ -333,12 +271,6 @@ def leave(status: int, seconds: float = DRAIN_S) -> NoReturn:
         child.kill()
     drain(seconds)
     os._exit(status)
-
-
-def is_terminal(stream: TextIO | None) -> bool:
-    """Return whether a stream writes to a terminal, directly or through the printing thread."""
-    descriptor = _descriptor(stream)
-    return descriptor >= 0 and os.isatty(descriptor)
 
 
 def _descriptor(stream: TextIO | None) -> int:

@@ -63,7 +63,7 @@ class Estimating:
         if not state.matching.any():
             total = int(state.has[: state.rows].any(1).sum())
             pending = int(lacking_estimates(state).sum())
-            run.progress.show("estimate", total - pending, total)
+            run.progress.count("estimate", total - pending, total)
 
     def _use(self, index: int, result: Result) -> None:
         """Use an estimate, even if its pair has newer points meanwhile: the former estimate is

@@ -127,7 +127,7 @@ class Matching:
         if (work := self._shown) is not None:
             # The schedule counted the finished pairs before this answer.
             done = min(work.total, work.done + len(job.indices))
-            run.progress.show(str(work.phase), done, work.total)
+            run.progress.count(str(work.phase), done, work.total)
 
     def _results(self, index: int, outcome: Outcome, crops: Sequence[str]) -> list[Result]:
         """Return the new points of a pair, and its images, as rows of the store.

@@ -202,7 +202,7 @@ def _weakest_section(
         weakest.append((_picture(sources.get(record.pair.id), match), record))
         # Reading and drawing large photographs takes a second for each pair.
         if progress is not None and sources:
-            progress.show("drawing", number, len(log.weakest))
+            progress.count("drawing", number, len(log.weakest))
     # The next text begins a new line.
     if progress is not None:
         progress.close()

@@ -7,7 +7,6 @@ from simulator import VirtualClock
 
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.console import Progress
-from mkpc_kaggle.engine.jobs import Phase
 from mkpc_kaggle.progress import LINE_INTERVAL_S
 
 
@@ -19,22 +18,22 @@ class Terminal(StringIO):
 def no_notebook(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("JPY_PARENT_PID", raising=False)
     is_terminal = lambda stream: isinstance(stream, Terminal)  # noqa: E731
-    monkeypatch.setattr("mkpc_kaggle.engine.console.is_terminal", is_terminal)
+    monkeypatch.setattr("mkpc_kaggle.progress.is_terminal", is_terminal)
 
 
 def test_a_terminal_has_a_line_for_each_phase() -> None:
     stream = Terminal()
     clock = VirtualClock()
     progress = Progress(Budget(0.0, 100.0, clock), stream)
-    progress.show(Phase.SWEEP, 8, 8)
+    progress.count("sweep", 8, 8)
     for done in (1, 2):
-        progress.show(Phase.DEEPEN, done, 8)
+        progress.count("deepen", done, 8)
         clock.now = 10.0
     progress.close()
     shown = [line.split("\r\x1b[K")[-1] for line in stream.getvalue().split("\n")[:-1]]
     assert shown == [
-        "sweep: 8/8 [00:00<?, ? s/pair], budget left 1m38s",
-        "deepen: 2/8 [00:10<01:00, 10 s/pair], budget left 1m28s",
+        "sweep: 8/8 |##########| [00:00<?, ?pair/s], budget left 1m38s",
+        "deepen: 2/8 |##5       | [00:10<01:00, 10.00s/pair], budget left 1m28s",
     ]
 
 
@@ -43,8 +42,8 @@ def test_the_terminal_that_a_notebook_gives_its_commands_has_lines(
 ) -> None:
     monkeypatch.setenv("JPY_PARENT_PID", "1")
     stream = Terminal()
-    Progress(Budget(0.0, clock=VirtualClock()), stream).show(Phase.SWEEP, 1, 5)
-    assert stream.getvalue() == "sweep: 1/5 [00:00<?, ? s/pair]\n"
+    Progress(Budget(0.0, clock=VirtualClock()), stream).count("sweep", 1, 5)
+    assert stream.getvalue() == "sweep: 1/5 [00:00<?, ?pair/s]\n"
 
 
 def test_lines_come_when_a_phase_begins_now_and_then_and_in_the_end() -> None:
@@ -52,19 +51,19 @@ def test_lines_come_when_a_phase_begins_now_and_then_and_in_the_end() -> None:
     progress = Progress(Budget(0.0, clock=clock), stream)
     for done in range(1, 101):  # 100 seconds
         clock.now += 1
-        progress.show(Phase.SWEEP, done, 100)
-    progress.show(Phase.DEEPEN, 1, 2)
+        progress.count("sweep", done, 100)
+    progress.count("deepen", 1, 2)
     clock.now += LINE_INTERVAL_S - 1
-    progress.show(Phase.DEEPEN, 2, 2)
+    progress.count("deepen", 2, 2)
     progress.close()
     progress.close()
     times = [
-        "31/100 [00:30<01:09, 1 s/pair]",
-        "61/100 [01:00<00:39, 1 s/pair]",
-        "91/100 [01:30<00:09, 1 s/pair]",
+        "31/100 [00:30<01:09,  1.00pair/s]",
+        "61/100 [01:00<00:39,  1.00pair/s]",
+        "91/100 [01:30<00:09,  1.00pair/s]",
     ]
-    deepen = ["deepen: 1/2 [00:00<?, ? s/pair]", "deepen: 2/2 [00:29<00:00, 29 s/pair]"]
-    sweep = ["sweep: 1/100 [00:00<?, ? s/pair]", *(f"sweep: {text}" for text in times)]
+    deepen = ["deepen: 1/2 [00:00<?, ?pair/s]", "deepen: 2/2 [00:29<00:00, 29.00s/pair]"]
+    sweep = ["sweep: 1/100 [00:00<?, ?pair/s]", *(f"sweep: {text}" for text in times)]
     assert stream.getvalue().splitlines() == [*sweep, *deepen]
 
 
@@ -81,15 +80,17 @@ def test_a_wait_is_counted_on_a_terminal_and_a_line_now_and_then_elsewhere() -> 
     )
     assert [line[-7:] for line in file.getvalue().splitlines()] == ["[30.0s]", "[1m00s]"]
     for progress in shown:
-        progress.show(Phase.SWEEP, 1, 2)
+        progress.count("sweep", 1, 2)
         progress.close()
-    assert terminal.getvalue().splitlines()[-1].endswith("sweep: 1/2 [00:00<?, ? s/pair]")
+    assert (
+        terminal.getvalue().splitlines()[-1].endswith("sweep: 1/2 |#####     | [00:00<?, ?pair/s]")
+    )
 
 
 @pytest.mark.parametrize("stream", [StringIO(), Terminal()])
 def test_a_note_is_a_line_of_its_own(stream: StringIO) -> None:
     progress = Progress(Budget(0.0, clock=VirtualClock()), stream)
-    progress.show(Phase.SWEEP, 1, 5)
+    progress.count("sweep", 1, 5)
     progress.note("batch one: 4 of 4 images have a camera")
     progress.close()
     assert "batch one: 4 of 4 images have a camera\n" in stream.getvalue()
