@@ -53,8 +53,13 @@ def summary(runs: list[Ran]) -> None:
     print(f"late: {sum(run.late > 0 for run in runs)}, rows lost: {sum(run.lost for run in runs)}")
     print(f"units run: {sum(run.report.units_run for run in runs)}")
     fit = [run for run in runs if run.scenario.batches and run.scenes_fit]
-    batches, missed = sum(run.scenario.batches for run in fit), sum(run.missed for run in fit)
-    print(f"scenes: {len(fit)} scenarios in which they fit, {missed} of {batches} batches missed")
+    batches = sum(run.scenario.batches for run in fit)
+    missed = sum(run.missed for run in fit)
+    unmatched = sum(run.unmatched for run in fit)
+    print(
+        f"scenes: {len(fit)} scenarios in which they fit, {missed} of {batches} batches missed; "
+        f"{unmatched} have no matches"
+    )
     low, middle = np.percentile(busy or [math.nan], [5, 50])
     print(
         f"utilisation: median {middle:.4f}, mean {np.mean(busy or [math.nan]):.4f}, 5th percentile {low:.4f}"

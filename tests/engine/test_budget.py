@@ -1,9 +1,13 @@
 import math
 import time
 
+import numpy as np
 import pytest
 
 from mkpc_kaggle.engine.budget import (
+    PACE_WINDOW,
+    SCENE_MARGIN,
+    SCENE_START_S,
     WINDOW,
     Budget,
     Costs,
@@ -86,6 +90,25 @@ def test_costs_follow_a_machine_that_slows_down() -> None:
     for seconds in [1.0] * (WINDOW + 1) + [10.0] * WINDOW:
         costs.observe("a", seconds)
     assert costs.mean("a") == 10.0
+
+
+def test_forecasts_of_scenes_follow_a_machine_that_slows_down_but_not_cached_encodings() -> None:
+    costs = Costs()
+    costs.observe("a", 1.0)
+    costs.observe_scene(1000, SCENE_START_S + 10.0)
+
+    def forecast() -> float:
+        return float(costs.scenes(np.array([1000]))[0])
+
+    before = forecast()
+    for _ in range(PACE_WINDOW):
+        costs.observe("a", 10.0)
+    assert forecast() == pytest.approx(10 * before)
+    costs.observe_scene(1000, SCENE_START_S + 100.0)  # as expected at this pace
+    assert forecast() == pytest.approx(SCENE_START_S + SCENE_MARGIN * 100.0)
+    for _ in range(PACE_WINDOW):
+        costs.observe("a", 1.0)
+    assert forecast() == pytest.approx(SCENE_START_S + SCENE_MARGIN * 100.0)
 
 
 def test_a_limit_may_count_from_an_earlier_moment(monkeypatch: pytest.MonkeyPatch) -> None:

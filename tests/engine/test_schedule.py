@@ -32,6 +32,8 @@ from mkpc_kaggle.engine.schedule import Crew, NextWork, View, next_work, outlook
 from mkpc_kaggle.engine.state import State
 from mkpc_kaggle.engine.store import Kind, Store
 from mkpc_kaggle.recipe import SceneConfig, Unit
+from mkpc_kaggle.scene.choose import Choice, Reason
+from mkpc_kaggle.scene.reconstruct import Solution
 
 DIED = Failure(Cause.DIED, "signal SIGKILL")
 UNITS = THREE_UNITS.units
@@ -412,13 +414,14 @@ def test_a_lost_job_comes_back_as_single_units_and_a_unit_lost_twice_is_skipped_
     assert engine.state.current.tolist() == [[True] * 3] * 2 + [[True, True, False], [True] * 3]
 
 
-def ran_at(site_class, scenario):
+def ran_at(site_class, scenario, store=None, publish=lambda _: None):
     clock = VirtualClock()
     time = Budget(0.0, scenario.limit, clock)
     pairs = [Pair(str(n), "", str(n), "b") for n in range(scenario.pairs)]
     site = site_class(scenario, clock, time.stop_units)
-    with Engine(site, memory_store(), time, interrupt=threading.Event(), progress=False) as engine:
-        engine.ask(Request(pairs, scenario.recipe, scenario.keys))
+    store = store or memory_store()
+    with Engine(site, store, time, interrupt=threading.Event(), progress=False) as engine:
+        engine.ask(Request(pairs, scenario.recipe, scenario.keys, publish=publish))
         return engine, engine.report()
 
 
@@ -466,6 +469,37 @@ def test_the_loop_reads_nothing_back_but_the_points_that_crops_come_from(monkeyp
     assert len(ran.scenes) >= 4
     assert set(read) == {("data", True)}
     assert len(read) <= 40, "once for the unit of stage 2 on each pair"
+
+
+def test_the_file_and_the_report_agree_on_an_image_that_is_replaced_during_a_run():
+    by_scene = Choice(np.arange(1.0, 10.0).reshape(3, 3), Reason.SCENE)
+
+    class FirstSite(SimulatedSite):
+        def reconstruct(self, job):
+            return 3.0, Solution((), (by_scene,) * len(job.pairs)), 0.0
+
+    class LaterSite(SimulatedSite):
+        """The first pair's image has another content, and no scene is made of it."""
+
+        def match(self, warm, job):
+            seconds, (outcome,), fault = super().match(warm, job)
+            if job.indices == (0,):
+                image0, image1 = outcome.images
+                outcome = replace(outcome, images=(replace(image0, digest="another"), image1))
+            return seconds, (outcome,), fault
+
+        def reconstruct(self, job):
+            return 3.0, DIED, 0.0
+
+    scenario = Scenario(4, (1.0,), 1, math.inf, spread=0, misses=0, batches=1)
+    store, written = memory_store(), []
+    ran_at(FirstSite, scenario, store)
+    another_unit = replace(scenario, costs=(1.0, 1.0))
+    publish = lambda state: written.append(state.fundamentals)  # noqa: E731
+    _, report = ran_at(LaterSite, another_unit, store, publish)
+    assert [record.source for record in report.records] == ["pair", "scene", "scene", "scene"]
+    for F, record in zip(written[-1], report.records, strict=True):
+        np.testing.assert_array_equal(F, record.chosen_fundamental)
 
 
 def test_reading_how_a_run_ended_changes_nothing():

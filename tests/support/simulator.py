@@ -394,9 +394,9 @@ class Ran:
     (see :class:`SimulatedSite`).
 
     ``lost`` counts pairs without the sweep's F where the sweep fits (see :func:`sweep_seconds`), and versions of
-    the submission with a missing row. ``missed`` are batches without a scene and without a fault; ``scenes_fit``
-    states that the largest reserve suffices for all, and that none hung while others waited. ``stale`` are the
-    batches whose scene is out of date.
+    the submission with a missing row. ``missed`` are batches with matches, without a scene and without a fault;
+    ``unmatched`` are batches that the sweep did not reach. ``scenes_fit`` states that the largest reserve suffices
+    for all scenes, and that none hung while others waited. ``stale`` are the batches whose scene is out of date.
     """
 
     scenario: Scenario
@@ -405,6 +405,7 @@ class Ran:
     late: float
     lost: int
     missed: int
+    unmatched: int
     scenes_fit: bool
     last_job: float
     scenes: tuple[SceneRun, ...]
@@ -443,6 +444,8 @@ def simulate(scenario: Scenario, store: Store | None = None, until: float = math
     sweep_fits = sweep_seconds(scenario) < SWEEP_SHARE * scenario.limit
     given = len(site.of(Work.MATCH)) * (site.stop - RESTART_S) - site.faults
     faulty = {scene.batch for scene in site.scenes if scene.is_faulty}
+    matches = zip(state.batches, state.matches_of_batches(), strict=True)
+    matched = {batch for batch, count in matches if count}
     made = {pairs[record.index].group for record in report.records if record.scene is not None}
     return Ran(
         scenario,
@@ -451,7 +454,8 @@ def simulate(scenario: Scenario, store: Store | None = None, until: float = math
         max(0.0, clock.now - scenario.limit),
         sum(length != scenario.pairs for length in published)
         + (scenario.pairs - swept if sweep_fits else 0),
-        len(set(state.batches) - faulty - made),
+        len(matched - faulty - made),
+        len(state.batches) - len(matched),
         SCENE_MARGIN * scenario.longest_scenes < RESERVE_SHARE * scenario.limit
         and not any(math.isinf(scene.seconds) for scene in site.scenes),
         site.last_job,
