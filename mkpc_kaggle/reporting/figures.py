@@ -59,24 +59,27 @@ def draw_strip(images: tuple[Image, Image], match: PairMatch) -> "Figure":
     figure = new_figure(aspect * height, height)
     # The constrained layout would leave a margin for text that a strip does not have.
     figure.set_layout_engine("none")
-    draw_matches(figure.add_axes((0, 0, 1, 1)), images, match)
+    draw_matches(figure.add_axes((0, 0, 1, 1)), images, match, round(height * DPI))
     return figure
 
 
-def draw_matches(axes: "Axes", images: tuple[Image, Image], match: PairMatch) -> str:
+def draw_matches(
+    axes: "Axes", images: tuple[Image, Image], match: PairMatch, height_px: int | None = None
+) -> str:
     """Draw the images side by side, matches as lines, and critical regions as boxes. Return a
     caption.
 
     Of many matches, an even sample is drawn. In axes coordinates, each image is one unit high.
+    Images are reduced to ``height_px``, if given: matplotlib takes several times as long to do it.
     """
     from matplotlib.collections import LineCollection
 
     ends: list[NDArray[np.float64]] = []
     left = 0.0
     for side, points in enumerate((match.matches.points0, match.matches.points1)):
-        view = _upright(images[side])
+        view = _upright(images[side], height_px)
         width, height = view.content
-        _show(axes, images[side], match.regions and match.regions[side], 1 / height, left)
+        _show(axes, images[side], view, match.regions and match.regions[side], 1 / height, left)
         # (0, 0) is the centre of a pixel, and the corner of the picture
         ends.append((view.from_image(points) + 0.5) / height + (left, 0))
         left += width / height
@@ -100,7 +103,8 @@ def draw_matches(axes: "Axes", images: tuple[Image, Image], match: PairMatch) ->
 def _draw_clusters(
     axes: "Axes", image: Image, match: PairMatch, config: MkpcConfig, side: int
 ) -> None:
-    _show(axes, image, match.regions and match.regions[side])
+    view = _upright(image)
+    _show(axes, image, view, match.regions and match.regions[side])
     axes.set(xticks=[], yticks=[])
     if match.regions is None:
         axes.set_title("no stage 2: no critical region", loc="left")
@@ -110,7 +114,7 @@ def _draw_clusters(
     stage1 = match.matches[match.in_stage(1)]
     points = stage1.points1 if side else stage1.points0
     clusters = find_clusters(points, image.size, config)
-    shown = _upright(image).from_image(points) + 0.5  # (0, 0) is the top-left corner in the figure
+    shown = view.from_image(points) + 0.5  # (0, 0) is the top-left corner in the figure
     x, y = shown[~clusters.in_kept].T
     axes.scatter(x, y, s=8, color=DROPPED, marker="x", linewidths=0.7)
     for rank, label in enumerate(clusters.kept):
@@ -125,12 +129,16 @@ def _draw_clusters(
 
 
 def _show(
-    axes: "Axes", image: Image, region: CriticalRegion | None, scale: float = 1.0, left: float = 0.0
+    axes: "Axes",
+    image: Image,
+    view: View,
+    region: CriticalRegion | None,
+    scale: float = 1.0,
+    left: float = 0.0,
 ) -> None:
-    """Draw an image upright, from (left, 0) with pixels ``scale`` wide, and its critical region."""
+    """Draw a view of an image, from (left, 0) with pixels ``scale`` wide, and its critical region."""
     from matplotlib.patches import Polygon
 
-    view = _upright(image)
     width, height = view.content
     axes.imshow(view.render(image.pixels), extent=(left, left + scale * width, scale * height, 0))
     if region is not None:
@@ -148,9 +156,13 @@ def _show(
         )
 
 
-def _upright(image: Image) -> View:
-    """Return the upright view of the whole image at its original size."""
-    return View.fit(Box.whole(image.size), long_side=max(image.size), turns=image.turns)
+def _upright(image: Image, height_px: int | None = None) -> View:
+    """Return the upright view of the whole image, up to ``height_px`` high if given."""
+    view = View.fit(Box.whole(image.size), long_side=max(image.size), turns=image.turns)
+    if height_px is None or view.content.height <= height_px:
+        return view
+    long_side = round(max(image.size) * height_px / view.content.height)
+    return View.fit(Box.whole(image.size), long_side=long_side, turns=image.turns)
 
 
 def draw_cameras(scene: SceneRecord, number: int = 0) -> "Figure":
