@@ -1,13 +1,17 @@
 """Seconds of ``reconstruct`` beside pycolmap alone, on the same folders of images.
 
     python -m benchmarks.folder_seconds --images DIR... [--code NAME=CHECKOUT...] [--rounds N]
-        [--mappers incremental global] [--recipe NAME]
+        [--mappers incremental global] [--recipe NAME] [--render N]
 
 The programs alternate. Each runs in a separate process with one thread per library. Its seconds are
 CPU seconds of that process and of all processes that it started. pycolmap has its default settings,
 and one SIMPLE_PINHOLE camera per image as ``reconstruct`` has. ``reconstruct`` also writes its
 tables and its report. ``--code`` adds other versions of this package, such as
-``before=../checkout``.
+``before=../checkout``. ``--render`` first fills the folder with N rendered photographs of one
+courtyard, taken on a walk.
+
+The column "mapping" has CPU seconds of pycolmap alone, and seconds by the clock of ``reconstruct``,
+with the start of the process.
 """
 
 import argparse
@@ -21,11 +25,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
+
+from mkpc_kaggle.demo.camera import look_at
+from mkpc_kaggle.demo.render import render
+from mkpc_kaggle.demo.world import build_world
+from mkpc_kaggle.progress import counted
 
 HERE = Path(__file__).resolve().parents[1]
 # A library with more threads waits actively, which would count as work.
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+RENDERED = (768, 576)  # width and height of a rendered photograph, in pixels
+RENDERED_FOCAL = 0.9  # over the width
 ALONE = "from benchmarks.folder_seconds import pycolmap_alone; pycolmap_alone(*__import__('sys').argv[1:])"
 
 
@@ -54,6 +66,20 @@ class Program:
         if process.returncode:
             raise SystemExit(f"{self.name}: exit status {process.returncode} on {images}")
         return used.ru_utime + used.ru_stime
+
+
+def write_rendered(folder: Path, count: int) -> None:
+    """Write photographs of a demo world by one camera, on a walk from its west to its east side."""
+    folder.mkdir(parents=True)
+    surfaces, _ = build_world("courtyard")
+    focal = RENDERED_FOCAL * RENDERED[0]
+    for number in counted(range(count), "rendering", "image"):
+        along = number / max(1, count - 1)
+        # Back and forth, and up and down, as of a person who looks for views
+        position = (18 * along - 9, -4 + 3 * np.sin(9 * along), 1.7 + np.sin(23 * along) ** 2)
+        target = (8 * along - 4, 20, 4)
+        picture, _ = render(surfaces, look_at(position, target, focal, RENDERED))
+        cv2.imwrite(str(folder / f"{number:03d}.jpg"), picture.round().astype(np.uint8))
 
 
 def pycolmap_alone(images: str, out: str, mapper: str) -> None:
@@ -147,7 +173,10 @@ def main() -> None:
         "--mappers", nargs="*", default=["incremental", "global"], help="of pycolmap alone"
     )
     parser.add_argument("--recipe", default="auto")
+    parser.add_argument("--render", type=int, metavar="N", help="into the new folder of --images")
     arguments = parser.parse_args()
+    if arguments.render:
+        write_rendered(arguments.images[0], arguments.render)
     print(f"{'folder':<28}{'program':<26}{'round':>6}{'CPU s':>8}{'mapping':>9}{'cameras':>9}")
     for folder in arguments.images:
         measure(programs_of(arguments), folder, arguments.rounds)

@@ -43,24 +43,36 @@ MAX_ERROR_PX = 2.0
 MAX_TRIALS = 300  # RANSAC trials per edge; more trials find the same inliers at five times the cost
 LARGE = 100  # images; all tracks cost too much in larger scenes and improve smaller ones
 TRACKS_PER_IMAGE = 200  # the longest tracks, from which the global mapper starts in a large scene
+# Of the models with shared intrinsics, as in COLMAP's global mapper
+MAX_REFINEMENTS = 5
+MAX_ITERATIONS = 50  # of each bundle adjustment of a refinement
+MIN_CHANGE = 0.0005  # share of the observations; with fewer changes, a model has converged
 SEED = 0
 
 
 def structure_from_motion(
-    merged: MergedGraph, shared: SharedIntrinsics, config: SceneConfig
+    merged: MergedGraph,
+    shared: SharedIntrinsics,
+    config: SceneConfig,
+    former: Sequence[SfmModel] = (),
 ) -> Reconstruction:
     """Return pycolmap's reconstruction of a view graph, with any number of models.
 
     Each image has its own camera, except images with ``shared`` intrinsics. The initial focal
     length is the shared one, the user's or EXIF's. All focal lengths are refined, unless the user
-    knows them exactly.
+    knows them exactly. With ``former`` models of the same graph, their poses are refined instead of
+    computed again.
     """
     # Its warnings about single images would fill the log.
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
     pycolmap.set_random_seed(SEED)
     with pycolmap.Database.open(":memory:") as database:
         _fill(database, merged, shared, config.camera_model)
-        return run_mapper(database, merged.graph, config.threads)
+        if former:
+            models = refine_models(database, merged.graph, config.threads, former)
+        else:
+            models = run_mapper(database, merged.graph, config.threads)
+    return _reconstruction(models, merged.graph)
 
 
 def write_files(
@@ -209,26 +221,94 @@ def verify(merged: MergedGraph, cameras: Sequence[Any]) -> list[Any]:
     return found
 
 
-def run_mapper(database: Any, graph: ViewGraph, threads: int) -> Reconstruction:
-    """Run the global mapper on a filled database. Return its plausible models."""
+def run_mapper(database: Any, graph: ViewGraph, threads: int) -> list[Any]:
+    """Run the global mapper on a filled database. Return pycolmap's models."""
+    common = {"random_seed": SEED, "num_threads": threads}
+    # Smaller models are dropped later anyway.
+    limits = {"min_model_size": MIN_IMAGES, "min_num_matches": MIN_MATCHES}
+    manager = pycolmap.ReconstructionManager()
+    mapper = _mapper_options(graph, threads)
+    options = pycolmap.GlobalPipelineOptions({**common, **limits, "mapper": mapper})
+    pycolmap.GlobalPipeline(options, database, manager).run()
+    return [manager.get(number) for number in range(manager.size())]
+
+
+def _mapper_options(graph: ViewGraph, threads: int) -> Any:
+    """Return the settings of the global mapper for a graph."""
     seed = {"random_seed": SEED}
-    common = seed | {"num_threads": threads}
     # Each part has a separate random generator.
     parts = dict.fromkeys(("rotation_averaging", "global_positioning", "retriangulation"), seed)
     required = (
         {"track_required_tracks_per_view": TRACKS_PER_IMAGE} if len(graph.images) > LARGE else {}
     )
-    mapper = {**common, **parts, **required}
+    mapper = {**seed, "num_threads": threads, **parts, **required}
     # With some exact cameras, the others must still be refined: those are restored afterwards.
     exact = [digest for digest, known in graph.known.items() if not known.sigma]
     if len(exact) == len(graph.images):
         mapper["bundle_adjustment"] = {"refine_focal_length": False, "refine_extra_params": False}
-    # Smaller models are dropped later anyway.
-    limits = {"min_model_size": MIN_IMAGES, "min_num_matches": MIN_MATCHES}
-    manager = pycolmap.ReconstructionManager()
-    options = pycolmap.GlobalPipelineOptions({**common, **limits, "mapper": mapper})
-    pycolmap.GlobalPipeline(options, database, manager).run()
-    found = [manager.get(number) for number in range(manager.size())]
+    return pycolmap.GlobalMapperOptions(mapper)
+
+
+def refine_models(
+    database: Any, graph: ViewGraph, threads: int, former: Sequence[SfmModel]
+) -> list[Any]:
+    """Return pycolmap's models with the cameras of a filled database and the poses of ``former``.
+
+    Points are triangulated again. These are the last steps of the global mapper; its positions,
+    which take most of its time, are not computed again.
+    """
+    options = pycolmap.DatabaseCacheOptions({"min_num_matches": MIN_MATCHES})
+    cache = pycolmap.DatabaseCache.create(database, options)
+    settings = _mapper_options(graph, threads)
+    # The mapper does this itself.
+    settings.bundle_adjustment.ceres.solver_options.num_threads = threads
+    return [_refine(cache, model.colmap, settings) for model in former]
+
+
+def _refine(cache: Any, former: Any, settings: Any) -> Any:
+    """Return a model with the cameras of ``cache``, from the poses of pycolmap's model ``former``."""
+    model = pycolmap.Reconstruction()
+    model.load(cache)
+    # Images have the same numbers in both
+    for number in sorted(former.reg_frame_ids()):
+        model.frame(number).rig_from_world = former.frame(number).rig_from_world
+        model.register_frame(number)
+    mapper = pycolmap.IncrementalMapper(cache)
+    mapper.begin_reconstruction(model)
+    for image in sorted(model.reg_image_ids()):
+        mapper.triangulate_image(settings.retriangulation, image)
+    options = pycolmap.IncrementalMapperOptions(
+        {"random_seed": SEED, "num_threads": settings.num_threads}
+    )
+    # While points come and go, least squares of all tracks; the mapper's robust loss comes last.
+    solver = {"num_threads": settings.num_threads, "max_num_iterations": MAX_ITERATIONS}
+    least_squares = pycolmap.BundleAdjustmentOptions(
+        {"print_summary": False, "ceres": {"use_gpu": False, "solver_options": solver}}
+    )
+    mapper.iterative_global_refinement(
+        MAX_REFINEMENTS, MIN_CHANGE, options, least_squares, settings.retriangulation
+    )
+    _filter_points(mapper.observation_manager, model, settings)
+    mapper.adjust_global_bundle(options, settings.bundle_adjustment)
+    _filter_points(mapper.observation_manager, model, settings)
+    mapper.end_reconstruction(False)
+    model.update_point_3d_errors()
+    return model
+
+
+def _filter_points(observations: Any, model: Any, settings: Any) -> None:
+    """Remove wrong and uncertain points from a model, by the limits of the global mapper."""
+    normalised = pycolmap.ReprojectionErrorType.NORMALIZED
+    observations.filter_points3D_with_large_reprojection_error(
+        settings.max_normalized_reproj_error, set(model.point3D_ids()), normalised
+    )
+    observations.filter_points3D_with_small_triangulation_angle(
+        settings.min_tri_angle_deg, set(model.point3D_ids())
+    )
+
+
+def _reconstruction(found: Sequence[Any], graph: ViewGraph) -> Reconstruction:
+    """Return pycolmap's models with the user's cameras, without implausible images."""
     for model in found:
         apply_known_cameras(model, known_by_name(graph))
     models = filter_models([_sfm_model(model, graph) for model in found])

@@ -77,10 +77,11 @@ def reconstruct_sharing(
 ) -> tuple[list[Reconstruction], SharedIntrinsics]:
     """Return the reconstruction of each component, and the shared intrinsics of the images.
 
-    If images seem to share a camera, a second reconstruction shares intrinsics. It is kept unless
-    images then see fewer points. If the recipe shares cameras, the first reconstruction does too.
-    The refined focal lengths are returned. With a ``directory``, the graph is reconstructed as a
-    whole, moved onto the cameras of the last complete run, and COLMAP's files are written there.
+    If images seem to share a camera, a second reconstruction shares intrinsics. It starts from the
+    first one's poses where these are good enough. It is kept unless images then see fewer points.
+    If the recipe shares cameras, the first reconstruction does too. The refined focal lengths are
+    returned. With a ``directory``, the graph is reconstructed as a whole, moved onto the cameras of
+    the last complete run, and COLMAP's files are written there.
     """
     graph = graph.with_intrinsics(read_intrinsics(config.intrinsics))
     if directory is None:
@@ -98,7 +99,10 @@ def reconstruct_sharing(
     if config.cameras is CameraSharing.AUTO and (
         alike := shared_intrinsics(free, models_of(found))
     ):
-        again = [make(part, alike) for part in parts]
+        again = []
+        for part, former in zip(parts, found, strict=True):
+            refined = refine_complete(part, alike, config, former)
+            again.append(refined or make(part, alike))
         # Images of two cameras that are forced into one lose points.
         before, after = (sum(each.observations for each in made) for made in (found, again))
         if after >= MIN_OBSERVATIONS * before:
@@ -143,17 +147,40 @@ def reconstruct_component(
     return reconstruct_connected(merged, shared, config)
 
 
+def refine_complete(
+    merged: MergedGraph, shared: SharedIntrinsics, config: SceneConfig, former: Reconstruction
+) -> Reconstruction | None:
+    """Return the reconstruction with shared intrinsics from the poses of a ``former`` one.
+
+    Return ``None`` if the mapper might do better: some matched images have no common model, or
+    images see fewer points than before, so the former poses do not fit the shared intrinsics.
+    """
+    matched = {image for edge in merged.graph.edges for image in (edge.first, edge.second)}
+    if not former.models or len(former.models[0].images) < len(matched):
+        return None
+    refined = reconstruct_connected(merged, shared, config, former.models[:1])
+    if refined.observations < MIN_OBSERVATIONS * former.observations:
+        return None
+    return refined
+
+
 def reconstruct_connected(
-    merged: MergedGraph, shared: SharedIntrinsics, config: SceneConfig
+    merged: MergedGraph,
+    shared: SharedIntrinsics,
+    config: SceneConfig,
+    former: Sequence[SfmModel] = (),
 ) -> Reconstruction:
-    """Return pycolmap's reconstruction of a graph, or the reason for its failure."""
+    """Return pycolmap's reconstruction of a graph, or the reason for its failure.
+
+    With ``former`` models, their poses are refined.
+    """
     names = merged.graph.names
     # Only a batch is lost: pairs keep their own F.
     try:
         # Here, because pycolmap may be missing and is slow to import
         from mkpc_kaggle.scene.colmap import structure_from_motion
 
-        return structure_from_motion(merged, shared, config)
+        return structure_from_motion(merged, shared, config, former)
     except ImportError as error:
         return Reconstruction(names, failure=f"pycolmap cannot be imported: {error}")
     except (RuntimeError, ValueError) as error:

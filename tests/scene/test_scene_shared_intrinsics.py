@@ -10,13 +10,15 @@ from benchmarks.synthetic_scene import SyntheticScene, registered_images, synthe
 from mkpc_kaggle.geometry.cameras import Camera, relative_pose
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
+from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import RobustConfig
 from mkpc_kaggle.recipe import CameraSharing, SceneConfig
+from mkpc_kaggle.scene import colmap
 from mkpc_kaggle.scene.choose import estimate_at_known_focals
 from mkpc_kaggle.scene.reconstruct import Solution, reconstruct_batch, reconstruct_sharing
 from mkpc_kaggle.scene.reconstruction import RegisteredImage, SfmModel
 from mkpc_kaggle.scene.shared_intrinsics import shared_intrinsics
-from mkpc_kaggle.scene.view_graph import BatchImage, ViewGraph
+from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair, ViewGraph
 
 WIDE = Size(800, 600)
 TALL = Size(600, 800)
@@ -127,6 +129,53 @@ def test_shared_intrinsics_stay_unless_they_explain_fewer_points_and_the_files_a
     }
     with pycolmap.Database.open(str(tmp_path / "database.db")) as database:
         assert (len(written), database.num_cameras()) == (cameras, cameras)
+
+
+@pytest.fixture
+def mappings(monkeypatch) -> list[int]:
+    """The number of images of each run of the global mapper."""
+    sizes = []
+    run = colmap.run_mapper
+
+    def counted(database, graph, threads):
+        sizes.append(len(graph.images))
+        return run(database, graph, threads)
+
+    monkeypatch.setattr(colmap, "run_mapper", counted)
+    return sizes
+
+
+def test_shared_intrinsics_start_from_the_poses_of_the_first_reconstruction(mappings, monkeypatch):
+    scene = synthetic_scene(7, 12, points=250, focals=[FOCAL] * 7, seed=1)
+    refined = reconstruct_batch(scene.pairs, CONFIG)
+    assert mappings == [7]
+    monkeypatch.setattr("mkpc_kaggle.scene.reconstruct.refine_complete", lambda *_: None)
+    mapped = reconstruct_batch(scene.pairs, CONFIG)
+    assert mappings == [7, 7, 7]
+    # The same optimum, from other starts
+    assert focals_of(refined) == pytest.approx(focals_of(mapped), rel=1e-3)
+    for found, other in zip(refined.choices, mapped.choices, strict=True):
+        assert found.from_scene
+        assert abs(np.sum(found.F * other.F)) == pytest.approx(1, abs=1e-4)
+
+
+def test_an_incomplete_reconstruction_is_mapped_again_with_shared_intrinsics(mappings):
+    scene = synthetic_scene(7, points=300, focals=[FOCAL] * 7)
+    # It matches an image of the scene, and nothing of the scene is in it.
+    stray = BatchImage("stray", "stray", scene.images[0].size)
+    points = np.random.default_rng(0).uniform(0, 600, (2, 40, 2)).astype(np.float32)
+    wrong = BatchPair(scene.images[0], stray, Matches(*points, np.ones(40, np.float32)))
+    (found,) = reconstruct_batch([*scene.pairs, wrong], CONFIG).reconstructions
+    assert (found.registered, mappings) == (7, [8, 8])
+
+
+def test_poses_with_which_images_see_fewer_points_are_mapped_again(mappings, monkeypatch):
+    scene = synthetic_scene(6, points=300)
+    # The images have different focal lengths, so no poses fit a shared one.
+    everything = {image.digest: FOCAL for image in scene.images}
+    monkeypatch.setattr("mkpc_kaggle.scene.reconstruct.shared_intrinsics", lambda *_: everything)
+    assert len(set(focals_of(reconstruct_batch(scene.pairs, CONFIG)))) == 6
+    assert mappings == [6, 6]
 
 
 def test_an_image_that_the_scene_lacks_has_the_shared_focal_length():
