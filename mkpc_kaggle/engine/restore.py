@@ -9,6 +9,7 @@ import numpy as np
 
 from mkpc_kaggle.engine.image_files import known_images
 from mkpc_kaggle.engine.records import SCENE, Row, Table
+from mkpc_kaggle.engine.schedule import sweeping_unit
 from mkpc_kaggle.engine.state import State
 from mkpc_kaggle.engine.store import Store
 from mkpc_kaggle.scene.export import has_files
@@ -29,12 +30,22 @@ def restore(state: State, store: Store, digests: Mapping[str, str]) -> None:
     contents = {index: state.contents(index) for index in known}
     old = {index: rows[text] for index, text in contents.items() if text in rows}
     units = [name for name, _ in former.units]
+    # An extra pair has points of the sweeping unit, and no estimate. The store may have more, of another
+    # recipe, or of a run in which it was a row, and a scene must not depend on that.
+    sweep = sweeping_unit(state)
+    own_rows = [index for index in known if index < state.rows]
     # Stage 1 first, because the keys of stage 2 depend on it. Then estimates, then scenes, for the
     # same reason.
     for stage in (False, True):
         numbers = np.flatnonzero(state.is_crop == stage).tolist()
-        _restore_points(state, store, known, numbers, _former_points(state, old, units, numbers))
-    _restore_estimates(state, store, known, old)
+        wanted = [
+            (index, number)
+            for index in known
+            for number in numbers
+            if index < state.rows or number == sweep
+        ]
+        _restore_points(state, store, wanted, _former_points(state, old, units, numbers))
+    _restore_estimates(state, store, own_rows, old)
     _restore_scenes(state, store, former, digests)
 
 
@@ -57,19 +68,15 @@ def _former_points(
 def _restore_points(
     state: State,
     store: Store,
-    known: list[int],
-    numbers: list[int],
+    wanted: list[tuple[int, int]],
     former: Mapping[tuple[int, int], str],
 ) -> None:
-    # Only pairs whose two images are known can have results.
     # All keys first, because one query for thousands of keys is much faster than one for each.
     today: dict[tuple[int, int], str] = {}
-    for index in known:
+    for index, number in wanted:
         images = state.images_of(index)
         assert images
-        first = state.first_stage(index)
-        for number in numbers:
-            today[index, number] = state.key_of(index, number, images, first)
+        today[index, number] = state.key_of(index, number, images, state.first_stage(index))
     about = store.about([*today.values(), *former.values()])
     for (index, number), key in today.items():
         is_current = key in about

@@ -4,7 +4,7 @@ be pruned.
 
 import os
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -70,12 +70,17 @@ class Room:
         self.ask()
 
     def ask(
-        self, recipe: Recipe = RECIPE, count: int = 3, pairs: list[Pair] | None = None, **other: str
+        self,
+        recipe: Recipe = RECIPE,
+        count: int = 3,
+        pairs: list[Pair] | None = None,
+        extra: Sequence[Pair] = (),
+        **other: str,
     ) -> None:
         """Begin a run, as the loop does. ``other`` are other settings."""
         pairs = pairs or [pair_of(number) for number in range(count)]
         request = Request(pairs, recipe, keys_of(recipe, **other), about=About({"name": "x"}))
-        self.state = State(request)
+        self.state = State(request, extra)
         names = [name for names in self.state.names for name in names]
         restore(self.state, self.store, stored_digests(self.store, names))
         budget = Budget(0.0)
@@ -289,6 +294,22 @@ def test_reports_show_the_f_that_was_written_last_and_decide_nothing_themselves(
     record = read_records(whole.store)[2]
     assert (record.source, len(record.units)) == ("pair", 1)
     assert np.array_equal(record.chosen_fundamental, F)
+
+
+def test_what_an_extra_pair_got_as_a_row_or_by_another_recipe_does_not_change_a_scene(
+    room: Room,
+) -> None:
+    extra = {"pairs": [pair_of(1), pair_of(2)], "extra": [pair_of(0)]}
+    for index in range(3):
+        room.match(index, SWEEP)
+    room.ask(**extra)
+    _, fresh = room.state.scene_inputs("one")
+    room.ask()
+    room.match(0, SECOND)
+    room.estimate(0)
+    room.ask(**extra)
+    _, again = room.state.scene_inputs("one")
+    assert again == fresh
 
 
 def test_rows_of_the_same_images_share_their_points_and_turned_images_are_others(
