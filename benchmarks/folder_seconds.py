@@ -1,4 +1,4 @@
-"""Seconds of ``reconstruct`` beside pycolmap alone, on the same folders of images.
+"""Seconds of ``reconstruct`` next to pycolmap alone, on the same folders of images.
 
     python -m benchmarks.folder_seconds --images DIR... [--code NAME=CHECKOUT...] [--rounds N]
         [--mappers incremental global] [--recipe NAME] [--render N]

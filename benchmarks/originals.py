@@ -1,4 +1,4 @@
-"""ALIKED + LightGlue and XFeat + LighterGlue beside the original code: CPU seconds, and share of
+"""ALIKED + LightGlue and XFeat + LighterGlue next to the original code: CPU seconds, and share of
 equal results.
 
 python -m benchmarks.originals --train-dir DIR --weights DIR [--scene reichstag_26] [--pairs 20]
@@ -43,7 +43,7 @@ from mkpc_kaggle.weights import WeightStore
 LONG_SIDE_PX = 1024
 SAME_PX = 0.01  # keypoints at this distance are equal
 COMPLETE = {"depth_confidence": -1.0, "width_confidence": -1.0}
-# What the published code sets for its own weights.
+# The shapes that the published code sets for its own weights
 SHAPES = {
     "aliked_lightglue": {"input_dim": 128},
     "xfeat_lighterglue": {
@@ -60,7 +60,7 @@ EARLY = {
 
 
 class Record:
-    """What was measured: CPU seconds of this process by row and side, and shares of equal results by
+    """Measurements: CPU seconds of this process by row and side, and shares of equal results by
     row.
     """
 
@@ -79,7 +79,7 @@ class Record:
 class Comparison:
     """A matcher of ours and the published networks, each *complete* and *early*.
 
-    ``aliked`` is kornia's network, beside which our ALIKED is measured; ``None`` for XFeat.
+    ``aliked`` is kornia's network, to which our ALIKED is compared; ``None`` for XFeat.
     """
 
     matcher: str

@@ -16,9 +16,8 @@ MAX_INTEGER = 2**63 - 1  # as in TOML
 def from_table(cls: type[Config], table: Mapping[str, Any], where: str) -> Config:
     """Build the dataclass ``cls`` from a TOML table.
 
-    ``where`` names the table in messages. Raises :class:`UserError` for an unknown key (with a list
-    of the known ones), a missing key, a wrong type, or a value that the dataclass refuses with a
-    ``ValueError``.
+    ``where`` names the table in messages. Raises :class:`UserError` for an unknown or missing key
+    and for a wrong type; also for a value that the dataclass refuses with a ``ValueError``.
     """
     known: dict[str, Field[Any]] = {field.name: field for field in fields(cls)}  # type: ignore[arg-type]
     check_keys(table, known, where)

@@ -1,4 +1,4 @@
-"""Errors and warnings for users."""
+"""Errors and warnings for users, and parts of their texts."""
 
 import warnings
 from collections.abc import Iterator
@@ -37,6 +37,14 @@ def read_text(path: Path) -> str:
         raise UserError(f"{path} cannot be read: {error.strerror}") from error
     except UnicodeDecodeError as error:
         raise UserError(f"{path} is not UTF-8 text") from error
+
+
+def plural(count: int, noun: str) -> str:
+    """Return the count with its noun, such as "1 batch" or "2 batches"."""
+    if count == 1:
+        return f"{count} {noun}"
+    ending = "es" if noun.endswith("ch") else "s"  # batches, matches
+    return f"{count} {noun}{ending}"
 
 
 def shown(name: object) -> str:

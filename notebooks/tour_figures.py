@@ -276,9 +276,12 @@ def draw_pose_errors(errors: Mapping[str, PoseError]) -> "Figure":
         bars = axes.barh(
             names, np.where(known, angles, 0), color=list(COLOURS[: len(names)]), height=0.6
         )
-        labels = [f"{angle:.2f}" if ok else "no F" for angle, ok in zip(angles, known, strict=True)]
+        # Significant digits: the errors of a pair may be thousandths of a degree.
+        labels = [f"{angle:.3g}" if ok else "no F" for angle, ok in zip(angles, known, strict=True)]
         axes.bar_label(bars, labels, padding=3)
         axes.margins(x=0.15)
+        # With more ticks, the numbers of both panels would touch.
+        axes.locator_params(axis="x", nbins=5)
     panels[0].invert_yaxis()
     return figure
 

@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 
 from mkpc_kaggle.data.competition import read_test_side, submission_problems
+from mkpc_kaggle.errors import plural
 
 HELP = """\
 Compare a submission with test.csv: header, ids and their order, nine finite numbers per row.
@@ -22,11 +23,11 @@ def run(arguments: argparse.Namespace) -> int:
     pairs = read_test_side(arguments.test_dir)
     problems = submission_problems(arguments.submission, [pair.id for pair in pairs])
     if not problems:
-        print(f"good: {len(pairs)} rows")
+        print(f"good: {plural(len(pairs), 'row')}")
         return 0
     lines = problems[:MAX_LINES]
     if len(problems) > MAX_LINES:
         lines.append(f"... and {len(problems) - MAX_LINES} more")
-    lines.append(f"{arguments.submission}: {len(problems)} problems")
+    lines.append(f"{arguments.submission}: {plural(len(problems), 'problem')}")
     print("\n".join(lines))
     return 1

@@ -9,7 +9,7 @@ import numpy as np
 from mkpc_kaggle.cli import options
 from mkpc_kaggle.data.outputs import replacing, require_apart
 from mkpc_kaggle.engine.console import unblocked
-from mkpc_kaggle.errors import UserError, writing
+from mkpc_kaggle.errors import UserError, plural, writing
 from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
 from mkpc_kaggle.pipeline.pair import PairMatch
 from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher, to_image
@@ -91,13 +91,14 @@ def _lines(match: PairMatch, recipe: str) -> list[str]:
     lines = [f"F, by recipe {recipe}; x1^T F x0 = 0 in pixels of the stored files:"]
     lines += [" ".join(f"{value: .9e}" for value in row) for row in found.matrix]
     lines += [f"this is the fallback: {found.failure}"] if found.failure else []
-    lines.append(f"{len(match.matches)} matches, {found.inlier_count} inliers")
+    inliers = plural(found.inlier_count, "inlier")
+    lines.append(f"{plural(len(match.matches), 'match')}, {inliers}")
     verdict = "the images may not overlap"
     if found.stats.support >= MIN_SUPPORT:
         verdict = "the images overlap"
     lines.append(f"{found.stats.support:.1f} times the inliers expected by chance: {verdict}")
     for result in match.results:
-        counts = f"{len(result.matches):>6} matches  {result.seconds:.2f} s"
+        counts = f"{plural(len(result.matches), 'match'):>14}  {result.seconds:.2f} s"
         remark = result.failure or result.note
         lines.append(f"  {result.unit.name:<30}{counts}  {remark}".rstrip())
     for number, region in enumerate(match.regions or ()):

@@ -4,7 +4,8 @@ import argparse
 from pathlib import Path
 
 from mkpc_kaggle.cli import options
-from mkpc_kaggle.package.metadata import LATEST
+from mkpc_kaggle.errors import plural
+from mkpc_kaggle.package.metadata import DATASET_METADATA, LATEST
 from mkpc_kaggle.package.package import Request, make_package
 from mkpc_kaggle.package.wheels import PYTHONS
 
@@ -52,6 +53,8 @@ def run(arguments: argparse.Namespace) -> None:
         image=arguments.image,
         models=arguments.models,
     )
+    # Kaggle creates a dataset once; each later upload is a version of it.
+    is_packaged = (out / "dataset" / DATASET_METADATA).is_file()
     package = make_package(request)
     for folder, items in (("dataset", package.dataset), ("kernel", package.kernel)):
         rows = [("file", "bytes", "licence", "")]
@@ -60,7 +63,7 @@ def run(arguments: argparse.Namespace) -> None:
             size = item.source.stat().st_size
             total += size
             rows.append((item.name, str(size), item.licence or "-", item.note))
-        rows.append((f"{len(items)} files", str(total), "", ""))
+        rows.append((plural(len(items), "file"), str(total), "", ""))
         print(out / folder)
         options.print_table(rows)
         print()
@@ -68,7 +71,7 @@ def run(arguments: argparse.Namespace) -> None:
     if package.restricted:
         names = ", ".join(f"{item.name} ({item.licence})" for item in package.restricted)
         print(f"{_PRIVATE if arguments.private else _LEFT_OUT}: {names}\n")
-    print(_NEXT.format(out=out))
+    print((_NEXT_VERSION if is_packaged else _NEXT).format(out=out))
 
 
 _LEFT_OUT = (
@@ -80,4 +83,9 @@ share it, and check what the licences say about competitions"""
 _NEXT = """\
 Next, with the `kaggle` command (README.md; details in docs/kaggle.md):
   kaggle datasets create -p {out}/dataset
+  kaggle kernels push -p {out}/kernel"""
+_NEXT_VERSION = """\
+Next, with the `kaggle` command. The folder was packaged before, so the dataset on Kaggle gets a new version. If it
+is not on Kaggle yet, the first command is `kaggle datasets create -p {out}/dataset`:
+  kaggle datasets version -p {out}/dataset -m "new files"
   kaggle kernels push -p {out}/kernel"""

@@ -11,6 +11,7 @@ from mkpc_kaggle.data.masks import Masks
 from mkpc_kaggle.engine.budget import format_duration
 from mkpc_kaggle.engine.console import say
 from mkpc_kaggle.engine.session import interruptible
+from mkpc_kaggle.errors import plural
 from mkpc_kaggle.recipe import CameraSharing
 from mkpc_kaggle.reconstruction.coordinates import forget_coordinates, keep_coordinates
 from mkpc_kaggle.reconstruction.directory import (
@@ -131,7 +132,7 @@ def run(arguments: argparse.Namespace) -> int:
         assembly = options.assembly_of(arguments, arguments.recipe, arguments.mode, interrupt)
         recipe = for_cameras(assembly.recipe, arguments.camera, known)
         assembly = replace(assembly, recipe=recipe, masks=masks)
-        options.say_start(f"{len(files)} images", assembly, work_dir)
+        options.say_start(plural(len(files), "image"), assembly, work_dir)
         result = reconstruct_folder(
             root,
             datasets,
@@ -155,7 +156,7 @@ def run(arguments: argparse.Namespace) -> int:
         ]
         lines = [*options.plan_lines(arguments, result.report), *_lines(result, root), *problems]
         say("\n".join(filter(None, [*lines, f"results: {out}"])))
-        # Without pairs there is nothing to report.
+        # A run without pairs has no report.
         page = out / "report.html" if result.pairs else None
         return options.finish(session, page, result.pairs)
 
@@ -164,7 +165,8 @@ def _lines(result: FolderResult, root: Path) -> Iterator[str]:
     """Yield lines about the run, each dataset and the errors."""
     report = result.report
     ended = f"{report.ending} after {format_duration(report.seconds)}"
-    yield f"{len(result.pairs)} pairs: {ended}; {report.units_run} units run, {report.estimated} F estimated"
+    done = f"{plural(report.units_run, 'unit')} run, {report.estimated} F estimated"
+    yield f"{plural(len(result.pairs), 'pair')}: {ended}; {done}"
     # Of the datasets that the run reached
     reasons = {scene.batch: scene.failure for scene in report.scenes}
     batches = batch_names(root, result.cameras)
@@ -176,7 +178,8 @@ def _lines(result: FolderResult, root: Path) -> Iterator[str]:
             if models
             else reasons.get(batches[name], "too few pairs, or too little time")
         )
-        yield f"{batches[name]}: {models.total()} of {len(found)} images have a camera: {why}"
+        placed = f"{models.total()} of {plural(len(found), 'image')} with a camera"
+        yield f"{batches[name]}: {placed}: {why}"
     yield from weakest_line(report.scenes)
     yield from pending_lines(report)
     # An image that cannot be read fails in all of its pairs, with one text.

@@ -8,6 +8,7 @@ from mkpc_kaggle.data.competition import read_test_side, test_side
 from mkpc_kaggle.data.outputs import require_apart
 from mkpc_kaggle.engine.console import say
 from mkpc_kaggle.engine.session import first_version, interruptible, submit
+from mkpc_kaggle.errors import plural
 from mkpc_kaggle.reporting.summary import summary, trouble
 
 HELP = """\
@@ -70,7 +71,7 @@ def run(arguments: argparse.Namespace) -> int:
             options.watched_session(arguments, work_dir, interrupt) as session,
         ):
             assembly = options.assembly_of(arguments, arguments.recipe, arguments.mode, interrupt)
-            options.say_start(f"{len(pairs)} pairs", assembly, work_dir)
+            options.say_start(plural(len(pairs), "pair"), assembly, work_dir)
             _, images = test_side(arguments.test_dir)
             report = submit(pairs, assembly, session, output, str(images))
             session.status = int(bool(report.unwritten or trouble(report)))

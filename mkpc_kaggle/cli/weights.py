@@ -6,7 +6,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from mkpc_kaggle.cli import options
-from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.errors import UserError, plural
 from mkpc_kaggle.matchers.registry import UnusableError, matcher_names, spec_of
 from mkpc_kaggle.pipeline.availability import fit_of, slots_of
 from mkpc_kaggle.recipe import load_recipe, recipe_names
@@ -117,7 +117,7 @@ def _verify(arguments: argparse.Namespace) -> int:
         return 0
     options.print_table(rows)
     refused = sum(not found.usable for found in files)
-    print(f"{len(rows) - 1} files, {refused} refused, {len(missing)} missing")
+    print(f"{plural(len(rows) - 1, 'file')}, {refused} refused, {len(missing)} missing")
     return int(bool(refused or missing))
 
 

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mkpc_kaggle.data.outputs import replacing
-from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.errors import UserError, plural
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Matrix3
 
@@ -214,9 +214,9 @@ def submission_problems(path: Path, sample_ids: Sequence[str]) -> list[str]:
     found = dict.fromkeys(sample for sample, _ in rows)
     wanted = dict.fromkeys(sample_ids)
     if missing := [sample for sample in wanted if sample not in found]:
-        problems.append(f"{len(missing)} samples are missing, the first is {missing[0]}")
+        problems.append(f"missing samples: {len(missing)}, the first is {missing[0]}")
     elif surplus := [sample for sample in found if sample not in wanted]:
-        problems.append(f"{len(surplus)} samples are not in test.csv, the first is {surplus[0]}")
+        problems.append(f"samples not in test.csv: {len(surplus)}, the first is {surplus[0]}")
     elif [sample for sample, _ in rows] != [*wanted]:
         problems.append("the samples are not in the order of test.csv, or a sample appears twice")
     for sample, cell in rows:
@@ -328,7 +328,7 @@ def _require_cells(path: Path, count: int) -> None:
         for row in filter(None, table):
             if len(row) != count:
                 where = f"{path}, line {table.line_num}"
-                raise UserError(f"{where}: {len(row)} cells, the header has {count}")
+                raise UserError(f"{where}: {plural(len(row), 'cell')}, the header has {count}")
 
 
 def _refusal(path: Path, error: Exception, skipped: int) -> str:
@@ -337,7 +337,8 @@ def _refusal(path: Path, error: Exception, skipped: int) -> str:
     if counts is None:
         return f"{path} cannot be read as a table: {error}"
     expected, line, saw = counts.groups()
-    return f"{path}, line {skipped + int(line)}: {saw} cells, the header has {expected}"
+    cells = plural(int(saw), "cell")
+    return f"{path}, line {skipped + int(line)}: {cells}, the header has {expected}"
 
 
 class _LimitedLines(TextIOBase):
@@ -407,4 +408,5 @@ def _numbers(cell: str, where: str, count: int) -> NDArray[np.float64]:
     with suppress(ValueError):
         if len(parts) == count:
             return np.array([float(part) for part in parts])
-    raise UserError(f"{where}: expected {count} numbers, found {len(parts)} words: {cell!r}")
+    words = plural(len(parts), "word")
+    raise UserError(f"{where}: expected {count} numbers, found {words}: {cell!r}")

@@ -87,7 +87,7 @@ def require_table(path: Path, columns: Iterable[str]) -> None:
                 if stream.readline(1 << 16).rstrip("\n") == ",".join(columns):
                     return
     if os.path.lexists(path):
-        raise UserError(f"{path} exists and is no such table; name another directory")
+        raise UserError(f"{path} exists and is another table; name another directory")
 
 
 def weights_of_environment() -> list[Path]:

@@ -40,7 +40,7 @@ from mkpc_kaggle.engine.run import EventLog, JobHandler, Run
 from mkpc_kaggle.engine.schedule import Crew, NextWork, is_complete, next_work
 from mkpc_kaggle.engine.state import State, extra_pairs_of
 from mkpc_kaggle.engine.store import Store
-from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.errors import UserError, plural
 
 # A job of unknown cost that takes longer than this share of the time left hangs. A first job may be
 # slow (a warm-up, a slow disk), but the rest of the run must be able to make up for it.
@@ -152,7 +152,8 @@ class Engine:
             resumed=int(state.complete.sum()),
         )
         if self._asked.resumed:
-            self._progress.note(f"{self._asked.resumed} of {state.rows} pairs are there")
+            pairs = plural(state.rows, "pair")
+            self._progress.note(f"{self._asked.resumed} of {pairs} from earlier runs")
         # Publish existing results before any work: a former F is better than the fallback.
         self._asked.publication.publish()
         self._loop()
@@ -207,7 +208,8 @@ class Engine:
         digests = update_digests(self.store, files, self._is_over)
         if changed := digests.changed:
             count = sum(not changed.isdisjoint(names) for names in state.names)
-            text = f"{len(changed)} images have changed: their {count} pairs are matched again"
+            images = plural(len(changed), "image")
+            text = f"{images} changed; matching {plural(count, 'pair')} again"
             console.warn(text)
             self.log.fault(text)
         return digests.by_name

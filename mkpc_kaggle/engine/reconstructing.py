@@ -9,6 +9,7 @@ from mkpc_kaggle.engine.restore import EXPORT
 from mkpc_kaggle.engine.run import HANG_FACTOR, Run
 from mkpc_kaggle.engine.state import State
 from mkpc_kaggle.engine.store import Kind, Result
+from mkpc_kaggle.errors import plural
 from mkpc_kaggle.scene.reconstruct import Solution
 
 
@@ -44,7 +45,7 @@ class Reconstructing:
             export=export,
         )
         about = format_duration(self.forecast(job))
-        text = f"reconstructing its cameras from {len(pairs)} pairs, about {about}"
+        text = f"reconstructing its cameras from {plural(len(pairs), 'pair')}, about {about}"
         run.progress.note(f"batch {batch}: {text}")
         return job
 
@@ -79,9 +80,9 @@ class Reconstructing:
         # Otherwise pairs have got other results meanwhile, and the batch stays stale.
         if state.scene_inputs(job.batch)[1] == job.key:
             state.stale.discard(job.batch)
-        text = f"{record.registered} of {record.images} images"
+        text = f"{record.registered} of {plural(record.images, 'image')}"
         run.log.note(EventKind.SCENE, f"{job.batch}: {text}")
-        run.progress.note(f"batch {job.batch}: {text} have a camera")
+        run.progress.note(f"batch {job.batch}: {text} with a camera")
 
     def lose(self, job: SceneJob, failure: Failure) -> None:
         run = self._run

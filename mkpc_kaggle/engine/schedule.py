@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from mkpc_kaggle.engine.budget import ESTIMATE, Budget, Costs, format_duration
 from mkpc_kaggle.engine.jobs import MatchJob, Phase
 from mkpc_kaggle.engine.state import Mask, State
+from mkpc_kaggle.errors import plural
 
 # Maximum share of the time after the sweep for extra pairs: they only serve scenes.
 CONNECT_SHARE = 0.1
@@ -388,4 +389,4 @@ def outlook(state: State, costs: Costs, budget: Budget, crew: Crew, now: float) 
         return f"{text}; there is no time limit"
     fit = min(prefix_that_fits(view), len(usable))
     left = format_duration(view.left)
-    return f"{text}; {fit} of {len(usable)} units fit in the remaining {left}"
+    return f"{text}; {fit} of {plural(len(usable), 'unit')} can run in the remaining {left}"

@@ -236,8 +236,8 @@ def batch_pair(
 ) -> BatchPair:
     """Return a pair of a batch with its points.
 
-    Images have their file names, or with ``keeps_paths`` their paths below the root, as in COLMAP's
-    files, in tables of intrinsics and in the cameras of an earlier run.
+    Images have their file names. With ``keeps_paths`` they have their paths below the root, as in
+    COLMAP's files, in tables of intrinsics and in the cameras of an earlier run.
     """
     image0, image1 = (
         image if keeps_paths else replace(image, name=Path(image.name).name)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from mkpc_kaggle.config import POSITIVE
 from mkpc_kaggle.data.competition import read_rows
-from mkpc_kaggle.errors import UserError, shown
+from mkpc_kaggle.errors import UserError, plural, shown
 
 OUTLIERS = "outliers"
 POSE_COLUMNS = ("dataset", "scene", "image", "rotation_matrix", "translation_vector")
@@ -65,7 +65,8 @@ def score_imc2025(directory: Path, submission: Path) -> list[DatasetScore]:
     for name, scenes in truth.items():
         _require_poses(labels, name, scenes)
         if wrong := _images(scenes) ^ _images(found.get(name, {})):
-            message = f"{len(wrong)} images of {name} are missing or unknown, such as {min(wrong)}"
+            count = plural(len(wrong), "image")
+            message = f"{count} of {name} missing or unknown, such as {min(wrong)}"
             raise UserError(f"{submission}: {shown(message)}")
         for scene in scenes:
             if scene != OUTLIERS and scene not in thresholds.get(name, {}):

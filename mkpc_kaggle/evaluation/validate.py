@@ -20,7 +20,7 @@ from mkpc_kaggle.engine.records import PairRecord, Table, read_points
 from mkpc_kaggle.engine.request import RunReport
 from mkpc_kaggle.engine.session import Session, run_pairs
 from mkpc_kaggle.engine.store import Store
-from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.errors import UserError, plural
 from mkpc_kaggle.geometry import metrics
 from mkpc_kaggle.geometry.coordinates import Matrix3
 from mkpc_kaggle.geometry.matches import Matches
@@ -313,7 +313,8 @@ def score_table(validation: Validation) -> list[str]:
     if missing := validation.missing:
         more = f" and {len(missing) - MAX_NAMES} more" if len(missing) > MAX_NAMES else ""
         names = ", ".join(missing[:MAX_NAMES]) + more
-        lines.append(f"{len(missing)} samples have no row and count as failed: {names}")
+        count = plural(len(missing), "sample")
+        lines.append(f"{count} without a row, counted as failed: {names}")
     several = len(validation.steps) > 1
     return ["mAA after each step, AUC after the last:", *lines] if several else lines
 

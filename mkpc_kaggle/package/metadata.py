@@ -11,6 +11,7 @@ from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.version import __version__
 
 COMPETITION = "image-matching-challenge-2022"
+DATASET_METADATA = "dataset-metadata.json"
 DATASET_SLUG = "mkpc-kaggle"
 KERNEL_TITLE = "MKPC submission"
 # Kaggle derives the slug from the title; both must agree.

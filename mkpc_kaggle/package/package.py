@@ -14,6 +14,7 @@ from mkpc_kaggle.package.files import (
     write_files,
 )
 from mkpc_kaggle.package.metadata import (
+    DATASET_METADATA,
     LATEST,
     MODELS,
     check_owner,
@@ -125,7 +126,7 @@ def _dataset_items(
     )
     requirements = "\n".join(install_lines(own, others)) + "\n"
     return (
-        _text(staging, "dataset-metadata.json", dataset_metadata(request.owner, licences)),
+        _text(staging, DATASET_METADATA, dataset_metadata(request.owner, licences)),
         *(Item(path.name, path, licence_of(path)) for path in (own, *others)),
         _text(staging, "requirements.txt", requirements),
         _text(staging, "README.md", dataset_page(licences)),

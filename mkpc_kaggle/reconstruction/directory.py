@@ -110,7 +110,7 @@ def _in_the_way(
     """Yield the user's links and files at the paths of results; in an unmarked directory, all links
     and files.
     """
-    # Hidden files, such as those of file managers, are in nobody's way.
+    # Hidden files of file managers, for example, are in nobody's way.
     if marked is None:
         yield from (path for path in out.rglob("[!.]*") if path.is_symlink() or not path.is_dir())
     for name in results:

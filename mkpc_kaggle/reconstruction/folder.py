@@ -45,7 +45,7 @@ def read_folder(root: Path) -> Datasets:
             _require_usable(folder, root, files)
             datasets[folder.relative_to(root).as_posix()] = files
     if hidden:
-        warn(f"{len(hidden)} hidden files or folders are passed over, the first is {hidden[0]}")
+        warn(f"hidden files and folders are passed over: {len(hidden)}, the first is {hidden[0]}")
     if not datasets:
         raise UserError(
             f"{root} has no images: name a folder with {', '.join(IMAGE_SUFFIXES)} files"
@@ -53,7 +53,7 @@ def read_folder(root: Path) -> Datasets:
     # Other datasets of a single image are listed without a camera.
     if all(len(files) < 2 for files in datasets.values()):
         name = next(iter(datasets.values()))[0].name
-        raise UserError(f"{root} has a single image, {name}: there is nothing to match")
+        raise UserError(f"{root} has a single image, {name}: matching needs two")
     return dict(sorted(datasets.items()))
 
 

@@ -13,7 +13,7 @@ from mkpc_kaggle.data.competition import evenly_spread
 from mkpc_kaggle.data.images import Image
 from mkpc_kaggle.data.outputs import replacing
 from mkpc_kaggle.engine.records import SceneRecord
-from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.errors import UserError, plural
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Box, View
 from mkpc_kaggle.geometry.critical_region import CriticalRegion, MkpcConfig, find_clusters
@@ -42,7 +42,8 @@ def draw_pair(image0: Image, image1: Image, match: PairMatch, config: MkpcConfig
     figure = new_figure(12, 9)  # inches: legible on a screen of 1,320 pixels
     panels = figure.subplot_mosaic([["matches", "matches"], ["0", "1"]])
     # The title joins what is known: a failure is empty for most pairs.
-    counts = f"{len(match.matches)} matches, {match.estimate.inlier_count} inliers"
+    inliers = plural(match.estimate.inlier_count, "inlier")
+    counts = f"{plural(len(match.matches), 'match')}, {inliers}"
     drawn = draw_matches(panels["matches"], (image0, image1), match)
     panels["matches"].set_title(
         "; ".join(filter(None, [counts, match.estimate.failure, drawn])), loc="left"
@@ -97,7 +98,7 @@ def draw_matches(
         )
         x, y = lines[some].reshape(-1, 2).T
         axes.scatter(x, y, s=5, color=colour, linewidths=0)
-    return f"{len(inliers)} inliers (green) and {len(outliers)} outliers (orange) drawn"
+    return f"{plural(len(inliers), 'inlier')} (green) and {plural(len(outliers), 'outlier')} (orange) drawn"
 
 
 def _draw_clusters(
@@ -123,7 +124,7 @@ def _draw_clusters(
     share = region.box.area / (image.size.width * image.size.height)
     axes.set_title(
         f"critical region: {region.reason}, {100 * share:.0f} % of the image\n"
-        f"{region.kept} of {region.clusters} clusters kept, grey: the other points",
+        f"{region.kept} of {plural(region.clusters, 'cluster')} kept, grey: the other points",
         loc="left",
     )
 
@@ -198,7 +199,7 @@ def _upright_axes(cameras: Sequence[Camera]) -> NDArray[np.float64]:
 def _draw_projected(panel: "Axes", name: str, model: SfmModel, axes: NDArray[np.float64]) -> None:
     """Draw a model's cameras and points as seen from ``name``, projected on ``axes`` (3, 2)."""
     cameras = [found.camera for found in model.images]
-    plain(panel, f"{len(cameras)} cameras from {name}")
+    plain(panel, f"{plural(len(cameras), 'camera')} from {name}")
     points = model.points @ axes
     # A few points of wrong matches lie far away and would shrink all others.
     near = _near(points[:, 0]) & _near(points[:, 1])

@@ -33,7 +33,7 @@ class Cloud:
 def clouds_of(scene: SceneRecord, out: Path) -> Sequence[Cloud]:
     """Return the points of a scene's models from the results of ``reconstruct`` in ``out``.
 
-    Empty if there are none, or if they belong to another run: then the number of points differs.
+    Empty if no results exist, or if they belong to another run: then the number of points differs.
     """
     for folder in (out / scene.batch / SPARSE, out / SPARSE):
         with suppress(OSError, struct.error, ValueError):

@@ -21,7 +21,7 @@ from mkpc_kaggle.data.outputs import replacing
 from mkpc_kaggle.engine.budget import format_duration
 from mkpc_kaggle.engine.console import Progress
 from mkpc_kaggle.engine.records import PairRecord
-from mkpc_kaggle.errors import UserError, printable, writing
+from mkpc_kaggle.errors import UserError, plural, printable, writing
 from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
 from mkpc_kaggle.pipeline.pair import PairMatch
 from mkpc_kaggle.pipeline.two_stage import to_image
@@ -88,7 +88,7 @@ def report_run(
     # Any error, also of matplotlib, of fonts and of a damaged journal
     try:
         log = read_log(work_dir)
-        # Drawings fail most easily: their page replaces one that is there already.
+        # Drawings fail most easily, so a page without them is written first.
         write_report(
             log, path, pairs, undrawn="little time was left; the journal command draws them"
         )
@@ -143,7 +143,9 @@ def report_page(
         **_seconds_section(log),
     }
     page = templates().get_template("report.html")
-    return page.render(log=log, duration=format_duration, undrawn=undrawn, **sections)
+    return page.render(
+        log=log, duration=format_duration, plural=plural, undrawn=undrawn, **sections
+    )
 
 
 def _head(log: RunLog) -> dict[str, Any]:

@@ -108,7 +108,7 @@ def read_log(directory: Path) -> RunLog:
             estimate = Estimate(ModelKind.F, F, inliers, record.failure)
             return record, PairMatch(results, record.regions, estimate)
 
-        # Their points alone are read: those of all pairs may be gigabytes.
+        # The points of other pairs are not read: they may have gigabytes.
         weakest = tuple(map(weak, touched[:MAX_DRAWN_PAIRS]))
         scenes = tuple(read_scenes(store, published).values())
         events = read_events(store)

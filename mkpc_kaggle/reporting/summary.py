@@ -12,6 +12,7 @@ import numpy as np
 from mkpc_kaggle.engine.budget import format_duration
 from mkpc_kaggle.engine.records import NOT_RECONSTRUCTED, PairRecord, SceneRecord
 from mkpc_kaggle.engine.request import Ending, RunReport
+from mkpc_kaggle.errors import plural
 from mkpc_kaggle.geometry.critical_region import RegionReason
 from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
 from mkpc_kaggle.pipeline.availability import UnavailableKind
@@ -29,7 +30,7 @@ Run: TypeAlias = RunReport | RunLog
 def summary(report: RunReport) -> str:
     """Return the summary at the end of a run."""
     resumed = f", {report.resumed} of them from earlier runs" if report.resumed else ""
-    done = f"; {report.units_run} units run, {report.estimated} F estimated"
+    done = f"; {plural(report.units_run, 'unit')} run, {report.estimated} F estimated"
     # Of libjpeg, CUDA and others: they would tear the progress bar.
     printed = f"messages of image and device libraries: {report.log}" if report.log else ""
     lines = [headline(report) + resumed + done, *_lines(report), printed, trouble(report)]
@@ -38,17 +39,20 @@ def summary(report: RunReport) -> str:
 
 def overview(log: RunLog) -> str:
     """Return the summary of a journal."""
-    about = f"recipe {log.recipe.name}, {log.about.device}, {len(log.events)} events"
+    about = f"recipe {log.recipe.name}, {log.about.device}, {plural(len(log.events), 'event')}"
     left_out = left_out_line(log.recipe, log.about.left_out)
     return "\n".join(filter(None, [headline(log), about, left_out, *_lines(log)]))
 
 
 def headline(run: Run) -> str:
     """Return a line: how the run ended, its duration, and the number of pairs with an F."""
-    count = (
-        f"{sum(record.is_solved for record in run.records)} of {len(run.records)} pairs have an F"
-    )
-    return f"{run.ending} after {format_duration(run.seconds)}: {count}"
+    return f"{run.ending} after {format_duration(run.seconds)}: {solved_pairs(run.records)}"
+
+
+def solved_pairs(records: Sequence[PairRecord]) -> str:
+    """Return the number of pairs with an F, as text."""
+    solved = sum(record.is_solved for record in records)
+    return f"{solved} of {plural(len(records), 'pair')} with an F"
 
 
 def trouble(run: Run) -> str:
@@ -66,7 +70,7 @@ def trouble(run: Run) -> str:
     if 2 * reasons.total() <= len(reached):
         return ""
     ((reason, count),) = reasons.most_common(1)
-    share = f"{reasons.total()} of {len(reached)} pairs"
+    share = f"{reasons.total()} of {plural(len(reached), 'pair')}"
     return (
         f"the run failed: errors left {share} without an F, {count} of them with this one: {reason}"
     )
@@ -85,13 +89,13 @@ def _error(record: PairRecord) -> str:
 def left_out_line(recipe: Recipe, left_out: Sequence[str]) -> str:
     """Return a line on the matchers of the recipe that do not run, with advice; empty if all run.
 
-    ``left_out`` has a text for each cause. Missing weights are the normal case, so many matchers without are only
-    counted; `mkpc recipes NAME` lists them.
+    ``left_out`` has a text for each cause. Missing weights are the normal case: more than a few
+    matchers without them are counted, and `mkpc recipes NAME` lists them.
     """
     others = [cause for cause in left_out if not cause.startswith(UnavailableKind.NO_WEIGHTS)]
     missing = [cause for cause in left_out if cause.startswith(UnavailableKind.NO_WEIGHTS)]
     parts = [f"left out, {cause}" for cause in others]
-    # The recipe named other matchers, so their list would tell the user nothing to do.
+    # The recipe named other matchers, whose list would not say what to do.
     if missing and set(recipe.matcher_names) == {"sift"}:
         parts.append(
             "RootSIFT only; `mkpc weights fetch light --out weights` adds learned matchers"
@@ -110,7 +114,7 @@ def advice(log: RunLog) -> list[str]:
     overlaps.
     """
     found = []
-    # What ran, and not what the recipe names: a matcher may have failed to load.
+    # The units that ran, which may be fewer than the recipe's: a matcher may have failed to load.
     ran = {unit.unit for record in log.records for unit in record.units}
     has_missing = any(cause.startswith(UnavailableKind.NO_WEIGHTS) for cause in log.about.left_out)
     if has_missing and all(name.partition(":")[2].startswith("sift@") for name in ran):
@@ -123,14 +127,6 @@ def advice(log: RunLog) -> list[str]:
             "No pair overlaps. Check that the input is the right test set and that its images can be read."
         )
     return found
-
-
-def plural(count: int, noun: str) -> str:
-    """Return the count with its noun, such as "1 batch" or "2 batches"."""
-    if count == 1:
-        return f"{count} {noun}"
-    ending = "es" if noun.endswith("ch") else "s"  # batches, matches
-    return f"{count} {noun}{ending}"
 
 
 def unit_means(run: Run) -> list[tuple[str, int, float, float, float]]:
@@ -151,7 +147,7 @@ def unit_reasons(run: Run, field: str = "failure") -> list[str]:
     counts = Counter(
         f"{unit.unit}: {getattr(unit, field)}" for unit in units if getattr(unit, field)
     )
-    return [f"{reason} ({count} pairs)" for reason, count in counts.most_common()]
+    return [f"{reason} ({plural(count, 'pair')})" for reason, count in counts.most_common()]
 
 
 def seconds_by_part(run: Run) -> dict[str, float]:

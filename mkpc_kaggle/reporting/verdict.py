@@ -14,12 +14,13 @@ import numpy as np
 
 from mkpc_kaggle.data.outputs import replacing
 from mkpc_kaggle.engine.records import PairRecord, SceneRecord
-from mkpc_kaggle.errors import UserError, printable, writing
+from mkpc_kaggle.errors import UserError, plural, printable, writing
 from mkpc_kaggle.reporting.run_log import RunLog
 from mkpc_kaggle.reporting.summary import (
     headline,
     is_doubtful,
     seconds_by_part,
+    solved_pairs,
     trouble,
     unit_means,
     unit_reasons,
@@ -58,11 +59,11 @@ def verdict(log: RunLog) -> Verdict:
     # Without scenes, pairs are all that the run was asked for.
     if not log.scenes:
         problems += _pair_problems(log.records)
-        return Verdict(_with_an_f(log.records), tuple(problems))
+        return Verdict(solved_pairs(log.records), tuple(problems))
     placed = sum(scene.registered for scene in log.scenes)
     images = sum(scene.images for scene in log.scenes)
     # Also without any camera: this line answers the user's question.
-    text = f"{placed} of {images} images have a camera"
+    text = f"{placed} of {plural(images, 'image')} with a camera"
     if reconstructed:
         text += f"; reprojection {_reprojection(reconstructed):.2f} px"
     problems += [problem for scene in log.scenes for problem in _scene_problems(scene, log)]
@@ -91,17 +92,13 @@ def inlier_histogram(records: Sequence[PairRecord]) -> list[tuple[str, int]]:
     return list(zip([*names, f"{INLIER_BINS[-1]} or more"], counts.tolist(), strict=True))
 
 
-def _with_an_f(records: Sequence[PairRecord]) -> str:
-    return f"{sum(record.is_solved for record in records)} of {len(records)} pairs have an F"
-
-
 def _pair_problems(records: Sequence[PairRecord]) -> Iterator[str]:
     if late := sum(not record.reached for record in records):
-        yield f"not reached in time: {late} pairs; give the run more time, or a smaller recipe"
+        yield f"not reached in time: {plural(late, 'pair')}; give the run more time, or a smaller recipe"
     if lost := sum(record.reached and not record.is_solved for record in records):
-        yield f"with the fallback: {lost} pairs; the reasons are below"
+        yield f"with the fallback: {plural(lost, 'pair')}; the reasons are below"
     if doubtful := sum(bool(doubt(record)) for record in records):
-        yield f"perhaps of different things: {doubtful} pairs; look at them below"
+        yield f"perhaps of different things: {plural(doubtful, 'pair')}; look at them below"
 
 
 def _scene_problems(scene: SceneRecord, log: RunLog) -> Iterator[str]:

@@ -155,7 +155,7 @@ def view_data(
     given: Sequence[NDArray[np.uint8] | None] = colours or [None] * len(models)
     rows = [_model(*each, pictures, partners) for each in zip(models, frames, given, strict=True)]
     metres = None
-    # Models side by side have a scale of their own each, and one bar cannot measure both.
+    # Models side by side have different scales, which one bar cannot measure.
     if metres_per_unit and len(models) == 1:
         metres = metres_per_unit / frames[0].scale
     return {"models": rows, "metres": metres}
@@ -214,7 +214,7 @@ def _model(
     # A model in memory, or in a journal, has no colours.
     found = point_colours(points, model.images, pictures) if known is None else known
     colours = found[:MAX_POINTS]
-    # The largest coordinate has the largest step, whatever the model's size.
+    # The largest coordinate has the largest step, in models of any size.
     reach = float(np.abs(placed[near]).max(initial=1e-6))
     steps = np.round(placed[near] * (STEPS / reach)).astype("<i2")
     centres = frame.place(np.array([found.camera.centre for found in model.images]))

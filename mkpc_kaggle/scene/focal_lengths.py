@@ -28,7 +28,7 @@ def apply_known_cameras(found: Any, known: Mapping[str, KnownCamera]) -> None:
     ]
     if not placed:
         return
-    # Without the user's knowledge, which is to be weighed against it
+    # Computed without the user's knowledge, so that the two can be weighed
     sigmas = camera_sigmas(found)
     for image in placed:
         # Bundle adjustment does not determine this focal length: the user's counts alone.

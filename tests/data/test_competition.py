@@ -58,7 +58,7 @@ def keys(scene):
     return [true.pair.id.partition(";")[2] for true in scene.pairs]
 
 
-def test_pairs_and_columns_come_in_any_order_and_ids_stay_the_text_that_they_are(side):
+def test_pairs_and_columns_come_in_any_order_and_ids_are_text(side):
     # Ids that pandas and spreadsheets read as numbers or as missing values.
     rows = ["0010,more,1e3,NA,007", "2,x,b,1,a", "1,x,b,2,z"]
     images = ["1e3/NA.png", "1e3/0010.Jpg", "1e3/00.png", "1e3/0010.txt"]
@@ -195,8 +195,11 @@ def test_a_submission_keeps_its_numbers_and_their_order(tmp_path):
     [
         ("id,F\na,1\n", "lacks the columns sample_id, fundamental_matrix"),
         ("sample_id,fundamental_matrix,x\na,{F},1\nb,{F},1\n", "the header is"),
-        ("sample_id,fundamental_matrix\na,{F}\n", "1 samples are missing, the first is b"),
-        ("sample_id,fundamental_matrix\na,{F}\nb,{F}\nc,{F}\n", "not in test.csv, the first is c"),
+        ("sample_id,fundamental_matrix\na,{F}\n", "missing samples: 1, the first is b"),
+        (
+            "sample_id,fundamental_matrix\na,{F}\nb,{F}\nc,{F}\n",
+            "samples not in test.csv: 1, the first is c",
+        ),
         ("sample_id,fundamental_matrix\nb,{F}\na,{F}\n", "not in the order of test.csv"),
         ("sample_id,fundamental_matrix\na,{F}\nb,{F}\nb,{F}\n", "twice"),
         (
@@ -249,7 +252,7 @@ def test_cells_are_the_text_of_the_file_with_its_lines(tmp_path, content, rows):
         ("id,value\n1,2\0", "line contains NUL"),
         ('id,value\n1,"2', "cannot be read as a table: .*EOF inside string"),
         ("\n\nid,value\n1,2,3", "line 4: 3 cells, the header has 2"),
-        ("id,value\n1,2\n3", "line 3: 1 cells, the header has 2"),
+        ("id,value\n1,2\n3", "line 3: 1 cell, the header has 2"),
     ],
 )
 def test_a_table_that_pandas_would_guess_at_is_refused(tmp_path, content, says):

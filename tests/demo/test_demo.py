@@ -29,12 +29,14 @@ def rows(path: Path) -> list[dict[str, str]]:
 
 
 def numbers(text: str, *shape: int) -> np.ndarray:
-    return np.array([float(word) for word in text.split(" ")]).reshape(shape)
+    values = [float(word) for word in text.split(" ")]
+    return np.array(values).reshape(shape)
 
 
 def blobs():
     """Blobs of about 16 texels: the intensity changes fast enough to show half a pixel."""
-    noise = np.random.default_rng(0).uniform(0, 255, (32, 32, 3)).astype(np.uint8)
+    rng = np.random.default_rng(0)
+    noise = rng.uniform(0, 255, (32, 32, 3)).astype(np.uint8)
     return cv2.resize(noise, (512, 512), interpolation=cv2.INTER_CUBIC)
 
 
@@ -45,10 +47,14 @@ def upright(
     high: float,
     texture: np.ndarray,
 ):
-    return quad((*left, high), (*right, high), (*left, low), texture)
+    """A wall between two points of the ground (x, y), from a height ``low`` to ``high``."""
+    top_left = (*left, high)
+    top_right = (*right, high)
+    bottom_left = (*left, low)
+    return quad(top_left, top_right, bottom_left, texture)
 
 
-def test_a_view_warped_by_depth_falls_on_the_other():
+def test_a_view_warped_by_its_depth_agrees_with_the_other_view():
     """Image, depth and camera agree to a small part of a pixel; half a pixel would show."""
     texture = blobs()
     surfaces = [
@@ -61,36 +67,50 @@ def test_a_view_warped_by_depth_falls_on_the_other():
     second = look_at((1.5, 1, 1.5), (0, 10, 1), 380, (300, 400), roll=-12)
     image_a, depth_a = render(surfaces, first)
     image_b, depth_b = render(surfaces, second)
-    y, x = np.nonzero(visible_mask(first, depth_a, second, depth_b))
+    visible = visible_mask(first, depth_a, second, depth_b)
+    y, x = np.nonzero(visible)
     pixels_a = np.column_stack([x, y]).astype(float)
-    points = unproject(first, pixels_a, depth_a[y, x].astype(float))
+    depths = depth_a[y, x].astype(float)
+    points = unproject(first, pixels_a, depths)
     pixels, _ = project(second, points)
 
     def difference(shift: tuple[float, float]) -> float:
         maps = np.zeros((*depth_a.shape, 2), dtype=np.float32)
         maps[y, x] = pixels + np.array(shift)
-        warped = cv2.remap(image_b, maps[..., 0], maps[..., 1], cv2.INTER_LINEAR)
-        return float(np.median(np.abs(warped[y, x] - image_a[y, x])))
+        columns = maps[..., 0]
+        lines = maps[..., 1]
+        warped = cv2.remap(image_b, columns, lines, cv2.INTER_LINEAR)
+        levels = np.abs(warped[y, x] - image_a[y, x])
+        return float(np.median(levels))
 
     assert len(y) > 0.3 * depth_a.size
-    assert difference((0, 0)) < 1
+    unshifted = difference((0, 0))
+    assert unshifted < 1
     # Half a pixel is the error of a renderer whose pixel centres are not at integers.
     for shift in ((0.5, 0), (-0.5, 0), (0, 0.5), (0, -0.5)):
-        assert difference(shift) > 3 * difference((0, 0))
+        assert difference(shift) > 3 * unshifted
 
 
 def test_covisibility_counts_the_shared_half_of_a_wall_but_no_sky_and_no_hidden_points():
     # A view is 10 m wide at the wall; half of that is a baseline of 5 m.
-    a, b = (look_at((x, 0, 0), (x, 10, 0), 200, (200, 150)) for x in (0.0, 5.0))
-    wall = upright((-50, 10), (50, 10), -50, 50, blobs())
+    a = look_at((0.0, 0, 0), (0.0, 10, 0), 200, (200, 150))
+    b = look_at((5.0, 0, 0), (5.0, 10, 0), 200, (200, 150))
+    texture = blobs()
+    wall = upright((-50, 10), (50, 10), -50, 50, texture)
     # 2 m before the second camera, it fills that view.
-    screen = upright((3, 2), (7, 2), -50, 50, blobs())
-    for surfaces, shared in (([wall], 0.5), ([wall, screen], 0), ([], 0)):
+    screen = upright((3, 2), (7, 2), -50, 50, texture)
+    cases = [
+        ([wall], 0.5),
+        ([wall, screen], 0),
+        ([], 0),
+    ]
+    for surfaces, shared in cases:
         _, depth_a = render(surfaces, a)
         _, depth_b = render(surfaces, b)
+        found = covisibility(a, depth_a, b, depth_b)
         # A view has 200 columns, so a border that is one column off costs 0.005.
-        assert covisibility(a, depth_a, b, depth_b) == pytest.approx(shared, abs=0.02)
-        assert covisibility(a, depth_a, b, depth_b) == covisibility(b, depth_b, a, depth_a)
+        assert found == pytest.approx(shared, abs=0.02)
+        assert found == covisibility(b, depth_b, a, depth_a)
 
 
 @pytest.mark.parametrize("scene_name", SCENES)
@@ -105,14 +125,15 @@ def test_fundamental_matrices_and_pictures_are_those_of_the_cameras(small_demo, 
     for row in rows(train / "pair_covisibility.csv"):
         name0, name1 = row["pair"].split("-")
         F = fundamental_of_cameras(cameras[name0], cameras[name1])
-
-        np.testing.assert_allclose(numbers(row["fundamental_matrix"], 3, 3), F, atol=1e-9)
+        written = numbers(row["fundamental_matrix"], 3, 3)
+        np.testing.assert_allclose(written, F, atol=1e-9)
     _, placed = build_world(scene_name, image_scale=SCALE)
     for name, camera in zip(sorted(cameras), placed, strict=True):
         np.testing.assert_allclose(cameras[name].K, camera.K, atol=1e-9)
         np.testing.assert_allclose(cameras[name].R, camera.R, atol=1e-9)
         picture = cv2.imread(str(train / "images" / f"{name}.jpg"))
-        assert picture.shape[1::-1] == (camera.width, camera.height)
+        height, width, _ = picture.shape
+        assert (width, height) == (camera.width, camera.height)
 
 
 def test_the_test_side_has_covisible_pairs_of_renamed_train_images(small_demo):
@@ -127,20 +148,26 @@ def test_the_test_side_has_covisible_pairs_of_renamed_train_images(small_demo):
         assert row["sample_id"] == f"{truth['scene']};{batch};{'-'.join(hidden)}"
         train = small_demo.train_dir / truth["scene"]
         table = rows(train / "pair_covisibility.csv")
+        # The two images of a pair may be exchanged.
         (pair,) = (each for each in table if set(each["pair"].split("-")) == set(names))
         # The competition's lower limit.
         assert float(pair["covisibility"]) >= 0.1
         for image, name in zip(hidden, names, strict=True):
-            png = cv2.imread(str(small_demo.test_dir / "test_images" / batch / f"{image}.png"))
+            tested = small_demo.test_dir / "test_images" / batch / f"{image}.png"
+            png = cv2.imread(str(tested))
             jpg = cv2.imread(str(train / "images" / f"{name}.jpg"))
             assert png.shape == jpg.shape
+            difference = np.abs(png.astype(int) - jpg).mean()
             # Grey levels of JPEG's loss: the train side is stored as JPEG, the test side as PNG.
-            assert np.abs(png.astype(int) - jpg).mean() < 6, "the same picture"
+            assert difference < 6, "the same picture"
 
 
 def test_a_scene_has_the_same_bytes_with_and_without_the_other_scenes(tmp_path, small_demo):
     alone = write_demo(tmp_path, scenes=["market"], image_scale=SCALE)
-    assert [path.name for path in alone.train_dir.iterdir() if path.is_dir()] == ["market"]
-    assert contents(alone.train_dir / "market") == contents(small_demo.train_dir / "market")
+    scenes = [path.name for path in alone.train_dir.iterdir() if path.is_dir()]
+    assert scenes == ["market"]
+    market = contents(alone.train_dir / "market")
+    assert market == contents(small_demo.train_dir / "market")
     of_all = contents(small_demo.test_dir / "test_images")
-    assert contents(alone.test_dir / "test_images").items() <= of_all.items()
+    of_market = contents(alone.test_dir / "test_images")
+    assert of_market.items() <= of_all.items()

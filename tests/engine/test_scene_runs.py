@@ -193,7 +193,7 @@ def test_a_run_that_goes_on_reconstructs_only_the_batch_whose_image_was_replaced
     cv2.imwrite(str(pairs[0].images[0]), np.full((72, 80, 3), 200, np.uint8))
     scenes_by(monkeypatch, partial(befall, lack_an_image))
     again = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
-    assert "their 3 pairs are matched again" in capsys.readouterr().err
+    assert "1 image changed; matching 3 pairs again" in capsys.readouterr().err
     assert [record.source for record in again.records] == ["pair"] * 6 + ["pair", "scene", "scene"]
     assert {scene.batch: bool(scene.failure) for scene in again.scenes} == {
         "one": True,

@@ -195,7 +195,7 @@ def test_nothing_is_told_of_costs_before_all_units_were_measured():
     assert told() == ""
     run.learn(SECOND)
     assert told().startswith(
-        "all units on all pairs would take 1m52s; 3 of 3 units fit in the remaining "
+        "all units on all pairs would take 1m52s; 3 of 3 units can run in the remaining "
     )
 
 

@@ -13,28 +13,39 @@ import numpy as np
 def evaluate(line, points, keypoints, sizes, side):
     """Return pose, errors in degrees, precision and matching score of a pair of a list."""
     numbers = np.array(line.split()[4:], float)
-    Ks, T = numbers[:18].reshape(2, 3, 3), numbers[18:].reshape(4, 4)
+    Ks = numbers[:18].reshape(2, 3, 3)
+    pose = numbers[18:].reshape(4, 4)
+    true_R = pose[:3, :3]
+    true_t = pose[:3, 3]
     rays = []
     focals = []
     for K, x, size in zip(Ks, points, sizes, strict=True):
-        rays.append(np.column_stack([x, np.ones(len(x))]) @ np.linalg.inv(K).T)
+        homogeneous = np.column_stack([x, np.ones(len(x))])
+        rays.append(homogeneous @ np.linalg.inv(K).T)
         # SuperGlue's script rounds the sides of the resized picture and scales K by the result.
         scale = [round(pixels * side / max(size)) / pixels for pixels in size]
         focals.append(K.diagonal()[:2] * scale)
     # A pixel over the mean of the four focal lengths.
-    R, t = in_front([p[:, :2] for p in rays], 1 / np.mean(focals))
-    E = np.cross(np.eye(3), T[:3, 3]) @ T[:3, :3]
-    lines0 = rays[1] @ E
-    lines1 = rays[0] @ E.T
-    residual = np.sum(rays[1] * lines1, axis=1) ** 2
+    R, t = in_front([x[:, :2] for x in rays], 1 / np.mean(focals))
+    E = np.cross(np.eye(3), true_t) @ true_R
+    rays0, rays1 = rays
+    lines0 = rays1 @ E
+    lines1 = rays0 @ E.T
+    residual = np.sum(rays1 * lines1, axis=1) ** 2
     distance0 = residual / np.sum(lines0[:, :2] ** 2, axis=1)
     distance1 = residual / np.sum(lines1[:, :2] ** 2, axis=1)
     correct = distance0 + distance1 < 5e-4
+    rotation = np.inf
+    translation = np.inf
+    if R is not None:
+        rotation = angle((np.trace(R.T @ true_R) - 1) / 2)
+        # The sign of t is free.
+        translation = angle(abs(t @ true_t) / np.linalg.norm(true_t))
     return {
         "R": R,
         "t": t,
-        "rotation": np.inf if R is None else angle((np.trace(R.T @ T[:3, :3]) - 1) / 2),
-        "translation": np.inf if R is None else angle(abs(t @ T[:3, 3]) / np.linalg.norm(T[:3, 3])),
+        "rotation": rotation,
+        "translation": translation,
         "precision": correct.mean() if len(correct) else 0,
         "matching_score": correct.sum() / keypoints if keypoints else 0,
     }
@@ -52,7 +63,9 @@ def in_front(rays, threshold):
         return None, None
     best = (0, None, None)
     for E in np.split(stacked, len(stacked) // 3):  # five points have up to ten solutions
-        count, R, t, _ = cv2.recoverPose(E, *rays, np.eye(3), 1e9, mask=mask.copy())[:4]
+        # OpenCV changes the mask.
+        found = cv2.recoverPose(E, *rays, np.eye(3), 1e9, mask=mask.copy())
+        count, R, t, _ = found[:4]
         if count > best[0]:
             best = (count, R, t.ravel())
     return best[1:]

@@ -101,7 +101,7 @@ def test_a_comparison_of_runs_that_failed_or_ended_early_has_their_status(
     assert "gain of mAA" not in printed
 
 
-def test_what_recipes_have_in_common_is_matched_once(demo, small_recipe, tmp_path, capsys):
+def test_units_that_recipes_share_are_matched_once(demo, small_recipe, tmp_path, capsys):
     text = small_recipe.read_text()
     third = tmp_path / "third.toml"
     third.write_text(f"{text}threshold = 1.0\n")  # the last table is [magsac]

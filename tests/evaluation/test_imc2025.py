@@ -67,7 +67,7 @@ NO_POSE = np.full(3, np.nan)
         ({"a": A}, [], 0, 0),
     ],
 )
-def test_the_score_is_the_harmonic_mean_of_accuracy_and_clusterness_by_hand(
+def test_the_score_is_the_harmonic_mean_of_accuracy_and_clusterness_computed_by_hand(
     scenes, clusters, maa, clusterness
 ):
     # A similarity has seven degrees of freedom: three of the images always fit and do not count.
@@ -145,7 +145,7 @@ ROW = f"set,a,a0.png,{POSE}"
             "submission",
             "outliers,x",
             "outliers,y",
-            "2 images of set are missing or unknown, such as x",
+            "2 images of set missing or unknown, such as x",
         ),
         ("submission", "set,a,a0.png", "set,a,a1.png", "the image set/a1.png is there twice"),
         ("submission", POSE, "1;0;0", "expected 9 and 3 numbers joined by ';', found 3 and 3"),

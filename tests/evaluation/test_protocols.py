@@ -34,7 +34,10 @@ from mkpc_kaggle.recipe import Recipe, Unit
 
 K = np.array([[800.0, 0, 320], [0, 800, 240], [0, 0, 1]])
 # Side by side, with a little forward motion, so that both epipoles are in no picture.
-CAMERAS = Camera(K, np.eye(3), np.zeros(3)), Camera(K, np.eye(3), np.array([1.0, 0, 0.1]))
+CAMERAS = (
+    Camera(K, np.eye(3), np.zeros(3)),
+    Camera(K, np.eye(3), np.array([1.0, 0, 0.1])),
+)
 
 
 def listed(file: Path, root: Path, recipe: Path) -> list[object]:
@@ -42,7 +45,8 @@ def listed(file: Path, root: Path, recipe: Path) -> list[object]:
 
 
 def matches_of(store: Store, position: int) -> Matches:
-    return Matches.concatenate(read_points(store, Table.of(store), position).values())
+    points = read_points(store, Table.of(store), position)
+    return Matches.concatenate(points.values())
 
 
 OUTDOORS = ["castle_p19", "fountain_p11", "herz_jesus_p8", "reichstag_26"]
@@ -52,14 +56,40 @@ def precise(camera: Camera) -> Camera:
     """The camera with a rotation of all digits: with six, the angle from a trace is wrong by up to
     0.1 degrees.
     """
-    return replace(camera, R=Rotation.from_matrix(camera.R).as_matrix())
+    rotation = Rotation.from_matrix(camera.R)
+    return replace(camera, R=rotation.as_matrix())
+
+
+def evaluated_by_hand(work_dir: Path, lines, truths, side: int) -> list[dict[str, object]]:
+    """The independent evaluation of a run's matches, whose poses must be those of the run."""
+    expected = []
+    with Store.read(work_dir) as store:
+        records = read_records(store)
+        for line, true, record in zip(lines, truths, records, strict=True):
+            matches = matches_of(store, record.index)
+            keypoints = sum(unit.keypoints for unit in record.units)
+            # In double precision, as the other evaluation reads its lists.
+            points = [each.astype(float) for each in (matches.points0, matches.points1)]
+            sizes = [read_image(path).size for path in true.pair.images]
+            by_hand = evaluate(line, points, keypoints, sizes, side)
+            expected.append(by_hand)
+            if by_hand["R"] is not None:
+                own_R = Rotation.from_rotvec(record.stats.rotation).as_matrix()
+                np.testing.assert_allclose(own_R, by_hand["R"], atol=1e-6)
+                # t is E's left null vector.
+                residual = by_hand["t"] @ record.pair_fundamental
+                np.testing.assert_allclose(residual, 0, atol=1e-6)
+    return expected
 
 
 @needs_data
 @pytest.mark.parametrize(
     ("scenes", "pairs", "units"),
     # One unit as in SuperGlue's ScanNet evaluation, and several sizes with crops as in the paper.
-    [(["scannet_samples"], 8, [(1, 640)]), (OUTDOORS, 1, [(1, 480), (1, 640), (2, 480)])],
+    [
+        (["scannet_samples"], 8, [(1, 640)]),
+        (OUTDOORS, 1, [(1, 480), (1, 640), (2, 480)]),
+    ],
 )
 def test_an_independent_evaluation_of_the_same_matches_agrees(scenes, pairs, units, tmp_path):
     train = DATA / "train"
@@ -67,7 +97,9 @@ def test_an_independent_evaluation_of_the_same_matches_agrees(scenes, pairs, uni
     truths = [true for scene in read for true in scene.pairs]
     lines = []
     for true in truths:
-        sharp = replace(true, camera0=precise(true.camera0), camera1=precise(true.camera1))
+        camera0 = precise(true.camera0)
+        camera1 = precise(true.camera1)
+        sharp = replace(true, camera0=camera0, camera1=camera1)
         lines.append(line_of_pair(sharp, train))
     (tmp_path / "list.txt").write_text("\n".join(lines))
     recipe = write_recipe(tmp_path / "recipe.toml", *units)
@@ -77,27 +109,15 @@ def test_an_independent_evaluation_of_the_same_matches_agrees(scenes, pairs, uni
     )
     # The threshold is a pixel of the largest picture of stage 1.
     side = max(side for stage, side in units if stage == 1)
-    expected = []
-    with Store.read(tmp_path) as store:
-        for line, true, record in zip(lines, truths, read_records(store), strict=True):
-            matches = matches_of(store, record.index)
-            keypoints = sum(unit.keypoints for unit in record.units)
-            points = matches.points0.astype(float), matches.points1.astype(float)
-            sizes = [read_image(path).size for path in true.pair.images]
-            by_hand = evaluate(line, points, keypoints, sizes, side)
-            expected.append(by_hand)
-            if by_hand["R"] is not None:
-                own_R = Rotation.from_rotvec(record.stats.rotation).as_matrix()
-                np.testing.assert_allclose(own_R, by_hand["R"], atol=1e-6)
-                residual = by_hand["t"] @ record.pair_fundamental  # t is E's left null vector
-                np.testing.assert_allclose(residual, 0, atol=1e-6)
+    expected = evaluated_by_hand(tmp_path, lines, truths, side)
     (scene,) = scores["scenes"]
     own = {"rotation": "rotation_error_degrees", "translation": "translation_error_degrees"}
     for key in ("rotation", "translation", "precision", "matching_score"):
         values = [pair[own.get(key, key)] for pair in scene["pairs"]]
         # JSON has no infinity: an error of a failed pair is null.
         found = [np.inf if value is None else value for value in values]
-        np.testing.assert_allclose(found, [pair[key] for pair in expected], atol=1e-6, err_msg=key)
+        by_hand = [pair[key] for pair in expected]
+        np.testing.assert_allclose(found, by_hand, atol=1e-6, err_msg=key)
         if key not in own:
             assert scores[key] == pytest.approx(np.mean(found), abs=1e-9)
     errors = [max(pair["rotation"], pair["translation"]) for pair in expected]
@@ -111,10 +131,13 @@ def test_the_threshold_that_reaches_opencv_is_a_pixel_of_the_resized_picture(
     side, width, monkeypatch, tmp_path
 ):
     """The stored images are 640 and 500 pixels wide, and resized to the same long side."""
-    small = Camera(np.diag([500 / 640, 500 / 640, 1]) @ K, CAMERAS[1].R, CAMERAS[1].t)
+    first, second = CAMERAS
+    scale = 500 / 640
+    small = Camera(np.diag([scale, scale, 1]) @ K, second.R, second.t)
     for name, shape in (("a.png", (480, 640)), ("b.png", (375, 500))):
         cv2.imwrite(str(tmp_path / name), np.full(shape, 90, np.uint8))
-    (tmp_path / "list.txt").write_text(line_of(("a.png", "b.png"), (CAMERAS[0], small)))
+    line = line_of(("a.png", "b.png"), (first, small))
+    (tmp_path / "list.txt").write_text(line)
     (true,) = read_pairs(tmp_path / "list.txt", tmp_path).pairs
     thresholds = []
     find = cv2.findEssentialMat
@@ -125,22 +148,31 @@ def test_the_threshold_that_reaches_opencv_is_a_pixel_of_the_resized_picture(
 
     monkeypatch.setattr(cv2, "findEssentialMat", noted)
     # The largest side of stage 1 counts; a crop of 2000 has pixels of another size.
-    units = (Unit(1, "rectified", 1200), Unit(1, "rectified", 1600), Unit(2, "rectified", 2000))
+    units = (
+        Unit(1, "rectified", 1200),
+        Unit(1, "rectified", 1600),
+        Unit(2, "rectified", 2000),
+    )
     recipe = by_protocol(Recipe(units), "superglue")
     if side is not None:
-        recipe = replace(recipe, magsac=replace(recipe.magsac, threshold_side=side))
+        magsac = replace(recipe.magsac, threshold_side=side)
+        recipe = replace(recipe, magsac=magsac)
     matcher = TwoStageMatcher(recipe, matchers={"rectified": RectifiedMatcher()})
     matcher(*true.pair.images, model=ModelKind.E, intrinsics=true.pair.intrinsics)
-    focals = [800, 500 / 640 * 800] if side == 0 else [800 * width / 640]
+    # A side of 0 means pixels of the stored pictures, whose focal lengths differ.
+    focals = [800, scale * 800] if side == 0 else [800 * width / 640]
     assert thresholds == pytest.approx([1 / np.mean(focals)])
 
 
 def test_five_matches_are_enough_for_an_essential_matrix_and_duplicates_count():
     generator = np.random.default_rng(1)
     points = generator.uniform((-1, -1, 3), (1, 1, 6), (5, 3))
-    projected = [(points + camera.t) @ K.T for camera in CAMERAS]
-    x0, x1 = ((each[:, :2] / each[:, 2:]).astype(np.float32) for each in projected)
-    five = Matches(x0, x1, np.ones(5))
+    projected = []
+    for camera in CAMERAS:
+        x = (points + camera.t) @ K.T
+        pixels = x[:, :2] / x[:, 2:]
+        projected.append(pixels.astype(np.float32))
+    five = Matches(*projected, np.ones(5))
     config = RobustConfig(Method.RANSAC, 1.0, permutations=1)
     # SuperGlue's evaluation passes all matches to OpenCV, which needs five.
     every = replace(config, every_match=True)
@@ -153,22 +185,27 @@ def test_five_matches_are_enough_for_an_essential_matrix_and_duplicates_count():
     twice = Matches.concatenate([five[:4], five[:4]])
     distinct = estimate(twice, config, ModelKind.E, (K, K))
     assert "too few distinct matches for E: 4" in distinct.failure
-    assert "too few" not in estimate(twice, every, ModelKind.E, (K, K)).failure
+    of_all = estimate(twice, every, ModelKind.E, (K, K))
+    assert "too few" not in of_all.failure
 
 
 def test_points_in_front_of_both_cameras_decide_which_rotation_of_e_is_scored():
     """Matches of the twisted pair have the same E as the truth, whose rotation they do not have."""
     t = CAMERAS[1].t
     twisted = 2 * np.outer(t, t) / (t @ t) - np.eye(3)
-    points = np.random.default_rng(0).uniform((6, -1, 1), (8, 1, 2), (40, 3))
+    rng = np.random.default_rng(0)
+    points = rng.uniform((6, -1, 1), (8, 1, 2), (40, 3))
     points[:, 0] *= points[:, 2]  # far to the side, in front of both
-    projected = points @ K.T, (points @ twisted.T + t) @ K.T
-    assert min(each[:, 2].min() for each in projected) > 0
-    x0, x1 = (each[:, :2] / each[:, 2:] for each in projected)
+    pixels = []
+    for in_camera in (points, points @ twisted.T + t):
+        x = in_camera @ K.T
+        assert x[:, 2].min() > 0
+        pixels.append((x[:, :2] / x[:, 2:]).astype(np.float32))
+    matches = Matches(*pixels, np.ones(40))
     recipe = by_protocol(Recipe((Unit(1, "sift", 640),)), "superglue")
-    matches = Matches(x0.astype(np.float32), x1.astype(np.float32), np.ones(40))
     found = UnitResult(recipe.units[0], matches)
-    pair = PairMatch((found,), sizes=(Size(640, 480), Size(640, 480)))
+    size = Size(640, 480)
+    pair = PairMatch((found,), sizes=(size, size))
     result = with_estimate(pair, recipe, ModelKind.E, (K, K)).estimate
     rotation = Rotation.from_rotvec(result.stats.rotation).as_matrix()
     calibrated = [camera.calibrated for camera in CAMERAS]
@@ -190,17 +227,20 @@ def write_scene_info(path: Path, scenes, root: Path) -> Path:
     for scene in scenes:
         for true in scene.pairs:
             images += zip(true.pair.images, (true.camera0, true.camera1), strict=True)
-    poses = np.array([None] * (len(images) + 1), object)
+    # Arrays of objects, as MegaDepth's, with an entry of None for image 0
+    poses = np.full(len(images) + 1, None, object)
     paths = poses.copy()
     Ks = poses.copy()
-    infos = np.array([None] * (len(images) // 2), object)
+    infos = np.full(len(images) // 2, None, object)
     # Image 0 has no camera, as images without a depth map in MegaDepth.
     for number, (file, camera) in enumerate(images, 1):
         paths[number] = str(file.relative_to(root))
         Ks[number] = camera.K
-        poses[number] = np.vstack([np.column_stack([camera.R, camera.t]), [0, 0, 0, 1]])
+        pose = np.column_stack([camera.R, camera.t])
+        poses[number] = np.vstack([pose, [0, 0, 0, 1]])
     for number in range(len(infos)):
-        infos[number] = ((2 * number + 1, 2 * number + 2), 0.5, np.zeros((1, 4)))
+        pair = (2 * number + 1, 2 * number + 2)
+        infos[number] = (pair, 0.5, np.zeros((1, 4)))
     np.savez(path, pair_infos=infos, image_paths=paths, intrinsics=Ks, poses=poses)
     return path
 
@@ -209,11 +249,13 @@ def test_megadepths_files_are_read_as_the_list_that_they_stand_for(demo, scenes,
     (tmp_path / "infos").mkdir()
     for number, scene in enumerate(scenes):
         write_scene_info(tmp_path / "infos" / f"{number}.npz", [scene], demo.train_dir)
-    listed = read_pairs(write_list(tmp_path / "list.txt", scenes, demo.train_dir), demo.train_dir)
+    file = write_list(tmp_path / "list.txt", scenes, demo.train_dir)
+    listed = read_pairs(file, demo.train_dir)
     found = read_pairs(tmp_path / "infos", demo.train_dir)
     for one, other in zip(found.pairs, listed.pairs, strict=True):
         assert one.pair == replace(other.pair, group="infos")
-        for camera, truth in ((one.camera0, other.camera0), (one.camera1, other.camera1)):
+        cameras = [(one.camera0, other.camera0), (one.camera1, other.camera1)]
+        for camera, truth in cameras:
             np.testing.assert_allclose(camera.K, truth.K)
             np.testing.assert_allclose(camera.R, truth.R, atol=1e-12)
             np.testing.assert_allclose(camera.t, truth.t, atol=1e-9)
@@ -230,25 +272,36 @@ def pickled(data: bytes):
     """Write a scene_info whose arrays of objects are this pickle."""
     # An .npy header, padded to 128 bytes with its magic number and its length.
     header = b"{'descr': '|O', 'fortran_order': False, 'shape': (1,), }".ljust(117) + b"\n"
+    array = b"\x93NUMPY\x01\x00\x76\x00" + header + data
 
     def write(path: Path) -> None:
         with zipfile.ZipFile(path, "w") as archive:
             for name in ("pair_infos", "image_paths", "intrinsics", "poses"):
-                archive.writestr(f"{name}.npy", b"\x93NUMPY\x01\x00\x76\x00" + header + data)
+                archive.writestr(f"{name}.npy", array)
 
     return write
 
 
 def table(row: str, header: str = "image_0,image_1,box_0,box_1"):
-    return lambda path: path.write_text(f"{header}\n{row}\n")
+    return text(f"{header}\n{row}\n")
 
 
+def text(content: str):
+    return lambda path: path.write_text(content)
+
+
+def other_arrays(path: Path) -> None:
+    np.savez(path, a=[1])
+
+
+CODE = pickle.dumps(Run())
+CUT_OFF = pickle.dumps([1, 2])[:-3]
 BAD = {
-    "other arrays": ("pairs.npz", lambda path: np.savez(path, a=[1]), "pair_infos.npy"),
-    "code": ("pairs.npz", pickled(pickle.dumps(Run())), "it names builtins.print"),
-    "cut off": ("pairs.npz", pickled(pickle.dumps([1, 2])[:-3]), "is not a scene_info"),
+    "other arrays": ("pairs.npz", other_arrays, "pair_infos.npy"),
+    "code": ("pairs.npz", pickled(CODE), "it names builtins.print"),
+    "cut off": ("pairs.npz", pickled(CUT_OFF), "is not a scene_info"),
     # Mistakes of users: another text, a folder without files, a table of regions.
-    "no pairs": ("pairs.txt", lambda path: path.write_text("a b\n"), "expected 38 fields"),
+    "no pairs": ("pairs.txt", text("a b\n"), "expected 38 fields"),
     "an empty directory": ("pairs", Path.mkdir, "cannot be read"),
     "no columns": ("regions.csv", table("1,2", "a,b"), "lacks the columns image_0"),
     "no row of a pair": (
@@ -281,11 +334,13 @@ def test_bad_lists_and_regions_get_one_line_and_exit_2(
     write(source)
     regions = []
     if file == "regions.csv":
+        # The rows that name the pair A,B are of the listed one.
         names = ",".join(one.read_text().split()[:2])
         source.write_text(source.read_text().replace("A,B", names))
         regions = ["--regions", source]
         source = one
-    assert run_command("validate", *listed(source, demo.train_dir, small_recipe), *regions) == 2
+    command = ["validate", *listed(source, demo.train_dir, small_recipe), *regions]
+    assert run_command(*command) == 2
     out, err = capsys.readouterr()
     # NumPy's own reader would run the code of a pickle.
     assert "executed" not in out
@@ -293,23 +348,31 @@ def test_bad_lists_and_regions_get_one_line_and_exit_2(
     assert re.search(told, line)
 
 
+def write_regions(path: Path, listed: Path, boxes) -> None:
+    """Write the boxes of the first pair of a list."""
+    names = ",".join(listed.read_text().split()[:2])
+    cells = ",".join(f"{box.left} {box.top} {box.right} {box.bottom}" for box in boxes)
+    write = table(f"{names},{cells}")
+    write(path)
+
+
 def test_given_regions_replace_mkpcs_and_are_part_of_the_key_of_stage_2(
     demo, scenes, small_recipe, tmp_path
 ):
     true = max(scenes[0].pairs, key=lambda true: true.covisibility)
-    sizes = [read_image(path).size for path in true.pair.images]
+    size0, size1 = (read_image(path).size for path in true.pair.images)
     # Boxes that MKPC would not find: a left half, and one without a few rows and columns.
     boxes = (
-        Box(0, 0, sizes[0].width // 2, sizes[0].height),
-        Box(7, 0, sizes[1].width, sizes[1].height - 3),
+        Box(0, 0, size0.width // 2, size0.height),
+        Box(7, 0, size1.width, size1.height - 3),
     )
     match = TwoStageMatcher(str(small_recipe))(*true.pair.images, regions=boxes)
     second = match.matches[match.in_stage(2)]
     assert len(second)
     assert boxes[0].contains(second.points0).all()
-    one = write_list(tmp_path / "list.txt", [replace(scenes[0], pairs=(true,))], demo.train_dir)
-    cells = ",".join(f"{box.left} {box.top} {box.right} {box.bottom}" for box in boxes)
-    table(f"{','.join(one.read_text().split()[:2])},{cells}")(tmp_path / "regions.csv")
+    alone = replace(scenes[0], pairs=(true,))
+    one = write_list(tmp_path / "list.txt", [alone], demo.train_dir)
+    write_regions(tmp_path / "regions.csv", one, boxes)
     command = ["validate", "--workers", 0, *listed(one, demo.train_dir, small_recipe)]
     given = ["--regions", tmp_path / "regions.csv"]
     scores = tmp_path / "scores.json"
@@ -321,10 +384,12 @@ def test_given_regions_replace_mkpcs_and_are_part_of_the_key_of_stage_2(
             (record,) = read_records(store)
             found = matches_of(store, 0)
         is_given = bool(options)
-        assert ([region.box for region in record.regions] == [*boxes]) == is_given
+        used = [region.box for region in record.regions]
+        assert (used == [*boxes]) == is_given
         reasons = {region.reason for region in record.regions}
         assert (reasons == {RegionReason.GIVEN}) == is_given
-        with closing(sqlite3.connect(tmp_path / "run" / "journal.sqlite")) as database:
+        journal = tmp_path / "run" / "journal.sqlite"
+        with closing(sqlite3.connect(journal)) as database:
             count = "SELECT count(*) FROM result WHERE kind = 'points'"
             assert database.execute(count).fetchone() == (rows,)
     np.testing.assert_array_equal(found.points0, match.matches.points0)

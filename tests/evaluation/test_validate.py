@@ -38,7 +38,7 @@ def true_matrices(demo: DemoSet) -> dict[str, np.ndarray]:
     }
 
 
-def test_the_true_matrices_score_one_whatever_the_order_of_the_images(demo, tmp_path):
+def test_the_true_matrices_score_one_in_either_order_of_the_images(demo, tmp_path):
     truth = true_matrices(demo)
     assert list(truth) == [pair.id for pair in read_test_side(demo.test_dir)]
     competition.write_submission(tmp_path / "true.csv", truth)
@@ -78,7 +78,7 @@ def test_samples_without_a_row_count_as_failed_and_are_named(demo, tmp_path, cap
     assert run_command(*score, some) == 0
     lacking = list(truth)[2:]
     printed = capsys.readouterr().out
-    assert "6 samples have no row and count as failed: " in printed
+    assert "6 samples without a row, counted as failed: " in printed
     # Five are named at most, so that a wrong file does not fill the screen.
     assert sum(sample in printed for sample in lacking) == 5
     figures = json.loads(out.read_text())
@@ -185,7 +185,7 @@ def test_a_validation_that_hangs_ends_at_its_limit(demo):
         ),
     ],
 )
-def test_options_that_make_no_validation_are_refused(demo, small_recipe, options, told, capsys):
+def test_contradictory_options_are_refused(demo, small_recipe, options, told, capsys):
     places = {"T": demo.train_dir, "R": small_recipe}
     assert run_command("validate", *(places.get(option, option) for option in options)) == 2
     captured = capsys.readouterr()

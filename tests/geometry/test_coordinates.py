@@ -10,7 +10,9 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from mkpc_kaggle.geometry.coordinates import Box, Size, View, from_corner, from_normalised
 
-SIDES, TURNS = st.integers(1, 3000), st.integers(0, 3)
+SIDES = st.integers(1, 3000)
+TURNS = st.integers(0, 3)
+SEEDS = st.integers(0, 2**32 - 1)
 
 
 @st.composite
@@ -32,29 +34,32 @@ def views(draw):
 
 # Odd and prime, so that no scale is a whole number.
 IMAGE = Size(107, 71)
+WHOLE = Box.whole(IMAGE)
+CROP = Box(13, 8, 90, 65)
 RENDERED = {
-    "enlarged": View.fit(Box.whole(IMAGE), long_side=250),
-    "shrunk": View.fit(Box.whole(IMAGE), long_side=46),
-    "cropped and enlarged": View.fit(Box(13, 8, 90, 65), long_side=200, multiple=32),
-    "cropped and shrunk": View.fit(Box(13, 8, 90, 65), long_side=51, multiple=32),
-    "enlarged along x, shrunk along y": View(Box.whole(IMAGE), Size(240, 40), Size(240, 40)),
-    "shrunk along x, enlarged along y": View(Box.whole(IMAGE), Size(60, 170), Size(64, 192)),
-    "cropped and turned by three quarters": View(
-        Box(13, 8, 90, 65), Size(80, 48), Size(96, 48), turns=3
-    ),
+    "enlarged": View.fit(WHOLE, long_side=250),
+    "shrunk": View.fit(WHOLE, long_side=46),
+    "cropped and enlarged": View.fit(CROP, long_side=200, multiple=32),
+    "cropped and shrunk": View.fit(CROP, long_side=51, multiple=32),
+    "enlarged along x, shrunk along y": View(WHOLE, Size(240, 40), Size(240, 40)),
+    "shrunk along x, enlarged along y": View(WHOLE, Size(60, 170), Size(64, 192)),
+    "cropped and turned by three quarters": View(CROP, Size(80, 48), Size(96, 48), turns=3),
 }
 
 
-@given(view=views(), seed=st.integers(0, 2**32 - 1))
+@given(view=views(), seed=SEEDS)
 @settings(max_examples=150, deadline=None)
 def test_a_view_maps_points_there_and_back(view, seed):
-    points = np.random.default_rng(seed).uniform(-4000, 4000, (20, 2))
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-4000, 4000, (20, 2))
+    to_view_and_back = view.to_image(view.from_image(points))
+    to_image_and_back = view.from_image(view.to_image(points))
     # Rounding alone: coordinates of 4000 are scaled by up to 3000 and back.
-    assert_allclose(view.to_image(view.from_image(points)), points, rtol=0, atol=1e-7)
-    assert_allclose(view.from_image(view.to_image(points)), points, rtol=0, atol=1e-7)
+    assert_allclose(to_view_and_back, points, rtol=0, atol=1e-7)
+    assert_allclose(to_image_and_back, points, rtol=0, atol=1e-7)
 
 
-@given(turns=TURNS, scale=st.sampled_from([1, 2]), seed=st.integers(0, 2**32 - 1))
+@given(turns=TURNS, scale=st.sampled_from([1, 2]), seed=SEEDS)
 @settings(max_examples=50, deadline=None)
 def test_a_turned_view_is_the_view_of_the_turned_picture(turns, scale, seed):
     """One grey level a pixel: each pixel of the view has the level of the stored pixel that it
@@ -62,16 +67,22 @@ def test_a_turned_view_is_the_view_of_the_turned_picture(turns, scale, seed):
     """
     levels = np.random.default_rng(seed).permutation(6 * 8)
     stored = levels.reshape(6, 8).astype(np.uint8)
-    view = View.fit(Box(1, 2, 8, 5), long_side=7 * scale, multiple=4, turns=turns)
-    upright = np.ascontiguousarray(np.rot90(stored[2:5, 1:8], turns))
-    whole = Box.whole(Size(*upright.shape[::-1]))
-    expected = View.fit(whole, long_side=7 * scale, multiple=4)
+    crop = Box(1, 2, 8, 5)
+    long_side = 7 * scale
+    view = View.fit(crop, long_side=long_side, multiple=4, turns=turns)
+    # The same crop cut out and turned by NumPy, and seen as a whole image
+    cut = stored[2:5, 1:8]
+    upright = np.ascontiguousarray(np.rot90(cut, turns))
+    height, width = upright.shape
+    whole = Box.whole(Size(width, height))
+    expected = View.fit(whole, long_side=long_side, multiple=4)
     assert (view.content, view.padded) == (expected.content, expected.padded)
     assert_array_equal(view.render(stored), expected.render(upright))
     # Only an unscaled pixel comes from one pixel.
     if scale == 1:
         y, x = np.indices(upright.shape).reshape(2, -1)
-        x0, y0 = view.to_image(np.column_stack([x, y])).astype(int).T
+        pixels = np.column_stack([x, y])
+        x0, y0 = view.to_image(pixels).astype(int).T
         assert_array_equal(stored[y0, x0], upright.ravel())
 
 
@@ -92,9 +103,11 @@ def test_a_view_keeps_the_aspect_to_the_nearest_pixel_and_pads_to_the_multiple(
     by_area = (area / crop.area) ** 0.5
     for view, scale in ((fitted, by_side), (of_area, by_area)):
         assert view.crop == crop
-        for side, content, padded in zip(crop.size, view.content, view.padded, strict=True):
+        sides = zip(crop.size, view.content, view.padded, strict=True)
+        for side, content, padded in sides:
             # A crop of 1 x 3000 at a long side of 90 still has a column.
-            assert abs(content - max(1, side * scale)) <= 0.5 + 1e-9 * side * scale
+            exact = max(1, side * scale)
+            assert abs(content - exact) <= 0.5 + 1e-9 * side * scale
             assert padded % multiple == 0
             assert 0 <= padded - content < multiple
 
@@ -102,34 +115,42 @@ def test_a_view_keeps_the_aspect_to_the_nearest_pixel_and_pads_to_the_multiple(
 def test_corner_based_and_normalised_coordinates_become_centres_at_integers():
     # Half a pixel at 640 pixels is a pixel and more in a photograph of 1600.
     corners = np.array([[0, 0], [0.5, 0.5], [30, 40]], np.float32)
-    assert from_corner(corners).tolist() == [[-0.5, -0.5], [0, 0], [29.5, 39.5]]
+    centres = from_corner(corners)
+    assert centres.tolist() == [[-0.5, -0.5], [0, 0], [29.5, 39.5]]
+    # The corners of an image are at -1 and 1.
     normalised = np.array([[-1, -1], [0, 0.5], [1, 1]], np.float32)
     found = from_normalised(normalised, Size(10, 40))
     assert found.tolist() == [[-0.5, -0.5], [4.5, 29.5], [9.5, 39.5]]
-    assert found.dtype == from_corner(corners).dtype == np.float32
+    assert centres.dtype == found.dtype == np.float32
 
 
 @pytest.mark.parametrize("name", RENDERED)
 @pytest.mark.parametrize("centre", [(41.3, 30.8), (55.75, 44.25)])
 def test_a_spot_is_rendered_where_the_map_says(name, centre):
     view = RENDERED[name]
-    x, y = np.meshgrid(np.arange(IMAGE.width), np.arange(IMAGE.height))
+    y, x = np.indices((IMAGE.height, IMAGE.width))
     squared = (x - centre[0]) ** 2 + (y - centre[1]) ** 2
-    # A sigma of 4 pixels: wide enough to be sampled well where the view shrinks.
-    spot = np.rint(255 * np.exp(-squared / (2 * 4.0**2))).astype(np.uint8)
+    # Wide enough to be sampled well where the view shrinks
+    sigma = 4.0
+    levels = 255 * np.exp(-squared / (2 * sigma**2))
+    spot = np.rint(levels).astype(np.uint8)
     picture = view.render(spot)
     assert picture.shape == (view.padded.height, view.padded.width)
     y, x = np.indices(picture.shape)
-    centroid = np.average([x.ravel(), y.ravel()], axis=1, weights=picture.ravel())
+    pixels = [x.ravel(), y.ravel()]
+    centroid = np.average(pixels, axis=1, weights=picture.ravel())
+    (mapped,) = view.from_image(np.array([centre]))
     # Grey levels are rounded. A map without the halves is off by at least 0.17 pixels.
-    assert_allclose(centroid, view.from_image(np.array([centre]))[0], rtol=0, atol=0.04)
+    assert_allclose(centroid, mapped, rtol=0, atol=0.04)
 
 
 @pytest.mark.parametrize("shape", [(71, 107), (71, 107, 3)])
 def test_a_crop_that_is_not_resized_is_copied_and_padded_with_black_right_and_bottom(shape):
-    image = np.random.default_rng(0).integers(1, 256, shape, dtype=np.uint8)
-    view = View.fit(Box(5, 7, 55, 37), long_side=50, multiple=32)
-    picture = view.render(image)
+    # Without black pixels, so that only padding is black
+    rng = np.random.default_rng(0)
+    image = rng.integers(1, 256, shape, dtype=np.uint8)
+    crop = Box(5, 7, 55, 37)
+    picture = View.fit(crop, long_side=50, multiple=32).render(image)
     cut = image[7:37, 5:55]
     assert picture.shape == (32, 64, *shape[2:])
     assert picture.dtype == np.uint8
@@ -140,10 +161,20 @@ def test_a_crop_that_is_not_resized_is_copied_and_padded_with_black_right_and_bo
 
 def test_a_box_holds_the_points_on_its_pixels_half_open_and_never_nan():
     box = Box(2, 3, 10, 7)
-    inside = [(1.5, 2.5), (2, 3), (9, 6), (np.nextafter(9.5, 0), np.nextafter(6.5, 0))]
+    last = (np.nextafter(9.5, 0), np.nextafter(6.5, 0))
+    inside = [(1.5, 2.5), (2, 3), (9, 6), last]
     # Adjacent boxes share no point, because a box is open to the right and at the bottom.
-    outside = [(np.nextafter(1.5, 0), 4), (4, np.nextafter(2.5, 0)), (9.5, 4), (4, 6.5)]
-    outside += [(np.nan, 4), (4, np.nan), (np.inf, 4), (4, -np.inf), (np.nan, np.nan)]
+    outside = [
+        (np.nextafter(1.5, 0), 4),
+        (4, np.nextafter(2.5, 0)),
+        (9.5, 4),
+        (4, 6.5),
+        (np.nan, 4),
+        (4, np.nan),
+        (np.inf, 4),
+        (4, -np.inf),
+        (np.nan, np.nan),
+    ]
     assert box.contains(np.array(inside)).all()
     assert not box.contains(np.array(outside)).any()
     assert box.contains(np.zeros((0, 2))).shape == (0,)
@@ -152,18 +183,27 @@ def test_a_box_holds_the_points_on_its_pixels_half_open_and_never_nan():
 
 @pytest.mark.parametrize("content", [Size(64, 16), Size(64, 19), Size(32, 16), Size(90, 16)])
 def test_shrinking_averages_stripes_that_would_alias(content):
-    stripes = np.tile(np.array([[0], [255]] * 32, np.uint8), (1, 64))
-    picture = View(Box.whole(Size(64, 64)), content, content).render(stripes)
+    rows = np.array([[0], [255]] * 32, np.uint8)
+    stripes = np.tile(rows, (1, 64))
+    whole = Box.whole(Size(64, 64))
+    picture = View(whole, content, content).render(stripes)
     # Sampling without averaging gives 0 and 255, which are 127.5 away.
     assert abs(picture - 127.5).max() < 30
 
 
 @pytest.mark.parametrize(
-    ("size", "shape"), [((1, 1), (90, 90)), ((900, 1), (1, 90)), ((1, 3), (90, 30))]
+    ("size", "shape"),
+    [
+        ((1, 1), (90, 90)),
+        ((900, 1), (1, 90)),
+        ((1, 3), (90, 30)),
+    ],
 )
 def test_images_one_pixel_wide_or_high_are_rendered(size, shape):
-    view = View.fit(Box.whole(Size(*size)), long_side=90)
-    picture = view.render(np.full(size[::-1], 200, np.uint8))
+    width, height = size
+    whole = Box.whole(Size(width, height))
+    image = np.full((height, width), 200, np.uint8)
+    picture = View.fit(whole, long_side=90).render(image)
     assert picture.shape == shape
     assert (picture == 200).all()
 
@@ -173,6 +213,8 @@ def test_an_empty_box_or_a_crop_that_leaves_its_image_is_an_error():
         with pytest.raises(ValueError, match="empty box"):
             Box(*corners)
     # NumPy would cut the first two silently and take the third from the other end.
+    image = np.zeros((30, 40), np.uint8)
     for corners in ((0, 0, 41, 30), (0, 0, 40, 31), (-9, -9, -1, -1)):
+        view = View.fit(Box(*corners), long_side=9)
         with pytest.raises(ValueError, match="leaves the image of 40 x 30"):
-            View.fit(Box(*corners), long_side=9).render(np.zeros((30, 40), np.uint8))
+            view.render(image)

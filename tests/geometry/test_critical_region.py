@@ -27,13 +27,20 @@ SEEDS = st.integers(0, 2**32 - 1)
 
 def block(left, top, right, bottom, n):
     """n points that span a box from pixel to pixel: two of its corners, the others anywhere in it."""
-    inner = np.random.default_rng(n).uniform((left, top), (right, bottom), (n - 2, 2))
-    return np.concatenate([[(left, top), (right, bottom)], inner]).astype(np.float32)
+    corners = [(left, top), (right, bottom)]
+    inner = np.random.default_rng(n).uniform(*corners, (n - 2, 2))
+    return np.concatenate([corners, inner]).astype(np.float32)
 
 
 def lone(n):
     """n points farther than eps apart, in the lower half of the square."""
-    return np.array([(20 + 60 * (i % 16), 440 + 60 * (i // 16)) for i in range(n)], np.float32)
+    row, column = np.divmod(np.arange(n), 16)
+    points = np.column_stack([20 + 60 * column, 440 + 60 * row])
+    return points.astype(np.float32)
+
+
+NOTHING = np.zeros((0, 2), np.float32)
+FIVE = block(100, 100, 133, 133, 5)
 
 
 def region(*parts, size=SQUARE, config=BARE):
@@ -43,19 +50,14 @@ def region(*parts, size=SQUARE, config=BARE):
 @pytest.mark.parametrize(
     ("points", "reason", "clusters", "kept"),
     [
-        (np.zeros((0, 2), np.float32), RegionReason.TOO_FEW_POINTS, 0, 0),
+        (NOTHING, RegionReason.TOO_FEW_POINTS, 0, 0),
         (block(100, 100, 101, 101, 4), RegionReason.TOO_FEW_POINTS, 0, 0),
         (lone(30), RegionReason.NO_CLUSTER, 0, 0),
-        (
-            np.concatenate([block(100, 100, 133, 133, 5), lone(21)]),
-            RegionReason.TOO_SCATTERED,
-            1,
-            1,
-        ),
+        (np.concatenate([FIVE, lone(21)]), RegionReason.TOO_SCATTERED, 1, 1),
         (block(100, 100, 132, 130, 50), RegionReason.TOO_SMALL, 1, 1),
         (block(100, 100, 132, 131, 50), RegionReason.CROPPED, 1, 1),
         # 5 of 25 points are the 20 % that may be clustered at least.
-        (np.concatenate([block(100, 100, 133, 133, 5), lone(20)]), RegionReason.CROPPED, 1, 1),
+        (np.concatenate([FIVE, lone(20)]), RegionReason.CROPPED, 1, 1),
     ],
     ids=[
         "empty",
@@ -99,7 +101,9 @@ def test_clusters_are_kept_down_to_the_share_largest_first_and_equal_ones_in_the
 
 
 def test_clusters_label_noise_and_mark_the_points_of_kept_clusters():
-    points = np.concatenate([block(600, 600, 640, 640, 5), lone(3), block(100, 100, 140, 140, 101)])
+    small = block(600, 600, 640, 640, 5)
+    large = block(100, 100, 140, 140, 101)
+    points = np.concatenate([small, lone(3), large])
     clusters = regions.find_clusters(points, SQUARE, PAPER)
     assert_array_equal(clusters.sizes, [5, 101])
     assert_array_equal(clusters.labels, [0] * 5 + [-1] * 3 + [1] * 101)
@@ -111,13 +115,21 @@ def test_clusters_label_noise_and_mark_the_points_of_kept_clusters():
 
 def test_x_is_normalised_by_the_width_and_y_by_the_height():
     size = Size(1000, 200)  # eps is 50 pixels along x and 10 along y
-    stack = np.repeat(np.array([[500, 100]], np.float32), 6, axis=0)
+    stack = np.full((6, 2), (500, 100), np.float32)
     # One cluster if the two stacks are within eps of each other, else two.
-    for shift, last_label in [((40, 0), 0), ((60, 0), 1), ((0, 9), 0), ((0, 20), 1)]:
+    cases = [
+        ((40, 0), 0),
+        ((60, 0), 1),
+        ((0, 9), 0),
+        ((0, 20), 1),
+    ]
+    for shift, last_label in cases:
         points = np.concatenate([stack, stack + np.float32(shift)])
         found = regions.find_clusters(points, size, PAPER)
         assert found.labels.max() == last_label
-        found = regions.find_clusters(points[:, ::-1], Size(200, 1000), PAPER)
+        # The same with x and y exchanged
+        turned = points[:, ::-1]
+        found = regions.find_clusters(turned, Size(200, 1000), PAPER)
         assert found.labels.max() == last_label
 
 
@@ -137,10 +149,11 @@ def test_points_that_are_not_finite_or_not_on_the_image_are_ignored():
     clustered = block(100, 100, 130, 130, 10)
     # Pixels end at 999.5, so that point is the first outside.
     outside = [(1000, 5), (5, 999.5), (-0.75, 5)]
-    junk = np.array([(np.nan, 5), (5, np.inf), (-np.inf, np.nan), *outside], np.float32)
+    not_finite = [(np.nan, 5), (5, np.inf), (-np.inf, np.nan)]
     # Thirty of each: enough for a cluster, if they counted.
-    assert region(clustered, np.repeat(junk, 30, axis=0)) == region(clustered)
-    assert region(np.repeat(junk, 30, axis=0)).reason is RegionReason.TOO_FEW_POINTS
+    junk = np.repeat(np.float32([*not_finite, *outside]), 30, axis=0)
+    assert region(clustered, junk) == region(clustered)
+    assert region(junk).reason is RegionReason.TOO_FEW_POINTS
 
 
 @given(
@@ -161,7 +174,8 @@ def test_the_box_is_on_the_image_and_holds_every_kept_point(seed, size, config):
     for _ in range(4):
         centre = rng.random(2)
         spread = rng.choice([1e-3, 0.02])
-        parts.append(rng.normal(centre, spread, (rng.integers(1, 60), 2)))
+        count = rng.integers(1, 60)
+        parts.append(rng.normal(centre, spread, (count, 2)))
     points = (np.concatenate(parts) * size).astype(np.float32)
     got = critical_region(points, size, config)
     box = got.box
@@ -178,12 +192,14 @@ def test_the_box_is_on_the_image_and_holds_every_kept_point(seed, size, config):
     assert min(box.size) >= config.min_side
 
 
-EPS, MIN_SAMPLES = 0.05, 5
+EPS = 0.05
+MIN_SAMPLES = 5
 
 
 def clumps(rng, n):
     """Six clumps of many widths, farther apart than eps, and a little noise."""
-    centre = np.stack([np.arange(6) % 3, np.arange(6) // 3], axis=1) * 0.3 + 0.15
+    row, column = np.divmod(np.arange(6), 3)
+    centre = 0.15 + 0.3 * np.column_stack([column, row])
     # From far below the side of a merged cell (a tenth of eps) to almost eps.
     width = 10.0 ** np.linspace(-4, -1.7, 6)
     clump = rng.integers(6, size=n)
@@ -192,20 +208,29 @@ def clumps(rng, n):
     return points
 
 
-DISTRIBUTIONS = [lambda rng, n: rng.random((n, 2)), clumps, lambda rng, n: np.full((n, 2), 0.3)]
+def scattered(rng, n):
+    return rng.random((n, 2))
+
+
+def all_in_one_place(_, n):
+    return np.full((n, 2), 0.3)
 
 
 @pytest.mark.parametrize("count", [200, regions.MERGE_ABOVE + 1])
-@pytest.mark.parametrize("sample", DISTRIBUTIONS)
+@pytest.mark.parametrize("sample", [scattered, clumps, all_in_one_place])
 def test_merged_points_have_scikit_learns_clusters(sample, count):
     points = sample(np.random.default_rng(1), count)
     merged = regions.dbscan(points, eps=EPS, min_samples=MIN_SAMPLES)
-    expected = DBSCAN(eps=EPS, min_samples=MIN_SAMPLES, algorithm="kd_tree").fit_predict(points)
+    plain = DBSCAN(eps=EPS, min_samples=MIN_SAMPLES, algorithm="kd_tree")
+    expected = plain.fit_predict(points)
     # Only points at the edge of a cluster may differ; clusters have other numbers.
-    both = np.unique(np.column_stack([merged, expected])[(merged >= 0) & (expected >= 0)], axis=0)
+    is_merged = merged >= 0
+    is_expected = expected >= 0
+    labels = np.column_stack([merged, expected])[is_merged & is_expected]
+    both = np.unique(labels, axis=0)
     assert len(both) == expected.max() + 1 == merged.max() + 1
     # A merged point moves by up to a cell's diagonal, so some points at an edge become noise.
-    assert np.mean((merged >= 0) != (expected >= 0)) < 0.002
+    assert np.mean(is_merged != is_expected) < 0.002
 
 
 def test_many_points_are_merged_so_that_memory_stays_linear(monkeypatch):
@@ -217,8 +242,10 @@ def test_many_points_are_merged_so_that_memory_stays_linear(monkeypatch):
         return fit(self, points, sample_weight=sample_weight)
 
     monkeypatch.setattr(DBSCAN, "fit", spy)
-    regions.dbscan(clumps(np.random.default_rng(2), 20_000), eps=EPS, min_samples=MIN_SAMPLES)
+    points = clumps(np.random.default_rng(2), 20_000)
+    regions.dbscan(points, eps=EPS, min_samples=MIN_SAMPLES)
     [(cells, counts)] = seen
     assert counts.sum() == 20_000
+    neighbours = KDTree(cells).query_ball_point(cells, EPS, return_length=True)
     # pi 10^2 cells, and cells that the circle only touches
-    assert KDTree(cells).query_ball_point(cells, EPS, return_length=True).max() < 450
+    assert neighbours.max() < 450

@@ -20,10 +20,13 @@ WEAK = FocalPrior.of_image(SIZE), FocalPrior.of_image(SIZE)
 
 
 def camera(focal, turn=0.0, t=(0, 0, 0), centre=CENTRE):
+    """A camera that is turned about the vertical axis, by an angle in radians."""
     c = np.cos(turn)
     s = np.sin(turn)
-    K = np.array([[focal, 0, centre[0]], [0, focal, centre[1]], [0, 0, 1.0]])
-    return Camera(K, np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]), np.array(t, float))
+    x, y = centre
+    K = np.array([[focal, 0, x], [0, focal, y], [0, 0, 1.0]])
+    R = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+    return Camera(K, R, np.array(t, float))
 
 
 # Two lenses: with equal focal lengths, exchanged ones would not show.
@@ -33,12 +36,21 @@ CAMERAS = camera(900.0), camera(1300.0, 0.15, (-1.0, 0.1, 0.2))
 def seen(cameras, n=200, noise=0.0, outliers=0, seed=0, depth=(4, 9)):
     """n matches of random points, then wild ones."""
     rng = np.random.default_rng(seed)
-    X = rng.uniform((-1.5, -1.2, depth[0]), (1.5, 1.2, depth[1]), (n, 3))
-    points = [project(view, X) + rng.normal(scale=noise, size=(n, 2)) for view in cameras]
-    wild = [rng.uniform(0, SIZE, (outliers, 2)) for _ in range(2)]
-    points0 = np.vstack([points[0], wild[0]])
-    points1 = np.vstack([points[1], wild[1]])
-    return Matches(points0, points1, np.ones(n + outliers))
+    near, far = depth
+    X = rng.uniform((-1.5, -1.2, near), (1.5, 1.2, far), (n, 3))
+    points = []
+    for view in cameras:
+        points.append(project(view, X) + rng.normal(scale=noise, size=(n, 2)))
+    # After the inliers: tests know which matches are wild by their position.
+    for image in range(2):
+        wild = rng.uniform(0, SIZE, (outliers, 2))
+        points[image] = np.vstack([points[image], wild])
+    return Matches(*points, np.ones(n + outliers))
+
+
+def matches_of(X, first, second):
+    """The matches of points (N, 3), without noise."""
+    return Matches(project(first, X), project(second, X), np.ones(len(X)))
 
 
 def with_prior(matches, priors=WEAK, magsac=MAGSAC, config=CONFIG, model=ModelKind.F):
@@ -46,7 +58,8 @@ def with_prior(matches, priors=WEAK, magsac=MAGSAC, config=CONFIG, model=ModelKi
 
 
 def test_focal_lengths_and_pose_are_found_among_outliers():
-    result = with_prior(seen(CAMERAS, 400, 0.05, 150))
+    matches = seen(CAMERAS, 400, 0.05, 150)
+    result = with_prior(matches)
     assert result.ok
     error = pose_error(result.matrix, *CAMERAS, 1.0)
     assert error.rotation < 1
@@ -54,14 +67,20 @@ def test_focal_lengths_and_pose_are_found_among_outliers():
     assert result.inliers[:400].mean() > 0.95
     assert result.inliers[400:].mean() < 0.05
     # MAGSAC's own F is kept for the column of `validate` that shows the prior's gain.
-    plain = estimate(seen(CAMERAS, 400, 0.05, 150), MAGSAC).matrix
-    assert_allclose(result.magsac, np.sign(np.sum(result.magsac * plain)) * plain, atol=1e-12)
+    plain = estimate(matches, MAGSAC).matrix
+    # The sign of F is free.
+    sign = np.sign(np.sum(result.magsac * plain))
+    assert_allclose(result.magsac, sign * plain, atol=1e-12)
 
 
 def test_the_more_is_known_of_the_focal_lengths_the_better_is_the_pose_of_few_noisy_matches():
     exif = FocalPrior.of_image(SIZE, 700.0)
-    assert exif.focal == 700 != WEAK[0].focal and exif.sigma < WEAK[0].sigma
-    sure = FocalPrior.of_focal(900, 0.01, SIZE), FocalPrior.of_focal(1300, 0.01, SIZE)
+    assert exif.focal == 700 != WEAK[0].focal
+    assert exif.sigma < WEAK[0].sigma
+    sure = (
+        FocalPrior.of_focal(900, 0.01, SIZE),
+        FocalPrior.of_focal(1300, 0.01, SIZE),
+    )
     alone = []
     weakly = []
     surely = []
@@ -73,7 +92,8 @@ def test_the_more_is_known_of_the_focal_lengths_the_better_is_the_pose_of_few_no
             (with_prior(matches), weakly),
             (with_prior(matches, sure), surely),
         ):
-            errors.append(pose_error(result.matrix, *CAMERAS, 1.0).angle)
+            error = pose_error(result.matrix, *CAMERAS, 1.0)
+            errors.append(error.angle)
     assert np.median(weakly) < 0.7 * np.median(alone)
     assert np.median(surely) < 0.7 * np.median(weakly)
 
@@ -83,25 +103,26 @@ def test_known_cameras_of_two_focal_lengths_and_any_centre_give_their_essential_
     first = Camera(K0, np.eye(3), np.zeros(3))
     second = CAMERAS[1]
     matches = seen((first, second), 100, 0.2, 40)
-    result = with_prior(matches, (FocalPrior(K0, 0), FocalPrior(second.K, 0)), model=ModelKind.E)
+    # No deviation: the cameras are known.
+    known = (FocalPrior(K0, 0), FocalPrior(second.K, 0))
+    result = with_prior(matches, known, model=ModelKind.E)
     assert result.ok
     # An essential matrix has two equal singular values.
     singular_values = np.linalg.svd(result.matrix, compute_uv=False)
     assert_allclose(singular_values, np.array([1, 1, 0]) / np.sqrt(2), atol=1e-9)
-    assert pose_error(result.matrix, first.calibrated, second.calibrated, 1.0).angle < 2
+    error = pose_error(result.matrix, first.calibrated, second.calibrated, 1.0)
+    assert error.angle < 2
     assert result.inlier_count > 0
     assert result.magsac is None
 
 
 def test_if_the_principal_point_is_far_from_the_centre_magsacs_f_stays():
     # The prior's model has the principal point at the centre, which a cropped image has not.
-    cropped = (
-        camera(700.0, centre=(-900, 1500)),
-        camera(800.0, 0.3, (-2.0, 0.3, 0.5), centre=(2500, -800)),
-    )
+    first = camera(700.0, centre=(-900, 1500))
+    second = camera(800.0, 0.3, (-2.0, 0.3, 0.5), centre=(2500, -800))
     rng = np.random.default_rng(0)
     X = rng.uniform((-4, -4, 4), (4, 4, 9), (400, 3))
-    matches = Matches(*(project(view, X) for view in cropped), np.ones(400))
+    matches = matches_of(X, first, second)
     result = with_prior(matches)
     assert result.ok
     assert_array_equal(result.matrix, result.magsac)
@@ -112,15 +133,16 @@ def test_if_the_principal_point_is_far_from_the_centre_magsacs_f_stays():
 
 def degenerate():
     rng = np.random.default_rng(0)
-    X = np.column_stack([rng.uniform(-1, 1, (80, 2)), np.full(80, 5.0)])
+    plane = np.column_stack([rng.uniform(-1, 1, (80, 2)), np.full(80, 5.0)])
     along = np.linspace(0, 700, 40)
     line0 = np.column_stack([along, along])
     line1 = np.column_stack([along, 2 * along])
     same = rng.uniform(0, 700, (50, 2))
-    far0, far1 = rng.normal(size=(2, 40, 2)) * 1e18  # squares overflow float32
+    # Squares overflow float32.
+    far0, far1 = 1e18 * rng.normal(size=(2, 40, 2))
     return {
         "a pure rotation": seen((camera(1100), camera(1100, 0.1)), 80, 0.1),
-        "one plane": Matches(project(CAMERAS[0], X), project(CAMERAS[1], X), np.ones(80)),
+        "one plane": matches_of(plane, *CAMERAS),
         "a line": Matches(line0, line1, np.ones(40)),
         "six": seen(CAMERAS, 6),
         "five": seen(CAMERAS, 5),
@@ -138,24 +160,29 @@ def test_degenerate_matches_give_a_finite_matrix_and_no_error(name):
     assert np.linalg.norm(result.matrix) == pytest.approx(1)
     assert result.inliers.shape == (len(matches),)
     assert result.ok or result.inlier_count == 0
-    assert ("too few distinct matches" in result.failure) == (name in ("five", "none"))
+    has_too_few = "too few distinct matches" in result.failure
+    assert has_too_few == (name in ("five", "none"))
     # Six are too few for MAGSAC's F (eight), not for a pose and two focal lengths.
     assert name != "six" or (result.ok and result.magsac is None)
 
 
 def test_magsacs_f_stays_if_its_focal_lengths_contradict_a_narrow_prior():
     # The prior expects 1.1 long sides, 1126 pixels; the true ones are 900 and 1300.
+    matches = seen(CAMERAS, 400, 0.05)
     for sigma, has_focals in ((0.4, True), (0.03, False)):
-        priors = (FocalPrior.of_focal(WEAK[0].focal, sigma, SIZE),) * 2
-        assert any(with_prior(seen(CAMERAS, 400, 0.05), priors).stats.focals) == has_focals
+        prior = FocalPrior.of_focal(WEAK[0].focal, sigma, SIZE)
+        result = with_prior(matches, (prior, prior))
+        assert any(result.stats.focals) == has_focals
 
 
 def test_matches_of_points_behind_the_cameras_cost_as_outliers():
-    X = np.random.default_rng(1).uniform((-1.5, -1.2, -9), (1.5, 1.2, -4), (60, 3))
+    rng = np.random.default_rng(1)
+    X = rng.uniform((-1.5, -1.2, -9), (1.5, 1.2, -4), (60, 3))
     before = seen(CAMERAS, 200, 0.05)
-    behind = Matches(project(CAMERAS[0], X), project(CAMERAS[1], X), np.ones(60))
+    behind = matches_of(X, *CAMERAS)
     both = Matches.concatenate([before, behind])
-    added = with_prior(both).stats.cost - with_prior(before).stats.cost
+    cost_before = with_prior(before).stats.cost
+    added = with_prior(both).stats.cost - cost_before
     # They satisfy F exactly, so the Sampson distance alone would count them as inliers. An outlier
     # costs a half.
     assert added == pytest.approx(60 / 2, rel=0.1)

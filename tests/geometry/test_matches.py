@@ -9,12 +9,14 @@ from numpy.testing import assert_allclose, assert_array_equal
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
 from mkpc_kaggle.geometry.matches import Matches
 
-NAN, INF = np.nan, np.inf
+NAN = np.nan
+INF = np.inf
 
 
 def scored(scores):
     """The i-th match lies at (i, i), so its point identifies it."""
-    at = np.repeat(np.arange(len(scores))[:, None], 2, axis=1)
+    numbers = np.arange(len(scores))
+    at = np.column_stack([numbers, numbers])
     return Matches(at, at, np.asarray(scores))
 
 
@@ -55,7 +57,7 @@ def test_empty_is_legal_everywhere():
         assert result.scores.shape == (0,)
 
 
-def test_concatenation_keeps_every_match_in_order_duplicates_too():
+def test_concatenation_keeps_every_match_in_order_and_duplicates():
     parts = [scored([1, 1]), Matches.empty(), scored([1]), scored([1, 1])]
     # An iterator: it can be read only once.
     together = Matches.concatenate(iter(parts))
@@ -67,9 +69,11 @@ def test_concatenation_keeps_every_match_in_order_duplicates_too():
 def test_the_best_matches_are_the_first_of_a_stable_sort_in_their_own_order(scores, most):
     # MAGSAC's result depends on the order, so the kept matches stay in theirs.
     by_score = sorted(range(len(scores)), key=lambda i: -scores[i])
-    assert places(scored(scores).best(most)) == sorted(by_score[:most])
+    best = scored(scores).best(most)
+    assert places(best) == sorted(by_score[:most])
     # NaN sorts last: a score that is unknown beats none.
-    assert places(scored([NAN, 0.2, NAN, 0.1]).best(2)) == [1, 3]
+    best = scored([NAN, 0.2, NAN, 0.1]).best(2)
+    assert places(best) == [1, 3]
 
 
 def test_to_image_drops_points_on_padding_outside_or_not_finite_and_maps_the_rest():
@@ -88,8 +92,9 @@ def test_to_image_drops_points_on_padding_outside_or_not_finite_and_maps_the_res
         ((3, 3), (5, 5), INF),
         ((40, 20), (14, 10), -3),  # kept: a low score is a score
     ]
-    columns = [np.array(column, np.float32) for column in zip(*rows, strict=True)]
-    out = Matches(*columns).to_image(view0, view1)
+    points0, points1, scores = zip(*rows, strict=True)
+    found = Matches(np.float32(points0), np.float32(points1), np.float32(scores))
+    out = found.to_image(view0, view1)
     assert_allclose(out.points0, [(10, 20), (49.375, 39.375), (29.75, 29.75)], atol=1e-5)
     assert_allclose(out.points1, [(0.5, 0.5), (58.5, 58.5), (28.5, 20.5)], atol=1e-5)
     assert_array_equal(out.scores, np.array([0.9, 0.1, -3], np.float32))

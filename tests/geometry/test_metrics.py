@@ -23,20 +23,29 @@ SEEDS = st.integers(0, 2**32 - 1)
 
 
 def rotation(axis, degrees):
-    axis = np.asarray(axis, np.float64)
-    return cv2.Rodrigues(axis / np.linalg.norm(axis) * np.radians(degrees))[0]
+    direction = np.asarray(axis, np.float64) / np.linalg.norm(axis)
+    matrix, _ = cv2.Rodrigues(np.radians(degrees) * direction)
+    return matrix
 
 
 def random_camera(rng):
     focal, cx, ratio, cy = rng.uniform((300, 200, 0.8, 200), (3000, 900, 1.25, 900))
     K = np.array([[focal, 0, cx], [0, focal * ratio, cy], [0, 0, 1]])
-    return Camera(K, rotation(rng.normal(size=3), rng.uniform(0, 180)), rng.normal(size=3) * 3)
+    axis = rng.normal(size=3)
+    R = rotation(axis, rng.uniform(0, 180))
+    t = 3 * rng.normal(size=3)
+    return Camera(K, R, t)
 
 
 def random_cameras(seed):
     rng = np.random.default_rng(seed)
     first = random_camera(rng)
     return first, random_camera(rng)
+
+
+def at_origin(camera):
+    """The camera of a pair's first image, for a wrong pose of the second one."""
+    return Camera(camera.K, np.eye(3), np.zeros(3))
 
 
 def errors(*angles):
@@ -79,17 +88,21 @@ def test_the_rotation_angle_is_precise_at_both_ends(degrees):
 def test_the_fundamental_matrix_of_two_cameras_meets_the_epipolar_constraint(seed):
     cameras = random_cameras(seed)
     F = fundamental_of_cameras(*cameras)
-    X = np.random.default_rng(seed).normal(size=(50, 3)) * 10
-    # Homogeneous and of norm 1: some points are behind a camera or near its plane.
-    x0, x1 = ((X @ camera.R.T + camera.t) @ camera.K.T for camera in cameras)
-    x0 /= np.linalg.norm(x0, axis=1, keepdims=True)
-    x1 /= np.linalg.norm(x1, axis=1, keepdims=True)
+    rng = np.random.default_rng(seed)
+    X = 10 * rng.normal(size=(50, 3))
+    projected = []
+    for camera in cameras:
+        x = (X @ camera.R.T + camera.t) @ camera.K.T
+        # Homogeneous and of norm 1: some points are behind a camera or near its plane.
+        projected.append(x / np.linalg.norm(x, axis=1, keepdims=True))
+    x0, x1 = projected
     lines = x0 @ F.T
     residual = np.abs(np.sum(x1 * lines, axis=1))
     assert (residual < 1e-9 * np.linalg.norm(F)).all()
     # A matrix that maps every point to nearly nothing would pass the line above.
     wrong = np.abs(np.sum(x1[::-1] * lines, axis=1))
-    assert wrong.max() > 1e-6 * np.linalg.norm(lines, axis=1).max()
+    longest = np.linalg.norm(lines, axis=1).max()
+    assert wrong.max() > 1e-6 * longest
     assert np.linalg.norm(F) == pytest.approx(1, abs=1e-12)
     assert np.linalg.svd(F, compute_uv=False)[2] < 1e-12
 
@@ -101,9 +114,9 @@ def test_a_rotation_about_the_baseline_is_an_error_of_rotation_alone(seed, degre
     # off.
     first, second = random_cameras(seed)
     R, t = relative_pose(first, second)
-    origin = Camera(first.K, np.eye(3), np.zeros(3))
     wrong = Camera(second.K, rotation(t, degrees) @ R, t)
-    error = pose_error(fundamental_of_cameras(origin, wrong), first, second, 1.0)
+    F = fundamental_of_cameras(at_origin(first), wrong)
+    error = pose_error(F, first, second, 1.0)
     assert error.rotation == pytest.approx(degrees, rel=1e-5)
     assert error.translation_angle < 1e-4
     assert error.translation < 1e-5
@@ -111,7 +124,13 @@ def test_a_rotation_about_the_baseline_is_an_error_of_rotation_alone(seed, degre
 
 
 # E leaves the sign of t open, so a turn of 120 degrees is an error of 60.
-TURNED = [(0.5, 0.5), (30.0, 30.0), (90.0, 90.0), (120.0, 60.0), (180.0, 0.0)]
+TURNED = [
+    (0.5, 0.5),
+    (30.0, 30.0),
+    (90.0, 90.0),
+    (120.0, 60.0),
+    (180.0, 0.0),
+]
 
 
 @pytest.mark.parametrize(("degrees", "expected"), TURNED)
@@ -120,9 +139,11 @@ def test_the_translation_is_scaled_to_metres_and_its_sign_is_free(seed, degrees,
     first, second = random_cameras(seed)
     R, t = relative_pose(first, second)
     across = np.cross(t, (1.0, 2.0, 3.0))
-    origin = Camera(first.K, np.eye(3), np.zeros(3))
-    wrong = Camera(second.K, R, rotation(across, degrees) @ t * 7)  # its length is not known from F
-    error = pose_error(fundamental_of_cameras(origin, wrong), first, second, 2.5)
+    # The length of t is not known from F.
+    turned = 7 * rotation(across, degrees) @ t
+    wrong = Camera(second.K, R, turned)
+    F = fundamental_of_cameras(at_origin(first), wrong)
+    error = pose_error(F, first, second, 2.5)
     assert error.translation_angle == pytest.approx(expected, rel=1e-5, abs=1e-4)
     chord = 2 * np.linalg.norm(t) * np.sin(np.radians(expected) / 2)
     assert error.translation == pytest.approx(2.5 * chord, rel=1e-5, abs=1e-5)
@@ -151,7 +172,14 @@ def test_the_pose_auc_is_the_area_computed_by_hand(angles, threshold, area):
     assert isnan(pose_auc([], threshold))
 
 
-@pytest.mark.parametrize("R", [np.zeros((3, 3)), np.full((3, 3), np.nan), -1e100 * np.eye(3)])
+@pytest.mark.parametrize(
+    "R",
+    [
+        np.zeros((3, 3)),
+        np.full((3, 3), np.nan),
+        -1e100 * np.eye(3),
+    ],
+)
 def test_a_matrix_that_is_no_rotation_has_an_angle_and_raises_nothing(R):
     # Files of users may hold any matrix.
     assert isinstance(rotation_angle(R), float)
@@ -160,9 +188,11 @@ def test_a_matrix_that_is_no_rotation_has_an_angle_and_raises_nothing(R):
 def test_matches_are_correct_within_superglues_distance_of_both_epipolar_lines():
     # Cameras side by side: a line is a row, and 2 (dy / 800)^2 the distance
     K = np.diag([800.0, 800, 1])
-    cameras = Camera(K, np.eye(3), np.zeros(3)), Camera(K, np.eye(3), np.array([1.0, 0, 0]))
+    left = Camera(K, np.eye(3), np.zeros(3))
+    right = Camera(K, np.eye(3), np.array([1.0, 0, 0]))
     points0 = np.array([(5, 0), (5, 0), (5, 0)])
     # 5e-4 is the limit, which is 12.65 rows.
     points1 = np.array([(90, 12.6), (7, -12.7), (0, 0)])
     matches = Matches(points0, points1, np.ones(3))
-    assert metrics.correct_matches(matches, *cameras).tolist() == [True, False, True]
+    is_correct = metrics.correct_matches(matches, left, right)
+    assert is_correct.tolist() == [True, False, True]

@@ -45,28 +45,35 @@ def cameras(seed):
 
 def seen(seed, n, *, plane=False):
     """n noiseless matches of random points in general position, or on a plane askew."""
-    X = np.random.default_rng(seed + 100).uniform((-2, -2, 4), (2, 2, 9), (n, 3))
+    rng = np.random.default_rng(seed + 100)
+    X = rng.uniform((-2, -2, 4), (2, 2, 9), (n, 3))
     if plane:
-        X[:, 2] = 6 + 0.2 * X[:, 0] - 0.3 * X[:, 1]
+        x, y, _ = X.T
+        X[:, 2] = 6 + 0.2 * x - 0.3 * y
     first, second = cameras(seed)
     return Matches(project(first, X), project(second, X), np.ones(n))
 
 
 def wild(seed, n):
     rng = np.random.default_rng(seed + 200)
-    return Matches(*(rng.uniform(0, (WIDTH, HEIGHT), (n, 2)) for _ in range(2)), np.ones(n))
+    points0 = rng.uniform(0, (WIDTH, HEIGHT), (n, 2))
+    points1 = rng.uniform(0, (WIDTH, HEIGHT), (n, 2))
+    return Matches(points0, points1, np.ones(n))
 
 
 @cache
 def scene(seed, plane=False):
     """300 matches in random order, 40 % of them outliers, and which are true."""
     order = np.random.default_rng(seed).permutation(300)
-    matches = Matches.concatenate([seen(seed, 180, plane=plane), wild(seed, 120)])
+    inliers = seen(seed, 180, plane=plane)
+    matches = Matches.concatenate([inliers, wild(seed, 120)])
     return matches[order], order < 180
 
 
 def estimated(model, matches, config=DEFAULT, seed=0):
-    intrinsics = tuple(camera.K for camera in cameras(seed)) if model is ModelKind.E else None
+    intrinsics = None
+    if model is ModelKind.E:
+        intrinsics = tuple(camera.K for camera in cameras(seed))
     return estimate(matches, config, model, intrinsics)
 
 
@@ -82,7 +89,9 @@ def assert_fallback(result, model, count):
     assert result.failure
     assert result.inliers.shape == (count,)
     assert result.inlier_count == 0
-    expected = np.eye(3) / np.sqrt(3) if model is ModelKind.H else FALLBACK_FUNDAMENTAL / np.sqrt(2)
+    expected = FALLBACK_FUNDAMENTAL / np.sqrt(2)
+    if model is ModelKind.H:
+        expected = np.eye(3) / np.sqrt(3)
     assert_allclose(result.matrix, expected, atol=1e-15)
 
 
@@ -113,7 +122,9 @@ def test_the_essential_matrix_and_the_homography_of_a_plane_are_found_among_outl
     E = second.K.T @ fundamental_of_cameras(first, second) @ first.K
     E /= np.linalg.norm(E)
     # The sign of E is free.
-    assert min(np.linalg.norm(result.matrix - E), np.linalg.norm(result.matrix + E)) < 1e-3
+    difference = np.linalg.norm(result.matrix - E)
+    with_other_sign = np.linalg.norm(result.matrix + E)
+    assert min(difference, with_other_sign) < 1e-3
     result = estimated(ModelKind.H, scene(0, plane=True)[0])
     fresh = seen(0, 500, plane=True)[180:]
     moved = cv2.perspectiveTransform(fresh.points0[:, None], result.matrix)[:, 0]
@@ -125,22 +136,29 @@ def test_magsac_finds_the_pose_of_noisy_matches_at_a_threshold_of_a_pixel():
     config = RobustConfig(threshold=1.0, permutations=1)
     for seed in range(12):
         matches, _ = scene(seed)
-        noise = np.random.default_rng(seed).normal(0, 0.5, (2, *matches.points0.shape))
-        noisy = Matches(matches.points0 + noise[0], matches.points1 + noise[1], matches.scores)
+        rng = np.random.default_rng(seed)
+        noise0, noise1 = rng.normal(0, 0.5, (2, *matches.points0.shape))
+        noisy = Matches(matches.points0 + noise0, matches.points1 + noise1, matches.scores)
         result = estimated(ModelKind.E, noisy, config, seed)
         first, second = cameras(seed)
-        errors.append(pose_error(result.matrix, first.calibrated, second.calibrated, 1.0).angle)
+        error = pose_error(result.matrix, first.calibrated, second.calibrated, 1.0)
+        errors.append(error.angle)
     # Degrees; 0.9 in units of the focal length, where the score has no scale
     assert np.median(errors) < 0.4
 
 
 def test_sampson_distance_is_in_pixels_and_the_same_in_either_order():
-    matches = Matches(np.array([(10, 20), (30, 40)]), np.array([(500, 20), (7, 43)]), np.ones(2))
+    points0 = np.array([(10, 20), (30, 40)])
+    points1 = np.array([(500, 20), (7, 43)])
+    matches = Matches(points0, points1, np.ones(2))
     # The fallback's lines are rows. Three rows off, each image takes half of the correction.
-    assert_allclose(robust.sampson_distances(FALLBACK_FUNDAMENTAL, matches), [0, 3 / np.sqrt(2)])
+    distances = robust.sampson_distances(FALLBACK_FUNDAMENTAL, matches)
+    assert_allclose(distances, [0, 3 / np.sqrt(2)])
     # The second image is half as high: y1 = y0 / 2
     twice = FALLBACK_FUNDAMENTAL @ np.diag([1, 0.5, 1])
-    matches = Matches(np.array([(10, 20)]), np.array([(500, 13)]), np.ones(1))
+    point0 = np.array([(10, 20)])
+    point1 = np.array([(500, 13)])
+    matches = Matches(point0, point1, np.ones(1))
     distance = 3 / np.sqrt(1 + 0.5**2)
     assert_allclose(robust.sampson_distances(twice, matches), [distance])
     swapped = Matches(matches.points1, matches.points0, np.ones(1))
@@ -169,9 +187,12 @@ def test_repeated_matches_do_not_change_the_model_and_non_finite_ones_are_never_
     assert_agrees(clean, truth)
     # Units of several sizes find the same points: repetitions must not outvote other matches.
     again = np.random.default_rng(4).integers(0, 300, 900)
-    nan = Matches(np.full((50, 2), np.nan), np.full((50, 2), 5), np.ones(50))
-    infinite = Matches(np.full((50, 2), 5), np.full((50, 2), np.inf), np.ones(50))
-    more = estimated(model, Matches.concatenate([nan, matches, infinite, matches[again]]), seed=1)
+    ones = np.ones(50)
+    fives = np.full((50, 2), 5)
+    nan = Matches(np.full((50, 2), np.nan), fives, ones)
+    infinite = Matches(fives, np.full((50, 2), np.inf), ones)
+    together = Matches.concatenate([nan, matches, infinite, matches[again]])
+    more = estimated(model, together, seed=1)
     assert_array_equal(more.matrix, clean.matrix)
     none = np.zeros(50, bool)
     expected = np.concatenate([none, clean.inliers, none, clean.inliers[again]])
@@ -186,25 +207,27 @@ def test_the_same_input_gives_the_same_bytes_after_other_calls_and_beside_other_
     plane = model is ModelKind.H
     config = RobustConfig(method=method, max_iterations=2000)
     inputs = [scene(seed, plane)[0] for seed in SEEDS] * 2
-    alone = [as_bytes(estimated(model, matches, config)) for matches in inputs]
+
+    def result_of(matches):
+        return as_bytes(estimated(model, matches, config))
+
+    alone = [result_of(matches) for matches in inputs]
     assert alone[:3] == alone[3:]
     assert len(set(alone)) == 3
     # OpenCV has one generator of random numbers for each process.
     for rng_seed in (0, 12345):
         cv2.setRNGSeed(rng_seed)
-        assert [as_bytes(estimated(model, matches, config)) for matches in inputs[:3]] == alone[:3]
+        again = [result_of(matches) for matches in inputs[:3]]
+        assert again == alone[:3]
     with ThreadPoolExecutor(4) as threads:
-        together = list(
-            threads.map(lambda matches: as_bytes(estimated(model, matches, config)), inputs)
-        )
+        together = list(threads.map(result_of, inputs))
     assert together == alone
 
 
 ANY_FLOAT = st.floats(width=32)
 # Squares of 1e20 overflow float32, and squares of 1e-20 vanish.
-CORNERS = st.sampled_from(
-    np.array([0, 1, -1, 2, 100, 1e-20, 1e10, 1e18, 1e20, 3e38], np.float32).tolist()
-)
+EXTREMES = np.array([0, 1, -1, 2, 100, 1e-20, 1e10, 1e18, 1e20, 3e38], np.float32)
+CORNERS = st.sampled_from(EXTREMES.tolist())
 # Few values, so that points coincide.
 PIXELS = st.integers(0, 5).map(float)
 
@@ -230,7 +253,8 @@ def test_any_points_give_a_finite_matrix_of_norm_1_and_a_mask(data, n, model, me
     assert np.linalg.norm(result.matrix) == UNIT
     assert result.inliers.shape == (n,)
     assert result.ok == result.inliers.any()
-    assert not result.inliers[~np.isfinite(rows).all(axis=1)].any()
+    is_finite = np.isfinite(rows).all(axis=1)
+    assert not result.inliers[~is_finite].any()
 
 
 @pytest.mark.parametrize("refused", [1, 3])

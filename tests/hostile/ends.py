@@ -58,7 +58,9 @@ SUBMISSIONS = {
 }
 CLEARED = r"a\x1b[2J\n: no"
 SCORE = "validate --train-dir T --submission sub.csv --truth truth.csv"
-SHORT, LONG = ("1s", "0.001s", "3s"), ("99999999999h", "' 60s '")  # limits
+# Time limits that end the run early, and limits that do not
+SHORT = ("1s", "0.001s", "3s")
+LONG = ("99999999999h", "' 60s '")
 SOON = (0.6, 1.5, 3.0, 6.0)  # Python itself takes 0.1 s to start, more on a busy machine
 ENDS = {"SIGINT": 130, "SIGTERM": 143}
 STATUSES = {name: (0, status, -status + 128) for name, status in ENDS.items()}

@@ -62,7 +62,7 @@ CASES = [
         for name, (fault, says) in FAULTS.items()
     ),
     # `ulimit -f` counts blocks of 512 bytes; a file that reaches the limit fails as on a full disk.
-    Case("faults", "no file above 20 kB", SUBMIT, says="2 of 2 pairs have an F", limits="-f 40"),
+    Case("faults", "no file above 20 kB", SUBMIT, says="2 of 2 pairs with an F", limits="-f 40"),
     *(
         Case(
             "faults",

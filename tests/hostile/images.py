@@ -66,7 +66,7 @@ DAMAGED = {
     for suffix in (".png", ".jpg")
 }
 CASES = [
-    *makes("images", SUBMIT, DAMAGED, (0,), says="pairs have an F"),
+    *makes("images", SUBMIT, DAMAGED, (0,), says="pairs with an F"),
     *makes("images", REPORTED, {name: at(X, make) for name, make in ODD.items()}, (0,)),
     *makes(
         "images",

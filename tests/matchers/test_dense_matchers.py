@@ -19,17 +19,18 @@ from mkpc_kaggle.matchers.networks.warp_refiner import WarpEstimate, identity_ma
 
 
 @torch.inference_mode()
-def test_corrections_are_in_pixels_of_the_query_however_large_the_support_is(monkeypatch):
+def test_corrections_are_in_pixels_of_the_query_for_supports_of_any_size(monkeypatch):
     network = DKM()
     refiner = network.decoder.conv_refiner["8"]
     monkeypatch.setattr(refiner, "forward", lambda *_: torch.ones(1, 3, 6, 8))
     query = network.encode(torch.zeros(1, 3, 48, 64)).coarse
     support = network.encode(torch.zeros(1, 3, 72, 40)).coarse
     estimate = WarpEstimate(torch.zeros(1, 2, 6, 8), torch.zeros(1, 1, 6, 8))
+    # A grid of 6 x 8 cells spans 2 in each direction, and the correction is an eighth of a cell.
+    cell = torch.tensor([2 / 8, 2 / 6])
     for other in (query, support):
         flow = network.decoder.correct(estimate, query, other, 8).flow
-        # A grid of 6 x 8 cells spans 2 in each direction, and the correction is an eighth of a cell.
-        torch.testing.assert_close(flow[0, :, 0, 0], torch.tensor([2 / 8, 2 / 6]) / 8)
+        torch.testing.assert_close(flow[0, :, 0, 0], cell / 8)
 
 
 def test_matches_without_certainty_are_never_drawn():
@@ -38,9 +39,12 @@ def test_matches_without_certainty_are_never_drawn():
     certainty[10:] = 0
     generator = torch.Generator()
     # Fifty are asked for, and ten have a certainty.
-    assert sorted(sample_matches(warp, certainty, 50, 0.05, generator).tolist()) == [*range(10)]
-    assert len(sample_matches(warp, certainty * 0, 50, 0.05, generator)) == 0
-    assert len(sample_matches(warp[:0], certainty[:0], 50, 0.05, generator)) == 0
+    drawn = sample_matches(warp, certainty, 50, 0.05, generator)
+    assert sorted(drawn.tolist()) == [*range(10)]
+    of_none = sample_matches(warp, certainty * 0, 50, 0.05, generator)
+    assert len(of_none) == 0
+    of_empty = sample_matches(warp[:0], certainty[:0], 50, 0.05, generator)
+    assert len(of_empty) == 0
 
 
 @pytest.fixture(scope="module")
@@ -50,33 +54,49 @@ def matcher() -> DenseMatcher:
 
 # Dense networks resize the content alone: padding would enter the warp as a place to match.
 def test_padding_changes_nothing(matcher):
-    plain = [picture(40, 56), picture(50, 36, "another")]
-    padded = [picture(40, 56, padding=(13, 26)), picture(50, 36, "another", padding=(8, 16))]
+    plain = [
+        picture(40, 56),
+        picture(50, 36, "another"),
+    ]
+    padded = [
+        picture(40, 56, padding=(13, 26)),
+        picture(50, 36, "another", padding=(8, 16)),
+    ]
     assert padded[0].pixels.shape == (66, 69, 3)
     assert same(match_one(matcher, *plain), match_one(matcher, *padded))
 
 
 def identity_warp(height: int, width: int, certainty: float) -> DenseWarp:
     grid = as_grid(identity_map(torch.zeros(height, width)))  # (1, h, w, 2)
-    return DenseWarp(torch.cat([grid, grid], dim=3), torch.full((1, height, width), certainty))
+    warp = torch.cat([grid, grid], dim=3)
+    return DenseWarp(warp, torch.full((1, height, width), certainty))
 
 
 def test_points_of_either_picture_are_in_its_own_pixels():
     """Both show the same, at another size: places relative to the edges agree."""
     # Two certainties, so that a match shows which of the two warps it comes from.
-    warps = identity_warp(40, 60, 0.3), identity_warp(80, 30, 0.9)
+    warps = (
+        identity_warp(40, 60, 0.3),
+        identity_warp(80, 30, 0.9),
+    )
     network = SimpleNamespace(encode=lambda *_: None, match=lambda *_: warps)
-    matcher = DenseMatcher(MatcherSpec("given"), network, DenseOptions(matches=9999), "cpu")
+    options = DenseOptions(matches=9999)
+    matcher = DenseMatcher(MatcherSpec("given"), network, options, "cpu")
     matches = match_one(matcher, picture(40, 60), picture(80, 30))
     assert len(matches) == 40 * 60 + 80 * 30
     expected = (matches.points0 + 0.5) * (30 / 60, 80 / 40) - 0.5
     np.testing.assert_allclose(matches.points1, expected, atol=1e-4)
     # A warp starts at whole pixels of one picture.
-    whole0 = np.abs(matches.points0 - np.rint(matches.points0)).max(axis=1) < 1e-4
-    whole1 = np.abs(matches.points1 - np.rint(matches.points1)).max(axis=1) < 1e-4
+    whole0 = are_whole(matches.points0)
+    whole1 = are_whole(matches.points1)
     assert (whole0 | whole1).all()
     np.testing.assert_array_equal(matches.scores == np.float32(0.3), whole0)
     assert set(np.unique(matches.scores)) == {np.float32(0.3), np.float32(0.9)}
+
+
+def are_whole(points):
+    distances = np.abs(points - np.rint(points))
+    return distances.max(axis=1) < 1e-4
 
 
 @pytest.mark.parametrize(("passes", "sides"), [(2, (56, 84)), (1, (84, 126))])
@@ -85,7 +105,9 @@ def test_sides_of_the_first_pass_are_multiples_of_14(passes, sides):
     options = DenseOptions(passes=passes, first_pass=0.648)
     matcher = DenseMatcher(MatcherSpec("given"), network, options, "cpu", multiple=14)
     (encoded,) = matcher.encode([picture(86, 130)])
-    assert encoded.features.coarse.at(1).shape[2:] == sides
+    features = encoded.features
+    assert features.coarse.at(1).shape[2:] == sides
     # DINOv2 needs patches of 14 pixels; the second pass has no DINOv2, and keeps the size.
-    fine = [each.at(1).shape[2:] for each in [encoded.features.fine] if each]
-    assert fine == [(86, 130)] * (passes - 1)
+    assert bool(features.fine) == (passes == 2)
+    if features.fine:
+        assert features.fine.at(1).shape[2:] == (86, 130)

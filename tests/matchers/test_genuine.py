@@ -56,7 +56,8 @@ def golden() -> dict[str, NDArray[np.float32]]:
 @cache
 def picture(pair: int, side: int) -> Picture:
     """Return the picture that the original networks saw; see the README of the golden vectors."""
-    path = json.loads((GOLDEN / "genuine" / "genuine.json").read_text())["pairs"][pair][side]
+    index = json.loads((GOLDEN / "genuine" / "genuine.json").read_text())
+    path = index["pairs"][pair][side]
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
     stored = cv2.imread(str(DATA / "train" / path), flags)
     if stored.shape[1] > 1100:
@@ -68,9 +69,10 @@ def picture(pair: int, side: int) -> Picture:
 
 
 def golden_keypoints(detector: str, pair: int, side: int) -> Keypoints:
-    points = torch.from_numpy(golden()[f"{pair}/{detector}/keypoints{side}"])
-    descriptors = torch.from_numpy(golden()[f"{pair}/{detector}/descriptors{side}"])
-    return Keypoints(points, descriptors, picture(pair, side).content)
+    points = golden()[f"{pair}/{detector}/keypoints{side}"]
+    descriptors = golden()[f"{pair}/{detector}/descriptors{side}"]
+    size = picture(pair, side).content
+    return Keypoints(torch.from_numpy(points), torch.from_numpy(descriptors), size)
 
 
 @needs_data
@@ -91,19 +93,23 @@ def test_keypoints_and_descriptors_are_the_originals(detector, matcher, least, m
             distances, nearest = KDTree(found.points).query(expected.points)
             same = distances < SAME_PX
             shares.append(same.mean())
-            assert_allclose(found.descriptors[nearest[same]], expected.descriptors[same], atol=1e-3)
+            of_same = found.descriptors[nearest[same]]
+            assert_allclose(of_same, expected.descriptors[same], atol=1e-3)
     assert min(shares) >= least
     assert np.mean(shares) >= mean
 
 
 def matches_of(name: str, pair: int, kind: str, **options: float) -> tuple[Scores, Scores]:
     """Return the scores of our matches and of the golden ones, both on the golden keypoints."""
-    keypoints = [golden_keypoints(name.partition("_")[0], pair, side) for side in (0, 1)]
-    (found,) = matcher_of(name, **options).match(keypoints[:1], keypoints[1:])
-    indices = golden()[f"{pair}/{name}/{kind}/matches"].T
-    points = [each.points[index].numpy() for each, index in zip(keypoints, indices, strict=True)]
+    detector = name.partition("_")[0]
+    first = golden_keypoints(detector, pair, 0)
+    second = golden_keypoints(detector, pair, 1)
+    (found,) = matcher_of(name, **options).match([first], [second])
+    ours = by_points(found.points0, found.points1, found.scores)
+    index0, index1 = golden()[f"{pair}/{name}/{kind}/matches"].T
     scores = golden()[f"{pair}/{name}/{kind}/scores"]
-    return by_points(found.points0, found.points1, found.scores), by_points(*points, scores)
+    expected = by_points(first.points[index0].numpy(), second.points[index1].numpy(), scores)
+    return ours, expected
 
 
 def by_points(*columns: NDArray[np.float32]) -> Scores:
@@ -122,7 +128,9 @@ def test_all_layers_find_the_originals_matches_of_its_keypoints(name, pair):
     # A score at the threshold may fall on either side of it.
     common = expected.keys() & ours.keys()
     assert len(common) >= 0.995 * len(expected.keys() | ours.keys())
-    assert_allclose([ours[row] for row in common], [expected[row] for row in common], atol=1e-3)
+    own_scores = [ours[row] for row in common]
+    scores = [expected[row] for row in common]
+    assert_allclose(own_scores, scores, atol=1e-3)
 
 
 @needs_data

@@ -23,7 +23,11 @@ from mkpc_kaggle.recipe import Recipe, Unit
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*is not verified")
 # Odd sides, a wide strip, and a picture of one column.
-SIZES = [((33, 47), (64, 48)), ((9, 120), (40, 40)), ((20, 1), (40, 50))]
+SIZES = [
+    ((33, 47), (64, 48)),
+    ((9, 120), (40, 40)),
+    ((20, 1), (40, 50)),
+]
 
 
 @pytest.fixture(params=MATCHERS, scope="module")
@@ -32,40 +36,44 @@ def matcher(request):
 
 
 def picture(matcher, height, width, name="scene"):
-    channels = 1 if matcher.spec.colour is Colour.GRAY else 3
-    return pictures.picture(height, width, name, channels=channels, multiple=matcher.spec.multiple)
+    spec = matcher.spec
+    channels = 1 if spec.colour is Colour.GRAY else 3
+    return pictures.picture(height, width, name, channels=channels, multiple=spec.multiple)
 
 
 @pytest.mark.parametrize("sizes", SIZES)
-def test_matches_lie_on_the_pictures_whatever_their_sizes(matcher, sizes):
+def test_matches_lie_on_pictures_of_any_size(matcher, sizes):
     shown = [picture(matcher, *size, f"{size}") for size in sizes]
     encodings = [matcher.encode([each])[0] for each in shown]
     (matches,) = matcher.match(encodings[:1], encodings[1:])
     # A lossless copy for the store, which keeps float32.
     for part in (matches.points0, matches.points1, matches.scores):
         assert part.dtype == np.float32
-    assert ((matches.scores >= 0) & (matches.scores <= 1.0001)).all()
+    assert (matches.scores >= 0).all()
+    assert (matches.scores <= 1.0001).all()
+    both = (matches.points0, matches.points1)
     # A window may reach over the edge by a few pixels.
-    for points, size in zip((matches.points0, matches.points1), sizes, strict=True):
-        assert (points > -5).all() and (points < np.array(size[::-1]) + 4).all()
+    for points, (height, width) in zip(both, sizes, strict=True):
+        assert (points > -5).all()
+        assert (points < np.array([width, height]) + 4).all()
     views = [each.view for each in shown]
     assert len(matches.to_image(*views)) >= 0.8 * len(matches)
 
 
-def test_the_same_pair_gives_the_same_bytes_whatever_ran_before(matcher):
+def test_the_same_pair_gives_the_same_bytes_after_other_pairs(matcher):
     shown = [picture(matcher, 64, 96, name) for name in ("scene", "scene", "another")]
     encodings = [matcher.encode([each])[0] for each in shown]
     (alone,) = matcher.match(encodings[:1], encodings[1:2])
     # A matcher that draws from torch's global generator would now draw other numbers.
     torch.rand(5)
-    other = matcher.match(encodings[2:], encodings[1:2])[0]
+    (other,) = matcher.match(encodings[2:], encodings[1:2])
     (again,) = matcher.match(encodings[:1], encodings[1:2])
     assert len(alone) > 5
     assert same(alone, again)
     assert not same(alone, other)
 
 
-def test_an_encoding_keeps_no_more_memory_than_is_counted_and_nothing_gives_nothing(matcher):
+def test_an_encoding_keeps_only_counted_memory_and_no_pairs_give_no_matches(matcher):
     pictures_of_a_batch = [picture(matcher, 64, 96, name) for name in ("scene", "another")]
     for encoding in matcher.encode(pictures_of_a_batch):
         # A view of the whole batch's tensor would keep all of it, and the cache would count a part.
@@ -78,7 +86,8 @@ def test_both_stages_run_with_an_odd_flat_picture(matcher):
     name = matcher.spec.name
     recipe = Recipe((Unit(1, name, 64), Unit(2, name, 48)), magsac=QUICK)
     run = TwoStageMatcher(recipe, matchers={name: matcher})
-    found = run(np.full((33, 47, 3), 128, np.uint8), scene(90, 70, 3))
+    flat = np.full((33, 47, 3), 128, np.uint8)
+    found = run(flat, scene(90, 70, 3))
     assert [result.failure for result in found.results] == ["", ""]
     assert np.isfinite(found.estimate.matrix).all()
 
@@ -90,15 +99,17 @@ def overflow(monkeypatch):
         return lambda *args, **more: exact(*args, **more) * torch.inf
 
     for name in ("linear", "conv1d", "conv2d"):
-        monkeypatch.setattr(functional, name, infinite(getattr(functional, name)))
+        exact = getattr(functional, name)
+        monkeypatch.setattr(functional, name, infinite(exact))
 
 
 def test_overflow_is_an_error_and_never_a_lack_of_keypoints_or_matches(matcher, monkeypatch):
     encodings = [matcher.encode([picture(matcher, 64, 96, name)]) for name in ("scene", "another")]
     overflow(monkeypatch)
     if matcher.spec.name != "sift_lightglue":  # SIFT is no network
+        shown = picture(matcher, 64, 96)
         with pytest.raises(NonFiniteError):
-            check_finite("features", list(matcher.encode([picture(matcher, 64, 96)])))
+            check_finite("features", list(matcher.encode([shown])))
     if matcher.spec.name != "aliked":  # nearest neighbours need no network
         with pytest.raises(NonFiniteError):
             matcher.match(*encodings)

@@ -52,7 +52,7 @@ FEW = {"loma": "\nthreshold = 0.0", "dkm": "\nmatches = 300", "roma": "\nmatches
 
 
 @pytest.mark.parametrize("matcher", TRIALS)
-def test_odd_small_and_blank_pictures_go_through(
+def test_odd_small_and_blank_pictures_are_matched_without_an_error(
     clean_environment, monkeypatch, matcher, test_dir, tmp_path
 ):
     checkpoints = write_checkpoints(tmp_path, [file for file in FILES if file.matcher == matcher])

@@ -34,7 +34,7 @@ def matches_of(name, precision=Precision.FLOAT32, noise=0):
 
 @pytest.mark.parametrize("precision", [Precision.BFLOAT16, Precision.FLOAT16])
 @pytest.mark.parametrize("name", NAMES)
-def test_matches_move_less_than_by_noise(name, precision):
+def test_half_precision_moves_matches_less_than_noise_does(name, precision):
     exact = matches_of(name)
     half = matches_of(name, precision)
     disturbed = matches_of(name, noise=1)

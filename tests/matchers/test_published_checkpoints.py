@@ -154,7 +154,7 @@ SPARSE: dict[str, tuple[str, Callable[[], Tables], int]] = {
 
 
 @pytest.mark.parametrize("name", SPARSE)
-def test_a_lightglue_and_its_detector_load_whatever_their_names_and_leftovers(name):
+def test_lightglue_and_its_detector_load_with_renamed_and_surplus_entries(name):
     matcher, make, count = SPARSE[name]
     tables = make()
     assert len(list(tables.values())[-1]) == count
@@ -240,7 +240,7 @@ for _training in ("outdoor", "indoor"):
 
 @needs_golden
 @pytest.mark.parametrize("name", GOLDEN_LISTS)
-def test_every_known_list_of_entries_loads(name):
+def test_every_published_set_of_tensor_names_loads(name):
     matcher, make, count = GOLDEN_LISTS[name]
     tables = make()
     assert len(list(tables.values())[-1]) >= count

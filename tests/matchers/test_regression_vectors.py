@@ -38,7 +38,7 @@ def found(name):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_matches_are_those_of_the_vectors(name):
+def test_matches_equal_the_regression_vectors(name):
     with np.load(DATA) as file:
         stored = file[name]
     assert len(stored) > 20

@@ -32,12 +32,16 @@ def test_matches_are_the_mutual_maxima_of_both_softmaxes(monkeypatch, held):
     grid1 = torch.randn(5, 7, 16, generator=generator)
     matches = coarse_matches(grid0, grid1, 0.5, 0.02, 0, None)
     # The whole matrix in float64, which the network never holds: it takes gigabytes.
-    similarity = (grid0.flatten(0, 1).double() @ grid1.flatten(0, 1).double().mT) * 0.5
+    cells0 = grid0.flatten(0, 1).double()
+    cells1 = grid1.flatten(0, 1).double()
+    similarity = 0.5 * cells0 @ cells1.mT
     confidence = similarity.softmax(0) * similarity.softmax(1)
     largest_of_column = confidence == confidence.amax(0, keepdim=True)
     largest_of_row = confidence == confidence.amax(1, keepdim=True)
-    expected = (largest_of_column & largest_of_row & (confidence > 0.02)).nonzero()
-    torch.testing.assert_close(torch.stack([matches.index0, matches.index1], dim=1), expected)
+    is_match = largest_of_column & largest_of_row & (confidence > 0.02)
+    expected = is_match.nonzero()
+    found = torch.stack([matches.index0, matches.index1], dim=1)
+    torch.testing.assert_close(found, expected)
     scores = confidence[tuple(expected.T)]
     torch.testing.assert_close(matches.scores.double(), scores, rtol=1e-5, atol=0)
 
@@ -47,6 +51,7 @@ def test_span_attention_in_chunks_is_that_of_the_whole(monkeypatch):
     generator = torch.Generator().manual_seed(0)
     q = torch.randn(2, 4, 6, 16, generator=generator)
     k, v = torch.randn(2, 2, 5, 7, 16, generator=generator)
+    # Cells of the 5 x 7 grid, and far outside of it
     samples = torch.rand(2, 6, 64, 2, generator=generator) * 30 - 10
     samples[0, 0, 0] = 1e12
     usable = torch.rand(2, 6, 64, generator=generator) > 0.3
@@ -63,9 +68,11 @@ def test_span_attention_in_chunks_is_that_of_the_whole(monkeypatch):
 def test_weights_with_optimal_transport_are_refused_with_what_to_take_instead(tmp_path):
     # LoFTR also publishes weights for optimal transport, which this entry reveals.
     surplus = {"coarse_matching.bin_score": torch.ones(())}
-    file = PublicFile(
-        "x.ckpt", "loftr", "loftr-outdoor", "loftr", Loftr, lambda state: wrapped(state | surplus)
-    )
+
+    def with_surplus(state):
+        return wrapped(state | surplus)
+
+    file = PublicFile("x.ckpt", "loftr", "loftr-outdoor", "loftr", Loftr, with_surplus)
     store = store_of(tmp_path, [file])
     with pytest.raises(UserError, match=r"'loftr-outdoor' match by optimal transport.*outdoor_ds"):
         loftr.load(store, loftr.SPEC.options(), Placement())
@@ -74,9 +81,11 @@ def test_weights_with_optimal_transport_are_refused_with_what_to_take_instead(tm
 @pytest.mark.parametrize("name", ["loftr", "quadtree", "aspanformer"])
 def test_points_of_image_0_are_centres_of_cells_within_the_border_of_the_content(name):
     matcher = MATCHERS[name](Placement())
-    padded = picture(97, 131, channels=1, multiple=matcher.spec.multiple, padding=(20, 40))
-    whole = picture(97, 131, channels=1, multiple=matcher.spec.multiple)
-    first, second = matcher.encode([padded]) + matcher.encode([whole])
+    multiple = matcher.spec.multiple
+    padded = picture(97, 131, channels=1, multiple=multiple, padding=(20, 40))
+    whole = picture(97, 131, channels=1, multiple=multiple)
+    (first,) = matcher.encode([padded])
+    (second,) = matcher.encode([whole])
     assert first.mask.sum() == 13 * 17  # cells of 8 pixels that 97 x 131 pixels touch
     (matches,) = matcher.match([first], [second])
     assert len(matches) > 0
@@ -84,7 +93,8 @@ def test_points_of_image_0_are_centres_of_cells_within_the_border_of_the_content
     cells = (matches.points0 + 0.5) / 8
     np.testing.assert_array_equal(cells % 1, 0)
     border = matcher._network.border
-    assert (cells >= border).all() and (cells < np.array([17, 13]) - border).all()
+    assert (cells >= border).all()
+    assert (cells < np.array([17, 13]) - border).all()
 
 
 @pytest.mark.parametrize(
@@ -99,7 +109,8 @@ def test_the_threshold_of_the_options_decides_which_cells_match(name, make):
         options = spec_of(name, "test").options(threshold=threshold)
         matcher = load_matcher(name, weights, options, Placement())
         view = picture(64, 96, channels=1, multiple=matcher.spec.multiple)
-        (matches,) = matcher.match(matcher.encode([view]), matcher.encode([view]))
+        encoded = matcher.encode([view])
+        (matches,) = matcher.match(encoded, encoded)
         counts.append(len(matches))
         assert (matches.scores > threshold).all()
     assert counts[0] > counts[1] == 0

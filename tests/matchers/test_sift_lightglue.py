@@ -18,16 +18,29 @@ from mkpc_kaggle.matchers.networks.lightglue import Adaptation, LightGlue
 PICTURE = picture(130, 171, channels=1)
 
 
+def seeded_network() -> LightGlue:
+    """LightGlue with the weights of the golden vectors."""
+    glue = LightGlue(SHAPE, Adaptation(depth=-1, width=-1))
+    seeded = {}
+    for name, tensor in glue.state_dict().items():
+        seeded[name] = seeded_tensor(name, tuple(tensor.shape))
+    glue.load_state_dict(seeded)
+    return glue
+
+
+def by_position(rows):
+    return rows[np.lexsort(rows[:, :2].T)]
+
+
 @needs_golden
 def test_keypoints_and_log_assignment_are_the_golden_ones():
     golden = golden_arrays("sift_lightglue", "herz_jesus")
-    glue = LightGlue(SHAPE, Adaptation(depth=-1, width=-1))
-    state = glue.state_dict()
-    glue.load_state_dict({name: seeded_tensor(name, tuple(x.shape)) for name, x in state.items()})
+    glue = seeded_network()
     found = []
     glue.assignment(8).register_forward_hook(lambda *call: found.append(call[-1]))
     matcher = LightGlueMatcher(SPEC, sift_encoder(512, "cpu"), glue, Placement())
-    encodings = matcher.encode([as_picture(golden[f"image{number}"].numpy()) for number in (0, 1)])
+    shown = [as_picture(golden[f"image{number}"].numpy()) for number in (0, 1)]
+    encodings = matcher.encode(shown)
     for number, keypoints in enumerate(encodings):
         parts = {
             "keypoints": keypoints.points + 0.25,  # OpenCV's offset
@@ -38,7 +51,8 @@ def test_keypoints_and_log_assignment_are_the_golden_ones():
         count = len(keypoints)
         expected = np.hstack([golden[f"{part}{number}"].reshape(count, -1) for part in parts])
         own = np.hstack([part.reshape(count, -1) for part in parts.values()])
-        off = np.abs(own[np.lexsort(own[:, :2].T)] - expected[np.lexsort(expected[:, :2].T)])
+        # Versions of OpenCV order keypoints differently.
+        off = np.abs(by_position(own) - by_position(expected))
         is_close = off < 1e-5 + 1e-6 * np.abs(expected)
         assert is_close.mean() > 0.998, "OpenCV 4.8 rounds some elsewhere"
         assert off.max() < 2e-3
@@ -53,25 +67,32 @@ def test_keypoints_and_log_assignment_are_the_golden_ones():
             descriptors=golden[f"descriptors{number}"],
         )
         given.append([exact])
-    assert len(matcher.match(*given)[0]) == len(golden["matches"]) == 0
+    (matches,) = matcher.match(*given)
+    assert len(matches) == len(golden["matches"]) == 0
+    assignment = found[0]
+    rows, columns = assignment.shape
+    expected = golden["log_assignment"][:rows, :columns]
     # Down to -38. The golden values differ by up to 2e-4 from values in float64, so the tolerance is
     # relative, too.
-    expected = golden["log_assignment"][: found[0].shape[0], : found[0].shape[1]]
-    assert_allclose(found[0], expected, rtol=1e-4, atol=1e-4)
+    assert_allclose(assignment, expected, rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.parametrize("turns", [1, 2, 3])
 def test_a_picture_matches_itself_turned_by_quarter_turns(turns):
-    turned = as_picture(np.ascontiguousarray(np.rot90(PICTURE.pixels, turns)))
-    matches = match_one(lightglue_matcher("sift_lightglue", Placement()), PICTURE, turned)
+    pixels = np.rot90(PICTURE.pixels, turns)
+    turned = as_picture(np.ascontiguousarray(pixels))
+    matcher = lightglue_matcher("sift_lightglue", Placement())
+    matches = match_one(matcher, PICTURE, turned)
     points = matches.points0
     width, height = PICTURE.content
     for _ in range(turns):
-        points = np.stack([points[:, 1], width - 1 - points[:, 0]], 1)
+        x, y = points.T
+        points = np.column_stack([y, width - 1 - x])
         width, height = height, width
     offsets = matches.points1 - points
     assert len(matches) > 100
-    assert np.mean(np.hypot(*offsets.T) < 1) > 0.9
+    distances = np.linalg.norm(offsets, axis=1)
+    assert np.mean(distances < 1) > 0.9
     # OpenCV's offset of a quarter pixel, uncorrected, turns with the picture: up to 0.5 apart.
     assert_allclose(np.median(offsets, axis=0), 0, atol=0.06)
 
@@ -80,8 +101,12 @@ def test_a_pixel_has_one_keypoint_and_the_strongest_are_kept():
     (few,) = sift_encoder(20, "cpu")([PICTURE])
     (many,) = sift_encoder(500, "cpu")([PICTURE])
     # OpenCV gives a point with two orientations twice.
-    assert len(many) == len((many.points - 0.25).round().unique(dim=0)) > 100
-    assert torch.cdist(few.points, many.points).min(dim=1).values.max() < 0.5
+    pixels = (many.points - 0.25).round()
+    assert len(many) == len(pixels.unique(dim=0)) > 100
+    to_nearest = torch.cdist(few.points, many.points).min(dim=1).values
+    assert to_nearest.max() < 0.5
     # Sixteen equal squares: OpenCV keeps all keypoints that are as strong as the weakest kept.
-    equal = as_picture(np.tile(np.pad(np.full((6, 6), 255, np.uint8), 13), (4, 4)))
-    assert len(sift_encoder(5, "cpu")([equal])[0]) == 5
+    square = np.full((6, 6), 255, np.uint8)
+    equal = np.tile(np.pad(square, 13), (4, 4))
+    (five,) = sift_encoder(5, "cpu")([as_picture(equal)])
+    assert len(five) == 5

@@ -46,9 +46,7 @@ class Vismatch:
 # Its matchers count pixels from a corner or from a centre, and some have no confidences.
 @pytest.mark.parametrize("corner", [False, True])
 @pytest.mark.parametrize("confidences", [None, np.linspace(0, 1, len(POINTS))])
-def test_points_are_pixels_from_the_first_ones_centre_and_confidences_are_scores(
-    corner, confidences
-):
+def test_the_centre_of_the_first_pixel_is_at_0_and_confidences_are_scores(corner, confidences):
     matcher = VismatchMatcher(Vismatch(corner, confidences), corner=corner)
     matches = match_one(matcher, as_picture(PICTURE), as_picture(PICTURE))
     assert_allclose(matches.points0, POINTS, atol=1e-4)

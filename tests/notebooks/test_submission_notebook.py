@@ -84,7 +84,7 @@ IMAGES = [  # of Kaggle's: Python, OpenCV, torch, NumPy
 
 
 @pytest.mark.parametrize(("python", "opencv", "torch", "numpy"), IMAGES)
-def test_every_image_has_what_the_package_takes_from_it(python, opencv, torch, numpy):
+def test_every_kaggle_image_has_the_packages_that_the_dataset_lacks(python, opencv, torch, numpy):
     text = (NOTEBOOKS[0].parents[1] / "pyproject.toml").read_text(encoding="utf-8")
     dependencies = tomllib.loads(text)["project"]["dependencies"]
     taken = {need.name: need for need in map(Requirement, dependencies)}
@@ -100,7 +100,7 @@ def test_every_image_has_what_the_package_takes_from_it(python, opencv, torch, n
 PRINTED = {
     GENUINE: (
         "2 files, 0 refused, 0 missing",
-        "1 of 1 pairs have an F",
+        "1 of 1 pair with an F",
         r"\n1:aliked_lightglue@\d+ +1 +[1-9]",
         r"\n2:aliked_lightglue@\d+ +1 +[1-9]",
     ),
@@ -132,7 +132,9 @@ def packaged_weights(source: Path | None, directory: Path) -> tuple[Path, ...]:
 
 
 @needs_namespaces
-def test_a_commit_run_without_network_leaves_a_submission_and_shows_pairs(kaggle, demo, tmp_path):
+def test_a_saved_version_without_a_network_writes_a_submission_and_shows_pairs(
+    kaggle, demo, tmp_path
+):
     """On photographs where there are some, else on rendered pictures."""
     kaggle.add_test_side(DATA / "test" if DATA.is_dir() else demo.test_dir, pairs=1)
     source = best_weights()
@@ -149,7 +151,7 @@ def test_a_commit_run_without_network_leaves_a_submission_and_shows_pairs(kaggle
     assert [text for text in PRINTED[source] if not re.search(text, printed)] == [], printed
     assert "does without" not in printed
     assert kaggle.problems() == []
-    assert "good: 1 rows" in printed
+    assert "good: 1 row" in printed
     assert "recipe auto" in printed
     assert "of 525 minutes used" in printed
     assert printed.count("sweep: ") == 1, "a notebook keeps every line, so progress is few of them"
@@ -158,7 +160,7 @@ def test_a_commit_run_without_network_leaves_a_submission_and_shows_pairs(kaggle
     assert (kaggle.root / "temp" / "submission.work" / "journal.sqlite").is_file()
     assert not list(kaggle.working.rglob("journal*")), "files in `working` are published"
     assert kaggle.figures() == 1, "the pair"
-    assert "&lt;title&gt;auto: 1 pairs&lt;/title&gt;" in kaggle.pages(), "the report, in an iframe"
+    assert "&lt;title&gt;auto: 1 pair&lt;/title&gt;" in kaggle.pages(), "the report, in an iframe"
 
 
 @needs_namespaces
@@ -195,7 +197,7 @@ def test_if_no_wheel_fits_the_notebook_shows_pips_message_and_the_advice(kaggle,
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_notebooks_are_committed_in_one_form_with_pictures_at_most(path):
+def test_notebooks_are_committed_without_traces_of_a_run_except_pictures(path):
     text = path.read_text(encoding="utf-8")
     notebook = nbformat.reads(text, as_version=4)
     nbformat.validate(notebook)

@@ -125,7 +125,7 @@ def test_weights_survive_the_upload_and_are_held_against_the_datasets_manifest(
     verify = ["weights", "verify", "--weights", tmp_path / "input"]
     verify += ["--manifest", mount / "weights_manifest.txt"]
     assert run_command(*verify) == 0
-    assert "1 files, 0 refused, 0 missing" in capsys.readouterr().out
+    assert "1 file, 0 refused, 0 missing" in capsys.readouterr().out
     (mount / "free.pt.safetensors").unlink()
     assert run_command(*verify) == 1
     assert "missing" in capsys.readouterr().out
@@ -213,7 +213,10 @@ def test_a_private_package_has_all_weights_and_a_public_one_is_not_written_over_
     arguments = ["package", "--owner", "someone", "--out", wanted.out, "--python", python_version()]
     arguments += ["--wheels", wanted.wheels, "--weights", wanted.weights[0]]
     assert run_command(*arguments, "--private") == 0
-    out = " ".join(capsys.readouterr().out.split())
+    printed = capsys.readouterr().out
+    assert "kaggle datasets create" in printed
+    assert "kaggle datasets version" not in printed, "nothing was uploaded before"
+    out = " ".join(printed.split())
     assert "private on Kaggle, do not share it" in out
     assert "kept.pt (Magic-Leap-noncommercial)" in out
     kept = wanted.out / "dataset" / "kept.pt.safetensors"
@@ -223,7 +226,9 @@ def test_a_private_package_has_all_weights_and_a_public_one_is_not_written_over_
     # The folder is uploaded as it is: a restricted file that stays there would be published.
     kept.unlink()
     assert run_command(*arguments) == 0
-    assert "Left out" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "Left out" in printed
+    assert f"  kaggle datasets version -p {wanted.out}/dataset" in printed, "the second upload"
 
 
 def test_bad_requests_are_refused_before_anything_is_written(wanted, tmp_path):

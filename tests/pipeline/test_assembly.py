@@ -65,7 +65,7 @@ def test_a_named_recipe_without_its_weights_is_refused_with_the_file_names():
 
 
 @needs_weights
-def test_recipes_take_what_is_there_and_fallbacks_stand_in_for_the_rest():
+def test_recipes_use_the_weights_that_exist_and_fallbacks_replace_the_other_units():
     auto = assemble("auto", weights=[WEIGHTS])
     there = {"xfeat_lighterglue", "sift", "aliked"}
     assert auto.recipe == load_recipe("auto").only(lambda unit: unit.matcher in there)
@@ -121,7 +121,7 @@ def test_the_advice_of_recipe_auto_is_the_light_recipe_unless_its_weights_are_th
     assert "fetch" not in told
 
 
-def test_a_permissive_run_leaves_out_of_recipe_auto_what_is_licensed_otherwise(known_files):
+def test_a_permissive_run_drops_units_under_other_licences_from_recipe_auto(known_files):
     every = assemble("auto", weights=[known_files])
     assert every.recipe.matcher_names == ("superglue", "loftr", "sift", "dkm")
     some = assemble("auto", weights=[known_files], licence=Licence.PERMISSIVE)
@@ -133,7 +133,7 @@ def test_a_permissive_run_leaves_out_of_recipe_auto_what_is_licensed_otherwise(k
 
 
 @pytest.mark.filterwarnings("ignore:weights not verified")
-def test_a_fallback_stands_in_for_a_matcher_whose_weights_are_not_permitted_or_not_there(
+def test_a_fallback_replaces_a_matcher_whose_weights_are_missing_or_not_permitted(
     known_files,
 ):
     recipe = Recipe((Unit(1, "superglue", 640, fallback="loftr"), Unit(2, "dkm", area="90x120")))
@@ -242,7 +242,7 @@ def test_recipe_auto_leaves_out_weights_that_have_the_digest_and_do_not_fit(misf
         "a fallback without weights",
     ],
 )
-def test_a_named_recipe_runs_the_fallback_of_weights_that_do_not_fit_or_goes_on_without(
+def test_a_named_recipe_runs_the_fallback_of_weights_that_do_not_fit_or_omits_the_unit(
     misfits, units, expected
 ):
     with pytest.warns(UserWarning, match=DOES_WITHOUT):
@@ -290,7 +290,9 @@ def submitted(demo, tmp_path, recipe, weights):
 
 @pytest.mark.filterwarnings("default:.* does without")  # the command prints it
 @pytest.mark.parametrize("recipe", ["auto", "own"])
-def test_one_checkpoint_that_does_not_fit_ends_no_run(misfits, demo, tmp_path, recipe, capsys):
+def test_a_checkpoint_that_does_not_fit_does_not_end_the_run(
+    misfits, demo, tmp_path, recipe, capsys
+):
     # It did: a file with the manifest's digest was trusted to fit, and the run ended with status 2.
     assert submitted(demo, tmp_path, recipe, misfits) == (0, [])
     told = capsys.readouterr()
@@ -300,9 +302,7 @@ def test_one_checkpoint_that_does_not_fit_ends_no_run(misfits, demo, tmp_path, r
 
 
 @pytest.mark.filterwarnings("default:.* does without")
-def test_match_does_without_a_checkpoint_that_does_not_fit_as_submit_does(
-    misfits, demo, tmp_path, capsys
-):
+def test_match_omits_a_checkpoint_that_does_not_fit_as_submit_does(misfits, demo, tmp_path, capsys):
     (tmp_path / "own.toml").write_text(TWO_UNITS)
     images = sorted((demo.test_dir / "test_images").rglob("*.png"))[:2]
     options = ["--recipe", tmp_path / "own.toml", "--weights", misfits]

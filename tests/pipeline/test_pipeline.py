@@ -5,6 +5,7 @@ import warnings
 from collections import Counter
 from dataclasses import replace
 from functools import cache
+from itertools import combinations
 
 import cv2
 import numpy as np
@@ -30,9 +31,11 @@ from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher
 from mkpc_kaggle.recipe import Recipe, Unit
 
 SIZE = Size(480, 360)
-CORNER0, CORNER1, SCALE = (60, 130), (170, 50), 1.2
+CORNER0 = (60, 130)
+CORNER1 = (170, 50)
+SCALE = 1.2
 # Image 0 -> image 1, pixel centres at integers
-SHIFT = (0.5 - np.array(CORNER0)) * SCALE - 0.5 + CORNER1
+SHIFT = SCALE * (0.5 - np.array(CORNER0)) - 0.5 + CORNER1
 SIFT = Recipe((Unit(1, "sift", 480),))
 TWO_STAGES = Recipe((Unit(1, "sift", 480), Unit(2, "sift", 440)))
 
@@ -49,11 +52,11 @@ def pair():
     photograph = load_sample_image("china.jpg")[20:380, 60:520]
     canvases = []
     for (left, top), scale in ((CORNER0, 1), (CORNER1, SCALE)):
-        size = (round(230 * scale), round(180 * scale))
+        width = round(230 * scale)
+        height = round(180 * scale)
+        resized = cv2.resize(photograph, (width, height), interpolation=cv2.INTER_AREA)
         canvas = np.full((SIZE.height, SIZE.width, 3), 128, np.uint8)
-        bottom = top + size[1]
-        right = left + size[0]
-        canvas[top:bottom, left:right] = cv2.resize(photograph, size, interpolation=cv2.INTER_AREA)
+        canvas[top : top + height, left : left + width] = resized
         canvases.append(canvas)
     return tuple(canvases)
 
@@ -64,7 +67,9 @@ def two_stage_match():
 
 
 def errors(matches):
-    return np.hypot(*(matches.points1 - SCALE * matches.points0 - SHIFT).T)
+    """The distances (N,) of points 1 from where points 0 are in image 1, in pixels."""
+    difference = matches.points1 - SCALE * matches.points0 - SHIFT
+    return np.linalg.norm(difference, axis=1)
 
 
 class Scripted:
@@ -106,44 +111,50 @@ def test_both_stages_give_matches_in_full_image_pixels():
     first, second = (result.matches for result in match.results)
     assert same(match.matches[match.in_stage(1)], first)
     assert same(match.matches[match.in_stage(2)], second)
-    points = second.points0, second.points1
-    corners = CORNER0, CORNER1
-    for region, xy, corner, scale in zip(match.regions, points, corners, (1, SCALE), strict=True):
+    sides = [
+        (second.points0, CORNER0, 1),
+        (second.points1, CORNER1, SCALE),
+    ]
+    for region, (xy, corner, scale) in zip(match.regions, sides, strict=True):
         assert region.reason == "cropped"
         box = region.box
         assert box.contains(xy).all()
         # Keypoints lie a few pixels within the photograph, and CAE adds up to 5 % of its width.
         tolerance = 8 + 0.05 * 230 * scale
-        assert np.abs(np.subtract((box.left, box.top), corner)).max() < tolerance
         end = corner + scale * np.array([230, 180])
-        assert np.abs((box.right, box.bottom) - end).max() < tolerance
+        assert_allclose((box.left, box.top), corner, rtol=0, atol=tolerance)
+        assert_allclose((box.right, box.bottom), end, rtol=0, atol=tolerance)
     assert len(match.inliers) == match.estimate.inlier_count > 100
     for result in match.results:
         assert len(result.matches) > 100
+        distances = errors(result.matches)
         # A crop's offset or scale that is applied wrongly moves all points by pixels.
-        assert np.median(errors(result.matches)) < 0.5
-        assert np.mean(errors(result.matches) < 2) > 0.9
+        assert np.median(distances) < 0.5
+        assert np.mean(distances < 2) > 0.9
 
 
-def test_a_prior_on_focal_lengths_goes_by_the_sizes_of_the_images_unless_the_cameras_are_known():
+def test_a_prior_on_focal_lengths_comes_from_the_sizes_of_the_images_unless_the_cameras_are_known():
     focal = FocalConfig()
     matcher = TwoStageMatcher(replace(SIFT, focal=focal))
     K = np.array([[400.0, 0, 240], [0, 400, 180], [0, 0, 1]])
     sizes = [Size(*image.shape[1::-1]) for image in pair()]
     by_size = [FocalPrior.of_image(size) for size in sizes]
     known = [FocalPrior(K, 0.0)] * 2  # a sigma of 0: certain
-    for match, priors in [
+    cases = [
         (matcher(*pair()), by_size),
         (matcher(*pair(), intrinsics=(K, K)), known),
-    ]:
+    ]
+    for match, priors in cases:
         expected = estimate_with_prior(match.matches, tuple(priors), SIFT.magsac, focal)
         assert_array_equal(match.estimate.matrix, expected.matrix)
         assert match.estimate.magsac is not None
     with pytest.raises(ValueError, match="model E needs intrinsics"):
         matcher(*pair(), model=ModelKind.E)
-    assert matcher(*pair(), model=ModelKind.E, intrinsics=(K, K)).estimate.ok
+    essential = matcher(*pair(), model=ModelKind.E, intrinsics=(K, K))
+    assert essential.estimate.ok
     # A homography has no focal lengths, so no prior refines it.
-    assert matcher(*pair(), model=ModelKind.H).estimate.magsac is None
+    homography = matcher(*pair(), model=ModelKind.H)
+    assert homography.estimate.magsac is None
 
 
 def test_paths_arrays_and_images_give_the_same(tmp_path):
@@ -166,24 +177,29 @@ def test_a_photograph_on_its_side_gives_the_same_matches_in_its_stored_pixels(tm
     paths = []
     views = []
     # EXIF's orientations of a camera upside down and on its side.
-    for number, (upright, orientation) in enumerate(zip(pair(), (3, 8), strict=True)):
-        path = tmp_path / f"{number}.png"
+    for upright, orientation in zip(pair(), (3, 8), strict=True):
+        path = tmp_path / f"{orientation}.png"
         turns = TURNS[orientation]
         stored = np.rot90(upright, -turns)
         cv2.imwrite(str(path), stored[..., ::-1])
         set_exif(path, orientation)
         paths.append(path)
-        whole = Box.whole(Size(*stored.shape[1::-1]))
+        height, width, _ = stored.shape
+        whole = Box.whole(Size(width, height))
         views.append(View.fit(whole, long_side=max(SIZE), turns=turns))
     found = TwoStageMatcher(TWO_STAGES)(*paths)
     expected = two_stage_match()
-    first, second = (
-        Matches(views[0].from_image(m.points0), views[1].from_image(m.points1), m.scores)
-        for m in (result.matches for result in found.results)
-    )
+    upright = []
+    for result in found.results:
+        matches = result.matches
+        points0 = views[0].from_image(matches.points0)
+        points1 = views[1].from_image(matches.points1)
+        upright.append(Matches(points0, points1, matches.scores))
+    first, second = upright
     # Stage 1 sees the same pixels. Crops of stored pixels may differ by a row or column.
     wanted = expected.results[0].matches
-    assert_allclose([first.points0, first.points1], [wanted.points0, wanted.points1], atol=1e-3)
+    assert_allclose(first.points0, wanted.points0, atol=1e-3)
+    assert_allclose(first.points1, wanted.points1, atol=1e-3)
     assert len(second) > 100
     assert np.mean(errors(second) < 2) > 0.9
     assert found.estimate.inlier_count > 100
@@ -191,8 +207,10 @@ def test_a_photograph_on_its_side_gives_the_same_matches_in_its_stored_pixels(tm
 
 def works(count=1):
     image0, image1 = map(Image.of_array, pair())
-    smaller = Image.of_array(np.ascontiguousarray(pair()[1][:300, 100:]))
-    return [PairMatch(images=(image0, other)) for other in (image1, smaller, image0)[:count]]
+    part = pair()[1][:300, 100:]
+    smaller = Image.of_array(np.ascontiguousarray(part))
+    others = [image1, smaller, image0]
+    return [PairMatch(images=(image0, other)) for other in others[:count]]
 
 
 def pipeline(recipe, matcher=None, **what):
@@ -200,13 +218,15 @@ def pipeline(recipe, matcher=None, **what):
     return Pipeline(recipe, lambda name: matcher, **what)
 
 
-def test_results_are_in_the_order_of_the_recipe_whatever_was_run_first():
+def test_results_are_in_the_order_of_the_recipe_for_any_order_of_running():
     # MAGSAC's result depends on the order of the matches, and a resumed run has another one.
     recipe = Recipe((Unit(1, "sift", 480), Unit(2, "sift", 440), Unit(1, "sift", 360)))
-    at_once = with_estimate(pipeline(recipe).match(works(), recipe.units)[0], recipe)
-    runner, (work,) = pipeline(recipe), works()
-    for unit in (recipe.units[2], recipe.units[0], recipe.units[1]):
-        (work,) = runner.match([work], [unit])
+    (work,) = pipeline(recipe).match(works(), recipe.units)
+    at_once = with_estimate(work, recipe)
+    runner = pipeline(recipe)
+    (work,) = works()
+    for number in (2, 0, 1):
+        (work,) = runner.match([work], [recipe.units[number]])
     piecemeal = with_estimate(work, recipe)
     assert [result.unit for result in at_once.results] == list(recipe.units)
     assert [result.unit for result in piecemeal.results] == list(recipe.units)
@@ -215,9 +235,10 @@ def test_results_are_in_the_order_of_the_recipe_whatever_was_run_first():
 
 
 def test_results_so_far_are_returned_when_no_unit_may_start():
-    (work,) = pipeline(TWO_STAGES).match(works(), TWO_STAGES.units, lambda unit: unit.stage == 1)
+    runner = pipeline(TWO_STAGES)
+    (work,) = runner.match(works(), TWO_STAGES.units, lambda unit: unit.stage == 1)
     assert [result.unit.stage for result in work.results] == [1]
-    (none,) = pipeline(TWO_STAGES).match(works(), TWO_STAGES.units, lambda unit: False)
+    (none,) = runner.match(works(), TWO_STAGES.units, lambda unit: False)
     assert none.results == ()
     assert with_estimate(none, TWO_STAGES).estimate.failure
 
@@ -225,9 +246,11 @@ def test_results_so_far_are_returned_when_no_unit_may_start():
 def test_regions_come_from_stage_1_alone():
     # Otherwise a repeated stage 2 would crop otherwise than the first one did.
     (work,) = pipeline(TWO_STAGES).match(works(), TWO_STAGES.units)
-    points = np.random.default_rng(0).uniform(0, 300, (999, 2))
+    rng = np.random.default_rng(0)
+    points = rng.uniform(0, 300, (999, 2))
     stray = Matches(points, points, np.ones(999))
-    strayed = replace(work, results=(work.results[0], replace(work.results[1], matches=stray)))
+    first, second = work.results
+    strayed = replace(work, results=(first, replace(second, matches=stray)))
     assert stages.with_regions(strayed, TWO_STAGES).regions == work.regions
 
 
@@ -245,7 +268,8 @@ def test_whole_images_are_encoded_once_and_crops_for_each_pair():
     image0, image1 = works()[0].images
     first = PairMatch(images=(image0, image1))
     runner = pipeline(TWO_STAGES, sift)
-    done = runner.match([first, PairMatch(images=(image1, image0)), first], TWO_STAGES.units)
+    turned = PairMatch(images=(image1, image0))
+    done = runner.match([first, turned, first], TWO_STAGES.units)
     runner.match(done, TWO_STAGES.units)  # a unit that a pair has had is not run again
     assert sift.seen.pop(Box.whole(SIZE)) == 2
     # Two crops of each of three pairs.
@@ -256,10 +280,13 @@ def test_whole_images_are_encoded_once_and_crops_for_each_pair():
 def test_two_matchers_of_one_class_do_not_share_encodings_and_the_surest_matches_are_kept():
     few = SiftMatcher(SiftOptions(features=30), "cpu")
     many = SiftMatcher(SiftOptions(features=600), "cpu")
-    match = own(Unit(1, "few", 480), Unit(1, "many", 480), few=few, many=many)(*pair())
-    alone = TwoStageMatcher(replace(SIFT, matchers={"sift": {"features": 600}}))(*pair())
+    both = own(Unit(1, "few", 480), Unit(1, "many", 480), few=few, many=many)
+    match = both(*pair())
+    as_written = replace(SIFT, matchers={"sift": {"features": 600}})
+    alone = TwoStageMatcher(as_written)(*pair())
     assert same(match.results[1].matches, alone.matches)
-    assert same(own(Unit(1, "many", 480, 50), many=many)(*pair()).matches, alone.matches.best(50))
+    of_fifty = own(Unit(1, "many", 480, 50), many=many)
+    assert same(of_fifty(*pair()).matches, alone.matches.best(50))
     # OpenCV may keep one keypoint more, with a second orientation.
     assert 0 < len(match.results[0].matches) <= 31
 
@@ -269,9 +296,8 @@ def test_no_matches_are_a_result_and_a_missing_answer_is_a_failure():
         def match(self, encodings0, encodings1):
             return []
 
-    match = own(Unit(1, "none", 480), Unit(2, "short", 480), none=Scripted(), short=Short())(
-        *pair()
-    )
+    units = (Unit(1, "none", 480), Unit(2, "short", 480))
+    match = own(*units, none=Scripted(), short=Short())(*pair())
     assert match.results[0].failure == ""
     assert "ValueError" in match.results[1].failure
     assert "too few" in match.estimate.failure
@@ -295,9 +321,14 @@ def test_if_a_matcher_raises_for_one_pair_the_others_of_its_minibatch_are_matche
         return 150
 
     matcher = RectifiedMatcher(matches=moody)
-    images = [Image(str(n), np.full((72, 80, 3), 10 + n, np.uint8)) for n in range(8)]
-    runner = Pipeline(Recipe((SWEEP,)), {"rectified": matcher}.__getitem__, minibatch=8)
-    done = runner.match([PairMatch(images=(each, each)) for each in images], [SWEEP])
+    pairs = []
+    for number in range(8):
+        # The matcher knows an image by its brightness.
+        pixels = np.full((72, 80, 3), 10 + number, np.uint8)
+        image = Image(str(number), pixels)
+        pairs.append(PairMatch(images=(image, image)))
+    runner = pipeline(Recipe((SWEEP,)), matcher, minibatch=8)
+    done = runner.match(pairs, [SWEEP])
     failures = [work.results[0].failure for work in done]
     assert failures == ["", "", "RuntimeError: no mood", *[""] * 5]
     for work in done:
@@ -313,7 +344,7 @@ def test_if_a_matcher_raises_for_one_pair_the_others_of_its_minibatch_are_matche
         KeyboardInterrupt("x"),
     ],
 )
-def test_memory_devices_and_interrupts_are_not_failures_of_a_matcher(error):
+def test_errors_of_memory_or_of_a_device_and_interrupts_are_not_failures_of_a_matcher(error):
     # A smaller minibatch, another device or the user decide about these, so they are raised.
     with pytest.raises(type(error), match=str(error)):
         own(Unit(1, "bad", 480), bad=Scripted(error))(*pair())
@@ -341,14 +372,16 @@ def in_child(match):
 def test_pairs_with_a_common_image_encode_it_once_and_match_as_single_pairs(tmp_path):
     paths = [tmp_path / f"{name}.png" for name in "abc"]
     photograph = load_sample_image("china.jpg")
-    for shift, path in enumerate(paths):
-        cv2.imwrite(str(path), photograph[20:300, 30 * shift :][:, :400])
-    pairs = [(paths[0], paths[1]), (paths[0], paths[2]), (paths[1], paths[2])]
+    for number, path in enumerate(paths):
+        left = 30 * number
+        cv2.imwrite(str(path), photograph[20:300, left : left + 400])
+    pairs = list(combinations(paths, 2))
     alone = [TwoStageMatcher(SIFT)(*pair) for pair in pairs]
 
     # Three images in three pairs: six encodings without a cache.
     counting = CountingSift()
-    found = list(TwoStageMatcher(SIFT, matchers={"sift": counting}).match_pairs(pairs))
+    matcher = TwoStageMatcher(SIFT, matchers={"sift": counting})
+    found = list(matcher.match_pairs(pairs))
     assert counting.seen.total() == 3
     for match, expected in zip(found, alone, strict=True):
         assert_array_equal(match.matches.points0, expected.matches.points0)
@@ -356,9 +389,11 @@ def test_pairs_with_a_common_image_encode_it_once_and_match_as_single_pairs(tmp_
 
 
 def test_match_pairs_names_an_unreadable_image(tmp_path):
-    (tmp_path / "a.png").write_bytes(b"")
+    path = tmp_path / "a.png"
+    path.write_bytes(b"")
+    found = TwoStageMatcher(SIFT).match_pairs([(path, path)])
     with pytest.raises(UserError, match="the file is empty"):
-        next(TwoStageMatcher(SIFT).match_pairs([(tmp_path / "a.png", tmp_path / "a.png")]))
+        next(found)
 
 
 class Loader:
@@ -390,7 +425,8 @@ def test_a_matcher_that_cannot_be_loaded_fails_its_units_alone_and_is_tried_once
     load = Loader(bad=error)
     pipeline = Pipeline(TWO_MATCHERS, load, minibatch=2)
     pipeline.load()
-    pairs = [PairMatch(images=tuple(map(Image.of_array, pair()))) for _ in range(3)]
+    images = tuple(map(Image.of_array, pair()))
+    pairs = [PairMatch(images=images) for _ in range(3)]
     for match in pipeline.match(pairs, TWO_MATCHERS.units):
         assert [result.failure for result in match.results] == ["", told, told]
     assert load.calls == {"good": 1, "bad": 1}

@@ -56,7 +56,8 @@ def test_what_is_hidden_is_passed_over_with_a_line(tmp_path, capsys):
     )
     assert names_of(root) == {".": ["f0.jpg", "f1.jpg"]}
     assert (
-        f"3 hidden files or folders are passed over, the first is {root}" in capsys.readouterr().err
+        f"hidden files and folders are passed over: 3, the first is {root}"
+        in capsys.readouterr().err
     )
 
 

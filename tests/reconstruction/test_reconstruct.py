@@ -309,7 +309,7 @@ def test_folders_that_cannot_be_reconstructed_get_one_line(tmp_path, capsys):
     root.mkdir()
     assert "has no images" in refused()
     (root / "a.png").write_bytes(b"")
-    assert "has a single image, a.png: there is nothing to match" in refused()
+    assert "has a single image, a.png: matching needs two" in refused()
     (root / "a.jpg").write_bytes(b"")
     assert "has both a.jpg and a.png; rename one of them" in refused()
     (root / "a.jpg").rename(root / "b.jpg")

@@ -18,30 +18,38 @@ from mkpc_kaggle.reporting.figures import draw_cameras, draw_strip, encode
 from mkpc_kaggle.scene.reconstruction import RegisteredImage, SfmModel
 from mkpc_kaggle.scene.view_graph import BatchImage
 
-SIZES = Size(120, 80), Size(60, 90)
-IMAGES = tuple(
-    Image.of_array(np.full((size.height, size.width, 3), 90, np.uint8)) for size in SIZES
+SIZE0 = Size(120, 80)
+SIZE1 = Size(60, 90)
+UNITS = (
+    Unit(1, "sift", 100),
+    Unit(2, "sift", 100),
 )
-UNITS = Unit(1, "sift", 100), Unit(2, "sift", 100)
 REGIONS = (
     CriticalRegion(Box(20, 10, 60, 30), RegionReason.CROPPED, 1, 1),
-    CriticalRegion(Box.whole(SIZES[1]), RegionReason.NO_CLUSTER),
+    CriticalRegion(Box.whole(SIZE1), RegionReason.NO_CLUSTER),
 )
+
+
+def gray(size, level):
+    pixels = np.full((size.height, size.width, 3), level, np.uint8)
+    return Image.of_array(pixels)
 
 
 def some(n):
     """n matches in a corner of both images."""
     # Within the critical region of the first image
-    points = np.random.default_rng(n).uniform(21, 29, (n, 2))
+    rng = np.random.default_rng(n)
+    points = rng.uniform(21, 29, (n, 2))
     return Matches(points, points, np.ones(n))
 
 
 def test_points_of_stage_2_are_drawn_where_they_are_on_the_crop():
-    results = tuple(UnitResult(unit, some(n)) for unit, n in zip(UNITS, (0, 20), strict=True))
-    match = PairMatch(
-        results, REGIONS, Estimate(ModelKind.F, FALLBACK_FUNDAMENTAL, np.ones(20, bool))
-    )
-    left, right = figures.draw_stage(IMAGES, match, 2).axes
+    first, second = UNITS
+    results = (UnitResult(first, some(0)), UnitResult(second, some(20)))
+    estimate = Estimate(ModelKind.F, FALLBACK_FUNDAMENTAL, np.ones(20, bool))
+    match = PairMatch(results, REGIONS, estimate)
+    images = (gray(SIZE0, 90), gray(SIZE1, 90))
+    left, right = figures.draw_stage(images, match, 2).axes
     # The first view is the crop, the second one the whole image.
     assert left.images[0].get_array().shape[:2] == (20, 40)
     xy = np.concatenate([dots.get_offsets() for dots in left.collections])
@@ -55,34 +63,44 @@ def test_cameras_are_seen_from_above_and_from_the_side_with_the_points_before_th
     """
     # Rows: right, down, and ahead in the world
     R = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
-    cameras = [Camera(np.eye(3), R, -R @ (0.0, 2.0 * n, 1.0)) for n in (0, 1)]
+    image = BatchImage("a.png", "a", Size(80, 60))
+    placed = []
+    for y in (0.0, 2.0):
+        camera = Camera(np.eye(3), R, -R @ (0.0, y, 1.0))
+        placed.append(RegisteredImage(image, camera, 9))
     wall = np.array([(10.0, y, z) for y in range(5) for z in range(8)])
-    images = tuple(
-        RegisteredImage(BatchImage("a.png", "a", Size(80, 60)), camera, 9) for camera in cameras
-    )
-    above, side = draw_cameras(SceneRecord("batch", models=(SfmModel(images, wall, 0.5),))).axes
-    (cloud, _, centres), (seen, _, points) = ([*panel.collections] for panel in (above, side))
-    assert np.ptp(centres.get_offsets(), axis=0).tolist() == [2, 0]
-    assert np.ptp(cloud.get_offsets(), axis=0).tolist() == [4, 0], "from above a wall is a line"
+    model = SfmModel(tuple(placed), wall, 0.5)
+    above, side = draw_cameras(SceneRecord("batch", models=(model,))).axes
+    cloud, _, centres = above.collections
+    assert extent(centres) == [2, 0]
+    assert extent(cloud) == [4, 0], "from above a wall is a line"
     assert (cloud.get_offsets()[:, 1] == 10).all()
-    assert np.ptp(points.get_offsets(), axis=0).tolist() == [0, 0], "one behind the other"
-    assert np.ptp(seen.get_offsets(), axis=0).tolist() == [0, 7]
-    assert seen.get_offsets()[:, 1].max() == 7, "up is up"
+    cloud, _, centres = side.collections
+    assert extent(centres) == [0, 0], "one behind the other"
+    assert extent(cloud) == [0, 7]
+    assert cloud.get_offsets()[:, 1].max() == 7, "up is up"
+
+
+def extent(dots):
+    """The width and height of drawn points, in units of the axes."""
+    return np.ptp(dots.get_offsets(), axis=0).tolist()
 
 
 def test_a_strip_shows_both_images_upright_at_one_height_with_matches_where_they_are():
     # 100 wide in its file, and 200 when it is upright
-    lying = Image.of_array(np.full((200, 100, 3), 250, np.uint8)).turned(1)
-    square = Image.of_array(np.full((300, 300, 3), 5, np.uint8))
-    matches = Matches(np.array([[89.5, 9.5]]), np.array([[149.5, 149.5]]), np.ones(1))
+    lying = gray(Size(100, 200), 250).turned(1)
+    square = gray(Size(300, 300), 5)
+    point0 = np.array([[89.5, 9.5]])
+    point1 = np.array([[149.5, 149.5]])
+    result = UnitResult(UNITS[0], Matches(point0, point1, np.ones(1)))
     found = Estimate(ModelKind.F, np.eye(3), np.array([True]))
-    figure = draw_strip((lying, square), PairMatch((UnitResult(UNITS[0], matches),), None, found))
-    drawn = cv2.imdecode(np.frombuffer(encode(figure, "jpeg"), np.uint8), cv2.IMREAD_COLOR)
+    figure = draw_strip((lying, square), PairMatch((result,), None, found))
+    jpeg = np.frombuffer(encode(figure, "jpeg"), np.uint8)
+    drawn = cv2.imdecode(jpeg, cv2.IMREAD_COLOR)
     # Older versions of matplotlib round down
     assert drawn.shape[:2] == pytest.approx((480, 960 + 480), abs=1)
     assert drawn[400, 100].min() > 200
     assert drawn[400, 1400].max() < 50
-    ends = [
-        dots.get_offsets() for dots in figure.axes[0].collections if len(dots.get_offsets()) > 1
-    ]
-    np.testing.assert_allclose(np.concatenate(ends), [[0.1, 0.1], [2 + 0.5, 0.5]])
+    drawn_points = [dots.get_offsets() for dots in figure.axes[0].collections]
+    (ends,) = (points for points in drawn_points if len(points) > 1)
+    np.testing.assert_allclose(ends, [[0.1, 0.1], [2 + 0.5, 0.5]])

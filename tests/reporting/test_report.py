@@ -79,7 +79,7 @@ def test_a_run_exports_tables_that_a_reader_of_csv_files_understands(tmp_path, c
     capsys.readouterr()
     assert run_command("journal", tmp_path / "work") == 0
     out = capsys.readouterr().out
-    assert re.search("complete after .*: 11 of 12 pairs have an F", out)
+    assert re.search("complete after .*: 11 of 12 pairs with an F", out)
     assert "the file is empty" in out
     assert len(out.splitlines()) < 20
     # A resumed run is a second session
@@ -115,7 +115,7 @@ def test_an_export_replaces_nothing_but_its_own_tables(tmp_path, make, capsys):
     (tmp_path / "csv").mkdir()
     make(tmp_path / "csv" / "units.csv")
     assert run_command("journal", tmp_path, "--csv", tmp_path / "csv") == 2
-    assert "units.csv exists and is no such table" in capsys.readouterr().err
+    assert "units.csv exists and is another table" in capsys.readouterr().err
     assert [path.name for path in (tmp_path / "csv").iterdir()] == ["units.csv"]
     assert read_log(tmp_path).records == ()
 
@@ -125,7 +125,7 @@ def test_the_page_begins_with_the_verdict_has_pictures_inside_and_asks_for_nothi
     page = tmp_path / "new" / "report.html"
     assert report_run(tmp_path / "work", page, inf, pairs) == f"report: {page}"
     text = page.read_text(encoding="utf-8")
-    assert re.search("<h1>Complete after .*: 11 of 12 pairs have an F</h1>", text)
+    assert re.search("<h1>Complete after .*: 11 of 12 pairs with an F</h1>", text)
     # A run without scenes has no section on them.
     titles = [
         "Missing results",
@@ -137,7 +137,7 @@ def test_the_page_begins_with_the_verdict_has_pictures_inside_and_asks_for_nothi
     assert re.findall("<h2>(.*?)</h2>", text) == titles
     # The pair that was not read has no picture.
     assert text.count("<img ") == 11, "the pairs with an F"
-    assert "With the fallback: 1 pairs; the reasons are below." in text
+    assert "With the fallback: 1 pair; the reasons are below." in text
     assert re.findall("<script[^>]*>", text) == ["<script>", "<script>"], "both inside the page"
     assert all(
         source.startswith("data:image/")
@@ -158,7 +158,7 @@ def test_the_summary_has_the_facts_of_the_page_for_programs(tmp_path):
     report_run(tmp_path / "work", tmp_path / "report.html", inf, pairs)
     table = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
     assert table["format"] == "mkpc summary 1"
-    assert table["verdict"].startswith("11 of 12 pairs have an F; with the fallback: 1 pairs")
+    assert table["verdict"].startswith("11 of 12 pairs with an F; with the fallback: 1 pair")
     assert (table["pairs"]["count"], table["pairs"]["with_f"]) == (12, 11)
     assert table["pairs"]["sources"] == {"fallback": 1, "pair": 11}
     records = read_log(tmp_path / "work").records
@@ -182,7 +182,7 @@ def test_a_summary_replaces_nothing_but_a_summary(tmp_path, make):
     assert read_log(tmp_path).records == ()
 
 
-def test_what_comes_from_files_is_escaped(tmp_path):
+def test_text_from_files_is_escaped(tmp_path):
     pairs = [Pair(EVIL, EVIL, f"{EVIL.replace('/', '')}.png", "b.png")]
     with empty_store(
         tmp_path, pairs, device=EVIL, left_out=(EVIL,), versions={EVIL: EVIL}
@@ -216,7 +216,7 @@ def test_without_matplotlib_the_page_has_tables_and_says_so(tmp_path, monkeypatc
 
 @needs_browser
 @pytest.mark.parametrize("width", [1280, 400])
-def test_pairs_sort_and_filter_and_pictures_enlarge(tmp_path, width):
+def test_the_table_of_pairs_sorts_and_filters_and_pictures_enlarge(tmp_path, width):
     pairs = a_run(tmp_path, 6)
     page = tmp_path / "report.html"
     report_run(tmp_path / "work", page, inf, pairs)
@@ -252,7 +252,9 @@ def test_pairs_sort_and_filter_and_pictures_enlarge(tmp_path, width):
         assert browser.errors == []
 
 
-def test_a_late_report_leaves_out_drawings_then_itself(tmp_path, monkeypatch):
+def test_with_little_time_the_report_has_no_drawings_and_with_less_it_is_not_written(
+    tmp_path, monkeypatch
+):
     # At time 0, so that the end of the time is the time left
     monkeypatch.setattr("mkpc_kaggle.reporting.report.time", SimpleNamespace(monotonic=lambda: 0.0))
     pairs = a_run(tmp_path, 3)

@@ -16,7 +16,6 @@ from mkpc_kaggle.reporting.summary import (
     is_doubtful,
     left_out_line,
     pending_lines,
-    plural,
     summary,
     weakest_cameras,
     weakest_line,
@@ -116,11 +115,6 @@ def test_a_run_whose_time_is_up_says_what_is_left():
 def test_matchers_that_do_not_run_are_one_short_line(matchers, left_out, line):
     units = tuple(Unit(1, matcher, 640) for matcher in matchers)
     assert left_out_line(Recipe(units, "auto (stage-1)"), left_out) == line
-
-
-def test_counts_are_in_the_singular_and_the_plural():
-    assert [plural(count, "batch") for count in (0, 1, 2)] == ["0 batches", "1 batch", "2 batches"]
-    assert plural(2, "pair") == "2 pairs"
 
 
 def test_no_line_of_the_summary_is_longer_than_100_characters():

@@ -127,7 +127,7 @@ def test_points_and_colours_come_from_the_files_of_a_reconstruction(tmp_path):
         assert clouds_of(scene, tmp_path) == ()
 
 
-def test_a_view_of_degenerate_models_is_still_data(tmp_path):
+def test_degenerate_models_give_a_view_of_finite_numbers(tmp_path):
     model = a_model(tmp_path, cameras=3)
     at_one_point = tuple(replace(each, camera=model.images[0].camera) for each in model.images)
     upside_down = Camera(model.images[0].camera.K, np.diag([-1.0, -1.0, 1.0]), np.zeros(3))

@@ -136,7 +136,8 @@ class Page:
 @contextmanager
 def opened_browser() -> Iterator[Page]:
     """Start Chromium without a window, and end it afterwards."""
-    (commands, send), (receive, answers) = os.pipe(), os.pipe()
+    commands, send = os.pipe()
+    receive, answers = os.pipe()
     with TemporaryDirectory(ignore_cleanup_errors=True) as home:
         # The browser reads commands from descriptor 3 and writes answers to 4.
         line = f'exec "$@" 3<&{commands} 4>&{answers}'

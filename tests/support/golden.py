@@ -99,7 +99,8 @@ class Stage(NamedTuple):
         """Return by how much the difference exceeds the allowed one: infinite for other shapes,
         kinds, or NaN.
         """
-        got, expected = self.got, self.expected
+        got = self.got
+        expected = self.expected
         alike = (
             got.shape == expected.shape and got.is_floating_point() == expected.is_floating_point()
         )

@@ -255,7 +255,8 @@ class SimulatedSite(Site):
         return self.scenario.drift if now > self.scenario.turn * self.scenario.limit else 1.0
 
     def unit_seconds(self, unit: Unit, now: float) -> float:
-        scenario, rng = self.scenario, self.rng
+        scenario = self.scenario
+        rng = self.rng
         # Lognormal with a mean of 1.
         factor = math.exp(scenario.spread * rng.normal() - scenario.spread**2 / 2)
         seconds = self.costs[unit.name] * factor
@@ -272,7 +273,10 @@ class SimulatedSite(Site):
         """Draw the answer of a worker that ran the units of ``warm`` before; none begins after
         ``job.seconds``.
         """
-        scenario, rng, begun, spent = self.scenario, self.rng, self.clock.now, 0.0
+        scenario = self.scenario
+        rng = self.rng
+        begun = self.clock.now
+        spent = 0.0
         expected = dict(zip(job.units, job.expected, strict=True))
         if rng.random() < scenario.job_faults:
             fate = rng.integers(3)
@@ -319,7 +323,9 @@ class SimulatedSite(Site):
         return ESTIMATE_S * len(estimates), tuple(estimates), 0.0
 
     def reconstruct(self, job: SceneJob) -> Drawn:
-        scenario, rng, begun = self.scenario, self._scene_rng, self.clock.now
+        scenario = self.scenario
+        rng = self._scene_rng
+        begun = self.clock.now
         spread = math.exp(0.3 * rng.normal() - 0.3**2 / 2)
         spent = (SCENE_START_S + spread * scenario.scene_seconds * len(job.pairs)) * self.drift(
             begun
@@ -434,7 +440,8 @@ def simulate(scenario: Scenario, store: Store | None = None, until: float = math
         if clock.now >= until:
             interrupt.set()
 
-    whole_wait, site.wait = site.wait, wait
+    whole_wait = site.wait
+    site.wait = wait
     with engine:
         publish = lambda state: published.append(len(state.fundamentals))  # noqa: E731
         engine.ask(Request(pairs, scenario.recipe, scenario.keys, publish=publish))

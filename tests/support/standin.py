@@ -89,7 +89,8 @@ REFINERS = {stride: WarpRefinerShape(*shape) for stride, shape in REFINERS.items
 
 
 def narrow_roma() -> RoMa:
-    vit, decoder = {"WIDTH": 64, "BLOCKS": 2, "HEADS": 2, "POSITIONS": 5}, {"BLOCKS": 2, "HEADS": 2}
+    vit = {"WIDTH": 64, "BLOCKS": 2, "HEADS": 2, "POSITIONS": 5}
+    decoder = {"BLOCKS": 2, "HEADS": 2}
     with patch.multiple(dinov2, **vit), patch.multiple(roma, REFINERS=REFINERS, **decoder):
         return RoMa()
 
@@ -149,7 +150,8 @@ def scene(height: int, width: int, channels: int = 1, name: str = "scene") -> np
     """
     total = np.zeros((height, width, channels), int)
     for cell in (3, 8, 24):
-        rows, columns = -(-height // cell), -(-width // cell)
+        rows = -(-height // cell)
+        columns = -(-width // cell)
         steps = uniform(f"{name}, {cell}", (rows, columns, channels)) * 128
         total += np.kron(steps.astype(int), np.ones((cell, cell, 1), int))[:height, :width]
     return (128 + total // 3).astype(np.uint8)

@@ -179,7 +179,7 @@ SOURCES = [
 
 
 @pytest.mark.parametrize("source", SOURCES)
-def test_a_source_that_is_no_address_of_the_file_itself_is_for_the_user(tmp_path, source):
+def test_a_source_without_a_direct_download_is_left_to_the_user(tmp_path, source):
     by_hand = fetch.fetch(line(source=source), tmp_path, NO_WHEELS)
     assert by_hand.outcome is FetchOutcome.BY_HAND
     assert by_hand.note == f"get it from {source} and save it as {tmp_path / 'a.bin'}"
