@@ -35,14 +35,17 @@ def test_durations_are_read(text: str, seconds: float) -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["", "h", "8 hours", "-5s", "1m1h", "0", "0s", "nan", "9:00", "8h45", "1h30m20"]
+    "text",
+    # "8h45" may mean minutes or seconds, and a limit of no time is a mistake.
+    ["", "h", "8 hours", "-5s", "1m1h", "0", "0s", "nan", "9:00", "8h45", "1h30m20"],
 )
-def test_what_is_not_a_duration_is_refused(text: str) -> None:
+def test_a_text_that_is_no_duration_is_refused(text: str) -> None:
     with pytest.raises(UserError):
         parse_duration(text)
 
 
-def test_durations_are_shown_short() -> None:
+def test_durations_are_printed_in_a_short_form() -> None:
+    # 3599.9 s would be "60m00s" if minutes were rounded before hours are split off.
     shown = [format_duration(seconds) for seconds in (4.24, 59.9, 61, 3599.9, 31500)]
     assert shown == ["4.2s", "59.9s", "1m01s", "1h00m", "8h45m"]
 
@@ -51,17 +54,21 @@ def test_the_four_moments_of_a_budget_follow_each_other() -> None:
     for limit in (10.0, 60.0, 31500.0):
         budget = Budget(0.0, limit, lambda: 0.0)
         moments = [0.0, budget.stop_units, budget.stop_waiting, budget.final_write, budget.limit]
+        # No two are equal: each moment leaves time for the work of the next.
         assert moments == sorted(set(moments))
         assert budget.left() == budget.stop_units
-    assert Budget(0.0, 60, lambda: 100.0).left() == 0
+    too_late = Budget(0.0, 60, lambda: 100.0)
+    assert too_late.left() == 0
 
 
 def test_a_single_slow_write_is_forgotten_and_slow_writes_are_not() -> None:
     budget = Budget(0.0, 32400.0, lambda: 0.0)
     assert budget.writing == 0
+    # A disk may stall once; to reserve 200 s for each later version would waste the time.
     for seconds in (2.0, 200.0, 2.0):
         budget.note_write(seconds)
     assert budget.writing == 3.0
+    # A disk that stays slow counts.
     for _ in range(3):
         budget.note_write(40.0)
     assert budget.writing == 60.0
@@ -74,11 +81,13 @@ def test_a_single_slow_write_is_forgotten_and_slow_writes_are_not() -> None:
 def test_the_warm_up_counts_only_until_there_is_another_measurement() -> None:
     costs = Costs()
     assert not costs.is_known("a")
+    # The first run of a network compiles and allocates: it may take ten times as long.
     costs.observe("a", 10.0, warm_up=True)
     assert not costs.is_known("a")
     assert costs.mean("a") == 10.0
     costs.observe("a", 1.0)
-    costs.observe("a", 9.0, warm_up=True)  # another worker's
+    # Another worker warms up later; its first run says nothing new.
+    costs.observe("a", 9.0, warm_up=True)
     for seconds in (2.0, 6.0):
         costs.observe("a", seconds)
     assert costs.is_known("a")
@@ -87,6 +96,7 @@ def test_the_warm_up_counts_only_until_there_is_another_measurement() -> None:
 
 def test_costs_follow_a_machine_that_slows_down() -> None:
     costs = Costs()
+    # The mean of all measurements would follow too late.
     for seconds in [1.0] * (WINDOW + 1) + [10.0] * WINDOW:
         costs.observe("a", seconds)
     assert costs.mean("a") == 10.0

@@ -12,25 +12,32 @@ from mkpc_kaggle.errors import UserError
 
 @pytest.mark.parametrize(
     ("text", "meant"),
-    [("0", 0), ("12", 12), ("ray", "ray"), ("ray://10.0.0.1:6379", "ray://10.0.0.1:6379")],
+    [
+        ("0", 0),
+        ("12", 12),
+        ("ray", "ray"),
+        ("ray://10.0.0.1:6379", "ray://10.0.0.1:6379"),
+    ],
 )
-def test_forms_of_workers(text: str, meant: int | str) -> None:
+def test_the_forms_of_the_option_are_read(text: str, meant: int | str) -> None:
     assert parse_workers(text) == meant
 
 
 @pytest.mark.parametrize(
     "text", ["-1", "1000", "two", "ray:", "ray://", "ray://host", "ray://host:port", "ssh://host:1"]
 )
-def test_other_forms_are_refused_with_those_that_there_are(text: str) -> None:
+def test_other_forms_are_refused_with_the_known_ones(text: str) -> None:
     with pytest.raises(UserError) as refusal:
         parse_workers(text)
     told = str(refusal.value)
-    assert all(form in told for form in ("a number of processes", "ray (", "ray://HOST:PORT")), told
+    for form in ("a number of processes", "ray (", "ray://HOST:PORT"):
+        assert form in told
 
 
-def test_without_ray_it_says_how_to_install_it(
+def test_without_ray_the_message_says_how_to_install_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    # As if it were not installed: the import fails.
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(UserError, match=r'pip install "mkpc-kaggle\[ray\]"'):
         run(
@@ -40,5 +47,6 @@ def test_without_ray_it_says_how_to_install_it(
 
 @pytest.mark.parametrize("port", [1, 99999])
 def test_an_address_where_nothing_answers_is_told_at_once(port: int) -> None:
+    # Ray itself would try for minutes, of a run's time.
     with pytest.raises(UserError, match=rf"ray://127\.0\.0\.1:{port}: no cluster answers there"):
         join(None, f"ray://127.0.0.1:{port}")

@@ -36,9 +36,10 @@ COUNT = 12
 VICTIM = 3  # brightness 13
 
 
-def test_what_errors_mean():
+def test_each_error_is_a_kind_of_failure_by_its_text():
     import torch
 
+    # PyTorch has one class, RuntimeError, for most errors of a device: only the text differs.
     cuda = (
         "CUDA error: {}\nCUDA kernel errors might be asynchronously reported at some other API call"
     )
@@ -49,6 +50,7 @@ def test_what_errors_mean():
             cuda.format("CUBLAS_STATUS_ALLOC_FAILED when calling `cublasCreate(handle)`"),
             "cuDNN error: CUDNN_STATUS_ALLOC_FAILED",
             "cuDNN error: CUDNN_STATUS_INTERNAL_ERROR_DEVICE_ALLOCATION_FAILED",
+            # cuDNN's words if its workspace does not fit
             "FIND was unable to find an engine to execute this computation",
             "GET was unable to find an engine to execute this computation",
         ],
@@ -68,7 +70,9 @@ def test_what_errors_mean():
         torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB."),
     ):
         assert failure_of(error) is FailureKind.OUT_OF_MEMORY
-    assert failure_of(ValueError("no points")) is failure_of(AssertionError()) is FailureKind.RAISED
+    for error in (ValueError("no points"), AssertionError()):
+        assert failure_of(error) is FailureKind.RAISED
+    # One line for the report: without CUDA's advice, and with the unit's name.
     illegal = RuntimeError(cuda.format("an illegal memory access was encountered"))
     illegal.add_note("in 1:loftr@840")
     assert reason_of(illegal) == f"RuntimeError: {BROKEN}, in 1:loftr@840"
@@ -88,12 +92,14 @@ def run_at(pairs, tmp_path, monkeypatch) -> Callable[..., RunReport]:
 def assert_as_if_nothing_had_failed(report: RunReport, undisturbed: RunReport) -> None:
     assert report.ending is Ending.COMPLETE
     assert matrices(report) == matrices(undisturbed)
-    assert not [unit.failure for record in report.records for unit in record.units if unit.failure]
+    units = [unit for record in report.records for unit in record.units]
+    assert not [unit.failure for unit in units if unit.failure]
 
 
 @pytest.mark.parametrize(
     "gpus",
     [
+        # A broken CUDA context stays broken: each GPU fails from some pair on.
         [RectifiedMatcher(matches=breaks_after(2)), RectifiedMatcher(matches=breaks_after(3))],
         [RectifiedMatcher(matches=lambda _: exhaust_gpu())],
     ],
@@ -116,17 +122,20 @@ def test_a_device_that_fails_once_costs_a_worker_and_no_unit(run_at, undisturbed
     assert_as_if_nothing_had_failed(report, undisturbed)
 
 
-def test_a_pair_at_which_a_device_fails_is_done_by_a_healthy_one(run_at, undisturbed):
-    broken, healthy = RectifiedMatcher(matches=breaks_after(2)), RectifiedMatcher(seconds=0.02)
+def test_a_pair_on_which_a_device_failed_is_matched_by_a_healthy_one(run_at, undisturbed):
+    broken = RectifiedMatcher(matches=breaks_after(2))
+    # Slow enough that the other one gets pairs
+    healthy = RectifiedMatcher(seconds=0.02)
     report = run_at(thread_place("cuda:0", broken), thread_place("cuda:1", healthy))
     assert report.faults
     assert all("a job was lost on cuda:0: the device failed" in fault for fault in report.faults)
     assert_as_if_nothing_had_failed(report, undisturbed)
 
 
-def test_a_device_without_kernels_leaves_the_work_to_the_cpu_and_a_line(
+def test_a_device_without_kernels_leaves_the_work_to_the_cpu_with_a_message(
     run_at, undisturbed, capsys
 ):
+    # As Kaggle's P100, for which PyTorch has no kernels any more
     assembly = assemble(THREE_UNITS, matchers={"rectified": RectifiedMatcher()}, device="cpu")
     gpu = thread_place("cuda:99", RectifiedMatcher(), pipeline=assembly.on("cuda:99").pipeline)
     report = run_at(gpu, fallback=[thread_place("cpu", RectifiedMatcher())])
@@ -135,7 +144,9 @@ def test_a_device_without_kernels_leaves_the_work_to_the_cpu_and_a_line(
 
 
 def test_a_worker_that_hangs_keeps_no_job_from_the_others(run_at, undisturbed):
-    swept, others_done = set(), threading.Event()
+    # One worker waits until the other has matched all other pairs.
+    swept = set()
+    others_done = threading.Event()
 
     def wait_for_others(brightness: int) -> int:
         assert others_done.wait(120), f"only {sorted(swept)} had a turn"
@@ -157,6 +168,7 @@ def test_a_worker_that_hangs_keeps_no_job_from_the_others(run_at, undisturbed):
 def test_a_unit_too_large_for_the_memory_is_skipped_on_that_pair_alone_and_tried_by_the_next_run(
     run_at, undisturbed
 ):
+    # Views above 100 pixels of the victim: its sweep at 96 succeeds.
     report = run_at(thread_place("cuda:0", FaultyMatcher(fault=exhaust_gpu, above=100)))
     assert report.ending is Ending.COMPLETE
     memory = "out of memory: RuntimeError: CUDA out of memory. Tried to allocate 20.00 GiB, in {0}"
@@ -169,11 +181,12 @@ def test_a_unit_too_large_for_the_memory_is_skipped_on_that_pair_alone_and_tried
     assert report.records[VICTIM].inliers > 100, "it keeps the F that it has"
     assert matrices(report)[:VICTIM] == matrices(undisturbed)[:VICTIM]
     assert matrices(report)[VICTIM + 1 :] == matrices(undisturbed)[VICTIM + 1 :]
+    # Failures are not stored, so a run on a larger GPU tries them.
     again = run_at(thread_place("cuda:0", RectifiedMatcher()))
     assert matrices(again) == matrices(undisturbed)
 
 
-def test_a_minibatch_that_memory_is_too_short_for_is_halved_once_and_no_worker_lost(
+def test_a_minibatch_too_large_for_the_memory_is_halved_once_and_no_worker_is_lost(
     run_at, undisturbed, monkeypatch
 ):
     monkeypatch.setattr(Assembly, "minibatch", 8)
@@ -181,6 +194,7 @@ def test_a_minibatch_that_memory_is_too_short_for_is_halved_once_and_no_worker_l
     report = run_at(thread_place("cuda:0", matcher, minibatch=8))
     assert report.faults == ()
     assert_as_if_nothing_had_failed(report, undisturbed)
+    # Each further try of the large size would repeat the failure.
     too_large = [size for size in matcher.sizes if size > 2]
     assert len(too_large) == 2 * len(THREE_UNITS.units), (
         "seven or eight, and three or four: once a unit"
@@ -206,11 +220,10 @@ def test_a_run_that_failed_has_exit_status_one_and_a_line(
     made = assemble(THREE_UNITS, matchers={matcher.name: matcher}, device="cpu")
     monkeypatch.setattr(options, "assemble", lambda *_, **__: made)
     output = tmp_path / "submission.csv"
-    assert (
-        main(["submit", "--test-dir", str(demo.test_dir), "--output", str(output), "--no-report"])
-        == 1
-    )
+    command = ["submit", "--test-dir", str(demo.test_dir), "--output", str(output), "--no-report"]
+    assert main(command) == 1
     assert f"the run failed: {told}" in capsys.readouterr().out
+    # Failed, but complete: on Kaggle a file with fallback rows still scores.
     assert submission_problems(output, [pair.id for pair in read_test_side(demo.test_dir)]) == []
 
 
@@ -244,6 +257,7 @@ def test_workers_that_cannot_be_loaded_end_the_run_before_any_work(run_at, error
 def test_a_matcher_that_a_worker_cannot_load_costs_its_units_alone_and_is_told_once(
     pairs, undisturbed, tmp_path, monkeypatch, capsys, error, told
 ):
+    # The parent checks weights without loading them all, so a worker may be the first to see it.
     def load(name: str) -> RectifiedMatcher:
         if name == "broken":
             raise error
@@ -264,8 +278,9 @@ def test_a_matcher_that_a_worker_cannot_load_costs_its_units_alone_and_is_told_o
     assert {len(record.units) for record in report.records} == {3}
 
 
-def test_a_worker_that_cannot_be_started_again_ends_the_run_with_every_row_there(run_at):
-    broken, made = RectifiedMatcher(matches=breaks_after(5)), []
+def test_a_worker_that_cannot_be_started_again_ends_the_run_with_all_rows(run_at):
+    broken = RectifiedMatcher(matches=breaks_after(5))
+    made = []
 
     def once() -> Any:
         made.append(broken)

@@ -59,8 +59,9 @@ def test_a_run_without_a_limit_gives_every_pair_every_unit(tmp_path):
         assert record.regions is not None
 
 
-def test_every_published_version_is_whole_and_the_first_comes_before_any_work(tmp_path):
-    matcher, published = RectifiedMatcher(), []
+def test_every_published_version_is_complete_and_the_first_comes_before_any_work(tmp_path):
+    matcher = RectifiedMatcher()
+    published = []
 
     def publish(state: State) -> None:
         published.append((state.fundamentals, len(matcher.calls)))
@@ -73,9 +74,11 @@ def test_every_published_version_is_whole_and_the_first_comes_before_any_work(tm
         assert all(np.isfinite(F).all() and F.any() for F in version)
 
 
-def test_an_interrupted_run_goes_on_where_it_was_and_ends_with_the_same_bytes(tmp_path):
-    pairs, interrupt = write_pairs(tmp_path, 20), Interrupt()
+def test_an_interrupted_run_resumes_and_ends_with_the_same_bytes(tmp_path):
+    pairs = write_pairs(tmp_path, 20)
+    interrupt = Interrupt()
     undisturbed = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "undisturbed")
+    # Call 25 of 60 is a few jobs after the sweep of the 20 pairs.
     first = RectifiedMatcher(matches=after_calls(25, interrupt.set))
     cut = run(pairs, THREE_UNITS, first, tmp_path / "work", interrupt=interrupt)
     assert cut.ending is Ending.INTERRUPTED
@@ -83,10 +86,10 @@ def test_an_interrupted_run_goes_on_where_it_was_and_ends_with_the_same_bytes(tm
     second = RectifiedMatcher()
     resumed = run(pairs, THREE_UNITS, second, tmp_path / "work")
     assert matrices(resumed) == matrices(undisturbed)
-    assert [units(record) for record in resumed.records] == [
-        units(record) for record in undisturbed.records
-    ]
-    again = [call for call, count in Counter(first.calls[:25] + second.calls).items() if count > 1]
+    run_units = [units(record) for record in resumed.records]
+    assert run_units == [units(record) for record in undisturbed.records]
+    calls = Counter(first.calls[:25] + second.calls)
+    again = [call for call, count in calls.items() if count > 1]
     assert len(again) <= 3, "only the job that was under way runs twice"
     assert second.calls
 
@@ -94,6 +97,7 @@ def test_an_interrupted_run_goes_on_where_it_was_and_ends_with_the_same_bytes(tm
 def test_a_finished_run_loads_no_matcher_again(tmp_path, monkeypatch):
     pairs = write_pairs(tmp_path, 3)
     once = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
+    # Loading gigabytes of weights to find that nothing is missing would take minutes.
     loaded = []
     monkeypatch.setattr(Pipeline, "load", lambda *_: loaded.append(1))
     twice = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
@@ -106,6 +110,7 @@ def test_a_run_that_ends_before_it_asks_leaves_the_store_as_it_was(tmp_path):
     run(write_pairs(tmp_path, 3), THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
     assembly = assemble(THREE_UNITS, matchers={"rectified": RectifiedMatcher()}, device="cpu")
     session = Session(tmp_path / "work", Budget(0.0), Interrupt(), progress=False)
+    # As `reconstruct` does when it is interrupted before the pairs are chosen
     with opened_engine(assembly, session) as engine:
         assert engine.look({}) == {}
     with Store.read(tmp_path / "work") as store:
@@ -118,14 +123,17 @@ def test_a_run_that_ends_before_it_asks_leaves_the_store_as_it_was(tmp_path):
 def test_a_unit_that_never_returns_holds_the_run_neither_past_its_limit_nor_after_an_interrupt(
     tmp_path, limit, ending
 ):
-    released, interrupt = threading.Event(), Interrupt()
+    # Python cannot end a thread, so the run must leave it behind.
+    released = threading.Event()
+    interrupt = Interrupt()
 
     def hang() -> None:
         if ending is Ending.INTERRUPTED:
             interrupt.set()
         released.wait()
 
-    matcher, pairs = RectifiedMatcher(matches=after_calls(5, hang)), write_pairs(tmp_path, 12)
+    matcher = RectifiedMatcher(matches=after_calls(5, hang))
+    pairs = write_pairs(tmp_path, 12)
     try:
         report = run(
             pairs, THREE_UNITS, matcher, tmp_path / "work", limit=limit, interrupt=interrupt

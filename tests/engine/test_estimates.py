@@ -1,4 +1,4 @@
-"""A store outlives a change of the estimation: F and cameras are made anew of its points."""
+"""After a change of the estimation, F and cameras are computed again from the stored points."""
 
 import os
 import signal
@@ -23,7 +23,7 @@ from mkpc_kaggle.reporting.run_log import read_log
 from mkpc_kaggle.reporting.summary import summary
 
 ALONE = replace(RECIPE, scene=None)
-ESTIMATIONS = {  # in their order each is made of the journal of the one before
+ESTIMATIONS = {  # in this order; each continues from the journal of the one before
     "scene": RECIPE,
     "no scene": ALONE,
     "threshold": replace(ALONE, magsac=replace(QUICK, threshold=1.0)),
@@ -50,32 +50,35 @@ def submission(
     return output.read_bytes(), report
 
 
-def test_a_run_that_goes_on_from_another_estimation_ends_with_the_bytes_of_a_fresh_one(
+def test_a_run_resumed_with_another_estimation_ends_with_the_bytes_of_a_fresh_one(
     tmp_path, monkeypatch
 ):
     pairs = synthetic_pairs(tmp_path / "images", 4)
-    fresh = {
-        name: submission(pairs, recipe, tmp_path / name)[0] for name, recipe in ESTIMATIONS.items()
-    }
+    fresh = {}
+    for name, recipe in ESTIMATIONS.items():
+        fresh[name], _ = submission(pairs, recipe, tmp_path / name)
+    # Equal bytes everywhere would prove nothing.
     assert len(set(fresh.values())) >= 5
     journal = tmp_path / "scene"
     for path in (tmp_path / "images").iterdir():
         path.unlink()  # no image is read
     monkeypatch.setattr(Pipeline, "load", lambda *_: pytest.fail("no matcher is loaded"))
-    for name, recipe in [*ESTIMATIONS.items()][1:]:
+    _, *others = ESTIMATIONS.items()
+    for name, recipe in others:
         written, report = submission(pairs, recipe, journal, NoMatcher(name="synthetic"))
         assert written == fresh[name], name
         # Without the scene F is that of the pairs' own matches, which the journal has.
-        assert (report.units_run, report.estimated) == (0, 0 if name == "no scene" else 6)
-        assert read_log(journal).recipe == replace(recipe, name=read_log(journal).recipe.name)
+        estimated = 0 if name == "no scene" else 6
+        assert (report.units_run, report.estimated) == (0, estimated)
+        stored = read_log(journal).recipe
+        assert stored == replace(recipe, name=stored.name)
     assert "0 units run, 6 F estimated" in summary(report)
 
 
 def die_at_a_write(pairs: Sequence[Pair], recipe: Recipe, work_dir: Path, *, after: bool) -> None:
-    """Go on, until this process kills itself at the first write to the store: before it, or after
-    it.
+    """Resume a run, and kill this process at the first write of an estimate or a scene: before it,
+    or after it.
     """
-
     put = Store.put
 
     def put_and_die(store: Store, results: Iterable[Result]) -> None:
@@ -91,28 +94,30 @@ def die_at_a_write(pairs: Sequence[Pair], recipe: Recipe, work_dir: Path, *, aft
 
 
 @pytest.mark.parametrize("kills", [2, pytest.param(10, marks=pytest.mark.slow)])
-def test_a_run_that_is_killed_while_it_estimates_anew_ends_with_the_same_bytes(tmp_path, kills):
+def test_a_run_that_is_killed_while_it_estimates_again_ends_with_the_same_bytes(tmp_path, kills):
     # 36 pairs are five jobs and a scene: each second kill leaves one of them done.
     images = 9 if kills > 2 else 4
-    pairs, other = synthetic_pairs(tmp_path / "images", images), ESTIMATIONS["another scene"]
-    undisturbed = submission(pairs, other, tmp_path / "fresh", SyntheticMatcher(images=images))[0]
-    submission(pairs, RECIPE, tmp_path / "work", SyntheticMatcher(images=images))
+    pairs = synthetic_pairs(tmp_path / "images", images)
+    other = ESTIMATIONS["another scene"]
+    matcher = SyntheticMatcher(images=images)
+    undisturbed, _ = submission(pairs, other, tmp_path / "fresh", matcher)
+    submission(pairs, RECIPE, tmp_path / "work", matcher)
+    # A fresh interpreter each time: a fork would have this one's threads and locks.
+    context = get_context("spawn")
     for number in range(kills):
         settings = {"after": bool(number % 2)}
-        arguments = pairs, other, tmp_path / "work"
-        process = get_context("spawn").Process(
-            target=die_at_a_write, args=arguments, kwargs=settings
-        )
+        arguments = (pairs, other, tmp_path / "work")
+        process = context.Process(target=die_at_a_write, args=arguments, kwargs=settings)
         process.start()
         process.join()
         assert process.exitcode == -signal.SIGKILL
-    assert (
-        submission(pairs, other, tmp_path / "work", NoMatcher(name="synthetic"))[0] == undisturbed
-    )
+    written, _ = submission(pairs, other, tmp_path / "work", NoMatcher(name="synthetic"))
+    assert written == undisturbed
 
 
-def test_the_file_has_the_former_f_until_another_is_there(tmp_path):
-    pairs, versions = synthetic_pairs(tmp_path / "images", 4), []
+def test_the_file_has_the_former_f_until_a_new_one_exists(tmp_path):
+    pairs = synthetic_pairs(tmp_path / "images", 4)
+    versions = []
     first = run(pairs, RECIPE, SyntheticMatcher(images=4), tmp_path / "work")
     other = replace(RECIPE, magsac=replace(QUICK, threshold=1.0))
     publish = lambda state: versions.append(state.fundamentals)  # noqa: E731
@@ -122,9 +127,10 @@ def test_the_file_has_the_former_f_until_another_is_there(tmp_path):
     assert last.estimated == 6
 
 
-def test_e_is_estimated_of_the_points_that_f_was_made_of(tmp_path):
+def test_e_is_estimated_from_the_points_of_f(tmp_path):
     pairs = synthetic_pairs(tmp_path / "images", 4)
     submission(pairs, ALONE, tmp_path / "work")
+    # Known intrinsics change what is estimated, and nothing that is matched.
     K = np.array([[900.0, 0, 400], [0, 900, 300], [0, 0, 1]])
     known = [replace(pair, intrinsics=(K, K)) for pair in pairs]
     written, report = submission(known, ALONE, tmp_path / "work")

@@ -14,33 +14,41 @@ from mkpc_kaggle.recipe import SceneConfig, Unit, load_recipe
 from mkpc_kaggle.scene.view_graph import BatchImage
 
 CLASSICAL = load_recipe("classical")
-IMAGES = (BatchImage("0.png", "d", Size(80, 60)), BatchImage("1.png", "c", Size(80, 60)))
+IMAGES = (
+    BatchImage("0.png", "d", Size(80, 60)),
+    BatchImage("1.png", "c", Size(80, 60)),
+)
 BOXES = (Box(0, 0, 9, 9), Box(0, 0, 8, 8))
 
 
 @pytest.mark.parametrize(
     ("changes", "estimates_differ", "scenes_differ"),
     [
+        # A user's copy of a recipe under another name
         ({"name": "other", "description": "the same"}, False, False),
         ({"magsac": replace(CLASSICAL.magsac, threshold=0.21)}, True, True),
         ({"focal": None}, True, True),
         ({"scene": SceneConfig(pairs_per_image=1)}, False, True),
         ({"scene": None}, False, True),
+        # It changes the points of stage 2, and by their keys the estimates.
         ({"mkpc": replace(CLASSICAL.mkpc, eps=0.1)}, False, False),
     ],
 )
 def test_estimates_and_scenes_have_a_digest_of_their_settings(
     changes, estimates_differ, scenes_differ
 ):
-    former, new = (
-        Keys.of(assemble(recipe)) for recipe in (CLASSICAL, replace(CLASSICAL, **changes))
-    )
+    former = Keys.of(assemble(CLASSICAL))
+    new = Keys.of(assemble(replace(CLASSICAL, **changes)))
     assert (former.estimate != new.estimate) == estimates_differ
     assert (former.scene != new.scene) == scenes_differ
 
 
 @pytest.mark.parametrize(
-    ("slot", "changed"), [("xfeat", [True, False, True]), ("aliked-n16", [False, True, True])]
+    ("slot", "changed"),
+    [
+        ("xfeat", [True, False, True]),
+        ("aliked-n16", [False, True, True]),
+    ],
 )
 def test_other_weights_change_the_points_of_their_units_and_of_stage_2(monkeypatch, slot, changed):
     units = (
@@ -51,21 +59,23 @@ def test_other_weights_change_the_points_of_their_units_and_of_stage_2(monkeypat
     assembly = replace(assemble(CLASSICAL), recipe=replace(CLASSICAL, units=units))
 
     def digests(**other: str) -> tuple[str, ...]:
-        slots = (
-            dict.fromkeys(("xfeat", "xfeat-lighterglue", "aliked-n16", "aliked-lightglue"), "same")
-            | other
-        )
+        names = ("xfeat", "xfeat-lighterglue", "aliked-n16", "aliked-lightglue")
+        slots = dict.fromkeys(names, "same") | other
         files = {name: SimpleNamespace(digest=digest) for name, digest in slots.items()}
         monkeypatch.setattr(Assembly, "weight_files", files)
-        keys, pair = Keys.of(assembly), Pair("p", "b", "0.png", "1.png")
+        keys = Keys.of(assembly)
+        pair = Pair("p", "b", "0.png", "1.png")
         first = [keys.of_points(unit, pair, IMAGES, []) for unit in (0, 1)]
-        return (*first, keys.of_points(2, pair, IMAGES, keys.crops_of(pair, first)))
+        # Stage 2 looks at crops from all of stage 1, so it depends on both matchers' weights.
+        second = keys.of_points(2, pair, IMAGES, keys.crops_of(pair, first))
+        return (*first, second)
 
     pairs = zip(digests(), digests(**{slot: "other"}), strict=True)
     assert [former != new for former, new in pairs] == changed
 
 
-# And whether the points of stage 1 and stage 2, the estimate and the scene then have other keys
+# Another input, and whether the points of stage 1, those of stage 2, the estimate and the scene then
+# have other keys
 OTHERS = {
     "nothing": ({}, (False, False, False, False)),
     "content": ({"digest": "other"}, (True, True, True, True)),
@@ -73,6 +83,7 @@ OTHERS = {
     "crops": ({"mkpc": "other"}, (False, True, True, True)),
     "points of stage 1": ({"first": "other"}, (False, True, True, True)),
     "regions": ({"regions": {("0.png", "1.png"): BOXES}}, (False, True, True, True)),
+    # MAGSAC's result depends on the order of the matches.
     "order": ({"first_is_last": True}, (False, False, True, True)),
     "intrinsics": ({"intrinsics": (np.eye(3), 2 * np.eye(3))}, (False, False, True, True)),
     "scene": ({"scene": "other"}, (False, False, False, True)),
@@ -86,11 +97,13 @@ def test_a_key_is_the_digest_of_all_inputs_of_a_result(other, changed):
     ) -> list[str]:
         keys = Keys(("u", "v"), **{"mkpc": "m", "estimate": "e", "scene": "s"} | settings)
         pair = Pair("p", "b", "0.png", "1.png", intrinsics, turns)
-        images = replace(IMAGES[0], digest=digest), IMAGES[1]
+        first_image, second_image = IMAGES
+        images = (replace(first_image, digest=digest), second_image)
         one = keys.of_points(0, pair, images, [])
         two = keys.of_points(1, pair, images, keys.crops_of(pair, [first or one]))
         points = [two, one] if first_is_last else [one, two]
         estimate = keys.of_estimate(pair, points)
         return [one, two, estimate, keys.of_scene([["names", points, estimate]])]
 
-    assert tuple(a != b for a, b in zip(chain(), chain(**other), strict=True)) == changed
+    keys = zip(chain(), chain(**other), strict=True)
+    assert tuple(former != new for former, new in keys) == changed

@@ -55,7 +55,8 @@ class DoomedWorker(ProcessWorker):
     def __init__(self, name: str, *arguments: Any) -> None:
         super().__init__(f"{name}, {len(self.known)}", *arguments)
         self.known[self.name] = self
-        self.place, self.kind = name, name.split(maxsplit=1)[0]
+        self.place = name
+        self.kind = name.split(maxsplit=1)[0]
         self.signal: signal.Signals | None = None
         self.is_busy = False  # from its start to its answer, and from a job to its answer
         self.clock = 0
@@ -86,9 +87,10 @@ class DoomedWorker(ProcessWorker):
             self.spared.remove(self.place)
         elif self.kind in self.lives:
             moment = self.rng.uniform(0.0, self.lives[self.kind])
-            threading.Thread(
-                target=self._disturb, args=(os.pidfd_open(pid), moment), daemon=True
-            ).start()
+            # A descriptor, since the number of an ended process may be given to another.
+            process = os.pidfd_open(pid)
+            disturb = threading.Thread(target=self._disturb, args=(process, moment), daemon=True)
+            disturb.start()
 
     def _disturb(self, process: int, moment: float) -> None:
         try:
@@ -150,10 +152,10 @@ def matrices(report: RunReport, batches: set[str], pairs: list[Pair]) -> list[by
 def test_a_run_whose_workers_are_killed_and_stopped_at_random_moments_ends_as_the_undisturbed_one(
     tmp_path, monkeypatch, forks, moments
 ):
-    names = map(str, range(BATCHES))
-    pairs = [
-        pair for name in names for pair in synthetic_pairs(tmp_path / "images" / name, batch=name)
-    ]
+    pairs = []
+    for batch in range(BATCHES):
+        folder = tmp_path / "images" / str(batch)
+        pairs += synthetic_pairs(folder, batch=str(batch))
     budget = Budget(0.0, inf, VirtualClock())
     monkeypatch.setattr(places, "ProcessWorker", DoomedWorker)
     monkeypatch.setattr(places, "RESTART_PAUSE_S", 0.0)
@@ -166,6 +168,7 @@ def test_a_run_whose_workers_are_killed_and_stopped_at_random_moments_ends_as_th
         )
         assert report.ending is Ending.COMPLETE, report.faults
         assert all(record.units for record in report.records)
+        # Neither a stopped process nor one that was just started may stay behind.
         for process in multiprocessing.active_children():
             process.join(timeout=60)
             assert not process.is_alive()
@@ -173,24 +176,23 @@ def test_a_run_whose_workers_are_killed_and_stopped_at_random_moments_ends_as_th
 
     undisturbed = run_whole("undisturbed")
     assert undisturbed.faults == ()
+    # Later moments are drawn from the whole life of a worker, its start and its end included.
     for worker in DoomedWorker.known.values():
-        DoomedWorker.lives[worker.kind] = max(
-            DoomedWorker.lives.get(worker.kind, 0.0), worker.computed
-        )
+        longest = DoomedWorker.lives.get(worker.kind, 0.0)
+        DoomedWorker.lives[worker.kind] = max(longest, worker.computed)
     compared = 0
     while len(DoomedWorker.sent) < moments:
         report = run_whole(f"disturbed {len(DoomedWorker.sent)}")
-        skipped = {
-            event.text.split()[4]
-            for event in report.explanations
-            if " is skipped on pair " in event.text
-        }
+        # "UNIT is skipped on pair INDEX (...)": a pair whose unit was lost twice may differ.
+        texts = [event.text for event in report.explanations]
+        skipped = {text.split()[4] for text in texts if " is skipped on pair " in text}
         given_up = {pairs[int(index)].group for index in skipped}
         intact = {pair.group for pair in pairs} - given_up
         assert matrices(report, intact, pairs) == matrices(undisturbed, intact, pairs), (
             report.faults
         )
         compared += len(intact)
+    # Otherwise some kind of worker, or one of the signals, was not tested.
     assert {number for _, number in DoomedWorker.sent} == {signal.SIGKILL, signal.SIGSTOP}
     assert {kind for kind, _ in DoomedWorker.sent} == {"mkpc", "estimates", SCENE}
     assert compared > 0

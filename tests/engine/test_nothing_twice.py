@@ -25,13 +25,11 @@ from simulator import Scenario, memory_store, simulate
 
 from mkpc_kaggle.cli import main
 from mkpc_kaggle.demo import DemoSet
-from mkpc_kaggle.engine.request import Ending
+from mkpc_kaggle.engine.request import Ending, RunReport
 
-FIRST, SECOND, THIRD = (
-    '{ stage = 1, matcher = "sift", long_side = 320 }',
-    '{ stage = 2, matcher = "sift", long_side = 400 }',
-    '{ stage = 1, matcher = "sift", long_side = 256 }',
-)
+FIRST = '{ stage = 1, matcher = "sift", long_side = 320 }'
+SECOND = '{ stage = 2, matcher = "sift", long_side = 400 }'
+THIRD = '{ stage = 1, matcher = "sift", long_side = 256 }'
 BEFORE = 6  # rows of the test side before the change, of 8
 
 
@@ -50,10 +48,10 @@ class Room:
         return self.home / "small.toml"
 
     def units(self, *units: str, more: str = "") -> None:
+        # Quick estimates, with all kinds of results: units, F under a prior, scenes
         magsac = "[magsac]\npermutations = 1\nmax_iterations = 2000\n"
-        self.recipe.write_text(
-            f"units = [{', '.join(units)}]\n{magsac}{more}\n[focal]\n[scene]\npairs_per_image = 0\n"
-        )
+        others = "[focal]\n[scene]\npairs_per_image = 0\n"
+        self.recipe.write_text(f"units = [{', '.join(units)}]\n{magsac}{more}\n{others}")
 
     def rows(self, count: int) -> None:
         lines = (self.home / "rows.csv").read_text().splitlines()
@@ -102,6 +100,7 @@ def replace_an_image(room: Room) -> None:
     cv2.imwrite(str(path), np.ascontiguousarray(cv2.imread(str(path))[::-1]))
 
 
+# A change, and the number of units that run after it
 CHANGES: dict[str, tuple[Callable[[Room], None], Callable[[Room], int]]] = {
     "nothing": (lambda room: None, lambda room: 0),
     "a unit added": (
@@ -128,11 +127,12 @@ CHANGES: dict[str, tuple[Callable[[Room], None], Callable[[Room], int]]] = {
 
 
 @pytest.mark.parametrize("change", CHANGES)
-def test_what_runs_after_a_change_and_the_bytes_are_those_of_a_fresh_run(
+def test_a_change_runs_only_what_depends_on_it_and_gives_the_bytes_of_a_fresh_run(
     room: Room, change: str, capsys
 ) -> None:
     make, units = CHANGES[change]
     make(room)
+    # Fewer units would be a stale result, more would be wasted hours.
     again = room.run()
     (run,) = re.findall(r"(\d+) units run", capsys.readouterr().out)
     assert int(run) == units(room)
@@ -144,10 +144,15 @@ def test_a_simulated_run_cut_by_its_limit_at_a_random_moment_and_finished_later_
     seed,
 ):
     rng = np.random.default_rng(seed)
-    costs = tuple(rng.uniform(0.2, 2.0, rng.integers(3, 6)).tolist())  # units of stage 1, 2, 1, ...
+    # Units of stage 1, 2, 1, ...: points of stage 2 are computed again after a later unit of stage 1.
+    count = rng.integers(3, 6)
+    costs = tuple(rng.uniform(0.2, 2.0, count).tolist())
     whole = Scenario(40, costs, 1, math.inf, warm_up=0, misses=0, batches=2, seed=seed)
-    store, fresh = memory_store(), simulate(whole)
-    cut = simulate(replace(whole, limit=float(rng.uniform(0.2, 1.2)) * whole.work), store)
+    store = memory_store()
+    fresh = simulate(whole)
+    # Up to a limit that is too long to cut the run
+    share = float(rng.uniform(0.2, 1.2))
+    cut = simulate(replace(whole, limit=share * whole.work), store)
     finished = simulate(whole, store)
     assert finished.report.ending is fresh.report.ending is Ending.COMPLETE
     assert finished.keys == fresh.keys
@@ -176,43 +181,49 @@ def test_a_run_cut_by_its_limit_at_a_random_moment_and_finished_later_has_the_by
 ):
     rng = random.Random(moments)
     for number in range(moments):
+        # 36 units take 1.8 s or more: the limit ends the run somewhere in its phases.
         slow = RectifiedMatcher(seconds=0.05)
         run(pairs, THREE_UNITS, slow, tmp_path / str(number), limit=rng.uniform(2.2, 3.8))
         report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / str(number))
         assert report.ending is Ending.COMPLETE
         assert matrices(report) == matrices(undisturbed)
-        found = [[(unit.unit, unit.matches) for unit in record.units] for record in report.records]
-        assert found == [
-            [(unit.unit, unit.matches) for unit in record.units] for record in undisturbed.records
-        ]
+        assert matches_of_units(report) == matches_of_units(undisturbed)
 
 
-def test_what_raised_is_run_again_by_the_next_run_and_nothing_else(pairs, undisturbed, tmp_path):
-    failed = run(
-        pairs, THREE_UNITS, FaultyMatcher(fault=lack_an_image, above=100), tmp_path / "work"
-    )
+def matches_of_units(report: RunReport) -> list[list[tuple[str, int]]]:
+    found = []
+    for record in report.records:
+        found.append([(unit.unit, unit.matches) for unit in record.units])
+    return found
+
+
+def failed_units(report: RunReport) -> list[tuple[int, str]]:
+    """The index of the pair and the name of each unit that failed."""
+    failed = []
+    for record in report.records:
+        failed += [(record.index, unit.unit) for unit in record.units if unit.failure]
+    return failed
+
+
+def test_the_next_run_repeats_only_units_that_raised(pairs, undisturbed, tmp_path):
+    faulty = FaultyMatcher(fault=lack_an_image, above=100)
+    failed = run(pairs, THREE_UNITS, faulty, tmp_path / "work")
     assert failed.ending is Ending.COMPLETE
-    told = [
-        (record.index, unit.unit)
-        for record in failed.records
-        for unit in record.units
-        if unit.failure
-    ]
-    assert told == [(3, unit.name) for unit in THREE_UNITS.units[1:]]
+    assert failed_units(failed) == [(3, unit.name) for unit in THREE_UNITS.units[1:]]
     mended = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
     assert mended.units_run == 2
     assert matrices(mended) == matrices(undisturbed)
-    assert not [unit.failure for record in mended.records for unit in record.units if unit.failure]
+    assert failed_units(mended) == []
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("change", CHANGES)
 def test_ten_kills_after_a_change_leave_the_same_bytes(room: Room, change: str) -> None:
-    rng, command = (
-        random.Random(change),
-        [sys.executable, "-m", "mkpc_kaggle", *room.command("a.csv")],
-    )
-    CHANGES[change][0](room)
+    rng = random.Random(change)
+    command = [sys.executable, "-m", "mkpc_kaggle", *room.command("a.csv")]
+    make, _ = CHANGES[change]
+    make(room)
+    # From the imports to the report
     for _ in range(10):
         running = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         time.sleep(rng.uniform(0.5, 6.0))
@@ -234,18 +245,20 @@ def test_a_prune_frees_the_results_of_former_settings_and_keeps_those_of_the_las
     assert float(freed) == round((before - store.stat().st_size) / 1e6, 2) > 0
     assert room.run() == last
     assert "0 units run, 0 F estimated" in capsys.readouterr().out
+    # The former settings again: their results are gone.
     room.units(FIRST, SECOND)
     room.run()
     assert f"{2 * BEFORE} units run" in capsys.readouterr().out
 
 
-def test_images_added_to_a_folder_are_matched_with_each_other_and_with_the_former(
+def test_images_added_to_a_folder_are_matched_with_each_other_and_with_the_former_ones(
     demo, tmp_path, monkeypatch, capsys
 ) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib", None)  # pages without drawings
     images = sorted((demo.train_dir / "courtyard" / "images").iterdir())
     (tmp_path / "in").mkdir()
-    recipe, folder = tmp_path / "small.toml", tmp_path / "in"
+    recipe = tmp_path / "small.toml"
+    folder = tmp_path / "in"
     recipe.write_text(f"units = [{FIRST}]\n")
 
     def reconstruct(out: str) -> tuple[int, list[str]]:
@@ -255,9 +268,11 @@ def test_images_added_to_a_folder_are_matched_with_each_other_and_with_the_forme
         (run,) = re.findall(r"(\d+) units run", printed.out)
         return int(run), (tmp_path / out / "cameras.csv").read_text().splitlines()
 
+    # Six pairs of four images, then nine more of six
     for path in images[:4]:
         shutil.copy(path, folder)
-    assert reconstruct("out")[0] == 6
+    run, _ = reconstruct("out")
+    assert run == 6
     for path in images[4:6]:
         shutil.copy(path, folder)
     run, cameras = reconstruct("out")

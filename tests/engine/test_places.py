@@ -12,8 +12,10 @@ from mkpc_kaggle.engine.places import LocalSite, Place, Work
 from mkpc_kaggle.engine.process import ThreadWorker
 from mkpc_kaggle.engine.worker import scene_runner
 
-LOST, DONE = Failure(Cause.DIED), ()
-RAISED, NO_MEMORY = Failure(Cause.RAISED), Failure(Cause.OUT_OF_MEMORY)
+LOST = Failure(Cause.DIED)
+DONE = ()
+RAISED = Failure(Cause.RAISED)
+NO_MEMORY = Failure(Cause.OUT_OF_MEMORY)
 
 
 def job(*, is_retry=False):
@@ -23,7 +25,10 @@ def job(*, is_retry=False):
 def place_of(waiting):
     """A place whose workers give these answers."""
     worker = SimpleNamespace(
-        start=lambda: None, submit=lambda *_: None, kill=lambda: None, answer=lambda: waiting.pop(0)
+        start=lambda: None,
+        submit=lambda *_: None,
+        kill=lambda: None,
+        answer=lambda: waiting.pop(0),
     )
     return Place("cpu", lambda: worker)
 
@@ -34,10 +39,12 @@ def place_of(waiting):
         ([LOST] * 2, False, False),
         ([LOST] * 3, False, True),
         ([LOST, LOST, DONE, LOST, LOST], False, False),
-        ([LOST, LOST, RAISED, LOST, LOST], False, False),  # what a worker reports is an answer
+        # What a worker reports is an answer: its device works.
+        ([LOST, LOST, RAISED, LOST, LOST], False, False),
         ([LOST, LOST, NO_MEMORY, LOST, LOST], False, False),
         ([DONE] + [LOST] * 3, False, True),
-        ([LOST] * 3, True, False),  # it is the job that other workers were lost at
+        # A job that cost other workers before is the likely cause, and not the place.
+        ([LOST] * 3, True, False),
     ],
 )
 def test_three_workers_lost_in_a_row_with_no_answer_between_close_a_place(
@@ -57,6 +64,7 @@ def test_three_workers_lost_in_a_row_with_no_answer_between_close_a_place(
 
 
 def test_a_thread_that_cannot_start_is_an_answer(monkeypatch):
+    # Containers limit the number of threads. An exception here would end the run.
     def no_thread(_):
         raise RuntimeError("can't start new thread")
 
@@ -66,7 +74,8 @@ def test_a_thread_that_cannot_start_is_an_answer(monkeypatch):
     assert place.poll(0.0) == Failure(Cause.NOT_STARTED, "can't start new thread")
 
 
-def test_an_answer_that_is_there_counts_though_its_time_is_over():
+def test_an_answer_that_has_arrived_counts_even_after_its_limit():
+    # The loop may have been busy, so the limit is checked only if no answer is waiting.
     place = place_of([Loaded(), DONE])
     place.start(0.0)
     place.poll(0.0)
@@ -114,8 +123,9 @@ def test_scenes_have_the_cores_that_matching_leaves_free_and_estimates_those_of_
     monkeypatch.setattr(places.os, "sched_getaffinity", lambda _: set(range(cores)))
     monkeypatch.setattr(places.os, "cpu_count", lambda: 64)  # of the whole machine
     site = LocalSite(assembly, workers, lambda: 0.0)
-    at_a_time = [site.scenes_at_a_time(is_matching=is_matching) for is_matching in (True, False)]
-    assert tuple(at_a_time) == scenes
+    while_matching = site.scenes_at_a_time(is_matching=True)
+    afterwards = site.scenes_at_a_time(is_matching=False)
+    assert (while_matching, afterwards) == scenes
     assert len(site.of(Work.SCENE)) == cores
     assert len(site.of(Work.LIGHT)) == max(1, cores // 4)
 
@@ -124,6 +134,7 @@ def test_workers_in_threads_leave_the_limits_of_the_users_process_as_they_are(tm
     import cv2
     from threadpoolctl import threadpool_info, threadpool_limits
 
+    # Numbers that the workers would not set themselves
     former = cv2.getNumThreads()
     cv2.setNumThreads(3)
     try:

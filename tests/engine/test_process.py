@@ -1,6 +1,4 @@
-"""Whatever becomes of a worker's process, and however large its job is, no call blocks and the
-reason is told.
-"""
+"""Calls of a worker never block, whatever happens to its process, and report why it was lost."""
 
 import multiprocessing
 import os
@@ -28,7 +26,11 @@ from mkpc_kaggle.scene.reconstruct import Solution
 from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair
 
 ROOT = Path(__file__).resolve().parents[2]
-IMAGES = (BatchImage("a", "a", Size(80, 72)), BatchImage("b", "b", Size(80, 72)))
+IMAGES = (
+    BatchImage("a", "a", Size(80, 72)),
+    BatchImage("b", "b", Size(80, 72)),
+)
+# A megabyte, and a pipe holds 64 kB: a write to a process that does not read would block.
 POINTS = np.random.default_rng(1).uniform(0, 70, (50_000, 2)).astype(np.float32)
 MATCHES = Matches(POINTS, POINTS, POINTS[:, 0])
 SCENES = Recipe((Unit(1, "m", 80),), scene=SceneConfig())
@@ -68,20 +70,23 @@ def start() -> Iterator[Callable[..., Worker]]:
 
 
 def test_a_worker_that_cannot_be_sent_to_its_process_says_so(start):
+    # A lambda cannot be pickled.
     assert start(lambda job: None).next_answer().cause is Cause.RAISED
 
 
-def test_a_process_that_dies_at_its_birth_is_told(monkeypatch, start):
+def test_a_process_that_dies_at_its_start_is_reported(monkeypatch, start):
+    # As the system does if memory is short
     on_fork(monkeypatch, lambda pid: os.kill(pid, signal.SIGKILL))
     assert start().next_answer() == Failure(Cause.DIED, "signal SIGKILL")
 
 
-def test_a_process_that_stops_at_its_birth_blocks_nothing(monkeypatch, start):
+def test_a_process_that_stops_at_its_start_blocks_nothing(monkeypatch, start):
     on_fork(monkeypatch, lambda pid: os.kill(pid, signal.SIGSTOP))
     assert start().answer() is None
 
 
-def test_a_start_returns_before_there_is_a_process(monkeypatch, start):
+def test_a_start_returns_before_the_process_exists(monkeypatch, start):
+    # On a busy machine a start takes seconds, for which the loop must not wait.
     has_returned = threading.Event()
     on_fork(monkeypatch, lambda _: has_returned.wait())
     worker = start()
@@ -122,15 +127,17 @@ if __name__ == "__main__":
 @pytest.mark.parametrize("is_stopped", [False, True])
 def test_a_worker_at_work_ends_with_its_parent_and_prints_nothing(tmp_path, is_stopped):
     script = tmp_path / "orphan.py"  # a file, since its children import it
-    script.write_text(
-        ORPHAN.format(path=[str(ROOT), str(Path(__file__).parent), str(ROOT / "tests" / "support")])
-    )
-    mark, home = tmp_path / "hangs", {**os.environ, "MKPC_TEST_HOME": str(tmp_path)}
+    paths = [str(ROOT), str(Path(__file__).parent), str(ROOT / "tests" / "support")]
+    script.write_text(ORPHAN.format(path=paths))
+    # The worker writes its process's number there before it hangs.
+    mark = tmp_path / "hangs"
+    home = {**os.environ, "MKPC_TEST_HOME": str(tmp_path)}
     parent = subprocess.Popen([sys.executable, str(script)], env=home, stderr=subprocess.PIPE)
     while not (mark.exists() and mark.read_text()):
         assert parent.poll() is None, parent.stderr
         threading.Event().wait(0.05)
     child = os.pidfd_open(int(mark.read_text()))
+    # A stopped process reads no end of file, so only the system can end it with its parent.
     if is_stopped:
         signal.pidfd_send_signal(child, signal.SIGSTOP)
     parent.kill()
@@ -169,8 +176,9 @@ def test_the_first_worker_of_a_program_hears_no_ctrl_c_and_is_told_not_to_spin_a
 ):
     script = tmp_path / "starts.py"
     script.write_text(STARTS)
-    environment = {
-        name: value for name, value in os.environ.items() if name not in WORKER_ENVIRONMENT
-    }
+    environment = dict(os.environ)
+    for name in WORKER_ENVIRONMENT:
+        environment.pop(name, None)
+    # A value that the user has set stays.
     environment |= {"GOMP_SPINCOUNT": "7", "PYTHONPATH": str(ROOT)}
     subprocess.run([sys.executable, script], env=environment, check=True)

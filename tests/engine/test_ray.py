@@ -30,7 +30,7 @@ ray = pytest.importorskip("ray", reason="Ray is not installed: pip install 'mkpc
 TESTS = Path(__file__).parents[1]
 # What machines can import
 IMPORTED = [str(TESTS.parent), str(TESTS / "engine"), str(TESTS / "support")]
-STORE_BYTES = 80 << 20
+STORE_BYTES = 80 << 20  # of each machine; Ray would take a share of the whole memory
 
 
 @dataclass
@@ -56,6 +56,7 @@ def cluster() -> Iterator[Any]:
     """A head and one more machine, one CPU each; joined by the runs, one after the other."""
     from ray.cluster_utils import Cluster
 
+    # Machines import the tests' matchers when they unpickle them.
     patch = pytest.MonkeyPatch()
     patch.setenv("PYTHONPATH", os.pathsep.join([*IMPORTED, os.environ.get("PYTHONPATH", "")]))
     small = {"num_cpus": 1, "object_store_memory": STORE_BYTES, "include_dashboard": False}
@@ -81,6 +82,7 @@ def test_a_machine_lost_during_the_run_costs_its_job_alone(cluster, pairs, undis
     lost = cluster.add_node(num_cpus=1, object_store_memory=STORE_BYTES)
     matcher = DoomedMatcher(node=lost.node_id, mark=tmp_path / "begun")
 
+    # Once a job is under way on it: before, the machine would only be missing.
     def lose() -> None:
         while not matcher.mark.exists():
             time.sleep(0.05)
@@ -98,26 +100,20 @@ def test_a_machine_that_lacks_the_weights_or_the_test_set_is_named_when_the_run_
 ):
     missing = tmp_path / "nowhere"
     lacking = [Pair("a", "a", str(missing / "a.png"), str(missing / "b.png"))]
+    told = rf"lacks {missing}: test set and weights must have the same paths"
+    workers = f"ray://{cluster.address}"
     for asked, weights in ((lacking, ()), (pairs, (missing,))):
         monkeypatch.setattr(Assembly, "weight_paths", weights)
-        with pytest.raises(
-            UserError, match=rf"lacks {missing}: test set and weights must have the same paths"
-        ):
-            run(
-                asked,
-                THREE_UNITS,
-                RectifiedMatcher(),
-                tmp_path / asked[0].id,
-                workers=f"ray://{cluster.address}",
-            )
+        work_dir = tmp_path / asked[0].id
+        with pytest.raises(UserError, match=told):
+            run(asked, THREE_UNITS, RectifiedMatcher(), work_dir, workers=workers)
 
 
 def test_batches_are_reconstructed_on_the_cluster_to_the_same_bytes(cluster, tmp_path):
     batch = synthetic_pairs(tmp_path / "images")
     here = run(batch, SYNTHETIC, SyntheticMatcher(), tmp_path / "here")
-    report = run(
-        batch, SYNTHETIC, SyntheticMatcher(), tmp_path / "w", workers=f"ray://{cluster.address}"
-    )
+    workers = f"ray://{cluster.address}"
+    report = run(batch, SYNTHETIC, SyntheticMatcher(), tmp_path / "w", workers=workers)
     assert report.faults == ()
     assert [record.source for record in report.records] == ["scene"] * len(batch)
     chosen = [[record.chosen_fundamental for record in each.records] for each in (report, here)]
@@ -143,7 +139,8 @@ if __name__ == "__main__":
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
-def test_a_cluster_of_its_own_ends_with_the_run(tmp_path, number):
+def test_a_cluster_that_the_run_started_ends_with_it(tmp_path, number):
+    # All processes of the cluster have this in their environment.
     mark = f"MKPC_TEST={tmp_path}"
     environment = {**os.environ, "MKPC_TEST": str(tmp_path), "RAY_ADDRESS": "local"}
     environment["PYTHONPATH"] = os.pathsep.join([*IMPORTED, os.environ.get("PYTHONPATH", "")])

@@ -48,48 +48,57 @@ def own_matrices(pairs: list[Pair], directory: Path) -> list[bytes]:
 
 def test_pairs_get_the_f_of_their_scene_and_keep_their_own(tmp_path, monkeypatch):
     scenes_by(monkeypatch, choose_scene_for_all_but_the_first, process=True)
-    pairs, published = batch_pairs(tmp_path / "images"), []
+    pairs = batch_pairs(tmp_path / "images")
+    published = []
     publish = lambda state: published.append(state.fundamentals)  # noqa: E731
     report = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work", publish=publish)
     assert report.ending is Ending.COMPLETE
     assert [record.source for record in report.records] == ["pair"] + ["scene"] * 5
-    assert all(np.array_equal(record.chosen_fundamental, SCENE_F) for record in report.records[1:])
+    chosen = [record.chosen_fundamental for record in report.records]
+    assert all(np.array_equal(F, SCENE_F) for F in chosen[1:])
+    # A scene replaces no pair's own F: another setting of scenes may need it.
     assert matrices(report) == own_matrices(pairs, tmp_path / "alone")
     assert report.records[0].scene.reason is Reason.CONTRADICTION
-    assert np.array_equal(published[-1], [record.chosen_fundamental for record in report.records])
+    assert np.array_equal(published[-1], chosen)
     log = read_log(tmp_path / "work")
     assert "pairs with an F: 6 of 6 (5 from scenes, 1 from their own matches)" in overview(log)
     assert "images with a camera: 4 of 4 (in 1 batch)" in overview(log)
-    assert (
-        "weakest cameras, with the error of the centre: 3.png (3 %), 2.png (2 %), 1.png (1 %)"
-        in overview(log)
-    )
-    assert report_page(log).index("3.png</td>") < report_page(log).index("2.png</td>")
-    assert "both cameras are known" in report_page(log)
-    assert all(len(match.results[0].matches) for _, match in log.weakest), (
-        "what is drawn keeps its points"
-    )
+    weakest = "weakest cameras, with the error of the centre: 3.png (3 %), 2.png (2 %), 1.png (1 %)"
+    assert weakest in overview(log)
+    page = report_page(log)
+    assert page.index("3.png</td>") < page.index("2.png</td>"), "the weakest camera first"
+    assert "both cameras are known" in page
+    assert all(len(match.results[0].matches) for _, match in log.weakest), "drawings have points"
 
 
 def test_a_focal_length_of_exif_goes_to_the_pairs_the_store_and_the_scene(tmp_path, monkeypatch):
-    pairs, jobs = batch_pairs(tmp_path / "images", 3), list[SceneJob]()
+    pairs = batch_pairs(tmp_path / "images", 3)
+    jobs = list[SceneJob]()
 
     def note(job: SceneJob) -> Solution:
         jobs.append(job)
         return choose_scene_for_all_but_the_first(job)
 
     scenes_by(monkeypatch, note)
-    told, recipe = pytest.approx(28 / 43.27 * np.hypot(*SIZE)), replace(RECIPE, focal=FocalConfig())
+    # COLMAP's rule: 28 mm of a film whose diagonal is 43.27 mm
+    told = pytest.approx(28 / 43.27 * np.hypot(*SIZE))
+    recipe = replace(RECIPE, focal=FocalConfig())
     reports = []
-    for name, expected in (("without", [(0, 0)] * 3), ("with", [(told, 0), (told, 0), (0, 0)])):
+    # Image 0 is the first of two pairs. It gets its EXIF after the first run.
+    cases = [
+        ("without", [(0, 0)] * 3),
+        ("with", [(told, 0), (told, 0), (0, 0)]),
+    ]
+    for name, expected in cases:
         reports.append(run(pairs, recipe, RectifiedMatcher(), tmp_path / name))
         with Store.read(tmp_path / name) as store:
             rows = Table.of(store).rows
             focals = [tuple(image.focal for image in read_images(store, row)) for row in rows]
         assert focals == expected
         set_exif(pairs[0].images[0], tA405=28)
-    assert not np.array_equal(*(report.records[0].pair_fundamental for report in reports))
-    assert np.array_equal(*(report.records[2].pair_fundamental for report in reports))
+    without, with_exif = ([row.pair_fundamental for row in each.records] for each in reports)
+    assert not np.array_equal(without[0], with_exif[0])
+    assert np.array_equal(without[2], with_exif[2]), "the pair of the other images"
     assert [pair.images[0].focal for pair in jobs[-1].pairs] == [told, told, 0]
 
 
@@ -117,7 +126,9 @@ def test_a_reconstruction_that_is_lost_costs_its_scene_alone_is_named_and_tried_
     assert fault.startswith(f"batch one was not reconstructed: {reason}")
     assert report.scenes[0].failure.startswith(reason)
     assert f"  one: {reason}" in summary(report)
+    # pycolmap prints to the descriptors, which would tear the progress bar.
     assert capfd.readouterr() == ("", "")
+    # Failures are not stored, so the same command tries the scene again, and matches nothing.
     scenes_by(monkeypatch, choose_scene_for_all_but_the_first, process=True)
     matcher = RectifiedMatcher()
     again = run(pairs, RECIPE, matcher, tmp_path / "work")
@@ -144,25 +155,20 @@ def test_a_run_reconstructs_the_true_cameras_and_a_gigabyte_is_enough(tmp_path, 
     report = run(synthetic_pairs(tmp_path / "images"), SYNTHETIC, matcher, tmp_path / "work")
     assert report.faults == ()
     assert [record.source for record in report.records] == ["scene"] * 15
-    pairs = zip(report.records, matcher.scene.pairs, strict=True)
-    assert (
-        max(
-            matcher.scene.median_distance(record.chosen_fundamental, pair) for record, pair in pairs
-        )
-        < 0.5
-    )
+    distances = []
+    for record, pair in zip(report.records, matcher.scene.pairs, strict=True):
+        distances.append(matcher.scene.median_distance(record.chosen_fundamental, pair))
+    # Pixels between true points and the lines of F
+    assert max(distances) < 0.5
 
 
 def test_a_death_within_pycolmap_costs_the_scene_alone_and_leaves_no_files(tmp_path, monkeypatch):
+    # pycolmap reads its database there; a process that was killed cannot remove it.
     (tmp_path / "temporary").mkdir()
     monkeypatch.setenv("TMPDIR", str(tmp_path / "temporary"))
     scenes_by(monkeypatch, die_within_pycolmap, process=True)
-    report = run(
-        synthetic_pairs(tmp_path / "images", 4),
-        SYNTHETIC,
-        SyntheticMatcher(images=4),
-        tmp_path / "work",
-    )
+    pairs = synthetic_pairs(tmp_path / "images", 4)
+    report = run(pairs, SYNTHETIC, SyntheticMatcher(images=4), tmp_path / "work")
     assert report.ending is Ending.COMPLETE
     assert [record.source for record in report.records] == ["pair"] * 6
     assert report.scenes[0].failure
@@ -177,6 +183,7 @@ def test_the_scene_of_a_run_is_made_of_tracks_and_judged_by_all_matches(tmp_path
         return choose_scene_for_all_but_the_first(job)
 
     scenes_by(monkeypatch, note)
+    # A unit may be too inaccurate for tracks, and still decide whether a pair agrees.
     first, *others = THREE_UNITS.units
     recipe = replace(RECIPE, units=(replace(first, tracks=False), *others))
     run(batch_pairs(tmp_path / "images"), recipe, RectifiedMatcher(), tmp_path / "work")
@@ -184,25 +191,27 @@ def test_the_scene_of_a_run_is_made_of_tracks_and_judged_by_all_matches(tmp_path
     assert all(0 < len(pair.tracks) < len(pair.matches) for pair in given)
 
 
-def test_a_run_that_goes_on_reconstructs_only_the_batch_whose_image_was_replaced(
+def test_a_resumed_run_reconstructs_only_the_batch_whose_image_was_replaced(
     tmp_path, monkeypatch, capsys
 ):
     scenes_by(monkeypatch, choose_scene_for_all_but_the_first)
-    pairs = batch_pairs(tmp_path / "images") + batch_pairs(tmp_path / "others", 3, "two")
+    one = batch_pairs(tmp_path / "images")
+    two = batch_pairs(tmp_path / "others", 3, "two")
+    pairs = one + two
     run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
     cv2.imwrite(str(pairs[0].images[0]), np.full((72, 80, 3), 200, np.uint8))
+    # From now on every reconstruction fails, so a success is the stored one.
     scenes_by(monkeypatch, partial(befall, lack_an_image))
     again = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
     assert "1 image changed; matching 3 pairs again" in capsys.readouterr().err
     assert [record.source for record in again.records] == ["pair"] * 6 + ["pair", "scene", "scene"]
-    assert {scene.batch: bool(scene.failure) for scene in again.scenes} == {
-        "one": True,
-        "two": False,
-    }
+    has_failed = {scene.batch: bool(scene.failure) for scene in again.scenes}
+    assert has_failed == {"one": True, "two": False}
     assert matrices(again) == own_matrices(pairs, tmp_path / "alone")
 
 
 def test_a_model_that_the_store_cannot_hold_costs_its_scene_alone(tmp_path, monkeypatch):
+    # JSON has no NaN, and the store refuses it.
     def with_a_wrong_error(job: SceneJob) -> Solution:
         found = choose_scene_for_all_but_the_first(job)
         (reconstruction,) = found.reconstructions

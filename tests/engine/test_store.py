@@ -49,7 +49,9 @@ REGIONS = (
     CriticalRegion(Box(0, 0, 5, 6), RegionReason.TOO_SMALL),
 )
 RECIPE = replace(THREE_UNITS, units=(SWEEP, SECOND), scene=SceneConfig(pairs_per_image=0))
-CAMERA = Camera(np.diag([500.0, 500, 1]), np.eye(3)[[1, 0, 2]], np.array([0.0, 0.0, 1.0]))
+# No identity, so that rows and columns cannot be exchanged unnoticed
+ROTATION = np.eye(3)[[1, 0, 2]]
+CAMERA = Camera(np.diag([500.0, 500, 1]), ROTATION, np.array([0.0, 0.0, 1.0]))
 
 
 def pair_of(number: int) -> Pair:
@@ -167,29 +169,30 @@ def whole(room: Room) -> Room:
     return room
 
 
-def test_what_is_put_is_read_after_opening_again(whole: Room, tmp_path: Path) -> None:
-    before = read_records(whole.store), read_scenes(whole.store)
+def test_stored_results_are_read_after_reopening(whole: Room, tmp_path: Path) -> None:
+    records_before = read_records(whole.store)
+    scenes_before = read_scenes(whole.store)
     whole.store.close()
     with Store.open(tmp_path) as again:
-        records, scenes = read_records(again), read_scenes(again)
+        records = read_records(again)
+        scenes = read_scenes(again)
         assert [record.source for record in records] == ["scene", "pair", "fallback"]
         found = [(unit.unit, unit.matches, unit.inliers) for unit in records[1].units]
         assert found == [(SWEEP.name, 30, 7), (SECOND.name, 30, 8)]
         assert records[0].regions == REGIONS
         assert np.array_equal(records[0].chosen_fundamental, 3 * F)
         assert np.array_equal(records[0].magsac_fundamental, 2 * F)
-        assert scenes == before[1]
-        (model,), (known,) = scenes["one"].models, before[1]["one"].models
+        assert scenes == scenes_before
+        (model,) = scenes["one"].models
+        (known,) = scenes_before["one"].models
         assert (model.points.tolist(), model.reprojection_error) == ([[0.0, 0.0, 5.0]], 0.7)
+        # The comparison of scenes leaves out their models.
         for image, other in zip(model.images, known.images, strict=True):
-            assert (image.image, image.points, image.sigmas) == (
-                other.image,
-                other.points,
-                other.sigmas,
-            )
+            assert image.image == other.image
+            assert (image.points, image.sigmas) == (other.points, other.sigmas)
             for part in ("K", "R", "t"):
                 assert np.array_equal(getattr(image.camera, part), getattr(other.camera, part))
-        assert [record.units for record in records] == [record.units for record in before[0]]
+        assert [record.units for record in records] == [record.units for record in records_before]
         points = read_points(again, Table.of(again), 0)
         assert to_bytes(points[SWEEP.name]) == to_bytes(matches_of(0))
         assert Table.of(again).about.recipe == {"name": "x"}
@@ -205,7 +208,8 @@ def test_results_are_data_frames_of_pairs_units_and_cameras(whole: Room, tmp_pat
     assert cameras["centre_sigma"].isna().tolist() == [False, True]
 
 
-# And: pairs with points of before, with an estimate of today, and whether the scene is today's
+# A change, then the number of pairs with points in use, the number of pairs whose estimate is up to
+# date, and whether the scene is
 CHANGES = {
     "nothing": (lambda room: room.ask(), (2, 2, True)),
     "unit added": (
@@ -216,7 +220,8 @@ CHANGES = {
     # Until there are other estimates
     "threshold": (lambda room: room.ask(estimate="other"), (2, 0, True)),
     "scene": (lambda room: room.ask(scene="other"), (2, 2, False)),
-    "crops": (lambda room: room.ask(mkpc="other"), (2, 2, True)),  # until the others are there
+    # The old points of stage 2 stay in use until new ones exist.
+    "crops": (lambda room: room.ask(mkpc="other"), (2, 2, True)),
     "pair added": (lambda room: room.ask(count=4), (2, 2, True)),
     "content": (lambda room: room.replace("0.png"), (1, 1, False)),
     "content of second images": (lambda room: room.replace("c.png"), (0, 0, False)),
@@ -226,7 +231,7 @@ SECOND_360 = replace(SECOND, long_side=360)
 
 
 @pytest.mark.parametrize(("change", "standing"), CHANGES.values(), ids=CHANGES)
-def test_a_result_is_of_today_if_it_is_stored_under_the_key_of_today(
+def test_a_result_is_up_to_date_if_it_is_stored_under_todays_key(
     whole: Room, change, standing
 ) -> None:
     change(whole)
@@ -259,7 +264,8 @@ def test_an_image_that_is_put_back_has_its_results_again(whole: Room) -> None:
     assert whole.standing == (2, 2, True)
 
 
-def test_former_results_are_of_today_again_when_the_former_settings_return(whole: Room) -> None:
+def test_former_results_are_up_to_date_again_when_the_former_settings_return(whole: Room) -> None:
+    # A user who compares two settings goes back and forth between them.
     whole.ask(replace(RECIPE, units=(SWEEP,)), estimate="other", scene="other")
     for index in (0, 1):
         whole.estimate(index)
@@ -269,12 +275,12 @@ def test_former_results_are_of_today_again_when_the_former_settings_return(whole
     assert whole.standing == (2, 2, True)
 
 
-def test_the_f_of_before_stays_until_there_is_one_of_today_but_not_for_another_image(
-    whole: Room,
-) -> None:
+def test_a_former_f_stays_until_a_new_one_exists_unless_an_image_changed(whole: Room) -> None:
+    # An F by former settings is better than the fallback.
     whole.ask(estimate="other", scene="other")
     assert whole.state.has_own.tolist() == [True, True, False]
     assert set(whole.state.scenes) == {"one"}
+    # An F of another image is not.
     whole.match(0, SWEEP, SECOND, digest="new")
     assert whole.state.has_own.tolist() == [False, True, False]
     whole.publish()
@@ -285,6 +291,7 @@ def test_the_f_of_before_stays_until_there_is_one_of_today_but_not_for_another_i
 def test_reports_show_the_f_that_was_written_last_and_decide_nothing_themselves(
     whole: Room,
 ) -> None:
+    # Stored, but not in the submission yet: the report must agree with the file.
     whole.match(2, SWEEP)
     whole.estimate(2)
     record = read_records(whole.store)[2]
@@ -325,24 +332,30 @@ def test_rows_of_the_same_images_share_their_points_and_turned_images_are_others
     assert not room.state.current.any()
 
 
-def test_results_are_put_all_or_none(room: Room) -> None:
+def test_results_are_stored_all_or_none(room: Room) -> None:
+    good = Result("a", Kind.SCENE, 1.0)
+    bad = Result("b", Kind.SCENE, np.nan)  # not JSON
     with pytest.raises(sqlite3.IntegrityError):
-        room.store.put([Result("a", Kind.SCENE, 1.0), Result("b", Kind.SCENE, np.nan)])
+        room.store.put([good, bad])
     assert room.store.about(["a", "b"]) == {}
 
 
-def test_what_a_full_disk_refuses_is_in_memory_and_written_when_there_is_room(
+def test_results_that_a_full_disk_refuses_stay_in_memory_and_are_written_later(
     tmp_path: Path,
 ) -> None:
     rows = [Result(f"key {n}", Kind.POINTS, n, bytes(600)) for n in range(200)]
     with Store.open(tmp_path) as store:
+        # SQLite then reports a full disk after five more pages.
         (pages,) = store._db.execute("PRAGMA page_count").fetchone()
         store._db.execute(f"PRAGMA max_page_count = {pages + 5}")
         for row in rows:
             store.put([row])
         assert "full" in store.trouble
         assert store.about(row.key for row in rows) == {row.key: row.about for row in rows}
-        assert store.source([rows[-1].key]).data([rows[-1].key]) == {rows[-1].key: rows[-1].data}
+        # The worker that estimates F gets these points, too.
+        last = rows[-1]
+        assert store.source([last.key]).data([last.key]) == {last.key: last.data}
+        # The user deletes files: the next write takes all.
         store._db.execute("PRAGMA max_page_count = 100000")
     with Store.read(tmp_path) as again:
         assert len(again.data(row.key for row in rows)) == 200
@@ -360,8 +373,11 @@ def test_a_prune_removes_what_the_table_of_pairs_does_not_name(whole: Room, tmp_
     assert freed >= 1 << 20
     assert (tmp_path / FILE_NAME).stat().st_size == before - freed
     with Store.read(tmp_path) as store:
-        kinds = (Kind.POINTS, Kind.ESTIMATE, Kind.SCENE)
-        assert {key for kind in kinds for key in store.of_kind(kind)} == named
+        kept = set()
+        for kind in (Kind.POINTS, Kind.ESTIMATE, Kind.SCENE):
+            kept |= store.of_kind(kind).keys()
+        assert kept == named
+        # Features belong to images, which the table of pairs does not name.
         assert store.data(["features"]) == {"features": b"kept"}
 
 
@@ -378,7 +394,7 @@ DAMAGES = [
 
 
 @pytest.mark.parametrize(("damage", "told"), DAMAGES)
-def test_damage_is_what_sqlite_calls_damage(
+def test_only_what_sqlite_reports_as_damage_is_damage(
     whole: Room, tmp_path: Path, damage: str, told: str
 ) -> None:
     whole.store.close()
@@ -393,6 +409,7 @@ def test_damage_is_what_sqlite_calls_damage(
 
 
 def test_a_bug_in_a_reader_is_no_damage(whole: Room, monkeypatch: pytest.MonkeyPatch) -> None:
+    # "Delete your journal" would cost the user hours and hide the bug.
     monkeypatch.setattr("mkpc_kaggle.engine.records.Row", lambda *_: None)
     with pytest.raises(AttributeError):
         read_records(whole.store)
@@ -408,7 +425,8 @@ def test_an_error_of_the_disk_is_no_damage_and_no_bad_input(
             raise error
 
     monkeypatch.setattr(whole.store, "_unsaved", {})
-    whole.store._db, healthy = Failing(), whole.store._db
+    healthy = whole.store._db
+    whole.store._db = Failing()
     with pytest.raises(sqlite3.OperationalError, match="disk I/O error"):
         whole.store.about(["key"])
     whole.store._db = healthy
@@ -431,9 +449,10 @@ def test_a_store_of_another_format_and_an_old_sqlite_are_refused_in_one_line(
 
 
 def test_files_in_the_place_of_the_store_or_its_lock_are_named(tmp_path: Path) -> None:
-    for number, name in enumerate(("journal.lock", "journal.sqlite")):
-        directory = tmp_path / str(number)
+    for name in ("journal.lock", "journal.sqlite"):
+        directory = tmp_path / f"with {name}"
         directory.mkdir()
+        # Opening a pipe without a writer would block forever.
         os.mkfifo(directory / name)
         with pytest.raises(UserError, match=f"{name} is not a regular file"):
             Store.open(directory)
@@ -452,9 +471,9 @@ def test_a_refused_store_holds_no_lock_and_no_file(tmp_path: Path) -> None:
     (tmp_path / FILE_NAME).write_bytes(b"not a database" * 100)
     with pytest.raises(UserError) as caught:
         Store.open(tmp_path)
-    assert caught  # as a notebook keeps the last traceback
-    open_files = [
-        str(link.readlink()) for link in Path("/proc/self/fd").iterdir() if link.is_symlink()
-    ]
+    # A notebook keeps the last traceback, and with it the store's objects.
+    assert caught
+    links = [link for link in Path("/proc/self/fd").iterdir() if link.is_symlink()]
+    open_files = [str(link.readlink()) for link in links]
     assert not [name for name in open_files if name.startswith(str(tmp_path))]
     Store.open(tmp_path, fresh=True).close()

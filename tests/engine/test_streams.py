@@ -39,18 +39,21 @@ if __name__ == "__main__":
 
 @pytest.mark.parametrize("in_worker", [False, True])
 @pytest.mark.parametrize("descriptor", [1, 2])
-def test_native_code_that_complains_to_a_pipe_without_a_reader_does_not_wait(
+def test_native_code_that_prints_to_a_pipe_without_a_reader_does_not_block(
     descriptor, in_worker, tmp_path
 ):
-    script, (reader, pipe), (told, done) = tmp_path / "complains.py", os.pipe(), os.pipe()
+    script = tmp_path / "complains.py"
+    # 3,000 lines are more than the 64 kB that a pipe holds, and nobody reads this one.
+    reader, pipe = os.pipe()
+    told, done = os.pipe()
     script.write_text(COMPLAINS.format(descriptor=descriptor, in_worker=in_worker, done=done))
     given = {"stdout": pipe} if descriptor == 1 else {"stderr": pipe}
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    with subprocess.Popen(
-        [sys.executable, script], env=environment, pass_fds=[done], **given
-    ) as process:
+    command = [sys.executable, script]
+    with subprocess.Popen(command, env=environment, pass_fds=[done], **given) as process:
         os.close(done)
         os.close(pipe)
+        # A process that blocks is killed: the read then ends without "done".
         timer = threading.Timer(60, process.kill)
         timer.start()
         assert os.read(told, 10) == b"done"
@@ -78,7 +81,7 @@ if __name__ == "__main__":
 """
 
 
-def test_what_native_code_of_a_worker_writes_is_in_a_file_of_the_run(tmp_path):
+def test_output_of_native_code_in_a_worker_goes_to_a_file_of_the_run(tmp_path):
     script = tmp_path / "logs.py"
     script.write_text(LOGS)
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
@@ -88,28 +91,44 @@ def test_what_native_code_of_a_worker_writes_is_in_a_file_of_the_run(tmp_path):
     assert (tmp_path / "workers.log").read_bytes() == b"libpng warning, libjpeg: premature end"
 
 
-def test_what_native_code_writes_is_printed(tmp_path):
-    script = "import os\nfrom mkpc_kaggle.engine.console import unblocked\nwith unblocked():\n"
-    script += "    os.write(2, b'libjpeg: premature end')\nprint('later', flush=True)\nos.write(2, b', again')"
-    done = subprocess.run(
-        [sys.executable, "-c", script],
-        capture_output=True,
-        check=True,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-    )
+PRINTS = """
+import os
+from mkpc_kaggle.engine.console import unblocked
+
+with unblocked():
+    os.write(2, b"libjpeg: premature end")
+print("later", flush=True)
+os.write(2, b", again")
+"""
+
+
+def test_output_of_native_code_is_printed_at_the_end(tmp_path):
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-c", PRINTS]
+    done = subprocess.run(command, capture_output=True, check=True, env=environment)
     assert done.stderr == b"libjpeg: premature end, again"
 
 
+CLOSES = """
+import os, sys
+from mkpc_kaggle.engine.console import drain, say, unblocked
+
+with unblocked():
+    say("\u00e9")
+    sys.stdout.buffer.write(b"bytes, ")
+    say("text")
+    drain()
+    os.close(sys.stdout.fileno())
+    say("lost")
+"""
+
+
 def test_text_that_a_stream_cannot_encode_and_a_closed_file_end_nothing(tmp_path):
-    script = "import os, sys\nfrom mkpc_kaggle.engine.console import drain, say, unblocked\nwith unblocked():\n"
-    script += "    say('\u00e9')\n    sys.stdout.buffer.write(b'bytes, ')\n    say('text')\n"
-    script += "    drain()\n    os.close(sys.stdout.fileno())\n    say('lost')"
     environment = os.environ | {
         "PYTHONPATH": str(ROOT),
         "PYTHONIOENCODING": "ascii",
         "PYTHONUTF8": "0",
     }
-    done = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, check=True, env=environment
-    )
+    command = [sys.executable, "-c", CLOSES]
+    done = subprocess.run(command, capture_output=True, check=True, env=environment)
     assert done.stdout == b"bytes, text\n"
