@@ -3,19 +3,22 @@
 import os
 import shutil
 import sys
+import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from math import inf
 from typing import TextIO, TypeVar
 
 LINE_INTERVAL_S = 30.0  # between lines where a line cannot be redrawn in place
 REDRAW_S = 0.2  # between redraws: a reader sees no more, and a terminal may be slow
-MAX_SILENCE_S = 1.0  # before a line about a wait: shorter waits need none
+MAX_SILENCE_S = 1.0  # before a bar on a terminal: shorter waits need none
+WAIT_S = 5.0  # before a line that stays
 ERASE = "\r\x1b[K"  # moves a terminal's cursor to the start of the line, and clears the line
-# Of tqdm; a bar of ten ASCII characters, since a terminal may know no others
-BAR = "|{bar:10a}| "
-METER = "{desc}: {n_fmt}/{total_fmt} %s[{elapsed}<{remaining}, {rate_fmt}]"
+# Parts of tqdm's meter; a bar of ten ASCII characters, since a terminal may know no others
+COUNT = "{desc}: {n_fmt}/{total_fmt}"
+BAR = " |{bar:10a}|"
+PACE = " [{elapsed}<{remaining}, {rate_fmt}]"
 
 Item = TypeVar("Item")
 
@@ -87,29 +90,61 @@ class ProgressLine:
     ) -> str:
         """Return text such as ``sweep: 84/304 [02:10<05:40, 1.55s/pair]``, on a terminal with a bar.
 
-        The ``first`` items were done before these seconds, and say nothing about the rate.
+        The ``first`` items were done before these seconds, and say nothing about the rate. The
+        times are left out as long as no rate is known.
         """
         from tqdm import tqdm  # most commands do not need it
 
         count = done - first
         rate = count / seconds if count and seconds else None
-        bar_format = METER % (BAR if self.is_redrawn else "")
+        bar_format = COUNT + (BAR if self.is_redrawn else "")
+        if rate is not None:
+            bar_format += PACE
         return tqdm.format_meter(
             done, total, seconds, prefix=what, unit=unit, rate=rate, bar_format=bar_format
         )
 
 
-def counted(items: Sequence[Item], what: str, unit: str) -> Iterator[Item]:
+def counted(items: Sequence[Item], what: str, unit: str) -> Generator[Item, None, None]:
     """Yield the items and show how many are done, with the rate and the remaining time."""
     line = ProgressLine(sys.stderr)
-    silence = MAX_SILENCE_S if line.is_redrawn else LINE_INTERVAL_S
+    silence = MAX_SILENCE_S if line.is_redrawn else WAIT_S
     began = time.monotonic()
-    for done, item in enumerate(items):
+
+    def show(done: int) -> None:
         seconds = time.monotonic() - began
         if seconds >= silence:
             line.show(line.meter(what, done, len(items), seconds, unit))
-        yield item
-    line.remove()
+
+    try:
+        # The first item may take a minute.
+        with _after(silence, lambda: show(0)) as timer:
+            for done, item in enumerate(items):
+                if done:
+                    timer.cancel()
+                show(done)
+                yield item
+    finally:
+        line.remove()
+
+
+@contextmanager
+def announced(text: str) -> Iterator[None]:
+    """Print a line if the block takes long and has nothing to count."""
+    with _after(WAIT_S, lambda: print_to(sys.stderr, text)):
+        yield
+
+
+@contextmanager
+def _after(seconds: float, show: Callable[[], None]) -> Iterator[threading.Timer]:
+    """Call ``show`` in a thread if the block takes longer than this."""
+    timer = threading.Timer(seconds, show)
+    timer.daemon = True  # a terminal that accepts no text must not keep the program alive
+    timer.start()
+    try:
+        yield timer
+    finally:
+        timer.cancel()
 
 
 def print_to(stream: TextIO | None, text: str, end: str = "\n") -> None:

@@ -13,6 +13,7 @@ from mkpc_kaggle.errors import UserError, plural, writing
 from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
 from mkpc_kaggle.pipeline.pair import PairMatch
 from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher, to_image
+from mkpc_kaggle.progress import announced
 from mkpc_kaggle.reporting.figures import draw_pair, require_format, save
 
 HELP = """\
@@ -50,18 +51,21 @@ def run(arguments: argparse.Namespace) -> None:
         raise UserError(f"--save {arguments.save}: the name must end in .npz")
     images = (to_image(arguments.image0), to_image(arguments.image1))
     # After the images: a wrong path should not wait for weights to be digested.
-    matcher = TwoStageMatcher(
-        arguments.recipe,
-        weights=arguments.weights,
-        device=arguments.device,
-        precision=arguments.precision,
-        licence=arguments.licence,
-        settings=options.settings_of(arguments),
-    )
+    with announced(f"loading recipe {arguments.recipe}: libraries, and checks of weights"):
+        matcher = TwoStageMatcher(
+            arguments.recipe,
+            weights=arguments.weights,
+            device=arguments.device,
+            precision=arguments.precision,
+            licence=arguments.licence,
+            settings=options.settings_of(arguments),
+            progress=True,
+        )
     match = matcher(*images)
     print("\n".join(_lines(match, matcher.recipe.name)))
     if arguments.out is not None:
-        save(draw_pair(*images, match, matcher.recipe.mkpc), arguments.out)
+        with announced("drawing the figure"):
+            save(draw_pair(*images, match, matcher.recipe.mkpc), arguments.out)
         print(f"figure: {arguments.out}")
     if arguments.save is not None:
         with writing(f"--save {arguments.save}"):

@@ -24,9 +24,8 @@ from tempfile import TemporaryFile
 from typing import Any, NoReturn, TextIO
 
 from mkpc_kaggle.engine.budget import Budget, format_duration
-from mkpc_kaggle.progress import LINE_INTERVAL_S, ProgressLine, print_to
+from mkpc_kaggle.progress import LINE_INTERVAL_S, WAIT_S, ProgressLine, print_to
 
-WAIT_S = 5.0  # shorter waits are not shown on a terminal
 MAX_WAITING = 1000  # writes, which a busy progress line makes in a few minutes
 # Of the text of native libraries, printed at the end: a warning for each photograph would hide the rest.
 MAX_NATIVE_BYTES = 4096

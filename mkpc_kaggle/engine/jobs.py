@@ -50,7 +50,8 @@ class MatchJob:
     ``expected`` are the expected seconds of each unit per pair. A unit begins only if it is expected to
     end within ``seconds`` of the job's start. ``known`` are each pair's points of stage 1, for critical
     regions, and ``crops`` their keys. ``upcoming`` are the images that will probably be matched next.
-    ``is_retry`` states that the work lost a worker before.
+    ``is_retry`` states that the work lost a worker before, ``is_last`` that its pairs need no other
+    units in this phase.
     """
 
     phase: Phase
@@ -59,6 +60,7 @@ class MatchJob:
     expected: tuple[float, ...]
     seconds: float
     is_retry: bool = False
+    is_last: bool = True
     # The schedule leaves the rest empty: :meth:`mkpc_kaggle.engine.matching.Matching.fill` adds it.
     pairs: tuple[Pair, ...] = ()
     names: tuple[tuple[str, str], ...] = ()

@@ -125,9 +125,10 @@ class Matching:
                 run.costs.observe(found.unit.name, found.seconds, warm_up=found.warm_up)
                 run.log.units_run += 1
         if (work := self._shown) is not None:
-            # The schedule counted the finished pairs before this answer.
-            done = min(work.total, work.done + len(job.indices))
-            run.progress.count(str(work.phase), done, work.total)
+            # The schedule counted the finished pairs before this answer. A pair whose other units
+            # follow in another job counts after the last.
+            done = work.done + len(job.indices) if job.is_last else work.done
+            run.progress.count(str(work.phase), min(work.total, done), work.total)
 
     def _results(self, index: int, outcome: Outcome, crops: Sequence[str]) -> list[Result]:
         """Return the new points of a pair, and its images, as rows of the store.

@@ -225,9 +225,10 @@ def match_job(view: View, phase: Phase, missing: Mask, ready: Mask) -> MatchJob:
         view.costs.mean(unit.name) if view.costs.is_known(unit.name) else inf for unit in units
     ]
     fits = np.cumsum(seconds) * len(indices) < JOB_SHARE * view.left
-    units = units[: 1 if alone else max(1, int(fits.sum()))]
-    expected = tuple(view.costs.mean(unit.name) for unit in units)
-    return MatchJob(phase, indices, tuple(units), expected, view.left, is_retry=alone)
+    chosen = tuple(units[: 1 if alone else max(1, int(fits.sum()))])
+    expected = tuple(view.costs.mean(unit.name) for unit in chosen)
+    is_last = len(chosen) == len(units)
+    return MatchJob(phase, indices, chosen, expected, view.left, is_retry=alone, is_last=is_last)
 
 
 def upcoming_pairs(state: State, job: MatchJob, count: int) -> list[int]:

@@ -11,7 +11,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.progress import counted
+from mkpc_kaggle.progress import announced, counted
 from mkpc_kaggle.weights.wheel import run_pip
 
 # Direct and indirect dependencies that may be missing or too old in Kaggle's image.
@@ -53,7 +53,8 @@ def build_wheel(checkout: Path, directory: Path) -> Path:
     """
     # If hatchling is not installed, pip downloads it for the build.
     isolation = ["--no-build-isolation"] if find_spec("hatchling") else []
-    failure = run_pip("wheel", "--no-deps", *isolation, "--wheel-dir", directory, checkout)
+    with announced("building the wheel of this checkout with pip"):
+        failure = run_pip("wheel", "--no-deps", *isolation, "--wheel-dir", directory, checkout)
     if failure:
         raise UserError(f"the wheel could not be built from {checkout}: {failure}")
     return next(directory.glob("mkpc_kaggle-*.whl"))

@@ -17,7 +17,8 @@ from mkpc_kaggle.matchers.contract import Matcher
 from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.pipeline.availability import Licence
 from mkpc_kaggle.pipeline.pair import PairMatch, with_estimate
-from mkpc_kaggle.recipe import Recipe
+from mkpc_kaggle.progress import counted
+from mkpc_kaggle.recipe import Recipe, Unit
 
 ImageSource: TypeAlias = str | Path | Pixels | Image
 
@@ -36,8 +37,9 @@ class TwoStageMatcher:
     ``recipe`` is a :class:`Recipe`, a recipe's name, or a path to a TOML file. ``weights`` are
     directories to search for weights. ``licence`` "permissive" refuses weights that forbid some
     uses. ``matchers`` maps names in the recipe's units to your own matchers. ``settings`` replace
-    the recipe's, by dotted key, such as ``{"matchers.loftr.threshold": 0.3}``. Raises
-    :class:`UserError` for an unknown name and for missing weights.
+    the recipe's, by dotted key, such as ``{"matchers.loftr.threshold": 0.3}``. ``progress`` counts
+    the units of a call on stderr. Raises :class:`UserError` for an unknown name and for missing
+    weights.
     """
 
     def __init__(
@@ -50,6 +52,7 @@ class TwoStageMatcher:
         licence: Licence | str = Licence.ANY,
         matchers: Mapping[str, Matcher[Any]] | None = None,
         settings: Mapping[str, Any] = MappingProxyType({}),
+        progress: bool = False,
     ) -> None:
         assembly = assemble(
             recipe,
@@ -62,6 +65,7 @@ class TwoStageMatcher:
         )
         self.recipe = assembly.recipe
         self._pipeline = assembly.pipeline()
+        self._progress = progress
 
     def __call__(
         self,
@@ -91,8 +95,28 @@ class TwoStageMatcher:
         self._pipeline.regions = {}
         if regions:
             self._pipeline.regions = {tuple(image.name for image in images): regions}
-        (pair,) = self._pipeline.match([PairMatch(images=images)], self.recipe.units)
+        (pair,) = self._match(images)
         return with_estimate(pair, self.recipe, ModelKind(model), intrinsics)
+
+    def _match(self, images: tuple[Image, Image]) -> list[PairMatch]:
+        """Run all units on a pair, with a bar if the user wants one."""
+        pair = PairMatch(images=images)
+        units = self.recipe.units
+        if not self._progress:
+            return self._pipeline.match([pair], units)
+        bar = counted(units, f"matching by recipe {self.recipe.name}", "unit")
+        begun: set[Unit] = set()
+
+        def may_start(unit: Unit) -> bool:
+            # A unit that is tried again, in float32, counts once.
+            if unit not in begun:
+                begun.add(unit)
+                next(bar)
+            return True
+
+        # Closed even if a unit raises: its error is printed below the bar.
+        with closing(bar):
+            return self._pipeline.match([pair], units, may_start)
 
     def match_pairs(self, pairs: Iterable[tuple[ImageSource, ImageSource]]) -> Iterator[PairMatch]:
         """Yield the match of each pair, as a call does for one pair.

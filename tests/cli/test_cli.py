@@ -118,6 +118,18 @@ def test_match_prints_f_and_draws_the_pair(demo, small_recipe, tmp_path, capsys)
     assert cv2.imread(str(figure)).shape[1] > 1000
 
 
+def test_match_counts_the_units_that_it_has_run(demo, small_recipe, monkeypatch, capsys):
+    images = sorted((demo.train_dir / "courtyard" / "images").iterdir())[:2]
+    monkeypatch.setattr("mkpc_kaggle.progress.LINE_INTERVAL_S", 0.0)
+    monkeypatch.setattr("mkpc_kaggle.progress.WAIT_S", 1e-6)
+    assert run_command("match", *images, "--recipe", small_recipe) == 0
+    loading, *counts = capsys.readouterr().err.splitlines()
+    assert loading.startswith(f"loading recipe {small_recipe}: ")
+    # The first of two units is done; the result follows the second.
+    assert counts[0] == "matching by recipe small: 0/2"
+    assert counts[-1].startswith("matching by recipe small: 1/2 [")
+
+
 def test_match_saves_arrays(demo, small_recipe, tmp_path):
     images = sorted((demo.train_dir / "courtyard" / "images").iterdir())[:2]
     saved = tmp_path / "new" / "pair.npz"

@@ -208,6 +208,18 @@ def test_no_forecast_is_printed_before_all_units_were_measured():
     )
 
 
+def test_a_pair_with_unmeasured_units_needs_several_jobs_and_the_last_says_so():
+    run = Run(2, limit=1000.0, had=[(SWEEP,)] * 2)
+    run.learn(SWEEP)
+    deepening = [(job.indices, job.units, job.is_last) for job in run.jobs()]
+    # The first pair shows what each unit costs. The bar once counted it twice.
+    assert deepening == [
+        ((0,), (THIRD,), False),
+        ((0,), (SECOND,), True),
+        ((1,), (THIRD, SECOND), True),
+    ]
+
+
 @pytest.mark.parametrize("reserve", [0, 100])
 def test_a_unit_begins_only_if_it_ends_before_the_time_reserved_for_estimates_and_scenes(reserve):
     run = Run(3, limit=100.0, had=[(SWEEP,)] * 3)
