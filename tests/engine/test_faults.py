@@ -66,18 +66,22 @@ def test_a_worker_lost_once_costs_time_alone(pairs, undisturbed, tmp_path, fault
 def test_a_signal_ends_a_resumed_run_while_an_image_is_digested(tmp_path, monkeypatch, number):
     pairs = write_pairs(tmp_path / "images", 12)
     run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
-    first, released, digested = iter([number]), threading.Event(), []
+    first = iter([number])
+    released = threading.Event()
+    digested = []
 
     def digest(path: Path) -> str:
         for signal_number in first:
             os.kill(os.getpid(), signal_number)
-            released.wait(60)  # an image of many GB
+            # As long as the digest of an image of many GB takes
+            released.wait(60)
             digested.append(path)
         return "changed"
 
     monkeypatch.setattr(image_files, "content_digest", digest)
+    # Copied or restored files have other times: whether they changed, only a digest can tell.
     for path in (tmp_path / "images").iterdir():
-        os.utime(path, (0, 0))  # the same content, which only a digest can tell
+        os.utime(path, (0, 0))
     with session.interruptible() as interrupt:
         report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work", interrupt=interrupt)
     assert digested == [], "the run ends before that digest"
@@ -88,7 +92,9 @@ def test_a_signal_ends_a_resumed_run_while_an_image_is_digested(tmp_path, monkey
 def test_an_error_of_the_engine_itself_leaves_the_latest_version_behind(
     pairs, tmp_path, monkeypatch
 ):
-    use, used, published = Matching._use, [], []
+    use = Matching._use
+    used = []
+    published = []
 
     def fail_later(matching: Matching, *arguments: Any) -> None:
         used.append(matching)
@@ -101,7 +107,8 @@ def test_an_error_of_the_engine_itself_leaves_the_latest_version_behind(
         run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work", publish=published.append)
     assert len(published[-1].fundamentals) == 12
     with Store.read(tmp_path / "work") as store:
-        assert [bool(record.units) for record in read_records(store)] == [True, True] + [False] * 10
+        has_units = [bool(record.units) for record in read_records(store)]
+    assert has_units == [True, True] + [False] * 10
 
 
 def test_a_run_whose_store_is_full_keeps_its_results_in_memory(
@@ -111,12 +118,14 @@ def test_a_run_whose_store_is_full_keeps_its_results_in_memory(
 
     def small(self: Store) -> None:
         prepare(self)
+        # SQLite then reports a full disk after a few results.
         self._db.execute("PRAGMA max_page_count = 20")
 
     monkeypatch.setattr(Store, "_prepare", small)
     report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
     assert any("is full" in fault for fault in report.faults)
     assert matrices(report) == matrices(undisturbed)
+    # Later there is room: what was not written is computed again.
     monkeypatch.undo()
     resumed = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
     assert resumed.ending is Ending.COMPLETE
@@ -126,7 +135,8 @@ def test_a_run_whose_store_is_full_keeps_its_results_in_memory(
 def test_an_error_of_the_disk_when_points_are_read_costs_a_job_and_the_run_goes_on(
     pairs, undisturbed, tmp_path, monkeypatch
 ):
-    errors, data = iter([sqlite3.OperationalError("disk I/O error")]), Store.data
+    errors = iter([sqlite3.OperationalError("disk I/O error")])
+    data = Store.data
 
     def failing(store: Store, keys: Any) -> dict[str, bytes]:
         for error in errors:
@@ -148,18 +158,21 @@ def test_an_error_of_the_disk_at_the_start_is_no_bad_input(
 
     monkeypatch.setattr(Store, "about", failing)
     output = tmp_path / "submission.csv"
-    with pytest.raises(sqlite3.OperationalError):  # a traceback, status 1
+    # A traceback, with status 1: status 2 would ask the user to correct the input.
+    with pytest.raises(sqlite3.OperationalError):
         main(["submit", *arguments_of(demo, small_recipe, output), "--workers", "0"])
     assert submission_problems(output, [pair.id for pair in read_test_side(demo.test_dir)]) == []
 
 
-def test_a_submission_that_the_disk_does_not_take_is_told_and_the_exit_status_is_one(
+def test_a_submission_that_the_disk_refuses_is_reported_and_the_exit_status_is_one(
     demo, small_recipe, tmp_path, monkeypatch, capsys
 ):
-    whole, versions = session.write_submission, []
+    whole = session.write_submission
+    versions = []
 
     def full(path: Path, rows: dict[str, Any]) -> None:
         versions.append(rows)
+        # The disk fills up after the first version.
         if len(versions) > 1:
             raise OSError(28, "No space left on device")
         whole(path, rows)
@@ -210,6 +223,7 @@ def on_a_terminal(command: list[str], *, is_stopped: bool = False, is_read: bool
     first text.
     """
     ours, its = pty.openpty()
+    # From now on each write to the terminal blocks.
     if is_stopped:
         termios.tcflow(its, termios.TCOOFF)
     running = subprocess.Popen(command, stdin=its, stdout=its, stderr=its, start_new_session=True)
@@ -254,17 +268,20 @@ def told(demo: DemoSet, tmp_path_factory: pytest.TempPathFactory) -> bytes:
 def test_a_run_that_cannot_print_makes_the_whole_submission(
     demo, small_recipe, told, tmp_path, monkeypatch, run_without
 ):
+    # Each write then reaches the stream at once, and fails or blocks there.
     monkeypatch.setenv("PYTHONUNBUFFERED", "1")
-    script, output = [sys.executable, str(ROOT / "make_submission.py")], tmp_path / "alone.csv"
+    script = [sys.executable, str(ROOT / "make_submission.py")]
+    output = tmp_path / "alone.csv"
     assert run_without([*script, *arguments_of(demo, small_recipe, output)]) == 0
     assert output.read_bytes() == told
 
 
-def test_scenes_are_made_after_the_terminal_went_away(demo, small_recipe, tmp_path):
+def test_scenes_are_reconstructed_after_the_terminal_closed(demo, small_recipe, tmp_path):
     output = tmp_path / "submission.csv"
     script = [sys.executable, str(ROOT / "make_submission.py"), "--scenes"]
     # As soon as something is printed: the processes of workers and scenes are started later.
-    assert on_a_terminal([*script, *arguments_of(demo, small_recipe, output)], is_read=True) == 0
+    command = [*script, *arguments_of(demo, small_recipe, output)]
+    assert on_a_terminal(command, is_read=True) == 0
     log = read_log(tmp_path / "submission.work")
     assert log.faults == []
     assert len(log.scenes) == 1
@@ -275,7 +292,8 @@ def python(code: str, *arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
-def test_a_program_leaves_without_what_an_interpreter_does_at_its_end():
+def test_a_program_exits_without_the_interpreters_shutdown():
+    # An orderly exit takes a second or longer, and waits for threads that hang.
     late = "import atexit; atexit.register(print, 'late'); "
     done = python(late + "from mkpc_kaggle.cli import program; program(['recipes'])")
     assert (done.returncode, done.stderr) == (0, "")
@@ -311,7 +329,7 @@ run(pairs, THREE_UNITS, RectifiedMatcher(), home / "work", budget=budget, publis
 """
 
 
-def test_the_watchdog_writes_and_leaves_where_the_engine_is_stuck(tmp_path):
+def test_the_watchdog_writes_the_file_and_exits_if_the_engine_hangs(tmp_path):
     assert python(STUCK.format(path=PATHS), str(tmp_path)).returncode == 0
     assert int((tmp_path / "out").read_text()) > 1
 
@@ -332,28 +350,31 @@ if __name__ == "__main__":
 @pytest.mark.parametrize(
     "moments", [2, pytest.param(20, marks=[pytest.mark.slow, pytest.mark.timeout(1200)])]
 )
-def test_a_parent_killed_at_any_moment_leaves_a_whole_file_no_orphans_and_a_run_to_resume(
+def test_a_parent_killed_at_any_moment_leaves_a_complete_file_no_orphans_and_a_resumable_run(
     pairs, undisturbed, tmp_path, moments
 ):
     script = tmp_path / "run.py"
     script.write_text(KILLED.format(path=PATHS))
-    mark, rng = f"MKPC_TEST={tmp_path}", random.Random(moments)
+    mark = f"MKPC_TEST={tmp_path}"
+    rng = random.Random(moments)
     environment = {**os.environ, "MKPC_TEST": str(tmp_path)}
     for _ in range(moments):
         running = subprocess.Popen([sys.executable, str(script), str(tmp_path)], env=environment)
+        # From the imports to the last pair
         time.sleep(rng.uniform(0.5, 5.0))
         running.send_signal(signal.SIGKILL)
         running.wait()
-        if (tmp_path / "submission.csv").exists():
-            assert (
-                submission_problems(tmp_path / "submission.csv", [pair.id for pair in pairs]) == []
-            )
-        while started_with(mark):  # they end soon
+        submission = tmp_path / "submission.csv"
+        if submission.exists():
+            assert submission_problems(submission, [pair.id for pair in pairs]) == []
+        # Its workers notice that soon, even in the middle of a job.
+        while started_with(mark):
             time.sleep(0.05)
-    assert subprocess.run([sys.executable, str(script), str(tmp_path)], check=False).returncode == 0
+    subprocess.run([sys.executable, str(script), str(tmp_path)], check=True)
+    # A process that was killed cannot remove its unfinished file; the next one does.
     assert list(tmp_path.glob(".*.part")) == []
-    stored = [record.pair_fundamental.tobytes() for record in read_log(tmp_path / "work").records]
-    assert stored == matrices(undisturbed)
+    records = read_log(tmp_path / "work").records
+    assert [record.pair_fundamental.tobytes() for record in records] == matrices(undisturbed)
 
 
 GUARDED = """
@@ -374,16 +395,18 @@ def stuck(body: str) -> subprocess.CompletedProcess[str]:
 
 
 def test_a_child_that_was_stopped_does_not_outlive_the_watchdog():
-    child = (
-        "multiprocessing.get_context('fork').Process(target=time.sleep, args=[600], daemon=True)"
-    )
-    done = stuck(
-        f"child = {child}; child.start(); os.kill(child.pid, signal.SIGSTOP); print(child.pid, flush=True)"
-    )
-    assert done.returncode == 1  # nothing was written
+    fork = "multiprocessing.get_context('fork')"
+    statements = [
+        f"child = {fork}.Process(target=time.sleep, args=[600], daemon=True)",
+        "child.start()",
+        "os.kill(child.pid, signal.SIGSTOP)",
+        "print(child.pid, flush=True)",
+    ]
+    done = stuck("; ".join(statements))
+    assert done.returncode == 1, "nothing was written"
     assert "the time limit passed before the first results were written" in done.stderr
     status = Path(f"/proc/{done.stdout.strip()}/stat")
-    # Dead, though nobody has asked of it yet
+    # A zombie is dead; its new parent has not asked for its status yet.
     while status.exists() and status.read_text().split()[2] != "Z":
         time.sleep(0.05)
 
@@ -396,7 +419,7 @@ def test_a_child_that_was_stopped_does_not_outlive_the_watchdog():
         ("session.save = lambda: ''", 0),
     ],
 )
-def test_the_watchdog_leaves_though_writing_hangs_and_keeps_the_status_of_the_run(body, status):
+def test_the_watchdog_exits_even_if_writing_hangs_with_the_status_of_the_run(body, status):
     assert stuck(body).returncode == status
 
 
@@ -409,7 +432,8 @@ def test_the_watchdog_leaves_no_unfinished_file(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_limit_of_ten_million_years_is_none():
+def test_a_limit_of_ten_million_years_is_no_limit():
+    # More seconds than the clock of the system has; a wait for them raises OverflowError.
     done = python(
         GUARDED.format(limit=359999999996400, body="time.sleep(0.5); print('ended by itself')")
     )

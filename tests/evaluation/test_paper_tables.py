@@ -17,20 +17,25 @@ def test_the_papers_tables_are_made_with_one_command(demo, tmp_path, capsys):
     tables = ["--yfcc", str(listed), train, "--imc", train, "--pairs", "1"]
     tables += ["--out", str(tmp_path / "out"), "--matcher", "sift"]
     paper_tables.main([*tables, "--rows", "1600", "1200 + 1600", "loftr"])
-    lines = []
+    rows = []
     for line in capsys.readouterr().out.splitlines():
-        lines.append([cell.strip() for cell in line.split("|")[1:-1]])
-    yfcc = lines[:6]
-    imc = lines[6:]
-    names = ["1600 ransac", "1600 magsac", "1200 + 1600 magsac", "mean difference"]
-    assert [" ".join(row[:2]).strip() for row in yfcc[2:]] == names
+        cells = line.split("|")[1:-1]
+        rows.append([cell.strip() for cell in cells])
+    # Each table has a head and a line below it.
+    yfcc = rows[2:6]
+    (imc,) = rows[8:]
+    names = [" ".join(row[:2]).strip() for row in yfcc]
+    assert names == ["1600 ransac", "1600 magsac", "1200 + 1600 magsac", "mean difference"]
+    *scores, means = yfcc
     # The paper's figures, in separate columns.
-    assert yfcc[2][7:] == ["37.73", "58.03", "74.57", "1"]
-    assert [row[10] for row in yfcc[2:5]] == ["1", "0", "2"]  # the unit that two rows have ran once
-    own = np.array([row[2:5] for row in yfcc[2:5]], float)
-    published = np.array([row[7:10] for row in yfcc[2:5]], float)
-    difference = np.array(yfcc[5][7:10], float)
+    assert scores[0][7:10] == ["37.73", "58.03", "74.57"]
+    # A unit that several rows have in common ran once.
+    assert [row[10] for row in scores] == ["1", "0", "2"]
+    own = np.array([row[2:5] for row in scores], float)
+    published = np.array([row[7:10] for row in scores], float)
+    difference = np.array(means[7:10], float)
+    expected = (own - published).mean(axis=0)
     # Both sides are rounded to a hundredth.
-    np.testing.assert_allclose(difference, (own - published).mean(axis=0), atol=0.006)
-    assert imc[2][0] == "loftr"
-    assert imc[2][3:] == ["0.75478", "0.75606", "1"]
+    np.testing.assert_allclose(difference, expected, atol=0.006)
+    assert imc[0] == "loftr"
+    assert imc[3:] == ["0.75478", "0.75606", "1"]

@@ -25,9 +25,11 @@ def scene() -> SyntheticScene:
 
 
 def model(cameras: dict[str, Camera], points: int = 100) -> SfmModel:
-    images = {name: BatchImage(name, f"digest of {name}", SIZE) for name in cameras}
-    registered = tuple(RegisteredImage(images[name], cameras[name], points) for name in cameras)
-    return SfmModel(registered, np.zeros((points, 3)), 0.5)
+    registered = []
+    for name, camera in cameras.items():
+        image = BatchImage(name, f"digest of {name}", SIZE)
+        registered.append(RegisteredImage(image, camera, points))
+    return SfmModel(tuple(registered), np.zeros((points, 3)), 0.5)
 
 
 def choice(models: list[SfmModel], scene: SyntheticScene, **changes: object) -> Choice:
@@ -36,24 +38,31 @@ def choice(models: list[SfmModel], scene: SyntheticScene, **changes: object) -> 
 
 
 def test_a_pair_whose_cameras_make_no_fundamental_keeps_its_own(scene):
-    # Without the first camera, with both in different models, and with both at one point
+    first = scene.cameras["0000"]
+    second = scene.cameras["0001"]
     rest = {name: camera for name, camera in scene.cameras.items() if name != "0000"}
-    apart = [model({name: scene.cameras[name]}) for name in ("0000", "0001")]
-    together = [model(scene.cameras | {"0001": scene.cameras["0000"]})]
-    assert choice([], scene).reason is choice([model(rest)], scene).reason is Reason.UNREGISTERED
+    assert choice([], scene).reason is Reason.UNREGISTERED
+    assert choice([model(rest)], scene).reason is Reason.UNREGISTERED
+    # The relative pose of two models is unknown.
+    apart = [model({"0000": first}), model({"0001": second})]
     assert choice(apart, scene).reason is Reason.APART
-    assert choice([model(scene.cameras)], scene, image1=scene.images[0]).reason is Reason.SAME_IMAGE
+    whole = [model(scene.cameras)]
+    assert choice(whole, scene, image1=scene.images[0]).reason is Reason.SAME_IMAGE
+    # Without a baseline F is zero.
+    together = [model(scene.cameras | {"0001": first})]
     assert choice(together, scene).reason is Reason.SAME_CENTRE
 
 
 def test_a_wrong_camera_is_contradicted_by_the_pairs_matches(scene):
     camera = scene.cameras["0001"]
     # Enough that few matches stay near their epipolar lines
-    tilt = cv2.Rodrigues(np.array([np.radians(15), 0, 0]))[0]
-    wrong = scene.cameras | {"0001": Camera(camera.K, tilt @ camera.R, tilt @ camera.t)}
+    tilt, _ = cv2.Rodrigues(np.array([np.radians(15), 0, 0]))
+    tilted = Camera(camera.K, tilt @ camera.R, tilt @ camera.t)
+    wrong = [model(scene.cameras | {"0001": tilted})]
     own = scene.true_fundamental(scene.pairs[0])
-    assert choice([model(wrong)], scene, pair_fundamental=own).reason is Reason.CONTRADICTION
-    assert choice([model(wrong)], scene).from_scene  # without an F of its own, nothing contradicts
+    assert choice(wrong, scene, pair_fundamental=own).reason is Reason.CONTRADICTION
+    # Without an F of its own, nothing contradicts.
+    assert choice(wrong, scene).from_scene
 
 
 @pytest.mark.parametrize("focal", [-900.0, 0.0, 1e5, np.nan])
@@ -65,12 +74,13 @@ def test_an_absurd_focal_length_is_left_out(scene, focal):
 
 def test_a_model_that_is_too_small_is_left_out(scene):
     small = model({name: scene.cameras[name] for name in ("0000", "0001")})
-    assert [len(each.images) for each in filter_models((small, model(scene.cameras)))] == [4]
+    kept = filter_models((small, model(scene.cameras)))
+    assert [len(each.images) for each in kept] == [4]
 
 
 def test_the_models_of_all_components_are_numbered_by_size(scene):
-    small, large = (model(dict(list(scene.cameras.items())[:count])) for count in (3, 4))
-    assert models_of([Reconstruction(("a",), (small,)), Reconstruction(("b",), (large,))]) == (
-        large,
-        small,
-    )
+    first_three = list(scene.cameras.items())[:3]
+    small = model(dict(first_three))
+    large = model(scene.cameras)
+    components = [Reconstruction(("a",), (small,)), Reconstruction(("b",), (large,))]
+    assert models_of(components) == (large, small)

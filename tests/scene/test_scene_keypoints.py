@@ -30,28 +30,30 @@ def pair(names: str, found: Matches) -> BatchPair:
     return BatchPair(image(names[0]), image(names[1]), found)
 
 
-@given(
-    arrays(
-        np.float32, st.tuples(st.integers(0, 60), st.just(2)), elements=st.floats(-5, 5, width=32)
-    )
-)
+SHAPES = st.tuples(st.integers(0, 60), st.just(2))
+COORDINATES = st.floats(-5, 5, width=32)
+CELL_PX = 0.75
+
+
+@given(arrays(np.float32, SHAPES, elements=COORDINATES))
 def test_a_keypoint_is_the_mean_of_its_points_and_near_each_of_them(points):
-    keypoints, place = merge_points(points, 0.75)
+    keypoints, place = merge_points(points, CELL_PX)
     assert len(place) == len(points)
     assert set(place.tolist()) == set(range(len(keypoints)))
     for number, keypoint in enumerate(keypoints):
-        np.testing.assert_allclose(
-            keypoint, points[place == number].astype(float).mean(axis=0), atol=1e-5
-        )
-    if len(points):  # two cells, shifted against each other, are 1.5 cells wide at most
-        assert np.abs(points - keypoints[place]).max() <= 1.5 * 0.75 + 1e-5
+        merged = points[place == number].astype(float)
+        np.testing.assert_allclose(keypoint, merged.mean(axis=0), atol=1e-5)
+    # Two cells, shifted against each other, are 1.5 cells wide at most.
+    distances = np.abs(points - keypoints[place])
+    assert distances.max(initial=0) <= 1.5 * CELL_PX + 1e-5
 
 
 def test_a_keypoint_is_matched_once_and_to_what_was_found_most_often():
     # Keypoint 0 was matched to 6 twice, to 5 once. Both matches of 2 were found once.
     index = np.array([[0, 5], [0, 6], [0, 6], [1, 6], [2, 7], [2, 8]])
     assert one_to_one(index).tolist() == [[0, 6], [2, 7]]
-    assert one_to_one(np.zeros((0, 2), np.intp)).shape == (0, 2)
+    nothing = np.zeros((0, 2), np.intp)
+    assert one_to_one(nothing).shape == (0, 2)
 
 
 def test_a_point_seen_in_two_pairs_is_one_keypoint():
@@ -60,7 +62,8 @@ def test_a_point_seen_in_two_pairs_is_one_keypoint():
         Edge(0, 2, matches((10.55, 9.9, 50, 50))),
         Edge(1, 2, matches((20.05, 20, 50.1, 50))),
     )
-    keypoints, found = scene_keypoints(ViewGraph(tuple(map(image, "ABC")), edges))
+    graph = ViewGraph(tuple(map(image, "ABC")), edges)
+    keypoints, found = scene_keypoints(graph)
     assert list(map(len, keypoints)) == [2, 2, 1]
     first, second, third = (index.tolist() for index in found)
     # Their points lie on both sides of 10.5, the border of a cell.
@@ -76,17 +79,20 @@ def test_the_same_picture_under_two_names_is_one_image():
     there = matches((1, 1, 2, 2))
     back = matches((4, 4, 3, 3))
     same = matches((1,) * 4)
-    graph = ViewGraph.of_pairs([pair("AB", there), pair("Ba", back), pair("Aa", same)])
+    pairs = [pair("AB", there), pair("Ba", back), pair("Aa", same)]
+    graph = ViewGraph.of_pairs(pairs)
     assert [found.name for found in graph.images] == ["A", "B"]
-    assert [(edge.first, edge.second) for edge in graph.edges] == [(0, 1)]
-    assert graph.edges[0].matches.points0.tolist() == [[1, 1], [3, 3]]
-    assert graph.edges[0].matches.points1.tolist() == [[2, 2], [4, 4]]
+    (edge,) = graph.edges
+    assert (edge.first, edge.second) == (0, 1)
+    assert edge.matches.points0.tolist() == [[1, 1], [3, 3]]
+    assert edge.matches.points1.tolist() == [[2, 2], [4, 4]]
 
 
 def test_a_graph_is_made_of_a_pairs_tracks_where_it_has_some():
     every = matches((1,) * 4, (2, 2, 3, 3), (4, 4, 5, 5))
     tracks = matches((4, 4, 5, 5))
-    pairs = [pair("AB", Matches.empty()), BatchPair(image("B"), image("A"), every, tracks=tracks)]
+    with_tracks = BatchPair(image("B"), image("A"), every, tracks=tracks)
+    pairs = [pair("AB", Matches.empty()), with_tracks]
     # The images of the graph begin with A, so the pair B, A is turned round.
     (edge,) = ViewGraph.of_pairs(pairs).edges
     assert edge.matches.points0.tolist() == [[5, 5]]
@@ -95,30 +101,31 @@ def test_a_graph_is_made_of_a_pairs_tracks_where_it_has_some():
 
 def test_components_are_connected_by_pairs_with_enough_matches():
     def edge(first: int, second: int, count: int) -> Edge:
-        return Edge(
-            first, second, Matches(np.zeros((count, 2)), np.zeros((count, 2)), np.zeros(count))
-        )
+        points = np.zeros((count, 2))
+        return Edge(first, second, Matches(points, points, np.zeros(count)))
 
     # Four matches are too few to connect 3 and 5; 15 are just enough.
     edges = (edge(1, 3, 20), edge(1, 4, 20), edge(3, 5, 4), edge(5, 6, 15))
     found = ViewGraph(tuple(map(image, "ABCDEFGH")), edges).components()
-    assert ["".join(each.name for each in graph.images) for graph in found] == ["BDE", "FG"]
-    assert [[(e.first, e.second) for e in graph.edges] for graph in found] == [
-        [(0, 1), (0, 2)],
-        [(0, 1)],
-    ]
+    names = ["".join(each.name for each in graph.images) for graph in found]
+    assert names == ["BDE", "FG"]
+    # Images are renumbered within a component.
+    ends = [[(edge.first, edge.second) for edge in graph.edges] for graph in found]
+    assert ends == [[(0, 1), (0, 2)], [(0, 1)]]
     assert ViewGraph((image("A"),), ()).components() == ()
     assert ViewGraph((), ()).components() == ()
 
 
 def results_of(*counts: int) -> list[UnitResult]:
-    """Of a unit whose matches make no tracks, and of a unit whose matches do, that many each."""
-    rows = [np.arange(2 * count, dtype=np.float32).reshape(count, 2) for count in counts]
+    """Results with these numbers of matches: of a unit whose matches make no tracks, and of a unit
+    whose matches do.
+    """
     units = (Unit(1, "coarse", 640, tracks=False), Unit(1, "fine", 640))
-    return [
-        UnitResult(unit, Matches(row, row, np.zeros(len(row))))
-        for unit, row in zip(units, rows, strict=True)
-    ]
+    results = []
+    for unit, count in zip(units, counts, strict=True):
+        points = np.arange(2 * count, dtype=np.float32).reshape(count, 2)
+        results.append(UnitResult(unit, Matches(points, points, np.zeros(count))))
+    return results
 
 
 @pytest.mark.parametrize(("fine", "used"), [(50, 50), (49, 79), (0, 30)])

@@ -15,8 +15,10 @@ def turned_camera(camera: Camera, turns: int, size: Size) -> Camera:
     quarter = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])
     width, height = size
     for _ in range(turns % 4):
-        moved = np.array([[1.0, 0, 0], [0, 1, width - 1], [0, 0, 1]]) @ quarter
-        camera = Camera(moved @ camera.K @ quarter.T, quarter @ camera.R, quarter @ camera.t)
+        # The last column of pixels becomes the first row.
+        shift = np.array([[1.0, 0, 0], [0, 1, width - 1], [0, 0, 1]])
+        K = shift @ quarter @ camera.K @ quarter.T
+        camera = Camera(K, quarter @ camera.R, quarter @ camera.t)
         width, height = height, width
     return camera
 
@@ -29,8 +31,10 @@ def line_of(
     T[:3, :3] = R
     T[:3, 3] = t
     # 17 digits: the package must read the very cameras that the test has.
-    numbers = np.concatenate([cameras[0].K.ravel(), cameras[1].K.ravel(), T.ravel()])
-    return " ".join([*names, *map(str, turns), *(f"{number:.17g}" for number in numbers)])
+    first, second = cameras
+    numbers = np.concatenate([first.K.ravel(), second.K.ravel(), T.ravel()])
+    written = [f"{number:.17g}" for number in numbers]
+    return " ".join([*names, *map(str, turns), *written])
 
 
 def line_of_pair(true: TruePair, image_root: Path) -> str:

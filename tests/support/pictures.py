@@ -1,5 +1,6 @@
 """Pictures for matchers, and comparisons of matches."""
 
+from math import ceil
 from typing import Any
 
 import numpy as np
@@ -28,12 +29,15 @@ def picture(
 
 
 def as_picture(pixels: np.ndarray, multiple: int = 1, padding: tuple[int, int] = (0, 0)) -> Picture:
-    content = Size(pixels.shape[1], pixels.shape[0])
+    height, width = pixels.shape[:2]
+    content = Size(width, height)
     sides = []
     for side, more in zip(content, padding, strict=True):
-        sides.append(-(-(side + more) // multiple) * multiple)  # rounded up
+        multiples = ceil((side + more) / multiple)
+        sides.append(multiples * multiple)
     view = View(Box.whole(content), content, Size(*sides))
-    return Picture(view.render(np.ascontiguousarray(pixels)), view)
+    shown = view.render(np.ascontiguousarray(pixels))
+    return Picture(shown, view)
 
 
 def match_one(matcher: Any, first: Picture, second: Picture) -> Matches:
@@ -54,4 +58,5 @@ def agreement(first: torch.Tensor, second: torch.Tensor, within: float, p: float
     if not len(first) and not len(second):
         return 1.0
     near = torch.cdist(first, second, p=p) <= within
-    return ((near.any(1).sum() + near.any(0).sum()) / (len(first) + len(second))).item()
+    count = near.any(1).sum() + near.any(0).sum()
+    return (count / (len(first) + len(second))).item()
