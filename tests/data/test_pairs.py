@@ -20,7 +20,13 @@ from mkpc_kaggle.recipe import load_recipe
 
 WHERE = Path("list.txt"), 7, Path("images")
 EYE = " ".join(["1 0 0 0 1 0 0 0 1"] * 2 + ["1 0 0 1 0 1 0 0 0 0 1 0 0 0 0 1"])
-K = np.array([[500.0, 0, 31.5], [0, 450, 20.25], [0, 0, 1]])
+K = np.array(
+    [
+        [500.0, 0, 31.5],
+        [0, 450, 20.25],
+        [0, 0, 1],
+    ]
+)
 R = cv2.Rodrigues(np.array([0.1, -0.3, 0.2]))[0]
 CAMERA = Camera(K, R, np.array([0.2, -0.1, 0.5]))
 

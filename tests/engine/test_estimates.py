@@ -131,7 +131,13 @@ def test_e_is_estimated_from_the_points_of_f(tmp_path):
     pairs = synthetic_pairs(tmp_path / "images", 4)
     submission(pairs, ALONE, tmp_path / "work")
     # Known intrinsics change what is estimated, and nothing that is matched.
-    K = np.array([[900.0, 0, 400], [0, 900, 300], [0, 0, 1]])
+    K = np.array(
+        [
+            [900.0, 0, 400],
+            [0, 900, 300],
+            [0, 0, 1],
+        ]
+    )
     known = [replace(pair, intrinsics=(K, K)) for pair in pairs]
     written, report = submission(known, ALONE, tmp_path / "work")
     assert (report.units_run, report.estimated) == (0, 6)

@@ -32,7 +32,13 @@ from mkpc_kaggle.geometry.robust import Method, ModelKind, RobustConfig, estimat
 from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult, with_estimate
 from mkpc_kaggle.recipe import Recipe, Unit
 
-K = np.array([[800.0, 0, 320], [0, 800, 240], [0, 0, 1]])
+K = np.array(
+    [
+        [800.0, 0, 320],
+        [0, 800, 240],
+        [0, 0, 1],
+    ]
+)
 # Side by side, with a little forward motion, so that both epipoles are in no picture.
 CAMERAS = (
     Camera(K, np.eye(3), np.zeros(3)),

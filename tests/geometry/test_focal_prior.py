@@ -24,8 +24,20 @@ def camera(focal, turn=0.0, t=(0, 0, 0), centre=CENTRE):
     c = np.cos(turn)
     s = np.sin(turn)
     x, y = centre
-    K = np.array([[focal, 0, x], [0, focal, y], [0, 0, 1.0]])
-    R = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+    K = np.array(
+        [
+            [focal, 0, x],
+            [0, focal, y],
+            [0, 0, 1.0],
+        ]
+    )
+    R = np.array(
+        [
+            [c, 0, s],
+            [0, 1, 0],
+            [-s, 0, c],
+        ]
+    )
     return Camera(K, R, np.array(t, float))
 
 
@@ -99,7 +111,13 @@ def test_the_more_is_known_of_the_focal_lengths_the_better_is_the_pose_of_few_no
 
 
 def test_known_cameras_of_two_focal_lengths_and_any_centre_give_their_essential_matrix():
-    K0 = np.array([[820.0, 0, 400], [0, 860, 390], [0, 0, 1]])
+    K0 = np.array(
+        [
+            [820.0, 0, 400],
+            [0, 860, 390],
+            [0, 0, 1],
+        ]
+    )
     first = Camera(K0, np.eye(3), np.zeros(3))
     second = CAMERAS[1]
     matches = seen((first, second), 100, 0.2, 40)

@@ -30,7 +30,13 @@ def rotation(axis, degrees):
 
 def random_camera(rng):
     focal, cx, ratio, cy = rng.uniform((300, 200, 0.8, 200), (3000, 900, 1.25, 900))
-    K = np.array([[focal, 0, cx], [0, focal * ratio, cy], [0, 0, 1]])
+    K = np.array(
+        [
+            [focal, 0, cx],
+            [0, focal * ratio, cy],
+            [0, 0, 1],
+        ]
+    )
     axis = rng.normal(size=3)
     R = rotation(axis, rng.uniform(0, 180))
     t = 3 * rng.normal(size=3)

@@ -35,8 +35,20 @@ UNIT = pytest.approx(1, abs=1e-12)
 @cache
 def cameras(seed):
     rng = np.random.default_rng(seed)
-    K0 = np.array([[820.0, 0, 500], [0, 840, 390], [0, 0, 1]])
-    K1 = np.array([[900.0, 0, 530], [0, 880, 370], [0, 0, 1]])
+    K0 = np.array(
+        [
+            [820.0, 0, 500],
+            [0, 840, 390],
+            [0, 0, 1],
+        ]
+    )
+    K1 = np.array(
+        [
+            [900.0, 0, 530],
+            [0, 880, 370],
+            [0, 0, 1],
+        ]
+    )
     R0 = cv2.Rodrigues(rng.uniform(-0.15, 0.15, 3))[0]
     R1 = cv2.Rodrigues(rng.uniform(-0.15, 0.15, 3))[0]
     t = np.array([1.0, *rng.uniform(-0.5, 0.5, 2)])

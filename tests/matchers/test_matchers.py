@@ -104,7 +104,13 @@ def test_sift_has_no_offset_at_any_scale():
         size = Size(*(int(side * scale) for side in SIZE))
         method = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
         matches = match_photograph("sift", cv2.resize(photograph(), size, interpolation=method))
-        H = np.array([[scale, 0, (scale - 1) / 2], [0, scale, (scale - 1) / 2], [0, 0, 1]])
+        H = np.array(
+            [
+                [scale, 0, (scale - 1) / 2],
+                [0, scale, (scale - 1) / 2],
+                [0, 0, 1],
+            ]
+        )
         off = offsets(matches, H)
         # OpenCV's own offset, a quarter pixel, would be 0.13 at half the size and 0.25 at twice.
         assert_allclose(np.median(off[np.hypot(*off.T) < 3], axis=0), 0, atol=0.06)

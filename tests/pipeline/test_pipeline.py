@@ -136,7 +136,13 @@ def test_both_stages_give_matches_in_full_image_pixels():
 def test_a_prior_on_focal_lengths_comes_from_the_sizes_of_the_images_unless_the_cameras_are_known():
     focal = FocalConfig()
     matcher = TwoStageMatcher(replace(SIFT, focal=focal))
-    K = np.array([[400.0, 0, 240], [0, 400, 180], [0, 0, 1]])
+    K = np.array(
+        [
+            [400.0, 0, 240],
+            [0, 400, 180],
+            [0, 0, 1],
+        ]
+    )
     sizes = [Size(*image.shape[1::-1]) for image in pair()]
     by_size = [FocalPrior.of_image(size) for size in sizes]
     known = [FocalPrior(K, 0.0)] * 2  # a sigma of 0: certain

@@ -62,7 +62,13 @@ def test_cameras_are_seen_from_above_and_from_the_side_with_the_points_before_th
     units ahead.
     """
     # Rows: right, down, and ahead in the world
-    R = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
+    R = np.array(
+        [
+            [0.0, -1, 0],
+            [0, 0, -1],
+            [1, 0, 0],
+        ]
+    )
     image = BatchImage("a.png", "a", Size(80, 60))
     placed = []
     for y in (0.0, 2.0):

@@ -32,7 +32,13 @@ def a_model(folder: Path, points: int = 2000, cameras: int = CAMERAS) -> SfmMode
     cloud = np.column_stack(
         [rng.uniform(-3, 3, points), rng.uniform(-2, 2, points), np.full(points, WALL)]
     )
-    K = np.array([[400.0, 0, 199.5], [0, 400.0, 149.5], [0, 0, 1]])
+    K = np.array(
+        [
+            [400.0, 0, 199.5],
+            [0, 400.0, 149.5],
+            [0, 0, 1],
+        ]
+    )
     placed = []
     for number in range(cameras):
         path = folder / f"{number}.png"

@@ -116,7 +116,13 @@ class NarrowMatcher(RectifiedMatcher):
 
 
 # The scenes of these tests give it to all pairs.
-SCENE_F = np.array([[0.0, 0, 0.2], [0, 0, -0.5], [-0.3, 0.6, 0.5]])
+SCENE_F = np.array(
+    [
+        [0.0, 0, 0.2],
+        [0, 0, -0.5],
+        [-0.3, 0.6, 0.5],
+    ]
+)
 
 
 def runner(run: Callable[[SceneJob], Solution]) -> Callable[[SceneJob], Solution]:

@@ -12,11 +12,23 @@ from mkpc_kaggle.geometry.coordinates import Size
 
 def turned_camera(camera: Camera, turns: int, size: Size) -> Camera:
     """The camera of ``np.rot90(picture, turns)``, where ``camera`` took a picture of ``size``."""
-    quarter = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])
+    quarter = np.array(
+        [
+            [0.0, 1, 0],
+            [-1, 0, 0],
+            [0, 0, 1],
+        ]
+    )
     width, height = size
     for _ in range(turns % 4):
         # The last column of pixels becomes the first row.
-        shift = np.array([[1.0, 0, 0], [0, 1, width - 1], [0, 0, 1]])
+        shift = np.array(
+            [
+                [1.0, 0, 0],
+                [0, 1, width - 1],
+                [0, 0, 1],
+            ]
+        )
         K = shift @ quarter @ camera.K @ quarter.T
         camera = Camera(K, quarter @ camera.R, quarter @ camera.t)
         width, height = height, width
