@@ -81,6 +81,7 @@ def attack(case: Case, room: Path) -> None:
     for command in filter(None, (case.command, case.then)):
         mark = uuid.uuid4().hex
         process = _start(command, room, {**case.env, MARK: mark}, case.limits, case.stderr)
+        # Such as a signal, or a file that is removed during the run
         if command == case.command and case.act is not None:
             case.act(process)
         status, output = _wait(process, room)
@@ -121,6 +122,7 @@ def _start(
     limits: str = "-c 0",
     stderr: Callable[[], int] | None = None,
 ) -> "subprocess.Popen[bytes]":
+    # A hostile file must not take the memory of the machine.
     limited = ["sh", "-c", f'ulimit -d {MEMORY_KIB}; ulimit {limits}; exec "$@"', "sh"]
     own = {
         "PATH": os.defpath,
@@ -128,6 +130,7 @@ def _start(
         "OMP_NUM_THREADS": "1",
         "PYTHONDONTWRITEBYTECODE": "1",
     }
+    # What is written there is listed at the end: a run must leave nothing behind.
     own |= {"HOME": str(room / "home"), "TMPDIR": str(room / "tmp"), "no_proxy": "*"}
     # Its list of fonts is slow
     own["MPLCONFIGDIR"] = str(Path(tempfile.gettempdir()) / "hostile-matplotlib")

@@ -17,6 +17,7 @@ DAMAGES = {
     "bits turned in the middle": lambda data: (
         data[:500] + bytes(255 - b for b in data[500:600]) + data[600:]
     ),
+    # The head of a PNG has both sides as numbers of four bytes; a JPEG stays as it is.
     "another size in its head": lambda data: data.replace(
         struct.pack(">I", 160), struct.pack(">I", 60_000), 2
     ),
@@ -36,6 +37,7 @@ def png(width: int, height: int, *chunks: bytes, depth: int = 8) -> bytes:
 
 
 def rows(width: int, height: int, depth: int = 8) -> bytes:
+    # Black; each row begins with a byte for its filter.
     return chunk(b"IDAT", zlib.compress(bytes((1 + (width * depth + 7) // 8) * height)))
 
 

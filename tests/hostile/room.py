@@ -48,6 +48,7 @@ def picture(shift: int) -> NDArray[np.uint8]:
 
     ``shift`` is its motion in pixels of the farthest band.
     """
+    # Blobs of two sizes: without texture, no pair would have an F.
     noise = np.random.default_rng(0).integers(0, 256, (SIDE, 3 * SIDE, 3)).astype(np.float32)
     rough = sum(cv2.GaussianBlur(noise, (0, 0), width) * width for width in (1.5, 4.0))
     whole = cv2.normalize(rough, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
@@ -86,6 +87,7 @@ def finished() -> Path:
     room = write_template(Path(tempfile.mkdtemp(prefix="hostile-")) / "room")
     for command in (SUBMIT, RECONSTRUCT):
         assert prepared(command, room) == 0, f"undisturbed, it failed: {command}"
+    # The log of a case has only its own output.
     (room / "out" / "log").unlink()
     return room
 

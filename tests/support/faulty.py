@@ -168,6 +168,7 @@ def die_within_pycolmap(job: SceneJob) -> Solution:
     """Die after its database is written, when cameras are computed."""
     import pycolmap
 
+    # As after an assertion in its C++ code: no exception reaches Python.
     pycolmap.GlobalPipeline = lambda *_: die()
     return reconstruct(job)
 

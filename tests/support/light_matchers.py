@@ -46,6 +46,7 @@ SIZE = Size(96, 64)
 SHIFT = 8  # pixels between the two pictures of a pair
 
 
+# Filling a network takes long, and no test changes this one: each matcher gets a copy.
 @cache
 def standin(name: str, make: Callable[..., nn.Module], *settings: Any, **named: Any) -> nn.Module:
     return filled(make(*settings, **named), name)
@@ -103,6 +104,7 @@ def sift_keypoints(placement: Placement, keypoints: int) -> Keypoints:
 
 def xfeat_keypoints(placement: Placement, keypoints: int) -> Keypoints:
     network = xfeat_lighterglue.xfeat_network(keypoints)
+    # Weights that were never trained detect nothing above the published threshold.
     network.detection_threshold = 0.0
     network.net = filled(network.net, "xfeat")
     return xfeat_lighterglue.xfeat_encoder(network, keypoints, placement), xfeat_lighterglue.SHAPE
@@ -119,6 +121,7 @@ def lightglue_matcher(
     name: str, placement: Placement, keypoints: int = 200, layers: int = 2, threshold: float = 0.0
 ) -> LightGlueMatcher:
     encode, shape = KEYPOINTS[name](placement, keypoints)
+    # All layers and keypoints: what untrained weights would drop is chance.
     every = Adaptation(depth=-1, width=-1, threshold=threshold)
     network = unprepared("lightglue", LightGlue, replace(shape, layers=layers), every)
     return LightGlueMatcher(spec_of(name, "test"), encode, network, placement)

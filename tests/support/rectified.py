@@ -56,6 +56,7 @@ class RectifiedMatcher:
 
     def _match(self, seen0: Seen, seen1: Seen) -> Matches:
         self.calls.append((max(seen0.view.content), seen0.brightness))
+        # A matcher that takes no time would leave other workers without a pair.
         time.sleep(self.seconds)
         count = self.matches(seen0.brightness)
         # Other points for each pair and unit, and the same in every run.
@@ -88,6 +89,7 @@ def write_pairs(directory: Path, count: int) -> list[Pair]:
 
 
 def flat(number: int, size: Size = SIZE) -> np.ndarray:
+    # A matcher sees pixels only; `number_of` reads the number from them.
     return np.full((size.height, size.width, 3), 10 + 10 * number, np.uint8)
 
 
