@@ -146,11 +146,11 @@ def test_a_worker_at_work_ends_with_its_parent_and_prints_nothing(tmp_path, is_s
     assert parent.communicate()[1] == b""
 
 
-STARTS = """
-import os, signal, threading
+# In a file that the worker can import: the program itself is not imported there.
+CHECKS = """
+import signal
 from pathlib import Path
-from mkpc_kaggle.engine.jobs import Loaded
-from mkpc_kaggle.engine.process import WORKER_ENVIRONMENT, ProcessWorker
+from mkpc_kaggle.engine.process import WORKER_ENVIRONMENT
 
 def check():
     entries = Path("/proc/self/environ").read_text().split(chr(0))
@@ -158,16 +158,21 @@ def check():
     assert [told[name] for name in WORKER_ENVIRONMENT] == ["PASSIVE", "7", "1"], told
     blocked = signal.pthread_sigmask(signal.SIG_BLOCK, ())
     assert blocked >= {signal.SIGINT, signal.SIGTERM}, blocked
+"""
+STARTS = """
+import os, signal, threading
+from checks import check
+from mkpc_kaggle.engine.jobs import Loaded
+from mkpc_kaggle.engine.process import WORKER_ENVIRONMENT, ProcessWorker
 
-if __name__ == "__main__":
-    answers = threading.Semaphore(0)
-    worker = ProcessWorker("scene", check, answers.release)
-    worker.start()
-    answers.acquire()
-    assert worker.answer() == Loaded()
-    worker.kill()
-    assert not signal.pthread_sigmask(signal.SIG_BLOCK, ())
-    assert [name for name in WORKER_ENVIRONMENT if name in os.environ] == ["GOMP_SPINCOUNT"]
+answers = threading.Semaphore(0)
+worker = ProcessWorker("scene", check, answers.release)
+worker.start()
+answers.acquire()
+assert worker.answer() == Loaded()
+worker.kill()
+assert not signal.pthread_sigmask(signal.SIG_BLOCK, ())
+assert [name for name in WORKER_ENVIRONMENT if name in os.environ] == ["GOMP_SPINCOUNT"]
 """
 
 
@@ -175,6 +180,7 @@ def test_the_first_worker_of_a_program_hears_no_ctrl_c_and_is_told_not_to_spin_a
     tmp_path,
 ):
     script = tmp_path / "starts.py"
+    (tmp_path / "checks.py").write_text(CHECKS)
     script.write_text(STARTS)
     environment = dict(os.environ)
     for name in WORKER_ENVIRONMENT:

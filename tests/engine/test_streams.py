@@ -11,29 +11,33 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-COMPLAINS = """
-import os, threading
-from mkpc_kaggle.engine.jobs import Loaded
-from mkpc_kaggle.engine.process import ProcessWorker
-from mkpc_kaggle.engine.console import unblocked
+# Workers import what they run, and not the program that starts them.
+LIBRARY = """
+import os
 
 def complain():
     for number in range(3000):
         os.write({descriptor}, b"libpng warning: iCCP: known incorrect sRGB profile, number %d" % number)
+"""
+COMPLAINS = """
+import os, threading
+from library import complain
+from mkpc_kaggle.engine.jobs import Loaded
+from mkpc_kaggle.engine.process import ProcessWorker
+from mkpc_kaggle.engine.console import unblocked
 
-if __name__ == "__main__":
-    with unblocked():
-        if {in_worker}:
-            answers = threading.Semaphore(0)
-            worker = ProcessWorker("decoder", complain, answers.release)
-            worker.start()
-            answers.acquire()
-            assert worker.answer() == Loaded()
-            worker.kill()
-        else:
-            complain()
-    os.write({done}, b"done")
-    os._exit(0)
+with unblocked():
+    if {in_worker}:
+        answers = threading.Semaphore(0)
+        worker = ProcessWorker("decoder", complain, answers.release)
+        worker.start()
+        answers.acquire()
+        assert worker.answer() == Loaded()
+        worker.kill()
+    else:
+        complain()
+os.write({done}, b"done")
+os._exit(0)
 """
 
 
@@ -46,7 +50,8 @@ def test_native_code_that_prints_to_a_pipe_without_a_reader_does_not_block(
     # 3,000 lines are more than the 64 kB that a pipe holds, and nobody reads this one.
     reader, pipe = os.pipe()
     told, done = os.pipe()
-    script.write_text(COMPLAINS.format(descriptor=descriptor, in_worker=in_worker, done=done))
+    (tmp_path / "library.py").write_text(LIBRARY.format(descriptor=descriptor))
+    script.write_text(COMPLAINS.format(in_worker=in_worker, done=done))
     given = {"stdout": pipe} if descriptor == 1 else {"stderr": pipe}
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     command = [sys.executable, script]
@@ -62,27 +67,31 @@ def test_native_code_that_prints_to_a_pipe_without_a_reader_does_not_block(
     os.close(reader)
 
 
-LOGS = """
-import os, sys, threading
-from pathlib import Path
-from mkpc_kaggle.engine.process import ProcessWorker
+QUIET_LIBRARY = """
+import os
 
 def complain():
     os.write(1, b"libpng warning, ")
     os.write(2, b"libjpeg: premature end")
+"""
+LOGS = """
+import sys, threading
+from library import complain
+from pathlib import Path
+from mkpc_kaggle.engine.process import ProcessWorker
 
-if __name__ == "__main__":
-    answers = threading.Semaphore(0)
-    worker = ProcessWorker("decoder", complain, answers.release)
-    worker.log = Path(sys.argv[1])
-    worker.start()
-    answers.acquire()
-    worker.kill()
+answers = threading.Semaphore(0)
+worker = ProcessWorker("decoder", complain, answers.release)
+worker.log = Path(sys.argv[1])
+worker.start()
+answers.acquire()
+worker.kill()
 """
 
 
 def test_output_of_native_code_in_a_worker_goes_to_a_file_of_the_run(tmp_path):
     script = tmp_path / "logs.py"
+    (tmp_path / "library.py").write_text(QUIET_LIBRARY)
     script.write_text(LOGS)
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     command = [sys.executable, script, tmp_path / "workers.log"]
