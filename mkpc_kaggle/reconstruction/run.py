@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
@@ -183,7 +184,11 @@ def reconstruct(
     # By absolute path, because the journal knows an image by its path below the common directory
     given = {Path(image).absolute(): str(image) for image in images}
     files = sorted(given)
+    checked = partial(
+        assemble, recipe, weights=map(Path, weights), device=device, matchers=matchers
+    )
     if len(files) < 2:
+        checked()  # wrong arguments are errors here, too
         return Models()
     root = Path(os.path.commonpath([file.parent for file in files]))
     require_distinct(files)
@@ -192,7 +197,7 @@ def reconstruct(
         if isinstance(image := read_image(file), Unreadable):
             raise UserError(str(image))
     known = "" if intrinsics is None else read_intrinsics_table(Path(intrinsics), root, files)
-    assembly = assemble(recipe, weights=map(Path, weights), device=device, matchers=matchers)
+    assembly = checked()
     assembly = replace(
         assembly,
         recipe=for_cameras(assembly.recipe, intrinsics=known),
