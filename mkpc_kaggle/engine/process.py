@@ -163,7 +163,7 @@ def spawn(name: str, log: Path | None = None) -> tuple[SpawnProcess, Connection]
 def _without_program() -> Iterator[None]:
     """Hide the user's program from a new process.
 
-    It would run the program again, to find classes of its own there. A script that calls
+    It would run the program again, to find its classes there. A script that calls
     :func:`mkpc_kaggle.reconstruct` without a guard would call it in each worker.
     """
     program = sys.modules["__main__"]
