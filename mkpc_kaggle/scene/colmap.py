@@ -23,8 +23,8 @@ from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.intrinsics import KnownCamera
 from mkpc_kaggle.recipe import CameraModel, SceneConfig
+from mkpc_kaggle.scene.adjustment import adjust
 from mkpc_kaggle.scene.export import DATABASE, FORMER, MODELS, PART
-from mkpc_kaggle.scene.focal_lengths import apply_known_cameras
 from mkpc_kaggle.scene.keypoints import MergedGraph
 from mkpc_kaggle.scene.reconstruction import (
     MIN_IMAGES,
@@ -309,8 +309,11 @@ def _filter_points(observations: Any, model: Any, settings: Any) -> None:
 
 def _reconstruction(found: Sequence[Any], graph: ViewGraph) -> Reconstruction:
     """Return pycolmap's models with the user's cameras, without implausible images."""
-    for model in found:
-        apply_known_cameras(model, known_by_name(graph))
+    known = known_by_name(graph)
+    # In a large scene, points of two views are too many.
+    if known or len(graph.images) <= LARGE:
+        for model in found:
+            adjust(model, known)
     models = filter_models([_sfm_model(model, graph) for model in found])
     return Reconstruction(
         graph.names, models, "" if models else "the matches gave no plausible model"

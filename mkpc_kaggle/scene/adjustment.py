@@ -1,8 +1,9 @@
-"""Intrinsics of the user in pycolmap's models: exact ones restored, uncertain ones as priors.
+"""The last bundle adjustment of pycolmap's models, with the intrinsics that the user knows.
 
-The global mapper refines all focal lengths, without priors. A prior joins afterwards: the mean of
-the mapper's focal length and the user's, weighted by their variances, as if bundle adjustment had
-one more measurement. A last bundle adjustment then holds these cameras and refines the rest.
+The global mapper refines all focal lengths, without priors, and leaves out points that only two images
+see. With these, cameras of tourists' photographs are more accurate. A prior joins first: the mean of the mapper's
+focal length and the user's, weighted by their variances, as if bundle adjustment had one more measurement. These
+cameras are then held, and the rest is refined.
 """
 
 from collections.abc import Mapping
@@ -15,21 +16,20 @@ from mkpc_kaggle.geometry.intrinsics import KnownCamera
 from mkpc_kaggle.scene.uncertainty import camera_sigmas
 
 MAX_ITERATIONS = 100
+CONVERGED = 1e-6  # relative change of the cost
 
 
-def apply_known_cameras(found: Any, known: Mapping[str, KnownCamera]) -> None:
-    """Set the cameras that the user knows in pycolmap's model, and refine poses, points and other
-    cameras.
+def adjust(found: Any, known: Mapping[str, KnownCamera]) -> None:
+    """Set the cameras that the user knows in pycolmap's model; refine poses, points and other cameras
+    by all tracks.
 
-    ``known`` is by image name; each of these images has its own camera. If it is empty, the model stays as it is.
+    ``known`` is by image name; each of these images has its own camera.
     """
     placed = [
         image for _, image in sorted(found.images.items()) if image.has_pose and image.name in known
     ]
-    if not placed:
-        return
     # Computed without the user's knowledge, so that the two can be weighed
-    sigmas = camera_sigmas(found)
+    sigmas = camera_sigmas(found) if placed else {}
     for image in placed:
         # Bundle adjustment does not determine this focal length: the user's counts alone.
         sigma = sigmas[image.name].focal if image.name in sigmas else np.inf
@@ -37,10 +37,15 @@ def apply_known_cameras(found: Any, known: Mapping[str, KnownCamera]) -> None:
     config = pycolmap.BundleAdjustmentConfig()
     for number in sorted(found.reg_image_ids()):
         config.add_image(number)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     for image in placed:
         config.set_constant_cam_intrinsics(image.camera_id)
     # With more, the last digits vary
-    solver = {"max_num_iterations": MAX_ITERATIONS, "num_threads": 1}
+    solver = {
+        "max_num_iterations": MAX_ITERATIONS,
+        "num_threads": 1,
+        "function_tolerance": CONVERGED,
+    }
     ceres = {
         "use_gpu": False,
         # A few wrong tracks remain in any model.
