@@ -41,9 +41,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    inputs = [arguments.image0, arguments.image1, Path(arguments.recipe)]
+    inputs = [arguments.image0, arguments.image1, options.recipe_file(arguments)]
     files = {"--out": arguments.out, "--save": arguments.save}
-    require_apart(files, inputs, weights=arguments.weights)
+    require_apart(files, filter(None, inputs), weights=arguments.weights)
     # Before the work: a wrong suffix should not cost minutes of matching.
     if arguments.out is not None:
         require_format(arguments.out)

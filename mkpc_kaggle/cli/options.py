@@ -50,6 +50,12 @@ def add_matching(parser: argparse.ArgumentParser) -> None:
     add("--set", action="append", default=[], metavar="TABLE.KEY=VALUE", help=text)
 
 
+def recipe_file(arguments: argparse.Namespace) -> Path | None:
+    """Return the file of the recipe, which no output may replace; ``None`` for a recipe's name."""
+    # A folder may have the name of a recipe.
+    return Path(arguments.recipe) if arguments.recipe.endswith(".toml") else None
+
+
 def add_weights(parser: argparse.ArgumentParser) -> None:
     """Add ``--weights``."""
     text = (

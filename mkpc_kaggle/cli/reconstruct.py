@@ -113,7 +113,8 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.intrinsics is not None:
         known = read_intrinsics_table(arguments.intrinsics, root, files)
     masks = Masks() if arguments.masks is None else Masks.of_folder(arguments.masks, root, files)
-    inputs = [root, arguments.pairs, Path(arguments.recipe), arguments.intrinsics, arguments.masks]
+    more = [arguments.pairs, arguments.intrinsics, arguments.masks]
+    inputs = [root, options.recipe_file(arguments), *more]
     require_directory_apart(out, filter(None, inputs), arguments.weights)
     listed = None if arguments.pairs is None else read_pair_list(arguments.pairs, root, datasets)
     with (

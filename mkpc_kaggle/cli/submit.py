@@ -59,9 +59,8 @@ def run(arguments: argparse.Namespace) -> int:
         None if arguments.no_report else arguments.report or output.parent / f"{output.stem}.html"
     )
     files = {"--output": output, "--report": page}
-    require_apart(
-        files, [*test_side(arguments.test_dir), Path(arguments.recipe)], work_dir, arguments.weights
-    )
+    inputs = [*test_side(arguments.test_dir), options.recipe_file(arguments)]
+    require_apart(files, filter(None, inputs), work_dir, arguments.weights)
     with interruptible() as interrupt:
         pairs = read_test_side(arguments.test_dir)
         # The first version precedes the watchdog: a run that starts after its limit must leave a

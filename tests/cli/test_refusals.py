@@ -18,6 +18,8 @@ REFUSALS = [
     ("submit --test-dir nowhere", "test.csv: no such file"),
     (f"{SUBMIT} --recipe imaginary", "unknown recipe 'imaginary'; known: "),
     (f"{SUBMIT} --recipe light", "needs weights that were not found"),
+    # A folder with the name of the recipe is no input.
+    (f"{SUBMIT} --recipe light --output light/a.csv", "needs weights that were not found"),
     (f"{SUBMIT} --weights nowhere", "--weights nowhere: no such directory"),
     (f"{SUBMIT} --time-limit soon", "'soon' is not a duration"),
     (f"{SUBMIT} --device abacus", "unknown device 'abacus'"),
