@@ -3,6 +3,7 @@ import re
 import subprocess
 import sys
 import threading
+import time
 from io import StringIO
 from pathlib import Path
 
@@ -122,6 +123,14 @@ def test_match_counts_the_units_that_it_has_run(demo, small_recipe, monkeypatch,
     images = sorted((demo.train_dir / "courtyard" / "images").iterdir())[:2]
     monkeypatch.setattr("mkpc_kaggle.progress.LINE_INTERVAL_S", 0.0)
     monkeypatch.setattr("mkpc_kaggle.progress.WAIT_S", 1e-6)
+
+    class SlowMatcher(TwoStageMatcher):
+        def __init__(self, *given: object, **more: object) -> None:
+            # Once the libraries are imported, loading may end before the line is printed.
+            time.sleep(0.5)
+            super().__init__(*given, **more)
+
+    monkeypatch.setattr("mkpc_kaggle.cli.match.TwoStageMatcher", SlowMatcher)
     assert run_command("match", *images, "--recipe", small_recipe) == 0
     loading, *counts = capsys.readouterr().err.splitlines()
     assert loading.startswith(f"loading recipe {small_recipe}: ")
