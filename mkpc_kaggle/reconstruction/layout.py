@@ -71,6 +71,9 @@ def _link(path: Path, file: Path) -> None:
     with suppress(OSError):  # an old copy exists, or the file system has no links
         path.symlink_to(file)
         return
+    # A device has no end: a copy of /dev/zero would fill the disk.
+    if not file.is_file():
+        return
     # A copy that was cut off must not look like an image.
     part = path.with_name(f"{PART}{path.name}")
     shutil.copy2(file, part)

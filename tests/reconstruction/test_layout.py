@@ -212,3 +212,15 @@ def test_a_folder_that_grew_keeps_its_coordinates(tmp_path, dataset):
         )
     forget_coordinates(out, [dataset])
     assert not (out / dataset / REFERENCE).exists()
+
+
+def test_a_device_is_not_copied(tmp_path):
+    # A copy of an earlier run is in the place of the link. /dev/zero would fill the disk here.
+    folder = tmp_path / "out" / "images"
+    folder.mkdir(parents=True)
+    (folder / "0.png").write_bytes(b"a copy")
+    device = tmp_path / "0.png"
+    device.symlink_to("/dev/null")
+    write_images(tmp_path / "out", [device])
+    assert (folder / "0.png").read_bytes() == b"a copy"
+    assert [path.name for path in folder.iterdir()] == ["0.png"]
