@@ -24,6 +24,7 @@ from mkpc_kaggle.engine.session import (
     request_of,
 )
 from mkpc_kaggle.engine.state import State, name_below
+from mkpc_kaggle.engine.store import FILE_NAME
 from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.matchers.contract import Matcher
 from mkpc_kaggle.pipeline.assembly import Assembly, assemble
@@ -174,12 +175,13 @@ def reconstruct(
     ``progress`` is shown on the standard error stream. ``work_dir`` keeps the journal and COLMAP's
     files: after Ctrl-C, which raises ``KeyboardInterrupt``, the same call continues, and with more
     images it matches only the new pairs. ``masks`` is a directory, and ``intrinsics`` a table, as for
-    the command; their paths are relative to the common directory of the images. ``matchers`` run in
-    this process, all others in processes of their own.
+    the command; their paths are relative to the common directory of the images. With ``matchers``,
+    matching runs in this process, else in processes of its own.
 
     Cameras refer to the stored pixels of the files, as COLMAP reads them. ``colmap`` of a model is
     pycolmap's. Raises :class:`UserError` for a recipe that cannot run here, for unusable masks or
-    intrinsics, and for an unreadable image.
+    intrinsics, for an unreadable image, and for a ``work_dir`` with a folder ``colmap`` that is not of
+    an earlier call.
     """
     # By absolute path, because the journal knows an image by its path below the common directory
     given = {Path(image).absolute(): str(image) for image in images}
@@ -207,6 +209,8 @@ def reconstruct(
         if work_dir is None:
             work_dir = closed.enter_context(TemporaryDirectory(prefix="mkpc-"))
         directory = Path(work_dir)
+        if (directory / COLMAP).exists() and not (directory / FILE_NAME).is_file():
+            raise UserError(f"{directory / COLMAP} was not made here; name another work_dir")
         session = Session(
             directory,
             Budget(time.monotonic()),

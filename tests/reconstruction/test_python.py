@@ -123,6 +123,15 @@ def test_an_image_that_cannot_be_used_is_an_error_before_any_work(
     assert not matcher.calls
 
 
+def test_a_colmap_folder_of_the_user_is_not_replaced(tmp_path, files):
+    database = tmp_path / "project" / "colmap" / "database.db"
+    database.parent.mkdir(parents=True)
+    database.write_text("mine")
+    with pytest.raises(UserError, match="was not made here"):
+        models(files, MixedMatcher(), work_dir=tmp_path / "project", progress=False)
+    assert database.read_text() == "mine"
+
+
 def test_fewer_than_two_images_have_no_model(files):
     assert models([], MixedMatcher()) == ()
     assert models(files[:1], MixedMatcher()) == ()
