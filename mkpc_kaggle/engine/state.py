@@ -116,8 +116,11 @@ class State:
             known = pair.intrinsics and tuple(K.tobytes() for K in pair.intrinsics)
             key = (self.names[index], pair.turns, known)
             alike.setdefault(key, []).append(index)
-        groups = [group for group in alike.values() if len(group) > 1]
-        return {index: group for group in groups for index in group}
+        twins = {}
+        for group in alike.values():
+            if len(group) > 1:
+                twins.update(dict.fromkeys(group, group))
+        return twins
 
     # Results in use
 
@@ -202,7 +205,8 @@ class State:
         """Return the pairs of a batch that have points, and the key of a scene from them."""
         members = self.members[self.batches[batch]]
         # A pair without points adds nothing to a scene.
-        indices = members[self.has[members].any(1)].tolist()
+        has_points = self.has[members].any(1)
+        indices = members[has_points].tolist()
         inputs = [
             [
                 self.names[index],
@@ -231,7 +235,8 @@ class State:
 
     def use_points(self, index: int, unit: int, key: str, matches: int) -> None:
         self.points[index, unit] = key
-        self.has[index, unit] = self.current[index, unit] = True
+        self.has[index, unit] = True
+        self.current[index, unit] = True
         self.matches[index, unit] = matches
 
     def note_points(self, index: int) -> None:
@@ -261,11 +266,13 @@ class State:
     def _drop_results(self, index: int) -> None:
         self._contents[index] = ""
         self.points[index] = ""
-        self.has[index] = self.current[index] = False
+        self.has[index] = False
+        self.current[index] = False
         self.matches[index] = 0
         self.estimates[index] = ""
-        self.estimated[index] = self.has_own[index] = False
+        self.estimated[index] = False
         self.own[index] = FALLBACK_FUNDAMENTAL
+        self.has_own[index] = False
         self.inliers[index] = 0
         self.scene_source[index] = FALLBACK
         self.note_change(index)
@@ -335,14 +342,14 @@ class State:
         self.changed.update(range(len(self.pairs)))
         self.skipped[:] = False
         # The jobs of killed workers never come back.
-        self.matching[:] = self.filling[:] = False
+        self.matching[:] = False
+        self.filling[:] = False
 
     @property
     def unusable(self) -> Mask:
         """(U,): units that no worker can run."""
-        return np.array(
-            [("matcher", unit.name) in self.tries.given_up for unit in self.units], bool
-        )
+        given_up = self.tries.given_up
+        return np.array([("matcher", unit.name) in given_up for unit in self.units], bool)
 
 
 def names_of(pair: Pair, root: str) -> tuple[str, str]:
@@ -379,11 +386,14 @@ def extra_pairs_of(pairs: Sequence[Pair], config: SceneConfig | None) -> list[Pa
         return []
     extra: list[tuple[float, Pair]] = []
     for batch, indices in batches_of(pairs).items():
-        of_batch = [pairs[index] for index in indices]
-        images = [file for pair in of_batch for file in (pair.file0, pair.file1)]
-        files = list(dict.fromkeys(images))
-        number = {file: index for index, file in enumerate(files)}
-        ends = [(number[pair.file0], number[pair.file1]) for pair in of_batch]
+        number: dict[str, int] = {}  # of each image in its batch
+        ends = []
+        for index in indices:
+            pair = pairs[index]
+            i = number.setdefault(pair.file0, len(number))
+            j = number.setdefault(pair.file1, len(number))
+            ends.append((i, j))
+        files = list(number)
         distinct = len({tuple(sorted(pair)) for pair in ends})
         more = extra_pairs(len(files), ends, config.pairs_per_image)
         for count, (i, j) in enumerate(more, start=distinct):

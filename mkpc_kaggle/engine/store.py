@@ -6,6 +6,7 @@ writes, one transaction for each answer. It reads the store once, at its start, 
 in memory (:mod:`state`).
 """
 
+import errno
 import json
 import os
 import sqlite3
@@ -123,11 +124,7 @@ class Store:
                     raise UserError(
                         f"{path} is not a regular file; remove it, or name another --work-dir"
                     )
-            with undamaged(lock, "remove it"):
-                # A separate file, so that others can read the store during a run.
-                store._lock = opened.enter_context(closing(connected(lock)))
-                # SQLite releases the lock with the process, however it ends.
-                store._lock.execute("BEGIN EXCLUSIVE")
+            store._take_lock(lock, opened)
             if fresh:
                 # A write-ahead log of a former file would be applied to the new one.
                 for ending in ("", "-journal", "-wal", "-shm"):
@@ -271,6 +268,16 @@ class Store:
 
     # Opening
 
+    def _take_lock(self, path: Path, opened: ExitStack) -> None:
+        try:
+            with undamaged(path, "remove it"):
+                # A separate file, so that others can read the store during a run.
+                self._lock = opened.enter_context(closing(connected(path)))
+                # SQLite releases the lock with the process, however it ends.
+                self._lock.execute("BEGIN EXCLUSIVE")
+        except sqlite3.OperationalError as error:  # not a byte of the disk is free
+            raise OSError(errno.ENOSPC, str(error)) from error
+
     def _open_file(self, opened: ExitStack) -> None:
         try:
             self._db = opened.enter_context(closing(connected(self.path)))
@@ -278,22 +285,25 @@ class Store:
         except sqlite3.OperationalError as error:
             if getattr(error, "sqlite_errorcode", 0) & 0xFF in UNUSABLE - {CANNOT_OPEN}:
                 raise
-            # A full disk has no room for SQLite's locks, either. Its files can be read.
             self.trouble = str(error)
             self._has_file = False
-            is_empty = not self.path.exists() or not self.path.stat().st_size
             self._db.close()
-            file = ":memory:" if is_empty else self.path
-            self._db = opened.enter_context(
-                closing(connected(file, "" if is_empty else "immutable=1"))
-            )
-            if is_empty:
-                self._db.execute(SCHEMA)
-            else:
+            self._open_without_writing(opened)
+
+    def _open_without_writing(self, opened: ExitStack) -> None:
+        """Open the results of earlier runs, or an empty store in memory."""
+        if self.path.exists():
+            # A full disk has no room for SQLite's locks, either. Its files can be read.
+            self._db = opened.enter_context(closing(connected(self.path, "immutable=1")))
+            # A disk that became full in _prepare has a file without a table.
+            if self._has_table():
                 self._check()
+                return
+        self._db = opened.enter_context(closing(connected(":memory:")))
+        self._db.execute(SCHEMA)
 
     def _prepare(self) -> None:
-        if self._db.execute("SELECT 1 FROM sqlite_master").fetchone() is None:
+        if not self._has_table():
             # Readers do not block the writer, and a commit is one append.
             self._db.execute("PRAGMA journal_mode = WAL")
             # In one transaction, so that no file has the table and not its format.
@@ -301,8 +311,13 @@ class Store:
         else:
             self._check()
             self._db.execute("PRAGMA journal_mode = WAL")
+            # On a full disk, the first read in this mode fails: it makes an index of 32 kB.
+            self._has_table()
         # A kill of the process loses no result. A power failure may lose the latest.
         self._db.execute("PRAGMA synchronous = NORMAL")
+
+    def _has_table(self) -> bool:
+        return self._db.execute("SELECT 1 FROM sqlite_master").fetchone() is not None
 
     def _check(self) -> None:
         """Raise :class:`UserError` for a file of another format, or for a damaged file."""

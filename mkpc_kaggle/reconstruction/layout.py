@@ -76,8 +76,11 @@ def _link(path: Path, file: Path) -> None:
         return
     # A copy that was cut off must not look like an image.
     part = path.with_name(f"{PART}{path.name}")
-    shutil.copy2(file, part)
-    part.replace(path)
+    try:
+        shutil.copy2(file, part)
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
 
 
 def _version(path: Path) -> tuple[int, int]:

@@ -15,6 +15,7 @@ from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.data.images import Unreadable, read_image
 from mkpc_kaggle.data.masks import Masks
 from mkpc_kaggle.engine.budget import Budget
+from mkpc_kaggle.engine.console import warn
 from mkpc_kaggle.engine.request import RunReport
 from mkpc_kaggle.engine.session import (
     Interrupt,
@@ -33,7 +34,7 @@ from mkpc_kaggle.reconstruction.choice import choose_pairs
 from mkpc_kaggle.reconstruction.folder import Datasets, Ends, batch_names, require_distinct
 from mkpc_kaggle.reconstruction.outputs import Cameras
 from mkpc_kaggle.reconstruction.priors import read_intrinsics_table
-from mkpc_kaggle.scene.export import MODELS
+from mkpc_kaggle.scene.export import MODELS, remove_files
 from mkpc_kaggle.scene.reconstruction import RegisteredImage, SfmModel
 
 if TYPE_CHECKING:
@@ -119,6 +120,12 @@ def reconstruct_folder(
         engine.ask(request_of(pairs, assembly, session, str(root), exports=exports, publish=write))
         # Within the context: afterwards the store is closed.
         report = engine.report()
+        # An earlier run's models, from other images, do not belong to tables without cameras.
+        state = engine.state
+        assert state is not None
+        for batch in state.batches:
+            if batch not in state.scenes and remove_files(exports[batch]):
+                warn(f"{batch}: this run has no cameras; the models of an earlier run were removed")
     return FolderResult(report, tuple(pairs), *standing)
 
 
@@ -176,7 +183,7 @@ def reconstruct(
     files: after Ctrl-C, which raises ``KeyboardInterrupt``, the same call continues, and with more
     images it matches only the new pairs. ``masks`` is a directory, and ``intrinsics`` a table, as for
     the command; their paths are relative to the common directory of the images. With ``matchers``,
-    matching runs in this process, else in processes of its own.
+    matching runs in this process, else in separate processes.
 
     Cameras refer to the stored pixels of the files, as COLMAP reads them. ``colmap`` of a model is
     pycolmap's. Raises :class:`UserError` for a recipe that cannot run here, for unusable masks or
@@ -195,7 +202,7 @@ def reconstruct(
     root = Path(os.path.commonpath([file.parent for file in files]))
     require_distinct(files)
     for file in files:
-        # A few images of a notebook: one that is missing is a mistake, and no reason to go on.
+        # A few images of a notebook: one that is missing is a mistake.
         if isinstance(image := read_image(file), Unreadable):
             raise UserError(str(image))
     known = "" if intrinsics is None else read_intrinsics_table(Path(intrinsics), root, files)

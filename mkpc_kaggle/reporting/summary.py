@@ -95,7 +95,7 @@ def left_out_line(recipe: Recipe, left_out: Sequence[str]) -> str:
     others = [cause for cause in left_out if not cause.startswith(UnavailableKind.NO_WEIGHTS)]
     missing = [cause for cause in left_out if cause.startswith(UnavailableKind.NO_WEIGHTS)]
     parts = [f"left out, {cause}" for cause in others]
-    # The recipe named other matchers, whose list would not say what to do.
+    # A list of the recipe's other matchers would give no advice.
     if missing and set(recipe.matcher_names) == {"sift"}:
         parts.append(
             "RootSIFT only; `mkpc weights fetch light --out weights` adds learned matchers"

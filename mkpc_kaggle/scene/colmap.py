@@ -92,7 +92,11 @@ def write_files(
         shutil.rmtree(left, ignore_errors=True)
     with TemporaryDirectory(prefix=PART, dir=directory) as name:
         made = Path(name)
-        with pycolmap.Database.open(str(made / DATABASE)) as database:
+        try:
+            file = pycolmap.Database.open(str(made / DATABASE))
+        except RuntimeError as error:  # a full disk; its message names no file
+            raise OSError(f"{directory / DATABASE} cannot be written") from error
+        with file as database:
             _fill(database, merged, shared, camera_model)
         for number, model in enumerate(models):
             kept = {each.image.name for each in model.images}
@@ -353,7 +357,7 @@ def _sfm_model(found: Any, graph: ViewGraph) -> SfmModel:
 
 
 def points_of(found: Any) -> NDArray[np.float64]:
-    """Return the finite points (P, 3) of pycolmap's model, those of the longest tracks first."""
+    """Return the finite points (P, 3) of pycolmap's model, the longest tracks first."""
     tracks = {
         number: found.points3D[number].track.length() for number in sorted(found.point3D_ids())
     }

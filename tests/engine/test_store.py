@@ -4,6 +4,8 @@ be pruned.
 
 import os
 import sqlite3
+import subprocess
+import sys
 from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import replace
@@ -359,6 +361,50 @@ def test_results_that_a_full_disk_refuses_stay_in_memory_and_are_written_later(
         store._db.execute("PRAGMA max_page_count = 100000")
     with Store.read(tmp_path) as again:
         assert len(again.data(row.key for row in rows)) == 200
+
+
+# Puts a result into the store in argv[1], and prints the results that it has, and why they stay in memory.
+PUT = """
+import resource, sys
+from pathlib import Path
+from mkpc_kaggle.engine.store import Kind, Result, Store
+
+limit = 1024 * int(sys.argv[2])
+resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+with Store.open(Path(sys.argv[1])) as store:
+    store.put([Result("new", Kind.POINTS, 2)])
+    print(store.about(["former", "new"]), bool(store.trouble))
+"""
+
+
+# The file can have a first page, but SQLite's index of 32 kB fails.
+@pytest.mark.parametrize("kib", [4, 20])
+@pytest.mark.parametrize("former", [{}, {"former": 1}], ids=["new", "resumed"])
+def test_a_disk_that_is_full_from_the_start_costs_no_result(
+    tmp_path: Path, kib: int, former: dict[str, int]
+) -> None:
+    if former:
+        with Store.open(tmp_path) as store:
+            store.put(Result(key, Kind.POINTS, about) for key, about in former.items())
+    process = put_into(tmp_path, kib)
+    assert process.stderr == ""
+    assert process.stdout == f"{former | {'new': 2}} True\n"
+
+
+def put_into(directory: Path, kib: int) -> "subprocess.CompletedProcess[str]":
+    return subprocess.run(
+        [sys.executable, "-c", PUT, str(directory), str(kib)],
+        check=False,
+        text=True,
+        capture_output=True,
+    )
+
+
+def test_a_disk_without_a_free_byte_is_refused_in_one_line(tmp_path: Path) -> None:
+    last = put_into(tmp_path, 0).stderr.splitlines()[-1]
+    assert last.endswith(
+        f"UserError: the work directory {tmp_path} cannot be written: disk I/O error"
+    )
 
 
 def test_a_prune_removes_what_the_table_of_pairs_does_not_name(whole: Room, tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ import pycolmap
 import pytest
 from test_reconstruct import FIRST, MixedMatcher, cameras, run, write_flat
 
+from mkpc_kaggle.reconstruction import layout
 from mkpc_kaggle.reconstruction.coordinates import forget_coordinates, keep_coordinates
 from mkpc_kaggle.reconstruction.folder import read_folder
 from mkpc_kaggle.reconstruction.layout import write_images, write_layouts, write_sparse
@@ -154,6 +155,22 @@ def test_where_links_fail_there_are_copies(tmp_path, monkeypatch):
         copy = tmp_path / "out" / "images" / file.name
         assert not copy.is_symlink()
         assert copy.read_bytes() == content
+
+
+def test_a_copy_that_was_cut_off_leaves_nothing(tmp_path, monkeypatch):
+    def refuse(*_: object) -> None:
+        raise OSError(1, "Operation not permitted")
+
+    def copy_a_part(_: Path, part: Path) -> None:
+        part.write_bytes(b"a part")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "symlink_to", refuse)
+    monkeypatch.setattr(layout.shutil, "copy2", copy_a_part)
+    files = sorted(write_flat(tmp_path / "from", 1).iterdir())
+    with pytest.raises(OSError, match="No space left"):
+        write_images(tmp_path / "out", files)
+    assert list((tmp_path / "out" / "images").iterdir()) == []
 
 
 def test_a_model_that_cannot_be_read_is_a_line_and_the_former_folder_stays(tmp_path, laid_out):

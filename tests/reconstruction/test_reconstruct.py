@@ -9,7 +9,7 @@ import time
 from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import combinations
 from pathlib import Path
 
@@ -18,6 +18,7 @@ import numpy as np
 import pycolmap
 import pytest
 from exif_files import set_exif
+from faulty import befall, scenes_by
 from pair_lists import turned_camera
 from rectified import Seen, flat, number_of
 from shared import run_command
@@ -247,6 +248,25 @@ def test_results_that_were_removed_are_made_again_and_an_image_that_was_absent_c
     (tmp_path / "away.png").rename(root / "03.png")
     run(root, out)
     assert contents(out) == before
+
+
+def test_models_of_images_that_have_changed_do_not_outlive_a_run_without_cameras(
+    tmp_path, monkeypatch, capsys
+):
+    root = write_flat(tmp_path / "images", 4)
+    out = tmp_path / "out"
+    run(root, out)
+    assert (out / "models" / "0").is_dir()
+    cv2.imwrite(str(root / "00.png"), flat(3, SIZE))
+    with monkeypatch.context() as patched:
+        scenes_by(patched, partial(befall, fail))
+        assert cameras(run(root, out)) == {}
+    assert "the models of an earlier run were removed" in capsys.readouterr().err
+    assert not any((out / name).exists() for name in ("models", "database.db", "sparse"))
+
+
+def fail():
+    raise OSError(28, "No space left on device")
 
 
 def test_a_folder_in_the_folder_is_a_dataset_and_files_of_one_content_share_a_camera(tmp_path):
