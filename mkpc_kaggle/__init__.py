@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from mkpc_kaggle.pipeline.pair import PairMatch
     from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher
     from mkpc_kaggle.recipe import Recipe
-    from mkpc_kaggle.reconstruction.run import reconstruct
+    from mkpc_kaggle.reconstruction.python import reconstruct
     from mkpc_kaggle.reporting.notebook import results
 
 __all__ = ["PairMatch", "Recipe", "TwoStageMatcher", "__version__", "reconstruct", "results"]
@@ -23,7 +23,7 @@ _MODULES = {
     "PairMatch": "pipeline.pair",
     "TwoStageMatcher": "pipeline.two_stage",
     "Recipe": "recipe",
-    "reconstruct": "reconstruction.run",
+    "reconstruct": "reconstruction.python",
     "results": "reporting.notebook",
 }
 

@@ -1,47 +1,24 @@
-"""Reconstruction of a folder, or of the images of a Python program, in a run of the engine."""
+"""Reconstruction of a folder of images in a run of the engine."""
 
-import os
-import threading
-import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.data.images import Unreadable, read_image
-from mkpc_kaggle.data.masks import Masks
-from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.console import warn
 from mkpc_kaggle.engine.request import RunReport
-from mkpc_kaggle.engine.session import (
-    Interrupt,
-    Session,
-    interruptible,
-    opened_engine,
-    request_of,
-)
+from mkpc_kaggle.engine.session import Session, opened_engine, request_of
 from mkpc_kaggle.engine.state import State, name_below
-from mkpc_kaggle.engine.store import FILE_NAME
-from mkpc_kaggle.errors import UserError, writing
-from mkpc_kaggle.matchers.contract import Matcher
-from mkpc_kaggle.pipeline.assembly import Assembly, assemble
+from mkpc_kaggle.errors import writing
+from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.recipe import CameraSharing, Recipe, SceneConfig
 from mkpc_kaggle.reconstruction.choice import choose_pairs
-from mkpc_kaggle.reconstruction.folder import Datasets, Ends, batch_names, require_distinct
+from mkpc_kaggle.reconstruction.folder import Datasets, Ends, batch_names
 from mkpc_kaggle.reconstruction.outputs import Cameras
-from mkpc_kaggle.reconstruction.priors import read_intrinsics_table
-from mkpc_kaggle.scene.export import MODELS, remove_files
-from mkpc_kaggle.scene.reconstruction import RegisteredImage, SfmModel
-
-if TYPE_CHECKING:
-    from mkpc_kaggle.reporting.view import View
+from mkpc_kaggle.scene.export import remove_files
+from mkpc_kaggle.scene.reconstruction import RegisteredImage
 
 AUTO = "auto"  # the recipe of all matchers whose weights are found
-COLMAP = "colmap"  # in the work directory of :func:`reconstruct`, for COLMAP's files
 
 
 @dataclass(frozen=True)
@@ -146,116 +123,3 @@ def cameras_of(datasets: Datasets, root: Path, results: State) -> Cameras:
         digests = {file: known_digests.get(name_below(str(root), str(file)), "") for file in files}
         cameras[name] = {file: known.get(digests[file]) for file in files}
     return cameras
-
-
-class Models(tuple[SfmModel, ...]):
-    """The models of :func:`reconstruct`, the largest first, which a notebook can show."""
-
-    __slots__ = ()
-
-    def show(self, *, metres_per_unit: float | None = None) -> "View":
-        """Return an interactive view of cameras and points, the last value of a notebook's cell.
-
-        With ``metres_per_unit``, the scale of a single model, a bar shows a length.
-        """
-        from mkpc_kaggle.reporting.view import show  # jinja2 is slow to import
-
-        return show(self, metres_per_unit=metres_per_unit)
-
-
-def reconstruct(
-    images: Iterable[str | Path],
-    recipe: Recipe | str = "auto",
-    *,
-    weights: Iterable[str | Path] = (),
-    device: str = "auto",
-    matchers: Mapping[str, Matcher[Any]] | None = None,
-    masks: str | Path | None = None,
-    intrinsics: str | Path | None = None,
-    progress: bool = True,
-    work_dir: str | Path | None = None,
-) -> Models:
-    """Return the models of the images at these paths, the largest first; no model if too few images
-    match.
-
-    This is a run of the command ``reconstruct`` on one set of images, without a time limit. Its
-    ``progress`` is shown on the standard error stream. ``work_dir`` keeps the journal and COLMAP's
-    files: after Ctrl-C, which raises ``KeyboardInterrupt``, the same call continues, and with more
-    images it matches only the new pairs. ``masks`` is a directory, and ``intrinsics`` a table, as for
-    the command; their paths are relative to the common directory of the images. With ``matchers``,
-    matching runs in this process, else in separate processes.
-
-    Cameras refer to the stored pixels of the files, as COLMAP reads them. ``colmap`` of a model is
-    pycolmap's. Raises :class:`UserError` for a recipe that cannot run here, for unusable masks or
-    intrinsics, for an unreadable image, and for a ``work_dir`` with a folder ``colmap`` that is not of
-    an earlier call.
-    """
-    # By absolute path, because the journal knows an image by its path below the common directory
-    given = {Path(image).absolute(): str(image) for image in images}
-    files = sorted(given)
-    checked = partial(
-        assemble, recipe, weights=map(Path, weights), device=device, matchers=matchers
-    )
-    if len(files) < 2:
-        checked()  # wrong arguments are errors here, too
-        return Models()
-    root = Path(os.path.commonpath([file.parent for file in files]))
-    require_distinct(files)
-    for file in files:
-        # A few images of a notebook: one that is missing is a mistake.
-        if isinstance(image := read_image(file), Unreadable):
-            raise UserError(str(image))
-    known = "" if intrinsics is None else read_intrinsics_table(Path(intrinsics), root, files)
-    assembly = checked()
-    assembly = replace(
-        assembly,
-        recipe=for_cameras(assembly.recipe, intrinsics=known),
-        masks=assembly.masks if masks is None else Masks.of_folder(Path(masks), root, files),
-    )
-    with ExitStack() as closed:
-        if work_dir is None:
-            work_dir = closed.enter_context(TemporaryDirectory(prefix="mkpc-"))
-        directory = Path(work_dir)
-        if (directory / COLMAP).exists() and not (directory / FILE_NAME).is_file():
-            raise UserError(f"{directory / COLMAP} was not made here; name another work_dir")
-        session = Session(
-            directory,
-            Budget(time.monotonic()),
-            closed.enter_context(interruptible()) if is_main_thread() else Interrupt(),
-            progress=progress,
-            # Objects of the user's program may not exist in other processes.
-            workers=0 if matchers else None,
-        )
-        result = reconstruct_folder(root, {".": files}, assembly, session, directory / COLMAP)
-        if session.interrupt.is_set():
-            raise KeyboardInterrupt
-        from mkpc_kaggle.reporting.summary import trouble  # jinja2 is slow to import
-
-        if reason := trouble(result.report):
-            raise UserError(reason)
-        scenes = result.report.scenes
-        names = {name_below(str(root), str(file)): name for file, name in given.items()}
-        return Models(
-            _complete(model, directory / COLMAP / MODELS / str(number), names)
-            for scene in scenes
-            for number, model in enumerate(scene.models)
-        )
-
-
-def _complete(model: SfmModel, folder: Path, names: Mapping[str, str]) -> SfmModel:
-    """Return a model of the journal with all of its points, and with the user's names of images."""
-    import pycolmap
-
-    from mkpc_kaggle.scene.colmap import points_of
-
-    found = pycolmap.Reconstruction(folder)
-    images = []
-    for placed in model.images:
-        image = replace(placed.image, name=names[placed.image.name])
-        images.append(replace(placed, image=image))
-    return replace(model, images=tuple(images), points=points_of(found), colmap=found)
-
-
-def is_main_thread() -> bool:
-    """Return whether this is the thread that may handle signals."""
-    return threading.current_thread() is threading.main_thread()

@@ -24,13 +24,8 @@ from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.reconstruction.folder import read_folder
 from mkpc_kaggle.reconstruction.priors import read_intrinsics_table
-from mkpc_kaggle.reconstruction.run import (
-    FolderResult,
-    Models,
-    for_cameras,
-    reconstruct,
-    reconstruct_folder,
-)
+from mkpc_kaggle.reconstruction.python import Models, reconstruct
+from mkpc_kaggle.reconstruction.run import FolderResult, for_cameras, reconstruct_folder
 
 HEAD = "image,model,parameters,sigma\n"
 

@@ -14,7 +14,7 @@ from test_reconstruct import FIRST, RECIPE, MixedMatcher, write_flat
 from mkpc_kaggle import reconstruct, results
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.reconstruction.run import Models
+from mkpc_kaggle.reconstruction.python import Models
 
 PAIRS = FIRST * (FIRST - 1) // 2
 

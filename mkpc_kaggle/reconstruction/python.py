@@ -1,0 +1,159 @@
+"""``mkpc_kaggle.reconstruct``: the models of a Python program's images."""
+
+import os
+import threading
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
+
+from mkpc_kaggle.data.images import Unreadable, read_image
+from mkpc_kaggle.data.masks import Masks
+from mkpc_kaggle.engine.budget import Budget
+from mkpc_kaggle.engine.session import Interrupt, Session, interruptible
+from mkpc_kaggle.engine.state import name_below
+from mkpc_kaggle.engine.store import FILE_NAME
+from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.matchers.contract import Matcher
+from mkpc_kaggle.pipeline.assembly import Assembly, assemble
+from mkpc_kaggle.recipe import Recipe
+from mkpc_kaggle.reconstruction.folder import require_distinct
+from mkpc_kaggle.reconstruction.priors import read_intrinsics_table
+from mkpc_kaggle.reconstruction.run import for_cameras, reconstruct_folder
+from mkpc_kaggle.scene.export import MODELS
+from mkpc_kaggle.scene.reconstruction import SfmModel
+
+if TYPE_CHECKING:
+    from mkpc_kaggle.reporting.view import View
+
+COLMAP = "colmap"  # in the work directory, for COLMAP's files
+
+
+class Models(tuple[SfmModel, ...]):
+    """The models of :func:`reconstruct`, the largest first, which a notebook can show."""
+
+    __slots__ = ()
+
+    def show(self, *, metres_per_unit: float | None = None) -> "View":
+        """Return an interactive view of cameras and points, the last value of a notebook's cell.
+
+        With ``metres_per_unit``, the scale of a single model, a bar shows a length.
+        """
+        from mkpc_kaggle.reporting.view import show  # jinja2 is slow to import
+
+        return show(self, metres_per_unit=metres_per_unit)
+
+
+def reconstruct(
+    images: Iterable[str | Path],
+    recipe: Recipe | str = "auto",
+    *,
+    weights: Iterable[str | Path] = (),
+    device: str = "auto",
+    matchers: Mapping[str, Matcher[Any]] | None = None,
+    masks: str | Path | None = None,
+    intrinsics: str | Path | None = None,
+    progress: bool = True,
+    work_dir: str | Path | None = None,
+) -> Models:
+    """Return the models of the images at these paths, the largest first; no model if too few images
+    match.
+
+    This is a run of the command ``reconstruct`` on one set of images, without a time limit. Its
+    ``progress`` is shown on the standard error stream. ``work_dir`` keeps the journal and COLMAP's
+    files: after Ctrl-C, which raises ``KeyboardInterrupt``, the same call continues, and with more
+    images it matches only the new pairs. ``masks`` is a directory, and ``intrinsics`` a table, as for
+    the command; their paths are relative to the common directory of the images. With ``matchers``,
+    matching runs in this process, else in separate processes.
+
+    Cameras refer to the stored pixels of the files, as COLMAP reads them. ``colmap`` of a model is
+    pycolmap's. Raises :class:`UserError` for a recipe that cannot run here, for unusable masks or
+    intrinsics, for an unreadable image, and for a ``work_dir`` with a folder ``colmap`` that is not of
+    an earlier call.
+    """
+    # By absolute path, because the journal knows an image by its path below the common directory
+    given = {Path(image).absolute(): str(image) for image in images}
+    files = sorted(given)
+    assembly = assemble(recipe, weights=map(Path, weights), device=device, matchers=matchers)
+    if len(files) < 2:
+        return Models()
+    require_readable(files)
+    root = Path(os.path.commonpath([file.parent for file in files]))
+    assembly = with_priors(assembly, root, files, masks, intrinsics)
+    with ExitStack() as closed:
+        if work_dir is None:
+            work_dir = closed.enter_context(TemporaryDirectory(prefix="mkpc-"))
+        directory = Path(work_dir)
+        out = directory / COLMAP
+        if out.exists() and not (directory / FILE_NAME).is_file():
+            raise UserError(f"{out} was not made here; name another work_dir")
+        session = Session(
+            directory,
+            Budget(time.monotonic()),
+            closed.enter_context(interruptible()) if is_main_thread() else Interrupt(),
+            progress=progress,
+            # Objects of the user's program may not exist in other processes.
+            workers=0 if matchers else None,
+        )
+        result = reconstruct_folder(root, {".": files}, assembly, session, out)
+        if session.interrupt.is_set():
+            raise KeyboardInterrupt
+        from mkpc_kaggle.reporting.summary import trouble  # jinja2 is slow to import
+
+        if reason := trouble(result.report):
+            raise UserError(reason)
+        names = {name_below(str(root), str(file)): name for file, name in given.items()}
+        return Models(
+            complete_model(model, out / MODELS / str(number), names)
+            for scene in result.report.scenes
+            for number, model in enumerate(scene.models)
+        )
+
+
+def require_readable(files: Sequence[Path]) -> None:
+    """Raise :class:`UserError` for an image that cannot be read, or for one that is given twice."""
+    require_distinct(files)
+    for file in files:
+        # A few images of a notebook: one that is missing is a mistake.
+        if isinstance(image := read_image(file), Unreadable):
+            raise UserError(str(image))
+
+
+def with_priors(
+    assembly: Assembly,
+    root: Path,
+    files: Sequence[Path],
+    masks: str | Path | None,
+    intrinsics: str | Path | None,
+) -> Assembly:
+    """Return the assembly for cameras, with the user's masks and intrinsics. Raises
+    :class:`UserError` if they are unusable.
+    """
+    known = "" if intrinsics is None else read_intrinsics_table(Path(intrinsics), root, files)
+    return replace(
+        assembly,
+        recipe=for_cameras(assembly.recipe, intrinsics=known),
+        masks=assembly.masks if masks is None else Masks.of_folder(Path(masks), root, files),
+    )
+
+
+def complete_model(model: SfmModel, folder: Path, names: Mapping[str, str]) -> SfmModel:
+    """Return a model of the journal with all of its points, and with the user's names of images."""
+    import pycolmap
+
+    from mkpc_kaggle.scene.colmap import points_of
+
+    found = pycolmap.Reconstruction(folder)
+    images = []
+    for placed in model.images:
+        image = replace(placed.image, name=names[placed.image.name])
+        images.append(replace(placed, image=image))
+    return replace(model, images=tuple(images), points=points_of(found), colmap=found)
+
+
+def is_main_thread() -> bool:
+    """Return whether this is the thread that may handle signals."""
+    return threading.current_thread() is threading.main_thread()
