@@ -25,6 +25,7 @@ def scene() -> SyntheticScene:
 
 
 def model(cameras: dict[str, Camera], points: int = 100) -> SfmModel:
+    """Return a model with these cameras by name, each of which sees all points."""
     registered = []
     for name, camera in cameras.items():
         image = BatchImage(name, f"digest of {name}", SIZE)
@@ -33,21 +34,29 @@ def model(cameras: dict[str, Camera], points: int = 100) -> SfmModel:
 
 
 def choice(models: list[SfmModel], scene: SyntheticScene, **changes: object) -> Choice:
-    found = [{image.image.digest: image for image in model.images} for model in models]
-    return choose(replace(scene.pairs[0], **changes), found)
+    """Return the choice for the pair of images 0000 and 0001, with fields of the pair changed."""
+    registered = []
+    for each in models:
+        by_digest = {found.image.digest: found for found in each.images}
+        registered.append(by_digest)
+    pair = replace(scene.pairs[0], **changes)
+    return choose(pair, registered)
 
 
 def test_a_pair_whose_cameras_make_no_fundamental_keeps_its_own(scene):
     first = scene.cameras["0000"]
     second = scene.cameras["0001"]
-    rest = {name: camera for name, camera in scene.cameras.items() if name != "0000"}
+    all_but_first = {name: camera for name, camera in scene.cameras.items() if name != "0000"}
     assert choice([], scene).reason is Reason.UNREGISTERED
-    assert choice([model(rest)], scene).reason is Reason.UNREGISTERED
+    incomplete = [model(all_but_first)]
+    assert choice(incomplete, scene).reason is Reason.UNREGISTERED
     # The relative pose of two models is unknown.
     apart = [model({"0000": first}), model({"0001": second})]
     assert choice(apart, scene).reason is Reason.APART
-    whole = [model(scene.cameras)]
-    assert choice(whole, scene, image1=scene.images[0]).reason is Reason.SAME_IMAGE
+    complete = [model(scene.cameras)]
+    # A pair of an image with itself
+    twice_the_first = choice(complete, scene, image1=scene.images[0])
+    assert twice_the_first.reason is Reason.SAME_IMAGE
     # Without a baseline F is zero.
     together = [model(scene.cameras | {"0001": first})]
     assert choice(together, scene).reason is Reason.SAME_CENTRE
@@ -55,32 +64,43 @@ def test_a_pair_whose_cameras_make_no_fundamental_keeps_its_own(scene):
 
 def test_a_wrong_camera_is_contradicted_by_the_pairs_matches(scene):
     camera = scene.cameras["0001"]
-    # Enough that few matches stay near their epipolar lines
-    tilt, _ = cv2.Rodrigues(np.array([np.radians(15), 0, 0]))
+    # Enough that few matches stay near their epipolar lines.
+    angles = np.array([np.radians(15), 0, 0])
+    tilt, _ = cv2.Rodrigues(angles)
     tilted = Camera(camera.K, tilt @ camera.R, tilt @ camera.t)
     wrong = [model(scene.cameras | {"0001": tilted})]
-    own = scene.true_fundamental(scene.pairs[0])
-    assert choice(wrong, scene, pair_fundamental=own).reason is Reason.CONTRADICTION
-    # Without an F of its own, nothing contradicts.
+    true_F = scene.true_fundamental(scene.pairs[0])
+    assert choice(wrong, scene, pair_fundamental=true_F).reason is Reason.CONTRADICTION
+    # Without an F of the pair, nothing contradicts the scene's.
     assert choice(wrong, scene).from_scene
 
 
+# Images have 800 x 600 pixels, so 1e5 is a field of view below half a degree.
 @pytest.mark.parametrize("focal", [-900.0, 0.0, 1e5, np.nan])
 def test_an_absurd_focal_length_is_left_out(scene, focal):
-    bad = replace(scene.cameras["0000"], K=np.diag([focal, focal, 1.0]))
-    (kept,) = filter_models((model(scene.cameras | {"0000": bad}),))
-    assert [found.image.name for found in kept.images] == ["0001", "0002", "0003"]
+    K = np.diag([focal, focal, 1.0])
+    absurd = replace(scene.cameras["0000"], K=K)
+    with_absurd = model(scene.cameras | {"0000": absurd})
+    (kept,) = filter_models((with_absurd,))
+    names = [found.image.name for found in kept.images]
+    assert names == ["0001", "0002", "0003"]
 
 
 def test_a_model_that_is_too_small_is_left_out(scene):
-    small = model({name: scene.cameras[name] for name in ("0000", "0001")})
-    kept = filter_models((small, model(scene.cameras)))
-    assert [len(each.images) for each in kept] == [4]
+    two = {name: scene.cameras[name] for name in ("0000", "0001")}
+    small = model(two)
+    large = model(scene.cameras)
+    kept = filter_models((small, large))
+    sizes = [len(each.images) for each in kept]
+    assert sizes == [4]
 
 
 def test_the_models_of_all_components_are_numbered_by_size(scene):
     first_three = list(scene.cameras.items())[:3]
     small = model(dict(first_three))
     large = model(scene.cameras)
-    components = [Reconstruction(("a",), (small,)), Reconstruction(("b",), (large,))]
+    components = [
+        Reconstruction(("a",), (small,)),
+        Reconstruction(("b",), (large,)),
+    ]
     assert models_of(components) == (large, small)

@@ -10,10 +10,12 @@ from rectified import run
 from synthetic import RECIPE, SyntheticMatcher, synthetic_pairs
 
 from mkpc_kaggle.engine.request import Ending
+from mkpc_kaggle.engine.state import State
 from mkpc_kaggle.recipe import SceneConfig
 from mkpc_kaggle.reporting.run_log import read_log
 from mkpc_kaggle.scene.densify import extra_pairs
 
+# Each of six images with the next only.
 CHAIN = [(0, 1), (1, 2), (2, 3), (3, 4), (4, 5)]
 
 
@@ -21,43 +23,56 @@ CHAIN = [(0, 1), (1, 2), (2, 3), (3, 4), (4, 5)]
 def test_a_batch_gets_as_many_pairs_as_it_lacks_and_none_twice(images, wanted, seed):
     rng = np.random.default_rng(seed)
     every = list(combinations(range(images), 2))
-    # In either order, as a test set has them
-    asked = [ends if rng.random() < 0.5 else ends[::-1] for ends in every if rng.random() < 0.4]
+    known = []
+    asked = []
+    for first, second in every:
+        # About 40 % of the pairs, so that few and many wanted pairs are missing.
+        if rng.random() < 0.4:
+            known.append((first, second))
+            # A test set has pairs in either order.
+            is_swapped = rng.random() < 0.5
+            asked.append((second, first) if is_swapped else (first, second))
     chosen = extra_pairs(images, asked, wanted)
-    known = {(min(ends), max(ends)) for ends in asked}
     assert len(set(chosen)) == len(chosen)
-    assert set(chosen) <= set(every) - known
-    assert len(chosen) == max(0, min(int(np.ceil(wanted * images)), len(every)) - len(known))
+    assert set(chosen) <= set(every) - set(known)
+    # Each pair of images exists once, so small batches cannot have all wanted pairs.
+    total = min(int(np.ceil(wanted * images)), len(every))
+    assert len(chosen) == max(0, total - len(known))
 
 
 def test_images_in_few_pairs_come_first_and_get_partners_that_have_the_same_partners():
+    # Six images at 1 pair an image: one more than the five of the chain.
     assert extra_pairs(6, CHAIN, 1) == [(0, 2)], "0 and 2 have 1 in common"
-    degrees = np.bincount(np.ravel([*CHAIN, *extra_pairs(6, CHAIN, 1.5)]))
-    assert degrees.min() >= 2
+    # At 1.5, the four more pairs suffice for a second partner of both ends.
+    pairs = [*CHAIN, *extra_pairs(6, CHAIN, 1.5)]
+    partners = np.bincount(np.ravel(pairs))
+    assert partners.min() >= 2
     assert extra_pairs(6, CHAIN, 0) == []
 
 
 def test_a_sparse_batch_has_a_scene_by_pairs_that_no_row_names(tmp_path):
+    work = tmp_path / "work"
     every = synthetic_pairs(tmp_path / "images")
     matcher = SyntheticMatcher()
-    # A chain: the mapper needs pairs across it.
-    asked = [every[list(combinations(range(6), 2)).index(ends)] for ends in CHAIN]
-    published: list[int] = []
+    # The mapper needs pairs across the chain.
+    order = list(combinations(range(6), 2))
+    indices = [order.index(ends) for ends in CHAIN]
+    asked = [every[index] for index in indices]
     recipe = replace(RECIPE, scene=SceneConfig(pairs_per_image=2))
-    publish = lambda standing: published.append(len(standing.fundamentals))  # noqa: E731
-    report = run(asked, recipe, matcher, tmp_path / "work", publish=publish)
+    published: list[int] = []
+
+    def publish(standing: State) -> None:
+        published.append(len(standing.fundamentals))
+
+    report = run(asked, recipe, matcher, work, publish=publish)
     assert report.ending is Ending.COMPLETE
     assert [record.source for record in report.records] == ["scene"] * 5
-    true = [matcher.scene.pairs[list(combinations(range(6), 2)).index(ends)] for ends in CHAIN]
-    found = zip(report.records, true, strict=True)
-    assert (
-        max(
-            matcher.scene.median_distance(record.chosen_fundamental, pair) for record, pair in found
-        )
-        < 0.5
-    )
+    true_pairs = [matcher.scene.pairs[index] for index in indices]
+    for record, pair in zip(report.records, true_pairs, strict=True):
+        assert matcher.scene.median_distance(record.chosen_fundamental, pair) < 0.5
     assert len(matcher.calls) == 12, "two pairs an image"
     # Extra pairs are in no result, table or report.
     assert set(published) == {5}
-    assert len(read_log(tmp_path / "work").records) == 5
-    assert run(asked, recipe, SyntheticMatcher(), tmp_path / "work").scenes == report.scenes
+    assert len(read_log(work).records) == 5
+    again = run(asked, recipe, SyntheticMatcher(), work)
+    assert again.scenes == report.scenes

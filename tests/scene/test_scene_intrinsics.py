@@ -26,19 +26,23 @@ def reconstructed(
 
 
 def true_camera(name: str, factor: float = 1.0, sigma: float = 0.0) -> tuple[str, KnownCamera]:
+    """Return a row with the image's true camera, its focal length multiplied by `factor`."""
     K = SCENE.cameras[name].K
+    focal = factor * K[0, 0]
     # COLMAP's (0, 0) is the corner of the first pixel.
-    return name, KnownCamera(
-        "SIMPLE_PINHOLE", (factor * K[0, 0], K[0, 2] + 0.5, K[1, 2] + 0.5), sigma
-    )
+    cx = K[0, 2] + 0.5
+    cy = K[1, 2] + 0.5
+    return name, KnownCamera("SIMPLE_PINHOLE", (focal, cx, cy), sigma)
 
 
-def focals(model: SfmModel) -> dict[str, float]:
-    """The focal length of each image over the true one."""
-    return {
-        found.image.name: found.focal / SCENE.cameras[found.image.name].K[0, 0]
-        for found in model.images
-    }
+def focal_ratios(model: SfmModel) -> dict[str, float]:
+    """Return each image's focal length divided by the true one."""
+    ratios = {}
+    for found in model.images:
+        name = found.image.name
+        true_focal = SCENE.cameras[name].K[0, 0]
+        ratios[name] = found.focal / true_focal
+    return ratios
 
 
 @pytest.fixture(scope="module")
@@ -48,49 +52,56 @@ def free() -> SfmModel:
 
 @pytest.mark.parametrize("sharing", [CameraSharing.AUTO, CameraSharing.FOLDER])
 def test_exact_intrinsics_stay_and_have_no_uncertainty(free, sharing):
-    # Wrong by 2 %, so that it shows whether the mapper has refined them
     names = NAMES[:3]
-    model = reconstructed([true_camera(name, 1.02) for name in names], sharing)
+    # Wrong by 2 %, so that it shows whether the mapper has refined them.
+    rows = [true_camera(name, 1.02) for name in names]
+    model = reconstructed(rows, sharing)
+    ratios = focal_ratios(model)
     for found in model.images:
         is_known = found.image.name in names
-        assert (focals(model)[found.image.name] == pytest.approx(1.02, abs=1e-9)) == is_known
-        assert (found.sigmas.focal == 0) == is_known
+        has_stayed = ratios[found.image.name] == pytest.approx(1.02, abs=1e-9)
+        assert has_stayed == is_known, found.image.name
+        assert (found.sigmas.focal == 0) == is_known, found.image.name
 
 
 def test_intrinsics_that_are_all_exact_leave_less_uncertainty(free):
-    model = reconstructed([true_camera(name) for name in NAMES])
-    assert focals(model) == pytest.approx(dict.fromkeys(NAMES, 1.0), abs=1e-9)
+    rows = [true_camera(name) for name in NAMES]
+    model = reconstructed(rows)
+    assert focal_ratios(model) == pytest.approx(dict.fromkeys(NAMES, 1.0), abs=1e-9)
+
+    def mean_sigma(model: SfmModel, field: str) -> float:
+        return float(np.mean([getattr(found.sigmas, field) for found in model.images]))
+
     for field in ("rotation", "centre"):
-        known, unknown = (
-            np.mean([getattr(each.sigmas, field) for each in made.images]) for made in (model, free)
-        )
-        assert known < unknown
+        assert mean_sigma(model, field) < mean_sigma(free, field), field
 
 
-def test_a_prior_pulls_a_focal_length_as_far_as_its_deviation_allows(free):
+# Sigmas in percent: a prior of 0.01 % decides alone, one of 100 % has no effect.
+@pytest.mark.parametrize(("sigma", "is_decisive"), [(0.01, True), (100.0, False)])
+def test_a_prior_pulls_a_focal_length_as_far_as_its_deviation_allows(free, sigma, is_decisive):
     name = NAMES[2]
-    start = focals(free)[name]
-    # A prior of 0.01 % decides alone, one of 100 % says nothing.
-    pulled = {
-        sigma: focals(reconstructed([true_camera(name, 1.1, sigma)]))[name]
-        for sigma in (0.01, 100.0)
-    }
-    assert pulled[0.01] == pytest.approx(1.1, abs=2e-3)
-    assert pulled[100.0] == pytest.approx(start, abs=2e-3)
-    # Two measurements together are better than the prior alone.
-    model = reconstructed([true_camera(name, 1.0, 0.1)])
+    # 10 % from the truth, far more than the scene alone is wrong.
+    model = reconstructed([true_camera(name, 1.1, sigma)])
+    expected = 1.1 if is_decisive else focal_ratios(free)[name]
+    assert focal_ratios(model)[name] == pytest.approx(expected, abs=2e-3)
+
+
+def test_a_prior_and_the_scene_together_are_less_uncertain_than_the_prior_alone():
+    name = NAMES[2]
+    prior_sigma = 0.1  # percent
+    model = reconstructed([true_camera(name, 1.0, prior_sigma)])
     (sigma,) = (found.sigmas.focal for found in model.images if found.image.name == name)
-    assert 0 < sigma < 0.1
+    assert 0 < sigma < prior_sigma
 
 
 def test_distortion_is_part_of_verification_and_of_the_model(tmp_path):
-    known = [
-        (
-            name,
-            KnownCamera("OPENCV", (K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5, 1e-4, 0, 0, 0)),
-        )
-        for name, K in ((name, SCENE.cameras[name].K) for name in NAMES)
-    ]
+    known = []
+    for name in NAMES:
+        K = SCENE.cameras[name].K
+        # The synthetic points have no distortion, so k1 is small: matches still agree with it.
+        distortion = (1e-4, 0, 0, 0)
+        pinhole = (K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5)
+        known.append((name, KnownCamera("OPENCV", (*pinhole, *distortion))))
     config = SceneConfig(intrinsics=written(known))
     reconstruct_sharing(ViewGraph.of_pairs(SCENE.pairs), config, tmp_path)
     with pycolmap.Database.open(str(tmp_path / "database.db")) as database:
@@ -99,21 +110,33 @@ def test_distortion_is_part_of_verification_and_of_the_model(tmp_path):
     assert {camera.model.name for camera in cameras} == {"OPENCV"}
     assert geometry.config == pycolmap.TwoViewGeometryConfiguration.CALIBRATED.value
     model = pycolmap.Reconstruction(tmp_path / "models" / "0")
+    cameras_by_name = dict(known)
     for image in model.images.values():
-        np.testing.assert_array_equal(image.camera.params, dict(known)[image.name].parameters)
+        expected = cameras_by_name[image.name].parameters
+        np.testing.assert_array_equal(image.camera.params, expected)
 
 
 def test_a_row_names_an_image_by_its_path_its_name_or_a_pattern():
-    rows = [
-        parse_row(pattern, "SIMPLE_PINHOLE", f"{focal} 10 10", "fixed")
-        for focal, pattern in enumerate(
-            ("set/a.jpg", "b.jpg", "[c].jpg", "set/*", "*.png"), start=1
-        )
-    ]
-    # [c].jpg is a name and a pattern; the first row that fits counts.
-    names = ["set/a.jpg", "x/b.jpg", "[c].jpg", "c.jpg", "set/z.jpg", "y/z.png", "z.jpg"]
-    found = [camera_of(rows, name) for name in names]
-    assert [camera and camera.focal for camera in found] == [1, 2, 3, 3, 4, 5, None]
+    # The focal length is the row's number.
+    rows = []
+    for number, pattern in enumerate(["set/a.jpg", "b.jpg", "[c].jpg", "set/*", "*.png"], start=1):
+        rows.append(parse_row(pattern, "SIMPLE_PINHOLE", f"{number} 10 10", "fixed"))
+    # The first row that fits counts.
+    expected = {
+        "set/a.jpg": 1,
+        "x/b.jpg": 2,
+        # [c].jpg is a name and a pattern.
+        "[c].jpg": 3,
+        "c.jpg": 3,
+        "set/z.jpg": 4,
+        "y/z.png": 5,
+        "z.jpg": None,
+    }
+    found = {}
+    for name in expected:
+        camera = camera_of(rows, name)
+        found[name] = None if camera is None else camera.focal
+    assert found == expected
     assert read(written(rows)) == rows
 
 
@@ -141,8 +164,10 @@ def test_the_models_have_the_parameters_of_colmap():
     for name, parameters in MODELS.items():
         camera = pycolmap.Camera.create_from_model_name(1, name, 500.0, 640, 480)
         assert len(camera.params) == len(parameters)
-        assert camera.params_info.replace(" ", "").split(",") == list(parameters)
+        colmap_parameters = camera.params_info.replace(" ", "").split(",")
+        assert colmap_parameters == list(parameters)
 
 
 def test_deviations_combine_as_those_of_independent_measurements():
+    # Weights add: 1 / 9 + 1 / 16 = 1 / 2.4**2.
     assert combined(3.0, 4.0) == pytest.approx(2.4)
