@@ -40,17 +40,23 @@ def scene() -> SyntheticScene:
 
 
 def pair_of(names: str, matches: Matches) -> BatchPair:
-    return BatchPair(*(BatchImage(name, f"digest {name}", SIZE) for name in names), matches)
+    """Return a pair of two images, each named by one character."""
+    image0, image1 = (BatchImage(name, f"digest {name}", SIZE) for name in names)
+    return BatchPair(image0, image1, matches)
 
 
 def distances(solution: Solution, scene: SyntheticScene) -> list[float]:
-    """How far true correspondences are from the F that each pair got, in pixels; infinite without
-    an F.
+    """Return each pair's median distance of true correspondences under its F, in pixels.
+
+    Infinite without an F.
     """
-    return [
-        np.inf if choice.F is None else scene.median_distance(choice.F, pair)
-        for choice, pair in zip(solution.choices, scene.pairs, strict=True)
-    ]
+    found = []
+    for choice, pair in zip(solution.choices, scene.pairs, strict=True):
+        if choice.F is None:
+            found.append(np.inf)
+        else:
+            found.append(scene.median_distance(choice.F, pair))
+    return found
 
 
 def test_cameras_are_right_in_spite_of_noise_and_wrong_matches(scene):
@@ -58,23 +64,26 @@ def test_cameras_are_right_in_spite_of_noise_and_wrong_matches(scene):
     (found,) = solution.reconstructions
     assert (found.registered, found.failure) == (6, "")
     assert max(distances(solution, scene)) < 0.5
+    # Pixel centres are at integers, so the middle of 800 pixels is at 399.5.
+    middle = [SIZE.width / 2 - 0.5, SIZE.height / 2 - 0.5]
+    registered = registered_images(solution)
     for image in scene.images:
-        registered = registered_images(solution)[image.digest]
-        assert registered.focal == pytest.approx(scene.cameras[image.name].K[0, 0], rel=0.03)
-        assert registered.camera.K[:2, 2].tolist() == [SIZE.width / 2 - 0.5, SIZE.height / 2 - 0.5]
-        assert registered.points > 50
+        found_image = registered[image.digest]
+        true_focal = scene.cameras[image.name].K[0, 0]
+        assert found_image.focal == pytest.approx(true_focal, rel=0.03)
+        assert found_image.camera.K[:2, 2].tolist() == middle
+        assert found_image.points > 50
     (model,) = found.models
     assert 0.1 < model.reprojection_error < 1
     assert len(model.points) > 200
 
 
 def test_the_same_batch_gives_the_same_bytes_through_a_pipe_too(scene):
-    # As a worker's process receives them
+    # As a worker's process receives them.
     piped = pickle.loads(pickle.dumps(scene.pairs))
-    first, again = (
-        pickle.dumps(reconstruct_batch(pairs, SceneConfig())) for pairs in (scene.pairs, piped)
-    )
-    assert first == again
+    first = reconstruct_batch(scene.pairs, SceneConfig())
+    again = reconstruct_batch(piped, SceneConfig())
+    assert pickle.dumps(first) == pickle.dumps(again)
 
 
 def test_points_of_a_dense_matcher_make_tracks(scene):
@@ -85,8 +94,11 @@ def test_points_of_a_dense_matcher_make_tracks(scene):
     pairs = []
     for pair in scene.pairs:
         world = front(rng, 8000)
-        seen = [see(rng, camera, world, 0.3) for camera in scene.true_cameras(pair)]
-        pairs.append(replace(pair, matches=match(rng, *seen, 0.1, None)))
+        camera0, camera1 = scene.true_cameras(pair)
+        seen0 = see(rng, camera0, world, 0.3)
+        seen1 = see(rng, camera1, world, 0.3)
+        dense = match(rng, seen0, seen1, 0.1, None)
+        pairs.append(replace(pair, matches=dense))
     solution = reconstruct_batch(pairs, SceneConfig())
     (found,) = solution.reconstructions
     assert (found.registered, found.failure) == (6, "")
@@ -95,20 +107,30 @@ def test_points_of_a_dense_matcher_make_tracks(scene):
 
 @pytest.mark.parametrize("count", [3, 0])
 def test_a_pair_with_few_matches_or_none_gets_the_scenes_fundamental(scene, count):
-    # Its images have cameras by their other pairs.
-    few = replace(scene.pairs[0], matches=scene.pairs[0].matches[:count])
-    choice = reconstruct_batch((few, *scene.pairs[1:]), SceneConfig()).choices[0]
+    first, *others = scene.pairs
+    few = replace(first, matches=first.matches[:count])
+    # The images of this pair have cameras by their other pairs.
+    solution = reconstruct_batch((few, *others), SceneConfig())
+    choice = solution.choices[0]
     assert choice.from_scene
     assert scene.median_distance(choice.F, few) < 0.5
 
 
 def test_a_pair_that_the_scene_lacks_is_estimated_at_its_focal_lengths(scene):
     last = scene.images[-1]
-    inside = [pair for pair in scene.pairs if last not in (pair.image0, pair.image1)]
-    outside = next(pair for pair in scene.pairs if last in (pair.image0, pair.image1))
-    # Enough for an F at a known focal length
-    few = replace(outside, matches=outside.matches[:14])  # too few to place the image
-    pairs = (few, replace(few, matches=few.matches[:3]), *inside)
+    inside = []
+    outside = []
+    for pair in scene.pairs:
+        if last in (pair.image0, pair.image1):
+            outside.append(pair)
+        else:
+            inside.append(pair)
+    matches = outside[0].matches
+    # 14 are too few to register the image, but enough for an F at a known focal length.
+    few = replace(outside[0], matches=matches[:14])
+    # 3 are too few for any F.
+    too_few = replace(outside[0], matches=matches[:3])
+    pairs = (few, too_few, *inside)
     magsac = RobustConfig(permutations=1, max_iterations=2000)
     solution = reconstruct_batch(pairs, SceneConfig(), FocalConfig(), magsac)
     found, hopeless, *others = solution.choices
@@ -134,26 +156,40 @@ def test_a_pair_whose_matches_agree_on_something_else_keeps_its_own(scene):
     stays.
     """
     pair = scene.pairs[-1]
-    shifted = replace(pair.matches, points1=pair.matches.points0 + np.array([0, 90], np.float32))
+    shift = np.array([0, 90], np.float32)
+    shifted = replace(pair.matches, points1=pair.matches.points0 + shift)
     # F of a shift along y: its lines are the columns.
-    columns = np.array([[0, 0, 1], [0, 0, 0], [-1, 0, 0]]) / np.sqrt(2)
-    pairs = (*scene.pairs[:-1], replace(pair, matches=shifted, pair_fundamental=columns))
+    F = np.array(
+        [
+            [0, 0, 1],
+            [0, 0, 0],
+            [-1, 0, 0],
+        ]
+    )
+    F = F / np.sqrt(2)
+    repeated = replace(pair, matches=shifted, pair_fundamental=F)
+    pairs = (*scene.pairs[:-1], repeated)
     solution = reconstruct_batch(pairs, SceneConfig(), FocalConfig())
-    assert (solution.choices[-1].reason, solution.choices[-1].F) == (Reason.CONTRADICTION, None)
-    assert all(choice.from_scene for choice in solution.choices[:-1])
+    *others, last = solution.choices
+    assert (last.reason, last.F) == (Reason.CONTRADICTION, None)
+    assert all(choice.from_scene for choice in others)
 
 
 def test_too_few_pairs_or_matches_make_no_scene(scene):
-    # Three images on a chain
-    two = tuple(pair for pair in scene.pairs if pair.image0 == scene.pairs[0].image0)[:2]
-    (found,) = reconstruct_batch(two, SceneConfig()).reconstructions
+    # Two pairs of one image: three images on a chain.
+    first = scene.images[0]
+    of_first = [pair for pair in scene.pairs if pair.image0 == first]
+    chain = of_first[:2]
+    (found,) = reconstruct_batch(chain, SceneConfig()).reconstructions
     assert found.failure == (
         "2 matched pairs connect 3 images, and reliable cameras need 5; more overlapping images would help"
     )
-    for none in ([], [pair_of("01", Matches.empty())]):
-        assert reconstruct_batch(none, SceneConfig()).reconstructions == ()
+    unmatched = pair_of("01", Matches.empty())
+    for pairs in ([], [unmatched]):
+        assert reconstruct_batch(pairs, SceneConfig()).reconstructions == ()
 
 
+# 60 matches: far more than the number below which a pair is ignored.
 POINTS, OTHERS = np.random.default_rng(0).uniform(10, 500, (2, 60, 2))
 LINE = np.column_stack([POINTS[:, 0], POINTS[:, 0]])
 DEGENERATE = {
@@ -161,17 +197,18 @@ DEGENERATE = {
     "one point": (np.full((60, 2), 50.0), np.full((60, 2), 60.0)),
     "a line": (LINE, LINE + 5),
     "the same places": (POINTS, POINTS),
-    # Of a plane, or a camera that only turned
+    # Of a plane, or a camera that only turned.
     "a homography": (POINTS, POINTS[:, ::-1] * 0.9 + 20),
 }
 
 
 @pytest.mark.parametrize("kind", DEGENERATE)
 def test_degenerate_matches_give_a_reason(kind):
-    matches = Matches(*DEGENERATE[kind], np.ones(60))
-    solution = reconstruct_batch(
-        [pair_of(names, matches) for names in ("01", "12", "02", "23")], SceneConfig()
-    )
+    points0, points1 = DEGENERATE[kind]
+    matches = Matches(points0, points1, np.ones(60))
+    # A triangle and a fourth image.
+    pairs = [pair_of(names, matches) for names in ("01", "12", "02", "23")]
+    solution = reconstruct_batch(pairs, SceneConfig())
     (found,) = solution.reconstructions
     assert found.models or found.failure
     for choice in solution.choices:
@@ -185,13 +222,15 @@ def test_a_missing_or_broken_pycolmap_is_a_reason(scene, monkeypatch, is_missing
         raise RuntimeError("disk I/O error")
 
     if is_missing:
+        # Without its entry, the module is imported again, and its import of pycolmap fails.
         monkeypatch.delitem(sys.modules, "mkpc_kaggle.scene.colmap", raising=False)
         monkeypatch.setitem(sys.modules, "pycolmap", None)
+        expected = "pycolmap cannot be imported"
     else:
         monkeypatch.setattr(colmap, "structure_from_motion", broken)
+        expected = "pycolmap failed: disk I/O error"
     solution = reconstruct_batch(scene.pairs, SceneConfig())
-    told = "pycolmap cannot be imported" if is_missing else "pycolmap failed: disk I/O error"
-    assert told in solution.reconstructions[0].failure
+    assert expected in solution.reconstructions[0].failure
     assert {choice.reason for choice in solution.choices} == {Reason.UNREGISTERED}
 
 
@@ -205,17 +244,21 @@ def test_an_edge_is_verified_once_for_the_same_cameras_on_any_number_of_threads(
         calls.append(arguments)
         return estimate(*arguments)
 
-    # The scene, and its files, ask for all geometries.
     monkeypatch.setattr(colmap.pycolmap, "estimate_two_view_geometry", counted)
+    # A second reconstruction with shared intrinsics would have other cameras.
+    config = SceneConfig(cameras=CameraSharing.IMAGE)
     written = []
     for threads in (1, 4):
-        monkeypatch.setattr(colmap, "ThreadPoolExecutor", partial(ThreadPoolExecutor, threads))
+        executor = partial(ThreadPoolExecutor, threads)
+        monkeypatch.setattr(colmap, "ThreadPoolExecutor", executor)
         calls.clear()
         out = tmp_path / str(threads)
-        reconstruct_batch(scene.pairs, SceneConfig(cameras=CameraSharing.IMAGE), export=out)
+        # Both the scene and its files use all geometries.
+        reconstruct_batch(scene.pairs, config, export=out)
         assert len(calls) == len(scene.pairs)
         with closing(sqlite3.connect(out / "database.db")) as database:
-            written.append([*database.iterdump()])
+            dump = list(database.iterdump())
+        written.append(dump)
     assert written[0] == written[1]
 
 

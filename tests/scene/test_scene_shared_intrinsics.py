@@ -34,19 +34,22 @@ def images(count: int, size: Size = WIDE, prefix: str = "") -> list[BatchImage]:
 def model(
     registered: Sequence[BatchImage], focals: Sequence[float], points: Sequence[int] = ()
 ) -> SfmModel:
-    found = [
-        RegisteredImage(image, Camera(np.diag([focal, focal, 1.0]), np.eye(3), np.zeros(3)), seen)
-        for image, focal, seen in zip(
-            registered, focals, points or [100] * len(focals), strict=True
-        )
-    ]
+    """Return a model of images with these focal lengths and numbers of points, by default 100."""
+    points = points or [100] * len(focals)
+    found = []
+    for image, focal, seen in zip(registered, focals, points, strict=True):
+        # Only the focal length and the number of points decide; poses do not.
+        K = np.diag([focal, focal, 1.0])
+        camera = Camera(K, np.eye(3), np.zeros(3))
+        found.append(RegisteredImage(image, camera, seen))
     return SfmModel(tuple(found), np.zeros((0, 3)), 0.5)
 
 
 def shared(*focals: float, points: Sequence[int] = ()) -> dict[str, float]:
-    """By digest, the shared focal length of wide images, each found to have its own."""
+    """Return the shared focal length by digest, of wide images reconstructed with these."""
     every = images(len(focals))
-    return dict(shared_intrinsics(every, [model(every, focals, points)]))
+    reconstructed = model(every, focals, points)
+    return dict(shared_intrinsics(every, [reconstructed]))
 
 
 @pytest.mark.parametrize(
@@ -72,32 +75,35 @@ def test_most_images_of_a_size_tell_its_focal_length(focals, points, expected):
 
 
 def test_an_image_without_a_camera_shares_that_of_its_size():
-    every = [*images(6), *images(1, TALL, "tall")]
-    found = shared_intrinsics(every, [model(every[:5], [FOCAL] * 5)])
+    wide = images(6)
+    tall = images(1, TALL, "tall")
+    # Neither the sixth wide image nor the tall one is registered.
+    registered = model(wide[:5], [FOCAL] * 5)
+    found = shared_intrinsics([*wide, *tall], [registered])
     assert found == dict.fromkeys("012345", FOCAL)
 
 
 def focals_of(solution: Solution) -> list[float]:
-    return [
-        found.focal
-        for each in solution.reconstructions
-        for model in each.models
-        for found in model.images
-    ]
+    """Return the focal lengths of all registered images, in pixels."""
+    focals = []
+    for reconstruction in solution.reconstructions:
+        for each in reconstruction.models:
+            focals += [found.focal for found in each.images]
+    return focals
 
 
 def mean_angle(solution: Solution, scene: SyntheticScene) -> float:
-    """Between the found and the true direction from one image to the other, in degrees."""
+    """Return the mean angle between the found and the true translation of a pair, in degrees."""
     angles = []
     registered = registered_images(solution)
     for pair in scene.pairs:
-        found_cameras = [registered[image.digest].camera for image in (pair.image0, pair.image1)]
-        found, wanted = (
-            relative_pose(*both)[1] for both in (found_cameras, scene.true_cameras(pair))
-        )
-        angles.append(
-            np.degrees(np.arccos(found @ wanted / np.linalg.norm(found) / np.linalg.norm(wanted)))
-        )
+        camera0 = registered[pair.image0.digest].camera
+        camera1 = registered[pair.image1.digest].camera
+        _, found = relative_pose(camera0, camera1)
+        _, true = relative_pose(*scene.true_cameras(pair))
+        # Translations have no common scale, only a direction.
+        cosine = found @ true / np.linalg.norm(found) / np.linalg.norm(true)
+        angles.append(np.degrees(np.arccos(cosine)))
     return float(np.mean(angles))
 
 
@@ -121,14 +127,17 @@ def test_shared_intrinsics_stay_unless_they_explain_fewer_points_and_the_files_a
     everything = {image.digest: FOCAL for image in scene.images}
     monkeypatch.setattr("mkpc_kaggle.scene.reconstruct.shared_intrinsics", lambda *_: everything)
     monkeypatch.setattr("mkpc_kaggle.scene.reconstruct.MIN_OBSERVATIONS", least)
-    assert len(set(focals_of(reconstruct_batch(scene.pairs, CONFIG)))) == cameras
-    (found,), _ = reconstruct_sharing(ViewGraph.of_pairs(scene.pairs), CONFIG, tmp_path)
+    solution = reconstruct_batch(scene.pairs, CONFIG)
+    assert len(set(focals_of(solution))) == cameras
+
+    graph = ViewGraph.of_pairs(scene.pairs)
+    (found,), _ = reconstruct_sharing(graph, CONFIG, tmp_path)
     written = pycolmap.Reconstruction(tmp_path / "models" / "0").cameras.values()
-    assert {camera.focal_length for camera in written} == {
-        image.focal for image in found.models[0].images
-    }
+    written_focals = {camera.focal_length for camera in written}
+    assert written_focals == {image.focal for image in found.models[0].images}
+    assert len(written) == cameras
     with pycolmap.Database.open(str(tmp_path / "database.db")) as database:
-        assert (len(written), database.num_cameras()) == (cameras, cameras)
+        assert database.num_cameras() == cameras
 
 
 @pytest.fixture
@@ -156,17 +165,23 @@ def test_shared_intrinsics_start_from_the_poses_of_the_first_reconstruction(mapp
     assert focals_of(refined) == pytest.approx(focals_of(mapped), rel=1e-3)
     for found, other in zip(refined.choices, mapped.choices, strict=True):
         assert found.from_scene
-        assert abs(np.sum(found.F * other.F)) == pytest.approx(1, abs=1e-4)
+        # F has norm 1 and either sign, so the product of equal matrices is 1 or -1.
+        product = np.sum(found.F * other.F)
+        assert abs(product) == pytest.approx(1, abs=1e-4)
 
 
 def test_an_incomplete_reconstruction_is_mapped_again_with_shared_intrinsics(mappings):
     scene = synthetic_scene(7, points=300, focals=[FOCAL] * 7)
-    # It matches an image of the scene, and nothing of the scene is in it.
-    stray = BatchImage("stray", "stray", scene.images[0].size)
-    points = np.random.default_rng(0).uniform(0, 600, (2, 40, 2)).astype(np.float32)
-    wrong = BatchPair(scene.images[0], stray, Matches(*points, np.ones(40, np.float32)))
+    first = scene.images[0]
+    # Random matches connect it with the scene, but no camera explains them.
+    stray = BatchImage("stray", "stray", first.size)
+    random = np.random.default_rng(0).uniform(0, 600, (2, 40, 2))
+    points0, points1 = random.astype(np.float32)
+    matches = Matches(points0, points1, np.ones(40, np.float32))
+    wrong = BatchPair(first, stray, matches)
     (found,) = reconstruct_batch([*scene.pairs, wrong], CONFIG).reconstructions
-    assert (found.registered, mappings) == (7, [8, 8])
+    assert found.registered == 7
+    assert mappings == [8, 8]
 
 
 def test_poses_with_which_images_see_fewer_points_are_mapped_again(mappings, monkeypatch):
@@ -174,13 +189,17 @@ def test_poses_with_which_images_see_fewer_points_are_mapped_again(mappings, mon
     # The images have different focal lengths, so no poses fit a shared one.
     everything = {image.digest: FOCAL for image in scene.images}
     monkeypatch.setattr("mkpc_kaggle.scene.reconstruct.shared_intrinsics", lambda *_: everything)
-    assert len(set(focals_of(reconstruct_batch(scene.pairs, CONFIG)))) == 6
+    solution = reconstruct_batch(scene.pairs, CONFIG)
+    assert len(set(focals_of(solution))) == 6
     assert mappings == [6, 6]
 
 
 def test_an_image_that_the_scene_lacks_has_the_shared_focal_length():
-    pair = synthetic_scene(2, points=300, focals=[FOCAL] * 2).pairs[0]
-    settings = FocalConfig(), RobustConfig(permutations=1, max_iterations=2000)
+    scene = synthetic_scene(2, points=300, focals=[FOCAL] * 2)
+    (pair,) = scene.pairs
+    focal = FocalConfig()
+    # Fewer trials than the default: whether there is an F does not depend on them.
+    magsac = RobustConfig(permutations=1, max_iterations=2000)
     both = {pair.image0.digest: FOCAL, pair.image1.digest: FOCAL}
-    assert estimate_at_known_focals(pair, both, *settings) is not None
-    assert estimate_at_known_focals(pair, {}, *settings) is None
+    assert estimate_at_known_focals(pair, both, focal, magsac) is not None
+    assert estimate_at_known_focals(pair, {}, focal, magsac) is None
