@@ -49,8 +49,16 @@ def look_at(
     # Pixel centres are at integers, so the middle of n pixels is at (n - 1) / 2.
     centre_x = (width - 1) / 2
     centre_y = (height - 1) / 2
-    K = np.array([[focal, 0, centre_x], [0, focal, centre_y], [0, 0, 1]], dtype=np.float64)
-    return SizedCamera(K, R, -R @ centre, width, height)
+    K = np.array(
+        [
+            [focal, 0, centre_x],
+            [0, focal, centre_y],
+            [0, 0, 1],
+        ],
+        dtype=np.float64,
+    )
+    t = -R @ centre
+    return SizedCamera(K, R, t, width, height)
 
 
 def resized(camera: SizedCamera, scale: float) -> SizedCamera:
@@ -60,7 +68,13 @@ def resized(camera: SizedCamera, scale: float) -> SizedCamera:
     half a pixel on the right and at the bottom.
     """
     offset = (scale - 1) / 2  # (x + 0.5) s - 0.5 = s x + (s - 1) / 2
-    to_resized = np.array([[scale, 0, offset], [0, scale, offset], [0, 0, 1]])
+    to_resized = np.array(
+        [
+            [scale, 0, offset],
+            [0, scale, offset],
+            [0, 0, 1],
+        ]
+    )
     width = max(1, round(camera.width * scale))
     height = max(1, round(camera.height * scale))
     return replace(camera, K=to_resized @ camera.K, width=width, height=height)
@@ -71,7 +85,8 @@ def project(camera: SizedCamera, points: Floats) -> tuple[Floats, Floats]:
 
     Pixels of depth <= 0 are undefined.
     """
-    image = (points @ camera.R.T + camera.t) @ camera.K.T
+    in_camera = points @ camera.R.T + camera.t
+    image = in_camera @ camera.K.T
     depth = image[:, 2]
     # No division by zero: NumPy would warn, and callers ignore these pixels.
     divisor = np.where(depth == 0, np.finfo(np.float64).tiny, depth)

@@ -77,10 +77,12 @@ def _draw(
     axes = np.column_stack([surface.edge_u, surface.edge_v, surface.origin - camera.centre])
     A = np.linalg.inv(camera.K @ camera.R @ axes).astype(np.float32)
     y, x = (axis.astype(np.float32) for axis in np.ogrid[rows, columns])
+    # x is a row and y a column, so only the outer sum has the size of the image.
     u, v, inverse = (row[0] * x + (row[1] * y + row[2]) for row in A)
-    is_nearest = inverse > nearness[rows, columns]
+    hit = inverse > nearness[rows, columns]
     # 0 <= u <= 1 and 0 <= v <= 1, all divided by the depth.
-    hit = is_nearest & (u >= 0) & (u <= inverse) & (v >= 0) & (v <= inverse)
+    hit &= (u >= 0) & (u <= inverse)
+    hit &= (v >= 0) & (v <= inverse)
     if not hit.any():
         return
     np.copyto(nearness[rows, columns], inverse, where=hit)

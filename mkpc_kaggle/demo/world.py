@@ -98,9 +98,23 @@ def box(rng: np.random.Generator, centre: Floats, size: Floats, yaw: float) -> l
     cos = np.cos(np.radians(yaw))
     sin = np.sin(np.radians(yaw))
     # The four corners (4, 2) of the ground plan, counter-clockwise from above.
-    signs = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
-    turn = np.array([[cos, sin], [-sin, cos]])  # of rows
-    corners = signs * (width / 2, depth / 2) @ turn + centre
+    signs = np.array(
+        [
+            [-1, -1],
+            [1, -1],
+            [1, 1],
+            [-1, 1],
+        ]
+    )
+    # For points as rows, so it is the transpose of the usual rotation.
+    turn = np.array(
+        [
+            [cos, sin],
+            [-sin, cos],
+        ]
+    )
+    unturned = signs * (width / 2, depth / 2)
+    corners = unturned @ turn + centre
     low = np.column_stack([corners, np.full(4, 0.0)])
     high = np.column_stack([corners, np.full(4, height)])
 
@@ -144,12 +158,18 @@ def paint(
     height = max(16, round(height_m * scale))
     picture = np.full((height, width, 3), colour, dtype=np.uint8)
     count = width * height // 60
-    max_side_m = 1.2 if is_stone else 0.9
-    max_aspect = 0.6 if is_stone else 1
+    if is_stone:
+        max_side_m = 1.2
+        max_aspect = 0.6
+        contrast = 0.06
+    else:
+        max_side_m = 0.9
+        max_aspect = 1.0
+        contrast = 0.4
     sides = _leaf_sides(rng, count, max_side_m * scale, max_aspect)
     centres = rng.uniform((0, 0), (width, height), (count, 2))
     angles = rng.uniform(0, 180, count)
-    tones = _leaf_tones(rng, count, colour, 0.06 if is_stone else 0.4)
+    tones = _leaf_tones(rng, count, colour, contrast)
     for centre, side, angle, tone in zip(centres, sides, angles, tones, strict=True):
         if is_stone:
             low = (centre - side / 2).astype(int)
@@ -192,7 +212,8 @@ def facade(rng: np.random.Generator, width_m: float, height_m: float, colour: Co
     w = int(window_w * scale)
     h = int(window_h * scale)
     # One pane for all windows: repetition is what makes facades hard to match.
-    pane = cv2.resize(paint(rng, window_w, window_h, GLASS), (w, h))
+    glass = paint(rng, window_w, window_h, GLASS)
+    pane = cv2.resize(glass, (w, h))
     # The first windows are 1.2 m above the ground and from the left edge.
     for z in np.arange(1.2, height_m - window_h, WINDOW_STEP_M):
         for x in np.arange(1.2, width_m - window_w, WINDOW_STEP_M):

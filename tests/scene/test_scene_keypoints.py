@@ -50,7 +50,16 @@ def test_a_keypoint_is_the_mean_of_its_points_and_near_each_of_them(points):
 
 def test_a_keypoint_is_matched_once_and_to_what_was_found_most_often():
     # Keypoint 0 was matched to 6 twice, to 5 once. Both matches of 2 were found once.
-    index = np.array([[0, 5], [0, 6], [0, 6], [1, 6], [2, 7], [2, 8]])
+    index = np.array(
+        [
+            [0, 5],
+            [0, 6],
+            [0, 6],
+            [1, 6],
+            [2, 7],
+            [2, 8],
+        ]
+    )
     assert one_to_one(index).tolist() == [[0, 6], [2, 7]]
     nothing = np.zeros((0, 2), np.intp)
     assert one_to_one(nothing).shape == (0, 2)
@@ -105,13 +114,19 @@ def test_components_are_connected_by_pairs_with_enough_matches():
         return Edge(first, second, Matches(points, points, np.zeros(count)))
 
     # Four matches are too few to connect 3 and 5; 15 are just enough.
-    edges = (edge(1, 3, 20), edge(1, 4, 20), edge(3, 5, 4), edge(5, 6, 15))
-    found = ViewGraph(tuple(map(image, "ABCDEFGH")), edges).components()
-    names = ["".join(each.name for each in graph.images) for graph in found]
-    assert names == ["BDE", "FG"]
+    edges = (
+        edge(1, 3, 20),
+        edge(1, 4, 20),
+        edge(3, 5, 4),
+        edge(5, 6, 15),
+    )
+    images = tuple(image(name) for name in "ABCDEFGH")
+    large, small = ViewGraph(images, edges).components()
+    assert [found.name for found in large.images] == ["B", "D", "E"]
+    assert [found.name for found in small.images] == ["F", "G"]
     # Images are renumbered within a component.
-    ends = [[(edge.first, edge.second) for edge in graph.edges] for graph in found]
-    assert ends == [[(0, 1), (0, 2)], [(0, 1)]]
+    assert [(found.first, found.second) for found in large.edges] == [(0, 1), (0, 2)]
+    assert [(found.first, found.second) for found in small.edges] == [(0, 1)]
     assert ViewGraph((image("A"),), ()).components() == ()
     assert ViewGraph((), ()).components() == ()
 
