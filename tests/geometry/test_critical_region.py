@@ -204,7 +204,10 @@ def clumps(rng, n):
     width = 10.0 ** np.linspace(-4, -1.7, 6)
     clump = rng.integers(6, size=n)
     points = centre[clump] + rng.normal(size=(n, 2)) * width[clump, None]
-    points[:5] = [(0.95, 0.1 + 0.2 * i) for i in range(5)]
+    # The noise: 0.2 apart, so none is within eps of another.
+    noise_y = 0.1 + 0.2 * np.arange(5)
+    points[:5, 0] = 0.95
+    points[:5, 1] = noise_y
     return points
 
 

@@ -30,20 +30,23 @@ def test_right_matches_support_their_f_among_any_number_of_wrong_ones(wrong):
 def test_wrong_matches_alone_do_not_support_the_best_f_that_is_found(wrong):
     # F is fitted to the wrong matches themselves: any F finds inliers among 5,000.
     matches = rectified(0, wrong)
-    assert support(estimate(matches, QUICK).matrix, matches) < MIN_SUPPORT
+    F = estimate(matches, QUICK).matrix
+    assert support(F, matches) < MIN_SUPPORT
 
 
 def test_thousands_of_inliers_in_one_spot_are_no_support():
     # All points are within 3 pixels, so shuffled matches agree with F just as often.
     matches = rectified(2000, 0, box=(3, 3))
-    assert (np.abs(matches.points0[:, 1] - matches.points1[:, 1]) < 1).all()
+    rows_apart = np.abs(matches.points0[:, 1] - matches.points1[:, 1])
+    assert (rows_apart < 1).all()
     assert support(FALLBACK_FUNDAMENTAL, matches) < MIN_SUPPORT
 
 
 def test_duplicates_count_once_and_fewer_than_eight_matches_are_no_support():
     matches = rectified(200, 60)
+    repeated = Matches.concatenate([matches, matches, matches])
     once = support(FALLBACK_FUNDAMENTAL, matches)
-    thrice = support(FALLBACK_FUNDAMENTAL, Matches.concatenate([matches] * 3))
+    thrice = support(FALLBACK_FUNDAMENTAL, repeated)
     assert once == thrice
     # Seven matches always have an F that fits them.
     for count in (0, 1, 7):

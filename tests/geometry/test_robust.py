@@ -49,8 +49,10 @@ def cameras(seed):
             [0, 0, 1],
         ]
     )
-    R0 = cv2.Rodrigues(rng.uniform(-0.15, 0.15, 3))[0]
-    R1 = cv2.Rodrigues(rng.uniform(-0.15, 0.15, 3))[0]
+    # Turned by up to 15 degrees: both cameras look at the points of `seen`.
+    R0, _ = cv2.Rodrigues(rng.uniform(-0.15, 0.15, 3))
+    R1, _ = cv2.Rodrigues(rng.uniform(-0.15, 0.15, 3))
+    # The baseline is mostly along x, and never zero.
     t = np.array([1.0, *rng.uniform(-0.5, 0.5, 2)])
     return Camera(K0, R0, np.zeros(3)), Camera(K1, R1, t)
 
@@ -67,6 +69,7 @@ def seen(seed, n, *, plane=False):
 
 
 def wild(seed, n):
+    """n wrong matches, anywhere in both images."""
     rng = np.random.default_rng(seed + 200)
     points0 = rng.uniform(0, (WIDTH, HEIGHT), (n, 2))
     points1 = rng.uniform(0, (WIDTH, HEIGHT), (n, 2))
@@ -92,8 +95,11 @@ def estimated(model, matches, config=DEFAULT, seed=0):
 def assert_agrees(result, truth):
     assert result.ok
     assert np.linalg.norm(result.matrix) == UNIT
-    assert (result.inliers & truth).sum() >= 0.97 * truth.sum()
-    assert (result.inliers & ~truth).sum() <= 0.05 * (~truth).sum()
+    found_share = result.inliers[truth].mean()
+    assert found_share >= 0.97
+    # A wrong match can lie on its epipolar line by chance.
+    wrong_share = result.inliers[~truth].mean()
+    assert wrong_share <= 0.05
 
 
 def assert_fallback(result, model, count):
