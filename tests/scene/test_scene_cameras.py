@@ -1,6 +1,4 @@
-"""The focal lengths that cameras start with, by EXIF or not, and the cameras that images are told
-to share.
-"""
+"""Initial focal lengths, with and without EXIF, and cameras that several images share."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -25,7 +25,7 @@ def scene() -> SyntheticScene:
 
 
 def model(cameras: dict[str, Camera], points: int = 100) -> SfmModel:
-    """Return a model with these cameras by name, each of which sees all points."""
+    """Return a model with these cameras by name. Each camera sees all points."""
     registered = []
     for name, camera in cameras.items():
         image = BatchImage(name, f"digest of {name}", SIZE)

@@ -1,4 +1,4 @@
-"""Extra pairs: which they are, and what a run makes of them."""
+"""Extra pairs: their choice, and their effect on a run."""
 
 from dataclasses import replace
 from itertools import combinations

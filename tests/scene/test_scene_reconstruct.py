@@ -1,6 +1,4 @@
-"""Reconstruction of small synthetic scenes: right cameras, the same bytes, and a reason whenever
-there is none.
-"""
+"""Reconstruction of small synthetic scenes: right cameras, the same bytes, reasons of failures."""
 
 import pickle
 import sqlite3

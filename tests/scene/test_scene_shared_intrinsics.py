@@ -56,17 +56,17 @@ def shared(*focals: float, points: Sequence[int] = ()) -> dict[str, float]:
     ("focals", "points", "expected"),
     [
         ((838, 839, 840, 841, 842), (), dict.fromkeys("01234", 840)),
-        # With few points, an image shares the camera whatever its focal length; with many, it had
-        # another zoom.
+        # Few points say little: the image shares the camera at any focal length. With many
+        # points, another focal length is another zoom.
         ((838, 840, 841, 2900, 880), (100, 100, 100, 4, 49), dict.fromkeys("01234", 841)),
         ((838, 840, 841, 420, 842), (100, 100, 100, 90, 100), dict.fromkeys("0124", 840)),
         ((), (), {}),
-        # Too few images to tell
+        # Four images of a size are one too few.
         ((FOCAL,) * 4, (), {}),
         # Two cameras with half of the images each
         ((840, 840, 840, 900, 900, 900), (), {}),
         ((600, 700, 840, 950, 1100), (), {}),
-        # What no camera has
+        # Impossible focal lengths
         ((-840,) * 3 + (np.nan,) * 3, (), {}),
     ],
 )
