@@ -113,16 +113,17 @@ def _restore_scenes(state: State, store: Store, former: Table, digests: Mapping[
         used = key if key in about else former.scenes.get(batch, "")
         if used not in about:
             continue  # the batch stays stale
+        if not _has_images(about[used], digests):
+            continue
         record = SCENE.of_json(about[used]["scene"])
+        state.use_scene(batch, used, record)
+        is_current = used == key
         if directory := state.request.exports.get(batch):
-            # A scene without its COLMAP files is made again.
+            # A scene without its COLMAP files is made again. Until then its cameras are used.
             has_mark = marks.get(EXPORT + batch) == used
-            if not has_mark or not has_files(directory, len(record.models)):
-                continue
-        if _has_images(about[used], digests):
-            state.use_scene(batch, used, record)
-            if used == key:
-                state.stale.discard(batch)
+            is_current &= has_mark and has_files(directory, len(record.models))
+        if is_current:
+            state.stale.discard(batch)
 
 
 def _has_images(about: Mapping[str, Any], digests: Mapping[str, str]) -> bool:

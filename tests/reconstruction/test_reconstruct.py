@@ -265,6 +265,20 @@ def test_models_of_images_that_have_changed_do_not_outlive_a_run_without_cameras
     assert not any((out / name).exists() for name in ("models", "database.db", "sparse"))
 
 
+def test_former_cameras_stay_until_a_grown_folder_has_new_ones(tmp_path, monkeypatch):
+    root = write_flat(tmp_path / "images", 4)
+    out = tmp_path / "out"
+    former = cameras(run(root, out)).keys()
+    write_flat(root, 5)
+    # The first loss leaves files that may be of either scene, and the next run begins from these.
+    with monkeypatch.context() as patched:
+        scenes_by(patched, partial(befall, fail))
+        for _ in range(2):
+            assert cameras(run(root, out)).keys() == former
+            assert (out / "models" / "0").is_dir()
+    assert len(cameras(run(root, out))) == 5
+
+
 def fail():
     raise OSError(28, "No space left on device")
 
