@@ -141,7 +141,7 @@ def _fetch(arguments: argparse.Namespace) -> int:
         wheels = Wheels(Path(temporary))
         for file in files:
             # Before the download: a licence may be a reason not to fetch the file.
-            print(f"{file.name}: licence {file.licence}, from {file.source}", flush=True)
+            print(f"{file.name}: licence {file.licence}, from {file.shown_source}", flush=True)
             fetched = fetch(file, arguments.out, wheels)
             print(f"{file.name}: {fetched.outcome}{fetched.note and ': '}{fetched.note}")
             # From now on, another file under this name is refused.

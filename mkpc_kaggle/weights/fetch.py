@@ -82,7 +82,7 @@ def fetch(
     if judge(path, file).usable:
         return Fetched(path, FetchOutcome.ALREADY_THERE)
     if not can_fetch(file):
-        advice = f"get it from {file.source} and save it as {path}"
+        advice = f"get it from {file.shown_source} and save it as {path}"
         return Fetched(path, FetchOutcome.BY_HAND, advice)
     part = path.with_name(f"{path.name}.part")
     try:

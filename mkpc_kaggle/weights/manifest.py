@@ -43,6 +43,11 @@ class WeightFile:
     source: str
 
     @property
+    def shown_source(self) -> str:
+        """The source in messages: an address, or a wheel."""
+        return self.source.replace(" wheel:", " or wheel:")
+
+    @property
     def line(self) -> str:
         """The line of a manifest, which :func:`parse_manifest` reads."""
         size = "?" if self.size < 0 else str(self.size)
