@@ -1,7 +1,8 @@
 """The last bundle adjustment of pycolmap's models, with the intrinsics that the user knows.
 
 The global mapper refines all focal lengths, without priors, and leaves out points that only two images
-see. With these, cameras of tourists' photographs are more accurate. A prior joins first: the mean of the mapper's
+see. With these, cameras of tourists' photographs are more accurate. But no third image tells a wrong match, so
+the uncertain ones are removed first. A prior joins next: the mean of the mapper's
 focal length and the user's, weighted by their variances, as if bundle adjustment had one more measurement. These
 cameras are then held, and the rest is refined.
 """
@@ -15,6 +16,10 @@ import pycolmap
 from mkpc_kaggle.geometry.intrinsics import KnownCamera
 from mkpc_kaggle.scene.uncertainty import camera_sigmas
 
+# Of a point that two images see: COLMAP's own limits, for any point of its incremental mapper, are 4 pixels and
+# 1.5 degrees. The global mapper keeps errors of a hundredth of the focal length, about ten pixels.
+MAX_TWO_VIEW_ERROR_PX = 4.0
+MIN_TWO_VIEW_ANGLE_DEG = 2.0
 MAX_ITERATIONS = 100
 CONVERGED = 1e-6  # relative change of the cost
 
@@ -25,6 +30,7 @@ def adjust(found: Any, known: Mapping[str, KnownCamera]) -> None:
 
     ``known`` is by image name; each of these images has its own camera.
     """
+    remove_uncertain_points(found)
     placed = [
         image for _, image in sorted(found.images.items()) if image.has_pose and image.name in known
     ]
@@ -57,6 +63,23 @@ def adjust(found: Any, known: Mapping[str, KnownCamera]) -> None:
     adjuster: Any = pycolmap.create_default_ceres_bundle_adjuster(options, config, found)
     adjuster.solve()
     found.update_point_3d_errors()
+
+
+def remove_uncertain_points(found: Any) -> None:
+    """Remove points of two views with large errors, or with nearly parallel rays, from pycolmap's
+    model.
+    """
+    observations = pycolmap.ObservationManager(found)
+    observations.filter_points3D_with_large_reprojection_error(
+        MAX_TWO_VIEW_ERROR_PX, two_view_points(found)
+    )
+    observations.filter_points3D_with_small_triangulation_angle(
+        MIN_TWO_VIEW_ANGLE_DEG, two_view_points(found)
+    )
+
+
+def two_view_points(found: Any) -> set[int]:
+    return {number for number, point in found.points3D.items() if point.track.length() == 2}
 
 
 def set_camera(camera: Any, known: KnownCamera, sigma: float) -> None:

@@ -7,7 +7,6 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import replace
 from functools import partial
-from itertools import combinations
 
 import numpy as np
 import pytest
@@ -15,7 +14,6 @@ import pytest
 from benchmarks.synthetic_scene import (
     SIZE,
     SyntheticScene,
-    arc_camera,
     front,
     match,
     registered_images,
@@ -258,38 +256,3 @@ def test_an_edge_is_verified_once_for_the_same_cameras_on_any_number_of_threads(
             dump = list(database.iterdump())
         written.append(dump)
     assert written[0] == written[1]
-
-
-def pairwise_scene() -> SyntheticScene:
-    """Four images. The first hundred points are matched in all pairs, each other point in one pair."""
-    rng = np.random.default_rng(0)
-    world = front(rng, 9000)
-    cameras = [arc_camera(rng, number / 3) for number in range(4)]
-    ends = list(combinations(range(4), 2))
-    indices = np.arange(len(world))
-    seen = [see(rng, camera, world, 1.0) for camera in cameras]
-    images = tuple(BatchImage(f"{number:04}", f"digest {number}", SIZE) for number in range(4))
-    pairs = []
-    for number, (first, second) in enumerate(ends):
-        is_matched = (indices < 100) | (indices % len(ends) == number)
-        seen0, seen1 = (
-            (points[is_matched[points]], positions[is_matched[points]])
-            for points, positions in (seen[first], seen[second])
-        )
-        matches = match(rng, seen0, seen1, 0.1, None)
-        pairs.append(BatchPair(images[first], images[second], matches))
-    names = [image.name for image in images]
-    return SyntheticScene(images, tuple(pairs), dict(zip(names, cameras, strict=True)), world)
-
-
-def test_cameras_also_fit_the_points_that_only_two_images_see(monkeypatch):
-    scene = pairwise_scene()
-    errors = []
-    # The mapper's cameras alone, and after the last bundle adjustment
-    for adjust in (lambda *_: None, colmap.adjust):
-        monkeypatch.setattr(colmap, "adjust", adjust)
-        (found,) = reconstruct_batch(scene.pairs, SceneConfig()).reconstructions
-        (model,) = found.models
-        errors.append(model.reprojection_error)
-    before, after = errors
-    assert after < 0.95 * before
