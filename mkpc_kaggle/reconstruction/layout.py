@@ -5,6 +5,7 @@ splatting read.
 model in COLMAP's format, with plain file names and with the colours of points.
 """
 
+import errno
 import os
 import shutil
 import signal
@@ -74,6 +75,9 @@ def _link(path: Path, file: Path) -> None:
     # A device has no end: a copy of /dev/zero would fill the disk.
     if not file.is_file():
         return
+    # A copy that cannot fit would fill the disk before it fails, at the cost of other programs.
+    if file.stat().st_size > shutil.disk_usage(path.parent).free:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(file))
     # A copy that was cut off must not look like an image.
     part = path.with_name(f"{PART}{path.name}")
     try:

@@ -173,6 +173,21 @@ def test_a_copy_that_was_cut_off_leaves_nothing(tmp_path, monkeypatch):
     assert list((tmp_path / "out" / "images").iterdir()) == []
 
 
+def test_a_copy_that_cannot_fit_is_not_begun(tmp_path, monkeypatch):
+    folder = tmp_path / "out" / "images"
+    folder.mkdir(parents=True)
+    # An earlier copy is in the place of the link.
+    (folder / "00.png").write_bytes(b"a copy")
+    huge = tmp_path / "00.png"
+    with huge.open("wb") as stream:
+        # Without blocks of the disk, but a copy would have them all
+        stream.truncate(1 << 40)
+    monkeypatch.setattr(layout.shutil, "copy2", lambda *_: pytest.fail("the copy was begun"))
+    with pytest.raises(OSError, match="No space left"):
+        write_images(tmp_path / "out", [huge])
+    assert (folder / "00.png").read_bytes() == b"a copy"
+
+
 def test_a_model_that_cannot_be_read_is_a_line_and_the_former_folder_stays(tmp_path, laid_out):
     _, out = laid_out
     folder = tmp_path / "set"
