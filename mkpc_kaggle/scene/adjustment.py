@@ -1,10 +1,11 @@
 """The last bundle adjustment of pycolmap's models, with the intrinsics that the user knows.
 
-The global mapper refines all focal lengths, without priors, and leaves out points that only two images
-see. With these, cameras of tourists' photographs are more accurate. But no third image tells a wrong match, so
-the uncertain ones are removed first. A prior joins next: the mean of the mapper's
-focal length and the user's, weighted by their variances, as if bundle adjustment had one more measurement. These
-cameras are then held, and the rest is refined.
+The global mapper refines all focal lengths, without priors, and leaves out points that only two
+images see. With these, cameras of tourists' photographs are more accurate. But no third image
+reveals a wrong match, so uncertain points of two views are removed first.
+
+A prior is the mean of the mapper's focal length and the user's, weighted by their variances, as if
+bundle adjustment had one more measurement. These cameras are then held, and the rest is refined.
 """
 
 from collections.abc import Mapping
@@ -16,8 +17,8 @@ import pycolmap
 from mkpc_kaggle.geometry.intrinsics import KnownCamera
 from mkpc_kaggle.scene.uncertainty import camera_sigmas
 
-# Of a point that two images see: COLMAP's own limits, for any point of its incremental mapper, are 4 pixels and
-# 1.5 degrees. The global mapper keeps errors of a hundredth of the focal length, about ten pixels.
+# Limits for a point that two images see, close to those of COLMAP's incremental mapper for any point (4 pixels,
+# 1.5 degrees). The global mapper keeps errors of a hundredth of the focal length, about ten pixels.
 MAX_TWO_VIEW_ERROR_PX = 4.0
 MIN_TWO_VIEW_ANGLE_DEG = 2.0
 MAX_ITERATIONS = 100
@@ -79,6 +80,7 @@ def remove_uncertain_points(found: Any) -> None:
 
 
 def two_view_points(found: Any) -> set[int]:
+    """Return the numbers of the points of pycolmap's model that two images see."""
     return {number for number, point in found.points3D.items() if point.track.length() == 2}
 
 
