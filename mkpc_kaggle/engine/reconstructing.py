@@ -96,14 +96,23 @@ class Reconstructing:
 
 def scene_records(state: State) -> tuple[SceneRecord, ...]:
     """Return the scene of each batch, in order; ``failure`` is the reason for a missing scene."""
-    everywhere = state.tries.given_up.get(("scenes",))
-    reason = str(everywhere) if everywhere else NOT_RECONSTRUCTED
-    reasons = dict.fromkeys(state.batches, reason)
-    for item, failure in state.tries.given_up.items():
-        match item:
-            case ("scene", str(batch), _):
-                reasons[batch] = str(failure)
+    reasons = scene_failures(state)
     return tuple(
-        state.scenes.get(batch) or SceneRecord(batch, failure=reasons[batch])
+        state.scenes.get(batch)
+        or SceneRecord(batch, failure=str(reasons.get(batch, NOT_RECONSTRUCTED)))
         for batch in state.batches
     )
+
+
+def scene_failures(state: State) -> dict[str, Failure]:
+    """Return why batches could not be reconstructed in this run. The scene of an earlier run may
+    stand in.
+    """
+    given_up = state.tries.given_up
+    everywhere = given_up.get(("scenes",))
+    found = {} if everywhere is None else dict.fromkeys(state.batches, everywhere)
+    for item, failure in given_up.items():
+        match item:
+            case ("scene", str(batch), _):
+                found[batch] = failure
+    return found

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.console import warn
+from mkpc_kaggle.engine.reconstructing import scene_failures
 from mkpc_kaggle.engine.request import RunReport
 from mkpc_kaggle.engine.session import Session, opened_engine, request_of
 from mkpc_kaggle.engine.state import State, name_below
@@ -23,9 +24,14 @@ AUTO = "auto"  # the recipe of all matchers whose weights are found
 
 @dataclass(frozen=True)
 class FolderResult:
+    """What a run on a folder leaves. ``lost`` says why datasets have no new cameras; those of an
+    earlier run may stand in.
+    """
+
     report: RunReport
     pairs: tuple[Pair, ...]
     cameras: Cameras
+    lost: tuple[str, ...] = ()
 
 
 def for_cameras(recipe: Recipe, sharing: str | None = None, intrinsics: str = "") -> Recipe:
@@ -103,7 +109,8 @@ def reconstruct_folder(
         for batch in state.batches:
             if batch not in state.scenes and remove_files(exports[batch]):
                 warn(f"{batch}: this run has no cameras; the models of an earlier run were removed")
-    return FolderResult(report, tuple(pairs), *standing)
+        lost = tuple(str(failure) for failure in scene_failures(state).values())
+    return FolderResult(report, tuple(pairs), *standing, lost=lost)
 
 
 def cameras_of(datasets: Datasets, root: Path, results: State) -> Cameras:

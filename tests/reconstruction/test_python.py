@@ -5,11 +5,13 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
-from test_reconstruct import FIRST, RECIPE, MixedMatcher, write_flat
+from faulty import befall, scenes_by
+from test_reconstruct import FIRST, RECIPE, MixedMatcher, fail, write_flat
 
 from mkpc_kaggle import reconstruct, results
 from mkpc_kaggle.errors import UserError
@@ -144,6 +146,21 @@ def test_a_matcher_that_always_fails_is_an_error(files):
 
     with pytest.raises(UserError, match="out of order"):
         models(files, Broken(), progress=False)
+
+
+@pytest.mark.parametrize("calls_before", [0, 1])
+def test_cameras_that_cannot_be_computed_are_an_error(tmp_path, files, monkeypatch, calls_before):
+    work = tmp_path / "work"
+    for _ in range(calls_before):
+        models(files[:-1], MixedMatcher(), work_dir=work, progress=False)
+    with monkeypatch.context() as patched:
+        scenes_by(patched, partial(befall, fail))
+        # The first failure may remove the former models' files, and the second call begins without.
+        for _ in range(2):
+            with pytest.raises(UserError, match="No space left on device; the same call tries"):
+                models(files, MixedMatcher(), work_dir=work, progress=False)
+    (model,) = models(files, MixedMatcher(), work_dir=work, progress=False)
+    assert len(model.images) == FIRST
 
 
 SCRIPT = """\
