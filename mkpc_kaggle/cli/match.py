@@ -21,7 +21,7 @@ Match two images. Print the fundamental matrix F (x1^T F x0 = 0, pixel centres a
 number of matches of each unit, and the critical regions. Points are in pixels of the stored
 files, without the EXIF orientation; figures are upright.
 
-  --out   draws the matches, the clusters and the critical regions
+  --out   draws the matches, the clusters and the critical regions.
   --save  writes the arrays points0 and points1 (N x 2), scores (N), inliers (N, true or false)
           and F (3 x 3), for numpy.load
 """

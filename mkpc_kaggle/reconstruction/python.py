@@ -71,8 +71,8 @@ def reconstruct(
 
     Cameras refer to the stored pixels of the files, as COLMAP reads them. ``colmap`` of a model is
     pycolmap's. Raises :class:`UserError` for a recipe that cannot run here, for unusable masks or
-    intrinsics, for an unreadable image, for a ``work_dir`` with a folder ``colmap`` that is not of an
-    earlier call, and if the cameras cannot be computed.
+    intrinsics, and for an unreadable image. A ``work_dir`` with a folder ``colmap`` that is not of an
+    earlier call raises it, and so do cameras that cannot be computed.
     """
     # By absolute path, because the journal knows an image by its path below the common directory
     given = {Path(image).absolute(): str(image) for image in images}
@@ -105,7 +105,7 @@ def reconstruct(
 
         if reason := trouble(result.report):
             raise UserError(reason)
-        # The models of an earlier call may lack images, and their files may be gone.
+        # The models of an earlier call may lack images, and their files may be missing.
         if result.lost:
             raise UserError(f"no cameras: {result.lost[0]}; the same call tries again")
         names = {name_below(str(root), str(file)): name for file, name in given.items()}

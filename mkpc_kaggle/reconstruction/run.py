@@ -24,8 +24,8 @@ AUTO = "auto"  # the recipe of all matchers whose weights are found
 
 @dataclass(frozen=True)
 class FolderResult:
-    """What a run on a folder leaves. ``lost`` says why datasets have no new cameras; those of an
-    earlier run may stand in.
+    """The outcome of a run on a folder. ``lost`` has the reasons for datasets without new cameras;
+    an earlier run's cameras may stand in.
     """
 
     report: RunReport
