@@ -59,7 +59,8 @@ All pairs of up to 100 images are matched; in larger datasets, each image is mat
 Without weights, recipe auto runs one unit of RootSIFT here: three units cost three times as much, and their
 cameras are hardly better.
 
-Exit status: 0 done; 1 no image has a camera, or the run failed; 2 bad input; 130 or 143 ended by a signal.
+Exit status: 0 done; 1 no image has a camera, a dataset has only an earlier run's cameras, or the run failed;
+2 bad input; 130 or 143 ended by a signal.
 """
 MAX_LINES = 20  # printed of each list
 
@@ -145,7 +146,7 @@ def run(arguments: argparse.Namespace) -> int:
             publish=publish,
         )
         # A run that failed has failed even if an earlier one has left a model.
-        if trouble(result.report) or result.report.unwritten:
+        if trouble(result.report) or result.report.unwritten or result.lost:
             session.status = 1
         if any(any(found.values()) for found in result.cameras.values()):
             say("writing images/ and sparse/ for other programs")
@@ -179,6 +180,8 @@ def _lines(result: FolderResult, root: Path) -> Iterator[str]:
             if models
             else reasons.get(batches[name], "too few pairs, or too little time")
         )
+        if models and batches[name] in result.lost:
+            why += " by an earlier run"
         placed = f"{models.total()} of {plural(len(found), 'image')} with a camera"
         yield f"{batches[name]}: {placed}: {why}"
     yield from weakest_line(report.scenes)

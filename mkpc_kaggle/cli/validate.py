@@ -44,9 +44,9 @@ train side has calibration.csv, pair_covisibility.csv and images/ in each scene,
 the scenes.
 
 The score is the mAA over rotation errors of 1 to 10 degrees and translation errors of 0.2 to 5 metres. It is
-printed for each scene and as the mean of the scenes. The next columns are the AUC of the larger angular error up to 5, 10 and 20
-degrees. The mAA has a column for each step of the estimate: MAGSAC alone, with the prior on focal lengths, with
-the cameras of the scene.
+printed for each scene and as the mean of the scenes. The next columns are the AUC of the larger angular error up
+to 5, 10 and 20 degrees. The mAA has a column for each step of the estimate: MAGSAC alone, with the prior on focal
+lengths, with the cameras of the scene.
 
 With --compare, several recipes run on the same pairs and are compared with the first.
 

@@ -107,7 +107,8 @@ def reconstruct(
             raise UserError(reason)
         # The models of an earlier call may lack images, and their files may be missing.
         if result.lost:
-            raise UserError(f"no cameras: {result.lost[0]}; the same call tries again")
+            reason = next(iter(result.lost.values()))
+            raise UserError(f"no cameras: {reason}; the same call tries again")
         names = {name_below(str(root), str(file)): name for file, name in given.items()}
         return Models(
             complete_model(model, out / MODELS / str(number), names)

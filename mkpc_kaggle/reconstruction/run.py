@@ -24,14 +24,16 @@ AUTO = "auto"  # the recipe of all matchers whose weights are found
 
 @dataclass(frozen=True)
 class FolderResult:
-    """The outcome of a run on a folder. ``lost`` has the reasons for datasets without new cameras;
-    an earlier run's cameras may stand in.
+    """The outcome of a run on a folder.
+
+    ``lost`` has the reason for each batch whose cameras could not be computed; an earlier run's
+    cameras may stand in.
     """
 
     report: RunReport
     pairs: tuple[Pair, ...]
     cameras: Cameras
-    lost: tuple[str, ...] = ()
+    lost: Mapping[str, str]
 
 
 def for_cameras(recipe: Recipe, sharing: str | None = None, intrinsics: str = "") -> Recipe:
@@ -109,8 +111,8 @@ def reconstruct_folder(
         for batch in state.batches:
             if batch not in state.scenes and remove_files(exports[batch]):
                 warn(f"{batch}: this run has no cameras; the models of an earlier run were removed")
-        lost = tuple(str(failure) for failure in scene_failures(state).values())
-    return FolderResult(report, tuple(pairs), *standing, lost=lost)
+        lost = {batch: str(failure) for batch, failure in scene_failures(state).items()}
+    return FolderResult(report, tuple(pairs), standing[0], lost)
 
 
 def cameras_of(datasets: Datasets, root: Path, results: State) -> Cameras:

@@ -4,6 +4,7 @@ side.
 
 import csv
 import hashlib
+import shutil
 import sqlite3
 import time
 from collections.abc import Mapping
@@ -380,6 +381,31 @@ def test_the_command_writes_tables_models_a_database_and_a_page(demo, small_reci
         assert [row["image"] for row in csv.DictReader(stream)] == sorted(
             path.name for path in images.iterdir()
         )
+
+
+def test_the_command_fails_if_only_an_earlier_runs_cameras_are_left(
+    demo, small_recipe, tmp_path, monkeypatch, capsys
+):
+    *files, last = sorted((demo.train_dir / "courtyard" / "images").iterdir())
+    root = tmp_path / "images"
+    root.mkdir()
+    for file in files:
+        shutil.copy(file, root)
+    text = small_recipe.read_text()
+    small_recipe.write_text(text.replace("320", "480").replace("400", "640"))
+    command = ["reconstruct", root, "--out", tmp_path / "out", "--recipe", small_recipe]
+    command += ["--workers", 0]
+    assert run_command(*command) == 0
+    shutil.copy(last, root)
+    with monkeypatch.context() as patched:
+        scenes_by(patched, partial(befall, fail))
+        capsys.readouterr()
+        assert run_command(*command) == 1
+        said = capsys.readouterr().out
+        assert "by an earlier run" in said
+        assert "No space left on device" in said
+    assert run_command(*command) == 0
+    assert "by an earlier run" not in capsys.readouterr().out
 
 
 def photographs(folder: Path, count: int) -> list[Path]:
