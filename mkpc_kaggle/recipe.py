@@ -54,6 +54,7 @@ class Unit:
     # Height x width, such as "540x720": the area of a view, which keeps its aspect ratio.
     area: str = ""
     stretch: bool = False  # True: a view gets exactly the height and width of ``area``
+    enlarge: bool = True  # False: a crop smaller than the view keeps its size
     fallback: str = ""  # the matcher to use if ``matcher`` is unavailable
     antialias: bool = True  # False: shrink views bilinearly, without averaging areas
     # False: scenes use the unit's matches only if the pair's other units have fewer than 50.
@@ -69,6 +70,8 @@ class Unit:
             raise ValueError(f'area must be height x width such as "540x720", not {self.area!r}')
         if self.stretch and not self.area:
             raise ValueError("stretch needs an area, the height and width to stretch views to")
+        if self.area and not self.enlarge:
+            raise ValueError("enlarge = false needs a long_side")
 
     @cached_property  # used often by plans
     def name(self) -> str:
@@ -84,11 +87,12 @@ class Unit:
     def view(self, crop: Box, multiple: int, turns: int = 0) -> View:
         """Return this unit's view of a crop, rotated by quarter turns and padded to a multiple."""
         height, width = map(int, (self.area or "1x1").split("x"))
+        long_side = self.long_side if self.enlarge else min(self.long_side, max(crop.size))
         if self.stretch:
             view = View.stretched(crop, size=Size(width, height), multiple=multiple, turns=turns)
         else:
             view = View.fit(
-                crop, long_side=self.long_side, area=width * height, multiple=multiple, turns=turns
+                crop, long_side=long_side, area=width * height, multiple=multiple, turns=turns
             )
         return replace(view, antialias=self.antialias)
 

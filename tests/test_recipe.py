@@ -1,6 +1,7 @@
 """Recipes of the package load, and a wrong recipe is refused with advice."""
 
 import os
+from dataclasses import replace
 from itertools import combinations
 
 import pytest
@@ -108,6 +109,10 @@ def test_a_recipe_reads_as_written():
 def test_a_unit_shows_a_crop_at_its_size():
     crop = Box(10, 20, 110, 220)
     assert Unit(1, "a", 640).view(crop, 32) == View.fit(crop, long_side=640, multiple=32)
+    native = View.fit(crop, long_side=200, multiple=32, turns=1)
+    assert Unit(1, "a", 640, enlarge=False).view(crop, 32, turns=1) == native
+    shrunk = Unit(1, "a", 150, enlarge=False)
+    assert shrunk.view(crop, 32) == replace(shrunk, enlarge=True).view(crop, 32)
     assert Unit(1, "a", area="54x72").view(crop, 8) == View.fit(crop, area=54 * 72, multiple=8)
     assert Unit(1, "a", area="54x72", stretch=True).view(crop, 1).content == Size(72, 54)
 
@@ -151,6 +156,10 @@ def unit(**changes):
         (units(unit(area='"9x9"')), "and not both"),
         (units(unit(max_matches=0)), r"max_matches must be in \[1, inf\), not 0"),
         (units(unit(stretch="true")), "stretch needs an area"),
+        (
+            units(unit(long_side=None, area='"54x72"', enlarge="false")),
+            "enlarge = false needs a long_side",
+        ),
         *[
             (
                 units(unit(long_side=None, area=f'"{area}"')),

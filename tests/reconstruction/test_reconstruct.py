@@ -179,11 +179,14 @@ def test_a_notebook_shows_the_results_with_and_without_their_images(mixed):
         ("auto", {"loma": SiftMatcher(SiftOptions(), "cpu")}, None),
     ],
 )
-def test_without_weights_one_unit_of_rootsift_runs(nowhere_else, name, more, units):
+def test_without_weights_one_unit_of_rootsift_runs_and_enlarges_no_image(
+    nowhere_else, name, more, units
+):
     """A recipe that the user names, and one with other matchers, runs as it is written."""
     recipe = assemble(name, device="cpu", matchers=more).recipe
-    kept = [unit.name for unit in for_cameras(recipe).units]
-    assert kept == (units or [unit.name for unit in recipe.units])
+    kept = for_cameras(recipe).units
+    assert [unit.name for unit in kept] == (units or [unit.name for unit in recipe.units])
+    assert all(unit.enlarge for unit in kept) == (len(kept) > 1)
 
 
 def test_estimates_that_only_the_report_needs_are_the_cheap_ones():
