@@ -56,8 +56,8 @@ If images were added or removed since the last complete run, the cameras keep it
 do not.
 
 All pairs of up to 100 images are matched; in larger datasets, each image is matched with the 20 most similar.
-Without weights, recipe auto runs one unit of RootSIFT here: three units cost three times as much, and their
-cameras are hardly better.
+Without weights, recipe auto runs one unit of RootSIFT here, and enlarges no image: three units cost three times
+as much, and their cameras are hardly better.
 
 Exit status: 0 done; 1 no image has a camera, a dataset has only an earlier run's cameras, or the run failed;
 2 bad input; 130 or 143 ended by a signal.
