@@ -20,6 +20,10 @@ from mkpc_kaggle.scene.export import remove_files
 from mkpc_kaggle.scene.reconstruction import RegisteredImage
 
 AUTO = "auto"  # the recipe of all matchers whose weights are found
+# Of MAGSAC on a pair. Most pairs of a folder do not overlap, and then all iterations run: 50,000
+# take 0.09 s, 10,000 take 0.02 s. With 30 % inliers, 10,000 samples of seven matches still contain
+# one without outliers in nine of ten runs.
+MAX_ITERATIONS = 10_000
 
 
 @dataclass(frozen=True)
@@ -60,7 +64,9 @@ def for_cameras(recipe: Recipe, sharing: str | None = None, intrinsics: str = ""
     if recipe.name == AUTO and recipe.matcher_names == ("sift",):
         units = (replace(units[0], enlarge=False),)
     # F of a pair is for the report alone: its inliers, and doubts about the pair.
-    magsac = replace(recipe.magsac, permutations=1)
+    magsac = recipe.magsac
+    iterations = min(magsac.max_iterations, MAX_ITERATIONS)
+    magsac = replace(magsac, permutations=1, max_iterations=iterations)
     return replace(recipe, units=units, magsac=magsac, focal=None, scene=scene)
 
 

@@ -9,7 +9,7 @@ import sqlite3
 import time
 from collections.abc import Mapping
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import combinations
 from pathlib import Path
@@ -194,6 +194,10 @@ def test_estimates_that_only_the_report_needs_are_the_cheap_ones():
     assert recipe.magsac.permutations > 1
     kept = for_cameras(recipe)
     assert (kept.focal, kept.magsac.permutations) == (None, 1)
+    assert kept.magsac.max_iterations < recipe.magsac.max_iterations
+    # A recipe with fewer keeps its own.
+    few = replace(recipe, magsac=RobustConfig(max_iterations=100))
+    assert for_cameras(few).magsac.max_iterations == 100
 
 
 # Upright, on both sides, and upside down
