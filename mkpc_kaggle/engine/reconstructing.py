@@ -105,14 +105,17 @@ def scene_records(state: State) -> tuple[SceneRecord, ...]:
 
 
 def scene_failures(state: State) -> dict[str, Failure]:
-    """Return why batches could not be reconstructed in this run. The scene of an earlier run may
-    stand in.
+    """Return why batches could not be reconstructed from today's results. The scene of an earlier
+    run may stand in.
     """
     given_up = state.tries.given_up
     everywhere = given_up.get(("scenes",))
-    found = {} if everywhere is None else dict.fromkeys(state.batches, everywhere)
-    for item, failure in given_up.items():
-        match item:
-            case ("scene", str(batch), _):
-                found[batch] = failure
+    found = {}
+    for batch in state.batches:
+        # Neither a failure on former inputs counts, nor one after the batch was done.
+        failure = given_up.get(("scene", batch, state.scene_inputs(batch)[1]))
+        if failure is None and batch in state.stale:
+            failure = everywhere
+        if failure is not None:
+            found[batch] = failure
     return found

@@ -27,6 +27,7 @@ from mkpc_kaggle.engine.budget import Budget, Costs
 from mkpc_kaggle.engine.jobs import Cause, Failure, MatchJob, Phase
 from mkpc_kaggle.engine.keys import Keys
 from mkpc_kaggle.engine.loop import Engine
+from mkpc_kaggle.engine.reconstructing import scene_failures
 from mkpc_kaggle.engine.request import Ending, Request
 from mkpc_kaggle.engine.schedule import Crew, NextWork, View, next_work, outlook, prefix_that_fits
 from mkpc_kaggle.engine.state import State
@@ -280,6 +281,23 @@ def test_a_first_scene_waits_for_the_units_that_fit_and_a_later_scene_for_all():
     assert run.next_work().scenes == ()
     run.crew = replace(run.crew, can_match=False)
     assert run.next_work().scenes == ("",)
+
+
+def test_only_a_scene_that_cannot_be_made_from_todays_results_is_lost():
+    run = Run(6, limit=1000.0)
+    state = State(replace(run.state.request, recipe=replace(THREE_UNITS, scene=SceneConfig())))
+    died = Failure(Cause.DIED)
+    state.give_up(("scene", "", "a former key"), died)
+    assert scene_failures(state) == {}
+    state.give_up(("scene", "", state.scene_inputs("")[1]), died)
+    assert scene_failures(state) == {"": died}
+    # The processes of scenes cannot be started any more, after this batch has its scene.
+    state.tries.given_up.clear()
+    state.stale.clear()
+    state.give_up(("scenes",), Failure(Cause.NOT_STARTED))
+    assert scene_failures(state) == {}
+    state.stale.add("")
+    assert scene_failures(state) == {"": Failure(Cause.NOT_STARTED)}
 
 
 def test_a_first_scene_does_not_wait_for_a_job_that_hangs_until_the_end():
