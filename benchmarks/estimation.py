@@ -9,13 +9,14 @@ made with ``--min-covisibility 0`` also has the extra pairs that a scene may add
 scored.
 
 The unit of evidence is a draw: some or all images of a scene, and a share of their pairs. The
-output has a table for each journal and share. Each row has an estimate's mAA by scene, gain over
-the first estimate, and CPU seconds per pair or batch. Intervals resample images if each scene has
-one draw, and draws otherwise; the mean's interval then also resamples scenes. ``--settings`` gives
-a row for each line of a recipe's table [scene], such as "cameras = 'image'". ``--units`` gives a
-row for each choice of the journal's units, such as ``1:sift@1536,1:aliked_lightglue@1024-``; a unit
-with a minus connects images but makes no tracks. F of a pair is then estimated again, from these
-units. ``--thresholds`` replaces the rows by two rows for each threshold of MAGSAC.
+output has a table for each share. Each row has an estimate's mAA by scene, gain over the first row,
+and CPU seconds per pair or batch. Of several journals, only pairs that all of them have are used,
+so their draws are the same. Intervals resample images if each scene has one draw, and draws
+otherwise; the mean's interval then also resamples scenes. ``--settings`` gives a row for each line
+of a recipe's table [scene], such as "cameras = 'image'". ``--units`` gives a row for each choice of
+the journals' units, such as ``1:sift@1536,1:aliked_lightglue@1024-``; a unit with a minus connects
+images but makes no tracks. F of a pair is then estimated again, from these units. ``--thresholds``
+replaces the rows by two rows for each threshold of MAGSAC.
 """
 
 import argparse
@@ -355,33 +356,40 @@ def draws_parser(description: str) -> argparse.ArgumentParser:
 
 
 def compare(estimators: Mapping[str, Estimator], arguments: argparse.Namespace) -> None:
-    """Print a table of the estimators' scores for each journal and share."""
-    for directory in arguments.journals:
-        recipe, journal = read_journal(directory)
-        # By share of the pairs, then by scene: the scores of each draw.
-        done: dict[float, dict[str, list[dict[str, Score]]]]
-        done = defaultdict(lambda: defaultdict(list))
-        # Pairs without overlap, too: a scene may match them.
-        scenes = read_train_side(arguments.train_dir, scenes=arguments.scenes, min_covisibility=0)
-        for scene in scenes:
-            every = []
-            for true in scene.pairs:
-                if true.pair.id in journal:
-                    every.append(Known(true, *journal[true.pair.id]))
-            if not every:  # the journal has other scenes
-                continue
-            plan = product(arguments.shares, arguments.images, range(arguments.seeds))
-            for share, images, seed in plan:
-                if seed and not images and share == 1:
-                    continue  # all images of a scene make a single draw
+    """Print a table for each share, with a row for each estimator and journal."""
+    journals = {str(directory): read_journal(directory) for directory in arguments.journals}
+    recipes = ", ".join(dict.fromkeys(recipe for recipe, _ in journals.values()))
+    # By share of the pairs, then by scene: the scores of each draw.
+    done: dict[float, dict[str, list[dict[str, Score]]]]
+    done = defaultdict(lambda: defaultdict(list))
+    # Pairs without overlap, too: a scene may match them.
+    scenes = read_train_side(arguments.train_dir, scenes=arguments.scenes, min_covisibility=0)
+    for scene in scenes:
+        common = []
+        for true in scene.pairs:
+            if all(true.pair.id in journal for _, journal in journals.values()):
+                common.append(true)
+        if not common:  # the journals have other scenes
+            continue
+        known = {}
+        for directory, (_, journal) in journals.items():
+            known[directory] = [Known(true, *journal[true.pair.id]) for true in common]
+        plan = product(arguments.shares, arguments.images, range(arguments.seeds))
+        for share, images, seed in plan:
+            if seed and not images and share == 1:
+                continue  # all images of a scene make a single draw
+            scores = {}
+            for directory, every in known.items():
                 pairs, inside = drawn(every, images, share, seed)
-                scores = {}
                 for name, make in estimators.items():
-                    scores[name] = score(make, pairs, inside, scene)
-                done[share][scene.name].append(scores)
-        for share, draws in done.items():
-            title = f"{recipe}, {share:.0%} of the pairs"
-            print("\n".join(table(title, draws, list(estimators))), "\n", flush=True)
+                    row = name if len(journals) == 1 else f"{name} ({directory})"
+                    scores[row] = score(make, pairs, inside, scene)
+            done[share][scene.name].append(scores)
+    for share, draws in done.items():
+        title = f"{recipes}, {share:.0%} of the pairs"
+        # Every draw has the same rows.
+        rows = list(next(iter(draws.values()))[0])
+        print("\n".join(table(title, draws, rows)), "\n", flush=True)
 
 
 if __name__ == "__main__":
