@@ -1,13 +1,14 @@
 """Images: decoded once, in the background; an unreadable file is a value with the reason.
 
 EXIF gives the orientation of the stored pixels, and the focal length as COLMAP computes it. Source:
-``Bitmap::ExifFocalLength`` of COLMAP 4.2, without COLMAP's table of sensors.
+``Bitmap::ExifFocalLength`` of COLMAP 4.2, without COLMAP's table of sensors, and scaled to the stored
+pixels if the photograph was reduced after it was taken.
 """
 
 import hashlib
 import warnings
 from collections import OrderedDict
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -35,11 +36,14 @@ DIRECTORY = 0x8769  # of the tags below
 FOCAL_MM = 0x920A
 PLANE_RESOLUTION = 0xA20E  # pixels per unit of the sensor
 PLANE_UNIT = 0xA210
+RECORDED_SIDES = 0xA002, 0xA003  # width and height in pixels when the photograph was taken
 FOCAL_35MM = 0xA405
 FILM_MM = 43.27  # diagonal of 35 mm film
 UNITS_MM: dict[float, float] = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # inch, cm, mm, micrometre
 # In long sides of the image; a focal length outside this range counts as unknown.
 FOCALS = Range(0.2, 20.0)
+# Ratio of the shapes of a stored and a recorded picture; more is a crop, and not rounding.
+MAX_SHAPE_RATIO = 1.03
 # Counter-clockwise quarter turns that set pixels upright, by EXIF orientation; mirrored pixels stay
 # mirrored.
 TURNS: dict[float, int] = {3: 2, 4: 2, 5: 3, 6: 3, 7: 1, 8: 1}
@@ -157,7 +161,28 @@ def read_exif(data: bytes, size: Size) -> tuple[int, float]:
     if not focal:
         unit = UNITS_MM.get(tags.get(PLANE_UNIT, 0), inf)
         focal = tags.get(FOCAL_MM, 0.0) * tags.get(PLANE_RESOLUTION, 0.0) / unit
+        focal *= scale_since_taken(tags, size)
     return turns, focal if focal / max(size) in FOCALS else 0.0
+
+
+def scale_since_taken(tags: Mapping[int, float], size: Size) -> float:
+    """Return the stored pixels per pixel of the recorded photograph; 0 for a crop of it.
+
+    The sensor's resolution in EXIF counts recorded pixels, and programs that reduce a photograph
+    keep its EXIF. 1 if the recorded size is unknown.
+    """
+    sides = [tags.get(tag, 0.0) for tag in RECORDED_SIDES]
+    recorded = [side for side in sides if 0 < side < inf]
+    if not recorded:
+        return 1.0
+    # Longer side with longer side: pixels may have been rotated without their EXIF.
+    scale = max(size) / max(recorded)
+    if len(recorded) == len(sides):
+        shape_ratio = min(size) / (scale * min(recorded))
+        # How much of the photograph a crop shows is unknown, and so is its scale.
+        if not 1 / MAX_SHAPE_RATIO < shape_ratio < MAX_SHAPE_RATIO:
+            return 0.0
+    return scale
 
 
 def read_size(path: Path) -> Size | None:

@@ -22,7 +22,7 @@ import numpy as np
 from mkpc_kaggle.errors import UserError, printable, writing
 from mkpc_kaggle.geometry.matches import Matches
 
-FORMAT = 17  # increase it when a kind of result is stored differently: nothing is converted
+FORMAT = 18  # increase it when a kind of result is stored differently: nothing is converted
 FILE_NAME = "journal.sqlite"  # named in the documentation, and in scripts of users
 LOCK_NAME = "journal.lock"
 # STRICT refuses values of a wrong type, and json_valid refuses numbers that are not JSON, such as NaN.

@@ -204,6 +204,26 @@ def test_the_focal_length_is_that_of_colmap(tmp_path, tags, order):
     assert read_image(path).focal == pytest.approx(expected, rel=1e-6)
 
 
+# A focal length of 4.2 mm on 10 pixels per millimetre, which EXIF calls 42 recorded pixels
+PLANE = {"t920A": (42, 10), "tA20E": (100, 1), "tA210": 3}
+RECORDED = {
+    "as it was taken": ({"tA002": 60, "tA003": 40}, 42),
+    "reduced three times": ({"tA002": 180, "tA003": 120}, 14),
+    "enlarged": ({"tA002": 30, "tA003": 20}, 84),
+    "rotated and reduced": ({"tA002": 80, "tA003": 120}, 21),
+    "only the width is known": ({"tA002": 120}, 21),
+    "cropped, by an unknown part": ({"tA002": 120, "tA003": 120}, 0),
+    "zeros": ({"tA002": 0, "tA003": 0}, 42),
+    "no size": ({}, 42),
+}
+
+
+@pytest.mark.parametrize(("recorded", "expected"), RECORDED.values(), ids=RECORDED)
+def test_a_focal_length_by_the_sensor_is_that_of_the_stored_pixels(tmp_path, recorded, expected):
+    path = set_exif(write(tmp_path / "a.jpg", PIXELS), 1, **PLANE, **recorded)
+    assert read_image(path).focal == pytest.approx(expected)
+
+
 # Far from any lens, divisions by zero, and text.
 IMPOSSIBLE = [
     {"tA405": 65535},

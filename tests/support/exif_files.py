@@ -5,6 +5,7 @@ import zlib
 from pathlib import Path
 
 import PIL.Image
+from PIL.TiffImagePlugin import IFDRational
 
 Value = int | str | tuple[int, int]  # a pair is a fraction
 
@@ -25,7 +26,12 @@ def tiff(orientation: int | None = None, order: str = "<", **tags: Value) -> byt
     exif.endian = order
     if orientation is not None:
         exif[0x0112] = orientation
-    exif[0x8769] = {int(tag[1:], 16): value for tag, value in tags.items()}
+    directory: dict[int, object] = {}
+    for tag, value in tags.items():
+        # Pillow would write a pair of integers as two numbers, and not as a fraction.
+        stored = IFDRational(*value) if isinstance(value, tuple) else value
+        directory[int(tag[1:], 16)] = stored
+    exif[0x8769] = directory
     return exif.tobytes().removeprefix(b"Exif\0\0")
 
 
