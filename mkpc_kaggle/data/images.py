@@ -6,24 +6,20 @@ pixels if the photograph was reduced after it was taken.
 """
 
 import hashlib
-import warnings
 from collections import OrderedDict
 from collections.abc import Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
-from io import BytesIO
 from math import hypot, inf
-from numbers import Real
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
-import PIL.Image
 
 from mkpc_kaggle.config import Range
+from mkpc_kaggle.data.heads import ORIENTATION, exif_tags, is_tiff, size_of
 from mkpc_kaggle.errors import shown
 from mkpc_kaggle.geometry.coordinates import Pixels, Size
 
@@ -31,8 +27,6 @@ from mkpc_kaggle.geometry.coordinates import Pixels, Size
 MAX_ASPECT = 32
 
 # Tags of EXIF.
-ORIENTATION = 0x0112
-DIRECTORY = 0x8769  # of the tags below
 FOCAL_MM = 0x920A
 PLANE_RESOLUTION = 0xA20E  # pixels per unit of the sensor
 PLANE_UNIT = 0xA210
@@ -40,6 +34,9 @@ RECORDED_SIDES = 0xA002, 0xA003  # width and height in pixels when the photograp
 FOCAL_35MM = 0xA405
 FILM_MM = 43.27  # diagonal of 35 mm film
 UNITS_MM: dict[float, float] = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # inch, cm, mm, micrometre
+# Marks of JPEG, and bytes that change a picture if they are decoded
+JPEG_START, JPEG_END = b"\xff\xd8", b"\xff\xd9"
+JPEG_FILL = b"\xaa" * 64
 # In long sides of the image; a focal length outside this range counts as unknown.
 FOCALS = Range(0.2, 20.0)
 # Ratio of the shapes of a stored and a recorded picture; more is a crop, and not rounding.
@@ -108,7 +105,7 @@ def read_image(path: Path) -> Image | Unreadable:
     """Decode a file's stored pixels to RGB; return failures, never raise.
 
     16-bit values are divided by 256. OpenCV decides whether a damaged file is readable: version 5
-    refuses a truncated file.
+    refuses a truncated file. A JPEG file may lack its end mark alone.
     """
     name = str(path)
     bgr = None
@@ -117,7 +114,7 @@ def read_image(path: Path) -> Image | Unreadable:
             return Unreadable(name, "cannot be read: not a regular file")
         data = np.fromfile(path, np.uint8)
         if data.size:  # OpenCV raises for an empty array
-            bgr = cv2.imdecode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+            bgr = _decode(data)
     except FileNotFoundError:
         return Unreadable(name, "no such file")
     except (OSError, ValueError, MemoryError, cv2.error) as error:
@@ -135,25 +132,51 @@ def read_image(path: Path) -> Image | Unreadable:
     return Image(name, pixels, _content_digest(data), focal, turns)
 
 
+def _decode(data: Pixels) -> Pixels | None:
+    """Return the stored pixels of a picture file, (H, W, 3) BGR; ``None`` if it is unreadable."""
+    bgr = _decode_file(data)
+    start = data[:4].tobytes()
+    if bgr is None and start.startswith(JPEG_START):
+        # Some cameras and downloads leave the end mark out. If the picture is complete, further
+        # bytes change nothing; if it is cut off, they are decoded.
+        bgr, other = (_decode_file(_with_end(data, more)) for more in (b"", JPEG_FILL))
+        if bgr is None or other is None or not np.array_equal(bgr, other):
+            return None
+    if bgr is not None and is_tiff(start):
+        # OpenCV sets TIFF upright even if it is asked not to. COLMAP reads the stored pixels.
+        orientation = int(exif_tags(data.tobytes()).get(ORIENTATION, 1))
+        bgr = _stored(bgr, orientation)
+    return bgr
+
+
+def _decode_file(data: Pixels) -> Pixels | None:
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    bgr: Pixels | None = cv2.imdecode(data, flags)
+    return bgr
+
+
+def _with_end(data: Pixels, more: bytes) -> Pixels:
+    """Return the bytes of a JPEG file without its end, with ``more`` bytes and the end mark."""
+    whole = data[:-1] if data[-1] == JPEG_END[0] else data  # the first half of the mark
+    return np.concatenate([whole, np.frombuffer(more + JPEG_END, np.uint8)])
+
+
+def _stored(pixels: Pixels, orientation: int) -> Pixels:
+    """Return the stored pixels of a picture that was set upright from an EXIF orientation."""
+    if orientation in (2, 4, 5, 7):
+        # Mirrored: 2 as such, the others turned as 3, 8 and 6 are.
+        pixels = pixels[:, ::-1]
+    turns = -TURNS.get(orientation, 0)
+    return np.ascontiguousarray(np.rot90(pixels, turns))
+
+
 def read_exif(data: bytes, size: Size) -> tuple[int, float]:
     """Return the quarter turns that set an image upright, and its focal length in pixels.
 
     Turns are counter-clockwise. ``data`` has the file's bytes; ``size`` is in pixels. Both results
     are 0 if unknown. Damaged EXIF is ignored.
     """
-    tags: dict[int, float] = {}
-    # Pillow raises errors of any type for a damaged file.
-    with suppress(Exception), warnings.catch_warnings():
-        warnings.filterwarnings("ignore", module="PIL")
-        # OpenCV already rotates TIFF. Pillow would decode all pixels of a PNG, since EXIF may come
-        # after them.
-        formats = ("JPEG", "PNG", "WEBP")
-        with PIL.Image.open(BytesIO(data), formats=formats) as picture:
-            if picture.format != "PNG" or b"eXIf" in data:
-                exif = picture.getexif()
-                for tag, value in {**exif, **exif.get_ifd(DIRECTORY)}.items():
-                    if isinstance(value, Real):
-                        tags[tag] = float(value)
+    tags = exif_tags(data)
     turns = TURNS.get(tags.get(ORIENTATION, 1), 0)
     # In COLMAP's order: the equivalent focal length first, then the sensor's resolution. An unknown
     # unit is infinite, which gives 0.
@@ -186,12 +209,21 @@ def scale_since_taken(tags: Mapping[int, float], size: Size) -> float:
 
 
 def read_size(path: Path) -> Size | None:
-    """Return a picture's size from its head, in stored pixels; ``None`` if it is unreadable."""
-    with suppress(Exception), warnings.catch_warnings():  # Pillow raises errors of any type
-        warnings.filterwarnings("ignore", module="PIL")
-        with PIL.Image.open(path, formats=("JPEG", "PNG")) as picture:
-            return Size(*picture.size)
-    return None
+    """Return a picture's size in stored pixels, from its head if possible; ``None`` if it is
+    unreadable.
+    """
+    try:
+        # A pipe or a device may never end.
+        if not path.is_file():
+            return None
+        with path.open("rb") as stream:
+            size = size_of(stream)
+    except (OSError, ValueError):
+        return None
+    # A format without a head that Pillow reads, and a damaged head
+    if size is None and isinstance(image := read_image(path), Image):
+        return image.size
+    return size
 
 
 def content_digest(path: Path) -> str:

@@ -13,10 +13,8 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-import PIL.Image
-
 from mkpc_kaggle.data.competition import Pair, read_rows
-from mkpc_kaggle.data.images import ByteCache, Image
+from mkpc_kaggle.data.images import ByteCache, Image, read_size
 from mkpc_kaggle.data.masks import MaskReader, Masks
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Box, View
@@ -323,14 +321,10 @@ def read_regions(file: Path, image_root: Path, pairs: Iterable[Pair]) -> GivenRe
         if (files := (pair.file0, pair.file1)) not in boxes:
             raise UserError(f"{file} has no regions of the pair {pair.id}")
         for path, box in zip(files, boxes[files], strict=True):
-            # Only the head of the file is read.
-            with (
-                suppress(OSError, PIL.Image.DecompressionBombError),
-                PIL.Image.open(path) as picture,
-            ):
-                if box.right > picture.width or box.bottom > picture.height:
-                    size = f"{picture.width} x {picture.height} pixels"
-                    raise UserError(
-                        f"{file}: a box ends at {box.right}, {box.bottom}, beyond {path} of {size}"
-                    )
+            size = read_size(Path(path))  # an unreadable image is reported by the run
+            if size and (box.right > size.width or box.bottom > size.height):
+                raise UserError(
+                    f"{file}: a box ends at {box.right}, {box.bottom}, beyond {path} "
+                    f"of {size.width} x {size.height} pixels"
+                )
     return boxes

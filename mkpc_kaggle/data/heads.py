@@ -1,0 +1,121 @@
+"""Heads of picture files: their size and their EXIF tags, for every format that OpenCV decodes.
+
+Pillow's readers of the formats are called directly. ``PIL.Image.open`` refuses more than 179
+megapixels, since it would decode them; here no pixel is decoded.
+"""
+
+import struct
+import warnings
+from collections.abc import Iterator
+from io import BytesIO
+from numbers import Real
+from typing import BinaryIO
+
+import PIL.Image
+
+from mkpc_kaggle.geometry.coordinates import Size
+
+# Of EXIF and TIFF
+ORIENTATION = 0x0112
+DIRECTORY = 0x8769  # of the tags that only EXIF has
+TIFF_WIDTH = 0x0100
+TIFF_HEIGHT = 0x0101
+
+# Pillow's names of the formats. A file is known by its first bytes, whatever its name says.
+FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "AVIF", "JPEG2000", "PPM", "GIF")
+MAX_PREFIX = 16  # bytes that Pillow knows a format by
+# What Pillow raises for damaged files, seen with 50,000 of them. Its limit of pixels is only in
+# readers that decode, and lack of memory is no damage.
+DAMAGE = (
+    SyntaxError,
+    OSError,
+    EOFError,
+    ValueError,
+    TypeError,
+    AttributeError,
+    LookupError,
+    ArithmeticError,
+    RuntimeError,
+    struct.error,
+    PIL.Image.DecompressionBombError,
+)
+PNG_START = b"\x89PNG\r\n\x1a\n"
+
+
+def size_of(stream: BinaryIO) -> Size | None:
+    """Return a picture's size in stored pixels; ``None`` if its head cannot be read."""
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", module="PIL")
+            picture = _opened(stream)
+            if picture is None:
+                return None
+            tags = getattr(picture, "tag_v2", {})
+            # Pillow gives the upright size of TIFF; its tags have the stored one.
+            if TIFF_WIDTH in tags and TIFF_HEIGHT in tags:
+                return Size(int(tags[TIFF_WIDTH]), int(tags[TIFF_HEIGHT]))
+            return Size(*picture.size)
+    except DAMAGE:
+        return None
+
+
+def exif_tags(data: bytes) -> dict[int, float]:
+    """Return the numbers among the EXIF tags of a picture file, by tag; empty if damaged."""
+    tags: dict[int, float] = {}
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", module="PIL")
+            exif = _exif(data)
+            for tag, value in {**exif, **exif.get_ifd(DIRECTORY)}.items():
+                if isinstance(value, Real):
+                    tags[tag] = float(value)
+    except DAMAGE:
+        return {}
+    return tags
+
+
+def is_tiff(data: bytes) -> bool:
+    return data[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+
+
+def _exif(data: bytes) -> PIL.Image.Exif:
+    """Return the EXIF of a picture file. Raises one of ``DAMAGE``."""
+    exif = PIL.Image.Exif()
+    # Pillow would decode all pixels of a PNG, since EXIF may come after them, and its reader of
+    # WebP decodes.
+    if data.startswith(PNG_START):
+        exif.load(next(_chunks(data, len(PNG_START), ">I4s", b"eXIf", trailer=4), b""))
+    elif data[:4] == b"RIFF" and data[8:12] == b"WEBP":
+        exif.load(next(_chunks(data, 12, "<4sI", b"EXIF", trailer=0), b""))
+    elif (picture := _opened(BytesIO(data))) is not None:
+        exif = picture.getexif()
+    return exif
+
+
+def _chunks(data: bytes, start: int, head: str, wanted: bytes, trailer: int) -> Iterator[bytes]:
+    """Yield the contents of the chunks of a kind, from ``start``.
+
+    ``head`` is the struct of a chunk's length and kind. ``trailer`` bytes follow a content; those
+    of RIFF have an even length.
+    """
+    while start + 8 <= len(data):
+        parts = struct.unpack_from(head, data, start)
+        kind, length = parts if isinstance(parts[0], bytes) else parts[::-1]
+        if kind == wanted:
+            yield data[start + 8 : start + 8 + length]
+        padding = 0 if trailer else length % 2
+        start += 8 + length + padding + trailer
+
+
+def _opened(stream: BinaryIO) -> PIL.Image.Image | None:
+    """Return Pillow's picture of a stream; ``None`` for an unknown format. Raises ``DAMAGE``."""
+    PIL.Image.init()
+    prefix = stream.read(MAX_PREFIX)
+    for name in FORMATS:
+        # An older Pillow has no reader of AVIF.
+        reader, accepts = PIL.Image.OPEN.get(name, (None, None))
+        # A reader without its library answers with a text.
+        if reader is not None and accepts is not None and accepts(prefix) is True:
+            stream.seek(0)
+            return reader(stream, "")
+    return None
