@@ -230,26 +230,30 @@ def submission_problems(path: Path, sample_ids: Sequence[str]) -> list[str]:
 
 
 def read_rows(
-    path: Path, columns: Sequence[str], *, only: bool = False
+    path: Path, columns: Sequence[str], *, only: bool = False, optional: Sequence[str] = ()
 ) -> Iterator[tuple[str, list[str]]]:
-    """Yield each row of a CSV file as its location, for messages, and its cells in ``columns``.
+    """Yield each row of a CSV file as its location, for messages, and its cells in ``columns`` and
+    ``optional``.
 
-    ``only`` requires that the file has no other columns. Raises :class:`UserError` for an unusable
-    file.
+    ``only`` requires that the file has no other columns. Cells of an ``optional`` column that the
+    file lacks are empty. Raises :class:`UserError` for an unusable file.
     """
-    table = read_table(path, columns, only=only)
+    table = read_table(path, columns, only=only, optional=optional)
     # Lists of str: iterating over pandas' own strings takes ten times as long.
-    cells = [table[column].tolist() for column in columns]
+    cells = [table[column].tolist() for column in (*columns, *optional)]
     for line, *row in zip(table.index.tolist(), *cells, strict=True):
         yield f"{path}, line {line}", row
 
 
-def read_table(path: Path, columns: Sequence[str], *, only: bool = False) -> "DataFrame":
+def read_table(
+    path: Path, columns: Sequence[str], *, only: bool = False, optional: Sequence[str] = ()
+) -> "DataFrame":
     """Return a CSV file with its text unchanged: ids such as "007", "1e3" and "NA" are no numbers.
 
     The index is the line of the file where a row ends. Empty rows are skipped. ``only`` requires
-    that the file has no columns except ``columns``. Raises :class:`UserError` for a file that is
-    not a regular table with these columns.
+    that the file has no columns except ``columns``. An ``optional`` column that the file lacks has
+    empty cells. Raises :class:`UserError` for a file that is not a regular table with these
+    columns.
     """
     import pandas as pd  # the import takes most of a second
 
@@ -279,7 +283,8 @@ def read_table(path: Path, columns: Sequence[str], *, only: bool = False) -> "Da
         raise UserError(f"{path} cannot be read as a table: {error}") from error
     _number_lines(rows, skipped, lines.has_quotes)
     is_filled = (rows != "").any(axis=1)
-    return _with_header(path, rows[is_filled], columns, only)
+    table = _with_header(path, rows[is_filled], columns, only, optional)
+    return table.reindex(columns=[*columns, *optional], fill_value="")
 
 
 def _number_lines(rows: "DataFrame", skipped: int, has_quotes: bool) -> None:
@@ -304,7 +309,9 @@ def _skip_to_header(path: Path, stream: TextIO) -> int:
     return skipped
 
 
-def _with_header(path: Path, rows: "DataFrame", columns: Sequence[str], only: bool) -> "DataFrame":
+def _with_header(
+    path: Path, rows: "DataFrame", columns: Sequence[str], only: bool, optional: Sequence[str]
+) -> "DataFrame":
     """Return the rows below the header. Raise :class:`UserError` for missing columns or cells."""
     header = list(rows.iloc[0])
     found = ", ".join(header)[:200]
@@ -317,8 +324,9 @@ def _with_header(path: Path, rows: "DataFrame", columns: Sequence[str], only: bo
     if (table.iloc[:, -1] == "").any():
         _require_cells(path, len(header))
     # Of columns with the same name, the first one counts.
-    firsts = [header.index(column) for column in columns]
-    return table.iloc[:, firsts].set_axis(list(columns), axis=1)
+    present = [*columns, *(column for column in optional if column in header)]
+    firsts = [header.index(column) for column in present]
+    return table.iloc[:, firsts].set_axis(present, axis=1)
 
 
 def _require_cells(path: Path, count: int) -> None:

@@ -6,7 +6,7 @@ its centre.
 
 import fnmatch
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import isfinite
 from types import MappingProxyType
 
@@ -65,6 +65,17 @@ class KnownCamera:
         """The point (cx, cy); the centre of the top-left pixel is (0.5, 0.5)."""
         at = MODELS[self.model].index("cx")
         return self.parameters[at], self.parameters[at + 1]
+
+    def scaled(self, x: float, y: float) -> "KnownCamera":
+        """Return the camera of pictures that are ``x`` times as wide and ``y`` times as high."""
+        at = MODELS[self.model].index("cx")
+        # A single focal length gets the mean, since x and y then differ by rounding.
+        factors = [(x + y) / 2] if at == 1 else [x, y]
+        factors += [x, y]
+        # Distortion has no unit, so it stays.
+        factors += [1.0] * (len(self.parameters) - len(factors))
+        values = [value * factor for value, factor in zip(self.parameters, factors, strict=True)]
+        return replace(self, parameters=tuple(values))
 
 
 Rows = Sequence[tuple[str, KnownCamera]]  # a name or a pattern of images, and their camera

@@ -1,43 +1,63 @@
 """Priors of a folder's cameras: the user's table of intrinsics."""
 
+import re
 from collections.abc import Iterable
 from pathlib import Path
 
 from mkpc_kaggle.data.competition import read_rows
 from mkpc_kaggle.data.images import FOCALS, read_size
+from mkpc_kaggle.engine.console import warn
 from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.intrinsics import KnownCamera, camera_of, parse_row, written
 
 COLUMNS = ("image", "model", "parameters", "sigma")
+OPTIONAL = ("size",)  # of the images that the parameters are for
+SIZE = re.compile(r"\s*([1-9]\d{0,5})\s*[xX]\s*([1-9]\d{0,5})\s*", re.ASCII)
+# Offsets of a principal point from the middle of its image, as shares of the sides. Lenses are
+# centred to a few percent. A row for three quarters of the resolution is 0.125 off.
+MAX_OFFSET = 0.1
+MAX_USUAL_OFFSET = 0.05
+MAX_SHAPE_RATIO = 1.05  # of pictures of one camera at two resolutions
 
 
 def read_intrinsics_table(file: Path, root: Path, images: Iterable[Path]) -> str:
     """Return the rows of a table for ``[scene] intrinsics``.
 
     Columns: ``image``, a path below ``root``, a file name, or a pattern with ``*``; ``model`` of COLMAP, its
-    ``parameters`` separated by blanks; ``sigma`` of the focal length in percent, or ``fixed``. Raises
-    :class:`UserError` for a malformed row, a row that names no image, and a camera that does not fit its image.
+    ``parameters`` separated by blanks; ``sigma`` of the focal length in percent, or ``fixed``; optionally
+    ``size``, the width x height that the parameters are for. Raises :class:`UserError` for a malformed row, a row
+    that names no image, and a camera that does not fit its image.
     """
     rows: list[tuple[str, KnownCamera]] = []
-    # The file and line of each row, for messages
+    # The file and line of each row, for messages, and its size if it has one
     where: list[str] = []
-    for place, cells in read_rows(file, COLUMNS):
+    sizes: list[Size | None] = []
+    for place, cells in read_rows(file, COLUMNS, optional=OPTIONAL):
+        *camera, size = cells
         try:
-            rows.append(parse_row(*cells))
+            rows.append(parse_row(*camera))
+            sizes.append(parse_size(size))
         except ValueError as error:
             raise UserError(f"{place}: {error}") from error
         where.append(place)
     if not rows:
         raise UserError(f"{file} has no rows; the columns are {', '.join(COLUMNS)}")
     used = set()
+    warned = set()
     for image in images:
         name = image.relative_to(root).as_posix()
         known = camera_of(rows, name)
-        if known is not None:
-            # By identity, because two rows may have equal cameras
-            number = next(n for n, (_, camera) in enumerate(rows) if camera is known)
-            used.add(number)
-            _require_fit(known, image, where[number])
+        if known is None:
+            continue
+        # By identity, because two rows may have equal cameras
+        number = next(n for n, (_, camera) in enumerate(rows) if camera is known)
+        used.add(number)
+        doubt = require_fit(known, sizes[number], image, where[number])
+        # A row may name thousands of images.
+        if doubt and number not in warned:
+            warned.add(number)
+            warn(doubt)
     # A misspelt name would silently have no effect.
     for number, (pattern, _) in enumerate(rows):
         if number not in used:
@@ -47,21 +67,71 @@ def read_intrinsics_table(file: Path, root: Path, images: Iterable[Path]) -> str
     return written(rows)
 
 
-def _require_fit(known: KnownCamera, image: Path, where: str) -> None:
-    """Raise :class:`UserError` for a camera that cannot have taken an image of this size."""
+def parse_size(cell: str) -> Size | None:
+    """Return the size of a cell such as ``640x480``; ``None`` if it is empty."""
+    if not cell.strip():
+        return None
+    found = SIZE.fullmatch(cell)
+    if found is None:
+        raise ValueError(f"a size is width x height such as 640x480, not {cell!r}")
+    return Size(int(found[1]), int(found[2]))
+
+
+def require_fit(known: KnownCamera, stated: Size | None, image: Path, where: str) -> str:
+    """Return a doubt about a camera of an image, or an empty string.
+
+    ``stated`` is the size in the camera's row, if any. Raises :class:`UserError` for a camera that
+    cannot have taken an image of this size.
+    """
     size = read_size(image)
     if size is None:  # an unreadable image is reported by the run
-        return
+        return ""
+    has_pixels = f"{image.name} has {text_of(size)} pixels"
+    if stated is not None and stated != size:
+        raise UserError(
+            f"{where}: the row is for {text_of(stated)}, and {has_pixels}{remedy(known, stated, size)}"
+        )
     # Such as millimetres in place of pixels
     if known.focal / max(size) not in FOCALS:
         raise UserError(
             f"{where}: a focal length of {known.focal:g} px is implausible for {image.name} "
-            f"of {size.width} x {size.height} pixels"
+            f"of {text_of(size)} pixels"
         )
-    # The most frequent mistake: a calibration at another resolution
+    # The most frequent mistake: a calibration at another resolution. A stated size rules it out.
+    if stated is not None:
+        return ""
     x, y = known.principal_point
-    if x >= size.width or y >= size.height:
-        raise UserError(
-            f"{where}: the principal point {x:g}, {y:g} is outside {image.name} "
-            f"of {size.width} x {size.height} pixels"
-        )
+    offset = max(abs(x / size.width - 0.5), abs(y / size.height - 0.5))
+    if offset <= MAX_USUAL_OFFSET:
+        return ""
+    # The size in whose middle the point would be
+    other = Size(max(1, round(2 * x)), max(1, round(2 * y)))
+    place = "outside" if x >= size.width or y >= size.height else "far from the middle"
+    text = f"{where}: the principal point {x:g}, {y:g} is {place}: {has_pixels}"
+    is_other_resolution = is_same_shape(other, size)
+    if is_other_resolution or is_same_shape(other, Size(size.height, size.width)):
+        text += f", and the row seems to be for {text_of(other)}"
+        text += remedy(known, other, size)
+    text += f"; if the row is right, add the column size with {size.width}x{size.height}"
+    if offset > MAX_OFFSET:
+        raise UserError(text)
+    return text
+
+
+def remedy(known: KnownCamera, of: Size, size: Size) -> str:
+    """Return the remedy for a row that is for another size than that of its image."""
+    if not is_same_shape(of, size):
+        return ". Rows are for pixels as stored, without the rotation of EXIF"
+    scaled = known.scaled(size.width / of.width, size.height / of.height)
+    parameters = " ".join(f"{value:.6g}" for value in scaled.parameters)
+    return f". Write the parameters {parameters}"
+
+
+def is_same_shape(one: Size, other: Size) -> bool:
+    """Return whether both may be pictures of one camera at two resolutions."""
+    ratio = (one.width * other.height) / (one.height * other.width)
+    return 1 / MAX_SHAPE_RATIO < ratio < MAX_SHAPE_RATIO
+
+
+def text_of(size: Size) -> str:
+    return f"{size.width} x {size.height}"

@@ -28,6 +28,7 @@ from mkpc_kaggle.reconstruction.python import Models, reconstruct
 from mkpc_kaggle.reconstruction.run import FolderResult, for_cameras, reconstruct_folder
 
 HEAD = "image,model,parameters,sigma\n"
+SIZED = "image,model,parameters,sigma,size\n"
 
 
 def run(
@@ -88,6 +89,33 @@ def write_masks(folder: Path, root: Path, left: int = 400) -> Path:
             HEAD + "00.png,SIMPLE_PINHOLE,900 4000 300,fixed\n",
             "line 2: the principal point 4000, 300 is outside",
         ),
+        # A calibration at another resolution, of the rotated picture, and with its size
+        (
+            HEAD + "*,PINHOLE,450 451 200 150,fixed\n",
+            "the row seems to be for 400 x 300. Write the parameters 900 902 400 300",
+        ),
+        (
+            HEAD + "*,SIMPLE_RADIAL,1800 800 600 -0.1,2\n",
+            "the row seems to be for 1600 x 1200. Write the parameters 900 400 300 -0.1",
+        ),
+        (
+            HEAD + "*,SIMPLE_PINHOLE,675 300 225,5\n",
+            "is far from the middle: 00.png has 800 x 600 pixels, and the row seems to be for 600 x 450",
+        ),
+        (
+            HEAD + "*,SIMPLE_PINHOLE,900 300 400,fixed\n",
+            "the row seems to be for 600 x 800. Rows are for pixels as stored",
+        ),
+        (
+            HEAD + "*,SIMPLE_PINHOLE,900 200 300,5\n",
+            "if the row is right, add the column size with",
+        ),
+        (
+            SIZED + "*,SIMPLE_PINHOLE,450 200 150,fixed,400x300\n",
+            "the row is for 400 x 300, and 00.png has 800 x 600 pixels. Write the parameters 900 400",
+        ),
+        (SIZED + "*,SIMPLE_PINHOLE,900 300 400,fixed,600 x 800\n", "Rows are for pixels as stored"),
+        (SIZED + "*,SIMPLE_PINHOLE,900 400 300,fixed,800\n", "a size is width x height such as"),
         ("\xff\x00", "line contains NUL"),
         (None, "no such file"),
     ],
@@ -106,6 +134,28 @@ def test_a_bad_table_of_intrinsics_is_one_line_and_nothing_is_touched(
     assert reason in line
     assert contents(tmp_path) == before
     assert not out.exists()
+
+
+# Rows for images of 800 x 600 pixels, and the warnings about them
+ACCEPTED = {
+    "centred": (HEAD + "*,SIMPLE_PINHOLE,900 410 290,fixed\n", []),
+    "somewhat off": (HEAD + "*,SIMPLE_PINHOLE,900 460 300,fixed\n", ["far from the middle"]),
+    "off, with the size": (SIZED + "*,SIMPLE_PINHOLE,900 100 100,fixed,800x600\n", []),
+    "without the size": (SIZED + "*,SIMPLE_PINHOLE,900 400 300,fixed,\n", []),
+}
+
+
+@pytest.mark.parametrize(("table", "warnings"), ACCEPTED.values(), ids=ACCEPTED)
+def test_a_principal_point_off_the_middle_is_warned_of_once_unless_the_size_is_stated(
+    tmp_path, capsys, table, warnings
+):
+    root = write_flat(tmp_path / "images", 3)
+    file = tmp_path / "known.csv"
+    file.write_text(table)
+    assert len(read(read_intrinsics_table(file, root, sorted(root.iterdir())))) == 1
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == len(warnings)
+    assert all(text in line for text, line in zip(warnings, lines, strict=True))
 
 
 BAD_MASKS = {
