@@ -24,6 +24,7 @@ from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.intrinsics import KnownCamera
 from mkpc_kaggle.recipe import CameraModel, SceneConfig
 from mkpc_kaggle.scene.adjustment import adjust
+from mkpc_kaggle.scene.edges import supported
 from mkpc_kaggle.scene.export import DATABASE, FORMER, MODELS, PART
 from mkpc_kaggle.scene.keypoints import MergedGraph
 from mkpc_kaggle.scene.reconstruction import (
@@ -48,6 +49,7 @@ MAX_REFINEMENTS = 5
 MAX_ITERATIONS = 50  # of each bundle adjustment of a refinement
 MIN_CHANGE = 0.0005  # share of the observations; with fewer changes, a model has converged
 SEED = 0
+DEFAULTS = SceneConfig()
 
 
 def structure_from_motion(
@@ -67,7 +69,7 @@ def structure_from_motion(
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
     pycolmap.set_random_seed(SEED)
     with pycolmap.Database.open(":memory:") as database:
-        _fill(database, merged, shared, config.camera_model)
+        _fill(database, merged, shared, config)
         if former:
             models = refine_models(database, merged.graph, config.threads, former)
         else:
@@ -80,7 +82,7 @@ def write_files(
     merged: MergedGraph,
     shared: SharedIntrinsics,
     models: Sequence[SfmModel],
-    camera_model: CameraModel = CameraModel.SIMPLE_PINHOLE,
+    config: SceneConfig = DEFAULTS,
 ) -> None:
     """Write COLMAP's files: the database and one folder per model.
 
@@ -97,7 +99,7 @@ def write_files(
         except RuntimeError as error:  # a full disk; its message names no file
             raise OSError(f"{directory / DATABASE} cannot be written") from error
         with file as database:
-            _fill(database, merged, shared, camera_model)
+            _fill(database, merged, shared, config)
         for number, model in enumerate(models):
             kept = {each.image.name for each in model.images}
             # A list, because the loop removes frames from the mapping.
@@ -120,14 +122,22 @@ def write_files(
 
 
 def _fill(
-    database: Any, merged: MergedGraph, shared: SharedIntrinsics, camera_model: CameraModel
+    database: Any, merged: MergedGraph, shared: SharedIntrinsics, config: SceneConfig
 ) -> None:
-    """Write the images, cameras and keypoints, and each edge's matches and verified geometry."""
+    """Write the images, cameras and keypoints, and each edge's matches and verified geometry.
+
+    An edge without enough support keeps its matches, and has no geometry.
+    """
     # One transaction: a commit for each edge would wait for the disk.
     with pycolmap.DatabaseTransaction(database):
-        cameras = _write_images(database, merged, shared, camera_model)
-        geometries = verify(merged, cameras)
+        cameras = _write_images(database, merged, shared, config.camera_model)
         edges = merged.graph.edges
+        geometries = verify(merged, cameras)
+        inliers = [len(geometry.inlier_matches) for geometry in geometries]
+        ends = [(edge.first, edge.second) for edge in edges]
+        for number, is_supported in enumerate(supported(ends, inliers, config.min_support)):
+            if not is_supported:
+                geometries[number] = pycolmap.TwoViewGeometry()
         for edge, matches, geometry in zip(edges, merged.matches, geometries, strict=True):
             database.write_matches(edge.first + 1, edge.second + 1, matches)
             database.write_two_view_geometry(edge.first + 1, edge.second + 1, geometry)

@@ -112,7 +112,7 @@ def reconstruct_sharing(
 
         # Before the files are written, so that files and results agree
         found = align(found, read_reference(directory))
-        write_files(directory, parts[0], shared, models_of(found), config.camera_model)
+        write_files(directory, parts[0], shared, models_of(found), config)
     # Images without a camera have the refined focal length, and not the one it began with.
     if given:
         shared = refined_intrinsics(free, models_of(found))
