@@ -67,6 +67,11 @@ def convert(value: Any, kind: type, where: str) -> Any:
     return value
 
 
+def plain(value: Any) -> Any:
+    """Return a number of NumPy or torch as Python's; anything else as it is."""
+    return value.item() if getattr(value, "ndim", None) == 0 else value
+
+
 @dataclass(frozen=True)
 class Range:
     """Finite numbers from ``low`` to ``high``; ``bounds`` is "[]", "(]", "[)" or "()"."""

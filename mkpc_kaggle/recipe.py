@@ -20,6 +20,7 @@ from mkpc_kaggle.config import (
     check_keys,
     check_ranges,
     from_table,
+    plain,
 )
 from mkpc_kaggle.errors import UserError, read_text
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
@@ -61,6 +62,11 @@ class Unit:
     tracks: bool = True
 
     def __post_init__(self) -> None:
+        for name in ("stage", "long_side", "max_matches"):
+            number = plain(getattr(self, name))
+            if type(number) is not int:  # not ``isinstance``: True is an int
+                raise ValueError(f"{name} must be a whole number, not {number!r}")
+            object.__setattr__(self, name, number)  # the class is frozen
         check_ranges(
             self, stage=Range(1, 2), long_side=Range(0, MAX_SIDE_PX), max_matches=AT_LEAST_1
         )
@@ -153,6 +159,12 @@ class Recipe:
 
     def __post_init__(self) -> None:
         where = f"recipe {self.name!r}"
+        object.__setattr__(self, "units", tuple(self.units))  # the class is frozen
+        for unit in self.units:
+            if not isinstance(unit, Unit):
+                raise TypeError(
+                    f"{where}: expected units such as Unit(1, 'sift', 640), got {unit!r}"
+                )
         if not self.units:
             raise UserError(f"{where} has no units")
         if self.units[0].stage != 1:
@@ -241,6 +253,8 @@ def with_settings(recipe: Recipe, settings: Mapping[str, Any]) -> Recipe:
     """
     table = recipe.table()
     for key, value in settings.items():
+        if not isinstance(key, str):
+            raise UserError(f"settings: expected a key such as 'magsac.threshold', got {key!r}")
         *names, last = key.split(".")
         if not names or names[0] not in TABLES:
             known = ", ".join(TABLES)
@@ -252,7 +266,7 @@ def with_settings(recipe: Recipe, settings: Mapping[str, Any]) -> Recipe:
             inner = inner[name]
             if not isinstance(inner, dict):
                 raise UserError(f"--set {key}: {name} is a key, not a table of keys")
-        inner[last] = value
+        inner[last] = plain(value)
     # The same checks as for a file.
     return recipe_of(table, recipe.name)
 

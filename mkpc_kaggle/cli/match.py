@@ -24,7 +24,12 @@ files, without the EXIF orientation; figures are upright.
   --out   draws the matches, the clusters and the critical regions.
   --save  writes the arrays points0 and points1 (N x 2), scores (N), inliers (N, true or false)
           and F (3 x 3), for numpy.load
+
+Exit status: 0 done, 1 every unit failed, 2 bad input.
 """
+
+
+EXIT_NOTHING_RAN = 1
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -40,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     options.add_matching(parser)
 
 
-def run(arguments: argparse.Namespace) -> None:
+def run(arguments: argparse.Namespace) -> int:
     inputs = [arguments.image0, arguments.image1, options.recipe_file(arguments)]
     files = {"--out": arguments.out, "--save": arguments.save}
     require_apart(files, filter(None, inputs), weights=arguments.weights)
@@ -71,6 +76,7 @@ def run(arguments: argparse.Namespace) -> None:
         with writing(f"--save {arguments.save}"):
             save_arrays(match, arguments.save)
         print(f"arrays: {arguments.save}")
+    return EXIT_NOTHING_RAN if _nothing_ran(match) else 0
 
 
 def save_arrays(match: PairMatch, path: Path) -> None:
@@ -85,22 +91,27 @@ def save_arrays(match: PairMatch, path: Path) -> None:
             points1=matches.points1,
             scores=matches.scores,
             inliers=match.estimate.inliers,
-            F=match.estimate.matrix,
+            F=match.estimate.matrix_or_fallback,
         )
+
+
+def _nothing_ran(match: PairMatch) -> bool:
+    return len(match.failures) == len(match.results)
 
 
 def _lines(match: PairMatch, recipe: str) -> list[str]:
     """Return the result as lines: F, counts, the units, the critical regions."""
     found = match.estimate
     lines = [f"F, by recipe {recipe}; x1^T F x0 = 0 in pixels of the stored files:"]
-    lines += [" ".join(f"{value: .9e}" for value in row) for row in found.matrix]
+    lines += [" ".join(f"{value: .9e}" for value in row) for row in found.matrix_or_fallback]
     lines += [f"this is the fallback: {found.failure}"] if found.failure else []
     inliers = plural(found.inlier_count, "inlier")
     lines.append(f"{plural(len(match.matches), 'match')}, {inliers}")
-    verdict = "the images may not overlap"
-    if found.stats.support >= MIN_SUPPORT:
-        verdict = "the images overlap"
-    lines.append(f"{found.stats.support:.1f} times the inliers expected by chance: {verdict}")
+    if not _nothing_ran(match):  # failed units say nothing of the images
+        verdict = "the images may not overlap"
+        if found.stats.support >= MIN_SUPPORT:
+            verdict = "the images overlap"
+        lines.append(f"{found.stats.support:.1f} times the inliers expected by chance: {verdict}")
     for result in match.results:
         counts = f"{plural(len(result.matches), 'match'):>14}  {result.seconds:.2f} s"
         remark = result.failure or result.note

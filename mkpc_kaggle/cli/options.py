@@ -27,7 +27,7 @@ def add_matching(parser: argparse.ArgumentParser) -> None:
         "--recipe",
         default="auto",
         metavar="NAME|FILE.toml",
-        help="default: auto, every matcher with its weights",
+        help="a recipe, or one matcher such as aliked_lightglue (default: auto, every matcher with its weights)",
     )
     add_weights(parser)
     text = """permissive: only weights under Apache-2.0, BSD-3-Clause or MIT. Recipe auto omits other weights, and

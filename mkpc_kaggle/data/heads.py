@@ -6,7 +6,7 @@ megapixels, since it would decode them; here no pixel is decoded.
 
 import struct
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from io import BytesIO
 from numbers import Real
 from typing import BinaryIO
@@ -61,11 +61,20 @@ def size_of(stream: BinaryIO) -> Size | None:
 
 def exif_tags(data: bytes) -> dict[int, float]:
     """Return the numbers among the EXIF tags of a picture file, by tag; empty if damaged."""
+    return _tags(lambda: _exif(data))
+
+
+def tags_of_picture(picture: PIL.Image.Image) -> dict[int, float]:
+    """Return the numbers among the EXIF tags of Pillow's picture, by tag; empty if damaged."""
+    return _tags(picture.getexif)
+
+
+def _tags(read: Callable[[], PIL.Image.Exif]) -> dict[int, float]:
     tags: dict[int, float] = {}
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", module="PIL")
-            exif = _exif(data)
+            exif = read()
             for tag, value in {**exif, **exif.get_ifd(DIRECTORY)}.items():
                 if isinstance(value, Real):
                     tags[tag] = float(value)

@@ -176,7 +176,11 @@ def read_exif(data: bytes, size: Size) -> tuple[int, float]:
     Turns are counter-clockwise. ``data`` has the file's bytes; ``size`` is in pixels. Both results
     are 0 if unknown. Damaged EXIF is ignored.
     """
-    tags = exif_tags(data)
+    return exif_facts(exif_tags(data), size)
+
+
+def exif_facts(tags: Mapping[int, float], size: Size) -> tuple[int, float]:
+    """Return the turns and the focal length of :func:`read_exif` from EXIF's tags."""
     turns = TURNS.get(tags.get(ORIENTATION, 1), 0)
     # In COLMAP's order: the equivalent focal length first, then the sensor's resolution. An unknown
     # unit is infinite, which gives 0.

@@ -93,6 +93,18 @@ def require_matchers(matchers: Mapping[str, Matcher[Any]]) -> Mapping[str, Match
     if not isinstance(matchers, Mapping):
         raise TypeError(f"matchers are a mapping from names to matchers, not {matchers!r}")
     for name, matcher in matchers.items():
+        if isinstance(matcher, type):
+            raise TypeError(
+                f"matcher {name!r} is a class, {matcher.__name__}; give an instance of it"
+            )
         if not isinstance(getattr(matcher, "spec", None), MatcherSpec):
             raise TypeError(f"matcher {name!r} has no `spec` that is a MatcherSpec: {matcher!r}")
     return matchers
+
+
+def require_methods(matchers: Mapping[str, Matcher[Any]]) -> None:
+    """Raise ``TypeError`` if a matcher of the user cannot encode or match."""
+    for name, matcher in matchers.items():
+        for method in ("encode", "match"):
+            if not callable(getattr(matcher, method, None)):
+                raise TypeError(f"matcher {name!r} has no method `{method}`: {matcher!r}")

@@ -1,16 +1,29 @@
 """Assembly of a run's parts: recipe, weights, device, matchers."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
+from os import PathLike, fspath
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 from mkpc_kaggle.data.masks import Masks
-from mkpc_kaggle.errors import warn_once
+from mkpc_kaggle.errors import UserError, warn_once
 from mkpc_kaggle.matchers.contract import Matcher, Placement, Precision
-from mkpc_kaggle.matchers.registry import load_matcher, require_matchers
+from mkpc_kaggle.matchers.registry import (
+    VISMATCH,
+    load_matcher,
+    matcher_names,
+    require_matchers,
+)
+from mkpc_kaggle.pipeline.arguments import (
+    Weights,
+    device_of,
+    precision_of,
+    shown_value,
+    weights_of,
+)
 from mkpc_kaggle.pipeline.availability import (
     FAULTS,
     Licence,
@@ -27,6 +40,7 @@ from mkpc_kaggle.recipe import Mode, Recipe, Unit, load_recipe, with_settings
 from mkpc_kaggle.weights import FoundFile, State, WeightStore
 
 CACHE_SHARE = 0.25  # of a GPU's free memory, for the cached encodings of all workers on it
+DEFAULT_SIDE_PX = 1024  # of a single matcher that no recipe has
 CUDA_MINIBATCH = 8  # pairs at a time; on a CPU, more than one gains nothing and takes memory
 
 
@@ -131,9 +145,9 @@ class Assembly:
 
 
 def assemble(
-    recipe: Recipe | str,
+    recipe: Recipe | str | PathLike[str],
     *,
-    weights: Iterable[Path] = (),
+    weights: Weights = (),
     device: str = AUTO,
     precision: str = Precision.FLOAT32,
     mode: Mode = Mode.TWO_STAGE,
@@ -144,17 +158,19 @@ def assemble(
 ) -> Assembly:
     """Check recipe, options, licences, weights, device and precision; return the assembly.
 
+    ``recipe`` may be the name of a single matcher. ``weights`` are directories, or files by slot.
     A fallback replaces an unavailable matcher. Without one, recipe ``auto`` drops its units, and so
     does every recipe if the matcher cannot be loaded. ``scenes`` switches the reconstruction of
     batches on or off; ``None`` follows the recipe. ``settings`` replace the recipe's, see
     :func:`mkpc_kaggle.recipe.with_settings`. Raises :class:`UserError`, also if weights of a
     recipe other than ``auto`` are missing or not permitted, and if no unit of stage 1 remains.
     """
-    if not isinstance(recipe, Recipe | str):
-        raise TypeError(f"a recipe is a Recipe, a name, or a path as text, not {recipe!r}")
-    own = require_matchers(matchers or {})
-    store = WeightStore(weights)
-    written = load_recipe(recipe) if isinstance(recipe, str) else recipe
+    own = require_matchers({} if matchers is None else matchers)
+    directories, files = weights_of(weights)
+    store = WeightStore(directories, chosen=files)
+    written = recipe_of_name(recipe, own)
+    if not isinstance(settings, Mapping):
+        raise TypeError(f"settings is {shown_value(settings)}; expected a mapping from dotted keys")
     if settings:
         written = with_settings(written, settings)
     reasons = unavailable(written, store, licence, own)
@@ -164,9 +180,49 @@ def assemble(
     omitted = {name: reasons[name] for name in written.matcher_names if name in reasons}
     texts = left_out(written, omitted, is_auto=recipe == AUTO)
     chosen = chosen.with_scenes(scenes).in_mode(mode)
-    made = Assembly(chosen, store, resolve_placement(device, precision), texts, own, device)
+    placement = resolve_placement(device_of(device), precision_of(precision))
+    made = Assembly(chosen, store, placement, texts, own, device_of(device))
     _warn_of_unverified(made.weight_files.values())
     return made
+
+
+def recipe_of_name(recipe: Recipe | str | PathLike[str], own: Container[str] = ()) -> Recipe:
+    """Return the recipe of a name or file, or the recipe of a single matcher.
+
+    ``own`` has the names of the user's matchers. Raises :class:`UserError` for an unknown name.
+    """
+    if isinstance(recipe, Recipe):
+        return recipe
+    if not isinstance(recipe, str | PathLike):
+        raise TypeError(
+            f"recipe must be a Recipe, a name or the path of a TOML file, not {shown_value(recipe)}"
+        )
+    name = fspath(recipe)
+    if name in own or name in matcher_names() or name.startswith(VISMATCH):
+        return recipe_of_matcher(name)
+    try:
+        return load_recipe(name)
+    except UserError as error:
+        if name.endswith(".toml"):
+            raise
+        raise UserError(f"{error}, or a matcher: {', '.join(matcher_names())}") from error
+
+
+def recipe_of_matcher(name: str) -> Recipe:
+    """Return the recipe of one matcher on whole images: its first unit in ``auto``, if any, and
+    the settings of ``auto``.
+    """
+    auto = load_recipe(AUTO)
+    units = [unit for unit in auto.units if unit.matcher == name and unit.stage == 1]
+    unit = units[0] if units else Unit(1, name, DEFAULT_SIDE_PX)
+    own = {key: table for key, table in auto.matchers.items() if key == name}
+    return replace(
+        auto,
+        name=name,
+        description=f"{name} on whole images",
+        units=(replace(unit, tracks=True),),
+        matchers=own,
+    )
 
 
 def _without_unavailable(

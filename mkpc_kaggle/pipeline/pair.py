@@ -60,6 +60,11 @@ class PairMatch:
         return Matches.concatenate(result.matches for result in self.results)
 
     @property
+    def failures(self) -> dict[str, str]:
+        """The reason of each unit that failed, by the unit's name."""
+        return {result.unit.name: result.failure for result in self.results if result.failure}
+
+    @property
     def inliers(self) -> Matches:
         """The matches within MAGSAC's threshold of the model."""
         return self.matches[self.estimate.inliers]

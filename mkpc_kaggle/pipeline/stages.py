@@ -6,7 +6,7 @@ crops.
 
 import time
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +16,7 @@ from typing import Any
 from mkpc_kaggle.data.competition import Pair, read_rows
 from mkpc_kaggle.data.images import ByteCache, Image, read_size
 from mkpc_kaggle.data.masks import MaskReader, Masks
-from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.errors import UserError, plural
 from mkpc_kaggle.geometry.coordinates import Box, View
 from mkpc_kaggle.geometry.critical_region import CriticalRegion, RegionReason, critical_region
 from mkpc_kaggle.geometry.matches import Matches
@@ -43,6 +43,7 @@ class Pipeline:
     of one shape to encode. A unit that runs out of memory halves its minibatch from then on.
     Encodings of whole images, which many pairs share, are cached up to ``cache_bytes``. ``regions``
     replace MKPC's critical regions. Matches with a point that ``masks`` leave out are dropped.
+    Errors of the matchers in ``raising`` are raised, and do not become failed results.
     """
 
     def __init__(
@@ -56,6 +57,7 @@ class Pipeline:
         regions: GivenRegions = MappingProxyType({}),
         masks: Masks | None = None,
     ) -> None:
+        self.raising: Container[str] = ()
         self._masks = MaskReader(masks or Masks())
         self.recipe = recipe
         self.minibatch = minibatch
@@ -141,6 +143,9 @@ class Pipeline:
             is_overflow = isinstance(error, NonFiniteError)
             if is_overflow and self._fall_back_to_float32(unit.matcher, error):
                 return []
+            if failure is FailureKind.RAISED and unit.matcher in self.raising:
+                error.add_note(f"in {unit.name}")
+                raise
             if failure is FailureKind.RAISED and len(pairs) == 1:
                 reason = str(error) if isinstance(error, UnloadableError) else reason_of(error)
                 return [UnitResult(unit, Matches.empty(), failure=reason)]
@@ -187,6 +192,7 @@ class Pipeline:
         with exact_float32():
             found = matcher.match(firsts, encodings[1::2])
         matched = time.perf_counter()
+        require_answers(found, len(pairs), f"match of {unit.matcher!r}")
         warm_up = unit not in self._ran
         self._ran.add(unit)
         results = []
@@ -236,6 +242,11 @@ class Pipeline:
                     pictures.append(Picture(view.render(pixels), view))
                 with exact_float32():
                     encodings = matcher.encode(pictures)
+                if not hasattr(encodings, "__len__") or len(encodings) != len(pictures):
+                    raise TypeError(
+                        f"encode of {unit.matcher!r} must return an item for each of "
+                        f"{plural(len(pictures), 'picture')}"
+                    )
                 check_finite(f"features of {unit.matcher}", list(encodings))
                 known |= zip(part, encodings, strict=True)
         for key, image in missing.items():
@@ -261,6 +272,19 @@ class Pipeline:
             cause = self._unloadable[name]
             raise UnloadableError(f"{name} cannot be loaded: {_text_of(cause)}") from cause
         return self._matchers[name]
+
+
+def require_answers(found: Any, count: int, what: str) -> None:
+    """Raise ``TypeError`` unless ``found`` is a sequence of ``count`` :class:`Matches`."""
+    is_sequence = isinstance(found, Sequence)
+    if is_sequence and len(found) == count and all(isinstance(each, Matches) for each in found):
+        return
+    each = found[0] if is_sequence and found else found
+    returned = f"{len(found)} items, such as" if is_sequence and found else "a"
+    raise TypeError(
+        f"{what} must return a list of Matches, one for each of {plural(count, 'pair')}, "
+        f"not {returned} {type(each).__name__}"
+    )
 
 
 def _text_of(error: Exception) -> str:

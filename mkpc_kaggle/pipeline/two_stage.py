@@ -1,26 +1,40 @@
 """The Python API: two images in, matches and two-view model out."""
 
-from collections.abc import Iterable, Iterator, Mapping
+import warnings
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
-from pathlib import Path
+from itertools import repeat
+from os import PathLike
 from types import MappingProxyType
-from typing import Any, TypeAlias
+from typing import Any
 
-import numpy as np
-
-from mkpc_kaggle.data.images import Image, ImageStore, Unreadable, read_image
-from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.geometry.coordinates import Box, Matrix3, Pixels
-from mkpc_kaggle.geometry.robust import ModelKind
+from mkpc_kaggle.data.images import Image, ImageStore
+from mkpc_kaggle.errors import plural
+from mkpc_kaggle.geometry.coordinates import Box, Matrix3
+from mkpc_kaggle.geometry.robust import FailedEstimate, ModelKind
 from mkpc_kaggle.matchers.contract import Matcher
+from mkpc_kaggle.matchers.registry import require_methods
+from mkpc_kaggle.pipeline.arguments import (
+    ImageSource,
+    Weights,
+    boxes_of,
+    intrinsics_of,
+    member_of,
+    shown_value,
+    to_image,
+)
 from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.pipeline.availability import Licence
 from mkpc_kaggle.pipeline.pair import PairMatch, with_estimate
+from mkpc_kaggle.pipeline.stages import Pipeline
 from mkpc_kaggle.progress import counted
 from mkpc_kaggle.recipe import Recipe, Unit
 
-ImageSource: TypeAlias = str | Path | Pixels | Image
+__all__ = ["TwoStageMatcher", "to_image"]
+
+Intrinsics = tuple[Matrix3, Matrix3]
+Regions = tuple[Box, Box]
 
 
 class TwoStageMatcher:
@@ -34,19 +48,22 @@ class TwoStageMatcher:
         for match in matcher.match_pairs([("a.jpg", "b.jpg"), ("a.jpg", "c.jpg")]):
             print(match.estimate.inlier_count)
 
-    ``recipe`` is a :class:`Recipe`, a recipe's name, or a path to a TOML file. ``weights`` are
-    directories to search for weights. ``licence`` "permissive" refuses weights that forbid some
-    uses. ``matchers`` maps names in the recipe's units to your own matchers. ``settings`` replace
-    the recipe's, by dotted key, such as ``{"matchers.loftr.threshold": 0.3}``. ``progress`` counts
-    the units of a call on stderr. Raises :class:`UserError` for an unknown name and for missing
-    weights.
+    ``recipe`` is a :class:`Recipe`, a recipe's name, a path to a TOML file, or the name of a single
+    matcher, such as "aliked_lightglue". ``weights`` is a directory to search for weights, several
+    directories, or a mapping from slots to files, such as ``{"aliked-n16": "mine.pth"}``.
+    ``licence`` "permissive" refuses weights that forbid some uses. ``matchers`` maps names in the
+    recipe's units to your own matchers. ``settings`` replace the recipe's, by dotted key, such as
+    ``{"matchers.loftr.threshold": 0.3}``. ``progress`` counts the units of a call on stderr. Raises
+    :class:`UserError` for an unknown name and for missing weights.
+
+    A matcher can be pickled if the user's own matchers can. A copy loads its networks again.
     """
 
     def __init__(
         self,
-        recipe: Recipe | str = "auto",
+        recipe: Recipe | str | PathLike[str] = "auto",
         *,
-        weights: Iterable[str | Path] = (),
+        weights: Weights = (),
         device: str = "auto",
         precision: str = "float32",
         licence: Licence | str = Licence.ANY,
@@ -54,18 +71,33 @@ class TwoStageMatcher:
         settings: Mapping[str, Any] = MappingProxyType({}),
         progress: bool = False,
     ) -> None:
-        assembly = assemble(
+        self._assembly = assemble(
             recipe,
-            weights=map(Path, weights),
+            weights=weights,
             device=device,
             precision=precision,
-            licence=Licence(licence),
+            licence=member_of(Licence, licence, "licence"),
             matchers=matchers,
             settings=settings,
         )
-        self.recipe = assembly.recipe
-        self._pipeline = assembly.pipeline()
+        self.recipe = self._assembly.recipe
         self._progress = progress
+        self._pipeline = self._new_pipeline()
+
+    def _new_pipeline(self) -> Pipeline:
+        require_methods(self._assembly.matchers)
+        pipeline = self._assembly.pipeline()
+        # A fault of the user's own code is the user's to see.
+        pipeline.raising = self._assembly.matchers.keys()
+        return pipeline
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the state without the loaded matchers."""
+        return {name: value for name, value in vars(self).items() if name != "_pipeline"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._pipeline = self._new_pipeline()
 
     def __call__(
         self,
@@ -73,36 +105,104 @@ class TwoStageMatcher:
         image1: ImageSource,
         *,
         model: ModelKind | str = ModelKind.F,
-        intrinsics: tuple[Matrix3, Matrix3] | None = None,
-        regions: tuple[Box, Box] | None = None,
+        intrinsics: Intrinsics | None = None,
+        regions: Regions | None = None,
     ) -> PairMatch:
-        """Match two images, given as paths or as uint8 arrays, (H, W, 3) RGB or (H, W) gray.
+        """Match two images: paths, PIL images, arrays (H, W, 3) RGB or (H, W), tensors (3, H, W).
 
-        ``model`` E needs ``intrinsics``, the camera matrices in pixels. ``regions`` replace MKPC's
-        boxes; units of stage 2 fail if a box extends beyond its image. Points, boxes and F are in
-        pixels of the stored files; EXIF only turns the matchers' views upright. If no model is
-        found, ``estimate.failure`` has the reason.
+        Arrays and tensors are uint8, or floats in 0..1. ``model`` E needs ``intrinsics``, the
+        camera matrices in pixels. ``regions`` replace MKPC's boxes; each is a :class:`Box` or its
+        left, top, right and bottom. Points, boxes and F are in pixels of the stored files; EXIF
+        only turns the matchers' views upright.
 
-        Raises ``ValueError`` for model E without intrinsics and :class:`UserError` for an
-        unreadable image. Memory and device errors are not caught.
+        A unit that fails is a warning, and ``match.failures`` has its reason. If no model is found,
+        ``match.estimate`` is false, its ``failure`` has the reason, and the use of its matrix
+        raises it. The result keeps no images.
+
+        Raises ``TypeError`` or ``ValueError`` for a wrong argument, and :class:`UserError` for an
+        unreadable image, before any matching. Errors of memory, of the device, and of the user's
+        own matchers are raised.
         """
-        if ModelKind(model) is ModelKind.E and intrinsics is None:
+        kind = member_of(ModelKind, model, "model")
+        images = (to_image(image0, name="image0"), to_image(image1, name="image1"))
+        return self._match(images, kind, intrinsics, regions, progress=self._progress)
+
+    def match_pairs(
+        self,
+        pairs: Iterable[Sequence[ImageSource]],
+        *,
+        model: ModelKind | str = ModelKind.F,
+        intrinsics: Iterable[Intrinsics | None] | None = None,
+        regions: Iterable[Regions | None] | None = None,
+    ) -> Iterator[PairMatch]:
+        """Yield the match of each pair, as a call does for one pair.
+
+        An image that appears in several pairs is decoded and encoded once, while the caches have
+        room: sort the pairs by their first image. ``intrinsics`` and ``regions`` have an item for
+        each pair, which may be ``None``. Raises as a call does; wrong arguments of a pair when its
+        turn comes.
+        """
+        kind = member_of(ModelKind, model, "model")
+        if isinstance(pairs, str | bytes) or not hasattr(pairs, "__iter__"):
+            raise TypeError(f"pairs is {shown_value(pairs)}; expected pairs of images")
+        # Checked when they are iterated, because they may be generators.
+        each = (
+            pairs,
+            _of_each_pair(intrinsics, "intrinsics"),
+            _of_each_pair(regions, "regions"),
+        )
+        return self._match_each(zip(*each, strict=False), kind)
+
+    def _match_each(
+        self, given: Iterable[tuple[Any, Any, Any]], kind: ModelKind
+    ) -> Iterator[PairMatch]:
+        # Closed also if the caller stops early: its thread would keep the process alive.
+        with closing(ImageStore()) as store:
+            for number, (pair, intrinsics, regions) in enumerate(given):
+                name = f"pairs[{number}]"
+                if isinstance(pair, str) or not hasattr(pair, "__len__") or len(pair) != 2:
+                    raise TypeError(f"{name} is {shown_value(pair)}; expected two images")
+                first, second = pair
+                images = (
+                    to_image(first, store, f"{name}[0]"),
+                    to_image(second, store, f"{name}[1]"),
+                )
+                yield self._match(images, kind, intrinsics, regions)
+
+    def _match(
+        self,
+        images: tuple[Image, Image],
+        kind: ModelKind,
+        intrinsics: Intrinsics | None,
+        regions: Regions | None,
+        *,
+        progress: bool = False,
+    ) -> PairMatch:
+        """Check the arguments of a pair, run all units, and estimate the model."""
+        matrices = intrinsics_of(intrinsics)
+        boxes = boxes_of(regions, images)
+        if kind is ModelKind.E and matrices is None:
             raise ValueError(
                 "model E needs intrinsics=(K0, K1), the camera matrices of both images in pixels"
             )
-        images = (to_image(image0), to_image(image1))
+        if boxes and all(unit.stage == 1 for unit in self.recipe.units):
+            text = f"regions have no effect: recipe {self.recipe.name} has no unit of stage 2"
+            warnings.warn(text, RuntimeWarning, stacklevel=3)
         # Set or cleared by each call: they are of this pair only.
         self._pipeline.regions = {}
-        if regions:
-            self._pipeline.regions = {tuple(image.name for image in images): regions}
-        (pair,) = self._match(images)
-        return with_estimate(pair, self.recipe, ModelKind(model), intrinsics)
+        if boxes:
+            self._pipeline.regions = {tuple(image.name for image in images): boxes}
+        (pair,) = self._run(images, progress=progress)
+        match = _for_programs(with_estimate(pair, self.recipe, kind, matrices))
+        for name, reason in match.failures.items():
+            warnings.warn(f"unit {name} failed: {reason}", RuntimeWarning, stacklevel=3)
+        return match
 
-    def _match(self, images: tuple[Image, Image]) -> list[PairMatch]:
+    def _run(self, images: tuple[Image, Image], *, progress: bool) -> list[PairMatch]:
         """Run all units on a pair, with a bar if the user wants one."""
         pair = PairMatch(images=images)
         units = self.recipe.units
-        if not self._progress:
+        if not progress:
             return self._pipeline.match([pair], units)
         bar = counted(units, f"matching by recipe {self.recipe.name}", "unit")
         begun: set[Unit] = set()
@@ -118,34 +218,27 @@ class TwoStageMatcher:
         with closing(bar):
             return self._pipeline.match([pair], units, may_start)
 
-    def match_pairs(self, pairs: Iterable[tuple[ImageSource, ImageSource]]) -> Iterator[PairMatch]:
-        """Yield the match of each pair, as a call does for one pair.
 
-        An image that appears in several pairs is decoded and encoded once, while the caches have
-        room: sort the pairs by their first image. Raises :class:`UserError` for an unreadable
-        image.
-        """
-        self._pipeline.regions = {}
-        # Closed also if the caller stops early: its thread would keep the process alive.
-        with closing(ImageStore()) as store:
-            for first, second in pairs:
-                images = (to_image(first, store), to_image(second, store))
-                (pair,) = self._pipeline.match([PairMatch(images=images)], self.recipe.units)
-                yield with_estimate(pair, self.recipe)
+def _of_each_pair(values: Iterable[Any] | None, name: str) -> Iterator[Any]:
+    """Yield an argument's item for each pair. Raise ``ValueError`` for a pair without one."""
+    if values is None:
+        yield from repeat(None)
+    else:
+        count = 0
+        for value in values:
+            yield value
+            count += 1
+        raise ValueError(f"{name} has items for {plural(count, 'pair')} only")
 
 
-def to_image(source: ImageSource, store: ImageStore | None = None) -> Image:
-    """Return the image of a path or of an array. Raise :class:`UserError` for an unreadable file.
-
-    Paths are decoded by ``store``, if given, which remembers them.
-    """
-    if isinstance(source, Image):
-        return source
-    if isinstance(source, np.ndarray):
-        return Image.of_array(source)
-    path = Path(source)
-    image = read_image(path) if store is None else store.get(path)
-    if isinstance(image, Unreadable):
-        raise UserError(str(image))
-    # The name identifies the content: a file may change between calls.
-    return replace(image, name=image.version)
+def _for_programs(match: PairMatch) -> PairMatch:
+    """Return a match without its images, whose failed estimate cannot be used by mistake."""
+    sizes = tuple(image.size for image in match.images)
+    focals = tuple(image.focal for image in match.images)
+    estimate = match.estimate
+    if not estimate:
+        reasons = dict.fromkeys(match.failures.values())
+        has_points = len(match.failures) < len(match.results)
+        reason = estimate.failure if has_points else f"every unit failed: {'; '.join(reasons)}"
+        estimate = FailedEstimate.of(estimate, reason)
+    return replace(match, estimate=estimate, images=(), sizes=sizes, focals=focals)

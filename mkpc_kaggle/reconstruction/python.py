@@ -8,6 +8,7 @@ from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from mkpc_kaggle.data.images import Unreadable, read_image
@@ -18,9 +19,11 @@ from mkpc_kaggle.engine.state import name_below
 from mkpc_kaggle.engine.store import FILE_NAME
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.matchers.contract import Matcher
+from mkpc_kaggle.pipeline.arguments import PathSource, Weights, member_of, shown_value
 from mkpc_kaggle.pipeline.assembly import Assembly, assemble
+from mkpc_kaggle.pipeline.availability import Licence
 from mkpc_kaggle.recipe import Recipe
-from mkpc_kaggle.reconstruction.folder import require_distinct
+from mkpc_kaggle.reconstruction.folder import read_folder, require_distinct
 from mkpc_kaggle.reconstruction.priors import read_intrinsics_table
 from mkpc_kaggle.reconstruction.run import for_cameras, reconstruct_folder
 from mkpc_kaggle.scene.export import MODELS
@@ -48,20 +51,24 @@ class Models(tuple[SfmModel, ...]):
 
 
 def reconstruct(
-    images: Iterable[str | Path],
-    recipe: Recipe | str = "auto",
+    images: PathSource | Iterable[PathSource],
+    recipe: Recipe | PathSource = "auto",
     *,
-    weights: Iterable[str | Path] = (),
+    weights: Weights = (),
     device: str = "auto",
+    precision: str = "float32",
+    licence: Licence | str = Licence.ANY,
     matchers: Mapping[str, Matcher[Any]] | None = None,
+    settings: Mapping[str, Any] = MappingProxyType({}),
     masks: str | Path | None = None,
     intrinsics: str | Path | None = None,
     progress: bool = True,
     work_dir: str | Path | None = None,
 ) -> Models:
-    """Return the models of the images at these paths, the largest first; no model if too few images
-    match.
+    """Return the models of the images at these paths, or of a folder's images, the largest first; no
+    model if too few images match.
 
+    The arguments from ``recipe`` to ``settings`` are those of :class:`mkpc_kaggle.TwoStageMatcher`.
     This is a run of the command ``reconstruct`` on one set of images, without a time limit. Its
     ``progress`` is shown on the standard error stream. ``work_dir`` keeps the journal and COLMAP's
     files: after Ctrl-C, which raises ``KeyboardInterrupt``, the same call continues, and with more
@@ -75,9 +82,17 @@ def reconstruct(
     earlier call raises it, and so do cameras that cannot be computed.
     """
     # By absolute path, because the journal knows an image by its path below the common directory
-    given = {Path(image).absolute(): str(image) for image in images}
+    given = {image.absolute(): str(image) for image in image_paths(images)}
     files = sorted(given)
-    assembly = assemble(recipe, weights=map(Path, weights), device=device, matchers=matchers)
+    assembly = assemble(
+        recipe,
+        weights=weights,
+        device=device,
+        precision=precision,
+        licence=member_of(Licence, licence, "licence"),
+        matchers=matchers,
+        settings=settings,
+    )
     if len(files) < 2:
         return Models()
     require_readable(files)
@@ -115,6 +130,35 @@ def reconstruct(
             for scene in result.report.scenes
             for number, model in enumerate(scene.models)
         )
+
+
+def image_paths(images: Any) -> list[Path]:
+    """Return the paths of images, or the images of a folder.
+
+    Raises :class:`UserError` for a folder with several folders of images.
+    """
+    expected = "a folder, or paths of images"
+    if isinstance(images, str | os.PathLike):
+        folder = Path(images)
+        if not folder.is_dir():
+            raise UserError(f"images: {folder} is no folder; expected {expected}")
+        datasets = read_folder(folder)
+        if len(datasets) > 1:
+            names = ", ".join(datasets)
+            raise UserError(
+                f"images: {folder} has several folders of images, {names}; name one of them"
+            )
+        return [file for files in datasets.values() for file in files]
+    if not isinstance(images, Iterable) or hasattr(images, "shape"):
+        raise TypeError(f"images is {shown_value(images)}; expected {expected}")
+    paths = []
+    for number, image in enumerate(images):
+        if not isinstance(image, str | os.PathLike):
+            raise TypeError(
+                f"images[{number}] is {shown_value(image)}; expected the path of an image"
+            )
+        paths.append(Path(image))
+    return paths
 
 
 def require_readable(files: Sequence[Path]) -> None:

@@ -3,12 +3,13 @@
 import copy
 import os
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import cached_property
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from mkpc_kaggle.data.outputs import weights_of_environment
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     import torch
 
 KAGGLE_INPUT = Path("/kaggle/input")
+UNKNOWN_LICENCE = "unknown (own weights)"
 # A competition's input has thousands of images.
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png"})
 CHECKPOINT_SUFFIXES = frozenset({".pth", ".pt", ".ckpt", ".safetensors", ".bin", ".pkl", ""})
@@ -79,11 +81,15 @@ class WeightStore:
 
     These are ``--weights``, then ``$MKPC_WEIGHTS``, then ``/kaggle/input/**``. Files are compared
     with the lines ``files``. By default, the lines are from the package's manifest and from
-    manifests in the search directories, which list weights that ``package`` converted.
+    manifests in the search directories, which list weights that ``package`` converted. The
+    files ``chosen`` for slots are used as they are.
     """
 
     def __init__(
-        self, directories: Iterable[Path] = (), files: Sequence[WeightFile] | None = None
+        self,
+        directories: Iterable[Path] = (),
+        files: Sequence[WeightFile] | None = None,
+        chosen: Mapping[str, Path] = MappingProxyType({}),
     ) -> None:
         given = list(directories)
         for directory in given:
@@ -96,6 +102,8 @@ class WeightStore:
         self._device = "cpu"
         self._chosen: dict[str, FoundFile] = {}  # by slot; they replace the results of searches
         self._searches: dict[tuple[WeightFile, ...], Search] = {}
+        for slot, path in chosen.items():
+            self._chosen[slot] = self._given(slot, path)
 
     @property
     def searched(self) -> str:
@@ -124,6 +132,24 @@ class WeightStore:
                 if known.digest == UNVERIFIED:
                     lines[file.name] = replace(known, size=file.size, digest=file.digest)
         return tuple(lines.values())
+
+    def _given(self, slot: str, path: Path) -> FoundFile:
+        """Return the file that the user gives for a slot, whatever its bytes are.
+
+        Raises :class:`UserError` for an unknown slot and an unreadable file.
+        """
+        if not self.alternatives(slot):
+            known = ", ".join(dict.fromkeys(file.slot for file in self.files))
+            raise UserError(f"weights: unknown slot {slot!r}; known: {known}")
+        try:
+            digest = digest_of(path)
+            size = path.stat().st_size
+        except OSError as error:
+            raise UserError(f"weights[{slot!r}]: {path}: {error.strerror}") from error
+        # A file of the manifest keeps its licence; of other files it is unknown.
+        same = (file for file in self.alternatives(slot) if file.digest == digest)
+        own = WeightFile(path.name, size, digest, UNKNOWN_LICENCE, slot, str(path))
+        return FoundFile(next(same, own), path, State.GOOD, digest, "given for its slot")
 
     def alternatives(self, slot: str) -> list[WeightFile]:
         """Return the manifest's lines for a slot, in order of preference."""
@@ -156,7 +182,7 @@ class WeightStore:
         # A shallow copy shares the results of searches.
         other = copy.copy(self)
         other._device = "meta"
-        other._chosen = {found.file.slot: found for found in chosen}
+        other._chosen = self._chosen | {found.file.slot: found for found in chosen}
         return other
 
     def search(self, lines: Sequence[WeightFile]) -> Search:

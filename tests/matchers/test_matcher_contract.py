@@ -89,7 +89,7 @@ def test_both_stages_run_with_an_odd_flat_picture(matcher):
     flat = np.full((33, 47, 3), 128, np.uint8)
     found = run(flat, scene(90, 70, 3))
     assert [result.failure for result in found.results] == ["", ""]
-    assert np.isfinite(found.estimate.matrix).all()
+    assert np.isfinite(found.estimate.matrix_or_fallback).all()
 
 
 def overflow(monkeypatch):

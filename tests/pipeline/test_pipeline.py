@@ -297,15 +297,9 @@ def test_two_matchers_of_one_class_do_not_share_encodings_and_the_surest_matches
     assert 0 < len(match.results[0].matches) <= 31
 
 
-def test_no_matches_are_a_result_and_a_missing_answer_is_a_failure():
-    class Short(Scripted):
-        def match(self, encodings0, encodings1):
-            return []
-
-    units = (Unit(1, "none", 480), Unit(2, "short", 480))
-    match = own(*units, none=Scripted(), short=Short())(*pair())
-    assert match.results[0].failure == ""
-    assert "ValueError" in match.results[1].failure
+def test_no_matches_are_a_result():
+    match = own(Unit(1, "none", 480), Unit(2, "none", 480), none=Scripted())(*pair())
+    assert match.failures == {}
     assert "too few" in match.estimate.failure
     assert [region.reason for region in match.regions] == ["too few points"] * 2
 
@@ -313,9 +307,13 @@ def test_no_matches_are_a_result_and_a_missing_answer_is_a_failure():
 @pytest.mark.parametrize("error", [RuntimeError("out of luck"), cv2.error("no"), ValueError()])
 def test_a_matcher_that_raises_fails_its_units_and_the_others_run(error):
     units = [Unit(1, "bad", 480), Unit(1, "sift", 480), Unit(2, "bad", 480)]
-    match = own(*units, bad=Scripted(error))(*pair())
+    matchers = {"bad": Scripted(error), "sift": SiftMatcher(SiftOptions(), "cpu")}
+    recipe = Recipe(units)
+    (work,) = Pipeline(recipe, matchers.__getitem__).match(works(), units)
+    match = with_estimate(work, recipe)
     assert [bool(result.failure) for result in match.results] == [True, False, True]
     assert match.results[0].failure == f"{type(error).__name__}: {error}"
+    assert list(match.failures) == ["1:bad@480", "2:bad@480"]
     assert len(match.results[0].matches) == 0
     assert match.estimate.ok
 

@@ -1,0 +1,542 @@
+"""Arguments of the Python API: every accepted and every refused type, and errors that are seen."""
+
+import pickle
+import warnings
+from functools import cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+import PIL.Image
+import pytest
+import torch
+from exif_files import set_exif
+from pictures import same
+from sklearn.datasets import load_sample_image
+
+from mkpc_kaggle import PairMatch, TwoStageMatcher, reconstruct
+from mkpc_kaggle.cli import main
+from mkpc_kaggle.data.images import Image
+from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.geometry.coordinates import Box
+from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.matchers.adapters.sift import SiftMatcher, SiftOptions
+from mkpc_kaggle.matchers.contract import Colour, MatcherSpec
+from mkpc_kaggle.pipeline import assembly
+from mkpc_kaggle.pipeline.arguments import boxes_of, intrinsics_of, to_image
+from mkpc_kaggle.recipe import Recipe, Unit
+
+pytestmark = pytest.mark.usefixtures("nowhere_else")
+
+SIFT = Recipe((Unit(1, "sift", 320),))
+TWO_STAGES = Recipe((Unit(1, "sift", 320), Unit(2, "sift", 320)))
+K = np.array([[300.0, 0, 140], [0, 300, 100], [0, 0, 1]])
+ROTATED = 6  # EXIF's orientation of a camera on its side
+
+
+@cache
+def pixels(shift: int = 0):
+    photograph = load_sample_image("china.jpg")[100:300, 100 + shift : 380 + shift]
+    return np.ascontiguousarray(photograph)
+
+
+def chw(image):
+    return torch.from_numpy(image.copy()).permute(2, 0, 1)
+
+
+def gray(image):
+    return cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+
+
+def raises(call, error, *words):
+    """Raise unless the call raises ``error`` with all words in one line."""
+    with pytest.raises(error) as raised:
+        call()
+    message = str(raised.value)
+    assert "\n" not in message
+    assert [word for word in words if word not in message] == [], message
+
+
+# Images
+
+
+SAME = {  # forms of one image
+    "uint8": lambda image: image,
+    "not contiguous": lambda image: np.ascontiguousarray(image[:, ::-1])[:, ::-1],
+    "float64 in 0..1": lambda image: image / 255,
+    "float32 in 0..1": lambda image: (image / 255).astype(np.float32),
+    "(1, H, W, 3)": lambda image: image[None],
+    "(3, H, W)": lambda image: np.moveaxis(image, 2, 0),
+    "PIL": PIL.Image.fromarray,
+    "PIL, with alpha": lambda image: PIL.Image.fromarray(image).convert("RGBA"),
+    "Image": Image.of_array,
+    "tensor (3, H, W)": chw,
+    "tensor (H, W, 3)": torch.from_numpy,
+    "tensor (1, 3, H, W)": lambda image: chw(image)[None],
+    "tensor of floats": lambda image: chw(image) / 255,
+    "tensor with a gradient": lambda image: (chw(image) / 255).requires_grad_(),
+}
+SAME_GRAY = {
+    "(H, W)": gray,
+    "(H, W, 1)": lambda image: gray(image)[..., None],
+    "PIL, L": lambda image: PIL.Image.fromarray(gray(image)),
+    "PIL, 16 bits": lambda image: PIL.Image.fromarray(gray(image).astype(np.uint16) * 256),
+    "PIL, F": lambda image: PIL.Image.fromarray((gray(image) / 255).astype(np.float32)),
+    "tensor (1, H, W)": lambda image: torch.from_numpy(gray(image))[None],
+    "tensor (H, W)": lambda image: torch.from_numpy(gray(image) / 255),
+}
+
+
+@pytest.mark.parametrize("form", SAME)
+def test_an_image_in_each_form_has_the_same_pixels(form):
+    found = to_image(SAME[form](pixels()))
+    np.testing.assert_array_equal(found.pixels, pixels())
+
+
+@pytest.mark.parametrize("form", SAME_GRAY)
+def test_a_gray_image_in_each_form_has_the_same_pixels(form):
+    found = to_image(SAME_GRAY[form](pixels()))
+    np.testing.assert_array_equal(found.pixels, np.stack([gray(pixels())] * 3, axis=2))
+
+
+def test_a_pil_image_has_the_orientation_of_its_file(tmp_path):
+    path = tmp_path / "a.png"
+    PIL.Image.fromarray(pixels()).save(path)
+    set_exif(path, ROTATED)
+    for source in (path, str(path), PIL.Image.open(path)):
+        assert to_image(source).turns == 3
+        np.testing.assert_array_equal(to_image(source).pixels, pixels())
+
+
+REFUSED_IMAGES = {
+    "None": (None, TypeError, ["image1 is None", "cv2.imread"]),
+    "bytes": (b"png", TypeError, ["image1 is bytes", "expected a path"]),
+    "list": ([[1, 2], [3, 4]], TypeError, ["image1 is list", "expected a path"]),
+    "number": (3, TypeError, ["image1 is int 3"]),
+    "floats to 255": (pixels().astype(float), ValueError, ["image1", "float64", "0..1", "255"]),
+    "NaN": (np.full((9, 9), np.nan), ValueError, ["image1", "nan", "0..1"]),
+    "negative": (np.full((9, 9), -0.5), ValueError, ["image1", "-0.5", "0..1"]),
+    "int64": (pixels().astype(int), ValueError, ["image1 is int64 (200, 280, 3)", "uint8"]),
+    "uint16": (pixels().astype(np.uint16), ValueError, ["image1 is uint16", "uint8"]),
+    "mask": (np.zeros((9, 9), bool), ValueError, ["image1 is bool", "uint8"]),
+    "four channels": (np.zeros((9, 9, 4), np.uint8), ValueError, ["(9, 9, 4)", "(H, W, 3)"]),
+    "batch": (np.zeros((2, 9, 9, 3), np.uint8), ValueError, ["(2, 9, 9, 3)", "(H, W, 3)"]),
+    "vector": (np.zeros(9, np.uint8), ValueError, ["(9,)", "(H, W)"]),
+    "no pixels": (np.zeros((0, 9), np.uint8), ValueError, ["(0, 9)", "(H, W)"]),
+    "batch of tensors": (torch.zeros(2, 3, 9, 9), ValueError, ["(2, 3, 9, 9)", "(3, H, W)"]),
+    "no such file": ("none.png", UserError, ["none.png: no such file"]),
+    "a folder": (".", UserError, ["not a regular file"]),
+}
+
+
+class Unrun:
+    """A matcher that must not run."""
+
+    spec = MatcherSpec("unrun")
+
+    def encode(self, pictures):
+        raise AssertionError("arguments are checked before any work")
+
+    match = encode
+
+
+def unrun(*units):
+    return TwoStageMatcher(Recipe(units or (Unit(1, "unrun", 320),)), matchers={"unrun": Unrun()})
+
+
+@pytest.mark.parametrize("form", REFUSED_IMAGES)
+def test_another_value_for_an_image_is_refused_by_name_before_any_work(form):
+    value, error, words = REFUSED_IMAGES[form]
+    raises(lambda: unrun()(pixels(), value), error, *words)
+    if error is not UserError:
+        words = [word.replace("image1", "pairs[0][1]") for word in words]
+    raises(lambda: next(unrun().match_pairs([(pixels(), value)])), error, *words)
+
+
+# Camera matrices and boxes
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        (K, K),
+        [K, K],
+        np.stack([K, K]),
+        (K.tolist(), K.tolist()),
+        [[list(map(int, row)) for row in K]] * 2,
+        (torch.from_numpy(K), torch.from_numpy(K).float()),
+        torch.from_numpy(np.stack([K, K])).requires_grad_(),
+        (K[None], torch.from_numpy(K)[None]),
+        (K.astype(np.float32), K.astype(int)),
+    ],
+)
+def test_camera_matrices_in_each_form_are_the_same(given):
+    first, second = intrinsics_of(given)
+    np.testing.assert_array_equal(first, K)
+    np.testing.assert_array_equal(second, K)
+    assert first.dtype == second.dtype == np.float64
+
+
+REFUSED_INTRINSICS = [
+    (K, ValueError, ["intrinsics has the shape (3, 3)", "(K0, K1)"]),
+    ((K,), ValueError, ["intrinsics has 1 value", "(K0, K1)"]),
+    ((K, K, K), ValueError, ["intrinsics has 3 values"]),
+    ((K, K[:2]), ValueError, ["intrinsics[1] has the shape (2, 3)"]),
+    ((K, None), TypeError, ["intrinsics[1] is None"]),
+    ((K, "K"), TypeError, ["intrinsics[1] is str 'K'"]),
+    ((300.0, 300.0), TypeError, ["intrinsics[0] is float 300.0"]),
+    (300.0, TypeError, ["intrinsics is float 300.0"]),
+    ((K * 0, K), ValueError, ["intrinsics[0]", "positive fx and fy"]),
+    ((K, K * np.nan), ValueError, ["intrinsics[1]", "positive fx and fy"]),
+    ((K, K.T), ValueError, ["intrinsics[1]", "[fx s cx; 0 fy cy; 0 0 1]"]),
+]
+
+
+@pytest.mark.parametrize(("given", "error", "words"), REFUSED_INTRINSICS)
+def test_other_camera_matrices_are_refused_before_any_work(given, error, words):
+    raises(lambda: unrun()(pixels(), pixels(), intrinsics=given), error, *words)
+    of_pairs = unrun().match_pairs([(pixels(), pixels())], intrinsics=[given])
+    raises(lambda: next(of_pairs), error, *words)
+
+
+IMAGES = (Image.of_array(pixels()), Image.of_array(pixels(40)))
+BOX = Box(0, 10, 200, 150)
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        (BOX, BOX),
+        [(0, 10, 200, 150), [0, 10, 200, 150]],
+        np.array([[0, 10, 200, 150]] * 2),
+        np.array([[0.0, 10, 200, 150]] * 2),
+        torch.tensor([[0, 10, 200, 150]] * 2),
+        (Box(0.0, 10.0, 200.0, 150.0), BOX),
+    ],
+)
+def test_boxes_in_each_form_are_the_same(given):
+    first, second = boxes_of(given, IMAGES)
+    assert first == second == BOX
+    assert {type(side) for side in vars(first).values()} == {int}
+
+
+REFUSED_REGIONS = [
+    (BOX, TypeError, ["regions is Box", "two boxes"]),
+    ((BOX,), ValueError, ["regions has 1 value", "two boxes"]),
+    ((), ValueError, ["regions has 0 values"]),
+    (np.zeros((3, 4), int), ValueError, ["regions has the shape (3, 4)"]),
+    ((BOX, None), TypeError, ["regions[1] is None", "left, top, right, bottom"]),
+    ((BOX, (0, 0, 9)), TypeError, ["regions[1] is tuple (0, 0, 9)"]),
+    ((BOX, (0, 0, 9.5, 9)), TypeError, ["regions[1]", "whole numbers"]),
+    ((BOX, (9, 9, 5, 5)), ValueError, ["regions[1]", "empty"]),
+    ((BOX, Box(0, 0, 281, 100)), ValueError, ["regions[1]", "beyond image1 of 280 x 200 pixels"]),
+    ((Box(-1, 0, 9, 9), BOX), ValueError, ["regions[0]", "beyond image0"]),
+]
+
+
+@pytest.mark.parametrize(("given", "error", "words"), REFUSED_REGIONS)
+def test_other_boxes_are_refused_before_any_work(given, error, words):
+    two = (Unit(1, "unrun", 320), Unit(2, "unrun", 320))
+    raises(lambda: unrun(*two)(pixels(), pixels(40), regions=given), error, *words)
+    of_pairs = unrun(*two).match_pairs([(pixels(), pixels(40))], regions=[given])
+    raises(lambda: next(of_pairs), error, *words)
+
+
+def test_boxes_crop_stage_2_and_one_image_may_have_two():
+    match = TwoStageMatcher(TWO_STAGES)(pixels(), pixels(), regions=((0, 0, 200, 150), BOX))
+    assert [region.box for region in match.regions] == [Box(0, 0, 200, 150), BOX]
+    assert len(match.matches[match.in_stage(2)]) > 20
+
+
+def test_boxes_without_a_stage_2_are_a_warning():
+    with pytest.warns(RuntimeWarning, match="regions have no effect: recipe unnamed has no unit"):
+        TwoStageMatcher(SIFT)(pixels(), pixels(40), regions=(BOX, BOX))
+
+
+# Other arguments
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "words"),
+    [
+        ({"recipe": None}, TypeError, ["recipe", "None"]),
+        ({"recipe": "sfit"}, UserError, ["'sfit'", "classical", "aliked_lightglue"]),
+        ({"recipe": Path("none.toml")}, UserError, ["none.toml cannot be read"]),
+        ({"weights": 5}, TypeError, ["weights is int 5", "a directory"]),
+        ({"weights": [None]}, TypeError, ["weights[0] is None", "a path"]),
+        ({"weights": "none"}, UserError, ["weights none: no such directory"]),
+        ({"weights": {"aliked": "a.pth"}}, UserError, ["unknown slot 'aliked'", "aliked-n16"]),
+        ({"weights": {"aliked-n16": "none.pth"}}, UserError, ["aliked-n16", "none.pth", "No such"]),
+        ({"weights": {"aliked-n16": None}}, TypeError, ["weights['aliked-n16'] is None"]),
+        ({"licence": "mit"}, ValueError, ["licence is str 'mit'", "'any', 'permissive'"]),
+        ({"device": "gpu"}, UserError, ["'gpu'"]),
+        ({"precision": "half"}, UserError, ["'half'", "float16"]),
+        ({"precision": None}, UserError, ["'None'", "float16"]),
+        ({"settings": [1]}, TypeError, ["settings is list [1]", "dotted keys"]),
+        ({"settings": {1: 2}}, UserError, ["settings", "got 1"]),
+        ({"settings": {"magsac.threshold": "wide"}}, UserError, ["threshold", "'wide'"]),
+        ({"settings": {"magsac.threshold": np.ones(2)}}, UserError, ["threshold", "array"]),
+        ({"matchers": {"sift": SiftMatcher}}, TypeError, ["'sift' is a class", "instance"]),
+    ],
+)
+@pytest.mark.parametrize("call", [TwoStageMatcher, lambda *a, **k: reconstruct([], *a, **k)])
+def test_another_argument_of_a_matcher_is_refused_by_name(call, arguments, error, words):
+    given = {"recipe": "classical"} | arguments
+    raises(lambda: call(given.pop("recipe"), **given), error, *words)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        {"weights": "."},
+        {"weights": Path()},
+        {"weights": None},
+        {"weights": (Path(), ".")},
+        {"device": torch.device("cpu")},
+        {"precision": torch.float32},
+        {"settings": {"magsac.threshold": np.linspace(0.1, 1, 3)[1]}},
+        {"settings": {"magsac.threshold": np.float32(0.5), "magsac.every_match": np.True_}},
+        {"settings": {"magsac.threshold": torch.tensor(0.5)}},
+        {"settings": {"matchers.sift.features": np.arange(1000, 4000, 1000)[1]}},
+        {"settings": {"magsac.max_iterations": np.array(1000)}},
+    ],
+)
+def test_an_argument_of_a_matcher_is_taken_where_its_meaning_is_plain(arguments):
+    for recipe in ("classical", SIFT):
+        made = TwoStageMatcher(recipe, **arguments)
+        for key, value in arguments.get("settings", {}).items():
+            table, *_, name = key.split(".")
+            settings = (
+                made.recipe.matchers["sift"] if table == "matchers" else vars(made.recipe.magsac)
+            )
+            assert settings[name] == value
+
+
+def test_a_recipe_may_be_a_path(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text('units = [{ stage = 1, matcher = "sift", long_side = 320 }]\n')
+    assert TwoStageMatcher(path).recipe == TwoStageMatcher(str(path)).recipe
+
+
+def test_units_have_whole_numbers_and_recipes_have_units():
+    assert Unit(np.int64(1), "sift", np.int32(640)) == Unit(1, "sift", 640)
+    for values in (("1", "sift", 640), (1, "sift", 640.0), (True, "sift", 640)):
+        raises(lambda values=values: Unit(*values), ValueError, "must be a whole number")
+    assert Recipe([Unit(1, "sift", 640)]).units == (Unit(1, "sift", 640),)
+    raises(lambda: Recipe(("sift",)), TypeError, "expected units", "'sift'")
+
+
+@pytest.mark.parametrize(
+    ("pairs", "word"), [("ab", "pairs is str 'ab'"), (5, "pairs is int 5"), (None, "pairs is None")]
+)
+def test_pairs_of_another_type_are_refused(pairs, word):
+    raises(lambda: unrun().match_pairs(pairs), TypeError, word)
+
+
+@pytest.mark.parametrize("pair", ["ab", ("a.png",), 5, None])
+def test_a_pair_of_another_type_is_refused(pair):
+    raises(lambda: list(unrun().match_pairs([pair])), TypeError, "pairs[0] is", "two images")
+
+
+def test_a_model_of_another_name_is_refused():
+    for call in (
+        lambda: unrun()(pixels(), pixels(), model="G"),
+        lambda: unrun().match_pairs([], model="G"),
+    ):
+        raises(call, ValueError, "model is str 'G'", "'F', 'E', 'H'")
+    raises(lambda: unrun()(pixels(), pixels(), model="E"), ValueError, "model E needs intrinsics")
+
+
+def test_the_images_of_reconstruct_may_be_a_folder(tmp_path):
+    raises(lambda: reconstruct(str(tmp_path / "none"), "classical"), UserError, "is no folder")
+    raises(lambda: reconstruct(5, "classical"), TypeError, "images is int 5")
+    raises(lambda: reconstruct([5], "classical"), TypeError, "images[0] is int 5")
+    for name in ("one", "two"):
+        (tmp_path / name).mkdir()
+        for number in range(2):
+            PIL.Image.fromarray(pixels()).save(tmp_path / name / f"{number}.png")
+    raises(lambda: reconstruct(tmp_path, "classical"), UserError, "several folders", "one, two")
+
+
+def test_arguments_of_pairs_are_those_of_a_call():
+    matcher = TwoStageMatcher(TWO_STAGES)
+    pair = (pixels(), pixels(40))
+    options = {"intrinsics": (K, K), "regions": (BOX, BOX)}
+    expected = matcher(*pair, model="E", **options)
+    given = {name: [value, None] for name, value in options.items()}
+    given["intrinsics"][1] = (K, K)
+    found, other = matcher.match_pairs([pair, pair], model="E", **given)
+    assert same(found.matches, expected.matches)
+    np.testing.assert_array_equal(found.estimate.matrix, expected.estimate.matrix)
+    assert found.estimate.model == "E"
+    assert [region.reason for region in other.regions] != ["given"] * 2
+    short = matcher.match_pairs([pair, pair], intrinsics=[(K, K)])
+    raises(lambda: list(short), ValueError, "intrinsics", "1")
+
+
+# Errors
+
+
+class Own:
+    """A matcher of the user's, whose ``match`` is given."""
+
+    spec = MatcherSpec("own", colour=Colour.GRAY)
+
+    def __init__(self, match):
+        self.match = match
+
+    def encode(self, pictures):
+        return [None for _ in pictures]
+
+
+def fail(*_):
+    raise RuntimeError("my bug")
+
+
+def own(match):
+    return TwoStageMatcher(Recipe((Unit(1, "own", 320),)), matchers={"own": Own(match)})
+
+
+def test_an_error_of_the_users_own_matcher_is_raised():
+    for call in (
+        lambda: own(fail)(pixels(), pixels()),
+        lambda: list(own(fail).match_pairs([(pixels(), pixels())])),
+    ):
+        with pytest.raises(RuntimeError, match="my bug") as raised:
+            call()
+        assert raised.value.__notes__ == ["in 1:own@320"]
+
+
+ONE = Matches([(1, 1)], [(2, 2)], [1])
+
+
+@pytest.mark.parametrize(
+    ("answer", "word"),
+    [
+        (None, "not a NoneType"),
+        ([], "one for each of 1 pair"),
+        (ONE, "not a Matches"),
+        ([None], "not 1 items, such as NoneType"),
+        ([(ONE.points0, ONE.points1, ONE.scores)], "not 1 items, such as tuple"),
+        ([{"keypoints0": ONE.points0}], "not 1 items, such as dict"),
+        ([ONE, ONE], "not 2 items, such as Matches"),
+    ],
+)
+def test_another_answer_of_the_users_own_matcher_is_named(answer, word):
+    call = own(lambda *_: answer)
+    raises(lambda: call(pixels(), pixels()), TypeError, "match of 'own'", "a list of Matches", word)
+
+
+def test_a_matcher_without_a_method_is_refused():
+    class Half:
+        spec = MatcherSpec("own")
+
+        def encode(self, pictures):
+            return pictures
+
+    raises(
+        lambda: TwoStageMatcher(Recipe((Unit(1, "own", 320),)), matchers={"own": Half()}),
+        TypeError,
+        "'own' has no method `match`",
+    )
+
+
+class Unlucky(SiftMatcher):
+    def match(self, encodings0, encodings1):
+        raise RuntimeError("out of luck")
+
+
+@pytest.fixture
+def unlucky(monkeypatch):
+    """The package's own RootSIFT fails."""
+    monkeypatch.setattr(
+        assembly, "load_matcher", lambda *_: Unlucky(SiftOptions(features=100), "cpu")
+    )
+
+
+def test_a_unit_that_fails_is_a_warning_and_an_estimate_without_points_names_it(unlucky):
+    with pytest.warns(RuntimeWarning, match=r"unit 1:sift@320 failed: RuntimeError: out of luck"):
+        match = TwoStageMatcher(SIFT)(pixels(), pixels(40))
+    assert match.failures == {"1:sift@320": "RuntimeError: out of luck"}
+    assert not match.estimate
+    assert not match.estimate.ok
+    assert match.estimate.failure == "every unit failed: RuntimeError: out of luck"
+    assert match.estimate.inlier_count == 0
+    assert "every unit failed" in repr(match.estimate)
+    raises(lambda: match.estimate.matrix, UserError, "no F was found: every unit failed")
+    assert np.isfinite(match.estimate.matrix_or_fallback).all()
+    copy = pickle.loads(pickle.dumps(match))
+    raises(lambda: copy.estimate.matrix, UserError, "no F was found: every unit failed")
+
+
+@pytest.mark.parametrize(("is_unlucky", "status"), [(True, 1), (False, 0)])
+def test_the_command_match_ends_with_1_if_every_unit_failed(
+    tmp_path, monkeypatch, capsys, request, is_unlucky, status
+):
+    if is_unlucky:
+        request.getfixturevalue("unlucky")
+    monkeypatch.chdir(tmp_path)
+    for name in "ab":
+        PIL.Image.fromarray(pixels()).save(f"{name}.png")
+    Path("one.toml").write_text('units = [{ stage = 1, matcher = "sift", long_side = 320 }]\n')
+    with warnings.catch_warnings():  # a command prints them
+        warnings.simplefilter("always")
+        found = main(["match", "a.png", "b.png", "--recipe", "one.toml", "--device", "cpu"])
+    printed = capsys.readouterr()
+    assert found == status, printed
+    assert ("overlap" in printed.out) != is_unlucky
+    assert ("out of luck" in printed.err) == is_unlucky
+    assert ("out of luck" in printed.out) == is_unlucky
+
+
+def test_flat_images_have_a_failure_of_the_estimate_and_not_of_units():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        match = TwoStageMatcher(SIFT)(np.zeros((99, 99), np.uint8), np.zeros((99, 99), np.uint8))
+    assert match.failures == {}
+    assert not match.estimate
+    raises(lambda: match.estimate.matrix, UserError, "no F was found: too few")
+
+
+# What a result keeps
+
+
+def arrays_in(value, seen=None):
+    """All arrays that an object holds, at any depth."""
+    seen = set() if seen is None else seen
+    if id(value) in seen:
+        return []
+    seen.add(id(value))
+    if isinstance(value, np.ndarray):
+        return [value]
+    parts = []
+    if isinstance(value, dict):
+        parts = list(value.values())
+    elif isinstance(value, tuple | list):
+        parts = list(value)
+    elif hasattr(value, "__dict__"):
+        parts = list(vars(value).values())
+    return [array for part in parts for array in arrays_in(part, seen)]
+
+
+def test_a_result_keeps_no_image_and_can_be_pickled():
+    matcher = TwoStageMatcher(TWO_STAGES)
+    alone = matcher(pixels(), pixels(40))
+    for match in (alone, *matcher.match_pairs([(pixels(), pixels(40))])):
+        assert match.images == ()
+        assert match.sizes == ((280, 200), (280, 200))
+        assert match.focals == (0.0, 0.0)
+        kept = arrays_in(match)
+        assert kept
+        assert all(array.dtype != np.uint8 for array in kept)
+        copy: PairMatch = pickle.loads(pickle.dumps(match))
+        assert same(copy.matches, match.matches)
+        assert copy.regions == match.regions
+        np.testing.assert_array_equal(copy.estimate.matrix, match.estimate.matrix)
+
+
+def test_a_copy_of_a_matcher_by_pickle_gives_the_same_matches():
+    matcher = TwoStageMatcher(TWO_STAGES, settings={"matchers.sift.features": 500})
+    expected = matcher(pixels(), pixels(40))
+    copy = pickle.loads(pickle.dumps(matcher))
+    assert same(copy(pixels(), pixels(40)).matches, expected.matches)
