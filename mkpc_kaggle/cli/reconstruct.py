@@ -94,7 +94,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--camera", choices=list(map(str, CameraSharing)), help=text)
     text = """known cameras, a table with the columns image (a path, a name or a pattern such as 'drone*.jpg'),
         model (COLMAP's: SIMPLE_PINHOLE, OPENCV, ...), parameters (in COLMAP's order, separated by blanks),
-        sigma (of the focal length, in percent, or fixed), and optionally size (such as 1536x1024, of the images)"""
+        sigma (of the focal length, in percent, or fixed), and optionally size (of the images: 1536x1024)"""
     add("--intrinsics", type=Path, metavar="FILE.csv", help=text)
     text = "masks named as COLMAP's, MASKS/a.jpg.png for a.jpg; points on black pixels are left out"
     add("--masks", type=Path, metavar="MASKS", help=text)

@@ -151,8 +151,9 @@ def _decode(data: Pixels) -> Pixels | None:
 
 def _decode_file(data: Pixels) -> Pixels | None:
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-    bgr: Pixels | None = cv2.imdecode(data, flags)
-    return bgr
+    # OpenCV's types do not say that the pixels are bytes, as IMREAD_COLOR makes them.
+    bgr: Any = cv2.imdecode(data, flags)
+    return bgr if bgr is None else np.asarray(bgr, np.uint8)
 
 
 def _with_end(data: Pixels, more: bytes) -> Pixels:

@@ -72,7 +72,7 @@ def test_a_box_beyond_a_picture_that_is_called_otherwise_is_refused(tmp_path, sm
     names = [str(write(tmp_path / name, "WEBP")) for name in ("a.jpg", "b.jpg")]
     table = tmp_path / "regions.csv"
     table.write_text("image_0,image_1,box_0,box_1\na.jpg,b.jpg,0 0 60 40,0 0 61 40\n")
-    with pytest.raises(UserError, match="a box ends at 61, 40, beyond .*b.jpg of 60 x 40 pixels"):
+    with pytest.raises(UserError, match=r"a box ends at 61, 40, beyond .*b.jpg of 60 x 40 pixels"):
         read_regions(table, tmp_path, [Pair("p", "b", *names)])
 
 
