@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 import numpy as np
 from numpy.typing import NDArray
 
+from mkpc_kaggle.data.images import IMAGE_SUFFIXES, MORE_SUFFIXES
 from mkpc_kaggle.data.outputs import replacing
 from mkpc_kaggle.errors import UserError, plural
 from mkpc_kaggle.geometry.cameras import Camera
@@ -29,7 +30,6 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 SUBMISSION_COLUMNS = ("sample_id", "fundamental_matrix")
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 
 MAX_COLUMNS = 1000  # of a table; pandas takes minutes for a hundred thousand
 MAX_LINE = 1 << 20  # characters of a row; other files may have lines of gigabytes
@@ -403,10 +403,12 @@ def image_files(directory: Path) -> Callable[[str], str]:
     known: dict[str, str] = {}
     # The directory is missing, or its name is too long or not encodable.
     with suppress(OSError, ValueError):
-        for path in sorted(directory.iterdir()):
-            # Of "a.jpg" and "a.png", the first one counts.
-            if path.suffix.lower() in IMAGE_SUFFIXES:
-                known.setdefault(path.stem, str(path))
+        paths = sorted(directory.iterdir())
+        # Of "a.jpg" and "a.png", the first one counts; other formats come after both.
+        for suffixes in (IMAGE_SUFFIXES, MORE_SUFFIXES):
+            for path in paths:
+                if path.suffix.lower() in suffixes:
+                    known.setdefault(path.stem, str(path))
     return lambda name: known.get(name) or f"{directory}{os.sep}{name}.png"
 
 

@@ -23,6 +23,24 @@ from mkpc_kaggle.data.heads import ORIENTATION, exif_tags, is_tiff, size_of
 from mkpc_kaggle.errors import shown
 from mkpc_kaggle.geometry.coordinates import Pixels, Size
 
+# Files that are read as photographs, by suffix; the first three also stand for the competitions'
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
+MORE_SUFFIXES = (
+    *(".jpe", ".jfif", ".webp", ".tif", ".tiff", ".bmp", ".ppm", ".pgm", ".pnm", ".jp2"),
+    # OpenCV's wheels have a reader of AVIF since 2024.
+    *((".avif",) if cv2.haveImageWriter("a.avif") else ()),
+)
+READ_SUFFIXES = IMAGE_SUFFIXES + MORE_SUFFIXES
+# Photographs that nothing here decodes: of phones, of newer formats, and of sensors (raw)
+OTHER_SUFFIXES = frozenset(
+    (
+        *(".heic", ".heif", ".hif", ".avif", ".jxl", ".jxr", ".exr", ".psd", ".gif", ".insp"),
+        *(".dng", ".raw", ".cr2", ".cr3", ".crw", ".nef", ".nrw", ".arw", ".sr2", ".srf", ".orf"),
+        *(".rw2", ".raf", ".pef", ".srw", ".x3f", ".3fr", ".iiq", ".rwl", ".erf", ".mrw", ".kdc"),
+        ".gpr",
+    )
+) - set(READ_SUFFIXES)
+
 # Ratio of the sides; a longer image's views would be a few pixels high or exceed the memory.
 MAX_ASPECT = 32
 

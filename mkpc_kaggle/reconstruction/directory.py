@@ -10,7 +10,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
 
-from mkpc_kaggle.data.competition import IMAGE_SUFFIXES
+from mkpc_kaggle.data.images import READ_SUFFIXES
 from mkpc_kaggle.data.outputs import lies_in, replacing, weights_of_environment
 from mkpc_kaggle.engine.console import warn
 from mkpc_kaggle.errors import UserError, writing
@@ -24,7 +24,7 @@ RESERVED = {DATABASE, MODELS, SPARSE, WORK, *TABLES}  # names that no dataset ma
 FILES = (DATABASE, MODELS, SPARSE, IMAGES, REFERENCE)  # of each dataset
 MARK = f"{WORK}/results.json"  # digests of results by path; "" if their run did not end
 MODEL_FILE = re.compile(rf"\d+(/({'|'.join(map(re.escape, MODEL_FILES))}))?")
-IMAGE_FILE = re.compile(rf"[^/]+({'|'.join(map(re.escape, IMAGE_SUFFIXES))})", re.IGNORECASE)
+IMAGE_FILE = re.compile(rf"[^/]+({'|'.join(map(re.escape, READ_SUFFIXES))})", re.IGNORECASE)
 # The paths in folders of results
 CONTENTS = {MODELS: MODEL_FILE, SPARSE: MODEL_FILE, IMAGES: IMAGE_FILE}
 

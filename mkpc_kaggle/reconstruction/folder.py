@@ -2,10 +2,13 @@
 
 import os
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
-from mkpc_kaggle.data.competition import CONTROL, IMAGE_SUFFIXES
+from mkpc_kaggle.data.competition import CONTROL
+from mkpc_kaggle.data.images import IMAGE_SUFFIXES, MORE_SUFFIXES, OTHER_SUFFIXES, READ_SUFFIXES
 from mkpc_kaggle.engine.console import warn
 from mkpc_kaggle.errors import UserError, printable, read_text
 from mkpc_kaggle.reconstruction.directory import RESERVED
@@ -13,48 +16,123 @@ from mkpc_kaggle.reconstruction.directory import RESERVED
 # Images of each folder, by the folder's path below the root
 Datasets = Mapping[str, Sequence[Path]]
 Ends = tuple[Path, Path]
+# Of Synology, QNAP, Windows and macOS: small copies of the photographs, and deleted ones
+THUMBNAIL_FOLDERS = frozenset(
+    {"@eadir", "#recycle", "@recycle", "$recycle.bin", "system volume information", "__macosx"}
+)
 
 
-def read_folder(root: Path) -> Datasets:
+def read_folder(root: Path, *, join: bool = False) -> Datasets:
     """Return the datasets, sorted by name: each folder with images below ``root``, and ``root``
-    itself as ".".
+    itself as ".". With ``join``, all images below ``root`` are the dataset ".".
 
-    Hidden files and folders are skipped with a warning. Raises :class:`UserError` if no dataset has
-    two images, if images of a dataset differ only in the suffix, or if a name cannot be used in
-    result files.
+    Hidden files, thumbnails of file servers and photographs that cannot be read are skipped with a
+    warning. Raises :class:`UserError` if no dataset has two images, if images of a dataset differ
+    only in the suffix, or if a name cannot be used in result files.
     """
     if not root.is_dir():
         raise UserError(
             f"{root}: no such directory; name a folder of images, or of folders of images"
         )
-    datasets = {}
-    hidden: list[Path] = []
+    found = _Found()
+    datasets: dict[str, list[Path]] = {}
+    for folder, files in _folders(root, found):
+        name = folder.relative_to(root).as_posix()
+        _require_usable(folder, root, files, is_dataset=not join)
+        datasets.setdefault("." if join else name, []).extend(files)
+    for line in found.lines():
+        warn(line)
+    if not datasets:
+        message = f"{root} has no images: name a folder with {', '.join(READ_SUFFIXES)} files"
+        if found.unread:
+            message += "; photographs of other formats must be converted first"
+        raise UserError(message)
+    # Other datasets of a single image are listed without a camera.
+    if all(len(files) < 2 for files in datasets.values()):
+        name = next(iter(datasets.values()))[0].name
+        raise UserError(f"{root} has a single image, {name}: matching needs two")
+    return dict(sorted(datasets.items()))
+
+
+def images_below(folder: Path) -> list[Path]:
+    """Return all images below a folder, for a program that names the folder in place of them."""
+    found = _Found()
+    files = [file for _, files in _folders(folder, found) for file in files]
+    for line in found.lines():
+        warn(line)
+    return files
+
+
+@dataclass
+class _Found:
+    """Files and folders that are not read, for one line about each kind."""
+
+    hidden: list[Path] = field(default_factory=list)
+    thumbnails: list[Path] = field(default_factory=list)
+    unread: list[Path] = field(default_factory=list)
+    twins: list[Path] = field(default_factory=list)
+
+    def lines(self) -> Iterator[str]:
+        if self.hidden:
+            yield f"hidden files and folders are passed over: {_first(self.hidden)}"
+        if self.thumbnails:
+            yield f"folders of thumbnails and deleted files are passed over: {_first(self.thumbnails)}"
+        if self.twins:
+            yield (
+                "passed over, for another image of the folder has the same name: "
+                f"{_first(self.twins)}"
+            )
+        if self.unread:
+            kinds = Counter(path.suffix.lower() for path in self.unread)
+            counts = ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items()))
+            yield (
+                f"photographs that cannot be read: {counts}, the first is {self.unread[0]}; "
+                "convert them to JPEG or PNG"
+            )
+
+
+def _first(paths: Sequence[Path]) -> str:
+    return f"{len(paths)}, the first is {paths[0]}"
+
+
+def _folders(root: Path, found: _Found) -> Iterator[tuple[Path, list[Path]]]:
+    """Yield each folder with images from ``root`` on, and its images, sorted."""
     seen = {root.resolve()}
     # A folder that cannot be read is an error: a part of the images would be missing silently.
     for place, folders, names in os.walk(root, onerror=_refuse_unreadable, followlinks=True):
         folder = Path(place)
         # Sorted, since the order of a file system is arbitrary and decides bytes of results
         images = sorted(filter(_is_image, names))
-        hidden += [folder / name for name in (*folders, *images) if name.startswith(".")]
-        inner = [folder / name for name in sorted(folders) if not name.startswith(".")]
+        found.hidden += [folder / name for name in (*folders, *images) if name.startswith(".")]
+        found.thumbnails += [folder / name for name in sorted(folders) if _has_thumbnails(name)]
+        inner = [
+            folder / name
+            for name in sorted(folders)
+            if not name.startswith(".") and not _has_thumbnails(name)
+        ]
         # Links may form a cycle
         folders[:] = [each.name for each in inner if each.resolve() not in seen]
         seen.update(each.resolve() for each in inner)
-        files = [folder / name for name in images if not name.startswith(".")]
+        files, twins = _without_twins(name for name in images if not name.startswith("."))
+        found.twins += [folder / name for name in twins]
+        # A raw file next to its JPEG is no loss.
+        stems = {_stem(name) for name in files}
+        others = [name for name in sorted(names) if _suffix(name) in OTHER_SUFFIXES]
+        found.unread += [
+            folder / name
+            for name in others
+            if _stem(name) not in stems and not name.startswith(".")
+        ]
         if files:
-            _require_usable(folder, root, files)
-            datasets[folder.relative_to(root).as_posix()] = files
-    if hidden:
-        warn(f"hidden files and folders are passed over: {len(hidden)}, the first is {hidden[0]}")
-    if not datasets:
-        raise UserError(
-            f"{root} has no images: name a folder with {', '.join(IMAGE_SUFFIXES)} files"
-        )
-    # Other datasets of a single image are listed without a camera.
-    if all(len(files) < 2 for files in datasets.values()):
-        name = next(iter(datasets.values()))[0].name
-        raise UserError(f"{root} has a single image, {name}: matching needs two")
-    return dict(sorted(datasets.items()))
+            yield folder, [folder / name for name in files]
+
+
+def _without_twins(names: Iterable[str]) -> tuple[list[str], list[str]]:
+    """Return the images to read, and other formats of images that are also there as JPEG or PNG."""
+    files = list(names)
+    usual = {_stem(name) for name in files if _suffix(name) in IMAGE_SUFFIXES}
+    twins = [name for name in files if _suffix(name) in MORE_SUFFIXES and _stem(name) in usual]
+    return [name for name in files if name not in set(twins)], twins
 
 
 def batch_names(root: Path, datasets: Iterable[str]) -> dict[str, str]:
@@ -70,11 +148,24 @@ def batch_names(root: Path, datasets: Iterable[str]) -> dict[str, str]:
     return names
 
 
+def _suffix(name: str) -> str:
+    return os.path.splitext(name)[1].lower()  # noqa: PTH122  Path takes ten times as long
+
+
+def _stem(name: str) -> str:
+    return os.path.splitext(name)[0]  # noqa: PTH122
+
+
 def _is_image(name: str) -> bool:
-    return name.lower().endswith(IMAGE_SUFFIXES)
+    # A hidden file may be called ".jpg".
+    return name.lower().endswith(READ_SUFFIXES)
 
 
-def _require_usable(folder: Path, root: Path, files: Sequence[Path]) -> None:
+def _has_thumbnails(folder: str) -> bool:
+    return folder.lower() in THUMBNAIL_FOLDERS
+
+
+def _require_usable(folder: Path, root: Path, files: Sequence[Path], *, is_dataset: bool) -> None:
     """Raise :class:`UserError` if the name of a folder or an image cannot be used in tables and
     databases.
     """
@@ -85,7 +176,9 @@ def _require_usable(folder: Path, root: Path, files: Sequence[Path]) -> None:
             raise UserError(
                 f"{folder}: the name {name!r} has characters that are no text; rename it"
             )
-    if reserved := RESERVED.intersection(map(str.lower, folder.relative_to(root).parts)):
+    reserved = RESERVED.intersection(map(str.lower, folder.relative_to(root).parts))
+    # Only a dataset has a folder in OUT.
+    if reserved and is_dataset:
         raise UserError(f"{folder}: results are called {min(reserved)}; rename that folder")
     require_distinct(files)
 

@@ -106,3 +106,48 @@ def test_the_images_of_the_root_have_the_name_of_its_folder(tmp_path):
     assert batch_names(root, [".", "inner"]) == {".": "fountain", "inner": "inner"}
     assert batch_names(root, [".", "fountain"]) == {".": "fountain_", "fountain": "fountain"}
     assert batch_names(Path("/"), ["."]) == {".": "images"}
+
+
+def test_photographs_of_all_formats_that_are_decoded_are_taken(tmp_path, capsys):
+    names = ["a.jpg", "b.jfif", "c.WEBP", "d.tif", "e.tiff", "f.bmp", "g.JPE", "h.ppm", "i.jp2"]
+    assert names_of(written(tmp_path, *names, "notes.txt", "calibration.xml")) == {".": names}
+    assert capsys.readouterr().err == ""
+
+
+def test_photographs_that_cannot_be_read_are_counted_with_the_remedy(tmp_path, capsys):
+    root = written(tmp_path, "0.jpg", "1.jpg", "2.HEIC", "3.heic", "a/4.dng", "a/5.jpg", ".x.heic")
+    # A raw file next to its JPEG is no loss.
+    written(tmp_path, "0.CR2", "1.heic")
+    assert names_of(root) == {".": ["0.jpg", "1.jpg"], "a": ["5.jpg"]}
+    (line,) = (line for line in capsys.readouterr().err.splitlines() if "cannot be read" in line)
+    assert "1 .dng, 2 .heic, the first is" in line
+    assert f"{root}/2.HEIC; convert them to JPEG or PNG" in line
+
+
+def test_a_folder_with_only_unread_formats_is_refused_with_the_remedy(tmp_path):
+    with pytest.raises(UserError, match=r"has no images: .* must be converted first"):
+        read_folder(written(tmp_path, "1.heic", "2.heic"))
+
+
+def test_a_second_format_of_a_photograph_is_passed_over_with_a_line(tmp_path, capsys):
+    root = written(tmp_path, "0.jpg", "0.webp", "1.png", "1.tif", "2.webp")
+    assert names_of(root) == {".": ["0.jpg", "1.png", "2.webp"]}
+    assert f"the same name: 2, the first is {root}/0.webp" in capsys.readouterr().err
+    # Among the other formats, none is the usual one.
+    with pytest.raises(UserError, match=r"has both 3\.tif and 3\.webp"):
+        read_folder(written(root, "3.tif", "3.webp"))
+
+
+@pytest.mark.parametrize("folder", ["@eaDir/0.jpg", "#recycle", "$RECYCLE.BIN", "__MACOSX"])
+def test_thumbnails_of_file_servers_are_passed_over_with_a_line(tmp_path, capsys, folder):
+    root = written(tmp_path, "0.jpg", "1.jpg", f"{folder}/XL.jpg", f"{folder}/M.jpg")
+    assert names_of(root) == {".": ["0.jpg", "1.jpg"]}
+    assert f"are passed over: 1, the first is {root}/{folder[:5]}" in capsys.readouterr().err
+
+
+def test_all_folders_can_be_one_dataset(tmp_path):
+    root = written(tmp_path, "100/1.jpg", "100/2.jpg", "101/1.jpg", "models/3.jpg", "4.jpg")
+    (name, files), *others = read_folder(root, join=True).items()
+    assert (name, others) == (".", [])
+    found = [file.relative_to(root).as_posix() for file in files]
+    assert sorted(found) == ["100/1.jpg", "100/2.jpg", "101/1.jpg", "4.jpg", "models/3.jpg"]
