@@ -2,7 +2,7 @@
 
 import argparse
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from math import inf
 from pathlib import Path
@@ -137,12 +137,14 @@ def watched_session(
         drain()  # while the watchdog is active: the reader of the output may hang
 
 
-def say_start(what: str, assembly: Assembly, work_dir: Path) -> None:
-    """Print the input, the recipe and the omitted matchers."""
+def say_start(what: str, assembly: Assembly, work_dir: Path, effects: Iterable[str] = ()) -> None:
+    """Print the input, the recipe and the omitted matchers, and which parts of the input take
+    effect.
+    """
     # One call, so that no worker's line comes between.
     header = f"{what}, recipe {assembly.recipe.name}, {assembly.placement}, journal in {work_dir}"
     left_out = left_out_line(assembly.recipe, assembly.left_out)
-    say("\n".join(filter(None, [header, left_out])))
+    say("\n".join(filter(None, [header, left_out, *effects])))
 
 
 def finish(session: Session, page: Path | None, pairs: Sequence[Pair]) -> int:

@@ -19,10 +19,15 @@ from mkpc_kaggle.reconstruction.directory import (
     output_directory,
     require_directory_apart,
 )
-from mkpc_kaggle.reconstruction.folder import batch_names, read_folder, read_pair_list
+from mkpc_kaggle.reconstruction.folder import (
+    batch_names,
+    pair_list_line,
+    read_folder,
+    read_pair_list,
+)
 from mkpc_kaggle.reconstruction.layout import write_layouts
 from mkpc_kaggle.reconstruction.outputs import FORMS, Cameras, write_tables
-from mkpc_kaggle.reconstruction.priors import read_intrinsics_table
+from mkpc_kaggle.reconstruction.priors import intrinsics_line, read_intrinsics_table
 from mkpc_kaggle.reconstruction.run import FolderResult, for_cameras, reconstruct_folder
 from mkpc_kaggle.reporting.summary import pending_lines, trouble, weakest_line
 
@@ -134,7 +139,12 @@ def run(arguments: argparse.Namespace) -> int:
         assembly = options.assembly_of(arguments, arguments.recipe, arguments.mode, interrupt)
         recipe = for_cameras(assembly.recipe, arguments.camera, known)
         assembly = replace(assembly, recipe=recipe, masks=masks)
-        options.say_start(plural(len(files), "image"), assembly, work_dir)
+        effects = [*masks.lines]
+        if known:
+            effects.append(intrinsics_line(known, root, files))
+        if listed is not None:
+            effects.append(pair_list_line(listed, root, datasets))
+        options.say_start(plural(len(files), "image"), assembly, work_dir, effects)
         result = reconstruct_folder(
             root,
             datasets,

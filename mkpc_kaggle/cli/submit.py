@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 
 from mkpc_kaggle.cli import options
-from mkpc_kaggle.data.competition import read_test_side, test_side
+from mkpc_kaggle.data.competition import missing_line, read_test_side, test_side
 from mkpc_kaggle.data.outputs import require_apart
 from mkpc_kaggle.engine.console import say
 from mkpc_kaggle.engine.session import first_version, interruptible, submit
@@ -70,7 +70,8 @@ def run(arguments: argparse.Namespace) -> int:
             options.watched_session(arguments, work_dir, interrupt) as session,
         ):
             assembly = options.assembly_of(arguments, arguments.recipe, arguments.mode, interrupt)
-            options.say_start(plural(len(pairs), "pair"), assembly, work_dir)
+            effects = [line] if (line := missing_line(pairs)) else []
+            options.say_start(plural(len(pairs), "pair"), assembly, work_dir, effects)
             _, images = test_side(arguments.test_dir)
             report = submit(pairs, assembly, session, output, str(images))
             session.status = int(bool(report.unwritten or trouble(report)))

@@ -17,7 +17,7 @@ from mkpc_kaggle.data.pairs import read_pairs
 from mkpc_kaggle.engine.console import say
 from mkpc_kaggle.engine.request import Ending, RunReport
 from mkpc_kaggle.engine.session import Interrupt, Session, interruptible
-from mkpc_kaggle.errors import UserError, writing
+from mkpc_kaggle.errors import UserError, plural, writing
 from mkpc_kaggle.evaluation.compare import comparison_json, comparison_table, step_gains
 from mkpc_kaggle.evaluation.imc2025 import score_imc2025, score_lines
 from mkpc_kaggle.evaluation.validate import (
@@ -225,6 +225,10 @@ def _match_and_score(
     choices = [split_mode(text) for text in compared] or [(arguments.recipe, arguments.mode)]
     pairs = [true.pair for scene in scenes for true in scene.pairs]
     regions = {} if arguments.regions is None else read_regions(arguments.regions, root, pairs)
+    if arguments.regions is not None:
+        used = len({(pair.file0, pair.file1) for pair in pairs})
+        # The table may be of more scenes, or of more pairs of them.
+        say(f"regions: {used} of {plural(len(regions), 'row')} are of pairs of this run")
     validations = []
     status = 0
     budget = options.budget_of(arguments)

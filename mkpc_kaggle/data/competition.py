@@ -119,6 +119,26 @@ def read_test_side(directory: Path) -> tuple[Pair, ...]:
     return tuple(pairs.values())
 
 
+def missing_line(pairs: Iterable[Pair]) -> str:
+    """Return a line on the images of the test side that are missing; empty if all exist."""
+    wanted = dict.fromkeys(file for pair in pairs for file in (pair.file0, pair.file1))
+    listed: dict[str, set[str]] = {}
+    missing = []
+    for file in wanted:
+        folder, _, name = file.rpartition(os.sep)
+        # Each folder is listed once: a network disk takes long to look for each file.
+        if folder not in listed:
+            listed[folder] = set()
+            with suppress(OSError, ValueError):  # the folder is missing, too
+                listed[folder] = {path.name for path in Path(folder).iterdir()}
+        if name not in listed[folder]:
+            missing.append(file)
+    if not missing:
+        return ""
+    count = f"{len(missing)} of {plural(len(wanted), 'image')}"
+    return f"missing in test_images: {count}, the first is {missing[0]}"
+
+
 def read_train_side(
     directory: Path,
     *,

@@ -132,7 +132,7 @@ def read_image(path: Path) -> Image | Unreadable:
             return Unreadable(name, "cannot be read: not a regular file")
         data = np.fromfile(path, np.uint8)
         if data.size:  # OpenCV raises for an empty array
-            bgr = _decode(data)
+            bgr = decode(data)
     except FileNotFoundError:
         return Unreadable(name, "no such file")
     except (OSError, ValueError, MemoryError, cv2.error) as error:
@@ -150,28 +150,29 @@ def read_image(path: Path) -> Image | Unreadable:
     return Image(name, pixels, _content_digest(data), focal, turns)
 
 
-def _decode(data: Pixels) -> Pixels | None:
-    """Return the stored pixels of a picture file, (H, W, 3) BGR; ``None`` if it is unreadable."""
-    bgr = _decode_file(data)
+def decode(data: Pixels, kind: int = cv2.IMREAD_COLOR) -> Pixels | None:
+    """Return the stored pixels of a picture file, (H, W, 3) BGR or as OpenCV's ``kind``; ``None``
+    if it is unreadable.
+    """
+    pixels = _decode_file(data, kind)
     start = data[:4].tobytes()
-    if bgr is None and start.startswith(JPEG_START):
+    if pixels is None and start.startswith(JPEG_START):
         # Some cameras and downloads leave the end mark out. If the picture is complete, further
         # bytes change nothing; if it is cut off, they are decoded.
-        bgr, other = (_decode_file(_with_end(data, more)) for more in (b"", JPEG_FILL))
-        if bgr is None or other is None or not np.array_equal(bgr, other):
+        pixels, other = (_decode_file(_with_end(data, more), kind) for more in (b"", JPEG_FILL))
+        if pixels is None or other is None or not np.array_equal(pixels, other):
             return None
-    if bgr is not None and is_tiff(start):
+    if pixels is not None and is_tiff(start):
         # OpenCV sets TIFF upright even if it is asked not to. COLMAP reads the stored pixels.
         orientation = int(exif_tags(data.tobytes()).get(ORIENTATION, 1))
-        bgr = _stored(bgr, orientation)
-    return bgr
+        pixels = _stored(pixels, orientation)
+    return pixels
 
 
-def _decode_file(data: Pixels) -> Pixels | None:
-    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+def _decode_file(data: Pixels, kind: int) -> Pixels | None:
     # OpenCV's types do not say that the pixels are bytes, as IMREAD_COLOR makes them.
-    bgr: Any = cv2.imdecode(data, flags)
-    return bgr if bgr is None else np.asarray(bgr, np.uint8)
+    pixels: Any = cv2.imdecode(data, kind | cv2.IMREAD_IGNORE_ORIENTATION)
+    return pixels if pixels is None else np.asarray(pixels)
 
 
 def _with_end(data: Pixels, more: bytes) -> Pixels:

@@ -1,7 +1,11 @@
-"""Masks of images, as COLMAP reads them: ``DIR/a.jpg.png`` masks ``a.jpg``; black is left out."""
+"""Masks of images, named as COLMAP's: ``DIR/a.jpg.png`` masks ``a.jpg``.
+
+Black pixels are left out, and transparent ones.
+"""
 
 import hashlib
-from collections.abc import Iterable, Mapping
+import unicodedata
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -9,9 +13,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mkpc_kaggle.data.images import ByteCache, read_size
+from mkpc_kaggle.data.images import ByteCache, decode, read_size
 from mkpc_kaggle.data.outputs import lies_in
-from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.errors import UserError, plural
 from mkpc_kaggle.geometry.coordinates import Points, Size
 
 CACHE_BYTES = 128 << 20
@@ -20,9 +24,15 @@ SUFFIX = ".png"
 
 @dataclass(frozen=True)
 class Masks:
-    """The mask file of each image, by the image's path, with the digest of its content."""
+    """The mask file of each image, by the image's path, with the digest of its content.
+
+    ``lines`` state for the user which part of the masks takes effect; ``is_partial`` if that is not
+    all of them.
+    """
 
     files: Mapping[str, tuple[str, str]] = field(default_factory=dict)
+    lines: tuple[str, ...] = field(default=(), compare=False)
+    is_partial: bool = field(default=False, compare=False)
 
     @classmethod
     def of_folder(cls, directory: Path, root: Path, images: Iterable[Path]) -> "Masks":
@@ -42,28 +52,71 @@ class Masks:
             raise UserError(
                 f"--masks {directory} has images of the run, so masks count as images; move it elsewhere"
             )
+        present = _files_below(directory)
         files: dict[str, tuple[str, str]] = {}
-        first = None
+        unusual: dict[str, list[Path]] = {}
         for image in images:
-            first = first or image
-            path = directory / f"{image.relative_to(root).as_posix()}{SUFFIX}"
-            if path.exists():  # as in COLMAP, an image without a mask is used whole
-                _require_usable(path, image)
-                digest = hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest()
-                files[str(image)] = (str(path), digest)
+            path = present.pop(_key(f"{image.relative_to(root).as_posix()}{SUFFIX}"), None)
+            if path is None:  # as in COLMAP, an image without a mask is used whole
+                continue
+            effect = _checked(path, image)
+            if effect:
+                unusual.setdefault(effect, []).append(path)
+            digest = hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest()
+            files[str(image)] = (str(path), digest)
         if not files:
-            name = first.relative_to(root).as_posix() if first else "a.jpg"
+            name = images[0].relative_to(root).as_posix() if images else "a.jpg"
             expected = f"{name}{SUFFIX}"
             raise UserError(f"{directory} has no mask of any image: {expected} would be the first")
-        return cls(files)
+        lines = _lines(directory, len(images), len(files), present, unusual)
+        is_partial = len(files) < len(images) or bool(present or unusual)
+        return cls(files, tuple(lines), is_partial)
 
     def digest(self, image: str) -> str:
         """Return the digest of an image's mask; empty without a mask."""
         return self.files.get(image, ("", ""))[1]
 
 
-def _require_usable(path: Path, image: Path) -> None:
-    """Raise :class:`UserError` for a mask that is unreadable or not as large as its image."""
+def _files_below(directory: Path) -> dict[str, Path]:
+    """Return the files below a directory of masks by the key of their names, sorted."""
+    files: dict[str, Path] = {}
+    for path in sorted(directory.rglob("*")):
+        name = path.relative_to(directory).as_posix()
+        # A directory at the name of a mask is refused later.
+        is_mask = not path.is_dir() or path.suffix.lower() == SUFFIX
+        if is_mask and not any(part.startswith(".") for part in name.split("/")):
+            files.setdefault(_key(name), path)
+    return files
+
+
+def _key(name: str) -> str:
+    """Return a key that equal names have: macOS writes "é" as two characters, Windows ".PNG"."""
+    stem, dot, suffix = unicodedata.normalize("NFC", name).rpartition(".")
+    return f"{stem}{dot}{suffix.lower()}"
+
+
+def _lines(
+    directory: Path,
+    images: int,
+    masked: int,
+    surplus: Mapping[str, Path],
+    unusual: Mapping[str, Sequence[Path]],
+) -> Iterator[str]:
+    """Yield which part of the masks takes effect."""
+    line = f"masks: {masked} of {plural(images, 'image')}"
+    if surplus:
+        first = next(iter(surplus.values())).relative_to(directory)
+        belong = "belongs" if len(surplus) == 1 else "belong"
+        line += f"; {plural(len(surplus), 'file')} of {directory} {belong} to none, the first is {first}"
+    yield line
+    for effect, paths in unusual.items():
+        yield f"masks that {effect}: {len(paths)}, the first is {paths[0]}"
+
+
+def _checked(path: Path, image: Path) -> str:
+    """Return what is unusual about a mask, if anything. Raise :class:`UserError` for a mask that is
+    unreadable or not as large as its image.
+    """
     if not path.is_file():
         raise UserError(f"{path} cannot be read: not a regular file")
     mask = read_mask(path)
@@ -74,10 +127,14 @@ def _require_usable(path: Path, image: Path) -> None:
         raise UserError(
             f"{path} has {found} pixels, its image {size.width} x {size.height}; make them equal"
         )
+    if not mask.any():
+        return "hide everything"
+    # Such as those of JPEG, whose black is 1 or 2
+    return "hide nothing, since only black or transparent pixels do" if mask.all() else ""
 
 
 def read_mask(path: Path) -> NDArray[np.bool_]:
-    """Return the mask (H, W) of a file, False where it is black.
+    """Return the mask (H, W) of a file, False where it is black or transparent.
 
     Raises :class:`UserError` if it is unreadable.
     """
@@ -85,12 +142,19 @@ def read_mask(path: Path) -> NDArray[np.bool_]:
     try:
         data = np.fromfile(path, np.uint8)
         if data.size:  # OpenCV raises for an empty array
-            pixels = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+            # As stored: a conversion to 8 bits would make 255 of 65,535 black.
+            pixels = decode(data, cv2.IMREAD_UNCHANGED)
     except (OSError, ValueError, MemoryError, cv2.error) as error:
         raise UserError(f"the mask {path} cannot be read: {error}") from error
     if pixels is None:
         raise UserError(f"the mask {path} cannot be read: it is no picture")
-    return np.asarray(pixels > 0)
+    channels = np.atleast_3d(pixels)
+    has_alpha = channels.shape[2] in (2, 4)
+    colours = channels[:, :, :-1] if has_alpha else channels
+    shown = (colours > 0).any(axis=2)
+    if has_alpha:
+        shown &= channels[:, :, -1] > 0
+    return np.asarray(shown)
 
 
 class MaskReader:

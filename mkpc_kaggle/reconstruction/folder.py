@@ -10,7 +10,7 @@ from pathlib import Path
 from mkpc_kaggle.data.competition import CONTROL
 from mkpc_kaggle.data.images import IMAGE_SUFFIXES, MORE_SUFFIXES, OTHER_SUFFIXES, READ_SUFFIXES
 from mkpc_kaggle.engine.console import warn
-from mkpc_kaggle.errors import UserError, printable, read_text
+from mkpc_kaggle.errors import UserError, plural, printable, read_text
 from mkpc_kaggle.reconstruction.directory import RESERVED
 
 # Images of each folder, by the folder's path below the root
@@ -192,6 +192,18 @@ def require_distinct(files: Iterable[Path]) -> None:
             raise UserError(
                 f"{path.parent} has both {other.name} and {path.name}; rename one of them"
             )
+
+
+def pair_list_line(listed: Sequence[Ends], root: Path, datasets: Datasets) -> str:
+    """Return a line on the images that the pairs of a list connect."""
+    files = [file for found in datasets.values() for file in found]
+    paired = {file for ends in listed for file in ends}
+    without = [file for file in files if file not in paired]
+    named = len(files) - len(without)
+    line = f"listed: {plural(len(listed), 'pair')} of {named} of {plural(len(files), 'image')}"
+    if not without:
+        return line
+    return f"{line}; the first without a pair is {without[0].relative_to(root).as_posix()}"
 
 
 def _refuse_unreadable(error: OSError) -> None:

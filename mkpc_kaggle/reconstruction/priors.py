@@ -1,15 +1,15 @@
 """Priors of a folder's cameras: the user's table of intrinsics."""
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from mkpc_kaggle.data.competition import read_rows
 from mkpc_kaggle.data.images import FOCALS, read_size
 from mkpc_kaggle.engine.console import warn
-from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.errors import UserError, plural
 from mkpc_kaggle.geometry.coordinates import Size
-from mkpc_kaggle.geometry.intrinsics import KnownCamera, camera_of, parse_row, written
+from mkpc_kaggle.geometry.intrinsics import KnownCamera, camera_of, parse_row, read, written
 
 COLUMNS = ("image", "model", "parameters", "sigma")
 OPTIONAL = ("size",)  # of the images that the parameters are for
@@ -65,6 +65,20 @@ def read_intrinsics_table(file: Path, root: Path, images: Iterable[Path]) -> str
                 f"{where[number]}: {pattern!r} is the camera of no image; earlier rows come first"
             )
     return written(rows)
+
+
+def intrinsics_line(known: str, root: Path, images: Sequence[Path]) -> str:
+    """Return a line on the images that have a camera in the rows of
+    :func:`read_intrinsics_table`.
+    """
+    rows = read(known)
+    without = [
+        name
+        for name in (image.relative_to(root).as_posix() for image in images)
+        if camera_of(rows, name) is None
+    ]
+    line = f"known cameras: {len(images) - len(without)} of {plural(len(images), 'image')}"
+    return line + (f"; the first without one is {without[0]}" if without else "")
 
 
 def parse_size(cell: str) -> Size | None:

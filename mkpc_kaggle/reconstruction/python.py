@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from mkpc_kaggle.data.images import Unreadable, read_image
 from mkpc_kaggle.data.masks import Masks
 from mkpc_kaggle.engine.budget import Budget
+from mkpc_kaggle.engine.console import warn
 from mkpc_kaggle.engine.session import Interrupt, Session, interruptible
 from mkpc_kaggle.engine.state import name_below
 from mkpc_kaggle.engine.store import FILE_NAME
@@ -181,11 +182,12 @@ def with_priors(
     :class:`UserError` if they are unusable.
     """
     known = "" if intrinsics is None else read_intrinsics_table(Path(intrinsics), root, files)
-    return replace(
-        assembly,
-        recipe=for_cameras(assembly.recipe, intrinsics=known),
-        masks=assembly.masks if masks is None else Masks.of_folder(Path(masks), root, files),
-    )
+    given = assembly.masks if masks is None else Masks.of_folder(Path(masks), root, files)
+    if given.is_partial:
+        for line in given.lines:
+            warn(line)
+    recipe = for_cameras(assembly.recipe, intrinsics=known)
+    return replace(assembly, recipe=recipe, masks=given)
 
 
 def complete_model(model: SfmModel, folder: Path, names: Mapping[str, str]) -> SfmModel:

@@ -9,6 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from mkpc_kaggle.data import competition
 from mkpc_kaggle.data.competition import (
+    missing_line,
     read_rows,
     read_submission,
     read_test_side,
@@ -261,3 +262,18 @@ def test_a_table_that_pandas_would_guess_at_is_refused(tmp_path, content, says):
     path.write_text(content)
     with pytest.raises(UserError, match=says):
         list(read_rows(path, ("id", "value")))
+
+
+def test_missing_images_are_counted_before_the_run(side):
+    rows = ["s1,b,a,c", "s2,b,a,none", "s3,empty,x,y"]
+    pairs = read_test_side(side(*rows, images=["b/a.png", "b/c.JPG"]))
+    line = missing_line(pairs)
+    assert line.startswith("missing in test_images: 3 of 5 images, the first is ")
+    assert line.endswith("test_images/b/none.png")
+    assert missing_line(pairs[:1]) == ""
+
+
+def test_other_formats_stand_for_images_without_the_usual_ones(side):
+    images = ["b/a.webp", "b/c.bmp", "b/c.jpg"]
+    (pair,) = read_test_side(side("s1,b,a,c", images=images))
+    assert pair.names == ("a.webp", "c.jpg")

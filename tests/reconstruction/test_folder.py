@@ -12,7 +12,12 @@ import pytest
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Size
-from mkpc_kaggle.reconstruction.folder import batch_names, read_folder, read_pair_list
+from mkpc_kaggle.reconstruction.folder import (
+    batch_names,
+    pair_list_line,
+    read_folder,
+    read_pair_list,
+)
 from mkpc_kaggle.reconstruction.outputs import submission_rows
 from mkpc_kaggle.scene.reconstruction import RegisteredImage
 from mkpc_kaggle.scene.view_graph import BatchImage
@@ -151,3 +156,15 @@ def test_all_folders_can_be_one_dataset(tmp_path):
     assert (name, others) == (".", [])
     found = [file.relative_to(root).as_posix() for file in files]
     assert sorted(found) == ["100/1.jpg", "100/2.jpg", "101/1.jpg", "4.jpg", "models/3.jpg"]
+
+
+def test_the_images_that_a_list_of_pairs_leaves_out_are_counted(tmp_path):
+    root = written(tmp_path / "images", "a.png", "b.png", "c.png", "d.png")
+    datasets = read_folder(root)
+    (tmp_path / "pairs.txt").write_text("a.png b.png\na.png c.png\n")
+    listed = read_pair_list(tmp_path / "pairs.txt", root, datasets)
+    line = "listed: 2 pairs of 3 of 4 images; the first without a pair is d.png"
+    assert pair_list_line(listed, root, datasets) == line
+    (tmp_path / "pairs.txt").write_text("a.png b.png\nd.png c.png\n")
+    listed = read_pair_list(tmp_path / "pairs.txt", root, datasets)
+    assert pair_list_line(listed, root, datasets) == "listed: 2 pairs of 4 of 4 images"

@@ -23,7 +23,7 @@ from mkpc_kaggle.geometry.intrinsics import KnownCamera, read
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.reconstruction.folder import read_folder
-from mkpc_kaggle.reconstruction.priors import read_intrinsics_table
+from mkpc_kaggle.reconstruction.priors import intrinsics_line, read_intrinsics_table
 from mkpc_kaggle.reconstruction.python import Models, reconstruct
 from mkpc_kaggle.reconstruction.run import FolderResult, for_cameras, reconstruct_folder
 
@@ -183,6 +183,19 @@ def test_bad_masks_are_one_line_and_nothing_is_touched(tmp_path, capsys, reason)
     (line,) = capsys.readouterr().err.splitlines()
     assert reason in line
     assert not out.exists()
+
+
+def test_the_images_without_a_known_camera_are_counted(tmp_path):
+    root = write_flat(tmp_path / "images", 3)
+    # As cameras name them: a pattern is of one case.
+    (root / "01.png").rename(root / "01.PNG")
+    table = tmp_path / "known.csv"
+    table.write_text(f"{HEAD}*.png,SIMPLE_PINHOLE,900 400 300,fixed\n")
+    files = sorted(root.iterdir())
+    known = read_intrinsics_table(table, root, files)
+    line = "known cameras: 2 of 3 images; the first without one is 01.PNG"
+    assert intrinsics_line(known, root, files) == line
+    assert intrinsics_line(known, root, files[::2]) == "known cameras: 2 of 2 images"
 
 
 def test_masks_among_the_images_are_refused(tmp_path):
