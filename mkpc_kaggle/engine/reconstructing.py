@@ -4,7 +4,13 @@ import numpy as np
 
 from mkpc_kaggle.engine.budget import SCENE_MATCH_S, SCENE_START_S, format_duration
 from mkpc_kaggle.engine.jobs import Failure, SceneJob
-from mkpc_kaggle.engine.records import NOT_RECONSTRUCTED, SCENE, EventKind, SceneRecord
+from mkpc_kaggle.engine.records import (
+    NOT_RECONSTRUCTED,
+    SCENE,
+    EventKind,
+    SceneRecord,
+    unmatched_scene,
+)
 from mkpc_kaggle.engine.restore import EXPORT
 from mkpc_kaggle.engine.run import HANG_FACTOR, Run
 from mkpc_kaggle.engine.state import State
@@ -97,11 +103,19 @@ class Reconstructing:
 def scene_records(state: State) -> tuple[SceneRecord, ...]:
     """Return the scene of each batch, in order; ``failure`` is the reason for a missing scene."""
     reasons = scene_failures(state)
-    return tuple(
-        state.scenes.get(batch)
-        or SceneRecord(batch, failure=str(reasons.get(batch, NOT_RECONSTRUCTED)))
-        for batch in state.batches
-    )
+    records = []
+    for batch in state.batches:
+        if batch in state.scenes:
+            records.append(state.scenes[batch])
+        elif batch in reasons:
+            records.append(SceneRecord(batch, failure=str(reasons[batch])))
+        elif state.is_unmatched(batch):
+            records.append(
+                unmatched_scene(batch, map(state.pairs.__getitem__, state.rows_of(batch)))
+            )
+        else:
+            records.append(SceneRecord(batch, failure=NOT_RECONSTRUCTED))
+    return tuple(records)
 
 
 def scene_failures(state: State) -> dict[str, Failure]:

@@ -5,7 +5,7 @@ the F to write. Nothing else decides which results reports show. If the files of
 not be written, an event states why.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import Any, NamedTuple, Self
@@ -35,6 +35,7 @@ TABLE = "table of pairs"  # the key of the table; each publication replaces the 
 NOT_REACHED = "not reached in time"
 NOT_RECONSTRUCTED = "not reconstructed yet"
 NO_CAMERAS = "no matches connect its images"
+MIN_PAIRS = 2  # of a batch that is reconstructed: the minimum to connect three images
 MAX_DRAWN_POINTS = 5000  # of a model, which are 60 kB in the store and enough for a picture
 
 
@@ -196,6 +197,30 @@ class SceneRecord:
             models=tuple(replace(model, points=_drawn(model.points)) for model in models),
             choices=choices or {},
         )
+
+
+def unmatched_scene(batch: str, pairs: Iterable[Pair]) -> SceneRecord:
+    """Return the record of a batch whose pairs have no matches. It is not stored, as no scene is
+    computed.
+    """
+    images = {file for pair in pairs for file in (pair.file0, pair.file1)}
+    return SceneRecord(batch, images=len(images), failure=NO_CAMERAS)
+
+
+def unmatched_scenes(records: Iterable[PairRecord]) -> list[SceneRecord]:
+    """Return the records of the batches whose pairs have all been reached, without a match."""
+    batches: dict[str, list[PairRecord]] = {}
+    for found in records:
+        batches.setdefault(found.pair.group, []).append(found)
+    return [
+        unmatched_scene(batch, (found.pair for found in members))
+        for batch, members in batches.items()
+        if len(members) >= MIN_PAIRS and not any(_may_match(found) for found in members)
+    ]
+
+
+def _may_match(found: PairRecord) -> bool:
+    return found.matches > 0 or not found.reached
 
 
 def _drawn(points: NDArray[np.float64]) -> NDArray[np.float64]:

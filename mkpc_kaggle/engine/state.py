@@ -17,7 +17,7 @@ from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.image_files import contents_of
 from mkpc_kaggle.engine.jobs import Failure, PairInputs, Tries, visiting_order
 from mkpc_kaggle.engine.keys import Images
-from mkpc_kaggle.engine.records import SceneRecord
+from mkpc_kaggle.engine.records import MIN_PAIRS, SceneRecord
 from mkpc_kaggle.engine.request import Request
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 from mkpc_kaggle.recipe import SceneConfig
@@ -26,8 +26,6 @@ from mkpc_kaggle.scene.view_graph import BatchImage
 
 Mask = NDArray[np.bool_]
 
-# Pairs of a batch that is reconstructed: the minimum to connect three images
-MIN_PAIRS = 2
 # Where the F of a pair comes from, in increasing order of preference
 FALLBACK, PAIR, SCENE = 0, 1, 2
 SOURCES = ("fallback", "pair", "scene")
@@ -217,6 +215,19 @@ class State:
             for index in indices
         ]
         return indices, self.request.keys.of_scene(inputs)
+
+    def rows_of(self, batch: str) -> list[int]:
+        """Return the rows of a batch, without its extra pairs."""
+        members = self.members[self.batches[batch]]
+        return [int(index) for index in members if index < self.rows]
+
+    def is_unmatched(self, batch: str) -> bool:
+        """Return whether all units have run on the rows of a batch, and none found a match.
+
+        No scene is made for such a batch, and no further run would change that.
+        """
+        rows = self.rows_of(batch)
+        return not (self.missing[rows].any() or self.matches[rows].any())
 
     def inputs_of(self, index: int) -> PairInputs:
         """Return the inputs of a pair's estimate, or of its batch's scene."""

@@ -16,6 +16,7 @@ from mkpc_kaggle.recipe import CameraSharing, Recipe, SceneConfig
 from mkpc_kaggle.reconstruction.choice import choose_pairs
 from mkpc_kaggle.reconstruction.folder import Datasets, Ends, batch_names
 from mkpc_kaggle.reconstruction.outputs import Cameras
+from mkpc_kaggle.reconstruction.unmatched import cause_of_no_matches
 from mkpc_kaggle.scene.export import remove_files
 from mkpc_kaggle.scene.reconstruction import RegisteredImage
 
@@ -111,11 +112,18 @@ def reconstruct_folder(
             publish(standing[0])
 
         engine.ask(request_of(pairs, assembly, session, str(root), exports=exports, publish=write))
+        state = engine.state
+        assert state is not None
+        for name, files in datasets.items():
+            batch = batches[name]
+            # A batch of one pair is none.
+            if batch in state.batches and state.is_unmatched(batch):
+                cause = cause_of_no_matches(files, assembly.masks)
+                if cause:
+                    engine.log.fault(f"{batch}: {cause}")
         # Within the context: afterwards the store is closed.
         report = engine.report()
         # An earlier run's models, from other images, do not belong to tables without cameras.
-        state = engine.state
-        assert state is not None
         for batch in state.batches:
             if batch not in state.scenes and remove_files(exports[batch]):
                 warn(f"{batch}: this run has no cameras; the models of an earlier run were removed")

@@ -21,6 +21,7 @@ from mkpc_kaggle.engine.records import (
     read_points,
     read_records,
     read_scenes,
+    unmatched_scenes,
 )
 from mkpc_kaggle.engine.store import Store
 from mkpc_kaggle.errors import UserError, writing
@@ -110,9 +111,12 @@ def read_log(directory: Path) -> RunLog:
 
         # The points of other pairs are not read: they may have gigabytes.
         weakest = tuple(map(weak, touched[:MAX_DRAWN_PAIRS]))
-        scenes = tuple(read_scenes(store, published).values())
+        scenes = [*read_scenes(store, published).values()]
+        if recipe.scene is not None:
+            present = {scene.batch for scene in scenes}
+            scenes += [each for each in unmatched_scenes(records) if each.batch not in present]
         events = read_events(store)
-        return RunLog(store.path, published.about, recipe, records, events, weakest, scenes)
+        return RunLog(store.path, published.about, recipe, records, events, weakest, tuple(scenes))
 
 
 def write_csv(log: RunLog, directory: Path) -> list[Path]:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from mkpc_kaggle.data.outputs import replacing
-from mkpc_kaggle.engine.records import PairRecord, SceneRecord
+from mkpc_kaggle.engine.records import NO_CAMERAS, PairRecord, SceneRecord
 from mkpc_kaggle.errors import UserError, plural, printable, writing
 from mkpc_kaggle.reporting.run_log import RunLog
 from mkpc_kaggle.reporting.summary import (
@@ -104,6 +104,13 @@ def _pair_problems(records: Sequence[PairRecord]) -> Iterator[str]:
 def _scene_problems(scene: SceneRecord, log: RunLog) -> Iterator[str]:
     # A folder without subfolders has one scene, whose name says nothing.
     where = f"{scene.batch}: " if len(log.scenes) > 1 else ""
+    if scene.failure == NO_CAMERAS:
+        # The run looks for causes in the files, and saves them as faults.
+        prefix = f"{scene.batch}: "
+        causes = [fault.removeprefix(prefix) for fault in log.faults if fault.startswith(prefix)]
+        remedy = causes[-1] if causes else "photographs that overlap more are needed"
+        yield f"{where}no cameras, {scene.failure}: {remedy}"
+        return
     if not scene.models:
         yield f"{where}no cameras, {scene.failure}: photographs that overlap more are needed"
         return
