@@ -5,8 +5,9 @@ import json
 import os
 import re
 import shutil
+import sqlite3
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
 
@@ -44,6 +45,10 @@ def output_directory(out: Path, datasets: Iterable[str], form: str | None = None
     results += sorted(each for each in inner if not holds_dataset(each, names))
     with writing(f"--out {out}"):
         marked = _read_mark(out)
+        for name in results:
+            is_ours = name in (marked or ()) and _is_inside(out, name)
+            if is_ours and PurePosixPath(name).name == DATABASE:
+                _require_closed(out, out / name)
         if strange := next(_in_the_way(out, results, marked), None):
             message = f"--out {out}: {strange} is in the way, it was not made by this command"
             raise UserError(f"{message}; move it, or name an empty directory")
@@ -68,6 +73,31 @@ def output_directory(out: Path, datasets: Iterable[str], form: str | None = None
             if digest:
                 after[name] = known[name] if digest == before[name] else digest
         _write_mark(out, after)
+
+
+def _require_closed(out: Path, database: Path) -> None:
+    """Raise :class:`UserError` if another program has a database open.
+
+    A program that was killed leaves files next to it. SQLite removes these with the last connection.
+    """
+    if not _companions(database) or not database.is_file():
+        return
+    try:
+        with closing(sqlite3.connect(database, timeout=0)) as connection:
+            connection.execute("SELECT count(*) FROM sqlite_master").fetchone()
+    except sqlite3.OperationalError:  # locked
+        pass
+    except sqlite3.DatabaseError:  # no database, so the files next to it are the user's
+        return
+    if left := _companions(database):
+        raise UserError(
+            f"--out {out}: another program has {database} open, as {left[0].name} shows; "
+            "close that program"
+        )
+
+
+def _companions(database: Path) -> list[Path]:
+    return sorted(database.parent.glob(f"{database.name}-*"))
 
 
 def holds_dataset(result: str, datasets: Iterable[str]) -> bool:
@@ -120,7 +150,8 @@ def _in_the_way(
         )
         if not _is_inside(out, name) or (path.exists() and not is_result):
             yield path
-        yield from path.parent.glob(f"{DATABASE}-*")  # another program has the database open
+        # They belong to another database, whose program was killed.
+        yield from _companions(path.parent / DATABASE)
         for each in path.rglob("*") if path.name in CONTENTS else ():
             if not CONTENTS[path.name].fullmatch(each.relative_to(path).as_posix()):
                 yield each

@@ -2,6 +2,10 @@
 
 import json
 import os
+import sqlite3
+import subprocess
+import sys
+from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -63,6 +67,43 @@ def test_a_link_or_a_file_of_the_users_in_the_place_of_a_result_is_refused(tmp_p
     with pytest.raises(UserError, match=told), output_directory(out, "abc", "imc2025"):
         raise AssertionError
     assert files_of(tmp_path) == before
+
+
+@pytest.fixture
+def database(tmp_path: Path) -> Path:
+    """A database in OUT that a run has made, in SQLite's mode of COLMAP."""
+    path = tmp_path / "out" / "database.db"
+    with output_directory(tmp_path / "out", ["."]), closing(sqlite3.connect(path)) as made:
+        made.execute("PRAGMA journal_mode=WAL")
+        made.execute("CREATE TABLE images (name TEXT)")
+    return path
+
+
+KILLED_READER = """
+import os, sqlite3, sys
+sqlite3.connect(sys.argv[1]).execute("SELECT count(*) FROM images").fetchall()
+os.kill(os.getpid(), 9)
+"""
+
+
+def test_a_reader_that_was_killed_does_not_block_the_directory(database):
+    before = database.read_bytes()
+    subprocess.run([sys.executable, "-c", KILLED_READER, database], check=False)
+    assert [path.name for path in database.parent.glob("database.db-*")], "as a kill leaves them"
+    with output_directory(database.parent, ["."]):
+        pass
+    assert [*database.parent.glob("database.db-*")] == []
+    assert database.read_bytes() == before
+
+
+def test_a_database_that_another_program_has_open_is_refused_with_the_remedy(database):
+    with closing(sqlite3.connect(database)) as reader:
+        reader.execute("SELECT count(*) FROM images").fetchall()
+        told = r"another program has .*database\.db open, .*; close that program"
+        with pytest.raises(UserError, match=told), output_directory(database.parent, ["."]):
+            raise AssertionError
+    with output_directory(database.parent, ["."]):
+        pass
 
 
 @pytest.mark.parametrize(
