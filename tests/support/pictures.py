@@ -5,11 +5,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from standin import scene
 
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import Picture
+from tests.support.standin import scene
 
 
 def picture(
