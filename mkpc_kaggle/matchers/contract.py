@@ -83,6 +83,9 @@ class MatcherSpec:
     # Of the manifest; ``{name}`` stands for the value of option ``name``.
     slots: tuple[str, ...] = ()
     licences: tuple[str, ...] = ()  # licence tags of weights outside the manifest
+    # Of a matcher that is not from this package: its results are kept for later runs under this
+    # text, so change it whenever equal pictures get other points. Without it, they are not kept.
+    version: str = ""
 
     def slots_for(self, options: Any) -> tuple[str, ...]:
         """Return the manifest's slots that a matcher with these options needs."""

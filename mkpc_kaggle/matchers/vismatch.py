@@ -9,8 +9,10 @@ vismatch's ``get_matcher(NAME)`` returns a callable that maps two images to a di
 """
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
-from importlib import import_module
+from importlib import import_module, metadata
+from importlib.metadata import PackageNotFoundError
 from typing import Any
 
 import numpy as np
@@ -47,7 +49,9 @@ class Adapter:
 
     @property
     def SPEC(self) -> MatcherSpec:  # noqa: N802  the name of a module's constant
-        return MatcherSpec(f"{VISMATCH}{self.name}", VismatchOptions, licences=(LICENCE,))
+        return MatcherSpec(
+            f"{VISMATCH}{self.name}", VismatchOptions, licences=(LICENCE,), version=_version()
+        )
 
     def load(
         self, weights: WeightStore, options: VismatchOptions, placement: Placement
@@ -62,7 +66,15 @@ class Adapter:
             corner=options.corner,
             multiple=options.multiple,
             licences=(LICENCE,),
+            version=_version(),
         )
+
+
+def _version() -> str:
+    """Return the version of vismatch, which also decides which weights it downloads."""
+    with suppress(PackageNotFoundError):
+        return metadata.version("vismatch")
+    return str(getattr(import_module("vismatch"), "__version__", ""))
 
 
 def adapter_of(name: str) -> Adapter:
@@ -89,8 +101,9 @@ class VismatchMatcher(PairwiseMatcher[Picture]):
         corner: bool = False,
         multiple: int = 1,
         licences: tuple[str, ...] = (),
+        version: str = "",
     ) -> None:
-        self.spec = MatcherSpec(name, multiple=multiple, licences=licences)
+        self.spec = MatcherSpec(name, multiple=multiple, licences=licences, version=version)
         self._matcher = matcher
         self._corner = corner
         matcher.skip_ransac = True

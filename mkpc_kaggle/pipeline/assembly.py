@@ -7,6 +7,7 @@ from os import PathLike, fspath
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
+from uuid import uuid4
 
 from mkpc_kaggle.data.masks import Masks
 from mkpc_kaggle.errors import UserError, warn_once
@@ -16,6 +17,7 @@ from mkpc_kaggle.matchers.registry import (
     load_matcher,
     matcher_names,
     require_matchers,
+    spec_of,
 )
 from mkpc_kaggle.pipeline.arguments import (
     Weights,
@@ -58,6 +60,8 @@ class Assembly:
     sharing: int = 1  # workers on the placement's device
     regions: GivenRegions = field(default_factory=dict)  # replace MKPC's regions
     masks: Masks = field(default_factory=Masks)
+    # Stands for the version of a matcher without one, so that no later run has the same keys
+    nonce: str = field(default_factory=lambda: uuid4().hex)
 
     @property
     def devices(self) -> tuple[str, ...]:
@@ -117,12 +121,28 @@ class Assembly:
                 weights[slot] = self.weight_files[slot].digest
         # Nothing is known of the options of a user's matcher.
         is_own = name in self.matchers
-        return {
+        settings: dict[str, Any] = {
             "unit": fields,
             "options": None if is_own else asdict(options_of(self.recipe, name)),
             "precision": self.placement.precision,
             "weights": weights,
         }
+        # The code and the weights of a matcher of this package have digests, or versions in keys.
+        if is_own or name.startswith(VISMATCH):
+            settings["version"] = self._version_of(name) or self.nonce
+        return settings
+
+    def _version_of(self, name: str) -> str:
+        is_own = name in self.matchers
+        spec = self.matchers[name].spec if is_own else spec_of(name, f"matcher {name}")
+        return spec.version
+
+    @property
+    def unversioned(self) -> list[str]:
+        """The recipe's matchers whose results are not kept for later runs."""
+        names = self.recipe.matcher_names
+        foreign = [name for name in names if name in self.matchers or name.startswith(VISMATCH)]
+        return [name for name in foreign if not self._version_of(name)]
 
     @property
     def weight_paths(self) -> tuple[Path, ...]:

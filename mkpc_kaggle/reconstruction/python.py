@@ -73,8 +73,9 @@ def reconstruct(
     This is a run of the command ``reconstruct`` on one set of images, without a time limit. Its
     ``progress`` is shown on the standard error stream. ``work_dir`` keeps the journal and COLMAP's
     files: after Ctrl-C, which raises ``KeyboardInterrupt``, the same call continues, and with more
-    images it matches only the new pairs. ``masks`` is a directory, and ``intrinsics`` a table, as for
-    the command; their paths are relative to the common directory of the images. With ``matchers``,
+    images it matches only the new pairs. Your own matchers need
+    ``MatcherSpec(version=...)`` for that. ``masks`` is a directory, and ``intrinsics`` a table, as
+    for the command; their paths are relative to the common directory of the images. With ``matchers``,
     matching runs in this process, else in separate processes.
 
     Cameras refer to the stored pixels of the files, as COLMAP reads them. ``colmap`` of a model is
@@ -102,6 +103,11 @@ def reconstruct(
     with ExitStack() as closed:
         if work_dir is None:
             work_dir = closed.enter_context(TemporaryDirectory(prefix="mkpc-"))
+        elif assembly.unversioned:
+            warn(
+                f"the results of {', '.join(assembly.unversioned)} are not kept for later calls: "
+                "set MatcherSpec(version=...), and change it whenever equal pictures get other points"
+            )
         directory = Path(work_dir)
         out = directory / COLMAP
         if out.exists() and not (directory / FILE_NAME).is_file():

@@ -1,5 +1,6 @@
 """Which settings decide which keys."""
 
+import sys
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -107,3 +108,16 @@ def test_a_key_is_the_digest_of_all_inputs_of_a_result(other, changed):
 
     keys = zip(chain(), chain(**other), strict=True)
     assert tuple(former != new for former, new in keys) == changed
+
+
+def test_another_vismatch_makes_other_points(monkeypatch):
+    recipe = replace(CLASSICAL, units=(Unit(1, "vismatch:any", 640),))
+
+    def key(version: str) -> str:
+        monkeypatch.setitem(sys.modules, "vismatch", SimpleNamespace(__version__=version))
+        return Keys.of(replace(assemble(CLASSICAL), recipe=recipe)).units[0]
+
+    assert key("1.4") == key("1.4")
+    assert key("1.4") != key("1.5")
+    # Without a version, it may be any.
+    assert key("") != key("")

@@ -16,6 +16,7 @@ from test_reconstruct import FIRST, RECIPE, MixedMatcher, fail, write_flat
 from mkpc_kaggle import reconstruct, results
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.matchers.contract import MatcherSpec
 from mkpc_kaggle.reconstruction.python import Models
 
 PAIRS = FIRST * (FIRST - 1) // 2
@@ -185,3 +186,27 @@ def test_a_script_needs_no_guard_although_scenes_are_computed_in_processes(tmp_p
         command, check=False, cwd=tmp_path, env=environment, capture_output=True, text=True
     )
     assert (done.stdout, done.returncode) == (f"{FIRST} cameras\n", 0), done.stderr
+
+
+class Unnamed(MixedMatcher):
+    """A matcher whose code or weights may be others in each call."""
+
+    version = ""
+
+    @property
+    def spec(self) -> MatcherSpec:
+        return MatcherSpec(self.name, version=self.version)
+
+
+def test_results_of_a_matcher_are_kept_only_under_its_version(tmp_path, files, capfd):
+    kept = {}
+    for version in ("", "1", "2", "1"):
+        # Without a version, no later call takes the points of an earlier one.
+        for _ in range(2):
+            matcher = Unnamed()
+            matcher.version = version
+            models(files, matcher, work_dir=tmp_path / "work", progress=False)
+            kept.setdefault(version, []).append(len(matcher.calls))
+    assert kept == {"": [PAIRS, PAIRS], "1": [PAIRS, 0, 0, 0], "2": [PAIRS, 0]}
+    line = "the results of synthetic are not kept for later calls: set MatcherSpec(version=...)"
+    assert capfd.readouterr().err.count(line) == 2

@@ -46,7 +46,7 @@ class RectifiedMatcher:
 
     @property
     def spec(self) -> MatcherSpec:
-        return MatcherSpec(self.name)
+        return MatcherSpec(self.name, version="1")
 
     def encode(self, pictures: Sequence[Picture]) -> list[Seen]:
         return [Seen(picture.view, int(np.median(picture.pixels))) for picture in pictures]
