@@ -19,10 +19,11 @@ Show the journal of a run, also while it is running. DIR is the run's work direc
 submission. Without options, print an overview of one screen.
 
 --csv writes long tables for pandas.read_csv. All have the column `pair`, the row of the test set:
-  pairs.csv    ids, image names, failure, source of F (pair, scene, fallback), matches, inliers, seconds by part;
-               F (f11 ... f33). For the F of the pair's own matches: support (ratio of inliers to inliers by
-               chance), overlaps (whether the images overlap), number of candidates; cost of the result and of
-               MAGSAC's own F, focal lengths
+  pairs.csv    ids, images (paths below the directory of the run's images), failure, source of F (pair, scene,
+               fallback), matches, inliers, seconds by part; f11 ... f33, the matrix of the column model: F, or E
+               for pairs with known intrinsics. For the F of the pair's own matches: support (ratio of inliers to
+               inliers by chance), overlaps (whether the images overlap), number of candidates; cost of the result
+               and of MAGSAC's own F, focal lengths
   units.csv    per unit and pair: matches, inliers, seconds, failure
   regions.csv  per image (0 or 1) and pair: the critical region's box and the reason for it
   events.csv   times of starts, plans, scenes, faults, ends

@@ -1,11 +1,12 @@
 """The results of a run as three pandas DataFrames."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from mkpc_kaggle.engine.image_files import stored_digests
 from mkpc_kaggle.engine.records import (
     PairRecord,
     SceneRecord,
@@ -22,12 +23,60 @@ if TYPE_CHECKING:
 
 # pandas treats NaN as missing.
 UNKNOWN = Sigmas(np.nan, np.nan, np.nan)
+# The columns with their types, so that a table without rows has them, too.
+ELEMENTS = [f"f{row}{column}" for row in (1, 2, 3) for column in (1, 2, 3)]  # row by row
+PAIR_COLUMNS = {
+    "pair": str,
+    "group": str,
+    "image0": str,
+    "image1": str,
+    "failure": str,
+    "source": str,
+    "matches": int,
+    "inliers": int,
+    "overlaps": bool,
+    "support": float,
+    "focal0": float,
+    "focal1": float,
+    "model": str,
+    **dict.fromkeys(ELEMENTS, float),
+}
+UNIT_COLUMNS = {
+    "pair": str,
+    "unit": str,
+    "stage": int,
+    "matches": int,
+    "inliers": int,
+    "encode_seconds": float,
+    "match_seconds": float,
+    "failure": str,
+    "note": str,
+    "keypoints": int,
+}
+CAMERA_COLUMNS = {
+    "batch": str,
+    "model": int,
+    "image": str,
+    "width": int,
+    "height": int,
+    "focal": float,
+    "points": int,
+    "rotation_sigma": float,
+    "centre_sigma": float,
+    "focal_sigma": float,
+    "K": object,
+    "R": object,
+    "t": object,
+}
 
 
 class Results(NamedTuple):
     """The results of a run. ``pairs`` has a row for each pair, ``units`` for each unit of a pair.
 
-    ``cameras`` has a row for each camera of each model. Columns that name a pair have its id.
+    ``cameras`` has a row for each camera of each model; identical files share a camera, and each
+    has a row. Columns that name a pair have its id. Columns that name an image have its path below
+    the directory of the run's images. ``f11`` to ``f33`` of ``pairs`` are the matrix of ``model``:
+    F, or E for a pair with known intrinsics.
     """
 
     pairs: "DataFrame"
@@ -44,22 +93,43 @@ def results(directory: Path | str) -> Results:
         table = Table.of(store)
         records = read_records(store, table)
         scenes = read_scenes(store, table)
-    from pandas import DataFrame  # importing it takes half a second
-
+        digests = stored_digests(store, table.image_names)
     units = [_unit_row(record, unit) for record in records for unit in record.units]
+    names = names_by_content(table, digests)
     return Results(
-        DataFrame([_pair_row(record) for record in records]),
-        DataFrame(units),
-        DataFrame(list(_camera_rows(scenes.values()))),
+        _frame([_pair_row(record) for record in records], PAIR_COLUMNS),
+        _frame(units, UNIT_COLUMNS),
+        _frame(list(_camera_rows(scenes.values(), names)), CAMERA_COLUMNS),
     )
+
+
+def names_by_content(
+    table: Table, digests: Mapping[str, str]
+) -> dict[tuple[str, str], dict[str, None]]:
+    """Return the names of the images of each batch and content, in the order of the table."""
+    names: dict[tuple[str, str], dict[str, None]] = {}
+    for row in table.rows:
+        for name in (row.image0, row.image1):
+            # A dictionary keeps the order, and a name once.
+            names.setdefault((row.batch, digests.get(name, "")), {})[name] = None
+    return names
+
+
+def _frame(rows: Sequence[Mapping[str, Any]], columns: Mapping[str, type]) -> "DataFrame":
+    from pandas import DataFrame, Series  # importing it takes half a second
+
+    if rows:
+        return DataFrame(rows, columns=list(columns))
+    return DataFrame({name: Series(dtype=kind) for name, kind in columns.items()})
 
 
 def _pair_row(record: PairRecord) -> dict[str, Any]:
     row = {
         "pair": record.pair.id,
         "group": record.pair.group,
-        "image0": record.pair.names[0],
-        "image1": record.pair.names[1],
+        # Not the file names alone: two folders may have the same.
+        "image0": record.pair.file0,
+        "image1": record.pair.file1,
         "failure": record.failure,
         "source": record.source,
         "matches": record.matches,
@@ -68,10 +138,9 @@ def _pair_row(record: PairRecord) -> dict[str, Any]:
         "support": record.stats.support,
         "focal0": record.stats.focals[0],
         "focal1": record.stats.focals[1],
+        "model": record.model,
     }
-    for index, value in np.ndenumerate(record.chosen_fundamental):
-        row[f"f{index[0] + 1}{index[1] + 1}"] = value  # f11 to f33, row by row
-    return row
+    return row | dict(zip(ELEMENTS, record.chosen_fundamental.flat, strict=True))
 
 
 def _unit_row(record: PairRecord, unit: UnitRecord) -> dict[str, Any]:
@@ -89,20 +158,25 @@ def _unit_row(record: PairRecord, unit: UnitRecord) -> dict[str, Any]:
     }
 
 
-def _camera_rows(scenes: Iterable[SceneRecord]) -> Iterator[dict[str, Any]]:
+def _camera_rows(
+    scenes: Iterable[SceneRecord], names: Mapping[tuple[str, str], Iterable[str]]
+) -> Iterator[dict[str, Any]]:
     for scene in scenes:
         # Model 0 has the most images.
         for number, model in enumerate(scene.models):
             for found in model.images:
-                yield _camera_row(scene.batch, number, found)
+                # An image that has changed since is known by its former name.
+                alike = names.get((scene.batch, found.image.digest), [found.image.name])
+                for name in alike:
+                    yield _camera_row(scene.batch, number, name, found)
 
 
-def _camera_row(batch: str, model: int, found: RegisteredImage) -> dict[str, Any]:
+def _camera_row(batch: str, model: int, name: str, found: RegisteredImage) -> dict[str, Any]:
     sigmas = found.sigmas or UNKNOWN
     return {
         "batch": batch,
         "model": model,
-        "image": found.image.name,
+        "image": name,
         "width": found.image.size.width,
         "height": found.image.size.height,
         "focal": found.focal,

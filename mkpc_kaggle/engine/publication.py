@@ -8,6 +8,7 @@ from mkpc_kaggle.engine.records import Row, Table
 from mkpc_kaggle.engine.run import EventLog
 from mkpc_kaggle.engine.state import SOURCES, State
 from mkpc_kaggle.engine.store import Store
+from mkpc_kaggle.geometry.robust import ModelKind
 
 INTERVAL_S = 30.0  # between versions: a run that is killed loses at most this from its submission
 TIME_SHARE = 0.05  # maximum share of the time for writing versions, if a disk is slow
@@ -117,4 +118,5 @@ def _row(state: State, index: int, source: str) -> Row:
         source=source,
         failures=failures,
         failure=reason,
+        model=ModelKind.F if pair.intrinsics is None else ModelKind.E,
     )

@@ -24,7 +24,7 @@ from mkpc_kaggle.geometry.coordinates import Matrix3
 from mkpc_kaggle.geometry.critical_region import CriticalRegion
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
-from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, NO_STATS, EstimateStats
+from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, NO_STATS, EstimateStats, ModelKind
 from mkpc_kaggle.pipeline.pair import Regions
 from mkpc_kaggle.scene.choose import Choice
 from mkpc_kaggle.scene.reconstruct import models_of
@@ -139,6 +139,7 @@ class PairRecord:
     stats: EstimateStats = NO_STATS
     source: str = "fallback"
     chosen_fundamental: Matrix3 = field(default_factory=FALLBACK_FUNDAMENTAL.copy)
+    model: str = ModelKind.F  # of both matrices
 
     @property
     def inliers(self) -> int:
@@ -280,6 +281,7 @@ class Row(NamedTuple):
     source: str  # of the written F: "scene", "pair" or "fallback"; empty for an extra pair
     failures: dict[str, str]
     failure: str
+    model: str = ModelKind.F  # of the written matrix; E for a pair with intrinsics
 
     @property
     def pair(self) -> Pair:
@@ -328,6 +330,11 @@ class Table:
             scenes=found["scenes"],
             written=np.frombuffer(data).reshape(-1, 3, 3),
         )
+
+    @property
+    def image_names(self) -> list[str]:
+        """The distinct names of all images, in order."""
+        return list(dict.fromkeys(name for row in self.rows for name in (row.image0, row.image1)))
 
     @property
     def keys(self) -> list[str]:
@@ -452,6 +459,7 @@ def _pair_record(
         stats=own.stats,
         source=row.source,
         chosen_fundamental=table.written[index],
+        model=row.model,
     )
 
 

@@ -243,8 +243,13 @@ def score_record(
     errors = {step: error_of(matrix, true, scene, rotation) for step, matrix in matrices.items()}
     made = {step: errors[step] for step in steps}
     return PairScore(
-        true.pair.id, true.pair.names, true.covisibility, errors[Step.SCENE], record, made
+        true.pair.id, files_of(true), true.covisibility, errors[Step.SCENE], record, made
     )
+
+
+def files_of(true: TruePair) -> tuple[str, str]:
+    """Return the paths of a pair's images: lists may have one file name in several folders."""
+    return true.pair.file0, true.pair.file1
 
 
 def error_of(
@@ -289,7 +294,7 @@ def score_submission(submission: Path, truth: Path, scenes: Sequence[TrainScene]
             if F is None:
                 missing.append(sample)
             error = error_of(F, true, there)
-            pairs.append(PairScore(true.pair.id, true.pair.names, true.covisibility, error))
+            pairs.append(PairScore(true.pair.id, files_of(true), true.covisibility, error))
         if pairs:
             scored.append(SceneScore(there.name, tuple(pairs)))
     if len(missing) == sum(len(scene.pairs) for scene in scored):
@@ -353,7 +358,7 @@ def to_json(validation: Validation) -> dict[str, Any]:
     report = validation.report
     scenes = []
     for scene in validation.scenes:
-        pairs = [_pair_json(pair) for pair in scene.pairs]
+        pairs = [_pair_json(pair, in_metres=scene.in_metres) for pair in scene.pairs]
         scenes.append({"scene": scene.scene, **_scores_json(scene, steps), "pairs": pairs})
     figures = {
         "recipe": validation.recipe,
@@ -376,7 +381,7 @@ def _scores_json(scores: SceneScore | Validation, steps: Sequence[Step]) -> dict
     }
 
 
-def _pair_json(pair: PairScore) -> dict[str, Any]:
+def _pair_json(pair: PairScore, *, in_metres: bool) -> dict[str, Any]:
     values: dict[str, Any] = {
         "pair": pair.id,
         "covisibility": pair.covisibility,
@@ -385,7 +390,9 @@ def _pair_json(pair: PairScore) -> dict[str, Any]:
         "translation_error_degrees": pair.error.translation_angle,
         **dict(zip(MATCHING, pair.matching, strict=True)),
         "accuracy_by_step": {
-            step: metrics.pair_accuracy(error) for step, error in pair.steps.items()
+            # Without metres, no translation error meets a threshold: 0 would be misleading.
+            step: metrics.pair_accuracy(error) if in_metres else None
+            for step, error in pair.steps.items()
         },
     }
     # A submission from a file has no record.

@@ -28,7 +28,7 @@ from mkpc_kaggle.reconstruction.folder import read_folder, require_distinct
 from mkpc_kaggle.reconstruction.priors import read_intrinsics_table
 from mkpc_kaggle.reconstruction.run import for_cameras, reconstruct_folder
 from mkpc_kaggle.scene.export import MODELS
-from mkpc_kaggle.scene.reconstruction import SfmModel
+from mkpc_kaggle.scene.reconstruction import RegisteredImage, SfmModel
 
 if TYPE_CHECKING:
     from mkpc_kaggle.reporting.view import View
@@ -79,7 +79,8 @@ def reconstruct(
     matching runs in this process, else in separate processes.
 
     Cameras refer to the stored pixels of the files, as COLMAP reads them. ``colmap`` of a model is
-    pycolmap's. Raises :class:`UserError` for a recipe that cannot run here, for unusable masks or
+    pycolmap's; it has one of several identical files, whose camera all of them have in
+    ``images``. Raises :class:`UserError` for a recipe that cannot run here, for unusable masks or
     intrinsics, and for an unreadable image. A ``work_dir`` with a folder ``colmap`` that is not of an
     earlier call raises it, and so do cameras that cannot be computed.
     """
@@ -133,7 +134,11 @@ def reconstruct(
             raise UserError(f"no cameras: {reason}; the same call tries again")
         names = {name_below(str(root), str(file)): name for file, name in given.items()}
         return Models(
-            complete_model(model, out / MODELS / str(number), names)
+            with_copies(
+                complete_model(model, out / MODELS / str(number), names),
+                number,
+                {given[file]: camera for file, camera in result.cameras["."].items()},
+            )
             for scene in result.report.scenes
             for number, model in enumerate(scene.models)
         )
@@ -208,6 +213,23 @@ def complete_model(model: SfmModel, folder: Path, names: Mapping[str, str]) -> S
         image = replace(placed.image, name=names[placed.image.name])
         images.append(replace(placed, image=image))
     return replace(model, images=tuple(images), points=points_of(found), colmap=found)
+
+
+def with_copies(
+    model: SfmModel, number: int, cameras: Mapping[str, tuple[int, RegisteredImage] | None]
+) -> SfmModel:
+    """Return model ``number`` with a camera for each file that is identical to one of its images.
+
+    ``cameras`` has the number of the model and the camera of each file, by the user's name.
+    """
+    names = {found.image.name for found in model.images}
+    by_content = {found.image.digest: found for found in model.images}
+    copies = []
+    for name, camera in cameras.items():
+        if camera is not None and camera[0] == number and name not in names:
+            found = by_content[camera[1].image.digest]
+            copies.append(replace(found, image=replace(found.image, name=name)))
+    return replace(model, images=(*model.images, *copies))
 
 
 def is_main_thread() -> bool:

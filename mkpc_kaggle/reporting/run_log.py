@@ -1,14 +1,15 @@
 """The data of a run for reports: a snapshot of the journal, and tables as CSV files."""
 
 import csv
-from collections.abc import Iterable, Iterator
-from dataclasses import astuple, dataclass
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import astuple, dataclass, field
 from itertools import chain
 from pathlib import Path
 from typing import Any
 
 from mkpc_kaggle.data.outputs import replacing, require_table
 from mkpc_kaggle.engine.budget import format_duration
+from mkpc_kaggle.engine.image_files import stored_digests
 from mkpc_kaggle.engine.records import (
     About,
     Event,
@@ -39,7 +40,7 @@ SECONDS = {  # fields of a pair's record, and their names in reports
     "estimate_seconds": "MAGSAC (in parallel with matching)",
 }
 PAIR_HEADS = f"""pair id group image0 image1 failure source matches inliers overlaps {" ".join(SECONDS)}
-    support candidates cost magsac_cost focal0 focal1 f11 f12 f13 f21 f22 f23 f31 f32 f33"""
+    support candidates cost magsac_cost focal0 focal1 model f11 f12 f13 f21 f22 f23 f31 f32 f33"""
 REGION_HEADS = "pair image left top right bottom reason clusters kept"
 
 
@@ -52,6 +53,7 @@ class RunLog:
     events: tuple[Event, ...]  # of all sessions
     weakest: tuple[tuple[PairRecord, PairMatch], ...]  # matched pairs, the fewest inliers first
     scenes: tuple[SceneRecord, ...] = ()
+    digests: Mapping[str, str] = field(default_factory=dict)  # of the images' contents, by name
 
     @property
     def ending(self) -> str:
@@ -116,7 +118,10 @@ def read_log(directory: Path) -> RunLog:
             present = {scene.batch for scene in scenes}
             scenes += [each for each in unmatched_scenes(records) if each.batch not in present]
         events = read_events(store)
-        return RunLog(store.path, published.about, recipe, records, events, weakest, tuple(scenes))
+        digests = stored_digests(store, published.image_names)
+        return RunLog(
+            store.path, published.about, recipe, records, events, weakest, tuple(scenes), digests
+        )
 
 
 def write_csv(log: RunLog, directory: Path) -> list[Path]:
@@ -153,7 +158,8 @@ def _pair_cells(record: PairRecord) -> tuple[Any, ...]:
         record.index,
         record.pair.id,
         record.pair.group,
-        *record.pair.names,
+        record.pair.file0,
+        record.pair.file1,
         record.failure,
         record.source,
         record.matches,
@@ -165,6 +171,7 @@ def _pair_cells(record: PairRecord) -> tuple[Any, ...]:
         stats.cost,
         stats.magsac_cost,
         *stats.focals,
+        record.model,
         *record.chosen_fundamental.flat,
     )
 

@@ -114,10 +114,15 @@ def _scene_problems(scene: SceneRecord, log: RunLog) -> Iterator[str]:
     if not scene.models:
         yield f"{where}no cameras, {scene.failure}: photographs that overlap more are needed"
         return
-    known = {Path(found.image.name).name for model in scene.models for found in model.images}
+    cameras = [found.image for model in scene.models for found in model.images]
+    known = {Path(image.name).name for image in cameras}
+    # Identical files share the camera of one of them.
+    contents = {image.digest for image in cameras}
     records = [record for record in log.records if record.pair.group == scene.batch]
     # The record of a scene has no list of its images without a camera; its pairs name them.
-    missing = sorted({name for record in records for name in record.pair.names} - known)
+    files = {file for record in records for file in (record.pair.file0, record.pair.file1)}
+    names = {Path(file).name for file in files if log.digests.get(file) not in contents}
+    missing = sorted(names - known)
     if missing:
         yield f"{where}no camera for {_named(missing)}: add photographs between these and the others"
     if len(scene.models) > 1:

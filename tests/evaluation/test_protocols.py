@@ -126,6 +126,9 @@ def test_an_independent_evaluation_of_the_same_matches_agrees(scenes, pairs, uni
         np.testing.assert_allclose(found, by_hand, atol=1e-6, err_msg=key)
         if key not in own:
             assert scores[key] == pytest.approx(np.mean(found), abs=1e-9)
+    # A list has no metres, so a pair has no accuracy: 0 would be the worst one.
+    assert scores["mAA"] is None
+    assert all({*pair["accuracy_by_step"].values()} == {None} for pair in scene["pairs"])
     errors = [max(pair["rotation"], pair["translation"]) for pair in expected]
     for limit in (5, 10, 20):
         assert scores["AUC"][str(limit)] == pytest.approx(auc(errors, limit), abs=1e-6)

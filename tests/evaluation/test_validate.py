@@ -1,6 +1,8 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
+from math import nan
 
 import numpy as np
 import pytest
@@ -190,3 +192,14 @@ def test_contradictory_options_are_refused(demo, small_recipe, options, told, ca
     assert run_command("validate", *(places.get(option, option) for option in options)) == 2
     captured = capsys.readouterr()
     assert (told in captured.err, captured.out) == (True, "")
+
+
+def test_images_of_a_list_with_one_file_name_are_two_images(tmp_path):
+    # Intervals draw images, and those of one name would be drawn together.
+    camera = Camera(np.eye(3), np.eye(3), np.zeros(3))
+    pair = Pair("1", "list", str(tmp_path / "a" / "1.jpg"), str(tmp_path / "b" / "1.jpg"))
+    true = TruePair(pair, camera, replace(camera, t=np.array([1.0, 0, 0])), nan)
+    scene = TrainScene("list", nan, (true,))
+    record = PairRecord(0, pair, failure="no matches")
+    first, second = score_record(true, record, scene, (Step.MAGSAC,)).images
+    assert first != second

@@ -1,6 +1,7 @@
 """``mkpc_kaggle.reconstruct``: a run of the engine, called from a program."""
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -18,6 +19,8 @@ from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import MatcherSpec
 from mkpc_kaggle.reconstruction.python import Models
+from mkpc_kaggle.reporting.run_log import read_log
+from mkpc_kaggle.reporting.verdict import verdict
 
 PAIRS = FIRST * (FIRST - 1) // 2
 
@@ -103,7 +106,35 @@ def test_images_of_several_folders_are_one_set(tmp_path, files):
     work = tmp_path / "work"
     (model,) = models([*files[:-1], moved], MixedMatcher(), work_dir=work, progress=False)
     assert str(moved) in {found.image.name for found in model.images}
-    assert results(work).pairs["pair"].is_unique
+    pairs, _, cameras = results(work)
+    assert pairs["pair"].is_unique
+    # Each image of a pair has a row, under the same name.
+    for side in ("image0", "image1"):
+        assert len(pairs.merge(cameras, left_on=side, right_on="image")) == PAIRS
+
+
+def test_identical_files_have_a_camera_each(tmp_path, files):
+    copy = files[0].with_name("copy.png")
+    shutil.copy(files[0], copy)
+    work = tmp_path / "work"
+    (model,) = models([*files, copy], MixedMatcher(), work_dir=work, progress=False)
+    by_name = {Path(found.image.name).name: found for found in model.images}
+    assert set(by_name) == {file.name for file in (*files, copy)}
+    first, second = by_name[files[0].name], by_name["copy.png"]
+    np.testing.assert_array_equal(first.camera.R, second.camera.R)
+    np.testing.assert_array_equal(first.camera.t, second.camera.t)
+    assert len(model.colmap.images) == FIRST
+    pairs, _, cameras = results(work)
+    assert sorted(cameras["image"]) == sorted(file.name for file in (*files, copy))
+    assert {*pairs["image0"], *pairs["image1"]} == set(cameras["image"])
+    assert not [text for text in verdict(read_log(work)).problems if "no camera" in text]
+
+
+def test_the_images_of_a_folder_are_those_of_their_paths(tmp_path, files):
+    (model,) = models(tmp_path / "images", MixedMatcher(), progress=False)
+    assert {found.image.name for found in model.images} == set(map(str, files))
+    (model,) = models(str(tmp_path / "images"), MixedMatcher(), progress=False)
+    assert len(model.images) == FIRST
 
 
 @pytest.mark.parametrize(

@@ -65,7 +65,7 @@ def test_a_run_exports_tables_that_a_reader_of_csv_files_understands(tmp_path, c
         assert record.chosen_fundamental.ravel().tolist() == F
         inliers = [int(unit["inliers"]) for unit in tables["units"] if unit["pair"] == row["pair"]]
         assert sum(inliers) == int(row["inliers"])
-        assert (row["image1"], row["overlaps"]) == (record.pair.names[1], str(record.overlaps))
+        assert (row["image1"], row["overlaps"]) == (record.pair.file1, str(record.overlaps))
     # A row without matches is a valid F, too.
     assert np.linalg.matrix_rank(read_log(tmp_path / "work").records[1].chosen_fundamental) == 2, (
         "the fallback"
