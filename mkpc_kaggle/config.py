@@ -1,5 +1,6 @@
 """Settings: frozen dataclasses from TOML tables, with checked keys and values."""
 
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import MISSING, Field, dataclass, fields
 from enum import StrEnum
@@ -10,6 +11,10 @@ from mkpc_kaggle.errors import UserError
 
 Config = TypeVar("Config")
 
+DECIMAL = re.compile(
+    r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?|[+-]?(nan|inf|infinity)", re.ASCII | re.IGNORECASE
+)
+WHOLE = re.compile(r"\d{1,18}", re.ASCII)
 MAX_INTEGER = 2**63 - 1  # as in TOML
 
 
@@ -65,6 +70,24 @@ def convert(value: Any, kind: type, where: str) -> Any:
     if type(value) is not kind:
         raise UserError(f"{where}: expected {kind.__name__}, got {value!r}")
     return value
+
+
+def decimal(text: str) -> float:
+    """Return the number of a decimal text, as other programs read it. Raise ``ValueError``.
+
+    Python's ``float`` also takes "1_0", digits of other scripts, and blanks and line breaks around
+    the number.
+    """
+    if not DECIMAL.fullmatch(text):
+        raise ValueError(f"{text!r} is not a decimal number")
+    return float(text)
+
+
+def whole(text: str) -> int:
+    """Return the number of a text of ASCII digits. Raise ``ValueError``."""
+    if not WHOLE.fullmatch(text):
+        raise ValueError(f"{text!r} is not a whole number")
+    return int(text)
 
 
 def plain(value: Any) -> Any:

@@ -3,11 +3,12 @@
 import argparse
 from pathlib import Path
 
-from mkpc_kaggle.data.competition import read_test_side, submission_problems
+from mkpc_kaggle.data.competition import read_test_side, submission_problems, submission_warnings
 from mkpc_kaggle.errors import plural
 
 HELP = """\
 Compare a submission with test.csv: header, ids and their order, nine finite numbers per row.
+Cells of nine numbers that are no fundamental matrix (rank 3, or rounded to zero) are warned of.
 Exit status: 0 good, 1 not good (one problem per line), 2 the test side cannot be read.
 """
 MAX_LINES = 20  # of problems; a wrong file may have one in each of a hundred thousand rows
@@ -24,6 +25,8 @@ def run(arguments: argparse.Namespace) -> int:
     problems = submission_problems(arguments.submission, [pair.id for pair in pairs])
     if not problems:
         print(f"good: {plural(len(pairs), 'row')}")
+        for text in submission_warnings(arguments.submission):
+            print(f"warning: {text}")
         return 0
     lines = problems[:MAX_LINES]
     if len(problems) > MAX_LINES:

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 import numpy as np
 from numpy.typing import NDArray
 
+from mkpc_kaggle.config import decimal
 from mkpc_kaggle.data.images import IMAGE_SUFFIXES, MORE_SUFFIXES
 from mkpc_kaggle.data.outputs import replacing
 from mkpc_kaggle.errors import UserError, plural
@@ -31,6 +32,11 @@ if TYPE_CHECKING:
 
 SUBMISSION_COLUMNS = ("sample_id", "fundamental_matrix")
 
+ROUNDED = re.compile(r"-?0\.00+")  # zero in fixed digits, such as 0.000000
+# Smallest over largest singular value of a balanced matrix: 1 for the identity, 1e-6 for an F that
+# was rounded to six digits.
+MAX_RANK_3 = 1e-3
+BALANCE_STEPS = 20
 MAX_COLUMNS = 1000  # of a table; pandas takes minutes for a hundred thousand
 MAX_LINE = 1 << 20  # characters of a row; other files may have lines of gigabytes
 # Characters that end lines or control a terminal.
@@ -154,7 +160,7 @@ def read_train_side(
     metres = {}
     rows = read_rows(directory / "scaling_factors.csv", ("scene", "scaling_factor"))
     for where, (scene, cell) in rows:
-        metres[plain_name(scene, where)] = float(*_numbers(cell, where, 1))
+        metres[plain_name(scene, where)] = float(*finite_numbers(cell, where, 1))
     # The table may name scenes that were not downloaded.
     wanted = list(scenes) or sorted(name for name in metres if (directory / name).is_dir())
     if not wanted:
@@ -174,9 +180,9 @@ def _read_cameras(path: Path) -> dict[str, Camera]:
     cameras: dict[str, Camera] = {}
     columns = ("image_id", "camera_intrinsics", "rotation_matrix", "translation_vector")
     for where, (image, *cells) in read_rows(path, columns):
-        K = _numbers(cells[0], where, 9).reshape(3, 3)
-        R = _numbers(cells[1], where, 9).reshape(3, 3)
-        t = _numbers(cells[2], where, 3)
+        K = finite_numbers(cells[0], where, 9).reshape(3, 3)
+        R = finite_numbers(cells[1], where, 9).reshape(3, 3)
+        t = finite_numbers(cells[2], where, 3)
         cameras[plain_name(image, where)] = Camera(K, R, t)
     return cameras
 
@@ -190,7 +196,7 @@ def _read_scene(
     path = directory / "pair_covisibility.csv"
     pairs = []
     for where, (key, cell) in read_rows(path, ("pair", "covisibility")):
-        covisibility = float(*_numbers(cell, where, 1))
+        covisibility = float(*finite_numbers(cell, where, 1))
         first, _, second = key.partition("-")
         if first not in cameras or second not in cameras:
             raise UserError(f"{where}: the pair {key!r} is not two images of calibration.csv")
@@ -247,6 +253,48 @@ def submission_problems(path: Path, sample_ids: Sequence[str]) -> list[str]:
         except UserError as error:
             problems.append(str(error))
     return problems
+
+
+def submission_warnings(path: Path) -> list[str]:
+    """Return a line for each kind of row that is no fundamental matrix, although it has nine
+    numbers.
+
+    Raises :class:`UserError` for a file that is not a submission.
+    """
+    rounded = []
+    of_full_rank = []
+    for where, (sample, cell) in read_rows(path, SUBMISSION_COLUMNS):
+        F = _numbers(cell, where, 9).reshape(3, 3)
+        words = cell.split()
+        # In pixels, these four are the smallest: fixed digits such as %.6f lose them first.
+        if all(ROUNDED.fullmatch(words[index]) for index in (0, 1, 3, 4)):
+            rounded.append(sample)
+        elif np.isfinite(F).all() and _rank_3(F) > MAX_RANK_3:
+            of_full_rank.append(sample)
+    found = []
+    if rounded:
+        found.append(
+            f"numbers rounded to zero: {plural(len(rounded), 'row')}, the first is {rounded[0]}; "
+            "write more digits, such as %.12g"
+        )
+    if of_full_rank:
+        found.append(
+            f"matrices of rank 3: {plural(len(of_full_rank), 'row')}, the first is {of_full_rank[0]}; "
+            "a fundamental matrix has rank 2"
+        )
+    return found
+
+
+def _rank_3(matrix: Matrix3) -> float:
+    """Return the smallest over the largest singular value, with rows and columns of equal size."""
+    # The elements of F in pixels have very different sizes, which its rank does not depend on.
+    balanced = matrix.copy()
+    for _ in range(BALANCE_STEPS):
+        for axis in (0, 1):
+            norms = np.linalg.norm(balanced, axis=axis, keepdims=True)
+            balanced /= np.where(norms, norms, 1.0)
+    values = np.linalg.svd(balanced, compute_uv=False)
+    return float(values[2] / values[0]) if values[0] else 0.0
 
 
 def read_rows(
@@ -432,11 +480,20 @@ def image_files(directory: Path) -> Callable[[str], str]:
     return lambda name: known.get(name) or f"{directory}{os.sep}{name}.png"
 
 
+def finite_numbers(cell: str, where: str, count: int) -> NDArray[np.float64]:
+    """Return the ``count`` numbers of a cell. Raise :class:`UserError` unless they are finite."""
+    numbers = _numbers(cell, where, count)
+    if not np.isfinite(numbers).all():
+        raise UserError(f"{where}: a number is not finite: {cell!r}")
+    return numbers
+
+
 def _numbers(cell: str, where: str, count: int) -> NDArray[np.float64]:
     """Return the ``count`` numbers of a cell. Raise :class:`UserError` for any other cell."""
-    parts = cell.split()
+    # Blanks alone: readers of the competition's files may not take other white space.
+    parts = [part for part in cell.split(" ") if part]
     with suppress(ValueError):
         if len(parts) == count:
-            return np.array([float(part) for part in parts])
+            return np.array([decimal(part) for part in parts])
     words = plural(len(parts), "word")
     raise UserError(f"{where}: expected {count} numbers, found {words}: {cell!r}")

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mkpc_kaggle.config import decimal, whole
 from mkpc_kaggle.data.competition import Pair, TrainScene, TruePair, evenly_spread
 from mkpc_kaggle.errors import UserError, read_text
 from mkpc_kaggle.geometry.cameras import Camera
@@ -82,8 +83,8 @@ def parse_line(line: str, file: Path, number: int, image_root: Path) -> TruePair
                 f"{where}: {name!r} points outside the image root; expected a path without .."
             )
     try:
-        turns = (int(cells[2]), int(cells[3]))
-        numbers = np.array([float(cell) for cell in cells[4:]])
+        turns = (whole(cells[2]), whole(cells[3]))
+        numbers = np.array([decimal(cell) for cell in cells[4:]])
     except ValueError as error:
         raise UserError(
             f"{where}: expected numbers for turns, K0, K1 and T_0to1: {error}"

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mkpc_kaggle.config import POSITIVE
+from mkpc_kaggle.config import POSITIVE, decimal
 from mkpc_kaggle.data.competition import read_rows
 from mkpc_kaggle.errors import UserError, plural, shown
 
@@ -230,7 +230,7 @@ def _numbers(cell: str, where: str) -> Points:
     Raises :class:`UserError` for a malformed or huge number.
     """
     try:
-        found = np.array([float(part) for part in cell.split(";")])
+        found = np.array([decimal(part.strip(" ")) for part in cell.split(";")])
     except ValueError as error:
         raise UserError(f"{where}: {cell!r} is not a list of numbers joined by ';'") from error
     if (np.abs(found) > MAX_NUMBER).any():

@@ -10,6 +10,8 @@ from dataclasses import dataclass, replace
 from math import isfinite
 from types import MappingProxyType
 
+from mkpc_kaggle.config import decimal
+
 # Parameters of the models that a perspective camera with a usual lens needs.
 MODELS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
@@ -85,12 +87,12 @@ def parse_row(pattern: str, model: str, parameters: str, sigma: str) -> tuple[st
     """Return a row of a table from its cells. Raises ``ValueError`` with the reason."""
     if not pattern.strip():
         raise ValueError("the name of the image is missing")
-    if sigma.strip() != FIXED and float(sigma) <= 0:
+    if sigma.strip() != FIXED and decimal(sigma.strip()) <= 0:
         raise ValueError(
             f"a standard deviation must be {FIXED!r} or a number of percent above 0, not {sigma!r}"
         )
-    percent = 0.0 if sigma.strip() == FIXED else float(sigma)
-    values = tuple(map(float, parameters.split()))
+    percent = 0.0 if sigma.strip() == FIXED else decimal(sigma.strip())
+    values = tuple(decimal(part) for part in parameters.split(" ") if part)
     return pattern.strip(), KnownCamera(model.strip(), values, percent)
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+from mkpc_kaggle.config import whole
 from mkpc_kaggle.data.competition import Pair, read_rows
 from mkpc_kaggle.data.images import ByteCache, Image, read_size
 from mkpc_kaggle.data.masks import MaskReader, Masks
@@ -333,7 +334,7 @@ def read_regions(file: Path, image_root: Path, pairs: Iterable[Pair]) -> GivenRe
     columns = ("image_0", "image_1", "box_0", "box_1")
     for where, (name0, name1, *cells) in read_rows(file, columns):
         try:
-            box0, box1 = (Box(*map(int, cell.split())) for cell in cells)
+            box0, box1 = (Box(*map(whole, filter(None, cell.split(" ")))) for cell in cells)
         except (ValueError, TypeError) as error:
             found = f"{cells[0]!r} and {cells[1]!r}"
             raise UserError(
