@@ -2,7 +2,7 @@
 
 import re
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from pickle import UnpicklingError
 from tempfile import TemporaryDirectory
@@ -17,9 +17,14 @@ if TYPE_CHECKING:
     from torch import nn
 
 # Entries that hold the tensors, of training checkpoints and of DISK.
-WRAPPERS = ("state_dict", "extractor")
+WRAPPERS = ("state_dict", "model", "extractor")
+PARALLEL = "module."  # begins all names in checkpoints of torch.nn.DataParallel
+MAX_NAMED = 5  # entries of each kind in a message
+LFS_START = b"version https://git-lfs.github.com/spec/"
+PAGE_STARTS = (b"<!doctype html", b"<html", b"<?xml")
 # Of a batch norm, used in training only; old files have none.
 COUNTER = re.compile(r"(.*\.)?num_batches_tracked")
+MAX_WRAPPINGS = 4  # such as {"model": {"state_dict": ...}}
 MAX_EXPANSION = 4  # bytes of tensors per byte of the file; some tensors share their bytes
 
 
@@ -52,11 +57,31 @@ def load_tensors(path: Path, device: str = "cpu") -> "dict[str, torch.Tensor]":
         _require_plain(table, path)
     # Any error: a damaged file makes torch, zipfile and safetensors raise errors of many types.
     except Exception as error:
-        raise UserError(f"{path} cannot be read as a checkpoint: {error}") from error
+        reason = no_checkpoint(path) or error
+        raise UserError(f"{path} cannot be read as a checkpoint: {reason}") from error
+    is_parallel = bool(table) and all(name.startswith(PARALLEL) for name in table)
     tensors = {}
     for name, tensor in table.items():
-        tensors[name] = tensor.detach().to(device)  # without gradients, which parameters have
+        own = name.removeprefix(PARALLEL) if is_parallel else name
+        tensors[own] = tensor.detach().to(device)  # without gradients, which parameters have
     return tensors
+
+
+def no_checkpoint(path: Path) -> str:
+    """Return what a file is that is no checkpoint but came in the place of one; empty if unknown."""
+    try:
+        with path.open("rb") as stream:
+            start = stream.read(1 << 10).lstrip()
+    except OSError:
+        return ""
+    if start.startswith(LFS_START):
+        return (
+            "it is a pointer of Git LFS, and not the file itself: `git lfs pull` gets it, "
+            "or download the file from its page"
+        )
+    if start.lower().startswith(PAGE_STARTS):
+        return "it is a web page, such as a login or an error, and not the file itself: download it again"
+    return ""
 
 
 def load_into(
@@ -66,27 +91,42 @@ def load_into(
 
     Only counters of batch norms, and entries whose names match the pattern ``unused``, may be
     missing or surplus. A network on the device "meta" takes the tensors themselves, so that a large
-    network is not in memory twice. Raises :class:`UserError` that names up to five entries that do
-    not fit.
+    network is not in memory twice. Raises :class:`UserError` that names missing entries, surplus
+    ones and other shapes, up to five of each.
     """
     own = network.state_dict()
-    odd = []
-    for name in own.keys() ^ tensors.keys():  # missing or surplus
-        if not re.match(unused, name) and not COUNTER.fullmatch(name):
-            odd.append(name)
-    for name in own.keys() & tensors.keys():
-        if own[name].shape != tensors[name].shape:
-            odd.append(name)
-    if odd:
-        raise UserError(
-            f"the weights for {what!r} do not fit the network: {', '.join(sorted(odd)[:5])}"
-        )
+
+    def counts(name: str) -> bool:
+        return not re.match(unused, name) and not COUNTER.fullmatch(name)
+
+    missing = [name for name in own if name not in tensors and counts(name)]
+    surplus = [name for name in tensors if name not in own and counts(name)]
+    reshaped = [
+        f"{name} {tuple(tensors[name].shape)} instead of {tuple(own[name].shape)}"
+        for name in own
+        if name in tensors and own[name].shape != tensors[name].shape
+    ]
+    sides = {
+        "the network also has": missing,
+        "the file also has": surplus,
+        "other shapes": reshaped,
+    }
+    if any(sides.values()):
+        texts = [f"{side} {_named(names)}" for side, names in sides.items() if names]
+        raise UserError(f"the weights for {what!r} do not fit the network: {'; '.join(texts)}")
     # Files in half precision are converted once, here.
     fitting = {}
     for name in own.keys() & tensors.keys():
         fitting[name] = tensors[name].to(own[name].dtype)
     is_meta = any(tensor.is_meta for tensor in own.values())
     network.load_state_dict({**own, **fitting}, assign=is_meta)
+
+
+def _named(names: Sequence[str]) -> str:
+    """Return the first names, sorted, and the number of the others."""
+    shown = ", ".join(sorted(names)[:MAX_NAMED])
+    more = len(names) - MAX_NAMED
+    return f"{shown} and {more} more" if more > 0 else shown
 
 
 def convert(source: Path, target: Path, known: WeightFile | None = None) -> WeightFile:
@@ -193,10 +233,23 @@ def _load_table(path: Path, *, is_mapped: bool = False) -> Mapping[Any, Any]:
         raise ValueError(
             "it is not a checkpoint, or contains unsupported objects; save the network's state_dict alone"
         ) from refusal
-    if isinstance(contents, dict):
-        contents = next((contents[name] for name in WRAPPERS if name in contents), contents)
+    contents = _unwrapped(contents)
     if not isinstance(contents, dict):
         raise ValueError("it contains no table of named tensors")
+    return contents
+
+
+def _unwrapped(contents: object) -> object:
+    """Return the table of tensors of a training checkpoint, at any depth; anything else as it is."""
+    for _ in range(MAX_WRAPPINGS):
+        tables = [
+            contents[name]
+            for name in WRAPPERS
+            if isinstance(contents, dict) and isinstance(contents.get(name), dict)
+        ]
+        if not tables:
+            break
+        contents = tables[0]
     return contents
 
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from mkpc_kaggle.data.outputs import weights_of_environment
 from mkpc_kaggle.errors import UserError, plural, warn_once
-from mkpc_kaggle.weights.checkpoint import is_unpacked_from, load_tensors
+from mkpc_kaggle.weights.checkpoint import is_unpacked_from, load_tensors, no_checkpoint
 from mkpc_kaggle.weights.manifest import (
     MANIFEST,
     UNVERIFIED,
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     import torch
 
 KAGGLE_INPUT = Path("/kaggle/input")
+MAX_POINTER_BYTES = 1 << 20  # web pages in the place of a file are smaller
 UNKNOWN_LICENCE = "unknown (own weights)"
 # A competition's input has thousands of images.
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png"})
@@ -293,6 +294,8 @@ def judge(path: Path, file: WeightFile, files: Iterable[WeightFile] = ()) -> Fou
         if path.is_dir() and not unpacked:
             return FoundFile(file, path, State.REFUSED, "", "it is a directory")
         size = path.stat().st_size
+        if path.is_file() and size <= MAX_POINTER_BYTES and (what := no_checkpoint(path)):
+            return FoundFile(file, path, State.REFUSED, "", what)
         # Most wrong files have another size, and need not be read.
         length = plural(size, "byte")
         wrong_size = f"{length}, the manifest says {file.size}: truncated, or another file"

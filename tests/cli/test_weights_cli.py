@@ -102,8 +102,9 @@ def test_verify_refuses_a_file_with_the_manifests_digest_that_no_network_takes(
         put(tmp_path, file.name, wrong)
     rows = verified(capsys, put(tmp_path, "superpoint.pt"), 1)
     assert "refused" in rows["dkm-outdoor.pt"]
-    says = "the weights for 'dkm-outdoor' do not fit the network: a, decoder."
+    says = "the weights for 'dkm-outdoor' do not fit the network: the network also has decoder."
     assert says in rows["dkm-outdoor.pt"]
+    assert "the file also has a" in rows["dkm-outdoor.pt"]
     assert "cannot be read as a checkpoint" in rows["superpoint.pt"]
     # A matcher is only built from all its files.
     says = "not tried in a network: xfeat_lighterglue also needs xfeat-lighterglue"

@@ -11,6 +11,7 @@ import PIL.Image
 import pytest
 import torch
 from exif_files import set_exif
+from light_matchers import standin
 from pictures import same
 from sklearn.datasets import load_sample_image
 
@@ -22,9 +23,12 @@ from mkpc_kaggle.geometry.coordinates import Box
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.adapters.sift import SiftMatcher, SiftOptions
 from mkpc_kaggle.matchers.contract import Colour, MatcherSpec
+from mkpc_kaggle.matchers.networks.aliked import Aliked
+from mkpc_kaggle.matchers.registry import matcher_names
 from mkpc_kaggle.pipeline import assembly
 from mkpc_kaggle.pipeline.arguments import boxes_of, intrinsics_of, to_image
-from mkpc_kaggle.recipe import Recipe, Unit
+from mkpc_kaggle.pipeline.assembly import recipe_of_name
+from mkpc_kaggle.recipe import Recipe, Unit, load_recipe
 
 pytestmark = pytest.mark.usefixtures("nowhere_else")
 
@@ -310,6 +314,48 @@ def test_an_argument_of_a_matcher_is_taken_where_its_meaning_is_plain(arguments)
                 made.recipe.matchers["sift"] if table == "matchers" else vars(made.recipe.magsac)
             )
             assert settings[name] == value
+
+
+def write_aliked(path, extra=()):
+    network = standin("aliked", Aliked, 200)
+    table = {f"module.{name}": tensor for name, tensor in network.state_dict().items()}
+    torch.save({"model": table | dict(extra), "epoch": 3}, path)
+    return path
+
+
+def test_own_weights_are_a_file_for_a_slot(tmp_path):
+    path = write_aliked(tmp_path / "mine.pth")
+    given = {"aliked-n16": path}
+    made = TwoStageMatcher("aliked", weights=given, settings={"matchers.aliked.features": 200})
+    assert made.recipe.matcher_names == ("aliked",)
+    match = made(pixels(), pixels(40))
+    assert match.failures == {}
+    assert len(match.matches) > 0
+    # Nothing is known of their licence.
+    raises(
+        lambda: TwoStageMatcher("aliked", weights=given, licence="permissive"),
+        UserError,
+        "unknown (own weights)",
+    )
+    write_aliked(path, {"module.head": torch.zeros(1)})
+    raises(lambda: TwoStageMatcher("aliked", weights=given), UserError, "the file also has head")
+
+
+def test_the_name_of_a_matcher_is_a_recipe(tmp_path):
+    made = TwoStageMatcher("sift")
+    (unit,) = made.recipe.units
+    auto = load_recipe("auto")
+    assert unit == next(unit for unit in auto.units if unit.matcher == "sift")
+    assert (made.recipe.name, made.recipe.magsac, made.recipe.focal) == (
+        "sift",
+        auto.magsac,
+        auto.focal,
+    )
+    (unit,) = TwoStageMatcher("own", matchers={"own": Own(fail)}).recipe.units
+    assert unit == Unit(1, "own", 1024)
+    for name in matcher_names():
+        (unit,) = recipe_of_name(name).units
+        assert (unit.stage, unit.matcher, unit.tracks) == (1, name, True)
 
 
 def test_a_recipe_may_be_a_path(tmp_path):

@@ -26,6 +26,7 @@ from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.weights import checkpoint, load_tensors
 from mkpc_kaggle.weights.checkpoint import convert
 from mkpc_kaggle.weights.manifest import UNVERIFIED, WeightFile
+from mkpc_kaggle.weights.store import judge
 
 # A matrix, a scalar and an empty tensor: formats store each in its own way.
 TENSORS = {
@@ -73,10 +74,37 @@ def test_on_the_device_meta_a_file_gives_names_shapes_and_types(tmp_path, save):
     assert {name: (tensor.shape, tensor.dtype) for name, tensor in loaded.items()} == expected
 
 
-@pytest.mark.parametrize("wrapper", ["state_dict", "extractor"])
+@pytest.mark.parametrize("wrapper", ["state_dict", "extractor", "model"])
 def test_tensors_in_a_wrapper_are_found(tmp_path, wrapper):
     torch.save({wrapper: TENSORS, "epoch": 3}, tmp_path / "x.pt")
     assert_same(load_tensors(tmp_path / "x.pt"), TENSORS)
+
+
+def test_wrappers_in_wrappers_and_the_prefix_of_parallel_training_are_removed(tmp_path):
+    parallel = {f"module.{name}": tensor for name, tensor in TENSORS.items()}
+    torch.save({"model": {"state_dict": parallel}, "epoch": 3}, tmp_path / "x.pt")
+    assert_same(load_tensors(tmp_path / "x.pt"), TENSORS)
+    # Of one network, "module" may be a part.
+    mixed = parallel | {"head": torch.zeros(1)}
+    torch.save(mixed, tmp_path / "y.pt")
+    assert list(load_tensors(tmp_path / "y.pt")) == list(mixed)
+
+
+LFS = b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 123456\n"
+PAGE = b"\n<!DOCTYPE html><html><title>Sign in</title></html>"
+
+
+@pytest.mark.parametrize(("data", "named"), [(LFS, "pointer of Git LFS"), (PAGE, "a web page")])
+@pytest.mark.parametrize("size", [-1, 123456])
+def test_a_pointer_or_a_page_in_the_place_of_a_file_is_named(tmp_path, data, named, size):
+    for name in ("x.pth", "x.safetensors"):
+        (tmp_path / name).write_bytes(data)
+        with pytest.raises(UserError, match=f"cannot be read as a checkpoint: it is .*{named}"):
+            load_tensors(tmp_path / name)
+    line = WeightFile("x.pth", size, f"sha256:{'0' * 64}", "MIT", "x", "here")
+    found = judge(tmp_path / "x.pth", line, [line])
+    assert found.state == "refused"
+    assert named in found.note
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")  # of torch, on prototypes
