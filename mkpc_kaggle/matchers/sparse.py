@@ -12,6 +12,7 @@ from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import Picture, Placement
 from mkpc_kaggle.matchers.dtypes import check_finite
+from mkpc_kaggle.matchers.lists import Lists
 from mkpc_kaggle.matchers.networks.placement import autocast
 
 # Images (B, 3, H, W) -> for each image, points (K, 2) in pixels and unit descriptors (K, D).
@@ -34,7 +35,7 @@ class Keypoints:
 
     ``points`` (K, 2) are float32 in view pixels, ``descriptors`` (K, D) unit vectors. If the
     detector has them: ``scales`` (K,), diameters in view pixels, and ``orientations`` (K,),
-    radians.
+    radians. If keypoints are sorted by ``lists`` of their descriptors, these are searched.
     """
 
     points: Tensor
@@ -42,6 +43,7 @@ class Keypoints:
     content: Size
     scales: Tensor | None = None
     orientations: Tensor | None = None
+    lists: Lists | None = None
 
     @classmethod
     def on_content(
@@ -55,7 +57,8 @@ class Keypoints:
         upper = points.new_tensor(content) - 0.5
         kept = ((points >= -0.5) & (points < upper)).all(dim=1)
         kept_shapes = [shape[kept] for shape in shapes]
-        return cls(points[kept], descriptors[kept], content, *kept_shapes)
+        scales, orientations = kept_shapes or (None, None)
+        return cls(points[kept], descriptors[kept], content, scales, orientations)
 
     def __len__(self) -> int:
         return len(self.points)

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from mkpc_kaggle.config import AT_LEAST_0, AT_LEAST_1, SHARE, check_ranges
 from mkpc_kaggle.matchers.contract import Colour, MatcherSpec, Picture, Placement
+from mkpc_kaggle.matchers.lists import Search
 from mkpc_kaggle.matchers.neighbours import NeighbourMatcher, Neighbours
 from mkpc_kaggle.matchers.sparse import Keypoints
 from mkpc_kaggle.weights import WeightStore
@@ -26,6 +27,7 @@ class SiftOptions:
     features: int = 8000  # the strongest keypoints per picture
     ratio: float = 0.8  # the maximum distance ratio, in both directions
     contrast_threshold: float = 0.04  # OpenCV's default
+    search: Search = Search.EXACT
 
     def __post_init__(self) -> None:
         check_ranges(self, features=AT_LEAST_1, ratio=SHARE, contrast_threshold=AT_LEAST_0)
@@ -41,6 +43,7 @@ class SiftMatcher(NeighbourMatcher):
 
     def __init__(self, options: SiftOptions, device: str) -> None:
         self.ratio = options.ratio
+        self.search = options.search
         self.device = device
         # Without precise upscaling, OpenCV shifts every point by a quarter of a pixel.
         self._sift = cv2.SIFT_create(  # type: ignore[attr-defined]  # missing in OpenCV's stubs
@@ -50,7 +53,7 @@ class SiftMatcher(NeighbourMatcher):
         )
 
     def encode(self, pictures: Sequence[Picture]) -> list[Keypoints]:
-        return [self._encode(picture) for picture in pictures]
+        return [self._searchable(self._encode(picture)) for picture in pictures]
 
     def _encode(self, picture: Picture) -> Keypoints:
         found, descriptors = self._sift.detectAndCompute(picture.pixels, None)
