@@ -155,20 +155,25 @@ def single_pairs(
 
 
 def scene_draws(
-    scene: TrainScene,
-    every: Sequence[dict[str, Known]],
-    names: Sequence[str],
-    images: int,
-    seeds: int,
+    scene: TrainScene, searches: Searches, images: int, seeds: int
 ) -> list[dict[str, Score]]:
     """Return the scores of F from cameras by each search, for each draw of images."""
+    stubs = [Known(true, PairMatch(), None) for true in scene.pairs]
+    matched: dict[str, dict[str, Known]] = {}
     draws = []
     for seed in range(seeds):
+        chosen, inside = drawn(stubs, images, 1.0, seed)
+        for stub in inside:
+            if stub.true.pair.id not in matched:  # in no former draw
+                matched[stub.true.pair.id] = searches.of_pair(stub.true)
         scores = {}
-        for name in names:
-            pairs, inside = drawn([pair[name] for pair in every], images, 1.0, seed)
-            scores[f"{SCENE}, {name}"] = score(_cameras, pairs, inside, scene)
+        for name in searches.names:
+            pairs = [matched[stub.true.pair.id][name] for stub in chosen]
+            every = [matched[stub.true.pair.id][name] for stub in inside]
+            scores[f"{SCENE}, {name}"] = score(_cameras, pairs, every, scene)
         draws.append(scores)
+        shown = ", ".join(f"{name} {mean(each.accuracies):.4f}" for name, each in scores.items())
+        print(f"{scene.name}, draw {seed}: {shown}", flush=True)
     return draws
 
 
@@ -237,19 +242,19 @@ def main() -> None:
     if arguments.seconds:
         seconds(scenes[0], unit, arguments.seconds)
         return
-    heads = "kept | extra | match, ms | lists, ms | mAA | gain"
-    print(f"| scene (pairs) | search | {heads} |\n|" + "---|" * 8)
+    if arguments.orders:
+        heads = "kept | extra | match, ms | lists, ms | mAA | gain"
+        print(f"| scene (pairs) | search | {heads} |\n|" + "---|" * 8)
     by_scene_and_draw = {}
     for scene in scenes:
         searches = Searches(unit, arguments.probes)
-        every = [searches.of_pair(true) for true in scene.pairs]
         if arguments.orders:
-            scored = [pair for pair in every if pair[EXACT].true.covisibility >= MIN_COVISIBILITY]
-            single_pairs(scene, scored, searches, arguments.orders)
+            scored = [true for true in scene.pairs if true.covisibility >= MIN_COVISIBILITY]
+            pairs = [searches.of_pair(true) for true in scored]
+            single_pairs(scene, pairs, searches, arguments.orders)
         if arguments.images:
-            names = list(searches.names)
             by_scene_and_draw[scene.name] = scene_draws(
-                scene, every, names, arguments.images, arguments.seeds
+                scene, searches, arguments.images, arguments.seeds
             )
     if by_scene_and_draw:
         draws: Draws = by_scene_and_draw
