@@ -29,7 +29,7 @@ from mkpc_kaggle.reconstruction.layout import write_layouts
 from mkpc_kaggle.reconstruction.outputs import FORMS, Cameras, write_tables
 from mkpc_kaggle.reconstruction.priors import intrinsics_line, read_intrinsics_table
 from mkpc_kaggle.reconstruction.run import FolderResult, for_cameras, reconstruct_folder
-from mkpc_kaggle.reporting.summary import pending_lines, trouble, weakest_line
+from mkpc_kaggle.reporting.summary import pending_lines, trouble, unreadable_images, weakest_line
 
 HELP = """\
 Match the images of a folder with the engine that makes submissions, and reconstruct their cameras. Each folder
@@ -196,9 +196,6 @@ def _lines(result: FolderResult, root: Path) -> Iterator[str]:
         yield f"{batches[name]}: {placed}: {why}"
     yield from weakest_line(report.scenes)
     yield from pending_lines(report)
-    # An image that cannot be read fails in all of its pairs, with one text.
-    unreadable = {
-        record.failure for record in report.records if record.reached and not record.units
-    }
-    yield from (f"cannot be read: {failure}" for failure in sorted(unreadable)[:MAX_LINES])
+    unreadable = unreadable_images(report.records)
+    yield from (f"cannot be read: {failure}" for failure in unreadable[:MAX_LINES])
     yield from (f"fault: {fault}" for fault in report.faults[:MAX_LINES])

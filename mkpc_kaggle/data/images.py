@@ -141,13 +141,18 @@ def read_image(path: Path) -> Image | Unreadable:
         cause = "not a picture, or cut off: it cannot be decoded"
         return Unreadable(name, cause if data.size else "the file is empty")
     height, width = bgr.shape[:2]
-    if max(height, width) > MAX_ASPECT * min(height, width):
+    if not has_usable_shape(Size(width, height)):
         return Unreadable(
             name, f"{width} x {height} pixels: one side is more than {MAX_ASPECT} times the other"
         )
     turns, focal = read_exif(data.tobytes(), Size(width, height))
     pixels = np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
     return Image(name, pixels, _content_digest(data), focal, turns)
+
+
+def has_usable_shape(size: Size) -> bool:
+    """Return whether no side is more than ``MAX_ASPECT`` times the other."""
+    return max(size) <= MAX_ASPECT * min(size)
 
 
 def decode(data: Pixels, kind: int = cv2.IMREAD_COLOR) -> Pixels | None:

@@ -58,6 +58,27 @@ def update_digests(store: Store, files: Mapping[str, Path], is_over: Callable[[]
     return Digests(digests | found, changed)
 
 
+def current_digests(
+    store: Store, files: Mapping[str, Path], is_over: Callable[[], bool]
+) -> dict[str, str]:
+    """Return the digest of each file's content by name, without files that cannot be read.
+
+    Stored digests of unchanged files are used; those of new files are stored.
+    """
+    known = _stored_files(store, files)
+    states = {name: file_state(path) for name, path in files.items()}
+    current = {
+        name: facts["digest"]
+        for name, facts in known.items()
+        if any(states[name]) and states[name] == tuple(facts["file"])
+    }
+    found = digest_files({n: path for n, path in files.items() if n not in current}, is_over)
+    # Of a file that has changed, :func:`update_digests` must still find the former digest.
+    new = [name for name in found if name not in known]
+    store.put(file_result(name, found[name], states[name]) for name in new)
+    return current | found
+
+
 def digest_files(files: Mapping[str, Path], is_over: Callable[[], bool]) -> dict[str, str]:
     """Return the digest of each file's content by name, without files that cannot be read."""
     # Threads, since both reading and hashing release the interpreter lock.

@@ -16,7 +16,7 @@ from typing import Any, Self
 from mkpc_kaggle.engine import console
 from mkpc_kaggle.engine.budget import Budget, Costs, format_duration
 from mkpc_kaggle.engine.console import Progress
-from mkpc_kaggle.engine.image_files import digest_files, update_digests
+from mkpc_kaggle.engine.image_files import current_digests, update_digests
 from mkpc_kaggle.engine.jobs import (
     Answer,
     Cause,
@@ -197,15 +197,31 @@ class Engine:
         return Ending.NO_WORKER if self._is_closed else Ending.TIME_IS_UP
 
     def digest_files(self, files: Mapping[str, Path]) -> dict[str, str]:
-        """Return the digest of each file's content by name, without files that cannot be read."""
-        return digest_files(files, self._is_over)
+        """Return the digest of each file's content, by its name below the root of the images.
+
+        Files that cannot be read are left out.
+        """
+        return current_digests(self.store, files, self._is_over_while_reading(len(files)))
+
+    def _is_over_while_reading(self, count: int) -> Callable[[], bool]:
+        """Return a function that shows how long reading files takes, and whether the time is over."""
+        since = self.budget.clock()
+        text = f"reading {plural(count, 'image')}"
+
+        def is_over() -> bool:
+            if self._progress.is_shown:
+                self._progress.wait(text, since)
+            return self._is_over()
+
+        return is_over
 
     def _digests(self, state: State) -> dict[str, str]:
         """Return the known digests of the pairs' images, by name; warn of images that have changed."""
         files: dict[str, Path] = {}
         for pair, names in zip(state.pairs, state.names, strict=True):
             files |= zip(names, pair.images, strict=True)
-        digests = update_digests(self.store, files, self._is_over)
+        is_over = self._is_over_while_reading(len(files))
+        digests = update_digests(self.store, files, is_over)
         if changed := digests.changed:
             count = sum(not changed.isdisjoint(names) for names in state.names)
             images = plural(len(changed), "image")

@@ -70,7 +70,7 @@ class Pipeline:
         self._matchers: dict[str, Matcher[Any]] = {}
         self._unloadable: dict[str, Exception] = {}  # by matcher; its units fail with the error
         self._notes: dict[str, str] = {}  # on matchers that fell back to float32
-        self._encodings = ByteCache(cache_bytes)  # by matcher, image and view
+        self._encodings = ByteCache(cache_bytes)  # by matcher, content of the image, and view
 
     def load(self) -> None:
         """Load all matchers of the recipe now. One that cannot be loaded costs its units only.
@@ -222,8 +222,9 @@ class Pipeline:
         """Return the encodings of views: cached, or computed one shape at a time."""
         matcher = self._matcher(unit.matcher)
         is_gray = matcher.spec.colour is Colour.GRAY
-        # Units of one matcher that see the same view share its encoding.
-        keys = [(unit.matcher, image.name, view) for image, view in wanted]
+        # Units of one matcher that see the same view share its encoding. By content: a file that is
+        # replaced during a run keeps its name.
+        keys = [(unit.matcher, image.version or image.name, view) for image, view in wanted]
         # Held here, as the cache may drop an encoding before it is matched.
         known = {key: self._encodings.get(key) for key in keys}
         missing: dict[tuple[str, str, View], Image] = {}  # a view of several pairs once

@@ -17,6 +17,7 @@ from mkpc_kaggle.engine.console import warn
 from mkpc_kaggle.engine.keys import digest
 from mkpc_kaggle.engine.loop import Engine
 from mkpc_kaggle.engine.session import Session, request_of
+from mkpc_kaggle.engine.state import name_below
 from mkpc_kaggle.engine.store import Source
 from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.reconstruction.folder import Datasets, Ends, batch_names
@@ -76,7 +77,7 @@ def choose_pairs(
         # Only images with partners can be compared in several orientations.
         may_lie = rotations and (bool(ends[name]) if listed else len(files) > 1)
         count = PARTNERS if is_large else TURN_PARTNERS
-        partners = find_partners(engine, name, files, count) if is_large or may_lie else []
+        partners = find_partners(engine, root, files, count) if is_large or may_lie else []
         if may_lie:
             near |= {
                 a: [files[j] for j in partners[i][:TURN_PARTNERS]] for i, a in enumerate(files)
@@ -108,22 +109,23 @@ def pair_of(names: Names, a: Path, b: Path, *turns: int) -> Pair:
     )
 
 
-def find_partners(engine: Engine, dataset: str, files: Sequence[Path], count: int) -> Partners:
+def find_partners(engine: Engine, root: Path, files: Sequence[Path], count: int) -> Partners:
     """Return the indices of the ``count`` images most similar to each image; empty if the
     comparison failed.
     """
     # By contents, so that a folder that moved is not compared again
-    found = engine.digest_files({str(file): file for file in files})
-    digests = [found.get(str(file), "") for file in files]
+    names = [name_below(str(root), str(file)) for file in files]
+    found = engine.digest_files(dict(zip(names, files, strict=True)))
+    digests = [found.get(name, "") for name in names]
     keys = [features_key(each) for each in digests]
     key = digest([digests, FEATURE_SETTINGS, count])
     known = engine.known(key)
     if known is None:
         # Features first: they stay if the comparison is interrupted.
         missing = {}
-        for file in files:
-            if str(file) in found:
-                missing[features_key(found[str(file)])] = partial(local_features, file)
+        for name, file in zip(names, files, strict=True):
+            if name in found:
+                missing[features_key(found[name])] = partial(local_features, file)
         engine.look(missing)
         source = engine.store.source(keys)
         known = engine.look({key: partial(compare, source, keys, count)}).get(key)

@@ -11,7 +11,7 @@ from tempfile import TemporaryDirectory
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from mkpc_kaggle.data.images import Unreadable, read_image
+from mkpc_kaggle.data.images import Unreadable, has_usable_shape, read_image, read_size
 from mkpc_kaggle.data.masks import Masks
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.console import warn
@@ -124,10 +124,15 @@ def reconstruct(
         result = reconstruct_folder(root, {".": files}, assembly, session, out)
         if session.interrupt.is_set():
             raise KeyboardInterrupt
-        from mkpc_kaggle.reporting.summary import trouble  # jinja2 is slow to import
+        from mkpc_kaggle.reporting.summary import (
+            trouble,
+            unreadable_images,
+        )  # jinja2 is slow to import
 
         if reason := trouble(result.report):
             raise UserError(reason)
+        for failure in unreadable_images(result.report.records):
+            warn(f"cannot be read: {failure}")
         # The models of an earlier call may lack images, and their files may be missing.
         if result.lost:
             reason = next(iter(result.lost.values()))
@@ -177,7 +182,11 @@ def require_readable(files: Sequence[Path]) -> None:
     """Raise :class:`UserError` for an image that cannot be read, or for one that is given twice."""
     require_distinct(files)
     for file in files:
-        # A few images of a notebook: one that is missing is a mistake.
+        # A few images of a notebook: one that is missing is a mistake. The head is enough here: the
+        # run decodes the rest, and this process may be a notebook's.
+        size = read_size(file)
+        if size is not None and has_usable_shape(size):
+            continue
         if isinstance(image := read_image(file), Unreadable):
             raise UserError(str(image))
 

@@ -2,7 +2,7 @@
 
 import textwrap
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from statistics import median
 from typing import TypeAlias
@@ -84,6 +84,12 @@ def _error(record: PairRecord) -> str:
         return record.failure
     # A unit that ran and found nothing is no error: the images may not overlap.
     return next((unit.failure for unit in record.units if unit.failure and not unit.matches), "")
+
+
+def unreadable_images(records: Iterable[PairRecord]) -> list[str]:
+    """Return the reason of each image that could not be decoded, sorted."""
+    # An image that cannot be read fails in all of its pairs, with one text.
+    return sorted({found.failure for found in records if found.reached and not found.units})
 
 
 def left_out_line(recipe: Recipe, left_out: Sequence[str]) -> str:

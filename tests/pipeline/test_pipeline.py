@@ -446,3 +446,27 @@ def test_a_pipeline_without_a_matcher_that_can_be_loaded_raises_the_first_error(
 def test_errors_of_memory_or_of_a_device_while_loading_are_raised(error):
     with pytest.raises(type(error)):
         Pipeline(TWO_MATCHERS, Loader(bad=error)).load()
+
+
+class Brightness(Scripted):
+    """Encodes the mean of a picture, and returns it as the x of a match."""
+
+    def encode(self, pictures):
+        return [float(picture.pixels.mean()) for picture in pictures]
+
+    def match(self, encodings0, encodings1):
+        return [Matches([[value, 1]], [[1, 1]], [1]) for value in encodings0]
+
+
+def test_a_file_that_is_replaced_during_a_run_is_encoded_again():
+    unit = Unit(1, "own", 64)
+    pipeline = Pipeline(Recipe((unit,)), lambda _: Brightness())
+    found = []
+    for value in (10, 50):
+        images = []
+        for name, level in (("a.png", value), ("b.png", 7)):
+            pixels = np.full((64, 64, 3), level, np.uint8)
+            images.append(Image(name, pixels, version=f"digest of {level}"))
+        (match,) = pipeline.match([PairMatch(images=tuple(images))], [unit])
+        found.append(match.matches.points0[0, 0])
+    assert found == [10, 50]

@@ -15,9 +15,11 @@ from faulty import befall, scenes_by
 from test_reconstruct import FIRST, RECIPE, MixedMatcher, fail, write_flat
 
 from mkpc_kaggle import reconstruct, results
+from mkpc_kaggle.engine import image_files
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import MatcherSpec
+from mkpc_kaggle.reconstruction import choice, python
 from mkpc_kaggle.reconstruction.python import Models
 from mkpc_kaggle.reporting.run_log import read_log
 from mkpc_kaggle.reporting.verdict import verdict
@@ -241,3 +243,33 @@ def test_results_of_a_matcher_are_kept_only_under_its_version(tmp_path, files, c
     assert kept == {"": [PAIRS, PAIRS], "1": [PAIRS, 0, 0, 0], "2": [PAIRS, 0]}
     line = "the results of synthetic are not kept for later calls: set MatcherSpec(version=...)"
     assert capfd.readouterr().err.count(line) == 2
+
+
+def test_the_caller_decodes_no_photograph_and_names_one_that_is_cut_off(
+    tmp_path, files, monkeypatch, capfd
+):
+    monkeypatch.setattr(python, "read_image", pytest.fail)
+    cut = tmp_path / "images" / "99.png"
+    cut.write_bytes(files[0].read_bytes()[:-2000])
+    (model,) = models([*files, cut], MixedMatcher(), progress=False)
+    assert len(model.images) == FIRST
+    assert f"cannot be read: {cut}: not a picture, or cut off" in capfd.readouterr().err
+
+
+def test_a_large_folder_is_digested_once(tmp_path, files, monkeypatch):
+    # Large folders have a shortlist of pairs, by the contents of all images.
+    monkeypatch.setattr(choice, "MAX_IMAGES", 3)
+    digested = []
+    real = image_files.content_digest
+    monkeypatch.setattr(
+        image_files, "content_digest", lambda path: (digested.append(path.name), real(path))[1]
+    )
+    counts = []
+    for _ in range(2):
+        models(files, MixedMatcher(), work_dir=tmp_path / "work", progress=False)
+        counts.append(len(digested))
+    assert counts == [FIRST, FIRST]
+    # A changed file is read again, and reported.
+    files[0].write_bytes(files[0].read_bytes() + b"more")
+    models(files, MixedMatcher(), work_dir=tmp_path / "work", progress=False)
+    assert set(digested[FIRST:]) == {files[0].name}
