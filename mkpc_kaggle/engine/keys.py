@@ -9,7 +9,7 @@ import hashlib
 import json
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 import cv2
@@ -74,7 +74,7 @@ class Keys:
             units,
             digest(asdict(recipe.mkpc)),
             estimate,
-            digest([SCENE, scene, tracks, estimate, version("pycolmap")]),
+            digest([SCENE, scene, tracks, estimate, _mapper_version()]),
             assembly.regions,
             assembly.masks,
         )
@@ -112,6 +112,14 @@ class Keys:
         """
         # Names count here: images with equal contents are one image of a scene, with one name.
         return digest([self.scene, inputs])
+
+
+def _mapper_version() -> str:
+    """Return the version of pycolmap; empty without it: pairs need none."""
+    try:
+        return version("pycolmap")
+    except PackageNotFoundError:
+        return ""
 
 
 def _text_of(box: Box) -> str:

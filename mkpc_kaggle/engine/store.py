@@ -208,20 +208,52 @@ class Store:
     def prune(self, named: Iterable[str]) -> int:
         """Remove points, estimates and scenes whose keys are not ``named``. Return the bytes set
         free.
+
+        Raises :class:`UserError` if the disk is too full for that. No result in use is lost then.
         """
-        before = self.path.stat().st_size
+        before = self._size()
+        marks = ", ".join("?" * len(PRUNED))
+        unnamed = "key NOT IN (SELECT key FROM named)"
         with undamaged(self.path):
-            # In a table, since a query takes less than a thousand values.
-            self._db.execute("CREATE TEMPORARY TABLE named (key TEXT PRIMARY KEY)")
-            rows = [(key,) for key in named]
-            self._db.executemany("INSERT OR IGNORE INTO named VALUES (?)", rows)
-            marks = ", ".join("?" * len(PRUNED))
-            unnamed = "key NOT IN (SELECT key FROM named)"
-            self._db.execute(f"DELETE FROM result WHERE kind IN ({marks}) AND {unnamed}", PRUNED)
+            with self._needs_room("nothing was removed"):
+                # The pages of the log go to the file, which sets the log's own bytes free.
+                self._db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+                # In a table, since a query takes less than a thousand values.
+                # Some builds of SQLite overwrite deleted rows with zeros, which takes room in the log.
+                self._db.execute("PRAGMA secure_delete = OFF")
+                self._db.execute("PRAGMA temp_store = MEMORY")
+                self._db.execute("CREATE TEMPORARY TABLE named (key TEXT PRIMARY KEY)")
+                rows = [(key,) for key in named]
+                self._db.executemany("INSERT OR IGNORE INTO named VALUES (?)", rows)
+                self._db.execute(
+                    f"DELETE FROM result WHERE kind IN ({marks}) AND {unnamed}", PRUNED
+                )
+                # A copy in memory might be too large for it.
+                self._db.execute("PRAGMA temp_store = DEFAULT")
+                self._db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
             # Deleted rows leave free pages, which VACUUM removes; the log is as large as the rest.
-            self._db.execute("VACUUM")
-            self._db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
-        return before - self.path.stat().st_size
+            with self._needs_room(
+                "unused results are removed, and the next run uses their bytes, but the file keeps its size"
+            ):
+                self._db.execute("VACUUM")
+                self._db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+        return before - self._size()
+
+    def _size(self) -> int:
+        """Return the bytes of the file and of its log."""
+        log = self.path.with_name(f"{self.path.name}-wal")
+        return sum(path.stat().st_size for path in (self.path, log) if path.exists())
+
+    @contextmanager
+    def _needs_room(self, outcome: str) -> Iterator[None]:
+        """Convert SQLite's report of a full disk to a :class:`UserError` with the outcome."""
+        try:
+            yield
+        except sqlite3.OperationalError as error:
+            code = getattr(error, "sqlite_errorcode", 0) & 0xFF
+            if code in UNUSABLE or code in CORRUPT:
+                raise
+            raise UserError(f"{self.path}: {outcome}: {error}; make room on the disk") from error
 
     # Reading
 

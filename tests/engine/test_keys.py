@@ -2,12 +2,14 @@
 
 import sys
 from dataclasses import replace
+from importlib.metadata import PackageNotFoundError
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from mkpc_kaggle.data.competition import Pair
+from mkpc_kaggle.engine import keys
 from mkpc_kaggle.engine.keys import Keys
 from mkpc_kaggle.geometry.coordinates import Box, Size
 from mkpc_kaggle.pipeline.assembly import Assembly, assemble
@@ -121,3 +123,15 @@ def test_another_vismatch_makes_other_points(monkeypatch):
     assert key("1.4") != key("1.5")
     # Without a version, it may be any.
     assert key("") != key("")
+
+
+def test_without_pycolmap_there_are_keys_and_none_is_that_of_an_installed_one(monkeypatch):
+    installed = Keys.of(assemble(CLASSICAL))
+
+    def version(name: str) -> str:
+        raise PackageNotFoundError(name)
+
+    monkeypatch.setattr(keys, "version", version)
+    missing = Keys.of(assemble(CLASSICAL))
+    assert (missing.units, missing.estimate) == (installed.units, installed.estimate)
+    assert missing.scene != installed.scene

@@ -16,6 +16,7 @@ import pytest
 from rectified import SECOND, SWEEP, THIRD, THREE_UNITS
 
 from mkpc_kaggle.data.competition import Pair
+from mkpc_kaggle.engine import store as store_module
 from mkpc_kaggle.engine.budget import Budget, Costs
 from mkpc_kaggle.engine.console import Progress
 from mkpc_kaggle.engine.dataframes import results
@@ -405,6 +406,44 @@ def test_a_disk_without_a_free_byte_is_refused_in_one_line(tmp_path: Path) -> No
     assert last.endswith(
         f"UserError: the work directory {tmp_path} cannot be written: disk I/O error"
     )
+
+
+class FullDisk:
+    """A connection whose disk has no room for statements that begin with a word."""
+
+    def __init__(self, connection: sqlite3.Connection, word: str) -> None:
+        self._connection = connection
+        self._word = word
+
+    def execute(self, statement: str, *values: object) -> sqlite3.Cursor:
+        if statement.startswith(self._word):
+            raise sqlite3.OperationalError("database or disk is full")
+        return self._connection.execute(statement, *values)
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self._connection, name)
+
+
+@pytest.mark.parametrize(
+    ("word", "outcome", "kept"),
+    [("DELETE", "nothing was removed", True), ("VACUUM", "unused results are removed", False)],
+)
+def test_a_prune_on_a_full_disk_is_one_line_and_loses_nothing(
+    whole: Room, tmp_path: Path, monkeypatch, word, outcome, kept
+) -> None:
+    whole.store.put([Result("unnamed", Kind.POINTS, {}, bytes(1 << 16))])
+    named = set(Table.of(whole.store).keys)
+    whole.store.close()
+    real = store_module.connected
+    monkeypatch.setattr(
+        store_module, "connected", lambda *options, **more: FullDisk(real(*options, **more), word)
+    )
+    told = rf"sqlite: {outcome}.*: database or disk is full; make room on the disk"
+    with Store.open(tmp_path) as store, pytest.raises(UserError, match=told):
+        store.prune(Table.of(store).keys)
+    monkeypatch.undo()
+    with Store.read(tmp_path) as store:
+        assert set(store.about([*named, "unnamed"])) == named | ({"unnamed"} if kept else set())
 
 
 def test_a_prune_removes_what_the_table_of_pairs_does_not_name(whole: Room, tmp_path: Path) -> None:
