@@ -15,7 +15,7 @@ from mkpc_kaggle.data.competition import TrainScene, read_train_side
 from mkpc_kaggle.data.outputs import require_apart
 from mkpc_kaggle.data.pairs import read_pairs
 from mkpc_kaggle.engine.console import say
-from mkpc_kaggle.engine.request import Ending, RunReport
+from mkpc_kaggle.engine.request import RunReport
 from mkpc_kaggle.engine.session import Interrupt, Session, interruptible
 from mkpc_kaggle.errors import UserError, plural, writing
 from mkpc_kaggle.evaluation.compare import comparison_json, comparison_table, step_gains
@@ -247,7 +247,7 @@ def _match_and_score(
             session.status = max(status, bool(trouble(report)))
             status = options.finish(session, page, pairs)
             # A comparison of unequal pairs would mean nothing.
-            if compared and report.ending != Ending.COMPLETE:
+            if compared and not report.ending.is_done:
                 say(
                     "nothing is compared until all is done; with a --work-dir, the same command resumes"
                 )

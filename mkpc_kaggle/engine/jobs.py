@@ -184,6 +184,7 @@ class Cause(StrEnum):
     DEVICE = "the device failed"
     OUT_OF_MEMORY = "out of memory"
     RAISED = "the worker failed"
+    WRONG = "the worker gave a wrong answer"
     UNIT_RAISED = "the matcher failed"
     UNREADABLE = "an image cannot be read"
 
@@ -209,16 +210,17 @@ class Tries:
 
     An item of a lost job is retried in its own job (``alone``), and given up when that job is lost
     for the second time. ``given_up`` has the reason of each item. Items are tuples: ("unit", pair,
-    unit), ("matcher", unit), ("pair", pair), ("estimate", pair), ("scene", batch, key), ("scenes",)
-    and ("features", key).
+    unit), ("matcher", unit), ("pair", pair), ("estimate", pair), ("scene", batch, key), ("scenes",),
+    ("features", key) and ("estimates",). The workers of estimates give up an estimate, which is tried
+    once more elsewhere: ("estimate elsewhere", pair).
     """
 
     def __init__(self) -> None:
         self.alone: set[Hashable] = set()
-        self.given_up: dict[Hashable, Failure] = {}
+        self.given_up: dict[tuple[Any, ...], Failure] = {}
         self._counts: Counter[Hashable] = Counter()
 
-    def lose(self, items: Sequence[Hashable], failure: Failure) -> bool:
+    def lose(self, items: Sequence[tuple[Any, ...]], failure: Failure) -> bool:
         """Record the items of a lost job. Return whether it had a single item, which is now given
         up.
         """

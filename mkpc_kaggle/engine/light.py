@@ -3,8 +3,10 @@
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from mkpc_kaggle.engine.budget import ESTIMATE
-from mkpc_kaggle.engine.jobs import Estimated, EstimateJob, Failure, FeatureJob, Found, Tries
+from mkpc_kaggle.engine.jobs import Cause, Estimated, EstimateJob, Failure, FeatureJob, Found, Tries
 from mkpc_kaggle.engine.records import ESTIMATED
 from mkpc_kaggle.engine.run import HANG_FACTOR, Run
 from mkpc_kaggle.engine.schedule import lacking_estimates
@@ -13,6 +15,12 @@ from mkpc_kaggle.engine.store import Kind, Result, Store
 # In a job. More pairs would make the last F of a run wait for each other; single pairs, each with a
 # message and a transaction, would cost the loop more.
 MAX_PAIRS = 8
+# If this number of estimates was lost everywhere, and none ever succeeded, no other is tried.
+MAX_FAILED_ESTIMATES = 2
+# Expected seconds of an estimate that was not measured yet: eight permutations of 50,000 iterations
+# of MAGSAC take 0.7 s, and a busy machine is slower.
+UNMEASURED_S = 1.0
+UNMEASURED_SHARE = 0.25  # of the time left, at most
 
 
 class Estimating:
@@ -20,6 +28,12 @@ class Estimating:
 
     def __init__(self, run: Run) -> None:
         self._run = run
+
+    def split(self, due: Sequence[int]) -> tuple[list[int], list[int]]:
+        """Return the pairs for the workers of estimates, and the pairs that these gave up."""
+        given_up = self._run.state.tries.given_up
+        elsewhere = [index for index in due if ("estimate", index) in given_up]
+        return [index for index in due if index not in elsewhere], elsewhere
 
     def job(self, due: Sequence[int]) -> EstimateJob:
         """Return a job for the first pairs that are due. A pair whose job was lost is alone in its
@@ -41,9 +55,12 @@ class Estimating:
         pairs = tuple(state.inputs_of(index) for index in begun)
         return EstimateJob(pairs, state.request.recipe, run.source(pairs), is_retry)
 
-    def patience(self, job: EstimateJob) -> float | None:
-        # Without a measurement the mean is 0.
-        return HANG_FACTOR * len(job.pairs) * self._run.costs.mean(ESTIMATE) or None
+    def patience(self, job: EstimateJob) -> float:
+        run = self._run
+        mean = run.costs.mean(ESTIMATE)
+        patience = HANG_FACTOR * len(job.pairs) * (mean or UNMEASURED_S)
+        # A hung first estimate must not use up a short limit.
+        return patience if mean else min(patience, UNMEASURED_SHARE * run.budget.left())
 
     def save(self, job: EstimateJob, answer: Sequence[Estimated], seconds: float) -> None:
         run = self._run
@@ -57,6 +74,8 @@ class Estimating:
         state.end(state.estimating, (pair.index for pair in job.pairs))
         for pair, found, result in zip(job.pairs, answer, results, strict=True):
             self._use(pair.index, result)
+            for each in state.alike(pair.index):
+                state.lost_estimates.pop(each, None)
             run.costs.observe(ESTIMATE, found.seconds)
         run.log.estimated += len(answer)
         # While pairs are matched, the bar shows those.
@@ -83,8 +102,35 @@ class Estimating:
         state = run.state
         indices = [pair.index for pair in job.pairs]
         state.end(state.estimating, indices)
-        if state.tries.lose([("estimate", index) for index in indices], failure):
-            run.log.explain(f"pair {indices[0]} keeps the F it has: {failure}")
+        for index in indices:
+            for each in state.alike(index):
+                state.lost_estimates[each] = failure
+                state.changed.add(each)
+        tries = state.tries
+        if ("estimate", indices[0]) in tries.given_up:
+            self.give_up(indices[0])
+        elif tries.lose([("estimate", index) for index in indices], failure):
+            # The cause may lie in these workers. An estimate is cheap, so another process tries it.
+            run.log.explain(f"pair {indices[0]} is estimated in another process: {failure}")
+
+    def give_up(self, index: int) -> None:
+        """Give up an estimate that was lost elsewhere, too, or that no other process can try."""
+        run = self._run
+        state = run.state
+        nowhere = Failure(Cause.NOT_STARTED, "no worker estimates any more")
+        failure = state.lost_estimates.get(index, nowhere)
+        given_up = state.tries.given_up
+        given_up["estimate elsewhere", index] = failure
+        run.log.explain(f"pair {index} keeps the F it has: {failure}")
+        # Estimates that never succeed would cost three processes for each pair.
+        lost = sum(item[0] == "estimate elsewhere" for item in given_up)
+        if lost < MAX_FAILED_ESTIMATES or run.log.estimated:
+            return
+        for each in np.flatnonzero(lacking_estimates(state)).tolist():
+            state.lost_estimates.setdefault(each, failure)
+            state.changed.add(each)
+        given_up["estimates",] = failure
+        run.log.explain(f"no pair is estimated any more: {failure}")
 
 
 class Features:

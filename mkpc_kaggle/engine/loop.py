@@ -32,7 +32,7 @@ from mkpc_kaggle.engine.light import Estimating, Features
 from mkpc_kaggle.engine.matching import Matching
 from mkpc_kaggle.engine.places import START_TIMEOUT_S, Place, Site, Work
 from mkpc_kaggle.engine.publication import Publication
-from mkpc_kaggle.engine.reconstructing import Reconstructing, scene_records
+from mkpc_kaggle.engine.reconstructing import Reconstructing, scene_failures, scene_records
 from mkpc_kaggle.engine.records import read_records
 from mkpc_kaggle.engine.request import Ending, Request, RunReport
 from mkpc_kaggle.engine.restore import restore
@@ -193,7 +193,8 @@ class Engine:
         if state.unusable.all():
             return Ending.NOTHING_RUNS
         if is_complete(state, self.crew):
-            return Ending.COMPLETE
+            has_failures = state.has_given_up or bool(scene_failures(state))
+            return Ending.WITH_FAILURES if has_failures else Ending.COMPLETE
         return Ending.NO_WORKER if self._is_closed else Ending.TIME_IS_UP
 
     def digest_files(self, files: Mapping[str, Path]) -> dict[str, str]:
@@ -306,7 +307,7 @@ class Engine:
                 self.site.open()
                 self._is_open = True
             needs[Work.MATCH] = self._hand_out_pairs(asked, work, now)
-            needs[Work.SCENE] = self._hand_out_scenes(asked, work, now)
+            needs[Work.SCENE] = self._hand_out_single_jobs(asked, work, now)
         needs[Work.LIGHT] = self._hand_out_light(asked, work, now)
         is_under_way = False
         for place in self.site.places:
@@ -351,7 +352,9 @@ class Engine:
 
     def _hand_out_light(self, asked: Asked | None, work: NextWork | None, now: float) -> int:
         """Give features and estimates to idle workers. Return the number of remaining ones."""
-        due = list(work.estimates) if work is not None else []
+        due: list[int] = []
+        if asked is not None and work is not None:
+            due, _ = self._split_estimates(asked, work)
         for place in [place for place in self.site.of(Work.LIGHT) if place.is_idle]:
             # Features first: pairs are chosen by them.
             if self._features.pending:
@@ -362,17 +365,37 @@ class Engine:
                 due = [index for index in due if not asked.state.estimating[index]]
         return len(self._features.pending) + len(due)
 
-    def _hand_out_scenes(self, asked: Asked, work: NextWork, now: float) -> int:
-        """Give scenes to idle workers. Return the number of remaining ones that may begin now."""
+    def _split_estimates(self, asked: Asked, work: NextWork) -> tuple[list[int], list[int]]:
+        """Return the estimates that are due for their workers, and the ones for other processes."""
+        due, elsewhere = asked.estimating.split(work.estimates)
+        if all(place.closed for place in self.site.of(Work.LIGHT)):
+            elsewhere += due
+            due = []
+        if not self.crew.scenes:
+            for index in elsewhere:
+                asked.estimating.give_up(index)
+            return due, []
+        return due, elsewhere
+
+    def _hand_out_single_jobs(self, asked: Asked, work: NextWork, now: float) -> int:
+        """Give scenes, and estimates that their workers gave up, to idle workers of scenes. Return
+        the number of remaining ones that may begin now.
+        """
+        _, estimates = self._split_estimates(asked, work)
         due = list(work.scenes)
         places = self.site.of(Work.SCENE)
         for place in [place for place in places if place.is_idle]:
-            if due:
+            # Estimates first: scenes wait for them.
+            if estimates:
+                self._give(place, asked.estimating.job(estimates[:1]), now)
+                estimates = [index for index in estimates if not asked.state.estimating[index]]
+            elif due:
                 self._give(place, asked.reconstructing.job(due.pop(0)), now)
         # While matching uses the other cores, scenes have only the cores that it leaves free.
         is_matching = work.match is not None or bool(asked.state.matching.any())
         busy = sum(place.job is not None for place in places)
-        return min(len(due), self.site.scenes_at_a_time(is_matching=is_matching) - busy)
+        count = len(estimates) + len(due)
+        return min(count, self.site.scenes_at_a_time(is_matching=is_matching) - busy)
 
     def _start(self, place: Place, now: float) -> None:
         timeout = START_TIMEOUT_S

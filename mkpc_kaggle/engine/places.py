@@ -16,6 +16,7 @@ from functools import partial
 from math import inf
 from pathlib import Path
 
+from mkpc_kaggle.engine.answers import wrong_answer
 from mkpc_kaggle.engine.jobs import Answer, Cause, Failure, Job, Loaded
 from mkpc_kaggle.engine.process import ProcessWorker, ThreadWorker
 from mkpc_kaggle.engine.worker import Maker, MatchRunner, light_runner, scene_runner
@@ -95,6 +96,10 @@ class Place:
             return None
         # An answer counts even after the limit: its work is done.
         answer = self.worker.answer()
+        if answer is not None:
+            job = self.job if self.is_loaded else None
+            if reason := wrong_answer(job, answer):
+                answer = Failure(Cause.WRONG, reason)
         if answer is None and now >= self.limit:
             answer = Failure(Cause.TIMED_OUT, f"no answer for {now - self.since:.0f} s")
         if answer is None:
@@ -126,7 +131,7 @@ class Place:
         is_retry = (
             self.job is not None
             and self.job.is_retry
-            and failure.cause in (Cause.DIED, Cause.TIMED_OUT)
+            and failure.cause in (Cause.DIED, Cause.TIMED_OUT, Cause.WRONG)
         )
         if self.is_loaded and failure.cause in (Cause.RAISED, Cause.OUT_OF_MEMORY):
             self.losses = 0

@@ -89,11 +89,17 @@ class ThreadWorker:
                 answer = self._exchange(message)
             except Exception as error:  # out of memory, or no more processes
                 answer = Failure(Cause.NOT_STARTED, str(error))
-            self._answers.put(answer)
+            # ``None`` would be taken for no answer yet, and the worker would count as hung.
+            self._answers.put(_not_none(answer))
             self._on_answer()
 
     def _exchange(self, message: Message) -> Answer:
         return self._executor.answer(message)
+
+
+def _not_none(answer: Answer | None) -> Answer:
+    """Return a failure in place of a runner's ``None``, which would mean that it still computes."""
+    return Failure(Cause.WRONG, "None is no answer") if answer is None else answer
 
 
 class ProcessWorker(ThreadWorker):

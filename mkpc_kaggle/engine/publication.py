@@ -3,7 +3,7 @@
 import threading
 
 from mkpc_kaggle.engine.budget import Budget
-from mkpc_kaggle.engine.jobs import Cause
+from mkpc_kaggle.engine.jobs import Cause, Failure
 from mkpc_kaggle.engine.records import Row, Table
 from mkpc_kaggle.engine.run import EventLog
 from mkpc_kaggle.engine.state import SOURCES, State
@@ -94,17 +94,20 @@ def _row(state: State, index: int, source: str) -> Row:
     image0, image1 = state.names[index]
     points = state.points[index].tolist()
     given_up = state.tries.given_up
-    # Lost workers are faults of the run; a row has the errors that matchers raised on its pair.
+    # The reason of each unit that was given up on the pair, whatever the cause was
     failures = {}
     for unit in state.units:
         failure = given_up.get(("unit", index, unit.name))
-        if failure is not None and failure.cause is Cause.UNIT_RAISED:
-            failures[unit.name] = failure.message
+        if failure is not None:
+            failures[unit.name] = _reason(failure)
     reason = ""
     if unread := given_up.get(("pair", index)):
         reason = unread.message
     elif failures and not any(points):
         reason = next(iter(failures.values()))
+    # Without an estimate, and not because of the time
+    lost = state.lost_estimates.get(index)
+    unestimated = _reason(lost) if lost is not None and not state.estimates[index] else ""
     return Row(
         id=pair.id,
         batch=pair.group,
@@ -119,4 +122,10 @@ def _row(state: State, index: int, source: str) -> Row:
         failures=failures,
         failure=reason,
         model=ModelKind.F if pair.intrinsics is None else ModelKind.E,
+        unestimated=unestimated,
     )
+
+
+def _reason(failure: Failure) -> str:
+    # The unit's name stands beside the message of its matcher.
+    return failure.message if failure.cause is Cause.UNIT_RAISED else str(failure)

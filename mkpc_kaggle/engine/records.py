@@ -126,6 +126,7 @@ class PairRecord:
     pair: Pair  # with image names in place of paths
     pair_fundamental: Matrix3 = field(default_factory=FALLBACK_FUNDAMENTAL.copy)
     failure: str = NOT_REACHED
+    unestimated: str = ""  # the failure, if no worker could estimate F
     units: Sequence[UnitRecord] = ()
     regions: Regions | None = None
     matches: int = 0  # this and the next four fields: over all units
@@ -265,7 +266,8 @@ class Row(NamedTuple):
     """A pair in the table. ``points`` are the keys of its units' points, empty for a unit without
     points.
 
-    ``failures`` are the reasons why units raised, by unit; ``failure`` is why the pair has no points.
+    ``failures`` are the reasons why units were given up, by unit; ``failure`` is why the pair has no points, and
+    ``unestimated`` why it has points but no estimate, if not for lack of time.
     """
 
     # A named tuple and not a dataclass: JSON has it as a short list, and a table has thousands.
@@ -282,6 +284,7 @@ class Row(NamedTuple):
     failures: dict[str, str]
     failure: str
     model: str = ModelKind.F  # of the written matrix; E for a pair with intrinsics
+    unestimated: str = ""
 
     @property
     def pair(self) -> Pair:
@@ -432,8 +435,8 @@ def _pair_record(
     own = NO_ESTIMATE
     if row.estimate in about:
         own = ESTIMATED.of_json(about[row.estimate])
-    elif row.failure:
-        own = replace(NO_ESTIMATE, failure=row.failure)
+    elif reason := row.failure or row.unestimated:
+        own = replace(NO_ESTIMATE, failure=reason)
     # By the key of points: points that are newer than the estimate have no inliers yet.
     inliers = dict(zip(own.points, own.inliers, strict=True))
     facts_of = {key: UNIT_FACTS.of_json(about[key]) for key in row.points if key in about}
@@ -446,6 +449,7 @@ def _pair_record(
         row.pair,
         pair_fundamental=own.F,
         failure=own.failure,
+        unestimated=row.unestimated,
         units=tuple(units),
         regions=None if regions is None else (regions[0], regions[1]),
         matches=sum(facts.matches for facts in found),

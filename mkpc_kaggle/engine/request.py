@@ -19,10 +19,17 @@ class Ending(StrEnum):
     """Why a run ended."""
 
     COMPLETE = "complete"
+    # Something was given up. All else is complete, and the next run tries it again.
+    WITH_FAILURES = "ended with failures"
     TIME_IS_UP = "time is up"
     INTERRUPTED = "interrupted"
     NO_WORKER = "no worker left"
     NOTHING_RUNS = "every unit was skipped"
+
+    @property
+    def is_done(self) -> bool:
+        """Whether the run has computed everything that it could."""
+        return self in (Ending.COMPLETE, Ending.WITH_FAILURES)
 
 
 @dataclass(frozen=True)

@@ -266,8 +266,10 @@ def lacking_estimates(state: State) -> Mask:
     lacking[state.rows :] = False  # extra pairs are for scenes alone
     for item in state.tries.given_up:
         match item:
-            case ("estimate", int(index)):
+            case ("estimate elsewhere", int(index)):
                 lacking[index] = False
+            case ("estimates",):
+                lacking[:] = False
     return np.asarray(lacking)
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.image_files import contents_of
-from mkpc_kaggle.engine.jobs import Failure, PairInputs, Tries, visiting_order
+from mkpc_kaggle.engine.jobs import Cause, Failure, PairInputs, Tries, visiting_order
 from mkpc_kaggle.engine.keys import Images
 from mkpc_kaggle.engine.records import MIN_PAIRS, SceneRecord
 from mkpc_kaggle.engine.request import Request
@@ -89,6 +89,7 @@ class State:
         self.by_scene = np.zeros((count, 3, 3))
         self.scene_source = np.full(count, FALLBACK)
         self.changed = set(range(count))
+        self.lost_estimates: dict[int, Failure] = {}  # why the latest job of a pair was lost
         self._contents = [""] * count
 
     def _start_batches(self) -> None:
@@ -134,13 +135,21 @@ class State:
         written = self.own[: self.rows].copy()
         chosen = self.scene_source[: self.rows] != FALLBACK
         written[chosen] = self.by_scene[: self.rows][chosen]
+        # The last gate of the submission: the competition refuses a whole file for one matrix.
+        written[self.sources == FALLBACK] = FALLBACK_FUNDAMENTAL
         return written
 
     @property
     def sources(self) -> NDArray[np.int_]:
         """Where the F to write comes from (rows,)."""
         own = np.where(self.has_own[: self.rows], PAIR, FALLBACK)
-        return np.asarray(np.maximum(own, self.scene_source[: self.rows]))
+        sources = np.maximum(own, self.scene_source[: self.rows])
+        by_scene = self.scene_source[: self.rows] != FALLBACK
+        written = np.where(
+            by_scene[:, None, None], self.by_scene[: self.rows], self.own[: self.rows]
+        )
+        is_usable = np.isfinite(written).all((1, 2)) & written.any((1, 2))
+        return np.asarray(np.where(is_usable, sources, FALLBACK))
 
     @property
     def digests(self) -> dict[str, str]:
@@ -355,6 +364,18 @@ class State:
         # The jobs of killed workers never come back.
         self.matching[:] = False
         self.filling[:] = False
+
+    @property
+    def has_given_up(self) -> bool:
+        """Whether a unit or an estimate was given up.
+
+        Unreadable images and matchers that are left out are facts of the input.
+        """
+        kinds = ("unit", "matcher", "estimate elsewhere", "estimates")
+        return any(
+            item[0] in kinds and failure.cause is not Cause.REFUSED
+            for item, failure in self.tries.given_up.items()
+        )
 
     @property
     def unusable(self) -> Mask:

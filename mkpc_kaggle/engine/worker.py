@@ -214,7 +214,14 @@ def estimate_pair(pair: PairInputs, results: tuple[UnitResult, ...], recipe: Rec
 
 
 def scene_runner() -> Runner:
-    return reconstruct
+    """Return the runner of a process that does one job: a scene, or the estimate of a pair that the
+    workers of estimates gave up.
+    """
+    return do_single_job
+
+
+def do_single_job(job: Job) -> Answer:
+    return reconstruct(job) if isinstance(job, SceneJob) else do_light_job(job)
 
 
 def reconstruct(job: Job) -> Solution:

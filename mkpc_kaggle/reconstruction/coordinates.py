@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 
 from mkpc_kaggle.data.outputs import replacing
-from mkpc_kaggle.engine.request import Ending
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.reconstruction.folder import batch_names
 from mkpc_kaggle.reconstruction.run import FolderResult
@@ -40,7 +39,7 @@ def keep_coordinates(out: Path, root: Path, result: FolderResult) -> Iterator[st
     resumed.
     """
     # Cameras of half the pairs are no coordinates to keep.
-    if result.report.ending != Ending.COMPLETE:
+    if not result.report.ending.is_done:
         return
     batches = batch_names(root, result.cameras)
     for dataset, cameras in result.cameras.items():

@@ -80,7 +80,7 @@ def _error(record: PairRecord) -> str:
     """Return the error that left a pair without an F, or an empty string."""
     if record.is_solved:
         return ""
-    if not record.units:
+    if not record.units or record.unestimated:
         return record.failure
     # A unit that ran and found nothing is no error: the images may not overlap.
     return next((unit.failure for unit in record.units if unit.failure and not unit.matches), "")

@@ -208,7 +208,7 @@ def failed_units(report: RunReport) -> list[tuple[int, str]]:
 def test_the_next_run_repeats_only_units_that_raised(pairs, undisturbed, tmp_path):
     faulty = FaultyMatcher(fault=lack_an_image, above=100)
     failed = run(pairs, THREE_UNITS, faulty, tmp_path / "work")
-    assert failed.ending is Ending.COMPLETE
+    assert failed.ending is Ending.WITH_FAILURES
     assert failed_units(failed) == [(3, unit.name) for unit in THREE_UNITS.units[1:]]
     mended = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
     assert mended.units_run == 2

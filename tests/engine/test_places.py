@@ -7,19 +7,20 @@ import pytest
 from rectified import THREE_UNITS, RectifiedMatcher, run, write_pairs
 
 from mkpc_kaggle.engine import places
-from mkpc_kaggle.engine.jobs import Cause, Failure, Loaded, MatchJob, Phase
+from mkpc_kaggle.engine.jobs import Cause, Failure, Loaded, MatchJob, Outcome, Phase
 from mkpc_kaggle.engine.places import LocalSite, Place, Work
 from mkpc_kaggle.engine.process import ThreadWorker
 from mkpc_kaggle.engine.worker import scene_runner
 
 LOST = Failure(Cause.DIED)
-DONE = ()
+DONE = (Outcome(failure="unreadable"),)
 RAISED = Failure(Cause.RAISED)
 NO_MEMORY = Failure(Cause.OUT_OF_MEMORY)
 
 
 def job(*, is_retry=False):
-    return MatchJob(Phase.DEEPEN, (0,), (), (), 1.0, is_retry=is_retry)
+    names = (("a.png", "b.png"),)
+    return MatchJob(Phase.DEEPEN, (0,), (), (), 1.0, is_retry=is_retry, names=names)
 
 
 def place_of(waiting):

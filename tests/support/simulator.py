@@ -35,7 +35,7 @@ from mkpc_kaggle.engine.jobs import (
 from mkpc_kaggle.engine.keys import Keys
 from mkpc_kaggle.engine.loop import Engine
 from mkpc_kaggle.engine.places import Place, Site, Work
-from mkpc_kaggle.engine.request import Ending, Request, RunReport
+from mkpc_kaggle.engine.request import Request, RunReport
 from mkpc_kaggle.engine.schedule import RESERVE_SHARE
 from mkpc_kaggle.engine.store import SCHEMA, Store, connected
 from mkpc_kaggle.geometry.coordinates import Size
@@ -311,10 +311,11 @@ class SimulatedSite(Site):
         files = [((0, 0), (0, 0))] * len(images)
         return spent, tuple(map(Outcome, images, files, map(tuple, found))), 0.0
 
-    def estimate(self, job: EstimateJob) -> Drawn:
+    def estimate(self, job: EstimateJob, rng: np.random.Generator | None = None) -> Drawn:
         """Draw an answer: each pair has from 20 to 79 inliers by its number."""
-        if self.rng.random() < self.scenario.job_faults:
-            return 0.0 if self.rng.random() < 0.5 else math.inf, Failure(Cause.DIED), 0.0
+        rng = rng or self.rng
+        if rng.random() < self.scenario.job_faults:
+            return 0.0 if rng.random() < 0.5 else math.inf, Failure(Cause.DIED), 0.0
         estimates = []
         for pair in job.pairs:
             inliers = (20 + pair.index % 60,) * len(pair.points)
@@ -322,7 +323,10 @@ class SimulatedSite(Site):
             estimates.append(Estimated(points, inliers, FALLBACK_FUNDAMENTAL, seconds=ESTIMATE_S))
         return ESTIMATE_S * len(estimates), tuple(estimates), 0.0
 
-    def reconstruct(self, job: SceneJob) -> Drawn:
+    def reconstruct(self, job: SceneJob | EstimateJob) -> Drawn:
+        # The process of a scene also estimates a pair that the workers of estimates gave up.
+        if isinstance(job, EstimateJob):
+            return self.estimate(job, self._scene_rng)
         scenario = self.scenario
         rng = self._scene_rng
         begun = self.clock.now
@@ -420,7 +424,7 @@ class Ran:
 
     @property
     def work_left(self) -> bool:
-        return self.report.ending is not Ending.COMPLETE
+        return not self.report.ending.is_done
 
 
 def simulate(scenario: Scenario, store: Store | None = None, until: float = math.inf) -> Ran:
