@@ -122,6 +122,10 @@ class CameraModel(StrEnum):
     FULL_OPENCV = "FULL_OPENCV"
 
 
+# F of two cameras exists for these models only; others bend its lines.
+PINHOLES = frozenset({CameraModel.SIMPLE_PINHOLE, CameraModel.PINHOLE})
+
+
 @dataclass(frozen=True)
 class SceneConfig:
     """Settings of :mod:`mkpc_kaggle.scene`, table ``[scene]`` of a recipe."""
@@ -138,6 +142,12 @@ class SceneConfig:
     def __post_init__(self) -> None:
         check_ranges(self, pairs_per_image=AT_LEAST_0, min_support=Range(0, 1), threads=AT_LEAST_1)
         read_intrinsics(self.intrinsics)
+
+    @property
+    def distorted(self) -> list[str]:
+        """The camera models with distortion that these settings give to images."""
+        given = [self.camera_model, *(known.model for _, known in read_intrinsics(self.intrinsics))]
+        return sorted({str(model) for model in given} - {str(model) for model in PINHOLES})
 
 
 @dataclass(frozen=True)

@@ -44,7 +44,7 @@ OUT gets a folder for each folder in DIR, with:
 and for all datasets together:
   cameras.csv     image, model, K, R, t: X_cam = R X + t, (0, 0) is the first pixel's centre; numbers joined by ;
                   and the uncertainty of each camera: rotation_sigma (degrees), centre_sigma (of the model's size),
-                  focal_sigma (percent); see docs/running.md
+                  focal_sigma (percent); see docs/folder.md
   submission.csv  with --format
   report.html     the run, with an interactive view of each scene; summary.json has the same facts
   work/           the journal: after a kill, the same command resumes the run and makes the same files

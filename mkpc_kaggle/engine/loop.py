@@ -1,7 +1,7 @@
 """The loop of a run, on one thread: give jobs to idle workers, take their answers, publish.
 
 The schedule decides which pairs, estimates and scenes come next (:mod:`schedule`). Each kind of work
-has a file for its jobs and their answers (:mod:`work`).
+has a file for its jobs and their answers (:mod:`matching`, :mod:`light`, :mod:`reconstructing`).
 """
 
 import sqlite3

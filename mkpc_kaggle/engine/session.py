@@ -213,8 +213,14 @@ def run_pairs(
     """Run the recipe on all pairs. In the store, an image's name is its path below ``root``.
 
     ``more`` are other fields of the request. Raises :class:`mkpc_kaggle.errors.UserError` if the store cannot be
-    used or a matcher cannot be loaded.
+    used or a matcher cannot be loaded, and for scenes whose cameras have distortion.
     """
+    scene = assembly.recipe.scene
+    if scene is not None and scene.distorted:
+        raise UserError(
+            f"[scene] has cameras with distortion ({', '.join(scene.distorted)}), and F ignores it: "
+            "use PINHOLE or SIMPLE_PINHOLE here; `mkpc reconstruct` takes all models"
+        )
     folders = dict.fromkeys(path.parent for pair in pairs for path in pair.images)
     with opened_engine(assembly, session, folders) as engine:
         engine.ask(request_of(pairs, assembly, session, root, **more))

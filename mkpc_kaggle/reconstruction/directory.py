@@ -65,7 +65,7 @@ def output_directory(out: Path, datasets: Iterable[str], form: str | None = None
         # Results of datasets that are gone, unless the user has changed them
         for name in known.keys() - results:
             if known[name] and known[name] == _digest(out / name):
-                _remove(out / name)
+                _remove(out / name, out)
         after = {}
         for name in results:
             digest = _digest(out / name)
@@ -185,10 +185,12 @@ def _version(path: Path) -> str:
     return f"{status.st_size} {status.st_mtime_ns}"
 
 
-def _remove(path: Path) -> None:
+def _remove(path: Path, out: Path) -> None:
+    """Remove a result, and the folders of its dataset in ``out`` if they are empty then."""
     shutil.rmtree(path) if path.is_dir() else path.unlink()
-    # The folder of a dataset that is gone
-    for folder in path.parents:
-        with suppress(OSError):  # the folder is not empty
-            folder.rmdir()
+    for folder in path.relative_to(out).parents:
+        # The last is OUT itself, which belongs to the user.
+        if folder.parts:
+            with suppress(OSError):  # the folder is not empty
+                (out / folder).rmdir()
     warn(f"{path} was removed: an earlier run made it, and this run does not")

@@ -268,7 +268,7 @@ def _scene_table(scene: SceneRecord) -> dict[str, Any]:
                         "image": found.image.name,
                         "focal_px": _number(found.focal),
                         "points": found.points,
-                        # Keys with units are in docs/running.md
+                        # Keys with units are in docs/folder.md
                         "sigmas": found.sigmas._asdict() if found.sigmas else None,
                     }
                     for found in model.images

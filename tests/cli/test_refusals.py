@@ -76,6 +76,10 @@ REFUSALS = [
     (f"{SUBMIT} --set scene.threads=many", "key 'threads': expected int, got 'many'"),
     (f"{SUBMIT} --set scene.cameras=1", "1 is none of 'auto', "),
     (f"{SUBMIT} --set scene.camera_model=FISHEYE", "'FISHEYE' is none of 'SIMPLE_PINHOLE', "),
+    (
+        f"{SUBMIT} --scenes --set scene.camera_model=OPENCV",
+        "cameras with distortion (OPENCV), and F",
+    ),
     # Folders that hold data of somebody else.
     ("demo --out users", "users/train is in the way"),
     ("demo --out truth", "truth/test_truth.csv is in the way"),
