@@ -126,13 +126,14 @@ def run(arguments: argparse.Namespace) -> int:
     with (
         interruptible() as interrupt,
         options.watched_session(arguments, work_dir, interrupt) as session,
-        output_directory(out, datasets, arguments.format),
+        output_directory(out, datasets, arguments.format) as held,
     ):
         session.status = 1  # until a model exists
         if arguments.fresh:
             forget_coordinates(out, datasets)
 
         def publish(cameras: Cameras) -> None:
+            held.check()
             write_tables(out, cameras, root, arguments.format)
             session.status = int(not any(any(found.values()) for found in cameras.values()))
 
@@ -158,18 +159,24 @@ def run(arguments: argparse.Namespace) -> int:
         # A run that failed has failed even if an earlier one has left a model.
         if trouble(result.report) or result.report.unwritten or result.lost:
             session.status = 1
-        if any(any(found.values()) for found in result.cameras.values()):
-            say("writing images/ and sparse/ for other programs")
-        problems = [
-            *write_layouts(out, root, datasets, session.must_end()),
-            *keep_coordinates(out, root, result),
-            trouble(result.report),
-            result.report.unwritten,
-        ]
+        problems = [trouble(result.report), result.report.unwritten]
+        is_here = held.is_here and all(each.is_here for each in result.held.values())
+        if is_here:
+            if any(any(found.values()) for found in result.cameras.values()):
+                say("writing images/ and sparse/ for other programs")
+            problems = [
+                *write_layouts(out, root, datasets, session.must_end(), result.held),
+                *keep_coordinates(out, root, result),
+                *problems,
+            ]
+        else:
+            # The directory that has the name now is the user's.
+            session.status = 1
+            problems.append(f"{out} was moved or replaced during the run; no more is written there")
         lines = [*options.plan_lines(arguments, result.report), *_lines(result, root), *problems]
         say("\n".join(filter(None, [*lines, f"results: {out}"])))
         # A run without pairs has no report.
-        page = out / "report.html" if result.pairs else None
+        page = out / "report.html" if result.pairs and is_here else None
         return options.finish(session, page, result.pairs)
 
 

@@ -18,6 +18,7 @@ from mkpc_kaggle.geometry.coordinates import Matrix3
 from mkpc_kaggle.geometry.robust import NO_STATS, EstimateStats
 from mkpc_kaggle.pipeline.pair import Regions, UnitResult
 from mkpc_kaggle.recipe import Recipe, Unit
+from mkpc_kaggle.scene.export import HeldDirectory
 from mkpc_kaggle.scene.reconstruct import Solution
 
 # Of an item in its own job. One loss may have its cause elsewhere, such as short memory; a third try
@@ -109,7 +110,7 @@ class SceneJob:
     recipe: Recipe
     source: Source
     matches: int = 0
-    export: Path | None = None
+    export: HeldDirectory | None = None
     # A crash of pycolmap counts against the batch, not against its place.
     is_retry: bool = True
 

@@ -10,6 +10,7 @@ from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.keys import Keys
 from mkpc_kaggle.engine.records import About, Event, PairRecord, SceneRecord
 from mkpc_kaggle.recipe import Recipe
+from mkpc_kaggle.scene.export import HeldDirectory
 
 if TYPE_CHECKING:
     from mkpc_kaggle.engine.state import State
@@ -46,7 +47,7 @@ class Request:
     recipe: Recipe
     keys: Keys
     root: str = ""
-    exports: Mapping[str, Path] = field(default_factory=dict)
+    exports: Mapping[str, HeldDirectory] = field(default_factory=dict)
     about: About = field(default_factory=About)
     publish: "Callable[[State], None]" = lambda _: None
     is_trial: bool = False

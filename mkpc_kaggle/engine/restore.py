@@ -121,7 +121,7 @@ def _restore_scenes(state: State, store: Store, former: Table, digests: Mapping[
         if directory := state.request.exports.get(batch):
             # A scene without its COLMAP files is made again. Until then its cameras are used.
             has_mark = marks.get(EXPORT + batch) == used
-            is_current &= has_mark and has_files(directory, len(record.models))
+            is_current &= has_mark and has_files(directory.path, len(record.models))
         if is_current:
             state.stale.discard(batch)
 

@@ -16,7 +16,17 @@ from mkpc_kaggle.data.outputs import lies_in, replacing, weights_of_environment
 from mkpc_kaggle.engine.console import warn
 from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.scene.align import REFERENCE
-from mkpc_kaggle.scene.export import DATABASE, IMAGES, MODEL_FILES, MODELS, PART, SPARSE
+from mkpc_kaggle.scene.export import (
+    DATABASE,
+    IMAGES,
+    MODEL_FILE,
+    MODELS,
+    PART,
+    SPARSE,
+    HeldDirectory,
+    model_files,
+    remove_models,
+)
 from mkpc_kaggle.weights.manifest import digest_of
 
 WORK = "work"
@@ -24,18 +34,20 @@ TABLES = ("cameras.csv", "submission.csv", "report.html", "summary.json")
 RESERVED = {DATABASE, MODELS, SPARSE, WORK, *TABLES}  # names that no dataset may have
 FILES = (DATABASE, MODELS, SPARSE, IMAGES, REFERENCE)  # of each dataset
 MARK = f"{WORK}/results.json"  # digests of results by path; "" if their run did not end
-MODEL_FILE = re.compile(rf"\d+(/({'|'.join(map(re.escape, MODEL_FILES))}))?")
+MODEL_FOLDER = re.compile(r"\d+")
 IMAGE_FILE = re.compile(rf"[^/]+({'|'.join(map(re.escape, READ_SUFFIXES))})", re.IGNORECASE)
-# The paths in folders of results
-CONTENTS = {MODELS: MODEL_FILE, SPARSE: MODEL_FILE, IMAGES: IMAGE_FILE}
+CONTENTS = (MODELS, SPARSE, IMAGES)  # folders that may have files of others, too
 
 
 @contextmanager
-def output_directory(out: Path, datasets: Iterable[str], form: str | None = None) -> Iterator[None]:
+def output_directory(
+    out: Path, datasets: Iterable[str], form: str | None = None
+) -> Iterator[HeldDirectory]:
     """Reserve ``out`` for a run's results. At the end, remove results that only earlier runs made.
 
     With a ``form``, ``submission.csv`` is a result. A result that was changed after its run is not
-    removed. Raise :class:`UserError` if ``out`` is neither empty nor marked by a run. A link or
+    removed, and files of others stay. If ``out`` leads to another directory at the end, nothing is
+    written or removed there. Raise :class:`UserError` if ``out`` is neither empty nor marked by a run. A link or
     another file at the path of a result also raises it.
     """
     results = [name for name in TABLES if form or name != "submission.csv"]
@@ -60,7 +72,10 @@ def output_directory(out: Path, datasets: Iterable[str], form: str | None = None
             folder.mkdir(parents=True, exist_ok=True)
             TemporaryDirectory(prefix=PART, dir=folder).cleanup()
         before = {name: _digest(out / name) for name in results}
-    yield
+        held = HeldDirectory.of(out)
+    yield held
+    if not held.is_here:
+        return
     with writing(f"--out {out}"):
         # Results of datasets that are gone, unless the user has changed them
         for name in known.keys() - results:
@@ -153,8 +168,21 @@ def _in_the_way(
         # They belong to another database, whose program was killed.
         yield from _companions(path.parent / DATABASE)
         for each in path.rglob("*") if path.name in CONTENTS else ():
-            if not CONTENTS[path.name].fullmatch(each.relative_to(path).as_posix()):
+            if _blocks(each, each.relative_to(path).as_posix(), path.name):
                 yield each
+
+
+def _blocks(path: Path, name: str, folder: str) -> bool:
+    """Return whether something else bears the ``name`` of a result in a folder of results.
+
+    Files of other names are in nobody's way: Gaussian splatting writes sparse/0/points3D.ply.
+    """
+    if folder == IMAGES:
+        # Links and copies of photographs are results.
+        return bool(IMAGE_FILE.fullmatch(name)) and path.is_dir()
+    if MODEL_FILE.fullmatch(name):
+        return path.is_symlink() or not path.is_file()
+    return bool(MODEL_FOLDER.fullmatch(name)) and (path.is_symlink() or not path.is_dir())
 
 
 def _is_inside(out: Path, name: str) -> bool:
@@ -174,6 +202,13 @@ def _digest(path: Path) -> str:
     if path.name == IMAGES and path.is_dir():
         lines = sorted(f"{each.name} {_version(each)}\n" for each in path.iterdir())
         return hashlib.sha256("".join(lines).encode("utf-8", "surrogateescape")).hexdigest()
+    if path.name in (MODELS, SPARSE) and path.is_dir():
+        # As digest_of, without files of others
+        lines = [
+            f"{digest_of(file).removeprefix('sha256:')} {file.relative_to(path).as_posix()}\n"
+            for file in sorted(model_files(path))
+        ]
+        return f"sha256:{hashlib.sha256(''.join(lines).encode()).hexdigest()}" if lines else ""
     return digest_of(path) if path.exists() else ""
 
 
@@ -187,7 +222,12 @@ def _version(path: Path) -> str:
 
 def _remove(path: Path, out: Path) -> None:
     """Remove a result, and the folders of its dataset in ``out`` if they are empty then."""
-    shutil.rmtree(path) if path.is_dir() else path.unlink()
+    if path.name in (MODELS, SPARSE):
+        remove_models(path)
+    elif path.is_dir():
+        shutil.rmtree(path)  # links and copies of photographs, as they were after their run
+    else:
+        path.unlink()
     for folder in path.relative_to(out).parents:
         # The last is OUT itself, which belongs to the user.
         if folder.parts:

@@ -19,14 +19,30 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from mkpc_kaggle.reconstruction.directory import holds_dataset
-from mkpc_kaggle.scene.export import FORMER, IMAGES, MODELS, PART, SPARSE
+from mkpc_kaggle.scene.export import (
+    FORMER,
+    IMAGES,
+    MODELS,
+    PART,
+    SPARSE,
+    HeldDirectory,
+    replace_models,
+)
 
 Datasets = Mapping[str, Sequence[Path]]
 
 
-def write_layouts(out: Path, root: Path, datasets: Datasets, ends: float) -> Iterator[str]:
+def write_layouts(
+    out: Path,
+    root: Path,
+    datasets: Datasets,
+    ends: float,
+    held: Mapping[str, HeldDirectory] | None = None,
+) -> Iterator[str]:
     """Write the folders of each dataset until ``ends``, in seconds of the monotonic clock. Yield
     the problems.
+
+    ``held`` are the datasets' directories as the run began with them.
     """
     # A folder that fails is a line, and the others are still written.
     for dataset, files in datasets.items():
@@ -37,6 +53,8 @@ def write_layouts(out: Path, root: Path, datasets: Datasets, ends: float) -> Ite
         left = max(0.0, ends - time.monotonic())
         names = {file.relative_to(root).as_posix(): file.name for file in files}
         try:
+            if held is not None:
+                held[dataset].check()
             write_images(directory, files)
             failure = write_sparse(directory, names, None if ends == inf else left)
         except OSError as error:
@@ -102,7 +120,9 @@ def write_sparse(directory: Path, names: Mapping[str, str], seconds: float | Non
     context = get_context("spawn")
     receiver, sender = context.Pipe(duplex=False)
     process = context.Process(
-        target=_write_sparse_to, args=(sender, directory, dict(names)), daemon=True
+        target=_write_sparse_to,
+        args=(sender, HeldDirectory.of(directory), dict(names)),
+        daemon=True,
     )
     process.start()
     # The child's end alone stays open, so its death ends the wait.
@@ -120,17 +140,18 @@ def write_sparse(directory: Path, names: Mapping[str, str], seconds: float | Non
         receiver.close()
 
 
-def _write_sparse_to(sender: Any, directory: Path, names: Mapping[str, str]) -> None:
+def _write_sparse_to(sender: Any, held: HeldDirectory, names: Mapping[str, str]) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # of the terminal; the parent decides
     try:
-        convert_models(directory, names)
+        convert_models(held, names)
         sender.send("")
     except Exception as error:  # any error of pycolmap
         sender.send(str(error))
 
 
-def convert_models(directory: Path, names: Mapping[str, str]) -> None:
+def convert_models(held: HeldDirectory, names: Mapping[str, str]) -> None:
     """Write ``sparse`` in this process. The complete folder replaces an earlier one."""
+    directory = held.path
     import pycolmap
 
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
@@ -149,8 +170,5 @@ def convert_models(directory: Path, names: Mapping[str, str]) -> None:
             # A power failure must not leave empty files under their names
             with path.open("rb") as stream:
                 os.fsync(stream.fileno())
-        if (directory / SPARSE).exists():
-            (directory / SPARSE).rename(made / FORMER)
-        # A dataset without cameras has no folder, which other programs would take for an empty model.
-        if any((made / SPARSE).iterdir()):
-            (made / SPARSE).rename(directory / SPARSE)
+        held.check()
+        replace_models(made / SPARSE, directory / SPARSE, made / FORMER)

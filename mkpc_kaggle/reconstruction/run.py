@@ -1,7 +1,7 @@
 """Reconstruction of a folder of images in a run of the engine."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from mkpc_kaggle.data.competition import Pair
@@ -17,7 +17,7 @@ from mkpc_kaggle.reconstruction.choice import choose_pairs
 from mkpc_kaggle.reconstruction.folder import Datasets, Ends, batch_names
 from mkpc_kaggle.reconstruction.outputs import Cameras
 from mkpc_kaggle.reconstruction.unmatched import cause_of_no_matches
-from mkpc_kaggle.scene.export import remove_files
+from mkpc_kaggle.scene.export import HeldDirectory, remove_files, versions_of
 from mkpc_kaggle.scene.reconstruction import RegisteredImage
 
 AUTO = "auto"  # the recipe of all matchers whose weights are found
@@ -39,6 +39,7 @@ class FolderResult:
     pairs: tuple[Pair, ...]
     cameras: Cameras
     lost: Mapping[str, str]
+    held: Mapping[str, HeldDirectory] = field(default_factory=dict)  # of COLMAP's files, by dataset
 
 
 def for_cameras(recipe: Recipe, sharing: str | None = None, intrinsics: str = "") -> Recipe:
@@ -104,7 +105,9 @@ def reconstruct_folder(
         )
         # Reports call the images directly below the root by the root's name.
         batches = batch_names(root, datasets)
-        exports = {batches[name]: out / name for name in datasets}
+        with writing(f"--out {out}"):
+            exports = {batches[name]: HeldDirectory.of(out / name) for name in datasets}
+            former = {name: versions_of(held.path) for name, held in exports.items()}
 
         # Called by the engine's publications, and by the watchdog at the end of the time
         def write(results: State) -> None:
@@ -125,10 +128,11 @@ def reconstruct_folder(
         report = engine.report()
         # An earlier run's models, from other images, do not belong to tables without cameras.
         for batch in state.batches:
-            if batch not in state.scenes and remove_files(exports[batch]):
+            if batch not in state.scenes and remove_files(exports[batch], former[batch]):
                 warn(f"{batch}: this run has no cameras; the models of an earlier run were removed")
         lost = {batch: str(failure) for batch, failure in scene_failures(state).items()}
-    return FolderResult(report, tuple(pairs), standing[0], lost)
+    held = {name: exports[batches[name]] for name in datasets}
+    return FolderResult(report, tuple(pairs), standing[0], lost, held)
 
 
 def cameras_of(datasets: Datasets, root: Path, results: State) -> Cameras:

@@ -8,7 +8,6 @@ Source: Pan et al. 2024 (the global mapper).
 """
 
 import os
-import shutil
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -25,7 +24,15 @@ from mkpc_kaggle.geometry.intrinsics import KnownCamera
 from mkpc_kaggle.recipe import CameraModel, SceneConfig
 from mkpc_kaggle.scene.adjustment import adjust
 from mkpc_kaggle.scene.edges import supported
-from mkpc_kaggle.scene.export import DATABASE, FORMER, MODELS, PART
+from mkpc_kaggle.scene.export import (
+    DATABASE,
+    FORMER,
+    MODELS,
+    PART,
+    HeldDirectory,
+    remove_parts,
+    replace_models,
+)
 from mkpc_kaggle.scene.keypoints import MergedGraph
 from mkpc_kaggle.scene.reconstruction import (
     MIN_IMAGES,
@@ -78,7 +85,7 @@ def structure_from_motion(
 
 
 def write_files(
-    directory: Path,
+    held: HeldDirectory,
     merged: MergedGraph,
     shared: SharedIntrinsics,
     models: Sequence[SfmModel],
@@ -86,12 +93,13 @@ def write_files(
 ) -> None:
     """Write COLMAP's files: the database and one folder per model.
 
-    A temporary folder in ``directory`` holds the files until all are complete. Then they replace
-    earlier files. A model's files contain only its plausible images.
+    A temporary folder in the directory holds the files until all are complete. Then they replace
+    earlier files. A model's files contain only its plausible images. Raises ``OSError`` if the path
+    leads to another directory now.
     """
-    directory.mkdir(parents=True, exist_ok=True)
-    for left in directory.glob(f"{PART}*"):  # of a killed process
-        shutil.rmtree(left, ignore_errors=True)
+    directory = held.path
+    held.check()
+    remove_parts(directory)
     with TemporaryDirectory(prefix=PART, dir=directory) as name:
         made = Path(name)
         try:
@@ -113,12 +121,10 @@ def write_files(
             # A power failure must not leave empty files under their names
             with path.open("rb") as stream:
                 os.fsync(stream.fileno())
+        held.check()
         # Only renames from here on: a kill leaves complete files, of one run or of two.
         (made / DATABASE).replace(directory / DATABASE)
-        if (directory / MODELS).exists():
-            (directory / MODELS).rename(made / FORMER)
-        if models:
-            (made / MODELS).rename(directory / MODELS)
+        replace_models(made / MODELS, directory / MODELS, made / FORMER)
 
 
 def _fill(

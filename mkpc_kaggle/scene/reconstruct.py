@@ -4,7 +4,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.intrinsics import read as read_intrinsics
@@ -12,6 +11,7 @@ from mkpc_kaggle.geometry.robust import RobustConfig
 from mkpc_kaggle.recipe import CameraSharing, SceneConfig
 from mkpc_kaggle.scene.align import align, read_reference
 from mkpc_kaggle.scene.choose import Choice, Reason, choose, estimate_at_known_focals
+from mkpc_kaggle.scene.export import HeldDirectory
 from mkpc_kaggle.scene.keypoints import MergedGraph
 from mkpc_kaggle.scene.reconstruction import MIN_IMAGES, Reconstruction, SfmModel
 from mkpc_kaggle.scene.shared_intrinsics import (
@@ -44,7 +44,7 @@ def reconstruct_batch(
     config: SceneConfig,
     focal: FocalConfig | None = None,
     magsac: RobustConfig | None = None,
-    export: Path | None = None,
+    export: HeldDirectory | None = None,
 ) -> Solution:
     """Reconstruct every connected component of a batch, and choose an F for each of its pairs.
 
@@ -73,7 +73,7 @@ def reconstruct_batch(
 
 
 def reconstruct_sharing(
-    graph: ViewGraph, config: SceneConfig, directory: Path | None = None
+    graph: ViewGraph, config: SceneConfig, directory: HeldDirectory | None = None
 ) -> tuple[list[Reconstruction], SharedIntrinsics]:
     """Return the reconstruction of each component, and the shared intrinsics of the images.
 
@@ -111,7 +111,7 @@ def reconstruct_sharing(
         from mkpc_kaggle.scene.colmap import write_files
 
         # Before the files are written, so that files and results agree
-        found = align(found, read_reference(directory))
+        found = align(found, read_reference(directory.path))
         write_files(directory, parts[0], shared, models_of(found), config)
     # Images without a camera have the refined focal length, and not the one it began with.
     if given:

@@ -14,7 +14,13 @@ import pytest
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.reconstruction.directory import MARK, output_directory, require_directory_apart
 from mkpc_kaggle.scene import colmap
-from mkpc_kaggle.scene.export import MODEL_FILES
+from mkpc_kaggle.scene.export import (
+    MODEL_FILES,
+    HeldDirectory,
+    remove_files,
+    remove_parts,
+    versions_of,
+)
 
 FILES = ["database.db", *(f"models/0/{name}" for name in MODEL_FILES)]
 TABLES = ["cameras.csv", "report.html", "submission.csv"]
@@ -28,7 +34,10 @@ def write(folder: Path, names: list[str], text: str = "made") -> None:
 
 def files_of(folder: Path) -> dict[str, str]:
     paths = [path for path in folder.rglob("*") if path.is_file() and path.name != "results.json"]
-    return {path.relative_to(folder).as_posix(): path.read_text() for path in sorted(paths)}
+    return {
+        path.relative_to(folder).as_posix(): path.read_text(errors="replace")
+        for path in sorted(paths)
+    }
 
 
 @pytest.fixture
@@ -44,7 +53,8 @@ def out(tmp_path: Path) -> Path:
 
 
 IN_THE_WAY = {
-    "an exported model": ("a/models/0/points.ply", Path.touch),
+    "a folder for a file of a model": ("a/models/0/images.bin", Path.mkdir),
+    "a file for a model": ("a/models/1", Path.touch),
     "an open database": ("a/database.db-wal", Path.touch),
     "a dataset's file that no run has made": (
         "c/database.db",
@@ -104,6 +114,33 @@ def test_a_database_that_another_program_has_open_is_refused_with_the_remedy(dat
             raise AssertionError
     with output_directory(database.parent, ["."]):
         pass
+
+
+def test_files_of_others_next_to_models_are_in_nobodys_way(out):
+    # Gaussian splatting writes the first one.
+    others = ["a/sparse/0/points3D.ply", "a/models/notes.txt", "a/models/0/dense/fused.ply"]
+    with output_directory(out, "ab", "imc2025"):
+        write(out, [f"a/sparse/0/{name}" for name in MODEL_FILES])
+    write(out, others, "the user's")
+    for datasets in ("ab", "b", "b"):
+        with output_directory(out, datasets, "imc2025"):
+            pass
+        assert {files_of(out)[name] for name in others} == {"the user's"}
+    # The dataset is gone, and our files with it.
+    left = [name for name in files_of(out) if name.startswith("a/")]
+    assert left == sorted(others)
+
+
+def test_nothing_is_written_or_removed_in_another_directory_that_has_the_name_now(out, tmp_path):
+    write(tmp_path / "project", ["submission.csv", "b/database.db"])
+    before = files_of(tmp_path / "project")
+    with output_directory(out, ["a"]) as held:
+        out.rename(tmp_path / "moved")
+        out.symlink_to("project")
+        with pytest.raises(OSError, match="moved or replaced"):
+            held.check()
+    assert files_of(tmp_path / "project") == before
+    assert not (tmp_path / "project" / "work").exists()
 
 
 @pytest.mark.parametrize(
@@ -189,6 +226,55 @@ def test_nothing_that_is_read_lies_in_the_directory_of_results(tmp_path, monkeyp
     require_directory_apart(Path("out"), [Path("auto")], [])
 
 
+def test_new_models_leave_files_of_others_where_they_are(tmp_path, monkeypatch):
+    others = ["models/0/thesis.txt", "models/3/mine/notes.txt", "models/0/points3D.ply"]
+    write(tmp_path, FILES + [f"models/1/{name}" for name in MODEL_FILES])
+    monkeypatch.setattr(colmap, "_fill", lambda *_: None)
+
+    def fill(folder: Path) -> None:
+        write(folder, [*MODEL_FILES], "new")
+        write(tmp_path, others, "the user's")  # during the run
+
+    model = SimpleNamespace(images=(), colmap=SimpleNamespace(frames={}, write=fill))
+    (tmp_path / "models" / "0").joinpath("link").symlink_to("thesis.txt")
+    held = HeldDirectory.of(tmp_path)
+    colmap.write_files(held, None, {}, [model])
+    found = files_of(tmp_path)
+    assert {found[name] for name in others} == {"the user's"}
+    assert (tmp_path / "models" / "0" / "link").readlink() == Path("thesis.txt")
+    assert {name for name in found if name.startswith("models/1")} == set(), "a former model"
+    assert found["models/0/images.bin"] == "new"
+    # A run without cameras
+    remove_files(held, versions_of(tmp_path))
+    assert sorted(files_of(tmp_path)) == sorted([*others, "models/0/link"])
+
+
+def test_only_files_that_the_run_began_with_are_removed_and_only_in_its_own_directory(tmp_path):
+    out = tmp_path / "out"
+    write(out, FILES)
+    held = HeldDirectory.of(out)
+    former = versions_of(out)
+    write(out, ["models/0/images.bin", "sparse/0/images.bin"], "the user's now")
+    out.rename(tmp_path / "moved")
+    write(out, FILES, "the user's")
+    assert not remove_files(held, former)
+    assert set(files_of(out).values()) == {"the user's"}
+    (tmp_path / "out").rename(tmp_path / "project")
+    (tmp_path / "moved").rename(out)
+    assert remove_files(held, former)
+    assert sorted(files_of(out)) == ["models/0/images.bin", "sparse/0/images.bin"]
+
+
+def test_a_killed_process_leaves_no_folder_and_loses_no_file_of_others(tmp_path):
+    left = tmp_path / ".mkpc-new-1"
+    write(left, [*FILES, "former/0/images.bin", "former/0/thesis.txt"])
+    remove_parts(tmp_path)
+    assert sorted(files_of(left)) == ["former/0/thesis.txt"]
+    (left / "former" / "0" / "thesis.txt").unlink()
+    remove_parts(tmp_path)
+    assert not left.exists()
+
+
 def test_former_files_stay_until_the_new_ones_are_whole(tmp_path, monkeypatch):
     """A disk that is full while models are written costs neither the former models nor the former
     database.
@@ -202,7 +288,7 @@ def test_former_files_stay_until_the_new_ones_are_whole(tmp_path, monkeypatch):
                 raise OSError(28, "No space left on device")
 
         model = SimpleNamespace(images=(), colmap=SimpleNamespace(frames={}, write=fill))
-        colmap.write_files(tmp_path, None, {}, [model])
+        colmap.write_files(HeldDirectory.of(tmp_path), None, {}, [model])
 
     monkeypatch.setattr(colmap, "_fill", lambda *_: None)
     with pytest.raises(OSError, match="No space"):

@@ -7,6 +7,7 @@ import pytest
 from benchmarks.synthetic_scene import synthetic_scene
 from mkpc_kaggle.geometry.intrinsics import MODELS, KnownCamera, camera_of, parse_row, read, written
 from mkpc_kaggle.recipe import CameraSharing, SceneConfig
+from mkpc_kaggle.scene.export import HeldDirectory
 from mkpc_kaggle.scene.reconstruct import models_of, reconstruct_sharing
 from mkpc_kaggle.scene.reconstruction import SfmModel
 from mkpc_kaggle.scene.uncertainty import combined
@@ -103,7 +104,7 @@ def test_distortion_is_part_of_verification_and_of_the_model(tmp_path):
         pinhole = (K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5)
         known.append((name, KnownCamera("OPENCV", (*pinhole, *distortion))))
     config = SceneConfig(intrinsics=written(known))
-    reconstruct_sharing(ViewGraph.of_pairs(SCENE.pairs), config, tmp_path)
+    reconstruct_sharing(ViewGraph.of_pairs(SCENE.pairs), config, HeldDirectory.of(tmp_path))
     with pycolmap.Database.open(str(tmp_path / "database.db")) as database:
         cameras = database.read_all_cameras()
         geometry = database.read_two_view_geometry(1, 2)

@@ -15,6 +15,7 @@ from mkpc_kaggle.geometry.robust import RobustConfig
 from mkpc_kaggle.recipe import CameraSharing, SceneConfig
 from mkpc_kaggle.scene import colmap
 from mkpc_kaggle.scene.choose import estimate_at_known_focals
+from mkpc_kaggle.scene.export import HeldDirectory
 from mkpc_kaggle.scene.reconstruct import Solution, reconstruct_batch, reconstruct_sharing
 from mkpc_kaggle.scene.reconstruction import RegisteredImage, SfmModel
 from mkpc_kaggle.scene.shared_intrinsics import shared_intrinsics
@@ -131,7 +132,7 @@ def test_shared_intrinsics_stay_unless_they_explain_fewer_points_and_the_files_a
     assert len(set(focals_of(solution))) == cameras
 
     graph = ViewGraph.of_pairs(scene.pairs)
-    (found,), _ = reconstruct_sharing(graph, CONFIG, tmp_path)
+    (found,), _ = reconstruct_sharing(graph, CONFIG, HeldDirectory.of(tmp_path))
     written = pycolmap.Reconstruction(tmp_path / "models" / "0").cameras.values()
     written_focals = {camera.focal_length for camera in written}
     assert written_focals == {image.focal for image in found.models[0].images}
