@@ -15,12 +15,14 @@ class Matches:
 
     ``points0`` and ``points1`` are (N, 2) float32, ``scores`` is (N,) float32, higher is more
     certain. All methods keep the matcher's order, since MAGSAC's result depends on it. Other dtypes
-    are cast. Raises ``ValueError`` for inconsistent shapes.
+    are cast. ``indices`` (N, 2) are the rows of the keypoints of both pictures, of a matcher of
+    keypoints. Raises ``ValueError`` for inconsistent shapes.
     """
 
     points0: Points
     points1: Points
     scores: NDArray[np.float32]
+    indices: NDArray[np.int64] | None = None
 
     def __post_init__(self) -> None:
         for name, width in (("points0", (2,)), ("points1", (2,)), ("scores", ())):
@@ -30,6 +32,11 @@ class Matches:
             if array.shape != (len(self.scores), *width):
                 raise ValueError(f"{name} has shape {array.shape}, scores {np.shape(self.scores)}")
             object.__setattr__(self, name, array)  # the class is frozen
+        if self.indices is not None:
+            indices = np.asarray(self.indices, np.int64).reshape(-1, 2)
+            if len(indices) != len(self.scores):
+                raise ValueError(f"indices has {len(indices)} rows, scores {np.shape(self.scores)}")
+            object.__setattr__(self, "indices", indices)
 
     @classmethod
     def empty(cls) -> "Matches":
@@ -38,7 +45,7 @@ class Matches:
 
     @classmethod
     def concatenate(cls, parts: Iterable["Matches"]) -> "Matches":
-        """Return all parts in order, without merging or sorting."""
+        """Return all parts in order, without merging or sorting, and without their indices."""
         parts = list(parts)
         if not parts:
             return cls.empty()
@@ -53,7 +60,8 @@ class Matches:
 
     def __getitem__(self, index: NDArray[np.bool_] | NDArray[np.integer] | slice) -> "Matches":
         """Return the matches selected by a mask, indices or a slice."""
-        return Matches(self.points0[index], self.points1[index], self.scores[index])
+        indices = None if self.indices is None else self.indices[index]
+        return Matches(self.points0[index], self.points1[index], self.scores[index], indices)
 
     def best(self, most: int) -> "Matches":
         """Return up to ``most`` matches of highest score, in their present order.
@@ -78,4 +86,5 @@ class Matches:
             view0.to_image(kept.points0).astype(np.float32),
             view1.to_image(kept.points1).astype(np.float32),
             kept.scores,
+            kept.indices,
         )

@@ -125,6 +125,14 @@ def _pixels(array: NDArray[Any], name: str, *, channels_first: bool = False) -> 
     return array
 
 
+def files_of(sources: Iterable[ImageSource]) -> tuple[str, ...]:
+    """Return the absolute path of each image that was given as one; empty for others."""
+    return tuple(
+        str(Path(source).absolute()) if isinstance(source, str | os.PathLike) else ""
+        for source in sources
+    )
+
+
 def boxes_of(regions: Any, images: tuple[Image, Image]) -> tuple[Box, Box] | None:
     """Return the boxes of both images; ``None`` if the user gave none.
 

@@ -1,18 +1,32 @@
 """A pair on its way through the stages: results of units, critical regions, the two-view model."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mkpc_kaggle.data.images import Image
 from mkpc_kaggle.geometry.coordinates import Matrix3, Size
-from mkpc_kaggle.geometry.critical_region import CriticalRegion
+from mkpc_kaggle.geometry.critical_region import CriticalRegion, MkpcConfig
 from mkpc_kaggle.geometry.focal_prior import FocalPrior, estimate_with_prior
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.overlap import support
-from mkpc_kaggle.geometry.robust import Estimate, ModelKind, estimate, rotation_in_front
+from mkpc_kaggle.geometry.robust import (
+    Estimate,
+    ModelKind,
+    NoModelError,
+    RelativePose,
+    estimate,
+    pose_in_front,
+    rotation_in_front,
+)
+from mkpc_kaggle.pipeline.arguments import ImageSource, intrinsics_of, to_image
+from mkpc_kaggle.pipeline.keypoints import Keypoints
 from mkpc_kaggle.recipe import Recipe, Unit
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 Regions = tuple[CriticalRegion, CriticalRegion]
 # A complete value, so that an interrupted pair has a row like any other.
@@ -31,6 +45,7 @@ class UnitResult:
     warm_up: bool = False  # the first run of the unit in this process, which may take much longer
     note: str = ""  # why the unit did not run as written
     keypoints: int = 0  # detected in the first view; 0 for a matcher without a detector
+    found: Keypoints | None = None  # for programs, of a matcher with a detector
 
     @property
     def seconds(self) -> float:
@@ -53,6 +68,9 @@ class PairMatch:
     failure: str = ""  # the image that cannot be read
     decode_seconds: float = 0.0
     cluster_seconds: float = 0.0
+    # For plots of a match of files.
+    files: tuple[str, ...] = ()
+    mkpc: MkpcConfig = field(default_factory=MkpcConfig)
 
     @property
     def matches(self) -> Matches:
@@ -68,6 +86,57 @@ class PairMatch:
     def inliers(self) -> Matches:
         """The matches within MAGSAC's threshold of the model."""
         return self.matches[self.estimate.inliers]
+
+    @property
+    def keypoints(self) -> Keypoints:
+        """The keypoints of all units, in image pixels, with the indices of ``matches``."""
+        counts = [len(result.matches) for result in self.results]
+        return Keypoints.concatenate([result.found for result in self.results], counts)
+
+    def pose(self, K0: Matrix3, K1: Matrix3) -> RelativePose:
+        """Return the pose of camera 1 relative to camera 0 from F or E: R, t, inliers in front.
+
+        K0 and K1 are the camera matrices in pixels. ``in_front`` is a mask over ``matches``. Raises
+        ``ValueError`` for a homography, and :class:`mkpc_kaggle.errors.UserError` without a model.
+        """
+        matrices = intrinsics_of((K0, K1))
+        assert matrices is not None
+        E = self.estimate.matrix
+        if self.estimate.model is ModelKind.H:
+            raise ValueError("a homography has no single pose: estimate model F or E")
+        if self.estimate.model is ModelKind.F:
+            E = matrices[1].T @ E @ matrices[0]
+        inliers = self.estimate.inliers
+        if not inliers.any():
+            raise NoModelError("no pose: the model has no inliers")
+        pose = pose_in_front(E, self.matches[inliers], matrices)
+        in_front = np.zeros(len(inliers), bool)
+        in_front[inliers] = pose.in_front
+        return pose._replace(in_front=in_front)
+
+    def plot(
+        self, image0: "ImageSource | None" = None, image1: "ImageSource | None" = None
+    ) -> "Figure":
+        """Draw the matches, the clusters and the critical regions, as reports do.
+
+        The images are read again if the match is of files; otherwise they must be given. Raises
+        ``ValueError`` for images of another size, and :class:`mkpc_kaggle.errors.UserError`
+        without matplotlib.
+        """
+        from mkpc_kaggle.pipeline.drawing import draw_pair  # it draws this class
+
+        images = []
+        for number, given in enumerate((image0, image1)):
+            source = given
+            if source is None:
+                if not self.files[number : number + 1] or not self.files[number]:
+                    raise ValueError("the match is not of files: call plot(image0, image1)")
+                source = self.files[number]
+            image = to_image(source, name=f"image{number}")
+            if image.size != self.sizes[number]:
+                raise ValueError(f"image{number} has another size than the matched image")
+            images.append(image)
+        return draw_pair(images[0], images[1], self, self.mkpc)
 
     def in_stage(self, stage: int) -> NDArray[np.bool_]:
         """Return the (N,) mask of the ``matches`` that units of this stage found."""

@@ -24,6 +24,7 @@ from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import Colour, Matcher, NonFiniteError, Picture, encoding_bytes
 from mkpc_kaggle.matchers.dtypes import check_finite, exact_float32
 from mkpc_kaggle.matchers.failures import FailureKind, failure_of, reason_of, require_unforked
+from mkpc_kaggle.pipeline.keypoints import Keypoints
 from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
 from mkpc_kaggle.recipe import Recipe, Unit
 
@@ -44,7 +45,8 @@ class Pipeline:
     of one shape to encode. A unit that runs out of memory halves its minibatch from then on.
     Encodings of whole images, which many pairs share, are cached up to ``cache_bytes``. ``regions``
     replace MKPC's critical regions. Matches with a point that ``masks`` leave out are dropped.
-    Errors of the matchers in ``raising`` are raised, and do not become failed results.
+    Errors of the matchers in ``raising`` are raised, and do not become failed results. Results have
+    keypoints, and descriptors, if ``keeps_keypoints`` and ``keeps_descriptors`` are set.
     """
 
     def __init__(
@@ -59,6 +61,8 @@ class Pipeline:
         masks: Masks | None = None,
     ) -> None:
         self.raising: Container[str] = ()
+        self.keeps_keypoints = False
+        self.keeps_descriptors = False
         self._masks = MaskReader(masks or Masks())
         self.recipe = recipe
         self.minibatch = minibatch
@@ -197,16 +201,24 @@ class Pipeline:
         warm_up = unit not in self._ran
         self._ran.add(unit)
         results = []
-        for pair, both, encoding, matches in zip(pairs, views, firsts, found, strict=True):
+        each_pair = zip(pairs, views, firsts, encodings[1::2], found, strict=True)
+        for pair, both, encoding, other, matches in each_pair:
             in_image = self._unmasked(matches.to_image(*both), pair.images)
+            best = in_image.best(unit.max_matches)
+            kept = None
+            if self.keeps_keypoints:
+                kept = Keypoints.of(
+                    (encoding, other), both, best, with_descriptors=self.keeps_descriptors
+                )
             result = UnitResult(
                 unit,
-                in_image.best(unit.max_matches),
+                best,
                 (encoded - start) / len(pairs),
                 (matched - encoded) / len(pairs),
                 warm_up=warm_up,
                 note=self._notes.get(unit.matcher, ""),
                 keypoints=len(getattr(encoding, "points", ())),
+                found=kept,
             )
             results.append(result)
         return results

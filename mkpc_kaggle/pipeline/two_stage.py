@@ -19,6 +19,7 @@ from mkpc_kaggle.pipeline.arguments import (
     ImageSource,
     Weights,
     boxes_of,
+    files_of,
     intrinsics_of,
     member_of,
     shown_value,
@@ -89,6 +90,7 @@ class TwoStageMatcher:
         pipeline = self._assembly.pipeline()
         # A fault of the user's own code is the user's to see.
         pipeline.raising = self._assembly.matchers.keys()
+        pipeline.keeps_keypoints = True
         return pipeline
 
     def __getstate__(self) -> dict[str, Any]:
@@ -107,6 +109,7 @@ class TwoStageMatcher:
         model: ModelKind | str = ModelKind.F,
         intrinsics: Intrinsics | None = None,
         regions: Regions | None = None,
+        descriptors: bool = False,
     ) -> PairMatch:
         """Match two images: paths, PIL images, arrays (H, W, 3) RGB or (H, W), tensors (3, H, W).
 
@@ -114,6 +117,9 @@ class TwoStageMatcher:
         camera matrices in pixels. ``regions`` replace MKPC's boxes; each is a :class:`Box` or its
         left, top, right and bottom. Points, boxes and F are in pixels of the stored files; EXIF
         only turns the matchers' views upright.
+
+        ``match.keypoints`` has the keypoints of matchers that detect some, also their descriptors
+        if ``descriptors`` is true.
 
         A unit that fails is a warning, and ``match.failures`` has its reason. If no model is found,
         ``match.estimate`` is false, its ``failure`` has the reason, and the use of its matrix
@@ -124,8 +130,11 @@ class TwoStageMatcher:
         own matchers are raised.
         """
         kind = member_of(ModelKind, model, "model")
+        sources = (image0, image1)
         images = (to_image(image0, name="image0"), to_image(image1, name="image1"))
-        return self._match(images, kind, intrinsics, regions, progress=self._progress)
+        self._pipeline.keeps_descriptors = descriptors
+        match = self._match(images, kind, intrinsics, regions, progress=self._progress)
+        return replace(match, files=files_of(sources))
 
     def match_pairs(
         self,
@@ -134,6 +143,7 @@ class TwoStageMatcher:
         model: ModelKind | str = ModelKind.F,
         intrinsics: Iterable[Intrinsics | None] | None = None,
         regions: Iterable[Regions | None] | None = None,
+        descriptors: bool = False,
     ) -> Iterator[PairMatch]:
         """Yield the match of each pair, as a call does for one pair.
 
@@ -151,10 +161,10 @@ class TwoStageMatcher:
             _of_each_pair(intrinsics, "intrinsics"),
             _of_each_pair(regions, "regions"),
         )
-        return self._match_each(zip(*each, strict=False), kind)
+        return self._match_each(zip(*each, strict=False), kind, descriptors=descriptors)
 
     def _match_each(
-        self, given: Iterable[tuple[Any, Any, Any]], kind: ModelKind
+        self, given: Iterable[tuple[Any, Any, Any]], kind: ModelKind, *, descriptors: bool
     ) -> Iterator[PairMatch]:
         # Closed also if the caller stops early: its thread would keep the process alive.
         with closing(ImageStore()) as store:
@@ -167,7 +177,10 @@ class TwoStageMatcher:
                     to_image(first, store, f"{name}[0]"),
                     to_image(second, store, f"{name}[1]"),
                 )
-                yield self._match(images, kind, intrinsics, regions)
+                # Set for each pair: another call may come between.
+                self._pipeline.keeps_descriptors = descriptors
+                match = self._match(images, kind, intrinsics, regions)
+                yield replace(match, files=files_of(pair))
 
     def _match(
         self,
@@ -194,6 +207,7 @@ class TwoStageMatcher:
             self._pipeline.regions = {tuple(image.name for image in images): boxes}
         (pair,) = self._run(images, progress=progress)
         match = _for_programs(with_estimate(pair, self.recipe, kind, matrices))
+        match = replace(match, mkpc=self.recipe.mkpc)
         for name, reason in match.failures.items():
             warnings.warn(f"unit {name} failed: {reason}", RuntimeWarning, stacklevel=3)
         return match

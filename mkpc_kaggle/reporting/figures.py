@@ -1,169 +1,55 @@
-"""Figures of pairs, with matches, clusters and critical regions, and of a scene's cameras."""
+"""Figures of pairs and of a scene's cameras, and their files."""
 
 from collections.abc import Sequence
 from io import BytesIO
-from math import sqrt
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mkpc_kaggle.data.competition import evenly_spread
-from mkpc_kaggle.data.images import Image
 from mkpc_kaggle.data.outputs import replacing
 from mkpc_kaggle.engine.records import SceneRecord
 from mkpc_kaggle.errors import UserError, plural
 from mkpc_kaggle.geometry.cameras import Camera
-from mkpc_kaggle.geometry.coordinates import Box, View
-from mkpc_kaggle.geometry.critical_region import CriticalRegion, MkpcConfig, find_clusters
-from mkpc_kaggle.pipeline.pair import PairMatch
+from mkpc_kaggle.pipeline.drawing import (
+    COLOURS,
+    DPI,
+    DROPPED,
+    INLIER,
+    OUTLIER,
+    REGION,
+    draw_matches,
+    draw_pair,
+    draw_strip,
+    new_figure,
+    sample,
+)
 from mkpc_kaggle.scene.reconstruction import SfmModel
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# The Okabe-Ito palette, suitable for colour-blind readers.
-INLIER, OUTLIER, REGION, DROPPED = "#009E73", "#D55E00", "#F0E442", "#999999"
-COLOURS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#56B4E9", "#CC79A7")
-DPI = 110
-STRIP_HEIGHT_PX = 480
-MAX_STRIP_PX = 2_000_000  # a panorama would otherwise make a picture of many megabytes
-# Maximum numbers of lines in a legible figure
-MAX_INLIERS = 150
-MAX_OUTLIERS = 50
-
-
-def draw_pair(image0: Image, image1: Image, match: PairMatch, config: MkpcConfig) -> "Figure":
-    """Draw the matches of all units and the critical regions, and below them the clusters of stage
-    1.
-    """
-    figure = new_figure(12, 9)  # inches: legible on a screen of 1,320 pixels
-    panels = figure.subplot_mosaic([["matches", "matches"], ["0", "1"]])
-    # The title joins what is known: a failure is empty for most pairs.
-    inliers = plural(match.estimate.inlier_count, "inlier")
-    counts = f"{plural(len(match.matches), 'match')}, {inliers}"
-    drawn = draw_matches(panels["matches"], (image0, image1), match)
-    panels["matches"].set_title(
-        "; ".join(filter(None, [counts, match.estimate.failure, drawn])), loc="left"
-    )
-    for side, image in enumerate((image0, image1)):
-        _draw_clusters(panels[str(side)], image, match, config, side)
-    return figure
-
-
-def draw_strip(images: tuple[Image, Image], match: PairMatch) -> "Figure":
-    """Draw the matches and the critical regions without text, in up to :data:`MAX_STRIP_PX` pixels."""
-    aspect = sum(view.content.width / view.content.height for view in map(_upright, images))
-    height = min(STRIP_HEIGHT_PX, sqrt(MAX_STRIP_PX / aspect)) / DPI
-    figure = new_figure(aspect * height, height)
-    # The constrained layout would leave a margin for text that a strip does not have.
-    figure.set_layout_engine("none")
-    draw_matches(figure.add_axes((0, 0, 1, 1)), images, match, round(height * DPI))
-    return figure
-
-
-def draw_matches(
-    axes: "Axes", images: tuple[Image, Image], match: PairMatch, height_px: int | None = None
-) -> str:
-    """Draw the images side by side, matches as lines, and critical regions as boxes. Return a
-    caption.
-
-    Of many matches, an even sample is drawn. In axes coordinates, each image is one unit high.
-    Images are reduced to ``height_px``, if given: matplotlib takes several times as long to do it.
-    """
-    from matplotlib.collections import LineCollection
-
-    ends: list[NDArray[np.float64]] = []
-    left = 0.0
-    for side, points in enumerate((match.matches.points0, match.matches.points1)):
-        view = _upright(images[side], height_px)
-        width, height = view.content
-        _show(axes, images[side], view, match.regions and match.regions[side], 1 / height, left)
-        # (0, 0) is the centre of a pixel, and the corner of the picture
-        ends.append((view.from_image(points) + 0.5) / height + (left, 0))
-        left += width / height
-        # A gap between the images, below the lines
-        axes.axvline(left, color="white", linewidth=4, zorder=0.5)
-    axes.set(xlim=(0, left), ylim=(1, 0))
-    axes.axis("off")
-    lines = np.stack(ends, axis=1)
-    inliers = sample(match.estimate.inliers, MAX_INLIERS)
-    outliers = sample(~match.estimate.inliers, MAX_OUTLIERS)
-    # Inliers last: they lie above the others.
-    for some, colour, thickness in ((outliers, OUTLIER, 0.6), (inliers, INLIER, 1.0)):
-        axes.add_collection(
-            LineCollection([*lines[some]], colors=colour, linewidths=thickness, alpha=0.75)
-        )
-        x, y = lines[some].reshape(-1, 2).T
-        axes.scatter(x, y, s=5, color=colour, linewidths=0)
-    return f"{plural(len(inliers), 'inlier')} (green) and {plural(len(outliers), 'outlier')} (orange) drawn"
-
-
-def _draw_clusters(
-    axes: "Axes", image: Image, match: PairMatch, config: MkpcConfig, side: int
-) -> None:
-    view = _upright(image)
-    _show(axes, image, view, match.regions and match.regions[side])
-    axes.set(xticks=[], yticks=[])
-    if match.regions is None:
-        axes.set_title("no stage 2: no critical region", loc="left")
-        return
-    region = match.regions[side]
-    # Clusters are not stored. The same points give the same clusters as in the run.
-    stage1 = match.matches[match.in_stage(1)]
-    points = stage1.points1 if side else stage1.points0
-    clusters = find_clusters(points, image.size, config)
-    shown = view.from_image(points) + 0.5  # (0, 0) is the top-left corner in the figure
-    x, y = shown[~clusters.in_kept].T
-    axes.scatter(x, y, s=8, color=DROPPED, marker="x", linewidths=0.7)
-    for rank, label in enumerate(clusters.kept):
-        x, y = shown[clusters.labels == label].T
-        axes.scatter(x, y, s=8, color=COLOURS[rank % len(COLOURS)], linewidths=0)
-    share = region.box.area / (image.size.width * image.size.height)
-    axes.set_title(
-        f"critical region: {region.reason}, {100 * share:.0f} % of the image\n"
-        f"{region.kept} of {plural(region.clusters, 'cluster')} kept, grey: the other points",
-        loc="left",
-    )
-
-
-def _show(
-    axes: "Axes",
-    image: Image,
-    view: View,
-    region: CriticalRegion | None,
-    scale: float = 1.0,
-    left: float = 0.0,
-) -> None:
-    """Draw a view of an image, from (left, 0) with pixels ``scale`` wide, and its critical region."""
-    from matplotlib.patches import Polygon
-
-    width, height = view.content
-    axes.imshow(view.render(image.pixels), extent=(left, left + scale * width, scale * height, 0))
-    if region is not None:
-        box = region.box
-        ends = [
-            (box.left, box.top),
-            (box.left, box.bottom),
-            (box.right, box.bottom),
-            (box.right, box.top),
-        ]
-        # A box has borders of pixels, a view maps centres. A view may be turned.
-        corners = view.from_image(np.array(ends) - 0.5) + 0.5
-        axes.add_patch(
-            Polygon(scale * corners + (left, 0), fill=False, edgecolor=REGION, linewidth=2.5)
-        )
-
-
-def _upright(image: Image, height_px: int | None = None) -> View:
-    """Return the upright view of the whole image, up to ``height_px`` high if given."""
-    view = View.fit(Box.whole(image.size), long_side=max(image.size), turns=image.turns)
-    if height_px is None or view.content.height <= height_px:
-        return view
-    long_side = round(max(image.size) * height_px / view.content.height)
-    return View.fit(Box.whole(image.size), long_side=long_side, turns=image.turns)
+# Figures of a pair are drawn below this layer, for programs.
+__all__ = [
+    "COLOURS",
+    "DPI",
+    "DROPPED",
+    "INLIER",
+    "OUTLIER",
+    "REGION",
+    "draw_cameras",
+    "draw_matches",
+    "draw_pair",
+    "draw_strip",
+    "encode",
+    "new_figure",
+    "plain",
+    "require_format",
+    "sample",
+    "save",
+]
 
 
 def draw_cameras(scene: SceneRecord, number: int = 0) -> "Figure":
@@ -234,16 +120,6 @@ def _near(values: NDArray[np.float64]) -> NDArray[np.bool_]:
     return near
 
 
-def new_figure(width: float, height: float) -> "Figure":
-    """Return an empty figure of this size in inches. Raise :class:`UserError` without matplotlib."""
-    # Without pyplot, which would choose a window system and keep all figures in memory.
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise UserError("figures need matplotlib: pip install 'mkpc-kaggle[plots]'") from error
-    return Figure(figsize=(width, height), layout="constrained")
-
-
 def require_format(path: Path) -> None:
     """Raise :class:`UserError` if matplotlib is missing or does not support the suffix as a format."""
     # Before hours of matching, and not after them
@@ -279,8 +155,3 @@ def plain(axes: "Axes", title: str) -> "Axes":
     axes.tick_params(labelsize=9)
     axes.spines[["top", "right"]].set_visible(False)
     return axes
-
-
-def sample(mask: NDArray[np.bool_], most: int) -> NDArray[np.intp]:
-    """Return up to ``most`` evenly spread indices of the mask's true elements."""
-    return np.array(evenly_spread(np.flatnonzero(mask).tolist(), most), np.intp)

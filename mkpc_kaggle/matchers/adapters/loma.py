@@ -4,7 +4,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from mkpc_kaggle.config import AT_LEAST_1, POSITIVE, SHARE, check_ranges
 from mkpc_kaggle.geometry.coordinates import Size, from_normalised
@@ -49,6 +51,11 @@ class LomaEncoding(NamedTuple):
     keypoints: LomaKeypoints
     content: Size  # of the picture
 
+    @property
+    def points(self) -> NDArray[np.floating]:
+        """The keypoints (K, 2) in view pixels."""
+        return from_normalised(self.keypoints.points.cpu().numpy(), self.content)
+
 
 class LomaAdapter(PairwiseMatcher[LomaEncoding]):
     """LoMa. A match's score is the product of two softmaxes, one over each picture's keypoints.
@@ -87,12 +94,12 @@ class LomaAdapter(PairwiseMatcher[LomaEncoding]):
 
     def _match(self, first: LomaEncoding, second: LomaEncoding) -> Matches:
         found = self._network.matcher(first.keypoints, second.keypoints, self.options.threshold)
-        points0 = first.keypoints.points[found.index0].cpu().numpy()
-        points1 = second.keypoints.points[found.index1].cpu().numpy()
+        indices = torch.stack([found.index0, found.index1], dim=1).cpu().numpy()
         return Matches(
-            from_normalised(points0, first.content),
-            from_normalised(points1, second.content),
+            first.points[indices[:, 0]],
+            second.points[indices[:, 1]],
             found.scores.cpu().numpy(),
+            indices,
         )
 
 
