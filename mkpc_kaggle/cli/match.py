@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from mkpc_kaggle.cli import options
-from mkpc_kaggle.data.outputs import replacing, require_apart
+from mkpc_kaggle.data.hloc import SUFFIX, HlocPair, require_h5py, write_hloc
+from mkpc_kaggle.data.outputs import RESULTS, replacing, require_apart
 from mkpc_kaggle.engine.console import unblocked
 from mkpc_kaggle.errors import UserError, plural, writing
 from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
@@ -23,7 +24,8 @@ files, without the EXIF orientation; figures are upright.
 
   --out   draws the matches, the clusters and the critical regions.
   --save  writes the arrays points0 and points1 (N x 2), scores (N), inliers (N, true or false)
-          and F (3 x 3), for numpy.load
+          and F (3 x 3), for numpy.load. A name that ends in .h5 gets keypoints and matches
+          in hloc's layout, under the names of the files
 
 Exit status: 0 done, 1 every unit failed, 2 bad input.
 """
@@ -40,8 +42,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out", type=Path, metavar="FIG.png", help="draw the pair; the suffix sets the format"
     )
-    text = "save the points, scores, inliers and F as arrays"
-    parser.add_argument("--save", type=Path, metavar="FILE.npz", help=text)
+    text = "save the points, scores, inliers and F as arrays, or keypoints and matches for hloc"
+    parser.add_argument("--save", type=Path, metavar="FILE.npz|FILE.h5", help=text)
     options.add_matching(parser)
 
 
@@ -52,8 +54,11 @@ def run(arguments: argparse.Namespace) -> int:
     # Before the work: a wrong suffix should not cost minutes of matching.
     if arguments.out is not None:
         require_format(arguments.out)
-    if arguments.save is not None and arguments.save.suffix != ".npz":
-        raise UserError(f"--save {arguments.save}: the name must end in .npz")
+    if arguments.save is not None:
+        if arguments.save.suffix not in RESULTS["--save"]:
+            raise UserError(f"--save {arguments.save}: the name must end in .npz or .h5")
+        if arguments.save.suffix == SUFFIX:
+            require_h5py()
     images = (to_image(arguments.image0), to_image(arguments.image1))
     # After the images: a wrong path should not wait for weights to be digested.
     with announced(f"loading recipe {arguments.recipe}: libraries, and checks of weights"):
@@ -74,7 +79,10 @@ def run(arguments: argparse.Namespace) -> int:
         print(f"figure: {arguments.out}")
     if arguments.save is not None:
         with writing(f"--save {arguments.save}"):
-            save_arrays(match, arguments.save)
+            if arguments.save.suffix == SUFFIX:
+                save_for_hloc(match, (arguments.image0, arguments.image1), arguments.save)
+            else:
+                save_arrays(match, arguments.save)
         print(f"arrays: {arguments.save}")
     return EXIT_NOTHING_RAN if _nothing_ran(match) else 0
 
@@ -93,6 +101,23 @@ def save_arrays(match: PairMatch, path: Path) -> None:
             inliers=match.estimate.inliers,
             F=match.estimate.matrix_or_fallback,
         )
+
+
+def save_for_hloc(match: PairMatch, files: tuple[Path, Path], path: Path) -> None:
+    """Write the keypoints of both images and their matches, of all units, before estimation."""
+    names = tuple(file.name for file in files)
+    if names[0] == names[1]:
+        names = tuple(str(file).lstrip("/") for file in files)
+    found = match.keypoints
+    points = (found.points0, found.points1)
+    indices = found.indices
+    # A match of a matcher without keypoints is a keypoint of its own.
+    if (indices < 0).any():
+        points = (match.matches.points0, match.matches.points1)
+        indices = np.column_stack([np.arange(len(match.matches))] * 2)
+    pair = HlocPair(names[0], names[1], indices, match.matches.scores)
+    sizes = dict(zip(names, match.sizes, strict=True))
+    write_hloc(path, dict(zip(names, points, strict=True)), sizes, [pair])
 
 
 def _nothing_ran(match: PairMatch) -> bool:

@@ -2,16 +2,18 @@
 
 import argparse
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from mkpc_kaggle.cli import options
+from mkpc_kaggle.data.hloc import SUFFIX, require_h5py
 from mkpc_kaggle.data.masks import Masks
+from mkpc_kaggle.data.outputs import require_apart
 from mkpc_kaggle.engine.budget import format_duration
 from mkpc_kaggle.engine.console import say
 from mkpc_kaggle.engine.session import interruptible
-from mkpc_kaggle.errors import plural
+from mkpc_kaggle.errors import UserError, plural
 from mkpc_kaggle.recipe import CameraSharing
 from mkpc_kaggle.reconstruction.coordinates import forget_coordinates, keep_coordinates
 from mkpc_kaggle.reconstruction.directory import (
@@ -19,6 +21,7 @@ from mkpc_kaggle.reconstruction.directory import (
     output_directory,
     require_directory_apart,
 )
+from mkpc_kaggle.reconstruction.export import export_matches
 from mkpc_kaggle.reconstruction.folder import (
     batch_names,
     pair_list_line,
@@ -88,6 +91,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="match only these: two paths below DIR per line, as in hloc",
     )
+    text = "also write keypoints and matches of all images to this file, in hloc's layout"
+    add("--export", type=Path, metavar="FILE.h5", help=text)
     add("--format", choices=FORMS, help="also write submission.csv; imc2023 is also for 2024")
     add(
         "--rotations",
@@ -122,6 +127,8 @@ def run(arguments: argparse.Namespace) -> int:
     more = [arguments.pairs, arguments.intrinsics, arguments.masks]
     inputs = [root, options.recipe_file(arguments), *more]
     require_directory_apart(out, filter(None, inputs), arguments.weights)
+    if arguments.export is not None:
+        _require_export(arguments.export, [path for path in inputs if path], work_dir)
     listed = None if arguments.pairs is None else read_pair_list(arguments.pairs, root, datasets)
     with (
         interruptible() as interrupt,
@@ -173,11 +180,21 @@ def run(arguments: argparse.Namespace) -> int:
             # The directory that has the name now is the user's.
             session.status = 1
             problems.append(f"{out} was moved or replaced during the run; no more is written there")
+        if arguments.export is not None and is_here:
+            problems.append(export_matches(arguments.export, out, datasets))
         lines = [*options.plan_lines(arguments, result.report), *_lines(result, root), *problems]
         say("\n".join(filter(None, [*lines, f"results: {out}"])))
         # A run without pairs has no report.
         page = out / "report.html" if result.pairs and is_here else None
         return options.finish(session, page, result.pairs)
+
+
+def _require_export(path: Path, inputs: Sequence[Path], work_dir: Path) -> None:
+    """Raise :class:`UserError` before hours of matching if the file cannot be written after them."""
+    if path.suffix != SUFFIX:
+        raise UserError(f"--export {path}: the name must end in {SUFFIX}")
+    require_h5py()
+    require_apart({"--export": path}, inputs, work_dir)
 
 
 def _lines(result: FolderResult, root: Path) -> Iterator[str]:

@@ -17,7 +17,8 @@ RESULTS = {
     "--json": (".json",),
     "--report": (".html", ".htm"),
     "--out": (".png", ".jpg", ".pdf", ".svg"),
-    "--save": (".npz",),
+    "--save": (".npz", ".h5"),
+    "--export": (".h5",),
 }
 UNFINISHED: set[Path] = set()  # temporary files of this process
 
