@@ -54,15 +54,6 @@ def read_folder(root: Path, *, join: bool = False) -> Datasets:
     return dict(sorted(datasets.items()))
 
 
-def images_below(folder: Path) -> list[Path]:
-    """Return all images below a folder, for a program that names the folder in place of them."""
-    found = _Found()
-    files = [file for _, files in _folders(folder, found) for file in files]
-    for line in found.lines():
-        warn(line)
-    return files
-
-
 @dataclass
 class _Found:
     """Files and folders that are not read, for one line about each kind."""

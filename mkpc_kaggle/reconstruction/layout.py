@@ -10,6 +10,8 @@ import os
 import shutil
 import signal
 import time
+import unicodedata
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from math import inf
@@ -17,7 +19,9 @@ from multiprocessing import get_context
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
 from typing import Any
+from unicodedata import combining
 
+from mkpc_kaggle.reconstruction.colours import colour_points
 from mkpc_kaggle.reconstruction.directory import holds_dataset
 from mkpc_kaggle.scene.export import (
     FORMER,
@@ -51,7 +55,8 @@ def write_layouts(
             yield f"{directory / IMAGES} belongs to another dataset, so {directory / SPARSE} has no images"
             continue
         left = max(0.0, ends - time.monotonic())
-        names = {file.relative_to(root).as_posix(): file.name for file in files}
+        links = link_names(files)
+        names = {file.relative_to(root).as_posix(): link for file, link in links.items()}
         try:
             if held is not None:
                 held[dataset].check()
@@ -69,13 +74,44 @@ def write_images(directory: Path, files: Sequence[Path]) -> None:
     """
     folder = directory / IMAGES
     folder.mkdir(parents=True, exist_ok=True)
-    names = {file.name for file in files}
+    links = link_names(files)
+    names = set(links.values())
     # Files that are no links may be the user's.
     for former in folder.iterdir():
         if former.is_symlink() and former.name not in names:
             former.unlink()
+    for file, name in links.items():
+        _link(folder / name, file.resolve())
+
+
+def link_names(files: Sequence[Path]) -> dict[Path, str]:
+    """Return the name of each file in ``images`` and ``sparse``: its own, if that is unique ASCII.
+
+    Some readers of COLMAP's files decode names byte by byte, which only ASCII survives. Of files
+    with equal names, each has the name of its folder before its own.
+    """
+    counts = Counter(file.name for file in files)
+    names = {file: file.name for file in files if file.name.isascii() and counts[file.name] == 1}
+    used = set(names.values())
     for file in files:
-        _link(folder / file.name, file.resolve())
+        if file in names:
+            continue
+        name = file.name if counts[file.name] == 1 else f"{file.parent.name}_{file.name}"
+        path = PurePosixPath(_ascii(name))
+        number = 1
+        name = path.name
+        while name in used:
+            number += 1
+            name = f"{path.stem}_{number}{path.suffix}"
+        used.add(name)
+        names[file] = name
+    return {file: names[file] for file in files}
+
+
+def _ascii(name: str) -> str:
+    """Return a name in ASCII: letters without accents, and "_" for other characters."""
+    letters = (each for each in unicodedata.normalize("NFKD", name) if not combining(each))
+    return "".join(each if each.isascii() else "_" for each in letters)
 
 
 def _link(path: Path, file: Path) -> None:
@@ -163,7 +199,7 @@ def convert_models(held: HeldDirectory, names: Mapping[str, str]) -> None:
             # Before colours are read: images/ has plain names.
             for image in model.images.values():
                 image.name = names.get(image.name, image.name)
-            model.extract_colors_for_all_images(directory / IMAGES)
+            colour_points(model, directory / IMAGES)
             (made / SPARSE / folder.name).mkdir()
             model.write(made / SPARSE / folder.name)
         for path in filter(Path.is_file, (made / SPARSE).rglob("*")):

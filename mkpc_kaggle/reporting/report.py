@@ -347,7 +347,11 @@ def linked_images(out: Path, batch: str) -> dict[str, Path]:
     # The images that lie directly in DIR have their folder in OUT itself.
     for folder in (out / batch / IMAGES, out / IMAGES):
         if folder.is_dir():
-            return {file.name: file for file in folder.iterdir()}
+            # A link may have another name than the photograph: names of links are ASCII.
+            return {
+                (file.readlink() if file.is_symlink() else file).name: file
+                for file in folder.iterdir()
+            }
     return {}
 
 

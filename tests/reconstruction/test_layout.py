@@ -15,7 +15,13 @@ from test_reconstruct import FIRST, MixedMatcher, cameras, run, write_flat
 from mkpc_kaggle.reconstruction import layout
 from mkpc_kaggle.reconstruction.coordinates import forget_coordinates, keep_coordinates
 from mkpc_kaggle.reconstruction.folder import read_folder
-from mkpc_kaggle.reconstruction.layout import write_images, write_layouts, write_sparse
+from mkpc_kaggle.reconstruction.layout import (
+    link_names,
+    write_images,
+    write_layouts,
+    write_sparse,
+)
+from mkpc_kaggle.reporting.report import linked_images
 from mkpc_kaggle.scene.align import REFERENCE
 
 
@@ -256,3 +262,45 @@ def test_a_device_is_not_copied(tmp_path):
     write_images(tmp_path / "out", [device])
     assert (folder / "0.png").read_bytes() == b"a copy"
     assert [path.name for path in folder.iterdir()] == ["0.png"]
+
+
+def test_names_in_the_layout_are_unique_and_ascii():
+    files = [
+        Path("in/a.jpg"),
+        Path("in/\N{LATIN SMALL LETTER E WITH ACUTE}1.jpg"),
+        Path("in/e1.jpg"),
+        Path("in/\N{CJK UNIFIED IDEOGRAPH-6A4B}.jpg"),
+        Path("in/100/b.jpg"),
+        Path("in/101/b.jpg"),
+    ]
+    names = [*link_names(files).values()]
+    assert names == ["a.jpg", "e1_2.jpg", "e1.jpg", "_.jpg", "100_b.jpg", "101_b.jpg"]
+
+
+def test_a_photograph_with_an_accent_has_an_ascii_name_for_other_programs(tmp_path):
+    root = write_flat(tmp_path / "images", FIRST)
+    name = "00\N{LATIN SMALL LETTER E WITH ACUTE}.png"
+    (root / "00.png").rename(root / name)
+    run(root, tmp_path / "out")
+    assert list(write_layouts(tmp_path / "out", root, read_folder(root), inf)) == []
+    found = load_as_gsplat(tmp_path / "out")
+    assert "00e.png" in found.names
+    assert all(path.is_file() for path in found.paths)
+    original = pycolmap.Reconstruction(tmp_path / "out" / "models" / "0")
+    assert name in {image.name for image in original.images.values()}
+    pictures = linked_images(tmp_path / "out", "images")
+    assert pictures[name].name == "00e.png"
+
+
+def test_points_of_webp_photographs_have_their_colours(tmp_path):
+    root = write_flat(tmp_path / "images", FIRST)
+    for path in root.iterdir():
+        # The name says PNG: some programs save WebP under any name.
+        path.write_bytes(
+            cv2.imencode(".webp", cv2.imread(str(path)), [cv2.IMWRITE_WEBP_QUALITY, 101])[1]
+        )
+    run(root, tmp_path / "out")
+    assert list(write_layouts(tmp_path / "out", root, read_folder(root), inf)) == []
+    found = load_as_gsplat(tmp_path / "out")
+    greys = [float(cv2.imread(str(path)).mean()) for path in found.paths]
+    assert 0 < min(greys) - 1 <= found.colours.min() <= found.colours.max() <= max(greys) + 1
