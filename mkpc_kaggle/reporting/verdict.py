@@ -2,7 +2,7 @@
 
 import json
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import pairwise
@@ -127,7 +127,12 @@ def _scene_problems(scene: SceneRecord, log: RunLog) -> Iterator[str]:
         yield f"{where}no camera for {_named(missing)}: add photographs between these and the others"
     if len(scene.models) > 1:
         sizes = ", ".join(str(len(model.images)) for model in scene.models)
-        yield f"{where}the images form {len(scene.models)} models of {sizes}: add photographs that connect them"
+        near = nearest_to_joining(scene, records, log.digests)
+        between = f", between {near} for example" if near else ""
+        yield (
+            f"{where}the images form {len(scene.models)} models of {sizes}: "
+            f"add photographs that connect them{between}"
+        )
     uncertain = sorted(
         {Path(found.image.name).name for found in _cameras(scene) if _is_uncertain(found)}
     )
@@ -137,6 +142,33 @@ def _scene_problems(scene: SceneRecord, log: RunLog) -> Iterator[str]:
     worst = max(model.reprojection_error for model in scene.models)
     if worst > MAX_REPROJECTION_PX:
         yield f"{where}a mean reprojection error of {worst:.1f} px is large: the lens may be distorted"
+
+
+def nearest_to_joining(
+    scene: SceneRecord, records: Sequence[PairRecord], digests: Mapping[str, str]
+) -> str:
+    """Return the pair of images of two models with the most inliers, as text; empty if no such
+    pair has any.
+
+    ``digests`` are of the contents of the images, by name.
+    """
+    models = [{found.image.digest for found in model.images} for model in scene.models]
+
+    def models_of(file: str) -> set[int]:
+        return {number for number, images in enumerate(models) if digests.get(file) in images}
+
+    def would_join(record: PairRecord) -> bool:
+        first = models_of(record.pair.file0)
+        second = models_of(record.pair.file1)
+        # Two images of one model join nothing.
+        return bool(record.inliers and first and second and first.isdisjoint(second))
+
+    # The first of several equal ones, so that equal runs name the same pair
+    best = max(filter(would_join, records), key=lambda record: record.inliers, default=None)
+    if best is None:
+        return ""
+    name0, name1 = best.pair.names
+    return f"{name0} and {name1} ({plural(best.inliers, 'inlier')})"
 
 
 def _cameras(scene: SceneRecord) -> Iterator[RegisteredImage]:
