@@ -33,7 +33,7 @@ from mkpc_kaggle.scene.export import (
     remove_parts,
     replace_models,
 )
-from mkpc_kaggle.scene.keypoints import MergedGraph
+from mkpc_kaggle.scene.keypoints import Lens, MergedGraph
 from mkpc_kaggle.scene.reconstruction import (
     MIN_IMAGES,
     Reconstruction,
@@ -56,6 +56,10 @@ MAX_REFINEMENTS = 5
 MAX_ITERATIONS = 50  # of each bundle adjustment of a refinement
 MIN_CHANGE = 0.0005  # share of the observations; with fewer changes, a model has converged
 SEED = 0
+# Verification keeps the matches of E or F, whichever explains more, and F knows no focal length. So
+# focal lengths of a half to twice the true ones keep 0.998 of the matches of castle_p19 and 0.999 of
+# herz_jesus_p8. Beyond, nothing was measured.
+MAX_FOCAL_CHANGE = 2.0
 DEFAULTS = SceneConfig()
 
 
@@ -76,7 +80,8 @@ def structure_from_motion(
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
     pycolmap.set_random_seed(SEED)
     with pycolmap.Database.open(":memory:") as database:
-        _fill(database, merged, shared, config)
+        # The refinement reads the verified matches alone; the mapper reads relative poses, too.
+        _fill(database, merged, shared, config, reuse=bool(former))
         if former:
             models = refine_models(database, merged.graph, config.threads, former)
         else:
@@ -107,7 +112,7 @@ def write_files(
         except RuntimeError as error:  # a full disk; its message names no file
             raise OSError(f"{directory / DATABASE} cannot be written") from error
         with file as database:
-            _fill(database, merged, shared, config)
+            _fill(database, merged, shared, config, reuse=True)
         for number, model in enumerate(models):
             kept = {each.image.name for each in model.images}
             # A list, because the loop removes frames from the mapping.
@@ -128,17 +133,23 @@ def write_files(
 
 
 def _fill(
-    database: Any, merged: MergedGraph, shared: SharedIntrinsics, config: SceneConfig
+    database: Any,
+    merged: MergedGraph,
+    shared: SharedIntrinsics,
+    config: SceneConfig,
+    *,
+    reuse: bool,
 ) -> None:
     """Write the images, cameras and keypoints, and each edge's matches and verified geometry.
 
-    An edge without enough support keeps its matches, and has no geometry.
+    An edge without enough support keeps its matches, and has no geometry. For ``reuse`` see
+    :func:`verify`.
     """
     # One transaction: a commit for each edge would wait for the disk.
     with pycolmap.DatabaseTransaction(database):
         cameras = _write_images(database, merged, shared, config.camera_model)
         edges = merged.graph.edges
-        geometries = verify(merged, cameras)
+        geometries = verify(merged, cameras, reuse=reuse)
         inliers = [len(geometry.inlier_matches) for geometry in geometries]
         ends = [(edge.first, edge.second) for edge in edges]
         for number, is_supported in enumerate(supported(ends, inliers, config.min_support)):
@@ -207,24 +218,30 @@ def _write_camera(
     return camera
 
 
-def verify(merged: MergedGraph, cameras: Sequence[Any]) -> list[Any]:
+def verify(merged: MergedGraph, cameras: Sequence[Any], *, reuse: bool = False) -> list[Any]:
     """Return the two-view geometry of each edge, with its inliers, for the ``cameras`` of the
     images.
 
-    Geometries that are known for the same two cameras are not estimated again.
+    Geometries that are known for the same two cameras are not estimated again. With ``reuse``, one
+    at other focal lengths is used, too, without its E.
     """
     ransac = {"max_error": MAX_ERROR_PX, "max_num_trials": MAX_TRIALS, "random_seed": SEED}
     # COLMAP takes matches without motion for a watermark, but nearby views have many of these.
     settings = {"ransac": ransac, "min_num_inliers": MIN_MATCHES, "detect_watermark": False}
     options = pycolmap.TwoViewGeometryOptions(settings)
     points = [found.astype(np.float64) + CENTRE_PX for found in merged.keypoints]
-    versions = [(camera.model, *camera.params) for camera in cameras]
+    lenses = [_lens(camera) for camera in cameras]
 
     def estimate(number: int) -> None:
         edge = merged.graph.edges[number]
-        key = (number, versions[edge.first], versions[edge.second])
-        if key not in merged.geometries:
-            merged.geometries[key] = pycolmap.estimate_two_view_geometry(
+        both = (lenses[edge.first], lenses[edge.second])
+        known = merged.geometries.setdefault(number, {})
+        similar = [each for each in known if reuse and _are_similar(each, both)]
+        if both not in known and similar:
+            found[number] = _uncalibrated(known[similar[0]])
+            return
+        if both not in known:
+            known[both] = pycolmap.estimate_two_view_geometry(
                 cameras[edge.first],
                 points[edge.first],
                 cameras[edge.second],
@@ -232,13 +249,37 @@ def verify(merged: MergedGraph, cameras: Sequence[Any]) -> list[Any]:
                 merged.matches[number],
                 options,
             )
-        found[number] = merged.geometries[key]
+        found[number] = known[both]
 
     found: list[Any] = [None] * len(merged.graph.edges)
     # On all cores: an edge starts from the same seed in every thread, so results are the same.
     with ThreadPoolExecutor() as pool:
         list(pool.map(estimate, range(len(found))))
     return found
+
+
+def _lens(camera: Any) -> Lens:
+    focal = set(camera.focal_length_idxs())
+    others = (value for index, value in enumerate(camera.params) if index not in focal)
+    return Lens(camera.model, tuple(others), camera.mean_focal_length())
+
+
+def _are_similar(first: Sequence[Lens], second: Sequence[Lens]) -> bool:
+    """Return whether two pairs of cameras verify the same matches."""
+    return all(
+        (one.model, one.others) == (other.model, other.others)
+        and 1 / MAX_FOCAL_CHANGE <= one.focal / other.focal <= MAX_FOCAL_CHANGE
+        for one, other in zip(first, second, strict=True)
+    )
+
+
+def _uncalibrated(geometry: Any) -> Any:
+    """Return a geometry without E, which holds at its focal lengths alone."""
+    kept = pycolmap.TwoViewGeometry(geometry.todict())
+    kept.E = None
+    if kept.config == pycolmap.TwoViewGeometryConfiguration.CALIBRATED:
+        kept.config = pycolmap.TwoViewGeometryConfiguration.UNCALIBRATED
+    return kept
 
 
 def run_mapper(database: Any, graph: ViewGraph, threads: int) -> list[Any]:

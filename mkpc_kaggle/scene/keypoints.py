@@ -6,9 +6,8 @@ Structure from motion tracks a point through several pairs, so its positions in 
 one keypoint.
 """
 
-from collections.abc import Hashable
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,17 +21,27 @@ CELL_PX = 0.75  # points of an image in one cell of this size are one keypoint
 Index = NDArray[np.uint32]  # (M, 2): indices of the matched keypoints in both images of an edge
 
 
+class Lens(NamedTuple):
+    """A camera as far as verification depends on it: COLMAP's model, the other parameters, and the
+    mean focal length in pixels.
+    """
+
+    model: Any
+    others: tuple[float, ...]
+    focal: float
+
+
 class MergedGraph:
     """A view graph with the keypoints of its images, and all that was computed from these.
 
     The same graph is reconstructed with separate and with shared intrinsics, and then exported. So
     keypoints are merged once, and ``geometries`` has the two-view geometries that are verified so
-    far, by edge and by its cameras.
+    far, by the number of their edge and by its two cameras.
     """
 
     def __init__(self, graph: ViewGraph) -> None:
         self.graph = graph
-        self.geometries: dict[Hashable, Any] = {}
+        self.geometries: dict[int, dict[tuple[Lens, Lens], Any]] = {}
 
     @property
     def keypoints(self) -> list[Points]:

@@ -16,6 +16,7 @@ from mkpc_kaggle.recipe import CameraSharing, SceneConfig
 from mkpc_kaggle.scene import colmap
 from mkpc_kaggle.scene.choose import estimate_at_known_focals
 from mkpc_kaggle.scene.export import HeldDirectory
+from mkpc_kaggle.scene.keypoints import MergedGraph
 from mkpc_kaggle.scene.reconstruct import Solution, reconstruct_batch, reconstruct_sharing
 from mkpc_kaggle.scene.reconstruction import RegisteredImage, SfmModel
 from mkpc_kaggle.scene.shared_intrinsics import shared_intrinsics
@@ -204,3 +205,51 @@ def test_an_image_that_the_scene_lacks_has_the_shared_focal_length():
     both = {pair.image0.digest: FOCAL, pair.image1.digest: FOCAL}
     assert estimate_at_known_focals(pair, both, focal, magsac) is not None
     assert estimate_at_known_focals(pair, {}, focal, magsac) is None
+
+
+def test_shared_intrinsics_verify_no_edge_again(tmp_path, monkeypatch):
+    verified = []
+    estimate = pycolmap.estimate_two_view_geometry
+
+    def counted(*arguments: object) -> object:
+        verified.append(arguments)
+        return estimate(*arguments)
+
+    monkeypatch.setattr(pycolmap, "estimate_two_view_geometry", counted)
+    scene = synthetic_scene(7, 15, points=250, focals=[FOCAL] * 7, seed=1)
+    solution = reconstruct_batch(scene.pairs, CONFIG, export=HeldDirectory.of(tmp_path))
+    assert len(set(focals_of(solution))) == 1
+    assert len(verified) == len(scene.pairs)
+    with pycolmap.Database.open(str(tmp_path / "database.db")) as database:
+        assert database.num_cameras() == 1
+        for geometry in database.read_two_view_geometries()[1]:
+            assert len(geometry.inlier_matches) > 15
+            # Of the camera before, E would be wrong.
+            assert geometry.E is None or not geometry.E.any()
+
+
+def test_a_geometry_of_other_focal_lengths_stands_in_without_its_essential_matrix():
+    scene = synthetic_scene(4, 6, points=250)
+    merged = MergedGraph(ViewGraph.of_pairs(scene.pairs))
+
+    def verified(
+        focal: float, model: str = "SIMPLE_PINHOLE", *, reuse: bool = False
+    ) -> list[pycolmap.TwoViewGeometry]:
+        camera = pycolmap.Camera.create_from_model_name(1, model, focal, *WIDE)
+        camera.has_prior_focal_length = True
+        return colmap.verify(merged, [camera] * 4, reuse=reuse)
+
+    first = verified(FOCAL)
+    for focal in (0.6 * FOCAL, 1.9 * FOCAL):
+        for again, former in zip(verified(focal, reuse=True), first, strict=True):
+            assert np.array_equal(again.inlier_matches, former.inlier_matches)
+            assert np.array_equal(again.F, former.F)
+            assert again.E is None
+    # The mapper reads relative poses, so without ``reuse`` each edge is verified; also with another
+    # model of the camera, and at quite another focal length.
+    for others in (
+        verified(0.9 * FOCAL),
+        verified(FOCAL, "SIMPLE_RADIAL", reuse=True),
+        verified(4 * FOCAL, reuse=True),
+    ):
+        assert all(geometry.E is not None for geometry in others)
