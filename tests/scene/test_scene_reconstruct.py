@@ -26,6 +26,7 @@ from mkpc_kaggle.geometry.robust import RobustConfig
 from mkpc_kaggle.recipe import CameraSharing, SceneConfig
 from mkpc_kaggle.scene import colmap
 from mkpc_kaggle.scene.choose import Reason
+from mkpc_kaggle.scene.export import HeldDirectory
 from mkpc_kaggle.scene.reconstruct import Solution, reconstruct_batch
 from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair
 
@@ -250,7 +251,7 @@ def test_an_edge_is_verified_once_for_the_same_cameras_on_any_number_of_threads(
         calls.clear()
         out = tmp_path / str(threads)
         # Both the scene and its files use all geometries.
-        reconstruct_batch(scene.pairs, config, export=out)
+        reconstruct_batch(scene.pairs, config, export=HeldDirectory.of(out))
         assert len(calls) == len(scene.pairs)
         with closing(sqlite3.connect(out / "database.db")) as database:
             dump = list(database.iterdump())
