@@ -88,7 +88,10 @@ class Reconstructing:
             state.stale.discard(job.batch)
         text = f"{record.registered} of {plural(record.images, 'image')}"
         run.log.note(EventKind.SCENE, f"{job.batch}: {text}")
-        run.progress.note(f"batch {job.batch}: {text} with a camera")
+        note = f"batch {job.batch}: {text} with a camera"
+        if record.loose:
+            note += f", {record.loose} of them unknown to within the size of their model"
+        run.progress.note(note)
 
     def lose(self, job: SceneJob, failure: Failure) -> None:
         run = self._run

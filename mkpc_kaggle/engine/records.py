@@ -200,6 +200,12 @@ class SceneRecord:
             choices=choices or {},
         )
 
+    @property
+    def loose(self) -> int:
+        """Number of images whose only cameras are in loose models (:attr:`SfmModel.is_loose`)."""
+        sure = {found.image.name for m in self.models if not m.is_loose for found in m.images}
+        return len({found.image.name for m in self.models for found in m.images} - sure)
+
 
 def unmatched_scene(batch: str, pairs: Iterable[Pair]) -> SceneRecord:
     """Return the record of a batch whose pairs have no matches. It is not stored, as no scene is

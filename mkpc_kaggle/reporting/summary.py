@@ -193,7 +193,10 @@ def facts(run: Run) -> Iterator[tuple[str, str, str]]:
     if scenes:
         placed = sum(scene.registered for scene in scenes)
         images = sum(scene.images for scene in scenes)
-        yield "images with a camera", f"{placed} of {images}", f"in {plural(len(scenes), 'batch')}"
+        remark = f"in {plural(len(scenes), 'batch')}"
+        if loose := sum(scene.loose for scene in scenes):
+            remark += f"; {loose} of them unknown to within the size of their model"
+        yield "images with a camera", f"{placed} of {images}", remark
 
 
 def _lines(run: Run) -> Iterator[str]:

@@ -26,7 +26,7 @@ from mkpc_kaggle.reporting.summary import (
     unit_reasons,
 )
 from mkpc_kaggle.scene.choose import Reason
-from mkpc_kaggle.scene.reconstruction import RegisteredImage
+from mkpc_kaggle.scene.reconstruction import RegisteredImage, SfmModel
 from mkpc_kaggle.version import __version__
 
 FORMAT = "mkpc summary 1"  # increase the number if a key changes its meaning or disappears
@@ -60,7 +60,8 @@ def verdict(log: RunLog) -> Verdict:
     if not log.scenes:
         problems += _pair_problems(log.records)
         return Verdict(solved_pairs(log.records), tuple(problems))
-    placed = sum(scene.registered for scene in log.scenes)
+    # Cameras that are unknown to within the size of their model are none.
+    placed = sum(scene.registered - scene.loose for scene in log.scenes)
     images = sum(scene.images for scene in log.scenes)
     # Also without any camera: this line answers the user's question.
     text = f"{placed} of {plural(images, 'image')} with a camera"
@@ -138,6 +139,13 @@ def _scene_problems(scene: SceneRecord, log: RunLog) -> Iterator[str]:
     )
     if uncertain:
         yield f"{where}uncertain cameras: {_named(uncertain)}; add photographs of the same things"
+    for model in scene.models:
+        if model.is_loose:
+            count = plural(len(model.images), "camera")
+            yield (
+                f"{where}a model of {count} hangs together loosely: its cameras are unknown to within "
+                f"{_looseness(model)}; add photographs that connect its parts"
+            )
     # Verified matches fit within 2 px, so a few wrong matches do not explain a large mean.
     worst = max(model.reprojection_error for model in scene.models)
     if worst > MAX_REPROJECTION_PX:
@@ -171,8 +179,16 @@ def nearest_to_joining(
     return f"{name0} and {name1} ({plural(best.inliers, 'inlier')})"
 
 
+def _looseness(model: SfmModel) -> str:
+    """Return the median expected error of a model's centres, as text."""
+    sigmas = [found.sigmas.centre if found.sigmas else np.inf for found in model.images]
+    found = median(sigmas)
+    return f"{100 * found:.2g} % of its size" if np.isfinite(found) else "any distance"
+
+
 def _cameras(scene: SceneRecord) -> Iterator[RegisteredImage]:
-    return (found for model in scene.models for found in model.images)
+    # A loose model has its own line.
+    return (found for model in scene.models if not model.is_loose for found in model.images)
 
 
 def _is_uncertain(found: RegisteredImage) -> bool:

@@ -14,6 +14,10 @@ from mkpc_kaggle.scene.view_graph import BatchImage
 MIN_IMAGES = 3  # in a model
 MIN_POINTS = 30  # seen by a plausible image
 MAX_POINTS = 20_000  # of a model, for pictures and views: the points of the longest tracks
+MAX_SIGMA_IMAGES = 200  # of a model with sigmas; memory is quadratic and time cubic in the images
+# Sigma of centres, in sizes of the model. Over pairs of draws of five scenes, F of cameras with a smaller
+# sigma gains on F of the pair, and F of the others gains nothing (benchmarks/RESULTS.md).
+LOOSE_SIGMA = 0.25
 FOCALS = Range(0.3, 5.0)  # plausible focal lengths, in long sides of the image
 
 
@@ -57,6 +61,18 @@ class SfmModel:
     points: NDArray[np.float64]
     reprojection_error: float
     colmap: Any = None
+
+    @property
+    def is_loose(self) -> bool:
+        """True if most cameras are unknown to within the model's own size.
+
+        Parts of the model then hang together loosely, or wrong matches have bent it.
+        """
+        if len(self.images) > MAX_SIGMA_IMAGES:
+            return False  # not computed
+        # Bundle adjustment does not determine a camera without sigmas.
+        sigmas = [found.sigmas.centre if found.sigmas else np.inf for found in self.images]
+        return bool(sigmas) and float(np.median(sigmas)) > LOOSE_SIGMA
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "colmap": None}

@@ -16,9 +16,8 @@ from scipy.linalg import block_diag
 
 from mkpc_kaggle.geometry.intrinsics import KnownCamera
 from mkpc_kaggle.geometry.two_view import cross_matrix
-from mkpc_kaggle.scene.reconstruction import Sigmas
+from mkpc_kaggle.scene.reconstruction import MAX_SIGMA_IMAGES, Sigmas
 
-MAX_IMAGES = 200  # of a model; memory is quadratic and time cubic in the number of images
 # The world is free, so the normal equations are singular
 DAMPED = pycolmap.BACovarianceOptions({"damping": 1e-3})
 
@@ -34,7 +33,7 @@ def camera_sigmas(
     images = [
         image for _, image in sorted(found.images.items()) if image.has_pose and image.num_points3D
     ]
-    if not 1 < len(images) <= MAX_IMAGES:
+    if not 1 < len(images) <= MAX_SIGMA_IMAGES:
         return {}
     ids = [image.image_id for image in images]
     adjuster = _evaluator(found, images, known)

@@ -1,17 +1,19 @@
 """The lines of a run's summary: doubts, weakest cameras, unfinished work, matchers that do not run."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine.records import NOT_RECONSTRUCTED, PairRecord, SceneRecord
+from mkpc_kaggle.engine.records import NOT_RECONSTRUCTED, About, PairRecord, SceneRecord
 from mkpc_kaggle.engine.request import Ending, RunReport
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.robust import EstimateStats
 from mkpc_kaggle.recipe import Recipe, Unit
+from mkpc_kaggle.reporting.run_log import RunLog
 from mkpc_kaggle.reporting.summary import (
     is_doubtful,
     left_out_line,
@@ -20,6 +22,7 @@ from mkpc_kaggle.reporting.summary import (
     weakest_cameras,
     weakest_line,
 )
+from mkpc_kaggle.reporting.verdict import verdict
 from mkpc_kaggle.scene.choose import Choice, Reason
 from mkpc_kaggle.scene.reconstruction import RegisteredImage, SfmModel, Sigmas
 from mkpc_kaggle.scene.view_graph import BatchImage
@@ -121,3 +124,54 @@ def test_no_line_of_the_summary_is_longer_than_100_characters():
     lines = summary(report(Ending.COMPLETE, FEW_INLIERS)).splitlines()
     assert any(line.startswith("seconds a pair: wait for decoding") for line in lines)
     assert max(map(len, lines)) <= 100
+
+
+def model(*centres: float | None) -> SfmModel:
+    """A model of cameras with these expected errors of their centres; ``None``: unknown."""
+    cameras = []
+    for number, centre in enumerate(centres):
+        sigmas = () if centre is None else Sigmas(0.1, centre, 1.0)
+        cameras.append(camera(f"{number}.png", sigmas))
+    return SfmModel(tuple(cameras), np.zeros((0, 3)), 0.5)
+
+
+@pytest.mark.parametrize(
+    ("centres", "is_loose"),
+    [
+        ((0.01, 0.02, 0.1), False),
+        ((0.39, 0.5, 1.06), True),
+        ((0.01, 0.02, 1.06), False),  # one uncertain camera is no loose model
+        ((None, None, None), True),
+        ((0.01,) * 201, False),
+        ((None,) * 201, False),  # too many images for sigmas
+    ],
+)
+def test_a_model_is_loose_if_most_cameras_are_unknown_to_within_its_size(centres, is_loose):
+    assert model(*centres).is_loose is is_loose
+
+
+def test_images_of_a_loose_model_alone_are_counted_apart():
+    sure = model(0.01, 0.02, 0.03)
+    loose = model(0.5, 0.6, 0.7, 0.8)  # one more image than the other
+    record = SceneRecord("batch", images=5, registered=4, models=(loose, sure))
+    assert record.loose == 1
+    text = summary(report(Ending.COMPLETE, scenes=(record,)))
+    line = "images with a camera: 4 of 5 (in 1 batch; 1 of them unknown to within the size of their model)"
+    assert line in text
+    assert "unknown to within" not in summary(report(Ending.COMPLETE, scenes=(scene(),)))
+
+
+def test_the_verdict_counts_no_camera_of_a_loose_model_and_says_what_to_add():
+    loose = SceneRecord("batch", images=4, registered=4, models=(model(0.39, 0.5, 0.7, 1.06),))
+    log = RunLog(Path("work"), About(), Recipe((Unit(1, "sift", 64),)), (), (), (), (loose,))
+    found = verdict(log)
+    assert found.text.startswith("0 of 4 images with a camera")
+    (problem,) = [problem for problem in found.problems if "loosely" in problem]
+    assert problem == (
+        "a model of 4 cameras hangs together loosely: its cameras are unknown to within 60 % of its size; "
+        "add photographs that connect its parts"
+    )
+    sure = replace(loose, models=(model(0.01, 0.01, 0.01, 0.01),))
+    found = verdict(replace(log, scenes=(sure,)))
+    assert found.text.startswith("4 of 4 images with a camera")
+    assert not found.problems
