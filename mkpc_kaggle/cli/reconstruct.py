@@ -32,6 +32,7 @@ from mkpc_kaggle.reconstruction.layout import write_layouts
 from mkpc_kaggle.reconstruction.outputs import FORMS, Cameras, write_tables
 from mkpc_kaggle.reconstruction.priors import intrinsics_line, read_intrinsics_table
 from mkpc_kaggle.reconstruction.run import FolderResult, for_cameras, reconstruct_folder
+from mkpc_kaggle.reporting.contradictions import contradictions
 from mkpc_kaggle.reporting.summary import pending_lines, trouble, unreadable_images, weakest_line
 
 HELP = """\
@@ -219,6 +220,8 @@ def _lines(result: FolderResult, root: Path) -> Iterator[str]:
         placed = f"{models.total()} of {plural(len(found), 'image')} with a camera"
         yield f"{batches[name]}: {placed}: {why}"
     yield from weakest_line(report.scenes)
+    for scene in report.scenes:
+        yield from (f"{scene.batch}: {sentence}" for sentence in contradictions(scene))
     yield from pending_lines(report)
     unreadable = unreadable_images(report.records)
     yield from (f"cannot be read: {failure}" for failure in unreadable[:MAX_LINES])

@@ -16,9 +16,18 @@ from numpy.typing import NDArray
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Box, Size
 from mkpc_kaggle.geometry.critical_region import CriticalRegion, RegionReason
+from mkpc_kaggle.geometry.intrinsics import KnownCamera
 from mkpc_kaggle.geometry.robust import EstimateStats
 from mkpc_kaggle.scene.choose import Choice, Reason
-from mkpc_kaggle.scene.reconstruction import RegisteredImage, SfmModel, Sigmas
+from mkpc_kaggle.scene.reconstruction import (
+    Comparison,
+    DistortedLens,
+    FocalContradiction,
+    RegisteredImage,
+    SfmModel,
+    Sigmas,
+    Source,
+)
 from mkpc_kaggle.scene.view_graph import BatchImage
 
 T = TypeVar("T")
@@ -107,6 +116,19 @@ CAMERA = record(Camera, K=MATRIX, R=MATRIX, t=array(3))
 # Unknown errors of a camera are an empty tuple.
 SIGMAS: Codec[Sigmas | tuple[()]] = Codec(list, lambda about: Sigmas(*about) if about else ())
 REGISTERED_IMAGE = record(RegisteredImage, image=IMAGE, camera=CAMERA, points=PLAIN, sigmas=SIGMAS)
+KNOWN_CAMERA = record(KnownCamera, model=PLAIN, parameters=several(FLOAT), sigma=FLOAT)
+NAMES = several(PLAIN)
+COMPARISON = record(
+    Comparison,
+    focals=several(
+        record(FocalContradiction, source=enum(Source), images=NAMES, given=FLOAT, fitted=FLOAT)
+    ),
+    lenses=several(record(DistortedLens, images=NAMES, displacement=FLOAT, camera=KNOWN_CAMERA)),
+)
 MODEL = record(
-    SfmModel, images=several(REGISTERED_IMAGE), points=POINTS_3D, reprojection_error=FLOAT
+    SfmModel,
+    images=several(REGISTERED_IMAGE),
+    points=POINTS_3D,
+    reprojection_error=FLOAT,
+    comparison=COMPARISON,
 )

@@ -13,8 +13,10 @@ from typing import Any
 import numpy as np
 
 from mkpc_kaggle.data.outputs import replacing
+from mkpc_kaggle.engine import codec
 from mkpc_kaggle.engine.records import NO_CAMERAS, PairRecord, SceneRecord
 from mkpc_kaggle.errors import UserError, plural, printable, writing
+from mkpc_kaggle.reporting.contradictions import contradictions, named
 from mkpc_kaggle.reporting.run_log import RunLog
 from mkpc_kaggle.reporting.summary import (
     headline,
@@ -30,9 +32,7 @@ from mkpc_kaggle.scene.reconstruction import RegisteredImage, SfmModel
 from mkpc_kaggle.version import __version__
 
 FORMAT = "mkpc summary 1"  # increase the number if a key changes its meaning or disappears
-MAX_NAMED = 3  # images in a sentence
 MAX_CENTRE_SIGMA = 0.02  # of the model's size; a camera with a larger expected error is uncertain
-MAX_REPROJECTION_PX = 1.5  # verified matches are within 2 px
 # Bounds of the histogram of inliers; the last bin is open.
 INLIER_BINS = (0, 1, 10, 20, 50, 100, 200, 500, 1000, 2000)
 
@@ -125,7 +125,7 @@ def _scene_problems(scene: SceneRecord, log: RunLog) -> Iterator[str]:
     names = {Path(file).name for file in files if log.digests.get(file) not in contents}
     missing = sorted(names - known)
     if missing:
-        yield f"{where}no camera for {_named(missing)}: add photographs between these and the others"
+        yield f"{where}no camera for {named(missing)}: add photographs between these and the others"
     if len(scene.models) > 1:
         sizes = ", ".join(str(len(model.images)) for model in scene.models)
         near = nearest_to_joining(scene, records, log.digests)
@@ -138,7 +138,7 @@ def _scene_problems(scene: SceneRecord, log: RunLog) -> Iterator[str]:
         {Path(found.image.name).name for found in _cameras(scene) if _is_uncertain(found)}
     )
     if uncertain:
-        yield f"{where}uncertain cameras: {_named(uncertain)}; add photographs of the same things"
+        yield f"{where}uncertain cameras: {named(uncertain)}; add photographs of the same things"
     for model in scene.models:
         if model.is_loose:
             count = plural(len(model.images), "camera")
@@ -146,10 +146,7 @@ def _scene_problems(scene: SceneRecord, log: RunLog) -> Iterator[str]:
                 f"{where}a model of {count} hangs together loosely: its cameras are unknown to within "
                 f"{_looseness(model)}; add photographs that connect its parts"
             )
-    # Verified matches fit within 2 px, so a few wrong matches do not explain a large mean.
-    worst = max(model.reprojection_error for model in scene.models)
-    if worst > MAX_REPROJECTION_PX:
-        yield f"{where}a mean reprojection error of {worst:.1f} px is large: the lens may be distorted"
+    yield from (f"{where}{sentence}" for sentence in contradictions(scene))
 
 
 def nearest_to_joining(
@@ -194,12 +191,6 @@ def _cameras(scene: SceneRecord) -> Iterator[RegisteredImage]:
 def _is_uncertain(found: RegisteredImage) -> bool:
     # Bundle adjustment does not determine a camera without sigmas.
     return not found.sigmas or found.sigmas.centre > MAX_CENTRE_SIGMA
-
-
-def _named(names: Sequence[str]) -> str:
-    """Return up to ``MAX_NAMED`` names and the number of the others."""
-    more = len(names) - MAX_NAMED
-    return ", ".join(names[:MAX_NAMED]) + (f" and {more} more" if more > 0 else "")
 
 
 def _reprojection(scenes: Sequence[SceneRecord]) -> float:
@@ -311,6 +302,7 @@ def _scene_table(scene: SceneRecord) -> dict[str, Any]:
         "models": [
             {
                 "reprojection_px": _number(model.reprojection_error),
+                "contradictions": codec.COMPARISON.to_json(model.comparison),
                 "cameras": [
                     {
                         "image": found.image.name,

@@ -47,7 +47,15 @@ def adjust(found: Any, known: Mapping[str, KnownCamera]) -> None:
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     for image in placed:
         config.set_constant_cam_intrinsics(image.camera_id)
-    # With more, the last digits vary
+    options = robust_options()
+    adjuster: Any = pycolmap.create_default_ceres_bundle_adjuster(options, config, found)
+    adjuster.solve()
+    found.update_point_3d_errors()
+
+
+def robust_options() -> Any:
+    """Return the options of a bundle adjustment of a finished model."""
+    # With more threads, the last digits vary
     solver = {
         "max_num_iterations": MAX_ITERATIONS,
         "num_threads": 1,
@@ -60,10 +68,7 @@ def adjust(found: Any, known: Mapping[str, KnownCamera]) -> None:
         "loss_function_scale": 1.0,
         "solver_options": solver,
     }
-    options = pycolmap.BundleAdjustmentOptions({"print_summary": False, "ceres": ceres})
-    adjuster: Any = pycolmap.create_default_ceres_bundle_adjuster(options, config, found)
-    adjuster.solve()
-    found.update_point_3d_errors()
+    return pycolmap.BundleAdjustmentOptions({"print_summary": False, "ceres": ceres})
 
 
 def remove_uncertain_points(found: Any) -> None:

@@ -43,7 +43,7 @@ from mkpc_kaggle.scene.reconstruction import (
 )
 from mkpc_kaggle.scene.shared_intrinsics import SharedIntrinsics, start_focal
 from mkpc_kaggle.scene.uncertainty import camera_sigmas
-from mkpc_kaggle.scene.view_graph import MIN_MATCHES, ViewGraph
+from mkpc_kaggle.scene.view_graph import MIN_MATCHES, ViewGraph, known_by_name
 
 CENTRE_PX = 0.5  # in COLMAP the top-left pixel's centre is (0.5, 0.5), here it is (0, 0)
 # Of a verified match; 1 px loses accuracy on tourist photographs, 4 px on repeated windows
@@ -379,15 +379,6 @@ def _reconstruction(found: Sequence[Any], graph: ViewGraph) -> Reconstruction:
     return Reconstruction(
         graph.names, models, "" if models else "the matches gave no plausible model"
     )
-
-
-def known_by_name(graph: ViewGraph) -> dict[str, KnownCamera]:
-    """Return the user's cameras by image name."""
-    return {
-        image.name: graph.known[image.digest]
-        for image in graph.images
-        if image.digest in graph.known
-    }
 
 
 def _sfm_model(found: Any, graph: ViewGraph) -> SfmModel:

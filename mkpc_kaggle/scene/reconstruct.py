@@ -19,7 +19,7 @@ from mkpc_kaggle.scene.shared_intrinsics import (
     given_intrinsics,
     shared_intrinsics,
 )
-from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair, ViewGraph
+from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair, ViewGraph, known_by_name
 
 MIN_PAIRS_PER_IMAGE = 1.35  # connected pairs; with fewer, cameras are poorly constrained
 # Not re-estimated at other focal lengths
@@ -107,6 +107,7 @@ def reconstruct_sharing(
         before, after = (sum(each.observations for each in made) for made in (found, again))
         if after >= MIN_OBSERVATIONS * before:
             found, shared = again, alike
+    found = [compared(part, each) for part, each in zip(parts, found, strict=True)]
     if directory is not None:
         from mkpc_kaggle.scene.colmap import write_files
 
@@ -185,6 +186,18 @@ def reconstruct_connected(
         return Reconstruction(names, failure=f"pycolmap cannot be imported: {error}")
     except (RuntimeError, ValueError) as error:
         return Reconstruction(names, failure=f"pycolmap failed: {error}")
+
+
+def compared(merged: MergedGraph, found: Reconstruction) -> Reconstruction:
+    """Return the reconstruction, each model with the assumptions that its photographs contradict."""
+    if not found.models:
+        return found
+    # Only with a model: pycolmap may be missing
+    from mkpc_kaggle.scene.comparison import compare
+
+    known = known_by_name(merged.graph)
+    models = tuple(replace(each, comparison=compare(each, known)) for each in found.models)
+    return replace(found, models=models)
 
 
 def models_of(reconstructions: Sequence[Reconstruction]) -> tuple[SfmModel, ...]:

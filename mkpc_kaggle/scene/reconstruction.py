@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from enum import StrEnum
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 
 from mkpc_kaggle.config import Range
 from mkpc_kaggle.geometry.cameras import Camera
+from mkpc_kaggle.geometry.intrinsics import KnownCamera
 from mkpc_kaggle.scene.view_graph import BatchImage
 
 MIN_IMAGES = 3  # in a model
@@ -34,7 +36,8 @@ class RegisteredImage:
     """An image with its camera, in the model's world units; ``points`` is the number of visible
     points.
 
-    ``sigmas`` is empty if unknown.
+    ``sigmas`` is empty if unknown: the points do not determine the camera, or the model has more
+    than ``MAX_SIGMA_IMAGES`` images.
     """
 
     image: BatchImage
@@ -46,6 +49,47 @@ class RegisteredImage:
     def focal(self) -> float:
         """Focal length in pixels."""
         return float(self.camera.K[0, 0])
+
+
+class Source(StrEnum):
+    """Origin of a focal length that was given."""
+
+    INTRINSICS = "--intrinsics"
+    EXIF = "EXIF"
+
+
+@dataclass(frozen=True)
+class FocalContradiction:
+    """A given focal length that the photographs contradict; both are medians over the images, in
+    pixels.
+    """
+
+    source: Source
+    images: tuple[str, ...]
+    given: float
+    fitted: float
+
+
+@dataclass(frozen=True)
+class DistortedLens:
+    """A lens with radial distortion in a model of pinholes.
+
+    ``displacement`` is that of a point half the long side away from the middle, as a share of this
+    distance; negative for a barrel. ``camera`` has the model and the parameters that fit, as in a
+    table of intrinsics.
+    """
+
+    images: tuple[str, ...]
+    displacement: float
+    camera: KnownCamera
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What the photographs of a model contradict; see :mod:`mkpc_kaggle.scene.comparison`."""
+
+    focals: tuple[FocalContradiction, ...] = ()
+    lenses: tuple[DistortedLens, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +105,7 @@ class SfmModel:
     points: NDArray[np.float64]
     reprojection_error: float
     colmap: Any = None
+    comparison: Comparison = Comparison()
 
     @property
     def is_loose(self) -> bool:

@@ -36,7 +36,7 @@ def camera_sigmas(
     if not 1 < len(images) <= MAX_SIGMA_IMAGES:
         return {}
     ids = [image.image_id for image in images]
-    adjuster = _evaluator(found, images, known)
+    adjuster = evaluator(found, images, known)
     fit = adjuster.solve().ceres_summary
     redundancy = fit.num_residuals - fit.num_effective_parameters + 7
     solved: Any = redundancy > 0 and pycolmap.estimate_ba_covariance(DAMPED, found, adjuster)
@@ -57,7 +57,7 @@ def camera_sigmas(
     return dict(zip((image.name for image in images), rows, strict=True))
 
 
-def _evaluator(found: Any, images: Sequence[Any], known: Mapping[str, KnownCamera]) -> Any:
+def evaluator(found: Any, images: Sequence[Any], known: Mapping[str, KnownCamera]) -> Any:
     """Return a bundle adjustment of the images that evaluates the model and leaves it as it is."""
     config = pycolmap.BundleAdjustmentConfig()
     for image in images:

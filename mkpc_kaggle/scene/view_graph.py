@@ -142,3 +142,12 @@ def tracks_of(results: Sequence[UnitResult]) -> Matches:
         return tracks
     # Any connection is better than none.
     return Matches.concatenate(each.matches for each in results)
+
+
+def known_by_name(graph: ViewGraph) -> dict[str, KnownCamera]:
+    """Return the user's cameras by image name."""
+    return {
+        image.name: graph.known[image.digest]
+        for image in graph.images
+        if image.digest in graph.known
+    }

@@ -1,0 +1,53 @@
+"""Sentences about what the photographs of a scene contradict, each with its remedy."""
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from mkpc_kaggle.engine.records import SceneRecord
+from mkpc_kaggle.errors import plural
+from mkpc_kaggle.scene.reconstruction import DistortedLens, FocalContradiction, Source
+
+MAX_NAMED = 3  # images in a sentence
+
+
+def contradictions(scene: SceneRecord) -> Iterator[str]:
+    """Yield a sentence for each assumption that the photographs of a scene contradict."""
+    for model in scene.models:
+        for focal in model.comparison.focals:
+            yield _focal_sentence(focal)
+        for lens in model.comparison.lenses:
+            yield _lens_sentence(lens, is_everything=len(lens.images) == scene.images)
+
+
+def _focal_sentence(found: FocalContradiction) -> str:
+    images = named([Path(name).name for name in found.images])
+    if found.source is Source.INTRINSICS:
+        return (
+            f"the focal length of {found.given:.0f} px in --intrinsics contradicts the photographs, which "
+            f"fit {found.fitted:.0f} px: {images}; correct or remove the row"
+        )
+    return (
+        f"the focal length of {found.given:.0f} px in EXIF contradicts the photographs, which fit "
+        f"{found.fitted:.0f} px: {images}; the cameras have the latter. If they look wrong, give "
+        "--intrinsics or remove the focal length from EXIF"
+    )
+
+
+def _lens_sentence(found: DistortedLens, *, is_everything: bool) -> str:
+    camera = found.camera
+    parameters = " ".join(f"{value:.5g}" for value in camera.parameters)
+    first = "*" if is_everything else found.images[0]
+    others = "" if is_everything or len(found.images) == 1 else ", and the same for the others"
+    images = named([Path(name).name for name in found.images])
+    return (
+        f"the lens of {plural(len(found.images), 'photograph')} is distorted by "
+        f"{100 * abs(found.displacement):.1f} % at the edge, and neither the cameras nor their expected errors "
+        f"include that: {images}; give --intrinsics with the row "
+        f"{first},{camera.model},{parameters},{camera.sigma:g}{others}"
+    )
+
+
+def named(names: Sequence[str]) -> str:
+    """Return up to ``MAX_NAMED`` names and the number of the others."""
+    more = len(names) - MAX_NAMED
+    return ", ".join(names[:MAX_NAMED]) + (f" and {more} more" if more > 0 else "")

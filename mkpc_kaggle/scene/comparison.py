@@ -1,0 +1,187 @@
+"""Comparison of a model's assumptions with its photographs: given focal lengths, and lenses without
+distortion.
+
+Bundle adjustment makes the best of a wrong assumption: reprojection errors stay small, since matches
+were verified under the same assumption, and the poses are wrong. So a copy of the finished model is
+adjusted with all focal lengths free, and with one radial coefficient for each pinhole. If these move
+clearly, the photographs contradict the assumption. The model itself does not change. The copy starts
+close to its optimum, so it takes a small part of the time of the model.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import pycolmap
+
+from mkpc_kaggle.geometry.intrinsics import KnownCamera
+from mkpc_kaggle.scene.adjustment import robust_options
+from mkpc_kaggle.scene.reconstruction import (
+    MAX_SIGMA_IMAGES,
+    Comparison,
+    DistortedLens,
+    FocalContradiction,
+    RegisteredImage,
+    SfmModel,
+    Source,
+)
+from mkpc_kaggle.scene.uncertainty import DAMPED, evaluator
+
+PINHOLES = (pycolmap.CameraModelId.SIMPLE_PINHOLE, pycolmap.CameraModelId.PINHOLE)
+MAX_ASPECT_RATIO = 1.02  # of two focal lengths; a radial coefficient needs a common one
+# Relative deviations of a focal length. Calibrations are better than 5 %. EXIF's values are rounded
+# and ignore the distance of focus.
+MAX_DEVIATION = 0.05
+MAX_EXIF_DEVIATION = 0.3
+MAX_PRIOR_SIGMAS = 3.0  # of a prior
+# Displacement of a point half the long side away from the middle, as a share of this distance. The
+# largest of five scenes of undistorted photographs is 0.0014; k = -0.05 of a phone is 0.015.
+MIN_DISPLACEMENT = 0.005
+MIN_LENS_IMAGES = 3  # of one size; a single weak camera fits any coefficient
+MIN_AGREEING = 0.8  # share of these images with at least half of the median displacement
+CLEAR_SIGMAS = 5.0  # smaller differences are noise
+LENS_SIGMA = 5.0  # percent, of the focal length in the row to give
+
+
+class Freed(NamedTuple):
+    """A registered image with its camera of the copy, as pycolmap has it."""
+
+    found: RegisteredImage
+    camera: Any
+    is_radial: bool  # the radial coefficient is free, too
+
+    @property
+    def focal(self) -> float:
+        return float(self.camera.mean_focal_length())
+
+    @property
+    def displacement(self) -> float:
+        """The displacement as in :class:`DistortedLens`."""
+        half = max(self.camera.width, self.camera.height) / 2
+        return float(self.camera.params[3] * (half / self.focal) ** 2)
+
+
+def compare(model: SfmModel, known: Mapping[str, KnownCamera]) -> Comparison:
+    """Return what the photographs of a model contradict. ``known`` are the user's cameras, by image
+    name.
+    """
+    copy = pycolmap.Reconstruction(model.colmap)
+    radial = {number for number, camera in copy.cameras.items() if _free_radial(camera)}
+    config = pycolmap.BundleAdjustmentConfig()
+    for number in sorted(copy.reg_image_ids()):
+        config.add_image(number)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    adjuster: Any = pycolmap.create_default_ceres_bundle_adjuster(robust_options(), config, copy)
+    adjuster.solve()
+    images = {image.name: image for image in copy.images.values()}
+    freed = []
+    for found in model.images:
+        camera = images[found.image.name].camera
+        freed.append(Freed(found, camera, camera.camera_id in radial))
+    given = [*_given_focals(copy, freed, known)]
+    # A wrong focal length bends a model as a lens does. So does a model that is not determined.
+    wrong = {name for contradiction in given for name in contradiction.images}
+    determined = [
+        each
+        for each in freed
+        if each.found.image.name not in wrong
+        and (each.found.sigmas or len(freed) > MAX_SIGMA_IMAGES)
+    ]
+    focals = (*given, *_exif_focals(determined, known))
+    return Comparison(focals, tuple(_lenses(copy, determined)))
+
+
+def _free_radial(camera: Any) -> bool:
+    """Give a pinhole a radial coefficient of 0. Return whether it has one now."""
+    *focals, x, y = camera.params
+    if camera.model not in PINHOLES or max(focals) > MAX_ASPECT_RATIO * min(focals):
+        return False
+    focal = camera.mean_focal_length()
+    camera.model = pycolmap.CameraModelId.SIMPLE_RADIAL
+    camera.params = [focal, x, y, 0.0]
+    return True
+
+
+def _given_focals(
+    copy: Any, freed: Sequence[Freed], known: Mapping[str, KnownCamera]
+) -> Iterable[FocalContradiction]:
+    """Yield the user's cameras with a focal length that the photographs contradict."""
+    for camera in dict.fromkeys(known.values()):
+        alike = [each for each in freed if known.get(each.found.image.name) == camera]
+        if not alike:
+            continue
+        fitted = float(np.median([each.focal for each in alike]))
+        limit = np.log1p(max(MAX_DEVIATION, MAX_PRIOR_SIGMAS * camera.sigma / 100))
+        deviation = abs(np.log(fitted / camera.focal))
+        if deviation > limit and deviation > CLEAR_SIGMAS * _sigma(copy, alike, 0) / fitted:
+            names = tuple(each.found.image.name for each in alike)
+            yield FocalContradiction(Source.INTRINSICS, names, camera.focal, fitted)
+
+
+def _exif_focals(
+    freed: Sequence[Freed], known: Mapping[str, KnownCamera]
+) -> Iterable[FocalContradiction]:
+    """Yield the images whose refined focal lengths are far from those of EXIF."""
+    wrong = []
+    for each in freed:
+        image = each.found.image
+        # The user's cameras replace those of EXIF.
+        if not image.focal or image.name in known:
+            continue
+        deviation = abs(np.log(each.found.focal / image.focal))
+        sigma = each.found.sigmas.focal / 100 if each.found.sigmas else 0.0
+        if deviation > np.log1p(MAX_EXIF_DEVIATION) and deviation > CLEAR_SIGMAS * sigma:
+            wrong.append(each.found)
+    if wrong:
+        given = float(np.median([found.image.focal for found in wrong]))
+        fitted = float(np.median([found.focal for found in wrong]))
+        names = tuple(found.image.name for found in wrong)
+        yield FocalContradiction(Source.EXIF, names, given, fitted)
+
+
+def _lenses(copy: Any, freed: Sequence[Freed]) -> Iterable[DistortedLens]:
+    """Yield the lenses of a model's pinholes that are clearly distorted; images of one size share
+    a lens.
+    """
+    pinholes = [each for each in freed if each.is_radial]
+    for size in dict.fromkeys(each.found.image.size for each in pinholes):
+        alike = [each for each in pinholes if each.found.image.size == size]
+        displacement = float(np.median([each.displacement for each in alike]))
+        agreeing = sum(each.displacement / displacement > 0.5 for each in alike)
+        if (
+            len(alike) < MIN_LENS_IMAGES
+            or abs(displacement) < MIN_DISPLACEMENT
+            or agreeing < MIN_AGREEING * len(alike)
+        ):
+            continue
+        coefficient = float(np.median([each.camera.params[3] for each in alike]))
+        if abs(coefficient) < CLEAR_SIGMAS * _sigma(copy, alike, 1):
+            continue
+        focal = float(np.median([each.focal for each in alike]))
+        parameters = (focal, size.width / 2, size.height / 2, coefficient)
+        camera = KnownCamera("SIMPLE_RADIAL", parameters, LENS_SIGMA)
+        names = tuple(each.found.image.name for each in alike)
+        yield DistortedLens(names, displacement, camera)
+
+
+def _sigma(copy: Any, freed: Sequence[Freed], parameter: int) -> float:
+    """Return the median standard deviation of a free parameter of the cameras: 0 is the first focal
+    length in pixels, 1 the radial coefficient. Infinity if the model does not determine it.
+    """
+    images = [image for _, image in sorted(copy.images.items()) if image.has_pose]
+    # As for the model: time and memory would be too much. The many images have little noise.
+    if len(images) > MAX_SIGMA_IMAGES:
+        return 0.0
+    adjuster = evaluator(copy, images, {})
+    fit = adjuster.solve().ceres_summary
+    redundancy = fit.num_residuals - fit.num_effective_parameters + 7
+    solved: Any = redundancy > 0 and pycolmap.estimate_ba_covariance(DAMPED, copy, adjuster)
+    if not solved:
+        return float("inf")
+    noise = 2 * fit.initial_cost / redundancy  # square pixels, of a keypoint's coordinate
+    variances = []
+    for each in freed:
+        covariance = solved.get_other_params_cov(each.camera.params)
+        variances.append(covariance[parameter, parameter])
+    found = float(np.sqrt(noise * np.median(variances)))
+    return found if np.isfinite(found) else float("inf")
