@@ -28,7 +28,7 @@ from mkpc_kaggle.reporting.summary import (
     unit_reasons,
 )
 from mkpc_kaggle.scene.choose import Reason
-from mkpc_kaggle.scene.reconstruction import RegisteredImage, SfmModel
+from mkpc_kaggle.scene.reconstruction import MAX_SIGMA_IMAGES, RegisteredImage, SfmModel
 from mkpc_kaggle.version import __version__
 
 FORMAT = "mkpc summary 1"  # increase the number if a key changes its meaning or disappears
@@ -135,7 +135,14 @@ def _scene_problems(scene: SceneRecord, log: RunLog) -> Iterator[str]:
             f"add photographs that connect them{between}"
         )
     uncertain = sorted(
-        {Path(found.image.name).name for found in _cameras(scene) if _is_uncertain(found)}
+        {
+            Path(found.image.name).name
+            for model in scene.models
+            # A loose model has its own line.
+            if not model.is_loose
+            for found in model.images
+            if _is_uncertain(found, model)
+        }
     )
     if uncertain:
         yield f"{where}uncertain cameras: {named(uncertain)}; add photographs of the same things"
@@ -183,14 +190,11 @@ def _looseness(model: SfmModel) -> str:
     return f"{100 * found:.2g} % of its size" if np.isfinite(found) else "any distance"
 
 
-def _cameras(scene: SceneRecord) -> Iterator[RegisteredImage]:
-    # A loose model has its own line.
-    return (found for model in scene.models if not model.is_loose for found in model.images)
-
-
-def _is_uncertain(found: RegisteredImage) -> bool:
-    # Bundle adjustment does not determine a camera without sigmas.
-    return not found.sigmas or found.sigmas.centre > MAX_CENTRE_SIGMA
+def _is_uncertain(found: RegisteredImage, model: SfmModel) -> bool:
+    if found.sigmas:
+        return found.sigmas.centre > MAX_CENTRE_SIGMA
+    # Bundle adjustment does not determine a camera without sigmas. Large models have none.
+    return len(model.images) <= MAX_SIGMA_IMAGES
 
 
 def _reprojection(scenes: Sequence[SceneRecord]) -> float:

@@ -1,0 +1,199 @@
+"""The verdict on a run: each of its sentences has an input on which it speaks, and one on which it
+does not.
+"""
+
+import ast
+import inspect
+import re
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mkpc_kaggle.data.competition import Pair
+from mkpc_kaggle.engine.records import (
+    NO_CAMERAS,
+    About,
+    Event,
+    EventKind,
+    PairRecord,
+    SceneRecord,
+    UnitRecord,
+)
+from mkpc_kaggle.engine.request import Ending
+from mkpc_kaggle.geometry.cameras import Camera
+from mkpc_kaggle.geometry.coordinates import Size
+from mkpc_kaggle.geometry.intrinsics import KnownCamera
+from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
+from mkpc_kaggle.geometry.robust import EstimateStats
+from mkpc_kaggle.recipe import Recipe, Unit
+from mkpc_kaggle.reporting import contradictions, verdict
+from mkpc_kaggle.reporting.run_log import RunLog
+from mkpc_kaggle.scene.choose import Choice, Reason
+from mkpc_kaggle.scene.reconstruction import (
+    MAX_SIGMA_IMAGES,
+    Comparison,
+    DistortedLens,
+    FocalContradiction,
+    RegisteredImage,
+    SfmModel,
+    Sigmas,
+    Source,
+)
+from mkpc_kaggle.scene.view_graph import BatchImage
+
+NAMES = [f"{number}.jpg" for number in range(4)]
+GOOD = Sigmas(0.1, 0.019, 1.0)
+RADIAL = KnownCamera("SIMPLE_RADIAL", (575.0, 320.0, 213.5, -0.05), 5.0)
+# A pair whose F is good
+PAIR = PairRecord(
+    0,
+    Pair("a", "set", NAMES[0], NAMES[1]),
+    failure="",
+    stats=EstimateStats(support=MIN_SUPPORT),
+    source="pair",
+)
+
+
+def model(
+    *sigmas: Sigmas | tuple[()], names: list[str] = NAMES, comparison: Comparison | None = None
+) -> SfmModel:
+    """Return a model of images with these sigmas."""
+    images = []
+    for name, each in zip(names, sigmas, strict=True):
+        pose = Camera(np.diag([575.0, 575, 1]), np.eye(3), np.zeros(3))
+        images.append(RegisteredImage(BatchImage(name, name, Size(640, 427)), pose, 50, each))
+    found = SfmModel(tuple(images), np.zeros((0, 3)), 0.5)
+    return replace(found, comparison=comparison or Comparison())
+
+
+def scene(*models: SfmModel, failure: str = "") -> SceneRecord:
+    registered = sum(len(each.images) for each in models)
+    return SceneRecord("set", len(NAMES), registered, failure=failure, models=models)
+
+
+def log(
+    *scenes: SceneRecord,
+    records: tuple[PairRecord, ...] = (),
+    ending: str = Ending.COMPLETE,
+    faults: tuple[str, ...] = (),
+) -> RunLog:
+    events = [Event(EventKind.FAULT, 1.0, text) for text in faults]
+    events.append(Event(EventKind.END, 2.0, str(ending)))
+    recipe = Recipe((Unit(1, "sift", 640),))
+    return RunLog(Path("journal"), About(), recipe, records, tuple(events), (), scenes)
+
+
+ALL = tuple(replace(PAIR, pair=Pair(name, "set", first, name)) for first, name in pairwise(NAMES))
+GOOD_MODEL = model(GOOD, GOOD, GOOD, GOOD)
+FAILED = UnitRecord("1:sift@640", 1, 0, 0, 0.0, 0.0, failure="out of memory")
+LATE = PairRecord(0, PAIR.pair)
+
+
+def compared(*found: FocalContradiction | DistortedLens) -> RunLog:
+    focals = tuple(each for each in found if isinstance(each, FocalContradiction))
+    lenses = tuple(each for each in found if isinstance(each, DistortedLens))
+    comparison = Comparison(focals, lenses)
+    return log(scene(model(GOOD, GOOD, GOOD, GOOD, comparison=comparison)))
+
+
+# Each sentence, with a run on which it speaks
+SPEAKS = {
+    "the run failed: no worker left": log(ending=Ending.NO_WORKER),
+    "the run failed: errors left 1 of 1 pair without an F": log(
+        records=(replace(PAIR, source="fallback", units=(FAILED,)),)
+    ),
+    "not reached in time: 1 pair; give": log(records=(LATE,)),
+    "with the fallback: 1 pair; the reasons": log(records=(replace(PAIR, source="fallback"),)),
+    "perhaps of different things: 1 pair": log(
+        records=(replace(PAIR, stats=EstimateStats(support=MIN_SUPPORT - 0.1)),)
+    ),
+    f"no cameras, {NO_CAMERAS}: photographs that overlap more": log(scene(failure=NO_CAMERAS)),
+    f"no cameras, {NO_CAMERAS}: all masks are black": log(
+        scene(failure=NO_CAMERAS), faults=("set: all masks are black",)
+    ),
+    "no cameras, too few pairs: photographs that overlap more": log(scene(failure="too few pairs")),
+    "no camera for 3.jpg: add photographs between": log(
+        scene(model(GOOD, GOOD, GOOD, names=NAMES[:3])), records=ALL
+    ),
+    "the images form 2 models of 4, 4": log(scene(GOOD_MODEL, GOOD_MODEL)),
+    "uncertain cameras: 1.jpg; add": log(scene(model(GOOD, Sigmas(0.1, 0.021, 1), GOOD, GOOD))),
+    "uncertain cameras: 0.jpg; add": log(scene(model((), GOOD, GOOD, GOOD))),
+    "the focal length of 287 px in --intrinsics contradicts the photographs, which fit 575 px": (
+        compared(FocalContradiction(Source.INTRINSICS, ("0.jpg",), 287.4, 574.9))
+    ),
+    "the focal length of 1150 px in EXIF contradicts the photographs, which fit 575 px: 0.jpg; the": (
+        compared(FocalContradiction(Source.EXIF, ("0.jpg",), 1150.0, 575.0))
+    ),
+    "the lens of 4 photographs is distorted by 1.5 % at the edge": compared(
+        DistortedLens(tuple(NAMES), -0.0154, RADIAL)
+    ),
+    "give --intrinsics with the row *,SIMPLE_RADIAL,575 320 213.5 -0.05,5": compared(
+        DistortedLens(tuple(NAMES), -0.0154, RADIAL)
+    ),
+    "the row 0.jpg,SIMPLE_RADIAL,575 320 213.5 -0.05,5, and the same for the others": compared(
+        DistortedLens(tuple(NAMES[:3]), -0.0154, RADIAL)
+    ),
+}
+
+
+@pytest.mark.parametrize("text", SPEAKS)
+def test_each_sentence_speaks_on_its_input(text):
+    problems = verdict.verdict(SPEAKS[text]).problems
+    assert any(text in problem for problem in problems), problems
+
+
+def test_a_run_without_problems_looks_right():
+    for run in (log(records=ALL), log(scene(GOOD_MODEL), records=ALL)):
+        assert verdict.verdict(run).problems == ()
+        assert str(verdict.verdict(run)).endswith("nothing looks wrong")
+
+
+def test_cameras_of_a_model_that_is_too_large_for_sigmas_are_not_called_uncertain():
+    count = MAX_SIGMA_IMAGES + 1
+    names = [f"{number}.jpg" for number in range(count)]
+    large = model(*[()] * count, names=names)
+    assert verdict.verdict(log(scene(large))).problems == ()
+
+
+def test_the_doubts_about_a_pair_have_inputs():
+    weak = replace(PAIR, stats=EstimateStats(support=MIN_SUPPORT - 0.1))
+    assert "times the inliers by chance" in verdict.doubt(weak)
+    contradicting = replace(PAIR, scene=Choice(None, Reason.CONTRADICTION))
+    assert verdict.doubt(contradicting) == "its matches contradict the cameras"
+    assert verdict.doubt(PAIR) == ""
+
+
+def sentences(module: object) -> list[str]:
+    """Return the texts that functions of a module yield or return, as regular expressions."""
+    patterns = []
+    for node in ast.walk(ast.parse(inspect.getsource(module))):
+        value = node.value if isinstance(node, ast.Yield | ast.Return) else None
+        if not isinstance(value, ast.JoinedStr):
+            continue
+        parts = [
+            re.escape(str(part.value)) if isinstance(part, ast.Constant) else ".*"
+            for part in value.values
+        ]
+        pattern = "".join(parts)
+        # Sentences, and not names of files or lists of them
+        if pattern.count("\\ ") >= 3:
+            patterns.append(pattern)
+    return patterns
+
+
+def test_no_sentence_of_the_verdict_lacks_an_input():
+    """A threshold outside the range of its quantity would never speak, and nobody would notice."""
+    said = [problem for run in SPEAKS.values() for problem in verdict.verdict(run).problems]
+    patterns = [*sentences(verdict), *sentences(contradictions)]
+    assert len(patterns) >= 10
+    doubts = "its matches contradict", "times the inliers by chance"
+    missing = [
+        pattern
+        for pattern in patterns
+        if not any(re.fullmatch(pattern, text) for text in said)
+        and not any(re.escape(text) in pattern for text in doubts)
+    ]
+    assert missing == []
