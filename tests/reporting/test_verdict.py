@@ -89,6 +89,7 @@ def log(
 ALL = tuple(replace(PAIR, pair=Pair(name, "set", first, name)) for first, name in pairwise(NAMES))
 GOOD_MODEL = model(GOOD, GOOD, GOOD, GOOD)
 FAILED = UnitRecord("1:sift@640", 1, 0, 0, 0.0, 0.0, failure="out of memory")
+FEW = UnitRecord("1:sift@640", 1, 20, 7, 0.0, 0.0, failure="")
 LATE = PairRecord(0, PAIR.pair)
 
 
@@ -118,7 +119,23 @@ SPEAKS = {
     "no camera for 3.jpg: add photographs between": log(
         scene(model(GOOD, GOOD, GOOD, names=NAMES[:3])), records=ALL
     ),
-    "the images form 2 models of 4, 4": log(scene(GOOD_MODEL, GOOD_MODEL)),
+    "the images form 2 models of 4, 4: add photographs that connect them": (
+        log(scene(GOOD_MODEL, GOOD_MODEL))
+    ),
+    "between 2.jpg and 3.jpg (7 inliers) for example": replace(
+        log(
+            scene(
+                model(GOOD, GOOD, GOOD, names=NAMES[:3]),
+                model(GOOD, GOOD, GOOD, names=NAMES[3:] * 3),
+            ),
+            records=(replace(ALL[2], units=(FEW,)),),
+        ),
+        digests={name: name for name in NAMES},
+    ),
+    "a model of 4 cameras hangs together loosely: its cameras are unknown to within 26 % of": log(
+        scene(model(*[Sigmas(0.1, 0.26, 1.0)] * 4))
+    ),
+    "are unknown to within any distance; add": log(scene(model((), (), (), GOOD))),
     "uncertain cameras: 1.jpg; add": log(scene(model(GOOD, Sigmas(0.1, 0.021, 1), GOOD, GOOD))),
     "uncertain cameras: 0.jpg; add": log(scene(model((), GOOD, GOOD, GOOD))),
     "the focal length of 287 px in --intrinsics contradicts the photographs, which fit 575 px": (
@@ -193,7 +210,7 @@ def test_no_sentence_of_the_verdict_lacks_an_input():
     missing = [
         pattern
         for pattern in patterns
-        if not any(re.fullmatch(pattern, text) for text in said)
+        if not any(re.search(pattern, text) for text in said)
         and not any(re.escape(text) in pattern for text in doubts)
     ]
     assert missing == []
