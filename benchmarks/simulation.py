@@ -51,6 +51,11 @@ def summary(runs: list[Ran]) -> None:
     busy = [run.utilisation for run in runs if run.work_left]
     print(f"{len(runs)} scenarios, {len(busy)} with work left at the end")
     print(f"late: {sum(run.late > 0 for run in runs)}, rows lost: {sum(run.lost for run in runs)}")
+    bad = sum(run.scenario.bad_places for run in runs)
+    closed = sum(len(run.closed) for run in runs)
+    wrongly = sum(len(run.wrongly_closed) for run in runs)
+    pairs = sum(len(run.scenario.fates) for run in runs)
+    print(f"bad pairs: {pairs}; bad places: {bad}; places closed: {closed}, good ones: {wrongly}")
     print(f"units run: {sum(run.report.units_run for run in runs)}")
     fit = [run for run in runs if run.scenario.batches and run.scenes_fit]
     batches = sum(run.scenario.batches for run in fit)

@@ -4,7 +4,6 @@ Messages are pickled, so none has a connection, a lock, or a large array that th
 itself.
 """
 
-from collections import Counter
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum, StrEnum
@@ -20,10 +19,6 @@ from mkpc_kaggle.pipeline.pair import Regions, UnitResult
 from mkpc_kaggle.recipe import Recipe, Unit
 from mkpc_kaggle.scene.export import HeldDirectory
 from mkpc_kaggle.scene.reconstruct import Solution
-
-# Of an item in its own job. One loss may have its cause elsewhere, such as short memory; a third try
-# would rarely help and costs a worker's start.
-MAX_TRIES = 2
 
 
 class Phase(IntEnum):
@@ -51,8 +46,8 @@ class MatchJob:
     ``expected`` are the expected seconds of each unit per pair. A unit begins only if it is expected to
     end within ``seconds`` of the job's start. ``known`` are each pair's points of stage 1, for critical
     regions, and ``crops`` their keys. ``upcoming`` are the images that will probably be matched next.
-    ``is_retry`` states that the work lost a worker before, ``is_last`` that its pairs need no other
-    units in this phase.
+    ``is_last`` states that its pairs need no other units in this phase, ``is_check`` that the work is
+    done already: the answer shows that the place works, and is not used.
     """
 
     phase: Phase
@@ -60,14 +55,19 @@ class MatchJob:
     units: tuple[Unit, ...]
     expected: tuple[float, ...]
     seconds: float
-    is_retry: bool = False
     is_last: bool = True
+    is_check: bool = False
     # The schedule leaves the rest empty: :meth:`mkpc_kaggle.engine.matching.Matching.fill` adds it.
     pairs: tuple[Pair, ...] = ()
     names: tuple[tuple[str, str], ...] = ()
     known: tuple[tuple[UnitResult, ...], ...] = ()
     crops: tuple[tuple[str, ...], ...] = ()
     upcoming: tuple[Path, ...] = ()
+
+    @property
+    def items(self) -> tuple[tuple[Hashable, ...], ...]:
+        """The units of pairs that a loss of this job concerns."""
+        return tuple(("unit", index, unit.name) for index in self.indices for unit in self.units)
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +92,10 @@ class EstimateJob:
     pairs: tuple[PairInputs, ...]
     recipe: Recipe
     source: Source
-    is_retry: bool = False
+
+    @property
+    def items(self) -> tuple[tuple[Hashable, ...], ...]:
+        return tuple(("estimate", pair.index) for pair in self.pairs)
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +115,7 @@ class SceneJob:
     matches: int = 0
     export: HeldDirectory | None = None
     # A crash of pycolmap counts against the batch, not against its place.
-    is_retry: bool = True
+    items: tuple[tuple[Hashable, ...], ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +125,7 @@ class FeatureJob:
     key: str
     do: Callable[[], Any]
     # An image that crashes its decoder counts against itself, not against the place.
-    is_retry: bool = True
+    items: tuple[tuple[Hashable, ...], ...] = ()
 
 
 Job = MatchJob | EstimateJob | SceneJob | FeatureJob
@@ -203,37 +206,6 @@ class Failure:
 
 # The answer to a match job or an estimate job has a value for each pair, in the order of the job.
 Answer = Loaded | tuple[Outcome, ...] | tuple[Estimated, ...] | Solution | Found | Failure
-
-
-class Tries:
-    """The only memory of failures, for one run: nothing of it is stored, so the next run tries
-    everything again.
-
-    An item of a lost job is retried in its own job (``alone``), and given up when that job is lost
-    for the second time. ``given_up`` has the reason of each item. Items are tuples: ("unit", pair,
-    unit), ("matcher", unit), ("pair", pair), ("estimate", pair), ("scene", batch, key), ("scenes",),
-    ("features", key) and ("estimates",). The workers of estimates give up an estimate, which is tried
-    once more elsewhere: ("estimate elsewhere", pair).
-    """
-
-    def __init__(self) -> None:
-        self.alone: set[Hashable] = set()
-        self.given_up: dict[tuple[Any, ...], Failure] = {}
-        self._counts: Counter[Hashable] = Counter()
-
-    def lose(self, items: Sequence[tuple[Any, ...]], failure: Failure) -> bool:
-        """Record the items of a lost job. Return whether it had a single item, which is now given
-        up.
-        """
-        self.alone.update(items)
-        # With several items, the cause is unknown: no try is counted.
-        if len(items) != 1:
-            return False
-        self._counts[items[0]] += 1
-        if self._counts[items[0]] < MAX_TRIES:
-            return False
-        self.given_up[items[0]] = failure
-        return True
 
 
 def visiting_order(pairs: Sequence[Pair]) -> list[int]:

@@ -5,8 +5,9 @@ from typing import Any
 
 import numpy as np
 
+from mkpc_kaggle.engine.blame import Tries
 from mkpc_kaggle.engine.budget import ESTIMATE
-from mkpc_kaggle.engine.jobs import Cause, Estimated, EstimateJob, Failure, FeatureJob, Found, Tries
+from mkpc_kaggle.engine.jobs import Cause, Estimated, EstimateJob, Failure, FeatureJob, Found
 from mkpc_kaggle.engine.records import ESTIMATED
 from mkpc_kaggle.engine.run import HANG_FACTOR, Run
 from mkpc_kaggle.engine.schedule import lacking_estimates
@@ -35,17 +36,17 @@ class Estimating:
         elsewhere = [index for index in due if ("estimate", index) in given_up]
         return [index for index in due if index not in elsewhere], elsewhere
 
-    def job(self, due: Sequence[int]) -> EstimateJob:
+    def job(self, due: Sequence[int], *, is_trial: bool = False) -> EstimateJob:
         """Return a job for the first pairs that are due. A pair whose job was lost is alone in its
-        job.
+        job; on trial, a place gets other pairs first.
         """
         run = self._run
         state = run.state
         alone = {index for index in due if ("estimate", index) in state.tries.alone}
-        is_retry = due[0] in alone
+        others = [index for index in due if index not in alone]
         chosen = [due[0]]
-        if not is_retry:
-            chosen = [index for index in due if index not in alone][:MAX_PAIRS]
+        if others and (is_trial or due[0] not in alone):
+            chosen = others[:MAX_PAIRS]
         begun: list[int] = []
         for index in chosen:
             # One estimate serves all rows with the same images.
@@ -53,7 +54,7 @@ class Estimating:
                 state.begin(state.estimating, [index])
                 begun.append(index)
         pairs = tuple(state.inputs_of(index) for index in begun)
-        return EstimateJob(pairs, state.request.recipe, run.source(pairs), is_retry)
+        return EstimateJob(pairs, state.request.recipe, run.source(pairs))
 
     def patience(self, job: EstimateJob) -> float:
         run = self._run

@@ -7,13 +7,14 @@ has a file for its jobs and their answers (:mod:`matching`, :mod:`light`, :mod:`
 import sqlite3
 import sys
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from math import inf
 from pathlib import Path
 from typing import Any, Self
 
 from mkpc_kaggle.engine import console
+from mkpc_kaggle.engine.blame import Item, different
 from mkpc_kaggle.engine.budget import Budget, Costs, format_duration
 from mkpc_kaggle.engine.console import Progress
 from mkpc_kaggle.engine.image_files import current_digests, update_digests
@@ -141,6 +142,9 @@ class Engine:
         restore(state, self.store, self._digests(state))
         # A worker of an earlier request may have failed to load a matcher already.
         self._leave_out(state)
+        # The items of an earlier request's losses are others.
+        for place in self.site.places:
+            place.lost = []
         run = Run(state, self.store, self.costs, self.budget, self.log, self._progress)
         self._asked = Asked(
             state,
@@ -323,11 +327,15 @@ class Engine:
                 is_under_way = True
         return is_under_way
 
-    def _next_work(self, asked: Asked, now: float) -> NextWork | None:
-        """Return what to do next; ``None`` if the time of a trial is over."""
+    def _next_work(
+        self, asked: Asked, now: float, lost: Sequence[frozenset[Item]] = ()
+    ) -> NextWork | None:
+        """Return what to do next, on a place that ``lost`` jobs since its last answer; ``None`` if
+        the time of a trial is over.
+        """
         if now >= asked.until:
             return None
-        work = next_work(asked.state, self.costs, self.budget, self.crew, now)
+        work = next_work(asked.state, self.costs, self.budget, self.crew, now, lost)
         if work.match is not None:
             asked.matching.explain(work, self.crew, now)
         return work
@@ -339,6 +347,9 @@ class Engine:
         others = any(place.may_start(now) or place.is_starting for place in places)
         job = work.match
         while job is not None and idle:
+            if lost := different(idle[0].lost, asked.state.tries.given_up):
+                trial = self._next_work(asked, now, lost)
+                job = (trial.match if trial is not None else None) or job
             # ``None``: the store cannot be read, and the job is planned again in other parts.
             filled = asked.matching.fill(job, self.minibatch)
             if filled is not None:
@@ -360,7 +371,7 @@ class Engine:
             if self._features.pending:
                 self._give(place, self._features.next(), now)
             elif due and asked is not None:
-                self._give(place, asked.estimating.job(due), now)
+                self._give(place, asked.estimating.job(due, is_trial=bool(place.lost)), now)
                 # The job's pairs, and the rows with the same images
                 due = [index for index in due if not asked.state.estimating[index]]
         return len(self._features.pending) + len(due)
@@ -448,7 +459,7 @@ class Engine:
             self._note_loaded(place, answer)
             return
         if isinstance(answer, Failure):
-            self._lose(place, job, answer)
+            self._lose(place, job, answer, now)
         elif job is not None:
             self._save(job, answer, seconds)
         if place.work is Work.SCENE:
@@ -491,17 +502,24 @@ class Engine:
                 failure = Failure(Cause.REFUSED, self._refused[unit.matcher])
                 state.give_up(("matcher", unit.name), failure)
 
-    def _lose(self, place: Place, job: Job | None, failure: Failure) -> None:
+    def _lose(self, place: Place, job: Job | None, failure: Failure, now: float) -> None:
         """Record that a worker failed on a job, or could not start."""
+        state = self.state
         if job is None:
             self.log.fault(f"{place.name}: {failure}")
         else:
             self.log.fault(f"a job was lost on {place.name}: {failure}")
+            # First the items: what they explain does not count against the place.
+            self._handler(job).lose(job, failure)
+            # A worker that reports an ordinary error works.
+            if failure.cause is not Cause.RAISED:
+                given_up = () if state is None else state.tries.given_up
+                place.lose(job.items, failure, now, given_up)
         if place.closed:
             self.log.explain(f"no worker is started any more on {place.closed}")
-        if job is not None:
-            self._handler(job).lose(job, failure)
-        state = self.state
+            if state is not None and (count := state.forgive(place.lost)):
+                units = plural(count, "lost job")
+                self.log.explain(f"{units} of {place.name} will be tried again elsewhere")
         # Without a place for scenes, waiting batches must not keep the run from its end.
         if state is not None and place.work is Work.SCENE and not self.crew.scenes:
             state.give_up(("scenes",), failure)

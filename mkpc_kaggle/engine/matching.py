@@ -1,7 +1,6 @@
 """Matching: the schedule's jobs with their inputs, explained phases, results and losses."""
 
 import sqlite3
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -62,9 +61,10 @@ class Matching:
         Return ``None`` if the points cannot be read: the job is lost then.
         """
         state = self._run.state
-        state.begin(state.matching, job.indices)
-        if job.phase is Phase.FILL:
-            state.begin(state.filling, job.indices)
+        if not job.is_check:
+            state.begin(state.matching, job.indices)
+            if job.phase is Phase.FILL:
+                state.begin(state.filling, job.indices)
         # Units of stage 1 look at whole images and need no points.
         known: list[tuple[UnitResult, ...]] = [()] * len(job.indices)
         crops: list[tuple[str, ...]] = [()] * len(job.indices)
@@ -77,7 +77,7 @@ class Matching:
             except (sqlite3.Error, KeyError) as error:  # a disk that fails
                 self.lose(job, Failure(Cause.RAISED, f"the store cannot be read: {error}"))
                 return None
-        upcoming = upcoming_pairs(state, job, minibatch)
+        upcoming = [] if job.is_check else upcoming_pairs(state, job, minibatch)
         return replace(
             job,
             pairs=tuple(state.pairs[index] for index in job.indices),
@@ -111,6 +111,8 @@ class Matching:
     # Answers
 
     def save(self, job: MatchJob, answer: Sequence[Outcome], seconds: float) -> None:
+        if job.is_check:
+            return
         run = self._run
         results = [
             self._results(index, outcome, crops)
@@ -122,6 +124,8 @@ class Matching:
         for index, outcome, rows in zip(job.indices, answer, results, strict=True):
             self._use(index, outcome, rows)
             for found in outcome.found:
+                if not found.failure:
+                    run.state.tries.succeed(("unit", index, found.unit.name))
                 run.costs.observe(found.unit.name, found.seconds, warm_up=found.warm_up)
                 run.log.units_run += 1
         if (work := self._shown) is not None:
@@ -198,21 +202,31 @@ class Matching:
     def lose(self, job: MatchJob, failure: Failure) -> None:
         run = self._run
         state = run.state
+        if job.is_check:
+            # The next check is of another item: the points of this one may be unreadable.
+            state.tries.discard_proven(job.items)
+            return
         self._end(job)
-        items = [("unit", index, unit.name) for index in job.indices for unit in job.units]
-        if failure.cause is Cause.DEVICE:  # counts against the worker's place, not the unit
-            state.tries.alone.update(items)
+        if not state.tries.lose(job.items, failure):
             return
-        if not state.tries.lose(items, failure):
-            return
-        ((_, index, name),) = items  # only a single item is given up
-        state.give_up(items[0], failure)
+        # Only a single item is given up.
+        (index,) = job.indices
+        name = job.units[0].name
+        state.give_up(job.items[0], failure)
         run.log.explain(f"{name} is skipped on pair {index} ({failure})")
         # A unit that never ran on any pair would cost two workers for each.
-        given_up = Counter(state.given_up_units())
-        if given_up[name] >= MAX_FAILED_PAIRS and not run.costs.mean(name):
+        if not run.costs.mean(name) and self._fails_everywhere(name):
             state.give_up(("matcher", name), failure)
             run.log.explain(f"{name} is skipped on all pairs: it never ran ({failure})")
+
+    def _fails_everywhere(self, name: str) -> bool:
+        """Return whether a unit that never ran is at fault, and not its pairs."""
+        state = self._run.state
+        pairs = [index for index, unit in state.given_up_units() if unit == name]
+        if len(pairs) < min(MAX_FAILED_PAIRS, len(state.pairs)):
+            return False
+        # The first pairs may be bad. A unit that fails where other units ran is not.
+        return bool(state.has[pairs].any()) or not state.has.any()
 
     def _end(self, job: MatchJob) -> None:
         state = self._run.state

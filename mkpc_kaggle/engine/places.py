@@ -1,5 +1,5 @@
-"""Places of workers. A place has one worker at a time, and is closed after it loses three workers
-in a row.
+"""Places of workers. A place has one worker at a time, and is closed after it loses three different
+items in a row (:mod:`mkpc_kaggle.engine.blame`).
 
 A hung worker ends here: the loop sets :attr:`Place.limit` from measured costs
 (``Engine._time_limit``), and :meth:`Place.poll` kills a worker that has not answered by then. Its
@@ -8,15 +8,16 @@ process gets SIGKILL.
 
 import os
 import queue
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import partial
 from math import inf
 from pathlib import Path
 
 from mkpc_kaggle.engine.answers import wrong_answer
+from mkpc_kaggle.engine.blame import MAX_LOSSES, Item, different
 from mkpc_kaggle.engine.jobs import Answer, Cause, Failure, Job, Loaded
 from mkpc_kaggle.engine.process import ProcessWorker, ThreadWorker
 from mkpc_kaggle.engine.worker import Maker, MatchRunner, light_runner, scene_runner
@@ -25,8 +26,6 @@ from mkpc_kaggle.pipeline.assembly import Assembly
 START_TIMEOUT_S = 300.0  # for a worker to load its matchers, which is slow from a network disk
 # Times the number of workers lost in a row: scarce memory may become free meanwhile.
 RESTART_PAUSE_S = 1.0
-# A place is closed after this number of workers lost in a row, without an answer between.
-MAX_LOSSES = 3
 LISTEN_S = 0.2  # between checks for an interrupt, since a signal does not ring
 # An estimate takes a fraction of a pair's matching on a CPU; on a GPU, the other cores decode images.
 CORES_PER_ESTIMATOR = 4
@@ -45,7 +44,8 @@ class Place:
     """A place such as "cuda:0", with its worker and the worker's job, which began at ``since``.
 
     ``since`` and ``limit`` are times of the engine's clock. A worker must answer by ``limit``; without a worker,
-    the next may start then. ``closed`` is the reason why no more workers start here, else empty.
+    the next may start then. ``closed`` is the reason why no more workers start here, else empty. ``lost`` has the
+    items of each job that was lost since the last answer.
     """
 
     name: str
@@ -54,7 +54,8 @@ class Place:
     worker: ThreadWorker | None = None
     job: Job | None = None
     is_loaded: bool = False
-    losses: int = 0
+    lost: list[frozenset[Item]] = field(default_factory=list)
+    failed_starts: int = 0  # since the last answer
     closed: str = ""
     since: float = 0.0
     limit: float = -inf  # in the past: a worker may start at once
@@ -66,9 +67,8 @@ class Place:
     @property
     def is_starting(self) -> bool:
         """Return whether a worker is loading, or will be started again after a pause."""
-        return (
-            not self.is_loaded and not self.closed and (self.worker is not None or self.losses > 0)
-        )
+        has_begun = self.worker is not None or bool(self.lost) or self.failed_starts > 0
+        return has_begun and not self.is_loaded and not self.closed
 
     def may_start(self, now: float) -> bool:
         return self.worker is None and not self.closed and now >= self.limit
@@ -110,8 +110,20 @@ class Place:
         elif isinstance(answer, Loaded):
             self.is_loaded = True
         else:
-            self.losses = 0
+            self._note_answer()
         return answer
+
+    def lose(
+        self, items: Collection[Item], failure: Failure, now: float, given_up: Collection[Item]
+    ) -> None:
+        """Count a lost job, and close the place if it is at fault. ``given_up`` are items at fault.
+
+        Without items, the job says nothing about its place, nor does any job of a place for scenes:
+        each has a new process.
+        """
+        if items and self.work is not Work.SCENE:
+            self.lost.append(frozenset(items))
+            self._judge(failure, now, given_up)
 
     def kill(self) -> None:
         if self.worker is not None:
@@ -120,30 +132,32 @@ class Place:
             self.is_loaded = False
             self.limit = -inf
 
+    def _note_answer(self) -> None:
+        self.lost = []
+        self.failed_starts = 0
+
     def _fail(self, failure: Failure, now: float) -> None:
         """End the worker, unless only its job failed.
 
-        After an out-of-memory error, memory stays fragmented. A failed device keeps failing. Lack
-        of memory does not count against the place, nor does a death or a hang on a job that has
-        already lost a worker.
+        After an out-of-memory error, memory stays fragmented. A failed device keeps failing.
         """
-        # The job is the suspect if it has lost a worker before.
-        is_retry = (
-            self.job is not None
-            and self.job.is_retry
-            and failure.cause in (Cause.DIED, Cause.TIMED_OUT, Cause.WRONG)
-        )
-        if self.is_loaded and failure.cause in (Cause.RAISED, Cause.OUT_OF_MEMORY):
-            self.losses = 0
-            if failure.cause is Cause.RAISED:
-                return
-        elif not is_retry:
-            self.losses += 1
-            # A refusal is an answer of the configuration, which no other worker would change.
-            if self.losses >= MAX_LOSSES or failure.cause is Cause.REFUSED:
-                self.closed = f"{self.name}: {failure}"
+        if self.is_loaded and failure.cause is Cause.RAISED:
+            self._note_answer()  # the worker and its device work
+            return
+        has_started = self.is_loaded
         self.kill()
-        self.limit = now + RESTART_PAUSE_S * self.losses
+        self.limit = now  # the next worker may start, unless the loop counts the job
+        if not has_started:
+            self.failed_starts += 1
+            self._judge(failure, now, ())
+
+    def _judge(self, failure: Failure, now: float, given_up: Collection[Item]) -> None:
+        """Close the place after three losses in a row, or set the pause before the next worker."""
+        losses = self.failed_starts + len(different(self.lost, given_up))
+        # A refusal is an answer of the configuration, which no other worker would change.
+        if losses >= MAX_LOSSES or failure.cause is Cause.REFUSED:
+            self.closed = f"{self.name}: {failure}"
+        self.limit = now + RESTART_PAUSE_S * losses
 
 
 class Site:

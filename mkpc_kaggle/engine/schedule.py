@@ -7,6 +7,7 @@ Two rules decide that a unit no longer fits in time: :func:`prefix_that_fits` fo
 :class:`mkpc_kaggle.engine.worker.MatchRunner` for the units of a job that ran out of time.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from math import inf, isfinite
@@ -15,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mkpc_kaggle.engine.blame import MAX_LOSSES, Item
 from mkpc_kaggle.engine.budget import ESTIMATE, Budget, Costs, format_duration
 from mkpc_kaggle.engine.jobs import MatchJob, Phase
 from mkpc_kaggle.engine.state import Mask, State
@@ -92,8 +94,17 @@ class View:
         return max(0.0, self.stop - self.now)
 
 
-def next_work(state: State, costs: Costs, budget: Budget, crew: Crew, now: float) -> NextWork:
-    """Return what to do next."""
+def next_work(
+    state: State,
+    costs: Costs,
+    budget: Budget,
+    crew: Crew,
+    now: float,
+    lost: Sequence[frozenset[Item]] = (),
+) -> NextWork:
+    """Return what to do next. ``lost`` are the jobs that the place of the next match job lost since
+    its last answer.
+    """
     view = View(state, costs, budget, crew, now)
     fit = prefix_that_fits(view)
     connecting = pairs_to_connect(view)
@@ -110,7 +121,9 @@ def next_work(state: State, costs: Costs, budget: Budget, crew: Crew, now: float
     match = None
     if phase is not Phase.NEVER and crew.can_match:
         # A job takes the units of its phase and of earlier phases, which other pairs have finished.
-        match = match_job(view, phase, wanted <= phase, best == phase)
+        match = trial_job(view, wanted, lost) if lost else None
+        if match is None:
+            match = match_job(view, phase, wanted <= phase, best == phase)
     is_matching = match is not None or bool(state.matching.any())
     estimates = estimates_due(view, first)
     scenes = scenes_due(view, phase, first, estimates, is_matching=is_matching)
@@ -142,6 +155,8 @@ def phases_of(view: View, fit: int, connecting: Mask) -> NDArray[Any]:
     sweep = sweeping_unit(state)
     rows[:, sweep] = Phase.SWEEP
     phases[state.rows :, sweep][connecting] = Phase.CONNECT
+    # A pair that cost two workers may cost two more for each unit, so all others come first.
+    phases[state.costly] = np.maximum(phases[state.costly], FILL)
     phases[~view.missing] = NEVER
     return phases
 
@@ -208,18 +223,21 @@ def match_job(view: View, phase: Phase, missing: Mask, ready: Mask) -> MatchJob:
     # In visiting order, for the cache of encodings; in the last phase the weakest pairs first.
     if phase is Phase.FILL:
         order = order[np.argsort(state.inliers[order], kind="stable")]
-    first = int(order[0])
+        order = order[np.argsort(state.costly[order], kind="stable")]
+    first = first_pair(view, order, missing)
     # Stage 1 first, because the crops come from its points.
     numbers = np.flatnonzero(missing[first]).tolist()
     numbers.sort(key=state.is_crop.__getitem__)
     units = [state.units[number] for number in numbers]
-    # A unit that lost a worker before runs alone, so that another loss has one cause.
+    # A unit that was lost before runs alone, so that another loss has one cause.
     alone = any(("unit", first, unit.name) in state.tries.alone for unit in units)
     size = 1 if alone else view.crew.minibatch
-    alike = order[:1]
+    indices = (first,)
     if size > 1:
         alike = order[(missing[order] == missing[first]).all(1)]
-    indices = tuple(alike[:size].tolist())
+        # In a minibatch, a suspect would cost the other pairs another try.
+        alike = alike[~np.isin(alike, [first, *suspect_pairs(state)])]
+        indices = (first, *alike[: size - 1].tolist())
     # An unmeasured unit counts as infinitely long, so its cost is learnt from a job of one unit.
     seconds = [
         view.costs.mean(unit.name) if view.costs.is_known(unit.name) else inf for unit in units
@@ -228,7 +246,96 @@ def match_job(view: View, phase: Phase, missing: Mask, ready: Mask) -> MatchJob:
     chosen = tuple(units[: 1 if alone else max(1, int(fits.sum()))])
     expected = tuple(view.costs.mean(unit.name) for unit in chosen)
     is_last = len(chosen) == len(units)
-    return MatchJob(phase, indices, chosen, expected, view.left, is_retry=alone, is_last=is_last)
+    return MatchJob(phase, indices, chosen, expected, view.left, is_last=is_last)
+
+
+def first_pair(view: View, order: NDArray[Any], missing: Mask) -> int:
+    """Return the first pair in an order, or one that tells a bad pair from a bad unit.
+
+    A unit that never ran, and was lost on a pair, runs next on a pair where other units ran.
+    """
+    state = view.state
+    first = int(order[0])
+    unproven = [n for n, unit in enumerate(state.units) if not view.costs.mean(unit.name)]
+    if not unproven or not state.costly.any():
+        return first
+    lost = {unit for _, unit in state.given_up_units()}
+    if any(missing[first, n] and state.units[n].name in lost for n in unproven):
+        has_points = order[state.has[order].any(1)]
+        return int(has_points[0] if has_points.size else order[order.size // 2])
+    return first
+
+
+def suspect_pairs(state: State) -> list[int]:
+    """Return the pairs with a unit that was lost before."""
+    found = []
+    for item in state.tries.alone:
+        match item:
+            case ("unit", int(index), _):
+                found.append(index)
+    return found
+
+
+def trial_job(view: View, wanted: NDArray[Any], lost: Sequence[frozenset[Item]]) -> MatchJob | None:
+    """Return a job for a place that ``lost`` jobs since its last answer, or ``None`` if any job will
+    do.
+
+    ``wanted`` (N, U) are phases. Another loss must say whether the place is at fault. So after a
+    first loss the place gets other items, and after a second one an item that worked before:
+    several bad pairs in a row must not close a place. Before any item worked, the place gets
+    another pair and another unit, since a unit may fail on all pairs.
+    """
+    state = view.state
+    others = wanted.copy(order="F")
+    others[state.matching] = NEVER
+    for item in state.tries.alone:
+        match item:
+            case ("unit", int(index), str(unit)):
+                others[state.alike(index), state.number_of[unit]] = NEVER
+    phase = Phase(int(others.min(initial=NEVER)))
+    tried = frozenset[Item]().union(*lost)
+    proven = [item for item in state.tries.proven if item not in tried]
+    if proven and (len(lost) > 1 or phase is Phase.NEVER):
+        return check_job(view, proven[-1])
+    if phase is Phase.NEVER:
+        return None
+    if not state.tries.proven:
+        return unlike_job(view, others, lost)
+    return match_job(view, phase, others <= phase, others.min(1) == phase)
+
+
+def check_job(view: View, item: Item) -> MatchJob:
+    """Return a job that repeats an item, to see whether a place works."""
+    _, index, name = item
+    assert isinstance(index, int)
+    unit = next(unit for unit in view.state.units if unit.name == name)
+    expected = view.costs.mean(unit.name)
+    return MatchJob(Phase.SWEEP, (index,), (unit,), (expected,), view.left, is_check=True)
+
+
+def unlike_job(view: View, wanted: NDArray[Any], lost: Sequence[frozenset[Item]]) -> MatchJob:
+    """Return a job of another unit and another pair than the lost ones, as far as possible."""
+    state = view.state
+    lost_pairs = set()
+    lost_units = set()
+    for job in lost:
+        for item in job:
+            match item:
+                case ("unit", int(pair), str(name)):
+                    lost_pairs.add(pair)
+                    lost_units.add(name)
+    available = [n for n in range(len(state.units)) if (wanted[:, n] < NEVER).any()]
+    # Units of stage 1 first, since the others need their points.
+    number = min(available, key=lambda n: (state.units[n].name in lost_units, state.is_crop[n]))
+    order = state.order[wanted[state.order, number] < NEVER]
+    new = order[~np.isin(order, list(lost_pairs))]
+    if new.size:
+        order = new
+    # Far from the lost pairs: neighbours have an image in common.
+    index = int(order[(order.size - 1) * len(lost) // MAX_LOSSES])
+    unit = state.units[number]
+    phase = Phase(int(wanted[index, number]))
+    return MatchJob(phase, (index,), (unit,), (view.costs.mean(unit.name),), view.left)
 
 
 def upcoming_pairs(state: State, job: MatchJob, count: int) -> list[int]:

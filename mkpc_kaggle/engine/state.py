@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mkpc_kaggle.data.competition import Pair
+from mkpc_kaggle.engine.blame import Item, Tries
 from mkpc_kaggle.engine.image_files import contents_of
-from mkpc_kaggle.engine.jobs import Cause, Failure, PairInputs, Tries, visiting_order
+from mkpc_kaggle.engine.jobs import Cause, Failure, PairInputs, visiting_order
 from mkpc_kaggle.engine.keys import Images
 from mkpc_kaggle.engine.records import MIN_PAIRS, SceneRecord
 from mkpc_kaggle.engine.request import Request
@@ -41,7 +42,8 @@ class State:
     Of a pair (N,): ``estimates``, the key of the estimate in use; ``estimated``, it is today's;
     ``inliers``, the F ``own`` (N, 3, 3) and ``has_own``, it is no fallback. ``matching`` and
     ``estimating`` are the pairs of jobs under way, and ``filling`` the pairs in the last phase.
-    ``by_scene`` (N, 3, 3) and ``scene_source`` are the F that the scene in use gives, if any.
+    ``costly`` are pairs with a unit whose jobs were lost twice. ``by_scene`` (N, 3, 3) and
+    ``scene_source`` are the F that the scene in use gives, if any.
     ``changed`` has the pairs with other results than in the last table of pairs.
 
     Of a batch: ``batches`` has its number by name, ``members`` its pairs; ``batch_of`` (N,) is -1 for a pair
@@ -84,6 +86,7 @@ class State:
         self.has_own = np.zeros(count, bool)
         self.matching = np.zeros(count, bool)
         self.filling = np.zeros(count, bool)
+        self.costly = np.zeros(count, bool)
         self.estimating = np.zeros(count, bool)
         self.inliers = np.zeros(count, int)
         self.by_scene = np.zeros((count, 3, 3))
@@ -336,12 +339,15 @@ class State:
             under_way[self.alike(index)] = False
 
     def give_up(self, item: tuple[Any, ...], failure: Failure) -> None:
-        """Stop trying an item in this run. For the items see :class:`Tries`."""
+        """Stop trying an item in this run. For the items see :mod:`mkpc_kaggle.engine.blame`."""
         self.tries.given_up[item] = failure
         match item:
             case ("unit", index, unit):
                 self.changed.add(index)
                 self.skipped[self.alike(index), self.number_of[unit]] = True
+                # A matcher that raised costs no worker.
+                if failure.cause is not Cause.UNIT_RAISED:
+                    self.costly[self.alike(index)] = True
             case ("matcher", unit):
                 # For all pairs, but told once: no row of the table gets this reason.
                 self.skipped[:, self.number_of[unit]] = True
@@ -349,18 +355,47 @@ class State:
                 self.changed.add(index)
                 self.skipped[index] = True
 
-    def given_up_units(self) -> Iterator[str]:
-        """Yield the name of a unit for each pair that it was given up on."""
+    def forgive(self, lost: Iterable[frozenset[Item]]) -> int:
+        """Forget the losses of a closed place. Return the number of items to try again."""
+        taken_back = self.tries.forgive(lost)
+        for item in taken_back:
+            match item:
+                case ("unit", int(index), str(unit)):
+                    self.changed.add(index)
+                    self.costly[self.alike(index)] = False
+                    self._reconsider(unit)
+        return len(taken_back)
+
+    def _reconsider(self, unit: str) -> None:
+        """Skip a unit on exactly the pairs that are still given up."""
+        number = self.number_of[unit]
+        given_up = self.tries.given_up
+        everywhere = given_up.get(("matcher", unit))
+        if everywhere is not None and everywhere.cause is Cause.REFUSED:
+            return
+        # It was skipped on all pairs because of losses, some of which are forgiven.
+        given_up.pop(("matcher", unit), None)
+        self.skipped[:, number] = False
+        for item in given_up:
+            match item:
+                case ("unit", int(index), name) if name == unit:
+                    self.skipped[self.alike(index), number] = True
+                case ("pair", int(index)):
+                    self.skipped[index, number] = True
+
+    def given_up_units(self) -> Iterator[tuple[int, str]]:
+        """Yield each pair and unit that was given up."""
         for item in self.tries.given_up:
             match item:
-                case ("unit", _, str(unit)):
-                    yield unit
+                case ("unit", int(index), str(unit)):
+                    yield index, unit
 
     def forget_failures(self) -> None:
         """Forget the failures of the devices so far: another device takes over."""
         self.tries = Tries()
         self.changed.update(range(len(self.pairs)))
         self.skipped[:] = False
+        self.costly[:] = False
         # The jobs of killed workers never come back.
         self.matching[:] = False
         self.filling[:] = False

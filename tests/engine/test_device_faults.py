@@ -122,6 +122,51 @@ def test_a_device_that_fails_once_costs_a_worker_and_no_unit(run_at, undisturbed
     assert_as_if_nothing_had_failed(report, undisturbed)
 
 
+@pytest.mark.parametrize(
+    "error",
+    [
+        "CUDA error: invalid configuration argument",
+        "CUDA error: device-side assert triggered",
+        "cuDNN error: CUDNN_STATUS_NOT_SUPPORTED",
+        "cusolver error: CUSOLVER_STATUS_EXECUTION_FAILED, when calling `cusolverDnSgesvdj(...)`",
+    ],
+)
+@pytest.mark.parametrize("gpus", [1, 2, 4])
+def test_a_pair_that_fails_on_each_gpu_costs_its_own_units_and_no_gpu(
+    run_at, undisturbed, error, gpus
+):
+    def fail() -> None:
+        raise RuntimeError(error)
+
+    cpu = RectifiedMatcher()
+    places = [
+        thread_place(f"cuda:{number}", FaultyMatcher(fault=fail, seconds=0.01))
+        for number in range(gpus)
+    ]
+    report = run_at(*places, fallback=[thread_place("cpu", cpu)])
+    assert report.ending is Ending.WITH_FAILURES
+    assert cpu.calls == []
+    assert [place.name for place in places if place.closed] == []
+    skipped = [event.text for event in report.explanations if "skipped" in event.text]
+    assert len(skipped) == len(THREE_UNITS.units)
+    assert all(f"on pair {VICTIM} (the device failed: RuntimeError: {error}" in s for s in skipped)
+    assert matrices(report)[:VICTIM] == matrices(undisturbed)[:VICTIM]
+    assert matrices(report)[VICTIM + 1 :] == matrices(undisturbed)[VICTIM + 1 :]
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_one_or_two_pairs_that_a_gpu_cannot_match_are_left_to_the_cpu(
+    pairs, undisturbed, tmp_path, monkeypatch, count
+):
+    # Too few losses to close the place
+    gpu = thread_place("cuda:0", RectifiedMatcher(matches=lambda _: break_device()))
+    use_places(monkeypatch, gpu, fallback=[thread_place("cpu", RectifiedMatcher())])
+    recipe = replace(THREE_UNITS, units=(SWEEP,))
+    report = run(pairs[:count], recipe, RectifiedMatcher(), tmp_path / "work")
+    assert report.ending is Ending.COMPLETE
+    assert all(len(record.units) == 1 for record in report.records)
+
+
 def test_a_pair_on_which_a_device_failed_is_matched_by_a_healthy_one(run_at, undisturbed):
     broken = RectifiedMatcher(matches=breaks_after(2))
     # Slow enough that the other one gets pairs
@@ -214,7 +259,7 @@ def test_a_minibatch_too_large_for_the_memory_is_halved_once_and_no_worker_is_lo
             "errors left 8 of 8 pairs without an F, 8 of them with this one: KeyError: 'image 7'",
         ),
         (break_device, "no worker left, the faults say why; the same command resumes"),
-        (exhaust_gpu, "every unit was skipped, the faults say why; the same command resumes"),
+        (exhaust_gpu, "no worker left, the faults say why; the same command resumes"),
     ],
 )
 def test_a_run_that_failed_has_exit_status_one_and_a_line(

@@ -1,4 +1,4 @@
-"""A place: when it is given up, on workers that answer as they are told."""
+"""A place: when it is closed, on workers that answer as they are told."""
 
 import threading
 from types import SimpleNamespace
@@ -15,12 +15,11 @@ from mkpc_kaggle.engine.worker import scene_runner
 LOST = Failure(Cause.DIED)
 DONE = (Outcome(failure="unreadable"),)
 RAISED = Failure(Cause.RAISED)
-NO_MEMORY = Failure(Cause.OUT_OF_MEMORY)
 
 
-def job(*, is_retry=False):
+def job():
     names = (("a.png", "b.png"),)
-    return MatchJob(Phase.DEEPEN, (0,), (), (), 1.0, is_retry=is_retry, names=names)
+    return MatchJob(Phase.DEEPEN, (0,), (), (), 1.0, names=names)
 
 
 def place_of(waiting):
@@ -35,21 +34,27 @@ def place_of(waiting):
 
 
 @pytest.mark.parametrize(
-    ("answers", "is_retry", "is_closed"),
+    ("answers", "is_closed"),
     [
-        ([LOST] * 2, False, False),
-        ([LOST] * 3, False, True),
-        ([LOST, LOST, DONE, LOST, LOST], False, False),
-        # What a worker reports is an answer: its device works.
-        ([LOST, LOST, RAISED, LOST, LOST], False, False),
-        ([LOST, LOST, NO_MEMORY, LOST, LOST], False, False),
-        ([DONE] + [LOST] * 3, False, True),
-        # A job that cost other workers before is the likely cause, and not the place.
-        ([LOST] * 3, True, False),
+        # A letter is a lost job with this item, for any cause.
+        ("AB", False),
+        ("ABC", True),
+        (["A", "B", DONE, "C", "D"], False),
+        # An ordinary error that a worker reports is an answer: its device works.
+        (["A", "B", RAISED, "C", "D"], False),
+        ([DONE, "A", "B", "C"], True),
+        # The same item is one loss, however often, and so is a minibatch with it.
+        ("AAAA", False),
+        (["A", "AB", "ABC"], False),
+        (["AB", "C", "DE"], True),
+        # An item at fault says nothing about the place.
+        ("ABX", False),
+        (["AB", "CX", "DX", "E"], False),
     ],
 )
-def test_three_workers_lost_in_a_row_with_no_answer_between_close_a_place(
-    answers, is_retry, is_closed
+@pytest.mark.parametrize("cause", [Cause.DIED, Cause.TIMED_OUT, Cause.DEVICE, Cause.OUT_OF_MEMORY])
+def test_three_different_items_lost_in_a_row_with_no_answer_between_close_a_place(
+    answers, is_closed, cause
 ):
     waiting = []
     place = place_of(waiting)
@@ -58,10 +63,24 @@ def test_three_workers_lost_in_a_row_with_no_answer_between_close_a_place(
             place.start(0.0)
             waiting.append(Loaded())
             place.poll(0.0)
-        waiting.append(answer)
-        place.submit(job(is_retry=is_retry), 1.0, now=0.0)
+        waiting.append(Failure(cause) if isinstance(answer, str) else answer)
+        place.submit(job(), 1.0, now=0.0)
         place.poll(0.0)
+        if isinstance(answer, str):
+            items = [("unit", 0, letter) for letter in answer]
+            place.lose(items, Failure(cause), 0.0, given_up={("unit", 0, "X")})
     assert bool(place.closed) == is_closed
+
+
+def test_a_worker_that_cannot_start_counts_as_a_loss():
+    waiting = [Failure(Cause.DEVICE)] * 2
+    place = place_of(waiting)
+    place.lose([("unit", 0, "A")], LOST, 0.0, ())
+    for _ in range(2):
+        assert not place.closed
+        place.start(0.0)
+        place.poll(0.0)
+    assert place.closed == "cpu: the device failed"
 
 
 def test_a_thread_that_cannot_start_is_an_answer(monkeypatch):

@@ -18,8 +18,9 @@ from typing import Any
 import numpy as np
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine import budget, jobs, light, matching, reconstructing, schedule
-from mkpc_kaggle.engine.budget import SCENE_MARGIN, SCENE_START_S, Budget
+from mkpc_kaggle.engine import blame, budget, light, matching, reconstructing, schedule
+from mkpc_kaggle.engine.blame import MAX_TRIES
+from mkpc_kaggle.engine.budget import MAX_SILENCE_S, SCENE_MARGIN, SCENE_START_S, Budget
 from mkpc_kaggle.engine.jobs import (
     Answer,
     Cause,
@@ -36,6 +37,7 @@ from mkpc_kaggle.engine.keys import Keys
 from mkpc_kaggle.engine.loop import Engine
 from mkpc_kaggle.engine.places import Place, Site, Work
 from mkpc_kaggle.engine.request import Request, RunReport
+from mkpc_kaggle.engine.run import HANG_FACTOR
 from mkpc_kaggle.engine.schedule import RESERVE_SHARE
 from mkpc_kaggle.engine.store import SCHEMA, Store, connected
 from mkpc_kaggle.geometry.coordinates import Size
@@ -54,6 +56,8 @@ STALL = 20.0  # how many times as long a unit takes that stalls
 SIZE = Size(640, 480)
 MATCHES = 200  # that a unit finds
 POINTS = Matches(np.zeros((MATCHES, 2)), np.zeros((MATCHES, 2)), np.zeros(MATCHES))
+# Of bad pairs, with probabilities. A hang takes thirty times as long as a unit.
+FATES = {Cause.DEVICE: 0.4, Cause.DIED: 0.3, Cause.OUT_OF_MEMORY: 0.25, Cause.TIMED_OUT: 0.05}
 SWEEP_SHARE = 0.7  # of the limit, within which the sweep is said to fit
 
 # Changes that switch each of them off
@@ -67,7 +71,7 @@ MECHANISMS: dict[str, tuple[tuple[object, str, object], ...]] = {
     "patience": tuple(
         (kind, "HANG_FACTOR", math.inf) for kind in (matching, light, reconstructing)
     ),
-    "second try": ((jobs, "MAX_TRIES", 1),),
+    "second try": ((blame, "MAX_TRIES", 1),),
     "end of tries": ((matching, "MAX_FAILED_PAIRS", 10**9),),
 }
 
@@ -91,6 +95,10 @@ class Scenario:
     With 0 ``batches``, there are no scenes. Each image but one is in a single pair; if ``pairs_per_image`` is
     above 1, the run adds pairs. A scene takes ``scene_seconds`` per pair. It crashes, runs out of memory or hangs
     with probability ``scene_faults``.
+
+    A share ``bad_pairs`` of the pairs, and the pairs of ``bad``, fail in each unit, in the way of ``bad_fate``
+    or in a random one. The last ``bad_places`` places fail in every job after the share ``broken`` of the limit.
+    With ``fallback``, there is another place, where nothing is bad.
     """
 
     pairs: int
@@ -114,6 +122,13 @@ class Scenario:
     scene_places: int = 1
     seed: int = 0
     never: str = ""  # the matcher whose worker dies whenever it runs
+    bad_pairs: float = 0.0
+    bad: tuple[int, ...] = ()
+    bad_fate: Cause | None = None
+    bad_places: int = 0
+    broken: float = 0.0
+    fallback: bool = False
+    minibatch: int = 1
 
     @property
     def recipe(self) -> Recipe:
@@ -125,6 +140,15 @@ class Scenario:
     @property
     def keys(self) -> Keys:
         return Keys(tuple(unit.name for unit in self.recipe.units), "mkpc", "estimate", "scene")
+
+    @property
+    def fates(self) -> dict[int, Cause]:
+        """How each bad pair fails, by its index."""
+        rng = np.random.default_rng([self.seed, 2])
+        drawn = rng.random(self.pairs)
+        kinds = rng.choice(len(FATES), self.pairs, p=tuple(FATES.values()))
+        bad = {*self.bad, *np.flatnonzero(drawn < self.bad_pairs).tolist()}
+        return {pair: self.bad_fate or list(FATES)[kinds[pair]] for pair in sorted(bad)}
 
     @property
     def work(self) -> float:
@@ -180,6 +204,10 @@ def random_scenario(seed: int, pairs: int) -> Scenario:
         scene_seconds=float(np.exp(rng.normal(np.log(0.06), 0.8))),
         scene_faults=float(rng.uniform(0, 0.3)) if troubled else 0.0,
         job_faults=float(rng.uniform(0, 3)) / jobs if troubled else 0.0,
+        bad_pairs=float(rng.uniform(0, 0.05)) if troubled else 0.0,
+        # One place must remain.
+        bad_places=int(rng.integers(scenario.workers)) if troubled else 0,
+        broken=float(rng.uniform(0, 1)),
     )
 
 
@@ -227,17 +255,35 @@ class SimulatedSite(Site):
         # Two generators: the number of scenes must not change the costs of units.
         self.rng = np.random.default_rng(scenario.seed)
         self._scene_rng = np.random.default_rng([scenario.seed, 1])
-        makers = [(f"place {n}", self.match_worker, Work.MATCH) for n in range(scenario.workers)]
+        self._fates = scenario.fates
+        good = scenario.workers - scenario.bad_places
+        self.bad_names = [f"place {n}" for n in range(good, scenario.workers)]
+        self.on_fallback = 0  # jobs
+        makers = [
+            (f"place {n}", partial(self.match_worker, is_bad=n >= good), Work.MATCH)
+            for n in range(scenario.workers)
+        ]
         makers.append(("estimates", lambda: SimulatedWorker(self, self.estimate), Work.LIGHT))
         for number in range(scenario.scene_places):
             makers.append((f"scenes {number}", self.scene_worker, Work.SCENE))
         self.places = [Place(*maker) for maker in makers]
+        self.matching = self.of(Work.MATCH)
+        if scenario.fallback:
+            self.fallback = [Place("cpu", self.fallback_worker)]
 
     def scenes_at_a_time(self, *, is_matching: bool) -> int:
         return self.scenario.scene_places
 
-    def match_worker(self) -> "SimulatedWorker":
-        return SimulatedWorker(self, partial(self.match, set()), RESTART_S)
+    def match_worker(self, *, is_bad: bool = False) -> "SimulatedWorker":
+        return SimulatedWorker(self, partial(self.match_at, is_bad, set()), RESTART_S)
+
+    def fallback_worker(self) -> "SimulatedWorker":
+        def match(job: MatchJob) -> Drawn:
+            self.on_fallback += 1
+            return self.match(warm, job)
+
+        warm: set[str] = set()
+        return SimulatedWorker(self, match, RESTART_S)
 
     def scene_worker(self) -> "SimulatedWorker":
         return SimulatedWorker(self, self.reconstruct)
@@ -268,6 +314,20 @@ class SimulatedSite(Site):
         time.
         """
         return STALL * self.costs[unit.name] * max(1.0, self.scenario.miss_factor) * self.drift(now)
+
+    def match_at(self, is_bad: bool, warm: set[str], job: MatchJob) -> Drawn:
+        """Draw the answer of a place of its own, on which a job may be lost for a reason."""
+        scenario = self.scenario
+        # The whole time until a loss is a fault: of the place, or of a pair.
+        if is_bad and self.clock.now >= scenario.broken * scenario.limit:
+            return self.lose(scenario.bad_fate or Cause.DEVICE)
+        for index in job.indices:
+            if index in self._fates:
+                return self.lose(self._fates[index])
+        return self.match(warm, job)
+
+    def lose(self, cause: Cause) -> Drawn:
+        return math.inf if cause is Cause.TIMED_OUT else 0.5, Failure(cause), math.inf
 
     def match(self, warm: set[str], job: MatchJob) -> Drawn:
         """Draw the answer of a worker that ran the units of ``warm`` before; none begins after
@@ -356,12 +416,14 @@ class SimulatedWorker:
         self._start_s = start_s
         self._answer: Answer = Loaded()
         self._begun = self._fault = 0.0
+        self._is_check = False  # whose result is not used
 
     def start(self) -> None:
         self._site.workers.add(self)
         self.ready = self._site.clock.now + self._start_s
 
     def submit(self, job: Job) -> None:
+        self._is_check = isinstance(job, MatchJob) and job.is_check
         self._begun = self._site.clock.now
         taken, self._answer, self._fault = self._draw(job)
         self.ready = self._begun + taken
@@ -371,7 +433,8 @@ class SimulatedWorker:
         if site.clock.now < self.ready:
             return None
         if self._start_s and isinstance(self._answer, tuple):
-            site.kept += max(0.0, min(self.ready, site.stop) - self._begun)
+            if not self._is_check:
+                site.kept += max(0.0, min(self.ready, site.stop) - self._begun)
             site.last_job = self.ready
         self.ready = math.inf
         return self._answer
@@ -407,6 +470,8 @@ class Ran:
     the submission with a missing row. ``missed`` are batches with matches, without a scene and without a fault;
     ``unmatched`` are batches that the sweep did not reach. ``scenes_fit`` states that the largest reserve suffices
     for all scenes, and that none hung while others waited. ``stale`` are the batches whose scene is out of date.
+    ``closed`` are places, and ``wrongly_closed`` the good ones of them. ``on_fallback`` counts jobs on the place
+    that takes over.
     """
 
     scenario: Scenario
@@ -421,6 +486,10 @@ class Ran:
     scenes: tuple[SceneRun, ...]
     stale: set[str]
     keys: list[list[str]]  # of the points and the estimate of each pair
+    closed: tuple[str, ...] = ()
+    wrongly_closed: tuple[str, ...] = ()
+    on_fallback: int = 0
+    given_up: tuple[tuple[Any, ...], ...] = ()  # items
 
     @property
     def work_left(self) -> bool:
@@ -437,7 +506,9 @@ def simulate(scenario: Scenario, store: Store | None = None, until: float = math
     published: list[int] = []
     interrupt = threading.Event()
     store = memory_store() if store is None else store
-    engine = Engine(site, store, time, interrupt=interrupt, progress=False)
+    engine = Engine(
+        site, store, time, interrupt=interrupt, progress=False, minibatch=scenario.minibatch
+    )
 
     def wait(moment: float) -> None:
         whole_wait(min(moment, until))
@@ -451,9 +522,14 @@ def simulate(scenario: Scenario, store: Store | None = None, until: float = math
         engine.ask(Request(pairs, scenario.recipe, scenario.keys, publish=publish))
         report = engine.report()
     state = engine.state
-    swept = int(state.has[: scenario.pairs].any(1).sum())
+    # A bad pair can have no F, except on the place that takes over.
+    swept = state.has[: scenario.pairs].any(1)
+    swept[list(scenario.fates)] = True
+    closed = [place for place in site.matching if place.closed]
+    # A place that is closed has no time to use.
+    site.faults += sum(max(0.0, site.stop - place.limit) for place in closed)
     sweep_fits = sweep_seconds(scenario) < SWEEP_SHARE * scenario.limit
-    given = len(site.of(Work.MATCH)) * (site.stop - RESTART_S) - site.faults
+    given = scenario.workers * (site.stop - RESTART_S) - site.faults
     faulty = {scene.batch for scene in site.scenes if scene.is_faulty}
     matches = zip(state.batches, state.matches_of_batches(), strict=True)
     matched = {batch for batch, count in matches if count}
@@ -464,7 +540,7 @@ def simulate(scenario: Scenario, store: Store | None = None, until: float = math
         (site.kept + site.for_scenes) / given,
         max(0.0, clock.now - scenario.limit),
         sum(length != scenario.pairs for length in published)
-        + (scenario.pairs - swept if sweep_fits else 0),
+        + (scenario.pairs - int(swept.sum()) if sweep_fits else 0),
         len(matched - faulty - made),
         len(state.batches) - len(matched),
         SCENE_MARGIN * scenario.longest_scenes < RESERVE_SHARE * scenario.limit
@@ -473,6 +549,10 @@ def simulate(scenario: Scenario, store: Store | None = None, until: float = math
         tuple(site.scenes),
         set(state.stale),
         [[*points, state.estimates[index]] for index, points in enumerate(state.points.tolist())],
+        tuple(place.name for place in closed),
+        tuple(place.name for place in closed if place.name not in site.bad_names),
+        site.on_fallback,
+        tuple(state.tries.given_up),
     )
 
 
@@ -488,7 +568,10 @@ def sweep_seconds(scenario: Scenario) -> float:
     stalls = scenario.stalls * (STALL - 1) * unit
     faults = (scenario.crashes + scenario.hangs) * start + scenario.hangs * STALL * unit
     faults += scenario.job_faults * (start + STALL * unit)
-    return start + scenario.pairs * (unit + stalls + faults) / scenario.workers
+    hang = FATES[Cause.TIMED_OUT] * (HANG_FACTOR * unit + MAX_SILENCE_S)
+    faults += scenario.bad_pairs * MAX_TRIES * (start + hang)
+    workers = max(1, scenario.workers - scenario.bad_places)
+    return start + scenario.pairs * (unit + stalls + faults) / workers
 
 
 def without_records(ran: Ran) -> Ran:
