@@ -203,6 +203,8 @@ def _lines(result: FolderResult, root: Path) -> Iterator[str]:
     report = result.report
     ended = f"{report.ending} after {format_duration(report.seconds)}"
     done = f"{plural(report.units_run, 'unit')} run, {report.estimated} F estimated"
+    if report.units_failed:
+        done += f", {plural(report.units_failed, 'unit')} failed"
     yield f"{plural(len(result.pairs), 'pair')}: {ended}; {done}"
     # Of the datasets that the run reached
     reasons = {scene.batch: scene.failure for scene in report.scenes}

@@ -86,14 +86,16 @@ class RaySite(Site):
         self.matching_cores = self._cores
         if gpus and self._assembly.device != "cpu":
             self.matching_cores = gpus
-            make = partial(MatchRunner, self._assembly.on("cuda:0").pipeline)
+            assembly = self._assembly.on("cuda:0")
+            make = partial(MatchRunner, assembly.pipeline)
             for number in range(gpus):
-                self._add(f"gpu {number}", make, num_gpus=1)
+                self._add(f"gpu {number}", make, assembly.minibatch, num_gpus=1)
         else:
             for number, node in enumerate(machines):  # several machines may have the same name
                 cores = int(node["Resources"]["CPU"])
                 make = partial(MatchRunner, self._assembly.pipeline, threads=cores)
-                self._add(f"machine {number} ({node['NodeManagerHostname']})", make, num_cpus=cores)
+                name = f"machine {number} ({node['NodeManagerHostname']})"
+                self._add(name, make, self._assembly.minibatch, num_cpus=cores)
         if not self.of(Work.MATCH):
             raise UserError("the Ray cluster offers neither a CPU nor a GPU")
 
@@ -105,7 +107,7 @@ class RaySite(Site):
                     worker.thread.join(max(0.0, until - time.monotonic()))
             self._ray.shutdown()
 
-    def _add(self, name: str, make: Maker, **where: float) -> None:
+    def _add(self, name: str, make: Maker, minibatch: int, **where: float) -> None:
         """Add a place for workers that need these resources of Ray."""
         # Checked on the machine, since other versions or files would give other results silently.
         make = partial(make_alike, make, __version__, self._needed)
@@ -117,7 +119,7 @@ class RaySite(Site):
             )
             return self._workers[-1]
 
-        self.places.append(Place(name, worker))
+        self.places.append(Place(name, worker, minibatch=minibatch))
 
 
 class RayWorker(ThreadWorker):

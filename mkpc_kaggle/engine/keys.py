@@ -17,6 +17,7 @@ import cv2
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.data.masks import Masks
 from mkpc_kaggle.geometry.coordinates import Box
+from mkpc_kaggle.matchers.contract import Precision
 from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.pipeline.stages import GivenRegions
 from mkpc_kaggle.scene.view_graph import BatchImage
@@ -47,8 +48,9 @@ def text_digest(lines: Iterable[str]) -> str:
 class Keys:
     """The keys of a recipe's results, from digests of its settings.
 
-    ``units`` has a digest for each unit, in the recipe's order. ``regions`` replace MKPC's regions
-    of some pairs. ``masks`` are of single images.
+    ``units`` has a digest for each unit, in the recipe's order. ``float32`` has the digests of units
+    that ran in float32 although the run was given half precision: on the CPU that took over, or
+    after an overflow. ``regions`` replace MKPC's regions of some pairs. ``masks`` are of single images.
     """
 
     units: tuple[str, ...]
@@ -57,11 +59,14 @@ class Keys:
     scene: str = ""
     regions: GivenRegions | None = None
     masks: Masks = field(default_factory=Masks)
+    float32: tuple[str, ...] = ()  # empty: the same
 
     @classmethod
     def of(cls, assembly: Assembly) -> "Keys":
         recipe = assembly.recipe
         units = tuple(digest([POINTS, assembly.unit_settings(unit)]) for unit in recipe.units)
+        exact = Precision.FLOAT32
+        float32 = [digest([POINTS, assembly.unit_settings(unit, exact)]) for unit in recipe.units]
         # All settings of a table: a new setting changes the keys, which costs a rerun but no wrong result.
         magsac = asdict(recipe.magsac)
         focal = recipe.focal and asdict(recipe.focal)
@@ -77,10 +82,19 @@ class Keys:
             digest([SCENE, scene, tracks, estimate, _mapper_version()]),
             assembly.regions,
             assembly.masks,
+            tuple(float32),
         )
 
-    def of_points(self, unit: int, pair: Pair, images: Images, first: Sequence[str]) -> str:
-        """Return the key of a unit's points on a pair.
+    def of_points(
+        self,
+        unit: int,
+        pair: Pair,
+        images: Images,
+        first: Sequence[str],
+        *,
+        is_float32: bool = False,
+    ) -> str:
+        """Return the key of a unit's points on a pair, in the given precision or in float32.
 
         ``first`` are the keys of the points that the pair's crops come from; empty for a unit of stage 1.
         """
@@ -89,9 +103,8 @@ class Keys:
         # A pair without masks has the key that it would have without the option.
         masks = [self.masks.digest(file) for file in (pair.file0, pair.file1)]
         masked = ["masks", *masks] if any(masks) else []
-        return text_digest(
-            [self.units[unit], image0.digest, image1.digest, *turns, *masked, *first]
-        )
+        units = self.float32 if is_float32 and self.float32 else self.units
+        return text_digest([units[unit], image0.digest, image1.digest, *turns, *masked, *first])
 
     def crops_of(self, pair: Pair, first: Sequence[str]) -> list[str]:
         """Return what decides a pair's crops: the given regions, or [mkpc] and the keys of stage 1."""

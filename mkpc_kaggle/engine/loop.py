@@ -76,13 +76,11 @@ class Engine:
         *,
         interrupt: threading.Event,
         progress: bool = True,
-        minibatch: int = 1,
     ) -> None:
         self.site = site
         self.store = store
         self.budget = budget
         self.interrupt = interrupt
-        self.minibatch = minibatch
         # By this run's answers alone: another machine may have computed the stored results.
         self.costs = Costs()
         self.log = EventLog(store, budget)
@@ -177,6 +175,7 @@ class Engine:
             unwritten=asked.publication.unwritten,
             scenes=scene_records(asked.state),
             units_run=self.log.units_run,
+            units_failed=self.log.units_failed,
             estimated=self.log.estimated,
             log=self.site.printed(),
         )
@@ -286,7 +285,8 @@ class Engine:
             max(1, len(matchers)),  # before the places are open, one is assumed
             len(self.site.of(Work.LIGHT)),
             len(scenes),
-            self.minibatch,
+            # All places of matching have the same kind of device.
+            max((place.minibatch for place in matchers), default=1),
             can_match=bool(matchers) or not self._is_open,
         )
 
@@ -351,7 +351,7 @@ class Engine:
                 trial = self._next_work(asked, now, lost)
                 job = (trial.match if trial is not None else None) or job
             # ``None``: the store cannot be read, and the job is planned again in other parts.
-            filled = asked.matching.fill(job, self.minibatch)
+            filled = asked.matching.fill(job, idle[0].minibatch)
             if filled is not None:
                 self._give(idle.pop(0), filled, now)
             job = None
@@ -537,11 +537,7 @@ class Engine:
             self.log.fault(text)
             self.log.explain(text)
             console.warn(text)
-            for place in places:
-                place.kill()
-                self.site.places.remove(place)
-            self.site.places += self.site.fallback
-            self.site.fallback = []
+            self.site.fall_back()
             # Costs, losses and refusals say nothing about the other device.
             self.costs.forget()
             self._refused = {}

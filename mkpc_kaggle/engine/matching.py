@@ -124,8 +124,11 @@ class Matching:
         for index, outcome, rows in zip(job.indices, answer, results, strict=True):
             self._use(index, outcome, rows)
             for found in outcome.found:
-                if not found.failure:
-                    run.state.tries.succeed(("unit", index, found.unit.name))
+                # A unit that raised says nothing about the time of one that runs.
+                if found.failure:
+                    run.log.units_failed += 1
+                    continue
+                run.state.tries.succeed(("unit", index, found.unit.name))
                 run.costs.observe(found.unit.name, found.seconds, warm_up=found.warm_up)
                 run.log.units_run += 1
         if (work := self._shown) is not None:
@@ -162,7 +165,8 @@ class Matching:
             if is_crop and not are_valid:
                 continue  # the unit stays missing and runs again
             keys = [first[n] for n in sorted(first)]
-            key = state.key_of(index, number, images, keys)
+            is_float32 = found.is_float32
+            key = state.key_of(index, number, images, keys, is_float32=is_float32)
             # An answer has stage 1 first: its units of stage 2 looked at crops from all of stage 1.
             if not is_crop:
                 first[number] = key

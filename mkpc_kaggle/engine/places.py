@@ -6,7 +6,6 @@ A hung worker ends here: the loop sets :attr:`Place.limit` from measured costs
 process gets SIGKILL.
 """
 
-import os
 import queue
 from collections.abc import Callable, Collection
 from contextlib import suppress
@@ -16,6 +15,7 @@ from functools import partial
 from math import inf
 from pathlib import Path
 
+from mkpc_kaggle.cores import available_cores
 from mkpc_kaggle.engine.answers import wrong_answer
 from mkpc_kaggle.engine.blame import MAX_LOSSES, Item, different
 from mkpc_kaggle.engine.jobs import Answer, Cause, Failure, Job, Loaded
@@ -51,6 +51,7 @@ class Place:
     name: str
     make: Callable[[], ThreadWorker]
     work: Work = Work.MATCH
+    minibatch: int = 1  # pairs of a job of matching
     worker: ThreadWorker | None = None
     job: Job | None = None
     is_loaded: bool = False
@@ -182,7 +183,7 @@ class Site:
         self._bell: queue.SimpleQueue[None] = queue.SimpleQueue()
         self._worker = ThreadWorker if threads else ProcessWorker
         self._log = log
-        self._cores = cores()
+        self._cores = available_cores()
         # In this process, a second thread would take its time from the thread that matches.
         estimators = 1 if threads else max(1, self._cores // CORES_PER_ESTIMATOR)
         make = partial(light_runner, in_process=not threads)
@@ -217,6 +218,15 @@ class Site:
 
     def open(self) -> None:
         """Add places for matching. Raise :class:`mkpc_kaggle.errors.UserError` if none is possible."""
+
+    def fall_back(self) -> None:
+        """Let the fallback places take over matching."""
+        for place in self.of(Work.MATCH):
+            place.kill()
+            self.places.remove(place)
+        self.places += self.fallback
+        self.fallback = []
+        self.matching_cores = self._cores  # the CPU computes now
 
     def scene_worker(self) -> ThreadWorker:
         """Return a worker for a scene, always in a process, since pycolmap may crash."""
@@ -270,14 +280,8 @@ class LocalSite(Site):
             self.fallback = [self._place("cpu", assembly.on_cpu())]
 
     def _place(self, name: str, assembly: Assembly, share: int = 1) -> Place:
-        make = partial(MatchRunner, assembly.pipeline, share=share)
-        return Place(name, partial(self._make, f"mkpc {name}", make))
-
-
-def cores() -> int:
-    """Return the number of cores that this process may use, which in a container are fewer than
-    there are.
-    """
-    if hasattr(os, "sched_getaffinity"):  # not on macOS and Windows
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+        # A thread of the user's process leaves the process's limits as they are.
+        is_process = self._worker is ProcessWorker
+        make = partial(MatchRunner, assembly.pipeline, share=share, is_limited=is_process)
+        worker = partial(self._make, f"mkpc {name}", make)
+        return Place(name, worker, minibatch=assembly.minibatch)

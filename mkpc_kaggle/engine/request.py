@@ -70,5 +70,6 @@ class RunReport:
     unwritten: str = ""
     scenes: tuple[SceneRecord, ...] = ()
     units_run: int = 0
+    units_failed: int = 0  # that raised
     estimated: int = 0
     log: Path | None = None  # the output of workers' libraries, if any

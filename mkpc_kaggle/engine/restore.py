@@ -3,6 +3,7 @@ for missing ones.
 """
 
 from collections.abc import Mapping
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -72,16 +73,17 @@ def _restore_points(
     former: Mapping[tuple[int, int], str],
 ) -> None:
     # All keys first, because one query for thousands of keys is much faster than one for each.
-    today: dict[tuple[int, int], str] = {}
+    today: dict[tuple[int, int], list[str]] = {}
     for index, number in wanted:
         images = state.images_of(index)
         assert images
-        today[index, number] = state.key_of(index, number, images, state.first_stage(index))
-    about = store.about([*today.values(), *former.values()])
-    for (index, number), key in today.items():
-        is_current = key in about
+        today[index, number] = state.keys_of(index, number, images, state.first_stage(index))
+    about = store.about([*chain.from_iterable(today.values()), *former.values()])
+    for (index, number), keys in today.items():
+        stored = [key for key in keys if key in about]
+        is_current = bool(stored)
         # Points of former settings are better than none.
-        used = key if is_current else former.get((index, number), "")
+        used = stored[0] if stored else former.get((index, number), "")
         if used in about:
             state.use_points(index, number, used, about[used]["matches"])
             state.current[index, number] = is_current

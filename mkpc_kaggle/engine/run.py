@@ -30,6 +30,7 @@ class EventLog:
         self.faults: list[str] = []
         self.plans: list[Event] = []
         self.units_run = 0
+        self.units_failed = 0  # that raised
         self.estimated = 0
 
     def note(self, kind: EventKind, text: str = "") -> Event:

@@ -232,6 +232,9 @@ def match_job(view: View, phase: Phase, missing: Mask, ready: Mask) -> MatchJob:
     # A unit that was lost before runs alone, so that another loss has one cause.
     alone = any(("unit", first, unit.name) in state.tries.alone for unit in units)
     size = 1 if alone else view.crew.minibatch
+    # Near the end, a smaller minibatch still ends in time.
+    if mean := view.costs.mean(units[0].name):
+        size = max(1, int(min(size, view.left / mean)))
     indices = (first,)
     if size > 1:
         alike = order[(missing[order] == missing[first]).all(1)]

@@ -278,7 +278,6 @@ def opened_engine(
             budget,
             interrupt=session.interrupt,
             progress=session.progress,
-            minibatch=assembly.minibatch,
         )
         engine.log.note(EventKind.START)
         session.save = engine.save_results

@@ -199,12 +199,31 @@ class State:
         chosen = ~self.is_crop & self.current[index]
         return [key for key in self.points[index][chosen] if key]
 
-    def key_of(self, index: int, unit: int, images: Images, first: Sequence[str]) -> str:
-        """Return today's key of a unit's points; ``first`` are the keys of stage 1."""
+    def key_of(
+        self,
+        index: int,
+        unit: int,
+        images: Images,
+        first: Sequence[str],
+        *,
+        is_float32: bool = False,
+    ) -> str:
+        """Return today's key of a unit's points; ``first`` are the keys of stage 1.
+
+        ``is_float32`` states that the unit ran in float32, whatever precision the run was given.
+        """
         keys = self.request.keys
         pair = self.pairs[index]
         crops = keys.crops_of(pair, first) if self.is_crop[unit] else []
-        return keys.of_points(unit, pair, images, crops)
+        return keys.of_points(unit, pair, images, crops, is_float32=is_float32)
+
+    def keys_of(self, index: int, unit: int, images: Images, first: Sequence[str]) -> list[str]:
+        """Return the keys of points that are today's: in the given precision, then in float32."""
+        keys = [
+            self.key_of(index, unit, images, first, is_float32=is_float32)
+            for is_float32 in (False, True)
+        ]
+        return list(dict.fromkeys(keys))
 
     def estimate_key(self, index: int) -> str:
         """Return the key of an estimate from the points in use."""
@@ -275,8 +294,8 @@ class State:
             return
         first = self.first_stage(index)
         for unit in np.flatnonzero(self.is_crop & self.current[index]).tolist():
-            key = self.key_of(index, unit, images, first)
-            self.current[index, unit] = self.points[index, unit] == key
+            keys = self.keys_of(index, unit, images, first)
+            self.current[index, unit] = self.points[index, unit] in keys
 
     def use_image(self, image: BatchImage) -> None:
         """Use an image as it was decoded. Drop all results of another content of its file."""

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
+from mkpc_kaggle.cores import available_cores
 from mkpc_kaggle.data.images import Image, ImageStore
 from mkpc_kaggle.engine.image_files import file_state
 from mkpc_kaggle.engine.jobs import (
@@ -76,7 +77,7 @@ def failure_of(error: Exception) -> Failure:
 
 class MatchRunner:
     """A runner of match jobs with ``threads`` threads, or as one of ``share`` processes that share
-    the cores.
+    the cores. One that is not ``is_limited`` leaves PyTorch's and OpenCV's threads as they are.
 
     ``refused`` has the reason for each matcher that cannot be loaded: the run continues without its units. Raises
     :class:`mkpc_kaggle.errors.UserError` if none can be loaded.
@@ -88,13 +89,15 @@ class MatchRunner:
         *,
         threads: int = 0,
         share: int = 1,
+        is_limited: bool = True,
     ) -> None:
-        # Alone on a machine, a process uses all cores by default.
-        if threads or share > 1:
+        if is_limited:
             import cv2
             import torch
 
-            threads = threads or max(1, torch.get_num_threads() // share)
+            # PyTorch counts the machine's cores, and knows OMP_NUM_THREADS.
+            available = min(torch.get_num_threads(), available_cores())
+            threads = threads or max(1, available // share)
             torch.set_num_threads(threads)
             cv2.setNumThreads(threads)
         self._pipeline = make_pipeline()
@@ -111,8 +114,8 @@ class MatchRunner:
         deadline = time.monotonic() + job.seconds
         expected = dict(zip(job.units, job.expected, strict=True))
 
-        def may_start(unit: Unit) -> bool:
-            return time.monotonic() + expected[unit] < deadline
+        def may_start(unit: Unit, pairs: int) -> bool:
+            return time.monotonic() + pairs * expected[unit] < deadline
 
         self._look_at(path for pair in job.pairs for path in pair.images)
         opened = [self._open(job, number) for number in range(len(job.pairs))]

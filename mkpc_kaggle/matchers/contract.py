@@ -86,6 +86,8 @@ class MatcherSpec:
     # Of a matcher that is not from this package: its results are kept for later runs under this
     # text, so change it whenever equal pictures get other points. Without it, they are not kept.
     version: str = ""
+    # Distributions whose code computes points: their versions are in the keys. "opencv" is OpenCV.
+    packages: tuple[str, ...] = ()
 
     def slots_for(self, options: Any) -> tuple[str, ...]:
         """Return the manifest's slots that a matcher with these options needs."""

@@ -3,11 +3,14 @@
 from collections.abc import Container, Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
+from importlib import metadata
 from os import PathLike, fspath
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 from uuid import uuid4
+
+import cv2
 
 from mkpc_kaggle.data.masks import Masks
 from mkpc_kaggle.errors import UserError, warn_once
@@ -107,10 +110,14 @@ class Assembly:
             load_float32=None if exact == self.placement else lambda name: self._load(name, exact),
             regions=self.regions,
             masks=self.masks,
+            precision=self.placement.precision,
         )
 
-    def unit_settings(self, unit: Unit) -> dict[str, Any]:
-        """Return all settings that determine a unit's points on given views, as JSON values."""
+    def unit_settings(self, unit: Unit, precision: Precision | None = None) -> dict[str, Any]:
+        """Return all settings that determine a unit's points on given views, as JSON values.
+
+        ``precision`` is the one that the points were computed in; default: the placement's.
+        """
         name = unit.matcher
         fields = asdict(unit)
         # The matcher is settled, and scenes read the points without changing them.
@@ -124,12 +131,14 @@ class Assembly:
         settings: dict[str, Any] = {
             "unit": fields,
             "options": None if is_own else asdict(options_of(self.recipe, name)),
-            "precision": self.placement.precision,
+            "precision": precision or self.placement.precision,
             "weights": weights,
         }
         # The code and the weights of a matcher of this package have digests, or versions in keys.
         if is_own or name.startswith(VISMATCH):
             settings["version"] = self._version_of(name) or self.nonce
+        elif packages := spec_of(name, f"matcher {name}").packages:
+            settings["packages"] = {package: _version_of_package(package) for package in packages}
         return settings
 
     def _version_of(self, name: str) -> str:
@@ -270,6 +279,11 @@ def _without_unavailable(
         if name in faulty:
             warn_once(f"recipe {written.name} does without {name}: {reasons[name]}")
     return chosen.without(missing)
+
+
+def _version_of_package(name: str) -> str:
+    # OpenCV has several distributions.
+    return cv2.__version__ if name == "opencv" else metadata.version(name)
 
 
 def _warn_of_unverified(files: Iterable[FoundFile]) -> None:

@@ -44,6 +44,7 @@ class UnitResult:
     failure: str = ""  # the reason for a result without matches
     warm_up: bool = False  # the first run of the unit in this process, which may take much longer
     note: str = ""  # why the unit did not run as written
+    is_float32: bool = False  # it ran in float32, whatever precision the run was given
     keypoints: int = 0  # detected in the first view; 0 for a matcher without a detector
     found: Keypoints | None = None  # for programs, of a matcher with a detector
 

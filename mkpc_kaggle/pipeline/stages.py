@@ -21,7 +21,14 @@ from mkpc_kaggle.errors import UserError, plural
 from mkpc_kaggle.geometry.coordinates import Box, View
 from mkpc_kaggle.geometry.critical_region import CriticalRegion, RegionReason, critical_region
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.matchers.contract import Colour, Matcher, NonFiniteError, Picture, encoding_bytes
+from mkpc_kaggle.matchers.contract import (
+    Colour,
+    Matcher,
+    NonFiniteError,
+    Picture,
+    Precision,
+    encoding_bytes,
+)
 from mkpc_kaggle.matchers.dtypes import check_finite, exact_float32
 from mkpc_kaggle.matchers.failures import FailureKind, failure_of, reason_of, require_unforked
 from mkpc_kaggle.pipeline.keypoints import Keypoints
@@ -59,7 +66,9 @@ class Pipeline:
         load_float32: Callable[[str], Matcher[Any]] | None = None,
         regions: GivenRegions = MappingProxyType({}),
         masks: Masks | None = None,
+        precision: Precision = Precision.FLOAT32,
     ) -> None:
+        self._precision = precision
         self.raising: Container[str] = ()
         self.keeps_keypoints = False
         self.keeps_descriptors = False
@@ -97,12 +106,13 @@ class Pipeline:
         self,
         pairs: Sequence[PairMatch],
         units: Iterable[Unit],
-        may_start: Callable[[Unit], bool] = lambda _: True,
+        may_start: Callable[[Unit, int], bool] = lambda *_: True,
     ) -> list[PairMatch]:
         """Run each unit on the pairs that have no result of it.
 
         First the units of stage 1, then the critical regions, then the units of stage 2.
-        ``may_start(unit)`` is called before each minibatch of a unit; False stops the unit. If a
+        ``may_start(unit, pairs)`` is called before each minibatch of a unit, with its number of
+        pairs. False halves the minibatch, and stops the unit before a single pair. If a
         matcher raises, the minibatch's pairs run one by one, and a pair that raises again gets a
         result with this failure. Raises device errors, memory errors on a single pair (see
         :mod:`mkpc_kaggle.matchers.failures`), and :class:`UserError` in a forked child.
@@ -121,14 +131,21 @@ class Pipeline:
             self._run(unit, pairs, may_start)
         return pairs
 
-    def _run(self, unit: Unit, pairs: list[PairMatch], may_start: Callable[[Unit], bool]) -> None:
+    def _run(
+        self, unit: Unit, pairs: list[PairMatch], may_start: Callable[[Unit, int], bool]
+    ) -> None:
         """Add the unit's results to the pairs, in place."""
         waiting = []
         for number, pair in enumerate(pairs):
             if unit not in (result.unit for result in pair.results):
                 waiting.append(number)
-        while waiting and may_start(unit):
-            numbers = waiting[: self._minibatches.get(unit, self.minibatch)]
+        while waiting:
+            size = min(len(waiting), self._minibatches.get(unit, self.minibatch))
+            while size and not may_start(unit, size):
+                size //= 2
+            if not size:
+                return
+            numbers = waiting[:size]
             results = self._run_minibatch(unit, [pairs[number] for number in numbers])
             # No results: the same pairs are tried again, in float32 or fewer at a time.
             for number, result in zip(numbers[: len(results)], results, strict=True):
@@ -217,6 +234,7 @@ class Pipeline:
                 (matched - encoded) / len(pairs),
                 warm_up=warm_up,
                 note=self._notes.get(unit.matcher, ""),
+                is_float32=self._precision is Precision.FLOAT32 or unit.matcher in self._notes,
                 keypoints=len(getattr(encoding, "points", ())),
                 found=kept,
             )

@@ -221,7 +221,7 @@ class TwoStageMatcher:
         bar = counted(units, f"matching by recipe {self.recipe.name}", "unit")
         begun: set[Unit] = set()
 
-        def may_start(unit: Unit) -> bool:
+        def may_start(unit: Unit, _: int) -> bool:
             # A unit that is tried again, in float32, counts once.
             if unit not in begun:
                 begun.add(unit)

@@ -31,6 +31,8 @@ def summary(report: RunReport) -> str:
     """Return the summary at the end of a run."""
     resumed = f", {report.resumed} of them from earlier runs" if report.resumed else ""
     done = f"; {plural(report.units_run, 'unit')} run, {report.estimated} F estimated"
+    if report.units_failed:
+        done += f", {plural(report.units_failed, 'unit')} failed"
     # Of libjpeg, CUDA and others: they would tear the progress bar.
     printed = f"messages of image and device libraries: {report.log}" if report.log else ""
     lines = [headline(report) + resumed + done, *_lines(report), printed, trouble(report)]

@@ -18,6 +18,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from mkpc_kaggle.cores import available_cores
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.intrinsics import KnownCamera
@@ -253,7 +254,7 @@ def verify(merged: MergedGraph, cameras: Sequence[Any], *, reuse: bool = False) 
 
     found: list[Any] = [None] * len(merged.graph.edges)
     # On all cores: an edge starts from the same seed in every thread, so results are the same.
-    with ThreadPoolExecutor() as pool:
+    with ThreadPoolExecutor(available_cores()) as pool:
         list(pool.map(estimate, range(len(found))))
     return found
 

@@ -9,6 +9,7 @@ from functools import partial
 from typing import Any
 
 import pytest
+import rectified
 from faulty import (
     BROKEN,
     FaultyMatcher,
@@ -24,13 +25,16 @@ from rectified import SECOND, SWEEP, THIRD, THREE_UNITS, RectifiedMatcher, matri
 
 from mkpc_kaggle.cli import main, options
 from mkpc_kaggle.data.competition import read_test_side, submission_problems
+from mkpc_kaggle.engine.budget import Costs
 from mkpc_kaggle.engine.places import Place
 from mkpc_kaggle.engine.request import Ending, RunReport
 from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.matchers.contract import NonFiniteError, Placement, Precision
 from mkpc_kaggle.matchers.failures import DeviceError, FailureKind, failure_of, reason_of
 from mkpc_kaggle.pipeline.assembly import Assembly, assemble
 from mkpc_kaggle.pipeline.stages import Pipeline
 from mkpc_kaggle.recipe import Unit
+from mkpc_kaggle.reporting.summary import summary
 
 COUNT = 12
 VICTIM = 3  # brightness 13
@@ -177,6 +181,81 @@ def test_a_pair_on_which_a_device_failed_is_matched_by_a_healthy_one(run_at, und
     assert_as_if_nothing_had_failed(report, undisturbed)
 
 
+def test_jobs_of_the_cpu_that_takes_over_have_one_pair(run_at, undisturbed, monkeypatch):
+    sizes: dict[str, set[int]] = {"cuda:0": set(), "cpu": set()}
+    submit = Place.submit
+
+    def noted(place: Place, job: Any, *arguments: float) -> None:
+        if place.name in sizes:
+            sizes[place.name].add(len(job.indices))
+        submit(place, job, *arguments)
+
+    monkeypatch.setattr(Place, "submit", noted)
+    gpu = thread_place("cuda:0", RectifiedMatcher(matches=breaks_after(2)), minibatch=8)
+    report = run_at(gpu, fallback=[thread_place("cpu", RectifiedMatcher())])
+    assert_as_if_nothing_had_failed(report, undisturbed)
+    assert max(sizes["cuda:0"]) == 8
+    assert sizes["cpu"] == {1}
+
+
+def half_precision(matcher: RectifiedMatcher) -> Pipeline:
+    load = {matcher.name: matcher}.__getitem__
+    return Pipeline(THREE_UNITS, load, load_float32=load, precision=Precision.FLOAT16)
+
+
+def overflow() -> None:
+    raise NonFiniteError("infinite features")
+
+
+@pytest.mark.filterwarnings("ignore:rectified runs in float32")
+@pytest.mark.parametrize("cause", ["the CPU took over", "overflow"])
+def test_points_that_were_computed_in_float32_have_a_key_that_says_so(
+    pairs, tmp_path, monkeypatch, cause
+):
+    def assembled(*arguments: Any, **options: Any) -> Assembly:
+        half = Placement("cpu", Precision.FLOAT16)
+        return replace(assemble(*arguments, **options), placement=half)
+
+    def run_on(place: Place) -> RunReport:
+        use_places(monkeypatch, place, fallback=[thread_place("cpu", RectifiedMatcher())])
+        return run(pairs, recipe, RectifiedMatcher(), tmp_path / "work", publish=states.append)
+
+    monkeypatch.setattr(rectified, "assemble", assembled)
+    states: list[Any] = []
+    recipe = replace(THREE_UNITS, units=(SWEEP,))
+    matcher = RectifiedMatcher(matches=breaks_after(VICTIM))
+    if cause == "overflow":
+        # The first pair in float32 is the one that overflowed.
+        matcher = FaultyMatcher(fault=overflow, once=tmp_path / "once")
+    gpu = thread_place("cuda:0", matcher, pipeline=partial(half_precision, matcher))
+    assert run_on(gpu).ending is Ending.COMPLETE
+    state = states[-1]
+    for index in range(COUNT):
+        half, exact = state.keys_of(index, 0, state.images_of(index), [])
+        assert half != exact
+        assert state.points[index, 0] == (half if index < VICTIM else exact), index
+    # Both are today's results for the next run.
+    assert run_on(thread_place("cuda:0", RectifiedMatcher())).units_run == 0
+
+
+def test_a_unit_that_raises_is_no_measurement_and_is_counted_apart(
+    pairs, tmp_path, monkeypatch, capsys
+):
+    measured = []
+    monkeypatch.setattr(Costs, "observe", lambda _, unit, *__, **___: measured.append(unit))
+
+    def answer(brightness: int) -> int:
+        if brightness % 4:
+            raise KeyError("x")
+        return 150
+
+    recipe = replace(THREE_UNITS, units=(SWEEP,))
+    report = run(pairs, recipe, RectifiedMatcher(matches=answer), tmp_path / "work")
+    assert (report.units_run, report.units_failed) == (3, 9)
+    assert measured.count(SWEEP.name) == 3
+    assert "3 units run, 3 F estimated, 9 units failed" in summary(report)
+
+
 def test_a_device_without_kernels_leaves_the_work_to_the_cpu_with_a_message(
     run_at, undisturbed, capsys
 ):
@@ -237,9 +316,8 @@ def test_a_unit_too_large_for_the_memory_is_skipped_on_that_pair_alone_and_tried
 
 
 def test_a_minibatch_too_large_for_the_memory_is_halved_once_and_no_worker_is_lost(
-    run_at, undisturbed, monkeypatch
+    run_at, undisturbed
 ):
-    monkeypatch.setattr(Assembly, "minibatch", 8)
     matcher = NarrowMatcher(most=2)
     report = run_at(thread_place("cuda:0", matcher, minibatch=8))
     assert report.faults == ()

@@ -12,6 +12,8 @@ from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine import keys
 from mkpc_kaggle.engine.keys import Keys
 from mkpc_kaggle.geometry.coordinates import Box, Size
+from mkpc_kaggle.matchers.contract import Placement, Precision
+from mkpc_kaggle.pipeline import assembly
 from mkpc_kaggle.pipeline.assembly import Assembly, assemble
 from mkpc_kaggle.recipe import SceneConfig, Unit, load_recipe
 from mkpc_kaggle.scene.view_graph import BatchImage
@@ -59,14 +61,14 @@ def test_other_weights_change_the_points_of_their_units_and_of_stage_2(monkeypat
         Unit(1, "aliked_lightglue", 640),
         Unit(2, "sift", 640),
     )
-    assembly = replace(assemble(CLASSICAL), recipe=replace(CLASSICAL, units=units))
+    made = replace(assemble(CLASSICAL), recipe=replace(CLASSICAL, units=units))
 
     def digests(**other: str) -> tuple[str, ...]:
         names = ("xfeat", "xfeat-lighterglue", "aliked-n16", "aliked-lightglue")
         slots = dict.fromkeys(names, "same") | other
         files = {name: SimpleNamespace(digest=digest) for name, digest in slots.items()}
         monkeypatch.setattr(Assembly, "weight_files", files)
-        keys = Keys.of(assembly)
+        keys = Keys.of(made)
         pair = Pair("p", "b", "0.png", "1.png")
         first = [keys.of_points(unit, pair, IMAGES, []) for unit in (0, 1)]
         # Stage 2 looks at crops from all of stage 1, so it depends on both matchers' weights.
@@ -75,6 +77,42 @@ def test_other_weights_change_the_points_of_their_units_and_of_stage_2(monkeypat
 
     pairs = zip(digests(), digests(**{slot: "other"}), strict=True)
     assert [former != new for former, new in pairs] == changed
+
+
+@pytest.mark.parametrize(
+    ("package", "changed"),
+    [
+        ("opencv", [True, True, False, False, False]),
+        ("kornia", [False, False, True, True, False]),
+    ],
+)
+def test_another_version_of_a_library_changes_the_points_that_come_from_it(
+    monkeypatch, package, changed
+):
+    names = ("sift", "sift_lightglue", "disk_lightglue", "xfeat_lighterglue", "aliked_lightglue")
+    units = tuple(Unit(1, name, 640) for name in names)
+    made = replace(assemble(CLASSICAL), recipe=replace(CLASSICAL, units=units))
+    monkeypatch.setattr(Assembly, "weight_files", {})
+    former = Keys.of(made).units
+    version_of = assembly._version_of_package
+    other = {package: "another"}
+    monkeypatch.setattr(
+        assembly, "_version_of_package", lambda name: other.get(name) or version_of(name)
+    )
+    pairs = zip(former, Keys.of(made).units, strict=True)
+    assert [before != after for before, after in pairs] == changed
+
+
+def test_a_unit_in_half_precision_has_the_keys_of_float32_where_it_ran_in_that():
+    exact = assemble(CLASSICAL)
+    half = replace(exact, placement=Placement("cpu", Precision.FLOAT16))
+    pair = Pair("p", "b", "0.png", "1.png")
+
+    def key(keys: Keys, *, is_float32: bool) -> str:
+        return keys.of_points(0, pair, IMAGES, [], is_float32=is_float32)
+
+    assert key(Keys.of(half), is_float32=False) != key(Keys.of(exact), is_float32=False)
+    assert key(Keys.of(half), is_float32=True) == key(Keys.of(exact), is_float32=False)
 
 
 # Another input, and whether the points of stage 1, those of stage 2, the estimate and the scene then

@@ -1,5 +1,6 @@
 """A place: when it is closed, on workers that answer as they are told."""
 
+import os
 import threading
 from types import SimpleNamespace
 
@@ -117,7 +118,7 @@ def test_an_answer_that_has_arrived_counts_even_after_its_limit():
 def test_the_workers_of_a_machine_share_its_cores_on_gpus_too(
     monkeypatch, devices, workers, shares
 ):
-    made = SimpleNamespace(pipeline=None)
+    made = SimpleNamespace(pipeline=None, minibatch=1)
     assembly = SimpleNamespace(devices=devices, on=lambda *_: made, on_cpu=lambda: made)
     worker = lambda name, make, ring: SimpleNamespace(share=make.keywords["share"])  # noqa: E731
     monkeypatch.setattr(places, "ProcessWorker", worker)
@@ -138,16 +139,30 @@ def test_the_workers_of_a_machine_share_its_cores_on_gpus_too(
 def test_scenes_have_the_cores_that_matching_leaves_free_and_estimates_those_of_the_container(
     monkeypatch, cores, devices, workers, scenes
 ):
-    made = SimpleNamespace(pipeline=None)
+    made = SimpleNamespace(pipeline=None, minibatch=1)
     assembly = SimpleNamespace(devices=devices, on=lambda *_: made, on_cpu=lambda: made)
-    monkeypatch.setattr(places.os, "sched_getaffinity", lambda _: set(range(cores)))
-    monkeypatch.setattr(places.os, "cpu_count", lambda: 64)  # of the whole machine
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(cores)))
+    monkeypatch.setattr(os, "cpu_count", lambda: 64)  # of the whole machine
     site = LocalSite(assembly, workers, lambda: 0.0)
     while_matching = site.scenes_at_a_time(is_matching=True)
     afterwards = site.scenes_at_a_time(is_matching=False)
     assert (while_matching, afterwards) == scenes
     assert len(site.of(Work.SCENE)) == cores
     assert len(site.of(Work.LIGHT)) == max(1, cores // 4)
+
+
+def test_the_cpu_that_takes_over_has_its_own_sizes_and_all_cores(monkeypatch):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(8)))
+    gpu = SimpleNamespace(pipeline=None, minibatch=8)
+    cpu = SimpleNamespace(pipeline=None, minibatch=1)
+    assembly = SimpleNamespace(devices=("cuda:0",), on=lambda *_: gpu, on_cpu=lambda: cpu)
+    site = LocalSite(assembly, None, lambda: 0.0)
+    assert [place.minibatch for place in site.of(Work.MATCH)] == [8]
+    assert site.scenes_at_a_time(is_matching=True) == 7
+    site.fall_back()
+    assert [place.minibatch for place in site.of(Work.MATCH)] == [1]
+    assert site.scenes_at_a_time(is_matching=True) == 1
+    assert site.fallback == []
 
 
 def test_workers_in_threads_leave_the_limits_of_the_users_process_as_they_are(tmp_path):

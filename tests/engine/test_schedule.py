@@ -159,6 +159,16 @@ def test_a_minibatch_has_pairs_that_lack_the_same_units():
     assert units == [(SWEEP,), (SWEEP,), (THIRD, SECOND), (SECOND,)], "stage 1 first"
 
 
+def test_near_the_end_a_minibatch_gets_as_small_as_the_time_that_is_left():
+    run = Run(30, limit=100.0, had=[(SWEEP,)] * 30, minibatch=8)
+    run.learn(*UNITS)
+    sizes = []
+    for left in (50.0, 9.5, 8.5, 5.5, 1.5):
+        job = run.next_work(view_of(run).stop - left).match
+        sizes.append(len(job.indices))
+    assert sizes == [8, 8, 8, 5, 1]
+
+
 def test_a_unit_that_was_lost_before_is_alone_in_its_job():
     run = Run(3, had=[(SWEEP,)] * 3)
     run.learn(*UNITS)

@@ -242,9 +242,9 @@ def test_results_are_in_the_order_of_the_recipe_for_any_order_of_running():
 
 def test_results_so_far_are_returned_when_no_unit_may_start():
     runner = pipeline(TWO_STAGES)
-    (work,) = runner.match(works(), TWO_STAGES.units, lambda unit: unit.stage == 1)
+    (work,) = runner.match(works(), TWO_STAGES.units, lambda unit, _: unit.stage == 1)
     assert [result.unit.stage for result in work.results] == [1]
-    (none,) = runner.match(works(), TWO_STAGES.units, lambda unit: False)
+    (none,) = runner.match(works(), TWO_STAGES.units, lambda *_: False)
     assert none.results == ()
     assert with_estimate(none, TWO_STAGES).estimate.failure
 

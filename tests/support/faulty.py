@@ -187,9 +187,10 @@ def thread_place(
 ) -> Place:
     """Where workers are threads of this process, with that matcher, or that pipeline."""
     make = partial(Pipeline, THREE_UNITS, {matcher.name: matcher}.__getitem__, minibatch=minibatch)
-    return Place(
-        name, partial(ThreadWorker, name, partial(MatchRunner, pipeline or make), lambda: None)
-    )
+    # The threads of the tests' process stay as they are.
+    runner = partial(MatchRunner, pipeline or make, is_limited=False)
+    worker = partial(ThreadWorker, name, runner, lambda: None)
+    return Place(name, worker, minibatch=minibatch)
 
 
 def use_places(

@@ -268,6 +268,8 @@ class SimulatedSite(Site):
             makers.append((f"scenes {number}", self.scene_worker, Work.SCENE))
         self.places = [Place(*maker) for maker in makers]
         self.matching = self.of(Work.MATCH)
+        for place in self.matching:
+            place.minibatch = scenario.minibatch
         if scenario.fallback:
             self.fallback = [Place("cpu", self.fallback_worker)]
 
@@ -506,9 +508,7 @@ def simulate(scenario: Scenario, store: Store | None = None, until: float = math
     published: list[int] = []
     interrupt = threading.Event()
     store = memory_store() if store is None else store
-    engine = Engine(
-        site, store, time, interrupt=interrupt, progress=False, minibatch=scenario.minibatch
-    )
+    engine = Engine(site, store, time, interrupt=interrupt, progress=False)
 
     def wait(moment: float) -> None:
         whole_wait(min(moment, until))

@@ -14,7 +14,11 @@ from mkpc_kaggle.weights import WeightStore, load_into
 
 SHAPE = LightGlueShape(descriptor=128)
 SPEC = MatcherSpec(
-    "disk_lightglue", LightGlueOptions, multiple=16, slots=("disk", "disk-lightglue")
+    "disk_lightglue",
+    LightGlueOptions,
+    multiple=16,
+    slots=("disk", "disk-lightglue"),
+    packages=("kornia",),
 )
 
 

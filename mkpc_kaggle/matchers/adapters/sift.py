@@ -33,7 +33,7 @@ class SiftOptions:
         check_ranges(self, features=AT_LEAST_1, ratio=SHARE, contrast_threshold=AT_LEAST_0)
 
 
-SPEC = MatcherSpec("sift", SiftOptions, Colour.GRAY)
+SPEC = MatcherSpec("sift", SiftOptions, Colour.GRAY, packages=("opencv",))
 
 
 class SiftMatcher(NeighbourMatcher):

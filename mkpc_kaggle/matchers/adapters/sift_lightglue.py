@@ -23,7 +23,13 @@ class SiftLightGlueOptions(LightGlueOptions):
 
 
 SHAPE = LightGlueShape(descriptor=128, positions=4)
-SPEC = MatcherSpec("sift_lightglue", SiftLightGlueOptions, Colour.GRAY, slots=("sift-lightglue",))
+SPEC = MatcherSpec(
+    "sift_lightglue",
+    SiftLightGlueOptions,
+    Colour.GRAY,
+    slots=("sift-lightglue",),
+    packages=("opencv",),
+)
 SHIFT_PX = 0.25  # OpenCV's offset if precise upscaling is off, as in the published evaluation
 
 

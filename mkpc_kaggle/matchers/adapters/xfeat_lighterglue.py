@@ -23,7 +23,11 @@ class LighterGlueOptions(LightGlueOptions):
 
 SHAPE = LightGlueShape(descriptor=64, width=96, heads=1)  # a narrow LightGlue
 SPEC = MatcherSpec(
-    "xfeat_lighterglue", LighterGlueOptions, multiple=32, slots=("xfeat", "xfeat-lighterglue")
+    "xfeat_lighterglue",
+    LighterGlueOptions,
+    multiple=32,
+    slots=("xfeat", "xfeat-lighterglue"),
+    packages=("kornia",),
 )
 
 
