@@ -165,7 +165,8 @@ def run(arguments: argparse.Namespace) -> int:
             publish=publish,
         )
         # A run that failed has failed even if an earlier one has left a model.
-        if trouble(result.report) or result.report.unwritten or result.lost:
+        unwritten = result.report.unwritten or result.report.unsaved
+        if trouble(result.report) or unwritten or result.lost:
             session.status = 1
         problems = [trouble(result.report), result.report.unwritten]
         is_here = held.is_here and all(each.is_here for each in result.held.values())

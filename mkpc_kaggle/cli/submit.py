@@ -74,7 +74,7 @@ def run(arguments: argparse.Namespace) -> int:
             options.say_start(plural(len(pairs), "pair"), assembly, work_dir, effects)
             _, images = test_side(arguments.test_dir)
             report = submit(pairs, assembly, session, output, str(images))
-            session.status = int(bool(report.unwritten or trouble(report)))
+            session.status = int(bool(report.unwritten or report.unsaved or trouble(report)))
             unwritten = f" is not the last version: {report.unwritten}" if report.unwritten else ""
             # A file that could not be replaced is an earlier version; it is complete, too.
             lines = [*options.plan_lines(arguments, report), summary(report)]

@@ -94,6 +94,7 @@ def results(directory: Path | str) -> Results:
         records = read_records(store, table)
         scenes = read_scenes(store, table)
         digests = stored_digests(store, table.image_names)
+        store.warn_of_damage()
     units = [_unit_row(record, unit) for record in records for unit in record.units]
     names = names_by_content(table, digests)
     return Results(

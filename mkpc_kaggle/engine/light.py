@@ -1,5 +1,6 @@
 """Light work, without torch: estimates of pairs, and features of images."""
 
+import sqlite3
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -11,7 +12,7 @@ from mkpc_kaggle.engine.jobs import Cause, Estimated, EstimateJob, Failure, Feat
 from mkpc_kaggle.engine.records import ESTIMATED
 from mkpc_kaggle.engine.run import HANG_FACTOR, Run
 from mkpc_kaggle.engine.schedule import lacking_estimates
-from mkpc_kaggle.engine.store import Kind, Result, Store
+from mkpc_kaggle.engine.store import Kind, Result, Source, Store
 
 # In a job. More pairs would make the last F of a run wait for each other; single pairs, each with a
 # message and a transaction, would cost the loop more.
@@ -36,9 +37,11 @@ class Estimating:
         elsewhere = [index for index in due if ("estimate", index) in given_up]
         return [index for index in due if index not in elsewhere], elsewhere
 
-    def job(self, due: Sequence[int], *, is_trial: bool = False) -> EstimateJob:
-        """Return a job for the first pairs that are due. A pair whose job was lost is alone in its
-        job; on trial, a place gets other pairs first.
+    def job(self, due: Sequence[int], *, is_trial: bool = False) -> EstimateJob | None:
+        """Return a job for the first pairs that are due, with their points. A pair whose job was
+        lost is alone in its job; on trial, a place gets other pairs first.
+
+        Return ``None`` if points cannot be read: these pairs are planned again.
         """
         run = self._run
         state = run.state
@@ -54,7 +57,19 @@ class Estimating:
                 state.begin(state.estimating, [index])
                 begun.append(index)
         pairs = tuple(state.inputs_of(index) for index in begun)
-        return EstimateJob(pairs, state.request.recipe, run.source(pairs))
+        recipe = state.request.recipe
+        try:
+            # A worker that opened the store by its path would depend on where the path leads now.
+            source = run.source(pairs, held=True)
+        except sqlite3.Error as error:  # a disk that fails
+            failure = Failure(Cause.RAISED, f"the store cannot be read: {error}")
+            run.log.fault(str(failure))
+            self.lose(EstimateJob(pairs, recipe, Source(None, {})), failure)
+            return None
+        if source is None:
+            state.end(state.estimating, begun)
+            return None
+        return EstimateJob(pairs, recipe, source)
 
     def patience(self, job: EstimateJob) -> float:
         run = self._run

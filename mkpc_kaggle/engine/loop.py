@@ -89,6 +89,7 @@ class Engine:
         self._asked: Asked | None = None  # the latest request
         self._refused: dict[str, str] = {}  # why a matcher cannot be loaded, by name
         self._looking_since = 0.0  # the features of a large folder are many short jobs
+        self._must_replan = False  # a job was dropped, as its points are lost
         self._is_open = False  # the places for matching exist
         self._has_loaded = False  # some worker of matching was ready
         self._has_ended = False
@@ -136,6 +137,12 @@ class Engine:
         time.
         """
         state = State(request, extra_pairs_of(request.pairs, request.recipe.scene))
+        if damaged := len(self.store.damaged):
+            # They are missing now, like results that never were.
+            text = f"{plural(damaged, 'result')} of the journal, damaged, will be computed again"
+            console.warn(text)
+            self.log.fault(text)
+            self.store.damaged.clear()
         # The only time that the store is read for the state: later, answers update it.
         restore(state, self.store, self._digests(state))
         # A worker of an earlier request may have failed to load a matcher already.
@@ -165,6 +172,9 @@ class Engine:
         self._end()
         asked = self._asked
         assert asked is not None, "nothing was asked for"
+        unsaved = self.store.flush()  # the disk may have room again
+        if unsaved:
+            self.log.fault(unsaved)
         return RunReport(
             records=tuple(read_records(self.store, asked.publication.table())),
             ending=self.ending,
@@ -173,6 +183,7 @@ class Engine:
             faults=tuple(self.log.faults),
             explanations=tuple(self.log.plans),
             unwritten=asked.publication.unwritten,
+            unsaved=unsaved,
             scenes=scene_records(asked.state),
             units_run=self.log.units_run,
             units_failed=self.log.units_failed,
@@ -313,7 +324,8 @@ class Engine:
             needs[Work.MATCH] = self._hand_out_pairs(asked, work, now)
             needs[Work.SCENE] = self._hand_out_single_jobs(asked, work, now)
         needs[Work.LIGHT] = self._hand_out_light(asked, work, now)
-        is_under_way = False
+        is_under_way = self._must_replan
+        self._must_replan = False
         for place in self.site.places:
             if place.may_start(now) and needs[place.work] > 0:
                 self._start(place, now)
@@ -415,7 +427,11 @@ class Engine:
             timeout = min(timeout, max(self.budget.silence, self._unknown_patience(now)))
         place.start(now, timeout)
 
-    def _give(self, place: Place, job: Job, now: float) -> None:
+    def _give(self, place: Place, job: Job | None, now: float) -> None:
+        """Give a job to an idle worker; ``None`` if its points are lost, and it is planned again."""
+        if job is None:
+            self._must_replan = True
+            return
         place.submit(job, self._time_limit(job, now), now)
 
     def _time_limit(self, job: Job, now: float) -> float:
@@ -474,10 +490,9 @@ class Engine:
             text = f"a result cannot be saved: {error}"
             self.log.fault(text)
             handler.lose(job, Failure(Cause.RAISED, text))
-        # A full disk: the run continues, and the user may make room.
+        # A full disk or a lock: the run continues, and the user may make room.
         if self.store.trouble:
-            trouble = f"the journal cannot be written ({self.store.trouble})"
-            self.log.fault(f"{trouble}; results stay in memory")
+            self.log.fault(self.store.trouble)
         if isinstance(job, SceneJob) and job.export is not None and self._asked is not None:
             # COLMAP's files of this batch are complete, so tables of cameras should agree.
             self._asked.publication.publish()

@@ -1,7 +1,7 @@
 """Matching: the schedule's jobs with their inputs, explained phases, results and losses."""
 
 import sqlite3
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from mkpc_kaggle.engine.image_files import image_results
@@ -71,12 +71,17 @@ class Matching:
         if any(unit.stage == 2 for unit in job.units):
             # Crops come from points of today alone. Others may be of former settings.
             crops = [tuple(state.first_stage(index)) for index in job.indices]
-            inputs = zip(job.indices, crops, strict=True)
+            inputs = list(zip(job.indices, crops, strict=True))
             try:
-                known = [self._points_of(index, keys) for index, keys in inputs]
-            except (sqlite3.Error, KeyError) as error:  # a disk that fails
+                # The arrays of all points would not fit in memory.
+                data = self._run.store.data(key for _, keys in inputs for key in keys)
+            except sqlite3.Error as error:  # a disk that fails
                 self.lose(job, Failure(Cause.RAISED, f"the store cannot be read: {error}"))
                 return None
+            if self._run.forget_lost({key for _, keys in inputs for key in keys} - data.keys()):
+                self._end(job)
+                return None
+            known = [self._points_of(index, keys, data) for index, keys in inputs]
         upcoming = [] if job.is_check else upcoming_pairs(state, job, minibatch)
         return replace(
             job,
@@ -87,11 +92,11 @@ class Matching:
             upcoming=tuple(path for index in upcoming for path in state.pairs[index].images),
         )
 
-    def _points_of(self, index: int, keys: Sequence[str]) -> tuple[UnitResult, ...]:
+    def _points_of(
+        self, index: int, keys: Sequence[str], data: Mapping[str, bytes]
+    ) -> tuple[UnitResult, ...]:
         if not keys:
             return ()
-        # The only read of the loop: the arrays of all points would not fit in memory.
-        data = self._run.store.data(keys)
         points = self._run.state.inputs_of(index).points
         units = {key: unit for unit, key in points.items()}
         return tuple(UnitResult(units[key], from_bytes(data[key])) for key in keys)

@@ -25,8 +25,9 @@ class Reconstructing:
     def __init__(self, run: Run) -> None:
         self._run = run
 
-    def job(self, batch: str) -> SceneJob:
-        """Return the job of a batch, from the results in use now.
+    def job(self, batch: str) -> SceneJob | None:
+        """Return the job of a batch, from the results in use now; ``None`` if points are lost, which
+        are matched again.
 
         If its pairs get other results meanwhile, the scene is stale when it arrives.
         """
@@ -36,6 +37,10 @@ class Reconstructing:
         state.reconstructing.add(batch)
         indices, key = state.scene_inputs(batch)
         pairs = tuple(state.inputs_of(index) for index in indices)
+        source = run.source(pairs)
+        if source is None:
+            state.reconstructing.discard(batch)
+            return None
         export = state.request.exports.get(batch)
         if export is not None:
             # From now on the files may be replaced, so they belong to no stored scene.
@@ -46,7 +51,7 @@ class Reconstructing:
             pairs,
             contents=tuple(state.contents(index) for index in indices),
             recipe=state.request.recipe,
-            source=run.source(pairs),
+            source=source,
             matches=int(state.matches[indices].sum()),
             export=export,
         )
@@ -98,6 +103,9 @@ class Reconstructing:
         state = run.state
         run.log.fault(f"batch {job.batch} was not reconstructed: {failure}")
         state.reconstructing.discard(job.batch)
+        # Its worker reads the store by itself. Another program may have damaged it.
+        if run.forget_lost_points(job.pairs):
+            return
         if state.tries.lose([("scene", job.batch, job.key)], failure):
             # The batch becomes stale again when its inputs change.
             state.stale.discard(job.batch)

@@ -330,7 +330,9 @@ class Table:
         found = store.about([TABLE]).get(TABLE)
         if found is None:
             return cls()
-        data = store.data([TABLE])[TABLE]
+        data = store.data([TABLE]).get(TABLE)
+        if data is None:  # damaged
+            return cls()
         return cls(
             about=ABOUT.of_json(found["about"]),
             units=[(name, stage) for name, stage in found["units"]],

@@ -68,6 +68,7 @@ class RunReport:
     faults: tuple[str, ...] = ()
     explanations: tuple[Event, ...] = ()  # decisions of the schedule
     unwritten: str = ""
+    unsaved: str = ""  # why the journal does not have all results
     scenes: tuple[SceneRecord, ...] = ()
     units_run: int = 0
     units_failed: int = 0  # that raised

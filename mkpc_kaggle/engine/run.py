@@ -4,7 +4,8 @@ Each kind has a file, from its jobs to their results: :mod:`matching`, :mod:`lig
 (estimates, features of images) and :mod:`reconstructing`.
 """
 
-from collections.abc import Sequence
+import sqlite3
+from collections.abc import Sequence, Set
 from dataclasses import dataclass
 from secrets import token_hex
 from typing import Any, Protocol
@@ -15,6 +16,7 @@ from mkpc_kaggle.engine.jobs import Failure, PairInputs
 from mkpc_kaggle.engine.records import EVENT, Event, EventKind
 from mkpc_kaggle.engine.state import State
 from mkpc_kaggle.engine.store import Kind, Result, Source, Store
+from mkpc_kaggle.errors import plural
 
 # A job that takes this multiple of its measured cost hangs. Stalls of twenty times the cost, as in the
 # simulator, must not cost a worker.
@@ -65,9 +67,33 @@ class Run:
     log: EventLog
     progress: Progress
 
-    def source(self, pairs: Sequence[PairInputs]) -> Source:
-        """Return where a worker finds the points of these pairs."""
-        return self.store.source([key for pair in pairs for key in pair.points.values()])
+    def source(self, pairs: Sequence[PairInputs], *, held: bool = False) -> Source | None:
+        """Return where a worker finds the points of these pairs, or the points if ``held``.
+
+        Return ``None`` if the store has lost points, which are matched again.
+        """
+        keys = [key for pair in pairs for key in pair.points.values()]
+        source = self.store.held(keys) if held else self.store.source(keys)
+        if source.directory is None and self.forget_lost(set(keys) - source.held.keys()):
+            return None
+        return source
+
+    def forget_lost_points(self, pairs: Sequence[PairInputs]) -> bool:
+        """Forget the points of these pairs that the store has lost. Return whether there are any."""
+        keys = {key for pair in pairs for key in pair.points.values()}
+        try:
+            data = self.store.data(keys)
+        except sqlite3.Error:  # a disk that fails: perhaps they can be read later
+            return False
+        return self.forget_lost(keys - data.keys())
+
+    def forget_lost(self, keys: Set[str]) -> bool:
+        """Forget these points, so that they are matched again. Return whether there are any."""
+        if keys:
+            self.state.forget_points(keys)
+            results = plural(len(keys), "result")
+            self.log.fault(f"the journal has lost {results}, which this run computes again")
+        return bool(keys)
 
 
 class JobHandler(Protocol):

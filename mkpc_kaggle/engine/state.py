@@ -6,7 +6,7 @@ unit looks at crops that come from the pair's stage-1 points: new points of stag
 and its points are computed again.
 """
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from pathlib import Path
 from typing import Any
 
@@ -280,6 +280,17 @@ class State:
         self.has[index, unit] = True
         self.current[index, unit] = True
         self.matches[index, unit] = matches
+
+    def forget_points(self, keys: Set[str]) -> None:
+        """Forget the points with these keys: their units are missing again."""
+        has_key = np.isin(self.points, list(keys))
+        for index in np.flatnonzero(has_key.any(1)).tolist():
+            lost = has_key[index]
+            self.points[index, lost] = ""
+            self.matches[index, lost] = 0
+            self.has[index, lost] = False
+            self.current[index, lost] = False
+            self.note_points(index)
 
     def note_points(self, index: int) -> None:
         """Note that a pair has new points: its crops, its estimate and its scene may be outdated."""

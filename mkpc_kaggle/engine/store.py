@@ -7,22 +7,26 @@ in memory (:mod:`state`).
 """
 
 import errno
+import hashlib
 import json
 import os
+import shutil
 import sqlite3
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from time import monotonic
 from typing import Any, Self
 
 import numpy as np
 
-from mkpc_kaggle.errors import UserError, printable, writing
+from mkpc_kaggle.errors import UserError, plural, printable, warn_once, writing
 from mkpc_kaggle.geometry.matches import Matches
 
-FORMAT = 18  # increase it when a kind of result is stored differently: nothing is converted
+FORMAT = 19  # increase it when a kind of result is stored differently: nothing is converted
 FILE_NAME = "journal.sqlite"  # named in the documentation, and in scripts of users
 LOCK_NAME = "journal.lock"
 # STRICT refuses values of a wrong type, and json_valid refuses numbers that are not JSON, such as NaN.
@@ -32,9 +36,11 @@ CREATE TABLE result (
     key TEXT PRIMARY KEY,
     kind TEXT NOT NULL,
     about TEXT NOT NULL CHECK (json_valid(about)),
-    data BLOB NOT NULL
+    data BLOB NOT NULL,
+    digest BLOB NOT NULL
 ) STRICT
 """
+DIGEST_BYTES = 8  # of each part of a row; the column has two of them, of about and of data
 MIN_SQLITE = (3, 37, 0)  # STRICT tables
 MAX_KEYS = 500  # in a query; SQLite allows 999 values
 
@@ -43,6 +49,12 @@ MAX_KEYS = 500  # in a query; SQLite allows 999 values
 CORRUPT = {11, 26}  # a malformed file, and a file that is no database
 UNUSABLE = {3, 5, 6, 8, 14}  # no permission, busy, locked, read only, cannot be opened
 CANNOT_OPEN = 14
+BUSY = {5, 6}  # another program has a lock
+
+LATEST_BYTES = 8 << 20  # twice the log, which SQLite copies to the file at 1,000 pages
+RETRY_S = 30.0  # between tries to write results that the file did not take
+# For the lock of another program, while the loop waits
+BUSY_TIMEOUT_MS = 100
 
 
 class Kind(StrEnum):
@@ -98,11 +110,17 @@ class Store:
     def __init__(self, directory: Path) -> None:
         self.directory = directory
         self.path = directory / FILE_NAME
-        self.trouble = ""  # the reason why results stay in memory, if they do
+        self.trouble = ""  # a sentence on what keeps the file from having all results, if anything
+        self.damaged: set[str] = set()  # keys of rows that do not fit their digest
         self._has_file = True  # false if the disk was full already at the start
+        self._is_damaged = False  # by another program, since the file was opened
+        self._identity: tuple[int, int] | None = None  # of the open file
         self._unsaved: dict[str, Result] = {}  # results that the file did not take
+        self._latest: dict[str, int] = {}  # keys and bytes of the latest results in the file
+        self._retry_at = 0.0  # when they are tried again, on the monotonic clock
         self._db = closed_connection()
         self._lock: sqlite3.Connection | None = None
+        self._closing = ExitStack()  # a copy to remove
 
     @classmethod
     def open(cls, directory: Path, *, fresh: bool = False) -> Self:
@@ -131,6 +149,7 @@ class Store:
                     directory.joinpath(FILE_NAME + ending).unlink(missing_ok=True)
             with undamaged(store.path):
                 store._open_file(opened)
+                store._remove_damaged_rows()
             opened.pop_all()  # all is open: nothing is closed on leaving
         return store
 
@@ -144,16 +163,21 @@ class Store:
         if not store.path.is_file():
             name = f"{directory} has no {FILE_NAME}"
             raise UserError(f"{name}: name the work directory of a run (NAME.work)")
-        # SQLite cannot create its locks in a read-only directory, and needs none there.
-        is_writable = os.access(directory, os.W_OK)
-        mode = "mode=ro" if is_writable else "mode=ro&immutable=1"
-        with ExitStack() as opened, undamaged(store.path):
-            store._db = opened.enter_context(closing(connected(store.path, mode, timeout=5.0)))
+        path = store.path
+        # The last connection removes SQLite's other files, which a read-only one would leave.
+        mode = "mode=rw"
+        with ExitStack() as opened, undamaged(path):
+            # SQLite cannot create its locks in a read-only directory, and needs none there.
+            if not os.access(directory, os.W_OK):
+                mode = "mode=ro&immutable=1"
+                path = _with_its_log(path, opened)
+            store._db = opened.enter_context(closing(connected(path, mode, timeout=5.0)))
+            store._db.execute("PRAGMA query_only = ON")
             # One transaction for all reads: the run may publish meanwhile.
             store._db.execute("BEGIN")
             if check:
                 store._check()
-            opened.pop_all()
+            store._closing = opened.pop_all()
         return store
 
     def __enter__(self) -> Self:
@@ -164,11 +188,28 @@ class Store:
 
     def close(self) -> None:
         if self._lock is not None:
-            self.put([])  # the disk may have room again
-            with suppress(sqlite3.Error):  # unless a reader uses the file
-                self._db.execute("PRAGMA journal_mode = DELETE")  # a single file, to copy
+            self.flush()
+            if self._is_damaged:
+                self._close_without_checkpoint()
+            else:
+                with suppress(sqlite3.Error):  # a full disk
+                    # If no reader uses the file, closing leaves a single file, to copy.
+                    self._db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
             self._lock.close()
         self._db.close()
+        self._closing.close()
+
+    def _close_without_checkpoint(self) -> None:
+        """Close the file, and leave its log as it is.
+
+        Pages that another program has overwritten must not get into the file: the next run reads
+        the part of the log that is whole.
+        """
+        with suppress(sqlite3.Error), closing(connected(self.path, "mode=ro")) as reader:
+            # While this connection has the file open, the other one is not the last, which would
+            # copy the log; and this one cannot write.
+            reader.execute("SELECT 1 FROM sqlite_master").fetchone()
+            self._db.close()
 
     # Writing
 
@@ -178,31 +219,110 @@ class Store:
         Raises ``sqlite3.IntegrityError`` for results that the table cannot hold, such as a number
         that is NaN.
         """
-        # Waiting results are tried again with each later one: the disk may have room again.
         new = {result.key: result for result in results}
-        waiting = self._unsaved | new
-        if not waiting:
+        # A value that the table cannot hold must be refused now, and not when it is written later.
+        rows = [_row(each) for each in new.values()]
+        self._note_place()
+        if self._is_damaged or (self._unsaved and monotonic() < self._retry_at):
+            self._check_values(rows)
+            self._unsaved |= new
             return
-        # Names may have lone surrogates, from bytes that are no UTF-8; SQLite takes none.
-        rows = [
-            (printable(each.key), each.kind, printable(json.dumps(each.about)), each.data)
-            for each in waiting.values()
-        ]
+        # Waiting results are tried again: the disk may have room, or the lock may be free.
+        rows = [_row(each) for each in self._unsaved.values() if each.key not in new] + rows
+        if not rows:
+            return
         try:
             with self._db:
-                self._db.execute("BEGIN")
+                self._db.execute("BEGIN IMMEDIATE")
                 # REPLACE: a table of pairs and the facts of a file have the same key each time.
-                self._db.executemany("REPLACE INTO result VALUES (?, ?, ?, ?)", rows)
-        except sqlite3.OperationalError as error:  # a full disk
-            self.trouble = str(error)
-            self._unsaved = waiting
+                self._db.executemany("REPLACE INTO result VALUES (?, ?, ?, ?, ?)", rows)
+        except sqlite3.IntegrityError:
+            raise
+        except sqlite3.DatabaseError as error:  # a full disk, a lock, a damaged file
+            if not self._note_damage(error):
+                self.trouble = f"the journal cannot be written ({error}); results stay in memory"
+            self._unsaved |= new
+            # Not with each answer, because waiting for a lock and writing many rows take time.
+            self._retry_at = monotonic() + RETRY_S
         else:
+            self.damaged -= new.keys()
             self._unsaved = {}
+            self._note_written(rows)
+
+    def flush(self) -> str:
+        """Try to write the results that wait in memory. Return why the file does not have all
+        results, or an empty text.
+        """
+        self._retry_at = 0.0
+        self.put([])
+        self._check_latest()
+        is_whole = self._has_file and not self._is_damaged and self._is_in_place
+        if is_whole and not self._unsaved:
+            self.trouble = ""  # a lock, or a disk that has room again
+        return self.trouble
+
+    def _note_written(self, rows: Iterable[tuple[str, str, str, bytes, bytes]]) -> None:
+        for key, _, about, data, _ in rows:
+            self._latest[key] = len(about) + len(data)
+        while sum(self._latest.values()) > LATEST_BYTES:
+            del self._latest[next(iter(self._latest))]
+
+    def _check_latest(self) -> None:
+        """Read the latest results again, as they are in the log. SQLite copies the log to the file
+        unread, with all that another program has written there.
+        """
+        if not self._latest or not self._has_file or self._is_damaged or not self._is_in_place:
+            return
+        marks = ", ".join("?" * MAX_KEYS)
+        query = f"SELECT key, kind, about, data, digest FROM result WHERE key IN ({marks})"
+        keys = list(self._latest)
+        # Another connection, which has no page in memory
+        try:
+            with closing(connected(self.path, "mode=ro")) as reader:
+                for start in range(0, len(keys), MAX_KEYS):
+                    part = keys[start : start + MAX_KEYS]
+                    part += part[:1] * (MAX_KEYS - len(part))
+                    for key, kind, about, data, digest in reader.execute(query, part):
+                        if digest != _digest(key, kind, about) + _digest(key, kind, data):
+                            raise sqlite3.DatabaseError("a result does not fit its digest")
+        except sqlite3.DatabaseError as error:
+            code = getattr(error, "sqlite_errorcode", 11) & 0xFF
+            if code in CORRUPT:
+                self._is_damaged = True
+                self.trouble = f"the journal was damaged during the run ({error})"
+
+    @property
+    def _is_in_place(self) -> bool:
+        """Whether the path leads to the open file."""
+        return self._identity is None or self._identity == _identity(self.path)
+
+    def _note_place(self) -> None:
+        if not self._is_in_place:
+            # The open file takes results all the same: a directory that was moved has them.
+            self.trouble = f"the journal {self.path} was moved or removed during the run"
+
+    def _note_damage(self, error: sqlite3.DatabaseError) -> bool:
+        """Return whether an error is damage by another program, which a run survives in memory."""
+        code = getattr(error, "sqlite_errorcode", 0) & 0xFF
+        # A run has checked the table at its start.
+        if self._lock is None or not (code in CORRUPT or "no such table" in str(error)):
+            return False
+        self._is_damaged = True
+        self.trouble = f"the journal was damaged during the run ({error}); results stay in memory"
+        return True
+
+    def _check_values(self, rows: Iterable[tuple[Any, ...]]) -> None:
+        """Raise ``sqlite3.IntegrityError`` for a value that the table cannot hold, without it."""
+        for key, _, about, *_ in rows:
+            try:
+                json.loads(about, parse_constant=_refuse)
+            except ValueError as error:
+                raise sqlite3.IntegrityError(f"{key}: {error}") from error
 
     def remove(self, key: str) -> None:
         """Remove a result, if it exists."""
         self._unsaved.pop(key, None)
-        with suppress(sqlite3.OperationalError):  # a full disk
+        with suppress(sqlite3.DatabaseError):  # a full disk, a lock, a damaged file
             self._db.execute("DELETE FROM result WHERE key = ?", [printable(key)])
 
     def prune(self, named: Iterable[str]) -> int:
@@ -267,10 +387,9 @@ class Store:
 
     def of_kind(self, kind: Kind) -> dict[str, Any]:
         """Return the JSON values about all results of a kind, by key, in the order of writing."""
-        query = "SELECT key, about FROM result WHERE kind = ? ORDER BY rowid"
-        with undamaged(self.path):
-            rows = self._db.execute(query, [kind]).fetchall()
-        found = {key: json.loads(about) for key, about in rows}
+        query = "SELECT key, kind, about, digest FROM result WHERE kind = ? ORDER BY rowid"
+        rows = self._rows(query, [kind])
+        found = {key: json.loads(about) for key, about in self._whole(rows, ABOUT)}
         unsaved = (each for each in self._unsaved.values() if each.kind is kind)
         return found | {each.key: each.about for each in unsaved}
 
@@ -279,9 +398,13 @@ class Store:
         value.
         """
         # Workers read the file themselves: points of a scene may be hundreds of MB.
-        if self._unsaved or not self._has_file:
-            return Source(None, self.data(keys))
+        if self._unsaved or not self._has_file or self._is_damaged or not self._is_in_place:
+            return self.held(keys)
         return Source(self.directory, {})
+
+    def held(self, keys: Sequence[str]) -> "Source":
+        """Return the points with these keys, to send them to a worker."""
+        return Source(None, self.data(keys))
 
     def _columns(self, column: str, keys: Iterable[str]) -> Iterator[tuple[str, Any]]:
         asked = list(dict.fromkeys(keys))
@@ -290,15 +413,64 @@ class Store:
         for start in range(0, len(stored), MAX_KEYS):
             part = [printable(key) for key in stored[start : start + MAX_KEYS]]
             marks = ", ".join("?" * len(part))
-            query = f"SELECT key, {column} FROM result WHERE key IN ({marks})"
-            with undamaged(self.path):
-                yield from self._db.execute(query, part).fetchall()
+            query = f"SELECT key, kind, {column}, digest FROM result WHERE key IN ({marks})"
+            rows = self._rows(query, part)
+            yield from self._whole(rows, ABOUT if column == "about" else DATA)
         for key in asked:
             if key in self._unsaved:
                 unsaved = self._unsaved[key]
                 yield key, json.dumps(unsaved.about) if column == "about" else unsaved.data
 
+    def _rows(self, query: str, values: Sequence[str]) -> list[tuple[str, str, Any, bytes]]:
+        try:
+            with undamaged(self.path):
+                return self._db.execute(query, values).fetchall()
+        except UserError as error:
+            cause = error.__cause__
+            if isinstance(cause, sqlite3.DatabaseError) and self._note_damage(cause):
+                return []  # these results are missing, and are computed again
+            raise
+        except sqlite3.DatabaseError as error:
+            if self._note_damage(error):
+                return []
+            raise
+
+    def _whole(
+        self, rows: Iterable[tuple[str, str, Any, bytes]], part: slice
+    ) -> Iterator[tuple[str, Any]]:
+        """Yield key and value of the rows whose value fits its part of the digest."""
+        for key, kind, value, digest in rows:
+            if digest[part] == _digest(key, kind, value):
+                yield key, value
+            else:
+                self.damaged.add(key)
+                # Damaged rows of earlier runs are removed when a run opens its store.
+                if self._lock is not None and self._has_file:
+                    self._is_damaged = True
+                    self.trouble = "the journal was damaged during the run; results stay in memory"
+
+    def warn_of_damage(self) -> None:
+        """Warn of the rows that were read and do not fit their digest."""
+        if count := len(self.damaged):
+            warn_once(
+                f"{plural(count, 'result')} of {self.path}, damaged, were not read; the run's command "
+                "computes them again"
+            )
+
     # Opening
+
+    def _remove_damaged_rows(self) -> None:
+        """Remove the rows that do not fit their digest: their results are missing, and are computed
+        again.
+        """
+        query = "SELECT key, kind, about, data, digest FROM result"
+        for key, kind, about, data, digest in self._db.execute(query):
+            if digest != _digest(key, kind, about) + _digest(key, kind, data):
+                self.damaged.add(key)
+        if self.damaged and self._has_file:
+            with suppress(sqlite3.OperationalError):  # a full disk
+                keys = [(key,) for key in self.damaged]
+                self._db.executemany("DELETE FROM result WHERE key = ?", keys)
 
     def _take_lock(self, path: Path, opened: ExitStack) -> None:
         try:
@@ -317,7 +489,7 @@ class Store:
         except sqlite3.OperationalError as error:
             if getattr(error, "sqlite_errorcode", 0) & 0xFF in UNUSABLE - {CANNOT_OPEN}:
                 raise
-            self.trouble = str(error)
+            self.trouble = f"the journal cannot be written ({error}); results stay in memory"
             self._has_file = False
             self._db.close()
             self._open_without_writing(opened)
@@ -325,7 +497,11 @@ class Store:
     def _open_without_writing(self, opened: ExitStack) -> None:
         """Open the results of earlier runs, or an empty store in memory."""
         if self.path.exists():
-            # A full disk has no room for SQLite's locks, either. Its files can be read.
+            # A full disk has no room for SQLite's locks, either. Its files can be read, but for the
+            # log of a run that was killed.
+            if has_log(self.path):
+                log = f"{self.path.name}-wal"
+                self.trouble += f"; the latest results of the last run, in {log}, were not read"
             self._db = opened.enter_context(closing(connected(self.path, "immutable=1")))
             # A disk that became full in _prepare has a file without a table.
             if self._has_table():
@@ -335,28 +511,49 @@ class Store:
         self._db.execute(SCHEMA)
 
     def _prepare(self) -> None:
-        if not self._has_table():
+        if (
+            not self._has_table()
+            and self._db.execute("PRAGMA user_version").fetchone()[0] != FORMAT
+        ):
             # Readers do not block the writer, and a commit is one append.
             self._db.execute("PRAGMA journal_mode = WAL")
             # In one transaction, so that no file has the table and not its format.
             self._db.executescript(f"BEGIN; {SCHEMA}; PRAGMA user_version = {FORMAT}; COMMIT;")
         else:
             self._check()
-            self._db.execute("PRAGMA journal_mode = WAL")
+            # A reader has the file open, in the mode of a copy: the run writes between its reads.
+            with suppress_busy():
+                self._db.execute("PRAGMA journal_mode = WAL")
             # On a full disk, the first read in this mode fails: it makes an index of 32 kB.
             self._has_table()
         # A kill of the process loses no result. A power failure may lose the latest.
         self._db.execute("PRAGMA synchronous = NORMAL")
+        self._db.execute(f"PRAGMA busy_timeout = {BUSY_TIMEOUT_MS}")
+        self._identity = _identity(self.path)
 
     def _has_table(self) -> bool:
         return self._db.execute("SELECT 1 FROM sqlite_master").fetchone() is not None
 
     def _check(self) -> None:
         """Raise :class:`UserError` for a file of another format, or for a damaged file."""
-        if self._db.execute("PRAGMA user_version").fetchone()[0] != FORMAT:
+        version = self._db.execute("PRAGMA user_version").fetchone()[0]
+        if not version and not self._has_table():
+            raise UserError(f"{self.path} has no results yet")
+        if version != FORMAT:
             raise UserError(
                 f"{self.path} was written by another version of this program (its format is not "
                 f"{FORMAT}). Use that version, delete it with --fresh, or name another --work-dir."
+            )
+        # Another program may have added a trigger, or removed the table.
+        query = (
+            "SELECT type, name, sql FROM sqlite_master WHERE name NOT LIKE 'sqlite!_%' ESCAPE '!'"
+        )
+        schema = [(*each, sql.strip()) for *each, sql in self._db.execute(query)]
+        if schema != [("table", "result", SCHEMA.strip())]:
+            names = ", ".join(f"{kind} {name}" for kind, name, _ in schema) or "no table"
+            raise UserError(
+                f"{self.path} is damaged (it has {names}, and not the table of this program); "
+                "delete it with --fresh"
             )
         # quick_check reads all pages, but does not compare the table with its index.
         trouble = self._db.execute("PRAGMA quick_check(1)").fetchone()[0]
@@ -394,6 +591,70 @@ def connected(path: Path | str, options: str = "", timeout: float = 1.0) -> sqli
     """
     uri = f"{path.resolve().as_uri()}?{options}" if isinstance(path, Path) else f"file:{path}"
     return sqlite3.connect(uri, uri=True, timeout=timeout, isolation_level=None)
+
+
+ABOUT, DATA = slice(DIGEST_BYTES), slice(DIGEST_BYTES, None)  # the parts of a row's digest
+
+
+def _row(result: Result) -> tuple[str, str, str, bytes, bytes]:
+    # Names may have lone surrogates, from bytes that are no UTF-8; SQLite takes none.
+    key = printable(result.key)
+    about = printable(json.dumps(result.about))
+    digest = _digest(key, result.kind, about) + _digest(key, result.kind, result.data)
+    return key, str(result.kind), about, result.data, digest
+
+
+def _digest(key: str, kind: str, value: str | bytes) -> bytes:
+    """Return the digest of a part of a row. With the key, so that rows cannot be exchanged."""
+    found = hashlib.blake2b(f"{key}\n{kind}\n".encode(), digest_size=DIGEST_BYTES)
+    found.update(value.encode() if isinstance(value, str) else value)
+    return found.digest()
+
+
+def _refuse(constant: str) -> None:
+    raise ValueError(f"{constant} is not JSON")
+
+
+def _identity(path: Path) -> tuple[int, int] | None:
+    """Return device and inode of a file, which identify it; ``None`` if it is missing."""
+    try:
+        status = path.stat()
+    except OSError:
+        return None
+    return status.st_dev, status.st_ino
+
+
+def has_log(path: Path) -> bool:
+    """Return whether a store has a write-ahead log with results, as that of a killed run."""
+    log = path.with_name(f"{path.name}-wal")
+    return log.is_file() and log.stat().st_size > 0
+
+
+def _with_its_log(path: Path, opened: ExitStack) -> Path:
+    """Return a copy of a store with a write-ahead log, which SQLite cannot read in a read-only
+    directory; a store without one is its own copy.
+    """
+    if not has_log(path):
+        return path
+    log = f"{path.name}-wal"
+    with writing(f"a copy of {path}, whose log {log} cannot be read here,"):
+        folder = Path(opened.enter_context(TemporaryDirectory(prefix="mkpc-")))
+        for name in (path.name, log):
+            shutil.copyfile(path.with_name(name), folder / name)
+    # A connection that may write reads the log into the copy.
+    with closing(connected(folder / path.name)) as copy:
+        copy.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+    return folder / path.name
+
+
+@contextmanager
+def suppress_busy() -> Iterator[None]:
+    """Ignore that another program has a lock."""
+    try:
+        yield
+    except sqlite3.OperationalError as error:
+        if getattr(error, "sqlite_errorcode", 0) & 0xFF not in BUSY:
+            raise
 
 
 def closed_connection() -> sqlite3.Connection:

@@ -91,6 +91,7 @@ def read_log(directory: Path) -> RunLog:
         table = dict(published.about.recipe)
         # A store that was opened, and then ended by a signal before the first publication
         if not table:
+            store.warn_of_damage()
             raise UserError(f"{directory}: the run has not begun, or was stopped at its start")
         # The recipe as it ran: its file may have changed since.
         recipe = recipe_of(table, table.pop("name"))
@@ -118,6 +119,7 @@ def read_log(directory: Path) -> RunLog:
             present = {scene.batch for scene in scenes}
             scenes += [each for each in unmatched_scenes(records) if each.batch not in present]
         events = read_events(store)
+        store.warn_of_damage()
         digests = stored_digests(store, published.image_names)
         return RunLog(
             store.path, published.about, recipe, records, events, weakest, tuple(scenes), digests

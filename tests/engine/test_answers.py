@@ -114,12 +114,12 @@ def test_estimates_that_no_worker_can_make_end_the_run_as_failed_after_few_tries
     assert (again.ending, again.units_run, again.estimated) == (Ending.COMPLETE, 0, 5)
 
 
-def count_jobs(monkeypatch: pytest.MonkeyPatch) -> list[EstimateJob]:
-    jobs = []
+def count_jobs(monkeypatch: pytest.MonkeyPatch) -> list[EstimateJob | None]:
+    jobs: list[EstimateJob | None] = []
     job_of = light.Estimating.job
 
-    def noted(self: light.Estimating, due: Sequence[int]) -> EstimateJob:
-        jobs.append(job_of(self, due))
+    def noted(self: light.Estimating, due: Sequence[int], **more: Any) -> EstimateJob | None:
+        jobs.append(job_of(self, due, **more))
         return jobs[-1]
 
     monkeypatch.setattr(light.Estimating, "job", noted)

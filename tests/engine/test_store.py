@@ -3,9 +3,13 @@ be pruned.
 """
 
 import os
+import shutil
 import sqlite3
 import subprocess
 import sys
+import tempfile
+import threading
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import replace
@@ -13,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rectified import SECOND, SWEEP, THIRD, THREE_UNITS
+from rectified import SECOND, SWEEP, THIRD, THREE_UNITS, RectifiedMatcher, matrices, run
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine import store as store_module
@@ -28,11 +32,11 @@ from mkpc_kaggle.engine.matching import Matching
 from mkpc_kaggle.engine.publication import Publication
 from mkpc_kaggle.engine.reconstructing import Reconstructing
 from mkpc_kaggle.engine.records import About, Table, read_points, read_records, read_scenes
-from mkpc_kaggle.engine.request import Request
+from mkpc_kaggle.engine.request import Ending, Request
 from mkpc_kaggle.engine.restore import restore
 from mkpc_kaggle.engine.run import EventLog, Run
 from mkpc_kaggle.engine.state import State
-from mkpc_kaggle.engine.store import FILE_NAME, Kind, Result, Store, to_bytes
+from mkpc_kaggle.engine.store import FILE_NAME, Kind, Result, Store, connected, to_bytes
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Box, Size
@@ -41,6 +45,7 @@ from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.recipe import Recipe, SceneConfig, Unit
+from mkpc_kaggle.reporting.run_log import read_log, write_csv
 from mkpc_kaggle.scene.choose import Choice, Reason
 from mkpc_kaggle.scene.reconstruct import Solution
 from mkpc_kaggle.scene.reconstruction import Reconstruction, RegisteredImage, SfmModel, Sigmas
@@ -562,3 +567,234 @@ def test_a_refused_store_holds_no_lock_and_no_file(tmp_path: Path) -> None:
     open_files = [str(link.readlink()) for link in links]
     assert not [name for name in open_files if name.startswith(str(tmp_path))]
     Store.open(tmp_path, fresh=True).close()
+
+
+# Readers beside a run, other programs, and damage
+
+
+def test_a_reader_that_has_the_file_open_neither_blocks_a_run_nor_is_blocked(
+    whole: Room, tmp_path: Path
+) -> None:
+    whole.store.close()
+    # A transaction, as of a backup or of a notebook
+    with Store.read(tmp_path) as reader:
+        before = read_records(reader)
+        with Store.open(tmp_path) as store:
+            store.put([Result("new", Kind.POINTS, 1)])
+            assert store.flush() == ""
+            with Store.read(tmp_path) as other:
+                assert other.about(["new"]) == {"new": 1}
+        assert len(read_records(reader)) == len(before)
+    with Store.read(tmp_path) as again:
+        assert again.about(["new"]) == {"new": 1}
+    # Nor does a reader leave files of SQLite's behind.
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["journal.lock", "journal.sqlite"]
+
+
+@pytest.mark.parametrize("mode", ["DELETE", "WAL"])
+def test_a_reader_of_a_copy_in_another_mode_does_not_block_a_run(
+    whole: Room, tmp_path: Path, mode: str
+) -> None:
+    whole.store.close()
+    with closing(connected(tmp_path / FILE_NAME)) as db:
+        db.execute(f"PRAGMA journal_mode = {mode}")
+    with closing(connected(tmp_path / FILE_NAME, "mode=ro")) as reader:
+        reader.execute("BEGIN")
+        assert reader.execute("SELECT count(*) FROM result").fetchone()[0] > 0
+        with Store.open(tmp_path) as store:
+            store.put([Result("new", Kind.POINTS, 1)])
+            assert store.about(["new"]) == {"new": 1}
+
+
+def test_readers_in_a_loop_beside_a_run_work_or_have_one_line(pairs, undisturbed, tmp_path) -> None:
+    work = tmp_path / "work"
+    ended = threading.Event()
+    read = []
+    refused = []
+
+    def loop(tables: Path) -> None:
+        while not ended.is_set():
+            try:
+                read.append(len(results(work).pairs))
+                write_csv(read_log(work), tables)
+            except UserError as error:
+                refused.append(str(error))
+
+    threads = [threading.Thread(target=loop, args=[tmp_path / name]) for name in "ab"]
+    for thread in threads:
+        thread.start()
+    for _ in range(2):
+        report = run(pairs, THREE_UNITS, RectifiedMatcher(seconds=0.005), work)
+        assert (report.ending, report.faults) == (Ending.COMPLETE, ())
+        assert matrices(report) == matrices(undisturbed)
+    ended.set()
+    for thread in threads:
+        thread.join()
+    assert 12 in read
+    # Before the first table of pairs
+    reasons = ("has no journal.sqlite", "has no results yet", "the run has not begun")
+    assert [text for text in refused if not any(reason in text for reason in reasons)] == []
+
+
+DAMAGED_ROWS = {
+    "no field": "UPDATE result SET about = '{}' WHERE kind = 'points'",
+    "another number": "UPDATE result SET about = json_set(about, '$.matches', 7) WHERE kind = 'points'",
+    "truncated": "UPDATE result SET data = substr(data, 1, 7) WHERE kind = 'points'",
+    "empty": "UPDATE result SET data = x'' WHERE kind = 'points'",
+    "other bytes": "UPDATE result SET data = zeroblob(length(data)) WHERE kind = 'points'",
+    "an estimate": "UPDATE result SET about = json_set(about, '$.F[0]', 7) WHERE kind = 'estimate'",
+    "an image": "UPDATE result SET about = '7' WHERE kind = 'image'",
+    "the table": "UPDATE result SET about = '{}' WHERE kind = 'table'",
+    "F of the table": "UPDATE result SET data = zeroblob(length(data)) WHERE kind = 'table'",
+    "an event": "UPDATE result SET about = '[]' WHERE kind = 'event'",
+    "exchanged rows": "UPDATE result SET kind = 'scene' WHERE kind = 'points'",
+}
+
+
+@pytest.mark.parametrize("name", DAMAGED_ROWS)
+def test_a_row_that_does_not_fit_its_digest_is_missing_and_computed_again(
+    pairs, undisturbed, tmp_path, name, capsys
+) -> None:
+    run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path)
+    count = edit(tmp_path, DAMAGED_ROWS[name])
+    with warnings.catch_warnings(record=True):
+        warnings.simplefilter("always")
+        try:  # a reader has the other rows, or one line
+            results(tmp_path)
+            read_log(tmp_path)
+        except UserError as error:
+            assert "the run has not begun" in str(error)
+    report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path)
+    rows = "1 result" if count == 1 else f"{count} results"
+    assert report.faults == (f"{rows} of the journal, damaged, will be computed again",)
+    assert f"warning: {report.faults[0]}\n" in capsys.readouterr().err
+    assert report.ending is Ending.COMPLETE
+    assert matrices(report) == matrices(undisturbed)
+    again = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path)
+    assert (again.faults, again.units_run, again.estimated) == ((), 0, 0)
+    assert len(results(tmp_path).units) == 36
+
+
+def edit(directory: Path, script: str) -> int:
+    """Change the file of a store as another program. Return the number of changed rows."""
+    with closing(connected(directory / FILE_NAME)) as db:
+        return db.execute(script).rowcount
+
+
+TABLES = {
+    "no table": "DROP TABLE result",
+    "another table": "CREATE TABLE notes (text TEXT)",
+    "a trigger": "CREATE TRIGGER t AFTER INSERT ON result BEGIN DELETE FROM result; END",
+    "another column": "ALTER TABLE result ADD COLUMN note TEXT",
+}
+
+
+@pytest.mark.parametrize("script", TABLES.values(), ids=TABLES)
+def test_other_tables_than_the_programs_are_damage_in_one_line(
+    whole: Room, tmp_path: Path, script: str
+) -> None:
+    whole.store.close()
+    edit(tmp_path, script)
+    for use in (Store.open, Store.read):
+        with pytest.raises(UserError, match=r"is damaged \(it has .*delete it with --fresh"):
+            use(tmp_path)
+
+
+def test_a_file_without_results_is_no_other_format(tmp_path: Path) -> None:
+    (tmp_path / FILE_NAME).touch()
+    with pytest.raises(UserError, match="has no results yet"):
+        Store.read(tmp_path)
+
+
+def test_a_lock_of_another_program_is_waited_for_once_in_half_a_minute(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = [0.0]
+    monkeypatch.setattr("mkpc_kaggle.engine.store.monotonic", lambda: clock[0])
+    with Store.open(tmp_path) as store, closing(connected(tmp_path / FILE_NAME)) as other:
+        tried = []
+        store._db.set_trace_callback(lambda text: tried.append("BEGIN" in text))
+        other.execute("BEGIN IMMEDIATE")
+        for number in range(60):
+            clock[0] = float(number)
+            store.put([Result(f"key {number}", Kind.POINTS, number)])
+        assert sum(tried) == 2
+        assert store.about(["key 59"]) == {"key 59": 59}
+        assert "is locked" in store.trouble
+        with pytest.raises(sqlite3.IntegrityError):  # also while nothing is written
+            store.put([Result("bad", Kind.POINTS, np.nan)])
+        other.execute("ROLLBACK")
+        # The end of the run, which has lost nothing
+        assert store.flush() == ""
+        assert store.trouble == ""
+    with Store.read(tmp_path) as again:
+        assert len(again.of_kind(Kind.POINTS)) == 60
+
+
+def test_a_directory_that_is_moved_during_a_run_costs_no_result(
+    pairs, undisturbed, tmp_path, monkeypatch
+) -> None:
+    moved = iter([tmp_path / "moved"])
+    use = Matching._use
+
+    def use_and_move(*arguments: object) -> None:
+        use(*arguments)
+        for target in moved:
+            (tmp_path / "work").rename(target)
+
+    monkeypatch.setattr(Matching, "_use", use_and_move)
+    report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
+    assert matrices(report) == matrices(undisturbed)
+    assert "was moved or removed during the run" in report.unsaved
+    assert report.faults == (report.unsaved,)
+    # The results went with the directory.
+    again = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "moved")
+    assert (again.units_run, again.estimated, again.faults) == (0, 0, ())
+
+
+def test_a_log_that_is_overwritten_during_a_run_is_like_a_full_disk(
+    pairs, undisturbed, tmp_path, monkeypatch
+) -> None:
+    spoilt = []
+    use = Matching._use
+
+    def use_and_spoil(self: Matching, index: int, *arguments: object) -> None:
+        use(self, index, *arguments)
+        # After the sweep, whose points the crops of the second unit come from
+        if not spoilt and self._run.log.units_run == 11:
+            log = tmp_path / f"{FILE_NAME}-wal"
+            spoilt.append(log.stat().st_size)
+            with log.open("r+b") as stream:
+                stream.write(np.random.default_rng(0).bytes(spoilt[0]))
+
+    monkeypatch.setattr(Matching, "_use", use_and_spoil)
+    report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path)
+    assert spoilt
+    assert report.ending is Ending.COMPLETE
+    assert matrices(report) == matrices(undisturbed)
+    assert "the journal was damaged during the run" in report.unsaved
+    monkeypatch.undo()
+    # What the journal lost is computed again.
+    again = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path)
+    assert matrices(again) == matrices(undisturbed)
+    assert again.unsaved == ""
+
+
+def test_the_log_of_a_killed_run_in_a_read_only_directory_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    work = tmp_path / "work"
+    with Store.open(work) as store:
+        store.put([Result("in the log", Kind.POINTS, 1)])
+        shutil.copytree(work, tmp_path / "killed")
+    killed = tmp_path / "killed"
+    before = {path.name: path.read_bytes() for path in killed.iterdir()}
+    # As root, a test can write anywhere.
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr(tempfile, "tempdir", None)
+    with Store.read(killed) as reader:
+        # One transaction, after a kill
+        assert reader.about(["in the log"]) == {"in the log": 1}
+    assert {path.name: path.read_bytes() for path in killed.iterdir()} == before
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["killed", "work"], "no copy is left"
