@@ -23,6 +23,8 @@ from mkpc_kaggle.reconstruction.directory import (
 )
 from mkpc_kaggle.reconstruction.export import export_matches
 from mkpc_kaggle.reconstruction.folder import (
+    Datasets,
+    Ends,
     batch_names,
     pair_list_line,
     read_folder,
@@ -30,6 +32,7 @@ from mkpc_kaggle.reconstruction.folder import (
 )
 from mkpc_kaggle.reconstruction.layout import write_layouts
 from mkpc_kaggle.reconstruction.outputs import FORMS, Cameras, write_tables
+from mkpc_kaggle.reconstruction.panoramas import require_perspective
 from mkpc_kaggle.reconstruction.priors import intrinsics_line, read_intrinsics_table
 from mkpc_kaggle.reconstruction.run import FolderResult, for_cameras, reconstruct_folder
 from mkpc_kaggle.reporting.contradictions import contradictions
@@ -121,6 +124,7 @@ def run(arguments: argparse.Namespace) -> int:
     datasets = read_folder(root)
     files = [file for found in datasets.values() for file in found]
     # All inputs are read and checked before OUT is touched.
+    require_perspective(files)
     known = ""
     if arguments.intrinsics is not None:
         known = read_intrinsics_table(arguments.intrinsics, root, files)
@@ -148,11 +152,7 @@ def run(arguments: argparse.Namespace) -> int:
         assembly = options.assembly_of(arguments, arguments.recipe, arguments.mode, interrupt)
         recipe = for_cameras(assembly.recipe, arguments.camera, known)
         assembly = replace(assembly, recipe=recipe, masks=masks)
-        effects = [*masks.lines]
-        if known:
-            effects.append(intrinsics_line(known, root, files))
-        if listed is not None:
-            effects.append(pair_list_line(listed, root, datasets))
+        effects = _effects(masks, known, listed, root, datasets)
         options.say_start(plural(len(files), "image"), assembly, work_dir, effects)
         result = reconstruct_folder(
             root,
@@ -197,6 +197,18 @@ def _require_export(path: Path, inputs: Sequence[Path], work_dir: Path) -> None:
         raise UserError(f"--export {path}: the name must end in {SUFFIX}")
     require_h5py()
     require_apart({"--export": path}, inputs, work_dir)
+
+
+def _effects(
+    masks: Masks, known: str, listed: Sequence[Ends] | None, root: Path, datasets: Datasets
+) -> Iterator[str]:
+    """Yield which part of the masks, the known cameras and the list of pairs takes effect."""
+    files = [file for found in datasets.values() for file in found]
+    yield from masks.lines
+    if known:
+        yield intrinsics_line(known, root, files)
+    if listed is not None:
+        yield pair_list_line(listed, root, datasets)
 
 
 def _lines(result: FolderResult, root: Path) -> Iterator[str]:

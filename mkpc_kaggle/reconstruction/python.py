@@ -25,6 +25,7 @@ from mkpc_kaggle.pipeline.assembly import Assembly, assemble
 from mkpc_kaggle.pipeline.availability import Licence
 from mkpc_kaggle.recipe import Recipe
 from mkpc_kaggle.reconstruction.folder import read_folder, require_distinct
+from mkpc_kaggle.reconstruction.panoramas import require_perspective
 from mkpc_kaggle.reconstruction.priors import read_intrinsics_table
 from mkpc_kaggle.reconstruction.run import for_cameras, reconstruct_folder
 from mkpc_kaggle.scene.export import MODELS
@@ -99,6 +100,7 @@ def reconstruct(
     if len(files) < 2:
         return Models()
     require_readable(files)
+    require_perspective(files)
     root = Path(os.path.commonpath([file.parent for file in files]))
     assembly = with_priors(assembly, root, files, masks, intrinsics)
     with ExitStack() as closed:
