@@ -124,6 +124,7 @@ COMPARISON = record(
         record(FocalContradiction, source=enum(Source), images=NAMES, given=FLOAT, fitted=FLOAT)
     ),
     lenses=several(record(DistortedLens, images=NAMES, displacement=FLOAT, camera=KNOWN_CAMERA)),
+    has_moved=PLAIN,
 )
 MODEL = record(
     SfmModel,

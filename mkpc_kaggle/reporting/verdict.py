@@ -28,11 +28,16 @@ from mkpc_kaggle.reporting.summary import (
     unit_reasons,
 )
 from mkpc_kaggle.scene.choose import Reason
-from mkpc_kaggle.scene.reconstruction import MAX_SIGMA_IMAGES, RegisteredImage, SfmModel
+from mkpc_kaggle.scene.reconstruction import (
+    HARDLY_MOVED,
+    MAX_CENTRE_SIGMA,
+    MAX_SIGMA_IMAGES,
+    RegisteredImage,
+    SfmModel,
+)
 from mkpc_kaggle.version import __version__
 
 FORMAT = "mkpc summary 1"  # increase the number if a key changes its meaning or disappears
-MAX_CENTRE_SIGMA = 0.02  # of the model's size; a camera with a larger expected error is uncertain
 # Bounds of the histogram of inliers; the last bin is open.
 INLIER_BINS = (0, 1, 10, 20, 50, 100, 200, 500, 1000, 2000)
 
@@ -112,8 +117,16 @@ def _scene_problems(scene: SceneRecord, log: RunLog) -> Iterator[str]:
         remedy = causes[-1] if causes else "photographs that overlap more are needed"
         yield f"{where}no cameras, {scene.failure}: {remedy}"
         return
+    if HARDLY_MOVED in scene.failure:
+        # More photographs from there would not help.
+        yield f"{where}no cameras: {HARDLY_MOVED}"
+        return
     if not scene.models:
         yield f"{where}no cameras, {scene.failure}: photographs that overlap more are needed"
+        return
+    # Remedies for single images would not help.
+    if not scene.models[0].comparison.has_moved:
+        yield f"{where}the cameras are not to be trusted: {HARDLY_MOVED}"
         return
     cameras = [found.image for model in scene.models for found in model.images]
     known = {Path(image.name).name for image in cameras}

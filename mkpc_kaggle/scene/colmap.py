@@ -178,7 +178,7 @@ def _write_images(
         # Images of two sizes never share, even at one focal length.
         key = number if focal is None else (image.size, focal)
         if key not in cameras:
-            start = start_focal(image) if focal is None else focal
+            start = start_focal(image, uses_exif=graph.uses_exif) if focal is None else focal
             known = graph.known.get(image.digest)
             cameras[key] = _write_camera(database, number, camera_model, image.size, start, known)
         camera = cameras[key]

@@ -147,12 +147,10 @@ def _lenses(copy: Any, freed: Sequence[Freed]) -> Iterable[DistortedLens]:
     for size in dict.fromkeys(each.found.image.size for each in pinholes):
         alike = [each for each in pinholes if each.found.image.size == size]
         displacement = float(np.median([each.displacement for each in alike]))
+        if len(alike) < MIN_LENS_IMAGES or not abs(displacement) >= MIN_DISPLACEMENT:
+            continue
         agreeing = sum(each.displacement / displacement > 0.5 for each in alike)
-        if (
-            len(alike) < MIN_LENS_IMAGES
-            or abs(displacement) < MIN_DISPLACEMENT
-            or agreeing < MIN_AGREEING * len(alike)
-        ):
+        if agreeing < MIN_AGREEING * len(alike):
             continue
         coefficient = float(np.median([each.camera.params[3] for each in alike]))
         if abs(coefficient) < CLEAR_SIGMAS * _sigma(copy, alike, 1):
@@ -168,7 +166,9 @@ def _sigma(copy: Any, freed: Sequence[Freed], parameter: int) -> float:
     """Return the median standard deviation of a free parameter of the cameras: 0 is the first focal
     length in pixels, 1 the radial coefficient. Infinity if the model does not determine it.
     """
-    images = [image for _, image in sorted(copy.images.items()) if image.has_pose]
+    images = [
+        image for _, image in sorted(copy.images.items()) if image.has_pose and image.num_points3D
+    ]
     # As for the model: time and memory would be too much. The many images have little noise.
     if len(images) > MAX_SIGMA_IMAGES:
         return 0.0

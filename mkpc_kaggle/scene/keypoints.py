@@ -6,6 +6,8 @@ Structure from motion tracks a point through several pairs, so its positions in 
 one keypoint.
 """
 
+from copy import copy
+from dataclasses import replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -42,6 +44,12 @@ class MergedGraph:
     def __init__(self, graph: ViewGraph) -> None:
         self.graph = graph
         self.geometries: dict[int, dict[tuple[Lens, Lens], Any]] = {}
+
+    def without_exif(self) -> "MergedGraph":
+        """Return the graph whose cameras start without EXIF's focal lengths; the rest is shared."""
+        other = copy(self)
+        other.graph = replace(self.graph, uses_exif=False)
+        return other
 
     @property
     def keypoints(self) -> list[Points]:

@@ -1,9 +1,13 @@
 """Reconstruction of a batch: from pairs to cameras and a choice of F for each pair, all picklable."""
 
 import math
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import TypeAlias
+
+import numpy as np
 
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.intrinsics import read as read_intrinsics
@@ -13,18 +17,31 @@ from mkpc_kaggle.scene.align import align, read_reference
 from mkpc_kaggle.scene.choose import Choice, Reason, choose, estimate_at_known_focals
 from mkpc_kaggle.scene.export import HeldDirectory
 from mkpc_kaggle.scene.keypoints import MergedGraph
-from mkpc_kaggle.scene.reconstruction import MIN_IMAGES, Reconstruction, SfmModel
+from mkpc_kaggle.scene.motion import hardly_moved
+from mkpc_kaggle.scene.reconstruction import (
+    HARDLY_MOVED,
+    MAX_CENTRE_SIGMA,
+    MIN_IMAGES,
+    Reconstruction,
+    SfmModel,
+)
 from mkpc_kaggle.scene.shared_intrinsics import (
     SharedIntrinsics,
     given_intrinsics,
     shared_intrinsics,
+    undecided_zooms,
 )
 from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair, ViewGraph, known_by_name
 
 MIN_PAIRS_PER_IMAGE = 1.35  # connected pairs; with fewer, cameras are poorly constrained
 # Not re-estimated at other focal lengths
 KEEPS_ITS_F = Reason.SCENE, Reason.SAME_IMAGE, Reason.CONTRADICTION
+MIN_REGISTERED = 0.5  # share of the matched images; fewer may be due to wrong focal lengths of EXIF
+MAX_EXIF_LOG_DEVIATION = float(np.log(1.3))  # of a refined focal length; EXIF is then wrong
 MIN_OBSERVATIONS = 0.99  # share of the observations before sharing; with fewer, sharing is dropped
+
+# Reconstructs a graph with shared intrinsics
+Make: TypeAlias = Callable[[MergedGraph, SharedIntrinsics], Reconstruction]
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,8 +94,9 @@ def reconstruct_sharing(
 ) -> tuple[list[Reconstruction], SharedIntrinsics]:
     """Return the reconstruction of each component, and the shared intrinsics of the images.
 
-    If images seem to share a camera, a second reconstruction shares intrinsics. It starts from the
-    first one's poses where these are good enough. It is kept unless images then see fewer points.
+    If cameras are missing or doubtful that started with EXIF's focal lengths, a reconstruction
+    without these is tried, and the one with more observations is kept. If images seem to share a
+    camera, a further reconstruction shares intrinsics, see :func:`share`.
     If the recipe shares cameras, the first reconstruction does too. The refined focal lengths are
     returned. With a ``directory``, the graph is reconstructed as a whole, moved onto the cameras of
     the last complete run, and COLMAP's files are written there.
@@ -86,27 +104,28 @@ def reconstruct_sharing(
     graph = graph.with_intrinsics(read_intrinsics(config.intrinsics))
     if directory is None:
         # Each component alone, since a bad one may make the mapper fail
-        parts = tuple(map(MergedGraph, graph.components()))
+        parts = list(map(MergedGraph, graph.components()))
         make = partial(reconstruct_component, config=config)
     else:
         # COLMAP's database holds all images of a folder.
-        parts = (MergedGraph(graph.strong),)
+        parts = [MergedGraph(graph.strong)]
         make = partial(reconstruct_connected, config=config)
     # The user's cameras are neither compared nor shared.
-    free = [image for image in graph.images if image.digest not in graph.known]
+    free = free_of(graph)
     given = shared = given_intrinsics(free, config)
     found = [make(part, shared) for part in parts]
-    if config.cameras is CameraSharing.AUTO and (
-        alike := shared_intrinsics(free, models_of(found))
-    ):
-        again = []
-        for part, former in zip(parts, found, strict=True):
-            refined = refine_complete(part, alike, config, former)
-            again.append(refined or make(part, alike))
-        # Images of two cameras that are forced into one lose points.
-        before, after = (sum(each.observations for each in made) for made in (found, again))
-        if after >= MIN_OBSERVATIONS * before:
-            found, shared = again, alike
+    for number, (part, first) in enumerate(zip(parts, found, strict=True)):
+        if not doubts_exif(part.graph, first):
+            continue
+        other = part.without_exif()
+        starts = given_intrinsics(free_of(part.graph), config, uses_exif=False)
+        second = make(other, {**shared, **starts})
+        if second.observations > first.observations:
+            shared = {**shared, **starts}
+            parts[number] = other
+            found[number] = second
+    if config.cameras is CameraSharing.AUTO:
+        found, shared = share(parts, found, free, config, make) or (found, shared)
     found = [compared(part, each) for part, each in zip(parts, found, strict=True)]
     if directory is not None:
         from mkpc_kaggle.scene.colmap import write_files
@@ -118,6 +137,85 @@ def reconstruct_sharing(
     if given:
         shared = refined_intrinsics(free, models_of(found))
     return found, shared
+
+
+def free_of(graph: ViewGraph) -> list[BatchImage]:
+    """Return the images of a graph without the user's cameras."""
+    return [image for image in graph.images if image.digest not in graph.known]
+
+
+def doubts_exif(graph: ViewGraph, found: Reconstruction) -> bool:
+    """Return whether wrong focal lengths of EXIF may be why cameras are missing or doubtful."""
+    if not any(image.focal for image in free_of(graph)):
+        return False
+    matched = {image for edge in graph.edges for image in (edge.first, edge.second)}
+    if not found.models or found.registered < MIN_REGISTERED * len(matched):
+        return True
+    if found.models[0].is_loose:
+        return True
+    # Some EXIF is wrong, so that of the images without a camera may be wrong, too.
+    contradicting = [
+        each.image
+        for each in found.models[0].images
+        if each.image.focal and abs(np.log(each.focal / each.image.focal)) > MAX_EXIF_LOG_DEVIATION
+    ]
+    return bool(contradicting) and found.registered < len(matched)
+
+
+def share(
+    parts: Sequence[MergedGraph],
+    found: list[Reconstruction],
+    free: Sequence[BatchImage],
+    config: SceneConfig,
+    make: Make,
+) -> tuple[list[Reconstruction], SharedIntrinsics] | None:
+    """Return reconstructions with shared intrinsics of the ``free`` images that seem to share a
+    camera, or ``None`` if none do, or if images then see fewer points.
+
+    They start from the poses ``found`` where these are good enough. Images that seem to have another
+    zoom share, too, unless they lose points by that.
+    """
+    models = models_of(found)
+    alike = shared_intrinsics(free, models)
+    if not alike:
+        return None
+    everything = shared_intrinsics(free, models, with_zoomed=True)
+    if everything.keys() != alike.keys():
+        # From these poses alone: most zooms are real, and the mapper takes long.
+        together = []
+        for part, former in zip(parts, found, strict=True):
+            refined = refine_complete(part, everything, config, former)
+            if refined is not None:
+                together.append(refined)
+        zoomed = undecided_zooms(free, models)
+        if len(together) == len(parts) and not loses_points(found, together, zoomed):
+            return together, everything
+    again = []
+    for part, former in zip(parts, found, strict=True):
+        refined = refine_complete(part, alike, config, former)
+        again.append(refined or make(part, alike))
+    return None if loses_points(found, again) else (again, alike)
+
+
+def loses_points(
+    before: Sequence[Reconstruction],
+    after: Sequence[Reconstruction],
+    digests: Collection[str] = (),
+) -> bool:
+    """Return whether all images together, or one of these, see fewer points than before.
+
+    Images of two cameras that are forced into one lose points.
+    """
+    counts = []
+    for found in (before, after):
+        points: Counter[str] = Counter()
+        for model in models_of(found):
+            points.update({each.image.digest: each.points for each in model.images})
+        counts.append(points)
+    former, latter = counts
+    if latter.total() < MIN_OBSERVATIONS * former.total():
+        return True
+    return any(latter[digest] < MIN_OBSERVATIONS * former[digest] for digest in digests)
 
 
 def refined_intrinsics(
@@ -189,15 +287,21 @@ def reconstruct_connected(
 
 
 def compared(merged: MergedGraph, found: Reconstruction) -> Reconstruction:
-    """Return the reconstruction, each model with the assumptions that its photographs contradict."""
+    """Return the reconstruction, with what its photographs contradict."""
+    # Certain cameras have moved.
+    is_doubtful = not found.models or found.models[0].centre_sigma > MAX_CENTRE_SIGMA
+    has_moved = not (is_doubtful and hardly_moved(merged))
     if not found.models:
-        return found
+        return found if has_moved else replace(found, failure=HARDLY_MOVED)
     # Only with a model: pycolmap may be missing
     from mkpc_kaggle.scene.comparison import compare
 
     known = known_by_name(merged.graph)
-    models = tuple(replace(each, comparison=compare(each, known)) for each in found.models)
-    return replace(found, models=models)
+    models = []
+    for model in found.models:
+        comparison = replace(compare(model, known), has_moved=has_moved)
+        models.append(replace(model, comparison=comparison))
+    return replace(found, models=tuple(models))
 
 
 def models_of(reconstructions: Sequence[Reconstruction]) -> tuple[SfmModel, ...]:

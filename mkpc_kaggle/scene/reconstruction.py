@@ -20,6 +20,11 @@ MAX_SIGMA_IMAGES = 200  # of a model with sigmas; memory is quadratic and time c
 # Sigma of centres, in sizes of the model. Over pairs of draws of five scenes, F of cameras with a smaller
 # sigma gains on F of the pair, and F of the others gains nothing (benchmarks/RESULTS.md).
 LOOSE_SIGMA = 0.25
+MAX_CENTRE_SIGMA = 0.02  # of the model's size; a camera with a larger expected error is uncertain
+# The reason for missing and for doubtful cameras
+HARDLY_MOVED = (
+    "the camera hardly moved: nothing can be triangulated; step aside between photographs"
+)
 FOCALS = Range(0.3, 5.0)  # plausible focal lengths, in long sides of the image
 
 
@@ -90,6 +95,7 @@ class Comparison:
 
     focals: tuple[FocalContradiction, ...] = ()
     lenses: tuple[DistortedLens, ...] = ()
+    has_moved: bool = True  # False: the camera only turned, see :mod:`mkpc_kaggle.scene.motion`
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,16 +114,23 @@ class SfmModel:
     comparison: Comparison = Comparison()
 
     @property
+    def centre_sigma(self) -> float:
+        """The median sigma of the centres, in sizes of the model; infinite if the points do not
+        determine them, 0 if sigmas of so many images are not computed.
+        """
+        if not self.images or len(self.images) > MAX_SIGMA_IMAGES:
+            return 0.0
+        # Bundle adjustment does not determine a camera without sigmas.
+        sigmas = [found.sigmas.centre if found.sigmas else np.inf for found in self.images]
+        return float(np.median(sigmas))
+
+    @property
     def is_loose(self) -> bool:
         """True if most cameras are unknown to within the model's own size.
 
         Parts of the model then hang together loosely, or wrong matches have bent it.
         """
-        if len(self.images) > MAX_SIGMA_IMAGES:
-            return False  # not computed
-        # Bundle adjustment does not determine a camera without sigmas.
-        sigmas = [found.sigmas.centre if found.sigmas else np.inf for found in self.images]
-        return bool(sigmas) and float(np.median(sigmas)) > LOOSE_SIGMA
+        return self.centre_sigma > LOOSE_SIGMA
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "colmap": None}

@@ -58,12 +58,13 @@ class Edge:
 @dataclass(frozen=True, eq=False)
 class ViewGraph:
     """Distinct images, and their edges, sorted by image indices. ``known`` has the user's cameras,
-    by digest.
+    by digest. Unless ``uses_exif``, cameras start without EXIF's focal lengths.
     """
 
     images: tuple[BatchImage, ...]
     edges: tuple[Edge, ...]
     known: Mapping[str, KnownCamera] = field(default_factory=dict)
+    uses_exif: bool = True
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -33,6 +33,7 @@ from mkpc_kaggle.reporting import contradictions, verdict
 from mkpc_kaggle.reporting.run_log import RunLog
 from mkpc_kaggle.scene.choose import Choice, Reason
 from mkpc_kaggle.scene.reconstruction import (
+    HARDLY_MOVED,
     MAX_SIGMA_IMAGES,
     Comparison,
     DistortedLens,
@@ -116,6 +117,12 @@ SPEAKS = {
         scene(failure=NO_CAMERAS), faults=("set: all masks are black",)
     ),
     "no cameras, too few pairs: photographs that overlap more": log(scene(failure="too few pairs")),
+    "no cameras: the camera hardly moved: nothing can be triangulated; step aside": log(
+        scene(failure=HARDLY_MOVED)
+    ),
+    "the cameras are not to be trusted: the camera hardly moved": log(
+        scene(model(GOOD, GOOD, GOOD, GOOD, comparison=Comparison(has_moved=False)))
+    ),
     "no camera for 3.jpg: add photographs between": log(
         scene(model(GOOD, GOOD, GOOD, names=NAMES[:3])), records=ALL
     ),

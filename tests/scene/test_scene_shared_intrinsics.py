@@ -1,12 +1,21 @@
 """Shared intrinsics: recognised by focal lengths, and kept only if they explain the matches."""
 
 from collections.abc import Sequence
+from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 import pycolmap
 import pytest
 
-from benchmarks.synthetic_scene import SyntheticScene, registered_images, synthetic_scene
+from benchmarks.synthetic_scene import (
+    SyntheticScene,
+    batch_of,
+    front,
+    pointed,
+    registered_images,
+    synthetic_scene,
+)
 from mkpc_kaggle.geometry.cameras import Camera, relative_pose
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
@@ -19,7 +28,7 @@ from mkpc_kaggle.scene.export import HeldDirectory
 from mkpc_kaggle.scene.keypoints import MergedGraph
 from mkpc_kaggle.scene.reconstruct import Solution, reconstruct_batch, reconstruct_sharing
 from mkpc_kaggle.scene.reconstruction import RegisteredImage, SfmModel
-from mkpc_kaggle.scene.shared_intrinsics import shared_intrinsics
+from mkpc_kaggle.scene.shared_intrinsics import shared_intrinsics, undecided_zooms
 from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair, ViewGraph
 
 WIDE = Size(800, 600)
@@ -85,6 +94,55 @@ def test_an_image_without_a_camera_shares_that_of_its_size():
     assert found == dict.fromkeys("012345", FOCAL)
 
 
+# Focal lengths of EXIF: of the four images that agree, and of the last one, which seems to be zoomed
+EXIF = {
+    "unknown": (0, 0, dict.fromkeys("01234", 840), {"4"}),
+    "the same": (800, 800, dict.fromkeys("01234", 840), set()),
+    "rounded": (800, 840, dict.fromkeys("01234", 840), set()),
+    "another zoom": (800, 1200, dict.fromkeys("0123", 840), set()),
+    "unknown of the others": (0, 1200, dict.fromkeys("01234", 840), {"4"}),
+}
+
+
+@pytest.mark.parametrize(("exif", "last", "expected", "undecided"), EXIF.values(), ids=EXIF)
+def test_exif_decides_whether_an_image_that_seems_zoomed_may_share(exif, last, expected, undecided):
+    every = [replace(image, focal=exif) for image in images(4)]
+    every.append(replace(images(5)[4], focal=last))
+    models = [model(every, [840, 839, 840, 841, 1200])]
+    assert shared_intrinsics(every, models) == dict.fromkeys("0123", 840)
+    assert shared_intrinsics(every, models, with_zoomed=True) == expected
+    assert undecided_zooms(every, models) == undecided
+
+
+def views(flat: bool, zoom: float = 1.0) -> list[BatchPair]:
+    """Return the pairs of seven views of a wall; the middle one is frontal, and zoomed."""
+    world = front(np.random.default_rng(0), 800)
+    if flat:
+        world[:, 2] = 0
+    cameras = []
+    for number in range(7):
+        angle = np.radians(14 * (number - 3))
+        height = 0.6 * np.sin(2.0 * number)
+        centre = np.array([12 * np.sin(angle), height, -12 * np.cos(angle)])
+        focal = zoom * FOCAL if number == 3 else FOCAL
+        cameras.append(pointed(centre, -centre / np.linalg.norm(centre), focal))
+    ends = list(combinations(range(7), 2))
+    return list(batch_of(np.random.default_rng(1), world, cameras, ends, 0.4, 0.1).pairs)
+
+
+def test_a_frontal_view_of_a_flat_scene_shares_the_focal_length_of_the_others():
+    # Alone it has any focal length: the plane and the distance make up for it.
+    assert max(focals_of(reconstruct_batch(views(flat=True), OWN))) > 1.2 * FOCAL
+    found = focals_of(reconstruct_batch(views(flat=True), CONFIG))
+    assert found == pytest.approx([FOCAL] * 7, rel=0.01)
+
+
+def test_a_view_of_another_zoom_keeps_its_focal_length():
+    found = focals_of(reconstruct_batch(views(flat=False, zoom=1.3), CONFIG))
+    expected = [FOCAL] * 3 + [1.3 * FOCAL] + [FOCAL] * 3
+    assert found == pytest.approx(expected, rel=0.01)
+
+
 def focals_of(solution: Solution) -> list[float]:
     """Return the focal lengths of all registered images, in pixels."""
     focals = []
@@ -127,7 +185,9 @@ def test_shared_intrinsics_stay_unless_they_explain_fewer_points_and_the_files_a
     scene = synthetic_scene(6, points=300)
     # The images have different focal lengths, so sharing loses points.
     everything = {image.digest: FOCAL for image in scene.images}
-    monkeypatch.setattr("mkpc_kaggle.scene.reconstruct.shared_intrinsics", lambda *_: everything)
+    monkeypatch.setattr(
+        "mkpc_kaggle.scene.reconstruct.shared_intrinsics", lambda *_, **__: everything
+    )
     monkeypatch.setattr("mkpc_kaggle.scene.reconstruct.MIN_OBSERVATIONS", least)
     solution = reconstruct_batch(scene.pairs, CONFIG)
     assert len(set(focals_of(solution))) == cameras
@@ -190,7 +250,9 @@ def test_poses_with_which_images_see_fewer_points_are_mapped_again(mappings, mon
     scene = synthetic_scene(6, points=300)
     # The images have different focal lengths, so no poses fit a shared one.
     everything = {image.digest: FOCAL for image in scene.images}
-    monkeypatch.setattr("mkpc_kaggle.scene.reconstruct.shared_intrinsics", lambda *_: everything)
+    monkeypatch.setattr(
+        "mkpc_kaggle.scene.reconstruct.shared_intrinsics", lambda *_, **__: everything
+    )
     solution = reconstruct_batch(scene.pairs, CONFIG)
     assert len(set(focals_of(solution))) == 6
     assert mappings == [6, 6]
