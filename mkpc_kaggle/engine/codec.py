@@ -115,8 +115,15 @@ IMAGE = record(BatchImage, name=PLAIN, digest=PLAIN, size=SIZE, focal=PLAIN)
 CAMERA = record(Camera, K=MATRIX, R=MATRIX, t=array(3))
 # Unknown errors of a camera are an empty tuple.
 SIGMAS: Codec[Sigmas | tuple[()]] = Codec(list, lambda about: Sigmas(*about) if about else ())
-REGISTERED_IMAGE = record(RegisteredImage, image=IMAGE, camera=CAMERA, points=PLAIN, sigmas=SIGMAS)
 KNOWN_CAMERA = record(KnownCamera, model=PLAIN, parameters=several(FLOAT), sigma=FLOAT)
+REGISTERED_IMAGE = record(
+    RegisteredImage,
+    image=IMAGE,
+    camera=CAMERA,
+    points=PLAIN,
+    sigmas=SIGMAS,
+    lens=optional(KNOWN_CAMERA),
+)
 NAMES = several(PLAIN)
 COMPARISON = record(
     Comparison,

@@ -67,6 +67,8 @@ CAMERA_COLUMNS = {
     "K": object,
     "R": object,
     "t": object,
+    "camera_model": str,
+    "parameters": object,
 }
 
 
@@ -188,4 +190,7 @@ def _camera_row(batch: str, model: int, name: str, found: RegisteredImage) -> di
         "K": found.camera.K,
         "R": found.camera.R,
         "t": found.camera.t,
+        # COLMAP's, with (0.5, 0.5) in the centre of the first pixel: K has no distortion.
+        "camera_model": "" if found.lens is None else found.lens.model,
+        "parameters": () if found.lens is None else found.lens.parameters,
     }

@@ -36,12 +36,14 @@ def write_tables(out: Path, cameras: Cameras, root: Path, form: str | None) -> N
 
 
 def camera_rows(cameras: Cameras, root: Path) -> Iterator[Sequence[str]]:
-    """Yield a header, and a row per image with a camera: path below ``root``, model, K, R, t, and
-    ``Sigmas``.
+    """Yield a header, and a row per image with a camera: path below ``root``, model, K, R, t,
+    ``Sigmas``, COLMAP's camera model and its parameters.
 
-    The centre of an image's first pixel is (0, 0); X_cam = R X + t. Unknown sigmas are empty cells.
+    The centre of an image's first pixel is (0, 0); X_cam = R X + t. In COLMAP's parameters it is
+    (0.5, 0.5). Unknown sigmas are empty cells.
     """
-    yield "image", "model", "K", "R", "t", "rotation_sigma", "centre_sigma", "focal_sigma"
+    sigma_names = ("rotation_sigma", "centre_sigma", "focal_sigma")
+    yield "image", "model", "K", "R", "t", *sigma_names, "camera_model", "parameters"
     for files in cameras.values():
         for file, placed in files.items():
             if placed is None:
@@ -49,6 +51,11 @@ def camera_rows(cameras: Cameras, root: Path) -> Iterator[Sequence[str]]:
             model, found = placed
             camera = found.camera
             sigmas = [f"{value:g}" for value in found.sigmas] or [""] * 3
+            # As in a table of --intrinsics, which takes them
+            lens = found.lens
+            parameters = (
+                "" if lens is None else " ".join(f"{each:.12g}" for each in lens.parameters)
+            )
             yield (
                 file.relative_to(root).as_posix(),
                 str(model),
@@ -56,6 +63,8 @@ def camera_rows(cameras: Cameras, root: Path) -> Iterator[Sequence[str]]:
                 joined(camera.R),
                 joined(camera.t),
                 *sigmas,
+                "" if lens is None else lens.model,
+                parameters,
             )
 
 

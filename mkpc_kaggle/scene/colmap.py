@@ -399,10 +399,19 @@ def _sfm_model(found: Any, graph: ViewGraph) -> SfmModel:
                 camera,
                 int(image.num_points3D),
                 sigmas.get(image.name, ()),
+                _lens_of(image.camera),
             )
         )
     error = float(found.compute_mean_reprojection_error()) if found.num_points3D() else 0.0
     return SfmModel(tuple(images), points_of(found), error, found)
+
+
+def _lens_of(camera: Any) -> KnownCamera | None:
+    """Return pycolmap's camera model and parameters; ``None`` if no lens has them."""
+    try:
+        return KnownCamera(camera.model_name, tuple(float(each) for each in camera.params))
+    except ValueError:  # such as a focal length below zero, of an implausible image
+        return None
 
 
 def points_of(found: Any) -> NDArray[np.float64]:

@@ -49,6 +49,8 @@ class RegisteredImage:
     camera: Camera
     points: int
     sigmas: Sigmas | tuple[()] = ()
+    # COLMAP's model with all parameters, as in a table of intrinsics: K has no distortion.
+    lens: KnownCamera | None = None
 
     @property
     def focal(self) -> float:

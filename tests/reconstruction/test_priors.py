@@ -14,6 +14,7 @@ from shared import run_command
 from test_reconstruct import FIRST, RECIPE, MixedMatcher, cameras, contents, write_flat
 
 from benchmarks.synthetic_scene import SIZE
+from mkpc_kaggle import results
 from mkpc_kaggle.data.masks import MaskReader, Masks
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.request import Ending
@@ -23,6 +24,7 @@ from mkpc_kaggle.geometry.intrinsics import KnownCamera, read
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.reconstruction.folder import read_folder
+from mkpc_kaggle.reconstruction.outputs import camera_rows
 from mkpc_kaggle.reconstruction.priors import intrinsics_line, read_intrinsics_table
 from mkpc_kaggle.reconstruction.python import Models, reconstruct
 from mkpc_kaggle.reconstruction.run import FolderResult, for_cameras, reconstruct_folder
@@ -380,6 +382,31 @@ def test_a_row_with_a_path_is_the_camera_of_that_image_alone(tmp_path):
     }
     assert focals["a"] == pytest.approx(901, abs=1e-9)
     assert abs(focals["b"] - 901) > 1
+
+
+def test_all_parameters_of_a_distorted_camera_are_in_the_tables(tmp_path):
+    root = write_flat(tmp_path / "images", FIRST)
+    table = tmp_path / "known.csv"
+    truth = MixedMatcher().scenes[0].cameras["0000"].K[0, 0]
+    given = [truth, truth, 400, 300, 0.001, -0.002, 0.0003, -0.0004]
+    parameters = " ".join(f"{each:.12g}" for each in given)
+    table.write_text(f"{HEAD}00.png,OPENCV,{parameters},fixed\n")
+    known = read_intrinsics_table(table, root, sorted(root.iterdir()))
+    result = run(root, tmp_path / "out", known=known)
+    head, *rows = camera_rows(result.cameras, root)
+    cells = {row[0]: dict(zip(head, row, strict=True)) for row in rows}
+    assert len(cells) == FIRST
+    assert cells["00.png"]["camera_model"] == "OPENCV"
+    assert cells["00.png"]["parameters"] == parameters
+    # The other cameras are pinholes, with COLMAP's principal point.
+    assert cells["01.png"]["camera_model"] == "SIMPLE_PINHOLE"
+    focal, cx, cy = map(float, cells["01.png"]["parameters"].split())
+    K = np.array(cells["01.png"]["K"].split(";"), float)
+    assert [focal, cx - 0.5, cy - 0.5] == pytest.approx([K[0], K[2], K[5]])
+    # The journal has the same, and so have tables of pandas.
+    frame = results(tmp_path / "out" / "work").cameras.set_index("image")
+    assert frame.loc["00.png", "camera_model"] == "OPENCV"
+    assert frame.loc["00.png", "parameters"] == pytest.approx(given)
 
 
 def test_python_takes_masks_and_intrinsics_as_the_command_does(tmp_path):
