@@ -42,14 +42,15 @@ def program(arguments: Sequence[str] | None = None) -> NoReturn:
     The time limit counts from the start of the process.
     """
     try:  # Ctrl-C during slow imports is not an error
-        from mkpc_kaggle.engine.console import leave
-
         former = os.environ.get("MPLCONFIGDIR")
         status = main(arguments, process_start())
         # Set by matplotlib if it cannot write below HOME. Matplotlib removes the directory only in
         # an orderly exit.
         if (made := os.environ.get("MPLCONFIGDIR")) != former:
             shutil.rmtree(str(made), ignore_errors=True)
+        if "cv2" not in sys.modules:  # it cannot be imported, and neither can the console
+            sys.exit(status)
+        from mkpc_kaggle.engine.console import leave
     except KeyboardInterrupt:
         os._exit(EXIT_INTERRUPTED)
     leave(status)
@@ -81,6 +82,19 @@ def main(arguments: Sequence[str] | None = None, started: float | None = None) -
     """
     if started is None:
         started = time.monotonic()
+    from mkpc_kaggle.errors import require_libraries
+
+    try:
+        require_libraries()
+    except ImportError as error:
+        # Without the printing thread, whose module needs the library.
+        sys.stderr.write(f"{error}\n")
+        return EXIT_BAD_INPUT
+    return _main(arguments, started)
+
+
+def _main(arguments: Sequence[str] | None, started: float) -> int:
+    """Run a command with the package's libraries, and print its errors, one line each."""
     from mkpc_kaggle.engine.console import complain, warn
     from mkpc_kaggle.errors import UserError
 
@@ -97,6 +111,14 @@ def main(arguments: Sequence[str] | None = None, started: float | None = None) -
             return _run(given, started, printing)
         except UserError as error:
             complain(str(error))
+            return EXIT_BAD_INPUT
+        except ImportError as error:
+            # Of a native library, such as torch without its CUDA; a fault of the package is a
+            # traceback.
+            if str(error.name).startswith("mkpc_kaggle"):
+                raise
+            reason = " ".join(str(error).split())
+            complain(f"a library cannot be imported: {reason}; install the package again")
             return EXIT_BAD_INPUT
         except KeyboardInterrupt as error:
             complain("interrupted")
