@@ -22,7 +22,8 @@ submission. Without options, print an overview of one screen.
   pairs.csv    ids, images (paths below the directory of the run's images), failure, source of F (pair, scene,
                fallback), matches, inliers, seconds by part; f11 ... f33, the matrix of the column model: F, or E
                for pairs with known intrinsics. For the F of the pair's own matches: support (ratio of inliers to
-               inliers by chance), overlaps (whether the images overlap), number of candidates; cost of the result
+               inliers by chance), overlaps (whether the images overlap), plane (share of the inliers that
+               one homography explains), flat (nearly all of them), number of candidates; cost of the result
                and of MAGSAC's own F, focal lengths
   units.csv    per unit and pair: matches, inliers, seconds, failure
   regions.csv  per image (0 or 1) and pair: the critical region's box and the reason for it

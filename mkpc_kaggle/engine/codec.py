@@ -109,6 +109,7 @@ STATS = record(
     focals=several(FLOAT),
     support=FLOAT,
     rotation=several(FLOAT),
+    plane=FLOAT,
 )
 CHOICE = record(Choice, F=optional(MATRIX), reason=enum(Reason))
 IMAGE = record(BatchImage, name=PLAIN, digest=PLAIN, size=SIZE, focal=PLAIN)

@@ -24,6 +24,7 @@ from mkpc_kaggle.geometry.coordinates import Matrix3
 from mkpc_kaggle.geometry.critical_region import CriticalRegion
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
+from mkpc_kaggle.geometry.planarity import MIN_PLANE_SHARE
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, NO_STATS, EstimateStats, ModelKind
 from mkpc_kaggle.pipeline.pair import Regions
 from mkpc_kaggle.scene.choose import Choice
@@ -154,6 +155,11 @@ class PairRecord:
     def overlaps(self) -> bool:
         """True if the two images probably overlap."""
         return self.stats.support >= MIN_SUPPORT
+
+    @property
+    def is_flat(self) -> bool:
+        """True if one homography explains the inliers of the pair's own F, so it is uncertain."""
+        return self.stats.plane >= MIN_PLANE_SHARE
 
     @property
     def reached(self) -> bool:

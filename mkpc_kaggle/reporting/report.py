@@ -212,6 +212,7 @@ def _weakest_section(
         "weakest": weakest,
         "sources": sources,
         "is_doubtful": is_doubtful,
+        "flatness": flatness,
         "min_support": MIN_SUPPORT,
     }
 
@@ -263,10 +264,24 @@ def pair_rows(records: Sequence[PairRecord]) -> list[tuple[str | int | float, ..
             record.inliers,
             round(record.stats.support, 1),
             record.source,
-            doubt(record) or ("" if record.is_solved else record.failure),
+            remark(record),
         )
         for record in weakest_first
     ]
+
+
+def remark(record: PairRecord) -> str:
+    """Return why a pair has no F, or why its F is doubtful or uncertain, or an empty string."""
+    if not record.is_solved:
+        return record.failure
+    return doubt(record) or flatness(record)
+
+
+def flatness(record: PairRecord) -> str:
+    """Return that a pair is flat, or an empty string. Cameras determine F of flat pairs, too."""
+    if not record.is_flat or record.source == "scene":
+        return ""
+    return f"flat: one homography explains {100 * record.stats.plane:.0f} % of the inliers"
 
 
 def _views(

@@ -40,7 +40,7 @@ SECONDS = {  # fields of a pair's record, and their names in reports
     "estimate_seconds": "MAGSAC (in parallel with matching)",
 }
 PAIR_HEADS = f"""pair id group image0 image1 failure source matches inliers overlaps {" ".join(SECONDS)}
-    support candidates cost magsac_cost focal0 focal1 model f11 f12 f13 f21 f22 f23 f31 f32 f33"""
+    support flat plane candidates cost magsac_cost focal0 focal1 model f11 f12 f13 f21 f22 f23 f31 f32 f33"""
 REGION_HEADS = "pair image left top right bottom reason clusters kept"
 
 
@@ -169,6 +169,8 @@ def _pair_cells(record: PairRecord) -> tuple[Any, ...]:
         record.overlaps,
         *(getattr(record, name) for name in SECONDS),
         stats.support,
+        record.is_flat,
+        stats.plane,
         stats.candidates,
         stats.cost,
         stats.magsac_cost,
