@@ -10,19 +10,29 @@ from typing import TYPE_CHECKING, Any
 from mkpc_kaggle.version import __version__
 
 if TYPE_CHECKING:
+    from mkpc_kaggle.errors import UserError
     from mkpc_kaggle.pipeline.pair import PairMatch
     from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher
     from mkpc_kaggle.recipe import Recipe
     from mkpc_kaggle.reconstruction.python import reconstruct
     from mkpc_kaggle.reporting.notebook import results
 
-__all__ = ["PairMatch", "Recipe", "TwoStageMatcher", "__version__", "reconstruct", "results"]
+__all__ = [
+    "PairMatch",
+    "Recipe",
+    "TwoStageMatcher",
+    "UserError",
+    "__version__",
+    "reconstruct",
+    "results",
+]
 
 # Imported on first use: torch alone takes seconds.
 _MODULES = {
     "PairMatch": "pipeline.pair",
     "TwoStageMatcher": "pipeline.two_stage",
     "Recipe": "recipe",
+    "UserError": "errors",
     "reconstruct": "reconstruction.python",
     "results": "reporting.notebook",
 }

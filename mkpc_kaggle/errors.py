@@ -8,6 +8,7 @@ from functools import cache
 from importlib import import_module
 from io import StringIO
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 MAX_TEXT_BYTES = 1 << 24  # a recipe, a list of pairs; a file given by mistake may have gigabytes
 
@@ -85,6 +86,21 @@ def shown(name: object) -> str:
 def printable(text: str) -> str:
     """Return ``text`` with escapes for characters that UTF-8 cannot encode, as paths may have."""
     return text.encode("utf-8", "backslashreplace").decode()
+
+
+@contextmanager
+def temporary_directory() -> Iterator[Path]:
+    """Yield a directory that is removed afterwards. Raise :class:`UserError` if there is no place
+    for one.
+    """
+    try:
+        made = TemporaryDirectory(prefix="mkpc-")
+    except OSError as error:
+        raise UserError(
+            f"no temporary directory: {error.strerror}; set TMPDIR to a directory that can be written"
+        ) from error
+    with made as name:
+        yield Path(name)
 
 
 @contextmanager

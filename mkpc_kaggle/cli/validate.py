@@ -3,8 +3,8 @@
 import argparse
 import json
 import re
-import tempfile
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from mkpc_kaggle.data.pairs import read_pairs
 from mkpc_kaggle.engine.console import say
 from mkpc_kaggle.engine.request import RunReport
 from mkpc_kaggle.engine.session import Interrupt, Session, interruptible
-from mkpc_kaggle.errors import UserError, plural, writing
+from mkpc_kaggle.errors import UserError, plural, temporary_directory, writing
 from mkpc_kaggle.evaluation.compare import comparison_json, comparison_table, step_gains
 from mkpc_kaggle.evaluation.imc2025 import score_imc2025, score_lines
 from mkpc_kaggle.evaluation.validate import (
@@ -153,8 +153,8 @@ def run(arguments: argparse.Namespace) -> int:
         status, figures = _score(arguments, scenes)
     else:
         # Without a work directory, nothing is kept.
-        with tempfile.TemporaryDirectory(prefix="mkpc-") as temporary:
-            work_dir = arguments.work_dir or Path(temporary)
+        with ExitStack() as closed:
+            work_dir = arguments.work_dir or closed.enter_context(temporary_directory())
             status, figures = _match_and_score(arguments, scenes, root, work_dir)
     if figures is not None and arguments.json is not None:
         with writing(f"--json {arguments.json}"):

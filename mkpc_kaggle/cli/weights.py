@@ -3,10 +3,9 @@
 import argparse
 from dataclasses import replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 from mkpc_kaggle.cli import options
-from mkpc_kaggle.errors import UserError, plural
+from mkpc_kaggle.errors import UserError, plural, temporary_directory
 from mkpc_kaggle.matchers.registry import UnusableError, matcher_names, spec_of
 from mkpc_kaggle.pipeline.availability import fit_of, slots_of
 from mkpc_kaggle.recipe import load_recipe, recipe_names
@@ -137,8 +136,8 @@ def _fetch(arguments: argparse.Namespace) -> int:
     wanted = [lines for name in arguments.names for lines in files_of(name, store)]
     files = dict.fromkeys(choose(lines, arguments.out) for lines in wanted)
     outcomes = []
-    with TemporaryDirectory(prefix="mkpc-") as temporary:
-        wheels = Wheels(Path(temporary))
+    with temporary_directory() as temporary:
+        wheels = Wheels(temporary)
         for file in files:
             # Before the download: a licence may be a reason not to fetch the file.
             print(f"{file.name}: licence {file.licence}, from {file.shown_source}", flush=True)

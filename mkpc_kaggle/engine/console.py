@@ -63,7 +63,8 @@ class Progress(ProgressLine):
         if not total:
             return
         now = self._budget.clock()
-        is_new = phase != self._phase
+        # A phase that became smaller has no rate yet: fewer pairs are done than when it began.
+        is_new = phase != self._phase or done < self._first
         if is_new:
             self._phase = phase
             self._first = done
@@ -192,12 +193,22 @@ def unblocked(descriptors: Sequence[int] = (1, 2)) -> Iterator[None]:
             )
             setattr(sys, name, queued)
             # From here on, native libraries write to a file, which never blocks.
-            file = ended.enter_context(TemporaryFile())
+            file = ended.enter_context(_native_file())
             os.dup2(file.fileno(), number)
             _native.append(number)
             ended.callback(_restore, name, stream, number, sink, file)
         ended.callback(drain)
         yield
+
+
+def _native_file() -> Any:
+    """Open a file for the text of native libraries: a temporary file, or the null device where there
+    is no directory for one.
+    """
+    try:
+        return TemporaryFile()
+    except OSError:  # a container in which only the output is writable, or a full disk
+        return open(os.devnull, "w+b")  # noqa: PTH123
 
 
 def _restore(name: str, stream: TextIO, number: int, sink: int, file: Any) -> None:

@@ -60,7 +60,9 @@ class Interrupt(threading.Event):
 
 @contextmanager
 def interruptible() -> Iterator[Interrupt]:
-    """Let SIGTERM and Ctrl-C set the interrupt. A second signal has its default effect."""
+    """Let SIGTERM and Ctrl-C set the interrupt, unless the parent program ignores them. A second
+    signal has its default effect.
+    """
     interrupt = Interrupt()
     with ExitStack() as restored:
 
@@ -72,8 +74,11 @@ def interruptible() -> Iterator[Interrupt]:
                 raise KeyboardInterrupt(number)
 
         for number in (signal.SIGINT, signal.SIGTERM):
-            restored.callback(signal.signal, number, signal.getsignal(number))
-            signal.signal(number, note)
+            former = signal.getsignal(number)
+            # A shell's background job ignores Ctrl-C, which is for the script, and so does nohup.
+            if former is not signal.SIG_IGN:
+                restored.callback(signal.signal, number, former)
+                signal.signal(number, note)
         yield interrupt
 
 

@@ -3,9 +3,8 @@
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
-from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.errors import UserError, temporary_directory
 from mkpc_kaggle.package.files import (
     ChosenWeights,
     Item,
@@ -71,8 +70,7 @@ def make_package(request: Request) -> Package:
     checkout = find_checkout()
     dataset = request.out / "dataset"
     kernel = request.out / "kernel"
-    with TemporaryDirectory(prefix="mkpc-") as temporary:
-        staging = Path(temporary)
+    with temporary_directory() as staging:
         store = WeightStore(request.weights)
         chosen = choose_weights(store, checkout, staging, private=request.private)
         kernel_items = _kernel_items(request, checkout, staging, has_weights=bool(chosen.items))

@@ -7,7 +7,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +17,7 @@ from mkpc_kaggle.engine.console import warn
 from mkpc_kaggle.engine.session import Interrupt, Session, interruptible
 from mkpc_kaggle.engine.state import name_below
 from mkpc_kaggle.engine.store import FILE_NAME
-from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.errors import UserError, temporary_directory
 from mkpc_kaggle.matchers.contract import Matcher
 from mkpc_kaggle.pipeline.arguments import PathSource, Weights, member_of, shown_value
 from mkpc_kaggle.pipeline.assembly import Assembly, assemble
@@ -105,7 +104,7 @@ def reconstruct(
     assembly = with_priors(assembly, root, files, masks, intrinsics)
     with ExitStack() as closed:
         if work_dir is None:
-            work_dir = closed.enter_context(TemporaryDirectory(prefix="mkpc-"))
+            work_dir = closed.enter_context(temporary_directory())
         elif assembly.unversioned:
             warn(
                 f"the results of {', '.join(assembly.unversioned)} are not kept for later calls: "

@@ -5,11 +5,10 @@ import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from pickle import UnpicklingError
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 from mkpc_kaggle.data.outputs import require_apart
-from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.errors import UserError, temporary_directory
 from mkpc_kaggle.weights.manifest import UNVERIFIED, WeightFile, digest_of, manifest
 
 if TYPE_CHECKING:
@@ -218,8 +217,8 @@ def _load_table(path: Path, *, is_mapped: bool = False) -> Mapping[Any, Any]:
     """Return the table of tensors. With ``is_mapped``, their numbers are read on first use."""
     if path.is_dir():
         # torch reads archives only. Without mapping, as the archive is removed again.
-        with TemporaryDirectory(prefix="mkpc-") as temporary:
-            return _load_table(_pack(path, Path(temporary) / "checkpoint.pt"))
+        with temporary_directory() as temporary:
+            return _load_table(_pack(path, temporary / "checkpoint.pt"))
     if path.exists() and not path.is_file():
         raise ValueError("not a regular file")
     if path.suffix == ".safetensors":

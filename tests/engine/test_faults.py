@@ -438,3 +438,40 @@ def test_a_limit_of_ten_million_years_is_no_limit():
         GUARDED.format(limit=359999999996400, body="time.sleep(0.5); print('ended by itself')")
     )
     assert (done.returncode, done.stdout, done.stderr) == (0, "ended by itself\n", "")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_that_the_parent_program_ignores_is_ignored(number):
+    # A shell lets its background jobs ignore Ctrl-C.
+    code = (
+        "import os, signal; from mkpc_kaggle.engine.session import interruptible\n"
+        "with interruptible() as interrupt:\n"
+        f"    os.kill(os.getpid(), {int(number)})\n"
+        "    print(interrupt.is_set())"
+    )
+    for action, told in ((signal.SIG_IGN, "False\n"), (signal.SIG_DFL, "True\n")):
+        done = subprocess.run(
+            [sys.executable, "-c", code],
+            preexec_fn=partial(signal.signal, number, action),
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert (done.returncode, done.stdout, done.stderr) == (0, told, "")
+
+
+def test_a_full_disk_for_the_journal_alone_is_exit_status_one(
+    demo, small_recipe, tmp_path, monkeypatch, capsys
+):
+    prepare = Store._prepare
+
+    def small(self: Store) -> None:
+        prepare(self)
+        self._db.execute("PRAGMA max_page_count = 6")
+
+    monkeypatch.setattr(Store, "_prepare", small)
+    output = tmp_path / "submission.csv"
+    assert main(["submit", *arguments_of(demo, small_recipe, output), "--workers", "0"]) == 1
+    said = capsys.readouterr().out
+    assert "the journal cannot be written (database or disk is full)" in said
+    assert submission_problems(output, [pair.id for pair in read_test_side(demo.test_dir)]) == []

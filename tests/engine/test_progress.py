@@ -107,3 +107,19 @@ def test_a_note_is_a_line_of_its_own(stream: StringIO) -> None:
     progress.note("batch one: 4 of 4 images with a camera")
     progress.close()
     assert "batch one: 4 of 4 images with a camera\n" in stream.getvalue()
+
+
+def test_a_phase_that_becomes_smaller_has_no_negative_rate() -> None:
+    stream = StringIO()
+    clock = VirtualClock()
+    progress = Progress(Budget(0.0, clock=clock), stream)
+    # Fewer extra pairs fit in the time: those that were counted as done are no part of it.
+    for done, total in ((40, 60), (24, 24), (25, 30)):
+        progress.count("connect", done, total)
+        clock.now += LINE_INTERVAL_S
+    progress.close()
+    assert stream.getvalue().splitlines() == [
+        "connect: 40/60",
+        "connect: 24/24",
+        "connect: 25/30 [00:30<02:30, 30.00s/pair]",
+    ]

@@ -141,3 +141,21 @@ def test_text_that_a_stream_cannot_encode_and_a_closed_file_end_nothing(tmp_path
     command = [sys.executable, "-c", CLOSES]
     done = subprocess.run(command, capture_output=True, check=True, env=environment)
     assert done.stdout == b"bytes, text\n"
+
+
+def test_a_machine_without_a_place_for_temporary_files_has_no_native_text_and_no_error(tmp_path):
+    # As in a container in which only the output can be written
+    code = """
+import os, tempfile
+def none(*_, **__):
+    raise FileNotFoundError(2, "No usable temporary directory found")
+tempfile._get_default_tempdir = none
+from mkpc_kaggle.engine.console import unblocked
+with unblocked():
+    os.write(1, b"of a library")
+    print("of the program")
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (0, "of the program\n", "")
