@@ -148,12 +148,12 @@ def test_a_row_names_an_image_by_its_path_its_name_or_a_pattern():
         (("a", "pinhole", "1 1 1 1", "fixed"), "unknown camera model"),
         (("a", "PINHOLE", "1 1 1", "fixed"), r"has 4 parameters \(fx, fy, cx, cy\)"),
         (("a", "PINHOLE", "1 nan 1 1", "fixed"), "not finite"),
-        (("a", "PINHOLE", "1 x 1 1", "fixed"), "could not convert"),
+        (("a", "PINHOLE", "1 x 1 1", "fixed"), "is not a decimal number"),
         (("a", "PINHOLE", "1 -1 1 1", "fixed"), "must be positive"),
         (("a", "PINHOLE", "1 1 1 1", "0"), "above 0"),
         (("a", "PINHOLE", "1 1 1 1", "nan"), "must be 'fixed'"),
         (("a", "PINHOLE", "1 1 1 1", "101"), "at most 100 percent"),
-        (("a", "PINHOLE", "1 1 1 1", "exact"), "could not convert"),
+        (("a", "PINHOLE", "1 1 1 1", "exact"), "is not a decimal number"),
     ],
 )
 def test_a_row_that_no_camera_has_is_refused_with_the_reason(cells, reason):
