@@ -40,8 +40,8 @@ from mkpc_kaggle.reporting.summary import pending_lines, trouble, unreadable_ima
 
 HELP = """\
 Match the images of a folder with the engine that makes submissions, and reconstruct their cameras. Each folder
-in DIR with images is a separate dataset, and the images directly in DIR are another. Images of several scenes
-may be mixed: each scene becomes a model, and unrelated images get no camera.
+in DIR with images is a separate dataset, and the images directly in DIR are another; with --join, all are one.
+Images of several scenes may be mixed: each scene becomes a model, and unrelated images get no camera.
 
 OUT gets a folder for each folder in DIR, with:
   database.db     COLMAP's: cameras, images, keypoints, matches, verified two-view geometries
@@ -97,6 +97,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     text = "also write keypoints and matches of all images to this file, in hloc's layout"
     add("--export", type=Path, metavar="FILE.h5", help=text)
+    text = "all images below DIR are one dataset, as those of a camera with several cards"
+    add("--join", action="store_true", help=text)
     add("--format", choices=FORMS, help="also write submission.csv; imc2023 is also for 2024")
     add(
         "--rotations",
@@ -121,7 +123,7 @@ def run(arguments: argparse.Namespace) -> int:
     root = arguments.images
     out = arguments.out
     work_dir = out / WORK
-    datasets = read_folder(root)
+    datasets = read_folder(root, join=arguments.join)
     files = [file for found in datasets.values() for file in found]
     # All inputs are read and checked before OUT is touched.
     require_perspective(files)

@@ -72,7 +72,8 @@ def choose_pairs(
     ends: dict[str, Sequence[Ends]] = {}
     near: dict[Path, list[Path]] = {}
     for name, files in datasets.items():
-        ends[name] = [two for two in listed or () if two[0].parent == files[0].parent]
+        inside = set(files)
+        ends[name] = [two for two in listed or () if two[0] in inside]
         is_large = listed is None and len(files) > MAX_IMAGES
         # Only images with partners can be compared in several orientations.
         may_lie = rotations and (bool(ends[name]) if listed else len(files) > 1)

@@ -51,7 +51,8 @@ def read_folder(root: Path, *, join: bool = False) -> Datasets:
     if all(len(files) < 2 for files in datasets.values()):
         name = next(iter(datasets.values()))[0].name
         raise UserError(f"{root} has a single image, {name}: matching needs two")
-    return dict(sorted(datasets.items()))
+    # Joined, the images of all folders have one order.
+    return {name: sorted(files) for name, files in sorted(datasets.items())}
 
 
 @dataclass
@@ -207,7 +208,8 @@ def read_pair_list(path: Path, root: Path, datasets: Datasets) -> list[Ends]:
 
     Raises :class:`UserError` for a line that does not name two images of one dataset.
     """
-    known = {file for files in datasets.values() for file in files}
+    # The dataset of each image
+    known = {file: name for name, files in datasets.items() for file in files}
     found = []
     for number, line in enumerate(read_text(path).splitlines(), start=1):
         text = line.strip()
@@ -218,8 +220,8 @@ def read_pair_list(path: Path, root: Path, datasets: Datasets) -> list[Ends]:
             for gap in re.finditer(r"\s+", text)
         )
         # Names may have blanks, so each blank may be the border.
-        ends = [sorted(two) for two in ways if known.issuperset(two)]
-        if len(ends) != 1 or ends[0][0] == ends[0][1] or ends[0][0].parent != ends[0][1].parent:
+        ends = [sorted(two) for two in ways if known.keys() >= set(two)]
+        if len(ends) != 1 or ends[0][0] == ends[0][1] or known[ends[0][0]] != known[ends[0][1]]:
             raise UserError(
                 f"{path}, line {number}: expected two images of one dataset of {root}, found {line!r}"
             )

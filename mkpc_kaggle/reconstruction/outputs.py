@@ -82,7 +82,9 @@ def submission_rows(form: str, cameras: Cameras, root: Path) -> Iterator[Sequenc
     for dataset, found in cameras.items():
         folder = _unused(root.resolve().name, names) if dataset == "." else dataset
         parts = folder.split("/")  # dataset/scene/images in 2023, dataset/images in 2024
-        for name, placed in ((file.name, placed) for file, placed in found.items()):
+        for file, placed in found.items():
+            # The file's name, except in a dataset of several folders
+            name = file.relative_to(root / dataset).as_posix()
             pose = (joined(placed[1].camera.R), joined(placed[1].camera.t)) if placed else NO_POSE
             if of_2025:
                 number = _unused(f"{folder}_{name}", ids)

@@ -92,9 +92,8 @@ def reconstruct_folder(
     initially with no cameras, then after each scene.
     """
     assembly = replace(assembly, recipe=for_cameras(assembly.recipe))
-    with opened_engine(
-        assembly, session, [files[0].parent for files in datasets.values()]
-    ) as engine:
+    folders = dict.fromkeys(file.parent for files in datasets.values() for file in files)
+    with opened_engine(assembly, session, folders) as engine:
         standing: list[Cameras] = [{name: dict.fromkeys(files) for name, files in datasets.items()}]
         # The tables of an earlier run are worth more than empty ones.
         if not (out / "cameras.csv").exists():

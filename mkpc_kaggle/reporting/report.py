@@ -179,7 +179,7 @@ def _scene_section(log: RunLog, pairs: Sequence[Pair], *, is_drawn: bool) -> dic
 
     def read_in(batch: str) -> Reader:
         files = [file for pair in pairs if pair.group == batch for file in pair.images]
-        return reader_of({file.name: file for file in files})
+        return reader_of({str(file): file for file in files})
 
     # Rows whose F is not the scene's have a reason, such as images without a camera.
     choices = Counter(str(record.scene.reason) for record in log.records if record.scene)
@@ -323,12 +323,20 @@ def _views(
 
 
 def reader_of(paths: Mapping[str, Path]) -> Reader:
-    """Return a reader of images by their file names; an image without a path is unknown."""
+    """Return a reader of images by the ends of their paths; an image without a path is unknown.
+
+    ``paths`` has the file to read for each original path.
+    """
+    keys: dict[str, list[str]] = {}
+    for key in paths:
+        keys.setdefault(Path(key).name, []).append(key)
 
     def read(name: str) -> Image | None:
-        # A scene names its images by file names, or by paths below the folder.
-        path = paths.get(Path(name).name)
-        return None if path is None else picture_at(str(path))
+        # A scene names its images by file names, or by paths below the folder. Photographs in
+        # several folders may have one name.
+        alike = keys.get(Path(name).name, [])
+        fitting = [key for key in alike if f"/{key}".endswith(f"/{name}")] or alike
+        return picture_at(str(paths[fitting[0]])) if fitting else None
 
     return read
 
@@ -351,34 +359,35 @@ def show_run(work_dir: Path, root: Path | None = None) -> View:
             if record.pair.group == batch
             for file in (record.pair.file0, record.pair.file1)
         }
-        return reader_of({Path(file).name: root / file for file in files})
+        return reader_of({file: root / file for file in files})
 
     # A notebook runs scripts, so there are no pictures in place of the view.
     return view_of(_views(log, read_in, is_drawn=False))
 
 
 def linked_images(out: Path, batch: str) -> dict[str, Path]:
-    """Return the images of a dataset in the results of ``reconstruct``, by file name."""
+    """Return the images of a dataset in the results of ``reconstruct``, by original path."""
     # The images that lie directly in DIR have their folder in OUT itself.
     for folder in (out / batch / IMAGES, out / IMAGES):
         if folder.is_dir():
             # A link may have another name than the photograph: names of links are ASCII.
             return {
-                (file.readlink() if file.is_symlink() else file).name: file
+                str(file.readlink() if file.is_symlink() else file): file
                 for file in folder.iterdir()
             }
     return {}
 
 
 def partners_of(records: Iterable[PairRecord]) -> dict[str, list[tuple[str, int, int]]]:
-    """Return the partners of each image: name, inliers and matches of the pair, the most inliers
-    first.
+    """Return the partners of each image, by its path below the images: name, inliers and matches of
+    the pair, the most inliers first.
     """
     partners: dict[str, list[tuple[str, int, int]]] = {}
     for record in records:
         # A pair counts for both of its images.
-        for name, other in (record.pair.names, record.pair.names[::-1]):
-            partners.setdefault(name, []).append((other, record.inliers, record.matches))
+        files = (record.pair.file0, record.pair.file1)
+        for file, other in zip(files, record.pair.names[::-1], strict=True):
+            partners.setdefault(file, []).append((other, record.inliers, record.matches))
     return {name: sorted(found, key=lambda each: -each[1]) for name, found in partners.items()}
 
 

@@ -129,14 +129,14 @@ def _scene_problems(scene: SceneRecord, log: RunLog) -> Iterator[str]:
         yield f"{where}the cameras are not to be trusted: {HARDLY_MOVED}"
         return
     cameras = [found.image for model in scene.models for found in model.images]
-    known = {Path(image.name).name for image in cameras}
+    known = {image.name for image in cameras}
     # Identical files share the camera of one of them.
     contents = {image.digest for image in cameras}
     records = [record for record in log.records if record.pair.group == scene.batch]
     # The record of a scene has no list of its images without a camera; its pairs name them.
     files = {file for record in records for file in (record.pair.file0, record.pair.file1)}
-    names = {Path(file).name for file in files if log.digests.get(file) not in contents}
-    missing = sorted(names - known)
+    lost = {file for file in files - known if log.digests.get(file) not in contents}
+    missing = sorted(Path(file).name for file in lost)
     if missing:
         yield f"{where}no camera for {named(missing)}: add photographs between these and the others"
     if len(scene.models) > 1:

@@ -246,7 +246,7 @@ def _camera(
         "pixels": [*size],
         "points": found.points,
         "sigmas": [float(f"{value:.2g}") for value in sigmas] or None,
-        "pairs": [*partners.get(Path(name).name, ())],
+        "pairs": [*(partners.get(name) or partners.get(Path(name).name, ()))],
         "thumbnail": _thumbnail(pictures[name]) if name in pictures else "",
     }
 

@@ -289,7 +289,7 @@ def test_a_photograph_with_an_accent_has_an_ascii_name_for_other_programs(tmp_pa
     original = pycolmap.Reconstruction(tmp_path / "out" / "models" / "0")
     assert name in {image.name for image in original.images.values()}
     pictures = linked_images(tmp_path / "out", "images")
-    assert pictures[name].name == "00e.png"
+    assert pictures[str(root / name)].name == "00e.png"
 
 
 def test_points_of_webp_photographs_have_their_colours(tmp_path):
