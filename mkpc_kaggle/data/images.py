@@ -7,7 +7,7 @@ pixels if the photograph was reduced after it was taken.
 
 import hashlib
 from collections import OrderedDict
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -73,6 +73,8 @@ class Image:
     version: str = ""  # :func:`content_digest` of its file
     focal: float = 0.0  # in pixels, from EXIF; 0: unknown
     turns: int = 0  # counter-clockwise quarter turns, from EXIF
+    # Size in bytes and time of change in nanoseconds of its file before it was read; 0: not noted
+    file: tuple[int, int] = (0, 0)
 
     @classmethod
     def of_array(cls, array: Pixels) -> "Image":
@@ -94,6 +96,11 @@ class Image:
     @property
     def size(self) -> Size:
         return Size(self.pixels.shape[1], self.pixels.shape[0])
+
+    @property
+    def nbytes(self) -> int:
+        """The memory of its pixels and of its gray values, in bytes."""
+        return self.pixels.nbytes + self.pixels[..., 0].size
 
     @cached_property
     def gray(self) -> Pixels:
@@ -294,29 +301,60 @@ class ByteCache:
 class ImageStore:
     """Images by path, decoded in the background; the most recently used are cached.
 
-    Not thread-safe.
+    Besides the cache, only the images of the latest :meth:`prefetch` wait, and the one that is being
+    decoded. ``read`` decodes a file. Not thread-safe.
     """
 
-    def __init__(self, limit_bytes: int = 512 << 20) -> None:
+    def __init__(
+        self,
+        limit_bytes: int = 512 << 20,
+        read: Callable[[Path], Image | Unreadable] | None = None,
+    ) -> None:
+        self._read = read or read_image
         self._images = ByteCache(limit_bytes)
         self._pending: dict[Path, Future[Image | Unreadable]] = {}
         self._decoder = ThreadPoolExecutor(1, thread_name_prefix="decode")
 
     def prefetch(self, paths: Iterable[Path]) -> None:
-        """Start decoding the images that are neither cached nor being decoded."""
-        for path in paths:
-            if self._images.get(path) is None and path not in self._pending:
-                self._pending[path] = self._decoder.submit(read_image, path)
+        """Start decoding the images that are neither cached nor being decoded.
+
+        Images of former calls that nobody asked for are cached, or not decoded at all: with several
+        workers, another one may have got their pairs.
+        """
+        wanted = dict.fromkeys(paths)
+        for path in self._pending.keys() - wanted:
+            future = self._pending[path]
+            if future.cancel():
+                del self._pending[path]
+            # The image that is being decoded waits for the next call.
+            elif future.done():
+                del self._pending[path]
+                self._keep(path, future.result())
+        for path in wanted:
+            self._start(path)
 
     def get(self, path: Path) -> Image | Unreadable:
         """Wait until the image is decoded, then return it."""
-        self.prefetch([path])
+        self._start(path)
         image: Image | Unreadable | None = self._images.get(path)
         if image is None:
             image = self._pending.pop(path).result()
-        if isinstance(image, Image):
-            self._images.put(path, image, image.pixels.nbytes)
+            self._keep(path, image)
         return image
+
+    def _start(self, path: Path) -> None:
+        if self._images.get(path) is None and path not in self._pending:
+            self._pending[path] = self._decoder.submit(self._read, path)
+
+    def _keep(self, path: Path, image: Image | Unreadable) -> None:
+        if isinstance(image, Image):
+            self._images.put(path, image, image.nbytes)
+
+    @property
+    def nbytes(self) -> int:
+        """The memory of the images that are cached, or decoded and waiting, in bytes."""
+        waiting = [future.result() for future in self._pending.values() if future.done()]
+        return self._images.bytes + sum(each.nbytes for each in waiting if isinstance(each, Image))
 
     def close(self) -> None:
         """Stop decoding: images that wait are dropped, and the one in work is not waited for."""

@@ -113,6 +113,8 @@ class RaySite(Site):
         make = partial(make_alike, make, __version__, self._needed)
 
         def worker() -> RayWorker:
+            # Workers that ended long ago would stay in memory.
+            self._workers = [each for each in self._workers if each.thread.is_alive()]
             self._workers.append(
                 # Ray reserves a CPU for each actor by default, also for an actor with a GPU.
                 RayWorker(name, make, self.ring, self._ray, {"num_cpus": 0, **where})

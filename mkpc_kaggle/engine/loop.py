@@ -130,7 +130,10 @@ class Engine:
         self._looking_since = self.budget.clock()
         self._loop()
         self._features.pending = {}  # the time is over, or the run was interrupted
-        return self._features.found
+        # Descriptors of many photographs: they are the caller's from now on.
+        found = self._features.found
+        self._features.found = {}
+        return found
 
     def ask(self, request: Request, share: float = 1.0) -> None:
         """Compute the missing results of a request. No job begins after ``share`` of the remaining

@@ -79,10 +79,18 @@ class Matching:
                 self.lose(job, Failure(Cause.RAISED, f"the store cannot be read: {error}"))
                 return None
             if self._run.forget_lost({key for _, keys in inputs for key in keys} - data.keys()):
-                self._end(job)
+                if job.is_check:
+                    state.tries.discard_proven(job.items)
+                else:
+                    self._end(job)
                 return None
             known = [self._points_of(index, keys, data) for index, keys in inputs]
-        upcoming = [] if job.is_check else upcoming_pairs(state, job, minibatch)
+        upcoming: list[int] = []
+        if not job.is_check:
+            # The others have these units, or another worker matches them.
+            numbers = [state.number_of[unit.name] for unit in job.units]
+            missing = state.missing[:, numbers].any(1) & ~state.matching
+            upcoming = upcoming_pairs(state, job, minibatch, missing)
         return replace(
             job,
             pairs=tuple(state.pairs[index] for index in job.indices),

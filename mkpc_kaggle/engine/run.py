@@ -23,6 +23,9 @@ from mkpc_kaggle.errors import plural
 HANG_FACTOR = 30.0
 
 
+MAX_FAULTS = 1000  # of a run, with different texts
+
+
 class EventLog:
     """The events and counts of this program, for its final report."""
 
@@ -46,6 +49,8 @@ class EventLog:
 
     def fault(self, text: str) -> None:
         """Record a fault, once for each text: a broken disk would fill the store with them."""
+        if len(self.faults) == MAX_FAULTS:
+            text = "further faults are not listed"
         if text not in self.faults:
             self.faults.append(text)
             self.note(EventKind.FAULT, text)

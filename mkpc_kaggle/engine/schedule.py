@@ -341,15 +341,22 @@ def unlike_job(view: View, wanted: NDArray[Any], lost: Sequence[frozenset[Item]]
     return MatchJob(phase, (index,), (unit,), (view.costs.mean(unit.name),), view.left)
 
 
-def upcoming_pairs(state: State, job: MatchJob, count: int) -> list[int]:
-    """Return the pairs that will probably be matched after a job."""
+def upcoming_pairs(
+    state: State, job: MatchJob, count: int, open_pairs: Mask | None = None
+) -> list[int]:
+    """Return the pairs that will probably be matched after a job.
+
+    ``open_pairs`` (N,) are the ones that may be; default: all.
+    """
     # In the last phase, the order depends on inliers that come meanwhile.
     if job.phase is Phase.FILL:
         return []
     last = job.indices[-1]
     rank = int(np.flatnonzero(state.order == last)[0]) + 1
-    following: list[int] = state.order[rank : rank + count].tolist()
-    return following
+    following = state.order[rank:]
+    if open_pairs is not None:
+        following = following[open_pairs[following]]
+    return [int(index) for index in following[:count]]
 
 
 # Estimates and scenes

@@ -8,7 +8,7 @@ per CPU. A worker that is a thread of the user's process leaves the process's li
 """
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 
 from mkpc_kaggle.cores import available_cores
-from mkpc_kaggle.data.images import Image, ImageStore
+from mkpc_kaggle.data.images import Image, ImageStore, Unreadable, read_image
 from mkpc_kaggle.engine.image_files import file_state
 from mkpc_kaggle.engine.jobs import (
     Answer,
@@ -103,9 +103,7 @@ class MatchRunner:
         self._pipeline = make_pipeline()
         self._pipeline.load()
         self.refused = self._pipeline.unloadable
-        self._images = ImageStore()
-        # As of the first look at each file, in this worker
-        self._files: dict[Path, tuple[int, int]] = {}
+        self._images = ImageStore(read=read_noted)
 
     def __call__(self, job: Job) -> tuple[Outcome, ...]:
         """Match the pairs of a job with each unit that is expected to end in time."""
@@ -117,22 +115,14 @@ class MatchRunner:
         def may_start(unit: Unit, pairs: int) -> bool:
             return time.monotonic() + pairs * expected[unit] < deadline
 
-        self._look_at(path for pair in job.pairs for path in pair.images)
         opened = [self._open(job, number) for number in range(len(job.pairs))]
         # Decoding the next pairs' images takes place while a GPU matches.
-        self._look_at(job.upcoming)
         self._images.prefetch(job.upcoming)
         # An unreadable image fails its pair alone, not the minibatch.
         readable = [pair for pair in opened if not pair.failure]
         matched = iter(self._pipeline.match(readable, job.units, may_start))
         done = [pair if pair.failure else next(matched) for pair in opened]
         return tuple(self._outcome(job, number, pair) for number, pair in enumerate(done))
-
-    def _look_at(self, paths: Iterable[Path]) -> None:
-        """Note size and time of files before they are read, so that a later change is never missed."""
-        for path in paths:
-            if path not in self._files:
-                self._files[path] = file_state(path)
 
     def _open(self, job: MatchJob, number: int) -> PairMatch:
         """Return a pair with its images; ``failure`` names an unreadable image."""
@@ -162,13 +152,21 @@ class MatchRunner:
         )
         return Outcome(
             (image0, image1),
-            tuple(self._files[path] for path in job.pairs[number].images),
+            tuple(image.file for image in pair.images),
             pair.results[len(job.known[number]) :],  # without the known points of stage 1
             pair.regions,
             "",
             pair.decode_seconds,
             pair.cluster_seconds,
         )
+
+
+def read_noted(path: Path) -> Image | Unreadable:
+    """Decode an image with its file's size and time of change."""
+    # Before it is read, so that a later change is never missed.
+    file = file_state(path)
+    image = read_image(path)
+    return replace(image, file=file) if isinstance(image, Image) else image
 
 
 def light_runner(*, in_process: bool = True) -> Runner:

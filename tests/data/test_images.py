@@ -130,15 +130,43 @@ def test_prefetched_images_are_decoded_in_the_background(monkeypatch):
 
 
 def test_a_file_is_decoded_once_unless_it_made_room_or_is_unreadable(decoded):
-    with closing(ImageStore(limit_bytes=900)) as store:  # three images
+    with closing(ImageStore(limit_bytes=1200)) as store:  # three images with gray values
         store.prefetch([Path("a"), Path("b"), Path("a")])
         for name in ("a", "b", "c", "a", "d", "a", "b", "bad", "bad"):
             store.get(Path(name))
     assert [path.name for path in decoded] == ["a", "b", "c", "d", "b", "bad", "bad"]
     # An image above the limit is handed out all the same
-    with closing(ImageStore(limit_bytes=299)) as small:
+    with closing(ImageStore(limit_bytes=399)) as small:
         assert [small.get(Path("a")).name for _ in range(2)] == ["a", "a"]
     assert len(decoded) == 9
+
+
+def test_images_that_nobody_asks_for_are_dropped_or_counted_in_the_limit(decoded):
+    # As with two workers: each prefetches pairs that the other one gets.
+    size = Image("a", np.zeros((10, 10, 3), np.uint8)).nbytes
+    with closing(ImageStore(limit_bytes=5 * size)) as store:
+        for number in range(0, 400, 8):
+            store.get(Path(str(number)))
+            store.prefetch([Path(str(number + 8 * k)) for k in range(1, 4)])
+            store.prefetch([Path(f"other {number + k}") for k in range(4)])
+            assert store.nbytes <= (5 + 4 + 1) * size, (
+                "the cache, the latest images, and one in work"
+            )
+        # Images in the cache are not decoded again.
+        latest = decoded[-1]
+        store.get(latest)
+        store.get(latest)
+    assert decoded.count(latest) == 1
+
+
+def test_an_image_that_was_prefetched_is_handed_out_even_if_others_were_asked_for_meanwhile(
+    decoded,
+):
+    with closing(ImageStore()) as store:
+        store.prefetch([Path("a"), Path("b")])
+        store.prefetch([Path("c")])
+        assert [store.get(Path(name)).name for name in "abc"] == ["a", "b", "c"]
+    assert max(decoded.count(Path(name)) for name in "abc") == 1
 
 
 def test_a_cache_drops_the_entries_that_were_used_least_recently():

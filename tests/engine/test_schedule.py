@@ -29,7 +29,15 @@ from mkpc_kaggle.engine.keys import Keys
 from mkpc_kaggle.engine.loop import Engine
 from mkpc_kaggle.engine.reconstructing import scene_failures
 from mkpc_kaggle.engine.request import Ending, Request
-from mkpc_kaggle.engine.schedule import Crew, NextWork, View, next_work, outlook, prefix_that_fits
+from mkpc_kaggle.engine.schedule import (
+    Crew,
+    NextWork,
+    View,
+    next_work,
+    outlook,
+    prefix_that_fits,
+    upcoming_pairs,
+)
 from mkpc_kaggle.engine.state import State
 from mkpc_kaggle.engine.store import Kind, Store
 from mkpc_kaggle.recipe import SceneConfig, Unit
@@ -167,6 +175,16 @@ def test_near_the_end_a_minibatch_gets_as_small_as_the_time_that_is_left():
         job = run.next_work(view_of(run).stop - left).match
         sizes.append(len(job.indices))
     assert sizes == [8, 8, 8, 5, 1]
+
+
+def test_upcoming_pairs_are_those_that_may_be_next():
+    run = Run(9)
+    job = MatchJob(Phase.SWEEP, (0, 1), (SWEEP,), (1.0,), 1.0)
+    assert upcoming_pairs(run.state, job, 3) == [2, 3, 4]
+    missing = np.ones(9, bool)
+    missing[[0, 3, 4, 6]] = False
+    assert upcoming_pairs(run.state, job, 3, missing) == [2, 5, 7]
+    assert upcoming_pairs(run.state, replace(job, phase=Phase.FILL), 3) == []
 
 
 def test_a_unit_that_was_lost_before_is_alone_in_its_job():
