@@ -11,7 +11,8 @@ its gain over exact search with an interval over images. MAGSAC depends on the o
 so a pair's accuracy is the mean over random orders, the same number for each search.
 
 With `--images`, draws of that number of images are reconstructed as `reconstruct` does it, and rows
-have the mAA of F from cameras; gains by draw follow. With `--seconds`, the first adjacent images
+have the mAA of F from cameras; gains by draw follow. One row has the exact matches in another order:
+its gain is chance. With `--seconds`, the first adjacent images
 are matched with these numbers of keypoints, and the output has milliseconds alone.
 """
 
@@ -43,7 +44,6 @@ from mkpc_kaggle.evaluation.compare import paired_difference
 from mkpc_kaggle.evaluation.validate import error_of
 from mkpc_kaggle.geometry.coordinates import Box, Matrix3, Size, View
 from mkpc_kaggle.geometry.focal_prior import FocalPrior, estimate_with_prior
-from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.metrics import pair_accuracy
 from mkpc_kaggle.matchers import lists, neighbours
 from mkpc_kaggle.matchers.adapters.sift import SiftMatcher, SiftOptions
@@ -54,6 +54,7 @@ from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
 from mkpc_kaggle.recipe import Unit, load_recipe
 
 EXACT = "exact"
+CONTROL = "exact, in another order"
 RECIPE = load_recipe("classical")
 OPTIONS = SiftOptions(**RECIPE.matchers["sift"])
 MATCHER = SiftMatcher(OPTIONS, "cpu")
@@ -128,13 +129,11 @@ def accuracy(known: Known, scene: TrainScene, orders: int) -> float:
     """Return the mean accuracy of F from a pair's matches over random orders of the matches."""
     size0, size1 = known.found.sizes
     priors = (FocalPrior.of_image(size0), FocalPrior.of_image(size1))
-    matches = known.found.matches
     found = []
     for seed in range(orders):
-        order = np.random.default_rng(seed).permutation(len(matches))
-        shuffled = Matches(matches.points0[order], matches.points1[order], matches.scores[order])
+        matches = shuffled(known, seed).found.matches
         assert RECIPE.focal is not None
-        made = estimate_with_prior(shuffled, priors, RECIPE.magsac, RECIPE.focal)
+        made = estimate_with_prior(matches, priors, RECIPE.magsac, RECIPE.focal)
         error = error_of(made.matrix if made.ok else None, known.true, scene)
         found.append(pair_accuracy(error))
     return mean(found)
@@ -165,9 +164,11 @@ def scene_draws(
         chosen, inside = drawn(stubs, images, 1.0, seed)
         for stub in inside:
             if stub.true.pair.id not in matched:  # in no former draw
-                matched[stub.true.pair.id] = searches.of_pair(stub.true)
+                found = searches.of_pair(stub.true)
+                found[CONTROL] = shuffled(found[EXACT])
+                matched[stub.true.pair.id] = found
         scores = {}
-        for name in searches.names:
+        for name in (EXACT, CONTROL, *list(searches.names)[1:]):
             pairs = [matched[stub.true.pair.id][name] for stub in chosen]
             every = [matched[stub.true.pair.id][name] for stub in inside]
             scores[f"{SCENE}, {name}"] = score(_cameras, pairs, every, scene)
@@ -175,6 +176,14 @@ def scene_draws(
         shown = ", ".join(f"{name} {mean(each.accuracies):.4f}" for name, each in scores.items())
         print(f"{scene.name}, draw {seed}: {shown}", flush=True)
     return draws
+
+
+def shuffled(known: Known, seed: int = 0) -> Known:
+    """Return a pair with its matches in a random order."""
+    (result,) = known.found.results
+    order = np.random.default_rng(seed).permutation(len(result.matches))
+    results = (replace(result, matches=result.matches[order]),)
+    return replace(known, found=replace(known.found, results=results))
 
 
 def _cameras(pairs: Sequence[Known], every: Sequence[Known]) -> list[Matrix3 | None]:
