@@ -67,7 +67,8 @@ made are removed. Other files remain.
 If images were added or removed since the last complete run, the cameras keep its coordinates; with --fresh they
 do not.
 
-All pairs of up to 100 images are matched; in larger datasets, each image is matched with the 20 most similar.
+All pairs of up to 40 images are matched. Of up to 200, pairs whose largest keypoints do not match are left out,
+unless most pairs have matches. In larger datasets, each image is matched with the 20 most similar.
 Without weights, recipe auto runs one unit of RootSIFT here, and enlarges no image: three units cost three times
 as much, and their cameras are hardly better.
 

@@ -4,34 +4,43 @@ The orientation of an image is found by matching four rotations of the image wit
 images.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import combinations
 from pathlib import Path
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine.console import warn
+from mkpc_kaggle.engine.console import say, warn
 from mkpc_kaggle.engine.keys import digest
 from mkpc_kaggle.engine.loop import Engine
 from mkpc_kaggle.engine.session import Session, request_of
 from mkpc_kaggle.engine.state import name_below
 from mkpc_kaggle.engine.store import Source
+from mkpc_kaggle.errors import plural
 from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.reconstruction.folder import Datasets, Ends, batch_names
 from mkpc_kaggle.scene.likeness import (
     FEATURE_SETTINGS,
+    LARGEST_SETTINGS,
+    ONE_PLACE,
     PARTNERS,
+    SAMPLED_PAIRS,
     Partners,
+    largest_features,
     local_features,
     most_alike,
+    overlapping,
     shortlist,
 )
 
 IMAGES_AT_A_TIME = 100  # whose features are in memory
-MAX_IMAGES = 100  # with more, each image has a shortlist instead of all pairs
+# With more images, only pairs that may overlap are matched, unless most do; with fewer, all pairs
+# take less time than a mistake costs.
+MIN_FILTERED = 40
+MAX_IMAGES = 200  # with more, each image has a shortlist instead of all pairs
 # Of the time left, for trials of unturned images, and then for trials of turned images
 TRIAL_SHARE = 0.25
 TURN_PARTNERS = 4  # similar images per image, to find its orientation
@@ -64,8 +73,11 @@ def choose_pairs(
     listed: Sequence[Ends] | None,
     rotations: bool,
 ) -> list[Pair]:
-    """Return the pairs of all datasets: as ``listed``, all pairs of up to ``MAX_IMAGES`` images, or
-    a shortlist.
+    """Return the pairs of all datasets: as ``listed``, or a choice that depends on the number of
+    images.
+
+    Up to ``MIN_FILTERED`` images, these are all pairs; up to ``MAX_IMAGES``, the pairs that may
+    overlap; with more, a shortlist.
 
     With ``rotations``, images are turned by :func:`find_turns`.
     """
@@ -84,7 +96,12 @@ def choose_pairs(
                 a: [files[j] for j in partners[i][:TURN_PARTNERS]] for i, a in enumerate(files)
             }
         if listed is None:
-            indices = shortlist(partners) if is_large else combinations(range(len(files)), 2)
+            if is_large:
+                indices = shortlist(partners)
+            elif len(files) > MIN_FILTERED:
+                indices = find_overlaps(engine, root, files)
+            else:
+                indices = list(combinations(range(len(files)), 2))
             ends[name] = [(files[i], files[j]) for i, j in indices]
     batches = batch_names(root, datasets)
     names = {}
@@ -114,22 +131,10 @@ def find_partners(engine: Engine, root: Path, files: Sequence[Path], count: int)
     """Return the indices of the ``count`` images most similar to each image; empty if the
     comparison failed.
     """
-    # By contents, so that a folder that moved is not compared again
-    names = [name_below(str(root), str(file)) for file in files]
-    found = engine.digest_files(dict(zip(names, files, strict=True)))
-    digests = [found.get(name, "") for name in names]
-    keys = [features_key(each) for each in digests]
-    key = digest([digests, FEATURE_SETTINGS, count])
-    known = engine.known(key)
-    if known is None:
-        # Features first: they stay if the comparison is interrupted.
-        missing = {}
-        for name, file in zip(names, files, strict=True):
-            if name in found:
-                missing[features_key(found[name])] = partial(local_features, file)
-        engine.look(missing)
-        source = engine.store.source(keys)
-        known = engine.look({key: partial(compare, source, keys, count)}).get(key)
+    compared = partial(compare, count=count)
+    known = compare_images(
+        engine, root, files, FEATURE_SETTINGS, local_features, compared, [FEATURE_SETTINGS, count]
+    )
     # The time is over, or the comparison failed twice. Then no image has partners.
     if known is None:
         warn(f"the images of {files[0].parent} were not compared")
@@ -137,9 +142,65 @@ def find_partners(engine: Engine, root: Path, files: Sequence[Path], count: int)
     return partners
 
 
-def features_key(content: str) -> str:
+def find_overlaps(engine: Engine, root: Path, files: Sequence[Path]) -> list[tuple[int, int]]:
+    """Return the indices of pairs that may overlap, all pairs if the comparison failed."""
+    settings = [LARGEST_SETTINGS, ONE_PLACE, SAMPLED_PAIRS]
+    known = compare_images(
+        engine, root, files, LARGEST_SETTINGS, largest_features, overlaps, settings
+    )
+    every = len(files) * (len(files) - 1) // 2
+    if known is None:
+        warn(f"the images of {files[0].parent} were not compared; all pairs are matched")
+        return list(combinations(range(len(files)), 2))
+    if len(known) < every:
+        say(f"{files[0].parent}: {len(known)} of {plural(every, 'pair')} may overlap")
+    return [(first, second) for first, second in known]
+
+
+def compare_images(
+    engine: Engine,
+    root: Path,
+    files: Sequence[Path],
+    settings: str,
+    features_of: Callable[[Path], bytes],
+    compare_features: Callable[[Source, Sequence[str]], Any],
+    result_settings: Sequence[Any],
+) -> Any:
+    """Return what ``compare_features`` computes from the features of all images; ``None`` if that
+    failed.
+
+    ``settings`` are those of one image's features, ``result_settings`` those of the result. Both
+    are in the keys of the stored results.
+    """
+    # By contents, so that a folder that moved is not compared again
+    names = [name_below(str(root), str(file)) for file in files]
+    found = engine.digest_files(dict(zip(names, files, strict=True)))
+    digests = [found.get(name, "") for name in names]
+    keys = [features_key(each, settings) for each in digests]
+    key = digest([digests, *result_settings])
+    known = engine.known(key)
+    if known is None:
+        # Features first: they stay if the comparison is interrupted.
+        missing = {}
+        for name, file in zip(names, files, strict=True):
+            if name in found:
+                missing[features_key(found[name], settings)] = partial(features_of, file)
+        engine.look(missing)
+        source = engine.store.source(keys)
+        known = engine.look({key: partial(compare_features, source, keys)}).get(key)
+    return known
+
+
+def features_key(content: str, settings: str = FEATURE_SETTINGS) -> str:
     """Return the key of an image's features."""
-    return digest([FEATURE_SETTINGS, content])
+    return digest([settings, content])
+
+
+def overlaps(source: Source, keys: Sequence[str]) -> list[tuple[int, int]]:
+    """Return :func:`overlapping` for the images with these features in a store."""
+    # Up to ``MAX_IMAGES`` times 128 kB.
+    found = source.data(keys)
+    return overlapping([found.get(key, b"") for key in keys])
 
 
 def compare(source: Source, keys: Sequence[str], count: int) -> Partners:

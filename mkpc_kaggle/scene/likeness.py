@@ -1,5 +1,7 @@
-"""Similarity of images by VLAD descriptors of RootSIFT, to choose each image's partners in a large
-folder.
+"""Pairs of images that may overlap, by RootSIFT: to match fewer pairs of a folder.
+
+In a folder of different places, the few largest keypoints of two images tell whether they may
+overlap. In a large folder, VLAD descriptors give each image's most similar images.
 
 All recipes use RootSIFT: it needs no weights, works with dense matchers, and does not depend on the
 orientation of an image. Source: Jegou et al. 2010; normalisation by Arandjelovic and Zisserman
@@ -7,16 +9,20 @@ orientation of an image. Source: Jegou et al. 2010; normalisation by Arandjelovi
 """
 
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2, vq
 
 from mkpc_kaggle.data.images import Image, read_image
 from mkpc_kaggle.matchers.adapters.sift import root_sift
+from mkpc_kaggle.matchers.neighbours import mutual_neighbours
 
 Partners = list[list[int]]  # of each image, as indices of images
 
@@ -26,6 +32,20 @@ SIDE_PX = 640
 FEATURES = 1000  # descriptors per image
 MAX_TRAINING = 50_000  # descriptors to cluster into words
 FEATURE_SETTINGS = f"rootsift {SIDE_PX} {FEATURES} 1"  # ends with the version of the algorithm
+# Of pairs with a covisibility of 0.1 to 0.3, 0.98 to 1.00 have this number of matches, and all pairs
+# above; half of the pairs of different places have it or less (`python -m benchmarks.shortlists`).
+MIN_LARGE_MATCHES = 4
+LARGEST = 1000  # keypoints per image
+LARGEST_SIDE_PX = 1024  # at 640, a pair of fountain_p11 with a covisibility above 0.3 is left out
+DETECTED = 4000  # the strongest keypoints, of which these are the largest
+CONTRAST = 0.02
+RATIO = 0.8
+LARGEST_SETTINGS = (
+    f"largest {LARGEST_SIDE_PX} {LARGEST} {DETECTED} {CONTRAST} {RATIO} {MIN_LARGE_MATCHES} 1"
+)
+# A folder is of one place, and all pairs are matched, if this share of the sampled pairs may overlap.
+ONE_PLACE = 0.6
+SAMPLED_PAIRS = 50
 SCALE = np.float32(255)  # of descriptors stored as bytes
 
 
@@ -40,16 +60,68 @@ def local_features(path: Path) -> bytes:
     """Return the RootSIFT descriptors of an image, 128 bytes each; empty if the image is
     unreadable.
     """
-    image = read_image(path)
-    found = None
-    # An unreadable image is reported when its pairs are matched.
-    if isinstance(image, Image):
-        scale = SIDE_PX / max(image.size)
-        gray = cv2.resize(image.gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-        _, found = cv2.SIFT_create(FEATURES).detectAndCompute(gray, None)  # type: ignore[attr-defined]
+    detector = cv2.SIFT_create(FEATURES)  # type: ignore[attr-defined]
+    _, found = _detected(path, detector, SIDE_PX)
+    return _packed(found)
+
+
+def largest_features(path: Path) -> bytes:
+    """Return the RootSIFT descriptors of an image's largest keypoints, as :func:`local_features`.
+
+    Large keypoints are few, and are seen from any distance, so a small sample of them has matches.
+    """
+    detector = cv2.SIFT_create(DETECTED, contrastThreshold=CONTRAST)  # type: ignore[attr-defined]
+    keypoints, found = _detected(path, detector, LARGEST_SIDE_PX)
     if found is None:
         return b""
-    scaled = SCALE * root_sift(found)
+    order = np.argsort([-keypoint.size for keypoint in keypoints], kind="stable")
+    return _packed(found[order[:LARGEST]])
+
+
+def overlapping(features: Sequence[bytes]) -> list[tuple[int, int]]:
+    """Return the pairs of images that may overlap, by their :func:`largest_features`.
+
+    These are all pairs if most of a random sample may overlap. An image without features is in all
+    of its pairs: the matcher reports what is wrong with it.
+    """
+    descriptors = [torch.from_numpy(_unpacked(each)) for each in features]
+    pairs = list(combinations(range(len(features)), 2))
+
+    def may_overlap(pair: tuple[int, int]) -> bool:
+        first, second = (descriptors[index] for index in pair)
+        if not len(first) or not len(second):
+            return True
+        found = mutual_neighbours(first, second, RATIO)
+        return len(found.index0) >= MIN_LARGE_MATCHES
+
+    order = np.random.default_rng(0).permutation(len(pairs))[:SAMPLED_PAIRS]
+    sample = [may_overlap(pairs[index]) for index in order]
+    if np.mean(sample) >= ONE_PLACE:
+        return pairs
+    return [pair for pair in pairs if may_overlap(pair)]
+
+
+def _detected(
+    path: Path, detector: Any, side: int
+) -> tuple[Sequence[Any], NDArray[np.float32] | None]:
+    """Return the keypoints of an image with ``side`` pixels on its long side, and their descriptors
+    (K, 128) or ``None``.
+    """
+    image = read_image(path)
+    # An unreadable image is reported when its pairs are matched.
+    if not isinstance(image, Image):
+        return (), None
+    scale = side / max(image.size)
+    gray = cv2.resize(image.gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    keypoints, found = detector.detectAndCompute(gray, None)
+    return keypoints, found
+
+
+def _packed(descriptors: NDArray[np.float32] | None) -> bytes:
+    """Return RootSIFT of descriptors (K, 128) as bytes."""
+    if descriptors is None:
+        return b""
+    scaled = SCALE * root_sift(descriptors)
     return scaled.round().astype(np.uint8).tobytes()
 
 

@@ -38,11 +38,18 @@ from mkpc_kaggle.geometry.robust import RobustConfig
 from mkpc_kaggle.matchers.adapters.sift import SiftMatcher, SiftOptions
 from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.recipe import Recipe, Unit
+from mkpc_kaggle.reconstruction import choice
 from mkpc_kaggle.reconstruction.folder import read_folder, read_pair_list
 from mkpc_kaggle.reconstruction.layout import write_images
 from mkpc_kaggle.reconstruction.outputs import Cameras, camera_rows, submission_rows
 from mkpc_kaggle.reconstruction.run import FolderResult, for_cameras, reconstruct_folder
-from mkpc_kaggle.scene.likeness import local_features, most_alike, shortlist
+from mkpc_kaggle.scene.likeness import (
+    largest_features,
+    local_features,
+    most_alike,
+    overlapping,
+    shortlist,
+)
 from mkpc_kaggle.scene.reconstruction import RegisteredImage
 
 RECIPE = for_cameras(Recipe((Unit(1, "synthetic", SIZE.width),), magsac=QUICK))
@@ -439,6 +446,55 @@ def test_a_shortlist_has_images_that_are_alike_and_none_that_cannot_be_read(tmp_
     # Without features, images are in the order of their names.
     nothing = [local_features(tmp_path / f"{number}.png") for number in range(3)]
     assert shortlist(most_alike(lambda: nothing, 1)) == [(0, 1), (0, 2)]
+
+
+def test_images_of_different_places_are_in_no_pair_unless_they_have_no_features(tmp_path):
+    paths = photographs(tmp_path / "images", 4)
+    blank = np.zeros((340, 420, 3), np.uint8)
+    paths.append(tmp_path / "blank.png")
+    cv2.imwrite(str(paths[-1]), blank)
+    features = [*map(largest_features, paths)]
+    assert {len(each) % 128 for each in features} == {0}
+    pairs = overlapping(features)
+    # The matcher reports what is wrong with an image without features.
+    with_blank = {(number, 8) for number in range(8)}
+    within = {(i, j) for i, j in combinations(range(8), 2) if (i < 4) == (j < 4)}
+    assert with_blank | within <= set(pairs)
+    # 16 pairs are of different places; single ones pass.
+    assert len(pairs) < len(with_blank | within) + 5
+    assert pairs == sorted(set(pairs))
+    # If most images overlap, a mistake costs more than the pairs that it saves.
+    assert overlapping(features[:4]) == list(combinations(range(4), 2))
+    mostly_one_place = [features[0]] * 8 + [features[4]]
+    assert overlapping(mostly_one_place) == list(combinations(range(9), 2))
+
+
+def test_in_a_folder_of_many_images_only_pairs_that_may_overlap_are_matched(
+    tmp_path, monkeypatch, capsys
+):
+    monkeypatch.setattr(choice, "MIN_FILTERED", 5)
+    photographs(tmp_path / "images", 3)
+    result = run(tmp_path / "images", tmp_path / "out", UprightSift())
+    names = [[path.stem[:-1] for path in pair.images] for pair in result.pairs]
+    assert len(names) == 6
+    assert all(first == second for first, second in names)
+    assert "6 of 15 pairs may overlap" in capsys.readouterr().out
+    # Known from the journal
+    monkeypatch.setattr(choice, "largest_features", None)
+    again = run(tmp_path / "images", tmp_path / "out", UprightSift())
+    assert again.pairs == result.pairs
+
+
+def test_all_pairs_are_matched_if_the_images_cannot_be_compared(tmp_path, monkeypatch):
+    monkeypatch.setattr(choice, "MIN_FILTERED", 5)
+
+    def broken(*_: object) -> None:
+        raise RuntimeError("no")
+
+    monkeypatch.setattr(choice, "overlaps", broken)
+    photographs(tmp_path / "images", 3)
+    result = run(tmp_path / "images", tmp_path / "out", UprightSift())
+    assert len(result.pairs) == 15
 
 
 class UprightSift(SyntheticMatcher):
