@@ -32,8 +32,8 @@ SIDE_PX = 640
 FEATURES = 1000  # descriptors per image
 MAX_TRAINING = 50_000  # descriptors to cluster into words
 FEATURE_SETTINGS = f"rootsift {SIDE_PX} {FEATURES} 1"  # ends with the version of the algorithm
-# Of pairs with a covisibility of 0.1 to 0.3, 0.98 to 1.00 have this number of matches, and all pairs
-# above; half of the pairs of different places have it or less (`python -m benchmarks.shortlists`).
+# Of pairs with a covisibility of 0.1 to 0.2, 0.96 to 1.00 have this number of matches, and all pairs
+# above. Of the pairs of different scenes, 0.30 have it (`python -m benchmarks.shortlists`).
 MIN_LARGE_MATCHES = 4
 LARGEST = 1000  # keypoints per image
 LARGEST_SIDE_PX = 1024  # at 640, a pair of fountain_p11 with a covisibility above 0.3 is left out

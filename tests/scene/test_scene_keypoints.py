@@ -65,6 +65,16 @@ def test_a_keypoint_is_matched_once_and_to_what_was_found_most_often():
     assert one_to_one(nothing).shape == (0, 2)
 
 
+@given(arrays(np.intp, SHAPES, elements=st.integers(0, 12)))
+def test_of_conflicting_matches_the_more_frequent_wins_and_then_the_earlier(index):
+    rows = [tuple(row) for row in index.tolist()]
+    wanted = []
+    for row in sorted(set(rows), key=lambda row: (-rows.count(row), rows.index(row))):
+        if all(row[0] != i and row[1] != j for i, j in wanted):
+            wanted.append(row)
+    assert one_to_one(index).tolist() == [list(row) for row in sorted(wanted)]
+
+
 def test_a_point_seen_in_two_pairs_is_one_keypoint():
     edges = (
         Edge(0, 1, matches((10.45, 10, 20, 20), (30, 30, 40, 40))),
