@@ -35,12 +35,7 @@ def main() -> None:
     parser.add_argument("--batches", type=int, default=40)
     parser.add_argument("--matches", type=int, default=2000)
     arguments = parser.parse_args()
-    rng = np.random.default_rng(0)
-    # Random sub-pixel points on images of 1600 x 1200 pixels hardly compress.
-    points = (rng.random((arguments.matches, 2)) * (1600, 1200) for _ in range(2))
-    simulator.POINTS = Matches(*points, rng.random(arguments.matches))
-    costs = (0.5,) * arguments.units
-    scenario = Scenario(arguments.pairs, costs, 1, float("inf"), 0.1, 0, batches=arguments.batches)
+    scenario = scenario_of(arguments.pairs, arguments.batches, arguments.units, arguments.matches)
     with tempfile.TemporaryDirectory() as directory:
         with Store.open(Path(directory)) as store:
             started = time.process_time()
@@ -60,6 +55,24 @@ def main() -> None:
         f"start from the store: {resuming:.2f} s, {resuming_cpu:.2f} s CPU; {len(state.stale)} scenes out of date"
     )
     print(f"memory: {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3:.0f} MB")
+
+
+def scenario_of(pairs: int, batches: int, units: int = 5, matches: int = 2000) -> Scenario:
+    """Return a run without a limit, whose units return the same random matches."""
+    rng = np.random.default_rng(0)
+    # Random sub-pixel points on images of 1600 x 1200 pixels hardly compress.
+    points = (rng.random((matches, 2)) * (1600, 1200) for _ in range(2))
+    simulator.POINTS = Matches(*points, rng.random(matches))
+    return Scenario(pairs, (0.5,) * units, 1, float("inf"), 0.1, 0, batches=batches)
+
+
+def loop_seconds(pairs: int, batches: int) -> float:
+    """Return the CPU seconds of the loop in a run of these pairs."""
+    scenario = scenario_of(pairs, batches)
+    with tempfile.TemporaryDirectory() as directory, Store.open(Path(directory)) as store:
+        started = time.process_time()
+        simulate(scenario, store)
+        return time.process_time() - started
 
 
 def restored(scenario: Scenario, store: Store) -> State:
