@@ -12,6 +12,7 @@ from mkpc_kaggle.data.masks import Masks
 from mkpc_kaggle.data.outputs import require_apart
 from mkpc_kaggle.engine.budget import format_duration
 from mkpc_kaggle.engine.console import say
+from mkpc_kaggle.engine.records import MIN_PAIRS, NOT_RECONSTRUCTED
 from mkpc_kaggle.engine.session import interruptible
 from mkpc_kaggle.errors import UserError, plural
 from mkpc_kaggle.recipe import CameraSharing
@@ -225,14 +226,19 @@ def _lines(result: FolderResult, root: Path) -> Iterator[str]:
     # Of the datasets that the run reached
     reasons = {scene.batch: scene.failure for scene in report.scenes}
     batches = batch_names(root, result.cameras)
+    pairs = Counter(pair.group for pair in result.pairs)
     for name, found in result.cameras.items():
         models = Counter(placed[0] for placed in found.values() if placed)
         sizes = ", ".join(str(models[number]) for number in sorted(models))
-        why = (
-            f"models of {sizes}"
-            if models
-            else reasons.get(batches[name], "too few pairs, or too little time")
-        )
+        batch = batches[name]
+        if models:
+            why = f"models of {sizes}"
+        elif batch in reasons:
+            why = reasons[batch]
+        elif pairs[batch] < MIN_PAIRS:
+            why = f"{plural(pairs[batch], 'pair')}; cameras need at least three matched images"
+        else:
+            why = f"{NOT_RECONSTRUCTED}, too little time"
         if models and batches[name] in result.lost:
             why += " by an earlier run"
         placed = f"{models.total()} of {plural(len(found), 'image')} with a camera"

@@ -11,7 +11,7 @@ from typing import Any
 
 from mkpc_kaggle.cli import options
 from mkpc_kaggle.config import from_table
-from mkpc_kaggle.data.competition import TrainScene, read_train_side
+from mkpc_kaggle.data.competition import TrainScene, missing_line, read_train_side
 from mkpc_kaggle.data.outputs import require_apart
 from mkpc_kaggle.data.pairs import read_pairs
 from mkpc_kaggle.engine.console import say
@@ -224,6 +224,8 @@ def _match_and_score(
     compared: list[str] = arguments.compare or []
     choices = [split_mode(text) for text in compared] or [(arguments.recipe, arguments.mode)]
     pairs = [true.pair for scene in scenes for true in scene.pairs]
+    if line := missing_line(pairs):
+        say(line)
     regions = {} if arguments.regions is None else read_regions(arguments.regions, root, pairs)
     if arguments.regions is not None:
         used = len({(pair.file0, pair.file1) for pair in pairs})

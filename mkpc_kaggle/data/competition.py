@@ -126,7 +126,7 @@ def read_test_side(directory: Path) -> tuple[Pair, ...]:
 
 
 def missing_line(pairs: Iterable[Pair]) -> str:
-    """Return a line on the images of the test side that are missing; empty if all exist."""
+    """Return a line on the images of pairs that are missing; empty if all exist."""
     wanted = dict.fromkeys(file for pair in pairs for file in (pair.file0, pair.file1))
     listed: dict[str, set[str]] = {}
     missing = []
@@ -142,7 +142,7 @@ def missing_line(pairs: Iterable[Pair]) -> str:
     if not missing:
         return ""
     count = f"{len(missing)} of {plural(len(wanted), 'image')}"
-    return f"missing in test_images: {count}, the first is {missing[0]}"
+    return f"missing: {count}, the first is {missing[0]}"
 
 
 def read_train_side(

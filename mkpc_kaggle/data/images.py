@@ -41,6 +41,8 @@ OTHER_SUFFIXES = frozenset(
     )
 ) - set(READ_SUFFIXES)
 
+HEIC_BRANDS = frozenset({b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1"})
+
 # Ratio of the sides; a longer image's views would be a few pixels high or exceed the memory.
 MAX_ASPECT = 32
 
@@ -145,8 +147,7 @@ def read_image(path: Path) -> Image | Unreadable:
     except (OSError, ValueError, MemoryError, cv2.error) as error:
         return Unreadable(name, f"cannot be read: {error}")
     if bgr is None:
-        cause = "not a picture, or cut off: it cannot be decoded"
-        return Unreadable(name, cause if data.size else "the file is empty")
+        return Unreadable(name, _undecoded(path, data))
     height, width = bgr.shape[:2]
     if not has_usable_shape(Size(width, height)):
         return Unreadable(
@@ -155,6 +156,19 @@ def read_image(path: Path) -> Image | Unreadable:
     turns, focal = read_exif(data.tobytes(), Size(width, height))
     pixels = np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
     return Image(name, pixels, _content_digest(data), focal, turns)
+
+
+def _undecoded(path: Path, data: Pixels) -> str:
+    """Return why OpenCV does not decode the bytes of a file."""
+    if not data.size:
+        return "the file is empty"
+    # Photographs of phones are often HEIC under the name of a JPEG.
+    head = data[:12].tobytes()
+    if head[4:8] == b"ftyp" and head[8:12] in HEIC_BRANDS:
+        return "a HEIC file, which cannot be decoded here; convert it to JPEG or PNG"
+    if path.suffix.lower() in OTHER_SUFFIXES:
+        return f"{path.suffix} files cannot be decoded here; convert it to JPEG or PNG"
+    return "not a picture, or cut off: it cannot be decoded"
 
 
 def has_usable_shape(size: Size) -> bool:

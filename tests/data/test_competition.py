@@ -272,7 +272,7 @@ def test_missing_images_are_counted_before_the_run(side):
     rows = ["s1,b,a,c", "s2,b,a,none", "s3,empty,x,y"]
     pairs = read_test_side(side(*rows, images=["b/a.png", "b/c.JPG"]))
     line = missing_line(pairs)
-    assert line.startswith("missing in test_images: 3 of 5 images, the first is ")
+    assert line.startswith("missing: 3 of 5 images, the first is ")
     assert line.endswith("test_images/b/none.png")
     assert missing_line(pairs[:1]) == ""
 

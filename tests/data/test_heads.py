@@ -94,3 +94,15 @@ def test_a_jpeg_may_lack_its_end_mark_and_nothing_else(tmp_path, options):
     for missing in (20, 200, len(whole) // 2):
         path.write_bytes(whole[:-missing])
         assert isinstance(read_image(path), Unreadable), missing
+
+
+def test_a_format_that_is_not_decoded_is_named_with_the_remedy(tmp_path):
+    told = {
+        # As an iPhone's photograph under the name of a JPEG
+        "a.jpg": (b"\0\0\0\x18ftypheic" + bytes(500), "a HEIC file, which cannot be decoded here"),
+        "b.dng": (b"II*\0" + bytes(500), ".dng files cannot be decoded here; convert it to JPEG"),
+        "c.jpg": (b"no picture", "not a picture, or cut off"),
+    }
+    for name, (content, reason) in told.items():
+        (tmp_path / name).write_bytes(content)
+        assert read_image(tmp_path / name).reason.startswith(reason)

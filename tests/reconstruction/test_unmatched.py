@@ -74,3 +74,13 @@ def test_causes_are_named_only_if_the_files_show_them(tmp_path):
     for number in range(2):
         cv2.imwrite(str(flat / f"{number}.png"), np.full((20, 20), 200 + number, np.uint8))
     assert "has one brightness" in cause_of_no_matches(sorted(flat.iterdir()), Masks())
+
+
+def test_two_images_are_too_few_for_cameras_and_the_line_says_so(tmp_path, capsys):
+    root = write(tmp_path / "photos", count=2)
+    recipe = tmp_path / "one.toml"
+    recipe.write_text('units = [{ stage = 1, matcher = "sift", long_side = 320 }]\n[scene]\n')
+    options = ["--out", tmp_path / "out", "--recipe", recipe, "--workers", 0]
+    assert run_command("reconstruct", root, *options) == 1
+    line = "photos: 0 of 2 images with a camera: 1 pair; cameras need at least three matched images"
+    assert line in capsys.readouterr().out
