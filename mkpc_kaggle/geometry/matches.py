@@ -8,6 +8,12 @@ from numpy.typing import NDArray
 
 from mkpc_kaggle.geometry.coordinates import Points, View
 
+MEANINGS = {
+    "points0": "shape (N, 2)",
+    "points1": "shape (N, 2)",
+    "scores": "shape (N,)",
+}
+
 
 @dataclass(frozen=True, eq=False)
 class Matches:
@@ -25,8 +31,14 @@ class Matches:
     indices: NDArray[np.int64] | None = None
 
     def __post_init__(self) -> None:
-        for name, width in (("points0", (2,)), ("points1", (2,)), ("scores", ())):
-            array = np.ascontiguousarray(getattr(self, name), dtype=np.float32)
+        for name, width in (("scores", ()), ("points0", (2,)), ("points1", (2,))):
+            given = getattr(self, name)
+            if given is None:
+                raise TypeError(f"{name} is None; expected an array of {MEANINGS[name]}")
+            # Of a tensor with a gradient, or on a GPU, NumPy takes no array.
+            if hasattr(given, "detach"):
+                given = given.detach().cpu()
+            array = np.ascontiguousarray(given, dtype=np.float32)
             if array.shape == (0,):  # an empty list is an empty list of points
                 array = array.reshape(0, *width)
             if array.shape != (len(self.scores), *width):

@@ -221,6 +221,11 @@ class Pipeline:
         each_pair = zip(pairs, views, firsts, encodings[1::2], found, strict=True)
         for pair, both, encoding, other, matches in each_pair:
             in_image = self._unmasked(matches.to_image(*both), pair.images)
+            if unit.matcher in self.raising and len(matches) and not len(in_image):
+                raise ValueError(
+                    f"match of {unit.matcher!r}: all {plural(len(matches), 'match')} were dropped; "
+                    "their points are outside of the pictures, or points or scores are not finite"
+                )
             best = in_image.best(unit.max_matches)
             kept = None
             if self.keeps_keypoints:

@@ -473,6 +473,31 @@ def test_another_answer_of_the_users_own_matcher_is_named(answer, word):
     raises(lambda: call(pixels(), pixels()), TypeError, "match of 'own'", "a list of Matches", word)
 
 
+@pytest.mark.parametrize(
+    "found",
+    [
+        Matches([(1, 1)], [(2, 2)], [np.nan]),
+        Matches([(1, 1)], [(np.inf, 2)], [1]),
+        Matches([(5000, 1)], [(2, 2)], [1]),
+    ],
+)
+def test_matches_of_the_users_own_matcher_that_are_all_dropped_are_an_error(found):
+    call = own(lambda *_: [found])
+    raises(lambda: call(pixels(), pixels()), ValueError, "match of 'own'", "1 match were dropped")
+    # Some may be on the padding, and none may be found.
+    both = Matches.concatenate([found, ONE])
+    assert len(own(lambda *_: [both])(pixels(), pixels()).matches) == 1
+    assert len(own(lambda *_: [Matches.empty()])(pixels(), pixels()).matches) == 0
+
+
+def test_matches_may_be_tensors_with_gradients():
+    points = torch.ones(3, 2, requires_grad=True)
+    found = Matches(points, points * 2, torch.ones(3))
+    np.testing.assert_array_equal(found.points1, np.full((3, 2), 2))
+    raises(lambda: Matches(points, points, None), TypeError, "scores is None", "(N,)")
+    raises(lambda: Matches(None, points, torch.ones(3)), TypeError, "points0 is None", "(N, 2)")
+
+
 def test_a_matcher_without_a_method_is_refused():
     class Half:
         spec = MatcherSpec("own")
