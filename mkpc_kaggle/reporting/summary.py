@@ -138,10 +138,13 @@ def advice(log: RunLog) -> list[str]:
 
 
 def unit_means(run: Run) -> list[tuple[str, int, float, float, float]]:
-    """Return a row per unit: name, number of pairs, and mean matches, inliers and seconds."""
+    """Return a row per unit: name, number of pairs, and mean matches, inliers and seconds.
+
+    Without the pairs on which the unit failed, whose matches and seconds were not measured.
+    """
     # By name, in the order in which units first appear: that of the recipe
     results: dict[str, list[tuple[float, float, float]]] = {}
-    for unit in (unit for record in run.records for unit in record.units):
+    for unit in (unit for record in run.records for unit in record.units if not unit.failure):
         values = unit.matches, unit.inliers, unit.encode_seconds + unit.match_seconds
         results.setdefault(unit.unit, []).append(values)
     return [(name, len(rows), *np.mean(rows, axis=0)) for name, rows in results.items()]

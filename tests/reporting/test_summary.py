@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine.records import NOT_RECONSTRUCTED, About, PairRecord, SceneRecord
+from mkpc_kaggle.engine.records import NOT_RECONSTRUCTED, About, PairRecord, SceneRecord, UnitRecord
 from mkpc_kaggle.engine.request import Ending, RunReport
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Size
@@ -19,6 +19,7 @@ from mkpc_kaggle.reporting.summary import (
     left_out_line,
     pending_lines,
     summary,
+    unit_means,
     weakest_cameras,
     weakest_line,
 )
@@ -52,6 +53,14 @@ def test_a_pair_with_few_inliers_is_doubtful_unless_its_cameras_agree():
     settled = replace(FEW_INLIERS, scene=Choice(np.eye(3), Reason.SCENE), source="scene")
     assert not is_doubtful(settled)
     assert is_doubtful(replace(FEW_INLIERS, scene=Choice(None, Reason.CONTRADICTION)))
+
+
+def test_the_means_of_a_unit_leave_out_the_pairs_on_which_it_failed():
+    done = UnitRecord("1:sift@640", 1, 200, 100, 0.5, 1.5, failure="")
+    failed = UnitRecord("1:sift@640", 1, 0, 0, 0.0, 0.0, failure="KeyError: 'x'")
+    records = [replace(UNREACHED, units=(unit,)) for unit in (failed, done, failed)]
+    means = unit_means(report(Ending.COMPLETE, *records))
+    assert means == [("1:sift@640", 1, 200.0, 100.0, 2.0)]
 
 
 def test_cameras_with_unknown_errors_are_the_weakest():
