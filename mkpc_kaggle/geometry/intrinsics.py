@@ -5,6 +5,7 @@ its centre.
 """
 
 import fnmatch
+import unicodedata
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import isfinite
@@ -125,8 +126,11 @@ def camera_of(rows: Rows, name: str) -> KnownCamera | None:
 
     A row names it by path, by file name, or by a pattern of these.
     """
+    # macOS writes "é" as two characters, and most tables as one.
+    name = unicodedata.normalize("NFC", name)
     base = name.rpartition("/")[2]
-    for pattern, known in rows:
+    for written_pattern, known in rows:
+        pattern = unicodedata.normalize("NFC", written_pattern)
         # Equality first: a file may be called "photo [1].jpg", and as a pattern this is another.
         if pattern in (name, base):
             return known

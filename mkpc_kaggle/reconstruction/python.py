@@ -14,6 +14,7 @@ from mkpc_kaggle.data.images import Unreadable, has_usable_shape, read_image, re
 from mkpc_kaggle.data.masks import Masks
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.console import warn
+from mkpc_kaggle.engine.request import RunReport
 from mkpc_kaggle.engine.session import Interrupt, Session, interruptible
 from mkpc_kaggle.engine.state import name_below
 from mkpc_kaggle.engine.store import FILE_NAME
@@ -138,6 +139,9 @@ def reconstruct(
         if result.lost:
             reason = next(iter(result.lost.values()))
             raise UserError(f"no cameras: {reason}; the same call tries again")
+        # An empty result without its reason would look like a success.
+        for line in no_models(result.report):
+            warn(line)
         names = {name_below(str(root), str(file)): name for file, name in given.items()}
         return Models(
             with_copies(
@@ -148,6 +152,15 @@ def reconstruct(
             for scene in result.report.scenes
             for number, model in enumerate(scene.models)
         )
+
+
+def no_models(report: RunReport) -> list[str]:
+    """Return why a run has no models, and the faults that explain it; empty if it has models."""
+    if any(scene.models for scene in report.scenes):
+        return []
+    reasons = [scene.failure for scene in report.scenes]
+    reason = "; ".join(reasons) or "at least three matched images are needed"
+    return [f"no cameras: {reason}", *report.faults]
 
 
 def image_paths(images: Any) -> list[Path]:

@@ -3,6 +3,7 @@ again.
 """
 
 import csv
+import unicodedata
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -198,6 +199,18 @@ def test_the_images_without_a_known_camera_are_counted(tmp_path):
     line = "known cameras: 2 of 3 images; the first without one is 01.PNG"
     assert intrinsics_line(known, root, files) == line
     assert intrinsics_line(known, root, files[::2]) == "known cameras: 2 of 2 images"
+
+
+def test_a_row_names_a_photograph_of_macos_too(tmp_path):
+    root = write_flat(tmp_path / "images", 3)
+    name = "\N{LATIN SMALL LETTER E WITH ACUTE}.png"
+    (root / "00.png").rename(root / unicodedata.normalize("NFD", name))
+    table = tmp_path / "known.csv"
+    row = unicodedata.normalize("NFC", name)
+    table.write_text(f"{HEAD}{row},SIMPLE_PINHOLE,900 400 300,fixed\n", encoding="utf-8")
+    files = sorted(root.iterdir())
+    known = read_intrinsics_table(table, root, files)
+    assert intrinsics_line(known, root, files).startswith("known cameras: 1 of 3 images")
 
 
 def test_masks_among_the_images_are_refused(tmp_path):

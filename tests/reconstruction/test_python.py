@@ -273,3 +273,17 @@ def test_a_large_folder_is_digested_once(tmp_path, files, monkeypatch):
     files[0].write_bytes(files[0].read_bytes() + b"more")
     models(files, MixedMatcher(), work_dir=tmp_path / "work", progress=False)
     assert set(digested[FIRST:]) == {files[0].name}
+
+
+class Blind(MixedMatcher):
+    """Finds no match."""
+
+    def _match(self, seen0: object, seen1: object) -> Matches:
+        return Matches.empty()
+
+
+def test_no_model_is_a_warning_with_its_reason(files, capfd):
+    assert models(files, Blind(), progress=False) == ()
+    assert "no cameras: no matches connect its images" in capfd.readouterr().err
+    assert models(files[:2], MixedMatcher(), progress=False) == ()
+    assert "at least three matched images are needed" in capfd.readouterr().err
