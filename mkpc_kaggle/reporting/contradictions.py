@@ -42,8 +42,8 @@ def _lens_sentence(found: DistortedLens, *, is_everything: bool) -> str:
     return (
         f"the lens of {plural(len(found.images), 'photograph')} is distorted by "
         f"{100 * abs(found.displacement):.1f} % at the edge, and neither the cameras nor their expected errors "
-        f"include that: {images}; give --intrinsics with the row "
-        f"{first},{camera.model},{parameters},{camera.sigma:g}{others}"
+        f"include that: {images}; reconstruct again with --set scene.camera_model={camera.model}, or give "
+        f"--intrinsics with the row {first},{camera.model},{parameters},{camera.sigma:g}{others}"
     )
 
 

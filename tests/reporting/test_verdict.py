@@ -154,7 +154,10 @@ SPEAKS = {
     "the lens of 4 photographs is distorted by 1.5 % at the edge": compared(
         DistortedLens(tuple(NAMES), -0.0154, RADIAL)
     ),
-    "give --intrinsics with the row *,SIMPLE_RADIAL,575 320 213.5 -0.05,5": compared(
+    "with --set scene.camera_model=SIMPLE_RADIAL, or give --intrinsics": compared(
+        DistortedLens(tuple(NAMES), -0.0154, RADIAL)
+    ),
+    "the row *,SIMPLE_RADIAL,575 320 213.5 -0.05,5": compared(
         DistortedLens(tuple(NAMES), -0.0154, RADIAL)
     ),
     "the row 0.jpg,SIMPLE_RADIAL,575 320 213.5 -0.05,5, and the same for the others": compared(
