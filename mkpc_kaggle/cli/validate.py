@@ -230,7 +230,7 @@ def _match_and_score(
     if arguments.regions is not None:
         used = len({(pair.file0, pair.file1) for pair in pairs})
         # The table may be of more scenes, or of more pairs of them.
-        say(f"regions: {used} of {plural(len(regions), 'row')} are of pairs of this run")
+        say(f"regions: {used} of {plural(len(regions), 'row')} name pairs of this run")
     validations = []
     status = 0
     budget = options.budget_of(arguments)

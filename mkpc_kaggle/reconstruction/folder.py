@@ -71,7 +71,7 @@ class _Found:
             yield f"folders of thumbnails and deleted files are passed over: {_first(self.thumbnails)}"
         if self.twins:
             yield (
-                "passed over, for another image of the folder has the same name: "
+                "not used, because another image of the folder has the same name: "
                 f"{_first(self.twins)}"
             )
         if self.unread:
@@ -192,10 +192,10 @@ def pair_list_line(listed: Sequence[Ends], root: Path, datasets: Datasets) -> st
     paired = {file for ends in listed for file in ends}
     without = [file for file in files if file not in paired]
     named = len(files) - len(without)
-    line = f"listed: {plural(len(listed), 'pair')} of {named} of {plural(len(files), 'image')}"
+    line = f"--pairs: {plural(len(listed), 'pair')} with {named} of {plural(len(files), 'image')}"
     if not without:
         return line
-    return f"{line}; the first without a pair is {without[0].relative_to(root).as_posix()}"
+    return f"{line}; the first image without a pair is {without[0].relative_to(root).as_posix()}"
 
 
 def _refuse_unreadable(error: OSError) -> None:

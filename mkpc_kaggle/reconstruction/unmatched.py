@@ -18,7 +18,7 @@ def cause_of_no_matches(files: Sequence[Path], masks: Masks) -> str:
     step = max(1, (len(files) - 1) // max(1, SAMPLES - 1))
     sample = files[::step][:SAMPLES]
     if all(_is_hidden(file, masks) for file in sample):
-        return "the masks hide everything; black pixels are left out, so invert them"
+        return "the masks hide everything: black pixels are left out; invert the masks"
     images = [image for image in map(read_image, sample) if isinstance(image, Image)]
     if not images:  # each of them is reported as unreadable
         return ""
@@ -30,9 +30,7 @@ def cause_of_no_matches(files: Sequence[Path], masks: Masks) -> str:
             f"{maximum} of 255; values of 10, 12 or 14 bits must be scaled to all 16 bits of a file"
         )
     if all(float(image.gray.std()) < MAX_SPREAD for image in images):
-        return (
-            f"the photographs show nothing: all of {Path(images[0].name).name} has one brightness"
-        )
+        return f"the photographs have no structure: all of {Path(images[0].name).name} has one brightness"
     return ""
 
 

@@ -163,8 +163,8 @@ def test_the_images_that_a_list_of_pairs_leaves_out_are_counted(tmp_path):
     datasets = read_folder(root)
     (tmp_path / "pairs.txt").write_text("a.png b.png\na.png c.png\n")
     listed = read_pair_list(tmp_path / "pairs.txt", root, datasets)
-    line = "listed: 2 pairs of 3 of 4 images; the first without a pair is d.png"
+    line = "--pairs: 2 pairs with 3 of 4 images; the first image without a pair is d.png"
     assert pair_list_line(listed, root, datasets) == line
     (tmp_path / "pairs.txt").write_text("a.png b.png\nd.png c.png\n")
     listed = read_pair_list(tmp_path / "pairs.txt", root, datasets)
-    assert pair_list_line(listed, root, datasets) == "listed: 2 pairs of 4 of 4 images"
+    assert pair_list_line(listed, root, datasets) == "--pairs: 2 pairs with 4 of 4 images"
