@@ -142,7 +142,7 @@ def _lines(match: PairMatch, recipe: str) -> list[str]:
         lines.append(f"flat: one homography explains {share} of the inliers, so F is uncertain")
     for result in match.results:
         counts = f"{plural(len(result.matches), 'match'):>14}  {result.seconds:.2f} s"
-        remark = result.failure or result.note
+        remark = result.failure or result.note or (str(result.need) if result.need else "")
         lines.append(f"  {result.unit.name:<30}{counts}  {remark}".rstrip())
     for number, region in enumerate(match.regions or ()):
         box = region.box

@@ -162,6 +162,9 @@ def _unit_row(record: PairRecord, unit: UnitRecord) -> dict[str, Any]:
         "failure": unit.failure,
         "note": unit.note,
         "keypoints": unit.keypoints,
+        "is_needed": unit.is_needed,
+        "scale": unit.scale,
+        "detail": unit.detail,
     }
 
 

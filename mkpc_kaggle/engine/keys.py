@@ -17,6 +17,7 @@ import cv2
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.data.masks import Masks
 from mkpc_kaggle.geometry.coordinates import Box
+from mkpc_kaggle.geometry.critical_region import When
 from mkpc_kaggle.matchers.contract import Precision
 from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.pipeline.stages import GivenRegions
@@ -27,6 +28,9 @@ from mkpc_kaggle.scene.view_graph import BatchImage
 POINTS = 2
 ESTIMATE = 4
 SCENE = 8
+
+# Settings of [mkpc] that decide whether a crop is matched, and not what is found in it.
+RULE = ("when", "min_scale", "min_detail")
 
 Images = tuple[BatchImage, BatchImage]
 
@@ -55,6 +59,7 @@ class Keys:
 
     units: tuple[str, ...]
     mkpc: str = ""
+    rule: str = ""  # that says which pairs need their crops; empty: all of them
     estimate: str = ""
     scene: str = ""
     regions: GivenRegions | None = None
@@ -73,11 +78,13 @@ class Keys:
         # MAGSAC comes from OpenCV, and other versions of it may give another F.
         estimate = digest([ESTIMATE, magsac, focal, cv2.__version__])
         scene = recipe.scene and asdict(recipe.scene)
+        mkpc = asdict(recipe.mkpc)
         # The units that make tracks: a unit's points do not depend on it, but scenes do.
         tracks = [unit.name for unit in recipe.units if unit.tracks]
         return cls(
             units,
-            digest(asdict(recipe.mkpc)),
+            digest({name: value for name, value in mkpc.items() if name not in RULE}),
+            "" if recipe.mkpc.when is When.ALWAYS else digest([mkpc[name] for name in RULE]),
             estimate,
             digest([SCENE, scene, tracks, estimate, _mapper_version()]),
             assembly.regions,
@@ -105,6 +112,10 @@ class Keys:
         masked = ["masks", *masks] if any(masks) else []
         units = self.float32 if is_float32 and self.float32 else self.units
         return text_digest([units[unit], image0.digest, image1.digest, *turns, *masked, *first])
+
+    def unneeded(self, points: str) -> str:
+        """Return the key of the answer that a pair does not need the unit with these points."""
+        return text_digest([self.rule, points])
 
     def crops_of(self, pair: Pair, first: Sequence[str]) -> list[str]:
         """Return what decides a pair's crops: the given regions, or [mkpc] and the keys of stage 1."""

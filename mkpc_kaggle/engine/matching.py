@@ -142,8 +142,10 @@ class Matching:
                     run.log.units_failed += 1
                     continue
                 run.state.tries.succeed(("unit", index, found.unit.name))
-                run.costs.observe(found.unit.name, found.seconds, warm_up=found.warm_up)
-                run.log.units_run += 1
+                # A unit that the pair does not need took no time.
+                if found.is_needed:
+                    run.costs.observe(found.unit.name, found.seconds, warm_up=found.warm_up)
+                    run.log.units_run += 1
         if (work := self._shown) is not None:
             # The schedule counted the finished pairs before this answer. A pair whose other units
             # follow in another job counts after the last.
@@ -178,11 +180,13 @@ class Matching:
             if is_crop and not are_valid:
                 continue  # the unit stays missing and runs again
             keys = [first[n] for n in sorted(first)]
-            is_float32 = found.is_float32
+            is_float32 = found.is_float32 and found.is_needed
             key = state.key_of(index, number, images, keys, is_float32=is_float32)
             # An answer has stage 1 first: its units of stage 2 looked at crops from all of stage 1.
             if not is_crop:
                 first[number] = key
+            if not found.is_needed:
+                key = state.request.keys.unneeded(key)
             facts = UNIT_FACTS.to_json(_facts(found, outcome, len(good)))
             results.append(Result(key, Kind.POINTS, facts, to_bytes(found.matches)))
         return results
@@ -202,6 +206,7 @@ class Matching:
         """Use the points of an answer, on all rows with the same images."""
         state = self._run.state
         points = [result for result in results if result.kind is Kind.POINTS]
+        before = state.keys_in_use(index)
         for each in state.alike(index):
             # An unreadable image stays unreadable in this run, and a matcher that raised raises again.
             if outcome.failure:
@@ -212,9 +217,12 @@ class Matching:
                     state.give_up(("unit", each, found.unit.name), failure)
             for result in points:
                 number = state.number_of[result.about["unit"]]
-                state.use_points(each, number, result.key, result.about["matches"])
-            if points:
+                state.use_points(each, number, result.key, result.about)
+            # Units that the pair does not need change nothing.
+            if state.keys_in_use(each) != before:
                 state.note_points(each)
+            elif points:
+                state.changed.add(each)
 
     def lose(self, job: MatchJob, failure: Failure) -> None:
         run = self._run
@@ -253,6 +261,7 @@ class Matching:
 
 def _facts(found: UnitResult, outcome: Outcome, units: int) -> UnitFacts:
     """Return the facts about one of the ``units`` of an answer."""
+    need = found.need
     return UnitFacts(
         unit=found.unit.name,
         matches=len(found.matches),
@@ -264,4 +273,7 @@ def _facts(found: UnitResult, outcome: Outcome, units: int) -> UnitFacts:
         match_seconds=found.match_seconds,
         note=found.note,
         regions=(outcome.regions or ()) if found.unit.stage == 2 else (),
+        is_needed=found.is_needed,
+        scale=None if need is None else need.scale,
+        detail=None if need is None else need.detail,
     )

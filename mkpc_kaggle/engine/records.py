@@ -56,6 +56,10 @@ class UnitFacts:
     match_seconds: float
     note: str
     regions: tuple[CriticalRegion, ...]  # of both images, or none
+    # Of a unit of stage 2: whether the pair needs it, and the ratios of its ``CropNeed``
+    is_needed: bool
+    scale: float | None
+    detail: float | None
 
 
 UNIT_FACTS = record(
@@ -69,6 +73,9 @@ UNIT_FACTS = record(
     match_seconds=PLAIN,
     note=PLAIN,
     regions=several(codec.REGION),
+    is_needed=PLAIN,
+    scale=PLAIN,
+    detail=PLAIN,
 )
 ESTIMATED = record(
     Estimated,
@@ -97,6 +104,9 @@ class UnitRecord:
     failure: str
     note: str = ""  # how the unit deviated from its settings, for example in precision
     keypoints: int = 0  # detected in the first view; 0 for a matcher without a detector
+    is_needed: bool = True  # False for a unit of stage 2 that the pair does not need
+    scale: float | None = None  # of a unit of stage 2, as in ``CropNeed``
+    detail: float | None = None
 
     @classmethod
     def of(cls, facts: UnitFacts, stage: int, inliers: int) -> "UnitRecord":
@@ -110,6 +120,9 @@ class UnitRecord:
             failure="",
             note=facts.note,
             keypoints=facts.keypoints,
+            is_needed=facts.is_needed,
+            scale=facts.scale,
+            detail=facts.detail,
         )
 
 

@@ -13,6 +13,7 @@ from mkpc_kaggle.engine.records import SCENE, Row, Table
 from mkpc_kaggle.engine.schedule import sweeping_unit
 from mkpc_kaggle.engine.state import State
 from mkpc_kaggle.engine.store import Store
+from mkpc_kaggle.geometry.crop_need import pays
 from mkpc_kaggle.scene.export import has_files
 
 EXPORT = "export "  # prefix of the keys of marks; a mark names the scene of a batch's files
@@ -72,6 +73,7 @@ def _restore_points(
     wanted: list[tuple[int, int]],
     former: Mapping[tuple[int, int], str],
 ) -> None:
+    mkpc = state.request.recipe.mkpc
     # All keys first, because one query for thousands of keys is much faster than one for each.
     today: dict[tuple[int, int], list[str]] = {}
     for index, number in wanted:
@@ -80,12 +82,20 @@ def _restore_points(
         today[index, number] = state.keys_of(index, number, images, state.first_stage(index))
     about = store.about([*chain.from_iterable(today.values()), *former.values()])
     for (index, number), keys in today.items():
-        stored = [key for key in keys if key in about]
+        # Points that were found under another rule count if today's rule asks for them, too.
+        stored = [
+            key
+            for key in keys
+            if key in about
+            and (
+                not about[key]["is_needed"] or pays(about[key]["scale"], about[key]["detail"], mkpc)
+            )
+        ]
         is_current = bool(stored)
         # Points of former settings are better than none.
         used = stored[0] if stored else former.get((index, number), "")
         if used in about:
-            state.use_points(index, number, used, about[used]["matches"])
+            state.use_points(index, number, used, about[used])
             state.current[index, number] = is_current
 
 

@@ -185,6 +185,7 @@ def seconds_of_prefixes(view: View) -> NDArray[np.float64]:
     # Extra pairs are left out: they have a share of the time, not a claim.
     missing = view.missing[: state.rows]
     forecasts = np.array([view.costs.forecast(unit.name) for unit in state.units])
+    forecasts *= state.need_shares
     count = len(state.units)
     seconds = missing.sum(0) * forecasts
     # New points of stage 1 give new crops, so the units of stage 2 run again in the same prefix.

@@ -37,7 +37,8 @@ class State:
     a row; the ``extra`` pairs after them are for scenes alone.
 
     Of a pair's units (N, U): ``points``, the keys of the points in use, "" if none; ``has``, there are some;
-    ``current``, they are today's; ``matches``, their number; ``skipped``, this run tries the unit no more.
+    ``current``, they are today's; ``matches``, their number; ``skipped``, this run tries the unit no more;
+    ``unneeded``, the pair does not need the unit, whose key stands for no points.
 
     Of a pair (N,): ``estimates``, the key of the estimate in use; ``estimated``, it is today's;
     ``inliers``, the F ``own`` (N, 3, 3) and ``has_own``, it is no fallback. ``matching`` and
@@ -80,6 +81,7 @@ class State:
         self.has = np.zeros(size, bool, order="F")
         self.current = np.zeros(size, bool, order="F")
         self.skipped = np.zeros(size, bool, order="F")
+        self.unneeded = np.zeros(size, bool, order="F")
         self.estimates = np.full(count, "", object)
         self.own = np.tile(FALLBACK_FUNDAMENTAL, (count, 1, 1))
         self.estimated = np.zeros(count, bool)
@@ -130,6 +132,16 @@ class State:
     def missing(self) -> Mask:
         """(N, U): today's points are missing, and this run can get them."""
         return np.asarray(~self.current & ~self.skipped)
+
+    @property
+    def need_shares(self) -> NDArray[np.float64]:
+        """(U,): the expected share of the pairs that need a unit, 1 for a unit of stage 1.
+
+        The share of the pairs that are known, and one more that needs it.
+        """
+        known = self.current[: self.rows].sum(0)
+        needed = known - self.unneeded[: self.rows].sum(0)
+        return np.asarray((needed + 1) / (known + 1))
 
     @property
     def fundamentals(self) -> NDArray[np.float64]:
@@ -218,17 +230,25 @@ class State:
         return keys.of_points(unit, pair, images, crops, is_float32=is_float32)
 
     def keys_of(self, index: int, unit: int, images: Images, first: Sequence[str]) -> list[str]:
-        """Return the keys of points that are today's: in the given precision, then in float32."""
+        """Return the keys of points that are today's: in the given precision, then in float32.
+
+        A last key of a crop, if a rule decides, is that of the answer that the pair does not need it.
+        """
         keys = [
             self.key_of(index, unit, images, first, is_float32=is_float32)
             for is_float32 in (False, True)
         ]
+        if self.is_crop[unit] and self.request.keys.rule:
+            keys.append(self.request.keys.unneeded(keys[0]))
         return list(dict.fromkeys(keys))
+
+    def keys_in_use(self, index: int) -> list[str]:
+        """Return the keys of a pair's points in use, in the recipe's order."""
+        return list(self.points[index][self.has[index]])
 
     def estimate_key(self, index: int) -> str:
         """Return the key of an estimate from the points in use."""
-        points = [key for key in self.points[index] if key]
-        return self.request.keys.of_estimate(self.pairs[index], points)
+        return self.request.keys.of_estimate(self.pairs[index], self.keys_in_use(index))
 
     def scene_inputs(self, batch: str) -> tuple[list[int], str]:
         """Return the pairs of a batch that have points, and the key of a scene from them."""
@@ -240,7 +260,7 @@ class State:
             [
                 self.names[index],
                 self.contents(index),
-                [key for key in self.points[index] if key],
+                self.keys_in_use(index),
                 self.estimates[index],
             ]
             for index in indices
@@ -264,8 +284,8 @@ class State:
         """Return the inputs of a pair's estimate, or of its batch's scene."""
         images = self.images_of(index)
         assert images
-        keys = zip(self.units, self.points[index], strict=True)
-        points = {unit: key for unit, key in keys if key}
+        keys = zip(self.units, self.points[index], self.has[index], strict=True)
+        points = {unit: key for unit, key, is_used in keys if is_used}
         own = self.own[index] if self.has_own[index] else None
         return PairInputs(index, images, points, self.pairs[index].intrinsics, own)
 
@@ -275,11 +295,13 @@ class State:
         """Return the rows with the same images as a pair, including itself."""
         return self._twins.get(index, [index])
 
-    def use_points(self, index: int, unit: int, key: str, matches: int) -> None:
+    def use_points(self, index: int, unit: int, key: str, about: Mapping[str, Any]) -> None:
+        """Use a unit's points, given as the store has them; none if the pair does not need the unit."""
         self.points[index, unit] = key
-        self.has[index, unit] = True
+        self.has[index, unit] = about["is_needed"]
+        self.unneeded[index, unit] = not about["is_needed"]
         self.current[index, unit] = True
-        self.matches[index, unit] = matches
+        self.matches[index, unit] = about["matches"]
 
     def forget_points(self, keys: Set[str]) -> None:
         """Forget the points with these keys: their units are missing again."""
@@ -320,6 +342,7 @@ class State:
         self._contents[index] = ""
         self.points[index] = ""
         self.has[index] = False
+        self.unneeded[index] = False
         self.current[index] = False
         self.matches[index] = 0
         self.estimates[index] = ""

@@ -26,7 +26,7 @@ import numpy as np
 from mkpc_kaggle.errors import UserError, plural, printable, warn_once, writing
 from mkpc_kaggle.geometry.matches import Matches
 
-FORMAT = 20  # increase it when a kind of result is stored differently: nothing is converted
+FORMAT = 21  # increase it when a kind of result is stored differently: nothing is converted
 FILE_NAME = "journal.sqlite"  # named in the documentation, and in scripts of users
 LOCK_NAME = "journal.lock"
 # STRICT refuses values of a wrong type, and json_valid refuses numbers that are not JSON, such as NaN.

@@ -20,9 +20,19 @@ MERGE_ABOVE = 2000
 CELLS_PER_EPS = 10  # a merged point moves by less than a tenth of the radius on each axis
 
 
+class When(StrEnum):
+    """The pairs that stage 2 runs on."""
+
+    ALWAYS = "always"  # all of them, as in the paper
+    SCALE = "scale"  # those that differ in scale, or whose detail a crop restores
+
+
 @dataclass(frozen=True)
 class MkpcConfig:
-    """Settings of :func:`critical_region`, table ``[mkpc]`` of a recipe."""
+    """Settings of :func:`critical_region`, and of :func:`mkpc_kaggle.geometry.crop_need.crop_need`.
+
+    Table ``[mkpc]`` of a recipe.
+    """
 
     eps: float = 0.05  # radius of DBSCAN, relative to the image's width and height
     min_samples: int = 5  # of DBSCAN
@@ -31,12 +41,17 @@ class MkpcConfig:
     expand_y: float = 1.0  # the paper's e_v
     min_clustered: float = 0.2  # minimum share of points in clusters
     min_side: int = 32  # of a crop, in pixels
+    when: When = When.ALWAYS
+    # With ``when = "scale"``, one of these two decides.
+    min_scale: float = 2.0  # ratio of the scales of the two images, by the matches of stage 1
+    min_detail: float = 2.0  # ratio of the scales of a crop's view and the largest view of stage 1
 
     def __post_init__(self) -> None:
         check_ranges(
             self, eps=Range(1e-6), min_samples=Range(1, 100), share=SHARE, min_clustered=SHARE
         )
         check_ranges(self, expand_x=POSITIVE, expand_y=POSITIVE, min_side=AT_LEAST_1)
+        check_ranges(self, min_scale=AT_LEAST_1, min_detail=AT_LEAST_1)
 
 
 class RegionReason(StrEnum):

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from mkpc_kaggle.data.images import Image
 from mkpc_kaggle.geometry.coordinates import Matrix3, Size
 from mkpc_kaggle.geometry.critical_region import CriticalRegion, MkpcConfig
+from mkpc_kaggle.geometry.crop_need import CropNeed
 from mkpc_kaggle.geometry.focal_prior import FocalPrior, estimate_with_prior
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.overlap import support
@@ -48,6 +49,12 @@ class UnitResult:
     is_float32: bool = False  # it ran in float32, whatever precision the run was given
     keypoints: int = 0  # detected in the first view; 0 for a matcher without a detector
     found: Keypoints | None = None  # for programs, of a matcher with a detector
+    need: CropNeed | None = None  # of stage 2; one that is not needed has no matches
+
+    @property
+    def is_needed(self) -> bool:
+        """False for a unit of stage 2 that the pair does not need."""
+        return self.need is None or self.need.is_needed
 
     @property
     def seconds(self) -> float:
@@ -73,6 +80,7 @@ class PairMatch:
     # For plots of a match of files.
     files: tuple[str, ...] = ()
     mkpc: MkpcConfig = field(default_factory=MkpcConfig)
+    scale: float = 1.0  # between both images, known with the regions
 
     @property
     def matches(self) -> Matches:

@@ -18,8 +18,9 @@ from mkpc_kaggle.data.competition import Pair, read_rows
 from mkpc_kaggle.data.images import ByteCache, Image, read_size
 from mkpc_kaggle.data.masks import MaskReader, Masks
 from mkpc_kaggle.errors import UserError, plural
-from mkpc_kaggle.geometry.coordinates import Box, View
+from mkpc_kaggle.geometry.coordinates import Box, Size, View
 from mkpc_kaggle.geometry.critical_region import CriticalRegion, RegionReason, critical_region
+from mkpc_kaggle.geometry.crop_need import CropNeed, crop_need, scale_between
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import (
     Colour,
@@ -110,7 +111,8 @@ class Pipeline:
     ) -> list[PairMatch]:
         """Run each unit on the pairs that have no result of it.
 
-        First the units of stage 1, then the critical regions, then the units of stage 2.
+        First the units of stage 1, then the critical regions, then the units of stage 2 on the pairs
+        that need them. A unit that a pair does not need has a result without matches.
         ``may_start(unit, pairs)`` is called before each minibatch of a unit, with its number of
         pairs. False halves the minibatch, and stops the unit before a single pair. If a
         matcher raises, the minibatch's pairs run one by one, and a pair that raises again gets a
@@ -128,8 +130,19 @@ class Pipeline:
         if crops:
             pairs = [with_regions(pair, self.recipe, self.regions) for pair in pairs]
         for unit in crops:
+            pairs = [self._with_need(pair, unit) for pair in pairs]
             self._run(unit, pairs, may_start)
         return pairs
+
+    def _with_need(self, pair: PairMatch, unit: Unit) -> PairMatch:
+        """Return the pair with an empty result if it does not need a unit of stage 2."""
+        if unit in (result.unit for result in pair.results):
+            return pair
+        need = need_of(unit, pair, self.recipe)
+        if need.is_needed:
+            return pair
+        result = UnitResult(unit, Matches.empty(), need=need)
+        return replace(pair, results=(*pair.results, result))
 
     def _run(
         self, unit: Unit, pairs: list[PairMatch], may_start: Callable[[Unit, int], bool]
@@ -242,6 +255,7 @@ class Pipeline:
                 is_float32=self._precision is Precision.FLOAT32 or unit.matcher in self._notes,
                 keypoints=len(getattr(encoding, "points", ())),
                 found=kept,
+                need=need_of(unit, pair, self.recipe) if unit.stage == 2 else None,
             )
             results.append(result)
         return results
@@ -337,6 +351,32 @@ def views_of(unit: Unit, multiple: int, pair: PairMatch) -> tuple[View, ...]:
     return tuple(unit.view(box, multiple, image.turns) for box, image in both)
 
 
+def need_of(unit: Unit, pair: PairMatch, recipe: Recipe) -> CropNeed:
+    """Return whether a pair with critical regions needs a unit of stage 2."""
+    assert pair.regions is not None
+    image0, image1 = pair.images
+    region0, region1 = pair.regions
+    seen = [result.unit for result in pair.results if result.unit.stage == 1]
+
+    def whole(size: Size) -> float:
+        # The finest view of stage 1; without one, the image as it is stored.
+        return max((_scale_of(first, Box.whole(size)) for first in seen), default=1.0)
+
+    return crop_need(
+        (region0, region1),
+        pair.scale,
+        (whole(image0.size), whole(image1.size)),
+        (_scale_of(unit, region0.box), _scale_of(unit, region1.box)),
+        recipe.mkpc,
+    )
+
+
+def _scale_of(unit: Unit, crop: Box) -> float:
+    """Return the view pixels per image pixel of a unit's view of a crop, the smaller of both axes."""
+    # Neither padding nor turns change it.
+    return min(unit.view(crop, multiple=1).scale)
+
+
 def with_regions(
     pair: PairMatch, recipe: Recipe, given: GivenRegions = MappingProxyType({})
 ) -> PairMatch:
@@ -354,8 +394,9 @@ def with_regions(
     image0, image1 = pair.images
     region0 = critical_region(matches.points0, image0.size, recipe.mkpc)
     region1 = critical_region(matches.points1, image1.size, recipe.mkpc)
+    scale = scale_between(matches, (image0.size, image1.size))
     seconds = time.perf_counter() - start
-    return replace(pair, regions=(region0, region1), cluster_seconds=seconds)
+    return replace(pair, regions=(region0, region1), scale=scale, cluster_seconds=seconds)
 
 
 def read_regions(file: Path, image_root: Path, pairs: Iterable[Pair]) -> GivenRegions:

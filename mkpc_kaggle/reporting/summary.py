@@ -146,7 +146,8 @@ def unit_means(run: Run) -> list[tuple[str, int, float, float, float]]:
     results: dict[str, list[tuple[float, float, float]]] = {}
     for unit in (unit for record in run.records for unit in record.units if not unit.failure):
         values = unit.matches, unit.inliers, unit.encode_seconds + unit.match_seconds
-        results.setdefault(unit.unit, []).append(values)
+        if unit.is_needed:
+            results.setdefault(unit.unit, []).append(values)
     return [(name, len(rows), *np.mean(rows, axis=0)) for name, rows in results.items()]
 
 
@@ -195,6 +196,10 @@ def facts(run: Run) -> Iterator[tuple[str, str, str]]:
     if regions := Counter(region.reason for record in records for region in record.regions or ()):
         counts = ", ".join(f"{count} {reason}" for reason, count in regions.most_common())
         yield "critical regions", f"{regions[RegionReason.CROPPED]} of {regions.total()}", counts
+    needs = Counter(need for record in records if (need := needs_crops(record)) is not None)
+    if needs[False]:
+        remark = "scales differ, or the crop restores detail"
+        yield "pairs that need their crops", f"{needs[True]} of {needs.total()}", remark
     if scenes:
         placed = sum(scene.registered for scene in scenes)
         images = sum(scene.images for scene in scenes)
@@ -260,6 +265,12 @@ def pending_lines(run: Run) -> Iterator[str]:
         yield "; ".join(filter(None, ["interrupted", what, "run the same command to continue"]))
     elif what:
         yield f"{what}; run the same command to continue"
+
+
+def needs_crops(record: PairRecord) -> bool | None:
+    """Return whether a pair needs a unit of stage 2; ``None`` if it has no result of any."""
+    needs = [unit.is_needed for unit in record.units if unit.scale is not None]
+    return any(needs) if needs else None
 
 
 def is_doubtful(record: PairRecord) -> bool:

@@ -116,6 +116,11 @@ CHANGES: dict[str, tuple[Callable[[Room], None], Callable[[Room], int]]] = {
         lambda room: room.units(FIRST, SECOND, more="threshold = 1.0"),
         lambda room: 0,
     ),
+    # No pair of the demo's street needs a crop: their scales are alike.
+    "crops where scales differ": (
+        lambda room: room.units(FIRST, SECOND, more='[mkpc]\nwhen = "scale"'),
+        lambda room: 0,
+    ),
     "another option of the matcher": (
         lambda room: room.units(FIRST, SECOND, more="[matchers.sift]\nratio = 0.75"),
         lambda room: 2 * BEFORE,
@@ -147,7 +152,10 @@ def test_a_simulated_run_cut_by_its_limit_at_a_random_moment_and_finished_later_
     # Units of stage 1, 2, 1, ...: points of stage 2 are computed again after a later unit of stage 1.
     count = rng.integers(3, 6)
     costs = tuple(rng.uniform(0.2, 2.0, count).tolist())
-    whole = Scenario(40, costs, 1, math.inf, warm_up=0, misses=0, batches=2, seed=seed)
+    crops = (1.0, 0.3)[seed % 2]
+    whole = Scenario(
+        40, costs, 1, math.inf, warm_up=0, misses=0, batches=2, crop_share=crops, seed=seed
+    )
     store = memory_store()
     fresh = simulate(whole)
     # Up to a limit that is too long to cut the run

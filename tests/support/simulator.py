@@ -41,6 +41,7 @@ from mkpc_kaggle.engine.run import HANG_FACTOR
 from mkpc_kaggle.engine.schedule import RESERVE_SHARE
 from mkpc_kaggle.engine.store import SCHEMA, Store, connected
 from mkpc_kaggle.geometry.coordinates import Size
+from mkpc_kaggle.geometry.crop_need import CropNeed
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 from mkpc_kaggle.pipeline.pair import UnitResult
@@ -129,6 +130,7 @@ class Scenario:
     broken: float = 0.0
     fallback: bool = False
     minibatch: int = 1
+    crop_share: float = 1.0  # of the pairs that need their units of stage 2
 
     @property
     def recipe(self) -> Recipe:
@@ -139,7 +141,7 @@ class Scenario:
 
     @property
     def keys(self) -> Keys:
-        return Keys(tuple(unit.name for unit in self.recipe.units), "mkpc", "estimate", "scene")
+        return Keys(tuple(unit.name for unit in self.recipe.units), "mkpc", "rule", "estimate", "scene")
 
     @property
     def fates(self) -> dict[int, Cause]:
@@ -152,8 +154,14 @@ class Scenario:
 
     @property
     def work(self) -> float:
-        """Seconds that all units take on all pairs and workers, on average and without faults."""
-        return self.pairs * sum(self.costs) * self.cached / self.workers
+        """Seconds that the needed units take on all pairs and workers, on average and without faults."""
+        units = zip(self.recipe.units, self.costs, strict=True)
+        costs = [cost * (self.crop_share if unit.stage == 2 else 1.0) for unit, cost in units]
+        return self.pairs * sum(costs) * self.cached / self.workers
+
+    def needs_crops(self, index: int) -> bool:
+        # Multiples of the golden ratio spread evenly.
+        return index * 0.618034 % 1.0 < self.crop_share
 
     @property
     def cached(self) -> float:
@@ -186,6 +194,7 @@ def random_scenario(seed: int, pairs: int) -> Scenario:
         drift=float(rng.choice([0.3, 1, 1, 1, 2, 10])),
         turn=float(rng.uniform(0.1, 0.9)),
         seed=seed,
+        crop_share=float(np.random.default_rng([seed, 3]).choice([1.0, 1.0, 0.3, 0.05])),
     )
     limit = max(600.0, scenario.work * float(rng.uniform(0.3, 1.3)))
     # Faults a run: some dozens of stalls, a crash or two, now and then a hang.
@@ -350,7 +359,10 @@ class SimulatedSite(Site):
             spent = len(job.indices) * sum(self.costs[unit.name] for unit in job.units)
         found: list[list[UnitResult]] = [[] for _ in job.indices]
         for unit in sorted(job.units, key=lambda unit: unit.stage):
-            for rows in found:
+            for index, rows in zip(job.indices, found, strict=True):
+                if unit.stage == 2 and not scenario.needs_crops(index):
+                    rows.append(UnitResult(unit, Matches.empty(), need=CropNeed(False)))
+                    continue
                 if spent + expected[unit] >= job.seconds:
                     continue  # as a real worker, which begins no unit that would end too late
                 slow = STALL if rng.random() < scenario.stalls else 1.0

@@ -32,7 +32,9 @@ PARTS = len(CHANNELS)  # each scale gives a quarter of the joined map's channels
 RADIUS = 2  # of suppression and of refinement, in pixels
 TEMPERATURE = 0.1  # of the softmax in the refinement window
 PATCH = 3  # pixels per axis from which a keypoint's offsets are computed
-POSITIONS_AT_ONCE = 1024  # intermediate maps fit a CPU's cache
+# On a CPU, intermediate maps fit its cache. A GPU is idle between small blocks: with 65,536 two images of
+# 1,024 pixels take 0.03 instead of 0.20 s on an H100, with equal results.
+POSITIONS_AT_ONCE = {"cpu": 1024, "cuda": 65536}
 
 
 class Aliked(nn.Module):
@@ -196,9 +198,10 @@ class JoinedMap:
         """Sample at positions (Q, 2) of the images ``image`` (Q,): (Q, C) float32, zero outside."""
         pixels, weights = corners(positions, image, self.size)  # (Q, 4)
         sums = []
+        at_once = POSITIONS_AT_ONCE.get(positions.device.type, 1024)
         blocks = zip(
-            torch.split(pixels, POSITIONS_AT_ONCE),
-            torch.split(weights, POSITIONS_AT_ONCE),
+            torch.split(pixels, at_once),
+            torch.split(weights, at_once),
             strict=True,
         )
         for some, shares in blocks:
