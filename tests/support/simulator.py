@@ -141,7 +141,9 @@ class Scenario:
 
     @property
     def keys(self) -> Keys:
-        return Keys(tuple(unit.name for unit in self.recipe.units), "mkpc", "rule", "estimate", "scene")
+        return Keys(
+            tuple(unit.name for unit in self.recipe.units), "mkpc", "rule", "estimate", "scene"
+        )
 
     @property
     def fates(self) -> dict[int, Cause]:
