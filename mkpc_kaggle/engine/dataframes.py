@@ -54,6 +54,9 @@ UNIT_COLUMNS = {
     "failure": str,
     "note": str,
     "keypoints": int,
+    "is_needed": bool,
+    "scale": float,
+    "detail": float,
 }
 CAMERA_COLUMNS = {
     "batch": str,

@@ -25,11 +25,13 @@ from simulator import Scenario, memory_store, simulate
 
 from mkpc_kaggle.cli import main
 from mkpc_kaggle.demo import DemoSet
+from mkpc_kaggle.engine.dataframes import results
 from mkpc_kaggle.engine.request import Ending, RunReport
 
 FIRST = '{ stage = 1, matcher = "sift", long_side = 320 }'
 SECOND = '{ stage = 2, matcher = "sift", long_side = 400 }'
 THIRD = '{ stage = 1, matcher = "sift", long_side = 256 }'
+RULE = '[mkpc]\nwhen = "scale"\nmin_scale = {}'
 BEFORE = 6  # rows of the test side before the change, of 8
 
 
@@ -119,6 +121,11 @@ CHANGES: dict[str, tuple[Callable[[Room], None], Callable[[Room], int]]] = {
     # No pair of the demo's street needs a crop: their scales are alike.
     "crops where scales differ": (
         lambda room: room.units(FIRST, SECOND, more='[mkpc]\nwhen = "scale"'),
+        lambda room: 0,
+    ),
+    # Points of crops do not depend on the rule that asks for them.
+    "crops at all scales": (
+        lambda room: room.units(FIRST, SECOND, more='[mkpc]\nwhen = "scale"\nmin_scale = 1.0'),
         lambda room: 0,
     ),
     "another option of the matcher": (
@@ -257,6 +264,25 @@ def test_a_prune_frees_the_results_of_former_settings_and_keeps_those_of_the_las
     room.units(FIRST, SECOND)
     room.run()
     assert f"{2 * BEFORE} units run" in capsys.readouterr().out
+
+
+def test_a_lower_factor_runs_only_the_crops_that_it_adds(room: Room, capsys) -> None:
+    def units_run(factor: float) -> int:
+        room.units(FIRST, SECOND.replace("400", "360"), more=RULE.format(factor))
+        room.run()
+        return int(re.findall(r"(\d+) units run", capsys.readouterr().out)[-1])
+
+    assert units_run(10.0) == 0, "no pair of the demo's scenes needs a crop"
+    units = results(room.home / "a.work").units
+    crops = units[units["stage"] == 2]
+    assert len(crops) == BEFORE
+    assert not crops["is_needed"].any()
+    assert crops["matches"].sum() == 0
+    between = float(crops["scale"].median())
+    assert units_run(between) == (crops["scale"] >= between).sum()
+    # The other way round, points that were found are not used, and stay in the store.
+    assert units_run(10.0) == 0
+    assert units_run(between) == 0
 
 
 def test_images_added_to_a_folder_are_matched_with_each_other_and_with_the_former_ones(
