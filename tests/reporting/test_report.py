@@ -5,6 +5,7 @@ import json
 import os
 import re
 import sys
+from dataclasses import replace
 from math import inf
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,11 +17,11 @@ from rectified import THREE_UNITS, RectifiedMatcher, run, write_pairs
 from shared import run_command
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine.records import About, Event, EventKind, Row, Table
+from mkpc_kaggle.engine.records import About, Event, EventKind, PairRecord, Row, Table
 from mkpc_kaggle.engine.run import note_event
 from mkpc_kaggle.engine.store import Store
-from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
-from mkpc_kaggle.reporting.report import DRAWING_S, report_page, report_run
+from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, EstimateStats
+from mkpc_kaggle.reporting.report import DRAWING_S, pair_rows, remark, report_page, report_run
 from mkpc_kaggle.reporting.run_log import read_log
 from mkpc_kaggle.reporting.summary import overview
 
@@ -289,3 +290,19 @@ def test_the_command_draws_a_page_with_the_images_of_a_test_side(tmp_path):
     for more, told in (["--test-dir", tmp_path], "<img"), ([], "where the images are is not known"):
         assert run_command("journal", tmp_path / "work", "--report", page, *more) == 0
         assert told in page.read_text()
+
+
+def test_a_flat_pair_is_marked_unless_the_scene_determines_its_f():
+    pair = Pair("a", "b", "0.png", "1.png")
+    stats = EstimateStats(support=99, plane=0.97)
+    flat = PairRecord(0, pair, failure="", stats=stats, source="pair")
+    assert remark(flat) == "flat: one homography explains 97 % of the inliers"
+    assert pair_rows([flat])[0][-1] == remark(flat)
+    for other in (
+        replace(flat, source="scene"),
+        replace(flat, stats=replace(stats, plane=0.89)),
+    ):
+        assert remark(other) == ""
+    # A doubt comes first, and a pair without an F has its reason.
+    assert "by chance" in remark(replace(flat, stats=replace(stats, support=3)))
+    assert remark(replace(flat, source="fallback", failure="too few")) == "too few"
