@@ -129,20 +129,26 @@ def missing_line(pairs: Iterable[Pair]) -> str:
     """Return a line on the images of pairs that are missing; empty if all exist."""
     wanted = dict.fromkeys(file for pair in pairs for file in (pair.file0, pair.file1))
     listed: dict[str, set[str]] = {}
+    unreadable: dict[str, str] = {}
     missing = []
     for file in wanted:
         folder, _, name = file.rpartition(os.sep)
         # Each folder is listed once: a network disk takes long to look for each file.
         if folder not in listed:
             listed[folder] = set()
-            with suppress(OSError, ValueError):  # the folder is missing, too
+            try:
                 listed[folder] = {path.name for path in Path(folder).iterdir()}
+            except (FileNotFoundError, ValueError):  # the folder is missing, too
+                pass
+            except OSError as error:  # no permission, or a file in the place of the folder
+                unreadable[folder] = f"{folder} cannot be read: {error.strerror}"
         if name not in listed[folder]:
             missing.append(file)
     if not missing:
         return ""
     count = f"{len(missing)} of {plural(len(wanted), 'image')}"
-    return f"missing: {count}, the first is {missing[0]}"
+    reason = next(iter(unreadable.values()), "")
+    return f"missing: {count}, the first is {missing[0]}" + (f"; {reason}" if reason else "")
 
 
 def read_train_side(

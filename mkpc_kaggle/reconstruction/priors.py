@@ -67,18 +67,24 @@ def read_intrinsics_table(file: Path, root: Path, images: Iterable[Path]) -> str
     return written(rows)
 
 
+def has_gaps(known: str, root: Path, images: Sequence[Path]) -> bool:
+    """Return whether an image has no camera in the rows of :func:`read_intrinsics_table`."""
+    return bool(_without_camera(known, root, images))
+
+
 def intrinsics_line(known: str, root: Path, images: Sequence[Path]) -> str:
     """Return a line on the images that have a camera in the rows of
     :func:`read_intrinsics_table`.
     """
-    rows = read(known)
-    without = [
-        name
-        for name in (image.relative_to(root).as_posix() for image in images)
-        if camera_of(rows, name) is None
-    ]
+    without = _without_camera(known, root, images)
     line = f"known cameras: {len(images) - len(without)} of {plural(len(images), 'image')}"
     return line + (f"; the first without one is {without[0]}" if without else "")
+
+
+def _without_camera(known: str, root: Path, images: Sequence[Path]) -> list[str]:
+    rows = read(known)
+    names = (image.relative_to(root).as_posix() for image in images)
+    return [name for name in names if camera_of(rows, name) is None]
 
 
 def parse_size(cell: str) -> Size | None:

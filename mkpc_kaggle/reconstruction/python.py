@@ -26,7 +26,11 @@ from mkpc_kaggle.pipeline.availability import Licence
 from mkpc_kaggle.recipe import Recipe
 from mkpc_kaggle.reconstruction.folder import read_folder, require_distinct
 from mkpc_kaggle.reconstruction.panoramas import require_perspective
-from mkpc_kaggle.reconstruction.priors import read_intrinsics_table
+from mkpc_kaggle.reconstruction.priors import (
+    has_gaps,
+    intrinsics_line,
+    read_intrinsics_table,
+)
 from mkpc_kaggle.reconstruction.run import for_cameras, reconstruct_folder
 from mkpc_kaggle.scene.export import MODELS
 from mkpc_kaggle.scene.reconstruction import RegisteredImage, SfmModel
@@ -220,6 +224,8 @@ def with_priors(
     if given.is_partial:
         for line in given.lines:
             warn(line)
+    if known and has_gaps(known, root, files):
+        warn(intrinsics_line(known, root, files))
     recipe = for_cameras(assembly.recipe, intrinsics=known)
     return replace(assembly, recipe=recipe, masks=given)
 

@@ -268,13 +268,16 @@ def test_a_table_that_pandas_would_guess_at_is_refused(tmp_path, content, says):
         list(read_rows(path, ("id", "value")))
 
 
-def test_missing_images_are_counted_before_the_run(side):
+def test_missing_images_are_counted_before_the_run(tmp_path, side):
     rows = ["s1,b,a,c", "s2,b,a,none", "s3,empty,x,y"]
     pairs = read_test_side(side(*rows, images=["b/a.png", "b/c.JPG"]))
     line = missing_line(pairs)
     assert line.startswith("missing: 3 of 5 images, the first is ")
     assert line.endswith("test_images/b/none.png")
     assert missing_line(pairs[:1]) == ""
+    # A folder that exists and cannot be listed is no missing folder.
+    (tmp_path / "test_images" / "empty").touch()
+    assert "test_images/empty cannot be read: Not a directory" in missing_line(pairs)
 
 
 def test_other_formats_stand_for_images_without_the_usual_ones(side):
