@@ -540,6 +540,15 @@ def test_a_unit_that_fails_is_a_warning_and_an_estimate_without_points_names_it(
     raises(lambda: copy.estimate.matrix, UserError, "no F was found: every unit failed")
 
 
+def test_a_matcher_that_cannot_be_loaded_is_a_warning_and_the_reason_of_the_estimate(monkeypatch):
+    monkeypatch.setattr(assembly, "load_matcher", fail)
+    reason = "sift cannot be loaded: RuntimeError: my bug"
+    with pytest.warns(RuntimeWarning, match=f"unit 1:sift@320 failed: {reason}"):
+        match = TwoStageMatcher(SIFT)(pixels(), pixels(40))
+    assert match.failures == {"1:sift@320": reason}
+    assert match.estimate.failure == f"every unit failed: {reason}"
+
+
 @pytest.mark.parametrize(("is_unlucky", "status"), [(True, 1), (False, 0)])
 def test_the_command_match_ends_with_1_if_every_unit_failed(
     tmp_path, monkeypatch, capsys, request, is_unlucky, status
