@@ -57,6 +57,7 @@ UNITS_MM: dict[float, float] = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # inch, cm,
 # Marks of JPEG, and bytes that change a picture if they are decoded
 JPEG_START, JPEG_END = b"\xff\xd8", b"\xff\xd9"
 JPEG_FILL = b"\xaa" * 64
+MAX_TRAILER_BYTES = 1 << 16  # after the end mark, such as a maker's notes
 # In long sides of the image; a focal length outside this range counts as unknown.
 FOCALS = Range(0.2, 20.0)
 # Ratio of the shapes of a stored and a recorded picture; more is a crop, and not rounding.
@@ -132,7 +133,7 @@ def read_image(path: Path) -> Image | Unreadable:
     """Decode a file's stored pixels to RGB; return failures, never raise.
 
     16-bit values are divided by 256. OpenCV decides whether a damaged file is readable: version 5
-    refuses a truncated file. A JPEG file may lack its end mark alone.
+    refuses a truncated file, and so do all versions if it is a JPEG. A JPEG file may lack its end mark alone.
     """
     name = str(path)
     bgr = None
@@ -182,7 +183,10 @@ def decode(data: Pixels, kind: int = cv2.IMREAD_COLOR) -> Pixels | None:
     """
     pixels = _decode_file(data, kind)
     start = data[:4].tobytes()
-    if pixels is None and start.startswith(JPEG_START):
+    # OpenCV 5 refuses these files, and OpenCV 4 fills their missing part without a word. Cameras may
+    # write more after the end mark.
+    lacks_end = JPEG_END not in data[-MAX_TRAILER_BYTES:].tobytes()
+    if start.startswith(JPEG_START) and lacks_end:
         # Some cameras and downloads leave the end mark out. If the picture is complete, further
         # bytes change nothing; if it is cut off, they are decoded.
         pixels, other = (_decode_file(_with_end(data, more), kind) for more in (b"", JPEG_FILL))
