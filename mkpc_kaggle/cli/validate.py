@@ -246,7 +246,7 @@ def _match_and_score(
             validations.append(validation)
             page = _page(arguments, work_dir, compared[number] if compared else "report")
             # The worst status of all runs.
-            session.status = max(status, bool(trouble(report)))
+            session.status = max(status, bool(trouble(report) or report.unsaved))
             status = options.finish(session, page, pairs)
             # A comparison of unequal pairs would mean nothing.
             if compared and not report.ending.is_done:

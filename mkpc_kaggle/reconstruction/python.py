@@ -137,6 +137,9 @@ def reconstruct(
 
         if reason := trouble(result.report):
             raise UserError(reason)
+        # The models are complete, but the next call computes results again.
+        if result.report.unsaved:
+            warn(result.report.unsaved)
         for failure in unreadable_images(result.report.records):
             warn(f"cannot be read: {failure}")
         # The models of an earlier call may lack images, and their files may be missing.
