@@ -16,6 +16,8 @@ from mkpc_kaggle.geometry.coordinates import Pixels, Size
 
 # Photographs of this shape whose pixels are looked at; phones make thousands of them.
 MAX_SAMPLES = 10
+MAX_PIXELS = 150_000_000  # of an image that is decoded here; more are judged by their metadata
+MAX_ROWS = 401  # that are compared; their number is odd, so the middle one is among them
 HEAD_BYTES = 1 << 17  # of a file, which has its XMP there
 MARK = b"equirectangular"  # the value of GPano:ProjectionType in XMP
 # Of the difference between neighbouring columns: the borders of a panorama are neighbours, too.
@@ -35,11 +37,17 @@ def require_perspective(files: Iterable[Path]) -> None:
         samples += 1
         if samples > MAX_SAMPLES:
             return
-        if has_mark(file) or (isinstance(image := read_image(file), Image) and wraps(image.pixels)):
+        if has_mark(file) or (size.width * size.height <= MAX_PIXELS and is_panorama(file)):
             raise UserError(
                 f"{file} is a panorama of 360 degrees ({size.width} x {size.height}), and cameras here are "
                 "perspective; cut each panorama into perspective views of about 90 degrees first"
             )
+
+
+def is_panorama(file: Path) -> bool:
+    """Return whether the pixels of a file are those of a panorama."""
+    image = read_image(file)
+    return isinstance(image, Image) and wraps(image.pixels)
 
 
 def has_shape(size: Size) -> bool:
@@ -58,7 +66,9 @@ def has_mark(file: Path) -> bool:
 
 def wraps(pixels: Pixels) -> bool:
     """Return whether the borders of pixels (H, W, 3) fit together as those of a panorama."""
-    values = pixels.astype(np.float32)
+    # Some rows are enough; all of a large image would fill the memory.
+    rows = np.unique(np.linspace(0, len(pixels) - 1, MAX_ROWS).round().astype(np.intp))
+    values = pixels[rows].astype(np.float32)
     neighbours = np.abs(np.diff(values, axis=1)).mean(axis=(0, 2))
     # In a JPEG, the border is one between blocks of eight columns, too.
     usual = float(max(np.median(neighbours), np.median(neighbours[7::8])))
