@@ -50,8 +50,10 @@ def test_a_rehearsal_on_the_cpu_runs_every_part(tmp_path):
     networks = parts["networks"]["rows"]
     assert [row["verdict"] for row in networks] == [EXPECTED] * len(networks)
     assert all(row["new"] > row["cached"] > 0 for row in parts["speed"]["rows"])
-    (run,) = parts["runs"]["rows"]
-    assert (run["devices"], run["errors of calls"] > 0) == ("cpu", True)
+    # A device-side assert at one place, and at two
+    asserts = parts["runs"]["rows"]
+    assert [row["verdict"] for row in asserts] == [EXPECTED] * 2, done.stdout
+    assert all(row["devices"] == "cpu" and row["errors of calls"] > 0 for row in asserts)
     text = (tmp_path / "gpu.md").read_text()
     assert all(f"## {part['title']}" in text for part in parts.values())
     # The runs' images and journals are gone.
@@ -133,16 +135,18 @@ def test_a_forecast_counts_one_new_image_on_whole_images_and_two_on_crops():
 
 
 @pytest.mark.parametrize(
-    ("text", "good", "told"),
+    ("text", "short", "told"),
     [
-        ("", 15, []),
-        ("", 14, ["2 results are missing, not 1"]),
-        ("no worker is started any more on cuda:0", 15, ["a place was closed"]),
-        ("matching continues on the cpu: cuda:0", 15, ["the CPU took over"]),
+        ("", 1, []),
+        ("", 2, ["results of 2 pairs are missing, not of 1"]),
+        ("", 0, ["results of 0 pairs are missing, not of 1"]),
+        ("no worker is started any more on cuda:0", 1, ["a place was closed"]),
+        ("matching continues on the cpu: cuda:0", 1, ["the CPU took over"]),
+        ("time is up after 28.0s", 8, ["the time was up, with 14 of 16 results"]),
     ],
 )
-def test_a_bad_pair_may_cost_one_result_and_no_place(text, good, told):
+def test_a_bad_pair_may_cost_its_own_results_and_no_place(text, short, told):
     event = {"error": "AcceleratorError: CUDA error: device-side assert triggered", "call": "match"}
     reason = "1:a@64 is skipped on pair 2 (CUDA error: device-side assert triggered)"
-    outcome = runs.Outcome(0, f"{text}\n{reason}", 1.0, [event], good, 16, "")
+    outcome = runs.Outcome(0, f"{text}\n{reason}", 1.0, [event], 14, 16, short, "")
     assert runs.one_pair_is_given_up(outcome) == told

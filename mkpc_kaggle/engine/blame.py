@@ -7,7 +7,7 @@ One rule serves every cause: a device that fails, a worker that dies or hangs, m
   closed. Its losses since its last answer then say nothing about the items: they are forgiven.
 
 Both can be told apart only if a place gets other items after a loss. Until its next answer, a place
-gets no item that was lost before, and before its third loss an item that worked before
+gets no pair with a unit that was lost before, and before its third loss an item that worked before
 (:func:`mkpc_kaggle.engine.schedule.trial_job`).
 """
 

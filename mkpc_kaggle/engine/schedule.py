@@ -285,17 +285,17 @@ def trial_job(view: View, wanted: NDArray[Any], lost: Sequence[frozenset[Item]])
     do.
 
     ``wanted`` (N, U) are phases. Another loss must say whether the place is at fault. So after a
-    first loss the place gets other items, and after a second one an item that worked before:
+    first loss the place gets other pairs, and after a second one an item that worked before:
     several bad pairs in a row must not close a place. Before any item worked, the place gets
     another pair and another unit, since a unit may fail on all pairs.
     """
     state = view.state
     others = wanted.copy(order="F")
     others[state.matching] = NEVER
-    for item in state.tries.alone:
-        match item:
-            case ("unit", int(index), str(unit)):
-                others[state.alike(index), state.number_of[unit]] = NEVER
+    # No unit of such a pair: without points of stage 1, a crop is the whole image, on which the same
+    # matcher fails in the same way.
+    for index in suspect_pairs(state):
+        others[state.alike(index)] = NEVER
     phase = Phase(int(others.min(initial=NEVER)))
     tried = frozenset[Item]().union(*lost)
     proven = [item for item in state.tries.proven if item not in tried]

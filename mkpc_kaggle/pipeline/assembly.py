@@ -2,7 +2,7 @@
 
 from collections.abc import Container, Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from importlib import metadata
 from os import PathLike, fspath
 from pathlib import Path
@@ -96,9 +96,11 @@ class Assembly:
         # If half precision overflows, a matcher is loaded again with this placement.
         exact = replace(self.placement, precision=Precision.FLOAT32)
         cache_bytes = ENCODING_CACHE_BYTES
+        synchronise = None
         if device != "cpu":
             import torch
 
+            synchronise = partial(torch.cuda.synchronize, device)
             # Of a GPU's own memory: encodings stay where they were computed.
             free, _ = torch.cuda.mem_get_info(device)  # most of the GPU is still free
             cache_bytes = int(free * CACHE_SHARE / self.sharing)
@@ -111,6 +113,7 @@ class Assembly:
             regions=self.regions,
             masks=self.masks,
             precision=self.placement.precision,
+            synchronise=synchronise,
         )
 
     def unit_settings(self, unit: Unit, precision: Precision | None = None) -> dict[str, Any]:

@@ -53,7 +53,8 @@ class Pipeline:
     of one shape to encode. A unit that runs out of memory halves its minibatch from then on.
     Encodings of whole images, which many pairs share, are cached up to ``cache_bytes``. ``regions``
     replace MKPC's critical regions. Matches with a point that ``masks`` leave out are dropped.
-    Errors of the matchers in ``raising`` are raised, and do not become failed results. Results have
+    Errors of the matchers in ``raising`` are raised, and do not become failed results.
+    ``synchronise()`` is called after an error, and raises if the device has failed. Results have
     keypoints, and descriptors, if ``keeps_keypoints`` and ``keeps_descriptors`` are set.
     """
 
@@ -68,6 +69,7 @@ class Pipeline:
         regions: GivenRegions = MappingProxyType({}),
         masks: Masks | None = None,
         precision: Precision = Precision.FLOAT32,
+        synchronise: Callable[[], None] | None = None,
     ) -> None:
         self._precision = precision
         self.raising: Container[str] = ()
@@ -79,6 +81,7 @@ class Pipeline:
         self.regions = regions
         self._load = load
         self._load_float32 = load_float32
+        self._synchronise = synchronise
         self._minibatches: dict[Unit, int] = {}  # of units that ran out of memory
         self._ran: set[Unit] = set()  # their times no longer include a warm-up
         self._matchers: dict[str, Matcher[Any]] = {}
@@ -174,6 +177,8 @@ class Pipeline:
             return self._match(unit, pairs)
         except Exception as error:
             failure = failure_of(error)
+            if failure is FailureKind.RAISED:
+                self._require_device(unit)
             # A NaN may also come from the pictures; then float32 raises again, and the pair fails.
             is_overflow = isinstance(error, NonFiniteError)
             if is_overflow and self._fall_back_to_float32(unit.matcher, error):
@@ -201,6 +206,20 @@ class Pipeline:
         torch.cuda.empty_cache()  # cuBLAS and cuDNN cannot use PyTorch's cached memory
         self._minibatches[unit] = len(pairs) // 2
         return []
+
+    def _require_device(self, unit: Unit) -> None:
+        """Raise the device's error if it has failed.
+
+        Kernels run asynchronously: the values of one that failed may first raise another error.
+        The pair would then get the wrong reason, and each later pair of this process would fail.
+        """
+        if self._synchronise is None:
+            return
+        try:
+            self._synchronise()
+        except Exception as error:
+            error.add_note(f"in {unit.name}")
+            raise
 
     def _fall_back_to_float32(self, name: str, error: Exception) -> bool:
         """Switch the matcher to float32. Return False if it cannot, or has switched before."""

@@ -11,9 +11,11 @@ from typing import Any
 import pytest
 import rectified
 from faulty import (
+    ASSERTED,
     BROKEN,
     FaultyMatcher,
     NarrowMatcher,
+    PoisonedMatcher,
     break_device,
     breaks_after,
     exhaust_gpu,
@@ -154,6 +156,32 @@ def test_a_pair_that_fails_on_each_gpu_costs_its_own_units_and_no_gpu(
     skipped = [event.text for event in report.explanations if "skipped" in event.text]
     assert len(skipped) == len(THREE_UNITS.units)
     assert all(f"on pair {VICTIM} (the device failed: RuntimeError: {error}" in s for s in skipped)
+    assert matrices(report)[:VICTIM] == matrices(undisturbed)[:VICTIM]
+    assert matrices(report)[VICTIM + 1 :] == matrices(undisturbed)[VICTIM + 1 :]
+
+
+@pytest.mark.parametrize("first", [ASSERTED, "index 7 is out of bounds"])
+@pytest.mark.parametrize("minibatch", [1, 8])
+@pytest.mark.parametrize("gpus", [1, 2, 4])
+def test_a_pair_that_spoils_its_process_costs_no_other_pair_a_unit(
+    run_at, undisturbed, monkeypatch, gpus, minibatch, first
+):
+    # After a device-side assert, each call in this process fails, also for good pairs.
+    monkeypatch.setattr(Assembly, "minibatch", minibatch)
+
+    def started() -> Pipeline:
+        matcher = PoisonedMatcher(first=first, seconds=0.002)
+        load = {matcher.name: matcher}.__getitem__
+        return Pipeline(THREE_UNITS, load, minibatch=minibatch, synchronise=matcher.synchronise)
+
+    cpu = RectifiedMatcher()
+    places = [thread_place(f"cuda:{n}", cpu, pipeline=started) for n in range(gpus)]
+    report = run_at(*places, fallback=[thread_place("cpu", cpu)])
+    assert (cpu.calls, [place.name for place in places if place.closed]) == ([], [])
+    failed = [r.index for r in report.records if any(unit.failure for unit in r.units)]
+    assert failed == [VICTIM]
+    reasons = {unit.failure.partition(", in ")[0] for unit in report.records[VICTIM].units}
+    assert reasons == {f"the device failed: RuntimeError: {ASSERTED}"}
     assert matrices(report)[:VICTIM] == matrices(undisturbed)[:VICTIM]
     assert matrices(report)[VICTIM + 1 :] == matrices(undisturbed)[VICTIM + 1 :]
 

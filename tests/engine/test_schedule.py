@@ -23,6 +23,7 @@ from simulator import (
 )
 
 from mkpc_kaggle.data.competition import Pair
+from mkpc_kaggle.engine.blame import Item
 from mkpc_kaggle.engine.budget import Budget, Costs
 from mkpc_kaggle.engine.jobs import Cause, Failure, MatchJob, Phase
 from mkpc_kaggle.engine.keys import Keys
@@ -87,8 +88,8 @@ class Run:
         for unit in units:
             self.costs.observe(unit.name, 1.0)
 
-    def next_work(self, now: float = 0.0) -> NextWork:
-        return next_work(self.state, self.costs, self.budget, self.crew, now)
+    def next_work(self, now: float = 0.0, lost: Sequence[frozenset[Item]] = ()) -> NextWork:
+        return next_work(self.state, self.costs, self.budget, self.crew, now, lost)
 
     def next(self, now: float = 0.0) -> MatchJob | None:
         """The next job of matching, which is under way then."""
@@ -196,6 +197,17 @@ def test_a_unit_that_was_lost_before_is_alone_in_its_job():
     # Another loss then has one cause. The pair's other units run first, on their own.
     assert (suspect.indices, suspect.units) == ((0,), (THIRD,))
     assert (other.indices, other.units) == ((1,), (THIRD, SECOND))
+
+
+def test_a_place_that_lost_a_job_gets_no_other_unit_of_its_pair():
+    run = Run(3, had=[(), (SWEEP,), (SWEEP,)], minibatch=8)
+    run.learn(*UNITS)
+    lost = ("unit", 0, SWEEP.name)
+    run.state.tries.lose([lost], DIED)
+    run.state.tries.succeed(("unit", 1, SWEEP.name))
+    job = run.next_work(lost=[frozenset([lost])]).match
+    # Without points of stage 1, stage 2 would look at the same whole images.
+    assert job.indices == (1, 2)
 
 
 def test_better_crops_come_after_all_units_that_fit_and_with_them_the_prefix_takes_longer():

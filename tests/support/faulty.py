@@ -24,6 +24,7 @@ from mkpc_kaggle.engine.worker import MatchRunner, reconstruct
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.matchers.contract import Picture
 from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.pipeline.stages import Pipeline
 from mkpc_kaggle.scene.choose import Choice, Reason
@@ -32,6 +33,7 @@ from mkpc_kaggle.scene.reconstruction import Reconstruction, RegisteredImage, Sf
 from mkpc_kaggle.scene.view_graph import BatchImage
 
 BROKEN = "CUDA error: an illegal memory access was encountered"
+ASSERTED = "CUDA error: device-side assert triggered"
 
 
 def die() -> None:
@@ -97,6 +99,34 @@ class FaultyMatcher(RectifiedMatcher):
         is_due = not self.once.exists()
         self.once.touch()
         return is_due
+
+
+@dataclass
+class PoisonedMatcher(RectifiedMatcher):
+    """Asserts on the device at the pair of brightness ``at``. After that, each call of this object fails, as
+    each call of a process does.
+
+    ``first`` is the text of the first error. Errors of Python need not name the device.
+    """
+
+    at: int = 13
+    first: str = ASSERTED
+    is_poisoned: bool = False
+
+    def encode(self, pictures: Sequence[Picture]) -> list[Seen]:
+        self.synchronise()
+        return super().encode(pictures)
+
+    def _match(self, seen0: Seen, seen1: Seen) -> Matches:
+        self.synchronise()
+        if seen0.brightness == self.at:
+            self.is_poisoned = True
+            raise RuntimeError(self.first)
+        return super()._match(seen0, seen1)
+
+    def synchronise(self) -> None:
+        if self.is_poisoned:
+            raise RuntimeError(ASSERTED)
 
 
 @dataclass
