@@ -20,6 +20,7 @@ from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.metrics import pose_error
 from mkpc_kaggle.geometry.robust import (
     FALLBACK_FUNDAMENTAL,
+    DistinctMatches,
     Method,
     ModelKind,
     RobustConfig,
@@ -295,3 +296,23 @@ def test_points_that_opencv_refuses_fail_one_permutation_and_the_estimate_if_all
     assert len(calls) == 3
     reason = "OpenCV refused the points: sample_size <= points_size_"
     assert found.failure == ("" if refused == 1 else reason)
+
+
+VALUES = st.sampled_from([0.0, -0.0, 1.0, 2.5, -3.0, np.nan, np.inf])
+
+
+@given(arrays(np.float32, st.tuples(st.integers(0, 40), st.just(4)), elements=VALUES))
+def test_distinct_matches_are_those_of_numpy_in_order_of_first_appearance(rows):
+    found = DistinctMatches.of(Matches(rows[:, :2], rows[:, 2:], np.ones(len(rows), np.float32)))
+    finite = np.isfinite(rows).all(axis=1)
+    wanted: list[tuple[float, ...]] = []
+    for row in map(tuple, rows[finite].tolist()):
+        if row not in wanted:
+            wanted.append(row)
+    made = np.hstack([found.points0, found.points1])
+    assert list(map(tuple, made.tolist())) == wanted
+    numbers = [
+        wanted.index(tuple(row)) if ok else -1
+        for row, ok in zip(rows.tolist(), finite, strict=True)
+    ]
+    assert found.index.tolist() == numbers
