@@ -18,12 +18,12 @@ from mkpc_kaggle.engine.state import State
 from mkpc_kaggle.engine.store import Kind, Result, Source, Store
 from mkpc_kaggle.errors import plural
 
+# Faults of a run with different texts, and its decisions. The number of units that fit may change with
+# each job, for hours.
+MAX_FAULTS, MAX_PLANS = 1000, 10_000
 # A job that takes this multiple of its measured cost hangs. Stalls of twenty times the cost, as in the
 # simulator, must not cost a worker.
 HANG_FACTOR = 30.0
-
-
-MAX_FAULTS = 1000  # of a run, with different texts
 
 
 class EventLog:
@@ -45,11 +45,15 @@ class EventLog:
 
     def explain(self, text: str) -> None:
         """Record a decision."""
+        if len(self.plans) > MAX_PLANS:
+            return
+        if len(self.plans) == MAX_PLANS:
+            text = "further decisions are not listed"
         self.plans.append(self.note(EventKind.PLAN, text))
 
     def fault(self, text: str) -> None:
         """Record a fault, once for each text: a broken disk would fill the store with them."""
-        if len(self.faults) == MAX_FAULTS:
+        if len(self.faults) >= MAX_FAULTS:
             text = "further faults are not listed"
         if text not in self.faults:
             self.faults.append(text)

@@ -18,8 +18,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from rectified import SECOND, SWEEP, THIRD, THREE_UNITS, RectifiedMatcher, matrices, run
+from simulator import VirtualClock, memory_store
 
 from mkpc_kaggle.data.competition import Pair
+from mkpc_kaggle.engine import run as engine_run
 from mkpc_kaggle.engine import store as store_module
 from mkpc_kaggle.engine.budget import Budget, Costs
 from mkpc_kaggle.engine.console import Progress
@@ -798,3 +800,15 @@ def test_the_log_of_a_killed_run_in_a_read_only_directory_is_read(
         assert reader.about(["in the log"]) == {"in the log": 1}
     assert {path.name: path.read_bytes() for path in killed.iterdir()} == before
     assert sorted(path.name for path in tmp_path.iterdir()) == ["killed", "work"], "no copy is left"
+
+
+def test_the_lists_of_faults_and_decisions_end_at_a_number(monkeypatch):
+    monkeypatch.setattr(engine_run, "MAX_FAULTS", 3)
+    monkeypatch.setattr(engine_run, "MAX_PLANS", 3)
+    log = EventLog(memory_store(), Budget(0.0, clock=VirtualClock()))
+    for number in range(10):
+        log.fault(f"fault {number}")
+        log.explain(f"decision {number}")
+    assert log.faults == ["fault 0", "fault 1", "fault 2", "further faults are not listed"]
+    texts = [event.text for event in log.plans]
+    assert texts == ["decision 0", "decision 1", "decision 2", "further decisions are not listed"]
