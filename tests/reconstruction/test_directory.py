@@ -229,7 +229,7 @@ def test_nothing_that_is_read_lies_in_the_directory_of_results(tmp_path, monkeyp
 def test_new_models_leave_files_of_others_where_they_are(tmp_path, monkeypatch):
     others = ["models/0/thesis.txt", "models/3/mine/notes.txt", "models/0/points3D.ply"]
     write(tmp_path, FILES + [f"models/1/{name}" for name in MODEL_FILES])
-    monkeypatch.setattr(colmap, "_fill", lambda *_: None)
+    monkeypatch.setattr(colmap, "_fill", lambda *_, **__: None)
 
     def fill(folder: Path) -> None:
         write(folder, [*MODEL_FILES], "new")
@@ -290,7 +290,7 @@ def test_former_files_stay_until_the_new_ones_are_whole(tmp_path, monkeypatch):
         model = SimpleNamespace(images=(), colmap=SimpleNamespace(frames={}, write=fill))
         colmap.write_files(HeldDirectory.of(tmp_path), None, {}, [model])
 
-    monkeypatch.setattr(colmap, "_fill", lambda *_: None)
+    monkeypatch.setattr(colmap, "_fill", lambda *_, **__: None)
     with pytest.raises(OSError, match="No space"):
         write_files(is_full=True)
     assert files_of(tmp_path) == dict.fromkeys(FILES, "former")
