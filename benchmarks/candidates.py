@@ -2,20 +2,21 @@
 
 python -m benchmarks.candidates --train-dir DIR [DIR ...] --journals DIR [DIR ...] --facts FILE
     [--scenes NAME ...] [--confirm NAME ...] [--images 8 10 12] [--seeds 4] [--supports 0.1]
-    [--processes N]
+    [--true-edges] [--held-out] [--processes N]
 
 Journals, the work directories of `validate --min-covisibility 0` (or with scenes, which match extra
 pairs), provide the matches and each pair's own F. A candidate is a reconstruction whose tracks come
 from all units (today's rule) or from a single one. With ``--supports`` further candidates have tracks
-from all units, without edges of less support (``min_support`` of [scene]). All candidates have the same
-pairs, and the same matches and own F of a pair.
+from all units, without edges of less support (``min_support`` of [scene]). With ``--true-edges`` one has
+no wrong edges, by truth. All candidates have the same pairs, and the same matches and own F of a pair.
 
 Each draw of images is mapped once, and its facts become a line of ``--facts``: accuracies by truth, and
 everything that a judge may use. A further run maps only the draws that the file lacks. The tables
 compare each judge with today's rule, with each single candidate and with the oracle, which chooses
 by truth. ``--confirm`` names scenes that were not used to choose the judge; they get tables of their
 own. ``chosen`` is the share of draws in which a judge takes the better of the candidates, among draws
-in which they differ by more than ``TIE``.
+in which they differ by more than ``TIE``. A last table counts verified edges that are wrong by truth.
+``--held-out`` maps a second time without every fifth pair, for judges by these pairs.
 """
 
 import argparse
@@ -24,6 +25,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, replace
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 from statistics import fmean, median
@@ -31,30 +33,46 @@ from time import process_time
 from typing import Any, TypeAlias
 
 import numpy as np
+import pycolmap
 
 from mkpc_kaggle.data.competition import TrainScene, TruePair, read_train_side
 from mkpc_kaggle.engine.records import Table, read_images, read_points, read_records
 from mkpc_kaggle.engine.store import Store
 from mkpc_kaggle.evaluation.compare import paired_difference
 from mkpc_kaggle.evaluation.validate import error_of
-from mkpc_kaggle.geometry.cameras import fundamental_of_cameras
+from mkpc_kaggle.geometry.cameras import Camera, fundamental_of_cameras
 from mkpc_kaggle.geometry.coordinates import Matrix3
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.metrics import pair_accuracy, pose_error
 from mkpc_kaggle.geometry.robust import sampson_distances
 from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.recipe import Recipe, SceneConfig, recipe_of
+from mkpc_kaggle.scene import colmap
 from mkpc_kaggle.scene.densify import extra_pairs
+from mkpc_kaggle.scene.keypoints import MergedGraph
 from mkpc_kaggle.scene.reconstruct import Solution, models_of, reconstruct_batch
-from mkpc_kaggle.scene.reconstruction import RegisteredImage
-from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair, tracks_of
+from mkpc_kaggle.scene.reconstruction import LOOSE_SIGMA, RegisteredImage
+from mkpc_kaggle.scene.view_graph import MIN_MATCHES, BatchImage, BatchPair, ViewGraph, tracks_of
 
+TRUE = "!"  # suffix of a candidate without wrong edges
 ALL = "all"  # the candidate of today: tracks from all units
 SCALES_PX = (0.5, 1.0, 2.0)  # of the robust evidence of matches
 HELD_OUT = 5  # every fifth pair is kept out of the second mapping
 TIE = 0.005  # of mAA
+SIGMAS = (0.01, 0.03, 0.1, LOOSE_SIGMA, 1.0, np.inf)  # upper bounds of classes, in model sizes
+MARGINS = (
+    0.01,
+    0.02,
+    0.03,
+    0.05,
+)  # of the product's judge: today's rule wins unless another is nearer
 LOST = 90.0  # degrees; of a pair that a candidate has no F for
 MAX_ANGLE = 10.0  # degrees; larger disagreements count as this
+RIGHT_PX = 2.0  # Sampson distance of a right match from the true F
+MIN_RIGHT = 0.5  # share of the inliers of a right edge
+# The same of matches before verification, of which many are wrong on right edges, too
+RIGHT_MATCH_PX = 3.0
+MIN_RIGHT_MATCHES = 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,6 +163,50 @@ def settings_of(candidate: str) -> tuple[str, float]:
     return unit, float(share or 0)
 
 
+def batch_of(draw: "Draw", pairs: Sequence[Stored], candidate: str) -> list[BatchPair]:
+    """Return the pairs of a candidate, without tracks on wrong edges if its name ends with TRUE."""
+    batch = []
+    for pair in pairs:
+        tracks = tracks_from(pair, candidate.removesuffix(TRUE))
+        if candidate.endswith(TRUE):
+            F = draw.true_fundamental(pair.names)
+            if share_right(F, tracks, RIGHT_MATCH_PX) < MIN_RIGHT_MATCHES:
+                tracks = Matches.empty()
+        batch.append(pair.batch_pair(tracks))
+    return batch
+
+
+def share_right(F: Matrix3, matches: Matches, pixels: float = RIGHT_PX) -> float:
+    """Return the share of matches that agree with the true F."""
+    if not len(matches):
+        return 0.0
+    return float(np.mean(sampson_distances(F, matches) < pixels))
+
+
+def edges_of(draw: "Draw", candidate: str) -> list[tuple[int, float, float]]:
+    """Return each verified edge: inliers, their share that is right, and their median distance in
+    pixels from the true F.
+    """
+    merged = MergedGraph(ViewGraph.of_pairs(batch_of(draw, draw.pairs, candidate)))
+    config = draw.recipe.scene or SceneConfig()
+    with pycolmap.Database.open(":memory:") as database:
+        cameras = colmap._write_images(database, merged, {}, config.camera_model)
+        geometries = colmap.verify(merged, cameras)
+    found = []
+    for edge, geometry in zip(merged.graph.edges, geometries, strict=True):
+        indices = geometry.inlier_matches
+        if len(indices) < MIN_MATCHES:
+            continue
+        names = (merged.graph.images[edge.first].name, merged.graph.images[edge.second].name)
+        points0 = merged.keypoints[edge.first][indices[:, 0]]
+        points1 = merged.keypoints[edge.second][indices[:, 1]]
+        inliers = Matches(points0, points1, np.ones(len(indices)))
+        F = draw.true_fundamental(names)
+        distance = float(np.median(sampson_distances(F, inliers)))
+        found.append((len(indices), share_right(F, inliers), distance))
+    return found
+
+
 def tracks_from(pair: Stored, candidate: str) -> Matches:
     """Return the matches that a candidate maps from."""
     unit, _ = settings_of(candidate)
@@ -153,11 +215,13 @@ def tracks_from(pair: Stored, candidate: str) -> Matches:
     return Matches.concatenate(each.matches for each in pair.results if each.unit.name == unit)
 
 
-def mapped(pairs: Sequence[Stored], candidate: str, recipe: Recipe) -> tuple[Solution, float]:
+def mapped(draw: "Draw", pairs: Sequence[Stored], candidate: str) -> tuple[Solution, float]:
     """Return a candidate's cameras and choices, and its CPU seconds."""
-    batch = [pair.batch_pair(tracks_from(pair, candidate)) for pair in pairs]
+    batch = batch_of(draw, pairs, candidate)
+    recipe = draw.recipe
     start = process_time()
-    config = replace(recipe.scene or SceneConfig(), min_support=settings_of(candidate)[1])
+    share = settings_of(candidate.removesuffix(TRUE))[1]
+    config = replace(recipe.scene or SceneConfig(), min_support=share)
     solution = reconstruct_batch(batch, config, recipe.focal, recipe.magsac)
     return solution, process_time() - start
 
@@ -228,6 +292,11 @@ class Draw:
     recipe: Recipe
     pairs: tuple[Stored, ...]
     candidates: tuple[str, ...]
+    cameras: Mapping[str, Camera]  # true ones, by image name
+    is_held_out: bool = False
+
+    def true_fundamental(self, names: tuple[str, str]) -> Matrix3:
+        return fundamental_of_cameras(*(self.cameras[name] for name in names))
 
     @property
     def key(self) -> tuple[str, int, int]:
@@ -239,14 +308,14 @@ def facts_of(draw: Draw) -> dict[str, Any]:
     scored = [pair for pair in draw.pairs if pair.true is not None]
     # Every fifth of the scored pairs in a random order, the same for all candidates
     order = np.random.default_rng(draw.seed).permutation(len(scored)).tolist()
-    out = set(order[::HELD_OUT])
+    out = set(order[::HELD_OUT] if draw.is_held_out else [])
     kept = [pair for number, pair in enumerate(scored) if number not in out]
     kept += [pair for pair in draw.pairs if pair.true is None]
     candidates: dict[str, Any] = {}
     models: dict[str, list[CamerasOfModel]] = {}
     matrices: dict[str, list[Matrix3 | None]] = {}
     for name in draw.candidates:
-        solution, seconds = mapped(draw.pairs, name, draw.recipe)
+        solution, seconds = mapped(draw, draw.pairs, name)
         models[name] = cameras_by_digest(solution)
         matrices[name] = [scene_fundamental(models[name], pair) for pair in scored]
         accuracies = []
@@ -255,11 +324,12 @@ def facts_of(draw: Draw) -> dict[str, Any]:
             F = pair.F if choice.F is None else choice.F
             accuracies.append(accuracy(F, pair, draw.scene))
             reasons.append(choice.reason.name)
-        again, more = mapped(kept, name, draw.recipe)
-        rest = cameras_by_digest(again)
+        rest: list[CamerasOfModel] = []
+        if out:
+            rest = cameras_by_digest(mapped(draw, kept, name)[0])
         candidates[name] = {
             "seconds": seconds,
-            "held_out_seconds": more,
+            "edges": edges_of(draw, name),
             "accuracies": accuracies,
             "reasons": reasons,
             "models": [len(model) for model in models[name]],
@@ -439,6 +509,13 @@ def choice_of(values: Mapping[str, float]) -> str:
     return max(values, key=lambda name: values[name])
 
 
+def by_rotations(facts: Facts, margin: float) -> str:
+    """Return the choice of the product's judge (:mod:`mkpc_kaggle.scene.candidates`)."""
+    angles = {name: -value for name, value in own_judge(0)(facts).items()}
+    best = min(angles, key=lambda name: angles[name])
+    return best if angles[best] < (1 - margin) * angles[ALL] else ALL
+
+
 # Tables
 
 
@@ -464,6 +541,8 @@ def table(title: str, draws: Sequence[Facts]) -> list[str]:
         rules[f"always {unit}"] = lambda _, unit=unit: unit  # type: ignore[misc]
     for name, judge in JUDGES.items():
         rules[name] = lambda facts, judge=judge: choice_of(judge(facts))  # type: ignore[misc]
+    for margin in MARGINS:
+        rules[f"rotations of own F, {margin:.0%} nearer"] = partial(by_rotations, margin=margin)
     rules["the oracle"] = lambda facts: choice_of(oracle(facts))
     most = gain_over_today(draws, rules["the oracle"])[0]
     for name, rule in rules.items():
@@ -475,6 +554,53 @@ def table(title: str, draws: Sequence[Facts]) -> list[str]:
         cells += [text, f"{share_chosen(draws, rule):.2f}", f"{gain / most:.2f}" if most else ""]
         lines.append(f"| {name} | {' | '.join(cells)} |")
     return lines
+
+
+def edge_table(draws: Sequence[Facts]) -> list[str]:
+    """Return a Markdown table of verified edges by scene and candidate."""
+    heads = ["edges of", "verified", "wrong", "inliers", "on wrong edges", "px on right edges"]
+    lines = [f"| {' | '.join(heads)} |", "|" + " --- |" * len(heads)]
+    for scene in dict.fromkeys(facts["scene"] for facts in draws):
+        found = [facts["candidates"] for facts in draws if facts["scene"] == scene]
+        for name in found[0]:
+            edges = [edge for candidates in found for edge in candidates[name].get("edges", ())]
+            if not edges:
+                continue
+            wrong = [inliers for inliers, share, _ in edges if share < MIN_RIGHT]
+            total = sum(inliers for inliers, _, _ in edges)
+            pixels = median(distance for _, share, distance in edges if share >= MIN_RIGHT)
+            counts = f"{len(edges)} | {len(wrong)} | {total} | {sum(wrong)} | {pixels:.2f}"
+            lines.append(f"| {scene}, {name} | {counts} |")
+    return lines
+
+
+def sigma_table(draws: Sequence[Facts]) -> list[str]:
+    """Return a Markdown table: what F of the cameras gains over F of the pair, by the larger sigma of
+    the two centres, over the pairs of all candidates.
+    """
+    gains: dict[float, list[float]] = {upper: [] for upper in SIGMAS}
+    loose: dict[str, list[float]] = defaultdict(list)
+    for facts in draws:
+        for name, candidate in facts["candidates"].items():
+            pairs = zip(candidate["by_scene"], facts["own"], candidate["pair_sigmas"], strict=True)
+            for scene, own, sigmas in pairs:
+                if not sigmas:
+                    continue
+                sigma = max(each[1] if each else np.inf for each in sigmas)
+                gains[next(upper for upper in SIGMAS if sigma <= upper)].append(scene - own)
+                # A pair that keeps its own F gains nothing by it.
+                if name == ALL:
+                    loose[facts["scene"]].append(own - scene if sigma > LOOSE_SIGMA else 0.0)
+    lines = ["| sigma up to | pairs | gain of the cameras' F |", "| --- | --- | --- |"]
+    for upper, found in gains.items():
+        if found:
+            lines.append(f"| {upper:g} | {len(found)} | {fmean(found):+.3f} |")
+    kept = ", ".join(f"{scene} {fmean(found):+.3f}" for scene, found in loose.items())
+    return [
+        *lines,
+        "",
+        f"today's rule, F of the pair above {LOOSE_SIGMA:g}, mean over pairs: {kept}",
+    ]
 
 
 def gain_over_today(draws: Sequence[Facts], rule: Callable[[Facts], str]) -> tuple[float, str]:
@@ -518,13 +644,19 @@ def key_of(facts: Facts) -> tuple[str, int, int]:
 def draws_of(arguments: argparse.Namespace) -> Iterator[Draw]:
     """Yield the draws of all scenes that the journals have."""
     scenes: dict[str, TrainScene] = {}
+    cameras: dict[str, dict[str, Camera]] = {}
     for directory in arguments.train_dir:
+        for scene in read_train_side(directory, min_covisibility=0):
+            of = cameras.setdefault(scene.name, {})
+            for true in scene.pairs:
+                of |= zip(true.pair.names, (true.camera0, true.camera1), strict=True)
         for scene in read_train_side(directory):
             if not arguments.scenes or scene.name in arguments.scenes:
                 scenes[scene.name] = scene
     for name, (recipe, pairs) in read_journals(arguments.journals, scenes).items():
         units = [unit.name for unit in recipe.units if unit.tracks]
         supports = [f"{ALL}+{share:g}" for share in arguments.supports]
+        true_edges = [ALL + TRUE] if arguments.true_edges else []
         number = len({image for pair in pairs for image in pair.names})
         for images in arguments.images:
             # All images of a scene make a single draw.
@@ -536,7 +668,9 @@ def draws_of(arguments: argparse.Namespace) -> Iterator[Draw]:
                     seed,
                     recipe,
                     tuple(drawn(pairs, images, seed)),
-                    (ALL, *units, *supports),
+                    (ALL, *units, *supports, *true_edges),
+                    cameras[name],
+                    arguments.held_out,
                 )
 
 
@@ -552,6 +686,8 @@ def main() -> None:
     parser.add_argument("--images", nargs="+", type=int, default=[8, 10, 12])
     parser.add_argument("--seeds", type=int, default=4)
     parser.add_argument("--supports", nargs="*", type=float, default=(0.1,))
+    parser.add_argument("--true-edges", action="store_true")
+    parser.add_argument("--held-out", action="store_true")
     parser.add_argument("--processes", type=int, default=1)
     arguments = parser.parse_args()
     done = {key_of(facts) for facts in read_facts(arguments.facts)}
@@ -575,6 +711,7 @@ def main() -> None:
         groups["all"] = [*draws]
     for title, group in groups.items():
         print("\n".join(table(title, group)), "\n", flush=True)
+    print("\n".join([*edge_table(draws), "", *sigma_table(draws)]), flush=True)
 
 
 if __name__ == "__main__":

@@ -134,13 +134,21 @@ class SceneConfig:
     pairs_per_image: float = 10.0
     cameras: CameraSharing = CameraSharing.AUTO
     camera_model: CameraModel = CameraModel.SIMPLE_PINHOLE
+    # Reconstructions of a batch to choose from, see :mod:`mkpc_kaggle.scene.candidates`
+    candidates: int = 1
     # Minimum share of inliers of an edge, see :mod:`mkpc_kaggle.scene.edges`; 0: all edges.
     min_support: float = 0.0
     threads: int = 1  # of the mapper; with more, the last digits vary from run to run
     intrinsics: str = ""  # known cameras, as lines of :mod:`mkpc_kaggle.geometry.intrinsics`
 
     def __post_init__(self) -> None:
-        check_ranges(self, pairs_per_image=AT_LEAST_0, min_support=Range(0, 1), threads=AT_LEAST_1)
+        check_ranges(
+            self,
+            pairs_per_image=AT_LEAST_0,
+            candidates=AT_LEAST_1,
+            min_support=Range(0, 1),
+            threads=AT_LEAST_1,
+        )
         read_intrinsics(self.intrinsics)
 
     @property

@@ -37,7 +37,13 @@ from mkpc_kaggle.reconstruction.panoramas import require_perspective
 from mkpc_kaggle.reconstruction.priors import intrinsics_line, read_intrinsics_table
 from mkpc_kaggle.reconstruction.run import FolderResult, for_cameras, reconstruct_folder
 from mkpc_kaggle.reporting.contradictions import contradictions
-from mkpc_kaggle.reporting.summary import pending_lines, trouble, unreadable_images, weakest_line
+from mkpc_kaggle.reporting.summary import (
+    chosen_candidates,
+    pending_lines,
+    trouble,
+    unreadable_images,
+    weakest_line,
+)
 
 HELP = """\
 Match the images of a folder with the engine that makes submissions, and reconstruct their cameras. Each folder
@@ -243,6 +249,8 @@ def _lines(result: FolderResult, root: Path) -> Iterator[str]:
             why += " by an earlier run"
         placed = f"{models.total()} of {plural(len(found), 'image')} with a camera"
         yield f"{batches[name]}: {placed}: {why}"
+    for name, value, remark in chosen_candidates(report.scenes):
+        yield f"{name}: {value} ({remark})"
     yield from weakest_line(report.scenes)
     for scene in report.scenes:
         yield from (f"{scene.batch}: {sentence}" for sentence in contradictions(scene))

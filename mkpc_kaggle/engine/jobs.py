@@ -17,6 +17,7 @@ from mkpc_kaggle.geometry.coordinates import Matrix3
 from mkpc_kaggle.geometry.robust import NO_STATS, EstimateStats
 from mkpc_kaggle.pipeline.pair import Regions, UnitResult
 from mkpc_kaggle.recipe import Recipe, Unit
+from mkpc_kaggle.scene.candidates import ALL_UNITS
 from mkpc_kaggle.scene.export import HeldDirectory
 from mkpc_kaggle.scene.reconstruct import Solution
 
@@ -102,6 +103,9 @@ class EstimateJob:
 class SceneJob:
     """Reconstruct a batch, from ``matches`` matches. ``export`` is for COLMAP's files.
 
+    A ``candidate`` other than the first has its own ``key``, and ``scene`` is the key of the first. A batch
+    that has files is reconstructed as a whole, ``is_whole``, even by a job that writes none.
+
     The answer is a :class:`Solution`, with choices in the order of the pairs, which have
     ``contents``.
     """
@@ -114,6 +118,9 @@ class SceneJob:
     source: Source
     matches: int = 0
     export: HeldDirectory | None = None
+    candidate: str = ALL_UNITS
+    scene: str = ""
+    is_whole: bool = False
     # A crash of pycolmap counts against the batch, not against its place.
     items: tuple[tuple[Hashable, ...], ...] = ()
 

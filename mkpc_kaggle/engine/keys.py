@@ -8,7 +8,7 @@ other results.
 import hashlib
 import json
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
@@ -77,7 +77,8 @@ class Keys:
         focal = recipe.focal and asdict(recipe.focal)
         # MAGSAC comes from OpenCV, and other versions of it may give another F.
         estimate = digest([ESTIMATE, magsac, focal, cv2.__version__])
-        scene = recipe.scene and asdict(recipe.scene)
+        # The number of candidates does not change any of them.
+        scene = recipe.scene and asdict(replace(recipe.scene, candidates=1))
         mkpc = asdict(recipe.mkpc)
         # The units that make tracks: a unit's points do not depend on it, but scenes do.
         tracks = [unit.name for unit in recipe.units if unit.tracks]
@@ -144,6 +145,11 @@ def _mapper_version() -> str:
         return version("pycolmap")
     except PackageNotFoundError:
         return ""
+
+
+def of_candidate(scene: str, candidate: str) -> str:
+    """Return the key of a batch's candidate; ``scene`` is that of the first, from all units."""
+    return text_digest([scene, candidate]) if candidate else scene
 
 
 def _text_of(box: Box) -> str:

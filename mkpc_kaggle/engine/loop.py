@@ -42,6 +42,7 @@ from mkpc_kaggle.engine.schedule import Crew, NextWork, is_complete, next_work
 from mkpc_kaggle.engine.state import State, extra_pairs_of
 from mkpc_kaggle.engine.store import Store
 from mkpc_kaggle.errors import UserError, plural
+from mkpc_kaggle.scene.candidates import ALL_UNITS
 
 # A job of unknown cost that takes longer than this share of the time left hangs. A first job may be
 # slow (a warm-up, a slow disk), but the rest of the run must be able to make up for it.
@@ -408,7 +409,7 @@ class Engine:
         the number of remaining ones that may begin now.
         """
         _, estimates = self._split_estimates(asked, work)
-        due = list(work.scenes)
+        due = [(batch, ALL_UNITS) for batch in work.scenes] + list(work.candidates)
         places = self.site.of(Work.SCENE)
         for place in [place for place in places if place.is_idle]:
             # Estimates first: scenes wait for them.
@@ -416,7 +417,7 @@ class Engine:
                 self._give(place, asked.estimating.job(estimates[:1]), now)
                 estimates = [index for index in estimates if not asked.state.estimating[index]]
             elif due:
-                self._give(place, asked.reconstructing.job(due.pop(0)), now)
+                self._give(place, asked.reconstructing.job(*due.pop(0)), now)
         # While matching uses the other cores, scenes have only the cores that it leaves free.
         is_matching = work.match is not None or bool(asked.state.matching.any())
         busy = sum(place.job is not None for place in places)

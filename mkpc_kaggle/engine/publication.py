@@ -86,7 +86,9 @@ class Publication:
         units = [(unit.name, unit.stage) for unit in state.units]
         rows = [row for row in self._rows if row is not None]
         scenes = dict(state.scene_keys)
-        return Table(state.request.about, units, state.rows, rows, scenes, state.fundamentals)
+        return Table(
+            state.request.about, units, state.rows, rows, scenes, state.fundamentals, state.rivals
+        )
 
 
 def _row(state: State, index: int, source: str) -> Row:

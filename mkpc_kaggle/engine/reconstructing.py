@@ -4,6 +4,7 @@ import numpy as np
 
 from mkpc_kaggle.engine.budget import SCENE_MATCH_S, SCENE_START_S, format_duration
 from mkpc_kaggle.engine.jobs import Failure, SceneJob
+from mkpc_kaggle.engine.keys import of_candidate
 from mkpc_kaggle.engine.records import (
     NOT_RECONSTRUCTED,
     SCENE,
@@ -16,48 +17,62 @@ from mkpc_kaggle.engine.run import HANG_FACTOR, Run
 from mkpc_kaggle.engine.state import State
 from mkpc_kaggle.engine.store import Kind, Result
 from mkpc_kaggle.errors import plural
+from mkpc_kaggle.scene.candidates import ALL_UNITS, title_of
 from mkpc_kaggle.scene.reconstruct import Solution
 
 
 class Reconstructing:
-    """Jobs that reconstruct a batch each."""
+    """Jobs that make a candidate of a batch's scene each."""
 
     def __init__(self, run: Run) -> None:
         self._run = run
 
-    def job(self, batch: str) -> SceneJob | None:
-        """Return the job of a batch, from the results in use now; ``None`` if points are lost, which
-        are matched again.
+    def job(self, batch: str, candidate: str = ALL_UNITS) -> SceneJob | None:
+        """Return the job of a batch's candidate, from the results in use now; ``None`` if points are
+        lost, which are matched again.
 
         If its pairs get other results meanwhile, the scene is stale when it arrives.
         """
         run = self._run
         state = run.state
-        # Not removed from the stale batches yet: the job may be lost.
-        state.reconstructing.add(batch)
         indices, key = state.scene_inputs(batch)
         pairs = tuple(state.inputs_of(index) for index in indices)
         source = run.source(pairs)
         if source is None:
             state.reconstructing.discard(batch)
             return None
-        export = state.request.exports.get(batch)
+        folder = state.request.exports.get(batch)
+        export = None
+        if candidate == ALL_UNITS:
+            # Not removed from the stale batches yet: the job may be lost.
+            state.reconstructing.add(batch)
+            export = folder
+        else:
+            state.trying.add((batch, candidate))
+            # The best one is made again, for its files.
+            if candidate in state.made[batch]:
+                export = folder
         if export is not None:
             # From now on the files may be replaced, so they belong to no stored scene.
             run.store.remove(EXPORT + batch)
         job = SceneJob(
             batch,
-            key,
+            of_candidate(key, candidate),
             pairs,
             contents=tuple(state.contents(index) for index in indices),
             recipe=state.request.recipe,
             source=source,
-            matches=int(state.matches[indices].sum()),
+            matches=state.matches_of_candidate(batch, candidate),
             export=export,
+            candidate=candidate,
+            scene=key,
+            is_whole=folder is not None,
         )
         about = format_duration(self.forecast(job))
-        text = f"reconstructing its cameras from {plural(len(pairs), 'pair')}, about {about}"
-        run.progress.note(f"batch {batch}: {text}")
+        text = f"reconstructing its cameras from {plural(len(pairs), 'pair')}"
+        if candidate != ALL_UNITS:
+            text += f", by the tracks of {title_of(candidate)}"
+        run.progress.note(f"batch {batch}: {text}, about {about}")
         return job
 
     def forecast(self, job: SceneJob) -> float:
@@ -70,11 +85,16 @@ class Reconstructing:
         return HANG_FACTOR * max(self.forecast(job), unmeasured)
 
     def save(self, job: SceneJob, answer: Solution, seconds: float) -> None:
-        """Save and use a scene, even if it is stale: the former scene is older still."""
+        """Save and use a scene, even if it is stale: the former scene is older still.
+
+        A further candidate is used only if it is the best one from the results in use.
+        """
         run = self._run
         state = run.state
         choices = dict(zip(job.contents, answer.choices, strict=True))
-        record = SceneRecord.of(job.batch, answer.reconstructions, seconds, choices)
+        record = SceneRecord.of(
+            job.batch, answer.reconstructions, seconds, choices, job.candidate, answer.disagreement
+        )
         images = [image for pair in job.pairs for image in pair.images]
         # With them, a former scene is known to be of the present images, without reading its points.
         digests = {image.name: image.digest for image in images}
@@ -86,21 +106,48 @@ class Reconstructing:
         run.store.put(rows)
         # The time of the loop, with the process's start: the forecast needs both.
         run.costs.observe_scene(job.matches, seconds)
-        state.reconstructing.discard(job.batch)
-        state.use_scene(job.batch, job.key, record)
-        # Otherwise pairs have got other results meanwhile, and the batch stays stale.
-        if state.scene_inputs(job.batch)[1] == job.key:
-            state.stale.discard(job.batch)
         text = f"{record.registered} of {plural(record.images, 'image')}"
+        if job.export is not None:
+            state.filed[job.batch] = job.key
+        if job.candidate == ALL_UNITS:
+            state.reconstructing.discard(job.batch)
+            state.use_candidate(job.batch, job.key, record)
+            # Otherwise pairs have got other results meanwhile, and the batch stays stale.
+            if state.scene_inputs(job.batch)[1] == job.key:
+                state.stale.discard(job.batch)
+                state.try_others(job.batch)
+        else:
+            state.trying.discard((job.batch, job.candidate))
+            is_best = self._use_other(job, record)
+            text += f" by the tracks of {title_of(job.candidate)}, {'better' if is_best else 'not better'}"
         run.log.note(EventKind.SCENE, f"{job.batch}: {text}")
         note = f"batch {job.batch}: {text} with a camera"
         if record.loose:
             note += f", {record.loose} of them unknown to within the size of their model"
         run.progress.note(note)
 
+    def _use_other(self, job: SceneJob, record: SceneRecord) -> bool:
+        """Use a candidate other than the first. Return whether it is the best one so far."""
+        state = self._run.state
+        if not self._is_of_today(job):
+            return False
+        state.use_candidate(job.batch, job.key, record)
+        state.try_others(job.batch)
+        return state.best_candidate(job.batch) == job.candidate
+
+    def _is_of_today(self, job: SceneJob) -> bool:
+        """Return whether the first candidate is from the same results as a job, and today's."""
+        state = self._run.state
+        made = state.made.get(job.batch, {})
+        is_same = ALL_UNITS in made and made[ALL_UNITS][0] == job.scene
+        return is_same and job.batch not in state.stale
+
     def lose(self, job: SceneJob, failure: Failure) -> None:
         run = self._run
         state = run.state
+        if job.candidate != ALL_UNITS:
+            self._lose_candidate(job, failure)
+            return
         run.log.fault(f"batch {job.batch} was not reconstructed: {failure}")
         state.reconstructing.discard(job.batch)
         # Its worker reads the store by itself. Another program may have damaged it.
@@ -109,6 +156,17 @@ class Reconstructing:
         if state.tries.lose([("scene", job.batch, job.key)], failure):
             # The batch becomes stale again when its inputs change.
             state.stale.discard(job.batch)
+
+    def _lose_candidate(self, job: SceneJob, failure: Failure) -> None:
+        state = self._run.state
+        tracks = f"the tracks of {title_of(job.candidate)}"
+        self._run.log.fault(f"batch {job.batch} was not reconstructed from {tracks}: {failure}")
+        state.trying.discard((job.batch, job.candidate))
+        if self._run.forget_lost_points(job.pairs):
+            return
+        is_given_up = state.tries.lose([("scene", job.batch, job.key)], failure)
+        if is_given_up and self._is_of_today(job):
+            state.try_others(job.batch)
 
 
 def scene_records(state: State) -> tuple[SceneRecord, ...]:

@@ -27,6 +27,7 @@ from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
 from mkpc_kaggle.geometry.planarity import MIN_PLANE_SHARE
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, NO_STATS, EstimateStats, ModelKind
 from mkpc_kaggle.pipeline.pair import Regions
+from mkpc_kaggle.scene.candidates import ALL_UNITS
 from mkpc_kaggle.scene.choose import Choice
 from mkpc_kaggle.scene.reconstruct import models_of
 from mkpc_kaggle.scene.reconstruction import Reconstruction, SfmModel
@@ -180,6 +181,15 @@ class PairRecord:
 
 
 @dataclass(frozen=True)
+class Rival:
+    """A candidate of a scene that was not chosen: its disagreement and its number of registered images."""
+
+    candidate: str
+    disagreement: float
+    registered: int
+
+
+@dataclass(frozen=True)
 class SceneRecord:
     """The reconstruction of a batch: numbers of images, registered images and points, and the
     models.
@@ -187,6 +197,9 @@ class SceneRecord:
     The largest model comes first. Each model has up to ``MAX_DRAWN_POINTS`` of its points, of the
     longest tracks, rounded to float32. Without a model, ``failure`` is the reason. ``choices`` has
     the choice for each pair, by the contents of its images (:func:`contents_of`).
+
+    ``candidate`` states whose tracks were used, with its ``disagreement`` in degrees; ``rivals`` are the other
+    candidates, the best first. The store has them as scenes.
     """
 
     batch: str
@@ -197,6 +210,9 @@ class SceneRecord:
     failure: str = ""
     models: tuple[SfmModel, ...] = field(default=(), compare=False)
     choices: Mapping[str, Choice] = field(default_factory=dict, compare=False)
+    candidate: str = ALL_UNITS
+    disagreement: float = 0.0
+    rivals: tuple[Rival, ...] = ()
 
     @classmethod
     def of(
@@ -205,6 +221,8 @@ class SceneRecord:
         found: Sequence[Reconstruction],
         seconds: float = 0.0,
         choices: Mapping[str, Choice] | None = None,
+        candidate: str = ALL_UNITS,
+        disagreement: float = 0.0,
     ) -> "SceneRecord":
         models = models_of(found)
         reasons = dict.fromkeys(each.failure for each in found if each.failure)
@@ -217,6 +235,9 @@ class SceneRecord:
             failure="" if models else "; ".join(reasons) or NO_CAMERAS,
             models=tuple(replace(model, points=_drawn(model.points)) for model in models),
             choices=choices or {},
+            candidate=candidate,
+            # Later digits vary between processors
+            disagreement=float(f"{disagreement:.6g}"),
         )
 
     @property
@@ -224,6 +245,13 @@ class SceneRecord:
         """Number of images whose only cameras are in loose models (:attr:`SfmModel.is_loose`)."""
         sure = {found.image.name for m in self.models if not m.is_loose for found in m.images}
         return len({found.image.name for m in self.models for found in m.images} - sure)
+
+    def against(self, others: Iterable["SceneRecord"]) -> "SceneRecord":
+        """Return the record of the chosen candidate, with the others as rivals."""
+        rivals = [Rival(each.candidate, each.disagreement, each.registered) for each in others]
+        # The sort is stable: of equals, the former candidate first.
+        rivals.sort(key=lambda rival: rival.disagreement)
+        return replace(self, rivals=tuple(rivals))
 
 
 def unmatched_scene(batch: str, pairs: Iterable[Pair]) -> SceneRecord:
@@ -265,6 +293,8 @@ SCENE = record(
     failure=PLAIN,
     models=several(codec.MODEL),
     choices=by_name(codec.CHOICE),
+    candidate=PLAIN,
+    disagreement=PLAIN,
 )
 
 
@@ -322,7 +352,8 @@ class Table:
     """The rows of all pairs, the keys of the batches' scenes, and the F of each row.
 
     The first ``count`` rows belong to the test set, the others to pairs for scenes alone.
-    ``scenes`` has keys by batch. ``written`` is (count, 3, 3).
+    ``scenes`` has keys by batch, and ``rivals`` those of the other candidates. ``written`` is
+    (count, 3, 3).
     """
 
     about: About = field(default_factory=About)
@@ -331,6 +362,7 @@ class Table:
     rows: Sequence[Row] = ()
     scenes: Mapping[str, str] = field(default_factory=dict)
     written: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3, 3)))
+    rivals: Mapping[str, Sequence[str]] = field(default_factory=dict)
 
     def to_result(self) -> Result:
         """Return the table as a row of the store."""
@@ -340,6 +372,7 @@ class Table:
             "count": self.count,
             "rows": self.rows,
             "scenes": dict(self.scenes),
+            "rivals": dict(self.rivals),
         }
         return Result(TABLE, Kind.TABLE, about, self.written.tobytes())
 
@@ -359,6 +392,7 @@ class Table:
             rows=[Row(*row) for row in found["rows"]],
             scenes=found["scenes"],
             written=np.frombuffer(data).reshape(-1, 3, 3),
+            rivals=found["rivals"],
         )
 
     @property
@@ -371,7 +405,8 @@ class Table:
         """The keys of all results that the table names."""
         points = [key for row in self.rows for key in row.points]
         estimates = [row.estimate for row in self.rows]
-        return [key for key in [*points, *estimates, *self.scenes.values()] if key]
+        rivals = [key for keys in self.rivals.values() for key in keys]
+        return [key for key in [*points, *estimates, *self.scenes.values(), *rivals] if key]
 
 
 # Events
@@ -437,13 +472,17 @@ def read_images(store: Store, row: Row) -> tuple[BatchImage, ...]:
 def read_scenes(store: Store, table: Table | None = None) -> dict[str, SceneRecord]:
     """Return the present reconstruction of each batch that has one."""
     table = table or Table.of(store)
-    about = store.about(table.scenes.values())
-    # A batch may have another name than when its scene was stored: the key has only its contents.
-    return {
-        batch: replace(SCENE.of_json(about[key]["scene"]), batch=batch)
-        for batch, key in table.scenes.items()
-        if key in about
-    }
+    rivals = [key for keys in table.rivals.values() for key in keys]
+    about = store.about([*table.scenes.values(), *rivals])
+    scenes = {}
+    for batch, key in table.scenes.items():
+        if key not in about:
+            continue
+        others = [about[rival]["scene"] for rival in table.rivals.get(batch, ()) if rival in about]
+        scene = SCENE.of_json(about[key]["scene"]).against(map(SCENE.of_json, others))
+        # A batch may have another name than when its scene was stored: the key has only its contents.
+        scenes[batch] = replace(scene, batch=batch)
+    return scenes
 
 
 def read_events(store: Store) -> tuple[Event, ...]:

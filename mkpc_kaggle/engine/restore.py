@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from mkpc_kaggle.engine.image_files import known_images
+from mkpc_kaggle.engine.keys import of_candidate
 from mkpc_kaggle.engine.records import SCENE, Row, Table
 from mkpc_kaggle.engine.schedule import sweeping_unit
 from mkpc_kaggle.engine.state import State
@@ -119,7 +120,13 @@ def _restore_estimates(
 
 def _restore_scenes(state: State, store: Store, former: Table, digests: Mapping[str, str]) -> None:
     today = {batch: state.scene_inputs(batch)[1] for batch in state.batches}
-    about = store.about([*today.values(), *former.scenes.values()])
+    # The first candidate has the key of the scene's inputs.
+    others = {
+        batch: {name: of_candidate(key, name) for name in state.candidates[1:]}
+        for batch, key in today.items()
+    }
+    keys = [key for named in others.values() for key in named.values()]
+    about = store.about([*today.values(), *former.scenes.values(), *keys])
     marks = store.about(EXPORT + batch for batch in state.request.exports)
     for batch, key in today.items():
         used = key if key in about else former.scenes.get(batch, "")
@@ -128,14 +135,23 @@ def _restore_scenes(state: State, store: Store, former: Table, digests: Mapping[
         if not _has_images(about[used], digests):
             continue
         record = SCENE.of_json(about[used]["scene"])
-        state.use_scene(batch, used, record)
-        is_current = used == key
+        if used != key:
+            state.use_scene(batch, used, record)
+            continue
+        # Before the candidates: the scene whose COLMAP files exist is used.
+        if batch in state.request.exports:
+            state.filed[batch] = marks.get(EXPORT + batch, "")
+        state.use_candidate(batch, used, record)
+        for other in others[batch].values():
+            if other in about:
+                state.use_candidate(batch, other, SCENE.of_json(about[other]["scene"]))
         if directory := state.request.exports.get(batch):
             # A scene without its COLMAP files is made again. Until then its cameras are used.
-            has_mark = marks.get(EXPORT + batch) == used
-            is_current &= has_mark and has_files(directory.path, len(record.models))
-        if is_current:
-            state.stale.discard(batch)
+            has_mark = state.filed[batch] == state.scene_keys[batch]
+            if not (has_mark and has_files(directory.path, len(state.scenes[batch].models))):
+                continue
+        state.stale.discard(batch)
+        state.try_others(batch)
 
 
 def _has_images(about: Mapping[str, Any], digests: Mapping[str, str]) -> bool:

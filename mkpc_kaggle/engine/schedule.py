@@ -30,6 +30,9 @@ JOB_SHARE = 0.01
 # Maximum share of the limit that is reserved for estimates and scenes: a wrong forecast must not stop
 # the matching, on which every row depends.
 RESERVE_SHARE = 0.2
+# Maximum share of the limit that is reserved for further candidates of scenes: any scene is worth
+# more than a choice of scenes.
+CANDIDATES_SHARE = 0.05
 # Phases in arrays are plain integers.
 FILL = int(Phase.FILL)
 NEVER = int(Phase.NEVER)
@@ -61,6 +64,8 @@ class NextWork:
     match: MatchJob | None
     estimates: tuple[int, ...]
     scenes: tuple[str, ...]
+    # Of scenes that have their first candidate: (batch, candidate)
+    candidates: tuple[tuple[str, str], ...]
     phase: Phase
     done: int
     total: int
@@ -85,7 +90,7 @@ class View:
     @cached_property
     def stop(self) -> float:
         """The time after which no unit may run, so that estimates and scenes have theirs."""
-        reserve = estimates_reserve(self) + scenes_reserve(self)
+        reserve = estimates_reserve(self) + scenes_reserve(self) + candidates_reserve(self)
         longest = RESERVE_SHARE * self.budget.time_limit
         return self.budget.stop_units - min(reserve, longest)
 
@@ -135,7 +140,8 @@ def next_work(
         total = int(connecting.sum())
     pending = int((pairs.min(1) <= phase).sum()) if pairs.size else 0
     order = tuple(estimates.tolist())
-    return NextWork(match, order, scenes, phase, total - pending, total, fit)
+    candidates = candidates_due(view, estimates, is_matching=is_matching)
+    return NextWork(match, order, scenes, candidates, phase, total - pending, total, fit)
 
 
 # Matching
@@ -452,6 +458,51 @@ def pairs_to_await(
     return for_first, pending | state.matching | (first < NEVER)
 
 
+def candidates_due(
+    view: View, estimates: NDArray[Any], *, is_matching: bool
+) -> tuple[tuple[str, str], ...]:
+    """Return the further candidates to make now, as (batch, candidate).
+
+    They wait for the end of matching, and are made only if they are expected to end in time.
+    """
+    state = view.state
+    if is_matching or not view.crew.scenes:
+        return ()
+    pending = state.estimating.copy()
+    pending[estimates] = True
+    blocked = batches_with(state, pending)
+    due = []
+    for batch, number in state.batches.items():
+        if batch in state.stale or batch in state.reconstructing or blocked[number]:
+            continue
+        for candidate in state.untried.get(batch, ()):
+            end = view.now + candidate_seconds(view, batch, candidate)
+            if (batch, candidate) not in state.trying and end <= view.budget.stop_units:
+                due.append((batch, candidate))
+    # Each batch gets its second candidate before any gets a third.
+    due.sort(key=lambda each: state.candidates.index(each[1]))
+    return tuple(due)
+
+
+def candidate_seconds(view: View, batch: str, candidate: str) -> float:
+    """Return the expected seconds of a candidate."""
+    matches = view.state.matches_of_candidate(batch, candidate)
+    return float(view.costs.scenes(np.array([matches]))[0])
+
+
+def candidates_reserve(view: View) -> float:
+    """Return the seconds to reserve for further candidates of scenes, several at a time."""
+    state = view.state
+    if len(state.candidates) == 1 or not view.crew.scenes:
+        return 0.0
+    seconds = 0.0
+    for batch in state.batches:
+        # A stale batch will get all of them.
+        missing = state.candidates[1:] if batch in state.stale else state.untried.get(batch, ())
+        seconds += sum(candidate_seconds(view, batch, candidate) for candidate in missing)
+    return min(CANDIDATES_SHARE * view.budget.time_limit, seconds / view.crew.scenes)
+
+
 def batches_with(state: State, pairs: Mask) -> Mask:
     """Return a (B,) mask of the batches of these pairs."""
     found = np.zeros(len(state.batches), bool)
@@ -492,7 +543,8 @@ def is_complete(state: State, crew: Crew) -> bool:
     """Whether all rows have all results that this run can compute, and so do all batches."""
     if state.missing[: state.rows].any() or lacking_estimates(state).any():
         return False
-    return not waiting_batches(state, crew)
+    has_untried = crew.scenes and any(state.untried.values())
+    return not waiting_batches(state, crew) and not has_untried
 
 
 def outlook(state: State, costs: Costs, budget: Budget, crew: Crew, now: float) -> str:

@@ -17,11 +17,12 @@ from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.blame import Item, Tries
 from mkpc_kaggle.engine.image_files import contents_of
 from mkpc_kaggle.engine.jobs import Cause, Failure, PairInputs, visiting_order
-from mkpc_kaggle.engine.keys import Images
+from mkpc_kaggle.engine.keys import Images, of_candidate
 from mkpc_kaggle.engine.records import MIN_PAIRS, SceneRecord
 from mkpc_kaggle.engine.request import Request
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 from mkpc_kaggle.recipe import SceneConfig
+from mkpc_kaggle.scene.candidates import ALL_UNITS, best_of, candidates_of
 from mkpc_kaggle.scene.densify import extra_pairs
 from mkpc_kaggle.scene.view_graph import BatchImage
 
@@ -49,7 +50,10 @@ class State:
 
     Of a batch: ``batches`` has its number by name, ``members`` its pairs; ``batch_of`` (N,) is -1 for a pair
     without one. ``scenes`` has the scenes in use, ``stale`` the batches whose scene is not today's, and
-    ``reconstructing`` the batches of jobs under way.
+    ``reconstructing`` the batches of jobs under way. A scene is the best of the ``candidates``: ``made`` has those
+    from today's results, with their keys, once the first is made; ``untried`` are the missing ones, and ``trying``
+    those of jobs under way, as (batch, candidate). ``filed`` has the key of the scene whose files are in the
+    batch's folder.
     """
 
     def __init__(self, request: Request, extra: Sequence[Pair] = ()) -> None:
@@ -111,6 +115,11 @@ class State:
         self.scene_keys: dict[str, str] = {}
         self.stale = set(batches)
         self.reconstructing: set[str] = set()
+        self.candidates = candidates_of(self.units, self.request.recipe.scene)
+        self.made: dict[str, dict[str, tuple[str, SceneRecord]]] = {}
+        self.untried: dict[str, list[str]] = {}
+        self.trying: set[tuple[str, str]] = set()
+        self.filed: dict[str, str] = {}
 
     def _twins_of_pairs(self) -> dict[int, list[int]]:
         """Return the rows with the same two images, which share their points and their estimate."""
@@ -185,6 +194,13 @@ class State:
         matches = self.matches.sum(1)
         found = np.bincount(bins, matches, minlength=len(self.batches) + 1)
         return found[1:].astype(int)
+
+    def matches_of_candidate(self, batch: str, candidate: str) -> int:
+        """Return the number of matches that make a candidate's tracks, about."""
+        matches = self.matches[self.members[self.batches[batch]]]
+        if candidate not in self.number_of:
+            return int(matches.sum())
+        return int(matches[:, self.number_of[candidate]].sum())
 
     # Keys of today
 
@@ -360,6 +376,61 @@ class State:
         self.has_own[index] = not about["failure"]
         self.inliers[index] = sum(about["inliers"])
 
+    def use_candidate(self, batch: str, key: str, record: SceneRecord) -> None:
+        """Use a candidate of a scene, if it is the best one so far.
+
+        The first candidate is always from newer results than the others, and replaces them. With
+        files, the best candidate is used once its files are written.
+        """
+        if record.candidate == ALL_UNITS:
+            self.made[batch] = {}
+        made = self.made[batch]
+        made[record.candidate] = (key, record)
+        used = self.best_candidate(batch)
+        if batch in self.request.exports and made[used][0] != self.filed.get(batch):
+            filed = [name for name, (of, _) in made.items() if of == self.filed.get(batch)]
+            used = next(iter(filed), ALL_UNITS)
+        key, chosen = made[used]
+        others = [other for name, (_, other) in made.items() if name != used]
+        self.use_scene(batch, key, chosen.against(others))
+
+    def best_candidate(self, batch: str) -> str:
+        """Return the candidate with the smallest disagreement among those that are made."""
+        made = self.made[batch]
+        return best_of(
+            {name: made[name][1].disagreement for name in self.candidates if name in made}
+        )
+
+    def try_others(self, batch: str) -> None:
+        """Note which other candidates are missing: the first one is from today's results.
+
+        With files, the best one is made again in the end, if its files are missing.
+        """
+        made = self.made[batch]
+        scene = made[ALL_UNITS][0]
+        missing = [name for name in self.candidates if name not in made]
+        open_ones = [name for name in missing if not self._is_given_up(batch, scene, name)]
+        best = self.best_candidate(batch)
+        if (
+            not open_ones
+            and batch in self.request.exports
+            and made[best][0] != self.filed.get(batch)
+            and not self._is_given_up(batch, scene, best)
+        ):
+            open_ones = [best]
+        self.untried[batch] = open_ones
+
+    def _is_given_up(self, batch: str, scene: str, candidate: str) -> bool:
+        return ("scene", batch, of_candidate(scene, candidate)) in self.tries.given_up
+
+    @property
+    def rivals(self) -> dict[str, list[str]]:
+        """The keys of the candidates that are not in use, by batch."""
+        return {
+            batch: [key for key, _ in made.values() if key != self.scene_keys[batch]]
+            for batch, made in self.made.items()
+        }
+
     def use_scene(self, batch: str, key: str, record: SceneRecord) -> None:
         """Use a scene: pairs with a choice take its F."""
         self.scenes[batch] = record
@@ -378,7 +449,10 @@ class State:
         """Note that a pair has other points, or another estimate, than before."""
         self.changed.add(index)
         if self.batch_of[index] >= 0:
-            self.stale.add(self.pairs[index].group)
+            batch = self.pairs[index].group
+            self.stale.add(batch)
+            # Until the first candidate is made again
+            self.untried.pop(batch, None)
 
     # Jobs and failures
 

@@ -39,8 +39,9 @@ from mkpc_kaggle.geometry.robust import ModelKind
 from mkpc_kaggle.matchers import failures
 from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult, with_estimate
 from mkpc_kaggle.recipe import Recipe, Unit
-from mkpc_kaggle.scene.reconstruct import Solution, reconstruct_batch
-from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair, tracks_of
+from mkpc_kaggle.scene.candidates import ALL_UNITS, candidate_tracks, disagreement, settings_of
+from mkpc_kaggle.scene.reconstruct import Solution, models_of, reconstruct_batch
+from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair
 
 if TYPE_CHECKING:
     from mkpc_kaggle.pipeline.stages import Pipeline
@@ -230,10 +231,17 @@ def reconstruct(job: Job) -> Solution:
     process.
     """
     assert isinstance(job, SceneJob) and job.recipe.scene is not None
-    keeps_paths = job.export is not None
-    pairs = [batch_pair(*each, keeps_paths=keeps_paths) for each in results_of(job)]
+    inputs = results_of(job)
+    pairs = [
+        batch_pair(*each, keeps_paths=job.is_whole, candidate=job.candidate) for each in inputs
+    ]
     recipe = job.recipe
-    return reconstruct_batch(pairs, job.recipe.scene, recipe.focal, recipe.magsac, job.export)
+    config = settings_of(job.candidate, job.recipe.scene)
+    solution = reconstruct_batch(
+        pairs, config, recipe.focal, recipe.magsac, job.export, job.is_whole
+    )
+    found = disagreement(pairs, models_of(solution.reconstructions))
+    return replace(solution, disagreement=found)
 
 
 def batch_pair(
@@ -241,8 +249,9 @@ def batch_pair(
     results: tuple[UnitResult, ...],
     *,
     keeps_paths: bool,
+    candidate: str = ALL_UNITS,
 ) -> BatchPair:
-    """Return a pair of a batch with its points.
+    """Return a pair of a batch with its points, and the tracks of a candidate.
 
     Images have their file names. With ``keeps_paths`` they have their paths below the root, as in
     COLMAP's files, in tables of intrinsics and in the cameras of an earlier run.
@@ -252,7 +261,8 @@ def batch_pair(
         for image in pair.images
     )
     matches = Matches.concatenate(result.matches for result in results)
-    return BatchPair(image0, image1, matches, pair.own, tracks_of(results))
+    tracks = candidate_tracks(results, candidate)
+    return BatchPair(image0, image1, matches, pair.own, tracks)
 
 
 def results_of(

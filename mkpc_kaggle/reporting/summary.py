@@ -18,6 +18,7 @@ from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
 from mkpc_kaggle.pipeline.availability import UnavailableKind
 from mkpc_kaggle.recipe import Recipe
 from mkpc_kaggle.reporting.run_log import SECONDS, RunLog
+from mkpc_kaggle.scene.candidates import title_of
 from mkpc_kaggle.scene.reconstruction import Sigmas
 
 MAX_LINES = 8  # per list; the summary is one screen
@@ -207,6 +208,28 @@ def facts(run: Run) -> Iterator[tuple[str, str, str]]:
         if loose := sum(scene.loose for scene in scenes):
             remark += f"; {loose} of them unknown to within the size of their model"
         yield "images with a camera", f"{placed} of {images}", remark
+        yield from chosen_candidates(scenes)
+
+
+def chosen_candidates(scenes: Sequence[SceneRecord]) -> Iterator[tuple[str, str, str]]:
+    """Yield a fact on the candidates that were chosen, if scenes had a choice."""
+    compared = [scene for scene in scenes if scene.rivals]
+    if not compared:
+        return
+    if len(compared) == 1:
+        (scene,) = compared
+        others = [f"{title_of(each.candidate)} {each.disagreement:.2f}" for each in scene.rivals]
+        remark = (
+            f"rotations {scene.disagreement:.2f} degrees from those of single pairs; "
+            f"others: {'; '.join(others)}"
+        )
+        yield "cameras by the tracks of", title_of(scene.candidate), remark
+        return
+    # The most frequent first; each batch is in summary.json.
+    counts = Counter(title_of(scene.candidate) for scene in compared).most_common()
+    parts = [f"{name} in {plural(count, 'batch')}" for name, count in counts]
+    margin = median(scene.rivals[0].disagreement - scene.disagreement for scene in compared)
+    yield "cameras by the tracks of", ", ".join(parts), f"median margin {margin:.2f} degrees"
 
 
 def _lines(run: Run) -> Iterator[str]:

@@ -27,6 +27,7 @@ from mkpc_kaggle.reporting.summary import (
     unit_means,
     unit_reasons,
 )
+from mkpc_kaggle.scene.candidates import title_of
 from mkpc_kaggle.scene.choose import Reason
 from mkpc_kaggle.scene.reconstruction import (
     HARDLY_MOVED,
@@ -316,6 +317,17 @@ def _scene_table(scene: SceneRecord) -> dict[str, Any]:
         "points": scene.points,
         "seconds": _number(scene.seconds),
         "failure": scene.failure,
+        # Whose tracks made the cameras, and the other candidates, the best first
+        "candidate": title_of(scene.candidate),
+        "disagreement_degrees": _number(scene.disagreement),
+        "rivals": [
+            {
+                "candidate": title_of(rival.candidate),
+                "disagreement_degrees": _number(rival.disagreement),
+                "cameras": rival.registered,
+            }
+            for rival in scene.rivals
+        ],
         "models": [
             {
                 "reprojection_px": _number(model.reprojection_error),

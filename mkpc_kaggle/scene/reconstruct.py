@@ -49,11 +49,13 @@ class Solution:
     """The reconstructions of a batch's components, and a choice for each pair, in the order of the
     pairs.
 
-    Images with the same content have the name of the first of them.
+    Images with the same content have the name of the first of them. ``disagreement`` is the value by which
+    candidates are compared (:mod:`mkpc_kaggle.scene.candidates`).
     """
 
     reconstructions: tuple[Reconstruction, ...]
     choices: tuple[Choice, ...]
+    disagreement: float = 0.0
 
 
 def reconstruct_batch(
@@ -62,17 +64,19 @@ def reconstruct_batch(
     focal: FocalConfig | None = None,
     magsac: RobustConfig | None = None,
     export: HeldDirectory | None = None,
+    is_whole: bool = False,
 ) -> Solution:
     """Reconstruct every connected component of a batch, and choose an F for each of its pairs.
 
     With the recipe's prior ``focal``, a pair without an F from cameras is re-estimated at the scene's focal
     lengths, unless the pair contradicts the scene. ``magsac`` has default settings if ``None``. With a directory
-    ``export``, the batch is reconstructed as a whole, and COLMAP's files are written there.
+    ``export``, the batch is reconstructed as a whole, and COLMAP's files are written there. With ``is_whole``, it
+    is reconstructed in the same way without files.
 
     A missing result has a reason; bad matches never raise. Reconstruction takes seconds to minutes
     and may end the process, see :mod:`mkpc_kaggle.scene.colmap`.
     """
-    found, shared = reconstruct_sharing(ViewGraph.of_pairs(pairs), config, export)
+    found, shared = reconstruct_sharing(ViewGraph.of_pairs(pairs), config, export, is_whole)
     models = [{image.image.digest: image for image in model.images} for model in models_of(found)]
     # From the first model with the image, else from the image's shared camera
     focals = dict(shared)
@@ -90,7 +94,10 @@ def reconstruct_batch(
 
 
 def reconstruct_sharing(
-    graph: ViewGraph, config: SceneConfig, directory: HeldDirectory | None = None
+    graph: ViewGraph,
+    config: SceneConfig,
+    directory: HeldDirectory | None = None,
+    is_whole: bool = False,
 ) -> tuple[list[Reconstruction], SharedIntrinsics]:
     """Return the reconstruction of each component, and the shared intrinsics of the images.
 
@@ -99,10 +106,11 @@ def reconstruct_sharing(
     camera, a further reconstruction shares intrinsics, see :func:`share`.
     If the recipe shares cameras, the first reconstruction does too. The refined focal lengths are
     returned. With a ``directory``, the graph is reconstructed as a whole, moved onto the cameras of
-    the last complete run, and COLMAP's files are written there.
+    the last complete run, and COLMAP's files are written there. With ``is_whole``, it is reconstructed
+    as a whole without files.
     """
     graph = graph.with_intrinsics(read_intrinsics(config.intrinsics))
-    if directory is None:
+    if directory is None and not is_whole:
         # Each component alone, since a bad one may make the mapper fail
         parts = list(map(MergedGraph, graph.components()))
         make = partial(reconstruct_component, config=config)

@@ -94,8 +94,8 @@ class Scenario:
     first run on a worker. After the share ``turn`` of the limit, costs are ``drift`` times as high.
 
     With 0 ``batches``, there are no scenes. Each image but one is in a single pair; if ``pairs_per_image`` is
-    above 1, the run adds pairs. A scene takes ``scene_seconds`` per pair. It crashes, runs out of memory or hangs
-    with probability ``scene_faults``.
+    above 1, the run adds pairs. A scene takes ``scene_seconds`` per pair, for each of up to ``candidates``. It
+    crashes, runs out of memory or hangs with probability ``scene_faults``.
 
     A share ``bad_pairs`` of the pairs, and the pairs of ``bad``, fail in each unit, in the way of ``bad_fate``
     or in a random one. The last ``bad_places`` places fail in every job after the share ``broken`` of the limit.
@@ -121,6 +121,7 @@ class Scenario:
     scene_seconds: float = 0.06
     scene_faults: float = 0.0
     scene_places: int = 1
+    candidates: int = 1
     seed: int = 0
     never: str = ""  # the matcher whose worker dies whenever it runs
     bad_pairs: float = 0.0
@@ -136,7 +137,8 @@ class Scenario:
     def recipe(self) -> Recipe:
         count = len(self.costs)
         units = [Unit(1 if number % 2 == 0 else 2, f"m{number}", 100) for number in range(count)]
-        scene = SceneConfig(pairs_per_image=self.pairs_per_image) if self.batches else None
+        config = SceneConfig(pairs_per_image=self.pairs_per_image, candidates=self.candidates)
+        scene = config if self.batches else None
         return Recipe(tuple(units), scene=scene)
 
     @property
@@ -410,9 +412,10 @@ class SimulatedSite(Site):
         spent = (SCENE_START_S + spread * scenario.scene_seconds * len(job.pairs)) * self.drift(
             begun
         )
-        answer: Answer = Solution(
-            (), (Choice(FALLBACK_FUNDAMENTAL, Reason.SCENE),) * len(job.pairs)
-        )
+        # By the key, so that a scene that is made again has the same value
+        disagreement = int(job.key[:4], 16) / 65536
+        choices = (Choice(FALLBACK_FUNDAMENTAL, Reason.SCENE),) * len(job.pairs)
+        answer: Answer = Solution((), choices, disagreement)
         if is_faulty := rng.random() < scenario.scene_faults:
             answer = Failure(Cause.DIED, "signal SIGSEGV")
             spent *= (0.5, 0.3, math.inf)[rng.integers(3)]

@@ -1,0 +1,241 @@
+"""Candidates of a scene in whole runs: which one is used, and what the others cost."""
+
+import shutil
+import time
+from collections import Counter
+from dataclasses import replace
+from functools import partial
+
+import cv2
+import numpy as np
+import pytest
+from faulty import choose_scene_for_all_but_the_first, scenes_by
+from rectified import SIZE, THREE_UNITS, RectifiedMatcher, batch_pairs, run
+from simulator import Scenario, memory_store, simulate
+from synthetic import QUICK, SyntheticMatcher, synthetic_pairs
+
+from mkpc_kaggle.engine.budget import Budget
+from mkpc_kaggle.engine.jobs import SceneJob
+from mkpc_kaggle.engine.records import Rival, Table
+from mkpc_kaggle.engine.request import Ending, RunReport
+from mkpc_kaggle.engine.session import Interrupt, Session, run_pairs
+from mkpc_kaggle.engine.store import Store
+from mkpc_kaggle.engine.worker import reconstruct
+from mkpc_kaggle.pipeline.assembly import assemble
+from mkpc_kaggle.recipe import Recipe, SceneConfig, Unit
+from mkpc_kaggle.reporting.run_log import read_log
+from mkpc_kaggle.reporting.summary import overview, summary
+from mkpc_kaggle.reporting.verdict import summary_table
+from mkpc_kaggle.scene.candidates import ALL_UNITS, SUPPORTED
+from mkpc_kaggle.scene.export import HeldDirectory, has_files
+from mkpc_kaggle.scene.reconstruct import Solution
+
+FIRST, _, LAST = (unit.name for unit in THREE_UNITS.units)
+# All units, and the units of stage 1 alone
+RECIPE = Recipe((THREE_UNITS.units[0], THREE_UNITS.units[2]), scene=SceneConfig(candidates=4))
+DISAGREEMENTS = {ALL_UNITS: 5.0, SUPPORTED: 4.0, FIRST: 1.0, LAST: 3.0}
+
+
+def solve(made: list[SceneJob], disagreements: dict[str, float], job: SceneJob) -> Solution:
+    """Note the job. Answer with the disagreement of its candidate, and F that differs by candidate."""
+    made.append(job)
+    found = choose_scene_for_all_but_the_first(job)
+    number = 1.0 + list(DISAGREEMENTS).index(job.candidate)
+    choices = tuple(
+        each if each.F is None else replace(each, F=np.diag([number, 1, 0]))
+        for each in found.choices
+    )
+    return replace(found, choices=choices, disagreement=disagreements[job.candidate])
+
+
+def numbers(report: RunReport) -> set[float]:
+    """The numbers of the candidates whose F was written."""
+    return {each.chosen_fundamental[0, 0] for each in report.records if each.source == "scene"}
+
+
+def candidates(jobs: list[SceneJob]) -> list[str]:
+    """The candidates that were made: the first, then the others, which begin at the same time."""
+    first, *others = [job.candidate for job in jobs]
+    return [first, *sorted(others, key=list(DISAGREEMENTS).index)]
+
+
+@pytest.fixture
+def made(monkeypatch: pytest.MonkeyPatch) -> list[SceneJob]:
+    jobs: list[SceneJob] = []
+    scenes_by(monkeypatch, partial(solve, jobs, DISAGREEMENTS))
+    return jobs
+
+
+def test_the_candidate_that_agrees_best_is_used_and_the_others_are_named(tmp_path, made):
+    pairs = batch_pairs(tmp_path / "images")
+    report = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
+    assert report.ending is Ending.COMPLETE
+    assert candidates(made) == [ALL_UNITS, SUPPORTED, FIRST, LAST]
+    assert numbers(report) == {3.0}
+    (scene,) = report.scenes
+    assert (scene.candidate, scene.disagreement) == (FIRST, 1.0)
+    assert scene.rivals == (
+        Rival(LAST, 3.0, 4),
+        Rival(SUPPORTED, 4.0, 4),
+        Rival(ALL_UNITS, 5.0, 4),
+    )
+    others = f"{LAST} 3.00; all units, supported edges 4.00; all units 5.00"
+    line = (
+        f"cameras by the tracks of: {FIRST} "
+        f"(rotations 1.00 degrees from those of single pairs; others: {others})"
+    )
+    assert line in summary(report)
+    log = read_log(tmp_path / "work")
+    assert line in overview(log)
+    (table,) = summary_table(log)["scenes"]
+    assert table["candidate"] == FIRST
+    assert [rival["candidate"] for rival in table["rivals"]] == [
+        LAST,
+        "all units, supported edges",
+        "all units",
+    ]
+
+
+def test_a_candidate_is_a_result_under_its_key_and_is_not_made_twice(tmp_path, made):
+    pairs = batch_pairs(tmp_path / "images")
+    first = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
+    del made[:]
+    again = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
+    assert made == []
+    assert again.scenes == first.scenes
+    assert again.scenes[0].rivals == first.scenes[0].rivals
+    with Store.open(tmp_path / "work") as store:
+        store.prune(Table.of(store).keys)
+    run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
+    assert made == [], "a prune keeps the others, too"
+    # Fewer candidates are no reason to make the first again, more make only the missing ones.
+    one = replace(RECIPE, scene=SceneConfig())
+    assert numbers(run(pairs, one, RectifiedMatcher(), tmp_path / "work")) == {1.0}
+    two = replace(RECIPE, scene=SceneConfig(candidates=3))
+    assert numbers(run(pairs, two, RectifiedMatcher(), tmp_path / "fresh")) == {3.0}
+    assert candidates(made) == [ALL_UNITS, SUPPORTED, FIRST]
+
+
+@pytest.mark.parametrize(
+    "recipe",
+    [
+        replace(RECIPE, scene=SceneConfig()),
+        replace(RECIPE, units=RECIPE.units[:1]),
+        replace(RECIPE, units=(RECIPE.units[0], replace(RECIPE.units[1], tracks=False))),
+    ],
+    ids=["one is asked for", "one unit", "one unit makes tracks"],
+)
+def test_without_a_choice_there_is_one_candidate_and_nothing_is_said(tmp_path, made, recipe):
+    report = run(batch_pairs(tmp_path / "images"), recipe, RectifiedMatcher(), tmp_path / "work")
+    assert [job.candidate for job in made] == [ALL_UNITS]
+    assert "cameras by the tracks" not in summary(report)
+
+
+def test_a_candidate_that_is_lost_costs_itself_alone_and_the_next_run_tries_it_again(
+    tmp_path, made, monkeypatch
+):
+    def fail(job: SceneJob) -> Solution:
+        if job.candidate == FIRST:
+            raise RuntimeError("no cameras")
+        return solve(made, DISAGREEMENTS, job)
+
+    scenes_by(monkeypatch, fail)
+    pairs = batch_pairs(tmp_path / "images")
+    report = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
+    assert report.ending is Ending.COMPLETE
+    assert numbers(report) == {4.0}
+    fault = f"batch one was not reconstructed from the tracks of {FIRST}"
+    assert any(each.startswith(fault) for each in report.faults)
+    assert not report.scenes[0].failure
+    del made[:]
+    scenes_by(monkeypatch, partial(solve, made, DISAGREEMENTS))
+    again = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
+    assert [job.candidate for job in made] == [FIRST]
+    assert numbers(again) == {3.0}
+
+
+def test_of_equal_candidates_the_first_stays(tmp_path, monkeypatch):
+    equal = dict.fromkeys(DISAGREEMENTS, 0.8)
+    scenes_by(monkeypatch, partial(solve, [], equal))
+    report = run(batch_pairs(tmp_path / "images"), RECIPE, RectifiedMatcher(), tmp_path / "work")
+    assert numbers(report) == {1.0}
+
+
+def test_a_candidate_of_former_images_is_not_compared_with_others(tmp_path, made):
+    pairs = batch_pairs(tmp_path / "images")
+    run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
+    cv2.imwrite(pairs[0].file0, np.full((SIZE.height, SIZE.width, 3), 200, np.uint8))
+    del made[:]
+    report = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
+    assert candidates(made) == [ALL_UNITS, SUPPORTED, FIRST, LAST]
+    assert len(report.scenes[0].rivals) == 3
+
+
+def test_without_time_for_others_the_first_candidate_is_all(tmp_path, made):
+    # The forecast of any scene has the start of its process, three seconds.
+    budget = Budget(time.monotonic(), 4.0)
+    pairs = batch_pairs(tmp_path / "images")
+    report = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work", budget=budget)
+    assert [job.candidate for job in made] == [ALL_UNITS]
+    assert report.ending is Ending.TIME_IS_UP
+    # The same command continues.
+    assert numbers(run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")) == {3.0}
+
+
+@pytest.mark.parametrize("until", [20.0, 45.0, 60.0, 66.0, 73.0, 79.0])
+def test_interrupted_and_resumed_runs_choose_as_an_undisturbed_one(until):
+    scenario = Scenario(12, (1.0, 1.0, 1.0), 1, 600.0, batches=3, candidates=4, misses=0)
+    whole = simulate(scenario)
+    assert whole.report.ending is Ending.COMPLETE
+    jobs = Counter(scene.batch for scene in whole.scenes)
+    store = memory_store()
+    cut = simulate(scenario, store, until=until)
+    resumed = simulate(scenario, store)
+    assert [scene.candidate for scene in resumed.report.scenes] == [
+        scene.candidate for scene in whole.report.scenes
+    ]
+    assert len({scene.candidate for scene in whole.report.scenes}) > 1, "a choice was made"
+    assert all(len(scene.rivals) == 3 for scene in resumed.report.scenes)
+    # What an interrupted process was making is made again, and nothing else.
+    again = Counter(scene.batch for scene in [*cut.scenes, *resumed.scenes])
+    assert sum(again.values()) <= sum(jobs.values()) + 1
+
+
+def test_files_of_colmap_are_those_of_the_chosen_candidate(tmp_path, monkeypatch):
+    """Real reconstructions; the second agrees best."""
+    width = 640
+    units = (Unit(1, "synthetic", width), Unit(1, "synthetic", width // 2))
+    recipe = Recipe(units, magsac=QUICK, scene=SceneConfig(candidates=4))
+    jobs: list[SceneJob] = []
+
+    def judge(job: SceneJob) -> Solution:
+        jobs.append(job)
+        return replace(reconstruct(job), disagreement=float(job.candidate != units[1].name))
+
+    scenes_by(monkeypatch, judge)
+    pairs = synthetic_pairs(tmp_path / "images", 4)
+    out = tmp_path / "colmap"
+
+    def ask() -> str:
+        matcher = SyntheticMatcher(images=4)
+        assembly = assemble(recipe, matchers={matcher.name: matcher}, device="cpu")
+        session = Session(tmp_path / "work", Budget(time.monotonic()), Interrupt(), progress=False)
+        (scene,) = run_pairs(
+            pairs, assembly, session, exports={"batch": HeldDirectory.of(out)}
+        ).scenes
+        return scene.candidate
+
+    assert ask() == units[1].name
+    # The last job makes the best one again, with its files.
+    assert {job.candidate for job in jobs[1:4]} == {SUPPORTED, *(unit.name for unit in units)}
+    assert [jobs[0].candidate, jobs[4].candidate] == [ALL_UNITS, units[1].name]
+    assert [job.export is not None for job in jobs] == [True, False, False, False, True]
+    assert has_files(out, 1)
+    assert sorted(path.name for path in out.iterdir()) == ["database.db", "models"]
+    chosen = (out / "models" / "0" / "images.bin").read_bytes()
+    # Nothing is made again while the files are there.
+    assert ask() == units[1].name
+    assert len(jobs) == 5
+    shutil.rmtree(out)
+    assert ask() == units[1].name
+    assert (out / "models" / "0" / "images.bin").read_bytes() == chosen
