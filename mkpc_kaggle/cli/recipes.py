@@ -3,6 +3,7 @@
 import argparse
 
 from mkpc_kaggle.cli import options
+from mkpc_kaggle.pipeline.assembly import recipe_of_name
 from mkpc_kaggle.pipeline.availability import UnavailableReason, unavailable
 from mkpc_kaggle.recipe import Recipe, load_recipe, recipe_names
 from mkpc_kaggle.weights import WeightStore
@@ -18,7 +19,7 @@ width ("!"). A custom recipe is a TOML file in the format of the package's recip
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    text = "list the units of this recipe"
+    text = "list the units of this recipe, or of one matcher"
     parser.add_argument("name", nargs="?", metavar="NAME|FILE.toml", help=text)
     options.add_weights(parser)
 
@@ -26,7 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     store = WeightStore(arguments.weights)
     if arguments.name is not None:
-        recipe = load_recipe(arguments.name)
+        recipe = recipe_of_name(arguments.name)
         print("\n".join(unit_lines(recipe, unavailable(recipe, store))))
         return
     rows = [("recipe", "runs here", "matchers")]
@@ -49,5 +50,9 @@ def unit_lines(recipe: Recipe, missing: dict[str, UnavailableReason]) -> list[st
         lines.append(f"  {unit.name:<30}at most {unit.max_matches} matches{fallback}")
     if not missing:
         return [*lines, "all weights are available"]
-    lines.append(f"missing; `mkpc weights fetch {recipe.name} --out weights` gets the weights:")
+    # ``weights fetch`` knows the package's recipes and the slots of files.
+    wanted = recipe.name
+    if recipe.name not in recipe_names():
+        wanted = " ".join(slot for reason in missing.values() for slot in reason.slots)
+    lines.append(f"missing; `mkpc weights fetch {wanted} --out weights` gets the weights:")
     return [*lines, *(f"  {matcher}: {reason}" for matcher, reason in missing.items())]

@@ -63,6 +63,11 @@ def test_a_recipe_is_listed_with_its_units_and_missing_weights(clean_environment
     unit = f"  {'2:superglue@1280':<30}at most 4096 matches, or aliked_lightglue if its weights are missing"
     assert unit in lines
     assert "  superglue: no weights (superpoint: superpoint_v1.pth" in "\n".join(lines)
+    # One matcher is a recipe; its weights are fetched by their slots.
+    assert run_command("recipes", "aliked_lightglue") == 0
+    listed = capsys.readouterr().out
+    assert "1:aliked_lightglue@" in listed
+    assert "`mkpc weights fetch aliked-n16 aliked-lightglue --out weights`" in listed
     assert run_command("recipes", "classical") == 0
     assert "all weights are available" in capsys.readouterr().out
 
