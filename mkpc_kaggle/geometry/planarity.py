@@ -1,8 +1,7 @@
 """A test of whether one homography explains the inliers of an F: a flat scene, or no parallax.
 
-Then F is not determined: a family of F fits the same points, and the pose and the focal lengths
-that come from it may be far off although all matches are right (Hartley and Zisserman, Multiple
-View Geometry, 11.9).
+Then F is not determined: a family of F fits the same points. Its pose and focal lengths may be far
+off although all matches are right (Hartley and Zisserman, Multiple View Geometry, 11.9).
 """
 
 import cv2

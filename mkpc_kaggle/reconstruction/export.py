@@ -19,7 +19,7 @@ PAIR_BASE = 2**31 - 1  # COLMAP's id of a pair is id0 * PAIR_BASE + id1
 def export_matches(path: Path, out: Path, datasets: Iterable[str]) -> str:
     """Write what COLMAP's databases below ``out`` have to ``path``. Return a line about it.
 
-    Names of images are those of the databases. Raises :class:`UserError` if writing fails.
+    Images have their names in the databases. Raises :class:`UserError` if writing fails.
     """
     keypoints: dict[str, Points] = {}
     sizes: dict[str, Size] = {}
