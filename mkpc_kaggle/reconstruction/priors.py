@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterable, Sequence
+from fractions import Fraction
 from pathlib import Path
 
 from mkpc_kaggle.data.competition import read_rows
@@ -18,6 +19,8 @@ SIZE = re.compile(r"\s*([1-9]\d{0,5})\s*[xX]\s*([1-9]\d{0,5})\s*", re.ASCII)
 # centred to a few percent. A row for three quarters of the resolution is 0.125 off.
 MAX_OFFSET = 0.1
 MAX_USUAL_OFFSET = 0.05
+MAX_DENOMINATOR = 4  # of the ratio of two usual resolutions
+MAX_SCALE_ERROR = 0.03  # of such a ratio by the principal point
 MAX_SHAPE_RATIO = 1.05  # of pictures of one camera at two resolutions
 
 
@@ -111,31 +114,53 @@ def require_fit(known: KnownCamera, stated: Size | None, image: Path, where: str
         raise UserError(
             f"{where}: the row is for {text_of(stated)}, and {has_pixels}{remedy(known, stated, size)}"
         )
+    # The most frequent mistake: a calibration at another resolution. A stated size rules it out.
+    doubt = "" if stated is not None else _principal_point_doubt(known, size, has_pixels, where)
     # Such as millimetres in place of pixels
     if known.focal / max(size) not in FOCALS:
         raise UserError(
             f"{where}: a focal length of {known.focal:g} px is implausible for {image.name} "
             f"of {text_of(size)} pixels"
         )
-    # The most frequent mistake: a calibration at another resolution. A stated size rules it out.
-    if stated is not None:
-        return ""
+    return doubt
+
+
+def _principal_point_doubt(known: KnownCamera, size: Size, has_pixels: str, where: str) -> str:
+    """Return a doubt about a principal point off the middle, or an empty string. Raises
+    :class:`UserError` if it is far off.
+    """
     x, y = known.principal_point
     offset = max(abs(x / size.width - 0.5), abs(y / size.height - 0.5))
     if offset <= MAX_USUAL_OFFSET:
         return ""
-    # The size in whose middle the point would be
-    other = Size(max(1, round(2 * x)), max(1, round(2 * y)))
     place = "outside" if x >= size.width or y >= size.height else "far from the middle"
     text = f"{where}: the principal point {x:g}, {y:g} is {place}: {has_pixels}"
-    is_other_resolution = is_same_shape(other, size)
-    if is_other_resolution or is_same_shape(other, Size(size.height, size.width)):
-        text += f", and the row seems to be for {text_of(other)}"
-        text += remedy(known, other, size)
+    other = size_of_row(x, y, size)
+    if other is not None:
+        text += f", and the row seems to be for {text_of(other)}{remedy(known, other, size)}"
     text += f"; if the row is right, add the column size with {size.width}x{size.height}"
     if offset > MAX_OFFSET:
         raise UserError(text)
     return text
+
+
+def size_of_row(x: float, y: float, size: Size) -> Size | None:
+    """Return the size of the pictures that a row with this principal point seems to be for, given
+    that of the image; ``None`` if it has another shape.
+    """
+    # The size in whose middle the point would be, which is a few percent wrong
+    rough = Size(max(1, round(2 * x)), max(1, round(2 * y)))
+    for shape in (size, Size(size.height, size.width)):
+        if not is_same_shape(rough, shape):
+            continue
+        scale = ((rough.width / shape.width) * (rough.height / shape.height)) ** 0.5
+        # Pictures are reduced to a half or to three quarters, and not to 0.496.
+        simple = Fraction(max(scale, 1 / scale)).limit_denominator(MAX_DENOMINATOR)
+        exact = float(simple if scale > 1 else 1 / simple)
+        if abs(exact / scale - 1) < MAX_SCALE_ERROR:
+            scale = exact
+        return Size(max(1, round(scale * shape.width)), max(1, round(scale * shape.height)))
+    return None
 
 
 def remedy(known: KnownCamera, of: Size, size: Size) -> str:

@@ -105,8 +105,18 @@ def write_masks(folder: Path, root: Path, left: int = 400) -> Path:
             HEAD + "*,SIMPLE_PINHOLE,675 300 225,5\n",
             "is far from the middle: 00.png has 800 x 600 pixels, and the row seems to be for 600 x 450",
         ),
+        # A principal point is a little off the middle, and the ratio of resolutions is simple.
         (
-            HEAD + "*,SIMPLE_PINHOLE,900 300 400,fixed\n",
+            HEAD + "*,PINHOLE,450 450 197 153,fixed\n",
+            "the row seems to be for 400 x 300. Write the parameters 900 900 394 306;",
+        ),
+        # Neither the focal length nor the principal point fits: the reason for both
+        (
+            HEAD + "*,SIMPLE_PINHOLE,90 40 30,fixed\n",
+            "the row seems to be for 80 x 60. Write the parameters 900 400 300;",
+        ),
+        (
+            HEAD + "*,SIMPLE_PINHOLE,900 306 394,fixed\n",
             "the row seems to be for 600 x 800. Rows are for pixels as stored",
         ),
         (
