@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from mkpc_kaggle.data.heads import tags_of_picture
 from mkpc_kaggle.data.images import Image, ImageStore, Unreadable, exif_facts, read_image
-from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.errors import UserError, plural
 from mkpc_kaggle.geometry.coordinates import Box, Matrix3, Pixels
 
 if TYPE_CHECKING:
@@ -212,7 +212,7 @@ def _pair_of(values: Any, name: str, expected: str) -> Sequence[Any]:
         raise TypeError(f"{name} is {shown_value(values)}; expected {expected}")
     if len(values) != 2:
         shape = tuple(getattr(values, "shape", ()))
-        found = f"has the shape {shape}" if shape else f"has {len(values)} values"
+        found = f"has the shape {shape}" if shape else f"has {plural(len(values), 'value')}"
         raise ValueError(f"{name} {found}; expected {expected}")
     return [values[0], values[1]]
 
