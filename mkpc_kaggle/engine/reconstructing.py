@@ -72,6 +72,8 @@ class Reconstructing:
         text = f"reconstructing its cameras from {plural(len(pairs), 'pair')}"
         if candidate != ALL_UNITS:
             text += f", by the tracks of {title_of(candidate)}"
+            if export is not None:
+                text += ", again for its files"
         run.progress.note(f"batch {batch}: {text}, about {about}")
         return job
 
@@ -107,6 +109,7 @@ class Reconstructing:
         # The time of the loop, with the process's start: the forecast needs both.
         run.costs.observe_scene(job.matches, seconds)
         text = f"{record.registered} of {plural(record.images, 'image')}"
+        more = ""  # about a further candidate
         if job.export is not None:
             state.filed[job.batch] = job.key
         if job.candidate == ALL_UNITS:
@@ -119,9 +122,10 @@ class Reconstructing:
         else:
             state.trying.discard((job.batch, job.candidate))
             is_best = self._use_other(job, record)
-            text += f" by the tracks of {title_of(job.candidate)}, {'better' if is_best else 'not better'}"
-        run.log.note(EventKind.SCENE, f"{job.batch}: {text}")
-        note = f"batch {job.batch}: {text} with a camera"
+            outcome = "the best so far" if is_best else "not better"
+            more = f" by the tracks of {title_of(job.candidate)}, {outcome}"
+        run.log.note(EventKind.SCENE, f"{job.batch}: {text}{more}")
+        note = f"batch {job.batch}: {text} with a camera{more}"
         if record.loose:
             note += f", {record.loose} of them unknown to within the size of their model"
         run.progress.note(note)
