@@ -32,6 +32,7 @@ from mkpc_kaggle.reconstruction.priors import (
     read_intrinsics_table,
 )
 from mkpc_kaggle.reconstruction.run import for_cameras, reconstruct_folder
+from mkpc_kaggle.reporting.contradictions import contradictions
 from mkpc_kaggle.scene.export import MODELS
 from mkpc_kaggle.scene.reconstruction import RegisteredImage, SfmModel
 
@@ -142,6 +143,9 @@ def reconstruct(
             warn(result.report.unsaved)
         for failure in unreadable_images(result.report.records):
             warn(f"cannot be read: {failure}")
+        for scene in result.report.scenes:
+            for sentence in contradictions(scene):
+                warn(sentence)
         # The models of an earlier call may lack images, and their files may be missing.
         if result.lost:
             reason = next(iter(result.lost.values()))

@@ -5,18 +5,27 @@ from pathlib import Path
 
 from mkpc_kaggle.engine.records import SceneRecord
 from mkpc_kaggle.errors import plural
-from mkpc_kaggle.scene.reconstruction import DistortedLens, FocalContradiction, Source
+from mkpc_kaggle.scene.reconstruction import HARDLY_MOVED, DistortedLens, FocalContradiction, Source
 
 MAX_NAMED = 3  # images in a sentence
 
 
 def contradictions(scene: SceneRecord) -> Iterator[str]:
     """Yield a sentence for each assumption that the photographs of a scene contradict."""
+    if not has_moved(scene):
+        yield f"the cameras are not to be trusted: {HARDLY_MOVED}"
+        # Without depth, focal lengths and distortion are not determined.
+        return
     for model in scene.models:
         for focal in model.comparison.focals:
             yield _focal_sentence(focal)
         for lens in model.comparison.lenses:
             yield _lens_sentence(lens, is_everything=len(lens.images) == scene.images)
+
+
+def has_moved(scene: SceneRecord) -> bool:
+    """Return whether the cameras of a scene, if it has any, were at different places."""
+    return not scene.models or scene.models[0].comparison.has_moved
 
 
 def _focal_sentence(found: FocalContradiction) -> str:

@@ -16,7 +16,7 @@ from mkpc_kaggle.data.outputs import replacing
 from mkpc_kaggle.engine import codec
 from mkpc_kaggle.engine.records import NO_CAMERAS, PairRecord, SceneRecord
 from mkpc_kaggle.errors import UserError, plural, printable, writing
-from mkpc_kaggle.reporting.contradictions import contradictions, named
+from mkpc_kaggle.reporting.contradictions import contradictions, has_moved, named
 from mkpc_kaggle.reporting.run_log import RunLog
 from mkpc_kaggle.reporting.summary import (
     headline,
@@ -126,8 +126,8 @@ def _scene_problems(scene: SceneRecord, log: RunLog) -> Iterator[str]:
         yield f"{where}no cameras, {scene.failure}: photographs that overlap more are needed"
         return
     # Remedies for single images would not help.
-    if not scene.models[0].comparison.has_moved:
-        yield f"{where}the cameras are not to be trusted: {HARDLY_MOVED}"
+    if not has_moved(scene):
+        yield from (f"{where}{sentence}" for sentence in contradictions(scene))
         return
     cameras = [found.image for model in scene.models for found in model.images]
     known = {image.name for image in cameras}
