@@ -9,8 +9,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import torch
 
-from benchmarks.gpu import forecast, runs
+from benchmarks.gpu import forecast, networks, runs
 from benchmarks.gpu.record import (
     EXPECTED,
     Part,
@@ -58,6 +59,20 @@ def test_a_rehearsal_on_the_cpu_runs_every_part(tmp_path):
     assert all(f"## {part['title']}" in text for part in parts.values())
     # The runs' images and journals are gone.
     assert sorted(path.name for path in tmp_path.iterdir()) == ["gpu.json", "gpu.md"]
+
+
+def test_warps_agree_pixel_by_pixel_in_points_and_certainty():
+    warp = torch.rand(100, 5) * 50
+    moved = warp.clone()
+    moved[:10, 3] += 0.2
+    doubted = warp.clone()
+    doubted[:30, 4] += 0.1
+    assert networks._agreement([warp], [warp.clone()], 0.05) == 1.0
+    assert networks._agreement([warp], [moved], 0.05) == 0.9
+    assert networks._agreement([warp, warp], [warp, doubted], 0.05) == 0.85
+    # The same points in another order are matches in common, and another warp.
+    assert networks._agreement([warp[:, :4]], [warp[:, :4].flip(0)], 0.05) == 1.0
+    assert networks._agreement([warp], [warp.flip(0)], 0.05) < 0.1
 
 
 def test_an_error_of_a_part_is_recorded_with_its_rows_so_far():

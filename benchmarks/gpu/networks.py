@@ -2,6 +2,10 @@
 
 The pictures are textures and their shifted copies, on which stand-in weights find matches. Agreement
 is the share of matches, of either side, that lie within a distance of a match of the other side.
+
+Dense networks draw their matches at random: each device has its own random numbers, and the last bit
+of one certainty changes the whole sample. So all pixels of their warps are compared instead. Two agree
+if their points lie within the distance and their certainties within ``SAME_CERTAINTY``.
 """
 
 from collections.abc import Iterator, Sequence
@@ -17,9 +21,10 @@ from benchmarks.gpu.record import EXPECTED, Part, SkippedError
 from benchmarks.gpu.seeded import SeededWeights
 from benchmarks.gpu.setup import Setup
 from mkpc_kaggle.config import from_table
-from mkpc_kaggle.geometry.coordinates import Box, Size, View
+from mkpc_kaggle.geometry.coordinates import Box, Size, View, from_normalised
 from mkpc_kaggle.matchers.adapters import roma
 from mkpc_kaggle.matchers.contract import Colour, Matcher, Picture, Placement, Precision
+from mkpc_kaggle.matchers.dense import DenseEncoding, DenseMatcher
 from mkpc_kaggle.matchers.dtypes import exact_float32
 from mkpc_kaggle.matchers.registry import UnusableError, load_matcher, spec_of
 from tests.support.pictures import agreement
@@ -32,6 +37,7 @@ PAIRS = 8  # of a minibatch
 QUICK_PAIRS = 2
 SAME_PX = 0.05  # rounding of float32 moves points less
 HALF_PX = 0.25
+SAME_CERTAINTY = 0.01
 SAME = 0.98  # the agreement of equal arithmetic: a match at a threshold may come or go
 
 # All layers, all keypoints, all matches: what untrained weights would leave out is chance.
@@ -51,7 +57,8 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "dkm": {"matches": 500},
     "roma": {"matches": 500},
 }
-QUICK = ("superglue", "aliked_lightglue", "loftr")
+QUICK = ("superglue", "aliked_lightglue", "loftr", "roma")
+CERTAINTY = 4  # the column of a warp's certainty, after its points
 LAYERS = 2  # of LightGlue: untrained layers move all keypoints' features towards each other
 
 
@@ -132,7 +139,10 @@ def _for_seeded_weights(name: str) -> Iterator[None]:
 def _points(
     matcher: Matcher[Any], colour: Colour, setup: Setup, *, at_a_time: int = 1, noise: int = 0
 ) -> list[Tensor]:
-    """Return the points (M, 4) of each pair: x and y in both pictures."""
+    """Return the points (M, 4) of each pair: x and y in both pictures.
+
+    Of a dense matcher, return all pixels of both warps with their certainties (M, 5).
+    """
     count = QUICK_PAIRS if setup.quick else PAIRS
     points = []
     for start in range(0, count, at_a_time):
@@ -141,9 +151,22 @@ def _points(
         for shift in (SHIFT, 0):
             sides.append([_picture(colour, number, shift, noise, setup) for number in numbers])
         with exact_float32():
-            found = matcher.match(*(matcher.encode(pictures) for pictures in sides))
+            encodings = [matcher.encode(pictures) for pictures in sides]
+            if isinstance(matcher, DenseMatcher):
+                points += [_warp(matcher, *both) for both in zip(*encodings, strict=True)]
+                continue
+            found = matcher.match(*encodings)
         points += [torch.from_numpy(np.hstack([each.points0, each.points1])) for each in found]
     return points
+
+
+def _warp(matcher: DenseMatcher, first: DenseEncoding, second: DenseEncoding) -> Tensor:
+    warp, certainty = matcher.candidates(first, second)
+    values = warp.cpu().numpy()
+    points0 = from_normalised(values[:, :2], first.content)
+    points1 = from_normalised(values[:, 2:], second.content)
+    rows = np.column_stack([points0, points1, certainty.cpu().numpy()])
+    return torch.from_numpy(rows)
 
 
 def _picture(colour: Colour, number: int, shift: int, noise: int, setup: Setup) -> Picture:
@@ -160,5 +183,18 @@ def _picture(colour: Colour, number: int, shift: int, noise: int, setup: Setup) 
 
 def _agreement(first: Sequence[Tensor], second: Sequence[Tensor], within: float) -> float:
     """Return the mean agreement of pairs."""
-    shares = [agreement(*both, within, torch.inf) for both in zip(first, second, strict=True)]
+    shares = []
+    for one, other in zip(first, second, strict=True):
+        if one.shape[1] > CERTAINTY:
+            shares.append(_warp_agreement(one, other, within))
+        else:
+            shares.append(agreement(one, other, within, torch.inf))
     return round(sum(shares) / len(shares), 4)
+
+
+def _warp_agreement(first: Tensor, second: Tensor, within: float) -> float:
+    """Return the share of pixels whose points and certainties agree, on warps of the same grids."""
+    change = (first - second).abs()
+    is_near = (change[:, :CERTAINTY] <= within).all(1)
+    is_as_certain = change[:, CERTAINTY] <= SAME_CERTAINTY
+    return (is_near & is_as_certain).double().mean().item()

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
+from torch import Tensor
 
 from mkpc_kaggle.config import AT_LEAST_1, SHARE, Range, check_ranges
 from mkpc_kaggle.geometry.coordinates import Size, from_normalised
@@ -102,12 +103,21 @@ class DenseMatcher(PairwiseMatcher[DenseEncoding]):
         columns = max(1, round(content.width * scale / multiple))
         return multiple * rows, multiple * columns
 
-    def _match(self, first: DenseEncoding, second: DenseEncoding) -> Matches:
-        # Candidates come from the grids of both images.
+    @torch.inference_mode()
+    def candidates(self, first: DenseEncoding, second: DenseEncoding) -> tuple[Tensor, Tensor]:
+        """Return all points that matches are sampled from, and their certainties (N,).
+
+        Points (N, 4) are x and y in the first, then the second image, normalised.
+        """
+        # From the grids of both images
         warps = self._network.match(first.features, second.features)
         warp = torch.cat([dense.warp.reshape(-1, 4) for dense in warps])
         certainty = torch.cat([dense.certainty.flatten() for dense in warps])
         check_finite(f"certainties of {self.spec.name}", certainty, warp)
+        return warp, certainty
+
+    def _match(self, first: DenseEncoding, second: DenseEncoding) -> Matches:
+        warp, certainty = self.candidates(first, second)
         # PyTorch's CPU generator uses 32 bits of a seed, so the two checksums are combined into 32
         # bits.
         seed = zlib.crc32(second.checksum.to_bytes(4), first.checksum)
