@@ -22,7 +22,7 @@ from benchmarks.gpu.record import (
     write,
 )
 from benchmarks.gpu.setup import Setup
-from benchmarks.gpu.speed import RECIPES, cases_of
+from benchmarks.gpu.speed import RECIPES, cases_of, loads_of
 from mkpc_kaggle.recipe import load_recipe
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -130,6 +130,17 @@ def test_the_seconds_of_every_unit_of_every_recipe_are_measured():
     names = {case.name for case in cases_of(RECIPES)}
     assert len(names) == len(cases_of(RECIPES))
     assert {"loma l@1024", "loma b128@1024", "roma@864x864!", "superglue indoor@1280"} <= names
+
+
+def test_every_matcher_is_measured_before_a_second_size_of_any():
+    cases = cases_of(RECIPES)
+    loads = loads_of(cases)
+    measured = [case for load in loads if load.minibatch > 1 for case in load.cases]
+    assert sorted(case.name for case in measured) == sorted(case.name for case in cases)
+    kinds = {(case.matcher, case.options) for case in cases}
+    assert {(case.matcher, case.options) for case in measured[: len(kinds)]} == kinds
+    single = [load.cases[0].name for load in loads if load.minibatch == 1]
+    assert single == ["aliked_lightglue@1024", "aliked@1024"]
 
 
 def test_a_forecast_counts_one_new_image_on_whole_images_and_two_on_crops():

@@ -30,7 +30,7 @@ PARTS: tuple[tuple[str, str, float, Callable[[Part, Setup], None]], ...] = (
     ("networks", "Networks with seeded weights", 0.2, networks.measure),
     ("golden", "Networks against golden vectors", 0.3, golden.measure),
     ("trained", "ALIKED + LightGlue with trained weights", 0.35, trained.measure),
-    ("runs", "Runs of submit", 0.62, runs.measure),
+    ("runs", "Runs of submit", 0.7, runs.measure),
     ("speed", "Seconds of a pair", 1.0, speed.measure),
 )
 

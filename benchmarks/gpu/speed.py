@@ -23,7 +23,9 @@ from benchmarks.gpu.setup import Setup
 from mkpc_kaggle.config import from_table
 from mkpc_kaggle.data.images import Image
 from mkpc_kaggle.geometry.coordinates import Size
+from mkpc_kaggle.matchers.adapters.sift import SiftMatcher
 from mkpc_kaggle.matchers.contract import Matcher, MatcherSpec, Picture, Placement, Precision
+from mkpc_kaggle.matchers.dense import DenseMatcher
 from mkpc_kaggle.matchers.registry import UnusableError, load_matcher, spec_of
 from mkpc_kaggle.pipeline.assembly import CACHE_SHARE, CUDA_MINIBATCH
 from mkpc_kaggle.pipeline.pair import PairMatch
@@ -35,8 +37,9 @@ from mkpc_kaggle.weights import WeightStore
 RECIPES = ("light", "best", "auto", "permissive", "imc2022", "classical", "yfcc", "scannet")
 QUICK_RECIPES = ("light",)
 PHOTOGRAPH = Size(1600, 1200)
-ROUNDS = 2  # after a warm-up
 SINGLE_PAIRS = 3  # of a round with one pair at a time
+SINGLE = ("aliked_lightglue", "aliked")  # are measured with one pair at a time, too
+ONE_BY_ONE = (DenseMatcher, SiftMatcher)  # their warm-up needs no minibatch
 CUT_SIDE_PX = 160  # of a rehearsal's views
 CUT_FEATURES = 256
 
@@ -76,20 +79,41 @@ def cases_of(recipes: Sequence[str]) -> list[Case]:
     return list(cases)
 
 
-def measure(part: Part, setup: Setup) -> None:
-    """Add a row for each case, precision and minibatch; a matcher is loaded once for each precision."""
+@dataclass(frozen=True)
+class Load:
+    """A matcher that is loaded in each precision, for these cases."""
+
+    cases: tuple[Case, ...]
+    minibatch: int = CUDA_MINIBATCH
+
+
+def loads_of(cases: Sequence[Case]) -> list[Load]:
+    """Return the cases in the order of the measurements.
+
+    First each matcher at its first size, then the other sizes, then ALIKED pair by pair: a slower
+    GPU, on which the time is short, then has figures of every matcher.
+    """
     groups: dict[tuple[str, tuple[tuple[str, Any], ...]], list[Case]] = {}
-    for case in cases_of(QUICK_RECIPES if setup.quick else RECIPES):
+    for case in cases:
         groups.setdefault((case.matcher, case.options), []).append(case)
-    for cases in groups.values():
+    firsts = [Load((group[0],)) for group in groups.values()]
+    others = [Load(tuple(group[1:])) for group in groups.values() if len(group) > 1]
+    singles = [Load((group[0],), 1) for group in groups.values() if group[0].matcher in SINGLE]
+    return [*firsts, *others, *singles]
+
+
+def measure(part: Part, setup: Setup) -> None:
+    """Add a row for each case and precision."""
+    for load in loads_of(cases_of(QUICK_RECIPES if setup.quick else RECIPES)):
         for precision in (Precision.FLOAT16, Precision.FLOAT32):
-            part.check_time(needed=8.0 if setup.is_gpu else 0.0)
-            _measure_matcher(part, cases, precision, setup)
+            part.check_time(needed=5.0 if setup.is_gpu else 0.0)
+            _measure_load(part, load, precision, setup)
             _free(setup)
 
 
-def _measure_matcher(part: Part, cases: Sequence[Case], precision: Precision, setup: Setup) -> None:
-    """Add the rows of a matcher at one precision: all sizes, and the first size pair by pair."""
+def _measure_load(part: Part, load: Load, precision: Precision, setup: Setup) -> None:
+    """Add the rows of a matcher at one precision."""
+    cases = load.cases
     facts = {"matcher": cases[0].name, "precision": str(precision)}
     try:
         weights, kind = _weights(cases[0], setup)
@@ -102,11 +126,11 @@ def _measure_matcher(part: Part, cases: Sequence[Case], precision: Precision, se
         with part.row(**facts):
             raise error
         return
-    for case, minibatch in [*((case, CUDA_MINIBATCH) for case in cases), (cases[0], 1)]:
+    for case in cases:
         part.check_time(needed=5.0 if setup.is_gpu else 0.0)
-        facts = {"matcher": case.name, "precision": str(precision), "minibatch": minibatch}
-        with part.row(**facts) as row:
-            row.update(_seconds(case, matcher, minibatch, setup))
+        with part.row(matcher=case.name, precision=str(precision)) as row:
+            row["minibatch"] = load.minibatch
+            row.update(_seconds(case, matcher, load.minibatch, setup))
             row["weights"] = kind
         _free(setup)
 
@@ -119,16 +143,14 @@ def _seconds(case: Case, matcher: Matcher[Any], minibatch: int, setup: Setup) ->
         Recipe((unit,)), lambda _: watched, minibatch=minibatch, cache_bytes=_cache_bytes(setup)
     )
     count = minibatch if minibatch > 1 else SINGLE_PAIRS
-    _matched(pipeline, unit, _pairs(count, "warm-up"), setup)
+    warm_up = 1 if isinstance(matcher, ONE_BY_ONE) else count
+    _matched(pipeline, unit, _pairs(warm_up, "warm-up"), setup)
     if setup.is_gpu:
         torch.cuda.reset_peak_memory_stats(setup.device)
-    encode = []
-    match = []
-    for number in range(1 if setup.quick else ROUNDS):
-        results = _matched(pipeline, unit, _pairs(count, f"round {number}"), setup)
-        encode.append(statistics.mean(result.encode_seconds for result in results))
-        match.append(statistics.mean(result.match_seconds for result in results))
-    row: Row = {"new": min(encode) + min(match), "cached": min(match), "encode": min(encode)}
+    results = _matched(pipeline, unit, _pairs(count, "measured"), setup)
+    encode = statistics.mean(result.encode_seconds for result in results)
+    match = statistics.mean(result.match_seconds for result in results)
+    row: Row = {"new": encode + match, "cached": match, "encode": encode}
     row["matches"] = round(statistics.mean(len(result.matches) for result in results))
     row["pictures at a time"] = watched.largest
     if setup.is_gpu:
