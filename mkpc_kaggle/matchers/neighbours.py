@@ -16,7 +16,8 @@ from mkpc_kaggle.matchers.lists import (
 )
 from mkpc_kaggle.matchers.sparse import Keypoints, matches_of
 
-BLOCK_ROWS = 512  # a block of 512 x 8,000 similarities fits the cache
+# On a CPU, a block of 512 x 8,000 similarities fits the cache. A GPU is idle between small blocks.
+BLOCK_ROWS = {"cpu": 512, "cuda": 8192}
 GROUP = 64  # keys
 # Of pictures that are searched by lists. With fewer, the choice of the lists takes as long as the
 # products that it saves (`python -m benchmarks.neighbours --seconds`).
@@ -123,11 +124,12 @@ def _nearest(queries: Tensor, keys: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     rest = -len(keys) % GROUP
     filled = torch.cat([keys, keys.new_zeros(rest, keys.shape[1])])
     # One buffer for all blocks: new memory for each block takes a third of the product's time.
-    buffer = queries.new_empty(min(BLOCK_ROWS, len(queries)), len(filled))
+    rows = BLOCK_ROWS.get(queries.device.type, 512)
+    buffer = queries.new_empty(min(rows, len(queries)), len(filled))
     similarities = []
     ratios = []
     indices = []
-    for block in torch.split(queries, BLOCK_ROWS):
+    for block in torch.split(queries, rows):
         similarity = torch.mm(block, filled.T, out=buffer[: len(block)])  # (rows, M)
         similarity[:, len(keys) :] = -1.0
         # Only the maximum of each group is taken over all keys: a search for its index is slow.

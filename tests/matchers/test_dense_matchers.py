@@ -11,11 +11,21 @@ from standin import narrow_roma
 
 from mkpc_kaggle.matchers.contract import MatcherSpec, Placement
 from mkpc_kaggle.matchers.dense import DenseMatcher, DenseOptions
+from mkpc_kaggle.matchers.networks import dense_sampling
 from mkpc_kaggle.matchers.networks.dense_sampling import sample_matches
 from mkpc_kaggle.matchers.networks.dense_warp import DenseWarp
 from mkpc_kaggle.matchers.networks.dkm import DKM
 from mkpc_kaggle.matchers.networks.grids import as_grid
 from mkpc_kaggle.matchers.networks.warp_refiner import WarpEstimate, identity_map
+
+
+@pytest.mark.parametrize("floats", [1, 64, 1 << 20])
+def test_a_density_is_the_same_in_blocks_of_any_size(monkeypatch, floats):
+    monkeypatch.setattr(dense_sampling, "BLOCK_FLOATS", {"cpu": floats})
+    points = torch.rand(50, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    squares = (points[:, None] - points).square().sum(2)
+    expected = (squares / (-2 * dense_sampling.BANDWIDTH**2)).clamp(min=-80).exp().sum(1)
+    torch.testing.assert_close(dense_sampling.density(points), expected)
 
 
 @torch.inference_mode()

@@ -2,6 +2,7 @@
 none.
 """
 
+import threading
 from functools import cache
 
 import cv2
@@ -145,6 +146,30 @@ def with_search(search, pixels0, pixels1):
     options = SiftOptions(search=search)
     matcher = load_matcher("sift", WeightStore([]), options, Placement())
     return match_one(matcher, as_picture(pixels0, 1), as_picture(pixels1, 1))
+
+
+@pytest.mark.parametrize("count", [1, 5])
+def test_sift_finds_the_same_in_several_pictures_at_a_time(monkeypatch, count):
+    gray = cv2.cvtColor(photograph(), cv2.COLOR_RGB2GRAY)
+    pictures = [as_picture(np.roll(gray, 7 * number, axis=1), 1) for number in range(count)]
+    matcher = load_matcher("sift", WeightStore([]), SiftOptions(), Placement())
+    one_by_one = [matcher.encode([picture])[0] for picture in pictures]
+    makers = set()
+    make = cv2.SIFT_create
+
+    def made(*arguments, **settings):
+        makers.add(threading.current_thread().name)
+        return make(*arguments, **settings)
+
+    monkeypatch.setattr(cv2, "SIFT_create", made)
+    monkeypatch.setattr(cv2, "getNumThreads", lambda: 8)
+    parallel = load_matcher("sift", WeightStore([]), SiftOptions(), Placement()).encode(pictures)
+    # A single picture needs no thread.
+    assert (threading.current_thread().name in makers) == (count == 1)
+    for alone, together in zip(one_by_one, parallel, strict=True):
+        assert len(alone) > 100
+        assert torch.equal(alone.points, together.points)
+        assert torch.equal(alone.descriptors, together.descriptors)
 
 
 def rows_of(matches):

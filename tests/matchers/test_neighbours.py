@@ -67,7 +67,7 @@ def found(first, second, dtype=torch.float64):
 def test_neighbours_are_those_of_brute_force_in_blocks_of_any_size(
     n, m, dtype, tolerance, rows, monkeypatch
 ):
-    monkeypatch.setattr(neighbours, "BLOCK_ROWS", rows)
+    monkeypatch.setattr(neighbours, "BLOCK_ROWS", {"cpu": rows})
     first, second = related(n, n, m)
     index0, index1, *values = found(first, second, dtype)
     true0, true1, *true_values = brute_force(first, second)

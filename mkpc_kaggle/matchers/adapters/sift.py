@@ -3,8 +3,11 @@
 Sources: Lowe 2004 (SIFT, as in OpenCV); Arandjelovic and Zisserman 2012 (RootSIFT).
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import cv2
 import numpy as np
@@ -34,6 +37,9 @@ class SiftOptions:
 
 
 SPEC = MatcherSpec("sift", SiftOptions, Colour.GRAY, packages=("opencv",))
+CORES_PER_PICTURE = 2
+MAX_THREADS = 4  # each has a scale space of its picture in memory
+Detected = tuple[Sequence[cv2.KeyPoint], NDArray[np.float32]]
 
 
 class SiftMatcher(NeighbourMatcher):
@@ -45,21 +51,25 @@ class SiftMatcher(NeighbourMatcher):
         self.ratio = options.ratio
         self.search = options.search
         self.device = device
-        # Without precise upscaling, OpenCV shifts every point by a quarter of a pixel.
-        self._sift = cv2.SIFT_create(  # type: ignore[attr-defined]  # missing in OpenCV's stubs
+        self._detector = partial(
+            cv2.SIFT_create,  # type: ignore[attr-defined]  # missing in OpenCV's stubs
             options.features,
             contrastThreshold=options.contrast_threshold,
+            # Without it, OpenCV shifts every point by a quarter of a pixel.
             enable_precise_upscale=True,
         )
 
     def encode(self, pictures: Sequence[Picture]) -> list[Keypoints]:
-        return [self._searchable(self._encode(picture)) for picture in pictures]
+        detected = detected_in(pictures, self._detector)
+        return [
+            self._searchable(self._keypoints(*found, picture))
+            for found, picture in zip(detected, pictures, strict=True)
+        ]
 
-    def _encode(self, picture: Picture) -> Keypoints:
-        found, descriptors = self._sift.detectAndCompute(picture.pixels, None)
+    def _keypoints(
+        self, found: Sequence[cv2.KeyPoint], descriptors: NDArray[np.float32], picture: Picture
+    ) -> Keypoints:
         points = np.array([keypoint.pt for keypoint in found], np.float32).reshape(-1, 2)
-        if descriptors is None:  # OpenCV's value for no keypoints
-            descriptors = np.zeros((0, 128), np.float32)
         return Keypoints.on_content(
             torch.from_numpy(points).to(self.device),
             torch.from_numpy(root_sift(descriptors)).to(self.device),
@@ -68,6 +78,26 @@ class SiftMatcher(NeighbourMatcher):
 
     def _scores(self, pairs: Neighbours) -> Tensor:
         return 1 - pairs.ratio
+
+
+def detected_in(pictures: Sequence[Picture], make: Callable[[], Any]) -> list[Detected]:
+    """Return OpenCV's keypoints and descriptors (K, 128) of each picture, by detectors from ``make``.
+
+    Several pictures at a time where there are cores for it, with the same results.
+    """
+
+    def detect(picture: Picture) -> Detected:
+        found, descriptors = make().detectAndCompute(picture.pixels, None)
+        if descriptors is None:  # OpenCV's value for no keypoints
+            descriptors = np.zeros((0, 128), np.float32)
+        return found, descriptors
+
+    # OpenCV's own limit is this process's share of the cores. One picture keeps few of them busy.
+    threads = min(MAX_THREADS, len(pictures), cv2.getNumThreads() // CORES_PER_PICTURE)
+    if threads < 2:
+        return [detect(picture) for picture in pictures]
+    with ThreadPoolExecutor(threads) as pool:
+        return list(pool.map(detect, pictures))
 
 
 def root_sift(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -1,13 +1,15 @@
 """SIFT keypoints (Lowe 2004, as in OpenCV) matched by LightGlue (Lindenberger et al. 2023)."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
 import torch
 from torch.nn import functional
 
-from mkpc_kaggle.matchers.adapters.sift import root_sift
+from mkpc_kaggle.matchers.adapters.sift import Detected, detected_in, root_sift
 from mkpc_kaggle.matchers.contract import Colour, MatcherSpec, Picture, Placement
 from mkpc_kaggle.matchers.lightglue import LightGlueMatcher, LightGlueOptions, load_lightglue
 from mkpc_kaggle.matchers.networks.lightglue import LightGlueShape
@@ -40,12 +42,10 @@ def sift_encoder(features: int, device: str) -> Encode:
     angle.
     """
     # Octave layers, contrast threshold and edge threshold as in the published evaluation.
-    sift = cv2.SIFT_create(features, 4, 0.0066667, 10)  # type: ignore[attr-defined]  # missing in stubs
+    make = partial(cv2.SIFT_create, features, 4, 0.0066667, 10)  # type: ignore[attr-defined]
 
-    def encode(picture: Picture) -> Keypoints:
-        detected, descriptors = sift.detectAndCompute(picture.pixels, None)
-        if descriptors is None:  # OpenCV's value for no keypoints
-            descriptors = np.zeros((0, 128), np.float32)
+    def keypoints_of(detection: Detected, picture: Picture) -> Keypoints:
+        detected, descriptors = detection
         rows = [(*each.pt, each.size, np.radians(each.angle), each.response) for each in detected]
         found = np.array(rows).reshape(-1, 5)
 
@@ -63,7 +63,10 @@ def sift_encoder(features: int, device: str) -> Encode:
         unit = functional.normalize(roots.clamp(min=1e-3), dim=1)
         return Keypoints.on_content(points, unit, picture.content, sizes, angles)
 
-    return lambda pictures: [encode(picture) for picture in pictures]
+    def encode(pictures: Sequence[Picture]) -> list[Keypoints]:
+        return list(map(keypoints_of, detected_in(pictures, make), pictures))
+
+    return encode
 
 
 def load(

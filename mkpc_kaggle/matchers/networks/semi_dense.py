@@ -25,7 +25,9 @@ from mkpc_kaggle.matchers.networks.resnet_fpn import FINE, TOP, FeatureMaps, Res
 
 HEADS = 8
 TEMPERATURE = 0.1  # of the dual softmax
-WINDOWS_AT_ONCE = 1024  # 13 MB of features per image; a pair may have 6,000 matches
+# 1,024 have 13 MB of features per image; a pair may have 6,000 matches. A GPU is idle between small
+# blocks.
+WINDOWS_AT_ONCE = {"cpu": 1024, "cuda": 8192}
 
 
 class SemiDenseNetwork(nn.Module, ABC):
@@ -91,9 +93,10 @@ class SemiDenseNetwork(nn.Module, ABC):
         features0 = grid0.flatten(0, 1)  # (L, 256)
         features1 = grid1.flatten(0, 1)  # (S, 256)
         found = []
+        at_once = WINDOWS_AT_ONCE.get(coarse.index0.device.type, 1024)
         parts = zip(
-            torch.split(coarse.index0, WINDOWS_AT_ONCE),
-            torch.split(coarse.index1, WINDOWS_AT_ONCE),
+            torch.split(coarse.index0, at_once),
+            torch.split(coarse.index1, at_once),
             strict=True,
         )
         for cells0, cells1 in parts:
