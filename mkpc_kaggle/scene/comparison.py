@@ -39,6 +39,7 @@ MAX_PRIOR_SIGMAS = 3.0  # of a prior
 MIN_DISPLACEMENT = 0.005
 MIN_LENS_IMAGES = 3  # of one size; a single weak camera fits any coefficient
 MIN_AGREEING = 0.8  # share of these images with at least half of the median displacement
+MAX_POINTS = 300  # per image, of the longest tracks; more cost time and tell the same
 CLEAR_SIGMAS = 5.0  # smaller differences are noise
 LENS_SIGMA = 5.0  # percent, of the focal length in the row to give
 
@@ -66,6 +67,7 @@ def compare(model: SfmModel, known: Mapping[str, KnownCamera]) -> Comparison:
     name.
     """
     copy = pycolmap.Reconstruction(model.colmap)
+    _thin(copy)
     radial = {number for number, camera in copy.cameras.items() if _free_radial(camera)}
     config = pycolmap.BundleAdjustmentConfig()
     for number in sorted(copy.reg_image_ids()):
@@ -89,6 +91,22 @@ def compare(model: SfmModel, known: Mapping[str, KnownCamera]) -> Comparison:
     ]
     focals = (*given, *_exif_focals(determined, known))
     return Comparison(focals, tuple(_lenses(copy, determined)))
+
+
+def _thin(copy: Any) -> None:
+    """Remove short tracks of images that have ``MAX_POINTS`` longer ones."""
+    counts = dict.fromkeys(copy.reg_image_ids(), 0)
+    if copy.num_points3D() <= MAX_POINTS:
+        return
+    lengths = {number: copy.points3D[number].track.length() for number in copy.point3D_ids()}
+    # Of equally long tracks, the point with the lower number
+    for number in sorted(lengths, key=lambda number: (-lengths[number], number)):
+        images = {element.image_id for element in copy.points3D[number].track.elements}
+        if all(counts[image] >= MAX_POINTS for image in images):
+            copy.delete_point3D(number)
+            continue
+        for image in images:
+            counts[image] += 1
 
 
 def _free_radial(camera: Any) -> bool:
