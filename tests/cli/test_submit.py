@@ -153,7 +153,8 @@ def test_the_light_recipe_with_genuine_weights_matches_photographs_with_aliked_a
     with Store.read(tmp_path / "submission.work") as store:
         records = list(read_records(store))
     for record in records:
-        counts = [unit.matches for unit in record.units if ":aliked_lightglue@" in unit.unit]
+        # A pair that does not need the crops has none of their matches.
+        counts = [unit.matches for unit in record.units if "1:aliked_lightglue@" in unit.unit]
         assert counts
         # Networks with wrong weights find a handful.
         assert min(counts) > 100
