@@ -102,7 +102,7 @@ PRINTED = {
         "2 files, 0 refused, 0 missing",
         "1 of 1 pair with an F",
         r"\n1:aliked_lightglue@\d+ +1 +[1-9]",
-        r"\n2:aliked_lightglue@\d+ +1 +[1-9]",
+        "pairs that need their crops: 0 of 1",
     ),
     WEIGHTS: (
         "3 files, 0 refused, 0 missing",
