@@ -3,7 +3,7 @@
 import sys
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager, redirect_stderr
+from contextlib import contextmanager, redirect_stderr, suppress
 from functools import cache
 from importlib import import_module
 from io import StringIO
@@ -36,7 +36,9 @@ def require_native(name: str, remedy: str) -> None:
         first = " ".join(said.getvalue().split()).partition(". ")[0]
         reason = first or f"{type(error).__name__}: {' '.join(str(error).split())}"
         raise ImportError(f"{name} cannot be imported: {reason}; {remedy}", name=name) from None
-    sys.stderr.write(said.getvalue())
+    # Without a terminal, or with its descriptor closed, the text is lost, and the run continues.
+    with suppress(OSError, ValueError, AttributeError):
+        sys.stderr.write(said.getvalue())
 
 
 def require_libraries() -> None:
