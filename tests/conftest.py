@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -22,6 +23,12 @@ from mkpc_kaggle.weights import store as weight_store
 # Before torch is imported, here and in the processes of the tests: their tensors are small, and on
 # a busy machine threads wait for each other more than they work.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+
+# A shell that starts the tests in the background lets them ignore Ctrl-C, and so would each program
+# that they start. Tests send it.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 # How long an example takes is the machine's affair; tests that are about time measure it.

@@ -550,7 +550,7 @@ def test_scenes_at_several_places_take_less_time_and_end_as_at_one():
     assert written[0] == written[1]
 
 
-def test_the_loop_reads_nothing_back_but_the_points_that_crops_come_from(monkeypatch):
+def test_the_loop_reads_nothing_back_but_the_points_of_crops_and_estimates(monkeypatch):
     read = []
     is_looping = []
     loop = Engine._loop
@@ -573,7 +573,8 @@ def test_the_loop_reads_nothing_back_but_the_points_that_crops_come_from(monkeyp
     assert len(ran.scenes) >= 4
     # Answers update the state; the store is for the next run.
     assert set(read) == {("data", True)}
-    assert len(read) <= 40, "once for the unit of stage 2 on each pair"
+    # An estimator gets the points of a pair in its job: after the sweep, and with those of its crops.
+    assert len(read) <= 40 + 2 * 40
 
 
 def test_the_file_and_the_report_agree_on_an_image_that_is_replaced_during_a_run():

@@ -5,6 +5,7 @@ that they fit.
 import hashlib
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -122,6 +123,5 @@ def store_of(directory: Path, files: Iterable[PublicFile]) -> WeightStore:
 def use_manifest(monkeypatch: pytest.MonkeyPatch, lines: tuple[WeightFile, ...]) -> None:
     """Let runs compare weights with these lines instead of the package's."""
     # Stand-in files have other digests than the published ones.
-    monkeypatch.setattr(
-        assembly, "WeightStore", lambda directories: WeightStore(directories, lines)
-    )
+    with_lines = partial(WeightStore, files=lines)
+    monkeypatch.setattr(assembly, "WeightStore", with_lines)
