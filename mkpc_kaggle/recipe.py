@@ -46,19 +46,52 @@ class Mode(StrEnum):
 
 @dataclass(frozen=True)
 class Unit:
-    """One matcher on one kind of view of a pair. Raises ``ValueError`` for contradictory values."""
+    """One matcher on one kind of view of a pair.
 
-    stage: int  # 1: on whole images, 2: on the critical regions
+    Parameters
+    ----------
+    stage : int
+        1: on whole images; 2: on the critical regions.
+    matcher : str
+        The name of the matcher.
+    long_side : int
+        Pixels of a view's longer side, or 0 with ``area``.
+    max_matches : int
+        The number of matches to keep, those with the highest scores.
+    area : str
+        Height x width, such as "540x720": the area of a view, which keeps its aspect ratio.
+    stretch : bool
+        True: a view gets exactly the height and width of ``area``.
+    enlarge : bool
+        False: a crop smaller than the view keeps its size.
+    fallback : str
+        The matcher to use if ``matcher`` is unavailable.
+    antialias : bool
+        False: shrink views bilinearly, without averaging areas.
+    tracks : bool
+        False: scenes use the unit's matches only if the pair's other units have fewer than 50.
+
+    Raises
+    ------
+    ValueError
+        For a value out of range, and for contradictory values.
+
+    Examples
+    --------
+    >>> from mkpc_kaggle import Unit
+    >>> Unit(2, "sift", 1280).name
+    '2:sift@1280'
+    """
+
+    stage: int
     matcher: str
-    long_side: int = 0  # pixels of a view's longer side, or 0 with ``area``
-    max_matches: int = 4096  # the matches with the highest scores
-    # Height x width, such as "540x720": the area of a view, which keeps its aspect ratio.
+    long_side: int = 0
+    max_matches: int = 4096
     area: str = ""
-    stretch: bool = False  # True: a view gets exactly the height and width of ``area``
-    enlarge: bool = True  # False: a crop smaller than the view keeps its size
-    fallback: str = ""  # the matcher to use if ``matcher`` is unavailable
-    antialias: bool = True  # False: shrink views bilinearly, without averaging areas
-    # False: scenes use the unit's matches only if the pair's other units have fewer than 50.
+    stretch: bool = False
+    enlarge: bool = True
+    fallback: str = ""
+    antialias: bool = True
     tracks: bool = True
 
     def __post_init__(self) -> None:
@@ -162,8 +195,37 @@ class SceneConfig:
 class Recipe:
     """Units in order of importance, and the settings of MKPC, MAGSAC, the matchers and scenes.
 
-    Raises :class:`UserError` if a unit is repeated, or the first unit, which sweeps all pairs, is
-    not of stage 1.
+    Parameters
+    ----------
+    units : sequence of Unit
+        The first one is of stage 1, because it sweeps all pairs.
+    name, description : str
+        For messages and reports.
+    mkpc : MkpcConfig
+        Settings of critical regions.
+    magsac : RobustConfig
+        Settings of the estimation of F, E and H.
+    focal : FocalConfig, optional
+        The prior on the focal lengths. ``None``: F is MAGSAC's.
+    matchers : mapping
+        The options of each matcher, by its name.
+    scene : SceneConfig, optional
+        Settings of structure from motion. ``None``: batches are not reconstructed.
+
+    Raises
+    ------
+    UserError
+        If there are no units, a unit is repeated, or the first one is not of stage 1.
+    TypeError
+        If a unit is not a :class:`Unit`.
+
+    Examples
+    --------
+    >>> from mkpc_kaggle import MkpcConfig, Recipe, Unit
+    >>> units = [Unit(1, "sift", 1024), Unit(2, "sift", 1280)]
+    >>> recipe = Recipe(units, "mine", mkpc=MkpcConfig(expand_x=1.2))
+    >>> [unit.name for unit in recipe.units]
+    ['1:sift@1024', '2:sift@1280']
     """
 
     units: tuple[Unit, ...]
@@ -171,9 +233,9 @@ class Recipe:
     description: str = ""
     mkpc: MkpcConfig = field(default_factory=MkpcConfig)
     magsac: RobustConfig = field(default_factory=RobustConfig)
-    focal: FocalConfig | None = None  # ``None``: F is MAGSAC's, without a prior on focal lengths
-    matchers: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  # options by name
-    scene: SceneConfig | None = None  # ``None``: batches are not reconstructed
+    focal: FocalConfig | None = None
+    matchers: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    scene: SceneConfig | None = None
 
     def __post_init__(self) -> None:
         where = f"recipe {self.name!r}"

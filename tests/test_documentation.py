@@ -104,8 +104,9 @@ def test_the_python_of_the_pages_runs(block, tmp_path, monkeypatch):
     for name, shift in (("a.jpg", 0), ("b.jpg", 40)):
         assert cv2.imwrite(str(tmp_path / name), photograph[:, shift : shift + 560, ::-1])
     (tmp_path / "docs").symlink_to(ROOT / "docs")
-    # Examples read and write files by short names.
+    # Examples read and write files by short names, and import the template of a matcher.
     monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(ROOT / "docs")
     names = {}
     exec(compile(block, "page", "exec"), names)
     if "models" in names:

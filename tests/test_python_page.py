@@ -4,12 +4,11 @@ import re
 import sys
 from pathlib import Path
 
-import cv2
 import matplotlib as mpl
 import numpy as np
 import pytest
 from genuine import GENUINE
-from sklearn.datasets import load_sample_image
+from pictures import write_two_views
 from their_lightglue import stand_in
 
 from mkpc_kaggle import TwoStageMatcher
@@ -24,11 +23,7 @@ OURS = [block for block in BLOCKS if block not in THEIRS + GENUINE_BLOCKS]
 @pytest.fixture
 def names(tmp_path, monkeypatch) -> dict:
     """The names that snippets have in common, in a directory with two parts of a photograph."""
-    photograph = load_sample_image("china.jpg")[..., ::-1]
-    for name, shift in (("a.jpg", 0), ("b.jpg", 40)):
-        # Small: RootSIFT enlarges a view to 1,536 pixels, and this text is about the API.
-        part = photograph[60:300, 60 + shift : 420 + shift]
-        assert cv2.imwrite(str(tmp_path / name), part)
+    write_two_views(tmp_path)
     monkeypatch.chdir(tmp_path)
     mpl.use("agg")
     return {}

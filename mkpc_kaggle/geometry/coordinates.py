@@ -32,7 +32,26 @@ class Size(NamedTuple):
 
 @dataclass(frozen=True)
 class Box:
-    """A half-open box of whole pixels: ``left <= x < right``, ``top <= y < bottom``."""
+    """A half-open box of whole pixels: ``left <= x < right``, ``top <= y < bottom``.
+
+    Parameters
+    ----------
+    left, top : int
+        The first column and row.
+    right, bottom : int
+        One after the last column and row.
+
+    Raises
+    ------
+    ValueError
+        If the box has no pixels.
+
+    Examples
+    --------
+    >>> from mkpc_kaggle import Box
+    >>> Box(10, 20, 330, 260).size
+    Size(width=320, height=240)
+    """
 
     left: int
     top: int

@@ -32,19 +32,51 @@ class MkpcConfig:
     """Settings of :func:`critical_region`, and of :func:`mkpc_kaggle.geometry.crop_need.crop_need`.
 
     Table ``[mkpc]`` of a recipe.
+
+    Parameters
+    ----------
+    eps : float
+        Radius of DBSCAN, relative to the image's width and height.
+    min_samples : int
+        Points within the radius that make a cluster.
+    share : float
+        Minimum size of a kept cluster, relative to the largest: T of the paper's Algorithm 1.
+    expand_x, expand_y : float
+        Factors of Crop Area Expansion: the paper's e_h and e_v.
+    min_clustered : float
+        Minimum share of the points that are in clusters; below it, the region is the whole image.
+    min_side : int
+        Minimum side of a crop, in pixels; below it, the region is the whole image.
+    when : When
+        The pairs that stage 2 runs on.
+    min_scale : float
+        With ``when = "scale"``: minimum ratio of the scales of both images, by their matches.
+    min_detail : float
+        With ``when = "scale"``: minimum ratio of the scales of a crop's view and the largest view
+        of stage 1. Either ratio is enough.
+
+    Raises
+    ------
+    ValueError
+        If a value is outside its range.
+
+    Examples
+    --------
+    >>> from mkpc_kaggle import MkpcConfig
+    >>> MkpcConfig(expand_x=1.2).expand_x
+    1.2
     """
 
-    eps: float = 0.05  # radius of DBSCAN, relative to the image's width and height
-    min_samples: int = 5  # of DBSCAN
-    share: float = 0.05  # Algorithm 1's T: minimum size of a kept cluster, relative to the largest
-    expand_x: float = 1.05  # the paper's e_h
-    expand_y: float = 1.0  # the paper's e_v
-    min_clustered: float = 0.2  # minimum share of points in clusters
-    min_side: int = 32  # of a crop, in pixels
+    eps: float = 0.05
+    min_samples: int = 5
+    share: float = 0.05
+    expand_x: float = 1.05
+    expand_y: float = 1.0
+    min_clustered: float = 0.2
+    min_side: int = 32
     when: When = When.ALWAYS
-    # With ``when = "scale"``, one of these two decides.
-    min_scale: float = 2.0  # ratio of the scales of the two images, by the matches of stage 1
-    min_detail: float = 2.0  # ratio of the scales of a crop's view and the largest view of stage 1
+    min_scale: float = 2.0
+    min_detail: float = 2.0
 
     def __post_init__(self) -> None:
         check_ranges(
@@ -90,10 +122,37 @@ class Clusters:
 
 
 def critical_region(points: Points, size: Size, config: MkpcConfig) -> CriticalRegion:
-    """Return the critical region of an image of ``size`` with matched ``points``.
+    """Return the critical region of an image, by its matched points of stage 1.
 
-    Points are (N, 2) float32 in image pixels. Ignores points that are not finite or not on the
-    image. Never raises.
+    Parameters
+    ----------
+    points : array (N, 2) of float32
+        Matched points, in pixels of the image. Points that are not finite or not on the image are
+        ignored.
+    size : Size
+        Width and height of the image, in pixels.
+    config : MkpcConfig
+        Settings of the clustering and of the expansion.
+
+    Returns
+    -------
+    CriticalRegion
+        The box, and its reason: ``CROPPED``, or why the box is the whole image.
+
+    Examples
+    --------
+    A dense cluster of 100 points, and a single wrong match far from it:
+
+    >>> import numpy as np
+    >>> from mkpc_kaggle import MkpcConfig, Size, critical_region
+    >>> x, y = np.meshgrid(np.arange(200, 300, 10), np.arange(100, 200, 10))
+    >>> points = np.column_stack([x.ravel(), y.ravel()]).astype(np.float32)
+    >>> points = np.append(points, np.float32([[620, 440]]), axis=0)
+    >>> region = critical_region(points, Size(640, 480), MkpcConfig())
+    >>> region.box
+    Box(left=197, top=100, right=294, bottom=191)
+    >>> str(region.reason)
+    'cropped'
     """
     whole = Box.whole(size)
     points = points[whole.contains(points)]

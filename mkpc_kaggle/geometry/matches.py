@@ -19,10 +19,32 @@ MEANINGS = {
 class Matches:
     """N corresponding points (x, y) with scores; pixel centres are at integers.
 
-    ``points0`` and ``points1`` are (N, 2) float32, ``scores`` is (N,) float32, higher is more
-    certain. All methods keep the matcher's order, since MAGSAC's result depends on it. Other dtypes
-    are cast. ``indices`` (N, 2) are the rows of the keypoints of both pictures, of a matcher of
-    keypoints. Raises ``ValueError`` for inconsistent shapes.
+    All methods keep the matcher's order, since MAGSAC's result depends on it.
+
+    Parameters
+    ----------
+    points0, points1 : array (N, 2) of float32
+        The points in image 0 and image 1. Lists, tensors and other dtypes are converted.
+    scores : array (N,) of float32
+        A higher score is more certain.
+    indices : array (N, 2) of int64, optional
+        Of a matcher that detects keypoints: the rows of both keypoints.
+
+    Raises
+    ------
+    ValueError
+        If the shapes do not agree.
+    TypeError
+        If points or scores are ``None``.
+
+    Examples
+    --------
+    >>> from mkpc_kaggle import Matches
+    >>> matches = Matches([[10, 20], [30, 40]], [[12, 20], [33, 41]], [0.9, 0.4])
+    >>> len(matches), len(matches[matches.scores > 0.5])
+    (2, 1)
+    >>> len(Matches.empty())
+    0
     """
 
     points0: Points

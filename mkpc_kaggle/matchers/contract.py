@@ -73,20 +73,43 @@ class TrainedOptions:
 
 @dataclass(frozen=True)
 class MatcherSpec:
-    """The description of a matcher, known before it is loaded."""
+    """The description of a matcher, known before it is loaded.
+
+    Parameters
+    ----------
+    name : str
+        The matcher's name in the units of recipes.
+    options : type
+        A frozen dataclass; a recipe's table ``[matchers.NAME]`` sets its fields.
+    colour : Colour
+        The format of the pictures that the matcher gets.
+    multiple : int
+        The sides of pictures are padded to multiples of this.
+    slots : tuple of str
+        Slots of the manifest of weights; ``{name}`` stands for the value of option ``name``.
+    licences : tuple of str
+        Licence tags of weights outside the manifest.
+    version : str
+        Of a custom matcher: its results are kept for later runs under this text, so change it
+        whenever equal pictures get other points. Without it, results are not kept.
+    packages : tuple of str
+        Distributions whose code computes points: their versions are in the keys of results.
+        "opencv" is any build of OpenCV.
+
+    Examples
+    --------
+    >>> from mkpc_kaggle import Colour, MatcherSpec
+    >>> MatcherSpec("orb", colour=Colour.GRAY, version="1").colour.value
+    'gray'
+    """
 
     name: str
-    # A frozen dataclass; a recipe's table [matchers.NAME] sets its fields.
     options: type = NoOptions
     colour: Colour = Colour.RGB
-    multiple: int = 1  # the sides of pictures are padded to multiples of this
-    # Of the manifest; ``{name}`` stands for the value of option ``name``.
+    multiple: int = 1
     slots: tuple[str, ...] = ()
-    licences: tuple[str, ...] = ()  # licence tags of weights outside the manifest
-    # Of a matcher that is not from this package: its results are kept for later runs under this
-    # text, so change it whenever equal pictures get other points. Without it, they are not kept.
+    licences: tuple[str, ...] = ()
     version: str = ""
-    # Distributions whose code computes points: their versions are in the keys. "opencv" is OpenCV.
     packages: tuple[str, ...] = ()
 
     def slots_for(self, options: Any) -> tuple[str, ...]:
@@ -152,7 +175,30 @@ class Matcher(Protocol[Encoding]):
 class PairwiseMatcher(Generic[Encoding]):
     """A matcher that matches pairs one by one, so that results do not depend on the minibatch.
 
-    Subclasses define ``_match``, which returns the matches of one pair in view pixels.
+    A subclass defines three things: ``spec``, a :class:`MatcherSpec`; ``encode(pictures)``, which
+    returns an encoding for each :class:`Picture`; and ``_match(first, second)``, which returns the
+    :class:`Matches` of two encodings, in pixels of the pictures. ``docs/own_matcher.py`` is a
+    template.
+
+    Examples
+    --------
+    A matcher that returns a grid of identical points:
+
+    >>> import numpy as np
+    >>> from mkpc_kaggle import Matches, MatcherSpec, PairwiseMatcher, TwoStageMatcher
+    >>> from mkpc_kaggle import Recipe, Unit
+    >>> class Identity(PairwiseMatcher):
+    ...     spec = MatcherSpec("identity")
+    ...
+    ...     def encode(self, pictures):
+    ...         return [np.argwhere(np.ones((10, 10))) * 20.0 for picture in pictures]
+    ...
+    ...     def _match(self, first, second):
+    ...         return Matches(first, second, np.ones(len(first)))
+    >>> recipe = Recipe([Unit(1, "identity", 320)])
+    >>> matcher = TwoStageMatcher(recipe, matchers={"identity": Identity()})
+    >>> len(matcher("a.jpg", "a.jpg").matches)
+    100
     """
 
     def match(

@@ -64,23 +64,53 @@ class UnitResult:
 
 @dataclass(frozen=True, eq=False)
 class PairMatch:
-    """A pair with its results so far; each step returns a new one."""
+    """A pair with its results so far; each step returns a new one.
 
-    # In the order of execution; once estimated, in the recipe's order.
+    Parameters
+    ----------
+    results : tuple of UnitResult
+        In the order of execution; once estimated, in the recipe's order.
+    regions : pair of CriticalRegion, optional
+        ``None`` until a unit of stage 2 needs them.
+    estimate : Estimate
+        The two-view model of all matches.
+    images : tuple of Image
+        Both, while units run; afterwards only ``sizes`` and ``focals`` remain.
+    sizes, focals
+        Width and height, and the focal length by EXIF, of each image, in pixels.
+    failure : str
+        The image that cannot be read.
+    decode_seconds, cluster_seconds : float
+        Times of reading the images and of MKPC.
+    files, mkpc
+        Of a match of files: their paths and the settings of MKPC, for ``plot()``.
+    scale : float
+        The ratio of the scales of both images, known with the regions.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from mkpc_kaggle import TwoStageMatcher
+    >>> match = TwoStageMatcher("sift")("a.jpg", "b.jpg")
+    >>> len(match.inliers) == match.estimate.inlier_count
+    True
+    >>> K = np.array([[600, 0, 180], [0, 600, 120], [0, 0, 1]])
+    >>> match.pose(K, K).R.shape
+    (3, 3)
+    """
+
     results: tuple[UnitResult, ...] = ()
-    regions: Regions | None = None  # None until a unit of stage 2 needs them
+    regions: Regions | None = None
     estimate: Estimate = NOT_ESTIMATED
-    # Both, while units run; afterwards only ``sizes`` and ``focals`` remain.
     images: tuple[Image, ...] = ()
     sizes: tuple[Size, ...] = ()
     focals: tuple[float, ...] = ()
-    failure: str = ""  # the image that cannot be read
+    failure: str = ""
     decode_seconds: float = 0.0
     cluster_seconds: float = 0.0
-    # For plots of a match of files.
     files: tuple[str, ...] = ()
     mkpc: MkpcConfig = field(default_factory=MkpcConfig)
-    scale: float = 1.0  # between both images, known with the regions
+    scale: float = 1.0
 
     @property
     def matches(self) -> Matches:

@@ -39,25 +39,52 @@ Regions = tuple[Box, Box]
 
 
 class TwoStageMatcher:
-    """Matcher of pairs of images::
-
-        match = TwoStageMatcher("classical")("a.jpg", "b.jpg")
-        F, points0 = match.estimate.matrix, match.inliers.points0
-
-    or of many pairs with images in common::
-
-        for match in matcher.match_pairs([("a.jpg", "b.jpg"), ("a.jpg", "c.jpg")]):
-            print(match.estimate.inlier_count)
-
-    ``recipe`` is a :class:`Recipe`, a recipe's name, a path to a TOML file, or the name of a single
-    matcher, such as "aliked_lightglue". ``weights`` is a directory to search for weights, several
-    directories, or a mapping from slots to files, such as ``{"aliked-n16": "mine.pth"}``.
-    ``licence`` "permissive" refuses weights that forbid some uses. ``matchers`` maps names in the
-    recipe's units to your own matchers. ``settings`` replace the recipe's, by dotted key, such as
-    ``{"matchers.loftr.threshold": 0.3}``. ``progress`` counts the units of a call on stderr. Raises
-    :class:`UserError` for an unknown name and for missing weights.
+    """Matcher of pairs of images: two stages, then a two-view model.
 
     A matcher can be pickled if the user's own matchers can. A copy loads its networks again.
+
+    Parameters
+    ----------
+    recipe : Recipe, str or path
+        A recipe, its name, a path to a TOML file, or the name of a single matcher, such as
+        "aliked_lightglue".
+    weights : path, iterable of paths, or mapping
+        A directory to search for weights, several directories, or files by slot, such as
+        ``{"aliked-n16": "mine.pth"}``.
+    device : str
+        "auto", or torch's name of a device.
+    precision : str
+        "float32", "bfloat16" or "float16".
+    licence : str
+        "permissive" refuses weights that forbid some uses.
+    matchers : mapping
+        Custom matchers, by their names in the recipe's units.
+    settings : mapping
+        Replacements of the recipe's settings by dotted key, such as
+        ``{"matchers.loftr.threshold": 0.3}``.
+    progress : bool
+        Count the units of a call on the standard error stream.
+
+    Raises
+    ------
+    UserError
+        For an unknown name, and for missing weights.
+    TypeError, ValueError
+        For a wrong argument.
+
+    Examples
+    --------
+    >>> from mkpc_kaggle import TwoStageMatcher
+    >>> matcher = TwoStageMatcher("sift")
+    >>> match = matcher("a.jpg", "b.jpg")
+    >>> match.estimate.matrix.shape, match.estimate.inlier_count > 50
+    ((3, 3), True)
+
+    Many pairs with images in common:
+
+    >>> pairs = [("a.jpg", "b.jpg"), ("b.jpg", "a.jpg")]
+    >>> [bool(match.estimate) for match in matcher.match_pairs(pairs)]
+    [True, True]
     """
 
     def __init__(
@@ -111,23 +138,42 @@ class TwoStageMatcher:
         regions: Regions | None = None,
         descriptors: bool = False,
     ) -> PairMatch:
-        """Match two images: paths, PIL images, arrays (H, W, 3) RGB or (H, W), tensors (3, H, W).
+        """Match two images, and estimate their two-view model.
 
-        Arrays and tensors are uint8, or floats in 0..1. ``model`` E needs ``intrinsics``, the
-        camera matrices in pixels. ``regions`` replace MKPC's boxes; each is a :class:`Box` or its
-        left, top, right and bottom. Points, boxes and F are in pixels of the stored files; EXIF
-        only turns the matchers' views upright.
+        Parameters
+        ----------
+        image0, image1
+            Paths, PIL images, arrays (H, W, 3) RGB or (H, W), or tensors (3, H, W); uint8, or
+            floats in 0..1.
+        model : ModelKind or str
+            "F", "E" (needs ``intrinsics``) or "H".
+        intrinsics : pair of arrays (3, 3), optional
+            The camera matrices, in pixels.
+        regions : pair of boxes, optional
+            Replacements of MKPC's boxes; each is a :class:`Box` or its left, top, right and bottom.
+        descriptors : bool
+            Keep the descriptors of matchers that detect keypoints, in ``match.keypoints``.
 
-        ``match.keypoints`` has the keypoints of matchers that detect some, also their descriptors
-        if ``descriptors`` is true.
+        Returns
+        -------
+        PairMatch
+            Points, boxes and F are in pixels of the stored files; EXIF only turns the matchers'
+            views upright. If no model is found, ``match.estimate`` is false, its ``failure`` has
+            the reason, and the use of its matrix raises it. The result keeps no images.
 
-        A unit that fails is a warning, and ``match.failures`` has its reason. If no model is found,
-        ``match.estimate`` is false, its ``failure`` has the reason, and the use of its matrix
-        raises it. The result keeps no images.
+        Raises
+        ------
+        TypeError, ValueError
+            For a wrong argument, before any matching.
+        UserError
+            For an unreadable image, before any matching.
+        Exception
+            Errors of memory, of the device, and of the user's own matchers.
 
-        Raises ``TypeError`` or ``ValueError`` for a wrong argument, and :class:`UserError` for an
-        unreadable image, before any matching. Errors of memory, of the device, and of the user's
-        own matchers are raised.
+        Warns
+        -----
+        RuntimeWarning
+            For a unit that fails; ``match.failures`` has its reason.
         """
         kind = member_of(ModelKind, model, "model")
         sources = (image0, image1)
@@ -148,9 +194,26 @@ class TwoStageMatcher:
         """Yield the match of each pair, as a call does for one pair.
 
         An image that appears in several pairs is decoded and encoded once, while the caches have
-        room: sort the pairs by their first image. ``intrinsics`` and ``regions`` have an item for
-        each pair, which may be ``None``. Raises as a call does; wrong arguments of a pair when its
-        turn comes.
+        room: sort the pairs by their first image.
+
+        Parameters
+        ----------
+        pairs : iterable of two images
+            Images as for a call.
+        model, descriptors
+            As for a call.
+        intrinsics, regions : iterable, optional
+            An item for each pair, as for a call; it may be ``None``.
+
+        Yields
+        ------
+        PairMatch
+            In the order of the pairs; a pair is matched when the loop asks for it.
+
+        Raises
+        ------
+        TypeError, ValueError, UserError
+            As a call does; for wrong arguments of a pair when its turn comes.
         """
         kind = member_of(ModelKind, model, "model")
         if isinstance(pairs, str | bytes) or not hasattr(pairs, "__iter__"):

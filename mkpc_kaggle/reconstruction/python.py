@@ -72,23 +72,51 @@ def reconstruct(
     progress: bool = True,
     work_dir: str | Path | None = None,
 ) -> Models:
-    """Return the models of the images at these paths, or of a folder's images, the largest first; no
-    model if too few images match.
+    """Return the models of photographs: cameras and points by structure from motion.
 
-    The arguments from ``recipe`` to ``settings`` are those of :class:`mkpc_kaggle.TwoStageMatcher`.
-    This is a run of the command ``reconstruct`` on one set of images, without a time limit. Its
-    ``progress`` is shown on the standard error stream. ``work_dir`` keeps the journal and COLMAP's
-    files: after Ctrl-C, which raises ``KeyboardInterrupt``, the same call continues, and with more
-    images it matches only the new pairs. Your own matchers need
-    ``MatcherSpec(version=...)`` for that. ``masks`` is a directory, and ``intrinsics`` a table, as
-    for the command; their paths are relative to the common directory of the images. With ``matchers``,
-    matching runs in this process, else in separate processes.
+    This is a run of the command ``reconstruct`` on one set of images, without a time limit.
 
-    Cameras refer to the stored pixels of the files, as COLMAP reads them. ``colmap`` of a model is
-    pycolmap's; it has one of several identical files, whose camera all of them have in
-    ``images``. Raises :class:`UserError` for a recipe that cannot run here, for unusable masks or
-    intrinsics, and for an unreadable image. A ``work_dir`` with a folder ``colmap`` that is not of an
-    earlier call raises it, and so do cameras that cannot be computed.
+    Parameters
+    ----------
+    images : path, or iterable of paths
+        A folder of images, or image files.
+    recipe, weights, device, precision, licence, matchers, settings
+        As for :class:`mkpc_kaggle.TwoStageMatcher`. With ``matchers``, matching runs in this
+        process, else in separate processes.
+    masks : path, optional
+        A directory of masks, as for the command. Masks are named by the path of their image
+        relative to the common directory of the images.
+    intrinsics : path, optional
+        A table of known cameras, as for the command, whose images have the same paths.
+    progress : bool
+        Show the progress on the standard error stream.
+    work_dir : path, optional
+        A directory to keep the journal and COLMAP's files: after Ctrl-C, the same call continues,
+        and with more images it matches only the new pairs. Custom matchers need
+        ``MatcherSpec(version=...)`` for that.
+
+    Returns
+    -------
+    Models
+        A tuple of models, the largest first; empty if too few images match. Cameras refer to the
+        stored pixels of the files, as COLMAP reads them. ``colmap`` of a model is pycolmap's. It
+        has one of several identical files; ``images`` has a camera for each of them.
+
+    Raises
+    ------
+    UserError
+        For a recipe that cannot run here, unusable masks or intrinsics, an unreadable image, a
+        ``work_dir`` whose folder ``colmap`` is not of an earlier call, and cameras that cannot be
+        computed.
+    KeyboardInterrupt
+        After Ctrl-C, once finished work is saved.
+
+    Examples
+    --------
+    >>> from mkpc_kaggle import reconstruct
+    >>> models = reconstruct(["a.jpg", "b.jpg"], "sift", work_dir="work", progress=False)
+    >>> len(models)  # a model needs three images
+    0
     """
     # By absolute path, because the journal knows an image by its path below the common directory
     given = {image.absolute(): str(image) for image in image_paths(images)}

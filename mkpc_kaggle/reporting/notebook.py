@@ -25,10 +25,30 @@ class RunResults(Results):
 
 
 def results(directory: str | Path) -> RunResults:
-    """Return the results in a work directory (NAME.work), during a run or after it.
+    """Return the results in a work directory, during a run or after it.
 
-    Raises :class:`mkpc_kaggle.errors.UserError` if the store is missing, damaged, or of another
-    format.
+    Parameters
+    ----------
+    directory : str or Path
+        NAME.work of a submission, ``--work-dir``, or ``work_dir`` of :func:`reconstruct`.
+
+    Returns
+    -------
+    RunResults
+        The DataFrames ``pairs``, ``units`` and ``cameras``, and ``show()``, a view of the scenes.
+
+    Raises
+    ------
+    UserError
+        If the store is missing, damaged, or of another format.
+
+    Examples
+    --------
+    >>> from mkpc_kaggle import reconstruct, results
+    >>> models = reconstruct(["a.jpg", "b.jpg"], "sift", work_dir="work", progress=False)
+    >>> tables = results("work")
+    >>> tables.pairs[["image0", "image1", "model"]].values.tolist()
+    [['a.jpg', 'b.jpg', 'F']]
     """
     found = RunResults(*read_results(directory))
     found.directory = Path(directory)

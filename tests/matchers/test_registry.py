@@ -2,6 +2,7 @@
 alone.
 """
 
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -9,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pictures import write_two_views
 from sklearn.datasets import load_sample_image
 
 from mkpc_kaggle import Recipe, TwoStageMatcher
@@ -17,6 +19,7 @@ from mkpc_kaggle.matchers import adapters
 from mkpc_kaggle.matchers.registry import matcher_names, spec_of
 from mkpc_kaggle.recipe import Unit
 
+TEMPLATE = Path(__file__).parents[2] / "docs" / "own_matcher.py"
 # In a separate process, because imports of this one cannot be undone.
 WITHOUT_KORNIA = """
 import sys
@@ -44,15 +47,23 @@ def more_matchers(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[P
         sys.modules.pop(f"{adapters.__name__}.{name}", None)
 
 
-def test_the_matcher_of_contributing_md_runs_as_it_is_printed(more_matchers):
-    page = (Path(__file__).parents[2] / "CONTRIBUTING.md").read_text(encoding="utf-8")
-    (more_matchers / "orb.py").write_text(page.split("```python\n")[1].split("```")[0])
+def test_the_template_of_a_matcher_runs_as_a_file_of_the_package(more_matchers):
+    shutil.copy(TEMPLATE, more_matchers / "orb.py")
     image = load_sample_image("china.jpg")
     match = TwoStageMatcher(Recipe((Unit(1, "orb", 640), Unit(2, "orb", 640))))(image, image)
     assert match.estimate.inlier_count > 500
     # Without keypoints, OpenCV returns None instead of descriptors.
     flat = np.zeros_like(image)
     assert not TwoStageMatcher(Recipe((Unit(1, "orb", 640),)))(image, flat).estimate.ok
+
+
+def test_the_template_of_a_matcher_runs_as_a_program(tmp_path):
+    write_two_views(tmp_path)
+    command = [sys.executable, TEMPLATE, "a.jpg", "b.jpg"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    count = int(done.stdout.split(" inliers")[0])
+    assert count > 100
 
 
 def test_a_matcher_whose_import_fails_is_refused_with_the_reason_and_others_work(more_matchers):

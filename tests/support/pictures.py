@@ -1,10 +1,13 @@
 """Pictures for matchers, and comparisons of matches."""
 
 from math import ceil
+from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
+from sklearn.datasets import load_sample_image
 
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
 from mkpc_kaggle.geometry.matches import Matches
@@ -60,3 +63,12 @@ def agreement(first: torch.Tensor, second: torch.Tensor, within: float, p: float
     near = torch.cdist(first, second, p=p) <= within
     count = near.any(1).sum() + near.any(0).sum()
     return (count / (len(first) + len(second))).item()
+
+
+def write_two_views(directory: Path) -> None:
+    """Write a.jpg and b.jpg: two parts of a photograph, 40 pixels apart."""
+    photograph = load_sample_image("china.jpg")[..., ::-1]
+    for name, shift in (("a.jpg", 0), ("b.jpg", 40)):
+        # Small, because RootSIFT enlarges a view to 1,536 pixels.
+        part = photograph[60:300, 60 + shift : 420 + shift]
+        assert cv2.imwrite(str(directory / name), part)

@@ -1,0 +1,67 @@
+"""The names of ``mkpc_kaggle``: documented in sections, with examples that run."""
+
+import doctest
+import inspect
+import subprocess
+import sys
+
+import pytest
+from pictures import write_two_views
+
+import mkpc_kaggle
+
+# The names that programs build with; the others are parts of their results and arguments.
+DOCUMENTED = [
+    "Box",
+    "MatcherSpec",
+    "Matches",
+    "MkpcConfig",
+    "PairMatch",
+    "PairwiseMatcher",
+    "Recipe",
+    "TwoStageMatcher",
+    "Unit",
+    "critical_region",
+    "reconstruct",
+    "results",
+]
+
+
+@pytest.mark.parametrize("name", DOCUMENTED)
+def test_the_examples_of_a_public_name_run(name, tmp_path, monkeypatch):
+    write_two_views(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    public = getattr(mkpc_kaggle, name)
+    (examples,) = doctest.DocTestFinder(recurse=False).find(public, name, globs={})
+    assert examples.examples
+    said = []
+    result = doctest.DocTestRunner().run(examples, out=said.append)
+    assert result.failed == 0, "".join(said)
+
+
+@pytest.mark.parametrize("name", DOCUMENTED)
+def test_the_help_of_a_public_name_describes_each_parameter(name):
+    public = getattr(mkpc_kaggle, name)
+    text = inspect.getdoc(public)
+    parameters = list(inspect.signature(public).parameters)
+    if name == "PairwiseMatcher":  # a base class, made without arguments
+        return
+    assert "\nParameters\n----------\n" in text
+    described = text.split("\nParameters\n----------\n")[1].split("\n----")[0]
+    # A line such as "left, top : int".
+    heads = [line.split(" : ")[0] for line in described.splitlines() if line[:1].strip()]
+    words = {word for head in heads for word in head.split(", ")}
+    assert [parameter for parameter in parameters if parameter not in words] == []
+
+
+def test_every_public_name_exists_and_is_listed_for_completion():
+    assert sorted(mkpc_kaggle.__all__) == sorted({*mkpc_kaggle._MODULES, "__version__"})
+    for name in mkpc_kaggle.__all__:
+        assert getattr(mkpc_kaggle, name) is not None
+    assert {*mkpc_kaggle.__all__} <= {*dir(mkpc_kaggle)}
+
+
+def test_the_import_of_the_package_loads_no_library():
+    code = "import mkpc_kaggle, sys; print(*{'torch', 'numpy', 'cv2', 'pandas'} & {*sys.modules})"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == []
