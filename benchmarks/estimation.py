@@ -35,8 +35,8 @@ import numpy as np
 
 from mkpc_kaggle.config import from_table
 from mkpc_kaggle.data.competition import TrainScene, TruePair, read_train_side
-from mkpc_kaggle.engine.records import Table, read_images, read_points, read_records
-from mkpc_kaggle.engine.store import Store
+from mkpc_kaggle.engine.store.records import Table, read_images, read_points, read_records
+from mkpc_kaggle.engine.store.tables import Store
 from mkpc_kaggle.evaluation.compare import Difference, paired_difference
 from mkpc_kaggle.evaluation.validate import error_of
 from mkpc_kaggle.geometry.coordinates import Matrix3

@@ -20,14 +20,14 @@ from statistics import mean
 
 from mkpc_kaggle.data.competition import TrainScene, read_train_side
 from mkpc_kaggle.data.pairs import read_pairs
-from mkpc_kaggle.engine.budget import Budget
+from mkpc_kaggle.engine.plan.budget import Budget
 from mkpc_kaggle.engine.session import Session, interruptible
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.evaluation.validate import PROTOCOLS, Validation, by_protocol, validate
 from mkpc_kaggle.geometry.metrics import AUC_THRESHOLDS
 from mkpc_kaggle.geometry.robust import Method
-from mkpc_kaggle.pipeline.assembly import Assembly, assemble
 from mkpc_kaggle.recipe import Recipe, Unit, load_recipe
+from mkpc_kaggle.setup.assembly import Assembly, assemble
 
 TABLES = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 

@@ -10,7 +10,7 @@ from score_figures import short
 
 from mkpc_kaggle.data.competition import TrainScene, TruePair, read_train_side
 from mkpc_kaggle.data.images import Image
-from mkpc_kaggle.engine.records import SceneRecord
+from mkpc_kaggle.engine.store.records import SceneRecord
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Box, Matrix3, Points
 from mkpc_kaggle.geometry.critical_region import Clusters, CriticalRegion, MkpcConfig, expand_box

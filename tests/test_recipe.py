@@ -12,7 +12,6 @@ from mkpc_kaggle.geometry.critical_region import MkpcConfig
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.robust import Method, RobustConfig
 from mkpc_kaggle.matchers.registry import matcher_names, spec_of
-from mkpc_kaggle.pipeline.availability import options_of
 from mkpc_kaggle.recipe import (
     Mode,
     Recipe,
@@ -22,6 +21,7 @@ from mkpc_kaggle.recipe import (
     recipe_names,
     split_mode,
 )
+from mkpc_kaggle.setup.availability import options_of
 from mkpc_kaggle.weights.manifest import manifest
 
 SIFT = 'units = [{ stage = 1, matcher = "sift", long_side = 640 }]\n'

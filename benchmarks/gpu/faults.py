@@ -14,8 +14,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from mkpc_kaggle.matchers.contract import Matcher, Picture, Placement
-from mkpc_kaggle.pipeline.assembly import CUDA_MINIBATCH, Assembly
-from mkpc_kaggle.pipeline.stages import Pipeline
+from mkpc_kaggle.setup.assembly import CUDA_MINIBATCH, Assembly
 
 EVENTS = "events.jsonl"  # a line for each call of a matcher
 VICTIM = "victim"  # the file that names the pair of the fault
@@ -49,19 +48,15 @@ class FaultyAssembly(Assembly):
         is_rehearsal = self.device == "cpu"
         return CUDA_MINIBATCH if is_rehearsal else super().minibatch
 
-    def pipeline(self) -> Pipeline:
-        """Return a pipeline whose process has the limit of memory."""
+    def load(self, name: str, placement: Placement | None = None) -> Matcher[Any]:
+        """Load a matcher with the fault, in a process with the limit of memory."""
         device = self.placement.device
         if self.fault is Fault.MEMORY and device != "cpu":
             import torch
 
             _, total = torch.cuda.mem_get_info(device)
             torch.cuda.set_per_process_memory_fraction(self.limit / total, device)
-        return super().pipeline()
-
-    def _load(self, name: str, placement: Placement) -> Matcher[Any]:
-        inner = super()._load(name, placement)
-        return FaultyMatcher(inner, self.fault, self.home, placement.device)
+        return FaultyMatcher(super().load(name, placement), self.fault, self.home, device)
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,8 +7,8 @@ from pathlib import Path
 from mkpc_kaggle.data.competition import read_test_side, test_side
 from mkpc_kaggle.data.outputs import require_apart
 from mkpc_kaggle.engine.console import unblocked
-from mkpc_kaggle.engine.records import Table
-from mkpc_kaggle.engine.store import Store
+from mkpc_kaggle.engine.store.records import Table
+from mkpc_kaggle.engine.store.tables import Store
 from mkpc_kaggle.reporting.report import write_report
 from mkpc_kaggle.reporting.run_log import read_log, write_csv
 from mkpc_kaggle.reporting.summary import overview

@@ -9,15 +9,15 @@ from pathlib import Path
 from typing import Any
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine.budget import Budget, monotonic_of, parse_duration
-from mkpc_kaggle.engine.cluster import parse_workers
 from mkpc_kaggle.engine.console import Progress, drain, say, unblocked
+from mkpc_kaggle.engine.plan.budget import Budget, monotonic_of, parse_duration
 from mkpc_kaggle.engine.request import RunReport
 from mkpc_kaggle.engine.session import Interrupt, Session
-from mkpc_kaggle.pipeline.assembly import Assembly, assemble
-from mkpc_kaggle.pipeline.availability import Licence
+from mkpc_kaggle.engine.workers.cluster import parse_workers
 from mkpc_kaggle.recipe import Mode, parse_setting
 from mkpc_kaggle.reporting.summary import left_out_line
+from mkpc_kaggle.setup.assembly import Assembly, assemble
+from mkpc_kaggle.setup.availability import Licence
 
 
 def add_matching(parser: argparse.ArgumentParser) -> None:

@@ -3,9 +3,9 @@
 import argparse
 
 from mkpc_kaggle.cli import options
-from mkpc_kaggle.pipeline.assembly import recipe_of_name
-from mkpc_kaggle.pipeline.availability import UnavailableReason, unavailable
 from mkpc_kaggle.recipe import Recipe, load_recipe, recipe_names
+from mkpc_kaggle.setup.assembly import recipe_of_name
+from mkpc_kaggle.setup.availability import UnavailableReason, unavailable
 from mkpc_kaggle.weights import WeightStore
 
 HELP = """\

@@ -14,6 +14,7 @@ from mkpc_kaggle.config import from_table
 from mkpc_kaggle.data.competition import TrainScene, missing_line, read_train_side
 from mkpc_kaggle.data.outputs import require_apart
 from mkpc_kaggle.data.pairs import read_pairs
+from mkpc_kaggle.data.regions import read_regions
 from mkpc_kaggle.engine.console import say
 from mkpc_kaggle.engine.request import RunReport
 from mkpc_kaggle.engine.session import Interrupt, Session, interruptible
@@ -30,10 +31,9 @@ from mkpc_kaggle.evaluation.validate import (
     validate,
 )
 from mkpc_kaggle.geometry.robust import Method, RobustConfig
-from mkpc_kaggle.pipeline.assembly import Assembly
-from mkpc_kaggle.pipeline.stages import read_regions
 from mkpc_kaggle.recipe import split_mode
 from mkpc_kaggle.reporting.summary import left_out_line, summary, trouble
+from mkpc_kaggle.setup.assembly import Assembly
 
 # Defaults of the matching options.
 MATCHING = dict.fromkeys(("work_dir", "compare", "units", "method", "threshold", "regions"))

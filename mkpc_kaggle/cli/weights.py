@@ -7,8 +7,8 @@ from pathlib import Path
 from mkpc_kaggle.cli import options
 from mkpc_kaggle.errors import UserError, plural, temporary_directory
 from mkpc_kaggle.matchers.registry import UnusableError, matcher_names, spec_of
-from mkpc_kaggle.pipeline.availability import fit_of, slots_of
 from mkpc_kaggle.recipe import load_recipe, recipe_names
+from mkpc_kaggle.setup.availability import fit_of, slots_of
 from mkpc_kaggle.weights import FoundFile, State, WeightFile, WeightStore
 from mkpc_kaggle.weights.checkpoint import convert
 from mkpc_kaggle.weights.fetch import FetchOutcome, choose, fetch

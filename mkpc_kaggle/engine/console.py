@@ -23,7 +23,7 @@ from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any, NoReturn, TextIO
 
-from mkpc_kaggle.engine.budget import Budget, format_duration
+from mkpc_kaggle.engine.plan.budget import Budget, format_duration
 from mkpc_kaggle.progress import LINE_INTERVAL_S, WAIT_S, ProgressLine, print_to
 
 MAX_WAITING = 1000  # writes, which a busy progress line makes in a few minutes

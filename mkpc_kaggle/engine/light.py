@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from mkpc_kaggle.engine.blame import Tries
-from mkpc_kaggle.engine.budget import ESTIMATE
 from mkpc_kaggle.engine.jobs import Cause, Estimated, EstimateJob, Failure, FeatureJob, Found
-from mkpc_kaggle.engine.records import ESTIMATED
+from mkpc_kaggle.engine.plan.blame import Tries
+from mkpc_kaggle.engine.plan.budget import ESTIMATE
+from mkpc_kaggle.engine.plan.schedule import lacking_estimates
 from mkpc_kaggle.engine.run import HANG_FACTOR, Run
-from mkpc_kaggle.engine.schedule import lacking_estimates
-from mkpc_kaggle.engine.store import Kind, Result, Source, Store
+from mkpc_kaggle.engine.store.records import ESTIMATED
+from mkpc_kaggle.engine.store.tables import Kind, Result, Source, Store
 
 # In a job. More pairs would make the last F of a run wait for each other; single pairs, each with a
 # message and a transaction, would cost the loop more.

@@ -1,7 +1,8 @@
 """The loop of a run, on one thread: give jobs to idle workers, take their answers, publish.
 
-The schedule decides which pairs, estimates and scenes come next (:mod:`schedule`). Each kind of work
-has a file for its jobs and their answers (:mod:`matching`, :mod:`light`, :mod:`reconstructing`).
+The schedule decides which pairs, estimates and scenes come next
+(:mod:`mkpc_kaggle.engine.plan.schedule`). Each kind of work has a file for its jobs and their answers
+(:mod:`matching`, :mod:`light`, :mod:`reconstructing`).
 """
 
 import sqlite3
@@ -14,10 +15,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from mkpc_kaggle.engine import console
-from mkpc_kaggle.engine.blame import Item, different
-from mkpc_kaggle.engine.budget import Budget, Costs, format_duration
 from mkpc_kaggle.engine.console import Progress
-from mkpc_kaggle.engine.image_files import current_digests, update_digests
 from mkpc_kaggle.engine.jobs import (
     Answer,
     Cause,
@@ -31,16 +29,19 @@ from mkpc_kaggle.engine.jobs import (
 )
 from mkpc_kaggle.engine.light import Estimating, Features
 from mkpc_kaggle.engine.matching import Matching
-from mkpc_kaggle.engine.places import START_TIMEOUT_S, Place, Site, Work
+from mkpc_kaggle.engine.plan.blame import Item, different
+from mkpc_kaggle.engine.plan.budget import Budget, Costs, format_duration
+from mkpc_kaggle.engine.plan.schedule import Crew, NextWork, is_complete, next_work
+from mkpc_kaggle.engine.plan.state import State, extra_pairs_of
 from mkpc_kaggle.engine.publication import Publication
 from mkpc_kaggle.engine.reconstructing import Reconstructing, scene_failures, scene_records
-from mkpc_kaggle.engine.records import read_records
 from mkpc_kaggle.engine.request import Ending, Request, RunReport
 from mkpc_kaggle.engine.restore import restore
 from mkpc_kaggle.engine.run import EventLog, JobHandler, Run
-from mkpc_kaggle.engine.schedule import Crew, NextWork, is_complete, next_work
-from mkpc_kaggle.engine.state import State, extra_pairs_of
-from mkpc_kaggle.engine.store import Store
+from mkpc_kaggle.engine.store.image_files import current_digests, update_digests
+from mkpc_kaggle.engine.store.records import read_records
+from mkpc_kaggle.engine.store.tables import Store
+from mkpc_kaggle.engine.workers.places import START_TIMEOUT_S, Place, Site, Work
 from mkpc_kaggle.errors import UserError, plural
 from mkpc_kaggle.scene.candidates import ALL_UNITS
 

@@ -4,12 +4,12 @@ import sqlite3
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-from mkpc_kaggle.engine.image_files import image_results
 from mkpc_kaggle.engine.jobs import Cause, Failure, MatchJob, Outcome, Phase
-from mkpc_kaggle.engine.records import UNIT_FACTS, UnitFacts
+from mkpc_kaggle.engine.plan.schedule import Crew, NextWork, outlook, upcoming_pairs
 from mkpc_kaggle.engine.run import HANG_FACTOR, Run
-from mkpc_kaggle.engine.schedule import Crew, NextWork, outlook, upcoming_pairs
-from mkpc_kaggle.engine.store import Kind, Result, from_bytes, to_bytes
+from mkpc_kaggle.engine.store.image_files import image_results
+from mkpc_kaggle.engine.store.records import UNIT_FACTS, UnitFacts
+from mkpc_kaggle.engine.store.tables import Kind, Result, from_bytes, to_bytes
 from mkpc_kaggle.pipeline.pair import UnitResult
 
 # A unit that was given up on this number of pairs, and never ran, is skipped on all pairs.

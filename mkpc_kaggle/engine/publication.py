@@ -2,12 +2,12 @@
 
 import threading
 
-from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.jobs import Cause, Failure
-from mkpc_kaggle.engine.records import Row, Table
+from mkpc_kaggle.engine.plan.budget import Budget
+from mkpc_kaggle.engine.plan.state import SOURCES, State
 from mkpc_kaggle.engine.run import EventLog
-from mkpc_kaggle.engine.state import SOURCES, State
-from mkpc_kaggle.engine.store import Store
+from mkpc_kaggle.engine.store.records import Row, Table
+from mkpc_kaggle.engine.store.tables import Store
 from mkpc_kaggle.geometry.robust import ModelKind
 
 INTERVAL_S = 30.0  # between versions: a run that is killed loses at most this from its submission

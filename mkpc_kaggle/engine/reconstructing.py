@@ -2,20 +2,20 @@
 
 import numpy as np
 
-from mkpc_kaggle.engine.budget import SCENE_MATCH_S, SCENE_START_S, format_duration
 from mkpc_kaggle.engine.jobs import Failure, SceneJob
-from mkpc_kaggle.engine.keys import of_candidate
-from mkpc_kaggle.engine.records import (
+from mkpc_kaggle.engine.plan.budget import SCENE_MATCH_S, SCENE_START_S, format_duration
+from mkpc_kaggle.engine.plan.state import State
+from mkpc_kaggle.engine.restore import EXPORT
+from mkpc_kaggle.engine.run import HANG_FACTOR, Run
+from mkpc_kaggle.engine.store.keys import of_candidate
+from mkpc_kaggle.engine.store.records import (
     NOT_RECONSTRUCTED,
     SCENE,
     EventKind,
     SceneRecord,
     unmatched_scene,
 )
-from mkpc_kaggle.engine.restore import EXPORT
-from mkpc_kaggle.engine.run import HANG_FACTOR, Run
-from mkpc_kaggle.engine.state import State
-from mkpc_kaggle.engine.store import Kind, Result
+from mkpc_kaggle.engine.store.tables import Kind, Result
 from mkpc_kaggle.errors import plural
 from mkpc_kaggle.scene.candidates import ALL_UNITS, title_of
 from mkpc_kaggle.scene.reconstruct import Solution

@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine.keys import Keys
-from mkpc_kaggle.engine.records import About, Event, PairRecord, SceneRecord
+from mkpc_kaggle.engine.store.keys import Keys
+from mkpc_kaggle.engine.store.records import About, Event, PairRecord, SceneRecord
 from mkpc_kaggle.recipe import Recipe
 from mkpc_kaggle.scene.export import HeldDirectory
 
 if TYPE_CHECKING:
-    from mkpc_kaggle.engine.state import State
+    from mkpc_kaggle.engine.plan.state import State
 
 
 class Ending(StrEnum):

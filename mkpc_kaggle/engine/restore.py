@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from mkpc_kaggle.engine.image_files import known_images
-from mkpc_kaggle.engine.keys import of_candidate
-from mkpc_kaggle.engine.records import SCENE, Row, Table
-from mkpc_kaggle.engine.schedule import sweeping_unit
-from mkpc_kaggle.engine.state import State
-from mkpc_kaggle.engine.store import Store
+from mkpc_kaggle.engine.plan.schedule import sweeping_unit
+from mkpc_kaggle.engine.plan.state import State
+from mkpc_kaggle.engine.store.image_files import known_images
+from mkpc_kaggle.engine.store.keys import of_candidate
+from mkpc_kaggle.engine.store.records import SCENE, Row, Table
+from mkpc_kaggle.engine.store.tables import Store
 from mkpc_kaggle.geometry.crop_need import pays
 from mkpc_kaggle.scene.export import has_files
 

@@ -10,12 +10,12 @@ from dataclasses import dataclass
 from secrets import token_hex
 from typing import Any, Protocol
 
-from mkpc_kaggle.engine.budget import Budget, Costs
 from mkpc_kaggle.engine.console import Progress
 from mkpc_kaggle.engine.jobs import Failure, PairInputs
-from mkpc_kaggle.engine.records import EVENT, Event, EventKind
-from mkpc_kaggle.engine.state import State
-from mkpc_kaggle.engine.store import Kind, Result, Source, Store
+from mkpc_kaggle.engine.plan.budget import Budget, Costs
+from mkpc_kaggle.engine.plan.state import State
+from mkpc_kaggle.engine.store.records import EVENT, Event, EventKind
+from mkpc_kaggle.engine.store.tables import Kind, Result, Source, Store
 from mkpc_kaggle.errors import plural
 
 # Faults of a run with different texts, and its decisions. The number of units that fit may change with

@@ -21,18 +21,18 @@ import cv2
 from mkpc_kaggle.data.competition import Pair, submission_problems, write_submission
 from mkpc_kaggle.data.outputs import remove_unfinished, replacing
 from mkpc_kaggle.engine import console
-from mkpc_kaggle.engine.budget import Budget
-from mkpc_kaggle.engine.cluster import RaySite
-from mkpc_kaggle.engine.keys import Keys
 from mkpc_kaggle.engine.loop import Engine
-from mkpc_kaggle.engine.places import LISTEN_S, LocalSite
-from mkpc_kaggle.engine.records import About, EventKind
+from mkpc_kaggle.engine.plan.budget import Budget
+from mkpc_kaggle.engine.plan.state import State
 from mkpc_kaggle.engine.request import Request, RunReport
-from mkpc_kaggle.engine.state import State
-from mkpc_kaggle.engine.store import Store
+from mkpc_kaggle.engine.store.keys import Keys
+from mkpc_kaggle.engine.store.records import About, EventKind
+from mkpc_kaggle.engine.store.tables import Store
+from mkpc_kaggle.engine.workers.cluster import RaySite
+from mkpc_kaggle.engine.workers.places import LISTEN_S, LocalSite
 from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
-from mkpc_kaggle.pipeline.assembly import Assembly
+from mkpc_kaggle.setup.assembly import Assembly
 from mkpc_kaggle.version import __version__
 
 LOG_NAME = "workers.log"  # in the work directory, for the output of native libraries
@@ -87,7 +87,8 @@ class Session:
     """The environment of a run: everything besides its pairs and its recipe.
 
     ``workers`` is the number of worker processes, or the name of a Ray cluster (see
-    :func:`mkpc_kaggle.engine.cluster.join`). 0 means this process; ``None`` means a process for each device.
+    :func:`mkpc_kaggle.engine.workers.cluster.join`). 0 means this process; ``None`` means a process
+    for each device.
     ``save`` writes the submission. It returns an empty string, or why the file is not the last version. ``status``
     is the exit status so far; the watchdog uses it if it ends the program during the final report.
     """

@@ -16,18 +16,18 @@ from typing import TYPE_CHECKING, Any
 from scipy.spatial.transform import Rotation
 
 from mkpc_kaggle.data.competition import TrainScene, TruePair, read_rows, read_submission
-from mkpc_kaggle.engine.records import PairRecord, Table, read_points
 from mkpc_kaggle.engine.request import RunReport
 from mkpc_kaggle.engine.session import Session, run_pairs
-from mkpc_kaggle.engine.store import Store
+from mkpc_kaggle.engine.store.records import PairRecord, Table, read_points
+from mkpc_kaggle.engine.store.tables import Store
 from mkpc_kaggle.errors import UserError, plural
 from mkpc_kaggle.geometry import metrics
 from mkpc_kaggle.geometry.coordinates import Matrix3
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.metrics import AUC_THRESHOLDS, PoseError
 from mkpc_kaggle.geometry.robust import Method, RobustConfig
-from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.recipe import Recipe
+from mkpc_kaggle.setup.assembly import Assembly
 
 if TYPE_CHECKING:
     from pandas import DataFrame

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.pipeline.availability import fit_of
+from mkpc_kaggle.setup.availability import fit_of
 from mkpc_kaggle.weights import FoundFile, State, WeightFile, WeightStore
 from mkpc_kaggle.weights.checkpoint import convert
 

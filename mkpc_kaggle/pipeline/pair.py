@@ -23,9 +23,9 @@ from mkpc_kaggle.geometry.robust import (
     pose_in_front,
     rotation_in_front,
 )
-from mkpc_kaggle.pipeline.arguments import ImageSource, intrinsics_of, to_image
 from mkpc_kaggle.pipeline.keypoints import Keypoints
 from mkpc_kaggle.recipe import Recipe, Unit
+from mkpc_kaggle.setup.arguments import ImageSource, intrinsics_of, to_image
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -6,17 +6,16 @@ crops.
 
 import time
 import warnings
-from collections.abc import Callable, Container, Iterable, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from pathlib import Path
+from functools import partial
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Self
 
-from mkpc_kaggle.config import whole
-from mkpc_kaggle.data.competition import Pair, read_rows
-from mkpc_kaggle.data.images import ByteCache, Image, read_size
+from mkpc_kaggle.data.images import ByteCache, Image
 from mkpc_kaggle.data.masks import MaskReader, Masks
+from mkpc_kaggle.data.regions import GivenRegions
 from mkpc_kaggle.errors import UserError, plural
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
 from mkpc_kaggle.geometry.critical_region import CriticalRegion, RegionReason, critical_region
@@ -35,10 +34,11 @@ from mkpc_kaggle.matchers.failures import FailureKind, failure_of, reason_of, re
 from mkpc_kaggle.pipeline.keypoints import Keypoints
 from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
 from mkpc_kaggle.recipe import Recipe, Unit
+from mkpc_kaggle.setup.assembly import Assembly
+from mkpc_kaggle.setup.devices import require_device
 
-ENCODING_CACHE_BYTES = 2 << 30  # on a CPU; the assembly gives the size for a GPU
-
-GivenRegions = Mapping[tuple[str, ...], tuple[Box, Box]]  # by the names of both images
+ENCODING_CACHE_BYTES = 2 << 30  # on a CPU
+CACHE_SHARE = 0.25  # of a GPU's free memory, for the cached encodings of all workers on it
 
 
 class UnloadableError(UserError):
@@ -88,6 +88,38 @@ class Pipeline:
         self._unloadable: dict[str, Exception] = {}  # by matcher; its units fail with the error
         self._notes: dict[str, str] = {}  # on matchers that fell back to float32
         self._encodings = ByteCache(cache_bytes)  # by matcher, content of the image, and view
+
+    @classmethod
+    def of(cls, assembly: Assembly) -> Self:
+        """Return the pipeline of an assembly, on its device.
+
+        Raises :class:`mkpc_kaggle.matchers.failures.DeviceError` if the device cannot compute.
+        """
+        placement = assembly.placement
+        device = placement.device
+        require_device(device)
+        # If half precision overflows, a matcher is loaded again with this placement.
+        exact = replace(placement, precision=Precision.FLOAT32)
+        cache_bytes = ENCODING_CACHE_BYTES
+        synchronise = None
+        if device != "cpu":
+            import torch
+
+            synchronise = partial(torch.cuda.synchronize, device)
+            # Of a GPU's own memory: encodings stay where they were computed.
+            free, _ = torch.cuda.mem_get_info(device)  # most of the GPU is still free
+            cache_bytes = int(free * CACHE_SHARE / assembly.sharing)
+        return cls(
+            assembly.recipe,
+            assembly.load,
+            minibatch=assembly.minibatch,
+            cache_bytes=cache_bytes,
+            load_float32=None if exact == placement else partial(assembly.load, placement=exact),
+            regions=assembly.regions,
+            masks=assembly.masks,
+            precision=placement.precision,
+            synchronise=synchronise,
+        )
 
     def load(self) -> None:
         """Load all matchers of the recipe now. One that cannot be loaded costs its units only.
@@ -416,36 +448,3 @@ def with_regions(
     scale = scale_between(matches, (image0.size, image1.size))
     seconds = time.perf_counter() - start
     return replace(pair, regions=(region0, region1), scale=scale, cluster_seconds=seconds)
-
-
-def read_regions(file: Path, image_root: Path, pairs: Iterable[Pair]) -> GivenRegions:
-    """Return the stage-2 boxes of a table, keyed by the image files of a pair.
-
-    ``file`` has columns ``image_0,image_1,box_0,box_1``: paths under the root; left, top, right,
-    bottom of boxes in whole pixels of the stored image. Right and bottom are exclusive. Raises
-    :class:`UserError` for a malformed table, for a box that is malformed or extends beyond its
-    image, and for a missing pair.
-    """
-    boxes: dict[tuple[str, ...], tuple[Box, Box]] = {}
-    columns = ("image_0", "image_1", "box_0", "box_1")
-    for where, (name0, name1, *cells) in read_rows(file, columns):
-        try:
-            box0, box1 = (Box(*map(whole, filter(None, cell.split(" ")))) for cell in cells)
-        except (ValueError, TypeError) as error:
-            found = f"{cells[0]!r} and {cells[1]!r}"
-            raise UserError(
-                f"{where}: expected left, top, right and bottom of a box, found {found}"
-            ) from error
-        boxes[str(image_root / name0), str(image_root / name1)] = (box0, box1)
-    # Checked now: an error in the middle of a run would cost hours.
-    for pair in pairs:
-        if (files := (pair.file0, pair.file1)) not in boxes:
-            raise UserError(f"{file} has no regions of the pair {pair.id}")
-        for path, box in zip(files, boxes[files], strict=True):
-            size = read_size(Path(path))  # an unreadable image is reported by the run
-            if size and (box.right > size.width or box.bottom > size.height):
-                raise UserError(
-                    f"{file}: a box ends at {box.right}, {box.bottom}, beyond {path} "
-                    f"of {size.width} x {size.height} pixels"
-                )
-    return boxes

@@ -15,7 +15,11 @@ from mkpc_kaggle.geometry.coordinates import Box, Matrix3
 from mkpc_kaggle.geometry.robust import FailedEstimate, ModelKind
 from mkpc_kaggle.matchers.contract import Matcher
 from mkpc_kaggle.matchers.registry import require_methods
-from mkpc_kaggle.pipeline.arguments import (
+from mkpc_kaggle.pipeline.pair import PairMatch, with_estimate
+from mkpc_kaggle.pipeline.stages import Pipeline
+from mkpc_kaggle.progress import counted
+from mkpc_kaggle.recipe import Recipe, Unit
+from mkpc_kaggle.setup.arguments import (
     ImageSource,
     Weights,
     boxes_of,
@@ -25,12 +29,8 @@ from mkpc_kaggle.pipeline.arguments import (
     shown_value,
     to_image,
 )
-from mkpc_kaggle.pipeline.assembly import assemble
-from mkpc_kaggle.pipeline.availability import Licence
-from mkpc_kaggle.pipeline.pair import PairMatch, with_estimate
-from mkpc_kaggle.pipeline.stages import Pipeline
-from mkpc_kaggle.progress import counted
-from mkpc_kaggle.recipe import Recipe, Unit
+from mkpc_kaggle.setup.assembly import assemble
+from mkpc_kaggle.setup.availability import Licence
 
 __all__ = ["TwoStageMatcher", "to_image"]
 
@@ -114,7 +114,7 @@ class TwoStageMatcher:
 
     def _new_pipeline(self) -> Pipeline:
         require_methods(self._assembly.matchers)
-        pipeline = self._assembly.pipeline()
+        pipeline = Pipeline.of(self._assembly)
         # A fault of the user's own code is the user's to see.
         pipeline.raising = self._assembly.matchers.keys()
         pipeline.keeps_keypoints = True

@@ -14,13 +14,12 @@ from typing import Any, NamedTuple
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.console import say, warn
-from mkpc_kaggle.engine.keys import digest
 from mkpc_kaggle.engine.loop import Engine
+from mkpc_kaggle.engine.plan.state import name_below
 from mkpc_kaggle.engine.session import Session, request_of
-from mkpc_kaggle.engine.state import name_below
-from mkpc_kaggle.engine.store import Source
+from mkpc_kaggle.engine.store.keys import digest
+from mkpc_kaggle.engine.store.tables import Source
 from mkpc_kaggle.errors import plural
-from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.reconstruction.folder import Datasets, Ends, batch_names
 from mkpc_kaggle.scene.likeness import (
     FEATURE_SETTINGS,
@@ -35,6 +34,7 @@ from mkpc_kaggle.scene.likeness import (
     overlapping,
     shortlist,
 )
+from mkpc_kaggle.setup.assembly import Assembly
 
 IMAGES_AT_A_TIME = 100  # whose features are in memory
 # With more images, only pairs that may overlap are matched, unless most do; with fewer, all pairs

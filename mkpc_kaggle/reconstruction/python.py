@@ -12,17 +12,14 @@ from typing import TYPE_CHECKING, Any
 
 from mkpc_kaggle.data.images import Unreadable, has_usable_shape, read_image, read_size
 from mkpc_kaggle.data.masks import Masks
-from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.console import warn
+from mkpc_kaggle.engine.plan.budget import Budget
+from mkpc_kaggle.engine.plan.state import name_below
 from mkpc_kaggle.engine.request import RunReport
 from mkpc_kaggle.engine.session import Interrupt, Session, interruptible
-from mkpc_kaggle.engine.state import name_below
-from mkpc_kaggle.engine.store import FILE_NAME
+from mkpc_kaggle.engine.store.tables import FILE_NAME
 from mkpc_kaggle.errors import UserError, temporary_directory
 from mkpc_kaggle.matchers.contract import Matcher
-from mkpc_kaggle.pipeline.arguments import PathSource, Weights, member_of, shown_value
-from mkpc_kaggle.pipeline.assembly import Assembly, assemble
-from mkpc_kaggle.pipeline.availability import Licence
 from mkpc_kaggle.recipe import Recipe
 from mkpc_kaggle.reconstruction.folder import read_folder, require_distinct
 from mkpc_kaggle.reconstruction.panoramas import require_perspective
@@ -35,6 +32,9 @@ from mkpc_kaggle.reconstruction.run import for_cameras, reconstruct_folder
 from mkpc_kaggle.reporting.contradictions import contradictions
 from mkpc_kaggle.scene.export import MODELS
 from mkpc_kaggle.scene.reconstruction import RegisteredImage, SfmModel
+from mkpc_kaggle.setup.arguments import PathSource, Weights, member_of, shown_value
+from mkpc_kaggle.setup.assembly import Assembly, assemble
+from mkpc_kaggle.setup.availability import Licence
 
 if TYPE_CHECKING:
     from mkpc_kaggle.reporting.view import View

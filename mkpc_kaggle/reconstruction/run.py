@@ -6,12 +6,11 @@ from pathlib import Path
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.console import warn
+from mkpc_kaggle.engine.plan.state import State, name_below
 from mkpc_kaggle.engine.reconstructing import scene_failures
 from mkpc_kaggle.engine.request import RunReport
 from mkpc_kaggle.engine.session import Session, opened_engine, request_of
-from mkpc_kaggle.engine.state import State, name_below
 from mkpc_kaggle.errors import writing
-from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.recipe import CameraSharing, Recipe, SceneConfig
 from mkpc_kaggle.reconstruction.choice import choose_pairs
 from mkpc_kaggle.reconstruction.folder import Datasets, Ends, batch_names
@@ -19,6 +18,7 @@ from mkpc_kaggle.reconstruction.outputs import Cameras
 from mkpc_kaggle.reconstruction.unmatched import cause_of_no_matches
 from mkpc_kaggle.scene.export import HeldDirectory, remove_files, versions_of
 from mkpc_kaggle.scene.reconstruction import RegisteredImage
+from mkpc_kaggle.setup.assembly import Assembly
 
 AUTO = "auto"  # the recipe of all matchers whose weights are found
 # Of MAGSAC on a pair, whose F is for the report alone. Pairs that do not overlap run all iterations.

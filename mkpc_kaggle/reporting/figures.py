@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mkpc_kaggle.data.outputs import replacing
-from mkpc_kaggle.engine.records import SceneRecord
+from mkpc_kaggle.engine.store.records import SceneRecord
 from mkpc_kaggle.errors import UserError, plural
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.pipeline.drawing import (

@@ -18,9 +18,9 @@ from typing import TYPE_CHECKING, Any
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.data.images import Image
 from mkpc_kaggle.data.outputs import replacing
-from mkpc_kaggle.engine.budget import format_duration
 from mkpc_kaggle.engine.console import Progress
-from mkpc_kaggle.engine.records import PairRecord
+from mkpc_kaggle.engine.plan.budget import format_duration
+from mkpc_kaggle.engine.store.records import PairRecord
 from mkpc_kaggle.errors import UserError, plural, printable, writing
 from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
 from mkpc_kaggle.pipeline.pair import PairMatch

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from mkpc_kaggle.data.outputs import replacing, require_table
-from mkpc_kaggle.engine.budget import format_duration
-from mkpc_kaggle.engine.image_files import stored_digests
-from mkpc_kaggle.engine.records import (
+from mkpc_kaggle.engine.plan.budget import format_duration
+from mkpc_kaggle.engine.store.image_files import stored_digests
+from mkpc_kaggle.engine.store.records import (
     About,
     Event,
     EventKind,
@@ -24,7 +24,7 @@ from mkpc_kaggle.engine.records import (
     read_scenes,
     unmatched_scenes,
 )
-from mkpc_kaggle.engine.store import Store
+from mkpc_kaggle.engine.store.tables import Store
 from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import Estimate, ModelKind, sampson_distances

@@ -9,17 +9,17 @@ from typing import TypeAlias
 
 import numpy as np
 
-from mkpc_kaggle.engine.budget import format_duration
-from mkpc_kaggle.engine.records import NOT_RECONSTRUCTED, PairRecord, SceneRecord
+from mkpc_kaggle.engine.plan.budget import format_duration
 from mkpc_kaggle.engine.request import Ending, RunReport
+from mkpc_kaggle.engine.store.records import NOT_RECONSTRUCTED, PairRecord, SceneRecord
 from mkpc_kaggle.errors import plural
 from mkpc_kaggle.geometry.critical_region import RegionReason
 from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
-from mkpc_kaggle.pipeline.availability import UnavailableKind
 from mkpc_kaggle.recipe import Recipe
 from mkpc_kaggle.reporting.run_log import SECONDS, RunLog
 from mkpc_kaggle.scene.candidates import title_of
 from mkpc_kaggle.scene.reconstruction import Sigmas
+from mkpc_kaggle.setup.availability import UnavailableKind
 
 MAX_LINES = 8  # per list; the summary is one screen
 WIDTH = 100  # of a line, in characters

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from mkpc_kaggle.data.outputs import replacing
-from mkpc_kaggle.engine import codec
-from mkpc_kaggle.engine.records import NO_CAMERAS, PairRecord, SceneRecord
+from mkpc_kaggle.engine.store import codec
+from mkpc_kaggle.engine.store.records import NO_CAMERAS, PairRecord, SceneRecord
 from mkpc_kaggle.errors import UserError, plural, printable, writing
 from mkpc_kaggle.reporting.contradictions import contradictions, has_moved, named
 from mkpc_kaggle.reporting.run_log import RunLog

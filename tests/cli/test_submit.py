@@ -13,8 +13,8 @@ from genuine import GENUINE
 from shared import DATA, needs_data, problems_of, run_command, write_small_recipe
 
 from mkpc_kaggle.demo import DemoSet
-from mkpc_kaggle.engine.records import read_records
-from mkpc_kaggle.engine.store import Store
+from mkpc_kaggle.engine.store.records import read_records
+from mkpc_kaggle.engine.store.tables import Store
 from mkpc_kaggle.errors import UserError
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -17,10 +17,10 @@ from mkpc_kaggle.data.competition import (
     read_train_side,
     write_submission,
 )
+from mkpc_kaggle.data.regions import read_regions
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.intrinsics import parse_row
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
-from mkpc_kaggle.pipeline.stages import read_regions
 
 HEADER = "sample_id,batch_id,image_1_id,image_2_id"
 EYE = np.eye(3)

@@ -12,8 +12,8 @@ from numpy.testing import assert_array_equal
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.data.images import Image, Unreadable, read_image, read_size
+from mkpc_kaggle.data.regions import read_regions
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.pipeline.stages import read_regions
 
 PIXELS = np.random.default_rng(0).integers(0, 256, (40, 60, 3), np.uint8)
 # Pillow's names of the formats that keep EXIF

@@ -11,7 +11,7 @@ from shared import scores_of
 
 from mkpc_kaggle.data.competition import Pair, read_train_side
 from mkpc_kaggle.data.pairs import parse_line, read_pairs
-from mkpc_kaggle.engine.keys import Keys
+from mkpc_kaggle.engine.store.keys import Keys
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.evaluation.validate import error_of
 from mkpc_kaggle.geometry.cameras import Camera, fundamental_of_cameras

@@ -13,14 +13,15 @@ from faulty import choose_scene_for_all_but_the_first, runner, scenes_by
 from rectified import THREE_UNITS, RectifiedMatcher, batch_pairs, matrices, run, write_pairs
 
 from mkpc_kaggle.data.competition import Pair, submission_problems
-from mkpc_kaggle.engine import light, places
-from mkpc_kaggle.engine.budget import Budget, Costs
+from mkpc_kaggle.engine import light
 from mkpc_kaggle.engine.jobs import EstimateJob, Job, SceneJob
-from mkpc_kaggle.engine.places import LocalSite
-from mkpc_kaggle.engine.process import ThreadWorker
+from mkpc_kaggle.engine.plan.budget import Budget, Costs
+from mkpc_kaggle.engine.plan.state import State
 from mkpc_kaggle.engine.request import Ending, RunReport
-from mkpc_kaggle.engine.state import State
-from mkpc_kaggle.engine.worker import MatchRunner, do_light_job, scene_runner
+from mkpc_kaggle.engine.workers import places
+from mkpc_kaggle.engine.workers.places import LocalSite
+from mkpc_kaggle.engine.workers.process import ThreadWorker
+from mkpc_kaggle.engine.workers.worker import MatchRunner, do_light_job, scene_runner
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 from mkpc_kaggle.recipe import SceneConfig
 from mkpc_kaggle.reporting.run_log import read_log

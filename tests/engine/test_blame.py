@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 from simulator import Ran, Scenario, simulate
 
-from mkpc_kaggle.engine.blame import Tries
 from mkpc_kaggle.engine.jobs import Cause, Failure
-from mkpc_kaggle.engine.places import Place
+from mkpc_kaggle.engine.plan.blame import Tries
+from mkpc_kaggle.engine.workers.places import Place
 
 PAIRS = 30
 LIMIT = 3000.0  # much more than all the work takes

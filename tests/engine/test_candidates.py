@@ -14,14 +14,13 @@ from rectified import SIZE, THREE_UNITS, RectifiedMatcher, batch_pairs, run
 from simulator import Scenario, memory_store, simulate
 from synthetic import QUICK, SyntheticMatcher, synthetic_pairs
 
-from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.jobs import SceneJob
-from mkpc_kaggle.engine.records import Rival, Table
+from mkpc_kaggle.engine.plan.budget import Budget
 from mkpc_kaggle.engine.request import Ending, RunReport
 from mkpc_kaggle.engine.session import Interrupt, Session, run_pairs
-from mkpc_kaggle.engine.store import Store
-from mkpc_kaggle.engine.worker import reconstruct
-from mkpc_kaggle.pipeline.assembly import assemble
+from mkpc_kaggle.engine.store.records import Rival, Table
+from mkpc_kaggle.engine.store.tables import Store
+from mkpc_kaggle.engine.workers.worker import reconstruct
 from mkpc_kaggle.recipe import Recipe, SceneConfig, Unit
 from mkpc_kaggle.reporting.run_log import read_log
 from mkpc_kaggle.reporting.summary import overview, summary
@@ -29,6 +28,7 @@ from mkpc_kaggle.reporting.verdict import summary_table
 from mkpc_kaggle.scene.candidates import ALL_UNITS, SUPPORTED
 from mkpc_kaggle.scene.export import HeldDirectory, has_files
 from mkpc_kaggle.scene.reconstruct import Solution
+from mkpc_kaggle.setup.assembly import assemble
 
 FIRST, _, LAST = (unit.name for unit in THREE_UNITS.units)
 # All units, and the units of stage 1 alone

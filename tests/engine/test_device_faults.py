@@ -27,16 +27,16 @@ from rectified import SECOND, SWEEP, THIRD, THREE_UNITS, RectifiedMatcher, matri
 
 from mkpc_kaggle.cli import main, options
 from mkpc_kaggle.data.competition import read_test_side, submission_problems
-from mkpc_kaggle.engine.budget import Costs
-from mkpc_kaggle.engine.places import Place
+from mkpc_kaggle.engine.plan.budget import Costs
 from mkpc_kaggle.engine.request import Ending, RunReport
+from mkpc_kaggle.engine.workers.places import Place
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.matchers.contract import NonFiniteError, Placement, Precision
 from mkpc_kaggle.matchers.failures import DeviceError, FailureKind, failure_of, reason_of
-from mkpc_kaggle.pipeline.assembly import Assembly, assemble
 from mkpc_kaggle.pipeline.stages import Pipeline
 from mkpc_kaggle.recipe import Unit
 from mkpc_kaggle.reporting.summary import summary
+from mkpc_kaggle.setup.assembly import Assembly, assemble
 
 COUNT = 12
 VICTIM = 3  # brightness 13
@@ -289,7 +289,9 @@ def test_a_device_without_kernels_leaves_the_work_to_the_cpu_with_a_message(
 ):
     # As Kaggle's P100, for which PyTorch has no kernels any more
     assembly = assemble(THREE_UNITS, matchers={"rectified": RectifiedMatcher()}, device="cpu")
-    gpu = thread_place("cuda:99", RectifiedMatcher(), pipeline=assembly.on("cuda:99").pipeline)
+    gpu = thread_place(
+        "cuda:99", RectifiedMatcher(), pipeline=partial(Pipeline.of, assembly.on("cuda:99"))
+    )
     report = run_at(gpu, fallback=[thread_place("cpu", RectifiedMatcher())])
     assert "cuda:99 cannot be used" in capsys.readouterr().err
     assert_as_if_nothing_had_failed(report, undisturbed)
@@ -442,7 +444,7 @@ def test_a_worker_that_cannot_be_started_again_ends_the_run_with_all_rows(run_at
         made.append(broken)
         if len(made) > 1:
             raise UserError("the weights are gone")
-        return assemble(THREE_UNITS, matchers={broken.name: broken}, device="cpu").pipeline()
+        return Pipeline.of(assemble(THREE_UNITS, matchers={broken.name: broken}, device="cpu"))
 
     report = run_at(thread_place("cpu", broken, pipeline=once))
     assert report.ending is Ending.NO_WORKER

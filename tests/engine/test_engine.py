@@ -18,14 +18,14 @@ from rectified import (
     write_pairs,
 )
 
-from mkpc_kaggle.engine.budget import Budget
-from mkpc_kaggle.engine.records import PairRecord, read_records
+from mkpc_kaggle.engine.plan.budget import Budget
+from mkpc_kaggle.engine.plan.state import State
 from mkpc_kaggle.engine.request import Ending
 from mkpc_kaggle.engine.session import Interrupt, Session, opened_engine
-from mkpc_kaggle.engine.state import State
-from mkpc_kaggle.engine.store import Store
-from mkpc_kaggle.pipeline.assembly import assemble
+from mkpc_kaggle.engine.store.records import PairRecord, read_records
+from mkpc_kaggle.engine.store.tables import Store
 from mkpc_kaggle.pipeline.stages import Pipeline
+from mkpc_kaggle.setup.assembly import assemble
 
 
 def units(record: PairRecord) -> list[str]:

@@ -14,7 +14,7 @@ from synthetic import QUICK, RECIPE, SyntheticMatcher, synthetic_pairs
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.request import Ending
-from mkpc_kaggle.engine.store import Kind, Result, Store
+from mkpc_kaggle.engine.store.tables import Kind, Result, Store
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.robust import Method
 from mkpc_kaggle.pipeline.stages import Pipeline

@@ -23,12 +23,14 @@ from shared import write_small_recipe
 from mkpc_kaggle.cli import main
 from mkpc_kaggle.data.competition import read_test_side, submission_problems
 from mkpc_kaggle.demo import DemoSet
-from mkpc_kaggle.engine import image_files, session, worker
+from mkpc_kaggle.engine import session
 from mkpc_kaggle.engine.matching import Matching
-from mkpc_kaggle.engine.records import Table, read_records
+from mkpc_kaggle.engine.plan.state import State
 from mkpc_kaggle.engine.request import Ending
-from mkpc_kaggle.engine.state import State
-from mkpc_kaggle.engine.store import Store
+from mkpc_kaggle.engine.store import image_files
+from mkpc_kaggle.engine.store.records import Table, read_records
+from mkpc_kaggle.engine.store.tables import Store
+from mkpc_kaggle.engine.workers import worker
 from mkpc_kaggle.reporting.run_log import read_log
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -306,8 +308,8 @@ import sys, time
 sys.path[:0] = {path!r}
 from pathlib import Path
 from rectified import THREE_UNITS, RectifiedMatcher, run, write_pairs
-from mkpc_kaggle.engine.budget import Budget
-from mkpc_kaggle.engine.places import LocalSite
+from mkpc_kaggle.engine.plan.budget import Budget
+from mkpc_kaggle.engine.workers.places import LocalSite
 from mkpc_kaggle.engine.light import Estimating
 
 budget = Budget(time.monotonic(), 1000.0)
@@ -379,7 +381,7 @@ def test_a_parent_killed_at_any_moment_leaves_a_complete_file_no_orphans_and_a_r
 
 GUARDED = """
 import multiprocessing, os, signal, sys, time
-from mkpc_kaggle.engine.budget import Budget
+from mkpc_kaggle.engine.plan.budget import Budget
 from mkpc_kaggle.engine.session import Interrupt, Session
 
 if __name__ == "__main__":

@@ -22,11 +22,12 @@ from simulator import VirtualClock
 from synthetic import RECIPE, SyntheticMatcher, synthetic_pairs
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine import places, session
-from mkpc_kaggle.engine.budget import Budget
-from mkpc_kaggle.engine.places import LocalSite
-from mkpc_kaggle.engine.process import ProcessWorker
+from mkpc_kaggle.engine import session
+from mkpc_kaggle.engine.plan.budget import Budget
 from mkpc_kaggle.engine.request import Ending, RunReport
+from mkpc_kaggle.engine.workers import places
+from mkpc_kaggle.engine.workers.places import LocalSite
+from mkpc_kaggle.engine.workers.process import ProcessWorker
 from mkpc_kaggle.geometry.robust import RobustConfig
 
 BATCHES = WORKERS = 3  # in a run so many scene workers and so many matching workers are disturbed

@@ -25,8 +25,8 @@ from simulator import Scenario, memory_store, simulate
 
 from mkpc_kaggle.cli import main
 from mkpc_kaggle.demo import DemoSet
-from mkpc_kaggle.engine.dataframes import results
 from mkpc_kaggle.engine.request import Ending, RunReport
+from mkpc_kaggle.engine.store.dataframes import results
 
 FIRST = '{ stage = 1, matcher = "sift", long_side = 320 }'
 SECOND = '{ stage = 2, matcher = "sift", long_side = 400 }'

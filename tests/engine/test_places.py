@@ -7,11 +7,11 @@ from types import SimpleNamespace
 import pytest
 from rectified import THREE_UNITS, RectifiedMatcher, run, write_pairs
 
-from mkpc_kaggle.engine import places
 from mkpc_kaggle.engine.jobs import Cause, Failure, Loaded, MatchJob, Outcome, Phase
-from mkpc_kaggle.engine.places import LocalSite, Place, Work
-from mkpc_kaggle.engine.process import ThreadWorker
-from mkpc_kaggle.engine.worker import scene_runner
+from mkpc_kaggle.engine.workers import places
+from mkpc_kaggle.engine.workers.places import LocalSite, Place, Work
+from mkpc_kaggle.engine.workers.process import ThreadWorker
+from mkpc_kaggle.engine.workers.worker import scene_runner
 
 LOST = Failure(Cause.DIED)
 DONE = (Outcome(failure="unreadable"),)

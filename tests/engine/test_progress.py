@@ -5,8 +5,8 @@ from io import StringIO
 import pytest
 from simulator import VirtualClock
 
-from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.console import Progress
+from mkpc_kaggle.engine.plan.budget import Budget
 from mkpc_kaggle.progress import LINE_INTERVAL_S
 
 

@@ -26,10 +26,10 @@ from synthetic import SyntheticMatcher, synthetic_pairs
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.jobs import SceneJob
-from mkpc_kaggle.engine.records import Table, read_images
 from mkpc_kaggle.engine.request import Ending
-from mkpc_kaggle.engine.store import Store
-from mkpc_kaggle.engine.worker import batch_pair, results_of
+from mkpc_kaggle.engine.store.records import Table, read_images
+from mkpc_kaggle.engine.store.tables import Store
+from mkpc_kaggle.engine.workers.worker import batch_pair, results_of
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.recipe import SceneConfig
 from mkpc_kaggle.reporting.report import report_page

@@ -23,14 +23,11 @@ from simulator import (
 )
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine.blame import Item
-from mkpc_kaggle.engine.budget import Budget, Costs
 from mkpc_kaggle.engine.jobs import Cause, Failure, MatchJob, Phase
-from mkpc_kaggle.engine.keys import Keys
 from mkpc_kaggle.engine.loop import Engine
-from mkpc_kaggle.engine.reconstructing import scene_failures
-from mkpc_kaggle.engine.request import Ending, Request
-from mkpc_kaggle.engine.schedule import (
+from mkpc_kaggle.engine.plan.blame import Item
+from mkpc_kaggle.engine.plan.budget import Budget, Costs
+from mkpc_kaggle.engine.plan.schedule import (
     Crew,
     NextWork,
     View,
@@ -39,8 +36,11 @@ from mkpc_kaggle.engine.schedule import (
     prefix_that_fits,
     upcoming_pairs,
 )
-from mkpc_kaggle.engine.state import State
-from mkpc_kaggle.engine.store import Kind, Store
+from mkpc_kaggle.engine.plan.state import State
+from mkpc_kaggle.engine.reconstructing import scene_failures
+from mkpc_kaggle.engine.request import Ending, Request
+from mkpc_kaggle.engine.store.keys import Keys
+from mkpc_kaggle.engine.store.tables import Kind, Store
 from mkpc_kaggle.recipe import SceneConfig, Unit
 from mkpc_kaggle.scene.choose import Choice, Reason
 from mkpc_kaggle.scene.reconstruct import Solution

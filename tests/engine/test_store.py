@@ -22,23 +22,23 @@ from simulator import VirtualClock, memory_store
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine import run as engine_run
-from mkpc_kaggle.engine import store as store_module
-from mkpc_kaggle.engine.budget import Budget, Costs
 from mkpc_kaggle.engine.console import Progress
-from mkpc_kaggle.engine.dataframes import results
-from mkpc_kaggle.engine.image_files import file_result, stored_digests
 from mkpc_kaggle.engine.jobs import Estimated, MatchJob, Outcome, Phase
-from mkpc_kaggle.engine.keys import Keys
 from mkpc_kaggle.engine.light import Estimating
 from mkpc_kaggle.engine.matching import Matching
+from mkpc_kaggle.engine.plan.budget import Budget, Costs
+from mkpc_kaggle.engine.plan.state import State
 from mkpc_kaggle.engine.publication import Publication
 from mkpc_kaggle.engine.reconstructing import Reconstructing
-from mkpc_kaggle.engine.records import About, Table, read_points, read_records, read_scenes
 from mkpc_kaggle.engine.request import Ending, Request
 from mkpc_kaggle.engine.restore import restore
 from mkpc_kaggle.engine.run import EventLog, Run
-from mkpc_kaggle.engine.state import State
-from mkpc_kaggle.engine.store import FILE_NAME, Kind, Result, Store, connected, to_bytes
+from mkpc_kaggle.engine.store import tables as store_module
+from mkpc_kaggle.engine.store.dataframes import results
+from mkpc_kaggle.engine.store.image_files import file_result, stored_digests
+from mkpc_kaggle.engine.store.keys import Keys
+from mkpc_kaggle.engine.store.records import About, Table, read_points, read_records, read_scenes
+from mkpc_kaggle.engine.store.tables import FILE_NAME, Kind, Result, Store, connected, to_bytes
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Box, Size
@@ -375,7 +375,7 @@ def test_results_that_a_full_disk_refuses_stay_in_memory_and_are_written_later(
 PUT = """
 import resource, sys
 from pathlib import Path
-from mkpc_kaggle.engine.store import Kind, Result, Store
+from mkpc_kaggle.engine.store.tables import Kind, Result, Store
 
 limit = 1024 * int(sys.argv[2])
 resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
@@ -502,7 +502,7 @@ def test_only_what_sqlite_reports_as_damage_is_damage(
 
 def test_a_bug_in_a_reader_is_no_damage(whole: Room, monkeypatch: pytest.MonkeyPatch) -> None:
     # "Delete your journal" would cost the user hours and hide the bug.
-    monkeypatch.setattr("mkpc_kaggle.engine.records.Row", lambda *_: None)
+    monkeypatch.setattr("mkpc_kaggle.engine.store.records.Row", lambda *_: None)
     with pytest.raises(AttributeError):
         read_records(whole.store)
 
@@ -712,7 +712,7 @@ def test_a_lock_of_another_program_is_waited_for_once_in_half_a_minute(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clock = [0.0]
-    monkeypatch.setattr("mkpc_kaggle.engine.store.monotonic", lambda: clock[0])
+    monkeypatch.setattr("mkpc_kaggle.engine.store.tables.monotonic", lambda: clock[0])
     with Store.open(tmp_path) as store, closing(connected(tmp_path / FILE_NAME)) as other:
         tried = []
         store._db.set_trace_callback(lambda text: tried.append("BEGIN" in text))

@@ -23,7 +23,7 @@ COMPLAINS = """
 import os, threading
 from library import complain
 from mkpc_kaggle.engine.jobs import Loaded
-from mkpc_kaggle.engine.process import ProcessWorker
+from mkpc_kaggle.engine.workers.process import ProcessWorker
 from mkpc_kaggle.engine.console import unblocked
 
 with unblocked():
@@ -78,7 +78,7 @@ LOGS = """
 import sys, threading
 from library import complain
 from pathlib import Path
-from mkpc_kaggle.engine.process import ProcessWorker
+from mkpc_kaggle.engine.workers.process import ProcessWorker
 
 answers = threading.Semaphore(0)
 worker = ProcessWorker("decoder", complain, answers.release)

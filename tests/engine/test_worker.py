@@ -5,7 +5,7 @@ from faulty import NarrowMatcher
 from rectified import SWEEP, THREE_UNITS
 
 from mkpc_kaggle.engine.jobs import MatchJob, Phase
-from mkpc_kaggle.engine.worker import MatchRunner
+from mkpc_kaggle.engine.workers.worker import MatchRunner
 from mkpc_kaggle.pipeline.stages import Pipeline
 
 

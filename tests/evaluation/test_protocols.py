@@ -20,8 +20,8 @@ from mkpc_kaggle import TwoStageMatcher
 from mkpc_kaggle.data.competition import read_train_side
 from mkpc_kaggle.data.images import read_image
 from mkpc_kaggle.data.pairs import read_pairs
-from mkpc_kaggle.engine.records import Table, read_points, read_records
-from mkpc_kaggle.engine.store import Store
+from mkpc_kaggle.engine.store.records import Table, read_points, read_records
+from mkpc_kaggle.engine.store.tables import Store
 from mkpc_kaggle.evaluation.validate import by_protocol
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Box, Size

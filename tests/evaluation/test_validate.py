@@ -11,7 +11,7 @@ from shared import run_command, scores_of
 from mkpc_kaggle.data import competition
 from mkpc_kaggle.data.competition import Pair, TrainScene, TruePair, read_test_side, read_train_side
 from mkpc_kaggle.demo import DemoSet
-from mkpc_kaggle.engine.records import PairRecord
+from mkpc_kaggle.engine.store.records import PairRecord
 from mkpc_kaggle.evaluation.validate import (
     SceneScore,
     Step,

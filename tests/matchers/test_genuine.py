@@ -18,7 +18,7 @@ from mkpc_kaggle.geometry.coordinates import Box, Size, View
 from mkpc_kaggle.matchers.contract import Matcher, Picture, Placement
 from mkpc_kaggle.matchers.registry import load_matcher, matcher_names, spec_of
 from mkpc_kaggle.matchers.sparse import Keypoints
-from mkpc_kaggle.pipeline.availability import fit_of
+from mkpc_kaggle.setup.availability import fit_of
 
 pytestmark = pytest.mark.genuine
 KEYPOINTS = 2048

@@ -10,23 +10,23 @@ import torch
 from device_double import DeviceDouble
 
 from mkpc_kaggle.data.images import Image
-from mkpc_kaggle.engine.places import LocalSite, Work
+from mkpc_kaggle.engine.workers.places import LocalSite, Work
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import MatcherSpec, NonFiniteError, Precision
 from mkpc_kaggle.matchers.dtypes import check_finite, exact_float32
 from mkpc_kaggle.matchers.failures import DeviceError
-from mkpc_kaggle.pipeline import devices
-from mkpc_kaggle.pipeline.assembly import assemble
-from mkpc_kaggle.pipeline.devices import (
+from mkpc_kaggle.pipeline.pair import PairMatch
+from mkpc_kaggle.pipeline.stages import Pipeline
+from mkpc_kaggle.recipe import Recipe, Unit
+from mkpc_kaggle.setup import devices
+from mkpc_kaggle.setup.assembly import assemble
+from mkpc_kaggle.setup.devices import (
     fastest_precision,
     gpu_capabilities,
     require_device,
     resolve_placement,
 )
-from mkpc_kaggle.pipeline.pair import PairMatch
-from mkpc_kaggle.pipeline.stages import Pipeline
-from mkpc_kaggle.recipe import Recipe, Unit
 
 UNIT = Unit(1, "own", 64)
 RECIPE = Recipe((UNIT,))

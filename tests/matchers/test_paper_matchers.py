@@ -11,8 +11,8 @@ from shared import problems_of, run_command
 from standin import narrow_roma, scene
 
 from mkpc_kaggle.data.competition import read_submission
-from mkpc_kaggle.engine.records import read_records
-from mkpc_kaggle.engine.store import Store
+from mkpc_kaggle.engine.store.records import read_records
+from mkpc_kaggle.engine.store.tables import Store
 from mkpc_kaggle.matchers.adapters import roma
 
 # The sizes of the units of stages 1 and 2, which fit no network's multiple.

@@ -25,7 +25,7 @@ WITHOUT_KORNIA = """
 import sys
 sys.modules["kornia"] = None
 from mkpc_kaggle.cli import main
-from mkpc_kaggle.pipeline.assembly import assemble
+from mkpc_kaggle.setup.assembly import assemble
 from mkpc_kaggle.recipe import Recipe, Unit
 
 main(["weights", "list"])

@@ -10,10 +10,9 @@ import pytest
 from test_layout import load_as_gsplat
 from test_reconstruct import FIRST, RECIPE, MixedMatcher, write_flat
 
-from mkpc_kaggle.engine.budget import Budget
+from mkpc_kaggle.engine.plan.budget import Budget
 from mkpc_kaggle.engine.session import Interrupt, Session
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.reconstruction.folder import read_folder, read_pair_list
 from mkpc_kaggle.reconstruction.layout import write_layouts
 from mkpc_kaggle.reconstruction.outputs import write_tables
@@ -21,6 +20,7 @@ from mkpc_kaggle.reconstruction.run import FolderResult, reconstruct_folder
 from mkpc_kaggle.reporting.report import linked_images, reader_of
 from mkpc_kaggle.reporting.run_log import read_log
 from mkpc_kaggle.reporting.verdict import verdict
+from mkpc_kaggle.setup.assembly import assemble
 
 
 @pytest.fixture

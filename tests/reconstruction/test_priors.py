@@ -17,18 +17,18 @@ from test_reconstruct import FIRST, RECIPE, MixedMatcher, cameras, contents, wri
 from benchmarks.synthetic_scene import SIZE
 from mkpc_kaggle import results
 from mkpc_kaggle.data.masks import MaskReader, Masks
-from mkpc_kaggle.engine.budget import Budget
+from mkpc_kaggle.engine.plan.budget import Budget
 from mkpc_kaggle.engine.request import Ending
 from mkpc_kaggle.engine.session import Interrupt, Session
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.intrinsics import KnownCamera, read
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.reconstruction.folder import read_folder
 from mkpc_kaggle.reconstruction.outputs import camera_rows
 from mkpc_kaggle.reconstruction.priors import intrinsics_line, read_intrinsics_table
 from mkpc_kaggle.reconstruction.python import Models, reconstruct
 from mkpc_kaggle.reconstruction.run import FolderResult, for_cameras, reconstruct_folder
+from mkpc_kaggle.setup.assembly import assemble
 
 HEAD = "image,model,parameters,sigma\n"
 SIZED = "image,model,parameters,sigma,size\n"

@@ -15,7 +15,7 @@ from faulty import befall, scenes_by
 from test_reconstruct import FIRST, RECIPE, MixedMatcher, fail, write_flat
 
 from mkpc_kaggle import reconstruct, results
-from mkpc_kaggle.engine import image_files
+from mkpc_kaggle.engine.store import image_files
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import MatcherSpec

@@ -29,14 +29,13 @@ from synthetic import QUICK, SyntheticMatcher
 from benchmarks.synthetic_scene import SIZE, SyntheticScene, synthetic_scene
 from mkpc_kaggle import results
 from mkpc_kaggle.data.images import TURNS
-from mkpc_kaggle.engine.budget import Budget
+from mkpc_kaggle.engine.plan.budget import Budget
 from mkpc_kaggle.engine.session import Interrupt, Session
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import RobustConfig
 from mkpc_kaggle.matchers.adapters.sift import SiftMatcher, SiftOptions
-from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.recipe import Recipe, Unit
 from mkpc_kaggle.reconstruction import choice
 from mkpc_kaggle.reconstruction.folder import read_folder, read_pair_list
@@ -51,6 +50,7 @@ from mkpc_kaggle.scene.likeness import (
     shortlist,
 )
 from mkpc_kaggle.scene.reconstruction import RegisteredImage
+from mkpc_kaggle.setup.assembly import assemble
 
 RECIPE = for_cameras(Recipe((Unit(1, "synthetic", SIZE.width),), magsac=QUICK))
 # The brightness of a flat image is its number.

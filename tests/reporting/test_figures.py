@@ -6,7 +6,7 @@ import pytest
 import tour_figures as figures
 
 from mkpc_kaggle.data.images import Image
-from mkpc_kaggle.engine.records import SceneRecord
+from mkpc_kaggle.engine.store.records import SceneRecord
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Box, Size
 from mkpc_kaggle.geometry.critical_region import CriticalRegion, RegionReason

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine.records import PairRecord, SceneRecord, UnitRecord
+from mkpc_kaggle.engine.store.records import PairRecord, SceneRecord, UnitRecord
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.reporting.verdict import nearest_to_joining

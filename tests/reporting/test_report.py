@@ -17,9 +17,9 @@ from rectified import THREE_UNITS, RectifiedMatcher, run, write_pairs
 from shared import run_command
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine.records import About, Event, EventKind, PairRecord, Row, Table
 from mkpc_kaggle.engine.run import note_event
-from mkpc_kaggle.engine.store import Store
+from mkpc_kaggle.engine.store.records import About, Event, EventKind, PairRecord, Row, Table
+from mkpc_kaggle.engine.store.tables import Store
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, EstimateStats
 from mkpc_kaggle.reporting.report import DRAWING_S, pair_rows, remark, report_page, report_run
 from mkpc_kaggle.reporting.run_log import read_log

@@ -7,8 +7,14 @@ import numpy as np
 import pytest
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine.records import NOT_RECONSTRUCTED, About, PairRecord, SceneRecord, UnitRecord
 from mkpc_kaggle.engine.request import Ending, RunReport
+from mkpc_kaggle.engine.store.records import (
+    NOT_RECONSTRUCTED,
+    About,
+    PairRecord,
+    SceneRecord,
+    UnitRecord,
+)
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.robust import EstimateStats

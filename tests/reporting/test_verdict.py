@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine.records import (
+from mkpc_kaggle.engine.request import Ending
+from mkpc_kaggle.engine.store.records import (
     NO_CAMERAS,
     About,
     Event,
@@ -22,7 +23,6 @@ from mkpc_kaggle.engine.records import (
     SceneRecord,
     UnitRecord,
 )
-from mkpc_kaggle.engine.request import Ending
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.intrinsics import KnownCamera

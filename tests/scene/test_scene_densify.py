@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from rectified import run
 from synthetic import RECIPE, SyntheticMatcher, synthetic_pairs
 
+from mkpc_kaggle.engine.plan.state import State
 from mkpc_kaggle.engine.request import Ending
-from mkpc_kaggle.engine.state import State
 from mkpc_kaggle.recipe import SceneConfig
 from mkpc_kaggle.reporting.run_log import read_log
 from mkpc_kaggle.scene.densify import extra_pairs

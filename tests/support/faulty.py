@@ -16,21 +16,22 @@ import numpy as np
 import pytest
 from rectified import THREE_UNITS, RectifiedMatcher, Seen
 
-from mkpc_kaggle.engine import places, session
+from mkpc_kaggle.engine import session
 from mkpc_kaggle.engine.jobs import SceneJob
-from mkpc_kaggle.engine.places import LocalSite, Place, Work
-from mkpc_kaggle.engine.process import ThreadWorker
-from mkpc_kaggle.engine.worker import MatchRunner, reconstruct
+from mkpc_kaggle.engine.workers import places
+from mkpc_kaggle.engine.workers.places import LocalSite, Place, Work
+from mkpc_kaggle.engine.workers.process import ThreadWorker
+from mkpc_kaggle.engine.workers.worker import MatchRunner, reconstruct
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import Picture
-from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.pipeline.stages import Pipeline
 from mkpc_kaggle.scene.choose import Choice, Reason
 from mkpc_kaggle.scene.reconstruct import Solution
 from mkpc_kaggle.scene.reconstruction import Reconstruction, RegisteredImage, SfmModel, Sigmas
 from mkpc_kaggle.scene.view_graph import BatchImage
+from mkpc_kaggle.setup.assembly import Assembly
 
 BROKEN = "CUDA error: an illegal memory access was encountered"
 ASSERTED = "CUDA error: device-side assert triggered"

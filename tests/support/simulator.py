@@ -18,9 +18,7 @@ from typing import Any
 import numpy as np
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine import blame, budget, light, matching, reconstructing, schedule
-from mkpc_kaggle.engine.blame import MAX_TRIES
-from mkpc_kaggle.engine.budget import MAX_SILENCE_S, SCENE_MARGIN, SCENE_START_S, Budget
+from mkpc_kaggle.engine import light, matching, reconstructing
 from mkpc_kaggle.engine.jobs import (
     Answer,
     Cause,
@@ -33,13 +31,16 @@ from mkpc_kaggle.engine.jobs import (
     Outcome,
     SceneJob,
 )
-from mkpc_kaggle.engine.keys import Keys
 from mkpc_kaggle.engine.loop import Engine
-from mkpc_kaggle.engine.places import Place, Site, Work
+from mkpc_kaggle.engine.plan import blame, budget, schedule
+from mkpc_kaggle.engine.plan.blame import MAX_TRIES
+from mkpc_kaggle.engine.plan.budget import MAX_SILENCE_S, SCENE_MARGIN, SCENE_START_S, Budget
+from mkpc_kaggle.engine.plan.schedule import RESERVE_SHARE
 from mkpc_kaggle.engine.request import Request, RunReport
 from mkpc_kaggle.engine.run import HANG_FACTOR
-from mkpc_kaggle.engine.schedule import RESERVE_SHARE
-from mkpc_kaggle.engine.store import SCHEMA, Store, connected
+from mkpc_kaggle.engine.store.keys import Keys
+from mkpc_kaggle.engine.store.tables import SCHEMA, Store, connected
+from mkpc_kaggle.engine.workers.places import Place, Site, Work
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.crop_need import CropNeed
 from mkpc_kaggle.geometry.matches import Matches

@@ -17,7 +17,6 @@ import numpy as np
 
 from mkpc_kaggle.cores import available_cores
 from mkpc_kaggle.data.images import Image, ImageStore, Unreadable, read_image
-from mkpc_kaggle.engine.image_files import file_state
 from mkpc_kaggle.engine.jobs import (
     Answer,
     Cause,
@@ -33,6 +32,7 @@ from mkpc_kaggle.engine.jobs import (
     PairInputs,
     SceneJob,
 )
+from mkpc_kaggle.engine.store.image_files import file_state
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import ModelKind

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from mkpc_kaggle.data.images import content_digest
-from mkpc_kaggle.engine.codec import IMAGE
-from mkpc_kaggle.engine.store import Kind, Result, Store
+from mkpc_kaggle.engine.store.codec import IMAGE
+from mkpc_kaggle.engine.store.tables import Kind, Result, Store
 from mkpc_kaggle.scene.view_graph import BatchImage
 
 # Prefixes of keys. Facts have the content's digest, since a file's name may get another content.

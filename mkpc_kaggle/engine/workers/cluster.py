@@ -18,11 +18,12 @@ from pathlib import Path
 from typing import Any
 
 from mkpc_kaggle.engine.jobs import Answer, Cause, Failure
-from mkpc_kaggle.engine.places import Place, Site, Work
-from mkpc_kaggle.engine.process import EXIT_TIMEOUT_S, ThreadWorker
-from mkpc_kaggle.engine.worker import Executor, Maker, MatchRunner, Message, Runner
+from mkpc_kaggle.engine.workers.places import Place, Site, Work
+from mkpc_kaggle.engine.workers.process import EXIT_TIMEOUT_S, ThreadWorker
+from mkpc_kaggle.engine.workers.worker import Executor, Maker, MatchRunner, Message, Runner
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.pipeline.assembly import Assembly
+from mkpc_kaggle.pipeline.stages import Pipeline
+from mkpc_kaggle.setup.assembly import Assembly
 from mkpc_kaggle.version import __version__
 
 FORMS = "a number of processes, ray (this machine's cluster, or a new one for this run), ray://HOST:PORT"
@@ -87,13 +88,13 @@ class RaySite(Site):
         if gpus and self._assembly.device != "cpu":
             self.matching_cores = gpus
             assembly = self._assembly.on("cuda:0")
-            make = partial(MatchRunner, assembly.pipeline)
+            make = partial(MatchRunner, partial(Pipeline.of, assembly))
             for number in range(gpus):
                 self._add(f"gpu {number}", make, assembly.minibatch, num_gpus=1)
         else:
             for number, node in enumerate(machines):  # several machines may have the same name
                 cores = int(node["Resources"]["CPU"])
-                make = partial(MatchRunner, self._assembly.pipeline, threads=cores)
+                make = partial(MatchRunner, partial(Pipeline.of, self._assembly), threads=cores)
                 name = f"machine {number} ({node['NodeManagerHostname']})"
                 self._add(name, make, self._assembly.minibatch, num_cpus=cores)
         if not self.of(Work.MATCH):

@@ -26,7 +26,7 @@ from typing import cast
 
 from mkpc_kaggle.engine.console import append_to
 from mkpc_kaggle.engine.jobs import Answer, Cause, Failure, Job
-from mkpc_kaggle.engine.worker import Executor, Maker, Message, Runner, failure_of
+from mkpc_kaggle.engine.workers.worker import Executor, Maker, Message, Runner, failure_of
 
 # For PyTorch, which reads these once. OpenMP threads that wait for each other then sleep; by default they spin
 # and keep the cores from decoding, MAGSAC and other processes. On Linux, tensors of 2 MiB or more use huge pages:

@@ -2,7 +2,7 @@
 
 from collections.abc import Container, Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property
 from importlib import metadata
 from os import PathLike, fspath
 from pathlib import Path
@@ -13,6 +13,7 @@ from uuid import uuid4
 import cv2
 
 from mkpc_kaggle.data.masks import Masks
+from mkpc_kaggle.data.regions import GivenRegions
 from mkpc_kaggle.errors import UserError, warn_once
 from mkpc_kaggle.matchers.contract import Matcher, Placement, Precision
 from mkpc_kaggle.matchers.registry import (
@@ -22,14 +23,15 @@ from mkpc_kaggle.matchers.registry import (
     require_matchers,
     spec_of,
 )
-from mkpc_kaggle.pipeline.arguments import (
+from mkpc_kaggle.recipe import Mode, Recipe, Unit, load_recipe, with_settings
+from mkpc_kaggle.setup.arguments import (
     Weights,
     device_of,
     precision_of,
     shown_value,
     weights_of,
 )
-from mkpc_kaggle.pipeline.availability import (
+from mkpc_kaggle.setup.availability import (
     FAULTS,
     Licence,
     UnavailableReason,
@@ -39,12 +41,9 @@ from mkpc_kaggle.pipeline.availability import (
     slots_of,
     unavailable,
 )
-from mkpc_kaggle.pipeline.devices import AUTO, gpus_of, require_device, resolve_placement
-from mkpc_kaggle.pipeline.stages import ENCODING_CACHE_BYTES, GivenRegions, Pipeline
-from mkpc_kaggle.recipe import Mode, Recipe, Unit, load_recipe, with_settings
+from mkpc_kaggle.setup.devices import AUTO, gpus_of, resolve_placement
 from mkpc_kaggle.weights import FoundFile, State, WeightStore
 
-CACHE_SHARE = 0.25  # of a GPU's free memory, for the cached encodings of all workers on it
 DEFAULT_SIDE_PX = 1024  # of a single matcher that no recipe has
 CUDA_MINIBATCH = 8  # pairs at a time; on a CPU, more than one gains nothing and takes memory
 
@@ -85,36 +84,6 @@ class Assembly:
 
     def on_cpu(self) -> "Assembly":
         return replace(self, placement=Placement(), sharing=1)
-
-    def pipeline(self) -> Pipeline:
-        """Return a pipeline that loads each matcher on first use.
-
-        Raises :class:`mkpc_kaggle.matchers.failures.DeviceError` if the device cannot compute.
-        """
-        device = self.placement.device
-        require_device(device)
-        # If half precision overflows, a matcher is loaded again with this placement.
-        exact = replace(self.placement, precision=Precision.FLOAT32)
-        cache_bytes = ENCODING_CACHE_BYTES
-        synchronise = None
-        if device != "cpu":
-            import torch
-
-            synchronise = partial(torch.cuda.synchronize, device)
-            # Of a GPU's own memory: encodings stay where they were computed.
-            free, _ = torch.cuda.mem_get_info(device)  # most of the GPU is still free
-            cache_bytes = int(free * CACHE_SHARE / self.sharing)
-        return Pipeline(
-            self.recipe,
-            lambda name: self._load(name, self.placement),
-            minibatch=self.minibatch,
-            cache_bytes=cache_bytes,
-            load_float32=None if exact == self.placement else lambda name: self._load(name, exact),
-            regions=self.regions,
-            masks=self.masks,
-            precision=self.placement.precision,
-            synchronise=synchronise,
-        )
 
     def unit_settings(self, unit: Unit, precision: Precision | None = None) -> dict[str, Any]:
         """Return all settings that determine a unit's points on given views, as JSON values.
@@ -170,10 +139,13 @@ class Assembly:
                 files[slot] = file
         return files
 
-    def _load(self, name: str, placement: Placement) -> Matcher[Any]:
+    def load(self, name: str, placement: Placement | None = None) -> Matcher[Any]:
+        """Load a matcher, on the assembly's placement by default."""
         # The user's matcher has its own precision, and is not loaded twice.
         given = self.matchers.get(name)
-        return given or load_matcher(name, self.weights, options_of(self.recipe, name), placement)
+        return given or load_matcher(
+            name, self.weights, options_of(self.recipe, name), placement or self.placement
+        )
 
 
 def assemble(

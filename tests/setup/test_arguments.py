@@ -25,10 +25,10 @@ from mkpc_kaggle.matchers.adapters.sift import SiftMatcher, SiftOptions
 from mkpc_kaggle.matchers.contract import Colour, MatcherSpec
 from mkpc_kaggle.matchers.networks.aliked import Aliked
 from mkpc_kaggle.matchers.registry import matcher_names
-from mkpc_kaggle.pipeline import assembly
-from mkpc_kaggle.pipeline.arguments import boxes_of, intrinsics_of, to_image
-from mkpc_kaggle.pipeline.assembly import recipe_of_name
 from mkpc_kaggle.recipe import Recipe, Unit, load_recipe
+from mkpc_kaggle.setup import assembly
+from mkpc_kaggle.setup.arguments import boxes_of, intrinsics_of, to_image
+from mkpc_kaggle.setup.assembly import recipe_of_name
 
 pytestmark = pytest.mark.usefixtures("nowhere_else")
 

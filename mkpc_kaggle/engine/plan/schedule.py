@@ -4,7 +4,7 @@
 costs and the time left whenever a worker is idle.
 
 Two rules decide that a unit no longer fits in time: :func:`prefix_that_fits` for all pairs, and
-:class:`mkpc_kaggle.engine.worker.MatchRunner` for the units of a job that ran out of time.
+:class:`mkpc_kaggle.engine.workers.worker.MatchRunner` for the units of a job that ran out of time.
 """
 
 from collections.abc import Sequence
@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mkpc_kaggle.engine.blame import MAX_LOSSES, Item
-from mkpc_kaggle.engine.budget import ESTIMATE, Budget, Costs, format_duration
 from mkpc_kaggle.engine.jobs import MatchJob, Phase
-from mkpc_kaggle.engine.state import Mask, State
+from mkpc_kaggle.engine.plan.blame import MAX_LOSSES, Item
+from mkpc_kaggle.engine.plan.budget import ESTIMATE, Budget, Costs, format_duration
+from mkpc_kaggle.engine.plan.state import Mask, State
 from mkpc_kaggle.errors import plural
 
 # Maximum share of the time after the sweep for extra pairs: they only serve scenes.

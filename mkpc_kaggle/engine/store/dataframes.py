@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from mkpc_kaggle.engine.image_files import stored_digests
-from mkpc_kaggle.engine.records import (
+from mkpc_kaggle.engine.store.image_files import stored_digests
+from mkpc_kaggle.engine.store.records import (
     PairRecord,
     SceneRecord,
     Table,
@@ -15,7 +15,7 @@ from mkpc_kaggle.engine.records import (
     read_records,
     read_scenes,
 )
-from mkpc_kaggle.engine.store import Store
+from mkpc_kaggle.engine.store.tables import Store
 from mkpc_kaggle.scene.reconstruction import RegisteredImage, Sigmas
 
 if TYPE_CHECKING:

@@ -13,16 +13,16 @@ from weight_files import digest_of
 
 from mkpc_kaggle import reconstruct
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine.keys import Keys
+from mkpc_kaggle.engine.store.keys import Keys
 from mkpc_kaggle.errors import UserError, warn_once
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.matchers.contract import MatcherSpec
-from mkpc_kaggle.pipeline import availability
-from mkpc_kaggle.pipeline.assembly import Assembly, assemble
-from mkpc_kaggle.pipeline.availability import Licence
 from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher
 from mkpc_kaggle.recipe import Recipe, Unit, load_recipe
 from mkpc_kaggle.scene.view_graph import BatchImage
+from mkpc_kaggle.setup import availability
+from mkpc_kaggle.setup.assembly import Assembly, assemble
+from mkpc_kaggle.setup.availability import Licence
 from mkpc_kaggle.weights import WeightFile
 from mkpc_kaggle.weights import store as weight_store
 from mkpc_kaggle.weights.manifest import manifest

@@ -1,5 +1,5 @@
 """Places of workers. A place has one worker at a time, and is closed after it loses three different
-items in a row (:mod:`mkpc_kaggle.engine.blame`).
+items in a row (:mod:`mkpc_kaggle.engine.plan.blame`).
 
 A hung worker ends here: the loop sets :attr:`Place.limit` from measured costs
 (``Engine._time_limit``), and :meth:`Place.poll` kills a worker that has not answered by then. Its
@@ -16,12 +16,13 @@ from math import inf
 from pathlib import Path
 
 from mkpc_kaggle.cores import available_cores
-from mkpc_kaggle.engine.answers import wrong_answer
-from mkpc_kaggle.engine.blame import MAX_LOSSES, Item, different
 from mkpc_kaggle.engine.jobs import Answer, Cause, Failure, Job, Loaded
-from mkpc_kaggle.engine.process import ProcessWorker, ThreadWorker
-from mkpc_kaggle.engine.worker import Maker, MatchRunner, light_runner, scene_runner
-from mkpc_kaggle.pipeline.assembly import Assembly
+from mkpc_kaggle.engine.plan.blame import MAX_LOSSES, Item, different
+from mkpc_kaggle.engine.workers.answers import wrong_answer
+from mkpc_kaggle.engine.workers.process import ProcessWorker, ThreadWorker
+from mkpc_kaggle.engine.workers.worker import Maker, MatchRunner, light_runner, scene_runner
+from mkpc_kaggle.pipeline.stages import Pipeline
+from mkpc_kaggle.setup.assembly import Assembly
 
 START_TIMEOUT_S = 300.0  # for a worker to load its matchers, which is slow from a network disk
 # Times the number of workers lost in a row: scarce memory may become free meanwhile.
@@ -282,6 +283,7 @@ class LocalSite(Site):
     def _place(self, name: str, assembly: Assembly, share: int = 1) -> Place:
         # A thread of the user's process leaves the process's limits as they are.
         is_process = self._worker is ProcessWorker
-        make = partial(MatchRunner, assembly.pipeline, share=share, is_limited=is_process)
+        pipeline = partial(Pipeline.of, assembly)
+        make = partial(MatchRunner, pipeline, share=share, is_limited=is_process)
         worker = partial(self._make, f"mkpc {name}", make)
         return Place(name, worker, minibatch=assembly.minibatch)

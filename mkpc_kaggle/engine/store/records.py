@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine import codec
-from mkpc_kaggle.engine.budget import format_duration
-from mkpc_kaggle.engine.codec import FLOAT, PLAIN, by_name, optional, record, several
-from mkpc_kaggle.engine.image_files import known_images, stored_digests
 from mkpc_kaggle.engine.jobs import Estimated
-from mkpc_kaggle.engine.store import Kind, Result, Store, from_bytes
+from mkpc_kaggle.engine.plan.budget import format_duration
+from mkpc_kaggle.engine.store import codec
+from mkpc_kaggle.engine.store.codec import FLOAT, PLAIN, by_name, optional, record, several
+from mkpc_kaggle.engine.store.image_files import known_images, stored_digests
+from mkpc_kaggle.engine.store.tables import Kind, Result, Store, from_bytes
 from mkpc_kaggle.geometry.coordinates import Matrix3
 from mkpc_kaggle.geometry.critical_region import CriticalRegion
 from mkpc_kaggle.geometry.matches import Matches

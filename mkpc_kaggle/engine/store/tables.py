@@ -3,7 +3,7 @@
 There is one table. ``about`` is JSON, all that reports need; ``data`` are a unit's points. Results
 under unused keys stay until they are pruned or the run starts with --fresh. The parent alone
 writes, one transaction for each answer. It reads the store once, at its start, and keeps its state
-in memory (:mod:`state`).
+in memory (:mod:`mkpc_kaggle.engine.plan.state`).
 """
 
 import errno

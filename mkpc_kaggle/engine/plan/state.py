@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine.blame import Item, Tries
-from mkpc_kaggle.engine.image_files import contents_of
 from mkpc_kaggle.engine.jobs import Cause, Failure, PairInputs, visiting_order
-from mkpc_kaggle.engine.keys import Images, of_candidate
-from mkpc_kaggle.engine.records import MIN_PAIRS, SceneRecord
+from mkpc_kaggle.engine.plan.blame import Item, Tries
 from mkpc_kaggle.engine.request import Request
+from mkpc_kaggle.engine.store.image_files import contents_of
+from mkpc_kaggle.engine.store.keys import Images, of_candidate
+from mkpc_kaggle.engine.store.records import MIN_PAIRS, SceneRecord
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 from mkpc_kaggle.recipe import SceneConfig
 from mkpc_kaggle.scene.candidates import ALL_UNITS, best_of, candidates_of
@@ -466,7 +466,7 @@ class State:
             under_way[self.alike(index)] = False
 
     def give_up(self, item: tuple[Any, ...], failure: Failure) -> None:
-        """Stop trying an item in this run. For the items see :mod:`mkpc_kaggle.engine.blame`."""
+        """Stop trying an item in this run. For the items see :mod:`mkpc_kaggle.engine.plan.blame`."""
         self.tries.given_up[item] = failure
         match item:
             case ("unit", index, unit):
