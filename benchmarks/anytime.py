@@ -18,7 +18,7 @@ from statistics import fmean
 from tempfile import TemporaryDirectory
 
 from mkpc_kaggle.recipe import load_recipe
-from mkpc_kaggle.reporting.figures import new_figure, plain, save
+from mkpc_kaggle.reporting.figures import new_figure, plain_axes, save
 
 FACTORS = (1, 2, 4, 8, 16)  # of the sweep's time
 
@@ -56,7 +56,7 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=2)
     parser.add_argument("options", nargs="*")
     given = parser.parse_args()
-    axes = plain(new_figure(6.5, 3.2).subplots(), "mAA by time limit")
+    axes = plain_axes(new_figure(6.5, 3.2).subplots(), "mAA by time limit")
     print(f"{'recipe':12}{'limit':>10}{'early':>8}  mAA")
     for recipe in given.recipes:
         side = ["--train-dir", given.train_dir, "--recipe", recipe, *given.options]

@@ -50,8 +50,8 @@ from mkpc_kaggle.recipe import Recipe, SceneConfig, recipe_of
 from mkpc_kaggle.scene import colmap
 from mkpc_kaggle.scene.densify import extra_pairs
 from mkpc_kaggle.scene.keypoints import MergedGraph
-from mkpc_kaggle.scene.reconstruct import Solution, models_of, reconstruct_batch
-from mkpc_kaggle.scene.reconstruction import LOOSE_SIGMA, RegisteredImage
+from mkpc_kaggle.scene.models import LOOSE_SIGMA, RegisteredImage
+from mkpc_kaggle.scene.sfm import Solution, models_of, reconstruct_batch
 from mkpc_kaggle.scene.view_graph import MIN_MATCHES, BatchImage, BatchPair, ViewGraph, tracks_of
 
 TRUE = "!"  # suffix of a candidate without wrong edges

@@ -46,7 +46,7 @@ from mkpc_kaggle.geometry.robust import Estimate, RobustConfig, estimate
 from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
 from mkpc_kaggle.recipe import SceneConfig, recipe_of
 from mkpc_kaggle.scene.densify import extra_pairs
-from mkpc_kaggle.scene.reconstruct import reconstruct_batch
+from mkpc_kaggle.scene.sfm import reconstruct_batch
 from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair, tracks_of
 
 MIN_COVISIBILITY = 0.1  # of a scored pair, as in the competition

@@ -14,7 +14,7 @@ from typing import NamedTuple
 from mkpc_kaggle import TwoStageMatcher
 from mkpc_kaggle.data.competition import read_train_side
 from mkpc_kaggle.evaluation.compare import paired_difference
-from mkpc_kaggle.evaluation.validate import error_of, files_of
+from mkpc_kaggle.evaluation.validate import error_of, image_paths_of
 from mkpc_kaggle.geometry.focal_prior import FocalConfig, FocalPrior, estimate_with_prior
 from mkpc_kaggle.geometry.metrics import pair_accuracy
 from mkpc_kaggle.geometry.planarity import MIN_PLANE_SHARE, plane_share
@@ -54,7 +54,7 @@ def scored_pairs(train_dir: Path, name: str) -> list[Scored]:
         prior = estimate_with_prior(match.matches, priors, MAGSAC, FocalConfig())
         plane = plane_share(prior.matrix, match.matches) if prior.ok else 0.0
         plain = accuracy(estimate(match.matches, MAGSAC))
-        found.append(Scored(files_of(true), plane, plain, accuracy(prior)))
+        found.append(Scored(image_paths_of(true), plane, plain, accuracy(prior)))
     return found
 
 

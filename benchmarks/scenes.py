@@ -23,7 +23,7 @@ from benchmarks.synthetic_scene import SyntheticScene, registered_images, street
 from mkpc_kaggle.geometry.cameras import relative_pose
 from mkpc_kaggle.recipe import SceneConfig
 from mkpc_kaggle.scene import colmap
-from mkpc_kaggle.scene.reconstruct import Solution, reconstruct_batch
+from mkpc_kaggle.scene.sfm import Solution, reconstruct_batch
 
 
 def row(size: str, world: str) -> str:

@@ -37,8 +37,8 @@ from mkpc_kaggle.geometry.coordinates import Matrix3
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.recipe import CameraModel, CameraSharing, SceneConfig
 from mkpc_kaggle.scene import colmap, keypoints
-from mkpc_kaggle.scene.reconstruct import reconstruct_batch
-from mkpc_kaggle.scene.reconstruction import MIN_IMAGES
+from mkpc_kaggle.scene.models import MIN_IMAGES
+from mkpc_kaggle.scene.sfm import reconstruct_batch
 
 OURS = "all/0.75/2/pinhole/global"
 COLMAP = "COLMAP/0/4/radial/incremental"

@@ -10,8 +10,8 @@ from mkpc_kaggle.geometry.cameras import Camera, fundamental_of_cameras
 from mkpc_kaggle.geometry.coordinates import Box, Matrix3, Size
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import sampson_distances
-from mkpc_kaggle.scene.reconstruct import Solution
-from mkpc_kaggle.scene.reconstruction import RegisteredImage
+from mkpc_kaggle.scene.models import RegisteredImage
+from mkpc_kaggle.scene.sfm import Solution
 from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair
 
 SIZE = Size(800, 600)

@@ -26,7 +26,6 @@ from mkpc_kaggle.errors import UserError, read_text
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
 from mkpc_kaggle.geometry.critical_region import MkpcConfig
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
-from mkpc_kaggle.geometry.intrinsics import read as read_intrinsics
 from mkpc_kaggle.geometry.robust import RobustConfig
 
 DIRECTORY = Path(__file__).resolve().parent / "recipes"
@@ -172,7 +171,6 @@ class SceneConfig:
     # Minimum share of inliers of an edge, see :mod:`mkpc_kaggle.scene.edges`; 0: all edges.
     min_support: float = 0.0
     threads: int = 1  # of the mapper; with more, the last digits vary from run to run
-    intrinsics: str = ""  # known cameras, as lines of :mod:`mkpc_kaggle.geometry.intrinsics`
 
     def __post_init__(self) -> None:
         check_ranges(
@@ -182,13 +180,6 @@ class SceneConfig:
             min_support=Range(0, 1),
             threads=AT_LEAST_1,
         )
-        read_intrinsics(self.intrinsics)
-
-    @property
-    def distorted(self) -> list[str]:
-        """The camera models with distortion that these settings give to images."""
-        given = [self.camera_model, *(known.model for _, known in read_intrinsics(self.intrinsics))]
-        return sorted({str(model) for model in given} - {str(model) for model in PINHOLES})
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from mkpc_kaggle.evaluation.compare import gain_of
 from mkpc_kaggle.geometry.metrics import ROTATION_THRESHOLDS, TRANSLATION_THRESHOLDS
-from mkpc_kaggle.reporting.figures import COLOURS, DROPPED, new_figure, plain
+from mkpc_kaggle.reporting.figures import COLOURS, DROPPED, new_figure, plain_axes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -71,7 +71,7 @@ def draw_errors(validations: Sequence["Validation"]) -> "Figure":
     for axes, (kind, unit, thresholds, limits) in zip(
         figure.subplots(1, 2, sharey=True), PANELS, strict=True
     ):
-        plain(axes, f"pairs with a {kind} error below x")
+        plain_axes(axes, f"pairs with a {kind} error below x")
         axes.axvspan(
             thresholds[0],
             thresholds[-1],
@@ -98,7 +98,7 @@ def _rows(scenes: Sequence[str], title: str) -> "tuple[Figure, Axes]":
     """Return axes with one row per scene, the first on top, and a separate row for their mean."""
     names = [*map(short, scenes), "mean over scenes"]
     figure = new_figure(8, 1.5 + 0.45 * len(names))
-    axes = plain(figure.subplots(), title)
+    axes = plain_axes(figure.subplots(), title)
     axes.set_yticks(range(len(names)), names, parse_math=False)
     axes.set_ylim(len(names) - 0.5, -0.5)
     axes.axhline(len(names) - 1.5, color=DROPPED, linewidth=0.8)

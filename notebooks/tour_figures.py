@@ -27,10 +27,10 @@ from mkpc_kaggle.reporting.figures import (
     REGION,
     draw_cameras,
     new_figure,
-    plain,
+    plain_axes,
     sample,
 )
-from mkpc_kaggle.scene.reconstruction import Reconstruction
+from mkpc_kaggle.scene.models import Reconstruction
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -114,7 +114,7 @@ def draw_sizes(clusters: tuple[Clusters, Clusters], config: MkpcConfig) -> "Figu
     for number, (axes, found) in enumerate(zip(figure.subplots(1, 2), clusters, strict=True)):
         _size_bars(axes, found, config)
         kept = f"image {number}: {len(found.kept)} of {len(found.sizes)} clusters kept"
-        plain(axes, kept + _limit(found, config))
+        plain_axes(axes, kept + _limit(found, config))
     return figure
 
 
@@ -269,7 +269,7 @@ def draw_pose_errors(errors: Mapping[str, PoseError]) -> "Figure":
         ("rotation", "direction of translation"),
         strict=True,
     ):
-        plain(axes, f"error of the {title} (degrees)")
+        plain_axes(axes, f"error of the {title} (degrees)")
         angles = np.array([getattr(error, kind) for error in errors.values()])
         known = np.isfinite(angles)
         names = [short(name, 40) for name in errors]

@@ -6,7 +6,7 @@ from pathlib import Path
 from mkpc_kaggle.cli import options
 from mkpc_kaggle.errors import plural
 from mkpc_kaggle.package.metadata import DATASET_METADATA, LATEST
-from mkpc_kaggle.package.package import Request, make_package
+from mkpc_kaggle.package.package import PackageRequest, make_package
 from mkpc_kaggle.package.wheels import PYTHONS
 
 HELP = """\
@@ -43,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     out: Path = arguments.out
-    request = Request(
+    request = PackageRequest(
         out,
         arguments.owner,
         weights=tuple(arguments.weights),

@@ -15,6 +15,7 @@ from mkpc_kaggle.engine.plan.budget import format_duration
 from mkpc_kaggle.engine.session import interruptible
 from mkpc_kaggle.engine.store.records import MIN_PAIRS, NOT_RECONSTRUCTED
 from mkpc_kaggle.errors import UserError, plural
+from mkpc_kaggle.geometry.intrinsics import Rows
 from mkpc_kaggle.recipe import CameraSharing
 from mkpc_kaggle.reconstruction.coordinates import forget_coordinates, keep_coordinates
 from mkpc_kaggle.reconstruction.directory import (
@@ -32,7 +33,7 @@ from mkpc_kaggle.reconstruction.folder import (
     read_pair_list,
 )
 from mkpc_kaggle.reconstruction.layout import write_layouts
-from mkpc_kaggle.reconstruction.outputs import FORMS, Cameras, write_tables
+from mkpc_kaggle.reconstruction.outputs import SUBMISSION_FORMATS, Cameras, write_tables
 from mkpc_kaggle.reconstruction.panoramas import require_perspective
 from mkpc_kaggle.reconstruction.priors import intrinsics_line, read_intrinsics_table
 from mkpc_kaggle.reconstruction.run import FolderResult, for_cameras, reconstruct_folder
@@ -107,7 +108,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--export", type=Path, metavar="FILE.h5", help=text)
     text = "all images below DIR are one dataset, as those of a camera with several cards"
     add("--join", action="store_true", help=text)
-    add("--format", choices=FORMS, help="also write submission.csv; imc2023 is also for 2024")
+    add(
+        "--format",
+        choices=SUBMISSION_FORMATS,
+        help="also write submission.csv; imc2023 is also for 2024",
+    )
     add(
         "--rotations",
         action="store_true",
@@ -132,12 +137,12 @@ def run(arguments: argparse.Namespace) -> int:
     out = arguments.out
     work_dir = out / WORK
     datasets = read_folder(root, join=arguments.join)
-    files = [file for found in datasets.values() for file in found]
+    files = [file for dataset in datasets.values() for file in dataset]
     # All inputs are read and checked before OUT is touched.
     require_perspective(files)
-    known = ""
+    known_cameras: Rows = ()
     if arguments.intrinsics is not None:
-        known = read_intrinsics_table(arguments.intrinsics, root, files)
+        known_cameras = read_intrinsics_table(arguments.intrinsics, root, files)
     masks = Masks() if arguments.masks is None else Masks.of_folder(arguments.masks, root, files)
     more = [arguments.pairs, arguments.intrinsics, arguments.masks]
     inputs = [root, options.recipe_file(arguments), *more]
@@ -157,12 +162,12 @@ def run(arguments: argparse.Namespace) -> int:
         def publish(cameras: Cameras) -> None:
             held.check()
             write_tables(out, cameras, root, arguments.format)
-            session.status = int(not any(any(found.values()) for found in cameras.values()))
+            session.status = int(not any(any(dataset.values()) for dataset in cameras.values()))
 
         assembly = options.assembly_of(arguments, arguments.recipe, arguments.mode, interrupt)
-        recipe = for_cameras(assembly.recipe, arguments.camera, known)
-        assembly = replace(assembly, recipe=recipe, masks=masks)
-        effects = _effects(masks, known, listed, root, datasets)
+        recipe = for_cameras(assembly.recipe, arguments.camera)
+        assembly = replace(assembly, recipe=recipe, masks=masks, cameras=known_cameras)
+        effects = _effects(masks, known_cameras, listed, root, datasets)
         options.say_start(plural(len(files), "image"), assembly, work_dir, effects)
         result = reconstruct_folder(
             root,
@@ -179,9 +184,9 @@ def run(arguments: argparse.Namespace) -> int:
         if trouble(result.report) or unwritten or result.lost:
             session.status = 1
         problems = [trouble(result.report), result.report.unwritten]
-        is_here = held.is_here and all(each.is_here for each in result.held.values())
+        is_here = held.is_here and all(held_files.is_here for held_files in result.held.values())
         if is_here:
-            if any(any(found.values()) for found in result.cameras.values()):
+            if any(any(dataset.values()) for dataset in result.cameras.values()):
                 say("writing images/ and sparse/ for other programs")
             problems = [
                 *write_layouts(out, root, datasets, session.must_end(), result.held),
@@ -210,13 +215,13 @@ def _require_export(path: Path, inputs: Sequence[Path], work_dir: Path) -> None:
 
 
 def _effects(
-    masks: Masks, known: str, listed: Sequence[Ends] | None, root: Path, datasets: Datasets
+    masks: Masks, cameras: Rows, listed: Sequence[Ends] | None, root: Path, datasets: Datasets
 ) -> Iterator[str]:
     """Yield which part of the masks, the known cameras and the list of pairs takes effect."""
-    files = [file for found in datasets.values() for file in found]
+    files = [file for dataset in datasets.values() for file in dataset]
     yield from masks.lines
-    if known:
-        yield intrinsics_line(known, root, files)
+    if cameras:
+        yield intrinsics_line(cameras, root, files)
     if listed is not None:
         yield pair_list_line(listed, root, datasets)
 

@@ -9,9 +9,9 @@ from mkpc_kaggle.errors import UserError, plural, temporary_directory
 from mkpc_kaggle.matchers.registry import UnusableError, matcher_names, spec_of
 from mkpc_kaggle.recipe import load_recipe, recipe_names
 from mkpc_kaggle.setup.availability import fit_of, slots_of
-from mkpc_kaggle.weights import FoundFile, State, WeightFile, WeightStore
-from mkpc_kaggle.weights.checkpoint import convert
-from mkpc_kaggle.weights.fetch import FetchOutcome, choose, fetch
+from mkpc_kaggle.weights import FileState, FoundFile, WeightFile, WeightStore
+from mkpc_kaggle.weights.checkpoint import convert_file
+from mkpc_kaggle.weights.fetch import FetchOutcome, choose_alternative, fetch
 from mkpc_kaggle.weights.manifest import UNVERIFIED, pin, read_manifest
 from mkpc_kaggle.weights.wheel import Wheels
 
@@ -126,15 +126,15 @@ def tried(found: FoundFile, store: WeightStore) -> FoundFile:
         return found
     fit = fit_of(found, store)
     note = "; ".join(filter(None, [found.note, fit.text]))
-    return replace(found, state=State.REFUSED if fit.is_refused else found.state, note=note)
+    return replace(found, state=FileState.REFUSED if fit.is_refused else found.state, note=note)
 
 
 def _fetch(arguments: argparse.Namespace) -> int:
     """Fetch each file once; return 1 if one failed or must be fetched by hand."""
     # The directory's own manifest has the digests of former downloads.
     store = WeightStore([arguments.out] if arguments.out.is_dir() else [])
-    wanted = [lines for name in arguments.names for lines in files_of(name, store)]
-    files = dict.fromkeys(choose(lines, arguments.out) for lines in wanted)
+    wanted = [lines for name in arguments.names for lines in alternatives_of(name, store)]
+    files = dict.fromkeys(choose_alternative(lines, arguments.out) for lines in wanted)
     outcomes = []
     with temporary_directory() as temporary:
         wheels = Wheels(temporary)
@@ -151,10 +151,10 @@ def _fetch(arguments: argparse.Namespace) -> int:
 
 
 def _convert(arguments: argparse.Namespace) -> None:
-    print(convert(arguments.file, arguments.out).line)
+    print(convert_file(arguments.file, arguments.out).line)
 
 
-def files_of(name: str, store: WeightStore) -> list[list[WeightFile]]:
+def alternatives_of(name: str, store: WeightStore) -> list[list[WeightFile]]:
     """Return the files that a file name, slot or recipe refers to: a list of alternatives per slot.
 
     Raises :class:`UserError` with the known names for an unknown name.

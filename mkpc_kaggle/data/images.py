@@ -59,7 +59,7 @@ JPEG_START, JPEG_END = b"\xff\xd8", b"\xff\xd9"
 JPEG_FILL = b"\xaa" * 64
 MAX_TRAILER_BYTES = 1 << 16  # after the end mark, such as a maker's notes
 # In long sides of the image; a focal length outside this range counts as unknown.
-FOCALS = Range(0.2, 20.0)
+EXIF_FOCALS = Range(0.2, 20.0)
 # Ratio of the shapes of a stored and a recorded picture; more is a crop, and not rounding.
 MAX_SHAPE_RATIO = 1.03
 # Counter-clockwise quarter turns that set pixels upright, by EXIF orientation; mirrored pixels stay
@@ -239,7 +239,7 @@ def exif_facts(tags: Mapping[int, float], size: Size) -> tuple[int, float]:
         unit = UNITS_MM.get(tags.get(PLANE_UNIT, 0), inf)
         focal = tags.get(FOCAL_MM, 0.0) * tags.get(PLANE_RESOLUTION, 0.0) / unit
         focal *= scale_since_taken(tags, size)
-    return turns, focal if focal / max(size) in FOCALS else 0.0
+    return turns, focal if focal / max(size) in EXIF_FOCALS else 0.0
 
 
 def scale_since_taken(tags: Mapping[int, float], size: Size) -> float:

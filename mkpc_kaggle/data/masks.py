@@ -19,7 +19,7 @@ from mkpc_kaggle.errors import UserError, plural
 from mkpc_kaggle.geometry.coordinates import Points, Size
 
 CACHE_BYTES = 128 << 20
-SUFFIX = ".png"
+MASK_SUFFIX = ".png"
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Masks:
         """
         if not directory.is_dir():
             raise UserError(
-                f"{directory}: no such directory; --masks names a directory with files such as a.jpg{SUFFIX}"
+                f"{directory}: no such directory; --masks names a directory with files such as a.jpg{MASK_SUFFIX}"
             )
         images = list(images)
         # Each folder once: resolving links takes long.
@@ -56,7 +56,7 @@ class Masks:
         files: dict[str, tuple[str, str]] = {}
         unusual: dict[str, list[Path]] = {}
         for image in images:
-            path = present.pop(_key(f"{image.relative_to(root).as_posix()}{SUFFIX}"), None)
+            path = present.pop(_key(f"{image.relative_to(root).as_posix()}{MASK_SUFFIX}"), None)
             if path is None:  # as in COLMAP, an image without a mask is used whole
                 continue
             effect = _checked(path, image)
@@ -66,7 +66,7 @@ class Masks:
             files[str(image)] = (str(path), digest)
         if not files:
             name = images[0].relative_to(root).as_posix() if images else "a.jpg"
-            expected = f"{name}{SUFFIX}"
+            expected = f"{name}{MASK_SUFFIX}"
             raise UserError(f"{directory} has no mask of any image: {expected} would be the first")
         lines = _lines(directory, len(images), len(files), present, unusual)
         is_partial = len(files) < len(images) or bool(present or unusual)
@@ -83,7 +83,7 @@ def _files_below(directory: Path) -> dict[str, Path]:
     for path in sorted(directory.rglob("*")):
         name = path.relative_to(directory).as_posix()
         # A directory at the name of a mask is refused later.
-        is_mask = not path.is_dir() or path.suffix.lower() == SUFFIX
+        is_mask = not path.is_dir() or path.suffix.lower() == MASK_SUFFIX
         if is_mask and not any(part.startswith(".") for part in name.split("/")):
             files.setdefault(_key(name), path)
     return files

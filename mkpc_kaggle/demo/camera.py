@@ -61,7 +61,7 @@ def look_at(
     return SizedCamera(K, R, t, width, height)
 
 
-def resized(camera: SizedCamera, scale: float) -> SizedCamera:
+def resized_camera(camera: SizedCamera, scale: float) -> SizedCamera:
     """Return the camera of the image resized by `scale`: `x' = (x + 0.5) * scale - 0.5`.
 
     Sides are rounded to whole pixels, but K has the exact scale. So the image loses or gains up to

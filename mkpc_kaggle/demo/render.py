@@ -8,9 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mkpc_kaggle.demo.camera import FloatImage, Floats, SizedCamera, project, resized
-
-Picture = NDArray[np.uint8]
+from mkpc_kaggle.demo.camera import FloatImage, Floats, SizedCamera, project, resized_camera
+from mkpc_kaggle.geometry.coordinates import Pixels
 
 RAYS = 3  # along each axis of a pixel; odd, so that one ray passes through the pixel's centre
 SUN = np.array([0.41, -0.51, 0.76])  # the direction towards the light
@@ -32,7 +31,7 @@ class Surface:
     origin: Floats
     edge_u: Floats
     edge_v: Floats
-    texture: Picture
+    texture: Pixels
 
     @property
     def normal(self) -> Floats:
@@ -41,7 +40,7 @@ class Surface:
         return np.asarray(normal / np.linalg.norm(normal))
 
     @property
-    def shaded(self) -> Picture:
+    def shaded(self) -> Pixels:
         """The texture in sunlight, (H, W, 3) uint8 BGR."""
         shade = AMBIENT + DIFFUSE * max(0.0, float(self.normal @ SUN))
         # OpenCV rounds and clips to 0..255.
@@ -53,7 +52,7 @@ def render(surfaces: Sequence[Surface], camera: SizedCamera) -> tuple[FloatImage
 
     Depth is along the camera's axis, at pixel centres, in metres. The sky's depth is inf.
     """
-    fine = resized(camera, RAYS)
+    fine = resized_camera(camera, RAYS)
     image = np.full((fine.height, fine.width, 3), SKY, np.uint8)
     nearness = np.zeros(image.shape[:2], np.float32)  # 1 / depth, 0 for the sky
     for surface in surfaces:
@@ -69,7 +68,7 @@ def render(surfaces: Sequence[Surface], camera: SizedCamera) -> tuple[FloatImage
 
 
 def _draw(
-    surface: Surface, camera: SizedCamera, image: Picture, nearness: NDArray[np.float32]
+    surface: Surface, camera: SizedCamera, image: Pixels, nearness: NDArray[np.float32]
 ) -> None:
     """Draw a surface where nothing nearer is drawn: change the image and ``nearness`` in place."""
     rows, columns = _extent(surface, camera)

@@ -6,10 +6,11 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mkpc_kaggle.demo.camera import Floats, SizedCamera, look_at, resized
-from mkpc_kaggle.demo.render import Picture, Surface
+from mkpc_kaggle.demo.camera import Floats, SizedCamera, look_at, resized_camera
+from mkpc_kaggle.demo.render import Surface
+from mkpc_kaggle.geometry.coordinates import Pixels
 
-Colour = tuple[int, int, int]  # BGR
+Bgr = tuple[int, int, int]
 
 SCENES = {"courtyard": 2.5, "market": 1.0}  # metres per unit of the written poses
 
@@ -61,7 +62,7 @@ def build_world(
         towards = np.add(target, rng.uniform(-0.3, 0.3, 3))
         turned = roll + rng.uniform(-2, 2)
         camera = look_at(eye, towards, focal * max(size), size, turned)
-        cameras.append(resized(camera, image_scale))
+        cameras.append(resized_camera(camera, image_scale))
     return surfaces, cameras
 
 
@@ -131,7 +132,7 @@ def box(rng: np.random.Generator, centre: Floats, size: Floats, yaw: float) -> l
 
 
 def quad(
-    top_left: ArrayLike, top_right: ArrayLike, bottom_left: ArrayLike, picture: Picture
+    top_left: ArrayLike, top_right: ArrayLike, bottom_left: ArrayLike, picture: Pixels
 ) -> Surface:
     """Return the rectangle with these corners (3,), named as seen from the front."""
     corner = np.asarray(top_left, dtype=np.float64)
@@ -144,10 +145,10 @@ def paint(
     rng: np.random.Generator,
     width_m: float,
     height_m: float,
-    colour: Colour,
+    colour: Bgr,
     *,
     is_stone: bool = False,
-) -> Picture:
+) -> Pixels:
     """Draw a dead-leaves texture: shapes of all sizes in tones of the colour.
 
     Source: Lee, Mumford and Huang 2001. The shapes are upright rectangles for stone, rotated
@@ -194,7 +195,7 @@ def _leaf_sides(rng: np.random.Generator, count: int, max_side: float, max_aspec
 
 
 def _leaf_tones(
-    rng: np.random.Generator, count: int, colour: Colour, contrast: float
+    rng: np.random.Generator, count: int, colour: Bgr, contrast: float
 ) -> list[list[float]]:
     """Draw the BGR colours of shapes, which differ mostly in brightness and a little in hue."""
     brightness = rng.normal(0, contrast, (count, 1))
@@ -204,7 +205,7 @@ def _leaf_tones(
     return found
 
 
-def facade(rng: np.random.Generator, width_m: float, height_m: float, colour: Colour) -> Picture:
+def facade(rng: np.random.Generator, width_m: float, height_m: float, colour: Bgr) -> Pixels:
     """Draw a stone wall with a grid of windows that differ only in brightness."""
     picture = paint(rng, width_m, height_m, colour, is_stone=True)
     scale = picture.shape[1] / width_m

@@ -12,10 +12,11 @@ import cv2
 import numpy as np
 
 from mkpc_kaggle.demo.camera import FloatImage, Floats, SizedCamera, covisibility
-from mkpc_kaggle.demo.render import Picture, render
+from mkpc_kaggle.demo.render import render
 from mkpc_kaggle.demo.world import SCENES, build_world
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.cameras import fundamental_of_cameras
+from mkpc_kaggle.geometry.coordinates import Pixels
 from mkpc_kaggle.progress import counted
 
 MIN_COVISIBILITY = 0.1  # minimum of a pair that the competition scores
@@ -41,7 +42,7 @@ class Photograph(NamedTuple):
 
     name: str
     camera: SizedCamera
-    picture: Picture
+    picture: Pixels
     depth: FloatImage
 
 
@@ -114,7 +115,7 @@ def take_photographs(scene: str, seed: int, image_scale: float) -> list[Photogra
     return photographs
 
 
-def _developed(image: FloatImage, rng: np.random.Generator) -> Picture:
+def _developed(image: FloatImage, rng: np.random.Generator) -> Pixels:
     """Convert an image (H, W, 3) float32 in 0..255 to uint8, with exposure, tint and noise."""
     gain = rng.uniform(0.75, 1.25)
     gamma = rng.uniform(0.85, 1.2)
@@ -193,7 +194,7 @@ def _write_test(
         yield test_row, truth_row
 
 
-def _write_image(path: Path, picture: Picture, option: int, value: int) -> None:
+def _write_image(path: Path, picture: Pixels, option: int, value: int) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     done, data = cv2.imencode(path.suffix, picture, [option, value])
     if not done:

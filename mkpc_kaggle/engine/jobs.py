@@ -14,12 +14,13 @@ from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.store.keys import Images
 from mkpc_kaggle.engine.store.tables import Source
 from mkpc_kaggle.geometry.coordinates import Matrix3
+from mkpc_kaggle.geometry.intrinsics import Rows
 from mkpc_kaggle.geometry.robust import NO_STATS, EstimateStats
 from mkpc_kaggle.pipeline.pair import Regions, UnitResult
 from mkpc_kaggle.recipe import Recipe, Unit
 from mkpc_kaggle.scene.candidates import ALL_UNITS
 from mkpc_kaggle.scene.export import HeldDirectory
-from mkpc_kaggle.scene.reconstruct import Solution
+from mkpc_kaggle.scene.sfm import Solution
 
 
 class Phase(IntEnum):
@@ -41,14 +42,13 @@ class Phase(IntEnum):
 
 
 @dataclass(frozen=True, eq=False)
-class MatchJob:
-    """Run missing ``units`` on the pairs at ``indices``: one pair, or a minibatch on a GPU.
+class MatchPlan:
+    """The schedule's choice: missing ``units`` on the pairs at ``indices``, one or a minibatch.
 
     ``expected`` are the expected seconds of each unit per pair. A unit begins only if it is expected to
-    end within ``seconds`` of the job's start. ``known`` are each pair's points of stage 1, for critical
-    regions, and ``crops`` their keys. ``upcoming`` are the images that will probably be matched next.
-    ``is_last`` states that its pairs need no other units in this phase, ``is_check`` that the work is
-    done already: the answer shows that the place works, and is not used.
+    end within ``seconds`` of the job's start. ``is_last`` states that its pairs need no other units in
+    this phase, ``is_check`` that the work is done already: the answer shows that the place works, and is
+    not used.
     """
 
     phase: Phase
@@ -58,17 +58,26 @@ class MatchJob:
     seconds: float
     is_last: bool = True
     is_check: bool = False
-    # The schedule leaves the rest empty: :meth:`mkpc_kaggle.engine.matching.Matching.fill` adds it.
-    pairs: tuple[Pair, ...] = ()
-    names: tuple[tuple[str, str], ...] = ()
-    known: tuple[tuple[UnitResult, ...], ...] = ()
-    crops: tuple[tuple[str, ...], ...] = ()
-    upcoming: tuple[Path, ...] = ()
 
     @property
     def items(self) -> tuple[tuple[Hashable, ...], ...]:
         """The units of pairs that a loss of this job concerns."""
         return tuple(("unit", index, unit.name) for index in self.indices for unit in self.units)
+
+
+@dataclass(frozen=True, eq=False)
+class MatchJob(MatchPlan):
+    """A plan with its inputs, made by :meth:`mkpc_kaggle.engine.matching.Matching.job`.
+
+    ``stage_1`` are each pair's points of stage 1, for critical regions, and ``crops`` their keys.
+    ``upcoming`` are the images that will probably be matched next.
+    """
+
+    pairs: tuple[Pair, ...] = ()
+    names: tuple[tuple[str, str], ...] = ()
+    stage_1: tuple[tuple[UnitResult, ...], ...] = ()
+    crops: tuple[tuple[str, ...], ...] = ()
+    upcoming: tuple[Path, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +110,8 @@ class EstimateJob:
 
 @dataclass(frozen=True, eq=False)
 class SceneJob:
-    """Reconstruct a batch, from ``matches`` matches. ``export`` is for COLMAP's files.
+    """Reconstruct a batch, from ``matches`` matches. ``export`` is for COLMAP's files, ``cameras`` are
+    those that the user knows.
 
     A ``candidate`` other than the first has its own ``key``, and ``scene`` is the key of the first. A batch
     that has files is reconstructed as a whole, ``is_whole``, even by a job that writes none.
@@ -118,6 +128,7 @@ class SceneJob:
     source: Source
     matches: int = 0
     export: HeldDirectory | None = None
+    cameras: Rows = ()
     candidate: str = ALL_UNITS
     scene: str = ""
     is_whole: bool = False
@@ -158,7 +169,7 @@ class Outcome:
 
     images: Images | tuple[()] = ()
     files: tuple[tuple[int, int], ...] = ()
-    found: tuple[UnitResult, ...] = ()
+    results: tuple[UnitResult, ...] = ()
     regions: Regions | None = None
     failure: str = ""
     decode_seconds: float = 0.0

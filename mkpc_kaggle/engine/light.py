@@ -83,16 +83,16 @@ class Estimating:
         state = run.state
         # Under the key of the points that the worker read, which may be older than the state's.
         results = []
-        for pair, found in zip(job.pairs, answer, strict=True):
-            key = state.request.keys.of_estimate(state.pairs[pair.index], found.points)
-            results.append(Result(key, Kind.ESTIMATE, ESTIMATED.to_json(found)))
+        for pair, estimated in zip(job.pairs, answer, strict=True):
+            key = state.request.keys.of_estimate(state.pairs[pair.index], estimated.points)
+            results.append(Result(key, Kind.ESTIMATE, ESTIMATED.to_json(estimated)))
         run.store.put(results)
         state.end(state.estimating, (pair.index for pair in job.pairs))
-        for pair, found, result in zip(job.pairs, answer, results, strict=True):
+        for pair, estimated, result in zip(job.pairs, answer, results, strict=True):
             self._use(pair.index, result)
-            for each in state.alike(pair.index):
-                state.lost_estimates.pop(each, None)
-            run.costs.observe(ESTIMATE, found.seconds)
+            for row in state.alike(pair.index):
+                state.lost_estimates.pop(row, None)
+            run.costs.observe(ESTIMATE, estimated.seconds)
         run.log.estimated += len(answer)
         # While pairs are matched, the bar shows those.
         if not state.matching.any():

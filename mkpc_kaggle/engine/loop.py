@@ -2,7 +2,7 @@
 
 The schedule decides which pairs, estimates and scenes come next
 (:mod:`mkpc_kaggle.engine.plan.schedule`). Each kind of work has a file for its jobs and their answers
-(:mod:`matching`, :mod:`light`, :mod:`reconstructing`).
+(:mod:`matching`, :mod:`light`, :mod:`scenes`).
 """
 
 import sqlite3
@@ -34,10 +34,10 @@ from mkpc_kaggle.engine.plan.budget import Budget, Costs, format_duration
 from mkpc_kaggle.engine.plan.schedule import Crew, NextWork, is_complete, next_work
 from mkpc_kaggle.engine.plan.state import State, extra_pairs_of
 from mkpc_kaggle.engine.publication import Publication
-from mkpc_kaggle.engine.reconstructing import Reconstructing, scene_failures, scene_records
 from mkpc_kaggle.engine.request import Ending, Request, RunReport
 from mkpc_kaggle.engine.restore import restore
 from mkpc_kaggle.engine.run import EventLog, JobHandler, Run
+from mkpc_kaggle.engine.scenes import SceneWork, scene_failures, scene_records
 from mkpc_kaggle.engine.store.image_files import current_digests, update_digests
 from mkpc_kaggle.engine.store.records import read_records
 from mkpc_kaggle.engine.store.tables import Store
@@ -58,7 +58,7 @@ class Asked:
     state: State
     matching: Matching
     estimating: Estimating
-    reconstructing: Reconstructing
+    reconstructing: SceneWork
     publication: Publication
     until: float = inf  # no job begins after this time, which is the end of a trial
     resumed: int = 0  # rows that earlier runs finished
@@ -160,7 +160,7 @@ class Engine:
             state,
             Matching(run),
             Estimating(run),
-            Reconstructing(run),
+            SceneWork(run),
             Publication(state, self.store, self.budget, self.log),
             until=self.budget.clock() + share * self.budget.left() if share < 1 else inf,
             resumed=int(state.complete.sum()),
@@ -362,21 +362,21 @@ class Engine:
         places = self.site.of(Work.MATCH)
         idle = [place for place in places if place.is_idle]
         others = any(place.may_start(now) or place.is_starting for place in places)
-        job = work.match
-        while job is not None and idle:
+        plan = work.match
+        while plan is not None and idle:
             if lost := different(idle[0].lost, asked.state.tries.given_up):
                 trial = self._next_work(asked, now, lost)
-                job = (trial.match if trial is not None else None) or job
+                plan = (trial.match if trial is not None else None) or plan
             # ``None``: the store cannot be read, and the job is planned again in other parts.
-            filled = asked.matching.fill(job, idle[0].minibatch)
-            if filled is not None:
-                self._give(idle.pop(0), filled, now)
-            job = None
+            job = asked.matching.job(plan, idle[0].minibatch)
+            if job is not None:
+                self._give(idle.pop(0), job, now)
+            plan = None
             # Planning takes time, so the next job is planned only if a worker could take it.
             if idle or others:
                 following = self._next_work(asked, now)
-                job = following.match if following is not None else None
-        return int(job is not None)
+                plan = following.match if following is not None else None
+        return int(plan is not None)
 
     def _hand_out_light(self, asked: Asked | None, work: NextWork | None, now: float) -> int:
         """Give features and estimates to idle workers. Return the number of remaining ones."""

@@ -2,9 +2,8 @@
 
 import sqlite3
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
-from mkpc_kaggle.engine.jobs import Cause, Failure, MatchJob, Outcome, Phase
+from mkpc_kaggle.engine.jobs import Cause, Failure, MatchJob, MatchPlan, Outcome, Phase
 from mkpc_kaggle.engine.plan.schedule import Crew, NextWork, outlook, upcoming_pairs
 from mkpc_kaggle.engine.run import HANG_FACTOR, Run
 from mkpc_kaggle.engine.store.image_files import image_results
@@ -55,47 +54,53 @@ class Matching:
         """Explain the phase again, since another device takes over."""
         self._explained = ""
 
-    def fill(self, job: MatchJob, minibatch: int) -> MatchJob | None:
-        """Return the schedule's job with its pairs, and the points that their crops come from.
+    def job(self, plan: MatchPlan, minibatch: int) -> MatchJob | None:
+        """Return the job of the schedule's plan: with its pairs, and the points that their crops come from.
 
         Return ``None`` if the points cannot be read: the job is lost then.
         """
         state = self._run.state
-        if not job.is_check:
-            state.begin(state.matching, job.indices)
-            if job.phase is Phase.FILL:
-                state.begin(state.filling, job.indices)
+        if not plan.is_check:
+            state.begin(state.matching, plan.indices)
+            if plan.phase is Phase.FILL:
+                state.begin(state.filling, plan.indices)
         # Units of stage 1 look at whole images and need no points.
-        known: list[tuple[UnitResult, ...]] = [()] * len(job.indices)
-        crops: list[tuple[str, ...]] = [()] * len(job.indices)
-        if any(unit.stage == 2 for unit in job.units):
+        stage_1: list[tuple[UnitResult, ...]] = [()] * len(plan.indices)
+        crops: list[tuple[str, ...]] = [()] * len(plan.indices)
+        if any(unit.stage == 2 for unit in plan.units):
             # Crops come from points of today alone. Others may be of former settings.
-            crops = [tuple(state.first_stage(index)) for index in job.indices]
-            inputs = list(zip(job.indices, crops, strict=True))
+            crops = [tuple(state.first_stage(index)) for index in plan.indices]
+            inputs = list(zip(plan.indices, crops, strict=True))
             try:
                 # The arrays of all points would not fit in memory.
                 data = self._run.store.data(key for _, keys in inputs for key in keys)
             except sqlite3.Error as error:  # a disk that fails
-                self.lose(job, Failure(Cause.RAISED, f"the store cannot be read: {error}"))
+                self.lose(plan, Failure(Cause.RAISED, f"the store cannot be read: {error}"))
                 return None
             if self._run.forget_lost({key for _, keys in inputs for key in keys} - data.keys()):
-                if job.is_check:
-                    state.tries.discard_proven(job.items)
+                if plan.is_check:
+                    state.tries.discard_proven(plan.items)
                 else:
-                    self._end(job)
+                    self._end(plan)
                 return None
-            known = [self._points_of(index, keys, data) for index, keys in inputs]
+            stage_1 = [self._points_of(index, keys, data) for index, keys in inputs]
         upcoming: list[int] = []
-        if not job.is_check:
+        if not plan.is_check:
             # The others have these units, or another worker matches them.
-            numbers = [state.number_of[unit.name] for unit in job.units]
+            numbers = [state.number_of[unit.name] for unit in plan.units]
             missing = state.missing[:, numbers].any(1) & ~state.matching
-            upcoming = upcoming_pairs(state, job, minibatch, missing)
-        return replace(
-            job,
-            pairs=tuple(state.pairs[index] for index in job.indices),
-            names=tuple(state.names[index] for index in job.indices),
-            known=tuple(known),
+            upcoming = upcoming_pairs(state, plan, minibatch, missing)
+        return MatchJob(
+            plan.phase,
+            plan.indices,
+            plan.units,
+            plan.expected,
+            plan.seconds,
+            plan.is_last,
+            plan.is_check,
+            pairs=tuple(state.pairs[index] for index in plan.indices),
+            names=tuple(state.names[index] for index in plan.indices),
+            stage_1=tuple(stage_1),
             crops=tuple(crops),
             upcoming=tuple(path for index in upcoming for path in state.pairs[index].images),
         )
@@ -136,15 +141,17 @@ class Matching:
         self._end(job)
         for index, outcome, rows in zip(job.indices, answer, results, strict=True):
             self._use(index, outcome, rows)
-            for found in outcome.found:
+            for unit_result in outcome.results:
                 # A unit that raised says nothing about the time of one that runs.
-                if found.failure:
+                if unit_result.failure:
                     run.log.units_failed += 1
                     continue
-                run.state.tries.succeed(("unit", index, found.unit.name))
+                run.state.tries.succeed(("unit", index, unit_result.unit.name))
                 # A unit that the pair does not need took no time.
-                if found.is_needed:
-                    run.costs.observe(found.unit.name, found.seconds, warm_up=found.warm_up)
+                if unit_result.is_needed:
+                    run.costs.observe(
+                        unit_result.unit.name, unit_result.seconds, warm_up=unit_result.warm_up
+                    )
                     run.log.units_run += 1
         if (work := self._shown) is not None:
             # The schedule counted the finished pairs before this answer. A pair whose other units
@@ -173,22 +180,22 @@ class Matching:
             if state.current[index, number] and not state.is_crop[number]
         }
         # Failures are not stored: the next run tries them again.
-        good = [found for found in outcome.found if not found.failure]
-        for found in good:
-            number = state.number_of[found.unit.name]
+        good = [unit_result for unit_result in outcome.results if not unit_result.failure]
+        for unit_result in good:
+            number = state.number_of[unit_result.unit.name]
             is_crop = state.is_crop[number]
             if is_crop and not are_valid:
                 continue  # the unit stays missing and runs again
             keys = [first[n] for n in sorted(first)]
-            is_float32 = found.is_float32 and found.is_needed
+            is_float32 = unit_result.is_float32 and unit_result.is_needed
             key = state.key_of(index, number, images, keys, is_float32=is_float32)
             # An answer has stage 1 first: its units of stage 2 looked at crops from all of stage 1.
             if not is_crop:
                 first[number] = key
-            if not found.is_needed:
+            if not unit_result.is_needed:
                 key = state.request.keys.unneeded(key)
-            facts = UNIT_FACTS.to_json(_facts(found, outcome, len(good)))
-            results.append(Result(key, Kind.POINTS, facts, to_bytes(found.matches)))
+            facts = UNIT_FACTS.to_json(_facts(unit_result, outcome, len(good)))
+            results.append(Result(key, Kind.POINTS, facts, to_bytes(unit_result.matches)))
         return results
 
     def _use_images(self, outcome: Outcome) -> list[Result]:
@@ -207,24 +214,24 @@ class Matching:
         state = self._run.state
         points = [result for result in results if result.kind is Kind.POINTS]
         before = state.keys_in_use(index)
-        for each in state.alike(index):
+        for row in state.alike(index):
             # An unreadable image stays unreadable in this run, and a matcher that raised raises again.
             if outcome.failure:
-                state.give_up(("pair", each), Failure(Cause.UNREADABLE, outcome.failure))
-            for found in outcome.found:
-                if found.failure:
-                    failure = Failure(Cause.UNIT_RAISED, found.failure)
-                    state.give_up(("unit", each, found.unit.name), failure)
+                state.give_up(("pair", row), Failure(Cause.UNREADABLE, outcome.failure))
+            for unit_result in outcome.results:
+                if unit_result.failure:
+                    failure = Failure(Cause.UNIT_RAISED, unit_result.failure)
+                    state.give_up(("unit", row, unit_result.unit.name), failure)
             for result in points:
                 number = state.number_of[result.about["unit"]]
-                state.use_points(each, number, result.key, result.about)
+                state.use_points(row, number, result.key, result.about)
             # Units that the pair does not need change nothing.
-            if state.keys_in_use(each) != before:
-                state.note_points(each)
+            if state.keys_in_use(row) != before:
+                state.note_points(row)
             elif points:
-                state.changed.add(each)
+                state.changed.add(row)
 
-    def lose(self, job: MatchJob, failure: Failure) -> None:
+    def lose(self, job: MatchPlan, failure: Failure) -> None:
         run = self._run
         state = run.state
         if job.is_check:
@@ -253,7 +260,7 @@ class Matching:
         # The first pairs may be bad. A unit that fails where other units ran is not.
         return bool(state.has[pairs].any()) or not state.has.any()
 
-    def _end(self, job: MatchJob) -> None:
+    def _end(self, job: MatchPlan) -> None:
         state = self._run.state
         state.end(state.matching, job.indices)
         state.end(state.filling, job.indices)

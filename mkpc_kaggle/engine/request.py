@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.store.keys import Keys
 from mkpc_kaggle.engine.store.records import About, Event, PairRecord, SceneRecord
+from mkpc_kaggle.geometry.intrinsics import Rows
 from mkpc_kaggle.recipe import Recipe
 from mkpc_kaggle.scene.export import HeldDirectory
 
@@ -37,7 +38,8 @@ class Ending(StrEnum):
 class Request:
     """A request for points, estimates and scenes of ``pairs``, whose images are below ``root``.
 
-    ``exports`` are the directories for COLMAP's files, by batch. ``publish`` is called with the state, whose
+    ``cameras`` are those of scenes that the user knows. ``exports`` are the directories for COLMAP's
+    files, by batch. ``publish`` is called with the state, whose
     ``fundamentals``, ``scenes`` and ``digests`` are the results so far: at the start, every half minute (less
     often if slow), after each scene with files, and at the end. A trial is not the run's result: its table of
     pairs is not stored.
@@ -47,6 +49,7 @@ class Request:
     recipe: Recipe
     keys: Keys
     root: str = ""
+    cameras: Rows = ()
     exports: Mapping[str, HeldDirectory] = field(default_factory=dict)
     about: About = field(default_factory=About)
     publish: "Callable[[State], None]" = lambda _: None

@@ -32,6 +32,7 @@ from mkpc_kaggle.engine.workers.cluster import RaySite
 from mkpc_kaggle.engine.workers.places import LISTEN_S, LocalSite
 from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
+from mkpc_kaggle.recipe import PINHOLES
 from mkpc_kaggle.setup.assembly import Assembly
 from mkpc_kaggle.version import __version__
 
@@ -222,9 +223,9 @@ def run_pairs(
     used or a matcher cannot be loaded, and for scenes whose cameras have distortion.
     """
     scene = assembly.recipe.scene
-    if scene is not None and scene.distorted:
+    if scene is not None and scene.camera_model not in PINHOLES:
         raise UserError(
-            f"[scene] has cameras with distortion ({', '.join(scene.distorted)}), and F ignores it: "
+            f"[scene] has cameras with distortion ({scene.camera_model}), and F ignores it: "
             "use PINHOLE or SIMPLE_PINHOLE here; `mkpc reconstruct` takes all models"
         )
     folders = dict.fromkeys(path.parent for pair in pairs for path in pair.images)
@@ -255,7 +256,7 @@ def request_of(
         "SQLite": sqlite3.sqlite_version,
     }
     about = About(table, str(assembly.placement), limit, assembly.left_out, versions)
-    return Request(pairs, recipe, Keys.of(assembly), root, about=about, **more)
+    return Request(pairs, recipe, Keys.of(assembly), root, assembly.cameras, about=about, **more)
 
 
 @contextmanager

@@ -26,9 +26,9 @@ REFINEMENTS = 10
 MIN_SPREAD = 1e-12  # sum of squared distances from the mean; centres with a smaller sum coincide
 MAX_NUMBER = 1e12  # in a cell; keeps squares of derived numbers finite
 
-Points = NDArray[np.float64]  # (N, 3)
+WorldPoints = NDArray[np.float64]  # (N, 3)
 # Camera centre (3,) by image, in a scene or cluster; NaN without a camera.
-Centres = Mapping[str, Points]
+Centres = Mapping[str, WorldPoints]
 Parts = Mapping[str, Centres]  # the scenes or the clusters of a dataset, by name
 
 
@@ -98,7 +98,10 @@ def _require_poses(labels: Path, name: str, scenes: Parts) -> None:
 
 
 def score_dataset(
-    name: str, scenes: Parts, clusters: Parts, thresholds: Mapping[str, Sequence[float] | Points]
+    name: str,
+    scenes: Parts,
+    clusters: Parts,
+    thresholds: Mapping[str, Sequence[float] | WorldPoints],
 ) -> DatasetScore:
     """Return the score of a dataset.
 
@@ -126,7 +129,9 @@ def score_dataset(
     return DatasetScore(name, maa, clusterness)
 
 
-def accurate_images(truth: Centres, cluster: Centres, thresholds: Sequence[float] | Points) -> int:
+def accurate_images(
+    truth: Centres, cluster: Centres, thresholds: Sequence[float] | WorldPoints
+) -> int:
     """Return the number of accurate images beyond ``FREE``, summed over thresholds.
 
     For each threshold, the best similarity of three images is refitted to its inliers. Inliers are
@@ -155,7 +160,9 @@ def accurate_images(truth: Centres, cluster: Centres, thresholds: Sequence[float
     return total
 
 
-def residuals(source: Points, target: Points, fitted: NDArray[np.intp]) -> NDArray[np.float64]:
+def residuals(
+    source: WorldPoints, target: WorldPoints, fitted: NDArray[np.intp]
+) -> NDArray[np.float64]:
     """Fit a similarity to each row of indices ``fitted`` (B, k); return the distances (B, N).
 
     Distances are from ``target``, of all transformed sources; they are NaN if the fitted sources
@@ -188,9 +195,9 @@ def _triplets(count: int) -> NDArray[np.intp]:
     return np.argpartition(drawn, 3, axis=1)[:, :3]
 
 
-def _thresholds(path: Path) -> dict[str, dict[str, Points]]:
+def _thresholds(path: Path) -> dict[str, dict[str, WorldPoints]]:
     """Return the thresholds by dataset and scene."""
-    found: dict[str, dict[str, Points]] = {}
+    found: dict[str, dict[str, WorldPoints]] = {}
     for where, (dataset, scene, cell) in read_rows(path, ("dataset", "scene", "thresholds")):
         limits = _numbers(cell, where)
         if len(limits) <= SKIPPED_THRESHOLDS or not all(limit in POSITIVE for limit in limits):
@@ -203,9 +210,9 @@ def _thresholds(path: Path) -> dict[str, dict[str, Points]]:
     return found
 
 
-def _centres(path: Path) -> dict[str, dict[str, dict[str, Points]]]:
+def _centres(path: Path) -> dict[str, dict[str, dict[str, WorldPoints]]]:
     """Return the camera centres of a table of poses: by dataset, by scene or cluster, by image."""
-    found: dict[str, dict[str, dict[str, Points]]] = {}
+    found: dict[str, dict[str, dict[str, WorldPoints]]] = {}
     seen: set[tuple[str, str]] = set()
     for where, (dataset, scene, image, *cells) in read_rows(path, POSE_COLUMNS):
         if (dataset, image) in seen:
@@ -224,7 +231,7 @@ def _centres(path: Path) -> dict[str, dict[str, dict[str, Points]]]:
     return found
 
 
-def _numbers(cell: str, where: str) -> Points:
+def _numbers(cell: str, where: str) -> WorldPoints:
     """Return the numbers of a cell, which may be NaN.
 
     Raises :class:`UserError` for a malformed or huge number.

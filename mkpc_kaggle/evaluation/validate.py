@@ -243,11 +243,11 @@ def score_record(
     errors = {step: error_of(matrix, true, scene, rotation) for step, matrix in matrices.items()}
     made = {step: errors[step] for step in steps}
     return PairScore(
-        true.pair.id, files_of(true), true.covisibility, errors[Step.SCENE], record, made
+        true.pair.id, image_paths_of(true), true.covisibility, errors[Step.SCENE], record, made
     )
 
 
-def files_of(true: TruePair) -> tuple[str, str]:
+def image_paths_of(true: TruePair) -> tuple[str, str]:
     """Return the paths of a pair's images: lists may have one file name in several folders."""
     return true.pair.file0, true.pair.file1
 
@@ -274,27 +274,27 @@ def score_submission(submission: Path, truth: Path, scenes: Sequence[TrainScene]
     train side. Samples missing from the table or the scenes are left out; samples missing from the
     submission count as failed. Raises :class:`UserError` for unreadable files.
     """
-    found = read_submission(submission)
+    matrices = read_submission(submission)
     columns = ("sample_id", "scene", "image_1_id", "image_2_id")
     # By the pair's id in the train side, with its images in either order: the sample and its F.
-    known: dict[str, tuple[str, Matrix3 | None]] = {}
+    samples: dict[str, tuple[str, Matrix3 | None]] = {}
     for _, (sample, scene, first, second) in read_rows(truth, columns):
-        F = found.get(sample)
-        known[f"{scene};{first}-{second}"] = (sample, F)
+        F = matrices.get(sample)
+        samples[f"{scene};{first}-{second}"] = (sample, F)
         # x2^T F x1 = x1^T F^T x2.
-        known[f"{scene};{second}-{first}"] = (sample, None if F is None else F.T)
+        samples[f"{scene};{second}-{first}"] = (sample, None if F is None else F.T)
     scored = []
     missing = []
     for there in scenes:
         pairs = []
         for true in there.pairs:
-            if true.pair.id not in known:
+            if true.pair.id not in samples:
                 continue
-            sample, F = known[true.pair.id]
+            sample, F = samples[true.pair.id]
             if F is None:
                 missing.append(sample)
             error = error_of(F, true, there)
-            pairs.append(PairScore(true.pair.id, files_of(true), true.covisibility, error))
+            pairs.append(PairScore(true.pair.id, image_paths_of(true), true.covisibility, error))
         if pairs:
             scored.append(SceneScore(there.name, tuple(pairs)))
     if len(missing) == sum(len(scene.pairs) for scene in scored):

@@ -13,7 +13,7 @@ from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.critical_region import CriticalRegion, MkpcConfig, RegionReason, When
 from mkpc_kaggle.geometry.matches import Matches
 
-MIN_MATCHES = 8  # fewer say nothing about scale
+MIN_SCALE_MATCHES = 8  # fewer say nothing about scale
 SAMPLES = 2000  # pairs of matches
 # Interquartile range of the logarithm of the ratio of distances. Correct matches of two photographs
 # with a change of scale by two to four have 0.05 to 0.3, matches by chance more than 1.
@@ -81,7 +81,7 @@ def scale_between(matches: Matches, sizes: tuple[Size, Size]) -> float:
     result is the median ratio of the distances between two matched points; 1 if there are too few
     matches, or if the ratios disagree, as those of wrong matches do.
     """
-    if len(matches) < MIN_MATCHES:
+    if len(matches) < MIN_SCALE_MATCHES:
         return 1.0
     generator = np.random.default_rng(0)  # the same matches give the same result
     first, second = generator.integers(len(matches), size=(2, SAMPLES))

@@ -175,14 +175,14 @@ class _Candidate(NamedTuple):
     logs: Vectors | None = None  # log f / g of both cameras; None for MAGSAC's own F
 
 
-def _finite(found: Sequence[_Candidate]) -> list[_Candidate]:
+def _finite(candidates: Sequence[_Candidate]) -> list[_Candidate]:
     """Return the candidates of finite cost."""
-    return [each for each in found if np.isfinite(each.cost)]
+    return [candidate for candidate in candidates if np.isfinite(candidate.cost)]
 
 
-def _cheapest(found: Sequence[_Candidate]) -> _Candidate | None:
+def _cheapest(candidates: Sequence[_Candidate]) -> _Candidate | None:
     """Return the first candidate of lowest finite cost, if any."""
-    return min(_finite(found), key=lambda each: each.cost, default=None)
+    return min(_finite(candidates), key=lambda candidate: candidate.cost, default=None)
 
 
 class _Search:

@@ -14,7 +14,7 @@ from types import MappingProxyType
 from mkpc_kaggle.config import decimal
 
 # Parameters of the models that a perspective camera with a usual lens needs.
-MODELS: Mapping[str, tuple[str, ...]] = MappingProxyType(
+LENS_MODELS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
         "SIMPLE_PINHOLE": ("f", "cx", "cy"),
         "PINHOLE": ("fx", "fy", "cx", "cy"),
@@ -41,9 +41,11 @@ class KnownCamera:
     sigma: float = 0.0
 
     def __post_init__(self) -> None:
-        if self.model not in MODELS:
-            raise ValueError(f"unknown camera model {self.model!r}; known: {', '.join(MODELS)}")
-        names = MODELS[self.model]
+        if self.model not in LENS_MODELS:
+            raise ValueError(
+                f"unknown camera model {self.model!r}; known: {', '.join(LENS_MODELS)}"
+            )
+        names = LENS_MODELS[self.model]
         if len(self.parameters) != len(names):
             raise ValueError(f"{self.model} has {len(names)} parameters ({', '.join(names)})")
         if not all(map(isfinite, self.parameters)):
@@ -60,18 +62,18 @@ class KnownCamera:
     @property
     def focal(self) -> float:
         """The mean focal length in pixels."""
-        at = MODELS[self.model].index("cx")  # focal lengths come before it
+        at = LENS_MODELS[self.model].index("cx")  # focal lengths come before it
         return sum(self.parameters[:at]) / at
 
     @property
     def principal_point(self) -> tuple[float, float]:
         """The point (cx, cy); the centre of the top-left pixel is (0.5, 0.5)."""
-        at = MODELS[self.model].index("cx")
+        at = LENS_MODELS[self.model].index("cx")
         return self.parameters[at], self.parameters[at + 1]
 
     def scaled(self, x: float, y: float) -> "KnownCamera":
         """Return the camera of pictures that are ``x`` times as wide and ``y`` times as high."""
-        at = MODELS[self.model].index("cx")
+        at = LENS_MODELS[self.model].index("cx")
         # A single focal length gets the mean, since x and y then differ by rounding.
         factors = [(x + y) / 2] if at == 1 else [x, y]
         factors += [x, y]
@@ -95,30 +97,6 @@ def parse_row(pattern: str, model: str, parameters: str, sigma: str) -> tuple[st
     percent = 0.0 if sigma.strip() == FIXED else decimal(sigma.strip())
     values = tuple(decimal(part) for part in parameters.split(" ") if part)
     return pattern.strip(), KnownCamera(model.strip(), values, percent)
-
-
-def written(rows: Rows) -> str:
-    """Return rows as text, a line each, for the settings of a run."""
-    lines = []
-    for pattern, known in rows:
-        # ``repr`` of a float keeps all digits, so :func:`read` returns the same numbers.
-        parameters = " ".join(repr(float(value)) for value in known.parameters)
-        sigma = repr(float(known.sigma)) if known.sigma else FIXED
-        lines.append("\t".join([pattern, known.model, parameters, sigma]))
-    return "\n".join(lines)
-
-
-def read(text: str) -> Rows:
-    """Return the rows of :func:`written`. Raises ``ValueError`` for other text."""
-    rows = []
-    for line in text.splitlines():
-        cells = line.split("\t")
-        if len(cells) != 4:
-            raise ValueError(
-                f"expected name, model, parameters and sigma, separated by tabs, found {line!r}"
-            )
-        rows.append(parse_row(*cells))
-    return rows
 
 
 def camera_of(rows: Rows, name: str) -> KnownCamera | None:

@@ -16,7 +16,7 @@ from mkpc_kaggle.geometry.two_view import sampson
 TRANSFER_PX = 2.0  # maximum error of a match that the homography explains
 MIN_PLANE_SHARE = 0.9  # of the inliers, explained by one homography; more is flat
 MIN_INLIERS = 15  # a homography fits any four of them
-MAX_ITERATIONS = 1000
+PLANE_ITERATIONS = 1000
 CONFIDENCE = 0.999
 
 
@@ -39,7 +39,7 @@ def plane_share(F: Matrix3, matches: Matches) -> float:
             points1,
             cv2.USAC_MAGSAC,
             TRANSFER_PX,
-            maxIters=MAX_ITERATIONS,
+            maxIters=PLANE_ITERATIONS,
             confidence=CONFIDENCE,
         )
     except cv2.error:  # points that are all the same but for rounding

@@ -207,23 +207,23 @@ def consensus(
         threshold /= settings["focal"]
     settings["ransacReprojThreshold"] = threshold
 
-    found: list[_Found] = []
+    candidates: list[_PermutedModel] = []
     failure = f"no {model} fits {count} distinct matches"
     for number in range(config.permutations):
         try:
-            found += _model_of(solver, points0, points1, permutation(number, count), settings)
+            candidates += _model_of(solver, points0, points1, permutation(number, count), settings)
         except cv2.error as error:  # it may reject points in one order and accept them in another
             failure = f"OpenCV refused the points: {error.err}"
-    if not found:
+    if not candidates:
         return Estimate.failed(model, count, failure)
     # The number of inliers does not decide: MAGSAC scores distances up to several times the
     # threshold.
-    best = min(found, key=lambda each: each.cost)
+    best = min(candidates, key=lambda candidate: candidate.cost)
     if not best.inliers.any():
         failure = f"no {model} has inliers among {count} distinct matches"
         return Estimate.failed(model, count, failure)
-    known = best.cost if np.isfinite(best.cost) else 0.0
-    stats = EstimateStats(candidates=len(found), cost=known, magsac_cost=known)
+    cost = best.cost if np.isfinite(best.cost) else 0.0
+    stats = EstimateStats(candidates=len(candidates), cost=cost, magsac_cost=cost)
     return Estimate(model, unit_norm(best.matrix), best.inliers, stats=stats)
 
 
@@ -236,7 +236,7 @@ def _settings(config: RobustConfig) -> dict[str, Any]:
     }
 
 
-class _Found(NamedTuple):
+class _PermutedModel(NamedTuple):
     """OpenCV's model of one permutation, with the mask (N,) of its inliers."""
 
     matrix: Matrix3
@@ -250,7 +250,7 @@ def _model_of(
     points1: Vectors,
     order: NDArray[np.intp],
     settings: dict[str, Any],
-) -> list[_Found]:
+) -> list[_PermutedModel]:
     """Return OpenCV's model of the points in an order, if it finds one. May raise ``cv2.error``."""
     matrix, mask = solver.find(points0[order], points1[order], **settings)
     if not _is_model(matrix):
@@ -260,7 +260,7 @@ def _model_of(
     with np.errstate(over="ignore", invalid="ignore"):  # points may be any numbers
         distances = solver.distances(matrix, points0, points1)
         costs = robust_costs(distances, 2 * settings["ransacReprojThreshold"])
-        return [_Found(matrix, inliers, float(np.sum(costs)))]
+        return [_PermutedModel(matrix, inliers, float(np.sum(costs)))]
 
 
 def _is_model(matrix: Any) -> bool:

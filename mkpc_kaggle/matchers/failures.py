@@ -41,7 +41,7 @@ class DeviceError(UserError):
     """Error of a device that cannot compute."""
 
 
-def failure_of(error: BaseException) -> FailureKind:
+def failure_kind(error: BaseException) -> FailureKind:
     """Return the kind of an error that a matcher raised."""
     reason = reason_of(error)
     # First: "CUDA error: out of memory" is no failed device.

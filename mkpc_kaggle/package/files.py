@@ -8,8 +8,8 @@ from pathlib import Path
 
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.setup.availability import fit_of
-from mkpc_kaggle.weights import FoundFile, State, WeightFile, WeightStore
-from mkpc_kaggle.weights.checkpoint import convert
+from mkpc_kaggle.weights import FileState, FoundFile, WeightFile, WeightStore
+from mkpc_kaggle.weights.checkpoint import convert_file
 
 HEADER = (
     "# The weights of this dataset; the columns are name, bytes, digest, licence, slot, source.\n"
@@ -17,7 +17,7 @@ HEADER = (
 
 
 @dataclass(frozen=True)
-class Item:
+class PackageFile:
     """A file to write: name in the folder, source, and licence if it has its own."""
 
     name: str
@@ -26,7 +26,7 @@ class Item:
     note: str = ""
 
 
-def refuse_other_files(directory: Path, items: Sequence[Item]) -> None:
+def refuse_other_files(directory: Path, items: Sequence[PackageFile]) -> None:
     """Raise :class:`UserError` if the folder has files that are not in ``items``.
 
     They would be uploaded too.
@@ -40,7 +40,7 @@ def refuse_other_files(directory: Path, items: Sequence[Item]) -> None:
         )
 
 
-def write_files(directory: Path, items: Sequence[Item]) -> tuple[Item, ...]:
+def write_items(directory: Path, items: Sequence[PackageFile]) -> tuple[PackageFile, ...]:
     """Write the items into the folder; return them with their new paths.
 
     Identical files are kept, so a repeated call resumes. Raises :class:`UserError` if a file cannot
@@ -67,10 +67,10 @@ def write_files(directory: Path, items: Sequence[Item]) -> tuple[Item, ...]:
 class ChosenWeights:
     """The files to include, their licences' texts, and the files that must not be redistributed."""
 
-    items: tuple[Item, ...]
+    items: tuple[PackageFile, ...]
     manifest: str  # a line per item
-    licence_texts: tuple[Item, ...]
-    restricted: tuple[Item, ...]  # excluded unless the package is private
+    licence_texts: tuple[PackageFile, ...]
+    restricted: tuple[PackageFile, ...]  # excluded unless the package is private
 
 
 def choose_weights(
@@ -83,7 +83,7 @@ def choose_weights(
     damaged files, or a checkpoint cannot be read or fits no network.
     """
     shipped: list[FoundFile] = []
-    restricted: list[Item] = []
+    restricted: list[PackageFile] = []
     texts: set[Path] = set()
     for slot in dict.fromkeys(file.slot for file in store.files):
         found = _good_file(store, slot)
@@ -91,7 +91,7 @@ def choose_weights(
             continue
         text = licence_text(checkout, found.file.licence)
         if text is None:
-            restricted.append(Item(found.file.name, found.path, found.file.licence))
+            restricted.append(PackageFile(found.file.name, found.path, found.file.licence))
         elif text.name != "LICENSE":  # the package's own, which the dataset always has
             texts.add(text)
         if text is not None or private:
@@ -99,13 +99,13 @@ def choose_weights(
 
     # All are tried in their networks before the first is converted.
     notes = [_note(found, store) for found in shipped]
-    items: list[Item] = []
+    items: list[PackageFile] = []
     lines: list[str] = []
     for found, note in zip(shipped, notes, strict=True):
         file, path = _as_safetensors(found, staging)
-        items.append(Item(file.name, path, file.licence, note))
+        items.append(PackageFile(file.name, path, file.licence, note))
         lines.append(f"{file.line}\n")
-    licence_texts = tuple(Item(path.name, path) for path in sorted(texts))
+    licence_texts = tuple(PackageFile(path.name, path) for path in sorted(texts))
     return ChosenWeights(tuple(items), HEADER + "".join(lines), licence_texts, tuple(restricted))
 
 
@@ -124,7 +124,7 @@ def _note(found: FoundFile, store: WeightStore) -> str:
         raise UserError(
             f"{found.path}: {fit.text}. Remove it from the directory, or fetch the right file."
         )
-    verified = "" if found.state is State.GOOD else "its original is not verified"
+    verified = "" if found.state is FileState.GOOD else "its original is not verified"
     return "; ".join(filter(None, [verified, fit.text]))
 
 
@@ -152,4 +152,4 @@ def _as_safetensors(found: FoundFile, staging: Path) -> tuple[WeightFile, Path]:
     # The full name, with its suffix: the manifest may list another conversion under the shorter
     # name.
     path = staging / f"{found.file.name}.safetensors"
-    return convert(found.path, path, found.file), path
+    return convert_file(found.path, path, found.file), path

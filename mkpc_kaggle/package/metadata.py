@@ -21,7 +21,7 @@ LATEST = "latest"
 ORIGINAL = "original"
 # ALIKED-n16 and its LightGlue on Kaggle Models: the store finds the files below /kaggle/input by
 # their digests.
-MODELS = ("oldufo/aliked/pyTorch/aliked-n16/1", "oldufo/lightglue/pyTorch/aliked/1")
+KAGGLE_MODELS = ("oldufo/aliked/pyTorch/aliked-n16/1", "oldufo/lightglue/pyTorch/aliked/1")
 
 
 def check_owner(owner: str) -> None:

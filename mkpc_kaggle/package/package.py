@@ -7,15 +7,15 @@ from pathlib import Path
 from mkpc_kaggle.errors import UserError, temporary_directory
 from mkpc_kaggle.package.files import (
     ChosenWeights,
-    Item,
+    PackageFile,
     choose_weights,
     refuse_other_files,
-    write_files,
+    write_items,
 )
 from mkpc_kaggle.package.metadata import (
     DATASET_METADATA,
+    KAGGLE_MODELS,
     LATEST,
-    MODELS,
     check_owner,
     dataset_metadata,
     dataset_page,
@@ -37,7 +37,7 @@ NOTEBOOK = Path("notebooks", "submission.ipynb")
 
 
 @dataclass(frozen=True)
-class Request:
+class PackageRequest:
     """The options of the command ``package``."""
 
     out: Path
@@ -54,12 +54,12 @@ class Request:
 class Package:
     """The files of both folders, and the weights whose licences forbid redistribution."""
 
-    dataset: tuple[Item, ...]
-    kernel: tuple[Item, ...]
-    restricted: tuple[Item, ...]
+    dataset: tuple[PackageFile, ...]
+    kernel: tuple[PackageFile, ...]
+    restricted: tuple[PackageFile, ...]
 
 
-def make_package(request: Request) -> Package:
+def make_package(request: PackageRequest) -> Package:
     """Write the folders of dataset and kernel, and return their files.
 
     The same request gives the same bytes. Raises :class:`UserError` before anything is written: if
@@ -79,13 +79,13 @@ def make_package(request: Request) -> Package:
         refuse_other_files(dataset, dataset_items)
         refuse_other_files(kernel, kernel_items)
         return Package(
-            write_files(dataset, dataset_items),
-            write_files(kernel, kernel_items),
+            write_items(dataset, dataset_items),
+            write_items(kernel, kernel_items),
             chosen.restricted,
         )
 
 
-def _check(request: Request) -> None:
+def _check(request: PackageRequest) -> None:
     """Raise :class:`UserError` for options that cannot be right, before any work."""
     check_owner(request.owner)
     for python in request.pythons:
@@ -99,23 +99,23 @@ def _check(request: Request) -> None:
 
 
 def _kernel_items(
-    request: Request, checkout: Path, staging: Path, *, has_weights: bool
-) -> tuple[Item, ...]:
+    request: PackageRequest, checkout: Path, staging: Path, *, has_weights: bool
+) -> tuple[PackageFile, ...]:
     """Return the files of the kernel's folder."""
     metadata = kernel_metadata(
         request.owner,
         NOTEBOOK.name,
         request.image,
         has_gpu=has_weights or request.models,
-        models=MODELS if request.models else (),
+        models=KAGGLE_MODELS if request.models else (),
     )
-    notebook = Item(NOTEBOOK.name, checkout / NOTEBOOK)
+    notebook = PackageFile(NOTEBOOK.name, checkout / NOTEBOOK)
     return (_text(staging, "kernel-metadata.json", metadata), notebook)
 
 
 def _dataset_items(
-    request: Request, checkout: Path, staging: Path, chosen: ChosenWeights, dataset: Path
-) -> tuple[Item, ...]:
+    request: PackageRequest, checkout: Path, staging: Path, chosen: ChosenWeights, dataset: Path
+) -> tuple[PackageFile, ...]:
     """Return the files of the dataset's folder, for which wheels are built and collected."""
     licences = [item.licence for item in chosen.items]
     own = build_wheel(checkout, staging / "own")
@@ -125,10 +125,10 @@ def _dataset_items(
     requirements = "\n".join(install_lines(own, others)) + "\n"
     return (
         _text(staging, DATASET_METADATA, dataset_metadata(request.owner, licences)),
-        *(Item(path.name, path, licence_of(path)) for path in (own, *others)),
+        *(PackageFile(path.name, path, licence_of(path)) for path in (own, *others)),
         _text(staging, "requirements.txt", requirements),
         _text(staging, "README.md", dataset_page(licences)),
-        Item("LICENSE", checkout / "LICENSE"),
+        PackageFile("LICENSE", checkout / "LICENSE"),
         # The manifest of the converted files, which the store reads after the package's own.
         _text(staging, MANIFEST, chosen.manifest),
         *chosen.licence_texts,
@@ -136,10 +136,10 @@ def _dataset_items(
     )
 
 
-def _text(staging: Path, name: str, content: str) -> Item:
+def _text(staging: Path, name: str, content: str) -> PackageFile:
     """Write a text to the staging folder, with the same bytes on every system."""
     (staging / name).write_text(content, encoding="utf-8", newline="\n")
-    return Item(name, staging / name)
+    return PackageFile(name, staging / name)
 
 
 def find_checkout() -> Path:

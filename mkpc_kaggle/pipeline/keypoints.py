@@ -14,7 +14,7 @@ UNKNOWN = -1  # the index of a match by a matcher without keypoints
 
 
 @dataclass(frozen=True, eq=False)
-class Keypoints:
+class PairKeypoints:
     """Keypoints of both images, in image pixels.
 
     ``points0`` is (K0, 2) and ``points1`` (K1, 2). Row n of ``indices`` (N, 2) has the rows of both
@@ -37,7 +37,7 @@ class Keypoints:
         matches: Matches,
         *,
         with_descriptors: bool,
-    ) -> "Keypoints | None":
+    ) -> "PairKeypoints | None":
         """Return the keypoints of two encodings; ``None`` if a matcher has none, or no indices."""
         if matches.indices is None or not all(hasattr(each, "points") for each in encodings):
             return None
@@ -50,7 +50,9 @@ class Keypoints:
         return cls(points[0], points[1], matches.indices, descriptors[0], descriptors[1])
 
     @classmethod
-    def concatenate(cls, parts: Sequence["Keypoints | None"], counts: Sequence[int]) -> "Keypoints":
+    def concatenate(
+        cls, parts: Sequence["PairKeypoints | None"], counts: Sequence[int]
+    ) -> "PairKeypoints":
         """Return the keypoints of all units one after another; ``counts`` of their matches."""
         points0 = [np.zeros((0, 2), np.float32)]
         points1 = [np.zeros((0, 2), np.float32)]

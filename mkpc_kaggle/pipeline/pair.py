@@ -23,7 +23,7 @@ from mkpc_kaggle.geometry.robust import (
     pose_in_front,
     rotation_in_front,
 )
-from mkpc_kaggle.pipeline.keypoints import Keypoints
+from mkpc_kaggle.pipeline.keypoints import PairKeypoints
 from mkpc_kaggle.recipe import Recipe, Unit
 from mkpc_kaggle.setup.arguments import ImageSource, intrinsics_of, to_image
 
@@ -48,7 +48,7 @@ class UnitResult:
     note: str = ""  # why the unit did not run as written
     is_float32: bool = False  # it ran in float32, whatever precision the run was given
     keypoints: int = 0  # detected in the first view; 0 for a matcher without a detector
-    found: Keypoints | None = None  # for programs, of a matcher with a detector
+    detected: PairKeypoints | None = None  # for programs, of a matcher with a detector
     need: CropNeed | None = None  # of stage 2; one that is not needed has no matches
 
     @property
@@ -133,10 +133,10 @@ class PairMatch:
         return self.matches[self.estimate.inliers]
 
     @property
-    def keypoints(self) -> Keypoints:
+    def keypoints(self) -> PairKeypoints:
         """The keypoints of all units, in image pixels, with the indices of ``matches``."""
         counts = [len(result.matches) for result in self.results]
-        return Keypoints.concatenate([result.found for result in self.results], counts)
+        return PairKeypoints.concatenate([result.detected for result in self.results], counts)
 
     def pose(self, K0: Matrix3, K1: Matrix3) -> RelativePose:
         """Return the pose of camera 1 relative to camera 0 from F or E: R, t, inliers in front.

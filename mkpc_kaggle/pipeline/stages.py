@@ -9,6 +9,7 @@ import warnings
 from collections.abc import Callable, Container, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from enum import Enum, auto
 from functools import partial
 from types import MappingProxyType
 from typing import Any, Self
@@ -30,8 +31,8 @@ from mkpc_kaggle.matchers.contract import (
     encoding_bytes,
 )
 from mkpc_kaggle.matchers.dtypes import check_finite, exact_float32
-from mkpc_kaggle.matchers.failures import FailureKind, failure_of, reason_of, require_unforked
-from mkpc_kaggle.pipeline.keypoints import Keypoints
+from mkpc_kaggle.matchers.failures import FailureKind, failure_kind, reason_of, require_unforked
+from mkpc_kaggle.pipeline.keypoints import PairKeypoints
 from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
 from mkpc_kaggle.recipe import Recipe, Unit
 from mkpc_kaggle.setup.assembly import Assembly
@@ -43,6 +44,13 @@ CACHE_SHARE = 0.25  # of a GPU's free memory, for the cached encodings of all wo
 
 class UnloadableError(UserError):
     """Error for a matcher that could not be loaded; ``__cause__`` is the error of its load."""
+
+
+class Retry(Enum):
+    """How to run a minibatch again that has no results yet."""
+
+    IN_FLOAT32 = auto()  # the matcher has switched
+    ON_FEWER_PAIRS = auto()  # memory was not enough for all of them
 
 
 class Pipeline:
@@ -195,26 +203,24 @@ class Pipeline:
                 return
             numbers = waiting[:size]
             results = self._run_minibatch(unit, [pairs[number] for number in numbers])
-            # No results: the same pairs are tried again, in float32 or fewer at a time.
-            for number, result in zip(numbers[: len(results)], results, strict=True):
+            if isinstance(results, Retry):
+                continue
+            for number, result in zip(numbers, results, strict=True):
                 pairs[number] = replace(pairs[number], results=(*pairs[number].results, result))
-            waiting = waiting[len(results) :]
+            waiting = waiting[size:]
 
-    def _run_minibatch(self, unit: Unit, pairs: list[PairMatch]) -> list[UnitResult]:
-        """Return the unit's result on each pair.
-
-        An empty list means: try again, in float32 or on fewer pairs.
-        """
+    def _run_minibatch(self, unit: Unit, pairs: list[PairMatch]) -> list[UnitResult] | Retry:
+        """Return the unit's result on each pair, or how to run the same pairs again."""
         try:
             return self._match(unit, pairs)
         except Exception as error:
-            failure = failure_of(error)
+            failure = failure_kind(error)
             if failure is FailureKind.RAISED:
                 self._require_device(unit)
             # A NaN may also come from the pictures; then float32 raises again, and the pair fails.
             is_overflow = isinstance(error, NonFiniteError)
             if is_overflow and self._fall_back_to_float32(unit.matcher, error):
-                return []
+                return Retry.IN_FLOAT32
             if failure is FailureKind.RAISED and unit.matcher in self.raising:
                 error.add_note(f"in {unit.name}")
                 raise
@@ -222,12 +228,7 @@ class Pipeline:
                 reason = str(error) if isinstance(error, UnloadableError) else reason_of(error)
                 return [UnitResult(unit, Matches.empty(), failure=reason)]
             if failure is FailureKind.RAISED:
-                # One by one, and again if the matcher falls back to float32.
-                results = []
-                for pair in pairs:
-                    alone = self._run_minibatch(unit, [pair])
-                    results += alone or self._run_minibatch(unit, [pair])
-                return results
+                return [self._run_alone(unit, pair) for pair in pairs]
             if failure is FailureKind.DEVICE or len(pairs) == 1:
                 error.add_note(f"in {unit.name}")
                 raise
@@ -237,7 +238,16 @@ class Pipeline:
 
         torch.cuda.empty_cache()  # cuBLAS and cuDNN cannot use PyTorch's cached memory
         self._minibatches[unit] = len(pairs) // 2
-        return []
+        return Retry.ON_FEWER_PAIRS
+
+    def _run_alone(self, unit: Unit, pair: PairMatch) -> UnitResult:
+        """Return the unit's result on a pair."""
+        results = self._run_minibatch(unit, [pair])
+        # A matcher falls back to float32 once.
+        while isinstance(results, Retry):
+            results = self._run_minibatch(unit, [pair])
+        (result,) = results
+        return result
 
     def _require_device(self, unit: Unit) -> None:
         """Raise the device's error if it has failed.
@@ -293,7 +303,7 @@ class Pipeline:
             best = in_image.best(unit.max_matches)
             kept = None
             if self.keeps_keypoints:
-                kept = Keypoints.of(
+                kept = PairKeypoints.of(
                     (encoding, other), both, best, with_descriptors=self.keeps_descriptors
                 )
             result = UnitResult(
@@ -305,7 +315,7 @@ class Pipeline:
                 note=self._notes.get(unit.matcher, ""),
                 is_float32=self._precision is Precision.FLOAT32 or unit.matcher in self._notes,
                 keypoints=len(getattr(encoding, "points", ())),
-                found=kept,
+                detected=kept,
                 need=need_of(unit, pair, self.recipe) if unit.stage == 2 else None,
             )
             results.append(result)
@@ -326,10 +336,10 @@ class Pipeline:
         # replaced during a run keeps its name.
         keys = [(unit.matcher, image.version or image.name, view) for image, view in wanted]
         # Held here, as the cache may drop an encoding before it is matched.
-        known = {key: self._encodings.get(key) for key in keys}
+        by_key = {key: self._encodings.get(key) for key in keys}
         missing: dict[tuple[str, str, View], Image] = {}  # a view of several pairs once
         for key, (image, _) in zip(keys, wanted, strict=True):
-            if known[key] is None:
+            if by_key[key] is None:
                 missing[key] = image
         size = self._minibatches.get(unit, self.minibatch)
         # A minibatch is one tensor, so its views have one shape.
@@ -350,11 +360,11 @@ class Pipeline:
                         f"{plural(len(pictures), 'picture')}"
                     )
                 check_finite(f"features of {unit.matcher}", list(encodings))
-                known |= zip(part, encodings, strict=True)
+                by_key |= zip(part, encodings, strict=True)
         for key, image in missing.items():
             if key[2].crop == Box.whole(image.size):  # a crop serves one pair only
-                self._encodings.put(key, known[key], encoding_bytes(known[key]))
-        return [known[key] for key in keys]
+                self._encodings.put(key, by_key[key], encoding_bytes(by_key[key]))
+        return [by_key[key] for key in keys]
 
     def _matcher(self, name: str) -> Matcher[Any]:
         """Return the matcher, loaded on first use.
@@ -366,7 +376,7 @@ class Pipeline:
             try:
                 self._matchers[name] = self._load(name)
             except Exception as error:
-                if failure_of(error) is not FailureKind.RAISED:
+                if failure_kind(error) is not FailureKind.RAISED:
                     raise
                 # Not tried again: reading gigabytes for each minibatch would fail each time.
                 self._unloadable[name] = error
@@ -376,16 +386,20 @@ class Pipeline:
         return self._matchers[name]
 
 
-def require_answers(found: Any, count: int, what: str) -> None:
-    """Raise ``TypeError`` unless ``found`` is a sequence of ``count`` :class:`Matches`."""
-    is_sequence = isinstance(found, Sequence)
-    if is_sequence and len(found) == count and all(isinstance(each, Matches) for each in found):
+def require_answers(answers: Any, count: int, what: str) -> None:
+    """Raise ``TypeError`` unless ``answers`` is a sequence of ``count`` :class:`Matches`."""
+    is_sequence = isinstance(answers, Sequence)
+    if (
+        is_sequence
+        and len(answers) == count
+        and all(isinstance(answer, Matches) for answer in answers)
+    ):
         return
-    each = found[0] if is_sequence and found else found
-    returned = f"{len(found)} items, such as" if is_sequence and found else "a"
+    answer = answers[0] if is_sequence and answers else answers
+    returned = f"{len(answers)} items, such as" if is_sequence and answers else "a"
     raise TypeError(
         f"{what} must return a list of Matches, one for each of {plural(count, 'pair')}, "
-        f"not {returned} {type(each).__name__}"
+        f"not {returned} {type(answer).__name__}"
     )
 
 

@@ -35,7 +35,7 @@ from mkpc_kaggle.setup.availability import Licence
 __all__ = ["TwoStageMatcher", "to_image"]
 
 Intrinsics = tuple[Matrix3, Matrix3]
-Regions = tuple[Box, Box]
+Boxes = tuple[Box, Box]
 
 
 class TwoStageMatcher:
@@ -135,7 +135,7 @@ class TwoStageMatcher:
         *,
         model: ModelKind | str = ModelKind.F,
         intrinsics: Intrinsics | None = None,
-        regions: Regions | None = None,
+        regions: Boxes | None = None,
         descriptors: bool = False,
     ) -> PairMatch:
         """Match two images, and estimate their two-view model.
@@ -188,7 +188,7 @@ class TwoStageMatcher:
         *,
         model: ModelKind | str = ModelKind.F,
         intrinsics: Iterable[Intrinsics | None] | None = None,
-        regions: Iterable[Regions | None] | None = None,
+        regions: Iterable[Boxes | None] | None = None,
         descriptors: bool = False,
     ) -> Iterator[PairMatch]:
         """Yield the match of each pair, as a call does for one pair.
@@ -250,7 +250,7 @@ class TwoStageMatcher:
         images: tuple[Image, Image],
         kind: ModelKind,
         intrinsics: Intrinsics | None,
-        regions: Regions | None,
+        regions: Boxes | None,
         *,
         progress: bool = False,
     ) -> PairMatch:

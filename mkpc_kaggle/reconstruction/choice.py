@@ -27,7 +27,7 @@ from mkpc_kaggle.scene.likeness import (
     ONE_PLACE,
     PARTNERS,
     SAMPLED_PAIRS,
-    Partners,
+    PartnerIndices,
     largest_features,
     local_features,
     most_alike,
@@ -127,18 +127,18 @@ def pair_of(names: Names, a: Path, b: Path, *turns: int) -> Pair:
     )
 
 
-def find_partners(engine: Engine, root: Path, files: Sequence[Path], count: int) -> Partners:
+def find_partners(engine: Engine, root: Path, files: Sequence[Path], count: int) -> PartnerIndices:
     """Return the indices of the ``count`` images most similar to each image; empty if the
     comparison failed.
     """
-    compared = partial(compare, count=count)
+    compared = partial(most_alike_stored, count=count)
     known = compare_images(
         engine, root, files, FEATURE_SETTINGS, local_features, compared, [FEATURE_SETTINGS, count]
     )
     # The time is over, or the comparison failed twice. Then no image has partners.
     if known is None:
         warn(f"the images of {files[0].parent} were not compared")
-    partners: Partners = [[] for _ in files] if known is None else known
+    partners: PartnerIndices = [[] for _ in files] if known is None else known
     return partners
 
 
@@ -174,21 +174,21 @@ def compare_images(
     """
     # By contents, so that a folder that moved is not compared again
     names = [name_below(str(root), str(file)) for file in files]
-    found = engine.digest_files(dict(zip(names, files, strict=True)))
-    digests = [found.get(name, "") for name in names]
-    keys = [features_key(each, settings) for each in digests]
+    digests_by_name = engine.digest_files(dict(zip(names, files, strict=True)))
+    digests = [digests_by_name.get(name, "") for name in names]
+    keys = [features_key(content, settings) for content in digests]
     key = digest([digests, *result_settings])
-    known = engine.known(key)
-    if known is None:
+    partners = engine.known(key)
+    if partners is None:
         # Features first: they stay if the comparison is interrupted.
         missing = {}
         for name, file in zip(names, files, strict=True):
-            if name in found:
-                missing[features_key(found[name], settings)] = partial(features_of, file)
+            if name in digests_by_name:
+                missing[features_key(digests_by_name[name], settings)] = partial(features_of, file)
         engine.look(missing)
         source = engine.store.source(keys)
-        known = engine.look({key: partial(compare_features, source, keys)}).get(key)
-    return known
+        partners = engine.look({key: partial(compare_features, source, keys)}).get(key)
+    return partners
 
 
 def features_key(content: str, settings: str = FEATURE_SETTINGS) -> str:
@@ -203,7 +203,7 @@ def overlaps(source: Source, keys: Sequence[str]) -> list[tuple[int, int]]:
     return overlapping([found.get(key, b"") for key in keys])
 
 
-def compare(source: Source, keys: Sequence[str], count: int) -> Partners:
+def most_alike_stored(source: Source, keys: Sequence[str], count: int) -> PartnerIndices:
     """Return :func:`most_alike` for the images with these features in a store."""
 
     def features() -> Iterable[bytes]:

@@ -14,10 +14,10 @@ from mkpc_kaggle.reconstruction.run import FolderResult
 from mkpc_kaggle.scene.align import (
     MIN_COMMON,
     REFERENCE,
-    Cameras,
+    ModelCameras,
+    model_size,
     moved_by,
     read_reference,
-    size_of,
     write_reference,
 )
 
@@ -60,7 +60,9 @@ def keep_coordinates(out: Path, root: Path, result: FolderResult) -> Iterator[st
                 write_reference(stream, [models[number] for number in sorted(models)])
 
 
-def moved_lines(batch: str, earlier: Iterable[Cameras], models: Sequence[Cameras]) -> Iterator[str]:
+def moved_lines(
+    batch: str, earlier: Iterable[ModelCameras], models: Sequence[ModelCameras]
+) -> Iterator[str]:
     """Yield a line for each earlier model whose cameras are in a model now, and have moved."""
     for former in earlier:
         # A model may have split, or joined another one.
@@ -69,7 +71,7 @@ def moved_lines(batch: str, earlier: Iterable[Cameras], models: Sequence[Cameras
         if len(names) < MIN_COMMON:
             continue
         targets = [former[name] for name in names]
-        moved = moved_by([now[name] for name in names], targets) / size_of(targets)
+        moved = moved_by([now[name] for name in names], targets) / model_size(targets)
         if moved.max() > STILL:
             middle = 100 * np.median(moved)
             most = 100 * moved.max()

@@ -53,8 +53,8 @@ def output_directory(
     results = [name for name in TABLES if form or name != "submission.csv"]
     names = list(datasets)
     # Each dataset has its files in a folder of OUT with its name.
-    inner = {str(PurePosixPath(name, each)) for name in names for each in FILES}
-    results += sorted(each for each in inner if not holds_dataset(each, names))
+    inner = {str(PurePosixPath(name, file)) for name in names for file in FILES}
+    results += sorted(file for file in inner if not holds_dataset(file, names))
     with writing(f"--out {out}"):
         marked = _read_mark(out)
         for name in results:
@@ -64,9 +64,9 @@ def output_directory(
         if strange := next(_in_the_way(out, results, marked), None):
             message = f"--out {out}: {strange} is in the way, it was not made by this command"
             raise UserError(f"{message}; move it, or name an empty directory")
-        known = dict.fromkeys(results, "") | (marked or {})
+        digests = dict.fromkeys(results, "") | (marked or {})
         # Before the first result: after a kill, its files are known as ours.
-        _write_mark(out, known)
+        _write_mark(out, digests)
         # A folder that cannot be written is found now, and not after hours.
         for folder in {(out / name).parent for name in results}:
             folder.mkdir(parents=True, exist_ok=True)
@@ -78,15 +78,15 @@ def output_directory(
         return
     with writing(f"--out {out}"):
         # Results of datasets that are gone, unless the user has changed them
-        for name in known.keys() - results:
-            if known[name] and known[name] == _digest(out / name):
+        for name in digests.keys() - results:
+            if digests[name] and digests[name] == _digest(out / name):
                 _remove(out / name, out)
         after = {}
         for name in results:
             digest = _digest(out / name)
             # A result that this run left as it was may be the user's version of it.
             if digest:
-                after[name] = known[name] if digest == before[name] else digest
+                after[name] = digests[name] if digest == before[name] else digest
         _write_mark(out, after)
 
 

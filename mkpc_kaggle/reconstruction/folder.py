@@ -34,7 +34,7 @@ def read_folder(root: Path, *, join: bool = False) -> Datasets:
         raise UserError(
             f"{root}: no such directory; name a folder of images, or of folders of images"
         )
-    found = _Found()
+    found = _Unread()
     datasets: dict[str, list[Path]] = {}
     for folder, files in _folders(root, found):
         name = folder.relative_to(root).as_posix()
@@ -56,7 +56,7 @@ def read_folder(root: Path, *, join: bool = False) -> Datasets:
 
 
 @dataclass
-class _Found:
+class _Unread:
     """Files and folders that are not read, for one line about each kind."""
 
     hidden: list[Path] = field(default_factory=list)
@@ -87,7 +87,7 @@ def _first(paths: Sequence[Path]) -> str:
     return f"{len(paths)}, the first is {paths[0]}"
 
 
-def _folders(root: Path, found: _Found) -> Iterator[tuple[Path, list[Path]]]:
+def _folders(root: Path, unread: _Unread) -> Iterator[tuple[Path, list[Path]]]:
     """Yield each folder with images from ``root`` on, and its images, sorted."""
     seen = {root.resolve()}
     # A folder that cannot be read is an error: a part of the images would be missing silently.
@@ -95,22 +95,22 @@ def _folders(root: Path, found: _Found) -> Iterator[tuple[Path, list[Path]]]:
         folder = Path(place)
         # Sorted, since the order of a file system is arbitrary and decides bytes of results
         images = sorted(filter(_is_image, names))
-        found.hidden += [folder / name for name in (*folders, *images) if name.startswith(".")]
-        found.thumbnails += [folder / name for name in sorted(folders) if _has_thumbnails(name)]
+        unread.hidden += [folder / name for name in (*folders, *images) if name.startswith(".")]
+        unread.thumbnails += [folder / name for name in sorted(folders) if _has_thumbnails(name)]
         inner = [
             folder / name
             for name in sorted(folders)
             if not name.startswith(".") and not _has_thumbnails(name)
         ]
         # Links may form a cycle
-        folders[:] = [each.name for each in inner if each.resolve() not in seen]
-        seen.update(each.resolve() for each in inner)
+        folders[:] = [subfolder.name for subfolder in inner if subfolder.resolve() not in seen]
+        seen.update(subfolder.resolve() for subfolder in inner)
         files, twins = _without_twins(name for name in images if not name.startswith("."))
-        found.twins += [folder / name for name in twins]
+        unread.twins += [folder / name for name in twins]
         # A raw file next to its JPEG is no loss.
         stems = {_stem(name) for name in files}
         others = [name for name in sorted(names) if _suffix(name) in OTHER_SUFFIXES]
-        found.unread += [
+        unread.unread += [
             folder / name
             for name in others
             if _stem(name) not in stems and not name.startswith(".")
@@ -209,8 +209,8 @@ def read_pair_list(path: Path, root: Path, datasets: Datasets) -> list[Ends]:
     Raises :class:`UserError` for a line that does not name two images of one dataset.
     """
     # The dataset of each image
-    known = {file: name for name, files in datasets.items() for file in files}
-    found = []
+    dataset_of = {file: name for name, files in datasets.items() for file in files}
+    listed = []
     for number, line in enumerate(read_text(path).splitlines(), start=1):
         text = line.strip()
         if not text:
@@ -220,13 +220,17 @@ def read_pair_list(path: Path, root: Path, datasets: Datasets) -> list[Ends]:
             for gap in re.finditer(r"\s+", text)
         )
         # Names may have blanks, so each blank may be the border.
-        ends = [sorted(two) for two in ways if known.keys() >= set(two)]
-        if len(ends) != 1 or ends[0][0] == ends[0][1] or known[ends[0][0]] != known[ends[0][1]]:
+        ends = [sorted(two) for two in ways if dataset_of.keys() >= set(two)]
+        if (
+            len(ends) != 1
+            or ends[0][0] == ends[0][1]
+            or dataset_of[ends[0][0]] != dataset_of[ends[0][1]]
+        ):
             raise UserError(
                 f"{path}, line {number}: expected two images of one dataset of {root}, found {line!r}"
             )
-        found.append((ends[0][0], ends[0][1]))
-    if not found:
+        listed.append((ends[0][0], ends[0][1]))
+    if not listed:
         raise UserError(f"{path} has no pairs")
     # hloc's lists may name a pair in both orders.
-    return list(dict.fromkeys(found))
+    return list(dict.fromkeys(listed))

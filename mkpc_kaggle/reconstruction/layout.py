@@ -23,6 +23,7 @@ from unicodedata import combining
 
 from mkpc_kaggle.reconstruction.colours import colour_points
 from mkpc_kaggle.reconstruction.directory import holds_dataset
+from mkpc_kaggle.reconstruction.folder import Datasets
 from mkpc_kaggle.scene.export import (
     FORMER,
     IMAGES,
@@ -32,8 +33,6 @@ from mkpc_kaggle.scene.export import (
     HeldDirectory,
     replace_models,
 )
-
-Datasets = Mapping[str, Sequence[Path]]
 
 
 def write_layouts(

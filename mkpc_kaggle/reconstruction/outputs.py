@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mkpc_kaggle.data.outputs import replacing
-from mkpc_kaggle.scene.reconstruction import RegisteredImage
+from mkpc_kaggle.scene.models import RegisteredImage
 
 # By dataset and file: the number of the model and the camera in that model; None without a camera.
 Cameras = Mapping[str, Mapping[Path, tuple[int, RegisteredImage] | None]]
 
 NO_POSE = ";".join(["nan"] * 9), "nan;nan;nan"
 ORIGIN = "1;0;0;0;1;0;0;0;1", "0;0;0"
-FORMS = (  # of a submission
+SUBMISSION_FORMATS = (
     "imc2025",  # a cluster for each model; an image without a camera is an outlier, its pose nan
     "imc2023",  # also for 2024: the cameras of the largest model; other images are at the origin
 )
@@ -48,13 +48,13 @@ def camera_rows(cameras: Cameras, root: Path) -> Iterator[Sequence[str]]:
         for file, placed in files.items():
             if placed is None:
                 continue
-            model, found = placed
-            camera = found.camera
-            sigmas = [f"{value:g}" for value in found.sigmas] or [""] * 3
+            model, image = placed
+            camera = image.camera
+            sigmas = [f"{value:g}" for value in image.sigmas] or [""] * 3
             # As in a table of --intrinsics, which takes them
-            lens = found.lens
+            lens = image.lens
             parameters = (
-                "" if lens is None else " ".join(f"{each:.12g}" for each in lens.parameters)
+                "" if lens is None else " ".join(f"{value:.12g}" for value in lens.parameters)
             )
             yield (
                 file.relative_to(root).as_posix(),

@@ -6,11 +6,11 @@ from fractions import Fraction
 from pathlib import Path
 
 from mkpc_kaggle.data.competition import read_rows
-from mkpc_kaggle.data.images import FOCALS, read_size
+from mkpc_kaggle.data.images import EXIF_FOCALS, read_size
 from mkpc_kaggle.engine.console import warn
 from mkpc_kaggle.errors import UserError, plural
 from mkpc_kaggle.geometry.coordinates import Size
-from mkpc_kaggle.geometry.intrinsics import KnownCamera, camera_of, parse_row, read, written
+from mkpc_kaggle.geometry.intrinsics import KnownCamera, Rows, camera_of, parse_row
 
 COLUMNS = ("image", "model", "parameters", "sigma")
 OPTIONAL = ("size",)  # of the images that the parameters are for
@@ -24,8 +24,8 @@ MAX_SCALE_ERROR = 0.03  # of such a ratio by the principal point
 MAX_SHAPE_RATIO = 1.05  # of pictures of one camera at two resolutions
 
 
-def read_intrinsics_table(file: Path, root: Path, images: Iterable[Path]) -> str:
-    """Return the rows of a table for ``[scene] intrinsics``.
+def read_intrinsics_table(file: Path, root: Path, images: Iterable[Path]) -> Rows:
+    """Return the rows of a table of known cameras.
 
     Columns: ``image``, a path below ``root``, a file name, or a pattern with ``*``; ``model`` of COLMAP, its
     ``parameters`` separated by blanks; ``sigma`` of the focal length in percent, or ``fixed``; optionally
@@ -67,25 +67,24 @@ def read_intrinsics_table(file: Path, root: Path, images: Iterable[Path]) -> str
             raise UserError(
                 f"{where[number]}: {pattern!r} is the camera of no image; earlier rows come first"
             )
-    return written(rows)
+    return rows
 
 
-def has_gaps(known: str, root: Path, images: Sequence[Path]) -> bool:
+def has_gaps(rows: Rows, root: Path, images: Sequence[Path]) -> bool:
     """Return whether an image has no camera in the rows of :func:`read_intrinsics_table`."""
-    return bool(_without_camera(known, root, images))
+    return bool(_without_camera(rows, root, images))
 
 
-def intrinsics_line(known: str, root: Path, images: Sequence[Path]) -> str:
+def intrinsics_line(rows: Rows, root: Path, images: Sequence[Path]) -> str:
     """Return a line on the images that have a camera in the rows of
     :func:`read_intrinsics_table`.
     """
-    without = _without_camera(known, root, images)
+    without = _without_camera(rows, root, images)
     line = f"known cameras: {len(images) - len(without)} of {plural(len(images), 'image')}"
     return line + (f"; the first without one is {without[0]}" if without else "")
 
 
-def _without_camera(known: str, root: Path, images: Sequence[Path]) -> list[str]:
-    rows = read(known)
+def _without_camera(rows: Rows, root: Path, images: Sequence[Path]) -> list[str]:
     names = (image.relative_to(root).as_posix() for image in images)
     return [name for name in names if camera_of(rows, name) is None]
 
@@ -117,7 +116,7 @@ def require_fit(known: KnownCamera, stated: Size | None, image: Path, where: str
     # The most frequent mistake: a calibration at another resolution. A stated size rules it out.
     doubt = "" if stated is not None else _principal_point_doubt(known, size, has_pixels, where)
     # Such as millimetres in place of pixels
-    if known.focal / max(size) not in FOCALS:
+    if known.focal / max(size) not in EXIF_FOCALS:
         raise UserError(
             f"{where}: a focal length of {known.focal:g} px is implausible for {image.name} "
             f"of {text_of(size)} pixels"

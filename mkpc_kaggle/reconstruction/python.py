@@ -31,13 +31,13 @@ from mkpc_kaggle.reconstruction.priors import (
 from mkpc_kaggle.reconstruction.run import for_cameras, reconstruct_folder
 from mkpc_kaggle.reporting.contradictions import contradictions
 from mkpc_kaggle.scene.export import MODELS
-from mkpc_kaggle.scene.reconstruction import RegisteredImage, SfmModel
+from mkpc_kaggle.scene.models import RegisteredImage, SfmModel
 from mkpc_kaggle.setup.arguments import PathSource, Weights, member_of, shown_value
 from mkpc_kaggle.setup.assembly import Assembly, assemble
 from mkpc_kaggle.setup.availability import Licence
 
 if TYPE_CHECKING:
-    from mkpc_kaggle.reporting.view import View
+    from mkpc_kaggle.reporting.view import SceneView
 
 COLMAP = "colmap"  # in the work directory, for COLMAP's files
 
@@ -47,7 +47,7 @@ class Models(tuple[SfmModel, ...]):
 
     __slots__ = ()
 
-    def show(self, *, metres_per_unit: float | None = None) -> "View":
+    def show(self, *, metres_per_unit: float | None = None) -> "SceneView":
         """Return an interactive view of cameras and points, the last value of a notebook's cell.
 
         With ``metres_per_unit``, the scale of a single model, a bar shows a length.
@@ -254,15 +254,14 @@ def with_priors(
     """Return the assembly for cameras, with the user's masks and intrinsics. Raises
     :class:`UserError` if they are unusable.
     """
-    known = "" if intrinsics is None else read_intrinsics_table(Path(intrinsics), root, files)
+    cameras = () if intrinsics is None else read_intrinsics_table(Path(intrinsics), root, files)
     given = assembly.masks if masks is None else Masks.of_folder(Path(masks), root, files)
     if given.is_partial:
         for line in given.lines:
             warn(line)
-    if known and has_gaps(known, root, files):
-        warn(intrinsics_line(known, root, files))
-    recipe = for_cameras(assembly.recipe, intrinsics=known)
-    return replace(assembly, recipe=recipe, masks=given)
+    if cameras and has_gaps(cameras, root, files):
+        warn(intrinsics_line(cameras, root, files))
+    return replace(assembly, recipe=for_cameras(assembly.recipe), masks=given, cameras=cameras)
 
 
 def complete_model(model: SfmModel, folder: Path, names: Mapping[str, str]) -> SfmModel:

@@ -7,8 +7,8 @@ from pathlib import Path
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.console import warn
 from mkpc_kaggle.engine.plan.state import State, name_below
-from mkpc_kaggle.engine.reconstructing import scene_failures
 from mkpc_kaggle.engine.request import RunReport
+from mkpc_kaggle.engine.scenes import scene_failures
 from mkpc_kaggle.engine.session import Session, opened_engine, request_of
 from mkpc_kaggle.errors import writing
 from mkpc_kaggle.recipe import CameraSharing, Recipe, SceneConfig
@@ -17,14 +17,14 @@ from mkpc_kaggle.reconstruction.folder import Datasets, Ends, batch_names
 from mkpc_kaggle.reconstruction.outputs import Cameras
 from mkpc_kaggle.reconstruction.unmatched import cause_of_no_matches
 from mkpc_kaggle.scene.export import HeldDirectory, remove_files, versions_of
-from mkpc_kaggle.scene.reconstruction import RegisteredImage
+from mkpc_kaggle.scene.models import RegisteredImage
 from mkpc_kaggle.setup.assembly import Assembly
 
-AUTO = "auto"  # the recipe of all matchers whose weights are found
+AUTO_RECIPE = "auto"  # the recipe of all matchers whose weights are found
 # Of MAGSAC on a pair, whose F is for the report alone. Pairs that do not overlap run all iterations.
 # On 20 pairs of reichstag_26, 2,000 take 15 ms a pair in place of the 24 ms of 10,000, find 1.00 of
 # the inliers, and doubt the same pairs.
-MAX_ITERATIONS = 2_000
+MAGSAC_ITERATIONS = 2_000
 
 
 @dataclass(frozen=True)
@@ -42,13 +42,12 @@ class FolderResult:
     held: Mapping[str, HeldDirectory] = field(default_factory=dict)  # of COLMAP's files, by dataset
 
 
-def for_cameras(recipe: Recipe, sharing: str | None = None, intrinsics: str = "") -> Recipe:
+def for_cameras(recipe: Recipe, sharing: str | None = None) -> Recipe:
     """Return the recipe without extra pairs and without steps that only improve the F of single
     pairs.
 
     Recipe ``auto`` without weights keeps its first unit alone, and enlarges no image. ``sharing`` is a
-    :class:`CameraSharing`, and ``intrinsics`` are known cameras as in :class:`SceneConfig`. Without
-    them, the recipe's are kept.
+    :class:`CameraSharing`; without it, the recipe's is kept.
     """
     scene = recipe.scene or SceneConfig()
     scene = replace(
@@ -56,18 +55,17 @@ def for_cameras(recipe: Recipe, sharing: str | None = None, intrinsics: str = ""
         # The folder has its pairs already.
         pairs_per_image=0.0,
         cameras=CameraSharing(sharing or scene.cameras),
-        intrinsics=intrinsics or scene.intrinsics,
     )
     units = recipe.units
     # More views by RootSIFT cost three times as much, and two scenes scored 0.981 and 0.651 with
     # them, 0.985 and 0.637 without. Keypoints of enlarged images do not improve cameras either: the
     # mean of three scenes is 0.743 with them, 0.745 without. A recipe that the user names runs as it
     # is written.
-    if recipe.name == AUTO and recipe.matcher_names == ("sift",):
+    if recipe.name == AUTO_RECIPE and recipe.matcher_names == ("sift",):
         units = (replace(units[0], enlarge=False),)
     # F of a pair is for the report alone: its inliers, and doubts about the pair.
     magsac = recipe.magsac
-    iterations = min(magsac.max_iterations, MAX_ITERATIONS)
+    iterations = min(magsac.max_iterations, MAGSAC_ITERATIONS)
     magsac = replace(magsac, permutations=1, max_iterations=iterations)
     return replace(recipe, units=units, magsac=magsac, focal=None, scene=scene)
 
@@ -146,8 +144,8 @@ def cameras_of(datasets: Datasets, root: Path, results: State) -> Cameras:
         scene = results.scenes.get(batches[name])
         models = () if scene is None else scene.models
         # The largest model is the first, so it comes last into the dictionary and stays there.
-        placed = [(number, found) for number, model in enumerate(models) for found in model.images]
-        known = {found.image.digest: (number, found) for number, found in reversed(placed)}
+        placed = [(number, image) for number, model in enumerate(models) for image in model.images]
+        by_digest = {image.image.digest: (number, image) for number, image in reversed(placed)}
         digests = {file: known_digests.get(name_below(str(root), str(file)), "") for file in files}
-        cameras[name] = {file: known.get(digests[file]) for file in files}
+        cameras[name] = {file: by_digest.get(digests[file]) for file in files}
     return cameras

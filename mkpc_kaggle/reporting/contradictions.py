@@ -5,7 +5,7 @@ from pathlib import Path
 
 from mkpc_kaggle.engine.store.records import SceneRecord
 from mkpc_kaggle.errors import plural
-from mkpc_kaggle.scene.reconstruction import HARDLY_MOVED, DistortedLens, FocalContradiction, Source
+from mkpc_kaggle.scene.models import HARDLY_MOVED, DistortedLens, FocalContradiction, FocalSource
 
 MAX_NAMED = 3  # images in a sentence
 
@@ -30,7 +30,7 @@ def has_moved(scene: SceneRecord) -> bool:
 
 def _focal_sentence(found: FocalContradiction) -> str:
     images = named([Path(name).name for name in found.images])
-    if found.source is Source.INTRINSICS:
+    if found.source is FocalSource.INTRINSICS:
         return (
             f"the focal length of {found.given:.0f} px in --intrinsics contradicts the photographs, which "
             f"fit {found.fitted:.0f} px: {images}; correct or remove the row"

@@ -25,7 +25,7 @@ from mkpc_kaggle.pipeline.drawing import (
     new_figure,
     sample,
 )
-from mkpc_kaggle.scene.reconstruction import SfmModel
+from mkpc_kaggle.scene.models import SfmModel
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -45,7 +45,7 @@ __all__ = [
     "draw_strip",
     "encode",
     "new_figure",
-    "plain",
+    "plain_axes",
     "require_format",
     "sample",
     "save",
@@ -85,7 +85,7 @@ def _upright_axes(cameras: Sequence[Camera]) -> NDArray[np.float64]:
 def _draw_projected(panel: "Axes", name: str, model: SfmModel, axes: NDArray[np.float64]) -> None:
     """Draw a model's cameras and points as seen from ``name``, projected on ``axes`` (3, 2)."""
     cameras = [found.camera for found in model.images]
-    plain(panel, f"{plural(len(cameras), 'camera')} from {name}")
+    plain_axes(panel, f"{plural(len(cameras), 'camera')} from {name}")
     points = model.points @ axes
     # A few points of wrong matches lie far away and would shrink all others.
     near = _near(points[:, 0]) & _near(points[:, 1])
@@ -149,7 +149,7 @@ def encode(figure: "Figure", kind: str, dpi: int = DPI) -> bytes:
     return stream.getvalue()
 
 
-def plain(axes: "Axes", title: str) -> "Axes":
+def plain_axes(axes: "Axes", title: str) -> "Axes":
     """Return the axes with a title on the left and without the top and right edges of the frame."""
     axes.set_title(title, loc="left", fontsize=10)
     axes.tick_params(labelsize=9)

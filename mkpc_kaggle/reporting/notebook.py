@@ -4,7 +4,7 @@ from pathlib import Path
 
 from mkpc_kaggle.engine.store.dataframes import Results
 from mkpc_kaggle.engine.store.dataframes import results as read_results
-from mkpc_kaggle.reporting.view import View
+from mkpc_kaggle.reporting.view import SceneView
 
 
 class RunResults(Results):
@@ -12,7 +12,7 @@ class RunResults(Results):
 
     directory: Path  # the work directory
 
-    def show(self, root: str | Path | None = None) -> View:
+    def show(self, root: str | Path | None = None) -> SceneView:
         """Return the view of all scenes, the last value of a notebook's cell.
 
         ``root`` is the directory of the images: that of ``test.csv``, or DIR of ``reconstruct``.

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from mkpc_kaggle.engine.store.records import SceneRecord
 from mkpc_kaggle.scene.export import SPARSE
-from mkpc_kaggle.scene.reconstruction import MAX_POINTS
+from mkpc_kaggle.scene.models import MAX_POINTS
 
 COUNT = struct.Struct("<Q")
 POINT = struct.Struct("<Q3d3BdQ")  # id, x, y, z, red, green, blue, error, length of the track
@@ -37,16 +37,14 @@ def clouds_of(scene: SceneRecord, out: Path) -> Sequence[Cloud]:
     """
     for folder in (out / scene.batch / SPARSE, out / SPARSE):
         with suppress(OSError, struct.error, ValueError):
-            found = [
-                read_points(folder / str(n) / "points3D.bin") for n in range(len(scene.models))
-            ]
+            found = [read_cloud(folder / str(n) / "points3D.bin") for n in range(len(scene.models))]
             # A killed run may have left the files of an earlier scene.
             if sum(count for _, count in found) == scene.points:
                 return [cloud for cloud, _ in found]
     return ()
 
 
-def read_points(path: Path) -> tuple[Cloud, int]:
+def read_cloud(path: Path) -> tuple[Cloud, int]:
     """Return up to ``MAX_POINTS`` points of a file, and the number of all its points.
 
     Raises ``OSError`` if the file cannot be read, ``struct.error`` or ``ValueError`` if it is

@@ -41,7 +41,7 @@ from mkpc_kaggle.reporting.summary import (
 from mkpc_kaggle.reporting.verdict import doubt, inlier_histogram, verdict, write_summary
 from mkpc_kaggle.reporting.view import (
     Reader,
-    View,
+    SceneView,
     picture_at,
     style_and_script,
     template,
@@ -341,7 +341,7 @@ def reader_of(paths: Mapping[str, Path]) -> Reader:
     return read
 
 
-def show_run(work_dir: Path, root: Path | None = None) -> View:
+def show_run(work_dir: Path, root: Path | None = None) -> SceneView:
     """Return the view of the scenes of a run. Its images lie below ``root``.
 
     Without ``root``, only ``reconstruct`` has images: the links next to its models. Raises

@@ -18,14 +18,14 @@ from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
 from mkpc_kaggle.recipe import Recipe
 from mkpc_kaggle.reporting.run_log import SECONDS, RunLog
 from mkpc_kaggle.scene.candidates import title_of
-from mkpc_kaggle.scene.reconstruction import Sigmas
+from mkpc_kaggle.scene.models import Sigmas
 from mkpc_kaggle.setup.availability import UnavailableKind
 
 MAX_LINES = 8  # per list; the summary is one screen
 WIDTH = 100  # of a line, in characters
 MAX_NAMED = 3  # matchers or cameras in one line
 
-Run: TypeAlias = RunReport | RunLog
+AnyRun: TypeAlias = RunReport | RunLog
 
 
 def summary(report: RunReport) -> str:
@@ -47,7 +47,7 @@ def overview(log: RunLog) -> str:
     return "\n".join(filter(None, [headline(log), about, left_out, *_lines(log)]))
 
 
-def headline(run: Run) -> str:
+def headline(run: AnyRun) -> str:
     """Return a line: how the run ended, its duration, and the number of pairs with an F."""
     return f"{run.ending} after {format_duration(run.seconds)}: {solved_pairs(run.records)}"
 
@@ -58,7 +58,7 @@ def solved_pairs(records: Sequence[PairRecord]) -> str:
     return f"{solved} of {plural(len(records), 'pair')} with an F"
 
 
-def trouble(run: Run) -> str:
+def trouble(run: AnyRun) -> str:
     """Return why a run with a complete file failed, or an empty string.
 
     A pair without an F counts only if an error is the cause, rather than few matches or little
@@ -138,7 +138,7 @@ def advice(log: RunLog) -> list[str]:
     return found
 
 
-def unit_means(run: Run) -> list[tuple[str, int, float, float, float]]:
+def unit_means(run: AnyRun) -> list[tuple[str, int, float, float, float]]:
     """Return a row per unit: name, number of pairs, and mean matches, inliers and seconds.
 
     Without the pairs on which the unit failed, whose matches and seconds were not measured.
@@ -152,7 +152,7 @@ def unit_means(run: Run) -> list[tuple[str, int, float, float, float]]:
     return [(name, len(rows), *np.mean(rows, axis=0)) for name, rows in results.items()]
 
 
-def unit_reasons(run: Run, field: str = "failure") -> list[str]:
+def unit_reasons(run: AnyRun, field: str = "failure") -> list[str]:
     """Return the units' failures, or another ``field``, with numbers of pairs, the most frequent
     first.
     """
@@ -163,7 +163,7 @@ def unit_reasons(run: Run, field: str = "failure") -> list[str]:
     return [f"{reason} ({plural(count, 'pair')})" for reason, count in counts.most_common()]
 
 
-def seconds_by_part(run: Run) -> dict[str, float]:
+def seconds_by_part(run: AnyRun) -> dict[str, float]:
     """Return the total seconds of all pairs for each part of the work."""
     return {
         name: sum(getattr(record, field) for record in run.records)
@@ -171,7 +171,7 @@ def seconds_by_part(run: Run) -> dict[str, float]:
     }
 
 
-def facts(run: Run) -> Iterator[tuple[str, str, str]]:
+def facts(run: AnyRun) -> Iterator[tuple[str, str, str]]:
     """Yield the most important facts as (name, value, remark)."""
     records = run.records
     scenes = run.scenes
@@ -232,7 +232,7 @@ def chosen_candidates(scenes: Sequence[SceneRecord]) -> Iterator[tuple[str, str,
     yield "cameras by the tracks of", ", ".join(parts), f"median margin {margin:.2f} degrees"
 
 
-def _lines(run: Run) -> Iterator[str]:
+def _lines(run: AnyRun) -> Iterator[str]:
     """Yield the facts, means of units, seconds and weakest cameras, then lists of failures, units
     and faults.
     """
@@ -276,7 +276,7 @@ def wrapped(text: str) -> list[str]:
     return [line.replace("\N{NO-BREAK SPACE}%", " %") for line in lines]
 
 
-def pending_lines(run: Run) -> Iterator[str]:
+def pending_lines(run: AnyRun) -> Iterator[str]:
     """Yield a line on pairs and batches that the run did not reach, and how to continue."""
     # A pair may have an F from a scene without being matched.
     pairs = sum(not record.reached and not record.is_solved for record in run.records)

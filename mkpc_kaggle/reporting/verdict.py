@@ -29,7 +29,7 @@ from mkpc_kaggle.reporting.summary import (
 )
 from mkpc_kaggle.scene.candidates import title_of
 from mkpc_kaggle.scene.choose import Reason
-from mkpc_kaggle.scene.reconstruction import (
+from mkpc_kaggle.scene.models import (
     HARDLY_MOVED,
     MAX_CENTRE_SIGMA,
     MAX_SIGMA_IMAGES,

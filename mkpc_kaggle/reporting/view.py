@@ -22,7 +22,7 @@ from mkpc_kaggle.data.outputs import replacing
 from mkpc_kaggle.errors import writing
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Pixels
-from mkpc_kaggle.scene.reconstruction import MAX_POINTS, RegisteredImage, SfmModel
+from mkpc_kaggle.scene.models import MAX_POINTS, RegisteredImage, SfmModel
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -46,7 +46,7 @@ Partners: TypeAlias = Mapping[str, Sequence[Partner]]  # by name of the image
 
 
 @dataclass(frozen=True)
-class View:
+class SceneView:
     """A page with the view of a scene, which notebooks show in a sandboxed frame."""
 
     page: str  # a complete HTML document
@@ -62,7 +62,7 @@ class View:
             stream.write(self.page)
 
 
-def show(models: Iterable[SfmModel], *, metres_per_unit: float | None = None) -> View:
+def show(models: Iterable[SfmModel], *, metres_per_unit: float | None = None) -> SceneView:
     """Return the view of models from :func:`mkpc_kaggle.reconstruct`, whose image names are paths.
 
     With ``metres_per_unit``, the scale of the largest model, a bar shows a length in metres.
@@ -71,13 +71,15 @@ def show(models: Iterable[SfmModel], *, metres_per_unit: float | None = None) ->
     return view_of([("", part)])
 
 
-def view_of(parts: Iterable[tuple[str, "Markup"]]) -> View:
+def view_of(parts: Iterable[tuple[str, "Markup"]]) -> SceneView:
     """Return the view of scenes, given the title and the part of the page of each."""
     style = "body { margin: 0; padding: .5rem; background: #fff; font: 1rem/1.5 system-ui, sans-serif; }"
     title = '<meta charset="utf-8"><title>Cameras and points</title>'
     head = f"{title}\n<style>{style}</style>{style_and_script()}"
     body = "".join(f"<h3>{escape(name)}</h3>{part}" if name else part for name, part in parts)
-    return View(f'<!doctype html>\n<html lang="en"><head>{head}</head><body>{body}</body></html>')
+    return SceneView(
+        f'<!doctype html>\n<html lang="en"><head>{head}</head><body>{body}</body></html>'
+    )
 
 
 def picture_at(path: str) -> Image | None:
@@ -204,7 +206,7 @@ class _Frame:
 def _model(
     model: SfmModel,
     frame: _Frame,
-    known: NDArray[np.uint8] | None,
+    colours_of_points: NDArray[np.uint8] | None,
     pictures: Mapping[str, Pixels],
     partners: Partners,
 ) -> dict[str, Any]:
@@ -212,12 +214,13 @@ def _model(
     placed = frame.place(points)
     near = np.abs(placed).max(axis=1, initial=0) < FAR
     # A model in memory, or in a journal, has no colours.
-    found = point_colours(points, model.images, pictures) if known is None else known
-    colours = found[:MAX_POINTS]
+    if colours_of_points is None:
+        colours_of_points = point_colours(points, model.images, pictures)
+    colours = colours_of_points[:MAX_POINTS]
     # The largest coordinate has the largest step, in models of any size.
     reach = float(np.abs(placed[near]).max(initial=1e-6))
     steps = np.round(placed[near] * (STEPS / reach)).astype("<i2")
-    centres = frame.place(np.array([found.camera.centre for found in model.images]))
+    centres = frame.place(np.array([image.camera.centre for image in model.images]))
     return {
         "count": int(near.sum()),
         "range": reach,
@@ -225,7 +228,7 @@ def _model(
         "colours": _base64(colours[near].tobytes()),
         "extent": _rounded(frame.extent),
         "frustum": _frustum_size(centres),
-        "cameras": [_camera(found, frame, pictures, partners) for found in model.images],
+        "cameras": [_camera(image, frame, pictures, partners) for image in model.images],
     }
 
 

@@ -21,43 +21,45 @@ from mkpc_kaggle.scene.uncertainty import camera_sigmas
 # 1.5 degrees). The global mapper keeps errors of a hundredth of the focal length, about ten pixels.
 MAX_TWO_VIEW_ERROR_PX = 4.0
 MIN_TWO_VIEW_ANGLE_DEG = 2.0
-MAX_ITERATIONS = 100
+FINAL_ADJUSTMENT_ITERATIONS = 100
 CONVERGED = 1e-6  # relative change of the cost
 
 
-def adjust(found: Any, known: Mapping[str, KnownCamera]) -> None:
+def adjust(model: Any, cameras: Mapping[str, KnownCamera]) -> None:
     """Set the cameras that the user knows in pycolmap's model; refine poses, points and other cameras
     by all tracks.
 
-    ``known`` is by image name; each of these images has its own camera.
+    ``cameras`` is by image name; each of these images has its own camera.
     """
-    remove_uncertain_points(found)
+    remove_uncertain_points(model)
     placed = [
-        image for _, image in sorted(found.images.items()) if image.has_pose and image.name in known
+        image
+        for _, image in sorted(model.images.items())
+        if image.has_pose and image.name in cameras
     ]
     # Computed without the user's knowledge, so that the two can be weighed
-    sigmas = camera_sigmas(found) if placed else {}
+    sigmas = camera_sigmas(model) if placed else {}
     for image in placed:
         # Bundle adjustment does not determine this focal length: the user's counts alone.
         sigma = sigmas[image.name].focal if image.name in sigmas else np.inf
-        set_camera(found.cameras[image.camera_id], known[image.name], sigma)
+        set_camera(model.cameras[image.camera_id], cameras[image.name], sigma)
     config = pycolmap.BundleAdjustmentConfig()
-    for number in sorted(found.reg_image_ids()):
+    for number in sorted(model.reg_image_ids()):
         config.add_image(number)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     for image in placed:
         config.set_constant_cam_intrinsics(image.camera_id)
     options = robust_options()
-    adjuster: Any = pycolmap.create_default_ceres_bundle_adjuster(options, config, found)
+    adjuster: Any = pycolmap.create_default_ceres_bundle_adjuster(options, config, model)
     adjuster.solve()
-    found.update_point_3d_errors()
+    model.update_point_3d_errors()
 
 
 def robust_options() -> Any:
     """Return the options of a bundle adjustment of a finished model."""
     # With more threads, the last digits vary
     solver = {
-        "max_num_iterations": MAX_ITERATIONS,
+        "max_num_iterations": FINAL_ADJUSTMENT_ITERATIONS,
         "num_threads": 1,
         "function_tolerance": CONVERGED,
     }

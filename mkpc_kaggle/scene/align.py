@@ -17,7 +17,7 @@ from scipy.spatial.distance import pdist
 
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Matrix3
-from mkpc_kaggle.scene.reconstruction import Reconstruction, SfmModel
+from mkpc_kaggle.scene.models import Reconstruction, SfmModel
 
 # In the folder of a dataset's files: its cameras at the end of the last run
 REFERENCE = ".mkpc-reference.json"
@@ -25,7 +25,7 @@ MIN_COMMON = 3  # cameras
 STILL = 1e-9  # of a similarity's numbers
 OUTLIER = 4.0  # times the median distance: a camera that the two reconstructions place differently
 
-Cameras: TypeAlias = Mapping[str, Camera]  # of one model, by image name
+ModelCameras: TypeAlias = Mapping[str, Camera]  # of one model, by image name
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +91,7 @@ def moved_by(cameras: Sequence[Camera], targets: Sequence[Camera]) -> NDArray[np
     return np.asarray(np.linalg.norm(centres - goals, axis=1))
 
 
-def size_of(cameras: Sequence[Camera]) -> float:
+def model_size(cameras: Sequence[Camera]) -> float:
     """Return the size of a model: the RMS distance of its cameras from their mean."""
     return float(np.sqrt(_centres(cameras).var(axis=0).sum()))
 
@@ -138,23 +138,28 @@ def _centres(cameras: Sequence[Camera]) -> NDArray[np.float64]:
 
 
 def align(
-    reconstructions: Sequence[Reconstruction], reference: Sequence[Cameras]
+    reconstructions: Sequence[Reconstruction], reference: Sequence[ModelCameras]
 ) -> list[Reconstruction]:
     """Return the reconstructions, each model moved onto the earlier model with the most common
     images.
     """
 
     def aligned(model: SfmModel) -> SfmModel:
-        cameras = {found.image.name: found.camera for found in model.images}
+        cameras = {image.image.name: image.camera for image in model.images}
         # Of several models, each may belong to another earlier one.
         earlier = max(reference, key=lambda former: len(cameras.keys() & former.keys()), default={})
         names = sorted(cameras.keys() & earlier.keys())
-        found = find_similarity(
+        similarity = find_similarity(
             [cameras[name] for name in names], [earlier[name] for name in names]
         )
-        return model if found is None or found.is_identity else transformed(model, found)
+        if similarity is None or similarity.is_identity:
+            return model
+        return transformed(model, similarity)
 
-    return [replace(each, models=tuple(map(aligned, each.models))) for each in reconstructions]
+    return [
+        replace(reconstruction, models=tuple(map(aligned, reconstruction.models)))
+        for reconstruction in reconstructions
+    ]
 
 
 def transformed(model: SfmModel, similarity: Similarity) -> SfmModel:
@@ -171,7 +176,7 @@ def transformed(model: SfmModel, similarity: Similarity) -> SfmModel:
     return replace(model, images=images, points=similarity.of_points(model.points))
 
 
-def write_reference(stream: Any, models: Sequence[Cameras]) -> None:
+def write_reference(stream: Any, models: Sequence[ModelCameras]) -> None:
     """Write the cameras of models as JSON: R and t of each image."""
     rows = [
         {name: [*camera.R.ravel(), *camera.t] for name, camera in model.items()} for model in models
@@ -179,12 +184,12 @@ def write_reference(stream: Any, models: Sequence[Cameras]) -> None:
     json.dump(rows, stream, sort_keys=True)
 
 
-def read_reference(directory: Path) -> list[Cameras]:
+def read_reference(directory: Path) -> list[ModelCameras]:
     """Return the cameras of each model of the last complete run, with K the identity; empty if
     unknown.
     """
     # A missing or damaged file costs the coordinates and not the run.
-    models: list[Cameras] = []
+    models: list[ModelCameras] = []
     with suppress(OSError, ValueError, TypeError, AttributeError, RecursionError):
         for row in json.loads((directory / REFERENCE).read_text(encoding="utf-8")):
             cameras = {}

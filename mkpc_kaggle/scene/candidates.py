@@ -18,13 +18,13 @@ from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.metrics import pose_error
 from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.recipe import SceneConfig, Unit
-from mkpc_kaggle.scene.reconstruction import SfmModel
+from mkpc_kaggle.scene.models import SfmModel
 from mkpc_kaggle.scene.view_graph import BatchPair, tracks_of
 
 # Candidates with tracks of all units, on all edges or on those with enough support
 # (:mod:`mkpc_kaggle.scene.edges`); each other candidate has the name of its unit.
 ALL_UNITS, SUPPORTED = "", "supported"
-MIN_SUPPORT = 0.1
+CANDIDATE_SUPPORT = 0.1
 # A candidate's disagreement must be smaller than this share of the first one's. Shares from 0.97 to 0.99
 # choose the same on all draws of benchmarks.candidates.
 MAX_SHARE = 0.98
@@ -40,11 +40,11 @@ def candidates_of(units: Sequence[Unit], config: SceneConfig | None) -> tuple[st
     return (ALL_UNITS, *others)[:most]
 
 
-def settings_of(candidate: str, config: SceneConfig) -> SceneConfig:
+def candidate_settings(candidate: str, config: SceneConfig) -> SceneConfig:
     """Return the settings of a candidate's reconstruction."""
     if candidate != SUPPORTED:
         return config
-    return replace(config, min_support=max(config.min_support, MIN_SUPPORT))
+    return replace(config, min_support=max(config.min_support, CANDIDATE_SUPPORT))
 
 
 def candidate_tracks(results: Sequence[UnitResult], candidate: str) -> Matches:

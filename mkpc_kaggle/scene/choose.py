@@ -11,7 +11,7 @@ from mkpc_kaggle.geometry.cameras import fundamental_of_cameras
 from mkpc_kaggle.geometry.coordinates import Matrix3
 from mkpc_kaggle.geometry.focal_prior import FocalConfig, FocalPrior, estimate_with_prior
 from mkpc_kaggle.geometry.robust import RobustConfig, sampson_distances
-from mkpc_kaggle.scene.reconstruction import RegisteredImage
+from mkpc_kaggle.scene.models import RegisteredImage
 from mkpc_kaggle.scene.view_graph import BatchPair
 
 CONTRADICTION_ERROR_PX = 2.0  # maximum Sampson distance of a match that agrees with an F

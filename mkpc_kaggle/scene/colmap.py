@@ -35,7 +35,7 @@ from mkpc_kaggle.scene.export import (
     replace_models,
 )
 from mkpc_kaggle.scene.keypoints import Lens, MergedGraph
-from mkpc_kaggle.scene.reconstruction import (
+from mkpc_kaggle.scene.models import (
     MIN_IMAGES,
     Reconstruction,
     RegisteredImage,
@@ -54,7 +54,7 @@ LARGE = 100  # images; all tracks cost too much in larger scenes and improve sma
 TRACKS_PER_IMAGE = 200  # the longest tracks, from which the global mapper starts in a large scene
 # Of the models with shared intrinsics, as in COLMAP's global mapper
 MAX_REFINEMENTS = 5
-MAX_ITERATIONS = 50  # of each bundle adjustment of a refinement
+ADJUSTMENT_ITERATIONS = 50  # of each bundle adjustment of a refinement
 MIN_CHANGE = 0.0005  # share of the observations; with fewer changes, a model has converged
 SEED = 0
 # Verification keeps the matches of E or F, whichever explains more, and F knows no focal length. So
@@ -230,19 +230,19 @@ def verify(merged: MergedGraph, cameras: Sequence[Any], *, reuse: bool = False) 
     # COLMAP takes matches without motion for a watermark, but nearby views have many of these.
     settings = {"ransac": ransac, "min_num_inliers": MIN_MATCHES, "detect_watermark": False}
     options = pycolmap.TwoViewGeometryOptions(settings)
-    points = [found.astype(np.float64) + CENTRE_PX for found in merged.keypoints]
+    points = [keypoints.astype(np.float64) + CENTRE_PX for keypoints in merged.keypoints]
     lenses = [_lens(camera) for camera in cameras]
 
     def estimate(number: int) -> None:
         edge = merged.graph.edges[number]
         both = (lenses[edge.first], lenses[edge.second])
-        known = merged.geometries.setdefault(number, {})
-        similar = [each for each in known if reuse and _are_similar(each, both)]
-        if both not in known and similar:
-            found[number] = _uncalibrated(known[similar[0]])
+        of_edge = merged.geometries.setdefault(number, {})
+        similar = [former for former in of_edge if reuse and _are_similar(former, both)]
+        if both not in of_edge and similar:
+            geometries[number] = _uncalibrated(of_edge[similar[0]])
             return
-        if both not in known:
-            known[both] = pycolmap.estimate_two_view_geometry(
+        if both not in of_edge:
+            of_edge[both] = pycolmap.estimate_two_view_geometry(
                 cameras[edge.first],
                 points[edge.first],
                 cameras[edge.second],
@@ -250,13 +250,13 @@ def verify(merged: MergedGraph, cameras: Sequence[Any], *, reuse: bool = False) 
                 merged.matches[number],
                 options,
             )
-        found[number] = known[both]
+        geometries[number] = of_edge[both]
 
-    found: list[Any] = [None] * len(merged.graph.edges)
+    geometries: list[Any] = [None] * len(merged.graph.edges)
     # On all cores: an edge starts from the same seed in every thread, so results are the same.
     with ThreadPoolExecutor(available_cores()) as pool:
-        list(pool.map(estimate, range(len(found))))
-    return found
+        list(pool.map(estimate, range(len(geometries))))
+    return geometries
 
 
 def _lens(camera: Any) -> Lens:
@@ -343,7 +343,7 @@ def _refine(cache: Any, former: Any, settings: Any) -> Any:
         {"random_seed": SEED, "num_threads": settings.num_threads}
     )
     # While points come and go, least squares of all tracks; the mapper's robust loss comes last.
-    solver = {"num_threads": settings.num_threads, "max_num_iterations": MAX_ITERATIONS}
+    solver = {"num_threads": settings.num_threads, "max_num_iterations": ADJUSTMENT_ITERATIONS}
     least_squares = pycolmap.BundleAdjustmentOptions(
         {"print_summary": False, "ceres": {"use_gpu": False, "solver_options": solver}}
     )
@@ -369,14 +369,14 @@ def _filter_points(observations: Any, model: Any, settings: Any) -> None:
     )
 
 
-def _reconstruction(found: Sequence[Any], graph: ViewGraph) -> Reconstruction:
+def _reconstruction(mapped: Sequence[Any], graph: ViewGraph) -> Reconstruction:
     """Return pycolmap's models with the user's cameras, without implausible images."""
-    known = known_by_name(graph)
+    given_cameras = known_by_name(graph)
     # In a large scene, points of two views are too many.
-    if known or len(graph.images) <= LARGE:
-        for model in found:
-            adjust(model, known)
-    models = filter_models([_sfm_model(model, graph) for model in found])
+    if given_cameras or len(graph.images) <= LARGE:
+        for model in mapped:
+            adjust(model, given_cameras)
+    models = filter_models([_sfm_model(model, graph) for model in mapped])
     return Reconstruction(
         graph.names, models, "" if models else "the matches gave no plausible model"
     )

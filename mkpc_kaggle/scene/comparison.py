@@ -16,18 +16,18 @@ import pycolmap
 
 from mkpc_kaggle.geometry.intrinsics import KnownCamera
 from mkpc_kaggle.scene.adjustment import robust_options
-from mkpc_kaggle.scene.reconstruction import (
+from mkpc_kaggle.scene.models import (
     MAX_SIGMA_IMAGES,
     Comparison,
     DistortedLens,
     FocalContradiction,
+    FocalSource,
     RegisteredImage,
     SfmModel,
-    Source,
 )
 from mkpc_kaggle.scene.uncertainty import DAMPED, evaluator
 
-PINHOLES = (pycolmap.CameraModelId.SIMPLE_PINHOLE, pycolmap.CameraModelId.PINHOLE)
+COLMAP_PINHOLES = (pycolmap.CameraModelId.SIMPLE_PINHOLE, pycolmap.CameraModelId.PINHOLE)
 MAX_ASPECT_RATIO = 1.02  # of two focal lengths; a radial coefficient needs a common one
 # Relative deviations of a focal length. Calibrations are better than 5 %. EXIF's values are rounded
 # and ignore the distance of focus.
@@ -39,7 +39,7 @@ MAX_PRIOR_SIGMAS = 3.0  # of a prior
 MIN_DISPLACEMENT = 0.005
 MIN_LENS_IMAGES = 3  # of one size; a single weak camera fits any coefficient
 MIN_AGREEING = 0.8  # share of these images with at least half of the median displacement
-MAX_POINTS = 300  # per image, of the longest tracks; more cost time and tell the same
+MAX_IMAGE_POINTS = 300  # per image, of the longest tracks; more cost time and tell the same
 CLEAR_SIGMAS = 5.0  # smaller differences are noise
 LENS_SIGMA = 5.0  # percent, of the focal length in the row to give
 
@@ -47,7 +47,7 @@ LENS_SIGMA = 5.0  # percent, of the focal length in the row to give
 class Freed(NamedTuple):
     """A registered image with its camera of the copy, as pycolmap has it."""
 
-    found: RegisteredImage
+    registered: RegisteredImage
     camera: Any
     is_radial: bool  # the radial coefficient is free, too
 
@@ -62,8 +62,10 @@ class Freed(NamedTuple):
         return float(self.camera.params[3] * (half / self.focal) ** 2)
 
 
-def compare(model: SfmModel, known: Mapping[str, KnownCamera]) -> Comparison:
-    """Return what the photographs of a model contradict. ``known`` are the user's cameras, by image
+def compare_with_photographs(
+    model: SfmModel, given_cameras: Mapping[str, KnownCamera]
+) -> Comparison:
+    """Return what the photographs of a model contradict. ``given_cameras`` are the user's cameras, by image
     name.
     """
     copy = pycolmap.Reconstruction(model.colmap)
@@ -77,32 +79,32 @@ def compare(model: SfmModel, known: Mapping[str, KnownCamera]) -> Comparison:
     adjuster.solve()
     images = {image.name: image for image in copy.images.values()}
     freed = []
-    for found in model.images:
-        camera = images[found.image.name].camera
-        freed.append(Freed(found, camera, camera.camera_id in radial))
-    given = [*_given_focals(copy, freed, known)]
+    for registered in model.images:
+        camera = images[registered.image.name].camera
+        freed.append(Freed(registered, camera, camera.camera_id in radial))
+    given = [*_given_focals(copy, freed, given_cameras)]
     # A wrong focal length bends a model as a lens does. So does a model that is not determined.
     wrong = {name for contradiction in given for name in contradiction.images}
     determined = [
-        each
-        for each in freed
-        if each.found.image.name not in wrong
-        and (each.found.sigmas or len(freed) > MAX_SIGMA_IMAGES)
+        freed_image
+        for freed_image in freed
+        if freed_image.registered.image.name not in wrong
+        and (freed_image.registered.sigmas or len(freed) > MAX_SIGMA_IMAGES)
     ]
-    focals = (*given, *_exif_focals(determined, known))
+    focals = (*given, *_exif_focals(determined, given_cameras))
     return Comparison(focals, tuple(_lenses(copy, determined)))
 
 
 def _thin(copy: Any) -> None:
-    """Remove short tracks of images that have ``MAX_POINTS`` longer ones."""
+    """Remove short tracks of images that have ``MAX_IMAGE_POINTS`` longer ones."""
     counts = dict.fromkeys(copy.reg_image_ids(), 0)
-    if copy.num_points3D() <= MAX_POINTS:
+    if copy.num_points3D() <= MAX_IMAGE_POINTS:
         return
     lengths = {number: copy.points3D[number].track.length() for number in copy.point3D_ids()}
     # Of equally long tracks, the point with the lower number
     for number in sorted(lengths, key=lambda number: (-lengths[number], number)):
         images = {element.image_id for element in copy.points3D[number].track.elements}
-        if all(counts[image] >= MAX_POINTS for image in images):
+        if all(counts[image] >= MAX_IMAGE_POINTS for image in images):
             copy.delete_point3D(number)
             continue
         for image in images:
@@ -112,7 +114,7 @@ def _thin(copy: Any) -> None:
 def _free_radial(camera: Any) -> bool:
     """Give a pinhole a radial coefficient of 0. Return whether it has one now."""
     *focals, x, y = camera.params
-    if camera.model not in PINHOLES or max(focals) > MAX_ASPECT_RATIO * min(focals):
+    if camera.model not in COLMAP_PINHOLES or max(focals) > MAX_ASPECT_RATIO * min(focals):
         return False
     focal = camera.mean_focal_length()
     camera.model = pycolmap.CameraModelId.SIMPLE_RADIAL
@@ -121,40 +123,44 @@ def _free_radial(camera: Any) -> bool:
 
 
 def _given_focals(
-    copy: Any, freed: Sequence[Freed], known: Mapping[str, KnownCamera]
+    copy: Any, freed: Sequence[Freed], given_cameras: Mapping[str, KnownCamera]
 ) -> Iterable[FocalContradiction]:
     """Yield the user's cameras with a focal length that the photographs contradict."""
-    for camera in dict.fromkeys(known.values()):
-        alike = [each for each in freed if known.get(each.found.image.name) == camera]
+    for camera in dict.fromkeys(given_cameras.values()):
+        alike = [
+            freed_image
+            for freed_image in freed
+            if given_cameras.get(freed_image.registered.image.name) == camera
+        ]
         if not alike:
             continue
-        fitted = float(np.median([each.focal for each in alike]))
+        fitted = float(np.median([freed_image.focal for freed_image in alike]))
         limit = np.log1p(max(MAX_DEVIATION, MAX_PRIOR_SIGMAS * camera.sigma / 100))
         deviation = abs(np.log(fitted / camera.focal))
         if deviation > limit and deviation > CLEAR_SIGMAS * _sigma(copy, alike, 0) / fitted:
-            names = tuple(each.found.image.name for each in alike)
-            yield FocalContradiction(Source.INTRINSICS, names, camera.focal, fitted)
+            names = tuple(freed_image.registered.image.name for freed_image in alike)
+            yield FocalContradiction(FocalSource.INTRINSICS, names, camera.focal, fitted)
 
 
 def _exif_focals(
-    freed: Sequence[Freed], known: Mapping[str, KnownCamera]
+    freed: Sequence[Freed], given_cameras: Mapping[str, KnownCamera]
 ) -> Iterable[FocalContradiction]:
     """Yield the images whose refined focal lengths are far from those of EXIF."""
     wrong = []
-    for each in freed:
-        image = each.found.image
+    for freed_image in freed:
+        image = freed_image.registered.image
         # The user's cameras replace those of EXIF.
-        if not image.focal or image.name in known:
+        if not image.focal or image.name in given_cameras:
             continue
-        deviation = abs(np.log(each.found.focal / image.focal))
-        sigma = each.found.sigmas.focal / 100 if each.found.sigmas else 0.0
+        deviation = abs(np.log(freed_image.registered.focal / image.focal))
+        sigma = freed_image.registered.sigmas.focal / 100 if freed_image.registered.sigmas else 0.0
         if deviation > np.log1p(MAX_EXIF_DEVIATION) and deviation > CLEAR_SIGMAS * sigma:
-            wrong.append(each.found)
+            wrong.append(freed_image.registered)
     if wrong:
-        given = float(np.median([found.image.focal for found in wrong]))
-        fitted = float(np.median([found.focal for found in wrong]))
-        names = tuple(found.image.name for found in wrong)
-        yield FocalContradiction(Source.EXIF, names, given, fitted)
+        given = float(np.median([registered.image.focal for registered in wrong]))
+        fitted = float(np.median([registered.focal for registered in wrong]))
+        names = tuple(registered.image.name for registered in wrong)
+        yield FocalContradiction(FocalSource.EXIF, names, given, fitted)
 
 
 def _lenses(copy: Any, freed: Sequence[Freed]) -> Iterable[DistortedLens]:
@@ -162,8 +168,8 @@ def _lenses(copy: Any, freed: Sequence[Freed]) -> Iterable[DistortedLens]:
     a lens.
     """
     pinholes = [each for each in freed if each.is_radial]
-    for size in dict.fromkeys(each.found.image.size for each in pinholes):
-        alike = [each for each in pinholes if each.found.image.size == size]
+    for size in dict.fromkeys(each.registered.image.size for each in pinholes):
+        alike = [each for each in pinholes if each.registered.image.size == size]
         displacement = float(np.median([each.displacement for each in alike]))
         if len(alike) < MIN_LENS_IMAGES or not abs(displacement) >= MIN_DISPLACEMENT:
             continue
@@ -176,7 +182,7 @@ def _lenses(copy: Any, freed: Sequence[Freed]) -> Iterable[DistortedLens]:
         focal = float(np.median([each.focal for each in alike]))
         parameters = (focal, size.width / 2, size.height / 2, coefficient)
         camera = KnownCamera("SIMPLE_RADIAL", parameters, LENS_SIGMA)
-        names = tuple(each.found.image.name for each in alike)
+        names = tuple(each.registered.image.name for each in alike)
         yield DistortedLens(names, displacement, camera)
 
 
@@ -198,8 +204,8 @@ def _sigma(copy: Any, freed: Sequence[Freed], parameter: int) -> float:
         return float("inf")
     noise = 2 * fit.initial_cost / redundancy  # square pixels, of a keypoint's coordinate
     variances = []
-    for each in freed:
-        covariance = solved.get_other_params_cov(each.camera.params)
+    for freed_image in freed:
+        covariance = solved.get_other_params_cov(freed_image.camera.params)
         variances.append(covariance[parameter, parameter])
-    found = float(np.sqrt(noise * np.median(variances)))
-    return found if np.isfinite(found) else float("inf")
+    sigma = float(np.sqrt(noise * np.median(variances)))
+    return sigma if np.isfinite(sigma) else float("inf")

@@ -8,10 +8,10 @@ import numpy as np
 
 MAX_IMAGES = 2000  # the search is quadratic in the number of images
 
-Ends: TypeAlias = tuple[int, int]  # indices of a pair's two images, the smaller first
+IndexPair: TypeAlias = tuple[int, int]  # indices of a pair's two images, the smaller first
 
 
-def extra_pairs(image_count: int, pairs: Sequence[Ends], per_image: float) -> list[Ends]:
+def extra_pairs(image_count: int, pairs: Sequence[IndexPair], per_image: float) -> list[IndexPair]:
     """Return extra pairs that give a batch ``per_image`` pairs per image, the most useful first.
 
     ``pairs`` are the existing pairs, in any order. Each step links the image in the fewest pairs to the image with
@@ -29,7 +29,7 @@ def extra_pairs(image_count: int, pairs: Sequence[Ends], per_image: float) -> li
     degrees = linked.sum(1)
     all_pairs = image_count * (image_count - 1) // 2
     wanted = min(ceil(per_image * image_count), all_pairs)
-    extra: list[Ends] = []
+    extra: list[IndexPair] = []
     while (degrees.sum() - image_count) // 2 < wanted:
         image = int(np.where(degrees < image_count, degrees, image_count).argmin())
         # Partners in common decide, and degrees only between equals.

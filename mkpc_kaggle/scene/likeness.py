@@ -24,7 +24,7 @@ from mkpc_kaggle.data.images import Image, read_image
 from mkpc_kaggle.matchers.adapters.sift import root_sift
 from mkpc_kaggle.matchers.neighbours import mutual_neighbours
 
-Partners = list[list[int]]  # of each image, as indices of images
+PartnerIndices = list[list[int]]  # of each image, as indices of images
 
 PARTNERS = 20  # per image
 WORDS = 64
@@ -49,7 +49,7 @@ SAMPLED_PAIRS = 50
 SCALE = np.float32(255)  # of descriptors stored as bytes
 
 
-def shortlist(partners: Partners) -> list[tuple[int, int]]:
+def shortlist(partners: PartnerIndices) -> list[tuple[int, int]]:
     """Return the sorted, distinct pairs of images and their partners, each with the smaller index
     first.
     """
@@ -84,15 +84,15 @@ def overlapping(features: Sequence[bytes]) -> list[tuple[int, int]]:
     These are all pairs if most of a random sample may overlap. An image without features is in all
     of its pairs: the matcher reports what is wrong with it.
     """
-    descriptors = [torch.from_numpy(_unpacked(each)) for each in features]
+    descriptors = [torch.from_numpy(_unpacked(packed)) for packed in features]
     pairs = list(combinations(range(len(features)), 2))
 
     def may_overlap(pair: tuple[int, int]) -> bool:
         first, second = (descriptors[index] for index in pair)
         if not len(first) or not len(second):
             return True
-        found = mutual_neighbours(first, second, RATIO)
-        return len(found.index0) >= MIN_LARGE_MATCHES
+        neighbours = mutual_neighbours(first, second, RATIO)
+        return len(neighbours.index0) >= MIN_LARGE_MATCHES
 
     order = np.random.default_rng(0).permutation(len(pairs))[:SAMPLED_PAIRS]
     sample = [may_overlap(pairs[index]) for index in order]

@@ -15,7 +15,7 @@ import numpy as np
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.focal_prior import FOCAL_RATIO
 from mkpc_kaggle.recipe import CameraSharing, SceneConfig
-from mkpc_kaggle.scene.reconstruction import SfmModel
+from mkpc_kaggle.scene.models import SfmModel
 from mkpc_kaggle.scene.view_graph import BatchImage
 
 TOLERANCE = 0.02  # maximum relative deviation of agreeing focal lengths from the median

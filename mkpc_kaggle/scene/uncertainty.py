@@ -16,60 +16,63 @@ from scipy.linalg import block_diag
 
 from mkpc_kaggle.geometry.intrinsics import KnownCamera
 from mkpc_kaggle.geometry.two_view import cross_matrix
-from mkpc_kaggle.scene.reconstruction import MAX_SIGMA_IMAGES, Sigmas
+from mkpc_kaggle.scene.models import MAX_SIGMA_IMAGES, Sigmas
 
 # The world is free, so the normal equations are singular
 DAMPED = pycolmap.BACovarianceOptions({"damping": 1e-3})
 
 
 def camera_sigmas(
-    found: Any, known: Mapping[str, KnownCamera] = MappingProxyType({})
+    model: Any, given_cameras: Mapping[str, KnownCamera] = MappingProxyType({})
 ) -> dict[str, Sigmas]:
     """Return the sigmas of registered images in pycolmap's reconstruction, by name; empty if
     unknown.
 
-    ``known`` are the user's cameras by image name: exact ones, and priors that add to the images' information.
+    ``given_cameras`` are the user's cameras by image name: exact ones, and priors that add to the
+    images' information.
     """
     images = [
-        image for _, image in sorted(found.images.items()) if image.has_pose and image.num_points3D
+        image for _, image in sorted(model.images.items()) if image.has_pose and image.num_points3D
     ]
     if not 1 < len(images) <= MAX_SIGMA_IMAGES:
         return {}
     ids = [image.image_id for image in images]
-    adjuster = evaluator(found, images, known)
+    adjuster = evaluator(model, images, given_cameras)
     fit = adjuster.solve().ceres_summary
     redundancy = fit.num_residuals - fit.num_effective_parameters + 7
-    solved: Any = redundancy > 0 and pycolmap.estimate_ba_covariance(DAMPED, found, adjuster)
+    solved: Any = redundancy > 0 and pycolmap.estimate_ba_covariance(DAMPED, model, adjuster)
     if not solved:
         return {}
     poses = np.block([[solved.get_cam_cross_cov_from_world(i, j) for j in ids] for i in ids])
     if not np.isfinite(poses).all():  # of a degenerate model
         return {}
-    focals = [_focal_variance(image.camera, known.get(image.name), solved) for image in images]
+    focals = [
+        _focal_variance(image.camera, given_cameras.get(image.name), solved) for image in images
+    ]
     variances = _pose_variances([image.cam_from_world().matrix() for image in images], poses)
     noise = 2 * fit.initial_cost / redundancy  # variance of a keypoint's coordinate, square pixels
     sigmas = np.sqrt(noise * np.column_stack([variances, focals])) * [np.degrees(1), 1, 100]
     for row, image in zip(sigmas, images, strict=True):
-        if image.name in known and known[image.name].sigma:
-            row[2] = combined(row[2], known[image.name].sigma)
+        if image.name in given_cameras and given_cameras[image.name].sigma:
+            row[2] = combined(row[2], given_cameras[image.name].sigma)
     # Later digits vary between calls
     rows = (Sigmas(*(float(f"{value:.4g}") for value in row)) for row in sigmas)
     return dict(zip((image.name for image in images), rows, strict=True))
 
 
-def evaluator(found: Any, images: Sequence[Any], known: Mapping[str, KnownCamera]) -> Any:
+def evaluator(model: Any, images: Sequence[Any], given_cameras: Mapping[str, KnownCamera]) -> Any:
     """Return a bundle adjustment of the images that evaluates the model and leaves it as it is."""
     config = pycolmap.BundleAdjustmentConfig()
     for image in images:
         config.add_image(image.image_id)
         # The user's exact cameras are no parameters.
-        if image.name in known and not known[image.name].sigma:
+        if image.name in given_cameras and not given_cameras[image.name].sigma:
             config.set_constant_cam_intrinsics(image.camera_id)
     # No iterations: the solver only evaluates the residuals.
     solver = {"max_num_iterations": 0, "num_threads": 1}
     ceres = {"use_gpu": False, "solver_options": solver}
     options = pycolmap.BundleAdjustmentOptions({"print_summary": False, "ceres": ceres})
-    return pycolmap.create_default_ceres_bundle_adjuster(options, config, found)
+    return pycolmap.create_default_ceres_bundle_adjuster(options, config, model)
 
 
 def _focal_variance(camera: Any, known: KnownCamera | None, solved: Any) -> float:

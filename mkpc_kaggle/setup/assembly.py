@@ -15,6 +15,7 @@ import cv2
 from mkpc_kaggle.data.masks import Masks
 from mkpc_kaggle.data.regions import GivenRegions
 from mkpc_kaggle.errors import UserError, warn_once
+from mkpc_kaggle.geometry.intrinsics import Rows
 from mkpc_kaggle.matchers.contract import Matcher, Placement, Precision
 from mkpc_kaggle.matchers.registry import (
     VISMATCH,
@@ -42,7 +43,7 @@ from mkpc_kaggle.setup.availability import (
     unavailable,
 )
 from mkpc_kaggle.setup.devices import AUTO, gpus_of, resolve_placement
-from mkpc_kaggle.weights import FoundFile, State, WeightStore
+from mkpc_kaggle.weights import FileState, FoundFile, WeightStore
 
 DEFAULT_SIDE_PX = 1024  # of a single matcher that no recipe has
 CUDA_MINIBATCH = 8  # pairs at a time; on a CPU, more than one gains nothing and takes memory
@@ -62,6 +63,7 @@ class Assembly:
     sharing: int = 1  # workers on the placement's device
     regions: GivenRegions = field(default_factory=dict)  # replace MKPC's regions
     masks: Masks = field(default_factory=Masks)
+    cameras: Rows = ()  # of images of scenes, as far as the user knows them
     # Stands for the version of a matcher without one, so that no later run has the same keys
     nonce: str = field(default_factory=lambda: uuid4().hex)
 
@@ -263,7 +265,7 @@ def _version_of_package(name: str) -> str:
 
 def _warn_of_unverified(files: Iterable[FoundFile]) -> None:
     """Warn of weights without a digest, if there are any."""
-    names = sorted(file.path.name for file in files if file.state is State.UNVERIFIED)
+    names = sorted(file.path.name for file in files if file.state is FileState.UNVERIFIED)
     if names:
         listed = ", ".join(names)
         warn_once(f"weights not verified: {listed}; `mkpc weights verify` says why")

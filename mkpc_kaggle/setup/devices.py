@@ -8,7 +8,7 @@ from typing import Any
 
 from mkpc_kaggle.errors import UserError, warn_once
 from mkpc_kaggle.matchers.contract import Placement, Precision
-from mkpc_kaggle.matchers.failures import DeviceError, FailureKind, failure_of, reason_of
+from mkpc_kaggle.matchers.failures import DeviceError, FailureKind, failure_kind, reason_of
 
 AUTO = "auto"
 ADVICE = "on Kaggle choose the accelerator GPU T4 x2, elsewhere try --device cpu"
@@ -126,7 +126,7 @@ def require_device(device: str) -> None:
         image = torch.ones(1, 1, 8, 8, device=device)
         torch.nn.functional.conv2d(image @ image, image[..., :3, :3]).sum().item()
     except Exception as error:
-        if failure_of(error) is FailureKind.OUT_OF_MEMORY:
+        if failure_kind(error) is FailureKind.OUT_OF_MEMORY:
             raise
         reason = reason_of(error).partition("\n")[0]
         raise DeviceError(f"{device} cannot be used ({reason}); {ADVICE}") from error

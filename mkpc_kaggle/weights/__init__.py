@@ -5,12 +5,12 @@ The import brings no torch.
 
 from mkpc_kaggle.weights.checkpoint import load_into, load_tensors
 from mkpc_kaggle.weights.manifest import UNVERIFIED, WeightFile
-from mkpc_kaggle.weights.store import FoundFile, State, WeightStore
+from mkpc_kaggle.weights.store import FileState, FoundFile, WeightStore
 
 __all__ = [
     "UNVERIFIED",
+    "FileState",
     "FoundFile",
-    "State",
     "WeightFile",
     "WeightStore",
     "load_into",

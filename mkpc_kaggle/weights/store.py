@@ -31,7 +31,7 @@ KAGGLE_INPUT = Path("/kaggle/input")
 MAX_POINTER_BYTES = 1 << 20  # web pages in the place of a file are smaller
 UNKNOWN_LICENCE = "unknown (own weights)"
 # A competition's input has thousands of images.
-IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png"})
+NOT_WEIGHTS = frozenset({".jpg", ".jpeg", ".png"})
 CHECKPOINT_SUFFIXES = frozenset({".pth", ".pt", ".ckpt", ".safetensors", ".bin", ".pkl", ""})
 # Weights of unknown size have about 50 MB; larger files are not read.
 MAX_UNKNOWN_SIZE_BYTES = 1 << 28
@@ -41,7 +41,7 @@ UNPACKED = (
 )
 
 
-class State(StrEnum):
+class FileState(StrEnum):
     """The result of comparing a file with the manifest."""
 
     GOOD = "good"  # bytes as in the manifest, under any name
@@ -60,17 +60,17 @@ class FoundFile:
 
     file: WeightFile
     path: Path
-    state: State
+    state: FileState
     digest: str
     note: str = ""
 
     @property
     def usable(self) -> bool:
-        return self.state is not State.REFUSED
+        return self.state is not FileState.REFUSED
 
 
 @dataclass(frozen=True)
-class Search:
+class FileSearch:
     """The result of a search: the file, if found, and refused files of the right name."""
 
     found: FoundFile | None
@@ -102,7 +102,7 @@ class WeightStore:
         self._given_files = files
         self._device = "cpu"
         self._chosen: dict[str, FoundFile] = {}  # by slot; they replace the results of searches
-        self._searches: dict[tuple[WeightFile, ...], Search] = {}
+        self._searches: dict[tuple[WeightFile, ...], FileSearch] = {}
         for slot, path in chosen.items():
             self._chosen[slot] = self._given(slot, path)
 
@@ -150,7 +150,7 @@ class WeightStore:
         # A file of the manifest keeps its licence; of other files it is unknown.
         same = (file for file in self.alternatives(slot) if file.digest == digest)
         own = WeightFile(path.name, size, digest, UNKNOWN_LICENCE, slot, str(path))
-        return FoundFile(next(same, own), path, State.GOOD, digest, "given for its slot")
+        return FoundFile(next(same, own), path, FileState.GOOD, digest, "given for its slot")
 
     def alternatives(self, slot: str) -> list[WeightFile]:
         """Return the manifest's lines for a slot, in order of preference."""
@@ -186,7 +186,7 @@ class WeightStore:
         other._chosen = self._chosen | {found.file.slot: found for found in chosen}
         return other
 
-    def search(self, lines: Sequence[WeightFile]) -> Search:
+    def search(self, lines: Sequence[WeightFile]) -> FileSearch:
         """Return the first usable file for these lines.
 
         Results are cached and sent to workers with the store.
@@ -201,7 +201,7 @@ class WeightStore:
                     break
             found = next((file for file in judged.values() if file.usable), None)
             refused = tuple(file for file in judged.values() if not file.usable)
-            self._searches[key] = Search(found, refused)
+            self._searches[key] = FileSearch(found, refused)
         return self._searches[key]
 
     def verify(self) -> list[FoundFile]:
@@ -227,7 +227,7 @@ class WeightStore:
                 alike = [path for path, size in sizes.items() if size == file.size]
             for path in alike:
                 found = judge(path, file)
-                if found.state is State.GOOD:
+                if found.state is FileState.GOOD:
                     yield found
         for file in lines:
             for directory in unpacked:
@@ -279,7 +279,7 @@ class WeightStore:
             # Shallow files win over deep ones of the same name, and the order is the same on all
             # file systems.
             for path in sorted(files, key=lambda path: (len(path.parts), path)):
-                if path.suffix.lower() not in IMAGE_SUFFIXES:
+                if path.suffix.lower() not in NOT_WEIGHTS:
                     sizes[path] = path.stat().st_size if os.path.isfile(path) else -1  # noqa: PTH113  never raises
         return sizes, unpacked
 
@@ -292,32 +292,32 @@ def judge(path: Path, file: WeightFile, files: Iterable[WeightFile] = ()) -> Fou
     try:
         unpacked = (path / "data.pkl").is_file()
         if path.is_dir() and not unpacked:
-            return FoundFile(file, path, State.REFUSED, "", "it is a directory")
+            return FoundFile(file, path, FileState.REFUSED, "", "it is a directory")
         size = path.stat().st_size
         if path.is_file() and size <= MAX_POINTER_BYTES and (what := no_checkpoint(path)):
-            return FoundFile(file, path, State.REFUSED, "", what)
+            return FoundFile(file, path, FileState.REFUSED, "", what)
         # Most wrong files have another size, and need not be read.
         length = plural(size, "byte")
         wrong_size = f"{length}, the manifest says {file.size}: truncated, or another file"
         if path.is_file() and not _may_be(size, file, files):
-            return FoundFile(file, path, State.REFUSED, "", wrong_size)
+            return FoundFile(file, path, FileState.REFUSED, "", wrong_size)
         digest = digest_of(path)
     except OSError as error:
-        return FoundFile(file, path, State.REFUSED, "", f"cannot be read: {error.strerror}")
+        return FoundFile(file, path, FileState.REFUSED, "", f"cannot be read: {error.strerror}")
     other = next((line.name for line in files if line.digest == digest), "")
-    state = State.REFUSED
+    state = FileState.REFUSED
     if digest == file.digest:
-        state = State.GOOD
+        state = FileState.GOOD
         note = "" if path.name == file.name else f"it is {file.name}"
     elif unpacked:
-        state = State.UNVERIFIED
+        state = FileState.UNVERIFIED
         note = UNPACKED
     elif other:
         note = f"it has the bytes of {other}"
     elif 0 <= file.size != size:
         note = wrong_size
     elif file.digest == UNVERIFIED:
-        state = State.UNVERIFIED
+        state = FileState.UNVERIFIED
         note = f"the manifest has no digest for it; this file's is {digest}"
     else:
         note = f"its digest is {digest}, the manifest says {file.digest}: damaged, or another file"

@@ -27,7 +27,7 @@ from mkpc_kaggle.recipe import SceneConfig
 from mkpc_kaggle.reporting.run_log import read_log
 from mkpc_kaggle.reporting.summary import summary, trouble
 from mkpc_kaggle.scene.choose import Reason
-from mkpc_kaggle.scene.reconstruct import Solution
+from mkpc_kaggle.scene.sfm import Solution
 
 
 def each(**changes: Any) -> Callable[[Sequence[Any]], Any]:
@@ -143,15 +143,15 @@ MATCHES: dict[str, Callable[[Any], Any]] = {
     "a time that is not finite": lambda answer: units(answer, match_seconds=float("nan")),
     "a negative time": lambda answer: units(answer, match_seconds=-1e6),
     "a number that JSON has not": lambda answer: units(answer, keypoints=np.int64(5)),
-    "a unit twice": lambda answer: tuple(replace(one, found=one.found * 2) for one in answer),
+    "a unit twice": lambda answer: tuple(replace(one, results=one.results * 2) for one in answer),
     "points that are not finite": lambda answer: tuple(
-        replace(one, found=tuple(map(with_nan, one.found))) for one in answer
+        replace(one, results=tuple(map(with_nan, one.results))) for one in answer
     ),
 }
 
 
 def units(answer: Any, **changes: Any) -> Any:
-    return tuple(replace(one, found=each(**changes)(one.found)) for one in answer)
+    return tuple(replace(one, results=each(**changes)(one.results)) for one in answer)
 
 
 def with_nan(found: Any) -> Any:

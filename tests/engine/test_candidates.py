@@ -20,14 +20,14 @@ from mkpc_kaggle.engine.request import Ending, RunReport
 from mkpc_kaggle.engine.session import Interrupt, Session, run_pairs
 from mkpc_kaggle.engine.store.records import Rival, Table
 from mkpc_kaggle.engine.store.tables import Store
-from mkpc_kaggle.engine.workers.worker import reconstruct
+from mkpc_kaggle.engine.workers.worker import compute_scene
 from mkpc_kaggle.recipe import Recipe, SceneConfig, Unit
 from mkpc_kaggle.reporting.run_log import read_log
 from mkpc_kaggle.reporting.summary import overview, summary
 from mkpc_kaggle.reporting.verdict import summary_table
 from mkpc_kaggle.scene.candidates import ALL_UNITS, SUPPORTED
 from mkpc_kaggle.scene.export import HeldDirectory, has_files
-from mkpc_kaggle.scene.reconstruct import Solution
+from mkpc_kaggle.scene.sfm import Solution
 from mkpc_kaggle.setup.assembly import assemble
 
 FIRST, _, LAST = (unit.name for unit in THREE_UNITS.units)
@@ -210,7 +210,7 @@ def test_files_of_colmap_are_those_of_the_chosen_candidate(tmp_path, monkeypatch
 
     def judge(job: SceneJob) -> Solution:
         jobs.append(job)
-        return replace(reconstruct(job), disagreement=float(job.candidate != units[1].name))
+        return replace(compute_scene(job), disagreement=float(job.candidate != units[1].name))
 
     scenes_by(monkeypatch, judge)
     pairs = synthetic_pairs(tmp_path / "images", 4)

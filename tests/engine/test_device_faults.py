@@ -32,7 +32,7 @@ from mkpc_kaggle.engine.request import Ending, RunReport
 from mkpc_kaggle.engine.workers.places import Place
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.matchers.contract import NonFiniteError, Placement, Precision
-from mkpc_kaggle.matchers.failures import DeviceError, FailureKind, failure_of, reason_of
+from mkpc_kaggle.matchers.failures import DeviceError, FailureKind, failure_kind, reason_of
 from mkpc_kaggle.pipeline.stages import Pipeline
 from mkpc_kaggle.recipe import Unit
 from mkpc_kaggle.reporting.summary import summary
@@ -70,14 +70,14 @@ def test_each_error_is_a_kind_of_failure_by_its_text():
         FailureKind.RAISED: ["shapes differ"],
     }
     for kind, texts in messages.items():
-        assert {failure_of(RuntimeError(text)) for text in texts} == {kind}
+        assert {failure_kind(RuntimeError(text)) for text in texts} == {kind}
     for error in (
         MemoryError(),
         torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB."),
     ):
-        assert failure_of(error) is FailureKind.OUT_OF_MEMORY
+        assert failure_kind(error) is FailureKind.OUT_OF_MEMORY
     for error in (ValueError("no points"), AssertionError()):
-        assert failure_of(error) is FailureKind.RAISED
+        assert failure_kind(error) is FailureKind.RAISED
     # One line for the report: without CUDA's advice, and with the unit's name.
     illegal = RuntimeError(cuda.format("an illegal memory access was encountered"))
     illegal.add_note("in 1:loftr@840")

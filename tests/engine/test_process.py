@@ -22,7 +22,7 @@ from mkpc_kaggle.engine.workers.process import WORKER_ENVIRONMENT, ProcessWorker
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.recipe import Recipe, SceneConfig, Unit
-from mkpc_kaggle.scene.reconstruct import Solution
+from mkpc_kaggle.scene.sfm import Solution
 from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair
 
 ROOT = Path(__file__).resolve().parents[2]

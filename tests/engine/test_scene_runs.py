@@ -36,7 +36,7 @@ from mkpc_kaggle.reporting.report import report_page
 from mkpc_kaggle.reporting.run_log import read_log
 from mkpc_kaggle.reporting.summary import overview, summary
 from mkpc_kaggle.scene.choose import Reason
-from mkpc_kaggle.scene.reconstruct import Solution
+from mkpc_kaggle.scene.sfm import Solution
 from mkpc_kaggle.scene.view_graph import BatchPair
 
 RECIPE = replace(THREE_UNITS, scene=SceneConfig())

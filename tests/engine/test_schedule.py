@@ -30,20 +30,20 @@ from mkpc_kaggle.engine.plan.budget import Budget, Costs
 from mkpc_kaggle.engine.plan.schedule import (
     Crew,
     NextWork,
-    View,
+    Snapshot,
     next_work,
     outlook,
     prefix_that_fits,
     upcoming_pairs,
 )
 from mkpc_kaggle.engine.plan.state import State
-from mkpc_kaggle.engine.reconstructing import scene_failures
 from mkpc_kaggle.engine.request import Ending, Request
+from mkpc_kaggle.engine.scenes import scene_failures
 from mkpc_kaggle.engine.store.keys import Keys
 from mkpc_kaggle.engine.store.tables import Kind, Store
 from mkpc_kaggle.recipe import SceneConfig, Unit
 from mkpc_kaggle.scene.choose import Choice, Reason
-from mkpc_kaggle.scene.reconstruct import Solution
+from mkpc_kaggle.scene.sfm import Solution
 
 DIED = Failure(Cause.DIED, "signal SIGKILL")
 UNITS = THREE_UNITS.units
@@ -226,8 +226,8 @@ def test_better_crops_come_after_all_units_that_fit_and_with_them_the_prefix_tak
     assert prefix_that_fits(view_of(tight)) == 2
 
 
-def view_of(run: Run) -> View:
-    return View(run.state, run.costs, run.budget, run.crew, 0.0)
+def view_of(run: Run) -> Snapshot:
+    return Snapshot(run.state, run.costs, run.budget, run.crew, 0.0)
 
 
 def test_a_first_unit_that_never_runs_leaves_the_sweep_to_the_next_of_stage_1():

@@ -29,10 +29,10 @@ from mkpc_kaggle.engine.matching import Matching
 from mkpc_kaggle.engine.plan.budget import Budget, Costs
 from mkpc_kaggle.engine.plan.state import State
 from mkpc_kaggle.engine.publication import Publication
-from mkpc_kaggle.engine.reconstructing import Reconstructing
 from mkpc_kaggle.engine.request import Ending, Request
 from mkpc_kaggle.engine.restore import restore
 from mkpc_kaggle.engine.run import EventLog, Run
+from mkpc_kaggle.engine.scenes import SceneWork
 from mkpc_kaggle.engine.store import tables as store_module
 from mkpc_kaggle.engine.store.dataframes import results
 from mkpc_kaggle.engine.store.image_files import file_result, stored_digests
@@ -49,8 +49,8 @@ from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.recipe import Recipe, SceneConfig, Unit
 from mkpc_kaggle.reporting.run_log import read_log, write_csv
 from mkpc_kaggle.scene.choose import Choice, Reason
-from mkpc_kaggle.scene.reconstruct import Solution
-from mkpc_kaggle.scene.reconstruction import Reconstruction, RegisteredImage, SfmModel, Sigmas
+from mkpc_kaggle.scene.models import Reconstruction, RegisteredImage, SfmModel, Sigmas
+from mkpc_kaggle.scene.sfm import Solution
 from mkpc_kaggle.scene.view_graph import BatchImage
 
 F = np.arange(1.0, 10.0).reshape(3, 3)
@@ -134,7 +134,7 @@ class Room:
             *[Choice(None, Reason.UNREGISTERED)] * (len(indices) - 1),
         ]
         answer = Solution((Reconstruction(tuple(sigmas), (model,)),), tuple(choices))
-        reconstructing = Reconstructing(self.run)
+        reconstructing = SceneWork(self.run)
         reconstructing.save(reconstructing.job("one"), answer, 1.5)
 
     def publish(self) -> None:

@@ -35,9 +35,9 @@ def test_a_minibatch_that_would_not_end_in_time_gets_smaller_or_does_not_begin(
         seconds=seconds,
         pairs=tuple(pairs[:8]),
         names=tuple((pair.file0, pair.file1) for pair in pairs[:8]),
-        known=((),) * 8,
+        stage_1=((),) * 8,
         crops=((),) * 8,
     )
     answer = runner(job)
     assert matcher.sizes == sizes
-    assert sum(bool(outcome.found) for outcome in answer) == sum(sizes)
+    assert sum(bool(outcome.results) for outcome in answer) == sum(sizes)

@@ -13,7 +13,7 @@ from packaging.requirements import Requirement
 from shared import DATA, WEIGHTS, problems_of
 
 from mkpc_kaggle.package.metadata import COMPETITION
-from mkpc_kaggle.package.package import Request, make_package
+from mkpc_kaggle.package.package import PackageRequest, make_package
 from mkpc_kaggle.package.wheels import PYTHONS
 
 NOTEBOOKS = sorted((Path(__file__).resolve().parents[2] / "notebooks").glob("*.ipynb"))
@@ -50,7 +50,9 @@ class Kaggle:
         (self.test_dir / "test_images").symlink_to(test_dir / "test_images")
 
     def add_dataset(self, packaged: Path, weights: tuple[Path, ...] = ()) -> None:
-        make_package(Request(packaged, "someone", weights, (python_version(),), self._wheels))
+        make_package(
+            PackageRequest(packaged, "someone", weights, (python_version(),), self._wheels)
+        )
         upload(packaged / "dataset", self.dataset)
         self.notebook = packaged / "kernel" / "submission.ipynb"
 

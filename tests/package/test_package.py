@@ -22,7 +22,7 @@ from mkpc_kaggle import __version__
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.package import package
 from mkpc_kaggle.package.files import licence_text
-from mkpc_kaggle.package.package import Package, Request, find_checkout, make_package
+from mkpc_kaggle.package.package import Package, PackageRequest, find_checkout, make_package
 from mkpc_kaggle.package.wheels import BUNDLED, build_wheel, install_lines, pins
 from mkpc_kaggle.weights import load_tensors, store
 from mkpc_kaggle.weights.manifest import read_manifest
@@ -53,15 +53,15 @@ def own_manifest(tmp_path_factory: pytest.TempPathFactory, built_once: None) -> 
         yield
 
 
-def request_of(directory: Path, wheels: Path) -> Request:
+def request_of(directory: Path, wheels: Path) -> PackageRequest:
     # Renamed files are packaged under the manifest's name.
     weights = put(directory / "weights", "another_name.pt", DATA)
     put(weights, "kept.pt", OTHER)
-    return Request(directory / "out", "someone", (weights,), (python_version(),), wheels)
+    return PackageRequest(directory / "out", "someone", (weights,), (python_version(),), wheels)
 
 
 @pytest.fixture
-def wanted(tmp_path: Path, wheels: Path) -> Request:
+def wanted(tmp_path: Path, wheels: Path) -> PackageRequest:
     return request_of(tmp_path, wheels)
 
 

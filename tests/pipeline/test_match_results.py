@@ -89,9 +89,9 @@ def test_keypoints_have_the_points_of_matches_at_their_indices():
     assert keypoints.descriptors0 is None
     # Of one unit: the numbers that its result states.
     for result in match.results:
-        assert len(result.found.points0) == result.keypoints
+        assert len(result.detected.points0) == result.keypoints
         np.testing.assert_array_equal(
-            result.found.points1[result.found.indices[:, 1]], result.matches.points1
+            result.detected.points1[result.detected.indices[:, 1]], result.matches.points1
         )
 
 

@@ -19,7 +19,7 @@ from mkpc_kaggle.reconstruction.folder import (
     read_pair_list,
 )
 from mkpc_kaggle.reconstruction.outputs import submission_rows
-from mkpc_kaggle.scene.reconstruction import RegisteredImage
+from mkpc_kaggle.scene.models import RegisteredImage
 from mkpc_kaggle.scene.view_graph import BatchImage
 
 

@@ -21,7 +21,7 @@ from mkpc_kaggle.engine.plan.budget import Budget
 from mkpc_kaggle.engine.request import Ending
 from mkpc_kaggle.engine.session import Interrupt, Session
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.geometry.intrinsics import KnownCamera, read
+from mkpc_kaggle.geometry.intrinsics import KnownCamera, Rows
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.reconstruction.folder import read_folder
 from mkpc_kaggle.reconstruction.outputs import camera_rows
@@ -39,7 +39,7 @@ def run(
     out: Path,
     matcher: MixedMatcher | None = None,
     *,
-    known: str = "",
+    known: Rows = (),
     masks: Masks | None = None,
     interrupt: Interrupt | None = None,
     budget: Budget | None = None,
@@ -52,9 +52,8 @@ def run(
         workers=0,
     )
     assembly = assemble(RECIPE, matchers={"synthetic": matcher or MixedMatcher()}, device="cpu")
-    assembly = replace(
-        assembly, recipe=for_cameras(assembly.recipe, None, known), masks=masks or Masks()
-    )
+    recipe = for_cameras(assembly.recipe)
+    assembly = replace(assembly, recipe=recipe, masks=masks or Masks(), cameras=known)
     return reconstruct_folder(root, read_folder(root), assembly, session, out)
 
 
@@ -165,7 +164,7 @@ def test_a_principal_point_off_the_middle_is_warned_of_once_unless_the_size_is_s
     root = write_flat(tmp_path / "images", 3)
     file = tmp_path / "known.csv"
     file.write_text(table)
-    assert len(read(read_intrinsics_table(file, root, sorted(root.iterdir())))) == 1
+    assert len(read_intrinsics_table(file, root, sorted(root.iterdir()))) == 1
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == len(warnings)
     assert all(text in line for text, line in zip(warnings, lines, strict=True))
@@ -382,7 +381,7 @@ def test_the_table_is_read_in_the_order_of_its_rows(tmp_path):
             ("*", "SIMPLE_PINHOLE", "850 400 300", "5"),
         ]
         csv.writer(stream).writerows([HEAD.strip().split(","), *rows])
-    known = read(read_intrinsics_table(file, root, sorted(root.rglob("*.png"))))
+    known = read_intrinsics_table(file, root, sorted(root.rglob("*.png")))
     assert known[0] == ("set/00.png", KnownCamera("OPENCV", (900, 901, 400, 300, 0.1, 0, 0, 0)))
     assert known[1] == ("*", KnownCamera("SIMPLE_PINHOLE", (850, 400, 300), 5.0))
 

@@ -49,7 +49,7 @@ from mkpc_kaggle.scene.likeness import (
     overlapping,
     shortlist,
 )
-from mkpc_kaggle.scene.reconstruction import RegisteredImage
+from mkpc_kaggle.scene.models import RegisteredImage
 from mkpc_kaggle.setup.assembly import assemble
 
 RECIPE = for_cameras(Recipe((Unit(1, "synthetic", SIZE.width),), magsac=QUICK))

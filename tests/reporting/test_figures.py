@@ -15,7 +15,7 @@ from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, Estimate, ModelKin
 from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
 from mkpc_kaggle.recipe import Unit
 from mkpc_kaggle.reporting.figures import draw_cameras, draw_strip, encode
-from mkpc_kaggle.scene.reconstruction import RegisteredImage, SfmModel
+from mkpc_kaggle.scene.models import RegisteredImage, SfmModel
 from mkpc_kaggle.scene.view_graph import BatchImage
 
 SIZE0 = Size(120, 80)

@@ -8,7 +8,7 @@ from mkpc_kaggle.engine.store.records import PairRecord, SceneRecord, UnitRecord
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.reporting.verdict import nearest_to_joining
-from mkpc_kaggle.scene.reconstruction import RegisteredImage, SfmModel
+from mkpc_kaggle.scene.models import RegisteredImage, SfmModel
 from mkpc_kaggle.scene.view_graph import BatchImage
 
 

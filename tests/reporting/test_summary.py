@@ -31,7 +31,7 @@ from mkpc_kaggle.reporting.summary import (
 )
 from mkpc_kaggle.reporting.verdict import verdict
 from mkpc_kaggle.scene.choose import Choice, Reason
-from mkpc_kaggle.scene.reconstruction import RegisteredImage, SfmModel, Sigmas
+from mkpc_kaggle.scene.models import RegisteredImage, SfmModel, Sigmas
 from mkpc_kaggle.scene.view_graph import BatchImage
 
 # As a run leaves a pair that it had no time for

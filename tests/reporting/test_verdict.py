@@ -32,16 +32,16 @@ from mkpc_kaggle.recipe import Recipe, Unit
 from mkpc_kaggle.reporting import contradictions, verdict
 from mkpc_kaggle.reporting.run_log import RunLog
 from mkpc_kaggle.scene.choose import Choice, Reason
-from mkpc_kaggle.scene.reconstruction import (
+from mkpc_kaggle.scene.models import (
     HARDLY_MOVED,
     MAX_SIGMA_IMAGES,
     Comparison,
     DistortedLens,
     FocalContradiction,
+    FocalSource,
     RegisteredImage,
     SfmModel,
     Sigmas,
-    Source,
 )
 from mkpc_kaggle.scene.view_graph import BatchImage
 
@@ -146,10 +146,10 @@ SPEAKS = {
     "uncertain cameras: 1.jpg; add": log(scene(model(GOOD, Sigmas(0.1, 0.021, 1), GOOD, GOOD))),
     "uncertain cameras: 0.jpg; add": log(scene(model((), GOOD, GOOD, GOOD))),
     "the focal length of 287 px in --intrinsics contradicts the photographs, which fit 575 px": (
-        compared(FocalContradiction(Source.INTRINSICS, ("0.jpg",), 287.4, 574.9))
+        compared(FocalContradiction(FocalSource.INTRINSICS, ("0.jpg",), 287.4, 574.9))
     ),
     "the focal length of 1150 px in EXIF contradicts the photographs, which fit 575 px: 0.jpg; the": (
-        compared(FocalContradiction(Source.EXIF, ("0.jpg",), 1150.0, 575.0))
+        compared(FocalContradiction(FocalSource.EXIF, ("0.jpg",), 1150.0, 575.0))
     ),
     "the lens of 4 photographs is distorted by 1.5 % at the edge": compared(
         DistortedLens(tuple(NAMES), -0.0154, RADIAL)

@@ -17,7 +17,7 @@ from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.reporting.points import clouds_of
 from mkpc_kaggle.reporting.view import point_colours, show, view_data
-from mkpc_kaggle.scene.reconstruction import MAX_POINTS, RegisteredImage, SfmModel, Sigmas
+from mkpc_kaggle.scene.models import MAX_POINTS, RegisteredImage, SfmModel, Sigmas
 from mkpc_kaggle.scene.view_graph import BatchImage
 
 SIZE = Size(400, 300)

@@ -14,7 +14,7 @@ from mkpc_kaggle.scene.adjustment import (
     remove_uncertain_points,
     two_view_points,
 )
-from mkpc_kaggle.scene.reconstruct import reconstruct_batch
+from mkpc_kaggle.scene.sfm import reconstruct_batch
 
 
 @pytest.fixture

@@ -17,7 +17,7 @@ from mkpc_kaggle.scene.align import (
     read_reference,
     write_reference,
 )
-from mkpc_kaggle.scene.reconstruction import Reconstruction, RegisteredImage, SfmModel
+from mkpc_kaggle.scene.models import Reconstruction, RegisteredImage, SfmModel
 from mkpc_kaggle.scene.view_graph import BatchImage
 
 # Far from the identity in scale, rotation and translation, so that an omitted part shows.

@@ -13,7 +13,7 @@ from mkpc_kaggle.reconstruction.run import for_cameras
 from mkpc_kaggle.scene.colmap import write_files
 from mkpc_kaggle.scene.export import HeldDirectory
 from mkpc_kaggle.scene.keypoints import MergedGraph
-from mkpc_kaggle.scene.reconstruct import reconstruct_batch, reconstruct_sharing
+from mkpc_kaggle.scene.sfm import reconstruct_batch, reconstruct_sharing
 from mkpc_kaggle.scene.shared_intrinsics import given_intrinsics
 from mkpc_kaggle.scene.view_graph import BatchImage, ViewGraph
 

@@ -14,12 +14,12 @@ from mkpc_kaggle.scene.candidates import (
     ALL_UNITS,
     SUPPORTED,
     best_of,
+    candidate_settings,
     candidate_tracks,
     candidates_of,
     disagreement,
-    settings_of,
 )
-from mkpc_kaggle.scene.reconstruction import RegisteredImage, SfmModel
+from mkpc_kaggle.scene.models import RegisteredImage, SfmModel
 from mkpc_kaggle.scene.view_graph import tracks_of
 
 MANY, FEW = Unit(1, "many", 640), Unit(1, "few", 640)
@@ -112,10 +112,10 @@ def test_a_candidate_of_one_unit_has_the_tracks_of_that_unit():
 
 def test_only_the_candidate_of_supported_edges_leaves_out_others():
     config = SceneConfig()
-    assert settings_of(ALL_UNITS, config) == settings_of(MANY.name, config) == config
-    assert settings_of(SUPPORTED, config).min_support > 0
+    assert candidate_settings(ALL_UNITS, config) == candidate_settings(MANY.name, config) == config
+    assert candidate_settings(SUPPORTED, config).min_support > 0
     strict = SceneConfig(min_support=0.5)
-    assert settings_of(SUPPORTED, strict) == strict
+    assert candidate_settings(SUPPORTED, strict) == strict
 
 
 def test_the_first_candidate_stays_unless_another_is_clearly_better():

@@ -9,13 +9,13 @@ import pytest
 from benchmarks.synthetic_scene import SIZE, SyntheticScene, synthetic_scene
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.scene.choose import Choice, Reason, choose
-from mkpc_kaggle.scene.reconstruct import models_of
-from mkpc_kaggle.scene.reconstruction import (
+from mkpc_kaggle.scene.models import (
     Reconstruction,
     RegisteredImage,
     SfmModel,
     filter_models,
 )
+from mkpc_kaggle.scene.sfm import models_of
 from mkpc_kaggle.scene.view_graph import BatchImage
 
 

@@ -9,12 +9,12 @@ import pycolmap
 import pytest
 
 from benchmarks.synthetic_scene import SIZE, synthetic_scene
-from mkpc_kaggle.geometry.intrinsics import KnownCamera, written
+from mkpc_kaggle.geometry.intrinsics import KnownCamera
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.recipe import SceneConfig
-from mkpc_kaggle.scene.comparison import compare
-from mkpc_kaggle.scene.reconstruct import models_of, reconstruct_sharing
-from mkpc_kaggle.scene.reconstruction import Comparison, SfmModel, Source
+from mkpc_kaggle.scene.comparison import compare_with_photographs
+from mkpc_kaggle.scene.models import Comparison, FocalSource, SfmModel
+from mkpc_kaggle.scene.sfm import models_of, reconstruct_sharing
 from mkpc_kaggle.scene.view_graph import BatchPair, ViewGraph
 
 FOCAL = 840.0
@@ -45,8 +45,8 @@ def pairs_of(k: float = 0.0, exif: float = 0.0) -> list[BatchPair]:
 
 
 def model_of(pairs: list[BatchPair], *rows: tuple[str, KnownCamera]) -> SfmModel:
-    config = SceneConfig(intrinsics=written(rows))
-    found, _ = reconstruct_sharing(ViewGraph.of_pairs(pairs), config)
+    graph = ViewGraph.of_pairs(pairs).with_intrinsics(rows)
+    found, _ = reconstruct_sharing(graph, SceneConfig())
     (model,) = models_of(found)
     assert len(model.images) == 6
     return model
@@ -86,7 +86,7 @@ def test_a_wrong_focal_length_of_the_user_is_found_with_the_right_one(factor, si
     model = model_of(pairs_of(), pinhole(factor * FOCAL, sigma))
     (focal,) = model.comparison.focals
     assert model.comparison.lenses == ()
-    assert (focal.source, len(focal.images)) == (Source.INTRINSICS, 6)
+    assert (focal.source, len(focal.images)) == (FocalSource.INTRINSICS, 6)
     assert focal.given == pytest.approx(factor * FOCAL)
     assert focal.fitted == pytest.approx(FOCAL, rel=0.1)
 
@@ -94,7 +94,7 @@ def test_a_wrong_focal_length_of_the_user_is_found_with_the_right_one(factor, si
 def test_a_wrong_focal_length_of_exif_is_found_unless_the_user_knows_the_camera():
     model = model_of(pairs_of(exif=1.5 * FOCAL))
     (focal,) = model.comparison.focals
-    assert (focal.source, len(focal.images)) == (Source.EXIF, 6)
+    assert (focal.source, len(focal.images)) == (FocalSource.EXIF, 6)
     assert focal.given == pytest.approx(1.5 * FOCAL)
     assert focal.fitted == pytest.approx(FOCAL, rel=0.02)
     assert model_of(pairs_of(exif=1.5 * FOCAL), pinhole(FOCAL)).comparison == Comparison()
@@ -103,7 +103,7 @@ def test_a_wrong_focal_length_of_exif_is_found_unless_the_user_knows_the_camera(
 def test_the_comparison_leaves_the_model_as_it_is():
     model = model_of(pairs_of(-0.1))
     before = pycolmap.Reconstruction(model.colmap)
-    compare(model, {})
+    compare_with_photographs(model, {})
     for number, camera in before.cameras.items():
         assert model.colmap.cameras[number].model == camera.model
         np.testing.assert_array_equal(model.colmap.cameras[number].params, camera.params)

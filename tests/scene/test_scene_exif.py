@@ -7,8 +7,8 @@ import pytest
 from benchmarks.synthetic_scene import synthetic_scene
 from mkpc_kaggle.recipe import SceneConfig
 from mkpc_kaggle.scene import colmap
-from mkpc_kaggle.scene.reconstruct import models_of, reconstruct_sharing
-from mkpc_kaggle.scene.reconstruction import Source
+from mkpc_kaggle.scene.models import FocalSource
+from mkpc_kaggle.scene.sfm import models_of, reconstruct_sharing
 from mkpc_kaggle.scene.view_graph import BatchPair, ViewGraph
 
 FOCAL = 840.0
@@ -50,7 +50,7 @@ def test_all_cameras_are_found_in_spite_of_a_wrong_exif_and_it_is_named(mappings
     for each in model.images:
         assert each.focal == pytest.approx(FOCAL, rel=0.01)
     (focal,) = model.comparison.focals
-    assert focal.source is Source.EXIF
+    assert focal.source is FocalSource.EXIF
     assert focal.given == pytest.approx(factor * FOCAL)
 
 

@@ -7,9 +7,9 @@ import pytest
 
 from benchmarks.synthetic_scene import SIZE, batch_of, front, looking, synthetic_scene
 from mkpc_kaggle.recipe import SceneConfig
+from mkpc_kaggle.scene.models import HARDLY_MOVED, Comparison, Reconstruction
 from mkpc_kaggle.scene.motion import intrinsics, is_rotation
-from mkpc_kaggle.scene.reconstruct import reconstruct_sharing
-from mkpc_kaggle.scene.reconstruction import HARDLY_MOVED, Comparison, Reconstruction
+from mkpc_kaggle.scene.sfm import reconstruct_sharing
 from mkpc_kaggle.scene.view_graph import BatchPair, ViewGraph
 
 FOCAL = 840.0

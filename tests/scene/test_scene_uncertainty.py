@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.synthetic_scene import SyntheticScene, synthetic_scene
 from mkpc_kaggle.recipe import CameraSharing, SceneConfig
-from mkpc_kaggle.scene.reconstruct import reconstruct_batch
-from mkpc_kaggle.scene.reconstruction import SfmModel
+from mkpc_kaggle.scene.models import SfmModel
+from mkpc_kaggle.scene.sfm import reconstruct_batch
 from mkpc_kaggle.scene.uncertainty import camera_sigmas
 
 

@@ -21,15 +21,15 @@ from mkpc_kaggle.engine.jobs import SceneJob
 from mkpc_kaggle.engine.workers import places
 from mkpc_kaggle.engine.workers.places import LocalSite, Place, Work
 from mkpc_kaggle.engine.workers.process import ThreadWorker
-from mkpc_kaggle.engine.workers.worker import MatchRunner, reconstruct
+from mkpc_kaggle.engine.workers.worker import MatchRunner, compute_scene
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import Picture
 from mkpc_kaggle.pipeline.stages import Pipeline
 from mkpc_kaggle.scene.choose import Choice, Reason
-from mkpc_kaggle.scene.reconstruct import Solution
-from mkpc_kaggle.scene.reconstruction import Reconstruction, RegisteredImage, SfmModel, Sigmas
+from mkpc_kaggle.scene.models import Reconstruction, RegisteredImage, SfmModel, Sigmas
+from mkpc_kaggle.scene.sfm import Solution
 from mkpc_kaggle.scene.view_graph import BatchImage
 from mkpc_kaggle.setup.assembly import Assembly
 
@@ -201,13 +201,13 @@ def die_within_pycolmap(job: SceneJob) -> Solution:
 
     # As after an assertion in its C++ code: no exception reaches Python.
     pycolmap.GlobalPipeline = lambda *_: die()
-    return reconstruct(job)
+    return compute_scene(job)
 
 
 def scene_in_a_gigabyte(job: SceneJob) -> Solution:
     """All that it may have; libraries that are only mapped are not counted."""
     resource.setrlimit(resource.RLIMIT_DATA, (1 << 30, 1 << 30))
-    return reconstruct(job)
+    return compute_scene(job)
 
 
 def thread_place(

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine import light, matching, reconstructing
+from mkpc_kaggle.engine import light, matching, scenes
 from mkpc_kaggle.engine.jobs import (
     Answer,
     Cause,
@@ -48,7 +48,7 @@ from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.recipe import Recipe, SceneConfig, Unit
 from mkpc_kaggle.scene.choose import Choice, Reason
-from mkpc_kaggle.scene.reconstruct import Solution
+from mkpc_kaggle.scene.sfm import Solution
 from mkpc_kaggle.scene.view_graph import BatchImage
 
 RESTART_S = 8.0  # imports and loading of a worker, about as long as with torch
@@ -70,9 +70,7 @@ MECHANISMS: dict[str, tuple[tuple[object, str, object], ...]] = {
     "latest costs": ((budget, "WINDOW", 10**9),),
     "short jobs": ((schedule, "JOB_SHARE", math.inf),),
     "connect share": ((schedule, "CONNECT_SHARE", 1.0),),
-    "patience": tuple(
-        (kind, "HANG_FACTOR", math.inf) for kind in (matching, light, reconstructing)
-    ),
+    "patience": tuple((kind, "HANG_FACTOR", math.inf) for kind in (matching, light, scenes)),
     "second try": ((blame, "MAX_TRIES", 1),),
     "end of tries": ((matching, "MAX_FAILED_PAIRS", 10**9),),
 }

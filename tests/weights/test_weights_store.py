@@ -12,9 +12,9 @@ from weight_files import DATA, OTHER, digest_of, line, put
 
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.matchers.registry import matcher_names, spec_of
-from mkpc_kaggle.weights import UNVERIFIED, State, WeightStore, load_tensors, store
+from mkpc_kaggle.weights import UNVERIFIED, FileState, WeightStore, load_tensors, store
 from mkpc_kaggle.weights import manifest as manifest_module
-from mkpc_kaggle.weights.checkpoint import convert
+from mkpc_kaggle.weights.checkpoint import convert_file
 from mkpc_kaggle.weights.manifest import WeightFile, manifest, parse_manifest
 from mkpc_kaggle.weights.manifest import digest_of as file_digest
 
@@ -68,7 +68,7 @@ def test_a_renamed_file_is_found_by_its_size_and_digest(tmp_path, monkeypatch):
     put(tmp_path, "same size.dat", OTHER)
     put(tmp_path, "long.pth", DATA + b"!")
     found = WeightStore([tmp_path], [line()]).find("slot")
-    assert (found.path.name, found.state, found.note) == ("model", State.GOOD, "it is a.bin")
+    assert (found.path.name, found.state, found.note) == ("model", FileState.GOOD, "it is a.bin")
     # Another size cannot have the digest, so gigabytes stay unread.
     assert "long.pth" not in {path.name for path in read}
 
@@ -120,10 +120,10 @@ def test_an_unpacked_checkpoint_is_found_and_read(tmp_path, outer):
     weights = WeightStore([tmp_path / "input"], [file])
     found = weights.find("slot")
     # The digest of the file cannot be computed from its parts.
-    assert found.state is State.UNVERIFIED
+    assert found.state is FileState.UNVERIFIED
     assert found.path == tmp_path / "input" / "someones" / outer / "x"
     assert weights.load("slot").keys() == tensors.keys()
-    assert found.digest in convert(found.path, tmp_path / "x.safetensors").source
+    assert found.digest in convert_file(found.path, tmp_path / "x.safetensors").source
     loaded = load_tensors(tmp_path / "x.safetensors")
     assert all(torch.equal(loaded[name], tensor) for name, tensor in tensors.items())
     record = found.path / "data" / "0"
@@ -173,7 +173,7 @@ def test_a_pipe_or_a_broken_link_is_passed_over(tmp_path, kind):
     says = r"passed over: .*a\.bin: cannot be read: (No such|not a regular) file"
     with pytest.warns(UserWarning, match=says):
         assert weights.find("slot") is None
-    assert [file.state for file in weights.verify()] == [State.REFUSED]
+    assert [file.state for file in weights.verify()] == [FileState.REFUSED]
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ One rule serves every cause: a device that fails, a worker that dies or hangs, m
 
 Both can be told apart only if a place gets other items after a loss. Until its next answer, a place
 gets no pair with a unit that was lost before, and before its third loss an item that worked before
-(:func:`mkpc_kaggle.engine.plan.schedule.trial_job`).
+(:func:`mkpc_kaggle.engine.plan.schedule.trial_plan`).
 """
 
 from collections import Counter, deque

@@ -16,11 +16,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mkpc_kaggle.engine.jobs import MatchJob, Phase
+from mkpc_kaggle.engine.jobs import MatchPlan, Phase
 from mkpc_kaggle.engine.plan.blame import MAX_LOSSES, Item
 from mkpc_kaggle.engine.plan.budget import ESTIMATE, Budget, Costs, format_duration
 from mkpc_kaggle.engine.plan.state import Mask, State
 from mkpc_kaggle.errors import plural
+from mkpc_kaggle.recipe import Unit
 
 # Maximum share of the time after the sweep for extra pairs: they only serve scenes.
 CONNECT_SHARE = 0.1
@@ -61,7 +62,7 @@ class NextWork:
     pairs.
     """
 
-    match: MatchJob | None
+    match: MatchPlan | None
     estimates: tuple[int, ...]
     scenes: tuple[str, ...]
     # Of scenes that have their first candidate: (batch, candidate)
@@ -73,7 +74,7 @@ class NextWork:
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class Snapshot:
     """Inputs of the rules below at one moment: the state, and values computed from it once."""
 
     state: State
@@ -110,14 +111,14 @@ def next_work(
     """Return what to do next. ``lost`` are the jobs that the place of the next match job lost since
     its last answer.
     """
-    view = View(state, costs, budget, crew, now)
-    fit = prefix_that_fits(view)
-    connecting = pairs_to_connect(view)
-    phases = phases_of(view, fit, connecting)
+    snapshot = Snapshot(state, costs, budget, crew, now)
+    fit = prefix_that_fits(snapshot)
+    connecting = pairs_to_connect(snapshot)
+    phases = phases_of(snapshot, fit, connecting)
     # A unit that would not end in time does not begin. An unmeasured unit may: its cost is 0 so far.
     wanted = phases.copy(order="F")
     for number, unit in enumerate(state.units):
-        if costs.mean(unit.name) >= view.stop - now:
+        if costs.mean(unit.name) >= snapshot.stop - now:
             wanted[:, number] = NEVER
     # The most urgent phase of each pair, and of the pairs that no worker has now
     first = wanted.min(1)
@@ -126,12 +127,12 @@ def next_work(
     match = None
     if phase is not Phase.NEVER and crew.can_match:
         # A job takes the units of its phase and of earlier phases, which other pairs have finished.
-        match = trial_job(view, wanted, lost) if lost else None
+        match = trial_plan(snapshot, wanted, lost) if lost else None
         if match is None:
-            match = match_job(view, phase, wanted <= phase, best == phase)
+            match = match_plan(snapshot, phase, wanted <= phase, best == phase)
     is_matching = match is not None or bool(state.matching.any())
-    estimates = estimates_due(view, first)
-    scenes = scenes_due(view, phase, first, estimates, is_matching=is_matching)
+    estimates = estimates_due(snapshot, first)
+    scenes = scenes_due(snapshot, phase, first, estimates, is_matching=is_matching)
     # The share of the phase that is done. Pairs under way are not done.
     pairs = phases[: state.rows]
     total = state.rows
@@ -140,17 +141,17 @@ def next_work(
         total = int(connecting.sum())
     pending = int((pairs.min(1) <= phase).sum()) if pairs.size else 0
     order = tuple(estimates.tolist())
-    candidates = candidates_due(view, estimates, is_matching=is_matching)
+    candidates = candidates_due(snapshot, estimates, is_matching=is_matching)
     return NextWork(match, order, scenes, candidates, phase, total - pending, total, fit)
 
 
 # Matching
 
 
-def phases_of(view: View, fit: int, connecting: Mask) -> NDArray[Any]:
+def phases_of(snapshot: Snapshot, fit: int, connecting: Mask) -> NDArray[Any]:
     """Return the phase (N, U) of each pair's missing units; ``NEVER`` for the other units."""
-    state = view.state
-    phases = np.full(view.missing.shape, NEVER, np.int8, order="F")
+    state = snapshot.state
+    phases = np.full(snapshot.missing.shape, NEVER, np.int8, order="F")
     rows = phases[: state.rows]
     for number in range(len(state.units)):
         rows[:, number] = Phase.DEEPEN if number < fit else FILL
@@ -163,7 +164,7 @@ def phases_of(view: View, fit: int, connecting: Mask) -> NDArray[Any]:
     phases[state.rows :, sweep][connecting] = Phase.CONNECT
     # A pair that cost two workers may cost two more for each unit, so all others come first.
     phases[state.costly] = np.maximum(phases[state.costly], FILL)
-    phases[~view.missing] = NEVER
+    phases[~snapshot.missing] = NEVER
     return phases
 
 
@@ -175,22 +176,22 @@ def sweeping_unit(state: State) -> int:
     return int(next(iter([*first, *usable]), 0))
 
 
-def prefix_that_fits(view: View) -> int:
+def prefix_that_fits(snapshot: Snapshot) -> int:
     """Return the length of the longest prefix of the recipe that all rows can have in the time
     left.
     """
-    left = view.left * view.crew.matchers
+    left = snapshot.left * snapshot.crew.matchers
     if left <= 0:  # an unmeasured unit needs no time, but fits no more
         return 0
-    return int(np.searchsorted(seconds_of_prefixes(view), left, side="right"))
+    return int(np.searchsorted(seconds_of_prefixes(snapshot), left, side="right"))
 
 
-def seconds_of_prefixes(view: View) -> NDArray[np.float64]:
+def seconds_of_prefixes(snapshot: Snapshot) -> NDArray[np.float64]:
     """Return the seconds (U,) of one worker for the missing units of each prefix of the recipe."""
-    state = view.state
+    state = snapshot.state
     # Extra pairs are left out: they have a share of the time, not a claim.
-    missing = view.missing[: state.rows]
-    forecasts = np.array([view.costs.forecast(unit.name) for unit in state.units])
+    missing = snapshot.missing[: state.rows]
+    forecasts = np.array([snapshot.costs.forecast(unit.name) for unit in state.units])
     forecasts *= state.need_shares
     count = len(state.units)
     seconds = missing.sum(0) * forecasts
@@ -205,43 +206,43 @@ def seconds_of_prefixes(view: View) -> NDArray[np.float64]:
     return np.asarray(np.cumsum(seconds))
 
 
-def pairs_to_connect(view: View) -> Mask:
+def pairs_to_connect(snapshot: Snapshot) -> Mask:
     """Return an (N - rows,) mask of the extra pairs that fit in a tenth of the time, the most
     useful first.
     """
-    state = view.state
+    state = snapshot.state
     count = len(state.pairs) - state.rows
     if not count:
         return np.zeros(0, bool)
     sweep = sweeping_unit(state)
     # A share of the time after the sweep, as it was before the first extra pair.
     had = state.current[state.rows :, sweep]
-    seconds = view.costs.forecast(state.units[sweep].name) / view.crew.matchers
-    most = CONNECT_SHARE * (view.left + had.sum() * seconds)
+    seconds = snapshot.costs.forecast(state.units[sweep].name) / snapshot.crew.matchers
+    most = CONNECT_SHARE * (snapshot.left + had.sum() * seconds)
     return np.asarray(np.arange(1, count + 1) * seconds <= most)
 
 
-def match_job(view: View, phase: Phase, missing: Mask, ready: Mask) -> MatchJob:
-    """Return a job for the first pair, or on a GPU for a minibatch of pairs with the same missing
+def match_plan(snapshot: Snapshot, phase: Phase, missing: Mask, ready: Mask) -> MatchPlan:
+    """Return a plan for the first pair, or on a GPU for a minibatch of pairs with the same missing
     units.
     """
-    state = view.state
+    state = snapshot.state
     order = state.order[ready[state.order]]
     # In visiting order, for the cache of encodings; in the last phase the weakest pairs first.
     if phase is Phase.FILL:
         order = order[np.argsort(state.inliers[order], kind="stable")]
         order = order[np.argsort(state.costly[order], kind="stable")]
-    first = first_pair(view, order, missing)
+    first = first_pair(snapshot, order, missing)
     # Stage 1 first, because the crops come from its points.
     numbers = np.flatnonzero(missing[first]).tolist()
     numbers.sort(key=state.is_crop.__getitem__)
     units = [state.units[number] for number in numbers]
     # A unit that was lost before runs alone, so that another loss has one cause.
     alone = any(("unit", first, unit.name) in state.tries.alone for unit in units)
-    size = 1 if alone else view.crew.minibatch
+    size = 1 if alone else snapshot.crew.minibatch
     # Near the end, a smaller minibatch still ends in time.
-    if mean := view.costs.mean(units[0].name):
-        size = max(1, int(min(size, view.left / mean)))
+    if mean := snapshot.costs.mean(units[0].name):
+        size = max(1, int(min(size, snapshot.left / mean)))
     indices = (first,)
     if size > 1:
         alike = order[(missing[order] == missing[first]).all(1)]
@@ -250,23 +251,38 @@ def match_job(view: View, phase: Phase, missing: Mask, ready: Mask) -> MatchJob:
         indices = (first, *alike[: size - 1].tolist())
     # An unmeasured unit counts as infinitely long, so its cost is learnt from a job of one unit.
     seconds = [
-        view.costs.mean(unit.name) if view.costs.is_known(unit.name) else inf for unit in units
+        snapshot.costs.mean(unit.name) if snapshot.costs.is_known(unit.name) else inf
+        for unit in units
     ]
-    fits = np.cumsum(seconds) * len(indices) < JOB_SHARE * view.left
+    fits = np.cumsum(seconds) * len(indices) < JOB_SHARE * snapshot.left
     chosen = tuple(units[: 1 if alone else max(1, int(fits.sum()))])
-    expected = tuple(view.costs.mean(unit.name) for unit in chosen)
-    is_last = len(chosen) == len(units)
-    return MatchJob(phase, indices, chosen, expected, view.left, is_last=is_last)
+    return plan_of(snapshot, phase, indices, chosen, is_last=len(chosen) == len(units))
 
 
-def first_pair(view: View, order: NDArray[Any], missing: Mask) -> int:
+def plan_of(
+    snapshot: Snapshot,
+    phase: Phase,
+    indices: Sequence[int],
+    units: Sequence[Unit],
+    *,
+    is_last: bool = True,
+    is_check: bool = False,
+) -> MatchPlan:
+    """Return the plan to run these units on these pairs, with their expected seconds."""
+    expected = tuple(snapshot.costs.mean(unit.name) for unit in units)
+    return MatchPlan(
+        phase, tuple(indices), tuple(units), expected, snapshot.left, is_last, is_check
+    )
+
+
+def first_pair(snapshot: Snapshot, order: NDArray[Any], missing: Mask) -> int:
     """Return the first pair in an order, or one that tells a bad pair from a bad unit.
 
     A unit that never ran, and was lost on a pair, runs next on a pair where other units ran.
     """
-    state = view.state
+    state = snapshot.state
     first = int(order[0])
-    unproven = [n for n, unit in enumerate(state.units) if not view.costs.mean(unit.name)]
+    unproven = [n for n, unit in enumerate(state.units) if not snapshot.costs.mean(unit.name)]
     if not unproven or not state.costly.any():
         return first
     lost = {unit for _, unit in state.given_up_units()}
@@ -286,8 +302,10 @@ def suspect_pairs(state: State) -> list[int]:
     return found
 
 
-def trial_job(view: View, wanted: NDArray[Any], lost: Sequence[frozenset[Item]]) -> MatchJob | None:
-    """Return a job for a place that ``lost`` jobs since its last answer, or ``None`` if any job will
+def trial_plan(
+    snapshot: Snapshot, wanted: NDArray[Any], lost: Sequence[frozenset[Item]]
+) -> MatchPlan | None:
+    """Return a plan for a place that ``lost`` jobs since its last answer, or ``None`` if any job will
     do.
 
     ``wanted`` (N, U) are phases. Another loss must say whether the place is at fault. So after a
@@ -295,7 +313,7 @@ def trial_job(view: View, wanted: NDArray[Any], lost: Sequence[frozenset[Item]])
     several bad pairs in a row must not close a place. Before any item worked, the place gets
     another pair and another unit, since a unit may fail on all pairs.
     """
-    state = view.state
+    state = snapshot.state
     others = wanted.copy(order="F")
     others[state.matching] = NEVER
     # No unit of such a pair: without points of stage 1, a crop is the whole image, on which the same
@@ -306,26 +324,27 @@ def trial_job(view: View, wanted: NDArray[Any], lost: Sequence[frozenset[Item]])
     tried = frozenset[Item]().union(*lost)
     proven = [item for item in state.tries.proven if item not in tried]
     if proven and (len(lost) > 1 or phase is Phase.NEVER):
-        return check_job(view, proven[-1])
+        return check_plan(snapshot, proven[-1])
     if phase is Phase.NEVER:
         return None
     if not state.tries.proven:
-        return unlike_job(view, others, lost)
-    return match_job(view, phase, others <= phase, others.min(1) == phase)
+        return unlike_plan(snapshot, others, lost)
+    return match_plan(snapshot, phase, others <= phase, others.min(1) == phase)
 
 
-def check_job(view: View, item: Item) -> MatchJob:
-    """Return a job that repeats an item, to see whether a place works."""
+def check_plan(snapshot: Snapshot, item: Item) -> MatchPlan:
+    """Return a plan that repeats an item, to see whether a place works."""
     _, index, name = item
     assert isinstance(index, int)
-    unit = next(unit for unit in view.state.units if unit.name == name)
-    expected = view.costs.mean(unit.name)
-    return MatchJob(Phase.SWEEP, (index,), (unit,), (expected,), view.left, is_check=True)
+    unit = next(unit for unit in snapshot.state.units if unit.name == name)
+    return plan_of(snapshot, Phase.SWEEP, [index], [unit], is_check=True)
 
 
-def unlike_job(view: View, wanted: NDArray[Any], lost: Sequence[frozenset[Item]]) -> MatchJob:
-    """Return a job of another unit and another pair than the lost ones, as far as possible."""
-    state = view.state
+def unlike_plan(
+    snapshot: Snapshot, wanted: NDArray[Any], lost: Sequence[frozenset[Item]]
+) -> MatchPlan:
+    """Return a plan of another unit and another pair than the lost ones, as far as possible."""
+    state = snapshot.state
     lost_pairs = set()
     lost_units = set()
     for job in lost:
@@ -345,20 +364,20 @@ def unlike_job(view: View, wanted: NDArray[Any], lost: Sequence[frozenset[Item]]
     index = int(order[(order.size - 1) * len(lost) // MAX_LOSSES])
     unit = state.units[number]
     phase = Phase(int(wanted[index, number]))
-    return MatchJob(phase, (index,), (unit,), (view.costs.mean(unit.name),), view.left)
+    return plan_of(snapshot, phase, [index], [unit])
 
 
 def upcoming_pairs(
-    state: State, job: MatchJob, count: int, open_pairs: Mask | None = None
+    state: State, plan: MatchPlan, count: int, open_pairs: Mask | None = None
 ) -> list[int]:
-    """Return the pairs that will probably be matched after a job.
+    """Return the pairs that will probably be matched after a plan's.
 
     ``open_pairs`` (N,) are the ones that may be; default: all.
     """
     # In the last phase, the order depends on inliers that come meanwhile.
-    if job.phase is Phase.FILL:
+    if plan.phase is Phase.FILL:
         return []
-    last = job.indices[-1]
+    last = plan.indices[-1]
     rank = int(np.flatnonzero(state.order == last)[0]) + 1
     following = state.order[rank:]
     if open_pairs is not None:
@@ -369,13 +388,13 @@ def upcoming_pairs(
 # Estimates and scenes
 
 
-def estimates_due(view: View, first: NDArray[Any]) -> NDArray[Any]:
+def estimates_due(snapshot: Snapshot, first: NDArray[Any]) -> NDArray[Any]:
     """Return the rows to estimate now: first rows without an F, then rows with all units that fit
     in time.
 
     ``first`` (N,) is the phase of each pair's next unit.
     """
-    state = view.state
+    state = snapshot.state
     # A settled pair gets no other unit soon. A pair without an F is estimated at once: any F is better
     # than the fallback.
     is_settled = (first >= FILL) & ~state.matching
@@ -398,7 +417,7 @@ def lacking_estimates(state: State) -> Mask:
 
 
 def scenes_due(
-    view: View,
+    snapshot: Snapshot,
     phase: Phase,
     first: NDArray[Any],
     estimates: NDArray[Any],
@@ -410,13 +429,13 @@ def scenes_due(
     A batch's first scene waits for the units that fit in time, later scenes for all units until
     matching ends.
     """
-    state = view.state
-    waiting = waiting_batches(state, view.crew)
+    state = snapshot.state
+    waiting = waiting_batches(state, snapshot.crew)
     if not waiting:
         return ()
     pending = state.estimating.copy()
     pending[estimates] = True
-    for_first, for_later = pairs_to_await(view, phase, first, pending, is_matching=is_matching)
+    for_first, for_later = pairs_to_await(snapshot, phase, first, pending, is_matching=is_matching)
     blocked = {
         False: batches_with(state, for_first),
         True: batches_with(state, for_later),
@@ -429,7 +448,7 @@ def scenes_due(
 
 
 def pairs_to_await(
-    view: View,
+    snapshot: Snapshot,
     phase: Phase,
     first: NDArray[Any],
     pending: Mask,
@@ -441,8 +460,8 @@ def pairs_to_await(
 
     ``pending`` (N,) are the pairs whose estimate is due or under way.
     """
-    state = view.state
-    if view.now >= view.stop:
+    state = snapshot.state
+    if snapshot.now >= snapshot.stop:
         # No unit begins any more, and it is too late to wait for estimates. A hung job may last until
         # the end, so a first scene does not wait for its pairs.
         return np.zeros_like(pending), state.matching
@@ -459,14 +478,14 @@ def pairs_to_await(
 
 
 def candidates_due(
-    view: View, estimates: NDArray[Any], *, is_matching: bool
+    snapshot: Snapshot, estimates: NDArray[Any], *, is_matching: bool
 ) -> tuple[tuple[str, str], ...]:
     """Return the further candidates to make now, as (batch, candidate).
 
     They wait for the end of matching, and are made only if they are expected to end in time.
     """
-    state = view.state
-    if is_matching or not view.crew.scenes:
+    state = snapshot.state
+    if is_matching or not snapshot.crew.scenes:
         return ()
     pending = state.estimating.copy()
     pending[estimates] = True
@@ -476,31 +495,31 @@ def candidates_due(
         if batch in state.stale or batch in state.reconstructing or blocked[number]:
             continue
         for candidate in state.untried.get(batch, ()):
-            end = view.now + candidate_seconds(view, batch, candidate)
-            if (batch, candidate) not in state.trying and end <= view.budget.stop_units:
+            end = snapshot.now + candidate_seconds(snapshot, batch, candidate)
+            if (batch, candidate) not in state.trying and end <= snapshot.budget.stop_units:
                 due.append((batch, candidate))
     # Each batch gets its second candidate before any gets a third.
     due.sort(key=lambda each: state.candidates.index(each[1]))
     return tuple(due)
 
 
-def candidate_seconds(view: View, batch: str, candidate: str) -> float:
+def candidate_seconds(snapshot: Snapshot, batch: str, candidate: str) -> float:
     """Return the expected seconds of a candidate."""
-    matches = view.state.matches_of_candidate(batch, candidate)
-    return float(view.costs.scenes(np.array([matches]))[0])
+    matches = snapshot.state.matches_of_candidate(batch, candidate)
+    return float(snapshot.costs.scenes(np.array([matches]))[0])
 
 
-def candidates_reserve(view: View) -> float:
+def candidates_reserve(snapshot: Snapshot) -> float:
     """Return the seconds to reserve for further candidates of scenes, several at a time."""
-    state = view.state
-    if len(state.candidates) == 1 or not view.crew.scenes:
+    state = snapshot.state
+    if len(state.candidates) == 1 or not snapshot.crew.scenes:
         return 0.0
     seconds = 0.0
     for batch in state.batches:
         # A stale batch will get all of them.
         missing = state.candidates[1:] if batch in state.stale else state.untried.get(batch, ())
-        seconds += sum(candidate_seconds(view, batch, candidate) for candidate in missing)
-    return min(CANDIDATES_SHARE * view.budget.time_limit, seconds / view.crew.scenes)
+        seconds += sum(candidate_seconds(snapshot, batch, candidate) for candidate in missing)
+    return min(CANDIDATES_SHARE * snapshot.budget.time_limit, seconds / snapshot.crew.scenes)
 
 
 def batches_with(state: State, pairs: Mask) -> Mask:
@@ -520,20 +539,20 @@ def waiting_batches(state: State, crew: Crew) -> list[str]:
     return [batch for batch, number in state.batches.items() if batch in stale and matches[number]]
 
 
-def estimates_reserve(view: View) -> float:
+def estimates_reserve(snapshot: Snapshot) -> float:
     """Return the expected seconds of the pending estimates."""
-    count = int(lacking_estimates(view.state).sum())
-    return view.costs.mean(ESTIMATE) * count / view.crew.estimators
+    count = int(lacking_estimates(snapshot.state).sum())
+    return snapshot.costs.mean(ESTIMATE) * count / snapshot.crew.estimators
 
 
-def scenes_reserve(view: View) -> float:
+def scenes_reserve(snapshot: Snapshot) -> float:
     """Return the expected seconds of the pending reconstructions, several at a time."""
-    state = view.state
-    if not state.stale or not view.crew.scenes:
+    state = snapshot.state
+    if not state.stale or not snapshot.crew.scenes:
         return 0.0
     stale = [state.batches[batch] for batch in state.stale]
-    forecasts = view.costs.scenes(state.matches_of_batches()[stale])
-    return float(max(forecasts.max(), forecasts.sum() / view.crew.scenes))
+    forecasts = snapshot.costs.scenes(state.matches_of_batches()[stale])
+    return float(max(forecasts.max(), forecasts.sum() / snapshot.crew.scenes))
 
 
 # The end, and the outlook
@@ -555,11 +574,11 @@ def outlook(state: State, costs: Costs, budget: Budget, crew: Crew, now: float) 
     usable = [unit for unit, lost in zip(state.units, state.unusable, strict=True) if not lost]
     if not all(costs.is_known(unit.name) for unit in usable):
         return ""
-    view = View(state, costs, budget, crew, now)
-    seconds = seconds_of_prefixes(view)[-1] / crew.matchers
+    snapshot = Snapshot(state, costs, budget, crew, now)
+    seconds = seconds_of_prefixes(snapshot)[-1] / crew.matchers
     text = f"all units on all pairs would take {format_duration(seconds)}"
-    if not isfinite(view.stop):
+    if not isfinite(snapshot.stop):
         return f"{text}; there is no time limit"
-    fit = min(prefix_that_fits(view), len(usable))
-    left = format_duration(view.left)
+    fit = min(prefix_that_fits(snapshot), len(usable))
+    left = format_duration(snapshot.left)
     return f"{text}; {fit} of {plural(len(usable), 'unit')} can run in the remaining {left}"

@@ -19,14 +19,14 @@ from mkpc_kaggle.geometry.critical_region import CriticalRegion, RegionReason
 from mkpc_kaggle.geometry.intrinsics import KnownCamera
 from mkpc_kaggle.geometry.robust import EstimateStats
 from mkpc_kaggle.scene.choose import Choice, Reason
-from mkpc_kaggle.scene.reconstruction import (
+from mkpc_kaggle.scene.models import (
     Comparison,
     DistortedLens,
     FocalContradiction,
+    FocalSource,
     RegisteredImage,
     SfmModel,
     Sigmas,
-    Source,
 )
 from mkpc_kaggle.scene.view_graph import BatchImage
 
@@ -129,7 +129,9 @@ NAMES = several(PLAIN)
 COMPARISON = record(
     Comparison,
     focals=several(
-        record(FocalContradiction, source=enum(Source), images=NAMES, given=FLOAT, fitted=FLOAT)
+        record(
+            FocalContradiction, source=enum(FocalSource), images=NAMES, given=FLOAT, fitted=FLOAT
+        )
     ),
     lenses=several(record(DistortedLens, images=NAMES, displacement=FLOAT, camera=KNOWN_CAMERA)),
     has_moved=PLAIN,

@@ -16,7 +16,7 @@ from mkpc_kaggle.engine.store.records import (
     read_scenes,
 )
 from mkpc_kaggle.engine.store.tables import Store
-from mkpc_kaggle.scene.reconstruction import RegisteredImage, Sigmas
+from mkpc_kaggle.scene.models import RegisteredImage, Sigmas
 
 if TYPE_CHECKING:
     from pandas import DataFrame

@@ -44,18 +44,18 @@ def file_state(path: Path) -> tuple[int, int]:
 
 def update_digests(store: Store, files: Mapping[str, Path], is_over: Callable[[], bool]) -> Digests:
     """Digest the known files whose size or time has changed, and store the new digests."""
-    known = _stored_files(store, files)
+    stored = _stored_files(store, files)
     touched: dict[str, tuple[int, int]] = {}
-    for name, facts in known.items():
+    for name, facts in stored.items():
         now = file_state(files[name])
         # A missing file keeps its results: perhaps nothing must be matched.
         if any(now) and now != tuple(facts["file"]):
             touched[name] = now
-    found = digest_files({name: files[name] for name in touched}, is_over)
-    store.put(file_result(name, digest, touched[name]) for name, digest in found.items())
-    digests = {name: facts["digest"] for name, facts in known.items()}
-    changed = {name for name, digest in found.items() if digest != digests[name]}
-    return Digests(digests | found, changed)
+    computed = digest_files({name: files[name] for name in touched}, is_over)
+    store.put(file_result(name, digest, touched[name]) for name, digest in computed.items())
+    digests = {name: facts["digest"] for name, facts in stored.items()}
+    changed = {name for name, digest in computed.items() if digest != digests[name]}
+    return Digests(digests | computed, changed)
 
 
 def current_digests(
@@ -65,18 +65,18 @@ def current_digests(
 
     Stored digests of unchanged files are used; those of new files are stored.
     """
-    known = _stored_files(store, files)
+    stored = _stored_files(store, files)
     states = {name: file_state(path) for name, path in files.items()}
     current = {
         name: facts["digest"]
-        for name, facts in known.items()
+        for name, facts in stored.items()
         if any(states[name]) and states[name] == tuple(facts["file"])
     }
-    found = digest_files({n: path for n, path in files.items() if n not in current}, is_over)
+    computed = digest_files({n: path for n, path in files.items() if n not in current}, is_over)
     # Of a file that has changed, :func:`update_digests` must still find the former digest.
-    new = [name for name in found if name not in known]
-    store.put(file_result(name, found[name], states[name]) for name in new)
-    return current | found
+    new = [name for name in computed if name not in stored]
+    store.put(file_result(name, computed[name], states[name]) for name in new)
+    return current | computed
 
 
 def digest_files(files: Mapping[str, Path], is_over: Callable[[], bool]) -> dict[str, str]:

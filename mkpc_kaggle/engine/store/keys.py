@@ -25,9 +25,9 @@ from mkpc_kaggle.setup.assembly import Assembly
 
 # Versions of the algorithms, each in the digests of its kind. With a wrong version, old results would
 # pass as today's, which no later check notices.
-POINTS = 2
-ESTIMATE = 4
-SCENE = 8
+POINTS_VERSION = 2
+ESTIMATE_VERSION = 4
+SCENE_VERSION = 8
 
 # Settings of [mkpc] that decide whether a crop is matched, and not what is found in it.
 RULE = ("when", "min_scale", "min_detail")
@@ -69,17 +69,22 @@ class Keys:
     @classmethod
     def of(cls, assembly: Assembly) -> "Keys":
         recipe = assembly.recipe
-        units = tuple(digest([POINTS, assembly.unit_settings(unit)]) for unit in recipe.units)
+        units = tuple(
+            digest([POINTS_VERSION, assembly.unit_settings(unit)]) for unit in recipe.units
+        )
         exact = Precision.FLOAT32
-        float32 = [digest([POINTS, assembly.unit_settings(unit, exact)]) for unit in recipe.units]
+        float32 = [
+            digest([POINTS_VERSION, assembly.unit_settings(unit, exact)]) for unit in recipe.units
+        ]
         # All settings of a table: a new setting changes the keys, which costs a rerun but no wrong result.
         magsac = asdict(recipe.magsac)
         focal = recipe.focal and asdict(recipe.focal)
         # MAGSAC comes from OpenCV, and other versions of it may give another F.
-        estimate = digest([ESTIMATE, magsac, focal, cv2.__version__])
+        estimate = digest([ESTIMATE_VERSION, magsac, focal, cv2.__version__])
         # The number of candidates does not change any of them.
         scene = recipe.scene and asdict(replace(recipe.scene, candidates=1))
         mkpc = asdict(recipe.mkpc)
+        cameras = [[pattern, asdict(camera)] for pattern, camera in assembly.cameras]
         # The units that make tracks: a unit's points do not depend on it, but scenes do.
         tracks = [unit.name for unit in recipe.units if unit.tracks]
         return cls(
@@ -87,7 +92,7 @@ class Keys:
             digest({name: value for name, value in mkpc.items() if name not in RULE}),
             "" if recipe.mkpc.when is When.ALWAYS else digest([mkpc[name] for name in RULE]),
             estimate,
-            digest([SCENE, scene, tracks, estimate, _mapper_version()]),
+            digest([SCENE_VERSION, scene, cameras, tracks, estimate, _mapper_version()]),
             assembly.regions,
             assembly.masks,
             tuple(float32),

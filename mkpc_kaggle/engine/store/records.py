@@ -29,8 +29,8 @@ from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, NO_STATS, Estimate
 from mkpc_kaggle.pipeline.pair import Regions
 from mkpc_kaggle.scene.candidates import ALL_UNITS
 from mkpc_kaggle.scene.choose import Choice
-from mkpc_kaggle.scene.reconstruct import models_of
-from mkpc_kaggle.scene.reconstruction import Reconstruction, SfmModel
+from mkpc_kaggle.scene.models import Reconstruction, SfmModel
+from mkpc_kaggle.scene.sfm import models_of
 from mkpc_kaggle.scene.view_graph import BatchImage
 
 TABLE = "table of pairs"  # the key of the table; each publication replaces the former one

@@ -31,8 +31,8 @@ from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import EstimateStats
 from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.scene.choose import Choice
-from mkpc_kaggle.scene.reconstruct import Solution
-from mkpc_kaggle.scene.reconstruction import Reconstruction, RegisteredImage, SfmModel
+from mkpc_kaggle.scene.models import Reconstruction, RegisteredImage, SfmModel
+from mkpc_kaggle.scene.sfm import Solution
 from mkpc_kaggle.scene.view_graph import BatchImage
 
 # The second and third singular value of F, in pixels. MAGSAC's own F, from seven matches, has a
@@ -137,16 +137,16 @@ def _check_outcomes(job: MatchJob, answer: Any) -> None:
     _check_tuple(answer, Outcome, len(job.indices), "results of pairs")
     for names, outcome in zip(job.names, answer, strict=True):
         _check_text(outcome.failure)
-        _check_tuple(outcome.found, UnitResult, None, "results of units")
+        _check_tuple(outcome.results, UnitResult, None, "results of units")
         # An unreadable image is a result without images.
         if outcome.failure:
-            _require(not outcome.found, outcome.failure, "points of an unreadable image")
+            _require(not outcome.results, outcome.failure, "points of an unreadable image")
         else:
             _check_images(names, outcome)
-        units = [found.unit for found in outcome.found]
+        units = [found.unit for found in outcome.results]
         is_asked = len(set(units)) == len(units) and set(units) <= set(job.units)
         _require(is_asked, [unit.name for unit in units], "units that were not asked for")
-        for found in outcome.found:
+        for found in outcome.results:
             _check_unit(found)
         if outcome.regions is not None:
             _check_tuple(outcome.regions, CriticalRegion, 2, "critical regions")

@@ -26,7 +26,7 @@ from mkpc_kaggle.pipeline.stages import Pipeline
 from mkpc_kaggle.setup.assembly import Assembly
 from mkpc_kaggle.version import __version__
 
-FORMS = "a number of processes, ray (this machine's cluster, or a new one for this run), ray://HOST:PORT"
+WORKER_FORMS = "a number of processes, ray (this machine's cluster, or a new one for this run), ray://HOST:PORT"
 REACH_TIMEOUT_S = 5.0  # for a head node to accept a connection
 
 
@@ -36,7 +36,7 @@ def parse_workers(text: str) -> int | str:
     Raises :class:`UserError` with the accepted forms if the text has none of them.
     """
     if not re.fullmatch(r"\d{1,3}|ray(://[^/\s]+:\d{1,5})?", text):
-        raise UserError(f"--workers: {text!r} is none of: {FORMS}")
+        raise UserError(f"--workers: {text!r} is none of: {WORKER_FORMS}")
     return int(text) if text.isdecimal() else text
 
 

@@ -39,8 +39,13 @@ from mkpc_kaggle.geometry.robust import ModelKind
 from mkpc_kaggle.matchers import failures
 from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult, with_estimate
 from mkpc_kaggle.recipe import Recipe, Unit
-from mkpc_kaggle.scene.candidates import ALL_UNITS, candidate_tracks, disagreement, settings_of
-from mkpc_kaggle.scene.reconstruct import Solution, models_of, reconstruct_batch
+from mkpc_kaggle.scene.candidates import (
+    ALL_UNITS,
+    candidate_settings,
+    candidate_tracks,
+    disagreement,
+)
+from mkpc_kaggle.scene.sfm import Solution, models_of, reconstruct_batch
 from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair
 
 if TYPE_CHECKING:
@@ -73,7 +78,7 @@ class Executor:
 
 
 def failure_of(error: Exception) -> Failure:
-    return Failure(Cause[failures.failure_of(error).name], failures.reason_of(error))
+    return Failure(Cause[failures.failure_kind(error).name], failures.reason_of(error))
 
 
 class MatchRunner:
@@ -135,7 +140,7 @@ class MatchRunner:
         readable = tuple(image for image in images if isinstance(image, Image))
         failure = next((str(image) for image in images if not isinstance(image, Image)), "")
         return PairMatch(
-            job.known[number],
+            job.stage_1[number],
             images=() if failure else readable,
             failure=failure,
             decode_seconds=seconds,
@@ -154,7 +159,7 @@ class MatchRunner:
         return Outcome(
             (image0, image1),
             tuple(image.file for image in pair.images),
-            pair.results[len(job.known[number]) :],  # without the known points of stage 1
+            pair.results[len(job.stage_1[number]) :],  # without the given points of stage 1
             pair.regions,
             "",
             pair.decode_seconds,
@@ -223,25 +228,31 @@ def scene_runner() -> Runner:
 
 
 def do_single_job(job: Job) -> Answer:
-    return reconstruct(job) if isinstance(job, SceneJob) else do_light_job(job)
+    return compute_scene(job) if isinstance(job, SceneJob) else do_light_job(job)
 
 
-def reconstruct(job: Job) -> Solution:
+def compute_scene(job: Job) -> Solution:
     """Return the reconstructions of a batch, and a choice for each pair. pycolmap may end the
     process.
     """
     assert isinstance(job, SceneJob) and job.recipe.scene is not None
     inputs = results_of(job)
     pairs = [
-        batch_pair(*each, keeps_paths=job.is_whole, candidate=job.candidate) for each in inputs
+        batch_pair(*pair, keeps_paths=job.is_whole, candidate=job.candidate) for pair in inputs
     ]
     recipe = job.recipe
-    config = settings_of(job.candidate, job.recipe.scene)
+    config = candidate_settings(job.candidate, job.recipe.scene)
     solution = reconstruct_batch(
-        pairs, config, recipe.focal, recipe.magsac, job.export, job.is_whole
+        pairs,
+        config,
+        recipe.focal,
+        recipe.magsac,
+        job.export,
+        job.is_whole,
+        cameras=job.cameras,
     )
-    found = disagreement(pairs, models_of(solution.reconstructions))
-    return replace(solution, disagreement=found)
+    value = disagreement(pairs, models_of(solution.reconstructions))
+    return replace(solution, disagreement=value)
 
 
 def batch_pair(

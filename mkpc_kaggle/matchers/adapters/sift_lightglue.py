@@ -46,16 +46,19 @@ def sift_encoder(features: int, device: str) -> Encode:
 
     def keypoints_of(detection: Detected, picture: Picture) -> Keypoints:
         detected, descriptors = detection
-        rows = [(*each.pt, each.size, np.radians(each.angle), each.response) for each in detected]
-        found = np.array(rows).reshape(-1, 5)
+        rows = [
+            (*keypoint.pt, keypoint.size, np.radians(keypoint.angle), keypoint.response)
+            for keypoint in detected
+        ]
+        table = np.array(rows).reshape(-1, 5)
 
         # The first of each pixel in this order is the one to keep.
-        order = np.lexsort((found[:, 3], -found[:, 4]))  # by descending response, then by angle
-        pixels = np.rint(found[order, :2] - 0.5)  # the published rounding
+        order = np.lexsort((table[:, 3], -table[:, 4]))  # by descending response, then by angle
+        pixels = np.rint(table[order, :2] - 0.5)  # the published rounding
         _, first = np.unique(pixels, axis=0, return_index=True)
         kept = np.sort(order[np.sort(first)[:features]])  # the strongest, in OpenCV's order
 
-        columns = torch.from_numpy(found[kept].astype(np.float32)).to(device).T
+        columns = torch.from_numpy(table[kept].astype(np.float32)).to(device).T
         x, y, sizes, angles, _ = columns
         points = torch.stack([x, y], 1) - SHIFT_PX
         roots = torch.from_numpy(root_sift(descriptors[kept])).to(device)

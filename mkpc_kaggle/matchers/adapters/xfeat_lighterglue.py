@@ -44,8 +44,8 @@ def xfeat_encoder(network: XFeat, features: int, placement: Placement) -> Encode
     fold_norms(network.eval())
 
     def detect(images: Tensor) -> list[tuple[Tensor, Tensor]]:
-        found = network.detectAndCompute(images, top_k=features)
-        return [(each["keypoints"], each["descriptors"]) for each in found]
+        detected = network.detectAndCompute(images, top_k=features)
+        return [(image["keypoints"], image["descriptors"]) for image in detected]
 
     return library_encoder("xfeat", network, network.net, detect, placement)
 

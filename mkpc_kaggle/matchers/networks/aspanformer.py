@@ -22,7 +22,7 @@ from mkpc_kaggle.matchers.networks.grids import (
     pointwise,
 )
 from mkpc_kaggle.matchers.networks.layers import ExactConv1d, resize
-from mkpc_kaggle.matchers.networks.linear_attention import Masks
+from mkpc_kaggle.matchers.networks.linear_attention import MaskPair
 from mkpc_kaggle.matchers.networks.position import FIXED_DECAY, sine_positions
 from mkpc_kaggle.matchers.networks.resnet_fpn import TOP
 from mkpc_kaggle.matchers.networks.semi_dense import SemiDenseNetwork
@@ -332,7 +332,7 @@ class AspanFormer(SemiDenseNetwork):
         return self.coarse_matching.get_parameter("temperature") / TOP
 
     def transform(
-        self, coarse0: Tensor, coarse1: Tensor, masks: Masks | None = None
+        self, coarse0: Tensor, coarse1: Tensor, masks: MaskPair | None = None
     ) -> tuple[Tensor, Tensor]:
         mask0, mask1 = masks or (None, None)
         grid0, grid1 = self.loftr_coarse(self.side(coarse0, mask0), self.side(coarse1, mask1))

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from mkpc_kaggle.matchers.networks.layers import Assignment, linear
-from mkpc_kaggle.matchers.networks.linear_attention import Masks
+from mkpc_kaggle.matchers.networks.linear_attention import MaskPair
 
 ROWS_AT_ONCE = {"cpu": 256, "cuda": 8192}
 HELD_FLOATS = 2**25  # of the largest stored matrix: 128 MiB; 640 x 480 pixels need 23 million
@@ -24,7 +24,7 @@ def coarse_matches(
     scale: float | Tensor,
     threshold: float,
     border: int,
-    masks: Masks | None,
+    masks: MaskPair | None,
 ) -> Assignment:
     """Match grids (h0, w0, C) and (h1, w1, C); similarities are ``scale`` times dot products.
 

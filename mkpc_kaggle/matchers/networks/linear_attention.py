@@ -11,11 +11,11 @@ from torch.nn import functional
 from mkpc_kaggle.matchers.networks.grids import Perceptron
 from mkpc_kaggle.matchers.networks.layers import Linear
 
-Masks = tuple[Tensor, Tensor]
+MaskPair = tuple[Tensor, Tensor]
 
 
 def linear_attention(
-    q: Tensor, k: Tensor, v: Tensor, heads: int, masks: Masks | None = None
+    q: Tensor, k: Tensor, v: Tensor, heads: int, masks: MaskPair | None = None
 ) -> Tensor:
     """Map queries (N, L, C), keys and values (N, S, C) to (N, L, C); heads have adjacent channels.
 
@@ -66,7 +66,7 @@ class EncoderLayer(nn.Module):
         self.norm1 = nn.LayerNorm(width)
         self.norm2 = nn.LayerNorm(width)
 
-    def forward(self, x: Tensor, source: Tensor, masks: Masks | None = None) -> Tensor:
+    def forward(self, x: Tensor, source: Tensor, masks: MaskPair | None = None) -> Tensor:
         """Update tokens (N, L, C) from a source (N, S, C); masks are (N, L) and (N, S)."""
         # One cast instead of one per projection. The sums stay float32.
         seen = x.to(self.q_proj.weight.dtype)
@@ -93,7 +93,9 @@ class LinearTransformer(nn.Module):
         super().__init__()
         self.layers = nn.ModuleList(EncoderLayer(width, heads) for _ in range(2 * cycles))
 
-    def forward(self, x0: Tensor, x1: Tensor, masks: Masks | None = None) -> tuple[Tensor, Tensor]:
+    def forward(
+        self, x0: Tensor, x1: Tensor, masks: MaskPair | None = None
+    ) -> tuple[Tensor, Tensor]:
         """Map (N, L, C) and (N, S, C) to the same shapes; masks (N, L) and (N, S) mark content."""
         # Of the updated image, then of the source.
         own0 = own1 = cross0 = cross1 = None

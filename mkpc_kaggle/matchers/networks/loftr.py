@@ -6,7 +6,7 @@ Source: Sun et al., "LoFTR: Detector-Free Local Feature Matching with Transforme
 from torch import Tensor
 
 from mkpc_kaggle.matchers.contract import Training
-from mkpc_kaggle.matchers.networks.linear_attention import LinearTransformer, Masks
+from mkpc_kaggle.matchers.networks.linear_attention import LinearTransformer, MaskPair
 from mkpc_kaggle.matchers.networks.position import FIXED_DECAY, ORIGINAL_DECAY, with_positions
 from mkpc_kaggle.matchers.networks.resnet_fpn import TOP
 from mkpc_kaggle.matchers.networks.semi_dense import HEADS, SemiDenseNetwork
@@ -30,7 +30,7 @@ class Loftr(SemiDenseNetwork):
             self.border = 0
 
     def transform(
-        self, coarse0: Tensor, coarse1: Tensor, masks: Masks | None = None
+        self, coarse0: Tensor, coarse1: Tensor, masks: MaskPair | None = None
     ) -> tuple[Tensor, Tensor]:
         grid0 = with_positions(coarse0, self.decay)  # (N, h, w, 256)
         grid1 = with_positions(coarse1, self.decay)

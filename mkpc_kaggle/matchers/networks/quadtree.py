@@ -18,7 +18,7 @@ from mkpc_kaggle.matchers.networks.grids import (
     to_2x2_blocks,
 )
 from mkpc_kaggle.matchers.networks.layers import Linear
-from mkpc_kaggle.matchers.networks.linear_attention import Masks
+from mkpc_kaggle.matchers.networks.linear_attention import MaskPair
 from mkpc_kaggle.matchers.networks.position import FIXED_DECAY, with_positions
 from mkpc_kaggle.matchers.networks.resnet_fpn import TOP
 from mkpc_kaggle.matchers.networks.semi_dense import HEADS, SemiDenseNetwork
@@ -223,7 +223,7 @@ class Quadtree(SemiDenseNetwork):
         super().__init__(QuadtreeTransformer(TOPKS[training]))
 
     def transform(
-        self, coarse0: Tensor, coarse1: Tensor, masks: Masks | None = None
+        self, coarse0: Tensor, coarse1: Tensor, masks: MaskPair | None = None
     ) -> tuple[Tensor, Tensor]:
         grid0 = with_positions(coarse0, FIXED_DECAY)
         grid1 = with_positions(coarse1, FIXED_DECAY)

@@ -20,7 +20,7 @@ from mkpc_kaggle.matchers.networks.fine_matching import (
     expected_offset,
 )
 from mkpc_kaggle.matchers.networks.layers import Assignment
-from mkpc_kaggle.matchers.networks.linear_attention import LinearTransformer, Masks
+from mkpc_kaggle.matchers.networks.linear_attention import LinearTransformer, MaskPair
 from mkpc_kaggle.matchers.networks.resnet_fpn import FINE, TOP, FeatureMaps, ResNetFpn
 
 HEADS = 8
@@ -57,7 +57,7 @@ class SemiDenseNetwork(nn.Module, ABC):
 
     @abstractmethod
     def transform(
-        self, coarse0: Tensor, coarse1: Tensor, masks: Masks | None = None
+        self, coarse0: Tensor, coarse1: Tensor, masks: MaskPair | None = None
     ) -> tuple[Tensor, Tensor]:
         """Transform the coarse maps (N, 256, h, w) of both images to grids (N, h, w, 256)."""
 
@@ -67,7 +67,7 @@ class SemiDenseNetwork(nn.Module, ABC):
         return maps
 
     def match(
-        self, features0: FeatureMaps, features1: FeatureMaps, masks: Masks | None = None
+        self, features0: FeatureMaps, features1: FeatureMaps, masks: MaskPair | None = None
     ) -> SemiDenseMatches:
         """Match a pair; each image's mask (1, H/8, W/8) bool is True at the content, top left."""
         grids = self.transform(features0.coarse, features1.coarse, masks)

@@ -25,7 +25,7 @@ MAX_CENTRE_SIGMA = 0.02  # of the model's size; a camera with a larger expected 
 HARDLY_MOVED = (
     "the camera hardly moved: nothing can be triangulated; step aside between photographs"
 )
-FOCALS = Range(0.3, 5.0)  # plausible focal lengths, in long sides of the image
+PLAUSIBLE_FOCALS = Range(0.3, 5.0)  # plausible focal lengths, in long sides of the image
 
 
 class Sigmas(NamedTuple):
@@ -58,7 +58,7 @@ class RegisteredImage:
         return float(self.camera.K[0, 0])
 
 
-class Source(StrEnum):
+class FocalSource(StrEnum):
     """Origin of a focal length that was given."""
 
     INTRINSICS = "--intrinsics"
@@ -71,7 +71,7 @@ class FocalContradiction:
     pixels.
     """
 
-    source: Source
+    source: FocalSource
     images: tuple[str, ...]
     given: float
     fitted: float
@@ -174,5 +174,7 @@ def is_plausible(found: RegisteredImage) -> bool:
     camera = found.camera
     is_finite = all(np.isfinite(part).all() for part in (camera.K, camera.R, camera.t))
     return (
-        is_finite and found.focal / max(found.image.size) in FOCALS and found.points >= MIN_POINTS
+        is_finite
+        and found.focal / max(found.image.size) in PLAUSIBLE_FOCALS
+        and found.points >= MIN_POINTS
     )

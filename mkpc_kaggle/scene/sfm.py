@@ -10,21 +10,21 @@ from typing import TypeAlias
 import numpy as np
 
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
-from mkpc_kaggle.geometry.intrinsics import read as read_intrinsics
+from mkpc_kaggle.geometry.intrinsics import Rows
 from mkpc_kaggle.geometry.robust import RobustConfig
 from mkpc_kaggle.recipe import CameraSharing, SceneConfig
 from mkpc_kaggle.scene.align import align, read_reference
 from mkpc_kaggle.scene.choose import Choice, Reason, choose, estimate_at_known_focals
 from mkpc_kaggle.scene.export import HeldDirectory
 from mkpc_kaggle.scene.keypoints import MergedGraph
-from mkpc_kaggle.scene.motion import hardly_moved
-from mkpc_kaggle.scene.reconstruction import (
+from mkpc_kaggle.scene.models import (
     HARDLY_MOVED,
     MAX_CENTRE_SIGMA,
     MIN_IMAGES,
     Reconstruction,
     SfmModel,
 )
+from mkpc_kaggle.scene.motion import hardly_moved
 from mkpc_kaggle.scene.shared_intrinsics import (
     SharedIntrinsics,
     given_intrinsics,
@@ -65,19 +65,25 @@ def reconstruct_batch(
     magsac: RobustConfig | None = None,
     export: HeldDirectory | None = None,
     is_whole: bool = False,
+    *,
+    cameras: Rows = (),
 ) -> Solution:
     """Reconstruct every connected component of a batch, and choose an F for each of its pairs.
 
     With the recipe's prior ``focal``, a pair without an F from cameras is re-estimated at the scene's focal
     lengths, unless the pair contradicts the scene. ``magsac`` has default settings if ``None``. With a directory
     ``export``, the batch is reconstructed as a whole, and COLMAP's files are written there. With ``is_whole``, it
-    is reconstructed in the same way without files.
+    is reconstructed in the same way without files. ``cameras`` are those that the user knows.
 
     A missing result has a reason; bad matches never raise. Reconstruction takes seconds to minutes
     and may end the process, see :mod:`mkpc_kaggle.scene.colmap`.
     """
-    found, shared = reconstruct_sharing(ViewGraph.of_pairs(pairs), config, export, is_whole)
-    models = [{image.image.digest: image for image in model.images} for model in models_of(found)]
+    graph = ViewGraph.of_pairs(pairs).with_intrinsics(cameras)
+    reconstructions, shared = reconstruct_sharing(graph, config, export, is_whole)
+    models = [
+        {image.image.digest: image for image in model.images}
+        for model in models_of(reconstructions)
+    ]
     # From the first model with the image, else from the image's shared camera
     focals = dict(shared)
     for model in reversed(models):
@@ -90,7 +96,7 @@ def reconstruct_batch(
             F = estimate_at_known_focals(pair, focals, focal, magsac or RobustConfig())
             choice = replace(choice, F=F)
         choices.append(choice)
-    return Solution(tuple(found), tuple(choices))
+    return Solution(tuple(reconstructions), tuple(choices))
 
 
 def reconstruct_sharing(
@@ -109,7 +115,6 @@ def reconstruct_sharing(
     the last complete run, and COLMAP's files are written there. With ``is_whole``, it is reconstructed
     as a whole without files.
     """
-    graph = graph.with_intrinsics(read_intrinsics(config.intrinsics))
     if directory is None and not is_whole:
         # Each component alone, since a bad one may make the mapper fail
         parts = list(map(MergedGraph, graph.components()))
@@ -121,8 +126,8 @@ def reconstruct_sharing(
     # The user's cameras are neither compared nor shared.
     free = free_of(graph)
     given = shared = given_intrinsics(free, config)
-    found = [make(part, shared) for part in parts]
-    for number, (part, first) in enumerate(zip(parts, found, strict=True)):
+    reconstructions = [make(part, shared) for part in parts]
+    for number, (part, first) in enumerate(zip(parts, reconstructions, strict=True)):
         if not doubts_exif(part.graph, first):
             continue
         other = part.without_exif()
@@ -131,20 +136,25 @@ def reconstruct_sharing(
         if second.observations > first.observations:
             shared = {**shared, **starts}
             parts[number] = other
-            found[number] = second
+            reconstructions[number] = second
     if config.cameras is CameraSharing.AUTO:
-        found, shared = share(parts, found, free, config, make) or (found, shared)
-    found = [compared(part, each) for part, each in zip(parts, found, strict=True)]
+        sharing = share(parts, reconstructions, free, config, make)
+        if sharing is not None:
+            reconstructions, shared = sharing
+    reconstructions = [
+        compared(part, reconstruction)
+        for part, reconstruction in zip(parts, reconstructions, strict=True)
+    ]
     if directory is not None:
         from mkpc_kaggle.scene.colmap import write_files
 
         # Before the files are written, so that files and results agree
-        found = align(found, read_reference(directory.path))
-        write_files(directory, parts[0], shared, models_of(found), config)
+        reconstructions = align(reconstructions, read_reference(directory.path))
+        write_files(directory, parts[0], shared, models_of(reconstructions), config)
     # Images without a camera have the refined focal length, and not the one it began with.
     if given:
-        shared = refined_intrinsics(free, models_of(found))
-    return found, shared
+        shared = refined_intrinsics(free, models_of(reconstructions))
+    return reconstructions, shared
 
 
 def free_of(graph: ViewGraph) -> list[BatchImage]:
@@ -152,27 +162,28 @@ def free_of(graph: ViewGraph) -> list[BatchImage]:
     return [image for image in graph.images if image.digest not in graph.known]
 
 
-def doubts_exif(graph: ViewGraph, found: Reconstruction) -> bool:
+def doubts_exif(graph: ViewGraph, reconstruction: Reconstruction) -> bool:
     """Return whether wrong focal lengths of EXIF may be why cameras are missing or doubtful."""
     if not any(image.focal for image in free_of(graph)):
         return False
     matched = {image for edge in graph.edges for image in (edge.first, edge.second)}
-    if not found.models or found.registered < MIN_REGISTERED * len(matched):
+    if not reconstruction.models or reconstruction.registered < MIN_REGISTERED * len(matched):
         return True
-    if found.models[0].is_loose:
+    if reconstruction.models[0].is_loose:
         return True
     # Some EXIF is wrong, so that of the images without a camera may be wrong, too.
     contradicting = [
-        each.image
-        for each in found.models[0].images
-        if each.image.focal and abs(np.log(each.focal / each.image.focal)) > MAX_EXIF_LOG_DEVIATION
+        registered.image
+        for registered in reconstruction.models[0].images
+        if registered.image.focal
+        and abs(np.log(registered.focal / registered.image.focal)) > MAX_EXIF_LOG_DEVIATION
     ]
-    return bool(contradicting) and found.registered < len(matched)
+    return bool(contradicting) and reconstruction.registered < len(matched)
 
 
 def share(
     parts: Sequence[MergedGraph],
-    found: list[Reconstruction],
+    reconstructions: list[Reconstruction],
     free: Sequence[BatchImage],
     config: SceneConfig,
     make: Make,
@@ -180,10 +191,10 @@ def share(
     """Return reconstructions with shared intrinsics of the ``free`` images that seem to share a
     camera, or ``None`` if none do, or if images then see fewer points.
 
-    They start from the poses ``found`` where these are good enough. Images that seem to have another
+    They start from the poses ``reconstructions`` where these are good enough. Images that seem to have another
     zoom share, too, unless they lose points by that.
     """
-    models = models_of(found)
+    models = models_of(reconstructions)
     alike = shared_intrinsics(free, models)
     if not alike:
         return None
@@ -191,18 +202,18 @@ def share(
     if everything.keys() != alike.keys():
         # From these poses alone: most zooms are real, and the mapper takes long.
         together = []
-        for part, former in zip(parts, found, strict=True):
+        for part, former in zip(parts, reconstructions, strict=True):
             refined = refine_complete(part, everything, config, former)
             if refined is not None:
                 together.append(refined)
         zoomed = undecided_zooms(free, models)
-        if len(together) == len(parts) and not loses_points(found, together, zoomed):
+        if len(together) == len(parts) and not loses_points(reconstructions, together, zoomed):
             return together, everything
     again = []
-    for part, former in zip(parts, found, strict=True):
+    for part, former in zip(parts, reconstructions, strict=True):
         refined = refine_complete(part, alike, config, former)
         again.append(refined or make(part, alike))
-    return None if loses_points(found, again) else (again, alike)
+    return None if loses_points(reconstructions, again) else (again, alike)
 
 
 def loses_points(
@@ -215,10 +226,10 @@ def loses_points(
     Images of two cameras that are forced into one lose points.
     """
     counts = []
-    for found in (before, after):
+    for reconstructions in (before, after):
         points: Counter[str] = Counter()
-        for model in models_of(found):
-            points.update({each.image.digest: each.points for each in model.images})
+        for model in models_of(reconstructions):
+            points.update({image.image.digest: image.points for image in model.images})
         counts.append(points)
     former, latter = counts
     if latter.total() < MIN_OBSERVATIONS * former.total():
@@ -294,22 +305,24 @@ def reconstruct_connected(
         return Reconstruction(names, failure=f"pycolmap failed: {error}")
 
 
-def compared(merged: MergedGraph, found: Reconstruction) -> Reconstruction:
+def compared(merged: MergedGraph, reconstruction: Reconstruction) -> Reconstruction:
     """Return the reconstruction, with what its photographs contradict."""
     # Certain cameras have moved.
-    is_doubtful = not found.models or found.models[0].centre_sigma > MAX_CENTRE_SIGMA
+    is_doubtful = (
+        not reconstruction.models or reconstruction.models[0].centre_sigma > MAX_CENTRE_SIGMA
+    )
     has_moved = not (is_doubtful and hardly_moved(merged))
-    if not found.models:
-        return found if has_moved else replace(found, failure=HARDLY_MOVED)
+    if not reconstruction.models:
+        return reconstruction if has_moved else replace(reconstruction, failure=HARDLY_MOVED)
     # Only with a model: pycolmap may be missing
-    from mkpc_kaggle.scene.comparison import compare
+    from mkpc_kaggle.scene.comparison import compare_with_photographs
 
-    known = known_by_name(merged.graph)
+    given_cameras = known_by_name(merged.graph)
     models = []
-    for model in found.models:
-        comparison = replace(compare(model, known), has_moved=has_moved)
+    for model in reconstruction.models:
+        comparison = replace(compare_with_photographs(model, given_cameras), has_moved=has_moved)
         models.append(replace(model, comparison=comparison))
-    return replace(found, models=tuple(models))
+    return replace(reconstruction, models=tuple(models))
 
 
 def models_of(reconstructions: Sequence[Reconstruction]) -> tuple[SfmModel, ...]:

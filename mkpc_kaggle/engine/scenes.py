@@ -18,10 +18,10 @@ from mkpc_kaggle.engine.store.records import (
 from mkpc_kaggle.engine.store.tables import Kind, Result
 from mkpc_kaggle.errors import plural
 from mkpc_kaggle.scene.candidates import ALL_UNITS, title_of
-from mkpc_kaggle.scene.reconstruct import Solution
+from mkpc_kaggle.scene.sfm import Solution
 
 
-class Reconstructing:
+class SceneWork:
     """Jobs that make a candidate of a batch's scene each."""
 
     def __init__(self, run: Run) -> None:
@@ -64,6 +64,7 @@ class Reconstructing:
             source=source,
             matches=state.matches_of_candidate(batch, candidate),
             export=export,
+            cameras=state.request.cameras,
             candidate=candidate,
             scene=key,
             is_whole=folder is not None,

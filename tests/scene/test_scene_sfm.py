@@ -27,7 +27,7 @@ from mkpc_kaggle.recipe import CameraSharing, SceneConfig
 from mkpc_kaggle.scene import colmap
 from mkpc_kaggle.scene.choose import Reason
 from mkpc_kaggle.scene.export import HeldDirectory
-from mkpc_kaggle.scene.reconstruct import Solution, reconstruct_batch
+from mkpc_kaggle.scene.sfm import Solution, reconstruct_batch
 from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair
 
 
