@@ -13,9 +13,8 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache
-from io import TextIOBase
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import Any, TextIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,9 +26,6 @@ from mkpc_kaggle.errors import UserError, plural
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Matrix3
 
-if TYPE_CHECKING:
-    from pandas import DataFrame
-
 SUBMISSION_COLUMNS = ("sample_id", "fundamental_matrix")
 
 ROUNDED = re.compile(r"-?0\.00+")  # zero in fixed digits, such as 0.000000
@@ -37,7 +33,7 @@ ROUNDED = re.compile(r"-?0\.00+")  # zero in fixed digits, such as 0.000000
 # was rounded to six digits.
 MAX_RANK_3 = 1e-3
 BALANCE_STEPS = 20
-MAX_COLUMNS = 1000  # of a table; pandas takes minutes for a hundred thousand
+MAX_COLUMNS = 1000  # of a table; a file with more is another file
 MAX_LINE = 1 << 20  # characters of a row; other files may have lines of gigabytes
 # Characters that end lines or control a terminal.
 CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")
@@ -309,145 +305,70 @@ def read_rows(
     """Yield each row of a CSV file as its location, for messages, and its cells in ``columns`` and
     ``optional``.
 
-    ``only`` requires that the file has no other columns. Cells of an ``optional`` column that the
-    file lacks are empty. Raises :class:`UserError` for an unusable file.
+    Cells are the text of the file: ids such as "007", "1e3" and "NA" are no numbers. Empty rows are
+    skipped. Of columns with the same name, the first one counts. ``only`` requires that the file has
+    no other columns. Cells of an ``optional`` column that the file does not have are empty. Raises
+    :class:`UserError` for a file that is not a regular table with these columns.
     """
-    table = read_table(path, columns, only=only, optional=optional)
-    # Lists of str: iterating over pandas' own strings takes ten times as long.
-    cells = [table[column].tolist() for column in (*columns, *optional)]
-    for line, *row in zip(table.index.tolist(), *cells, strict=True):
-        yield f"{path}, line {line}", row
-
-
-def read_table(
-    path: Path, columns: Sequence[str], *, only: bool = False, optional: Sequence[str] = ()
-) -> "DataFrame":
-    """Return a CSV file with its text unchanged: ids such as "007", "1e3" and "NA" are no numbers.
-
-    The index is the line of the file where a row ends. Empty rows are skipped. ``only`` requires
-    that the file has no columns except ``columns``. An ``optional`` column that the file lacks has
-    empty cells. Raises :class:`UserError` for a file that is not a regular table with these
-    columns.
-    """
-    import pandas as pd  # the import takes most of a second
-
+    # A pipe or a device may never end.
+    if path.exists() and not path.is_file():
+        raise UserError(f"{path} is not a regular file")
+    last = 0  # the line where the last complete row ended
     try:
-        # A pipe or a device may never end.
-        if path.exists() and not path.is_file():
-            raise UserError(f"{path} is not a regular file")
         with path.open(encoding="utf-8-sig", newline="") as stream:
-            skipped = _skip_to_header(path, stream)
-            lines = _LimitedLines(stream)
-            rows = pd.read_csv(
-                lines,
-                # The header is read as a row, so that pandas refuses rows with more cells.
-                header=None,
-                dtype=str,
-                keep_default_na=False,
-                # Empty lines stay until the lines are counted.
-                skip_blank_lines=False,
-            )
+            # ``strict``: a quoted cell without an end is an error, and not the rest of the file.
+            table = csv.reader(_limited_lines(stream), strict=True)
+            header: list[str] = []
+            indices: list[int] = []
+            for row in table:
+                last = table.line_num
+                if not header and any(row):
+                    header = row
+                    indices = _column_indices(path, header, columns, only, optional)
+                elif len(row) > len(header) or (any(row) and len(row) < len(header)):
+                    cells = plural(len(row), "cell")
+                    raise UserError(f"{path}, line {last}: {cells}, the header has {len(header)}")
+                elif any(row):
+                    # An empty cell at the end stands for a missing column.
+                    row.append("")
+                    yield f"{path}, line {last}", [row[index] for index in indices]
     except FileNotFoundError as error:
         raise UserError(f"{path}: no such file") from error
-    except pd.errors.EmptyDataError:
-        raise UserError(f"{path} lacks the columns {', '.join(columns)}; it has nothing") from None
-    except pd.errors.ParserError as error:
-        raise UserError(_refusal(path, error, skipped)) from error
+    except csv.Error as error:
+        reason = str(error)
+        if reason == "unexpected end of data":
+            reason = f"EOF inside string, in the row that begins in line {last + 1}"
+        raise UserError(f"{path} cannot be read as a table: {reason}") from error
     except (OSError, ValueError) as error:
         raise UserError(f"{path} cannot be read as a table: {error}") from error
-    _number_lines(rows, skipped, lines.has_quotes)
-    is_filled = (rows != "").any(axis=1)
-    table = _with_header(path, rows[is_filled], columns, only, optional)
-    return table.reindex(columns=[*columns, *optional], fill_value="")
+    if not header:
+        raise UserError(f"{path} lacks the columns {', '.join(columns)}; it has nothing")
 
 
-def _number_lines(rows: "DataFrame", skipped: int, has_quotes: bool) -> None:
-    """Set the index to the line of the file where a row ends, after ``skipped`` empty lines."""
-    rows.index = np.arange(skipped + 1, skipped + len(rows) + 1)
-    if has_quotes:  # quoted cells may have line breaks
-        in_cells = rows.apply(lambda column: column.str.count("\n"))
-        breaks = in_cells.sum(axis=1)
-        rows.index += breaks.cumsum().astype(int)
+def _limited_lines(stream: TextIO) -> Iterator[str]:
+    """Yield the lines of a text. Raise ``ValueError`` for a long line and for a NUL character."""
+    # A line of another file may have gigabytes, so it is not read to its end.
+    while line := stream.readline(MAX_LINE + 2):
+        if len(line.rstrip("\r\n")) > MAX_LINE:
+            raise ValueError(f"a line of more than {MAX_LINE} characters")
+        if "\0" in line:
+            raise ValueError("line contains NUL")
+        yield line
 
 
-def _skip_to_header(path: Path, stream: TextIO) -> int:
-    """Move to the first line that is not empty. Return the number of empty lines before it."""
-    skipped = 0
-    position = stream.tell()
-    while (line := stream.readline(MAX_LINE)) and not line.strip("\r\n"):
-        skipped += 1
-        position = stream.tell()
-    if line.count(",") >= MAX_COLUMNS:
-        raise UserError(f"{path} has {line.count(',') + 1} columns; at most {MAX_COLUMNS} are read")
-    stream.seek(position)
-    return skipped
-
-
-def _with_header(
-    path: Path, rows: "DataFrame", columns: Sequence[str], only: bool, optional: Sequence[str]
-) -> "DataFrame":
-    """Return the rows below the header. Raise :class:`UserError` for missing columns or cells."""
-    header = list(rows.iloc[0])
+def _column_indices(
+    path: Path, header: list[str], columns: Sequence[str], only: bool, optional: Sequence[str]
+) -> list[int]:
+    """Return the index of each column in a row; -1 for an optional one that is missing."""
+    if len(header) > MAX_COLUMNS:
+        raise UserError(f"{path} has {len(header)} columns; at most {MAX_COLUMNS} are read")
     found = ", ".join(header)[:200]
     if missing := [column for column in columns if column not in header]:
         raise UserError(f"{path} lacks the columns {', '.join(missing)}; it has {found}")
     if only and header != list(columns):
         raise UserError(f"{path}: the header is {found}, not {', '.join(columns)}")
-    table = rows.iloc[1:]
-    # pandas fills the end of a short row with empty cells.
-    if (table.iloc[:, -1] == "").any():
-        _require_cells(path, len(header))
-    # Of columns with the same name, the first one counts.
-    present = [*columns, *(column for column in optional if column in header)]
-    firsts = [header.index(column) for column in present]
-    return table.iloc[:, firsts].set_axis(present, axis=1)
-
-
-def _require_cells(path: Path, count: int) -> None:
-    """Raise :class:`UserError` for the first row without ``count`` cells."""
-    with path.open(encoding="utf-8-sig", newline="") as stream:
-        table = csv.reader(stream)
-        for row in filter(None, table):
-            if len(row) != count:
-                where = f"{path}, line {table.line_num}"
-                raise UserError(f"{where}: {plural(len(row), 'cell')}, the header has {count}")
-
-
-def _refusal(path: Path, error: Exception, skipped: int) -> str:
-    """Return the message for a table that pandas refuses, after ``skipped`` empty lines."""
-    counts = re.search(r"Expected (\d+) fields in line (\d+), saw (\d+)", str(error))
-    if counts is None:
-        return f"{path} cannot be read as a table: {error}"
-    expected, line, saw = counts.groups()
-    cells = plural(int(saw), "cell")
-    return f"{path}, line {skipped + int(line)}: {cells}, the header has {expected}"
-
-
-class _LimitedLines(TextIOBase):
-    """A text stream for pandas that refuses long lines and NUL characters.
-
-    pandas would hold a line of more than ``MAX_LINE`` characters in memory several times, and would
-    cut a cell off at a NUL.
-    """
-
-    def __init__(self, stream: TextIO) -> None:
-        super().__init__()
-        self._stream = stream
-        self._length = 0  # of the line that the last part ends with
-        self.has_quotes = False
-
-    def read(self, size: int | None = -1, /) -> str:
-        text = self._stream.read(min(size, MAX_LINE) if size and size > 0 else MAX_LINE)
-        if "\0" in text:
-            raise ValueError("line contains NUL")
-        self.has_quotes |= '"' in text
-        # A part may begin within a line, and end within another.
-        lengths = [len(part) for part in text.split("\n")]
-        lengths[0] += self._length
-        self._length = lengths[-1]
-        if max(lengths) > MAX_LINE:
-            raise ValueError(f"a line of more than {MAX_LINE} characters")
-        return text
+    wanted = (*columns, *optional)
+    return [header.index(column) if column in header else -1 for column in wanted]
 
 
 def plain_name(name: str, where: str) -> str:

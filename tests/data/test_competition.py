@@ -240,6 +240,9 @@ def test_each_problem_of_a_submission_is_the_only_one_found(tmp_path, content, s
         ('id,value\n"a\nb",2\nc,3\n', [("line 3", ["a\nb", "2"]), ("line 4", ["c", "3"])]),
         ("id,other,value,value\n 1,x,2 ,y\n", [("line 2", [" 1", "2 "])]),
         ("\ufeffvalue,id\r\n#2,'1'\r\n", [("line 2", ["'1'", "#2"])]),
+        ("id,value\r1,2\r\r3,4", [("line 2", ["1", "2"]), ("line 4", ["3", "4"])]),
+        # Spreadsheets write empty rows with commas.
+        ('id,value\n,\n"1""2",3\n,\n', [("line 3", ['1"2', "3"])]),
     ],
 )
 def test_cells_are_the_text_of_the_file_with_its_lines(tmp_path, content, rows):
@@ -258,10 +261,14 @@ def test_cells_are_the_text_of_the_file_with_its_lines(tmp_path, content, rows):
         ('id,value\n1,"2', "cannot be read as a table: .*EOF inside string"),
         ("\n\nid,value\n1,2,3", "line 4: 3 cells, the header has 2"),
         ("id,value\n1,2\n3", "line 3: 1 cell, the header has 2"),
+        ("id,value\n1,2\n,,\n", "line 3: 3 cells, the header has 2"),
+        ('id,value\n1,2\n3,"4\n5\n6', "cannot be read as a table: EOF inside string.* line 3"),
+        ("id,value\n1," + "2" * 200_000, "cannot be read as a table: field larger than"),
+        ("", "it has nothing"),
+        ("\n\r\n", "it has nothing"),
     ],
 )
-def test_a_table_that_pandas_would_guess_at_is_refused(tmp_path, content, says):
-    # pandas fills short rows, and takes the first columns of long rows as an index.
+def test_a_table_that_a_reader_would_have_to_guess_at_is_refused(tmp_path, content, says):
     path = tmp_path / "table.csv"
     path.write_text(content)
     with pytest.raises(UserError, match=says):
