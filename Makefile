@@ -42,8 +42,7 @@ demo: install
 	$(BIN)/python make_submission.py --test-dir $(DEMO)/test --recipe auto --output $(DEMO)/submission.csv
 	$(BIN)/mkpc check $(DEMO)/submission.csv --test-dir $(DEMO)/test
 	@echo
-	@$(BIN)/mkpc validate --train-dir $(DEMO)/train --truth $(DEMO)/test_truth.csv \
-	    --submission $(DEMO)/submission.csv
+	@$(BIN)/mkpc score $(DEMO)/submission.csv --train-dir $(DEMO)/train --truth $(DEMO)/test_truth.csv
 	@echo
 	@$(BIN)/python -m benchmarks.two_pairs $(DEMO)/train --out $(DEMO)/pair.png
 	@echo

@@ -22,6 +22,7 @@ COMMANDS = {
     "match": "two images -> F, counts, a figure",
     "reconstruct": "a folder of images -> cameras, a COLMAP database, models",
     "validate": "a directory with known poses -> mAA and pose AUC of a recipe",
+    "score": "submission.csv with known poses -> mAA",
     "recipes": "list recipes; with a name, its units and missing weights",
     "weights": "list, verify, fetch and convert weight files",
     "check": "compare a submission.csv with the competition's format",

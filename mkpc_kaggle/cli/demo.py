@@ -12,7 +12,7 @@ poses, DIR/test without poses, and DIR/test_truth.csv to score a submission:
 
   mkpc demo --out demo
   python make_submission.py --test-dir demo/test
-  mkpc validate --train-dir demo/train --submission submission.csv --truth demo/test_truth.csv
+  mkpc score submission.csv --train-dir demo/train --truth demo/test_truth.csv
 """
 
 

@@ -6,14 +6,15 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from math import inf
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
-from mkpc_kaggle.data.competition import Pair
+from mkpc_kaggle.data.competition import Pair, TrainScene, read_train_side
 from mkpc_kaggle.engine.console import Progress, drain, say, unblocked
 from mkpc_kaggle.engine.plan.budget import Budget, monotonic_of, parse_duration
 from mkpc_kaggle.engine.request import RunReport
 from mkpc_kaggle.engine.session import Interrupt, Session
 from mkpc_kaggle.engine.workers.cluster import parse_workers
+from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.recipe import Mode, parse_setting
 from mkpc_kaggle.reporting.summary import left_out_line
 from mkpc_kaggle.setup.assembly import Assembly, assemble
@@ -64,6 +65,44 @@ def add_weights(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--weights", action="append", default=[], type=Path, metavar="DIR", help=text
     )
+
+
+def add_train_side(parser: argparse.ArgumentParser) -> None:
+    """Add the options that choose pairs of ``--train-dir``."""
+    add = parser.add_argument
+    add("--scenes", default="", metavar="A,B", help="of --train-dir; default: all")
+    add("--pairs-per-scene", type=int, metavar="N", help="evenly spread; default: all")
+    text = "minimum covisibility of pairs of --train-dir; default: 0.1, as in the competition"
+    add("--min-covisibility", type=float, default=0.1, help=text)
+
+
+def train_side_of(arguments: argparse.Namespace) -> tuple[TrainScene, ...]:
+    """Return the chosen pairs of ``--train-dir``."""
+    most = arguments.pairs_per_scene
+    if most is not None and most < 1:
+        raise UserError("--pairs-per-scene: give 1 or more")
+    names = filter(None, arguments.scenes.split(","))
+    least = arguments.min_covisibility
+    return read_train_side(
+        arguments.train_dir, scenes=names, min_covisibility=least, pairs_per_scene=most
+    )
+
+
+class Moved(argparse.Action):
+    """A former option, whose error names the new form."""
+
+    def __init__(self, option_strings: Sequence[str], dest: str, now: str) -> None:
+        super().__init__(option_strings, dest, nargs="*", help=argparse.SUPPRESS)
+        self._now = now
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: Any,
+        option_string: str | None = None,
+    ) -> NoReturn:
+        raise UserError(f"{option_string} is {self._now} now")
 
 
 def add_run(parser: argparse.ArgumentParser, time_limit: str | None) -> None:

@@ -5,7 +5,7 @@ import argparse
 from mkpc_kaggle.cli import options
 from mkpc_kaggle.recipe import Recipe, load_recipe, recipe_names
 from mkpc_kaggle.setup.assembly import recipe_of_name
-from mkpc_kaggle.setup.availability import UnavailableReason, unavailable
+from mkpc_kaggle.setup.availability import UnavailableReason, fetch_command, unavailable
 from mkpc_kaggle.weights import WeightStore
 
 HELP = """\
@@ -50,9 +50,5 @@ def unit_lines(recipe: Recipe, missing: dict[str, UnavailableReason]) -> list[st
         lines.append(f"  {unit.name:<30}at most {unit.max_matches} matches{fallback}")
     if not missing:
         return [*lines, "all weights are available"]
-    # ``weights fetch`` knows the package's recipes and the slots of files.
-    wanted = recipe.name
-    if recipe.name not in recipe_names():
-        wanted = " ".join(slot for reason in missing.values() for slot in reason.slots)
-    lines.append(f"missing; `mkpc weights fetch {wanted} --out weights` gets the weights:")
+    lines.append(f"missing; `{fetch_command(recipe, missing)}` gets the weights:")
     return [*lines, *(f"  {matcher}: {reason}" for matcher, reason in missing.items())]

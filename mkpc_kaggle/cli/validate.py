@@ -5,13 +5,12 @@ import json
 import re
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from mkpc_kaggle.cli import options
-from mkpc_kaggle.config import from_table
-from mkpc_kaggle.data.competition import TrainScene, missing_line, read_train_side
+from mkpc_kaggle.data.competition import TrainScene, missing_line
 from mkpc_kaggle.data.outputs import require_apart
 from mkpc_kaggle.data.pairs import read_pairs
 from mkpc_kaggle.data.regions import read_regions
@@ -20,24 +19,18 @@ from mkpc_kaggle.engine.request import RunReport
 from mkpc_kaggle.engine.session import Interrupt, Session, interruptible
 from mkpc_kaggle.errors import UserError, plural, temporary_directory, writing
 from mkpc_kaggle.evaluation.compare import comparison_json, comparison_table, step_gains
-from mkpc_kaggle.evaluation.imc2025 import score_imc2025, score_lines
 from mkpc_kaggle.evaluation.validate import (
     PROTOCOLS,
     Validation,
     by_protocol,
-    score_submission,
     score_table,
     to_json,
     validate,
 )
-from mkpc_kaggle.geometry.robust import Method, RobustConfig
-from mkpc_kaggle.recipe import split_mode
+from mkpc_kaggle.recipe import split_mode, with_settings
 from mkpc_kaggle.reporting.summary import left_out_line, summary, trouble
 from mkpc_kaggle.setup.assembly import Assembly
 
-# Defaults of the matching options.
-MATCHING = dict.fromkeys(("work_dir", "compare", "units", "method", "threshold", "regions"))
-MATCHING |= {"recipe": "auto", "mode": "two-stage", "set": []}
 HELP = """\
 Run a recipe on a train side with the engine that makes submissions, and score it as the competition does. A
 train side has calibration.csv, pair_covisibility.csv and images/ in each scene, and scaling_factors.csv next to
@@ -52,9 +45,6 @@ With --compare, several recipes run on the same pairs and are compared with the 
 
 With --pairs and --image-root, the pairs come from a list in the format of SuperGlue's evaluation, one line per
 pair: name0 name1 turns0 turns1 K0 K1 T_0to1. E is estimated, and the AUC is the score: see docs/benchmarks.md.
-
-With --submission and --truth, files are scored without matching. With --submission and --imc2025, they are scored
-by the rules of 2025: mAA of the camera centres, and the share of right images in the clusters.
 """
 
 
@@ -73,17 +63,10 @@ def _add_sources(parser: argparse.ArgumentParser) -> None:
     source.add_argument("--train-dir", type=Path, metavar="DIR")
     text = "a list of pairs with K and poses, or a directory of .npz of MegaDepth-1500"
     source.add_argument("--pairs", type=Path, metavar="FILE", help=text)
-    text = "score files of `reconstruct --format imc2025`; DIR has train_labels.csv and train_thresholds.csv"
-    source.add_argument("--imc2025", type=Path, metavar="DIR", help=text)
     add("--image-root", type=Path, metavar="DIR", help="where the images of --pairs lie")
-    add("--scenes", default="", metavar="A,B", help="of --train-dir; default: all")
-    add("--pairs-per-scene", type=int, metavar="N", help="evenly spread; default: all")
-    add(
-        "--min-covisibility",
-        type=float,
-        default=0.1,
-        help="of --train-dir; default: 0.1, as in the competition",
-    )
+    options.add_train_side(parser)
+    for name in ("--submission", "--truth", "--imc2025"):
+        add(name, action=options.Moved, now="an argument of `mkpc score`")
 
 
 def _add_estimates(parser: argparse.ArgumentParser) -> None:
@@ -99,14 +82,9 @@ def _add_estimates(parser: argparse.ArgumentParser) -> None:
     text = """run these instead of --recipe and --mode, and give the gain of each over the first with its 95 %%
         interval; such as classical:whole-images classical"""
     add("--compare", nargs="+", metavar="RECIPE[:MODE]", help=text)
-    add("--method", choices=list(map(str, Method)), help="default: the recipe's")
-    add(
-        "--threshold",
-        type=float,
-        metavar="PIXELS",
-        help="of the method; for E divided by the mean focal length",
-    )
-    text = "settings of a published evaluation, see docs/benchmarks.md; --method and --threshold change them"
+    for name in ("method", "threshold"):
+        add(f"--{name}", action=options.Moved, now=f"--set magsac.{name}=...")
+    text = "settings of a published evaluation, see docs/benchmarks.md; --set changes them"
     add("--protocol", choices=list(PROTOCOLS), help=text)
     text = "the matches choose between E's two rotations, as with --protocol; default: the one nearer to the truth"
     add("--in-front", action="store_true", help=text)
@@ -115,102 +93,49 @@ def _add_estimates(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_files(parser: argparse.ArgumentParser) -> None:
-    """Add the options of results, and of submissions to score."""
+    """Add the options of results."""
     add = parser.add_argument
     add("--json", type=Path, metavar="FILE", help="write all figures, per pair too")
     text = """keep the journal there and resume from it; report.html (with --compare, a page for each recipe) shows
         the run (not with --pairs); default: a temporary directory"""
     add("--work-dir", type=Path, metavar="DIR", help=text)
-    add(
-        "--submission",
-        action="append",
-        type=Path,
-        metavar="CSV",
-        help="score it, match nothing; may be repeated",
-    )
-    add(
-        "--truth",
-        type=Path,
-        metavar="CSV",
-        help="the pairs of its samples; `demo` writes an example",
-    )
 
 
 def run(arguments: argparse.Namespace) -> int:
     _require_a_whole(arguments)
-    if arguments.imc2025 is not None:
-        for submission in arguments.submission:
-            scores = score_imc2025(arguments.imc2025, submission)
-            say("\n".join([str(submission), *score_lines(scores)]))
-        return 0
     root = arguments.train_dir or arguments.image_root
     # Before any work: a run of hours must not end in an output that cannot be written.
-    inputs = [root, arguments.pairs, arguments.truth, arguments.regions]
-    inputs += arguments.submission or ()
+    inputs = [root, arguments.pairs, arguments.regions]
     require_apart({"--json": arguments.json}, filter(None, inputs), arguments.work_dir)
-    scenes = _scenes(arguments, root)
-    if arguments.submission is not None:
-        status, figures = _score(arguments, scenes)
+    if arguments.pairs is None:
+        scenes: Sequence[TrainScene] = options.train_side_of(arguments)
     else:
-        # Without a work directory, nothing is kept.
-        with ExitStack() as closed:
-            work_dir = arguments.work_dir or closed.enter_context(temporary_directory())
-            status, figures = _match_and_score(arguments, scenes, root, work_dir)
+        scenes = [read_pairs(arguments.pairs, root, most=arguments.pairs_per_scene)]
+    # Without a work directory, nothing is kept.
+    with ExitStack() as closed:
+        work_dir = arguments.work_dir or closed.enter_context(temporary_directory())
+        status, figures = _match_and_score(arguments, scenes, root, work_dir)
     if figures is not None and arguments.json is not None:
         with writing(f"--json {arguments.json}"):
             arguments.json.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
     return status
 
 
-def _scenes(arguments: argparse.Namespace, root: Path) -> Sequence[TrainScene]:
-    """Return the pairs to score, from a list or from a train side."""
-    most = arguments.pairs_per_scene
-    if arguments.pairs is not None:
-        return [read_pairs(arguments.pairs, root, most=most)]
-    names = filter(None, arguments.scenes.split(","))
-    least = arguments.min_covisibility
-    return read_train_side(root, scenes=names, min_covisibility=least, pairs_per_scene=most)
-
-
 def _require_a_whole(given: argparse.Namespace) -> None:
     """Raise :class:`UserError` for options that cannot be combined."""
-    scored = bool(given.submission)
-    matches = any(getattr(given, name) != default for name, default in MATCHING.items())
-    matching = ", ".join(f"--{name.replace('_', '-')}" for name in MATCHING)
-    has_no_root = (given.pairs is None) != (given.image_root is None)
-    has_no_truth = not given.imc2025 and scored != bool(given.truth)
-    is_empty = given.pairs_per_scene is not None and given.pairs_per_scene < 1
-    imc2025 = "--imc2025 needs --submission, and no --truth"
-    units = "--units chooses from one recipe; --compare takes recipes as they are"
-    # The first that is wrong is named: the order is that of the sources, then of the options.
-    for is_wrong, message in (
-        (given.imc2025 and (given.truth or not scored), imc2025),
-        (has_no_truth, "--submission and --truth go together"),
-        (scored and matches, f"--submission matches nothing: it goes without {matching}"),
-        (given.imc2025 and given.json, "--imc2025 only prints the score: it goes without --json"),
-        (has_no_root, "--pairs and --image-root go together"),
-        (scored and given.pairs, "--submission needs a --train-dir: it scores in metres"),
-        (given.protocol and not given.pairs, "--protocol needs --pairs: it is of E"),
-        (given.in_front and not given.pairs, "--in-front needs --pairs: it is of E"),
-        (given.pairs and given.compare, "--compare needs a --train-dir: it scores in metres"),
-        (given.compare and given.units, units),
-        (given.compare and len(given.compare) < 2, "--compare needs two recipes or more"),
-        (is_empty, "--pairs-per-scene: give 1 or more"),
-    ):
-        if is_wrong:
-            raise UserError(message)
-
-
-def _score(
-    arguments: argparse.Namespace, scenes: Sequence[TrainScene]
-) -> tuple[int, dict[str, Any] | None]:
-    """Print the scores of submissions. Return the exit status and all numbers for ``--json``."""
-    figures = []
-    for submission in arguments.submission:
-        validation = score_submission(submission, arguments.truth, scenes)
-        say("\n".join([str(submission), *score_table(validation)]))
-        figures.append(to_json(validation))
-    return 0, {"submissions": figures} if len(figures) > 1 else figures[0]
+    if (given.pairs is None) != (given.image_root is None):
+        raise UserError("--pairs and --image-root go together")
+    if given.pairs is None:
+        for option in ("protocol", "in_front"):
+            if getattr(given, option):
+                name = f"--{option.replace('_', '-')}"
+                raise UserError(f"{name} needs --pairs, because it evaluates E")
+    elif given.compare:
+        raise UserError("--compare needs a --train-dir: it scores in metres")
+    if given.compare and given.units:
+        raise UserError("--units chooses from one recipe; --compare takes recipes as they are")
+    if given.compare and len(given.compare) < 2:
+        raise UserError("--compare needs two recipes or more")
 
 
 def _match_and_score(
@@ -299,12 +224,10 @@ def _assemble(
     """Return the assembly of a recipe, as changed by the command's options."""
     assembly = options.assembly_of(arguments, name, mode, interrupt)
     recipe = assembly.recipe
-    # In this order: --method and --threshold change a protocol's settings, too.
     if arguments.units is not None:
         recipe = recipe.with_units(arguments.units.split(","))
     if arguments.protocol is not None:
         recipe = by_protocol(recipe, arguments.protocol)
-    given = {"method": arguments.method, "threshold": arguments.threshold}
-    changes = {key: value for key, value in given.items() if value is not None}
-    magsac = from_table(RobustConfig, asdict(recipe.magsac) | changes, "--method and --threshold")
-    return replace(assembly, recipe=replace(recipe, magsac=magsac))
+        # Again, because --set changes a protocol's settings, too.
+        recipe = with_settings(recipe, options.settings_of(arguments))
+    return replace(assembly, recipe=recipe)

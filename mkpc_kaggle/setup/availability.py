@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 from types import MappingProxyType
 from typing import Any
@@ -13,7 +13,7 @@ from mkpc_kaggle.matchers.contract import Matcher
 from mkpc_kaggle.matchers.failures import reason_of
 from mkpc_kaggle.matchers.registry import UnusableError, matcher_names, misfit, spec_of
 from mkpc_kaggle.recipe import Recipe, load_recipe, recipe_names
-from mkpc_kaggle.weights import FoundFile, WeightStore, load_tensors
+from mkpc_kaggle.weights import FoundFile, MissingWeights, WeightStore, load_tensors
 
 PERMISSIVE_TAGS = frozenset({"Apache-2.0", "BSD-3-Clause", "MIT"})
 
@@ -47,7 +47,7 @@ class UnavailableReason:
 
     kind: UnavailableKind
     detail: str
-    slots: tuple[str, ...] = ()  # the slots of missing files
+    missing: MissingWeights = field(default_factory=MissingWeights)
 
     def __str__(self) -> str:
         return f"{self.kind} ({self.detail})"
@@ -89,8 +89,7 @@ def _reason(
         detail = reason_of(error.__cause__ or error)
         return UnavailableReason(UnavailableKind.NOT_IMPORTABLE, detail)
     found = {slot: store.find(slot) for slot in spec.slots_for(options)}
-    missing = tuple(slot for slot, file in found.items() if file is None)
-
+    missing = store.missing(found)
     # Of missing files, too: nobody should fetch what the run would refuse.
     licences = set(spec.licences)
     for slot, file in found.items():
@@ -100,11 +99,7 @@ def _reason(
     if refused is not None:
         return refused
     if missing:
-        texts = []
-        for slot in missing:
-            names = " or ".join(file.name for file in store.alternatives(slot))
-            texts.append(f"{slot}: {names}")
-        return UnavailableReason(UnavailableKind.NO_WEIGHTS, "; ".join(texts), missing)
+        return UnavailableReason(UnavailableKind.NO_WEIGHTS, str(missing), missing)
     if found and (problem := misfit(name, store, options)):
         return UnavailableReason(UnavailableKind.UNREADABLE, problem)
     return None
@@ -175,16 +170,27 @@ def refusal(recipe: Recipe, reasons: Mapping[str, UnavailableReason]) -> UserErr
         )
     if kind is UnavailableKind.NO_WEIGHTS:
         what = f"recipe {recipe.name!r} needs weights that were not found: {those}"
-        # ``weights fetch`` knows the names of the package's recipes only.
-        is_ours = recipe.name in recipe_names()
-        slots = dict.fromkeys(slot for reason in reasons.values() for slot in reason.slots)
-        command = f"mkpc weights fetch {recipe.name if is_ours else ' '.join(slots)} --out DIR"
         return UserError(
-            f"{what}. Name their directory with --weights, get them with `{command}`, or use --recipe "
-            "auto, which needs none."
+            f"{what}. Name their directory with --weights, get them with "
+            f"`{fetch_command(recipe, reasons)}`, or use --recipe auto, which needs none."
         )
     what = f"recipe {recipe.name!r} has no unit left that can sweep all pairs: {kind}: {those}"
     return UserError(f"{what}. Use --recipe auto, which does without these matchers.")
+
+
+def missing_weights(reasons: Iterable[UnavailableReason]) -> MissingWeights:
+    """Return the missing weights of several matchers."""
+    missing = MissingWeights()
+    for reason in reasons:
+        missing |= reason.missing
+    return missing
+
+
+def fetch_command(recipe: Recipe, reasons: Mapping[str, UnavailableReason]) -> str:
+    """Return the command that gets a recipe's missing weights."""
+    # ``weights fetch`` knows the names of the package's recipes only.
+    name = recipe.name if recipe.name in recipe_names() else ""
+    return missing_weights(reasons.values()).command(name)
 
 
 def left_out(
@@ -198,14 +204,13 @@ def left_out(
     texts = []
     for kind in dict.fromkeys(reason.kind for reason in reasons.values()):
         names = [name for name, reason in reasons.items() if reason.kind is kind]
-        # Only missing weights have slots.
-        slots = list(dict.fromkeys(slot for name in names for slot in reasons[name].slots))
-        if is_auto:
-            light = load_recipe("light")
-            slots = ["light"] if set(slots) & set(slots_of(light, light.matcher_names)) else []
-        command = f"mkpc weights fetch {' '.join(slots)} --out DIR"
         text = f"{kind}: {', '.join(names)}"
-        texts.append(f"{text} (`{command}` gets weights)" if slots else text)
+        missing = missing_weights(reasons[name] for name in names)
+        light = load_recipe("light")
+        is_light_missing = not missing.files.keys().isdisjoint(slots_of(light, light.matcher_names))
+        if missing and (is_light_missing or not is_auto):
+            text += f" (`{missing.command('light' if is_auto else '')}` gets weights)"
+        texts.append(text)
     return tuple(texts)
 
 

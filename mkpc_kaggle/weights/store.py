@@ -5,7 +5,7 @@ import os
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from functools import cached_property
 from pathlib import Path
@@ -75,6 +75,27 @@ class FileSearch:
 
     found: FoundFile | None
     refused: tuple[FoundFile, ...] = ()
+
+
+@dataclass(frozen=True)
+class MissingWeights:
+    """Slots of the manifest without a usable file, each with the names of files that would do."""
+
+    files: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+
+    def __bool__(self) -> bool:
+        return bool(self.files)
+
+    def __or__(self, other: "MissingWeights") -> "MissingWeights":
+        return MissingWeights({**self.files, **other.files})
+
+    def __str__(self) -> str:
+        """Return the files, such as ``aliked-n16: aliked-n16.pth; raco: raco.pth or raco.bin``."""
+        return "; ".join(f"{slot}: {' or '.join(names)}" for slot, names in self.files.items())
+
+    def command(self, recipe: str = "") -> str:
+        """Return the command that gets them. The package's ``recipe`` is shorter than its slots."""
+        return f"mkpc weights fetch {recipe or ' '.join(self.files)} --out DIR"
 
 
 class WeightStore:
@@ -169,11 +190,21 @@ class WeightStore:
         """Return the slot's tensors by name. Raise :class:`UserError` for a missing or bad file."""
         found = self.find(slot)
         if found is None:
-            names = " or ".join(file.name for file in self.alternatives(slot))
+            missing = self.missing([slot])
             raise UserError(
-                f"no weights for {slot!r}: {names} not found (searched {self.searched})"
+                f"no weights for {missing} not found (searched {self.searched}); "
+                f"`{missing.command()}` gets them"
             )
         return load_tensors(found.path, self._device)
+
+    def missing(self, slots: Iterable[str]) -> MissingWeights:
+        """Return the slots without a usable file."""
+        files = {
+            slot: tuple(file.name for file in self.alternatives(slot))
+            for slot in slots
+            if self.find(slot) is None
+        }
+        return MissingWeights(files)
 
     def on_meta(self, *chosen: FoundFile) -> "WeightStore":
         """Return a store that loads names, shapes and types only, on the device "meta".

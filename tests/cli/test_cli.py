@@ -67,7 +67,7 @@ def test_a_recipe_is_listed_with_its_units_and_missing_weights(clean_environment
     assert run_command("recipes", "aliked_lightglue") == 0
     listed = capsys.readouterr().out
     assert "1:aliked_lightglue@" in listed
-    assert "`mkpc weights fetch aliked-n16 aliked-lightglue --out weights`" in listed
+    assert "`mkpc weights fetch aliked-n16 aliked-lightglue --out DIR`" in listed
     assert run_command("recipes", "classical") == 0
     assert "all weights are available" in capsys.readouterr().out
 

@@ -136,7 +136,8 @@ def test_a_listed_image_is_set_upright_and_scored_as_it_is_stored(
     lines.append(line_of(("missing.jpg", "none.jpg"), (true.camera0, true.camera1)))
     (tmp_path / "list.txt").write_text("\n\n".join(lines))
     options = ["--pairs", tmp_path / "list.txt", "--image-root", tmp_path]
-    options += ["--recipe", small_recipe, "--method", "ransac", "--threshold", 1]
+    options += ["--recipe", small_recipe]
+    options += ["--set", "magsac.method=ransac", "--set", "magsac.threshold=1"]
     scores = scores_of(tmp_path / "scores.json", *options)
     *found, missing = scores["scenes"][0]["pairs"]
     # A turn that was forgotten is an error of 90 degrees.

@@ -161,7 +161,7 @@ def test_a_table_that_cannot_be_scored_is_refused_in_one_line(
     submission.write_text((home / "train_labels.csv").read_text())
     path = home / f"{table}.csv"
     path.write_text(after if before is None else path.read_text().replace(before, after, 1))
-    assert run_command("validate", "--imc2025", home, "--submission", submission) == 2
+    assert run_command("score", submission, "--imc2025", home) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert re.search(told, line)
 
@@ -174,7 +174,7 @@ def test_the_command_scores_a_file_and_a_dataset_of_outliers_alone_needs_no_thre
         stream.write(f"a\x1b[2Jb,outliers,x.png,{';'.join(['nan'] * 9)},nan;nan;nan\n")
     # The truth as a submission; a dataset's name may drive a terminal.
     truth = home / "train_labels.csv"
-    assert run_command("validate", "--imc2025", home, "--submission", truth) == 0
+    assert run_command("score", truth, "--imc2025", home) == 0
     rows = [line.split() for line in capsys.readouterr().out.splitlines()]
     assert rows[2:] == [
         ["set", "1.0000", "1.0000", "1.0000"],

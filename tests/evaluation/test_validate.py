@@ -67,17 +67,8 @@ def test_samples_without_a_row_count_as_failed_and_are_named(demo, tmp_path, cap
     out = tmp_path / "scores.json"
     competition.write_submission(some, dict(list(truth.items())[:2]))
     competition.write_submission(whole, truth)
-    score = [
-        "validate",
-        "--train-dir",
-        demo.train_dir,
-        "--truth",
-        demo.truth_csv,
-        "--json",
-        out,
-        "--submission",
-    ]
-    assert run_command(*score, some) == 0
+    truth_options = ["--train-dir", demo.train_dir, "--truth", demo.truth_csv, "--json", out]
+    assert run_command("score", some, *truth_options) == 0
     lacking = list(truth)[2:]
     printed = capsys.readouterr().out
     assert "6 samples without a row, counted as failed: " in printed
@@ -86,7 +77,7 @@ def test_samples_without_a_row_count_as_failed_and_are_named(demo, tmp_path, cap
     figures = json.loads(out.read_text())
     assert figures["mAA"] == 2 / 8
     assert sorted(figures["missing"]) == sorted(lacking)
-    assert run_command(*score, some, "--submission", whole) == 0
+    assert run_command("score", some, whole, *truth_options) == 0
     assert [each["mAA"] for each in json.loads(out.read_text())["submissions"]] == [2 / 8, 1]
 
 
@@ -162,34 +153,48 @@ def test_a_validation_that_hangs_ends_at_its_limit(demo):
 @pytest.mark.parametrize(
     ("options", "told"),
     [
-        (["--train-dir", "T", "--submission", "x.csv"], "go together"),
         (
             ["--train-dir", "T", "--recipe", "R", "--units", "sift"],
             "no unit 'sift'; it has 1:sift@320, 2:",
         ),
-        (["--train-dir", "T", "--recipe", "classical", "--threshold", "0"], "threshold must be in"),
+        (
+            ["--train-dir", "T", "--recipe", "classical", "--set", "magsac.threshold=0"],
+            "threshold must be in",
+        ),
+        (["--train-dir", "T", "--threshold", "1"], "--threshold is --set magsac.threshold=... now"),
+        (["--train-dir", "T", "--method", "ransac"], "--method is --set magsac.method=... now"),
+        (["--train-dir", "T", "--submission", "x"], "is an argument of `mkpc score` now"),
+        (["--train-dir", "T", "--protocol", "loftr"], "--protocol needs --pairs"),
+        (["--train-dir", "T", "--in-front"], "--in-front needs --pairs"),
+        (["--train-dir", "T", "--pairs-per-scene", "0"], "give 1 or more"),
         (["--pairs", "a.txt"], "go together"),
         (["--pairs", "a.txt", "--image-root", ".", "--compare", "a", "b"], "needs a --train-dir"),
         (["--train-dir", ".", "--image-root", "."], "go together"),
-        (["--imc2025", "."], "--imc2025 needs --submission, and no --truth"),
         (
             ["--train-dir", "T", "--compare", "classical", "clasical:stage-1"],
             "unknown recipe 'clasical'",
         ),
         (["--train-dir", "T", "--compare", "classical"], "two recipes"),
-        (
-            ["--train-dir", "T", "--submission", "a", "--truth", "b", "--recipe", "nonsense"],
-            "it goes without",
-        ),
-        (
-            ["--train-dir", "T", "--submission", "a", "--truth", "b", "--units", "1:sift@320"],
-            "it goes without",
-        ),
     ],
 )
 def test_contradictory_options_are_refused(demo, small_recipe, options, told, capsys):
     places = {"T": demo.train_dir, "R": small_recipe}
     assert run_command("validate", *(places.get(option, option) for option in options)) == 2
+    captured = capsys.readouterr()
+    assert (told in captured.err, captured.out) == (True, "")
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (["--train-dir", "T"], "--train-dir needs --truth"),
+        (["--imc2025", ".", "--truth", "t.csv"], "leave --truth and --json out"),
+        (["--imc2025", ".", "--json", "out.json"], "leave --truth and --json out"),
+    ],
+)
+def test_a_score_needs_one_truth(demo, options, told, capsys):
+    given = [demo.train_dir if option == "T" else option for option in options]
+    assert run_command("score", "x.csv", *given) == 2
     captured = capsys.readouterr()
     assert (told in captured.err, captured.out) == (True, "")
 

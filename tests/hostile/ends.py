@@ -57,7 +57,7 @@ SUBMISSIONS = {
     "a submission of huge numbers": written("sub.csv", f"{HEADER}1,1e308 1e308 1 1 1 1 1 1 1\n"),
 }
 CLEARED = r"a\x1b[2J\n: no"
-SCORE = "validate --train-dir T --submission sub.csv --truth truth.csv"
+SCORE = "score sub.csv --train-dir T --truth truth.csv"
 # Time limits that end the run early, and limits that do not
 SHORT = ("1s", "0.001s", "3s")
 LONG = ("99999999999h", "' 60s '")

@@ -40,7 +40,7 @@ READ = {  # by its path: the command that reads it, and its allowed statuses
     "a.pt": (CONVERT, REFUSED),
     f"weights/deep/{NAME}": (AUTO, (0,)),
     "weights/deep/weights_manifest.txt": (f"weights verify {SEARCH}", (0,)),
-    "truth.csv": ("validate --train-dir T --submission sub.csv --truth truth.csv", REFUSED),
+    "truth.csv": ("score sub.csv --train-dir T --truth truth.csv", REFUSED),
     "T/scaling_factors.csv": ("validate --train-dir T --recipe quick.toml --workers 0", REFUSED),
     "out/s.work/journal.sqlite": (SUBMIT, (0, 2)),  # a link to nothing is followed
     "out/s.work/journal.lock": (SUBMIT, (0, 2)),
