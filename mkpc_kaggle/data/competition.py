@@ -349,7 +349,7 @@ def _limited_lines(stream: TextIO) -> Iterator[str]:
     """Yield the lines of a text. Raise ``ValueError`` for a long line and for a NUL character."""
     # A line of another file may have gigabytes, so it is not read to its end.
     while line := stream.readline(MAX_LINE + 2):
-        if len(line.rstrip("\r\n")) > MAX_LINE:
+        if len(line) > MAX_LINE and len(line.rstrip("\r\n")) > MAX_LINE:
             raise ValueError(f"a line of more than {MAX_LINE} characters")
         if "\0" in line:
             raise ValueError("line contains NUL")
