@@ -10,8 +10,8 @@ from score_figures import short
 
 from mkpc_kaggle.data.competition import TrainScene, TruePair, read_train_side
 from mkpc_kaggle.data.images import Image
-from mkpc_kaggle.engine.store.records import SceneRecord
-from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.errors import UserError, plural
+from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Box, Matrix3, Points
 from mkpc_kaggle.geometry.critical_region import Clusters, CriticalRegion, MkpcConfig, expand_box
 from mkpc_kaggle.geometry.matches import Matches
@@ -25,12 +25,12 @@ from mkpc_kaggle.reporting.figures import (
     INLIER,
     OUTLIER,
     REGION,
-    draw_cameras,
     new_figure,
     plain_axes,
     sample,
 )
-from mkpc_kaggle.scene.models import Reconstruction
+from mkpc_kaggle.scene.models import Reconstruction, SfmModel
+from mkpc_kaggle.scene.sfm import models_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -401,6 +401,74 @@ def _far_apart(points: Points, count: int) -> NDArray[np.intp]:
     return np.array(chosen, np.intp)
 
 
-def draw_scene(name: str, scenes: Sequence[Reconstruction]) -> "Figure":
-    """Draw the cameras and points of the largest model of a batch, from above and from the side."""
-    return draw_cameras(SceneRecord.of(name, scenes))
+def draw_scene(reconstructions: Sequence[Reconstruction]) -> "Figure":
+    """Draw the cameras and points of the largest model of a batch, or the reason for no model."""
+    models = models_of(reconstructions)
+    if models:
+        return draw_model(models[0])
+    reason = "; ".join(found.failure for found in reconstructions) or "no connected images"
+    figure = new_figure(8.4, 4.0)
+    figure.text(0.5, 0.5, f"no cameras: {reason}", ha="center", wrap=True)
+    return figure
+
+
+def draw_model(model: SfmModel) -> "Figure":
+    """Draw a model's cameras and points, in model units, from above and the side.
+
+    An arrow shows the viewing direction of a camera. Up is the images' mean up direction, and ahead
+    is the mean viewing direction. Points far from nearly all others are left out.
+    """
+    figure = new_figure(8.4, 4.0)
+    right, up, ahead = _upright_axes([found.camera for found in model.images])
+    from_above, from_the_side = figure.subplots(1, 2)
+    _draw_projected(from_above, "above", model, np.column_stack([right, ahead]))
+    _draw_projected(from_the_side, "the side", model, np.column_stack([ahead, up]))
+    return figure
+
+
+def _upright_axes(cameras: Sequence[Camera]) -> NDArray[np.float64]:
+    """Return the unit vectors (3, 3) right, up and ahead of the mean camera, in the model's world."""
+    # A model's axes are arbitrary, but photographs are mostly taken upright.
+    _, down, forward = np.mean([camera.R for camera in cameras], axis=0)
+    up = -down / np.linalg.norm(down)
+    ahead = forward - forward @ up * up
+    ahead /= np.linalg.norm(ahead)
+    return np.stack([np.cross(ahead, up), up, ahead])
+
+
+def _draw_projected(panel: "Axes", name: str, model: SfmModel, axes: NDArray[np.float64]) -> None:
+    """Draw a model's cameras and points as seen from ``name``, projected on ``axes`` (3, 2)."""
+    cameras = [found.camera for found in model.images]
+    plain_axes(panel, f"{plural(len(cameras), 'camera')} from {name}")
+    points = model.points @ axes
+    # A few points of wrong matches lie far away and would shrink all others.
+    near = _near(points[:, 0]) & _near(points[:, 1])
+    panel.scatter(points[near, 0], points[near, 1], s=2, color=DROPPED, linewidths=0)
+    centres = np.array([camera.centre for camera in cameras])
+    # Cameras at one point still have arrows.
+    arrow = 0.12 * (np.ptp(centres, axis=0).max() or 1.0)
+    looks = arrow * np.array([camera.R[2] for camera in cameras])
+    x, y = (centres @ axes).T
+    panel.quiver(
+        x,
+        y,
+        *(looks @ axes).T,
+        angles="xy",
+        scale_units="xy",
+        scale=1,
+        width=0.004,
+        color=COLOURS[0],
+    )
+    # Above the arrows and the points
+    panel.scatter(x, y, s=14, color=OUTLIER, linewidths=0, zorder=3)
+    # One scale for both axes, and the panel filled
+    panel.set_aspect("equal", adjustable="datalim")
+    panel.margins(0.1)
+
+
+def _near(values: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return a mask of the values in or near the range of nearly all values."""
+    low, high = np.percentile(values, (3, 97)) if len(values) else (0.0, 0.0)
+    # 40 % beyond the range on both sides
+    near: NDArray[np.bool_] = np.abs(values - (low + high) / 2) <= 0.7 * (high - low)
+    return near

@@ -1,17 +1,11 @@
-"""Figures of pairs and of a scene's cameras, and their files."""
+"""Figures of pairs, and their files."""
 
-from collections.abc import Sequence
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-from numpy.typing import NDArray
-
 from mkpc_kaggle.data.outputs import replacing
-from mkpc_kaggle.engine.store.records import SceneRecord
-from mkpc_kaggle.errors import UserError, plural
-from mkpc_kaggle.geometry.cameras import Camera
+from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.pipeline.drawing import (
     COLOURS,
     DPI,
@@ -25,7 +19,6 @@ from mkpc_kaggle.pipeline.drawing import (
     new_figure,
     sample,
 )
-from mkpc_kaggle.scene.models import SfmModel
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -39,7 +32,6 @@ __all__ = [
     "INLIER",
     "OUTLIER",
     "REGION",
-    "draw_cameras",
     "draw_matches",
     "draw_pair",
     "draw_strip",
@@ -50,74 +42,6 @@ __all__ = [
     "sample",
     "save",
 ]
-
-
-def draw_cameras(scene: SceneRecord, number: int = 0) -> "Figure":
-    """Draw a model's cameras and points, in model units, from above and the side; number 0 is the
-    largest.
-
-    An arrow shows the viewing direction of a camera. Up is the images' mean up direction, and ahead
-    is the mean viewing direction. Points far from nearly all others are left out. Without cameras,
-    the figure is only text.
-    """
-    figure = new_figure(8.4, 4.0)
-    if not scene.models:
-        figure.text(0.5, 0.5, f"no cameras: {scene.failure}", ha="center", wrap=True)
-        return figure
-    model = scene.models[number]
-    right, up, ahead = _upright_axes([found.camera for found in model.images])
-    from_above, from_the_side = figure.subplots(1, 2)
-    _draw_projected(from_above, "above", model, np.column_stack([right, ahead]))
-    _draw_projected(from_the_side, "the side", model, np.column_stack([ahead, up]))
-    return figure
-
-
-def _upright_axes(cameras: Sequence[Camera]) -> NDArray[np.float64]:
-    """Return the unit vectors (3, 3) right, up and ahead of the mean camera, in the model's world."""
-    # A model's axes are arbitrary, but photographs are mostly taken upright.
-    _, down, forward = np.mean([camera.R for camera in cameras], axis=0)
-    up = -down / np.linalg.norm(down)
-    ahead = forward - forward @ up * up
-    ahead /= np.linalg.norm(ahead)
-    return np.stack([np.cross(ahead, up), up, ahead])
-
-
-def _draw_projected(panel: "Axes", name: str, model: SfmModel, axes: NDArray[np.float64]) -> None:
-    """Draw a model's cameras and points as seen from ``name``, projected on ``axes`` (3, 2)."""
-    cameras = [found.camera for found in model.images]
-    plain_axes(panel, f"{plural(len(cameras), 'camera')} from {name}")
-    points = model.points @ axes
-    # A few points of wrong matches lie far away and would shrink all others.
-    near = _near(points[:, 0]) & _near(points[:, 1])
-    panel.scatter(points[near, 0], points[near, 1], s=2, color=DROPPED, linewidths=0)
-    centres = np.array([camera.centre for camera in cameras])
-    # Cameras at one point still have arrows.
-    arrow = 0.12 * (np.ptp(centres, axis=0).max() or 1.0)
-    looks = arrow * np.array([camera.R[2] for camera in cameras])
-    x, y = (centres @ axes).T
-    panel.quiver(
-        x,
-        y,
-        *(looks @ axes).T,
-        angles="xy",
-        scale_units="xy",
-        scale=1,
-        width=0.004,
-        color=COLOURS[0],
-    )
-    # Above the arrows and the points
-    panel.scatter(x, y, s=14, color=OUTLIER, linewidths=0, zorder=3)
-    # One scale for both axes, and the panel filled
-    panel.set_aspect("equal", adjustable="datalim")
-    panel.margins(0.1)
-
-
-def _near(values: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return a mask of the values in or near the range of nearly all values."""
-    low, high = np.percentile(values, (3, 97)) if len(values) else (0.0, 0.0)
-    # 40 % beyond the range on both sides
-    near: NDArray[np.bool_] = np.abs(values - (low + high) / 2) <= 0.7 * (high - low)
-    return near
 
 
 def require_format(path: Path) -> None:

@@ -25,7 +25,7 @@ from mkpc_kaggle.errors import UserError, plural, printable, writing
 from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
 from mkpc_kaggle.pipeline.pair import PairMatch
 from mkpc_kaggle.pipeline.two_stage import to_image
-from mkpc_kaggle.reporting.figures import draw_cameras, draw_pair, draw_strip, encode
+from mkpc_kaggle.reporting.figures import draw_pair, draw_strip, encode
 from mkpc_kaggle.reporting.points import clouds_of
 from mkpc_kaggle.reporting.run_log import RunLog, read_log
 from mkpc_kaggle.reporting.summary import (
@@ -61,7 +61,6 @@ WRITING_S_PER_PAIR = 0.0002
 DRAWING_S = 5.0  # drawings start only if more time is left
 # Drawn scenes, and drawn models per scene: with all points, each view adds 240 kB to the page.
 MAX_SCENES = 12
-MAX_MODELS = 8
 MAX_ROWS = 2000  # of the table of pairs
 
 
@@ -137,7 +136,7 @@ def report_page(
     sections = {
         **_head(log),
         **_missing(log),
-        **_scene_section(log, () if undrawn else pairs, is_drawn=not undrawn),
+        **_scene_section(log, () if undrawn else pairs),
         **_weakest_section(log, {} if undrawn else {pair.id: pair for pair in pairs}, progress),
         **_pair_section(log),
         **_seconds_section(log),
@@ -174,7 +173,7 @@ def _missing(log: RunLog) -> dict[str, Any]:
     }
 
 
-def _scene_section(log: RunLog, pairs: Sequence[Pair], *, is_drawn: bool) -> dict[str, Any]:
+def _scene_section(log: RunLog, pairs: Sequence[Pair]) -> dict[str, Any]:
     """Return the views and tables of scenes. ``pairs`` have the paths of images, if any are read."""
 
     def read_in(batch: str) -> Reader:
@@ -191,7 +190,7 @@ def _scene_section(log: RunLog, pairs: Sequence[Pair], *, is_drawn: bool) -> dic
             (name, 100 * of.centre, of.rotation, of.focal) if of else (name, "unknown", "", "")
             for name, of in weakest_cameras(log.scenes)
         ],
-        "views": [*_views(log, read_in, is_drawn=is_drawn)],
+        "views": [*_views(log, read_in)],
     }
 
 
@@ -284,23 +283,16 @@ def flatness(record: PairRecord) -> str:
     return f"flat: one homography explains {100 * record.stats.plane:.0f} % of the inliers"
 
 
-def _views(
-    log: RunLog, read_in: Callable[[str], Reader], *, is_drawn: bool
-) -> Iterator[tuple[str, "Markup"]]:
+def _views(log: RunLog, read_in: Callable[[str], Reader]) -> Iterator[tuple[str, "Markup"]]:
     """Yield the title and the view of each of the largest scenes.
 
-    ``read_in`` returns the reader of a batch's images. If ``is_drawn``, pictures replace a view
-    without scripts.
+    ``read_in`` returns the reader of a batch's images.
     """
     largest = sorted(log.scenes, key=lambda scene: -scene.registered)[:MAX_SCENES]
     for scene in largest:
         # Its reason is in the table of scenes.
         if not scene.models:
             continue
-        pictures = []
-        for number in range(min(len(scene.models), MAX_MODELS) if is_drawn else 0):
-            figure = draw_cameras(scene, number)
-            pictures.append((f"{scene.batch}, model {number}", _data_uri(figure, "png")))
         models = scene.models
         # COLMAP's files have more points than the journal, and their colours.
         clouds = clouds_of(scene, log.path.parent.parent)
@@ -316,7 +308,6 @@ def _views(
             scene.batch,
             read=read_in(scene.batch),
             partners=partners_of(records),
-            pictures=pictures,
             colours=[cloud.colours for cloud in clouds],
         )
         yield scene.batch, part
@@ -361,8 +352,7 @@ def show_run(work_dir: Path, root: Path | None = None) -> SceneView:
         }
         return reader_of({file: root / file for file in files})
 
-    # A notebook runs scripts, so there are no pictures in place of the view.
-    return view_of(_views(log, read_in, is_drawn=False))
+    return view_of(_views(log, read_in))
 
 
 def linked_images(out: Path, batch: str) -> dict[str, Path]:

@@ -107,14 +107,12 @@ def view_part(
     *,
     read: Reader = lambda _: None,
     partners: Partners | None = None,
-    pictures: Sequence[tuple[str, str]] = (),
     colours: Colours = (),
     metres_per_unit: float | None = None,
 ) -> "Markup":
     """Return the part of a page with the view of a scene's models.
 
-    ``read`` returns pictures, which colour the points of models without ``colours``. ``pictures`` are captions and
-    URIs of pictures that a browser without scripts shows instead. All text is escaped.
+    ``read`` returns pictures, which colour the points of models without ``colours``. All text is escaped.
     """
     from markupsafe import Markup
 
@@ -124,7 +122,7 @@ def view_part(
         models, read=read, partners=partners or {}, colours=colours, metres_per_unit=metres_per_unit
     )
     part = templates().get_template("view.html")
-    return Markup(part.render(data=data, title=title, pictures=pictures))
+    return Markup(part.render(data=data, title=title))
 
 
 @cache

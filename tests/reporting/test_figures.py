@@ -6,7 +6,6 @@ import pytest
 import tour_figures as figures
 
 from mkpc_kaggle.data.images import Image
-from mkpc_kaggle.engine.store.records import SceneRecord
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Box, Size
 from mkpc_kaggle.geometry.critical_region import CriticalRegion, RegionReason
@@ -14,7 +13,7 @@ from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, Estimate, ModelKind
 from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
 from mkpc_kaggle.recipe import Unit
-from mkpc_kaggle.reporting.figures import draw_cameras, draw_strip, encode
+from mkpc_kaggle.reporting.figures import draw_strip, encode
 from mkpc_kaggle.scene.models import RegisteredImage, SfmModel
 from mkpc_kaggle.scene.view_graph import BatchImage
 
@@ -76,7 +75,7 @@ def test_cameras_are_seen_from_above_and_from_the_side_with_the_points_before_th
         placed.append(RegisteredImage(image, camera, 9))
     wall = np.array([(10.0, y, z) for y in range(5) for z in range(8)])
     model = SfmModel(tuple(placed), wall, 0.5)
-    above, side = draw_cameras(SceneRecord("batch", models=(model,))).axes
+    above, side = figures.draw_model(model).axes
     cloud, _, centres = above.collections
     assert extent(centres) == [2, 0]
     assert extent(cloud) == [4, 0], "from above a wall is a line"
