@@ -36,8 +36,9 @@ import numpy as np
 import pycolmap
 
 from mkpc_kaggle.data.competition import TrainScene, TruePair, read_train_side
-from mkpc_kaggle.engine.store.records import Table, read_images, read_points, read_records
-from mkpc_kaggle.engine.store.tables import Store
+from mkpc_kaggle.engine.store.database import Store
+from mkpc_kaggle.engine.store.dataframes import pair_tables
+from mkpc_kaggle.engine.store.published import Published, read_images
 from mkpc_kaggle.evaluation.compare import paired_difference
 from mkpc_kaggle.evaluation.validate import error_of
 from mkpc_kaggle.geometry.cameras import Camera, fundamental_of_cameras
@@ -100,13 +101,13 @@ def read_journals(
     found: dict[str, tuple[Recipe, list[Stored]]] = {}
     for directory in directories:
         with Store.read(directory) as store:
-            table = Table.of(store)
-            settings = dict(table.about.recipe)
+            published = Published.of(store)
+            settings = dict(published.run.about.recipe)
             recipe = recipe_of(settings, settings.pop("name"))
             units = {unit.name: unit for unit in recipe.units}
-            records = read_records(store, table)
-            for index, row in enumerate(table.rows):
-                points = read_points(store, table, index)
+            tables = pair_tables(store, published)
+            for row in published.pairs:
+                points = published.points_of(store, row)
                 images = read_images(store, row)
                 if row.batch not in scenes or not points:
                     continue
@@ -121,8 +122,8 @@ def read_journals(
                 if true is None:
                     # The engine matches an extra pair by the first unit alone, without an F.
                     results = results[:1]
-                elif index < table.count and not records[index].failure:
-                    own = records[index].pair_fundamental
+                elif row.number < published.run.rows and not tables.pairs["failure"][row.number]:
+                    own = tables.estimates["F"][row.number]
                 pairs = found.setdefault(row.batch, (recipe, []))[1]
                 pairs.append(Stored((first, second), results, own, true))
     return found

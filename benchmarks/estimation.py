@@ -35,8 +35,9 @@ import numpy as np
 
 from mkpc_kaggle.config import from_table
 from mkpc_kaggle.data.competition import TrainScene, TruePair, read_train_side
-from mkpc_kaggle.engine.store.records import Table, read_images, read_points, read_records
-from mkpc_kaggle.engine.store.tables import Store
+from mkpc_kaggle.engine.store.database import Store
+from mkpc_kaggle.engine.store.dataframes import pair_tables
+from mkpc_kaggle.engine.store.published import Published, read_images
 from mkpc_kaggle.evaluation.compare import Difference, paired_difference
 from mkpc_kaggle.evaluation.validate import error_of
 from mkpc_kaggle.geometry.coordinates import Matrix3
@@ -181,21 +182,23 @@ def extra_of(pairs: Sequence[Known], every: Sequence[Known], config: SceneConfig
 def read_journal(directory: Path) -> tuple[str, dict[str, tuple[PairMatch, Matrix3 | None]]]:
     """Return the recipe's name, and each pair's matches and own F by pair id."""
     with Store.read(directory) as store:
-        published = Table.of(store)
-        table = dict(published.about.recipe)
+        published = Published.of(store)
+        tables = pair_tables(store, published)
+        table = dict(published.run.about.recipe)
         recipe = recipe_of(table, table.pop("name"))
         units = {unit.name: unit for unit in recipe.units}
         found = {}
-        for record in read_records(store, published):
+        for number, row in enumerate(published.rows):
+            pair = tables.pairs.loc[number]
             # A pair that was never matched, or whose image is unreadable.
-            if not record.units:
+            if not pair["units"]:
                 continue
-            images = read_images(store, published.rows[record.index])
-            points = read_points(store, published, record.index)
+            images = read_images(store, row)
+            points = published.points_of(store, row)
             results = tuple(UnitResult(units[name], matches) for name, matches in points.items())
             match = PairMatch(results, sizes=tuple(image.size for image in images))
-            F = None if record.failure else record.pair_fundamental
-            found[record.pair.id] = (match, F)
+            F = None if pair["failure"] else tables.estimates["F"][number]
+            found[row.id] = (match, F)
     return recipe.name, found
 
 

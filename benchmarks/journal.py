@@ -19,8 +19,8 @@ from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.plan.state import State
 from mkpc_kaggle.engine.request import Request
 from mkpc_kaggle.engine.restore import restore
+from mkpc_kaggle.engine.store.database import Store
 from mkpc_kaggle.engine.store.image_files import stored_digests
-from mkpc_kaggle.engine.store.tables import Store
 from mkpc_kaggle.geometry.matches import Matches
 from tests.support import simulator
 from tests.support.simulator import Scenario, simulate

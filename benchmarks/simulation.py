@@ -24,7 +24,7 @@ from tests.support.simulator import (
     random_scenario,
     simulate,
     switch_off,
-    without_records,
+    without_tables,
 )
 
 
@@ -36,7 +36,7 @@ def timeline(scenario: Scenario) -> None:
     for scene in ran.scenes:
         begun, ended = map(format_duration, (scene.begun, scene.begun + scene.seconds))
         print(f"{begun:>7}  batch {scene.batch} is reconstructed until {ended}")
-    units = Counter(len(record.units) for record in ran.report.records)
+    units = Counter(ran.report.tables.pairs["units"])
     had = ", ".join(f"{pairs} pairs with {count} units" for count, pairs in sorted(units.items()))
     print(
         f"{format_duration(ran.report.seconds):>7}  {ran.report.ending}: {had}; {ran.missed} scenes missed"
@@ -109,7 +109,7 @@ def main() -> None:
         )
         return
     seeds = range(arguments.seed, arguments.seed + arguments.scenarios)
-    summary([without_records(simulate(random_scenario(seed, arguments.pairs))) for seed in seeds])
+    summary([without_tables(simulate(random_scenario(seed, arguments.pairs))) for seed in seeds])
 
 
 if __name__ == "__main__":

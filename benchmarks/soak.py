@@ -26,7 +26,7 @@ import numpy as np
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.plan.budget import Budget
 from mkpc_kaggle.engine.session import Session, interruptible, run_pairs
-from mkpc_kaggle.engine.store.tables import FILE_NAME
+from mkpc_kaggle.engine.store.database import FILE_NAME
 from mkpc_kaggle.geometry.coordinates import Size, View
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import MatcherSpec, Picture
@@ -212,7 +212,7 @@ def matched(work_dir: Path) -> int:
     with suppress(sqlite3.Error):
         uri = f"{(work_dir / FILE_NAME).resolve().as_uri()}?mode=ro"
         with closing(sqlite3.connect(uri, uri=True)) as store:
-            (count,) = store.execute("SELECT count(*) FROM result WHERE kind = 'points'").fetchone()
+            (count,) = store.execute("SELECT count(*) FROM points").fetchone()
             return int(count)
     return 0
 

@@ -115,6 +115,17 @@ def test_the_python_of_the_pages_runs(block, tmp_path, monkeypatch):
         assert names["match"].estimate.inlier_count > 50
 
 
+def test_the_lines_of_a_fact_of_a_result_are_the_ones_of_its_files():
+    page = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    example = page.partition("- **A fact of a result**")[2].partition("\n- ")[0]
+    rows = re.findall(r"^  \| `(\S+\.py)`.*\| `(.*)` \|$", example, re.M)
+    assert len({file for file, _ in rows}) == len(rows) == 3
+    for file, line in rows:
+        # A bar within a cell is escaped.
+        text = (ROOT / "mkpc_kaggle" / file).read_text(encoding="utf-8")
+        assert f"    {line}\n".replace("\\|", "|") in text, (file, line)
+
+
 def test_a_folder_uses_those_above_it_and_never_those_below():
     page = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
     folders = re.findall(r"^\| `(\w+)/` \|", page, re.M)

@@ -7,8 +7,8 @@ from pathlib import Path
 from mkpc_kaggle.data.competition import read_test_side, test_side
 from mkpc_kaggle.data.outputs import require_apart
 from mkpc_kaggle.engine.console import unblocked
-from mkpc_kaggle.engine.store.records import Table
-from mkpc_kaggle.engine.store.tables import Store
+from mkpc_kaggle.engine.store.database import Store
+from mkpc_kaggle.engine.store.published import Published
 from mkpc_kaggle.reporting.report import write_report
 from mkpc_kaggle.reporting.run_log import read_log, write_csv
 from mkpc_kaggle.reporting.summary import overview
@@ -18,16 +18,18 @@ HELP = """\
 Show the journal of a run, also while it is running. DIR is the run's work directory, NAME.work next to the
 submission. Without options, print an overview of one screen.
 
---csv writes long tables for pandas.read_csv. All have the column `pair`, the row of the test set:
-  pairs.csv    ids, images (paths below the directory of the run's images), failure, source of F (pair, scene,
+--csv writes tables for pandas.read_csv. Except the last, all have the column `pair`, the id of the pair:
+  pairs.csv    images (paths below the directory of the run's images), failure, source of F (pair, scene,
                fallback), matches, inliers, seconds by part; f11 ... f33, the matrix of the column model: F, or E
                for pairs with known intrinsics. For the F of the pair's own matches: support (ratio of inliers to
                inliers by chance), overlaps (whether the images overlap), plane (share of the inliers that
                one homography explains), flat (nearly all of them), number of candidates; cost of the result
-               and of MAGSAC's own F, focal lengths
+               and of MAGSAC's own F, focal lengths. choice: why the F is the scene's, or not; units: the number of
+               units that ran or failed; error: what left the pair without an F, if not few matches
   units.csv    per unit and pair: matches, inliers, seconds, failure
   regions.csv  per image (0 or 1) and pair: the critical region's box and the reason for it
   events.csv   times of starts, plans, scenes, faults, ends
+In Python, mkpc_kaggle.results(DIR) returns the first two and the cameras as DataFrames with the same columns.
 
 --prune removes the results that the last run did not use: those of former recipes, settings, images and rows. If
 they are asked for again, they are computed again. It prints the size that it sets free.
@@ -58,11 +60,11 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.prune:
         read_log(arguments.work_dir)  # refuses a directory without a run
         with Store.open(arguments.work_dir) as store:
-            freed = store.prune(Table.of(store).keys)
+            freed = store.prune(Published.of(store).keys)
         print(f"{freed / 1e6:.2f} MB are free again")
         return
     log = read_log(arguments.work_dir)
-    written = write_csv(log, arguments.csv) if arguments.csv else []
+    written = write_csv(arguments.work_dir, arguments.csv) if arguments.csv else []
     if arguments.report:
         # Without the test side, the page has no pictures.
         pairs = read_test_side(arguments.test_dir) if arguments.test_dir else ()

@@ -13,7 +13,7 @@ from mkpc_kaggle.data.outputs import require_apart
 from mkpc_kaggle.engine.console import say
 from mkpc_kaggle.engine.plan.budget import format_duration
 from mkpc_kaggle.engine.session import interruptible
-from mkpc_kaggle.engine.store.records import MIN_PAIRS, NOT_RECONSTRUCTED
+from mkpc_kaggle.engine.store.scene_record import MIN_PAIRS, NOT_RECONSTRUCTED
 from mkpc_kaggle.errors import UserError, plural
 from mkpc_kaggle.geometry.intrinsics import Rows
 from mkpc_kaggle.recipe import CameraSharing
@@ -260,6 +260,6 @@ def _lines(result: FolderResult, root: Path) -> Iterator[str]:
     for scene in report.scenes:
         yield from (f"{scene.batch}: {sentence}" for sentence in contradictions(scene))
     yield from pending_lines(report)
-    unreadable = unreadable_images(report.records)
+    unreadable = unreadable_images(report.tables.pairs)
     yield from (f"cannot be read: {failure}" for failure in unreadable[:MAX_LINES])
     yield from (f"fault: {fault}" for fault in report.faults[:MAX_LINES])

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from mkpc_kaggle.data.competition import Pair
+from mkpc_kaggle.engine.store.database import Source
 from mkpc_kaggle.engine.store.keys import Images
-from mkpc_kaggle.engine.store.tables import Source
 from mkpc_kaggle.geometry.coordinates import Matrix3
 from mkpc_kaggle.geometry.intrinsics import Rows
 from mkpc_kaggle.geometry.robust import NO_STATS, EstimateStats

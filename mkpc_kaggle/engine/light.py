@@ -11,8 +11,8 @@ from mkpc_kaggle.engine.plan.blame import Tries
 from mkpc_kaggle.engine.plan.budget import ESTIMATE
 from mkpc_kaggle.engine.plan.schedule import lacking_estimates
 from mkpc_kaggle.engine.run import HANG_FACTOR, Run
-from mkpc_kaggle.engine.store.records import ESTIMATED
-from mkpc_kaggle.engine.store.tables import Kind, Result, Source, Store
+from mkpc_kaggle.engine.store.database import Source, Store
+from mkpc_kaggle.engine.store.tables import Feature, PairEstimate
 
 # In a job. More pairs would make the last F of a run wait for each other; single pairs, each with a
 # message and a transaction, would cost the loop more.
@@ -85,7 +85,7 @@ class Estimating:
         results = []
         for pair, estimated in zip(job.pairs, answer, strict=True):
             key = state.request.keys.of_estimate(state.pairs[pair.index], estimated.points)
-            results.append(Result(key, Kind.ESTIMATE, ESTIMATED.to_json(estimated)))
+            results.append(_estimate(key, estimated))
         run.store.put(results)
         state.end(state.estimating, (pair.index for pair in job.pairs))
         for pair, estimated, result in zip(job.pairs, answer, results, strict=True):
@@ -100,7 +100,7 @@ class Estimating:
             pending = int(lacking_estimates(state).sum())
             run.progress.count("estimate", total - pending, total)
 
-    def _use(self, index: int, result: Result) -> None:
+    def _use(self, index: int, estimate: PairEstimate) -> None:
         """Use an estimate, even if its pair has newer points meanwhile: the former estimate is
         older still.
         """
@@ -109,8 +109,8 @@ class Estimating:
             # Without points, an image has changed since, and the estimate belongs to its former
             # content.
             if state.has[each].any():
-                state.use_estimate(each, result.key, result.about)
-                state.estimated[each] = state.estimate_key(each) == result.key
+                state.use_estimate(each, estimate)
+                state.estimated[each] = state.estimate_key(each) == estimate.key
                 state.note_change(each)
 
     def lose(self, job: EstimateJob, failure: Failure) -> None:
@@ -149,6 +149,26 @@ class Estimating:
         run.log.explain(f"no pair is estimated any more: {failure}")
 
 
+def _estimate(key: str, found: Estimated) -> PairEstimate:
+    stats = found.stats
+    return PairEstimate(
+        key,
+        inliers=dict(zip(found.points, found.inliers, strict=True)),
+        F=found.F,
+        failure=found.failure,
+        magsac=found.magsac,
+        seconds=found.seconds,
+        candidates=stats.candidates,
+        cost=stats.cost,
+        magsac_cost=stats.magsac_cost,
+        focal0=stats.focals[0],
+        focal1=stats.focals[1],
+        support=stats.support,
+        rotation=stats.rotation,
+        plane=stats.plane,
+    )
+
+
 class Features:
     """Features of images by key: the ones ``found``, and the jobs ``pending``.
 
@@ -163,10 +183,11 @@ class Features:
 
     def ask(self, jobs: Mapping[str, Callable[[], Any]]) -> None:
         """Find features in the store; the others become pending."""
-        about = self._store.about(jobs)
+        features = self._store.get(Feature, jobs)
+        values = {key: feature.value for key, feature in features.items()}
         # Features that are no JSON value are data.
-        data = self._store.data(key for key in about if about[key] is None)
-        self.found = {**about, **data}
+        data = self._store.data(Feature, [key for key in values if values[key] is None])
+        self.found = {**values, **data}
         self.pending = {
             key: FeatureJob(key, do) for key, do in jobs.items() if key not in self.found
         }
@@ -182,11 +203,8 @@ class Features:
     def save(self, job: FeatureJob, answer: Found, seconds: float) -> None:
         value = answer.value
         # Keypoints and descriptors are bytes; partners of images are JSON.
-        if isinstance(value, bytes):
-            result = Result(job.key, Kind.FEATURES, None, value)
-        else:
-            result = Result(job.key, Kind.FEATURES, value)
-        self._store.put([result])
+        is_data = isinstance(value, bytes)
+        self._store.put([Feature(job.key, None, value) if is_data else Feature(job.key, value)])
         self.found[job.key] = value
 
     def lose(self, job: FeatureJob, failure: Failure) -> None:

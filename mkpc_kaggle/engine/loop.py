@@ -38,9 +38,10 @@ from mkpc_kaggle.engine.request import Ending, Request, RunReport
 from mkpc_kaggle.engine.restore import restore
 from mkpc_kaggle.engine.run import EventLog, JobHandler, Run
 from mkpc_kaggle.engine.scenes import SceneWork, scene_failures, scene_records
+from mkpc_kaggle.engine.store.database import Store
+from mkpc_kaggle.engine.store.dataframes import pair_tables
 from mkpc_kaggle.engine.store.image_files import current_digests, update_digests
-from mkpc_kaggle.engine.store.records import read_records
-from mkpc_kaggle.engine.store.tables import Store
+from mkpc_kaggle.engine.store.tables import Feature
 from mkpc_kaggle.engine.workers.places import START_TIMEOUT_S, Place, Site, Work
 from mkpc_kaggle.errors import UserError, plural
 from mkpc_kaggle.scene.candidates import ALL_UNITS
@@ -124,7 +125,8 @@ class Engine:
 
     def known(self, key: str) -> Any:
         """Return the stored features with this key, a JSON value; ``None`` without any."""
-        return self.store.about([key]).get(key)
+        feature = self.store.get(Feature, [key]).get(key)
+        return None if feature is None else feature.value
 
     def look(self, jobs: Mapping[str, Callable[[], Any]]) -> dict[str, Any]:
         """Return features by key: JSON values, or bytes. Failed ones are left out."""
@@ -181,7 +183,7 @@ class Engine:
         if unsaved:
             self.log.fault(unsaved)
         return RunReport(
-            records=tuple(read_records(self.store, asked.publication.table())),
+            tables=pair_tables(self.store, asked.publication.version()),
             ending=self.ending,
             seconds=self.budget.spent(),
             resumed=asked.resumed,

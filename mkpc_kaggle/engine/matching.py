@@ -2,13 +2,14 @@
 
 import sqlite3
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 from mkpc_kaggle.engine.jobs import Cause, Failure, MatchJob, MatchPlan, Outcome, Phase
 from mkpc_kaggle.engine.plan.schedule import Crew, NextWork, outlook, upcoming_pairs
 from mkpc_kaggle.engine.run import HANG_FACTOR, Run
-from mkpc_kaggle.engine.store.image_files import image_results
-from mkpc_kaggle.engine.store.records import UNIT_FACTS, UnitFacts
-from mkpc_kaggle.engine.store.tables import Kind, Result, from_bytes, to_bytes
+from mkpc_kaggle.engine.store.database import from_bytes, to_bytes
+from mkpc_kaggle.engine.store.image_files import image_rows
+from mkpc_kaggle.engine.store.tables import UnitPoints
 from mkpc_kaggle.pipeline.pair import UnitResult
 
 # A unit that was given up on this number of pairs, and never ran, is skipped on all pairs.
@@ -73,7 +74,7 @@ class Matching:
             inputs = list(zip(plan.indices, crops, strict=True))
             try:
                 # The arrays of all points would not fit in memory.
-                data = self._run.store.data(key for _, keys in inputs for key in keys)
+                data = self._run.store.data(UnitPoints, {key for _, keys in inputs for key in keys})
             except sqlite3.Error as error:  # a disk that fails
                 self.lose(plan, Failure(Cause.RAISED, f"the store cannot be read: {error}"))
                 return None
@@ -159,7 +160,7 @@ class Matching:
             done = work.done + len(job.indices) if job.is_last else work.done
             run.progress.count(str(work.phase), min(work.total, done), work.total)
 
-    def _results(self, index: int, outcome: Outcome, crops: Sequence[str]) -> list[Result]:
+    def _results(self, index: int, outcome: Outcome, crops: Sequence[str]) -> list[Any]:
         """Return the new points of a pair, and its images, as rows of the store.
 
         Changes the state's images alone. ``crops`` are the keys of the points of stage 1 that the
@@ -194,25 +195,24 @@ class Matching:
                 first[number] = key
             if not unit_result.is_needed:
                 key = state.request.keys.unneeded(key)
-            facts = UNIT_FACTS.to_json(_facts(unit_result, outcome, len(good)))
-            results.append(Result(key, Kind.POINTS, facts, to_bytes(unit_result.matches)))
+            results.append(_points(key, unit_result, outcome, len(good)))
         return results
 
-    def _use_images(self, outcome: Outcome) -> list[Result]:
+    def _use_images(self, outcome: Outcome) -> list[Any]:
         """Use the images of an answer, and return the new ones as rows of the store."""
         state = self._run.state
         results = []
         for image, file in zip(outcome.images, outcome.files, strict=True):
             # Most images are in many pairs, and are stored once.
             if state.images.get(image.name) != image:
-                results += image_results(image, file)
+                results += image_rows(image, file)
             state.use_image(image)
         return results
 
-    def _use(self, index: int, outcome: Outcome, results: Sequence[Result]) -> None:
+    def _use(self, index: int, outcome: Outcome, results: Sequence[Any]) -> None:
         """Use the points of an answer, on all rows with the same images."""
         state = self._run.state
-        points = [result for result in results if result.kind is Kind.POINTS]
+        points = [result for result in results if isinstance(result, UnitPoints)]
         before = state.keys_in_use(index)
         for row in state.alike(index):
             # An unreadable image stays unreadable in this run, and a matcher that raised raises again.
@@ -223,8 +223,7 @@ class Matching:
                     failure = Failure(Cause.UNIT_RAISED, unit_result.failure)
                     state.give_up(("unit", row, unit_result.unit.name), failure)
             for result in points:
-                number = state.number_of[result.about["unit"]]
-                state.use_points(row, number, result.key, result.about)
+                state.use_points(row, state.number_of[result.unit], result)
             # Units that the pair does not need change nothing.
             if state.keys_in_use(row) != before:
                 state.note_points(row)
@@ -266,10 +265,11 @@ class Matching:
         state.end(state.filling, job.indices)
 
 
-def _facts(found: UnitResult, outcome: Outcome, units: int) -> UnitFacts:
-    """Return the facts about one of the ``units`` of an answer."""
+def _points(key: str, found: UnitResult, outcome: Outcome, units: int) -> UnitPoints:
+    """Return the points of one of the ``units`` of an answer."""
     need = found.need
-    return UnitFacts(
+    return UnitPoints(
+        key,
         unit=found.unit.name,
         matches=len(found.matches),
         keypoints=found.keypoints,
@@ -283,4 +283,5 @@ def _facts(found: UnitResult, outcome: Outcome, units: int) -> UnitFacts:
         is_needed=found.is_needed,
         scale=None if need is None else need.scale,
         detail=None if need is None else need.detail,
+        data=to_bytes(found.matches),
     )

@@ -1,13 +1,15 @@
 """Publication: versions of the results, in the request's own files and as the table of pairs."""
 
 import threading
+from dataclasses import replace
 
 from mkpc_kaggle.engine.jobs import Cause, Failure
 from mkpc_kaggle.engine.plan.budget import Budget
 from mkpc_kaggle.engine.plan.state import SOURCES, State
 from mkpc_kaggle.engine.run import EventLog
-from mkpc_kaggle.engine.store.records import Row, Table
-from mkpc_kaggle.engine.store.tables import Store
+from mkpc_kaggle.engine.store.database import Store
+from mkpc_kaggle.engine.store.published import Published
+from mkpc_kaggle.engine.store.tables import PublishedPair, PublishedRun
 from mkpc_kaggle.geometry.robust import ModelKind
 
 INTERVAL_S = 30.0  # between versions: a run that is killed loses at most this from its submission
@@ -27,7 +29,7 @@ class Publication:
         self._lock = threading.Lock()
         self._has_ended = False
         self._published = budget.clock()
-        self._rows: list[Row | None] = [None] * len(state.pairs)
+        self._rows: dict[int, PublishedPair] = {}  # by index
         self.unwritten = ""  # why the latest version could not be written
 
     def is_due(self, now: float) -> bool:
@@ -48,8 +50,9 @@ class Publication:
             self._log.fault(trouble)
         # Also if the results were not written: a prune removes what the table does not name.
         # A trial's pairs are not the run's, whose table stays until its own pairs are known.
+        changed = self._update_rows()
         if not state.request.is_trial:
-            self._store.put([self.table().to_result()])
+            self._store.put([self._run(), *changed])
         # The measured time decides when the last version is written.
         self._published = self._budget.clock()
         self._budget.note_write(self._published - start)
@@ -72,26 +75,40 @@ class Publication:
         self.publish()
         self._has_ended = True
 
-    def table(self) -> Table:
-        """Return the table of pairs. Only rows that have changed since the last table are built
-        again.
-        """
+    def version(self) -> Published:
+        """Return the present version of the results."""
+        self._update_rows()
+        return Published(self._run(), [self._rows[index] for index in range(len(self._rows))])
+
+    def _run(self) -> PublishedRun:
         state = self._state
-        sources = state.sources
-        for index in state.changed:
-            # An extra pair has no row in the submission, and so no written F.
-            source = SOURCES[sources[index]] if index < state.rows else ""
-            self._rows[index] = _row(state, index, source)
-        state.changed.clear()
-        units = [(unit.name, unit.stage) for unit in state.units]
-        rows = [row for row in self._rows if row is not None]
-        scenes = dict(state.scene_keys)
-        return Table(
-            state.request.about, units, state.rows, rows, scenes, state.fundamentals, state.rivals
+        return PublishedRun(
+            about=state.request.about,
+            units=[(unit.name, unit.stage) for unit in state.units],
+            rows=state.rows,
+            pairs=len(state.pairs),
+            scenes={batch: scene.key for batch, scene in state.scenes.items()},
+            rivals=state.rivals,
         )
 
+    def _update_rows(self) -> list[PublishedPair]:
+        """Build the rows of the pairs that have changed since the last version. Return them."""
+        state = self._state
+        sources = state.sources
+        fundamentals = state.fundamentals
+        changed = []
+        for index in state.changed:
+            row = _row(state, index)
+            # An extra pair has no row in the submission, and so no written F.
+            if index < state.rows:
+                row = replace(row, source=SOURCES[sources[index]], F=fundamentals[index])
+            changed.append(row)
+            self._rows[index] = row
+        state.changed.clear()
+        return changed
 
-def _row(state: State, index: int, source: str) -> Row:
+
+def _row(state: State, index: int) -> PublishedPair:
     pair = state.pairs[index]
     image0, image1 = state.names[index]
     points = state.points[index].tolist()
@@ -110,20 +127,25 @@ def _row(state: State, index: int, source: str) -> Row:
     # Without an estimate, and not because of the time
     lost = state.lost_estimates.get(index)
     unestimated = _reason(lost) if lost is not None and not state.estimates[index] else ""
-    return Row(
+    contents = state.contents(index)
+    scene = state.scenes.get(pair.group)
+    choice = None if scene is None else scene.choices.get(contents)
+    return PublishedPair(
+        index,
         id=pair.id,
         batch=pair.group,
         image0=image0,
         image1=image1,
         turns0=pair.turns[0],
         turns1=pair.turns[1],
-        contents=state.contents(index),
+        contents=contents,
         points=points,
         estimate=state.estimates[index],
-        source=source,
+        model=ModelKind.F if pair.intrinsics is None else ModelKind.E,
+        source="",
+        choice="" if choice is None else choice.reason,
         failures=failures,
         failure=reason,
-        model=ModelKind.F if pair.intrinsics is None else ModelKind.E,
         unestimated=unestimated,
     )
 

@@ -7,8 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mkpc_kaggle.data.competition import Pair
+from mkpc_kaggle.engine.store.dataframes import PairTables
 from mkpc_kaggle.engine.store.keys import Keys
-from mkpc_kaggle.engine.store.records import About, Event, PairRecord, SceneRecord
+from mkpc_kaggle.engine.store.scene_record import SceneRecord
+from mkpc_kaggle.engine.store.tables import About, Event
 from mkpc_kaggle.geometry.intrinsics import Rows
 from mkpc_kaggle.recipe import Recipe
 from mkpc_kaggle.scene.export import HeldDirectory
@@ -58,13 +60,13 @@ class Request:
 
 @dataclass(frozen=True)
 class RunReport:
-    """The outcome of a run: a record of each pair, in order, and how the run ended.
+    """The outcome of a run: tables with a row for each pair, in order, and how the run ended.
 
     ``resumed`` is the number of pairs that earlier runs finished. ``faults`` are lost jobs and unwritten files.
     ``unwritten`` says why the last version of the results could not be written.
     """
 
-    records: tuple[PairRecord, ...]
+    tables: PairTables
     ending: Ending
     seconds: float
     resumed: int = 0

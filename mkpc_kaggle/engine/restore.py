@@ -4,20 +4,19 @@ for missing ones.
 
 from collections.abc import Mapping
 from itertools import chain
-from typing import Any
 
 import numpy as np
 
 from mkpc_kaggle.engine.plan.schedule import sweeping_unit
 from mkpc_kaggle.engine.plan.state import State
+from mkpc_kaggle.engine.store.database import Store
 from mkpc_kaggle.engine.store.image_files import known_images
 from mkpc_kaggle.engine.store.keys import of_candidate
-from mkpc_kaggle.engine.store.records import SCENE, Row, Table
-from mkpc_kaggle.engine.store.tables import Store
+from mkpc_kaggle.engine.store.published import Published
+from mkpc_kaggle.engine.store.scene_record import SceneRecord
+from mkpc_kaggle.engine.store.tables import Export, PairEstimate, PublishedPair, UnitPoints
 from mkpc_kaggle.geometry.crop_need import pays
 from mkpc_kaggle.scene.export import has_files
-
-EXPORT = "export "  # prefix of the keys of marks; a mark names the scene of a batch's files
 
 
 def restore(state: State, store: Store, digests: Mapping[str, str]) -> None:
@@ -26,13 +25,13 @@ def restore(state: State, store: Store, digests: Mapping[str, str]) -> None:
     ``digests`` are the known digests of the images' contents, by name.
     """
     state.images = known_images(store, digests)
-    former = Table.of(store)
+    former = Published.of(store)
     # By contents and not by id: another test set may name the same two images.
-    rows = {row.contents: row for row in former.rows if row.contents}
+    rows = {row.contents: row for row in former.pairs if row.contents}
     known = [index for index in range(len(state.pairs)) if state.images_of(index)]
     contents = {index: state.contents(index) for index in known}
     old = {index: rows[text] for index, text in contents.items() if text in rows}
-    units = [name for name, _ in former.units]
+    units = [name for name, _ in former.run.units]
     # An extra pair has points of the sweeping unit, and no estimate. The store may have more, of another
     # recipe, or of a run in which it was a row, and a scene must not depend on that.
     sweep = sweeping_unit(state)
@@ -54,7 +53,7 @@ def restore(state: State, store: Store, digests: Mapping[str, str]) -> None:
 
 def _former_points(
     state: State,
-    old: Mapping[int, Row],
+    old: Mapping[int, PublishedPair],
     units: list[str],
     numbers: list[int],
 ) -> dict[tuple[int, int], str]:
@@ -81,22 +80,20 @@ def _restore_points(
         images = state.images_of(index)
         assert images
         today[index, number] = state.keys_of(index, number, images, state.first_stage(index))
-    about = store.about([*chain.from_iterable(today.values()), *former.values()])
+    points = store.get(UnitPoints, [*chain.from_iterable(today.values()), *former.values()])
     for (index, number), keys in today.items():
         # Points that were found under another rule count if today's rule asks for them, too.
         stored = [
             key
             for key in keys
-            if key in about
-            and (
-                not about[key]["is_needed"] or pays(about[key]["scale"], about[key]["detail"], mkpc)
-            )
+            if key in points
+            and (not points[key].is_needed or pays(points[key].scale, points[key].detail, mkpc))
         ]
         is_current = bool(stored)
         # Points of former settings are better than none.
         used = stored[0] if stored else former.get((index, number), "")
-        if used in about:
-            state.use_points(index, number, used, about[used])
+        if used in points:
+            state.use_points(index, number, points[used])
             state.current[index, number] = is_current
 
 
@@ -104,21 +101,23 @@ def _restore_estimates(
     state: State,
     store: Store,
     known: list[int],
-    old: Mapping[int, Row],
+    old: Mapping[int, PublishedPair],
 ) -> None:
     # From the points in use: an estimate from former points is up to date until others replace them.
     today = {index: state.estimate_key(index) for index in known if state.has[index].any()}
     former = {index: row.estimate for index, row in old.items() if row.estimate}
-    about = store.about([*today.values(), *former.values()])
+    estimates = store.get(PairEstimate, [*today.values(), *former.values()])
     for index, key in today.items():
-        state.estimated[index] = key in about
+        state.estimated[index] = key in estimates
         # As long as the images are the same, the former F is better than the fallback.
-        used = key if key in about else former.get(index, "")
-        if used in about:
-            state.use_estimate(index, used, about[used])
+        used = key if key in estimates else former.get(index, "")
+        if used in estimates:
+            state.use_estimate(index, estimates[used])
 
 
-def _restore_scenes(state: State, store: Store, former: Table, digests: Mapping[str, str]) -> None:
+def _restore_scenes(
+    state: State, store: Store, former: Published, digests: Mapping[str, str]
+) -> None:
     today = {batch: state.scene_inputs(batch)[1] for batch in state.batches}
     # The first candidate has the key of the scene's inputs.
     others = {
@@ -126,35 +125,35 @@ def _restore_scenes(state: State, store: Store, former: Table, digests: Mapping[
         for batch, key in today.items()
     }
     keys = [key for named in others.values() for key in named.values()]
-    about = store.about([*today.values(), *former.scenes.values(), *keys])
-    marks = store.about(EXPORT + batch for batch in state.request.exports)
+    scenes = store.get(SceneRecord, [*today.values(), *former.run.scenes.values(), *keys])
+    marks = store.get(Export, state.request.exports)
     for batch, key in today.items():
-        used = key if key in about else former.scenes.get(batch, "")
-        if used not in about:
+        used = key if key in scenes else former.run.scenes.get(batch, "")
+        if used not in scenes:
             continue  # the batch stays stale
-        if not _has_images(about[used], digests):
+        scene = scenes[used]
+        if not _has_images(scene, digests):
             continue
-        record = SCENE.of_json(about[used]["scene"])
         if used != key:
-            state.use_scene(batch, used, record)
+            state.use_scene(batch, scene)
             continue
         # Before the candidates: the scene whose COLMAP files exist is used.
         if batch in state.request.exports:
-            state.filed[batch] = marks.get(EXPORT + batch, "")
-        state.use_candidate(batch, used, record)
+            state.filed[batch] = marks[batch].scene if batch in marks else ""
+        state.use_candidate(batch, scene)
         for other in others[batch].values():
-            if other in about:
-                state.use_candidate(batch, other, SCENE.of_json(about[other]["scene"]))
+            if other in scenes:
+                state.use_candidate(batch, scenes[other])
         if directory := state.request.exports.get(batch):
             # A scene without its COLMAP files is made again. Until then its cameras are used.
-            has_mark = state.filed[batch] == state.scene_keys[batch]
-            if not (has_mark and has_files(directory.path, len(state.scenes[batch].models))):
+            used_scene = state.scenes[batch]
+            has_mark = state.filed[batch] == used_scene.key
+            if not (has_mark and has_files(directory.path, len(used_scene.models))):
                 continue
         state.stale.discard(batch)
         state.try_others(batch)
 
 
-def _has_images(about: Mapping[str, Any], digests: Mapping[str, str]) -> bool:
+def _has_images(scene: SceneRecord, digests: Mapping[str, str]) -> bool:
     """Return whether no known image of a scene has changed since; else it must not stand in."""
-    contents = about["digests"]
-    return all(digests.get(name, content) == content for name, content in contents.items())
+    return all(digests.get(name, content) == content for name, content in scene.contents.items())

@@ -7,15 +7,14 @@ Each kind has a file, from its jobs to their results: :mod:`matching`, :mod:`lig
 import sqlite3
 from collections.abc import Sequence, Set
 from dataclasses import dataclass
-from secrets import token_hex
 from typing import Any, Protocol
 
 from mkpc_kaggle.engine.console import Progress
 from mkpc_kaggle.engine.jobs import Failure, PairInputs
 from mkpc_kaggle.engine.plan.budget import Budget, Costs
 from mkpc_kaggle.engine.plan.state import State
-from mkpc_kaggle.engine.store.records import EVENT, Event, EventKind
-from mkpc_kaggle.engine.store.tables import Kind, Result, Source, Store
+from mkpc_kaggle.engine.store.database import Source, Store
+from mkpc_kaggle.engine.store.tables import Event, EventKind, UnitPoints
 from mkpc_kaggle.errors import plural
 
 # Faults of a run with different texts, and its decisions. The number of units that fit may change with
@@ -40,7 +39,7 @@ class EventLog:
 
     def note(self, kind: EventKind, text: str = "") -> Event:
         event = Event(kind, self._budget.spent(), text)
-        note_event(self._store, event)
+        self._store.put([event])
         return event
 
     def explain(self, text: str) -> None:
@@ -58,11 +57,6 @@ class EventLog:
         if text not in self.faults:
             self.faults.append(text)
             self.note(EventKind.FAULT, text)
-
-
-def note_event(store: Store, event: Event) -> None:
-    # A random key, since several programs may write events of the same second to one store.
-    store.put([Result(f"event {token_hex(8)}", Kind.EVENT, EVENT.to_json(event))])
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +85,7 @@ class Run:
         """Forget the points of these pairs that the store has lost. Return whether there are any."""
         keys = {key for pair in pairs for key in pair.points.values()}
         try:
-            data = self.store.data(keys)
+            data = self.store.data(UnitPoints, keys)
         except sqlite3.Error:  # a disk that fails: perhaps they can be read later
             return False
         return self.forget_lost(keys - data.keys())

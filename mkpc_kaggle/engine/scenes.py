@@ -5,17 +5,10 @@ import numpy as np
 from mkpc_kaggle.engine.jobs import Failure, SceneJob
 from mkpc_kaggle.engine.plan.budget import SCENE_MATCH_S, SCENE_START_S, format_duration
 from mkpc_kaggle.engine.plan.state import State
-from mkpc_kaggle.engine.restore import EXPORT
 from mkpc_kaggle.engine.run import HANG_FACTOR, Run
 from mkpc_kaggle.engine.store.keys import of_candidate
-from mkpc_kaggle.engine.store.records import (
-    NOT_RECONSTRUCTED,
-    SCENE,
-    EventKind,
-    SceneRecord,
-    unmatched_scene,
-)
-from mkpc_kaggle.engine.store.tables import Kind, Result
+from mkpc_kaggle.engine.store.scene_record import NOT_RECONSTRUCTED, SceneRecord, unmatched_scene
+from mkpc_kaggle.engine.store.tables import EventKind, Export
 from mkpc_kaggle.errors import plural
 from mkpc_kaggle.scene.candidates import ALL_UNITS, title_of
 from mkpc_kaggle.scene.sfm import Solution
@@ -54,7 +47,7 @@ class SceneWork:
                 export = folder
         if export is not None:
             # From now on the files may be replaced, so they belong to no stored scene.
-            run.store.remove(EXPORT + batch)
+            run.store.remove(Export, batch)
         job = SceneJob(
             batch,
             of_candidate(key, candidate),
@@ -96,17 +89,18 @@ class SceneWork:
         state = run.state
         choices = dict(zip(job.contents, answer.choices, strict=True))
         record = SceneRecord.of(
-            job.batch, answer.reconstructions, seconds, choices, job.candidate, answer.disagreement
+            job.batch,
+            answer.reconstructions,
+            seconds,
+            choices,
+            job.candidate,
+            answer.disagreement,
+            key=job.key,
+            contents={image.name: image.digest for pair in job.pairs for image in pair.images},
         )
-        images = [image for pair in job.pairs for image in pair.images]
-        # With them, a former scene is known to be of the present images, without reading its points.
-        digests = {image.name: image.digest for image in images}
-        about = {"scene": SCENE.to_json(record), "digests": digests}
-        rows = [Result(job.key, Kind.SCENE, about)]
         # In the same transaction, a mark: these files belong to this scene.
-        if job.export is not None:
-            rows.append(Result(EXPORT + job.batch, Kind.EXPORT, job.key))
-        run.store.put(rows)
+        marks = [] if job.export is None else [Export(job.batch, job.key)]
+        run.store.put([record, *marks])
         # The time of the loop, with the process's start: the forecast needs both.
         run.costs.observe_scene(job.matches, seconds)
         text = f"{record.registered} of {plural(record.images, 'image')}"
@@ -115,7 +109,7 @@ class SceneWork:
             state.filed[job.batch] = job.key
         if job.candidate == ALL_UNITS:
             state.reconstructing.discard(job.batch)
-            state.use_candidate(job.batch, job.key, record)
+            state.use_candidate(job.batch, record)
             # Otherwise pairs have got other results meanwhile, and the batch stays stale.
             if state.scene_inputs(job.batch)[1] == job.key:
                 state.stale.discard(job.batch)
@@ -136,7 +130,7 @@ class SceneWork:
         state = self._run.state
         if not self._is_of_today(job):
             return False
-        state.use_candidate(job.batch, job.key, record)
+        state.use_candidate(job.batch, record)
         state.try_others(job.batch)
         return state.best_candidate(job.batch) == job.candidate
 
@@ -144,7 +138,7 @@ class SceneWork:
         """Return whether the first candidate is from the same results as a job, and today's."""
         state = self._run.state
         made = state.made.get(job.batch, {})
-        is_same = ALL_UNITS in made and made[ALL_UNITS][0] == job.scene
+        is_same = ALL_UNITS in made and made[ALL_UNITS].key == job.scene
         return is_same and job.batch not in state.stale
 
     def lose(self, job: SceneJob, failure: Failure) -> None:
@@ -184,9 +178,8 @@ def scene_records(state: State) -> tuple[SceneRecord, ...]:
         elif batch in reasons:
             records.append(SceneRecord(batch, failure=str(reasons[batch])))
         elif state.is_unmatched(batch):
-            records.append(
-                unmatched_scene(batch, map(state.pairs.__getitem__, state.rows_of(batch)))
-            )
+            names = {name for index in state.rows_of(batch) for name in state.names[index]}
+            records.append(unmatched_scene(batch, names))
         else:
             records.append(SceneRecord(batch, failure=NOT_RECONSTRUCTED))
     return tuple(records)

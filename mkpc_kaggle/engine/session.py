@@ -25,9 +25,9 @@ from mkpc_kaggle.engine.loop import Engine
 from mkpc_kaggle.engine.plan.budget import Budget
 from mkpc_kaggle.engine.plan.state import State
 from mkpc_kaggle.engine.request import Request, RunReport
+from mkpc_kaggle.engine.store.database import Store
 from mkpc_kaggle.engine.store.keys import Keys
-from mkpc_kaggle.engine.store.records import About, EventKind
-from mkpc_kaggle.engine.store.tables import Store
+from mkpc_kaggle.engine.store.tables import About, EventKind
 from mkpc_kaggle.engine.workers.cluster import RaySite
 from mkpc_kaggle.engine.workers.places import LISTEN_S, LocalSite
 from mkpc_kaggle.errors import UserError, writing

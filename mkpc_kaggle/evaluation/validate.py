@@ -4,9 +4,10 @@ A train side is scored by the competition's rules, a list of pairs by the rules 
 LoFTR.
 """
 
+import itertools
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import astuple, dataclass, field, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from math import isfinite, nan
 from pathlib import Path
@@ -18,8 +19,9 @@ from scipy.spatial.transform import Rotation
 from mkpc_kaggle.data.competition import TrainScene, TruePair, read_rows, read_submission
 from mkpc_kaggle.engine.request import RunReport
 from mkpc_kaggle.engine.session import Session, run_pairs
-from mkpc_kaggle.engine.store.records import PairRecord, Table, read_points
-from mkpc_kaggle.engine.store.tables import Store
+from mkpc_kaggle.engine.store.database import Store
+from mkpc_kaggle.engine.store.dataframes import PairTables, by_pair, matrices_of
+from mkpc_kaggle.engine.store.published import Published
 from mkpc_kaggle.errors import UserError, plural
 from mkpc_kaggle.geometry import metrics
 from mkpc_kaggle.geometry.coordinates import Matrix3
@@ -33,6 +35,7 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 MAX_NAMES = 5  # of samples to list in a line
+BOX = ["left", "top", "right", "bottom"]  # columns of the table of regions
 MATCHING = ("precision", "matching_score")  # the order of ``PairScore.matching``
 
 # OpenCV's RANSAC as in both published evaluations: 1 pixel, and 0.5 pixels for LoFTR.
@@ -50,7 +53,7 @@ class Step(StrEnum):
 
 @dataclass(frozen=True)
 class PairScore:
-    """One pair's error, infinite if the pair failed, and the pair's record if the engine ran.
+    """One pair's error, infinite if the pair failed, and its row in the run's tables if the engine ran.
 
     ``steps`` has the error after each :class:`Step` of the run; the last equals ``error``.
     ``matching``, for pairs of a list, is correct matches over all matches (precision) and over
@@ -61,7 +64,7 @@ class PairScore:
     images: tuple[str, str]
     covisibility: float
     error: PoseError
-    record: PairRecord | None = None
+    row: int | None = None
     steps: Mapping[Step, PoseError] = field(default_factory=dict)
     matching: tuple[float, float] = (nan, nan)
 
@@ -176,17 +179,18 @@ def validate(
     pairs = [true.pair for scene in scenes for true in scene.pairs]
     report = run_pairs(pairs, assembly, session, root=root)
     steps = _steps(report, has_prior=assembly.recipe.focal is not None)
-    records = iter(report.records)  # in the order of the pairs
+    rows = itertools.count()  # in the order of the pairs
     scored = []
     for scene in scenes:
-        scores = [score_record(true, next(records), scene, steps, in_front) for true in scene.pairs]
+        scores = [
+            score_pair(true, report.tables, next(rows), scene, steps, in_front)
+            for true in scene.pairs
+        ]
         in_metres = isfinite(scene.metres_per_unit)
         # A list of pairs: its evaluations publish precision and matching score, too.
         if not in_metres:
             with Store.read(session.work_dir) as store:
-                table = Table.of(store)
-                both = zip(scores, scene.pairs, strict=True)
-                scores = [with_matching(score, true, store, table) for score, true in both]
+                scores = list(_with_matching(scores, scene.pairs, store, report.tables))
         scored.append(SceneScore(scene.name, tuple(scores), in_metres))
     return Validation(assembly.recipe.name, tuple(scored), report, steps)
 
@@ -195,55 +199,75 @@ def _steps(report: RunReport, *, has_prior: bool) -> tuple[Step, ...]:
     """Return the steps that a run made."""
     steps = []
     # With known focal lengths, E has no step before the prior.
-    if not has_prior or any(each.magsac_fundamental is not None for each in report.records):
+    if not has_prior or report.tables.estimates["magsac"].notna().any():
         steps.append(Step.MAGSAC)
     if has_prior:
         steps.append(Step.PRIOR)
-    if any(each.scene is not None for each in report.records):
+    if (report.tables.pairs["choice"] != "").any():
         steps.append(Step.SCENE)
     return tuple(steps)
 
 
-def with_matching(pair: PairScore, true: TruePair, store: Store, table: Table) -> PairScore:
-    """Return the score with ``matching`` set.
+def _with_matching(
+    scores: Sequence[PairScore], pairs: Sequence[TruePair], store: Store, tables: PairTables
+) -> Iterator[PairScore]:
+    """Yield the scores with ``matching`` set, by the points in the store."""
+    published = Published.of(store)
+    rows = published.rows
+    units = by_pair(tables.units)
+    for score, true in zip(scores, pairs, strict=True):
+        assert score.row is not None
+        points = published.points_of(store, rows[score.row])
+        matches = Matches.concatenate(points.values())
+        yield replace(score, matching=matching_of(true, matches, units.get(score.id)))
 
-    The matching score is NaN if numbers of keypoints are unknown.
+
+def matching_of(true: TruePair, matches: Matches, units: "DataFrame | None") -> tuple[float, float]:
+    """Return the precision of a pair's matches, and their matching score.
+
+    ``units`` are the pair's rows in the table of units, if any. The matching score is NaN if
+    numbers of keypoints are unknown.
     """
-    assert pair.record is not None
-    matches = Matches.concatenate(read_points(store, table, pair.record.index).values())
-    units = pair.record.units
     # All matches, not only inliers, as in SuperGlue's evaluation.
     correct = metrics.correct_matches(matches, true.camera0, true.camera1).sum()
     # Dense matchers have matches and no keypoints.
-    is_known = all(unit.keypoints or not unit.matches for unit in units)
-    keypoints = sum(unit.keypoints for unit in units)
+    is_known = units is None or ((units["keypoints"] > 0) | (units["matches"] == 0)).all()
+    keypoints = 0 if units is None else int(units["keypoints"].sum())
     precision = correct / max(len(matches), 1)
     score = correct / max(keypoints, 1) if is_known else nan
-    return replace(pair, matching=(precision, score))
+    return precision, score
 
 
-def score_record(
+def score_pair(
     true: TruePair,
-    record: PairRecord,
+    tables: PairTables,
+    row: int,
     scene: TrainScene,
     steps: Sequence[Step] = (),
     in_front: bool = False,
 ) -> PairScore:
-    """Return the score of a pair's record. An F from the fallback counts as a failure."""
-    rotation = Rotation.from_rotvec(record.stats.rotation).as_matrix() if in_front else None
-    own = None if record.failure else record.pair_fundamental
-    matrices = {
+    """Return the score of the pair in a row of the run's tables. An F from the fallback counts as a
+    failure.
+    """
+    pair = tables.pairs.loc[row]
+    estimate = tables.estimates.loc[row]
+    rotation = Rotation.from_rotvec(estimate["rotation"]).as_matrix() if in_front else None
+    own: Any = None if pair["failure"] else estimate["F"]
+    magsac: Any = estimate["magsac"]
+    matrices: dict[Step, Matrix3 | None] = {
         # Without a prior, the pair's F is MAGSAC's.
-        Step.MAGSAC: record.magsac_fundamental if Step.PRIOR in steps else own,
+        Step.MAGSAC: magsac if Step.PRIOR in steps else own,
         Step.PRIOR: own,
         # The row of the submission: the scene's F, else the pair's.
-        Step.SCENE: None if record.source == "fallback" else record.chosen_fundamental,
+        Step.SCENE: None
+        if pair["source"] == "fallback"
+        else matrices_of(tables.pairs.loc[[row]])[0],
     }
     # The last step's error is the pair's, also where a step was not made.
     errors = {step: error_of(matrix, true, scene, rotation) for step, matrix in matrices.items()}
     made = {step: errors[step] for step in steps}
     return PairScore(
-        true.pair.id, image_paths_of(true), true.covisibility, errors[Step.SCENE], record, made
+        true.pair.id, image_paths_of(true), true.covisibility, errors[Step.SCENE], row, made
     )
 
 
@@ -357,8 +381,13 @@ def to_json(validation: Validation) -> dict[str, Any]:
     steps = validation.steps
     report = validation.report
     scenes = []
+    run = {} if report is None else _runs_json(report.tables)
     for scene in validation.scenes:
-        pairs = [_pair_json(pair, in_metres=scene.in_metres) for pair in scene.pairs]
+        # A submission from a file has no run.
+        pairs = [
+            _pair_json(pair, in_metres=scene.in_metres) | run.get(pair.id, {})
+            for pair in scene.pairs
+        ]
         scenes.append({"scene": scene.scene, **_scores_json(scene, steps), "pairs": pairs})
     figures = {
         "recipe": validation.recipe,
@@ -382,7 +411,7 @@ def _scores_json(scores: SceneScore | Validation, steps: Sequence[Step]) -> dict
 
 
 def _pair_json(pair: PairScore, *, in_metres: bool) -> dict[str, Any]:
-    values: dict[str, Any] = {
+    return {
         "pair": pair.id,
         "covisibility": pair.covisibility,
         "rotation_error_degrees": pair.error.rotation,
@@ -395,12 +424,23 @@ def _pair_json(pair: PairScore, *, in_metres: bool) -> dict[str, Any]:
             for step, error in pair.steps.items()
         },
     }
-    # A submission from a file has no record.
-    if (record := pair.record) is not None:
-        values |= {"failure": record.failure, "inliers": record.inliers}
-        values["matches"] = {unit.unit: unit.matches for unit in record.units}
-        regions = record.regions or ()
-        values["regions"] = [str(region.reason) for region in regions]
-        # Left, top, right, bottom, in pixels of the image.
-        values["boxes"] = [astuple(region.box) for region in regions]
-    return values
+
+
+def _runs_json(tables: PairTables) -> dict[str, dict[str, Any]]:
+    """Return the facts of a run about each pair, by id."""
+    units = by_pair(tables.units)
+    regions = by_pair(tables.regions)
+    facts = {}
+    columns = ["pair", "failure", "inliers"]
+    for pair, failure, inliers in zip(*(tables.pairs[name] for name in columns), strict=True):
+        ran = units.get(pair)
+        cropped = regions.get(pair)
+        facts[pair] = {
+            "failure": failure,
+            "inliers": inliers,
+            "matches": {} if ran is None else dict(zip(ran["unit"], ran["matches"], strict=True)),
+            "regions": [] if cropped is None else cropped["reason"].tolist(),
+            # In pixels of the image
+            "boxes": [] if cropped is None else cropped[BOX].to_numpy().tolist(),
+        }
+    return facts

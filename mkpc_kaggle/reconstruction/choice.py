@@ -17,8 +17,8 @@ from mkpc_kaggle.engine.console import say, warn
 from mkpc_kaggle.engine.loop import Engine
 from mkpc_kaggle.engine.plan.state import name_below
 from mkpc_kaggle.engine.session import Session, request_of
+from mkpc_kaggle.engine.store.database import Source
 from mkpc_kaggle.engine.store.keys import digest
-from mkpc_kaggle.engine.store.tables import Source
 from mkpc_kaggle.errors import plural
 from mkpc_kaggle.reconstruction.folder import Datasets, Ends, batch_names
 from mkpc_kaggle.scene.likeness import (

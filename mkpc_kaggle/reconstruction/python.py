@@ -17,7 +17,7 @@ from mkpc_kaggle.engine.plan.budget import Budget
 from mkpc_kaggle.engine.plan.state import name_below
 from mkpc_kaggle.engine.request import RunReport
 from mkpc_kaggle.engine.session import Interrupt, Session, interruptible
-from mkpc_kaggle.engine.store.tables import FILE_NAME
+from mkpc_kaggle.engine.store.database import FILE_NAME
 from mkpc_kaggle.errors import UserError, temporary_directory
 from mkpc_kaggle.matchers.contract import Matcher
 from mkpc_kaggle.recipe import Recipe
@@ -169,7 +169,7 @@ def reconstruct(
         # The models are complete, but the next call computes results again.
         if result.report.unsaved:
             warn(result.report.unsaved)
-        for failure in unreadable_images(result.report.records):
+        for failure in unreadable_images(result.report.tables.pairs):
             warn(f"cannot be read: {failure}")
         for scene in result.report.scenes:
             for sentence in contradictions(scene):

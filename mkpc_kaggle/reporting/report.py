@@ -7,7 +7,7 @@ are missing.
 import base64
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from importlib.util import find_spec
@@ -20,7 +20,6 @@ from mkpc_kaggle.data.images import Image
 from mkpc_kaggle.data.outputs import replacing
 from mkpc_kaggle.engine.console import Progress
 from mkpc_kaggle.engine.plan.budget import format_duration
-from mkpc_kaggle.engine.store.records import PairRecord
 from mkpc_kaggle.errors import UserError, plural, printable, writing
 from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
 from mkpc_kaggle.pipeline.pair import PairMatch
@@ -32,13 +31,14 @@ from mkpc_kaggle.reporting.summary import (
     facts,
     headline,
     is_doubtful,
+    is_solved,
     left_out_line,
     seconds_by_part,
     unit_means,
     unit_reasons,
     weakest_cameras,
 )
-from mkpc_kaggle.reporting.verdict import doubt, inlier_histogram, verdict, write_summary
+from mkpc_kaggle.reporting.verdict import doubts, inlier_histogram, verdict, write_summary
 from mkpc_kaggle.reporting.view import (
     Reader,
     SceneView,
@@ -54,6 +54,7 @@ from mkpc_kaggle.scene.export import IMAGES
 if TYPE_CHECKING:
     from markupsafe import Markup
     from matplotlib.figure import Figure
+    from pandas import DataFrame
 
 # Time to write a page without drawings
 WRITING_S = 0.6
@@ -161,11 +162,9 @@ def _head(log: RunLog) -> dict[str, Any]:
 def _missing(log: RunLog) -> dict[str, Any]:
     """Return the pairs without an F, and the units that failed, with the reasons."""
     # The template lists all of them, and counts their reasons only where several share one.
-    failed = [
-        (record.pair.id, record.pair.group, record.failure)
-        for record in log.records
-        if not record.is_solved
-    ]
+    pairs = log.tables.pairs
+    unsolved = pairs[~is_solved(pairs)]
+    failed = [tuple(row) for row in unsolved[["pair", "group", "failure"]].values]
     return {
         "failed": failed,
         "failures": Counter(reason for *_, reason in failed).most_common(),
@@ -181,7 +180,7 @@ def _scene_section(log: RunLog, pairs: Sequence[Pair]) -> dict[str, Any]:
         return reader_of({str(file): file for file in files})
 
     # Rows whose F is not the scene's have a reason, such as images without a camera.
-    choices = Counter(str(record.scene.reason) for record in log.records if record.scene)
+    choices = Counter(filter(None, log.tables.pairs["choice"]))
     return {
         # Lists, because the template asks for their lengths
         "scenes": [*_scenes(log)],
@@ -199,30 +198,31 @@ def _weakest_section(
 ) -> dict[str, Any]:
     """Return the weakest pairs with their pictures; ``sources`` has the pairs with paths, by id."""
     weakest = []
-    for number, (record, match) in enumerate(log.weakest, start=1):
-        weakest.append((_picture(sources.get(record.pair.id), match), record))
+    for count, (number, match) in enumerate(log.weakest, start=1):
+        row = log.tables.pairs.loc[[number]]
+        name = row["pair"].item()
+        weakest.append((_picture(sources.get(name), match), name, weakness(row)))
         # Reading and drawing large photographs takes a second for each pair.
         if progress is not None and sources:
-            progress.count("drawing", number, len(log.weakest))
+            progress.count("drawing", count, len(log.weakest))
     # The next text begins a new line.
     if progress is not None:
         progress.close()
     return {
         "weakest": weakest,
         "sources": sources,
-        "is_doubtful": is_doubtful,
-        "flatness": flatness,
         "min_support": MIN_SUPPORT,
     }
 
 
 def _pair_section(log: RunLog) -> dict[str, Any]:
     """Return the rows of the table of pairs, and the histogram of their inliers."""
-    histogram = inlier_histogram(log.records)
+    pairs = log.tables.pairs
+    histogram = inlier_histogram(pairs)
     return {
         # More rows make browsers slow; the journal command exports all.
-        "pair_rows": pair_rows(log.records)[:MAX_ROWS],
-        "more_pairs": max(0, len(log.records) - MAX_ROWS),
+        "pair_rows": pair_rows(pairs)[:MAX_ROWS],
+        "more_pairs": max(0, len(pairs) - MAX_ROWS),
         "histogram": histogram,
         # At least 1, since widths are relative to it
         "histogram_most": max(1, *(count for _, count in histogram)),
@@ -234,7 +234,7 @@ def _seconds_section(log: RunLog) -> dict[str, Any]:
     return {
         "units": [(*means, means[1] * means[-1]) for means in unit_means(log)],
         "parts": [
-            (name, total, total / len(log.records))
+            (name, total, total / len(log.tables.pairs))
             for name, total in seconds_by_part(log).items()
             # A part that no pair has needs no row.
             if total
@@ -250,37 +250,46 @@ def assets() -> "Markup":
     return Markup(f"<script>\n{template('report.js')}</script>\n") + style_and_script()
 
 
-def pair_rows(records: Sequence[PairRecord]) -> list[tuple[str | int | float, ...]]:
+def pair_rows(pairs: "DataFrame") -> list[tuple[str | int | float, ...]]:
     """Return id, matches, inliers, overlap, source of F and doubt of each pair, the fewest inliers
     first.
     """
     # The first rows of a long table are those to look at.
-    weakest_first = sorted(records, key=lambda record: (record.inliers, record.index))
+    rows = pairs.assign(support=pairs["support"].round(1), remark=remarks(pairs))
+    rows = rows.sort_values("inliers", kind="stable")
+    columns = ["pair", "matches", "inliers", "support", "source", "remark"]
+    # Python's numbers: the template formats them by their type.
+    return list(zip(*(rows[column].tolist() for column in columns), strict=True))
+
+
+def remarks(pairs: "DataFrame") -> list[str]:
+    """Return why each pair has no F, or why its F is doubtful or uncertain, or an empty string."""
+    found = []
+    rows = zip(is_solved(pairs), pairs["failure"], doubts(pairs), flatness(pairs), strict=True)
+    for has_f, failure, doubt, flat in rows:
+        found.append((doubt or flat) if has_f else failure)
+    return found
+
+
+def flatness(pairs: "DataFrame") -> list[str]:
+    """Return which pairs are flat, as text. Cameras determine F of flat pairs, too."""
+    is_flat = pairs["flat"] & (pairs["source"] != "scene")
     return [
-        (
-            record.pair.id,
-            record.matches,
-            record.inliers,
-            round(record.stats.support, 1),
-            record.source,
-            remark(record),
-        )
-        for record in weakest_first
+        f"flat: one homography explains {100 * plane:.0f} % of the inliers" if flat else ""
+        for flat, plane in zip(is_flat, pairs["plane"], strict=True)
     ]
 
 
-def remark(record: PairRecord) -> str:
-    """Return why a pair has no F, or why its F is doubtful or uncertain, or an empty string."""
-    if not record.is_solved:
-        return record.failure
-    return doubt(record) or flatness(record)
-
-
-def flatness(record: PairRecord) -> str:
-    """Return that a pair is flat, or an empty string. Cameras determine F of flat pairs, too."""
-    if not record.is_flat or record.source == "scene":
-        return ""
-    return f"flat: one homography explains {100 * record.stats.plane:.0f} % of the inliers"
+def weakness(row: "DataFrame") -> str:
+    """Return the facts about a weak pair, a table of one row."""
+    pair = row.iloc[0]
+    facts = [f"{pair['inliers']} inliers of {pair['matches']} matches", pair["failure"]]
+    if is_doubtful(row).item():
+        facts.append(f"may show different things: support {pair['support']:.1f}")
+    facts += flatness(row)
+    if pair["source"] == "scene":
+        facts.append("F from the scene")
+    return "; ".join(filter(None, facts))
 
 
 def _views(log: RunLog, read_in: Callable[[str], Reader]) -> Iterator[tuple[str, "Markup"]]:
@@ -302,12 +311,12 @@ def _views(log: RunLog, read_in: Callable[[str], Reader]) -> Iterator[tuple[str,
                 for each, cloud in zip(models, clouds, strict=True)
             )
         # A click on a camera lists the pairs of its image.
-        records = [record for record in log.records if record.pair.group == scene.batch]
+        pairs = log.tables.pairs
         part = view_part(
             models,
             scene.batch,
             read=read_in(scene.batch),
-            partners=partners_of(records),
+            partners=partners_of(pairs[pairs["group"] == scene.batch]),
             colours=[cloud.colours for cloud in clouds],
         )
         yield scene.batch, part
@@ -344,12 +353,8 @@ def show_run(work_dir: Path, root: Path | None = None) -> SceneView:
         if root is None:
             # The journal is in OUT/work.
             return reader_of(linked_images(log.path.parent.parent, batch))
-        files = {
-            file
-            for record in log.records
-            if record.pair.group == batch
-            for file in (record.pair.file0, record.pair.file1)
-        }
+        pairs = log.tables.pairs[log.tables.pairs["group"] == batch]
+        files = {*pairs["image0"], *pairs["image1"]}
         return reader_of({file: root / file for file in files})
 
     return view_of(_views(log, read_in))
@@ -368,16 +373,16 @@ def linked_images(out: Path, batch: str) -> dict[str, Path]:
     return {}
 
 
-def partners_of(records: Iterable[PairRecord]) -> dict[str, list[tuple[str, int, int]]]:
+def partners_of(pairs: "DataFrame") -> dict[str, list[tuple[str, int, int]]]:
     """Return the partners of each image, by its path below the images: name, inliers and matches of
     the pair, the most inliers first.
     """
     partners: dict[str, list[tuple[str, int, int]]] = {}
-    for record in records:
+    columns = ["image0", "image1", "inliers", "matches"]
+    for image0, image1, inliers, matches in pairs[columns].itertuples(index=False):
         # A pair counts for both of its images.
-        files = (record.pair.file0, record.pair.file1)
-        for file, other in zip(files, record.pair.names[::-1], strict=True):
-            partners.setdefault(file, []).append((other, record.inliers, record.matches))
+        for file, other in ((image0, image1), (image1, image0)):
+            partners.setdefault(file, []).append((Path(other).name, inliers, matches))
     return {name: sorted(found, key=lambda each: -each[1]) for name, found in partners.items()}
 
 
@@ -410,7 +415,8 @@ def _scenes(log: RunLog) -> Iterator[tuple[object, ...]]:
     """Yield a row per batch: name, images, registered, points, focals, reprojection, seconds,
     pairs, failure.
     """
-    counts = Counter(record.pair.group for record in log.records if record.source == "scene")
+    pairs = log.tables.pairs
+    counts = Counter(pairs["group"][pairs["source"] == "scene"])
     for each in log.scenes:
         focals = [found.focal for model in each.models for found in model.images]
         # A wide spread of focal lengths in photographs of one camera is a sign of wrong cameras.

@@ -1,47 +1,36 @@
 """The data of a run for reports: a snapshot of the journal, and tables as CSV files."""
 
-import csv
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import astuple, dataclass, field
-from itertools import chain
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from mkpc_kaggle.data.outputs import replacing, require_table
 from mkpc_kaggle.engine.plan.budget import format_duration
-from mkpc_kaggle.engine.store.image_files import stored_digests
-from mkpc_kaggle.engine.store.records import (
-    About,
-    Event,
-    EventKind,
-    PairRecord,
-    SceneRecord,
-    Table,
-    UnitRecord,
-    read_events,
-    read_points,
-    read_records,
-    read_scenes,
-    unmatched_scenes,
+from mkpc_kaggle.engine.store.database import Store
+from mkpc_kaggle.engine.store.dataframes import (
+    NOT_REACHED,
+    PairTables,
+    by_pair,
+    events_of,
+    pair_tables,
 )
-from mkpc_kaggle.engine.store.tables import Store
+from mkpc_kaggle.engine.store.image_files import stored_digests
+from mkpc_kaggle.engine.store.published import Published
+from mkpc_kaggle.engine.store.scene_record import MIN_PAIRS, SceneRecord, unmatched_scene
+from mkpc_kaggle.engine.store.tables import About, Event, EventKind
 from mkpc_kaggle.errors import UserError, writing
+from mkpc_kaggle.geometry.coordinates import Box
+from mkpc_kaggle.geometry.critical_region import CriticalRegion, RegionReason
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import Estimate, ModelKind, sampson_distances
-from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
+from mkpc_kaggle.pipeline.pair import PairMatch, Regions, UnitResult
 from mkpc_kaggle.recipe import Recipe, recipe_of
 
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
 MAX_DRAWN_PAIRS = 20  # the number of weakest pairs that the report draws
-SECONDS = {  # fields of a pair's record, and their names in reports
-    "decode_seconds": "wait for decoding",
-    "encode_seconds": "encode",
-    "match_seconds": "match",
-    "cluster_seconds": "cluster",
-    "estimate_seconds": "MAGSAC (in parallel with matching)",
-}
-PAIR_HEADS = f"""pair id group image0 image1 failure source matches inliers overlaps {" ".join(SECONDS)}
-    support flat plane candidates cost magsac_cost focal0 focal1 model f11 f12 f13 f21 f22 f23 f31 f32 f33"""
-REGION_HEADS = "pair image left top right bottom reason clusters kept"
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,10 +38,11 @@ class RunLog:
     path: Path  # of the journal
     about: About
     recipe: Recipe
-    records: tuple[PairRecord, ...]  # of each pair, in order
-    events: tuple[Event, ...]  # of all sessions
-    weakest: tuple[tuple[PairRecord, PairMatch], ...]  # matched pairs, the fewest inliers first
-    scenes: tuple[SceneRecord, ...] = ()
+    tables: PairTables
+    events: Sequence[Event]  # of all sessions
+    # The matched pairs with the fewest inliers, by their number in the tables
+    weakest: Sequence[tuple[int, PairMatch]] = ()
+    scenes: Sequence[SceneRecord] = ()
     digests: Mapping[str, str] = field(default_factory=dict)  # of the images' contents, by name
 
     @property
@@ -86,104 +76,105 @@ def read_log(directory: Path) -> RunLog:
     Raises :class:`UserError` if the journal is missing, or if this version cannot read it.
     """
     with Store.read(directory) as store:
-        published = Table.of(store)
-        records = tuple(read_records(store, published))
-        table = dict(published.about.recipe)
+        published = Published.of(store)
+        tables = pair_tables(store, published)
+        settings = dict(published.run.about.recipe)
         # A store that was opened, and then ended by a signal before the first publication
-        if not table:
+        if not settings:
             store.warn_of_damage()
             raise UserError(f"{directory}: the run has not begun, or was stopped at its start")
         # The recipe as it ran: its file may have changed since.
-        recipe = recipe_of(table, table.pop("name"))
-        # The index settles ties, so that equal runs draw the same pairs.
-        touched = sorted(
-            (record for record in records if record.units), key=lambda r: (r.inliers, r.index)
-        )
-        units = {unit.name: unit for unit in recipe.units}
-
-        # The journal has points and F, from which the inliers follow as in the run.
-        def weak(record: PairRecord) -> tuple[PairRecord, PairMatch]:
-            F = record.pair_fundamental
-            points = read_points(store, published, record.index)
-            results = tuple(UnitResult(units[name], found) for name, found in points.items())
-            distances = sampson_distances(F, Matches.concatenate(each.matches for each in results))
-            # The fallback fits some matches by chance.
-            inliers = (distances < recipe.magsac.threshold) & (not record.failure)
-            estimate = Estimate(ModelKind.F, F, inliers, record.failure)
-            return record, PairMatch(results, record.regions, estimate)
-
-        # The points of other pairs are not read: they may have gigabytes.
-        weakest = tuple(map(weak, touched[:MAX_DRAWN_PAIRS]))
-        scenes = [*read_scenes(store, published).values()]
+        recipe = recipe_of(settings, settings.pop("name"))
+        # Stable, so that equal runs draw the same pairs. The points of other pairs are not read: they
+        # may have gigabytes.
+        matched = tables.pairs[tables.pairs["units"] > 0].sort_values("inliers", kind="stable")
+        weakest = []
+        rows = published.rows
+        regions = by_pair(tables.regions)
+        for number in matched.index[:MAX_DRAWN_PAIRS]:
+            row = rows[number]
+            points = published.points_of(store, row)
+            match = _weak_match(tables, recipe, number, points, regions.get(row.id))
+            weakest.append((number, match))
+        scenes = [*published.scenes_of(store).values()]
         if recipe.scene is not None:
             present = {scene.batch for scene in scenes}
-            scenes += [each for each in unmatched_scenes(records) if each.batch not in present]
-        events = read_events(store)
-        store.warn_of_damage()
+            scenes += [each for each in unmatched(tables.pairs) if each.batch not in present]
+        events = store.all(Event)
         digests = stored_digests(store, published.image_names)
-        return RunLog(
-            store.path, published.about, recipe, records, events, weakest, tuple(scenes), digests
+        store.warn_of_damage()
+    about = published.run.about
+    return RunLog(store.path, about, recipe, tables, events, weakest, scenes, digests)
+
+
+def _weak_match(
+    tables: PairTables,
+    recipe: Recipe,
+    number: int,
+    points: Mapping[str, Matches],
+    regions: "DataFrame | None",
+) -> PairMatch:
+    """Return the match of a pair from its points and its own F, from which the inliers follow as in
+    the run.
+    """
+    units = {unit.name: unit for unit in recipe.units}
+    results = tuple(UnitResult(units[name], matches) for name, matches in points.items())
+    F = tables.estimates["F"][number]
+    failure = tables.pairs["failure"][number]
+    distances = sampson_distances(F, Matches.concatenate(each.matches for each in results))
+    # The fallback fits some matches by chance.
+    inliers = (distances < recipe.magsac.threshold) & (not failure)
+    crops = None if regions is None else regions_of(regions)
+    return PairMatch(results, crops, Estimate(ModelKind.F, F, inliers, failure))
+
+
+def regions_of(rows: "DataFrame") -> Regions:
+    """Return the critical regions of a pair from its two rows in the table of regions."""
+    first, second = (
+        CriticalRegion(
+            Box(row["left"], row["top"], row["right"], row["bottom"]),
+            RegionReason(row["reason"]),
+            row["clusters"],
+            row["kept"],
         )
+        for row in rows.to_dict("records")
+    )
+    return first, second
 
 
-def write_csv(log: RunLog, directory: Path) -> list[Path]:
-    """Write the tables pairs.csv, units.csv, regions.csv and events.csv. Return their paths.
+def unmatched(pairs: "DataFrame") -> list[SceneRecord]:
+    """Return the records of the batches whose pairs have all been reached, without a match."""
+    scenes = []
+    for batch, members in pairs.groupby("group", sort=False):
+        may_match = (members["matches"] > 0) | (members["failure"] == NOT_REACHED)
+        if len(members) >= MIN_PAIRS and not may_match.any():
+            scenes.append(unmatched_scene(str(batch), {*members["image0"], *members["image1"]}))
+    return scenes
+
+
+def write_csv(directory: Path, out: Path) -> list[Path]:
+    """Write the tables pairs.csv, units.csv, regions.csv and events.csv of a work directory to
+    ``out``. Return their paths.
 
     An existing file is replaced only if it is a table with the same columns. Otherwise, and if a
     table cannot be written, raises :class:`UserError`.
     """
-    tables: dict[str, tuple[list[str], Iterable[Iterable[Any]]]] = {
-        "pairs": (PAIR_HEADS.split(), map(_pair_cells, log.records)),
-        "units": (
-            ["pair", *UnitRecord.__annotations__],
-            ((record.index, *astuple(unit)) for record in log.records for unit in record.units),
-        ),
-        "regions": (REGION_HEADS.split(), _region_rows(log.records)),
-        "events": (["kind", "seconds", "text"], map(astuple, log.events)),
+    with Store.read(directory) as store:
+        tables = pair_tables(store)
+        events = events_of(store)
+    frames = {
+        "pairs": tables.pairs,
+        "units": tables.units,
+        "regions": tables.regions,
+        "events": events,
     }
-    with writing(f"--csv {directory}"):
-        directory.mkdir(parents=True, exist_ok=True)
-        files = {directory / f"{name}.csv": table for name, table in tables.items()}
+    with writing(f"--csv {out}"):
+        out.mkdir(parents=True, exist_ok=True)
+        files = {out / f"{name}.csv": frame for name, frame in frames.items()}
         # All before the first is written: a refused export leaves all files as they were.
-        for path, (heads, _) in files.items():
-            require_table(path, heads)
-        for path, (heads, rows) in files.items():
+        for path, frame in files.items():
+            require_table(path, list(frame.columns))
+        for path, frame in files.items():
             with replacing(path) as stream:
-                csv.writer(stream, lineterminator="\n").writerows(chain([heads], rows))
+                frame.to_csv(stream, index=False, lineterminator="\n")
     return list(files)
-
-
-def _pair_cells(record: PairRecord) -> tuple[Any, ...]:
-    """Return the cells of a pair, in the order of ``PAIR_HEADS``."""
-    stats = record.stats
-    return (
-        record.index,
-        record.pair.id,
-        record.pair.group,
-        record.pair.file0,
-        record.pair.file1,
-        record.failure,
-        record.source,
-        record.matches,
-        record.inliers,
-        record.overlaps,
-        *(getattr(record, name) for name in SECONDS),
-        stats.support,
-        record.is_flat,
-        stats.plane,
-        stats.candidates,
-        stats.cost,
-        stats.magsac_cost,
-        *stats.focals,
-        record.model,
-        *record.chosen_fundamental.flat,
-    )
-
-
-def _region_rows(records: Iterable[PairRecord]) -> Iterator[tuple[Any, ...]]:
-    """Yield a row per image of the pairs with critical regions, in the order of ``REGION_HEADS``."""
-    for record in records:
-        # A pair without a unit of stage 2 has none.
-        for image, region in enumerate(record.regions or ()):
-            counts = (region.reason, region.clusters, region.kept)
-            yield (record.index, image, *astuple(region.box), *counts)

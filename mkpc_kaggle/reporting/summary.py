@@ -2,24 +2,26 @@
 
 import textwrap
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from statistics import median
-from typing import TypeAlias
-
-import numpy as np
+from typing import TYPE_CHECKING, TypeAlias
 
 from mkpc_kaggle.engine.plan.budget import format_duration
 from mkpc_kaggle.engine.request import Ending, RunReport
-from mkpc_kaggle.engine.store.records import NOT_RECONSTRUCTED, PairRecord, SceneRecord
+from mkpc_kaggle.engine.store.dataframes import NOT_REACHED, SECONDS
+from mkpc_kaggle.engine.store.scene_record import NOT_RECONSTRUCTED, SceneRecord
 from mkpc_kaggle.errors import plural
 from mkpc_kaggle.geometry.critical_region import RegionReason
 from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
 from mkpc_kaggle.recipe import Recipe
-from mkpc_kaggle.reporting.run_log import SECONDS, RunLog
+from mkpc_kaggle.reporting.run_log import RunLog
 from mkpc_kaggle.scene.candidates import title_of
 from mkpc_kaggle.scene.models import Sigmas
 from mkpc_kaggle.setup.availability import UnavailableKind
+
+if TYPE_CHECKING:
+    from pandas import DataFrame, Series
 
 MAX_LINES = 8  # per list; the summary is one screen
 WIDTH = 100  # of a line, in characters
@@ -49,13 +51,20 @@ def overview(log: RunLog) -> str:
 
 def headline(run: AnyRun) -> str:
     """Return a line: how the run ended, its duration, and the number of pairs with an F."""
-    return f"{run.ending} after {format_duration(run.seconds)}: {solved_pairs(run.records)}"
+    return f"{run.ending} after {format_duration(run.seconds)}: {solved_pairs(run.tables.pairs)}"
 
 
-def solved_pairs(records: Sequence[PairRecord]) -> str:
+def solved_pairs(pairs: "DataFrame") -> str:
     """Return the number of pairs with an F, as text."""
-    solved = sum(record.is_solved for record in records)
-    return f"{solved} of {plural(len(records), 'pair')} with an F"
+    return f"{is_solved(pairs).sum()} of {plural(len(pairs), 'pair')} with an F"
+
+
+def is_solved(pairs: "DataFrame") -> "Series[bool]":
+    return pairs["source"] != "fallback"
+
+
+def is_reached(pairs: "DataFrame") -> "Series[bool]":
+    return pairs["failure"] != NOT_REACHED
 
 
 def trouble(run: AnyRun) -> str:
@@ -67,8 +76,9 @@ def trouble(run: AnyRun) -> str:
     # Nothing could run, so counts of pairs would say nothing.
     if run.ending in (Ending.NO_WORKER, Ending.NOTHING_RUNS):
         return f"the run failed: {run.ending}, the faults say why; the same command resumes"
-    reached = [record for record in run.records if record.reached]
-    reasons = Counter(filter(None, map(_error, reached)))
+    pairs = run.tables.pairs
+    reached = pairs[is_reached(pairs)]
+    reasons = Counter(filter(None, reached["error"]))
     # Single unreadable images are normal; most pairs without an F are not.
     if 2 * reasons.total() <= len(reached):
         return ""
@@ -79,20 +89,10 @@ def trouble(run: AnyRun) -> str:
     )
 
 
-def _error(record: PairRecord) -> str:
-    """Return the error that left a pair without an F, or an empty string."""
-    if record.is_solved:
-        return ""
-    if not record.units or record.unestimated:
-        return record.failure
-    # A unit that ran and found nothing is no error: the images may not overlap.
-    return next((unit.failure for unit in record.units if unit.failure and not unit.matches), "")
-
-
-def unreadable_images(records: Iterable[PairRecord]) -> list[str]:
+def unreadable_images(pairs: "DataFrame") -> list[str]:
     """Return the reason of each image that could not be decoded, sorted."""
     # An image that cannot be read fails in all of its pairs, with one text.
-    return sorted({found.failure for found in records if found.reached and not found.units})
+    return sorted(set(pairs["failure"][is_reached(pairs) & (pairs["units"] == 0)]))
 
 
 def left_out_line(recipe: Recipe, left_out: Sequence[str]) -> str:
@@ -124,14 +124,15 @@ def advice(log: RunLog) -> list[str]:
     """
     found = []
     # The units that ran, which may be fewer than the recipe's: a matcher may have failed to load.
-    ran = {unit.unit for record in log.records for unit in record.units}
+    ran = set(log.tables.units["unit"])
     has_missing = any(cause.startswith(UnavailableKind.NO_WEIGHTS) for cause in log.about.left_out)
     if has_missing and all(name.partition(":")[2].startswith("sift@") for name in ran):
         found.append(
             "No weights were found, so only RootSIFT ran. Add weights to the dataset "
             "(`mkpc package --weights DIR`), or ALIKED and LightGlue from Kaggle Models."
         )
-    if not any(record.is_solved and not is_doubtful(record) for record in log.records):
+    pairs = log.tables.pairs
+    if not (is_solved(pairs) & ~is_doubtful(pairs)).any():
         found.append(
             "No pair overlaps. Check that the input is the right test set and that its images can be read."
         )
@@ -143,64 +144,63 @@ def unit_means(run: AnyRun) -> list[tuple[str, int, float, float, float]]:
 
     Without the pairs on which the unit failed, whose matches and seconds were not measured.
     """
-    # By name, in the order in which units first appear: that of the recipe
-    results: dict[str, list[tuple[float, float, float]]] = {}
-    for unit in (unit for record in run.records for unit in record.units if not unit.failure):
-        values = unit.matches, unit.inliers, unit.encode_seconds + unit.match_seconds
-        if unit.is_needed:
-            results.setdefault(unit.unit, []).append(values)
-    return [(name, len(rows), *np.mean(rows, axis=0)) for name, rows in results.items()]
+    units = run.tables.units
+    ran = units[(units["failure"] == "") & units["is_needed"]]
+    ran = ran.assign(seconds=ran["encode_seconds"] + ran["match_seconds"])
+    means = []
+    # In the order in which units first appear: that of the recipe
+    for name, rows in ran.groupby("unit", sort=False):
+        columns = rows[["matches", "inliers", "seconds"]].mean().tolist()
+        means.append((str(name), len(rows), *columns))
+    return means
 
 
 def unit_reasons(run: AnyRun, field: str = "failure") -> list[str]:
     """Return the units' failures, or another ``field``, with numbers of pairs, the most frequent
     first.
     """
-    units = (unit for record in run.records for unit in record.units)
-    counts = Counter(
-        f"{unit.unit}: {getattr(unit, field)}" for unit in units if getattr(unit, field)
-    )
+    units = run.tables.units
+    counts = Counter(f"{name}: {text}" for name, text in units[["unit", field]].values if text)
     return [f"{reason} ({plural(count, 'pair')})" for reason, count in counts.most_common()]
 
 
 def seconds_by_part(run: AnyRun) -> dict[str, float]:
     """Return the total seconds of all pairs for each part of the work."""
-    return {
-        name: sum(getattr(record, field) for record in run.records)
-        for field, name in SECONDS.items()
-    }
+    return {name: float(run.tables.pairs[column].sum()) for column, name in SECONDS.items()}
 
 
 def facts(run: AnyRun) -> Iterator[tuple[str, str, str]]:
     """Yield the most important facts as (name, value, remark)."""
-    records = run.records
+    pairs, units, regions, _ = run.tables
     scenes = run.scenes
-    solved = [record for record in records if record.is_solved]
-    sources = Counter(record.source for record in records)
+    solved = pairs[is_solved(pairs)]
+    sources = Counter(pairs["source"])
     # The best source first
     parts = (("scene", "from scenes"), ("pair", "from their own matches"), ("fallback", "fallback"))
     from_where = ", ".join(
         f"{sources[source]} {what}" for source, what in parts if source in sources
     )
-    yield "pairs with an F", f"{len(solved)} of {len(records)}", from_where
-    if inliers := [record.inliers for record in solved]:
+    yield "pairs with an F", f"{len(solved)} of {len(pairs)}", from_where
+    if len(solved):
+        inliers = solved["inliers"]
         yield (
             "inliers of a pair",
-            f"{median(inliers):.0f}",
-            f"the median; the minimum is {min(inliers)}",
+            f"{inliers.median():.0f}",
+            f"the median; the minimum is {inliers.min()}",
         )
-        overlapping = sum(not is_doubtful(record) for record in solved)
+        overlapping = (~is_doubtful(solved)).sum()
         threshold = (
             f"{MIN_SUPPORT:g} times the inliers expected by chance, or two cameras that agree"
         )
         yield "overlapping pairs", f"{overlapping} of {len(solved)}", threshold
-    if regions := Counter(region.reason for record in records for region in record.regions or ()):
-        counts = ", ".join(f"{count} {reason}" for reason, count in regions.most_common())
-        yield "critical regions", f"{regions[RegionReason.CROPPED]} of {regions.total()}", counts
-    needs = Counter(need for record in records if (need := needs_crops(record)) is not None)
-    if needs[False]:
+    if reasons := Counter(regions["reason"]):
+        counts = ", ".join(f"{count} {reason}" for reason, count in reasons.most_common())
+        yield "critical regions", f"{reasons[RegionReason.CROPPED]} of {len(regions)}", counts
+    # Of pairs with a result of a unit of stage 2 under the rule
+    needs = units.dropna(subset=["scale"]).groupby("pair")["is_needed"].any()
+    if not needs.all():
         remark = "scales differ, or the crop restores detail"
-        yield "pairs that need their crops", f"{needs[True]} of {needs.total()}", remark
+        yield "pairs that need their crops", f"{needs.sum()} of {len(needs)}", remark
     if scenes:
         placed = sum(scene.registered for scene in scenes)
         images = sum(scene.images for scene in scenes)
@@ -241,7 +241,8 @@ def _lines(run: AnyRun) -> Iterator[str]:
         yield f"{'unit':<30}{'pairs':>7}{'matches':>9}{'inliers':>9}{'seconds':>9}"
     for name, pairs, matches, inliers, seconds in means:
         yield f"{name:<30}{pairs:>7}{matches:>9.0f}{inliers:>9.0f}{seconds:>9.2f}"
-    count = max(1, len(run.records))  # a run without pairs has a summary, too
+    table = run.tables.pairs
+    count = max(1, len(table))  # a run without pairs has a summary, too
     # A mean per pair compares runs of different lengths.
     parts = (f"{name} {seconds / count:.3f}" for name, seconds in seconds_by_part(run).items())
     yield from wrapped(f"seconds a pair: {', '.join(parts)}")
@@ -253,11 +254,8 @@ def _lines(run: AnyRun) -> Iterator[str]:
         for scene in run.scenes
         if scene.failure and scene.failure != NOT_RECONSTRUCTED
     ]
-    failed = [
-        f"{record.pair.id}: {record.failure}"
-        for record in run.records
-        if record.reached and not record.is_solved
-    ]
+    unsolved = table[is_reached(table) & ~is_solved(table)]
+    failed = [f"{name}: {failure}" for name, failure in unsolved[["pair", "failure"]].values]
     yield from _list("batches without a scene", no_scene)
     yield from _list("pairs with the fallback row", failed)
     # Last, since they may be many
@@ -279,9 +277,10 @@ def wrapped(text: str) -> list[str]:
 def pending_lines(run: AnyRun) -> Iterator[str]:
     """Yield a line on pairs and batches that the run did not reach, and how to continue."""
     # A pair may have an F from a scene without being matched.
-    pairs = sum(not record.reached and not record.is_solved for record in run.records)
+    pairs = run.tables.pairs
+    waiting = int((~is_reached(pairs) & ~is_solved(pairs)).sum())
     batches = sum(scene.failure == NOT_RECONSTRUCTED for scene in run.scenes)
-    left = [plural(count, noun) for count, noun in ((pairs, "pair"), (batches, "batch")) if count]
+    left = [plural(count, noun) for count, noun in ((waiting, "pair"), (batches, "batch")) if count]
     what = f"{' and '.join(left)} left" if left else ""
     # Also with nothing left: a publication may have been interrupted.
     if run.ending == Ending.INTERRUPTED:
@@ -290,18 +289,12 @@ def pending_lines(run: AnyRun) -> Iterator[str]:
         yield f"{what}; run the same command to continue"
 
 
-def needs_crops(record: PairRecord) -> bool | None:
-    """Return whether a pair needs a unit of stage 2; ``None`` if it has no result of any."""
-    needs = [unit.is_needed for unit in record.units if unit.scale is not None]
-    return any(needs) if needs else None
-
-
-def is_doubtful(record: PairRecord) -> bool:
-    """Return whether the two images may show different things.
+def is_doubtful(pairs: "DataFrame") -> "Series[bool]":
+    """Return whether the two images of each pair may show different things.
 
     Few inliers decide only where the scene does not: two cameras that agree have settled it.
     """
-    return not record.overlaps and record.source != "scene"
+    return ~pairs["overlaps"] & (pairs["source"] != "scene")
 
 
 def weakest_line(scenes: Sequence[SceneRecord]) -> Iterator[str]:

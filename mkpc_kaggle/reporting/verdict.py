@@ -8,19 +8,21 @@ from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from statistics import median
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mkpc_kaggle.data.outputs import replacing
-from mkpc_kaggle.engine.store import codec
-from mkpc_kaggle.engine.store.records import NO_CAMERAS, PairRecord, SceneRecord
+from mkpc_kaggle.engine.store.json_values import as_json
+from mkpc_kaggle.engine.store.scene_record import NO_CAMERAS, SceneRecord
 from mkpc_kaggle.errors import UserError, plural, printable, writing
 from mkpc_kaggle.reporting.contradictions import contradictions, has_moved, named
 from mkpc_kaggle.reporting.run_log import RunLog
 from mkpc_kaggle.reporting.summary import (
     headline,
     is_doubtful,
+    is_reached,
+    is_solved,
     seconds_by_part,
     solved_pairs,
     trouble,
@@ -37,6 +39,9 @@ from mkpc_kaggle.scene.models import (
     SfmModel,
 )
 from mkpc_kaggle.version import __version__
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 FORMAT = "mkpc summary 1"  # increase the number if a key changes its meaning or disappears
 # Bounds of the histogram of inliers; the last bin is open.
@@ -64,8 +69,8 @@ def verdict(log: RunLog) -> Verdict:
     reconstructed = [scene for scene in log.scenes if scene.models]
     # Without scenes, pairs are all that the run was asked for.
     if not log.scenes:
-        problems += _pair_problems(log.records)
-        return Verdict(solved_pairs(log.records), tuple(problems))
+        problems += _pair_problems(log.tables.pairs)
+        return Verdict(solved_pairs(log.tables.pairs), tuple(problems))
     # Cameras that are unknown to within the size of their model are none.
     placed = sum(scene.registered - scene.loose for scene in log.scenes)
     images = sum(scene.images for scene in log.scenes)
@@ -77,34 +82,38 @@ def verdict(log: RunLog) -> Verdict:
     return Verdict(text, tuple(problems))
 
 
-def doubt(record: PairRecord) -> str:
-    """Return why a pair may show different things, or an empty string.
+def doubts(pairs: "DataFrame") -> list[str]:
+    """Return why each pair may show different things, or an empty string.
 
     Matches that contradict the cameras are doubtful, too.
     """
     # The cameras agree with many pairs, this pair's matches with themselves alone.
-    if record.scene is not None and record.scene.reason is Reason.CONTRADICTION:
+    contradicts = pairs["choice"] == Reason.CONTRADICTION
+    is_weak = is_solved(pairs) & is_doubtful(pairs)
+    return [_doubt(*row) for row in zip(contradicts, is_weak, pairs["support"], strict=True)]
+
+
+def _doubt(contradicts: bool, is_weak: bool, support: float) -> str:
+    if contradicts:
         return "its matches contradict the cameras"
-    if record.is_solved and is_doubtful(record):
-        return f"{record.stats.support:.1f} times the inliers by chance"
-    return ""
+    return f"{support:.1f} times the inliers by chance" if is_weak else ""
 
 
-def inlier_histogram(records: Sequence[PairRecord]) -> list[tuple[str, int]]:
+def inlier_histogram(pairs: "DataFrame") -> list[tuple[str, int]]:
     """Return the number of reached pairs in each range of inliers, as (range, count)."""
     # A pair that was not reached has no inliers yet, and is no weak pair.
-    inliers = [record.inliers for record in records if record.reached]
-    counts, _ = np.histogram(inliers, [*INLIER_BINS, np.inf])
+    counts, _ = np.histogram(pairs["inliers"][is_reached(pairs)], [*INLIER_BINS, np.inf])
     names = ["0", *(f"{low} to {high - 1}" for low, high in pairwise(INLIER_BINS[1:]))]
     return list(zip([*names, f"{INLIER_BINS[-1]} or more"], counts.tolist(), strict=True))
 
 
-def _pair_problems(records: Sequence[PairRecord]) -> Iterator[str]:
-    if late := sum(not record.reached for record in records):
+def _pair_problems(pairs: "DataFrame") -> Iterator[str]:
+    reached = is_reached(pairs)
+    if late := int((~reached).sum()):
         yield f"not reached in time: {plural(late, 'pair')}; give the run more time, or a smaller recipe"
-    if lost := sum(record.reached and not record.is_solved for record in records):
+    if lost := int((reached & ~is_solved(pairs)).sum()):
         yield f"with the fallback: {plural(lost, 'pair')}; the reasons are below"
-    if doubtful := sum(bool(doubt(record)) for record in records):
+    if doubtful := sum(map(bool, doubts(pairs))):
         yield f"perhaps of different things: {plural(doubtful, 'pair')}; look at them below"
 
 
@@ -133,16 +142,17 @@ def _scene_problems(scene: SceneRecord, log: RunLog) -> Iterator[str]:
     known = {image.name for image in cameras}
     # Identical files share the camera of one of them.
     contents = {image.digest for image in cameras}
-    records = [record for record in log.records if record.pair.group == scene.batch]
+    pairs = log.tables.pairs
+    pairs = pairs[pairs["group"] == scene.batch]
     # The record of a scene has no list of its images without a camera; its pairs name them.
-    files = {file for record in records for file in (record.pair.file0, record.pair.file1)}
+    files = {*pairs["image0"], *pairs["image1"]}
     lost = {file for file in files - known if log.digests.get(file) not in contents}
     missing = sorted(Path(file).name for file in lost)
     if missing:
         yield f"{where}no camera for {named(missing)}: add photographs between these and the others"
     if len(scene.models) > 1:
         sizes = ", ".join(str(len(model.images)) for model in scene.models)
-        near = nearest_to_joining(scene, records, log.digests)
+        near = nearest_to_joining(scene, pairs, log.digests)
         between = f", between {near} for example" if near else ""
         yield (
             f"{where}the images form {len(scene.models)} models of {sizes}: "
@@ -170,9 +180,7 @@ def _scene_problems(scene: SceneRecord, log: RunLog) -> Iterator[str]:
     yield from (f"{where}{sentence}" for sentence in contradictions(scene))
 
 
-def nearest_to_joining(
-    scene: SceneRecord, records: Sequence[PairRecord], digests: Mapping[str, str]
-) -> str:
+def nearest_to_joining(scene: SceneRecord, pairs: "DataFrame", digests: Mapping[str, str]) -> str:
     """Return the pair of images of two models with the most inliers, as text; empty if no such
     pair has any.
 
@@ -183,18 +191,19 @@ def nearest_to_joining(
     def models_of(file: str) -> set[int]:
         return {number for number, images in enumerate(models) if digests.get(file) in images}
 
-    def would_join(record: PairRecord) -> bool:
-        first = models_of(record.pair.file0)
-        second = models_of(record.pair.file1)
+    def would_join(row: tuple[str, str, int]) -> bool:
+        first = models_of(row[0])
+        second = models_of(row[1])
         # Two images of one model join nothing.
-        return bool(record.inliers and first and second and first.isdisjoint(second))
+        return bool(row[2] and first and second and first.isdisjoint(second))
 
+    rows = zip(pairs["image0"], pairs["image1"], pairs["inliers"], strict=True)
     # The first of several equal ones, so that equal runs name the same pair
-    best = max(filter(would_join, records), key=lambda record: record.inliers, default=None)
+    best = max(filter(would_join, rows), key=lambda row: row[2], default=None)
     if best is None:
         return ""
-    name0, name1 = best.pair.names
-    return f"{name0} and {name1} ({plural(best.inliers, 'inlier')})"
+    image0, image1, inliers = best
+    return f"{Path(image0).name} and {Path(image1).name} ({plural(inliers, 'inlier')})"
 
 
 def _looseness(model: SfmModel) -> str:
@@ -267,7 +276,7 @@ def summary_table(log: RunLog) -> dict[str, Any]:
         "headline": headline(log),
         "ending": str(log.ending),
         "seconds": _number(log.seconds),
-        "pairs": _pairs_table(log.records),
+        "pairs": _pairs_table(log.tables.pairs),
         "scenes": [_scene_table(scene) for scene in log.scenes],
         "units": _units_table(log),
         "seconds_by_part": {
@@ -280,18 +289,20 @@ def summary_table(log: RunLog) -> dict[str, Any]:
     }
 
 
-def _pairs_table(records: Sequence[PairRecord]) -> dict[str, Any]:
-    inliers = [record.inliers for record in records if record.is_solved]
+def _pairs_table(pairs: "DataFrame") -> dict[str, Any]:
+    inliers = pairs["inliers"][is_solved(pairs)].tolist()
     return {
-        "count": len(records),
+        "count": len(pairs),
         "with_f": len(inliers),
         # Sorted, so that equal runs give equal files
-        "sources": dict(sorted(Counter(record.source for record in records).items())),
-        "doubtful": [record.pair.id for record in records if doubt(record)],
+        "sources": dict(sorted(Counter(pairs["source"]).items())),
+        "doubtful": [
+            name for name, doubt in zip(pairs["pair"], doubts(pairs), strict=True) if doubt
+        ],
         # Not 0, which would be a measurement
         "inliers_median": _number(median(inliers)) if inliers else None,
         "inliers_minimum": min(inliers, default=None),
-        "inliers_histogram": dict(inlier_histogram(records)),
+        "inliers_histogram": dict(inlier_histogram(pairs)),
     }
 
 
@@ -331,7 +342,7 @@ def _scene_table(scene: SceneRecord) -> dict[str, Any]:
         "models": [
             {
                 "reprojection_px": _number(model.reprojection_error),
-                "contradictions": codec.COMPARISON.to_json(model.comparison),
+                "contradictions": as_json(model.comparison),
                 "cameras": [
                     {
                         "image": found.image.name,

@@ -13,8 +13,8 @@ from genuine import GENUINE
 from shared import DATA, needs_data, problems_of, run_command, write_small_recipe
 
 from mkpc_kaggle.demo import DemoSet
-from mkpc_kaggle.engine.store.records import read_records
-from mkpc_kaggle.engine.store.tables import Store
+from mkpc_kaggle.engine.store.database import Store
+from mkpc_kaggle.engine.store.dataframes import pair_tables
 from mkpc_kaggle.errors import UserError
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -151,10 +151,11 @@ def test_the_light_recipe_with_genuine_weights_matches_photographs_with_aliked_a
     faults = "does without|units that failed|pairs with the fallback row"
     assert not re.search(faults, done.stdout + done.stderr)
     with Store.read(tmp_path / "submission.work") as store:
-        records = list(read_records(store))
-    for record in records:
+        pairs, units, *_ = pair_tables(store)
+    for pair in pairs["pair"]:
         # A pair that does not need the crops has none of their matches.
-        counts = [unit.matches for unit in record.units if "1:aliked_lightglue@" in unit.unit]
+        is_whole = units["unit"].str.contains("1:aliked_lightglue@")
+        counts = units["matches"][is_whole & (units["pair"] == pair)].tolist()
         assert counts
         # Networks with wrong weights find a handful.
         assert min(counts) > 100

@@ -10,7 +10,15 @@ from typing import Any
 import numpy as np
 import pytest
 from faulty import choose_scene_for_all_but_the_first, runner, scenes_by
-from rectified import THREE_UNITS, RectifiedMatcher, batch_pairs, matrices, run, write_pairs
+from rectified import (
+    THREE_UNITS,
+    RectifiedMatcher,
+    batch_pairs,
+    matrices,
+    run,
+    sources,
+    write_pairs,
+)
 
 from mkpc_kaggle.data.competition import Pair, submission_problems
 from mkpc_kaggle.engine import light
@@ -201,7 +209,7 @@ def test_a_wrong_answer_about_a_scene_costs_the_scene_alone(tmp_path, monkeypatc
     report = run(pairs, recipe, RectifiedMatcher(), tmp_path / "work")
     assert report.ending is Ending.WITH_FAILURES
     assert "wrong answer" in report.scenes[0].failure
-    assert [record.source for record in report.records] == ["pair"] * 6
+    assert sources(report) == ["pair"] * 6
 
 
 def test_no_matrix_that_the_competition_refuses_reaches_the_submission(tmp_path):
@@ -216,10 +224,10 @@ def test_no_matrix_that_the_competition_refuses_reaches_the_submission(tmp_path)
         versions.append((state.fundamentals, state.sources))
 
     report = spoiled(tmp_path, spoil)
-    written, sources = versions[-1]
-    assert sources.tolist() == [0, 0, 0, 1]
+    written, origins = versions[-1]
+    assert origins.tolist() == [0, 0, 0, 1]
     assert [np.array_equal(F, FALLBACK_FUNDAMENTAL) for F in written] == [True] * 3 + [False]
-    assert [record.source for record in report.records] == ["fallback"] * 3 + ["pair"]
+    assert sources(report) == ["fallback"] * 3 + ["pair"]
 
 
 def spoiled(home: Path, spoil: Callable[[State], None]) -> RunReport:

@@ -18,8 +18,9 @@ from mkpc_kaggle.engine.jobs import SceneJob
 from mkpc_kaggle.engine.plan.budget import Budget
 from mkpc_kaggle.engine.request import Ending, RunReport
 from mkpc_kaggle.engine.session import Interrupt, Session, run_pairs
-from mkpc_kaggle.engine.store.records import Rival, Table
-from mkpc_kaggle.engine.store.tables import Store
+from mkpc_kaggle.engine.store.database import Store
+from mkpc_kaggle.engine.store.published import Published
+from mkpc_kaggle.engine.store.scene_record import Rival
 from mkpc_kaggle.engine.workers.worker import compute_scene
 from mkpc_kaggle.recipe import Recipe, SceneConfig, Unit
 from mkpc_kaggle.reporting.run_log import read_log
@@ -50,7 +51,7 @@ def solve(made: list[SceneJob], disagreements: dict[str, float], job: SceneJob) 
 
 def numbers(report: RunReport) -> set[float]:
     """The numbers of the candidates whose F was written."""
-    return {each.chosen_fundamental[0, 0] for each in report.records if each.source == "scene"}
+    return set(report.tables.pairs.query("source == 'scene'")["f11"])
 
 
 def candidates(jobs: list[SceneJob]) -> list[str]:
@@ -105,7 +106,7 @@ def test_a_candidate_is_a_result_under_its_key_and_is_not_made_twice(tmp_path, m
     assert again.scenes == first.scenes
     assert again.scenes[0].rivals == first.scenes[0].rivals
     with Store.open(tmp_path / "work") as store:
-        store.prune(Table.of(store).keys)
+        store.prune(Published.of(store).keys)
     run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
     assert made == [], "a prune keeps the others, too"
     # Fewer candidates are no reason to make the first again, more make only the missing ones.

@@ -74,7 +74,7 @@ def test_tables_without_rows_have_their_columns(work):
 
 
 def test_a_run_that_has_only_begun_has_tables_with_all_columns(work, tmp_path):
-    from mkpc_kaggle.engine.store.tables import Store
+    from mkpc_kaggle.engine.store.database import Store
 
     with Store.open(tmp_path / "work"):
         pass

@@ -29,6 +29,7 @@ from mkpc_kaggle.cli import main, options
 from mkpc_kaggle.data.competition import read_test_side, submission_problems
 from mkpc_kaggle.engine.plan.budget import Costs
 from mkpc_kaggle.engine.request import Ending, RunReport
+from mkpc_kaggle.engine.store.dataframes import by_pair
 from mkpc_kaggle.engine.workers.places import Place
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.matchers.contract import NonFiniteError, Placement, Precision
@@ -98,8 +99,7 @@ def run_at(pairs, tmp_path, monkeypatch) -> Callable[..., RunReport]:
 def assert_as_if_nothing_had_failed(report: RunReport, undisturbed: RunReport) -> None:
     assert report.ending is Ending.COMPLETE
     assert matrices(report) == matrices(undisturbed)
-    units = [unit for record in report.records for unit in record.units]
-    assert not [unit.failure for unit in units if unit.failure]
+    assert set(report.tables.units["failure"]) == {""}
 
 
 @pytest.mark.parametrize(
@@ -178,9 +178,9 @@ def test_a_pair_that_spoils_its_process_costs_no_other_pair_a_unit(
     places = [thread_place(f"cuda:{n}", cpu, pipeline=started) for n in range(gpus)]
     report = run_at(*places, fallback=[thread_place("cpu", cpu)])
     assert (cpu.calls, [place.name for place in places if place.closed]) == ([], [])
-    failed = [r.index for r in report.records if any(unit.failure for unit in r.units)]
-    assert failed == [VICTIM]
-    reasons = {unit.failure.partition(", in ")[0] for unit in report.records[VICTIM].units}
+    failed = report.tables.units.query("failure != ''")
+    assert set(failed["pair"]) == {report.tables.pairs["pair"][VICTIM]}
+    reasons = {reason.partition(", in ")[0] for reason in failed["failure"]}
     assert reasons == {f"the device failed: RuntimeError: {ASSERTED}"}
     assert matrices(report)[:VICTIM] == matrices(undisturbed)[:VICTIM]
     assert matrices(report)[VICTIM + 1 :] == matrices(undisturbed)[VICTIM + 1 :]
@@ -196,7 +196,7 @@ def test_one_or_two_pairs_that_a_gpu_cannot_match_are_left_to_the_cpu(
     recipe = replace(THREE_UNITS, units=(SWEEP,))
     report = run(pairs[:count], recipe, RectifiedMatcher(), tmp_path / "work")
     assert report.ending is Ending.COMPLETE
-    assert all(len(record.units) == 1 for record in report.records)
+    assert set(report.tables.pairs["units"]) == {1}
 
 
 def test_a_pair_on_which_a_device_failed_is_matched_by_a_healthy_one(run_at, undisturbed):
@@ -331,13 +331,11 @@ def test_a_unit_too_large_for_the_memory_is_skipped_on_that_pair_alone_and_tried
         for unit in (THIRD, SECOND)
     ]
     assert [event.text for event in report.explanations if "skipped" in event.text] == told
-    units = report.records[VICTIM].units
-    assert [unit.unit for unit in units if not unit.failure] == [SWEEP.name]
-    assert [unit.unit for unit in units if unit.failure.startswith("out of memory")] == [
-        SECOND.name,
-        THIRD.name,
-    ]
-    assert report.records[VICTIM].inliers > 100, "it keeps the F that it has"
+    victim = report.tables.pairs.loc[VICTIM]
+    failures = by_pair(report.tables.units)[victim["pair"]].set_index("unit")["failure"]
+    assert failures[SWEEP.name] == ""
+    assert failures[[SECOND.name, THIRD.name]].str.startswith("out of memory").all()
+    assert victim["inliers"] > 100, "it keeps the F that it has"
     assert matrices(report)[:VICTIM] == matrices(undisturbed)[:VICTIM]
     assert matrices(report)[VICTIM + 1 :] == matrices(undisturbed)[VICTIM + 1 :]
     # Failures are not stored, so a run on a larger GPU tries them.
@@ -433,7 +431,7 @@ def test_a_matcher_that_a_worker_cannot_load_costs_its_units_alone_and_is_told_o
     assert_as_if_nothing_had_failed(report, undisturbed)
     assert report.faults == (f"broken is left out: {told}",)
     assert capsys.readouterr().err.count(told) == 1
-    assert {len(record.units) for record in report.records} == {3}
+    assert set(report.tables.pairs["units"]) == {3}
 
 
 def test_a_worker_that_cannot_be_started_again_ends_the_run_with_all_rows(run_at):
@@ -449,5 +447,5 @@ def test_a_worker_that_cannot_be_started_again_ends_the_run_with_all_rows(run_at
     report = run_at(thread_place("cpu", broken, pipeline=once))
     assert report.ending is Ending.NO_WORKER
     assert "cpu: the matchers cannot be loaded: the weights are gone" in report.faults
-    assert report.records[0].units
-    assert len(report.records) == COUNT
+    assert report.tables.pairs["units"][0] > 0
+    assert len(report.tables.pairs) == COUNT

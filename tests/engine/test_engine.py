@@ -20,16 +20,18 @@ from rectified import (
 
 from mkpc_kaggle.engine.plan.budget import Budget
 from mkpc_kaggle.engine.plan.state import State
-from mkpc_kaggle.engine.request import Ending
+from mkpc_kaggle.engine.request import Ending, RunReport
 from mkpc_kaggle.engine.session import Interrupt, Session, opened_engine
-from mkpc_kaggle.engine.store.records import PairRecord, read_records
-from mkpc_kaggle.engine.store.tables import Store
+from mkpc_kaggle.engine.store.database import Store
+from mkpc_kaggle.engine.store.dataframes import by_pair, pair_tables
 from mkpc_kaggle.pipeline.stages import Pipeline
 from mkpc_kaggle.setup.assembly import assemble
 
 
-def units(record: PairRecord) -> list[str]:
-    return [unit.unit for unit in record.units]
+def units(report: RunReport) -> list[list[str]]:
+    """The names of the units of each pair."""
+    rows = by_pair(report.tables.units)
+    return [rows[pair]["unit"].tolist() for pair in report.tables.pairs["pair"]]
 
 
 def after_calls(count: int, act: Callable[[], None]) -> Callable[[int], int]:
@@ -47,16 +49,15 @@ def after_calls(count: int, act: Callable[[], None]) -> Callable[[int], int]:
 def test_a_run_without_a_limit_gives_every_pair_every_unit(tmp_path):
     report = run(write_pairs(tmp_path, 11), THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
     assert report.ending is Ending.COMPLETE
-    assert [record.index for record in report.records] == list(range(11))
-    for record in report.records:
-        assert units(record) == [SWEEP.name, SECOND.name, THIRD.name]
-        assert record.failure == ""
-        # Stage 2 sees the critical region only, so a few points at its border are lost.
-        assert 400 < record.inliers == record.matches <= 450
-        np.testing.assert_allclose(
-            np.abs(record.pair_fundamental[1:, 1:]), [[0, 0.5**0.5], [0.5**0.5, 0]], atol=2e-3
-        )
-        assert record.regions is not None
+    assert units(report) == [[SWEEP.name, SECOND.name, THIRD.name]] * 11
+    pairs, _, regions, estimates = report.tables
+    assert (pairs["failure"] == "").all()
+    # Stage 2 sees the critical region only, so a few points at its border are lost.
+    assert pairs["matches"].between(401, 450).all()
+    assert (pairs["inliers"] == pairs["matches"]).all()
+    for F in estimates["F"]:
+        np.testing.assert_allclose(np.abs(F[1:, 1:]), [[0, 0.5**0.5], [0.5**0.5, 0]], atol=2e-3)
+    assert regions["pair"].tolist() == [pair for pair in pairs["pair"] for _ in range(2)]
 
 
 def test_every_published_version_is_complete_and_the_first_comes_before_any_work(tmp_path):
@@ -82,12 +83,11 @@ def test_an_interrupted_run_resumes_and_ends_with_the_same_bytes(tmp_path):
     first = RectifiedMatcher(matches=after_calls(25, interrupt.set))
     cut = run(pairs, THREE_UNITS, first, tmp_path / "work", interrupt=interrupt)
     assert cut.ending is Ending.INTERRUPTED
-    assert any(record.units for record in cut.records), "results are saved"
+    assert cut.tables.pairs["units"].any(), "results are saved"
     second = RectifiedMatcher()
     resumed = run(pairs, THREE_UNITS, second, tmp_path / "work")
     assert matrices(resumed) == matrices(undisturbed)
-    run_units = [units(record) for record in resumed.records]
-    assert run_units == [units(record) for record in undisturbed.records]
+    assert units(resumed) == units(undisturbed)
     calls = Counter(first.calls[:25] + second.calls)
     again = [call for call, count in calls.items() if count > 1]
     assert len(again) <= 3, "only the job that was under way runs twice"
@@ -114,7 +114,7 @@ def test_a_run_that_ends_before_it_asks_leaves_the_store_as_it_was(tmp_path):
     with opened_engine(assembly, session) as engine:
         assert engine.look({}) == {}
     with Store.read(tmp_path / "work") as store:
-        assert [len(record.units) for record in read_records(store)] == [3, 3, 3]
+        assert pair_tables(store).pairs["units"].tolist() == [3, 3, 3]
 
 
 @pytest.mark.parametrize(
@@ -140,7 +140,7 @@ def test_a_unit_that_never_returns_holds_the_run_neither_past_its_limit_nor_afte
         )
         assert not released.is_set(), "the run ends while the unit is under way"
         assert report.ending is ending
-        assert len(report.records) == 12
-        assert report.records[0].units
+        assert len(report.tables.pairs) == 12
+        assert report.tables.pairs["units"][0] > 0
     finally:
         released.set()

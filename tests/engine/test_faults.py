@@ -28,8 +28,9 @@ from mkpc_kaggle.engine.matching import Matching
 from mkpc_kaggle.engine.plan.state import State
 from mkpc_kaggle.engine.request import Ending
 from mkpc_kaggle.engine.store import image_files
-from mkpc_kaggle.engine.store.records import Table, read_records
-from mkpc_kaggle.engine.store.tables import Store
+from mkpc_kaggle.engine.store.database import Store
+from mkpc_kaggle.engine.store.dataframes import pair_tables
+from mkpc_kaggle.engine.store.published import Published
 from mkpc_kaggle.engine.workers import worker
 from mkpc_kaggle.reporting.run_log import read_log
 
@@ -109,8 +110,8 @@ def test_an_error_of_the_engine_itself_leaves_the_latest_version_behind(
         run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work", publish=published.append)
     assert len(published[-1].fundamentals) == 12
     with Store.read(tmp_path / "work") as store:
-        has_units = [bool(record.units) for record in read_records(store)]
-    assert has_units == [True, True] + [False] * 10
+        has_units = pair_tables(store).pairs["units"] > 0
+    assert has_units.tolist() == [True, True] + [False] * 10
 
 
 def test_a_run_whose_store_is_full_keeps_its_results_in_memory(
@@ -121,7 +122,7 @@ def test_a_run_whose_store_is_full_keeps_its_results_in_memory(
     def small(self: Store) -> None:
         prepare(self)
         # SQLite then reports a full disk after a few results.
-        self._db.execute("PRAGMA max_page_count = 20")
+        self._db.execute("PRAGMA max_page_count = 40")
 
     monkeypatch.setattr(Store, "_prepare", small)
     report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
@@ -140,10 +141,10 @@ def test_an_error_of_the_disk_when_points_are_read_costs_a_job_and_the_run_goes_
     errors = iter([sqlite3.OperationalError("disk I/O error")])
     data = Store.data
 
-    def failing(store: Store, keys: Any) -> dict[str, bytes]:
+    def failing(store: Store, kind: type, keys: Any) -> dict[str, bytes]:
         for error in errors:
             raise error
-        return data(store, keys)
+        return data(store, kind, keys)
 
     monkeypatch.setattr(Store, "data", failing)
     report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
@@ -158,7 +159,7 @@ def test_an_error_of_the_disk_at_the_start_is_no_bad_input(
     def failing(*_: Any) -> dict[str, Any]:
         raise sqlite3.OperationalError("disk I/O error")
 
-    monkeypatch.setattr(Store, "about", failing)
+    monkeypatch.setattr(Store, "facts", failing)
     output = tmp_path / "submission.csv"
     # A traceback, with status 1: status 2 would ask the user to correct the input.
     with pytest.raises(sqlite3.OperationalError):
@@ -196,8 +197,8 @@ def test_results_whose_file_cannot_be_written_stay_in_the_table_for_the_next_run
     assert "No space left on device" in report.unwritten
     assert report.faults == (report.unwritten,)
     with Store.open(tmp_path / "work") as store:
-        store.prune(Table.of(store).keys)  # what no table names is lost here
-        assert [len(record.units) for record in read_records(store)] == [3] * 12
+        store.prune(Published.of(store).keys)  # what no version names is lost here
+        assert pair_tables(store).pairs["units"].tolist() == [3] * 12
     written: list[list[bytes]] = []
 
     def note(state: State) -> None:
@@ -375,8 +376,7 @@ def test_a_parent_killed_at_any_moment_leaves_a_complete_file_no_orphans_and_a_r
     subprocess.run([sys.executable, str(script), str(tmp_path)], check=True)
     # A process that was killed cannot remove its unfinished file; the next one does.
     assert list(tmp_path.glob(".*.part")) == []
-    records = read_log(tmp_path / "work").records
-    assert [record.pair_fundamental.tobytes() for record in records] == matrices(undisturbed)
+    assert matrices(read_log(tmp_path / "work")) == matrices(undisturbed)
 
 
 GUARDED = """

@@ -25,6 +25,7 @@ from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine import session
 from mkpc_kaggle.engine.plan.budget import Budget
 from mkpc_kaggle.engine.request import Ending, RunReport
+from mkpc_kaggle.engine.store.dataframes import matrices_of
 from mkpc_kaggle.engine.workers import places
 from mkpc_kaggle.engine.workers.places import LocalSite
 from mkpc_kaggle.engine.workers.process import ProcessWorker
@@ -140,11 +141,10 @@ def forks(monkeypatch) -> None:
 
 
 def matrices(report: RunReport, batches: set[str], pairs: list[Pair]) -> list[bytes]:
-    rows = zip(pairs, report.records, strict=True)
+    own = report.tables.estimates["F"]
+    rows = zip(pairs, own, matrices_of(report.tables.pairs), strict=True)
     return [
-        record.pair_fundamental.tobytes() + record.chosen_fundamental.tobytes()
-        for pair, record in rows
-        if pair.group in batches
+        own.tobytes() + written.tobytes() for pair, own, written in rows if pair.group in batches
     ]
 
 
@@ -178,7 +178,7 @@ def test_a_run_whose_workers_are_killed_and_stopped_at_random_moments_ends_as_th
             pairs, QUICK, SyntheticMatcher(), tmp_path / name, budget=budget, workers=WORKERS
         )
         assert report.ending is Ending.COMPLETE, report.faults
-        assert all(record.units for record in report.records)
+        assert report.tables.pairs["units"].all()
         # Neither a stopped process nor one that was just started may stay behind.
         for process in multiprocessing.active_children():
             assert has_ended(process), process

@@ -182,7 +182,7 @@ def test_points_of_stage_2_are_computed_again_when_the_pair_has_new_points_of_st
     whole = Scenario(60, (1.0, 1.0, 1.0), 1, math.inf, spread=0.1, warm_up=0, misses=0)
     store = memory_store()
     cut = simulate(replace(whole, limit=150.0), store)
-    units = Counter(len(record.units) for record in cut.report.records)
+    units = Counter(cut.report.tables.pairs["units"])
     assert units[2] > 20
     assert units[3] > 0
     finished = simulate(whole, store)
@@ -205,19 +205,15 @@ def test_a_run_cut_by_its_limit_at_a_random_moment_and_finished_later_has_the_by
         assert matches_of_units(report) == matches_of_units(undisturbed)
 
 
-def matches_of_units(report: RunReport) -> list[list[tuple[str, int]]]:
-    found = []
-    for record in report.records:
-        found.append([(unit.unit, unit.matches) for unit in record.units])
-    return found
+def matches_of_units(report: RunReport) -> list[list[object]]:
+    return report.tables.units[["pair", "unit", "matches"]].to_numpy().tolist()
 
 
 def failed_units(report: RunReport) -> list[tuple[int, str]]:
     """The index of the pair and the name of each unit that failed."""
-    failed = []
-    for record in report.records:
-        failed += [(record.index, unit.unit) for unit in record.units if unit.failure]
-    return failed
+    indices = {pair: index for index, pair in enumerate(report.tables.pairs["pair"])}
+    failed = report.tables.units.query("failure != ''")
+    return [(indices[pair], unit) for pair, unit in failed[["pair", "unit"]].to_numpy()]
 
 
 def test_the_next_run_repeats_only_units_that_raised(pairs, undisturbed, tmp_path):

@@ -17,7 +17,7 @@ import pytest
 from faulty import choose_scene_for_all_but_the_first, on_fork, runner
 
 from mkpc_kaggle.engine.jobs import Cause, Failure, Loaded, SceneJob
-from mkpc_kaggle.engine.store.tables import Source
+from mkpc_kaggle.engine.store.database import Source
 from mkpc_kaggle.engine.workers.process import WORKER_ENVIRONMENT, ProcessWorker
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches

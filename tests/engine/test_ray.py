@@ -15,12 +15,13 @@ import numpy as np
 import pytest
 from faulty import FaultyMatcher, die
 from processes import started_with
-from rectified import THREE_UNITS, RectifiedMatcher, Seen, matrices, run
+from rectified import THREE_UNITS, RectifiedMatcher, Seen, matrices, run, sources
 from synthetic import RECIPE as SYNTHETIC
 from synthetic import SyntheticMatcher, synthetic_pairs
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.request import Ending
+from mkpc_kaggle.engine.store.dataframes import matrices_of
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.setup.assembly import Assembly
@@ -115,8 +116,8 @@ def test_batches_are_reconstructed_on_the_cluster_to_the_same_bytes(cluster, tmp
     workers = f"ray://{cluster.address}"
     report = run(batch, SYNTHETIC, SyntheticMatcher(), tmp_path / "w", workers=workers)
     assert report.faults == ()
-    assert [record.source for record in report.records] == ["scene"] * len(batch)
-    chosen = [[record.chosen_fundamental for record in each.records] for each in (report, here)]
+    assert sources(report) == ["scene"] * len(batch)
+    chosen = [matrices_of(each.tables.pairs) for each in (report, here)]
     assert np.array_equal(*chosen)
 
 

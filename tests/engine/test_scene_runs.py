@@ -20,15 +20,16 @@ from faulty import (
     scene_in_a_gigabyte,
     scenes_by,
 )
-from rectified import SIZE, THREE_UNITS, RectifiedMatcher, batch_pairs, matrices, run
+from rectified import SIZE, THREE_UNITS, RectifiedMatcher, batch_pairs, matrices, run, sources
 from synthetic import RECIPE as SYNTHETIC
 from synthetic import SyntheticMatcher, synthetic_pairs
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.jobs import SceneJob
 from mkpc_kaggle.engine.request import Ending
-from mkpc_kaggle.engine.store.records import Table, read_images
-from mkpc_kaggle.engine.store.tables import Store
+from mkpc_kaggle.engine.store.database import Store
+from mkpc_kaggle.engine.store.dataframes import matrices_of
+from mkpc_kaggle.engine.store.published import Published, read_images
 from mkpc_kaggle.engine.workers.worker import batch_pair, results_of
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.recipe import SceneConfig
@@ -53,12 +54,12 @@ def test_pairs_get_the_f_of_their_scene_and_keep_their_own(tmp_path, monkeypatch
     publish = lambda state: published.append(state.fundamentals)  # noqa: E731
     report = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work", publish=publish)
     assert report.ending is Ending.COMPLETE
-    assert [record.source for record in report.records] == ["pair"] + ["scene"] * 5
-    chosen = [record.chosen_fundamental for record in report.records]
+    assert sources(report) == ["pair"] + ["scene"] * 5
+    chosen = matrices_of(report.tables.pairs)
     assert all(np.array_equal(F, SCENE_F) for F in chosen[1:])
     # A scene replaces no pair's own F: another setting of scenes may need it.
     assert matrices(report) == own_matrices(pairs, tmp_path / "alone")
-    assert report.records[0].scene.reason is Reason.CONTRADICTION
+    assert report.tables.pairs["choice"][0] == Reason.CONTRADICTION
     assert np.array_equal(published[-1], chosen)
     log = read_log(tmp_path / "work")
     assert "pairs with an F: 6 of 6 (5 from scenes, 1 from their own matches)" in overview(log)
@@ -92,11 +93,11 @@ def test_a_focal_length_of_exif_goes_to_the_pairs_the_store_and_the_scene(tmp_pa
     for name, expected in cases:
         reports.append(run(pairs, recipe, RectifiedMatcher(), tmp_path / name))
         with Store.read(tmp_path / name) as store:
-            rows = Table.of(store).rows
+            rows = Published.of(store).rows
             focals = [tuple(image.focal for image in read_images(store, row)) for row in rows]
         assert focals == expected
         set_exif(pairs[0].images[0], tA405=28)
-    without, with_exif = ([row.pair_fundamental for row in each.records] for each in reports)
+    without, with_exif = (each.tables.estimates["F"] for each in reports)
     assert not np.array_equal(without[0], with_exif[0])
     assert np.array_equal(without[2], with_exif[2]), "the pair of the other images"
     assert [pair.images[0].focal for pair in jobs[-1].pairs] == [told, told, 0]
@@ -121,7 +122,7 @@ def test_a_reconstruction_that_is_lost_costs_its_scene_alone_is_named_and_tried_
     report = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
     assert report.ending is Ending.WITH_FAILURES
     assert matrices(report) == own_matrices(pairs, tmp_path / "alone")
-    assert [record.source for record in report.records] == ["pair"] * 6
+    assert sources(report) == ["pair"] * 6
     (fault,) = report.faults[1:]
     assert fault.startswith(f"batch one was not reconstructed: {reason}")
     assert report.scenes[0].failure.startswith(reason)
@@ -132,7 +133,7 @@ def test_a_reconstruction_that_is_lost_costs_its_scene_alone_is_named_and_tried_
     scenes_by(monkeypatch, choose_scene_for_all_but_the_first, process=True)
     matcher = RectifiedMatcher()
     again = run(pairs, RECIPE, matcher, tmp_path / "work")
-    assert [record.source for record in again.records] == ["pair"] + ["scene"] * 5
+    assert sources(again) == ["pair"] + ["scene"] * 5
     assert matcher.calls == []
 
 
@@ -154,10 +155,10 @@ def test_a_run_reconstructs_the_true_cameras_and_a_gigabyte_is_enough(tmp_path, 
     matcher = SyntheticMatcher()
     report = run(synthetic_pairs(tmp_path / "images"), SYNTHETIC, matcher, tmp_path / "work")
     assert report.faults == ()
-    assert [record.source for record in report.records] == ["scene"] * 15
+    assert sources(report) == ["scene"] * 15
     distances = []
-    for record, pair in zip(report.records, matcher.scene.pairs, strict=True):
-        distances.append(matcher.scene.median_distance(record.chosen_fundamental, pair))
+    for F, pair in zip(matrices_of(report.tables.pairs), matcher.scene.pairs, strict=True):
+        distances.append(matcher.scene.median_distance(F, pair))
     # Pixels between true points and the lines of F
     assert max(distances) < 0.5
 
@@ -170,7 +171,7 @@ def test_a_death_within_pycolmap_costs_the_scene_alone_and_leaves_no_files(tmp_p
     pairs = synthetic_pairs(tmp_path / "images", 4)
     report = run(pairs, SYNTHETIC, SyntheticMatcher(images=4), tmp_path / "work")
     assert report.ending is Ending.WITH_FAILURES
-    assert [record.source for record in report.records] == ["pair"] * 6
+    assert sources(report) == ["pair"] * 6
     assert report.scenes[0].failure
     assert list((tmp_path / "temporary").iterdir()) == []
 
@@ -204,7 +205,7 @@ def test_a_resumed_run_reconstructs_only_the_batch_whose_image_was_replaced(
     scenes_by(monkeypatch, partial(befall, lack_an_image))
     again = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
     assert "1 image changed; matching 3 pairs again" in capsys.readouterr().err
-    assert [record.source for record in again.records] == ["pair"] * 6 + ["pair", "scene", "scene"]
+    assert sources(again) == ["pair"] * 6 + ["pair", "scene", "scene"]
     has_failed = {scene.batch: bool(scene.failure) for scene in again.scenes}
     assert has_failed == {"one": True, "two": False}
     assert matrices(again) == own_matrices(pairs, tmp_path / "alone")
@@ -223,6 +224,6 @@ def test_a_model_with_a_number_that_is_not_finite_costs_its_scene_alone(tmp_path
     report = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
     assert report.ending is Ending.WITH_FAILURES
     assert "the worker gave a wrong answer: no number of seconds: 'nan'" in report.faults[-1]
-    assert [record.source for record in report.records] == ["pair"] * 6
+    assert sources(report) == ["pair"] * 6
     scenes_by(monkeypatch, choose_scene_for_all_but_the_first)
     assert run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work").faults == ()

@@ -9,7 +9,7 @@ from statistics import mean, median
 
 import numpy as np
 import pytest
-from rectified import SECOND, SWEEP, THIRD, THREE_UNITS
+from rectified import SECOND, SWEEP, THIRD, THREE_UNITS, sources
 from simulator import (
     Scenario,
     SimulatedSite,
@@ -19,7 +19,7 @@ from simulator import (
     random_scenario,
     simulate,
     switch_off,
-    without_records,
+    without_tables,
 )
 
 from mkpc_kaggle.data.competition import Pair
@@ -39,8 +39,10 @@ from mkpc_kaggle.engine.plan.schedule import (
 from mkpc_kaggle.engine.plan.state import State
 from mkpc_kaggle.engine.request import Ending, Request
 from mkpc_kaggle.engine.scenes import scene_failures
+from mkpc_kaggle.engine.store.database import Store
+from mkpc_kaggle.engine.store.dataframes import matrices_of
 from mkpc_kaggle.engine.store.keys import Keys
-from mkpc_kaggle.engine.store.tables import Kind, Store
+from mkpc_kaggle.engine.store.tables import Layout
 from mkpc_kaggle.recipe import SceneConfig, Unit
 from mkpc_kaggle.scene.choose import Choice, Reason
 from mkpc_kaggle.scene.sfm import Solution
@@ -372,11 +374,11 @@ def test_more_time_never_means_fewer_units():
 
 def units_of(ran):
     """The number of results of units of all pairs."""
-    return sum(not unit.failure for record in ran.report.records for unit in record.units)
+    return int((ran.report.tables.units["failure"] == "").sum())
 
 
 def test_random_runs_are_never_late_never_lose_a_row_and_use_their_time():
-    runs = [without_records(simulate(random_scenario(seed, pairs=150))) for seed in range(20)]
+    runs = [without_tables(simulate(random_scenario(seed, pairs=150))) for seed in range(20)]
     assert max(run.late for run in runs) == 0
     assert sum(run.lost for run in runs) == 0
     assert [run.wrongly_closed for run in runs if run.wrongly_closed] == []
@@ -545,7 +547,7 @@ def test_scenes_at_several_places_take_less_time_and_end_as_at_one():
         ran = simulate(replace(scenario, scene_places=places))
         assert ran.missed == 0
         seconds.append(ran.report.seconds)
-        written.append([record.chosen_fundamental.tobytes() for record in ran.report.records])
+        written.append(matrices_of(ran.report.tables.pairs).tobytes())
     assert seconds[1] < 0.6 * seconds[0]
     assert written[0] == written[1]
 
@@ -560,19 +562,21 @@ def test_the_loop_reads_nothing_back_but_the_points_of_crops_and_estimates(monke
         loop(engine)
         is_looping.clear()
 
-    def columns(store: Store, column: str, keys: Iterable[str]) -> Iterable[tuple[str, object]]:
-        asked = list(keys)
+    def rows(
+        store: Store, layout: Layout, columns: str, part: slice, keys: Iterable[str] | None
+    ) -> Iterable[tuple[str, object]]:
+        asked = None if keys is None else list(keys)
         if is_looping and asked:
-            read.append((column, store.of_kind(Kind.POINTS).keys() >= set(asked)))
-        return whole(store, column, asked)
+            read.append((layout.table, columns))
+        return whole(store, layout, columns, part, asked)
 
-    whole = Store._columns
+    whole = Store._read
     monkeypatch.setattr(Engine, "_loop", noted)
-    monkeypatch.setattr(Store, "_columns", columns)
+    monkeypatch.setattr(Store, "_read", rows)
     ran = simulate(Scenario(40, (1.0, 1.0), 1, math.inf, misses=0, batches=4))
     assert len(ran.scenes) >= 4
     # Answers update the state; the store is for the next run.
-    assert set(read) == {("data", True)}
+    assert set(read) == {("points", "data")}
     # An estimator gets the points of a pair in its job: after the sweep, and with those of its crops.
     assert len(read) <= 40 + 2 * 40
 
@@ -603,9 +607,8 @@ def test_the_file_and_the_report_agree_on_an_image_that_is_replaced_during_a_run
     another_unit = replace(scenario, costs=(1.0, 1.0))
     publish = lambda state: written.append(state.fundamentals)  # noqa: E731
     _, report = ran_at(LaterSite, another_unit, store, publish)
-    assert [record.source for record in report.records] == ["pair", "scene", "scene", "scene"]
-    for F, record in zip(written[-1], report.records, strict=True):
-        np.testing.assert_array_equal(F, record.chosen_fundamental)
+    assert sources(report) == ["pair", "scene", "scene", "scene"]
+    np.testing.assert_array_equal(written[-1], matrices_of(report.tables.pairs))
 
 
 def test_reading_how_a_run_ended_changes_nothing():

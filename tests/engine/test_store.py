@@ -33,12 +33,14 @@ from mkpc_kaggle.engine.request import Ending, Request
 from mkpc_kaggle.engine.restore import restore
 from mkpc_kaggle.engine.run import EventLog, Run
 from mkpc_kaggle.engine.scenes import SceneWork
-from mkpc_kaggle.engine.store import tables as store_module
-from mkpc_kaggle.engine.store.dataframes import results
-from mkpc_kaggle.engine.store.image_files import file_result, stored_digests
+from mkpc_kaggle.engine.store import database as store_module
+from mkpc_kaggle.engine.store.database import FILE_NAME, Store, connected, to_bytes
+from mkpc_kaggle.engine.store.dataframes import matrices_of, pair_tables, results
+from mkpc_kaggle.engine.store.image_files import stored_digests
 from mkpc_kaggle.engine.store.keys import Keys
-from mkpc_kaggle.engine.store.records import About, Table, read_points, read_records, read_scenes
-from mkpc_kaggle.engine.store.tables import FILE_NAME, Kind, Result, Store, connected, to_bytes
+from mkpc_kaggle.engine.store.published import Published
+from mkpc_kaggle.engine.store.scene_record import SceneRecord
+from mkpc_kaggle.engine.store.tables import About, Feature, ImageFile, PairEstimate, UnitPoints
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Box, Size
@@ -47,7 +49,7 @@ from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.recipe import Recipe, SceneConfig, Unit
-from mkpc_kaggle.reporting.run_log import read_log, write_csv
+from mkpc_kaggle.reporting.run_log import read_log, regions_of, write_csv
 from mkpc_kaggle.scene.choose import Choice, Reason
 from mkpc_kaggle.scene.models import Reconstruction, RegisteredImage, SfmModel, Sigmas
 from mkpc_kaggle.scene.sfm import Solution
@@ -142,7 +144,7 @@ class Room:
 
     def replace(self, name: str) -> None:
         """Give an image another content, as the next start of a run notices."""
-        self.store.put([file_result(name, "new", (3, 3))])
+        self.store.put([ImageFile(name, "new", 3, 3)])
         self.ask()
 
     @property
@@ -160,6 +162,16 @@ class Room:
 def matches_of(index: int) -> Matches:
     rng = np.random.default_rng(index)
     return Matches(rng.random((30, 2)), rng.random((30, 2)), rng.random(30))
+
+
+def matches_in(store: Store, keys: Sequence[str]) -> dict[str, int]:
+    """The number of matches of points, by key."""
+    return {key: points.matches for key, points in store.get(UnitPoints, keys).items()}
+
+
+def results_in(store: Store) -> set[str]:
+    """The keys of all results of a store that a prune may remove."""
+    return {row.key for kind in (UnitPoints, PairEstimate, SceneRecord) for row in store.all(kind)}
 
 
 @pytest.fixture
@@ -180,18 +192,19 @@ def whole(room: Room) -> Room:
 
 
 def test_stored_results_are_read_after_reopening(whole: Room, tmp_path: Path) -> None:
-    records_before = read_records(whole.store)
-    scenes_before = read_scenes(whole.store)
+    before = pair_tables(whole.store)
+    scenes_before = Published.of(whole.store).scenes_of(whole.store)
     whole.store.close()
     with Store.open(tmp_path) as again:
-        records = read_records(again)
-        scenes = read_scenes(again)
-        assert [record.source for record in records] == ["scene", "pair", "fallback"]
-        found = [(unit.unit, unit.matches, unit.inliers) for unit in records[1].units]
-        assert found == [(SWEEP.name, 30, 7), (SECOND.name, 30, 8)]
-        assert records[0].regions == REGIONS
-        assert np.array_equal(records[0].chosen_fundamental, 3 * F)
-        assert np.array_equal(records[0].magsac_fundamental, 2 * F)
+        published = Published.of(again)
+        scenes = published.scenes_of(again)
+        pairs, units, regions, estimates = pair_tables(again)
+        assert pairs["source"].tolist() == ["scene", "pair", "fallback"]
+        found = units[units["pair"] == "p1"][["unit", "matches", "inliers"]].to_numpy().tolist()
+        assert found == [[SWEEP.name, 30, 7], [SECOND.name, 30, 8]]
+        assert regions_of(regions[regions["pair"] == "p0"]) == REGIONS
+        assert np.array_equal(matrices_of(pairs)[0], 3 * F)
+        assert np.array_equal(estimates["magsac"][0], 2 * F)
         assert scenes == scenes_before
         (model,) = scenes["one"].models
         (known,) = scenes_before["one"].models
@@ -202,10 +215,10 @@ def test_stored_results_are_read_after_reopening(whole: Room, tmp_path: Path) ->
             assert (image.points, image.sigmas) == (other.points, other.sigmas)
             for part in ("K", "R", "t"):
                 assert np.array_equal(getattr(image.camera, part), getattr(other.camera, part))
-        assert [record.units for record in records] == [record.units for record in records_before]
-        points = read_points(again, Table.of(again), 0)
+        assert units.equals(before.units)
+        points = published.points_of(again, published.rows[0])
         assert to_bytes(points[SWEEP.name]) == to_bytes(matches_of(0))
-        assert Table.of(again).about.recipe == {"name": "x"}
+        assert published.run.about.recipe == {"name": "x"}
 
 
 def test_results_are_data_frames_of_pairs_units_and_cameras(whole: Room, tmp_path: Path) -> None:
@@ -269,7 +282,7 @@ def test_new_points_of_stage_1_make_those_of_stage_2_out_of_date_but_they_stay_i
 def test_an_image_that_is_put_back_has_its_results_again(whole: Room) -> None:
     whole.replace("0.png")
     assert whole.standing == (1, 1, False)
-    whole.store.put([file_result("0.png", "0.png", (4, 4))])
+    whole.store.put([ImageFile("0.png", "0.png", 4, 4)])
     whole.ask()
     assert whole.standing == (2, 2, True)
 
@@ -304,13 +317,13 @@ def test_reports_show_the_f_that_was_written_last_and_decide_nothing_themselves(
     # Stored, but not in the submission yet: the report must agree with the file.
     whole.match(2, SWEEP)
     whole.estimate(2)
-    record = read_records(whole.store)[2]
-    assert (record.source, record.units) == ("fallback", ())
-    assert np.array_equal(record.chosen_fundamental, FALLBACK_FUNDAMENTAL)
+    pairs = pair_tables(whole.store).pairs
+    assert pairs[["source", "units"]].loc[2].tolist() == ["fallback", 0]
+    assert np.array_equal(matrices_of(pairs)[2], FALLBACK_FUNDAMENTAL)
     whole.publish()
-    record = read_records(whole.store)[2]
-    assert (record.source, len(record.units)) == ("pair", 1)
-    assert np.array_equal(record.chosen_fundamental, F)
+    pairs = pair_tables(whole.store).pairs
+    assert pairs[["source", "units"]].loc[2].tolist() == ["pair", 1]
+    assert np.array_equal(matrices_of(pairs)[2], F)
 
 
 def test_what_an_extra_pair_got_as_a_row_or_by_another_recipe_does_not_change_a_scene(
@@ -343,17 +356,20 @@ def test_rows_of_the_same_images_share_their_points_and_turned_images_are_others
 
 
 def test_results_are_stored_all_or_none(room: Room) -> None:
-    good = Result("a", Kind.SCENE, 1.0)
-    bad = Result("b", Kind.SCENE, np.nan)  # not JSON
-    with pytest.raises(sqlite3.IntegrityError):
-        room.store.put([good, bad])
-    assert room.store.about(["a", "b"]) == {}
+    good = SceneRecord("one", seconds=1.0, key="a")
+    for bad in (
+        SceneRecord("one", seconds=np.nan, key="b"),
+        SceneRecord("one", images=1.5, key="b"),
+    ):
+        with pytest.raises(sqlite3.IntegrityError):
+            room.store.put([good, bad])
+        assert room.store.get(SceneRecord, ["a", "b"]) == {}
 
 
 def test_results_that_a_full_disk_refuses_stay_in_memory_and_are_written_later(
     tmp_path: Path,
 ) -> None:
-    rows = [Result(f"key {n}", Kind.POINTS, n, bytes(600)) for n in range(200)]
+    rows = [UnitPoints(f"key {n}", "u", n, data=bytes(600)) for n in range(200)]
     with Store.open(tmp_path) as store:
         # SQLite then reports a full disk after five more pages.
         (pages,) = store._db.execute("PRAGMA page_count").fetchone()
@@ -361,27 +377,31 @@ def test_results_that_a_full_disk_refuses_stay_in_memory_and_are_written_later(
         for row in rows:
             store.put([row])
         assert "full" in store.trouble
-        assert store.about(row.key for row in rows) == {row.key: row.about for row in rows}
+        assert matches_in(store, [row.key for row in rows]) == {
+            row.key: row.matches for row in rows
+        }
         # The worker that estimates F gets these points, too.
         last = rows[-1]
         assert store.source([last.key]).data([last.key]) == {last.key: last.data}
         # The user deletes files: the next write takes all.
         store._db.execute("PRAGMA max_page_count = 100000")
     with Store.read(tmp_path) as again:
-        assert len(again.data(row.key for row in rows)) == 200
+        assert len(again.data(UnitPoints, [row.key for row in rows])) == 200
 
 
 # Puts a result into the store in argv[1], and prints the results that it has, and why they stay in memory.
 PUT = """
 import resource, sys
 from pathlib import Path
-from mkpc_kaggle.engine.store.tables import Kind, Result, Store
+from mkpc_kaggle.engine.store.database import Store
+from mkpc_kaggle.engine.store.tables import UnitPoints
 
 limit = 1024 * int(sys.argv[2])
 resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
 with Store.open(Path(sys.argv[1])) as store:
-    store.put([Result("new", Kind.POINTS, 2)])
-    print(store.about(["former", "new"]), bool(store.trouble))
+    store.put([UnitPoints("new", "u", 2)])
+    rows = store.get(UnitPoints, ["former", "new"])
+    print({key: row.matches for key, row in rows.items()}, bool(store.trouble))
 """
 
 
@@ -393,7 +413,7 @@ def test_a_disk_that_is_full_from_the_start_costs_no_result(
 ) -> None:
     if former:
         with Store.open(tmp_path) as store:
-            store.put(Result(key, Kind.POINTS, about) for key, about in former.items())
+            store.put(UnitPoints(key, "u", count) for key, count in former.items())
     process = put_into(tmp_path, kib)
     assert process.stderr == ""
     assert process.stdout == f"{former | {'new': 2}} True\n"
@@ -438,8 +458,8 @@ class FullDisk:
 def test_a_prune_on_a_full_disk_is_one_line_and_loses_nothing(
     whole: Room, tmp_path: Path, monkeypatch, word, outcome, kept
 ) -> None:
-    whole.store.put([Result("unnamed", Kind.POINTS, {}, bytes(1 << 16))])
-    named = set(Table.of(whole.store).keys)
+    whole.store.put([UnitPoints("unnamed", "u", data=bytes(1 << 16))])
+    named = set(Published.of(whole.store).keys)
     whole.store.close()
     real = store_module.connected
     monkeypatch.setattr(
@@ -447,39 +467,32 @@ def test_a_prune_on_a_full_disk_is_one_line_and_loses_nothing(
     )
     told = rf"sqlite: {outcome}.*: database or disk is full; make room on the disk"
     with Store.open(tmp_path) as store, pytest.raises(UserError, match=told):
-        store.prune(Table.of(store).keys)
+        store.prune(Published.of(store).keys)
     monkeypatch.undo()
     with Store.read(tmp_path) as store:
-        assert set(store.about([*named, "unnamed"])) == named | ({"unnamed"} if kept else set())
+        assert results_in(store) == named | ({"unnamed"} if kept else set())
 
 
 def test_a_prune_removes_what_the_table_of_pairs_does_not_name(whole: Room, tmp_path: Path) -> None:
-    named = set(Table.of(whole.store).keys)
-    unnamed = Result("unnamed", Kind.POINTS, {}, bytes(1 << 20))
-    features = Result("features", Kind.FEATURES, None, b"kept")
+    named = set(Published.of(whole.store).keys)
+    unnamed = UnitPoints("unnamed", "u", data=bytes(1 << 20))
+    features = Feature("features", data=b"kept")
     whole.store.put([unnamed, features])
     whole.store.close()
     before = (tmp_path / FILE_NAME).stat().st_size
     with Store.open(tmp_path) as store:
-        freed = store.prune(Table.of(store).keys)
+        freed = store.prune(Published.of(store).keys)
     assert freed >= 1 << 20
     assert (tmp_path / FILE_NAME).stat().st_size == before - freed
     with Store.read(tmp_path) as store:
-        kept = set()
-        for kind in (Kind.POINTS, Kind.ESTIMATE, Kind.SCENE):
-            kept |= store.of_kind(kind).keys()
-        assert kept == named
+        assert results_in(store) == named
         # Features belong to images, which the table of pairs does not name.
-        assert store.data(["features"]) == {"features": b"kept"}
+        assert store.data(Feature, ["features"]) == {"features": b"kept"}
 
 
 DAMAGES = [
     (
-        "PRAGMA ignore_check_constraints = ON; UPDATE result SET about = '{'",
-        "CHECK constraint failed",
-    ),
-    (
-        "PRAGMA writable_schema = ON; UPDATE sqlite_master SET sql = 'x' WHERE name = 'result'",
+        "PRAGMA writable_schema = ON; UPDATE sqlite_master SET sql = 'x' WHERE name = 'points'",
         "malformed",
     ),
 ]
@@ -497,14 +510,14 @@ def test_only_what_sqlite_reports_as_damage_is_damage(
     ):
         Store.open(tmp_path)
     with Store.open(tmp_path, fresh=True) as store:
-        assert store.of_kind(Kind.POINTS) == {}
+        assert store.all(UnitPoints) == []
 
 
 def test_a_bug_in_a_reader_is_no_damage(whole: Room, monkeypatch: pytest.MonkeyPatch) -> None:
     # "Delete your journal" would cost the user hours and hide the bug.
-    monkeypatch.setattr("mkpc_kaggle.engine.store.records.Row", lambda *_: None)
-    with pytest.raises(AttributeError):
-        read_records(whole.store)
+    monkeypatch.setattr("mkpc_kaggle.engine.store.dataframes.PARAMETERS", None)
+    with pytest.raises(sqlite3.ProgrammingError):
+        pair_tables(whole.store)
 
 
 def test_an_error_of_the_disk_is_no_damage_and_no_bad_input(
@@ -520,7 +533,7 @@ def test_an_error_of_the_disk_is_no_damage_and_no_bad_input(
     healthy = whole.store._db
     whole.store._db = Failing()
     with pytest.raises(sqlite3.OperationalError, match="disk I/O error"):
-        whole.store.about(["key"])
+        whole.store.get(UnitPoints, ["key"])
     whole.store._db = healthy
 
 
@@ -580,15 +593,15 @@ def test_a_reader_that_has_the_file_open_neither_blocks_a_run_nor_is_blocked(
     whole.store.close()
     # A transaction, as of a backup or of a notebook
     with Store.read(tmp_path) as reader:
-        before = read_records(reader)
+        before = pair_tables(reader).pairs
         with Store.open(tmp_path) as store:
-            store.put([Result("new", Kind.POINTS, 1)])
+            store.put([UnitPoints("new", "u", 1)])
             assert store.flush() == ""
             with Store.read(tmp_path) as other:
-                assert other.about(["new"]) == {"new": 1}
-        assert len(read_records(reader)) == len(before)
+                assert matches_in(other, ["new"]) == {"new": 1}
+        assert pair_tables(reader).pairs.equals(before)
     with Store.read(tmp_path) as again:
-        assert again.about(["new"]) == {"new": 1}
+        assert matches_in(again, ["new"]) == {"new": 1}
     # Nor does a reader leave files of SQLite's behind.
     assert sorted(path.name for path in tmp_path.iterdir()) == ["journal.lock", "journal.sqlite"]
 
@@ -602,10 +615,10 @@ def test_a_reader_of_a_copy_in_another_mode_does_not_block_a_run(
         db.execute(f"PRAGMA journal_mode = {mode}")
     with closing(connected(tmp_path / FILE_NAME, "mode=ro")) as reader:
         reader.execute("BEGIN")
-        assert reader.execute("SELECT count(*) FROM result").fetchone()[0] > 0
+        assert reader.execute("SELECT count(*) FROM points").fetchone()[0] > 0
         with Store.open(tmp_path) as store:
-            store.put([Result("new", Kind.POINTS, 1)])
-            assert store.about(["new"]) == {"new": 1}
+            store.put([UnitPoints("new", "u", 1)])
+            assert matches_in(store, ["new"]) == {"new": 1}
 
 
 def test_readers_in_a_loop_beside_a_run_work_or_have_one_line(pairs, undisturbed, tmp_path) -> None:
@@ -618,7 +631,8 @@ def test_readers_in_a_loop_beside_a_run_work_or_have_one_line(pairs, undisturbed
         while not ended.is_set():
             try:
                 read.append(len(results(work).pairs))
-                write_csv(read_log(work), tables)
+                read_log(work)
+                write_csv(work, tables)
             except UserError as error:
                 refused.append(str(error))
 
@@ -639,17 +653,18 @@ def test_readers_in_a_loop_beside_a_run_work_or_have_one_line(pairs, undisturbed
 
 
 DAMAGED_ROWS = {
-    "no field": "UPDATE result SET about = '{}' WHERE kind = 'points'",
-    "another number": "UPDATE result SET about = json_set(about, '$.matches', 7) WHERE kind = 'points'",
-    "truncated": "UPDATE result SET data = substr(data, 1, 7) WHERE kind = 'points'",
-    "empty": "UPDATE result SET data = x'' WHERE kind = 'points'",
-    "other bytes": "UPDATE result SET data = zeroblob(length(data)) WHERE kind = 'points'",
-    "an estimate": "UPDATE result SET about = json_set(about, '$.F[0]', 7) WHERE kind = 'estimate'",
-    "an image": "UPDATE result SET about = '7' WHERE kind = 'image'",
-    "the table": "UPDATE result SET about = '{}' WHERE kind = 'table'",
-    "F of the table": "UPDATE result SET data = zeroblob(length(data)) WHERE kind = 'table'",
-    "an event": "UPDATE result SET about = '[]' WHERE kind = 'event'",
-    "exchanged rows": "UPDATE result SET kind = 'scene' WHERE kind = 'points'",
+    "another number": "UPDATE points SET matches = 7",
+    "truncated": "UPDATE points SET data = substr(data, 1, 7)",
+    "empty": "UPDATE points SET data = x''",
+    "other bytes": "UPDATE points SET data = zeroblob(length(data))",
+    "no JSON": "UPDATE points SET regions = '{'",
+    "an estimate": "UPDATE estimate SET F = zeroblob(72)",
+    "an image": "UPDATE image SET width = 7",
+    "the run": "UPDATE run SET about = '{}'",
+    "the table of pairs": "UPDATE pair SET points = '[]'",
+    "F of the table": "UPDATE pair SET F = zeroblob(72)",
+    "an event": "UPDATE event SET text = 'x' || text",
+    "exchanged rows": "UPDATE points SET key = 'x' || key",
 }
 
 
@@ -684,10 +699,10 @@ def edit(directory: Path, script: str) -> int:
 
 
 TABLES = {
-    "no table": "DROP TABLE result",
+    "no table": "DROP TABLE points",
     "another table": "CREATE TABLE notes (text TEXT)",
-    "a trigger": "CREATE TRIGGER t AFTER INSERT ON result BEGIN DELETE FROM result; END",
-    "another column": "ALTER TABLE result ADD COLUMN note TEXT",
+    "a trigger": "CREATE TRIGGER t AFTER INSERT ON points BEGIN DELETE FROM points; END",
+    "another column": "ALTER TABLE points ADD COLUMN more TEXT",
 }
 
 
@@ -712,25 +727,25 @@ def test_a_lock_of_another_program_is_waited_for_once_in_half_a_minute(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clock = [0.0]
-    monkeypatch.setattr("mkpc_kaggle.engine.store.tables.monotonic", lambda: clock[0])
+    monkeypatch.setattr("mkpc_kaggle.engine.store.database.monotonic", lambda: clock[0])
     with Store.open(tmp_path) as store, closing(connected(tmp_path / FILE_NAME)) as other:
         tried = []
         store._db.set_trace_callback(lambda text: tried.append("BEGIN" in text))
         other.execute("BEGIN IMMEDIATE")
         for number in range(60):
             clock[0] = float(number)
-            store.put([Result(f"key {number}", Kind.POINTS, number)])
+            store.put([UnitPoints(f"key {number}", "u", number)])
         assert sum(tried) == 2
-        assert store.about(["key 59"]) == {"key 59": 59}
+        assert matches_in(store, ["key 59"]) == {"key 59": 59}
         assert "is locked" in store.trouble
         with pytest.raises(sqlite3.IntegrityError):  # also while nothing is written
-            store.put([Result("bad", Kind.POINTS, np.nan)])
+            store.put([UnitPoints("bad", "u", match_seconds=np.nan)])
         other.execute("ROLLBACK")
         # The end of the run, which has lost nothing
         assert store.flush() == ""
         assert store.trouble == ""
     with Store.read(tmp_path) as again:
-        assert len(again.of_kind(Kind.POINTS)) == 60
+        assert len(again.all(UnitPoints)) == 60
 
 
 def test_a_directory_that_is_moved_during_a_run_costs_no_result(
@@ -787,7 +802,7 @@ def test_the_log_of_a_killed_run_in_a_read_only_directory_is_read(
 ) -> None:
     work = tmp_path / "work"
     with Store.open(work) as store:
-        store.put([Result("in the log", Kind.POINTS, 1)])
+        store.put([UnitPoints("in the log", "u", 1)])
         shutil.copytree(work, tmp_path / "killed")
     killed = tmp_path / "killed"
     before = {path.name: path.read_bytes() for path in killed.iterdir()}
@@ -797,7 +812,7 @@ def test_the_log_of_a_killed_run_in_a_read_only_directory_is_read(
     monkeypatch.setattr(tempfile, "tempdir", None)
     with Store.read(killed) as reader:
         # One transaction, after a kill
-        assert reader.about(["in the log"]) == {"in the log": 1}
+        assert matches_in(reader, ["in the log"]) == {"in the log": 1}
     assert {path.name: path.read_bytes() for path in killed.iterdir()} == before
     assert sorted(path.name for path in tmp_path.iterdir()) == ["killed", "work"], "no copy is left"
 

@@ -20,8 +20,9 @@ from mkpc_kaggle import TwoStageMatcher
 from mkpc_kaggle.data.competition import read_train_side
 from mkpc_kaggle.data.images import read_image
 from mkpc_kaggle.data.pairs import read_pairs
-from mkpc_kaggle.engine.store.records import Table, read_points, read_records
-from mkpc_kaggle.engine.store.tables import Store
+from mkpc_kaggle.engine.store.database import Store
+from mkpc_kaggle.engine.store.dataframes import pair_tables
+from mkpc_kaggle.engine.store.published import Published
 from mkpc_kaggle.evaluation.validate import by_protocol
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Box, Size
@@ -31,6 +32,7 @@ from mkpc_kaggle.geometry.metrics import pose_error
 from mkpc_kaggle.geometry.robust import Method, ModelKind, RobustConfig, estimate
 from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult, with_estimate
 from mkpc_kaggle.recipe import Recipe, Unit
+from mkpc_kaggle.reporting.run_log import regions_of
 
 K = np.array(
     [
@@ -51,7 +53,8 @@ def listed(file: Path, root: Path, recipe: Path) -> list[object]:
 
 
 def matches_of(store: Store, position: int) -> Matches:
-    points = read_points(store, Table.of(store), position)
+    published = Published.of(store)
+    points = published.points_of(store, published.rows[position])
     return Matches.concatenate(points.values())
 
 
@@ -70,20 +73,21 @@ def evaluated_by_hand(work_dir: Path, lines, truths, side: int) -> list[dict[str
     """The independent evaluation of a run's matches, whose poses must be those of the run."""
     expected = []
     with Store.read(work_dir) as store:
-        records = read_records(store)
-        for line, true, record in zip(lines, truths, records, strict=True):
-            matches = matches_of(store, record.index)
-            keypoints = sum(unit.keypoints for unit in record.units)
+        _, units, _, estimates = pair_tables(store)
+        for number, (line, true) in enumerate(zip(lines, truths, strict=True)):
+            matches = matches_of(store, number)
+            estimate = estimates.loc[number]
+            keypoints = units["keypoints"][units["pair"] == estimate["pair"]].sum()
             # In double precision, as the other evaluation reads its lists.
             points = [each.astype(float) for each in (matches.points0, matches.points1)]
             sizes = [read_image(path).size for path in true.pair.images]
             by_hand = evaluate(line, points, keypoints, sizes, side)
             expected.append(by_hand)
             if by_hand["R"] is not None:
-                own_R = Rotation.from_rotvec(record.stats.rotation).as_matrix()
+                own_R = Rotation.from_rotvec(estimate["rotation"]).as_matrix()
                 np.testing.assert_allclose(own_R, by_hand["R"], atol=1e-6)
                 # t is E's left null vector.
-                residual = by_hand["t"] @ record.pair_fundamental
+                residual = by_hand["t"] @ estimate["F"]
                 np.testing.assert_allclose(residual, 0, atol=1e-6)
     return expected
 
@@ -390,16 +394,16 @@ def test_given_regions_replace_mkpcs_and_are_part_of_the_key_of_stage_2(
         run_options = ["--work-dir", tmp_path / "run", "--json", scores, *options]
         assert run_command(*command, *run_options) == 0
         with Store.read(tmp_path / "run") as store:
-            (record,) = read_records(store)
+            cropped = regions_of(pair_tables(store).regions)
             found = matches_of(store, 0)
         is_given = bool(options)
-        used = [region.box for region in record.regions]
+        used = [region.box for region in cropped]
         assert (used == [*boxes]) == is_given
-        reasons = {region.reason for region in record.regions}
+        reasons = {region.reason for region in cropped}
         assert (reasons == {RegionReason.GIVEN}) == is_given
         journal = tmp_path / "run" / "journal.sqlite"
         with closing(sqlite3.connect(journal)) as database:
-            count = "SELECT count(*) FROM result WHERE kind = 'points'"
+            count = "SELECT count(*) FROM points"
             assert database.execute(count).fetchone() == (rows,)
     np.testing.assert_array_equal(found.points0, match.matches.points0)
     (scored,) = json.loads(scores.read_text())["scenes"][0]["pairs"]

@@ -6,16 +6,16 @@ from math import nan
 
 import numpy as np
 import pytest
+from run_tables import Described, tables_of
 from shared import run_command, scores_of
 
 from mkpc_kaggle.data import competition
 from mkpc_kaggle.data.competition import Pair, TrainScene, TruePair, read_test_side, read_train_side
 from mkpc_kaggle.demo import DemoSet
-from mkpc_kaggle.engine.store.records import PairRecord
 from mkpc_kaggle.evaluation.validate import (
     SceneScore,
     Step,
-    score_record,
+    score_pair,
     score_submission,
     score_table,
 )
@@ -87,9 +87,9 @@ def test_a_failed_pair_counts_as_failed_even_where_the_fallback_happens_to_be_ri
     camera1 = Camera(eye, eye, np.array([1.0, 0, 0]))  # the fallback's motion
     true = TruePair(Pair("p", "s", "a", "b"), camera0, camera1, 0.5)
     scene = TrainScene("s", 1.0, (true,))
-    record = PairRecord(0, true.pair, failure="too few matches")
-    failed = score_record(true, record, scene, [Step.MAGSAC])
-    right = score_record(true, PairRecord(0, true.pair, failure="", source="pair"), scene)
+    tables = tables_of(Described("p", failure="too few matches"), Described("p", source="pair"))
+    failed = score_pair(true, tables, 0, scene, [Step.MAGSAC])
+    right = score_pair(true, tables, 1, scene)
     assert SceneScore("s", (right, failed, right)).maa() == pytest.approx(2 / 3)
     assert failed.error.rotation == failed.steps[Step.MAGSAC].rotation == np.inf
     assert right.error.angle < 1e-6
@@ -129,7 +129,7 @@ def test_a_work_directory_keeps_the_journal_and_a_report_that_shows_the_pairs(
     assert [set(pair["matches"]) for pair in scores["scenes"][0]["pairs"]] == [{"1:sift@400"}] * 2
     page = tmp_path / "work" / "report.html"
     assert page.read_text(encoding="utf-8").count("<img ") == 2
-    assert len(read_log(tmp_path / "work").records) == 2
+    assert len(read_log(tmp_path / "work").tables.pairs) == 2
 
 
 # The command has 8 s, and the patched validation never returns.
@@ -205,6 +205,6 @@ def test_images_of_a_list_with_one_file_name_are_two_images(tmp_path):
     pair = Pair("1", "list", str(tmp_path / "a" / "1.jpg"), str(tmp_path / "b" / "1.jpg"))
     true = TruePair(pair, camera, replace(camera, t=np.array([1.0, 0, 0])), nan)
     scene = TrainScene("list", nan, (true,))
-    record = PairRecord(0, pair, failure="no matches")
-    first, second = score_record(true, record, scene, (Step.MAGSAC,)).images
+    tables = tables_of(Described("1", failure="no matches"))
+    first, second = score_pair(true, tables, 0, scene, (Step.MAGSAC,)).images
     assert first != second

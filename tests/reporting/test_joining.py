@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from run_tables import Described, tables_of
 
-from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine.store.records import PairRecord, SceneRecord, UnitRecord
+from mkpc_kaggle.engine.store.scene_record import SceneRecord
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.reporting.verdict import nearest_to_joining
@@ -20,10 +20,9 @@ def model(*names: str) -> SfmModel:
     return SfmModel(tuple(images), np.zeros((0, 3)), 0.5)
 
 
-def record(first: str, second: str, inliers: int) -> PairRecord:
-    pair = Pair(f"{first}{second}", "scene", f"{first}.jpg", f"{second}.jpg")
-    unit = UnitRecord("1:sift@640", 1, 2 * inliers, inliers, 0, 0, "")
-    return PairRecord(0, pair, failure="", units=(unit,))
+def described(first: str, second: str, inliers: int) -> Described:
+    images = (f"{first}.jpg", f"{second}.jpg")
+    return Described(f"{first}{second}", images, "scene", matches=2 * inliers, inliers=inliers)
 
 
 # Images a, b and c are one model, d and e another; f has no camera.
@@ -44,5 +43,5 @@ CASES = {
 def test_the_pair_with_the_most_inliers_between_two_models_is_named(pairs, told):
     scene = SceneRecord("scene", models=(model("a", "b", "c"), model("d", "e")))
     digests = {f"{name}.jpg": f"digest of {name}" for name in "abcdef"}
-    records = [record(*pair) for pair in pairs]
-    assert nearest_to_joining(scene, records, digests) == told
+    table = tables_of(*(described(*pair) for pair in pairs)).pairs
+    assert nearest_to_joining(scene, table, digests) == told

@@ -5,7 +5,6 @@ import json
 import os
 import re
 import sys
-from dataclasses import replace
 from math import inf
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,14 +13,14 @@ import numpy as np
 import pytest
 from browser import needs_browser, opened_browser
 from rectified import THREE_UNITS, RectifiedMatcher, run, write_pairs
+from run_tables import Described, tables_of
 from shared import run_command
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine.run import note_event
-from mkpc_kaggle.engine.store.records import About, Event, EventKind, PairRecord, Row, Table
-from mkpc_kaggle.engine.store.tables import Store
-from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, EstimateStats
-from mkpc_kaggle.reporting.report import DRAWING_S, pair_rows, remark, report_page, report_run
+from mkpc_kaggle.engine.store.database import Store
+from mkpc_kaggle.engine.store.dataframes import matrices_of
+from mkpc_kaggle.engine.store.tables import About, Event, EventKind, PublishedPair, PublishedRun
+from mkpc_kaggle.reporting.report import DRAWING_S, pair_rows, remarks, report_page, report_run
 from mkpc_kaggle.reporting.run_log import read_log
 from mkpc_kaggle.reporting.summary import overview
 
@@ -43,12 +42,10 @@ def a_run(directory: Path, count: int = 12) -> list[Pair]:
 def empty_store(work_dir: Path, pairs: list[Pair], **about: object) -> Store:
     store = Store.open(work_dir)
     rows = [
-        Row(pair.id, pair.group, *pair.names, 0, 0, "", [], "", "fallback", {}, "")
-        for pair in pairs
+        PublishedPair(number, pair.id, pair.group, *pair.names) for number, pair in enumerate(pairs)
     ]
     facts = About({**THREE_UNITS.table(), "name": "three"}, **about)
-    written = np.tile(FALLBACK_FUNDAMENTAL, (len(pairs), 1, 1))
-    store.put([Table(facts, [], len(pairs), rows, {}, written).to_result()])
+    store.put([PublishedRun(about=facts, rows=len(pairs), pairs=len(pairs)), *rows])
     return store
 
 
@@ -59,18 +56,19 @@ def test_a_run_exports_tables_that_a_reader_of_csv_files_understands(tmp_path, c
     for path in map(Path, capsys.readouterr().out.splitlines()):
         with path.open(encoding="utf-8", newline="") as stream:
             tables[path.stem] = [*csv.DictReader(stream)]
-    assert [row["id"] for row in tables["pairs"]] == [pair.id for pair in pairs]
+    assert [row["pair"] for row in tables["pairs"]] == [pair.id for pair in pairs]
     assert "the file is empty" in tables["pairs"][1]["failure"]
-    for row, record in zip(tables["pairs"], read_log(tmp_path / "work").records, strict=True):
+    log = read_log(tmp_path / "work")
+    written = matrices_of(log.tables.pairs)
+    for number, row in enumerate(tables["pairs"]):
         F = [float(row[f"f{i}{j}"]) for i in "123" for j in "123"]
-        assert record.chosen_fundamental.ravel().tolist() == F
+        assert written[number].ravel().tolist() == F
         inliers = [int(unit["inliers"]) for unit in tables["units"] if unit["pair"] == row["pair"]]
         assert sum(inliers) == int(row["inliers"])
-        assert (row["image1"], row["overlaps"]) == (record.pair.file1, str(record.overlaps))
+        known = log.tables.pairs.loc[number]
+        assert (row["image1"], row["overlaps"]) == (known["image1"], str(known["overlaps"]))
     # A row without matches is a valid F, too.
-    assert np.linalg.matrix_rank(read_log(tmp_path / "work").records[1].chosen_fundamental) == 2, (
-        "the fallback"
-    )
+    assert np.linalg.matrix_rank(written[1]) == 2, "the fallback"
     assert len(tables["units"]) == 3 * 11
     assert len(tables["regions"]) == 2 * 11
     assert {event["kind"] for event in tables["events"]} >= {"start", "end"}
@@ -118,7 +116,7 @@ def test_an_export_replaces_nothing_but_its_own_tables(tmp_path, make, capsys):
     assert run_command("journal", tmp_path, "--csv", tmp_path / "csv") == 2
     assert "units.csv exists and is another table" in capsys.readouterr().err
     assert [path.name for path in (tmp_path / "csv").iterdir()] == ["units.csv"]
-    assert read_log(tmp_path).records == ()
+    assert len(read_log(tmp_path).tables.pairs) == 0
 
 
 def test_the_page_begins_with_the_verdict_has_pictures_inside_and_asks_for_nothing(tmp_path):
@@ -150,8 +148,10 @@ def test_the_page_begins_with_the_verdict_has_pictures_inside_and_asks_for_nothi
     # Their inliers are computed again from the journal, and are those of the run.
     weakest = read_log(tmp_path / "work").weakest
     assert len(weakest) == 11
-    for record, match in weakest:
-        assert (len(match.matches), match.estimate.inlier_count) == (record.matches, record.inliers)
+    pairs = read_log(tmp_path / "work").tables.pairs
+    for number, match in weakest:
+        found = [len(match.matches), match.estimate.inlier_count]
+        assert pairs[["matches", "inliers"]].loc[number].tolist() == found
 
 
 def test_the_summary_has_the_facts_of_the_page_for_programs(tmp_path):
@@ -162,10 +162,8 @@ def test_the_summary_has_the_facts_of_the_page_for_programs(tmp_path):
     assert table["verdict"].startswith("11 of 12 pairs with an F; with the fallback: 1 pair")
     assert (table["pairs"]["count"], table["pairs"]["with_f"]) == (12, 11)
     assert table["pairs"]["sources"] == {"fallback": 1, "pair": 11}
-    records = read_log(tmp_path / "work").records
-    assert table["pairs"]["inliers_minimum"] == min(
-        record.inliers for record in records if record.is_solved
-    )
+    found = read_log(tmp_path / "work").tables.pairs.query("source != 'fallback'")
+    assert table["pairs"]["inliers_minimum"] == found["inliers"].min()
     assert sum(table["pairs"]["inliers_histogram"].values()) == 12
     assert [unit["pairs"] for unit in table["units"]] == [11, 11, 11]
 
@@ -180,7 +178,7 @@ def test_a_summary_replaces_nothing_but_a_summary(tmp_path, make):
     assert run_command("journal", tmp_path, "--report", tmp_path / "page.html") == 2
     after = os.lstat(tmp_path / "page.summary.json")
     assert (after.st_ino, after.st_mtime_ns) == identity
-    assert read_log(tmp_path).records == ()
+    assert len(read_log(tmp_path).tables.pairs) == 0
 
 
 def test_text_from_files_is_escaped(tmp_path):
@@ -189,7 +187,7 @@ def test_text_from_files_is_escaped(tmp_path):
         tmp_path, pairs, device=EVIL, left_out=(EVIL,), versions={EVIL: EVIL}
     ) as store:
         for kind in EventKind:
-            note_event(store, Event(kind, 1.0, EVIL))
+            store.put([Event(kind, 1.0, EVIL)])
     log = read_log(tmp_path)
     # With and without paths of images
     for known in ((), pairs):
@@ -293,16 +291,16 @@ def test_the_command_draws_a_page_with_the_images_of_a_test_side(tmp_path):
 
 
 def test_a_flat_pair_is_marked_unless_the_scene_determines_its_f():
-    pair = Pair("a", "b", "0.png", "1.png")
-    stats = EstimateStats(support=99, plane=0.97)
-    flat = PairRecord(0, pair, failure="", stats=stats, source="pair")
-    assert remark(flat) == "flat: one homography explains 97 % of the inliers"
-    assert pair_rows([flat])[0][-1] == remark(flat)
-    for other in (
-        replace(flat, source="scene"),
-        replace(flat, stats=replace(stats, plane=0.89)),
-    ):
-        assert remark(other) == ""
-    # A doubt comes first, and a pair without an F has its reason.
-    assert "by chance" in remark(replace(flat, stats=replace(stats, support=3)))
-    assert remark(replace(flat, source="fallback", failure="too few")) == "too few"
+    described = [
+        Described("flat", source="pair", support=99.0, plane=0.97),
+        Described("of a scene", source="scene", support=99.0, plane=0.97),
+        Described("not flat", source="pair", support=99.0, plane=0.89),
+        # A doubt comes first, and a pair without an F has its reason.
+        Described("doubtful", source="pair", support=3.0, plane=0.97),
+        Described("failed", failure="too few", support=99.0, plane=0.97),
+    ]
+    pairs = tables_of(*described).pairs
+    flat = "flat: one homography explains 97 % of the inliers"
+    doubt = "3.0 times the inliers by chance"
+    assert remarks(pairs) == [flat, "", "", doubt, "too few"]
+    assert [row[-1] for row in pair_rows(pairs)] == remarks(pairs)

@@ -5,19 +5,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from run_tables import UNIT, Described, tables_of
 
-from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.request import Ending, RunReport
-from mkpc_kaggle.engine.store.records import (
-    NOT_RECONSTRUCTED,
-    About,
-    PairRecord,
-    SceneRecord,
-    UnitRecord,
-)
+from mkpc_kaggle.engine.store.scene_record import NOT_RECONSTRUCTED, SceneRecord
+from mkpc_kaggle.engine.store.tables import About
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Size
-from mkpc_kaggle.geometry.robust import EstimateStats
 from mkpc_kaggle.recipe import Recipe, Unit
 from mkpc_kaggle.reporting.run_log import RunLog
 from mkpc_kaggle.reporting.summary import (
@@ -30,14 +24,14 @@ from mkpc_kaggle.reporting.summary import (
     weakest_line,
 )
 from mkpc_kaggle.reporting.verdict import verdict
-from mkpc_kaggle.scene.choose import Choice, Reason
+from mkpc_kaggle.scene.choose import Reason
 from mkpc_kaggle.scene.models import RegisteredImage, SfmModel, Sigmas
 from mkpc_kaggle.scene.view_graph import BatchImage
 
 # As a run leaves a pair that it had no time for
-UNREACHED = PairRecord(0, Pair("a", "batch", "0.png", "1.png"))
+UNREACHED = Described(failure=None)
 # Support below 20: perhaps of different things
-FEW_INLIERS = replace(UNREACHED, failure="", stats=EstimateStats(support=14.4))
+FEW_INLIERS = Described(support=14.4)
 
 
 def camera(name: str, sigmas: Sigmas | tuple[()]) -> RegisteredImage:
@@ -49,24 +43,23 @@ def scene(*cameras: RegisteredImage) -> SceneRecord:
     return SceneRecord("batch", models=(SfmModel(cameras, np.zeros((0, 3)), 0.5),))
 
 
-def report(ending: Ending, *records: PairRecord, scenes: tuple[SceneRecord, ...] = ()) -> RunReport:
-    return RunReport(records, ending, 60.0, scenes=scenes)
+def report(ending: Ending, *pairs: Described, scenes: tuple[SceneRecord, ...] = ()) -> RunReport:
+    return RunReport(tables_of(*pairs), ending, 60.0, scenes=scenes)
 
 
 def test_a_pair_with_few_inliers_is_doubtful_unless_its_cameras_agree():
-    assert is_doubtful(FEW_INLIERS)
     # The cameras agree with many pairs, so few inliers of one say nothing.
-    settled = replace(FEW_INLIERS, scene=Choice(np.eye(3), Reason.SCENE), source="scene")
-    assert not is_doubtful(settled)
-    assert is_doubtful(replace(FEW_INLIERS, scene=Choice(None, Reason.CONTRADICTION)))
+    settled = Described(support=14.4, choice=Reason.SCENE, source="scene")
+    contradicting = Described(support=14.4, choice=Reason.CONTRADICTION)
+    pairs = tables_of(FEW_INLIERS, settled, contradicting).pairs
+    assert is_doubtful(pairs).tolist() == [True, False, True]
 
 
 def test_the_means_of_a_unit_leave_out_the_pairs_on_which_it_failed():
-    done = UnitRecord("1:sift@640", 1, 200, 100, 0.5, 1.5, failure="")
-    failed = UnitRecord("1:sift@640", 1, 0, 0, 0.0, 0.0, failure="KeyError: 'x'")
-    records = [replace(UNREACHED, units=(unit,)) for unit in (failed, done, failed)]
-    means = unit_means(report(Ending.COMPLETE, *records))
-    assert means == [("1:sift@640", 1, 200.0, 100.0, 2.0)]
+    done = Described(matches=200, inliers=100, seconds=2.0)
+    failed = Described(error="KeyError: 'x'")
+    means = unit_means(report(Ending.COMPLETE, failed, done, failed))
+    assert means == [(UNIT, 1, 200.0, 100.0, 2.0)]
 
 
 def test_cameras_with_unknown_errors_are_the_weakest():
@@ -178,7 +171,9 @@ def test_images_of_a_loose_model_alone_are_counted_apart():
 
 def test_the_verdict_counts_no_camera_of_a_loose_model_and_says_what_to_add():
     loose = SceneRecord("batch", images=4, registered=4, models=(model(0.39, 0.5, 0.7, 1.06),))
-    log = RunLog(Path("work"), About(), Recipe((Unit(1, "sift", 64),)), (), (), (), (loose,))
+    log = RunLog(
+        Path("work"), About(), Recipe((Unit(1, "sift", 64),)), tables_of(), (), (), (loose,)
+    )
     found = verdict(log)
     assert found.text.startswith("0 of 4 images with a camera")
     (problem,) = [problem for problem in found.problems if "loosely" in problem]

@@ -11,27 +11,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from run_tables import Described, tables_of
 
-from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.request import Ending
-from mkpc_kaggle.engine.store.records import (
-    NO_CAMERAS,
-    About,
-    Event,
-    EventKind,
-    PairRecord,
-    SceneRecord,
-    UnitRecord,
-)
+from mkpc_kaggle.engine.store.scene_record import NO_CAMERAS, SceneRecord
+from mkpc_kaggle.engine.store.tables import About, Event, EventKind
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.intrinsics import KnownCamera
 from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
-from mkpc_kaggle.geometry.robust import EstimateStats
 from mkpc_kaggle.recipe import Recipe, Unit
 from mkpc_kaggle.reporting import contradictions, verdict
 from mkpc_kaggle.reporting.run_log import RunLog
-from mkpc_kaggle.scene.choose import Choice, Reason
+from mkpc_kaggle.scene.choose import Reason
 from mkpc_kaggle.scene.models import (
     HARDLY_MOVED,
     MAX_SIGMA_IMAGES,
@@ -49,13 +41,9 @@ NAMES = [f"{number}.jpg" for number in range(4)]
 GOOD = Sigmas(0.1, 0.019, 1.0)
 RADIAL = KnownCamera("SIMPLE_RADIAL", (575.0, 320.0, 213.5, -0.05), 5.0)
 # A pair whose F is good
-PAIR = PairRecord(
-    0,
-    Pair("a", "set", NAMES[0], NAMES[1]),
-    failure="",
-    stats=EstimateStats(support=MIN_SUPPORT),
-    source="pair",
-)
+GOOD_F = {"source": "pair", "support": MIN_SUPPORT}
+PAIR = Described("a", (NAMES[0], NAMES[1]), "set", **GOOD_F)
+WEAK = Described("a", (NAMES[0], NAMES[1]), "set", source="pair", support=MIN_SUPPORT - 0.1)
 
 
 def model(
@@ -77,21 +65,19 @@ def scene(*models: SfmModel, failure: str = "") -> SceneRecord:
 
 def log(
     *scenes: SceneRecord,
-    records: tuple[PairRecord, ...] = (),
+    pairs: tuple[Described, ...] = (),
     ending: str = Ending.COMPLETE,
     faults: tuple[str, ...] = (),
 ) -> RunLog:
     events = [Event(EventKind.FAULT, 1.0, text) for text in faults]
     events.append(Event(EventKind.END, 2.0, str(ending)))
     recipe = Recipe((Unit(1, "sift", 640),))
-    return RunLog(Path("journal"), About(), recipe, records, tuple(events), (), scenes)
+    return RunLog(Path("journal"), About(), recipe, tables_of(*pairs), tuple(events), (), scenes)
 
 
-ALL = tuple(replace(PAIR, pair=Pair(name, "set", first, name)) for first, name in pairwise(NAMES))
+ALL = tuple(Described(name, (first, name), "set", **GOOD_F) for first, name in pairwise(NAMES))
 GOOD_MODEL = model(GOOD, GOOD, GOOD, GOOD)
-FAILED = UnitRecord("1:sift@640", 1, 0, 0, 0.0, 0.0, failure="out of memory")
-FEW = UnitRecord("1:sift@640", 1, 20, 7, 0.0, 0.0, failure="")
-LATE = PairRecord(0, PAIR.pair)
+FEW = Described("few", (NAMES[2], NAMES[3]), "set", matches=20, inliers=7, **GOOD_F)
 
 
 def compared(*found: FocalContradiction | DistortedLens) -> RunLog:
@@ -105,13 +91,11 @@ def compared(*found: FocalContradiction | DistortedLens) -> RunLog:
 SPEAKS = {
     "the run failed: no worker left": log(ending=Ending.NO_WORKER),
     "the run failed: errors left 1 of 1 pair without an F": log(
-        records=(replace(PAIR, source="fallback", units=(FAILED,)),)
+        pairs=(Described(error="out of memory"),)
     ),
-    "not reached in time: 1 pair; give": log(records=(LATE,)),
-    "with the fallback: 1 pair; the reasons": log(records=(replace(PAIR, source="fallback"),)),
-    "perhaps of different things: 1 pair": log(
-        records=(replace(PAIR, stats=EstimateStats(support=MIN_SUPPORT - 0.1)),)
-    ),
+    "not reached in time: 1 pair; give": log(pairs=(Described(failure=None),)),
+    "with the fallback: 1 pair; the reasons": log(pairs=(Described(failure="too few"),)),
+    "perhaps of different things: 1 pair": log(pairs=(WEAK,)),
     f"no cameras, {NO_CAMERAS}: photographs that overlap more": log(scene(failure=NO_CAMERAS)),
     f"no cameras, {NO_CAMERAS}: all masks are black": log(
         scene(failure=NO_CAMERAS), faults=("set: all masks are black",)
@@ -124,7 +108,7 @@ SPEAKS = {
         scene(model(GOOD, GOOD, GOOD, GOOD, comparison=Comparison(has_moved=False)))
     ),
     "no camera for 3.jpg: add photographs between": log(
-        scene(model(GOOD, GOOD, GOOD, names=NAMES[:3])), records=ALL
+        scene(model(GOOD, GOOD, GOOD, names=NAMES[:3])), pairs=ALL
     ),
     "the images form 2 models of 4, 4: add photographs that connect them": (
         log(scene(GOOD_MODEL, GOOD_MODEL))
@@ -135,7 +119,7 @@ SPEAKS = {
                 model(GOOD, GOOD, GOOD, names=NAMES[:3]),
                 model(GOOD, GOOD, GOOD, names=NAMES[3:] * 3),
             ),
-            records=(replace(ALL[2], units=(FEW,)),),
+            pairs=(FEW,),
         ),
         digests={name: name for name in NAMES},
     ),
@@ -173,7 +157,7 @@ def test_each_sentence_speaks_on_its_input(text):
 
 
 def test_a_run_without_problems_looks_right():
-    for run in (log(records=ALL), log(scene(GOOD_MODEL), records=ALL)):
+    for run in (log(pairs=ALL), log(scene(GOOD_MODEL), pairs=ALL)):
         assert verdict.verdict(run).problems == ()
         assert str(verdict.verdict(run)).endswith("nothing looks wrong")
 
@@ -186,11 +170,11 @@ def test_cameras_of_a_model_that_is_too_large_for_sigmas_are_not_called_uncertai
 
 
 def test_the_doubts_about_a_pair_have_inputs():
-    weak = replace(PAIR, stats=EstimateStats(support=MIN_SUPPORT - 0.1))
-    assert "times the inliers by chance" in verdict.doubt(weak)
-    contradicting = replace(PAIR, scene=Choice(None, Reason.CONTRADICTION))
-    assert verdict.doubt(contradicting) == "its matches contradict the cameras"
-    assert verdict.doubt(PAIR) == ""
+    contradicting = Described(choice=Reason.CONTRADICTION, **GOOD_F)
+    weak, contradicts, none = verdict.doubts(tables_of(WEAK, contradicting, PAIR).pairs)
+    assert "times the inliers by chance" in weak
+    assert contradicts == "its matches contradict the cameras"
+    assert none == ""
 
 
 def sentences(module: object) -> list[str]:

@@ -6,11 +6,12 @@ from itertools import combinations
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
-from rectified import run
+from rectified import run, sources
 from synthetic import RECIPE, SyntheticMatcher, synthetic_pairs
 
 from mkpc_kaggle.engine.plan.state import State
 from mkpc_kaggle.engine.request import Ending
+from mkpc_kaggle.engine.store.dataframes import matrices_of
 from mkpc_kaggle.recipe import SceneConfig
 from mkpc_kaggle.reporting.run_log import read_log
 from mkpc_kaggle.scene.densify import extra_pairs
@@ -66,13 +67,13 @@ def test_a_sparse_batch_has_a_scene_by_pairs_that_no_row_names(tmp_path):
 
     report = run(asked, recipe, matcher, work, publish=publish)
     assert report.ending is Ending.COMPLETE
-    assert [record.source for record in report.records] == ["scene"] * 5
+    assert sources(report) == ["scene"] * 5
     true_pairs = [matcher.scene.pairs[index] for index in indices]
-    for record, pair in zip(report.records, true_pairs, strict=True):
-        assert matcher.scene.median_distance(record.chosen_fundamental, pair) < 0.5
+    for F, pair in zip(matrices_of(report.tables.pairs), true_pairs, strict=True):
+        assert matcher.scene.median_distance(F, pair) < 0.5
     assert len(matcher.calls) == 12, "two pairs an image"
     # Extra pairs are in no result, table or report.
     assert set(published) == {5}
-    assert len(read_log(work).records) == 5
+    assert len(read_log(work).tables.pairs) == 5
     again = run(asked, recipe, SyntheticMatcher(), work)
     assert again.scenes == report.scenes

@@ -138,4 +138,10 @@ def run(
 
 
 def matrices(report: RunReport) -> list[bytes]:
-    return [record.pair_fundamental.tobytes() for record in report.records]
+    """The bytes of each pair's own F."""
+    return [F.tobytes() for F in report.tables.estimates["F"]]
+
+
+def sources(report: RunReport) -> list[str]:
+    """Where the written F of each pair comes from."""
+    return report.tables.pairs["source"].tolist()

@@ -38,8 +38,10 @@ from mkpc_kaggle.engine.plan.budget import MAX_SILENCE_S, SCENE_MARGIN, SCENE_ST
 from mkpc_kaggle.engine.plan.schedule import RESERVE_SHARE
 from mkpc_kaggle.engine.request import Request, RunReport
 from mkpc_kaggle.engine.run import HANG_FACTOR
+from mkpc_kaggle.engine.store.database import Store, connected
+from mkpc_kaggle.engine.store.dataframes import PairTables
 from mkpc_kaggle.engine.store.keys import Keys
-from mkpc_kaggle.engine.store.tables import SCHEMA, Store, connected
+from mkpc_kaggle.engine.store.tables import SCHEMA
 from mkpc_kaggle.engine.workers.places import Place, Site, Work
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.crop_need import CropNeed
@@ -471,7 +473,7 @@ def memory_store() -> Store:
     with TemporaryDirectory() as directory:
         store = Store(Path(directory))
         store._db = connected(":memory:")
-        store._db.execute(SCHEMA)
+        store._db.executescript(SCHEMA)
         weakref.finalize(store, store._db.close)  # since 3.13, Python warns of open connections
         return store
 
@@ -549,7 +551,7 @@ def simulate(scenario: Scenario, store: Store | None = None, until: float = math
     faulty = {scene.batch for scene in site.scenes if scene.is_faulty}
     matches = zip(state.batches, state.matches_of_batches(), strict=True)
     matched = {batch for batch, count in matches if count}
-    made = {pairs[record.index].group for record in report.records if record.scene is not None}
+    made = set(report.tables.pairs.query("choice != ''")["group"])
     return Ran(
         scenario,
         report,
@@ -590,6 +592,7 @@ def sweep_seconds(scenario: Scenario) -> float:
     return start + scenario.pairs * (unit + stalls + faults) / workers
 
 
-def without_records(ran: Ran) -> Ran:
-    """Return the run without its records: a thousand runs with theirs would fill the memory."""
-    return replace(ran, report=replace(ran.report, records=()), scenes=(), keys=[])
+def without_tables(ran: Ran) -> Ran:
+    """Return the run without its tables: a thousand runs with theirs would fill the memory."""
+    nothing = PairTables(*(table.iloc[:0] for table in ran.report.tables))
+    return replace(ran, report=replace(ran.report, tables=nothing), scenes=(), keys=[])

@@ -6,7 +6,7 @@ unit looks at crops that come from the pair's stage-1 points: new points of stag
 and its points are computed again.
 """
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
+from collections.abc import Iterable, Iterator, Sequence, Set
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,8 @@ from mkpc_kaggle.engine.plan.blame import Item, Tries
 from mkpc_kaggle.engine.request import Request
 from mkpc_kaggle.engine.store.image_files import contents_of
 from mkpc_kaggle.engine.store.keys import Images, of_candidate
-from mkpc_kaggle.engine.store.records import MIN_PAIRS, SceneRecord
+from mkpc_kaggle.engine.store.scene_record import MIN_PAIRS, SceneRecord
+from mkpc_kaggle.engine.store.tables import PairEstimate, UnitPoints
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 from mkpc_kaggle.recipe import SceneConfig
 from mkpc_kaggle.scene.candidates import ALL_UNITS, best_of, candidates_of
@@ -51,7 +52,7 @@ class State:
     Of a batch: ``batches`` has its number by name, ``members`` its pairs; ``batch_of`` (N,) is -1 for a pair
     without one. ``scenes`` has the scenes in use, ``stale`` the batches whose scene is not today's, and
     ``reconstructing`` the batches of jobs under way. A scene is the best of the ``candidates``: ``made`` has those
-    from today's results, with their keys, once the first is made; ``untried`` are the missing ones, and ``trying``
+    from today's results, once the first is made; ``untried`` are the missing ones, and ``trying``
     those of jobs under way, as (batch, candidate). ``filed`` has the key of the scene whose files are in the
     batch's folder.
     """
@@ -112,11 +113,10 @@ class State:
         for number, members in enumerate(self.members):
             self.batch_of[members] = number
         self.scenes: dict[str, SceneRecord] = {}
-        self.scene_keys: dict[str, str] = {}
         self.stale = set(batches)
         self.reconstructing: set[str] = set()
         self.candidates = candidates_of(self.units, self.request.recipe.scene)
-        self.made: dict[str, dict[str, tuple[str, SceneRecord]]] = {}
+        self.made: dict[str, dict[str, SceneRecord]] = {}
         self.untried: dict[str, list[str]] = {}
         self.trying: set[tuple[str, str]] = set()
         self.filed: dict[str, str] = {}
@@ -311,13 +311,13 @@ class State:
         """Return the rows with the same images as a pair, including itself."""
         return self._twins.get(index, [index])
 
-    def use_points(self, index: int, unit: int, key: str, about: Mapping[str, Any]) -> None:
-        """Use a unit's points, given as the store has them; none if the pair does not need the unit."""
-        self.points[index, unit] = key
-        self.has[index, unit] = about["is_needed"]
-        self.unneeded[index, unit] = not about["is_needed"]
+    def use_points(self, index: int, unit: int, points: UnitPoints) -> None:
+        """Use a unit's points; none if the pair does not need the unit."""
+        self.points[index, unit] = points.key
+        self.has[index, unit] = points.is_needed
+        self.unneeded[index, unit] = not points.is_needed
         self.current[index, unit] = True
-        self.matches[index, unit] = about["matches"]
+        self.matches[index, unit] = points.matches
 
     def forget_points(self, keys: Set[str]) -> None:
         """Forget the points with these keys: their units are missing again."""
@@ -369,14 +369,14 @@ class State:
         self.scene_source[index] = FALLBACK
         self.note_change(index)
 
-    def use_estimate(self, index: int, key: str, about: Mapping[str, Any]) -> None:
-        """Use an estimate, given as the store has it."""
-        self.estimates[index] = key
-        self.own[index] = np.array(about["F"]).reshape(3, 3)
-        self.has_own[index] = not about["failure"]
-        self.inliers[index] = sum(about["inliers"])
+    def use_estimate(self, index: int, estimate: PairEstimate) -> None:
+        """Use an estimate."""
+        self.estimates[index] = estimate.key
+        self.own[index] = estimate.F
+        self.has_own[index] = not estimate.failure
+        self.inliers[index] = sum(estimate.inliers.values())
 
-    def use_candidate(self, batch: str, key: str, record: SceneRecord) -> None:
+    def use_candidate(self, batch: str, record: SceneRecord) -> None:
         """Use a candidate of a scene, if it is the best one so far.
 
         The first candidate is always from newer results than the others, and replaces them. With
@@ -385,21 +385,18 @@ class State:
         if record.candidate == ALL_UNITS:
             self.made[batch] = {}
         made = self.made[batch]
-        made[record.candidate] = (key, record)
+        made[record.candidate] = record
         used = self.best_candidate(batch)
-        if batch in self.request.exports and made[used][0] != self.filed.get(batch):
-            filed = [name for name, (of, _) in made.items() if of == self.filed.get(batch)]
+        if batch in self.request.exports and made[used].key != self.filed.get(batch):
+            filed = [name for name, each in made.items() if each.key == self.filed.get(batch)]
             used = next(iter(filed), ALL_UNITS)
-        key, chosen = made[used]
-        others = [other for name, (_, other) in made.items() if name != used]
-        self.use_scene(batch, key, chosen.against(others))
+        others = [other for name, other in made.items() if name != used]
+        self.use_scene(batch, made[used].against(others))
 
     def best_candidate(self, batch: str) -> str:
         """Return the candidate with the smallest disagreement among those that are made."""
         made = self.made[batch]
-        return best_of(
-            {name: made[name][1].disagreement for name in self.candidates if name in made}
-        )
+        return best_of({name: made[name].disagreement for name in self.candidates if name in made})
 
     def try_others(self, batch: str) -> None:
         """Note which other candidates are missing: the first one is from today's results.
@@ -407,14 +404,14 @@ class State:
         With files, the best one is made again in the end, if its files are missing.
         """
         made = self.made[batch]
-        scene = made[ALL_UNITS][0]
+        scene = made[ALL_UNITS].key
         missing = [name for name in self.candidates if name not in made]
         open_ones = [name for name in missing if not self._is_given_up(batch, scene, name)]
         best = self.best_candidate(batch)
         if (
             not open_ones
             and batch in self.request.exports
-            and made[best][0] != self.filed.get(batch)
+            and made[best].key != self.filed.get(batch)
             and not self._is_given_up(batch, scene, best)
         ):
             open_ones = [best]
@@ -427,14 +424,13 @@ class State:
     def rivals(self) -> dict[str, list[str]]:
         """The keys of the candidates that are not in use, by batch."""
         return {
-            batch: [key for key, _ in made.values() if key != self.scene_keys[batch]]
+            batch: [each.key for each in made.values() if each.key != self.scenes[batch].key]
             for batch, made in self.made.items()
         }
 
-    def use_scene(self, batch: str, key: str, record: SceneRecord) -> None:
+    def use_scene(self, batch: str, record: SceneRecord) -> None:
         """Use a scene: pairs with a choice take its F."""
         self.scenes[batch] = record
-        self.scene_keys[batch] = key
         members = self.members[self.batches[batch]]
         self.changed.update(members.tolist())
         self.scene_source[members] = FALLBACK  # of the former scene

@@ -1,80 +1,251 @@
-"""The results of a run as three pandas DataFrames."""
+"""The results of a run as pandas DataFrames, made by SQL from the tables of its store.
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+They are all that reports, the summary, ``mkpc journal``, notebooks and scores read. A further fact of a
+result is a field in :mod:`tables`, the line that computes it, and a line of a query here.
+"""
+
+import json
+import sqlite3
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from mkpc_kaggle.engine.store.image_files import stored_digests
-from mkpc_kaggle.engine.store.records import (
-    PairRecord,
-    SceneRecord,
-    Table,
-    UnitRecord,
-    read_records,
-    read_scenes,
+from mkpc_kaggle.engine.store.database import Store, connected
+from mkpc_kaggle.engine.store.published import Published
+from mkpc_kaggle.engine.store.scene_record import SceneRecord
+from mkpc_kaggle.engine.store.tables import (
+    LAYOUTS,
+    SCHEMA,
+    Event,
+    ImageFile,
+    PairEstimate,
+    PublishedPair,
+    PublishedRun,
+    UnitPoints,
 )
-from mkpc_kaggle.engine.store.tables import Store
-from mkpc_kaggle.scene.models import RegisteredImage, Sigmas
+from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
+from mkpc_kaggle.geometry.planarity import MIN_PLANE_SHARE
+from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-# pandas treats NaN as missing.
-UNKNOWN = Sigmas(np.nan, np.nan, np.nan)
-# The columns with their types, so that a table without rows has them, too.
-ELEMENTS = [f"f{row}{column}" for row in (1, 2, 3) for column in (1, 2, 3)]  # row by row
-PAIR_COLUMNS = {
-    "pair": str,
-    "group": str,
-    "image0": str,
-    "image1": str,
-    "failure": str,
-    "source": str,
-    "matches": int,
-    "inliers": int,
-    "overlaps": bool,
-    "support": float,
-    "flat": bool,
-    "plane": float,
-    "focal0": float,
-    "focal1": float,
-    "model": str,
-    **dict.fromkeys(ELEMENTS, float),
+NOT_REACHED = "not reached in time"
+# Numbers, since SQL has no names for ours
+PARAMETERS = {
+    "not_reached": NOT_REACHED,
+    "min_support": MIN_SUPPORT,
+    "min_plane": MIN_PLANE_SHARE,
+    "fallback": FALLBACK_FUNDAMENTAL.tobytes(),
 }
-UNIT_COLUMNS = {
-    "pair": str,
-    "unit": str,
-    "stage": int,
-    "matches": int,
-    "inliers": int,
-    "encode_seconds": float,
-    "match_seconds": float,
-    "failure": str,
-    "note": str,
-    "keypoints": int,
-    "is_needed": bool,
-    "scale": float,
-    "detail": float,
+
+# Units of pairs, with all columns of their points. Each has points, or a known reason why it has
+# none; without either, it was not reached. Inliers are by the key of points: newer points than the
+# estimate's have none yet.
+UNIT_TABLE = """
+CREATE TABLE unit AS
+WITH used AS (
+    SELECT
+        pair.number, pair.estimate, point.key AS position, point.value AS points,
+        json_extract(named.value, '$[0]') AS name, json_extract(named.value, '$[1]') AS stage,
+        json_extract(pair.failures, '$."' || json_extract(named.value, '$[0]') || '"') AS reason
+    FROM
+        run JOIN pair JOIN json_each(pair.points) AS point
+        JOIN json_each(run.units) AS named ON named.key = point.key
+)
+SELECT
+    number, name, stage, iif(points.key IS NULL, reason, '') AS reason,
+    json_extract(inliers, '$."' || points.key || '"') AS inliers, points.*
+FROM
+    used LEFT JOIN points ON points.key = used.points
+    LEFT JOIN estimate ON estimate.key = used.estimate
+WHERE points.key IS NOT NULL OR reason IS NOT NULL
+ORDER BY number, position;
+CREATE INDEX unit_of_pair ON unit (number);
+"""
+
+
+class Query(NamedTuple):
+    """A table: for each column its type and its SQL, and where the rows come from.
+
+    The type is for a table without rows, too.
+    """
+
+    columns: Mapping[str, tuple[type, str]]
+    source: str
+
+    def frame(self, database: sqlite3.Connection) -> "DataFrame":
+        from pandas import DataFrame  # importing it takes half a second
+
+        expressions = ", ".join(sql for _, sql in self.columns.values())
+        rows = database.execute(f"SELECT {expressions} {self.source}", PARAMETERS).fetchall()
+        kinds = {name: kind for name, (kind, _) in self.columns.items()}
+        return DataFrame(rows, columns=list(kinds)).astype(kinds)
+
+
+SECONDS = {  # columns of pairs, and their names in reports
+    "decode_seconds": "wait for decoding",
+    "encode_seconds": "encode",
+    "match_seconds": "match",
+    "cluster_seconds": "cluster",
+    "estimate_seconds": "MAGSAC (in parallel with matching)",
 }
-CAMERA_COLUMNS = {
-    "batch": str,
-    "model": int,
-    "image": str,
-    "width": int,
-    "height": int,
-    "focal": float,
-    "points": int,
-    "rotation_sigma": float,
-    "centre_sigma": float,
-    "focal_sigma": float,
-    "K": object,
-    "R": object,
-    "t": object,
-    "camera_model": str,
-    "parameters": object,
-}
+REASON = (
+    "coalesce(estimate.failure, nullif(pair.failure, ''), nullif(unestimated, ''), :not_reached)"
+)
+# The error that left a pair without an F. A unit that ran and found nothing is none: the images may
+# not overlap.
+ERROR = f"""
+CASE
+    WHEN source != 'fallback' OR {REASON} = :not_reached THEN ''
+    WHEN sums.units IS NULL OR unestimated != '' THEN {REASON}
+    ELSE coalesce(
+        (
+            SELECT reason FROM unit
+            WHERE unit.number = pair.number AND reason != '' AND matches IS NULL ORDER BY rowid
+        ),
+        ''
+    )
+END
+"""
+PAIRS = Query(
+    {
+        "pair": (str, "pair.id"),
+        "group": (str, "pair.batch"),
+        # Not the file names alone: two folders may have the same.
+        "image0": (str, "image0"),
+        "image1": (str, "image1"),
+        "failure": (str, REASON),
+        "source": (str, "source"),
+        "matches": (int, "coalesce(sums.matches, 0)"),
+        "inliers": (int, "coalesce(sums.inliers, 0)"),
+        "overlaps": (bool, "coalesce(support, 0) >= :min_support"),
+        "support": (float, "coalesce(support, 0)"),
+        "flat": (bool, "coalesce(plane, 0) >= :min_plane"),
+        "plane": (float, "coalesce(plane, 0)"),
+        "focal0": (float, "coalesce(focal0, 0)"),
+        "focal1": (float, "coalesce(focal1, 0)"),
+        "model": (str, "model"),
+        "F": (object, "pair.F"),
+        "decode_seconds": (float, "coalesce(sums.decode_seconds, 0)"),
+        "encode_seconds": (float, "coalesce(sums.encode_seconds, 0)"),
+        "match_seconds": (float, "coalesce(sums.match_seconds, 0)"),
+        "cluster_seconds": (float, "coalesce(sums.cluster_seconds, 0)"),
+        "estimate_seconds": (float, "coalesce(estimate.seconds, 0)"),
+        "candidates": (int, "coalesce(candidates, 0)"),
+        "cost": (float, "coalesce(cost, 0)"),
+        "magsac_cost": (float, "coalesce(magsac_cost, 0)"),
+        "choice": (str, "choice"),
+        "units": (int, "coalesce(sums.units, 0)"),
+        "error": (str, ERROR),
+    },
+    """
+    FROM
+        pair LEFT JOIN estimate ON estimate.key = pair.estimate
+        LEFT JOIN (
+            SELECT
+                number, count(*) AS units, sum(matches) AS matches, sum(inliers) AS inliers,
+                sum(decode_seconds) AS decode_seconds, sum(encode_seconds) AS encode_seconds,
+                sum(match_seconds) AS match_seconds, sum(cluster_seconds) AS cluster_seconds
+            FROM unit GROUP BY number
+        ) AS sums USING (number)
+    ORDER BY pair.number
+    """,
+)
+ELEMENTS = [f"f{row}{column}" for row in (1, 2, 3) for column in (1, 2, 3)]  # of F, row by row
+UNITS = Query(
+    {
+        "pair": (str, "pair.id"),
+        "unit": (str, "unit.name"),
+        "stage": (int, "stage"),
+        "matches": (int, "coalesce(matches, 0)"),
+        "inliers": (int, "coalesce(inliers, 0)"),
+        "encode_seconds": (float, "coalesce(encode_seconds, 0)"),
+        "match_seconds": (float, "coalesce(match_seconds, 0)"),
+        "failure": (str, "reason"),
+        "note": (str, "coalesce(note, '')"),
+        "keypoints": (int, "coalesce(keypoints, 0)"),
+        "is_needed": (bool, "coalesce(is_needed, 1)"),
+        "scale": (float, "scale"),
+        "detail": (float, "detail"),
+    },
+    "FROM unit JOIN pair USING (number) ORDER BY unit.rowid",
+)
+# All units of stage 2 in one job have the same regions; later jobs may have others.
+REGIONS = Query(
+    {
+        "pair": (str, "pair.id"),
+        "image": (int, "region.key"),
+        "left": (int, "json_extract(region.value, '$.box.left')"),
+        "top": (int, "json_extract(region.value, '$.box.top')"),
+        "right": (int, "json_extract(region.value, '$.box.right')"),
+        "bottom": (int, "json_extract(region.value, '$.box.bottom')"),
+        "reason": (str, "json_extract(region.value, '$.reason')"),
+        "clusters": (int, "json_extract(region.value, '$.clusters')"),
+        "kept": (int, "json_extract(region.value, '$.kept')"),
+    },
+    """
+    FROM
+        pair JOIN unit ON unit.rowid = (
+            SELECT min(rowid) FROM unit WHERE number = pair.number AND regions != '[]'
+        )
+        JOIN json_each(unit.regions) AS region
+    ORDER BY pair.number, region.key
+    """,
+)
+ESTIMATES = Query(
+    {
+        "pair": (str, "pair.id"),
+        "F": (object, "coalesce(estimate.F, :fallback)"),
+        "magsac": (object, "magsac"),
+        "rotation": (object, "coalesce(rotation, '[0.0, 0.0, 0.0]')"),
+    },
+    "FROM pair LEFT JOIN estimate ON estimate.key = pair.estimate ORDER BY pair.number",
+)
+# Identical files share a camera, and each has a row, in the order of the pairs. An image that has
+# changed since is known by its former name. Arrays are JSON, whose digits are exact.
+CAMERAS = Query(
+    {
+        "batch": (str, "used.key"),
+        "model": (int, "model.key"),
+        "image": (str, "coalesce(alike.name, json_extract(camera.value, '$.image.name'))"),
+        "width": (int, "json_extract(camera.value, '$.image.size[0]')"),
+        "height": (int, "json_extract(camera.value, '$.image.size[1]')"),
+        "points": (int, "json_extract(camera.value, '$.points')"),
+        "sigmas": (object, "json_extract(camera.value, '$.sigmas')"),
+        "K": (object, "json_extract(camera.value, '$.camera.K')"),
+        "R": (object, "json_extract(camera.value, '$.camera.R')"),
+        "t": (object, "json_extract(camera.value, '$.camera.t')"),
+        "camera_model": (str, "coalesce(json_extract(camera.value, '$.lens.model'), '')"),
+        "parameters": (object, "coalesce(json_extract(camera.value, '$.lens.parameters'), '[]')"),
+    },
+    """
+    FROM
+        run JOIN json_each(run.scenes) AS used JOIN scene ON scene.key = used.value
+        JOIN json_each(scene.models) AS model JOIN json_each(model.value, '$.images') AS camera
+        LEFT JOIN (
+            SELECT image.batch, content, image.name, min(position) AS position
+            FROM
+                (
+                    SELECT batch, image0 AS name, 2 * number AS position FROM pair
+                    UNION ALL SELECT batch, image1, 2 * number + 1 FROM pair
+                ) AS image JOIN file ON file.name = image.name
+            GROUP BY image.batch, image.name
+        ) AS alike
+            ON alike.batch = used.key
+            AND alike.content = json_extract(camera.value, '$.image.digest')
+    ORDER BY used.id, model.key, camera.key, alike.position
+    """,
+)
+SIGMAS = ["rotation_sigma", "centre_sigma", "focal_sigma"]
+EVENTS = Query(
+    {"kind": (str, "kind"), "seconds": (float, "seconds"), "text": (str, "text")},
+    "FROM event ORDER BY rowid",
+)
 
 
 class Results(NamedTuple):
@@ -91,116 +262,136 @@ class Results(NamedTuple):
     cameras: "DataFrame"
 
 
+class PairTables(NamedTuple):
+    """The pairs and units of :class:`Results`, and more about the pairs.
+
+    ``regions`` has the critical region of each image of a pair, numbers 0 and 1. ``estimates`` has a row for
+    each pair in the same order: its own F, from its matches alone, and MAGSAC's F before the prior, if any.
+    """
+
+    pairs: "DataFrame"
+    units: "DataFrame"
+    regions: "DataFrame"
+    estimates: "DataFrame"
+
+
 def results(directory: Path | str) -> Results:
     """Return the results in a work directory (NAME.work), during a run or after it.
 
     Raises :class:`UserError` if the store is missing, damaged, or of another format.
     """
     with Store.read(Path(directory)) as store:
-        table = Table.of(store)
-        records = read_records(store, table)
-        scenes = read_scenes(store, table)
-        digests = stored_digests(store, table.image_names)
+        with published_results(store) as database:
+            found = Results(_pairs(database), UNITS.frame(database), _cameras(database))
         store.warn_of_damage()
-    units = [_unit_row(record, unit) for record in records for unit in record.units]
-    names = names_by_content(table, digests)
-    return Results(
-        _frame([_pair_row(record) for record in records], PAIR_COLUMNS),
-        _frame(units, UNIT_COLUMNS),
-        _frame(list(_camera_rows(scenes.values(), names)), CAMERA_COLUMNS),
+    return found
+
+
+def pair_tables(store: Store, published: Published | None = None) -> PairTables:
+    """Return the tables of the pairs of a version, by default of the published one."""
+    with published_results(store, published) as database:
+        return tables_in(database)
+
+
+def tables_in(database: sqlite3.Connection) -> PairTables:
+    """Return the tables of the pairs in a database of :func:`published_results`."""
+    return PairTables(
+        _pairs(database),
+        UNITS.frame(database),
+        REGIONS.frame(database),
+        _estimates(database),
     )
 
 
-def names_by_content(
-    table: Table, digests: Mapping[str, str]
-) -> dict[tuple[str, str], dict[str, None]]:
-    """Return the names of the images of each batch and content, in the order of the table."""
-    names: dict[tuple[str, str], dict[str, None]] = {}
-    for row in table.rows:
-        for name in (row.image0, row.image1):
-            # A dictionary keeps the order, and a name once.
-            names.setdefault((row.batch, digests.get(name, "")), {})[name] = None
-    return names
+def events_of(store: Store) -> "DataFrame":
+    """Return all events of all sessions, in order."""
+    with database_of({Event: store.facts(Event)}) as database:
+        return EVENTS.frame(database)
 
 
-def _frame(rows: Sequence[Mapping[str, Any]], columns: Mapping[str, type]) -> "DataFrame":
-    from pandas import DataFrame, Series  # importing it takes half a second
+@contextmanager
+def published_results(
+    store: Store, published: Published | None = None
+) -> Iterator[sqlite3.Connection]:
+    """Yield a database in memory with the results that a version names, and nothing else.
 
-    if rows:
-        return DataFrame(rows, columns=list(columns))
-    return DataFrame({name: Series(dtype=kind) for name, kind in columns.items()})
-
-
-def _pair_row(record: PairRecord) -> dict[str, Any]:
-    row = {
-        "pair": record.pair.id,
-        "group": record.pair.group,
-        # Not the file names alone: two folders may have the same.
-        "image0": record.pair.file0,
-        "image1": record.pair.file1,
-        "failure": record.failure,
-        "source": record.source,
-        "matches": record.matches,
-        "inliers": record.inliers,
-        "overlaps": record.overlaps,
-        "support": record.stats.support,
-        "flat": record.is_flat,
-        "plane": record.stats.plane,
-        "focal0": record.stats.focals[0],
-        "focal1": record.stats.focals[1],
-        "model": record.model,
-    }
-    return row | dict(zip(ELEMENTS, record.chosen_fundamental.flat, strict=True))
+    Damaged rows of the file are missing there, and results that the file did not take are not.
+    """
+    version = Published.of(store) if published is None else published
+    rows = version.rows
+    with database_of(
+        {
+            PublishedRun: [LAYOUTS[PublishedRun].values(version.run)],
+            PublishedPair: map(LAYOUTS[PublishedPair].values, rows),
+            UnitPoints: store.facts(UnitPoints, [key for row in rows for key in row.points if key]),
+            PairEstimate: store.facts(PairEstimate, [row.estimate for row in rows if row.estimate]),
+            SceneRecord: store.facts(SceneRecord, version.run.scenes.values()),
+            ImageFile: store.facts(ImageFile, version.image_names),
+        }
+    ) as database:
+        yield database
 
 
-def _unit_row(record: PairRecord, unit: UnitRecord) -> dict[str, Any]:
-    return {
-        "pair": record.pair.id,
-        "unit": unit.unit,
-        "stage": unit.stage,
-        "matches": unit.matches,
-        "inliers": unit.inliers,
-        "encode_seconds": unit.encode_seconds,
-        "match_seconds": unit.match_seconds,
-        "failure": unit.failure,
-        "note": unit.note,
-        "keypoints": unit.keypoints,
-        "is_needed": unit.is_needed,
-        "scale": unit.scale,
-        "detail": unit.detail,
-    }
+@contextmanager
+def database_of(facts: Mapping[type, Iterable[tuple[Any, ...]]]) -> Iterator[sqlite3.Connection]:
+    """Yield a database in memory whose tables have these facts, as SQLite has them."""
+    with closing(connected(":memory:")) as database:
+        database.executescript(SCHEMA)
+        for kind, rows in facts.items():
+            layout = LAYOUTS[kind]
+            more = (b"",) * (1 + layout.has_data)
+            marks = ", ".join("?" * (len(layout.facts) + len(more)))
+            query = f"INSERT OR IGNORE INTO {layout.table} VALUES ({marks})"
+            database.executemany(query, ((*row, *more) for row in rows))
+        database.executescript(UNIT_TABLE)
+        yield database
 
 
-def _camera_rows(
-    scenes: Iterable[SceneRecord], names: Mapping[tuple[str, str], Iterable[str]]
-) -> Iterator[dict[str, Any]]:
-    for scene in scenes:
-        # Model 0 has the most images.
-        for number, model in enumerate(scene.models):
-            for found in model.images:
-                # An image that has changed since is known by its former name.
-                alike = names.get((scene.batch, found.image.digest), [found.image.name])
-                for name in alike:
-                    yield _camera_row(scene.batch, number, name, found)
+def matrices_of(pairs: "DataFrame") -> NDArray[np.float64]:
+    """Return the written matrices (N, 3, 3) of a table of pairs."""
+    return pairs[ELEMENTS].to_numpy(float).reshape(-1, 3, 3)
 
 
-def _camera_row(batch: str, model: int, name: str, found: RegisteredImage) -> dict[str, Any]:
-    sigmas = found.sigmas or UNKNOWN
-    return {
-        "batch": batch,
-        "model": model,
-        "image": name,
-        "width": found.image.size.width,
-        "height": found.image.size.height,
-        "focal": found.focal,
-        "points": found.points,
-        "rotation_sigma": sigmas.rotation,
-        "centre_sigma": sigmas.centre,
-        "focal_sigma": sigmas.focal,
-        "K": found.camera.K,
-        "R": found.camera.R,
-        "t": found.camera.t,
-        # COLMAP's, with (0.5, 0.5) in the centre of the first pixel: K has no distortion.
-        "camera_model": "" if found.lens is None else found.lens.model,
-        "parameters": () if found.lens is None else found.lens.parameters,
-    }
+def by_pair(rows: "DataFrame") -> dict[str, "DataFrame"]:
+    """Return the rows of each pair in a table of units or of regions, by the pair's id."""
+    return {str(pair): members for pair, members in rows.groupby("pair", sort=False)}
+
+
+def _pairs(database: sqlite3.Connection) -> "DataFrame":
+    from pandas import DataFrame, concat
+
+    frame = PAIRS.frame(database)
+    number = list(frame.columns).index("F")
+    data = b"".join(frame["F"])
+    elements = DataFrame(np.frombuffer(data).reshape(-1, 9), columns=ELEMENTS, index=frame.index)
+    return concat([frame.iloc[:, :number], elements, frame.iloc[:, number + 1 :]], axis=1)
+
+
+def _estimates(database: sqlite3.Connection) -> "DataFrame":
+    frame = ESTIMATES.frame(database)
+    for name in ("F", "magsac"):
+        frame[name] = _objects(frame[name], lambda data: data and np.frombuffer(data).reshape(3, 3))
+    frame["rotation"] = _objects(frame["rotation"], json.loads)
+    return frame
+
+
+def _cameras(database: sqlite3.Connection) -> "DataFrame":
+    frame = CAMERAS.frame(database)
+    for name in ("K", "R", "t"):
+        frame[name] = _objects(frame[name], lambda text: np.array(json.loads(text), float))
+    frame["parameters"] = _objects(frame["parameters"], lambda text: tuple(json.loads(text)))
+    # pandas treats NaN as missing.
+    sigmas = [json.loads(text) or (np.nan,) * len(SIGMAS) for text in frame.pop("sigmas")]
+    before = list(frame.columns).index("K")
+    for number, name in enumerate(SIGMAS):
+        frame.insert(before + number, name, np.array([each[number] for each in sigmas], float))
+    frame.insert(5, "focal", np.array([K[0, 0] for K in frame["K"]], float))
+    return frame
+
+
+def _objects(column: Iterable[Any], convert: Any) -> "Any":
+    """Return a column of converted values, which may be arrays."""
+    from pandas import Series
+
+    values = list(map(convert, column))
+    return Series(values, dtype=object)

@@ -8,16 +8,14 @@ image returns its digest.
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from mkpc_kaggle.data.images import content_digest
-from mkpc_kaggle.engine.store.codec import IMAGE
-from mkpc_kaggle.engine.store.tables import Kind, Result, Store
+from mkpc_kaggle.engine.store.database import Store
+from mkpc_kaggle.engine.store.tables import ImageContent, ImageFile
+from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.scene.view_graph import BatchImage
 
-# Prefixes of keys. Facts have the content's digest, since a file's name may get another content.
-FILE = "image "
-CONTENT = "content "
 HASH_THREADS = 4  # a network disk answers several reads at a time
 CHECK_S = 0.2  # between checks whether the time is over
 
@@ -44,16 +42,16 @@ def file_state(path: Path) -> tuple[int, int]:
 
 def update_digests(store: Store, files: Mapping[str, Path], is_over: Callable[[], bool]) -> Digests:
     """Digest the known files whose size or time has changed, and store the new digests."""
-    stored = _stored_files(store, files)
+    stored = store.get(ImageFile, files)
     touched: dict[str, tuple[int, int]] = {}
-    for name, facts in stored.items():
+    for name, file in stored.items():
         now = file_state(files[name])
         # A missing file keeps its results: perhaps nothing must be matched.
-        if any(now) and now != tuple(facts["file"]):
+        if any(now) and now != file.state:
             touched[name] = now
     computed = digest_files({name: files[name] for name in touched}, is_over)
-    store.put(file_result(name, digest, touched[name]) for name, digest in computed.items())
-    digests = {name: facts["digest"] for name, facts in stored.items()}
+    store.put(ImageFile(name, digest, *touched[name]) for name, digest in computed.items())
+    digests = {name: file.content for name, file in stored.items()}
     changed = {name for name, digest in computed.items() if digest != digests[name]}
     return Digests(digests | computed, changed)
 
@@ -65,17 +63,17 @@ def current_digests(
 
     Stored digests of unchanged files are used; those of new files are stored.
     """
-    stored = _stored_files(store, files)
+    stored = store.get(ImageFile, files)
     states = {name: file_state(path) for name, path in files.items()}
     current = {
-        name: facts["digest"]
-        for name, facts in stored.items()
-        if any(states[name]) and states[name] == tuple(facts["file"])
+        name: file.content
+        for name, file in stored.items()
+        if any(states[name]) and states[name] == file.state
     }
     computed = digest_files({n: path for n, path in files.items() if n not in current}, is_over)
     # Of a file that has changed, :func:`update_digests` must still find the former digest.
     new = [name for name in computed if name not in stored]
-    store.put(file_result(name, computed[name], states[name]) for name in new)
+    store.put(ImageFile(name, computed[name], *states[name]) for name in new)
     return current | computed
 
 
@@ -98,34 +96,28 @@ def digest_files(files: Mapping[str, Path], is_over: Callable[[], bool]) -> dict
 
 def stored_digests(store: Store, names: Iterable[str]) -> dict[str, str]:
     """Return the stored digests of these files' contents, by name."""
-    return {name: facts["digest"] for name, facts in _stored_files(store, names).items()}
-
-
-def _stored_files(store: Store, names: Iterable[str]) -> dict[str, dict[str, Any]]:
-    about = store.about(FILE + name for name in names)
-    return {key.removeprefix(FILE): facts for key, facts in about.items()}
+    return {name: file.content for name, file in store.get(ImageFile, names).items()}
 
 
 def known_images(store: Store, digests: Mapping[str, str]) -> dict[str, BatchImage]:
     """Return the images whose contents have stored facts, by name."""
-    about = store.about(CONTENT + digest for digest in digests.values())
-    images = {}
-    for name, digest in digests.items():
-        if facts := about.get(CONTENT + digest):
-            # Files with equal contents share their facts, but not their names.
-            images[name] = IMAGE.of_json({**facts, "name": name})
-    return images
+    contents = store.get(ImageContent, digests.values())
+    return {
+        # Files with equal contents share their facts, but not their names.
+        name: BatchImage(name, digest, Size(facts.width, facts.height), facts.focal)
+        for name, digest in digests.items()
+        if (facts := contents.get(digest)) is not None
+    }
 
 
-def image_results(image: BatchImage, file: tuple[int, int]) -> list[Result]:
-    """Return the digest of an image's file, and the facts about its content, as rows of the store."""
-    content = Result(CONTENT + image.digest, Kind.IMAGE, IMAGE.to_json(image))
-    return [file_result(image.name, image.digest, file), content]
-
-
-def file_result(name: str, digest: str, file: tuple[int, int]) -> Result:
-    """Return a file's digest, with its :func:`file_state`, as a row of the store."""
-    return Result(FILE + name, Kind.IMAGE, {"digest": digest, "file": list(file)})
+def image_rows(image: BatchImage, file: tuple[int, int]) -> list[ImageFile | ImageContent]:
+    """Return the digest of an image's file, with its :func:`file_state`, and the facts about its
+    content.
+    """
+    return [
+        ImageFile(image.name, image.digest, *file),
+        ImageContent(image.digest, image.size.width, image.size.height, image.focal),
+    ]
 
 
 def contents_of(images: Sequence[BatchImage], turns: Sequence[int]) -> str:
