@@ -4,12 +4,9 @@ import sqlite3
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-import numpy as np
-
 from mkpc_kaggle.engine.jobs import Cause, Estimated, EstimateJob, Failure, FeatureJob, Found
 from mkpc_kaggle.engine.plan.blame import Tries
 from mkpc_kaggle.engine.plan.budget import ESTIMATE
-from mkpc_kaggle.engine.plan.schedule import lacking_estimates
 from mkpc_kaggle.engine.run import HANG_FACTOR, Run
 from mkpc_kaggle.engine.store.database import Source, Store
 from mkpc_kaggle.engine.store.tables import Feature, PairEstimate
@@ -50,13 +47,8 @@ class Estimating:
         chosen = [due[0]]
         if others and (is_trial or due[0] not in alone):
             chosen = others[:MAX_PAIRS]
-        begun: list[int] = []
-        for index in chosen:
-            # One estimate serves all rows with the same images.
-            if not state.estimating[index]:
-                state.begin(state.estimating, [index])
-                begun.append(index)
-        pairs = tuple(state.inputs_of(index) for index in begun)
+        state.begin_estimates(chosen)
+        pairs = tuple(state.inputs_of(index) for index in chosen)
         recipe = state.request.recipe
         try:
             # A worker that opened the store by its path would depend on where the path leads now.
@@ -67,7 +59,7 @@ class Estimating:
             self.lose(EstimateJob(pairs, recipe, Source(None, {})), failure)
             return None
         if source is None:
-            state.end(state.estimating, begun)
+            state.end_estimates(chosen)
             return None
         return EstimateJob(pairs, recipe, source)
 
@@ -87,41 +79,23 @@ class Estimating:
             key = state.request.keys.of_estimate(state.pairs[pair.index], estimated.points)
             results.append(_estimate(key, estimated))
         run.store.put(results)
-        state.end(state.estimating, (pair.index for pair in job.pairs))
+        state.end_estimates(pair.index for pair in job.pairs)
         for pair, estimated, result in zip(job.pairs, answer, results, strict=True):
-            self._use(pair.index, result)
-            for row in state.alike(pair.index):
-                state.lost_estimates.pop(row, None)
+            state.use_new_estimate(pair.index, result)
             run.costs.observe(ESTIMATE, estimated.seconds)
         run.log.estimated += len(answer)
         # While pairs are matched, the bar shows those.
         if not state.matching.any():
             total = int(state.has[: state.rows].any(1).sum())
-            pending = int(lacking_estimates(state).sum())
+            pending = int(state.lacks_estimate.sum())
             run.progress.count("estimate", total - pending, total)
-
-    def _use(self, index: int, estimate: PairEstimate) -> None:
-        """Use an estimate, even if its pair has newer points meanwhile: the former estimate is
-        older still.
-        """
-        state = self._run.state
-        for each in state.alike(index):
-            # Without points, an image has changed since, and the estimate belongs to its former
-            # content.
-            if state.has[each].any():
-                state.use_estimate(each, estimate)
-                state.estimated[each] = state.estimate_key(each) == estimate.key
-                state.note_change(each)
 
     def lose(self, job: EstimateJob, failure: Failure) -> None:
         run = self._run
         state = run.state
         indices = [pair.index for pair in job.pairs]
-        state.end(state.estimating, indices)
-        for index in indices:
-            for each in state.alike(index):
-                state.lost_estimates[each] = failure
-                state.changed.add(each)
+        state.end_estimates(indices)
+        state.lose_estimates(indices, failure)
         tries = state.tries
         if ("estimate", indices[0]) in tries.given_up:
             self.give_up(indices[0])
@@ -135,17 +109,13 @@ class Estimating:
         state = run.state
         nowhere = Failure(Cause.NOT_STARTED, "no worker estimates any more")
         failure = state.lost_estimates.get(index, nowhere)
-        given_up = state.tries.given_up
-        given_up["estimate elsewhere", index] = failure
+        state.give_up(("estimate elsewhere", index), failure)
         run.log.explain(f"pair {index} keeps the F it has: {failure}")
         # Estimates that never succeed would cost three processes for each pair.
-        lost = sum(item[0] == "estimate elsewhere" for item in given_up)
+        lost = sum(item[0] == "estimate elsewhere" for item in state.tries.given_up)
         if lost < MAX_FAILED_ESTIMATES or run.log.estimated:
             return
-        for each in np.flatnonzero(lacking_estimates(state)).tolist():
-            state.lost_estimates.setdefault(each, failure)
-            state.changed.add(each)
-        given_up["estimates",] = failure
+        state.give_up_estimates(failure)
         run.log.explain(f"no pair is estimated any more: {failure}")
 
 

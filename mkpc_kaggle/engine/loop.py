@@ -10,6 +10,7 @@ import sys
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from math import inf
 from pathlib import Path
 from typing import Any, Self
@@ -143,6 +144,8 @@ class Engine:
         """Compute the missing results of a request. No job begins after ``share`` of the remaining
         time.
         """
+        # For the report: an interrupted program has two seconds for it, and the import takes one.
+        import_module("pandas")
         state = State(request, extra_pairs_of(request.pairs, request.recipe.scene))
         if damaged := len(self.store.damaged):
             # They are missing now, like results that never were.
@@ -391,7 +394,6 @@ class Engine:
                 self._give(place, self._features.next(), now)
             elif due and asked is not None:
                 self._give(place, asked.estimating.job(due, is_trial=bool(place.lost)), now)
-                # The job's pairs, and the rows with the same images
                 due = [index for index in due if not asked.state.estimating[index]]
         return len(self._features.pending) + len(due)
 

@@ -62,9 +62,7 @@ class Matching:
         """
         state = self._run.state
         if not plan.is_check:
-            state.begin(state.matching, plan.indices)
-            if plan.phase is Phase.FILL:
-                state.begin(state.filling, plan.indices)
+            state.begin_matching(plan.indices, is_filling=plan.phase is Phase.FILL)
         # Units of stage 1 look at whole images and need no points.
         stage_1: list[tuple[UnitResult, ...]] = [()] * len(plan.indices)
         crops: list[tuple[str, ...]] = [()] * len(plan.indices)
@@ -82,7 +80,7 @@ class Matching:
                 if plan.is_check:
                     state.tries.discard_proven(plan.items)
                 else:
-                    self._end(plan)
+                    state.end_matching(plan.indices)
                 return None
             stage_1 = [self._points_of(index, keys, data) for index, keys in inputs]
         upcoming: list[int] = []
@@ -139,7 +137,7 @@ class Matching:
         ]
         # First the store, in one transaction: results in the state are never lost.
         run.store.put(result for rows in results for result in rows)
-        self._end(job)
+        run.state.end_matching(job.indices)
         for index, outcome, rows in zip(job.indices, answer, results, strict=True):
             self._use(index, outcome, rows)
             for unit_result in outcome.results:
@@ -210,25 +208,17 @@ class Matching:
         return results
 
     def _use(self, index: int, outcome: Outcome, results: Sequence[Any]) -> None:
-        """Use the points of an answer, on all rows with the same images."""
+        """Use the points of an answer."""
         state = self._run.state
         points = [result for result in results if isinstance(result, UnitPoints)]
-        before = state.keys_in_use(index)
-        for row in state.alike(index):
-            # An unreadable image stays unreadable in this run, and a matcher that raised raises again.
-            if outcome.failure:
-                state.give_up(("pair", row), Failure(Cause.UNREADABLE, outcome.failure))
-            for unit_result in outcome.results:
-                if unit_result.failure:
-                    failure = Failure(Cause.UNIT_RAISED, unit_result.failure)
-                    state.give_up(("unit", row, unit_result.unit.name), failure)
-            for result in points:
-                state.use_points(row, state.number_of[result.unit], result)
-            # Units that the pair does not need change nothing.
-            if state.keys_in_use(row) != before:
-                state.note_points(row)
-            elif points:
-                state.changed.add(row)
+        # An unreadable image stays unreadable in this run, and a matcher that raised raises again.
+        if outcome.failure:
+            state.give_up(("pair", index), Failure(Cause.UNREADABLE, outcome.failure))
+        for unit_result in outcome.results:
+            if unit_result.failure:
+                failure = Failure(Cause.UNIT_RAISED, unit_result.failure)
+                state.give_up(("unit", index, unit_result.unit.name), failure)
+        state.use_new_points(index, points)
 
     def lose(self, job: MatchPlan, failure: Failure) -> None:
         run = self._run
@@ -237,7 +227,7 @@ class Matching:
             # The next check is of another item: the points of this one may be unreadable.
             state.tries.discard_proven(job.items)
             return
-        self._end(job)
+        state.end_matching(job.indices)
         if not state.tries.lose(job.items, failure):
             return
         # Only a single item is given up.
@@ -258,11 +248,6 @@ class Matching:
             return False
         # The first pairs may be bad. A unit that fails where other units ran is not.
         return bool(state.has[pairs].any()) or not state.has.any()
-
-    def _end(self, job: MatchPlan) -> None:
-        state = self._run.state
-        state.end(state.matching, job.indices)
-        state.end(state.filling, job.indices)
 
 
 def _points(key: str, found: UnitResult, outcome: Outcome, units: int) -> UnitPoints:

@@ -3,6 +3,8 @@
 import threading
 from dataclasses import replace
 
+import numpy as np
+
 from mkpc_kaggle.engine.jobs import Cause, Failure
 from mkpc_kaggle.engine.plan.budget import Budget
 from mkpc_kaggle.engine.plan.state import SOURCES, State
@@ -29,7 +31,13 @@ class Publication:
         self._lock = threading.Lock()
         self._has_ended = False
         self._published = budget.clock()
-        self._rows: dict[int, PublishedPair] = {}  # by index
+        self._rows: dict[int, PublishedPair] = {}  # by number
+        # The numbers of each pair's rows. An extra pair has one after those of the request.
+        extra = np.arange(len(state.pairs) - state.rows) + len(state.pair_of_row)
+        self._numbers: list[list[int]] = [[] for _ in range(state.rows)]
+        for number, index in enumerate(state.pair_of_row):
+            self._numbers[index].append(number)
+        self._numbers += [[number] for number in extra.tolist()]
         self.unwritten = ""  # why the latest version could not be written
 
     def is_due(self, now: float) -> bool:
@@ -85,8 +93,8 @@ class Publication:
         return PublishedRun(
             about=state.request.about,
             units=[(unit.name, unit.stage) for unit in state.units],
-            rows=state.rows,
-            pairs=len(state.pairs),
+            rows=len(state.pair_of_row),
+            pairs=len(state.pair_of_row) + len(state.pairs) - state.rows,
             scenes={batch: scene.key for batch, scene in state.scenes.items()},
             rivals=state.rivals,
         )
@@ -97,14 +105,20 @@ class Publication:
         sources = state.sources
         fundamentals = state.fundamentals
         changed = []
-        for index in state.changed:
+        for index in state.take_changed():
             row = _row(state, index)
-            # An extra pair has no row in the submission, and so no written F.
-            if index < state.rows:
-                row = replace(row, source=SOURCES[sources[index]], F=fundamentals[index])
-            changed.append(row)
-            self._rows[index] = row
-        state.changed.clear()
+            for number in self._numbers[index]:
+                row = replace(row, number=number)
+                # An extra pair has no row in the submission, and so no written F.
+                if index < state.rows:
+                    row = replace(
+                        row,
+                        id=state.request.pairs[number].id,
+                        source=SOURCES[sources[number]],
+                        F=fundamentals[number],
+                    )
+                changed.append(row)
+                self._rows[number] = row
         return changed
 
 

@@ -24,7 +24,7 @@ def restore(state: State, store: Store, digests: Mapping[str, str]) -> None:
 
     ``digests`` are the known digests of the images' contents, by name.
     """
-    state.images = known_images(store, digests)
+    state.use_images(known_images(store, digests))
     former = Published.of(store)
     # By contents and not by id: another test set may name the same two images.
     rows = {row.contents: row for row in former.pairs if row.contents}
@@ -93,8 +93,7 @@ def _restore_points(
         # Points of former settings are better than none.
         used = stored[0] if stored else former.get((index, number), "")
         if used in points:
-            state.use_points(index, number, points[used])
-            state.current[index, number] = is_current
+            state.use_points(index, points[used], is_current=is_current)
 
 
 def _restore_estimates(
@@ -108,7 +107,6 @@ def _restore_estimates(
     former = {index: row.estimate for index, row in old.items() if row.estimate}
     estimates = store.get(PairEstimate, [*today.values(), *former.values()])
     for index, key in today.items():
-        state.estimated[index] = key in estimates
         # As long as the images are the same, the former F is better than the fallback.
         used = key if key in estimates else former.get(index, "")
         if used in estimates:
@@ -139,7 +137,7 @@ def _restore_scenes(
             continue
         # Before the candidates: the scene whose COLMAP files exist is used.
         if batch in state.request.exports:
-            state.filed[batch] = marks[batch].scene if batch in marks else ""
+            state.note_files(batch, marks[batch].scene if batch in marks else "")
         state.use_candidate(batch, scene)
         for other in others[batch].values():
             if other in scenes:
@@ -150,8 +148,7 @@ def _restore_scenes(
             has_mark = state.filed[batch] == used_scene.key
             if not (has_mark and has_files(directory.path, len(used_scene.models))):
                 continue
-        state.stale.discard(batch)
-        state.try_others(batch)
+        state.settle(batch)
 
 
 def _has_images(scene: SceneRecord, digests: Mapping[str, str]) -> bool:

@@ -32,19 +32,13 @@ class SceneWork:
         pairs = tuple(state.inputs_of(index) for index in indices)
         source = run.source(pairs)
         if source is None:
-            state.reconstructing.discard(batch)
+            state.end_scene(batch, candidate)
             return None
         folder = state.request.exports.get(batch)
-        export = None
-        if candidate == ALL_UNITS:
-            # Not removed from the stale batches yet: the job may be lost.
-            state.reconstructing.add(batch)
-            export = folder
-        else:
-            state.trying.add((batch, candidate))
-            # The best one is made again, for its files.
-            if candidate in state.made[batch]:
-                export = folder
+        state.begin_scene(batch, candidate)
+        # The first candidate has files, until the best one is made again for its own.
+        has_files = candidate == ALL_UNITS or candidate in state.made[batch]
+        export = folder if has_files else None
         if export is not None:
             # From now on the files may be replaced, so they belong to no stored scene.
             run.store.remove(Export, batch)
@@ -105,18 +99,8 @@ class SceneWork:
         run.costs.observe_scene(job.matches, seconds)
         text = f"{record.registered} of {plural(record.images, 'image')}"
         more = ""  # about a further candidate
-        if job.export is not None:
-            state.filed[job.batch] = job.key
-        if job.candidate == ALL_UNITS:
-            state.reconstructing.discard(job.batch)
-            state.use_candidate(job.batch, record)
-            # Otherwise pairs have got other results meanwhile, and the batch stays stale.
-            if state.scene_inputs(job.batch)[1] == job.key:
-                state.stale.discard(job.batch)
-                state.try_others(job.batch)
-        else:
-            state.trying.discard((job.batch, job.candidate))
-            is_best = self._use_other(job, record)
+        is_best = state.use_new_scene(job.batch, job.scene, record, is_filed=job.export is not None)
+        if job.candidate != ALL_UNITS:
             outcome = "the best so far" if is_best else "not better"
             more = f" by the tracks of {title_of(job.candidate)}, {outcome}"
         run.log.note(EventKind.SCENE, f"{job.batch}: {text}{more}")
@@ -125,47 +109,19 @@ class SceneWork:
             note += f", {record.loose} of them unknown to within the size of their model"
         run.progress.note(note)
 
-    def _use_other(self, job: SceneJob, record: SceneRecord) -> bool:
-        """Use a candidate other than the first. Return whether it is the best one so far."""
-        state = self._run.state
-        if not self._is_of_today(job):
-            return False
-        state.use_candidate(job.batch, record)
-        state.try_others(job.batch)
-        return state.best_candidate(job.batch) == job.candidate
-
-    def _is_of_today(self, job: SceneJob) -> bool:
-        """Return whether the first candidate is from the same results as a job, and today's."""
-        state = self._run.state
-        made = state.made.get(job.batch, {})
-        is_same = ALL_UNITS in made and made[ALL_UNITS].key == job.scene
-        return is_same and job.batch not in state.stale
-
     def lose(self, job: SceneJob, failure: Failure) -> None:
         run = self._run
         state = run.state
+        tracks = ""
         if job.candidate != ALL_UNITS:
-            self._lose_candidate(job, failure)
-            return
-        run.log.fault(f"batch {job.batch} was not reconstructed: {failure}")
-        state.reconstructing.discard(job.batch)
+            tracks = f" from the tracks of {title_of(job.candidate)}"
+        run.log.fault(f"batch {job.batch} was not reconstructed{tracks}: {failure}")
+        state.end_scene(job.batch, job.candidate)
         # Its worker reads the store by itself. Another program may have damaged it.
         if run.forget_lost_points(job.pairs):
             return
         if state.tries.lose([("scene", job.batch, job.key)], failure):
-            # The batch becomes stale again when its inputs change.
-            state.stale.discard(job.batch)
-
-    def _lose_candidate(self, job: SceneJob, failure: Failure) -> None:
-        state = self._run.state
-        tracks = f"the tracks of {title_of(job.candidate)}"
-        self._run.log.fault(f"batch {job.batch} was not reconstructed from {tracks}: {failure}")
-        state.trying.discard((job.batch, job.candidate))
-        if self._run.forget_lost_points(job.pairs):
-            return
-        is_given_up = state.tries.lose([("scene", job.batch, job.key)], failure)
-        if is_given_up and self._is_of_today(job):
-            state.try_others(job.batch)
+            state.give_up_scene(job.batch, job.candidate, job.scene)
 
 
 def scene_records(state: State) -> tuple[SceneRecord, ...]:

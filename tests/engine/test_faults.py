@@ -311,10 +311,10 @@ from pathlib import Path
 from rectified import THREE_UNITS, RectifiedMatcher, run, write_pairs
 from mkpc_kaggle.engine.plan.budget import Budget
 from mkpc_kaggle.engine.workers.places import LocalSite
-from mkpc_kaggle.engine.light import Estimating
+from mkpc_kaggle.engine.plan.state import State
 
 budget = Budget(time.monotonic(), 1000.0)
-wait, use, saved = LocalSite.wait, Estimating._use, []
+wait, use, saved = LocalSite.wait, State.use_new_estimate, []
 def noted(self, *estimate):
     use(self, *estimate)
     saved.append(estimate)
@@ -323,7 +323,7 @@ def stuck(self, until):
         return wait(self, until)
     budget.time_limit = budget.spent() + 1
     time.sleep(1000)
-Estimating._use, LocalSite.wait = noted, stuck
+State.use_new_estimate, LocalSite.wait = noted, stuck
 home = Path(sys.argv[1])
 pairs = write_pairs(home / "pairs", 40)
 def publish(state):

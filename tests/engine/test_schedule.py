@@ -42,7 +42,7 @@ from mkpc_kaggle.engine.scenes import scene_failures
 from mkpc_kaggle.engine.store.database import Store
 from mkpc_kaggle.engine.store.dataframes import matrices_of
 from mkpc_kaggle.engine.store.keys import Keys
-from mkpc_kaggle.engine.store.tables import Layout
+from mkpc_kaggle.engine.store.layout import Layout
 from mkpc_kaggle.recipe import SceneConfig, Unit
 from mkpc_kaggle.scene.choose import Choice, Reason
 from mkpc_kaggle.scene.sfm import Solution
@@ -97,12 +97,12 @@ class Run:
         """The next job of matching, which is under way then."""
         job = self.next_work(now).match
         if job is not None:
-            self.state.begin(self.state.matching, job.indices)
+            self.state.begin_matching(job.indices)
         return job
 
     def finish(self, job: MatchJob, inliers: Callable[[int], int] = lambda _: 50) -> float:
         """Every unit of a job took a second. Return the seconds of the job."""
-        self.state.end(self.state.matching, job.indices)
+        self.state.end_matching(job.indices)
         for index in job.indices:
             self.have(index, job.units)
             self.state.inliers[index] = inliers(index)
@@ -351,7 +351,7 @@ def test_a_first_scene_does_not_wait_for_a_job_that_hangs_until_the_end():
         run.state.matches[index] = 50
     run.state.estimated[:] = run.state.has_own[:] = True
     run.learn(*UNITS)
-    run.state.begin(run.state.matching, [5])
+    run.state.begin_matching([5])
     stop = view_of(run).stop
     assert run.next_work(stop - 1.0).scenes == ()
     assert run.next_work(stop).scenes == ("",)

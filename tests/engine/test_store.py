@@ -347,10 +347,18 @@ def test_rows_of_the_same_images_share_their_points_and_turned_images_are_others
 ) -> None:
     pairs = [pair_of(0), pair_of(1), replace(pair_of(0), id="again")]
     room.ask(pairs=pairs)
-    room.state.begin(room.state.matching, [0])
-    assert room.state.matching.tolist() == [True, False, True]
+    assert len(room.state.pairs) == 2
     room.match(0, SWEEP)
-    assert room.state.current[:, 0].tolist() == [True, False, True]
+    room.estimate(0)
+    assert [np.array_equal(written, F) for written in room.state.fundamentals] == [
+        True,
+        False,
+        True,
+    ]
+    room.publish()
+    rows = pair_tables(room.store).pairs
+    assert rows["pair"].tolist() == ["p0", "p1", "again"]
+    assert rows["source"].tolist() == ["pair", "fallback", "pair"]
     room.ask(pairs=[replace(pairs[0], turns=(1, 0))])
     assert not room.state.current.any()
 

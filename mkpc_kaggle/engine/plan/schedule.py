@@ -319,7 +319,7 @@ def trial_plan(
     # No unit of such a pair: without points of stage 1, a crop is the whole image, on which the same
     # matcher fails in the same way.
     for index in suspect_pairs(state):
-        others[state.alike(index)] = NEVER
+        others[index] = NEVER
     phase = Phase(int(others.min(initial=NEVER)))
     tried = frozenset[Item]().union(*lost)
     proven = [item for item in state.tries.proven if item not in tried]
@@ -398,22 +398,9 @@ def estimates_due(snapshot: Snapshot, first: NDArray[Any]) -> NDArray[Any]:
     # A settled pair gets no other unit soon. A pair without an F is estimated at once: any F is better
     # than the fallback.
     is_settled = (first >= FILL) & ~state.matching
-    due = lacking_estimates(state) & ~state.estimating & (is_settled | ~state.has_own)
+    due = state.lacks_estimate & ~state.estimating & (is_settled | ~state.has_own)
     order = state.order[due[state.order]]
     return np.asarray(order[np.argsort(state.has_own[order], kind="stable")])
-
-
-def lacking_estimates(state: State) -> Mask:
-    """Return an (N,) mask of the rows whose estimate is not from the points in use."""
-    lacking = state.has.any(1) & ~state.estimated
-    lacking[state.rows :] = False  # extra pairs are for scenes alone
-    for item in state.tries.given_up:
-        match item:
-            case ("estimate elsewhere", int(index)):
-                lacking[index] = False
-            case ("estimates",):
-                lacking[:] = False
-    return np.asarray(lacking)
 
 
 def scenes_due(
@@ -541,7 +528,7 @@ def waiting_batches(state: State, crew: Crew) -> list[str]:
 
 def estimates_reserve(snapshot: Snapshot) -> float:
     """Return the expected seconds of the pending estimates."""
-    count = int(lacking_estimates(snapshot.state).sum())
+    count = int(snapshot.state.lacks_estimate.sum())
     return snapshot.costs.mean(ESTIMATE) * count / snapshot.crew.estimators
 
 
@@ -560,7 +547,7 @@ def scenes_reserve(snapshot: Snapshot) -> float:
 
 def is_complete(state: State, crew: Crew) -> bool:
     """Whether all rows have all results that this run can compute, and so do all batches."""
-    if state.missing[: state.rows].any() or lacking_estimates(state).any():
+    if state.missing[: state.rows].any() or state.lacks_estimate.any():
         return False
     has_untried = crew.scenes and any(state.untried.values())
     return not waiting_batches(state, crew) and not has_untried

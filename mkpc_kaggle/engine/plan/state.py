@@ -6,7 +6,7 @@ unit looks at crops that come from the pair's stage-1 points: new points of stag
 and its points are computed again.
 """
 
-from collections.abc import Iterable, Iterator, Sequence, Set
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from pathlib import Path
 from typing import Any
 
@@ -35,8 +35,9 @@ SOURCES = ("fallback", "pair", "scene")
 
 
 class State:
-    """Arrays for N pairs and the U units of a recipe, in their order. The first ``rows`` pairs have
-    a row; the ``extra`` pairs after them are for scenes alone.
+    """Arrays for N distinct pairs and the U units of a recipe, in their order. The first ``rows`` pairs
+    have a row in the request, or several: ``pair_of_row`` has the pair of each. The ``extra`` pairs
+    after them are for scenes alone.
 
     Of a pair's units (N, U): ``points``, the keys of the points in use, "" if none; ``has``, there are some;
     ``current``, they are today's; ``matches``, their number; ``skipped``, this run tries the unit no more;
@@ -59,8 +60,9 @@ class State:
 
     def __init__(self, request: Request, extra: Sequence[Pair] = ()) -> None:
         self.request = request
-        self.pairs = [*request.pairs, *extra]
-        self.rows = len(request.pairs)
+        distinct, self.pair_of_row = distinct_pairs(request.pairs)
+        self.pairs = [*distinct, *extra]
+        self.rows = len(distinct)
         self.units = request.recipe.units
         self.number_of = {unit.name: number for number, unit in enumerate(self.units)}
         self.is_crop = np.array([unit.stage == 2 for unit in self.units], bool)
@@ -72,7 +74,6 @@ class State:
         self.tries = Tries()
         self._start_pairs(len(self.pairs), len(self.units))
         self._start_batches()
-        self._twins = self._twins_of_pairs()
         self._pairs_of: dict[str, list[int]] = {}  # by the name of an image
         for index, names in enumerate(self.names):
             for name in dict.fromkeys(names):
@@ -121,26 +122,25 @@ class State:
         self.trying: set[tuple[str, str]] = set()
         self.filed: dict[str, str] = {}
 
-    def _twins_of_pairs(self) -> dict[int, list[int]]:
-        """Return the rows with the same two images, which share their points and their estimate."""
-        alike: dict[Any, list[int]] = {}
-        for index, pair in enumerate(self.pairs):
-            # With other intrinsics, another E is estimated.
-            known = pair.intrinsics and tuple(K.tobytes() for K in pair.intrinsics)
-            key = (self.names[index], pair.turns, known)
-            alike.setdefault(key, []).append(index)
-        twins = {}
-        for group in alike.values():
-            if len(group) > 1:
-                twins.update(dict.fromkeys(group, group))
-        return twins
-
     # Results in use
 
     @property
     def missing(self) -> Mask:
         """(N, U): today's points are missing, and this run can get them."""
         return np.asarray(~self.current & ~self.skipped)
+
+    @property
+    def lacks_estimate(self) -> Mask:
+        """(N,): the row's estimate is not from the points in use, and this run can get it."""
+        lacking = self.has.any(1) & ~self.estimated
+        lacking[self.rows :] = False  # extra pairs are for scenes alone
+        for item in self.tries.given_up:
+            match item:
+                case ("estimate elsewhere", int(index)):
+                    lacking[index] = False
+                case ("estimates",):
+                    lacking[:] = False
+        return np.asarray(lacking)
 
     @property
     def need_shares(self) -> NDArray[np.float64]:
@@ -154,18 +154,24 @@ class State:
 
     @property
     def fundamentals(self) -> NDArray[np.float64]:
-        """The F to write (rows, 3, 3): the scene's, else the pair's, else the fallback."""
+        """The F to write (R, 3, 3) for each row of the request: the scene's, else the pair's, else the
+        fallback.
+        """
         # A scene's F is more accurate: its cameras agree with all images of the batch.
         written = self.own[: self.rows].copy()
         chosen = self.scene_source[: self.rows] != FALLBACK
         written[chosen] = self.by_scene[: self.rows][chosen]
         # The last gate of the submission: the competition refuses a whole file for one matrix.
-        written[self.sources == FALLBACK] = FALLBACK_FUNDAMENTAL
-        return written
+        written[self._sources == FALLBACK] = FALLBACK_FUNDAMENTAL
+        return written[self.pair_of_row]
 
     @property
     def sources(self) -> NDArray[np.int_]:
-        """Where the F to write comes from (rows,)."""
+        """Where the F to write comes from (R,), for each row of the request."""
+        return self._sources[self.pair_of_row]
+
+    @property
+    def _sources(self) -> NDArray[np.int_]:
         own = np.where(self.has_own[: self.rows], PAIR, FALLBACK)
         sources = np.maximum(own, self.scene_source[: self.rows])
         by_scene = self.scene_source[: self.rows] != FALLBACK
@@ -307,17 +313,28 @@ class State:
 
     # Updates
 
-    def alike(self, index: int) -> list[int]:
-        """Return the rows with the same images as a pair, including itself."""
-        return self._twins.get(index, [index])
+    def use_images(self, images: Mapping[str, BatchImage]) -> None:
+        """Use the images whose contents are known at the start, by name."""
+        self.images.update(images)
 
-    def use_points(self, index: int, unit: int, points: UnitPoints) -> None:
+    def use_points(self, index: int, points: UnitPoints, *, is_current: bool = True) -> None:
         """Use a unit's points; none if the pair does not need the unit."""
+        unit = self.number_of[points.unit]
         self.points[index, unit] = points.key
         self.has[index, unit] = points.is_needed
         self.unneeded[index, unit] = not points.is_needed
-        self.current[index, unit] = True
+        self.current[index, unit] = is_current
         self.matches[index, unit] = points.matches
+        self.changed.add(index)
+
+    def use_new_points(self, index: int, found: Sequence[UnitPoints]) -> None:
+        """Use the points of an answer."""
+        before = self.keys_in_use(index)
+        for points in found:
+            self.use_points(index, points)
+        # Units that the pair does not need change nothing.
+        if self.keys_in_use(index) != before:
+            self._note_points(index)
 
     def forget_points(self, keys: Set[str]) -> None:
         """Forget the points with these keys: their units are missing again."""
@@ -328,15 +345,15 @@ class State:
             self.matches[index, lost] = 0
             self.has[index, lost] = False
             self.current[index, lost] = False
-            self.note_points(index)
+            self._note_points(index)
 
-    def note_points(self, index: int) -> None:
+    def _note_points(self, index: int) -> None:
         """Note that a pair has new points: its crops, its estimate and its scene may be outdated."""
-        self.check_crops(index)
+        self._check_crops(index)
         self.estimated[index] = False
-        self.note_change(index)
+        self._note_change(index)
 
-    def check_crops(self, index: int) -> None:
+    def _check_crops(self, index: int) -> None:
         """Mark the points of stage 2 whose crops come from other points of stage 1 than today's."""
         images = self.images_of(index)
         if not images:
@@ -367,14 +384,63 @@ class State:
         self.has_own[index] = False
         self.inliers[index] = 0
         self.scene_source[index] = FALLBACK
-        self.note_change(index)
+        self._note_change(index)
 
     def use_estimate(self, index: int, estimate: PairEstimate) -> None:
-        """Use an estimate."""
+        """Use an estimate. It is today's if it is from the points in use."""
         self.estimates[index] = estimate.key
+        self.estimated[index] = estimate.key == self.estimate_key(index)
         self.own[index] = estimate.F
         self.has_own[index] = not estimate.failure
         self.inliers[index] = sum(estimate.inliers.values())
+
+    def use_new_estimate(self, index: int, estimate: PairEstimate) -> None:
+        """Use the estimate of an answer, even if the pair has newer points meanwhile: the former
+        estimate is older still.
+        """
+        self.lost_estimates.pop(index, None)
+        # Without points, an image has changed since, and the estimate belongs to its former content.
+        if self.has[index].any():
+            self.use_estimate(index, estimate)
+            self._note_change(index)
+
+    def use_new_scene(
+        self, batch: str, scene: str, record: SceneRecord, *, is_filed: bool = False
+    ) -> bool:
+        """Use the scene of an answer, even if it is stale: the former scene is older still. Return
+        whether it is the best candidate.
+
+        A further candidate is used only if it is from the results in use, as the first one with the
+        key ``scene``. ``is_filed`` states that the batch's folder has its files.
+        """
+        if is_filed:
+            self.filed[batch] = record.key
+        self.end_scene(batch, record.candidate)
+        if record.candidate == ALL_UNITS:
+            self.use_candidate(batch, record)
+            # Otherwise pairs have got other results meanwhile, and the batch stays stale.
+            if self.scene_inputs(batch)[1] == record.key:
+                self.settle(batch)
+        elif self._is_of_today(batch, scene):
+            self.use_candidate(batch, record)
+            self._try_others(batch)
+        else:
+            return False
+        return self.best_candidate(batch) == record.candidate
+
+    def _is_of_today(self, batch: str, scene: str) -> bool:
+        """Return whether the first candidate is from the same results as ``scene``, and today's."""
+        first = self.made.get(batch, {}).get(ALL_UNITS)
+        return first is not None and first.key == scene and batch not in self.stale
+
+    def note_files(self, batch: str, key: str) -> None:
+        """Note that the batch's folder has the files of the scene with this key."""
+        self.filed[batch] = key
+
+    def settle(self, batch: str) -> None:
+        """Note that the scene of a batch is today's, and which other candidates are missing."""
+        self.stale.discard(batch)
+        self._try_others(batch)
 
     def use_candidate(self, batch: str, record: SceneRecord) -> None:
         """Use a candidate of a scene, if it is the best one so far.
@@ -398,7 +464,7 @@ class State:
         made = self.made[batch]
         return best_of({name: made[name].disagreement for name in self.candidates if name in made})
 
-    def try_others(self, batch: str) -> None:
+    def _try_others(self, batch: str) -> None:
         """Note which other candidates are missing: the first one is from today's results.
 
         With files, the best one is made again in the end, if its files are missing.
@@ -441,7 +507,7 @@ class State:
                 # F at the scene's focal lengths is still the pair's own.
                 self.scene_source[index] = SCENE if choice.from_scene else PAIR
 
-    def note_change(self, index: int) -> None:
+    def _note_change(self, index: int) -> None:
         """Note that a pair has other points, or another estimate, than before."""
         self.changed.add(index)
         if self.batch_of[index] >= 0:
@@ -450,16 +516,63 @@ class State:
             # Until the first candidate is made again
             self.untried.pop(batch, None)
 
+    def take_changed(self) -> list[int]:
+        """Return the pairs that have changed since the last call."""
+        changed = sorted(self.changed)
+        self.changed.clear()
+        return changed
+
     # Jobs and failures
 
-    def begin(self, under_way: Mask, indices: Iterable[int]) -> None:
-        """Mark the pairs of a job, and the rows with the same images, as ``under_way``."""
-        for index in indices:
-            under_way[self.alike(index)] = True
+    def begin_matching(self, indices: Iterable[int], *, is_filling: bool = False) -> None:
+        """Note the pairs of a job under way."""
+        self.matching[list(indices)] = True
+        if is_filling:
+            self.filling[list(indices)] = True
 
-    def end(self, under_way: Mask, indices: Iterable[int]) -> None:
+    def end_matching(self, indices: Iterable[int]) -> None:
+        self.matching[list(indices)] = False
+        self.filling[list(indices)] = False
+
+    def begin_estimates(self, indices: Iterable[int]) -> None:
+        self.estimating[list(indices)] = True
+
+    def end_estimates(self, indices: Iterable[int]) -> None:
+        self.estimating[list(indices)] = False
+
+    def begin_scene(self, batch: str, candidate: str) -> None:
+        """Note a candidate of a job under way. The batch stays stale: the job may be lost."""
+        if candidate == ALL_UNITS:
+            self.reconstructing.add(batch)
+        else:
+            self.trying.add((batch, candidate))
+
+    def end_scene(self, batch: str, candidate: str) -> None:
+        if candidate == ALL_UNITS:
+            self.reconstructing.discard(batch)
+        else:
+            self.trying.discard((batch, candidate))
+
+    def lose_estimates(self, indices: Iterable[int], failure: Failure) -> None:
+        """Note why the estimates of a job have no result."""
         for index in indices:
-            under_way[self.alike(index)] = False
+            self.lost_estimates[index] = failure
+            self.changed.add(index)
+
+    def give_up_estimates(self, failure: Failure) -> None:
+        """Estimate no pair any more in this run."""
+        for index in np.flatnonzero(self.lacks_estimate).tolist():
+            self.lost_estimates.setdefault(index, failure)
+            self.changed.add(index)
+        self.tries.given_up["estimates",] = failure
+
+    def give_up_scene(self, batch: str, candidate: str, scene: str) -> None:
+        """Try a candidate no more until the results of its batch change."""
+        if candidate == ALL_UNITS:
+            # The batch becomes stale again when its inputs change.
+            self.stale.discard(batch)
+        elif self._is_of_today(batch, scene):
+            self._try_others(batch)
 
     def give_up(self, item: tuple[Any, ...], failure: Failure) -> None:
         """Stop trying an item in this run. For the items see :mod:`mkpc_kaggle.engine.plan.blame`."""
@@ -467,10 +580,10 @@ class State:
         match item:
             case ("unit", index, unit):
                 self.changed.add(index)
-                self.skipped[self.alike(index), self.number_of[unit]] = True
+                self.skipped[index, self.number_of[unit]] = True
                 # A matcher that raised costs no worker.
                 if failure.cause is not Cause.UNIT_RAISED:
-                    self.costly[self.alike(index)] = True
+                    self.costly[index] = True
             case ("matcher", unit):
                 # For all pairs, but told once: no row of the table gets this reason.
                 self.skipped[:, self.number_of[unit]] = True
@@ -485,7 +598,7 @@ class State:
             match item:
                 case ("unit", int(index), str(unit)):
                     self.changed.add(index)
-                    self.costly[self.alike(index)] = False
+                    self.costly[index] = False
                     self._reconsider(unit)
         return len(taken_back)
 
@@ -502,7 +615,7 @@ class State:
         for item in given_up:
             match item:
                 case ("unit", int(index), name) if name == unit:
-                    self.skipped[self.alike(index), number] = True
+                    self.skipped[index, number] = True
                 case ("pair", int(index)):
                     self.skipped[index, number] = True
 
@@ -540,6 +653,25 @@ class State:
         """(U,): units that no worker can run."""
         given_up = self.tries.given_up
         return np.array([("matcher", unit.name) in given_up for unit in self.units], bool)
+
+
+def distinct_pairs(rows: Iterable[Pair]) -> tuple[list[Pair], NDArray[np.int_]]:
+    """Return the distinct pairs of a table, the first row of each, and the pair of each row.
+
+    Rows of a batch with the same two images are one pair: they share its points and its estimate.
+    """
+    pairs: list[Pair] = []
+    known: dict[Any, int] = {}
+    pair_of_row = []
+    for pair in rows:
+        # With other intrinsics, another E is estimated.
+        intrinsics = pair.intrinsics and tuple(K.tobytes() for K in pair.intrinsics)
+        key = (pair.group, pair.file0, pair.file1, pair.turns, intrinsics)
+        if key not in known:
+            known[key] = len(pairs)
+            pairs.append(pair)
+        pair_of_row.append(known[key])
+    return pairs, np.array(pair_of_row, int)
 
 
 def names_of(pair: Pair, root: str) -> tuple[str, str]:

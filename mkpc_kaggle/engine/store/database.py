@@ -21,11 +21,11 @@ from typing import Any, Self, TypeVar
 
 import numpy as np
 
-from mkpc_kaggle.engine.store.tables import LAYOUTS, PRUNED, SCHEMA, Layout, UnitPoints
+from mkpc_kaggle.engine.store.layout import Layout
+from mkpc_kaggle.engine.store.tables import LAYOUTS, PRUNED, SCHEMA, STORE_FORMAT, UnitPoints
 from mkpc_kaggle.errors import UserError, plural, printable, warn_once, writing
 from mkpc_kaggle.geometry.matches import Matches
 
-STORE_FORMAT = 22  # increase it when a kind of result is stored differently: nothing is converted
 FILE_NAME = "journal.sqlite"  # named in the documentation, and in scripts of users
 LOCK_NAME = "journal.lock"
 CHECKSUM_BYTES = 4  # of each part of a row: its facts, and its data if it has any
