@@ -8,6 +8,7 @@ import pytest
 import torch
 from numpy.testing import assert_allclose
 from pictures import as_picture, match_one
+from sklearn.datasets import load_sample_image
 from standin import scene
 
 from mkpc_kaggle.errors import UserError
@@ -99,3 +100,13 @@ def test_without_vismatch_its_matchers_cannot_be_used(monkeypatch):
     monkeypatch.setitem(sys.modules, "vismatch", None)
     with pytest.raises(UserError, match="cannot be used here: vismatch:master"):
         TwoStageMatcher(Recipe((Unit(1, "vismatch:master", 200),)))
+
+
+def test_a_genuine_matcher_of_vismatch_runs():
+    """On OpenCV's SIFT, which needs no weights."""
+    pytest.importorskip("vismatch", reason="vismatch is not installed")
+    image = load_sample_image("china.jpg")
+    recipe = Recipe((Unit(1, "vismatch:sift-nn", 640),))
+    match = TwoStageMatcher(recipe, device="cpu")(image, image)
+    assert match.estimate.inlier_count > 500
+    assert np.abs(match.inliers.points0 - match.inliers.points1).max() < 1
