@@ -9,7 +9,7 @@ from mkpc_kaggle.engine.plan.blame import Tries
 from mkpc_kaggle.engine.plan.budget import ESTIMATE
 from mkpc_kaggle.engine.run import HANG_FACTOR, Run
 from mkpc_kaggle.engine.store.database import Source, Store
-from mkpc_kaggle.engine.store.tables import Feature, PairEstimate
+from mkpc_kaggle.engine.store.tables import Feature, PairEstimate, UnitPoints
 
 # In a job. More pairs would make the last F of a run wait for each other; single pairs, each with a
 # message and a transaction, would cost the loop more.
@@ -56,7 +56,7 @@ class Estimating:
         except sqlite3.Error as error:  # a disk that fails
             failure = Failure(Cause.RAISED, f"the store cannot be read: {error}")
             run.log.fault(str(failure))
-            self.lose(EstimateJob(pairs, recipe, Source(None, {})), failure)
+            self.lose(EstimateJob(pairs, recipe, Source(UnitPoints)), failure)
             return None
         if source is None:
             state.end_estimates(chosen)

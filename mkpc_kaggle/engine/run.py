@@ -76,7 +76,7 @@ class Run:
         Return ``None`` if the store has lost points, which are matched again.
         """
         keys = [key for pair in pairs for key in pair.points.values()]
-        source = self.store.held(keys) if held else self.store.source(keys)
+        source = self.store.held(UnitPoints, keys) if held else self.store.source(UnitPoints, keys)
         if source.directory is None and self.forget_lost(set(keys) - source.held.keys()):
             return None
         return source

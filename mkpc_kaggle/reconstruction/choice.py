@@ -19,6 +19,7 @@ from mkpc_kaggle.engine.plan.state import name_below
 from mkpc_kaggle.engine.session import Session, request_of
 from mkpc_kaggle.engine.store.database import Source
 from mkpc_kaggle.engine.store.keys import digest
+from mkpc_kaggle.engine.store.tables import Feature
 from mkpc_kaggle.errors import plural
 from mkpc_kaggle.reconstruction.folder import Datasets, Ends, batch_names
 from mkpc_kaggle.scene.likeness import (
@@ -186,7 +187,7 @@ def compare_images(
             if name in digests_by_name:
                 missing[features_key(digests_by_name[name], settings)] = partial(features_of, file)
         engine.look(missing)
-        source = engine.store.source(keys)
+        source = engine.store.source(Feature, keys)
         partners = engine.look({key: partial(compare_features, source, keys)}).get(key)
     return partners
 

@@ -18,6 +18,7 @@ from faulty import choose_scene_for_all_but_the_first, on_fork, runner
 
 from mkpc_kaggle.engine.jobs import Cause, Failure, Loaded, SceneJob
 from mkpc_kaggle.engine.store.database import Source
+from mkpc_kaggle.engine.store.tables import UnitPoints
 from mkpc_kaggle.engine.workers.process import WORKER_ENVIRONMENT, ProcessWorker
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches
@@ -34,7 +35,7 @@ IMAGES = (
 POINTS = np.random.default_rng(1).uniform(0, 70, (50_000, 2)).astype(np.float32)
 MATCHES = Matches(POINTS, POINTS, POINTS[:, 0])
 SCENES = Recipe((Unit(1, "m", 80),), scene=SceneConfig())
-LARGE = SceneJob("one", "key", (BatchPair(*IMAGES, MATCHES),), ("ab",), SCENES, Source(None, {}))
+LARGE = SceneJob("one", "key", (BatchPair(*IMAGES, MATCHES),), ("ab",), SCENES, Source(UnitPoints))
 
 
 class Worker(ProcessWorker):

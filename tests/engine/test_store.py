@@ -390,7 +390,7 @@ def test_results_that_a_full_disk_refuses_stay_in_memory_and_are_written_later(
         }
         # The worker that estimates F gets these points, too.
         last = rows[-1]
-        assert store.source([last.key]).data([last.key]) == {last.key: last.data}
+        assert store.source(UnitPoints, [last.key]).data([last.key]) == {last.key: last.data}
         # The user deletes files: the next write takes all.
         store._db.execute("PRAGMA max_page_count = 100000")
     with Store.read(tmp_path) as again:

@@ -13,7 +13,7 @@ import sqlite3
 import zlib
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import monotonic
@@ -22,7 +22,7 @@ from typing import Any, Self, TypeVar
 import numpy as np
 
 from mkpc_kaggle.engine.store.layout import Layout
-from mkpc_kaggle.engine.store.tables import LAYOUTS, PRUNED, SCHEMA, STORE_FORMAT, UnitPoints
+from mkpc_kaggle.engine.store.tables import LAYOUTS, PRUNED, SCHEMA, STORE_FORMAT
 from mkpc_kaggle.errors import UserError, plural, printable, warn_once, writing
 from mkpc_kaggle.geometry.matches import Matches
 
@@ -370,18 +370,16 @@ class Store:
         found = {key: data for key, (data,) in self._read(layout, "data", DATA, asked)}
         return found | {key: saved.row.data for key, saved in self._waiting(layout, asked).items()}
 
-    def source(self, keys: Sequence[str], kind: type = UnitPoints) -> "Source":
-        """Return where a worker finds the data of rows, points by default: in the file, or in the
-        returned value.
-        """
+    def source(self, kind: type, keys: Sequence[str]) -> "Source":
+        """Return where a worker finds the data of rows: in the file, or in the returned value."""
         # Workers read the file themselves: points of a scene may be hundreds of MB.
         if self._unsaved or not self._has_file or self._is_damaged or not self._is_in_place:
-            return self.held(keys, kind)
-        return Source(self.directory, {}, kind)
+            return self.held(kind, keys)
+        return Source(kind, self.directory, {})
 
-    def held(self, keys: Sequence[str], kind: type = UnitPoints) -> "Source":
-        """Return the data of rows, points by default, to send it to a worker."""
-        return Source(None, self.data(kind, keys), kind)
+    def held(self, kind: type, keys: Sequence[str]) -> "Source":
+        """Return the data of rows, to send it to a worker."""
+        return Source(kind, None, self.data(kind, keys))
 
     def _waiting(
         self, layout: Layout[Any], keys: Iterable[Any] | None = None
@@ -563,9 +561,9 @@ class Source:
     A worker gets this in place of the data, and only this: it never writes.
     """
 
-    directory: Path | None
-    held: dict[str, bytes]
-    kind: type = UnitPoints
+    kind: type
+    directory: Path | None = None
+    held: dict[str, bytes] = field(default_factory=dict)
 
     def data(self, keys: Sequence[str]) -> dict[str, bytes]:
         """Return the data of the results with these keys, if they exist, by key."""
