@@ -60,7 +60,7 @@ def read_text(path: Path) -> str:
             raise UserError(f"{path} cannot be read: not a regular file")
         if path.exists() and (size := path.stat().st_size) > MAX_TEXT_BYTES:
             raise UserError(
-                f"{path} cannot be read: {size} bytes, at most {MAX_TEXT_BYTES} are; split it"
+                f"{path} is too large: {size / 2**20:.1f} MiB, the limit is 16 MiB; split it"
             )
         return path.read_text(encoding="utf-8-sig")
     except OSError as error:

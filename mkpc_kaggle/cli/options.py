@@ -39,14 +39,15 @@ def add_matching(parser: argparse.ArgumentParser) -> None:
         default="auto",
         help="cpu, cuda, cuda:N, or auto (the default): all GPUs, else the CPU",
     )
-    text = "of the networks; auto: half precision if the device computes faster with it (default: float32)"
+    text = """precision of the networks; auto: half precision if the device computes faster with it
+        (default: float32)"""
     add(
         "--precision",
         default="float32",
         choices=["float32", "auto", "bfloat16", "float16"],
         help=text,
     )
-    text = """another value of a recipe's setting, such as matchers.loftr.threshold=0.3; may be
+    text = """change a setting of the recipe, such as matchers.loftr.threshold=0.3; may be
         repeated. docs/recipes.md lists the settings"""
     add("--set", action="append", default=[], metavar="TABLE.KEY=VALUE", help=text)
 
@@ -70,7 +71,7 @@ def add_weights(parser: argparse.ArgumentParser) -> None:
 def add_train_side(parser: argparse.ArgumentParser) -> None:
     """Add the options that choose pairs of ``--train-dir``."""
     add = parser.add_argument
-    add("--scenes", default="", metavar="A,B", help="of --train-dir; default: all")
+    add("--scenes", default="", metavar="A,B", help="scenes of --train-dir; default: all")
     add("--pairs-per-scene", type=int, metavar="N", help="evenly spread; default: all")
     text = "minimum covisibility of pairs of --train-dir; default: 0.1, as in the competition"
     add("--min-covisibility", type=float, default=0.1, help=text)

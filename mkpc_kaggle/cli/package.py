@@ -29,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--python",
         default=",".join(PYTHONS),
         metavar="VERSIONS",
-        help="of the wheels (default: %(default)s)",
+        help="Python version of the wheels (default: %(default)s)",
     )
     add("--wheels", type=Path, metavar="DIR", help="take wheels from DIR, without a network")
     text = "include weights that must not be redistributed; the dataset must then stay private"

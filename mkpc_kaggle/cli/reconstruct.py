@@ -65,8 +65,8 @@ and for all datasets together:
   work/           the journal: after a kill, the same command resumes the run and makes the same files
 
 Points refer to the pixels of the stored file, as COLMAP reads it, without the EXIF orientation. A file that EXIF
-calls mirrored (2, 4, 5, 7) is matched as stored: hardly any but other mirrored files match it. Cameras start with
-the focal lengths of EXIF.
+calls mirrored (2, 4, 5, 7) is matched as stored, so it rarely matches files that are not mirrored.
+Cameras start with the focal lengths of EXIF.
 
 OUT must be empty or the result of an earlier run of this command. Complete new results replace former results; a
 link or a file of yours at the path of a result is refused. At the end, unchanged results that only an earlier run

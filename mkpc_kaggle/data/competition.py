@@ -342,7 +342,7 @@ def read_rows(
     except (OSError, ValueError) as error:
         raise UserError(f"{path} cannot be read as a table: {error}") from error
     if not header:
-        raise UserError(f"{path} lacks the columns {', '.join(columns)}; it has nothing")
+        raise UserError(f"{path} is empty; expected the columns {', '.join(columns)}")
 
 
 def _limited_lines(stream: TextIO) -> Iterator[str]:
@@ -364,7 +364,7 @@ def _column_indices(
         raise UserError(f"{path} has {len(header)} columns; at most {MAX_COLUMNS} are read")
     found = ", ".join(header)[:200]
     if missing := [column for column in columns if column not in header]:
-        raise UserError(f"{path} lacks the columns {', '.join(missing)}; it has {found}")
+        raise UserError(f"{path}: missing columns {', '.join(missing)}; it has {found}")
     if only and header != list(columns):
         raise UserError(f"{path}: the header is {found}, not {', '.join(columns)}")
     wanted = (*columns, *optional)

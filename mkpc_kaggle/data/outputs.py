@@ -43,7 +43,7 @@ def require_apart(
         if not path.name or os.path.isdir(path):  # noqa: PTH112  Path raises for a name that is too long
             raise UserError(f"{option} {str(path)!r} is a directory; name a file")
         if lost := _lost(option, files, precious, work_dir):
-            raise UserError(f"{option} {path} would be written over {lost}; name another file")
+            raise UserError(f"{option} {path} would overwrite {lost}; name another file")
         if option in ("--json", "--report") and not is_result and os.path.isfile(path):  # noqa: PTH113
             raise UserError(
                 f"{option} {path} exists and is not a {RESULTS[option][0]} file; name another file"
@@ -53,8 +53,7 @@ def require_apart(
     for source in inputs:
         if lies_in(work_dir, source):
             raise UserError(
-                f"--work-dir {work_dir} would be written over the input {source}; "
-                "name another place"
+                f"--work-dir {work_dir} would overwrite the input {source}; name another place"
             )
 
 

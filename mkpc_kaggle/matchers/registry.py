@@ -85,7 +85,7 @@ def _imported(name: str, where: str) -> Any:
     # only this matcher is affected.
     except Exception as error:
         message = f"matcher {name} cannot be used here ({type(error).__name__}: {error})"
-        raise UnusableError(f"{where}: {message}. `--recipe auto` does without it.") from error
+        raise UnusableError(f"{where}: {message}. `--recipe auto` runs without it.") from error
 
 
 def require_matchers(matchers: Mapping[str, Matcher[Any]]) -> Mapping[str, Matcher[Any]]:

@@ -130,7 +130,7 @@ class Pipeline:
         )
 
     def load(self) -> None:
-        """Load all matchers of the recipe now. One that cannot be loaded costs its units only.
+        """Load all matchers of the recipe now. If a matcher cannot be loaded, only its units fail.
 
         Raises device and memory errors, and the first matcher's error if none can be loaded.
         """

@@ -129,7 +129,7 @@ def require_directory_apart(out: Path, inputs: Iterable[Path], weights: Iterable
             lies_in(place, out) or (place in inputs and lies_in(out, place))
         ):
             raise UserError(
-                f"--out {out} and the input {place} are in each other's way; name another place"
+                f"--out {out} contains, or lies in, the input {place}; name another folder"
             )
 
 

@@ -65,7 +65,7 @@ def read_intrinsics_table(file: Path, root: Path, images: Iterable[Path]) -> Row
     for number, (pattern, _) in enumerate(rows):
         if number not in used:
             raise UserError(
-                f"{where[number]}: {pattern!r} is the camera of no image; earlier rows come first"
+                f"{where[number]}: row {pattern!r} matches no image, or only images that an earlier row matches"
             )
     return rows
 

@@ -83,10 +83,8 @@ def trouble(run: AnyRun) -> str:
     if 2 * reasons.total() <= len(reached):
         return ""
     ((reason, count),) = reasons.most_common(1)
-    share = f"{reasons.total()} of {plural(len(reached), 'pair')}"
-    return (
-        f"the run failed: errors left {share} without an F, {count} of them with this one: {reason}"
-    )
+    share = f"{reasons.total()} of {plural(len(reached), 'pair')} got no F"
+    return f"the run failed: {share} because of errors; the most frequent ({count}): {reason}"
 
 
 def unreadable_images(pairs: "DataFrame") -> list[str]:

@@ -114,7 +114,7 @@ def _pair_problems(pairs: "DataFrame") -> Iterator[str]:
     if lost := int((reached & ~is_solved(pairs)).sum()):
         yield f"with the fallback: {plural(lost, 'pair')}; the reasons are below"
     if doubtful := sum(map(bool, doubts(pairs))):
-        yield f"perhaps of different things: {plural(doubtful, 'pair')}; look at them below"
+        yield f"{plural(doubtful, 'pair')} may show different things; see below"
 
 
 def _scene_problems(scene: SceneRecord, log: RunLog) -> Iterator[str]:

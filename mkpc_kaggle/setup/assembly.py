@@ -242,7 +242,7 @@ def _without_unavailable(
     chosen = written.with_fallbacks(reasons)
     missing = {name: reasons[name] for name in chosen.matcher_names if name in reasons}
     faulty = {name for name, reason in reasons.items() if reason.kind in FAULTS}
-    # A run does without a faulty matcher. Missing weights, and a licence that is not permitted, are
+    # A run runs without a faulty matcher. Missing weights, and a licence that is not permitted, are
     # the user's to settle, except for ``auto``, which takes the available weights.
     refused = {}
     for asked, unit in zip(written.units, chosen.units, strict=True):
@@ -254,7 +254,7 @@ def _without_unavailable(
         raise refusal(chosen, missing)
     for name in dict.fromkeys((*written.matcher_names, *chosen.matcher_names)):
         if name in faulty:
-            warn_once(f"recipe {written.name} does without {name}: {reasons[name]}")
+            warn_once(f"recipe {written.name} runs without {name}: {reasons[name]}")
     return chosen.without(missing)
 
 

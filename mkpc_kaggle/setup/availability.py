@@ -175,7 +175,7 @@ def refusal(recipe: Recipe, reasons: Mapping[str, UnavailableReason]) -> UserErr
             f"`{fetch_command(recipe, reasons)}`, or use --recipe auto, which needs none."
         )
     what = f"recipe {recipe.name!r} has no unit left that can sweep all pairs: {kind}: {those}"
-    return UserError(f"{what}. Use --recipe auto, which does without these matchers.")
+    return UserError(f"{what}. Use --recipe auto, which runs without these matchers.")
 
 
 def missing_weights(reasons: Iterable[UnavailableReason]) -> MissingWeights:

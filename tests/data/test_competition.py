@@ -80,9 +80,9 @@ def test_pairs_and_columns_come_in_any_order_and_ids_are_text(side):
 @pytest.mark.parametrize(
     ("content", "says"),
     [
-        (b"", "lacks the columns .*; it has nothing"),
+        (b"", "is empty; expected the columns"),
         (HEADER.encode() + b"\n", "has no rows"),
-        (b"sample_id,image_1_id\ns,1\n", "lacks the columns batch_id, image_2_id"),
+        (b"sample_id,image_1_id\ns,1\n", "missing columns batch_id, image_2_id"),
         (b"\x89PNG\r\n\x1a\n\xff\xfe\x00", "cannot be read as a table"),
         (HEADER.encode() + b"\ns,b,1,2\n\nt,b,1,2,3,4\n", "line 4: 6 cells, the header has 4"),
         (HEADER.encode() + b"\ns,b,1\n", "line 2: 3 cells, the header has 4"),
@@ -152,7 +152,7 @@ TRAIN_REFUSALS = [  # file, text, its replacement, options, message
         {},
         "expected 9 numbers, found 8 words",
     ),
-    ("s/calibration.csv", ",rotation_matrix", ",rotation", {}, "lacks the columns rotation_matrix"),
+    ("s/calibration.csv", ",rotation_matrix", ",rotation", {}, "missing columns rotation_matrix"),
     ("s/pair_covisibility.csv", "c-b", "c-x", {}, "'c-x'"),
     ("s/pair_covisibility.csv", "c-b,0.5", "c-b,many", {}, "many"),
     ("scaling_factors.csv", "2.5", "long", {}, "long"),
@@ -198,7 +198,7 @@ def test_a_submission_keeps_its_numbers_and_their_order(tmp_path):
 @pytest.mark.parametrize(
     ("content", "says"),
     [
-        ("id,F\na,1\n", "lacks the columns sample_id, fundamental_matrix"),
+        ("id,F\na,1\n", "missing columns sample_id, fundamental_matrix"),
         ("sample_id,fundamental_matrix,x\na,{F},1\nb,{F},1\n", "the header is"),
         ("sample_id,fundamental_matrix\na,{F}\n", "missing samples: 1, the first is b"),
         (
@@ -219,7 +219,7 @@ def test_a_submission_keeps_its_numbers_and_their_order(tmp_path):
             "sample_id,fundamental_matrix\na,{F}\nb,0 0 0 0 0 0 0 0 0\n",
             "b: the matrix is zero, or a number",
         ),
-        ("\0\0\0", "lacks the columns|cannot be read"),
+        ("\0\0\0", "missing columns|cannot be read"),
     ],
 )
 def test_each_problem_of_a_submission_is_the_only_one_found(tmp_path, content, says):
@@ -264,8 +264,8 @@ def test_cells_are_the_text_of_the_file_with_its_lines(tmp_path, content, rows):
         ("id,value\n1,2\n,,\n", "line 3: 3 cells, the header has 2"),
         ('id,value\n1,2\n3,"4\n5\n6', "cannot be read as a table: EOF inside string.* line 3"),
         ("id,value\n1," + "2" * 200_000, "cannot be read as a table: field larger than"),
-        ("", "it has nothing"),
-        ("\n\r\n", "it has nothing"),
+        ("", "is empty; expected the columns"),
+        ("\n\r\n", "is empty; expected the columns"),
     ],
 )
 def test_a_table_that_a_reader_would_have_to_guess_at_is_refused(tmp_path, content, says):

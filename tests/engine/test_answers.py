@@ -109,7 +109,7 @@ def test_estimates_that_no_worker_can_make_end_the_run_as_failed_after_few_tries
     output = tmp_path / "submission.csv"
     report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work", output=output)
     assert report.ending is Ending.WITH_FAILURES
-    assert trouble(report).startswith("the run failed: errors left 5 of 5 pairs without an F")
+    assert trouble(report).startswith("the run failed: 5 of 5 pairs got no F because of errors")
     assert "not reached" not in summary(report)
     # The rest of the run goes on, and the file is valid.
     assert report.units_run == 15

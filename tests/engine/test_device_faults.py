@@ -362,7 +362,7 @@ def test_a_minibatch_too_large_for_the_memory_is_halved_once_and_no_worker_is_lo
     [
         (
             lack_an_image,
-            "errors left 8 of 8 pairs without an F, 8 of them with this one: KeyError: 'image 7'",
+            "8 of 8 pairs got no F because of errors; the most frequent (8): KeyError: 'image 7'",
         ),
         (break_device, "no worker left, the faults say why; the same command resumes"),
         (exhaust_gpu, "no worker left, the faults say why; the same command resumes"),

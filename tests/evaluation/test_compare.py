@@ -92,7 +92,7 @@ def test_a_comparison_of_runs_that_failed_or_ended_early_has_their_status(
     compared = ["--pairs-per-scene", "2", "--compare", *recipes]
     assert run_command("validate", "--train-dir", train, *compared) == 1
     printed = capsys.readouterr().out
-    assert printed.count("the run failed: errors left 2 of 2 pairs without an F") == 2
+    assert printed.count("the run failed: 2 of 2 pairs got no F because of errors") == 2
     assert "gain of mAA" in printed
     # A second is over before the first pair is matched, so no scores can be compared.
     assert compare(demo, *compared, "--time-limit", "1s") == 1

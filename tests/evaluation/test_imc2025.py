@@ -150,7 +150,7 @@ ROW = f"set,a,a0.png,{POSE}"
         ("submission", "set,a,a0.png", "set,a,a1.png", "the image set/a1.png is there twice"),
         ("submission", POSE, "1;0;0", "expected 9 and 3 numbers joined by ';', found 3 and 3"),
         ("submission", POSE, "north", "'north' is not a list of numbers joined by ';'"),
-        ("submission", "rotation_matrix", "R", "lacks the columns rotation_matrix"),
+        ("submission", "rotation_matrix", "R", "missing columns rotation_matrix"),
     ],
 )
 def test_a_table_that_cannot_be_scored_is_refused_in_one_line(

@@ -316,7 +316,7 @@ BAD = {
     # Mistakes of users: another text, a folder without files, a table of regions.
     "no pairs": ("pairs.txt", text("a b\n"), "expected 38 fields"),
     "an empty directory": ("pairs", Path.mkdir, "cannot be read"),
-    "no columns": ("regions.csv", table("1,2", "a,b"), "lacks the columns image_0"),
+    "no columns": ("regions.csv", table("1,2", "a,b"), "missing columns image_0"),
     "no row of a pair": (
         "regions.csv",
         table("A,C,0 0 9 9,0 0 9 9"),

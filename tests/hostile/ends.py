@@ -144,7 +144,7 @@ CASES = [
         SCORE,
         written("sub.csv", ""),
         REFUSED,
-        "lacks the columns",
+        "missing columns",
     ),
     Case(
         "arguments", "an owner that is a path", "package --out out/p --owner ../x", statuses=REFUSED

@@ -119,7 +119,7 @@ CASES = [
         SUBMIT,
         written("quick.toml", "#" * (17 << 20)),
         REFUSED,
-        "at most 16777216 are",
+        "the limit is 16 MiB",
     ),
     *makes("recipes", SUBMIT, tables_of("quick.toml", GOOD_RECIPES), (0,)),
 ]

@@ -83,6 +83,6 @@ def test_without_kornia_its_matchers_alone_are_lost(clean_environment):
     assert f"\nweights: matcher xfeat_lighterglue {reason}" in done.stdout
     assert f"  xfeat_lighterglue: {reason}" in done.stdout
     assert "('sift',) True" in done.stdout
-    assert f"recipe auto does without xfeat_lighterglue: {reason}" in done.stderr
-    assert f"recipe mine does without xfeat_lighterglue: {reason}" in done.stderr
+    assert f"recipe auto runs without xfeat_lighterglue: {reason}" in done.stderr
+    assert f"recipe mine runs without xfeat_lighterglue: {reason}" in done.stderr
     assert done.stdout.endswith("('sift',)\n")

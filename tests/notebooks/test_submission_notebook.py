@@ -151,7 +151,7 @@ def test_a_saved_version_without_a_network_writes_a_submission_and_shows_pairs(
     printed = kaggle.run()
     assert f"not used     {other} (version 0.0.9)" in printed
     assert [text for text in PRINTED[source] if not re.search(text, printed)] == [], printed
-    assert "does without" not in printed
+    assert "runs without" not in printed
     assert kaggle.problems() == []
     assert "good: 1 row" in printed
     assert "recipe auto" in printed

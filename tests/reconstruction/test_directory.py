@@ -218,9 +218,9 @@ def test_nothing_that_is_read_lies_in_the_directory_of_results(tmp_path, monkeyp
     (tmp_path / "out" / "a").mkdir(parents=True)
     if not Path(place).exists():
         Path(place).write_text("input")
-    with pytest.raises(UserError, match="are in each other's way"):
+    with pytest.raises(UserError, match="contains, or lies in, the input"):
         require_directory_apart(Path("out"), [Path(place)], [])
-    with pytest.raises(UserError, match="are in each other's way"):
+    with pytest.raises(UserError, match="contains, or lies in, the input"):
         require_directory_apart(Path("out"), [], [Path(place)])
     # The name of a recipe is no path.
     require_directory_apart(Path("out"), [Path("auto")], [])

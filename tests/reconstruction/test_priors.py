@@ -71,13 +71,13 @@ def write_masks(folder: Path, root: Path, left: int = 400) -> Path:
 @pytest.mark.parametrize(
     ("table", "reason"),
     [
-        ("", "lacks the columns"),
+        ("", "is empty; expected the columns"),
         (HEAD, "has no rows"),
         (HEAD + "00.png,PINHOLE,1 2 3,fixed\n", "line 2: PINHOLE has 4 parameters"),
         (HEAD + "00.png,PINHOLE\n", "line 2: 2 cells"),
         (
             HEAD + "none*.png,SIMPLE_PINHOLE,900 400 300,fixed\n",
-            "line 2: 'none*.png' is the camera of no image",
+            "line 2: row 'none*.png' matches no image",
         ),
         (
             HEAD + "*,SIMPLE_PINHOLE,900 400 300,2\n00.png,SIMPLE_PINHOLE,900 400 300,2\n",
@@ -368,7 +368,7 @@ def test_priors_in_the_directory_of_results_are_refused_and_stay(tmp_path, capsy
     before = contents(tmp_path)
     assert run_command("reconstruct", root, "--out", out, option, given) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert "are in each other's way" in line
+    assert "contains, or lies in, the input" in line
     assert contents(tmp_path) == before
 
 
@@ -452,7 +452,7 @@ def test_python_takes_masks_and_intrinsics_as_the_command_does(tmp_path):
     assert {each.image.name for each in found.images} == set(map(str, files)), "names are paths"
     # Half the pixels are masked, so there are fewer points.
     assert 0 < len(found.points) < 0.9 * len(free.points)
-    for name, reason in (("masks", "has no mask"), ("intrinsics", "lacks the columns")):
+    for name, reason in (("masks", "has no mask"), ("intrinsics", "missing columns")):
         (tmp_path / "empty").mkdir(exist_ok=True)
         (tmp_path / "empty.csv").touch()
         bad = tmp_path / ("empty" if name == "masks" else "empty.csv")

@@ -131,7 +131,7 @@ def test_the_page_begins_with_the_verdict_has_pictures_inside_and_asks_for_nothi
         "The weakest pairs",
         "Pairs",
         "Where the time went",
-        "What made this",
+        "Versions",
     ]
     assert re.findall("<h2>(.*?)</h2>", text) == titles
     # The pair that was not read has no picture.

@@ -30,7 +30,7 @@ from mkpc_kaggle.scene.view_graph import BatchImage
 
 # As a run leaves a pair that it had no time for
 UNREACHED = Described(failure=None)
-# Support below 20: perhaps of different things
+# Support below 20: they may show different things
 FEW_INLIERS = Described(support=14.4)
 
 

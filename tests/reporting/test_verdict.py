@@ -90,12 +90,12 @@ def compared(*found: FocalContradiction | DistortedLens) -> RunLog:
 # Each sentence, with a run on which it speaks
 SPEAKS = {
     "the run failed: no worker left": log(ending=Ending.NO_WORKER),
-    "the run failed: errors left 1 of 1 pair without an F": log(
+    "the run failed: 1 of 1 pair got no F because of errors": log(
         pairs=(Described(error="out of memory"),)
     ),
     "not reached in time: 1 pair; give": log(pairs=(Described(failure=None),)),
     "with the fallback: 1 pair; the reasons": log(pairs=(Described(failure="too few"),)),
-    "perhaps of different things: 1 pair": log(pairs=(WEAK,)),
+    "1 pair may show different things": log(pairs=(WEAK,)),
     f"no cameras, {NO_CAMERAS}: photographs that overlap more": log(scene(failure=NO_CAMERAS)),
     f"no cameras, {NO_CAMERAS}: all masks are black": log(
         scene(failure=NO_CAMERAS), faults=("set: all masks are black",)

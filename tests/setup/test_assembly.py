@@ -179,7 +179,7 @@ def test_a_permissive_run_refuses_a_users_matcher_by_its_licence_tags():
 def test_recipe_auto_leaves_out_matchers_with_damaged_weights(tmp_path, name):
     """The second has no digest in the manifest: it is found out when it is read."""
     (tmp_path / name).write_bytes(b"cut off")
-    with pytest.warns(UserWarning, match=rf"(passed over|does without dkm): .*{name}"):
+    with pytest.warns(UserWarning, match=rf"(passed over|runs without dkm): .*{name}"):
         assembly = assemble("auto", weights=[tmp_path])
     assert not {"dkm", "xfeat_lighterglue"} & set(assembly.recipe.matcher_names)
 
@@ -204,12 +204,12 @@ def misfits(monkeypatch, tmp_path):
 
 
 DOES_WITHOUT = (
-    r"does without aliked: weights cannot be loaded "
+    r"runs without aliked: weights cannot be loaded "
     r"\(the weights for 'aliked-n16' do not fit the network"
 )
 
 
-@pytest.mark.filterwarnings("ignore:.* does without superglue")
+@pytest.mark.filterwarnings("ignore:.* runs without superglue")
 def test_recipe_auto_leaves_out_weights_that_have_the_digest_and_do_not_fit(misfits):
     with pytest.warns(UserWarning, match=DOES_WITHOUT):
         assembly = assemble("auto", weights=[misfits])
@@ -217,7 +217,7 @@ def test_recipe_auto_leaves_out_weights_that_have_the_digest_and_do_not_fit(misf
     assert "weights cannot be loaded: superglue, aliked" in assembly.left_out
 
 
-@pytest.mark.filterwarnings("ignore:.* does without superglue")
+@pytest.mark.filterwarnings("ignore:.* runs without superglue")
 @pytest.mark.parametrize(
     ("units", "expected"),
     [
@@ -288,7 +288,7 @@ def submitted(demo, tmp_path, recipe, weights):
     return status, problems_of(output, test_dir)
 
 
-@pytest.mark.filterwarnings("default:.* does without")  # the command prints it
+@pytest.mark.filterwarnings("default:.* runs without")  # the command prints it
 @pytest.mark.parametrize("recipe", ["auto", "own"])
 def test_a_checkpoint_that_does_not_fit_does_not_end_the_run(
     misfits, demo, tmp_path, recipe, capsys
@@ -301,7 +301,7 @@ def test_a_checkpoint_that_does_not_fit_does_not_end_the_run(
     assert "left out, " in told.out
 
 
-@pytest.mark.filterwarnings("default:.* does without")
+@pytest.mark.filterwarnings("default:.* runs without")
 def test_match_omits_a_checkpoint_that_does_not_fit_as_submit_does(misfits, demo, tmp_path, capsys):
     (tmp_path / "own.toml").write_text(TWO_UNITS)
     images = sorted((demo.test_dir / "test_images").rglob("*.png"))[:2]

@@ -458,7 +458,7 @@ def pairs_to_await(
     if phase < FILL:
         for_first |= pending | state.matching
     else:
-        # Some pair of a batch is at work all the time now. A first scene takes the present points:
+        # In this phase, a pair of each batch is always being matched. A first scene takes the present points:
         # any scene is better than none, and its time helps to forecast the others.
         for_first |= (pending & ~state.has_own) | (state.matching & ~state.filling)
     return for_first, pending | state.matching | (first < NEVER)

@@ -140,7 +140,7 @@ class Keys:
         """Return the key of a scene. Each input is a pair: names, digests, keys of its points and
         estimate.
         """
-        # Names count here: images with equal contents are one image of a scene, with one name.
+        # The key includes names: images with equal contents are one image of a scene, with one name.
         return digest([self.scene, inputs])
 
 
