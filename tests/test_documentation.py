@@ -87,6 +87,33 @@ def test_pages_name_only_commands_and_options_that_exist(page):
         assert set(options) <= have, (name, set(options) - have)
 
 
+# Options of other programs that pages name: pip, kaggle, ray, accelerators of Kaggle, COLMAP, nerfstudio.
+OTHERS = {"--no-deps", "--follow", "--head", "--accelerator"}
+OTHERS |= {"--colmap-path", "--data", "--database", "--downscale-factor", "--import", "--result"}
+OPTION = re.compile(r"(?<![\w-])--[a-z][a-z0-9-]*")
+
+
+def all_options() -> set[str]:
+    """The options of all commands that ``--help`` shows."""
+    known = set()
+    for parser in inner(make_parser(list(COMMANDS))).values():
+        for own in (parser, *inner(parser).values()):
+            shown = [action for action in own._actions if action.help != argparse.SUPPRESS]
+            known |= {text for action in shown for text in action.option_strings}
+    return known - {"-h", "--help"}
+
+
+def test_every_option_is_in_the_pages_and_every_option_of_the_pages_exists():
+    pages = {page.stem: set(OPTION.findall(page.read_text("utf-8"))) for page in PAGES}
+    named = set().union(*pages.values()) - {"--help", "--version"}
+    known = all_options()
+    assert len(known) > 45
+    assert sorted(known - named) == [], "options that no page names"
+    measured = "\n".join(path.read_text("utf-8") for path in (ROOT / "benchmarks").rglob("*.py"))
+    benchmarks = set(OPTION.findall(measured))
+    assert sorted(named - known - benchmarks - OTHERS) == [], "options that do not exist"
+
+
 PYTHON = re.compile(r"^```python\n(.*?)^```", re.M | re.S)
 # The snippets of python.md are run by test_python_page.py.
 BLOCKS = [

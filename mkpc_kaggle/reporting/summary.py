@@ -83,8 +83,10 @@ def trouble(run: AnyRun) -> str:
     if 2 * reasons.total() <= len(reached):
         return ""
     ((reason, count),) = reasons.most_common(1)
-    share = f"{reasons.total()} of {plural(len(reached), 'pair')} got no F"
-    return f"the run failed: {share} because of errors; the most frequent ({count}): {reason}"
+    share = f"{reasons.total()} of {plural(len(reached), 'pair')}"
+    return (
+        f"the run failed: {share} got no F because of errors; the most frequent ({count}): {reason}"
+    )
 
 
 def unreadable_images(pairs: "DataFrame") -> list[str]:
