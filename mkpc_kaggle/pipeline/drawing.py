@@ -1,7 +1,7 @@
 """Figures of a pair: matches, clusters and critical regions, in matplotlib."""
 
 from math import sqrt
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,9 +50,8 @@ def draw_strip(images: tuple[Image, Image], match: PairMatch) -> "Figure":
     """Draw the matches and the critical regions without text, in up to :data:`MAX_STRIP_PX` pixels."""
     aspect = sum(view.content.width / view.content.height for view in map(_upright, images))
     height = min(STRIP_HEIGHT_PX, sqrt(MAX_STRIP_PX / aspect)) / DPI
-    figure = new_figure(aspect * height, height)
-    # The constrained layout would leave a margin for text that a strip does not have.
-    figure.set_layout_engine("none")
+    # A layout would leave a margin for text that a strip does not have, and draw everything twice.
+    figure = new_figure(aspect * height, height, layout=None)
     draw_matches(figure.add_axes((0, 0, 1, 1)), images, match, round(height * DPI))
     return figure
 
@@ -159,14 +158,16 @@ def _upright(image: Image, height_px: int | None = None) -> View:
     return View.fit(Box.whole(image.size), long_side=long_side, turns=image.turns)
 
 
-def new_figure(width: float, height: float) -> "Figure":
+def new_figure(
+    width: float, height: float, layout: Literal["constrained"] | None = "constrained"
+) -> "Figure":
     """Return an empty figure of this size in inches. Raise :class:`UserError` without matplotlib."""
     # Without pyplot, which would choose a window system and keep all figures in memory.
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
         raise UserError("figures need matplotlib: pip install 'mkpc-kaggle[plots]'") from error
-    return Figure(figsize=(width, height), layout="constrained")
+    return Figure(figsize=(width, height), layout=layout)
 
 
 def sample(mask: NDArray[np.bool_], most: int) -> NDArray[np.intp]:

@@ -109,3 +109,13 @@ def test_a_strip_shows_both_images_upright_at_one_height_with_matches_where_they
     drawn_points = [dots.get_offsets() for dots in figure.axes[0].collections]
     (ends,) = (points for points in drawn_points if len(points) > 1)
     np.testing.assert_allclose(ends, [[0.1, 0.1], [2 + 0.5, 0.5]])
+
+
+def test_a_strip_is_drawn_once(monkeypatch):
+    image = gray(Size(60, 40), 100)
+    figure = draw_strip((image, image), PairMatch())
+    drawn = []
+    draw = figure.draw
+    monkeypatch.setattr(figure, "draw", lambda renderer: drawn.append(draw(renderer)))
+    encode(figure, "jpeg")
+    assert len(drawn) == 1
