@@ -8,7 +8,7 @@ from itertools import chain
 import numpy as np
 
 from mkpc_kaggle.engine.plan.schedule import sweeping_unit
-from mkpc_kaggle.engine.plan.state import State
+from mkpc_kaggle.engine.plan.state import SCENE, State
 from mkpc_kaggle.engine.store.database import Store
 from mkpc_kaggle.engine.store.image_files import known_images
 from mkpc_kaggle.engine.store.keys import of_candidate
@@ -105,12 +105,29 @@ def _restore_estimates(
     # From the points in use: an estimate from former points is up to date until others replace them.
     today = {index: state.estimate_key(index) for index in known if state.has[index].any()}
     former = {index: row.estimate for index, row in old.items() if row.estimate}
-    estimates = store.get(PairEstimate, [*today.values(), *former.values()])
+    by_cameras = _camera_estimate_keys(state, list(today))
+    keys = [*today.values(), *former.values(), *by_cameras.values()]
+    estimates = store.get(PairEstimate, keys)
     for index, key in today.items():
+        if by_cameras.get(index) in estimates:
+            state.use_camera_estimate(index, estimates[by_cameras[index]])
+            continue
         # As long as the images are the same, the former F is better than the fallback.
         used = key if key in estimates else former.get(index, "")
         if used in estimates:
             state.use_estimate(index, estimates[used])
+
+
+def _camera_estimate_keys(state: State, known: list[int]) -> dict[int, str]:
+    """Return the keys of estimates from the cameras of today's scenes."""
+    if not state.uses_cameras:
+        return {}
+    scenes = {batch: state.scene_inputs(batch)[1] for batch in state.batches}
+    return {
+        index: state.camera_estimate_key(index, scenes[state.pairs[index].group])
+        for index in known
+        if state.batch_of[index] >= 0
+    }
 
 
 def _restore_scenes(
@@ -148,7 +165,16 @@ def _restore_scenes(
             has_mark = state.filed[batch] == used_scene.key
             if not (has_mark and has_files(directory.path, len(used_scene.models))):
                 continue
+        if state.uses_cameras and _lacks_estimates(state, batch):
+            continue
         state.settle(batch)
+
+
+def _lacks_estimates(state: State, batch: str) -> bool:
+    """Return whether an estimate that came with a batch's scene is missing: a damaged row."""
+    rows = state.rows_of(batch)
+    is_of_scene = state.scene_source[rows] == SCENE
+    return bool((is_of_scene & ~state.by_cameras[rows]).any())
 
 
 def _has_images(scene: SceneRecord, digests: Mapping[str, str]) -> bool:

@@ -6,9 +6,9 @@ from mkpc_kaggle.engine.jobs import Failure, SceneJob
 from mkpc_kaggle.engine.plan.budget import SCENE_MATCH_S, SCENE_START_S, format_duration
 from mkpc_kaggle.engine.plan.state import State
 from mkpc_kaggle.engine.run import HANG_FACTOR, Run
-from mkpc_kaggle.engine.store.keys import of_candidate
+from mkpc_kaggle.engine.store.keys import of_camera_estimate, of_candidate
 from mkpc_kaggle.engine.store.scene_record import NOT_RECONSTRUCTED, SceneRecord, unmatched_scene
-from mkpc_kaggle.engine.store.tables import EventKind, Export
+from mkpc_kaggle.engine.store.tables import EventKind, Export, PairEstimate
 from mkpc_kaggle.errors import plural
 from mkpc_kaggle.scene.candidates import ALL_UNITS, title_of
 from mkpc_kaggle.scene.sfm import Solution
@@ -55,6 +55,7 @@ class SceneWork:
             candidate=candidate,
             scene=key,
             is_whole=folder is not None,
+            with_estimates=state.uses_cameras,
         )
         about = format_duration(self.forecast(job))
         text = f"reconstructing its cameras from {plural(len(pairs), 'pair')}"
@@ -94,12 +95,16 @@ class SceneWork:
         )
         # In the same transaction, a mark: these files belong to this scene.
         marks = [] if job.export is None else [Export(job.batch, job.key)]
-        run.store.put([record, *marks])
+        estimates = self._estimates(job, answer)
+        run.store.put([record, *marks, *estimates.values()])
         # The time of the loop, with the process's start: the forecast needs both.
         run.costs.observe_scene(job.matches, seconds)
         text = f"{record.registered} of {plural(record.images, 'image')}"
         more = ""  # about a further candidate
         is_best = state.use_new_scene(job.batch, job.scene, record, is_filed=job.export is not None)
+        for index, estimate in estimates.items():
+            state.use_camera_estimate(index, estimate, is_current=job.batch not in state.stale)
+        run.log.estimated += len(estimates)
         if job.candidate != ALL_UNITS:
             outcome = "the best so far" if is_best else "not better"
             more = f" by the tracks of {title_of(job.candidate)}, {outcome}"
@@ -108,6 +113,27 @@ class SceneWork:
         if record.loose:
             note += f", {record.loose} of them unknown to within the size of their model"
         run.progress.note(note)
+
+    def _estimates(self, job: SceneJob, answer: Solution) -> dict[int, PairEstimate]:
+        """Return the estimates of the pairs that take F from their cameras, by index."""
+        estimates = {}
+        state = self._run.state
+        # Empty if the job was not asked for any
+        for pair, contents, found in zip(job.pairs, job.contents, answer.estimates, strict=False):
+            # An image may have changed since.
+            if found is None or state.contents(pair.index) != contents:
+                continue
+            points = tuple(pair.points.values())
+            own = state.request.keys.of_estimate(state.pairs[pair.index], points)
+            estimates[pair.index] = PairEstimate(
+                of_camera_estimate(own, job.key),
+                # Of one unit; see Request.uses_cameras
+                {points[0]: found.inlier_count},
+                found.matrix,
+                support=found.stats.support,
+                plane=found.stats.plane,
+            )
+        return estimates
 
     def lose(self, job: SceneJob, failure: Failure) -> None:
         run = self._run

@@ -219,12 +219,12 @@ def with_estimate(
         first, second = priors
         found = estimate_with_prior(matches, (first, second), magsac, recipe.focal, model)
     if found.ok and model is not ModelKind.H:
-        found = _with_stats(found, matches, intrinsics if model is ModelKind.E else None)
+        found = with_stats(found, matches, intrinsics if model is ModelKind.E else None)
     return replace(pair, results=results, estimate=found)
 
 
-def _with_stats(
-    found: Estimate, matches: Matches, intrinsics: tuple[Matrix3, Matrix3] | None
+def with_stats(
+    found: Estimate, matches: Matches, intrinsics: tuple[Matrix3, Matrix3] | None = None
 ) -> Estimate:
     """Return an F, or an E with ``intrinsics``, with its support, the share of its inliers on a
     plane, and for an E its rotation.

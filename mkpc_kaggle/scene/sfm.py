@@ -11,10 +11,16 @@ import numpy as np
 
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.intrinsics import Rows
-from mkpc_kaggle.geometry.robust import RobustConfig
+from mkpc_kaggle.geometry.robust import Estimate, RobustConfig
 from mkpc_kaggle.recipe import CameraSharing, SceneConfig
 from mkpc_kaggle.scene.align import align, read_reference
-from mkpc_kaggle.scene.choose import Choice, Reason, choose, estimate_at_known_focals
+from mkpc_kaggle.scene.choose import (
+    Choice,
+    Reason,
+    choose,
+    estimate_at_known_focals,
+    estimate_of,
+)
 from mkpc_kaggle.scene.export import HeldDirectory
 from mkpc_kaggle.scene.keypoints import MergedGraph
 from mkpc_kaggle.scene.models import (
@@ -50,12 +56,14 @@ class Solution:
     pairs.
 
     Images with the same content have the name of the first of them. ``disagreement`` is the value by which
-    candidates are compared (:mod:`mkpc_kaggle.scene.candidates`).
+    candidates are compared (:mod:`mkpc_kaggle.scene.candidates`). ``estimates``, if asked for, has the estimate
+    of each pair that takes its F from its cameras.
     """
 
     reconstructions: tuple[Reconstruction, ...]
     choices: tuple[Choice, ...]
     disagreement: float = 0.0
+    estimates: tuple[Estimate | None, ...] = ()
 
 
 def reconstruct_batch(
@@ -67,13 +75,15 @@ def reconstruct_batch(
     is_whole: bool = False,
     *,
     cameras: Rows = (),
+    with_estimates: bool = False,
 ) -> Solution:
     """Reconstruct every connected component of a batch, and choose an F for each of its pairs.
 
     With the recipe's prior ``focal``, a pair without an F from cameras is re-estimated at the scene's focal
     lengths, unless the pair contradicts the scene. ``magsac`` has default settings if ``None``. With a directory
     ``export``, the batch is reconstructed as a whole, and COLMAP's files are written there. With ``is_whole``, it
-    is reconstructed in the same way without files. ``cameras`` are those that the user knows.
+    is reconstructed in the same way without files. ``cameras`` are those that the user knows. ``with_estimates``,
+    pairs come without their own F, and get estimates from their cameras.
 
     A missing result has a reason; bad matches never raise. Reconstruction takes seconds to minutes
     and may end the process, see :mod:`mkpc_kaggle.scene.colmap`.
@@ -90,13 +100,16 @@ def reconstruct_batch(
         focals |= {digest: image.focal for digest, image in model.items()}
     # A reason for each pair, also for those without an F
     choices = []
+    estimates = []
     for pair in pairs:
-        choice = choose(pair, models)
+        choice = choose(pair, models, magsac if with_estimates else None)
         if focal is not None and choice.reason not in KEEPS_ITS_F:
             F = estimate_at_known_focals(pair, focals, focal, magsac or RobustConfig())
             choice = replace(choice, F=F)
         choices.append(choice)
-    return Solution(tuple(reconstructions), tuple(choices))
+        if with_estimates:
+            estimates.append(estimate_of(choice, pair, magsac or RobustConfig()))
+    return Solution(tuple(reconstructions), tuple(choices), estimates=tuple(estimates))
 
 
 def reconstruct_sharing(

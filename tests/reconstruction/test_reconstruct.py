@@ -16,6 +16,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pandas as pd
 import pycolmap
 import pytest
 from exif_files import set_exif
@@ -30,18 +31,25 @@ from benchmarks.synthetic_scene import SIZE, SyntheticScene, synthetic_scene
 from mkpc_kaggle import results
 from mkpc_kaggle.data.images import TURNS
 from mkpc_kaggle.engine.plan.budget import Budget
+from mkpc_kaggle.engine.request import Request
 from mkpc_kaggle.engine.session import Interrupt, Session
+from mkpc_kaggle.engine.store.database import FILE_NAME, Store
+from mkpc_kaggle.engine.store.dataframes import ELEMENTS
+from mkpc_kaggle.engine.store.keys import Keys
 from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.geometry.cameras import fundamental_of_cameras
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
+from mkpc_kaggle.geometry.intrinsics import KnownCamera
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import RobustConfig
 from mkpc_kaggle.matchers.adapters.sift import SiftMatcher, SiftOptions
-from mkpc_kaggle.recipe import Recipe, Unit
+from mkpc_kaggle.recipe import CameraModel, Recipe, SceneConfig, Unit
 from mkpc_kaggle.reconstruction import choice
 from mkpc_kaggle.reconstruction.folder import read_folder, read_pair_list
 from mkpc_kaggle.reconstruction.layout import write_images
 from mkpc_kaggle.reconstruction.outputs import Cameras, camera_rows, submission_rows
 from mkpc_kaggle.reconstruction.run import FolderResult, for_cameras, reconstruct_folder
+from mkpc_kaggle.scene.export import HeldDirectory
 from mkpc_kaggle.scene.likeness import (
     largest_features,
     local_features,
@@ -92,11 +100,15 @@ def write_flat(folder: Path, count: int = FIRST + SECOND + OTHERS) -> Path:
 
 
 def run(
-    root: Path, out: Path, matcher: SyntheticMatcher | None = None, **options: object
+    root: Path,
+    out: Path,
+    matcher: SyntheticMatcher | None = None,
+    interrupt: Interrupt | None = None,
+    **options: object,
 ) -> FolderResult:
     matcher = matcher or MixedMatcher()
     budget = Budget(time.monotonic(), float("inf"))
-    session = Session(out / "work", budget, Interrupt(), progress=False, workers=0)
+    session = Session(out / "work", budget, interrupt or Interrupt(), progress=False, workers=0)
     assembly = assemble(RECIPE, matchers={"synthetic": matcher}, device="cpu")
     return reconstruct_folder(root, read_folder(root), assembly, session, out, **options)
 
@@ -205,6 +217,102 @@ def test_estimates_that_only_the_report_needs_are_the_cheap_ones():
     # A recipe with fewer keeps its own.
     few = replace(recipe, magsac=RobustConfig(max_iterations=100))
     assert for_cameras(few).magsac.max_iterations == 100
+
+
+def pairs_of(out: Path) -> pd.DataFrame:
+    """The table of pairs, by the names of the images, without seconds."""
+    pairs = results(out / "work").pairs
+    kept = [name for name in pairs if not name.endswith("_seconds")]
+    return pairs[kept].set_index(["image0", "image1"])
+
+
+def test_a_pair_with_two_cameras_takes_f_and_inliers_from_them(mixed):
+    out, result = mixed
+    pairs = pairs_of(out)
+    is_seen = pairs["source"] == "scene"
+    # Both scenes, and no image of the other one or of none
+    assert is_seen.sum() == FIRST * (FIRST - 1) / 2 + SECOND * (SECOND - 1) / 2
+    assert pairs["overlaps"][is_seen].all()
+    for names in pairs.index[is_seen]:
+        F = fundamental_of_cameras(*(cameras(result)[name].camera for name in names))
+        np.testing.assert_allclose(pairs.loc[names][ELEMENTS].astype(float), F.ravel(), atol=1e-12)
+        assert pairs.loc[names, "inliers"] > 20
+    # MAGSAC estimates the others, from 25 wrong matches.
+    assert not pairs["overlaps"][~is_seen].any()
+    assert (pairs["candidates"] > 0).equals(~is_seen & (pairs["failure"] == ""))
+
+
+@pytest.mark.parametrize(
+    ("recipe", "camera", "uses_cameras"),
+    [
+        (RECIPE, KnownCamera("PINHOLE", (900, 900, 400, 300)), True),
+        # Others match for so long that MAGSAC is no share of it, or look at F before the cameras.
+        (replace(RECIPE, units=(*RECIPE.units, Unit(2, "synthetic", 640))), None, False),
+        # F of distorted cameras does not fit their matches.
+        (RECIPE, KnownCamera("SIMPLE_RADIAL", (900, 400, 300, 0.1)), False),
+        (replace(RECIPE, scene=SceneConfig(camera_model=CameraModel.OPENCV)), None, False),
+    ],
+    ids=["pinholes", "two units", "a distorted camera", "distorted cameras"],
+)
+def test_estimates_come_from_pinholes_if_one_unit_matches(tmp_path, recipe, camera, uses_cameras):
+    cameras = () if camera is None else (("*", camera),)
+    exports = {"batch": HeldDirectory.of(tmp_path)}
+    assert (
+        Request((), recipe, Keys(()), cameras=cameras, exports=exports).uses_cameras == uses_cameras
+    )
+    assert not Request((), recipe, Keys(()), cameras=cameras).uses_cameras, "of a submission"
+
+
+def test_estimates_from_cameras_are_the_same_wherever_a_run_is_cut(tmp_path, monkeypatch):
+    root = write_flat(tmp_path / "images", 5)
+    run(root, tmp_path / "undisturbed")
+    expected = pairs_of(tmp_path / "undisturbed")
+    puts = []
+    put = Store.put
+    monkeypatch.setattr(Store, "put", lambda store, rows: puts.append(put(store, rows)))
+    for limit in range(4, 24, 4):
+        out = tmp_path / f"cut after {limit}"
+        puts.clear()
+        run(root, out, interrupt=After(puts, limit))
+        run(root, out)
+        pd.testing.assert_frame_equal(pairs_of(out), expected)
+        assert contents(out) == contents(tmp_path / "undisturbed")
+
+
+class After(Interrupt):
+    """An interrupt that is set once a list has so many elements."""
+
+    def __init__(self, elements: list[None], limit: int) -> None:
+        super().__init__()
+        self.elements = elements
+        self.limit = limit
+
+    def is_set(self) -> bool:
+        return len(self.elements) >= self.limit
+
+
+def test_estimates_that_a_journal_has_lost_come_again_with_the_scene(tmp_path):
+    root = write_flat(tmp_path / "images", 4)
+    out = tmp_path / "out"
+    run(root, out)
+    expected = pairs_of(out)
+    with closing(sqlite3.connect(out / "work" / FILE_NAME)) as database, database:
+        database.execute("DELETE FROM estimate")
+    run(root, out)
+    pd.testing.assert_frame_equal(pairs_of(out), expected)
+
+
+def test_without_cameras_every_pair_is_estimated_by_itself(tmp_path, monkeypatch):
+    root = write_flat(tmp_path / "images", 4)
+    with monkeypatch.context() as patched:
+        scenes_by(patched, partial(befall, fail))
+        run(root, tmp_path / "out")
+    alone = pairs_of(tmp_path / "out")
+    assert alone["source"].tolist() == ["pair"] * 6
+    assert alone["inliers"].min() > 20
+    # The next run has cameras.
+    run(root, tmp_path / "out")
+    assert set(pairs_of(tmp_path / "out")["source"]) == {"scene"}
 
 
 # Upright, on both sides, and upside down

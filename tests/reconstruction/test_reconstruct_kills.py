@@ -19,7 +19,7 @@ from test_reconstruct import contents
 
 from mkpc_kaggle.demo import DemoSet
 
-ROUNDS, ENDS = 4, 5  # of each round, before the run that nobody disturbs
+ENDS = 5  # of each round, before the run that nobody disturbs
 SIGNALS = (signal.SIGKILL, signal.SIGINT, signal.SIGTERM)
 
 
@@ -50,9 +50,20 @@ def write_inputs(demo: DemoSet, home: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
-def test_a_run_that_is_ended_at_random_moments_ends_with_the_same_files(demo, tmp_path):
+@pytest.mark.parametrize(
+    ("units", "more", "rounds"),
+    [
+        (((1, 480), (2, 640)), "", 4),
+        (((1, 480),), "", 2),  # estimates come from cameras
+        (((1, 480), (1, 640)), "[scene]\ncandidates = 4\n", 2),
+    ],
+    ids=["two stages", "one unit", "candidates"],
+)
+def test_a_run_that_is_ended_at_random_moments_ends_with_the_same_files(
+    demo, tmp_path, units, more, rounds
+):
     write_inputs(demo, tmp_path)
-    write_recipe(tmp_path / "small.toml", (1, 480), (2, 640))
+    write_recipe(tmp_path / "small.toml", *units, more=more)
 
     def begin(out: str, *more: str) -> "subprocess.Popen[bytes]":
         options = ["--recipe", str(tmp_path / "small.toml"), "--rotations", "--workers", "1"]
@@ -86,7 +97,7 @@ def test_a_run_that_is_ended_at_random_moments_ends_with_the_same_files(demo, tm
     } <= expected.keys()
     rng = random.Random(0)
     ended = 0
-    for number in range(ROUNDS):
+    for number in range(rounds):
         out = f"out{number}"
         for _ in range(ENDS):
             seconds = rng.uniform(0.0, 0.6 * whole_s)
@@ -104,5 +115,5 @@ def test_a_run_that_is_ended_at_random_moments_ends_with_the_same_files(demo, tm
             process.wait()
         assert begin(out).wait() == 0
         assert files_of(out) == expected
-    assert ended >= ROUNDS
+    assert ended >= rounds
     assert {name: text for name, text in contents(tmp_path).items() if name in inputs} == inputs

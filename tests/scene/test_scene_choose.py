@@ -8,7 +8,9 @@ import pytest
 
 from benchmarks.synthetic_scene import SIZE, SyntheticScene, synthetic_scene
 from mkpc_kaggle.geometry.cameras import Camera
-from mkpc_kaggle.scene.choose import Choice, Reason, choose
+from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
+from mkpc_kaggle.geometry.robust import RobustConfig, sampson_distances
+from mkpc_kaggle.scene.choose import Choice, Reason, choose, estimate_of
 from mkpc_kaggle.scene.models import (
     Reconstruction,
     RegisteredImage,
@@ -71,8 +73,26 @@ def test_a_wrong_camera_is_contradicted_by_the_pairs_matches(scene):
     wrong = [model(scene.cameras | {"0001": tilted})]
     true_F = scene.true_fundamental(scene.pairs[0])
     assert choice(wrong, scene, pair_fundamental=true_F).reason is Reason.CONTRADICTION
-    # Without an F of the pair, nothing contradicts the scene's.
+    # Without an F of the pair, nothing contradicts the scene's,
     assert choice(wrong, scene).from_scene
+    # unless it may be estimated.
+    by_digest = {found.image.digest: found for found in wrong[0].images}
+    assert choose(scene.pairs[0], [by_digest], RobustConfig()).reason is Reason.CONTRADICTION
+
+
+def test_an_f_from_cameras_has_the_inliers_of_the_pairs_matches(scene):
+    pair = scene.pairs[0]
+    found = choice([model(scene.cameras)], scene)
+    estimate = estimate_of(found, pair, RobustConfig(threshold=2.0))
+    assert estimate is not None
+    np.testing.assert_array_equal(estimate.matrix, found.F)
+    distances = sampson_distances(estimate.matrix, pair.matches)
+    np.testing.assert_array_equal(estimate.inliers, distances < 2.0)
+    # 0.3 of the matches are wrong, and few of them agree by chance.
+    assert 0.6 < estimate.inliers.mean() < 0.8
+    assert estimate.stats.support > MIN_SUPPORT
+    # The cameras say nothing about F.
+    assert estimate_of(choice([], scene), pair, RobustConfig()) is None
 
 
 # Images have 800 x 600 pixels, so 1e5 is a field of view below half a degree.

@@ -157,5 +157,12 @@ def of_candidate(scene: str, candidate: str) -> str:
     return text_digest([scene, candidate]) if candidate else scene
 
 
+def of_camera_estimate(estimate: str, scene: str) -> str:
+    """Return the key of an estimate from a pair's cameras; ``estimate`` is that of one from its points
+    alone, ``scene`` that of its batch.
+    """
+    return text_digest(["cameras", estimate, scene])
+
+
 def _text_of(box: Box) -> str:
     return f"{box.left} {box.top} {box.right} {box.bottom}"

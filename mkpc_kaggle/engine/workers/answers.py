@@ -28,7 +28,7 @@ from mkpc_kaggle.engine.jobs import (
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.critical_region import CriticalRegion
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.geometry.robust import EstimateStats
+from mkpc_kaggle.geometry.robust import Estimate, EstimateStats
 from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.scene.choose import Choice
 from mkpc_kaggle.scene.models import Reconstruction, RegisteredImage, SfmModel
@@ -95,7 +95,7 @@ def _require(is_right: bool, value: Any, what: str) -> None:
         raise WrongAnswerError(f"{what}: {str(value)[:80]!r}")
 
 
-def _check_tuple(values: Any, kind: type, count: int | None, what: str) -> None:
+def _check_tuple(values: Any, kind: Any, count: int | None, what: str) -> None:
     """Require a tuple of ``count`` values of a kind."""
     is_tuple = isinstance(values, tuple) and all(isinstance(each, kind) for each in values)
     _require(is_tuple, type(values).__name__, f"not a tuple of {what}")
@@ -201,7 +201,10 @@ def _check_estimate(pair: PairInputs, found: Estimated) -> None:
         _check_numbers(found.magsac, (3, 3), "MAGSAC's F")
     _check_text(found.failure)
     _check_seconds([found.seconds])
-    stats = found.stats
+    _check_stats(found.stats)
+
+
+def _check_stats(stats: Any) -> None:
     _require(isinstance(stats, EstimateStats), stats, "no statistics")
     _check_counts([stats.candidates], "candidates")
     numbers = [stats.cost, stats.magsac_cost, *stats.focals, stats.support, *stats.rotation]
@@ -218,6 +221,12 @@ def _check_solution(job: SceneJob, answer: Any) -> None:
     for choice in answer.choices:
         if choice.F is not None:
             _require(is_fundamental(choice.F), choice.F, "F is not a finite matrix of rank 2")
+    estimates = answer.estimates
+    _check_tuple(estimates, Estimate | None, len(job.pairs) * job.with_estimates, "estimates")
+    for found in estimates:
+        if found is not None:
+            _require(is_fundamental(found.matrix), found.matrix, "F is not a matrix of rank 2")
+            _check_stats(found.stats)
     _check_tuple(answer.reconstructions, Reconstruction, None, "reconstructions")
     for found in answer.reconstructions:
         _check_tuple(found.names, str, None, "names")
