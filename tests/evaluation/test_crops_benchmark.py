@@ -1,0 +1,53 @@
+"""The tables of `benchmarks.crops`: gains by groups of scenes, on train sides and on lists."""
+
+import pytest
+
+from benchmarks.crops import LAYOUTS, gain_lines, recipe
+from mkpc_kaggle.recipe import load_recipe
+
+
+def run(accuracies):
+    """The figures of a run on scenes of one pair each."""
+    scenes = []
+    for scene, accuracy in accuracies.items():
+        pair = {"pair": f"{scene};b-a", "accuracy_by_step": {"MAGSAC": 0.0, "+ prior": accuracy}}
+        scenes.append({"scene": scene, "pairs": [pair]})
+    return {"scenes": scenes}
+
+
+def test_gains_are_those_of_the_last_layout_in_each_group_of_scenes():
+    first = run({"castle_zoom2": 0.1, "castle_zoom4": 0.2, "herz_zoom4": 0.3})
+    last = run({"castle_zoom2": 0.2, "castle_zoom4": 0.6, "herz_zoom4": 0.9})
+    lines = gain_lines([first, last], ["one", "rule"], chosen="castle")
+    cells = {line[:14].strip(): line[14:].split()[:4] for line in lines[1:]}
+    assert cells == {
+        "all": ["3", "0.2000", "0.5667", "+0.3667"],
+        "x2": ["1", "0.1000", "0.2000", "+0.1000"],
+        "x4": ["2", "0.2500", "0.7500", "+0.5000"],
+        "chosen on": ["2", "0.1500", "0.4000", "+0.2500"],
+        "confirmed on": ["1", "0.3000", "0.9000", "+0.6000"],
+    }
+
+
+def test_pairs_of_a_list_count_by_their_larger_angular_error():
+    def listed(rotation, translation):
+        pair = {
+            "pair": "1: a/x-1.jpg a/x-2.jpg",
+            "accuracy_by_step": {"MAGSAC": None},
+            "rotation_error_degrees": rotation,
+            "translation_error_degrees": translation,
+        }
+        return {"scenes": [{"scene": "list", "pairs": [pair]}]}
+
+    lines = gain_lines([listed(None, 3.0), listed(2.0, 5.0)], ["one", "rule"], chosen="")
+    # An infinite error counts as 0, an error of 5 of 20 degrees as 0.75.
+    assert lines[-1].split()[:4] == ["all", "1", "0.0000", "0.7500"]
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_each_layout_is_a_recipe(tmp_path, layout):
+    file = tmp_path / "layout.toml"
+    file.write_text(recipe("aliked_lightglue", layout, rootsift=True))
+    units = [unit.name for unit in load_recipe(str(file)).units]
+    assert units[0] == "1:sift@1536"
+    assert len(units) == 1 + len(LAYOUTS[layout][0])
