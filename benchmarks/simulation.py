@@ -7,7 +7,7 @@ Statistics of many runs:
 The timeline of one run; the costs are the seconds of each unit on a pair:
 
     python -m benchmarks.simulation --costs 0.6 0.4 0.35 [--batches 15] [--pairs 10000] [--scene-seconds 0.15]
-        [--limit 8h45m] [--workers 1]
+        [--limit 8h45m] [--workers 1] [--candidates 1]
 """
 
 import argparse
@@ -92,6 +92,7 @@ def main() -> None:
     )
     parser.add_argument("--limit", type=parse_duration, default=parse_duration("8h45m"))
     parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--candidates", type=int, default=1, help="of a scene")
     arguments = parser.parse_args()
     for name in arguments.without:
         switch_off(name)
@@ -104,6 +105,7 @@ def main() -> None:
                 arguments.limit,
                 batches=arguments.batches,
                 scene_seconds=arguments.scene_seconds,
+                candidates=arguments.candidates,
                 seed=arguments.seed,
             )
         )

@@ -52,6 +52,11 @@ def test_a_recipe_of_the_package_loads_with_options_for_every_matcher(name):
     assert recipe.magsac.permutations == (8 if paper else 1)
 
 
+def test_auto_reconstructs_scenes_as_light_does():
+    # With the weights of light alone, auto has its two matchers.
+    assert load_recipe("auto").scene == load_recipe("light").scene
+
+
 def test_any_remaining_matchers_of_recipe_auto_begin_with_a_unit_of_stage_1():
     # Users have any subset of the weights, and a run without a sweep has no F for any pair.
     recipe = load_recipe("auto")
