@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mkpc_kaggle.data.outputs import replacing
-from mkpc_kaggle.engine.store.json_values import as_json
+from mkpc_kaggle.engine.store.json_values import to_text
 from mkpc_kaggle.engine.store.scene_record import NO_CAMERAS, SceneRecord
 from mkpc_kaggle.errors import UserError, plural, printable, writing
 from mkpc_kaggle.reporting.contradictions import contradictions, has_moved, named
@@ -342,7 +342,7 @@ def _scene_table(scene: SceneRecord) -> dict[str, Any]:
         "models": [
             {
                 "reprojection_px": _number(model.reprojection_error),
-                "contradictions": as_json(model.comparison),
+                "contradictions": json.loads(to_text(model.comparison)),
                 "cameras": [
                     {
                         "image": found.image.name,

@@ -666,6 +666,7 @@ DAMAGED_ROWS = {
     "empty": "UPDATE points SET data = x''",
     "other bytes": "UPDATE points SET data = zeroblob(length(data))",
     "no JSON": "UPDATE points SET regions = '{'",
+    "no UTF-8": "UPDATE points SET note = CAST(x'ff41' AS TEXT)",
     "an estimate": "UPDATE estimate SET F = zeroblob(72)",
     "an image": "UPDATE image SET width = 7",
     "the run": "UPDATE run SET about = '{}'",

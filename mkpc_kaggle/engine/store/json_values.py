@@ -1,6 +1,7 @@
-"""Dataclasses as JSON values, and back, by the types of their fields."""
+"""Dataclasses as JSON, and back, by the types of their fields."""
 
-from collections.abc import Mapping
+import json
+from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass
 from enum import Enum
 from functools import cache
@@ -9,54 +10,80 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
+JsonReader = Callable[[Any], Any]
 
-def as_json(value: Any) -> Any:
-    """Return a value as JSON has it: a dataclass is an object with its fields, a tuple a list."""
-    if is_dataclass(value) and not isinstance(value, type):
-        return {field.name: as_json(getattr(value, field.name)) for field in fields(value)}
-    if isinstance(value, Mapping):
-        return {name: as_json(item) for name, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [as_json(item) for item in value]
+
+def to_text(value: Any) -> str:
+    """Return a value as JSON: a dataclass is an object with its fields, a tuple a list. Raise
+    ``ValueError`` for a number that is not finite.
+    """
+    return json.dumps(value, default=_of_known_type, allow_nan=False)
+
+
+def _of_known_type(value: Any) -> Any:
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
-    return str(value) if isinstance(value, Enum) else value
+    return {field.name: getattr(value, field.name) for field in fields(value)}
 
 
-def from_json(kind: Any, value: Any) -> Any:
-    """Return the value of a type that :func:`as_json` made ``value`` from.
+@cache
+def json_reader_of(kind: Any) -> JsonReader | None:
+    """Return the function that makes a value of a type from the JSON value that :func:`to_text`
+    wrote; ``None`` if that is the value.
 
     A field that is missing gets its default. Arrays are of float64.
     """
     if get_origin(kind) is not None:
-        return _of_generic(get_origin(kind), get_args(kind), value)
+        return _reader_of_generic(get_origin(kind), get_args(kind))
     if not isinstance(kind, type):
-        return value
+        return None
     if is_dataclass(kind):
-        hints = _hints(kind)
-        return kind(**{name: from_json(hints[name], item) for name, item in value.items()})
+        return _reader_of_fields(kind)
     if issubclass(kind, tuple):
-        return kind(*value)  # a named tuple
-    return kind(value) if issubclass(kind, Enum) else value
+        return lambda value: kind(*value)  # a named tuple
+    return kind if issubclass(kind, Enum) else None
 
 
-def _of_generic(origin: Any, kinds: tuple[Any, ...], value: Any) -> Any:
+def _reader_of_fields(kind: Any) -> JsonReader:
+    readers = {name: json_reader_of(hint) for name, hint in get_type_hints(kind).items()}
+
+    def read(value: Any) -> Any:
+        items = dict(value)
+        for name in value:
+            if (reader := readers[name]) is not None:
+                items[name] = reader(items[name])
+        return kind(**items)
+
+    return read
+
+
+def _reader_of_generic(origin: Any, kinds: tuple[Any, ...]) -> JsonReader | None:
     if origin in (Union, UnionType):
-        # ``None`` and the empty tuple stand for an unknown value.
-        if value is None:
-            return None
-        if not value and tuple[()] in kinds:
-            return ()
-        (kind,) = set(kinds) - {NoneType, tuple[()]}
-        return from_json(kind, value)
+        return _reader_of_optional(kinds)
     if origin is np.ndarray:
-        return np.array(value, float)
+        return lambda value: np.array(value, float)
     if issubclass(origin, Mapping):
-        return {name: from_json(kinds[1], item) for name, item in value.items()}
-    items = (from_json(kinds[0], item) for item in value)
-    return tuple(items) if origin is tuple else list(items)
+        return _reader_of_mapping(json_reader_of(kinds[1]))
+    item = json_reader_of(kinds[0])
+    if item is None:
+        return tuple if origin is tuple else None
+    return lambda value: tuple(map(item, value))
 
 
-@cache
-def _hints(kind: type) -> dict[str, Any]:
-    return get_type_hints(kind)
+def _reader_of_mapping(item: JsonReader | None) -> JsonReader | None:
+    if item is None:
+        return None
+    return lambda value: {name: item(each) for name, each in value.items()}
+
+
+def _reader_of_optional(kinds: tuple[Any, ...]) -> JsonReader:
+    # ``None`` and the empty tuple stand for an unknown value.
+    (kind,) = set(kinds) - {NoneType, tuple[()]}
+    reader = json_reader_of(kind)
+
+    def read(value: Any) -> Any:
+        if value is None or reader is None:
+            return value
+        return () if not value and tuple[()] in kinds else reader(value)
+
+    return read

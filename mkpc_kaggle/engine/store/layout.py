@@ -5,13 +5,15 @@ import sqlite3
 from base64 import b64decode, b64encode
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from math import isfinite
+from operator import attrgetter, index
 from types import NoneType
 from typing import Any, Generic, TypeVar, get_args, get_origin, get_type_hints
 
 import numpy as np
 
-from mkpc_kaggle.engine.store.json_values import as_json, from_json
+from mkpc_kaggle.engine.store.json_values import json_reader_of, to_text
 from mkpc_kaggle.errors import printable
 from mkpc_kaggle.scene.models import SfmModel
 
@@ -20,17 +22,20 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Column:
-    """A column, and the two directions of its conversion."""
+    """A column, and the two directions of its conversion; ``None`` if SQLite returns the value itself."""
 
     name: str
     declaration: str
     to_sql: Callable[[Any], Any]
-    of_sql: Callable[[Any], Any]
+    of_sql: Callable[[Any], Any] | None
 
 
 @dataclass(frozen=True)
 class Layout(Generic[T]):
-    """The table of a dataclass. ``facts`` are all columns besides ``data``, if there is such a column."""
+    """The table of a dataclass. ``facts`` are all columns besides ``data``, if there is such a column.
+
+    The facts are the first fields of the dataclass, in this order.
+    """
 
     kind: Callable[..., T]
     table: str
@@ -57,22 +62,40 @@ class Layout(Generic[T]):
         return f"CREATE TABLE {self.table} (\n    {columns}\n) STRICT"
 
     def values(self, row: T) -> tuple[Any, ...]:
-        """Return the facts as SQLite has them. Raise ``sqlite3.IntegrityError`` for a number that is
-        not finite.
+        """Return the facts as SQLite has them. Raise ``sqlite3.IntegrityError`` for other numbers than
+        the columns are for, or numbers that are not finite.
         """
         try:
-            return tuple(column.to_sql(getattr(row, column.name)) for column in self.facts)
-        except ValueError as error:
+            pairs = zip(self._to_sql, self._fields(row), strict=True)
+            return tuple([convert(value) for convert, value in pairs])
+        except (TypeError, ValueError) as error:
             raise sqlite3.IntegrityError(f"{self.table}: {error}") from error
 
     def row(self, values: Sequence[Any]) -> T:
         """Return the row with these facts, without its data."""
-        pairs = zip(self.facts, values, strict=True)
-        return self.kind(**{column.name: column.of_sql(value) for column, value in pairs})
+        # Few columns need a conversion, and a start of a run reads all rows.
+        row = list(values)
+        for number, convert in self._conversions:
+            row[number] = convert(row[number])
+        return self.kind(*row)
 
+    # Computed once, since a run converts each row of its results
 
-def _same(value: Any) -> Any:
-    return value
+    @cached_property
+    def _to_sql(self) -> list[Callable[[Any], Any]]:
+        return [column.to_sql for column in self.facts]
+
+    @cached_property
+    def _fields(self) -> Callable[[T], tuple[Any, ...]]:
+        return attrgetter(*(column.name for column in self.facts))
+
+    @cached_property
+    def _conversions(self) -> list[tuple[int, Callable[[Any], Any]]]:
+        found = []
+        for number, column in enumerate(self.facts):
+            if column.of_sql is not None:
+                found.append((number, column.of_sql))
+        return found
 
 
 def _finite(value: float) -> float:
@@ -81,13 +104,14 @@ def _finite(value: float) -> float:
     return float(value)  # also for NumPy's float32
 
 
-def _dumps(value: Any) -> str:
-    return printable(json.dumps(as_json(value), allow_nan=False))
+def _text(value: str) -> str:
+    text = str(value)  # of an enum, too
+    return text if text.isascii() else printable(text)
 
 
 # 16 characters a point; as decimal digits, the points would be most of a large store.
 def _models_to_sql(models: Sequence[SfmModel]) -> str:
-    return _dumps(
+    return to_text(
         [
             {
                 "images": model.images,
@@ -101,33 +125,36 @@ def _models_to_sql(models: Sequence[SfmModel]) -> str:
 
 
 def _models_of_sql(text: str) -> tuple[SfmModel, ...]:
+    read = json_reader_of(SfmModel)
+    assert read is not None
     models = []
     for about in json.loads(text):
         points = np.frombuffer(b64decode(about.pop("points")), "<f4").reshape(-1, 3)
-        model: SfmModel = from_json(SfmModel, {**about, "points": []})
+        model = read({**about, "points": []})
         models.append(replace(model, points=points.astype(np.float64)))
     return tuple(models)
 
 
-PLAIN: dict[Any, tuple[str, Callable[[Any], Any], Callable[[Any], Any]]] = {
-    str: ("TEXT", printable, _same),
-    int: ("INTEGER", _same, _same),
-    float: ("REAL", _finite, _same),
+PLAIN: dict[Any, tuple[str, Callable[[Any], Any], Callable[[Any], Any] | None]] = {
+    str: ("TEXT", _text, None),
+    int: ("INTEGER", index, None),
+    float: ("REAL", _finite, None),
     bool: ("INTEGER", int, bool),
     tuple[SfmModel, ...]: ("TEXT", _models_to_sql, _models_of_sql),
 }
+
+
+def _unless_none(convert: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    return lambda value: None if value is None else convert(value)
 
 
 def _column(name: str, hint: Any) -> Column:
     if NoneType in get_args(hint):
         (known,) = set(get_args(hint)) - {NoneType}
         column = _column(name, known)
-        return Column(
-            name,
-            column.declaration.removesuffix(" NOT NULL"),
-            lambda value: None if value is None else column.to_sql(value),
-            lambda value: None if value is None else column.of_sql(value),
-        )
+        declaration = column.declaration.removesuffix(" NOT NULL")
+        of_sql = column.of_sql and _unless_none(column.of_sql)
+        return Column(name, declaration, _unless_none(column.to_sql), of_sql)
     if hint in PLAIN:
         kind, to_sql, of_sql = PLAIN[hint]
         return Column(name, f"{kind} NOT NULL", to_sql, of_sql)
@@ -139,7 +166,21 @@ def _column(name: str, hint: Any) -> Column:
             lambda matrix: np.asarray(matrix, "<f8").tobytes(),
             lambda data: np.frombuffer(data, "<f8").reshape(3, 3),
         )
-    return Column(name, "TEXT NOT NULL", _dumps, lambda text: from_json(hint, json.loads(text)))
+    read = _reader(json_reader_of(hint))
+    if get_origin(hint) is tuple:
+        # Most are empty, such as the regions of a unit of stage 1.
+        return Column(
+            name, "TEXT NOT NULL", to_text, lambda text: () if text == "[]" else read(text)
+        )
+    return Column(name, "TEXT NOT NULL", to_text, read)
+
+
+def _reader(read: Callable[[Any], Any] | None) -> Callable[[str], Any]:
+    # Without the search for white space of json.loads
+    decode = json.JSONDecoder().raw_decode
+    if read is None:
+        return lambda text: decode(text)[0]
+    return lambda text: read(decode(text)[0])
 
 
 def layout_of(kind: type[T], table: str, key: str) -> Layout[T]:

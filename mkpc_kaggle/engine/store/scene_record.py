@@ -52,9 +52,9 @@ class SceneRecord:
     choices: Mapping[str, Choice] = field(default_factory=dict, compare=False)
     candidate: str = ALL_UNITS
     disagreement: float = 0.0
-    rivals: tuple[Rival, ...] = field(default=(), metadata={"is_stored": False})
     key: str = field(default="", compare=False)
     contents: Mapping[str, str] = field(default_factory=dict, compare=False)
+    rivals: tuple[Rival, ...] = field(default=(), metadata={"is_stored": False})
 
     @classmethod
     def of(
