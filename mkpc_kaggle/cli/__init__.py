@@ -96,7 +96,7 @@ def main(arguments: Sequence[str] | None = None, started: float | None = None) -
 
 def _main(arguments: Sequence[str] | None, started: float) -> int:
     """Run a command with the package's libraries, and print its errors, one line each."""
-    from mkpc_kaggle.engine.console import complain, warn
+    from mkpc_kaggle.engine.console import logger
     from mkpc_kaggle.errors import UserError
 
     for stream in (sys.stdout, sys.stderr):
@@ -106,12 +106,12 @@ def _main(arguments: Sequence[str] | None, started: float) -> int:
     # Leaving the stack ends the printing thread after the messages below.
     with ExitStack() as printing, warnings.catch_warnings():
         # One line each, without the file and line that Python prints.
-        warnings.showwarning = lambda message, *_, **__: warn(str(message))
+        warnings.showwarning = lambda message, *_, **__: logger.warning(str(message))
         try:
             given = sys.argv[1:] if arguments is None else list(arguments)
             return _run(given, started, printing)
         except UserError as error:
-            complain(str(error))
+            logger.error(str(error))
             return EXIT_BAD_INPUT
         except ImportError as error:
             # Of a native library, such as torch without its CUDA; a fault of the package is a
@@ -119,10 +119,10 @@ def _main(arguments: Sequence[str] | None, started: float) -> int:
             if str(error.name).startswith("mkpc_kaggle"):
                 raise
             reason = " ".join(str(error).split())
-            complain(f"a library cannot be imported: {reason}; install the package again")
+            logger.error(f"a library cannot be imported: {reason}; install the package again")
             return EXIT_BAD_INPUT
         except KeyboardInterrupt as error:
-            complain("interrupted")
+            logger.error("interrupted")
             return 128 + int(*error.args) if error.args else EXIT_INTERRUPTED
         except BrokenPipeError:  # the reader closed the pipe, as `head` does
             return EXIT_BROKEN_PIPE
@@ -130,7 +130,7 @@ def _main(arguments: Sequence[str] | None, started: float) -> int:
             # A path of the user's. Any other error is a fault of the program: a traceback.
             if error.errno != errno.ENAMETOOLONG:
                 raise
-            complain(f"{error.strerror}: {str(error.filename)[:80]}...")
+            logger.error(f"{error.strerror}: {str(error.filename)[:80]}...")
             return EXIT_BAD_INPUT
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from mkpc_kaggle.data.competition import Pair, TrainScene, read_train_side
-from mkpc_kaggle.engine.console import Progress, drain, say, unblocked
+from mkpc_kaggle.engine.console import Progress, drain, logger, unblocked
 from mkpc_kaggle.engine.plan.budget import Budget, monotonic_of, parse_duration
 from mkpc_kaggle.engine.request import RunReport
 from mkpc_kaggle.engine.session import Interrupt, Session
@@ -184,7 +184,7 @@ def say_start(what: str, assembly: Assembly, work_dir: Path, effects: Iterable[s
     # One call, so that no worker's line comes between.
     header = f"{what}, recipe {assembly.recipe.name}, {assembly.placement}, journal in {work_dir}"
     left_out = left_out_line(assembly.recipe, assembly.left_out)
-    say("\n".join(filter(None, [header, left_out, *effects])))
+    logger.info("\n".join(filter(None, [header, left_out, *effects])))
 
 
 def finish(session: Session, page: Path | None, pairs: Sequence[Pair]) -> int:
@@ -196,7 +196,7 @@ def finish(session: Session, page: Path | None, pairs: Sequence[Pair]) -> int:
 
     if page is not None:
         progress = Progress(session.budget, sys.stderr)
-        say(report_run(session.work_dir, page, session.must_end(), pairs, progress))
+        logger.info(report_run(session.work_dir, page, session.must_end(), pairs, progress))
     if session.interrupt.signal:
         return 128 + session.interrupt.signal  # as shells do
     return session.status

@@ -10,7 +10,7 @@ from mkpc_kaggle.cli import options
 from mkpc_kaggle.data.hloc import SUFFIX, require_h5py
 from mkpc_kaggle.data.masks import Masks
 from mkpc_kaggle.data.outputs import require_apart
-from mkpc_kaggle.engine.console import say
+from mkpc_kaggle.engine.console import logger
 from mkpc_kaggle.engine.plan.budget import format_duration
 from mkpc_kaggle.engine.session import interruptible
 from mkpc_kaggle.engine.store.scene_record import MIN_PAIRS, NOT_RECONSTRUCTED
@@ -187,7 +187,7 @@ def run(arguments: argparse.Namespace) -> int:
         is_here = held.is_here and all(held_files.is_here for held_files in result.held.values())
         if is_here:
             if any(any(dataset.values()) for dataset in result.cameras.values()):
-                say("writing images/ and sparse/ for other programs")
+                logger.info("writing images/ and sparse/ for other programs")
             problems = [
                 *write_layouts(out, root, datasets, session.must_end(), result.held),
                 *keep_coordinates(out, root, result),
@@ -200,7 +200,7 @@ def run(arguments: argparse.Namespace) -> int:
         if arguments.export is not None and is_here:
             problems.append(export_matches(arguments.export, out, datasets))
         lines = [*options.plan_lines(arguments, result.report), *_lines(result, root), *problems]
-        say("\n".join(filter(None, [*lines, f"results: {out}"])))
+        logger.info("\n".join(filter(None, [*lines, f"results: {out}"])))
         # A run without pairs has no report.
         page = out / "report.html" if result.pairs and is_here else None
         return options.finish(session, page, result.pairs)

@@ -6,7 +6,7 @@ from pathlib import Path
 from mkpc_kaggle.cli import options
 from mkpc_kaggle.data.competition import missing_line, read_test_side, test_side
 from mkpc_kaggle.data.outputs import require_apart
-from mkpc_kaggle.engine.console import say
+from mkpc_kaggle.engine.console import logger
 from mkpc_kaggle.engine.session import first_version, interruptible, submit
 from mkpc_kaggle.errors import plural
 from mkpc_kaggle.reporting.summary import summary, trouble
@@ -79,5 +79,5 @@ def run(arguments: argparse.Namespace) -> int:
             # A file that could not be replaced is an earlier version; it is complete, too.
             lines = [*options.plan_lines(arguments, report), summary(report)]
             # Before the report: drawing may exceed the time limit.
-            say("\n".join([*lines, f"submission: {output}{unwritten}"]))
+            logger.info("\n".join([*lines, f"submission: {output}{unwritten}"]))
             return options.finish(session, page, pairs)

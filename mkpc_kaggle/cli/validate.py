@@ -14,7 +14,7 @@ from mkpc_kaggle.data.competition import TrainScene, missing_line
 from mkpc_kaggle.data.outputs import require_apart
 from mkpc_kaggle.data.pairs import read_pairs
 from mkpc_kaggle.data.regions import read_regions
-from mkpc_kaggle.engine.console import say
+from mkpc_kaggle.engine.console import logger
 from mkpc_kaggle.engine.request import RunReport
 from mkpc_kaggle.engine.session import Interrupt, Session, interruptible
 from mkpc_kaggle.errors import UserError, plural, temporary_directory, writing
@@ -150,12 +150,12 @@ def _match_and_score(
     choices = [split_mode(text) for text in compared] or [(arguments.recipe, arguments.mode)]
     pairs = [true.pair for scene in scenes for true in scene.pairs]
     if line := missing_line(pairs):
-        say(line)
+        logger.info(line)
     regions = {} if arguments.regions is None else read_regions(arguments.regions, root, pairs)
     if arguments.regions is not None:
         used = len({(pair.file0, pair.file1) for pair in pairs})
         # The table may be of more scenes, or of more pairs of them.
-        say(f"regions: {used} of {plural(len(regions), 'row')} name pairs of this run")
+        logger.info(f"regions: {used} of {plural(len(regions), 'row')} name pairs of this run")
     validations = []
     status = 0
     budget = options.budget_of(arguments)
@@ -175,13 +175,13 @@ def _match_and_score(
             status = options.finish(session, page, pairs)
             # A comparison of unequal pairs would mean nothing.
             if compared and not report.ending.is_done:
-                say(
+                logger.info(
                     "nothing is compared until all is done; with a --work-dir, the same command resumes"
                 )
                 return status or 1, None
     if not compared:
         return status, to_json(validations[0])
-    say("\n".join(["", *comparison_table(validations)]))
+    logger.info("\n".join(["", *comparison_table(validations)]))
     return status, comparison_json(validations)
 
 
@@ -214,7 +214,7 @@ def _run_recipe(
     lines += options.plan_lines(arguments, report)
     lines += [summary(report), "", f"recipe {validation.recipe}"]
     lines += [*score_table(validation), *step_gains(validation)]
-    say("\n".join(lines))
+    logger.info("\n".join(lines))
     return validation, report
 
 

@@ -2,20 +2,19 @@
 
 A pipe without a reader or a stopped terminal (Ctrl-S) blocks a write forever, and with it every
 thread that waits for the stream's lock. A lost terminal (EIO), a full disk or a closed stream makes
-a write fail. So one thread prints, from a bounded queue. Native libraries write to the descriptors
-directly: libjpeg and libpng print warnings while OpenCV decodes a photograph. Their text goes to a
-file.
+a write fail. So during a run each stream has a thread that writes, from a bounded queue. Native
+libraries write to the descriptors directly: libjpeg and libpng print warnings while OpenCV decodes a
+photograph. Their text goes to a file.
 """
 
 import io
+import logging
 import multiprocessing
 import os
 import queue
-import select
 import sys
 import threading
 import time
-from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from math import isfinite
@@ -26,23 +25,33 @@ from typing import Any, NoReturn, TextIO
 from mkpc_kaggle.engine.plan.budget import Budget, format_duration
 from mkpc_kaggle.progress import LINE_INTERVAL_S, WAIT_S, ProgressLine, print_to
 
-MAX_WAITING = 1000  # writes, which a busy progress line makes in a few minutes
+MAX_WAITING = 1000  # texts, which a busy progress line writes in a few minutes
 # Of the text of native libraries, printed at the end: a warning for each photograph would hide the rest.
 MAX_NATIVE_BYTES = 4096
-RETRY_S = 0.05  # between looks at a descriptor that accepts no text
+CONSOLE_RETRY_S = 0.05  # between writes to a non-blocking descriptor that accepts no text
 DRAIN_S = 2.0  # maximum wait at the end for the remaining text to be printed
 
 
-def say(text: str) -> None:
-    print_to(sys.stdout, text)
+class Console(logging.Handler):
+    """Print records: warnings and errors on stderr after their level, others on stdout."""
+
+    def createLock(self) -> None:  # noqa: N802  logging's name
+        """Use no lock: a stream that blocks must not hold back the other."""
+        self.lock = None
+
+    def emit(self, record: logging.LogRecord) -> None:
+        # Looked up for each record: notebooks, tests and :func:`unblocked` replace streams.
+        if record.levelno < logging.WARNING:
+            print_to(sys.stdout, record.getMessage())
+        else:
+            print_to(sys.stderr, f"{record.levelname.lower()}: {record.getMessage()}")
 
 
-def warn(text: str) -> None:
-    print_to(sys.stderr, f"warning: {text}")
-
-
-def complain(text: str) -> None:
-    print_to(sys.stderr, f"error: {text}")
+# The messages of the package; a program may give this logger other handlers.
+logger = logging.getLogger("mkpc_kaggle")
+logger.setLevel(logging.INFO)
+logger.propagate = False
+logger.addHandler(Console())
 
 
 class Progress(ProgressLine):
@@ -82,19 +91,31 @@ class Progress(ProgressLine):
             self._write(f"{text} [{format_duration(seconds)}]")
 
 
-class Printer:
-    """The printing thread, with a bounded queue of (descriptor, bytes). Text is dropped if the
-    queue is full.
+class QueuedFile(io.RawIOBase):
+    """The binary file below a text stream, whose thread writes to ``descriptor`` from a bounded
+    queue. Text is dropped if the queue is full.
     """
 
-    def __init__(self) -> None:
-        self._waiting: queue.Queue[tuple[int, bytes]] = queue.Queue(MAX_WAITING)
-        self._thread = threading.Thread(target=self._print, name="print", daemon=True)
-        self._thread.start()
+    def __init__(self, descriptor: int) -> None:
+        self._descriptor = descriptor
+        self._waiting: queue.Queue[bytes | None] = queue.Queue(MAX_WAITING)
+        # Each stream has its own, because stdout and stderr may have different readers.
+        threading.Thread(target=self._write_all, name="print", daemon=True).start()
 
-    def put(self, descriptor: int, data: bytes) -> None:
+    def writable(self) -> bool:
+        return True
+
+    def write(self, data: Any) -> int:
+        text = bytes(data)
         with suppress(queue.Full):  # without a reader for minutes
-            self._waiting.put_nowait((descriptor, data))
+            self._waiting.put_nowait(text)
+        return len(text)
+
+    def isatty(self) -> bool:
+        return os.isatty(self._descriptor)
+
+    def fileno(self) -> int:
+        return self._descriptor
 
     def drain(self, until: float) -> bool:
         """Wait until all text is printed, at most until ``until`` on the monotonic clock. Return
@@ -106,67 +127,25 @@ class Printer:
             time.sleep(0.002)
         return True
 
-    def _print(self) -> None:
-        # By descriptor, because stdout and stderr may have different readers.
-        pending: dict[int, deque[bytes]] = {}
-        while True:
-            with suppress(queue.Empty):
-                # Look again from time to time whether a blocked descriptor accepts text.
-                descriptor, data = self._waiting.get(timeout=RETRY_S if pending else None)
-                pending.setdefault(descriptor, deque()).append(data)
-            for descriptor in list(pending):
-                self._write(descriptor, pending[descriptor])
-                if not pending[descriptor]:
-                    del pending[descriptor]
+    def end(self) -> None:
+        """End the thread, once all text is printed."""
+        self._waiting.put_nowait(None)
 
-    def _write(self, descriptor: int, texts: deque[bytes]) -> None:
-        """Write and remove texts until the descriptor would block: a reader of stderr that does not
-        read must not hold back stdout.
-        """
-        while texts and (len(texts) > MAX_WAITING or _accepts(descriptor)):
-            data = texts.popleft()
-            rest = b""
-            if len(texts) < MAX_WAITING:  # else the oldest text is dropped
-                with suppress(OSError):  # lost terminal, or full disk
-                    # A pipe that accepts text has room for PIPE_BUF bytes, and perhaps not for more.
-                    rest = data[os.write(descriptor, data[: select.PIPE_BUF]) :]
-            if rest:
-                texts.appendleft(rest)
-            else:
-                self._waiting.task_done()
+    def _write_all(self) -> None:
+        while (text := self._waiting.get()) is not None:
+            with suppress(OSError):  # lost terminal, or full disk
+                self._write_text(text)
+            self._waiting.task_done()
+
+    def _write_text(self, text: bytes) -> None:
+        while text:
+            try:
+                text = text[os.write(self._descriptor, text) :]
+            except BlockingIOError:  # the parent program has made the pipe non-blocking
+                time.sleep(CONSOLE_RETRY_S)
 
 
-def _accepts(descriptor: int) -> bool:
-    """Return whether a write of up to ``PIPE_BUF`` bytes does not block; also if it would fail."""
-    poll = select.poll()
-    poll.register(descriptor, select.POLLOUT)
-    return bool(poll.poll(0))
-
-
-class Queued(io.RawIOBase):
-    """The binary file below a text stream whose text the printing thread prints to ``descriptor``."""
-
-    def __init__(self, descriptor: int, printer: Printer) -> None:
-        self._descriptor = descriptor
-        self._printer = printer
-
-    def writable(self) -> bool:
-        return True
-
-    def write(self, data: Any) -> int:
-        text = bytes(data)
-        self._printer.put(self._descriptor, text)
-        return len(text)
-
-    def isatty(self) -> bool:
-        return os.isatty(self._descriptor)
-
-    def fileno(self) -> int:
-        return self._descriptor
-
-
-_printer: Printer | None = None  # of this process, once something is printed by it
-_native: list[int] = []  # descriptors that native libraries write to, while streams are queued
+_queued: dict[int, QueuedFile] = {}  # by descriptor; native libraries write to these descriptors
 
 
 @contextmanager
@@ -176,27 +155,29 @@ def unblocked(descriptors: Sequence[int] = (1, 2)) -> Iterator[None]:
     Text of native libraries is printed at the end, or goes to the file of :func:`log_native`.
     Streams at other descriptors, such as a notebook's, are not changed.
     """
-    global _printer  # noqa: PLW0603  one thread for the process
     occupy_standard_descriptors()
     with ExitStack() as ended:
         for name in ("stdout", "stderr"):
             stream = getattr(sys, name)
             number = _descriptor(stream)
-            if number not in descriptors or number in _native:
+            if number not in descriptors or number in _queued:
                 continue
-            _printer = _printer or Printer()
             stream.flush()
             sink = os.dup(number)  # the stream's file, once its number is taken by the other
-            raw = io.BufferedWriter(Queued(sink, _printer))
-            queued = io.TextIOWrapper(
-                raw, stream.encoding, stream.errors, write_through=True, line_buffering=True
+            queued = QueuedFile(sink)
+            text = io.TextIOWrapper(
+                io.BufferedWriter(queued),
+                stream.encoding,
+                stream.errors,
+                write_through=True,
+                line_buffering=True,
             )
-            setattr(sys, name, queued)
+            setattr(sys, name, text)
             # From here on, native libraries write to a file, which never blocks.
             file = ended.enter_context(_native_file())
             os.dup2(file.fileno(), number)
-            _native.append(number)
-            ended.callback(_restore, name, stream, number, sink, file)
+            _queued[number] = queued
+            ended.callback(_restore, name, stream, number, file)
         ended.callback(drain)
         yield
 
@@ -211,20 +192,20 @@ def _native_file() -> Any:
         return open(os.devnull, "w+b")  # noqa: PTH123
 
 
-def _restore(name: str, stream: TextIO, number: int, sink: int, file: Any) -> None:
+def _restore(name: str, stream: TextIO, number: int, file: Any) -> None:
     """Restore a stream and its descriptor, unless the file still blocks, since later writes would
     block, too.
     """
-    assert _printer is not None
+    queued = _queued.pop(number)
     setattr(sys, name, stream)
     file.seek(0)
     if text := file.read(MAX_NATIVE_BYTES):
-        _printer.put(sink, text)
-    if _printer.drain(time.monotonic() + DRAIN_S / 10):
+        queued.write(text)
+    if queued.drain(time.monotonic() + DRAIN_S / 10):
         with suppress(OSError):  # closed by the program
-            os.dup2(sink, number)
-            os.close(sink)
-    _native.remove(number)
+            os.dup2(queued.fileno(), number)
+            os.close(queued.fileno())
+        queued.end()
 
 
 def occupy_standard_descriptors() -> None:
@@ -242,7 +223,7 @@ def occupy_standard_descriptors() -> None:
 def log_native(path: Path) -> None:
     """Let native libraries write to a file from now on, while :func:`unblocked` is active."""
     with suppress(OSError):  # a full disk
-        append_to(path, _native)
+        append_to(path, list(_queued))
 
 
 def append_to(path: Path | str, descriptors: Sequence[int]) -> None:
@@ -262,8 +243,8 @@ def drain(seconds: float = DRAIN_S) -> None:
         for stream in filter(None, (sys.stdout, sys.stderr)):
             with suppress(OSError, ValueError):
                 stream.flush()
-        if _printer is not None:
-            _printer.drain(until)
+        for queued in list(_queued.values()):
+            queued.drain(until)
 
     until = time.monotonic() + seconds
     # In a thread, because flushing a blocked stream waits for its lock.

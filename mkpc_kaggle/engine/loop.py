@@ -150,7 +150,7 @@ class Engine:
         if damaged := len(self.store.damaged):
             # They are missing now, like results that never were.
             text = f"{plural(damaged, 'result')} of the journal, damaged, will be computed again"
-            console.warn(text)
+            console.logger.warning(text)
             self.log.fault(text)
             self.store.damaged.clear()
         # The only time that the store is read for the state: later, answers update it.
@@ -251,7 +251,7 @@ class Engine:
             count = sum(not changed.isdisjoint(names) for names in state.names)
             images = plural(len(changed), "image")
             text = f"{images} changed; matching {plural(count, 'pair')} again"
-            console.warn(text)
+            console.logger.warning(text)
             self.log.fault(text)
         return digests.by_name
 
@@ -515,7 +515,7 @@ class Engine:
                 text = f"{name} is left out: {reason}"
                 self.log.explain(text)
                 self.log.fault(text)
-                console.warn(text)
+                console.logger.warning(text)
         if self.state is not None:
             self._leave_out(self.state)
 
@@ -560,7 +560,7 @@ class Engine:
             text = f"matching continues on the {name}: {reason or Ending.NOTHING_RUNS}"
             self.log.fault(text)
             self.log.explain(text)
-            console.warn(text)
+            console.logger.warning(text)
             self.site.fall_back()
             # Costs, losses and refusals say nothing about the other device.
             self.costs.forget()

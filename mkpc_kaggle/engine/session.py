@@ -146,7 +146,7 @@ class Session:
         writer.join(max(EXIT_S, budget.limit - budget.clock() - EXIT_S))
         # Not exit(): its handlers wait for threads, and one of them hangs.
         if trouble:
-            console.complain(trouble)
+            console.logger.error(trouble)
         status = self.status or int(bool(trouble))
         console.leave(128 + self.interrupt.signal if self.interrupt.signal else status, EXIT_S / 4)
 

@@ -13,7 +13,7 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine.console import say, warn
+from mkpc_kaggle.engine.console import logger
 from mkpc_kaggle.engine.loop import Engine
 from mkpc_kaggle.engine.plan.state import name_below
 from mkpc_kaggle.engine.session import Session, request_of
@@ -138,7 +138,7 @@ def find_partners(engine: Engine, root: Path, files: Sequence[Path], count: int)
     )
     # The time is over, or the comparison failed twice. Then no image has partners.
     if known is None:
-        warn(f"the images of {files[0].parent} were not compared")
+        logger.warning(f"the images of {files[0].parent} were not compared")
     partners: PartnerIndices = [[] for _ in files] if known is None else known
     return partners
 
@@ -151,10 +151,10 @@ def find_overlaps(engine: Engine, root: Path, files: Sequence[Path]) -> list[tup
     )
     every = len(files) * (len(files) - 1) // 2
     if known is None:
-        warn(f"the images of {files[0].parent} were not compared; all pairs are matched")
+        logger.warning(f"the images of {files[0].parent} were not compared; all pairs are matched")
         return list(combinations(range(len(files)), 2))
     if len(known) < every:
-        say(f"{files[0].parent}: {len(known)} of {plural(every, 'pair')} may overlap")
+        logger.info(f"{files[0].parent}: {len(known)} of {plural(every, 'pair')} may overlap")
     return [(first, second) for first, second in known]
 
 

@@ -13,7 +13,7 @@ from tempfile import TemporaryDirectory
 
 from mkpc_kaggle.data.images import READ_SUFFIXES
 from mkpc_kaggle.data.outputs import lies_in, replacing, weights_of_environment
-from mkpc_kaggle.engine.console import warn
+from mkpc_kaggle.engine.console import logger
 from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.scene.align import REFERENCE
 from mkpc_kaggle.scene.export import (
@@ -233,4 +233,4 @@ def _remove(path: Path, out: Path) -> None:
         if folder.parts:
             with suppress(OSError):  # the folder is not empty
                 (out / folder).rmdir()
-    warn(f"{path} was removed: an earlier run made it, and this run does not")
+    logger.warning(f"{path} was removed: an earlier run made it, and this run does not")

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from mkpc_kaggle.data.competition import CONTROL
 from mkpc_kaggle.data.images import IMAGE_SUFFIXES, MORE_SUFFIXES, OTHER_SUFFIXES, READ_SUFFIXES
-from mkpc_kaggle.engine.console import warn
+from mkpc_kaggle.engine.console import logger
 from mkpc_kaggle.errors import UserError, plural, printable, read_text
 from mkpc_kaggle.reconstruction.directory import RESERVED
 
@@ -41,7 +41,7 @@ def read_folder(root: Path, *, join: bool = False) -> Datasets:
         _require_usable(folder, root, files, is_dataset=not join)
         datasets.setdefault("." if join else name, []).extend(files)
     for line in found.lines():
-        warn(line)
+        logger.warning(line)
     if not datasets:
         message = f"{root} has no images: name a folder with {', '.join(READ_SUFFIXES)} files"
         if found.unread:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from mkpc_kaggle.data.competition import read_rows
 from mkpc_kaggle.data.images import EXIF_FOCALS, read_size
-from mkpc_kaggle.engine.console import warn
+from mkpc_kaggle.engine.console import logger
 from mkpc_kaggle.errors import UserError, plural
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.intrinsics import KnownCamera, Rows, camera_of, parse_row
@@ -60,7 +60,7 @@ def read_intrinsics_table(file: Path, root: Path, images: Iterable[Path]) -> Row
         # A row may name thousands of images.
         if doubt and number not in warned:
             warned.add(number)
-            warn(doubt)
+            logger.warning(doubt)
     # A misspelt name would silently have no effect.
     for number, (pattern, _) in enumerate(rows):
         if number not in used:

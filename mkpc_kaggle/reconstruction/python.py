@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from mkpc_kaggle.data.images import Unreadable, has_usable_shape, read_image, read_size
 from mkpc_kaggle.data.masks import Masks
-from mkpc_kaggle.engine.console import warn
+from mkpc_kaggle.engine.console import logger
 from mkpc_kaggle.engine.plan.budget import Budget
 from mkpc_kaggle.engine.plan.state import name_below
 from mkpc_kaggle.engine.request import RunReport
@@ -140,7 +140,7 @@ def reconstruct(
         if work_dir is None:
             work_dir = closed.enter_context(temporary_directory())
         elif assembly.unversioned:
-            warn(
+            logger.warning(
                 f"the results of {', '.join(assembly.unversioned)} are not kept for later calls: "
                 "set MatcherSpec(version=...), and change it whenever equal pictures get other points"
             )
@@ -168,19 +168,19 @@ def reconstruct(
             raise UserError(reason)
         # The models are complete, but the next call computes results again.
         if result.report.unsaved:
-            warn(result.report.unsaved)
+            logger.warning(result.report.unsaved)
         for failure in unreadable_images(result.report.tables.pairs):
-            warn(f"cannot be read: {failure}")
+            logger.warning(f"cannot be read: {failure}")
         for scene in result.report.scenes:
             for sentence in contradictions(scene):
-                warn(sentence)
+                logger.warning(sentence)
         # The models of an earlier call may lack images, and their files may be missing.
         if result.lost:
             reason = next(iter(result.lost.values()))
             raise UserError(f"no cameras: {reason}; the same call tries again")
         # An empty result without its reason would look like a success.
         for line in no_models(result.report):
-            warn(line)
+            logger.warning(line)
         names = {name_below(str(root), str(file)): name for file, name in given.items()}
         return Models(
             with_copies(
@@ -258,9 +258,9 @@ def with_priors(
     given = assembly.masks if masks is None else Masks.of_folder(Path(masks), root, files)
     if given.is_partial:
         for line in given.lines:
-            warn(line)
+            logger.warning(line)
     if cameras and has_gaps(cameras, root, files):
-        warn(intrinsics_line(cameras, root, files))
+        logger.warning(intrinsics_line(cameras, root, files))
     return replace(assembly, recipe=for_cameras(assembly.recipe), masks=given, cameras=cameras)
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine.console import warn
+from mkpc_kaggle.engine.console import logger
 from mkpc_kaggle.engine.plan.state import State, name_below
 from mkpc_kaggle.engine.request import RunReport
 from mkpc_kaggle.engine.scenes import scene_failures
@@ -126,7 +126,9 @@ def reconstruct_folder(
         # An earlier run's models, from other images, do not belong to tables without cameras.
         for batch in state.batches:
             if batch not in state.scenes and remove_files(exports[batch], former[batch]):
-                warn(f"{batch}: this run has no cameras; the models of an earlier run were removed")
+                logger.warning(
+                    f"{batch}: this run has no cameras; the models of an earlier run were removed"
+                )
         lost = {batch: str(failure) for batch, failure in scene_failures(state).items()}
     held = {name: exports[batches[name]] for name in datasets}
     return FolderResult(report, tuple(pairs), standing[0], lost, held)

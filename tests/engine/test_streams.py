@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from mkpc_kaggle.engine.console import logger
+
 ROOT = Path(__file__).resolve().parents[2]
 # Workers import what they run, and not the program that starts them.
 LIBRARY = """
@@ -120,15 +122,15 @@ def test_output_of_native_code_is_printed_at_the_end(tmp_path):
 
 CLOSES = """
 import os, sys
-from mkpc_kaggle.engine.console import drain, say, unblocked
+from mkpc_kaggle.engine.console import drain, logger, unblocked
 
 with unblocked():
-    say("\u00e9")
+    logger.info("\u00e9")
     sys.stdout.buffer.write(b"bytes, ")
-    say("text")
+    logger.info("text")
     drain()
     os.close(sys.stdout.fileno())
-    say("lost")
+    logger.info("lost")
 """
 
 
@@ -159,3 +161,61 @@ with unblocked():
         [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False
     )
     assert (done.returncode, done.stdout, done.stderr) == (0, "of the program\n", "")
+
+
+UNREAD = """
+from mkpc_kaggle.engine.console import drain, leave, logger, unblocked
+
+with unblocked():
+    for number in range(20_000):
+        logger.warning("pair %d of 20000 %s", number, 100 * "x")
+    logger.info("all 20,000 lines")
+    leave(0, seconds=0.5)
+"""
+
+
+def test_a_stderr_that_is_not_read_holds_back_neither_the_program_nor_stdout():
+    reader, pipe = os.pipe()
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-c", UNREAD]
+    done = subprocess.run(
+        command, stdout=subprocess.PIPE, stderr=pipe, env=environment, check=False, timeout=300
+    )
+    os.close(pipe)
+    assert (done.returncode, done.stdout) == (0, b"all 20,000 lines\n")
+    with os.fdopen(reader, "rb") as unread:
+        lines = unread.read().splitlines()
+    # What fits into a pipe, in order and whole but for the last line.
+    assert len(lines) > 100
+    for number, line in enumerate(lines[:-1]):
+        assert line == b"warning: pair %d of 20000 %s" % (number, 100 * b"x")
+
+
+SLOW = """
+import os
+os.set_blocking(2, False)
+from mkpc_kaggle.engine.console import drain, logger, unblocked
+
+with unblocked():
+    for number in range(900):
+        logger.warning("line %d of a non-blocking pipe %s", number, 100 * "x")
+    drain(60)
+"""
+
+
+def test_a_pipe_that_the_parent_program_made_non_blocking_loses_no_line():
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-c", SLOW]
+    done = subprocess.run(command, capture_output=True, env=environment, check=True, timeout=300)
+    lines = done.stderr.splitlines()
+    assert [line.split()[2] for line in lines] == [b"%d" % number for number in range(900)]
+
+
+def test_messages_have_their_level_and_go_to_the_streams_of_the_moment(capsys):
+    logger.info("pairs: %d", 3)
+    logger.warning("a mask fits no image")
+    logger.error("no such file")
+    assert capsys.readouterr() == (
+        "pairs: 3\n",
+        "warning: a mask fits no image\nerror: no such file\n",
+    )
