@@ -43,7 +43,8 @@ from mkpc_kaggle.evaluation.validate import error_of
 from mkpc_kaggle.geometry.coordinates import Matrix3
 from mkpc_kaggle.geometry.focal_prior import FocalConfig, FocalPrior, estimate_with_prior
 from mkpc_kaggle.geometry.metrics import PoseError, pair_accuracy
-from mkpc_kaggle.geometry.robust import Estimate, RobustConfig, estimate
+from mkpc_kaggle.geometry.robust import Estimate, RobustConfig, estimate, sampson_distances
+from mkpc_kaggle.geometry.two_view import robust_costs
 from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
 from mkpc_kaggle.recipe import SceneConfig, recipe_of
 from mkpc_kaggle.scene.densify import extra_pairs
@@ -53,6 +54,7 @@ from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair, tracks_of
 MIN_COVISIBILITY = 0.1  # of a scored pair, as in the competition
 MAGSAC = RobustConfig(permutations=1)  # with a prior, the permutations are starts of a search
 FOCAL = FocalConfig()
+LIGHT = FocalConfig(scale=0.25)  # of the recipe `light`
 # Names of estimates.
 OWN = "own F"
 SCENE = "scene"
@@ -76,11 +78,29 @@ class Known:
 Estimator: TypeAlias = Callable[[Sequence[Known], Sequence[Known]], Sequence[Matrix3 | None]]
 
 
-def with_prior(found: PairMatch, magsac: RobustConfig = MAGSAC) -> Estimate:
+def with_prior(
+    found: PairMatch, magsac: RobustConfig = MAGSAC, focal: FocalConfig = FOCAL
+) -> Estimate:
     """Estimate F with a prior that knows the images' sizes only, not their EXIF."""
     size0, size1 = found.sizes
     priors = (FocalPrior.of_image(size0), FocalPrior.of_image(size1))
-    return estimate_with_prior(found.matches, priors, magsac, FOCAL)
+    return estimate_with_prior(found.matches, priors, magsac, focal)
+
+
+def cheapest_of_stages(found: PairMatch) -> Estimate:
+    """Return F of stage 1, of stage 2, or of both: the one with the lowest robust cost on all points."""
+    candidates = [with_prior(found, focal=LIGHT)]
+    for stage in (1, 2):
+        results = tuple(result for result in found.results if result.unit.stage == stage)
+        candidates.append(with_prior(replace(found, results=results), focal=LIGHT))
+
+    def cost(candidate: Estimate) -> float:
+        if not candidate.ok:
+            return np.inf
+        distances = sampson_distances(candidate.matrix, found.matches)
+        return float(robust_costs(distances, LIGHT.scale).sum())
+
+    return min(candidates, key=cost)
 
 
 def by_pair(make: Callable[[PairMatch], Estimate]) -> Estimator:
@@ -108,6 +128,8 @@ PAIR_ESTIMATORS: dict[str, Estimator] = {
     "MAGSAC, 8 permutations": by_pair(lambda found: estimate(found.matches, RobustConfig())),
     "MAGSAC": by_pair(lambda found: estimate(found.matches, MAGSAC)),
     "prior": by_pair(with_prior),
+    "prior of light": by_pair(partial(with_prior, focal=LIGHT)),
+    "cheapest of stages": by_pair(cheapest_of_stages),
     OWN: lambda pairs, _: [pair.F for pair in pairs],
 }
 
