@@ -369,7 +369,8 @@ class Engine:
         others = any(place.may_start(now) or place.is_starting for place in places)
         plan = work.match
         while plan is not None and idle:
-            if lost := different(idle[0].lost, asked.state.tries.given_up):
+            # Also losses that an item explains: two places that fail explain each other's.
+            if lost := different(idle[0].lost, ()):
                 trial = self._next_work(asked, now, lost)
                 plan = (trial.match if trial is not None else None) or plan
             # ``None``: the store cannot be read, and the job is planned again in other parts.

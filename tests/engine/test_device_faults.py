@@ -107,6 +107,8 @@ def assert_as_if_nothing_had_failed(report: RunReport, undisturbed: RunReport) -
     [
         # A broken CUDA context stays broken: each GPU fails from some pair on.
         [RectifiedMatcher(matches=breaks_after(2)), RectifiedMatcher(matches=breaks_after(3))],
+        # Each loses what another one lost, which must not look like faults of the pairs.
+        [RectifiedMatcher(matches=breaks_after(count)) for count in (1, 2, 2, 3)],
         [RectifiedMatcher(matches=lambda _: exhaust_gpu())],
     ],
 )
