@@ -25,7 +25,7 @@ submission. Without options, print an overview of one screen.
                inliers by chance), overlaps (whether the images overlap), plane (share of the inliers that
                one homography explains), flat (nearly all of them), number of candidates; cost of the result
                and of MAGSAC's own F, focal lengths. choice: why the F is the scene's, or not; units: the number of
-               units that ran or failed; error: what left the pair without an F, if not few matches
+               units that ran or failed; error: why the pair has no F, unless it has few matches
   units.csv    per unit and pair: matches, inliers, seconds, failure
   regions.csv  per image (0 or 1) and pair: the critical region's box and the reason for it
   events.csv   times of starts, plans, scenes, faults, ends

@@ -111,7 +111,7 @@ def save_for_hloc(match: PairMatch, files: tuple[Path, Path], path: Path) -> Non
     found = match.keypoints
     points = (found.points0, found.points1)
     indices = found.indices
-    # A match of a matcher without keypoints is a keypoint of its own.
+    # Each match of a matcher without keypoints is a separate keypoint.
     if (indices < 0).any():
         points = (match.matches.points0, match.matches.points1)
         indices = np.column_stack([np.arange(len(match.matches))] * 2)

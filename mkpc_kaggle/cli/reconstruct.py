@@ -106,7 +106,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     text = "also write keypoints and matches of all images to this file, in hloc's layout"
     add("--export", type=Path, metavar="FILE.h5", help=text)
-    text = "all images below DIR are one dataset, as those of a camera with several cards"
+    text = "all images below DIR are one dataset, such as the folders of one camera's cards"
     add("--join", action="store_true", help=text)
     add(
         "--format",

@@ -111,7 +111,7 @@ class EstimateJob:
 @dataclass(frozen=True, eq=False)
 class SceneJob:
     """Reconstruct a batch, from ``matches`` matches. ``export`` is for COLMAP's files, ``cameras`` are
-    those that the user knows.
+    the user's known cameras.
 
     A ``candidate`` other than the first has its own ``key``, and ``scene`` is the key of the first. A batch
     that has files is reconstructed as a whole, ``is_whole``, even by a job that writes none. ``with_estimates``,

@@ -534,7 +534,7 @@ class Engine:
             self.log.fault(f"{place.name}: {failure}")
         else:
             self.log.fault(f"a job was lost on {place.name}: {failure}")
-            # First the items: what they explain does not count against the place.
+            # First the items: a loss that they explain does not count against the place.
             self._handler(job).lose(job, failure)
             # A worker that reports an ordinary error works.
             if failure.cause is not Cause.RAISED:

@@ -40,7 +40,7 @@ class Ending(StrEnum):
 class Request:
     """A request for points, estimates and scenes of ``pairs``, whose images are below ``root``.
 
-    ``cameras`` are those of scenes that the user knows. ``exports`` are the directories for COLMAP's
+    ``cameras`` are the user's known cameras. ``exports`` are the directories for COLMAP's
     files, by batch. ``publish`` is called with the state, whose
     ``fundamentals``, ``scenes`` and ``digests`` are the results so far: at the start, every half minute (less
     often if slow), after each scene with files, and at the end. A trial is not the run's result: its table of

@@ -24,7 +24,7 @@ class When(StrEnum):
     """The pairs that stage 2 runs on."""
 
     ALWAYS = "always"  # all of them, as in the paper
-    SCALE = "scale"  # those that differ in scale, or whose detail a crop restores
+    SCALE = "scale"  # pairs of different scales, and pairs whose detail a crop restores
 
 
 @dataclass(frozen=True)

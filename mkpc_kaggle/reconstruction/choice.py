@@ -170,8 +170,8 @@ def compare_images(
     """Return what ``compare_features`` computes from the features of all images; ``None`` if that
     failed.
 
-    ``settings`` are those of one image's features, ``result_settings`` those of the result. Both
-    are in the keys of the stored results.
+    ``settings`` belong to one image's features, ``result_settings`` to the result. Both are in the
+    keys of the stored results.
     """
     # By contents, so that a folder that moved is not compared again
     names = [name_below(str(root), str(file)) for file in files]

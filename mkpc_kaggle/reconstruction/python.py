@@ -174,7 +174,7 @@ def reconstruct(
         for scene in result.report.scenes:
             for sentence in contradictions(scene):
                 logger.warning(sentence)
-        # The models of an earlier call may lack images, and their files may be missing.
+        # In the models of an earlier call, images may be missing, and so may their files.
         if result.lost:
             reason = next(iter(result.lost.values()))
             raise UserError(f"no cameras: {reason}; the same call tries again")

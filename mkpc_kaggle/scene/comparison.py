@@ -39,7 +39,7 @@ MAX_PRIOR_SIGMAS = 3.0  # of a prior
 MIN_DISPLACEMENT = 0.005
 MIN_LENS_IMAGES = 3  # of one size; a single weak camera fits any coefficient
 MIN_AGREEING = 0.8  # share of these images with at least half of the median displacement
-MAX_IMAGE_POINTS = 300  # per image, of the longest tracks; more cost time and tell the same
+MAX_IMAGE_POINTS = 300  # per image, of the longest tracks; more cost time and change nothing
 CLEAR_SIGMAS = 5.0  # smaller differences are noise
 LENS_SIGMA = 5.0  # percent, of the focal length in the row to give
 

@@ -1,6 +1,6 @@
 """Pairs of images that may overlap, by RootSIFT: to match fewer pairs of a folder.
 
-In a folder of different places, the few largest keypoints of two images tell whether they may
+In a folder of different places, the few largest keypoints of two images show whether they may
 overlap. In a large folder, VLAD descriptors give each image's most similar images.
 
 All recipes use RootSIFT: it needs no weights, works with dense matchers, and does not depend on the

@@ -93,7 +93,7 @@ class DistortedLens:
 
 @dataclass(frozen=True)
 class Comparison:
-    """What the photographs of a model contradict; see :mod:`mkpc_kaggle.scene.comparison`."""
+    """Assumptions that the photographs of a model contradict; see :mod:`mkpc_kaggle.scene.comparison`."""
 
     focals: tuple[FocalContradiction, ...] = ()
     lenses: tuple[DistortedLens, ...] = ()
@@ -118,7 +118,7 @@ class SfmModel:
     @property
     def centre_sigma(self) -> float:
         """The median sigma of the centres, in sizes of the model; infinite if the points do not
-        determine them, 0 if sigmas of so many images are not computed.
+        determine them, 0 for more than ``MAX_SIGMA_IMAGES`` images.
         """
         if not self.images or len(self.images) > MAX_SIGMA_IMAGES:
             return 0.0

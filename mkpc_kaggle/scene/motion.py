@@ -1,6 +1,6 @@
 """Motion of the camera between images: a camera that only turns shows no depth.
 
-The images of a pure rotation are related by the homography K1 R K0^-1, whatever the scene. Nothing
+The images of a pure rotation are related by the homography K1 R K0^-1, in any scene. Nothing
 can be triangulated from them, so positions of cameras are invented. Sources: Hartley and Zisserman
 2004, 8.4; Torr, Fitzgibbon and Zisserman 1999.
 """

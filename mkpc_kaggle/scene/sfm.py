@@ -82,7 +82,7 @@ def reconstruct_batch(
     With the recipe's prior ``focal``, a pair without an F from cameras is re-estimated at the scene's focal
     lengths, unless the pair contradicts the scene. ``magsac`` has default settings if ``None``. With a directory
     ``export``, the batch is reconstructed as a whole, and COLMAP's files are written there. With ``is_whole``, it
-    is reconstructed in the same way without files. ``cameras`` are those that the user knows. ``with_estimates``,
+    is reconstructed in the same way without files. ``cameras`` are the user's known cameras. ``with_estimates``,
     pairs come without their own F, and get estimates from their cameras.
 
     A missing result has a reason; bad matches never raise. Reconstruction takes seconds to minutes
@@ -319,7 +319,7 @@ def reconstruct_connected(
 
 
 def compared(merged: MergedGraph, reconstruction: Reconstruction) -> Reconstruction:
-    """Return the reconstruction, with what its photographs contradict."""
+    """Return the reconstruction with the assumptions that its photographs contradict."""
     # Certain cameras have moved.
     is_doubtful = (
         not reconstruction.models or reconstruction.models[0].centre_sigma > MAX_CENTRE_SIGMA

@@ -63,7 +63,7 @@ class Assembly:
     sharing: int = 1  # workers on the placement's device
     regions: GivenRegions = field(default_factory=dict)  # replace MKPC's regions
     masks: Masks = field(default_factory=Masks)
-    cameras: Rows = ()  # of images of scenes, as far as the user knows them
+    cameras: Rows = ()  # known ones of scenes, by the user
     # Stands for the version of a matcher without one, so that no later run has the same keys
     nonce: str = field(default_factory=lambda: uuid4().hex)
 

@@ -276,7 +276,7 @@ def plan_of(
 
 
 def first_pair(snapshot: Snapshot, order: NDArray[Any], missing: Mask) -> int:
-    """Return the first pair in an order, or one that tells a bad pair from a bad unit.
+    """Return the first pair in an order, or one that distinguishes a bad pair from a bad unit.
 
     A unit that never ran, and was lost on a pair, runs next on a pair where other units ran.
     """
@@ -316,7 +316,7 @@ def trial_plan(
     state = snapshot.state
     others = wanted.copy(order="F")
     others[state.matching] = NEVER
-    # No unit of such a pair: without points of stage 1, a crop is the whole image, on which the same
+    # No unit of a suspect pair: without points of stage 1, a crop is the whole image, on which the same
     # matcher fails in the same way.
     for index in suspect_pairs(state):
         others[index] = NEVER
@@ -343,7 +343,7 @@ def check_plan(snapshot: Snapshot, item: Item) -> MatchPlan:
 def unlike_plan(
     snapshot: Snapshot, wanted: NDArray[Any], lost: Sequence[frozenset[Item]]
 ) -> MatchPlan:
-    """Return a plan of another unit and another pair than the lost ones, as far as possible."""
+    """Return a plan of a unit and a pair that were not lost, if there are any."""
     state = snapshot.state
     lost_pairs = set()
     lost_units = set()
