@@ -383,7 +383,9 @@ def partners_of(pairs: "DataFrame") -> dict[str, list[tuple[str, int, int]]]:
         # A pair counts for both of its images.
         for file, other in ((image0, image1), (image1, image0)):
             partners.setdefault(file, []).append((Path(other).name, inliers, matches))
-    return {name: sorted(found, key=lambda each: -each[1]) for name, found in partners.items()}
+    return {
+        name: sorted(others, key=lambda partner: -partner[1]) for name, others in partners.items()
+    }
 
 
 def _picture(source: Pair | None, match: PairMatch) -> str:
@@ -417,14 +419,14 @@ def _scenes(log: RunLog) -> Iterator[tuple[object, ...]]:
     """
     pairs = log.tables.pairs
     counts = Counter(pairs["group"][pairs["source"] == "scene"])
-    for each in log.scenes:
-        focals = [found.focal for model in each.models for found in model.images]
+    for scene in log.scenes:
+        focals = [image.focal for model in scene.models for image in model.images]
         # A wide spread of focal lengths in photographs of one camera is a sign of wrong cameras.
         spread = f"{median(focals):.0f} ({min(focals):.0f} to {max(focals):.0f})" if focals else ""
         # Of each model: one of several may be wrong.
-        errors = ", ".join(f"{model.reprojection_error:.2f}" for model in each.models)
-        placed = each.batch, each.images, each.registered, each.points, spread, errors
-        yield (*placed, each.seconds, counts[each.batch], each.failure)
+        errors = ", ".join(f"{model.reprojection_error:.2f}" for model in scene.models)
+        placed = scene.batch, scene.images, scene.registered, scene.points, spread, errors
+        yield (*placed, scene.seconds, counts[scene.batch], scene.failure)
 
 
 def _data_uri(figure: "Figure", kind: str) -> str:

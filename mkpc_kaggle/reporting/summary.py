@@ -314,10 +314,10 @@ def weakest_cameras(scenes: Sequence[SceneRecord]) -> list[tuple[str, Sigmas | t
     Cameras with unknown sigmas are the most doubtful ones, so they come before all others.
     """
     # An image of several models has a camera in each.
-    placed = [found for scene in scenes for model in scene.models for found in model.images]
-    unknown = [(found.image.name, found.sigmas) for found in placed if not found.sigmas]
-    known = [(found.image.name, found.sigmas) for found in placed if found.sigmas]
-    return [*unknown, *sorted(known, key=lambda each: -each[1].centre)]
+    placed = [image for scene in scenes for model in scene.models for image in model.images]
+    unknown = [(image.image.name, image.sigmas) for image in placed if not image.sigmas]
+    certain = [(image.image.name, image.sigmas) for image in placed if image.sigmas]
+    return [*unknown, *sorted(certain, key=lambda camera: -camera[1].centre)]
 
 
 def _list(title: str, items: Sequence[str]) -> Iterator[str]:

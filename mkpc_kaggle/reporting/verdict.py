@@ -138,15 +138,15 @@ def _scene_problems(scene: SceneRecord, log: RunLog) -> Iterator[str]:
     if not has_moved(scene):
         yield from (f"{where}{sentence}" for sentence in contradictions(scene))
         return
-    cameras = [found.image for model in scene.models for found in model.images]
-    known = {image.name for image in cameras}
+    cameras = [image.image for model in scene.models for image in model.images]
+    names = {image.name for image in cameras}
     # Identical files share the camera of one of them.
     contents = {image.digest for image in cameras}
     pairs = log.tables.pairs
     pairs = pairs[pairs["group"] == scene.batch]
     # The record of a scene has no list of its images without a camera; its pairs name them.
     files = {*pairs["image0"], *pairs["image1"]}
-    lost = {file for file in files - known if log.digests.get(file) not in contents}
+    lost = {file for file in files - names if log.digests.get(file) not in contents}
     missing = sorted(Path(file).name for file in lost)
     if missing:
         yield f"{where}no camera for {named(missing)}: add photographs between these and the others"
@@ -160,12 +160,12 @@ def _scene_problems(scene: SceneRecord, log: RunLog) -> Iterator[str]:
         )
     uncertain = sorted(
         {
-            Path(found.image.name).name
+            Path(image.image.name).name
             for model in scene.models
             # A loose model has its own line.
             if not model.is_loose
-            for found in model.images
-            if _is_uncertain(found, model)
+            for image in model.images
+            if _is_uncertain(image, model)
         }
     )
     if uncertain:

@@ -60,7 +60,7 @@ class SceneRecord:
     def of(
         cls,
         batch: str,
-        found: Sequence[Reconstruction],
+        reconstructions: Sequence[Reconstruction],
         seconds: float = 0.0,
         choices: Mapping[str, Choice] | None = None,
         candidate: str = ALL_UNITS,
@@ -68,12 +68,14 @@ class SceneRecord:
         key: str = "",
         contents: Mapping[str, str] | None = None,
     ) -> "SceneRecord":
-        models = models_of(found)
-        reasons = dict.fromkeys(each.failure for each in found if each.failure)
+        models = models_of(reconstructions)
+        reasons = dict.fromkeys(
+            reconstruction.failure for reconstruction in reconstructions if reconstruction.failure
+        )
         return cls(
             batch,
-            images=sum(len(each.names) for each in found),
-            registered=sum(each.registered for each in found),
+            images=sum(len(reconstruction.names) for reconstruction in reconstructions),
+            registered=sum(reconstruction.registered for reconstruction in reconstructions),
             points=sum(len(model.points) for model in models),
             seconds=seconds,
             failure="" if models else "; ".join(reasons) or NO_CAMERAS,
