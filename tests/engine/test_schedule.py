@@ -459,6 +459,18 @@ def test_a_run_killed_at_any_moment_leaves_no_scene_out_of_date_when_it_resumes(
     assert units_of(ran) == 600
 
 
+def test_the_simulator_counts_no_time_as_wasted_in_which_there_is_nothing_to_do():
+    # The last pair costs each place its worker, and no other is needed while the scene is made.
+    lost = Scenario(20, (1.0,), 2, 300.0, batches=1, scene_seconds=60.0, bad=(18, 19))
+    ran = simulate(replace(lost, bad_fate=Cause.DIED))
+    assert ran.work_left
+    assert ran.utilisation > 0.95
+    # A run that waits for a bad pair until its end has done all other work.
+    waiting = simulate(Scenario(20, (1.0,), 2, 60.0, bad=(19,), bad_fate=Cause.TIMED_OUT))
+    assert waiting.report.ending is Ending.TIME_IS_UP
+    assert not waiting.work_left
+
+
 def test_time_reserved_for_scenes_is_used_for_units_when_they_need_less():
     ran = simulate(Scenario(600, (0.1, 0.2, 0.3), 1, 280.0, warm_up=1, batches=1))
     assert ran.work_left

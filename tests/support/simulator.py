@@ -252,8 +252,8 @@ class SimulatedSite(Site):
 
     Of their seconds until ``stop``, ``kept`` went into jobs that came back in time. ``faults`` are
     what injected faults take from any plan: the unit that a crash cut short, a hang for as long as
-    a stall takes, the start of a new worker. ``for_scenes`` are the seconds in which workers were
-    idle and a scene was under way.
+    a stall takes, a stall whose job is ended before its answer, the start of a new worker.
+    ``for_scenes`` are the seconds in which workers were idle and a scene was under way.
     """
 
     def __init__(self, scenario: Scenario, clock: VirtualClock, stop: float) -> None:
@@ -262,6 +262,7 @@ class SimulatedSite(Site):
         self.clock = clock
         self.stop = stop
         self.kept = self.faults = self.last_job = self.for_scenes = 0.0
+        self.starts = 0  # of workers of matching
         self.scenes: list[SceneRun] = []
         self.workers: set[SimulatedWorker] = set()
         names = [unit.name for unit in scenario.recipe.units]
@@ -309,8 +310,10 @@ class SimulatedSite(Site):
         assert moment < math.inf, "the engine waits for ever"
         moment = min(moment, self.clock.now + WAKE_S)
         if any(place.job for place in self.of(Work.SCENE)):
-            idle = sum(place.is_idle for place in self.of(Work.MATCH))
-            self.for_scenes += idle * max(0.0, min(moment, self.stop) - self.clock.now)
+            # After a loss, a place gets another worker only when there is work for it.
+            now = self.clock.now
+            idle = sum(place.is_idle or place.may_start(now) for place in self.of(Work.MATCH))
+            self.for_scenes += idle * max(0.0, min(moment, self.stop) - now)
         self.clock.now = max(self.clock.now, moment)
 
     def drift(self, now: float) -> float:
@@ -353,6 +356,7 @@ class SimulatedSite(Site):
         rng = self.rng
         begun = self.clock.now
         spent = 0.0
+        stalled = 0.0
         expected = dict(zip(job.units, job.expected, strict=True))
         if rng.random() < scenario.job_faults:
             fate = rng.integers(3)
@@ -371,8 +375,9 @@ class SimulatedSite(Site):
                 if spent + expected[unit] >= job.seconds:
                     continue  # as a real worker, which begins no unit that would end too late
                 slow = STALL if rng.random() < scenario.stalls else 1.0
-                took = slow * self.unit_seconds(unit, begun + spent)
-                took += scenario.warm_up * (unit.name not in warm)
+                undisturbed = self.unit_seconds(unit, begun + spent)
+                stalled += (slow - 1.0) * undisturbed
+                took = slow * undisturbed + scenario.warm_up * (unit.name not in warm)
                 fate = rng.random()
                 if fate < scenario.crashes or unit.matcher == scenario.never:
                     # In the middle of the unit, on average.
@@ -388,7 +393,7 @@ class SimulatedSite(Site):
                 warm.add(unit.name)
         images = [tuple(BatchImage(name, name, SIZE) for name in names) for names in job.names]
         files = [((0, 0), (0, 0))] * len(images)
-        return spent, tuple(map(Outcome, images, files, map(tuple, found))), 0.0
+        return spent, tuple(map(Outcome, images, files, map(tuple, found))), stalled
 
     def estimate(self, job: EstimateJob, rng: np.random.Generator | None = None) -> Drawn:
         """Draw an answer: each pair has from 20 to 79 inliers by its number."""
@@ -439,8 +444,14 @@ class SimulatedWorker:
         self._is_check = False  # whose result is not used
 
     def start(self) -> None:
-        self._site.workers.add(self)
-        self.ready = self._site.clock.now + self._start_s
+        site = self._site
+        site.workers.add(self)
+        self.ready = site.clock.now + self._start_s
+        if self._start_s:
+            site.starts += 1
+        # The first starts are no fault.
+        if site.starts > site.scenario.workers:
+            site.faults += max(0.0, min(self._start_s, site.stop - site.clock.now))
 
     def submit(self, job: Job) -> None:
         self._is_check = isinstance(job, MatchJob) and job.is_check
@@ -453,18 +464,30 @@ class SimulatedWorker:
         if site.clock.now < self.ready:
             return None
         if self._start_s and isinstance(self._answer, tuple):
-            if not self._is_check:
-                site.kept += max(0.0, min(self.ready, site.stop) - self._begun)
+            spent = max(0.0, min(self.ready, site.stop) - self._begun)
+            # The result of a check is not used. Its warm-up is, by the worker's next job.
+            site.kept += min(spent, self._warm_up_seconds()) if self._is_check else spent
             site.last_job = self.ready
         self.ready = math.inf
         return self._answer
+
+    def _warm_up_seconds(self) -> float:
+        """Return the seconds of the warm-ups in an answer."""
+        assert isinstance(self._answer, tuple)
+        count = 0
+        for outcome in self._answer:
+            assert isinstance(outcome, Outcome)
+            count += sum(result.warm_up for result in outcome.results)
+        return count * self._site.scenario.warm_up
 
     def kill(self) -> None:
         """End the worker, which died, hangs, or computes."""
         site = self._site
         site.workers.discard(self)
-        if self._start_s and isinstance(self._answer, Failure):
-            lost = min(self._fault, site.clock.now - self._begun) + RESTART_S
+        # A job that is ended before its answer may stall.
+        is_stalled = self._fault > 0 and self.ready < math.inf
+        if self._start_s and (is_stalled or isinstance(self._answer, Failure)):
+            lost = min(self._fault, site.clock.now - self._begun)
             site.faults += max(0.0, min(lost, site.stop - self._begun))
 
 
@@ -491,7 +514,8 @@ class Ran:
     ``unmatched`` are batches that the sweep did not reach. ``scenes_fit`` states that the largest reserve suffices
     for all scenes, and that none hung while others waited. ``stale`` are the batches whose scene is out of date.
     ``closed`` are places, and ``wrongly_closed`` the good ones of them. ``on_fallback`` counts jobs on the place
-    that takes over.
+    that takes over. ``work_left`` states that the run ended before all work was done: a unit of a good pair, or a
+    scene. Without it, a run has used what it needed, even if it waited for a bad pair until its end.
     """
 
     scenario: Scenario
@@ -510,10 +534,7 @@ class Ran:
     wrongly_closed: tuple[str, ...] = ()
     on_fallback: int = 0
     given_up: tuple[tuple[Any, ...], ...] = ()  # items
-
-    @property
-    def work_left(self) -> bool:
-        return not self.report.ending.is_done
+    work_left: bool = False
 
 
 def simulate(scenario: Scenario, store: Store | None = None, until: float = math.inf) -> Ran:
@@ -541,8 +562,11 @@ def simulate(scenario: Scenario, store: Store | None = None, until: float = math
         report = engine.report()
     state = engine.state
     # A bad pair can have no F, except on the place that takes over.
+    bad = list(scenario.fates)
     swept = state.has[: scenario.pairs].any(1)
-    swept[list(scenario.fates)] = True
+    swept[bad] = True
+    lacks_units = state.missing[: scenario.pairs].any(1)
+    lacks_units[bad] = False
     closed = [place for place in site.matching if place.closed]
     # A place that is closed has no time to use.
     site.faults += sum(max(0.0, site.stop - place.limit) for place in closed)
@@ -552,6 +576,7 @@ def simulate(scenario: Scenario, store: Store | None = None, until: float = math
     matches = zip(state.batches, state.matches_of_batches(), strict=True)
     matched = {batch for batch, count in matches if count}
     made = set(report.tables.pairs.query("choice != ''")["group"])
+    missed = matched - faulty - made
     return Ran(
         scenario,
         report,
@@ -559,7 +584,7 @@ def simulate(scenario: Scenario, store: Store | None = None, until: float = math
         max(0.0, clock.now - scenario.limit),
         sum(length != scenario.pairs for length in published)
         + (scenario.pairs - int(swept.sum()) if sweep_fits else 0),
-        len(matched - faulty - made),
+        len(missed),
         len(state.batches) - len(matched),
         SCENE_MARGIN * scenario.longest_scenes < RESERVE_SHARE * scenario.limit
         and not any(math.isinf(scene.seconds) for scene in site.scenes),
@@ -571,6 +596,7 @@ def simulate(scenario: Scenario, store: Store | None = None, until: float = math
         tuple(place.name for place in closed if place.name not in site.bad_names),
         site.on_fallback,
         tuple(state.tries.given_up),
+        bool(lacks_units.any() or missed),
     )
 
 
