@@ -69,6 +69,8 @@ def load_tensors(path: Path, device: str = "cpu") -> "dict[str, torch.Tensor]":
 def no_checkpoint(path: Path) -> str:
     """Return what a file is that is no checkpoint but came in the place of one; empty if unknown."""
     try:
+        if not path.is_file():  # a pipe would block
+            return ""
         with path.open("rb") as stream:
             start = stream.read(1 << 10).lstrip()
     except OSError:

@@ -107,6 +107,13 @@ def test_a_pointer_or_a_page_in_the_place_of_a_file_is_named(tmp_path, data, nam
     assert named in found.note
 
 
+@pytest.mark.timeout(60)
+def test_a_pipe_in_the_place_of_a_file_is_refused_and_does_not_block(tmp_path):
+    os.mkfifo(tmp_path / "x.pt")
+    with pytest.raises(UserError, match="not a regular file"):
+        load_tensors(tmp_path / "x.pt")
+
+
 @pytest.mark.filterwarnings("ignore::UserWarning")  # of torch, on prototypes
 @pytest.mark.parametrize("save", [torch.save, save_legacy])
 def test_anything_but_a_table_of_plain_tensors_is_refused(tmp_path, save):
