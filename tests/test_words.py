@@ -7,8 +7,6 @@ from pathlib import Path
 PACKAGE = Path(__file__).resolve().parents[1] / "mkpc_kaggle"
 # Each file is one network, whose constants have the names of its paper.
 NETWORKS = PACKAGE / "matchers" / "networks"
-# A wrapper of the engine's function, with a view of the scenes.
-WRAPPED = {"results"}
 
 
 def names_in(tree: ast.Module) -> tuple[set[str], set[str]]:
@@ -57,7 +55,7 @@ def test_no_function_and_no_constant_that_is_imported_elsewhere_is_defined_twice
                 imported |= {name.name for name in node.names}
     defined = defaultdict(set)
     for path, tree in trees.items():
-        for name in names_in(tree)[1] & (imported - WRAPPED):
+        for name in names_in(tree)[1] & imported:
             defined[name].add(str(path.relative_to(PACKAGE)))
     assert {name: files for name, files in defined.items() if len(files) > 1} == {}
 

@@ -21,7 +21,7 @@ from benchmarks.gpu.record import EXPECTED, Part
 from benchmarks.gpu.setup import Setup
 from benchmarks.gpu.trained import SLOTS
 from mkpc_kaggle.data.competition import read_test_side, submission_problems
-from mkpc_kaggle.engine.store.dataframes import results
+from mkpc_kaggle.engine.store.dataframes import read_results
 from mkpc_kaggle.weights import WeightStore
 
 UNITS = 2
@@ -228,7 +228,7 @@ def _run(case: Case, recipe: Path, setup: Setup, seconds: float, limit: int) -> 
     pairs = read_test_side(test_dir)
     good: dict[str, int] = {}  # results by pair
     with suppress(KeyError):  # no unit has a result
-        units = results(home / "submission.work").units
+        units = read_results(home / "submission.work").units
         good = units[units["failure"] == ""]["pair"].value_counts().to_dict()
     problems = submission_problems(output, [pair.id for pair in pairs])
     rows = "; ".join(map(str, problems))

@@ -2,8 +2,7 @@
 
 from pathlib import Path
 
-from mkpc_kaggle.engine.store.dataframes import Results
-from mkpc_kaggle.engine.store.dataframes import results as read_results
+from mkpc_kaggle.engine.store.dataframes import Results, read_results
 from mkpc_kaggle.reporting.view import SceneView
 
 

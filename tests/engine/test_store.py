@@ -35,7 +35,7 @@ from mkpc_kaggle.engine.run import EventLog, Run
 from mkpc_kaggle.engine.scenes import SceneWork
 from mkpc_kaggle.engine.store import database as store_module
 from mkpc_kaggle.engine.store.database import FILE_NAME, Store, connected, to_bytes
-from mkpc_kaggle.engine.store.dataframes import matrices_of, pair_tables, results
+from mkpc_kaggle.engine.store.dataframes import matrices_of, pair_tables, read_results
 from mkpc_kaggle.engine.store.image_files import stored_digests
 from mkpc_kaggle.engine.store.keys import Keys
 from mkpc_kaggle.engine.store.published import Published
@@ -222,7 +222,7 @@ def test_stored_results_are_read_after_reopening(whole: Room, tmp_path: Path) ->
 
 
 def test_results_are_data_frames_of_pairs_units_and_cameras(whole: Room, tmp_path: Path) -> None:
-    pairs, units, cameras = results(tmp_path)
+    pairs, units, cameras = read_results(tmp_path)
     assert pairs["pair"].tolist() == ["p0", "p1", "p2"]
     assert pairs["source"].tolist() == ["scene", "pair", "fallback"]
     assert pairs[["f11", "f33"]].iloc[0].tolist() == [3.0, 27.0]
@@ -638,7 +638,7 @@ def test_readers_in_a_loop_beside_a_run_work_or_have_one_line(pairs, undisturbed
     def loop(tables: Path) -> None:
         while not ended.is_set():
             try:
-                read.append(len(results(work).pairs))
+                read.append(len(read_results(work).pairs))
                 read_log(work)
                 write_csv(work, tables)
             except UserError as error:
@@ -686,7 +686,7 @@ def test_a_row_that_does_not_fit_its_digest_is_missing_and_computed_again(
     with warnings.catch_warnings(record=True):
         warnings.simplefilter("always")
         try:  # a reader has the other rows, or one line
-            results(tmp_path)
+            read_results(tmp_path)
             read_log(tmp_path)
         except UserError as error:
             assert "the run has not begun" in str(error)
@@ -698,7 +698,7 @@ def test_a_row_that_does_not_fit_its_digest_is_missing_and_computed_again(
     assert matrices(report) == matrices(undisturbed)
     again = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path)
     assert (again.faults, again.units_run, again.estimated) == ((), 0, 0)
-    assert len(results(tmp_path).units) == 36
+    assert len(read_results(tmp_path).units) == 36
 
 
 def edit(directory: Path, script: str) -> int:

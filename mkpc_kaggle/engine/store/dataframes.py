@@ -275,7 +275,7 @@ class PairTables(NamedTuple):
     estimates: "DataFrame"
 
 
-def results(directory: Path | str) -> Results:
+def read_results(directory: Path | str) -> Results:
     """Return the results in a work directory (NAME.work), during a run or after it.
 
     Raises :class:`UserError` if the store is missing, damaged, or of another format.
