@@ -2,7 +2,7 @@
 for missing ones.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from itertools import chain
 
 import numpy as np
@@ -31,7 +31,13 @@ def restore(state: State, store: Store, digests: Mapping[str, str]) -> None:
     known = [index for index in range(len(state.pairs)) if state.images_of(index)]
     contents = {index: state.contents(index) for index in known}
     old = {index: rows[text] for index, text in contents.items() if text in rows}
-    units = [name for name, _ in former.run.units]
+    former_number = {name: number for number, (name, _) in enumerate(former.run.units)}
+
+    def former_key(index: int, number: int) -> str:
+        """Return the key of a unit's former points on a pair, if there are any."""
+        unit = former_number.get(state.units[number].name)
+        return old[index].points[unit] if unit is not None and index in old else ""
+
     # An extra pair has points of the sweeping unit, and no estimate. The store may have more, of another
     # recipe, or of a run in which it was a row, and a scene must not depend on that.
     sweep = sweeping_unit(state)
@@ -46,32 +52,16 @@ def restore(state: State, store: Store, digests: Mapping[str, str]) -> None:
             for number in numbers
             if index < state.rows or number == sweep
         ]
-        _restore_points(state, store, wanted, _former_points(state, old, units, numbers))
+        _restore_points(state, store, wanted, former_key)
     _restore_estimates(state, store, own_rows, old)
     _restore_scenes(state, store, former, digests)
-
-
-def _former_points(
-    state: State,
-    old: Mapping[int, PublishedPair],
-    units: list[str],
-    numbers: list[int],
-) -> dict[tuple[int, int], str]:
-    """Return the keys of the former points of pairs and units, if any."""
-    found = {}
-    for index, row in old.items():
-        by_unit = dict(zip(units, row.points, strict=True))
-        for number in numbers:
-            if key := by_unit.get(state.units[number].name):
-                found[index, number] = key
-    return found
 
 
 def _restore_points(
     state: State,
     store: Store,
     wanted: list[tuple[int, int]],
-    former: Mapping[tuple[int, int], str],
+    former_key: Callable[[int, int], str],
 ) -> None:
     mkpc = state.request.recipe.mkpc
     # All keys first, because one query for thousands of keys is much faster than one for each.
@@ -80,7 +70,8 @@ def _restore_points(
         images = state.images_of(index)
         assert images
         today[index, number] = state.keys_of(index, number, images, state.first_stage(index))
-    points = store.get(UnitPoints, [*chain.from_iterable(today.values()), *former.values()])
+    points = store.get(UnitPoints, chain.from_iterable(today.values()))
+    former: dict[tuple[int, int], str] = {}
     for (index, number), keys in today.items():
         # Points that were found under another rule count if today's rule asks for them, too.
         stored = [
@@ -89,11 +80,15 @@ def _restore_points(
             if key in points
             and (not points[key].is_needed or pays(points[key].scale, points[key].detail, mkpc))
         ]
-        is_current = bool(stored)
-        # Points of former settings are better than none.
-        used = stored[0] if stored else former.get((index, number), "")
-        if used in points:
-            state.use_points(index, points[used], is_current=is_current)
+        if stored:
+            state.use_points(index, number, points[stored[0]])
+        elif key := former_key(index, number):
+            former[index, number] = key
+    # Points of former settings are better than none.
+    points = store.get(UnitPoints, former.values())
+    for (index, number), key in former.items():
+        if key in points:
+            state.use_points(index, number, points[key], is_current=False)
 
 
 def _restore_estimates(

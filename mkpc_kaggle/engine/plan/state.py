@@ -340,9 +340,10 @@ class State:
         """Use the images whose contents are known at the start, by name."""
         self.images.update(images)
 
-    def use_points(self, index: int, points: UnitPoints, *, is_current: bool = True) -> None:
+    def use_points(
+        self, index: int, unit: int, points: UnitPoints, *, is_current: bool = True
+    ) -> None:
         """Use a unit's points; none if the pair does not need the unit."""
-        unit = self.number_of[points.unit]
         self.points[index, unit] = points.key
         self.has[index, unit] = points.is_needed
         self.unneeded[index, unit] = not points.is_needed
@@ -354,7 +355,7 @@ class State:
         """Use the points of an answer."""
         before = self.keys_in_use(index)
         for points in found:
-            self.use_points(index, points)
+            self.use_points(index, self.number_of[points.unit], points)
         # Units that the pair does not need change nothing.
         if self.keys_in_use(index) != before:
             self._note_points(index)
