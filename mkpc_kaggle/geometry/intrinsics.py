@@ -83,6 +83,21 @@ class KnownCamera:
         return replace(self, parameters=tuple(values))
 
 
+@dataclass(frozen=True)
+class PlacedCamera(KnownCamera):
+    """A camera of a finished model: exact, and with a pose that no adjustment may move.
+
+    ``pose`` is COLMAP's: a unit quaternion (x, y, z, w) and t, with X_cam = R X + t.
+    """
+
+    pose: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if len(self.pose) != 7 or not all(map(isfinite, self.pose)) or self.sigma:
+            raise ValueError("a placed camera is exact, and its pose has seven finite numbers")
+
+
 Rows = Sequence[tuple[str, KnownCamera]]  # a name or a pattern of images, and their camera
 
 
@@ -102,13 +117,18 @@ def parse_row(pattern: str, model: str, parameters: str, sigma: str) -> tuple[st
 def camera_of(rows: Rows, name: str) -> KnownCamera | None:
     """Return the camera of the first row that names an image, or None.
 
-    A row names it by path, by file name, or by a pattern of these.
+    A row names it by path, by file name, or by a pattern of these; a placed camera by path alone.
     """
     # macOS writes "é" as two characters, and most tables as one.
     name = unicodedata.normalize("NFC", name)
     base = name.rpartition("/")[2]
     for written_pattern, known in rows:
         pattern = unicodedata.normalize("NFC", written_pattern)
+        # Another folder may have a photograph of the same name elsewhere.
+        if isinstance(known, PlacedCamera):
+            if pattern == name:
+                return known
+            continue
         # Equality first: a file may be called "photo [1].jpg", and as a pattern this is another.
         if pattern in (name, base):
             return known

@@ -23,6 +23,7 @@ from mkpc_kaggle.matchers.contract import Matcher
 from mkpc_kaggle.recipe import Recipe
 from mkpc_kaggle.reconstruction.folder import read_folder, require_distinct
 from mkpc_kaggle.reconstruction.panoramas import require_perspective
+from mkpc_kaggle.reconstruction.placed import read_placed
 from mkpc_kaggle.reconstruction.priors import (
     has_gaps,
     intrinsics_line,
@@ -69,6 +70,7 @@ def reconstruct(
     settings: Mapping[str, Any] = MappingProxyType({}),
     masks: str | Path | None = None,
     intrinsics: str | Path | None = None,
+    onto: str | Path | None = None,
     progress: bool = True,
     work_dir: str | Path | None = None,
 ) -> Models:
@@ -88,6 +90,9 @@ def reconstruct(
         relative to the common directory of the images.
     intrinsics : path, optional
         A table of known cameras, as for the command, whose images have the same paths.
+    onto : path, optional
+        A folder with a finished model of COLMAP, whose images have the same paths: they keep its
+        cameras, and the other images are registered among them.
     progress : bool
         Show the progress on the standard error stream.
     work_dir : path, optional
@@ -135,7 +140,7 @@ def reconstruct(
     require_readable(files)
     require_perspective(files)
     root = Path(os.path.commonpath([file.parent for file in files]))
-    assembly = with_priors(assembly, root, files, masks, intrinsics)
+    assembly = with_priors(assembly, root, files, masks, intrinsics, onto)
     with ExitStack() as closed:
         if work_dir is None:
             work_dir = closed.enter_context(temporary_directory())
@@ -250,6 +255,7 @@ def with_priors(
     files: Sequence[Path],
     masks: str | Path | None,
     intrinsics: str | Path | None,
+    onto: str | Path | None,
 ) -> Assembly:
     """Return the assembly for cameras, with the user's masks and intrinsics. Raises
     :class:`UserError` if they are unusable.
@@ -261,7 +267,9 @@ def with_priors(
             logger.warning(line)
     if cameras and has_gaps(cameras, root, files):
         logger.warning(intrinsics_line(cameras, root, files))
-    return replace(assembly, recipe=for_cameras(assembly.recipe), masks=given, cameras=cameras)
+    placed = () if onto is None else read_placed(Path(onto), root, {".": files})
+    recipe = for_cameras(assembly.recipe)
+    return replace(assembly, recipe=recipe, masks=given, cameras=(*placed, *cameras))
 
 
 def complete_model(model: SfmModel, folder: Path, names: Mapping[str, str]) -> SfmModel:

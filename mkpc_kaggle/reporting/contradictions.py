@@ -38,7 +38,7 @@ def _focal_sentence(found: FocalContradiction) -> str:
     return (
         f"the focal length of {found.given:.0f} px in EXIF contradicts the photographs, which fit "
         f"{found.fitted:.0f} px: {images}; the cameras have the latter. If they look wrong, give "
-        "--intrinsics or remove the focal length from EXIF"
+        "`mkpc reconstruct` --intrinsics, or remove the focal length from EXIF"
     )
 
 
@@ -51,8 +51,9 @@ def _lens_sentence(found: DistortedLens, *, is_everything: bool) -> str:
     return (
         f"the lens of {plural(len(found.images), 'photograph')} is distorted by "
         f"{100 * abs(found.displacement):.1f} % at the edge, and neither the cameras nor their expected errors "
-        f"include that: {images}; reconstruct again with --set scene.camera_model={camera.model}, or give "
-        f"--intrinsics with the row {first},{camera.model},{parameters},{camera.sigma:g}{others}"
+        f"include that: {images}; add --set scene.camera_model={camera.model} to `mkpc reconstruct`, or "
+        f"--intrinsics with the row {first},{camera.model},{parameters},{camera.sigma:g}{others}. F has no "
+        "distortion: for `mkpc submit`, undistort the photographs"
     )
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from mkpc_kaggle.geometry.intrinsics import KnownCamera
+from mkpc_kaggle.geometry.intrinsics import KnownCamera, PlacedCamera
 from mkpc_kaggle.scene.uncertainty import camera_sigmas
 
 # Limits for a point that two images see, close to those of COLMAP's incremental mapper for any point (4 pixels,
@@ -29,7 +29,7 @@ def adjust(model: Any, cameras: Mapping[str, KnownCamera]) -> None:
     """Set the cameras that the user knows in pycolmap's model; refine poses, points and other cameras
     by all tracks.
 
-    ``cameras`` is by image name; each of these images has its own camera.
+    ``cameras`` is by image name; each of these images has its own camera. Placed ones keep their poses.
     """
     remove_uncertain_points(model)
     placed = [
@@ -46,9 +46,14 @@ def adjust(model: Any, cameras: Mapping[str, KnownCamera]) -> None:
     config = pycolmap.BundleAdjustmentConfig()
     for number in sorted(model.reg_image_ids()):
         config.add_image(number)
-    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     for image in placed:
         config.set_constant_cam_intrinsics(image.camera_id)
+    held = [image for image in placed if isinstance(cameras[image.name], PlacedCamera)]
+    for image in held:
+        config.set_constant_rig_from_world_pose(image.frame_id)
+    # Cameras that are held fix the world.
+    if not held:
+        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     options = robust_options()
     adjuster: Any = pycolmap.create_default_ceres_bundle_adjuster(options, config, model)
     adjuster.solve()

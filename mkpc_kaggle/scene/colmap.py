@@ -44,7 +44,7 @@ from mkpc_kaggle.scene.models import (
 )
 from mkpc_kaggle.scene.shared_intrinsics import SharedIntrinsics, start_focal
 from mkpc_kaggle.scene.uncertainty import camera_sigmas
-from mkpc_kaggle.scene.view_graph import MIN_MATCHES, ViewGraph, known_by_name
+from mkpc_kaggle.scene.view_graph import MIN_MATCHES, ViewGraph, known_by_name, placed_by_name
 
 CENTRE_PX = 0.5  # in COLMAP the top-left pixel's centre is (0.5, 0.5), here it is (0, 0)
 # Of a verified match; 1 px loses accuracy on tourist photographs, 4 px on repeated windows
@@ -75,7 +75,7 @@ def structure_from_motion(
     Each image has its own camera, except images with ``shared`` intrinsics. The initial focal
     length is the shared one, the user's or EXIF's. All focal lengths are refined, unless the user
     knows them exactly. With ``former`` models of the same graph, their poses are refined instead of
-    computed again.
+    computed again. Placed cameras stay, and the other images are registered among them.
     """
     # Its warnings about single images would fill the log.
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
@@ -83,7 +83,9 @@ def structure_from_motion(
     with pycolmap.Database.open(":memory:") as database:
         # The refinement reads the verified matches alone; the mapper reads relative poses, too.
         _fill(database, merged, shared, config, reuse=bool(former))
-        if former:
+        if placed_by_name(merged.graph):
+            models = [register_onto(database, merged.graph, config.threads)]
+        elif former:
             models = refine_models(database, merged.graph, config.threads, former)
         else:
             models = run_mapper(database, merged.graph, config.threads)
@@ -335,27 +337,94 @@ def _refine(cache: Any, former: Any, settings: Any) -> Any:
     for number in sorted(former.reg_frame_ids()):
         model.frame(number).rig_from_world = former.frame(number).rig_from_world
         model.register_frame(number)
-    mapper = pycolmap.IncrementalMapper(cache)
-    mapper.begin_reconstruction(model)
-    for image in sorted(model.reg_image_ids()):
-        mapper.triangulate_image(settings.retriangulation, image)
-    options = pycolmap.IncrementalMapperOptions(
-        {"random_seed": SEED, "num_threads": settings.num_threads}
-    )
-    # While points come and go, least squares of all tracks; the mapper's robust loss comes last.
-    solver = {"num_threads": settings.num_threads, "max_num_iterations": ADJUSTMENT_ITERATIONS}
-    least_squares = pycolmap.BundleAdjustmentOptions(
-        {"print_summary": False, "ceres": {"use_gpu": False, "solver_options": solver}}
-    )
-    mapper.iterative_global_refinement(
-        MAX_REFINEMENTS, MIN_CHANGE, options, least_squares, settings.retriangulation
-    )
-    _filter_points(mapper.observation_manager, model, settings)
+    options = _incremental_options(settings)
+    mapper = _mapper_of(cache, model, settings)
+    _refine_all(mapper, options, settings)
     mapper.adjust_global_bundle(options, settings.bundle_adjustment)
     _filter_points(mapper.observation_manager, model, settings)
     mapper.end_reconstruction(False)
     model.update_point_3d_errors()
     return model
+
+
+def register_onto(database: Any, graph: ViewGraph, threads: int) -> Any:
+    """Return pycolmap's model of a filled database with the placed cameras as they are, and with the
+    images that the incremental mapper registers among them.
+    """
+    cache_options = pycolmap.DatabaseCacheOptions({"min_num_matches": MIN_MATCHES})
+    cache = pycolmap.DatabaseCache.create(database, cache_options)
+    settings = _mapper_options(graph, threads)
+    model = pycolmap.Reconstruction()
+    model.load(cache)
+    placed = placed_by_name(graph)
+    held = set()
+    for number, image in enumerate(graph.images, start=1):
+        if image.name in placed:
+            x, y, z, w, *t = placed[image.name].pose
+            rotation = pycolmap.Rotation3d(np.array([x, y, z, w]))
+            model.frame(number).rig_from_world = pycolmap.Rigid3d(rotation, np.array(t))
+            model.register_frame(number)
+            held.add(model.images[number].camera_id)
+        elif not image.focal:
+            # The points that it sees determine its focal length better than a guess.
+            model.cameras[model.images[number].camera_id].has_prior_focal_length = False
+    options = _incremental_options(settings)
+    options.fix_existing_frames = True
+    options.constant_cameras = held
+    mapper = _mapper_of(cache, model, settings)
+    # The best image first; each one adds points for the next.
+    while True:
+        candidates = mapper.find_next_images(options, False)
+        new = next(
+            (number for number in candidates if mapper.register_next_image(options, number)), None
+        )
+        if new is None:
+            break
+        mapper.triangulate_image(settings.retriangulation, new)
+        mapper.adjust_global_bundle(options, _least_squares(settings))
+    _refine_all(mapper, options, settings)
+    mapper.end_reconstruction(False)
+    model.update_point_3d_errors()
+    return model
+
+
+def _mapper_of(cache: Any, model: Any, settings: Any) -> Any:
+    """Return an incremental mapper that continues a model, with the points of its images."""
+    mapper = pycolmap.IncrementalMapper(cache)
+    mapper.begin_reconstruction(model)
+    for image in sorted(model.reg_image_ids()):
+        mapper.triangulate_image(settings.retriangulation, image)
+    return mapper
+
+
+def _refine_all(mapper: Any, options: Any, settings: Any) -> None:
+    """Adjust cameras and points in turn with the choice of points, until a model has converged."""
+    mapper.iterative_global_refinement(
+        MAX_REFINEMENTS,
+        MIN_CHANGE,
+        options,
+        _least_squares(settings),
+        settings.retriangulation,
+        # Cameras that are held fix the world.
+        normalize_reconstruction=not options.fix_existing_frames,
+    )
+    _filter_points(mapper.observation_manager, mapper.reconstruction, settings)
+
+
+def _incremental_options(settings: Any) -> Any:
+    return pycolmap.IncrementalMapperOptions(
+        {"random_seed": SEED, "num_threads": settings.num_threads}
+    )
+
+
+def _least_squares(settings: Any) -> Any:
+    """Return the options of an adjustment while points come and go: least squares of all tracks; the
+    robust loss comes last.
+    """
+    solver = {"num_threads": settings.num_threads, "max_num_iterations": ADJUSTMENT_ITERATIONS}
+    return pycolmap.BundleAdjustmentOptions(
+        {"print_summary": False, "ceres": {"use_gpu": False, "solver_options": solver}}
+    )
 
 
 def _filter_points(observations: Any, model: Any, settings: Any) -> None:
@@ -376,7 +445,8 @@ def _reconstruction(mapped: Sequence[Any], graph: ViewGraph) -> Reconstruction:
     if given_cameras or len(graph.images) <= LARGE:
         for model in mapped:
             adjust(model, given_cameras)
-    models = filter_models([_sfm_model(model, graph) for model in mapped])
+    found = [_sfm_model(model, graph) for model in mapped]
+    models = filter_models(found, placed_by_name(graph).keys())
     return Reconstruction(
         graph.names, models, "" if models else "the matches gave no plausible model"
     )

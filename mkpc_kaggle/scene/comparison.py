@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pycolmap
 
-from mkpc_kaggle.geometry.intrinsics import KnownCamera
+from mkpc_kaggle.geometry.intrinsics import KnownCamera, PlacedCamera
 from mkpc_kaggle.scene.adjustment import robust_options
 from mkpc_kaggle.scene.models import (
     MAX_SIGMA_IMAGES,
@@ -127,6 +127,9 @@ def _given_focals(
 ) -> Iterable[FocalContradiction]:
     """Yield the user's cameras with a focal length that the photographs contradict."""
     for camera in dict.fromkeys(given_cameras.values()):
+        # Nobody can correct the cameras of a finished model here.
+        if isinstance(camera, PlacedCamera):
+            continue
         alike = [
             freed_image
             for freed_image in freed

@@ -1,6 +1,6 @@
 """Results of a reconstruction: cameras and points, without implausible cameras."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Any, NamedTuple
@@ -161,11 +161,16 @@ class Reconstruction:
         return sum(found.points for model in self.models for found in model.images)
 
 
-def filter_models(models: Sequence[SfmModel]) -> tuple[SfmModel, ...]:
+def filter_models(models: Sequence[SfmModel], placed: Collection[str] = ()) -> tuple[SfmModel, ...]:
     """Remove implausible cameras, then models with too few images. Return the rest, the largest
-    first.
+    first. Images with ``placed`` cameras, by name, stay.
     """
-    cleaned = [replace(model, images=tuple(filter(is_plausible, model.images))) for model in models]
+    cleaned = []
+    for model in models:
+        images = [
+            found for found in model.images if found.image.name in placed or is_plausible(found)
+        ]
+        cleaned.append(replace(model, images=tuple(images)))
     kept = [model for model in cleaned if len(model.images) >= MIN_IMAGES]
     return tuple(sorted(kept, key=lambda model: (-len(model.images), -len(model.points))))
 

@@ -37,7 +37,13 @@ from mkpc_kaggle.scene.shared_intrinsics import (
     shared_intrinsics,
     undecided_zooms,
 )
-from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair, ViewGraph, known_by_name
+from mkpc_kaggle.scene.view_graph import (
+    BatchImage,
+    BatchPair,
+    ViewGraph,
+    known_by_name,
+    placed_by_name,
+)
 
 MIN_PAIRS_PER_IMAGE = 1.35  # connected pairs; with fewer, cameras are poorly constrained
 # Not re-estimated at other focal lengths
@@ -161,8 +167,9 @@ def reconstruct_sharing(
     if directory is not None:
         from mkpc_kaggle.scene.colmap import write_files
 
-        # Before the files are written, so that files and results agree
-        reconstructions = align(reconstructions, read_reference(directory.path))
+        # Before the files are written, so that files and results agree. Placed cameras have a world.
+        if not placed_by_name(graph):
+            reconstructions = align(reconstructions, read_reference(directory.path))
         write_files(directory, parts[0], shared, models_of(reconstructions), config)
     # Images without a camera have the refined focal length, and not the one it began with.
     if given:

@@ -8,7 +8,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from mkpc_kaggle.geometry.coordinates import Matrix3, Size
-from mkpc_kaggle.geometry.intrinsics import KnownCamera, Rows, camera_of
+from mkpc_kaggle.geometry.intrinsics import KnownCamera, PlacedCamera, Rows, camera_of
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.pipeline.pair import UnitResult
 
@@ -151,4 +151,13 @@ def known_by_name(graph: ViewGraph) -> dict[str, KnownCamera]:
         image.name: graph.known[image.digest]
         for image in graph.images
         if image.digest in graph.known
+    }
+
+
+def placed_by_name(graph: ViewGraph) -> dict[str, PlacedCamera]:
+    """Return the cameras of a finished model, which stay where they are, by image name."""
+    return {
+        name: camera
+        for name, camera in known_by_name(graph).items()
+        if isinstance(camera, PlacedCamera)
     }

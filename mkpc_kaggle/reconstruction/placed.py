@@ -1,0 +1,106 @@
+"""The cameras of a finished model, for new photographs that are registered among them.
+
+The parent process reads COLMAP's files itself, since pycolmap may end a process. Source: COLMAP's
+description of its binary format.
+"""
+
+import struct
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path, PurePosixPath
+
+from mkpc_kaggle.errors import UserError, plural
+from mkpc_kaggle.geometry.intrinsics import LENS_MODELS, PlacedCamera, Rows
+
+CAMERAS = "cameras.bin"
+IMAGES = "images.bin"
+COUNT = struct.Struct("<Q")
+CAMERA = struct.Struct("<IiQQ")  # id, model, width, height
+IMAGE = struct.Struct("<I7dI")  # id, quaternion (w, x, y, z), t, id of the camera
+KEYPOINT_BYTES = 24  # x, y, and the point that it sees
+# By COLMAP's numbers; those between them are no perspective lenses.
+MODEL_NAMES = dict(zip((0, 1, 2, 3, 4, 6), LENS_MODELS, strict=True))
+MIN_PLACED = 2  # images of the model in the folder; one has no points
+
+
+def read_placed(folder: Path, root: Path, datasets: Mapping[str, Sequence[Path]]) -> Rows:
+    """Return a row for each image of the only dataset that COLMAP's model in ``folder`` has.
+
+    The model names images by their path below ``root`` or below the dataset. Raises
+    :class:`UserError` for other files, and if fewer than two images are found.
+    """
+    if len(datasets) != 1:
+        raise UserError(
+            f"--onto {folder} is for one dataset, and {root} has {len(datasets)}: name one of its "
+            "folders, or add --join"
+        )
+    ((dataset, files),) = datasets.items()
+    cameras = read_cameras(folder)
+    rows = []
+    for file in files:
+        path = PurePosixPath(file.relative_to(root).as_posix())
+        names = (str(path), str(path.relative_to(dataset)))
+        found = next((cameras[name] for name in names if name in cameras), None)
+        if found is not None:
+            rows.append((str(path), found))
+    if len(rows) < MIN_PLACED:
+        first = min(cameras, default="")
+        example = f", such as {first}" if first else ""
+        raise UserError(
+            f"--onto {folder}: {plural(len(rows), 'image')} of {root} of the model's "
+            f"{plural(len(cameras), 'image')}{example}. The photographs of the model are needed, too, "
+            "since new ones are matched with them"
+        )
+    return tuple(rows)
+
+
+def placed_line(rows: Rows, folder: Path, files: Sequence[Path], root: Path) -> str:
+    """Return a line on the images that keep the cameras of a model."""
+    names = {name for name, _ in rows}
+    new = [file for file in files if file.relative_to(root).as_posix() not in names]
+    line = f"onto {folder}: {len(rows)} of {plural(len(files), 'image')} keep the model's cameras"
+    return line + (f"; the first new one is {new[0].relative_to(root)}" if new else "; none is new")
+
+
+def read_cameras(folder: Path) -> dict[str, PlacedCamera]:
+    """Return the cameras of COLMAP's binary model by image name. Raises :class:`UserError`."""
+    try:
+        lenses = dict(_lenses((folder / CAMERAS).read_bytes()))
+        return dict(_images((folder / IMAGES).read_bytes(), lenses))
+    except OSError as error:
+        raise UserError(
+            f"--onto {folder}: {error.filename} cannot be read: {error.strerror}; name a folder such as "
+            "OUT/models/0 with COLMAP's binary files"
+        ) from error
+    except (struct.error, ValueError, KeyError, IndexError) as error:
+        raise UserError(f"--onto {folder} is no model of COLMAP: {error}") from error
+
+
+def _lenses(data: bytes) -> Iterator[tuple[int, tuple[str, tuple[float, ...]]]]:
+    """Yield each camera's number, with the name of its model and its parameters."""
+    (count,) = COUNT.unpack_from(data)
+    at = COUNT.size
+    for _ in range(count):
+        number, model, _, _ = CAMERA.unpack_from(data, at)
+        if model not in MODEL_NAMES:
+            raise ValueError(f"a camera has model {model}; known: {', '.join(LENS_MODELS)}")
+        name = MODEL_NAMES[model]
+        parameters = struct.Struct(f"<{len(LENS_MODELS[name])}d")
+        yield number, (name, parameters.unpack_from(data, at + CAMERA.size))
+        at += CAMERA.size + parameters.size
+
+
+def _images(
+    data: bytes, lenses: Mapping[int, tuple[str, tuple[float, ...]]]
+) -> Iterator[tuple[str, PlacedCamera]]:
+    """Yield each image's name and camera."""
+    (count,) = COUNT.unpack_from(data)
+    at = COUNT.size
+    for _ in range(count):
+        _, w, x, y, z, *t, camera = IMAGE.unpack_from(data, at)
+        at += IMAGE.size
+        end = data.index(b"\0", at)
+        name = data[at:end].decode("utf-8")
+        (points,) = COUNT.unpack_from(data, end + 1)
+        at = end + 1 + COUNT.size + points * KEYPOINT_BYTES
+        model, parameters = lenses[camera]
+        yield name, PlacedCamera(model, parameters, pose=(x, y, z, w, *t))

@@ -1,0 +1,166 @@
+"""New photographs are registered in a finished model, whose cameras stay as they are."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from shared import run_command
+from test_reconstruct import FIRST, RECIPE, MixedMatcher, write_flat
+
+from mkpc_kaggle import reconstruct
+from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.geometry.intrinsics import PlacedCamera, camera_of
+from mkpc_kaggle.reconstruction.placed import placed_line, read_cameras, read_placed
+from mkpc_kaggle.scene.align import find_similarity, model_size, moved_by
+
+OLD = 4  # images of the finished model
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory) -> Path:
+    """Six images of a scene in ``images``, and a model of the first four in ``old``."""
+    home = tmp_path_factory.mktemp("onto")
+    files = sorted(write_flat(home / "images", FIRST).iterdir())
+    made(files[:OLD], home / "old")
+    # COLMAP's models have no fixed scale and origin, and neither need those of others.
+    model = pycolmap.Reconstruction(home / "old" / "colmap" / "models" / "0")
+    turned = pycolmap.Rotation3d(np.array([0.1, -0.2, 0.3, 0.9]))
+    model.transform(pycolmap.Sim3d(2.5, turned, np.array([30.0, -4.0, 7.0])))
+    (home / "model").mkdir()
+    model.write(home / "model")
+    return home
+
+
+def made(files, work: Path, **options):
+    given = {"synthetic": MixedMatcher()}
+    options = {"device": "cpu", "progress": False, "work_dir": work, "matchers": given} | options
+    return reconstruct(files, RECIPE, **options)
+
+
+def numbers_of(folder: Path) -> dict:
+    """Each image's pose and camera as they are stored."""
+    model = pycolmap.Reconstruction(folder)
+    return {
+        image.name: (
+            image.cam_from_world().params.tolist(),
+            image.camera.model_name,
+            image.camera.params.tolist(),
+        )
+        for image in model.images.values()
+        if image.has_pose
+    }
+
+
+def test_new_images_are_registered_and_no_other_camera_changes(home, tmp_path):
+    files = sorted((home / "images").iterdir())
+    (model,) = made(files, tmp_path / "new", onto=home / "model")
+    before = numbers_of(home / "model")
+    after = numbers_of(tmp_path / "new" / "colmap" / "models" / "0")
+    assert len(before) == OLD
+    assert len(after) == FIRST
+    assert {name: after[name] for name in before} == before
+    # The new cameras are those of the scene, in the world of the model.
+    truth = {f"{number:02}.png": camera for number, camera in enumerate(cameras_of_scene())}
+    found = {Path(image.image.name).name: image.camera for image in model.images}
+    assert found.keys() == truth.keys()
+    similarity = find_similarity(
+        [truth[name] for name in sorted(before)], [found[name] for name in sorted(before)]
+    )
+    new = sorted(found.keys() - before.keys())
+    targets = [similarity.of_camera(truth[name]) for name in new]
+    size = model_size([found[name] for name in sorted(before)])
+    assert moved_by([found[name] for name in new], targets).max() < 0.02 * size
+    for name, target in zip(new, targets, strict=True):
+        cosine = (np.trace(found[name].R.T @ target.R) - 1) / 2
+        assert np.degrees(np.arccos(min(1, cosine))) < 0.5
+
+
+def cameras_of_scene():
+    scene = MixedMatcher().scenes[0]
+    return [scene.cameras[name] for name in sorted(scene.cameras)]
+
+
+def test_the_command_reads_the_model_first(home, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(home)
+    command = ["reconstruct", "images", "--out", tmp_path / "out", "--onto", "images"]
+    assert run_command(*command) == 2
+    assert "--onto images: images/cameras.bin cannot be read" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_line_counts_the_images_that_keep_their_cameras(home):
+    files = sorted((home / "images").iterdir())
+    rows = read_placed(home / "model", home / "images", {".": files})
+    line = placed_line(rows, Path("model"), files, home / "images")
+    assert line == "onto model: 4 of 6 images keep the model's cameras; the first new one is 04.png"
+
+
+def test_a_camera_is_placed_by_its_path_alone():
+    camera = PlacedCamera("SIMPLE_PINHOLE", (500.0, 320, 240), pose=(0, 0, 0, 1, 0, 0, 0))
+    rows = [("a.jpg", camera), ("b[1].jpg", camera)]
+    assert camera_of(rows, "a.jpg") is camera
+    assert camera_of(rows, "b[1].jpg") is camera
+    # Other photographs that only a pattern or a file name would name
+    for name in ("left/a.jpg", "b1.jpg"):
+        assert camera_of(rows, name) is None
+    with pytest.raises(ValueError, match="seven finite numbers"):
+        PlacedCamera("SIMPLE_PINHOLE", (500.0, 320, 240), pose=(0, 0, 0, 1))
+
+
+def test_a_model_is_read_as_pycolmap_reads_it(home):
+    for name, camera in read_cameras(home / "model").items():
+        assert numbers_of(home / "model")[name] == (
+            list(camera.pose),
+            camera.model,
+            list(camera.parameters),
+        )
+
+
+def test_names_of_a_model_may_be_below_the_dataset(home):
+    files = sorted((home / "images").iterdir())
+    (row, *_) = read_placed(home / "model", home, {"images": files})
+    assert row[0] == f"images/{files[0].name}"
+
+
+def cut(folder: Path) -> None:
+    (folder / "images.bin").write_bytes((folder / "images.bin").read_bytes()[:100])
+
+
+def fisheye(folder: Path) -> None:
+    data = bytearray((folder / "cameras.bin").read_bytes())
+    data[12] = 5  # the number of the first camera's model
+    (folder / "cameras.bin").write_bytes(bytes(data))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (
+            lambda folder: (folder / "images.bin").unlink(),
+            "images.bin cannot be read: No such file",
+        ),
+        (lambda folder: (folder / "cameras.bin").write_bytes(b""), "is no model of COLMAP"),
+        (cut, "is no model of COLMAP"),
+        (fisheye, "a camera has model 5; known: SIMPLE_PINHOLE, PINHOLE"),
+    ],
+)
+def test_another_folder_is_refused_before_any_work(home, tmp_path, spoil, words):
+    folder = tmp_path / "model"
+    folder.mkdir()
+    for name in ("cameras.bin", "images.bin"):
+        (folder / name).write_bytes((home / "model" / name).read_bytes())
+    spoil(folder)
+    with pytest.raises(UserError, match=re.escape(words)):
+        made(sorted((home / "images").iterdir()), tmp_path / "work", onto=folder)
+    assert not (tmp_path / "work").exists()
+
+
+def test_a_model_of_other_photographs_is_refused_with_one_of_its_names(home, tmp_path):
+    files = sorted((home / "images").iterdir())
+    model = home / "model"
+    with pytest.raises(UserError, match=r"1 image of .* of the model's 4 images, such as 00\.png"):
+        read_placed(model, home / "images", {".": files[OLD - 1 :]})
+    with pytest.raises(UserError, match=r"is for one dataset, and .* has 2: .* --join"):
+        read_placed(model, home, {"a": files[:2], "b": files[2:]})
