@@ -370,7 +370,7 @@ def write_regions(path: Path, listed: Path, boxes) -> None:
 
 
 def test_given_regions_replace_mkpcs_and_are_part_of_the_key_of_stage_2(
-    demo, scenes, small_recipe, tmp_path
+    demo, scenes, small_recipe, tmp_path, capsys
 ):
     true = max(scenes[0].pairs, key=lambda true: true.covisibility)
     size0, size1 = (read_image(path).size for path in true.pair.images)
@@ -386,6 +386,8 @@ def test_given_regions_replace_mkpcs_and_are_part_of_the_key_of_stage_2(
     alone = replace(scenes[0], pairs=(true,))
     one = write_list(tmp_path / "list.txt", [alone], demo.train_dir)
     write_regions(tmp_path / "regions.csv", one, boxes)
+    with (tmp_path / "regions.csv").open("a") as stream:
+        stream.write("of_another_scene.png,b.png,0 0 9 9,0 0 9 9\n")
     command = ["validate", "--workers", 0, *listed(one, demo.train_dir, small_recipe)]
     given = ["--regions", tmp_path / "regions.csv"]
     scores = tmp_path / "scores.json"
@@ -393,10 +395,12 @@ def test_given_regions_replace_mkpcs_and_are_part_of_the_key_of_stage_2(
     for options, rows in ((given, 2), ([], 3), (given, 3)):
         run_options = ["--work-dir", tmp_path / "run", "--json", scores, *options]
         assert run_command(*command, *run_options) == 0
+        is_given = bool(options)
+        printed = capsys.readouterr().out
+        assert ("regions: 1 of 2 rows name pairs of this run" in printed) == is_given
         with Store.read(tmp_path / "run") as store:
             cropped = regions_of(pair_tables(store).regions)
             found = matches_of(store, 0)
-        is_given = bool(options)
         used = [region.box for region in cropped]
         assert (used == [*boxes]) == is_given
         reasons = {region.reason for region in cropped}
