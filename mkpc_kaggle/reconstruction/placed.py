@@ -7,8 +7,11 @@ description of its binary format.
 import struct
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path, PurePosixPath
+from typing import NamedTuple
 
+from mkpc_kaggle.data.images import read_size
 from mkpc_kaggle.errors import UserError, plural
+from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.intrinsics import LENS_MODELS, PlacedCamera, Rows
 
 CAMERAS = "cameras.bin"
@@ -22,11 +25,19 @@ MODEL_NAMES = dict(zip((0, 1, 2, 3, 4, 6), LENS_MODELS, strict=True))
 MIN_PLACED = 2  # images of the model in the folder; one has no points
 
 
+class Lens(NamedTuple):
+    """A camera of COLMAP's without a pose, and the size of its images."""
+
+    model: str
+    parameters: tuple[float, ...]
+    size: Size
+
+
 def read_placed(folder: Path, root: Path, datasets: Mapping[str, Sequence[Path]]) -> Rows:
     """Return a row for each image of the only dataset that COLMAP's model in ``folder`` has.
 
     The model names images by their path below ``root`` or below the dataset. Raises
-    :class:`UserError` for other files, and if fewer than two images are found.
+    :class:`UserError` for other files, for images of other sizes, and if fewer than two are found.
     """
     if len(datasets) != 1:
         raise UserError(
@@ -41,7 +52,14 @@ def read_placed(folder: Path, root: Path, datasets: Mapping[str, Sequence[Path]]
         names = (str(path), str(path.relative_to(dataset)))
         found = next((cameras[name] for name in names if name in cameras), None)
         if found is not None:
-            rows.append((str(path), found))
+            camera, size = found
+            stored = read_size(file)  # an unreadable image is reported by the run
+            if stored is not None and stored != size:
+                raise UserError(
+                    f"--onto {folder} has {path} with {size.width} x {size.height} pixels, and "
+                    f"{file} has {stored.width} x {stored.height}"
+                )
+            rows.append((str(path), camera))
     if len(rows) < MIN_PLACED:
         first = min(cameras, default="")
         example = f", such as {first}" if first else ""
@@ -61,8 +79,11 @@ def placed_line(rows: Rows, folder: Path, files: Sequence[Path], root: Path) -> 
     return line + (f"; the first new one is {new[0].relative_to(root)}" if new else "; none is new")
 
 
-def read_cameras(folder: Path) -> dict[str, PlacedCamera]:
-    """Return the cameras of COLMAP's binary model by image name. Raises :class:`UserError`."""
+def read_cameras(folder: Path) -> dict[str, tuple[PlacedCamera, Size]]:
+    """Return the camera and the size of each image of COLMAP's binary model, by name.
+
+    Raises :class:`UserError` for other files.
+    """
     try:
         lenses = dict(_lenses((folder / CAMERAS).read_bytes()))
         return dict(_images((folder / IMAGES).read_bytes(), lenses))
@@ -71,28 +92,31 @@ def read_cameras(folder: Path) -> dict[str, PlacedCamera]:
             f"--onto {folder}: {error.filename} cannot be read: {error.strerror}; name a folder such as "
             "OUT/models/0 with COLMAP's binary files"
         ) from error
-    except (struct.error, ValueError, KeyError, IndexError) as error:
+    except (struct.error, ValueError) as error:
         raise UserError(f"--onto {folder} is no model of COLMAP: {error}") from error
 
 
-def _lenses(data: bytes) -> Iterator[tuple[int, tuple[str, tuple[float, ...]]]]:
-    """Yield each camera's number, with the name of its model and its parameters."""
+def _lenses(data: bytes) -> Iterator[tuple[int, Lens]]:
+    """Yield each camera with its number."""
     (count,) = COUNT.unpack_from(data)
     at = COUNT.size
     for _ in range(count):
-        number, model, _, _ = CAMERA.unpack_from(data, at)
+        number, model, width, height = CAMERA.unpack_from(data, at)
         if model not in MODEL_NAMES:
             raise ValueError(f"a camera has model {model}; known: {', '.join(LENS_MODELS)}")
         name = MODEL_NAMES[model]
         parameters = struct.Struct(f"<{len(LENS_MODELS[name])}d")
-        yield number, (name, parameters.unpack_from(data, at + CAMERA.size))
+        yield (
+            number,
+            Lens(name, parameters.unpack_from(data, at + CAMERA.size), Size(width, height)),
+        )
         at += CAMERA.size + parameters.size
 
 
 def _images(
-    data: bytes, lenses: Mapping[int, tuple[str, tuple[float, ...]]]
-) -> Iterator[tuple[str, PlacedCamera]]:
-    """Yield each image's name and camera."""
+    data: bytes, lenses: Mapping[int, Lens]
+) -> Iterator[tuple[str, tuple[PlacedCamera, Size]]]:
+    """Yield each image's name, with its camera and its size."""
     (count,) = COUNT.unpack_from(data)
     at = COUNT.size
     for _ in range(count):
@@ -102,5 +126,7 @@ def _images(
         name = data[at:end].decode("utf-8")
         (points,) = COUNT.unpack_from(data, end + 1)
         at = end + 1 + COUNT.size + points * KEYPOINT_BYTES
-        model, parameters = lenses[camera]
-        yield name, PlacedCamera(model, parameters, pose=(x, y, z, w, *t))
+        if camera not in lenses:
+            raise ValueError(f"{name} has camera {camera}, which {CAMERAS} lacks")
+        lens = lenses[camera]
+        yield name, (PlacedCamera(lens.model, lens.parameters, pose=(x, y, z, w, *t)), lens.size)

@@ -3,12 +3,14 @@
 import re
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pycolmap
 import pytest
 from shared import run_command
 from test_reconstruct import FIRST, RECIPE, MixedMatcher, write_flat
 
+from benchmarks.synthetic_scene import SIZE
 from mkpc_kaggle import reconstruct
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.intrinsics import PlacedCamera, camera_of
@@ -110,7 +112,8 @@ def test_a_camera_is_placed_by_its_path_alone():
 
 
 def test_a_model_is_read_as_pycolmap_reads_it(home):
-    for name, camera in read_cameras(home / "model").items():
+    for name, (camera, size) in read_cameras(home / "model").items():
+        assert size == SIZE
         assert numbers_of(home / "model")[name] == (
             list(camera.pose),
             camera.model,
@@ -162,5 +165,9 @@ def test_a_model_of_other_photographs_is_refused_with_one_of_its_names(home, tmp
     model = home / "model"
     with pytest.raises(UserError, match=r"1 image of .* of the model's 4 images, such as 00\.png"):
         read_placed(model, home / "images", {".": files[OLD - 1 :]})
+    cv2.imwrite(str(tmp_path / files[0].name), np.zeros((60, 80), np.uint8))
+    reduced = [tmp_path / files[0].name]
+    with pytest.raises(UserError, match=r"00\.png with 800 x 600 pixels, and .* has 80 x 60"):
+        read_placed(model, tmp_path, {".": reduced})
     with pytest.raises(UserError, match=r"is for one dataset, and .* has 2: .* --join"):
         read_placed(model, home, {"a": files[:2], "b": files[2:]})
