@@ -25,7 +25,7 @@ MODEL_NAMES = dict(zip((0, 1, 2, 3, 4, 6), LENS_MODELS, strict=True))
 MIN_PLACED = 2  # images of the model in the folder; one has no points
 
 
-class Lens(NamedTuple):
+class StoredCamera(NamedTuple):
     """A camera of COLMAP's without a pose, and the size of its images."""
 
     model: str
@@ -96,7 +96,7 @@ def read_cameras(folder: Path) -> dict[str, tuple[PlacedCamera, Size]]:
         raise UserError(f"--onto {folder} is no model of COLMAP: {error}") from error
 
 
-def _lenses(data: bytes) -> Iterator[tuple[int, Lens]]:
+def _lenses(data: bytes) -> Iterator[tuple[int, StoredCamera]]:
     """Yield each camera with its number."""
     (count,) = COUNT.unpack_from(data)
     at = COUNT.size
@@ -108,13 +108,13 @@ def _lenses(data: bytes) -> Iterator[tuple[int, Lens]]:
         parameters = struct.Struct(f"<{len(LENS_MODELS[name])}d")
         yield (
             number,
-            Lens(name, parameters.unpack_from(data, at + CAMERA.size), Size(width, height)),
+            StoredCamera(name, parameters.unpack_from(data, at + CAMERA.size), Size(width, height)),
         )
         at += CAMERA.size + parameters.size
 
 
 def _images(
-    data: bytes, lenses: Mapping[int, Lens]
+    data: bytes, lenses: Mapping[int, StoredCamera]
 ) -> Iterator[tuple[str, tuple[PlacedCamera, Size]]]:
     """Yield each image's name, with its camera and its size."""
     (count,) = COUNT.unpack_from(data)
