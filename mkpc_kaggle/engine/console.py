@@ -35,9 +35,11 @@ DRAIN_S = 2.0  # maximum wait at the end for the remaining text to be printed
 class Console(logging.Handler):
     """Print records: warnings and errors on stderr after their level, others on stdout."""
 
-    def createLock(self) -> None:  # noqa: N802  logging's name
-        """Use no lock: a stream that blocks must not hold back the other."""
-        self.lock = None
+    def handle(self, record: logging.LogRecord) -> bool:
+        # Without logging's lock: a stream that blocks must not hold back the other.
+        if self.filter(record):
+            self.emit(record)
+        return True
 
     def emit(self, record: logging.LogRecord) -> None:
         # Looked up for each record: notebooks, tests and :func:`unblocked` replace streams.
