@@ -114,6 +114,19 @@ def test_every_option_is_in_the_pages_and_every_option_of_the_pages_exists():
     assert sorted(named - known - benchmarks - OTHERS) == [], "options that do not exist"
 
 
+def test_each_option_has_a_help_that_names_the_thing():
+    """Not "of the wheels" or "default: demo": a reader sees the name of the option, and wants a noun."""
+    vague = ("of", "those", "what", "such", "where", "only", "evenly", "default:")
+    wrong = []
+    for name, parser in inner(make_parser(list(COMMANDS))).items():
+        for own in (parser, *inner(parser).values()):
+            for action in own._actions:
+                if not isinstance(action, argparse._SubParsersAction):
+                    first = (action.help or "of").split()[0]
+                    wrong += [f"{name}: {action.dest}: {action.help}"] * (first in vague)
+    assert wrong == []
+
+
 PYTHON = re.compile(r"^```python\n(.*?)^```", re.M | re.S)
 # The snippets of python.md are run by test_python_page.py.
 BLOCKS = [

@@ -15,8 +15,10 @@ MAX_LINES = 20  # of problems; a wrong file may have one in each of a hundred th
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("submission", type=Path)
-    parser.add_argument("--test-dir", type=Path, required=True, metavar="DIR")
+    parser.add_argument("submission", type=Path, help="submission to check")
+    parser.add_argument(
+        "--test-dir", type=Path, required=True, metavar="DIR", help="directory with test.csv"
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:

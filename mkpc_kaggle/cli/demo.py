@@ -18,7 +18,11 @@ poses, DIR/test without poses, and DIR/test_truth.csv to score a submission:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--out", type=Path, default=Path("demo"), metavar="DIR", help="default: demo"
+        "--out",
+        type=Path,
+        default=Path("demo"),
+        metavar="DIR",
+        help="directory to write (default: demo)",
     )
     parser.add_argument("--seed", type=int, default=0, help="seed of the rendered scenes")
 

@@ -41,7 +41,7 @@ Exit status: 0 done, 2 the journal does not exist, or a file cannot be written.
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     # Stderr, where image decoders print warnings.
     parser.set_defaults(printing=partial(unblocked, [2]))
-    parser.add_argument("work_dir", type=Path, metavar="DIR")
+    parser.add_argument("work_dir", type=Path, metavar="DIR", help="work directory of the run")
     parser.add_argument("--csv", type=Path, metavar="OUT", help="write tables to this directory")
     parser.add_argument(
         "--report", type=Path, metavar="FILE.html", help="write a page with pictures"

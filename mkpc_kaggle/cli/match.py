@@ -37,8 +37,8 @@ EXIT_NOTHING_RAN = 1
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     # Stderr, where image decoders print warnings.
     parser.set_defaults(printing=partial(unblocked, [2]))
-    parser.add_argument("image0", type=Path)
-    parser.add_argument("image1", type=Path)
+    parser.add_argument("image0", type=Path, help="first image")
+    parser.add_argument("image1", type=Path, help="second image")
     parser.add_argument(
         "--out", type=Path, metavar="FIG.png", help="draw the pair; the suffix sets the format"
     )

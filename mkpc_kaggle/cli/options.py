@@ -72,7 +72,12 @@ def add_train_side(parser: argparse.ArgumentParser) -> None:
     """Add the options that choose pairs of ``--train-dir``."""
     add = parser.add_argument
     add("--scenes", default="", metavar="A,B", help="scenes of --train-dir; default: all")
-    add("--pairs-per-scene", type=int, metavar="N", help="evenly spread; default: all")
+    add(
+        "--pairs-per-scene",
+        type=int,
+        metavar="N",
+        help="pairs of each scene, evenly spread; default: all",
+    )
     text = "minimum covisibility of pairs of --train-dir; default: 0.1, as in the competition"
     add("--min-covisibility", type=float, default=0.1, help=text)
 
@@ -114,7 +119,7 @@ def add_run(parser: argparse.ArgumentParser, time_limit: str | None) -> None:
     text = """two-stage (the default): the recipe as written; stage-1: only its units of stage 1; whole-images:
         all its units on whole images, the naive ensemble of equal inference count"""
     add("--mode", choices=list(map(str, Mode)), default="two-stage", help=text)
-    text = f"""such as 8h45m, 90m or 60s, from the start of the program; the run ends before the limit, with the
+    text = f"""limit from the start of the program, such as 8h45m, 90m or 60s; the run ends before it, with the
         units that fit (default: {time_limit or "none"})"""
     add("--time-limit", default=time_limit, metavar="TIME", help=text)
     text = "count the limit from this time, in seconds since 1970: time.time(), or $(date +%%s)"

@@ -95,7 +95,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         required=True,
         metavar="OUT",
-        help="empty, or with the results of an earlier run",
+        help="directory for the results: empty, or of an earlier run",
     )
     options.add_matching(parser)
     options.add_run(parser, time_limit=None)

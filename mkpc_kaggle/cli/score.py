@@ -22,7 +22,7 @@ the clusters.
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("submissions", nargs="+", type=Path, metavar="SUBMISSION.csv")
+    add("submissions", nargs="+", type=Path, metavar="SUBMISSION.csv", help="files to score")
     source = parser.add_mutually_exclusive_group(required=True)
     source.add_argument("--train-dir", type=Path, metavar="DIR", help="the train side, with poses")
     text = "a directory with train_labels.csv and train_thresholds.csv"

@@ -31,9 +31,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         required=True,
         metavar="DIR",
-        help="holds test.csv and test_images/",
+        help="directory with test.csv and test_images/",
     )
-    add("--output", type=Path, default=Path("submission.csv"), help="default: submission.csv")
+    add(
+        "--output",
+        type=Path,
+        default=Path("submission.csv"),
+        help="file to write (default: submission.csv)",
+    )
     options.add_matching(parser)
     text = """reconstruct the pairs of a batch together and take F from the cameras (default: the recipe's choice;
         the paper's recipes do not). A pair's F then also depends on other pairs: read your competition's rules,

@@ -60,10 +60,10 @@ def _add_sources(parser: argparse.ArgumentParser) -> None:
     """Add the options that choose pairs."""
     add = parser.add_argument
     source = parser.add_mutually_exclusive_group(required=True)
-    source.add_argument("--train-dir", type=Path, metavar="DIR")
+    source.add_argument("--train-dir", type=Path, metavar="DIR", help="train side, with poses")
     text = "a list of pairs with K and poses, or a directory of .npz of MegaDepth-1500"
     source.add_argument("--pairs", type=Path, metavar="FILE", help=text)
-    add("--image-root", type=Path, metavar="DIR", help="where the images of --pairs lie")
+    add("--image-root", type=Path, metavar="DIR", help="directory of the images of --pairs")
     options.add_train_side(parser)
     for name in ("--submission", "--truth", "--imc2025"):
         add(name, action=options.Moved, now="an argument of `mkpc score`")
@@ -77,7 +77,7 @@ def _add_estimates(parser: argparse.ArgumentParser) -> None:
     add(
         "--units",
         metavar="A,B",
-        help="only these, in this order, such as 1:sift@1536; default: the recipe's",
+        help="units to run, in this order, such as 1:sift@1536; default: the recipe's",
     )
     text = """run these instead of --recipe and --mode, and give the gain of each over the first with its 95 %%
         interval; such as classical:whole-images classical"""

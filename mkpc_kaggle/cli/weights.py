@@ -51,15 +51,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parsers["verify"].add_argument(
         "--manifest", type=Path, metavar="FILE", help="check every file of this one"
     )
-    text = "default: all weights of recipe auto"
+    text = "file names, slots or recipes (default: all weights of recipe auto)"
     parsers["fetch"].add_argument(
         "names", nargs="*", default=["auto"], metavar="NAME|SLOT|RECIPE", help=text
     )
     parsers["fetch"].add_argument(
         "--out", type=Path, required=True, metavar="DIR", help="directory for the files"
     )
-    parsers["convert"].add_argument("file", type=Path, metavar="FILE")
-    parsers["convert"].add_argument("--out", type=Path, required=True, metavar="X.safetensors")
+    parsers["convert"].add_argument("file", type=Path, metavar="FILE", help="checkpoint to convert")
+    text = "file to write"
+    parsers["convert"].add_argument(
+        "--out", type=Path, required=True, metavar="X.safetensors", help=text
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:
