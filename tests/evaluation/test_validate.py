@@ -9,9 +9,12 @@ import pytest
 from run_tables import Described, tables_of
 from shared import run_command, scores_of
 
+from mkpc_kaggle.cli import make_parser
+from mkpc_kaggle.cli.validate import _assemble
 from mkpc_kaggle.data import competition
 from mkpc_kaggle.data.competition import Pair, TrainScene, TruePair, read_test_side, read_train_side
 from mkpc_kaggle.demo import DemoSet
+from mkpc_kaggle.engine.session import Interrupt
 from mkpc_kaggle.evaluation.validate import (
     SceneScore,
     Step,
@@ -208,3 +211,11 @@ def test_images_of_a_list_with_one_file_name_are_two_images(tmp_path):
     tables = tables_of(Described("1", failure="no matches"))
     first, second = score_pair(true, tables, 0, scene, (Step.MAGSAC,)).images
     assert first != second
+
+
+def test_settings_change_a_protocol_too(tmp_path):
+    given = ["validate", "--pairs", "list.txt", "--image-root", str(tmp_path)]
+    given += ["--protocol", "loftr", "--set", "magsac.threshold=2"]
+    arguments = make_parser(given).parse_args(given)
+    magsac = _assemble(arguments, Interrupt(), "classical", "two-stage").recipe.magsac
+    assert (magsac.method, magsac.max_iterations, magsac.threshold) == ("ransac", 1000, 2)
