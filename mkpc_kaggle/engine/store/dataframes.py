@@ -254,7 +254,9 @@ class Results(NamedTuple):
     ``cameras`` has a row for each camera of each model; identical files share a camera, and each
     has a row. Columns that name a pair have its id. Columns that name an image have its path below
     the directory of the run's images. ``f11`` to ``f33`` of ``pairs`` are the matrix of ``model``:
-    F, or E for a pair with known intrinsics.
+    F, or E for a pair with known intrinsics. ``choice`` is the reason why it is the scene's or not,
+    ``units`` the number of units that ran or failed, and ``error`` the error that left the pair without
+    an F, if it was not for few matches.
     """
 
     pairs: "DataFrame"
