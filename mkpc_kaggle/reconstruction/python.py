@@ -18,7 +18,7 @@ from mkpc_kaggle.engine.plan.state import name_below
 from mkpc_kaggle.engine.request import RunReport
 from mkpc_kaggle.engine.session import Interrupt, Session, interruptible
 from mkpc_kaggle.engine.store.database import FILE_NAME
-from mkpc_kaggle.errors import UserError, temporary_directory
+from mkpc_kaggle.errors import UserError, plural, temporary_directory
 from mkpc_kaggle.matchers.contract import Matcher
 from mkpc_kaggle.recipe import Recipe
 from mkpc_kaggle.reconstruction.folder import read_folder, require_distinct
@@ -136,6 +136,9 @@ def reconstruct(
         settings=settings,
     )
     if len(files) < 2:
+        # An empty result without its reason would look like a success.
+        count = plural(len(files), "image")
+        logger.warning(f"no cameras: {count} given, and at least three matched images are needed")
         return Models()
     require_readable(files)
     require_perspective(files)
@@ -232,7 +235,10 @@ def image_paths(images: Any) -> list[Path]:
             raise TypeError(
                 f"images[{number}] is {shown_value(image)}; expected the path of an image"
             )
-        paths.append(Path(image))
+        path = Path(image)
+        if path.is_dir():
+            raise UserError(f"images[{number}]: {path} is a folder; give it alone, or its images")
+        paths.append(path)
     return paths
 
 

@@ -178,9 +178,15 @@ def test_a_colmap_folder_of_the_user_is_not_replaced(tmp_path, files):
     assert database.read_text() == "mine"
 
 
-def test_fewer_than_two_images_have_no_model(files):
-    assert models([], MixedMatcher()) == ()
-    assert models(files[:1], MixedMatcher()) == ()
+def test_fewer_than_two_images_have_no_model_and_a_warning(files, capfd):
+    for given, count in (([], "0 images"), (files[:1], "1 image")):
+        assert models(given, MixedMatcher()) == ()
+        assert f"no cameras: {count} given, and at least three" in capfd.readouterr().err
+
+
+def test_a_folder_in_a_list_of_images_is_named(files):
+    with pytest.raises(UserError, match=r"images\[1\]: .*images is a folder; give it alone"):
+        models([files[0], files[0].parent], MixedMatcher())
 
 
 def test_a_matcher_that_always_fails_is_an_error(files):
