@@ -105,9 +105,16 @@ def signals() -> Iterator[Case]:
 
 
 LIMITED = f"{WITHOUT_LIMIT} --workers 1 --time-limit"
-CAMERAS = {
-    f"cameras of {new}": written("T/s/calibration.csv", CALIBRATION.replace(former, new))
-    for former, new in (("200 0 80", "nan nan nan"), ("1 0 0", "1 2 3"))
+WITHOUT_NUMBERS = {
+    "cameras of NaN": written(
+        "T/s/calibration.csv", CALIBRATION.replace("200 0 80", "nan nan nan")
+    ),
+}
+# It has numbers, and scores of it have no meaning.
+WITHOUT_ROTATION = {
+    "a rotation that is none": written(
+        "T/s/calibration.csv", CALIBRATION.replace("1 0 0", "1 2 3")
+    ),
 }
 CASES = [
     *(
@@ -123,7 +130,8 @@ CASES = [
         "limits", WORKING, {f"5s with {n} workers": f"{n} --time-limit 5s" for n in (0, 2)}, (0, 1)
     ),
     *options("arguments", VALIDATE, SCENES),
-    *makes("arguments", VALIDATE, CAMERAS, (0,)),
+    *makes("arguments", VALIDATE, WITHOUT_NUMBERS),
+    *makes("arguments", VALIDATE, WITHOUT_ROTATION, (0,)),
     *makes("arguments", SCORE, SUBMISSIONS, (0,)),
     *makes(
         "arguments",
