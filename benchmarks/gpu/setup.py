@@ -40,7 +40,7 @@ class Setup:
             )
         if self.quick:
             return write_demo(directory, scenes=["courtyard"], image_scale=QUICK_SCALE)
-        return write_demo(directory)
+        return write_demo(directory, scenes=["courtyard", "market"])
 
     def synchronise(self) -> None:
         """Wait until the device has finished."""

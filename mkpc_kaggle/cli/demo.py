@@ -8,7 +8,8 @@ from mkpc_kaggle.errors import UserError, writing
 
 HELP = """\
 Render scenes of stone walls and painted boxes with known cameras, in the competition's layout: DIR/train with
-poses, DIR/test without poses, and DIR/test_truth.csv to score a submission:
+poses, DIR/test without poses, and DIR/test_truth.csv to score a submission. One scene, `street`, is photographed
+with lenses of 1, 2 and 4 times the focal length.
 
   mkpc demo --out demo
   python make_submission.py --test-dir demo/test

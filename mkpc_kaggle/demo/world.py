@@ -1,6 +1,7 @@
 """Worlds of a ground, three walls and boxes with drawn textures, and their cameras."""
 
 from itertools import product
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -11,8 +12,6 @@ from mkpc_kaggle.demo.render import Surface
 from mkpc_kaggle.geometry.coordinates import Pixels
 
 Bgr = tuple[int, int, int]
-
-SCENES = {"courtyard": 2.5, "market": 1.0}  # metres per unit of the written poses
 
 TEXELS = 72  # per metre
 
@@ -34,16 +33,54 @@ BOX_SHARE = 0.65  # of the places that have a box
 MIN_BOX_M = (1.0, 1.0, 1.0)
 MAX_BOX_M = (3.0, 3.0, 5.5)
 
-# Position and target in metres, focal length over the long side, size in pixels, roll in degrees.
+
+class Shot(NamedTuple):
+    """A camera of a scene: position and target in metres, (width, height) in pixels."""
+
+    position: tuple[float, float, float]
+    target: tuple[float, float, float]
+    focal: float  # over the long side
+    size: tuple[int, int]
+    roll: float  # in degrees
+
+
+class DemoScene(NamedTuple):
+    """The cameras of a scene; ``metres_per_unit`` is of the written poses."""
+
+    metres_per_unit: float
+    shots: tuple[Shot, ...]
+
+
 SHOTS = (
-    ((-5.0, -7.0, 1.7), (-2.0, 20.0, 4.0), 0.75, (800, 600), 0),
-    ((-2.0, -6.0, 1.7), (-1.0, 20.0, 3.8), 0.80, (800, 533), 6),
-    ((7.0, -2.0, 1.6), (-3.0, 20.0, 4.5), 0.85, (600, 800), -9),
-    ((-1.0, 1.0, 3.2), (3.0, 19.0, 4.0), 1.60, (800, 600), 14),
-    ((-9.0, 4.0, 1.7), (4.0, 20.0, 4.0), 0.95, (800, 600), -4),
-    ((9.0, 4.5, 2.6), (-8.0, 19.0, 4.0), 1.00, (600, 800), 22),
-    ((-8.0, -4.0, 5.0), (6.0, 18.0, 4.2), 1.60, (800, 533), -12),
+    Shot((-5.0, -7.0, 1.7), (-2.0, 20.0, 4.0), 0.75, (800, 600), 0),
+    Shot((-2.0, -6.0, 1.7), (-1.0, 20.0, 3.8), 0.80, (800, 533), 6),
+    Shot((7.0, -2.0, 1.6), (-3.0, 20.0, 4.5), 0.85, (600, 800), -9),
+    Shot((-1.0, 1.0, 3.2), (3.0, 19.0, 4.0), 1.60, (800, 600), 14),
+    Shot((-9.0, 4.0, 1.7), (4.0, 20.0, 4.0), 0.95, (800, 600), -4),
+    Shot((9.0, 4.5, 2.6), (-8.0, 19.0, 4.0), 1.00, (600, 800), 22),
+    Shot((-8.0, -4.0, 5.0), (6.0, 18.0, 4.2), 1.60, (800, 533), -12),
 )
+WIDE = (1600, 1200)
+TELE = (800, 600)
+# Lenses of 1, 2 and 4 times the focal length. The wide photographs are as large as photographs of a
+# phone, compared to a matcher's view: a tele photograph shows more detail of its part than that view.
+TELEPHOTO = (
+    Shot((-4.0, -6.0, 1.7), (-1.2, 20.0, 4.0), 0.75, WIDE, 2),
+    Shot((3.0, -5.0, 1.7), (0.9, 20.0, 4.0), 0.75, WIDE, -3),
+    Shot((-6.0, -5.0, 1.8), (-7.0, 18.0, 3.0), 1.50, TELE, 4),
+    Shot((-3.5, -4.0, 1.8), (-2.0, 18.0, 4.0), 1.50, TELE, -2),
+    Shot((4.0, -3.0, 1.8), (3.0, 17.0, 3.0), 1.50, TELE, 3),
+    Shot((1.0, -2.0, 1.8), (7.0, 18.0, 4.0), 1.50, TELE, 0),
+    Shot((-1.0, -5.0, 1.8), (-7.0, 18.0, 3.0), 3.00, TELE, -3),
+    Shot((-3.5, -4.0, 1.8), (-2.0, 18.0, 4.0), 3.00, TELE, 2),
+    Shot((4.0, -3.0, 1.8), (3.0, 17.0, 3.0), 3.00, TELE, 0),
+    Shot((1.0, -2.0, 1.8), (7.0, 18.0, 4.0), 3.00, TELE, 4),
+)
+SCENES = {
+    "courtyard": DemoScene(2.5, SHOTS),
+    "market": DemoScene(1.0, SHOTS),
+    "street": DemoScene(1.0, TELEPHOTO),
+}
 
 
 def build_world(
@@ -57,7 +94,7 @@ def build_world(
     # All draws come from one generator: another order would change every world.
     surfaces = _surfaces(rng)
     cameras = []
-    for position, target, focal, size, roll in SHOTS:
+    for position, target, focal, size, roll in SCENES[name].shots:
         eye = np.add(position, rng.uniform(-0.15, 0.15, 3))
         towards = np.add(target, rng.uniform(-0.3, 0.3, 3))
         turned = roll + rng.uniform(-2, 2)

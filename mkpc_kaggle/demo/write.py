@@ -65,6 +65,7 @@ def write_demo(
     demo = DemoSet(directory, directory / "train", directory / "test", directory / "test_truth.csv")
     _claim(demo)
     scenes = scenes or tuple(SCENES)
+    metres = {scene: SCENES[scene].metres_per_unit for scene in scenes}
     samples: list[str] = []
     truths: list[str] = []
     for scene in scenes:
@@ -73,11 +74,11 @@ def write_demo(
         for a, b in combinations(photographs, 2):
             share = covisibility(b.camera, b.depth, a.camera, a.depth)
             pairs.append(DemoPair(b, a, share))
-        _write_train(demo.train_dir / scene, SCENES[scene], photographs, pairs)
+        _write_train(demo.train_dir / scene, metres[scene], photographs, pairs)
         for sample, truth in _write_test(demo.test_dir, scene, _selected(pairs), seed):
             samples.append(sample)
             truths.append(truth)
-    factors = (f"{scene},{SCENES[scene]:.17g}" for scene in scenes)
+    factors = (f"{scene},{metres[scene]:.17g}" for scene in scenes)
     _write_rows(demo.train_dir / "scaling_factors.csv", "scene,scaling_factor", factors)
     _write_rows(demo.test_dir / "test.csv", "sample_id,batch_id,image_1_id,image_2_id", samples)
     _write_rows(demo.truth_csv, "sample_id,scene,image_1_id,image_2_id", truths)

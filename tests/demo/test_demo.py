@@ -162,6 +162,26 @@ def test_the_test_side_has_covisible_pairs_of_renamed_train_images(small_demo):
             assert difference < 6, "the same picture"
 
 
+def test_the_street_has_wide_photographs_and_lenses_of_two_and_four_times_their_focal_length(
+    small_demo,
+):
+    street = small_demo.train_dir / "street"
+    focal = {}
+    for row in rows(street / "calibration.csv"):
+        K = numbers(row["camera_intrinsics"], 3, 3)
+        # Over the image's width: the principal point is its centre.
+        focal[row["image_id"]] = K[0, 0] / K[0, 2]
+    ratios = []
+    for row in rows(street / "pair_covisibility.csv"):
+        first, second = row["pair"].split("-")
+        is_wide = [name in {"street_0000", "street_0001"} for name in (first, second)]
+        if is_wide == [False, True]:
+            ratios.append(focal[first] / focal[second])
+            # A lens of four times the focal length shows at most a sixteenth of the wide photograph.
+            assert float(row["covisibility"]) > 0.02
+    np.testing.assert_allclose(sorted(ratios), 8 * [2.0] + 8 * [4.0], rtol=0.02)
+
+
 def test_a_scene_has_the_same_bytes_with_and_without_the_other_scenes(tmp_path, small_demo):
     alone = write_demo(tmp_path, scenes=["market"], image_scale=SCALE)
     scenes = [path.name for path in alone.train_dir.iterdir() if path.is_dir()]
