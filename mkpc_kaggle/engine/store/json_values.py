@@ -33,6 +33,7 @@ def json_reader_of(kind: Any) -> JsonReader | None:
 
     A field that is missing gets its default. Arrays are of float64.
     """
+    kind = without_alias(kind)
     if get_origin(kind) is not None:
         return _reader_of_generic(get_origin(kind), get_args(kind))
     if not isinstance(kind, type):
@@ -42,6 +43,16 @@ def json_reader_of(kind: Any) -> JsonReader | None:
     if issubclass(kind, tuple):
         return lambda value: kind(*value)  # a named tuple
     return kind if issubclass(kind, Enum) else None
+
+
+def without_alias(kind: Any) -> Any:
+    """Return the type that an alias of a ``type`` statement stands for; another type as it is."""
+    # NumPy's NDArray is such an alias since 2.5.
+    kinds = get_args(kind)
+    value = getattr(get_origin(kind) or kind, "__value__", None)
+    if value is None:
+        return kind
+    return without_alias(value[kinds] if kinds else value)
 
 
 def _reader_of_fields(kind: Any) -> JsonReader:

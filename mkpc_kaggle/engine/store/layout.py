@@ -13,7 +13,7 @@ from typing import Any, Generic, TypeVar, get_args, get_origin, get_type_hints
 
 import numpy as np
 
-from mkpc_kaggle.engine.store.json_values import json_reader_of, to_text
+from mkpc_kaggle.engine.store.json_values import json_reader_of, to_text, without_alias
 from mkpc_kaggle.errors import printable
 from mkpc_kaggle.scene.models import SfmModel
 
@@ -149,6 +149,7 @@ def _unless_none(convert: Callable[[Any], Any]) -> Callable[[Any], Any]:
 
 
 def _column(name: str, hint: Any) -> Column:
+    hint = without_alias(hint)
     if NoneType in get_args(hint):
         (known,) = set(get_args(hint)) - {NoneType}
         column = _column(name, known)
