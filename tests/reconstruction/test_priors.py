@@ -81,7 +81,7 @@ def write_masks(folder: Path, root: Path, left: int = 400) -> Path:
         ),
         (
             HEAD + "*,SIMPLE_PINHOLE,900 400 300,2\n00.png,SIMPLE_PINHOLE,900 400 300,2\n",
-            "line 3: '00.png' is",
+            "line 3: row '00.png' matches no image",
         ),
         (
             HEAD + "00.png,SIMPLE_PINHOLE,9 400 300,fixed\n",
