@@ -154,5 +154,7 @@ def remove_parts(directory: Path) -> None:
         if left.is_dir() and not left.is_symlink():
             for name in (MODELS, SPARSE, FORMER):
                 remove_models(left / name)
-            (left / DATABASE).unlink(missing_ok=True)
+            # A process that is killed while it writes the database leaves SQLite's other files.
+            for ending in ("", "-journal", "-wal", "-shm"):
+                (left / f"{DATABASE}{ending}").unlink(missing_ok=True)
             remove_empty(left)

@@ -267,7 +267,8 @@ def test_only_files_that_the_run_began_with_are_removed_and_only_in_its_own_dire
 
 def test_a_killed_process_leaves_no_folder_and_loses_no_file_of_others(tmp_path):
     left = tmp_path / ".mkpc-new-1"
-    write(left, [*FILES, "former/0/images.bin", "former/0/thesis.txt"])
+    companions = ["database.db-wal", "database.db-shm"]
+    write(left, [*FILES, *companions, "former/0/images.bin", "former/0/thesis.txt"])
     remove_parts(tmp_path)
     assert sorted(files_of(left)) == ["former/0/thesis.txt"]
     (left / "former" / "0" / "thesis.txt").unlink()
