@@ -201,6 +201,15 @@ def test_a_unit_that_was_lost_before_is_alone_in_its_job():
     assert (other.indices, other.units) == ((1,), (THIRD, SECOND))
 
 
+@pytest.mark.parametrize("count", range(1, 8))
+def test_a_place_that_lost_any_number_of_jobs_before_the_first_answer_gets_another_pair(count):
+    run = Run(10)
+    lost = [frozenset([("unit", index, SWEEP.name)]) for index in range(count)]
+    job = run.next_work(lost=lost).match
+    assert job is not None
+    assert set(job.indices).isdisjoint(range(count))
+
+
 def test_a_place_that_lost_a_job_gets_no_other_unit_of_its_pair():
     run = Run(3, had=[(), (SWEEP,), (SWEEP,)], minibatch=8)
     run.learn(*UNITS)

@@ -360,8 +360,10 @@ def unlike_plan(
     new = order[~np.isin(order, list(lost_pairs))]
     if new.size:
         order = new
-    # Far from the lost pairs: neighbours have an image in common.
-    index = int(order[(order.size - 1) * len(lost) // MAX_LOSSES])
+    # Far from the lost pairs: neighbours have an image in common. A place may have lost more jobs than
+    # count against it.
+    losses = min(len(lost), MAX_LOSSES)
+    index = int(order[(order.size - 1) * losses // MAX_LOSSES])
     unit = state.units[number]
     phase = Phase(int(wanted[index, number]))
     return plan_of(snapshot, phase, [index], [unit])
