@@ -9,12 +9,12 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def warnings_of(module: Path) -> list[str]:
-    """Return the longest fixed part of each text that a module passes to ``warn``."""
+    """Return the longest fixed part of each text that a module logs as a warning."""
     found = []
     for node in ast.walk(ast.parse(module.read_text(encoding="utf-8"))):
-        if not isinstance(node, ast.Call) or not isinstance(node.func, ast.Name):
+        if not isinstance(node, ast.Call) or not isinstance(node.func, ast.Attribute):
             continue
-        if node.func.id != "warn":
+        if node.func.attr != "warning":
             continue
         parts = [
             each.value
