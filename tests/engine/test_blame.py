@@ -143,3 +143,11 @@ def test_a_unit_that_was_answered_has_its_tries_again():
     tries.succeed(item)
     # Better crops let it run again.
     assert not tries.lose([item], DIED)
+
+
+def test_another_device_takes_over_the_failures_of_scenes_and_no_others():
+    tries = Tries()
+    items = [("unit", 1, "1:sift@640"), ("pair", 2), ("scene", "a", "key"), ("scenes",)]
+    for item in items:
+        tries.given_up[item] = DIED
+    assert list(tries.of_scenes().given_up) == items[2:]

@@ -28,6 +28,7 @@ PROVEN_ITEMS = MAX_LOSSES
 # ("scenes",), ("features", key) or ("estimates",). The workers of estimates give up an estimate, which
 # is tried once more elsewhere: ("estimate elsewhere", pair).
 Item = tuple[Hashable, ...]
+OF_SCENES = ("scene", "scenes")  # kinds of items that have nothing to do with a device
 
 
 class Tries:
@@ -65,6 +66,14 @@ class Tries:
         del self._counts[item]  # a counter ignores a missing key
         if item not in self.proven:
             self.proven.append(item)
+
+    def of_scenes(self) -> "Tries":
+        """Return the failures of scenes alone, which no device of matching has caused."""
+        kept = Tries()
+        for item, failure in self.given_up.items():
+            if item[0] in OF_SCENES:
+                kept.given_up[item] = failure
+        return kept
 
     def discard_proven(self, items: Collection[Item]) -> None:
         for item in items:

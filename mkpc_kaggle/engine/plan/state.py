@@ -669,7 +669,7 @@ class State:
 
     def forget_failures(self) -> None:
         """Forget the failures of the devices so far: another device takes over."""
-        self.tries = Tries()
+        self.tries = self.tries.of_scenes()
         self.changed.update(range(len(self.pairs)))
         self.skipped[:] = False
         self.costly[:] = False
