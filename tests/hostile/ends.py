@@ -152,7 +152,7 @@ CASES = [
         SCORE,
         written("sub.csv", ""),
         REFUSED,
-        "missing columns",
+        "is empty; expected the columns",
     ),
     Case(
         "arguments", "an owner that is a path", "package --out out/p --owner ../x", statuses=REFUSED
