@@ -452,7 +452,10 @@ def test_python_takes_masks_and_intrinsics_as_the_command_does(tmp_path):
     assert {each.image.name for each in found.images} == set(map(str, files)), "names are paths"
     # Half the pixels are masked, so there are fewer points.
     assert 0 < len(found.points) < 0.9 * len(free.points)
-    for name, reason in (("masks", "has no mask"), ("intrinsics", "is empty; expected the columns image")):
+    for name, reason in (
+        ("masks", "has no mask"),
+        ("intrinsics", "is empty; expected the columns image"),
+    ):
         (tmp_path / "empty").mkdir(exist_ok=True)
         (tmp_path / "empty.csv").touch()
         bad = tmp_path / ("empty" if name == "masks" else "empty.csv")
