@@ -1,5 +1,5 @@
-"""The plan of a run: what is done, what comes next, and who is to blame for what was lost.
+"""The plan of a run: finished work, the next work, and the blame for lost jobs.
 
 The door is :func:`mkpc_kaggle.engine.plan.schedule.next_work`, a pure function of the state, the
-costs, the budget and the crew. Nothing here knows a worker or an SQLite file.
+costs, the budget and the crew. Nothing here uses a worker or an SQLite file.
 """

@@ -6,9 +6,10 @@ One rule serves every cause: a device that fails, a worker that dies or hangs, m
 - A place that lost three different items in a row, with no answer in between, is at fault, and is
   closed. Its losses since its last answer then say nothing about the items: they are forgiven.
 
-Both can be told apart only if a place gets other items after a loss. Until its next answer, a place
-gets no pair with a unit that was lost before, and before its third loss an item that worked before
-(:func:`mkpc_kaggle.engine.plan.schedule.trial_plan`).
+The two are distinguished only if a place gets other items after a loss. Until its next answer, a
+place gets no pair with a unit that was lost before, and after two losses an item that worked before
+(:func:`mkpc_kaggle.engine.plan.schedule.trial_plan`). Losses that an item explains count for this
+choice, too: of two places that fail, each loses the same items.
 """
 
 from collections import Counter, deque
