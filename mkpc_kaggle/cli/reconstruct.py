@@ -11,11 +11,11 @@ from mkpc_kaggle.data.hloc import SUFFIX, require_h5py
 from mkpc_kaggle.data.masks import Masks
 from mkpc_kaggle.data.outputs import require_apart
 from mkpc_kaggle.engine.console import logger
-from mkpc_kaggle.engine.plan.budget import format_duration
 from mkpc_kaggle.engine.session import interruptible
 from mkpc_kaggle.engine.store.scene_record import MIN_PAIRS, NOT_RECONSTRUCTED
 from mkpc_kaggle.errors import UserError, plural
 from mkpc_kaggle.geometry.intrinsics import Rows
+from mkpc_kaggle.progress import format_duration
 from mkpc_kaggle.recipe import CameraSharing
 from mkpc_kaggle.reconstruction.coordinates import forget_coordinates, keep_coordinates
 from mkpc_kaggle.reconstruction.directory import (

@@ -22,8 +22,8 @@ from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any, NoReturn, TextIO
 
-from mkpc_kaggle.engine.plan.budget import Budget, format_duration
-from mkpc_kaggle.progress import LINE_INTERVAL_S, WAIT_S, ProgressLine, print_to
+from mkpc_kaggle.engine.plan.budget import Budget
+from mkpc_kaggle.progress import LINE_INTERVAL_S, WAIT_S, ProgressLine, format_duration, print_to
 
 MAX_WAITING = 1000  # texts, which a busy progress line writes in a few minutes
 # Of the text of native libraries, printed at the end: a warning for each photograph would hide the rest.

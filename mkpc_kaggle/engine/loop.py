@@ -31,7 +31,7 @@ from mkpc_kaggle.engine.jobs import (
 from mkpc_kaggle.engine.light import Estimating, Features
 from mkpc_kaggle.engine.matching import Matching
 from mkpc_kaggle.engine.plan.blame import Item, different
-from mkpc_kaggle.engine.plan.budget import Budget, Costs, format_duration
+from mkpc_kaggle.engine.plan.budget import Budget, Costs
 from mkpc_kaggle.engine.plan.schedule import Crew, NextWork, is_complete, next_work
 from mkpc_kaggle.engine.plan.state import State, extra_pairs_of
 from mkpc_kaggle.engine.publication import Publication
@@ -45,6 +45,7 @@ from mkpc_kaggle.engine.store.image_files import current_digests, update_digests
 from mkpc_kaggle.engine.store.tables import Feature
 from mkpc_kaggle.engine.workers.places import START_TIMEOUT_S, Place, Site, Work
 from mkpc_kaggle.errors import UserError, plural
+from mkpc_kaggle.progress import format_duration
 from mkpc_kaggle.scene.candidates import ALL_UNITS
 
 # A job of unknown cost that takes longer than this share of the time left hangs. A first job may be

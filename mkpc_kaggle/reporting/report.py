@@ -19,11 +19,11 @@ from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.data.images import Image
 from mkpc_kaggle.data.outputs import replacing
 from mkpc_kaggle.engine.console import Progress
-from mkpc_kaggle.engine.plan.budget import format_duration
 from mkpc_kaggle.errors import UserError, plural, printable, writing
 from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
 from mkpc_kaggle.pipeline.pair import PairMatch
 from mkpc_kaggle.pipeline.two_stage import to_image
+from mkpc_kaggle.progress import format_duration
 from mkpc_kaggle.reporting.figures import draw_pair, draw_strip, encode
 from mkpc_kaggle.reporting.points import clouds_of
 from mkpc_kaggle.reporting.run_log import RunLog, read_log

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mkpc_kaggle.data.outputs import replacing, require_table
-from mkpc_kaggle.engine.plan.budget import format_duration
 from mkpc_kaggle.engine.store.database import Store
 from mkpc_kaggle.engine.store.dataframes import (
     NOT_REACHED,
@@ -25,6 +24,7 @@ from mkpc_kaggle.geometry.critical_region import CriticalRegion, RegionReason
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import Estimate, ModelKind, sampson_distances
 from mkpc_kaggle.pipeline.pair import PairMatch, Regions, UnitResult
+from mkpc_kaggle.progress import format_duration
 from mkpc_kaggle.recipe import Recipe, recipe_of
 
 if TYPE_CHECKING:

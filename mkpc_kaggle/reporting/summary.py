@@ -7,13 +7,13 @@ from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, TypeAlias
 
-from mkpc_kaggle.engine.plan.budget import format_duration
 from mkpc_kaggle.engine.request import Ending, RunReport
 from mkpc_kaggle.engine.store.dataframes import NOT_REACHED, SECONDS
 from mkpc_kaggle.engine.store.scene_record import NOT_RECONSTRUCTED, SceneRecord
 from mkpc_kaggle.errors import plural
 from mkpc_kaggle.geometry.critical_region import RegionReason
 from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
+from mkpc_kaggle.progress import format_duration
 from mkpc_kaggle.recipe import Recipe
 from mkpc_kaggle.reporting.run_log import RunLog
 from mkpc_kaggle.scene.candidates import title_of

@@ -11,11 +11,11 @@ from mkpc_kaggle.engine.plan.budget import (
     WINDOW,
     Budget,
     Costs,
-    format_duration,
     monotonic_of,
     parse_duration,
 )
 from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.progress import format_duration
 
 
 @pytest.mark.parametrize(

@@ -54,14 +54,6 @@ def parse_duration(text: str) -> float:
     return total
 
 
-def format_duration(seconds: float) -> str:
-    """Return text such as ``8h45m``, ``12m03s`` or ``4.2s``."""
-    if seconds < 60:
-        return f"{seconds:.1f}s"
-    minutes, rest = divmod(round(seconds), 60)
-    return f"{minutes}m{rest:02d}s" if minutes < 60 else f"{minutes // 60}h{minutes % 60:02d}m"
-
-
 @dataclass
 class Budget:
     """The time of a run since ``started``, in seconds of ``clock``, which never jumps.

@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 
 from mkpc_kaggle.engine.jobs import MatchPlan, Phase
 from mkpc_kaggle.engine.plan.blame import MAX_LOSSES, Item
-from mkpc_kaggle.engine.plan.budget import ESTIMATE, Budget, Costs, format_duration
+from mkpc_kaggle.engine.plan.budget import ESTIMATE, Budget, Costs
 from mkpc_kaggle.engine.plan.state import Mask, State
 from mkpc_kaggle.errors import plural
+from mkpc_kaggle.progress import format_duration
 from mkpc_kaggle.recipe import Unit
 
 # Maximum share of the time after the sweep for extra pairs: they only serve scenes.

@@ -12,12 +12,12 @@ from enum import StrEnum
 from secrets import token_hex
 from typing import Any
 
-from mkpc_kaggle.engine.plan.budget import format_duration
 from mkpc_kaggle.engine.store.layout import Layout, layout_of
 from mkpc_kaggle.engine.store.scene_record import SceneRecord
 from mkpc_kaggle.geometry.coordinates import Matrix3
 from mkpc_kaggle.geometry.critical_region import CriticalRegion
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
+from mkpc_kaggle.progress import format_duration
 
 # Results, by key
 
