@@ -90,8 +90,8 @@ class Stored:
         return self.images[0].name, self.images[1].name
 
     def batch_pair(self, tracks: Matches) -> BatchPair:
-        matches = Matches.concatenate(result.matches for result in self.results)
-        return BatchPair(*self.images, matches, self.F, tracks)
+        by_unit = tuple(result.matches for result in self.results)
+        return BatchPair(*self.images, by_unit, self.F, tracks)
 
 
 def read_journals(

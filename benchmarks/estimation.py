@@ -185,7 +185,8 @@ def batch_pair(true: TruePair, found: PairMatch, F: Matrix3 | None = None) -> Ba
     # The name stands for the digest of the content: a scene's images have different names.
     image0 = BatchImage(name0, name0, size0)
     image1 = BatchImage(name1, name1, size1)
-    return BatchPair(image0, image1, found.matches, F, tracks_of(found.results))
+    by_unit = tuple(result.matches for result in found.results)
+    return BatchPair(image0, image1, by_unit, F, tracks_of(found.results))
 
 
 def extra_of(pairs: Sequence[Known], every: Sequence[Known], config: SceneConfig) -> list[Known]:

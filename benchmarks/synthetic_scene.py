@@ -139,7 +139,7 @@ def batch_of(
     pairs = []
     for first, second in ends:
         matches = match(rng, seen[first], seen[second], outliers, most)
-        pairs.append(BatchPair(images[first], images[second], matches))
+        pairs.append(BatchPair(images[first], images[second], (matches,)))
     by_name = dict(zip(names, cameras, strict=True))
     return SyntheticScene(images, tuple(pairs), by_name, world)
 

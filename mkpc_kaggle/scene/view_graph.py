@@ -33,7 +33,7 @@ class BatchImage:
 
 @dataclass(frozen=True, eq=False)
 class BatchPair:
-    """Two images of a batch, and their matches, perhaps none, in full-image pixels.
+    """Two images of a batch, and the matches of each unit, perhaps none, in full-image pixels.
 
     ``pair_fundamental`` is F (3, 3) from the pair's matches alone, or ``None``. ``tracks`` are the matches for the
     reconstruction; ``None`` means all matches.
@@ -41,9 +41,14 @@ class BatchPair:
 
     image0: BatchImage
     image1: BatchImage
-    matches: Matches
+    by_unit: tuple[Matches, ...]
     pair_fundamental: Matrix3 | None = None
     tracks: Matches | None = None
+
+    @property
+    def matches(self) -> Matches:
+        """The matches of all units."""
+        return Matches.concatenate(self.by_unit)
 
 
 @dataclass(frozen=True, eq=False)

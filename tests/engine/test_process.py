@@ -35,7 +35,9 @@ IMAGES = (
 POINTS = np.random.default_rng(1).uniform(0, 70, (50_000, 2)).astype(np.float32)
 MATCHES = Matches(POINTS, POINTS, POINTS[:, 0])
 SCENES = Recipe((Unit(1, "m", 80),), scene=SceneConfig())
-LARGE = SceneJob("one", "key", (BatchPair(*IMAGES, MATCHES),), ("ab",), SCENES, Source(UnitPoints))
+LARGE = SceneJob(
+    "one", "key", (BatchPair(*IMAGES, (MATCHES,)),), ("ab",), SCENES, Source(UnitPoints)
+)
 
 
 class Worker(ProcessWorker):

@@ -40,7 +40,7 @@ def pairs_of(k: float = 0.0, exif: float = 0.0) -> list[BatchPair]:
         matches = Matches(points0, points1, pair.matches.scores)
         image0 = replace(pair.image0, focal=exif)
         image1 = replace(pair.image1, focal=exif)
-        pairs.append(replace(pair, image0=image0, image1=image1, matches=matches))
+        pairs.append(replace(pair, image0=image0, image1=image1, by_unit=(matches,)))
     return pairs
 
 

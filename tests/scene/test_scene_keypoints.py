@@ -27,7 +27,7 @@ def image(name: str) -> BatchImage:
 
 
 def pair(names: str, found: Matches) -> BatchPair:
-    return BatchPair(image(names[0]), image(names[1]), found)
+    return BatchPair(image(names[0]), image(names[1]), (found,))
 
 
 SHAPES = st.tuples(st.integers(0, 60), st.just(2))
@@ -110,7 +110,7 @@ def test_the_same_picture_under_two_names_is_one_image():
 def test_a_graph_is_made_of_a_pairs_tracks_where_it_has_some():
     every = matches((1,) * 4, (2, 2, 3, 3), (4, 4, 5, 5))
     tracks = matches((4, 4, 5, 5))
-    with_tracks = BatchPair(image("B"), image("A"), every, tracks=tracks)
+    with_tracks = BatchPair(image("B"), image("A"), (every,), tracks=tracks)
     pairs = [pair("AB", Matches.empty()), with_tracks]
     # The images of the graph begin with A, so the pair B, A is turned round.
     (edge,) = ViewGraph.of_pairs(pairs).edges

@@ -39,7 +39,7 @@ def scene() -> SyntheticScene:
 def pair_of(names: str, matches: Matches) -> BatchPair:
     """Return a pair of two images, each named by one character."""
     image0, image1 = (BatchImage(name, f"digest {name}", SIZE) for name in names)
-    return BatchPair(image0, image1, matches)
+    return BatchPair(image0, image1, (matches,))
 
 
 def distances(solution: Solution, scene: SyntheticScene) -> list[float]:
@@ -95,7 +95,7 @@ def test_points_of_a_dense_matcher_make_tracks(scene):
         seen0 = see(rng, camera0, world, 0.3)
         seen1 = see(rng, camera1, world, 0.3)
         dense = match(rng, seen0, seen1, 0.1, None)
-        pairs.append(replace(pair, matches=dense))
+        pairs.append(replace(pair, by_unit=(dense,)))
     solution = reconstruct_batch(pairs, SceneConfig())
     (found,) = solution.reconstructions
     assert (found.registered, found.failure) == (6, "")
@@ -105,7 +105,7 @@ def test_points_of_a_dense_matcher_make_tracks(scene):
 @pytest.mark.parametrize("count", [3, 0])
 def test_a_pair_with_few_matches_or_none_gets_the_scenes_fundamental(scene, count):
     first, *others = scene.pairs
-    few = replace(first, matches=first.matches[:count])
+    few = replace(first, by_unit=(first.matches[:count],))
     # The images of this pair have cameras by their other pairs.
     solution = reconstruct_batch((few, *others), SceneConfig())
     choice = solution.choices[0]
@@ -124,9 +124,9 @@ def test_a_pair_that_the_scene_lacks_is_estimated_at_its_focal_lengths(scene):
             inside.append(pair)
     matches = outside[0].matches
     # 14 are too few to register the image, but enough for an F at a known focal length.
-    few = replace(outside[0], matches=matches[:14])
+    few = replace(outside[0], by_unit=(matches[:14],))
     # 3 are too few for any F.
-    too_few = replace(outside[0], matches=matches[:3])
+    too_few = replace(outside[0], by_unit=(matches[:3],))
     pairs = (few, too_few, *inside)
     magsac = RobustConfig(permutations=1, max_iterations=2000)
     solution = reconstruct_batch(pairs, SceneConfig(), FocalConfig(), magsac)
@@ -141,7 +141,7 @@ def test_a_pair_that_the_scene_lacks_is_estimated_at_its_focal_lengths(scene):
 def test_two_places_in_a_batch_are_two_scenes(scene):
     # A row may name images of both places.
     other = synthetic_scene(4, points=500, seed=7, prefix="b")
-    across = BatchPair(scene.images[0], other.images[0], Matches.empty())
+    across = BatchPair(scene.images[0], other.images[0], ())
     solution = reconstruct_batch((*scene.pairs, *other.pairs, across), SceneConfig())
     assert [found.registered for found in solution.reconstructions] == [6, 4]
     assert solution.choices[-1].reason is Reason.APART
@@ -164,7 +164,7 @@ def test_a_pair_whose_matches_agree_on_something_else_keeps_its_own(scene):
         ]
     )
     F = F / np.sqrt(2)
-    repeated = replace(pair, matches=shifted, pair_fundamental=F)
+    repeated = replace(pair, by_unit=(shifted,), pair_fundamental=F)
     pairs = (*scene.pairs[:-1], repeated)
     solution = reconstruct_batch(pairs, SceneConfig(), FocalConfig())
     *others, last = solution.choices

@@ -238,7 +238,7 @@ def test_an_incomplete_reconstruction_is_mapped_again_with_shared_intrinsics(map
     random = np.random.default_rng(0).uniform(0, 600, (2, 40, 2))
     points0, points1 = random.astype(np.float32)
     matches = Matches(points0, points1, np.ones(40, np.float32))
-    wrong = BatchPair(first, stray, matches)
+    wrong = BatchPair(first, stray, (matches,))
     (found,) = reconstruct_batch([*scene.pairs, wrong], CONFIG).reconstructions
     assert found.registered == 7
     assert mappings == [8, 8]

@@ -34,7 +34,6 @@ from mkpc_kaggle.engine.jobs import (
 )
 from mkpc_kaggle.engine.store.image_files import file_state
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import ModelKind
 from mkpc_kaggle.matchers import failures
 from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult, with_estimate
@@ -272,9 +271,8 @@ def batch_pair(
         image if keeps_paths else replace(image, name=Path(image.name).name)
         for image in pair.images
     )
-    matches = Matches.concatenate(result.matches for result in results)
-    tracks = candidate_tracks(results, candidate)
-    return BatchPair(image0, image1, matches, pair.own, tracks)
+    by_unit = tuple(result.matches for result in results)
+    return BatchPair(image0, image1, by_unit, pair.own, candidate_tracks(results, candidate))
 
 
 def results_of(
