@@ -1,13 +1,131 @@
-"""A pair keeps its F where the evidence of all its units speaks against the scene's."""
+"""Which F a pair gets, which cameras are rejected, and the settings' keys."""
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
+from benchmarks.synthetic_scene import SIZE, SyntheticScene, synthetic_scene
+from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.scene.choose import contradicts
+from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
+from mkpc_kaggle.geometry.robust import RobustConfig, sampson_distances
+from mkpc_kaggle.scene.choose import Choice, Reason, choose, contradicts, estimate_of
+from mkpc_kaggle.scene.models import (
+    Reconstruction,
+    RegisteredImage,
+    SfmModel,
+    filter_models,
+)
+from mkpc_kaggle.scene.sfm import models_of
 from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair
+
+
+@pytest.fixture(scope="module")
+def scene() -> SyntheticScene:
+    return synthetic_scene(4, points=600, outliers=0.3)
+
+
+def model(cameras: dict[str, Camera], points: int = 100) -> SfmModel:
+    """Return a model with these cameras by name. Each camera sees all points."""
+    registered = []
+    for name, camera in cameras.items():
+        image = BatchImage(name, f"digest of {name}", SIZE)
+        registered.append(RegisteredImage(image, camera, points))
+    return SfmModel(tuple(registered), np.zeros((points, 3)), 0.5)
+
+
+def choice(models: list[SfmModel], scene: SyntheticScene, **changes: object) -> Choice:
+    """Return the choice for the pair of images 0000 and 0001, with fields of the pair changed."""
+    registered = []
+    for each in models:
+        by_digest = {found.image.digest: found for found in each.images}
+        registered.append(by_digest)
+    pair = replace(scene.pairs[0], **changes)
+    return choose(pair, registered)
+
+
+def test_a_pair_whose_cameras_make_no_fundamental_keeps_its_own(scene):
+    first = scene.cameras["0000"]
+    second = scene.cameras["0001"]
+    all_but_first = {name: camera for name, camera in scene.cameras.items() if name != "0000"}
+    assert choice([], scene).reason is Reason.UNREGISTERED
+    incomplete = [model(all_but_first)]
+    assert choice(incomplete, scene).reason is Reason.UNREGISTERED
+    # The relative pose of two models is unknown.
+    apart = [model({"0000": first}), model({"0001": second})]
+    assert choice(apart, scene).reason is Reason.APART
+    complete = [model(scene.cameras)]
+    # A pair of an image with itself
+    twice_the_first = choice(complete, scene, image1=scene.images[0])
+    assert twice_the_first.reason is Reason.SAME_IMAGE
+    # Without a baseline F is zero.
+    together = [model(scene.cameras | {"0001": first})]
+    assert choice(together, scene).reason is Reason.SAME_CENTRE
+
+
+def test_a_wrong_camera_is_contradicted_by_the_pairs_matches(scene):
+    camera = scene.cameras["0001"]
+    # Enough that few matches stay near their epipolar lines.
+    angles = np.array([np.radians(15), 0, 0])
+    tilt, _ = cv2.Rodrigues(angles)
+    tilted = Camera(camera.K, tilt @ camera.R, tilt @ camera.t)
+    wrong = [model(scene.cameras | {"0001": tilted})]
+    true_F = scene.true_fundamental(scene.pairs[0])
+    assert choice(wrong, scene, pair_fundamental=true_F).reason is Reason.CONTRADICTION
+    # Without an F of the pair, nothing contradicts the scene's,
+    assert choice(wrong, scene).from_scene
+    # unless it may be estimated.
+    by_digest = {found.image.digest: found for found in wrong[0].images}
+    assert choose(scene.pairs[0], [by_digest], RobustConfig()).reason is Reason.CONTRADICTION
+
+
+def test_an_f_from_cameras_has_the_inliers_of_the_pairs_matches(scene):
+    pair = scene.pairs[0]
+    found = choice([model(scene.cameras)], scene)
+    estimate = estimate_of(found, pair, RobustConfig(threshold=2.0))
+    assert estimate is not None
+    np.testing.assert_array_equal(estimate.matrix, found.F)
+    distances = sampson_distances(estimate.matrix, pair.matches)
+    np.testing.assert_array_equal(estimate.inliers, distances < 2.0)
+    # 0.3 of the matches are wrong, and few of them agree by chance.
+    assert 0.6 < estimate.inliers.mean() < 0.8
+    assert estimate.stats.support > MIN_SUPPORT
+    # The cameras say nothing about F.
+    assert estimate_of(choice([], scene), pair, RobustConfig()) is None
+
+
+# Images have 800 x 600 pixels, so 1e5 is a field of view below half a degree.
+@pytest.mark.parametrize("focal", [-900.0, 0.0, 1e5, np.nan])
+def test_an_absurd_focal_length_is_left_out(scene, focal):
+    K = np.diag([focal, focal, 1.0])
+    absurd = replace(scene.cameras["0000"], K=K)
+    with_absurd = model(scene.cameras | {"0000": absurd})
+    (kept,) = filter_models((with_absurd,))
+    names = [found.image.name for found in kept.images]
+    assert names == ["0001", "0002", "0003"]
+
+
+def test_a_model_that_is_too_small_is_left_out(scene):
+    two = {name: scene.cameras[name] for name in ("0000", "0001")}
+    small = model(two)
+    large = model(scene.cameras)
+    kept = filter_models((small, large))
+    sizes = [len(each.images) for each in kept]
+    assert sizes == [4]
+
+
+def test_the_models_of_all_components_are_numbered_by_size(scene):
+    first_three = list(scene.cameras.items())[:3]
+    small = model(dict(first_three))
+    large = model(scene.cameras)
+    components = [
+        Reconstruction(("a",), (small,)),
+        Reconstruction(("b",), (large,)),
+    ]
+    assert models_of(components) == (large, small)
+
 
 # F of a camera that moves along x, whose lines are the rows, and along y, whose lines are the columns
 ALONG_X = np.array([[0, 0, 0], [0, 0, -1], [0, 1, 0]]) / np.sqrt(2)
