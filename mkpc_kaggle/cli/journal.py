@@ -19,13 +19,14 @@ Show the journal of a run, also while it is running. DIR is the run's work direc
 submission. Without options, print an overview of one screen.
 
 --csv writes tables for pandas.read_csv. Except the last, all have the column `pair`, the id of the pair:
-  pairs.csv    images (paths below the directory of the run's images), failure, source of F (pair, scene,
-               fallback), matches, inliers, seconds by part; f11 ... f33, the matrix of the column model: F, or E
-               for pairs with known intrinsics. For the F of the pair's own matches: support (ratio of inliers to
-               inliers by chance), overlaps (whether the images overlap), plane (share of the inliers that
-               one homography explains), flat (nearly all of them), number of candidates; cost of the result
-               and of MAGSAC's own F, focal lengths. choice: why the F is the scene's, or not; units: the number of
-               units that ran or failed; error: why the pair has no F, unless it has few matches
+  pairs.csv    images (paths below the directory of the run's images), failure, source of F (scene; pair;
+               earlier, a run with other settings; fallback), matches, inliers, seconds by part; f11 ... f33, the
+               matrix of the column model: F, or E for pairs with known intrinsics. For the F of the pair's own
+               matches: support (ratio of inliers to inliers by chance), overlaps (whether the images overlap),
+               plane (share of the inliers that one homography explains), flat (nearly all of them), number of
+               candidates; cost of the result and of MAGSAC's own F, focal lengths. choice: why the F is the
+               scene's, or not; units: the number of units that ran or failed; error: why the pair has no F,
+               unless it has few matches
   units.csv    per unit and pair: matches, inliers, seconds, failure
   regions.csv  per image (0 or 1) and pair: the critical region's box and the reason for it
   events.csv   times of starts, plans, scenes, faults, ends

@@ -187,7 +187,7 @@ def run(arguments: argparse.Namespace) -> int:
         )
         # A run that failed has failed even if an earlier one has left a model.
         unwritten = result.report.unwritten or result.report.unsaved
-        if trouble(result.report) or unwritten or result.lost:
+        if trouble(result.report) or unwritten or result.lost or result.earlier:
             session.status = 1
         problems = [trouble(result.report), result.report.unwritten]
         is_here = held.is_here and all(held_files.is_here for held_files in result.held.values())
@@ -245,7 +245,7 @@ def _lines(result: FolderResult, root: Path) -> Iterator[str]:
     batches = batch_names(root, result.cameras)
     pairs = Counter(pair.group for pair in result.pairs)
     for name, found in result.cameras.items():
-        models = Counter(placed[0] for placed in found.values() if placed)
+        models = Counter(placed.model for placed in found.values() if placed)
         sizes = ", ".join(str(models[number]) for number in sorted(models))
         batch = batches[name]
         if models:
@@ -256,10 +256,10 @@ def _lines(result: FolderResult, root: Path) -> Iterator[str]:
             why = f"{plural(pairs[batch], 'pair')}; cameras need at least three matched images"
         else:
             why = f"{NOT_RECONSTRUCTED}, too little time"
-        if models and batches[name] in result.lost:
+        if name in result.earlier:
             why += " by an earlier run"
-        placed = f"{models.total()} of {plural(len(found), 'image')} with a camera"
-        yield f"{batches[name]}: {placed}: {why}"
+        count = f"{models.total()} of {plural(len(found), 'image')} with a camera"
+        yield f"{batches[name]}: {count}: {why}"
     for name, value, remark in chosen_candidates(report.scenes):
         yield f"{name}: {value} ({remark})"
     yield from weakest_line(report.scenes)

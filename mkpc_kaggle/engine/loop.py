@@ -174,7 +174,7 @@ class Engine:
         if self._asked.resumed:
             pairs = plural(state.rows, "pair")
             self._progress.note(f"{self._asked.resumed} of {pairs} from earlier runs")
-        # Publish existing results before any work: a former F is better than the fallback.
+        # Publish existing results before any work: the F of an earlier run is better than the fallback.
         self._asked.publication.publish()
         self._loop()
 

@@ -169,9 +169,7 @@ def scene_records(state: State) -> tuple[SceneRecord, ...]:
 
 
 def scene_failures(state: State) -> dict[str, Failure]:
-    """Return why batches could not be reconstructed from today's results. The scene of an earlier
-    run may stand in.
-    """
+    """Return why batches could not be reconstructed from today's results."""
     given_up = state.tries.given_up
     everywhere = given_up.get(("scenes",))
     found = {}

@@ -43,11 +43,13 @@ def keep_coordinates(out: Path, root: Path, result: FolderResult) -> Iterator[st
         return
     batches = batch_names(root, result.cameras)
     for dataset, cameras in result.cameras.items():
+        if dataset in result.earlier:
+            continue  # nothing new
         models: dict[int, dict[str, Camera]] = {}
         for file, placed in cameras.items():
             if placed is not None:
-                number, found = placed
-                models.setdefault(number, {})[file.relative_to(root).as_posix()] = found.camera
+                name = file.relative_to(root).as_posix()
+                models.setdefault(placed.model, {})[name] = placed.camera
         # Before they are replaced
         yield from moved_lines(
             batches[dataset],

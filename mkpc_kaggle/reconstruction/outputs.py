@@ -4,19 +4,48 @@
 
 import csv
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mkpc_kaggle.data.outputs import replacing
-from mkpc_kaggle.scene.models import RegisteredImage
+from mkpc_kaggle.engine.console import logger
+from mkpc_kaggle.geometry.cameras import Camera
+from mkpc_kaggle.geometry.intrinsics import KnownCamera
+from mkpc_kaggle.reconstruction.folder import Datasets
+from mkpc_kaggle.scene.models import Sigmas
 
-# By dataset and file: the number of the model and the camera in that model; None without a camera.
-Cameras = Mapping[str, Mapping[Path, tuple[int, RegisteredImage] | None]]
+
+@dataclass(frozen=True, eq=False)
+class PlacedImage:
+    """The camera of an image file, and the number of its model: a row of ``cameras.csv``.
+
+    ``content`` is the digest of the file, or empty for a row of an earlier run.
+    """
+
+    model: int
+    camera: Camera
+    sigmas: Sigmas | tuple[()] = ()
+    lens: KnownCamera | None = None
+    content: str = ""
+
+
+# By dataset and file; None without a camera.
+Cameras = Mapping[str, Mapping[Path, PlacedImage | None]]
 
 NO_POSE = ";".join(["nan"] * 9), "nan;nan;nan"
 ORIGIN = "1;0;0;0;1;0;0;0;1", "0;0;0"
+CAMERA_HEADS = (
+    "image",
+    "model",
+    "K",
+    "R",
+    "t",
+    *("rotation_sigma", "centre_sigma", "focal_sigma"),
+    *("camera_model", "parameters"),
+)
 SUBMISSION_FORMATS = (
     "imc2025",  # a cluster for each model; an image without a camera is an outlier, its pose nan
     "imc2023",  # also for 2024: the cameras of the largest model; other images are at the origin
@@ -42,23 +71,21 @@ def camera_rows(cameras: Cameras, root: Path) -> Iterator[Sequence[str]]:
     The centre of an image's first pixel is (0, 0); X_cam = R X + t. In COLMAP's parameters it is
     (0.5, 0.5). Unknown sigmas are empty cells.
     """
-    sigma_names = ("rotation_sigma", "centre_sigma", "focal_sigma")
-    yield "image", "model", "K", "R", "t", *sigma_names, "camera_model", "parameters"
+    yield CAMERA_HEADS
     for files in cameras.values():
         for file, placed in files.items():
             if placed is None:
                 continue
-            model, image = placed
-            camera = image.camera
-            sigmas = [f"{value:g}" for value in image.sigmas] or [""] * 3
+            camera = placed.camera
+            sigmas = [f"{value:g}" for value in placed.sigmas] or [""] * 3
             # As in a table of --intrinsics, which takes them
-            lens = image.lens
+            lens = placed.lens
             parameters = (
                 "" if lens is None else " ".join(f"{value:.12g}" for value in lens.parameters)
             )
             yield (
                 file.relative_to(root).as_posix(),
-                str(model),
+                str(placed.model),
                 joined(camera.K),
                 joined(camera.R),
                 joined(camera.t),
@@ -66,6 +93,38 @@ def camera_rows(cameras: Cameras, root: Path) -> Iterator[Sequence[str]]:
                 "" if lens is None else lens.model,
                 parameters,
             )
+
+
+def read_cameras(path: Path, root: Path, datasets: Datasets) -> Cameras:
+    """Return the cameras that an earlier run wrote to ``cameras.csv``, of the files that exist now.
+
+    There are none without the file, or with a warning if it is no such table.
+    """
+    placed: dict[str, PlacedImage] = {}
+    try:
+        with path.open(newline="", encoding="utf-8") as stream:
+            heads, *rows = csv.reader(stream)
+        if tuple(heads) != CAMERA_HEADS:
+            raise ValueError("it has other columns")
+        placed = {row[0]: _placed(row) for row in rows}
+    except FileNotFoundError:
+        pass
+    except (OSError, ValueError, csv.Error) as error:
+        logger.warning(f"{path}: its cameras will be replaced, they cannot be read: {error}")
+    return {
+        name: {file: placed.get(file.relative_to(root).as_posix()) for file in files}
+        for name, files in datasets.items()
+    }
+
+
+def _placed(row: Sequence[str]) -> PlacedImage:
+    """Invert a row of :func:`camera_rows`. Raise ``ValueError`` for any other row."""
+    _, model, K, R, t, rotation, centre, focal, name, parameters = row
+    numbers = [np.array(text.split(";"), float) for text in (K, R, t)]
+    camera = Camera(numbers[0].reshape(3, 3), numbers[1].reshape(3, 3), numbers[2].reshape(3))
+    sigmas = Sigmas(float(rotation), float(centre), float(focal)) if rotation else ()
+    lens = KnownCamera(name, tuple(map(float, parameters.split()))) if name else None
+    return PlacedImage(int(model), camera, sigmas, lens)
 
 
 def submission_rows(form: str, cameras: Cameras, root: Path) -> Iterator[Sequence[str]]:
@@ -85,13 +144,14 @@ def submission_rows(form: str, cameras: Cameras, root: Path) -> Iterator[Sequenc
         for file, placed in found.items():
             # The file's name, except in a dataset of several folders
             name = file.relative_to(root / dataset).as_posix()
-            pose = (joined(placed[1].camera.R), joined(placed[1].camera.t)) if placed else NO_POSE
+            pose = (joined(placed.camera.R), joined(placed.camera.t)) if placed else NO_POSE
             if of_2025:
                 number = _unused(f"{folder}_{name}", ids)
-                yield number, folder, f"cluster{placed[0]}" if placed else "outliers", name, *pose
+                cluster = f"cluster{placed.model}" if placed else "outliers"
+                yield number, folder, cluster, name, *pose
             else:
                 place = f"{folder}/{name}", parts[0], parts[1 if len(parts) > 2 else 0]
-                yield *place, *(pose if placed and placed[0] == 0 else ORIGIN)
+                yield *place, *(pose if placed and placed.model == 0 else ORIGIN)
 
 
 def joined(numbers: NDArray[np.float64]) -> str:

@@ -22,6 +22,7 @@ from mkpc_kaggle.errors import UserError, plural, temporary_directory
 from mkpc_kaggle.matchers.contract import Matcher
 from mkpc_kaggle.recipe import Recipe
 from mkpc_kaggle.reconstruction.folder import read_folder, require_distinct
+from mkpc_kaggle.reconstruction.outputs import PlacedImage
 from mkpc_kaggle.reconstruction.panoramas import require_perspective
 from mkpc_kaggle.reconstruction.placed import read_placed
 from mkpc_kaggle.reconstruction.priors import (
@@ -32,7 +33,7 @@ from mkpc_kaggle.reconstruction.priors import (
 from mkpc_kaggle.reconstruction.run import for_cameras, reconstruct_folder
 from mkpc_kaggle.reporting.contradictions import contradictions
 from mkpc_kaggle.scene.export import MODELS
-from mkpc_kaggle.scene.models import RegisteredImage, SfmModel
+from mkpc_kaggle.scene.models import SfmModel
 from mkpc_kaggle.setup.arguments import PathSource, Weights, member_of, shown_value
 from mkpc_kaggle.setup.assembly import Assembly, assemble
 from mkpc_kaggle.setup.availability import Licence
@@ -293,18 +294,18 @@ def complete_model(model: SfmModel, folder: Path, names: Mapping[str, str]) -> S
 
 
 def with_copies(
-    model: SfmModel, number: int, cameras: Mapping[str, tuple[int, RegisteredImage] | None]
+    model: SfmModel, number: int, cameras: Mapping[str, PlacedImage | None]
 ) -> SfmModel:
     """Return model ``number`` with a camera for each file that is identical to one of its images.
 
-    ``cameras`` has the number of the model and the camera of each file, by the user's name.
+    ``cameras`` has the camera of each file, by the user's name.
     """
     names = {found.image.name for found in model.images}
     by_content = {found.image.digest: found for found in model.images}
     copies = []
     for name, camera in cameras.items():
-        if camera is not None and camera[0] == number and name not in names:
-            found = by_content[camera[1].image.digest]
+        if camera is not None and camera.model == number and name not in names:
+            found = by_content[camera.content]
             copies.append(replace(found, image=replace(found.image, name=name)))
     return replace(model, images=(*model.images, *copies))
 

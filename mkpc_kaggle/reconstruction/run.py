@@ -1,6 +1,6 @@
 """Reconstruction of a folder of images in a run of the engine."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -14,10 +14,9 @@ from mkpc_kaggle.errors import writing
 from mkpc_kaggle.recipe import CameraSharing, Recipe, SceneConfig
 from mkpc_kaggle.reconstruction.choice import choose_pairs
 from mkpc_kaggle.reconstruction.folder import Datasets, Ends, batch_names
-from mkpc_kaggle.reconstruction.outputs import Cameras
+from mkpc_kaggle.reconstruction.outputs import Cameras, PlacedImage, camera_rows, read_cameras
 from mkpc_kaggle.reconstruction.unmatched import cause_of_no_matches
 from mkpc_kaggle.scene.export import HeldDirectory, remove_files, versions_of
-from mkpc_kaggle.scene.models import RegisteredImage
 from mkpc_kaggle.setup.assembly import Assembly
 
 AUTO_RECIPE = "auto"  # the recipe of all matchers whose weights are found
@@ -25,20 +24,22 @@ AUTO_RECIPE = "auto"  # the recipe of all matchers whose weights are found
 # On 20 pairs of reichstag_26, 2,000 take 15 ms a pair in place of the 24 ms of 10,000, find 1.00 of
 # the inliers, and doubt the same pairs.
 MAGSAC_ITERATIONS = 2_000
+EARLIER = "its cameras and models are those of an earlier run, as this one has no new ones yet"
 
 
 @dataclass(frozen=True)
 class FolderResult:
     """The outcome of a run on a folder.
 
-    ``lost`` has the reason for each batch whose cameras could not be computed; an earlier run's
-    cameras may stand in.
+    ``lost`` has the reason for each batch whose cameras could not be computed. ``earlier`` are the
+    datasets whose cameras and files are still those of an earlier run.
     """
 
     report: RunReport
     pairs: tuple[Pair, ...]
     cameras: Cameras
     lost: Mapping[str, str]
+    earlier: Collection[str] = ()
     held: Mapping[str, HeldDirectory] = field(default_factory=dict)  # of COLMAP's files, by dataset
 
 
@@ -88,15 +89,19 @@ def reconstruct_folder(
     without matches are turned. A scene's process writes these files before the journal records the
     scene, so that a resumed run makes missing files. ``publish`` is called with the cameras so far:
     initially with no cameras, then after each scene.
+
+    Until this run knows the cameras of a dataset, its models and its rows of ``cameras.csv`` are those of
+    the earlier run in ``out``, if any.
     """
     assembly = replace(assembly, recipe=for_cameras(assembly.recipe))
     folders = dict.fromkeys(file.parent for files in datasets.values() for file in files)
     with opened_engine(assembly, session, folders) as engine:
-        standing: list[Cameras] = [{name: dict.fromkeys(files) for name, files in datasets.items()}]
-        # The tables of an earlier run are worth more than empty ones.
-        if not (out / "cameras.csv").exists():
+        table = out / "cameras.csv"
+        earlier = read_cameras(table, root, datasets)
+        cameras = [earlier]
+        if not table.exists():
             with writing(f"--out {out}"):
-                publish(standing[0])
+                publish(earlier)
         pairs = choose_pairs(
             engine, root, datasets, assembly, session, listed=listed, rotations=rotations
         )
@@ -104,12 +109,12 @@ def reconstruct_folder(
         batches = batch_names(root, datasets)
         with writing(f"--out {out}"):
             exports = {batches[name]: HeldDirectory.of(out / name) for name in datasets}
-            former = {name: versions_of(held.path) for name, held in exports.items()}
+            files_before = {name: versions_of(held.path) for name, held in exports.items()}
 
         # Called by the engine's publications, and by the watchdog at the end of the time
         def write(results: State) -> None:
-            standing[:] = [cameras_of(datasets, root, results)]
-            publish(standing[0])
+            cameras[0] = cameras_of(datasets, root, results, earlier)
+            publish(cameras[0])
 
         engine.ask(request_of(pairs, assembly, session, str(root), exports=exports, publish=write))
         state = engine.state
@@ -121,33 +126,76 @@ def reconstruct_folder(
                 cause = cause_of_no_matches(files, assembly.masks)
                 if cause:
                     engine.log.fault(f"{batch}: {cause}")
-        # Within the context: afterwards the store is closed.
-        report = engine.report()
-        # An earlier run's models, from other images, do not belong to tables without cameras.
+        # Models of an earlier run do not belong to tables without cameras.
         for batch in state.batches:
-            if batch not in state.scenes and remove_files(exports[batch], former[batch]):
+            is_without = batch not in state.scenes and is_decided(state, batch)
+            if is_without and remove_files(exports[batch], files_before[batch]):
                 logger.warning(
-                    f"{batch}: this run has no cameras; the models of an earlier run were removed"
+                    f"{batch}: its images have no matches; the models of an earlier run were removed"
                 )
         lost = {batch: str(failure) for batch, failure in scene_failures(state).items()}
+        unfinished = {name for name in datasets if is_unfinished(state, batches[name], lost)}
+        latest = cameras_of(datasets, root, state, earlier)
+        standing = [name for name in unchanged(earlier, latest, root) if name in unfinished]
+        for name in standing:
+            engine.log.fault(f"{batches[name]}: {EARLIER}")
+        # Within the context: afterwards the store is closed.
+        report = engine.report()
     held = {name: exports[batches[name]] for name in datasets}
-    return FolderResult(report, tuple(pairs), standing[0], lost, held)
+    return FolderResult(report, tuple(pairs), cameras[0], lost, standing, held)
 
 
-def cameras_of(datasets: Datasets, root: Path, results: State) -> Cameras:
+def is_decided(results: State, batch: str) -> bool:
+    """Return whether a run knows the cameras of a batch, or that it has none."""
+    if batch in results.scenes:
+        return True
+    # A batch of one pair is none. Units that failed say nothing about the images.
+    return (
+        batch in results.batches
+        and results.is_unmatched(batch)
+        and bool(results.current[results.rows_of(batch)].all())
+    )
+
+
+def is_unfinished(results: State, batch: str, lost: Collection[str]) -> bool:
+    """Return whether the cameras in use, if any, are not from all of today's results."""
+    return batch not in results.batches or batch in results.stale or batch in lost
+
+
+def unchanged(before: Cameras, after: Cameras, root: Path) -> list[str]:
+    """Return the datasets that have cameras, and the same ones as before."""
+    return [
+        name
+        for name, placed in before.items()
+        if any(placed.values())
+        and [*camera_rows({name: placed}, root)] == [*camera_rows({name: after[name]}, root)]
+    ]
+
+
+def cameras_of(datasets: Datasets, root: Path, results: State, earlier: Cameras) -> Cameras:
     """Return the camera of each image. Identical files share one camera, from the largest model
     that has it.
+
+    Datasets that the run has not decided yet have the cameras of an ``earlier`` run.
     """
-    cameras: dict[str, Mapping[Path, tuple[int, RegisteredImage] | None]] = {}
+    cameras: dict[str, Mapping[Path, PlacedImage | None]] = {}
     # A file that was not read has no digest, and no camera.
     known_digests = results.digests
     batches = batch_names(root, datasets)
     for name, files in datasets.items():
+        if not is_decided(results, batches[name]):
+            cameras[name] = earlier[name]
+            continue
         scene = results.scenes.get(batches[name])
         models = () if scene is None else scene.models
         # The largest model is the first, so it comes last into the dictionary and stays there.
-        placed = [(number, image) for number, model in enumerate(models) for image in model.images]
-        by_digest = {image.image.digest: (number, image) for number, image in reversed(placed)}
+        by_digest: dict[str, PlacedImage] = {}
+        for number, model in reversed([*enumerate(models)]):
+            for image in reversed(model.images):
+                content = image.image.digest
+                by_digest[content] = PlacedImage(
+                    number, image.camera, image.sigmas, image.lens, content
+                )
         digests = {file: known_digests.get(name_below(str(root), str(file)), "") for file in files}
         cameras[name] = {file: by_digest.get(digests[file]) for file in files}
     return cameras

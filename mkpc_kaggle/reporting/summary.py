@@ -63,6 +63,11 @@ def is_solved(pairs: "DataFrame") -> "Series[bool]":
     return pairs["source"] != "fallback"
 
 
+def is_of_this_run(pairs: "DataFrame") -> "Series[bool]":
+    """Return which pairs have an F, or none, by this run: not the F of one with other settings."""
+    return pairs["source"] != "earlier"
+
+
 def is_reached(pairs: "DataFrame") -> "Series[bool]":
     return pairs["failure"] != NOT_REACHED
 
@@ -176,11 +181,18 @@ def facts(run: AnyRun) -> Iterator[tuple[str, str, str]]:
     solved = pairs[is_solved(pairs)]
     sources = Counter(pairs["source"])
     # The best source first
-    parts = (("scene", "from scenes"), ("pair", "from their own matches"), ("fallback", "fallback"))
+    parts = (
+        ("scene", "from scenes"),
+        ("pair", "from their own matches"),
+        ("earlier", "of an earlier run with other settings"),
+        ("fallback", "fallback"),
+    )
     from_where = ", ".join(
         f"{sources[source]} {what}" for source, what in parts if source in sources
     )
     yield "pairs with an F", f"{len(solved)} of {len(pairs)}", from_where
+    # Of the F of an earlier run, this one knows no inliers.
+    solved = solved[is_of_this_run(solved)]
     if len(solved):
         inliers = solved["inliers"]
         yield (
@@ -294,7 +306,7 @@ def is_doubtful(pairs: "DataFrame") -> "Series[bool]":
 
     Few inliers decide only where the scene does not: two cameras that agree have settled it.
     """
-    return ~pairs["overlaps"] & (pairs["source"] != "scene")
+    return ~pairs["overlaps"] & (pairs["source"] != "scene") & is_of_this_run(pairs)
 
 
 def weakest_line(scenes: Sequence[SceneRecord]) -> Iterator[str]:

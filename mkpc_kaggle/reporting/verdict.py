@@ -21,6 +21,7 @@ from mkpc_kaggle.reporting.run_log import RunLog
 from mkpc_kaggle.reporting.summary import (
     headline,
     is_doubtful,
+    is_of_this_run,
     is_reached,
     is_solved,
     seconds_by_part,
@@ -290,10 +291,10 @@ def summary_table(log: RunLog) -> dict[str, Any]:
 
 
 def _pairs_table(pairs: "DataFrame") -> dict[str, Any]:
-    inliers = pairs["inliers"][is_solved(pairs)].tolist()
+    inliers = pairs["inliers"][is_solved(pairs) & is_of_this_run(pairs)].tolist()
     return {
         "count": len(pairs),
-        "with_f": len(inliers),
+        "with_f": int(is_solved(pairs).sum()),
         # Sorted, so that equal runs give equal files
         "sources": dict(sorted(Counter(pairs["source"]).items())),
         "doubtful": [

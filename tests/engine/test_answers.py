@@ -24,7 +24,7 @@ from mkpc_kaggle.data.competition import Pair, submission_problems
 from mkpc_kaggle.engine import light
 from mkpc_kaggle.engine.jobs import EstimateJob, Job, SceneJob
 from mkpc_kaggle.engine.plan.budget import Budget, Costs
-from mkpc_kaggle.engine.plan.state import State
+from mkpc_kaggle.engine.plan.state import FALLBACK, PAIR, SCENE, State
 from mkpc_kaggle.engine.request import Ending, RunReport
 from mkpc_kaggle.engine.workers import places
 from mkpc_kaggle.engine.workers.places import LocalSite
@@ -220,12 +220,12 @@ def test_no_matrix_that_the_competition_refuses_reaches_the_submission(tmp_path)
         state.own[0] = 0.0
         state.own[1, 2, 2] = np.nan
         state.by_scene[2] = np.inf
-        state.scene_source[2] = 2
+        state.scene_source[2] = SCENE
         versions.append((state.fundamentals, state.sources))
 
     report = spoiled(tmp_path, spoil)
     written, origins = versions[-1]
-    assert origins.tolist() == [0, 0, 0, 1]
+    assert origins.tolist() == [FALLBACK, FALLBACK, FALLBACK, PAIR]
     assert [np.array_equal(F, FALLBACK_FUNDAMENTAL) for F in written] == [True] * 3 + [False]
     assert sources(report) == ["fallback"] * 3 + ["pair"]
 

@@ -27,7 +27,7 @@ from mkpc_kaggle.engine.jobs import Estimated, MatchJob, Outcome, Phase
 from mkpc_kaggle.engine.light import Estimating
 from mkpc_kaggle.engine.matching import Matching
 from mkpc_kaggle.engine.plan.budget import Budget, Costs
-from mkpc_kaggle.engine.plan.state import State
+from mkpc_kaggle.engine.plan.state import EARLIER, FALLBACK, PAIR, State
 from mkpc_kaggle.engine.publication import Publication
 from mkpc_kaggle.engine.request import Ending, Request
 from mkpc_kaggle.engine.restore import restore
@@ -35,7 +35,12 @@ from mkpc_kaggle.engine.run import EventLog, Run
 from mkpc_kaggle.engine.scenes import SceneWork
 from mkpc_kaggle.engine.store import database as store_module
 from mkpc_kaggle.engine.store.database import FILE_NAME, Store, connected, to_bytes
-from mkpc_kaggle.engine.store.dataframes import matrices_of, pair_tables, read_results
+from mkpc_kaggle.engine.store.dataframes import (
+    NOT_REACHED,
+    matrices_of,
+    pair_tables,
+    read_results,
+)
 from mkpc_kaggle.engine.store.image_files import stored_digests
 from mkpc_kaggle.engine.store.keys import Keys
 from mkpc_kaggle.engine.store.published import Published
@@ -241,10 +246,9 @@ CHANGES = {
     ),
     "unit removed": (lambda room: room.ask(replace(RECIPE, units=(SWEEP,))), (2, 0, False)),
     # Until there are other estimates
-    "threshold": (lambda room: room.ask(estimate="other"), (2, 0, True)),
+    "threshold": (lambda room: room.ask(estimate="other"), (2, 0, False)),
     "scene": (lambda room: room.ask(scene="other"), (2, 2, False)),
-    # The old points of stage 2 stay in use until new ones exist.
-    "crops": (lambda room: room.ask(mkpc="other"), (2, 2, True)),
+    "crops": (lambda room: room.ask(mkpc="other"), (2, 0, False)),
     "pair added": (lambda room: room.ask(count=4), (2, 2, True)),
     "content": (lambda room: room.replace("0.png"), (1, 1, False)),
     "content of second images": (lambda room: room.replace("c.png"), (0, 0, False)),
@@ -261,7 +265,7 @@ def test_a_result_is_up_to_date_if_it_is_stored_under_todays_key(
     assert whole.standing == standing
 
 
-def test_new_points_of_stage_1_make_those_of_stage_2_out_of_date_but_they_stay_in_use(
+def test_new_points_of_stage_1_make_those_of_stage_2_out_of_date_but_the_run_uses_them(
     room: Room,
 ) -> None:
     recipe = replace(RECIPE, units=(SWEEP, SECOND, THIRD))
@@ -272,9 +276,8 @@ def test_new_points_of_stage_1_make_those_of_stage_2_out_of_date_but_they_stay_i
     assert room.state.current[0].tolist() == [True, False, True]
     assert room.state.has[0].all()
     room.publish()
-    room.ask(recipe)  # the same after a restart
-    assert room.state.current[0].tolist() == [True, False, True]
-    assert room.state.has[0].all()
+    room.ask(recipe)  # the next run has none but those of today
+    assert room.state.current[0].tolist() == room.state.has[0].tolist() == [True, False, True]
     room.match(0, SECOND)
     assert room.state.current[0].all()
 
@@ -298,17 +301,40 @@ def test_former_results_are_up_to_date_again_when_the_former_settings_return(who
     assert whole.standing == (2, 2, True)
 
 
-def test_a_former_f_stays_until_a_new_one_exists_unless_an_image_changed(whole: Room) -> None:
-    # An F by former settings is better than the fallback.
-    whole.ask(estimate="other", scene="other")
-    assert whole.state.has_own.tolist() == [True, True, False]
-    assert set(whole.state.scenes) == {"one"}
-    # An F of another image is not.
-    whole.match(0, SWEEP, SECOND, digest="new")
-    assert whole.state.has_own.tolist() == [False, True, False]
-    whole.publish()
-    whole.ask(estimate="other", scene="other")
-    assert whole.state.scenes == {}
+def test_the_f_of_the_last_table_stays_until_a_new_one_exists_unless_an_image_changed(
+    whole: Room,
+) -> None:
+    before = [3 * F, F]  # of a scene, and of a pair
+    # Again and again, as in runs that are interrupted at once.
+    for other in ("first", "second"):
+        whole.ask(replace(RECIPE, units=(THIRD,)), estimate=other, scene=other)
+        assert whole.state.sources.tolist() == [EARLIER, EARLIER, FALLBACK]
+        assert np.array_equal(whole.state.fundamentals[:2], before)
+        assert not whole.state.has.any()
+        assert not whole.state.scenes
+        whole.publish()
+        pairs = pair_tables(whole.store).pairs
+        assert pairs["source"].tolist() == ["earlier", "earlier", "fallback"]
+        assert pairs["failure"].tolist() == [NOT_REACHED] * 3
+        assert pairs["error"].tolist() == [""] * 3
+    whole.match(0, THIRD)
+    whole.estimate(0)
+    # An F of another image is worth nothing.
+    whole.match(1, THIRD, digest="new")
+    assert whole.state.sources.tolist() == [PAIR, FALLBACK, FALLBACK]
+    assert np.array_equal(whole.state.fundamentals, [F, *[FALLBACK_FUNDAMENTAL] * 2])
+
+
+def test_an_e_of_an_earlier_run_is_not_written_as_f(room: Room) -> None:
+    known = replace(pair_of(0), intrinsics=(np.eye(3), np.eye(3)))
+    room.ask(pairs=[known])
+    room.match(0, SWEEP)
+    room.estimate(0)
+    room.publish()
+    room.ask(pairs=[known], estimate="other")
+    assert room.state.sources.tolist() == [EARLIER]
+    room.ask(pairs=[pair_of(0)])
+    assert room.state.sources.tolist() == [FALLBACK]
 
 
 def test_reports_show_the_f_that_was_written_last_and_decide_nothing_themselves(

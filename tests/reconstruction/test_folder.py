@@ -11,16 +11,13 @@ import pytest
 
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.cameras import Camera
-from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.reconstruction.folder import (
     batch_names,
     pair_list_line,
     read_folder,
     read_pair_list,
 )
-from mkpc_kaggle.reconstruction.outputs import submission_rows
-from mkpc_kaggle.scene.models import RegisteredImage
-from mkpc_kaggle.scene.view_graph import BatchImage
+from mkpc_kaggle.reconstruction.outputs import PlacedImage, submission_rows
 
 
 def written(root: Path, *names: str) -> Path:
@@ -88,7 +85,7 @@ def test_names_in_a_list_of_pairs_may_have_blanks(tmp_path):
 
 def rows_of(root: Path, files: Iterable[str]) -> list[tuple[str, ...]]:
     camera = Camera(np.eye(3), np.eye(3), np.zeros(3))
-    placed = 0, RegisteredImage(BatchImage("x", "x", Size(10, 10)), camera, 5)
+    placed = PlacedImage(0, camera)
     cameras = {}
     for name in files:
         path = root / name

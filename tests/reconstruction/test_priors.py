@@ -271,7 +271,7 @@ def test_another_mask_is_matched_again_and_other_intrinsics_are_not(tmp_path):
     result = run(root, out, matcher, known=known)
     # The points do not depend on cameras.
     assert matcher.calls == [], "intrinsics change scenes alone"
-    assert cameras(result)["00.png"].focal == pytest.approx(truth[0, 0], abs=1e-9)
+    assert cameras(result)["00.png"].camera.K[0, 0] == pytest.approx(truth[0, 0], abs=1e-9)
     assert contents(out) != before
     folder = write_masks(tmp_path / "masks", root, 200)
     expected = FIRST * (FIRST - 1) // 2
@@ -400,7 +400,7 @@ def test_a_row_with_a_path_is_the_camera_of_that_image_alone(tmp_path):
     known = read_intrinsics_table(table, root, sorted(root.rglob("*.png")))
     result = run(root, tmp_path / "out", known=known)
     focals = {
-        name: next(placed[1].focal for file, placed in found.items() if file.name == "00.png")
+        name: next(placed.camera.K[0, 0] for file, placed in found.items() if file.name == "00.png")
         for name, found in result.cameras.items()
     }
     assert focals["a"] == pytest.approx(901, abs=1e-9)

@@ -36,6 +36,7 @@ from mkpc_kaggle.engine.session import Interrupt, Session
 from mkpc_kaggle.engine.store.database import FILE_NAME, Store
 from mkpc_kaggle.engine.store.dataframes import ELEMENTS
 from mkpc_kaggle.engine.store.keys import Keys
+from mkpc_kaggle.engine.workers.worker import compute_scene
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.cameras import fundamental_of_cameras
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
@@ -47,8 +48,20 @@ from mkpc_kaggle.recipe import CameraModel, Recipe, SceneConfig, Unit
 from mkpc_kaggle.reconstruction import choice
 from mkpc_kaggle.reconstruction.folder import read_folder, read_pair_list
 from mkpc_kaggle.reconstruction.layout import write_images
-from mkpc_kaggle.reconstruction.outputs import Cameras, camera_rows, submission_rows
-from mkpc_kaggle.reconstruction.run import FolderResult, for_cameras, reconstruct_folder
+from mkpc_kaggle.reconstruction.outputs import (
+    Cameras,
+    PlacedImage,
+    camera_rows,
+    read_cameras,
+    submission_rows,
+    write_tables,
+)
+from mkpc_kaggle.reconstruction.run import (
+    EARLIER,
+    FolderResult,
+    for_cameras,
+    reconstruct_folder,
+)
 from mkpc_kaggle.scene.export import HeldDirectory
 from mkpc_kaggle.scene.likeness import (
     largest_features,
@@ -57,7 +70,6 @@ from mkpc_kaggle.scene.likeness import (
     overlapping,
     shortlist,
 )
-from mkpc_kaggle.scene.models import RegisteredImage
 from mkpc_kaggle.setup.assembly import assemble
 
 RECIPE = for_cameras(Recipe((Unit(1, "synthetic", SIZE.width),), magsac=QUICK))
@@ -92,6 +104,13 @@ class MixedMatcher(SyntheticMatcher):
         )
 
 
+class MatcherOfNothing(MixedMatcher):
+    """Finds no match between any two images."""
+
+    def _match(self, seen0: Seen, seen1: Seen) -> Matches:
+        return Matches.empty()
+
+
 def write_flat(folder: Path, count: int = FIRST + SECOND + OTHERS) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     for number in range(count):
@@ -104,12 +123,15 @@ def run(
     out: Path,
     matcher: SyntheticMatcher | None = None,
     interrupt: Interrupt | None = None,
+    recipe: Recipe = RECIPE,
     **options: object,
 ) -> FolderResult:
+    """Reconstruct a folder, with ``cameras.csv`` as the command writes it."""
     matcher = matcher or MixedMatcher()
+    options = {"publish": lambda found: write_tables(out, found, root, None)} | options
     budget = Budget(time.monotonic(), float("inf"))
     session = Session(out / "work", budget, interrupt or Interrupt(), progress=False, workers=0)
-    assembly = assemble(RECIPE, matchers={"synthetic": matcher}, device="cpu")
+    assembly = assemble(recipe, matchers={"synthetic": matcher}, device="cpu")
     return reconstruct_folder(root, read_folder(root), assembly, session, out, **options)
 
 
@@ -119,9 +141,9 @@ def mixed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, FolderResult]
     return home / "out", run(write_flat(home / "images"), home / "out")
 
 
-def cameras(result: FolderResult) -> Mapping[str, RegisteredImage]:
+def cameras(result: FolderResult) -> Mapping[str, PlacedImage]:
     (found,) = result.cameras.values()
-    return {file.name: placed[1] for file, placed in found.items() if placed}
+    return {file.name: placed for file, placed in found.items() if placed}
 
 
 def contents(out: Path) -> dict[str, str]:
@@ -328,7 +350,8 @@ def test_colmap_goes_on_with_photographs_that_exif_turns(tmp_path):
         set_exif(path, orientation)
     result = run(root, out)
     sizes = {f"{n:02}.png": SIZE if o in (1, 3) else SIZE[::-1] for n, o in enumerate(ORIENTATIONS)}
-    assert {name: record.image.size for name, record in cameras(result).items()} == sizes
+    (model,) = result.report.scenes[0].models
+    assert {image.image.name: image.image.size for image in model.images} == sizes
     # COLMAP's own mapper, from our database and the user's photographs
     settings = {"min_model_size": 3, "random_seed": 0, "extract_colors": True, "num_threads": 1}
     options = pycolmap.IncrementalPipelineOptions(settings)
@@ -373,33 +396,106 @@ def test_results_that_were_removed_are_made_again_and_an_image_that_was_absent_c
     assert contents(out) == before
 
 
-def test_models_of_images_that_have_changed_do_not_outlive_a_run_without_cameras(
-    tmp_path, monkeypatch, capsys
-):
+def grow(root: Path) -> Recipe:
+    write_flat(root, 5)
+    return RECIPE
+
+
+def replace_an_image(root: Path) -> Recipe:
+    cv2.imwrite(str(root / "03.png"), flat(4, SIZE))
+    return RECIPE
+
+
+# What changes after a run, and the number of cameras of the next complete one
+CHANGES_OF_A_FOLDER = {
+    "a new image": (grow, 5),
+    "a replaced image": (replace_an_image, 4),
+    "another setting": (
+        lambda _: replace(RECIPE, magsac=replace(RECIPE.magsac, threshold=1.0)),
+        4,
+    ),
+    "another matcher": (
+        lambda _: replace(RECIPE, units=(Unit(1, "synthetic", SIZE.width, max_matches=900),)),
+        4,
+    ),
+}
+
+
+@pytest.mark.parametrize(("change", "count"), CHANGES_OF_A_FOLDER.values(), ids=CHANGES_OF_A_FOLDER)
+def test_files_of_an_earlier_run_stay_until_a_run_has_cameras(tmp_path, monkeypatch, change, count):
     root = write_flat(tmp_path / "images", 4)
     out = tmp_path / "out"
     run(root, out)
-    assert (out / "models" / "0").is_dir()
-    cv2.imwrite(str(root / "00.png"), flat(3, SIZE))
-    with monkeypatch.context() as patched:
-        scenes_by(patched, partial(befall, fail))
-        assert cameras(run(root, out)) == {}
-    assert "the models of an earlier run were removed" in capsys.readouterr().err
-    assert not any((out / name).exists() for name in ("models", "database.db", "sparse"))
-
-
-def test_former_cameras_stay_until_a_grown_folder_has_new_ones(tmp_path, monkeypatch):
-    root = write_flat(tmp_path / "images", 4)
-    out = tmp_path / "out"
-    former = cameras(run(root, out)).keys()
-    write_flat(root, 5)
-    # The first loss leaves files that may be of either scene, and the next run begins from these.
+    before = contents(out)
+    recipe = change(root)
+    # The first loss may leave files of either scene, and the next run begins from these.
     with monkeypatch.context() as patched:
         scenes_by(patched, partial(befall, fail))
         for _ in range(2):
-            assert cameras(run(root, out)).keys() == former
-            assert (out / "models" / "0").is_dir()
-    assert len(cameras(run(root, out))) == 5
+            result = run(root, out, recipe=recipe)
+            assert contents(out) == before
+            assert result.earlier == ["."]
+            assert f"images: {EARLIER}" in result.report.faults
+    interrupt = Interrupt()
+    interrupt.set()
+    assert run(root, out, interrupt=interrupt, recipe=recipe).earlier == ["."]
+    assert contents(out) == before
+    result = run(root, out, recipe=recipe)
+    assert (len(cameras(result)), result.earlier) == (count, [])
+    assert contents(out).keys() == before.keys()
+
+
+def test_each_dataset_has_its_new_cameras_or_those_of_an_earlier_run(tmp_path, monkeypatch):
+    root = tmp_path / "images"
+    for name in ("a", "b"):
+        write_flat(root / name, 4)
+    out = tmp_path / "out"
+    run(root, out)
+    before = (out / "cameras.csv").read_text().splitlines()
+    shutil.copy(root / "a" / "00.png", root / "a" / "copy.png")
+    write_flat(root / "b", 5)
+
+    def fail_one(job):
+        return befall(fail, job) if job.batch == "b" else compute_scene(job)
+
+    with monkeypatch.context() as patched:
+        scenes_by(patched, fail_one)
+        result = run(root, out)
+    assert result.earlier == ["b"]
+    after = (out / "cameras.csv").read_text().splitlines()
+    assert len(after) == len(before) + 1, "the copy"
+    assert [row for row in after if row.startswith("b/")] == before[5:]
+
+
+def test_files_of_an_earlier_run_are_removed_once_no_image_has_a_match(tmp_path, capsys):
+    root = write_flat(tmp_path / "images", 4)
+    out = tmp_path / "out"
+    run(root, out)
+    for number, file in enumerate(sorted(root.iterdir())):
+        cv2.imwrite(str(file), flat(FIRST + number, SIZE))
+    result = run(root, out, MatcherOfNothing())
+    assert (result.earlier, cameras(result)) == ([], {})
+    assert "the models of an earlier run were removed" in capsys.readouterr().err
+    assert not any((out / name).exists() for name in ("models", "database.db", "sparse"))
+    assert len((out / "cameras.csv").read_text().splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    "text", ["", "image,model\n", "{heads}\na.png,0\n", "{heads}\na.png," + 9 * "x,"]
+)
+def test_a_table_of_cameras_that_cannot_be_read_is_replaced_with_a_warning(tmp_path, capsys, text):
+    path = tmp_path / "cameras.csv"
+    files = {".": (tmp_path / "a.png",)}
+    path.write_text(text.format(heads=",".join(next(camera_rows({}, tmp_path)))))
+    assert read_cameras(path, tmp_path, files) == {".": {tmp_path / "a.png": None}}
+    assert "cannot be read" in capsys.readouterr().err
+
+
+def test_a_table_of_cameras_is_read_as_it_was_written(mixed):
+    out, result = mixed
+    root = out.parent / "images"
+    read = read_cameras(out / "cameras.csv", root, read_folder(root))
+    assert [*camera_rows(read, root)] == [*camera_rows(result.cameras, root)]
 
 
 def fail():

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from mkpc_kaggle.engine.jobs import MatchPlan, Phase
 from mkpc_kaggle.engine.plan.blame import MAX_LOSSES, Item
 from mkpc_kaggle.engine.plan.budget import ESTIMATE, Budget, Costs
-from mkpc_kaggle.engine.plan.state import Mask, State
+from mkpc_kaggle.engine.plan.state import FALLBACK, Mask, State
 from mkpc_kaggle.errors import plural
 from mkpc_kaggle.progress import format_duration
 from mkpc_kaggle.recipe import Unit
@@ -392,7 +392,7 @@ def upcoming_pairs(
 
 
 def estimates_due(snapshot: Snapshot, first: NDArray[Any]) -> NDArray[Any]:
-    """Return the rows to estimate now: first rows without an F, then rows with all units that fit
+    """Return the rows to estimate now: first rows without any F, then rows with all units that fit
     in time.
 
     ``first`` (N,) is the phase of each pair's next unit.
@@ -401,9 +401,10 @@ def estimates_due(snapshot: Snapshot, first: NDArray[Any]) -> NDArray[Any]:
     # A settled pair gets no other unit soon. A pair without an F is estimated at once: any F is better
     # than the fallback.
     is_settled = (first >= FILL) & ~state.matching
-    due = state.lacks_estimate & ~state.estimating & (is_settled | ~state.has_own)
+    has_f = state.own_source != FALLBACK
+    due = state.lacks_estimate & ~state.estimating & (is_settled | ~has_f)
     order = state.order[due[state.order]]
-    return np.asarray(order[np.argsort(state.has_own[order], kind="stable")])
+    return np.asarray(order[np.argsort(has_f[order], kind="stable")])
 
 
 def scenes_due(

@@ -1,9 +1,9 @@
 """The state of a run: arrays over pairs and units, updated from answers.
 
-A pair keeps its present points and F until results of today's keys exist. So the state has, for each
-pair and unit, the key of the points in use, and whether that is today's key. A stage-2
-unit looks at crops that come from the pair's stage-1 points: new points of stage 1 change its key,
-and its points are computed again.
+The state has, for each pair and unit, the key of the points in use, and whether that is today's key.
+A stage-2 unit looks at crops that come from the pair's stage-1 points: new points of stage 1 change
+its key, and its points are computed again; until then, the run uses the former ones. Of earlier runs
+with other settings, the state has the F that they wrote, and nothing else.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
@@ -21,6 +21,7 @@ from mkpc_kaggle.engine.store.image_files import contents_of
 from mkpc_kaggle.engine.store.keys import Images, of_camera_estimate, of_candidate
 from mkpc_kaggle.engine.store.scene_record import MIN_PAIRS, SceneRecord
 from mkpc_kaggle.engine.store.tables import PairEstimate, UnitPoints
+from mkpc_kaggle.geometry.coordinates import Matrix3
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 from mkpc_kaggle.recipe import SceneConfig
 from mkpc_kaggle.scene.candidates import ALL_UNITS, best_of, candidates_of
@@ -30,8 +31,8 @@ from mkpc_kaggle.scene.view_graph import BatchImage
 Mask = NDArray[np.bool_]
 
 # Where the F of a pair comes from, in increasing order of preference
-FALLBACK, PAIR, SCENE = 0, 1, 2
-SOURCES = ("fallback", "pair", "scene")
+FALLBACK, EARLIER, PAIR, SCENE = 0, 1, 2, 3
+SOURCES = ("fallback", "earlier", "pair", "scene")
 
 
 class State:
@@ -45,7 +46,8 @@ class State:
 
     Of a pair (N,): ``estimates``, the key of the estimate in use; ``estimated``, it is today's;
     ``by_cameras``, it comes from the cameras of its batch;
-    ``inliers``, the F ``own`` (N, 3, 3) and ``has_own``, it is no fallback. ``matching`` and
+    ``inliers``; the F ``own`` (N, 3, 3), and ``own_source``: its matches (``PAIR``), the table of pairs of
+    an earlier run with other settings (``EARLIER``), or neither. ``matching`` and
     ``estimating`` are the pairs of jobs under way, and ``filling`` the pairs in the last phase.
     ``costly`` are pairs with a unit whose jobs were lost twice. ``by_scene`` (N, 3, 3) and
     ``scene_source`` are the F that the scene in use gives, if any.
@@ -94,7 +96,7 @@ class State:
         self.own = np.tile(FALLBACK_FUNDAMENTAL, (count, 1, 1))
         self.estimated = np.zeros(count, bool)
         self.by_cameras = np.zeros(count, bool)
-        self.has_own = np.zeros(count, bool)
+        self.own_source = np.full(count, FALLBACK)
         self.matching = np.zeros(count, bool)
         self.filling = np.zeros(count, bool)
         self.costly = np.zeros(count, bool)
@@ -148,6 +150,11 @@ class State:
         return np.asarray(lacking)
 
     @property
+    def has_own(self) -> Mask:
+        """(N,): the pair has an F from its matches."""
+        return np.asarray(self.own_source == PAIR)
+
+    @property
     def need_shares(self) -> NDArray[np.float64]:
         """(U,): the expected share of the pairs that need a unit, 1 for a unit of stage 1.
 
@@ -177,8 +184,7 @@ class State:
 
     @property
     def _sources(self) -> NDArray[np.int_]:
-        own = np.where(self.has_own[: self.rows], PAIR, FALLBACK)
-        sources = np.maximum(own, self.scene_source[: self.rows])
+        sources = np.maximum(self.own_source, self.scene_source)[: self.rows]
         by_scene = self.scene_source[: self.rows] != FALLBACK
         written = np.where(
             by_scene[:, None, None], self.by_scene[: self.rows], self.own[: self.rows]
@@ -330,7 +336,7 @@ class State:
         assert images
         keys = zip(self.units, self.points[index], self.has[index], strict=True)
         points = {unit: key for unit, key, is_used in keys if is_used}
-        has_own = self.has_own[index] and not self.uses_cameras
+        has_own = self.own_source[index] == PAIR and not self.uses_cameras
         own = self.own[index] if has_own else None
         return PairInputs(index, images, points, self.pairs[index].intrinsics, own)
 
@@ -340,14 +346,17 @@ class State:
         """Use the images whose contents are known at the start, by name."""
         self.images.update(images)
 
-    def use_points(
-        self, index: int, unit: int, points: UnitPoints, *, is_current: bool = True
-    ) -> None:
-        """Use a unit's points; none if the pair does not need the unit."""
+    def use_earlier(self, index: int, F: Matrix3) -> None:
+        """Use the F that an earlier run with other settings wrote, until the pair gets another one."""
+        self.own[index] = F
+        self.own_source[index] = EARLIER
+
+    def use_points(self, index: int, unit: int, points: UnitPoints) -> None:
+        """Use a unit's points of today; none if the pair does not need the unit."""
         self.points[index, unit] = points.key
         self.has[index, unit] = points.is_needed
         self.unneeded[index, unit] = not points.is_needed
-        self.current[index, unit] = is_current
+        self.current[index, unit] = True
         self.matches[index, unit] = points.matches
         self.changed.add(index)
 
@@ -406,7 +415,7 @@ class State:
         self.estimated[index] = False
         self.by_cameras[index] = False
         self.own[index] = FALLBACK_FUNDAMENTAL
-        self.has_own[index] = False
+        self.own_source[index] = FALLBACK
         self.inliers[index] = 0
         self.scene_source[index] = FALLBACK
         self._note_change(index)
@@ -417,7 +426,7 @@ class State:
         self.estimated[index] = estimate.key == self.estimate_key(index)
         self.by_cameras[index] = False
         self.own[index] = estimate.F
-        self.has_own[index] = not estimate.failure
+        self.own_source[index] = FALLBACK if estimate.failure else PAIR
         self.inliers[index] = sum(estimate.inliers.values())
 
     def use_new_estimate(self, index: int, estimate: PairEstimate) -> None:
