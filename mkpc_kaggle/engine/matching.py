@@ -7,8 +7,8 @@ from typing import Any
 from mkpc_kaggle.engine.jobs import Cause, Failure, MatchJob, MatchPlan, Outcome, Phase
 from mkpc_kaggle.engine.plan.schedule import Crew, NextWork, outlook, upcoming_pairs
 from mkpc_kaggle.engine.run import HANG_FACTOR, Run
-from mkpc_kaggle.engine.store.database import from_bytes, to_bytes
 from mkpc_kaggle.engine.store.image_files import image_rows
+from mkpc_kaggle.engine.store.rows import from_bytes, to_bytes
 from mkpc_kaggle.engine.store.tables import UnitPoints
 from mkpc_kaggle.pipeline.pair import UnitResult
 

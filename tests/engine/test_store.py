@@ -34,7 +34,7 @@ from mkpc_kaggle.engine.restore import restore
 from mkpc_kaggle.engine.run import EventLog, Run
 from mkpc_kaggle.engine.scenes import SceneWork
 from mkpc_kaggle.engine.store import database as store_module
-from mkpc_kaggle.engine.store.database import FILE_NAME, Store, connected, to_bytes
+from mkpc_kaggle.engine.store.database import FILE_NAME, Store
 from mkpc_kaggle.engine.store.dataframes import (
     NOT_REACHED,
     matrices_of,
@@ -44,7 +44,9 @@ from mkpc_kaggle.engine.store.dataframes import (
 from mkpc_kaggle.engine.store.image_files import stored_digests
 from mkpc_kaggle.engine.store.keys import Keys
 from mkpc_kaggle.engine.store.published import Published
+from mkpc_kaggle.engine.store.rows import to_bytes
 from mkpc_kaggle.engine.store.scene_record import SceneRecord
+from mkpc_kaggle.engine.store.sqlite_file import connected
 from mkpc_kaggle.engine.store.tables import About, Feature, ImageFile, PairEstimate, UnitPoints
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.cameras import Camera

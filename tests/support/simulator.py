@@ -38,9 +38,10 @@ from mkpc_kaggle.engine.plan.budget import MAX_SILENCE_S, SCENE_MARGIN, SCENE_ST
 from mkpc_kaggle.engine.plan.schedule import RESERVE_SHARE
 from mkpc_kaggle.engine.request import Request, RunReport
 from mkpc_kaggle.engine.run import HANG_FACTOR
-from mkpc_kaggle.engine.store.database import Store, connected
+from mkpc_kaggle.engine.store.database import Store
 from mkpc_kaggle.engine.store.dataframes import PairTables
 from mkpc_kaggle.engine.store.keys import Keys
+from mkpc_kaggle.engine.store.sqlite_file import connected
 from mkpc_kaggle.engine.store.tables import SCHEMA
 from mkpc_kaggle.engine.workers.places import Place, Site, Work
 from mkpc_kaggle.geometry.coordinates import Size

@@ -7,41 +7,49 @@ reads the store once, at its start, and keeps its state in memory
 """
 
 import errno
-import marshal
 import os
-import shutil
 import sqlite3
-import zlib
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from time import monotonic
 from typing import Any, Self, TypeVar
 
-import numpy as np
-
 from mkpc_kaggle.engine.store.layout import Layout
+from mkpc_kaggle.engine.store.rows import (
+    DATA,
+    FACTS,
+    RowKey,
+    StoredRow,
+    by_table,
+    checksum_of,
+    data_checksum,
+    facts_checksum,
+    from_bytes,
+)
+from mkpc_kaggle.engine.store.sqlite_file import (
+    CANNOT_OPEN,
+    CORRUPT,
+    UNUSABLE,
+    closed_connection,
+    code_of,
+    connected,
+    has_log,
+    identity_of,
+    suppress_busy,
+    undamaged,
+    with_its_log,
+)
 from mkpc_kaggle.engine.store.tables import LAYOUTS, PRUNED, SCHEMA, STORE_FORMAT
 from mkpc_kaggle.errors import UserError, plural, printable, warn_once, writing
 from mkpc_kaggle.geometry.matches import Matches
 
 FILE_NAME = "journal.sqlite"  # named in the documentation, and in scripts of users
 LOCK_NAME = "journal.lock"
-CHECKSUM_BYTES = 4  # of each part of a row: its facts, and its data if it has any
 MIN_SQLITE = (3, 37, 0)  # STRICT tables
 MAX_KEYS = 500  # in a query; SQLite allows 999 values
-
-# SQLite's primary result codes. Only CORRUPT means damage, for which the advice is to delete the file:
-# wrong advice costs the user hours of results.
-CORRUPT = {11, 26}  # a malformed file, and a file that is no database
-UNUSABLE = {3, 5, 6, 8, 14}  # no permission, busy, locked, read only, cannot be opened
-CANNOT_OPEN = 14
-BUSY = {5, 6}  # another program has a lock
-
-FACTS_BYTES = 500  # of a row, about
 LATEST_BYTES = 8 << 20  # twice the log, which SQLite copies to the file at 1,000 pages
 RETRY_S = 30.0  # between tries to write results that the file did not take
 # For the lock of another program, while the loop waits
@@ -49,27 +57,6 @@ BUSY_TIMEOUT_MS = 100
 
 
 T = TypeVar("T")
-RowKey = tuple[str, Any]  # a table, and the key of a row in it
-
-
-@contextmanager
-def undamaged(path: Path, advice: str = "delete it with --fresh") -> Iterator[None]:
-    """Convert SQLite's report of a damaged file, or of one that cannot be used, to a
-    :class:`UserError`.
-
-    Everything else is a fault of the machine or of the program, and stays as it is.
-    """
-    try:
-        yield
-    except sqlite3.DatabaseError as error:
-        # The low byte is the primary code; the higher bytes are details of it.
-        code = getattr(error, "sqlite_errorcode", 0) & 0xFF
-        if code in UNUSABLE:
-            text = f"{path} cannot be used: {error}; is another run using it?"
-            raise UserError(text) from error
-        if code in CORRUPT:
-            raise UserError(f"{path} is damaged ({error}); {advice}") from error
-        raise
 
 
 class Store:
@@ -139,7 +126,7 @@ class Store:
             # SQLite cannot create its locks in a read-only directory, and needs none there.
             if not os.access(directory, os.W_OK):
                 mode = "mode=ro&immutable=1"
-                path = _with_its_log(path, opened)
+                path = with_its_log(path, opened)
             store._db = opened.enter_context(closing(connected(path, mode, timeout=5.0)))
             store._db.execute("PRAGMA query_only = ON")
             # One transaction for all reads: the run may publish meanwhile.
@@ -201,7 +188,7 @@ class Store:
         try:
             with self._db:
                 self._db.execute("BEGIN IMMEDIATE")
-                for table, values in _by_table(together.values()).items():
+                for table, values in by_table(together.values()).items():
                     marks = ", ".join("?" * len(values[0]))
                     # REPLACE: a published pair and the facts of a file have the same key each time.
                     self._db.executemany(f"REPLACE INTO {table} VALUES ({marks})", values)
@@ -253,18 +240,18 @@ class Store:
                         marks = ", ".join("?" * len(part))
                         where = f"WHERE {layout.key} IN ({marks})"
                         rows = reader.execute(f"SELECT * FROM {layout.table} {where}", part)
-                        if not all(row[-1] == _checksum(layout, row[:-1]) for row in rows):
+                        if not all(row[-1] == checksum_of(layout, row[:-1]) for row in rows):
                             raise sqlite3.DatabaseError("a result does not fit its checksum")
         except sqlite3.DatabaseError as error:
-            code = getattr(error, "sqlite_errorcode", 11) & 0xFF
-            if code in CORRUPT:
+            # No code: the error raised here, or text that is no UTF-8.
+            if code_of(error) in {0, *CORRUPT}:
                 self._is_damaged = True
                 self.trouble = f"the journal was damaged during the run ({error})"
 
     @property
     def _is_in_place(self) -> bool:
         """Whether the path leads to the open file."""
-        return self._identity is None or self._identity == _identity(self.path)
+        return self._identity is None or self._identity == identity_of(self.path)
 
     def _note_place(self) -> None:
         if not self._is_in_place:
@@ -273,7 +260,7 @@ class Store:
 
     def _note_damage(self, error: sqlite3.DatabaseError) -> bool:
         """Return whether an error is damage by another program, which a run survives in memory."""
-        code = getattr(error, "sqlite_errorcode", 0) & 0xFF
+        code = code_of(error)
         # A run has checked the table at its start.
         if self._lock is None or not (code in CORRUPT or "no such table" in str(error)):
             return False
@@ -332,7 +319,7 @@ class Store:
         try:
             yield
         except sqlite3.OperationalError as error:
-            code = getattr(error, "sqlite_errorcode", 0) & 0xFF
+            code = code_of(error)
             if code in UNUSABLE or code in CORRUPT:
                 raise
             raise UserError(f"{self.path}: {outcome}: {error}; make room on the disk") from error
@@ -435,9 +422,9 @@ class Store:
         """
         for key, *values, checksum in rows:
             right = (
-                _facts_checksum(layout, values)
+                facts_checksum(layout, values)
                 if part is FACTS
-                else _data_checksum(layout, key, *values)
+                else data_checksum(layout, key, *values)
             )
             if checksum[part] == right:
                 yield key, tuple(values)
@@ -465,7 +452,7 @@ class Store:
         for layout in LAYOUTS.values():
             number = [column.name for column in layout.facts].index(layout.key)
             for row in self._select(f"SELECT * FROM {layout.table}"):
-                if row[-1] != _checksum(layout, row[:-1]):
+                if row[-1] != checksum_of(layout, row[:-1]):
                     self.damaged.add((layout.table, row[number]))
         if self.damaged and self._has_file:
             with suppress(sqlite3.OperationalError):  # a full disk
@@ -489,7 +476,7 @@ class Store:
             self._db = opened.enter_context(closing(connected(self.path)))
             self._prepare()
         except sqlite3.OperationalError as error:
-            if getattr(error, "sqlite_errorcode", 0) & 0xFF in UNUSABLE - {CANNOT_OPEN}:
+            if code_of(error) in UNUSABLE - {CANNOT_OPEN}:
                 raise
             self.trouble = f"the journal cannot be written ({error}); results stay in memory"
             self._has_file = False
@@ -531,7 +518,7 @@ class Store:
         # A kill of the process loses no result. A power failure may lose the latest.
         self._db.execute("PRAGMA synchronous = NORMAL")
         self._db.execute(f"PRAGMA busy_timeout = {BUSY_TIMEOUT_MS}")
-        self._identity = _identity(self.path)
+        self._identity = identity_of(self.path)
 
     def _has_table(self) -> bool:
         return self._db.execute("SELECT 1 FROM sqlite_master").fetchone() is not None
@@ -588,143 +575,8 @@ class Source:
         return {key: from_bytes(found[key]) for key in keys}
 
 
-def connected(path: Path | str, options: str = "", timeout: float = 1.0) -> sqlite3.Connection:
-    """Return a connection without Python's implicit transactions.
-
-    ``path`` is a file, or ":memory:". ``options`` belong to the file's SQLite URI.
-    """
-    uri = f"{path.resolve().as_uri()}?{options}" if isinstance(path, Path) else f"file:{path}"
-    return sqlite3.connect(uri, uri=True, timeout=timeout, isolation_level=None)
-
-
-FACTS = slice(CHECKSUM_BYTES)  # the parts of a row's checksum
-DATA = slice(CHECKSUM_BYTES, None)
-
-
-@dataclass(frozen=True, eq=False)
-class StoredRow:
-    """A row, its table, and its values there: facts, data if there is any, and the checksum."""
-
-    row: Any
-    layout: Layout[Any]
-    values: tuple[Any, ...]
-
-    @classmethod
-    def of(cls, row: Any) -> "StoredRow":
-        layout = LAYOUTS[type(row)]
-        values = layout.values(row)
-        if layout.has_data:
-            values += (row.data,)
-        return cls(row, layout, (*values, _checksum(layout, values)))
-
-    @property
-    def key(self) -> RowKey:
-        return self.layout.table, getattr(self.row, self.layout.key)
-
-    @property
-    def facts(self) -> tuple[Any, ...]:
-        return self.values[: len(self.layout.facts)]
-
-    @property
-    def size(self) -> int:
-        """The bytes of the row, about."""
-        return FACTS_BYTES + (len(self.row.data) if self.layout.has_data else 0)
-
-
-def _by_table(rows: Iterable[StoredRow]) -> dict[str, list[tuple[Any, ...]]]:
-    """Return the values of rows by the name of their table."""
-    values: dict[str, list[tuple[Any, ...]]] = {}
-    for row in rows:
-        values.setdefault(row.layout.table, []).append(row.values)
-    return values
-
-
-def _checksum(layout: Layout[Any], values: Sequence[Any]) -> bytes:
-    """Return the checksum of a row's values: facts, and data if the table has any."""
-    if not layout.has_data:
-        return _facts_checksum(layout, values)
-    *facts, data = values
-    # Of results with data, the first column is the key.
-    return _facts_checksum(layout, facts) + _data_checksum(layout, facts[0], data)
-
-
-def _facts_checksum(layout: Layout[Any], facts: Sequence[Any]) -> bytes:
-    # Against accidents; a cryptographic digest would take four times as long, at each start of a run.
-    # In version 2, marshal has the same bytes for equal values, and is ten times as fast as a text.
-    content = marshal.dumps((layout.table, *facts), 2)
-    return zlib.crc32(content).to_bytes(CHECKSUM_BYTES, "little")
-
-
-def _data_checksum(layout: Layout[Any], key: str, data: bytes) -> bytes:
-    # With the key, so that data cannot be exchanged
-    start = zlib.crc32(f"{layout.table}\n{key}\n".encode())
-    return zlib.crc32(data, start).to_bytes(CHECKSUM_BYTES, "little")
-
-
 def parts_of(keys: Iterable[Any]) -> Iterator[list[Any]]:
     """Yield keys as SQLite has them, in parts for one query each."""
     texts = [printable(key) if isinstance(key, str) else key for key in keys]
     for start in range(0, len(texts), MAX_KEYS):
         yield texts[start : start + MAX_KEYS]
-
-
-def _identity(path: Path) -> tuple[int, int] | None:
-    """Return device and inode of a file, which identify it; ``None`` if it is missing."""
-    try:
-        status = path.stat()
-    except OSError:
-        return None
-    return status.st_dev, status.st_ino
-
-
-def has_log(path: Path) -> bool:
-    """Return whether a store has a write-ahead log with results, as that of a killed run."""
-    log = path.with_name(f"{path.name}-wal")
-    return log.is_file() and log.stat().st_size > 0
-
-
-def _with_its_log(path: Path, opened: ExitStack) -> Path:
-    """Return a copy of a store with a write-ahead log, which SQLite cannot read in a read-only
-    directory; a store without one is its own copy.
-    """
-    if not has_log(path):
-        return path
-    log = f"{path.name}-wal"
-    with writing(f"a copy of {path}, whose log {log} cannot be read here,"):
-        folder = Path(opened.enter_context(TemporaryDirectory(prefix="mkpc-")))
-        for name in (path.name, log):
-            shutil.copyfile(path.with_name(name), folder / name)
-    # A connection that may write reads the log into the copy.
-    with closing(connected(folder / path.name)) as copy:
-        copy.execute("PRAGMA wal_checkpoint(TRUNCATE)")
-    return folder / path.name
-
-
-@contextmanager
-def suppress_busy() -> Iterator[None]:
-    """Ignore that another program has a lock."""
-    try:
-        yield
-    except sqlite3.OperationalError as error:
-        if getattr(error, "sqlite_errorcode", 0) & 0xFF not in BUSY:
-            raise
-
-
-def closed_connection() -> sqlite3.Connection:
-    """Return a connection that is closed already, for a store that is not open yet."""
-    connection = sqlite3.connect(":memory:")
-    connection.close()
-    return connection
-
-
-def to_bytes(matches: Matches) -> bytes:
-    """Return the bytes of x0, y0, x1, y1 and score of each match, as little-endian float32."""
-    # Exact, because workers return float32.
-    columns = [matches.points0, matches.points1, matches.scores]
-    return np.column_stack(columns).astype("<f4").tobytes()
-
-
-def from_bytes(data: bytes) -> Matches:
-    """Invert :func:`to_bytes`."""
-    table = np.frombuffer(data, "<f4").reshape(-1, 5)
-    return Matches(table[:, :2], table[:, 2:4], table[:, 4])

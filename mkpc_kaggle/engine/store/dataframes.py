@@ -14,9 +14,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mkpc_kaggle.engine.store.database import Store, connected
+from mkpc_kaggle.engine.store.database import Store
 from mkpc_kaggle.engine.store.published import Published
 from mkpc_kaggle.engine.store.scene_record import SceneRecord
+from mkpc_kaggle.engine.store.sqlite_file import connected
 from mkpc_kaggle.engine.store.tables import (
     LAYOUTS,
     SCHEMA,

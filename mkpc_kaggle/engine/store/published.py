@@ -8,8 +8,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Self
 
-from mkpc_kaggle.engine.store.database import Store, from_bytes
+from mkpc_kaggle.engine.store.database import Store
 from mkpc_kaggle.engine.store.image_files import known_images, stored_digests
+from mkpc_kaggle.engine.store.rows import from_bytes
 from mkpc_kaggle.engine.store.scene_record import SceneRecord
 from mkpc_kaggle.engine.store.tables import PublishedPair, PublishedRun, UnitPoints
 from mkpc_kaggle.geometry.matches import Matches
