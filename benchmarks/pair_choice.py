@@ -16,7 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.candidates import SCALES_PX, by_rotations, read_facts
+from benchmarks.candidate_facts import SCALES_PX
+from benchmarks.candidate_judges import by_rotations
+from benchmarks.candidates import read_facts
 from mkpc_kaggle.evaluation.compare import paired_difference
 from mkpc_kaggle.scene.candidates import MAX_SHARE
 from mkpc_kaggle.scene.choose import EVIDENCE_MATCHES, EVIDENCE_PX, EVIDENCE_UNIT
