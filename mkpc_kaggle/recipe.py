@@ -56,7 +56,7 @@ class Unit:
     long_side : int
         Pixels of a view's longer side, or 0 with ``area``.
     max_matches : int
-        The number of matches to keep, those with the highest scores.
+        The number of matches to keep, by the highest scores.
     area : str
         Height x width, such as "540x720": the area of a view, which keeps its aspect ratio.
     stretch : bool

@@ -32,7 +32,7 @@ submission. Without options, print an overview of one screen.
   events.csv   times of starts, plans, scenes, faults, ends
 In Python, mkpc_kaggle.results(DIR) returns the first two and the cameras as DataFrames with the same columns.
 
---prune removes the results that the last run did not use: those of former recipes, settings, images and rows. If
+--prune removes the results that the last run did not use: of former recipes, settings, images and rows. If
 they are asked for again, they are computed again. It prints the size that it sets free.
 
 Exit status: 0 done, 2 the journal does not exist, or a file cannot be written.

@@ -21,11 +21,11 @@ DIRECTORY = 0x8769  # of the tags that only EXIF has
 TIFF_WIDTH = 0x0100
 TIFF_HEIGHT = 0x0101
 
-# Pillow's names of the formats. A file is known by its first bytes, whatever its name says.
+# Pillow's names of the formats. The first bytes of a file decide, and not its name.
 FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "AVIF", "JPEG2000", "PPM", "GIF")
 MAX_PREFIX = 16  # bytes that Pillow knows a format by
 # What Pillow raises for damaged files, seen with 50,000 of them. Its limit of pixels is only in
-# readers that decode, and lack of memory is no damage.
+# readers that decode, and a shortage of memory is no damage.
 DAMAGE = (
     SyntaxError,
     OSError,

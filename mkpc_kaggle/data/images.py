@@ -133,7 +133,8 @@ def read_image(path: Path) -> Image | Unreadable:
     """Decode a file's stored pixels to RGB; return failures, never raise.
 
     16-bit values are divided by 256. OpenCV decides whether a damaged file is readable: version 5
-    refuses a truncated file, and so do all versions if it is a JPEG. A JPEG file may lack its end mark alone.
+    refuses a truncated file, and so do all versions if it is a JPEG. In a JPEG file,
+    only the end mark may be missing.
     """
     name = str(path)
     bgr = None

@@ -129,7 +129,7 @@ def _checked(path: Path, image: Path) -> str:
         )
     if not mask.any():
         return "hide everything"
-    # Such as those of JPEG, whose black is 1 or 2
+    # For example JPEG files, whose black is 1 or 2
     return "hide nothing, since only black or transparent pixels do" if mask.all() else ""
 
 

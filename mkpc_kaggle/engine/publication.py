@@ -32,7 +32,7 @@ class Publication:
         self._has_ended = False
         self._published = budget.clock()
         self._rows: dict[int, PublishedPair] = {}  # by number
-        # The numbers of each pair's rows. An extra pair has one after those of the request.
+        # The numbers of each pair's rows. An extra pair has one after the request's rows.
         extra = np.arange(len(state.pairs) - state.rows) + len(state.pair_of_row)
         self._numbers: list[list[int]] = [[] for _ in range(state.rows)]
         for number, index in enumerate(state.pair_of_row):
@@ -127,7 +127,7 @@ def _row(state: State, index: int) -> PublishedPair:
     image0, image1 = state.names[index]
     points = state.points[index].tolist()
     given_up = state.tries.given_up
-    # The reason of each unit that was given up on the pair, whatever the cause was
+    # The reason of each unit that was given up on the pair, for any cause
     failures = {}
     for unit in state.units:
         failure = given_up.get(("unit", index, unit.name))
@@ -165,5 +165,5 @@ def _row(state: State, index: int) -> PublishedPair:
 
 
 def _reason(failure: Failure) -> str:
-    # The unit's name stands beside the message of its matcher.
+    # The unit's name stands next to the message of its matcher.
     return failure.message if failure.cause is Cause.UNIT_RAISED else str(failure)

@@ -79,7 +79,7 @@ def scale_between(matches: Matches, sizes: tuple[Size, Size]) -> float:
 
     Scales are relative to the images' longer sides, since a matcher's views have equal ones. The
     result is the median ratio of the distances between two matched points; 1 if there are too few
-    matches, or if the ratios disagree, as those of wrong matches do.
+    matches, or if the ratios disagree, as with wrong matches.
     """
     if len(matches) < MIN_SCALE_MATCHES:
         return 1.0

@@ -98,7 +98,7 @@ def camera_rows(cameras: Cameras, root: Path) -> Iterator[Sequence[str]]:
 def read_cameras(path: Path, root: Path, datasets: Datasets) -> Cameras:
     """Return the cameras that an earlier run wrote to ``cameras.csv``, of the files that exist now.
 
-    There are none without the file, or with a warning if it is no such table.
+    Without the file there are none, and a file that is no table of cameras is warned of.
     """
     placed: dict[str, PlacedImage] = {}
     try:

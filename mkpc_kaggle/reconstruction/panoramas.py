@@ -45,7 +45,7 @@ def require_perspective(files: Iterable[Path]) -> None:
 
 
 def is_panorama(file: Path) -> bool:
-    """Return whether the pixels of a file are those of a panorama."""
+    """Return whether the pixels of a file are a panorama's."""
     image = read_image(file)
     return isinstance(image, Image) and wraps(image.pixels)
 
@@ -65,7 +65,7 @@ def has_mark(file: Path) -> bool:
 
 
 def wraps(pixels: Pixels) -> bool:
-    """Return whether the borders of pixels (H, W, 3) fit together as those of a panorama."""
+    """Return whether the borders of pixels (H, W, 3) fit together as a panorama's do."""
     # Some rows are enough; all of a large image would fill the memory.
     rows = np.unique(np.linspace(0, len(pixels) - 1, MAX_ROWS).round().astype(np.intp))
     values = pixels[rows].astype(np.float32)

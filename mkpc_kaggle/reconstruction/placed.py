@@ -93,7 +93,7 @@ def read_cameras(folder: Path) -> dict[str, tuple[PlacedCamera, Size]]:
             "OUT/models/0 with COLMAP's binary files"
         ) from error
     except (struct.error, ValueError) as error:
-        raise UserError(f"--onto {folder} is no model of COLMAP: {error}") from error
+        raise UserError(f"--onto {folder} is not a model of COLMAP: {error}") from error
 
 
 def _lenses(data: bytes) -> Iterator[tuple[int, StoredCamera]]:

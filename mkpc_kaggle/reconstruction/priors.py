@@ -20,7 +20,7 @@ SIZE = re.compile(r"\s*([1-9]\d{0,5})\s*[xX]\s*([1-9]\d{0,5})\s*", re.ASCII)
 MAX_OFFSET = 0.1
 MAX_USUAL_OFFSET = 0.05
 MAX_DENOMINATOR = 4  # of the ratio of two usual resolutions
-MAX_SCALE_ERROR = 0.03  # of such a ratio by the principal point
+MAX_SCALE_ERROR = 0.03  # of this ratio by the principal point
 MAX_SHAPE_RATIO = 1.05  # of pictures of one camera at two resolutions
 
 

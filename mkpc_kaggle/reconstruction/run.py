@@ -24,7 +24,7 @@ AUTO_RECIPE = "auto"  # the recipe of all matchers whose weights are found
 # On 20 pairs of reichstag_26, 2,000 take 15 ms a pair in place of the 24 ms of 10,000, find 1.00 of
 # the inliers, and doubt the same pairs.
 MAGSAC_ITERATIONS = 2_000
-EARLIER = "its cameras and models are those of an earlier run, as this one has no new ones yet"
+EARLIER = "its cameras and models are from an earlier run, as this one has no new ones yet"
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class FolderResult:
     """The outcome of a run on a folder.
 
     ``lost`` has the reason for each batch whose cameras could not be computed. ``earlier`` are the
-    datasets whose cameras and files are still those of an earlier run.
+    datasets that still have the cameras and files of an earlier run.
     """
 
     report: RunReport
@@ -90,8 +90,8 @@ def reconstruct_folder(
     scene, so that a resumed run makes missing files. ``publish`` is called with the cameras so far:
     initially with no cameras, then after each scene.
 
-    Until this run knows the cameras of a dataset, its models and its rows of ``cameras.csv`` are those of
-    the earlier run in ``out``, if any.
+    Until this run knows the cameras of a dataset, the dataset keeps the models and the rows of
+    ``cameras.csv`` of the earlier run in ``out``, if any.
     """
     assembly = replace(assembly, recipe=for_cameras(assembly.recipe))
     folders = dict.fromkeys(file.parent for files in datasets.values() for file in files)

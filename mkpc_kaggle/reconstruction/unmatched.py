@@ -1,4 +1,4 @@
-"""Causes of a dataset without any match, as far as its files show them."""
+"""Causes of a dataset without any match that its files show."""
 
 from collections.abc import Sequence
 from pathlib import Path

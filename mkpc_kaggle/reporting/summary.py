@@ -232,7 +232,7 @@ def chosen_candidates(scenes: Sequence[SceneRecord]) -> Iterator[tuple[str, str,
         (scene,) = compared
         others = [f"{title_of(each.candidate)} {each.disagreement:.2f}" for each in scene.rivals]
         remark = (
-            f"rotations {scene.disagreement:.2f} degrees from those of single pairs; "
+            f"rotations {scene.disagreement:.2f} degrees from the rotations of single pairs; "
             f"others: {'; '.join(others)}"
         )
         yield "cameras by the tracks of", title_of(scene.candidate), remark

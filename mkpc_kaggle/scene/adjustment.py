@@ -17,7 +17,7 @@ import pycolmap
 from mkpc_kaggle.geometry.intrinsics import KnownCamera, PlacedCamera
 from mkpc_kaggle.scene.uncertainty import camera_sigmas
 
-# Limits for a point that two images see, close to those of COLMAP's incremental mapper for any point (4 pixels,
+# Limits for a point that two images see, close to COLMAP's incremental mapper's for any point (4 pixels,
 # 1.5 degrees). The global mapper keeps errors of a hundredth of the focal length, about ten pixels.
 MAX_TWO_VIEW_ERROR_PX = 4.0
 MIN_TWO_VIEW_ANGLE_DEG = 2.0

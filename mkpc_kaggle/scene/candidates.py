@@ -2,9 +2,9 @@
 
 Which matcher's points make the best cameras differs from scene to scene. So a batch may be
 reconstructed several times: from the tracks of all units, from those on edges with enough support,
-and from those of each unit alone.
+and from the tracks of each unit alone.
 
-The judge compares the rotations between cameras with those of F of single pairs, which no camera has
+The judge compares the rotations between cameras with the rotations by F of single pairs, which no camera has
 influenced. Wrong edges and poor keypoints bend cameras, and a pair has the matches of all units.
 """
 
@@ -21,7 +21,7 @@ from mkpc_kaggle.recipe import SceneConfig, Unit
 from mkpc_kaggle.scene.models import SfmModel
 from mkpc_kaggle.scene.view_graph import BatchPair, tracks_of
 
-# Candidates with tracks of all units, on all edges or on those with enough support
+# Candidates with tracks of all units, on all edges or on edges with enough support
 # (:mod:`mkpc_kaggle.scene.edges`); each other candidate has the name of its unit.
 ALL_UNITS, SUPPORTED = "", "supported"
 CANDIDATE_SUPPORT = 0.1

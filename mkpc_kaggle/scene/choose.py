@@ -143,7 +143,7 @@ def _agreeing(F: Matrix3, pair: BatchPair) -> int:
 def estimate_of(choice: Choice, pair: BatchPair, magsac: RobustConfig) -> Estimate | None:
     """Return the F of a pair's cameras as its estimate, with the inliers among its matches.
 
-    Return ``None`` for a pair without an F from cameras. It has as many inliers as MAGSAC's, in 0.4 of the
+    Return ``None`` for a pair without an F from cameras. Its number of inliers is MAGSAC's, in 0.4 of the
     time (``benchmarks.camera_estimates``).
     """
     if choice.F is None or not choice.from_scene:

@@ -148,11 +148,11 @@ def _given_focals(
 def _exif_focals(
     freed: Sequence[Freed], given_cameras: Mapping[str, KnownCamera]
 ) -> Iterable[FocalContradiction]:
-    """Yield the images whose refined focal lengths are far from those of EXIF."""
+    """Yield the images whose refined focal lengths are far from EXIF's."""
     wrong = []
     for freed_image in freed:
         image = freed_image.registered.image
-        # The user's cameras replace those of EXIF.
+        # The user's cameras replace EXIF's.
         if not image.focal or image.name in given_cameras:
             continue
         deviation = abs(np.log(freed_image.registered.focal / image.focal))

@@ -24,7 +24,7 @@ Index = NDArray[np.uint32]  # (M, 2): indices of the matched keypoints in both i
 
 
 class Lens(NamedTuple):
-    """A camera as far as verification depends on it: COLMAP's model, the other parameters, and the
+    """The part of a camera that verification depends on: COLMAP's model, the other parameters, and the
     mean focal length in pixels.
     """
 

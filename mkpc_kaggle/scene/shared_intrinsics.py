@@ -91,7 +91,7 @@ def undecided_zooms(images: Sequence[BatchImage], models: Sequence[SfmModel]) ->
 
 @dataclass(frozen=True)
 class _Group:
-    """Images of one size of which most agree on a focal length. ``exif`` is the median of EXIF's
+    """Images of one size; most of them agree on a focal length. ``exif`` is the median of EXIF's
     focal lengths of these, 0 if unknown.
     """
 

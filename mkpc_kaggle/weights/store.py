@@ -156,7 +156,7 @@ class WeightStore:
         return tuple(lines.values())
 
     def _given(self, slot: str, path: Path) -> FoundFile:
-        """Return the file that the user gives for a slot, whatever its bytes are.
+        """Return the file that the user gives for a slot, with any bytes.
 
         Raises :class:`UserError` for an unknown slot and an unreadable file.
         """

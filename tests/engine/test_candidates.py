@@ -83,7 +83,7 @@ def test_the_candidate_that_agrees_best_is_used_and_the_others_are_named(tmp_pat
     others = f"{LAST} 3.00; all units, supported edges 4.00; all units 5.00"
     line = (
         f"cameras by the tracks of: {FIRST} "
-        f"(rotations 1.00 degrees from those of single pairs; others: {others})"
+        f"(rotations 1.00 degrees from the rotations of single pairs; others: {others})"
     )
     assert line in summary(report)
     log = read_log(tmp_path / "work")

@@ -144,8 +144,8 @@ def fisheye(folder: Path) -> None:
             lambda folder: (folder / "images.bin").unlink(),
             "images.bin cannot be read: No such file",
         ),
-        (lambda folder: (folder / "cameras.bin").write_bytes(b""), "is no model of COLMAP"),
-        (cut, "is no model of COLMAP"),
+        (lambda folder: (folder / "cameras.bin").write_bytes(b""), "is not a model of COLMAP"),
+        (cut, "is not a model of COLMAP"),
         (fisheye, "a camera has model 5; known: SIMPLE_PINHOLE, PINHOLE"),
     ],
 )

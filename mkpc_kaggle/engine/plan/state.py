@@ -255,7 +255,7 @@ class State:
     ) -> str:
         """Return today's key of a unit's points; ``first`` are the keys of stage 1.
 
-        ``is_float32`` states that the unit ran in float32, whatever precision the run was given.
+        ``is_float32`` states that the unit ran in float32, even if the run was given another precision.
         """
         keys = self.request.keys
         pair = self.pairs[index]
@@ -325,7 +325,7 @@ class State:
     def is_unmatched(self, batch: str) -> bool:
         """Return whether all units have run on the rows of a batch, and none found a match.
 
-        No scene is made for such a batch, and no further run would change that.
+        No scene is made for this batch, and no further run would change that.
         """
         rows = self.rows_of(batch)
         return not (self.missing[rows].any() or self.matches[rows].any())
@@ -507,14 +507,14 @@ class State:
         self.use_scene(batch, made[used].against(others))
 
     def best_candidate(self, batch: str) -> str:
-        """Return the candidate with the smallest disagreement among those that are made."""
+        """Return the finished candidate with the smallest disagreement."""
         made = self.made[batch]
         return best_of({name: made[name].disagreement for name in self.candidates if name in made})
 
     def _try_others(self, batch: str) -> None:
         """Note which other candidates are missing: the first one is from today's results.
 
-        With files, the best one is made again in the end, if its files are missing.
+        With files, the best one is finally made again, if its files are missing.
         """
         made = self.made[batch]
         scene = made[ALL_UNITS].key
@@ -659,7 +659,7 @@ class State:
         everywhere = given_up.get(("matcher", unit))
         if everywhere is not None and everywhere.cause is Cause.REFUSED:
             return
-        # It was skipped on all pairs because of losses, some of which are forgiven.
+        # It was skipped on all pairs because of losses, and some of these are forgiven.
         given_up.pop(("matcher", unit), None)
         self.skipped[:, number] = False
         for item in given_up:

@@ -61,7 +61,7 @@ def current_digests(
 ) -> dict[str, str]:
     """Return the digest of each file's content by name, without files that cannot be read.
 
-    Stored digests of unchanged files are used; those of new files are stored.
+    Stored digests of unchanged files are used, and digests of new files are stored.
     """
     stored = store.get(ImageFile, files)
     states = {name: file_state(path) for name, path in files.items()}

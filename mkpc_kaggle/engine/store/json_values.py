@@ -47,7 +47,7 @@ def json_reader_of(kind: Any) -> JsonReader | None:
 
 def without_alias(kind: Any) -> Any:
     """Return the type that an alias of a ``type`` statement stands for; another type as it is."""
-    # NumPy's NDArray is such an alias since 2.5.
+    # Since NumPy 2.5, NDArray is an alias of this kind.
     kinds = get_args(kind)
     value = getattr(get_origin(kind) or kind, "__value__", None)
     if value is None:

@@ -133,11 +133,11 @@ class About:
 
 @dataclass(frozen=True, eq=False)
 class PublishedRun:
-    """The latest version of a run's results: one row, beside the rows of the pairs.
+    """The latest version of a run's results: one row, next to the rows of the pairs.
 
     The first ``rows`` of the ``pairs`` belong to the test set, the others are for scenes alone. Rows of
     the table of pairs after them are of an earlier run. ``units`` has names and stages, ``scenes`` the keys of
-    the scenes in use by batch, and ``rivals`` those of the other candidates.
+    the scenes in use by batch, and ``rivals`` the keys of the other candidates.
     """
 
     name: str = "run"
@@ -159,7 +159,7 @@ class PublishedPair:
     reason of the scene's choice, if there is a scene.
 
     ``failures`` are the reasons why units were given up, by unit; ``failure`` is why the pair has no points, and
-    ``unestimated`` why it has points but no estimate, if not for lack of time.
+    ``unestimated`` why it has points but no estimate, unless the time was too short.
     """
 
     number: int

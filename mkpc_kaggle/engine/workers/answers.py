@@ -1,6 +1,6 @@
 """The check of answers, once, where they arrive: an answer of another shape is a loss of its worker.
 
-A worker with a fault of its own (memory that flips bits, another version of a library) may answer
+A worker with its own fault (memory that flips bits, another version of a library) may answer
 anything. The loop, the store and the submission trust each answer that has passed this check.
 """
 

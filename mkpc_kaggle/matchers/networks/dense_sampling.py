@@ -9,7 +9,7 @@ BANDWIDTH = 0.1  # of the density's kernel, in normalised coordinates
 MIN_DENSITY = 10
 LAST_RESORT = 1e-7  # the weight of these matches
 # Of all-pairs distances, which would be 6.4 GB for 10,000 matches: 4 MiB on a CPU, 256 MiB on a GPU. It
-# is idle between small blocks, of which 20,000 points would have 385.
+# is idle between small blocks: 20,000 points would have 385 of them.
 BLOCK_FLOATS = {"cpu": 2**20, "cuda": 2**26}
 MIN_EXPONENT = -80  # exp of less is denormal: ten times slower, and adds nothing
 
