@@ -14,7 +14,12 @@ from mkpc_kaggle.errors import writing
 from mkpc_kaggle.recipe import CameraSharing, Recipe, SceneConfig
 from mkpc_kaggle.reconstruction.choice import choose_pairs
 from mkpc_kaggle.reconstruction.folder import Datasets, Ends, batch_names
-from mkpc_kaggle.reconstruction.outputs import Cameras, PlacedImage, camera_rows, read_cameras
+from mkpc_kaggle.reconstruction.outputs import (
+    Cameras,
+    PlacedImage,
+    camera_rows,
+    read_table_of_cameras,
+)
 from mkpc_kaggle.reconstruction.unmatched import cause_of_no_matches
 from mkpc_kaggle.scene.export import HeldDirectory, remove_files, versions_of
 from mkpc_kaggle.setup.assembly import Assembly
@@ -97,7 +102,7 @@ def reconstruct_folder(
     folders = dict.fromkeys(file.parent for files in datasets.values() for file in files)
     with opened_engine(assembly, session, folders) as engine:
         table = out / "cameras.csv"
-        earlier = read_cameras(table, root, datasets)
+        earlier = read_table_of_cameras(table, root, datasets)
         cameras = [earlier]
         if not table.exists():
             with writing(f"--out {out}"):

@@ -52,7 +52,7 @@ from mkpc_kaggle.reconstruction.outputs import (
     Cameras,
     PlacedImage,
     camera_rows,
-    read_cameras,
+    read_table_of_cameras,
     submission_rows,
     write_tables,
 )
@@ -487,14 +487,14 @@ def test_a_table_of_cameras_that_cannot_be_read_is_replaced_with_a_warning(tmp_p
     path = tmp_path / "cameras.csv"
     files = {".": (tmp_path / "a.png",)}
     path.write_text(text.format(heads=",".join(next(camera_rows({}, tmp_path)))))
-    assert read_cameras(path, tmp_path, files) == {".": {tmp_path / "a.png": None}}
+    assert read_table_of_cameras(path, tmp_path, files) == {".": {tmp_path / "a.png": None}}
     assert "cannot be read" in capsys.readouterr().err
 
 
 def test_a_table_of_cameras_is_read_as_it_was_written(mixed):
     out, result = mixed
     root = out.parent / "images"
-    read = read_cameras(out / "cameras.csv", root, read_folder(root))
+    read = read_table_of_cameras(out / "cameras.csv", root, read_folder(root))
     assert [*camera_rows(read, root)] == [*camera_rows(result.cameras, root)]
 
 
