@@ -51,9 +51,8 @@ def main() -> None:
     )
     print(f"{what}, {len(ran.scenes)} scenes: {ran.report.ending}")
     print(f"CPU: {1e3 * seconds / arguments.pairs:.2f} ms a pair; store: {size / 1e6:.0f} MB")
-    print(
-        f"start from the store: {resuming:.2f} s, {resuming_cpu:.2f} s CPU; {len(state.stale)} scenes out of date"
-    )
+    stale = f"{len(state.scenes.stale)} scenes out of date"
+    print(f"start from the store: {resuming:.2f} s, {resuming_cpu:.2f} s CPU; {stale}")
     print(f"memory: {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3:.0f} MB")
 
 

@@ -32,8 +32,9 @@ from mkpc_kaggle.engine.light import Estimating, Features
 from mkpc_kaggle.engine.matching import Matching
 from mkpc_kaggle.engine.plan.blame import Item, different
 from mkpc_kaggle.engine.plan.budget import Budget, Costs
+from mkpc_kaggle.engine.plan.pairs import extra_pairs_of
 from mkpc_kaggle.engine.plan.schedule import Crew, NextWork, is_complete, next_work
-from mkpc_kaggle.engine.plan.state import State, extra_pairs_of
+from mkpc_kaggle.engine.plan.state import State
 from mkpc_kaggle.engine.publication import Publication
 from mkpc_kaggle.engine.request import Ending, Request, RunReport
 from mkpc_kaggle.engine.restore import restore

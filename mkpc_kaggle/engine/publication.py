@@ -95,8 +95,8 @@ class Publication:
             units=[(unit.name, unit.stage) for unit in state.units],
             rows=len(state.pair_of_row),
             pairs=len(state.pair_of_row) + len(state.pairs) - state.rows,
-            scenes={batch: scene.key for batch, scene in state.scenes.items()},
-            rivals=state.rivals,
+            scenes={batch: scene.key for batch, scene in state.scenes.in_use.items()},
+            rivals=state.scenes.rivals,
         )
 
     def _update_rows(self) -> list[PublishedPair]:
@@ -142,7 +142,7 @@ def _row(state: State, index: int) -> PublishedPair:
     lost = state.lost_estimates.get(index)
     unestimated = _reason(lost) if lost is not None and not state.estimates[index] else ""
     contents = state.contents(index)
-    scene = state.scenes.get(pair.group)
+    scene = state.scenes.in_use.get(pair.group)
     choice = None if scene is None else scene.choices.get(contents)
     return PublishedPair(
         index,

@@ -107,7 +107,7 @@ def _restore_scenes(state: State, store: Store) -> None:
     today = {batch: state.scene_inputs(batch)[1] for batch in state.batches}
     # The first candidate has the key of the scene's inputs.
     others = {
-        batch: {name: of_candidate(key, name) for name in state.candidates[1:]}
+        batch: {name: of_candidate(key, name) for name in state.scenes.candidates[1:]}
         for batch, key in today.items()
     }
     keys = [key for named in others.values() for key in named.values()]
@@ -118,20 +118,20 @@ def _restore_scenes(state: State, store: Store) -> None:
             continue  # the batch stays stale
         # Before the candidates: the scene whose COLMAP files exist is used.
         if batch in state.request.exports:
-            state.note_files(batch, marks[batch].scene if batch in marks else "")
+            state.scenes.note_files(batch, marks[batch].scene if batch in marks else "")
         state.use_candidate(batch, scenes[key])
         for other in others[batch].values():
             if other in scenes:
                 state.use_candidate(batch, scenes[other])
         if directory := state.request.exports.get(batch):
             # A scene without its COLMAP files is made again. Until then its cameras are used.
-            used_scene = state.scenes[batch]
-            has_mark = state.filed[batch] == used_scene.key
+            used_scene = state.scenes.in_use[batch]
+            has_mark = state.scenes.filed[batch] == used_scene.key
             if not (has_mark and has_files(directory.path, len(used_scene.models))):
                 continue
         if state.uses_cameras and _lacks_estimates(state, batch):
             continue
-        state.settle(batch)
+        state.scenes.settle(batch, state.tries.given_up)
 
 
 def _lacks_estimates(state: State, batch: str) -> bool:

@@ -33,12 +33,12 @@ class SceneWork:
         pairs = tuple(state.inputs_of(index) for index in indices)
         source = run.source(pairs)
         if source is None:
-            state.end_scene(batch, candidate)
+            state.scenes.end(batch, candidate)
             return None
         folder = state.request.exports.get(batch)
-        state.begin_scene(batch, candidate)
+        state.scenes.begin(batch, candidate)
         # The first candidate has files, until the best one is made again for its own.
-        has_files = candidate == ALL_UNITS or candidate in state.made[batch]
+        has_files = candidate == ALL_UNITS or candidate in state.scenes.made[batch]
         export = folder if has_files else None
         if export is not None:
             # From now on the files may be replaced, so they belong to no stored scene.
@@ -104,7 +104,9 @@ class SceneWork:
         more = ""  # about a further candidate
         is_best = state.use_new_scene(job.batch, job.scene, record, is_filed=job.export is not None)
         for index, estimate in estimates.items():
-            state.use_camera_estimate(index, estimate, is_current=job.batch not in state.stale)
+            state.use_camera_estimate(
+                index, estimate, is_current=job.batch not in state.scenes.stale
+            )
         run.log.estimated += len(estimates)
         if job.candidate != ALL_UNITS:
             outcome = "the best so far" if is_best else "not better"
@@ -143,12 +145,12 @@ class SceneWork:
         if job.candidate != ALL_UNITS:
             tracks = f" from the tracks of {title_of(job.candidate)}"
         run.log.fault(f"batch {job.batch} was not reconstructed{tracks}: {failure}")
-        state.end_scene(job.batch, job.candidate)
+        state.scenes.end(job.batch, job.candidate)
         # Its worker reads the store by itself. Another program may have damaged it.
         if run.forget_lost_points(job.pairs):
             return
         if state.tries.lose([("scene", job.batch, job.key)], failure):
-            state.give_up_scene(job.batch, job.candidate, job.scene)
+            state.scenes.give_up(job.batch, job.candidate, job.scene, state.tries.given_up)
 
 
 def scene_records(state: State) -> tuple[SceneRecord, ...]:
@@ -156,8 +158,8 @@ def scene_records(state: State) -> tuple[SceneRecord, ...]:
     reasons = scene_failures(state)
     records = []
     for batch in state.batches:
-        if batch in state.scenes:
-            records.append(state.scenes[batch])
+        if batch in state.scenes.in_use:
+            records.append(state.scenes.in_use[batch])
         elif batch in reasons:
             records.append(SceneRecord(batch, failure=str(reasons[batch])))
         elif state.is_unmatched(batch):
@@ -176,7 +178,7 @@ def scene_failures(state: State) -> dict[str, Failure]:
     for batch in state.batches:
         # Neither a failure on former inputs counts, nor one after the batch was done.
         failure = given_up.get(("scene", batch, state.scene_inputs(batch)[1]))
-        if failure is None and batch in state.stale:
+        if failure is None and batch in state.scenes.stale:
             failure = everywhere
         if failure is not None:
             found[batch] = failure

@@ -6,7 +6,8 @@ from pathlib import Path
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.console import logger
-from mkpc_kaggle.engine.plan.state import State, name_below
+from mkpc_kaggle.engine.plan.pairs import name_below
+from mkpc_kaggle.engine.plan.state import State
 from mkpc_kaggle.engine.request import RunReport
 from mkpc_kaggle.engine.scenes import scene_failures
 from mkpc_kaggle.engine.session import Session, opened_engine, request_of
@@ -133,7 +134,7 @@ def reconstruct_folder(
                     engine.log.fault(f"{batch}: {cause}")
         # Models of an earlier run do not belong to tables without cameras.
         for batch in state.batches:
-            is_without = batch not in state.scenes and is_decided(state, batch)
+            is_without = batch not in state.scenes.in_use and is_decided(state, batch)
             if is_without and remove_files(exports[batch], files_before[batch]):
                 logger.warning(
                     f"{batch}: its images have no matches; the models of an earlier run were removed"
@@ -152,7 +153,7 @@ def reconstruct_folder(
 
 def is_decided(results: State, batch: str) -> bool:
     """Return whether a run knows the cameras of a batch, or that it has none."""
-    if batch in results.scenes:
+    if batch in results.scenes.in_use:
         return True
     # A batch of one pair is none. Units that failed say nothing about the images.
     return (
@@ -164,7 +165,7 @@ def is_decided(results: State, batch: str) -> bool:
 
 def is_unfinished(results: State, batch: str, lost: Collection[str]) -> bool:
     """Return whether the cameras in use, if any, are not from all of today's results."""
-    return batch not in results.batches or batch in results.stale or batch in lost
+    return batch not in results.batches or batch in results.scenes.stale or batch in lost
 
 
 def unchanged(before: Cameras, after: Cameras, root: Path) -> list[str]:
@@ -191,7 +192,7 @@ def cameras_of(datasets: Datasets, root: Path, results: State, earlier: Cameras)
         if not is_decided(results, batches[name]):
             cameras[name] = earlier[name]
             continue
-        scene = results.scenes.get(batches[name])
+        scene = results.scenes.in_use.get(batches[name])
         models = () if scene is None else scene.models
         # The largest model is the first, so it comes last into the dictionary and stays there.
         by_digest: dict[str, PlacedImage] = {}

@@ -290,7 +290,8 @@ def pending_lines(run: AnyRun) -> Iterator[str]:
     """Yield a line on pairs and batches that the run did not reach, and how to continue."""
     # A pair may have an F from a scene without being matched.
     pairs = run.tables.pairs
-    waiting = int((~is_reached(pairs) & ~is_solved(pairs)).sum())
+    has_f = is_solved(pairs) & is_of_this_run(pairs)
+    waiting = int((~is_reached(pairs) & ~has_f).sum())
     batches = sum(scene.failure == NOT_RECONSTRUCTED for scene in run.scenes)
     left = [plural(count, noun) for count, noun in ((waiting, "pair"), (batches, "batch")) if count]
     what = f"{' and '.join(left)} left" if left else ""

@@ -140,7 +140,7 @@ def test_the_f_of_the_last_table_stays_until_a_new_one_exists_unless_an_image_ch
         assert whole.state.sources.tolist() == [EARLIER, EARLIER, FALLBACK]
         assert np.array_equal(whole.state.fundamentals[:2], before)
         assert not whole.state.has.any()
-        assert not whole.state.scenes
+        assert not whole.state.scenes.in_use
         whole.publish()
         pairs = pair_tables(whole.store).pairs
         assert pairs["source"].tolist() == ["earlier", "earlier", "fallback"]

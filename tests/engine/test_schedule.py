@@ -329,7 +329,7 @@ def test_a_first_scene_waits_for_the_units_that_fit_and_a_later_scene_for_all():
     for _ in range(1000):
         run.costs.observe(THIRD.name, 400.0)
     assert run.next_work().scenes == ("",)
-    run.state.scenes[""] = None
+    run.state.scenes.in_use[""] = None
     assert run.next_work().scenes == ()
     run.crew = replace(run.crew, can_match=False)
     assert run.next_work().scenes == ("",)
@@ -345,10 +345,10 @@ def test_only_a_scene_that_cannot_be_made_from_todays_results_is_lost():
     assert scene_failures(state) == {"": died}
     # The processes of scenes cannot be started any more, after this batch has its scene.
     state.tries.given_up.clear()
-    state.stale.clear()
+    state.scenes.stale.clear()
     state.give_up(("scenes",), Failure(Cause.NOT_STARTED))
     assert scene_failures(state) == {}
-    state.stale.add("")
+    state.scenes.stale.add("")
     assert scene_failures(state) == {"": Failure(Cause.NOT_STARTED)}
 
 
@@ -366,7 +366,7 @@ def test_a_first_scene_does_not_wait_for_a_job_that_hangs_until_the_end():
     stop = view_of(run).stop
     assert run.next_work(stop - 1.0).scenes == ()
     assert run.next_work(stop).scenes == ("",)
-    run.state.scenes[""] = None  # a later scene needs all points
+    run.state.scenes.in_use[""] = None  # a later scene needs all points
     assert run.next_work(stop).scenes == ()
 
 
@@ -640,7 +640,7 @@ def test_reading_how_a_run_ended_changes_nothing():
     state = engine.state
 
     def contents():
-        return set(state.stale), dict(state.tries.given_up), state.missing.tolist()
+        return set(state.scenes.stale), dict(state.tries.given_up), state.missing.tolist()
 
     before = contents()
     endings = {engine.ending for _ in range(3)}

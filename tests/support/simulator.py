@@ -591,7 +591,7 @@ def simulate(scenario: Scenario, store: Store | None = None, until: float = math
         and not any(math.isinf(scene.seconds) for scene in site.scenes),
         site.last_job,
         tuple(site.scenes),
-        set(state.stale),
+        set(state.scenes.stale),
         [[*points, state.estimates[index]] for index, points in enumerate(state.points.tolist())],
         tuple(place.name for place in closed),
         tuple(place.name for place in closed if place.name not in site.bad_names),

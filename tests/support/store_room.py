@@ -141,7 +141,7 @@ class Room:
         return (
             int(self.state.current.any(1).sum()),
             int(self.state.estimated.sum()),
-            not self.state.stale,
+            not self.state.scenes.stale,
         )
 
 

@@ -432,9 +432,9 @@ def scenes_due(
         True: batches_with(state, for_later),
     }
     # Stable, so batches in the same position keep their order.
-    order = sorted(waiting, key=state.scenes.__contains__)
+    order = sorted(waiting, key=state.scenes.in_use.__contains__)
     return tuple(
-        batch for batch in order if not blocked[batch in state.scenes][state.batches[batch]]
+        batch for batch in order if not blocked[batch in state.scenes.in_use][state.batches[batch]]
     )
 
 
@@ -483,14 +483,14 @@ def candidates_due(
     blocked = batches_with(state, pending)
     due = []
     for batch, number in state.batches.items():
-        if batch in state.stale or batch in state.reconstructing or blocked[number]:
+        if batch in state.scenes.stale or batch in state.scenes.reconstructing or blocked[number]:
             continue
-        for candidate in state.untried.get(batch, ()):
+        for candidate in state.scenes.untried.get(batch, ()):
             end = snapshot.now + candidate_seconds(snapshot, batch, candidate)
-            if (batch, candidate) not in state.trying and end <= snapshot.budget.stop_units:
+            if (batch, candidate) not in state.scenes.trying and end <= snapshot.budget.stop_units:
                 due.append((batch, candidate))
     # Each batch gets its second candidate before any gets a third.
-    due.sort(key=lambda each: state.candidates.index(each[1]))
+    due.sort(key=lambda each: state.scenes.candidates.index(each[1]))
     return tuple(due)
 
 
@@ -502,13 +502,13 @@ def candidate_seconds(snapshot: Snapshot, batch: str, candidate: str) -> float:
 
 def candidates_reserve(snapshot: Snapshot) -> float:
     """Return the seconds to reserve for further candidates of scenes, several at a time."""
-    state = snapshot.state
-    if len(state.candidates) == 1 or not snapshot.crew.scenes:
+    scenes = snapshot.state.scenes
+    if len(scenes.candidates) == 1 or not snapshot.crew.scenes:
         return 0.0
     seconds = 0.0
-    for batch in state.batches:
+    for batch in snapshot.state.batches:
         # A stale batch will get all of them.
-        missing = state.candidates[1:] if batch in state.stale else state.untried.get(batch, ())
+        missing = scenes.candidates[1:] if batch in scenes.stale else scenes.untried.get(batch, ())
         seconds += sum(candidate_seconds(snapshot, batch, candidate) for candidate in missing)
     return min(CANDIDATES_SHARE * snapshot.budget.time_limit, seconds / snapshot.crew.scenes)
 
@@ -523,7 +523,7 @@ def batches_with(state: State, pairs: Mask) -> Mask:
 
 def waiting_batches(state: State, crew: Crew) -> list[str]:
     """Return the batches to reconstruct at some time, in their order."""
-    stale = state.stale - state.reconstructing
+    stale = state.scenes.stale - state.scenes.reconstructing
     if not stale or not crew.scenes:
         return []
     matches = state.matches_of_batches()
@@ -539,9 +539,9 @@ def estimates_reserve(snapshot: Snapshot) -> float:
 def scenes_reserve(snapshot: Snapshot) -> float:
     """Return the expected seconds of the pending reconstructions, several at a time."""
     state = snapshot.state
-    if not state.stale or not snapshot.crew.scenes:
+    if not state.scenes.stale or not snapshot.crew.scenes:
         return 0.0
-    stale = [state.batches[batch] for batch in state.stale]
+    stale = [state.batches[batch] for batch in state.scenes.stale]
     forecasts = snapshot.costs.scenes(state.matches_of_batches()[stale])
     return float(max(forecasts.max(), forecasts.sum() / snapshot.crew.scenes))
 
@@ -553,7 +553,7 @@ def is_complete(state: State, crew: Crew) -> bool:
     """Whether all rows have all results that this run can compute, and so do all batches."""
     if state.missing[: state.rows].any() or state.lacks_estimate.any():
         return False
-    has_untried = crew.scenes and any(state.untried.values())
+    has_untried = crew.scenes and any(state.scenes.untried.values())
     return not waiting_batches(state, crew) and not has_untried
 
 

@@ -7,7 +7,6 @@ with other settings, the state has the F that they wrote, and nothing else.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,16 +15,16 @@ from numpy.typing import NDArray
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.jobs import Cause, Failure, PairInputs, visiting_order
 from mkpc_kaggle.engine.plan.blame import Item, Tries
+from mkpc_kaggle.engine.plan.pairs import batches_of, distinct_pairs, names_of
+from mkpc_kaggle.engine.plan.scene_state import SceneState
 from mkpc_kaggle.engine.request import Request
 from mkpc_kaggle.engine.store.image_files import contents_of
-from mkpc_kaggle.engine.store.keys import Images, of_camera_estimate, of_candidate
-from mkpc_kaggle.engine.store.scene_record import MIN_PAIRS, SceneRecord
+from mkpc_kaggle.engine.store.keys import Images, of_camera_estimate
+from mkpc_kaggle.engine.store.scene_record import SceneRecord
 from mkpc_kaggle.engine.store.tables import PairEstimate, UnitPoints
 from mkpc_kaggle.geometry.coordinates import Matrix3
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
-from mkpc_kaggle.recipe import SceneConfig
-from mkpc_kaggle.scene.candidates import ALL_UNITS, best_of, candidates_of
-from mkpc_kaggle.scene.densify import extra_pairs
+from mkpc_kaggle.scene.candidates import ALL_UNITS, candidates_of
 from mkpc_kaggle.scene.view_graph import BatchImage
 
 Mask = NDArray[np.bool_]
@@ -54,11 +53,7 @@ class State:
     ``changed`` has the pairs with other results than in the last table of pairs.
 
     Of a batch: ``batches`` has its number by name, ``members`` its pairs; ``batch_of`` (N,) is -1 for a pair
-    without one. ``scenes`` has the scenes in use, ``stale`` the batches whose scene is not today's, and
-    ``reconstructing`` the batches of jobs under way. A scene is the best of the ``candidates``: ``made`` has those
-    from today's results, once the first is made; ``untried`` are the missing ones, and ``trying``
-    those of jobs under way, as (batch, candidate). ``filed`` has the key of the scene whose files are in the
-    batch's folder.
+    without one. ``scenes`` has the scenes in use, and the candidates to make.
     """
 
     def __init__(self, request: Request, extra: Sequence[Pair] = ()) -> None:
@@ -118,14 +113,8 @@ class State:
         self.batch_of = np.full(len(self.pairs), -1)
         for number, members in enumerate(self.members):
             self.batch_of[members] = number
-        self.scenes: dict[str, SceneRecord] = {}
-        self.stale = set(batches)
-        self.reconstructing: set[str] = set()
-        self.candidates = candidates_of(self.units, self.request.recipe.scene)
-        self.made: dict[str, dict[str, SceneRecord]] = {}
-        self.untried: dict[str, list[str]] = {}
-        self.trying: set[tuple[str, str]] = set()
-        self.filed: dict[str, str] = {}
+        candidates = candidates_of(self.units, self.request.recipe.scene)
+        self.scenes = SceneState(batches, candidates, self.request.exports)
 
     # Results in use
 
@@ -316,7 +305,7 @@ class State:
         awaits = np.zeros(len(self.pairs), bool)
         if self.uses_cameras and ("scenes",) not in self.tries.given_up:
             matches = self.matches_of_batches()
-            for batch in self.stale | self.reconstructing:
+            for batch in self.scenes.stale | self.scenes.reconstructing:
                 number = self.batches[batch]
                 # No scene is made of a batch without matches.
                 awaits[self.members[number]] = matches[number] > 0
@@ -460,95 +449,30 @@ class State:
         A further candidate is used only if it is from the results in use, as the first one with the
         key ``scene``. ``is_filed`` states that the batch's folder has its files.
         """
+        scenes = self.scenes
         if is_filed:
-            self.filed[batch] = record.key
-        self.end_scene(batch, record.candidate)
+            scenes.note_files(batch, record.key)
+        scenes.end(batch, record.candidate)
         if record.candidate == ALL_UNITS:
             self.use_candidate(batch, record)
             # Otherwise pairs have got other results meanwhile, and the batch stays stale.
             if self.scene_inputs(batch)[1] == record.key:
-                self.settle(batch)
-        elif self._is_of_today(batch, scene):
+                scenes.settle(batch, self.tries.given_up)
+        elif scenes.is_of_today(batch, scene):
             self.use_candidate(batch, record)
-            self._try_others(batch)
+            scenes.try_others(batch, self.tries.given_up)
         else:
             return False
-        return self.best_candidate(batch) == record.candidate
-
-    def _is_of_today(self, batch: str, scene: str) -> bool:
-        """Return whether the first candidate is from the same results as ``scene``, and today's."""
-        first = self.made.get(batch, {}).get(ALL_UNITS)
-        return first is not None and first.key == scene and batch not in self.stale
-
-    def note_files(self, batch: str, key: str) -> None:
-        """Note that the batch's folder has the files of the scene with this key."""
-        self.filed[batch] = key
-
-    def settle(self, batch: str) -> None:
-        """Note that the scene of a batch is today's, and which other candidates are missing."""
-        self.stale.discard(batch)
-        self._try_others(batch)
+        return scenes.best_candidate(batch) == record.candidate
 
     def use_candidate(self, batch: str, record: SceneRecord) -> None:
-        """Use a candidate of a scene, if it is the best one so far.
-
-        The first candidate is always from newer results than the others, and replaces them. With
-        files, the best candidate is used once its files are written.
-        """
-        if record.candidate == ALL_UNITS:
-            self.made[batch] = {}
-        made = self.made[batch]
-        made[record.candidate] = record
-        used = self.best_candidate(batch)
-        if batch in self.request.exports and made[used].key != self.filed.get(batch):
-            filed = [name for name, each in made.items() if each.key == self.filed.get(batch)]
-            used = next(iter(filed), ALL_UNITS)
-        others = [other for name, other in made.items() if name != used]
-        self.use_scene(batch, made[used].against(others))
-
-    def best_candidate(self, batch: str) -> str:
-        """Return the finished candidate with the smallest disagreement."""
-        made = self.made[batch]
-        return best_of({name: made[name].disagreement for name in self.candidates if name in made})
-
-    def _try_others(self, batch: str) -> None:
-        """Note which other candidates are missing: the first one is from today's results.
-
-        With files, the best one is finally made again, if its files are missing.
-        """
-        made = self.made[batch]
-        scene = made[ALL_UNITS].key
-        missing = [name for name in self.candidates if name not in made]
-        open_ones = [name for name in missing if not self._is_given_up(batch, scene, name)]
-        best = self.best_candidate(batch)
-        if (
-            not open_ones
-            and batch in self.request.exports
-            and made[best].key != self.filed.get(batch)
-            and not self._is_given_up(batch, scene, best)
-        ):
-            open_ones = [best]
-        self.untried[batch] = open_ones
-
-    def _is_given_up(self, batch: str, scene: str, candidate: str) -> bool:
-        return ("scene", batch, of_candidate(scene, candidate)) in self.tries.given_up
-
-    @property
-    def rivals(self) -> dict[str, list[str]]:
-        """The keys of the candidates that are not in use, by batch."""
-        return {
-            batch: [each.key for each in made.values() if each.key != self.scenes[batch].key]
-            for batch, made in self.made.items()
-        }
-
-    def use_scene(self, batch: str, record: SceneRecord) -> None:
-        """Use a scene: pairs with a choice take its F."""
-        self.scenes[batch] = record
+        """Use a candidate of a scene, if it is the best one so far: pairs with a choice take its F."""
+        scene = self.scenes.use(batch, record)
         members = self.members[self.batches[batch]]
         self.changed.update(members.tolist())
         self.scene_source[members] = FALLBACK  # of the former scene
         for index in members.tolist():
-            choice = record.choices.get(self.contents(index))
+            choice = scene.choices.get(self.contents(index))
             if choice is not None and choice.F is not None:
                 self.by_scene[index] = choice.F
                 # F at the scene's focal lengths is still the pair's own.
@@ -559,9 +483,7 @@ class State:
         self.changed.add(index)
         if self.batch_of[index] >= 0:
             batch = self.pairs[index].group
-            self.stale.add(batch)
-            # Until the first candidate is made again
-            self.untried.pop(batch, None)
+            self.scenes.note_change(batch)
             if self.uses_cameras:
                 members = self.members[self.batches[batch]]
                 self.estimated[members[self.by_cameras[members]]] = False
@@ -590,19 +512,6 @@ class State:
     def end_estimates(self, indices: Iterable[int]) -> None:
         self.estimating[list(indices)] = False
 
-    def begin_scene(self, batch: str, candidate: str) -> None:
-        """Note a candidate of a job under way. The batch stays stale: the job may be lost."""
-        if candidate == ALL_UNITS:
-            self.reconstructing.add(batch)
-        else:
-            self.trying.add((batch, candidate))
-
-    def end_scene(self, batch: str, candidate: str) -> None:
-        if candidate == ALL_UNITS:
-            self.reconstructing.discard(batch)
-        else:
-            self.trying.discard((batch, candidate))
-
     def lose_estimates(self, indices: Iterable[int], failure: Failure) -> None:
         """Note why the estimates of a job have no result."""
         for index in indices:
@@ -615,14 +524,6 @@ class State:
             self.lost_estimates.setdefault(index, failure)
             self.changed.add(index)
         self.tries.given_up["estimates",] = failure
-
-    def give_up_scene(self, batch: str, candidate: str, scene: str) -> None:
-        """Try a candidate no more until the results of its batch change."""
-        if candidate == ALL_UNITS:
-            # The batch becomes stale again when its inputs change.
-            self.stale.discard(batch)
-        elif self._is_of_today(batch, scene):
-            self._try_others(batch)
 
     def give_up(self, item: tuple[Any, ...], failure: Failure) -> None:
         """Stop trying an item in this run. For the items see :mod:`mkpc_kaggle.engine.plan.blame`."""
@@ -703,74 +604,3 @@ class State:
         """(U,): units that no worker can run."""
         given_up = self.tries.given_up
         return np.array([("matcher", unit.name) in given_up for unit in self.units], bool)
-
-
-def distinct_pairs(rows: Iterable[Pair]) -> tuple[list[Pair], NDArray[np.int_]]:
-    """Return the distinct pairs of a table, the first row of each, and the pair of each row.
-
-    Rows of a batch with the same two images are one pair: they share its points and its estimate.
-    """
-    pairs: list[Pair] = []
-    known: dict[Any, int] = {}
-    pair_of_row = []
-    for pair in rows:
-        # With other intrinsics, another E is estimated.
-        intrinsics = pair.intrinsics and tuple(K.tobytes() for K in pair.intrinsics)
-        key = (pair.group, pair.file0, pair.file1, pair.turns, intrinsics)
-        if key not in known:
-            known[key] = len(pairs)
-            pairs.append(pair)
-        pair_of_row.append(known[key])
-    return pairs, np.array(pair_of_row, int)
-
-
-def names_of(pair: Pair, root: str) -> tuple[str, str]:
-    """Return the paths of a pair's images below ``root``."""
-    return name_below(root, pair.file0), name_below(root, pair.file1)
-
-
-def name_below(root: str, file: str) -> str:
-    """Return a file's path relative to ``root``, or the whole path if the file lies elsewhere."""
-    return file.removeprefix(root.rstrip("/") + "/") if root else file
-
-
-# Batches
-
-
-def batches_of(pairs: Iterable[Pair]) -> dict[str, list[int]]:
-    """Return the pair indices of each batch that can be reconstructed: two or more pairs without
-    intrinsics.
-    """
-    batches: dict[str, list[int]] = {}
-    for index, pair in enumerate(pairs):
-        # With known intrinsics, a pair gets an E, which no scene can replace.
-        if pair.intrinsics is None:
-            batches.setdefault(pair.group, []).append(index)
-    return {name: members for name, members in batches.items() if len(members) >= MIN_PAIRS}
-
-
-def extra_pairs_of(pairs: Sequence[Pair], config: SceneConfig | None) -> list[Pair]:
-    """Return pairs that no row names, for the scenes of their batches, the most useful first.
-
-    Each batch is filled up to ``pairs_per_image``, the batch with the fewest pairs per image first.
-    """
-    if config is None or not config.pairs_per_image:
-        return []
-    extra: list[tuple[float, Pair]] = []
-    for batch, indices in batches_of(pairs).items():
-        number: dict[str, int] = {}  # of each image in its batch
-        ends = []
-        for index in indices:
-            pair = pairs[index]
-            i = number.setdefault(pair.file0, len(number))
-            j = number.setdefault(pair.file1, len(number))
-            ends.append((i, j))
-        files = list(number)
-        distinct = len({tuple(sorted(pair)) for pair in ends})
-        more = extra_pairs(len(files), ends, config.pairs_per_image)
-        for count, (i, j) in enumerate(more, start=distinct):
-            name = f"{batch};{Path(files[i]).stem}-{Path(files[j]).stem}"
-            pair = Pair(name, batch, files[i], files[j])
-            # Pairs per image of the batch before this pair is added: the order of all batches.
-            extra.append((count / len(files), pair))
-    return [pair for _, pair in sorted(extra, key=lambda each: each[0])]
