@@ -144,7 +144,10 @@ class CameraSharing(StrEnum):
 
 
 class CameraModel(StrEnum):
-    """COLMAP's camera models of perspective lenses. F of a pair needs one without distortion."""
+    """COLMAP's camera models of perspective lenses. F of a pair needs one without distortion.
+
+    ``AUTO`` is a pinhole, and for cameras SIMPLE_RADIAL where the photographs show distortion.
+    """
 
     SIMPLE_PINHOLE = "SIMPLE_PINHOLE"
     PINHOLE = "PINHOLE"
@@ -152,9 +155,10 @@ class CameraModel(StrEnum):
     RADIAL = "RADIAL"
     OPENCV = "OPENCV"
     FULL_OPENCV = "FULL_OPENCV"
+    AUTO = "AUTO"
 
 
-# F of two cameras exists for these models only; others bend its lines.
+# F of two cameras exists for these models only; distortion bends its lines.
 PINHOLES = frozenset({CameraModel.SIMPLE_PINHOLE, CameraModel.PINHOLE})
 
 
@@ -165,7 +169,7 @@ class SceneConfig:
     # A batch with fewer gets extra pairs, used only for its scene; 0: none.
     pairs_per_image: float = 10.0
     cameras: CameraSharing = CameraSharing.AUTO
-    camera_model: CameraModel = CameraModel.SIMPLE_PINHOLE
+    camera_model: CameraModel = CameraModel.AUTO
     # Reconstructions of a batch to choose from, see :mod:`mkpc_kaggle.scene.candidates`
     candidates: int = 1
     # Minimum share of inliers of an edge, see :mod:`mkpc_kaggle.scene.edges`; 0: all edges.

@@ -38,7 +38,7 @@ from mkpc_kaggle.reconstruction.panoramas import require_perspective
 from mkpc_kaggle.reconstruction.placed import placed_line, read_placed
 from mkpc_kaggle.reconstruction.priors import intrinsics_line, read_intrinsics_table
 from mkpc_kaggle.reconstruction.run import FolderResult, for_cameras, reconstruct_folder
-from mkpc_kaggle.reporting.contradictions import contradictions
+from mkpc_kaggle.reporting.contradictions import adopted_lenses, contradictions
 from mkpc_kaggle.reporting.summary import (
     chosen_candidates,
     pending_lines,
@@ -260,8 +260,8 @@ def _lines(result: FolderResult, root: Path) -> Iterator[str]:
             why += " by an earlier run"
         count = f"{models.total()} of {plural(len(found), 'image')} with a camera"
         yield f"{batches[name]}: {count}: {why}"
-    for name, value, remark in chosen_candidates(report.scenes):
-        yield f"{name}: {value} ({remark})"
+    for fact in (*chosen_candidates(report.scenes), *adopted_lenses(report.scenes)):
+        yield "{}: {} ({})".format(*fact)
     yield from weakest_line(report.scenes)
     for scene in report.scenes:
         yield from (f"{scene.batch}: {sentence}" for sentence in contradictions(scene))

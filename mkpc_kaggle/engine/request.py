@@ -12,7 +12,7 @@ from mkpc_kaggle.engine.store.keys import Keys
 from mkpc_kaggle.engine.store.scene_record import SceneRecord
 from mkpc_kaggle.engine.store.tables import About, Event
 from mkpc_kaggle.geometry.intrinsics import Rows
-from mkpc_kaggle.recipe import PINHOLES, Recipe
+from mkpc_kaggle.recipe import Recipe
 from mkpc_kaggle.scene.export import HeldDirectory
 
 if TYPE_CHECKING:
@@ -62,13 +62,9 @@ class Request:
         """Whether a pair's estimate comes from its cameras where these exist, and not from MAGSAC.
 
         The cameras are the result of a run with files, and F of a pair is for its report alone. With one
-        unit, MAGSAC takes a notable share of the time. F of distorted cameras does not fit their matches.
+        unit, MAGSAC takes a notable share of the time. Pairs of distorted cameras take F from MAGSAC.
         """
-        scene = self.recipe.scene
-        if scene is None or not self.exports or len(self.recipe.units) > 1:
-            return False
-        models = {scene.camera_model.value, *(camera.model for _, camera in self.cameras)}
-        return models <= {model.value for model in PINHOLES}
+        return self.recipe.scene is not None and bool(self.exports) and len(self.recipe.units) == 1
 
 
 @dataclass(frozen=True)

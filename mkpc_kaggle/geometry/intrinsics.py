@@ -60,22 +60,42 @@ class KnownCamera:
             )
 
     @property
+    def focals(self) -> tuple[float, ...]:
+        """One focal length in pixels, or fx and fy."""
+        return self.parameters[: LENS_MODELS[self.model].index("cx")]
+
+    @property
     def focal(self) -> float:
         """The mean focal length in pixels."""
-        at = LENS_MODELS[self.model].index("cx")  # focal lengths come before it
-        return sum(self.parameters[:at]) / at
+        return sum(self.focals) / len(self.focals)
 
     @property
     def principal_point(self) -> tuple[float, float]:
         """The point (cx, cy); the centre of the top-left pixel is (0.5, 0.5)."""
-        at = LENS_MODELS[self.model].index("cx")
-        return self.parameters[at], self.parameters[at + 1]
+        x, y = self.parameters[len(self.focals) :][:2]
+        return x, y
+
+    @property
+    def distortion(self) -> tuple[float, ...]:
+        """The coefficients of distortion, in COLMAP's and OpenCV's order; none of a pinhole."""
+        return self.parameters[len(self.focals) + 2 :]
+
+    @property
+    def without_distortion(self) -> "KnownCamera":
+        """The pinhole with the same focal lengths and principal point."""
+        model = "SIMPLE_PINHOLE" if len(self.focals) == 1 else "PINHOLE"
+        return KnownCamera(model, (*self.focals, *self.principal_point), self.sigma)
+
+    def with_focal(self, focal: float) -> "KnownCamera":
+        """Return the camera with another mean focal length in pixels."""
+        ratio = focal / self.focal
+        focals = tuple(value * ratio for value in self.focals)
+        return replace(self, parameters=focals + self.parameters[len(focals) :])
 
     def scaled(self, x: float, y: float) -> "KnownCamera":
         """Return the camera of pictures that are ``x`` times as wide and ``y`` times as high."""
-        at = LENS_MODELS[self.model].index("cx")
         # A single focal length gets the mean, since x and y then differ by rounding.
-        factors = [(x + y) / 2] if at == 1 else [x, y]
+        factors = [(x + y) / 2] if len(self.focals) == 1 else [x, y]
         factors += [x, y]
         # Distortion has no unit, so it stays.
         factors += [1.0] * (len(self.parameters) - len(factors))

@@ -24,6 +24,7 @@ from unicodedata import combining
 from mkpc_kaggle.reconstruction.colours import colour_points
 from mkpc_kaggle.reconstruction.directory import holds_dataset
 from mkpc_kaggle.reconstruction.folder import Datasets
+from mkpc_kaggle.reconstruction.undistort import undistort
 from mkpc_kaggle.scene.export import (
     FORMER,
     IMAGES,
@@ -193,17 +194,22 @@ def convert_models(held: HeldDirectory, names: Mapping[str, str]) -> None:
     with TemporaryDirectory(prefix=PART, dir=directory) as name:
         made = Path(name)
         (made / SPARSE).mkdir()
+        (made / IMAGES).mkdir()
         for folder in sorted((directory / MODELS).glob("[0-9]*")):
             model = pycolmap.Reconstruction(folder)
             # Before colours are read: images/ has plain names.
             for image in model.images.values():
                 image.name = names.get(image.name, image.name)
             colour_points(model, directory / IMAGES)
+            undistort(model, directory / IMAGES, made / IMAGES)
             (made / SPARSE / folder.name).mkdir()
             model.write(made / SPARSE / folder.name)
-        for path in filter(Path.is_file, (made / SPARSE).rglob("*")):
+        for path in filter(Path.is_file, made.rglob("*")):
             # A power failure must not leave empty files under their names
             with path.open("rb") as stream:
                 os.fsync(stream.fileno())
         held.check()
+        for path in sorted((made / IMAGES).iterdir()):
+            # Of a link, which is replaced, and not of its photograph
+            path.replace(directory / IMAGES / path.name)
         replace_models(made / SPARSE, directory / SPARSE, made / FORMER)

@@ -3,7 +3,7 @@
 import os
 import threading
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +18,7 @@ from mkpc_kaggle.engine.plan.pairs import name_below
 from mkpc_kaggle.engine.request import RunReport
 from mkpc_kaggle.engine.session import Interrupt, Session, interruptible
 from mkpc_kaggle.engine.store.database import FILE_NAME
+from mkpc_kaggle.engine.store.scene_record import SceneRecord
 from mkpc_kaggle.errors import UserError, plural, temporary_directory
 from mkpc_kaggle.matchers.contract import Matcher
 from mkpc_kaggle.recipe import Recipe
@@ -31,7 +32,7 @@ from mkpc_kaggle.reconstruction.priors import (
     read_intrinsics_table,
 )
 from mkpc_kaggle.reconstruction.run import for_cameras, reconstruct_folder
-from mkpc_kaggle.reporting.contradictions import contradictions
+from mkpc_kaggle.reporting.contradictions import adopted_lenses, contradictions
 from mkpc_kaggle.scene.export import MODELS
 from mkpc_kaggle.scene.models import SfmModel
 from mkpc_kaggle.setup.arguments import PathSource, Weights, member_of, shown_value
@@ -180,9 +181,8 @@ def reconstruct(
             logger.warning(result.report.unsaved)
         for failure in unreadable_images(result.report.tables.pairs):
             logger.warning(f"cannot be read: {failure}")
-        for scene in result.report.scenes:
-            for sentence in contradictions(scene):
-                logger.warning(sentence)
+        for line in lines_about_lenses(result.report.scenes):
+            logger.warning(line)
         # In the models of an earlier call, images may be missing, and so may their files.
         if result.lost:
             reason = next(iter(result.lost.values()))
@@ -200,6 +200,14 @@ def reconstruct(
             for scene in result.report.scenes
             for number, model in enumerate(scene.models)
         )
+
+
+def lines_about_lenses(scenes: Sequence[SceneRecord]) -> Iterator[str]:
+    """Yield the assumptions that photographs contradict, and the lenses that a K does not describe."""
+    for scene in scenes:
+        yield from contradictions(scene)
+    for name, value, _ in adopted_lenses(scenes):
+        yield f"{name}: {value}; K has no distortion, the field lens of each image has it"
 
 
 def no_models(report: RunReport) -> list[str]:

@@ -20,7 +20,27 @@ def contradictions(scene: SceneRecord) -> Iterator[str]:
         for focal in model.comparison.focals:
             yield _focal_sentence(focal)
         for lens in model.comparison.lenses:
-            yield _lens_sentence(lens, is_everything=len(lens.images) == scene.images)
+            # The model has an adopted lens, so nothing contradicts it.
+            if not lens.is_adopted:
+                yield _lens_sentence(lens, is_everything=len(lens.images) == scene.images)
+
+
+def adopted_lenses(scenes: Sequence[SceneRecord]) -> Iterator[tuple[str, str, str]]:
+    """Yield a fact on each lens with distortion that the photographs have shown."""
+    for scene in scenes:
+        for model in scene.models:
+            for lens in filter(lambda lens: lens.is_adopted, model.comparison.lenses):
+                names = named([Path(name).name for name in lens.images])
+                k = lens.camera.distortion[0]
+                remark = (
+                    f"{100 * abs(lens.displacement):.1f} % at the edge; images/ and sparse/ are "
+                    f"undistorted: {names}"
+                )
+                yield (
+                    "distorted lens",
+                    f"{lens.camera.model}, f = {lens.camera.focal:.1f}, k = {k:.4f}",
+                    remark,
+                )
 
 
 def has_moved(scene: SceneRecord) -> bool:

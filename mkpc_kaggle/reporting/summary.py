@@ -15,6 +15,7 @@ from mkpc_kaggle.geometry.critical_region import RegionReason
 from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
 from mkpc_kaggle.progress import format_duration
 from mkpc_kaggle.recipe import Recipe
+from mkpc_kaggle.reporting.contradictions import adopted_lenses
 from mkpc_kaggle.reporting.run_log import RunLog
 from mkpc_kaggle.scene.candidates import title_of
 from mkpc_kaggle.scene.models import Sigmas
@@ -221,6 +222,7 @@ def facts(run: AnyRun) -> Iterator[tuple[str, str, str]]:
             remark += f"; {loose} of them unknown to within the size of their model"
         yield "images with a camera", f"{placed} of {images}", remark
         yield from chosen_candidates(scenes)
+        yield from adopted_lenses(scenes)
 
 
 def chosen_candidates(scenes: Sequence[SceneRecord]) -> Iterator[tuple[str, str, str]]:

@@ -6,7 +6,7 @@ Points have 16-bit coordinates and 8-bit colours, in base64.
 
 import base64
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from html import escape
 from importlib.resources import files
@@ -21,7 +21,9 @@ from mkpc_kaggle.data.images import Image, read_image
 from mkpc_kaggle.data.outputs import replacing
 from mkpc_kaggle.errors import writing
 from mkpc_kaggle.geometry.cameras import Camera
-from mkpc_kaggle.geometry.coordinates import Pixels
+from mkpc_kaggle.geometry.coordinates import Pixels, Size
+from mkpc_kaggle.geometry.intrinsics import KnownCamera
+from mkpc_kaggle.geometry.undistortion import undistorted
 from mkpc_kaggle.scene.models import MAX_POINTS, RegisteredImage, SfmModel
 
 if TYPE_CHECKING:
@@ -292,9 +294,11 @@ def _projected(
 
 def _pictures(models: Sequence[SfmModel], read: Reader) -> dict[str, Pixels]:
     """Return the readable pictures by image name, reduced to thumbnails; of many, only the first."""
-    names = dict.fromkeys(found.image.name for model in models for found in model.images)
+    images: dict[str, RegisteredImage] = {}
+    for found in (found for model in models for found in model.images):
+        images.setdefault(found.image.name, found)  # of several models, the largest comes first
     pictures = {}
-    for name in [*names][:MAX_PICTURES]:
+    for name, found in [*images.items()][:MAX_PICTURES]:
         image = read(name)
         if image is not None:
             # A small image is not enlarged.
@@ -303,7 +307,29 @@ def _pictures(models: Sequence[SfmModel], read: Reader) -> dict[str, Pixels]:
                 image.pixels, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA
             )
             pictures[name] = np.asarray(reduced, np.uint8)
+            if found.lens is not None and found.has_distortion:
+                pictures[name] = _as_pinhole(
+                    pictures[name], image.size, found.lens, found.image.size
+                )
     return pictures
+
+
+def _as_pinhole(picture: Pixels, stored: Size, lens: KnownCamera, size: Size) -> Pixels:
+    """Return a reduced picture as a pinhole with the focal length of its lens shows the world.
+
+    ``size`` is that of the photograph. A file of another size is one of the results, without distortion already.
+    """
+    source = lens
+    if stored != size:
+        # pycolmap has moved the middle, and kept the focal length.
+        x, y = lens.principal_point
+        middle = (x * stored.width / size.width, y * stored.height / size.height)
+        pinhole = lens.without_distortion
+        source = replace(pinhole, parameters=(*pinhole.focals, *middle))
+    scale = picture.shape[1] / stored.width
+    shown = Size(round(scale * size.width), round(scale * size.height))
+    target = lens.without_distortion.scaled(scale, scale)
+    return undistorted(picture, source.scaled(scale, scale), target, shown)
 
 
 def _thumbnail(pixels: Pixels) -> str:

@@ -47,6 +47,7 @@ class Reason(StrEnum):
     APART = "the cameras are of different models"
     SAME_IMAGE = "both images are the same picture"
     SAME_CENTRE = "both cameras stand at one point"
+    DISTORTED = "a lens is distorted, and F has no distortion"
     CONTRADICTION = "the pair's own matches contradict the scene"
 
 
@@ -82,6 +83,8 @@ def choose(
     if model is None:
         registered = {digest for model in models for digest in model}
         return Choice(None, Reason.APART if registered >= set(digests) else Reason.UNREGISTERED)
+    if any(model[digest].has_distortion for digest in digests):
+        return Choice(None, Reason.DISTORTED)
     try:
         F = fundamental_of_cameras(*(model[digest].camera for digest in digests))
     except ValueError:

@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 
 from mkpc_kaggle.cores import available_cores
 from mkpc_kaggle.geometry.cameras import Camera
-from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.intrinsics import KnownCamera
 from mkpc_kaggle.recipe import CameraModel, SceneConfig
 from mkpc_kaggle.scene.adjustment import adjust
@@ -44,7 +43,13 @@ from mkpc_kaggle.scene.models import (
 )
 from mkpc_kaggle.scene.shared_intrinsics import SharedIntrinsics, start_focal
 from mkpc_kaggle.scene.uncertainty import camera_sigmas
-from mkpc_kaggle.scene.view_graph import MIN_MATCHES, ViewGraph, known_by_name, placed_by_name
+from mkpc_kaggle.scene.view_graph import (
+    MIN_MATCHES,
+    BatchImage,
+    ViewGraph,
+    known_by_name,
+    placed_by_name,
+)
 
 CENTRE_PX = 0.5  # in COLMAP the top-left pixel's centre is (0.5, 0.5), here it is (0, 0)
 # Of a verified match; 1 px loses accuracy on tourist photographs, 4 px on repeated windows
@@ -180,9 +185,8 @@ def _write_images(
         # Images of two sizes never share, even at one focal length.
         key = number if focal is None else (image.size, focal)
         if key not in cameras:
-            start = start_focal(image, uses_exif=graph.uses_exif) if focal is None else focal
-            known = graph.known.get(image.digest)
-            cameras[key] = _write_camera(database, number, camera_model, image.size, start, known)
+            start = _start_camera(graph, image, camera_model, focal)
+            cameras[key] = _write_camera(database, number, start)
         camera = cameras[key]
         # The keypoints are in the table of keypoints.
         taken = pycolmap.Image(
@@ -197,23 +201,28 @@ def _write_images(
     return used
 
 
-def _write_camera(
-    database: Any,
-    number: int,
-    model: CameraModel,
-    size: Size,
-    focal: float,
-    known: KnownCamera | None,
+def _start_camera(
+    graph: ViewGraph, image: BatchImage, camera_model: CameraModel, shared: float | None
 ) -> Any:
-    """Write a camera, the user's or one with initial focal length ``focal``, and a rig with only
-    this camera.
+    """Return pycolmap's camera that an image starts with: the user's, that of its distorted lens, or
+    one of ``camera_model``; with the ``shared`` focal length, if any.
     """
-    name = model.value if known is None else known.model
-    camera = pycolmap.Camera.create_from_model_name(number, name, focal, *size)
+    known = graph.known.get(image.digest) or graph.lenses.get(image.digest)
+    focal = shared or start_focal(image, uses_exif=graph.uses_exif)
+    # Its distortion, if any, comes later, where the photographs show it.
+    plain = CameraModel.SIMPLE_PINHOLE if camera_model is CameraModel.AUTO else camera_model
+    name = plain.value if known is None else known.model
+    camera = pycolmap.Camera.create_from_model_name(0, name, focal, *image.size)
     if known is not None:
-        camera.params = list(known.parameters)
+        camera.params = list(known.with_focal(shared or known.focal).parameters)
     # A pair that E explains at this focal length counts as calibrated
     camera.has_prior_focal_length = True
+    return camera
+
+
+def _write_camera(database: Any, number: int, camera: Any) -> Any:
+    """Write a camera, and a rig with only this camera."""
+    camera.camera_id = number
     database.write_camera(camera, use_camera_id=True)
     rig = pycolmap.Rig(rig_id=number)
     rig.add_ref_sensor(camera.sensor_id)
@@ -365,7 +374,7 @@ def register_onto(database: Any, graph: ViewGraph, threads: int) -> Any:
             model.frame(number).rig_from_world = pycolmap.Rigid3d(rotation, np.array(t))
             model.register_frame(number)
             held.add(model.images[number].camera_id)
-        elif not image.focal:
+        elif not image.focal and image.digest not in graph.lenses:
             # The points that it sees determine its focal length better than a guess.
             model.cameras[model.images[number].camera_id].has_prior_focal_length = False
     options = _incremental_options(settings)

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pycolmap
 
+from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.intrinsics import KnownCamera, PlacedCamera
 from mkpc_kaggle.scene.adjustment import robust_options
 from mkpc_kaggle.scene.models import (
@@ -58,8 +59,12 @@ class Freed(NamedTuple):
     @property
     def displacement(self) -> float:
         """The displacement as in :class:`DistortedLens`."""
-        half = max(self.camera.width, self.camera.height) / 2
-        return float(self.camera.params[3] * (half / self.focal) ** 2)
+        return displacement(self.registered.image.size, self.focal, self.camera.params[3])
+
+
+def displacement(size: Size, focal: float, coefficient: float) -> float:
+    """Return the displacement of :class:`DistortedLens` by a radial coefficient."""
+    return float(coefficient * (max(size) / 2 / focal) ** 2)
 
 
 def compare_with_photographs(
@@ -187,6 +192,21 @@ def _lenses(copy: Any, freed: Sequence[Freed]) -> Iterable[DistortedLens]:
         camera = KnownCamera("SIMPLE_RADIAL", parameters, LENS_SIGMA)
         names = tuple(each.registered.image.name for each in alike)
         yield DistortedLens(names, displacement, camera)
+
+
+def adopted_lenses(model: SfmModel, lenses: Mapping[str, KnownCamera]) -> Iterable[DistortedLens]:
+    """Yield the lenses of a model whose images have started with ``lenses``, by digest: the medians
+    of each size.
+    """
+    groups: dict[tuple[Size, str], list[RegisteredImage]] = {}
+    for found in model.images:
+        if found.image.digest in lenses and found.lens is not None:
+            groups.setdefault((found.image.size, found.lens.model), []).append(found)
+    for (size, name), alike in groups.items():
+        parameters = np.median([found.lens.parameters for found in alike if found.lens], axis=0)
+        camera = KnownCamera(name, tuple(parameters.tolist()), LENS_SIGMA)
+        share = displacement(size, camera.focal, camera.distortion[0])
+        yield DistortedLens(tuple(found.image.name for found in alike), share, camera, True)
 
 
 def _sigma(copy: Any, freed: Sequence[Freed], parameter: int) -> float:

@@ -45,10 +45,12 @@ class MergedGraph:
         self.graph = graph
         self.geometries: dict[int, dict[tuple[Lens, Lens], Any]] = {}
 
-    def without_exif(self) -> "MergedGraph":
-        """Return the graph whose cameras start without EXIF's focal lengths; the rest is shared."""
+    def starting_with(self, **fields: Any) -> "MergedGraph":
+        """Return the graph whose cameras start otherwise, by these fields of the view graph; the
+        rest is shared.
+        """
         other = copy(self)
-        other.graph = replace(self.graph, uses_exif=False)
+        other.graph = replace(self.graph, **fields)
         return other
 
     @property

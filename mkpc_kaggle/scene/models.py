@@ -57,6 +57,11 @@ class RegisteredImage:
         """Focal length in pixels."""
         return float(self.camera.K[0, 0])
 
+    @property
+    def has_distortion(self) -> bool:
+        """Whether F of its camera does not fit the pixels."""
+        return self.lens is not None and any(self.lens.distortion)
+
 
 class FocalSource(StrEnum):
     """Origin of a focal length that was given."""
@@ -79,16 +84,17 @@ class FocalContradiction:
 
 @dataclass(frozen=True)
 class DistortedLens:
-    """A lens with radial distortion in a model of pinholes.
+    """A lens with radial distortion, which pinholes do not fit.
 
     ``displacement`` is that of a point half the long side away from the middle, as a share of this
     distance; negative for a barrel. ``camera`` has the model and the parameters that fit, as in a
-    table of intrinsics.
+    table of intrinsics. ``is_adopted`` if the model has this lens.
     """
 
     images: tuple[str, ...]
     displacement: float
     camera: KnownCamera
+    is_adopted: bool = False
 
 
 @dataclass(frozen=True)

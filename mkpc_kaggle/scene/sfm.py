@@ -9,10 +9,11 @@ from typing import TypeAlias
 
 import numpy as np
 
+from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
-from mkpc_kaggle.geometry.intrinsics import Rows
+from mkpc_kaggle.geometry.intrinsics import KnownCamera, PlacedCamera, Rows
 from mkpc_kaggle.geometry.robust import Estimate, RobustConfig
-from mkpc_kaggle.recipe import CameraSharing, SceneConfig
+from mkpc_kaggle.recipe import CameraModel, CameraSharing, SceneConfig
 from mkpc_kaggle.scene.align import align, read_reference
 from mkpc_kaggle.scene.choose import (
     Choice,
@@ -144,18 +145,10 @@ def reconstruct_sharing(
         make = partial(reconstruct_connected, config=config)
     # The user's cameras are neither compared nor shared.
     free = free_of(graph)
-    given = shared = given_intrinsics(free, config)
-    reconstructions = [make(part, shared) for part in parts]
-    for number, (part, first) in enumerate(zip(parts, reconstructions, strict=True)):
-        if not doubts_exif(part.graph, first):
-            continue
-        other = part.without_exif()
-        starts = given_intrinsics(free_of(part.graph), config, uses_exif=False)
-        second = make(other, {**shared, **starts})
-        if second.observations > first.observations:
-            shared = {**shared, **starts}
-            parts[number] = other
-            reconstructions[number] = second
+    lenses = placed_lenses(graph) if config.camera_model is CameraModel.AUTO else {}
+    parts = [part.starting_with(lenses=lenses) for part in parts]
+    given = given_intrinsics(free, config)
+    parts, reconstructions, shared = with_right_exif(parts, given, config, make)
     if config.cameras is CameraSharing.AUTO:
         sharing = share(parts, reconstructions, free, config, make)
         if sharing is not None:
@@ -164,6 +157,10 @@ def reconstruct_sharing(
         compared(part, reconstruction)
         for part, reconstruction in zip(parts, reconstructions, strict=True)
     ]
+    if config.camera_model is CameraModel.AUTO:
+        adopted = with_lenses(parts, reconstructions, free, config, make)
+        if adopted is not None:
+            parts, reconstructions, shared = adopted
     if directory is not None:
         from mkpc_kaggle.scene.colmap import write_files
 
@@ -180,6 +177,38 @@ def reconstruct_sharing(
 def free_of(graph: ViewGraph) -> list[BatchImage]:
     """Return the images of a graph without the user's cameras."""
     return [image for image in graph.images if image.digest not in graph.known]
+
+
+def with_right_exif(
+    parts: Sequence[MergedGraph], given: SharedIntrinsics, config: SceneConfig, make: Make
+) -> tuple[list[MergedGraph], list[Reconstruction], SharedIntrinsics]:
+    """Return the graphs, without EXIF's focal lengths where these are wrong, their reconstructions,
+    and the shared intrinsics, of which ``given`` are the initial ones.
+    """
+    shared = given
+    chosen = list(parts)
+    reconstructions = [make(part, given) for part in parts]
+    for number, part in enumerate(parts):
+        if not doubts_exif(part.graph, reconstructions[number]):
+            continue
+        other = part.starting_with(uses_exif=False)
+        starts = given_intrinsics(free_of(part.graph), config, uses_exif=False)
+        second = make(other, {**given, **starts})
+        if second.observations > reconstructions[number].observations:
+            shared = {**shared, **starts}
+            chosen[number] = other
+            reconstructions[number] = second
+    return chosen, reconstructions, shared
+
+
+def placed_lenses(graph: ViewGraph) -> dict[str, KnownCamera]:
+    """Return the distorted lens of a finished model for its new images of the same size, by digest."""
+    lenses: dict[Size, KnownCamera] = {}
+    for image in graph.images:
+        camera = graph.known.get(image.digest)
+        if isinstance(camera, PlacedCamera) and any(camera.distortion):
+            lenses.setdefault(image.size, KnownCamera(camera.model, camera.parameters))
+    return {image.digest: lenses[image.size] for image in free_of(graph) if image.size in lenses}
 
 
 def doubts_exif(graph: ViewGraph, reconstruction: Reconstruction) -> bool:
@@ -234,6 +263,43 @@ def share(
         refined = refine_complete(part, alike, config, former)
         again.append(refined or make(part, alike))
     return None if loses_points(reconstructions, again) else (again, alike)
+
+
+def with_lenses(
+    parts: Sequence[MergedGraph],
+    pinholes: Sequence[Reconstruction],
+    free: Sequence[BatchImage],
+    config: SceneConfig,
+    make: Make,
+) -> tuple[list[MergedGraph], list[Reconstruction], SharedIntrinsics] | None:
+    """Return graphs, reconstructions and shared intrinsics with the distorted lenses that
+    ``pinholes`` show, or ``None`` if they show none, or if images then see fewer points.
+    """
+    sizes = {image.name: image.size for image in free}
+    shown: dict[Size, KnownCamera] = {}
+    for lens in (lens for model in models_of(pinholes) for lens in model.comparison.lenses):
+        # A pinhole that the user gives stays one. Of several models, the largest counts.
+        for name in lens.images:
+            if name in sizes and not lens.is_adopted:
+                shown.setdefault(sizes[name], lens.camera)
+    if not shown:
+        return None
+    # Images of one size share a lens, also those that have no camera so far.
+    lenses = {image.digest: shown[image.size] for image in free if image.size in shown}
+    bent = [part.starting_with(lenses={**part.graph.lenses, **lenses}) for part in parts]
+    given = given_intrinsics(free, config)
+    shared: SharedIntrinsics = {
+        digest: lenses[digest].focal if digest in lenses else focal
+        for digest, focal in given.items()
+    }
+    # From the matches: pinholes have bent the poses, too.
+    again: Sequence[Reconstruction] = [make(part, shared) for part in bent]
+    if config.cameras is CameraSharing.AUTO:
+        sharing = share(bent, list(again), free, config, make)
+        again, shared = sharing or (again, shared)
+    if loses_points(pinholes, again):
+        return None
+    return bent, [compared(*both) for both in zip(bent, again, strict=True)], shared
 
 
 def loses_points(
@@ -335,12 +401,14 @@ def compared(merged: MergedGraph, reconstruction: Reconstruction) -> Reconstruct
     if not reconstruction.models:
         return reconstruction if has_moved else replace(reconstruction, failure=HARDLY_MOVED)
     # Only with a model: pycolmap may be missing
-    from mkpc_kaggle.scene.comparison import compare_with_photographs
+    from mkpc_kaggle.scene.comparison import adopted_lenses, compare_with_photographs
 
     given_cameras = known_by_name(merged.graph)
     models = []
     for model in reconstruction.models:
         comparison = replace(compare_with_photographs(model, given_cameras), has_moved=has_moved)
+        lenses = (*adopted_lenses(model, merged.graph.lenses), *comparison.lenses)
+        comparison = replace(comparison, lenses=lenses)
         models.append(replace(model, comparison=comparison))
     return replace(reconstruction, models=tuple(models))
 

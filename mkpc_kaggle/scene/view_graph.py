@@ -63,13 +63,15 @@ class Edge:
 @dataclass(frozen=True, eq=False)
 class ViewGraph:
     """Distinct images, and their edges, sorted by image indices. ``known`` has the user's cameras,
-    by digest. Unless ``uses_exif``, cameras start without EXIF's focal lengths.
+    by digest. Unless ``uses_exif``, cameras start without EXIF's focal lengths. ``lenses`` are the
+    cameras that images with a distorted lens start with, by digest.
     """
 
     images: tuple[BatchImage, ...]
     edges: tuple[Edge, ...]
     known: Mapping[str, KnownCamera] = field(default_factory=dict)
     uses_exif: bool = True
+    lenses: Mapping[str, KnownCamera] = field(default_factory=dict)
 
     @property
     def names(self) -> tuple[str, ...]:

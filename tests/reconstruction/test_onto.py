@@ -13,9 +13,12 @@ from test_reconstruct import FIRST, RECIPE, MixedMatcher, write_flat
 from benchmarks.synthetic_scene import SIZE
 from mkpc_kaggle import reconstruct
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.geometry.intrinsics import PlacedCamera, camera_of
+from mkpc_kaggle.geometry.coordinates import Size
+from mkpc_kaggle.geometry.intrinsics import KnownCamera, PlacedCamera, camera_of
 from mkpc_kaggle.reconstruction.placed import placed_line, read_cameras, read_placed
 from mkpc_kaggle.scene.align import find_similarity, model_size, moved_by
+from mkpc_kaggle.scene.sfm import placed_lenses
+from mkpc_kaggle.scene.view_graph import BatchImage, ViewGraph
 
 OLD = 4  # images of the finished model
 
@@ -77,6 +80,19 @@ def test_new_images_are_registered_and_no_other_camera_changes(home, tmp_path):
     for name, target in zip(new, targets, strict=True):
         cosine = (np.trace(found[name].R.T @ target.R) - 1) / 2
         assert np.degrees(np.arccos(min(1, cosine))) < 0.5
+
+
+def test_new_images_start_with_the_distorted_lens_of_the_model():
+    def image(name: str, size: Size) -> BatchImage:
+        return BatchImage(name, name, size)
+
+    lens = ("SIMPLE_RADIAL", (500.0, 320.0, 240.0, -0.1))
+    images = (image("old", SIZE), image("new", SIZE), image("other camera", Size(100, 90)))
+    placed = PlacedCamera(*lens, pose=(0, 0, 0, 1, 0, 0, 0))
+    graph = ViewGraph(images, ()).with_intrinsics([("old", placed)])
+    assert placed_lenses(graph) == {"new": KnownCamera(*lens)}
+    pinhole = PlacedCamera("SIMPLE_PINHOLE", lens[1][:3], pose=placed.pose)
+    assert placed_lenses(ViewGraph(images, ()).with_intrinsics([("old", pinhole)])) == {}
 
 
 def cameras_of_scene():

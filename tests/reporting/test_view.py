@@ -15,8 +15,9 @@ from browser import Page, needs_browser, opened_browser
 from mkpc_kaggle.engine.store.scene_record import SceneRecord
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Size
+from mkpc_kaggle.geometry.intrinsics import KnownCamera
 from mkpc_kaggle.reporting.points import clouds_of
-from mkpc_kaggle.reporting.view import point_colours, show, view_data
+from mkpc_kaggle.reporting.view import picture_at, point_colours, show, view_data
 from mkpc_kaggle.scene.models import MAX_POINTS, RegisteredImage, SfmModel, Sigmas
 from mkpc_kaggle.scene.view_graph import BatchImage
 
@@ -276,3 +277,32 @@ def test_the_view_turns_and_zooms_by_touch(browser, page, width):
     browser.touch([(x, y + 100)])
     assert browser.value("window.scrollY") == 0
     assert browser.errors == []
+
+
+def test_a_picture_through_a_distorted_lens_is_shown_as_its_pinhole_sees_the_world(tmp_path):
+    lens = KnownCamera("SIMPLE_RADIAL", (400.0, 200.0, 150.0, -0.2))
+    plain = pycolmap.Camera(model=lens.model, width=400, height=300, params=lens.parameters)
+    wider = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), plain)
+    assert wider.width > 400
+    ray = np.array([-0.35, -0.25, 1.0])
+    # The photograph, and the file in OUT/images, which has no distortion
+    seen = {"photograph": plain, "file of the results": wider}
+    for name, camera in seen.items():
+        path = tmp_path / f"{name}.png"
+        rows, columns = np.mgrid[: camera.height, : camera.width]
+        x, y = camera.img_from_cam(ray)
+        spot = 255 * np.exp(-(((columns + 0.5 - x) ** 2 + (rows + 0.5 - y) ** 2) / 25))
+        cv2.imwrite(str(path), spot.astype(np.uint8))
+        model = a_model(tmp_path, cameras=3)
+        image = replace(model.images[0], lens=lens)
+        model = replace(model, images=(image, *model.images[1:]))
+        data = view_data([model], read=lambda _, path=path: picture_at(str(path)), partners={})
+        encoded = data["models"][0]["cameras"][0]["thumbnail"].partition(",")[2]
+        jpeg = np.frombuffer(base64.b64decode(encoded), np.uint8)
+        thumbnail = cv2.imdecode(jpeg, cv2.IMREAD_GRAYSCALE)
+        scale = thumbnail.shape[1] / 400
+        assert thumbnail.shape == (round(300 * scale), round(400 * scale))
+        row, column = np.unravel_index(int(thumbnail.argmax()), thumbnail.shape)
+        # K of the camera, without distortion
+        expected = np.array([200 - 0.35 * 400, 150 - 0.25 * 400]) * scale
+        assert (column + 0.5, row + 0.5) == pytest.approx(tuple(expected), abs=1.5), name

@@ -11,7 +11,8 @@ import pytest
 from benchmarks.synthetic_scene import SIZE, synthetic_scene
 from mkpc_kaggle.geometry.intrinsics import KnownCamera
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.recipe import SceneConfig
+from mkpc_kaggle.recipe import CameraModel, CameraSharing, SceneConfig
+from mkpc_kaggle.scene.align import find_similarity, model_size, moved_by
 from mkpc_kaggle.scene.comparison import compare_with_photographs
 from mkpc_kaggle.scene.models import Comparison, FocalSource, SfmModel
 from mkpc_kaggle.scene.sfm import models_of, reconstruct_sharing
@@ -44,9 +45,13 @@ def pairs_of(k: float = 0.0, exif: float = 0.0) -> list[BatchPair]:
     return pairs
 
 
-def model_of(pairs: list[BatchPair], *rows: tuple[str, KnownCamera]) -> SfmModel:
+def model_of(
+    pairs: list[BatchPair],
+    *rows: tuple[str, KnownCamera],
+    camera_model: CameraModel = CameraModel.SIMPLE_PINHOLE,
+) -> SfmModel:
     graph = ViewGraph.of_pairs(pairs).with_intrinsics(rows)
-    found, _ = reconstruct_sharing(graph, SceneConfig())
+    found, _ = reconstruct_sharing(graph, SceneConfig(camera_model=camera_model))
     (model,) = models_of(found)
     assert len(model.images) == 6
     return model
@@ -79,6 +84,58 @@ def test_a_lens_with_distortion_is_found_with_its_coefficient(k):
     # The row to give ends the contradiction, and the cameras are better.
     given = model_of(pairs_of(k), ("*", lens.camera))
     assert given.comparison == Comparison()
+
+
+def centre_errors(model: SfmModel) -> np.ndarray:
+    """Return the error of each centre after a similarity, as a share of the model's size."""
+    true = [SCENE.cameras[image.image.name] for image in model.images]
+    similarity = find_similarity([image.camera for image in model.images], true)
+    assert similarity is not None
+    moved = [similarity.of_camera(image.camera) for image in model.images]
+    return np.asarray(moved_by(moved, true)) / model_size(true)
+
+
+@pytest.mark.parametrize("k", [-0.2, 0.1])
+def test_a_lens_that_the_photographs_show_is_adopted(k):
+    model = model_of(pairs_of(k), camera_model=CameraModel.AUTO)
+    (lens,) = model.comparison.lenses
+    assert lens.is_adopted
+    assert len(lens.images) == 6
+    for image in model.images:
+        assert image.lens is not None
+        assert image.lens.model == "SIMPLE_RADIAL"
+        assert image.lens.distortion == pytest.approx((k,), rel=0.05)
+        assert image.has_distortion
+    bent = centre_errors(model_of(pairs_of(k)))
+    right = centre_errors(model)
+    assert right.max() < bent.max() / 5
+    # Expected errors include the lens.
+    sigmas = np.array([image.sigmas.centre for image in model.images if image.sigmas])
+    assert len(sigmas) == 6
+    assert (right < 3 * sigmas).all()
+
+
+def test_no_lens_is_adopted_that_the_photographs_do_not_show():
+    model = model_of(pairs_of(), camera_model=CameraModel.AUTO)
+    assert model.comparison == Comparison()
+    assert {image.lens.model for image in model.images if image.lens} == {"SIMPLE_PINHOLE"}
+
+
+def test_a_pinhole_that_the_user_gives_is_contradicted_and_stays():
+    known = pinhole(FOCAL, 20.0)
+    model = model_of(pairs_of(-0.2), known, camera_model=CameraModel.AUTO)
+    (lens,) = model.comparison.lenses
+    assert not lens.is_adopted
+    assert {image.lens.model for image in model.images if image.lens} == {"SIMPLE_PINHOLE"}
+
+
+def test_cameras_that_the_user_shares_share_the_adopted_lens():
+    config = SceneConfig(cameras=CameraSharing.FOLDER)
+    (found,), shared = reconstruct_sharing(ViewGraph.of_pairs(pairs_of(-0.2)), config)
+    (model,) = found.models
+    assert len({image.lens for image in model.images}) == 1
+    assert set(shared.values()) == {model.images[0].focal}
+    assert model.comparison.lenses[0].camera.distortion == pytest.approx((-0.2,), rel=0.05)
 
 
 @pytest.mark.parametrize(("factor", "sigma"), [(0.7, 0.0), (1.4, 0.0), (1.4, 5.0)])
