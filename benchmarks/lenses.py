@@ -117,7 +117,7 @@ def read_pairs(out: Path) -> list[BatchPair]:
             images = read_images(store, row)
             found = Matches.concatenate(published.points_of(store, row).values())
             first, second = (replace(image, name=Path(image.name).stem) for image in images)
-            pairs.append(BatchPair(first, second, found))
+            pairs.append(BatchPair(first, second, (found,)))
     return pairs
 
 

@@ -52,7 +52,7 @@ class LensMatcher(MixedMatcher):
         for pair in scene.pairs:
             points0 = bent(pair.matches.points0).astype(np.float32)
             points1 = bent(pair.matches.points1).astype(np.float32)
-            pairs.append(replace(pair, matches=Matches(points0, points1, pair.matches.scores)))
+            pairs.append(replace(pair, by_unit=(Matches(points0, points1, pair.matches.scores),)))
         return replace(scene, pairs=tuple(pairs)), scene
 
 
