@@ -13,7 +13,7 @@ import numpy as np
 import pycolmap
 import pytest
 from synthetic import QUICK
-from test_reconstruct import FIRST, MixedMatcher, contents, pairs_of, run, write_flat
+from test_reconstruct import FIRST, RECIPE, MixedMatcher, contents, pairs_of, run, write_flat
 
 from benchmarks.synthetic_scene import SIZE, SyntheticScene, synthetic_scene
 from mkpc_kaggle.data.competition import Pair
@@ -23,7 +23,6 @@ from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.recipe import CameraModel, Recipe, SceneConfig, Unit
 from mkpc_kaggle.reconstruction.folder import read_folder
 from mkpc_kaggle.reconstruction.layout import write_layouts
-from mkpc_kaggle.reconstruction.outputs import write_tables
 from mkpc_kaggle.reporting.contradictions import adopted_lenses, contradictions
 from mkpc_kaggle.reporting.run_log import read_log
 from mkpc_kaggle.reporting.verdict import summary_table
@@ -57,10 +56,8 @@ class LensMatcher(MixedMatcher):
 
 
 def write_results(root: Path, out: Path) -> None:
-    """Run as the command does: the tables, and the folders for other programs."""
-    result = run(
-        root, out, LensMatcher(), publish=lambda found: write_tables(out, found, root, None)
-    )
+    """Run as the command does, with the folders for other programs."""
+    result = run(root, out, LensMatcher())
     assert list(write_layouts(out, root, read_folder(root), inf, result.held)) == []
 
 
@@ -134,13 +131,10 @@ def test_a_resumed_run_leaves_the_same_bytes(folder):
     assert contents(out) == before
 
 
-def test_a_pinhole_that_the_user_asks_for_stays_one(folder, monkeypatch):
+def test_a_pinhole_that_the_user_asks_for_stays_one(folder):
     root, out = folder
-    pinholes = SceneConfig(camera_model=CameraModel.SIMPLE_PINHOLE)
-    monkeypatch.setattr(
-        "test_reconstruct.RECIPE", replace(run.__globals__["RECIPE"], scene=pinholes)
-    )
-    run(root, out.parent / "pinholes", LensMatcher())
+    pinholes = replace(RECIPE, scene=SceneConfig(camera_model=CameraModel.SIMPLE_PINHOLE))
+    run(root, out.parent / "pinholes", LensMatcher(), recipe=pinholes)
     log = read_log(out.parent / "pinholes" / "work")
     (sentence,) = contradictions(log.scenes[0])
     assert "is distorted by" in sentence
