@@ -6,8 +6,9 @@ down, and an image of width w covers [-0.5, w - 0.5). A resize by s gives ``x_vi
 offset. A quarter turn swaps the axes and flips one of them. Padding is added right and bottom, so
 coordinates do not change.
 
-Networks use other conventions: :func:`from_corner` and :func:`from_normalised` convert to this
-convention.
+Networks use other conventions: adapters of matchers convert to this one by :func:`from_corner` and
+:func:`from_normalised`. The pipeline converts the matches of a unit to image pixels once
+(``Pipeline._match``), by :meth:`View.to_image`.
 """
 
 from dataclasses import dataclass

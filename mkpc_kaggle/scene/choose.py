@@ -1,8 +1,13 @@
-"""Choice of a pair's fundamental matrix: from the scene, or from the pair's matches."""
+"""Choice of a pair's fundamental matrix: from the scene, or from the pair's matches.
+
+:func:`choose` decides it. In order: F of the pair's two cameras; the pair's own F, if its matches contradict the
+cameras; F from the pair's matches at the focal lengths of the scene, if an image has no camera.
+"""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
+from types import MappingProxyType
 from typing import TypeAlias
 
 import numpy as np
@@ -51,6 +56,10 @@ class Reason(StrEnum):
     CONTRADICTION = "the pair's own matches contradict the scene"
 
 
+# Not estimated again at the scene's focal lengths
+KEEPS_ITS_F = Reason.SCENE, Reason.SAME_IMAGE, Reason.CONTRADICTION
+
+
 @dataclass(frozen=True, eq=False)
 class Choice:
     """The F chosen for a pair, (3, 3) of unit norm with x1^T F x0 = 0.
@@ -68,13 +77,32 @@ class Choice:
 
 
 def choose(
-    pair: BatchPair, models: Sequence[ModelImages], magsac: RobustConfig | None = None
+    pair: BatchPair,
+    models: Sequence[ModelImages],
+    focals: Mapping[str, float] = MappingProxyType({}),
+    focal: FocalConfig | None = None,
+    magsac: RobustConfig | None = None,
+    *,
+    may_estimate: bool = False,
 ) -> Choice:
     """Return the F from a pair's cameras, in the first model with both cameras, or the reason for
-    no F.
+    none.
 
-    With ``magsac``, a pair without its own F is estimated if it may contradict the scene.
+    ``focals`` are the scene's focal lengths in pixels, by digest. With the recipe's prior ``focal``, a pair
+    without an F from cameras is estimated again at these, unless it contradicts the scene. With ``may_estimate``,
+    a pair without its own F is estimated if it may contradict the scene.
     """
+    magsac = magsac or RobustConfig()
+    choice = from_cameras(pair, models, magsac if may_estimate else None)
+    if focal is None or choice.reason in KEEPS_ITS_F:
+        return choice
+    return replace(choice, F=estimate_at_known_focals(pair, focals, focal, magsac))
+
+
+def from_cameras(
+    pair: BatchPair, models: Sequence[ModelImages], magsac: RobustConfig | None
+) -> Choice:
+    """Return the choice between the F of a pair's cameras and its own F, see :func:`choose`."""
     digests = pair.image0.digest, pair.image1.digest
     # Two copies of a file have one camera, and no epipolar geometry.
     if digests[0] == digests[1]:

@@ -15,13 +15,7 @@ from mkpc_kaggle.geometry.intrinsics import KnownCamera, PlacedCamera, Rows
 from mkpc_kaggle.geometry.robust import Estimate, RobustConfig
 from mkpc_kaggle.recipe import CameraModel, CameraSharing, SceneConfig
 from mkpc_kaggle.scene.align import align, read_reference
-from mkpc_kaggle.scene.choose import (
-    Choice,
-    Reason,
-    choose,
-    estimate_at_known_focals,
-    estimate_of,
-)
+from mkpc_kaggle.scene.choose import Choice, choose, estimate_of
 from mkpc_kaggle.scene.export import HeldDirectory
 from mkpc_kaggle.scene.keypoints import MergedGraph
 from mkpc_kaggle.scene.models import (
@@ -47,8 +41,6 @@ from mkpc_kaggle.scene.view_graph import (
 )
 
 MIN_PAIRS_PER_IMAGE = 1.35  # connected pairs; with fewer, cameras are poorly constrained
-# Not re-estimated at other focal lengths
-KEEPS_ITS_F = Reason.SCENE, Reason.SAME_IMAGE, Reason.CONTRADICTION
 MIN_REGISTERED = 0.5  # share of the matched images; fewer may be due to wrong focal lengths of EXIF
 MAX_EXIF_LOG_DEVIATION = float(np.log(1.3))  # of a refined focal length; EXIF is then wrong
 MIN_OBSERVATIONS = 0.99  # share of the observations before sharing; with fewer, sharing is dropped
@@ -109,10 +101,7 @@ def reconstruct_batch(
     choices = []
     estimates = []
     for pair in pairs:
-        choice = choose(pair, models, magsac if with_estimates else None)
-        if focal is not None and choice.reason not in KEEPS_ITS_F:
-            F = estimate_at_known_focals(pair, focals, focal, magsac or RobustConfig())
-            choice = replace(choice, F=F)
+        choice = choose(pair, models, focals, focal, magsac, may_estimate=with_estimates)
         choices.append(choice)
         if with_estimates:
             estimates.append(estimate_of(choice, pair, magsac or RobustConfig()))

@@ -3,7 +3,8 @@
 An image's own focal length is ambiguous with the distance to the scene, and poorly constrained by
 few points. If most images of one size agree on the focal length, one camera is assumed. A second
 reconstruction then has shared intrinsics. If the user declares one camera, the first reconstruction
-already has shared intrinsics.
+already has shared intrinsics (``cameras`` of [scene], ``--camera``). It is :func:`mkpc_kaggle.scene.sfm.share`
+that reconstructs again, and refuses the result if images then see fewer points.
 """
 
 from collections.abc import Mapping, Sequence

@@ -78,7 +78,7 @@ def test_a_wrong_camera_is_contradicted_by_the_pairs_matches(scene):
     assert choice(wrong, scene).from_scene
     # unless it may be estimated.
     by_digest = {found.image.digest: found for found in wrong[0].images}
-    assert choose(scene.pairs[0], [by_digest], RobustConfig()).reason is Reason.CONTRADICTION
+    assert choose(scene.pairs[0], [by_digest], may_estimate=True).reason is Reason.CONTRADICTION
 
 
 def test_an_f_from_cameras_has_the_inliers_of_the_pairs_matches(scene):

@@ -3,8 +3,9 @@
 :func:`next_work` is a pure function. It has no queue and no memory: it looks at the state, the
 costs and the time left whenever a worker is idle.
 
-Two rules decide that a unit no longer fits in time: :func:`prefix_that_fits` for all pairs, and
-:class:`mkpc_kaggle.engine.workers.worker.MatchRunner` for the units of a job that ran out of time.
+Three rules decide that a unit no longer fits in time: :func:`prefix_that_fits` for all pairs,
+:func:`next_work` for one more job, and before each minibatch of a job ``may_start`` of
+:class:`mkpc_kaggle.engine.workers.worker.MatchRunner`, which makes it smaller first.
 """
 
 from collections.abc import Sequence

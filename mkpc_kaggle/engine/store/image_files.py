@@ -3,6 +3,10 @@
 The store remembers a file's size, time of change and digest under its name. A file is digested
 again only if its size or time has changed. A fresh run digests nothing: the worker that decodes an
 image returns its digest.
+
+An image that is replaced between two runs has another digest, so another key: its pairs and their batch's
+scene are computed again, and nothing of the former file stands in for them. During a run the results of the
+former content are dropped once a worker decodes the new one (``State.use_image``).
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence

@@ -3,8 +3,9 @@
 Importing this module does not import torch, which only matching needs.
 
 Threads: one matching process uses all cores, and N processes share the cores. A process for
-estimates or scenes has one thread. On a Ray cluster without GPUs, a machine's actor has one thread
-per CPU. A worker that is a thread of the user's process leaves the process's limits as they are.
+estimates has one thread. A scene verifies its pairs on all cores, and maps on ``threads`` of [scene]. On a
+Ray cluster without GPUs, a machine's actor has one thread per CPU. A worker that is a thread of the
+user's process leaves the process's limits as they are.
 """
 
 import time
