@@ -16,8 +16,9 @@ from mkpc_kaggle.geometry.matches import Matches
 MIN_SCALE_MATCHES = 8  # fewer say nothing about scale
 SAMPLES = 2000  # pairs of matches
 # Interquartile range of the logarithm of the ratio of distances. Correct matches of two photographs
-# with a change of scale by two to four have 0.05 to 0.3, matches by chance more than 1.
-MAX_SPREAD = 0.6
+# with a change of scale by two to four have 0.05 to 0.3, few and partly wrong ones up to 1. Matches by chance
+# have more.
+MAX_SPREAD = 1.0
 MIN_TOLD = 1.05  # a smaller gain of detail is not worth a word
 
 

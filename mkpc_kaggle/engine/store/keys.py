@@ -28,6 +28,7 @@ from mkpc_kaggle.setup.assembly import Assembly
 POINTS_VERSION = 2
 ESTIMATE_VERSION = 4
 SCENE_VERSION = 9
+RULE_VERSION = 2
 
 # Settings of [mkpc] that decide whether a crop is matched, and not what is found in it.
 RULE = ("when", "min_scale", "min_detail")
@@ -90,7 +91,9 @@ class Keys:
         return cls(
             units,
             digest({name: value for name, value in mkpc.items() if name not in RULE}),
-            "" if recipe.mkpc.when is When.ALWAYS else digest([mkpc[name] for name in RULE]),
+            ""
+            if recipe.mkpc.when is When.ALWAYS
+            else digest([RULE_VERSION, *(mkpc[name] for name in RULE)]),
             estimate,
             digest([SCENE_VERSION, scene, cameras, tracks, estimate, _mapper_version()]),
             assembly.regions,
