@@ -31,6 +31,7 @@ from mkpc_kaggle.engine.store import image_files
 from mkpc_kaggle.engine.store.database import Store
 from mkpc_kaggle.engine.store.dataframes import pair_tables
 from mkpc_kaggle.engine.store.published import Published
+from mkpc_kaggle.engine.store.tables import UnitPoints
 from mkpc_kaggle.engine.workers import worker
 from mkpc_kaggle.reporting.run_log import read_log
 
@@ -150,6 +151,26 @@ def test_an_error_of_the_disk_when_points_are_read_costs_a_job_and_the_run_goes_
     report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
     assert report.ending is Ending.COMPLETE
     assert any("disk I/O error" in fault for fault in report.faults)
+    assert matrices(report) == matrices(undisturbed)
+
+
+def test_a_result_that_cannot_be_saved_costs_its_job_and_is_computed_again(
+    pairs, undisturbed, tmp_path, monkeypatch
+):
+    errors = iter([sqlite3.OperationalError("disk I/O error")])
+    put = Store.put
+
+    def failing(store: Store, rows: Any) -> None:
+        rows = list(rows)
+        # Of a worker's answer, and not of a table at the start
+        if any(isinstance(row, UnitPoints) for row in rows):
+            for error in errors:
+                raise error
+        put(store, rows)
+
+    monkeypatch.setattr(Store, "put", failing)
+    report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
+    assert "a result cannot be saved: disk I/O error" in report.faults
     assert matrices(report) == matrices(undisturbed)
 
 

@@ -160,6 +160,10 @@ def test_each_sentence_speaks_on_its_input(text):
     assert any(text in problem for problem in problems), problems
 
 
+def test_a_run_without_an_end_is_at_work_or_was_killed():
+    assert replace(log(), events=()).ending == "not ended (at work, or killed)"
+
+
 def test_a_run_without_problems_looks_right():
     for run in (log(pairs=ALL), log(scene(GOOD_MODEL), pairs=ALL)):
         assert verdict.verdict(run).problems == ()

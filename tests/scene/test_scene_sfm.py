@@ -181,6 +181,8 @@ def test_too_few_pairs_or_matches_make_no_scene(scene):
     assert found.failure == (
         "2 matched pairs connect 3 images, and reliable cameras need 5; more overlapping images would help"
     )
+    (found,) = reconstruct_batch(chain[:1], SceneConfig()).reconstructions
+    assert found.failure == "2 images are connected; a scene needs 3"
     unmatched = pair_of("01", Matches.empty())
     for pairs in ([], [unmatched]):
         assert reconstruct_batch(pairs, SceneConfig()).reconstructions == ()
@@ -203,11 +205,13 @@ DEGENERATE = {
 def test_degenerate_matches_give_a_reason(kind):
     points0, points1 = DEGENERATE[kind]
     matches = Matches(points0, points1, np.ones(60))
-    # A triangle and a fourth image.
-    pairs = [pair_of(names, matches) for names in ("01", "12", "02", "23")]
+    # Fewer pairs would not reach the mapper.
+    pairs = [pair_of(names, matches) for names in ("01", "02", "03", "12", "13", "23")]
     solution = reconstruct_batch(pairs, SceneConfig())
     (found,) = solution.reconstructions
     assert found.models or found.failure
+    if kind == "random":
+        assert found.failure == "the matches gave no plausible model"
     for choice in solution.choices:
         assert choice.from_scene or choice.reason is not Reason.SCENE
         assert choice.F is None or np.isfinite(choice.F).all()
