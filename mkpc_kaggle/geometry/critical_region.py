@@ -75,7 +75,7 @@ class MkpcConfig:
     min_clustered: float = 0.2
     min_side: int = 32
     when: When = When.ALWAYS
-    min_scale: float = 1.75
+    min_scale: float = 1.9
     min_detail: float = 2.0
 
     def __post_init__(self) -> None:
