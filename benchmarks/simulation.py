@@ -8,6 +8,7 @@ The timeline of one run; the costs are the seconds of each unit on a pair:
 
     python -m benchmarks.simulation --costs 0.6 0.4 0.35 [--batches 15] [--pairs 10000] [--scene-seconds 0.15]
         [--limit 8h45m] [--workers 1] [--candidates 1]
+        [--crops 0.1]
 """
 
 import argparse
@@ -94,6 +95,9 @@ def main() -> None:
     parser.add_argument("--limit", type=parse_duration, default=parse_duration("8h45m"))
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--candidates", type=int, default=1, help="of a scene")
+    parser.add_argument(
+        "--crops", type=float, default=1.0, metavar="SHARE", help="of the pairs need the last unit"
+    )
     arguments = parser.parse_args()
     for name in arguments.without:
         switch_off(name)
@@ -107,6 +111,7 @@ def main() -> None:
                 batches=arguments.batches,
                 scene_seconds=arguments.scene_seconds,
                 candidates=arguments.candidates,
+                crop_share=arguments.crops,
                 seed=arguments.seed,
             )
         )
