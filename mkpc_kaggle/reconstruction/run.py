@@ -1,10 +1,11 @@
 """Reconstruction of a folder of images in a run of the engine."""
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from mkpc_kaggle.data.competition import Pair
+from mkpc_kaggle.data.masks import Masks
 from mkpc_kaggle.engine.console import logger
 from mkpc_kaggle.engine.plan.pairs import name_below
 from mkpc_kaggle.engine.plan.state import State
@@ -104,7 +105,6 @@ def reconstruct_folder(
     with opened_engine(assembly, session, folders) as engine:
         table = out / "cameras.csv"
         earlier = read_table_of_cameras(table, root, datasets)
-        cameras = [earlier]
         if not table.exists():
             with writing(f"--out {out}"):
                 publish(earlier)
@@ -119,19 +119,13 @@ def reconstruct_folder(
 
         # Called by the engine's publications, and by the watchdog at the end of the time
         def write(results: State) -> None:
-            cameras[0] = cameras_of(datasets, root, results, earlier)
-            publish(cameras[0])
+            publish(cameras_of(datasets, root, results, earlier))
 
         engine.ask(request_of(pairs, assembly, session, str(root), exports=exports, publish=write))
         state = engine.state
         assert state is not None
-        for name, files in datasets.items():
-            batch = batches[name]
-            # A batch of one pair is none.
-            if batch in state.batches and state.is_unmatched(batch):
-                cause = cause_of_no_matches(files, assembly.masks)
-                if cause:
-                    engine.log.fault(f"{batch}: {cause}")
+        for fault in faults_of_unmatched(state, datasets, root, assembly.masks):
+            engine.log.fault(fault)
         # Models of an earlier run do not belong to tables without cameras.
         for batch in state.batches:
             is_without = batch not in state.scenes.in_use and is_decided(state, batch)
@@ -140,15 +134,30 @@ def reconstruct_folder(
                     f"{batch}: its images have no matches; the models of an earlier run were removed"
                 )
         lost = {batch: str(failure) for batch, failure in scene_failures(state).items()}
-        unfinished = {name for name in datasets if is_unfinished(state, batches[name], lost)}
-        latest = cameras_of(datasets, root, state, earlier)
-        standing = [name for name in unchanged(earlier, latest, root) if name in unfinished]
+        cameras = cameras_of(datasets, root, state, earlier)
+        standing = [
+            name
+            for name in unchanged(earlier, cameras, root)
+            if is_unfinished(state, batches[name], lost)
+        ]
         for name in standing:
             engine.log.fault(f"{batches[name]}: {EARLIER}")
         # Within the context: afterwards the store is closed.
         report = engine.report()
     held = {name: exports[batches[name]] for name in datasets}
-    return FolderResult(report, tuple(pairs), cameras[0], lost, standing, held)
+    return FolderResult(report, tuple(pairs), cameras, lost, standing, held)
+
+
+def faults_of_unmatched(
+    results: State, datasets: Datasets, root: Path, masks: Masks
+) -> Iterator[str]:
+    """Yield why datasets have no matches, if their files show a cause."""
+    for name, batch in batch_names(root, datasets).items():
+        # A batch of one pair is none.
+        if batch in results.batches and results.is_unmatched(batch):
+            cause = cause_of_no_matches(datasets[name], masks)
+            if cause:
+                yield f"{batch}: {cause}"
 
 
 def is_decided(results: State, batch: str) -> bool:

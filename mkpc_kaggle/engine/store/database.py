@@ -170,8 +170,8 @@ class Store:
     # Writing
 
     def put(self, rows: Iterable[Any]) -> None:
-        """Save rows, dataclasses of :mod:`tables`, all or none. Rows that the file does not take
-        wait in memory.
+        """Save rows, dataclasses of :mod:`tables`, all or none. Rows that cannot be written
+        stay in memory.
 
         Raises ``sqlite3.IntegrityError`` for values that a table cannot hold, such as a number that
         is NaN.

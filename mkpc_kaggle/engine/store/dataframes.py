@@ -384,10 +384,12 @@ def _cameras(database: sqlite3.Connection) -> "DataFrame":
         frame[name] = _objects(frame[name], lambda text: np.array(json.loads(text), float))
     frame["parameters"] = _objects(frame["parameters"], lambda text: tuple(json.loads(text)))
     # pandas treats NaN as missing.
-    sigmas = [json.loads(text) or (np.nan,) * len(SIGMAS) for text in frame.pop("sigmas")]
+    unknown = (np.nan,) * len(SIGMAS)
+    sigmas = [json.loads(text) or unknown for text in frame.pop("sigmas")]
+    table = np.array(sigmas, float).reshape(-1, len(SIGMAS))
     before = list(frame.columns).index("K")
     for number, name in enumerate(SIGMAS):
-        frame.insert(before + number, name, np.array([each[number] for each in sigmas], float))
+        frame.insert(before + number, name, table[:, number])
     frame.insert(5, "focal", np.array([K[0, 0] for K in frame["K"]], float))
     return frame
 

@@ -38,8 +38,8 @@ class SceneRecord:
     ``candidate`` states whose tracks were used, with its ``disagreement`` in degrees; ``rivals`` are the other
     candidates, the best first. The store has them as scenes.
 
-    ``key`` is that of the stored scene, and ``contents`` are the digests of its images by name: with
-    them, a former scene is known to be of the present images.
+    ``key`` is that of the stored scene, and ``contents`` are the digests of its images by name. No reader
+    needs these today; the next change of the format may remove the column.
     """
 
     batch: str
