@@ -1,4 +1,4 @@
-"""SQLite files: connections, and what SQLite's errors mean."""
+"""SQLite files: connections, and the meaning of SQLite's errors."""
 
 import shutil
 import sqlite3
