@@ -15,7 +15,6 @@ from math import inf
 from pathlib import Path
 from typing import Any, Self
 
-from mkpc_kaggle.engine import console
 from mkpc_kaggle.engine.console import Progress
 from mkpc_kaggle.engine.jobs import (
     Answer,
@@ -152,8 +151,7 @@ class Engine:
         if damaged := len(self.store.damaged):
             # They are missing now, like results that never were.
             text = f"{plural(damaged, 'result')} of the journal, damaged, will be computed again"
-            console.logger.warning(text)
-            self.log.fault(text)
+            self.log.warning(text)
             self.store.damaged.clear()
         # The only time that the store is read for the state: later, answers update it.
         restore(state, self.store, self._digests(state))
@@ -252,9 +250,7 @@ class Engine:
         if changed := digests.changed:
             count = sum(not changed.isdisjoint(names) for names in state.names)
             images = plural(len(changed), "image")
-            text = f"{images} changed; matching {plural(count, 'pair')} again"
-            console.logger.warning(text)
-            self.log.fault(text)
+            self.log.warning(f"{images} changed; matching {plural(count, 'pair')} again")
         return digests.by_name
 
     # The loop
@@ -517,8 +513,7 @@ class Engine:
                 self._refused[name] = reason
                 text = f"{name} is left out: {reason}"
                 self.log.explain(text)
-                self.log.fault(text)
-                console.logger.warning(text)
+                self.log.warning(text)
         if self.state is not None:
             self._leave_out(self.state)
 
@@ -561,9 +556,8 @@ class Engine:
         if self.site.fallback and (self._is_closed or nothing_runs):
             name = self.site.fallback[0].name  # the CPU
             text = f"matching continues on the {name}: {reason or Ending.NOTHING_RUNS}"
-            self.log.fault(text)
+            self.log.warning(text)
             self.log.explain(text)
-            console.logger.warning(text)
             self.site.fall_back()
             # Costs, losses and refusals say nothing about the other device.
             self.costs.forget()

@@ -9,7 +9,7 @@ from collections.abc import Sequence, Set
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from mkpc_kaggle.engine.console import Progress
+from mkpc_kaggle.engine.console import Progress, logger
 from mkpc_kaggle.engine.jobs import Failure, PairInputs
 from mkpc_kaggle.engine.plan.budget import Budget, Costs
 from mkpc_kaggle.engine.plan.state import State
@@ -57,6 +57,11 @@ class EventLog:
         if text not in self.faults:
             self.faults.append(text)
             self.note(EventKind.FAULT, text)
+
+    def warning(self, text: str) -> None:
+        """Record a fault, and print it at once."""
+        self.fault(text)
+        logger.warning(text)
 
 
 @dataclass(frozen=True, eq=False)
