@@ -90,9 +90,15 @@ def test_a_failed_pair_counts_as_failed_even_where_the_fallback_happens_to_be_ri
     camera1 = Camera(eye, eye, np.array([1.0, 0, 0]))  # the fallback's motion
     true = TruePair(Pair("p", "s", "a", "b"), camera0, camera1, 0.5)
     scene = TrainScene("s", 1.0, (true,))
-    tables = tables_of(Described("p", failure="too few matches"), Described("p", source="pair"))
+    tables = tables_of(
+        Described("p", failure="too few matches"),
+        Described("p", source="pair"),
+        # Of a run with other settings, which is not scored
+        Described("p", source="earlier", failure=None),
+    )
     failed = score_pair(true, tables, 0, scene, [Step.MAGSAC])
     right = score_pair(true, tables, 1, scene)
+    assert score_pair(true, tables, 2, scene).error.rotation == np.inf
     assert SceneScore("s", (right, failed, right)).maa() == pytest.approx(2 / 3)
     assert failed.error.rotation == failed.steps[Step.MAGSAC].rotation == np.inf
     assert right.error.angle < 1e-6
