@@ -20,7 +20,7 @@ submission. Without options, print an overview of one screen.
 
 --csv writes tables for pandas.read_csv. Except the last, all have the column `pair`, the id of the pair:
   pairs.csv    images (paths below the directory of the run's images), failure, source of F (scene; pair;
-               earlier, a run with other settings; fallback), matches, inliers, seconds by part; f11 ... f33, the
+               earlier, until this run has its own; fallback), matches, inliers, seconds by part; f11 ... f33, the
                matrix of the column model: F, or E for pairs with known intrinsics. For the F of the pair's own
                matches: support (ratio of inliers to inliers by chance), overlaps (whether the images overlap),
                plane (share of the inliers that one homography explains), flat (nearly all of them), number of

@@ -1,5 +1,5 @@
-"""Reading the store, once: a new state gets the results of today. Until a pair has an F of today, the
-one that the last run wrote stands in. Nothing else of former settings does.
+"""Reading the store, once: a new state gets the results of today. Until a pair has a new F, the one in
+the last table of pairs stands in, and no other result that is not today's.
 """
 
 from collections.abc import Mapping
@@ -8,7 +8,7 @@ from itertools import chain
 import numpy as np
 
 from mkpc_kaggle.engine.plan.schedule import sweeping_unit
-from mkpc_kaggle.engine.plan.state import FALLBACK, SCENE, SOURCES, State
+from mkpc_kaggle.engine.plan.state import EARLIER, FALLBACK, SCENE, SOURCES, State
 from mkpc_kaggle.engine.store.database import Store
 from mkpc_kaggle.engine.store.image_files import known_images
 from mkpc_kaggle.engine.store.keys import of_candidate
@@ -50,13 +50,17 @@ def _restore_earlier(state: State, store: Store, known: list[int]) -> None:
     for row in Published.of(store).rows:
         if row.source != SOURCES[FALLBACK]:
             # By contents and not by id: another test set may name the same two images.
-            written[row.contents, row.model] = row.F
+            written[row.contents, row.model] = row
     for index in known:
         # An E is no F: the user has given the intrinsics since, or no longer does.
         model = ModelKind.F if state.pairs[index].intrinsics is None else ModelKind.E
-        F = written.get((state.contents(index), model))
-        if F is not None:
-            state.use_earlier(index, F)
+        former = written.get((state.contents(index), model))
+        if former is None:
+            continue
+        # An F that stood in for the pair's estimate was a scene's.
+        stood_in = former.source == SOURCES[EARLIER] and bool(former.estimate)
+        is_by_scene = stood_in or former.source == SOURCES[SCENE]
+        state.use_earlier(index, former.F, is_by_scene=is_by_scene)
 
 
 def _restore_points(state: State, store: Store, wanted: list[tuple[int, int]]) -> None:

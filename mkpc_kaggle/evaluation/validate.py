@@ -247,10 +247,9 @@ def score_pair(
     in_front: bool = False,
 ) -> PairScore:
     """Return the score of the pair in a row of the run's tables. An F from the fallback counts as a
-    failure, and so does one of a run with other settings, which this score is not about.
+    failure. The F of an earlier run, perhaps with other settings, does not count.
     """
     pair = tables.pairs.loc[row]
-    has_f = pair["source"] not in ("fallback", "earlier")
     estimate = tables.estimates.loc[row]
     rotation = Rotation.from_rotvec(estimate["rotation"]).as_matrix() if in_front else None
     own: Any = None if pair["failure"] else estimate["F"]
@@ -259,9 +258,12 @@ def score_pair(
         # Without a prior, the pair's F is MAGSAC's.
         Step.MAGSAC: magsac if Step.PRIOR in steps else own,
         Step.PRIOR: own,
-        # The row of the submission: the scene's F, else the pair's.
-        Step.SCENE: matrices_of(tables.pairs.loc[[row]])[0] if has_f else None,
+        Step.SCENE: own,
     }
+    if pair["source"] != "earlier":
+        # The row of the submission: the scene's F, else the pair's.
+        written = matrices_of(tables.pairs.loc[[row]])[0]
+        matrices[Step.SCENE] = None if pair["source"] == "fallback" else written
     # The last step's error is the pair's, also where a step was not made.
     errors = {step: error_of(matrix, true, scene, rotation) for step, matrix in matrices.items()}
     made = {step: errors[step] for step in steps}

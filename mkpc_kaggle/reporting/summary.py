@@ -65,7 +65,7 @@ def is_solved(pairs: "DataFrame") -> "Series[bool]":
 
 
 def is_of_this_run(pairs: "DataFrame") -> "Series[bool]":
-    """Return which pairs have an F, or none, by this run: not the F of one with other settings."""
+    """Return which pairs have an F, or none, by this run, and not the F of an earlier one."""
     return pairs["source"] != "earlier"
 
 
@@ -185,7 +185,7 @@ def facts(run: AnyRun) -> Iterator[tuple[str, str, str]]:
     parts = (
         ("scene", "from scenes"),
         ("pair", "from their own matches"),
-        ("earlier", "of an earlier run with other settings"),
+        ("earlier", "of an earlier run"),
         ("fallback", "fallback"),
     )
     from_where = ", ".join(

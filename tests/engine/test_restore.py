@@ -8,7 +8,8 @@ import pytest
 from rectified import SECOND, SWEEP, THIRD
 from store_room import RECIPE, REGIONS, F, Room, matches_of, pair_of
 
-from mkpc_kaggle.engine.plan.state import EARLIER, FALLBACK, PAIR
+from mkpc_kaggle.engine.jobs import Cause, Failure
+from mkpc_kaggle.engine.plan.state import EARLIER, FALLBACK, PAIR, SCENE
 from mkpc_kaggle.engine.store.database import Store
 from mkpc_kaggle.engine.store.dataframes import (
     NOT_REACHED,
@@ -152,6 +153,26 @@ def test_the_f_of_the_last_table_stays_until_a_new_one_exists_unless_an_image_ch
     whole.match(1, THIRD, digest="new")
     assert whole.state.sources.tolist() == [PAIR, FALLBACK, FALLBACK]
     assert np.array_equal(whole.state.fundamentals, [F, *[FALLBACK_FUNDAMENTAL] * 2])
+
+
+def test_the_f_of_a_scene_stands_in_for_the_pairs_own_until_its_scene_is_made_again(
+    whole: Room,
+) -> None:
+    whole.match(2, SWEEP)
+    # The scene is of other points than today's. Again and again, as in runs that are interrupted.
+    for _ in range(2):
+        whole.ask()
+        assert whole.state.scenes.stale == {"one"}
+        assert whole.state.has_own.tolist() == [True, True, False]
+        assert whole.state.sources.tolist() == [EARLIER, PAIR, FALLBACK]
+        assert np.array_equal(whole.state.fundamentals[:2], [3 * F, F])
+        whole.publish()
+    # As a fresh run would write it, if no scene can be made
+    whole.state.give_up(("scenes",), Failure(Cause.NOT_STARTED))
+    assert whole.state.sources.tolist() == [PAIR, PAIR, FALLBACK]
+    whole.ask()
+    whole.reconstruct()
+    assert whole.state.sources.tolist() == [SCENE, PAIR, FALLBACK]
 
 
 def test_an_e_of_an_earlier_run_is_not_written_as_f(room: Room) -> None:

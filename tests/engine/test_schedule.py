@@ -36,7 +36,7 @@ from mkpc_kaggle.engine.plan.schedule import (
     prefix_that_fits,
     upcoming_pairs,
 )
-from mkpc_kaggle.engine.plan.state import PAIR, State
+from mkpc_kaggle.engine.plan.state import State
 from mkpc_kaggle.engine.request import Ending, Request
 from mkpc_kaggle.engine.scenes import scene_failures
 from mkpc_kaggle.engine.store.database import Store
@@ -322,8 +322,7 @@ def test_a_first_scene_waits_for_the_units_that_fit_and_a_later_scene_for_all():
     for index in range(6):
         run.have(index, (SWEEP, SECOND))
         run.state.matches[index] = 50
-    run.state.estimated[:] = True
-    run.state.own_source[:] = PAIR
+    run.state.estimated[:] = run.state.has_own[:] = True
     run.learn(SWEEP, SECOND)
     # The third unit does not fit for all pairs; many measurements, so that the forecast is certain.
     for _ in range(1000):
@@ -359,8 +358,7 @@ def test_a_first_scene_does_not_wait_for_a_job_that_hangs_until_the_end():
     for index in range(5):
         run.have(index, UNITS)
         run.state.matches[index] = 50
-    run.state.estimated[:] = True
-    run.state.own_source[:] = PAIR
+    run.state.estimated[:] = run.state.has_own[:] = True
     run.learn(*UNITS)
     run.state.begin_matching([5])
     stop = view_of(run).stop

@@ -93,7 +93,7 @@ def test_a_failed_pair_counts_as_failed_even_where_the_fallback_happens_to_be_ri
     tables = tables_of(
         Described("p", failure="too few matches"),
         Described("p", source="pair"),
-        # Of a run with other settings, which is not scored
+        # Of an earlier run, perhaps with other settings, which is not scored
         Described("p", source="earlier", failure=None),
     )
     failed = score_pair(true, tables, 0, scene, [Step.MAGSAC])

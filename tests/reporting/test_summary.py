@@ -56,14 +56,14 @@ def test_a_pair_with_few_inliers_is_doubtful_unless_its_cameras_agree():
 
 
 def test_an_f_of_an_earlier_run_is_counted_as_such_and_is_not_doubtful():
-    """A run with other settings wrote it, and this one knows neither its matches nor its inliers."""
+    """With other settings, this run knows neither its matches nor its inliers."""
     earlier = Described(source="earlier", failure=None)
     done = Described(source="pair", matches=200, inliers=100, support=99.0)
     tables = tables_of(earlier, done, UNREACHED)
     assert is_doubtful(tables.pairs).tolist()[:2] == [False, False]
     text = summary(RunReport(tables, Ending.INTERRUPTED, 60.0))
     assert "2 of 3 pairs with an F" in text
-    assert "1 from their own matches, 1 of an earlier run with other settings, 1 fallback" in text
+    assert "1 from their own matches, 1 of an earlier run, 1 fallback" in text
     assert "the median; the minimum is 100" in text
     assert "interrupted; 2 pairs left" in text
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from mkpc_kaggle.engine.jobs import MatchPlan, Phase
 from mkpc_kaggle.engine.plan.blame import MAX_LOSSES, Item
 from mkpc_kaggle.engine.plan.budget import ESTIMATE, Budget, Costs
-from mkpc_kaggle.engine.plan.state import FALLBACK, Mask, State
+from mkpc_kaggle.engine.plan.state import Mask, State
 from mkpc_kaggle.errors import plural
 from mkpc_kaggle.progress import format_duration
 from mkpc_kaggle.recipe import Unit
@@ -402,7 +402,7 @@ def estimates_due(snapshot: Snapshot, first: NDArray[Any]) -> NDArray[Any]:
     # A settled pair gets no other unit soon. A pair without an F is estimated at once: any F is better
     # than the fallback.
     is_settled = (first >= FILL) & ~state.matching
-    has_f = state.own_source != FALLBACK
+    has_f = state.has_own | state.has_earlier
     due = state.lacks_estimate & ~state.estimating & (is_settled | ~has_f)
     order = state.order[due[state.order]]
     return np.asarray(order[np.argsort(has_f[order], kind="stable")])

@@ -2,8 +2,8 @@
 
 The state has, for each pair and unit, the key of the points in use, and whether that is today's key.
 A stage-2 unit looks at crops that come from the pair's stage-1 points: new points of stage 1 change
-its key, and its points are computed again; until then, the run uses the former ones. Of earlier runs
-with other settings, the state has the F that they wrote, and nothing else.
+its key, and its points are computed again; until then, the run uses the former ones. Of an earlier run,
+whose results may not be today's, the state has the F that it wrote, and nothing else.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
@@ -29,9 +29,9 @@ from mkpc_kaggle.scene.view_graph import BatchImage
 
 Mask = NDArray[np.bool_]
 
-# Where the F of a pair comes from, in increasing order of preference
-FALLBACK, EARLIER, PAIR, SCENE = 0, 1, 2, 3
-SOURCES = ("fallback", "earlier", "pair", "scene")
+# Where the F of a pair comes from. The scene's is preferred to the pair's own.
+FALLBACK, PAIR, SCENE, EARLIER = 0, 1, 2, 3
+SOURCES = ("fallback", "pair", "scene", "earlier")
 
 
 class State:
@@ -45,9 +45,9 @@ class State:
 
     Of a pair (N,): ``estimates``, the key of the estimate in use; ``estimated``, it is today's;
     ``by_cameras``, it comes from the cameras of its batch;
-    ``inliers``; the F ``own`` (N, 3, 3), and ``own_source``: its matches (``PAIR``), the table of pairs of
-    an earlier run with other settings (``EARLIER``), or neither. ``matching`` and
-    ``estimating`` are the pairs of jobs under way, and ``filling`` the pairs in the last phase.
+    ``inliers``, the F ``own`` (N, 3, 3) and ``has_own``, it is no fallback. ``earlier`` (N, 3, 3) is the F
+    in the last table of an earlier run, if ``has_earlier``, and ``earlier_by_scene``, if a scene gave it.
+    ``matching`` and ``estimating`` are the pairs of jobs under way, and ``filling`` the pairs in the last phase.
     ``costly`` are pairs with a unit whose jobs were lost twice. ``by_scene`` (N, 3, 3) and
     ``scene_source`` are the F that the scene in use gives, if any.
     ``changed`` has the pairs with other results than in the last table of pairs.
@@ -91,7 +91,10 @@ class State:
         self.own = np.tile(FALLBACK_FUNDAMENTAL, (count, 1, 1))
         self.estimated = np.zeros(count, bool)
         self.by_cameras = np.zeros(count, bool)
-        self.own_source = np.full(count, FALLBACK)
+        self.has_own = np.zeros(count, bool)
+        self.earlier = np.zeros((count, 3, 3))
+        self.has_earlier = np.zeros(count, bool)
+        self.earlier_by_scene = np.zeros(count, bool)
         self.matching = np.zeros(count, bool)
         self.filling = np.zeros(count, bool)
         self.costly = np.zeros(count, bool)
@@ -139,11 +142,6 @@ class State:
         return np.asarray(lacking)
 
     @property
-    def has_own(self) -> Mask:
-        """(N,): the pair has an F from its matches."""
-        return np.asarray(self.own_source == PAIR)
-
-    @property
     def need_shares(self) -> NDArray[np.float64]:
         """(U,): the expected share of the pairs that need a unit, 1 for a unit of stage 1.
 
@@ -155,31 +153,47 @@ class State:
 
     @property
     def fundamentals(self) -> NDArray[np.float64]:
-        """The F to write (R, 3, 3) for each row of the request: the scene's, else the pair's, else the
-        fallback.
+        """The F to write (R, 3, 3) for each row of the request: an earlier one that stands in, else the
+        scene's, else the pair's, else the fallback.
         """
-        # A scene's F is more accurate: its cameras agree with all images of the batch.
-        written = self.own[: self.rows].copy()
-        chosen = self.scene_source[: self.rows] != FALLBACK
-        written[chosen] = self.by_scene[: self.rows][chosen]
+        sources, written = self._written
         # The last gate of the submission: the competition refuses a whole file for one matrix.
-        written[self._sources == FALLBACK] = FALLBACK_FUNDAMENTAL
+        written[sources == FALLBACK] = FALLBACK_FUNDAMENTAL
         return written[self.pair_of_row]
 
     @property
     def sources(self) -> NDArray[np.int_]:
         """Where the F to write comes from (R,), for each row of the request."""
-        return self._sources[self.pair_of_row]
+        sources, _ = self._written
+        return sources[self.pair_of_row]
 
     @property
-    def _sources(self) -> NDArray[np.int_]:
-        sources = np.maximum(self.own_source, self.scene_source)[: self.rows]
-        by_scene = self.scene_source[: self.rows] != FALLBACK
-        written = np.where(
-            by_scene[:, None, None], self.by_scene[: self.rows], self.own[: self.rows]
-        )
+    def _written(self) -> tuple[NDArray[np.int_], NDArray[np.float64]]:
+        """The source (rows,) of the F of each pair with a row, and the matrices (rows, 3, 3)."""
+        sources = np.where(self.has_own, PAIR, FALLBACK)
+        written = self.own.copy()
+        # A scene's F is more accurate: its cameras agree with all images of the batch.
+        by_scene = self.scene_source != FALLBACK
+        sources[by_scene] = self.scene_source[by_scene]
+        written[by_scene] = self.by_scene[by_scene]
+        stands_in = self.stands_in
+        sources[stands_in] = EARLIER
+        written[stands_in] = self.earlier[stands_in]
         is_usable = np.isfinite(written).all((1, 2)) & written.any((1, 2))
-        return np.asarray(np.where(is_usable, sources, FALLBACK))
+        sources[~is_usable] = FALLBACK
+        return sources[: self.rows], written[: self.rows]
+
+    @property
+    def stands_in(self) -> Mask:
+        """(N,): the F of an earlier run is written, since this run has none yet.
+
+        The F of an earlier scene also stands in for the pair's own F, while the scene of today is to be
+        made.
+        """
+        lacks_estimate = self.estimates == ""
+        awaits_better = self.earlier_by_scene & self._awaits_scene
+        has_scene = self.scene_source != FALLBACK
+        return np.asarray(self.has_earlier & ~has_scene & (lacks_estimate | awaits_better))
 
     @property
     def digests(self) -> dict[str, str]:
@@ -302,8 +316,13 @@ class State:
     @property
     def awaits_cameras(self) -> Mask:
         """(N,): the estimate may come from cameras that are still to be computed."""
+        return self._awaits_scene if self.uses_cameras else np.zeros(len(self.pairs), bool)
+
+    @property
+    def _awaits_scene(self) -> Mask:
+        """(N,): the scene of the pair's batch is still to be made."""
         awaits = np.zeros(len(self.pairs), bool)
-        if self.uses_cameras and ("scenes",) not in self.tries.given_up:
+        if ("scenes",) not in self.tries.given_up:
             matches = self.matches_of_batches()
             for batch in self.scenes.stale | self.scenes.reconstructing:
                 number = self.batches[batch]
@@ -325,7 +344,7 @@ class State:
         assert images
         keys = zip(self.units, self.points[index], self.has[index], strict=True)
         points = {unit: key for unit, key, is_used in keys if is_used}
-        has_own = self.own_source[index] == PAIR and not self.uses_cameras
+        has_own = self.has_own[index] and not self.uses_cameras
         own = self.own[index] if has_own else None
         return PairInputs(index, images, points, self.pairs[index].intrinsics, own)
 
@@ -335,10 +354,11 @@ class State:
         """Use the images whose contents are known at the start, by name."""
         self.images.update(images)
 
-    def use_earlier(self, index: int, F: Matrix3) -> None:
-        """Use the F that an earlier run with other settings wrote, until the pair gets another one."""
-        self.own[index] = F
-        self.own_source[index] = EARLIER
+    def use_earlier(self, index: int, F: Matrix3, *, is_by_scene: bool) -> None:
+        """Use the F that an earlier run wrote, until the pair gets another one."""
+        self.earlier[index] = F
+        self.has_earlier[index] = True
+        self.earlier_by_scene[index] = is_by_scene
 
     def use_points(self, index: int, unit: int, points: UnitPoints) -> None:
         """Use a unit's points of today; none if the pair does not need the unit."""
@@ -404,7 +424,8 @@ class State:
         self.estimated[index] = False
         self.by_cameras[index] = False
         self.own[index] = FALLBACK_FUNDAMENTAL
-        self.own_source[index] = FALLBACK
+        self.has_own[index] = False
+        self.has_earlier[index] = False
         self.inliers[index] = 0
         self.scene_source[index] = FALLBACK
         self._note_change(index)
@@ -415,7 +436,7 @@ class State:
         self.estimated[index] = estimate.key == self.estimate_key(index)
         self.by_cameras[index] = False
         self.own[index] = estimate.F
-        self.own_source[index] = FALLBACK if estimate.failure else PAIR
+        self.has_own[index] = not estimate.failure
         self.inliers[index] = sum(estimate.inliers.values())
 
     def use_new_estimate(self, index: int, estimate: PairEstimate) -> None:
@@ -470,6 +491,7 @@ class State:
         scene = self.scenes.use(batch, record)
         members = self.members[self.batches[batch]]
         self.changed.update(members.tolist())
+        self.has_earlier[members] = False
         self.scene_source[members] = FALLBACK  # of the former scene
         for index in members.tolist():
             choice = scene.choices.get(self.contents(index))

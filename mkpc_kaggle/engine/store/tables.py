@@ -155,7 +155,7 @@ class PublishedPair:
 
     ``points`` are the keys of its units' points, empty for a unit without points. ``F`` is the matrix
     that was written, F or E as ``model`` says, and ``source`` where it comes from: "scene", "pair",
-    "earlier" (a run with other settings) or "fallback"; empty for an extra pair. ``choice`` is the
+    "earlier" (an earlier run) or "fallback"; empty for an extra pair. ``choice`` is the
     reason of the scene's choice, if there is a scene.
 
     ``failures`` are the reasons why units were given up, by unit; ``failure`` is why the pair has no points, and
