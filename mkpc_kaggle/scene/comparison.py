@@ -194,7 +194,9 @@ def _lenses(copy: Any, freed: Sequence[Freed]) -> Iterable[DistortedLens]:
         yield DistortedLens(names, displacement, camera)
 
 
-def adopted_lenses(model: SfmModel, lenses: Mapping[str, KnownCamera]) -> Iterable[DistortedLens]:
+def adopted_lenses_of(
+    model: SfmModel, lenses: Mapping[str, KnownCamera]
+) -> Iterable[DistortedLens]:
     """Yield the lenses of a model whose images have started with ``lenses``, by digest: the medians
     of each size.
     """

@@ -390,13 +390,13 @@ def compared(merged: MergedGraph, reconstruction: Reconstruction) -> Reconstruct
     if not reconstruction.models:
         return reconstruction if has_moved else replace(reconstruction, failure=HARDLY_MOVED)
     # Only with a model: pycolmap may be missing
-    from mkpc_kaggle.scene.comparison import adopted_lenses, compare_with_photographs
+    from mkpc_kaggle.scene.comparison import adopted_lenses_of, compare_with_photographs
 
     given_cameras = known_by_name(merged.graph)
     models = []
     for model in reconstruction.models:
         comparison = replace(compare_with_photographs(model, given_cameras), has_moved=has_moved)
-        lenses = (*adopted_lenses(model, merged.graph.lenses), *comparison.lenses)
+        lenses = (*adopted_lenses_of(model, merged.graph.lenses), *comparison.lenses)
         comparison = replace(comparison, lenses=lenses)
         models.append(replace(model, comparison=comparison))
     return replace(reconstruction, models=tuple(models))

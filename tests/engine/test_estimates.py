@@ -21,7 +21,7 @@ from mkpc_kaggle.engine.store.tables import PairEstimate
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.robust import Method
 from mkpc_kaggle.pipeline.stages import Pipeline
-from mkpc_kaggle.recipe import CameraSharing, Recipe, SceneConfig
+from mkpc_kaggle.recipe import CameraModel, CameraSharing, Recipe, SceneConfig
 from mkpc_kaggle.reporting.run_log import read_log
 from mkpc_kaggle.reporting.summary import summary
 
@@ -74,7 +74,10 @@ def test_a_run_resumed_with_another_estimation_ends_with_the_bytes_of_a_fresh_on
         estimated = 0 if name == "no scene" else 6
         assert (report.units_run, report.estimated) == (0, estimated)
         stored = read_log(journal).recipe
-        assert stored == replace(recipe, name=stored.name)
+        # F is of cameras without distortion.
+        pinholes = {"camera_model": CameraModel.SIMPLE_PINHOLE}
+        scene = recipe.scene and replace(recipe.scene, **pinholes)
+        assert stored == replace(recipe, name=stored.name, scene=scene)
     assert "0 units run, 6 F estimated" in summary(report)
 
 
