@@ -118,6 +118,17 @@ class PlacedCamera(KnownCamera):
             raise ValueError("a placed camera is exact, and its pose has seven finite numbers")
 
 
+def radial_factor(camera: KnownCamera, radius: float) -> float:
+    """Return by how much a lens magnifies a ray at ``radius``, the tangent of its angle with the axis:
+    1 without distortion.
+    """
+    # COLMAP's and OpenCV's: k1, k2, p1, p2, k3 to k6; those of the tangential distortion are in the middle.
+    k = [*camera.distortion, *[0.0] * (8 - len(camera.distortion))]
+    r2 = radius**2
+    numerator = 1 + k[0] * r2 + k[1] * r2**2 + k[4] * r2**3
+    return numerator / (1 + k[5] * r2 + k[6] * r2**2 + k[7] * r2**3)
+
+
 Rows = Sequence[tuple[str, KnownCamera]]  # a name or a pattern of images, and their camera
 
 

@@ -10,7 +10,7 @@ from mkpc_kaggle.data.images import EXIF_FOCALS, read_size
 from mkpc_kaggle.engine.console import logger
 from mkpc_kaggle.errors import UserError, plural
 from mkpc_kaggle.geometry.coordinates import Size
-from mkpc_kaggle.geometry.intrinsics import KnownCamera, Rows, camera_of, parse_row
+from mkpc_kaggle.geometry.intrinsics import KnownCamera, Rows, camera_of, parse_row, radial_factor
 
 COLUMNS = ("image", "model", "parameters", "sigma")
 OPTIONAL = ("size",)  # of the images that the parameters are for
@@ -21,6 +21,9 @@ MAX_OFFSET = 0.1
 MAX_USUAL_OFFSET = 0.05
 MAX_DENOMINATOR = 4  # of the ratio of two usual resolutions
 MAX_SCALE_ERROR = 0.03  # of this ratio by the principal point
+MAX_ASPECT_RATIO = 1.1  # of two focal lengths; calibrations of one lens differ by 0.01
+MAX_TANGENT = 4.0  # of the angle of a ray with the axis: 76 degrees
+STEPS = 400
 MAX_SHAPE_RATIO = 1.05  # of pictures of one camera at two resolutions
 
 
@@ -121,7 +124,36 @@ def require_fit(known: KnownCamera, stated: Size | None, image: Path, where: str
             f"{where}: a focal length of {known.focal:g} px is implausible for {image.name} "
             f"of {text_of(size)} pixels"
         )
-    return doubt
+    _require_visible_edge(known, size, image, where)
+    return doubt or _aspect_doubt(known, where)
+
+
+def _aspect_doubt(known: KnownCamera, where: str) -> str:
+    """Return a doubt about two focal lengths, since pixels of cameras are square."""
+    ratio = max(known.focals) / min(known.focals)
+    if ratio <= MAX_ASPECT_RATIO:
+        return ""
+    return (
+        f"{where}: fx and fy differ by {100 * (ratio - 1):.0f} %, and pixels of cameras are square: "
+        "the order is fx fy cx cy"
+    )
+
+
+def _require_visible_edge(known: KnownCamera, size: Size, image: Path, where: str) -> None:
+    """Raise :class:`UserError` for coefficients by which no ray reaches the edge of an image."""
+    shown = 0.0
+    for number in range(1, STEPS + 1):
+        radius = number * MAX_TANGENT / STEPS
+        distorted = radius * radial_factor(known, radius)
+        # From here on, farther rays would come back to the middle.
+        if distorted <= shown:
+            break
+        shown = distorted
+    if shown < max(size) / 2 / known.focal:
+        raise UserError(
+            f"{where}: with this distortion no pixel of {image.name} is more than "
+            f"{shown * known.focal:.0f} px from the middle; COLMAP's coefficients are for x / f and y / f"
+        )
 
 
 def _principal_point_doubt(known: KnownCamera, size: Size, has_pixels: str, where: str) -> str:

@@ -5,7 +5,13 @@ from pathlib import Path
 
 from mkpc_kaggle.engine.store.scene_record import SceneRecord
 from mkpc_kaggle.errors import plural
-from mkpc_kaggle.scene.models import HARDLY_MOVED, DistortedLens, FocalContradiction, FocalSource
+from mkpc_kaggle.scene.models import (
+    HARDLY_MOVED,
+    DistortedLens,
+    DistortionContradiction,
+    FocalContradiction,
+    FocalSource,
+)
 
 MAX_NAMED = 3  # images in a sentence
 
@@ -19,6 +25,8 @@ def contradictions(scene: SceneRecord) -> Iterator[str]:
     for model in scene.models:
         for focal in model.comparison.focals:
             yield _focal_sentence(focal)
+        for distortion in model.comparison.distortions:
+            yield _distortion_sentence(distortion)
         for lens in model.comparison.lenses:
             # The model has an adopted lens, so nothing contradicts it.
             if not lens.is_adopted:
@@ -59,6 +67,16 @@ def _focal_sentence(found: FocalContradiction) -> str:
         f"the focal length of {found.given:.0f} px in EXIF contradicts the photographs, which fit "
         f"{found.fitted:.0f} px: {images}; the cameras have the latter. If they look wrong, give "
         "`mkpc reconstruct` --intrinsics, or remove the focal length from EXIF"
+    )
+
+
+def _distortion_sentence(found: DistortionContradiction) -> str:
+    images = named([Path(name).name for name in found.images])
+    parameters = " ".join(f"{value:.5g}" for value in found.camera.parameters)
+    return (
+        f"the distortion of {100 * found.given:.1f} % at the edge in --intrinsics contradicts the photographs, "
+        f"which fit {100 * found.fitted:.1f} %: {images}; correct or remove the row. The parameters "
+        f"{parameters} of {found.camera.model} fit"
     )
 
 

@@ -9,18 +9,20 @@ close to its optimum, so it takes a small part of the time of the model.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 import pycolmap
 
 from mkpc_kaggle.geometry.coordinates import Size
-from mkpc_kaggle.geometry.intrinsics import KnownCamera, PlacedCamera
+from mkpc_kaggle.geometry.intrinsics import KnownCamera, PlacedCamera, radial_factor
 from mkpc_kaggle.scene.adjustment import robust_options
 from mkpc_kaggle.scene.models import (
     MAX_SIGMA_IMAGES,
     Comparison,
     DistortedLens,
+    DistortionContradiction,
     FocalContradiction,
     FocalSource,
     RegisteredImage,
@@ -97,7 +99,8 @@ def compare_with_photographs(
         and (freed_image.registered.sigmas or len(freed) > MAX_SIGMA_IMAGES)
     ]
     focals = (*given, *_exif_focals(determined, given_cameras))
-    return Comparison(focals, tuple(_lenses(copy, determined)))
+    distortions = tuple(_given_distortions(copy, determined, given_cameras))
+    return Comparison(focals, tuple(_lenses(copy, determined)), distortions)
 
 
 def _thin(copy: Any) -> None:
@@ -148,6 +151,38 @@ def _given_focals(
         if deviation > limit and deviation > CLEAR_SIGMAS * _sigma(copy, alike, 0) / fitted:
             names = tuple(freed_image.registered.image.name for freed_image in alike)
             yield FocalContradiction(FocalSource.INTRINSICS, names, camera.focal, fitted)
+
+
+def _given_distortions(
+    copy: Any, freed: Sequence[Freed], given_cameras: Mapping[str, KnownCamera]
+) -> Iterable[DistortionContradiction]:
+    """Yield the user's cameras with a distortion that the photographs contradict."""
+    for camera in dict.fromkeys(given_cameras.values()):
+        if isinstance(camera, PlacedCamera) or not any(camera.distortion):
+            continue
+        alike = [each for each in freed if given_cameras.get(each.registered.image.name) == camera]
+        if len(alike) < MIN_LENS_IMAGES:
+            continue
+        size = alike[0].registered.image.size
+        given = displacement_of(camera, size)
+        lenses = [replace(camera, parameters=tuple(each.camera.params)) for each in alike]
+        changes = [displacement_of(lens, size) - given for lens in lenses]
+        change = float(np.median(changes))
+        agreeing = sum(each / change > 0.5 for each in changes) if change else 0
+        sigma = _sigma(copy, alike, len(camera.focals))
+        noise = abs(displacement(size, camera.focal, sigma))
+        is_clear = abs(change) >= max(MIN_DISPLACEMENT, CLEAR_SIGMAS * noise)
+        if is_clear and agreeing >= MIN_AGREEING * len(alike):
+            parameters = np.median([lens.parameters for lens in lenses], axis=0)
+            fitted = replace(camera, parameters=tuple(parameters.tolist()))
+            names = tuple(each.registered.image.name for each in alike)
+            yield DistortionContradiction(names, given, given + change, fitted)
+
+
+def displacement_of(camera: KnownCamera, size: Size) -> float:
+    """Return the displacement of :class:`DistortedLens` by all coefficients of a camera."""
+    radius = max(size) / 2 / camera.focal
+    return radial_factor(camera, radius) - 1
 
 
 def _exif_focals(

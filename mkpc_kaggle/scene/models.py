@@ -98,11 +98,24 @@ class DistortedLens:
 
 
 @dataclass(frozen=True)
+class DistortionContradiction:
+    """A distortion of the user's that the photographs contradict; displacements as in
+    :class:`DistortedLens`. ``camera`` has the parameters that fit.
+    """
+
+    images: tuple[str, ...]
+    given: float
+    fitted: float
+    camera: KnownCamera
+
+
+@dataclass(frozen=True)
 class Comparison:
     """Assumptions that the photographs of a model contradict; see :mod:`mkpc_kaggle.scene.comparison`."""
 
     focals: tuple[FocalContradiction, ...] = ()
     lenses: tuple[DistortedLens, ...] = ()
+    distortions: tuple[DistortionContradiction, ...] = ()
     has_moved: bool = True  # False: the camera only turned, see :mod:`mkpc_kaggle.scene.motion`
 
 

@@ -87,6 +87,12 @@ def write_masks(folder: Path, root: Path, left: int = 400) -> Path:
             HEAD + "00.png,SIMPLE_PINHOLE,9 400 300,fixed\n",
             "line 2: a focal length of 9 px is implausible for 00.png",
         ),
+        # Focal lengths and middles in turn, and coefficients of another convention
+        (HEAD + "*,PINHOLE,900 400 900 300,fixed\n", "the principal point 900, 300 is outside"),
+        (
+            HEAD + "*,OPENCV,900 900 400 300 -8 0 0 0,fixed\n",
+            "with this distortion no pixel of 00.png is more than 122 px from the middle",
+        ),
         (
             HEAD + "00.png,SIMPLE_PINHOLE,900 4000 300,fixed\n",
             "line 2: the principal point 4000, 300 is outside",
@@ -195,6 +201,16 @@ def test_bad_masks_are_one_line_and_nothing_is_touched(tmp_path, capsys, reason)
     (line,) = capsys.readouterr().err.splitlines()
     assert reason in line
     assert not out.exists()
+
+
+def test_focal_lengths_that_differ_are_warned_of(tmp_path, capsys):
+    root = write_flat(tmp_path / "images", 3)
+    table = tmp_path / "known.csv"
+    for row, is_warned in (("900 300 400 300", True), ("900 905 400 300", False)):
+        table.write_text(f"{HEAD}*,PINHOLE,{row},fixed\n")
+        read_intrinsics_table(table, root, sorted(root.iterdir()))
+        text = capsys.readouterr().err
+        assert ("fx and fy differ by 200 %, and pixels of cameras are square" in text) == is_warned
 
 
 def test_the_images_without_a_known_camera_are_counted(tmp_path):

@@ -29,6 +29,7 @@ from mkpc_kaggle.scene.models import (
     MAX_SIGMA_IMAGES,
     Comparison,
     DistortedLens,
+    DistortionContradiction,
     FocalContradiction,
     FocalSource,
     RegisteredImage,
@@ -87,6 +88,11 @@ def compared(*found: FocalContradiction | DistortedLens) -> RunLog:
     return log(scene(model(GOOD, GOOD, GOOD, GOOD, comparison=comparison)))
 
 
+def distorted(found: DistortionContradiction) -> RunLog:
+    comparison = Comparison(distortions=(found,))
+    return log(scene(model(GOOD, GOOD, GOOD, GOOD, comparison=comparison)))
+
+
 # Each sentence, with a run on which it speaks
 SPEAKS = {
     "the run failed: no worker left": log(ending=Ending.NO_WORKER),
@@ -134,6 +140,12 @@ SPEAKS = {
     ),
     "the focal length of 1150 px in EXIF contradicts the photographs, which fit 575 px: 0.jpg; the": (
         compared(FocalContradiction(FocalSource.EXIF, ("0.jpg",), 1150.0, 575.0))
+    ),
+    "the distortion of 4.5 % at the edge in --intrinsics contradicts the photographs, which fit -1.5 %": (
+        distorted(DistortionContradiction(tuple(NAMES), 0.0454, -0.0154, RADIAL))
+    ),
+    "0.jpg, 1.jpg, 2.jpg and 1 more; correct or remove the row. The parameters 575 320 213.5 -0.05 of": (
+        distorted(DistortionContradiction(tuple(NAMES), 0.0454, -0.0154, RADIAL))
     ),
     "the lens of 4 photographs is distorted by 1.5 % at the edge": compared(
         DistortedLens(tuple(NAMES), -0.0154, RADIAL)

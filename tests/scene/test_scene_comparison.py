@@ -148,6 +148,19 @@ def test_a_wrong_focal_length_of_the_user_is_found_with_the_right_one(factor, si
     assert focal.fitted == pytest.approx(FOCAL, rel=0.1)
 
 
+@pytest.mark.parametrize(("given", "true"), [(0.2, -0.1), (-0.25, 0.0)])
+def test_a_wrong_distortion_of_the_user_is_found_with_the_right_one(given, true):
+    known = KnownCamera("SIMPLE_RADIAL", (FOCAL, *MIDDLE, given))
+    model = model_of(pairs_of(true), ("*", known), camera_model=CameraModel.AUTO)
+    (found,) = model.comparison.distortions
+    assert model.comparison.lenses == ()
+    assert len(found.images) == 6
+    at_the_edge = (400 / FOCAL) ** 2
+    assert found.given == pytest.approx(given * at_the_edge)
+    assert found.fitted == pytest.approx(true * at_the_edge, abs=0.01)
+    assert found.camera.model == "SIMPLE_RADIAL"
+
+
 def test_a_wrong_focal_length_of_exif_is_found_unless_the_user_knows_the_camera():
     model = model_of(pairs_of(exif=1.5 * FOCAL))
     (focal,) = model.comparison.focals
