@@ -252,6 +252,16 @@ def test_boxes_crop_stage_2_and_one_image_may_have_two():
     assert len(match.matches[match.in_stage(2)]) > 20
 
 
+def test_boxes_of_a_call_within_a_loop_are_not_those_of_the_next_pairs():
+    matcher = TwoStageMatcher(TWO_STAGES)
+    pair = (pixels(), pixels(40))
+    regions = []
+    for match in matcher.match_pairs([pair, pair]):
+        regions.append([region.box for region in match.regions])
+        matcher(*pair, regions=(BOX, BOX))
+    assert regions[1] == regions[0] != [BOX, BOX]
+
+
 def test_boxes_without_a_stage_2_are_a_warning():
     with pytest.warns(RuntimeWarning, match="regions have no effect: recipe unnamed has no unit"):
         TwoStageMatcher(SIFT)(pixels(), pixels(40), regions=(BOX, BOX))
