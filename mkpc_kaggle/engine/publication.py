@@ -32,6 +32,7 @@ class Publication:
         self._has_ended = False
         self._published = budget.clock()
         self._rows: dict[int, PublishedPair] = {}  # by number
+        self._sources = np.full(len(state.pair_of_row), -1)  # of the rows, as in the last version
         # The numbers of each pair's rows. An extra pair has one after the request's rows.
         extra = np.arange(len(state.pairs) - state.rows) + len(state.pair_of_row)
         self._numbers: list[list[int]] = [[] for _ in range(state.rows)]
@@ -104,8 +105,11 @@ class Publication:
         state = self._state
         sources = state.sources
         fundamentals = state.fundamentals
+        # A pair may get another F although it has no new result: its scene is not made after all.
+        moved = state.pair_of_row[sources != self._sources]
+        self._sources = sources
         changed = []
-        for index in state.take_changed():
+        for index in sorted({*state.take_changed(), *moved.tolist()}):
             row = _row(state, index)
             for number in self._numbers[index]:
                 row = replace(row, number=number)

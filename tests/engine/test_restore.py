@@ -170,6 +170,8 @@ def test_the_f_of_a_scene_stands_in_for_the_pairs_own_until_its_scene_is_made_ag
     # As a fresh run would write it, if no scene can be made
     whole.state.give_up(("scenes",), Failure(Cause.NOT_STARTED))
     assert whole.state.sources.tolist() == [PAIR, PAIR, FALLBACK]
+    published = whole.publication.version()
+    assert [row.source for row in published.rows] == ["pair", "pair", "fallback"]
     whole.ask()
     whole.reconstruct()
     assert whole.state.sources.tolist() == [SCENE, PAIR, FALLBACK]
