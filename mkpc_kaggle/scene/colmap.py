@@ -374,6 +374,9 @@ def register_onto(database: Any, graph: ViewGraph, threads: int) -> Any:
             model.frame(number).rig_from_world = pycolmap.Rigid3d(rotation, np.array(t))
             model.register_frame(number)
             held.add(model.images[number].camera_id)
+        elif image.digest in graph.known:
+            if not graph.known[image.digest].sigma:
+                held.add(model.images[number].camera_id)
         elif not image.focal and image.digest not in graph.lenses:
             # The points that it sees determine its focal length better than a guess.
             model.cameras[model.images[number].camera_id].has_prior_focal_length = False

@@ -27,6 +27,7 @@ from mkpc_kaggle.scene.models import (
 )
 from mkpc_kaggle.scene.motion import hardly_moved
 from mkpc_kaggle.scene.shared_intrinsics import (
+    TOLERANCE,
     SharedIntrinsics,
     given_intrinsics,
     shared_intrinsics,
@@ -138,6 +139,10 @@ def reconstruct_sharing(
     parts = [part.starting_with(lenses=lenses) for part in parts]
     given = given_intrinsics(free, config)
     parts, reconstructions, shared = with_right_exif(parts, given, config, make)
+    if config.cameras is not CameraSharing.IMAGE:
+        parts, reconstructions = sharing_with_placed(parts, reconstructions, shared, make)
+        known = {digest for part in parts for digest in part.graph.known}
+        free = [image for image in free if image.digest not in known]
     if config.cameras is CameraSharing.AUTO:
         sharing = share(parts, reconstructions, free, config, make)
         if sharing is not None:
@@ -198,6 +203,53 @@ def placed_lenses(graph: ViewGraph) -> dict[str, KnownCamera]:
         if isinstance(camera, PlacedCamera) and any(camera.distortion):
             lenses.setdefault(image.size, KnownCamera(camera.model, camera.parameters))
     return {image.digest: lenses[image.size] for image in free_of(graph) if image.size in lenses}
+
+
+def sharing_with_placed(
+    parts: Sequence[MergedGraph],
+    reconstructions: Sequence[Reconstruction],
+    shared: SharedIntrinsics,
+    make: Make,
+) -> tuple[list[MergedGraph], list[Reconstruction]]:
+    """Return the graphs and the reconstructions with the intrinsics of :func:`with_placed_intrinsics`,
+    unless images then see fewer points.
+    """
+    chosen = list(parts)
+    found = list(reconstructions)
+    for number, part in enumerate(parts):
+        placed = with_placed_intrinsics(part, found[number])
+        if placed is None:
+            continue
+        again = make(placed, shared)
+        if not loses_points([found[number]], [again]):
+            chosen[number] = placed
+            found[number] = again
+    return chosen, found
+
+
+def with_placed_intrinsics(part: MergedGraph, found: Reconstruction) -> MergedGraph | None:
+    """Return the graph whose new images have the intrinsics of a finished model, where all of its images
+    of the size have one camera and the new focal length agrees; ``None`` if there are none.
+
+    A single new image determines its focal length poorly.
+    """
+    known = part.graph.known
+    lenses: dict[Size, set[KnownCamera]] = {}
+    for image in part.graph.images:
+        camera = known.get(image.digest)
+        if isinstance(camera, PlacedCamera):
+            lens = KnownCamera(camera.model, camera.parameters)
+            lenses.setdefault(image.size, set()).add(lens)
+    alike = {}
+    for registered in (registered for model in found.models for registered in model.images):
+        image = registered.image
+        of_size = lenses.get(image.size, set())
+        if image.digest in known or len(of_size) != 1:
+            continue
+        (lens,) = of_size
+        if abs(registered.focal / lens.focal - 1) < TOLERANCE:
+            alike[image.digest] = lens
+    return part.starting_with(known={**known, **alike}) if alike else None
 
 
 def doubts_exif(graph: ViewGraph, reconstruction: Reconstruction) -> bool:

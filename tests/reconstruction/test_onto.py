@@ -1,6 +1,8 @@
 """New photographs are registered in a finished model, whose cameras stay as they are."""
 
 import re
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import cv2
@@ -10,7 +12,7 @@ import pytest
 from shared import run_command
 from test_reconstruct import FIRST, RECIPE, MixedMatcher, write_flat
 
-from benchmarks.synthetic_scene import SIZE
+from benchmarks.synthetic_scene import SIZE, SyntheticScene, synthetic_scene
 from mkpc_kaggle import reconstruct
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Size
@@ -80,6 +82,34 @@ def test_new_images_are_registered_and_no_other_camera_changes(home, tmp_path):
     for name, target in zip(new, targets, strict=True):
         cosine = (np.trace(found[name].R.T @ target.R) - 1) / 2
         assert np.degrees(np.arccos(min(1, cosine))) < 0.5
+
+
+@dataclass
+class OneCamera(MixedMatcher):
+    """The photographs of a scene by one camera."""
+
+    @cached_property
+    def scenes(self) -> tuple[SyntheticScene, SyntheticScene]:
+        scene = synthetic_scene(FIRST, points=500, focals=[840.0] * FIRST)
+        return scene, scene
+
+
+@pytest.mark.parametrize("is_of_one_camera", [True, False])
+def test_new_images_of_the_models_camera_share_its_intrinsics(home, tmp_path, is_of_one_camera):
+    files = sorted((home / "images").iterdir())
+    matchers = {"synthetic": OneCamera() if is_of_one_camera else MixedMatcher()}
+    made(files[:OLD], tmp_path / "old", matchers=matchers)
+    old = pycolmap.Reconstruction(tmp_path / "old" / "colmap" / "models" / "0")
+    # As of a model whose images share a camera
+    focal = float(np.median([camera.mean_focal_length() for camera in old.cameras.values()]))
+    for camera in old.cameras.values():
+        camera.params = [focal, *camera.params[1:]]
+    (tmp_path / "shared").mkdir()
+    old.write(tmp_path / "shared")
+    made(files, tmp_path / "new", onto=tmp_path / "shared", matchers=matchers)
+    after = numbers_of(tmp_path / "new" / "colmap" / "models" / "0")
+    new = {tuple(after[name][2]) for name in ("04.png", "05.png")}
+    assert (new == {(focal, SIZE.width / 2, SIZE.height / 2)}) == is_of_one_camera
 
 
 def test_new_images_start_with_the_distorted_lens_of_the_model():
