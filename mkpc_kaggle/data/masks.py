@@ -124,8 +124,11 @@ def _checked(path: Path, image: Path) -> str:
     # An unreadable image is reported by the run.
     if size is not None and size != (mask.shape[1], mask.shape[0]):
         found = f"{mask.shape[1]} x {mask.shape[0]}"
+        remedy = "make them equal"
+        if size == (mask.shape[0], mask.shape[1]):
+            remedy = "masks are for pixels as stored, without the rotation of EXIF"
         raise UserError(
-            f"{path} has {found} pixels, its image {size.width} x {size.height}; make them equal"
+            f"{path} has {found} pixels, its image {size.width} x {size.height}; {remedy}"
         )
     if not mask.any():
         return "hide everything"

@@ -189,6 +189,11 @@ BAD_MASKS = {
     "has 9 x 9 pixels, its image 800 x 600": lambda folder, root: cv2.imwrite(
         str(write_masks(folder, root) / "02.png.png"), np.ones((9, 9))
     ),
+    "its image 800 x 600; masks are for pixels as stored, without the rotation of EXIF": (
+        lambda folder, root: cv2.imwrite(
+            str(write_masks(folder, root) / "02.png.png"), np.ones((SIZE.width, SIZE.height))
+        )
+    ),
 }
 
 
