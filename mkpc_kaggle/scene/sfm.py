@@ -176,8 +176,8 @@ def free_of(graph: ViewGraph) -> list[BatchImage]:
 def with_right_exif(
     parts: Sequence[MergedGraph], given: SharedIntrinsics, config: SceneConfig, make: Make
 ) -> tuple[list[MergedGraph], list[Reconstruction], SharedIntrinsics]:
-    """Return the graphs, without EXIF's focal lengths where these are wrong, their reconstructions,
-    and the shared intrinsics, of which ``given`` are the initial ones.
+    """Return the graphs, their reconstructions and the shared intrinsics, without EXIF's focal
+    lengths where these are wrong. ``given`` are the initial intrinsics.
     """
     shared = given
     chosen = list(parts)
@@ -228,10 +228,11 @@ def sharing_with_placed(
 
 
 def with_placed_intrinsics(part: MergedGraph, found: Reconstruction) -> MergedGraph | None:
-    """Return the graph whose new images have the intrinsics of a finished model, where all of its images
-    of the size have one camera and the new focal length agrees; ``None`` if there are none.
+    """Return the graph whose new images have the intrinsics of a finished model, ``None`` without
+    any such image.
 
-    A single new image determines its focal length poorly.
+    The model's images of the size must have one camera, and the new focal length must agree. A
+    single new image determines its focal length poorly.
     """
     known = part.graph.known
     lenses: dict[Size, set[KnownCamera]] = {}
@@ -325,7 +326,7 @@ def with_lenses(
                 shown.setdefault(sizes[name], lens.camera)
     if not shown:
         return None
-    # Images of one size share a lens, also those that have no camera so far.
+    # Images of one size share a lens, with and without a camera so far.
     lenses = {image.digest: shown[image.size] for image in free if image.size in shown}
     bent = [part.starting_with(lenses={**part.graph.lenses, **lenses}) for part in parts]
     given = given_intrinsics(free, config)
