@@ -98,7 +98,7 @@ def camera_rows(cameras: Cameras, root: Path) -> Iterator[Sequence[str]]:
 def read_table_of_cameras(path: Path, root: Path, datasets: Datasets) -> Cameras:
     """Return the cameras that an earlier run wrote to ``cameras.csv``, of the files that exist now.
 
-    Without the file there are none, and a file that is no table of cameras is warned of.
+    Without the file, no image has one. A file that is not a table of cameras is warned of.
     """
     placed: dict[str, PlacedImage] = {}
     try:

@@ -13,9 +13,9 @@ class SceneState:
     ``reconstructing``, the batches of jobs under way.
 
     A scene is the best of the ``candidates``: ``made`` has those from today's results, once the
-    first is made; ``untried`` are the missing ones, and ``trying`` those of jobs under way, as
-    (batch, candidate). The batches ``with_files`` have a folder for COLMAP's files, and ``filed``
-    has the key of the scene whose files are there.
+    first is made; ``untried`` are the missing ones, and ``trying`` the ones of jobs under way,
+    as (batch, candidate). The batches ``with_files`` have a folder for COLMAP's files, and ``filed``
+    has the key of the scene whose files it has.
     """
 
     def __init__(
@@ -88,7 +88,7 @@ class SceneState:
         """Note that the batch's folder has the files of the scene with this key."""
         self.filed[batch] = key
 
-    # What is missing
+    # Missing candidates
 
     def note_change(self, batch: str) -> None:
         """Note that the inputs of a batch's scene have changed."""

@@ -187,8 +187,8 @@ class State:
     def stands_in(self) -> Mask:
         """(N,): the F of an earlier run is written, since this run has none yet.
 
-        The F of an earlier scene also stands in for the pair's own F, while the scene of today is to be
-        made.
+        The F of an earlier scene also stands in for the pair's own F, while the scene of today is
+        pending.
         """
         lacks_estimate = self.estimates == ""
         awaits_better = self.earlier_by_scene & self._awaits_scene

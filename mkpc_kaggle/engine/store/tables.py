@@ -49,7 +49,7 @@ class PairEstimate:
     """The estimate of a pair: F, or E if the pair has intrinsics, and its statistics.
 
     ``inliers`` has a count for each key of points. ``F`` is the fallback if there is a ``failure``.
-    ``magsac`` is MAGSAC's result before refinement, if any. The statistics are those of
+    ``magsac`` is MAGSAC's result before refinement, if any. The statistics are described at
     :class:`mkpc_kaggle.geometry.robust.EstimateStats`.
     """
 
