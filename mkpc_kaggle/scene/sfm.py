@@ -227,7 +227,7 @@ def sharing_with_placed(
     return chosen, found
 
 
-def with_placed_intrinsics(part: MergedGraph, found: Reconstruction) -> MergedGraph | None:
+def with_placed_intrinsics(part: MergedGraph, reconstruction: Reconstruction) -> MergedGraph | None:
     """Return the graph whose new images have the intrinsics of a finished model, ``None`` without
     any such image.
 
@@ -242,7 +242,9 @@ def with_placed_intrinsics(part: MergedGraph, found: Reconstruction) -> MergedGr
             lens = KnownCamera(camera.model, camera.parameters)
             lenses.setdefault(image.size, set()).add(lens)
     alike = {}
-    for registered in (registered for model in found.models for registered in model.images):
+    for registered in (
+        registered for model in reconstruction.models for registered in model.images
+    ):
         image = registered.image
         of_size = lenses.get(image.size, set())
         if image.digest in known or len(of_size) != 1:
