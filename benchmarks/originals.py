@@ -102,10 +102,11 @@ class Comparison:
     def measure(self, pair: Pair, record: Record) -> None:
         first, second = (self.encoded(picture_of(path), record) for path in pair.images)
         data = {"image0": glue_input(first), "image1": glue_input(second)}
-        for kind, ours in self.ours.items():
+        # Without the authors' package there is nothing to compare a matcher with.
+        for kind, theirs in self.theirs.items():
             row = f"{self.matcher}, {kind}"
-            (own,) = record.run(row, "ours", partial(ours.match, [first], [second]))
-            published = record.run(row, "theirs", partial(self.theirs[kind], data))
+            (own,) = record.run(row, "ours", partial(self.ours[kind].match, [first], [second]))
+            published = record.run(row, "theirs", partial(theirs, data))
             record.equal[row].append(same_matches(own, published, (first, second)))
 
     def encoded(self, picture: Picture, record: Record) -> Keypoints:
