@@ -22,6 +22,7 @@ from mkpc_kaggle.geometry.robust import sampson_distances
 from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.recipe import Recipe, SceneConfig, recipe_of
 from mkpc_kaggle.scene import colmap
+from mkpc_kaggle.scene.choose import evidence
 from mkpc_kaggle.scene.densify import extra_pairs
 from mkpc_kaggle.scene.keypoints import MergedGraph
 from mkpc_kaggle.scene.models import RegisteredImage
@@ -215,19 +216,12 @@ def scene_fundamental(models: Sequence[CamerasOfModel], pair: Stored) -> Matrix3
         return None
 
 
-def evidence(F: Matrix3 | None, pair: Stored) -> dict[str, list[float]]:
-    """Return the robust number of each unit's matches that agree with F, at each scale.
-
-    It is the sum of 1 / (1 + (r / scale)^2), with Sampson distances r.
-    """
-    found = {}
-    for result in pair.results:
-        sums = [0.0] * len(SCALES_PX)
-        if F is not None and len(result.matches):
-            distances = sampson_distances(F, result.matches)
-            sums = [float(np.sum(1 / (1 + (distances / scale) ** 2))) for scale in SCALES_PX]
-        found[result.unit.name] = sums
-    return found
+def evidence_by_unit(F: Matrix3 | None, pair: Stored) -> dict[str, list[float]]:
+    """Return the evidence of each unit's matches for F, at each scale."""
+    return {
+        result.unit.name: [0.0 if F is None else evidence(F, result.matches, s) for s in SCALES_PX]
+        for result in pair.results
+    }
 
 
 def apart(F: Matrix3 | None, ends: Sequence[RegisteredImage]) -> list[float]:
@@ -302,9 +296,13 @@ def facts_of(draw: Draw) -> dict[str, Any]:
                 accuracy(F, pair, draw.scene)
                 for F, pair in zip(matrices[name], scored, strict=True)
             ],
-            "evidence": [evidence(F, pair) for F, pair in zip(matrices[name], scored, strict=True)],
+            "evidence": [
+                evidence_by_unit(F, pair) for F, pair in zip(matrices[name], scored, strict=True)
+            ],
             "held_out": {
-                str(number): evidence(scene_fundamental(rest, scored[number]), scored[number])
+                str(number): evidence_by_unit(
+                    scene_fundamental(rest, scored[number]), scored[number]
+                )
                 for number in sorted(out)
             },
             "own_apart": [apart(pair.F, ends_of(models[name], pair)) for pair in scored],
@@ -328,7 +326,7 @@ def facts_of(draw: Draw) -> dict[str, Any]:
         "present": len({image.digest for pair in draw.pairs for image in pair.images}),
         "pairs": [list(pair.names) for pair in scored],
         "own": [accuracy(pair.F, pair, draw.scene) for pair in scored],
-        "own_evidence": [evidence(pair.F, pair) for pair in scored],
+        "own_evidence": [evidence_by_unit(pair.F, pair) for pair in scored],
         "candidates": candidates,
     }
 

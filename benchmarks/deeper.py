@@ -11,7 +11,7 @@ both stages. For each pair:
   the other's nine overlapping tiles of half its sides, which shows them at twice the scale; then one more
   inference on the crops of all these points.
 
-Pairs become lines of ``--facts``; a further run matches only the pairs that the file lacks. Gains are in mAA,
+Pairs become lines of ``--facts``; a further run matches only the pairs that are missing there. Gains are in mAA,
 F of single pairs with the prior of `light`, intervals by images. ``--chosen`` names the scenes for choosing.
 """
 

@@ -181,7 +181,9 @@ def scores_of(
     errors = [*centre_errors(images, targets)]
     ratios = [
         error / found.sigmas.centre
-        for error, found in zip(errors, images, strict=False)
+        for error, found in zip(
+            errors, images, strict=False
+        )  # without a similarity, no image has an error
         if found.sigmas
     ]
     return Scores(

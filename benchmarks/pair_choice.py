@@ -2,11 +2,11 @@
 
 python -m benchmarks.pair_choice FACTS
 
-FACTS is the file of ``benchmarks.candidates``. A pair's evidence for an F counts each match by its Sampson
-distance r: 1 / (1 + (r / 1 px)^2). The first table has the accuracy of both F by the share of the evidence
-for the pair's F that the scene's F has, as the mean of the units. The second has the gain if the pair keeps
-its F where this share is below a limit, over the file's choice. "chosen" are the pairs of the candidate that
-the product takes; the others are of all candidates. Draws are resampled.
+FACTS is the file of ``benchmarks.candidates``. A share is the scene's evidence over that of the pair's own F
+(:func:`mkpc_kaggle.scene.choose.evidence`), as the mean of the units. The first table has the accuracy of
+both F by this share. The second has the gain if the pair keeps its F where the share is below a limit, over
+the file's choice. "chosen" are the pairs of the candidate that the product takes; the others are of all
+candidates. Draws are resampled.
 """
 
 import argparse

@@ -122,7 +122,7 @@ def radial_factor(camera: KnownCamera, radius: float) -> float:
     """Return by how much a lens magnifies a ray at ``radius``, the tangent of its angle with the axis:
     1 without distortion.
     """
-    # COLMAP's and OpenCV's: k1, k2, p1, p2, k3 to k6; those of the tangential distortion are in the middle.
+    # COLMAP's and OpenCV's order: k1, k2, p1, p2, k3 to k6. The tangential p1 and p2 are left out.
     k = [*camera.distortion, *[0.0] * (8 - len(camera.distortion))]
     r2 = radius**2
     numerator = 1 + k[0] * r2 + k[1] * r2**2 + k[4] * r2**3

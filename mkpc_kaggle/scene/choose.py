@@ -30,8 +30,7 @@ from mkpc_kaggle.scene.view_graph import BatchPair
 CONTRADICTION_ERROR_PX = 2.0  # maximum Sampson distance of a match that agrees with an F
 CONTRADICTION_MATCHES = 30  # minimum number of matches that agree with the pair's F
 CONTRADICTION_SHARE = 0.05  # minimum share of these matches that must agree with the scene's F
-# Evidence counts each match by its Sampson distance r: 1 / (1 + (r / scale)^2), with this scale, which is
-# larger in images with a longer side
+# The scale of the evidence for an F; larger in images with a longer side
 EVIDENCE_PX, EVIDENCE_SIDE = 1.0, 1536
 EVIDENCE_MATCHES = 60.0  # minimum evidence for the pair's F, of all units
 EVIDENCE_UNIT = 5.0  # minimum of a unit: less agrees by chance
@@ -152,16 +151,18 @@ def contradicts(F: Matrix3, pair: BatchPair, magsac: RobustConfig | None = None)
 def _has_little_evidence(F: Matrix3, own: Matrix3, pair: BatchPair) -> bool:
     side = max(*pair.image0.size, *pair.image1.size)
     scale = EVIDENCE_PX * max(1.0, side / EVIDENCE_SIDE)
-    for_own = np.array([_evidence(own, matches, scale) for matches in pair.by_unit])
-    for_scene = np.array([_evidence(F, matches, scale) for matches in pair.by_unit])
+    for_own = np.array([evidence(own, matches, scale) for matches in pair.by_unit])
+    for_scene = np.array([evidence(F, matches, scale) for matches in pair.by_unit])
     counts = for_own >= EVIDENCE_UNIT
     if for_own.sum() < EVIDENCE_MATCHES or not counts.any():
         return False
     return bool(np.mean(for_scene[counts] / for_own[counts]) < EVIDENCE_SHARE)
 
 
-def _evidence(F: Matrix3, matches: Matches, scale: float) -> float:
-    """Return the robust number of matches that agree with F, see EVIDENCE_PX."""
+def evidence(F: Matrix3, matches: Matches, scale: float) -> float:
+    """Return the robust number of matches that agree with F: the sum of 1 / (1 + (r / scale)^2), with
+    Sampson distances r and ``scale`` in pixels.
+    """
     return float(np.sum(1 / (1 + (sampson_distances(F, matches) / scale) ** 2)))
 
 

@@ -1,7 +1,7 @@
 """Extra pairs that densify the view graph of a batch with few pairs per image.
 
 In the phase *Connect*, the engine matches them by the recipe's first unit alone, without an F, for a tenth of
-the time. In `reconstruct` there are none: ``pairs_per_image`` of [scene] is 0.
+the time. `reconstruct` has no extra pairs: it sets ``pairs_per_image`` of [scene] to 0.
 """
 
 from collections.abc import Sequence

@@ -228,8 +228,8 @@ def sharing_with_placed(
 
 
 def with_placed_intrinsics(part: MergedGraph, reconstruction: Reconstruction) -> MergedGraph | None:
-    """Return the graph whose new images have the intrinsics of a finished model, ``None`` without
-    any such image.
+    """Return the graph whose new images have the intrinsics of a finished model, or ``None`` if no new
+    image has them.
 
     The model's images of the size must have one camera, and the new focal length must agree. A
     single new image determines its focal length poorly.
