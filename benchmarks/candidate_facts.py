@@ -25,8 +25,8 @@ from mkpc_kaggle.scene import colmap
 from mkpc_kaggle.scene.choose import evidence
 from mkpc_kaggle.scene.densify import extra_pairs
 from mkpc_kaggle.scene.keypoints import MergedGraph
-from mkpc_kaggle.scene.models import RegisteredImage
-from mkpc_kaggle.scene.sfm import Solution, models_of, reconstruct_batch
+from mkpc_kaggle.scene.models import RegisteredImage, models_of
+from mkpc_kaggle.scene.sfm import Solution, reconstruct_batch
 from mkpc_kaggle.scene.view_graph import MIN_MATCHES, BatchImage, BatchPair, ViewGraph, tracks_of
 
 TRUE = "!"  # suffix of a candidate without wrong edges

@@ -35,8 +35,8 @@ from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.metrics import pair_accuracy
 from mkpc_kaggle.recipe import CameraModel, SceneConfig
 from mkpc_kaggle.scene.align import find_similarity, model_size
-from mkpc_kaggle.scene.models import RegisteredImage, SfmModel
-from mkpc_kaggle.scene.sfm import models_of, reconstruct_batch
+from mkpc_kaggle.scene.models import RegisteredImage, SfmModel, models_of
+from mkpc_kaggle.scene.sfm import reconstruct_batch
 from mkpc_kaggle.scene.view_graph import BatchPair
 
 RECIPE = 'units = [{ stage = 1, matcher = "sift", long_side = 1024 }]\n'

@@ -29,8 +29,7 @@ from mkpc_kaggle.reporting.figures import (
     plain_axes,
     sample,
 )
-from mkpc_kaggle.scene.models import Reconstruction, SfmModel
-from mkpc_kaggle.scene.sfm import models_of
+from mkpc_kaggle.scene.models import Reconstruction, SfmModel, models_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -41,11 +41,11 @@ from mkpc_kaggle.scene.models import (
     SfmModel,
     filter_models,
 )
-from mkpc_kaggle.scene.shared_intrinsics import SharedIntrinsics, start_focal
 from mkpc_kaggle.scene.uncertainty import camera_sigmas
 from mkpc_kaggle.scene.view_graph import (
     MIN_MATCHES,
     BatchImage,
+    SharedIntrinsics,
     ViewGraph,
     known_by_name,
     placed_by_name,
@@ -208,7 +208,7 @@ def _start_camera(
     one of ``camera_model``; with the ``shared`` focal length, if any.
     """
     known = graph.known.get(image.digest) or graph.lenses.get(image.digest)
-    focal = shared or start_focal(image, uses_exif=graph.uses_exif)
+    focal = shared or graph.start_focal(image)
     # Its distortion, if any, comes later, where the photographs show it.
     plain = CameraModel.SIMPLE_PINHOLE if camera_model is CameraModel.AUTO else camera_model
     name = plain.value if known is None else known.model

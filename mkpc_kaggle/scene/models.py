@@ -202,3 +202,9 @@ def is_plausible(found: RegisteredImage) -> bool:
         and found.focal / max(found.image.size) in PLAUSIBLE_FOCALS
         and found.points >= MIN_POINTS
     )
+
+
+def models_of(reconstructions: Sequence[Reconstruction]) -> tuple[SfmModel, ...]:
+    """Return the models of all reconstructions, the largest first."""
+    models = (model for found in reconstructions for model in found.models)
+    return tuple(sorted(models, key=lambda model: -len(model.images)))

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from mkpc_kaggle.geometry.coordinates import Matrix3, Points, Size
 from mkpc_kaggle.scene.keypoints import MergedGraph
-from mkpc_kaggle.scene.shared_intrinsics import start_focal
 from mkpc_kaggle.scene.view_graph import MIN_MATCHES, BatchImage, ViewGraph
 
 Matrices: TypeAlias = NDArray[np.float64]
@@ -67,7 +66,7 @@ def is_rotation(H: Matrix3, points0: Points, points1: Points, K0: Matrices, K1: 
 def _intrinsics(image: BatchImage, graph: ViewGraph) -> Matrices:
     """Return the intrinsics (K, 3, 3) of an image for the tried focal lengths."""
     known = graph.known.get(image.digest)
-    focal = start_focal(image, uses_exif=graph.uses_exif) if known is None else known.focal
+    focal = graph.start_focal(image) if known is None else known.focal
     return intrinsics(focal, image.size)
 
 

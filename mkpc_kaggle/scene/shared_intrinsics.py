@@ -1,23 +1,30 @@
-"""Shared intrinsics of images from one camera at one zoom, detected by their focal lengths.
+"""Shared intrinsics: which images of one size have one focal length, and which reconstruction says so.
 
-An image's own focal length is ambiguous with the distance to the scene, and poorly constrained by
-few points. If most images of one size agree on the focal length, one camera is assumed. A second
-reconstruction then has shared intrinsics. If the user declares one camera, the first reconstruction
-already has shared intrinsics (``cameras`` of [scene], ``--camera``). It is :func:`mkpc_kaggle.scene.sfm.share`
-that reconstructs again, and refuses the result if images then see fewer points.
+An image's own focal length is ambiguous with the distance to the scene, and poorly constrained by few points. So
+images of one camera at one zoom share it. ``cameras`` of [scene] (``--camera``) says how:
+
+- ``auto``: :func:`share` reconstructs a second time, if most images of one size agree on the focal length. The
+  second reconstruction is refused if images then see fewer points.
+- ``folder``: the user declares one camera. The first reconstruction already shares it (:func:`given_intrinsics`).
+- ``image``: no image shares.
+
+New images of a finished model have its camera, unless ``image`` (:func:`sharing_with_placed`). Images with a
+camera of the user's are not compared.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
 
 import numpy as np
 
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.focal_prior import FOCAL_RATIO
+from mkpc_kaggle.geometry.intrinsics import KnownCamera, PlacedCamera
 from mkpc_kaggle.recipe import CameraSharing, SceneConfig
-from mkpc_kaggle.scene.models import SfmModel
-from mkpc_kaggle.scene.view_graph import BatchImage
+from mkpc_kaggle.scene.keypoints import MergedGraph
+from mkpc_kaggle.scene.mapper import Make, loses_points, refine_complete
+from mkpc_kaggle.scene.models import Reconstruction, SfmModel, models_of
+from mkpc_kaggle.scene.view_graph import BatchImage, SharedIntrinsics
 
 TOLERANCE = 0.02  # maximum relative deviation of agreeing focal lengths from the median
 MIN_ALIKE = 5  # registered images of one size
@@ -26,13 +33,40 @@ ZOOM_POINTS = 0.5
 
 EXIF_TOLERANCE = 0.1  # of one zoom; values of 35 mm film are rounded to millimetres
 
-# By image digest: the focal length, in pixels, of the camera that images of one size share.
-SharedIntrinsics: TypeAlias = Mapping[str, float]
 
+def share(
+    parts: Sequence[MergedGraph],
+    reconstructions: list[Reconstruction],
+    free: Sequence[BatchImage],
+    config: SceneConfig,
+    make: Make,
+) -> tuple[list[Reconstruction], SharedIntrinsics] | None:
+    """Return reconstructions with shared intrinsics of the ``free`` images that seem to share a
+    camera, or ``None`` if none do, or if images then see fewer points.
 
-def start_focal(image: BatchImage, *, uses_exif: bool = True) -> float:
-    """Return the initial focal length of an image's camera, in pixels; from EXIF if known."""
-    return (uses_exif and image.focal) or FOCAL_RATIO * max(image.size)
+    They start from the poses ``reconstructions`` where these are good enough. Images that seem to have another
+    zoom share, too, unless they lose points by that.
+    """
+    models = models_of(reconstructions)
+    alike = shared_intrinsics(free, models)
+    if not alike:
+        return None
+    everything = shared_intrinsics(free, models, with_zoomed=True)
+    if everything.keys() != alike.keys():
+        # From these poses alone: most zooms are real, and the mapper takes long.
+        together = []
+        for part, former in zip(parts, reconstructions, strict=True):
+            refined = refine_complete(part, everything, config, former)
+            if refined is not None:
+                together.append(refined)
+        zoomed = undecided_zooms(free, models)
+        if len(together) == len(parts) and not loses_points(reconstructions, together, zoomed):
+            return together, everything
+    again = []
+    for part, former in zip(parts, reconstructions, strict=True):
+        refined = refine_complete(part, alike, config, former)
+        again.append(refined or make(part, alike))
+    return None if loses_points(reconstructions, again) else (again, alike)
 
 
 def given_intrinsics(
@@ -88,6 +122,64 @@ def undecided_zooms(images: Sequence[BatchImage], models: Sequence[SfmModel]) ->
         if group is not None and image.digest in group.zoomed and not is_decided:
             undecided.add(image.digest)
     return undecided
+
+
+def sharing_with_placed(
+    parts: Sequence[MergedGraph],
+    reconstructions: Sequence[Reconstruction],
+    shared: SharedIntrinsics,
+    make: Make,
+) -> tuple[list[MergedGraph], list[Reconstruction]]:
+    """Return the graphs and the reconstructions with the intrinsics of :func:`with_placed_intrinsics`,
+    unless images then see fewer points.
+    """
+    chosen = list(parts)
+    found = list(reconstructions)
+    for number, part in enumerate(parts):
+        placed = with_placed_intrinsics(part, found[number])
+        if placed is None:
+            continue
+        again = make(placed, shared)
+        if not loses_points([found[number]], [again]):
+            chosen[number] = placed
+            found[number] = again
+    return chosen, found
+
+
+def with_placed_intrinsics(part: MergedGraph, reconstruction: Reconstruction) -> MergedGraph | None:
+    """Return the graph whose new images have the intrinsics of a finished model, or ``None`` if no new
+    image has them.
+
+    The model's images of the size must have one camera, and the new focal length must agree. A
+    single new image determines its focal length poorly.
+    """
+    known = part.graph.known
+    lenses: dict[Size, set[KnownCamera]] = {}
+    for image in part.graph.images:
+        camera = known.get(image.digest)
+        if isinstance(camera, PlacedCamera):
+            lens = KnownCamera(camera.model, camera.parameters)
+            lenses.setdefault(image.size, set()).add(lens)
+    alike = {}
+    for registered in (
+        registered for model in reconstruction.models for registered in model.images
+    ):
+        image = registered.image
+        of_size = lenses.get(image.size, set())
+        if image.digest in known or len(of_size) != 1:
+            continue
+        (lens,) = of_size
+        if abs(registered.focal / lens.focal - 1) < TOLERANCE:
+            alike[image.digest] = lens
+    return part.starting_with(known={**known, **alike}) if alike else None
+
+
+def refined_intrinsics(
+    images: Sequence[BatchImage], models: Sequence[SfmModel]
+) -> SharedIntrinsics:
+    """Return the focal length of each image, by the largest model with an image of its size."""
+    focals = {each.image.size: each.focal for model in reversed(models) for each in model.images}
+    return {image.digest: focals[image.size] for image in images if image.size in focals}
 
 
 @dataclass(frozen=True)

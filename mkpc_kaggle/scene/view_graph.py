@@ -2,12 +2,14 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import TypeAlias
 
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from mkpc_kaggle.geometry.coordinates import Matrix3, Size
+from mkpc_kaggle.geometry.focal_prior import FOCAL_RATIO
 from mkpc_kaggle.geometry.intrinsics import KnownCamera, PlacedCamera, Rows, camera_of
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.pipeline.pair import UnitResult
@@ -15,6 +17,9 @@ from mkpc_kaggle.pipeline.pair import UnitResult
 MIN_MATCHES = 15  # of a connecting edge; also the minimum number of inliers of a verified edge
 # From units that make tracks; with fewer, a pair uses the matches of all units
 MIN_TRACK_MATCHES = 50
+
+# By image digest: the focal length, in pixels, of the camera that images of one size share
+SharedIntrinsics: TypeAlias = Mapping[str, float]
 
 
 @dataclass(frozen=True)
@@ -78,6 +83,11 @@ class ViewGraph:
         return tuple(image.name for image in self.images)
 
     @property
+    def free(self) -> tuple[BatchImage, ...]:
+        """The images without a camera of the user's."""
+        return tuple(image for image in self.images if image.digest not in self.known)
+
+    @property
     def strong(self) -> "ViewGraph":
         """The graph with only the edges that have at least ``MIN_MATCHES`` matches."""
         edges = (edge for edge in self.edges if len(edge.matches) >= MIN_MATCHES)
@@ -117,6 +127,10 @@ class ViewGraph:
         return replace(
             self, known={digest: camera for digest, camera in found.items() if camera is not None}
         )
+
+    def start_focal(self, image: BatchImage) -> float:
+        """Return the focal length that the camera of a free image starts with, in pixels."""
+        return (self.uses_exif and image.focal) or FOCAL_RATIO * max(image.size)
 
     def components(self) -> tuple["ViewGraph", ...]:
         """Return the components connected by strong edges, ordered by first image."""

@@ -19,7 +19,7 @@ from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.intrinsics import KnownCamera, PlacedCamera, camera_of
 from mkpc_kaggle.reconstruction.placed import placed_line, read_cameras, read_placed
 from mkpc_kaggle.scene.align import find_similarity, model_size, moved_by
-from mkpc_kaggle.scene.sfm import placed_lenses
+from mkpc_kaggle.scene.assumptions import placed_lenses
 from mkpc_kaggle.scene.view_graph import BatchImage, ViewGraph
 
 OLD = 4  # images of the finished model

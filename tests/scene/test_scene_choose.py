@@ -17,8 +17,8 @@ from mkpc_kaggle.scene.models import (
     RegisteredImage,
     SfmModel,
     filter_models,
+    models_of,
 )
-from mkpc_kaggle.scene.sfm import models_of
 from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair
 
 

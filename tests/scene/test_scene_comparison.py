@@ -14,8 +14,8 @@ from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.recipe import CameraModel, CameraSharing, SceneConfig
 from mkpc_kaggle.scene.align import find_similarity, model_size, moved_by
 from mkpc_kaggle.scene.comparison import compare_with_photographs
-from mkpc_kaggle.scene.models import Comparison, FocalSource, SfmModel
-from mkpc_kaggle.scene.sfm import models_of, reconstruct_sharing
+from mkpc_kaggle.scene.models import Comparison, FocalSource, SfmModel, models_of
+from mkpc_kaggle.scene.sfm import reconstruct_sharing
 from mkpc_kaggle.scene.view_graph import BatchPair, ViewGraph
 
 FOCAL = 840.0

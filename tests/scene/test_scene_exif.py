@@ -7,8 +7,8 @@ import pytest
 from benchmarks.synthetic_scene import synthetic_scene
 from mkpc_kaggle.recipe import SceneConfig
 from mkpc_kaggle.scene import colmap
-from mkpc_kaggle.scene.models import FocalSource
-from mkpc_kaggle.scene.sfm import models_of, reconstruct_sharing
+from mkpc_kaggle.scene.models import FocalSource, models_of
+from mkpc_kaggle.scene.sfm import reconstruct_sharing
 from mkpc_kaggle.scene.view_graph import BatchPair, ViewGraph
 
 FOCAL = 840.0

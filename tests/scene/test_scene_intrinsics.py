@@ -13,8 +13,8 @@ from mkpc_kaggle.geometry.intrinsics import (
 )
 from mkpc_kaggle.recipe import CameraSharing, SceneConfig
 from mkpc_kaggle.scene.export import HeldDirectory
-from mkpc_kaggle.scene.models import SfmModel
-from mkpc_kaggle.scene.sfm import models_of, reconstruct_sharing
+from mkpc_kaggle.scene.models import SfmModel, models_of
+from mkpc_kaggle.scene.sfm import reconstruct_sharing
 from mkpc_kaggle.scene.uncertainty import combined
 from mkpc_kaggle.scene.view_graph import ViewGraph
 

@@ -185,8 +185,10 @@ def test_shared_intrinsics_stay_unless_they_explain_fewer_points_and_the_files_a
     scene = synthetic_scene(6, points=300)
     # The images have different focal lengths, so sharing loses points.
     everything = {image.digest: FOCAL for image in scene.images}
-    monkeypatch.setattr("mkpc_kaggle.scene.sfm.shared_intrinsics", lambda *_, **__: everything)
-    monkeypatch.setattr("mkpc_kaggle.scene.sfm.MIN_OBSERVATIONS", least)
+    monkeypatch.setattr(
+        "mkpc_kaggle.scene.shared_intrinsics.shared_intrinsics", lambda *_, **__: everything
+    )
+    monkeypatch.setattr("mkpc_kaggle.scene.mapper.MIN_OBSERVATIONS", least)
     solution = reconstruct_batch(scene.pairs, CONFIG)
     assert len(set(focals_of(solution))) == cameras
 
@@ -218,7 +220,7 @@ def test_shared_intrinsics_start_from_the_poses_of_the_first_reconstruction(mapp
     scene = synthetic_scene(7, 12, points=250, focals=[FOCAL] * 7, seed=1)
     refined = reconstruct_batch(scene.pairs, CONFIG)
     assert mappings == [7]
-    monkeypatch.setattr("mkpc_kaggle.scene.sfm.refine_complete", lambda *_: None)
+    monkeypatch.setattr("mkpc_kaggle.scene.shared_intrinsics.refine_complete", lambda *_: None)
     mapped = reconstruct_batch(scene.pairs, CONFIG)
     assert mappings == [7, 7, 7]
     # The same optimum, from other starts
@@ -248,7 +250,9 @@ def test_poses_with_which_images_see_fewer_points_are_mapped_again(mappings, mon
     scene = synthetic_scene(6, points=300)
     # The images have different focal lengths, so no poses fit a shared one.
     everything = {image.digest: FOCAL for image in scene.images}
-    monkeypatch.setattr("mkpc_kaggle.scene.sfm.shared_intrinsics", lambda *_, **__: everything)
+    monkeypatch.setattr(
+        "mkpc_kaggle.scene.shared_intrinsics.shared_intrinsics", lambda *_, **__: everything
+    )
     solution = reconstruct_batch(scene.pairs, CONFIG)
     assert len(set(focals_of(solution))) == 6
     assert mappings == [6, 6]

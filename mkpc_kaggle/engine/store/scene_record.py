@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 
 from mkpc_kaggle.scene.candidates import ALL_UNITS
 from mkpc_kaggle.scene.choose import Choice
-from mkpc_kaggle.scene.models import Reconstruction, SfmModel
-from mkpc_kaggle.scene.sfm import models_of
+from mkpc_kaggle.scene.models import Reconstruction, SfmModel, models_of
 
 NOT_RECONSTRUCTED = "not reconstructed yet"
 NO_CAMERAS = "no matches connect its images"

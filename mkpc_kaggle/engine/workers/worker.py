@@ -45,7 +45,8 @@ from mkpc_kaggle.scene.candidates import (
     candidate_tracks,
     disagreement,
 )
-from mkpc_kaggle.scene.sfm import Solution, models_of, reconstruct_batch
+from mkpc_kaggle.scene.models import models_of
+from mkpc_kaggle.scene.sfm import Solution, reconstruct_batch
 from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair
 
 if TYPE_CHECKING:
