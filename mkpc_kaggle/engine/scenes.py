@@ -92,7 +92,6 @@ class SceneWork:
             job.candidate,
             answer.disagreement,
             key=job.key,
-            contents={image.name: image.digest for pair in job.pairs for image in pair.images},
         )
         # In the same transaction, a mark: these files belong to this scene.
         marks = [] if job.export is None else [Export(job.batch, job.key)]

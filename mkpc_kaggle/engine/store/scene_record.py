@@ -37,8 +37,7 @@ class SceneRecord:
     ``candidate`` states whose tracks were used, with its ``disagreement`` in degrees; ``rivals`` are the other
     candidates, the best first. The store has them as scenes.
 
-    ``key`` is that of the stored scene, and ``contents`` are the digests of its images by name. No reader
-    needs these today; the next change of the format may remove the column.
+    ``key`` is that of the stored scene.
     """
 
     batch: str
@@ -52,7 +51,6 @@ class SceneRecord:
     candidate: str = ALL_UNITS
     disagreement: float = 0.0
     key: str = field(default="", compare=False)
-    contents: Mapping[str, str] = field(default_factory=dict, compare=False)
     rivals: tuple[Rival, ...] = field(default=(), metadata={"is_stored": False})
 
     @classmethod
@@ -65,7 +63,6 @@ class SceneRecord:
         candidate: str = ALL_UNITS,
         disagreement: float = 0.0,
         key: str = "",
-        contents: Mapping[str, str] | None = None,
     ) -> "SceneRecord":
         models = models_of(reconstructions)
         reasons = dict.fromkeys(
@@ -84,7 +81,6 @@ class SceneRecord:
             # Later digits vary between processors
             disagreement=float(f"{disagreement:.6g}"),
             key=key,
-            contents=contents or {},
         )
 
     @property
