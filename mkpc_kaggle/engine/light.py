@@ -7,7 +7,7 @@ from typing import Any
 from mkpc_kaggle.engine.jobs import Cause, Estimated, EstimateJob, Failure, FeatureJob, Found
 from mkpc_kaggle.engine.plan.blame import Tries
 from mkpc_kaggle.engine.plan.budget import ESTIMATE
-from mkpc_kaggle.engine.run import HANG_FACTOR, Run
+from mkpc_kaggle.engine.run import Run
 from mkpc_kaggle.engine.store.database import Source, Store
 from mkpc_kaggle.engine.store.tables import Feature, PairEstimate, UnitPoints
 
@@ -16,10 +16,6 @@ from mkpc_kaggle.engine.store.tables import Feature, PairEstimate, UnitPoints
 MAX_PAIRS = 8
 # If this number of estimates was lost everywhere, and none ever succeeded, no other is tried.
 MAX_FAILED_ESTIMATES = 2
-# Expected seconds of an estimate that was not measured yet: eight permutations of 50,000 iterations
-# of MAGSAC take 0.7 s, and a busy machine is slower.
-UNMEASURED_S = 1.0
-UNMEASURED_SHARE = 0.25  # of the time left, at most
 
 
 class Estimating:
@@ -62,13 +58,6 @@ class Estimating:
             state.end_estimates(chosen)
             return None
         return EstimateJob(pairs, recipe, source)
-
-    def patience(self, job: EstimateJob) -> float:
-        run = self._run
-        mean = run.costs.mean(ESTIMATE)
-        patience = HANG_FACTOR * len(job.pairs) * (mean or UNMEASURED_S)
-        # A hung first estimate must not use up a short limit.
-        return patience if mean else min(patience, UNMEASURED_SHARE * run.budget.left())
 
     def save(self, job: EstimateJob, answer: Sequence[Estimated], seconds: float) -> None:
         run = self._run
@@ -166,9 +155,6 @@ class Features:
         """Return the next pending job, which is under way then."""
         # In the order of asking: a dict keeps it.
         return self.pending.pop(next(iter(self.pending)))
-
-    def patience(self, job: FeatureJob) -> None:
-        """Return ``None``: the cost of an arbitrary function is unknown."""
 
     def save(self, job: FeatureJob, answer: Found, seconds: float) -> None:
         value = answer.value

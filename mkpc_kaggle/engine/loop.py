@@ -34,6 +34,7 @@ from mkpc_kaggle.engine.plan.budget import Budget, Costs
 from mkpc_kaggle.engine.plan.pairs import extra_pairs_of
 from mkpc_kaggle.engine.plan.schedule import Crew, NextWork, is_complete, next_work
 from mkpc_kaggle.engine.plan.state import State
+from mkpc_kaggle.engine.plan.time_limits import start_limit, time_limit
 from mkpc_kaggle.engine.publication import Publication
 from mkpc_kaggle.engine.request import Ending, Request, RunReport
 from mkpc_kaggle.engine.restore import restore
@@ -43,15 +44,10 @@ from mkpc_kaggle.engine.store.database import Store
 from mkpc_kaggle.engine.store.dataframes import pair_tables
 from mkpc_kaggle.engine.store.image_files import current_digests, update_digests
 from mkpc_kaggle.engine.store.tables import Feature
-from mkpc_kaggle.engine.workers.places import START_TIMEOUT_S, Place, Site, Work
+from mkpc_kaggle.engine.workers.places import Place, Site, Work
 from mkpc_kaggle.errors import UserError, plural
 from mkpc_kaggle.progress import format_duration
 from mkpc_kaggle.scene.candidates import ALL_UNITS
-
-# A job of unknown cost that takes longer than this share of the time left hangs. A first job may be
-# slow (a warm-up, a slow disk), but the rest of the run must be able to make up for it.
-UNKNOWN_SHARE = 0.25
-MAX_UNKNOWN_S = 3600.0  # without a limit, no share is finite
 
 
 @dataclass(frozen=True, eq=False)
@@ -287,7 +283,7 @@ class Engine:
                 count = len(self._features.pending) + 1
                 waits.append((self._looking_since, f"features of images: {count} pending"))
             elif isinstance(place.job, SceneJob) and self._asked is not None:
-                about = format_duration(self._asked.reconstructing.forecast(place.job))
+                about = format_duration(self.costs.scene(place.job.matches))
                 text = f"batch {place.job.batch}: reconstructing its cameras, about {about}"
                 waits.append((place.since, text))
         return waits
@@ -429,29 +425,15 @@ class Engine:
         return min(count, self.site.scenes_at_a_time(is_matching=is_matching) - busy)
 
     def _start(self, place: Place, now: float) -> None:
-        timeout = START_TIMEOUT_S
-        # Other workers load no matchers: one that takes long to start hangs.
-        if place.work is not Work.MATCH:
-            timeout = min(timeout, max(self.budget.silence, self._unknown_patience(now)))
-        place.start(now, timeout)
+        loads_matchers = place.work is Work.MATCH
+        place.start(now, start_limit(self.budget, now, loads_matchers=loads_matchers))
 
     def _give(self, place: Place, job: Job | None, now: float) -> None:
         """Give a job to an idle worker; ``None`` if its points are lost, and it is planned again."""
         if job is None:
             self._must_replan = True
             return
-        place.submit(job, self._time_limit(job, now), now)
-
-    def _time_limit(self, job: Job, now: float) -> float:
-        """Return the seconds after which a worker counts as hung, from measured costs or from the
-        time left.
-        """
-        patience = self._handler(job).patience(job)
-        return self.budget.silence + (self._unknown_patience(now) if patience is None else patience)
-
-    def _unknown_patience(self, now: float) -> float:
-        left = max(0.0, self.budget.stop_units - now)
-        return min(MAX_UNKNOWN_S, UNKNOWN_SHARE * left)
+        place.submit(job, time_limit(job, self.costs, self.budget, now), now)
 
     def _handler(self, job: Job) -> JobHandler:
         """Return the kind of work that a job belongs to."""
@@ -472,7 +454,8 @@ class Engine:
     def _take_answer(self, place: Place, now: float) -> None:
         if place.job is not None:
             # By the costs known now: the job may have begun before any cost was measured.
-            place.limit = place.since + self._time_limit(place.job, place.since)
+            limit = time_limit(place.job, self.costs, self.budget, place.since)
+            place.limit = place.since + limit
         seconds = now - place.since
         answer = place.poll(now)
         if answer is None:

@@ -6,7 +6,7 @@ from typing import Any
 
 from mkpc_kaggle.engine.jobs import Cause, Failure, MatchJob, MatchPlan, Outcome, Phase
 from mkpc_kaggle.engine.plan.schedule import Crew, NextWork, outlook, upcoming_pairs
-from mkpc_kaggle.engine.run import HANG_FACTOR, Run
+from mkpc_kaggle.engine.run import Run
 from mkpc_kaggle.engine.store.image_files import image_rows
 from mkpc_kaggle.engine.store.rows import from_bytes, to_bytes
 from mkpc_kaggle.engine.store.tables import UnitPoints
@@ -112,18 +112,6 @@ class Matching:
         points = self._run.state.inputs_of(index).points
         units = {key: unit for unit, key in points.items()}
         return tuple(UnitResult(units[key], from_bytes(data[key])) for key in keys)
-
-    def patience(self, job: MatchJob) -> float | None:
-        """Return the seconds after which a job counts as hung, warm-up included; ``None`` if a cost
-        is unknown.
-        """
-        costs = self._run.costs
-        # A warm-up alone says little: it may take a hundred times as long as a later run, or less.
-        if not all(costs.is_known(unit.name) for unit in job.units):
-            return None
-        seconds = sum(costs.mean(unit.name) for unit in job.units)
-        expected = len(job.indices) * seconds
-        return HANG_FACTOR * expected + costs.warm_up(job.units)
 
     # Answers
 

@@ -20,9 +20,6 @@ from mkpc_kaggle.errors import plural
 # Faults of a run with different texts, and its decisions. The number of units that fit may change with
 # each job, for hours.
 MAX_FAULTS, MAX_PLANS = 1000, 10_000
-# A job that takes this multiple of its measured cost hangs. Stalls of twenty times the cost, as in the
-# simulator, must not cost a worker.
-HANG_FACTOR = 30.0
 
 
 class EventLog:
@@ -106,9 +103,6 @@ class Run:
 
 class JobHandler(Protocol):
     """The part of a kind of work that the loop calls for any job; each kind also makes its jobs."""
-
-    def patience(self, job: Any) -> float | None:
-        """Return the seconds after which a job counts as hung; ``None`` if its cost is unknown."""
 
     def save(self, job: Any, answer: Any, seconds: float) -> None:
         """Save the answer to a job that took ``seconds``: first in the store, then in the state."""

@@ -1,11 +1,8 @@
-"""Scenes of batches: their jobs, time limits, results and losses."""
-
-import numpy as np
+"""Scenes of batches: their jobs, results and losses."""
 
 from mkpc_kaggle.engine.jobs import Failure, SceneJob
-from mkpc_kaggle.engine.plan.budget import SCENE_MATCH_S, SCENE_START_S
 from mkpc_kaggle.engine.plan.state import State
-from mkpc_kaggle.engine.run import HANG_FACTOR, Run
+from mkpc_kaggle.engine.run import Run
 from mkpc_kaggle.engine.store.keys import of_camera_estimate, of_candidate
 from mkpc_kaggle.engine.store.scene_record import NOT_RECONSTRUCTED, SceneRecord, unmatched_scene
 from mkpc_kaggle.engine.store.tables import EventKind, Export, PairEstimate
@@ -58,7 +55,7 @@ class SceneWork:
             is_whole=folder is not None,
             with_estimates=state.uses_cameras,
         )
-        about = format_duration(self.forecast(job))
+        about = format_duration(run.costs.scene(job.matches))
         text = f"reconstructing its cameras from {plural(len(pairs), 'pair')}"
         if candidate != ALL_UNITS:
             text += f", by the tracks of {title_of(candidate)}"
@@ -66,15 +63,6 @@ class SceneWork:
                 text += ", again for its files"
         run.progress.note(f"batch {batch}: {text}, about {about}")
         return job
-
-    def forecast(self, job: SceneJob) -> float:
-        """Return the expected seconds of a job, by the scenes of this run so far."""
-        return float(self._run.costs.scenes(np.array([job.matches]))[0])
-
-    def patience(self, job: SceneJob) -> float:
-        # Small scenes measured so far say little about the time of a large one.
-        unmeasured = SCENE_START_S + SCENE_MATCH_S * job.matches
-        return HANG_FACTOR * max(self.forecast(job), unmeasured)
 
     def save(self, job: SceneJob, answer: Solution, seconds: float) -> None:
         """Save and use a scene, even if it is stale: the former scene is older still.

@@ -4,7 +4,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -23,7 +22,6 @@ from rectified import (
 from mkpc_kaggle.data.competition import Pair, submission_problems
 from mkpc_kaggle.engine import light
 from mkpc_kaggle.engine.jobs import EstimateJob, Job, SceneJob
-from mkpc_kaggle.engine.plan.budget import Budget, Costs
 from mkpc_kaggle.engine.plan.state import FALLBACK, PAIR, SCENE, State
 from mkpc_kaggle.engine.request import Ending, RunReport
 from mkpc_kaggle.engine.workers import places
@@ -133,12 +131,6 @@ def count_jobs(monkeypatch: pytest.MonkeyPatch) -> list[EstimateJob | None]:
 
     monkeypatch.setattr(light.Estimating, "job", noted)
     return jobs
-
-
-def test_a_first_estimate_that_hangs_does_not_take_an_hour_of_nine():
-    budget = Budget(0.0, 9 * 3600.0, lambda: 0.0)
-    estimating = light.Estimating(SimpleNamespace(costs=Costs(), budget=budget))
-    assert estimating.patience(SimpleNamespace(pairs=[None] * 8)) < 600
 
 
 MATCHES: dict[str, Callable[[Any], Any]] = {

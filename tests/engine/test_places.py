@@ -61,7 +61,7 @@ def test_three_different_items_lost_in_a_row_with_no_answer_between_close_a_plac
     place = place_of(waiting)
     for answer in answers:
         if place.worker is None:
-            place.start(0.0)
+            place.start(0.0, 9.0)
             waiting.append(Loaded())
             place.poll(0.0)
         waiting.append(Failure(cause) if isinstance(answer, str) else answer)
@@ -79,7 +79,7 @@ def test_a_worker_that_cannot_start_counts_as_a_loss():
     place.lose([("unit", 0, "A")], LOST, 0.0, ())
     for _ in range(2):
         assert not place.closed
-        place.start(0.0)
+        place.start(0.0, 9.0)
         place.poll(0.0)
     assert place.closed == "cpu: the device failed"
 
@@ -91,14 +91,14 @@ def test_a_thread_that_cannot_start_is_an_answer(monkeypatch):
 
     monkeypatch.setattr(threading.Thread, "start", no_thread)
     place = Place("scene", lambda: ThreadWorker("scene", scene_runner, lambda: None))
-    place.start(0.0)
+    place.start(0.0, 9.0)
     assert place.poll(0.0) == Failure(Cause.NOT_STARTED, "can't start new thread")
 
 
 def test_an_answer_that_has_arrived_counts_even_after_its_limit():
     # The loop may have been busy, so the limit is checked only if no answer is waiting.
     place = place_of([Loaded(), DONE])
-    place.start(0.0)
+    place.start(0.0, 9.0)
     place.poll(0.0)
     place.submit(job(), 10.0, now=0.0)
     assert place.poll(now=99.0) is DONE

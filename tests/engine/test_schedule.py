@@ -407,7 +407,7 @@ ABLATIONS = {  # a scenario that each mechanism of the plan serves
     "margin of units": Scenario(150, (1.0,) * 4, 1, 500.0, warm_up=1, spread=1.0, seed=4),
     "connect share": Scenario(100, (1.0,) * 3, 1, 300.0, warm_up=1, batches=2, pairs_per_image=6.0),
     "short jobs": Scenario(100, (1.0,) * 8, 2, 300.0, warm_up=1, spread=0.5, crashes=0.01, seed=4),
-    "patience": Scenario(150, (1.0, 1.0), 1, 400.0, warm_up=1, hangs=0.01, misses=0, seed=1),
+    "time limits": Scenario(150, (1.0, 1.0), 1, 400.0, warm_up=1, hangs=0.01, misses=0, seed=1),
     "second try": Scenario(100, (1.0,), 1, 600.0, warm_up=1, crashes=0.05),
     "end of tries": Scenario(100, (0.5, 1.0, 1.0), 1, 300.0, warm_up=1, never="m1"),
 }

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine import light, matching, scenes
+from mkpc_kaggle.engine import matching
 from mkpc_kaggle.engine.jobs import (
     Answer,
     Cause,
@@ -32,12 +32,11 @@ from mkpc_kaggle.engine.jobs import (
     SceneJob,
 )
 from mkpc_kaggle.engine.loop import Engine
-from mkpc_kaggle.engine.plan import blame, budget, schedule
+from mkpc_kaggle.engine.plan import blame, budget, schedule, time_limits
 from mkpc_kaggle.engine.plan.blame import MAX_TRIES
 from mkpc_kaggle.engine.plan.budget import MAX_SILENCE_S, SCENE_MARGIN, SCENE_START_S, Budget
 from mkpc_kaggle.engine.plan.schedule import RESERVE_SHARE
 from mkpc_kaggle.engine.request import Request, RunReport
-from mkpc_kaggle.engine.run import HANG_FACTOR
 from mkpc_kaggle.engine.store.database import Store
 from mkpc_kaggle.engine.store.dataframes import PairTables
 from mkpc_kaggle.engine.store.keys import Keys
@@ -73,7 +72,7 @@ MECHANISMS: dict[str, tuple[tuple[object, str, object], ...]] = {
     "latest costs": ((budget, "WINDOW", 10**9),),
     "short jobs": ((schedule, "JOB_SHARE", math.inf),),
     "connect share": ((schedule, "CONNECT_SHARE", 1.0),),
-    "patience": tuple((kind, "HANG_FACTOR", math.inf) for kind in (matching, light, scenes)),
+    "time limits": ((time_limits, "HANG_FACTOR", math.inf),),
     "second try": ((blame, "MAX_TRIES", 1),),
     "end of tries": ((matching, "MAX_FAILED_PAIRS", 10**9),),
 }
@@ -613,7 +612,7 @@ def sweep_seconds(scenario: Scenario) -> float:
     stalls = scenario.stalls * (STALL - 1) * unit
     faults = (scenario.crashes + scenario.hangs) * start + scenario.hangs * STALL * unit
     faults += scenario.job_faults * (start + STALL * unit)
-    hang = FATES[Cause.TIMED_OUT] * (HANG_FACTOR * unit + MAX_SILENCE_S)
+    hang = FATES[Cause.TIMED_OUT] * (time_limits.HANG_FACTOR * unit + MAX_SILENCE_S)
     faults += scenario.bad_pairs * MAX_TRIES * (start + hang)
     workers = max(1, scenario.workers - scenario.bad_places)
     return start + scenario.pairs * (unit + stalls + faults) / workers

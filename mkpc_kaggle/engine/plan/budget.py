@@ -194,6 +194,10 @@ class Costs:
         slowdown = max(1.0, self._slowdown())
         return np.asarray(slowdown * (SCENE_START_S + matches * SCENE_MARGIN * rate))
 
+    def scene(self, matches: int) -> float:
+        """Return the expected seconds of a scene with this number of matches."""
+        return float(self.scenes(np.array([matches]))[0])
+
     def warm_up(self, units: Iterable[Unit]) -> float:
         """Return the longest warm-up of these units, in seconds, by the latest of each unit."""
         return max((self._warm_up.get(unit.name, 0.0) for unit in units), default=0.0)

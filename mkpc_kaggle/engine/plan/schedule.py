@@ -3,9 +3,14 @@
 :func:`next_work` is a pure function. It has no queue and no memory: it looks at the state, the
 costs and the time left whenever a worker is idle.
 
-Three rules decide that a unit no longer fits in time: :func:`prefix_that_fits` for all pairs,
-:func:`next_work` for one more job, and before each minibatch of a job ``may_start`` of
-:class:`mkpc_kaggle.engine.workers.worker.MatchRunner`, which makes it smaller first.
+A unit no longer fits in time by two rules:
+
+- :func:`prefix_that_fits`: its forecast for all rows exceeds the time left. It waits for the last phase.
+- :func:`pairs_in_time`: one more pair would not end in time. It does not begin, in any phase. Near the end, a
+  minibatch is made smaller first.
+
+A job has the expected seconds of its units and the time left. Its worker applies the second rule again before each
+minibatch, by its own clock (``may_start`` of :class:`mkpc_kaggle.engine.workers.worker.MatchRunner`).
 """
 
 from collections.abc import Sequence
@@ -117,10 +122,9 @@ def next_work(
     fit = prefix_that_fits(snapshot)
     connecting = pairs_to_connect(snapshot)
     phases = phases_of(snapshot, fit, connecting)
-    # A unit that would not end in time does not begin. An unmeasured unit may: its cost is 0 so far.
     wanted = phases.copy(order="F")
     for number, unit in enumerate(state.units):
-        if costs.mean(unit.name) >= snapshot.stop - now:
+        if pairs_in_time(snapshot, unit) <= 1:
             wanted[:, number] = NEVER
     # The most urgent phase of each pair, and of the pairs that no worker has now
     first = wanted.min(1)
@@ -188,6 +192,17 @@ def prefix_that_fits(snapshot: Snapshot) -> int:
     return int(np.searchsorted(seconds_of_prefixes(snapshot), left, side="right"))
 
 
+def pairs_in_time(snapshot: Snapshot, unit: Unit) -> float:
+    """Return on how many pairs, one after the other, a unit would end in time.
+
+    Infinite for an unmeasured unit, as long as there is time: its cost is learnt from its first run.
+    """
+    if not snapshot.left:
+        return 0.0
+    mean = snapshot.costs.mean(unit.name)
+    return snapshot.left / mean if mean else inf
+
+
 def seconds_of_prefixes(snapshot: Snapshot) -> NDArray[np.float64]:
     """Return the seconds (U,) of one worker for the missing units of each prefix of the recipe."""
     state = snapshot.state
@@ -243,8 +258,7 @@ def match_plan(snapshot: Snapshot, phase: Phase, missing: Mask, ready: Mask) -> 
     alone = any(("unit", first, unit.name) in state.tries.alone for unit in units)
     size = 1 if alone else snapshot.crew.minibatch
     # Near the end, a smaller minibatch still ends in time.
-    if mean := snapshot.costs.mean(units[0].name):
-        size = max(1, int(min(size, snapshot.left / mean)))
+    size = max(1, int(min(size, pairs_in_time(snapshot, units[0]))))
     indices = (first,)
     if size > 1:
         alike = order[(missing[order] == missing[first]).all(1)]
@@ -498,7 +512,7 @@ def candidates_due(
 def candidate_seconds(snapshot: Snapshot, batch: str, candidate: str) -> float:
     """Return the expected seconds of a candidate."""
     matches = snapshot.state.matches_of_candidate(batch, candidate)
-    return float(snapshot.costs.scenes(np.array([matches]))[0])
+    return snapshot.costs.scene(matches)
 
 
 def candidates_reserve(snapshot: Snapshot) -> float:

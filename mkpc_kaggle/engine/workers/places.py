@@ -1,9 +1,8 @@
 """Places of workers. A place has one worker at a time, and is closed after it loses three different
 items in a row (:mod:`mkpc_kaggle.engine.plan.blame`).
 
-A hung worker ends here: the loop sets :attr:`Place.limit` from measured costs
-(``Engine._time_limit``), and :meth:`Place.poll` kills a worker that has not answered by then. Its
-process gets SIGKILL.
+A hung worker ends here: :meth:`Place.poll` kills a worker that has not answered by :attr:`Place.limit`, which the
+loop sets (:mod:`mkpc_kaggle.engine.plan.time_limits`).
 """
 
 import queue
@@ -24,7 +23,6 @@ from mkpc_kaggle.engine.workers.worker import Maker, MatchRunner, light_runner, 
 from mkpc_kaggle.pipeline.stages import Pipeline
 from mkpc_kaggle.setup.assembly import Assembly
 
-START_TIMEOUT_S = 300.0  # for a worker to load its matchers, which is slow from a network disk
 # Times the number of workers lost in a row: scarce memory may become free meanwhile.
 RESTART_PAUSE_S = 1.0
 LISTEN_S = 0.2  # between checks for an interrupt, since a signal does not ring
@@ -75,7 +73,7 @@ class Place:
     def may_start(self, now: float) -> bool:
         return self.worker is None and not self.closed and now >= self.limit
 
-    def start(self, now: float, timeout: float = START_TIMEOUT_S) -> None:
+    def start(self, now: float, timeout: float) -> None:
         """Start a worker. Its first answer says whether it is loaded."""
         self.since = now
         self.limit = now + timeout
