@@ -1,6 +1,6 @@
 """Draws of a scene's images, and the facts of their candidates, for :mod:`benchmarks.candidates`."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import process_time
@@ -35,6 +35,7 @@ SCALES_PX = (0.5, 1.0, 2.0)  # of the robust evidence of matches
 HELD_OUT = 5  # every fifth pair is kept out of the second mapping
 LOST = 90.0  # degrees; of a pair that a candidate has no F for
 RIGHT_PX = 2.0  # Sampson distance of a right match from the true F
+MIN_RIGHT = 0.5  # share of the inliers of a right edge
 # The same of matches before verification, of which many are wrong on right edges, too
 RIGHT_MATCH_PX = 3.0
 MIN_RIGHT_MATCHES = 0.3
@@ -145,28 +146,45 @@ def share_right(F: Matrix3, matches: Matches, pixels: float = RIGHT_PX) -> float
     return float(np.mean(sampson_distances(F, matches) < pixels))
 
 
-def edges_of(draw: "Draw", candidate: str) -> list[tuple[int, float, float]]:
-    """Return each verified edge: inliers, their share that is right, and their median distance in
-    pixels from the true F.
-    """
+@dataclass(frozen=True, eq=False)
+class VerifiedEdge:
+    """Two images, the matches that verify them, and the true F."""
+
+    images: tuple[BatchImage, BatchImage]
+    inliers: Matches
+    F: Matrix3
+
+    @property
+    def share_right(self) -> float:
+        return share_right(self.F, self.inliers)
+
+    @property
+    def is_wrong(self) -> bool:
+        return self.share_right < MIN_RIGHT
+
+    @property
+    def distance(self) -> float:
+        """The median distance of the inliers from the true F, in pixels."""
+        return float(np.median(sampson_distances(self.F, self.inliers)))
+
+
+def verified_edges(draw: "Draw", candidate: str) -> Iterator[VerifiedEdge]:
+    """Yield the edges of a candidate's view graph that COLMAP verifies."""
     merged = MergedGraph(ViewGraph.of_pairs(batch_of(draw, draw.pairs, candidate)))
     config = draw.recipe.scene or SceneConfig()
     with pycolmap.Database.open(":memory:") as database:
         cameras = colmap._write_images(database, merged, {}, config.camera_model)
         geometries = colmap.verify(merged, cameras)
-    found = []
     for edge, geometry in zip(merged.graph.edges, geometries, strict=True):
         indices = geometry.inlier_matches
         if len(indices) < MIN_MATCHES:
             continue
-        names = (merged.graph.images[edge.first].name, merged.graph.images[edge.second].name)
+        images = (merged.graph.images[edge.first], merged.graph.images[edge.second])
         points0 = merged.keypoints[edge.first][indices[:, 0]]
         points1 = merged.keypoints[edge.second][indices[:, 1]]
         inliers = Matches(points0, points1, np.ones(len(indices)))
-        F = draw.true_fundamental(names)
-        distance = float(np.median(sampson_distances(F, inliers)))
-        found.append((len(indices), share_right(F, inliers), distance))
-    return found
+        F = draw.true_fundamental((images[0].name, images[1].name))
+        yield VerifiedEdge(images, inliers, F)
 
 
 def tracks_from(pair: Stored, candidate: str) -> Matches:
@@ -281,7 +299,10 @@ def facts_of(draw: Draw) -> dict[str, Any]:
             rest = cameras_by_digest(mapped(draw, kept, name)[0])
         candidates[name] = {
             "seconds": seconds,
-            "edges": edges_of(draw, name),
+            "edges": [
+                (len(edge.inliers), edge.share_right, edge.distance)
+                for edge in verified_edges(draw, name)
+            ],
             "accuracies": accuracies,
             "reasons": reasons,
             "models": [len(model) for model in models[name]],

@@ -32,7 +32,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.candidate_facts import ALL, TRUE, Draw, drawn, facts_of, read_journals
+from benchmarks.candidate_facts import ALL, MIN_RIGHT, TRUE, Draw, drawn, facts_of, read_journals
 from benchmarks.candidate_judges import JUDGES, Facts, by_rotations, choice_of
 from mkpc_kaggle.data.competition import TrainScene, read_train_side
 from mkpc_kaggle.evaluation.compare import paired_difference
@@ -43,7 +43,6 @@ TIE = 0.005  # of mAA
 SIGMAS = (0.01, 0.03, 0.1, LOOSE_SIGMA, 1.0, np.inf)  # upper bounds of classes, in model sizes
 # Of the product's judge: today's rule wins unless another is nearer
 MARGINS = (0.01, 0.02, 0.03, 0.05)
-MIN_RIGHT = 0.5  # share of the inliers of a right edge
 
 
 def maa(facts: Facts, name: str) -> float:
