@@ -1,4 +1,15 @@
-"""The number of CPU cores that this process may use."""
+"""CPU cores that this process may use, and the threads of its workers.
+
+| worker | threads |
+| --- | --- |
+| process of matching | all cores, or its part if several share them: :func:`limit_matching_threads` |
+| actor on a machine of a Ray cluster without GPUs | the number of CPUs that Ray has there, by the same function |
+| process of estimates and features | one: :func:`limit_to_one_thread` |
+| process of a scene | all cores to verify its pairs; ``threads`` of [scene], one by default, for the mapper |
+| thread of the user's process (``--workers 0``) | the process's limits stay as they are |
+
+The number of processes is decided in :mod:`mkpc_kaggle.engine.workers.places`.
+"""
 
 import os
 from collections.abc import Iterator
@@ -18,6 +29,27 @@ def available_cores() -> int:
     if hasattr(os, "sched_getaffinity"):  # not on macOS and Windows
         cores = len(os.sched_getaffinity(0))
     return max(1, int(min(cores, cpu_quota())))
+
+
+def limit_matching_threads(threads: int = 0, share: int = 1) -> None:
+    """Limit PyTorch and OpenCV to ``threads``, or to the cores of one of ``share`` processes."""
+    import cv2
+    import torch
+
+    # PyTorch counts the machine's cores, and knows OMP_NUM_THREADS.
+    available = min(torch.get_num_threads(), available_cores())
+    threads = threads or max(1, available // share)
+    torch.set_num_threads(threads)
+    cv2.setNumThreads(threads)
+
+
+def limit_to_one_thread() -> None:
+    """Limit OpenCV, and the libraries of NumPy and SciPy, to one thread."""
+    import cv2
+    from threadpoolctl import threadpool_limits  # comes with scikit-learn
+
+    cv2.setNumThreads(1)
+    threadpool_limits(1)
 
 
 def cpu_quota(own: Path = OWN_CGROUPS, root: Path = CGROUPS) -> float:

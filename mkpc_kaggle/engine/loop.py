@@ -31,12 +31,11 @@ from mkpc_kaggle.engine.light import Estimating, Features
 from mkpc_kaggle.engine.matching import Matching
 from mkpc_kaggle.engine.plan.blame import Item, different
 from mkpc_kaggle.engine.plan.budget import Budget, Costs
-from mkpc_kaggle.engine.plan.pairs import extra_pairs_of
 from mkpc_kaggle.engine.plan.schedule import Crew, NextWork, is_complete, next_work
 from mkpc_kaggle.engine.plan.state import State
 from mkpc_kaggle.engine.plan.time_limits import start_limit, time_limit
 from mkpc_kaggle.engine.publication import Publication
-from mkpc_kaggle.engine.request import Ending, Request, RunReport
+from mkpc_kaggle.engine.request import Ending, Request, RunReport, batches_of
 from mkpc_kaggle.engine.restore import restore
 from mkpc_kaggle.engine.run import EventLog, JobHandler, Run
 from mkpc_kaggle.engine.scenes import SceneWork, scene_failures, scene_records
@@ -48,6 +47,7 @@ from mkpc_kaggle.engine.workers.places import Place, Site, Work
 from mkpc_kaggle.errors import UserError, plural
 from mkpc_kaggle.progress import format_duration
 from mkpc_kaggle.scene.candidates import ALL_UNITS
+from mkpc_kaggle.scene.densify import extra_pairs_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +143,8 @@ class Engine:
         """
         # For the report: an interrupted program has two seconds for it, and the import takes one.
         import_module("pandas")
-        state = State(request, extra_pairs_of(request.pairs, request.recipe.scene))
+        batches = batches_of(request.pairs)
+        state = State(request, extra_pairs_of(request.pairs, batches, request.recipe.scene))
         if damaged := len(self.store.damaged):
             # They are missing now, like results that never were.
             text = f"{plural(damaged, 'result')} of the journal, damaged, will be computed again"

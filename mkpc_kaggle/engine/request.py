@@ -1,15 +1,18 @@
-"""The request of a run, and its final report."""
+"""The request of a run, its distinct pairs and batches, and the final report."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.store.dataframes import PairTables
 from mkpc_kaggle.engine.store.keys import Keys
-from mkpc_kaggle.engine.store.scene_record import SceneRecord
+from mkpc_kaggle.engine.store.scene_record import MIN_PAIRS, SceneRecord
 from mkpc_kaggle.engine.store.tables import About, Event
 from mkpc_kaggle.geometry.intrinsics import Rows
 from mkpc_kaggle.recipe import Recipe
@@ -88,3 +91,44 @@ class RunReport:
     units_failed: int = 0  # that raised
     estimated: int = 0
     log: Path | None = None  # the output of workers' libraries, if any
+
+
+def distinct_pairs(rows: Iterable[Pair]) -> tuple[list[Pair], NDArray[np.int_]]:
+    """Return the distinct pairs of a table, the first row of each, and the pair of each row.
+
+    Rows of a batch with the same two images are one pair: they share its points and its estimate.
+    """
+    pairs: list[Pair] = []
+    known: dict[Any, int] = {}
+    pair_of_row = []
+    for pair in rows:
+        # With other intrinsics, another E is estimated.
+        intrinsics = pair.intrinsics and tuple(K.tobytes() for K in pair.intrinsics)
+        key = (pair.group, pair.file0, pair.file1, pair.turns, intrinsics)
+        if key not in known:
+            known[key] = len(pairs)
+            pairs.append(pair)
+        pair_of_row.append(known[key])
+    return pairs, np.array(pair_of_row, int)
+
+
+def names_of(pair: Pair, root: str) -> tuple[str, str]:
+    """Return the paths of a pair's images below ``root``."""
+    return name_below(root, pair.file0), name_below(root, pair.file1)
+
+
+def name_below(root: str, file: str) -> str:
+    """Return a file's path relative to ``root``, or the whole path if the file lies elsewhere."""
+    return file.removeprefix(root.rstrip("/") + "/") if root else file
+
+
+def batches_of(pairs: Iterable[Pair]) -> dict[str, list[int]]:
+    """Return the pair indices of each batch that can be reconstructed: two or more pairs without
+    intrinsics.
+    """
+    batches: dict[str, list[int]] = {}
+    for index, pair in enumerate(pairs):
+        # With known intrinsics, a pair gets an E, which no scene can replace.
+        if pair.intrinsics is None:
+            batches.setdefault(pair.group, []).append(index)
+    return {name: members for name, members in batches.items() if len(members) >= MIN_PAIRS}

@@ -6,9 +6,9 @@ down, and an image of width w covers [-0.5, w - 0.5). A resize by s gives ``x_vi
 offset. A quarter turn swaps the axes and flips one of them. Padding is added right and bottom, so
 coordinates do not change.
 
-Networks use other conventions: adapters of matchers convert to this one by :func:`from_corner` and
-:func:`from_normalised`. The pipeline converts the matches of a unit to image pixels once
-(``Pipeline._match``), by :meth:`View.to_image`.
+The matches of every unit become full-image pixels once, by :meth:`View.to_image` (``Pipeline._match`` calls it for
+both images). Before that, adapters of networks with other conventions call :func:`from_corner` and
+:func:`from_normalised`. Points for COLMAP's files and functions are shifted by ``COLMAP_CENTRE_PX``.
 """
 
 from dataclasses import dataclass
@@ -22,6 +22,8 @@ from numpy.typing import NDArray
 Points = NDArray[np.float32]
 Pixels = NDArray[np.uint8]
 Matrix3 = NDArray[np.float64]  # (3, 3)
+
+COLMAP_CENTRE_PX = 0.5  # in COLMAP, the centre of the top-left pixel is (0.5, 0.5)
 
 
 class Size(NamedTuple):

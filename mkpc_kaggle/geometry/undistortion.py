@@ -3,10 +3,8 @@
 import cv2
 import numpy as np
 
-from mkpc_kaggle.geometry.coordinates import Pixels, Size
+from mkpc_kaggle.geometry.coordinates import COLMAP_CENTRE_PX, Pixels, Size
 from mkpc_kaggle.geometry.intrinsics import KnownCamera
-
-CENTRE_PX = 0.5  # in COLMAP the top-left pixel's centre is (0.5, 0.5), in OpenCV (0, 0)
 
 
 def undistorted(pixels: Pixels, lens: KnownCamera, pinhole: KnownCamera, size: Size) -> Pixels:
@@ -26,7 +24,9 @@ def opencv_camera(camera: KnownCamera) -> tuple[np.ndarray, np.ndarray]:
     """
     x, y = camera.principal_point
     focals = camera.focals
-    K = np.array([[focals[0], 0, x - CENTRE_PX], [0, focals[-1], y - CENTRE_PX], [0, 0, 1.0]])
+    K = np.array(
+        [[focals[0], 0, x - COLMAP_CENTRE_PX], [0, focals[-1], y - COLMAP_CENTRE_PX], [0, 0, 1.0]]
+    )
     coefficients = np.zeros(8)
     # COLMAP's models are parts of OpenCV's.
     coefficients[: len(camera.distortion)] = camera.distortion

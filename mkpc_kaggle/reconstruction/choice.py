@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.console import logger
 from mkpc_kaggle.engine.loop import Engine
-from mkpc_kaggle.engine.plan.pairs import name_below
+from mkpc_kaggle.engine.request import name_below
 from mkpc_kaggle.engine.session import Session, request_of
 from mkpc_kaggle.engine.store.database import Source
 from mkpc_kaggle.engine.store.keys import digest

@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mkpc_kaggle.data.images import Image, read_image
-from mkpc_kaggle.geometry.coordinates import Pixels
+from mkpc_kaggle.geometry.coordinates import COLMAP_CENTRE_PX, Pixels
 
-CENTRE_PX = 0.5  # in COLMAP the top-left pixel's centre is (0.5, 0.5)
 DECODERS = 4  # threads, and decoded images at a time
 
 
@@ -30,7 +29,7 @@ def colour_points(model: Any, folder: Path) -> None:
         picture = read_image(folder / image.name)
         if not observed or not isinstance(picture, Image):
             return np.empty(0, np.int64), np.empty((0, 3))
-        points = np.array([point.xy for point in observed]) - CENTRE_PX
+        points = np.array([point.xy for point in observed]) - COLMAP_CENTRE_PX
         numbers = np.array([point.point3D_id for point in observed], np.int64)
         return numbers, colours_at(picture.pixels, points)
 

@@ -9,10 +9,9 @@ import numpy as np
 
 from mkpc_kaggle.data.hloc import HlocPair, write_hloc
 from mkpc_kaggle.errors import plural, writing
-from mkpc_kaggle.geometry.coordinates import Points, Size
+from mkpc_kaggle.geometry.coordinates import COLMAP_CENTRE_PX, Points, Size
 from mkpc_kaggle.scene.export import DATABASE
 
-COLMAP_CENTRE_PX = 0.5  # of the top-left pixel; here it is 0
 PAIR_BASE = 2**31 - 1  # COLMAP's id of a pair is id0 * PAIR_BASE + id1
 
 

@@ -14,8 +14,7 @@ from mkpc_kaggle.data.images import Unreadable, has_usable_shape, read_image, re
 from mkpc_kaggle.data.masks import Masks
 from mkpc_kaggle.engine.console import logger
 from mkpc_kaggle.engine.plan.budget import Budget
-from mkpc_kaggle.engine.plan.pairs import name_below
-from mkpc_kaggle.engine.request import RunReport
+from mkpc_kaggle.engine.request import RunReport, name_below
 from mkpc_kaggle.engine.session import Interrupt, Session, interruptible
 from mkpc_kaggle.engine.store.database import FILE_NAME
 from mkpc_kaggle.engine.store.scene_record import SceneRecord

@@ -7,9 +7,8 @@ from pathlib import Path
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.data.masks import Masks
 from mkpc_kaggle.engine.console import logger
-from mkpc_kaggle.engine.plan.pairs import name_below
 from mkpc_kaggle.engine.plan.state import State
-from mkpc_kaggle.engine.request import RunReport
+from mkpc_kaggle.engine.request import RunReport, name_below
 from mkpc_kaggle.engine.scenes import scene_failures
 from mkpc_kaggle.engine.session import Session, opened_engine, request_of
 from mkpc_kaggle.errors import writing

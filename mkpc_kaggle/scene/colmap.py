@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from mkpc_kaggle.cores import available_cores
 from mkpc_kaggle.geometry.cameras import Camera
+from mkpc_kaggle.geometry.coordinates import COLMAP_CENTRE_PX
 from mkpc_kaggle.geometry.intrinsics import KnownCamera
 from mkpc_kaggle.recipe import CameraModel, SceneConfig
 from mkpc_kaggle.scene.adjustment import adjust
@@ -51,7 +52,6 @@ from mkpc_kaggle.scene.view_graph import (
     placed_by_name,
 )
 
-CENTRE_PX = 0.5  # in COLMAP the top-left pixel's centre is (0.5, 0.5), here it is (0, 0)
 # Of a verified match; 1 px loses accuracy on tourist photographs, 4 px on repeated windows
 MAX_ERROR_PX = 2.0
 MAX_TRIALS = 300  # RANSAC trials per edge; more trials find the same inliers at five times the cost
@@ -196,7 +196,7 @@ def _write_images(
         frame = pycolmap.Frame(frame_id=number, rig_id=camera.camera_id)
         frame.add_data_id(taken.data_id)
         database.write_frame(frame, use_frame_id=True)
-        database.write_keypoints(number, points + np.float32(CENTRE_PX))
+        database.write_keypoints(number, points + np.float32(COLMAP_CENTRE_PX))
         used.append(camera)
     return used
 
@@ -241,7 +241,7 @@ def verify(merged: MergedGraph, cameras: Sequence[Any], *, reuse: bool = False) 
     # COLMAP takes matches without motion for a watermark, but nearby views have many of these.
     settings = {"ransac": ransac, "min_num_inliers": MIN_MATCHES, "detect_watermark": False}
     options = pycolmap.TwoViewGeometryOptions(settings)
-    points = [keypoints.astype(np.float64) + CENTRE_PX for keypoints in merged.keypoints]
+    points = [keypoints.astype(np.float64) + COLMAP_CENTRE_PX for keypoints in merged.keypoints]
     lenses = [_lens(camera) for camera in cameras]
 
     def estimate(number: int) -> None:
@@ -472,7 +472,7 @@ def _sfm_model(found: Any, graph: ViewGraph) -> SfmModel:
         image = found.images[number]
         pose = np.asarray(image.cam_from_world().matrix())
         K = np.array(image.camera.calibration_matrix())
-        K[:2, 2] -= CENTRE_PX
+        K[:2, 2] -= COLMAP_CENTRE_PX
         # Copies: the views would keep pycolmap's memory.
         camera = Camera(K, pose[:, :3].copy(), pose[:, 3].copy())
         images.append(

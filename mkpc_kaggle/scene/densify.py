@@ -1,18 +1,53 @@
-"""Extra pairs that densify the view graph of a batch with few pairs per image.
+"""Extra pairs, which no row names: they densify the view graph of a batch with few pairs per image.
 
-In the phase *Connect*, the engine matches them by the recipe's first unit alone, without an F, for a tenth of
-the time. `reconstruct` has no extra pairs: it sets ``pairs_per_image`` of [scene] to 0.
+- Which: :func:`extra_pairs_of` fills each batch up to ``pairs_per_image`` of [scene]. `reconstruct` sets it to 0.
+- How: matched by the unit of the sweep alone, and without an F, because they serve scenes alone.
+- When: in the phase *Connect*, after the sweep, for up to a tenth of the time that is left then
+  (``pairs_to_connect`` of :mod:`mkpc_kaggle.engine.plan.schedule`).
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from math import ceil
+from pathlib import Path
 from typing import TypeAlias
 
 import numpy as np
 
+from mkpc_kaggle.data.competition import Pair
+from mkpc_kaggle.recipe import SceneConfig
+
 MAX_IMAGES = 2000  # the search is quadratic in the number of images
 
 IndexPair: TypeAlias = tuple[int, int]  # indices of a pair's two images, the smaller first
+
+
+def extra_pairs_of(
+    pairs: Sequence[Pair], batches: Mapping[str, Sequence[int]], config: SceneConfig | None
+) -> list[Pair]:
+    """Return the extra pairs of all batches, the most useful first.
+
+    ``batches`` has the indices of each batch's pairs. The batch with the fewest pairs per image is filled first.
+    """
+    if config is None or not config.pairs_per_image:
+        return []
+    extra: list[tuple[float, Pair]] = []
+    for batch, indices in batches.items():
+        number: dict[str, int] = {}  # of each image in its batch
+        ends = []
+        for index in indices:
+            pair = pairs[index]
+            i = number.setdefault(pair.file0, len(number))
+            j = number.setdefault(pair.file1, len(number))
+            ends.append((i, j))
+        files = list(number)
+        distinct = len({tuple(sorted(pair)) for pair in ends})
+        more = extra_pairs(len(files), ends, config.pairs_per_image)
+        for count, (i, j) in enumerate(more, start=distinct):
+            name = f"{batch};{Path(files[i]).stem}-{Path(files[j]).stem}"
+            pair = Pair(name, batch, files[i], files[j])
+            # Pairs per image of the batch before this pair is added: the order of all batches.
+            extra.append((count / len(files), pair))
+    return [pair for _, pair in sorted(extra, key=lambda each: each[0])]
 
 
 def extra_pairs(image_count: int, pairs: Sequence[IndexPair], per_image: float) -> list[IndexPair]:

@@ -10,7 +10,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from mkpc_kaggle.geometry.coordinates import Matrix3, Points, Size
+from mkpc_kaggle.geometry.coordinates import COLMAP_CENTRE_PX, Matrix3, Points, Size
 from mkpc_kaggle.scene.keypoints import MergedGraph
 from mkpc_kaggle.scene.view_graph import MIN_MATCHES, BatchImage, ViewGraph
 
@@ -40,8 +40,9 @@ def hardly_moved(merged: MergedGraph) -> bool:
             continue
         index = np.asarray(geometry.inlier_matches)
         # H is for COLMAP's pixels, whose (0, 0) is the corner of the first one.
-        points0 = merged.keypoints[edge.first][index[:, 0]] + np.float32(0.5)
-        points1 = merged.keypoints[edge.second][index[:, 1]] + np.float32(0.5)
+        centre = np.float32(COLMAP_CENTRE_PX)
+        points0 = merged.keypoints[edge.first][index[:, 0]] + centre
+        points1 = merged.keypoints[edge.second][index[:, 1]] + centre
         ends = (merged.graph.images[edge.first], merged.graph.images[edge.second])
         K0, K1 = (_intrinsics(image, merged.graph) for image in ends)
         rotations.append(is_rotation(np.asarray(geometry.H), points0, points1, K0, K1))

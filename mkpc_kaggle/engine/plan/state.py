@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.jobs import Cause, Failure, PairInputs, visiting_order
 from mkpc_kaggle.engine.plan.blame import Item, Tries
-from mkpc_kaggle.engine.plan.pairs import batches_of, distinct_pairs, names_of
 from mkpc_kaggle.engine.plan.scene_state import SceneState
-from mkpc_kaggle.engine.request import Request
+from mkpc_kaggle.engine.request import Request, batches_of, distinct_pairs, names_of
 from mkpc_kaggle.engine.store.image_files import contents_of
 from mkpc_kaggle.engine.store.keys import Images, of_camera_estimate
 from mkpc_kaggle.engine.store.scene_record import SceneRecord
@@ -153,8 +152,12 @@ class State:
 
     @property
     def fundamentals(self) -> NDArray[np.float64]:
-        """The F to write (R, 3, 3) for each row of the request: an earlier one that stands in, else the
-        scene's, else the pair's, else the fallback.
+        """The F to write (R, 3, 3) for each row of the request, with its source. The first that exists:
+
+        - "earlier": the F of the last table of pairs, while it :attr:`stands_in`;
+        - "scene": the F of the pair's cameras, where :func:`mkpc_kaggle.scene.choose.choose` prefers it;
+        - "pair": the F of its matches, at the focal lengths of the scene if these are known;
+        - "fallback": a fixed matrix.
         """
         sources, written = self._written
         # The last gate of the submission: the competition refuses a whole file for one matrix.

@@ -1,11 +1,7 @@
 """The work of workers: matching, estimates, features of images, reconstructions.
 
 Importing this module does not import torch, which only matching needs.
-
-Threads: one matching process uses all cores, and N processes share the cores. A process for
-estimates has one thread. A scene verifies its pairs on all cores, and maps on ``threads`` of [scene]. On a
-Ray cluster without GPUs, a machine's actor has one thread per CPU. A worker that is a thread of the
-user's process leaves the process's limits as they are.
+The threads of each worker are decided in :mod:`mkpc_kaggle.cores`.
 """
 
 import time
@@ -16,7 +12,7 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
-from mkpc_kaggle.cores import available_cores
+from mkpc_kaggle.cores import limit_matching_threads, limit_to_one_thread
 from mkpc_kaggle.data.images import Image, ImageStore, Unreadable, read_image
 from mkpc_kaggle.engine.jobs import (
     Answer,
@@ -99,14 +95,7 @@ class MatchRunner:
         is_limited: bool = True,
     ) -> None:
         if is_limited:
-            import cv2
-            import torch
-
-            # PyTorch counts the machine's cores, and knows OMP_NUM_THREADS.
-            available = min(torch.get_num_threads(), available_cores())
-            threads = threads or max(1, available // share)
-            torch.set_num_threads(threads)
-            cv2.setNumThreads(threads)
+            limit_matching_threads(threads, share)
         self._pipeline = make_pipeline()
         self._pipeline.load()
         self.refused = self._pipeline.unloadable
@@ -182,11 +171,7 @@ def light_runner(*, in_process: bool = True) -> Runner:
     """
     # The user's own process keeps its thread limits.
     if in_process:
-        import cv2
-        from threadpoolctl import threadpool_limits  # comes with scikit-learn
-
-        cv2.setNumThreads(1)
-        threadpool_limits(1)
+        limit_to_one_thread()
     return do_light_job
 
 
