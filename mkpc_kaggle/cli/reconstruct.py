@@ -12,7 +12,7 @@ from mkpc_kaggle.data.masks import Masks
 from mkpc_kaggle.data.outputs import require_apart
 from mkpc_kaggle.engine.console import logger
 from mkpc_kaggle.engine.session import interruptible
-from mkpc_kaggle.engine.store.scene_record import MIN_PAIRS, NOT_RECONSTRUCTED
+from mkpc_kaggle.engine.store.tables import MIN_PAIRS, NOT_RECONSTRUCTED
 from mkpc_kaggle.errors import UserError, plural
 from mkpc_kaggle.geometry.intrinsics import Rows
 from mkpc_kaggle.progress import format_duration

@@ -13,8 +13,7 @@ from mkpc_kaggle.engine.store.database import Store
 from mkpc_kaggle.engine.store.image_files import known_images
 from mkpc_kaggle.engine.store.keys import of_candidate
 from mkpc_kaggle.engine.store.published import Published
-from mkpc_kaggle.engine.store.scene_record import SceneRecord
-from mkpc_kaggle.engine.store.tables import Export, PairEstimate, UnitPoints
+from mkpc_kaggle.engine.store.tables import Export, PairEstimate, SceneRecord, UnitPoints
 from mkpc_kaggle.geometry.crop_need import pays
 from mkpc_kaggle.geometry.robust import ModelKind
 from mkpc_kaggle.scene.export import has_files

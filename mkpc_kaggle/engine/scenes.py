@@ -4,8 +4,14 @@ from mkpc_kaggle.engine.jobs import Failure, SceneJob
 from mkpc_kaggle.engine.plan.state import State
 from mkpc_kaggle.engine.run import Run
 from mkpc_kaggle.engine.store.keys import of_camera_estimate, of_candidate
-from mkpc_kaggle.engine.store.scene_record import NOT_RECONSTRUCTED, SceneRecord, unmatched_scene
-from mkpc_kaggle.engine.store.tables import EventKind, Export, PairEstimate
+from mkpc_kaggle.engine.store.tables import (
+    NOT_RECONSTRUCTED,
+    EventKind,
+    Export,
+    PairEstimate,
+    SceneRecord,
+    unmatched_scene,
+)
 from mkpc_kaggle.errors import plural
 from mkpc_kaggle.progress import format_duration
 from mkpc_kaggle.scene.candidates import ALL_UNITS, title_of

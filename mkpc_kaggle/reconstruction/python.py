@@ -17,7 +17,7 @@ from mkpc_kaggle.engine.plan.budget import Budget
 from mkpc_kaggle.engine.request import RunReport, name_below
 from mkpc_kaggle.engine.session import Interrupt, Session, interruptible
 from mkpc_kaggle.engine.store.database import FILE_NAME
-from mkpc_kaggle.engine.store.scene_record import SceneRecord
+from mkpc_kaggle.engine.store.tables import SceneRecord
 from mkpc_kaggle.errors import UserError, plural, temporary_directory
 from mkpc_kaggle.matchers.contract import Matcher
 from mkpc_kaggle.recipe import Recipe

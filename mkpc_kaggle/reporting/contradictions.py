@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from mkpc_kaggle.engine.store.scene_record import SceneRecord
+from mkpc_kaggle.engine.store.tables import SceneRecord
 from mkpc_kaggle.errors import plural
 from mkpc_kaggle.scene.models import (
     HARDLY_MOVED,

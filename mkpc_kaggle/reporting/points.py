@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mkpc_kaggle.engine.store.scene_record import SceneRecord
+from mkpc_kaggle.engine.store.tables import SceneRecord
 from mkpc_kaggle.scene.export import SPARSE
 from mkpc_kaggle.scene.models import MAX_POINTS
 

@@ -16,8 +16,14 @@ from mkpc_kaggle.engine.store.dataframes import (
 )
 from mkpc_kaggle.engine.store.image_files import stored_digests
 from mkpc_kaggle.engine.store.published import Published
-from mkpc_kaggle.engine.store.scene_record import MIN_PAIRS, SceneRecord, unmatched_scene
-from mkpc_kaggle.engine.store.tables import About, Event, EventKind
+from mkpc_kaggle.engine.store.tables import (
+    MIN_PAIRS,
+    About,
+    Event,
+    EventKind,
+    SceneRecord,
+    unmatched_scene,
+)
 from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.geometry.coordinates import Box
 from mkpc_kaggle.geometry.critical_region import CriticalRegion, RegionReason

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, TypeAlias
 
 from mkpc_kaggle.engine.request import Ending, RunReport
 from mkpc_kaggle.engine.store.dataframes import NOT_REACHED, SECONDS
-from mkpc_kaggle.engine.store.scene_record import NOT_RECONSTRUCTED, SceneRecord
+from mkpc_kaggle.engine.store.tables import NOT_RECONSTRUCTED, SceneRecord
 from mkpc_kaggle.errors import plural
 from mkpc_kaggle.geometry.critical_region import RegionReason
 from mkpc_kaggle.geometry.overlap import MIN_SUPPORT

@@ -14,7 +14,7 @@ import numpy as np
 
 from mkpc_kaggle.data.outputs import replacing
 from mkpc_kaggle.engine.store.json_values import to_text
-from mkpc_kaggle.engine.store.scene_record import NO_CAMERAS, SceneRecord
+from mkpc_kaggle.engine.store.tables import NO_CAMERAS, SceneRecord
 from mkpc_kaggle.errors import UserError, plural, printable, writing
 from mkpc_kaggle.reporting.contradictions import contradictions, has_moved, named
 from mkpc_kaggle.reporting.run_log import RunLog

@@ -20,7 +20,7 @@ from mkpc_kaggle.engine.request import Ending, RunReport
 from mkpc_kaggle.engine.session import Interrupt, Session, run_pairs
 from mkpc_kaggle.engine.store.database import Store
 from mkpc_kaggle.engine.store.published import Published
-from mkpc_kaggle.engine.store.scene_record import Rival
+from mkpc_kaggle.engine.store.tables import Rival
 from mkpc_kaggle.engine.workers.worker import compute_scene
 from mkpc_kaggle.recipe import Recipe, SceneConfig, Unit
 from mkpc_kaggle.reporting.run_log import read_log

@@ -16,8 +16,7 @@ from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.request import Ending
 from mkpc_kaggle.engine.store.database import Store
 from mkpc_kaggle.engine.store.dataframes import matrices_of
-from mkpc_kaggle.engine.store.scene_record import SceneRecord
-from mkpc_kaggle.engine.store.tables import PairEstimate
+from mkpc_kaggle.engine.store.tables import PairEstimate, SceneRecord
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.robust import Method
 from mkpc_kaggle.pipeline.stages import Pipeline

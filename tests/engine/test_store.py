@@ -23,9 +23,8 @@ from mkpc_kaggle.engine.run import EventLog
 from mkpc_kaggle.engine.store import database as store_module
 from mkpc_kaggle.engine.store.database import FILE_NAME, Store
 from mkpc_kaggle.engine.store.published import Published
-from mkpc_kaggle.engine.store.scene_record import SceneRecord
 from mkpc_kaggle.engine.store.sqlite_file import connected
-from mkpc_kaggle.engine.store.tables import Feature, PairEstimate, UnitPoints
+from mkpc_kaggle.engine.store.tables import Feature, PairEstimate, SceneRecord, UnitPoints
 from mkpc_kaggle.errors import UserError
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from run_tables import Described, tables_of
 
-from mkpc_kaggle.engine.store.scene_record import SceneRecord
+from mkpc_kaggle.engine.store.tables import SceneRecord
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.reporting.verdict import nearest_to_joining

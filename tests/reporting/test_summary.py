@@ -8,8 +8,7 @@ import pytest
 from run_tables import UNIT, Described, tables_of
 
 from mkpc_kaggle.engine.request import Ending, RunReport
-from mkpc_kaggle.engine.store.scene_record import NOT_RECONSTRUCTED, SceneRecord
-from mkpc_kaggle.engine.store.tables import About
+from mkpc_kaggle.engine.store.tables import NOT_RECONSTRUCTED, About, SceneRecord
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.recipe import Recipe, Unit

@@ -14,8 +14,7 @@ import pytest
 from run_tables import Described, tables_of
 
 from mkpc_kaggle.engine.request import Ending
-from mkpc_kaggle.engine.store.scene_record import NO_CAMERAS, SceneRecord
-from mkpc_kaggle.engine.store.tables import About, Event, EventKind
+from mkpc_kaggle.engine.store.tables import NO_CAMERAS, About, Event, EventKind, SceneRecord
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.intrinsics import KnownCamera

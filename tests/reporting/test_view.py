@@ -12,7 +12,7 @@ import pycolmap
 import pytest
 from browser import Page, needs_browser, opened_browser
 
-from mkpc_kaggle.engine.store.scene_record import SceneRecord
+from mkpc_kaggle.engine.store.tables import SceneRecord
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.intrinsics import KnownCamera

@@ -4,7 +4,7 @@ from collections.abc import Collection, Iterable, Sequence
 
 from mkpc_kaggle.engine.plan.blame import Item
 from mkpc_kaggle.engine.store.keys import of_candidate
-from mkpc_kaggle.engine.store.scene_record import SceneRecord
+from mkpc_kaggle.engine.store.tables import SceneRecord
 from mkpc_kaggle.scene.candidates import ALL_UNITS, best_of
 
 

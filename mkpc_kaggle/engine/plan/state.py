@@ -19,8 +19,7 @@ from mkpc_kaggle.engine.plan.scene_state import SceneState
 from mkpc_kaggle.engine.request import Request, batches_of, distinct_pairs, names_of
 from mkpc_kaggle.engine.store.image_files import contents_of
 from mkpc_kaggle.engine.store.keys import Images, of_camera_estimate
-from mkpc_kaggle.engine.store.scene_record import SceneRecord
-from mkpc_kaggle.engine.store.tables import PairEstimate, UnitPoints
+from mkpc_kaggle.engine.store.tables import PairEstimate, SceneRecord, UnitPoints
 from mkpc_kaggle.geometry.coordinates import Matrix3
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 from mkpc_kaggle.scene.candidates import ALL_UNITS, candidates_of

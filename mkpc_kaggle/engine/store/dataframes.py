@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from mkpc_kaggle.engine.store.database import Store
 from mkpc_kaggle.engine.store.published import Published
-from mkpc_kaggle.engine.store.scene_record import SceneRecord
 from mkpc_kaggle.engine.store.sqlite_file import connected
 from mkpc_kaggle.engine.store.tables import (
     LAYOUTS,
@@ -26,6 +25,7 @@ from mkpc_kaggle.engine.store.tables import (
     PairEstimate,
     PublishedPair,
     PublishedRun,
+    SceneRecord,
     UnitPoints,
 )
 from mkpc_kaggle.geometry.overlap import MIN_SUPPORT

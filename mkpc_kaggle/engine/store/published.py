@@ -11,8 +11,7 @@ from typing import Self
 from mkpc_kaggle.engine.store.database import Store
 from mkpc_kaggle.engine.store.image_files import known_images, stored_digests
 from mkpc_kaggle.engine.store.rows import from_bytes
-from mkpc_kaggle.engine.store.scene_record import SceneRecord
-from mkpc_kaggle.engine.store.tables import PublishedPair, PublishedRun, UnitPoints
+from mkpc_kaggle.engine.store.tables import PublishedPair, PublishedRun, SceneRecord, UnitPoints
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.scene.view_graph import BatchImage
 
