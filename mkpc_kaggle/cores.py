@@ -1,12 +1,10 @@
 """CPU cores that this process may use, and the threads of its workers.
 
-| worker | threads |
-| --- | --- |
-| process of matching | all cores, or its part if several share them: :func:`limit_matching_threads` |
-| actor on a machine of a Ray cluster without GPUs | the number of CPUs that Ray has there, by the same function |
-| process of estimates and features | one: :func:`limit_to_one_thread` |
-| process of a scene | all cores to verify its pairs; ``threads`` of [scene], one by default, for the mapper |
-| thread of the user's process (``--workers 0``) | the process's limits stay as they are |
+- A process of matching has all cores, or its share of them (:func:`limit_matching_threads`).
+- An actor on a machine of a Ray cluster without GPUs has the CPUs that Ray has there, by the same function.
+- A process of estimates and features has one thread (:func:`limit_to_one_thread`).
+- A process of a scene verifies its pairs on all cores. Its mapper has ``threads`` of [scene], one by default.
+- A thread of the user's process (``--workers 0``) leaves the limits of the process as they are.
 
 The number of processes is decided in :mod:`mkpc_kaggle.engine.workers.places`.
 """

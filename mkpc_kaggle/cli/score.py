@@ -13,8 +13,8 @@ from mkpc_kaggle.evaluation.validate import score_submission, score_table, to_js
 HELP = """\
 Score submissions whose truth is known. Nothing is matched.
 
-With --train-dir and --truth, by the rules of 2022: each sample is a pair of the train side, and the score is the
-mAA over rotation errors of 1 to 10 degrees and translation errors of 0.2 to 5 metres. With --imc2025, files of
+With --train-dir and --truth, by the rules of 2022. Each sample is a pair of the train side. The score is the mAA
+over rotation errors of 1 to 10 degrees and translation errors of 0.2 to 5 metres. With --imc2025, files of
 `reconstruct --format imc2025` by the rules of 2025: mAA of the camera centres, and the share of right images in
 the clusters.
 """

@@ -104,8 +104,8 @@ def _exif(data: bytes) -> PIL.Image.Exif:
 def _chunks(data: bytes, start: int, head: str, wanted: bytes, trailer: int) -> Iterator[bytes]:
     """Yield the contents of the chunks of a kind, from ``start``.
 
-    ``head`` is the struct of a chunk's length and kind. ``trailer`` bytes follow a content; those
-    of RIFF have an even length.
+    ``head`` is the struct of a chunk's length and kind. ``trailer`` bytes follow a content. RIFF
+    pads contents to an even length.
     """
     while start + 8 <= len(data):
         parts = struct.unpack_from(head, data, start)

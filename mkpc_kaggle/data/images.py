@@ -215,7 +215,7 @@ def _with_end(data: Pixels, more: bytes) -> Pixels:
 def _stored(pixels: Pixels, orientation: int) -> Pixels:
     """Return the stored pixels of a picture that was set upright from an EXIF orientation."""
     if orientation in (2, 4, 5, 7):
-        # Mirrored: 2 as such, the others turned as 3, 8 and 6 are.
+        # Mirrored: 2 and no more; 4, 5 and 7 are also turned, like 3, 8 and 6.
         pixels = pixels[:, ::-1]
     turns = -TURNS.get(orientation, 0)
     return np.ascontiguousarray(np.rot90(pixels, turns))

@@ -27,8 +27,8 @@ from mkpc_kaggle.setup.assembly import Assembly
 
 AUTO_RECIPE = "auto"  # the recipe of all matchers whose weights are found
 # Of MAGSAC on a pair, whose F is for the report alone. Pairs that do not overlap run all iterations.
-# On 20 pairs of reichstag_26, 2,000 take 15 ms a pair in place of the 24 ms of 10,000, find 1.00 of
-# the inliers, and doubt the same pairs.
+# On 20 pairs of reichstag_26, 2,000 take 15 ms a pair and 10,000 take 24 ms. They find 1.00 of the
+# inliers, and doubt the same pairs.
 MAGSAC_ITERATIONS = 2_000
 EARLIER = "its cameras and models are from an earlier run, as this one has no new ones yet"
 

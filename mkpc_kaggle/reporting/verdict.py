@@ -182,8 +182,8 @@ def _scene_problems(scene: SceneRecord, log: RunLog) -> Iterator[str]:
 
 
 def nearest_to_joining(scene: SceneRecord, pairs: "DataFrame", digests: Mapping[str, str]) -> str:
-    """Return the pair of images of two models with the most inliers, as text; empty if no such
-    pair has any.
+    """Return the pair of images of two models with the most inliers, as text; empty
+    without inliers.
 
     ``digests`` are of the contents of the images, by name.
     """

@@ -1,8 +1,8 @@
 """Assumptions about lenses that the photographs may contradict: EXIF's focal lengths, no distortion.
 
 If they do, a second reconstruction does without the assumption, and it stays if images see no fewer points.
-:mod:`mkpc_kaggle.scene.shared_intrinsics` does the same for shared cameras. What the photographs say is in
-:mod:`mkpc_kaggle.scene.comparison`.
+:mod:`mkpc_kaggle.scene.shared_intrinsics` does the same for shared cameras. The comparison with the
+photographs is in :mod:`mkpc_kaggle.scene.comparison`.
 """
 
 from collections.abc import Sequence

@@ -17,8 +17,8 @@ MIN_IMAGES = 3  # in a model
 MIN_POINTS = 30  # seen by a plausible image
 MAX_POINTS = 20_000  # of a model, for pictures and views: the points of the longest tracks
 MAX_SIGMA_IMAGES = 200  # of a model with sigmas; memory is quadratic and time cubic in the images
-# Sigma of centres, in sizes of the model. Over draws of five scenes, F of cameras up to a sigma of 0.1
-# gains 0.08 to 0.11 on F of the pair, and F of the others 0.01 (benchmarks.candidates).
+# Sigma of centres, in sizes of the model. Over draws of five scenes (benchmarks.candidates), cameras
+# with a sigma up to 0.1 gain 0.08 to 0.11 on F of the pair. The others gain 0.01.
 LOOSE_SIGMA = 0.25
 MAX_CENTRE_SIGMA = 0.02  # of the model's size; a camera with a larger expected error is uncertain
 # The reason for missing and for doubtful cameras

@@ -32,7 +32,7 @@ class Column:
 
 @dataclass(frozen=True)
 class Layout(Generic[T]):
-    """The table of a dataclass. ``facts`` are all columns besides ``data``, if there is such a column.
+    """The table of a dataclass. ``facts`` are all columns besides ``data``, if any.
 
     The facts are the first fields of the dataclass, in this order.
     """
