@@ -19,9 +19,8 @@ import pycolmap
 
 from mkpc_kaggle.data.competition import TrainScene, TruePair, read_train_side
 from mkpc_kaggle.geometry.cameras import Camera, fundamental_of_cameras
+from mkpc_kaggle.geometry.coordinates import COLMAP_CENTRE_PX
 from mkpc_kaggle.geometry.metrics import PoseError, pair_accuracy, pose_error
-
-CENTRE_PX = 0.5  # in COLMAP the top-left pixel's centre is (0.5, 0.5), in the tables it is (0, 0)
 
 Cameras = dict[str, Camera]
 
@@ -56,7 +55,7 @@ def cameras_of(model: pycolmap.Reconstruction) -> Cameras:
         image = model.images[number]
         pose = image.cam_from_world().matrix()
         K = image.camera.calibration_matrix()
-        K[:2, 2] -= CENTRE_PX
+        K[:2, 2] -= COLMAP_CENTRE_PX
         name = Path(image.name).stem
         cameras[name] = Camera(K, pose[:, :3], pose[:, 3])
     return cameras

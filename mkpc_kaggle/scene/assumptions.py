@@ -50,8 +50,8 @@ def doubts_exif(graph: ViewGraph, reconstruction: Reconstruction) -> bool:
     """Return whether wrong focal lengths of EXIF may be why cameras are missing or doubtful."""
     if not any(image.focal for image in graph.free):
         return False
-    matched = {image for edge in graph.edges for image in (edge.first, edge.second)}
-    if not reconstruction.models or reconstruction.registered < MIN_REGISTERED * len(matched):
+    matched = len(graph.matched)
+    if not reconstruction.models or reconstruction.registered < MIN_REGISTERED * matched:
         return True
     if reconstruction.models[0].is_loose:
         return True
@@ -62,7 +62,7 @@ def doubts_exif(graph: ViewGraph, reconstruction: Reconstruction) -> bool:
         if registered.image.focal
         and abs(np.log(registered.focal / registered.image.focal)) > MAX_EXIF_LOG_DEVIATION
     ]
-    return bool(contradicting) and reconstruction.registered < len(matched)
+    return bool(contradicting) and reconstruction.registered < matched
 
 
 def placed_lenses(graph: ViewGraph) -> dict[str, KnownCamera]:

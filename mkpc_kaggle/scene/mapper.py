@@ -72,8 +72,7 @@ def refine_complete(
     Return ``None`` if the mapper might do better: some matched images have no common model, or
     images see fewer points than before, so the former poses do not fit the shared intrinsics.
     """
-    matched = {image for edge in merged.graph.edges for image in (edge.first, edge.second)}
-    if not former.models or len(former.models[0].images) < len(matched):
+    if not former.models or len(former.models[0].images) < len(merged.graph.matched):
         return None
     refined = reconstruct_connected(merged, shared, config, former.models[:1])
     if refined.observations < MIN_OBSERVATIONS * former.observations:

@@ -88,6 +88,11 @@ class ViewGraph:
         return tuple(image for image in self.images if image.digest not in self.known)
 
     @property
+    def matched(self) -> set[int]:
+        """The numbers of the images with an edge."""
+        return {image for edge in self.edges for image in (edge.first, edge.second)}
+
+    @property
     def strong(self) -> "ViewGraph":
         """The graph with only the edges that have at least ``MIN_MATCHES`` matches."""
         edges = (edge for edge in self.edges if len(edge.matches) >= MIN_MATCHES)

@@ -4,9 +4,13 @@ The store remembers a file's size, time of change and digest under its name. A f
 again only if its size or time has changed. A fresh run digests nothing: the worker that decodes an
 image returns its digest.
 
-An image that is replaced between two runs has another digest, so another key: its pairs and their batch's
-scene are computed again, and nothing of the former file stands in for them. During a run the results of the
-former content are dropped once a worker decodes the new one (``State.use_image``).
+**An image that is replaced** has another digest, so another key: its pairs and their batch's scene are computed
+again, and nothing of the former file stands in for them.
+
+- Between two runs, :func:`update_digests` notices it by size and time, at the start.
+- In a run, each answer has the digest of the content that its worker decoded. With a new digest, all results of
+  the former content are dropped (``State.use_image``). A worker may match the former content as long as it has
+  the decoded picture in its cache; encodings are cached by content.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
