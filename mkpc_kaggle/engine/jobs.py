@@ -4,7 +4,7 @@ Messages are pickled, so none has a connection, a lock, or a large array that th
 itself.
 """
 
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum, StrEnum
 from pathlib import Path
@@ -226,12 +226,3 @@ class Failure:
 
 # The answer to a match job or an estimate job has a value for each pair, in the order of the job.
 Answer = Loaded | tuple[Outcome, ...] | tuple[Estimated, ...] | Solution | Found | Failure
-
-
-def visiting_order(pairs: Sequence[Pair]) -> list[int]:
-    """Return pair indices in an order that puts pairs with a common image together, for encoding
-    cache hits.
-    """
-    # The group first: a batch that is finished early gets its scene early.
-    keys = [(pair.group, pair.file0, pair.file1) for pair in pairs]
-    return sorted(range(len(pairs)), key=keys.__getitem__)

@@ -2,7 +2,7 @@
 
 The schedule decides which pairs, estimates and scenes come next
 (:mod:`mkpc_kaggle.engine.plan.schedule`). Each kind of work has a file for its jobs and their answers
-(:mod:`matching`, :mod:`light`, :mod:`scenes`).
+(:mod:`matching`, :mod:`estimates`, :mod:`scenes`).
 """
 
 import sqlite3
@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from mkpc_kaggle.engine.console import Progress
+from mkpc_kaggle.engine.estimates import Estimating, Features
 from mkpc_kaggle.engine.jobs import (
     Answer,
     Cause,
@@ -27,7 +28,6 @@ from mkpc_kaggle.engine.jobs import (
     MatchJob,
     SceneJob,
 )
-from mkpc_kaggle.engine.light import Estimating, Features
 from mkpc_kaggle.engine.matching import Matching
 from mkpc_kaggle.engine.plan.blame import Item, different
 from mkpc_kaggle.engine.plan.budget import Budget, Costs
@@ -299,7 +299,7 @@ class Engine:
         scenes = [place for place in self.site.of(Work.SCENE) if not place.closed]
         return Crew(
             max(1, len(matchers)),  # before the places are open, one is assumed
-            len(self.site.of(Work.LIGHT)),
+            len(self.site.of(Work.ESTIMATE)),
             len(scenes),
             # All places of matching have the same kind of device.
             max((place.minibatch for place in matchers), default=1),
@@ -328,7 +328,7 @@ class Engine:
                 self._is_open = True
             needs[Work.MATCH] = self._hand_out_pairs(asked, work, now)
             needs[Work.SCENE] = self._hand_out_single_jobs(asked, work, now)
-        needs[Work.LIGHT] = self._hand_out_light(asked, work, now)
+        needs[Work.ESTIMATE] = self._hand_out_estimates(asked, work, now)
         is_under_way = self._must_replan
         self._must_replan = False
         for place in self.site.places:
@@ -379,12 +379,12 @@ class Engine:
                 plan = following.match if following is not None else None
         return int(plan is not None)
 
-    def _hand_out_light(self, asked: Asked | None, work: NextWork | None, now: float) -> int:
+    def _hand_out_estimates(self, asked: Asked | None, work: NextWork | None, now: float) -> int:
         """Give features and estimates to idle workers. Return the number of remaining ones."""
         due: list[int] = []
         if asked is not None and work is not None:
             due, _ = self._split_estimates(asked, work)
-        for place in [place for place in self.site.of(Work.LIGHT) if place.is_idle]:
+        for place in [place for place in self.site.of(Work.ESTIMATE) if place.is_idle]:
             # Features first: pairs are chosen by them.
             if self._features.pending:
                 self._give(place, self._features.next(), now)
@@ -396,7 +396,7 @@ class Engine:
     def _split_estimates(self, asked: Asked, work: NextWork) -> tuple[list[int], list[int]]:
         """Return the estimates that are due for their workers, and the ones for other processes."""
         due, elsewhere = asked.estimating.split(work.estimates)
-        if all(place.closed for place in self.site.of(Work.LIGHT)):
+        if all(place.closed for place in self.site.of(Work.ESTIMATE)):
             elsewhere += due
             due = []
         if not self.crew.scenes:

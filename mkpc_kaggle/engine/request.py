@@ -131,3 +131,12 @@ def batches_of(pairs: Iterable[Pair]) -> dict[str, list[int]]:
         if pair.intrinsics is None:
             batches.setdefault(pair.group, []).append(index)
     return {name: members for name, members in batches.items() if len(members) >= MIN_PAIRS}
+
+
+def visiting_order(pairs: Sequence[Pair]) -> list[int]:
+    """Return pair indices in an order that puts pairs with a common image together, for encoding
+    cache hits.
+    """
+    # The group first: a batch that is finished early gets its scene early.
+    keys = [(pair.group, pair.file0, pair.file1) for pair in pairs]
+    return sorted(range(len(pairs)), key=keys.__getitem__)

@@ -1,7 +1,7 @@
 """The common part of all kinds of work: the run's state, store, costs, and events.
 
-Each kind has a file, from its jobs to their results: :mod:`matching`, :mod:`light`
-(estimates, features of images) and :mod:`scenes`.
+Each kind has a file, from its jobs to their results: :mod:`matching`, :mod:`estimates` (with the features of
+images) and :mod:`scenes`.
 """
 
 import sqlite3

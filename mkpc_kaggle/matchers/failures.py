@@ -6,7 +6,6 @@ device errors every further call in the process fails, and only a new process he
 error the process can continue.
 """
 
-import os
 import re
 from enum import Enum, auto
 
@@ -23,10 +22,6 @@ _OUT_OF_MEMORY = re.compile(
 _DEVICE = re.compile(
     "AcceleratorError|CUDA (driver )?error|cuDNN error|cuFFT error|cusolver error|No CUDA GPUs are available"
 )
-
-
-# Ids of this process and of the ancestors it was forked from, if they matched pairs.
-matched_in: set[int] = set()
 
 
 class FailureKind(Enum):
@@ -59,18 +54,3 @@ def reason_of(error: BaseException) -> str:
         text = text.partition("\n")[0]
     notes = getattr(error, "__notes__", ())
     return ", ".join([f"{type(error).__name__}: {text}", *notes])
-
-
-def require_unforked() -> None:
-    """Raise :class:`UserError` in a child that was forked after its parent had matched pairs.
-
-    A forked child inherits no threads of PyTorch and OpenCV but waits for them, even with a new
-    matcher.
-    """
-    # A fork copies the set, so a child finds its parent's id besides its own.
-    matched_in.add(os.getpid())
-    if len(matched_in) > 1:
-        raise UserError(
-            "this process was forked after its parent had matched, and would hang: use processes that are "
-            "spawned, such as multiprocessing.get_context('spawn') or DataLoader's multiprocessing_context='spawn'"
-        )

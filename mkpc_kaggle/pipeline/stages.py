@@ -4,6 +4,7 @@ Stage 1 matches whole images, MKPC finds the critical region of each image, and 
 crops.
 """
 
+import os
 import time
 import warnings
 from collections.abc import Callable, Container, Iterable, Sequence
@@ -31,7 +32,7 @@ from mkpc_kaggle.matchers.contract import (
     encoding_bytes,
 )
 from mkpc_kaggle.matchers.dtypes import check_finite, exact_float32
-from mkpc_kaggle.matchers.failures import FailureKind, failure_kind, reason_of, require_unforked
+from mkpc_kaggle.matchers.failures import FailureKind, failure_kind, reason_of
 from mkpc_kaggle.pipeline.keypoints import PairKeypoints
 from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
 from mkpc_kaggle.recipe import Recipe, Unit
@@ -40,6 +41,9 @@ from mkpc_kaggle.setup.devices import require_device
 
 ENCODING_CACHE_BYTES = 2 << 30  # on a CPU
 CACHE_SHARE = 0.25  # of a GPU's free memory, for the cached encodings of all workers on it
+
+# Ids of this process and of the ancestors it was forked from, if they matched pairs.
+matched_in: set[int] = set()
 
 
 class UnloadableError(UserError):
@@ -462,3 +466,18 @@ def with_regions(
     scale = scale_between(matches, (image0.size, image1.size))
     seconds = time.perf_counter() - start
     return replace(pair, regions=(region0, region1), scale=scale, cluster_seconds=seconds)
+
+
+def require_unforked() -> None:
+    """Raise :class:`UserError` in a child that was forked after its parent had matched pairs.
+
+    A forked child inherits no threads of PyTorch and OpenCV but waits for them, even with a new
+    matcher.
+    """
+    # A fork copies the set, so a child finds its parent's id besides its own.
+    matched_in.add(os.getpid())
+    if len(matched_in) > 1:
+        raise UserError(
+            "this process was forked after its parent had matched, and would hang: use processes that are "
+            "spawned, such as multiprocessing.get_context('spawn') or DataLoader's multiprocessing_context='spawn'"
+        )

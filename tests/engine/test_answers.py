@@ -20,14 +20,14 @@ from rectified import (
 )
 
 from mkpc_kaggle.data.competition import Pair, submission_problems
-from mkpc_kaggle.engine import light
+from mkpc_kaggle.engine import estimates
 from mkpc_kaggle.engine.jobs import EstimateJob, Job, SceneJob
 from mkpc_kaggle.engine.plan.state import FALLBACK, PAIR, SCENE, State
 from mkpc_kaggle.engine.request import Ending, RunReport
 from mkpc_kaggle.engine.workers import places
 from mkpc_kaggle.engine.workers.places import LocalSite
 from mkpc_kaggle.engine.workers.process import ThreadWorker
-from mkpc_kaggle.engine.workers.worker import MatchRunner, do_light_job, scene_runner
+from mkpc_kaggle.engine.workers.worker import MatchRunner, do_estimates_job, scene_runner
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 from mkpc_kaggle.recipe import SceneConfig
 from mkpc_kaggle.reporting.run_log import read_log
@@ -70,7 +70,7 @@ ESTIMATES: dict[str, Callable[[Any], Any]] = {
 
 
 def lying(lie: Callable[[Any], Any], job: Job) -> Any:
-    answer = do_light_job(job)
+    answer = do_estimates_job(job)
     return lie(answer) if isinstance(job, EstimateJob) else answer
 
 
@@ -79,7 +79,7 @@ def estimates_by(
 ) -> None:
     """Let the workers of estimates lie; ``everywhere``: and the other processes that try them."""
     make = partial(runner, partial(lying, lie))
-    monkeypatch.setattr(places, "light_runner", lambda **_: make())
+    monkeypatch.setattr(places, "estimates_runner", lambda **_: make())
     elsewhere = make if everywhere else scene_runner
     worker = partial(ThreadWorker, "elsewhere", elsewhere)
     monkeypatch.setattr(LocalSite, "scene_worker", lambda site: worker(site.ring))
@@ -123,13 +123,13 @@ def test_estimates_that_no_worker_can_make_end_the_run_as_failed_after_few_tries
 
 def count_jobs(monkeypatch: pytest.MonkeyPatch) -> list[EstimateJob | None]:
     jobs: list[EstimateJob | None] = []
-    job_of = light.Estimating.job
+    job_of = estimates.Estimating.job
 
-    def noted(self: light.Estimating, due: Sequence[int], **more: Any) -> EstimateJob | None:
+    def noted(self: estimates.Estimating, due: Sequence[int], **more: Any) -> EstimateJob | None:
         jobs.append(job_of(self, due, **more))
         return jobs[-1]
 
-    monkeypatch.setattr(light.Estimating, "job", noted)
+    monkeypatch.setattr(estimates.Estimating, "job", noted)
     return jobs
 
 

@@ -148,7 +148,7 @@ def test_scenes_have_the_cores_that_matching_leaves_free_and_estimates_those_of_
     afterwards = site.scenes_at_a_time(is_matching=False)
     assert (while_matching, afterwards) == scenes
     assert len(site.of(Work.SCENE)) == cores
-    assert len(site.of(Work.LIGHT)) == max(1, cores // 4)
+    assert len(site.of(Work.ESTIMATE)) == max(1, cores // 4)
 
 
 def test_the_cpu_that_takes_over_has_its_own_sizes_and_all_cores(monkeypatch):

@@ -278,7 +278,7 @@ class SimulatedSite(Site):
             (f"place {n}", partial(self.match_worker, is_bad=n >= good), Work.MATCH)
             for n in range(scenario.workers)
         ]
-        makers.append(("estimates", lambda: SimulatedWorker(self, self.estimate), Work.LIGHT))
+        makers.append(("estimates", lambda: SimulatedWorker(self, self.estimate), Work.ESTIMATE))
         for number in range(scenario.scene_places):
             makers.append((f"scenes {number}", self.scene_worker, Work.SCENE))
         self.places = [Place(*maker) for maker in makers]

@@ -8,8 +8,8 @@ from rectified import SECOND, SWEEP, THREE_UNITS
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.console import Progress
+from mkpc_kaggle.engine.estimates import Estimating
 from mkpc_kaggle.engine.jobs import Estimated, MatchJob, Outcome, Phase
-from mkpc_kaggle.engine.light import Estimating
 from mkpc_kaggle.engine.matching import Matching
 from mkpc_kaggle.engine.plan.budget import Budget, Costs
 from mkpc_kaggle.engine.plan.state import State

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine.jobs import Cause, Failure, PairInputs, visiting_order
+from mkpc_kaggle.engine.jobs import Cause, Failure, PairInputs
 from mkpc_kaggle.engine.plan.blame import Item, Tries
 from mkpc_kaggle.engine.plan.scene_state import SceneState
-from mkpc_kaggle.engine.request import Request, batches_of, distinct_pairs, names_of
+from mkpc_kaggle.engine.request import Request, batches_of, distinct_pairs, names_of, visiting_order
 from mkpc_kaggle.engine.store.image_files import contents_of
 from mkpc_kaggle.engine.store.keys import Images, of_camera_estimate
 from mkpc_kaggle.engine.store.tables import PairEstimate, SceneRecord, UnitPoints

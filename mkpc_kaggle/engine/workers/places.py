@@ -19,7 +19,7 @@ from mkpc_kaggle.engine.jobs import Answer, Cause, Failure, Job, Loaded
 from mkpc_kaggle.engine.plan.blame import MAX_LOSSES, Item, different
 from mkpc_kaggle.engine.workers.answers import wrong_answer
 from mkpc_kaggle.engine.workers.process import ProcessWorker, ThreadWorker
-from mkpc_kaggle.engine.workers.worker import Maker, MatchRunner, light_runner, scene_runner
+from mkpc_kaggle.engine.workers.worker import Maker, MatchRunner, estimates_runner, scene_runner
 from mkpc_kaggle.pipeline.stages import Pipeline
 from mkpc_kaggle.setup.assembly import Assembly
 
@@ -34,7 +34,7 @@ class Work(StrEnum):
     """The work of a place's workers."""
 
     MATCH = "matching"
-    LIGHT = "estimates"  # and features of images
+    ESTIMATE = "estimates"  # and features of images
     SCENE = "scenes"
 
 
@@ -185,9 +185,9 @@ class Site:
         self._cores = available_cores()
         # In this process, a second thread would take its time from the thread that matches.
         estimators = 1 if threads else max(1, self._cores // CORES_PER_ESTIMATOR)
-        make = partial(light_runner, in_process=not threads)
+        make = partial(estimates_runner, in_process=not threads)
         self.places = [
-            Place(f"estimates {n}", partial(self._make, "estimates", make), Work.LIGHT)
+            Place(f"estimates {n}", partial(self._make, "estimates", make), Work.ESTIMATE)
             for n in range(estimators)
         ]
         self.places += [

@@ -165,17 +165,18 @@ def read_noted(path: Path) -> Image | Unreadable:
     return replace(image, file=file) if isinstance(image, Image) else image
 
 
-def light_runner(*, in_process: bool = True) -> Runner:
+def estimates_runner(*, in_process: bool = True) -> Runner:
     """Return the runner of estimates and image features, without torch; a separate process has one
     thread.
     """
     # The user's own process keeps its thread limits.
     if in_process:
         limit_to_one_thread()
-    return do_light_job
+    return do_estimates_job
 
 
-def do_light_job(job: Job) -> tuple[Estimated, ...] | Found:
+def do_estimates_job(job: Job) -> tuple[Estimated, ...] | Found:
+    """Return the estimates of a job's pairs, or the feature of an image."""
     if isinstance(job, FeatureJob):
         return Found(job.do())
     assert isinstance(job, EstimateJob)
@@ -214,7 +215,7 @@ def scene_runner() -> Runner:
 
 
 def do_single_job(job: Job) -> Answer:
-    return compute_scene(job) if isinstance(job, SceneJob) else do_light_job(job)
+    return compute_scene(job) if isinstance(job, SceneJob) else do_estimates_job(job)
 
 
 def compute_scene(job: Job) -> Solution:

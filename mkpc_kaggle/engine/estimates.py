@@ -1,4 +1,4 @@
-"""Light work, without torch: estimates of pairs, and features of images."""
+"""Estimates of pairs, and features of images: jobs of the workers without torch, results and losses."""
 
 import sqlite3
 from collections.abc import Callable, Mapping, Sequence
