@@ -20,6 +20,7 @@ from mkpc_kaggle.geometry.coordinates import Points, Size
 
 CACHE_BYTES = 128 << 20
 MASK_SUFFIX = ".png"
+MIN_SHOWN = 0.05  # share of an image; a mask that shows less is often inverted
 
 
 @dataclass(frozen=True)
@@ -132,6 +133,8 @@ def _checked(path: Path, image: Path) -> str:
         )
     if not mask.any():
         return "hide everything"
+    if mask.mean() < MIN_SHOWN:
+        return f"hide more than {100 * (1 - MIN_SHOWN):g} % of their image, since black is left out"
     # For example JPEG files, whose black is 1 or 2
     return "hide nothing, since only black or transparent pixels do" if mask.all() else ""
 

@@ -187,7 +187,7 @@ def reconstruct(
             reason = next(iter(result.lost.values()))
             raise UserError(f"no cameras: {reason}; the same call tries again")
         # An empty result without its reason would look like a success.
-        for line in no_models(result.report):
+        for line in no_models(result.report) or result.causes:
             logger.warning(line)
         names = {name_below(str(root), str(file)): name for file, name in given.items()}
         return Models(

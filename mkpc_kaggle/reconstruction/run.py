@@ -11,8 +11,9 @@ from mkpc_kaggle.engine.plan.state import State
 from mkpc_kaggle.engine.request import RunReport, name_below
 from mkpc_kaggle.engine.scenes import scene_failures
 from mkpc_kaggle.engine.session import Session, opened_engine, request_of
-from mkpc_kaggle.errors import writing
+from mkpc_kaggle.errors import plural, writing
 from mkpc_kaggle.recipe import CameraSharing, Recipe, SceneConfig
+from mkpc_kaggle.reconstruction.causes import causes_in_files
 from mkpc_kaggle.reconstruction.choice import choose_pairs
 from mkpc_kaggle.reconstruction.folder import Datasets, Ends, batch_names
 from mkpc_kaggle.reconstruction.outputs import (
@@ -21,8 +22,8 @@ from mkpc_kaggle.reconstruction.outputs import (
     camera_rows,
     read_table_of_cameras,
 )
-from mkpc_kaggle.reconstruction.unmatched import cause_of_no_matches
 from mkpc_kaggle.scene.export import HeldDirectory, remove_files, versions_of
+from mkpc_kaggle.scene.models import MIN_IMAGES
 from mkpc_kaggle.setup.assembly import Assembly
 
 AUTO_RECIPE = "auto"  # the recipe of all matchers whose weights are found
@@ -38,7 +39,8 @@ class FolderResult:
     """The outcome of a run on a folder.
 
     ``lost`` has the reason for each batch whose cameras could not be computed. ``earlier`` are the
-    datasets that still have the cameras and files of an earlier run.
+    datasets that still have the cameras and files of an earlier run. ``causes`` are why images have no
+    camera, as their files show.
     """
 
     report: RunReport
@@ -47,6 +49,7 @@ class FolderResult:
     lost: Mapping[str, str]
     earlier: Collection[str] = ()
     held: Mapping[str, HeldDirectory] = field(default_factory=dict)  # of COLMAP's files, by dataset
+    causes: tuple[str, ...] = ()
 
 
 def for_cameras(recipe: Recipe, sharing: str | None = None) -> Recipe:
@@ -123,8 +126,6 @@ def reconstruct_folder(
         engine.ask(request_of(pairs, assembly, session, str(root), exports=exports, publish=write))
         state = engine.state
         assert state is not None
-        for fault in faults_of_unmatched(state, datasets, root, assembly.masks):
-            engine.log.fault(fault)
         # Models of an earlier run do not belong to tables without cameras.
         for batch in state.batches:
             is_without = batch not in state.scenes.in_use and is_decided(state, batch)
@@ -141,22 +142,34 @@ def reconstruct_folder(
         ]
         for name in standing:
             engine.log.fault(f"{batches[name]}: {EARLIER}")
+        causes = tuple(causes_of_missing(state, cameras, root, assembly.masks))
+        for cause in causes:
+            engine.log.fault(cause)
         # Within the context: afterwards the store is closed.
         report = engine.report()
     held = {name: exports[batches[name]] for name in datasets}
-    return FolderResult(report, tuple(pairs), cameras, lost, standing, held)
+    return FolderResult(report, tuple(pairs), cameras, lost, standing, held, causes)
 
 
-def faults_of_unmatched(
-    results: State, datasets: Datasets, root: Path, masks: Masks
-) -> Iterator[str]:
-    """Yield why datasets have no matches, if their files show a cause."""
-    for name, batch in batch_names(root, datasets).items():
+def causes_of_missing(results: State, cameras: Cameras, root: Path, masks: Masks) -> Iterator[str]:
+    """Yield why images of finished batches have no camera, if their files show a cause."""
+    digests = results.digests
+    for name, batch in batch_names(root, cameras).items():
         # A batch of one pair is none.
-        if batch in results.batches and results.is_unmatched(batch):
-            cause = cause_of_no_matches(datasets[name], masks)
-            if cause:
-                yield f"{batch}: {cause}"
+        is_unmatched = batch in results.batches and results.is_unmatched(batch)
+        if batch not in results.scenes.in_use and not is_unmatched:
+            continue
+        placed = cameras[name]
+        contents = {digests.get(name_below(str(root), str(file)), "") for file in placed} - {""}
+        if len(contents) < MIN_IMAGES:
+            be = "is" if len(contents) == 1 else "are"
+            yield (
+                f"{batch}: only {len(contents)} of {plural(len(placed), 'file')} can be read and {be} no "
+                "copy of another; cameras need three different photographs"
+            )
+            continue
+        missing = [file for file, camera in placed.items() if camera is None]
+        yield from (f"{batch}: {cause}" for cause in causes_in_files(missing, masks))
 
 
 def is_decided(results: State, batch: str) -> bool:

@@ -67,6 +67,14 @@ class RunLog:
     def faults(self) -> list[str]:
         return [text for _, text in self.of_kind(EventKind.FAULT)]
 
+    @property
+    def last_session(self) -> Sequence[Event]:
+        """The events since the run was begun or resumed for the last time."""
+        starts = [
+            number for number, event in enumerate(self.events) if event.kind == EventKind.START
+        ]
+        return self.events[starts[-1] :] if starts else self.events
+
     def of_kind(self, kind: str) -> list[tuple[str, str]]:
         """Return the time and the text of each event of a kind."""
         return [

@@ -14,7 +14,7 @@ import numpy as np
 
 from mkpc_kaggle.data.outputs import replacing
 from mkpc_kaggle.engine.store.json_values import to_text
-from mkpc_kaggle.engine.store.tables import NO_CAMERAS, SceneRecord
+from mkpc_kaggle.engine.store.tables import MIN_PAIRS, EventKind, SceneRecord
 from mkpc_kaggle.errors import UserError, plural, printable, writing
 from mkpc_kaggle.reporting.contradictions import contradictions, has_moved, named
 from mkpc_kaggle.reporting.run_log import RunLog
@@ -29,6 +29,7 @@ from mkpc_kaggle.reporting.summary import (
     trouble,
     unit_means,
     unit_reasons,
+    unreadable_images,
 )
 from mkpc_kaggle.scene.candidates import title_of
 from mkpc_kaggle.scene.choose import Reason
@@ -45,6 +46,7 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 FORMAT = "mkpc summary 1"  # increase the number if a key changes its meaning or disappears
+MAX_UNREADABLE = 3  # reasons in a sentence
 # Bounds of the histogram of inliers; the last bin is open.
 INLIER_BINS = (0, 1, 10, 20, 50, 100, 200, 500, 1000, 2000)
 
@@ -68,6 +70,7 @@ def verdict(log: RunLog) -> Verdict:
     problems = list(filter(None, [trouble(log)]))
     # A mean over scenes without models would divide by zero.
     reconstructed = [scene for scene in log.scenes if scene.models]
+    problems += _small_batches(log)
     # Without scenes, pairs are all that the run was asked for.
     if not log.scenes:
         problems += _pair_problems(log.tables.pairs)
@@ -121,19 +124,14 @@ def _pair_problems(pairs: "DataFrame") -> Iterator[str]:
 def _scene_problems(scene: SceneRecord, log: RunLog) -> Iterator[str]:
     # A folder without subfolders has one scene, whose name says nothing.
     where = f"{scene.batch}: " if len(log.scenes) > 1 else ""
-    if scene.failure == NO_CAMERAS:
-        # The run looks for causes in the files, and saves them as faults.
-        prefix = f"{scene.batch}: "
-        causes = [fault.removeprefix(prefix) for fault in log.faults if fault.startswith(prefix)]
-        remedy = causes[-1] if causes else "photographs that overlap more are needed"
-        yield f"{where}no cameras, {scene.failure}: {remedy}"
-        return
     if HARDLY_MOVED in scene.failure:
         # More photographs from there would not help.
         yield f"{where}no cameras: {HARDLY_MOVED}"
         return
+    causes = causes_of(scene.batch, log)
     if not scene.models:
-        yield f"{where}no cameras, {scene.failure}: photographs that overlap more are needed"
+        remedy = "; ".join(causes) or "photographs that overlap more are needed"
+        yield f"{where}no cameras, {scene.failure}: {remedy}"
         return
     # Remedies for single images would not help.
     if not has_moved(scene):
@@ -150,7 +148,8 @@ def _scene_problems(scene: SceneRecord, log: RunLog) -> Iterator[str]:
     lost = {file for file in files - names if log.digests.get(file) not in contents}
     missing = sorted(Path(file).name for file in lost)
     if missing:
-        yield f"{where}no camera for {named(missing)}: add photographs between these and the others"
+        remedies = "; ".join(_remedies(missing, unreadable_images(pairs), causes))
+        yield f"{where}no camera for {named(missing)}: {remedies}"
     if len(scene.models) > 1:
         sizes = ", ".join(str(len(model.images)) for model in scene.models)
         near = nearest_to_joining(scene, pairs, log.digests)
@@ -179,6 +178,44 @@ def _scene_problems(scene: SceneRecord, log: RunLog) -> Iterator[str]:
                 f"{_looseness(model)}; add photographs that connect its parts"
             )
     yield from (f"{where}{sentence}" for sentence in contradictions(scene))
+
+
+def _remedies(
+    missing: Sequence[str], unreadable: Sequence[str], causes: Sequence[str]
+) -> Iterator[str]:
+    """Yield why images have no camera: those that cannot be read, the causes in files, and the
+    remedy for the others.
+    """
+    yield from unreadable[:MAX_UNREADABLE]
+    if len(unreadable) > MAX_UNREADABLE:
+        yield f"{len(unreadable) - MAX_UNREADABLE} more cannot be read"
+    yield from causes
+    # Photographs between these and the others do not help images with another cause.
+    reasons = [*unreadable, *causes]
+    if not all(any(name in reason for reason in reasons) for name in missing):
+        yield "add photographs between these and the others"
+
+
+def causes_of(batch: str, log: RunLog) -> list[str]:
+    """Return why images of a batch have no camera, as the last session has found in their files."""
+    prefix = f"{batch}: "
+    # The files of an earlier session may have been corrected since.
+    faults = [event.text for event in log.last_session if event.kind == EventKind.FAULT]
+    return [fault.removeprefix(prefix) for fault in faults if fault.startswith(prefix)]
+
+
+def _small_batches(log: RunLog) -> Iterator[str]:
+    """Yield a sentence for each batch of a folder that is too small for cameras."""
+    scene = log.recipe.scene
+    # A submission has batches of one pair, and extra pairs; a folder has cameras alone.
+    if scene is None or scene.pairs_per_image:
+        return
+    for batch, pairs in log.tables.pairs.groupby("group", sort=False):
+        if len(pairs) < MIN_PAIRS:
+            yield (
+                f"{batch}: no cameras, {plural(len(pairs), 'pair')}: at least three matched images are "
+                "needed"
+            )
 
 
 def nearest_to_joining(scene: SceneRecord, pairs: "DataFrame", digests: Mapping[str, str]) -> str:

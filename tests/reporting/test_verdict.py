@@ -19,7 +19,7 @@ from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.intrinsics import KnownCamera
 from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
-from mkpc_kaggle.recipe import Recipe, Unit
+from mkpc_kaggle.recipe import Recipe, SceneConfig, Unit
 from mkpc_kaggle.reporting import contradictions, verdict
 from mkpc_kaggle.reporting.run_log import RunLog
 from mkpc_kaggle.scene.choose import Reason
@@ -80,6 +80,17 @@ GOOD_MODEL = model(GOOD, GOOD, GOOD, GOOD)
 FEW = Described("few", (NAMES[2], NAMES[3]), "set", matches=20, inliers=7, **GOOD_F)
 
 
+UNREADABLE = tuple(
+    Described(name, (NAMES[0], name), "set", failure=f"{name}: {reason}")
+    for name, reason in {
+        NAMES[3]: "the file is empty",
+        "b.jpg": "no such file",
+        "c.jpg": "no such file",
+        "d.jpg": "no such file",
+    }.items()
+)
+
+
 def compared(*found: FocalContradiction | DistortedLens) -> RunLog:
     focals = tuple(each for each in found if isinstance(each, FocalContradiction))
     lenses = tuple(each for each in found if isinstance(each, DistortedLens))
@@ -114,6 +125,19 @@ SPEAKS = {
     ),
     "no camera for 3.jpg: add photographs between": log(
         scene(model(GOOD, GOOD, GOOD, names=NAMES[:3])), pairs=ALL
+    ),
+    "no camera for 3.jpg: the masks hide everything: 3.jpg": log(
+        scene(model(GOOD, GOOD, GOOD, names=NAMES[:3])),
+        pairs=ALL,
+        faults=("set: the masks hide everything: 3.jpg",),
+    ),
+    "3.jpg: the file is empty; b.jpg: no such file; c.jpg: no such file; 1 more cannot be read": log(
+        scene(model(GOOD, GOOD, GOOD, names=NAMES[:3])),
+        pairs=(*ALL, *UNREADABLE),
+    ),
+    "alone: no cameras, 1 pair: at least three matched images are needed": replace(
+        log(pairs=(Described("alone", NAMES[:2], "alone"),)),
+        recipe=Recipe((Unit(1, "sift", 640),), scene=SceneConfig(pairs_per_image=0.0)),
     ),
     "the images form 2 models of 4, 4: add photographs that connect them": (
         log(scene(GOOD_MODEL, GOOD_MODEL))
