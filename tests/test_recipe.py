@@ -79,6 +79,14 @@ def test_recipes_for_every_user_name_no_weights_for_noncommercial_use_but_with_a
     assert bool(bound & free) == name.startswith(("yfcc", "scannet", "imc2022", "auto"))
 
 
+@pytest.mark.parametrize("name", recipe_names())
+def test_no_shipped_recipe_changes_the_threshold_as_robust_py_says(name):
+    magsac = load_recipe(name).magsac
+    default = RobustConfig()
+    assert magsac.threshold == default.threshold
+    assert magsac.threshold_side == default.threshold_side
+
+
 def test_fallbacks_replace_unfit_matchers_and_disappear_otherwise():
     first = Unit(1, "a", 640)
     second = Unit(1, "b", 640, fallback="c")

@@ -3,8 +3,8 @@
 An image's own focal length is ambiguous with the distance to the scene, and poorly constrained by few points. So
 images of one camera at one zoom share it. ``cameras`` of [scene] (``--camera``) says how:
 
-- ``auto``: :func:`share` reconstructs a second time, if most images of one size agree on the focal length. The
-  second reconstruction is refused if images then see fewer points.
+- ``auto``, the default: if most images of one size agree on the focal length, :func:`share` reconstructs a
+  second time. The second reconstruction is refused if images then see fewer points.
 - ``folder``: the user declares one camera. The first reconstruction already shares it (:func:`given_intrinsics`).
 - ``image``: no image shares.
 

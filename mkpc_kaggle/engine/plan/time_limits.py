@@ -26,7 +26,7 @@ def time_limit(job: Job, costs: Costs, budget: Budget, since: float) -> float:
     """Return the seconds after ``since``, the beginning of a job, within which its worker must answer.
 
     They are thirty times the measured cost, or a quarter of the time left if the cost is unknown, and
-    :attr:`Budget.silence` (5 to 60 s).
+    :attr:`Budget.silence` (2 % of the limit of the run, 5 to 60 s).
     """
     match job:
         case MatchJob():
