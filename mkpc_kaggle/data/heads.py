@@ -9,6 +9,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from io import BytesIO
 from numbers import Real
+from pathlib import Path
 from typing import BinaryIO
 
 import PIL.Image
@@ -39,7 +40,27 @@ DAMAGE = (
     struct.error,
     PIL.Image.DecompressionBombError,
 )
+HEIC_BRANDS = frozenset({b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1"})
 PNG_START = b"\x89PNG\r\n\x1a\n"
+
+
+# A TIFF file may also be a raw photograph.
+STARTS = (b"\xff\xd8\xff", PNG_START, b"II*\0", b"MM\0*", b"\0\0\0\x0cjP  ")
+
+
+def is_picture(path: Path) -> bool:
+    """Return whether a file begins as a photograph's: JPEG, PNG, TIFF, WebP, HEIC, AVIF or JPEG 2000."""
+    try:
+        # A pipe or a device may never end.
+        if not path.is_file():
+            return False
+        with path.open("rb") as stream:
+            start = stream.read(MAX_PREFIX)
+    except OSError:
+        return False
+    is_webp = start[:4] == b"RIFF" and start[8:12] == b"WEBP"
+    is_heif = start[4:8] == b"ftyp" and start[8:12] in (*HEIC_BRANDS, b"avif")
+    return start.startswith(STARTS) or is_webp or is_heif
 
 
 def size_of(stream: BinaryIO) -> Size | None:

@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 
 from mkpc_kaggle.config import Range
-from mkpc_kaggle.data.heads import ORIENTATION, exif_tags, is_tiff, size_of
+from mkpc_kaggle.data.heads import HEIC_BRANDS, ORIENTATION, exif_tags, is_tiff, size_of
 from mkpc_kaggle.errors import shown
 from mkpc_kaggle.geometry.coordinates import Pixels, Size
 
@@ -40,8 +40,6 @@ OTHER_SUFFIXES = frozenset(
         ".gpr",
     )
 ) - set(READ_SUFFIXES)
-
-HEIC_BRANDS = frozenset({b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1"})
 
 # Ratio of the sides; a longer image's views would be a few pixels high or exceed the memory.
 MAX_ASPECT = 32
@@ -168,6 +166,10 @@ def _undecoded(path: Path, data: Pixels) -> str:
     head = data[:12].tobytes()
     if head[4:8] == b"ftyp" and head[8:12] in HEIC_BRANDS:
         return "a HEIC file, which cannot be decoded here; convert it to JPEG or PNG"
+    if is_tiff(head):
+        return (
+            "a TIFF file of a kind that cannot be decoded here; save it with 8 or 16 bits per value"
+        )
     if path.suffix.lower() in OTHER_SUFFIXES:
         return f"{path.suffix} files cannot be decoded here; convert it to JPEG or PNG"
     return "not a picture, or cut off: it cannot be decoded"

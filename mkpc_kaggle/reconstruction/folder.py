@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from mkpc_kaggle.data.competition import CONTROL
+from mkpc_kaggle.data.heads import is_picture
 from mkpc_kaggle.data.images import IMAGE_SUFFIXES, MORE_SUFFIXES, OTHER_SUFFIXES, READ_SUFFIXES
 from mkpc_kaggle.engine.console import logger
 from mkpc_kaggle.errors import UserError, plural, printable, read_text
@@ -20,6 +21,9 @@ Ends = tuple[Path, Path]
 THUMBNAIL_FOLDERS = frozenset(
     {"@eadir", "#recycle", "@recycle", "$recycle.bin", "system volume information", "__macosx"}
 )
+KNOWN_SUFFIXES = OTHER_SUFFIXES.union(READ_SUFFIXES)
+# Files with other suffixes that are opened. On a file server each takes a millisecond.
+MAX_OPENED = 1_000
 
 
 def read_folder(root: Path, *, join: bool = False) -> Datasets:
@@ -46,6 +50,8 @@ def read_folder(root: Path, *, join: bool = False) -> Datasets:
         message = f"{root} has no images: name a folder with {', '.join(READ_SUFFIXES)} files"
         if found.unread:
             message += "; photographs of other formats must be converted first"
+        if found.unnamed:
+            message += "; photographs of other names must be renamed first"
         raise UserError(message)
     # Other datasets of a single image are listed without a camera.
     if all(len(files) < 2 for files in datasets.values()):
@@ -63,6 +69,8 @@ class _Unread:
     thumbnails: list[Path] = field(default_factory=list)
     unread: list[Path] = field(default_factory=list)
     twins: list[Path] = field(default_factory=list)
+    unnamed: list[Path] = field(default_factory=list)
+    opened: int = 0  # files of other names whose first bytes were read
 
     def lines(self) -> Iterator[str]:
         if self.hidden:
@@ -81,6 +89,20 @@ class _Unread:
                 f"photographs that cannot be read: {counts}, the first is {self.unread[0]}; "
                 "convert them to JPEG or PNG"
             )
+        if self.unnamed:
+            yield (
+                f"photographs without a known suffix are not used: {_first(self.unnamed)}; give them the "
+                "suffix of their format, such as .jpg"
+            )
+
+    def add_unnamed(self, folder: Path, names: Iterable[str]) -> None:
+        """Add the files of a folder that are pictures by their first bytes."""
+        for name in names:
+            if self.opened >= MAX_OPENED:
+                return
+            self.opened += 1
+            if is_picture(folder / name):
+                self.unnamed.append(folder / name)
 
 
 def _first(paths: Sequence[Path]) -> str:
@@ -115,6 +137,18 @@ def _folders(root: Path, unread: _Unread) -> Iterator[tuple[Path, list[Path]]]:
             for name in others
             if _stem(name) not in stems and not name.startswith(".")
         ]
+        # "a.jpg_original" and "a.jpg.bak" are copies of "a.jpg".
+        copied = stems.union(files)
+        unread.add_unnamed(
+            folder,
+            (
+                name
+                for name in sorted(names)
+                if _suffix(name) not in KNOWN_SUFFIXES
+                and _stem(name) not in copied
+                and not name.startswith(".")
+            ),
+        )
         if files:
             yield folder, [folder / name for name in files]
 
@@ -211,6 +245,7 @@ def read_pair_list(path: Path, root: Path, datasets: Datasets) -> list[Ends]:
     # The dataset of each image
     dataset_of = {file: name for name, files in datasets.items() for file in files}
     listed = []
+    problems = []
     for number, line in enumerate(read_text(path).splitlines(), start=1):
         text = line.strip()
         if not text:
@@ -221,16 +256,40 @@ def read_pair_list(path: Path, root: Path, datasets: Datasets) -> list[Ends]:
         )
         # Names may have blanks, so each blank may be the border.
         ends = [sorted(two) for two in ways if dataset_of.keys() >= set(two)]
-        if (
-            len(ends) != 1
-            or ends[0][0] == ends[0][1]
-            or dataset_of[ends[0][0]] != dataset_of[ends[0][1]]
-        ):
-            raise UserError(
-                f"{path}, line {number}: expected two images of one dataset of {root}, found {line!r}"
+        # As in COLMAP's lists; an image may be called "#1.jpg".
+        if not ends and text.startswith("#"):
+            continue
+        problem = _problem_of_line(text, ends, root, dataset_of)
+        if problem:
+            problems.append(
+                f"line {number}: expected two images of one dataset of {root}, found {line!r}; {problem}"
             )
-        listed.append((ends[0][0], ends[0][1]))
+        else:
+            listed.append((ends[0][0], ends[0][1]))
+    if problems:
+        count = f"; {len(problems)} lines name no pair" if len(problems) > 1 else ""
+        raise UserError(f"{path}, {problems[0]}{count}")
     if not listed:
         raise UserError(f"{path} has no pairs")
     # hloc's lists may name a pair in both orders.
     return list(dict.fromkeys(listed))
+
+
+def _problem_of_line(
+    text: str, ends: Sequence[Sequence[Path]], root: Path, dataset_of: Mapping[Path, str]
+) -> str:
+    """Return why a line of a list names no pair, or an empty string. ``ends`` are the pairs that it may
+    name.
+    """
+    if len(ends) > 1:
+        return "its blanks allow several pairs"
+    if not ends:
+        unknown = [name for name in text.split() if root / name not in dataset_of]
+        example = next(iter(dataset_of)).relative_to(root).as_posix()
+        return f"{' '.join(unknown) or 'a name'} is no image there; names are such as {example}"
+    first, second = ends[0]
+    if first == second:
+        return "both are one image"
+    if dataset_of[first] != dataset_of[second]:
+        return "their folders are datasets of their own without --join"
+    return ""

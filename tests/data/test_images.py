@@ -284,3 +284,11 @@ def test_damaged_exif_raises_nothing_and_gives_possible_values():
         assert turns in range(4)
         # 0.2 and 20 long sides of 60 pixels.
         assert focal == 0 or 12 <= focal <= 1200
+
+
+def test_a_tiff_of_floats_says_what_to_save(tmp_path):
+    path = tmp_path / "a.tif"
+    cv2.imwrite(str(path), np.random.default_rng(0).random((40, 60, 3), np.float32))
+    found = read_image(path)
+    assert isinstance(found, Unreadable)
+    assert found.reason.endswith("save it with 8 or 16 bits per value")

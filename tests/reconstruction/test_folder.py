@@ -11,6 +11,7 @@ import pytest
 
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.cameras import Camera
+from mkpc_kaggle.reconstruction import folder
 from mkpc_kaggle.reconstruction.folder import (
     batch_names,
     pair_list_line,
@@ -165,3 +166,70 @@ def test_the_images_that_a_list_of_pairs_leaves_out_are_counted(tmp_path):
     (tmp_path / "pairs.txt").write_text("a.png b.png\nd.png c.png\n")
     listed = read_pair_list(tmp_path / "pairs.txt", root, datasets)
     assert pair_list_line(listed, root, datasets) == "--pairs: 2 pairs with 4 of 4 images"
+
+
+@pytest.mark.parametrize(
+    ("line", "reason"),
+    {
+        "a.jpg c.jpg": "c.jpg is no image there; names are such as a.jpg",
+        "a b": "a b is no image there",
+        "a.jpg": "a name is no image there",
+        "a.jpg a.jpg": "both are one image",
+        "a.jpg sub/a.jpg": "datasets of their own without --join",
+    }.items(),
+)
+def test_a_line_of_a_list_that_names_no_pair_says_why(tmp_path, line, reason):
+    root = written(tmp_path / "photos", "a.jpg", "b.jpg", "sub/a.jpg", "sub/b.jpg")
+    path = tmp_path / "pairs.txt"
+    path.write_text(f"a.jpg b.jpg\n{line}\n")
+    datasets = read_folder(root)
+    with pytest.raises(UserError, match=f"line 2: expected two images .*{reason}"):
+        read_pair_list(path, root, datasets)
+    path.write_text(f"a.jpg b.jpg\n{line}\nx y\n{line}\n")
+    with pytest.raises(UserError, match=r"line 2: .*; 3 lines name no pair"):
+        read_pair_list(path, root, datasets)
+
+
+def test_comments_in_a_list_of_pairs_are_skipped_as_in_colmap(tmp_path):
+    root = written(tmp_path / "photos", "a.jpg", "b.jpg", "#1.jpg")
+    path = tmp_path / "pairs.txt"
+    path.write_text("# of the tower\na.jpg b.jpg\n#1.jpg a.jpg\n")
+    pairs = read_pair_list(path, root, read_folder(root))
+    assert [[file.name for file in pair] for pair in pairs] == [
+        ["a.jpg", "b.jpg"],
+        ["#1.jpg", "a.jpg"],
+    ]
+
+
+STARTS = {
+    "IMG_1": b"\xff\xd8\xff\xe0",
+    "a.jpg_large": b"\xff\xd8\xff\xe1",
+    "b.png.download": b"\x89PNG\r\n\x1a\n",
+    "c.mpo": b"\xff\xd8\xff\xe1",
+    "d.part": b"RIFF\0\0\0\0WEBP",
+    "e": b"\0\0\0\x18ftypheic",
+}
+
+
+def test_photographs_without_a_known_suffix_are_counted_with_the_remedy(tmp_path, capsys):
+    root = written(tmp_path / "photos", "x.jpg", "y.jpg", "notes.txt", "Thumbs.db")
+    for name, start in STARTS.items():
+        (root / name).write_bytes(start)
+    # Backups of programs that change EXIF
+    (root / "x.jpg_original").write_bytes(STARTS["IMG_1"])
+    (root / "x.jpg.bak").write_bytes(STARTS["IMG_1"])
+    assert names_of(root) == {".": ["x.jpg", "y.jpg"]}
+    line = "photographs without a known suffix are not used: 6, the first is"
+    assert f"{line} {root / 'IMG_1'}; give them the suffix" in capsys.readouterr().err
+    for name in ("x.jpg", "y.jpg"):
+        (root / name).unlink()
+    with pytest.raises(UserError, match="photographs of other names must be renamed first"):
+        read_folder(root)
+
+
+def test_of_many_other_files_some_are_opened(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(folder, "MAX_OPENED", 2)
+    root = written(tmp_path / "photos", "x.jpg", "y.jpg", "a.txt", "b.txt")
+    (root / "c").write_bytes(STARTS["IMG_1"])
+    read_folder(root)
+    assert "suffix" not in capsys.readouterr().err
