@@ -61,19 +61,24 @@ def synthetic_scene(
     seed: int = 0,
     prefix: str = "",
     focals: Sequence[float] = (),
+    principal_point_share: float = 0.0,
 ) -> SyntheticScene:
     """Return a scene of cameras on an arc in front of a facade, with ``pairs`` random pairs or all.
 
     ``noise`` is the detector's standard deviation in pixels per coordinate: one number, or one for
     each image. A point has the same error in all pairs of the image, except for a deviation of 0.05
     pixels. ``outliers`` is the share of wrong matches. Without ``focals``, in pixels, each camera
-    has its own random focal length.
+    has its own random focal length. Principal points deviate from the middle by
+    ``principal_point_share`` of the long side.
     """
     rng = np.random.default_rng(seed)
     world = front(rng, points)
     arc = [arc_camera(rng, number / max(images - 1, 1)) for number in range(images)]
     if focals:
         arc = [zoomed(camera, focal) for camera, focal in zip(arc, focals, strict=True)]
+    if principal_point_share:
+        offsets = rng.normal(0, principal_point_share * max(SIZE), (images, 2))
+        arc = [shifted(camera, offset) for camera, offset in zip(arc, offsets, strict=True)]
     ends = list(combinations(range(images), 2))
     if pairs is not None and pairs < len(ends):
         drawn = rng.choice(len(ends), pairs, replace=False)
@@ -194,6 +199,13 @@ def zoomed(camera: Camera, focal: float) -> Camera:
     centre_x = SIZE.width / 2 - 0.5
     centre_y = SIZE.height / 2 - 0.5
     K = np.array([[focal, 0, centre_x], [0, focal, centre_y], [0, 0, 1]])
+    return replace(camera, K=K)
+
+
+def shifted(camera: Camera, offset: np.ndarray) -> Camera:
+    """Return the camera with its principal point moved by ``offset`` (2,), in pixels."""
+    K = camera.K.copy()
+    K[:2, 2] += offset
     return replace(camera, K=K)
 
 

@@ -28,7 +28,7 @@ from mkpc_kaggle.scene.models import (
     RegisteredImage,
     SfmModel,
 )
-from mkpc_kaggle.scene.uncertainty import DAMPED, evaluator
+from mkpc_kaggle.scene.uncertainty import covariance_of, seeing_images
 
 COLMAP_PINHOLES = (pycolmap.CameraModelId.SIMPLE_PINHOLE, pycolmap.CameraModelId.PINHOLE)
 MAX_ASPECT_RATIO = 1.02  # of two focal lengths; a radial coefficient needs a common one
@@ -250,22 +250,11 @@ def _sigma(copy: Any, freed: Sequence[Freed], parameter: int) -> float:
     """Return the median standard deviation of a free parameter of the cameras: 0 is the first focal
     length in pixels, 1 the radial coefficient. Infinity if the model does not determine it.
     """
-    images = [
-        image for _, image in sorted(copy.images.items()) if image.has_pose and image.num_points3D
-    ]
     # As for the model: time and memory would be too much. The many images have little noise.
-    if len(images) > MAX_SIGMA_IMAGES:
+    if len(seeing_images(copy)) > MAX_SIGMA_IMAGES:
         return 0.0
-    adjuster = evaluator(copy, images, {})
-    fit = adjuster.solve().ceres_summary
-    redundancy = fit.num_residuals - fit.num_effective_parameters + 7
-    solved: Any = redundancy > 0 and pycolmap.estimate_ba_covariance(DAMPED, copy, adjuster)
-    if not solved:
+    found = covariance_of(copy, {}, 0.0)
+    if found is None:
         return float("inf")
-    noise = 2 * fit.initial_cost / redundancy  # square pixels, of a keypoint's coordinate
-    variances = []
-    for freed_image in freed:
-        covariance = solved.get_other_params_cov(freed_image.camera.params)
-        variances.append(covariance[parameter, parameter])
-    sigma = float(np.sqrt(noise * np.median(variances)))
-    return sigma if np.isfinite(sigma) else float("inf")
+    variances = [found.variance(freed_image.camera, parameter) for freed_image in freed]
+    return float(np.sqrt(np.median(variances)))

@@ -4,13 +4,20 @@ points.
 
 import numpy as np
 import pycolmap
+import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.synthetic_scene import SyntheticScene, synthetic_scene
 from mkpc_kaggle.recipe import CameraSharing, SceneConfig
+from mkpc_kaggle.scene import uncertainty
 from mkpc_kaggle.scene.models import SfmModel
 from mkpc_kaggle.scene.sfm import reconstruct_batch
-from mkpc_kaggle.scene.uncertainty import camera_sigmas
+from mkpc_kaggle.scene.uncertainty import (
+    PRINCIPAL_POINT_SHARE,
+    camera_sigmas,
+    covariance_of,
+    seeing_images,
+)
 
 
 def model_of(scene: SyntheticScene) -> SfmModel:
@@ -57,12 +64,17 @@ def errors_over_sigmas(model: SfmModel, scene: SyntheticScene) -> np.ndarray:
     return errors / sigmas
 
 
-def test_errors_are_about_as_large_as_expected():
-    """90 % of normal errors are below 1.645 sigma; of three dimensions, below 1.44 to 1.645."""
+@pytest.mark.parametrize("share", [0.001, PRINCIPAL_POINT_SHARE])
+def test_errors_are_about_as_large_as_expected(share, monkeypatch):
+    """90 % of normal errors are below 1.645 sigma; of three dimensions, below 1.44 to 1.645.
+
+    With the smaller share, most of the errors are by the noise of keypoints.
+    """
+    monkeypatch.setattr(uncertainty, "PRINCIPAL_POINT_SHARE", share)
     # 32 cameras; the bounds leave room for their number.
     ratios = []
     for seed in range(4):
-        scene = synthetic_scene(8, points=400, seed=seed)
+        scene = synthetic_scene(8, points=400, seed=seed, principal_point_share=share)
         model = model_of(scene)
         ratios.append(errors_over_sigmas(model, scene))
     # One row a camera; columns: rotation, centre, focal length.
@@ -72,6 +84,17 @@ def test_errors_are_about_as_large_as_expected():
     root_mean_square = np.sqrt((table**2).mean(axis=0))
     # Wrong by a factor of 1.5 at most, in either direction.
     assert (np.abs(np.log(root_mean_square)) < np.log(1.5)).all()
+
+
+def test_an_error_of_the_principal_point_is_expected_of_many_exact_points():
+    """Without noise, the rest of the error is the principal points' alone."""
+    model = model_of(synthetic_scene(6, points=3000, noise=0.01))
+    exact = covariance_of(model.colmap, {}, 0.0)
+    sigmas = camera_sigmas(model.colmap)
+    assert exact is not None
+    camera = seeing_images(model.colmap)[0].camera
+    noise_alone = 100 * np.sqrt(exact.focal_variance(camera))
+    assert sigmas[model.images[0].image.name].focal > 2 * noise_alone
 
 
 def test_they_are_the_same_in_another_world():
