@@ -136,7 +136,7 @@ def folder(inputs: Inputs) -> Iterator[tuple[str, float]]:
     seconds = {}
     for name, program in programs.items():
         with tempfile.TemporaryDirectory() as directory:
-            seconds[name] = program.seconds(images.resolve(), Path(directory) / "out")
+            seconds[name], _ = program.run(images.resolve(), Path(directory) / "out")
     ours = seconds.pop("ours")
     yield f"reconstruct of {FOLDER}, next to pycolmap alone", ours / min(seconds.values())
 
@@ -165,7 +165,7 @@ def submission(_: Inputs) -> Iterator[tuple[str, float]]:
         command = ("submit", "--test-dir", "{images}", "--out", "{out}", "--recipe", "classical")
         program = Program("submit", (python, "-m", "mkpc_kaggle", *command))
         before = products()
-        seconds = program.seconds(demo / "test", Path(name) / "submission.csv")
+        seconds, _ = program.run(demo / "test", Path(name) / "submission.csv")
         reference = (before + products()) / 2
     yield "submit of the demo set, next to products", seconds / reference
 
