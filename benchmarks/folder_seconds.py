@@ -1,15 +1,17 @@
 """Seconds of ``reconstruct`` next to pycolmap alone, on the same folders of images.
 
     python -m benchmarks.folder_seconds --images DIR... [--code NAME=CHECKOUT...] [--rounds N]
-        [--mappers incremental global] [--recipe NAME] [--render N [--street]] [--sequential]
+        [--mappers incremental global] [--recipe NAME] [--render N [--street]] [--unrelated N]
+        [--sequential]
 
 The programs alternate. Each runs in a separate process with one thread per library. Its seconds are
 CPU seconds of that process and of all processes that it started. pycolmap has its default settings,
 and one SIMPLE_PINHOLE camera per image as ``reconstruct`` has. ``reconstruct`` also writes its
 tables and its report. ``--code`` adds other versions of this package, such as
 ``before=../checkout``. ``--render`` first fills the folder with N rendered photographs of one
-courtyard, taken on a walk; with ``--street``, of a street of 20 houses. With ``--sequential`` pycolmap
-matches each image with the next ten in the order of names, and with images 2, 4, 8, ... places away.
+courtyard, taken on a walk; with ``--street``, of a street of 20 houses. ``--unrelated`` adds
+photographs of as many other worlds. With ``--sequential`` pycolmap matches each image with the next
+ten in the order of names, and with images 2, 4, 8, ... places away.
 
 The column "MB" has the resident memory of the largest process. The column "mapping" has CPU seconds
 of pycolmap alone, and seconds by the clock of ``reconstruct``, with the start of the process.
@@ -83,14 +85,14 @@ class Program:
         return used.ru_utime + used.ru_stime, used.ru_maxrss / 1024
 
 
-def write_rendered(folder: Path, count: int, views: Callable[[float], View]) -> None:
+def write_rendered(folder: Path, count: int, views: Callable[[float], View], prefix: str) -> None:
     """Write photographs of one camera on a walk; ``views`` has the view at a share of the way."""
-    folder.mkdir(parents=True)
+    folder.mkdir(parents=True, exist_ok=True)
     focal = RENDERED_FOCAL * RENDERED[0]
     for number in counted(range(count), "rendering", "image"):
         surfaces, position, target = views(number / max(1, count - 1))
         picture, _ = render(surfaces, look_at(position, target, focal, RENDERED))
-        cv2.imwrite(str(folder / f"{number:04d}.jpg"), picture.round().astype(np.uint8))
+        cv2.imwrite(str(folder / f"{prefix}{number:04d}.jpg"), picture.round().astype(np.uint8))
 
 
 def courtyard() -> Callable[[float], View]:
@@ -134,6 +136,18 @@ def street() -> Callable[[float], View]:
         position = (x, 5 + 2 * np.sin(40 * along), 1.7 + np.sin(230 * along) ** 2)
         target = (x + 8 * np.sin(90 * along), 20, 4)
         return View([surface for house in near for surface in house], position, target)
+
+    return view
+
+
+def other_worlds() -> Callable[[float], View]:
+    """Return views of worlds that have nothing in common."""
+
+    def view(along: float) -> View:
+        surfaces, cameras = build_world("market", seed=1 + round(1e6 * along))
+        camera = cameras[0]
+        ahead = camera.centre + 20 * camera.R[2]
+        return View(surfaces, tuple(camera.centre.tolist()), tuple(ahead.tolist()))
 
     return view
 
@@ -233,11 +247,14 @@ def main() -> None:
     parser.add_argument("--recipe", default="auto")
     parser.add_argument("--render", type=int, metavar="N", help="into the new folder of --images")
     parser.add_argument("--street", action="store_true", help="render a street, not a courtyard")
+    parser.add_argument("--unrelated", type=int, default=0, metavar="N", help="added to the folder")
     parser.add_argument("--sequential", action="store_true", help="pairs of pycolmap alone")
     arguments = parser.parse_args()
     if arguments.render:
         views = street() if arguments.street else courtyard()
-        write_rendered(arguments.images[0], arguments.render, views)
+        write_rendered(arguments.images[0], arguments.render, views, "walk")
+    if arguments.unrelated:
+        write_rendered(arguments.images[0], arguments.unrelated, other_worlds(), "other")
     print(
         f"{'folder':<28}{'program':<26}{'round':>6}{'CPU s':>8}{'MB':>7}{'mapping':>9}{'cameras':>9}"
     )
