@@ -20,7 +20,9 @@ MAX_SIGMA_IMAGES = 200  # of a model with sigmas; memory is quadratic and time c
 # Sigma of centres, in sizes of the model. Over draws of five scenes (benchmarks.candidates), cameras
 # with a sigma up to 0.1 gain 0.08 to 0.11 on F of the pair. The others gain 0.01.
 LOOSE_SIGMA = 0.25
-MAX_CENTRE_SIGMA = 0.02  # of the model's size; a camera with a larger expected error is uncertain
+# Of the model's size; a camera with a larger expected error is uncertain. Half of the tourists'
+# photographs of reichstag_26 are above 0.02, and their errors are 0.013.
+MAX_CENTRE_SIGMA = 0.05
 # The reason for missing and for doubtful cameras
 HARDLY_MOVED = (
     "the camera hardly moved: nothing can be triangulated; step aside between photographs"
