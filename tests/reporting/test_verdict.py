@@ -156,7 +156,7 @@ SPEAKS = {
         scene(model(*[Sigmas(0.1, 0.26, 1.0)] * 4))
     ),
     "are unknown to within any distance; add": log(scene(model((), (), (), GOOD))),
-    "uncertain cameras: 1.jpg; add": log(scene(model(GOOD, Sigmas(0.1, 0.021, 1), GOOD, GOOD))),
+    "uncertain cameras: 1.jpg; add": log(scene(model(GOOD, Sigmas(0.1, 0.051, 1), GOOD, GOOD))),
     "uncertain cameras: 0.jpg; add": log(scene(model((), GOOD, GOOD, GOOD))),
     "the focal length of 287 px in --intrinsics contradicts the photographs, which fit 575 px": (
         compared(FocalContradiction(FocalSource.INTRINSICS, ("0.jpg",), 287.4, 574.9))
