@@ -23,6 +23,7 @@ from mkpc_kaggle.evaluation.validate import (
     PROTOCOLS,
     Validation,
     by_protocol,
+    resolution_line,
     score_table,
     to_json,
     validate,
@@ -151,6 +152,8 @@ def _match_and_score(
     pairs = [true.pair for scene in scenes for true in scene.pairs]
     if line := missing_line(pairs):
         logger.info(line)
+    if line := resolution_line(scenes):
+        logger.warning(line)
     regions = {} if arguments.regions is None else read_regions(arguments.regions, root, pairs)
     if arguments.regions is not None:
         used = len({(pair.file0, pair.file1) for pair in pairs})

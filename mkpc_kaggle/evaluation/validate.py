@@ -16,7 +16,14 @@ from typing import TYPE_CHECKING, Any
 
 from scipy.spatial.transform import Rotation
 
-from mkpc_kaggle.data.competition import TrainScene, TruePair, read_rows, read_submission
+from mkpc_kaggle.data.competition import (
+    TrainScene,
+    TruePair,
+    evenly_spread,
+    read_rows,
+    read_submission,
+)
+from mkpc_kaggle.data.images import read_size
 from mkpc_kaggle.engine.request import RunReport
 from mkpc_kaggle.engine.session import Session, run_pairs
 from mkpc_kaggle.engine.store.database import Store
@@ -27,6 +34,7 @@ from mkpc_kaggle.geometry import metrics
 from mkpc_kaggle.geometry.coordinates import Matrix3
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.metrics import AUC_THRESHOLDS, PoseError
+from mkpc_kaggle.geometry.resolution import doubt_about_resolution
 from mkpc_kaggle.geometry.robust import Method, RobustConfig
 from mkpc_kaggle.recipe import Recipe
 from mkpc_kaggle.setup.assembly import Assembly
@@ -34,6 +42,7 @@ from mkpc_kaggle.setup.assembly import Assembly
 if TYPE_CHECKING:
     from pandas import DataFrame
 
+MAX_SIZES = 100  # of images that are read and compared with their calibrations
 MAX_NAMES = 5  # of samples to list in a line
 BOX = ["left", "top", "right", "bottom"]  # columns of the table of regions
 MATCHING = ("precision", "matching_score")  # the order of ``PairScore.matching``
@@ -41,6 +50,30 @@ MATCHING = ("precision", "matching_score")  # the order of ``PairScore.matching`
 # OpenCV's RANSAC as in both published evaluations: 1 pixel, and 0.5 pixels for LoFTR.
 SUPERGLUE = RobustConfig(Method.RANSAC, 1.0, max_iterations=1000, permutations=1, every_match=True)
 PROTOCOLS = {"superglue": SUPERGLUE, "loftr": replace(SUPERGLUE, threshold=0.5)}
+
+
+def resolution_line(scenes: Sequence[TrainScene]) -> str:
+    """Return a line on images whose calibration seems to be for another resolution; empty without any.
+
+    Their true F, and so their scores, would be wrong.
+    """
+    matrices: dict[str, Matrix3] = {}
+    for true in itertools.chain.from_iterable(scene.pairs for scene in scenes):
+        matrices.setdefault(true.pair.file0, true.camera0.K)
+        matrices.setdefault(true.pair.file1, true.camera1.K)
+    doubts = []
+    sample = evenly_spread(list(matrices), MAX_SIZES)
+    for file in sample:
+        size = read_size(Path(file))  # a missing image has a line of its own
+        doubt = "" if size is None else doubt_about_resolution(matrices[file], size)
+        if doubt:
+            doubts.append(f"{file}: {doubt}")
+    if not doubts:
+        return ""
+    return (
+        f"{len(doubts)} of {plural(len(sample), 'calibration')} may be for images of another resolution, "
+        f"and then the scores are wrong; the first is {doubts[0]}"
+    )
 
 
 class Step(StrEnum):

@@ -12,6 +12,7 @@ from typing import Any
 from mkpc_kaggle.data.images import Image, ImageStore
 from mkpc_kaggle.errors import plural
 from mkpc_kaggle.geometry.coordinates import Box, Matrix3
+from mkpc_kaggle.geometry.resolution import doubt_about_resolution
 from mkpc_kaggle.geometry.robust import FailedEstimate, ModelKind
 from mkpc_kaggle.matchers.contract import Matcher
 from mkpc_kaggle.matchers.registry import require_methods
@@ -261,6 +262,9 @@ class TwoStageMatcher:
             raise ValueError(
                 "model E needs intrinsics=(K0, K1), the camera matrices of both images in pixels"
             )
+        for number, K in enumerate(matrices or ()):
+            if doubt := doubt_about_resolution(K, images[number].size):
+                warnings.warn(f"intrinsics[{number}]: {doubt}", RuntimeWarning, stacklevel=3)
         if boxes and all(unit.stage == 1 for unit in self.recipe.units):
             text = f"regions have no effect: recipe {self.recipe.name} has no unit of stage 2"
             warnings.warn(text, RuntimeWarning, stacklevel=3)

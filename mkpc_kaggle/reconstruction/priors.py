@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Iterable, Sequence
-from fractions import Fraction
 from pathlib import Path
 
 from mkpc_kaggle.data.competition import read_rows
@@ -11,20 +10,22 @@ from mkpc_kaggle.engine.console import logger
 from mkpc_kaggle.errors import UserError, plural
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.intrinsics import KnownCamera, Rows, camera_of, parse_row, radial_factor
+from mkpc_kaggle.geometry.resolution import (
+    MAX_OFFSET,
+    is_same_shape,
+    offset_from_middle,
+    size_around,
+    text_of,
+    text_of_point,
+)
 
 COLUMNS = ("image", "model", "parameters", "sigma")
 OPTIONAL = ("size",)  # of the images that the parameters are for
 SIZE = re.compile(r"\s*([1-9]\d{0,5})\s*[xX]\s*([1-9]\d{0,5})\s*", re.ASCII)
-# Offsets of a principal point from the middle of its image, as shares of the sides. Lenses are
-# centred to a few percent. A row for three quarters of the resolution is 0.125 off.
-MAX_OFFSET = 0.1
-MAX_USUAL_OFFSET = 0.05
-MAX_DENOMINATOR = 4  # of the ratio of two usual resolutions
-MAX_SCALE_ERROR = 0.03  # of this ratio by the principal point
+MAX_USUAL_OFFSET = 0.05  # of a principal point from the middle, as a share of the sides
 MAX_ASPECT_RATIO = 1.1  # of two focal lengths; calibrations of one lens differ by 0.01
 MAX_TANGENT = 4.0  # of the angle of a ray with the axis: 76 degrees
 STEPS = 400
-MAX_SHAPE_RATIO = 1.05  # of pictures of one camera at two resolutions
 
 
 def read_intrinsics_table(file: Path, root: Path, images: Iterable[Path]) -> Rows:
@@ -160,38 +161,18 @@ def _principal_point_doubt(known: KnownCamera, size: Size, has_pixels: str, wher
     """Return a doubt about a principal point off the middle, or an empty string. Raises
     :class:`UserError` if it is far off.
     """
-    x, y = known.principal_point
-    offset = max(abs(x / size.width - 0.5), abs(y / size.height - 0.5))
+    point = known.principal_point
+    offset = offset_from_middle(point, size)
     if offset <= MAX_USUAL_OFFSET:
         return ""
-    place = "outside" if x >= size.width or y >= size.height else "far from the middle"
-    text = f"{where}: the principal point {x:g}, {y:g} is {place}: {has_pixels}"
-    other = size_of_row(x, y, size)
+    text = f"{where}: {text_of_point(point, size)}: {has_pixels}"
+    other = size_around(point, size)
     if other is not None:
         text += f", and the row seems to be for {text_of(other)}{remedy(known, other, size)}"
     text += f"; if the row is right, add the column size with {size.width}x{size.height}"
     if offset > MAX_OFFSET:
         raise UserError(text)
     return text
-
-
-def size_of_row(x: float, y: float, size: Size) -> Size | None:
-    """Return the size of the pictures that a row with this principal point seems to be for, given
-    that of the image; ``None`` if it has another shape.
-    """
-    # The size in whose middle the point would be, which is a few percent wrong
-    rough = Size(max(1, round(2 * x)), max(1, round(2 * y)))
-    for shape in (size, Size(size.height, size.width)):
-        if not is_same_shape(rough, shape):
-            continue
-        scale = ((rough.width / shape.width) * (rough.height / shape.height)) ** 0.5
-        # Pictures are reduced to a half or to three quarters, and not to 0.496.
-        simple = Fraction(max(scale, 1 / scale)).limit_denominator(MAX_DENOMINATOR)
-        exact = float(simple if scale > 1 else 1 / simple)
-        if abs(exact / scale - 1) < MAX_SCALE_ERROR:
-            scale = exact
-        return Size(max(1, round(scale * shape.width)), max(1, round(scale * shape.height)))
-    return None
 
 
 def remedy(known: KnownCamera, of: Size, size: Size) -> str:
@@ -201,13 +182,3 @@ def remedy(known: KnownCamera, of: Size, size: Size) -> str:
     scaled = known.scaled(size.width / of.width, size.height / of.height)
     parameters = " ".join(f"{value:.6g}" for value in scaled.parameters)
     return f". Write the parameters {parameters}"
-
-
-def is_same_shape(one: Size, other: Size) -> bool:
-    """Return whether both may be pictures of one camera at two resolutions."""
-    ratio = (one.width * other.height) / (one.height * other.width)
-    return 1 / MAX_SHAPE_RATIO < ratio < MAX_SHAPE_RATIO
-
-
-def text_of(size: Size) -> str:
-    return f"{size.width} x {size.height}"

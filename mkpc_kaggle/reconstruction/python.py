@@ -235,7 +235,8 @@ def image_paths(images: Any) -> list[Path]:
                 f"images: {folder} has several folders of images, {names}; name one of them"
             )
         return [file for files in datasets.values() for file in files]
-    if not isinstance(images, Iterable) or hasattr(images, "shape"):
+    # An array or a column of a table may have paths; one of several dimensions has pixels or cells.
+    if not isinstance(images, Iterable) or len(getattr(images, "shape", (0,))) != 1:
         raise TypeError(f"images is {shown_value(images)}; expected {expected}")
     paths = []
     for number, image in enumerate(images):

@@ -18,6 +18,7 @@ from mkpc_kaggle.engine.session import Interrupt
 from mkpc_kaggle.evaluation.validate import (
     SceneScore,
     Step,
+    resolution_line,
     score_pair,
     score_submission,
     score_table,
@@ -225,3 +226,16 @@ def test_settings_change_a_protocol_too(tmp_path):
     arguments = make_parser(given).parse_args(given)
     magsac = _assemble(arguments, Interrupt(), "classical", "two-stage").recipe.magsac
     assert (magsac.method, magsac.max_iterations, magsac.threshold) == ("ransac", 1000, 2)
+
+
+def test_calibrations_of_another_resolution_are_named_before_the_scores(demo):
+    scenes = read_train_side(demo.train_dir)
+    assert resolution_line(scenes) == ""
+    (first, *others), *_ = (scene.pairs for scene in scenes)
+    larger = Camera(np.diag([2.0, 2.0, 1.0]) @ first.camera0.K, first.camera0.R, first.camera0.t)
+    wrong = TrainScene("s", 1.0, (replace(first, camera0=larger), *others))
+    line = resolution_line([wrong])
+    assert line.startswith("1 of ")
+    assert "calibrations may be for images of another resolution, and then the scores" in line
+    assert f"{first.pair.file0}: the principal point" in line
+    assert "the matrix seems to be for" in line

@@ -470,3 +470,13 @@ def test_a_file_that_is_replaced_during_a_run_is_encoded_again():
         (match,) = pipeline.match([PairMatch(images=tuple(images))], [unit])
         found.append(match.matches.points0[0, 0])
     assert found == [10, 50]
+
+
+def test_a_camera_matrix_of_another_resolution_is_warned_of():
+    matcher = TwoStageMatcher(SIFT)
+    first, second = pair()
+    height, width = first.shape[:2]
+    right = np.array([[400.0, 0, width / 2], [0, 400, height / 2], [0, 0, 1]])
+    half = np.diag([0.5, 0.5, 1]) @ right
+    with pytest.warns(RuntimeWarning, match=r"intrinsics\[1\]: the principal point .* seems to be"):
+        matcher(first, second, intrinsics=(right, half))

@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from faulty import befall, scenes_by
 from test_reconstruct import FIRST, RECIPE, MixedMatcher, fail, write_flat
@@ -20,7 +21,7 @@ from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import MatcherSpec
 from mkpc_kaggle.reconstruction import choice, python
-from mkpc_kaggle.reconstruction.python import Models
+from mkpc_kaggle.reconstruction.python import Models, image_paths
 from mkpc_kaggle.reporting.run_log import read_log
 from mkpc_kaggle.reporting.verdict import verdict
 
@@ -303,3 +304,12 @@ def test_no_model_is_a_warning_with_its_reason(files, capfd):
     assert "no cameras: no matches connect its images" in capfd.readouterr().err
     assert models(files[:2], MixedMatcher(), progress=False) == ()
     assert "at least three matched images are needed" in capfd.readouterr().err
+
+
+def test_paths_may_be_a_column_of_a_table(files):
+    names = [str(file) for file in files]
+    for column in (pd.Series(names), np.array(names)):
+        assert image_paths(column) == files
+    for table in (pd.DataFrame({"path": names}), np.zeros((4, 5), np.uint8)):
+        with pytest.raises(TypeError, match="expected a folder, or paths of images"):
+            image_paths(table)
