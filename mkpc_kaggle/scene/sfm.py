@@ -69,7 +69,7 @@ def reconstruct_batch(
     and may end the process, see :mod:`mkpc_kaggle.scene.colmap`.
     """
     graph = ViewGraph.of_pairs(pairs).with_intrinsics(cameras)
-    reconstructions, shared = reconstruct_sharing(graph, config, export, is_whole)
+    reconstructions, shared = reconstruct_graph(graph, config, export, is_whole)
     models = [
         {image.image.digest: image for image in model.images}
         for model in models_of(reconstructions)
@@ -89,7 +89,7 @@ def reconstruct_batch(
     return Solution(tuple(reconstructions), tuple(choices), estimates=tuple(estimates))
 
 
-def reconstruct_sharing(
+def reconstruct_graph(
     graph: ViewGraph,
     config: SceneConfig,
     directory: HeldDirectory | None = None,

@@ -13,7 +13,7 @@ from mkpc_kaggle.reconstruction.run import for_cameras
 from mkpc_kaggle.scene.colmap import write_files
 from mkpc_kaggle.scene.export import HeldDirectory
 from mkpc_kaggle.scene.keypoints import MergedGraph
-from mkpc_kaggle.scene.sfm import reconstruct_batch, reconstruct_sharing
+from mkpc_kaggle.scene.sfm import reconstruct_batch, reconstruct_graph
 from mkpc_kaggle.scene.shared_intrinsics import given_intrinsics
 from mkpc_kaggle.scene.view_graph import BatchImage, ViewGraph
 
@@ -88,13 +88,13 @@ def test_images_that_one_camera_took_have_one_focal_length_however_few_they_are(
     scene = synthetic_scene(4, points=500, focals=[900.0] * 4)
     graph = ViewGraph.of_pairs(scene.pairs)
     # Four images: too few for the detection of a common focal length.
-    (alone,), nothing_shared = reconstruct_sharing(graph, config("image"))
+    (alone,), nothing_shared = reconstruct_graph(graph, config("image"))
     assert nothing_shared == {}
     focals = [image.focal for image in alone.models[0].images]
     assert len(focals) == 4
     assert len(set(focals)) == 4
 
-    (together,), shared = reconstruct_sharing(graph, config("folder"))
+    (together,), shared = reconstruct_graph(graph, config("folder"))
     focals = [image.focal for image in together.models[0].images]
     assert focals == pytest.approx([focals[0]] * 4)
     assert focals[0] == pytest.approx(900, rel=0.03)

@@ -15,7 +15,7 @@ from mkpc_kaggle.recipe import CameraModel, CameraSharing, SceneConfig
 from mkpc_kaggle.scene.align import find_similarity, model_size, moved_by
 from mkpc_kaggle.scene.comparison import compare_with_photographs
 from mkpc_kaggle.scene.models import Comparison, FocalSource, SfmModel, models_of
-from mkpc_kaggle.scene.sfm import reconstruct_sharing
+from mkpc_kaggle.scene.sfm import reconstruct_graph
 from mkpc_kaggle.scene.view_graph import BatchPair, ViewGraph
 
 FOCAL = 840.0
@@ -51,7 +51,7 @@ def model_of(
     camera_model: CameraModel = CameraModel.SIMPLE_PINHOLE,
 ) -> SfmModel:
     graph = ViewGraph.of_pairs(pairs).with_intrinsics(rows)
-    found, _ = reconstruct_sharing(graph, SceneConfig(camera_model=camera_model))
+    found, _ = reconstruct_graph(graph, SceneConfig(camera_model=camera_model))
     (model,) = models_of(found)
     assert len(model.images) == 6
     return model
@@ -131,7 +131,7 @@ def test_a_pinhole_that_the_user_gives_is_contradicted_and_stays():
 
 def test_cameras_that_the_user_shares_share_the_adopted_lens():
     config = SceneConfig(cameras=CameraSharing.FOLDER)
-    (found,), shared = reconstruct_sharing(ViewGraph.of_pairs(pairs_of(-0.2)), config)
+    (found,), shared = reconstruct_graph(ViewGraph.of_pairs(pairs_of(-0.2)), config)
     (model,) = found.models
     assert len({image.lens for image in model.images}) == 1
     assert set(shared.values()) == {model.images[0].focal}

@@ -8,7 +8,7 @@ from benchmarks.synthetic_scene import synthetic_scene
 from mkpc_kaggle.recipe import SceneConfig
 from mkpc_kaggle.scene import colmap
 from mkpc_kaggle.scene.models import FocalSource, models_of
-from mkpc_kaggle.scene.sfm import reconstruct_sharing
+from mkpc_kaggle.scene.sfm import reconstruct_graph
 from mkpc_kaggle.scene.view_graph import BatchPair, ViewGraph
 
 FOCAL = 840.0
@@ -43,7 +43,7 @@ def mappings(monkeypatch) -> list[bool]:
 @pytest.mark.parametrize("factor", [0.3, 6.0])
 def test_all_cameras_are_found_in_spite_of_a_wrong_exif_and_it_is_named(mappings, factor):
     graph = ViewGraph.of_pairs(pairs_with_exif(factor))
-    found, _ = reconstruct_sharing(graph, SceneConfig())
+    found, _ = reconstruct_graph(graph, SceneConfig())
     (model,) = models_of(found)
     assert len(model.images) == 6
     assert mappings == [True, False]
@@ -55,6 +55,6 @@ def test_all_cameras_are_found_in_spite_of_a_wrong_exif_and_it_is_named(mappings
 
 
 def test_a_right_exif_is_tried_alone(mappings):
-    found, _ = reconstruct_sharing(ViewGraph.of_pairs(pairs_with_exif(1.0)), SceneConfig())
+    found, _ = reconstruct_graph(ViewGraph.of_pairs(pairs_with_exif(1.0)), SceneConfig())
     assert found[0].registered == 6
     assert mappings == [True]

@@ -14,7 +14,7 @@ from mkpc_kaggle.geometry.intrinsics import (
 from mkpc_kaggle.recipe import CameraSharing, SceneConfig
 from mkpc_kaggle.scene.export import HeldDirectory
 from mkpc_kaggle.scene.models import SfmModel, models_of
-from mkpc_kaggle.scene.sfm import reconstruct_sharing
+from mkpc_kaggle.scene.sfm import reconstruct_graph
 from mkpc_kaggle.scene.uncertainty import combined
 from mkpc_kaggle.scene.view_graph import ViewGraph
 
@@ -26,7 +26,7 @@ def reconstructed(
     rows: list[tuple[str, KnownCamera]], sharing: CameraSharing = CameraSharing.AUTO
 ) -> SfmModel:
     graph = ViewGraph.of_pairs(SCENE.pairs).with_intrinsics(rows)
-    found, _ = reconstruct_sharing(graph, SceneConfig(cameras=sharing))
+    found, _ = reconstruct_graph(graph, SceneConfig(cameras=sharing))
     (model,) = models_of(found)
     return model
 
@@ -109,7 +109,7 @@ def test_distortion_is_part_of_verification_and_of_the_model(tmp_path):
         pinhole = (K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5)
         known.append((name, KnownCamera("OPENCV", (*pinhole, *distortion))))
     graph = ViewGraph.of_pairs(SCENE.pairs).with_intrinsics(known)
-    reconstruct_sharing(graph, SceneConfig(), HeldDirectory.of(tmp_path))
+    reconstruct_graph(graph, SceneConfig(), HeldDirectory.of(tmp_path))
     with pycolmap.Database.open(str(tmp_path / "database.db")) as database:
         cameras = database.read_all_cameras()
         geometry = database.read_two_view_geometry(1, 2)

@@ -9,7 +9,7 @@ from benchmarks.synthetic_scene import SIZE, batch_of, front, looking, synthetic
 from mkpc_kaggle.recipe import SceneConfig
 from mkpc_kaggle.scene.models import HARDLY_MOVED, Comparison, Reconstruction
 from mkpc_kaggle.scene.motion import intrinsics, is_rotation
-from mkpc_kaggle.scene.sfm import reconstruct_sharing
+from mkpc_kaggle.scene.sfm import reconstruct_graph
 from mkpc_kaggle.scene.view_graph import BatchPair, ViewGraph
 
 FOCAL = 840.0
@@ -28,7 +28,7 @@ def panorama(step: float) -> list[BatchPair]:
 
 
 def reconstructed(pairs: list[BatchPair]) -> Reconstruction:
-    (found,), _ = reconstruct_sharing(ViewGraph.of_pairs(pairs), SceneConfig())
+    (found,), _ = reconstruct_graph(ViewGraph.of_pairs(pairs), SceneConfig())
     return found
 
 

@@ -27,7 +27,7 @@ from mkpc_kaggle.scene.choose import estimate_at_known_focals
 from mkpc_kaggle.scene.export import HeldDirectory
 from mkpc_kaggle.scene.keypoints import MergedGraph
 from mkpc_kaggle.scene.models import RegisteredImage, SfmModel
-from mkpc_kaggle.scene.sfm import Solution, reconstruct_batch, reconstruct_sharing
+from mkpc_kaggle.scene.sfm import Solution, reconstruct_batch, reconstruct_graph
 from mkpc_kaggle.scene.shared_intrinsics import shared_intrinsics, undecided_zooms
 from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair, ViewGraph
 
@@ -193,7 +193,7 @@ def test_shared_intrinsics_stay_unless_they_explain_fewer_points_and_the_files_a
     assert len(set(focals_of(solution))) == cameras
 
     graph = ViewGraph.of_pairs(scene.pairs)
-    (found,), _ = reconstruct_sharing(graph, CONFIG, HeldDirectory.of(tmp_path))
+    (found,), _ = reconstruct_graph(graph, CONFIG, HeldDirectory.of(tmp_path))
     written = pycolmap.Reconstruction(tmp_path / "models" / "0").cameras.values()
     written_focals = {camera.focal_length for camera in written}
     assert written_focals == {image.focal for image in found.models[0].images}
