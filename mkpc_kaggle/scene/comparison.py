@@ -18,6 +18,7 @@ import pycolmap
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.intrinsics import KnownCamera, PlacedCamera, radial_factor
 from mkpc_kaggle.scene.adjustment import robust_options
+from mkpc_kaggle.scene.covariance import covariance_of, seeing_images
 from mkpc_kaggle.scene.models import (
     MAX_SIGMA_IMAGES,
     Comparison,
@@ -28,7 +29,6 @@ from mkpc_kaggle.scene.models import (
     RegisteredImage,
     SfmModel,
 )
-from mkpc_kaggle.scene.uncertainty import covariance_of, seeing_images
 
 COLMAP_PINHOLES = (pycolmap.CameraModelId.SIMPLE_PINHOLE, pycolmap.CameraModelId.PINHOLE)
 MAX_ASPECT_RATIO = 1.02  # of two focal lengths; a radial coefficient needs a common one

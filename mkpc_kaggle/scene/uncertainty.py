@@ -1,36 +1,24 @@
-"""Uncertainty of a reconstruction's cameras: the covariance of bundle adjustment.
+"""Expected errors of a reconstruction's cameras, from their covariance.
 
-It is the inverse of the normal equations, from which the points are eliminated (the Schur
-complement). All cameras together fix the origin, orientation and scale. So errors that a similarity
-of the world explains do not count (the S-transformation of Baarda 1981). The noise of keypoints is
-estimated from the residuals.
-
-Bundle adjustment holds principal points in the middle of the images, and no camera's is exactly
-there. Of many keypoints, this error is larger than that of their noise, so it is added.
+All cameras together fix the origin, orientation and scale. So errors that a similarity of the world
+explains do not count (the S-transformation of Baarda 1981).
 """
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
-from scipy.sparse import csr_array
 
 from mkpc_kaggle.geometry.intrinsics import KnownCamera
 from mkpc_kaggle.geometry.two_view import cross_matrix
-from mkpc_kaggle.scene.models import MAX_SIGMA_IMAGES, Sigmas
-
-Array = NDArray[np.float64]
+from mkpc_kaggle.scene.covariance import covariance_of, seeing_images
+from mkpc_kaggle.scene.models import Sigmas
 
 # Standard deviation of a principal point from the middle of its image, as a share of the long side
 PRINCIPAL_POINT_SHARE = 0.005
-STEP = 1e-6  # of numerical derivatives, relative
-DAMPING = 1e-10  # of scaled normal equations, which have the seven freedoms of the world
-GAUGE = 7
 
 
 def camera_sigmas(
@@ -49,6 +37,9 @@ def camera_sigmas(
     poses = [image.cam_from_world().matrix() for image in images]
     focals = [found.focal_variance(image.camera) for image in images]
     variances = np.column_stack([_pose_variances(poses, found.poses), focals])
+    # Of a degenerate model
+    if not np.isfinite(variances).all() or variances.min() < 0:
+        return {}
     rows = np.sqrt(variances) * [np.degrees(1), 1, 100]
     for row, image in zip(rows, images, strict=True):
         if image.name in given_cameras and given_cameras[image.name].sigma:
@@ -58,210 +49,6 @@ def camera_sigmas(
     return dict(zip((image.name for image in images), sigmas, strict=True))
 
 
-@dataclass(frozen=True, eq=False)
-class Covariance:
-    """Covariance of a model's cameras, in an arbitrary world.
-
-    ``poses`` (6N, 6N) has three angles in radians and the translation of each image, in the order of
-    :func:`seeing_images`, for X_cam = exp(angles) R X + t. ``intrinsics`` has the covariance (p, p)
-    of each camera's parameters, by camera id; those that were held have none.
-    """
-
-    poses: Array
-    intrinsics: Mapping[int, Array]
-
-    def variance(self, camera: Any, parameter: int) -> float:
-        """Return the variance of a camera's parameter; 0 if the camera is exact."""
-        known = self.intrinsics.get(camera.camera_id)
-        return 0.0 if known is None else float(known[parameter, parameter])
-
-    def focal_variance(self, camera: Any) -> float:
-        """Return the variance of the logarithm of a mean focal length; 0 if it is exact."""
-        known = self.intrinsics.get(camera.camera_id)
-        focals = camera.focal_length_idxs()
-        if known is None:
-            return 0.0
-        return float(known[np.ix_(focals, focals)].mean() / camera.mean_focal_length() ** 2)
-
-
-def covariance_of(
-    model: Any, given_cameras: Mapping[str, KnownCamera], principal_point_share: float
-) -> Covariance | None:
-    """Return the covariance of pycolmap's model; ``None`` if it is not determined, or of more than
-    ``MAX_SIGMA_IMAGES`` images.
-
-    Principal points deviate by ``principal_point_share`` of the long side; with 0 they are exact.
-    """
-    images = seeing_images(model)
-    if not 1 < len(images) <= MAX_SIGMA_IMAGES:
-        return None
-    cameras = _inexact_cameras(images, given_cameras)
-    equations = _NormalEquations.of(model, images, cameras.values())
-    # The adjusted parameters, and the principal points, which are held
-    is_held = np.zeros(len(equations.matrix), bool)
-    held_variances = np.zeros(len(is_held))
-    for start, (camera, sigma) in zip(equations.starts, cameras.values(), strict=True):
-        held = start + np.array(camera.principal_point_idxs())
-        is_held[held] = True
-        deviation = principal_point_share * max(camera.width, camera.height)
-        if sigma:
-            # A calibration knows it about as well, in pixels, as the focal length.
-            deviation = min(deviation, sigma / 100 * camera.mean_focal_length())
-        held_variances[held] = deviation**2
-    redundancy = equations.residuals - np.count_nonzero(~is_held) - 3 * len(model.points3D) + GAUGE
-    if redundancy <= 0:
-        return None
-    noise = equations.squares / redundancy  # variance of a keypoint's coordinate, square pixels
-    matrix = equations.matrix / noise
-    inverse = _inverse(matrix[np.ix_(~is_held, ~is_held)])
-    if inverse is None:
-        return None
-    # Errors of what is held move the optimum of the rest.
-    moves = inverse @ matrix[np.ix_(~is_held, is_held)]
-    covariance = np.diag(held_variances)
-    covariance[np.ix_(~is_held, ~is_held)] = inverse + moves * held_variances[is_held] @ moves.T
-    blocks = {}
-    for start, (camera, _) in zip(equations.starts, cameras.values(), strict=True):
-        block = slice(start, start + len(camera.params))
-        blocks[camera.camera_id] = covariance[block, block]
-    number = 6 * len(images)
-    return Covariance(covariance[:number, :number], blocks)
-
-
-def seeing_images(model: Any) -> list[Any]:
-    """Return the registered images of pycolmap's model that see a point, in the order of their ids."""
-    return [
-        image for _, image in sorted(model.images.items()) if image.has_pose and image.num_points3D
-    ]
-
-
-def _inexact_cameras(
-    images: Sequence[Any], given_cameras: Mapping[str, KnownCamera]
-) -> dict[int, tuple[Any, float]]:
-    """Return the cameras whose intrinsics are not exact, by id, with the deviations in percent of
-    their given focal lengths, 0 if unknown.
-    """
-    cameras = {}
-    for image in images:
-        known = given_cameras.get(image.name)
-        if known is None or known.sigma:
-            cameras[image.camera_id] = (image.camera, known.sigma if known else 0.0)
-    return cameras
-
-
-@dataclass(frozen=True, eq=False)
-class _NormalEquations:
-    """The normal equations J^T J of all reprojection errors, without the points.
-
-    The six columns of each image come first, then the parameters of the cameras, at ``starts``.
-    """
-
-    matrix: Array
-    starts: tuple[int, ...]
-    residuals: int  # two of each observation
-    squares: float  # their sum of squares, in square pixels
-
-    @classmethod
-    def of(
-        cls, model: Any, images: Sequence[Any], cameras: Iterable[tuple[Any, float]]
-    ) -> "_NormalEquations":
-        start_of = {}
-        size = 6 * len(images)
-        for camera, _ in cameras:
-            start_of[camera.camera_id] = size
-            size += len(camera.params)
-        numbers = sorted(model.point3D_ids())
-        row_of = {number: row for row, number in enumerate(numbers)}
-        points = np.array([model.points3D[number].xyz for number in numbers])
-        matrix = np.zeros((size, size))
-        of_points = np.zeros((len(points), 3, 3))
-        observed = []  # of each image: the rows of its points, its columns, and J^T J with the points
-        squares = 0.0
-        for number, image in enumerate(images):
-            seen = [each for each in image.points2D if each.has_point3D()]
-            rows = np.array([row_of[each.point3D_id] for each in seen])
-            columns = np.arange(6 * number, 6 * number + 6)
-            residuals, by_pose, by_parameters, by_point = _derivatives(image, points[rows], seen)
-            by_camera = by_pose
-            if image.camera_id in start_of:
-                by_camera = np.concatenate([by_pose, by_parameters], axis=2)
-                start = start_of[image.camera_id]
-                columns = np.append(columns, np.arange(start, start + by_parameters.shape[2]))
-            squares += float((residuals**2).sum())
-            matrix[np.ix_(columns, columns)] += np.einsum("nij,nik->jk", by_camera, by_camera)
-            np.add.at(of_points, rows, np.einsum("nij,nik->njk", by_point, by_point))
-            observed.append((rows, columns, np.einsum("nij,nik->njk", by_camera, by_point)))
-        # With C = L L^T, A - B C^-1 B^T = A - V V^T, where V = B L^-T
-        trace = np.trace(of_points, axis1=1, axis2=2)[:, None, None]
-        roots = np.linalg.cholesky(of_points + DAMPING * trace * np.eye(3))
-        to_white = np.linalg.inv(roots).transpose(0, 2, 1)
-        blocks = [(rows, columns, mixed @ to_white[rows]) for rows, columns, mixed in observed]
-        white = _sparse(blocks, (size, 3 * len(points)))
-        matrix -= (white @ white.T).toarray()
-        residuals_count = sum(2 * len(rows) for rows, _, _ in observed)
-        return cls(matrix, tuple(start_of.values()), residuals_count, squares)
-
-
-def _sparse(blocks: Iterable[tuple[Any, Any, Array]], shape: tuple[int, int]) -> Any:
-    """Return the matrix of blocks (n, columns, 3): rows are parameters, columns are points."""
-    values = []
-    rows = []
-    columns = []
-    for points, parameters, block in blocks:
-        values.append(block.ravel())
-        rows.append(np.broadcast_to(parameters[:, None].astype(np.int32), block.shape).ravel())
-        places = (3 * points[:, None, None] + np.arange(3)).astype(np.int32)
-        columns.append(np.broadcast_to(places, block.shape).ravel())
-    indices = (np.concatenate(rows), np.concatenate(columns))
-    return csr_array((np.concatenate(values), indices), shape=shape)
-
-
-def _derivatives(
-    image: Any, points: Array, seen: Sequence[Any]
-) -> tuple[Array, Array, Array, Array]:
-    """Return an image's residuals (n, 2) in pixels, and their derivatives: by angles and translation
-    (n, 2, 6), by the camera's parameters (n, 2, p), and by the points (n, 2, 3).
-    """
-    pose = image.cam_from_world().matrix()
-    R = pose[:, :3]
-    turned = points @ R.T
-    in_camera = turned + pose[:, 3]
-    camera = pycolmap.Camera(image.camera.todict())
-    by_ray = np.empty((len(points), 2, 3))
-    for axis in range(3):
-        step = np.zeros_like(in_camera)
-        step[:, axis] = STEP * in_camera[:, 2]
-        change = camera.img_from_cam(in_camera + step) - camera.img_from_cam(in_camera - step)
-        by_ray[:, :, axis] = change / (2 * step[:, axis, None])
-    values = np.array(camera.params)
-    by_parameters = np.empty((len(points), 2, len(values)))
-    for parameter, value in enumerate(values):
-        step = np.zeros_like(values)
-        step[parameter] = STEP * max(1.0, abs(value))
-        camera.params = (values + step).tolist()
-        after = camera.img_from_cam(in_camera)
-        camera.params = (values - step).tolist()
-        change = after - camera.img_from_cam(in_camera)
-        by_parameters[:, :, parameter] = change / (2 * step[parameter])
-    residuals = image.camera.img_from_cam(in_camera) - np.array([each.xy for each in seen])
-    # An angle w moves a turned point by w x point, and ray . (w x point) = w . (point x ray).
-    by_angles = np.cross(turned[:, None], by_ray)
-    return residuals, np.concatenate([by_angles, by_ray], axis=2), by_parameters, by_ray @ R
-
-
-def _inverse(matrix: Array) -> Array | None:
-    """Return the inverse of normal equations; ``None`` if they are singular."""
-    scale = np.sqrt(np.diag(matrix))
-    if not (np.isfinite(matrix).all() and scale.all()):
-        return None
-    scales = np.outer(scale, scale)
-    try:
-        inverse = np.linalg.inv(matrix / scales + DAMPING * np.eye(len(scale)))
-    except np.linalg.LinAlgError:
-        return None
-    return np.asarray(inverse / scales) if np.isfinite(inverse).all() else None
-
-
 def combined(sigma: float, prior: float) -> float:
     """Return the standard deviation of the weighted mean of two independent values with these
     deviations.
@@ -269,7 +56,9 @@ def combined(sigma: float, prior: float) -> float:
     return float((sigma**-2 + prior**-2) ** -0.5) if sigma > 0 else 0.0
 
 
-def _pose_variances(poses: Sequence[Array], covariance: Array) -> Array:
+def _pose_variances(
+    poses: Sequence[NDArray[np.float64]], covariance: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Return variances (N, 2) of rotations, in radians, and centres, in model sizes; ``poses`` are
     [R | t].
     """

@@ -10,14 +10,10 @@ from scipy.spatial.transform import Rotation
 from benchmarks.synthetic_scene import SyntheticScene, synthetic_scene
 from mkpc_kaggle.recipe import CameraSharing, SceneConfig
 from mkpc_kaggle.scene import uncertainty
+from mkpc_kaggle.scene.covariance import covariance_of, seeing_images
 from mkpc_kaggle.scene.models import SfmModel
 from mkpc_kaggle.scene.sfm import reconstruct_batch
-from mkpc_kaggle.scene.uncertainty import (
-    PRINCIPAL_POINT_SHARE,
-    camera_sigmas,
-    covariance_of,
-    seeing_images,
-)
+from mkpc_kaggle.scene.uncertainty import PRINCIPAL_POINT_SHARE, camera_sigmas
 
 
 def model_of(scene: SyntheticScene) -> SfmModel:
@@ -110,3 +106,22 @@ def test_they_are_the_same_in_another_world():
     assert [*after] == [*before]
     # Sigmas have four digits, so the last one may differ by rounding.
     np.testing.assert_allclose([*after.values()], [*before.values()], rtol=1e-3)
+
+
+@pytest.mark.parametrize(
+    "fault", ["a point behind a camera", "a point at infinity", "a point seen along one ray"]
+)
+def test_a_degenerate_model_has_no_sigmas_or_finite_ones(fault):
+    model = pycolmap.Reconstruction(model_of(synthetic_scene(6, points=400)).colmap)
+    number = min(model.point3D_ids())
+    point = model.points3D[number]
+    image = model.images[point.track.elements[0].image_id]
+    centre = image.projection_center()
+    places = {
+        "a point behind a camera": centre - (point.xyz - centre),
+        "a point at infinity": np.full(3, np.inf),
+        "a point seen along one ray": centre + 1e12 * (point.xyz - centre),
+    }
+    point.xyz = places[fault]
+    sigmas = camera_sigmas(model)
+    assert all(np.isfinite(each).all() for each in sigmas.values())
