@@ -58,6 +58,13 @@ def has_moved(scene: SceneRecord) -> bool:
 
 def _focal_sentence(found: FocalContradiction) -> str:
     images = named([Path(name).name for name in found.images])
+    if found.given_axes:
+        given = " and ".join(f"{value:.0f}" for value in found.given_axes)
+        fitted = " and ".join(f"{value:.0f}" for value in found.fitted_axes)
+        return (
+            f"fx and fy of {given} px in --intrinsics contradict the photographs, which fit {fitted} px: "
+            f"{images}; correct or remove the row"
+        )
     if found.source is FocalSource.INTRINSICS:
         return (
             f"the focal length of {found.given:.0f} px in --intrinsics contradicts the photographs, which "

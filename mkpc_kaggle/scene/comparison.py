@@ -8,7 +8,7 @@ clearly, the photographs contradict the assumption. The model itself does not ch
 close to its optimum, so it takes a small part of the time of the model.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -18,7 +18,7 @@ import pycolmap
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.intrinsics import KnownCamera, PlacedCamera, radial_factor
 from mkpc_kaggle.scene.adjustment import robust_options
-from mkpc_kaggle.scene.covariance import covariance_of, seeing_images
+from mkpc_kaggle.scene.covariance import Covariance, covariance_of, seeing_images
 from mkpc_kaggle.scene.models import (
     MAX_SIGMA_IMAGES,
     Comparison,
@@ -36,6 +36,8 @@ MAX_ASPECT_RATIO = 1.02  # of two focal lengths; a radial coefficient needs a co
 # and ignore the distance of focus.
 MAX_DEVIATION = 0.05
 MAX_EXIF_DEVIATION = 0.3
+# Of fx / fy, which photographs determine better than their mean. Pixels are square to 0.01.
+MAX_RATIO_DEVIATION = 0.02
 MAX_PRIOR_SIGMAS = 3.0  # of a prior
 # Displacement of a point half the long side away from the middle, as a share of this distance. The
 # largest of five scenes of undistorted photographs is 0.0014; k = -0.05 of a phone is 0.015.
@@ -148,9 +150,35 @@ def _given_focals(
         fitted = float(np.median([freed_image.focal for freed_image in alike]))
         limit = np.log1p(max(MAX_DEVIATION, MAX_PRIOR_SIGMAS * camera.sigma / 100))
         deviation = abs(np.log(fitted / camera.focal))
-        if deviation > limit and deviation > CLEAR_SIGMAS * _sigma(copy, alike, 0) / fitted:
-            names = tuple(freed_image.registered.image.name for freed_image in alike)
-            yield FocalContradiction(FocalSource.INTRINSICS, names, camera.focal, fitted)
+        names = tuple(freed_image.registered.image.name for freed_image in alike)
+        found = FocalContradiction(FocalSource.INTRINSICS, names, camera.focal, fitted)
+        axes = _fitted_axes(alike, camera)
+        if axes and _contradicts_ratio(copy, alike, camera, axes):
+            yield replace(found, given_axes=camera.focals, fitted_axes=axes)
+        elif deviation > limit and deviation > CLEAR_SIGMAS * _sigma(copy, alike, 0) / fitted:
+            yield found
+
+
+def _fitted_axes(alike: Sequence[Freed], camera: KnownCamera) -> tuple[float, ...]:
+    """Return the medians of fx and fy of copies that have both free; empty for a single focal length."""
+    # Pinholes whose pixels are almost square have one in the copy, see _free_radial.
+    if len(camera.focals) == 1 or any(freed_image.is_radial for freed_image in alike):
+        return ()
+    axes = np.median([freed_image.camera.params[:2] for freed_image in alike], axis=0)
+    return float(axes[0]), float(axes[1])
+
+
+def _contradicts_ratio(
+    copy: Any, alike: Sequence[Freed], camera: KnownCamera, axes: Sequence[float]
+) -> bool:
+    """Return whether the photographs contradict fx / fy of a camera; ``axes`` are the fitted ones."""
+    given = np.log(camera.focals[0] / camera.focals[1])
+    deviation = abs(np.log(axes[0] / axes[1]) - given)
+    if deviation <= np.log1p(MAX_RATIO_DEVIATION):
+        return False
+    # Both focal lengths err together, so their ratio is known much better than each.
+    noise = _deviation(copy, alike, lambda found, camera: found.ratio_variance(camera))
+    return bool(deviation > CLEAR_SIGMAS * noise)
 
 
 def _given_distortions(
@@ -250,11 +278,17 @@ def _sigma(copy: Any, freed: Sequence[Freed], parameter: int) -> float:
     """Return the median standard deviation of a free parameter of the cameras: 0 is the first focal
     length in pixels, 1 the radial coefficient. Infinity if the model does not determine it.
     """
+    return _deviation(copy, freed, lambda found, camera: found.variance(camera, parameter))
+
+
+def _deviation(
+    copy: Any, freed: Sequence[Freed], variance_of: Callable[[Covariance, Any], float]
+) -> float:
     # As for the model: time and memory would be too much. The many images have little noise.
     if len(seeing_images(copy)) > MAX_SIGMA_IMAGES:
         return 0.0
     found = covariance_of(copy, {}, 0.0)
     if found is None:
         return float("inf")
-    variances = [found.variance(freed_image.camera, parameter) for freed_image in freed]
+    variances = [variance_of(found, freed_image.camera) for freed_image in freed]
     return float(np.sqrt(np.median(variances)))

@@ -50,6 +50,17 @@ class Covariance:
             return 0.0
         return float(known[np.ix_(focals, focals)].mean() / camera.mean_focal_length() ** 2)
 
+    def ratio_variance(self, camera: Any) -> float:
+        """Return the variance of the logarithm of fx / fy; 0 if the camera is exact."""
+        known = self.intrinsics.get(camera.camera_id)
+        if known is None:
+            return 0.0
+        first, second = camera.focal_length_idxs()
+        gradient = np.zeros(len(known))
+        gradient[first] = 1 / camera.params[first]
+        gradient[second] = -1 / camera.params[second]
+        return float(gradient @ known @ gradient)
+
 
 def covariance_of(
     model: Any, given_cameras: Mapping[str, KnownCamera], principal_point_share: float

@@ -76,12 +76,16 @@ class FocalSource(StrEnum):
 class FocalContradiction:
     """A given focal length that the photographs contradict; both are medians over the images, in
     pixels.
+
+    If they contradict the ratio of fx and fy, ``given_axes`` and ``fitted_axes`` have both of each.
     """
 
     source: FocalSource
     images: tuple[str, ...]
     given: float
     fitted: float
+    given_axes: tuple[float, ...] = ()
+    fitted_axes: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -161,6 +161,13 @@ SPEAKS = {
     "the focal length of 287 px in --intrinsics contradicts the photographs, which fit 575 px": (
         compared(FocalContradiction(FocalSource.INTRINSICS, ("0.jpg",), 287.4, 574.9))
     ),
+    "fx and fy of 552 and 598 px in --intrinsics contradict the photographs, which fit 575 and 576 px": (
+        compared(
+            FocalContradiction(
+                FocalSource.INTRINSICS, ("0.jpg",), 575.0, 575.5, (552.0, 598.0), (575.0, 576.0)
+            )
+        )
+    ),
     "the focal length of 1150 px in EXIF contradicts the photographs, which fit 575 px: 0.jpg; the": (
         compared(FocalContradiction(FocalSource.EXIF, ("0.jpg",), 1150.0, 575.0))
     ),

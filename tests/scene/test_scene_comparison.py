@@ -9,7 +9,8 @@ import pycolmap
 import pytest
 
 from benchmarks.synthetic_scene import SIZE, synthetic_scene
-from mkpc_kaggle.geometry.intrinsics import KnownCamera
+from mkpc_kaggle.geometry.coordinates import Size
+from mkpc_kaggle.geometry.intrinsics import LENS_MODELS, KnownCamera
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.recipe import CameraModel, CameraSharing, SceneConfig
 from mkpc_kaggle.scene.align import find_similarity, model_size, moved_by
@@ -68,6 +69,35 @@ def test_right_assumptions_are_not_contradicted():
     assert model_of(pairs_of(), pinhole(1.2 * FOCAL, 30.0)).comparison == Comparison()
     radial = KnownCamera("SIMPLE_RADIAL", (FOCAL, *MIDDLE, -0.1))
     assert model_of(pairs_of(-0.1), ("*", radial)).comparison == Comparison()
+
+
+@pytest.mark.parametrize(
+    ("name", "ratio"),
+    # Free distortion makes the ratio less certain.
+    [("PINHOLE", 0.92), ("PINHOLE", 1.05), ("PINHOLE", 1.5), ("OPENCV", 0.92)],
+)
+def test_pixels_that_are_not_square_are_contradicted(name, ratio):
+    axes = (FOCAL * ratio**0.5, FOCAL / ratio**0.5)
+    distortion = (0.0,) * (len(LENS_MODELS[name]) - 4)
+    model = model_of(pairs_of(), ("*", KnownCamera(name, (*axes, *MIDDLE, *distortion))))
+    (focal,) = model.comparison.focals
+    assert focal.given_axes == axes
+    assert focal.fitted_axes == pytest.approx((FOCAL, FOCAL), rel=0.03)
+    assert focal.fitted_axes[0] / focal.fitted_axes[1] == pytest.approx(1, abs=0.02)
+
+
+def test_a_right_ratio_of_the_focal_lengths_is_not_contradicted():
+    stretched = []
+    for pair in pairs_of():
+        points = [each * (1.0, 1.2) for each in (pair.matches.points0, pair.matches.points1)]
+        matches = Matches(*map(np.float32, points), pair.matches.scores)
+        size = Size(SIZE.width, round(1.2 * SIZE.height))
+        image0 = replace(pair.image0, size=size)
+        image1 = replace(pair.image1, size=size)
+        stretched.append(replace(pair, image0=image0, image1=image1, by_unit=(matches,)))
+    middle = (SIZE.width / 2, 0.6 * SIZE.height)
+    camera = KnownCamera("PINHOLE", (FOCAL, 1.2 * FOCAL, *middle))
+    assert model_of(stretched, ("*", camera)).comparison == Comparison()
 
 
 @pytest.mark.parametrize("k", [-0.2, -0.05, 0.1])
