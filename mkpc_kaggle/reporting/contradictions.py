@@ -23,6 +23,12 @@ def contradictions(scene: SceneRecord) -> Iterator[str]:
         # Without depth, focal lengths and distortion are not determined.
         return
     for model in scene.models:
+        if model.comparison.misplaced:
+            names = named([Path(name).name for name in model.comparison.misplaced])
+            yield (
+                f"matches contradict the cameras of {names} in the model of --onto, so these are registered "
+                "as new photographs: probably other pictures have their names"
+            )
         for focal in model.comparison.focals:
             yield _focal_sentence(focal)
         for distortion in model.comparison.distortions:

@@ -10,6 +10,7 @@ Source: Pan et al. 2024 (the global mapper).
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -42,6 +43,7 @@ from mkpc_kaggle.scene.models import (
     SfmModel,
     filter_models,
 )
+from mkpc_kaggle.scene.placement import misplaced_images
 from mkpc_kaggle.scene.uncertainty import camera_sigmas
 from mkpc_kaggle.scene.view_graph import (
     MIN_MATCHES,
@@ -89,8 +91,12 @@ def structure_from_motion(
         # The refinement reads the verified matches alone; the mapper reads relative poses, too.
         _fill(database, merged, shared, config, reuse=bool(former))
         if placed_by_name(merged.graph):
-            models = [register_onto(database, merged.graph, config.threads)]
-        elif former:
+            model, graph = register_onto(database, merged.graph, config.threads)
+            if not placed_by_name(graph):
+                failure = "the photographs contradict all cameras of the model of --onto"
+                return Reconstruction(graph.names, failure=failure)
+            return _reconstruction([model], graph)
+        if former:
             models = refine_models(database, merged.graph, config.threads, former)
         else:
             models = run_mapper(database, merged.graph, config.threads)
@@ -356,30 +362,34 @@ def _refine(cache: Any, former: Any, settings: Any) -> Any:
     return model
 
 
-def register_onto(database: Any, graph: ViewGraph, threads: int) -> Any:
+def register_onto(database: Any, graph: ViewGraph, threads: int) -> tuple[Any, ViewGraph]:
     """Return pycolmap's model of a filled database with the placed cameras as they are, and with the
     images that the incremental mapper registers among them.
+
+    An image whose matches contradict its placed camera is registered as a new one. In the returned
+    graph, it has no placed camera.
     """
     cache_options = pycolmap.DatabaseCacheOptions({"min_num_matches": MIN_MATCHES})
     cache = pycolmap.DatabaseCache.create(database, cache_options)
     settings = _mapper_options(graph, threads)
-    model = pycolmap.Reconstruction()
-    model.load(cache)
-    placed = placed_by_name(graph)
-    held = set()
+    model, numbers = _placed_model(cache, graph)
+    misplaced = misplaced_images(model, cache.correspondence_graph, numbers)
+    if misplaced:
+        wrong = {graph.images[number - 1].digest for number in misplaced}
+        right = {digest: camera for digest, camera in graph.known.items() if digest not in wrong}
+        graph = replace(graph, known=right)
+        model, numbers = _placed_model(cache, graph)
+    held = {model.images[number].camera_id for number in numbers}
     for number, image in enumerate(graph.images, start=1):
-        if image.name in placed:
-            x, y, z, w, *t = placed[image.name].pose
-            rotation = pycolmap.Rotation3d(np.array([x, y, z, w]))
-            model.frame(number).rig_from_world = pycolmap.Rigid3d(rotation, np.array(t))
-            model.register_frame(number)
-            held.add(model.images[number].camera_id)
-        elif image.digest in graph.known:
+        if number in numbers:
+            continue
+        camera_id = model.images[number].camera_id
+        if image.digest in graph.known:
             if not graph.known[image.digest].sigma:
-                held.add(model.images[number].camera_id)
+                held.add(camera_id)
         elif not image.focal and image.digest not in graph.lenses:
             # The points that it sees determine its focal length better than a guess.
-            model.cameras[model.images[number].camera_id].has_prior_focal_length = False
+            model.cameras[camera_id].has_prior_focal_length = False
     options = _incremental_options(settings)
     options.fix_existing_frames = True
     options.constant_cameras = held
@@ -397,7 +407,25 @@ def register_onto(database: Any, graph: ViewGraph, threads: int) -> Any:
     _refine_all(mapper, options, settings)
     mapper.end_reconstruction(False)
     model.update_point_3d_errors()
-    return model
+    return model, graph
+
+
+def _placed_model(cache: Any, graph: ViewGraph) -> tuple[Any, list[int]]:
+    """Return pycolmap's model with the poses of placed cameras, without points, and the numbers of
+    their images.
+    """
+    placed = placed_by_name(graph)
+    model = pycolmap.Reconstruction()
+    model.load(cache)
+    numbers = []
+    for number, image in enumerate(graph.images, start=1):
+        if image.name in placed:
+            x, y, z, w, *t = placed[image.name].pose
+            rotation = pycolmap.Rotation3d(np.array([x, y, z, w]))
+            model.frame(number).rig_from_world = pycolmap.Rigid3d(rotation, np.array(t))
+            model.register_frame(number)
+            numbers.append(number)
+    return model, numbers
 
 
 def _mapper_of(cache: Any, model: Any, settings: Any) -> Any:

@@ -29,6 +29,7 @@ from mkpc_kaggle.scene.models import (
     RegisteredImage,
     SfmModel,
 )
+from mkpc_kaggle.scene.placement import is_at
 
 COLMAP_PINHOLES = (pycolmap.CameraModelId.SIMPLE_PINHOLE, pycolmap.CameraModelId.PINHOLE)
 MAX_ASPECT_RATIO = 1.02  # of two focal lengths; a radial coefficient needs a common one
@@ -102,7 +103,8 @@ def compare_with_photographs(
     ]
     focals = (*given, *_exif_focals(determined, given_cameras))
     distortions = tuple(_given_distortions(copy, determined, given_cameras))
-    return Comparison(focals, tuple(_lenses(copy, determined)), distortions)
+    misplaced = tuple(_misplaced(model, given_cameras))
+    return Comparison(focals, tuple(_lenses(copy, determined)), distortions, misplaced=misplaced)
 
 
 def _thin(copy: Any) -> None:
@@ -211,6 +213,16 @@ def displacement_of(camera: KnownCamera, size: Size) -> float:
     """Return the displacement of :class:`DistortedLens` by all coefficients of a camera."""
     radius = max(size) / 2 / camera.focal
     return radial_factor(camera, radius) - 1
+
+
+def _misplaced(model: SfmModel, given_cameras: Mapping[str, KnownCamera]) -> Iterable[str]:
+    """Yield the images whose cameras of a finished model were not kept."""
+    cameras = {registered.image.name: registered.camera for registered in model.images}
+    for name, given in given_cameras.items():
+        if not isinstance(given, PlacedCamera):
+            continue
+        if name not in cameras or not is_at(cameras[name], given):
+            yield name
 
 
 def _exif_focals(

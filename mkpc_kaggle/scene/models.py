@@ -123,6 +123,7 @@ class Comparison:
     lenses: tuple[DistortedLens, ...] = ()
     distortions: tuple[DistortionContradiction, ...] = ()
     has_moved: bool = True  # False: the camera only turned, see :mod:`mkpc_kaggle.scene.motion`
+    misplaced: tuple[str, ...] = ()  # images that do not fit their cameras in a finished model
 
 
 @dataclass(frozen=True, eq=False)

@@ -233,3 +233,12 @@ def test_of_many_other_files_some_are_opened(tmp_path, monkeypatch, capsys):
     (root / "c").write_bytes(STARTS["IMG_1"])
     read_folder(root)
     assert "suffix" not in capsys.readouterr().err
+
+
+def test_a_line_with_several_readings_is_refused(tmp_path):
+    names = ("x.jpg", "y.jpg y.jpg", "x.jpg y.jpg", "y.jpg")
+    root = written(tmp_path / "photos", *names)
+    path = tmp_path / "pairs.txt"
+    path.write_text("x.jpg y.jpg y.jpg\n")
+    with pytest.raises(UserError, match="its blanks allow several pairs"):
+        read_pair_list(path, root, read_folder(root))

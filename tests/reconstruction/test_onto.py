@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
+from rectified import Seen, flat, number_of
 from shared import run_command
 from test_reconstruct import FIRST, RECIPE, MixedMatcher, write_flat
 
@@ -17,6 +18,7 @@ from mkpc_kaggle import reconstruct
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.intrinsics import KnownCamera, PlacedCamera, camera_of
+from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.reconstruction.placed import placed_line, read_cameras, read_placed
 from mkpc_kaggle.scene.align import find_similarity, model_size, moved_by
 from mkpc_kaggle.scene.assumptions import placed_lenses
@@ -220,3 +222,49 @@ def test_a_model_of_other_photographs_is_refused_with_one_of_its_names(home, tmp
         read_placed(model, tmp_path, {".": reduced})
     with pytest.raises(UserError, match=r"is for one dataset, and .* has 2: .* --join"):
         read_placed(model, home, {"a": files[:2], "b": files[2:]})
+
+
+class AnyOrder(MixedMatcher):
+    """Matches a pair of the scene in both orders."""
+
+    def _match(self, seen0: Seen, seen1: Seen) -> Matches:
+        if number_of(seen0) < number_of(seen1):
+            return super()._match(seen0, seen1)
+        found = super()._match(seen1, seen0)
+        return Matches(found.points1, found.points0, found.scores)
+
+
+def test_another_picture_under_a_name_of_the_model_is_registered_as_new(home, tmp_path):
+    files = []
+    for number, file in enumerate(sorted((home / "images").iterdir())):
+        # The first and the last photograph have exchanged their names.
+        shown = {0: FIRST - 1, FIRST - 1: 0}.get(number, number)
+        files.append(tmp_path / "images" / file.name)
+        files[-1].parent.mkdir(exist_ok=True)
+        cv2.imwrite(str(files[-1]), flat(shown, SIZE))
+    given = {"synthetic": AnyOrder()}
+    (model,) = made(files, tmp_path / "new", onto=home / "model", matchers=given)
+    assert [Path(name).name for name in model.comparison.misplaced] == ["00.png"]
+    truth = cameras_of_scene()
+    shown = [truth[number] for number in (FIRST - 1, *range(1, FIRST - 1), 0)]
+    found = {Path(image.image.name).name: image.camera for image in model.images}
+    cameras = [found[file.name] for file in files]
+    similarity = find_similarity(shown[1:OLD], cameras[1:OLD])
+    moved = [similarity.of_camera(camera) for camera in shown]
+    assert moved_by(cameras, moved).max() < 0.03 * model_size(cameras)
+    # Cameras that fit stay.
+    before = numbers_of(home / "model")
+    after = numbers_of(tmp_path / "new" / "colmap" / "models" / "0")
+    for name in ("01.png", "02.png", "03.png"):
+        assert after[name][0] == pytest.approx(before[name][0], rel=0, abs=1e-14)
+
+
+def test_a_model_of_other_pictures_is_a_failure_with_its_reason(home, tmp_path, capfd):
+    files = []
+    for number in range(FIRST):
+        files.append(tmp_path / "images" / f"{number:02}.png")
+        files[-1].parent.mkdir(exist_ok=True)
+        cv2.imwrite(str(files[-1]), flat((number * 5 + 2) % FIRST, SIZE))
+    given = {"synthetic": AnyOrder()}
+    assert made(files, tmp_path / "new", onto=home / "model", matchers=given) == ()
+    assert "the photographs contradict all cameras of the model of --onto" in capfd.readouterr().err

@@ -161,6 +161,9 @@ SPEAKS = {
     "the focal length of 287 px in --intrinsics contradicts the photographs, which fit 575 px": (
         compared(FocalContradiction(FocalSource.INTRINSICS, ("0.jpg",), 287.4, 574.9))
     ),
+    "matches contradict the cameras of 0.jpg in the model of --onto, so these are registered": log(
+        scene(model(GOOD, GOOD, GOOD, GOOD, comparison=Comparison(misplaced=("0.jpg",))))
+    ),
     "fx and fy of 552 and 598 px in --intrinsics contradict the photographs, which fit 575 and 576 px": (
         compared(
             FocalContradiction(
