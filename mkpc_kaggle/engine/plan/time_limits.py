@@ -25,8 +25,8 @@ MATCHERS_START_S = 300.0  # for a worker to load its matchers, which is slow fro
 def time_limit(job: Job, costs: Costs, budget: Budget, since: float) -> float:
     """Return the seconds after ``since``, the beginning of a job, within which its worker must answer.
 
-    They are thirty times the measured cost, or a quarter of the time left if the cost is unknown, and
-    :attr:`Budget.silence` (2 % of the limit of the run, 5 to 60 s).
+    They are thirty times the measured cost, or a quarter of the time left if the cost is unknown.
+    :attr:`Budget.silence` is added: 2 % of the limit of the run, 5 to 60 s.
     """
     match job:
         case MatchJob():
