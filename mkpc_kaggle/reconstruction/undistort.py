@@ -29,9 +29,11 @@ def undistort(model: Any, photographs: Path, folder: Path) -> None:
     Raises ``OSError`` if writing fails.
     """
     pinholes = {}
-    for number, camera in sorted(model.cameras.items()):
-        lens = lens_of(camera)
-        if any(lens.distortion):
+    # The mapper leaves cameras of images that it has given up, with focal lengths below zero.
+    used = {image.camera_id for image in model.images.values()}
+    for number in sorted(used):
+        camera = model.cameras[number]
+        if any(lens_of(camera).distortion):
             pinholes[number] = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera)
     for _, image in sorted(model.images.items()):
         if image.camera_id not in pinholes:

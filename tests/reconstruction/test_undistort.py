@@ -112,3 +112,19 @@ def test_pictures_of_all_formats_are_written(tmp_path, suffix):
     picture = read_image(path)
     assert isinstance(picture, Image)
     assert np.abs(picture.pixels.astype(int) - pixels).mean() < 4
+
+
+def test_a_camera_that_no_image_has_may_have_any_parameters(tmp_path):
+    photographs, out = write_dataset(tmp_path)
+    folder = out / "models" / "0"
+    model = pycolmap.Reconstruction(folder)
+    # As the mapper leaves one for an image of another kind
+    parameters = [-1422.6, SIZE[0] / 2, SIZE[1] / 2]
+    camera = pycolmap.Camera(
+        model="SIMPLE_PINHOLE", width=SIZE[0], height=SIZE[1], params=parameters, camera_id=9
+    )
+    model.add_camera_with_trivial_rig(camera)
+    model.write(folder)
+    lay_out(photographs, out)
+    written = pycolmap.Reconstruction(out / "sparse" / "0")
+    assert len(written.images) == len(LENSES)
