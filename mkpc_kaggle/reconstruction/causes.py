@@ -1,5 +1,6 @@
 """Causes that the files show why images have no camera."""
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -34,13 +35,16 @@ def causes_in_files(files: Sequence[Path], masks: Masks) -> Iterator[str]:
     """
     step = -(-len(files) // MAX_FILES) or 1
     sample = files[::step]
+    counts = Counter(file.name for file in files)
     sentences: dict[str, str] = {}
     names: dict[str, list[str]] = {}
     for file in sample:
         cause = _cause_in_file(file, masks)
         if cause is not None:
             sentences.setdefault(cause.kind, cause.sentence)
-            names.setdefault(cause.kind, []).append(file.name)
+            is_unique = counts[file.name] == 1
+            label = file.name if is_unique else f"{file.parent.name}/{file.name}"
+            names.setdefault(cause.kind, []).append(label)
     others = f"; {len(sample)} of {len(files)} files were read" if step > 1 else ""
     for kind, sentence in sentences.items():
         yield f"{sentence}: {', '.join(names[kind])}{others}"

@@ -1,6 +1,7 @@
 """Sentences about what the photographs of a scene contradict, each with its remedy."""
 
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from mkpc_kaggle.engine.store.tables import SceneRecord
@@ -14,6 +15,7 @@ from mkpc_kaggle.scene.models import (
 )
 
 MAX_NAMED = 3  # images in a sentence
+Labels = Mapping[str, str]  # what to call each image in a sentence
 
 
 def contradictions(scene: SceneRecord) -> Iterator[str]:
@@ -22,29 +24,32 @@ def contradictions(scene: SceneRecord) -> Iterator[str]:
         yield f"the cameras are not to be trusted: {HARDLY_MOVED}"
         # Without depth, focal lengths and distortion are not determined.
         return
+    labels = labels_of(scene)
     for model in scene.models:
         if model.comparison.misplaced:
-            names = named([Path(name).name for name in model.comparison.misplaced])
+            names = named([labels.get(name, name) for name in model.comparison.misplaced])
             yield (
                 f"matches contradict the cameras of {names} in the model of --onto, so these are registered "
                 "as new photographs: probably other pictures have their names"
             )
         for focal in model.comparison.focals:
-            yield _focal_sentence(focal)
+            yield _focal_sentence(focal, labels)
         for distortion in model.comparison.distortions:
-            yield _distortion_sentence(distortion)
+            yield _distortion_sentence(distortion, labels)
         for lens in model.comparison.lenses:
             # The model has an adopted lens, so nothing contradicts it.
             if not lens.is_adopted:
-                yield _lens_sentence(lens, is_everything=len(lens.images) == scene.images)
+                is_everything = len(lens.images) == scene.images
+                yield _lens_sentence(lens, labels, is_everything=is_everything)
 
 
 def adopted_lenses(scenes: Sequence[SceneRecord]) -> Iterator[tuple[str, str, str]]:
     """Yield a fact on each lens with distortion that the photographs have shown."""
     for scene in scenes:
+        labels = labels_of(scene)
         for model in scene.models:
             for lens in filter(lambda lens: lens.is_adopted, model.comparison.lenses):
-                names = named([Path(name).name for name in lens.images])
+                names = named([labels[name] for name in lens.images])
                 k = lens.camera.distortion[0]
                 remark = (
                     f"{100 * abs(lens.displacement):.1f} % at the edge; images/ and sparse/ are "
@@ -62,8 +67,8 @@ def has_moved(scene: SceneRecord) -> bool:
     return not scene.models or scene.models[0].comparison.has_moved
 
 
-def _focal_sentence(found: FocalContradiction) -> str:
-    images = named([Path(name).name for name in found.images])
+def _focal_sentence(found: FocalContradiction, labels: Labels) -> str:
+    images = named([labels[name] for name in found.images])
     if found.given_axes:
         given = " and ".join(f"{value:.0f}" for value in found.given_axes)
         fitted = " and ".join(f"{value:.0f}" for value in found.fitted_axes)
@@ -83,8 +88,8 @@ def _focal_sentence(found: FocalContradiction) -> str:
     )
 
 
-def _distortion_sentence(found: DistortionContradiction) -> str:
-    images = named([Path(name).name for name in found.images])
+def _distortion_sentence(found: DistortionContradiction, labels: Labels) -> str:
+    images = named([labels[name] for name in found.images])
     parameters = " ".join(f"{value:.5g}" for value in found.camera.parameters)
     return (
         f"the distortion of {100 * found.given:.1f} % at the edge in --intrinsics contradicts the photographs, "
@@ -93,12 +98,12 @@ def _distortion_sentence(found: DistortionContradiction) -> str:
     )
 
 
-def _lens_sentence(found: DistortedLens, *, is_everything: bool) -> str:
+def _lens_sentence(found: DistortedLens, labels: Labels, *, is_everything: bool) -> str:
     camera = found.camera
     parameters = " ".join(f"{value:.5g}" for value in camera.parameters)
     first = "*" if is_everything else found.images[0]
     others = "" if is_everything or len(found.images) == 1 else ", and the same for the others"
-    images = named([Path(name).name for name in found.images])
+    images = named([labels[name] for name in found.images])
     return (
         f"the lens of {plural(len(found.images), 'photograph')} is distorted by "
         f"{100 * abs(found.displacement):.1f} % at the edge, and neither the cameras nor their expected errors "
@@ -106,6 +111,20 @@ def _lens_sentence(found: DistortedLens, *, is_everything: bool) -> str:
         f"--intrinsics with the row {first},{camera.model},{parameters},{camera.sigma:g}{others}. F has no "
         "distortion: for `mkpc submit`, undistort the photographs"
     )
+
+
+def labels_of(scene: SceneRecord) -> dict[str, str]:
+    """Return :func:`file_labels` of the images with a camera of a scene."""
+    return file_labels(found.image.name for model in scene.models for found in model.images)
+
+
+def file_labels(names: Iterable[str]) -> dict[str, str]:
+    """Return what to call each image in a sentence: its file name, or the whole name if another image has
+    the same file name.
+    """
+    distinct = set(names)
+    counts = Counter(Path(name).name for name in distinct)
+    return {name: Path(name).name if counts[Path(name).name] == 1 else name for name in distinct}
 
 
 def named(names: Sequence[str]) -> str:

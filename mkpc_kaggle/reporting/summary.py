@@ -3,7 +3,6 @@
 import textwrap
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, TypeAlias
 
@@ -15,7 +14,7 @@ from mkpc_kaggle.geometry.critical_region import RegionReason
 from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
 from mkpc_kaggle.progress import format_duration
 from mkpc_kaggle.recipe import Recipe
-from mkpc_kaggle.reporting.contradictions import adopted_lenses
+from mkpc_kaggle.reporting.contradictions import adopted_lenses, file_labels
 from mkpc_kaggle.reporting.run_log import RunLog
 from mkpc_kaggle.scene.candidates import title_of
 from mkpc_kaggle.scene.models import Sigmas
@@ -318,9 +317,11 @@ def weakest_line(scenes: Sequence[SceneRecord]) -> Iterator[str]:
     """Yield a line with the weakest cameras, if any is known."""
     named = []
     # Enough to see whether one camera is worse than all others; the report has them all.
-    for name, sigmas in weakest_cameras(scenes)[:MAX_NAMED]:
+    cameras = weakest_cameras(scenes)
+    labels = file_labels(name for name, _ in cameras)
+    for name, sigmas in cameras[:MAX_NAMED]:
         error = f"{100 * sigmas.centre:.2g} %" if sigmas else "unknown"
-        named.append(f"{Path(name).name} ({error})")
+        named.append(f"{labels[name]} ({error})")
     if named:
         yield from wrapped(f"weakest cameras, with the error of the centre: {', '.join(named)}")
 

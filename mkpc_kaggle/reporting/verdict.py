@@ -16,7 +16,7 @@ from mkpc_kaggle.data.outputs import replacing
 from mkpc_kaggle.engine.store.json_values import to_text
 from mkpc_kaggle.engine.store.tables import MIN_PAIRS, EventKind, SceneRecord
 from mkpc_kaggle.errors import UserError, plural, printable, writing
-from mkpc_kaggle.reporting.contradictions import contradictions, has_moved, named
+from mkpc_kaggle.reporting.contradictions import contradictions, file_labels, has_moved, named
 from mkpc_kaggle.reporting.run_log import RunLog
 from mkpc_kaggle.reporting.summary import (
     headline,
@@ -146,7 +146,8 @@ def _scene_problems(scene: SceneRecord, log: RunLog) -> Iterator[str]:
     # The record of a scene has no list of its images without a camera; its pairs name them.
     files = {*pairs["image0"], *pairs["image1"]}
     lost = {file for file in files - names if log.digests.get(file) not in contents}
-    missing = sorted(Path(file).name for file in lost)
+    labels = file_labels(files)
+    missing = sorted(labels[file] for file in lost)
     if missing:
         remedies = "; ".join(_remedies(missing, unreadable_images(pairs), causes))
         yield f"{where}no camera for {named(missing)}: {remedies}"
@@ -160,7 +161,7 @@ def _scene_problems(scene: SceneRecord, log: RunLog) -> Iterator[str]:
         )
     uncertain = sorted(
         {
-            Path(image.image.name).name
+            labels.get(image.image.name, Path(image.image.name).name)
             for model in scene.models
             # A loose model has its own line.
             if not model.is_loose
@@ -241,7 +242,8 @@ def nearest_to_joining(scene: SceneRecord, pairs: "DataFrame", digests: Mapping[
     if best is None:
         return ""
     image0, image1, inliers = best
-    return f"{Path(image0).name} and {Path(image1).name} ({plural(inliers, 'inlier')})"
+    labels = file_labels([*pairs["image0"], *pairs["image1"]])
+    return f"{labels[image0]} and {labels[image1]} ({plural(inliers, 'inlier')})"
 
 
 def _looseness(model: SfmModel) -> str:

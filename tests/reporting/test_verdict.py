@@ -21,10 +21,13 @@ from mkpc_kaggle.geometry.intrinsics import KnownCamera
 from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
 from mkpc_kaggle.recipe import Recipe, SceneConfig, Unit
 from mkpc_kaggle.reporting import contradictions, verdict
+from mkpc_kaggle.reporting.contradictions import file_labels
 from mkpc_kaggle.reporting.run_log import RunLog
+from mkpc_kaggle.reporting.summary import weakest_line
 from mkpc_kaggle.scene.choose import Reason
 from mkpc_kaggle.scene.models import (
     HARDLY_MOVED,
+    MAX_CENTRE_SIGMA,
     MAX_SIGMA_IMAGES,
     Comparison,
     DistortedLens,
@@ -261,3 +264,24 @@ def test_no_sentence_of_the_verdict_lacks_an_input():
         and not any(re.escape(text) in pattern for text in doubts)
     ]
     assert missing == []
+
+
+def test_images_with_equal_file_names_are_called_by_their_folders():
+    assert file_labels(["a/1.jpg", "b/1.jpg", "b/2.jpg"]) == {
+        "a/1.jpg": "a/1.jpg",
+        "b/1.jpg": "b/1.jpg",
+        "b/2.jpg": "2.jpg",
+    }
+    names = ["a/1.jpg", "b/1.jpg", "b/2.jpg", "c/1.jpg"]
+    pairs = tuple(
+        Described(name, (first, name), "set", **GOOD_F) for first, name in pairwise(names)
+    )
+    uncertain = Sigmas(0.1, MAX_CENTRE_SIGMA * 2, 1)
+    run = log(scene(model(uncertain, GOOD, GOOD, names=names[:3])), pairs=pairs)
+    problems = verdict.verdict(run).problems
+    assert problems[0].startswith("no camera for c/1.jpg: ")
+    assert problems[1].startswith("uncertain cameras: a/1.jpg; ")
+    (line,) = weakest_line(run.scenes)
+    assert "error of the centre: a/1.jpg (" in line
+    assert "2.jpg (" in line
+    assert "b/2.jpg" not in line
