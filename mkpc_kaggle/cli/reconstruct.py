@@ -36,7 +36,11 @@ from mkpc_kaggle.reconstruction.layout import write_layouts
 from mkpc_kaggle.reconstruction.outputs import SUBMISSION_FORMATS, Cameras, write_tables
 from mkpc_kaggle.reconstruction.panoramas import require_perspective
 from mkpc_kaggle.reconstruction.placed import placed_line, read_placed
-from mkpc_kaggle.reconstruction.priors import intrinsics_line, read_intrinsics_table
+from mkpc_kaggle.reconstruction.priors import (
+    crops_line,
+    intrinsics_line,
+    read_intrinsics_table,
+)
 from mkpc_kaggle.reconstruction.run import FolderResult, for_cameras, reconstruct_folder
 from mkpc_kaggle.reporting.contradictions import adopted_lenses, contradictions
 from mkpc_kaggle.reporting.summary import (
@@ -223,11 +227,15 @@ def _require_export(path: Path, inputs: Sequence[Path], work_dir: Path) -> None:
 def _effects(
     masks: Masks, cameras: Rows, listed: Sequence[Ends] | None, root: Path, datasets: Datasets
 ) -> Iterator[str]:
-    """Yield which part of the masks, the known cameras and the list of pairs takes effect."""
+    """Yield which part of the masks, the known cameras and the list of pairs takes effect, and a line
+    on photographs that are crops.
+    """
     files = [file for dataset in datasets.values() for file in dataset]
     yield from masks.lines
     if cameras:
         yield intrinsics_line(cameras, root, files)
+    if line := crops_line(cameras, root, files):
+        yield line
     if listed is not None:
         yield pair_list_line(listed, root, datasets)
 

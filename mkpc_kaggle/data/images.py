@@ -48,6 +48,7 @@ MAX_ASPECT = 32
 FOCAL_MM = 0x920A
 PLANE_RESOLUTION = 0xA20E  # pixels per unit of the sensor
 PLANE_UNIT = 0xA210
+EXIF_BYTES = 1 << 17  # of a file, which has its EXIF there; a segment of JPEG has up to 64 kB
 RECORDED_SIDES = 0xA002, 0xA003  # width and height in pixels when the photograph was taken
 FOCAL_35MM = 0xA405
 FILM_MM = 43.27  # diagonal of 35 mm film
@@ -166,12 +167,13 @@ def _undecoded(path: Path, data: Pixels) -> str:
     head = data[:12].tobytes()
     if head[4:8] == b"ftyp" and head[8:12] in HEIC_BRANDS:
         return "a HEIC file, which cannot be decoded here; convert it to JPEG or PNG"
+    if path.suffix.lower() in OTHER_SUFFIXES:
+        return f"{path.suffix} files cannot be decoded here; convert it to JPEG or PNG"
+    # A raw file is a TIFF file, too.
     if is_tiff(head):
         return (
             "a TIFF file of a kind that cannot be decoded here; save it with 8 or 16 bits per value"
         )
-    if path.suffix.lower() in OTHER_SUFFIXES:
-        return f"{path.suffix} files cannot be decoded here; convert it to JPEG or PNG"
     return "not a picture, or cut off: it cannot be decoded"
 
 
@@ -263,6 +265,16 @@ def scale_since_taken(tags: Mapping[int, float], size: Size) -> float:
         if not 1 / MAX_SHAPE_RATIO < shape_ratio < MAX_SHAPE_RATIO:
             return 0.0
     return scale
+
+
+def is_crop(path: Path, size: Size) -> bool:
+    """Return whether EXIF at the head of a picture file states that it is a part of a photograph."""
+    try:
+        with path.open("rb") as stream:
+            head = stream.read(EXIF_BYTES)
+    except (OSError, ValueError):
+        return False
+    return not scale_since_taken(exif_tags(head), size)
 
 
 def read_size(path: Path) -> Size | None:

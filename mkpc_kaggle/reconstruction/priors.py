@@ -4,8 +4,8 @@ import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from mkpc_kaggle.data.competition import read_rows
-from mkpc_kaggle.data.images import EXIF_FOCALS, read_size
+from mkpc_kaggle.data.competition import evenly_spread, read_rows
+from mkpc_kaggle.data.images import EXIF_FOCALS, is_crop, read_size
 from mkpc_kaggle.engine.console import logger
 from mkpc_kaggle.errors import UserError, plural
 from mkpc_kaggle.geometry.coordinates import Size
@@ -26,6 +26,7 @@ MAX_USUAL_OFFSET = 0.05  # of a principal point from the middle, as a share of t
 MAX_ASPECT_RATIO = 1.1  # of two focal lengths; calibrations of one lens differ by 0.01
 MAX_TANGENT = 4.0  # of the angle of a ray with the axis: 76 degrees
 STEPS = 400
+MAX_HEADS = 200  # of files whose EXIF is read before a run, at a millisecond each
 
 
 def read_intrinsics_table(file: Path, root: Path, images: Iterable[Path]) -> Rows:
@@ -72,6 +73,27 @@ def read_intrinsics_table(file: Path, root: Path, images: Iterable[Path]) -> Row
                 f"{where[number]}: row {pattern!r} matches no image, or only images that an earlier row matches"
             )
     return rows
+
+
+def crops_line(rows: Rows, root: Path, images: Sequence[Path]) -> str:
+    """Return a line on images without a row that are crops by their EXIF; empty without any.
+
+    The middle of a crop need not be the middle of its lens, which cameras assume.
+    """
+    sample = evenly_spread(images, MAX_HEADS)
+    crops = []
+    for image in sample:
+        size = read_size(image)
+        is_known = camera_of(rows, image.relative_to(root).as_posix()) is not None
+        if size is not None and not is_known and is_crop(image, size):
+            crops.append(f"{image.relative_to(root).as_posix()} with {text_of(size)} pixels")
+    if not crops:
+        return ""
+    return (
+        f"{len(crops)} of {plural(len(sample), 'photograph')} are crops by their EXIF, the first is "
+        f"{crops[0]}: cameras assume that the middle of an image is the middle of the lens; use the "
+        "photographs as taken, or give --intrinsics"
+    )
 
 
 def has_gaps(rows: Rows, root: Path, images: Sequence[Path]) -> bool:

@@ -26,6 +26,7 @@ from mkpc_kaggle.reconstruction.outputs import PlacedImage
 from mkpc_kaggle.reconstruction.panoramas import require_perspective
 from mkpc_kaggle.reconstruction.placed import read_placed
 from mkpc_kaggle.reconstruction.priors import (
+    crops_line,
     has_gaps,
     intrinsics_line,
     read_intrinsics_table,
@@ -282,6 +283,8 @@ def with_priors(
             logger.warning(line)
     if cameras and has_gaps(cameras, root, files):
         logger.warning(intrinsics_line(cameras, root, files))
+    if line := crops_line(cameras, root, files):
+        logger.warning(line)
     placed = () if onto is None else read_placed(Path(onto), root, {".": files})
     recipe = for_cameras(assembly.recipe)
     return replace(assembly, recipe=recipe, masks=given, cameras=(*placed, *cameras))

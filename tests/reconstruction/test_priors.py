@@ -10,6 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from exif_files import set_exif
 from rectified import Seen
 from shared import run_command
 from test_reconstruct import FIRST, RECIPE, MixedMatcher, cameras, contents, write_flat
@@ -25,7 +26,11 @@ from mkpc_kaggle.geometry.intrinsics import KnownCamera, Rows
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.reconstruction.folder import read_folder
 from mkpc_kaggle.reconstruction.outputs import camera_rows
-from mkpc_kaggle.reconstruction.priors import intrinsics_line, read_intrinsics_table
+from mkpc_kaggle.reconstruction.priors import (
+    crops_line,
+    intrinsics_line,
+    read_intrinsics_table,
+)
 from mkpc_kaggle.reconstruction.python import Models, reconstruct
 from mkpc_kaggle.reconstruction.run import FolderResult, for_cameras, reconstruct_folder
 from mkpc_kaggle.setup.assembly import assemble
@@ -482,3 +487,30 @@ def test_python_takes_masks_and_intrinsics_as_the_command_does(tmp_path):
         bad = tmp_path / ("empty" if name == "masks" else "empty.csv")
         with pytest.raises(UserError, match=reason):
             models(**{name: bad})
+
+
+def write_jpeg(path: Path, width: int, height: int, **tags: int) -> Path:
+    path.parent.mkdir(exist_ok=True)
+    cv2.imwrite(str(path), np.full((height, width, 3), 90, np.uint8))
+    return set_exif(path, **tags)
+
+
+def test_crops_are_counted_by_their_exif_unless_their_camera_is_given(tmp_path, capsys):
+    recorded = {"tA002": 640, "tA003": 427}
+    root = tmp_path / "photos"
+    files = [
+        write_jpeg(root / "a.jpg", 520, 427, **recorded),
+        write_jpeg(root / "b.jpg", 640, 427, **recorded),
+        write_jpeg(root / "c.jpg", 320, 214, **recorded),  # reduced
+        write_jpeg(root / "d.jpg", 427, 640, **recorded),  # turned
+        write_jpeg(root / "e.jpg", 300, 300, tA405=28),
+    ]
+    words = "1 of 5 photographs are crops by their EXIF, the first is a.jpg with 520 x 427 pixels"
+    assert crops_line((), root, files).startswith(words)
+    known = [("a.jpg", KnownCamera("SIMPLE_PINHOLE", (575.0, 200, 213)))]
+    assert crops_line(known, root, files) == ""
+    recipe = tmp_path / "one.toml"
+    recipe.write_text('units = [{ stage = 1, matcher = "sift", long_side = 64 }]\n[scene]\n')
+    options = ["--out", tmp_path / "out", "--recipe", recipe, "--workers", 0]
+    run_command("reconstruct", root, *options)
+    assert words in capsys.readouterr().out
