@@ -174,6 +174,8 @@ class SceneConfig:
     candidates: int = 1
     # Minimum share of inliers of an edge, see :mod:`mkpc_kaggle.scene.edges`; 0: all edges.
     min_support: float = 0.0
+    # Images up to which the mapper starts from all tracks; from the longest of each image in larger scenes
+    all_tracks: int = 100
     threads: int = 1  # of the mapper; with more, the last digits vary from run to run
 
     def __post_init__(self) -> None:
@@ -182,6 +184,7 @@ class SceneConfig:
             pairs_per_image=AT_LEAST_0,
             candidates=AT_LEAST_1,
             min_support=Range(0, 1),
+            all_tracks=AT_LEAST_0,
             threads=AT_LEAST_1,
         )
 

@@ -57,7 +57,7 @@ from mkpc_kaggle.scene.view_graph import (
 # Of a verified match; 1 px loses accuracy on tourist photographs, 4 px on repeated windows
 MAX_ERROR_PX = 2.0
 MAX_TRIALS = 300  # RANSAC trials per edge; more trials find the same inliers at five times the cost
-LARGE = 100  # images; all tracks cost too much in larger scenes and improve smaller ones
+LARGE = 100  # images; in larger scenes, a last adjustment with points of two views costs too much
 TRACKS_PER_IMAGE = 200  # the longest tracks, from which the global mapper starts in a large scene
 # Of the models with shared intrinsics, as in COLMAP's global mapper
 MAX_REFINEMENTS = 5
@@ -99,7 +99,7 @@ def structure_from_motion(
         if former:
             models = refine_models(database, merged.graph, config.threads, former)
         else:
-            models = run_mapper(database, merged.graph, config.threads)
+            models = run_mapper(database, merged.graph, config)
     return _reconstruction(models, merged.graph)
 
 
@@ -300,13 +300,15 @@ def _uncalibrated(geometry: Any) -> Any:
     return kept
 
 
-def run_mapper(database: Any, graph: ViewGraph, threads: int) -> list[Any]:
+def run_mapper(database: Any, graph: ViewGraph, config: SceneConfig) -> list[Any]:
     """Run the global mapper on a filled database. Return pycolmap's models."""
-    common = {"random_seed": SEED, "num_threads": threads}
+    common = {"random_seed": SEED, "num_threads": config.threads}
     # Smaller models are dropped later anyway.
     limits = {"min_model_size": MIN_IMAGES, "min_num_matches": MIN_MATCHES}
+    mapper = _mapper_options(graph, config.threads)
+    if len(graph.images) > config.all_tracks:
+        mapper.track_required_tracks_per_view = TRACKS_PER_IMAGE
     manager = pycolmap.ReconstructionManager()
-    mapper = _mapper_options(graph, threads)
     options = pycolmap.GlobalPipelineOptions({**common, **limits, "mapper": mapper})
     pycolmap.GlobalPipeline(options, database, manager).run()
     return [manager.get(number) for number in range(manager.size())]
@@ -317,10 +319,7 @@ def _mapper_options(graph: ViewGraph, threads: int) -> Any:
     seed = {"random_seed": SEED}
     # Each part has a separate random generator.
     parts = dict.fromkeys(("rotation_averaging", "global_positioning", "retriangulation"), seed)
-    required = (
-        {"track_required_tracks_per_view": TRACKS_PER_IMAGE} if len(graph.images) > LARGE else {}
-    )
-    mapper = {**seed, "num_threads": threads, **parts, **required}
+    mapper = {**seed, "num_threads": threads, **parts}
     # With some exact cameras, the others must still be refined: those are restored afterwards.
     exact = [digest for digest, known in graph.known.items() if not known.sigma]
     if len(exact) == len(graph.images):

@@ -44,7 +44,7 @@ from mkpc_kaggle.geometry.intrinsics import KnownCamera
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import RobustConfig
 from mkpc_kaggle.matchers.adapters.sift import SiftMatcher, SiftOptions
-from mkpc_kaggle.recipe import Recipe, Unit
+from mkpc_kaggle.recipe import Recipe, SceneConfig, Unit
 from mkpc_kaggle.reconstruction import choice
 from mkpc_kaggle.reconstruction.folder import read_folder, read_pair_list
 from mkpc_kaggle.reconstruction.layout import write_images
@@ -225,9 +225,12 @@ def test_without_weights_one_unit_of_rootsift_runs_and_enlarges_no_image(
 ):
     """A recipe that the user names, and one with other matchers, runs as it is written."""
     recipe = assemble(name, device="cpu", matchers=more).recipe
-    kept = for_cameras(recipe).units
+    changed = for_cameras(recipe)
+    kept = changed.units
     assert [unit.name for unit in kept] == (units or [unit.name for unit in recipe.units])
     assert all(unit.enlarge for unit in kept) == (len(kept) > 1)
+    # A larger folder starts from fewer tracks by recipe auto alone, with any matchers.
+    assert (changed.scene.all_tracks < SceneConfig().all_tracks) == (name == "auto")
 
 
 def test_estimates_that_only_the_report_needs_are_the_cheap_ones():

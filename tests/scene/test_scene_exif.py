@@ -31,9 +31,9 @@ def mappings(monkeypatch) -> list[bool]:
     starts = []
     run = colmap.run_mapper
 
-    def noted(database, graph, threads):
+    def noted(database, graph, config):
         starts.append(graph.uses_exif)
-        return run(database, graph, threads)
+        return run(database, graph, config)
 
     monkeypatch.setattr(colmap, "run_mapper", noted)
     return starts

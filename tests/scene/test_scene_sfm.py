@@ -75,6 +75,25 @@ def test_cameras_are_right_in_spite_of_noise_and_wrong_matches(scene):
     assert len(model.points) > 200
 
 
+@pytest.mark.parametrize(("all_tracks", "most"), [(6, None), (5, 20)])
+def test_a_large_scene_starts_from_a_few_tracks_of_each_image(scene, monkeypatch, all_tracks, most):
+    """The cameras are as right, and points of all tracks come in the end."""
+    monkeypatch.setattr(colmap, "TRACKS_PER_IMAGE", 20)
+    starts = []
+    pipeline = colmap.pycolmap.GlobalPipeline
+
+    def noted(options, *rest):
+        starts.append(options.mapper.track_required_tracks_per_view)
+        return pipeline(options, *rest)
+
+    monkeypatch.setattr(colmap.pycolmap, "GlobalPipeline", noted)
+    solution = reconstruct_batch(scene.pairs, SceneConfig(all_tracks=all_tracks))
+    assert {each == most for each in starts} == {most is not None}
+    assert max(distances(solution, scene)) < 1
+    (found,) = solution.reconstructions
+    assert len(found.models[0].points) > 6 * 20
+
+
 def test_the_same_batch_gives_the_same_bytes_through_a_pipe_too(scene):
     # As a worker's process receives them.
     piped = pickle.loads(pickle.dumps(scene.pairs))

@@ -208,9 +208,9 @@ def mappings(monkeypatch) -> list[int]:
     sizes = []
     run = colmap.run_mapper
 
-    def counted(database, graph, threads):
+    def counted(database, graph, config):
         sizes.append(len(graph.images))
-        return run(database, graph, threads)
+        return run(database, graph, config)
 
     monkeypatch.setattr(colmap, "run_mapper", counted)
     return sizes
