@@ -14,8 +14,8 @@ from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.intrinsics import KnownCamera, PlacedCamera
 from mkpc_kaggle.recipe import CameraSharing, SceneConfig
 from mkpc_kaggle.scene.keypoints import MergedGraph
-from mkpc_kaggle.scene.mapper import Make, loses_points
-from mkpc_kaggle.scene.models import HARDLY_MOVED, MAX_CENTRE_SIGMA, Reconstruction, models_of
+from mkpc_kaggle.scene.mapper import Make, Mapped, loses_points
+from mkpc_kaggle.scene.models import HARDLY_MOVED, MAX_CENTRE_SIGMA, Reconstruction
 from mkpc_kaggle.scene.motion import hardly_moved
 from mkpc_kaggle.scene.shared_intrinsics import given_intrinsics, share
 from mkpc_kaggle.scene.view_graph import BatchImage, SharedIntrinsics, ViewGraph, known_by_name
@@ -26,24 +26,26 @@ MAX_EXIF_LOG_DEVIATION = float(np.log(1.3))  # of a refined focal length; EXIF i
 
 def with_right_exif(
     parts: Sequence[MergedGraph], given: SharedIntrinsics, config: SceneConfig, make: Make
-) -> tuple[list[MergedGraph], list[Reconstruction], SharedIntrinsics]:
-    """Return the graphs, their reconstructions and the shared intrinsics, without EXIF's focal
-    lengths where these are wrong. ``given`` are the initial intrinsics.
+) -> Mapped:
+    """Return the reconstructions without EXIF's focal lengths where these are wrong. ``given`` are the
+    initial intrinsics.
     """
     shared = given
-    chosen = list(parts)
-    reconstructions = [make(part, given) for part in parts]
-    for number, part in enumerate(parts):
-        if not doubts_exif(part.graph, reconstructions[number]):
+    chosen = []
+    reconstructions = []
+    for part, first in Mapped.of(parts, given, make):
+        chosen.append(part)
+        reconstructions.append(first)
+        if not doubts_exif(part.graph, first):
             continue
         other = part.starting_with(uses_exif=False)
         starts = given_intrinsics(part.graph.free, config, uses_exif=False)
         second = make(other, {**given, **starts})
-        if second.observations > reconstructions[number].observations:
+        if second.observations > first.observations:
             shared = {**shared, **starts}
-            chosen[number] = other
-            reconstructions[number] = second
-    return chosen, reconstructions, shared
+            chosen[-1] = other
+            reconstructions[-1] = second
+    return Mapped(tuple(chosen), tuple(reconstructions), shared)
 
 
 def doubts_exif(graph: ViewGraph, reconstruction: Reconstruction) -> bool:
@@ -76,18 +78,14 @@ def placed_lenses(graph: ViewGraph) -> dict[str, KnownCamera]:
 
 
 def with_lenses(
-    parts: Sequence[MergedGraph],
-    pinholes: Sequence[Reconstruction],
-    free: Sequence[BatchImage],
-    config: SceneConfig,
-    make: Make,
-) -> tuple[list[MergedGraph], list[Reconstruction], SharedIntrinsics] | None:
-    """Return graphs, reconstructions and shared intrinsics with the distorted lenses that
-    ``pinholes`` show, or ``None`` if they show none, or if images then see fewer points.
+    pinholes: Mapped, free: Sequence[BatchImage], config: SceneConfig, make: Make
+) -> Mapped | None:
+    """Return reconstructions with the distorted lenses that ``pinholes`` show, or ``None`` if they
+    show none, or if images then see fewer points.
     """
     sizes = {image.name: image.size for image in free}
     shown: dict[Size, KnownCamera] = {}
-    for lens in (lens for model in models_of(pinholes) for lens in model.comparison.lenses):
+    for lens in (lens for model in pinholes.models for lens in model.comparison.lenses):
         # A pinhole that the user gives stays one. Of several models, the largest counts.
         for name in lens.images:
             if name in sizes and not lens.is_adopted:
@@ -96,23 +94,27 @@ def with_lenses(
         return None
     # Images of one size share a lens, with and without a camera so far.
     lenses = {image.digest: shown[image.size] for image in free if image.size in shown}
-    bent = [part.starting_with(lenses={**part.graph.lenses, **lenses}) for part in parts]
+    parts = [part.starting_with(lenses={**part.graph.lenses, **lenses}) for part in pinholes.parts]
     given = given_intrinsics(free, config)
     shared: SharedIntrinsics = {
         digest: lenses[digest].focal if digest in lenses else focal
         for digest, focal in given.items()
     }
     # From the matches: pinholes have bent the poses, too.
-    again: Sequence[Reconstruction] = [make(part, shared) for part in bent]
+    bent = Mapped.of(parts, shared, make)
     if config.cameras is CameraSharing.AUTO:
-        sharing = share(bent, list(again), free, config, make)
-        again, shared = sharing or (again, shared)
-    if loses_points(pinholes, again):
+        bent = share(bent, free, config, make) or bent
+    if loses_points(pinholes.reconstructions, bent.reconstructions):
         return None
-    return bent, [compared(*both) for both in zip(bent, again, strict=True)], shared
+    return compared(bent)
 
 
-def compared(merged: MergedGraph, reconstruction: Reconstruction) -> Reconstruction:
+def compared(mapped: Mapped) -> Mapped:
+    """Return the reconstructions with the assumptions that their photographs contradict."""
+    return replace(mapped, reconstructions=tuple(_compared(*part) for part in mapped))
+
+
+def _compared(merged: MergedGraph, reconstruction: Reconstruction) -> Reconstruction:
     """Return the reconstruction with the assumptions that its photographs contradict."""
     # Certain cameras have moved.
     is_doubtful = (

@@ -6,8 +6,9 @@ pairs.
 
 import math
 from collections import Counter
-from collections.abc import Callable, Collection, Sequence
-from typing import TypeAlias
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Self, TypeAlias
 
 from mkpc_kaggle.recipe import SceneConfig
 from mkpc_kaggle.scene.keypoints import MergedGraph
@@ -19,6 +20,31 @@ MIN_OBSERVATIONS = 0.99  # share of the observations before another assumption; 
 
 # Reconstructs a graph with shared intrinsics
 Make: TypeAlias = Callable[[MergedGraph, SharedIntrinsics], Reconstruction]
+
+
+@dataclass(frozen=True, eq=False)
+class Mapped:
+    """The parts of a graph, the reconstruction of each, and the intrinsics that images share.
+
+    Assumptions are tried one after the other: another value of this kind replaces the former one, or not.
+    """
+
+    parts: tuple[MergedGraph, ...]
+    reconstructions: tuple[Reconstruction, ...]
+    shared: SharedIntrinsics
+
+    @classmethod
+    def of(cls, parts: Sequence[MergedGraph], shared: SharedIntrinsics, make: Make) -> Self:
+        return cls(tuple(parts), tuple(make(part, shared) for part in parts), shared)
+
+    @property
+    def models(self) -> tuple[SfmModel, ...]:
+        """The models of all parts, the largest first."""
+        return models_of(self.reconstructions)
+
+    def __iter__(self) -> Iterator[tuple[MergedGraph, Reconstruction]]:
+        """Yield each part with its reconstruction."""
+        return zip(self.parts, self.reconstructions, strict=True)
 
 
 def reconstruct_component(

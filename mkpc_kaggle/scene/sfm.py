@@ -118,30 +118,25 @@ def reconstruct_graph(
     lenses = placed_lenses(graph) if config.camera_model is CameraModel.AUTO else {}
     parts = [part.starting_with(lenses=lenses) for part in parts]
     given = given_intrinsics(free, config)
-    parts, reconstructions, shared = with_right_exif(parts, given, config, make)
+    mapped = with_right_exif(parts, given, config, make)
     if config.cameras is not CameraSharing.IMAGE:
-        parts, reconstructions = sharing_with_placed(parts, reconstructions, shared, make)
-        known = {digest for part in parts for digest in part.graph.known}
+        mapped = sharing_with_placed(mapped, make)
+        known = {digest for part in mapped.parts for digest in part.graph.known}
         free = [image for image in free if image.digest not in known]
     if config.cameras is CameraSharing.AUTO:
-        sharing = share(parts, reconstructions, free, config, make)
-        if sharing is not None:
-            reconstructions, shared = sharing
-    reconstructions = [
-        compared(part, reconstruction)
-        for part, reconstruction in zip(parts, reconstructions, strict=True)
-    ]
+        mapped = share(mapped, free, config, make) or mapped
+    mapped = compared(mapped)
     if config.camera_model is CameraModel.AUTO:
-        adopted = with_lenses(parts, reconstructions, free, config, make)
-        if adopted is not None:
-            parts, reconstructions, shared = adopted
+        mapped = with_lenses(mapped, free, config, make) or mapped
+    reconstructions = list(mapped.reconstructions)
+    shared = mapped.shared
     if directory is not None:
         from mkpc_kaggle.scene.colmap import write_files
 
         # Before the files are written, so that files and results agree. Placed cameras have a world.
         if not placed_by_name(graph):
             reconstructions = align(reconstructions, read_reference(directory.path))
-        write_files(directory, parts[0], shared, models_of(reconstructions), config)
+        write_files(directory, mapped.parts[0], shared, models_of(reconstructions), config)
     # Images without a camera have the refined focal length, and not the one it began with.
     if given:
         shared = refined_intrinsics(free, models_of(reconstructions))

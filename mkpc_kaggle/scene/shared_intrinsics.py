@@ -13,7 +13,7 @@ camera of the user's are not compared.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -22,8 +22,8 @@ from mkpc_kaggle.geometry.focal_prior import FOCAL_RATIO
 from mkpc_kaggle.geometry.intrinsics import KnownCamera, PlacedCamera
 from mkpc_kaggle.recipe import CameraSharing, SceneConfig
 from mkpc_kaggle.scene.keypoints import MergedGraph
-from mkpc_kaggle.scene.mapper import Make, loses_points, refine_complete
-from mkpc_kaggle.scene.models import Reconstruction, SfmModel, models_of
+from mkpc_kaggle.scene.mapper import Make, Mapped, loses_points, refine_complete
+from mkpc_kaggle.scene.models import Reconstruction, SfmModel
 from mkpc_kaggle.scene.view_graph import BatchImage, SharedIntrinsics
 
 TOLERANCE = 0.02  # maximum relative deviation of agreeing focal lengths from the median
@@ -35,38 +35,36 @@ EXIF_TOLERANCE = 0.1  # of one zoom; values of 35 mm film are rounded to millime
 
 
 def share(
-    parts: Sequence[MergedGraph],
-    reconstructions: list[Reconstruction],
-    free: Sequence[BatchImage],
-    config: SceneConfig,
-    make: Make,
-) -> tuple[list[Reconstruction], SharedIntrinsics] | None:
+    former: Mapped, free: Sequence[BatchImage], config: SceneConfig, make: Make
+) -> Mapped | None:
     """Return reconstructions with shared intrinsics of the ``free`` images that seem to share a
     camera, or ``None`` if none do, or if images then see fewer points.
 
-    They start from the poses ``reconstructions`` where these are good enough. Images that seem to have another
-    zoom share, too, unless they lose points by that.
+    They start from the poses of the ``former`` reconstructions where these are good enough. Images that seem to
+    have another zoom share, too, unless they lose points by that.
     """
-    models = models_of(reconstructions)
-    alike = shared_intrinsics(free, models)
+    alike = shared_intrinsics(free, former.models)
     if not alike:
         return None
-    everything = shared_intrinsics(free, models, with_zoomed=True)
+    everything = shared_intrinsics(free, former.models, with_zoomed=True)
     if everything.keys() != alike.keys():
         # From these poses alone: most zooms are real, and the mapper takes long.
         together = []
-        for part, former in zip(parts, reconstructions, strict=True):
-            refined = refine_complete(part, everything, config, former)
+        for part, reconstruction in former:
+            refined = refine_complete(part, everything, config, reconstruction)
             if refined is not None:
                 together.append(refined)
-        zoomed = undecided_zooms(free, models)
-        if len(together) == len(parts) and not loses_points(reconstructions, together, zoomed):
-            return together, everything
+        zoomed = undecided_zooms(free, former.models)
+        is_complete = len(together) == len(former.parts)
+        if is_complete and not loses_points(former.reconstructions, together, zoomed):
+            return replace(former, reconstructions=tuple(together), shared=everything)
     again = []
-    for part, former in zip(parts, reconstructions, strict=True):
-        refined = refine_complete(part, alike, config, former)
+    for part, reconstruction in former:
+        refined = refine_complete(part, alike, config, reconstruction)
         again.append(refined or make(part, alike))
-    return None if loses_points(reconstructions, again) else (again, alike)
+    if loses_points(former.reconstructions, again):
+        return None
+    return replace(former, reconstructions=tuple(again), shared=alike)
 
 
 def given_intrinsics(
@@ -124,26 +122,23 @@ def undecided_zooms(images: Sequence[BatchImage], models: Sequence[SfmModel]) ->
     return undecided
 
 
-def sharing_with_placed(
-    parts: Sequence[MergedGraph],
-    reconstructions: Sequence[Reconstruction],
-    shared: SharedIntrinsics,
-    make: Make,
-) -> tuple[list[MergedGraph], list[Reconstruction]]:
-    """Return the graphs and the reconstructions with the intrinsics of :func:`with_placed_intrinsics`,
-    unless images then see fewer points.
+def sharing_with_placed(former: Mapped, make: Make) -> Mapped:
+    """Return the reconstructions with the intrinsics of :func:`with_placed_intrinsics`, unless images
+    then see fewer points.
     """
-    chosen = list(parts)
-    found = list(reconstructions)
-    for number, part in enumerate(parts):
-        placed = with_placed_intrinsics(part, found[number])
+    parts = []
+    reconstructions = []
+    for part, reconstruction in former:
+        parts.append(part)
+        reconstructions.append(reconstruction)
+        placed = with_placed_intrinsics(part, reconstruction)
         if placed is None:
             continue
-        again = make(placed, shared)
-        if not loses_points([found[number]], [again]):
-            chosen[number] = placed
-            found[number] = again
-    return chosen, found
+        again = make(placed, former.shared)
+        if not loses_points([reconstruction], [again]):
+            parts[-1] = placed
+            reconstructions[-1] = again
+    return Mapped(tuple(parts), tuple(reconstructions), former.shared)
 
 
 def with_placed_intrinsics(part: MergedGraph, reconstruction: Reconstruction) -> MergedGraph | None:
