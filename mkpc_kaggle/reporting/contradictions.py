@@ -81,6 +81,11 @@ def _focal_sentence(found: FocalContradiction, labels: Labels) -> str:
             f"the focal length of {found.given:.0f} px in --intrinsics contradicts the photographs, which "
             f"fit {found.fitted:.0f} px: {images}; correct or remove the row"
         )
+    if found.source is FocalSource.SHARED:
+        return (
+            f"the focal length of {found.given:.0f} px that photographs share contradicts some of them, which "
+            f"fit about {found.fitted:.0f} px: {images}; omit --camera folder"
+        )
     return (
         f"the focal length of {found.given:.0f} px in EXIF contradicts the photographs, which fit "
         f"{found.fitted:.0f} px: {images}; the cameras have the latter. If they look wrong, give "

@@ -21,6 +21,7 @@ from mkpc_kaggle.scene.adjustment import robust_options
 from mkpc_kaggle.scene.covariance import Covariance, covariance_of, seeing_images
 from mkpc_kaggle.scene.models import (
     MAX_SIGMA_IMAGES,
+    MIN_POINTS,
     Comparison,
     DistortedLens,
     DistortionContradiction,
@@ -39,6 +40,9 @@ MAX_DEVIATION = 0.05
 MAX_EXIF_DEVIATION = 0.3
 # Of fx / fy, which photographs determine better than their mean. Pixels are square to 0.01.
 MAX_RATIO_DEVIATION = 0.02
+# Of images that share one. Images of one camera differ by up to 0.006 (three scenes at full size).
+MAX_SHARED_DEVIATION = 0.05
+MAX_STRAY_DEVIATION = 0.15  # of a single image, which may be a weak one
 MAX_PRIOR_SIGMAS = 3.0  # of a prior
 # Displacement of a point half the long side away from the middle, as a share of this distance. The
 # largest of five scenes of undistorted photographs is 0.0014; k = -0.05 of a phone is 0.015.
@@ -101,10 +105,13 @@ def compare_with_photographs(
         if freed_image.registered.image.name not in wrong
         and (freed_image.registered.sigmas or len(freed) > MAX_SIGMA_IMAGES)
     ]
-    focals = (*given, *_exif_focals(determined, given_cameras))
+    lenses = tuple(_lenses(copy, determined))
+    # A distorted lens bends a model, too, and each image then fits another focal length.
+    shared = () if lenses else tuple(_shared_focals(model))
+    focals = (*given, *shared, *_exif_focals(determined, given_cameras))
     distortions = tuple(_given_distortions(copy, determined, given_cameras))
     misplaced = tuple(_misplaced(model, given_cameras))
-    return Comparison(focals, tuple(_lenses(copy, determined)), distortions, misplaced=misplaced)
+    return Comparison(focals, lenses, distortions, misplaced=misplaced)
 
 
 def _thin(copy: Any) -> None:
@@ -159,6 +166,24 @@ def _given_focals(
             yield replace(found, given_axes=camera.focals, fitted_axes=axes)
         elif deviation > limit and deviation > CLEAR_SIGMAS * _sigma(copy, alike, 0) / fitted:
             yield found
+        else:
+            yield from _stray_focals(copy, alike, camera, limit)
+
+
+def _stray_focals(
+    copy: Any, alike: Sequence[Freed], camera: KnownCamera, limit: float
+) -> Iterable[FocalContradiction]:
+    """Yield the images of a row that its focal length does not fit, though it fits the others: they
+    were taken with another zoom.
+    """
+    limit = max(limit, np.log1p(MAX_STRAY_DEVIATION))
+    far = [each for each in alike if abs(np.log(each.focal / camera.focal)) > limit]
+    noise = CLEAR_SIGMAS * _sigma(copy, far, 0) / camera.focal if far else 0.0
+    stray = [each for each in far if abs(np.log(each.focal / camera.focal)) > noise]
+    if stray:
+        names = tuple(each.registered.image.name for each in stray)
+        fitted = float(np.median([each.focal for each in stray]))
+        yield FocalContradiction(FocalSource.INTRINSICS, names, camera.focal, fitted)
 
 
 def _fitted_axes(alike: Sequence[Freed], camera: KnownCamera) -> tuple[float, ...]:
@@ -213,6 +238,55 @@ def displacement_of(camera: KnownCamera, size: Size) -> float:
     """Return the displacement of :class:`DistortedLens` by all coefficients of a camera."""
     radius = max(size) / 2 / camera.focal
     return radial_factor(camera, radius) - 1
+
+
+def sharing_images(colmap: Any) -> dict[int, list[str]]:
+    """Return the names of the images that share a camera, by the camera's number."""
+    names: dict[int, list[str]] = {}
+    for number in sorted(colmap.reg_image_ids()):
+        image = colmap.images[number]
+        names.setdefault(image.camera_id, []).append(image.name)
+    return {camera: found for camera, found in names.items() if len(found) > 1}
+
+
+def _shared_focals(model: SfmModel) -> Iterable[FocalContradiction]:
+    """Yield the focal lengths that images share, but that some of these contradict.
+
+    Each image alone is registered to the points of the model with its own focal length.
+    """
+    groups = sharing_images(model.colmap)
+    if not groups:
+        return
+    images = {image.name: image for image in model.colmap.images.values()}
+    for names in groups.values():
+        given = float(images[names[0]].camera.mean_focal_length())
+        fitted = {name: own_focal(model.colmap, images[name]) for name in names}
+        limit = np.log1p(MAX_SHARED_DEVIATION)
+        wrong = [name for name in names if abs(np.log(fitted[name] / given)) > limit]
+        if wrong:
+            median = float(np.median([fitted[name] for name in wrong]))
+            yield FocalContradiction(FocalSource.SHARED, tuple(wrong), given, median)
+
+
+def own_focal(colmap: Any, image: Any) -> float:
+    """Return the focal length with which an image alone fits the points of a model best; the image's own
+    if that is not determined.
+    """
+    focal = float(image.camera.mean_focal_length())
+    seen = [point for point in image.points2D if point.has_point3D()]
+    # Evenly spread over the keypoints; more take time and change nothing.
+    seen = seen[:: max(1, len(seen) // MAX_IMAGE_POINTS)]
+    if len(seen) < MIN_POINTS:
+        return focal
+    points2D = np.array([point.xy for point in seen])
+    points3D = np.array([colmap.points3D[point.point3D_id].xyz for point in seen])
+    camera = pycolmap.Camera(image.camera.todict())
+    options = pycolmap.AbsolutePoseRefinementOptions()
+    options.refine_focal_length = True
+    refined = pycolmap.refine_absolute_pose(
+        image.cam_from_world(), points2D, points3D, np.ones(len(seen), bool), camera, options
+    )
+    return float(camera.mean_focal_length()) if refined is not None else focal
 
 
 def _misplaced(model: SfmModel, given_cameras: Mapping[str, KnownCamera]) -> Iterable[str]:

@@ -70,6 +70,7 @@ class FocalSource(StrEnum):
 
     INTRINSICS = "--intrinsics"
     EXIF = "EXIF"
+    SHARED = "shared"  # with other images, as with --camera folder
 
 
 @dataclass(frozen=True)

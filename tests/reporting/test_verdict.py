@@ -167,6 +167,9 @@ SPEAKS = {
     "matches contradict the cameras of 0.jpg in the model of --onto, so these are registered": log(
         scene(model(GOOD, GOOD, GOOD, GOOD, comparison=Comparison(misplaced=("0.jpg",))))
     ),
+    "the focal length of 912 px that photographs share contradicts some of them, which fit about 684 px": (
+        compared(FocalContradiction(FocalSource.SHARED, ("0.jpg",), 912.2, 684.0))
+    ),
     "fx and fy of 552 and 598 px in --intrinsics contradict the photographs, which fit 575 and 576 px": (
         compared(
             FocalContradiction(

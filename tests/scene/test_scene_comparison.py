@@ -71,6 +71,31 @@ def test_right_assumptions_are_not_contradicted():
     assert model_of(pairs_of(-0.1), ("*", radial)).comparison == Comparison()
 
 
+ZOOMED = synthetic_scene(
+    6, points=500, focals=[FOCAL, FOCAL, FOCAL, FOCAL, 1.4 * FOCAL, 1.4 * FOCAL]
+)
+
+
+def test_a_row_that_does_not_fit_some_of_its_images_names_these():
+    model = model_of(list(ZOOMED.pairs), pinhole(FOCAL))
+    (focal,) = model.comparison.focals
+    assert len(focal.images) == 2
+    assert {*focal.images} < {image.image.name for image in model.images}
+    assert focal.fitted == pytest.approx(1.4 * FOCAL, rel=0.1)
+
+
+def test_images_that_a_shared_focal_length_does_not_fit_are_named():
+    graph = ViewGraph.of_pairs(list(ZOOMED.pairs))
+    (found,), _ = reconstruct_graph(graph, SceneConfig(cameras=CameraSharing.FOLDER))
+    (model,) = found.models
+    (focal,) = model.comparison.focals
+    assert focal.source is FocalSource.SHARED
+    assert {*focal.images} < {image.image.name for image in model.images}
+    # Cameras that are shared only if they agree are right.
+    (right,), _ = reconstruct_graph(graph, SceneConfig())
+    assert [each.comparison for each in right.models] == [Comparison()]
+
+
 @pytest.mark.parametrize(
     ("name", "ratio"),
     # Free distortion makes the ratio less certain.

@@ -118,7 +118,7 @@ class Store:
         store = cls(directory)
         if not store.path.is_file():
             name = f"{directory} has no {FILE_NAME}"
-            raise UserError(f"{name}: name the work directory of a run (NAME.work)")
+            raise UserError(f"{name}: name the work directory of a run (NAME.work, or OUT/work)")
         path = store.path
         # The last connection removes SQLite's other files, which a read-only one would leave.
         mode = "mode=rw"
