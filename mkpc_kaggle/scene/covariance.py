@@ -13,16 +13,18 @@ from typing import Any
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
 
 from mkpc_kaggle.geometry.intrinsics import KnownCamera
 from mkpc_kaggle.scene.models import MAX_SIGMA_IMAGES
 
 Array = NDArray[np.float64]
+# Of an image: the ascending rows (n,) of its points, the columns (c,) of its parameters, values (n, c, 3)
+Block = tuple[NDArray[np.int64], NDArray[np.int64], Array]
 
 STEP = 1e-6  # of numerical derivatives, relative
 DAMPING = 1e-10  # of scaled normal equations, which have the seven freedoms of the world
 GAUGE = 7
+CHUNK = 1_000_000  # parameters times points that are eliminated at a time, for 24 MB
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,10 +162,11 @@ class _NormalEquations:
         points = np.array([places[number] for number in numbers]).reshape(-1, 3)
         matrix = np.zeros((size, size))
         of_points = np.zeros((len(points), 3, 3))
-        observed = []  # of each image: the rows of its points, its columns, and J^T J with the points
+        observed: list[Block] = []  # J^T J of cameras with points
         squares = 0.0
         for number, image in enumerate(images):
             seen = [each for each in image.points2D if each.point3D_id in row_of]
+            seen.sort(key=lambda each: row_of[each.point3D_id])
             rows = np.array([row_of[each.point3D_id] for each in seen], np.int64)
             columns = np.arange(6 * number, 6 * number + 6)
             residuals, by_pose, by_parameters, by_point = _derivatives(image, points[rows], seen)
@@ -181,24 +184,23 @@ class _NormalEquations:
         roots = np.linalg.cholesky(of_points + DAMPING * trace * np.eye(3))
         to_white = np.linalg.inv(roots).transpose(0, 2, 1)
         blocks = [(rows, columns, mixed @ to_white[rows]) for rows, columns, mixed in observed]
-        white = _sparse(blocks, (size, 3 * len(points)))
-        matrix -= (white @ white.T).toarray()
+        step = max(1, CHUNK // size)
+        for start in range(0, len(points), step):
+            part = _dense(blocks, size, start, min(start + step, len(points)))
+            matrix -= part @ part.T
         residuals_count = sum(2 * len(rows) for rows, _, _ in observed)
         return cls(matrix, tuple(start_of.values()), len(points), residuals_count, squares)
 
 
-def _sparse(blocks: Iterable[tuple[Any, Any, Array]], shape: tuple[int, int]) -> Any:
-    """Return the matrix of blocks (n, columns, 3): rows are parameters, columns are points."""
-    values = []
-    rows = []
-    columns = []
-    for points, parameters, block in blocks:
-        values.append(block.ravel())
-        rows.append(np.broadcast_to(parameters[:, None].astype(np.int32), block.shape).ravel())
-        places = (3 * points[:, None, None] + np.arange(3)).astype(np.int32)
-        columns.append(np.broadcast_to(places, block.shape).ravel())
-    indices = (np.concatenate(rows), np.concatenate(columns))
-    return csr_array((np.concatenate(values), indices), shape=shape)
+def _dense(blocks: Iterable[Block], size: int, start: int, end: int) -> Array:
+    """Return V (size, 3 n) of the points from ``start`` to ``end``."""
+    dense = np.zeros((size, end - start, 3))
+    for rows, columns, block in blocks:
+        inside = slice(*np.searchsorted(rows, (start, end)))
+        places = (columns[:, None], rows[inside] - start)
+        # An image may see a point twice.
+        np.add.at(dense, places, block[inside].transpose(1, 0, 2))
+    return dense.reshape(size, -1)
 
 
 def _derivatives(
