@@ -1,6 +1,8 @@
 """The number of cores that a process may use."""
 
 import os
+import subprocess
+import sys
 from math import inf
 from pathlib import Path
 
@@ -62,3 +64,35 @@ def test_nothing_else_counts_cores():
         if any(word in path.read_text() for word in words)
     ]
     assert users == ["cores.py"]
+
+
+THREADS = """
+import cv2, torch
+from threadpoolctl import threadpool_info
+from mkpc_kaggle import cores
+cores.available_cores = lambda: 6
+torch.set_num_threads(6)
+{call}
+pools = [pool["num_threads"] for pool in threadpool_info()]
+print(torch.get_num_threads(), cv2.getNumThreads(), max(pools))
+"""
+
+
+@pytest.mark.parametrize(
+    ("call", "threads"),
+    [
+        ("cores.limit_matching_threads()", {"torch": 6, "cv2": 6}),
+        ("cores.limit_matching_threads(share=2)", {"torch": 3, "cv2": 3}),
+        ("cores.limit_matching_threads(share=9)", {"torch": 1, "cv2": 1}),
+        ("cores.limit_matching_threads(4)", {"torch": 4, "cv2": 4}),
+        ("cores.limit_to_one_thread()", {"cv2": 1, "pools": 1}),
+    ],
+)
+def test_workers_have_their_threads(call: str, threads: dict[str, int]) -> None:
+    # In a process of its own: limits last until it ends.
+    program = THREADS.format(call=call)
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
+    counts = dict(zip(("torch", "cv2", "pools"), map(int, done.stdout.split()), strict=True))
+    assert {name: counts[name] for name in threads} == threads
