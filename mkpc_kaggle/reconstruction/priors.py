@@ -67,11 +67,14 @@ def read_intrinsics_table(file: Path, root: Path, images: Iterable[Path]) -> Row
             warned.add(number)
             logger.warning(doubt)
     # A misspelt name would silently have no effect.
-    for number, (pattern, _) in enumerate(rows):
-        if number not in used:
-            raise UserError(
-                f"{where[number]}: row {pattern!r} matches no image, or only images that an earlier row matches"
-            )
+    unused = [number for number in range(len(rows)) if number not in used]
+    if unused:
+        pattern, _ = rows[unused[0]]
+        count = f"; {len(unused)} of {plural(len(rows), 'row')} are so" if len(unused) > 1 else ""
+        raise UserError(
+            f"{where[unused[0]]}: row {pattern!r} matches no image, or only images that an earlier row "
+            f"matches{count}; a row has a path below {root}, a file name or a pattern such as *.jpg"
+        )
     return rows
 
 

@@ -514,3 +514,13 @@ def test_crops_are_counted_by_their_exif_unless_their_camera_is_given(tmp_path, 
     options = ["--out", tmp_path / "out", "--recipe", recipe, "--workers", 0]
     run_command("reconstruct", root, *options)
     assert words in capsys.readouterr().out
+
+
+def test_rows_that_name_no_image_are_counted(tmp_path):
+    root = write_flat(tmp_path / "photos", 2)
+    table = tmp_path / "cameras.csv"
+    row = "SIMPLE_PINHOLE,800 400 300,fixed\n"
+    table.write_text(HEAD + f"00,{row}" + f"01.png,{row}" + f"photos/00.png,{row}")
+    expected = "line 2: row '00' matches no image, .*; 2 of 3 rows are so; a row has a path below"
+    with pytest.raises(UserError, match=expected):
+        read_intrinsics_table(table, root, sorted(root.iterdir()))
