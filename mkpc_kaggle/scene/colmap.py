@@ -38,6 +38,7 @@ from mkpc_kaggle.scene.export import (
 from mkpc_kaggle.scene.keypoints import Lens, MergedGraph
 from mkpc_kaggle.scene.models import (
     MIN_IMAGES,
+    OTHER_PICTURES,
     Reconstruction,
     RegisteredImage,
     SfmModel,
@@ -93,8 +94,7 @@ def structure_from_motion(
         if placed_by_name(merged.graph):
             model, graph = register_onto(database, merged.graph, config.threads)
             if not placed_by_name(graph):
-                failure = "the photographs contradict all cameras of the model of --onto"
-                return Reconstruction(graph.names, failure=failure)
+                return Reconstruction(graph.names, failure=OTHER_PICTURES)
             return _reconstruction([model], graph)
         if former:
             models = refine_models(database, merged.graph, config.threads, former)

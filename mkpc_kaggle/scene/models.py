@@ -27,6 +27,11 @@ MAX_CENTRE_SIGMA = 0.05
 HARDLY_MOVED = (
     "the camera hardly moved: nothing can be triangulated; step aside between photographs"
 )
+# The reason if no photograph fits its camera in a finished model
+OTHER_PICTURES = (
+    "the photographs contradict all cameras of the model of --onto; "
+    "give the model of these photographs"
+)
 PLAUSIBLE_FOCALS = Range(0.3, 5.0)  # plausible focal lengths, in long sides of the image
 
 

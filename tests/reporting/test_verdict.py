@@ -29,6 +29,7 @@ from mkpc_kaggle.scene.models import (
     HARDLY_MOVED,
     MAX_CENTRE_SIGMA,
     MAX_SIGMA_IMAGES,
+    OTHER_PICTURES,
     Comparison,
     DistortedLens,
     DistortionContradiction,
@@ -125,6 +126,9 @@ SPEAKS = {
     ),
     "the cameras are not to be trusted: the camera hardly moved": log(
         scene(model(GOOD, GOOD, GOOD, GOOD, comparison=Comparison(has_moved=False)))
+    ),
+    "no cameras: the photographs contradict all cameras of the model of --onto; give the": log(
+        scene(failure=OTHER_PICTURES)
     ),
     "no camera for 3.jpg: add photographs between": log(
         scene(model(GOOD, GOOD, GOOD, names=NAMES[:3])), pairs=ALL
