@@ -7,7 +7,7 @@ pixels if the photograph was reduced after it was taken.
 
 import hashlib
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -128,6 +128,17 @@ class Unreadable:
         return self
 
 
+def file_state(path: Path) -> tuple[int, int]:
+    """Return the size of a file in bytes and its time of change in nanoseconds; zeros if it is
+    missing.
+    """
+    try:
+        status = path.stat()
+    except (OSError, ValueError):
+        return 0, 0
+    return status.st_size, status.st_mtime_ns
+
+
 def read_image(path: Path) -> Image | Unreadable:
     """Decode a file's stored pixels to RGB; return failures, never raise.
 
@@ -137,6 +148,8 @@ def read_image(path: Path) -> Image | Unreadable:
     """
     name = str(path)
     bgr = None
+    # Before it is read, so that a later change is never missed.
+    file = file_state(path)
     try:
         if path.exists() and not path.is_file():  # a pipe or a device may never end
             return Unreadable(name, "cannot be read: not a regular file")
@@ -156,7 +169,7 @@ def read_image(path: Path) -> Image | Unreadable:
         )
     turns, focal = read_exif(data.tobytes(), Size(width, height))
     pixels = np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
-    return Image(name, pixels, _content_digest(data), focal, turns)
+    return Image(name, pixels, _content_digest(data), focal, turns, file)
 
 
 def _undecoded(path: Path, data: Pixels) -> str:
@@ -332,18 +345,15 @@ class ByteCache:
 
 
 class ImageStore:
-    """Images by path, decoded in the background; the most recently used are cached.
+    """Images by path, decoded in the background; the most recently used are cached as long as their
+    files do not change.
 
-    Besides the cache, only the images of the latest :meth:`prefetch` wait, and the one that is being
-    decoded. ``read`` decodes a file. Not thread-safe.
+    Otherwise two workers might answer with the former and the new content of a file in turns, and each
+    answer would drop the results of the other. Besides the cache, only the images of the latest
+    :meth:`prefetch` wait, and the one that is being decoded. Not thread-safe.
     """
 
-    def __init__(
-        self,
-        limit_bytes: int = 512 << 20,
-        read: Callable[[Path], Image | Unreadable] | None = None,
-    ) -> None:
-        self._read = read or read_image
+    def __init__(self, limit_bytes: int = 512 << 20) -> None:
         self._images = ByteCache(limit_bytes)
         self._pending: dict[Path, Future[Image | Unreadable]] = {}
         self._decoder = ThreadPoolExecutor(1, thread_name_prefix="decode")
@@ -368,16 +378,23 @@ class ImageStore:
 
     def get(self, path: Path) -> Image | Unreadable:
         """Wait until the image is decoded, then return it."""
-        self._start(path)
-        image: Image | Unreadable | None = self._images.get(path)
+        image: Image | Unreadable | None = self._cached(path)
         if image is None:
+            self._start(path)
             image = self._pending.pop(path).result()
             self._keep(path, image)
         return image
 
     def _start(self, path: Path) -> None:
-        if self._images.get(path) is None and path not in self._pending:
-            self._pending[path] = self._decoder.submit(self._read, path)
+        if path not in self._pending and self._cached(path) is None:
+            self._pending[path] = self._decoder.submit(read_image, path)
+
+    def _cached(self, path: Path) -> Image | None:
+        image: Image | None = self._images.get(path)
+        # A file that is missing now keeps its image.
+        if image is not None and file_state(path) in (image.file, (0, 0)):
+            return image
+        return None
 
     def _keep(self, path: Path, image: Image | Unreadable) -> None:
         if isinstance(image, Image):

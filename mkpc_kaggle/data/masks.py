@@ -63,8 +63,7 @@ class Masks:
             effect = _checked(path, image)
             if effect:
                 unusual.setdefault(effect, []).append(path)
-            digest = hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest()
-            files[str(image)] = (str(path), digest)
+            files[str(image)] = (str(path), _digest(path))
         if not files:
             name = images[0].relative_to(root).as_posix() if images else "a.jpg"
             expected = f"{name}{MASK_SUFFIX}"
@@ -163,6 +162,10 @@ def read_mask(path: Path) -> NDArray[np.bool_]:
     return np.asarray(shown)
 
 
+def _digest(path: Path) -> str:
+    return hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest()
+
+
 class MaskReader:
     """Masks by image, the most recently used in memory. Not thread-safe."""
 
@@ -173,15 +176,20 @@ class MaskReader:
     def shows(self, image: str, points: Points, size: Size) -> NDArray[np.bool_]:
         """Return a mask (N,) of the points (N, 2) that an image's mask keeps; all without a mask.
 
-        Raises :class:`UserError` for a mask that has changed since the run began: unreadable, or of
-        another size.
+        Raises :class:`UserError` for a mask that has changed since the run began.
         """
         if image not in self._masks.files:
             return np.ones(len(points), bool)
         mask = self._cache.get(image)
         if mask is None:
-            path = Path(self._masks.files[image][0])
+            name, digest = self._masks.files[image]
+            path = Path(name)
             mask = read_mask(path)
+            # Results with this mask are stored under the digest.
+            if _digest(path) != digest:
+                raise UserError(
+                    f"the mask {path} has changed during the run; run the command again"
+                )
             if mask.shape != (size.height, size.width):
                 raise UserError(f"the mask {path} is not as large as its image")
             self._cache.put(image, mask, mask.nbytes)

@@ -9,8 +9,9 @@ import numpy as np
 import PIL.Image
 import pytest
 
-from mkpc_kaggle.data.masks import Masks, read_mask
+from mkpc_kaggle.data.masks import MaskReader, Masks, read_mask
 from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.geometry.coordinates import Size
 
 # The left half is hidden.
 HALF = np.full((20, 30), 255, np.uint8)
@@ -82,6 +83,19 @@ def test_masks_of_all_images_are_one_line(folder):
         save(HALF, folder / "M" / f"{number}.png.png")
     assert masks_of(folder).lines == ("masks: 5 of 5 images",)
     assert not masks_of(folder).is_partial
+
+
+def test_a_mask_that_changes_during_the_run_is_refused(folder):
+    """Points are stored under the digest of the mask at the start."""
+    save(HALF, folder / "M" / "0.png.png")
+    masks = masks_of(folder)
+    image = str(folder / "I" / "0.png")
+    points = np.array([[2.0, 3.0], [20.0, 3.0]])
+    size = Size(HALF.shape[1], HALF.shape[0])
+    assert MaskReader(masks).shows(image, points, size).tolist() == [False, True]
+    save(255 - HALF, folder / "M" / "0.png.png")
+    with pytest.raises(UserError, match="has changed during the run"):
+        MaskReader(masks).shows(image, points, size)
 
 
 def test_masks_that_hide_everything_or_nothing_are_named(folder):

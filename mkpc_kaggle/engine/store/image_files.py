@@ -9,8 +9,8 @@ again, and nothing of the former file stands in for them.
 
 - Between two runs, :func:`update_digests` notices it by size and time, at the start.
 - In a run, each answer has the digest of the content that its worker decoded. With a new digest, all results of
-  the former content are dropped (``State.use_image``). A worker may match the former content as long as it has
-  the decoded picture in its cache; encodings are cached by content.
+  the former content are dropped (``State.use_image``). Workers decode a changed file again, and cache encodings
+  by content.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -18,7 +18,7 @@ from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import NamedTuple
 
-from mkpc_kaggle.data.images import content_digest
+from mkpc_kaggle.data.images import content_digest, file_state
 from mkpc_kaggle.engine.store.database import Store
 from mkpc_kaggle.engine.store.tables import ImageContent, ImageFile
 from mkpc_kaggle.geometry.coordinates import Size
@@ -35,17 +35,6 @@ class Digests(NamedTuple):
 
     by_name: dict[str, str]
     changed: set[str]
-
-
-def file_state(path: Path) -> tuple[int, int]:
-    """Return the size of a file in bytes and its time of change in nanoseconds; zeros if it is
-    missing.
-    """
-    try:
-        status = path.stat()
-    except (OSError, ValueError):
-        return 0, 0
-    return status.st_size, status.st_mtime_ns
 
 
 def update_digests(store: Store, files: Mapping[str, Path], is_over: Callable[[], bool]) -> Digests:

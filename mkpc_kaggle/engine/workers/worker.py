@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 
 from mkpc_kaggle.cores import limit_matching_threads, limit_to_one_thread
-from mkpc_kaggle.data.images import Image, ImageStore, Unreadable, read_image
+from mkpc_kaggle.data.images import Image, ImageStore
 from mkpc_kaggle.engine.jobs import (
     Answer,
     Cause,
@@ -29,7 +29,6 @@ from mkpc_kaggle.engine.jobs import (
     PairInputs,
     SceneJob,
 )
-from mkpc_kaggle.engine.store.image_files import file_state
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.robust import ModelKind
 from mkpc_kaggle.matchers import failures
@@ -99,7 +98,7 @@ class MatchRunner:
         self._pipeline = make_pipeline()
         self._pipeline.load()
         self.refused = self._pipeline.unloadable
-        self._images = ImageStore(read=read_noted)
+        self._images = ImageStore()
 
     def __call__(self, job: Job) -> tuple[Outcome, ...]:
         """Match the pairs of a job with each unit that is expected to end in time."""
@@ -155,14 +154,6 @@ class MatchRunner:
             pair.decode_seconds,
             pair.cluster_seconds,
         )
-
-
-def read_noted(path: Path) -> Image | Unreadable:
-    """Decode an image with its file's size and time of change."""
-    # Before it is read, so that a later change is never missed.
-    file = file_state(path)
-    image = read_image(path)
-    return replace(image, file=file) if isinstance(image, Image) else image
 
 
 def estimates_runner(*, in_process: bool = True) -> Runner:
