@@ -291,5 +291,5 @@ def _problem_of_line(
     if first == second:
         return "both are one image"
     if dataset_of[first] != dataset_of[second]:
-        return "their folders are datasets of their own without --join"
+        return "their folders are separate datasets without --join"
     return ""

@@ -188,8 +188,8 @@ def _scene_problems(scene: SceneRecord, log: RunLog) -> Iterator[str]:
 def _remedies(
     missing: Sequence[str], unreadable: Sequence[str], causes: Sequence[str]
 ) -> Iterator[str]:
-    """Yield why images have no camera: those that cannot be read, the causes in files, and the
-    remedy for the others.
+    """Yield why images have no camera: unreadable files, causes in files, and the remedy for the
+    other images.
     """
     yield from unreadable[:MAX_UNREADABLE]
     if len(unreadable) > MAX_UNREADABLE:

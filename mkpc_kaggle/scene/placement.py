@@ -15,7 +15,7 @@ from mkpc_kaggle.geometry.robust import sampson_distances
 
 MIN_CHECKED = 100  # verified matches with other images of the model; fewer may be wrong ones
 # Share of these matches that fit the cameras. Right cameras keep almost all, and a picture from
-# elsewhere those near an epipolar line by chance. A half may be with other such pictures.
+# elsewhere those near an epipolar line by chance. Half of them may be with other wrong pictures.
 MIN_CONSISTENT = 0.25
 MAX_DISTANCE = 0.01  # of a match to the epipolar line, in focal lengths: the limit of the mapper
 

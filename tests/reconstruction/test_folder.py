@@ -175,7 +175,7 @@ def test_the_images_that_a_list_of_pairs_leaves_out_are_counted(tmp_path):
         "a b": "a b is no image there",
         "a.jpg": "a name is no image there",
         "a.jpg a.jpg": "both are one image",
-        "a.jpg sub/a.jpg": "datasets of their own without --join",
+        "a.jpg sub/a.jpg": "separate datasets without --join",
     }.items(),
 )
 def test_a_line_of_a_list_that_names_no_pair_says_why(tmp_path, line, reason):
