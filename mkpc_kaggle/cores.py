@@ -1,9 +1,11 @@
 """CPU cores that this process may use, and the threads of its workers.
 
-- A process of matching has all cores, or its share of them (:func:`limit_matching_threads`).
+- A process of matching has all cores, or its share of them (:func:`limit_matching_threads`). There is one such
+  process for each device, unless ``--workers`` asks for more.
 - An actor on a machine of a Ray cluster without GPUs has the CPUs that Ray has there, by the same function.
 - A process of estimates and features has one thread (:func:`limit_to_one_thread`).
 - A process of a scene verifies its pairs on all cores. Its mapper has ``threads`` of [scene], one by default.
+- A Ray actor on a GPU has the threads that torch takes by default.
 - A thread of the user's process (``--workers 0``) leaves the limits of the process as they are.
 
 The number of processes is decided in :mod:`mkpc_kaggle.engine.workers.places`.

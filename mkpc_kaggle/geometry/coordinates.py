@@ -6,9 +6,10 @@ down, and an image of width w covers [-0.5, w - 0.5). A resize by s gives ``x_vi
 offset. A quarter turn swaps the axes and flips one of them. Padding is added right and bottom, so
 coordinates do not change.
 
-The matches of every unit become full-image pixels once, by :meth:`View.to_image` (``Pipeline._match`` calls it for
-both images). Before that, adapters of networks with other conventions call :func:`from_corner` and
-:func:`from_normalised`. Points for COLMAP's files and functions are shifted by ``COLMAP_CENTRE_PX``.
+The matches of every unit become full-image pixels once: ``Pipeline._match`` (``pipeline/stages.py``) calls
+``Matches.to_image``, which calls :meth:`View.to_image` for both images and drops matches on padding. Before
+that, adapters of networks with other conventions call :func:`from_corner` and :func:`from_normalised`. Points
+for COLMAP's files and functions are shifted by ``COLMAP_CENTRE_PX``.
 """
 
 from dataclasses import dataclass

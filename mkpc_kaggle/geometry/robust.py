@@ -1,7 +1,8 @@
 """Two-view models from matches: F, E or H by MAGSAC++.
 
 MAGSAC's threshold is :attr:`RobustConfig.threshold`, ``[magsac] threshold`` of a recipe; no shipped recipe
-sets it. Others are for other purposes: ``ESSENTIAL_THRESHOLD_PX`` of
+sets it. With ``[focal]``, F is refined by that table's ``scale``, and this threshold counts the inliers. Others
+are for other purposes: ``ESSENTIAL_THRESHOLD_PX`` of
 :mod:`mkpc_kaggle.geometry.focal_prior` for rough starts, and the published ones of ``validate --protocol``.
 
 An estimate always has a matrix. If no model is found, it holds the reason and the fallback matrix,

@@ -1,7 +1,9 @@
 """Choice of a pair's fundamental matrix: from the scene, or from the pair's matches.
 
 :func:`choose` decides it. In order: F of the pair's two cameras; the pair's own F, if its matches contradict the
-cameras; F from the pair's matches at the focal lengths of the scene, if an image has no camera.
+cameras; F from the pair's matches at the focal lengths of the scene, if the cameras give none: an image has no
+camera, they are in two models or at one place, or a lens is distorted. :mod:`mkpc_kaggle.scene.candidates`
+chooses the scene itself.
 """
 
 from collections.abc import Mapping, Sequence

@@ -1,6 +1,7 @@
 """Extra pairs, which no row names: they densify the view graph of a batch with few pairs per image.
 
-- Which: :func:`extra_pairs_of` fills each batch up to ``pairs_per_image`` of [scene]. `reconstruct` sets it to 0.
+- Which: :func:`extra_pairs_of` fills each batch of up to 2,000 images up to ``pairs_per_image`` of
+  [scene], 10 by default. `reconstruct` sets it to 0.
 - How: matched by the unit of the sweep alone, and without an F, because they serve scenes alone.
 - When: in the phase *Connect*, after the sweep, for up to a tenth of the time that is left then
   (``pairs_to_connect`` of :mod:`mkpc_kaggle.engine.plan.schedule`).

@@ -3,9 +3,11 @@
 An image's own focal length is ambiguous with the distance to the scene, and poorly constrained by few points. So
 images of one camera at one zoom share it. ``cameras`` of [scene] (``--camera``) says how:
 
-- ``auto``, the default: if most images of one size agree on the focal length, :func:`share` reconstructs a
-  second time. The second reconstruction is refused if images then see fewer points.
-- ``folder``: the user declares one camera. The first reconstruction already shares it (:func:`given_intrinsics`).
+- ``auto``, the default: if at least five images of one size are registered, and more than half of them agree on
+  the focal length within 2 %, :func:`share` reconstructs a second time, with one focal length for all of this
+  size. The second reconstruction is refused if images then see fewer points.
+- ``folder``: the user declares one camera for each size. The first reconstruction already shares it
+  (:func:`given_intrinsics`).
 - ``image``: no image shares.
 
 New images of a finished model have its camera, unless ``image`` (:func:`sharing_with_placed`). Images with a

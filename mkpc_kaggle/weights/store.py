@@ -1,8 +1,9 @@
 """The weight files of this machine, found by name or digest and compared with the manifest.
 
-The file of a slot (:meth:`WeightStore.find`) is the one that the user gives for it, else the first usable one
-for the slot's lines of the manifest: a file with the name of a line, then a renamed file with its digest, then
-a checkpoint that is unpacked into a directory. Manifests in the searched directories add lines.
+The directories of ``--weights`` come first, then ``$MKPC_WEIGHTS`` and /kaggle/input. The file of a slot
+(:meth:`WeightStore.find`) is the one that the user gives for it, else the first usable one for the slot's lines
+of the manifest: a file with the name of a line, then a renamed file with its digest, then a checkpoint that is
+unpacked into a directory. Manifests in the searched directories add lines.
 """
 
 import copy

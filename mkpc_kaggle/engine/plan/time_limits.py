@@ -1,9 +1,12 @@
 """Time limits of workers: the seconds after which a worker that starts, or computes a job, counts as hung.
 
-Nothing else decides it. The loop asks again at every turn, because costs become known while a job runs.
-:meth:`mkpc_kaggle.engine.workers.places.Place.poll` ends a worker that has not answered by then: its process gets
-SIGKILL, and its job is lost. A worker in a thread of the user's process cannot be killed: the run continues
-without its answer.
+Nothing else decides it. The loop asks again at every turn while a job runs, because costs become known.
+:func:`time_limit` is 30 times the measured cost of the job (of a scene also 30 times a cost by its matches),
+plus the silence that is always allowed: 2 % of the limit of the run, 5 to 60 s. Work of unknown cost may take a
+quarter of the time that is left, an hour at most. Matchers must be loaded within 300 s (:func:`start_limit`).
+:meth:`mkpc_kaggle.engine.workers.places.Place.poll` ends a worker that has not answered by then: its process
+gets SIGKILL, and its job is lost. A worker in a thread of the user's process cannot be killed: the run
+continues without its answer.
 """
 
 from mkpc_kaggle.engine.jobs import EstimateJob, FeatureJob, Job, MatchJob, SceneJob
