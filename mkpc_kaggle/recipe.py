@@ -174,7 +174,8 @@ class SceneConfig:
     candidates: int = 1
     # Minimum share of inliers of an edge, see :mod:`mkpc_kaggle.scene.edges`; 0: all edges.
     min_support: float = 0.0
-    # Images up to which the mapper starts from all tracks; from the longest of each image in larger scenes
+    # Images up to which the mapper starts from all tracks, and ends with points of two views. Larger scenes start
+    # from the longest tracks of each image.
     all_tracks: int = 100
     threads: int = 1  # of the mapper; with more, the last digits vary from run to run
 

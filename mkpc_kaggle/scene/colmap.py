@@ -58,8 +58,7 @@ from mkpc_kaggle.scene.view_graph import (
 # Of a verified match; 1 px loses accuracy on tourist photographs, 4 px on repeated windows
 MAX_ERROR_PX = 2.0
 MAX_TRIALS = 300  # RANSAC trials per edge; more trials find the same inliers at five times the cost
-LARGE = 100  # images; in larger scenes, a last adjustment with points of two views costs too much
-TRACKS_PER_IMAGE = 200  # the longest tracks, from which the global mapper starts in a large scene
+TRACKS_PER_IMAGE = 200  # the longest ones, from which the global mapper starts in a large scene
 # Of the models with shared intrinsics, as in COLMAP's global mapper
 MAX_REFINEMENTS = 5
 ADJUSTMENT_ITERATIONS = 50  # of each bundle adjustment of a refinement
@@ -95,12 +94,12 @@ def structure_from_motion(
             model, graph = register_onto(database, merged.graph, config.threads)
             if not placed_by_name(graph):
                 return Reconstruction(graph.names, failure=OTHER_PICTURES)
-            return _reconstruction([model], graph)
+            return _reconstruction([model], graph, config)
         if former:
             models = refine_models(database, merged.graph, config.threads, former)
         else:
             models = run_mapper(database, merged.graph, config)
-    return _reconstruction(models, merged.graph)
+    return _reconstruction(models, merged.graph, config)
 
 
 def write_files(
@@ -477,11 +476,11 @@ def _filter_points(observations: Any, model: Any, settings: Any) -> None:
     )
 
 
-def _reconstruction(mapped: Sequence[Any], graph: ViewGraph) -> Reconstruction:
+def _reconstruction(mapped: Sequence[Any], graph: ViewGraph, config: SceneConfig) -> Reconstruction:
     """Return pycolmap's models with the user's cameras, without implausible images."""
     given_cameras = known_by_name(graph)
     # In a large scene, points of two views are too many.
-    if given_cameras or len(graph.images) <= LARGE:
+    if given_cameras or len(graph.images) <= config.all_tracks:
         for model in mapped:
             adjust(model, given_cameras)
     found = [_sfm_model(model, graph) for model in mapped]
