@@ -23,6 +23,7 @@ MAX_TWO_VIEW_ERROR_PX = 4.0
 MIN_TWO_VIEW_ANGLE_DEG = 2.0
 FINAL_ADJUSTMENT_ITERATIONS = 100
 CONVERGED = 1e-6  # relative change of the cost
+MAX_ROUNDINGS = 60  # of 50,000 random quaternions, all but one stay after 8
 
 
 def adjust(model: Any, cameras: Mapping[str, KnownCamera]) -> None:
@@ -58,6 +59,31 @@ def adjust(model: Any, cameras: Mapping[str, KnownCamera]) -> None:
     adjuster: Any = pycolmap.create_default_ceres_bundle_adjuster(options, config, model)
     adjuster.solve()
     model.update_point_3d_errors()
+
+
+def settle_rotations(model: Any) -> None:
+    """Change the last digits of quaternions so that normalising them changes nothing.
+
+    Readers of COLMAP's files normalise them. So the cameras of a finished model stay bit for bit.
+    """
+    for _, frame in sorted(model.frames.items()):
+        if frame.has_pose():
+            pose = frame.rig_from_world
+            frame.rig_from_world = pycolmap.Rigid3d(_settled(pose.rotation), pose.translation)
+
+
+def _settled(rotation: Any) -> Any:
+    settled = pycolmap.Rotation3d(rotation.quat)
+    for trial in range(MAX_ROUNDINGS):
+        before = settled.quat.copy()
+        settled.normalize()
+        if np.array_equal(settled.quat, before):
+            break
+        # Some quaternions alternate between two roundings: a neighbour may stay.
+        changed = settled.quat.copy()
+        changed[trial % 4] = np.nextafter(changed[trial % 4], 0)
+        settled = pycolmap.Rotation3d(changed if trial > 1 else settled.quat)
+    return settled
 
 
 def robust_options() -> Any:

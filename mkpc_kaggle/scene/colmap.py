@@ -24,7 +24,7 @@ from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import COLMAP_CENTRE_PX
 from mkpc_kaggle.geometry.intrinsics import KnownCamera
 from mkpc_kaggle.recipe import CameraModel, SceneConfig
-from mkpc_kaggle.scene.adjustment import adjust
+from mkpc_kaggle.scene.adjustment import adjust, settle_rotations
 from mkpc_kaggle.scene.edges import supported
 from mkpc_kaggle.scene.export import (
     DATABASE,
@@ -483,6 +483,9 @@ def _reconstruction(mapped: Sequence[Any], graph: ViewGraph, config: SceneConfig
     if given_cameras or len(graph.images) <= config.all_tracks:
         for model in mapped:
             adjust(model, given_cameras)
+    if not placed_by_name(graph):
+        for model in mapped:
+            settle_rotations(model)
     found = [_sfm_model(model, graph) for model in mapped]
     models = filter_models(found, placed_by_name(graph).keys())
     return Reconstruction(
