@@ -25,6 +25,12 @@ from mkpc_kaggle.geometry.coordinates import Box, Matrix3, Size, View
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.two_view import Vectors, robust_costs, sampson
 
+# The second and third singular value of F, in pixels. MAGSAC's own F, from seven matches, has a
+# third value of up to 4e-7 of the second; the second is at least 3e-7 of the first. A false alarm
+# would cost a pair its F, so the bounds are far from these.
+MAX_THIRD, MIN_SECOND = 0.1, 1e-12
+# OpenCV's E is of rank 2 to within 3e-3 only (tests/engine/test_estimates.py).
+MAX_THIRD_OF_E = 0.5
 # F of a pure sideways motion, [e_x]_x: finite, rank 2; the epipolar lines are the image rows.
 FALLBACK_FUNDAMENTAL: Matrix3 = np.array([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 FALLBACK_FUNDAMENTAL.setflags(write=False)
@@ -275,6 +281,18 @@ def _is_model(matrix: Any) -> bool:
     return bool(np.isfinite(matrix).all() and matrix.any())
 
 
+def is_fundamental(F: Any, max_third: float = MAX_THIRD) -> bool:
+    """Return whether F is a real (3, 3) matrix with finite numbers, of rank 2: its third singular
+    value is below ``max_third`` of the second.
+    """
+    if not isinstance(F, np.ndarray) or F.shape != (3, 3) or F.dtype.kind != "f":
+        return False
+    if not np.isfinite(F).all():
+        return False
+    first, second, third = np.linalg.svd(F, compute_uv=False)
+    return bool(second > MIN_SECOND * first and third < max_third * second)
+
+
 @dataclass(frozen=True, eq=False)
 class DistinctMatches:
     """The distinct finite matches of N, in order of first appearance."""
@@ -410,6 +428,14 @@ class _Solver(NamedTuple):
     distances: Callable[[Matrix3, Vectors, Vectors], Vectors]
 
 
+def _find_fundamental(points0: Vectors, points1: Vectors, **settings: Any) -> Any:
+    """Find F: return OpenCV's matrix and mask. A matrix of rank 3, of some sets of wrong matches, is none."""
+    matrix, mask = cv2.findFundamentalMat(points0, points1, **settings)
+    if _is_model(matrix) and not is_fundamental(matrix):
+        return None, mask
+    return matrix, mask
+
+
 def _find_essential(
     points0: Vectors, points1: Vectors, confidence: float, focal: float, **settings: Any
 ) -> Any:
@@ -434,7 +460,7 @@ def _find_essential(
 
 
 _SOLVERS = {
-    ModelKind.F: _Solver(8, 8, FALLBACK_FUNDAMENTAL, cv2.findFundamentalMat, _epipolar_distances),
+    ModelKind.F: _Solver(8, 8, FALLBACK_FUNDAMENTAL, _find_fundamental, _epipolar_distances),
     ModelKind.E: _Solver(5, 6, FALLBACK_FUNDAMENTAL, _find_essential, _epipolar_distances),
     ModelKind.H: _Solver(4, 5, np.eye(3), cv2.findHomography, _transfer_distances),
 }

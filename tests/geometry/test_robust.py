@@ -298,6 +298,16 @@ def test_points_that_opencv_refuses_fail_one_permutation_and_the_estimate_if_all
     assert found.failure == ("" if refused == 1 else reason)
 
 
+def test_a_matrix_of_rank_3_is_no_fundamental_matrix(monkeypatch):
+    """OpenCV returns one for some sets of wrong matches. It would be a wrong answer of its worker."""
+    matches = seen(0, 60)
+    mask = np.ones((60, 1), np.uint8)
+    monkeypatch.setattr(robust.cv2, "findFundamentalMat", lambda *_, **__: (np.eye(3), mask))
+    found = estimate(matches, DEFAULT)
+    assert found.failure.startswith("no F fits 60 distinct matches")
+    assert_array_equal(found.matrix, FALLBACK_FUNDAMENTAL / np.linalg.norm(FALLBACK_FUNDAMENTAL))
+
+
 VALUES = st.sampled_from([0.0, -0.0, 1.0, 2.5, -3.0, np.nan, np.inf])
 
 

@@ -28,19 +28,19 @@ from mkpc_kaggle.engine.jobs import (
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.critical_region import CriticalRegion
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.geometry.robust import Estimate, EstimateStats
+from mkpc_kaggle.geometry.robust import (
+    MAX_THIRD,
+    MAX_THIRD_OF_E,
+    Estimate,
+    EstimateStats,
+    is_fundamental,
+)
 from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.scene.choose import Choice
 from mkpc_kaggle.scene.models import Reconstruction, RegisteredImage, SfmModel
 from mkpc_kaggle.scene.sfm import Solution
 from mkpc_kaggle.scene.view_graph import BatchImage
 
-# The second and third singular value of F, in pixels. MAGSAC's own F, from seven matches, has a
-# third value of up to 4e-7 of the second; the second is at least 3e-7 of the first. A false alarm
-# would cost a pair its F, so the bounds are far from these.
-MAX_THIRD, MIN_SECOND = 0.1, 1e-12
-# OpenCV's E is of rank 2 to within 3e-3 only (tests/engine/test_estimates.py).
-MAX_THIRD_OF_E = 0.5
 MAX_COUNT = 1 << 40  # of matches, keypoints or bytes; the state has 64-bit numbers
 
 
@@ -75,18 +75,6 @@ def wrong_answer(job: Job | None, answer: Answer) -> str:
             else f"{type(error).__name__}: {error}"
         )
     return ""
-
-
-def is_fundamental(F: Any, max_third: float = MAX_THIRD) -> bool:
-    """Return whether F is a real (3, 3) matrix with finite numbers, of rank 2: its third singular
-    value is below ``max_third`` of the second.
-    """
-    if not isinstance(F, np.ndarray) or F.shape != (3, 3) or F.dtype.kind != "f":
-        return False
-    if not np.isfinite(F).all():
-        return False
-    first, second, third = np.linalg.svd(F, compute_uv=False)
-    return bool(second > MIN_SECOND * first and third < max_third * second)
 
 
 def _require(is_right: bool, value: Any, what: str) -> None:
