@@ -18,7 +18,7 @@ import pycolmap
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.intrinsics import KnownCamera, PlacedCamera, radial_factor
 from mkpc_kaggle.scene.adjustment import robust_options
-from mkpc_kaggle.scene.covariance import Covariance, covariance_of, seeing_images
+from mkpc_kaggle.scene.covariance import Covariance, covariance_of
 from mkpc_kaggle.scene.models import (
     MAX_SIGMA_IMAGES,
     MIN_POINTS,
@@ -371,7 +371,7 @@ def _deviation(
     copy: Any, freed: Sequence[Freed], variance_of: Callable[[Covariance, Any], float]
 ) -> float:
     # As for the model: time and memory would be too much. The many images have little noise.
-    if len(seeing_images(copy)) > MAX_SIGMA_IMAGES:
+    if copy.num_reg_images() > MAX_SIGMA_IMAGES:
         return 0.0
     found = covariance_of(copy, {}, 0.0)
     if found is None:

@@ -6,8 +6,11 @@ Of many keypoints, this error is larger than that of their noise, so it is added
 from the residuals.
 """
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
+from math import inf
 from typing import Any
 
 import numpy as np
@@ -15,7 +18,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from mkpc_kaggle.geometry.intrinsics import KnownCamera
-from mkpc_kaggle.scene.models import MAX_SIGMA_IMAGES
+from mkpc_kaggle.scene.models import MAX_SIGMA_IMAGES, MIN_POINTS
 
 Array = NDArray[np.float64]
 # Of an image: the ascending rows (n,) of its points, the columns (c,) of its parameters, values (n, c, 3)
@@ -31,32 +34,33 @@ CHUNK = 1_000_000  # parameters times points that are eliminated at a time, for 
 class Covariance:
     """Covariance of a model's cameras, in an arbitrary world.
 
-    ``poses`` (6N, 6N) has three angles in radians and the translation of each image, in the order of
-    :func:`seeing_images`, for X_cam = exp(angles) R X + t. ``intrinsics`` has the covariance (p, p)
-    of each camera's parameters, by camera id; those that were held have none.
+    ``poses`` (6N, 6N) has three angles in radians and the translation of each of the ``images``, for
+    X_cam = exp(angles) R X + t. ``intrinsics`` has the covariance (p, p) of each camera's parameters, by
+    camera id, zeros if the camera is exact. Variances of a camera without it are infinite.
     """
 
+    images: tuple[Any, ...]  # as :func:`seeing_images` returns them
     poses: Array
     intrinsics: Mapping[int, Array]
 
     def variance(self, camera: Any, parameter: int) -> float:
-        """Return the variance of a camera's parameter; 0 if the camera is exact."""
+        """Return the variance of a camera's parameter."""
         known = self.intrinsics.get(camera.camera_id)
-        return 0.0 if known is None else float(known[parameter, parameter])
+        return inf if known is None else float(known[parameter, parameter])
 
     def focal_variance(self, camera: Any) -> float:
-        """Return the variance of the logarithm of a mean focal length; 0 if it is exact."""
+        """Return the variance of the logarithm of a mean focal length."""
         known = self.intrinsics.get(camera.camera_id)
         focals = camera.focal_length_idxs()
         if known is None:
-            return 0.0
+            return inf
         return float(known[np.ix_(focals, focals)].mean() / camera.mean_focal_length() ** 2)
 
     def ratio_variance(self, camera: Any) -> float:
-        """Return the variance of the logarithm of fx / fy; 0 if the camera is exact."""
+        """Return the variance of the logarithm of fx / fy."""
         known = self.intrinsics.get(camera.camera_id)
         if known is None:
-            return 0.0
+            return inf
         first, second = camera.focal_length_idxs()
         gradient = np.zeros(len(known))
         gradient[first] = 1 / camera.params[first]
@@ -93,30 +97,51 @@ def covariance_of(
         held_variances[held] = deviation**2
     adjusted = np.count_nonzero(~is_held) + 3 * equations.points - GAUGE
     redundancy = equations.residuals - adjusted
-    if redundancy <= 0:
+    if redundancy <= 0 or not equations.squares:
         return None
     noise = equations.squares / redundancy  # variance of a keypoint's coordinate, square pixels
     matrix = equations.matrix / noise
-    inverse = _inverse(matrix[np.ix_(~is_held, ~is_held)])
+    inverse = _inverse(matrix[np.ix_(~is_held, ~is_held)], equations.scale[~is_held] / noise)
     if inverse is None:
         return None
     # Errors of what is held move the optimum of the rest.
     moves = inverse @ matrix[np.ix_(~is_held, is_held)]
     covariance = np.diag(held_variances)
     covariance[np.ix_(~is_held, ~is_held)] = inverse + moves * held_variances[is_held] @ moves.T
-    blocks = {}
+    blocks = {
+        image.camera_id: np.zeros((len(image.camera.params),) * 2)
+        for image in images
+        if image.camera_id not in cameras
+    }
     for start, (camera, _) in zip(equations.starts, cameras.values(), strict=True):
         block = slice(start, start + len(camera.params))
         blocks[camera.camera_id] = covariance[block, block]
     number = 6 * len(images)
-    return Covariance(covariance[:number, :number], blocks)
+    return Covariance(tuple(images), covariance[:number, :number], blocks)
 
 
 def seeing_images(model: Any) -> list[Any]:
-    """Return the registered images of pycolmap's model that see a point, in the order of their ids."""
-    return [
-        image for _, image in sorted(model.images.items()) if image.has_pose and image.num_points3D
-    ]
+    """Return the registered images of pycolmap's model that see enough points which others of them see,
+    too, in the order of their ids.
+
+    An image that sees fewer is no plausible one of the model. Its pose may be anywhere, and would make the
+    world of all others uncertain.
+    """
+    images = [image for _, image in sorted(model.images.items()) if image.has_pose]
+    seen = {
+        image.image_id: [each.point3D_id for each in image.points2D if each.has_point3D()]
+        for image in images
+    }
+    while True:
+        counts = Counter(chain.from_iterable(seen[image.image_id] for image in images))
+        kept = [
+            image
+            for image in images
+            if sum(counts[number] > 1 for number in seen[image.image_id]) >= MIN_POINTS
+        ]
+        if len(kept) == len(images):
+            return kept
+        images = kept
 
 
 def _inexact_cameras(
@@ -141,6 +166,7 @@ class _NormalEquations:
     """
 
     matrix: Array
+    scale: Array  # the diagonal before the points were eliminated
     starts: tuple[int, ...]
     points: int
     residuals: int  # two of each observation
@@ -155,8 +181,13 @@ class _NormalEquations:
         for camera, _ in cameras:
             start_of[camera.camera_id] = size
             size += len(camera.params)
-        places = {number: model.points3D[number].xyz for number in sorted(model.point3D_ids())}
-        # Rays without parallax give points at infinity.
+        counts = Counter(
+            each.point3D_id for image in images for each in image.points2D if each.has_point3D()
+        )
+        # One ray determines no point, and rays without parallax give points at infinity.
+        places = {
+            number: model.points3D[number].xyz for number in sorted(counts) if counts[number] > 1
+        }
         numbers = [number for number, place in places.items() if np.isfinite(place).all()]
         row_of = {number: row for row, number in enumerate(numbers)}
         points = np.array([places[number] for number in numbers]).reshape(-1, 3)
@@ -184,12 +215,13 @@ class _NormalEquations:
         roots = np.linalg.cholesky(of_points + DAMPING * trace * np.eye(3))
         to_white = np.linalg.inv(roots).transpose(0, 2, 1)
         blocks = [(rows, columns, mixed @ to_white[rows]) for rows, columns, mixed in observed]
+        scale = np.diag(matrix).copy()
         step = max(1, CHUNK // size)
         for start in range(0, len(points), step):
             part = _dense(blocks, size, start, min(start + step, len(points)))
             matrix -= part @ part.T
         residuals_count = sum(2 * len(rows) for rows, _, _ in observed)
-        return cls(matrix, tuple(start_of.values()), len(points), residuals_count, squares)
+        return cls(matrix, scale, tuple(start_of.values()), len(points), residuals_count, squares)
 
 
 def _dense(blocks: Iterable[Block], size: int, start: int, end: int) -> Array:
@@ -237,12 +269,13 @@ def _derivatives(
     return residuals, np.concatenate([by_angles, by_ray], axis=2), by_parameters, by_ray @ R
 
 
-def _inverse(matrix: Array) -> Array | None:
-    """Return the inverse of normal equations; ``None`` if they are singular."""
-    diagonal = np.diag(matrix)
-    if not np.isfinite(matrix).all() or diagonal.min() <= 0:
+def _inverse(matrix: Array, scale: Array) -> Array | None:
+    """Return the inverse of normal equations, whose rounding errors are relative to ``scale``; ``None``
+    if they are singular.
+    """
+    if not np.isfinite(matrix).all() or scale.min() <= 0:
         return None
-    scales = np.sqrt(np.outer(diagonal, diagonal))
+    scales = np.sqrt(np.outer(scale, scale))
     try:
         inverse = np.linalg.inv(matrix / scales + DAMPING * np.eye(len(matrix)))
     except np.linalg.LinAlgError:

@@ -14,7 +14,7 @@ from scipy.linalg import block_diag
 
 from mkpc_kaggle.geometry.intrinsics import KnownCamera
 from mkpc_kaggle.geometry.two_view import cross_matrix
-from mkpc_kaggle.scene.covariance import covariance_of, seeing_images
+from mkpc_kaggle.scene.covariance import covariance_of
 from mkpc_kaggle.scene.models import Sigmas
 
 # Standard deviation of a principal point from the middle of its image, as a share of the long side
@@ -33,7 +33,7 @@ def camera_sigmas(
     found = covariance_of(model, given_cameras, PRINCIPAL_POINT_SHARE)
     if found is None:
         return {}
-    images = seeing_images(model)
+    images = found.images
     poses = [image.cam_from_world().matrix() for image in images]
     focals = [found.focal_variance(image.camera) for image in images]
     variances = np.column_stack([_pose_variances(poses, found.poses), focals])

@@ -125,3 +125,19 @@ def test_a_degenerate_model_has_no_sigmas_or_finite_ones(fault):
     point.xyz = places[fault]
     sigmas = camera_sigmas(model)
     assert all(np.isfinite(each).all() for each in sigmas.values())
+
+
+def test_an_image_with_few_points_leaves_the_sigmas_of_the_others(tmp_path):
+    """Its pose may be anywhere, and points that only it and one other image see are undetermined."""
+    model = pycolmap.Reconstruction(model_of(synthetic_scene(7, points=400)).colmap)
+    before = camera_sigmas(model)
+    weak = seeing_images(model)[-1]
+    observations = pycolmap.ObservationManager(model)
+    seen = [number for number, each in enumerate(weak.points2D) if each.has_point3D()]
+    for number in seen[3:]:
+        observations.delete_observation(weak.image_id, number)
+    after = camera_sigmas(model)
+    assert weak.name not in after
+    assert after.keys() == before.keys() - {weak.name}
+    for name, sigmas in after.items():
+        assert sigmas.centre < 3 * before[name].centre
