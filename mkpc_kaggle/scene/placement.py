@@ -57,9 +57,9 @@ def _count_consistent(first: Any, second: Any, indices: Any) -> int:
         rays.append(np.asarray(image.camera.cam_from_img(points), np.float32)[:, :2])
         pose = np.asarray(image.cam_from_world().matrix())
         cameras.append(Camera(np.eye(3), pose[:, :3], pose[:, 3]))
-    essential = fundamental_of_cameras(*cameras)
-    # Two cameras at one place have no epipolar lines.
-    if not np.isfinite(essential).all() or not essential.any():
+    try:
+        essential = fundamental_of_cameras(*cameras)
+    except ValueError:  # two cameras at one place have no epipolar lines
         return len(indices)
     matches = Matches(rays[0], rays[1], np.ones(len(indices), np.float32))
     return int((sampson_distances(essential, matches) < MAX_DISTANCE).sum())
