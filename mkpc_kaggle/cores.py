@@ -1,10 +1,11 @@
 """CPU cores that this process may use, and the threads of its workers.
 
-- A process of matching has all cores, or its share of them (:func:`limit_matching_threads`). There is one such
-  process for each device, unless ``--workers`` asks for more.
+- A process of matching has all cores, or its share of them, in PyTorch and OpenCV
+  (:func:`limit_matching_threads`). There is one for each device, unless ``--workers`` has another number.
 - An actor on a machine of a Ray cluster without GPUs has the CPUs that Ray has there, by the same function.
-- A process of estimates and features has one thread (:func:`limit_to_one_thread`).
-- A process of a scene verifies its pairs on all cores. Its mapper has ``threads`` of [scene], one by default.
+- A process of estimates and features has one thread, in all libraries (:func:`limit_to_one_thread`).
+- A process of a scene verifies its pairs on all cores, and limits no library. Its mapper has ``threads`` of
+  [scene], one by default, and its last adjustment one.
 - A Ray actor on a GPU has the threads that torch takes by default.
 - A thread of the user's process (``--workers 0``) leaves the limits of the process as they are.
 
@@ -44,10 +45,12 @@ def limit_matching_threads(threads: int = 0, share: int = 1) -> None:
 
 
 def limit_to_one_thread() -> None:
-    """Limit OpenCV, and the libraries of NumPy and SciPy, to one thread."""
+    """Limit OpenCV, the libraries of NumPy and SciPy, and PyTorch to one thread."""
     import cv2
     from threadpoolctl import threadpool_limits  # comes with scikit-learn
 
+    # For libraries that a job may load later: PyTorch, to compare features
+    os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
     cv2.setNumThreads(1)
     threadpool_limits(1)
 

@@ -96,3 +96,14 @@ def test_workers_have_their_threads(call: str, threads: dict[str, int]) -> None:
     )
     counts = dict(zip(("torch", "cv2", "pools"), map(int, done.stdout.split()), strict=True))
     assert {name: counts[name] for name in threads} == threads
+
+
+def test_a_library_that_a_worker_of_estimates_loads_later_has_one_thread() -> None:
+    # A job that compares features of images loads torch.
+    program = "from mkpc_kaggle import cores; cores.limit_to_one_thread(); import torch"
+    program += "; print(torch.get_num_threads())"
+    environment = {**os.environ, "OMP_NUM_THREADS": "3"}
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True, env=environment
+    )
+    assert done.stdout.split() == ["1"]

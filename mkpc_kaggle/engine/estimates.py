@@ -1,4 +1,4 @@
-"""Estimates of pairs, and features of images: jobs of the workers without torch, results and losses."""
+"""Estimates of pairs, and features of images: jobs of the workers that do not match, results, losses."""
 
 import sqlite3
 from collections.abc import Callable, Mapping, Sequence

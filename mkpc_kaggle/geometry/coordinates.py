@@ -1,4 +1,4 @@
-"""Boxes and views: the only code that converts pixel coordinates.
+"""Boxes and views: the conversions of pixel coordinates.
 
 Pixel centres are at integers: the centre of the top-left pixel is (0, 0), x runs right, y runs
 down, and an image of width w covers [-0.5, w - 0.5). A resize by s gives ``x_view = (x + 0.5) * s -
@@ -7,9 +7,12 @@ offset. A quarter turn swaps the axes and flips one of them. Padding is added ri
 coordinates do not change.
 
 The matches of every unit become full-image pixels once: ``Pipeline._match`` (``pipeline/stages.py``) calls
-``Matches.to_image``, which calls :meth:`View.to_image` for both images and drops matches on padding. Before
-that, adapters of networks with other conventions call :func:`from_corner` and :func:`from_normalised`. Points
-for COLMAP's files and functions are shifted by ``COLMAP_CENTRE_PX``.
+``Matches.to_image``, which calls :meth:`View.to_image` for both images and drops matches on padding. All
+keypoints of an image, for programs, do so in ``PairKeypoints.of`` (``pipeline/keypoints.py``).
+
+Before that, matchers with other conventions convert to pixel centres: LoFTR's family and vismatch by
+:func:`from_corner`, DKM, RoMa and LoMa by :func:`from_normalised`. ``sift_lightglue`` takes away the quarter of
+a pixel that OpenCV adds. Points for COLMAP's files and functions are shifted by ``COLMAP_CENTRE_PX``.
 """
 
 from dataclasses import dataclass

@@ -1,9 +1,17 @@
 """Two-view models from matches: F, E or H by MAGSAC++.
 
-MAGSAC's threshold is :attr:`RobustConfig.threshold`, ``[magsac] threshold`` of a recipe; no shipped recipe
-sets it. With ``[focal]``, F is refined by that table's ``scale``, and this threshold counts the inliers. Others
-are for other purposes: ``ESSENTIAL_THRESHOLD_PX`` of
-:mod:`mkpc_kaggle.geometry.focal_prior` for rough starts, and the published ones of ``validate --protocol``.
+MAGSAC's threshold is :attr:`RobustConfig.threshold`, ``[magsac] threshold`` of a recipe, 0.2 px of the stored
+image; no shipped recipe sets it. With ``[focal]``, F is refined by that table's ``scale``, and this threshold
+counts the inliers. Limits of other errors, in pixels of the stored image:
+
+- 0.4 of rough starts under a prior (``ESSENTIAL_THRESHOLD_PX`` of :mod:`mkpc_kaggle.geometry.focal_prior`);
+- 2.0 of pycolmap's verification and triangulation (``MAX_ERROR_PX`` of :mod:`mkpc_kaggle.scene.colmap`);
+- 2.0 and 1.0 of matches that speak against a scene's F (:mod:`mkpc_kaggle.scene.choose`);
+- 1.0 of matches that count as support (:mod:`mkpc_kaggle.geometry.overlap`);
+- 1.0 and 0.5 of ``validate --protocol``, as published.
+
+``threshold`` in a matcher's table is a confidence. `reconstruct` has fewer iterations, and
+one order of the matches.
 
 An estimate always has a matrix. If no model is found, it holds the reason and the fallback matrix,
 which is finite and of the right rank. So a submission is always complete.

@@ -5,6 +5,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from mkpc_kaggle.data.outputs import replacing, require_table
 from mkpc_kaggle.engine.store.database import Store
 from mkpc_kaggle.engine.store.dataframes import (
@@ -108,7 +110,9 @@ def read_log(directory: Path) -> RunLog:
         for number in matched.index[:MAX_DRAWN_PAIRS]:
             row = rows[number]
             points = published.points_of(store, row)
-            match = _weak_match(tables, recipe, number, points, regions.get(row.id))
+            # An E has no residuals in pixels.
+            inliers = tables.pairs["inliers"][number] if row.model == ModelKind.F else 0
+            match = _weak_match(tables, recipe, number, points, regions.get(row.id), inliers)
             weakest.append((number, match))
         scenes = [*published.scenes_of(store).values()]
         if recipe.scene is not None:
@@ -127,17 +131,18 @@ def _weak_match(
     number: int,
     points: Mapping[str, Matches],
     regions: "DataFrame | None",
+    count: int,
 ) -> PairMatch:
-    """Return the match of a pair from its points and its own F, from which the inliers follow as in
-    the run.
+    """Return the match of a pair from its points and its own F. Its inliers are the ``count`` matches that
+    are nearest to F.
     """
     units = {unit.name: unit for unit in recipe.units}
     results = tuple(UnitResult(units[name], matches) for name, matches in points.items())
     F = tables.estimates["F"][number]
     failure = tables.pairs["failure"][number]
     distances = sampson_distances(F, Matches.concatenate(each.matches for each in results))
-    # The fallback fits some matches by chance.
-    inliers = (distances < recipe.magsac.threshold) & (not failure)
+    inliers = np.zeros(len(distances), bool)
+    inliers[np.argsort(distances, kind="stable")[:count]] = True
     crops = None if regions is None else regions_of(regions)
     return PairMatch(results, crops, Estimate(ModelKind.F, F, inliers, failure))
 

@@ -1,8 +1,9 @@
 """Choice of a pair's fundamental matrix: from the scene, or from the pair's matches.
 
 :func:`choose` decides it. In order: F of the pair's two cameras; the pair's own F, if its matches contradict the
-cameras; F from the pair's matches at the focal lengths of the scene, if the cameras give none: an image has no
-camera, they are in two models or at one place, or a lens is distorted. :mod:`mkpc_kaggle.scene.candidates`
+cameras, or both images are one file; with ``[focal]``, F from the pair's matches at the focal lengths of the
+scene, if the cameras give none: an image has no camera, they are in two models or at one place, or a lens is
+distorted. Without ``[focal]``, such a pair keeps its own F, too. :mod:`mkpc_kaggle.scene.candidates`
 chooses the scene itself.
 """
 
@@ -93,7 +94,8 @@ def choose(
     without an F from cameras is estimated again at these, unless it contradicts the scene. With ``may_estimate``,
     a pair without its own F is estimated if it may contradict the scene.
     """
-    magsac = magsac or RobustConfig()
+    sizes = pair.image0.size, pair.image1.size
+    magsac = (magsac or RobustConfig()).in_stored_pixels(sizes)
     choice = from_cameras(pair, models, magsac if may_estimate else None)
     if focal is None or choice.reason in KEEPS_ITS_F:
         return choice
@@ -141,8 +143,7 @@ def contradicts(F: Matrix3, pair: BatchPair, magsac: RobustConfig | None = None)
         return False
     own = pair.pair_fundamental
     if own is None and magsac is not None:
-        sizes = (pair.image0.size, pair.image1.size)
-        found = estimate(pair.matches, magsac.in_stored_pixels(sizes))
+        found = estimate(pair.matches, magsac)
         own = found.matrix if found.ok else None
     if own is None:
         return False

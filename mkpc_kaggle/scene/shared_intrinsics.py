@@ -4,8 +4,11 @@ An image's own focal length is ambiguous with the distance to the scene, and poo
 images of one camera at one zoom share it. ``cameras`` of [scene] (``--camera``) says how:
 
 - ``auto``, the default: if at least five images of one size are registered, and more than half of them agree on
-  the focal length within 2 %, :func:`share` reconstructs a second time, with one focal length for all of this
-  size. The second reconstruction is refused if images then see fewer points.
+  the focal length within 2 %, :func:`share` reconstructs a second time, with their median for all images of
+  this size, registered or not. It is refused if images then have fewer than 0.99 of the observations before
+  (``MIN_OBSERVATIONS`` of :mod:`mkpc_kaggle.scene.mapper`). Images that see many points with another focal
+  length seem to have another zoom. They share only if EXIF does not differ by 10 %, and if none of them loses
+  observations.
 - ``folder``: the user declares one camera for each size. The first reconstruction already shares it
   (:func:`given_intrinsics`).
 - ``image``: no image shares.

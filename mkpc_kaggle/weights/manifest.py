@@ -6,7 +6,7 @@ comment::
     name  bytes  digest  licence  slot  source
 
 ``bytes`` is a number or ``?``. ``digest`` is ``sha256:<64 hex>`` or ``unverified``. Matchers ask
-for files by *slot*. Lines of one slot are alternatives: the first file that is found is used.
+for files by *slot*. Lines of one slot are alternatives: the first usable one is used.
 """
 
 import errno

@@ -1,9 +1,14 @@
 """The weight files of this machine, found by name or digest and compared with the manifest.
 
-The directories of ``--weights`` come first, then ``$MKPC_WEIGHTS`` and /kaggle/input. The file of a slot
-(:meth:`WeightStore.find`) is the one that the user gives for it, else the first usable one for the slot's lines
-of the manifest: a file with the name of a line, then a renamed file with its digest, then a checkpoint that is
-unpacked into a directory. Manifests in the searched directories add lines.
+The file of a slot (:meth:`WeightStore.find`) is the one that the user gives for it, whatever its bytes. Else it
+is the first usable one: for each of the slot's lines in the manifest, a file with the name of the line; then a
+renamed file with the digest of a line; then a checkpoint that is unpacked into a directory. Within each of these
+steps, directories of ``--weights`` come first, then ``$MKPC_WEIGHTS`` and /kaggle/input.
+
+Usable are files with the digest of their line, or of a line without one (``unverified``), and unpacked
+checkpoints (:func:`judge`). Manifests in the searched directories add lines. A file whose licence is not
+permitted, or that does not fit its network, leaves the matcher out, and no other file is tried
+(:mod:`mkpc_kaggle.setup.availability`).
 """
 
 import copy

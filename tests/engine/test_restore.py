@@ -177,6 +177,22 @@ def test_the_f_of_a_scene_stands_in_for_the_pairs_own_until_its_scene_is_made_ag
     assert whole.state.sources.tolist() == [SCENE, PAIR, FALLBACK]
 
 
+def test_a_scene_of_today_leaves_the_earlier_f_of_pairs_that_it_does_not_know(whole: Room) -> None:
+    # Near the end of a run, a scene is made of the pairs that were reached.
+    before = whole.state.fundamentals
+    whole.ask(replace(RECIPE, units=(THIRD,)), estimate="other", scene="other")
+    whole.match(0, THIRD)
+    whole.estimate(0)
+    whole.reconstruct()
+    assert whole.state.sources.tolist() == [SCENE, EARLIER, FALLBACK]
+    assert np.array_equal(whole.state.fundamentals[1], before[1])
+    # A new scene, or a stale one, brings back no F of an earlier scene for a pair with its own.
+    whole.match(1, THIRD)
+    whole.estimate(1)
+    assert whole.state.scenes.stale == {"one"}
+    assert whole.state.sources.tolist() == [SCENE, PAIR, FALLBACK]
+
+
 def test_an_e_of_an_earlier_run_is_not_written_as_f(room: Room) -> None:
     known = replace(pair_of(0), intrinsics=(np.eye(3), np.eye(3)))
     room.ask(pairs=[known])

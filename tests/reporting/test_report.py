@@ -5,6 +5,7 @@ import json
 import os
 import re
 import sys
+from dataclasses import replace
 from math import inf
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,6 +21,8 @@ from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.store.database import Store
 from mkpc_kaggle.engine.store.dataframes import matrices_of
 from mkpc_kaggle.engine.store.tables import About, Event, EventKind, PublishedPair, PublishedRun
+from mkpc_kaggle.geometry.robust import RobustConfig, sampson_distances
+from mkpc_kaggle.recipe import Recipe
 from mkpc_kaggle.reporting.report import DRAWING_S, pair_rows, remarks, report_page, report_run
 from mkpc_kaggle.reporting.run_log import read_log
 from mkpc_kaggle.reporting.summary import overview
@@ -28,14 +31,14 @@ from mkpc_kaggle.reporting.summary import overview
 EVIL = '<script>alert("$x$")</script>'
 
 
-def a_run(directory: Path, count: int = 12) -> list[Pair]:
+def a_run(directory: Path, count: int = 12, recipe: Recipe = THREE_UNITS) -> list[Pair]:
     """A run over pairs of which the second cannot be read; its work directory is
     ``directory``/work.
     """
     pairs = write_pairs(directory / "images", count)
     # The other images are read, and the run is complete.
     pairs[1].images[1].write_bytes(b"")
-    run(pairs, THREE_UNITS, RectifiedMatcher(), directory / "work")
+    run(pairs, recipe, RectifiedMatcher(), directory / "work")
     return pairs
 
 
@@ -145,13 +148,25 @@ def test_the_page_begins_with_the_verdict_has_pictures_inside_and_asks_for_nothi
     assert not re.search(r"url\(|@import", text)
     assert "the file is empty" in text
     assert "Drawings are missing" not in text
-    # Their inliers are computed again from the journal, and are those of the run.
+    # Their inliers are not stored, and are those of the run.
     weakest = read_log(tmp_path / "work").weakest
     assert len(weakest) == 11
     pairs = read_log(tmp_path / "work").tables.pairs
     for number, match in weakest:
         found = [len(match.matches), match.estimate.inlier_count]
         assert pairs[["matches", "inliers"]].loc[number].tolist() == found
+        within = sampson_distances(match.estimate.matrix, match.matches) < RobustConfig.threshold
+        assert np.array_equal(match.estimate.inliers, within)
+
+
+def test_drawn_inliers_are_those_of_the_run_whatever_the_unit_of_the_threshold(tmp_path):
+    # In pixels of the image resized to 4,000 pixels: a tenth of a stored pixel, and less
+    magsac = replace(THREE_UNITS.magsac, threshold_side=4000)
+    a_run(tmp_path, recipe=replace(THREE_UNITS, magsac=magsac))
+    log = read_log(tmp_path / "work")
+    drawn = {number: match.estimate.inlier_count for number, match in log.weakest}
+    assert drawn == log.tables.pairs["inliers"][list(drawn)].to_dict()
+    assert sum(drawn.values()) > 0
 
 
 def test_the_summary_has_the_facts_of_the_page_for_programs(tmp_path):

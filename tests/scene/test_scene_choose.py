@@ -8,6 +8,7 @@ import pytest
 
 from benchmarks.synthetic_scene import SIZE, SyntheticScene, synthetic_scene
 from mkpc_kaggle.geometry.cameras import Camera
+from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
 from mkpc_kaggle.geometry.robust import RobustConfig, sampson_distances
@@ -94,6 +95,19 @@ def test_an_f_from_cameras_has_the_inliers_of_the_pairs_matches(scene):
     assert estimate.stats.support > MIN_SUPPORT
     # The cameras say nothing about F.
     assert estimate_of(choice([], scene), pair, RobustConfig()) is None
+
+
+def test_a_threshold_in_resized_pixels_is_one_in_stored_pixels_everywhere(scene):
+    pair = scene.pairs[0]
+    focals = {pair.image0.digest: 700.0, pair.image1.digest: 700.0}
+    quick = RobustConfig(threshold=0.5, permutations=1, max_iterations=2000)
+    resized = replace(quick, threshold=1.0, threshold_side=2 * max(SIZE))
+    first, second = (choose(pair, [], focals, FocalConfig(), magsac) for magsac in (quick, resized))
+    assert first.F is not None
+    np.testing.assert_array_equal(first.F, second.F)
+    cameras = choice([model(scene.cameras)], scene)
+    counts = [estimate_of(cameras, pair, magsac).inlier_count for magsac in (quick, resized)]
+    assert counts[0] == counts[1] > 0
 
 
 # Images have 800 x 600 pixels, so 1e5 is a field of view below half a degree.

@@ -3,14 +3,20 @@
 :func:`next_work` is a pure function. It has no queue and no memory: it looks at the state, the
 costs and the time left whenever a worker is idle.
 
-A unit no longer fits in time by two rules:
+A unit no longer fits in time by two rules. The time left ends at :attr:`Snapshot.stop`: before the estimates,
+scenes and candidates that are still due, for which up to a fifth of the limit is reserved.
 
-- :func:`prefix_that_fits`: its forecast for all rows exceeds the time left. It waits for the last phase.
+- :func:`prefix_that_fits`: the forecast for it and the units before it, on all rows, exceeds the time left. It
+  waits for the last phase.
 - :func:`pairs_in_time`: one more pair would not end in time. It does not begin, in any phase. Near the end, a
-  minibatch is made smaller first.
+  minibatch is made smaller first. A unit that was never measured always fits while there is time.
 
 A job has the expected seconds of its units and the time left. Its worker applies the second rule again before each
 minibatch, by its own clock (``may_start`` of :class:`mkpc_kaggle.engine.workers.worker.MatchRunner`).
+
+Other work that is left out for lack of time: extra pairs beyond a tenth of it (:func:`pairs_to_connect`),
+candidates that would not end (:func:`candidates_due`), and trials of ``--rotations`` after a quarter of it
+(:mod:`mkpc_kaggle.reconstruction.choice`). The first scene of a batch begins without such a check.
 """
 
 from collections.abc import Sequence

@@ -153,7 +153,8 @@ class State:
     def fundamentals(self) -> NDArray[np.float64]:
         """The F to write (R, 3, 3) for each row of the request, with its source. The first that exists:
 
-        - "earlier": the F of the last table of pairs, while it :attr:`stands_in`;
+        - "earlier": the F of the last table of pairs, while it :attr:`stands_in`: the pair has no estimate
+          yet, or this F was a scene's and the batch has no scene of today yet;
         - "scene": the F of the pair's cameras, where :func:`mkpc_kaggle.scene.choose.choose` prefers it;
         - "pair": the F of its matches, at the focal lengths of the scene if these are known;
         - "fallback": a fixed matrix.
@@ -189,8 +190,8 @@ class State:
     def stands_in(self) -> Mask:
         """(N,): the F of an earlier run is written, since this run has none yet.
 
-        The F of an earlier scene also stands in for the pair's own F, while the scene of today is
-        pending.
+        The F of an earlier scene also stands in for the pair's own F, while the first scene of today is
+        pending. An estimate that failed is today's result: nothing stands in for it.
         """
         lacks_estimate = self.estimates == ""
         awaits_better = self.earlier_by_scene & self._awaits_scene
@@ -493,7 +494,9 @@ class State:
         scene = self.scenes.use(batch, record)
         members = self.members[self.batches[batch]]
         self.changed.update(members.tolist())
-        self.has_earlier[members] = False
+        self.earlier_by_scene[members] = (
+            False  # pairs without any F of today keep their earlier one
+        )
         self.scene_source[members] = FALLBACK  # of the former scene
         for index in members.tolist():
             choice = scene.choices.get(self.contents(index))

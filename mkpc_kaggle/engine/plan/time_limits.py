@@ -1,12 +1,18 @@
 """Time limits of workers: the seconds after which a worker that starts, or computes a job, counts as hung.
 
-Nothing else decides it. The loop asks again at every turn while a job runs, because costs become known.
-:func:`time_limit` is 30 times the measured cost of the job (of a scene also 30 times a cost by its matches),
-plus the silence that is always allowed: 2 % of the limit of the run, 5 to 60 s. Work of unknown cost may take a
-quarter of the time that is left, an hour at most. Matchers must be loaded within 300 s (:func:`start_limit`).
+The loop asks again at every turn while a job runs, because costs become known. :func:`time_limit` is 30 times
+the expected cost of the job, plus the silence that is always allowed: 2 % of the limit of the run, 5 to 60 s.
+
+- Matching: the measured seconds of its units, plus their warm-up. Until all are measured, a quarter of the time
+  that is left, an hour at most. The same for a feature of an image, whose cost is never known.
+- Estimates: the measured mean. Until it is known, 1 s each, and no more than that quarter.
+- A scene: the seconds measured on other scenes, at least 3 s and 0.5 ms per match.
+- A start (:func:`start_limit`): 300 s to load matchers; for other workers that quarter, 300 s at most.
+
 :meth:`mkpc_kaggle.engine.workers.places.Place.poll` ends a worker that has not answered by then: its process
-gets SIGKILL, and its job is lost. A worker in a thread of the user's process cannot be killed: the run
-continues without its answer.
+gets SIGKILL (a Ray actor is killed by Ray), and its job is lost. A worker in a thread of the user's process
+cannot be killed: the run continues without its answer. At the end of the run's time
+(``Budget.stop_waiting``) and after Ctrl-C, the loop ends all workers, whether they hang or not.
 """
 
 from mkpc_kaggle.engine.jobs import EstimateJob, FeatureJob, Job, MatchJob, SceneJob

@@ -5,12 +5,16 @@ again only if its size or time has changed. A fresh run digests nothing: the wor
 image returns its digest.
 
 **An image that is replaced** has another digest, so another key: its pairs and their batch's scene are computed
-again, and nothing of the former file stands in for them.
+again, and no result of these pairs with the former file is used. The batch's other pairs have the F of the
+former scene until the new one.
 
 - Between two runs, :func:`update_digests` notices it by size and time, at the start.
 - In a run, each answer has the digest of the content that its worker decoded. With a new digest, all results of
   the former content are dropped (``State.use_image``). Workers decode a changed file again, and cache encodings
-  by content.
+  by content. If no job reads the file again, the next run notices it.
+
+A file that is missing or unreadable, or was not read in time, keeps its former digest and results. A change that
+leaves size and time as they were is not noticed.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence

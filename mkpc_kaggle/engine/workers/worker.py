@@ -1,6 +1,6 @@
 """The work of workers: matching, estimates, features of images, reconstructions.
 
-Importing this module does not import torch, which only matching needs.
+Importing this module does not import torch, which estimates and scenes do not need.
 The threads of each worker are decided in :mod:`mkpc_kaggle.cores`.
 """
 
@@ -157,9 +157,7 @@ class MatchRunner:
 
 
 def estimates_runner(*, in_process: bool = True) -> Runner:
-    """Return the runner of estimates and image features, without torch; a separate process has one
-    thread.
-    """
+    """Return the runner of estimates and image features. A separate process has one thread."""
     # The user's own process keeps its thread limits.
     if in_process:
         limit_to_one_thread()
