@@ -130,7 +130,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         model (COLMAP's: SIMPLE_PINHOLE, OPENCV, ...), parameters (in COLMAP's order, separated by blanks),
         sigma (of the focal length, in percent, or fixed), and optionally size (of the images: 1536x1024)"""
     add("--intrinsics", type=Path, metavar="FILE.csv", help=text)
-    text = """a finished model of COLMAP, such as the folder OUT/models/0 of an earlier run: its photographs, which
+    text = """a finished model of COLMAP, such as the folder models/0 in the OUT of another run: its photographs, which
         DIR has, too, keep these cameras exactly, and the new ones are registered among them"""
     add("--onto", type=Path, metavar="MODEL", help=text)
     text = "masks named as COLMAP's, MASKS/a.jpg.png for a.jpg; points on black pixels are left out"
@@ -153,7 +153,7 @@ def run(arguments: argparse.Namespace) -> int:
         known_cameras = read_intrinsics_table(arguments.intrinsics, root, files)
     placed = () if arguments.onto is None else read_placed(arguments.onto, root, datasets)
     masks = Masks() if arguments.masks is None else Masks.of_folder(arguments.masks, root, files)
-    more = [arguments.pairs, arguments.intrinsics, arguments.masks]
+    more = [arguments.pairs, arguments.intrinsics, arguments.masks, arguments.onto]
     inputs = [root, options.recipe_file(arguments), *more]
     require_directory_apart(out, filter(None, inputs), arguments.weights)
     if arguments.export is not None:

@@ -120,16 +120,20 @@ def holds_dataset(result: str, datasets: Iterable[str]) -> bool:
     return any(PurePosixPath(name).is_relative_to(result) for name in datasets)
 
 
-def require_directory_apart(out: Path, inputs: Iterable[Path], weights: Iterable[Path]) -> None:
-    """Raise :class:`UserError` if ``out`` contains an input or weights, or lies in an input."""
+def require_directory_apart(
+    out: Path, inputs: Iterable[Path], around: Iterable[Path], option: str = "--out"
+) -> None:
+    """Raise :class:`UserError` if ``out``, the folder of an option, contains an input or lies in one.
+
+    Inputs that may lie ``around`` it, such as weights in a home directory, must only not lie in it.
+    """
     inputs = list(inputs)
-    # Weights may lie around OUT, as in a home directory; an input folder may not.
-    for place in (*inputs, *weights, *weights_of_environment()):
+    for place in (*inputs, *around, *weights_of_environment()):
         if os.path.lexists(place) and (
             lies_in(place, out) or (place in inputs and lies_in(out, place))
         ):
             raise UserError(
-                f"--out {out} contains, or lies in, the input {place}; name another folder"
+                f"{option} {out} contains, or lies in, the input {place}; name another folder"
             )
 
 

@@ -89,8 +89,8 @@ def read_cameras(folder: Path) -> dict[str, tuple[PlacedCamera, Size]]:
         return dict(_images((folder / IMAGES).read_bytes(), lenses))
     except OSError as error:
         raise UserError(
-            f"--onto {folder}: {error.filename} cannot be read: {error.strerror}; name a folder such as "
-            "OUT/models/0 with COLMAP's binary files"
+            f"--onto {folder}: {error.filename} cannot be read: {error.strerror}; name a folder with COLMAP's "
+            "binary files, such as models/0 in the OUT of another run"
         ) from error
     except (struct.error, ValueError) as error:
         raise UserError(f"--onto {folder} is not a model of COLMAP: {error}") from error

@@ -21,6 +21,7 @@ from mkpc_kaggle.engine.store.tables import SceneRecord
 from mkpc_kaggle.errors import UserError, plural, temporary_directory
 from mkpc_kaggle.matchers.contract import Matcher
 from mkpc_kaggle.recipe import Recipe
+from mkpc_kaggle.reconstruction.directory import require_directory_apart
 from mkpc_kaggle.reconstruction.folder import read_folder, require_distinct
 from mkpc_kaggle.reconstruction.outputs import PlacedImage
 from mkpc_kaggle.reconstruction.panoramas import require_perspective
@@ -35,7 +36,7 @@ from mkpc_kaggle.reconstruction.run import for_cameras, reconstruct_folder
 from mkpc_kaggle.reporting.contradictions import adopted_lenses, contradictions
 from mkpc_kaggle.scene.export import MODELS
 from mkpc_kaggle.scene.models import SfmModel
-from mkpc_kaggle.setup.arguments import PathSource, Weights, member_of, shown_value
+from mkpc_kaggle.setup.arguments import PathSource, Weights, member_of, shown_value, weights_of
 from mkpc_kaggle.setup.assembly import Assembly, assemble
 from mkpc_kaggle.setup.availability import Licence
 
@@ -113,8 +114,8 @@ def reconstruct(
     ------
     UserError
         For a recipe that cannot run here, unusable masks or intrinsics, an unreadable image, a
-        ``work_dir`` whose folder ``colmap`` is not of an earlier call, and cameras that cannot be
-        computed.
+        ``work_dir`` whose folder ``colmap`` is not of an earlier call or has an input, and cameras
+        that cannot be computed.
     KeyboardInterrupt
         After Ctrl-C, once finished work is saved.
 
@@ -158,6 +159,17 @@ def reconstruct(
         out = directory / COLMAP
         if out.exists() and not (directory / FILE_NAME).is_file():
             raise UserError(f"{out} was not made here; name another work_dir")
+        files_of_recipe = () if isinstance(recipe, Recipe) else (recipe,)
+        weight_folders, weight_files = weights_of(weights)
+        given_paths = filter(None, (masks, intrinsics, onto, *files_of_recipe))
+        inputs = [
+            *dict.fromkeys(file.parent for file in files),
+            *map(Path, given_paths),
+            *weight_folders,
+            *weight_files.values(),
+        ]
+        # The photographs often lie around the work directory, and so may all other inputs.
+        require_directory_apart(out, (), inputs, "work_dir:")
         session = Session(
             directory,
             Budget(time.monotonic()),

@@ -1,6 +1,7 @@
 """New photographs are registered in a finished model, whose cameras stay as they are."""
 
 import re
+import shutil
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -138,6 +139,49 @@ def test_the_command_reads_the_model_first(home, tmp_path, capsys, monkeypatch):
     assert run_command(*command) == 2
     assert "--onto images: images/cameras.bin cannot be read" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_a_model_that_the_run_would_replace_is_refused_and_stays(home, tmp_path, capsys):
+    shutil.copytree(home / "model", tmp_path / "out" / "models" / "0")
+    shutil.copytree(home / "old", tmp_path / "work")
+    refused = r"contains, or lies in, the input .*; name another folder"
+    before = contents(tmp_path)
+    command = ["reconstruct", home / "images", "--out", tmp_path / "out"]
+    assert run_command(*command, "--onto", tmp_path / "out" / "models" / "0") == 2
+    assert re.search(refused, capsys.readouterr().err)
+    with pytest.raises(UserError, match=refused):
+        model = tmp_path / "work" / "colmap" / "models" / "0"
+        made(sorted((home / "images").iterdir()), tmp_path / "work", onto=model)
+    assert contents(tmp_path) == before
+
+
+def contents(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize("name", ["masks", "intrinsics", "recipe", "weights"])
+def test_no_input_of_a_python_program_lies_among_its_results(home, tmp_path, name):
+    shutil.copytree(home / "old", tmp_path / "work")
+    given = tmp_path / "work" / "colmap" / name
+    given.write_text("mine")
+    options = {"device": "cpu", "progress": False, "work_dir": tmp_path / "work"}
+    files = sorted((home / "images").iterdir())
+    # Files that are read before this check would be refused for their content.
+    if name == "recipe":
+        given = given.rename(given.with_suffix(".toml"))
+        given.write_text('units = [{ stage = 1, matcher = "sift", long_side = 800 }]\n')
+    if name == "masks":
+        given.unlink()
+        given.mkdir()
+        for file in files:
+            shutil.copy(file, given / f"{file.name}.png")
+    if name == "intrinsics":
+        given.write_text("image,model,parameters,sigma\n*,SIMPLE_PINHOLE,900 400 300,fixed\n")
+    if name == "weights":
+        given.unlink()
+        given.mkdir()
+    with pytest.raises(UserError, match=f"the input {given}; name another folder"):
+        reconstruct(files, **({"recipe": "sift"} | options | {name: given}))
 
 
 def test_a_line_counts_the_images_that_keep_their_cameras(home):
