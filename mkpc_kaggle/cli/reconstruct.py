@@ -130,8 +130,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         model (COLMAP's: SIMPLE_PINHOLE, OPENCV, ...), parameters (in COLMAP's order, separated by blanks),
         sigma (of the focal length, in percent, or fixed), and optionally size (of the images: 1536x1024)"""
     add("--intrinsics", type=Path, metavar="FILE.csv", help=text)
-    text = """a finished model of COLMAP, such as the folder models/0 in the OUT of another run: its photographs, which
-        DIR has, too, keep these cameras exactly, and the new ones are registered among them"""
+    text = """a finished model of COLMAP, such as the folder models/0 in the OUT of another run: its photographs,
+        which DIR has, too, keep these cameras exactly, and the new ones are registered among them"""
     add("--onto", type=Path, metavar="MODEL", help=text)
     text = "masks named as COLMAP's, MASKS/a.jpg.png for a.jpg; points on black pixels are left out"
     add("--masks", type=Path, metavar="MASKS", help=text)
