@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 from mkpc_kaggle.cores import available_cores
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import COLMAP_CENTRE_PX
-from mkpc_kaggle.geometry.intrinsics import KnownCamera
 from mkpc_kaggle.recipe import CameraModel, SceneConfig
 from mkpc_kaggle.scene.adjustment import adjust, settle_rotations
 from mkpc_kaggle.scene.edges import supported
@@ -43,6 +42,7 @@ from mkpc_kaggle.scene.models import (
     RegisteredImage,
     SfmModel,
     filter_models,
+    lens_of,
 )
 from mkpc_kaggle.scene.placement import misplaced_images
 from mkpc_kaggle.scene.uncertainty import camera_sigmas
@@ -510,19 +510,11 @@ def _sfm_model(found: Any, graph: ViewGraph) -> SfmModel:
                 camera,
                 int(image.num_points3D),
                 sigmas.get(image.name, ()),
-                _lens_of(image.camera),
+                lens_of(image.camera),
             )
         )
     error = float(found.compute_mean_reprojection_error()) if found.num_points3D() else 0.0
     return SfmModel(tuple(images), points_of(found), error, found)
-
-
-def _lens_of(camera: Any) -> KnownCamera | None:
-    """Return pycolmap's camera model and parameters; ``None`` if no lens has them."""
-    try:
-        return KnownCamera(camera.model_name, tuple(float(each) for each in camera.params))
-    except ValueError:  # such as a focal length below zero, of an implausible image
-        return None
 
 
 def points_of(found: Any) -> NDArray[np.float64]:

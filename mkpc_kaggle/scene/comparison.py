@@ -10,6 +10,8 @@ close to its optimum, so it takes a small part of the time of the model.
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import cached_property, partial
+from math import log
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,6 +31,7 @@ from mkpc_kaggle.scene.models import (
     FocalSource,
     RegisteredImage,
     SfmModel,
+    lens_of,
 )
 from mkpc_kaggle.scene.placement import is_at
 
@@ -55,25 +58,59 @@ LENS_SIGMA = 5.0  # percent, of the focal length in the row to give
 
 
 class Freed(NamedTuple):
-    """A registered image with its camera of the copy, as pycolmap has it."""
+    """A registered image with its camera of the copy, as pycolmap has it, and as a lens."""
 
     registered: RegisteredImage
     camera: Any
-    is_radial: bool  # the radial coefficient is free, too
+    lens: KnownCamera
+    is_radial: bool  # a pinhole with a free radial coefficient
 
     @property
     def focal(self) -> float:
-        return float(self.camera.mean_focal_length())
+        return self.lens.focal
 
     @property
     def displacement(self) -> float:
         """The displacement as in :class:`DistortedLens`."""
-        return displacement(self.registered.image.size, self.focal, self.camera.params[3])
+        return displacement_of(self.lens, self.registered.image.size)
 
 
-def displacement(size: Size, focal: float, coefficient: float) -> float:
-    """Return the displacement of :class:`DistortedLens` by a radial coefficient."""
-    return float(coefficient * (max(size) / 2 / focal) ** 2)
+class Noise:
+    """Standard deviations of an adjusted copy's free parameters, from the covariance of its cameras."""
+
+    def __init__(self, copy: Any) -> None:
+        self._copy = copy
+
+    def sigma(self, freed: Sequence[Freed], quantity: Callable[[KnownCamera], float]) -> float:
+        """Return the median standard deviation of a quantity of the cameras; infinity if the model does
+        not determine it.
+        """
+        # As for the model: time and memory would be too much. The many images have little noise.
+        if self._copy.num_reg_images() > MAX_SIGMA_IMAGES:
+            return 0.0
+        if self._covariance is None:
+            return float("inf")
+        variances = [self._covariance.variance(each.camera, quantity) for each in freed]
+        return float(np.sqrt(np.median(variances)))
+
+    @cached_property
+    def _covariance(self) -> Covariance | None:
+        return covariance_of(self._copy, {}, 0.0)
+
+
+def log_focal(camera: KnownCamera) -> float:
+    return log(camera.focal)
+
+
+def log_ratio(camera: KnownCamera) -> float:
+    """Return the logarithm of fx / fy."""
+    return log(camera.focals[0] / camera.focals[1])
+
+
+def displacement_of(camera: KnownCamera, size: Size) -> float:
+    """Return the displacement of :class:`DistortedLens` by all coefficients of a camera."""
+    radius = max(size) / 2 / camera.focal
+    return radial_factor(camera, radius) - 1
 
 
 def compare_with_photographs(
@@ -95,8 +132,11 @@ def compare_with_photographs(
     freed = []
     for registered in model.images:
         camera = images[registered.image.name].camera
-        freed.append(Freed(registered, camera, camera.camera_id in radial))
-    given = [*_given_focals(copy, freed, given_cameras)]
+        lens = lens_of(camera)
+        if lens is not None:
+            freed.append(Freed(registered, camera, lens, camera.camera_id in radial))
+    noise = Noise(copy)
+    given = [*_given_focals(noise, freed, given_cameras)]
     # A wrong focal length bends a model as a lens does. So does a model that is not determined.
     wrong = {name for contradiction in given for name in contradiction.images}
     determined = [
@@ -105,11 +145,11 @@ def compare_with_photographs(
         if freed_image.registered.image.name not in wrong
         and (freed_image.registered.sigmas or len(freed) > MAX_SIGMA_IMAGES)
     ]
-    lenses = tuple(_lenses(copy, determined))
+    lenses = tuple(_lenses(noise, determined))
     # A distorted lens bends a model, too, and each image then fits another focal length.
     shared = () if lenses else tuple(_shared_focals(model))
     focals = (*given, *shared, *_exif_focals(determined, given_cameras))
-    distortions = tuple(_given_distortions(copy, determined, given_cameras))
+    distortions = tuple(_given_distortions(noise, determined, given_cameras))
     misplaced = tuple(_misplaced(model, given_cameras))
     return Comparison(focals, lenses, distortions, misplaced=misplaced)
 
@@ -142,7 +182,7 @@ def _free_radial(camera: Any) -> bool:
 
 
 def _given_focals(
-    copy: Any, freed: Sequence[Freed], given_cameras: Mapping[str, KnownCamera]
+    noise: Noise, freed: Sequence[Freed], given_cameras: Mapping[str, KnownCamera]
 ) -> Iterable[FocalContradiction]:
     """Yield the user's cameras with a focal length that the photographs contradict."""
     for camera in dict.fromkeys(given_cameras.values()):
@@ -162,24 +202,24 @@ def _given_focals(
         names = tuple(freed_image.registered.image.name for freed_image in alike)
         found = FocalContradiction(FocalSource.INTRINSICS, names, camera.focal, fitted)
         axes = _fitted_axes(alike, camera)
-        if axes and _contradicts_ratio(copy, alike, camera, axes):
+        if axes and _contradicts_ratio(noise, alike, camera, axes):
             yield replace(found, given_axes=camera.focals, fitted_axes=axes)
-        elif deviation > limit and deviation > CLEAR_SIGMAS * _sigma(copy, alike, 0) / fitted:
+        elif deviation > limit and deviation > CLEAR_SIGMAS * noise.sigma(alike, log_focal):
             yield found
         else:
-            yield from _stray_focals(copy, alike, camera, limit)
+            yield from _stray_focals(noise, alike, camera, limit)
 
 
 def _stray_focals(
-    copy: Any, alike: Sequence[Freed], camera: KnownCamera, limit: float
+    noise: Noise, alike: Sequence[Freed], camera: KnownCamera, limit: float
 ) -> Iterable[FocalContradiction]:
     """Yield the images of a row that its focal length does not fit, though it fits the others: they
     were taken with another zoom.
     """
     limit = max(limit, np.log1p(MAX_STRAY_DEVIATION))
     far = [each for each in alike if abs(np.log(each.focal / camera.focal)) > limit]
-    noise = CLEAR_SIGMAS * _sigma(copy, far, 0) / camera.focal if far else 0.0
-    stray = [each for each in far if abs(np.log(each.focal / camera.focal)) > noise]
+    clear = CLEAR_SIGMAS * noise.sigma(far, log_focal) if far else 0.0
+    stray = [each for each in far if abs(np.log(each.focal / camera.focal)) > clear]
     if stray:
         names = tuple(each.registered.image.name for each in stray)
         fitted = float(np.median([each.focal for each in stray]))
@@ -191,25 +231,23 @@ def _fitted_axes(alike: Sequence[Freed], camera: KnownCamera) -> tuple[float, ..
     # Pinholes whose pixels are almost square have one in the copy, see _free_radial.
     if len(camera.focals) == 1 or any(freed_image.is_radial for freed_image in alike):
         return ()
-    axes = np.median([freed_image.camera.params[:2] for freed_image in alike], axis=0)
+    axes = np.median([freed_image.lens.focals for freed_image in alike], axis=0)
     return float(axes[0]), float(axes[1])
 
 
 def _contradicts_ratio(
-    copy: Any, alike: Sequence[Freed], camera: KnownCamera, axes: Sequence[float]
+    noise: Noise, alike: Sequence[Freed], camera: KnownCamera, axes: Sequence[float]
 ) -> bool:
     """Return whether the photographs contradict fx / fy of a camera; ``axes`` are the fitted ones."""
-    given = np.log(camera.focals[0] / camera.focals[1])
-    deviation = abs(np.log(axes[0] / axes[1]) - given)
+    deviation = abs(log(axes[0] / axes[1]) - log_ratio(camera))
     if deviation <= np.log1p(MAX_RATIO_DEVIATION):
         return False
     # Both focal lengths err together, so their ratio is known much better than each.
-    noise = _deviation(copy, alike, lambda found, camera: found.ratio_variance(camera))
-    return bool(deviation > CLEAR_SIGMAS * noise)
+    return deviation > CLEAR_SIGMAS * noise.sigma(alike, log_ratio)
 
 
 def _given_distortions(
-    copy: Any, freed: Sequence[Freed], given_cameras: Mapping[str, KnownCamera]
+    noise: Noise, freed: Sequence[Freed], given_cameras: Mapping[str, KnownCamera]
 ) -> Iterable[DistortionContradiction]:
     """Yield the user's cameras with a distortion that the photographs contradict."""
     for camera in dict.fromkeys(given_cameras.values()):
@@ -220,24 +258,16 @@ def _given_distortions(
             continue
         size = alike[0].registered.image.size
         given = displacement_of(camera, size)
-        lenses = [replace(camera, parameters=tuple(each.camera.params)) for each in alike]
-        changes = [displacement_of(lens, size) - given for lens in lenses]
+        changes = [each.displacement - given for each in alike]
         change = float(np.median(changes))
         agreeing = sum(each / change > 0.5 for each in changes) if change else 0
-        sigma = _sigma(copy, alike, len(camera.focals))
-        noise = abs(displacement(size, camera.focal, sigma))
-        is_clear = abs(change) >= max(MIN_DISPLACEMENT, CLEAR_SIGMAS * noise)
+        sigma = noise.sigma(alike, partial(displacement_of, size=size))
+        is_clear = abs(change) >= max(MIN_DISPLACEMENT, CLEAR_SIGMAS * sigma)
         if is_clear and agreeing >= MIN_AGREEING * len(alike):
-            parameters = np.median([lens.parameters for lens in lenses], axis=0)
+            parameters = np.median([each.lens.parameters for each in alike], axis=0)
             fitted = replace(camera, parameters=tuple(parameters.tolist()))
             names = tuple(each.registered.image.name for each in alike)
             yield DistortionContradiction(names, given, given + change, fitted)
-
-
-def displacement_of(camera: KnownCamera, size: Size) -> float:
-    """Return the displacement of :class:`DistortedLens` by all coefficients of a camera."""
-    radius = max(size) / 2 / camera.focal
-    return radial_factor(camera, radius) - 1
 
 
 def sharing_images(colmap: Any) -> dict[int, list[str]]:
@@ -320,7 +350,7 @@ def _exif_focals(
         yield FocalContradiction(FocalSource.EXIF, names, given, fitted)
 
 
-def _lenses(copy: Any, freed: Sequence[Freed]) -> Iterable[DistortedLens]:
+def _lenses(noise: Noise, freed: Sequence[Freed]) -> Iterable[DistortedLens]:
     """Yield the lenses of a model's pinholes that are clearly distorted; images of one size share
     a lens.
     """
@@ -333,9 +363,11 @@ def _lenses(copy: Any, freed: Sequence[Freed]) -> Iterable[DistortedLens]:
         agreeing = sum(each.displacement / displacement > 0.5 for each in alike)
         if agreeing < MIN_AGREEING * len(alike):
             continue
-        coefficient = float(np.median([each.camera.params[3] for each in alike]))
-        if abs(coefficient) < CLEAR_SIGMAS * _sigma(copy, alike, 1):
+        if abs(displacement) < CLEAR_SIGMAS * noise.sigma(
+            alike, partial(displacement_of, size=size)
+        ):
             continue
+        coefficient = float(np.median([each.lens.distortion[0] for each in alike]))
         focal = float(np.median([each.focal for each in alike]))
         parameters = (focal, size.width / 2, size.height / 2, coefficient)
         camera = KnownCamera("SIMPLE_RADIAL", parameters, LENS_SIGMA)
@@ -356,25 +388,5 @@ def adopted_lenses_of(
     for (size, name), alike in groups.items():
         parameters = np.median([found.lens.parameters for found in alike if found.lens], axis=0)
         camera = KnownCamera(name, tuple(parameters.tolist()), LENS_SIGMA)
-        share = displacement(size, camera.focal, camera.distortion[0])
-        yield DistortedLens(tuple(found.image.name for found in alike), share, camera, True)
-
-
-def _sigma(copy: Any, freed: Sequence[Freed], parameter: int) -> float:
-    """Return the median standard deviation of a free parameter of the cameras: 0 is the first focal
-    length in pixels, 1 the radial coefficient. Infinity if the model does not determine it.
-    """
-    return _deviation(copy, freed, lambda found, camera: found.variance(camera, parameter))
-
-
-def _deviation(
-    copy: Any, freed: Sequence[Freed], variance_of: Callable[[Covariance, Any], float]
-) -> float:
-    # As for the model: time and memory would be too much. The many images have little noise.
-    if copy.num_reg_images() > MAX_SIGMA_IMAGES:
-        return 0.0
-    found = covariance_of(copy, {}, 0.0)
-    if found is None:
-        return float("inf")
-    variances = [variance_of(found, freed_image.camera) for freed_image in freed]
-    return float(np.sqrt(np.median(variances)))
+        names = tuple(found.image.name for found in alike)
+        yield DistortedLens(names, displacement_of(camera, size), camera, True)

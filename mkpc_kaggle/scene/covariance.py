@@ -7,7 +7,7 @@ from the residuals.
 """
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from math import inf
@@ -43,10 +43,21 @@ class Covariance:
     poses: Array
     intrinsics: Mapping[int, Array]
 
-    def variance(self, camera: Any, parameter: int) -> float:
-        """Return the variance of a camera's parameter."""
+    def variance(self, camera: Any, quantity: Callable[[KnownCamera], float]) -> float:
+        """Return the variance of a quantity of a camera, to first order."""
         known = self.intrinsics.get(camera.camera_id)
-        return inf if known is None else float(known[parameter, parameter])
+        if known is None:
+            return inf
+        values = np.array(camera.params)
+        gradient = np.empty(len(values))
+        for parameter, value in enumerate(values):
+            step = np.zeros(len(values))
+            step[parameter] = STEP * max(1.0, abs(value))
+            after = quantity(KnownCamera(camera.model_name, tuple(values + step)))
+            before = quantity(KnownCamera(camera.model_name, tuple(values - step)))
+            gradient[parameter] = (after - before) / (2 * step[parameter])
+        variance = float(gradient @ known @ gradient)
+        return variance if variance >= 0 else inf  # negative by rounding, if nearly undetermined
 
     def focal_variance(self, camera: Any) -> float:
         """Return the variance of the logarithm of a mean focal length."""
@@ -55,17 +66,6 @@ class Covariance:
         if known is None:
             return inf
         return float(known[np.ix_(focals, focals)].mean() / camera.mean_focal_length() ** 2)
-
-    def ratio_variance(self, camera: Any) -> float:
-        """Return the variance of the logarithm of fx / fy."""
-        known = self.intrinsics.get(camera.camera_id)
-        if known is None:
-            return inf
-        first, second = camera.focal_length_idxs()
-        gradient = np.zeros(len(known))
-        gradient[first] = 1 / camera.params[first]
-        gradient[second] = -1 / camera.params[second]
-        return float(gradient @ known @ gradient)
 
 
 def covariance_of(

@@ -217,6 +217,14 @@ def is_plausible(found: RegisteredImage) -> bool:
     )
 
 
+def lens_of(camera: Any) -> KnownCamera | None:
+    """Return the model and parameters of pycolmap's camera; ``None`` if no lens has them."""
+    try:
+        return KnownCamera(camera.model_name, tuple(float(each) for each in camera.params))
+    except ValueError:  # such as a focal length below zero, of an implausible image
+        return None
+
+
 def models_of(reconstructions: Sequence[Reconstruction]) -> tuple[SfmModel, ...]:
     """Return the models of all reconstructions, the largest first."""
     models = (model for found in reconstructions for model in found.models)

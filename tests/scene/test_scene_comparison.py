@@ -13,8 +13,10 @@ from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.intrinsics import LENS_MODELS, KnownCamera
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.recipe import CameraModel, CameraSharing, SceneConfig
+from mkpc_kaggle.scene import comparison
 from mkpc_kaggle.scene.align import find_similarity, model_size, moved_by
 from mkpc_kaggle.scene.comparison import compare_with_photographs
+from mkpc_kaggle.scene.covariance import covariance_of
 from mkpc_kaggle.scene.models import Comparison, FocalSource, SfmModel, models_of
 from mkpc_kaggle.scene.sfm import reconstruct_graph
 from mkpc_kaggle.scene.view_graph import BatchPair, ViewGraph
@@ -176,6 +178,15 @@ def test_no_lens_is_adopted_that_the_photographs_do_not_show():
     assert {image.lens.model for image in model.images if image.lens} == {"SIMPLE_PINHOLE"}
 
 
+def test_noise_is_no_lens():
+    """The points of these five pinholes fit distortions that are large, and uncertain by more than that."""
+    scene = synthetic_scene(5, points=300, noise=2.5, focals=[1000.0] * 5)
+    found, _ = reconstruct_graph(ViewGraph.of_pairs(scene.pairs), SceneConfig())
+    (model,) = models_of(found)
+    assert len(model.images) == 5
+    assert model.comparison.lenses == ()
+
+
 def test_a_pinhole_that_the_user_gives_is_contradicted_and_stays():
     known = pinhole(FOCAL, 20.0)
     model = model_of(pairs_of(-0.2), known, camera_model=CameraModel.AUTO)
@@ -216,6 +227,16 @@ def test_a_wrong_distortion_of_the_user_is_found_with_the_right_one(given, true)
     assert found.camera.model == "SIMPLE_RADIAL"
 
 
+def test_noise_contradicts_no_distortion_of_the_user():
+    scene = synthetic_scene(5, points=300, noise=2.5, seed=6, focals=[1000.0] * 5)
+    known = KnownCamera("SIMPLE_RADIAL", (1000.0, *MIDDLE, 1e-6))
+    graph = ViewGraph.of_pairs(scene.pairs).with_intrinsics([("*", known)])
+    found, _ = reconstruct_graph(graph, SceneConfig())
+    (model,) = models_of(found)
+    assert len(model.images) == 5
+    assert model.comparison == Comparison()
+
+
 def test_a_wrong_focal_length_of_exif_is_found_unless_the_user_knows_the_camera():
     model = model_of(pairs_of(exif=1.5 * FOCAL))
     (focal,) = model.comparison.focals
@@ -223,6 +244,23 @@ def test_a_wrong_focal_length_of_exif_is_found_unless_the_user_knows_the_camera(
     assert focal.given == pytest.approx(1.5 * FOCAL)
     assert focal.fitted == pytest.approx(FOCAL, rel=0.02)
     assert model_of(pairs_of(exif=1.5 * FOCAL), pinhole(FOCAL)).comparison == Comparison()
+
+
+def test_the_covariance_is_computed_once_for_all_rows(monkeypatch):
+    rows = [
+        (image.name, KnownCamera("SIMPLE_PINHOLE", (1.2 * FOCAL + number, *MIDDLE)))
+        for number, image in enumerate(SCENE.images)
+    ]
+    calls = []
+
+    def counted(*arguments):
+        calls.append(arguments)
+        return covariance_of(*arguments)
+
+    monkeypatch.setattr(comparison, "covariance_of", counted)
+    model = model_of(pairs_of(), *rows)
+    assert len(model.comparison.focals) == len(rows)
+    assert len(calls) == 1
 
 
 def test_the_comparison_leaves_the_model_as_it_is():

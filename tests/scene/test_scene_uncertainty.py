@@ -2,23 +2,29 @@
 points.
 """
 
+from functools import partial
+
 import numpy as np
 import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks.synthetic_scene import SyntheticScene, synthetic_scene
-from mkpc_kaggle.recipe import CameraSharing, SceneConfig
+from benchmarks.synthetic_scene import SIZE, SyntheticScene, synthetic_scene
+from mkpc_kaggle.recipe import CameraModel, CameraSharing, SceneConfig
 from mkpc_kaggle.scene import uncertainty
+from mkpc_kaggle.scene.comparison import displacement_of, log_ratio
 from mkpc_kaggle.scene.covariance import covariance_of, seeing_images
-from mkpc_kaggle.scene.models import SfmModel
+from mkpc_kaggle.scene.models import SfmModel, lens_of
 from mkpc_kaggle.scene.sfm import reconstruct_batch
 from mkpc_kaggle.scene.uncertainty import PRINCIPAL_POINT_SHARE, camera_sigmas
 
 
-def model_of(scene: SyntheticScene) -> SfmModel:
+def model_of(
+    scene: SyntheticScene, camera_model: CameraModel = CameraModel.SIMPLE_PINHOLE
+) -> SfmModel:
     # An intrinsic matrix for each image, so that each focal length has its own error.
-    solution = reconstruct_batch(scene.pairs, SceneConfig(cameras=CameraSharing.IMAGE))
+    config = SceneConfig(cameras=CameraSharing.IMAGE, camera_model=camera_model)
+    solution = reconstruct_batch(scene.pairs, config)
     (found,) = solution.reconstructions
     (model,) = found.models
     return model
@@ -80,6 +86,34 @@ def test_errors_are_about_as_large_as_expected(share, monkeypatch):
     root_mean_square = np.sqrt((table**2).mean(axis=0))
     # Wrong by a factor of 1.5 at most, in either direction.
     assert (np.abs(np.log(root_mean_square)) < np.log(1.5)).all()
+
+
+@pytest.mark.parametrize(
+    ("camera_model", "quantity"),
+    [
+        (CameraModel.SIMPLE_RADIAL, partial(displacement_of, size=SIZE)),
+        (CameraModel.PINHOLE, log_ratio),
+    ],
+)
+def test_errors_of_distortion_and_of_the_ratio_are_about_as_large_as_expected(
+    camera_model, quantity
+):
+    """True pinholes have square pixels and no distortion, so both quantities are 0."""
+    ratios = []
+    for seed in range(4):
+        scene = synthetic_scene(8, points=400, seed=seed)
+        model = model_of(scene, camera_model)
+        covariance = covariance_of(model.colmap, {}, 0.0)
+        assert covariance is not None
+        for image in covariance.images:
+            lens = lens_of(image.camera)
+            assert lens is not None
+            sigma = np.sqrt(covariance.variance(image.camera, quantity))
+            ratios.append(quantity(lens) / sigma)
+    assert len(ratios) == 32
+    root_mean_square = np.sqrt(np.mean(np.square(ratios)))
+    # Wrong by a factor of 1.5 at most, in either direction.
+    assert abs(np.log(root_mean_square)) < np.log(1.5)
 
 
 def test_an_error_of_the_principal_point_is_expected_of_many_exact_points():
