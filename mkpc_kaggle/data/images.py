@@ -55,6 +55,7 @@ FILM_MM = 43.27  # diagonal of 35 mm film
 UNITS_MM: dict[float, float] = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # inch, cm, mm, micrometre
 # Marks of JPEG, and bytes that change a picture if they are decoded
 JPEG_START, JPEG_END = b"\xff\xd8", b"\xff\xd9"
+JPEG_SCAN = 0xDA
 JPEG_FILL = b"\xaa" * 64
 MAX_TRAILER_BYTES = 1 << 16  # after the end mark, such as a maker's notes
 # In long sides of the image; a focal length outside this range counts as unknown.
@@ -201,10 +202,8 @@ def decode(data: Pixels, kind: int = cv2.IMREAD_COLOR) -> Pixels | None:
     """
     pixels = _decode_file(data, kind)
     start = data[:4].tobytes()
-    # OpenCV 5 refuses these files, and OpenCV 4 fills their missing part without a word. Cameras may
-    # write more after the end mark.
-    lacks_end = JPEG_END not in data[-MAX_TRAILER_BYTES:].tobytes()
-    if start.startswith(JPEG_START) and lacks_end:
+    # OpenCV 5 refuses these files, and OpenCV 4 fills their missing part without a word.
+    if start.startswith(JPEG_START) and not _has_end(data):
         # Some cameras and downloads leave the end mark out. If the picture is complete, further
         # bytes change nothing; if it is cut off, they are decoded.
         pixels, other = (_decode_file(_with_end(data, more), kind) for more in (b"", JPEG_FILL))
@@ -221,6 +220,16 @@ def _decode_file(data: Pixels, kind: int) -> Pixels | None:
     # OpenCV's types do not say that the pixels are bytes, as IMREAD_COLOR makes them.
     pixels: Any = cv2.imdecode(data, kind | cv2.IMREAD_IGNORE_ORIENTATION)
     return pixels if pixels is None else np.asarray(pixels)
+
+
+def _has_end(data: Pixels) -> bool:
+    """Return whether a JPEG file has an end mark after its first scan."""
+    scan = 2
+    # Each segment before it has a length. A thumbnail in EXIF has an end mark of its own.
+    while scan + 4 <= len(data) and data[scan] == JPEG_END[0] and data[scan + 1] != JPEG_SCAN:
+        scan += 2 + int.from_bytes(data[scan + 2 : scan + 4].tobytes(), "big")
+    # Cameras may write more after the end mark.
+    return JPEG_END in data[max(scan, len(data) - MAX_TRAILER_BYTES) :].tobytes()
 
 
 def _with_end(data: Pixels, more: bytes) -> Pixels:

@@ -8,7 +8,7 @@ from mkpc_kaggle.engine.jobs import Cause, Estimated, EstimateJob, Failure, Feat
 from mkpc_kaggle.engine.plan.blame import Tries
 from mkpc_kaggle.engine.plan.budget import ESTIMATE
 from mkpc_kaggle.engine.run import Run
-from mkpc_kaggle.engine.store.database import Source, Store
+from mkpc_kaggle.engine.store.database import Source, Store, parts_of
 from mkpc_kaggle.engine.store.tables import Feature, PairEstimate, UnitPoints
 
 # In a job. More pairs would make the last F of a run wait for each other; single pairs, each with a
@@ -129,7 +129,8 @@ def _estimate(key: str, found: Estimated) -> PairEstimate:
 
 
 class Features:
-    """Features of images by key: the ones ``found``, and the jobs ``pending``.
+    """Features of images by key: the ones ``found``, and the jobs ``pending``. Of features that are data,
+    such as descriptors, only the store has the value: those of a large folder would fill the memory.
 
     They come before any pair: similar images and orientations decide which pairs there are.
     """
@@ -143,10 +144,12 @@ class Features:
     def ask(self, jobs: Mapping[str, Callable[[], Any]]) -> None:
         """Find features in the store; the others become pending."""
         features = self._store.get(Feature, jobs)
-        values = {key: feature.value for key, feature in features.items()}
-        # Features that are no JSON value are data.
-        data = self._store.data(Feature, [key for key in values if values[key] is None])
-        self.found = {**values, **data}
+        self.found = {key: feature.value for key, feature in features.items()}
+        # Features that are no JSON value are data, which may be damaged.
+        data = [key for key, value in self.found.items() if value is None]
+        for part in parts_of(data):
+            for key in set(part) - self._store.data(Feature, part).keys():
+                del self.found[key]
         self.pending = {
             key: FeatureJob(key, do) for key, do in jobs.items() if key not in self.found
         }
@@ -161,7 +164,7 @@ class Features:
         # Keypoints and descriptors are bytes; partners of images are JSON.
         is_data = isinstance(value, bytes)
         self._store.put([Feature(job.key, None, value) if is_data else Feature(job.key, value)])
-        self.found[job.key] = value
+        self.found[job.key] = None if is_data else value
 
     def lose(self, job: FeatureJob, failure: Failure) -> None:
         # A feature lost twice is left out: its image is compared with no other.

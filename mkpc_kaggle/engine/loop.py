@@ -127,15 +127,14 @@ class Engine:
         return None if feature is None else feature.value
 
     def look(self, jobs: Mapping[str, Callable[[], Any]]) -> dict[str, Any]:
-        """Return features by key: JSON values, or bytes. Failed ones are left out."""
+        """Return features by key, if they are JSON values; ``None`` for data, which the store has.
+        Failed ones are left out.
+        """
         self._features.ask(jobs)
         self._looking_since = self.budget.clock()
         self._loop()
         self._features.pending = {}  # the time is over, or the run was interrupted
-        # Descriptors of many photographs: they are the caller's from now on.
-        found = self._features.found
-        self._features.found = {}
-        return found
+        return self._features.found
 
     def ask(self, request: Request, share: float = 1.0) -> None:
         """Compute the missing results of a request. No job begins after ``share`` of the remaining

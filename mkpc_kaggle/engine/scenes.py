@@ -1,6 +1,9 @@
 """Scenes of batches: their jobs, results and losses."""
 
-from mkpc_kaggle.engine.jobs import Failure, SceneJob
+import sqlite3
+from collections.abc import Sequence
+
+from mkpc_kaggle.engine.jobs import Cause, Failure, PairInputs, SceneJob
 from mkpc_kaggle.engine.plan.state import State
 from mkpc_kaggle.engine.run import Run
 from mkpc_kaggle.engine.store.keys import of_camera_estimate, of_candidate
@@ -34,7 +37,12 @@ class SceneWork:
         state = run.state
         indices, key = state.scene_inputs(batch)
         pairs = tuple(state.inputs_of(index) for index in indices)
-        source = run.source(pairs)
+        try:
+            source = run.source(pairs)
+        except sqlite3.Error as error:  # a disk that fails
+            failure = Failure(Cause.RAISED, f"the store cannot be read: {error}")
+            self._count_loss(batch, candidate, key, failure)
+            return None
         if source is None:
             state.scenes.end(batch, candidate)
             return None
@@ -132,18 +140,32 @@ class SceneWork:
         return estimates
 
     def lose(self, job: SceneJob, failure: Failure) -> None:
+        self._count_loss(job.batch, job.candidate, job.scene, failure, job.pairs)
+
+    def _count_loss(
+        self,
+        batch: str,
+        candidate: str,
+        scene: str,
+        failure: Failure,
+        pairs: Sequence[PairInputs] = (),
+    ) -> None:
+        """Note that a candidate was lost, and give it up after the second time.
+
+        ``scene`` is the key of the first candidate, ``pairs`` are those whose points a worker read.
+        """
         run = self._run
         state = run.state
         tracks = ""
-        if job.candidate != ALL_UNITS:
-            tracks = f" from the tracks of {title_of(job.candidate)}"
-        run.log.fault(f"batch {job.batch} was not reconstructed{tracks}: {failure}")
-        state.scenes.end(job.batch, job.candidate)
-        # Its worker reads the store by itself. Another program may have damaged it.
-        if run.forget_lost_points(job.pairs):
+        if candidate != ALL_UNITS:
+            tracks = f" from the tracks of {title_of(candidate)}"
+        run.log.fault(f"batch {batch} was not reconstructed{tracks}: {failure}")
+        state.scenes.end(batch, candidate)
+        # A worker reads the store by itself. Another program may have damaged it.
+        if run.forget_lost_points(pairs):
             return
-        if state.tries.lose([("scene", job.batch, job.key)], failure):
-            state.scenes.give_up(job.batch, job.candidate, job.scene, state.tries.given_up)
+        if state.tries.lose([("scene", batch, of_candidate(scene, candidate))], failure):
+            state.scenes.give_up(batch, candidate, scene, state.tries.given_up)
 
 
 def scene_records(state: State) -> tuple[SceneRecord, ...]:

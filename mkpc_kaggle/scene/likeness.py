@@ -31,6 +31,7 @@ WORDS = 64
 SIDE_PX = 640
 FEATURES = 1000  # descriptors per image
 MAX_TRAINING = 50_000  # descriptors to cluster into words
+COMPARED_AT_A_TIME = 1000  # images with all others
 FEATURE_SETTINGS = f"rootsift {SIDE_PX} {FEATURES} 1"  # ends with the version of the algorithm
 # Of pairs with a covisibility of 0.1 to 0.2, 0.96 to 1.00 have this number of matches, and all pairs
 # above. Of the pairs of different scenes, 0.30 have it (`python -m benchmarks.shortlists`).
@@ -146,11 +147,15 @@ def most_alike(features: Callable[[], Iterable[bytes]], count: int) -> list[list
             warnings.simplefilter("ignore")  # about words without descriptors
             words, _ = kmeans2(training, words, iter=10, minit="matrix")
     table = np.stack([vlad(found, words) for found in map(_unpacked, features())])
-    similarity = table @ table.T
-    np.fill_diagonal(similarity, -np.inf)
-    order = np.argsort(-similarity, axis=1, kind="stable")
-    # The last one is the image itself.
-    near: list[list[int]] = order[:, :-1][:, :count].tolist()
+    near: list[list[int]] = []
+    # In parts: the similarities of all images of a large folder would fill the memory.
+    for start in range(0, len(table), COMPARED_AT_A_TIME):
+        similarity = table[start : start + COMPARED_AT_A_TIME] @ table.T
+        own = np.arange(len(similarity))
+        similarity[own, start + own] = -np.inf
+        order = np.argsort(-similarity, axis=1, kind="stable")
+        # The last one is the image itself.
+        near += order[:, :-1][:, :count].tolist()
     return near
 
 

@@ -87,6 +87,29 @@ def test_a_file_that_is_not_a_picture_has_its_reason(tmp_path):
         assert reason(tmp_path / name) == "cannot be read: not a regular file"
 
 
+def test_a_jpeg_that_is_cut_off_is_refused_though_its_thumbnail_has_an_end(tmp_path):
+    # OpenCV 4 fills the missing part without a word (`make oldest`).
+    photograph = write(tmp_path / "a.jpg", noise(600, 400, 3)).read_bytes()
+    thumbnail = write(tmp_path / "thumbnail.jpg", noise(16, 16)).read_bytes()
+    segment = b"\xff\xe1" + (2 + len(thumbnail)).to_bytes(2, "big") + thumbnail
+    whole = photograph[:2] + segment + photograph[2:]
+    path = tmp_path / "whole.jpg"
+    path.write_bytes(whole)
+    image = read_image(path)
+    assert isinstance(image, Image)
+    # Both within the bytes that a camera may add after the end mark, and beyond them
+    assert len(whole) > 3 * images.MAX_TRAILER_BYTES
+    for length in (images.MAX_TRAILER_BYTES // 2, images.MAX_TRAILER_BYTES + 100, len(whole) - 100):
+        path.write_bytes(whole[:length])
+        assert "cut off" in reason(path)
+    # Without its end mark, and with a maker's notes after it, the picture is complete.
+    for complete in (whole[:-2], whole + b"notes" * 100):
+        path.write_bytes(complete)
+        again = read_image(path)
+        assert isinstance(again, Image)
+        assert_array_equal(again.pixels, image.pixels)
+
+
 def test_an_array_is_named_by_its_content_and_shape_or_refused():
     pixels = noise(6, 4, 3)
     # The name is the key of the cache of encodings.

@@ -1,5 +1,6 @@
 """Scenes in whole runs: whose F a pair gets, and what a reconstruction that goes wrong costs."""
 
+import sqlite3
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -101,6 +102,26 @@ def test_a_focal_length_of_exif_goes_to_the_pairs_the_store_and_the_scene(tmp_pa
     assert not np.array_equal(without[0], with_exif[0])
     assert np.array_equal(without[2], with_exif[2]), "the pair of the other images"
     assert [pair.images[0].focal for pair in jobs[-1].pairs] == [told, told, 0]
+
+
+@pytest.mark.parametrize(("count", "expected"), [(1, "scene"), (9, "pair")])
+def test_an_error_of_the_disk_when_a_scene_begins_costs_that_job_and_the_run_goes_on(
+    tmp_path, monkeypatch, count, expected
+):
+    scenes_by(monkeypatch, choose_scene_for_all_but_the_first)
+    errors = iter([sqlite3.OperationalError("disk I/O error")] * count)
+    source = Store.source
+
+    def failing(store: Store, kind: type, keys: Any) -> Any:
+        for error in errors:
+            raise error
+        return source(store, kind, keys)
+
+    monkeypatch.setattr(Store, "source", failing)
+    pairs = batch_pairs(tmp_path / "images")
+    report = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
+    assert any("the store cannot be read: disk I/O error" in fault for fault in report.faults)
+    assert sources(report) == ["pair"] + [expected] * 5
 
 
 @pytest.mark.parametrize(

@@ -25,6 +25,7 @@ from simulator import (
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.jobs import Cause, Failure, MatchJob, Phase
 from mkpc_kaggle.engine.loop import Engine
+from mkpc_kaggle.engine.plan import schedule
 from mkpc_kaggle.engine.plan.blame import Item
 from mkpc_kaggle.engine.plan.budget import Budget, Costs
 from mkpc_kaggle.engine.plan.schedule import (
@@ -270,6 +271,17 @@ def test_a_pair_with_unmeasured_units_needs_several_jobs_and_the_last_says_so():
         ((0,), (SECOND,), True),
         ((1,), (THIRD, SECOND), True),
     ]
+
+
+def test_a_part_of_many_due_estimates_is_handed_out_and_nothing_forgets_the_others(monkeypatch):
+    monkeypatch.setattr(schedule, "MAX_DUE", 3)
+    run = Run(count=8, had=[UNITS] * 8)
+    due = []
+    while work := run.next_work().estimates:
+        assert len(work) <= 3
+        due += work
+        run.state.begin_estimates(work)
+    assert sorted(due) == list(range(8))
 
 
 @pytest.mark.parametrize("reserve", [0, 100])

@@ -47,6 +47,9 @@ RESERVE_SHARE = 0.2
 # Maximum share of the limit that is reserved for further candidates of scenes: any scene is worth
 # more than a choice of scenes.
 CANDIDATES_SHARE = 0.05
+# Estimates that are handed out at a time. A list of all due ones, anew for each job, would cost the
+# loop more than the jobs in a run of 500,000 pairs.
+MAX_DUE = 1000
 # Phases in arrays are plain integers.
 FILL = int(Phase.FILL)
 NEVER = int(Phase.NEVER)
@@ -69,7 +72,8 @@ class Crew:
 
 @dataclass(frozen=True, eq=False)
 class NextWork:
-    """Work for idle workers: the next job of matching, and all estimates and scenes that are due.
+    """Work for idle workers: the next job of matching, the first estimates that are due, and all scenes
+    that are.
 
     ``done`` of ``total`` pairs are finished in the ``phase``. The first ``fit`` units of the recipe fit for all
     pairs.
@@ -152,7 +156,7 @@ def next_work(
         pairs = phases[state.rows :]
         total = int(connecting.sum())
     pending = int((pairs.min(1) <= phase).sum()) if pairs.size else 0
-    order = tuple(estimates.tolist())
+    order = tuple(estimates[:MAX_DUE].tolist())
     candidates = candidates_due(snapshot, estimates, is_matching=is_matching)
     return NextWork(match, order, scenes, candidates, phase, total - pending, total, fit)
 
