@@ -145,24 +145,25 @@ def parse_row(pattern: str, model: str, parameters: str, sigma: str) -> tuple[st
     return pattern.strip(), KnownCamera(model.strip(), values, percent)
 
 
-def camera_of(rows: Rows, name: str) -> KnownCamera | None:
-    """Return the camera of the first row that names an image, or None.
+def camera_of(rows: Rows, *names: str) -> KnownCamera | None:
+    """Return the camera of the first row that names an image by one of its ``names``, or None.
 
     A row names it by path, by file name, or by a pattern of these; a placed camera by path alone.
     """
     # macOS writes "é" as two characters, and most tables as one.
-    name = unicodedata.normalize("NFC", name)
-    base = name.rpartition("/")[2]
+    paths = [unicodedata.normalize("NFC", name) for name in names]
     for written_pattern, known in rows:
         pattern = unicodedata.normalize("NFC", written_pattern)
         # Another folder may have a photograph of the same name elsewhere.
-        if isinstance(known, PlacedCamera):
-            if pattern == name:
-                return known
-            continue
-        # Equality first: a file may be called "photo [1].jpg", and as a pattern this is another.
-        if pattern in (name, base):
-            return known
-        if fnmatch.fnmatchcase(name, pattern) or fnmatch.fnmatchcase(base, pattern):
+        is_placed = isinstance(known, PlacedCamera)
+        if any(pattern == path if is_placed else _is_named(path, pattern) for path in paths):
             return known
     return None
+
+
+def _is_named(path: str, pattern: str) -> bool:
+    base = path.rpartition("/")[2]
+    # Equality first: a file may be called "photo [1].jpg", and as a pattern this is another.
+    if pattern in (path, base):
+        return True
+    return fnmatch.fnmatchcase(path, pattern) or fnmatch.fnmatchcase(base, pattern)

@@ -29,8 +29,8 @@ def contradictions(scene: SceneRecord) -> Iterator[str]:
         if model.comparison.misplaced:
             names = named([labels.get(name, name) for name in model.comparison.misplaced])
             yield (
-                f"matches contradict the cameras of {names} in the model of --onto, so these are registered "
-                "as new photographs: probably other pictures have their names"
+                f"matches contradict the cameras of {names} in the model of --onto, so these count as new "
+                "photographs: probably other pictures have their names"
             )
         for focal in model.comparison.focals:
             yield _focal_sentence(focal, labels)

@@ -346,8 +346,8 @@ def _refine(cache: Any, former: Any, settings: Any) -> Any:
     """Return a model with the cameras of ``cache``, from the poses of pycolmap's model ``former``."""
     model = pycolmap.Reconstruction()
     model.load(cache)
-    # Images have the same numbers in both
-    for number in sorted(former.reg_frame_ids()):
+    # Images have the same numbers in both. The cache has none without verified matches.
+    for number in filter(model.exists_frame, sorted(former.reg_frame_ids())):
         model.frame(number).rig_from_world = former.frame(number).rig_from_world
         model.register_frame(number)
     options = _incremental_options(settings)
@@ -367,8 +367,9 @@ def register_onto(database: Any, graph: ViewGraph, threads: int) -> tuple[Any, V
     An image whose matches contradict its placed camera is registered as a new one. In the returned
     graph, it has no placed camera.
     """
-    cache_options = pycolmap.DatabaseCacheOptions({"min_num_matches": MIN_MATCHES})
-    cache = pycolmap.DatabaseCache.create(database, cache_options)
+    # Cameras of the model stay, also of images without verified matches.
+    cache_options = {"min_num_matches": MIN_MATCHES, "load_all_images": True}
+    cache = pycolmap.DatabaseCache.create(database, pycolmap.DatabaseCacheOptions(cache_options))
     settings = _mapper_options(graph, threads)
     model, numbers = _placed_model(cache, graph)
     misplaced = misplaced_images(model, cache.correspondence_graph, numbers)

@@ -88,6 +88,8 @@ def reconstruct_connected(
         return Reconstruction(names, failure=f"pycolmap cannot be imported: {error}")
     except (RuntimeError, ValueError) as error:
         return Reconstruction(names, failure=f"pycolmap failed: {error}")
+    except LookupError as error:  # its message is a mere key
+        return Reconstruction(names, failure=f"pycolmap failed: {error!r}")
 
 
 def refine_complete(

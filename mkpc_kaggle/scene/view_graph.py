@@ -1,6 +1,6 @@
 """The view graph of a batch: its distinct images, and the matches between them."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TypeAlias
 
@@ -69,7 +69,8 @@ class Edge:
 class ViewGraph:
     """Distinct images, and their edges, sorted by image indices. ``known`` has the user's cameras,
     by digest. Unless ``uses_exif``, cameras start without EXIF's focal lengths. ``lenses`` are the
-    cameras that images with a distorted lens start with, by digest.
+    cameras that images with a distorted lens start with, by digest. ``copies`` has the other names of
+    an image's content, by digest.
     """
 
     images: tuple[BatchImage, ...]
@@ -77,6 +78,7 @@ class ViewGraph:
     known: Mapping[str, KnownCamera] = field(default_factory=dict)
     uses_exif: bool = True
     lenses: Mapping[str, KnownCamera] = field(default_factory=dict)
+    copies: Mapping[str, Collection[str]] = field(default_factory=dict)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -107,8 +109,11 @@ class ViewGraph:
         """
         # The first image with a content stands for all of them.
         images: dict[str, BatchImage] = {}
+        copies: dict[str, set[str]] = {}
         for image in (image for pair in pairs for image in (pair.image0, pair.image1)):
-            images.setdefault(image.digest, image)
+            kept = images.setdefault(image.digest, image)
+            if image.name != kept.name:
+                copies.setdefault(image.digest, set()).add(image.name)
         index = {digest: number for number, digest in enumerate(images)}
         parts: dict[tuple[int, int], list[Matches]] = {}
         for pair in pairs:
@@ -123,12 +128,15 @@ class ViewGraph:
             if first < second and len(tracks):
                 parts.setdefault((first, second), []).append(tracks)
         edges = tuple(Edge(*ends, Matches.concatenate(parts[ends])) for ends in sorted(parts))
-        return cls(tuple(images.values()), edges)
+        return cls(tuple(images.values()), edges, copies=copies)
 
     def with_intrinsics(self, rows: Rows) -> "ViewGraph":
         """Return the graph with the user's cameras of the images that the rows name."""
         # By contents: a copy under another name is the same photograph.
-        found = {image.digest: camera_of(rows, image.name) for image in self.images}
+        found = {
+            image.digest: camera_of(rows, image.name, *self.copies.get(image.digest, ()))
+            for image in self.images
+        }
         return replace(
             self, known={digest: camera for digest, camera in found.items() if camera is not None}
         )

@@ -168,7 +168,7 @@ SPEAKS = {
     "the focal length of 287 px in --intrinsics contradicts the photographs, which fit 575 px": (
         compared(FocalContradiction(FocalSource.INTRINSICS, ("0.jpg",), 287.4, 574.9))
     ),
-    "matches contradict the cameras of 0.jpg in the model of --onto, so these are registered": log(
+    "matches contradict the cameras of 0.jpg in the model of --onto, so these count as new": log(
         scene(model(GOOD, GOOD, GOOD, GOOD, comparison=Comparison(misplaced=("0.jpg",))))
     ),
     "the focal length of 912 px that photographs share contradicts some of them, which fit about 684 px": (

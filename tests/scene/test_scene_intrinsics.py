@@ -1,5 +1,7 @@
 """Intrinsics that the user knows: tables of them, and scenes with exact and with uncertain ones."""
 
+from dataclasses import replace
+
 import numpy as np
 import pycolmap
 import pytest
@@ -8,6 +10,7 @@ from benchmarks.synthetic_scene import synthetic_scene
 from mkpc_kaggle.geometry.intrinsics import (
     LENS_MODELS,
     KnownCamera,
+    PlacedCamera,
     camera_of,
     parse_row,
 )
@@ -49,6 +52,22 @@ def focal_ratios(model: SfmModel) -> dict[str, float]:
         true_focal = SCENE.cameras[name].K[0, 0]
         ratios[name] = found.focal / true_focal
     return ratios
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [
+        KnownCamera("SIMPLE_PINHOLE", (900.0, 400, 300)),
+        PlacedCamera("SIMPLE_PINHOLE", (900.0, 400, 300), pose=(0, 0, 0, 1, 0, 0, 0)),
+    ],
+)
+def test_a_camera_is_that_of_all_copies_of_its_photograph(camera):
+    """A copy whose name comes first stands for the photograph that the row names."""
+    pair = SCENE.pairs[0]
+    copied = replace(pair.image0, name="a copy.jpg")
+    pairs = [replace(pair, image0=copied), replace(pair, image0=pair.image1, image1=pair.image0)]
+    rows = [(pair.image0.name, camera)]
+    assert ViewGraph.of_pairs(pairs).with_intrinsics(rows).known == {copied.digest: camera}
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,108 @@
+"""New images among the cameras of a finished model, of a graph of true cameras."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from benchmarks.synthetic_scene import SyntheticScene, synthetic_scene
+from mkpc_kaggle.geometry.intrinsics import PlacedCamera, Rows
+from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.recipe import SceneConfig
+from mkpc_kaggle.scene.keypoints import MergedGraph
+from mkpc_kaggle.scene.mapper import reconstruct_connected
+from mkpc_kaggle.scene.models import Comparison, Reconstruction, SfmModel
+from mkpc_kaggle.scene.sfm import reconstruct_graph
+from mkpc_kaggle.scene.view_graph import BatchPair, ViewGraph
+
+FOCAL = 840.0
+MIDDLE = (400.0, 300.0)  # from the corner of the first pixel
+SCENE = synthetic_scene(8, points=500, focals=[FOCAL] * 8)
+CONFIG = SceneConfig()
+OLD = 5  # images of the finished model
+EMPTY = Matches(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0))
+
+
+def name_of(number: int) -> str:
+    return f"{number:04}"
+
+
+def placed(scene: SyntheticScene, numbers: Sequence[int]) -> Rows:
+    """Return the rows of a finished model with the true cameras."""
+    rows = []
+    for name in map(name_of, numbers):
+        camera = scene.cameras[name]
+        pose = (*Rotation.from_matrix(camera.R).as_quat(), *camera.t)
+        rows.append((name, PlacedCamera("SIMPLE_PINHOLE", (FOCAL, *MIDDLE), pose=pose)))
+    return rows
+
+
+def without_matches(pairs: Sequence[BatchPair], number: int) -> list[BatchPair]:
+    """Return the pairs, as if one of the images were blank."""
+    return [
+        replace(pair, by_unit=(EMPTY,))
+        if name_of(number) in (pair.image0.name, pair.image1.name)
+        else pair
+        for pair in pairs
+    ]
+
+
+def model_of(pairs: Sequence[BatchPair], rows: Rows, config: SceneConfig = CONFIG) -> SfmModel:
+    graph = ViewGraph.of_pairs(pairs).with_intrinsics(rows)
+    (found,), _ = reconstruct_graph(graph, config, is_whole=True)
+    assert found.failure == ""
+    (model,) = found.models
+    return model
+
+
+def names_of(model: SfmModel) -> set[str]:
+    return {image.image.name for image in model.images}
+
+
+def assert_in_place(model: SfmModel, rows: Rows) -> None:
+    """Every camera of the finished model is in the new one, but for the rounding of its quaternion."""
+    for name, camera in rows:
+        image = model.colmap.find_image_with_name(name)
+        assert image.cam_from_world().params.tolist() == pytest.approx(camera.pose, abs=1e-14), name
+        assert tuple(image.camera.params) == camera.parameters, name
+
+
+def test_a_new_image_without_matches_leaves_the_others():
+    rows = placed(SCENE, range(OLD))
+    model = model_of(without_matches(SCENE.pairs, OLD + 1), rows)
+    assert names_of(model) == {*SCENE.cameras} - {name_of(OLD + 1)}
+    assert model.comparison == Comparison()
+    assert_in_place(model, rows)
+
+
+def test_an_image_of_the_model_without_matches_keeps_its_camera():
+    rows = placed(SCENE, range(OLD))
+    model = model_of(without_matches(SCENE.pairs, 2), rows)
+    assert names_of(model) == {*SCENE.cameras}
+    assert model.comparison == Comparison()
+    assert_in_place(model, rows)
+
+
+def test_a_refinement_without_the_matches_of_an_image_leaves_the_image_out():
+    pairs = [pair for pair in SCENE.pairs if int(pair.image1.name) < OLD]
+    first = reconstruct_connected(MergedGraph(ViewGraph.of_pairs(pairs)), {}, CONFIG)
+    assert first.registered == OLD
+    lacking = MergedGraph(ViewGraph.of_pairs(without_matches(pairs, 3)))
+    second = reconstruct_connected(lacking, {}, CONFIG, first.models)
+    assert second.failure == ""
+    assert names_of(second.models[0]) == {name_of(number) for number in (0, 1, 2, 4)}
+
+
+@pytest.mark.parametrize("error", [KeyError("6"), IndexError("6"), ValueError("6")])
+def test_an_error_within_a_reconstruction_is_a_reason(monkeypatch, error):
+    from mkpc_kaggle.scene import colmap
+
+    def failing(*arguments: object) -> Reconstruction:
+        raise error
+
+    monkeypatch.setattr(colmap, "structure_from_motion", failing)
+    found = reconstruct_connected(MergedGraph(ViewGraph.of_pairs(SCENE.pairs)), {}, CONFIG)
+    assert found.models == ()
+    assert "6" in found.failure
