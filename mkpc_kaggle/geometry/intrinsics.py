@@ -12,6 +12,7 @@ from math import isfinite
 from types import MappingProxyType
 
 from mkpc_kaggle.config import decimal
+from mkpc_kaggle.geometry.coordinates import Size
 
 # Parameters of the models that a perspective camera with a usual lens needs.
 LENS_MODELS: Mapping[str, tuple[str, ...]] = MappingProxyType(
@@ -104,8 +105,13 @@ class KnownCamera:
 
 
 @dataclass(frozen=True)
-class PlacedCamera(KnownCamera):
-    """A camera of a finished model: exact, and with a pose that no adjustment may move.
+class ModelCamera(KnownCamera):
+    """A camera of a finished model: exact, and no row of the user's, who cannot correct it here."""
+
+
+@dataclass(frozen=True)
+class PlacedCamera(ModelCamera):
+    """A camera of a finished model with a pose, which no adjustment may move.
 
     ``pose`` is COLMAP's: a unit quaternion (x, y, z, w) and t, with X_cam = R X + t.
     """
@@ -127,6 +133,13 @@ def radial_factor(camera: KnownCamera, radius: float) -> float:
     r2 = radius**2
     numerator = 1 + k[0] * r2 + k[1] * r2**2 + k[4] * r2**3
     return numerator / (1 + k[5] * r2 + k[6] * r2**2 + k[7] * r2**3)
+
+
+def displacement_of(camera: KnownCamera, size: Size) -> float:
+    """Return by how much all coefficients of a lens move a point half the long side away from the middle
+    of its image, as a share of this distance; negative for a barrel.
+    """
+    return radial_factor(camera, max(size) / 2 / camera.focal) - 1
 
 
 Rows = Sequence[tuple[str, KnownCamera]]  # a name or a pattern of images, and their camera

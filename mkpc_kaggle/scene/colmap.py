@@ -186,7 +186,8 @@ def _write_images(
     used = []
     images = zip(graph.images, merged.keypoints, strict=True)
     for number, (image, points) in enumerate(images, start=1):
-        focal = shared.get(image.digest)
+        # A known camera is the image's own, perhaps of another camera model.
+        focal = None if image.digest in graph.known else shared.get(image.digest)
         # Images of two sizes never share, even at one focal length.
         key = number if focal is None else (image.size, focal)
         if key not in cameras:

@@ -18,11 +18,17 @@ import numpy as np
 import pycolmap
 
 from mkpc_kaggle.geometry.coordinates import Size
-from mkpc_kaggle.geometry.intrinsics import KnownCamera, PlacedCamera, radial_factor
+from mkpc_kaggle.geometry.intrinsics import (
+    KnownCamera,
+    ModelCamera,
+    PlacedCamera,
+    displacement_of,
+)
 from mkpc_kaggle.scene.adjustment import robust_options
 from mkpc_kaggle.scene.covariance import Covariance, covariance_of
 from mkpc_kaggle.scene.models import (
     MAX_SIGMA_IMAGES,
+    MIN_DISPLACEMENT,
     MIN_POINTS,
     Comparison,
     DistortedLens,
@@ -47,9 +53,6 @@ MAX_RATIO_DEVIATION = 0.02
 MAX_SHARED_DEVIATION = 0.05
 MAX_STRAY_DEVIATION = 0.15  # of a single image, which may be a weak one
 MAX_PRIOR_SIGMAS = 3.0  # of a prior
-# Displacement of a point half the long side away from the middle, as a share of this distance. The
-# largest of five scenes of undistorted photographs is 0.0014; k = -0.05 of a phone is 0.015.
-MIN_DISPLACEMENT = 0.005
 MIN_LENS_IMAGES = 3  # of one size; a single weak camera fits any coefficient
 MIN_AGREEING = 0.8  # share of these images with at least half of the median displacement
 MAX_IMAGE_POINTS = 300  # per image, of the longest tracks; more cost time and change nothing
@@ -105,12 +108,6 @@ def log_focal(camera: KnownCamera) -> float:
 def log_ratio(camera: KnownCamera) -> float:
     """Return the logarithm of fx / fy."""
     return log(camera.focals[0] / camera.focals[1])
-
-
-def displacement_of(camera: KnownCamera, size: Size) -> float:
-    """Return the displacement of :class:`DistortedLens` by all coefficients of a camera."""
-    radius = max(size) / 2 / camera.focal
-    return radial_factor(camera, radius) - 1
 
 
 def compare_with_photographs(
@@ -186,8 +183,7 @@ def _given_focals(
 ) -> Iterable[FocalContradiction]:
     """Yield the user's cameras with a focal length that the photographs contradict."""
     for camera in dict.fromkeys(given_cameras.values()):
-        # Nobody can correct the cameras of a finished model here.
-        if isinstance(camera, PlacedCamera):
+        if isinstance(camera, ModelCamera):
             continue
         alike = [
             freed_image
@@ -251,7 +247,7 @@ def _given_distortions(
 ) -> Iterable[DistortionContradiction]:
     """Yield the user's cameras with a distortion that the photographs contradict."""
     for camera in dict.fromkeys(given_cameras.values()):
-        if isinstance(camera, PlacedCamera) or not any(camera.distortion):
+        if isinstance(camera, ModelCamera) or not any(camera.distortion):
             continue
         alike = [each for each in freed if given_cameras.get(each.registered.image.name) == camera]
         if len(alike) < MIN_LENS_IMAGES:

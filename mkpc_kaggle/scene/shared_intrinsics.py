@@ -24,11 +24,11 @@ import numpy as np
 
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.focal_prior import FOCAL_RATIO
-from mkpc_kaggle.geometry.intrinsics import KnownCamera, PlacedCamera
+from mkpc_kaggle.geometry.intrinsics import ModelCamera, PlacedCamera, displacement_of
 from mkpc_kaggle.recipe import CameraSharing, SceneConfig
 from mkpc_kaggle.scene.keypoints import MergedGraph
 from mkpc_kaggle.scene.mapper import Make, Mapped, loses_points, refine_complete
-from mkpc_kaggle.scene.models import Reconstruction, SfmModel
+from mkpc_kaggle.scene.models import MIN_DISPLACEMENT, Reconstruction, SfmModel
 from mkpc_kaggle.scene.view_graph import BatchImage, SharedIntrinsics
 
 TOLERANCE = 0.02  # maximum relative deviation of agreeing focal lengths from the median
@@ -150,15 +150,15 @@ def with_placed_intrinsics(part: MergedGraph, reconstruction: Reconstruction) ->
     """Return the graph whose new images have the intrinsics of a finished model, or ``None`` if no new
     image has them.
 
-    The model's images of the size must have one camera, and the new focal length must agree. A
-    single new image determines its focal length poorly.
+    The model's images of the size must have one camera, and the new image's own must agree with its
+    focal length and its distortion. A single new image determines these poorly.
     """
     known = part.graph.known
-    lenses: dict[Size, set[KnownCamera]] = {}
+    lenses: dict[Size, set[ModelCamera]] = {}
     for image in part.graph.images:
         camera = known.get(image.digest)
         if isinstance(camera, PlacedCamera):
-            lens = KnownCamera(camera.model, camera.parameters)
+            lens = ModelCamera(camera.model, camera.parameters)
             lenses.setdefault(image.size, set()).add(lens)
     alike = {}
     for registered in (
@@ -166,10 +166,12 @@ def with_placed_intrinsics(part: MergedGraph, reconstruction: Reconstruction) ->
     ):
         image = registered.image
         of_size = lenses.get(image.size, set())
-        if image.digest in known or len(of_size) != 1:
+        if image.digest in known or registered.lens is None or len(of_size) != 1:
             continue
         (lens,) = of_size
-        if abs(registered.focal / lens.focal - 1) < TOLERANCE:
+        own, placed = (displacement_of(each, image.size) for each in (registered.lens, lens))
+        is_alike = abs(registered.focal / lens.focal - 1) < TOLERANCE
+        if is_alike and abs(own - placed) < MIN_DISPLACEMENT:
             alike[image.digest] = lens
     return part.starting_with(known={**known, **alike}) if alike else None
 

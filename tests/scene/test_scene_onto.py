@@ -1,6 +1,6 @@
 """New images among the cameras of a finished model, of a graph of true cameras."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -8,9 +8,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.synthetic_scene import SyntheticScene, synthetic_scene
-from mkpc_kaggle.geometry.intrinsics import PlacedCamera, Rows
+from mkpc_kaggle.geometry.intrinsics import KnownCamera, PlacedCamera, Rows
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.recipe import SceneConfig
+from mkpc_kaggle.recipe import CameraModel, CameraSharing, SceneConfig
 from mkpc_kaggle.scene.keypoints import MergedGraph
 from mkpc_kaggle.scene.mapper import reconstruct_connected
 from mkpc_kaggle.scene.models import Comparison, Reconstruction, SfmModel
@@ -83,6 +83,64 @@ def test_an_image_of_the_model_without_matches_keeps_its_camera():
     assert names_of(model) == {*SCENE.cameras}
     assert model.comparison == Comparison()
     assert_in_place(model, rows)
+
+
+def distorted(pair: BatchPair, k: float, numbers: Collection[int]) -> BatchPair:
+    """Return a pair whose images, if they are among these numbers, show the lens with the coefficient k."""
+    points = [pair.matches.points0, pair.matches.points1]
+    for side, image in enumerate((pair.image0, pair.image1)):
+        if int(image.name) in numbers:
+            rays = (points[side] - np.subtract(MIDDLE, 0.5)) / FOCAL
+            points[side] = points[side] + FOCAL * k * rays * (rays**2).sum(axis=1, keepdims=True)
+    return replace(pair, by_unit=(Matches(*points, pair.matches.scores),))
+
+
+def test_new_images_have_the_lens_of_the_model_only_if_they_show_it():
+    lens = ("SIMPLE_RADIAL", (FOCAL, *MIDDLE, -0.05))
+    rows = [
+        (name, PlacedCamera(*lens, pose=camera.pose)) for name, camera in placed(SCENE, range(OLD))
+    ]
+    new = range(OLD, 8)
+    for numbers, has_lens in ((range(8), True), (range(OLD), False)):
+        model = model_of([distorted(pair, -0.05, numbers) for pair in SCENE.pairs], rows)
+        assert names_of(model) == {*SCENE.cameras}
+        lenses = [image.lens for image in model.images if int(image.image.name) in new]
+        coefficients = [lens.distortion for lens in lenses if lens]
+        assert (coefficients == [(-0.05,)] * 3) == has_lens
+        truth = -0.05 if has_lens else 0.0
+        assert [k for (k,) in coefficients] == pytest.approx([truth] * 3, abs=0.015)
+
+
+def test_new_images_share_the_camera_of_a_model_with_another_camera_model():
+    """Of the new images, one has its own camera, and the others are declared to share one."""
+    rows = [
+        (name, PlacedCamera("PINHOLE", (FOCAL, FOCAL, *MIDDLE), pose=camera.pose))
+        for name, camera in placed(SCENE, range(OLD))
+    ]
+    # Without a camera in the first reconstruction
+    pairs = without_matches(SCENE.pairs, OLD)
+    config = SceneConfig(camera_model=CameraModel.SIMPLE_PINHOLE, cameras=CameraSharing.FOLDER)
+    model = model_of(pairs, rows, config)
+    assert names_of(model) == {*SCENE.cameras} - {name_of(OLD)}
+    assert {image.lens for image in model.images} == {
+        KnownCamera("PINHOLE", (FOCAL, FOCAL, *MIDDLE))
+    }
+
+
+def test_a_wrong_camera_of_the_model_is_no_row_of_the_user():
+    lens = KnownCamera("SIMPLE_RADIAL", (FOCAL, *MIDDLE, -0.12))
+    old = {*map(name_of, range(OLD))}
+    pairs = [pair for pair in SCENE.pairs if {pair.image0.name, pair.image1.name} <= old]
+    first = model_of(pairs, [("*", lens)])
+    rows = []
+    for image in first.images:
+        pose = first.colmap.find_image_with_name(image.image.name).cam_from_world()
+        camera = PlacedCamera(lens.model, lens.parameters, pose=tuple(pose.params))
+        rows.append((image.image.name, camera))
+    model = model_of(SCENE.pairs, rows)
+    assert len(model.images) == 8
+    assert model.comparison.focals == ()
+    assert model.comparison.distortions == ()
 
 
 def test_a_refinement_without_the_matches_of_an_image_leaves_the_image_out():

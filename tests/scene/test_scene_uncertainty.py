@@ -10,9 +10,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.synthetic_scene import SIZE, SyntheticScene, synthetic_scene
+from mkpc_kaggle.geometry.intrinsics import displacement_of
 from mkpc_kaggle.recipe import CameraModel, CameraSharing, SceneConfig
 from mkpc_kaggle.scene import uncertainty
-from mkpc_kaggle.scene.comparison import displacement_of, log_ratio
+from mkpc_kaggle.scene.comparison import log_ratio
 from mkpc_kaggle.scene.covariance import covariance_of, seeing_images
 from mkpc_kaggle.scene.models import SfmModel, lens_of
 from mkpc_kaggle.scene.sfm import reconstruct_batch
