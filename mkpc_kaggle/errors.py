@@ -111,4 +111,4 @@ def writing(what: str) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise UserError(f"{what} cannot be written: {error.strerror}") from error
+        raise UserError(f"{what} cannot be written: {error.strerror or error}") from error

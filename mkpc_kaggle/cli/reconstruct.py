@@ -3,6 +3,7 @@
 import argparse
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from mkpc_kaggle.errors import UserError, plural
 from mkpc_kaggle.geometry.intrinsics import Rows
 from mkpc_kaggle.progress import format_duration
 from mkpc_kaggle.recipe import CameraSharing
-from mkpc_kaggle.reconstruction.coordinates import forget_coordinates, keep_coordinates
+from mkpc_kaggle.reconstruction.coordinates import keep_coordinates
 from mkpc_kaggle.reconstruction.directory import (
     WORK,
     output_directory,
@@ -85,8 +86,8 @@ unless most pairs have matches. In larger datasets, each image is matched with t
 Without weights, recipe auto runs one unit of RootSIFT here, and enlarges no image: three units cost three times
 as much, and their cameras are hardly better.
 
-Exit status: 0 done; 1 no image has a camera, a dataset has only an earlier run's cameras, or the run failed;
-2 bad input; 130 or 143 ended by a signal.
+Exit status: 0 done; 1 no image has a camera, a dataset has only an earlier run's cameras, a result was not
+written, or the run failed; 2 bad input; 130 or 143 ended by a signal.
 """
 MAX_LINES = 20  # printed of each list
 
@@ -165,8 +166,6 @@ def run(arguments: argparse.Namespace) -> int:
         output_directory(out, datasets, arguments.format) as held,
     ):
         session.status = 1  # until a model exists
-        if arguments.fresh:
-            forget_coordinates(out, datasets)
 
         def publish(cameras: Cameras) -> None:
             held.check()
@@ -193,27 +192,52 @@ def run(arguments: argparse.Namespace) -> int:
         unwritten = result.report.unwritten or result.report.unsaved
         if trouble(result.report) or unwritten or result.lost or result.earlier:
             session.status = 1
-        problems = [trouble(result.report), result.report.unwritten]
+        lines = [*options.plan_lines(arguments, result.report), *_lines(result, root)]
         is_here = held.is_here and all(held_files.is_here for held_files in result.held.values())
         if is_here:
-            if any(any(dataset.values()) for dataset in result.cameras.values()):
-                logger.info("writing images/ and sparse/ for other programs")
-            problems = [
-                *write_layouts(out, root, datasets, session.must_end(), result.held),
-                *keep_coordinates(out, root, result),
-                *problems,
-            ]
+            written, problems = _write_more(arguments, datasets, result, session.must_end())
+            lines += written
         else:
             # The directory that has the name now is the user's.
+            problems = [f"{out} was moved or replaced during the run; no more is written there"]
+        if problems:
             session.status = 1
-            problems.append(f"{out} was moved or replaced during the run; no more is written there")
-        if arguments.export is not None and is_here:
-            problems.append(export_matches(arguments.export, out, datasets))
-        lines = [*options.plan_lines(arguments, result.report), *_lines(result, root), *problems]
-        logger.info("\n".join(filter(None, [*lines, f"results: {out}"])))
+        lines += [*problems, trouble(result.report), result.report.unwritten, f"results: {out}"]
+        logger.info("\n".join(filter(None, lines)))
         # A run without pairs has no report.
         page = out / "report.html" if result.pairs and is_here else None
         return options.finish(session, page, result.pairs)
+
+
+def _write_more(
+    arguments: argparse.Namespace, datasets: Datasets, result: FolderResult, ends: float
+) -> tuple[list[str], list[str]]:
+    """Write the files for other programs until ``ends``, and the coordinates for the next run.
+
+    Return lines about them, and the problems. A file that cannot be written costs no other one, and neither
+    the summary nor the report.
+    """
+    root = arguments.images
+    out = arguments.out
+    if any(any(dataset.values()) for dataset in result.cameras.values()):
+        logger.info("writing images/ and sparse/ for other programs")
+    lines: list[str] = []
+    problems = [*write_layouts(out, root, datasets, ends, result.held)]
+    with _adding_problem(problems):
+        lines += keep_coordinates(out, root, result)
+    if arguments.export is not None:
+        with _adding_problem(problems):
+            lines.append(export_matches(arguments.export, out, datasets))
+    return lines, problems
+
+
+@contextmanager
+def _adding_problem(problems: list[str]) -> Iterator[None]:
+    """Add the text of a :class:`UserError` in the block to ``problems``."""
+    try:
+        yield
+    except UserError as error:
+        problems.append(str(error))
 
 
 def _require_export(path: Path, inputs: Sequence[Path], work_dir: Path) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from mkpc_kaggle.data.outputs import replacing
+from mkpc_kaggle.errors import writing
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.reconstruction.folder import batch_names
 from mkpc_kaggle.reconstruction.run import FolderResult
@@ -24,19 +25,12 @@ from mkpc_kaggle.scene.align import (
 STILL = 1e-6  # of the model's size; smaller movements are rounding
 
 
-def forget_coordinates(out: Path, datasets: Iterable[str]) -> None:
-    """Remove the cameras of the last complete run, so that the next models have new coordinates."""
-    for dataset in datasets:
-        # A first run has none.
-        (out / dataset / REFERENCE).unlink(missing_ok=True)
-
-
 def keep_coordinates(out: Path, root: Path, result: FolderResult) -> Iterator[str]:
     """Save the cameras of a complete run for the next run. Yield a line per dataset whose earlier
     cameras moved.
 
     A run that was ended early saves nothing, so that it ends as an undisturbed run when it is
-    resumed.
+    resumed. Raises :class:`UserError` if writing fails.
     """
     # Cameras of half the pairs are no coordinates to keep.
     if not result.report.ending.is_done:
@@ -58,7 +52,8 @@ def keep_coordinates(out: Path, root: Path, result: FolderResult) -> Iterator[st
         )
         # Without any model, the cameras of the last run stay for the next one.
         if models:
-            with replacing(out / dataset / REFERENCE) as stream:
+            path = out / dataset / REFERENCE
+            with writing(f"the coordinates {path}"), replacing(path) as stream:
                 write_reference(stream, [models[number] for number in sorted(models)])
 
 

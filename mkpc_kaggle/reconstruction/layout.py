@@ -21,6 +21,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 from unicodedata import combining
 
+from mkpc_kaggle.matchers.failures import reason_of
 from mkpc_kaggle.reconstruction.colours import colour_points
 from mkpc_kaggle.reconstruction.directory import holds_dataset
 from mkpc_kaggle.reconstruction.folder import Datasets
@@ -32,7 +33,9 @@ from mkpc_kaggle.scene.export import (
     PART,
     SPARSE,
     HeldDirectory,
+    remove_parts,
     replace_models,
+    require_on_disk,
 )
 
 
@@ -52,7 +55,10 @@ def write_layouts(
     for dataset, files in datasets.items():
         directory = out / dataset
         if holds_dataset(str(PurePosixPath(dataset, IMAGES)), datasets):
-            yield f"{directory / IMAGES} belongs to another dataset, so {directory / SPARSE} has no images"
+            yield (
+                f"{directory / IMAGES} belongs to another dataset, so {directory / SPARSE} was not written: "
+                f"rename the folder {root / dataset / IMAGES}"
+            )
             continue
         left = max(0.0, ends - time.monotonic())
         links = link_names(files)
@@ -63,7 +69,7 @@ def write_layouts(
             write_images(directory, files)
             failure = write_sparse(directory, names, None if ends == inf else left)
         except OSError as error:
-            failure = f"{error.strerror}: {error.filename}"
+            failure = reason_of(error)
         if failure:
             yield f"{directory / SPARSE} was not written: {failure}; the same command writes it"
 
@@ -78,7 +84,8 @@ def write_images(directory: Path, files: Sequence[Path]) -> None:
     names = set(links.values())
     # Files that are no links may be the user's.
     for former in folder.iterdir():
-        if former.is_symlink() and former.name not in names:
+        is_part = former.name.startswith(PART) and former.is_file()  # of a process that was killed
+        if is_part or (former.is_symlink() and former.name not in names):
             former.unlink()
     for file, name in links.items():
         _link(folder / name, file.resolve())
@@ -182,7 +189,8 @@ def _write_sparse_to(sender: Any, held: HeldDirectory, names: Mapping[str, str])
         convert_models(held, names)
         sender.send("")
     except Exception as error:  # any error of pycolmap
-        sender.send(str(error))
+        # Some errors have no text, such as a lack of memory.
+        sender.send(reason_of(error))
 
 
 def convert_models(held: HeldDirectory, names: Mapping[str, str]) -> None:
@@ -191,6 +199,7 @@ def convert_models(held: HeldDirectory, names: Mapping[str, str]) -> None:
     import pycolmap
 
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
+    remove_parts(directory)
     with TemporaryDirectory(prefix=PART, dir=directory) as name:
         made = Path(name)
         (made / SPARSE).mkdir()
@@ -204,10 +213,7 @@ def convert_models(held: HeldDirectory, names: Mapping[str, str]) -> None:
             undistort(model, directory / IMAGES, made / IMAGES)
             (made / SPARSE / folder.name).mkdir()
             model.write(made / SPARSE / folder.name)
-        for path in filter(Path.is_file, made.rglob("*")):
-            # A power failure must not leave empty files under their names
-            with path.open("rb") as stream:
-                os.fsync(stream.fileno())
+        require_on_disk(made)
         held.check()
         for path in sorted((made / IMAGES).iterdir()):
             # Of a link, which is replaced, and not of its photograph

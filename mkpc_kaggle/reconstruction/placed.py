@@ -13,15 +13,10 @@ from mkpc_kaggle.data.images import read_size
 from mkpc_kaggle.errors import UserError, plural
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.intrinsics import LENS_MODELS, PlacedCamera, Rows
+from mkpc_kaggle.scene.whole_files import CAMERA, COUNT, IMAGE, KEYPOINT_BYTES, MODEL_NAMES
 
 CAMERAS = "cameras.bin"
 IMAGES = "images.bin"
-COUNT = struct.Struct("<Q")
-CAMERA = struct.Struct("<IiQQ")  # id, model, width, height
-IMAGE = struct.Struct("<I7dI")  # id, quaternion (w, x, y, z), t, id of the camera
-KEYPOINT_BYTES = 24  # x, y, and the point that it sees
-# By COLMAP's numbers; those between them are no perspective lenses.
-MODEL_NAMES = dict(zip((0, 1, 2, 3, 4, 6), LENS_MODELS, strict=True))
 MIN_PLACED = 2  # images of the model in the folder; one has no points
 
 

@@ -1,6 +1,6 @@
 """Reconstruction of a folder of images in a run of the engine."""
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -22,6 +22,7 @@ from mkpc_kaggle.reconstruction.outputs import (
     camera_rows,
     read_table_of_cameras,
 )
+from mkpc_kaggle.scene.align import REFERENCE
 from mkpc_kaggle.scene.export import HeldDirectory, remove_files, versions_of
 from mkpc_kaggle.scene.models import MIN_IMAGES
 from mkpc_kaggle.setup.assembly import Assembly
@@ -111,6 +112,9 @@ def reconstruct_folder(
     assembly = replace(assembly, recipe=for_cameras(assembly.recipe))
     folders = dict.fromkeys(file.parent for files in datasets.values() for file in files)
     with opened_engine(assembly, session, folders) as engine:
+        # Not before this run has the journal: a run that is refused changes nothing.
+        if session.fresh:
+            forget_coordinates(out, datasets)
         table = out / "cameras.csv"
         earlier = read_table_of_cameras(table, root, datasets)
         if not table.exists():
@@ -155,6 +159,14 @@ def reconstruct_folder(
         report = engine.report()
     held = {name: exports[batches[name]] for name in datasets}
     return FolderResult(report, tuple(pairs), cameras, lost, standing, held, causes)
+
+
+def forget_coordinates(out: Path, datasets: Iterable[str]) -> None:
+    """Remove the cameras of the last complete run, so that the next models have new coordinates."""
+    with writing(f"--out {out}"):
+        for dataset in datasets:
+            # A first run has none.
+            (out / dataset / REFERENCE).unlink(missing_ok=True)
 
 
 def causes_of_missing(results: State, cameras: Cameras, root: Path, masks: Masks) -> Iterator[str]:

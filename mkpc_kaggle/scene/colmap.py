@@ -7,7 +7,6 @@ survive this, run pycolmap in a separate process. Only :func:`write_files` write
 Source: Pan et al. 2024 (the global mapper).
 """
 
-import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -33,6 +32,7 @@ from mkpc_kaggle.scene.export import (
     HeldDirectory,
     remove_parts,
     replace_models,
+    require_on_disk,
 )
 from mkpc_kaggle.scene.keypoints import Lens, MergedGraph
 from mkpc_kaggle.scene.models import (
@@ -135,10 +135,7 @@ def write_files(
             folder = made / MODELS / str(number)
             folder.mkdir(parents=True)
             model.colmap.write(folder)
-        for path in filter(Path.is_file, made.rglob("*")):
-            # A power failure must not leave empty files under their names
-            with path.open("rb") as stream:
-                os.fsync(stream.fileno())
+        require_on_disk(made)
         held.check()
         # Only renames from here on: a kill leaves complete files, of one run or of two.
         (made / DATABASE).replace(directory / DATABASE)

@@ -9,6 +9,8 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+from mkpc_kaggle.scene.whole_files import is_whole_database, is_whole_model_file
+
 DATABASE, MODELS = "database.db", "models"
 IMAGES, SPARSE = "images", "sparse"  # as other programs expect them
 MODEL_FILES = ("cameras.bin", "frames.bin", "images.bin", "points3D.bin", "rigs.bin")
@@ -53,9 +55,26 @@ class HeldDirectory:
 
 
 def has_files(directory: Path, models: int) -> bool:
-    """Return whether ``directory`` has the files of a reconstruction with ``models`` models."""
+    """Return whether ``directory`` has the files of a reconstruction with ``models`` models, none of
+    them cut off.
+    """
     names = [f"{MODELS}/{number}/{name}" for number in range(models) for name in MODEL_FILES]
-    return all(directory.joinpath(name).is_file() for name in (DATABASE, *names))
+    is_whole = is_whole_database(directory / DATABASE)
+    return is_whole and all(is_whole_model_file(directory / name) for name in names)
+
+
+def require_on_disk(made: Path) -> None:
+    """Wait until the files below a folder are on the disk. Raise ``OSError`` if one of COLMAP's is cut
+    off.
+
+    A power failure must not leave empty files under their names. pycolmap reports no full disk.
+    """
+    for path in filter(Path.is_file, made.rglob("*")):
+        with path.open("rb") as stream:
+            os.fsync(stream.fileno())
+        # SQLite reports a full disk itself.
+        if path.name in MODEL_FILES and not is_whole_model_file(path):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), path.name)
 
 
 def model_files(folder: Path) -> Iterator[Path]:
@@ -154,6 +173,9 @@ def remove_parts(directory: Path) -> None:
         if left.is_dir() and not left.is_symlink():
             for name in (MODELS, SPARSE, FORMER):
                 remove_models(left / name)
+            # Undistorted photographs
+            if not (left / IMAGES).is_symlink():
+                shutil.rmtree(left / IMAGES, ignore_errors=True)
             # A process that is killed while it writes the database leaves SQLite's other files.
             for ending in ("", "-journal", "-wal", "-shm"):
                 (left / f"{DATABASE}{ending}").unlink(missing_ok=True)

@@ -5,6 +5,7 @@ import os
 import sqlite3
 import subprocess
 import sys
+from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
@@ -22,6 +23,7 @@ from mkpc_kaggle.scene.export import (
     versions_of,
 )
 
+WITHOUT_RECORDS = "\0" * 8  # a file of a model, whose count of records is 0
 FILES = ["database.db", *(f"models/0/{name}" for name in MODEL_FILES)]
 TABLES = ["cameras.csv", "report.html", "submission.csv"]
 
@@ -232,7 +234,7 @@ def test_new_models_leave_files_of_others_where_they_are(tmp_path, monkeypatch):
     monkeypatch.setattr(colmap, "_fill", lambda *_, **__: None)
 
     def fill(folder: Path) -> None:
-        write(folder, [*MODEL_FILES], "new")
+        write(folder, [*MODEL_FILES], WITHOUT_RECORDS)
         write(tmp_path, others, "the user's")  # during the run
 
     model = SimpleNamespace(images=(), colmap=SimpleNamespace(frames={}, write=fill))
@@ -243,7 +245,7 @@ def test_new_models_leave_files_of_others_where_they_are(tmp_path, monkeypatch):
     assert {found[name] for name in others} == {"the user's"}
     assert (tmp_path / "models" / "0" / "link").readlink() == Path("thesis.txt")
     assert {name for name in found if name.startswith("models/1")} == set(), "a former model"
-    assert found["models/0/images.bin"] == "new"
+    assert found["models/0/images.bin"] == WITHOUT_RECORDS
     # A run without cameras
     remove_files(held, versions_of(tmp_path))
     assert sorted(files_of(tmp_path)) == sorted([*others, "models/0/link"])
@@ -269,6 +271,7 @@ def test_a_killed_process_leaves_no_folder_and_loses_no_file_of_others(tmp_path)
     left = tmp_path / ".mkpc-new-1"
     companions = ["database.db-wal", "database.db-shm"]
     write(left, [*FILES, *companions, "former/0/images.bin", "former/0/thesis.txt"])
+    write(left, ["images/undistorted.jpg"])
     remove_parts(tmp_path)
     assert sorted(files_of(left)) == ["former/0/thesis.txt"]
     (left / "former" / "0" / "thesis.txt").unlink()
@@ -282,10 +285,10 @@ def test_former_files_stay_until_the_new_ones_are_whole(tmp_path, monkeypatch):
     """
     write(tmp_path, FILES, "former")
 
-    def write_files(is_full: bool) -> None:
+    def write_files(names: Sequence[str] = MODEL_FILES, text: str = WITHOUT_RECORDS) -> None:
         def fill(folder: Path) -> None:
-            write(folder, [*MODEL_FILES[:1]] if is_full else [*MODEL_FILES], "new")
-            if is_full:
+            write(folder, [*names], text)
+            if len(names) < len(MODEL_FILES):
                 raise OSError(28, "No space left on device")
 
         model = SimpleNamespace(images=(), colmap=SimpleNamespace(frames={}, write=fill))
@@ -293,15 +296,19 @@ def test_former_files_stay_until_the_new_ones_are_whole(tmp_path, monkeypatch):
 
     monkeypatch.setattr(colmap, "_fill", lambda *_, **__: None)
     with pytest.raises(OSError, match="No space"):
-        write_files(is_full=True)
+        write_files(MODEL_FILES[:1])
+    # pycolmap itself reports nothing.
+    with pytest.raises(OSError, match="No space"):
+        write_files(text="cut")
     assert files_of(tmp_path) == dict.fromkeys(FILES, "former")
     # Links of /proc name the files that are synced.
     synced = set()
     monkeypatch.setattr(
         os, "fsync", lambda number: synced.add(Path(f"/proc/self/fd/{number}").readlink().name)
     )
-    write_files(is_full=False)
+    write_files()
     assert synced == {"database.db", *MODEL_FILES}, (
         "a power failure leaves no empty file under its name"
     )
-    assert {(tmp_path / "models" / "0" / name).read_text() for name in MODEL_FILES} == {"new"}
+    texts = {(tmp_path / "models" / "0" / name).read_text() for name in MODEL_FILES}
+    assert texts == {WITHOUT_RECORDS}

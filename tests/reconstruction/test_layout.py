@@ -13,7 +13,7 @@ import pytest
 from test_reconstruct import FIRST, MixedMatcher, cameras, run, write_flat
 
 from mkpc_kaggle.reconstruction import layout
-from mkpc_kaggle.reconstruction.coordinates import forget_coordinates, keep_coordinates
+from mkpc_kaggle.reconstruction.coordinates import keep_coordinates
 from mkpc_kaggle.reconstruction.folder import read_folder
 from mkpc_kaggle.reconstruction.layout import (
     link_names,
@@ -21,6 +21,7 @@ from mkpc_kaggle.reconstruction.layout import (
     write_layouts,
     write_sparse,
 )
+from mkpc_kaggle.reconstruction.run import forget_coordinates
 from mkpc_kaggle.reporting.report import linked_images
 from mkpc_kaggle.scene.align import REFERENCE
 
@@ -205,6 +206,21 @@ def test_a_model_that_cannot_be_read_is_a_line_and_the_former_folder_stays(tmp_p
     assert write_sparse(folder, {}, None) != ""
     assert (folder / "sparse" / "0" / "points3D.bin").read_text() == "former"
     assert write_sparse(out / "set", {}, 0.0) == "no time was left"
+
+
+def test_a_killed_undistortion_leaves_no_picture_behind(tmp_path):
+    left = tmp_path / ".mkpc-new-killed" / "images"
+    left.mkdir(parents=True)
+    (left / "a.jpg").write_bytes(b"undistorted")
+    write_sparse(tmp_path, {}, None)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_killed_copy_leaves_no_part_behind(tmp_path):
+    (tmp_path / "images").mkdir()
+    (tmp_path / "images" / ".mkpc-new-a.jpg").write_bytes(b"a part")
+    write_images(tmp_path, [])
+    assert list((tmp_path / "images").iterdir()) == []
 
 
 def test_a_folder_called_images_below_another_dataset_keeps_its_place(tmp_path):

@@ -174,6 +174,16 @@ def test_mixed_scenes_are_a_model_each_and_foreign_images_are_in_none(mixed):
     assert [model.num_points3D() > 100 for model in models] == [True, True]
 
 
+def test_a_model_that_was_cut_off_is_made_again(tmp_path):
+    root = write_flat(tmp_path / "images", FIRST)
+    run(root, tmp_path / "out")
+    before = contents(tmp_path / "out")
+    path = tmp_path / "out" / "models" / "0" / "images.bin"
+    path.write_bytes(path.read_bytes()[:500])
+    run(root, tmp_path / "out")
+    assert contents(tmp_path / "out") == before
+
+
 def test_the_cameras_are_those_of_the_models_and_right(mixed):
     out, result = mixed
     truth = MixedMatcher().scenes[0].cameras
