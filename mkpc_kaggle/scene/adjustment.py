@@ -8,7 +8,7 @@ A prior is the mean of the mapper's focal length and the user's, weighted by the
 bundle adjustment had one more measurement. These cameras are then held, and the rest is refined.
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import numpy as np
@@ -61,13 +61,16 @@ def adjust(model: Any, cameras: Mapping[str, KnownCamera]) -> None:
     model.update_point_3d_errors()
 
 
-def settle_rotations(model: Any) -> None:
-    """Change the last digits of quaternions so that normalising them changes nothing.
+def settle_rotations(model: Any, held: Collection[str] = ()) -> None:
+    """Change the last digits of quaternions, except those of the images ``held``, so that normalising
+    them changes nothing.
 
-    Readers of COLMAP's files normalise them. So the cameras of a finished model stay bit for bit.
+    The incremental mapper normalises them. So the cameras of a finished model stay bit for bit in the
+    next one.
     """
-    for _, frame in sorted(model.frames.items()):
-        if frame.has_pose():
+    for _, image in sorted(model.images.items()):
+        if image.has_pose and image.name not in held:
+            frame = model.frames[image.frame_id]
             pose = frame.rig_from_world
             frame.rig_from_world = pycolmap.Rigid3d(_settled(pose.rotation), pose.translation)
 

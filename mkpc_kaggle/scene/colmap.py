@@ -127,6 +127,9 @@ def write_files(
         with file as database:
             _fill(database, merged, shared, config, reuse=True)
         for number, model in enumerate(models):
+            # Placed cameras stay as they were read.
+            placed = placed_by_name(merged.graph).keys() - {*model.comparison.misplaced}
+            settle_rotations(model.colmap, placed)
             kept = {each.image.name for each in model.images}
             # A list, because the loop removes frames from the mapping.
             for frame in [frame for frame in model.colmap.frames.values() if frame.has_pose()]:
@@ -482,9 +485,6 @@ def _reconstruction(mapped: Sequence[Any], graph: ViewGraph, config: SceneConfig
     if given_cameras or len(graph.images) <= config.all_tracks:
         for model in mapped:
             adjust(model, given_cameras)
-    if not placed_by_name(graph):
-        for model in mapped:
-            settle_rotations(model)
     found = [_sfm_model(model, graph) for model in mapped]
     models = filter_models(found, placed_by_name(graph).keys())
     return Reconstruction(

@@ -2,8 +2,10 @@
 
 from collections.abc import Collection, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
+import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 
@@ -11,6 +13,7 @@ from benchmarks.synthetic_scene import SyntheticScene, synthetic_scene
 from mkpc_kaggle.geometry.intrinsics import KnownCamera, PlacedCamera, Rows
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.recipe import CameraModel, CameraSharing, SceneConfig
+from mkpc_kaggle.scene.export import MODELS, HeldDirectory
 from mkpc_kaggle.scene.keypoints import MergedGraph
 from mkpc_kaggle.scene.mapper import reconstruct_connected
 from mkpc_kaggle.scene.models import Comparison, Reconstruction, SfmModel
@@ -83,6 +86,27 @@ def test_an_image_of_the_model_without_matches_keeps_its_camera():
     assert names_of(model) == {*SCENE.cameras}
     assert model.comparison == Comparison()
     assert_in_place(model, rows)
+
+
+def test_the_cameras_of_a_model_stay_in_the_third_one(tmp_path: Path):
+    """The second model has new cameras, which the mapper of the third must not round."""
+    rows = placed(SCENE, range(3))
+    for number, count in enumerate((7, 8)):
+        pairs = [pair for pair in SCENE.pairs if int(pair.image1.name) < count]
+        graph = ViewGraph.of_pairs(pairs).with_intrinsics(rows)
+        held = HeldDirectory.of(tmp_path / str(number))
+        (found,), _ = reconstruct_graph(graph, CONFIG, held)
+        assert found.registered == count
+        model = pycolmap.Reconstruction(held.path / MODELS / "0")
+        before = dict(rows)
+        rows = []
+        for image in model.images.values():
+            parameters = tuple(image.camera.params)
+            pose = tuple(image.cam_from_world().params)
+            rows.append((image.name, PlacedCamera("SIMPLE_PINHOLE", parameters, pose=pose)))
+    new = before.keys() - {name for name, _ in placed(SCENE, range(3))}
+    assert len(new) == 4
+    assert {name: dict(rows)[name] for name in new} == {name: before[name] for name in new}
 
 
 def distorted(pair: BatchPair, k: float, numbers: Collection[int]) -> BatchPair:
