@@ -157,8 +157,8 @@ def _without_twins(names: Iterable[str]) -> tuple[list[str], list[str]]:
     """Return the images to read, and other formats of images that are also there as JPEG or PNG."""
     files = list(names)
     usual = {_stem(name) for name in files if _suffix(name) in IMAGE_SUFFIXES}
-    twins = [name for name in files if _suffix(name) in MORE_SUFFIXES and _stem(name) in usual]
-    return [name for name in files if name not in set(twins)], twins
+    twins = {name for name in files if _suffix(name) in MORE_SUFFIXES and _stem(name) in usual}
+    return [name for name in files if name not in twins], [name for name in files if name in twins]
 
 
 def batch_names(root: Path, datasets: Iterable[str]) -> dict[str, str]:

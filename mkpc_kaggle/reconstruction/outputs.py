@@ -106,7 +106,8 @@ def read_table_of_cameras(path: Path, root: Path, datasets: Datasets) -> Cameras
             heads, *rows = csv.reader(stream)
         if tuple(heads) != CAMERA_HEADS:
             raise ValueError("it has other columns")
-        placed = {row[0]: _placed(row) for row in rows}
+        # Editors leave blank lines.
+        placed = {row[0]: _placed(row) for row in rows if row}
     except FileNotFoundError:
         pass
     except (OSError, ValueError, csv.Error) as error:
@@ -121,6 +122,8 @@ def _placed(row: Sequence[str]) -> PlacedImage:
     """Invert a row of :func:`camera_rows`. Raise ``ValueError`` for any other row."""
     _, model, K, R, t, rotation, centre, focal, name, parameters = row
     numbers = [np.array(text.split(";"), float) for text in (K, R, t)]
+    if not all(np.isfinite(values).all() for values in numbers):
+        raise ValueError("a number is not finite")
     camera = Camera(numbers[0].reshape(3, 3), numbers[1].reshape(3, 3), numbers[2].reshape(3))
     sigmas = Sigmas(float(rotation), float(centre), float(focal)) if rotation else ()
     lens = KnownCamera(name, tuple(map(float, parameters.split()))) if name else None

@@ -3,6 +3,7 @@ traceback.
 """
 
 import os
+from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.reconstruction import folder
 from mkpc_kaggle.reconstruction.folder import (
+    _without_twins,
     batch_names,
     pair_list_line,
     read_folder,
@@ -139,6 +141,24 @@ def test_a_second_format_of_a_photograph_is_passed_over_with_a_line(tmp_path, ca
     # Among the other formats, none is the usual one.
     with pytest.raises(UserError, match=r"has both 3\.tif and 3\.webp"):
         read_folder(written(root, "3.tif", "3.webp"))
+
+
+def test_second_formats_take_time_in_proportion_to_their_number():
+    looked_up = Counter()
+
+    class Name(str):
+        __slots__ = ()
+
+        def __hash__(self) -> int:
+            looked_up["names"] += 1
+            return super().__hash__()
+
+    count = 100
+    files, twins = _without_twins(
+        Name(f"{n}{suffix}") for suffix in (".jpg", ".webp") for n in range(count)
+    )
+    assert (len(files), len(twins)) == (count, count)
+    assert looked_up["names"] < 10 * count
 
 
 @pytest.mark.parametrize("folder", ["@eaDir/0.jpg", "#recycle", "$RECYCLE.BIN", "__MACOSX"])

@@ -493,21 +493,38 @@ def test_files_of_an_earlier_run_are_removed_once_no_image_has_a_match(tmp_path,
     assert len((out / "cameras.csv").read_text().splitlines()) == 1
 
 
-@pytest.mark.parametrize(
-    "text", ["", "image,model\n", "{heads}\na.png,0\n", "{heads}\na.png," + 9 * "x,"]
-)
+ROW = "a.png,0,1;0;0;0;1;0;0;0;1,1;0;0;0;1;0;0;0;1,0;0;0,,,,,\n"
+DAMAGED_TABLES = [
+    "",
+    "image,model\n",
+    ROW,
+    "{heads}\na.png,0\n",
+    "{heads}\na.png," + 9 * "x,",
+    "{heads}\n" + ROW.replace("0;0;0,,", "0;0;inf,,"),
+    "{heads}\n" + ROW.replace("0;0;0,,", "0;0,,"),
+    "\0" * 80,
+    "{heads}\n\0\0",
+    "{heads}\n\udcff\n",  # not UTF-8
+]
+
+
+@pytest.mark.parametrize("text", DAMAGED_TABLES)
 def test_a_table_of_cameras_that_cannot_be_read_is_replaced_with_a_warning(tmp_path, capsys, text):
     path = tmp_path / "cameras.csv"
     files = {".": (tmp_path / "a.png",)}
-    path.write_text(text.format(heads=",".join(next(camera_rows({}, tmp_path)))))
+    text = text.format(heads=",".join(next(camera_rows({}, tmp_path))))
+    path.write_bytes(text.encode("utf-8", "surrogateescape"))
     assert read_table_of_cameras(path, tmp_path, files) == {".": {tmp_path / "a.png": None}}
     assert "cannot be read" in capsys.readouterr().err
 
 
-def test_a_table_of_cameras_is_read_as_it_was_written(mixed):
+@pytest.mark.parametrize("end", ["\n", "\n\n"], ids=["as written", "with blank lines"])
+def test_a_table_of_cameras_is_read_as_it_was_written(mixed, tmp_path, end):
     out, result = mixed
     root = out.parent / "images"
-    read = read_table_of_cameras(out / "cameras.csv", root, read_folder(root))
+    path = tmp_path / "cameras.csv"
+    path.write_text((out / "cameras.csv").read_text().replace("\n", end))
+    read = read_table_of_cameras(path, root, read_folder(root))
     assert [*camera_rows(read, root)] == [*camera_rows(result.cameras, root)]
 
 
