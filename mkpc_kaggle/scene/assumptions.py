@@ -7,6 +7,7 @@ photographs is in :mod:`mkpc_kaggle.scene.comparison`.
 
 from collections.abc import Sequence
 from dataclasses import replace
+from math import inf
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from mkpc_kaggle.geometry.intrinsics import KnownCamera, PlacedCamera
 from mkpc_kaggle.recipe import CameraSharing, SceneConfig
 from mkpc_kaggle.scene.keypoints import MergedGraph
 from mkpc_kaggle.scene.mapper import Make, Mapped, loses_points
-from mkpc_kaggle.scene.models import HARDLY_MOVED, MAX_CENTRE_SIGMA, Reconstruction
+from mkpc_kaggle.scene.models import HARDLY_MOVED, MAX_CENTRE_SIGMA, Reconstruction, SfmModel
 from mkpc_kaggle.scene.motion import hardly_moved
 from mkpc_kaggle.scene.shared_intrinsics import given_intrinsics, share
 from mkpc_kaggle.scene.view_graph import BatchImage, SharedIntrinsics, ViewGraph, known_by_name
@@ -114,13 +115,26 @@ def compared(mapped: Mapped) -> Mapped:
     return replace(mapped, reconstructions=tuple(_compared(*part) for part in mapped))
 
 
+def _has_moved(merged: MergedGraph, models: Sequence[SfmModel]) -> bool:
+    """Return whether cameras were at different places. Certain cameras have moved, also if most edges are
+    rotations, as of neighbours in a film.
+    """
+    sigma = models[0].centre_sigma if models else inf
+    if sigma is not None and sigma <= MAX_CENTRE_SIGMA:
+        return True
+    if not hardly_moved(merged):
+        return True
+    if sigma is not None:
+        return False
+    # Only with a model: pycolmap may be missing
+    from mkpc_kaggle.scene.uncertainty import centre_sigma_of_part
+
+    return centre_sigma_of_part(models[0]) <= MAX_CENTRE_SIGMA
+
+
 def _compared(merged: MergedGraph, reconstruction: Reconstruction) -> Reconstruction:
     """Return the reconstruction with the assumptions that its photographs contradict."""
-    # Certain cameras have moved.
-    is_doubtful = (
-        not reconstruction.models or reconstruction.models[0].centre_sigma > MAX_CENTRE_SIGMA
-    )
-    has_moved = not (is_doubtful and hardly_moved(merged))
+    has_moved = _has_moved(merged, reconstruction.models)
     if not reconstruction.models:
         return reconstruction if has_moved else replace(reconstruction, failure=HARDLY_MOVED)
     # Only with a model: pycolmap may be missing

@@ -7,7 +7,7 @@ from the residuals.
 """
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from math import inf
@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
 from mkpc_kaggle.geometry.intrinsics import KnownCamera
 from mkpc_kaggle.scene.models import MAX_SIGMA_IMAGES, MIN_POINTS
@@ -69,14 +70,18 @@ class Covariance:
 
 
 def covariance_of(
-    model: Any, given_cameras: Mapping[str, KnownCamera], principal_point_share: float
+    model: Any,
+    given_cameras: Mapping[str, KnownCamera],
+    principal_point_share: float,
+    numbers: Collection[int] | None = None,
 ) -> Covariance | None:
     """Return the covariance of pycolmap's model; ``None`` if it is not determined, or of more than
     ``MAX_SIGMA_IMAGES`` images.
 
-    Principal points deviate by ``principal_point_share`` of the long side; with 0 they are exact.
+    Principal points deviate by ``principal_point_share`` of the long side; with 0 they are exact. With
+    ``numbers``, the model is one of these images alone.
     """
-    images = seeing_images(model)
+    images = seeing_images(model, numbers)
     if not 1 < len(images) <= MAX_SIGMA_IMAGES:
         return None
     cameras = _inexact_cameras(images, given_cameras)
@@ -120,14 +125,41 @@ def covariance_of(
     return Covariance(tuple(images), covariance[:number, :number], blocks)
 
 
-def seeing_images(model: Any) -> list[Any]:
-    """Return the registered images of pycolmap's model that see enough points which others of them see,
-    too, in the order of their ids.
+def connected_part(model: Any) -> list[int]:
+    """Return the numbers of ``MAX_SIGMA_IMAGES`` images of a large model of pycolmap that see many points
+    together.
+    """
+    images = [image for _, image in sorted(model.images.items()) if image.has_pose]
+    points = [
+        {each.point3D_id for each in image.points2D if each.has_point3D()} for image in images
+    ]
+    rows = np.repeat(np.arange(len(images)), list(map(len, points)))
+    columns = np.fromiter(chain.from_iterable(points), np.int64)
+    _, columns = np.unique(columns, return_inverse=True)
+    seen = csr_array((np.ones(len(rows)), (rows, columns)))
+    common = (seen @ seen.T).tocsr()
+    # From the image with most points on, always the one with most points in common with those so far
+    chosen = [int(np.argmax(list(map(len, points))))]
+    counts = np.zeros(len(images))
+    while len(chosen) < min(MAX_SIGMA_IMAGES, len(images)):
+        counts += common[[chosen[-1]]].toarray()[0]
+        counts[chosen] = -inf
+        chosen.append(int(np.argmax(counts)))
+    return [images[index].image_id for index in chosen]
+
+
+def seeing_images(model: Any, numbers: Collection[int] | None = None) -> list[Any]:
+    """Return the registered images of pycolmap's model, or those among ``numbers``, that see enough points
+    which others of them see, too, in the order of their ids.
 
     An image that sees fewer is no plausible one of the model. Its pose may be anywhere, and would make the
     world of all others uncertain.
     """
-    images = [image for _, image in sorted(model.images.items()) if image.has_pose]
+    images = [
+        image
+        for number, image in sorted(model.images.items())
+        if image.has_pose and (numbers is None or number in numbers)
+    ]
     seen = {
         image.image_id: [each.point3D_id for each in image.points2D if each.has_point3D()]
         for image in images

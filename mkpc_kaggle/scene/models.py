@@ -151,23 +151,23 @@ class SfmModel:
     comparison: Comparison = Comparison()
 
     @property
-    def centre_sigma(self) -> float:
+    def centre_sigma(self) -> float | None:
         """The median sigma of the centres, in sizes of the model; infinite if the points do not
-        determine them, 0 for more than ``MAX_SIGMA_IMAGES`` images.
+        determine them, ``None`` if unknown, as of more than ``MAX_SIGMA_IMAGES`` images.
         """
         if not self.images or len(self.images) > MAX_SIGMA_IMAGES:
-            return 0.0
+            return None
         # Bundle adjustment does not determine a camera without sigmas.
         sigmas = [found.sigmas.centre if found.sigmas else np.inf for found in self.images]
         return float(np.median(sigmas))
 
     @property
     def is_loose(self) -> bool:
-        """True if most cameras are unknown to within the model's own size.
+        """True if most cameras are unknown to within the model's own size, as far as sigmas are known.
 
         Parts of the model then hang together loosely, or wrong matches have bent it.
         """
-        return self.centre_sigma > LOOSE_SIGMA
+        return self.centre_sigma is not None and self.centre_sigma > LOOSE_SIGMA
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "colmap": None}

@@ -4,7 +4,9 @@ All cameras together fix the origin, orientation and scale. So errors that a sim
 explains do not count (the S-transformation of Baarda 1981).
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from math import inf
+from statistics import median
 from types import MappingProxyType
 from typing import Any
 
@@ -14,23 +16,33 @@ from scipy.linalg import block_diag
 
 from mkpc_kaggle.geometry.intrinsics import KnownCamera
 from mkpc_kaggle.geometry.two_view import cross_matrix
-from mkpc_kaggle.scene.covariance import covariance_of
-from mkpc_kaggle.scene.models import Sigmas
+from mkpc_kaggle.scene.covariance import connected_part, covariance_of
+from mkpc_kaggle.scene.models import SfmModel, Sigmas
 
 # Standard deviation of a principal point from the middle of its image, as a share of the long side
 PRINCIPAL_POINT_SHARE = 0.005
 
 
+def centre_sigma_of_part(model: SfmModel) -> float:
+    """Return the median sigma of the centres of a connected part of a large model, in sizes of the part;
+    infinite if its points do not determine them.
+    """
+    sigmas = camera_sigmas(model.colmap, numbers=connected_part(model.colmap))
+    return median(each.centre for each in sigmas.values()) if sigmas else inf
+
+
 def camera_sigmas(
-    model: Any, given_cameras: Mapping[str, KnownCamera] = MappingProxyType({})
+    model: Any,
+    given_cameras: Mapping[str, KnownCamera] = MappingProxyType({}),
+    numbers: Collection[int] | None = None,
 ) -> dict[str, Sigmas]:
     """Return the sigmas of registered images in pycolmap's reconstruction, by name; empty if
     unknown.
 
     ``given_cameras`` are the user's cameras by image name: exact ones, and priors that add to the
-    images' information.
+    images' information. With ``numbers``, the reconstruction is one of these images alone.
     """
-    found = covariance_of(model, given_cameras, PRINCIPAL_POINT_SHARE)
+    found = covariance_of(model, given_cameras, PRINCIPAL_POINT_SHARE, numbers)
     if found is None:
         return {}
     images = found.images

@@ -7,6 +7,7 @@ import pytest
 
 from benchmarks.synthetic_scene import SIZE, batch_of, front, looking, synthetic_scene
 from mkpc_kaggle.recipe import SceneConfig
+from mkpc_kaggle.scene import assumptions, comparison, covariance, models
 from mkpc_kaggle.scene.models import HARDLY_MOVED, Comparison, Reconstruction
 from mkpc_kaggle.scene.motion import intrinsics, is_rotation
 from mkpc_kaggle.scene.sfm import reconstruct_graph
@@ -39,6 +40,22 @@ def test_a_camera_that_only_turned_is_the_reason_for_missing_or_doubtful_cameras
         assert not any(model.comparison.has_moved for model in found.models)
     else:
         assert found.failure == HARDLY_MOVED
+
+
+@pytest.mark.parametrize(("max_sigma", "has_moved"), [(0.05, True), (1e-6, False)])
+def test_a_part_of_a_large_model_shows_whether_its_cameras_are_certain(
+    monkeypatch, max_sigma, has_moved
+):
+    # As of models with more than 200 images, which have no sigmas
+    for module in (comparison, covariance, models):
+        monkeypatch.setattr(module, "MAX_SIGMA_IMAGES", IMAGES - 1)
+    # Most edges of a film are rotations, as those of a camera that turned.
+    monkeypatch.setattr(assumptions, "hardly_moved", lambda _: True)
+    monkeypatch.setattr(assumptions, "MAX_CENTRE_SIGMA", max_sigma)
+    (model,) = reconstructed(list(synthetic_scene(IMAGES, points=400).pairs)).models
+    assert len(model.images) == IMAGES
+    assert model.centre_sigma is None
+    assert model.comparison.has_moved is has_moved
 
 
 def test_cameras_from_several_places_have_moved():
