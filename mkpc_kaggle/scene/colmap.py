@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 
 from mkpc_kaggle.cores import available_cores
 from mkpc_kaggle.geometry.cameras import Camera
-from mkpc_kaggle.geometry.coordinates import COLMAP_CENTRE_PX
+from mkpc_kaggle.geometry.coordinates import COLMAP_CENTRE_PX, Matrix3
+from mkpc_kaggle.geometry.intrinsics import PlacedCamera
 from mkpc_kaggle.recipe import CameraModel, SceneConfig
 from mkpc_kaggle.scene.adjustment import adjust, settle_rotations
 from mkpc_kaggle.scene.edges import supported
@@ -420,12 +421,36 @@ def _placed_model(cache: Any, graph: ViewGraph) -> tuple[Any, list[int]]:
     numbers = []
     for number, image in enumerate(graph.images, start=1):
         if image.name in placed:
-            x, y, z, w, *t = placed[image.name].pose
-            rotation = pycolmap.Rotation3d(np.array([x, y, z, w]))
-            model.frame(number).rig_from_world = pycolmap.Rigid3d(rotation, np.array(t))
+            model.frame(number).rig_from_world = _rigid(placed[image.name])
             model.register_frame(number)
             numbers.append(number)
     return model, numbers
+
+
+def _rigid(camera: PlacedCamera) -> Any:
+    x, y, z, w, *t = camera.pose
+    return pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([x, y, z, w])), np.array(t))
+
+
+def moved_back(model: SfmModel, graph: ViewGraph, origin: NDArray[np.float64]) -> SfmModel:
+    """Return a model of the :func:`mkpc_kaggle.scene.placement.centred` graph in the world of the ``graph``,
+    whose placed cameras it has to the last digit. pycolmap's model is changed in place.
+    """
+    model.colmap.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), origin))
+    placed = placed_by_name(graph)
+    for name in model.comparison.misplaced:
+        del placed[name]
+    poses = {}
+    for image in model.colmap.images.values():
+        if image.name in placed:
+            model.colmap.frames[image.frame_id].rig_from_world = _rigid(placed[image.name])
+        if image.has_pose:
+            poses[image.name] = np.asarray(image.cam_from_world().matrix())
+    images = tuple(
+        replace(found, camera=_posed(found.camera.K, poses[found.image.name]))
+        for found in model.images
+    )
+    return replace(model, images=images, points=model.points + origin)
 
 
 def _mapper_of(cache: Any, model: Any, settings: Any) -> Any:
@@ -498,11 +523,9 @@ def _sfm_model(found: Any, graph: ViewGraph) -> SfmModel:
     # Sorted, because pycolmap's containers have no fixed order
     for number in sorted(found.reg_image_ids()):
         image = found.images[number]
-        pose = np.asarray(image.cam_from_world().matrix())
         K = np.array(image.camera.calibration_matrix())
         K[:2, 2] -= COLMAP_CENTRE_PX
-        # Copies: the views would keep pycolmap's memory.
-        camera = Camera(K, pose[:, :3].copy(), pose[:, 3].copy())
+        camera = _posed(K, np.asarray(image.cam_from_world().matrix()))
         images.append(
             RegisteredImage(
                 graph.images[number - 1],
@@ -514,6 +537,11 @@ def _sfm_model(found: Any, graph: ViewGraph) -> SfmModel:
         )
     error = float(found.compute_mean_reprojection_error()) if found.num_points3D() else 0.0
     return SfmModel(tuple(images), points_of(found), error, found)
+
+
+def _posed(K: Matrix3, pose: NDArray[np.float64]) -> Camera:
+    # Copies: the views would keep pycolmap's memory.
+    return Camera(K, pose[:, :3].copy(), pose[:, 3].copy())
 
 
 def points_of(found: Any) -> NDArray[np.float64]:

@@ -33,14 +33,16 @@ CHUNK = 1_000_000  # parameters times points that are eliminated at a time, for 
 
 @dataclass(frozen=True, eq=False)
 class Covariance:
-    """Covariance of a model's cameras, in an arbitrary world.
+    """Covariance of a model's cameras, in a world whose origin is in their middle.
 
     ``poses`` (6N, 6N) has three angles in radians and the translation of each of the ``images``, for
-    X_cam = exp(angles) R X + t. ``intrinsics`` has the covariance (p, p) of each camera's parameters, by
-    camera id, zeros if the camera is exact. Variances of a camera without it are infinite.
+    X_cam = exp(angles) R X + t; ``matrices`` are their [R | t]. ``intrinsics`` has the covariance (p, p) of
+    each camera's parameters, by camera id, zeros if the camera is exact. Variances of a camera without it
+    are infinite.
     """
 
     images: tuple[Any, ...]  # as :func:`seeing_images` returns them
+    matrices: Array  # (N, 3, 4)
     poses: Array
     intrinsics: Mapping[int, Array]
 
@@ -85,8 +87,12 @@ def covariance_of(
     if not 1 < len(images) <= MAX_SIGMA_IMAGES:
         return None
     cameras = _inexact_cameras(images, given_cameras)
+    # The world of coordinates such as UTM's is far away: their equations are singular but for rounding.
+    origin = np.mean([image.projection_center() for image in images], axis=0)
+    matrices = np.array([image.cam_from_world().matrix() for image in images])
+    matrices[:, :, 3] += matrices[:, :, :3] @ origin
     try:
-        equations = _NormalEquations.of(model, images, cameras.values())
+        equations = _NormalEquations.of(model, images, matrices, origin, cameras.values())
     except np.linalg.LinAlgError:  # a point that its images do not determine
         return None
     # The adjusted parameters, and the principal points, which are held
@@ -122,7 +128,7 @@ def covariance_of(
         block = slice(start, start + len(camera.params))
         blocks[camera.camera_id] = covariance[block, block]
     number = 6 * len(images)
-    return Covariance(tuple(images), covariance[:number, :number], blocks)
+    return Covariance(tuple(images), matrices, covariance[:number, :number], blocks)
 
 
 def connected_part(model: Any) -> list[int]:
@@ -192,7 +198,8 @@ def _inexact_cameras(
 
 @dataclass(frozen=True, eq=False)
 class _NormalEquations:
-    """The normal equations J^T J of all reprojection errors, without the points.
+    """The normal equations J^T J of all reprojection errors, without the points, in the world of the
+    ``matrices``.
 
     The six columns of each image come first, then the parameters of the cameras, at ``starts``.
     """
@@ -206,7 +213,12 @@ class _NormalEquations:
 
     @classmethod
     def of(
-        cls, model: Any, images: Sequence[Any], cameras: Iterable[tuple[Any, float]]
+        cls,
+        model: Any,
+        images: Sequence[Any],
+        matrices: Array,
+        origin: Array,
+        cameras: Iterable[tuple[Any, float]],
     ) -> "_NormalEquations":
         start_of = {}
         size = 6 * len(images)
@@ -222,7 +234,7 @@ class _NormalEquations:
         }
         numbers = [number for number, place in places.items() if np.isfinite(place).all()]
         row_of = {number: row for row, number in enumerate(numbers)}
-        points = np.array([places[number] for number in numbers]).reshape(-1, 3)
+        points = np.array([places[number] for number in numbers]).reshape(-1, 3) - origin
         matrix = np.zeros((size, size))
         of_points = np.zeros((len(points), 3, 3))
         observed: list[Block] = []  # J^T J of cameras with points
@@ -232,7 +244,9 @@ class _NormalEquations:
             seen.sort(key=lambda each: row_of[each.point3D_id])
             rows = np.array([row_of[each.point3D_id] for each in seen], np.int64)
             columns = np.arange(6 * number, 6 * number + 6)
-            residuals, by_pose, by_parameters, by_point = _derivatives(image, points[rows], seen)
+            residuals, by_pose, by_parameters, by_point = _derivatives(
+                image, matrices[number], points[rows], seen
+            )
             by_camera = by_pose
             if image.camera_id in start_of:
                 by_camera = np.concatenate([by_pose, by_parameters], axis=2)
@@ -268,16 +282,15 @@ def _dense(blocks: Iterable[Block], size: int, start: int, end: int) -> Array:
 
 
 def _derivatives(
-    image: Any, points: Array, seen: Sequence[Any]
+    image: Any, matrix: Array, points: Array, seen: Sequence[Any]
 ) -> tuple[Array, Array, Array, Array]:
     """Return an image's residuals (n, 2) in pixels, and their derivatives: by angles and translation
     (n, 2, 6), by the camera's parameters (n, 2, p), and by the points (n, 2, 3).
     """
-    pose = image.cam_from_world().matrix()
-    R = pose[:, :3]
+    R = matrix[:, :3]
     turned = points @ R.T
-    in_camera = turned + pose[:, 3]
-    camera = pycolmap.Camera(image.camera.todict())
+    in_camera = turned + matrix[:, 3]
+    camera: Any = pycolmap.Camera(image.camera.todict())
     by_ray = np.empty((len(points), 2, 3))
     for axis in range(3):
         step = np.zeros_like(in_camera)

@@ -1,17 +1,22 @@
-"""Cameras of a finished model that its photographs contradict: another picture has the name of one."""
+"""Cameras of a finished model: their world, and those that photographs contradict, since another picture
+has the name of one.
+"""
 
 from collections import Counter
 from collections.abc import Collection
+from dataclasses import replace
 from itertools import combinations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from mkpc_kaggle.geometry.cameras import Camera, fundamental_of_cameras
 from mkpc_kaggle.geometry.intrinsics import PlacedCamera
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import sampson_distances
+from mkpc_kaggle.scene.view_graph import ViewGraph
 
 MIN_CHECKED = 100  # verified matches with other images of the model; fewer may be wrong ones
 # Share of these matches that fit the cameras. Right cameras keep almost all, and a picture from
@@ -38,6 +43,25 @@ def misplaced_images(model: Any, correspondences: Any, numbers: Collection[int])
         for number, count in checked.items()
         if count >= MIN_CHECKED and consistent[number] < MIN_CONSISTENT * count
     }
+
+
+def centred(graph: ViewGraph) -> tuple[ViewGraph, NDArray[np.float64]]:
+    """Return the graph in a world whose origin is in the middle of its placed cameras, and this origin in
+    the world of the graph. Coordinates such as UTM's would leave few digits for bundle adjustment.
+    """
+    placed = {
+        digest: camera for digest, camera in graph.known.items() if isinstance(camera, PlacedCamera)
+    }
+    if not placed:
+        return graph, np.zeros(3)
+    R = Rotation.from_quat([camera.pose[:4] for camera in placed.values()]).as_matrix()
+    t = np.array([camera.pose[4:] for camera in placed.values()])
+    origin = -np.einsum("nji,nj->ni", R, t).mean(axis=0)
+    moved = {
+        digest: replace(camera, pose=(*camera.pose[:4], *offset.tolist()))
+        for (digest, camera), offset in zip(placed.items(), t + R @ origin, strict=True)
+    }
+    return replace(graph, known={**graph.known, **moved}), origin
 
 
 def is_at(camera: Camera, placed: PlacedCamera) -> bool:

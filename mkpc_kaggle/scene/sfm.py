@@ -1,8 +1,11 @@
 """Reconstruction of a batch: from pairs to cameras and a choice of F for each pair, all picklable."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
 
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.intrinsics import Rows
@@ -15,6 +18,7 @@ from mkpc_kaggle.scene.export import HeldDirectory
 from mkpc_kaggle.scene.keypoints import MergedGraph
 from mkpc_kaggle.scene.mapper import reconstruct_component, reconstruct_connected
 from mkpc_kaggle.scene.models import Reconstruction, models_of
+from mkpc_kaggle.scene.placement import centred
 from mkpc_kaggle.scene.shared_intrinsics import (
     given_intrinsics,
     refined_intrinsics,
@@ -105,6 +109,8 @@ def reconstruct_graph(
     With a ``directory``, the graph is reconstructed as a whole, moved onto the cameras of the last complete run,
     and COLMAP's files are written there. With ``is_whole``, it is reconstructed as a whole without files.
     """
+    given_graph = graph
+    graph, origin = centred(given_graph)
     if directory is None and not is_whole:
         # Each component alone, since a bad one may make the mapper fail
         parts = list(map(MergedGraph, graph.components()))
@@ -130,6 +136,8 @@ def reconstruct_graph(
         mapped = with_lenses(mapped, free, config, make) or mapped
     reconstructions = list(mapped.reconstructions)
     shared = mapped.shared
+    if placed_by_name(graph):
+        reconstructions = [_in_world_of(found, given_graph, origin) for found in reconstructions]
     if directory is not None:
         from mkpc_kaggle.scene.colmap import write_files
 
@@ -141,3 +149,16 @@ def reconstruct_graph(
     if given:
         shared = refined_intrinsics(free, models_of(reconstructions))
     return reconstructions, shared
+
+
+def _in_world_of(
+    reconstruction: Reconstruction, graph: ViewGraph, origin: NDArray[np.float64]
+) -> Reconstruction:
+    """Return the reconstruction of a graph with placed cameras in the world of these."""
+    if not reconstruction.models:
+        return reconstruction
+    # Only with a model: pycolmap may be missing
+    from mkpc_kaggle.scene.colmap import moved_back
+
+    models = tuple(moved_back(model, graph, origin) for model in reconstruction.models)
+    return replace(reconstruction, models=models)

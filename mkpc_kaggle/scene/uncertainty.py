@@ -4,7 +4,7 @@ All cameras together fix the origin, orientation and scale. So errors that a sim
 explains do not count (the S-transformation of Baarda 1981).
 """
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from math import inf
 from statistics import median
 from types import MappingProxyType
@@ -46,9 +46,8 @@ def camera_sigmas(
     if found is None:
         return {}
     images = found.images
-    poses = [image.cam_from_world().matrix() for image in images]
     focals = [found.focal_variance(image.camera) for image in images]
-    variances = np.column_stack([_pose_variances(poses, found.poses), focals])
+    variances = np.column_stack([_pose_variances(found.matrices, found.poses), focals])
     # Of a degenerate model
     if not np.isfinite(variances).all() or variances.min() < 0:
         return {}
@@ -69,10 +68,10 @@ def combined(sigma: float, prior: float) -> float:
 
 
 def _pose_variances(
-    poses: Sequence[NDArray[np.float64]], covariance: NDArray[np.float64]
+    poses: NDArray[np.float64], covariance: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return variances (N, 2) of rotations, in radians, and centres, in model sizes; ``poses`` are
-    [R | t].
+    [R | t] (N, 3, 4).
     """
     centres = np.array([-pose[:, :3].T @ pose[:, 3] for pose in poses])
     size = np.sqrt(centres.var(axis=0).sum())

@@ -109,6 +109,27 @@ def test_the_cameras_of_a_model_stay_in_the_third_one(tmp_path: Path):
     assert {name: dict(rows)[name] for name in new} == {name: before[name] for name in new}
 
 
+def test_new_cameras_are_as_exact_far_from_the_origin():
+    """As onto a model in coordinates such as UTM's."""
+    errors = []
+    for origin in (np.zeros(3), np.array([5e5, 5e6, 100])):
+        rows = []
+        for name, camera in placed(SCENE, range(OLD)):
+            R = SCENE.cameras[name].R
+            pose = (*camera.pose[:4], *(camera.pose[4:] - R @ origin))
+            rows.append((name, PlacedCamera(camera.model, camera.parameters, pose=pose)))
+        model = model_of(SCENE.pairs, rows)
+        assert len(model.images) == 8
+        assert model.comparison == Comparison()
+        assert_in_place(model, rows)
+        centres = np.array([image.camera.centre for image in model.images]) - origin
+        truth = np.array([SCENE.cameras[image.image.name].centre for image in model.images])
+        errors.append(np.linalg.norm(centres - truth, axis=1))
+        points = np.median(model.points - origin, axis=0)
+        assert points == pytest.approx(np.median(SCENE.world, axis=0), abs=1.0)
+    assert errors[1] == pytest.approx(errors[0], abs=1e-4)
+
+
 def distorted(pair: BatchPair, k: float, numbers: Collection[int]) -> BatchPair:
     """Return a pair whose images, if they are among these numbers, show the lens with the coefficient k."""
     points = [pair.matches.points0, pair.matches.points1]

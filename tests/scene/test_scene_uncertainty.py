@@ -128,13 +128,14 @@ def test_an_error_of_the_principal_point_is_expected_of_many_exact_points():
     assert sigmas[model.images[0].image.name].focal > 2 * noise_alone
 
 
-def test_they_are_the_same_in_another_world():
+# The last one as of coordinates such as UTM's
+@pytest.mark.parametrize("shift", [(5.0, -2, 1), (5e5, 5e6, 100)])
+def test_they_are_the_same_in_another_world(shift):
     model = model_of(synthetic_scene(6, points=400))
     before = camera_sigmas(model.colmap)
     # Another scale, orientation and origin.
     turn = pycolmap.Rotation3d(np.array([0.3, -0.2, 0.1]))
-    shift = np.array([5.0, -2, 1])
-    similarity = pycolmap.Sim3d(3.0, turn, shift)
+    similarity = pycolmap.Sim3d(3.0, turn, np.array(shift))
     moved = pycolmap.Reconstruction(model.colmap)
     moved.transform(similarity)
     after = camera_sigmas(moved)
