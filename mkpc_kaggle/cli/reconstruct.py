@@ -48,6 +48,7 @@ from mkpc_kaggle.reporting.summary import (
     chosen_candidates,
     pending_lines,
     trouble,
+    unpaired_sentences,
     unreadable_images,
     weakest_line,
 )
@@ -292,6 +293,8 @@ def _lines(result: FolderResult, root: Path) -> Iterator[str]:
             why += " by an earlier run"
         count = f"{models.total()} of {plural(len(found), 'image')} with a camera"
         yield f"{batches[name]}: {count}: {why}"
+    for batch, sentence in unpaired_sentences(report):
+        yield f"{batch}: {sentence}"
     for fact in (*chosen_candidates(report.scenes), *adopted_lenses(report.scenes)):
         yield "{}: {} ({})".format(*fact)
     yield from weakest_line(report.scenes)

@@ -195,6 +195,8 @@ class Engine:
             units_failed=self.log.units_failed,
             estimated=self.log.estimated,
             log=self.site.printed(),
+            files=asked.state.request.about.files,
+            digests=asked.state.digests,
         )
 
     def save_results(self) -> str:

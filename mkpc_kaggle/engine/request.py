@@ -90,6 +90,9 @@ class RunReport:
     units_failed: int = 0  # that raised
     estimated: int = 0
     log: Path | None = None  # the output of workers' libraries, if any
+    # As About.files, and the digests of the contents of images in pairs, by name
+    files: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    digests: Mapping[str, str] = field(default_factory=dict)
 
 
 def distinct_pairs(rows: Iterable[Pair]) -> tuple[list[Pair], NDArray[np.int_]]:

@@ -6,14 +6,14 @@ import signal
 import sqlite3
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from importlib import metadata
 from math import isfinite
 from pathlib import Path
 from tempfile import TemporaryFile
-from types import FrameType
+from types import FrameType, MappingProxyType
 from typing import Any, Self
 
 import cv2
@@ -247,9 +247,12 @@ def request_of(
     assembly: Assembly,
     session: Session,
     root: str = "",
+    files: Mapping[str, Sequence[str]] = MappingProxyType({}),
     **more: Any,
 ) -> Request:
-    """Return a request for these pairs; ``more`` are other fields of the request."""
+    """Return a request for these pairs. ``files`` are the images of each dataset of a folder, ``more`` other
+    fields of the request.
+    """
     budget = session.budget
     recipe = assembly.recipe
     limit = budget.time_limit if isfinite(budget.time_limit) else None
@@ -263,7 +266,9 @@ def request_of(
         "NumPy": metadata.version("numpy"),
         "SQLite": sqlite3.sqlite_version,
     }
-    about = About(table, str(assembly.placement), limit, assembly.left_out, versions)
+    about = About(
+        table, str(assembly.placement), limit, assembly.left_out, versions, files=dict(files)
+    )
     return Request(pairs, recipe, Keys.of(assembly), root, assembly.cameras, about=about, **more)
 
 

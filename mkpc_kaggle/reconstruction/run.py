@@ -133,7 +133,13 @@ def reconstruct_folder(
         def write(results: State) -> None:
             publish(cameras_of(datasets, root, results, earlier))
 
-        engine.ask(request_of(pairs, assembly, session, str(root), exports=exports, publish=write))
+        names = {
+            batches[name]: [name_below(str(root), str(file)) for file in files]
+            for name, files in datasets.items()
+        }
+        engine.ask(
+            request_of(pairs, assembly, session, str(root), names, exports=exports, publish=write)
+        )
         state = engine.state
         assert state is not None
         # Models of an earlier run do not belong to tables without cameras.
@@ -177,16 +183,20 @@ def causes_of_missing(results: State, cameras: Cameras, root: Path, masks: Masks
         is_unmatched = batch in results.batches and results.is_unmatched(batch)
         if batch not in results.scenes.in_use and not is_unmatched:
             continue
-        placed = cameras[name]
-        contents = {digests.get(name_below(str(root), str(file)), "") for file in placed} - {""}
+        # Images in no pair were not read.
+        paired = {name for index in results.rows_of(batch) for name in results.names[index]}
+        names = {file: name_below(str(root), str(file)) for file in cameras[name]}
+        files = [file for file in names if names[file] in paired]
+        contents = {digests.get(names[file], "") for file in files} - {""}
         if len(contents) < MIN_IMAGES:
             be = "is" if len(contents) == 1 else "are"
+            where = " in pairs" if len(files) < len(names) else ""
             yield (
-                f"{batch}: only {len(contents)} of {plural(len(placed), 'file')} can be read and {be} no "
+                f"{batch}: only {len(contents)} of {plural(len(files), 'file')}{where} can be read and {be} no "
                 "copy of another; cameras need three different photographs"
             )
             continue
-        missing = [file for file, camera in placed.items() if camera is None]
+        missing = [file for file in files if cameras[name][file] is None]
         yield from (f"{batch}: {cause}" for cause in causes_in_files(missing, masks))
 
 

@@ -30,6 +30,7 @@ from mkpc_kaggle.reporting.run_log import RunLog, read_log
 from mkpc_kaggle.reporting.summary import (
     facts,
     headline,
+    image_counts,
     is_doubtful,
     is_solved,
     left_out_line,
@@ -425,7 +426,8 @@ def _scenes(log: RunLog) -> Iterator[tuple[object, ...]]:
         spread = f"{median(focals):.0f} ({min(focals):.0f} to {max(focals):.0f})" if focals else ""
         # Of each model: one of several may be wrong.
         errors = ", ".join(f"{model.reprojection_error:.2f}" for model in scene.models)
-        placed = scene.batch, scene.images, scene.registered, scene.points, spread, errors
+        images = image_counts(log, scene)
+        placed = scene.batch, images.images, images.cameras, scene.points, spread, errors
         yield (*placed, scene.seconds, counts[scene.batch], scene.failure)
 
 

@@ -54,6 +54,11 @@ class RunLog:
     digests: Mapping[str, str] = field(default_factory=dict)  # of the images' contents, by name
 
     @property
+    def files(self) -> Mapping[str, Sequence[str]]:
+        """The images of each dataset of a folder, by batch, also those in no pair."""
+        return self.about.files
+
+    @property
     def ending(self) -> str:
         """The ending of the last session."""
         # Only the last event counts: a resumed run has the ends of former sessions.

@@ -4,17 +4,17 @@ import textwrap
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from statistics import median
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 from mkpc_kaggle.engine.request import Ending, RunReport
 from mkpc_kaggle.engine.store.dataframes import NOT_REACHED, SECONDS
-from mkpc_kaggle.engine.store.tables import NOT_RECONSTRUCTED, SceneRecord
+from mkpc_kaggle.engine.store.tables import MIN_PAIRS, NOT_RECONSTRUCTED, SceneRecord
 from mkpc_kaggle.errors import plural
 from mkpc_kaggle.geometry.critical_region import RegionReason
 from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
 from mkpc_kaggle.progress import format_duration
 from mkpc_kaggle.recipe import Recipe
-from mkpc_kaggle.reporting.contradictions import adopted_lenses, file_labels
+from mkpc_kaggle.reporting.contradictions import adopted_lenses, file_labels, named
 from mkpc_kaggle.reporting.run_log import RunLog
 from mkpc_kaggle.scene.candidates import title_of
 from mkpc_kaggle.scene.models import Sigmas
@@ -216,14 +216,71 @@ def facts(run: AnyRun) -> Iterator[tuple[str, str, str]]:
         remark = "scales differ, or the crop restores detail"
         yield "pairs that need their crops", f"{needs.sum()} of {len(needs)}", remark
     if scenes:
-        placed = sum(scene.registered for scene in scenes)
-        images = sum(scene.images for scene in scenes)
+        total = total_counts(run)
         remark = f"in {plural(len(scenes), 'batch')}"
-        if loose := sum(scene.loose for scene in scenes):
-            remark += f"; {loose} of them unknown to within the size of their model"
-        yield "images with a camera", f"{placed} of {images}", remark
+        if total.loose:
+            remark += f"; {total.loose} of them unknown to within the size of their model"
+        yield "images with a camera", f"{total.cameras} of {total.images}", remark
         yield from chosen_candidates(scenes)
         yield from adopted_lenses(scenes)
+
+
+class ImageCounts(NamedTuple):
+    """Numbers of images: all, those with a camera, and of these the ones whose camera is unknown to within
+    the size of its model.
+    """
+
+    images: int
+    cameras: int
+    loose: int
+
+
+def image_counts(run: AnyRun, scene: SceneRecord) -> ImageCounts:
+    """Return the counts of a scene: of the files of its dataset, or of distinct images if these are
+    unknown, as in a submission.
+    """
+    files = run.files.get(scene.batch)
+    if files is None:
+        return ImageCounts(scene.images, scene.registered, scene.loose)
+    # Identical files share the camera of one of them.
+    placed = {found.image.digest for model in scene.models for found in model.images}
+    sure = {
+        found.image.digest for model in scene.models if not model.is_loose for found in model.images
+    }
+    contents = [run.digests.get(name) for name in files]
+    cameras = sum(content in placed for content in contents)
+    return ImageCounts(len(files), cameras, cameras - sum(content in sure for content in contents))
+
+
+def total_counts(run: AnyRun) -> ImageCounts:
+    """Return the counts of all scenes, and of the datasets that are too small for one."""
+    counts = [image_counts(run, scene) for scene in run.scenes]
+    batches = {scene.batch for scene in run.scenes}
+    counts += [ImageCounts(len(run.files[batch]), 0, 0) for batch in run.files.keys() - batches]
+    return ImageCounts(*(sum(column) for column in zip(*counts, strict=True)))
+
+
+def unpaired_images(run: AnyRun) -> dict[str, list[str]]:
+    """Return the images of each dataset of a folder that are in none of its pairs."""
+    pairs = run.tables.pairs
+    paired = {*pairs["image0"], *pairs["image1"]}
+    return {
+        batch: [name for name in names if name not in paired] for batch, names in run.files.items()
+    }
+
+
+def unpaired_sentences(run: AnyRun) -> Iterator[tuple[str, str]]:
+    """Yield the batch and a sentence for each dataset with images in no pair."""
+    pairs = Counter(run.tables.pairs["group"])
+    for batch, names in unpaired_images(run).items():
+        # A dataset without cameras has another sentence.
+        if names and pairs[batch] >= MIN_PAIRS:
+            labels = file_labels(run.files[batch])
+            yield (
+                batch,
+                f"no pair has {named([labels[name] for name in names])}: such images resemble no others, or "
+                "--pairs omits them; add photographs between these and the others, or pairs",
+            )
 
 
 def chosen_candidates(scenes: Sequence[SceneRecord]) -> Iterator[tuple[str, str, str]]:

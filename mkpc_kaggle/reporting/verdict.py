@@ -20,15 +20,19 @@ from mkpc_kaggle.reporting.contradictions import contradictions, file_labels, ha
 from mkpc_kaggle.reporting.run_log import RunLog
 from mkpc_kaggle.reporting.summary import (
     headline,
+    image_counts,
     is_doubtful,
     is_of_this_run,
     is_reached,
     is_solved,
     seconds_by_part,
     solved_pairs,
+    total_counts,
     trouble,
     unit_means,
     unit_reasons,
+    unpaired_images,
+    unpaired_sentences,
     unreadable_images,
 )
 from mkpc_kaggle.scene.candidates import title_of
@@ -77,13 +81,13 @@ def verdict(log: RunLog) -> Verdict:
         problems += _pair_problems(log.tables.pairs)
         return Verdict(solved_pairs(log.tables.pairs), tuple(problems))
     # Cameras that are unknown to within the size of their model are none.
-    placed = sum(scene.registered - scene.loose for scene in log.scenes)
-    images = sum(scene.images for scene in log.scenes)
+    counts = total_counts(log)
     # Also without any camera: this line answers the user's question.
-    text = f"{placed} of {plural(images, 'image')} with a camera"
+    text = f"{counts.cameras - counts.loose} of {plural(counts.images, 'image')} with a camera"
     if reconstructed:
         text += f"; reprojection {_reprojection(reconstructed):.2f} px"
     problems += [problem for scene in log.scenes for problem in _scene_problems(scene, log)]
+    problems += [f"{_where(batch, log)}{text}" for batch, text in unpaired_sentences(log)]
     return Verdict(text, tuple(problems))
 
 
@@ -122,9 +126,14 @@ def _pair_problems(pairs: "DataFrame") -> Iterator[str]:
         yield f"{plural(doubtful, 'pair')} may show different things; see below"
 
 
-def _scene_problems(scene: SceneRecord, log: RunLog) -> Iterator[str]:
+def _where(batch: str, log: RunLog) -> str:
+    """Return the beginning of a sentence about a batch."""
     # A folder without subfolders has one scene, whose name says nothing.
-    where = f"{scene.batch}: " if len(log.scenes) > 1 else ""
+    return f"{batch}: " if len(log.scenes) > 1 else ""
+
+
+def _scene_problems(scene: SceneRecord, log: RunLog) -> Iterator[str]:
+    where = _where(scene.batch, log)
     if HARDLY_MOVED in scene.failure:
         # More photographs from there would not help.
         yield f"{where}no cameras: {HARDLY_MOVED}"
@@ -147,10 +156,10 @@ def _scene_problems(scene: SceneRecord, log: RunLog) -> Iterator[str]:
     contents = {image.digest for image in cameras}
     pairs = log.tables.pairs
     pairs = pairs[pairs["group"] == scene.batch]
-    # The record of a scene has no list of its images without a camera; its pairs name them.
+    # Images in no pair have a sentence of their own.
     files = {*pairs["image0"], *pairs["image1"]}
     lost = {file for file in files - names if log.digests.get(file) not in contents}
-    labels = file_labels(files)
+    labels = file_labels({*files, *log.files.get(scene.batch, ())})
     missing = sorted(labels[file] for file in lost)
     if missing:
         remedies = "; ".join(_remedies(missing, unreadable_images(pairs), causes))
@@ -196,9 +205,18 @@ def _remedies(
         yield f"{len(unreadable) - MAX_UNREADABLE} more cannot be read"
     yield from causes
     # Photographs between these and the others do not help images with another cause.
-    reasons = [*unreadable, *causes]
-    if not all(any(name in reason for reason in reasons) for name in missing):
+    if not all(_is_explained(name, unreadable, causes) for name in missing):
         yield "add photographs between these and the others"
+
+
+def _is_explained(name: str, unreadable: Sequence[str], causes: Sequence[str]) -> bool:
+    """Return whether a reason is about an image, and not about another whose name contains its name."""
+    # Unreadable files have the form "path: reason".
+    if any(f"/{name}: " in f"/{reason}" for reason in unreadable):
+        return True
+    # Causes end with the names of their images, and perhaps with a number of files.
+    ends = [cause.rpartition(": ")[2].partition("; ")[0] for cause in causes]
+    return any(f"/{name}".endswith(f"/{other}") for end in ends for other in end.split(", "))
 
 
 def causes_of(batch: str, log: RunLog) -> list[str]:
@@ -215,10 +233,11 @@ def _small_batches(log: RunLog) -> Iterator[str]:
     # A submission has batches of one pair, and extra pairs; a folder has cameras alone.
     if scene is None or scene.pairs_per_image:
         return
-    for batch, pairs in log.tables.pairs.groupby("group", sort=False):
-        if len(pairs) < MIN_PAIRS:
+    counts = Counter(log.tables.pairs["group"])
+    for batch in dict.fromkeys([*log.files, *counts]):
+        if counts[batch] < MIN_PAIRS:
             yield (
-                f"{batch}: no cameras, {plural(len(pairs), 'pair')}: at least three matched images are "
+                f"{batch}: no cameras, {plural(counts[batch], 'pair')}: at least three matched images are "
                 "needed"
             )
 
@@ -321,7 +340,11 @@ def summary_table(log: RunLog) -> dict[str, Any]:
         "ending": str(log.ending),
         "seconds": _number(log.seconds),
         "pairs": _pairs_table(log.tables.pairs),
-        "scenes": [_scene_table(scene) for scene in log.scenes],
+        "files": {
+            batch: {"count": len(log.files[batch]), "in_no_pair": names}
+            for batch, names in unpaired_images(log).items()
+        },
+        "scenes": [_scene_table(scene, log) for scene in log.scenes],
         "units": _units_table(log),
         "seconds_by_part": {
             name: _number(seconds) for name, seconds in seconds_by_part(log).items()
@@ -364,11 +387,12 @@ def _units_table(log: RunLog) -> list[dict[str, Any]]:
     ]
 
 
-def _scene_table(scene: SceneRecord) -> dict[str, Any]:
+def _scene_table(scene: SceneRecord, log: RunLog) -> dict[str, Any]:
+    counts = image_counts(log, scene)
     return {
         "batch": scene.batch,
-        "images": scene.images,
-        "cameras": scene.registered,
+        "images": counts.images,
+        "cameras": counts.cameras,
         "points": scene.points,
         "seconds": _number(scene.seconds),
         "failure": scene.failure,

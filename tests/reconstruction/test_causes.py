@@ -1,6 +1,7 @@
 """Images without a camera: a final result with its cause, and not one to wait for."""
 
 import json
+from itertools import combinations
 from pathlib import Path
 
 import cv2
@@ -9,10 +10,11 @@ import pytest
 from shared import run_command
 from test_reconstruct import FIRST, run, write_flat
 
+from mkpc_kaggle.cli.reconstruct import _lines
 from mkpc_kaggle.data.masks import Masks
 from mkpc_kaggle.reconstruction.causes import MAX_FILES, causes_in_files
 from mkpc_kaggle.reporting.run_log import read_log
-from mkpc_kaggle.reporting.verdict import verdict
+from mkpc_kaggle.reporting.verdict import summary_table, verdict
 
 SIZE = (240, 320)
 
@@ -152,3 +154,31 @@ def test_copies_of_one_photograph_are_named_as_the_cause(tmp_path, capsys):
     cause = "only 1 of 3 files can be read and is no copy of another; cameras need three different"
     assert f"fault: photos: {cause}" in capsys.readouterr().out
     assert cause in json.loads((tmp_path / "out/summary.json").read_text())["verdict"]
+
+
+def test_only_files_in_pairs_are_called_unreadable_or_copies(tmp_path):
+    root = write_flat(tmp_path / "photos", FIRST)
+    first, second, *_ = sorted(root.iterdir())
+    copy = root / "copy.png"
+    copy.write_bytes(second.read_bytes())
+    result = run(root, tmp_path / "out", listed=[(first, second), (first, copy)])
+    assert result.causes == (
+        "photos: only 2 of 3 files in pairs can be read and are no copy of another; cameras need "
+        "three different photographs",
+    )
+
+
+def test_images_in_no_pair_are_counted_and_named_in_all_outputs(tmp_path):
+    root = write_flat(tmp_path / "photos", FIRST)
+    *files, alone = sorted(root.iterdir())
+    result = run(root, tmp_path / "out", listed=[*combinations(files, 2)])
+    counts = f"{FIRST - 1} of {FIRST} images with a camera"
+    sentence = f"no pair has {alone.name}: such images resemble no others, or --pairs omits them"
+    lines = list(_lines(result, root))
+    assert any(line.startswith(f"photos: {counts}") for line in lines), lines
+    assert any(line.startswith(f"photos: {sentence}") for line in lines), lines
+    log = read_log(tmp_path / "out" / "work")
+    found = verdict(log)
+    assert found.text.startswith(counts)
+    assert [problem.partition(";")[0] for problem in found.problems] == [sentence]
+    assert summary_table(log)["files"] == {"photos": {"count": FIRST, "in_no_pair": [alone.name]}}

@@ -23,7 +23,7 @@ from mkpc_kaggle.recipe import Recipe, SceneConfig, Unit
 from mkpc_kaggle.reporting import contradictions, verdict
 from mkpc_kaggle.reporting.contradictions import file_labels
 from mkpc_kaggle.reporting.run_log import RunLog
-from mkpc_kaggle.reporting.summary import weakest_line
+from mkpc_kaggle.reporting.summary import facts, weakest_line
 from mkpc_kaggle.scene.choose import Reason
 from mkpc_kaggle.scene.models import (
     HARDLY_MOVED,
@@ -95,6 +95,12 @@ UNREADABLE = tuple(
 )
 
 
+def of_files(run: RunLog, **files: list[str]) -> RunLog:
+    """A run of folders with these images, whose contents are their names."""
+    digests = {name: name for name in NAMES}
+    return replace(run, about=replace(run.about, files=files), digests=digests)
+
+
 def compared(*found: FocalContradiction | DistortedLens) -> RunLog:
     focals = tuple(each for each in found if isinstance(each, FocalContradiction))
     lenses = tuple(each for each in found if isinstance(each, DistortedLens))
@@ -137,6 +143,29 @@ SPEAKS = {
         scene(model(GOOD, GOOD, GOOD, names=NAMES[:3])),
         pairs=ALL,
         faults=("set: the masks hide everything: 3.jpg",),
+    ),
+    # Another image, whose name contains this one's
+    "no camera for 3.jpg, 33.jpg: /d/33.jpg: the file is empty; add photographs between": log(
+        scene(model(GOOD, GOOD, GOOD, names=NAMES[:3])),
+        pairs=(
+            *ALL,
+            Described("33", (NAMES[0], "33.jpg"), "set", failure="/d/33.jpg: the file is empty"),
+        ),
+    ),
+    "no camera for 3.jpg, 33.jpg: the photographs are overexposed, 60 % of 33.jpg is white: 33.jpg; 1 of 2 "
+    "files were read; add photographs between": log(
+        scene(model(GOOD, GOOD, GOOD, names=NAMES[:3])),
+        pairs=(*ALL, Described("33", (NAMES[0], "33.jpg"), "set")),
+        faults=(
+            "set: the photographs are overexposed, 60 % of 33.jpg is white: 33.jpg; 1 of 2 files were read",
+        ),
+    ),
+    "no pair has e.jpg, f.jpg: such images resemble no others, or --pairs omits them; add": of_files(
+        log(scene(GOOD_MODEL), pairs=ALL), set=[*NAMES, "e.jpg", "f.jpg"]
+    ),
+    "other: no cameras, 0 pairs: at least three matched images are needed": replace(
+        of_files(log(scene(GOOD_MODEL), pairs=ALL), set=NAMES, other=["o.jpg"]),
+        recipe=Recipe((Unit(1, "sift", 640),), scene=SceneConfig(pairs_per_image=0.0)),
     ),
     "3.jpg: the file is empty; b.jpg: no such file; c.jpg: no such file; 1 more cannot be read": log(
         scene(model(GOOD, GOOD, GOOD, names=NAMES[:3])),
@@ -223,6 +252,22 @@ def test_a_run_without_problems_looks_right():
     for run in (log(pairs=ALL), log(scene(GOOD_MODEL), pairs=ALL)):
         assert verdict.verdict(run).problems == ()
         assert str(verdict.verdict(run)).endswith("nothing looks wrong")
+
+
+def test_images_in_no_pair_count_and_so_do_copies():
+    copy = Described("copy", (NAMES[0], "copy.jpg"), "set", **GOOD_F)
+    run = log(scene(GOOD_MODEL), pairs=(*ALL, copy))
+    assert verdict.verdict(run).text.startswith("4 of 4 images with a camera")
+    run = of_files(run, set=[*NAMES, "copy.jpg", "e.jpg"], other=["o.jpg"])
+    run = replace(run, digests=run.digests | {"copy.jpg": NAMES[0]})
+    assert verdict.verdict(run).text.startswith("5 of 7 images with a camera")
+    assert ("images with a camera", "5 of 7", "in 1 batch") in [*facts(run)]
+    table = verdict.summary_table(run)
+    assert [table["scenes"][0][key] for key in ("images", "cameras")] == [6, 5]
+    assert table["files"] == {
+        "set": {"count": 6, "in_no_pair": ["e.jpg"]},
+        "other": {"count": 1, "in_no_pair": ["o.jpg"]},
+    }
 
 
 def test_cameras_of_a_model_that_is_too_large_for_sigmas_are_not_called_uncertain():

@@ -232,6 +232,8 @@ class About:
     left_out: Sequence[str] = ()  # matchers that did not run, by cause
     # Of the package and its main dependencies
     versions: dict[str, str] = field(default_factory=dict)
+    # The images of each dataset of a folder, by batch, also those in no pair
+    files: dict[str, Sequence[str]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
