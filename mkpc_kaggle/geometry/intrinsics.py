@@ -8,7 +8,7 @@ import fnmatch
 import unicodedata
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from math import isfinite
+from math import hypot, isfinite
 from types import MappingProxyType
 
 from mkpc_kaggle.config import decimal
@@ -26,6 +26,7 @@ LENS_MODELS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     }
 )
 FIXED = "fixed"
+MAX_QUATERNION_DEVIATION = 1e-3  # of a norm from 1
 MAX_SIGMA = 100.0  # percent; a wider prior states nothing
 
 
@@ -122,6 +123,9 @@ class PlacedCamera(ModelCamera):
         super().__post_init__()
         if len(self.pose) != 7 or not all(map(isfinite, self.pose)) or self.sigma:
             raise ValueError("a placed camera is exact, and its pose has seven finite numbers")
+        # Files have rounded ones.
+        if abs(hypot(*self.pose[:4]) - 1) > MAX_QUATERNION_DEVIATION:
+            raise ValueError("the rotation of a placed camera is no unit quaternion")
 
 
 def radial_factor(camera: KnownCamera, radius: float) -> float:
@@ -136,8 +140,8 @@ def radial_factor(camera: KnownCamera, radius: float) -> float:
 
 
 def displacement_of(camera: KnownCamera, size: Size) -> float:
-    """Return by how much all coefficients of a lens move a point half the long side away from the middle
-    of its image, as a share of this distance; negative for a barrel.
+    """Return the displacement of a point half the long side away from the middle of its image, by all
+    coefficients of a lens. It is a share of this distance, and negative for a barrel.
     """
     return radial_factor(camera, max(size) / 2 / camera.focal) - 1
 

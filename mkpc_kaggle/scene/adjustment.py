@@ -62,8 +62,8 @@ def adjust(model: Any, cameras: Mapping[str, KnownCamera]) -> None:
 
 
 def settle_rotations(model: Any, held: Collection[str] = ()) -> None:
-    """Change the last digits of quaternions, except those of the images ``held``, so that normalising
-    them changes nothing.
+    """Change the last digits of quaternions so that normalising them changes nothing. Images ``held``, by
+    name, keep theirs.
 
     The incremental mapper normalises them. So the cameras of a finished model stay bit for bit in the
     next one.

@@ -1,5 +1,5 @@
-"""Cameras of a finished model: their world, and those that photographs contradict, since another picture
-has the name of one.
+"""Cameras of a finished model: their world, and contradictions of its photographs, since another picture
+may have the name of one.
 """
 
 from collections import Counter

@@ -229,6 +229,12 @@ def fisheye(folder: Path) -> None:
     (folder / "cameras.bin").write_bytes(bytes(data))
 
 
+def without_rotation(folder: Path) -> None:
+    data = bytearray((folder / "images.bin").read_bytes())
+    data[12:44] = bytes(32)  # the first image's quaternion
+    (folder / "images.bin").write_bytes(bytes(data))
+
+
 @pytest.mark.parametrize(
     ("spoil", "words"),
     [
@@ -238,6 +244,7 @@ def fisheye(folder: Path) -> None:
         ),
         (lambda folder: (folder / "cameras.bin").write_bytes(b""), "is not a model of COLMAP"),
         (cut, "is not a model of COLMAP"),
+        (without_rotation, "is not a model of COLMAP: the rotation of a placed camera is no unit"),
         (fisheye, "a camera has model 5; known: SIMPLE_PINHOLE, PINHOLE"),
     ],
 )
