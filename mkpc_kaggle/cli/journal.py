@@ -33,7 +33,8 @@ submission. Without options, print an overview of one screen.
 In Python, mkpc_kaggle.results(DIR) returns the first two and the cameras as DataFrames with the same columns.
 
 --prune removes the results that the last run did not use: of former recipes, settings, images and rows. If
-they are asked for again, they are computed again. It prints the size that it sets free.
+they are asked for again, they are computed again. It prints the size that it sets free. Tables and the page are
+written first.
 
 Exit status: 0 done, 2 the journal does not exist, or a file cannot be written.
 """
@@ -58,18 +59,18 @@ def run(arguments: argparse.Namespace) -> None:
     # The page must not be written over the test side, nor over the journal itself.
     inputs = test_side(arguments.test_dir) if arguments.test_dir else []
     require_apart({"--report": arguments.report}, inputs, arguments.work_dir)
-    if arguments.prune:
-        read_log(arguments.work_dir)  # refuses a directory without a run
-        with Store.open(arguments.work_dir) as store:
-            freed = store.prune(Published.of(store).keys)
-        print(f"{freed / 1e6:.2f} MB are free again")
-        return
-    log = read_log(arguments.work_dir)
-    written = write_csv(arguments.work_dir, arguments.csv) if arguments.csv else []
+    log = read_log(arguments.work_dir)  # refuses a directory without a run
+    written = [*map(str, write_csv(arguments.work_dir, arguments.csv))] if arguments.csv else []
     if arguments.report:
         # Without the test side, the page has no pictures.
         pairs = read_test_side(arguments.test_dir) if arguments.test_dir else ()
         write_report(log, arguments.report, pairs)
-        written += filter(None, [arguments.report, write_summary(log, arguments.report)])
+        pages = [arguments.report, write_summary(log, arguments.report)]
+        written += [str(page) for page in pages if page]
+    # Last: tables and pages show the same results before and after.
+    if arguments.prune:
+        with Store.open(arguments.work_dir) as store:
+            freed = store.prune(Published.of(store).keys)
+        written.append(f"{freed / 1e6:.2f} MB are free again")
     # The files that were written, else the overview.
-    print("\n".join(map(str, written)) or overview(log))
+    print("\n".join(written) or overview(log))

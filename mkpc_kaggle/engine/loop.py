@@ -88,6 +88,7 @@ class Engine:
         self._progress = Progress(budget, sys.stderr if progress else None)
         self._features = Features(store)
         self._asked: Asked | None = None  # the latest request
+        self._trials: list[str] = []  # the keys of the results of requests that were trials
         self._refused: dict[str, str] = {}  # why a matcher cannot be loaded, by name
         self._looking_since = 0.0  # the features of a large folder are many short jobs
         self._must_replan = False  # a job was dropped, as its points are lost
@@ -162,7 +163,7 @@ class Engine:
             Matching(run),
             Estimating(run),
             SceneWork(run),
-            Publication(state, self.store, self.budget, self.log),
+            Publication(state, self.store, self.budget, self.log, self._trials),
             until=self.budget.clock() + share * self.budget.left() if share < 1 else inf,
             resumed=int(state.complete.sum()),
         )
@@ -172,6 +173,8 @@ class Engine:
         # Publish existing results before any work: the F of an earlier run is better than the fallback.
         self._asked.publication.publish()
         self._loop()
+        if request.is_trial:
+            self._trials += state.result_keys
 
     def report(self) -> RunReport:
         """End the run. Return the results of the latest request."""

@@ -1,6 +1,7 @@
 """Publication: versions of the results, in the request's own files and as the table of pairs."""
 
 import threading
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -23,11 +24,19 @@ class Publication:
     version from its own thread.
     """
 
-    def __init__(self, state: State, store: Store, budget: Budget, log: EventLog) -> None:
+    def __init__(
+        self,
+        state: State,
+        store: Store,
+        budget: Budget,
+        log: EventLog,
+        trials: Sequence[str] = (),
+    ) -> None:
         self._state = state
         self._store = store
         self._budget = budget
         self._log = log
+        self._trials = trials  # keys of the results of earlier requests that were trials
         self._lock = threading.Lock()
         self._has_ended = False
         self._published = budget.clock()
@@ -98,6 +107,7 @@ class Publication:
             pairs=len(state.pair_of_row) + len(state.pairs) - state.rows,
             scenes={batch: scene.key for batch, scene in state.scenes.in_use.items()},
             rivals=state.scenes.rivals,
+            trials=self._trials,
         )
 
     def _update_rows(self) -> list[PublishedPair]:

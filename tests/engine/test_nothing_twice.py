@@ -251,7 +251,9 @@ def test_a_prune_frees_the_results_of_former_settings_and_keeps_those_of_the_las
     capsys.readouterr()
     store = room.home / "a.work" / "journal.sqlite"
     before = store.stat().st_size
-    assert main(["journal", str(store.parent), "--prune"]) == 0
+    tables = room.home / "tables"
+    assert main(["journal", str(store.parent), "--prune", "--csv", str(tables)]) == 0
+    assert (tables / "pairs.csv").exists()
     (freed,) = re.findall(r"(\d+\.\d\d) MB are free again", capsys.readouterr().out)
     assert float(freed) == round((before - store.stat().st_size) / 1e6, 2) > 0
     assert room.run() == last

@@ -36,6 +36,7 @@ from mkpc_kaggle.engine.session import Interrupt, Session
 from mkpc_kaggle.engine.store.database import FILE_NAME, Store
 from mkpc_kaggle.engine.store.dataframes import ELEMENTS
 from mkpc_kaggle.engine.store.keys import Keys
+from mkpc_kaggle.engine.store.published import Published
 from mkpc_kaggle.engine.workers.worker import compute_scene
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.cameras import fundamental_of_cameras
@@ -772,6 +773,12 @@ def test_images_that_lie_on_a_side_are_found(tmp_path):
         if t
     }
     assert found == turned
+    # A prune keeps the trials, which the run has used.
+    with Store.open(tmp_path / "out" / "work") as store:
+        store.prune(Published.of(store).keys)
+    again = run(tmp_path / "images", tmp_path / "out", UprightSift(), rotations=True)
+    assert again.pairs == result.pairs
+    assert again.report.units_run == 0
 
 
 def test_what_was_turned_comes_back_in_the_pixels_of_its_file(tmp_path, monkeypatch):

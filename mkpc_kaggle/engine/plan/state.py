@@ -199,6 +199,11 @@ class State:
         return np.asarray(self.has_earlier & ~has_scene & (lacks_estimate | awaits_better))
 
     @property
+    def result_keys(self) -> list[str]:
+        """The keys of all points and estimates in use."""
+        return [key for key in (*self.points.ravel(), *self.estimates) if key]
+
+    @property
     def digests(self) -> dict[str, str]:
         """The digest of each image's content, by name."""
         # A copy first: the watchdog may publish while the loop adds images.

@@ -56,7 +56,7 @@ class Published:
         """The keys of all results that this version names."""
         points = [key for row in self.pairs for key in row.points]
         estimates = [row.estimate for row in self.pairs]
-        return [key for key in [*points, *estimates, *self.scene_keys] if key]
+        return [key for key in [*points, *estimates, *self.scene_keys, *self.run.trials] if key]
 
     def points_of(self, store: Store, row: PublishedPair) -> dict[str, Matches]:
         """Return a pair's matches by unit, in the recipe's order."""

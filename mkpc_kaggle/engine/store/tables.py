@@ -242,7 +242,8 @@ class PublishedRun:
 
     The first ``rows`` of the ``pairs`` belong to the test set, the others are for scenes alone. Rows of
     the table of pairs after them are of an earlier run. ``units`` has names and stages, ``scenes`` the keys of
-    the scenes in use by batch, and ``rivals`` the keys of the other candidates.
+    the scenes in use by batch, and ``rivals`` the keys of the other candidates. ``trials`` are keys of points and
+    estimates of pairs that the run has tried, and does not have.
     """
 
     name: str = "run"
@@ -252,6 +253,7 @@ class PublishedRun:
     pairs: int = 0
     scenes: dict[str, str] = field(default_factory=dict)
     rivals: dict[str, list[str]] = field(default_factory=dict)
+    trials: Sequence[str] = ()
 
 
 @dataclass(frozen=True, eq=False)
