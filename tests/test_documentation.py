@@ -231,3 +231,36 @@ def test_no_error_of_any_type_is_dropped():
     dropped = re.compile(r"suppress\((Base)?Exception\b|except( (Base)?Exception)?:\s+pass\b")
     files = sorted((ROOT / "mkpc_kaggle").rglob("*.py"))
     assert [str(path) for path in files if dropped.search(path.read_text(encoding="utf-8"))] == []
+
+
+def uses_of_functions() -> dict[str, set[str]]:
+    """The files of the package that call each function, or read each property, besides its own."""
+    package = ROOT / "mkpc_kaggle"
+    calls: dict[str, set[str]] = {}
+    reads: dict[str, set[str]] = {}
+    homes: dict[str, set[str]] = {}
+    for path in sorted(package.rglob("*.py")):
+        file = path.relative_to(package).as_posix()
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            match node:
+                case ast.Call(func=ast.Name(id=name) | ast.Attribute(attr=name)):
+                    calls.setdefault(name, set()).add(file)
+                case ast.Attribute(attr=name):
+                    reads.setdefault(name, set()).add(file)
+                case ast.FunctionDef(name=name):
+                    homes.setdefault(name, set()).add(file)
+    return {name: calls.get(name, reads.get(name, set())) - homes[name] for name in homes}
+
+
+def test_only_the_files_that_contributing_names_call_the_functions_that_decide():
+    page = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    _, _, part = page.partition("**Where it is decided**")
+    rows = re.findall(r"^\| .*? \| .*? \| (`.*?) \|$", part, re.M)
+    assert len(rows) == 15
+    uses = uses_of_functions()
+    for row in rows:
+        for each in row.split(";"):
+            functions, files = (set(re.findall("`(.*?)`", text)) for text in each.split(":"))
+            called = set().union(*(uses[name] for name in functions))
+            # What a file does on the way for others is named, too.
+            assert called == files - {"geometry/matches.py"}, each

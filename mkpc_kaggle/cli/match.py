@@ -13,7 +13,7 @@ from mkpc_kaggle.engine.console import unblocked
 from mkpc_kaggle.errors import UserError, plural, writing
 from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
 from mkpc_kaggle.pipeline.pair import PairMatch
-from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher, to_image
+from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher, as_image
 from mkpc_kaggle.progress import announced
 from mkpc_kaggle.reporting.figures import draw_pair, require_format, save
 
@@ -59,7 +59,7 @@ def run(arguments: argparse.Namespace) -> int:
             raise UserError(f"--save {arguments.save}: the name must end in .npz or .h5")
         if arguments.save.suffix == SUFFIX:
             require_h5py()
-    images = (to_image(arguments.image0), to_image(arguments.image1))
+    images = (as_image(arguments.image0), as_image(arguments.image1))
     # After the images: a wrong path should not wait for weights to be digested.
     with announced(f"loading recipe {arguments.recipe}: libraries, and checks of weights"):
         matcher = TwoStageMatcher(

@@ -26,9 +26,9 @@ from mkpc_kaggle.scene.sfm import Solution
 class Phase(IntEnum):
     """Priorities of matching, the most urgent first."""
 
-    # The first unit on all pairs
+    # The first unit of stage 1 that can run, on all pairs
     SWEEP = 0
-    # The first unit on extra pairs, of batches with few pairs
+    # The same unit on extra pairs, of batches with few pairs
     CONNECT = 1
     # The longest prefix of the recipe's units with enough time for all pairs
     DEEPEN = 2

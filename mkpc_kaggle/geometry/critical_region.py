@@ -5,8 +5,8 @@ them by DBSCAN, and keep the large clusters. The bounding box of the kept points
 centre, is the critical region (the paper's Algorithm 1). If this box is unreliable, the region is
 the whole image, with the reason.
 
-So ``eps``, 0.05, is a share: of the width along x, and of the height along y. Above 2,000 points,
-those in a cell of a tenth of ``eps`` are merged first, weighted by their number.
+So ``eps``, 0.05 in all shipped recipes, is a share: of the width along x, and of the height along y. Above 2,000
+points, those in a cell of a tenth of ``eps`` are merged first, weighted by their number.
 """
 
 from dataclasses import dataclass
@@ -41,7 +41,7 @@ class MkpcConfig:
     eps : float
         Radius of DBSCAN, relative to the image's width and height.
     min_samples : int
-        Points within the radius that make a cluster.
+        Points within the radius that make a core point.
     share : float
         Minimum size of a kept cluster, relative to the largest: T of the paper's Algorithm 1.
     expand_x, expand_y : float

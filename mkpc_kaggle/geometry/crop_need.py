@@ -3,6 +3,9 @@ detail that stage 1 shrank away.
 
 On ordinary pairs a crop gains no more than a second whole image (docs/results.md). With a change of
 scale by two or more, the crops show both images at a similar scale, which no whole image does.
+
+``[mkpc] when = "scale"`` asks for a scale of ``min_scale`` (1.9) or a detail of ``min_detail`` (2.0);
+"always" crops all pairs (:func:`pays`).
 """
 
 from dataclasses import dataclass

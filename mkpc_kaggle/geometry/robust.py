@@ -1,17 +1,17 @@
 """Two-view models from matches: F, E or H by MAGSAC++.
 
-MAGSAC's threshold is :attr:`RobustConfig.threshold`, ``[magsac] threshold`` of a recipe, 0.2 px of the stored
-image; no shipped recipe sets it. With ``[focal]``, F is refined by that table's ``scale``, and this threshold
-counts the inliers. Limits of other errors, in pixels of the stored image:
+MAGSAC's threshold is :attr:`RobustConfig.threshold`, ``[magsac] threshold`` of a recipe: 0.2 px of the stored
+image, which no shipped recipe changes. ``threshold_side``, 0 in all of them, would make it pixels of a resized
+image (:meth:`RobustConfig.in_stored_pixels`). For an E it is divided by the mean focal length. With ``[focal]``, F
+is refined by that table's ``scale``, and this threshold counts the inliers.
 
-- 0.4 of rough starts under a prior (``ESSENTIAL_THRESHOLD_PX`` of :mod:`mkpc_kaggle.geometry.focal_prior`);
-- 2.0 of pycolmap's verification and triangulation (``MAX_ERROR_PX`` of :mod:`mkpc_kaggle.scene.colmap`);
-- 2.0 and 1.0 of matches that speak against a scene's F (:mod:`mkpc_kaggle.scene.choose`);
-- 1.0 of matches that count as support (:mod:`mkpc_kaggle.geometry.overlap`);
-- 1.0 and 0.5 of ``validate --protocol``, as published.
+At most 50,000 iterations; `reconstruct` has 2,000. One order of the matches in the shipped recipes, and eight in
+those of the paper and by default.
 
-``threshold`` in a matcher's table is a confidence. `reconstruct` has fewer iterations, and
-one order of the matches.
+Other limits, in pixels of the stored image, are for other purposes: 0.4 for rough starts under a prior
+(``ESSENTIAL_THRESHOLD_PX``), 2.0 for pycolmap's verification (``MAX_ERROR_PX``), 2.0 and 1.0 for matches that
+speak against a scene's F (:mod:`mkpc_kaggle.scene.choose`), 1.0 for the support of an F, 2.0 and 4.0 for
+homographies. ``validate --protocol`` has published ones. ``threshold`` in a matcher's table is a confidence.
 
 An estimate always has a matrix. If no model is found, it holds the reason and the fallback matrix,
 which is finite and of the right rank. So a submission is always complete.

@@ -25,7 +25,7 @@ from mkpc_kaggle.geometry.robust import (
 )
 from mkpc_kaggle.pipeline.keypoints import PairKeypoints
 from mkpc_kaggle.recipe import Recipe, Unit
-from mkpc_kaggle.setup.arguments import ImageSource, intrinsics_of, to_image
+from mkpc_kaggle.setup.arguments import ImageSource, as_image, intrinsics_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -177,7 +177,7 @@ class PairMatch:
                 if not self.files[number : number + 1] or not self.files[number]:
                     raise ValueError("the match is not of files: call plot(image0, image1)")
                 source = self.files[number]
-            image = to_image(source, name=f"image{number}")
+            image = as_image(source, name=f"image{number}")
             if image.size != self.sizes[number]:
                 raise ValueError(f"image{number} has another size than the matched image")
             images.append(image)

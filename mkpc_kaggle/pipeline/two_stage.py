@@ -23,17 +23,17 @@ from mkpc_kaggle.recipe import Recipe, Unit
 from mkpc_kaggle.setup.arguments import (
     ImageSource,
     Weights,
+    as_image,
     boxes_of,
     files_of,
     intrinsics_of,
     member_of,
     shown_value,
-    to_image,
 )
 from mkpc_kaggle.setup.assembly import assemble
 from mkpc_kaggle.setup.availability import Licence
 
-__all__ = ["TwoStageMatcher", "to_image"]
+__all__ = ["TwoStageMatcher", "as_image"]
 
 Intrinsics = tuple[Matrix3, Matrix3]
 Boxes = tuple[Box, Box]
@@ -178,7 +178,7 @@ class TwoStageMatcher:
         """
         kind = member_of(ModelKind, model, "model")
         sources = (image0, image1)
-        images = (to_image(image0, name="image0"), to_image(image1, name="image1"))
+        images = (as_image(image0, name="image0"), as_image(image1, name="image1"))
         self._pipeline.keeps_descriptors = descriptors
         match = self._match(images, kind, intrinsics, regions, progress=self._progress)
         return replace(match, files=files_of(sources))
@@ -238,8 +238,8 @@ class TwoStageMatcher:
                     raise TypeError(f"{name} is {shown_value(pair)}; expected two images")
                 first, second = pair
                 images = (
-                    to_image(first, store, f"{name}[0]"),
-                    to_image(second, store, f"{name}[1]"),
+                    as_image(first, store, f"{name}[0]"),
+                    as_image(second, store, f"{name}[1]"),
                 )
                 # Set for each pair: another call may come between.
                 self._pipeline.keeps_descriptors = descriptors

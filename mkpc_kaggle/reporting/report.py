@@ -22,7 +22,7 @@ from mkpc_kaggle.engine.console import Progress
 from mkpc_kaggle.errors import UserError, plural, printable, writing
 from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
 from mkpc_kaggle.pipeline.pair import PairMatch
-from mkpc_kaggle.pipeline.two_stage import to_image
+from mkpc_kaggle.pipeline.two_stage import as_image
 from mkpc_kaggle.progress import format_duration
 from mkpc_kaggle.reporting.figures import draw_pair, draw_strip, encode
 from mkpc_kaggle.reporting.points import clouds_of
@@ -409,7 +409,7 @@ def weak_figure(log: RunLog, match: PairMatch, source: Pair) -> "Figure":
 def _images(pair: Pair) -> tuple[Image, Image]:
     # As the run turned them, so that points fit
     first, second = (
-        to_image(path).turned(turns) for path, turns in zip(pair.images, pair.turns, strict=True)
+        as_image(path).turned(turns) for path, turns in zip(pair.images, pair.turns, strict=True)
     )
     return first, second
 

@@ -1,9 +1,15 @@
 """Choice of a pair's fundamental matrix: from the scene, or from the pair's matches.
 
-:func:`choose` decides it. In order: F of the pair's two cameras; the pair's own F, if its matches contradict the
-cameras, or both images are one file; with ``[focal]``, F from the pair's matches at the focal lengths of the
-scene, if the cameras give none: an image has no camera, they are in two models or at one place, or a lens is
-distorted. Without ``[focal]``, such a pair keeps its own F, too. :mod:`mkpc_kaggle.scene.candidates`
+:func:`choose` decides it. In order:
+
+1. F of the pair's two cameras;
+2. the pair's own F, if both images are one file, or its matches contradict the cameras: of its evidence, 60 or
+   more, the scene's F has less than half (the mean over the units), or of the matches within 2 px of it, 30 or
+   more, the scene's F has less than 5 %;
+3. if the cameras give no F, since an image has none, they are in two models or at one place, or a lens is
+   distorted: with ``[focal]``, F from the pair's matches at the focal lengths of the scene, else its own F.
+
+:mod:`mkpc_kaggle.scene.candidates`
 chooses the scene itself.
 """
 

@@ -113,7 +113,8 @@ def loses_points(
     after: Sequence[Reconstruction],
     digests: Collection[str] = (),
 ) -> bool:
-    """Return whether all images together, or one of these, see fewer points than before.
+    """Return whether all images together, or one of these, see fewer points than before: less than 0.99
+    of them.
 
     Images of two cameras that are forced into one lose points.
     """

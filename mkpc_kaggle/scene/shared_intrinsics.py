@@ -13,7 +13,8 @@ images of one camera at one zoom share it. ``cameras`` of [scene] (``--camera``)
   (:func:`given_intrinsics`).
 - ``image``: no image shares.
 
-New images of a finished model have its camera, unless ``image`` (:func:`sharing_with_placed`). Images with a
+New images of a finished model have its one camera of their size, unless ``image``, if their focal length agrees
+within 2 % and no observations are lost (:func:`sharing_with_placed`). Images with a
 camera of the user's are not compared.
 """
 

@@ -39,7 +39,7 @@ EXPECTED_IMAGE = (
 MAX_SHOWN = 60  # characters of a value in a message
 
 
-def to_image(source: ImageSource, store: ImageStore | None = None, name: str = "image") -> Image:
+def as_image(source: ImageSource, store: ImageStore | None = None, name: str = "image") -> Image:
     """Return the image of a path, an array, a PIL image or a tensor.
 
     Paths are decoded by ``store``, if given, which remembers them. ``name`` is the argument, for

@@ -108,7 +108,7 @@ class Assembly:
             "precision": precision or self.placement.precision,
             "weights": weights,
         }
-        # The code and the weights of a matcher of this package have digests, or versions in keys.
+        # The weights of a matcher of this package have digests, and its code has ``keys.POINTS_VERSION``.
         if is_own or name.startswith(VISMATCH):
             settings["version"] = self._version_of(name) or self.nonce
         elif packages := spec_of(name, f"matcher {name}").packages:

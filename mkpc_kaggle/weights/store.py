@@ -1,14 +1,15 @@
 """The weight files of this machine, found by name or digest and compared with the manifest.
 
-The file of a slot (:meth:`WeightStore.find`) is the one that the user gives for it, whatever its bytes. Else it
-is the first usable one: for each of the slot's lines in the manifest, a file with the name of the line; then a
-renamed file with the digest of a line; then a checkpoint that is unpacked into a directory. Within each of these
-steps, directories of ``--weights`` come first, then ``$MKPC_WEIGHTS`` and /kaggle/input.
+The file of a slot (:meth:`WeightStore.find`) is the one that the user gives for it in Python, whatever its bytes.
+Else it is the first usable one of three steps: files with the name of one of the slot's lines in the manifest;
+renamed files with the digest of a line; checkpoints that are unpacked into a directory. Within a step, the
+order of the lines decides first; then that of the directories, ``--weights``, ``$MKPC_WEIGHTS``, /kaggle/input;
+then shallow paths are before deep ones.
 
-Usable are files with the digest of their line, or of a line without one (``unverified``), and unpacked
-checkpoints (:func:`judge`). Manifests in the searched directories add lines. A file whose licence is not
-permitted, or that does not fit its network, leaves the matcher out, and no other file is tried
-(:mod:`mkpc_kaggle.setup.availability`).
+Usable are files with the digest of their line, or of a line without one (``unverified``) unless they are another
+line's or have another size than it states, and unpacked checkpoints (:func:`judge`). Manifests in the searched
+directories add lines. A file whose licence is not permitted, or that does not fit its network, leaves the
+matcher out, and no other file is tried (:mod:`mkpc_kaggle.setup.availability`).
 """
 
 import copy

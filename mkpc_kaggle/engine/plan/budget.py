@@ -58,7 +58,7 @@ def parse_duration(text: str) -> float:
 class Budget:
     """The time of a run since ``started``, in seconds of ``clock``, which never jumps.
 
-    No unit runs after ``stop_units``, and the run stops waiting for workers at ``stop_waiting``.
+    No unit begins after ``stop_units``, and the run stops waiting for workers at ``stop_waiting``.
     Writing of the final submission starts at ``final_write``. The process ends before ``limit``.
     """
 
@@ -81,7 +81,7 @@ class Budget:
 
     @property
     def reserve(self) -> float:
-        """Seconds at the end in which no unit runs."""
+        """Seconds at the end, most of which have no new unit."""
         # At least 1.5 s for the ends of processes, even in runs of a minute.
         return min(max(1.5, 0.005 * self.time_limit), 60.0)
 

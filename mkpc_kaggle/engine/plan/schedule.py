@@ -6,10 +6,13 @@ costs and the time left whenever a worker is idle.
 A unit no longer fits in time by two rules. The time left ends at :attr:`Snapshot.stop`: before the estimates,
 scenes and candidates that are still due, for which up to a fifth of the limit is reserved.
 
-- :func:`prefix_that_fits`: the forecast for it and the units before it, on all rows, exceeds the time left. It
-  waits for the last phase.
-- :func:`pairs_in_time`: one more pair would not end in time. It does not begin, in any phase. Near the end, a
-  minibatch is made smaller first. A unit that was never measured always fits while there is time.
+- :func:`prefix_that_fits`: its forecast and those of the units before it, for all missing pairs, exceed the time
+  left of all workers that match. It waits for the last phase.
+- :func:`pairs_in_time`: by its mean, one more pair would not end in time. It does not begin, in any phase. Near
+  the end, a minibatch is made smaller first.
+
+A forecast is the mean of the latest runs and a margin, 40 % after one and 1 % after many. A unit without a run
+fits while there is time; after its warm-up alone, its mean is that of the warm-up.
 
 A job has the expected seconds of its units and the time left. Its worker applies the second rule again before each
 minibatch, by its own clock (``may_start`` of :class:`mkpc_kaggle.engine.workers.worker.MatchRunner`).

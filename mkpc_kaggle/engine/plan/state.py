@@ -155,8 +155,10 @@ class State:
 
         - "earlier": the F of the last table of pairs, while it :attr:`stands_in`: the pair has no estimate
           yet, or this F was a scene's and the batch has no scene of today yet;
-        - "scene": the F of the pair's cameras, where :func:`mkpc_kaggle.scene.choose.choose` prefers it;
-        - "pair": the F of its matches, at the focal lengths of the scene if these are known;
+        - "scene": the F of the pair's cameras, unless its matches contradict it
+          (:func:`mkpc_kaggle.scene.choose.choose`);
+        - "pair": the F of its matches; with ``[focal]``, and if the cameras give no F, at the focal lengths of
+          the scene;
         - "fallback": a fixed matrix.
         """
         sources, written = self._written

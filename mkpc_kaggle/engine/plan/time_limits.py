@@ -1,13 +1,14 @@
 """Time limits of workers: the seconds after which a worker that starts, or computes a job, counts as hung.
 
-The loop asks again at every turn while a job runs, because costs become known. :func:`time_limit` is 30 times
-the expected cost of the job, plus the silence that is always allowed: 2 % of the limit of the run, 5 to 60 s.
+The loop asks again at every turn while a job runs, because costs become known. :func:`time_limit` adds the
+silence that is always allowed, 2 % of the limit of the run but 5 to 60 s, to:
 
-- Matching: the measured seconds of its units, plus their warm-up. Until all are measured, a quarter of the time
-  that is left, an hour at most. The same for a feature of an image, whose cost is never known.
-- Estimates: the measured mean. Until it is known, 1 s each, and no more than that quarter.
-- A scene: the seconds measured on other scenes, at least 3 s and 0.5 ms per match.
-- A start (:func:`start_limit`): 300 s to load matchers; for other workers that quarter, 300 s at most.
+- Matching: 30 times the mean seconds of the job's units, for each pair, and their longest warm-up once. Until all
+  are measured: a quarter of the time that is left, an hour at most. The same for a feature of an image.
+- Estimates: 30 times the mean; until it is known, 30 s a pair, and no more than that quarter.
+- A scene: 30 times the seconds expected from other scenes, at least of 3 s and 0.5 ms per match.
+
+A start (:func:`start_limit`) has 300 s for matchers; other workers have that quarter, 300 s at most.
 
 :meth:`mkpc_kaggle.engine.workers.places.Place.poll` ends a worker that has not answered by then: its process
 gets SIGKILL (a Ray actor is killed by Ray), and its job is lost. A worker in a thread of the user's process

@@ -1,8 +1,8 @@
 """Image files: the digest of each file's content, and the facts about each content.
 
 The store remembers a file's size, time of change and digest under its name. A file is digested
-again only if its size or time has changed. A fresh run digests nothing: the worker that decodes an
-image returns its digest.
+again only if its size or time has changed. A fresh run of ``submit`` digests nothing: the worker
+that decodes an image returns its digest.
 
 **An image that is replaced** has another digest, so another key: its pairs and their batch's scene are computed
 again, and no result of these pairs with the former file is used. The batch's other pairs have the F of the
