@@ -13,7 +13,7 @@ from mkpc_kaggle.data.images import read_size
 from mkpc_kaggle.errors import UserError, plural
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.intrinsics import LENS_MODELS, PlacedCamera, Rows
-from mkpc_kaggle.scene.whole_files import CAMERA, COUNT, IMAGE, KEYPOINT_BYTES, MODEL_NAMES
+from mkpc_kaggle.scene.whole_files import CAMERA, IMAGE, KEYPOINT_BYTES, MODEL_NAMES, RECORDS
 
 CAMERAS = "cameras.bin"
 IMAGES = "images.bin"
@@ -93,8 +93,8 @@ def read_cameras(folder: Path) -> dict[str, tuple[PlacedCamera, Size]]:
 
 def _lenses(data: bytes) -> Iterator[tuple[int, StoredCamera]]:
     """Yield each camera with its number."""
-    (count,) = COUNT.unpack_from(data)
-    at = COUNT.size
+    (count,) = RECORDS.unpack_from(data)
+    at = RECORDS.size
     for _ in range(count):
         number, model, width, height = CAMERA.unpack_from(data, at)
         if model not in MODEL_NAMES:
@@ -112,15 +112,15 @@ def _images(
     data: bytes, lenses: Mapping[int, StoredCamera]
 ) -> Iterator[tuple[str, tuple[PlacedCamera, Size]]]:
     """Yield each image's name, with its camera and its size."""
-    (count,) = COUNT.unpack_from(data)
-    at = COUNT.size
+    (count,) = RECORDS.unpack_from(data)
+    at = RECORDS.size
     for _ in range(count):
         _, w, x, y, z, *t, camera = IMAGE.unpack_from(data, at)
         at += IMAGE.size
         end = data.index(b"\0", at)
         name = data[at:end].decode("utf-8")
-        (points,) = COUNT.unpack_from(data, end + 1)
-        at = end + 1 + COUNT.size + points * KEYPOINT_BYTES
+        (points,) = RECORDS.unpack_from(data, end + 1)
+        at = end + 1 + RECORDS.size + points * KEYPOINT_BYTES
         if camera not in lenses:
             raise ValueError(f"{name} has camera {camera}, which {CAMERAS} lacks")
         lens = lenses[camera]

@@ -33,7 +33,7 @@ def undistort(model: Any, photographs: Path, folder: Path) -> None:
     used = {image.camera_id for image in model.images.values()}
     for number in sorted(used):
         camera = model.cameras[number]
-        if any(lens_of(camera).distortion):
+        if any(given_lens(camera).distortion):
             pinholes[number] = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera)
     for _, image in sorted(model.images.items()):
         if image.camera_id not in pinholes:
@@ -48,7 +48,7 @@ def undistort(model: Any, photographs: Path, folder: Path) -> None:
         picture = read_image(photographs / image.name)
         if isinstance(picture, Image) and not path.exists():
             size = Size(pinhole.width, pinhole.height)
-            pixels = undistorted(picture.pixels, lens_of(camera), lens_of(pinhole), size)
+            pixels = undistorted(picture.pixels, given_lens(camera), given_lens(pinhole), size)
             path.write_bytes(encoded(pixels, path.suffix.lower()))
     for number, pinhole in pinholes.items():
         model.cameras[number].model = pinhole.model
@@ -57,7 +57,7 @@ def undistort(model: Any, photographs: Path, folder: Path) -> None:
         model.cameras[number].height = pinhole.height
 
 
-def lens_of(camera: Any) -> KnownCamera:
+def given_lens(camera: Any) -> KnownCamera:
     return KnownCamera(camera.model_name, tuple(float(value) for value in camera.params))
 
 

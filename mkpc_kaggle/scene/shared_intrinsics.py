@@ -170,7 +170,7 @@ def with_placed_intrinsics(part: MergedGraph, reconstruction: Reconstruction) ->
         if image.digest in known or registered.lens is None or len(of_size) != 1:
             continue
         (lens,) = of_size
-        own, placed = (displacement_of(each, image.size) for each in (registered.lens, lens))
+        own, placed = (displacement_of(one, image.size) for one in (registered.lens, lens))
         is_alike = abs(registered.focal / lens.focal - 1) < TOLERANCE
         if is_alike and abs(own - placed) < MIN_DISPLACEMENT:
             alike[image.digest] = lens

@@ -12,7 +12,7 @@ from typing import TypeAlias
 
 from mkpc_kaggle.geometry.intrinsics import LENS_MODELS
 
-COUNT = struct.Struct("<Q")
+RECORDS = struct.Struct("<Q")  # the number of records that follow
 CAMERA = struct.Struct("<IiQQ")  # id, model, width, height
 IMAGE = struct.Struct("<I7dI")  # id, quaternion (w, x, y, z), t, id of the camera
 KEYPOINT_BYTES = 24  # x, y, and the point that it sees
@@ -50,8 +50,8 @@ def is_whole_model_file(path: Path) -> bool:
     try:
         data = path.read_bytes()
         record_end = RECORD_ENDS[path.name]
-        end = COUNT.size
-        for _ in range(_number(COUNT, data)):
+        end = RECORDS.size
+        for _ in range(_number(RECORDS, data)):
             end = record_end(data, end)
     except (OSError, struct.error, ValueError, KeyError):
         return False
@@ -71,12 +71,12 @@ def _camera_end(data: bytes, start: int) -> int:
 
 def _image_end(data: bytes, start: int) -> int:
     name_end = data.index(b"\0", start + IMAGE.size) + 1
-    return name_end + COUNT.size + _number(COUNT, data, name_end) * KEYPOINT_BYTES
+    return name_end + RECORDS.size + _number(RECORDS, data, name_end) * KEYPOINT_BYTES
 
 
 def _point_end(data: bytes, start: int) -> int:
     track_start = start + POINT.size
-    return track_start + COUNT.size + _number(COUNT, data, track_start) * OBSERVATION_BYTES
+    return track_start + RECORDS.size + _number(RECORDS, data, track_start) * OBSERVATION_BYTES
 
 
 RECORD_ENDS: Mapping[str, RecordEnd] = MappingProxyType(
