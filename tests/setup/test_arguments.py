@@ -27,7 +27,7 @@ from mkpc_kaggle.matchers.networks.aliked import Aliked
 from mkpc_kaggle.matchers.registry import matcher_names
 from mkpc_kaggle.recipe import Recipe, Unit, load_recipe
 from mkpc_kaggle.setup import assembly
-from mkpc_kaggle.setup.arguments import boxes_of, intrinsics_of, to_image
+from mkpc_kaggle.setup.arguments import boxes_of, intrinsics_of, as_image
 from mkpc_kaggle.setup.assembly import recipe_of_name
 
 pytestmark = pytest.mark.usefixtures("nowhere_else")
@@ -93,13 +93,13 @@ SAME_GRAY = {
 
 @pytest.mark.parametrize("form", SAME)
 def test_an_image_in_each_form_has_the_same_pixels(form):
-    found = to_image(SAME[form](pixels()))
+    found = as_image(SAME[form](pixels()))
     np.testing.assert_array_equal(found.pixels, pixels())
 
 
 @pytest.mark.parametrize("form", SAME_GRAY)
 def test_a_gray_image_in_each_form_has_the_same_pixels(form):
-    found = to_image(SAME_GRAY[form](pixels()))
+    found = as_image(SAME_GRAY[form](pixels()))
     np.testing.assert_array_equal(found.pixels, np.stack([gray(pixels())] * 3, axis=2))
 
 
@@ -108,8 +108,8 @@ def test_a_pil_image_has_the_orientation_of_its_file(tmp_path):
     PIL.Image.fromarray(pixels()).save(path)
     set_exif(path, ROTATED)
     for source in (path, str(path), PIL.Image.open(path)):
-        assert to_image(source).turns == 3
-        np.testing.assert_array_equal(to_image(source).pixels, pixels())
+        assert as_image(source).turns == 3
+        np.testing.assert_array_equal(as_image(source).pixels, pixels())
 
 
 REFUSED_IMAGES = {
