@@ -27,7 +27,7 @@ from mkpc_kaggle.matchers.networks.aliked import Aliked
 from mkpc_kaggle.matchers.registry import matcher_names
 from mkpc_kaggle.recipe import Recipe, Unit, load_recipe
 from mkpc_kaggle.setup import assembly
-from mkpc_kaggle.setup.arguments import boxes_of, intrinsics_of, as_image
+from mkpc_kaggle.setup.arguments import as_image, boxes_of, intrinsics_of
 from mkpc_kaggle.setup.assembly import recipe_of_name
 
 pytestmark = pytest.mark.usefixtures("nowhere_else")
