@@ -137,7 +137,7 @@ def reconstruct_graph(
     reconstructions = list(mapped.reconstructions)
     shared = mapped.shared
     if placed_by_name(graph):
-        reconstructions = [_in_world_of(found, given_graph, origin) for found in reconstructions]
+        reconstructions = [_in_world_of(one, given_graph, origin) for one in reconstructions]
     if directory is not None:
         from mkpc_kaggle.scene.colmap import write_files
 
