@@ -23,7 +23,7 @@ from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import COLMAP_CENTRE_PX, Matrix3
 from mkpc_kaggle.geometry.intrinsics import PlacedCamera
 from mkpc_kaggle.recipe import CameraModel, SceneConfig
-from mkpc_kaggle.scene.adjustment import adjust, settle_rotations
+from mkpc_kaggle.scene.adjustment import adjust
 from mkpc_kaggle.scene.edges import supported
 from mkpc_kaggle.scene.export import (
     DATABASE,
@@ -128,9 +128,6 @@ def write_files(
         with file as database:
             _fill(database, merged, shared, config, reuse=True)
         for number, model in enumerate(models):
-            # Placed cameras stay as they were read.
-            placed = placed_by_name(merged.graph).keys() - {*model.comparison.misplaced}
-            settle_rotations(model.colmap, placed)
             kept = {each.image.name for each in model.images}
             # A list, because the loop removes frames from the mapping.
             for frame in [frame for frame in model.colmap.frames.values() if frame.has_pose()]:

@@ -139,12 +139,18 @@ def reconstruct_graph(
     if placed_by_name(graph):
         reconstructions = [_in_world_of(one, given_graph, origin) for one in reconstructions]
     if directory is not None:
+        from mkpc_kaggle.scene.adjustment import settle_rotations
         from mkpc_kaggle.scene.colmap import write_files
 
         # Before the files are written, so that files and results agree. Placed cameras have a world.
-        if not placed_by_name(graph):
+        placed = placed_by_name(graph).keys()
+        if not placed:
             reconstructions = align(reconstructions, read_reference(directory.path))
-        write_files(directory, mapped.parts[0], shared, models_of(reconstructions), config)
+        models = models_of(reconstructions)
+        for model in models:
+            # Placed cameras stay as they were read.
+            settle_rotations(model.colmap, placed - {*model.comparison.misplaced})
+        write_files(directory, mapped.parts[0], shared, models, config)
     # Images without a camera have the refined focal length, and not the one it began with.
     if given:
         shared = refined_intrinsics(free, models_of(reconstructions))
