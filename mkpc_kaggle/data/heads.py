@@ -6,6 +6,7 @@ megapixels, since it would decode them; here no pixel is decoded.
 
 import struct
 import warnings
+import zlib
 from collections.abc import Callable, Iterator
 from io import BytesIO
 from numbers import Real
@@ -78,6 +79,24 @@ def size_of(stream: BinaryIO) -> Size | None:
             return Size(*picture.size)
     except DAMAGE:
         return None
+
+
+def is_whole_png(data: bytes) -> bool:
+    """Return whether all chunks of a PNG file fit their checksums. No pixel is decoded."""
+    if not data.startswith(PNG_START):
+        return False
+    view = memoryview(data)
+    start = len(PNG_START)
+    while start + 12 <= len(data):
+        length, kind = struct.unpack_from(">I4s", data, start)
+        end = start + 8 + length
+        # The checksum is of the kind and the content.
+        if view[end : end + 4] != zlib.crc32(view[start + 4 : end]).to_bytes(4, "big"):
+            return False
+        if kind == b"IEND":
+            return True
+        start = end + 4
+    return False
 
 
 def exif_tags(data: bytes) -> dict[int, float]:

@@ -13,13 +13,18 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mkpc_kaggle.data.competition import evenly_spread
+from mkpc_kaggle.data.heads import is_whole_png
 from mkpc_kaggle.data.images import ByteCache, decode, read_size
 from mkpc_kaggle.data.outputs import lies_in
 from mkpc_kaggle.errors import UserError, plural
 from mkpc_kaggle.geometry.coordinates import Points, Size
+from mkpc_kaggle.geometry.resolution import text_of
 
 CACHE_BYTES = 128 << 20
 MASK_SUFFIX = ".png"
+# Masks that are decoded before the run: one of 24 megapixels takes 0.28 s.
+MAX_DECODED = 24
 MIN_SHOWN = 0.05  # share of an image; a mask that shows less is often inverted
 
 
@@ -41,7 +46,8 @@ class Masks:
 
         An image without a mask is used whole. Raises :class:`UserError` for a directory that is
         missing, has images of the run or no masks of these images. Raises it also for a mask that
-        is unreadable or not as large as its image.
+        is unreadable or not as large as its image. Of many masks, up to ``MAX_DECODED`` are decoded; of
+        the others, sizes and checksums are read.
         """
         if not directory.is_dir():
             raise UserError(
@@ -54,20 +60,26 @@ class Masks:
                 f"--masks {directory} has images of the run, so masks count as images; move it elsewhere"
             )
         present = _files_below(directory)
-        files: dict[str, tuple[str, str]] = {}
-        unusual: dict[str, list[Path]] = {}
+        masked: dict[Path, Path] = {}
         for image in images:
             path = present.pop(_key(f"{image.relative_to(root).as_posix()}{MASK_SUFFIX}"), None)
-            if path is None:  # as in COLMAP, an image without a mask is used whole
-                continue
-            effect = _checked(path, image)
-            if effect:
-                unusual.setdefault(effect, []).append(path)
-            files[str(image)] = (str(path), _digest(path))
-        if not files:
+            if path is not None:  # as in COLMAP, an image without a mask is used whole
+                masked[image] = path
+        if not masked:
             name = images[0].relative_to(root).as_posix() if images else "a.jpg"
             expected = f"{name}{MASK_SUFFIX}"
             raise UserError(f"{directory} has no mask of any image: {expected} would be the first")
+        files: dict[str, tuple[str, str]] = {}
+        unusual: dict[str, list[Path]] = {}
+        sample = set(evenly_spread([*masked.values()], MAX_DECODED))
+        for image, path in masked.items():
+            data = _bytes_of(path)
+            mask = read_mask(path) if path in sample or not is_whole_png(data) else None
+            _require_size(path, image, mask)
+            effect = "" if mask is None else _effect(mask)
+            if effect:
+                unusual.setdefault(effect, []).append(path)
+            files[str(image)] = (str(path), _digest(data))
         lines = _lines(directory, len(images), len(files), present, unusual)
         is_partial = len(files) < len(images) or bool(present or unusual)
         return cls(files, tuple(lines), is_partial)
@@ -109,27 +121,37 @@ def _lines(
         belong = "belongs" if len(surplus) == 1 else "belong"
         line += f"; {plural(len(surplus), 'file')} of {directory} {belong} to none, the first is {first}"
     yield line
+    of_sample = f" of {MAX_DECODED} that were decoded" if masked > MAX_DECODED else ""
     for effect, paths in unusual.items():
-        yield f"masks that {effect}: {len(paths)}, the first is {paths[0]}"
+        yield f"masks that {effect}: {len(paths)}{of_sample}, the first is {paths[0]}"
 
 
-def _checked(path: Path, image: Path) -> str:
-    """Return what is unusual about a mask, if anything. Raise :class:`UserError` for a mask that is
-    unreadable or not as large as its image.
-    """
+def _bytes_of(path: Path) -> bytes:
     if not path.is_file():
         raise UserError(f"{path} cannot be read: not a regular file")
-    mask = read_mask(path)
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise UserError(f"the mask {path} cannot be read: {error}") from error
+
+
+def _require_size(path: Path, image: Path, mask: NDArray[np.bool_] | None) -> None:
+    """Raise :class:`UserError` for a mask that is not as large as its image. ``mask`` has its pixels, if it was
+    decoded.
+    """
+    found = read_size(path) if mask is None else Size(mask.shape[1], mask.shape[0])
     size = read_size(image)
     # An unreadable image is reported by the run.
-    if size is not None and size != (mask.shape[1], mask.shape[0]):
-        found = f"{mask.shape[1]} x {mask.shape[0]}"
-        remedy = "make them equal"
-        if size == (mask.shape[0], mask.shape[1]):
-            remedy = "masks are for pixels as stored, without the rotation of EXIF"
-        raise UserError(
-            f"{path} has {found} pixels, its image {size.width} x {size.height}; {remedy}"
-        )
+    if found is None or size is None or found == size:
+        return
+    remedy = "make them equal"
+    if (size.height, size.width) == found:
+        remedy = "masks are for pixels as stored, without the rotation of EXIF"
+    raise UserError(f"{path} has {text_of(found)} pixels, its image {text_of(size)}; {remedy}")
+
+
+def _effect(mask: NDArray[np.bool_]) -> str:
+    """Return what is unusual about a mask, if anything."""
     if not mask.any():
         return "hide everything"
     if mask.mean() < MIN_SHOWN:
@@ -162,8 +184,8 @@ def read_mask(path: Path) -> NDArray[np.bool_]:
     return np.asarray(shown)
 
 
-def _digest(path: Path) -> str:
-    return hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest()
+def _digest(data: bytes) -> str:
+    return hashlib.blake2b(data, digest_size=16).hexdigest()
 
 
 class MaskReader:
@@ -186,7 +208,7 @@ class MaskReader:
             path = Path(name)
             mask = read_mask(path)
             # Results with this mask are stored under the digest.
-            if _digest(path) != digest:
+            if _digest(path.read_bytes()) != digest:
                 raise UserError(
                     f"the mask {path} has changed during the run; run the command again"
                 )

@@ -2,6 +2,7 @@
 
 import unicodedata
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import cv2
@@ -9,6 +10,7 @@ import numpy as np
 import PIL.Image
 import pytest
 
+from mkpc_kaggle.data import masks
 from mkpc_kaggle.data.masks import MaskReader, Masks, read_mask
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Size
@@ -107,6 +109,36 @@ def test_masks_that_hide_everything_or_nothing_are_named(folder):
     assert everything == f"masks that hide everything: 2, the first is {folder}/M/0.png.png"
     assert nothing.startswith("masks that hide nothing, since only black")
     assert nothing.endswith(f": 1, the first is {folder}/M/2.png.png")
+
+
+def test_of_many_masks_some_are_decoded_and_all_are_checked(folder, monkeypatch):
+    monkeypatch.setattr(masks, "MAX_DECODED", 2)
+    decoded = []
+    monkeypatch.setattr(masks, "read_mask", lambda path: decoded.append(path) or read_mask(path))
+    for number in range(5):
+        save(0 * HALF, folder / "M" / f"{number}.png.png")
+    _, everything = masks_of(folder).lines
+    assert [path.name for path in decoded] == ["0.png.png", "4.png.png"]
+    assert everything.startswith("masks that hide everything: 2 of 2 that were decoded, the first")
+    # The others are no less refused.
+    save(HALF.T, folder / "M" / "2.png.png")
+    with pytest.raises(
+        UserError, match=r"2\.png\.png has 20 x 30 pixels, its image 30 x 20; masks"
+    ):
+        masks_of(folder)
+    for damaged in (b"no picture", b""):
+        (folder / "M" / "2.png.png").write_bytes(damaged)
+        with pytest.raises(UserError, match=r"2\.png\.png cannot be read"):
+            masks_of(folder)
+    # A file that does not fit its checksums is decoded.
+    save(HALF, folder / "M" / "2.png.png")
+    data = bytearray((folder / "M" / "2.png.png").read_bytes())
+    data[-20] ^= 255
+    (folder / "M" / "2.png.png").write_bytes(data)
+    decoded.clear()
+    with suppress(UserError):  # OpenCV decides
+        masks_of(folder)
+    assert folder / "M" / "2.png.png" in decoded
 
 
 def test_equal_names_may_be_written_in_two_ways(folder):
