@@ -146,6 +146,7 @@ def displacement_of(camera: KnownCamera, size: Size) -> float:
     return radial_factor(camera, max(size) / 2 / camera.focal) - 1
 
 
+WILD = frozenset("*?[")  # in a pattern
 Rows = Sequence[tuple[str, KnownCamera]]  # a name or a pattern of images, and their camera
 
 
@@ -162,25 +163,50 @@ def parse_row(pattern: str, model: str, parameters: str, sigma: str) -> tuple[st
     return pattern.strip(), KnownCamera(model.strip(), values, percent)
 
 
-def camera_of(rows: Rows, *names: str) -> KnownCamera | None:
-    """Return the camera of the first row that names an image by one of its ``names``, or None.
+class CameraTable:
+    """Finds the row that names an image, without a look at each row: both may be thousands.
 
-    A row names it by path, by file name, or by a pattern of these; a placed camera by path alone.
+    A row names an image by path, by file name, or by a pattern of these; a placed camera by path alone. The
+    first such row counts.
     """
-    # macOS writes "é" as two characters, and most tables as one.
-    paths = [unicodedata.normalize("NFC", name) for name in names]
-    for written_pattern, known in rows:
-        pattern = unicodedata.normalize("NFC", written_pattern)
-        # Another folder may have a photograph of the same name elsewhere.
-        is_placed = isinstance(known, PlacedCamera)
-        if any(pattern == path if is_placed else _is_named(path, pattern) for path in paths):
-            return known
-    return None
+
+    def __init__(self, rows: Rows) -> None:
+        self.rows = rows
+        # The first row with each text
+        self._placed: dict[str, int] = {}
+        self._texts: dict[str, int] = {}
+        self._patterns: list[tuple[int, str]] = []
+        for number, (written, camera) in enumerate(rows):
+            text = _composed(written)
+            # Another folder may have a photograph of the same name elsewhere.
+            if isinstance(camera, PlacedCamera):
+                self._placed.setdefault(text, number)
+                continue
+            # A file may be called "photo [1].jpg", and as a pattern this is another.
+            self._texts.setdefault(text, number)
+            if WILD.intersection(text):
+                self._patterns.append((number, text))
+
+    def row_of(self, *names: str) -> int | None:
+        """Return the number of the first row that names an image by one of its ``names``, or None."""
+        numbers = []
+        for path in map(_composed, names):
+            base = path.rpartition("/")[2]
+            numbers += [self._placed.get(path), self._texts.get(path), self._texts.get(base)]
+            fitting = (
+                number
+                for number, pattern in self._patterns
+                if fnmatch.fnmatchcase(path, pattern) or fnmatch.fnmatchcase(base, pattern)
+            )
+            numbers.append(next(fitting, None))
+        return min((number for number in numbers if number is not None), default=None)
+
+    def camera_of(self, *names: str) -> KnownCamera | None:
+        """Return the camera of the first row that names an image by one of its ``names``, or None."""
+        number = self.row_of(*names)
+        return None if number is None else self.rows[number][1]
 
 
-def _is_named(path: str, pattern: str) -> bool:
-    base = path.rpartition("/")[2]
-    # Equality first: a file may be called "photo [1].jpg", and as a pattern this is another.
-    if pattern in (path, base):
-        return True
-    return fnmatch.fnmatchcase(path, pattern) or fnmatch.fnmatchcase(base, pattern)
+def _composed(text: str) -> str:
+    """Return the text with composed letters: macOS writes "é" as two characters, most tables as one."""
+    return unicodedata.normalize("NFC", text)

@@ -9,7 +9,7 @@ from mkpc_kaggle.data.images import EXIF_FOCALS, is_crop, read_size
 from mkpc_kaggle.engine.console import logger
 from mkpc_kaggle.errors import UserError, plural
 from mkpc_kaggle.geometry.coordinates import Size
-from mkpc_kaggle.geometry.intrinsics import KnownCamera, Rows, camera_of, parse_row, radial_factor
+from mkpc_kaggle.geometry.intrinsics import CameraTable, KnownCamera, Rows, parse_row, radial_factor
 from mkpc_kaggle.geometry.resolution import (
     MAX_OFFSET,
     is_same_shape,
@@ -53,15 +53,13 @@ def read_intrinsics_table(file: Path, root: Path, images: Iterable[Path]) -> Row
         raise UserError(f"{file} has no rows; the columns are {', '.join(COLUMNS)}")
     used = set()
     warned = set()
+    table = CameraTable(rows)
     for image in images:
-        name = image.relative_to(root).as_posix()
-        known = camera_of(rows, name)
-        if known is None:
+        number = table.row_of(image.relative_to(root).as_posix())
+        if number is None:
             continue
-        # By identity, because two rows may have equal cameras
-        number = next(n for n, (_, camera) in enumerate(rows) if camera is known)
         used.add(number)
-        doubt = require_fit(known, sizes[number], image, where[number])
+        doubt = require_fit(rows[number][1], sizes[number], image, where[number])
         # A row may name thousands of images.
         if doubt and number not in warned:
             warned.add(number)
@@ -85,9 +83,10 @@ def crops_line(rows: Rows, root: Path, images: Sequence[Path]) -> str:
     """
     sample = evenly_spread(images, MAX_HEADS)
     crops = []
+    table = CameraTable(rows)
     for image in sample:
         size = read_size(image)
-        is_known = camera_of(rows, image.relative_to(root).as_posix()) is not None
+        is_known = table.row_of(image.relative_to(root).as_posix()) is not None
         if size is not None and not is_known and is_crop(image, size):
             crops.append(f"{image.relative_to(root).as_posix()} with {text_of(size)} pixels")
     if not crops:
@@ -115,7 +114,8 @@ def intrinsics_line(rows: Rows, root: Path, images: Sequence[Path]) -> str:
 
 def _without_camera(rows: Rows, root: Path, images: Sequence[Path]) -> list[str]:
     names = (image.relative_to(root).as_posix() for image in images)
-    return [name for name in names if camera_of(rows, name) is None]
+    table = CameraTable(rows)
+    return [name for name in names if table.row_of(name) is None]
 
 
 def parse_size(cell: str) -> Size | None:

@@ -10,7 +10,7 @@ from scipy.sparse.csgraph import connected_components
 
 from mkpc_kaggle.geometry.coordinates import Matrix3, Size
 from mkpc_kaggle.geometry.focal_prior import FOCAL_RATIO
-from mkpc_kaggle.geometry.intrinsics import KnownCamera, PlacedCamera, Rows, camera_of
+from mkpc_kaggle.geometry.intrinsics import CameraTable, KnownCamera, PlacedCamera, Rows
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.pipeline.pair import UnitResult
 
@@ -133,8 +133,9 @@ class ViewGraph:
     def with_intrinsics(self, rows: Rows) -> "ViewGraph":
         """Return the graph with the user's cameras of the images that the rows name."""
         # By contents: a copy under another name is the same photograph.
+        table = CameraTable(rows)
         found = {
-            image.digest: camera_of(rows, image.name, *self.copies.get(image.digest, ()))
+            image.digest: table.camera_of(image.name, *self.copies.get(image.digest, ()))
             for image in self.images
         }
         return replace(

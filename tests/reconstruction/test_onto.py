@@ -18,7 +18,7 @@ from benchmarks.synthetic_scene import SIZE, SyntheticScene, synthetic_scene
 from mkpc_kaggle import reconstruct
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Size
-from mkpc_kaggle.geometry.intrinsics import KnownCamera, PlacedCamera, camera_of
+from mkpc_kaggle.geometry.intrinsics import CameraTable, KnownCamera, PlacedCamera
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.reconstruction.placed import placed_line, read_cameras, read_placed
 from mkpc_kaggle.scene.align import find_similarity, model_size, moved_by
@@ -194,11 +194,11 @@ def test_a_line_counts_the_images_that_keep_their_cameras(home):
 def test_a_camera_is_placed_by_its_path_alone():
     camera = PlacedCamera("SIMPLE_PINHOLE", (500.0, 320, 240), pose=(0, 0, 0, 1, 0, 0, 0))
     rows = [("a.jpg", camera), ("b[1].jpg", camera)]
-    assert camera_of(rows, "a.jpg") is camera
-    assert camera_of(rows, "b[1].jpg") is camera
+    assert CameraTable(rows).camera_of("a.jpg") is camera
+    assert CameraTable(rows).camera_of("b[1].jpg") is camera
     # Other photographs that only a pattern or a file name would name
     for name in ("left/a.jpg", "b1.jpg"):
-        assert camera_of(rows, name) is None
+        assert CameraTable(rows).camera_of(name) is None
     with pytest.raises(ValueError, match="seven finite numbers"):
         PlacedCamera("SIMPLE_PINHOLE", (500.0, 320, 240), pose=(0, 0, 0, 1))
 

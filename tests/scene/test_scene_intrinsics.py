@@ -1,5 +1,6 @@
 """Intrinsics that the user knows: tables of them, and scenes with exact and with uncertain ones."""
 
+import fnmatch
 from dataclasses import replace
 
 import numpy as np
@@ -9,9 +10,9 @@ import pytest
 from benchmarks.synthetic_scene import synthetic_scene
 from mkpc_kaggle.geometry.intrinsics import (
     LENS_MODELS,
+    CameraTable,
     KnownCamera,
     PlacedCamera,
-    camera_of,
     parse_row,
 )
 from mkpc_kaggle.recipe import CameraSharing, SceneConfig
@@ -141,6 +142,16 @@ def test_distortion_is_part_of_verification_and_of_the_model(tmp_path):
         np.testing.assert_array_equal(image.camera.params, expected)
 
 
+def test_names_are_looked_up_and_only_patterns_are_compared_with_each_image(monkeypatch):
+    compared = []
+    monkeypatch.setattr(fnmatch, "fnmatchcase", lambda *texts: compared.append(texts))
+    names = [f"{number:04d}.jpg" for number in range(100)]
+    rows = [parse_row(name, "SIMPLE_PINHOLE", "900 10 10", "fixed") for name in [*names, "x*.jpg"]]
+    table = CameraTable(rows)
+    assert [table.row_of(f"walk/{name}") for name in names] == list(range(100))
+    assert len(compared) == 2 * 100, "by path and by name, with the one pattern"
+
+
 def test_a_row_names_an_image_by_its_path_its_name_or_a_pattern():
     # The focal length is the row's number.
     rows = []
@@ -159,7 +170,7 @@ def test_a_row_names_an_image_by_its_path_its_name_or_a_pattern():
     }
     found = {}
     for name in expected:
-        camera = camera_of(rows, name)
+        camera = CameraTable(rows).camera_of(name)
         found[name] = None if camera is None else camera.focal
     assert found == expected
 
