@@ -5,7 +5,6 @@ may have the name of one.
 from collections import Counter
 from collections.abc import Collection
 from dataclasses import replace
-from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -30,9 +29,15 @@ def misplaced_images(model: Any, correspondences: Any, numbers: Collection[int])
 
     ``model`` is pycolmap's, with these images registered; ``correspondences`` has verified matches.
     """
+    import pycolmap  # may be missing, and other functions here do without
+
     checked: Counter[int] = Counter()
     consistent: Counter[int] = Counter()
-    for first, second in combinations(sorted(numbers), 2):
+    placed = set(numbers)
+    matched = map(pycolmap.pair_id_to_image_pair, correspondences.num_matches_between_all_images())
+    for first, second in sorted(matched):
+        if not {first, second} <= placed:
+            continue
         indices = correspondences.extract_matches_between_images(first, second)
         count = _count_consistent(model.images[first], model.images[second], np.asarray(indices))
         for number in (first, second):

@@ -10,9 +10,17 @@ from mkpc_kaggle.scene.sfm import reconstruct_batch
 
 
 class Correspondences:
-    """The same 200 matches between any two images."""
+    """The same 200 matches between pairs of images."""
+
+    def __init__(self, *pairs: tuple[int, int]) -> None:
+        self.pairs = {pycolmap.image_pair_to_pair_id(*pair): 200 for pair in pairs}
+        self.asked: list[tuple[int, int]] = []
+
+    def num_matches_between_all_images(self) -> dict[int, int]:
+        return self.pairs
 
     def extract_matches_between_images(self, first: int, second: int) -> np.ndarray:
+        self.asked.append((first, second))
         return np.repeat(np.arange(200)[:, None], 2, axis=1)
 
 
@@ -21,8 +29,11 @@ def test_cameras_at_one_place_contradict_nothing():
         synthetic_scene(4, points=500).pairs, SceneConfig()
     ).reconstructions
     model = pycolmap.Reconstruction(found.models[0].colmap)
-    first, second, *_ = sorted(model.reg_image_ids())
+    first, second, third, fourth = sorted(model.reg_image_ids())
     model.frames[model.images[second].frame_id].rig_from_world = model.images[
         first
     ].cam_from_world()
-    assert misplaced_images(model, Correspondences(), [first, second]) == set()
+    # Only pairs with matches are looked at, of images of the finished model.
+    matched = Correspondences((first, second), (second, third))
+    assert misplaced_images(model, matched, [first, second, fourth]) == set()
+    assert matched.asked == [(first, second)]
