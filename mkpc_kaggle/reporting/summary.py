@@ -226,13 +226,11 @@ def facts(run: AnyRun) -> Iterator[tuple[str, str, str]]:
 
 
 class ImageCounts(NamedTuple):
-    """Numbers of images: all, those with a camera, and of these the ones whose camera is unknown to within
-    the size of its model.
-    """
+    """Numbers of images in a scene or in all scenes."""
 
     images: int
-    cameras: int
-    loose: int
+    cameras: int  # images with a camera
+    loose: int  # images whose camera is unknown to within the size of its model
 
 
 def image_counts(run: AnyRun, scene: SceneRecord) -> ImageCounts:
@@ -278,7 +276,7 @@ def unpaired_sentences(run: AnyRun) -> Iterator[tuple[str, str]]:
             labels = file_labels(run.files[batch])
             yield (
                 batch,
-                f"no pair has {named([labels[name] for name in names])}: such images resemble no others, or "
+                f"no pair has {named([labels[name] for name in names])}: no other image resembles these, or "
                 "--pairs omits them; add photographs between these and the others, or pairs",
             )
 

@@ -156,7 +156,7 @@ def _scene_problems(scene: SceneRecord, log: RunLog) -> Iterator[str]:
     contents = {image.digest for image in cameras}
     pairs = log.tables.pairs
     pairs = pairs[pairs["group"] == scene.batch]
-    # Images in no pair have a sentence of their own.
+    # Images in no pair have another sentence.
     files = {*pairs["image0"], *pairs["image1"]}
     lost = {file for file in files - names if log.digests.get(file) not in contents}
     labels = file_labels({*files, *log.files.get(scene.batch, ())})

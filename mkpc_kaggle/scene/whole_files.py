@@ -52,6 +52,9 @@ def is_whole_model_file(path: Path) -> bool:
         record_end = RECORD_ENDS[path.name]
         end = RECORDS.size
         for _ in range(_number(RECORDS, data)):
+            # A damaged count may be astronomical.
+            if end >= len(data):
+                return False
             end = record_end(data, end)
     except (OSError, struct.error, ValueError, KeyError):
         return False

@@ -173,7 +173,7 @@ def test_images_in_no_pair_are_counted_and_named_in_all_outputs(tmp_path):
     *files, alone = sorted(root.iterdir())
     result = run(root, tmp_path / "out", listed=[*combinations(files, 2)])
     counts = f"{FIRST - 1} of {FIRST} images with a camera"
-    sentence = f"no pair has {alone.name}: such images resemble no others, or --pairs omits them"
+    sentence = f"no pair has {alone.name}: no other image resembles these, or --pairs omits them"
     lines = list(_lines(result, root))
     assert any(line.startswith(f"photos: {counts}") for line in lines), lines
     assert any(line.startswith(f"photos: {sentence}") for line in lines), lines

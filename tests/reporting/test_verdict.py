@@ -160,7 +160,7 @@ SPEAKS = {
             "set: the photographs are overexposed, 60 % of 33.jpg is white: 33.jpg; 1 of 2 files were read",
         ),
     ),
-    "no pair has e.jpg, f.jpg: such images resemble no others, or --pairs omits them; add": of_files(
+    "no pair has e.jpg, f.jpg: no other image resembles these, or --pairs omits them; add": of_files(
         log(scene(GOOD_MODEL), pairs=ALL), set=[*NAMES, "e.jpg", "f.jpg"]
     ),
     "other: no cameras, 0 pairs: at least three matched images are needed": replace(

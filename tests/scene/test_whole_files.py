@@ -19,6 +19,7 @@ from mkpc_kaggle.scene.export import (
     require_on_disk,
 )
 from mkpc_kaggle.scene.sfm import reconstruct_batch
+from mkpc_kaggle.scene.whole_files import is_whole_model_file
 
 LIMIT_BYTES = 20_000
 
@@ -51,6 +52,12 @@ def test_files_that_end_too_early_are_no_files_of_a_scene(written, tmp_path, nam
     for size in {0, 4, 8, len(data) // 2, len(data) - 8, len(data) - 1}:
         path.write_bytes(data[:size])
         assert not has_files(tmp_path, 1), f"{size} of {len(data)} bytes"
+
+
+@pytest.mark.parametrize("name", MODEL_FILES)
+def test_a_damaged_count_of_records_takes_no_time(tmp_path, name):
+    (tmp_path / name).write_bytes((2**60).to_bytes(8, "little") + bytes(80))
+    assert not is_whole_model_file(tmp_path / name)
 
 
 def test_a_full_disk_that_pycolmap_does_not_report_is_an_error(written, tmp_path):
