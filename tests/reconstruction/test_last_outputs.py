@@ -1,6 +1,8 @@
 """The last files of the command: a failing disk costs its own file, not the summary and the report."""
 
 import shutil
+import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -11,6 +13,13 @@ from mkpc_kaggle.reconstruction import coordinates, export, layout
 from mkpc_kaggle.scene.align import REFERENCE
 
 FULL = OSError(28, "No space left on device")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def without_drawings() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setitem(sys.modules, "matplotlib", None)
+        yield
 
 
 @pytest.fixture(scope="module")
