@@ -47,7 +47,7 @@ class Masks:
         An image without a mask is used whole. Raises :class:`UserError` for a directory that is
         missing, has images of the run or no masks of these images. Raises it also for a mask that
         is unreadable or not as large as its image. Of many masks, up to ``MAX_DECODED`` are decoded; of
-        the others, sizes and checksums are read.
+        the others, sizes and the checksums of PNG are read.
         """
         if not directory.is_dir():
             raise UserError(
@@ -72,15 +72,17 @@ class Masks:
         files: dict[str, tuple[str, str]] = {}
         unusual: dict[str, list[Path]] = {}
         sample = set(evenly_spread([*masked.values()], MAX_DECODED))
+        decoded = 0
         for image, path in masked.items():
             data = _bytes_of(path)
             mask = read_mask(path) if path in sample or not is_whole_png(data) else None
             _require_size(path, image, mask)
-            effect = "" if mask is None else _effect(mask)
-            if effect:
-                unusual.setdefault(effect, []).append(path)
             files[str(image)] = (str(path), _digest(data))
-        lines = _lines(directory, len(images), len(files), present, unusual)
+            if mask is not None:
+                decoded += 1
+                if effect := _effect(mask):
+                    unusual.setdefault(effect, []).append(path)
+        lines = _lines(directory, len(images), len(files), decoded, present, unusual)
         is_partial = len(files) < len(images) or bool(present or unusual)
         return cls(files, tuple(lines), is_partial)
 
@@ -111,6 +113,7 @@ def _lines(
     directory: Path,
     images: int,
     masked: int,
+    decoded: int,
     surplus: Mapping[str, Path],
     unusual: Mapping[str, Sequence[Path]],
 ) -> Iterator[str]:
@@ -121,7 +124,7 @@ def _lines(
         belong = "belongs" if len(surplus) == 1 else "belong"
         line += f"; {plural(len(surplus), 'file')} of {directory} {belong} to none, the first is {first}"
     yield line
-    of_sample = f" of {MAX_DECODED} that were decoded" if masked > MAX_DECODED else ""
+    of_sample = f" of {decoded} that were decoded" if decoded < masked else ""
     for effect, paths in unusual.items():
         yield f"masks that {effect}: {len(paths)}{of_sample}, the first is {paths[0]}"
 

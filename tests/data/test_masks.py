@@ -139,6 +139,10 @@ def test_of_many_masks_some_are_decoded_and_all_are_checked(folder, monkeypatch)
     with suppress(UserError):  # OpenCV decides
         masks_of(folder)
     assert folder / "M" / "2.png.png" in decoded
+    # Nor has another format checksums.
+    PIL.Image.fromarray(0 * HALF).save(folder / "M" / "2.png.png", "BMP")
+    _, everything = masks_of(folder).lines
+    assert everything.startswith("masks that hide everything: 3 of 3 that were decoded")
 
 
 def test_equal_names_may_be_written_in_two_ways(folder):
