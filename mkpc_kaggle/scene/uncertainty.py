@@ -75,6 +75,8 @@ def _pose_variances(
     """
     centres = np.array([-pose[:, :3].T @ pose[:, 3] for pose in poses])
     size = np.sqrt(centres.var(axis=0).sum())
+    if not size:  # cameras at one place, as of a panorama
+        return np.full((len(poses), 2), np.inf)
     # Jacobians of angles and centres: by the parameters of each pose, and by a similarity of the world
     moves = []
     similarities = []

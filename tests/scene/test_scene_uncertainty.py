@@ -163,6 +163,15 @@ def test_a_degenerate_model_has_no_sigmas_or_finite_ones(fault):
     assert all(np.isfinite(each).all() for each in sigmas.values())
 
 
+def test_cameras_at_one_place_have_no_sigmas():
+    """As of a panorama; the errors are shares of the model's size, which is 0."""
+    model = pycolmap.Reconstruction(model_of(synthetic_scene(6, points=400)).colmap)
+    for _, frame in sorted(model.frames.items()):
+        rotation = frame.rig_from_world.rotation
+        frame.rig_from_world = pycolmap.Rigid3d(rotation, np.zeros(3))
+    assert camera_sigmas(model) == {}
+
+
 def test_an_image_with_few_points_leaves_the_sigmas_of_the_others(tmp_path):
     """Its pose may be anywhere, and points that only it and one other image see are undetermined."""
     model = pycolmap.Reconstruction(model_of(synthetic_scene(7, points=400)).colmap)
