@@ -9,8 +9,7 @@
 3. if the cameras give no F, since an image has none, they are in two models or at one place, or a lens is
    distorted: with ``[focal]``, F from the pair's matches at the focal lengths of the scene, else its own F.
 
-:mod:`mkpc_kaggle.scene.candidates`
-chooses the scene itself.
+:mod:`mkpc_kaggle.scene.candidates` chooses the scene itself.
 """
 
 from collections.abc import Mapping, Sequence
