@@ -3,10 +3,10 @@
 - A process of matching has all cores, or PyTorch's own number if that is less (``OMP_NUM_THREADS``), divided by
   the number of these processes: for PyTorch and OpenCV (:func:`limit_matching_threads`). There is one for each
   device, unless ``--workers`` has another number.
-- A Ray actor has the same of its machine; without GPUs, it has the CPUs that Ray has there.
+- A Ray actor has those of its machine; without GPUs, it has the CPUs that Ray has there.
 - A process of estimates and features has one thread, in all libraries (:func:`limit_to_one_thread`).
-- A process of a scene verifies its pairs on all cores, and limits no library. Its mapper has ``threads`` of
-  [scene], one by default, and its last adjustment one.
+- A process of a scene, or of an estimate that the others gave up, limits no library. It verifies pairs on all
+  cores. Its mapper has ``threads`` of [scene], one by default, and its last adjustment one.
 - A thread of the user's process (``--workers 0``) leaves the limits of the process as they are.
 
 The number of processes is decided in :mod:`mkpc_kaggle.engine.workers.places`.

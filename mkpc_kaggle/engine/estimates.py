@@ -70,7 +70,9 @@ class Estimating:
         run.store.put(results)
         state.end_estimates(pair.index for pair in job.pairs)
         for pair, estimated, result in zip(job.pairs, answer, results, strict=True):
-            state.use_new_estimate(pair.index, result)
+            # Of an image that was replaced meanwhile, the estimate belongs to the former content.
+            if state.images_of(pair.index) == pair.images:
+                state.use_new_estimate(pair.index, result)
             run.costs.observe(ESTIMATE, estimated.seconds)
         run.log.estimated += len(answer)
         # While pairs are matched, the bar shows those.

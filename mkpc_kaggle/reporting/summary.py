@@ -3,6 +3,7 @@
 import textwrap
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from statistics import median
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
@@ -17,7 +18,7 @@ from mkpc_kaggle.recipe import Recipe
 from mkpc_kaggle.reporting.contradictions import adopted_lenses, file_labels, named
 from mkpc_kaggle.reporting.run_log import RunLog
 from mkpc_kaggle.scene.candidates import title_of
-from mkpc_kaggle.scene.models import Sigmas
+from mkpc_kaggle.scene.models import MAX_SIGMA_IMAGES, Sigmas
 from mkpc_kaggle.setup.availability import UnavailableKind
 
 if TYPE_CHECKING:
@@ -369,10 +370,22 @@ def is_doubtful(pairs: "DataFrame") -> "Series[bool]":
 
 
 def weakest_line(scenes: Sequence[SceneRecord]) -> Iterator[str]:
-    """Yield a line with the weakest cameras, if any is known."""
+    """Yield a line with the weakest cameras, and one on models that are too large for expected errors."""
     named = []
+    counts = [len(model.images) for scene in scenes for model in scene.models]
+    large = [count for count in counts if count > MAX_SIGMA_IMAGES]
+    if large:
+        images = ", ".join(map(str, large))
+        yield from wrapped(
+            f"no expected errors of cameras in {plural(len(large), 'model')} of more than "
+            f"{MAX_SIGMA_IMAGES} images ({images}), where they would take too long"
+        )
     # Enough to see whether one camera is worse than all others; the report has them all.
-    cameras = weakest_cameras(scenes)
+    smaller = []
+    for scene in scenes:
+        models = [model for model in scene.models if len(model.images) <= MAX_SIGMA_IMAGES]
+        smaller.append(replace(scene, models=tuple(models)))
+    cameras = weakest_cameras(smaller)
     labels = file_labels(name for name, _ in cameras)
     for name, sigmas in cameras[:MAX_NAMED]:
         error = f"{100 * sigmas.centre:.2g} %" if sigmas else "unknown"

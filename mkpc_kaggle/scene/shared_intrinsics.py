@@ -4,18 +4,18 @@ An image's own focal length is ambiguous with the distance to the scene, and poo
 images of one camera at one zoom share it. ``cameras`` of [scene] (``--camera``) says how:
 
 - ``auto``, the default: if at least five images of one size are registered, and more than half of them agree on
-  the focal length within 2 %, :func:`share` reconstructs a second time, with their median for all images of
-  this size, registered or not. It is refused if images then have fewer than 0.99 of the observations before
+  the focal length within 2 %, :func:`share` reconstructs a second time, with their median for all images of this
+  size, registered or not. It is refused if images then have fewer than 0.99 of the observations before
   (``MIN_OBSERVATIONS`` of :mod:`mkpc_kaggle.scene.mapper`). Images that see many points with another focal
-  length seem to have another zoom. They share only if EXIF does not differ by 10 %, and if none of them loses
-  observations.
+  length seem to have another zoom. They share only if EXIF does not differ by 10 %, and, where it is unknown, if
+  none of them loses observations.
 - ``folder``: the user declares one camera for each size. The first reconstruction already shares it
   (:func:`given_intrinsics`).
 - ``image``: no image shares.
 
 New images of a finished model have its one camera of their size, unless ``image``, if their focal length agrees
-within 2 % and no observations are lost (:func:`sharing_with_placed`). Images with a
-camera of the user's are not compared.
+within 2 %, their distortion within 0.5 % at the edge, and no observations are lost
+(:func:`sharing_with_placed`). Images with a camera of the user's are not compared.
 """
 
 from collections.abc import Sequence

@@ -16,7 +16,7 @@ from mkpc_kaggle.data.masks import Masks
 from mkpc_kaggle.data.regions import GivenRegions
 from mkpc_kaggle.errors import UserError, warn_once
 from mkpc_kaggle.geometry.intrinsics import Rows
-from mkpc_kaggle.matchers.contract import Matcher, Placement, Precision
+from mkpc_kaggle.matchers.contract import Matcher, MatcherSpec, Placement, Precision
 from mkpc_kaggle.matchers.registry import (
     VISMATCH,
     load_matcher,
@@ -109,23 +109,25 @@ class Assembly:
             "weights": weights,
         }
         # The weights of a matcher of this package have digests, and its code has ``keys.POINTS_VERSION``.
+        spec = self._spec_of(name)
         if is_own or name.startswith(VISMATCH):
-            settings["version"] = self._version_of(name) or self.nonce
-        elif packages := spec_of(name, f"matcher {name}").packages:
-            settings["packages"] = {package: _version_of_package(package) for package in packages}
+            settings["version"] = spec.version or self.nonce
+        if spec.packages:
+            settings["packages"] = {
+                package: _version_of_package(package) for package in spec.packages
+            }
         return settings
 
-    def _version_of(self, name: str) -> str:
-        is_own = name in self.matchers
-        spec = self.matchers[name].spec if is_own else spec_of(name, f"matcher {name}")
-        return spec.version
+    def _spec_of(self, name: str) -> MatcherSpec:
+        given = self.matchers.get(name)
+        return given.spec if given is not None else spec_of(name, f"matcher {name}")
 
     @property
     def unversioned(self) -> list[str]:
         """The recipe's matchers whose results are not kept for later runs."""
         names = self.recipe.matcher_names
         foreign = [name for name in names if name in self.matchers or name.startswith(VISMATCH)]
-        return [name for name in foreign if not self._version_of(name)]
+        return [name for name in foreign if not self._spec_of(name).version]
 
     @property
     def weight_paths(self) -> tuple[Path, ...]:
@@ -260,7 +262,12 @@ def _without_unavailable(
 
 def _version_of_package(name: str) -> str:
     # OpenCV has several distributions.
-    return cv2.__version__ if name == "opencv" else metadata.version(name)
+    if name == "opencv":
+        return cv2.__version__
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:  # named by a user's matcher: a module without a version
+        return ""
 
 
 def _warn_of_unverified(files: Iterable[FoundFile]) -> None:

@@ -9,7 +9,7 @@ then shallow paths are before deep ones.
 Usable are files with the digest of their line, or of a line without one (``unverified``) unless they are another
 line's or have another size than it states, and unpacked checkpoints (:func:`judge`). Manifests in the searched
 directories add lines. A file whose licence is not permitted, or that does not fit its network, leaves the
-matcher out, and no other file is tried (:mod:`mkpc_kaggle.setup.availability`).
+matcher to its fallback, or out, and no other file is tried (:mod:`mkpc_kaggle.setup.availability`).
 """
 
 import copy
@@ -309,22 +309,28 @@ class WeightStore:
         entered: set[str] = set()
         for root in self.directories:
             files: list[Path] = []
+            checkpoints: list[Path] = []
             for folder, folders, names in os.walk(root, followlinks=True):
                 real = os.path.realpath(folder)
                 is_checkpoint = "data" in folders and "data.pkl" in names
                 if real in entered or is_checkpoint:
                     folders.clear()  # os.walk skips the subfolders
                 if is_checkpoint and real not in entered:
-                    unpacked.append(Path(folder))  # an archive that Kaggle unpacked
+                    checkpoints.append(Path(folder))  # an archive that Kaggle unpacked
                 elif real not in entered:
                     files += [Path(folder, name) for name in names]
                 entered.add(real)
-            # Shallow files win over deep ones of the same name, and the order is the same on all
-            # file systems.
-            for path in sorted(files, key=lambda path: (len(path.parts), path)):
+            # The order is the same on all file systems.
+            unpacked += sorted(checkpoints, key=_depth)
+            for path in sorted(files, key=_depth):
                 if path.suffix.lower() not in NOT_WEIGHTS:
                     sizes[path] = path.stat().st_size if os.path.isfile(path) else -1  # noqa: PTH113  never raises
         return sizes, unpacked
+
+
+def _depth(path: Path) -> tuple[int, Path]:
+    """Shallow paths win over deep ones of the same name."""
+    return len(path.parts), path
 
 
 def judge(path: Path, file: WeightFile, files: Iterable[WeightFile] = ()) -> FoundFile:

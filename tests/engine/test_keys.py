@@ -5,6 +5,7 @@ from dataclasses import replace
 from importlib.metadata import PackageNotFoundError
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -12,7 +13,7 @@ from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.store import keys
 from mkpc_kaggle.engine.store.keys import Keys
 from mkpc_kaggle.geometry.coordinates import Box, Size
-from mkpc_kaggle.matchers.contract import Placement, Precision
+from mkpc_kaggle.matchers.contract import MatcherSpec, Placement, Precision
 from mkpc_kaggle.recipe import SceneConfig, Unit, load_recipe
 from mkpc_kaggle.scene.view_graph import BatchImage
 from mkpc_kaggle.setup import assembly
@@ -101,6 +102,17 @@ def test_another_version_of_a_library_changes_the_points_that_come_from_it(
     )
     pairs = zip(former, Keys.of(made).units, strict=True)
     assert [before != after for before, after in pairs] == changed
+
+
+def test_a_matcher_given_in_python_has_the_versions_of_its_packages_in_its_keys(monkeypatch):
+    spec = MatcherSpec("mine", version="1", packages=("opencv", "no distribution"))
+    recipe = replace(CLASSICAL, units=(Unit(1, "mine", 640),))
+    given = {"mine": SimpleNamespace(spec=spec)}
+    made = replace(assemble(CLASSICAL), recipe=recipe, matchers=given)
+    former = Keys.of(made).units
+    assert Keys.of(made).units == former
+    monkeypatch.setattr(cv2, "__version__", "another")
+    assert Keys.of(made).units != former
 
 
 def test_a_unit_in_half_precision_has_the_keys_of_float32_where_it_ran_in_that():

@@ -8,7 +8,8 @@ import pytest
 from rectified import SECOND, SWEEP, THIRD
 from store_room import RECIPE, REGIONS, F, Room, matches_of, pair_of
 
-from mkpc_kaggle.engine.jobs import Cause, Failure
+from mkpc_kaggle.engine.estimates import Estimating
+from mkpc_kaggle.engine.jobs import Cause, Estimated, Failure
 from mkpc_kaggle.engine.plan.state import EARLIER, FALLBACK, PAIR, SCENE
 from mkpc_kaggle.engine.store.database import Store
 from mkpc_kaggle.engine.store.dataframes import (
@@ -191,6 +192,21 @@ def test_a_scene_of_today_leaves_the_earlier_f_of_pairs_that_it_does_not_know(wh
     whole.estimate(1)
     assert whole.state.scenes.stale == {"one"}
     assert whole.state.sources.tolist() == [SCENE, PAIR, FALLBACK]
+
+
+def test_an_estimate_of_the_former_content_of_an_image_is_not_used(whole: Room) -> None:
+    estimating = Estimating(whole.run)
+    whole.match(2, SWEEP)
+    job = estimating.job([2])
+    assert job is not None
+    # Its image is replaced while the worker estimates, and matched again at once.
+    whole.match(2, SWEEP, digest="new")
+    (pair,) = job.pairs
+    answer = Estimated(tuple(pair.points.values()), (7,) * len(pair.points), F)
+    estimating.save(job, [answer], 0.5)
+    assert whole.state.sources[2] == FALLBACK
+    whole.estimate(2)
+    assert whole.state.sources[2] == PAIR
 
 
 def test_an_e_of_an_earlier_run_is_not_written_as_f(room: Room) -> None:

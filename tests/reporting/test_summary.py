@@ -12,6 +12,7 @@ from mkpc_kaggle.engine.store.tables import NOT_RECONSTRUCTED, About, SceneRecor
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.recipe import Recipe, Unit
+from mkpc_kaggle.reporting import summary as summary_module
 from mkpc_kaggle.reporting.run_log import RunLog
 from mkpc_kaggle.reporting.summary import (
     is_doubtful,
@@ -90,6 +91,16 @@ def test_cameras_with_unknown_errors_are_the_weakest():
     assert max(map(len, lines)) <= 100
     text = " ".join(line.strip() for line in lines)
     assert text.endswith(": unknown.png (unknown), worse.png (3 %), known.png (2 %)")
+
+
+def test_cameras_of_a_model_that_is_too_large_for_expected_errors_are_not_the_weakest(monkeypatch):
+    monkeypatch.setattr(summary_module, "MAX_SIGMA_IMAGES", 2)
+    large = scene(*(camera(f"{number}.png", ()) for number in range(3)))
+    small = scene(camera("known.png", Sigmas(0.1, 0.02, 1.0)))
+    text = " ".join(line.strip() for line in weakest_line([large, small]))
+    assert text.startswith("no expected errors of cameras in 1 model of more than 2 images (3)")
+    assert text.endswith("error of the centre: known.png (2 %)")
+    assert "unknown" not in text
 
 
 def test_an_interrupted_run_says_how_to_continue_and_lists_no_failures():

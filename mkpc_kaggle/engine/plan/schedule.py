@@ -7,19 +7,20 @@ A unit no longer fits in time by two rules. The time left ends at :attr:`Snapsho
 scenes and candidates that are still due, for which up to a fifth of the limit is reserved.
 
 - :func:`prefix_that_fits`: its forecast and those of the units before it, for all missing pairs, exceed the time
-  left of all workers that match. It waits for the last phase.
+  left of all workers that match. A unit of stage 2 counts for the share of pairs that need it, and again where
+  new points of stage 1 change its crops. It waits for the last phase.
 - :func:`pairs_in_time`: by its mean, one more pair would not end in time. It does not begin, in any phase. Near
   the end, a minibatch is made smaller first.
 
-A forecast is the mean of the latest runs and a margin, 40 % after one and 1 % after many. A unit without a run
-fits while there is time; after its warm-up alone, its mean is that of the warm-up.
+A forecast is the mean of the latest runs and a margin, 40 % after one and 1 % after many. It is 0 for a unit that
+has had no run but its warm-up; the mean is that of the warm-up then.
 
 A job has the expected seconds of its units and the time left. Its worker applies the second rule again before each
 minibatch, by its own clock (``may_start`` of :class:`mkpc_kaggle.engine.workers.worker.MatchRunner`).
 
 Other work that is left out for lack of time: extra pairs beyond a tenth of it (:func:`pairs_to_connect`),
-candidates that would not end (:func:`candidates_due`), and trials of ``--rotations`` after a quarter of it
-(:mod:`mkpc_kaggle.reconstruction.choice`). The first scene of a batch begins without such a check.
+candidates that would not end (:func:`candidates_due`), and each of two trials of ``--rotations`` after a quarter
+of it (:mod:`mkpc_kaggle.reconstruction.choice`). The first scene of a batch begins without such a check.
 """
 
 from collections.abc import Sequence

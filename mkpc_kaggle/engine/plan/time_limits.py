@@ -4,7 +4,7 @@ The loop asks again at every turn while a job runs, because costs become known. 
 silence that is always allowed, 2 % of the limit of the run but 5 to 60 s, to:
 
 - Matching: 30 times the mean seconds of the job's units, for each pair, and their longest warm-up once. Until all
-  are measured: a quarter of the time that is left, an hour at most. The same for a feature of an image.
+  are measured: a quarter of the time that is left, an hour at most. A feature of an image always has that quarter.
 - Estimates: 30 times the mean; until it is known, 30 s a pair, and no more than that quarter.
 - A scene: 30 times the seconds expected from other scenes, at least of 3 s and 0.5 ms per match.
 
