@@ -6,7 +6,7 @@ centre, is the critical region (the paper's Algorithm 1). If this box is unrelia
 the whole image, with the reason.
 
 So ``eps``, 0.05 in all shipped recipes, is a share: of the width along x, and of the height along y. Above 2,000
-points, those in a cell of a tenth of ``eps`` are merged first, weighted by their number.
+points, points in one cell of a tenth of ``eps`` are merged first, weighted by their number.
 """
 
 from dataclasses import dataclass

@@ -1,10 +1,14 @@
 """Assumptions about lenses that the photographs may contradict: EXIF's focal lengths, no distortion.
 
-If they do, a second reconstruction does without the assumption. Without EXIF, which is doubted if fewer than
-half of the matched images have a camera, a model is loose, or a focal length moved by 30 % while images lack a
-camera, it stays if it has more observations. With a lens, it stays if
-:func:`mkpc_kaggle.scene.mapper.loses_points` denies. :mod:`mkpc_kaggle.scene.shared_intrinsics` does the same
-for shared cameras. The comparison with the photographs is in :mod:`mkpc_kaggle.scene.comparison`.
+If they do, a second reconstruction does without the assumption.
+
+- EXIF is doubted if fewer than half of the matched images have a camera, or if a model is loose. It is also
+  doubted if a focal length moved by 30 % and some images have no camera. The second reconstruction stays if it has
+  more observations.
+- A lens without distortion is doubted by :mod:`mkpc_kaggle.scene.comparison`. The second reconstruction stays
+  unless images lose points (:func:`mkpc_kaggle.scene.mapper.loses_points`).
+
+:mod:`mkpc_kaggle.scene.shared_intrinsics` does the same for shared cameras.
 """
 
 from collections.abc import Sequence

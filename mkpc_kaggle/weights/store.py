@@ -1,15 +1,17 @@
 """The weight files of this machine, found by name or digest and compared with the manifest.
 
-The file of a slot (:meth:`WeightStore.find`) is the one that the user gives for it in Python, whatever its bytes.
+The file of a slot (:meth:`WeightStore.find`) is the one that the user gives for it in Python, with any bytes.
 Else it is the first usable one of three steps: files with the name of one of the slot's lines in the manifest;
 renamed files with the digest of a line; checkpoints that are unpacked into a directory. Within a step, the
 order of the lines decides first; then that of the directories, ``--weights``, ``$MKPC_WEIGHTS``, /kaggle/input;
 then shallow paths are before deep ones.
 
-Usable are files with the digest of their line, or of a line without one (``unverified``) unless they are another
-line's or have another size than it states, and unpacked checkpoints (:func:`judge`). Manifests in the searched
-directories add lines. A file whose licence is not permitted, or that does not fit its network, leaves the
-matcher to its fallback, or out, and no other file is tried (:mod:`mkpc_kaggle.setup.availability`).
+Usable are files with the digest of their line. A file of a line without a digest (``unverified``) is usable unless
+it is another line's, or has another size than its line. Unpacked checkpoints are usable (:func:`judge`).
+
+Manifests in the searched directories add lines. If the file's licence is not permitted, or the file does not fit
+its network, no other file is tried. The unit's fallback runs instead, or the unit is skipped
+(:mod:`mkpc_kaggle.setup.availability`).
 """
 
 import copy

@@ -6,9 +6,9 @@ costs and the time left whenever a worker is idle.
 A unit no longer fits in time by two rules. The time left ends at :attr:`Snapshot.stop`: before the estimates,
 scenes and candidates that are still due, for which up to a fifth of the limit is reserved.
 
-- :func:`prefix_that_fits`: its forecast and those of the units before it, for all missing pairs, exceed the time
-  left of all workers that match. A unit of stage 2 counts for the share of pairs that need it, and again where
-  new points of stage 1 change its crops. It waits for the last phase.
+- :func:`prefix_that_fits`: its forecast plus the forecasts of the units before it, for all missing pairs, exceed
+  the time left of all workers that match. It waits for the last phase. A unit of stage 2 counts for the share of
+  pairs that need it, and again where new points of stage 1 change its crops.
 - :func:`pairs_in_time`: by its mean, one more pair would not end in time. It does not begin, in any phase. Near
   the end, a minibatch is made smaller first.
 
@@ -18,9 +18,9 @@ has had no run but its warm-up; the mean is that of the warm-up then.
 A job has the expected seconds of its units and the time left. Its worker applies the second rule again before each
 minibatch, by its own clock (``may_start`` of :class:`mkpc_kaggle.engine.workers.worker.MatchRunner`).
 
-Other work that is left out for lack of time: extra pairs beyond a tenth of it (:func:`pairs_to_connect`),
+Other work that is dropped when time is short: extra pairs beyond a tenth of it (:func:`pairs_to_connect`),
 candidates that would not end (:func:`candidates_due`), and each of two trials of ``--rotations`` after a quarter
-of it (:mod:`mkpc_kaggle.reconstruction.choice`). The first scene of a batch begins without such a check.
+of it (:mod:`mkpc_kaggle.reconstruction.choice`). The first scene of a batch begins unchecked.
 """
 
 from collections.abc import Sequence
@@ -51,7 +51,7 @@ RESERVE_SHARE = 0.2
 # Maximum share of the limit that is reserved for further candidates of scenes: any scene is worth
 # more than a choice of scenes.
 CANDIDATES_SHARE = 0.05
-# Estimates that are handed out at a time. A list of all due ones, anew for each job, would cost the
+# Estimates that are handed out at a time. A list of all due estimates, made again for each job, would cost the
 # loop more than the jobs in a run of 500,000 pairs.
 MAX_DUE = 1000
 # Phases in arrays are plain integers.

@@ -153,9 +153,8 @@ class State:
     def fundamentals(self) -> NDArray[np.float64]:
         """The F to write (R, 3, 3) for each row of the request. The first that exists, by :attr:`sources`:
 
-        - "earlier": the F of the last table of pairs, while it :attr:`stands_in`: no scene in use gives the
-          pair an F, and the pair has no estimate yet, or this F was a scene's and the scene of its batch is
-          still to be made;
+        - "earlier": the F of the last table of pairs, while it :attr:`stands_in`: no scene in use gives an F, and
+          there is no estimate yet, or a scene gave this F and the batch awaits its scene of today;
         - "scene": the F of the pair's cameras, unless its matches contradict it
           (:func:`mkpc_kaggle.scene.choose.choose`);
         - "pair": the F of its matches; with ``[focal]``, and if the cameras give no F, at the focal lengths of
@@ -455,7 +454,7 @@ class State:
         estimate is older still.
         """
         self.lost_estimates.pop(index, None)
-        # Without points, the store has lost those of the estimate.
+        # Without points, the store has lost the points of this estimate.
         if self.has[index].any():
             self.use_estimate(index, estimate)
             self.changed.add(index)
