@@ -33,6 +33,7 @@ from mkpc_kaggle.reporting.summary import (
     image_counts,
     is_doubtful,
     is_solved,
+    large_models,
     left_out_line,
     seconds_by_part,
     unit_means,
@@ -190,6 +191,7 @@ def _scene_section(log: RunLog, pairs: Sequence[Pair]) -> dict[str, Any]:
             (name, 100 * of.centre, of.rotation, of.focal) if of else (name, "unknown", "", "")
             for name, of in weakest_cameras(log.scenes)
         ],
+        "large_models": large_models(log.scenes),
         "views": [*_views(log, read_in)],
     }
 

@@ -3,7 +3,6 @@
 import textwrap
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from statistics import median
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
@@ -369,23 +368,25 @@ def is_doubtful(pairs: "DataFrame") -> "Series[bool]":
     return ~pairs["overlaps"] & (pairs["source"] != "scene") & is_of_this_run(pairs)
 
 
-def weakest_line(scenes: Sequence[SceneRecord]) -> Iterator[str]:
-    """Yield a line with the weakest cameras, and one on models that are too large for expected errors."""
-    named = []
+def large_models(scenes: Sequence[SceneRecord]) -> str:
+    """Return a sentence on the models that are too large for expected errors; empty without any."""
     counts = [len(model.images) for scene in scenes for model in scene.models]
-    large = [count for count in counts if count > MAX_SIGMA_IMAGES]
-    if large:
-        images = ", ".join(map(str, large))
-        yield from wrapped(
-            f"no expected errors of cameras in {plural(len(large), 'model')} of more than "
-            f"{MAX_SIGMA_IMAGES} images ({images}), where they would take too long"
-        )
+    large = [str(count) for count in counts if count > MAX_SIGMA_IMAGES]
+    if not large:
+        return ""
+    return (
+        f"no expected errors of cameras in {plural(len(large), 'model')} of more than "
+        f"{MAX_SIGMA_IMAGES} images ({', '.join(large)}), where they would take too long"
+    )
+
+
+def weakest_line(scenes: Sequence[SceneRecord]) -> Iterator[str]:
+    """Yield a line with the weakest cameras, if any is known, and one on :func:`large_models`."""
+    if large := large_models(scenes):
+        yield from wrapped(large)
+    named = []
     # Enough to see whether one camera is worse than all others; the report has them all.
-    smaller = []
-    for scene in scenes:
-        models = [model for model in scene.models if len(model.images) <= MAX_SIGMA_IMAGES]
-        smaller.append(replace(scene, models=tuple(models)))
-    cameras = weakest_cameras(smaller)
+    cameras = weakest_cameras(scenes)
     labels = file_labels(name for name, _ in cameras)
     for name, sigmas in cameras[:MAX_NAMED]:
         error = f"{100 * sigmas.centre:.2g} %" if sigmas else "unknown"
@@ -397,10 +398,14 @@ def weakest_line(scenes: Sequence[SceneRecord]) -> Iterator[str]:
 def weakest_cameras(scenes: Sequence[SceneRecord]) -> list[tuple[str, Sigmas | tuple[()]]]:
     """Return (image name, sigmas) of each camera, the largest expected error of the centre first.
 
-    Cameras with unknown sigmas are the most doubtful ones, so they come before all others.
+    Cameras with unknown sigmas are the most doubtful ones, so they come before all others. Those of a
+    model that is too large for expected errors are left out.
     """
+    models = [model for scene in scenes for model in scene.models]
     # An image of several models has a camera in each.
-    placed = [image for scene in scenes for model in scene.models for image in model.images]
+    placed = [
+        image for model in models if len(model.images) <= MAX_SIGMA_IMAGES for image in model.images
+    ]
     unknown = [(image.image.name, image.sigmas) for image in placed if not image.sigmas]
     certain = [(image.image.name, image.sigmas) for image in placed if image.sigmas]
     return [*unknown, *sorted(certain, key=lambda camera: -camera[1].centre)]

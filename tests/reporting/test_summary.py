@@ -101,6 +101,7 @@ def test_cameras_of_a_model_that_is_too_large_for_expected_errors_are_not_the_we
     assert text.startswith("no expected errors of cameras in 1 model of more than 2 images (3)")
     assert text.endswith("error of the centre: known.png (2 %)")
     assert "unknown" not in text
+    assert [name for name, _ in weakest_cameras([large, small])] == ["known.png"]
 
 
 def test_an_interrupted_run_says_how_to_continue_and_lists_no_failures():
