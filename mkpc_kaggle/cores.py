@@ -3,7 +3,7 @@
 - A process of matching has all cores, or PyTorch's own number if that is less (``OMP_NUM_THREADS``), divided by
   the number of these processes: for PyTorch and OpenCV (:func:`limit_matching_threads`). There is one for each
   device, unless ``--workers`` has another number.
-- A Ray actor has those of its machine; without GPUs, it has the CPUs that Ray has there.
+- A Ray actor has as many as one process alone on its machine; without GPUs, the CPUs that Ray has there.
 - A process of estimates and features has one thread, in all libraries (:func:`limit_to_one_thread`).
 - A process of a scene, or of an estimate that the others gave up, limits no library. It verifies pairs on all
   cores. Its mapper has ``threads`` of [scene], one by default, and its last adjustment one.

@@ -3,6 +3,7 @@
 import argparse
 import ast
 import json
+import math
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -27,13 +28,15 @@ from mkpc_kaggle.geometry import critical_region, crop_need, robust
 from mkpc_kaggle.geometry.critical_region import MkpcConfig
 from mkpc_kaggle.geometry.focal_prior import ESSENTIAL_THRESHOLD_PX
 from mkpc_kaggle.geometry.overlap import AGREEMENT_PX
+from mkpc_kaggle.geometry.planarity import TRANSFER_PX
 from mkpc_kaggle.geometry.robust import RobustConfig
 from mkpc_kaggle.recipe import SceneConfig, load_recipe
 from mkpc_kaggle.reconstruction.choice import TRIAL_SHARE
 from mkpc_kaggle.reconstruction.run import MAGSAC_ITERATIONS
-from mkpc_kaggle.scene import choose, densify, shared_intrinsics
+from mkpc_kaggle.scene import assumptions, choose, densify, shared_intrinsics
 from mkpc_kaggle.scene.mapper import MIN_OBSERVATIONS
 from mkpc_kaggle.scene.models import MIN_DISPLACEMENT
+from mkpc_kaggle.scene.motion import MAX_TRANSFER_PX
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -270,7 +273,11 @@ def uses_of_functions() -> dict[str, set[str]]:
                     reads.setdefault(name, set()).add(file)
                 case ast.FunctionDef(name=name):
                     homes.setdefault(name, set()).add(file)
-    return {name: calls.get(name, reads.get(name, set())) - homes[name] for name in homes}
+    # A file that defines the function may also call another one of the same name.
+    return {
+        name: calls.get(name, reads.get(name, set())) - (files if len(files) == 1 else set())
+        for name, files in homes.items()
+    }
 
 
 def test_only_the_files_that_contributing_names_call_the_functions_that_decide():
@@ -315,7 +322,7 @@ HEADS = {
         ("60 or more", choose.EVIDENCE_MATCHES),
         ("less than half", 1 / choose.EVIDENCE_SHARE),
         ("2 px", choose.CONTRADICTION_ERROR_PX),
-        ("30 or more", choose.CONTRADICTION_MATCHES),
+        ("30 matches or more", choose.CONTRADICTION_MATCHES),
         ("5 %", 100 * choose.CONTRADICTION_SHARE),
     ],
     robust: [
@@ -326,11 +333,16 @@ HEADS = {
         ),
         ("0.4 for rough starts", ESSENTIAL_THRESHOLD_PX),
         ("1.0 for the support", AGREEMENT_PX),
-        ("2.0 and 1.0 for matches", (choose.CONTRADICTION_ERROR_PX, choose.EVIDENCE_PX)),
+        ("2.0 for matches", choose.CONTRADICTION_ERROR_PX),
+        ("2.0 and 4.0 for homographies", (TRANSFER_PX, MAX_TRANSFER_PX)),
     ],
     critical_region: [
         ("``eps``, 0.05 in", MkpcConfig().eps),
         ("Above 2,000 points", critical_region.MERGE_ABOVE),
+    ],
+    assumptions: [
+        ("fewer than half", 1 / assumptions.MIN_REGISTERED),
+        ("moved by 30 %", 100 * (math.exp(assumptions.MAX_EXIF_LOG_DEVIATION) - 1)),
     ],
     crop_need: [("(1.9)", MkpcConfig().min_scale), ("(2.0)", MkpcConfig().min_detail)],
     densify: [

@@ -201,7 +201,7 @@ def _run(case: Case, recipe: Path, setup: Setup, seconds: float, limit: int) -> 
     test_dir = setup.demo().test_dir
     output = home / "submission.csv"
     store = WeightStore(setup.weights)
-    is_trained = all(store.find(slot) is not None for slot in SLOTS)
+    is_trained = all(store.file_of(slot) is not None for slot in SLOTS)
     words = ["--test-dir", test_dir, "--output", output, "--recipe", recipe, "--no-report"]
     words += ["--no-scenes", "--explain", "--device", setup.device, "--workers", case.places]
     # The limit only ends a run that hangs.

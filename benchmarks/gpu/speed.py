@@ -168,7 +168,7 @@ def _weights(case: Case, setup: Setup) -> tuple[WeightStore, str]:
     slots = _spec(case).slots_for(_options(case, setup))
     if not slots:
         return trained, "none"
-    if all(trained.find(slot) is not None for slot in slots):
+    if all(trained.file_of(slot) is not None for slot in slots):
         return trained, "trained"
     return SeededWeights(), "seeded"
 

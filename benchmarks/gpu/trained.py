@@ -32,7 +32,7 @@ SAME = {Precision.FLOAT32: 0.98, Precision.FLOAT16: 0.9, Precision.BFLOAT16: 0.8
 def measure(part: Part, setup: Setup) -> None:
     """Add a row for each precision on the device: the share of the CPU's matches that it finds."""
     weights = WeightStore(setup.weights)
-    missing = [slot for slot in SLOTS if weights.find(slot) is None]
+    missing = [slot for slot in SLOTS if weights.file_of(slot) is None]
     if missing:
         where = "--weights DIR or MKPC_WEIGHTS names their folder"
         raise SkippedError(f"no trained weights of {', '.join(missing)}; {where}")

@@ -5,13 +5,13 @@ image, which no shipped recipe changes. ``threshold_side``, 0 in all of them, wo
 image (:meth:`RobustConfig.in_stored_pixels`). For an E it is divided by the mean focal length. With ``[focal]``, F
 is refined by that table's ``scale``, and this threshold counts the inliers.
 
-At most 50,000 iterations; `reconstruct` has 2,000. One order of the matches in auto, light, best, permissive
-and classical; eight in the recipes of the paper, and by default.
+At most 50,000 iterations; `reconstruct` has 2,000. One order of the matches in auto, light, best, permissive and
+classical, and in `reconstruct`; eight in the recipes of the paper, and by default.
 
 Other limits, in pixels of the stored image, are for other purposes: 0.4 for rough starts under a prior
-(``ESSENTIAL_THRESHOLD_PX``), 2.0 for pycolmap's verification (``MAX_ERROR_PX``), 2.0 and 1.0 for matches that
-speak against a scene's F (:mod:`mkpc_kaggle.scene.choose`), 1.0 for the support of an F, 2.0 and 4.0 for
-homographies. ``validate --protocol`` has published ones. ``threshold`` in a matcher's table is a confidence.
+(``ESSENTIAL_THRESHOLD_PX``), 2.0 for pycolmap's verification (``MAX_ERROR_PX``), 2.0 for matches that speak
+against a scene's F (:mod:`mkpc_kaggle.scene.choose`), 1.0 for the support of an F, 2.0 and 4.0 for homographies.
+``validate --protocol`` has published ones. ``threshold`` in a matcher's table is a confidence.
 
 An estimate always has a matrix. If no model is found, it holds the reason and the fallback matrix,
 which is finite and of the right rank. So a submission is always complete.

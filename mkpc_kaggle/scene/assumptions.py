@@ -2,9 +2,9 @@
 
 If they do, a second reconstruction does without the assumption.
 
-- EXIF is doubted if fewer than half of the matched images have a camera, or if a model is loose. It is also
-  doubted if a focal length moved by 30 % and some images have no camera. The second reconstruction stays if it has
-  more observations.
+- EXIF is doubted if fewer than half of the matched images have a camera, or if the largest model is loose. A
+  focal length that moved by 30 % is another doubt, if some images have no camera. The second reconstruction stays
+  if it has more observations.
 - A lens without distortion is doubted by :mod:`mkpc_kaggle.scene.comparison`. The second reconstruction stays
   unless images lose points (:func:`mkpc_kaggle.scene.mapper.loses_points`).
 

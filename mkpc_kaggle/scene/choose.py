@@ -4,8 +4,8 @@
 
 1. F of the pair's two cameras;
 2. the pair's own F, if both images are one file, or its matches contradict the cameras. Of its evidence, 60 or
-   more, the scene's F has less than half (the mean over the units). Or of the matches within 2 px of it, 30 or
-   more, the scene's F has less than 5 %;
+   more, the scene's F has less than half (the mean over the units). Or
+   30 matches or more are within 2 px of it, and less than 5 % of their number within 2 px of the scene's F;
 3. if the cameras give no F, since an image has none, they are in two models or at one place, or a lens is
    distorted: with ``[focal]``, F from the pair's matches at the focal lengths of the scene, else its own F.
 

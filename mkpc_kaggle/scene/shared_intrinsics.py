@@ -13,9 +13,9 @@ images of one camera at one zoom share it. ``cameras`` of [scene] (``--camera``)
   (:func:`given_intrinsics`).
 - ``image``: no image shares.
 
-New images of a finished model have its one camera of their size, unless ``image``, if their focal length agrees
-within 2 %, their distortion within 0.5 % at the edge, and no observations are lost
-(:func:`sharing_with_placed`). Images with a camera of the user's are not compared.
+New images of a finished model may have its one camera of their size, unless ``image``
+(:func:`sharing_with_placed`). Their focal length must agree within 2 %, their distortion within 0.5 % at the edge,
+and no observations may be lost. Images with a camera of the user's are not compared.
 """
 
 from collections.abc import Sequence

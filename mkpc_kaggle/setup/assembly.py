@@ -139,7 +139,7 @@ class Assembly:
         names = [name for name in self.recipe.matcher_names if name not in self.matchers]
         files = {}
         for slot in slots_of(self.recipe, names):
-            if (file := self.weights.find(slot)) is not None:
+            if (file := self.weights.file_of(slot)) is not None:
                 files[slot] = file
         return files
 

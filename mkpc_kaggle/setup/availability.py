@@ -88,7 +88,7 @@ def _reason(
     except UnusableError as error:
         detail = reason_of(error.__cause__ or error)
         return UnavailableReason(UnavailableKind.NOT_IMPORTABLE, detail)
-    found = {slot: store.find(slot) for slot in spec.slots_for(options)}
+    found = {slot: store.file_of(slot) for slot in spec.slots_for(options)}
     missing = store.missing(found)
     # Of missing files, too: nobody should fetch what the run would refuse.
     licences = set(spec.licences)
@@ -140,7 +140,7 @@ def fit_of(found: FoundFile, store: WeightStore) -> Fit:
                     continue
                 others = [other for other in spec.slots_for(options) if other != slot]
                 # A network of two files cannot be tried with one.
-                missing = [other for other in others if store.find(other) is None]
+                missing = [other for other in others if store.file_of(other) is None]
                 problem = "" if missing else misfit(name, store.on_meta(found), options)
                 # Another file of the matcher may be at fault; messages name the slot.
                 if repr(slot) in problem:

@@ -1,6 +1,6 @@
 """The weight files of this machine, found by name or digest and compared with the manifest.
 
-The file of a slot (:meth:`WeightStore.find`) is the one that the user gives for it in Python, with any bytes.
+The file of a slot (:meth:`WeightStore.file_of`) is the one that the user gives for it in Python, with any bytes.
 Else it is the first usable one of three steps: files with the name of one of the slot's lines in the manifest;
 renamed files with the digest of a line; checkpoints that are unpacked into a directory. Within a step, the
 order of the lines decides first; then that of the directories, ``--weights``, ``$MKPC_WEIGHTS``, /kaggle/input;
@@ -10,8 +10,8 @@ Usable are files with the digest of their line. A file of a line without a diges
 it is another line's, or has another size than its line. Unpacked checkpoints are usable (:func:`judge`).
 
 Manifests in the searched directories add lines. If the file's licence is not permitted, or the file does not fit
-its network, no other file is tried. The unit's fallback runs instead, or the unit is skipped
-(:mod:`mkpc_kaggle.setup.availability`).
+its network, no other file is tried. The unit's fallback runs instead. Without one, the unit is skipped, but a
+licence that is not permitted is an error, except in ``auto`` (:mod:`mkpc_kaggle.setup.availability`).
 """
 
 import copy
@@ -191,7 +191,7 @@ class WeightStore:
         """Return the manifest's lines for a slot, in order of preference."""
         return [file for file in self.files if file.slot == slot]
 
-    def find(self, slot: str) -> FoundFile | None:
+    def file_of(self, slot: str) -> FoundFile | None:
         """Return the slot's file or ``None``. Warn of refused files of the right name."""
         if slot in self._chosen:
             return self._chosen[slot]
@@ -202,7 +202,7 @@ class WeightStore:
 
     def load(self, slot: str) -> "dict[str, torch.Tensor]":
         """Return the slot's tensors by name. Raise :class:`UserError` for a missing or bad file."""
-        found = self.find(slot)
+        found = self.file_of(slot)
         if found is None:
             missing = self.missing([slot])
             raise UserError(
@@ -216,7 +216,7 @@ class WeightStore:
         files = {
             slot: tuple(file.name for file in self.alternatives(slot))
             for slot in slots
-            if self.find(slot) is None
+            if self.file_of(slot) is None
         }
         return MissingWeights(files)
 

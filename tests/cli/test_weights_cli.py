@@ -179,4 +179,4 @@ def test_the_first_download_of_a_file_without_a_digest_is_accepted_from_then_on(
     assert not (out / "b.pt").exists()
     (out / "b.pt").write_bytes(OTHER)
     with pytest.warns(UserWarning, match="damaged, or another file"):
-        assert store.WeightStore([out]).find("aliked-n16") is None
+        assert store.WeightStore([out]).file_of("aliked-n16") is None

@@ -22,13 +22,13 @@ pytestmark = pytest.mark.usefixtures("nowhere_else")
 
 
 def found_by(weights: WeightStore) -> Path:
-    return weights.find("slot").path
+    return weights.file_of("slot").path
 
 
 def test_a_file_is_found_in_the_directory_and_below_it(tmp_path):
     assert found_by(WeightStore([put(tmp_path / "a")], [line()])) == tmp_path / "a" / "a.bin"
     put(tmp_path / "b" / "deep" / "deeper")
-    found = WeightStore([tmp_path / "b"], [line()]).find("slot")
+    found = WeightStore([tmp_path / "b"], [line()]).file_of("slot")
     assert found.path == tmp_path / "b" / "deep" / "deeper" / "a.bin"
     assert found.digest == digest_of(DATA)
     put(tmp_path / "c" / "a.bin")  # Kaggle makes these directories of data sets of one file
@@ -46,7 +46,7 @@ def test_directories_are_searched_in_order_then_the_environment_then_kaggle(tmp_
     for home in homes:
         assert found_by(WeightStore(homes[:2], [line()])) == home / "a.bin"
         (home / "a.bin").unlink()
-    assert WeightStore(homes[:2], [line()]).find("slot") is None
+    assert WeightStore(homes[:2], [line()]).file_of("slot") is None
 
 
 def test_the_first_existing_alternative_is_taken_and_missing_ones_are_all_named(tmp_path):
@@ -67,7 +67,7 @@ def test_a_renamed_file_is_found_by_its_size_and_digest(tmp_path, monkeypatch):
     put(tmp_path / "data set" / "v1", "model")
     put(tmp_path, "same size.dat", OTHER)
     put(tmp_path, "long.pth", DATA + b"!")
-    found = WeightStore([tmp_path], [line()]).find("slot")
+    found = WeightStore([tmp_path], [line()]).file_of("slot")
     assert (found.path.name, found.state, found.note) == ("model", FileState.GOOD, "it is a.bin")
     # Another size cannot have the digest, so gigabytes stay unread.
     assert "long.pth" not in {path.name for path in read}
@@ -75,10 +75,10 @@ def test_a_renamed_file_is_found_by_its_size_and_digest(tmp_path, monkeypatch):
 
 def test_a_store_that_is_sent_to_a_worker_digests_no_file_again(tmp_path, monkeypatch):
     weights = WeightStore([put(tmp_path)], [line()])
-    assert weights.find("slot") is not None
+    assert weights.file_of("slot") is not None
     sent = pickle.dumps(weights)
     monkeypatch.setattr(store, "digest_of", None)
-    assert pickle.loads(sent).find("slot") == weights.find("slot")
+    assert pickle.loads(sent).file_of("slot") == weights.file_of("slot")
 
 
 def test_processes_that_share_a_file_of_digests_read_a_weight_file_once(tmp_path, monkeypatch):
@@ -118,7 +118,7 @@ def test_an_unpacked_checkpoint_is_found_and_read(tmp_path, outer):
         archive.extractall(tmp_path / "input" / "someones" / outer)
     os.utime(tmp_path / "input" / "someones" / outer / "x" / "data.pkl", (0, 0))
     weights = WeightStore([tmp_path / "input"], [file])
-    found = weights.find("slot")
+    found = weights.file_of("slot")
     # The digest of the file cannot be computed from its parts.
     assert found.state is FileState.UNVERIFIED
     assert found.path == tmp_path / "input" / "someones" / outer / "x"
@@ -172,7 +172,7 @@ def test_a_pipe_or_a_broken_link_is_passed_over(tmp_path, kind):
     weights = WeightStore([tmp_path], [line()])
     says = r"passed over: .*a\.bin: cannot be read: (No such|not a regular) file"
     with pytest.warns(UserWarning, match=says):
-        assert weights.find("slot") is None
+        assert weights.file_of("slot") is None
     assert [file.state for file in weights.verify()] == [FileState.REFUSED]
 
 

@@ -7,8 +7,8 @@ A unit no longer fits in time by two rules. The time left ends at :attr:`Snapsho
 scenes and candidates that are still due, for which up to a fifth of the limit is reserved.
 
 - :func:`prefix_that_fits`: its forecast plus the forecasts of the units before it, for all missing pairs, exceed
-  the time left of all workers that match. It waits for the last phase. A unit of stage 2 counts for the share of
-  pairs that need it, and again where new points of stage 1 change its crops.
+  the time left of all workers that match. Unless it is the unit of the sweep, it waits for the last phase. A unit
+  of stage 2 counts for the share of pairs that need it, and again where new points of stage 1 change its crops.
 - :func:`pairs_in_time`: by its mean, one more pair would not end in time. It does not begin, in any phase. Near
   the end, a minibatch is made smaller first.
 
@@ -16,11 +16,11 @@ A forecast is the mean of the latest runs and a margin, 40 % after one and 1 % a
 has had no run but its warm-up; the mean is that of the warm-up then.
 
 A job has the expected seconds of its units and the time left. Its worker applies the second rule again before each
-minibatch, by its own clock (``may_start`` of :class:`mkpc_kaggle.engine.workers.worker.MatchRunner`).
+minibatch, by its own clock (:class:`mkpc_kaggle.engine.workers.worker.MatchRunner`).
 
 Other work that is dropped when time is short: extra pairs beyond a tenth of it (:func:`pairs_to_connect`),
 candidates that would not end (:func:`candidates_due`), and each of two trials of ``--rotations`` after a quarter
-of it (:mod:`mkpc_kaggle.reconstruction.choice`). The first scene of a batch begins unchecked.
+of it (:mod:`mkpc_kaggle.reconstruction.choice`). The first candidate of a scene begins unchecked.
 """
 
 from collections.abc import Sequence

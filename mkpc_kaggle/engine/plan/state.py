@@ -157,8 +157,8 @@ class State:
           there is no estimate yet, or a scene gave this F and the batch awaits its scene of today;
         - "scene": the F of the pair's cameras, unless its matches contradict it
           (:func:`mkpc_kaggle.scene.choose.choose`);
-        - "pair": the F of its matches; with ``[focal]``, and if the cameras give no F, at the focal lengths of
-          the scene;
+        - "pair": the F of its matches; with ``[focal]``, and if the cameras of two different files give no F,
+          at the focal lengths of the scene;
         - "fallback": a fixed matrix.
         """
         sources, written = self._written

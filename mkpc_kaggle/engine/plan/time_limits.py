@@ -8,7 +8,8 @@ silence that is always allowed, 2 % of the limit of the run but 5 to 60 s, to:
 - Estimates: 30 times the mean; until it is known, 30 s a pair, and no more than that quarter.
 - A scene: 30 times the seconds expected from other scenes, at least of 3 s and 0.5 ms per match.
 
-A start (:func:`start_limit`) has 300 s for matchers; other workers have that quarter, 300 s at most.
+A start (:func:`start_limit`) has 300 s for matchers; other workers have that quarter, at least the silence and at
+most 300 s.
 
 :meth:`mkpc_kaggle.engine.workers.places.Place.poll` ends a worker that has not answered by then: its process
 gets SIGKILL (a Ray actor is killed by Ray), and its job is lost. A worker in a thread of the user's process
@@ -35,8 +36,7 @@ MATCHERS_START_S = 300.0  # for a worker to load its matchers, which is slow fro
 def time_limit(job: Job, costs: Costs, budget: Budget, since: float) -> float:
     """Return the seconds after ``since``, the beginning of a job, within which its worker must answer.
 
-    They are thirty times the measured cost, or a quarter of the time left if the cost is unknown.
-    :attr:`Budget.silence` is added: 2 % of the limit of the run, 5 to 60 s.
+    See the head of this module. :attr:`Budget.silence` is added.
     """
     match job:
         case MatchJob():

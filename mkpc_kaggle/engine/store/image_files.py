@@ -5,7 +5,8 @@ again only if its size or time has changed. A fresh run of ``submit`` digests no
 that decodes an image returns its digest.
 
 **An image that is replaced** has another digest, so another key: its pairs and their batch's scene are computed
-again, and results of these pairs with the former file are dropped. The batch's other pairs have the F of the
+again, and results of these pairs with the former file are no longer
+used, though the journal keeps them. The batch's other pairs have the F of the
 former scene until the new one.
 
 - Between two runs, :func:`update_digests` notices it by size and time, at the start.
