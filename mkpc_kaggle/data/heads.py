@@ -43,6 +43,11 @@ DAMAGE = (
 )
 HEIC_BRANDS = frozenset({b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1"})
 PNG_START = b"\x89PNG\r\n\x1a\n"
+PNG_SIZE_AT = 16  # the offset of width, height, bits of a channel, and colour type
+PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # of a colour type
+PNG_CHUNKS_BYTES = 200  # heads, checksums and short texts
+DEFLATE_RATIO = 1030  # the largest
+PNG_ROW_BYTES = 3  # of one colour, by fast writers such as OpenCV's
 
 
 # A TIFF file may also be a raw photograph.
@@ -97,6 +102,15 @@ def is_whole_png(data: bytes) -> bool:
             return True
         start = end + 4
     return False
+
+
+def may_have_one_colour(data: bytes) -> bool:
+    """Return whether a whole PNG file is so small that all of its pixels may be equal."""
+    width, height, depth, kind = struct.unpack_from(">IIBB", data, PNG_SIZE_AT)
+    # A byte for each row says how it is filtered.
+    stored = height * (1 + width * PNG_CHANNELS.get(kind, 4) * depth / 8)
+    limit = stored / DEFLATE_RATIO + PNG_ROW_BYTES * height + PNG_CHUNKS_BYTES
+    return bool(len(data) <= limit)
 
 
 def exif_tags(data: bytes) -> dict[int, float]:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mkpc_kaggle.data.competition import evenly_spread
-from mkpc_kaggle.data.heads import is_whole_png
+from mkpc_kaggle.data.heads import is_whole_png, may_have_one_colour
 from mkpc_kaggle.data.images import ByteCache, decode, read_size
 from mkpc_kaggle.data.outputs import lies_in
 from mkpc_kaggle.errors import UserError, plural
@@ -46,8 +46,8 @@ class Masks:
 
         An image without a mask is used whole. Raises :class:`UserError` for a directory that is
         missing, has images of the run or no masks of these images. Raises it also for a mask that
-        is unreadable or not as large as its image. Of many masks, up to ``MAX_DECODED`` are decoded; of
-        the others, sizes and the checksums of PNG are read.
+        is unreadable or not as large as its image. Of many masks, up to ``MAX_DECODED`` are decoded,
+        and those that may have one colour; of the others, sizes and the checksums of PNG are read.
         """
         if not directory.is_dir():
             raise UserError(
@@ -70,18 +70,24 @@ class Masks:
             expected = f"{name}{MASK_SUFFIX}"
             raise UserError(f"{directory} has no mask of any image: {expected} would be the first")
         files: dict[str, tuple[str, str]] = {}
+        effects: dict[str, str] = {}  # of the decoded masks, by digest: many may be copies of one
         unusual: dict[str, list[Path]] = {}
         sample = set(evenly_spread([*masked.values()], MAX_DECODED))
         decoded = 0
         for image, path in masked.items():
             data = _bytes_of(path)
-            mask = read_mask(path) if path in sample or not is_whole_png(data) else None
+            digest = _digest(data)
+            mask = None
+            # A mask that hides everything or nothing has one colour.
+            is_light = is_whole_png(data) and not may_have_one_colour(data)
+            if digest not in effects and (path in sample or not is_light):
+                mask = read_mask(path)
+                effects[digest] = _effect(mask)
             _require_size(path, image, mask)
-            files[str(image)] = (str(path), _digest(data))
-            if mask is not None:
-                decoded += 1
-                if effect := _effect(mask):
-                    unusual.setdefault(effect, []).append(path)
+            files[str(image)] = (str(path), digest)
+            decoded += digest in effects
+            if effect := effects.get(digest):
+                unusual.setdefault(effect, []).append(path)
         lines = _lines(directory, len(images), len(files), decoded, present, unusual)
         is_partial = len(files) < len(images) or bool(present or unusual)
         return cls(files, tuple(lines), is_partial)

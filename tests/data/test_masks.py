@@ -115,13 +115,15 @@ def test_of_many_masks_some_are_decoded_and_all_are_checked(folder, monkeypatch)
     monkeypatch.setattr(masks, "MAX_DECODED", 2)
     decoded = []
     monkeypatch.setattr(masks, "read_mask", lambda path: decoded.append(path) or read_mask(path))
+    # So small pictures may have one colour, whatever they show.
+    monkeypatch.setattr(masks, "may_have_one_colour", lambda _: False)
+    noise = np.random.default_rng(0).integers(0, 2, (5, *HALF.shape), np.uint8) * 255
     for number in range(5):
-        save(0 * HALF, folder / "M" / f"{number}.png.png")
-    _, everything = masks_of(folder).lines
+        save(noise[number], folder / "M" / f"{number}.png.png")
+    assert masks_of(folder).lines == ("masks: 5 of 5 images",)
     assert [path.name for path in decoded] == ["0.png.png", "4.png.png"]
-    assert everything.startswith("masks that hide everything: 2 of 2 that were decoded, the first")
     # The others are no less refused.
-    save(HALF.T, folder / "M" / "2.png.png")
+    save(noise[2].T, folder / "M" / "2.png.png")
     with pytest.raises(
         UserError, match=r"2\.png\.png has 20 x 30 pixels, its image 30 x 20; masks"
     ):
@@ -131,7 +133,7 @@ def test_of_many_masks_some_are_decoded_and_all_are_checked(folder, monkeypatch)
         with pytest.raises(UserError, match=r"2\.png\.png cannot be read"):
             masks_of(folder)
     # A file that does not fit its checksums is decoded.
-    save(HALF, folder / "M" / "2.png.png")
+    save(noise[2], folder / "M" / "2.png.png")
     data = bytearray((folder / "M" / "2.png.png").read_bytes())
     data[-20] ^= 255
     (folder / "M" / "2.png.png").write_bytes(data)
@@ -142,7 +144,26 @@ def test_of_many_masks_some_are_decoded_and_all_are_checked(folder, monkeypatch)
     # Nor has another format checksums.
     PIL.Image.fromarray(0 * HALF).save(folder / "M" / "2.png.png", "BMP")
     _, everything = masks_of(folder).lines
-    assert everything.startswith("masks that hide everything: 3 of 3 that were decoded")
+    assert everything.startswith("masks that hide everything: 1 of 3 that were decoded")
+
+
+@pytest.mark.parametrize("shape", [(20, 30), (480, 640), (900, 1200)])
+@pytest.mark.parametrize("channels", [1, 3, 4])
+@pytest.mark.parametrize("write", [save, lambda array, path: cv2.imwrite(str(path), array)])
+def test_of_many_masks_those_of_one_colour_are_all_named_and_copies_are_decoded_once(
+    folder, monkeypatch, shape, channels, write
+):
+    monkeypatch.setattr(masks, "MAX_DECODED", 1)
+    decoded = []
+    monkeypatch.setattr(masks, "read_mask", lambda path: decoded.append(path) or read_mask(path))
+    size = shape if channels == 1 else (*shape, channels)
+    noise = np.random.default_rng(0).integers(0, 2, size, np.uint8) * 255
+    for number in range(5):
+        PIL.Image.new("RGB", shape[::-1]).save(folder / "I" / f"{number}.png")
+        write(noise if number == 0 else 0 * noise, folder / "M" / f"{number}.png.png")
+    _, everything = masks_of(folder).lines
+    assert everything.startswith("masks that hide everything: 4, the first is")
+    assert len(decoded) == 2
 
 
 def test_equal_names_may_be_written_in_two_ways(folder):
