@@ -31,6 +31,19 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+@pytest.fixture(autouse=True)
+def signals_as_before() -> Iterator[None]:
+    """A test that leaves Ctrl-C ignored would break later ones, in some orders of files."""
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.getsignal(number) for number in numbers]
+    yield
+    after = [signal.getsignal(number) for number in numbers]
+    for number, handler, left in zip(numbers, before, after, strict=True):
+        if left is not handler:
+            signal.signal(number, handler)
+    assert after == before, "the test has changed the handlers of signals"
+
+
 # How long an example takes is the machine's affair; tests that are about time measure it.
 settings.register_profile(
     "any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow]

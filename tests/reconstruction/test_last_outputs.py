@@ -80,6 +80,8 @@ def test_a_file_that_cannot_be_written_is_a_line_and_the_exit_status(
 def test_an_error_without_a_text_is_a_failure_of_sparse(monkeypatch):
     sent = []
     monkeypatch.setattr(layout, "convert_models", no_memory)
+    # Its own process ignores Ctrl-C, and this one must not.
+    monkeypatch.setattr(layout.signal, "signal", lambda *_: None)
     layout._write_sparse_to(type("Sender", (), {"send": sent.append}), None, {})
     (failure,) = sent
     assert failure.startswith("MemoryError")
