@@ -43,6 +43,7 @@ DAMAGE = (
 )
 HEIC_BRANDS = frozenset({b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1"})
 PNG_START = b"\x89PNG\r\n\x1a\n"
+PNG_FIRST_CHUNK = b"\0\0\0\x0dIHDR"  # of 13 bytes
 PNG_SIZE_AT = 16  # the offset of width, height, bits of a channel, and colour type
 PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # of a colour type
 PNG_CHUNKS_BYTES = 200  # heads, checksums and short texts
@@ -87,8 +88,10 @@ def size_of(stream: BinaryIO) -> Size | None:
 
 
 def is_whole_png(data: bytes) -> bool:
-    """Return whether all chunks of a PNG file fit their checksums. No pixel is decoded."""
-    if not data.startswith(PNG_START):
+    """Return whether a PNG file begins with its size, and all chunks fit their checksums. No pixel is
+    decoded.
+    """
+    if not data.startswith(PNG_START + PNG_FIRST_CHUNK):
         return False
     view = memoryview(data)
     start = len(PNG_START)

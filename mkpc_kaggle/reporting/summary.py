@@ -252,7 +252,7 @@ def image_counts(run: AnyRun, scene: SceneRecord) -> ImageCounts:
 
 def total_counts(run: AnyRun) -> ImageCounts:
     """Return the counts of all scenes, and of the datasets that are too small for one."""
-    counts = [image_counts(run, scene) for scene in run.scenes]
+    counts = [ImageCounts(0, 0, 0), *(image_counts(run, scene) for scene in run.scenes)]
     batches = {scene.batch for scene in run.scenes}
     counts += [ImageCounts(len(run.files[batch]), 0, 0) for batch in run.files.keys() - batches]
     return ImageCounts(*(sum(column) for column in zip(*counts, strict=True)))

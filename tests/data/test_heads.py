@@ -11,6 +11,7 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from mkpc_kaggle.data.competition import Pair
+from mkpc_kaggle.data.heads import is_whole_png
 from mkpc_kaggle.data.images import Image, Unreadable, read_image, read_size
 from mkpc_kaggle.data.regions import read_regions
 from mkpc_kaggle.errors import UserError
@@ -106,3 +107,8 @@ def test_a_format_that_is_not_decoded_is_named_with_the_remedy(tmp_path):
     for name, (content, reason) in told.items():
         (tmp_path / name).write_bytes(content)
         assert read_image(tmp_path / name).reason.startswith(reason)
+
+
+def test_a_png_without_its_size_is_not_whole():
+    start, end = b"\x89PNG\r\n\x1a\n", b"\0\0\0\0IEND\xaeB`\x82"
+    assert not is_whole_png(start + end)

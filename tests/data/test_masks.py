@@ -128,7 +128,9 @@ def test_of_many_masks_some_are_decoded_and_all_are_checked(folder, monkeypatch)
         UserError, match=r"2\.png\.png has 20 x 30 pixels, its image 30 x 20; masks"
     ):
         masks_of(folder)
-    for damaged in (b"no picture", b""):
+    # A whole file of chunks, and no size
+    no_size = b"\x89PNG\r\n\x1a\n\0\0\0\0IEND\xaeB`\x82"
+    for damaged in (b"no picture", b"", no_size):
         (folder / "M" / "2.png.png").write_bytes(damaged)
         with pytest.raises(UserError, match=r"2\.png\.png cannot be read"):
             masks_of(folder)
