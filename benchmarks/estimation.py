@@ -282,9 +282,9 @@ def difference(draws: Draws, first: str, second: str) -> Difference:
             after = only[second]
             single.append((before.accuracies, after.accuracies, before.images))
         return paired_difference(single)
-    firsts = []
-    seconds = []
-    ends = []
+    firsts: list[float] = []
+    seconds: list[float] = []
+    ends: list[tuple[str, str]] = []
     for scene, scores in draws.items():
         for each in scores:
             # Scene and draw take the place of two images: both are resampled.

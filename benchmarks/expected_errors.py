@@ -28,7 +28,11 @@ def ratios(table: pd.DataFrame, true_cameras: dict[str, Camera]) -> tuple[np.nda
     percent, (N, 3), and the same over their sigmas.
     """
     cameras = [
-        Camera(numbers(row.K).reshape(3, 3), numbers(row.R).reshape(3, 3), numbers(row.t))
+        Camera(
+            numbers(str(row.K)).reshape(3, 3),
+            numbers(str(row.R)).reshape(3, 3),
+            numbers(str(row.t)),
+        )
         for row in table.itertuples()
     ]
     targets = [true_cameras[name] for name in table["image"]]

@@ -204,8 +204,8 @@ def programs_of(arguments: argparse.Namespace) -> list[Program]:
         Program(f"pycolmap, {mapper}", (python, "-c", ALONE, "{images}", "{out}", mapper, pairing))
         for mapper in arguments.mappers
     ]
-    command = (python, "-m", "mkpc_kaggle", "reconstruct", "{images}", "--out", "{out}")
-    command += ("--recipe", arguments.recipe)
+    package = (python, "-m", "mkpc_kaggle")
+    command = (*package, "reconstruct", "{images}", "--out", "{out}", "--recipe", arguments.recipe)
     ours = [Program("reconstruct", command)]
     for each in arguments.code:
         name, _, checkout = each.partition("=")

@@ -149,7 +149,7 @@ def parent(_: Inputs) -> Iterator[tuple[str, float]]:
     yield "parent of 1,000 pairs, next to products", 1000 * seconds / LOOP_PAIRS / reference
 
 
-def submission(_: Inputs) -> Iterator[tuple[str, float]]:
+def submission(inputs: Inputs) -> Iterator[tuple[str, float]]:
     """Yield the seconds of ``submit`` of the demo set, in loops of products."""
     python = sys.executable
     with tempfile.TemporaryDirectory() as name:

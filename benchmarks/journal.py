@@ -60,8 +60,8 @@ def scenario_of(pairs: int, batches: int, units: int = 5, matches: int = 2000) -
     """Return a run without a limit, whose units return the same random matches."""
     rng = np.random.default_rng(0)
     # Random sub-pixel points on images of 1600 x 1200 pixels hardly compress.
-    points = (rng.random((matches, 2)) * (1600, 1200) for _ in range(2))
-    simulator.POINTS = Matches(*points, rng.random(matches))
+    points0, points1 = (rng.random((2, matches, 2)) * (1600, 1200)).astype(np.float32)
+    simulator.POINTS = Matches(points0, points1, rng.random(matches).astype(np.float32))
     return Scenario(pairs, (0.5,) * units, 1, float("inf"), 0.1, 0, batches=batches)
 
 

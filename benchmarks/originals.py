@@ -109,7 +109,7 @@ class Comparison:
             published = record.run(row, "theirs", partial(theirs, data))
             record.equal[row].append(same_matches(own, published, (first, second)))
 
-    def encoded(self, picture: Picture, record: Record) -> Keypoints:
+    def encoded(self, picture: Picture, record: Record) -> Any:
         """Return a picture's keypoints by our encoder."""
         encoder = self.ours["early"]
         if self.aliked is None:
@@ -222,7 +222,8 @@ def main() -> None:
 
 
 def loaded(matcher: str, store: WeightStore, settings: dict[str, float]) -> Any:
-    options = from_table(spec_of(matcher, "benchmark").options, settings, "benchmark")
+    kind: Any = spec_of(matcher, "benchmark").options
+    options = from_table(kind, settings, "benchmark")
     return load_matcher(matcher, store, options, Placement())
 
 

@@ -30,10 +30,11 @@ from torch import nn
 
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
 from mkpc_kaggle.matchers.adapters.loma import LomaAdapter, LomaOptions
-from mkpc_kaggle.matchers.adapters.roma import PATCH, SPEC, RomaOptions
+from mkpc_kaggle.matchers.adapters.roma import SPEC, RomaOptions
 from mkpc_kaggle.matchers.adapters.sift import SiftMatcher, SiftOptions
 from mkpc_kaggle.matchers.contract import Colour, Matcher, Picture, Placement, Precision
 from mkpc_kaggle.matchers.dense import DenseMatcher
+from mkpc_kaggle.matchers.networks.dinov2 import PATCH
 from mkpc_kaggle.matchers.networks.loftr import Loftr
 from mkpc_kaggle.matchers.networks.loma import Loma, Variant
 from mkpc_kaggle.matchers.networks.placement import prepared
@@ -111,7 +112,8 @@ CASES = {
 
 def photographs(size: Size) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
     """Return two images (H, W, 3) RGB; the second is the first, 16 pixels right and 8 down."""
-    resized = cv2.resize(load_sample_images().images[0], size, interpolation=cv2.INTER_AREA)
+    photograph = load_sample_images().images[0]
+    resized = np.asarray(cv2.resize(photograph, size, interpolation=cv2.INTER_AREA), np.uint8)
     return resized, np.roll(resized, (8, 16), axis=(0, 1))
 
 
@@ -121,7 +123,7 @@ def pictures_of(size: Size, colour: Colour, multiple: int) -> list[Picture]:
     pictures = []
     for rgb in photographs(size):
         is_gray = colour is Colour.GRAY
-        pixels = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY) if is_gray else rgb
+        pixels = np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY) if is_gray else rgb, np.uint8)
         pictures.append(Picture(view.render(pixels), view))
     return pictures
 

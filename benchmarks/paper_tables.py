@@ -35,7 +35,7 @@ TABLES = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="u
 def recipe_of(table: str, row: str, method: str, given: argparse.Namespace) -> Recipe:
     """Return a row's recipe, with the protocol and the matcher of the command, if given."""
     whole = load_recipe("imc2022" if table == "imc" else table)
-    units = []
+    units: list[Unit] = []
     if table == "imc":
         # A row names one matcher of the ensemble, on whole images, or the whole ensemble.
         own = next((unit for unit in whole.units if unit.matcher == row), None)

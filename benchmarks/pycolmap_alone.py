@@ -54,7 +54,7 @@ def cameras_of(model: pycolmap.Reconstruction) -> Cameras:
     for number in model.reg_image_ids():
         image = model.images[number]
         pose = image.cam_from_world().matrix()
-        K = image.camera.calibration_matrix()
+        K = model.cameras[image.camera_id].calibration_matrix()
         K[:2, 2] -= COLMAP_CENTRE_PX
         name = Path(image.name).stem
         cameras[name] = Camera(K, pose[:, :3], pose[:, 3])

@@ -11,7 +11,7 @@ pairs.
 import argparse
 import resource
 import time
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
@@ -32,7 +32,7 @@ def row(size: str, world: str) -> str:
     scene = street(images, pairs)
     if world == "front":
         scene = synthetic_scene(images, pairs, points=2500)
-    seconds: Counter[str] = Counter()
+    seconds: defaultdict[str, float] = defaultdict(float)
     # The process is thrown away after this row, so nothing is restored.
     for name in ("verify", "run_mapper"):
         setattr(colmap, name, timed(getattr(colmap, name), name, seconds))
@@ -55,7 +55,9 @@ def row(size: str, world: str) -> str:
     )
 
 
-def timed(function: Callable[..., Any], name: str, seconds: Counter[str]) -> Callable[..., Any]:
+def timed(
+    function: Callable[..., Any], name: str, seconds: defaultdict[str, float]
+) -> Callable[..., Any]:
     """Wrap ``function`` so that its CPU seconds are added to ``seconds[name]``."""
 
     def call(*arguments: Any) -> Any:

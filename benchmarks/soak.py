@@ -66,7 +66,8 @@ class StandIn:
         width, height = view0.content
         points0 = rng.uniform(2, min(width, height) - 20, (MATCHES, 2))
         points1 = points0 + np.column_stack([rng.uniform(0, 15, MATCHES), np.zeros(MATCHES)])
-        return Matches(points0, points1, np.ones(MATCHES))
+        scores = np.ones(MATCHES, np.float32)
+        return Matches(points0.astype(np.float32), points1.astype(np.float32), scores)
 
 
 @dataclass

@@ -47,7 +47,8 @@ class SyntheticScene:
         camera0, camera1 = self.true_cameras(pair)
         points0 = project(camera0, world)
         points1 = project(camera1, world)
-        true = Matches(points0, points1, np.ones(len(world)))
+        scores = np.ones(len(world), np.float32)
+        true = Matches(points0.astype(np.float32), points1.astype(np.float32), scores)
         return float(np.median(sampson_distances(F, true)))
 
 
@@ -245,4 +246,5 @@ def match(
     other[wrong] = rng.permutation(kept[wrong])
     moves = rng.normal(0, 0.05, (len(kept), 2))
     points1 = detected1[index1[other]] + moves
-    return Matches(points0, points1, np.ones(len(kept)))
+    scores = np.ones(len(kept), np.float32)
+    return Matches(points0.astype(np.float32), points1.astype(np.float32), scores)

@@ -18,9 +18,9 @@ from mkpc_kaggle.evaluation.compare import paired_difference
 from mkpc_kaggle.evaluation.validate import error_of
 from mkpc_kaggle.geometry.metrics import PoseError, pair_accuracy
 from mkpc_kaggle.pipeline.pair import PairMatch
-from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher, to_image
+from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher
 from mkpc_kaggle.recipe import Mode, Recipe, load_recipe
-from mkpc_kaggle.reporting.figures import draw_pair, save
+from mkpc_kaggle.reporting.figures import save
 
 RECIPE = load_recipe(str(Path(__file__).with_suffix(".toml")))
 MODES = {
@@ -51,9 +51,8 @@ def main() -> None:
     match = print_errors(*known[DECIDED], RECIPE)
     print(f"{FLAT}: the crop hardly helps: nearly all matches lie on one plane")
     print_errors(*known[FLAT], load_recipe("classical"))
-    true, street = known[DECIDED]
-    image0, image1 = map(to_image, true.pair.images)
-    save(draw_pair(image0, image1, match, RECIPE.mkpc), arguments.out)
+    _, street = known[DECIDED]
+    save(match.plot(), arguments.out)
 
     pairs = [true for true in street.pairs if len(WIDE & set(true.pair.names)) == 1]
     print("\nTelephoto pairs: mAA, and the median error of the rotation in degrees")

@@ -312,16 +312,18 @@ def connect(axes: "Sequence[Axes]", matches: Matches, inliers: NDArray[np.bool_]
     for indices, colour, width in ((outliers_drawn, OUTLIER, 0.5), (inliers_drawn, INLIER, 0.7)):
         for panel, points in zip(axes, (matches.points0, matches.points1), strict=True):
             panel.scatter(points[indices, 0], points[indices, 1], s=6, c=colour, linewidths=0)
-        style = {
-            "coordsA": "data",
-            "coordsB": "data",
-            "color": colour,
-            "linewidth": width,
-            "alpha": 0.6,
-        }
         for index in indices:
-            ends = matches.points0[index], matches.points1[index]
-            line = ConnectionPatch(*ends, axesA=axes[0], axesB=axes[1], **style)
+            line = ConnectionPatch(
+                matches.points0[index],
+                matches.points1[index],
+                "data",
+                "data",
+                axesA=axes[0],
+                axesB=axes[1],
+                color=colour,
+                linewidth=width,
+                alpha=0.6,
+            )
             axes[0].figure.add_artist(line)
     return f"{len(inliers_drawn)} inliers (green) and {len(outliers_drawn)} outliers (orange) drawn"
 

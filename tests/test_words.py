@@ -58,24 +58,3 @@ def test_no_function_and_no_constant_that_is_imported_elsewhere_is_defined_twice
         for name in names_in(tree)[1] & imported:
             defined[name].add(str(path.relative_to(PACKAGE)))
     assert {name: files for name, files in defined.items() if len(files) > 1} == {}
-
-
-def test_constants_with_these_words_are_named_by_their_purpose():
-    """Each had several values, and a reader had to look up which."""
-    for path, tree in modules().items():
-        assert "MAX_ITERATIONS" not in names_in(tree)[1], path
-
-
-def test_found_known_and_each_never_meet_in_a_function():
-    """Two of them in one place say nothing about either."""
-    words = {"found", "known", "each"}
-    meeting = []
-    for path, tree in modules().items():
-        for function in ast.walk(tree):
-            if isinstance(function, ast.FunctionDef):
-                nodes = list(ast.walk(function))
-                used = {node.id for node in nodes if isinstance(node, ast.Name)}
-                used |= {node.arg for node in nodes if isinstance(node, ast.arg)}
-                if len(used & words) > 1:
-                    meeting.append(f"{path.relative_to(PACKAGE)}: {function.name}")
-    assert meeting == []

@@ -32,9 +32,9 @@ def measure(part: Part, setup: Setup, speed: Part) -> None:
             for unit in recipe.units:
                 name = Case.of(recipe, unit).name
                 # RootSIFT has no network, and the same cost in each precision.
-                row = costs.get((name, precision)) or costs.get((name, "float32"))
-                if row is not None:
-                    seconds.append(_seconds(unit, row))
+                cost = costs.get((name, precision)) or costs.get((name, "float32"))
+                if cost is not None:
+                    seconds.append(_seconds(unit, cost))
             part.add(
                 recipe=recipe_name, precision=precision, **_forecast(seconds, len(recipe.units))
             )

@@ -106,7 +106,8 @@ def _verdict(row: dict[str, Any], half: float) -> str:
 def _load(name: str, device: str, precision: Precision = Precision.FLOAT32) -> Matcher[Any]:
     """Load a matcher with seeded weights, as a run loads it with files."""
     try:
-        options = from_table(spec_of(name, "benchmark").options, OPTIONS[name], name)
+        kind: Any = spec_of(name, "benchmark").options
+        options = from_table(kind, OPTIONS[name], name)
     except UnusableError as error:
         raise SkippedError(str(error.__cause__)) from error
     weights = SeededWeights(layers=LAYERS, narrow=True)

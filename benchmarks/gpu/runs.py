@@ -229,7 +229,8 @@ def _run(case: Case, recipe: Path, setup: Setup, seconds: float, limit: int) -> 
     good: dict[str, int] = {}  # results by pair
     with suppress(KeyError):  # no unit has a result
         units = read_results(home / "submission.work").units
-        good = units[units["failure"] == ""]["pair"].value_counts().to_dict()
+        counts = units[units["failure"] == ""]["pair"].value_counts()
+        good = {str(pair): int(count) for pair, count in counts.items()}
     problems = submission_problems(output, [pair.id for pair in pairs])
     rows = "; ".join(map(str, problems))
     return Outcome(

@@ -58,7 +58,7 @@ def machine(setup: Setup) -> Row:
         facts["compute capability"] = f"{properties.major}.{properties.minor}"
         facts["driver"] = _driver()
         facts["CUDA of torch"] = torch.version.cuda
-        facts["cuDNN"] = torch.backends.cudnn.version()
+        facts["cuDNN"] = torch.backends.cudnn.version()  # type: ignore[no-untyped-call]
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     facts["cores"] = cores
     facts["Python"] = platform.python_version()

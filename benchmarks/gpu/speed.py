@@ -57,8 +57,8 @@ class Case:
         """Return the case that a recipe's unit belongs to."""
         options = tuple(sorted(recipe.matchers.get(unit.matcher, {}).items()))
         # The rest of a unit changes no cost.
-        view = {"area": unit.area, "stretch": unit.stretch}
-        return cls(unit.matcher, options, Unit(1, unit.matcher, unit.long_side, **view))
+        viewed = Unit(1, unit.matcher, unit.long_side, area=unit.area, stretch=unit.stretch)
+        return cls(unit.matcher, options, viewed)
 
     @property
     def name(self) -> str:
@@ -70,7 +70,7 @@ class Case:
 
 def cases_of(recipes: Sequence[str]) -> list[Case]:
     """Return the cases of recipes, each once; a fallback is a case, too."""
-    cases = {}
+    cases: dict[Case, None] = {}
     for name in recipes:
         recipe = load_recipe(name)
         for unit in recipe.units:
@@ -129,14 +129,14 @@ def _measure_load(part: Part, load: Load, precision: Precision, setup: Setup) ->
     except Exception as error:
         with part.row(**facts):
             raise error
-        return
-    for case in cases:
-        part.check_time(needed=5.0 if setup.is_gpu else 0.0)
-        with part.row(matcher=case.name, precision=str(precision)) as row:
-            row["minibatch"] = load.minibatch
-            row.update(_seconds(case, matcher, load.minibatch, setup))
-            row["weights"] = kind
-        _free(setup)
+    else:
+        for case in cases:
+            part.check_time(needed=5.0 if setup.is_gpu else 0.0)
+            with part.row(matcher=case.name, precision=str(precision)) as row:
+                row["minibatch"] = load.minibatch
+                row.update(_seconds(case, matcher, load.minibatch, setup))
+                row["weights"] = kind
+            _free(setup)
 
 
 def _seconds(case: Case, matcher: Matcher[Any], minibatch: int, setup: Setup) -> Row:
@@ -182,7 +182,7 @@ def _spec(case: Case) -> MatcherSpec:
 
 def _options(case: Case, setup: Setup) -> Any:
     """Return the matcher's options: the recipe's, in a rehearsal with few keypoints."""
-    kind = _spec(case).options
+    kind: Any = _spec(case).options
     options = from_table(kind, dict(case.options), case.name)
     for name in ("features", "max_keypoints"):
         if setup.quick and hasattr(options, name):

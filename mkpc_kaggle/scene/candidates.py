@@ -26,7 +26,7 @@ from mkpc_kaggle.scene.view_graph import BatchPair, tracks_of
 ALL_UNITS, SUPPORTED = "", "supported"
 CANDIDATE_SUPPORT = 0.1
 # A candidate's disagreement must be smaller than this share of the first one's. Shares from 0.97 to 0.99
-# choose the same on all draws of benchmarks.candidates.
+# choose the same on all draws of docs/results.md.
 MAX_SHARE = 0.98
 MAX_ANGLE_DEG = 10.0  # of a pair: F of some pairs is wrong, and a pair may have no cameras
 

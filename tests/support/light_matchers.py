@@ -127,7 +127,7 @@ def lightglue_matcher(
     return LightGlueMatcher(spec_of(name, "test"), encode, network, placement)
 
 
-MATCHERS = {
+MATCHERS: dict[str, Callable[..., Any]] = {
     "superglue": superglue_matcher,
     "loftr": partial(semi_dense_matcher, "loftr", Loftr),
     "quadtree": partial(semi_dense_matcher, "quadtree", Quadtree),

@@ -1,0 +1,1 @@
+"""Commands that measure; each prints its table. README.md lists them."""
