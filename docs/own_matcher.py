@@ -42,8 +42,8 @@ class OrbMatcher(PairwiseMatcher):
 def load(weights, options, placement):
     """Return the matcher: used only in ``mkpc_kaggle/matchers/adapters/``.
 
-    A file there is named as the matcher, and must define ``SPEC`` and this function. ``options`` is an instance of
-    the frozen dataclass ``SPEC.options``, and ``SPEC.slots`` names the weights.
+    ``matchers/registry.py`` names the file, which must define ``SPEC`` and this function. ``options`` is an
+    instance of the frozen dataclass ``SPEC.options``, and ``SPEC.slots`` names the weights.
     A network reads its tensors with ``weights.load("slot")`` and moves to ``placement.device``.
     """
     return OrbMatcher()

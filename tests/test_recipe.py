@@ -11,7 +11,7 @@ from mkpc_kaggle.geometry.coordinates import Box, Size, View
 from mkpc_kaggle.geometry.critical_region import MkpcConfig
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.robust import Method, RobustConfig
-from mkpc_kaggle.matchers.registry import matcher_names, spec_of
+from mkpc_kaggle.matchers.registry import MATCHERS, spec_of
 from mkpc_kaggle.recipe import (
     Mode,
     Recipe,
@@ -61,7 +61,7 @@ def test_any_remaining_matchers_of_recipe_auto_begin_with_a_unit_of_stage_1():
     # Users have any subset of the weights, and a run without a sweep has no F for any pair.
     recipe = load_recipe("auto")
     names = recipe.matcher_names
-    assert set(matcher_names()) == set(names)
+    assert set(MATCHERS) == set(names)
     for count in range(1, len(names) + 1):
         for kept in combinations(names, count):
             remaining = recipe.only(lambda unit, kept=kept: unit.matcher in kept)

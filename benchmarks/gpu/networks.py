@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.gpu.record import EXPECTED, Part, SkippedError
+from benchmarks.gpu.record import EXPECTED, Part
 from benchmarks.gpu.seeded import SeededWeights
 from benchmarks.gpu.setup import Setup
 from mkpc_kaggle.config import from_table
@@ -26,7 +26,7 @@ from mkpc_kaggle.matchers.adapters import roma
 from mkpc_kaggle.matchers.contract import Colour, Matcher, Picture, Placement, Precision
 from mkpc_kaggle.matchers.dense import DenseEncoding, DenseMatcher
 from mkpc_kaggle.matchers.dtypes import exact_float32
-from mkpc_kaggle.matchers.registry import UnusableError, load_matcher, spec_of
+from mkpc_kaggle.matchers.registry import load_matcher, spec_of
 from tests.support.pictures import agreement
 from tests.support.standin import narrow_roma, scene
 
@@ -105,11 +105,8 @@ def _verdict(row: dict[str, Any], half: float) -> str:
 
 def _load(name: str, device: str, precision: Precision = Precision.FLOAT32) -> Matcher[Any]:
     """Load a matcher with seeded weights, as a run loads it with files."""
-    try:
-        kind: Any = spec_of(name, "benchmark").options
-        options = from_table(kind, OPTIONS[name], name)
-    except UnusableError as error:
-        raise SkippedError(str(error.__cause__)) from error
+    kind: Any = spec_of(name, "benchmark").options
+    options = from_table(kind, OPTIONS[name], name)
     weights = SeededWeights(layers=LAYERS, narrow=True)
     with _for_seeded_weights(name):
         return load_matcher(name, weights, options, Placement(device, precision))

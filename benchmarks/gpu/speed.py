@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from sklearn.datasets import load_sample_images
 
-from benchmarks.gpu.record import Part, Row, SkippedError
+from benchmarks.gpu.record import Part, Row
 from benchmarks.gpu.seeded import SeededWeights
 from benchmarks.gpu.setup import Setup
 from mkpc_kaggle.config import from_table
@@ -26,7 +26,7 @@ from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.matchers.adapters.sift import SiftMatcher
 from mkpc_kaggle.matchers.contract import Matcher, MatcherSpec, Picture, Placement, Precision
 from mkpc_kaggle.matchers.dense import DenseMatcher
-from mkpc_kaggle.matchers.registry import UnusableError, load_matcher, spec_of
+from mkpc_kaggle.matchers.registry import load_matcher, spec_of
 from mkpc_kaggle.pipeline.pair import PairMatch
 from mkpc_kaggle.pipeline.stages import CACHE_SHARE, ENCODING_CACHE_BYTES, Pipeline
 from mkpc_kaggle.recipe import Recipe, Unit, load_recipe
@@ -174,10 +174,7 @@ def _weights(case: Case, setup: Setup) -> tuple[WeightStore, str]:
 
 
 def _spec(case: Case) -> MatcherSpec:
-    try:
-        return spec_of(case.matcher, "benchmark")
-    except UnusableError as error:
-        raise SkippedError(str(error.__cause__)) from error
+    return spec_of(case.matcher, "benchmark")
 
 
 def _options(case: Case, setup: Setup) -> Any:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from mkpc_kaggle.cli import options
 from mkpc_kaggle.errors import UserError, plural, temporary_directory
-from mkpc_kaggle.matchers.registry import UnusableError, matcher_names, spec_of
+from mkpc_kaggle.matchers.registry import MATCHERS, spec_of
 from mkpc_kaggle.recipe import load_recipe, recipe_names
 from mkpc_kaggle.setup.availability import fit_of, slots_of
 from mkpc_kaggle.weights import FileState, FoundFile, WeightFile, WeightStore
@@ -70,16 +70,9 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _list(arguments: argparse.Namespace) -> None:
-    """Print a row for each slot, and a line for each matcher that cannot be imported."""
+    """Print a row for each slot."""
     store = WeightStore(arguments.weights)
-    specs = []
-    unusable = []
-    for name in matcher_names():
-        # A matcher of a missing library is named below the table; the others are listed.
-        try:
-            specs.append(spec_of(name, "weights"))
-        except UnusableError as error:
-            unusable.append(str(error))
+    specs = [spec_of(name, "weights") for name in MATCHERS]
     rows = [("slot", "licence", "matchers", "file")]
     for slot in dict.fromkeys(file.slot for file in store.files):
         files = store.alternatives(slot)
@@ -93,7 +86,6 @@ def _list(arguments: argparse.Namespace) -> None:
         names = ", ".join(users) or "-"
         rows.append((slot, files[0].licence, names, "; ".join(where)))
     options.print_table(rows)
-    print("".join(f"{text}\n" for text in unusable), end="")
 
 
 def _verify(arguments: argparse.Namespace) -> int:

@@ -10,9 +10,9 @@ The matches of every unit become full-image pixels once: ``Pipeline._match`` (``
 ``Matches.to_image``, which calls :meth:`View.to_image` for both images and drops matches on padding. All
 keypoints of an image, for programs, do so in ``PairKeypoints.of`` (``pipeline/keypoints.py``).
 
-Before that, matchers with other conventions convert to pixel centres: LoFTR's family, and vismatch if its option
-``corner`` is true, by :func:`from_corner`; DKM, RoMa and LoMa by :func:`from_normalised`. ``sift_lightglue``
-takes away the quarter of a pixel that OpenCV adds. Points for COLMAP's files and functions are shifted by
+Before that, matchers with other conventions convert to pixel centres: LoFTR's family by :func:`from_corner`;
+DKM, RoMa and LoMa by :func:`from_normalised`. ``sift_lightglue`` takes away the quarter of a pixel that
+OpenCV adds. Points for COLMAP's files and functions are shifted by
 ``COLMAP_CENTRE_PX``.
 """
 

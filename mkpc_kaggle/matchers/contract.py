@@ -90,9 +90,9 @@ class MatcherSpec:
     licences : tuple of str
         Licence tags of weights outside the manifest.
     version : str
-        Of a matcher given in Python, or of vismatch: its results are kept for later runs under this text, so
+        Of a matcher given in Python: its results are kept for later runs under this text, so
         change it whenever equal pictures get other points. Without it, results are not kept. For a
-        file of ``adapters/`` it has no effect: increase ``keys.POINTS_VERSION`` instead.
+        matcher of the registry it has no effect: increase ``keys.POINTS_VERSION`` instead.
     packages : tuple of str
         Distributions whose code computes points: their versions are in the keys of results.
         "opencv" is any build of OpenCV.

@@ -1,40 +1,42 @@
-"""The registry of matchers: a file of ``adapters/`` is a matcher, with a ``SPEC`` and a ``load``.
+"""The registry of matchers: names, and the modules with their ``SPEC`` and ``load``."""
 
-Matchers of the library vismatch are named ``vismatch:NAME``.
-"""
-
-import pkgutil
 from collections.abc import Mapping
-from functools import cache
 from importlib import import_module
 from typing import Any
 
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.matchers import adapters
 from mkpc_kaggle.matchers.contract import Matcher, MatcherSpec, Placement
 from mkpc_kaggle.weights import WeightStore
 
-# Begins the names of vismatch's matchers, which need no file in ``adapters/``.
-VISMATCH = "vismatch:"
-
-
-class UnusableError(UserError):
-    """Error for a matcher that cannot be imported here; ``__cause__`` is the import's error."""
-
-
-@cache
-def matcher_names() -> tuple[str, ...]:
-    """Return the names of all matchers, one per file, without importing them."""
-    return tuple(info.name for info in pkgutil.iter_modules(adapters.__path__))
+NAMES = (
+    "aliked",
+    "aliked_lightglue",
+    "aspanformer",
+    "disk_lightglue",
+    "dkm",
+    "loftr",
+    "loma",
+    "quadtree",
+    "roma",
+    "sift",
+    "sift_lightglue",
+    "superglue",
+    "superpoint_lightglue",
+    "xfeat_lighterglue",
+)
+# Imported on first use: torch and kornia take seconds.
+MATCHERS = {name: f"mkpc_kaggle.matchers.adapters.{name}" for name in NAMES}
 
 
 def spec_of(name: str, where: str) -> MatcherSpec:
     """Import a matcher and return its spec.
 
     Error messages start with ``where``, the source of the name. Raises :class:`UserError` for an
-    unknown name, :class:`UnusableError` if the import fails.
+    unknown name.
     """
-    spec: MatcherSpec = _imported(name, where).SPEC
+    if name not in MATCHERS:
+        raise UserError(f"{where}: unknown matcher {name!r}; known: {', '.join(MATCHERS)}")
+    spec: MatcherSpec = import_module(MATCHERS[name]).SPEC
     return spec
 
 
@@ -45,7 +47,7 @@ def load_matcher(
 
     Raises :class:`UserError` if its weights are missing or damaged.
     """
-    matcher: Matcher[Any] = _imported(name, "load").load(weights, options, placement)
+    matcher: Matcher[Any] = import_module(MATCHERS[name]).load(weights, options, placement)
     return matcher
 
 
@@ -68,24 +70,6 @@ def misfit(name: str, weights: WeightStore, options: Any) -> str:
         # run reports that, and continues with the other matchers.
         return ""
     return ""
-
-
-def _imported(name: str, where: str) -> Any:
-    """Return the module of a matcher, or for vismatch an object with the same interface."""
-    is_vismatch = name.startswith(VISMATCH)
-    if not is_vismatch and name not in matcher_names():
-        known = ", ".join(matcher_names())
-        raise UserError(f"{where}: unknown matcher {name!r}; known: {known}, {VISMATCH}NAME")
-    try:
-        if is_vismatch:
-            module = import_module("mkpc_kaggle.matchers.vismatch")
-            return module.adapter_of(name.removeprefix(VISMATCH))
-        return import_module(f"{adapters.__name__}.{name}")
-    # Any error, not only ImportError: a broken installation of a library raises all kinds, and
-    # only this matcher is affected.
-    except Exception as error:
-        message = f"matcher {name} cannot be used here ({type(error).__name__}: {error})"
-        raise UnusableError(f"{where}: {message}. `--recipe auto` runs without it.") from error
 
 
 def require_matchers(matchers: Mapping[str, Matcher[Any]]) -> Mapping[str, Matcher[Any]]:

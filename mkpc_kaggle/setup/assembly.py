@@ -18,9 +18,8 @@ from mkpc_kaggle.errors import UserError, warn_once
 from mkpc_kaggle.geometry.intrinsics import Rows
 from mkpc_kaggle.matchers.contract import Matcher, MatcherSpec, Placement, Precision
 from mkpc_kaggle.matchers.registry import (
-    VISMATCH,
+    MATCHERS,
     load_matcher,
-    matcher_names,
     require_matchers,
     spec_of,
 )
@@ -110,7 +109,7 @@ class Assembly:
         }
         # The weights of a matcher of this package have digests, and its code has ``keys.POINTS_VERSION``.
         spec = self._spec_of(name)
-        if is_own or name.startswith(VISMATCH):
+        if is_own:
             settings["version"] = spec.version or self.nonce
         if spec.packages:
             settings["packages"] = {
@@ -125,9 +124,8 @@ class Assembly:
     @property
     def unversioned(self) -> list[str]:
         """The recipe's matchers whose results are not kept for later runs."""
-        names = self.recipe.matcher_names
-        foreign = [name for name in names if name in self.matchers or name.startswith(VISMATCH)]
-        return [name for name in foreign if not self._spec_of(name).version]
+        own = [name for name in self.recipe.matcher_names if name in self.matchers]
+        return [name for name in own if not self.matchers[name].spec.version]
 
     @property
     def weight_paths(self) -> tuple[Path, ...]:
@@ -206,14 +204,14 @@ def recipe_of_name(recipe: Recipe | str | PathLike[str], own: Container[str] = (
             f"recipe must be a Recipe, a name or the path of a TOML file, not {shown_value(recipe)}"
         )
     name = fspath(recipe)
-    if name in own or name in matcher_names() or name.startswith(VISMATCH):
+    if name in own or name in MATCHERS:
         return recipe_of_matcher(name)
     try:
         return load_recipe(name)
     except UserError as error:
         if name.endswith(".toml"):
             raise
-        raise UserError(f"{error}, or a matcher: {', '.join(matcher_names())}") from error
+        raise UserError(f"{error}, or a matcher: {', '.join(MATCHERS)}") from error
 
 
 def recipe_of_matcher(name: str) -> Recipe:

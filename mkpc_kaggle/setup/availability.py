@@ -1,7 +1,6 @@
 """Availability of a recipe's matchers: code, weights, and the licences of the weights."""
 
 from collections.abc import Iterable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field
 from enum import StrEnum
 from types import MappingProxyType
@@ -10,8 +9,7 @@ from typing import Any
 from mkpc_kaggle.config import from_table
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.matchers.contract import Matcher
-from mkpc_kaggle.matchers.failures import reason_of
-from mkpc_kaggle.matchers.registry import UnusableError, matcher_names, misfit, spec_of
+from mkpc_kaggle.matchers.registry import MATCHERS, misfit, spec_of
 from mkpc_kaggle.recipe import Recipe, load_recipe, recipe_names
 from mkpc_kaggle.weights import FoundFile, MissingWeights, WeightStore, load_tensors
 
@@ -28,14 +26,13 @@ class Licence(StrEnum):
 class UnavailableKind(StrEnum):
     """Causes, with the texts of messages."""
 
-    NOT_IMPORTABLE = "cannot be used here"
     NOT_PERMITTED = "weights not permitted"
     NO_WEIGHTS = "no weights"
     UNREADABLE = "weights cannot be loaded"
 
 
 # The other kinds are the user's choices.
-FAULTS = (UnavailableKind.NOT_IMPORTABLE, UnavailableKind.UNREADABLE)
+FAULTS = (UnavailableKind.UNREADABLE,)
 
 
 @dataclass(frozen=True)
@@ -82,12 +79,8 @@ def _reason(
     name: str, recipe: Recipe, store: WeightStore, licence: Licence
 ) -> UnavailableReason | None:
     """Return why a matcher cannot run here, or ``None``."""
-    try:
-        spec = spec_of(name, f"recipe {recipe.name!r}")
-        options = options_of(recipe, name)
-    except UnusableError as error:
-        detail = reason_of(error.__cause__ or error)
-        return UnavailableReason(UnavailableKind.NOT_IMPORTABLE, detail)
+    spec = spec_of(name, f"recipe {recipe.name!r}")
+    options = options_of(recipe, name)
     found = {slot: store.file_of(slot) for slot in spec.slots_for(options)}
     missing = store.missing(found)
     # Of missing files, too: nobody should fetch what the run would refuse.
@@ -133,22 +126,21 @@ def fit_of(found: FoundFile, store: WeightStore) -> Fit:
     try:
         # Also a file that no matcher uses must be readable.
         load_tensors(found.path, "meta")
-        for name in matcher_names():
-            with suppress(UnusableError):
-                spec = spec_of(name, "weights")
-                if (options := spec.options_for(slot)) is None:
-                    continue
-                others = [other for other in spec.slots_for(options) if other != slot]
-                # A network of two files cannot be tried with one.
-                missing = [other for other in others if store.file_of(other) is None]
-                problem = "" if missing else misfit(name, store.on_meta(found), options)
-                # Another file of the matcher may be at fault; messages name the slot.
-                if repr(slot) in problem:
-                    raise UserError(problem)
-                if missing or problem:
-                    untried.append(problem or f"{name} also needs {', '.join(missing)}")
-                else:
-                    fitting.append(name)
+        for name in MATCHERS:
+            spec = spec_of(name, "weights")
+            if (options := spec.options_for(slot)) is None:
+                continue
+            others = [other for other in spec.slots_for(options) if other != slot]
+            # A network of two files cannot be tried with one.
+            missing = [other for other in others if store.file_of(other) is None]
+            problem = "" if missing else misfit(name, store.on_meta(found), options)
+            # Another file of the matcher may be at fault; messages name the slot.
+            if repr(slot) in problem:
+                raise UserError(problem)
+            if missing or problem:
+                untried.append(problem or f"{name} also needs {', '.join(missing)}")
+            else:
+                fitting.append(name)
     except UserError as error:
         return Fit(True, str(error))
     if fitting:
@@ -222,12 +214,8 @@ def options_of(recipe: Recipe, name: str) -> Any:
 
 
 def slots_of(recipe: Recipe, names: Iterable[str]) -> tuple[str, ...]:
-    """Return the distinct slots of a recipe's named matchers.
-
-    Matchers that cannot be imported are skipped.
-    """
+    """Return the distinct slots of a recipe's named matchers."""
     slots: list[str] = []
     for name in names:
-        with suppress(UnusableError):
-            slots += spec_of(name, f"recipe {recipe.name!r}").slots_for(options_of(recipe, name))
+        slots += spec_of(name, f"recipe {recipe.name!r}").slots_for(options_of(recipe, name))
     return tuple(dict.fromkeys(slots))

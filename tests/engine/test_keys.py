@@ -1,6 +1,5 @@
 """Which settings decide which keys."""
 
-import sys
 from dataclasses import replace
 from importlib.metadata import PackageNotFoundError
 from types import SimpleNamespace
@@ -162,12 +161,12 @@ def test_a_key_is_the_digest_of_all_inputs_of_a_result(other, changed):
     assert tuple(former != new for former, new in keys) == changed
 
 
-def test_another_vismatch_makes_other_points(monkeypatch):
-    recipe = replace(CLASSICAL, units=(Unit(1, "vismatch:any", 640),))
+def test_another_version_of_a_matcher_given_in_python_makes_other_points():
+    recipe = replace(CLASSICAL, units=(Unit(1, "mine", 640),))
 
     def key(version: str) -> str:
-        monkeypatch.setitem(sys.modules, "vismatch", SimpleNamespace(__version__=version))
-        return Keys.of(replace(assemble(CLASSICAL), recipe=recipe)).units[0]
+        given = {"mine": SimpleNamespace(spec=MatcherSpec("mine", version=version))}
+        return Keys.of(replace(assemble(CLASSICAL), recipe=recipe, matchers=given)).units[0]
 
     assert key("1.4") == key("1.4")
     assert key("1.4") != key("1.5")

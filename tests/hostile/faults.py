@@ -33,8 +33,8 @@ FAULTS = {  # and a part of the output
     ),
 }
 ENV = {"PYTHONPATH": f"lib:{ROOT}"}
-# The package of adapters gets a second folder, as a user's own matcher would be found.
-FINDING = "import mkpc_kaggle.matchers.adapters as known\nknown.__path__.append('lib')\n"
+# The registry gets another matcher.
+FINDING = "from mkpc_kaggle.matchers.registry import MATCHERS\nMATCHERS['faulty'] = 'faulty'\n"
 IN_WORKER = SUBMIT.replace("--workers 0", "--workers 1")
 UNITS = f"units = [{UNIT.format(1).replace('sift', 'faulty')}, {UNIT.format(1)}]"
 

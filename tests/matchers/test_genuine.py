@@ -16,7 +16,7 @@ from shared import DATA, needs_data
 
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
 from mkpc_kaggle.matchers.contract import Matcher, Picture, Placement
-from mkpc_kaggle.matchers.registry import load_matcher, matcher_names, spec_of
+from mkpc_kaggle.matchers.registry import MATCHERS, load_matcher, spec_of
 from mkpc_kaggle.matchers.sparse import Keypoints
 from mkpc_kaggle.setup.availability import fit_of
 
@@ -35,7 +35,7 @@ def test_every_genuine_file_fits_the_network_of_each_matcher_that_uses_it(name):
     (file,) = (file for file in genuine_files() if file.name == name)
     found = store.search([file]).found
     assert found is not None
-    users = [each for each in matcher_names() if spec_of(each, "test").uses(file.slot)]
+    users = [each for each in MATCHERS if spec_of(each, "test").uses(file.slot)]
     fit = fit_of(found, store)
     assert not fit.is_refused
     assert fit.text == (f"fits {', '.join(users)}" if users else "")

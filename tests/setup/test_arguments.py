@@ -24,7 +24,7 @@ from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.adapters.sift import SiftMatcher, SiftOptions
 from mkpc_kaggle.matchers.contract import Colour, MatcherSpec
 from mkpc_kaggle.matchers.networks.aliked import Aliked
-from mkpc_kaggle.matchers.registry import matcher_names
+from mkpc_kaggle.matchers.registry import MATCHERS
 from mkpc_kaggle.recipe import Recipe, Unit, load_recipe
 from mkpc_kaggle.setup import assembly
 from mkpc_kaggle.setup.arguments import as_image, boxes_of, intrinsics_of
@@ -363,7 +363,7 @@ def test_the_name_of_a_matcher_is_a_recipe(tmp_path):
     )
     (unit,) = TwoStageMatcher("own", matchers={"own": Own(fail)}).recipe.units
     assert unit == Unit(1, "own", 1024)
-    for name in matcher_names():
+    for name in MATCHERS:
         (unit,) = recipe_of_name(name).units
         assert (unit.stage, unit.matcher, unit.tracks) == (1, name, True)
 

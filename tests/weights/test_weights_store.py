@@ -11,7 +11,7 @@ import torch
 from weight_files import DATA, OTHER, digest_of, line, put
 
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.matchers.registry import matcher_names, spec_of
+from mkpc_kaggle.matchers.registry import MATCHERS, spec_of
 from mkpc_kaggle.weights import UNVERIFIED, FileState, WeightStore, load_tensors, store
 from mkpc_kaggle.weights import manifest as manifest_module
 from mkpc_kaggle.weights.checkpoint import convert_file
@@ -191,7 +191,7 @@ SHA256 = "sha256:" + "0f" * 32
 
 def test_the_manifest_has_every_slot_of_every_matcher():
     slots = {file.slot for file in manifest()}
-    specs = [spec_of(name, "test") for name in matcher_names()]
+    specs = [spec_of(name, "test") for name in MATCHERS]
     assert slots.issuperset(slot for spec in specs for slot in spec.slots_for(spec.options()))
     assert all(any(spec.uses(slot) for spec in specs) for slot in slots)
 

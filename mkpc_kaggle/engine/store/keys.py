@@ -3,7 +3,7 @@
 A result is up to date exactly if it is stored under the key that a computation today would have.
 Nothing else says so. Each kind has a version of its algorithm: increase it if the same inputs give
 other results. ``POINTS_VERSION`` is that of all matchers of the package. A matcher that a user gives
-in Python, and one of vismatch, has its own, ``MatcherSpec.version``.
+in Python has its own, ``MatcherSpec.version``.
 """
 
 import hashlib
