@@ -1,27 +1,17 @@
-"""Mutual nearest neighbours of descriptors: exact, in blocks of the N x M matrix, or by lists."""
+"""Mutual nearest neighbours of descriptors, in blocks of the N x M matrix."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import PairwiseMatcher
-from mkpc_kaggle.matchers.lists import (
-    Lists,
-    Search,
-    distance_ratio,
-    make_lists,
-    nearest_in_lists,
-)
 from mkpc_kaggle.matchers.sparse import Keypoints, matches_of
 
 # On a CPU, a block of 512 x 8,000 similarities fits the cache. A GPU is idle between small blocks.
 BLOCK_ROWS = {"cpu": 512, "cuda": 8192}
 GROUP = 64  # keys
-# Of pictures that are searched by lists. With fewer, the choice of the lists takes as long as the
-# products that it saves (`python -m benchmarks.neighbours --seconds`).
-MIN_KEYPOINTS = 3000
 
 
 @dataclass(frozen=True)
@@ -39,35 +29,12 @@ class Neighbours:
 
 
 class NeighbourMatcher(PairwiseMatcher[Keypoints]):
-    """Mutual nearest neighbours with a distance ratio up to ``ratio``, scored by their cosine.
-
-    Subclasses pass their keypoints through :meth:`_searchable` when they encode a picture.
-    """
+    """Mutual nearest neighbours with a distance ratio up to ``ratio``, scored by their cosine."""
 
     ratio = 1.0
-    search = Search.EXACT
-
-    def _searchable(self, keypoints: Keypoints) -> Keypoints:
-        """Return the keypoints, sorted by list if the search is by lists."""
-        # A GPU computes the whole matrix in less time than the many small products of lists.
-        is_on_cpu = keypoints.descriptors.device.type == "cpu"
-        if self.search == Search.EXACT or len(keypoints) < MIN_KEYPOINTS or not is_on_cpu:
-            return keypoints
-        order, lists = make_lists(keypoints.descriptors)
-        return replace(
-            keypoints,
-            points=keypoints.points[order],
-            descriptors=keypoints.descriptors[order],
-            lists=lists,
-        )
 
     def _match(self, first: Keypoints, second: Keypoints) -> Matches:
-        if first.lists is None or second.lists is None:
-            pairs = mutual_neighbours(first.descriptors, second.descriptors, self.ratio)
-        else:
-            pairs = mutual_in_lists(
-                first.descriptors, first.lists, second.descriptors, second.lists, self.ratio
-            )
+        pairs = mutual_neighbours(first.descriptors, second.descriptors, self.ratio)
         return matches_of(
             first.points, second.points, pairs.index0, pairs.index1, self._scores(pairs)
         )
@@ -98,26 +65,6 @@ def mutual_neighbours(
     return Neighbours(index0[kept], index1[kept], similarity[index0[kept]], ratio[kept])
 
 
-def mutual_in_lists(
-    descriptors0: Tensor,
-    lists0: Lists,
-    descriptors1: Tensor,
-    lists1: Lists,
-    max_ratio: float = 1.0,
-) -> Neighbours:
-    """Pair unit descriptors (N, D) and (M, D), sorted by list, as :func:`mutual_neighbours` does.
-
-    A few pairs are missing or extra, because most keys are not seen.
-    """
-    there = nearest_in_lists(descriptors0, descriptors1, lists1, max_ratio)
-    # Few pass a low ratio; only these need the other direction.
-    back = nearest_in_lists(descriptors1[there.key], descriptors0, lists0, max_ratio)
-    is_mutual = back.key == there.query[back.query]
-    kept = back.query[is_mutual]
-    ratio = torch.maximum(there.ratio[kept], back.ratio[is_mutual])
-    return Neighbours(there.query[kept], there.key[kept], there.similarity[kept], ratio)
-
-
 def _nearest(queries: Tensor, keys: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return the similarity, distance ratio and index of each query's nearest key, all (N,)."""
     # Zeros complete the last group; below they get the lowest similarity.
@@ -143,6 +90,14 @@ def _nearest(queries: Tensor, keys: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         highest.scatter_(1, group[:, None], -1.0)
         second = torch.maximum(inside.amax(dim=1), highest.amax(dim=1))
         similarities.append(best)
-        ratios.append(distance_ratio(best, second))
+        ratios.append(_distance_ratio(best, second))
         indices.append(group * GROUP + offset)
     return torch.cat(similarities), torch.cat(ratios), torch.cat(indices)
+
+
+def _distance_ratio(best: Tensor, second: Tensor) -> Tensor:
+    """Return the nearest over the second nearest distance of unit vectors, from their cosines."""
+    # Distances of unit vectors are sqrt(2 - 2 s); the ratio of two neighbours at distance 0 is 1.
+    nearest = (1 - best).clamp(min=1e-12)
+    next_nearest = (1 - second).clamp(min=1e-12)
+    return (nearest / next_nearest).sqrt()

@@ -12,7 +12,6 @@ from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import Picture, Placement
 from mkpc_kaggle.matchers.dtypes import check_finite
-from mkpc_kaggle.matchers.lists import Lists
 from mkpc_kaggle.matchers.networks.placement import autocast
 
 # Images (B, 3, H, W) -> for each image, points (K, 2) in pixels and unit descriptors (K, D).
@@ -35,7 +34,7 @@ class Keypoints:
 
     ``points`` (K, 2) are float32 in view pixels, ``descriptors`` (K, D) unit vectors. If the
     detector has them: ``scales`` (K,), diameters in view pixels, and ``orientations`` (K,),
-    radians. If keypoints are sorted by ``lists`` of their descriptors, these are searched.
+    radians.
     """
 
     points: Tensor
@@ -43,7 +42,6 @@ class Keypoints:
     content: Size
     scales: Tensor | None = None
     orientations: Tensor | None = None
-    lists: Lists | None = None
 
     @classmethod
     def on_content(

@@ -10,16 +10,15 @@ import numpy as np
 import pytest
 import torch
 from numpy.testing import assert_allclose
-from pictures import as_picture, match_one, same
+from pictures import as_picture, match_one
 from shared import WEIGHTS, needs_weights
 from sklearn.datasets import load_sample_image
 from torch import nn
 
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Box, Size
-from mkpc_kaggle.matchers import neighbours
 from mkpc_kaggle.matchers.adapters.sift import SiftOptions
-from mkpc_kaggle.matchers.contract import Colour, Placement, encoding_bytes
+from mkpc_kaggle.matchers.contract import Colour, Placement
 from mkpc_kaggle.matchers.registry import load_matcher, spec_of
 from mkpc_kaggle.weights import WeightStore, load_into
 
@@ -141,13 +140,6 @@ def test_all_names_and_shapes_of_a_checkpoint_must_fit_except_unused_ones():
     assert (network[0].weight == 1).all() and not (network[1].bias == 1).any()
 
 
-def with_search(search, pixels0, pixels1):
-    """Match two gray photographs by SIFT."""
-    options = SiftOptions(search=search)
-    matcher = load_matcher("sift", WeightStore([]), options, Placement())
-    return match_one(matcher, as_picture(pixels0, 1), as_picture(pixels1, 1))
-
-
 @pytest.mark.parametrize("count", [1, 5])
 def test_sift_finds_the_same_in_several_pictures_at_a_time(monkeypatch, count):
     gray = cv2.cvtColor(photograph(), cv2.COLOR_RGB2GRAY)
@@ -170,43 +162,3 @@ def test_sift_finds_the_same_in_several_pictures_at_a_time(monkeypatch, count):
         assert len(alone) > 100
         assert torch.equal(alone.points, together.points)
         assert torch.equal(alone.descriptors, together.descriptors)
-
-
-def rows_of(matches):
-    rows = np.column_stack([matches.points0, matches.points1, matches.scores])
-    return set(map(tuple, rows.round(2).tolist()))
-
-
-def test_sift_by_lists_has_nearly_all_matches_of_exact_search_and_the_same_bytes_each_time(
-    monkeypatch,
-):
-    monkeypatch.setattr(neighbours, "MIN_KEYPOINTS", 200)
-    gray = cv2.cvtColor(load_sample_image("china.jpg"), cv2.COLOR_RGB2GRAY)
-    other = cv2.warpAffine(gray, affine(10, 0.8, 0, 0)[:2], gray.shape[::-1])
-    exact = rows_of(with_search("exact", gray, other))
-    by_lists = with_search("lists", gray, other)
-    assert len(exact) > 500
-    assert len(rows_of(by_lists) & exact) > 0.97 * len(exact)
-    assert len(rows_of(by_lists) - exact) < 0.03 * len(exact)
-    again = with_search("lists", gray, other)
-    assert same(by_lists, again)
-
-
-def test_pictures_with_few_keypoints_are_searched_exactly():
-    gray = cv2.cvtColor(photograph(), cv2.COLOR_RGB2GRAY)
-    other = cv2.warpAffine(gray, MAPS["rotated"][:2], SIZE)
-    exact = with_search("exact", gray, other)
-    by_lists = with_search("lists", gray, other)
-    assert len(exact) > 0
-    assert same(exact, by_lists)
-
-
-def test_an_encoding_in_lists_counts_its_lists(monkeypatch):
-    monkeypatch.setattr(neighbours, "MIN_KEYPOINTS", 10)
-    picture = as_picture(cv2.cvtColor(photograph(), cv2.COLOR_RGB2GRAY), 1)
-    sizes = {}
-    for search in ("exact", "lists"):
-        matcher = load_matcher("sift", WeightStore([]), SiftOptions(search=search), Placement())
-        sizes[search] = encoding_bytes(matcher.encode([picture])[0])
-    # The keypoints are sorted, not stored twice.
-    assert sizes["exact"] < sizes["lists"] < 1.2 * sizes["exact"]

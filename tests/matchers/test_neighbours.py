@@ -1,13 +1,12 @@
-"""Mutual nearest neighbours against a brute force in numpy, and by lists."""
+"""Mutual nearest neighbours against a brute force in numpy."""
 
 import numpy as np
 import pytest
 import torch
 from numpy.testing import assert_allclose, assert_array_equal
 
-from mkpc_kaggle.matchers import lists, neighbours
-from mkpc_kaggle.matchers.lists import make_lists
-from mkpc_kaggle.matchers.neighbours import mutual_in_lists, mutual_neighbours
+from mkpc_kaggle.matchers import neighbours
+from mkpc_kaggle.matchers.neighbours import mutual_neighbours
 
 
 def unit(rng, n, dimension=16):
@@ -105,63 +104,3 @@ def test_a_pair_whose_second_neighbour_is_as_near_is_ambiguous():
     near = [np.cos(0.1), np.sin(0.1)]
     *_, ratios = found(np.array([x]), np.array([near, near]))
     assert_allclose(ratios, [1])
-
-
-def by_lists(first, second, max_ratio=1.0):
-    """Mutual neighbours by lists, as pairs of indices of the given descriptors."""
-    order0, lists0 = make_lists(first)
-    order1, lists1 = make_lists(second)
-    found = mutual_in_lists(first[order0], lists0, second[order1], lists1, max_ratio)
-    return found, order0[found.index0], order1[found.index1]
-
-
-def pairs_of(index0, index1):
-    return set(zip(index0.tolist(), index1.tolist(), strict=True))
-
-
-@pytest.mark.parametrize("max_ratio", [0.8, 1.0])
-def test_with_all_lists_probed_neighbours_by_lists_are_exact(max_ratio, monkeypatch):
-    monkeypatch.setattr(lists, "PROBES", 10_000)
-    first, second = (torch.tensor(each) for each in related(5, 400, 231))
-    found, index0, index1 = by_lists(first, second, max_ratio)
-    exact = mutual_neighbours(first, second, max_ratio)
-    assert pairs_of(index0, index1) == pairs_of(exact.index0, exact.index1)
-    # In the order of the first image
-    assert (found.index0.diff() > 0).all()
-    to_exact = index0.argsort()
-    assert_allclose(found.similarity[to_exact], exact.similarity, atol=1e-9)
-    assert_allclose(found.ratio[to_exact], exact.ratio, atol=1e-6)
-
-
-def test_neighbours_by_lists_are_nearly_all_of_the_exact_ones():
-    first, second = (torch.tensor(each) for each in related(7, 3000, 2500, dimension=64))
-    _, index0, index1 = by_lists(first, second, 0.8)
-    exact = mutual_neighbours(first, second, 0.8)
-    wanted = pairs_of(exact.index0, exact.index1)
-    assert len(wanted) > 1000
-    got = pairs_of(index0, index1)
-    assert len(got & wanted) > 0.95 * len(wanted)
-    assert len(got - wanted) < 0.02 * len(wanted)
-
-
-def test_lists_hold_each_descriptor_once_and_none_is_empty():
-    # Equal descriptors leave most centroids without any.
-    descriptors = torch.tensor(unit(np.random.default_rng(1), 3)).repeat(200, 1)
-    order, made = make_lists(descriptors)
-    assert sorted(order.tolist()) == list(range(600))
-    assert len(made.sizes) <= 3
-    assert made.sizes.sum() == 600
-    assert made.sizes.min() > 0
-    found, *_ = by_lists(descriptors, descriptors, 0.8)
-    assert len(found.index0) == 0  # each has 199 neighbours at distance 0
-
-
-def test_one_descriptor_and_descriptors_of_zeros_have_lists():
-    one = torch.tensor([[1.0, 0.0]])
-    found, index0, index1 = by_lists(one, one)
-    assert pairs_of(index0, index1) == {(0, 0)}
-    assert_allclose(found.similarity, [1])
-    zeros = torch.zeros(50, 8)
-    order, made = make_lists(zeros)
-    assert len(order) == made.sizes.sum() == 50
-    by_lists(zeros, zeros)  # raises nothing

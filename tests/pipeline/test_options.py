@@ -15,8 +15,6 @@ OPTIONS = [
     ("sift", "ratio", 0.7),
     ("sift", "features", 500),
     ("sift", "contrast_threshold", 0.03),
-    ("sift", "search", "lists"),
-    ("aliked", "search", "lists"),
     ("superglue", "max_keypoints", 500),
     ("superglue", "keypoint_threshold", 0.01),
     ("superglue", "nms_radius", 5),

@@ -6,7 +6,6 @@ from enum import StrEnum
 
 from mkpc_kaggle.config import SHARE, check_ranges
 from mkpc_kaggle.matchers.contract import MatcherSpec, Picture, Placement, Precision
-from mkpc_kaggle.matchers.lists import Search
 from mkpc_kaggle.matchers.neighbours import NeighbourMatcher
 from mkpc_kaggle.matchers.networks.aliked import Aliked, own_name
 from mkpc_kaggle.matchers.networks.placement import prepared
@@ -33,7 +32,6 @@ class AlikedOptions(KeypointOptions):
 
     variant: AlikedVariant = AlikedVariant.N16
     ratio: float = 1.0
-    search: Search = Search.EXACT
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -48,13 +46,12 @@ class AlikedMatcher(NeighbourMatcher):
 
     spec = SPEC
 
-    def __init__(self, encode: Encode, ratio: float = 1.0, search: Search = Search.EXACT) -> None:
+    def __init__(self, encode: Encode, ratio: float = 1.0) -> None:
         self._encode = encode
         self.ratio = ratio
-        self.search = search
 
     def encode(self, pictures: Sequence[Picture]) -> list[Keypoints]:
-        return [self._searchable(keypoints) for keypoints in self._encode(pictures)]
+        return self._encode(pictures)
 
 
 def load_encoder(
@@ -77,4 +74,4 @@ def aliked_encoder(network: Aliked, placement: Placement) -> Encode:
 
 def load(weights: WeightStore, options: AlikedOptions, placement: Placement) -> AlikedMatcher:
     encode = load_encoder(weights, options.features, options.variant, placement)
-    return AlikedMatcher(encode, options.ratio, options.search)
+    return AlikedMatcher(encode, options.ratio)

@@ -17,7 +17,6 @@ from torch import Tensor
 
 from mkpc_kaggle.config import AT_LEAST_0, AT_LEAST_1, SHARE, check_ranges
 from mkpc_kaggle.matchers.contract import Colour, MatcherSpec, Picture, Placement
-from mkpc_kaggle.matchers.lists import Search
 from mkpc_kaggle.matchers.neighbours import NeighbourMatcher, Neighbours
 from mkpc_kaggle.matchers.sparse import Keypoints
 from mkpc_kaggle.weights import WeightStore
@@ -30,7 +29,6 @@ class SiftOptions:
     features: int = 8000  # the strongest keypoints per picture
     ratio: float = 0.8  # the maximum distance ratio, in both directions
     contrast_threshold: float = 0.04  # OpenCV's default
-    search: Search = Search.EXACT
 
     def __post_init__(self) -> None:
         check_ranges(self, features=AT_LEAST_1, ratio=SHARE, contrast_threshold=AT_LEAST_0)
@@ -49,7 +47,6 @@ class SiftMatcher(NeighbourMatcher):
 
     def __init__(self, options: SiftOptions, device: str) -> None:
         self.ratio = options.ratio
-        self.search = options.search
         self.device = device
         self._detector = partial(
             cv2.SIFT_create,  # type: ignore[attr-defined]  # missing in OpenCV's stubs
@@ -62,7 +59,7 @@ class SiftMatcher(NeighbourMatcher):
     def encode(self, pictures: Sequence[Picture]) -> list[Keypoints]:
         detected = detected_in(pictures, self._detector)
         return [
-            self._searchable(self._keypoints(*found, picture))
+            self._keypoints(*found, picture)
             for found, picture in zip(detected, pictures, strict=True)
         ]
 
