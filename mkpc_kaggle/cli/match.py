@@ -137,9 +137,6 @@ def _lines(match: PairMatch, recipe: str) -> list[str]:
         if found.stats.support >= MIN_SUPPORT:
             verdict = "the images overlap"
         lines.append(f"{found.stats.support:.1f} times the inliers expected by chance: {verdict}")
-    if match.is_flat:
-        share = f"{100 * found.stats.plane:.0f} %"
-        lines.append(f"flat: one homography explains {share} of the inliers, so F is uncertain")
     for result in match.results:
         counts = f"{plural(len(result.matches), 'match'):>14}  {result.seconds:.2f} s"
         remark = result.failure or result.note or (str(result.need) if result.need else "")

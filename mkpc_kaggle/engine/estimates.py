@@ -126,7 +126,6 @@ def _estimate(key: str, found: Estimated) -> PairEstimate:
         focal1=stats.focals[1],
         support=stats.support,
         rotation=stats.rotation,
-        plane=stats.plane,
     )
 
 

@@ -135,7 +135,6 @@ class SceneWork:
                 {points[0]: found.inlier_count},
                 found.matrix,
                 support=found.stats.support,
-                plane=found.stats.plane,
             )
         return estimates
 

@@ -118,7 +118,6 @@ class EstimateStats:
     support: float = 0.0  # see :mod:`mkpc_kaggle.geometry.overlap`
     # Of an E, chosen by inliers, see :func:`rotation_in_front`.
     rotation: tuple[float, ...] = (0.0, 0.0, 0.0)
-    plane: float = 0.0  # share of the inliers on a plane, see :mod:`mkpc_kaggle.geometry.planarity`
 
 
 NO_STATS = EstimateStats()

@@ -13,7 +13,6 @@ from mkpc_kaggle.geometry.crop_need import CropNeed
 from mkpc_kaggle.geometry.focal_prior import FocalPrior, estimate_with_prior
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.overlap import support
-from mkpc_kaggle.geometry.planarity import MIN_PLANE_SHARE, plane_share
 from mkpc_kaggle.geometry.robust import (
     Estimate,
     ModelKind,
@@ -116,11 +115,6 @@ class PairMatch:
     def matches(self) -> Matches:
         """The matches of all units; ``estimate.inliers`` is a mask over them."""
         return Matches.concatenate(result.matches for result in self.results)
-
-    @property
-    def is_flat(self) -> bool:
-        """True if one homography explains the inliers: a flat scene, whose pose is uncertain."""
-        return self.estimate.stats.plane >= MIN_PLANE_SHARE
 
     @property
     def failures(self) -> dict[str, str]:
@@ -226,13 +220,11 @@ def with_estimate(
 def with_stats(
     found: Estimate, matches: Matches, intrinsics: tuple[Matrix3, Matrix3] | None = None
 ) -> Estimate:
-    """Return an F, or an E with ``intrinsics``, with its support, the share of its inliers on a
-    plane, and for an E its rotation.
-    """
+    """Return an F, or an E with ``intrinsics``, with its support, and for an E its rotation."""
     K0, K1 = intrinsics or (np.eye(3), np.eye(3))
     # The overlap test compares points in pixels, so an E becomes an F.
     F = np.linalg.inv(K1).T @ found.matrix @ np.linalg.inv(K0)
-    stats = replace(found.stats, support=support(F, matches), plane=plane_share(F, matches))
+    stats = replace(found.stats, support=support(F, matches))
     if intrinsics and found.inliers.any():
         rotation = rotation_in_front(found.matrix, matches[found.inliers], intrinsics)
         stats = replace(stats, rotation=tuple(rotation))

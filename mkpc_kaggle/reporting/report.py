@@ -266,21 +266,13 @@ def pair_rows(pairs: "DataFrame") -> list[tuple[str | int | float, ...]]:
 
 
 def remarks(pairs: "DataFrame") -> list[str]:
-    """Return why each pair has no F, or why its F is doubtful or uncertain, or an empty string."""
+    """Return why each pair has no F, or why its F is doubtful, or an empty string."""
     found = []
-    rows = zip(is_solved(pairs), pairs["failure"], doubts(pairs), flatness(pairs), strict=True)
-    for has_f, failure, doubt, flat in rows:
-        found.append((doubt or flat) if has_f else failure)
+    for has_f, failure, doubt in zip(
+        is_solved(pairs), pairs["failure"], doubts(pairs), strict=True
+    ):
+        found.append(doubt if has_f else failure)
     return found
-
-
-def flatness(pairs: "DataFrame") -> list[str]:
-    """Return which pairs are flat, as text. Cameras determine F of flat pairs, too."""
-    is_flat = pairs["flat"] & (pairs["source"] != "scene")
-    return [
-        f"flat: one homography explains {100 * plane:.0f} % of the inliers" if flat else ""
-        for flat, plane in zip(is_flat, pairs["plane"], strict=True)
-    ]
 
 
 def weakness(row: "DataFrame") -> str:
@@ -289,7 +281,6 @@ def weakness(row: "DataFrame") -> str:
     facts = [f"{pair['inliers']} inliers of {pair['matches']} matches", pair["failure"]]
     if is_doubtful(row).item():
         facts.append(f"may show different things: support {pair['support']:.1f}")
-    facts += flatness(row)
     if pair["source"] == "scene":
         facts.append("F from the scene")
     return "; ".join(filter(None, facts))

@@ -35,9 +35,6 @@ def matrix(row) -> np.ndarray:
 def test_the_model_of_a_pair_says_whether_its_matrix_is_f_or_e(work, tmp_path):
     pairs = results(work).pairs
     assert pairs["model"].tolist() == ["F", "E"]
-    # Points that move by different lengths along their rows
-    assert pairs["flat"].tolist() == [False, False]
-    assert pairs["plane"].between(0.05, 0.89).all()
     # The pictures are rectified, so F and E are [e_x]x of pixels and of calibrated points.
     singular = [np.linalg.svd(matrix(row), compute_uv=False) for _, row in pairs.iterrows()]
     np.testing.assert_allclose(singular[1] / singular[1][0], [1, 1, 0], atol=1e-6)

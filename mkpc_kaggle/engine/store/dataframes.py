@@ -29,7 +29,6 @@ from mkpc_kaggle.engine.store.tables import (
     UnitPoints,
 )
 from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
-from mkpc_kaggle.geometry.planarity import MIN_PLANE_SHARE
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 
 if TYPE_CHECKING:
@@ -40,7 +39,6 @@ NOT_REACHED = "not reached in time"
 PARAMETERS = {
     "not_reached": NOT_REACHED,
     "min_support": MIN_SUPPORT,
-    "min_plane": MIN_PLANE_SHARE,
     "fallback": FALLBACK_FUNDAMENTAL.tobytes(),
 }
 
@@ -126,8 +124,6 @@ PAIRS = Query(
         "inliers": (int, "coalesce(sums.inliers, 0)"),
         "overlaps": (bool, "coalesce(support, 0) >= :min_support"),
         "support": (float, "coalesce(support, 0)"),
-        "flat": (bool, "coalesce(plane, 0) >= :min_plane"),
-        "plane": (float, "coalesce(plane, 0)"),
         "focal0": (float, "coalesce(focal0, 0)"),
         "focal1": (float, "coalesce(focal1, 0)"),
         "model": (str, "model"),

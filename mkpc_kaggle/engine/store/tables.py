@@ -76,7 +76,6 @@ class PairEstimate:
     focal1: float = 0.0
     support: float = 0.0
     rotation: tuple[float, ...] = (0.0, 0.0, 0.0)
-    plane: float = 0.0
 
 
 @dataclass(frozen=True)
