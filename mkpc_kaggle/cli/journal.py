@@ -23,8 +23,8 @@ submission. Without options, print an overview of one screen.
                earlier, until this run has its own; fallback), matches, inliers, seconds by part; f11 ... f33, the
                matrix of the column model: F, or E for pairs with known intrinsics. For the F of the pair's own
                matches: support (ratio of inliers to inliers by chance), overlaps (whether the images overlap),
-               number of candidates; cost of the result and of MAGSAC's own F, focal lengths. choice: why the F is the
-               scene's, or not; units: the number of units that ran or failed; error: why the pair has no F,
+               number of candidates; cost of the result and of MAGSAC's own F, focal lengths. choice: why the F is
+               the scene's, or not; units: the number of units that ran or failed; error: why the pair has no F,
                unless it has few matches
   units.csv    per unit and pair: matches, inliers, seconds, failure
   regions.csv  per image (0 or 1) and pair: the critical region's box and the reason for it

@@ -13,11 +13,10 @@ from mkpc_kaggle.cli import options
 from mkpc_kaggle.data.competition import TrainScene, missing_line
 from mkpc_kaggle.data.outputs import require_apart
 from mkpc_kaggle.data.pairs import read_pairs
-from mkpc_kaggle.data.regions import read_regions
 from mkpc_kaggle.engine.console import logger
 from mkpc_kaggle.engine.request import RunReport
 from mkpc_kaggle.engine.session import Interrupt, Session, interruptible
-from mkpc_kaggle.errors import UserError, plural, temporary_directory, writing
+from mkpc_kaggle.errors import UserError, temporary_directory, writing
 from mkpc_kaggle.evaluation.compare import comparison_json, comparison_table, step_gains
 from mkpc_kaggle.evaluation.validate import (
     PROTOCOLS,
@@ -89,8 +88,6 @@ def _add_estimates(parser: argparse.ArgumentParser) -> None:
     add("--protocol", choices=list(PROTOCOLS), help=text)
     text = "the matches choose between E's two rotations, as with --protocol; default: the one nearer to the truth"
     add("--in-front", action="store_true", help=text)
-    text = "boxes for stage 2 instead of MKPC's: a table image_0,image_1,box_0,box_1"
-    add("--regions", type=Path, metavar="CSV", help=text)
 
 
 def _add_files(parser: argparse.ArgumentParser) -> None:
@@ -106,7 +103,7 @@ def run(arguments: argparse.Namespace) -> int:
     _require_a_whole(arguments)
     root = arguments.train_dir or arguments.image_root
     # Before any work: a run of hours must not end in an output that cannot be written.
-    inputs = [root, arguments.pairs, arguments.regions]
+    inputs = [root, arguments.pairs]
     require_apart({"--json": arguments.json}, filter(None, inputs), arguments.work_dir)
     if arguments.pairs is None:
         scenes: Sequence[TrainScene] = options.train_side_of(arguments)
@@ -154,19 +151,13 @@ def _match_and_score(
         logger.info(line)
     if line := resolution_line(scenes):
         logger.warning(line)
-    regions = {} if arguments.regions is None else read_regions(arguments.regions, root, pairs)
-    if arguments.regions is not None:
-        used = len({(pair.file0, pair.file1) for pair in pairs})
-        # The table may be of more scenes, or of more pairs of them.
-        logger.info(f"regions: {used} of {plural(len(regions), 'row')} name pairs of this run")
     validations = []
     status = 0
     budget = options.budget_of(arguments)
     with interruptible() as interrupt, Session(work_dir, budget, interrupt).watched() as watched:
         watched.save = lambda: "the time limit passed before the scores were printed"
         # All of them first: a wrong name should not end a comparison after its first run.
-        chosen = [_assemble(arguments, interrupt, *choice) for choice in choices]
-        assemblies = [replace(assembly, regions=regions) for assembly in chosen]
+        assemblies = [_assemble(arguments, interrupt, *choice) for choice in choices]
         for number, assembly in enumerate(assemblies):
             budget = options.budget_of(arguments)
             session = Session(work_dir, budget, interrupt, workers=arguments.workers)

@@ -90,10 +90,9 @@ class MkpcConfig:
 
 
 class RegionReason(StrEnum):
-    """Origin of a region: ``CROPPED``, ``GIVEN`` by the user, or why it is the whole image."""
+    """Origin of a region: ``CROPPED``, or why it is the whole image."""
 
     CROPPED = "cropped"
-    GIVEN = "given"
     TOO_FEW_POINTS = "too few points"
     NO_CLUSTER = "no cluster"
     TOO_SCATTERED = "too few points in clusters"

@@ -30,17 +30,14 @@ class CropNeed:
     """Whether a unit of stage 2 runs on a pair, and the two ratios that decide it, both at least 1.
 
     ``scale`` is the ratio of the scales of the two images, each relative to its longer side.
-    ``detail`` is how much larger the unit shows a region than stage 1 did, in stored pixels. Both
-    are ``None`` if the user gave the regions.
+    ``detail`` is how much larger the unit shows a region than stage 1 did, in stored pixels.
     """
 
     is_needed: bool
-    scale: float | None = 1.0
-    detail: float | None = 1.0
+    scale: float = 1.0
+    detail: float = 1.0
 
     def __str__(self) -> str:
-        if self.scale is None or self.detail is None:
-            return "regions given: crop"
         ratios = f"scales differ by {self.scale:.1f}"
         if self.detail >= MIN_TOLD:
             ratios += f", {self.detail:.1f} times the detail of stage 1"
@@ -59,12 +56,9 @@ def crop_need(
     ``scale`` is :func:`scale_between` of the matches of stage 1. ``whole`` and ``crop`` are view
     pixels per image pixel, for both images: of the largest view in stage 1, and of the unit's view
     of the region. An enlarged view has no more detail than the image. Two whole images have nothing
-    to gain: they were matched in stage 1. Regions that the user gave are always matched.
+    to gain: they were matched in stage 1.
     """
-    reasons = {region.reason for region in regions}
-    if RegionReason.GIVEN in reasons:
-        return CropNeed(True, None, None)
-    if RegionReason.CROPPED not in reasons:
+    if RegionReason.CROPPED not in {region.reason for region in regions}:
         return CropNeed(pays(1.0, 1.0, config))
     both = zip(whole, crop, strict=True)
     detail = max(1.0, *(min(1.0, after) / min(1.0, before) for before, after in both))

@@ -12,15 +12,13 @@ from contextlib import suppress
 from dataclasses import replace
 from enum import Enum, auto
 from functools import partial
-from types import MappingProxyType
 from typing import Any, Self
 
 from mkpc_kaggle.data.images import ByteCache, Image
 from mkpc_kaggle.data.masks import MaskReader, Masks
-from mkpc_kaggle.data.regions import GivenRegions
 from mkpc_kaggle.errors import UserError, plural
 from mkpc_kaggle.geometry.coordinates import Box, Size, View
-from mkpc_kaggle.geometry.critical_region import CriticalRegion, RegionReason, critical_region
+from mkpc_kaggle.geometry.critical_region import critical_region
 from mkpc_kaggle.geometry.crop_need import CropNeed, crop_need, scale_between
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import (
@@ -63,8 +61,8 @@ class Pipeline:
     ``load(name)`` returns a matcher. If half precision overflows, ``load_float32(name)`` replaces
     the matcher permanently. ``minibatch`` is the number of pairs to match at a time, and of views
     of one shape to encode. A unit that runs out of memory halves its minibatch from then on.
-    Encodings of whole images, which many pairs share, are cached up to ``cache_bytes``. ``regions``
-    replace MKPC's critical regions. Matches with a point that ``masks`` leave out are dropped.
+    Encodings of whole images, which many pairs share, are cached up to ``cache_bytes``.
+    Matches with a point that ``masks`` leave out are dropped.
     Errors of the matchers in ``raising`` are raised, and do not become failed results.
     ``synchronise()`` is called after an error, and raises if the device has failed. Results have
     keypoints, and descriptors, if ``keeps_keypoints`` and ``keeps_descriptors`` are set.
@@ -78,7 +76,6 @@ class Pipeline:
         minibatch: int = 1,
         cache_bytes: int = ENCODING_CACHE_BYTES,
         load_float32: Callable[[str], Matcher[Any]] | None = None,
-        regions: GivenRegions = MappingProxyType({}),
         masks: Masks | None = None,
         precision: Precision = Precision.FLOAT32,
         synchronise: Callable[[], None] | None = None,
@@ -90,7 +87,6 @@ class Pipeline:
         self._masks = MaskReader(masks or Masks())
         self.recipe = recipe
         self.minibatch = minibatch
-        self.regions = regions
         self._load = load
         self._load_float32 = load_float32
         self._synchronise = synchronise
@@ -127,7 +123,6 @@ class Pipeline:
             minibatch=assembly.minibatch,
             cache_bytes=cache_bytes,
             load_float32=None if exact == placement else partial(assembly.load, placement=exact),
-            regions=assembly.regions,
             masks=assembly.masks,
             precision=placement.precision,
             synchronise=synchronise,
@@ -175,7 +170,7 @@ class Pipeline:
                 self._run(unit, pairs, may_start)
         crops = [unit for unit in units if unit.stage == 2]
         if crops:
-            pairs = [with_regions(pair, self.recipe, self.regions) for pair in pairs]
+            pairs = [with_regions(pair, self.recipe) for pair in pairs]
         for unit in crops:
             pairs = [self._with_need(pair, unit) for pair in pairs]
             self._run(unit, pairs, may_start)
@@ -446,16 +441,8 @@ def _scale_of(unit: Unit, crop: Box) -> float:
     return min(unit.view(crop, multiple=1).scale)
 
 
-def with_regions(
-    pair: PairMatch, recipe: Recipe, given: GivenRegions = MappingProxyType({})
-) -> PairMatch:
-    """Return the pair with each image's critical region.
-
-    It is the user's, or MKPC's from the matches of stage 1.
-    """
-    if (boxes := given.get(tuple(image.name for image in pair.images))) is not None:
-        first, second = (CriticalRegion(box, RegionReason.GIVEN) for box in boxes)
-        return replace(pair, regions=(first, second))
+def with_regions(pair: PairMatch, recipe: Recipe) -> PairMatch:
+    """Return the pair with each image's critical region, from the matches of stage 1."""
     start = time.perf_counter()
     # In the recipe's order: after an interrupted run, units of stage 1 may have run in another.
     ordered = sorted(pair.results, key=lambda result: recipe.units.index(result.unit))

@@ -11,7 +11,7 @@ from typing import Any
 
 from mkpc_kaggle.data.images import Image, ImageStore
 from mkpc_kaggle.errors import plural
-from mkpc_kaggle.geometry.coordinates import Box, Matrix3
+from mkpc_kaggle.geometry.coordinates import Matrix3
 from mkpc_kaggle.geometry.resolution import doubt_about_resolution
 from mkpc_kaggle.geometry.robust import FailedEstimate, ModelKind
 from mkpc_kaggle.matchers.contract import Matcher
@@ -24,7 +24,6 @@ from mkpc_kaggle.setup.arguments import (
     ImageSource,
     Weights,
     as_image,
-    boxes_of,
     files_of,
     intrinsics_of,
     member_of,
@@ -36,7 +35,6 @@ from mkpc_kaggle.setup.availability import Licence
 __all__ = ["TwoStageMatcher", "as_image"]
 
 Intrinsics = tuple[Matrix3, Matrix3]
-Boxes = tuple[Box, Box]
 
 
 class TwoStageMatcher:
@@ -136,7 +134,6 @@ class TwoStageMatcher:
         *,
         model: ModelKind | str = ModelKind.F,
         intrinsics: Intrinsics | None = None,
-        regions: Boxes | None = None,
         descriptors: bool = False,
     ) -> PairMatch:
         """Match two images, and estimate their two-view model.
@@ -150,8 +147,6 @@ class TwoStageMatcher:
             "F", "E" (needs ``intrinsics``) or "H".
         intrinsics : pair of arrays (3, 3), optional
             The camera matrices, in pixels.
-        regions : pair of boxes, optional
-            Replacements of MKPC's boxes; each is a :class:`Box` or its left, top, right and bottom.
         descriptors : bool
             Keep the descriptors of matchers that detect keypoints, in ``match.keypoints``.
 
@@ -180,7 +175,7 @@ class TwoStageMatcher:
         sources = (image0, image1)
         images = (as_image(image0, name="image0"), as_image(image1, name="image1"))
         self._pipeline.keeps_descriptors = descriptors
-        match = self._match(images, kind, intrinsics, regions, progress=self._progress)
+        match = self._match(images, kind, intrinsics, progress=self._progress)
         return replace(match, files=files_of(sources))
 
     def match_pairs(
@@ -189,7 +184,6 @@ class TwoStageMatcher:
         *,
         model: ModelKind | str = ModelKind.F,
         intrinsics: Iterable[Intrinsics | None] | None = None,
-        regions: Iterable[Boxes | None] | None = None,
         descriptors: bool = False,
     ) -> Iterator[PairMatch]:
         """Yield the match of each pair, as a call does for one pair.
@@ -203,7 +197,7 @@ class TwoStageMatcher:
             Images as for a call.
         model, descriptors
             As for a call.
-        intrinsics, regions : iterable, optional
+        intrinsics : iterable, optional
             An item for each pair, as for a call; it may be ``None``.
 
         Yields
@@ -223,16 +217,15 @@ class TwoStageMatcher:
         each = (
             pairs,
             _of_each_pair(intrinsics, "intrinsics"),
-            _of_each_pair(regions, "regions"),
         )
         return self._match_each(zip(*each, strict=False), kind, descriptors=descriptors)
 
     def _match_each(
-        self, given: Iterable[tuple[Any, Any, Any]], kind: ModelKind, *, descriptors: bool
+        self, given: Iterable[tuple[Any, Any]], kind: ModelKind, *, descriptors: bool
     ) -> Iterator[PairMatch]:
         # Closed also if the caller stops early: its thread would keep the process alive.
         with closing(ImageStore()) as store:
-            for number, (pair, intrinsics, regions) in enumerate(given):
+            for number, (pair, intrinsics) in enumerate(given):
                 name = f"pairs[{number}]"
                 if isinstance(pair, str) or not hasattr(pair, "__len__") or len(pair) != 2:
                     raise TypeError(f"{name} is {shown_value(pair)}; expected two images")
@@ -243,7 +236,7 @@ class TwoStageMatcher:
                 )
                 # Set for each pair: another call may come between.
                 self._pipeline.keeps_descriptors = descriptors
-                match = self._match(images, kind, intrinsics, regions)
+                match = self._match(images, kind, intrinsics)
                 yield replace(match, files=files_of(pair))
 
     def _match(
@@ -251,13 +244,11 @@ class TwoStageMatcher:
         images: tuple[Image, Image],
         kind: ModelKind,
         intrinsics: Intrinsics | None,
-        regions: Boxes | None,
         *,
         progress: bool = False,
     ) -> PairMatch:
         """Check the arguments of a pair, run all units, and estimate the model."""
         matrices = intrinsics_of(intrinsics)
-        boxes = boxes_of(regions, images)
         if kind is ModelKind.E and matrices is None:
             raise ValueError(
                 "model E needs intrinsics=(K0, K1), the camera matrices of both images in pixels"
@@ -265,13 +256,6 @@ class TwoStageMatcher:
         for number, K in enumerate(matrices or ()):
             if doubt := doubt_about_resolution(K, images[number].size):
                 warnings.warn(f"intrinsics[{number}]: {doubt}", RuntimeWarning, stacklevel=3)
-        if boxes and all(unit.stage == 1 for unit in self.recipe.units):
-            text = f"regions have no effect: recipe {self.recipe.name} has no unit of stage 2"
-            warnings.warn(text, RuntimeWarning, stacklevel=3)
-        # Set or cleared by each call: they are of this pair only.
-        self._pipeline.regions = {}
-        if boxes:
-            self._pipeline.regions = {tuple(image.name for image in images): boxes}
         (pair,) = self._run(images, progress=progress)
         match = _for_programs(with_estimate(pair, self.recipe, kind, matrices))
         match = replace(match, mkpc=self.recipe.mkpc)

@@ -4,7 +4,6 @@ Each function returns the checked value, or raises before any work: ``TypeError`
 ``ValueError`` for a wrong value. The message names the argument, the value and the expected one.
 """
 
-import operator
 import os
 import sys
 from collections.abc import Iterable, Mapping, Sequence
@@ -20,7 +19,7 @@ from numpy.typing import NDArray
 from mkpc_kaggle.data.heads import tags_of_picture
 from mkpc_kaggle.data.images import Image, ImageStore, Unreadable, exif_facts, read_image
 from mkpc_kaggle.errors import UserError, plural
-from mkpc_kaggle.geometry.coordinates import Box, Matrix3, Pixels
+from mkpc_kaggle.geometry.coordinates import Matrix3, Pixels
 
 if TYPE_CHECKING:
     import torch
@@ -133,49 +132,6 @@ def files_of(sources: Iterable[ImageSource]) -> tuple[str, ...]:
     )
 
 
-def boxes_of(regions: Any, images: tuple[Image, Image]) -> tuple[Box, Box] | None:
-    """Return the boxes of both images; ``None`` if the user gave none.
-
-    A box is a :class:`Box` or four whole numbers: left, top, right, bottom.
-    """
-    if regions is None:
-        return None
-    expected = "two boxes, each Box(left, top, right, bottom) or these four whole numbers"
-    values = _pair_of(regions, "regions", expected)
-    boxes = []
-    for number, (value, image) in enumerate(zip(values, images, strict=True)):
-        name = f"regions[{number}]"
-        box = _box_of(value, name, expected)
-        whole = Box.whole(image.size)
-        if min(box.left, box.top) < 0 or box.right > whole.right or box.bottom > whole.bottom:
-            raise ValueError(
-                f"{name} is {box}, beyond image{number} of {whole.right} x {whole.bottom} pixels"
-            )
-        boxes.append(box)
-    return boxes[0], boxes[1]
-
-
-def _box_of(value: Any, name: str, expected: str) -> Box:
-    sides = value
-    if isinstance(value, Box):
-        sides = (value.left, value.top, value.right, value.bottom)
-    try:
-        left, top, right, bottom = map(_whole_number, sides)
-    except (TypeError, ValueError) as error:
-        raise TypeError(f"{name} is {shown_value(value)}; expected {expected}") from error
-    try:
-        return Box(left, top, right, bottom)
-    except ValueError as error:
-        raise ValueError(f"{name} is {error}") from error
-
-
-def _whole_number(value: Any) -> int:
-    # Floats such as 400.0 are whole, too.
-    if isinstance(value, float | np.floating) and float(value).is_integer():
-        return int(value)
-    return operator.index(value)
-
-
 def intrinsics_of(intrinsics: Any) -> tuple[Matrix3, Matrix3] | None:
     """Return both camera matrices (3, 3) float64; ``None`` if the user gave none.
 
@@ -208,7 +164,7 @@ def intrinsics_of(intrinsics: Any) -> tuple[Matrix3, Matrix3] | None:
 
 def _pair_of(values: Any, name: str, expected: str) -> Sequence[Any]:
     """Return the two values of an argument for both images."""
-    if isinstance(values, str | bytes | Box) or not hasattr(values, "__len__"):
+    if isinstance(values, str | bytes) or not hasattr(values, "__len__"):
         raise TypeError(f"{name} is {shown_value(values)}; expected {expected}")
     if len(values) != 2:
         shape = tuple(getattr(values, "shape", ()))

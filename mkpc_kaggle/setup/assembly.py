@@ -13,7 +13,6 @@ from uuid import uuid4
 import cv2
 
 from mkpc_kaggle.data.masks import Masks
-from mkpc_kaggle.data.regions import GivenRegions
 from mkpc_kaggle.errors import UserError, warn_once
 from mkpc_kaggle.geometry.intrinsics import Rows
 from mkpc_kaggle.matchers.contract import Matcher, MatcherSpec, Placement, Precision
@@ -60,7 +59,6 @@ class Assembly:
     matchers: Mapping[str, Matcher[Any]] = field(default_factory=dict)  # the user's ready matchers
     device: str = AUTO  # as named by the user
     sharing: int = 1  # workers on the placement's device
-    regions: GivenRegions = field(default_factory=dict)  # replace MKPC's regions
     masks: Masks = field(default_factory=Masks)
     cameras: Rows = ()  # known ones of scenes, by the user
     # Stands for the version of a matcher without one, so that no later run has the same keys

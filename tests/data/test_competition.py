@@ -10,7 +10,6 @@ from shared import run_command
 
 from mkpc_kaggle.data import competition
 from mkpc_kaggle.data.competition import (
-    Pair,
     missing_line,
     read_rows,
     read_submission,
@@ -18,9 +17,7 @@ from mkpc_kaggle.data.competition import (
     read_train_side,
     write_submission,
 )
-from mkpc_kaggle.data.regions import read_regions
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.geometry.coordinates import Box
 from mkpc_kaggle.geometry.intrinsics import parse_row
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 
@@ -318,12 +315,6 @@ def test_numbers_are_read_strictly_in_each_table(tmp_path, train, number):
         read_train_side(train)
     with pytest.raises(ValueError, match="decimal number"):
         parse_row("a.jpg", "SIMPLE_PINHOLE", f"{number} 5 5", "fixed")
-    boxes = tmp_path / "boxes.csv"
-    boxes.write_text(
-        f'image_0,image_1,box_0,box_1\na.jpg,b.jpg,"{number} 0 9 9",0 0 9 9\n', encoding="utf-8"
-    )
-    with pytest.raises(UserError, match="expected left, top, right and bottom"):
-        read_regions(boxes, tmp_path, [])
 
 
 @pytest.mark.parametrize("number", ["1", "-1.5", "+.5", "5.", "1e-7", "-2.5E+10", "  1 "])
@@ -382,19 +373,3 @@ def test_matrices_that_are_no_fundamental_matrix_are_warned_of(tmp_path, side, c
     good, *lines = capsys.readouterr().out.splitlines()
     assert good.startswith("good: ")
     assert lines == [f"warning: {text}" for text in found]
-
-
-def test_a_row_of_regions_may_have_the_images_in_the_other_order(tmp_path):
-    table = tmp_path / "boxes.csv"
-    rows = ["image_0,image_1,box_0,box_1", "a.png,b.png,0 0 1 2,0 0 3 4"]
-    table.write_text("\n".join(rows))
-    first, second = (str(tmp_path / name) for name in ("a.png", "b.png"))
-    turned = Pair("p", "b", second, first)
-    box0, box1 = Box(0, 0, 1, 2), Box(0, 0, 3, 4)
-    assert read_regions(table, tmp_path, [turned]) == {(second, first): (box1, box0)}
-    straight = Pair("q", "b", first, second)
-    both = read_regions(table, tmp_path, [turned, straight])
-    assert both == {(second, first): (box1, box0), (first, second): (box0, box1)}
-    missing = Pair("r", "b", first, first)
-    with pytest.raises(UserError, match="no regions of the pair r; 1 of 3 pairs have none"):
-        read_regions(table, tmp_path, [turned, straight, missing])

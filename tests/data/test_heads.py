@@ -10,11 +10,8 @@ import pycolmap
 import pytest
 from numpy.testing import assert_array_equal
 
-from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.data.heads import is_whole_png
 from mkpc_kaggle.data.images import Image, Unreadable, read_image, read_size
-from mkpc_kaggle.data.regions import read_regions
-from mkpc_kaggle.errors import UserError
 
 PIXELS = np.random.default_rng(0).integers(0, 256, (40, 60, 3), np.uint8)
 # Pillow's names of the formats that keep EXIF
@@ -67,14 +64,6 @@ def test_the_size_is_known_before_a_run_for_all_that_opencv_decodes(tmp_path, su
     path = tmp_path / f"a.{suffix}"
     assert cv2.imwrite(str(path), PIXELS)
     assert read_size(path) == read_image(path).size == (60, 40)
-
-
-def test_a_box_beyond_a_picture_that_is_called_otherwise_is_refused(tmp_path, small_limit):
-    names = [str(write(tmp_path / name, "WEBP")) for name in ("a.jpg", "b.jpg")]
-    table = tmp_path / "regions.csv"
-    table.write_text("image_0,image_1,box_0,box_1\na.jpg,b.jpg,0 0 60 40,0 0 61 40\n")
-    with pytest.raises(UserError, match=r"a box ends at 61, 40, beyond .*b.jpg of 60 x 40 pixels"):
-        read_regions(table, tmp_path, [Pair("p", "b", *names)])
 
 
 SMOOTH = cv2.GaussianBlur(np.repeat(np.repeat(PIXELS, 4, 0), 4, 1), (0, 0), 5)

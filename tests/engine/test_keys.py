@@ -72,7 +72,7 @@ def test_other_weights_change_the_points_of_their_units_and_of_stage_2(monkeypat
         pair = Pair("p", "b", "0.png", "1.png")
         first = [keys.of_points(unit, pair, IMAGES, []) for unit in (0, 1)]
         # Stage 2 looks at crops from all of stage 1, so it depends on both matchers' weights.
-        second = keys.of_points(2, pair, IMAGES, keys.crops_of(pair, first))
+        second = keys.of_points(2, pair, IMAGES, keys.crops_of(first))
         return (*first, second)
 
     pairs = zip(digests(), digests(**{slot: "other"}), strict=True)
@@ -134,7 +134,6 @@ OTHERS = {
     "turns": ({"turns": (0, 1)}, (True, True, True, True)),
     "crops": ({"mkpc": "other"}, (False, True, True, True)),
     "points of stage 1": ({"first": "other"}, (False, True, True, True)),
-    "regions": ({"regions": {("0.png", "1.png"): BOXES}}, (False, True, True, True)),
     # MAGSAC's result depends on the order of the matches.
     "order": ({"first_is_last": True}, (False, False, True, True)),
     "intrinsics": ({"intrinsics": (np.eye(3), 2 * np.eye(3))}, (False, False, True, True)),
@@ -152,7 +151,7 @@ def test_a_key_is_the_digest_of_all_inputs_of_a_result(other, changed):
         first_image, second_image = IMAGES
         images = (replace(first_image, digest=digest), second_image)
         one = keys.of_points(0, pair, images, [])
-        two = keys.of_points(1, pair, images, keys.crops_of(pair, [first or one]))
+        two = keys.of_points(1, pair, images, keys.crops_of([first or one]))
         points = [two, one] if first_is_last else [one, two]
         estimate = keys.of_estimate(pair, points)
         return [one, two, estimate, keys.of_scene([["names", points, estimate]])]

@@ -1,10 +1,7 @@
-import json
 import pickle
 import re
-import sqlite3
 import zipfile
-from contextlib import closing
-from dataclasses import astuple, replace
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -25,14 +22,12 @@ from mkpc_kaggle.engine.store.dataframes import pair_tables
 from mkpc_kaggle.engine.store.published import Published
 from mkpc_kaggle.evaluation.validate import by_protocol
 from mkpc_kaggle.geometry.cameras import Camera
-from mkpc_kaggle.geometry.coordinates import Box, Size
-from mkpc_kaggle.geometry.critical_region import RegionReason
+from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.metrics import pose_error
 from mkpc_kaggle.geometry.robust import Method, ModelKind, RobustConfig, estimate
 from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult, with_estimate
 from mkpc_kaggle.recipe import Recipe, Unit
-from mkpc_kaggle.reporting.run_log import regions_of
 
 K = np.array(
     [
@@ -313,102 +308,21 @@ BAD = {
     "other arrays": ("pairs.npz", other_arrays, "pair_infos.npy"),
     "code": ("pairs.npz", pickled(CODE), "it names builtins.print"),
     "cut off": ("pairs.npz", pickled(CUT_OFF), "is not a scene_info"),
-    # Mistakes of users: another text, a folder without files, a table of regions.
+    # Mistakes of users: another text, a folder without files.
     "no pairs": ("pairs.txt", text("a b\n"), "expected 38 fields"),
     "an empty directory": ("pairs", Path.mkdir, "cannot be read"),
-    "no columns": ("regions.csv", table("1,2", "a,b"), "missing columns image_0"),
-    "no row of a pair": (
-        "regions.csv",
-        table("A,C,0 0 9 9,0 0 9 9"),
-        "has no regions of the pair 1: ",
-    ),
-    "a box outside": (
-        "regions.csv",
-        table("A,B,0 0 9 9,0 0 9 9999"),
-        "a box ends at 9, 9999, beyond .* pixels",
-    ),
-    "words": ("regions.csv", table("A,B,0 0 x 9,0 0 9 9"), "line 2: expected left, .* '0 0 x 9'"),
-    "an empty box": (
-        "regions.csv",
-        table("A,B,9 0 9 9,0 0 9 9"),
-        "line 2: expected left, .* '9 0 9 9'",
-    ),
 }
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_bad_lists_and_regions_get_one_line_and_exit_2(
-    name, demo, scenes, small_recipe, tmp_path, capsys
-):
+def test_bad_lists_get_one_line_and_exit_2(name, demo, scenes, small_recipe, tmp_path, capsys):
     file, write, told = BAD[name]
-    first_pair = replace(scenes[0], pairs=scenes[0].pairs[:1])
-    one = write_list(tmp_path / "list.txt", [first_pair], demo.train_dir)
     source = tmp_path / file
     write(source)
-    regions = []
-    if file == "regions.csv":
-        # The rows that name the pair A,B are of the listed one.
-        names = ",".join(one.read_text().split()[:2])
-        source.write_text(source.read_text().replace("A,B", names))
-        regions = ["--regions", source]
-        source = one
-    command = ["validate", *listed(source, demo.train_dir, small_recipe), *regions]
+    command = ["validate", *listed(source, demo.train_dir, small_recipe)]
     assert run_command(*command) == 2
     out, err = capsys.readouterr()
     # NumPy's own reader would run the code of a pickle.
     assert "executed" not in out
     (line,) = err.splitlines()
     assert re.search(told, line)
-
-
-def write_regions(path: Path, listed: Path, boxes) -> None:
-    """Write the boxes of the first pair of a list."""
-    names = ",".join(listed.read_text().split()[:2])
-    cells = ",".join(f"{box.left} {box.top} {box.right} {box.bottom}" for box in boxes)
-    write = table(f"{names},{cells}")
-    write(path)
-
-
-def test_given_regions_replace_mkpcs_and_are_part_of_the_key_of_stage_2(
-    demo, scenes, small_recipe, tmp_path, capsys
-):
-    true = max(scenes[0].pairs, key=lambda true: true.covisibility)
-    size0, size1 = (read_image(path).size for path in true.pair.images)
-    # Boxes that MKPC would not find: a left half, and one without a few rows and columns.
-    boxes = (
-        Box(0, 0, size0.width // 2, size0.height),
-        Box(7, 0, size1.width, size1.height - 3),
-    )
-    match = TwoStageMatcher(str(small_recipe))(*true.pair.images, regions=boxes)
-    second = match.matches[match.in_stage(2)]
-    assert len(second)
-    assert boxes[0].contains(second.points0).all()
-    alone = replace(scenes[0], pairs=(true,))
-    one = write_list(tmp_path / "list.txt", [alone], demo.train_dir)
-    write_regions(tmp_path / "regions.csv", one, boxes)
-    with (tmp_path / "regions.csv").open("a") as stream:
-        stream.write("of_another_scene.png,b.png,0 0 9 9,0 0 9 9\n")
-    command = ["validate", "--workers", 0, *listed(one, demo.train_dir, small_recipe)]
-    given = ["--regions", tmp_path / "regions.csv"]
-    scores = tmp_path / "scores.json"
-    # Rows of points: other regions add one of stage 2, and the former one is used again.
-    for options, rows in ((given, 2), ([], 3), (given, 3)):
-        run_options = ["--work-dir", tmp_path / "run", "--json", scores, *options]
-        assert run_command(*command, *run_options) == 0
-        is_given = bool(options)
-        printed = capsys.readouterr().out
-        assert ("regions: 1 of 2 rows name pairs of this run" in printed) == is_given
-        with Store.read(tmp_path / "run") as store:
-            cropped = regions_of(pair_tables(store).regions)
-            found = matches_of(store, 0)
-        used = [region.box for region in cropped]
-        assert (used == [*boxes]) == is_given
-        reasons = {region.reason for region in cropped}
-        assert (reasons == {RegionReason.GIVEN}) == is_given
-        journal = tmp_path / "run" / "journal.sqlite"
-        with closing(sqlite3.connect(journal)) as database:
-            count = "SELECT count(*) FROM points"
-            assert database.execute(count).fetchone() == (rows,)
-    np.testing.assert_array_equal(found.points0, match.matches.points0)
-    (scored,) = json.loads(scores.read_text())["scenes"][0]["pairs"]
-    assert scored["boxes"] == [list(astuple(box)) for box in boxes]

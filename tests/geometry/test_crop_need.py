@@ -11,7 +11,6 @@ from mkpc_kaggle.geometry.matches import Matches
 SIZE = Size(1000, 800)
 SMALL = CriticalRegion(Box(100, 100, 500, 400), RegionReason.CROPPED)
 WHOLE = CriticalRegion(Box.whole(SIZE), RegionReason.TOO_SCATTERED)
-GIVEN = CriticalRegion(Box(100, 100, 500, 400), RegionReason.GIVEN)
 BY_SCALE = MkpcConfig(when=When.SCALE, min_scale=1.75, min_detail=2.0)
 STORED = (1.0, 1.0)  # views at the size of the file
 
@@ -66,7 +65,6 @@ def test_matches_that_say_nothing_have_scale_one(matches):
         ((SMALL, SMALL), 1.0, (0.25, 1.0), (0.4, 1.0), False),
         # An enlarged crop has no more detail.
         ((SMALL, SMALL), 1.0, STORED, (3.0, 3.0), False),
-        ((GIVEN, GIVEN), 1.0, STORED, STORED, True),
     ],
 )
 def test_a_crop_is_needed_where_scales_differ_or_detail_comes_back(

@@ -27,7 +27,7 @@ from mkpc_kaggle.matchers.networks.aliked import Aliked
 from mkpc_kaggle.matchers.registry import MATCHERS
 from mkpc_kaggle.recipe import Recipe, Unit, load_recipe
 from mkpc_kaggle.setup import assembly
-from mkpc_kaggle.setup.arguments import as_image, boxes_of, intrinsics_of
+from mkpc_kaggle.setup.arguments import as_image, intrinsics_of
 from mkpc_kaggle.setup.assembly import recipe_of_name
 
 pytestmark = pytest.mark.usefixtures("nowhere_else")
@@ -207,66 +207,6 @@ IMAGES = (Image.of_array(pixels()), Image.of_array(pixels(40)))
 BOX = Box(0, 10, 200, 150)
 
 
-@pytest.mark.parametrize(
-    "given",
-    [
-        (BOX, BOX),
-        [(0, 10, 200, 150), [0, 10, 200, 150]],
-        np.array([[0, 10, 200, 150]] * 2),
-        np.array([[0.0, 10, 200, 150]] * 2),
-        torch.tensor([[0, 10, 200, 150]] * 2),
-        (Box(0.0, 10.0, 200.0, 150.0), BOX),
-    ],
-)
-def test_boxes_in_each_form_are_the_same(given):
-    first, second = boxes_of(given, IMAGES)
-    assert first == second == BOX
-    assert {type(side) for side in vars(first).values()} == {int}
-
-
-REFUSED_REGIONS = [
-    (BOX, TypeError, ["regions is Box", "two boxes"]),
-    ((BOX,), ValueError, ["regions has 1 value", "two boxes"]),
-    ((), ValueError, ["regions has 0 values"]),
-    (np.zeros((3, 4), int), ValueError, ["regions has the shape (3, 4)"]),
-    ((BOX, None), TypeError, ["regions[1] is None", "left, top, right, bottom"]),
-    ((BOX, (0, 0, 9)), TypeError, ["regions[1] is tuple (0, 0, 9)"]),
-    ((BOX, (0, 0, 9.5, 9)), TypeError, ["regions[1]", "whole numbers"]),
-    ((BOX, (9, 9, 5, 5)), ValueError, ["regions[1]", "empty"]),
-    ((BOX, Box(0, 0, 281, 100)), ValueError, ["regions[1]", "beyond image1 of 280 x 200 pixels"]),
-    ((Box(-1, 0, 9, 9), BOX), ValueError, ["regions[0]", "beyond image0"]),
-]
-
-
-@pytest.mark.parametrize(("given", "error", "words"), REFUSED_REGIONS)
-def test_other_boxes_are_refused_before_any_work(given, error, words):
-    two = (Unit(1, "unrun", 320), Unit(2, "unrun", 320))
-    raises(lambda: unrun(*two)(pixels(), pixels(40), regions=given), error, *words)
-    of_pairs = unrun(*two).match_pairs([(pixels(), pixels(40))], regions=[given])
-    raises(lambda: next(of_pairs), error, *words)
-
-
-def test_boxes_crop_stage_2_and_one_image_may_have_two():
-    match = TwoStageMatcher(TWO_STAGES)(pixels(), pixels(), regions=((0, 0, 200, 150), BOX))
-    assert [region.box for region in match.regions] == [Box(0, 0, 200, 150), BOX]
-    assert len(match.matches[match.in_stage(2)]) > 20
-
-
-def test_boxes_of_a_call_within_a_loop_are_not_those_of_the_next_pairs():
-    matcher = TwoStageMatcher(TWO_STAGES)
-    pair = (pixels(), pixels(40))
-    regions = []
-    for match in matcher.match_pairs([pair, pair]):
-        regions.append([region.box for region in match.regions])
-        matcher(*pair, regions=(BOX, BOX))
-    assert regions[1] == regions[0] != [BOX, BOX]
-
-
-def test_boxes_without_a_stage_2_are_a_warning():
-    with pytest.warns(RuntimeWarning, match="regions have no effect: recipe unnamed has no unit"):
-        TwoStageMatcher(SIFT)(pixels(), pixels(40), regions=(BOX, BOX))
-
-
 # Other arguments
 
 
@@ -417,15 +357,14 @@ def test_the_images_of_reconstruct_may_be_a_folder(tmp_path):
 def test_arguments_of_pairs_are_those_of_a_call():
     matcher = TwoStageMatcher(TWO_STAGES)
     pair = (pixels(), pixels(40))
-    options = {"intrinsics": (K, K), "regions": (BOX, BOX)}
+    options = {"intrinsics": (K, K)}
     expected = matcher(*pair, model="E", **options)
     given = {name: [value, None] for name, value in options.items()}
     given["intrinsics"][1] = (K, K)
-    found, other = matcher.match_pairs([pair, pair], model="E", **given)
+    found, _ = matcher.match_pairs([pair, pair], model="E", **given)
     assert same(found.matches, expected.matches)
     np.testing.assert_array_equal(found.estimate.matrix, expected.estimate.matrix)
     assert found.estimate.model == "E"
-    assert [region.reason for region in other.regions] != ["given"] * 2
     short = matcher.match_pairs([pair, pair], intrinsics=[(K, K)])
     raises(lambda: list(short), ValueError, "intrinsics", "1")
 

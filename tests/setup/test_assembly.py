@@ -331,7 +331,7 @@ def points_keys(assembly: Assembly) -> tuple[str, ...]:
     images = tuple(BatchImage(name, name, Size(80, 60)) for name in ("0.png", "1.png"))
     stages = [unit.stage for unit in assembly.recipe.units]
     first = [keys.of_points(n, pair, images, []) for n, stage in enumerate(stages) if stage == 1]
-    crops = keys.crops_of(pair, first)
+    crops = keys.crops_of(first)
     found = []
     for n, stage in enumerate(stages):
         found.append(keys.of_points(n, pair, images, crops if stage == 2 else []))

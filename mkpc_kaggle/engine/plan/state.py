@@ -272,7 +272,7 @@ class State:
         """
         keys = self.request.keys
         pair = self.pairs[index]
-        crops = keys.crops_of(pair, first) if self.is_crop[unit] else []
+        crops = keys.crops_of(first) if self.is_crop[unit] else []
         return keys.of_points(unit, pair, images, crops, is_float32=is_float32)
 
     def keys_of(self, index: int, unit: int, images: Images, first: Sequence[str]) -> list[str]:

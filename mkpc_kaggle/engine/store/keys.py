@@ -17,8 +17,6 @@ import cv2
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.data.masks import Masks
-from mkpc_kaggle.data.regions import GivenRegions
-from mkpc_kaggle.geometry.coordinates import Box
 from mkpc_kaggle.geometry.critical_region import When
 from mkpc_kaggle.matchers.contract import Precision
 from mkpc_kaggle.scene.view_graph import BatchImage
@@ -56,7 +54,7 @@ class Keys:
 
     ``units`` has a digest for each unit, in the recipe's order. ``float32`` has the digests of units
     that ran in float32 although the run was given half precision: on the CPU that took over, or
-    after an overflow. ``regions`` replace MKPC's regions of some pairs. ``masks`` are of single images.
+    after an overflow. ``masks`` are of single images.
     """
 
     units: tuple[str, ...]
@@ -64,7 +62,6 @@ class Keys:
     rule: str = ""  # that says which pairs need their crops; empty: all of them
     estimate: str = ""
     scene: str = ""
-    regions: GivenRegions | None = None
     masks: Masks = field(default_factory=Masks)
     float32: tuple[str, ...] = ()  # empty: the same
 
@@ -97,7 +94,6 @@ class Keys:
             else digest([RULE_VERSION, *(mkpc[name] for name in RULE)]),
             estimate,
             digest([SCENE_VERSION, scene, cameras, tracks, estimate, _mapper_version()]),
-            assembly.regions,
             assembly.masks,
             tuple(float32),
         )
@@ -127,12 +123,9 @@ class Keys:
         """Return the key of the answer that a pair does not need the unit with these points."""
         return text_digest([self.rule, points])
 
-    def crops_of(self, pair: Pair, first: Sequence[str]) -> list[str]:
-        """Return what decides a pair's crops: the given regions, or [mkpc] and the keys of stage 1."""
-        boxes = (self.regions or {}).get((pair.file0, pair.file1))
-        if boxes is None:
-            return [self.mkpc, *first]
-        return ["given", *map(_text_of, boxes)]
+    def crops_of(self, first: Sequence[str]) -> list[str]:
+        """Return what decides a pair's crops: [mkpc] and the keys of its points of stage 1."""
+        return [self.mkpc, *first]
 
     def of_estimate(self, pair: Pair, points: Sequence[str]) -> str:
         """Return the key of a pair's estimate from its points, in the recipe's order."""
@@ -166,7 +159,3 @@ def of_camera_estimate(estimate: str, scene: str) -> str:
     alone, ``scene`` that of its batch.
     """
     return text_digest(["cameras", estimate, scene])
-
-
-def _text_of(box: Box) -> str:
-    return f"{box.left} {box.top} {box.right} {box.bottom}"
