@@ -88,7 +88,7 @@ def main(arguments: Sequence[str] | None = None, started: float | None = None) -
     try:
         require_libraries()
     except ImportError as error:
-        # Without the printing thread, whose module needs the library.
+        # Without logging, whose module needs the library.
         sys.stderr.write(f"{error}\n")
         return EXIT_BAD_INPUT
     return _main(arguments, started)
@@ -103,7 +103,7 @@ def _main(arguments: Sequence[str] | None, started: float) -> int:
         # Paths and ids may have characters that the terminal cannot encode.
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
-    # Leaving the stack ends the printing thread after the messages below.
+    # Leaving the stack ends the thread that prints after the messages below.
     with ExitStack() as printing, warnings.catch_warnings():
         # One line each, without the file and line that Python prints.
         warnings.showwarning = lambda message, *_, **__: logger.warning(str(message))
@@ -150,12 +150,13 @@ def _run(given: Sequence[str], started: float, printing: ExitStack) -> int:
             f"the current directory is gone ({error.strerror}); change to another"
         ) from error
     parsed.started = started
-    # After parsing: --help and errors in options need no printing thread.
+    # After parsing: --help and errors in options need no thread that prints.
     printing.enter_context(parsed.printing())
     status = int(parsed.run(parsed) or 0)
     with suppress(OSError, ValueError):  # the disk is full, or the stream closed
-        if sys.stdout is not None:
-            sys.stdout.flush()  # waits for a slow reader, except in a run
+        # A slow reader is waited for, except in a run, whose lines another thread prints.
+        if sys.stdout is not None and parsed.printing is nullcontext:
+            sys.stdout.flush()
     return status
 
 

@@ -1,12 +1,10 @@
 """The command ``journal``."""
 
 import argparse
-from functools import partial
 from pathlib import Path
 
 from mkpc_kaggle.data.competition import read_test_side, test_side
 from mkpc_kaggle.data.outputs import require_apart
-from mkpc_kaggle.engine.console import unblocked
 from mkpc_kaggle.engine.store.database import Store
 from mkpc_kaggle.engine.store.published import Published
 from mkpc_kaggle.reporting.report import write_report
@@ -18,7 +16,7 @@ HELP = """\
 Show the journal of a run, also while it is running. DIR is the run's work directory, NAME.work next to the
 submission. Without options, print an overview of one screen.
 
---csv writes tables for pandas.read_csv. Except the last, all have the column `pair`, the id of the pair:
+--csv writes tables for pandas.read_csv. All have the column `pair`, the id of the pair:
   pairs.csv    images (paths below the directory of the run's images), failure, source of F (scene; pair;
                earlier, until this run has its own; fallback), matches, inliers, seconds by part; f11 ... f33, the
                matrix of the column model: F, or E for pairs with known intrinsics. For the F of the pair's own
@@ -28,7 +26,6 @@ submission. Without options, print an overview of one screen.
                unless it has few matches
   units.csv    per unit and pair: matches, inliers, seconds, failure
   regions.csv  per image (0 or 1) and pair: the critical region's box and the reason for it
-  events.csv   times of starts, plans, scenes, faults, ends
 In Python, mkpc_kaggle.results(DIR) returns the first two and the cameras as DataFrames with the same columns.
 
 --prune removes the results that the last run did not use: of former recipes, settings, images and rows. If
@@ -40,8 +37,6 @@ Exit status: 0 done, 2 the journal does not exist, or a file cannot be written.
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    # Stderr, where image decoders print warnings.
-    parser.set_defaults(printing=partial(unblocked, [2]))
     parser.add_argument("work_dir", type=Path, metavar="DIR", help="work directory of the run")
     parser.add_argument("--csv", type=Path, metavar="OUT", help="write tables to this directory")
     parser.add_argument(

@@ -1,7 +1,6 @@
 """The command ``match``."""
 
 import argparse
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +8,6 @@ import numpy as np
 from mkpc_kaggle.cli import options
 from mkpc_kaggle.data.hloc import SUFFIX, HlocPair, require_h5py, write_hloc
 from mkpc_kaggle.data.outputs import RESULTS, replacing, require_apart
-from mkpc_kaggle.engine.console import unblocked
 from mkpc_kaggle.errors import UserError, plural, writing
 from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
 from mkpc_kaggle.pipeline.pair import PairMatch
@@ -35,8 +33,6 @@ EXIT_NOTHING_RAN = 1
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    # Stderr, where image decoders print warnings.
-    parser.set_defaults(printing=partial(unblocked, [2]))
     parser.add_argument("image0", type=Path, help="first image")
     parser.add_argument("image1", type=Path, help="second image")
     parser.add_argument(

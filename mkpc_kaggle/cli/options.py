@@ -1,7 +1,6 @@
 """Options shared by several commands, and tables for the terminal."""
 
 import argparse
-import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from math import inf
@@ -9,7 +8,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from mkpc_kaggle.data.competition import Pair, TrainScene, read_train_side
-from mkpc_kaggle.engine.console import Progress, drain, logger, unblocked
+from mkpc_kaggle.engine.console import Progress, drain, logger, queued
 from mkpc_kaggle.engine.plan.budget import Budget, monotonic_of, parse_duration
 from mkpc_kaggle.engine.request import RunReport
 from mkpc_kaggle.engine.session import Interrupt, Session
@@ -113,8 +112,8 @@ class Moved(argparse.Action):
 
 def add_run(parser: argparse.ArgumentParser, time_limit: str | None) -> None:
     """Add the options of the engine; ``time_limit``: the default, ``None`` for no limit."""
-    # A run's reader may be slow or hang, so its lines go through the printing thread.
-    parser.set_defaults(printing=unblocked)
+    # A run's reader may be slow or hang.
+    parser.set_defaults(printing=queued)
     add = parser.add_argument
     text = """two-stage (the default): the recipe as written; stage-1: only its units of stage 1; whole-images:
         all its units on whole images, the naive ensemble of equal inference count"""
@@ -200,7 +199,7 @@ def finish(session: Session, page: Path | None, pairs: Sequence[Pair]) -> int:
     from mkpc_kaggle.reporting.report import report_run
 
     if page is not None:
-        progress = Progress(session.budget, sys.stderr)
+        progress = Progress(session.budget)
         logger.info(report_run(session.work_dir, page, session.must_end(), pairs, progress))
     if session.interrupt.signal:
         return 128 + session.interrupt.signal  # as shells do

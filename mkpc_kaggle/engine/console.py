@@ -1,52 +1,58 @@
-"""Printing during a run: lines, warnings, progress. It never raises or blocks the run.
+"""Messages by logging: lines for the user, the progress of a run, and the events in its ``run.log``.
 
-A pipe without a reader or a stopped terminal (Ctrl-S) blocks a write forever, and with it every
-thread that waits for the stream's lock. A lost terminal (EIO), a full disk or a closed stream makes
-a write fail. So during a run each stream has a thread that writes, from a bounded queue. Native
-libraries write to the descriptors directly: libjpeg and libpng print warnings while OpenCV decodes a
-photograph. Their text goes to a file.
+A terminal without a reader (Ctrl-S) blocks a write forever. So a run prints from a bounded queue
+(:func:`queued`): a blocked terminal costs lines, and not the run.
 """
 
-import io
 import logging
 import multiprocessing
 import os
 import queue
 import sys
-import threading
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from enum import StrEnum
+from logging.handlers import QueueHandler, QueueListener
 from math import isfinite
 from pathlib import Path
-from tempfile import TemporaryFile
-from typing import Any, NoReturn, TextIO
+from typing import Any, NamedTuple, NoReturn
 
 from mkpc_kaggle.engine.plan.budget import Budget
-from mkpc_kaggle.progress import LINE_INTERVAL_S, WAIT_S, ProgressLine, format_duration, print_to
+from mkpc_kaggle.errors import printable
+from mkpc_kaggle.progress import LINE_INTERVAL_S, REDRAW_S, format_duration, is_terminal, print_to
 
-MAX_WAITING = 1000  # texts, which a busy progress line writes in a few minutes
-# Of the text of native libraries, printed at the end: a warning for each photograph would hide the rest.
-MAX_NATIVE_BYTES = 4096
-CONSOLE_RETRY_S = 0.05  # between writes to a non-blocking descriptor that accepts no text
-DRAIN_S = 2.0  # maximum wait at the end for the remaining text to be printed
+LOG_NAME = "run.log"  # in the work directory
+MAX_WAITING = 1000  # lines, which a progress line writes in a few minutes
+DRAIN_S = 2.0  # maximum wait at the end for the remaining lines to be printed
 
 
 class Console(logging.Handler):
-    """Print records: warnings and errors on stderr after their level, others on stdout."""
-
-    def handle(self, record: logging.LogRecord) -> bool:
-        # Without logging's lock: a stream that blocks must not hold back the other.
-        if self.filter(record):
-            self.emit(record)
-        return True
+    """Print records: warnings and errors on stderr after their level, a state of the progress on stderr as
+    it is, others on stdout.
+    """
 
     def emit(self, record: logging.LogRecord) -> None:
-        # Looked up for each record: notebooks, tests and :func:`unblocked` replace streams.
-        if record.levelno < logging.WARNING:
-            print_to(sys.stdout, record.getMessage())
+        # Looked up for each record, because notebooks and tests replace streams.
+        text = record.getMessage()
+        if hasattr(record, "progress"):
+            print_to(sys.stderr, text, end="")
+        elif record.levelno < logging.WARNING:
+            print_to(sys.stdout, text)
         else:
-            print_to(sys.stderr, f"{record.levelname.lower()}: {record.getMessage()}")
+            print_to(sys.stderr, f"{record.levelname.lower()}: {text}")
+
+
+class Dropping(QueueHandler):
+    """Put records into a bounded queue, or drop them if it is full: nobody has read for minutes."""
+
+    def __init__(self) -> None:
+        self.waiting: queue.Queue[Any] = queue.Queue(MAX_WAITING)
+        super().__init__(self.waiting)
+
+    def enqueue(self, record: logging.LogRecord) -> None:
+        with suppress(queue.Full):
+            self.waiting.put_nowait(record)
 
 
 # The messages of the package; a program may give this logger other handlers.
@@ -56,207 +62,36 @@ logger.propagate = False
 logger.addHandler(Console())
 
 
-class Progress(ProgressLine):
-    """Progress of a run: the pairs of a phase that are done, or how long a wait takes that has no
-    count.
-    """
-
-    def __init__(self, budget: Budget, stream: TextIO | None) -> None:
-        super().__init__(stream, budget.clock)
-        self._budget = budget
-        self._phase = ""
-        self._first = 0  # pairs that were done when the phase began
-        self._began = budget.clock()
-        self.is_shown = stream is not None
-
-    def count(self, phase: str, done: int, total: int) -> None:
-        """Show the pairs that are done, after a job. A phase without pairs is not shown."""
-        if not total:
-            return
-        now = self._budget.clock()
-        # A phase that became smaller has no rate yet: fewer pairs are done than when it began.
-        is_new = phase != self._phase or done < self._first
-        if is_new:
-            self._phase = phase
-            self._first = done
-            self._began = now
-        text = self.meter(phase, done, total, now - self._began, "pair", first=self._first)
-        if isfinite(self._budget.time_limit):
-            text += f", budget left {format_duration(self._budget.left())}"
-        self.show(text, is_new=is_new)
-
-    def wait(self, text: str, since: float) -> None:
-        """Show how long something takes that has no count. Short waits are not shown."""
-        seconds = self._budget.clock() - since
-        shortest = WAIT_S if self.is_redrawn else LINE_INTERVAL_S
-        if seconds >= shortest and self.is_due:
-            self._write(f"{text} [{format_duration(seconds)}]")
+@contextmanager
+def queued() -> Iterator[None]:
+    """Let a thread print from a queue, so that no call of the logger blocks."""
+    dropping = Dropping()
+    handlers = logger.handlers
+    listener = QueueListener(dropping.waiting, *handlers)
+    logger.handlers = [dropping]
+    listener.start()
+    try:
+        yield
+    finally:
+        # Otherwise the thread is blocked, and stays behind.
+        if drain():
+            listener.stop()
+        logger.handlers = handlers
 
 
-class QueuedFile(io.RawIOBase):
-    """The binary file below a text stream, whose thread writes to ``descriptor`` from a bounded
-    queue. Text is dropped if the queue is full.
-    """
-
-    def __init__(self, descriptor: int) -> None:
-        self._descriptor = descriptor
-        self._waiting: queue.Queue[bytes | None] = queue.Queue(MAX_WAITING)
-        # Each stream has its own, because stdout and stderr may have different readers.
-        threading.Thread(target=self._write_all, name="print", daemon=True).start()
-
-    def writable(self) -> bool:
-        return True
-
-    def write(self, data: Any) -> int:
-        text = bytes(data)
-        with suppress(queue.Full):  # without a reader for minutes
-            self._waiting.put_nowait(text)
-        return len(text)
-
-    def isatty(self) -> bool:
-        return os.isatty(self._descriptor)
-
-    def fileno(self) -> int:
-        return self._descriptor
-
-    def drain(self, until: float) -> bool:
-        """Wait until all text is printed, at most until ``until`` on the monotonic clock. Return
-        whether it is.
-        """
-        while self._waiting.unfinished_tasks:
+def drain(seconds: float = DRAIN_S) -> bool:
+    """Wait at most ``seconds`` until all lines are printed. Return whether they are."""
+    until = time.monotonic() + seconds
+    for handler in logger.handlers:
+        while isinstance(handler, Dropping) and handler.waiting.unfinished_tasks:
             if time.monotonic() >= until:
                 return False
             time.sleep(0.002)
-        return True
-
-    def end(self) -> None:
-        """End the thread, once all text is printed."""
-        self._waiting.put_nowait(None)
-
-    def _write_all(self) -> None:
-        while (text := self._waiting.get()) is not None:
-            with suppress(OSError):  # lost terminal, or full disk
-                self._write_text(text)
-            self._waiting.task_done()
-
-    def _write_text(self, text: bytes) -> None:
-        while text:
-            try:
-                text = text[os.write(self._descriptor, text) :]
-            except BlockingIOError:  # the parent program has made the pipe non-blocking
-                time.sleep(CONSOLE_RETRY_S)
-
-
-_queued: dict[int, QueuedFile] = {}  # by descriptor; native libraries write to these descriptors
-
-
-@contextmanager
-def unblocked(descriptors: Sequence[int] = (1, 2)) -> Iterator[None]:
-    """Print ``sys.stdout`` and ``sys.stderr`` by a thread, so that writes never block.
-
-    Text of native libraries is printed at the end, or goes to the file of :func:`log_native`.
-    Streams at other descriptors, such as a notebook's, are not changed.
-    """
-    occupy_standard_descriptors()
-    with ExitStack() as ended:
-        for name in ("stdout", "stderr"):
-            stream = getattr(sys, name)
-            number = _descriptor(stream)
-            if number not in descriptors or number in _queued:
-                continue
-            stream.flush()
-            sink = os.dup(number)  # the stream's file, once its number is taken by the other
-            queued = QueuedFile(sink)
-            text = io.TextIOWrapper(
-                io.BufferedWriter(queued),
-                stream.encoding,
-                stream.errors,
-                write_through=True,
-                line_buffering=True,
-            )
-            setattr(sys, name, text)
-            # From here on, native libraries write to a file, which never blocks.
-            file = ended.enter_context(_native_file())
-            os.dup2(file.fileno(), number)
-            _queued[number] = queued
-            ended.callback(_restore, name, stream, number, file)
-        ended.callback(drain)
-        yield
-
-
-def _native_file() -> Any:
-    """Open a file for the text of native libraries: a temporary file, or the null device where there
-    is no directory for one.
-    """
-    try:
-        return TemporaryFile()
-    except OSError:  # a container in which only the output is writable, or a full disk
-        return open(os.devnull, "w+b")  # noqa: PTH123
-
-
-def _restore(name: str, stream: TextIO, number: int, file: Any) -> None:
-    """Restore a stream and its descriptor, unless the file still blocks, since later writes would
-    block, too.
-    """
-    queued = _queued.pop(number)
-    setattr(sys, name, stream)
-    file.seek(0)
-    if text := file.read(MAX_NATIVE_BYTES):
-        queued.write(text)
-    if queued.drain(time.monotonic() + DRAIN_S / 10):
-        with suppress(OSError):  # closed by the program
-            os.dup2(queued.fileno(), number)
-            os.close(queued.fileno())
-        queued.end()
-
-
-def occupy_standard_descriptors() -> None:
-    """Open the null device at descriptors up to 2 that are closed: no other file may get their
-    numbers.
-    """
-    for number in range(3):
-        try:
-            os.fstat(number)
-        except OSError:
-            lowest = os.open(os.devnull, os.O_RDWR)  # this number, as those below are open
-            os.set_inheritable(lowest, True)  # by worker processes
-
-
-def log_native(path: Path) -> None:
-    """Let native libraries write to a file from now on, while :func:`unblocked` is active."""
-    with suppress(OSError):  # a full disk
-        append_to(path, list(_queued))
-
-
-def append_to(path: Path | str, descriptors: Sequence[int]) -> None:
-    """Let these descriptors append to a file. Raise ``OSError`` if it cannot be opened."""
-    if descriptors:
-        file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o666)
-        for number in descriptors:
-            os.dup2(file, number)
-        if file not in descriptors:
-            os.close(file)
-
-
-def drain(seconds: float = DRAIN_S) -> None:
-    """Wait at most ``seconds`` until the remaining text is printed."""
-
-    def flush() -> None:
-        for stream in filter(None, (sys.stdout, sys.stderr)):
-            with suppress(OSError, ValueError):
-                stream.flush()
-        for queued in list(_queued.values()):
-            queued.drain(until)
-
-    until = time.monotonic() + seconds
-    # In a thread, because flushing a blocked stream waits for its lock.
-    thread = threading.Thread(target=flush, name="flush", daemon=True)
-    thread.start()
-    thread.join(seconds)
+    return True
 
 
 def leave(status: int, seconds: float = DRAIN_S) -> NoReturn:
-    """End the process and its children, even if stopped (SIGSTOP). Print remaining text for up to
+    """End the process and its children, even if stopped (SIGSTOP). Print remaining lines for up to
     ``seconds``.
     """
     # SIGKILL also ends stopped children, which would hold the terminal.
@@ -266,8 +101,112 @@ def leave(status: int, seconds: float = DRAIN_S) -> NoReturn:
     os._exit(status)
 
 
-def _descriptor(stream: TextIO | None) -> int:
-    """Return the descriptor of a stream whose writes can block, else -1."""
-    with suppress(OSError, ValueError, AttributeError):
-        return stream.fileno() if stream is not None and sys.platform != "win32" else -1
-    return -1
+class Progress:
+    """The progress of a run on stderr: the pairs of a phase that are done, on a line that is drawn again; a
+    line every half minute where lines stay.
+    """
+
+    def __init__(self, budget: Budget, *, is_shown: bool = True) -> None:
+        self._budget = budget
+        self._is_shown = is_shown
+        self._bar: Any = None
+        # A notebook's `!command` has a terminal, but Jupyter keeps every state of a line. It sets
+        # JPY_PARENT_PID for these processes.
+        self._is_redrawn = is_terminal(sys.stderr) and "JPY_PARENT_PID" not in os.environ
+
+    def count(self, phase: str, done: int, total: int, unit: str = "pair") -> None:
+        """Show how many are done. A phase without any, or with fewer done than before, begins anew."""
+        if not self._is_shown or not total:
+            return
+        bar = self._bar
+        if bar is None or bar.desc != phase or done < bar.n or total != bar.total:
+            from tqdm import tqdm  # most commands do not need it
+
+            self.close()
+            tqdm.monitor_interval = 0  # without a thread of its own
+            interval = REDRAW_S if self._is_redrawn else LINE_INTERVAL_S
+            self._bar = bar = tqdm(
+                desc=phase,
+                initial=done,
+                total=total,
+                unit=unit,
+                ascii=True,
+                file=self,
+                mininterval=interval,
+                ncols=None if self._is_redrawn else 80,
+            )
+        if isfinite(self._budget.time_limit):
+            bar.set_postfix_str(
+                f"budget left {format_duration(self._budget.left())}", refresh=False
+            )
+        bar.update(done - bar.n)
+
+    def note(self, text: str) -> None:
+        """Print a line that stays."""
+        if self._is_shown:
+            self.write(f"\r{text}\n")
+
+    def close(self) -> None:
+        if self._bar is not None:
+            self._bar.close()
+            self._bar = None
+
+    # The file that tqdm writes to
+
+    def write(self, text: str) -> None:
+        if not self._is_redrawn:
+            text = f"{line}\n" if (line := text.strip()) else ""
+        if text:
+            logger.info("%s", text, extra={"progress": True})
+
+    def flush(self) -> None:
+        """Each record is flushed."""
+
+    def fileno(self) -> int:
+        """Return the descriptor whose width tqdm asks for."""
+        return sys.stderr.fileno()
+
+
+class EventKind(StrEnum):
+    """Kinds of events."""
+
+    START = "start"  # the program began or resumed the run
+    PLAN = "plan"  # a decision, with its reason
+    SCENE = "scene"  # a batch was reconstructed; the text states its registered part
+    FAULT = "fault"
+    END = "end"  # the run ended; the text states the ending
+
+
+class Event(NamedTuple):
+    """A line of ``run.log``: seconds since the start of the program, kind and text."""
+
+    seconds: float
+    kind: str
+    text: str = ""
+
+    def __str__(self) -> str:
+        return f"{format_duration(self.seconds):>7}  {self.text}"
+
+
+def append_event(directory: Path, event: Event) -> None:
+    text = " ".join(printable(event.text).splitlines())
+    with (
+        suppress(OSError),
+        (directory / LOG_NAME).open("a", encoding="utf-8") as stream,
+    ):  # full disk
+        stream.write(f"{event.seconds:.1f} {event.kind} {text}\n")
+
+
+def read_events(directory: Path) -> list[Event]:
+    """Return the events of the last session in a work directory, which is the last start of its run."""
+    events: list[Event] = []
+    with suppress(OSError):
+        for line in (
+            (directory / LOG_NAME).read_text(encoding="utf-8", errors="replace").splitlines()
+        ):
+            seconds, kind, text = f"{line}  ".split(" ", 2)
+            # A kill may have cut a line off.
+            with suppress(ValueError):
+                event = Event(float(seconds), EventKind(kind), text.strip())
+                events = [event] if event.kind == EventKind.START else [*events, event]
+    return events

@@ -208,7 +208,6 @@ class Cause(StrEnum):
     DEVICE = "the device failed"
     OUT_OF_MEMORY = "out of memory"
     RAISED = "the worker failed"
-    WRONG = "the worker gave a wrong answer"
     UNIT_RAISED = "the matcher failed"
     UNREADABLE = "an image cannot be read"
 

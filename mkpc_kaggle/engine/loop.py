@@ -6,7 +6,6 @@ The schedule decides which pairs, estimates and scenes come next
 """
 
 import sqlite3
-import sys
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -45,7 +44,6 @@ from mkpc_kaggle.engine.store.image_files import current_digests, update_digests
 from mkpc_kaggle.engine.store.tables import Feature
 from mkpc_kaggle.engine.workers.places import Place, Site, Work
 from mkpc_kaggle.errors import UserError, plural
-from mkpc_kaggle.progress import format_duration
 from mkpc_kaggle.scene.candidates import ALL_UNITS
 from mkpc_kaggle.scene.densify import extra_pairs_of
 
@@ -84,13 +82,12 @@ class Engine:
         self.interrupt = interrupt
         # By this run's answers alone: another machine may have computed the stored results.
         self.costs = Costs()
-        self.log = EventLog(store, budget)
-        self._progress = Progress(budget, sys.stderr if progress else None)
+        self.log = EventLog(store.directory, budget)
+        self._progress = Progress(budget, is_shown=progress)
         self._features = Features(store)
         self._asked: Asked | None = None  # the latest request
         self._trials: list[str] = []  # the keys of the results of requests that were trials
         self._refused: dict[str, str] = {}  # why a matcher cannot be loaded, by name
-        self._looking_since = 0.0  # the features of a large folder are many short jobs
         self._must_replan = False  # a job was dropped, as its points are lost
         self._is_open = False  # the places for matching exist
         self._has_loaded = False  # some worker of matching was ready
@@ -132,7 +129,6 @@ class Engine:
         Failed ones are left out.
         """
         self._features.ask(jobs)
-        self._looking_since = self.budget.clock()
         self._loop()
         self._features.pending = {}  # the time is over, or the run was interrupted
         return self._features.found
@@ -227,27 +223,14 @@ class Engine:
 
         Files that cannot be read are left out.
         """
-        return current_digests(self.store, files, self._is_over_while_reading(len(files)))
-
-    def _is_over_while_reading(self, count: int) -> Callable[[], bool]:
-        """Return a function that shows how long reading files takes, and whether the time is over."""
-        since = self.budget.clock()
-        text = f"reading {plural(count, 'image')}"
-
-        def is_over() -> bool:
-            if self._progress.is_shown:
-                self._progress.wait(text, since)
-            return self._is_over()
-
-        return is_over
+        return current_digests(self.store, files, self._is_over)
 
     def _digests(self, state: State) -> dict[str, str]:
         """Return the known digests of the pairs' images, by name; warn of images that have changed."""
         files: dict[str, Path] = {}
         for pair, names in zip(state.pairs, state.names, strict=True):
             files |= zip(names, pair.images, strict=True)
-        is_over = self._is_over_while_reading(len(files))
-        digests = update_digests(self.store, files, is_over)
+        digests = update_digests(self.store, files, self._is_over)
         if changed := digests.changed:
             count = sum(not changed.isdisjoint(names) for names in state.names)
             images = plural(len(changed), "image")
@@ -269,29 +252,7 @@ class Engine:
                 self._asked.publication.publish()
             # Until an answer, or until a worker must have answered or may be restarted.
             limits = [place.limit for place in self.site.places if place.limit > now]
-            waits = self._waits() if self._progress.is_shown else []
-            if waits:
-                # The longest stands for all. The line counts its seconds.
-                since, text = min(waits)
-                self._progress.wait(text, since)
             self.site.wait(min([self.budget.stop_waiting, *limits, inf]))
-
-    def _waits(self) -> list[tuple[float, str]]:
-        """Return what is under way and has no bar: the time of its beginning, and a text."""
-        waits = []
-        # While pairs are matched, the bar shows those.
-        is_matching = self.state is not None and bool(self.state.matching.any())
-        for place in self.site.places if not is_matching else []:
-            if place.is_starting and place.work is Work.MATCH:
-                waits.append((place.since, "loading the matchers"))
-            elif isinstance(place.job, FeatureJob):
-                count = len(self._features.pending) + 1
-                waits.append((self._looking_since, f"features of images: {count} pending"))
-            elif isinstance(place.job, SceneJob) and self._asked is not None:
-                about = format_duration(self.costs.scene(place.job.matches))
-                text = f"batch {place.job.batch}: reconstructing its cameras, about {about}"
-                waits.append((place.since, text))
-        return waits
 
     def _is_over(self) -> bool:
         return self.interrupt.is_set() or self.budget.clock() >= self.budget.stop_waiting

@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mkpc_kaggle.data.competition import Pair
+from mkpc_kaggle.engine.console import Event
 from mkpc_kaggle.engine.store.dataframes import PairTables
 from mkpc_kaggle.engine.store.keys import Keys
-from mkpc_kaggle.engine.store.tables import MIN_PAIRS, About, Event, SceneRecord
+from mkpc_kaggle.engine.store.tables import MIN_PAIRS, About, SceneRecord
 from mkpc_kaggle.geometry.intrinsics import Rows
 from mkpc_kaggle.recipe import Recipe
 from mkpc_kaggle.scene.export import HeldDirectory

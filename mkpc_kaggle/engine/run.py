@@ -7,14 +7,15 @@ images) and :mod:`scenes`.
 import sqlite3
 from collections.abc import Sequence, Set
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Protocol
 
-from mkpc_kaggle.engine.console import Progress, logger
+from mkpc_kaggle.engine.console import Event, EventKind, Progress, append_event, logger
 from mkpc_kaggle.engine.jobs import Failure, PairInputs
 from mkpc_kaggle.engine.plan.budget import Budget, Costs
 from mkpc_kaggle.engine.plan.state import State
 from mkpc_kaggle.engine.store.database import Source, Store
-from mkpc_kaggle.engine.store.tables import Event, EventKind, UnitPoints
+from mkpc_kaggle.engine.store.tables import UnitPoints
 from mkpc_kaggle.errors import plural
 
 # Faults of a run with different texts, and its decisions. The number of units that fit may change with
@@ -25,8 +26,8 @@ MAX_FAULTS, MAX_PLANS = 1000, 10_000
 class EventLog:
     """The events and counts of this program, for its final report."""
 
-    def __init__(self, store: Store, budget: Budget) -> None:
-        self._store = store
+    def __init__(self, directory: Path, budget: Budget) -> None:
+        self._directory = directory
         self._budget = budget
         self.faults: list[str] = []
         self.plans: list[Event] = []
@@ -35,8 +36,8 @@ class EventLog:
         self.estimated = 0
 
     def note(self, kind: EventKind, text: str = "") -> Event:
-        event = Event(kind, self._budget.spent(), text)
-        self._store.put([event])
+        event = Event(self._budget.spent(), kind, text)
+        append_event(self._directory, event)
         return event
 
     def explain(self, text: str) -> None:

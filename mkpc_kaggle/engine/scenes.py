@@ -3,13 +3,13 @@
 import sqlite3
 from collections.abc import Sequence
 
+from mkpc_kaggle.engine.console import EventKind
 from mkpc_kaggle.engine.jobs import Cause, Failure, PairInputs, SceneJob
 from mkpc_kaggle.engine.plan.state import State
 from mkpc_kaggle.engine.run import Run
 from mkpc_kaggle.engine.store.keys import of_camera_estimate, of_candidate
 from mkpc_kaggle.engine.store.tables import (
     NOT_RECONSTRUCTED,
-    EventKind,
     Export,
     PairEstimate,
     SceneRecord,

@@ -20,14 +20,14 @@ import cv2
 
 from mkpc_kaggle.data.competition import Pair, submission_problems, write_submission
 from mkpc_kaggle.data.outputs import remove_unfinished, replacing
-from mkpc_kaggle.engine import console
+from mkpc_kaggle.engine.console import LOG_NAME, EventKind, leave, logger
 from mkpc_kaggle.engine.loop import Engine
 from mkpc_kaggle.engine.plan.budget import Budget
 from mkpc_kaggle.engine.plan.state import State
 from mkpc_kaggle.engine.request import Request, RunReport
 from mkpc_kaggle.engine.store.database import Store
 from mkpc_kaggle.engine.store.keys import Keys
-from mkpc_kaggle.engine.store.tables import About, EventKind
+from mkpc_kaggle.engine.store.tables import About
 from mkpc_kaggle.engine.workers.cluster import RaySite
 from mkpc_kaggle.engine.workers.places import LISTEN_S, LocalSite
 from mkpc_kaggle.errors import UserError, writing
@@ -36,7 +36,7 @@ from mkpc_kaggle.recipe import PINHOLES, CameraModel, Recipe
 from mkpc_kaggle.setup.assembly import Assembly
 from mkpc_kaggle.version import __version__
 
-LOG_NAME = "workers.log"  # in the work directory, for the output of native libraries
+WORKERS_LOG = "workers.log"  # in the work directory, for the output of native libraries
 EXIT_S = 0.2  # for the system to end a process
 REPORT_S = 2.0  # for an interrupted program's report; enough for the tables
 
@@ -146,9 +146,9 @@ class Session:
         writer.join(max(EXIT_S, budget.limit - budget.clock() - EXIT_S))
         # Not exit(): its handlers wait for threads, and one of them hangs.
         if trouble:
-            console.logger.error(trouble)
+            logger.error(trouble)
         status = self.status or int(bool(trouble))
-        console.leave(128 + self.interrupt.signal if self.interrupt.signal else status, EXIT_S / 4)
+        leave(128 + self.interrupt.signal if self.interrupt.signal else status, EXIT_S / 4)
 
 
 def submit(
@@ -285,11 +285,12 @@ def opened_engine(
     budget = session.budget
     workers = session.workers
     with Store.open(session.work_dir, fresh=session.fresh) as store:
-        log = session.work_dir / LOG_NAME
+        log = session.work_dir / WORKERS_LOG
         # The summary names the file if this run wrote to it.
         with suppress(OSError):
             log.unlink(missing_ok=True)
-        console.log_native(log)
+            if session.fresh:
+                (session.work_dir / LOG_NAME).unlink(missing_ok=True)
         engine = Engine(
             RaySite(assembly, workers, budget.clock, folders, log)
             if isinstance(workers, str)

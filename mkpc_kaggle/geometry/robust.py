@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from mkpc_kaggle.config import POSITIVE, Range, check_ranges
@@ -294,10 +294,19 @@ def is_fundamental(F: Any, max_third: float = MAX_THIRD) -> bool:
     """
     if not isinstance(F, np.ndarray) or F.shape != (3, 3) or F.dtype.kind != "f":
         return False
-    if not np.isfinite(F).all():
-        return False
-    first, second, third = np.linalg.svd(F, compute_uv=False)
-    return bool(second > MIN_SECOND * first and third < max_third * second)
+    return bool(are_models(F[None], max_third)[0])
+
+
+def are_models(
+    matrices: NDArray[np.float64], max_third: ArrayLike = MAX_THIRD
+) -> NDArray[np.bool_]:
+    """Return which of the matrices (N, 3, 3) are finite and of rank 2; ``max_third`` is one number or (N,)."""
+    finite = np.isfinite(matrices).all((1, 2))
+    known = matrices.copy()
+    known[~finite] = 0
+    first, second, third = np.linalg.svd(known, compute_uv=False).T
+    is_rank_2 = (second > MIN_SECOND * first) & (third < np.asarray(max_third) * second)
+    return np.asarray(finite & is_rank_2)
 
 
 @dataclass(frozen=True, eq=False)

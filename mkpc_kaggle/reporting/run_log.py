@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mkpc_kaggle.data.outputs import replacing, require_table
+from mkpc_kaggle.engine.console import Event, EventKind, read_events
 from mkpc_kaggle.engine.store.database import Store
 from mkpc_kaggle.engine.store.dataframes import (
     NOT_REACHED,
     PairTables,
     by_pair,
-    events_of,
     pair_tables,
 )
 from mkpc_kaggle.engine.store.image_files import stored_digests
@@ -21,8 +21,6 @@ from mkpc_kaggle.engine.store.published import Published
 from mkpc_kaggle.engine.store.tables import (
     MIN_PAIRS,
     About,
-    Event,
-    EventKind,
     SceneRecord,
     unmatched_scene,
 )
@@ -47,7 +45,7 @@ class RunLog:
     about: About
     recipe: Recipe
     tables: PairTables
-    events: Sequence[Event]  # of all sessions
+    events: Sequence[Event]  # of the last session
     # The matched pairs with the fewest inliers, by their number in the tables
     weakest: Sequence[tuple[int, PairMatch]] = ()
     scenes: Sequence[SceneRecord] = ()
@@ -61,7 +59,6 @@ class RunLog:
     @property
     def ending(self) -> str:
         """The ending of the last session."""
-        # Only the last event counts: a resumed run has the ends of former sessions.
         ends = (event.text for event in self.events[-1:] if event.kind == EventKind.END)
         return next(ends, "not ended (at work, or killed)")
 
@@ -73,14 +70,6 @@ class RunLog:
     @property
     def faults(self) -> list[str]:
         return [text for _, text in self.of_kind(EventKind.FAULT)]
-
-    @property
-    def last_session(self) -> Sequence[Event]:
-        """The events since the run was begun or resumed for the last time."""
-        starts = [
-            number for number, event in enumerate(self.events) if event.kind == EventKind.START
-        ]
-        return self.events[starts[-1] :] if starts else self.events
 
     def of_kind(self, kind: str) -> list[tuple[str, str]]:
         """Return the time and the text of each event of a kind."""
@@ -123,7 +112,7 @@ def read_log(directory: Path) -> RunLog:
         if recipe.scene is not None:
             present = {scene.batch for scene in scenes}
             scenes += [each for each in unmatched(tables.pairs) if each.batch not in present]
-        events = store.all(Event)
+        events = read_events(directory)
         digests = stored_digests(store, published.image_names)
         store.warn_of_damage()
     about = published.run.about
@@ -177,20 +166,17 @@ def unmatched(pairs: "DataFrame") -> list[SceneRecord]:
 
 
 def write_csv(directory: Path, out: Path) -> list[Path]:
-    """Write the tables pairs.csv, units.csv, regions.csv and events.csv of a work directory to
-    ``out``. Return their paths.
+    """Write the tables pairs.csv, units.csv and regions.csv of a work directory to ``out``. Return their paths.
 
     An existing file is replaced only if it is a table with the same columns. Otherwise, and if a
     table cannot be written, raises :class:`UserError`.
     """
     with Store.read(directory) as store:
         tables = pair_tables(store)
-        events = events_of(store)
     frames = {
         "pairs": tables.pairs,
         "units": tables.units,
         "regions": tables.regions,
-        "events": events,
     }
     with writing(f"--csv {out}"):
         out.mkdir(parents=True, exist_ok=True)

@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mkpc_kaggle.data.outputs import replacing
+from mkpc_kaggle.engine.console import EventKind
 from mkpc_kaggle.engine.store.json_values import to_text
-from mkpc_kaggle.engine.store.tables import MIN_PAIRS, EventKind, SceneRecord
+from mkpc_kaggle.engine.store.tables import MIN_PAIRS, SceneRecord
 from mkpc_kaggle.errors import UserError, plural, printable, writing
 from mkpc_kaggle.reporting.contradictions import contradictions, file_labels, has_moved, named
 from mkpc_kaggle.reporting.run_log import RunLog
@@ -223,7 +224,7 @@ def causes_of(batch: str, log: RunLog) -> list[str]:
     """Return why images of a batch have no camera, as the last session has found in their files."""
     prefix = f"{batch}: "
     # The files of an earlier session may have been corrected since.
-    faults = [event.text for event in log.last_session if event.kind == EventKind.FAULT]
+    faults = [event.text for event in log.events if event.kind == EventKind.FAULT]
     return [fault.removeprefix(prefix) for fault in faults if fault.startswith(prefix)]
 
 

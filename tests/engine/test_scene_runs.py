@@ -230,21 +230,3 @@ def test_a_resumed_run_reconstructs_only_the_batch_whose_image_was_replaced(
     has_failed = {scene.batch: bool(scene.failure) for scene in again.scenes}
     assert has_failed == {"one": True, "two": False}
     assert matrices(again) == own_matrices(pairs, tmp_path / "alone")
-
-
-def test_a_model_with_a_number_that_is_not_finite_costs_its_scene_alone(tmp_path, monkeypatch):
-    def with_a_wrong_error(job: SceneJob) -> Solution:
-        found = choose_scene_for_all_but_the_first(job)
-        (reconstruction,) = found.reconstructions
-        (model,) = reconstruction.models
-        wrong = replace(model, reprojection_error=np.nan)
-        return replace(found, reconstructions=(replace(reconstruction, models=(wrong,)),))
-
-    scenes_by(monkeypatch, with_a_wrong_error)
-    pairs = batch_pairs(tmp_path / "images")
-    report = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
-    assert report.ending is Ending.WITH_FAILURES
-    assert "the worker gave a wrong answer: no number of seconds: 'nan'" in report.faults[-1]
-    assert sources(report) == ["pair"] * 6
-    scenes_by(monkeypatch, choose_scene_for_all_but_the_first)
-    assert run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work").faults == ()

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from rectified import THREE_UNITS, RectifiedMatcher, matrices, run
-from simulator import VirtualClock, memory_store
+from simulator import VirtualClock
 from store_room import (
     Room,
     matches_in,
@@ -245,10 +245,10 @@ def test_a_directory_that_is_moved_during_a_run_costs_no_result(
     assert (again.units_run, again.estimated, again.faults) == (0, 0, ())
 
 
-def test_the_lists_of_faults_and_decisions_end_at_a_number(monkeypatch):
+def test_the_lists_of_faults_and_decisions_end_at_a_number(tmp_path, monkeypatch):
     monkeypatch.setattr(engine_run, "MAX_FAULTS", 3)
     monkeypatch.setattr(engine_run, "MAX_PLANS", 3)
-    log = EventLog(memory_store(), Budget(0.0, clock=VirtualClock()))
+    log = EventLog(tmp_path, Budget(0.0, clock=VirtualClock()))
     for number in range(10):
         log.fault(f"fault {number}")
         log.explain(f"decision {number}")

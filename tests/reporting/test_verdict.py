@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 from run_tables import Described, tables_of
 
+from mkpc_kaggle.engine.console import Event, EventKind
 from mkpc_kaggle.engine.request import Ending
-from mkpc_kaggle.engine.store.tables import NO_CAMERAS, About, Event, EventKind, SceneRecord
+from mkpc_kaggle.engine.store.tables import NO_CAMERAS, About, SceneRecord
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.intrinsics import KnownCamera
@@ -73,8 +74,8 @@ def log(
     ending: str = Ending.COMPLETE,
     faults: tuple[str, ...] = (),
 ) -> RunLog:
-    events = [Event(EventKind.FAULT, 1.0, text) for text in faults]
-    events.append(Event(EventKind.END, 2.0, str(ending)))
+    events = [Event(1.0, EventKind.FAULT, text) for text in faults]
+    events.append(Event(2.0, EventKind.END, str(ending)))
     recipe = Recipe((Unit(1, "sift", 640),))
     return RunLog(Path("journal"), About(), recipe, tables_of(*pairs), tuple(events), (), scenes)
 

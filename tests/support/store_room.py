@@ -84,8 +84,10 @@ class Room:
         names = [name for names in self.state.names for name in names]
         restore(self.state, self.store, stored_digests(self.store, names))
         budget = Budget(0.0)
-        log = EventLog(self.store, budget)
-        self.run = Run(self.state, self.store, Costs(), budget, log, Progress(budget, None))
+        log = EventLog(self.store.directory, budget)
+        self.run = Run(
+            self.state, self.store, Costs(), budget, log, Progress(budget, is_shown=False)
+        )
         self.publication = Publication(self.state, self.store, budget, log)
 
     def match(self, index: int, *units: Unit, digest: str = "") -> None:

@@ -21,7 +21,12 @@ from mkpc_kaggle.engine.store.image_files import contents_of
 from mkpc_kaggle.engine.store.keys import Images, of_camera_estimate
 from mkpc_kaggle.engine.store.tables import PairEstimate, SceneRecord, UnitPoints
 from mkpc_kaggle.geometry.coordinates import Matrix3
-from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
+from mkpc_kaggle.geometry.robust import (
+    FALLBACK_FUNDAMENTAL,
+    MAX_THIRD,
+    MAX_THIRD_OF_E,
+    are_models,
+)
 from mkpc_kaggle.scene.candidates import ALL_UNITS, candidates_of
 from mkpc_kaggle.scene.view_graph import BatchImage
 
@@ -71,6 +76,9 @@ class State:
         self.tries = Tries()
         self._start_pairs(len(self.pairs), len(self.units))
         self._start_batches()
+        # An E has a third singular value of rounding alone.
+        is_f = [pair.intrinsics is None for pair in self.pairs]
+        self.max_third = np.where(is_f, MAX_THIRD, MAX_THIRD_OF_E)
         self._pairs_of: dict[str, list[int]] = {}  # by the name of an image
         for index, names in enumerate(self.names):
             for name in dict.fromkeys(names):
@@ -162,7 +170,6 @@ class State:
         - "fallback": a fixed matrix.
         """
         sources, written = self._written
-        # The last gate of the submission: the competition refuses a whole file for one matrix.
         written[sources == FALLBACK] = FALLBACK_FUNDAMENTAL
         return written[self.pair_of_row]
 
@@ -184,8 +191,8 @@ class State:
         stands_in = self.stands_in
         sources[stands_in] = EARLIER
         written[stands_in] = self.earlier[stands_in]
-        is_usable = np.isfinite(written).all((1, 2)) & written.any((1, 2))
-        sources[~is_usable] = FALLBACK
+        # The last gate of the submission: the competition refuses a whole file for one matrix.
+        sources[~are_models(written, self.max_third)] = FALLBACK
         return sources[: self.rows], written[: self.rows]
 
     @property

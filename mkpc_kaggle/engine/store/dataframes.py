@@ -20,7 +20,6 @@ from mkpc_kaggle.engine.store.sqlite_file import connected
 from mkpc_kaggle.engine.store.tables import (
     LAYOUTS,
     SCHEMA,
-    Event,
     ImageFile,
     PairEstimate,
     PublishedPair,
@@ -239,10 +238,6 @@ CAMERAS = Query(
     """,
 )
 SIGMAS = ["rotation_sigma", "centre_sigma", "focal_sigma"]
-EVENTS = Query(
-    {"kind": (str, "kind"), "seconds": (float, "seconds"), "text": (str, "text")},
-    "FROM event ORDER BY rowid",
-)
 
 
 class Results(NamedTuple):
@@ -300,12 +295,6 @@ def tables_in(database: sqlite3.Connection) -> PairTables:
         REGIONS.frame(database),
         _estimates(database),
     )
-
-
-def events_of(store: Store) -> "DataFrame":
-    """Return all events of all sessions, in order."""
-    with database_of({Event: store.facts(Event)}) as database:
-        return EVENTS.frame(database)
 
 
 @contextmanager

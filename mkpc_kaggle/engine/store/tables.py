@@ -8,8 +8,6 @@ another format are refused.
 import zlib
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from enum import StrEnum
-from secrets import token_hex
 from typing import Any
 
 import numpy as np
@@ -19,7 +17,6 @@ from mkpc_kaggle.engine.store.layout import Layout, layout_of
 from mkpc_kaggle.geometry.coordinates import Matrix3
 from mkpc_kaggle.geometry.critical_region import CriticalRegion
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
-from mkpc_kaggle.progress import format_duration
 from mkpc_kaggle.scene.candidates import ALL_UNITS
 from mkpc_kaggle.scene.choose import Choice
 from mkpc_kaggle.scene.models import Reconstruction, SfmModel, models_of
@@ -287,30 +284,6 @@ class PublishedPair:
     unestimated: str = ""
 
 
-class EventKind(StrEnum):
-    """Kinds of events."""
-
-    START = "start"  # the program began or resumed the run
-    PLAN = "plan"  # a decision, with its reason
-    SCENE = "scene"  # a batch was reconstructed; the text states its registered part
-    FAULT = "fault"
-    END = "end"  # the run ended; the text states the ending
-
-
-@dataclass(frozen=True)
-class Event:
-    """An event ``seconds`` after the start of the program; ``kind`` is an :class:`EventKind`."""
-
-    kind: str
-    seconds: float
-    text: str
-    # Random, since several programs may write events of the same second to one store
-    name: str = field(default_factory=lambda: token_hex(8), compare=False)
-
-    def __str__(self) -> str:
-        return f"{format_duration(self.seconds):>7}  {self.text}"
-
-
 LAYOUTS: dict[Any, Layout[Any]] = {
     kind: layout_of(kind, table, key)
     for kind, table, key in (
@@ -323,7 +296,6 @@ LAYOUTS: dict[Any, Layout[Any]] = {
         (Export, "export", "batch"),
         (PublishedRun, "run", "name"),
         (PublishedPair, "pair", "number"),
-        (Event, "event", "name"),
     )
 }
 SCHEMA = ";\n".join(layout.sql for layout in LAYOUTS.values()) + ";"

@@ -17,7 +17,6 @@ from pathlib import Path
 from mkpc_kaggle.cores import available_cores
 from mkpc_kaggle.engine.jobs import Answer, Cause, Failure, Job, Loaded
 from mkpc_kaggle.engine.plan.blame import MAX_LOSSES, Item, different
-from mkpc_kaggle.engine.workers.answers import wrong_answer
 from mkpc_kaggle.engine.workers.process import ProcessWorker, ThreadWorker
 from mkpc_kaggle.engine.workers.worker import Maker, MatchRunner, estimates_runner, scene_runner
 from mkpc_kaggle.pipeline.stages import Pipeline
@@ -96,10 +95,6 @@ class Place:
             return None
         # An answer counts even after the limit: its work is done.
         answer = self.worker.answer()
-        if answer is not None:
-            job = self.job if self.is_loaded else None
-            if reason := wrong_answer(job, answer):
-                answer = Failure(Cause.WRONG, reason)
         if answer is None and now >= self.limit:
             answer = Failure(Cause.TIMED_OUT, f"no answer for {now - self.since:.0f} s")
         if answer is None:

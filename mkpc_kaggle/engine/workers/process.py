@@ -24,7 +24,6 @@ from multiprocessing.context import SpawnProcess
 from pathlib import Path
 from typing import cast
 
-from mkpc_kaggle.engine.console import append_to
 from mkpc_kaggle.engine.jobs import Answer, Cause, Failure, Job
 from mkpc_kaggle.engine.workers.worker import Executor, Maker, Message, Runner, failure_of
 
@@ -89,17 +88,11 @@ class ThreadWorker:
                 answer = self._exchange(message)
             except Exception as error:  # out of memory, or no more processes
                 answer = Failure(Cause.NOT_STARTED, str(error))
-            # ``None`` would be taken for no answer yet, and the worker would count as hung.
-            self._answers.put(_not_none(answer))
+            self._answers.put(answer)
             self._on_answer()
 
     def _exchange(self, message: Message) -> Answer:
         return self._executor.answer(message)
-
-
-def _not_none(answer: Answer | None) -> Answer:
-    """Return a failure in place of a runner's ``None``, which would mean that it still computes."""
-    return Failure(Cause.WRONG, "None is no answer") if answer is None else answer
 
 
 class ProcessWorker(ThreadWorker):
@@ -137,6 +130,13 @@ class ProcessWorker(ThreadWorker):
             self._process.kill()
             return failure_of(error)
         return answer
+
+
+def append_to(path: Path | str) -> None:
+    """Let stdout and stderr append to a file. Raise ``OSError`` if it cannot be opened."""
+    file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o666)
+    os.dup2(file, 1)
+    os.dup2(file, 2)
 
 
 def spawn(name: str, log: Path | None = None) -> tuple[SpawnProcess, Connection]:
@@ -185,9 +185,9 @@ def serve(pipe: Connection, log: Path | None = None) -> None:
     """Answer messages in a worker process, one after another; the first is the maker of the runner."""
     # A file never blocks a library that prints, as a pipe without a reader does.
     try:
-        append_to(log or os.devnull, (1, 2))
+        append_to(log or os.devnull)
     except OSError:  # a full disk
-        append_to(os.devnull, (1, 2))
+        append_to(os.devnull)
 
     def make() -> Runner:
         return cast(Maker, pipe.recv())()  # unpickling may raise, which is an answer, too

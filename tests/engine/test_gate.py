@@ -1,0 +1,34 @@
+"""The last gate before the submission: a matrix that is no F costs its own row."""
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+from faulty import runner
+from rectified import THREE_UNITS, RectifiedMatcher, run, sources, write_pairs
+
+from mkpc_kaggle.data.competition import submission_problems
+from mkpc_kaggle.engine.jobs import Estimated, EstimateJob
+from mkpc_kaggle.engine.workers import places
+from mkpc_kaggle.engine.workers.worker import do_estimates_job
+
+
+def estimate_wrongly(F: np.ndarray, job: EstimateJob) -> tuple[Estimated, ...]:
+    first, *others = do_estimates_job(job)
+    return replace(first, F=F), *others
+
+
+@pytest.mark.parametrize(
+    "F",
+    [np.zeros((3, 3)), np.full((3, 3), np.nan), np.full((3, 3), np.inf), np.eye(3)],
+    ids=["zeros", "NaN", "infinite", "rank 3"],
+)
+def test_a_matrix_that_is_no_f_becomes_the_fallback_and_the_file_is_valid(tmp_path, monkeypatch, F):
+    pairs = write_pairs(tmp_path / "images", 1)
+    make = partial(runner, partial(estimate_wrongly, F))
+    monkeypatch.setattr(places, "estimates_runner", lambda **_: make())
+    output = tmp_path / "submission.csv"
+    report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work", output=output)
+    assert sources(report) == ["fallback"]
+    assert submission_problems(output, [pair.id for pair in pairs]) == []
