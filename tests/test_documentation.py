@@ -138,13 +138,13 @@ def test_links_lead_to_files_and_headings_that_exist(page):
 
 
 PYTHON = re.compile(r"^```python\n(.*?)^```", re.M | re.S)
-# The snippets of python.md are run by test_python_page.py, the one of vismatch by test_vismatch.py.
+# Other files run the snippets of python.md, of vismatch and of pycolmap.
 BLOCKS = [
     block
     for page in PAGES
     if page.stem != "python"
     for block in PYTHON.findall(page.read_text("utf-8"))
-    if "import vismatch" not in block
+    if "import vismatch" not in block and "import pycolmap" not in block
 ]
 
 

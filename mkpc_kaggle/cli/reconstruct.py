@@ -36,7 +36,6 @@ from mkpc_kaggle.reconstruction.folder import (
 from mkpc_kaggle.reconstruction.layout import write_layouts
 from mkpc_kaggle.reconstruction.outputs import SUBMISSION_FORMATS, Cameras, write_tables
 from mkpc_kaggle.reconstruction.panoramas import require_perspective
-from mkpc_kaggle.reconstruction.placed import placed_line, read_placed
 from mkpc_kaggle.reconstruction.priors import (
     crops_line,
     intrinsics_line,
@@ -132,9 +131,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         model (COLMAP's: SIMPLE_PINHOLE, OPENCV, ...), parameters (in COLMAP's order, separated by blanks),
         sigma (of the focal length, in percent, or fixed), and optionally size (of the images: 1536x1024)"""
     add("--intrinsics", type=Path, metavar="FILE.csv", help=text)
-    text = """a finished model of COLMAP, such as the folder models/0 in the OUT of another run: its photographs,
-        which DIR has, too, keep these cameras exactly, and the new ones are registered among them"""
-    add("--onto", type=Path, metavar="MODEL", help=text)
     text = "masks named as COLMAP's, MASKS/a.jpg.png for a.jpg; points on black pixels are left out"
     add("--masks", type=Path, metavar="MASKS", help=text)
     add("--fresh", action="store_true", help="delete the journal of an earlier run in OUT/work")
@@ -153,9 +149,8 @@ def run(arguments: argparse.Namespace) -> int:
     known_cameras: Rows = ()
     if arguments.intrinsics is not None:
         known_cameras = read_intrinsics_table(arguments.intrinsics, root, files)
-    placed = () if arguments.onto is None else read_placed(arguments.onto, root, datasets)
     masks = Masks() if arguments.masks is None else Masks.of_folder(arguments.masks, root, files)
-    more = [arguments.pairs, arguments.intrinsics, arguments.masks, arguments.onto]
+    more = [arguments.pairs, arguments.intrinsics, arguments.masks]
     inputs = [root, options.recipe_file(arguments), *more]
     require_directory_apart(out, filter(None, inputs), arguments.weights)
     if arguments.export is not None:
@@ -175,9 +170,8 @@ def run(arguments: argparse.Namespace) -> int:
 
         assembly = options.assembly_of(arguments, arguments.recipe, arguments.mode, interrupt)
         recipe = for_cameras(assembly.recipe, arguments.camera)
-        assembly = replace(assembly, recipe=recipe, masks=masks, cameras=(*placed, *known_cameras))
+        assembly = replace(assembly, recipe=recipe, masks=masks, cameras=known_cameras)
         effects = [*_effects(masks, known_cameras, listed, root, datasets)]
-        effects += [placed_line(placed, arguments.onto, files, root)] if placed else []
         options.say_start(plural(len(files), "image"), assembly, work_dir, effects)
         result = reconstruct_folder(
             root,

@@ -8,7 +8,7 @@ import fnmatch
 import unicodedata
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from math import hypot, isfinite
+from math import isfinite
 from types import MappingProxyType
 
 from mkpc_kaggle.config import decimal
@@ -26,7 +26,6 @@ LENS_MODELS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     }
 )
 FIXED = "fixed"
-MAX_QUATERNION_DEVIATION = 1e-3  # of a norm from 1
 MAX_SIGMA = 100.0  # percent; a wider prior states nothing
 
 
@@ -105,29 +104,6 @@ class KnownCamera:
         return replace(self, parameters=tuple(values))
 
 
-@dataclass(frozen=True)
-class ModelCamera(KnownCamera):
-    """A camera of a finished model: exact, and no row of the user's, who cannot correct it here."""
-
-
-@dataclass(frozen=True)
-class PlacedCamera(ModelCamera):
-    """A camera of a finished model with a pose, which no adjustment may move.
-
-    ``pose`` is COLMAP's: a unit quaternion (x, y, z, w) and t, with X_cam = R X + t.
-    """
-
-    pose: tuple[float, ...] = ()
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if len(self.pose) != 7 or not all(map(isfinite, self.pose)) or self.sigma:
-            raise ValueError("a placed camera is exact, and its pose has seven finite numbers")
-        # Files have rounded ones.
-        if abs(hypot(*self.pose[:4]) - 1) > MAX_QUATERNION_DEVIATION:
-            raise ValueError("the rotation of a placed camera is no unit quaternion")
-
-
 def radial_factor(camera: KnownCamera, radius: float) -> float:
     """Return by how much a lens magnifies a ray at ``radius``, the tangent of its angle with the axis:
     1 without distortion.
@@ -166,22 +142,16 @@ def parse_row(pattern: str, model: str, parameters: str, sigma: str) -> tuple[st
 class CameraTable:
     """Finds the row that names an image, without a look at each row: both may be thousands.
 
-    A row names an image by path, by file name, or by a pattern of these; a placed camera by path alone. The
-    first such row counts.
+    A row names an image by path, by file name, or by a pattern of these. The first such row counts.
     """
 
     def __init__(self, rows: Rows) -> None:
         self.rows = rows
         # The first row with each text
-        self._placed: dict[str, int] = {}
         self._texts: dict[str, int] = {}
         self._patterns: list[tuple[int, str]] = []
-        for number, (written, camera) in enumerate(rows):
+        for number, (written, _) in enumerate(rows):
             text = _composed(written)
-            # Another folder may have a photograph of the same name elsewhere.
-            if isinstance(camera, PlacedCamera):
-                self._placed.setdefault(text, number)
-                continue
             # A file may be called "photo [1].jpg", and as a pattern this is another.
             self._texts.setdefault(text, number)
             if WILD.intersection(text):
@@ -192,7 +162,7 @@ class CameraTable:
         numbers = []
         for path in map(_composed, names):
             base = path.rpartition("/")[2]
-            numbers += [self._placed.get(path), self._texts.get(path), self._texts.get(base)]
+            numbers += [self._texts.get(path), self._texts.get(base)]
             fitting = (
                 number
                 for number, pattern in self._patterns

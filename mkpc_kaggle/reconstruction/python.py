@@ -25,7 +25,6 @@ from mkpc_kaggle.reconstruction.directory import require_directory_apart
 from mkpc_kaggle.reconstruction.folder import read_folder, require_distinct
 from mkpc_kaggle.reconstruction.outputs import PlacedImage
 from mkpc_kaggle.reconstruction.panoramas import require_perspective
-from mkpc_kaggle.reconstruction.placed import read_placed
 from mkpc_kaggle.reconstruction.priors import (
     crops_line,
     has_gaps,
@@ -73,7 +72,6 @@ def reconstruct(
     settings: Mapping[str, Any] = MappingProxyType({}),
     masks: str | Path | None = None,
     intrinsics: str | Path | None = None,
-    onto: str | Path | None = None,
     progress: bool = True,
     work_dir: str | Path | None = None,
 ) -> Models:
@@ -93,9 +91,6 @@ def reconstruct(
         relative to the common directory of the images.
     intrinsics : path, optional
         A table of known cameras, as for the command, whose images have the same paths.
-    onto : path, optional
-        A folder with a finished model of COLMAP, whose images have the same paths: they keep its
-        cameras, and the other images are registered among them.
     progress : bool
         Show the progress on the standard error stream.
     work_dir : path, optional
@@ -146,7 +141,7 @@ def reconstruct(
     require_readable(files)
     require_perspective(files)
     root = Path(os.path.commonpath([file.parent for file in files]))
-    assembly = with_priors(assembly, root, files, masks, intrinsics, onto)
+    assembly = with_priors(assembly, root, files, masks, intrinsics)
     with ExitStack() as closed:
         if work_dir is None:
             work_dir = closed.enter_context(temporary_directory())
@@ -161,7 +156,7 @@ def reconstruct(
             raise UserError(f"{out} was not made here; name another work_dir")
         files_of_recipe = () if isinstance(recipe, Recipe) else (recipe,)
         weight_folders, weight_files = weights_of(weights)
-        given_paths = filter(None, (masks, intrinsics, onto, *files_of_recipe))
+        given_paths = filter(None, (masks, intrinsics, *files_of_recipe))
         inputs = [
             *dict.fromkeys(file.parent for file in files),
             *map(Path, given_paths),
@@ -283,7 +278,6 @@ def with_priors(
     files: Sequence[Path],
     masks: str | Path | None,
     intrinsics: str | Path | None,
-    onto: str | Path | None,
 ) -> Assembly:
     """Return the assembly for cameras, with the user's masks and intrinsics. Raises
     :class:`UserError` if they are unusable.
@@ -297,9 +291,8 @@ def with_priors(
         logger.warning(intrinsics_line(cameras, root, files))
     if line := crops_line(cameras, root, files):
         logger.warning(line)
-    placed = () if onto is None else read_placed(Path(onto), root, {".": files})
     recipe = for_cameras(assembly.recipe)
-    return replace(assembly, recipe=recipe, masks=given, cameras=(*placed, *cameras))
+    return replace(assembly, recipe=recipe, masks=given, cameras=cameras)
 
 
 def complete_model(model: SfmModel, folder: Path, names: Mapping[str, str]) -> SfmModel:

@@ -26,12 +26,6 @@ def contradictions(scene: SceneRecord) -> Iterator[str]:
         return
     labels = labels_of(scene)
     for model in scene.models:
-        if model.comparison.misplaced:
-            names = named([labels.get(name, name) for name in model.comparison.misplaced])
-            yield (
-                f"matches contradict the cameras of {names} in the model of --onto, so these count as new "
-                "photographs: probably other pictures have their names"
-            )
         for focal in model.comparison.focals:
             yield _focal_sentence(focal, labels)
         for distortion in model.comparison.distortions:

@@ -42,7 +42,6 @@ from mkpc_kaggle.scene.models import (
     HARDLY_MOVED,
     MAX_CENTRE_SIGMA,
     MAX_SIGMA_IMAGES,
-    OTHER_PICTURES,
     RegisteredImage,
     SfmModel,
 )
@@ -138,9 +137,6 @@ def _scene_problems(scene: SceneRecord, log: RunLog) -> Iterator[str]:
     if HARDLY_MOVED in scene.failure:
         # More photographs from there would not help.
         yield f"{where}no cameras: {HARDLY_MOVED}"
-        return
-    if OTHER_PICTURES in scene.failure:
-        yield f"{where}no cameras: {OTHER_PICTURES}"
         return
     causes = causes_of(scene.batch, log)
     if not scene.models:

@@ -8,13 +8,13 @@ A prior is the mean of the mapper's focal length and the user's, weighted by the
 bundle adjustment had one more measurement. These cameras are then held, and the rest is refined.
 """
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import pycolmap
 
-from mkpc_kaggle.geometry.intrinsics import KnownCamera, PlacedCamera
+from mkpc_kaggle.geometry.intrinsics import KnownCamera
 from mkpc_kaggle.scene.uncertainty import camera_sigmas
 
 # Limits for a point that two images see, close to COLMAP's incremental mapper's for any point (4 pixels,
@@ -23,70 +23,36 @@ MAX_TWO_VIEW_ERROR_PX = 4.0
 MIN_TWO_VIEW_ANGLE_DEG = 2.0
 FINAL_ADJUSTMENT_ITERATIONS = 100
 CONVERGED = 1e-6  # relative change of the cost
-MAX_ROUNDINGS = 60  # of 50,000 random quaternions, all but one stay after 8
 
 
 def adjust(model: Any, cameras: Mapping[str, KnownCamera]) -> None:
     """Set the cameras that the user knows in pycolmap's model; refine poses, points and other cameras
     by all tracks.
 
-    ``cameras`` is by image name; each of these images has its own camera. Placed ones keep their poses.
+    ``cameras`` is by image name; each of these images has its own camera.
     """
     remove_uncertain_points(model)
-    placed = [
+    given = [
         image
         for _, image in sorted(model.images.items())
         if image.has_pose and image.name in cameras
     ]
     # Computed without the user's knowledge, so that the two can be weighed
-    sigmas = camera_sigmas(model) if placed else {}
-    for image in placed:
+    sigmas = camera_sigmas(model) if given else {}
+    for image in given:
         # Bundle adjustment does not determine this focal length: the user's counts alone.
         sigma = sigmas[image.name].focal if image.name in sigmas else np.inf
         set_camera(model.cameras[image.camera_id], cameras[image.name], sigma)
     config = pycolmap.BundleAdjustmentConfig()
     for number in sorted(model.reg_image_ids()):
         config.add_image(number)
-    for image in placed:
+    for image in given:
         config.set_constant_cam_intrinsics(image.camera_id)
-    held = [image for image in placed if isinstance(cameras[image.name], PlacedCamera)]
-    for image in held:
-        config.set_constant_rig_from_world_pose(image.frame_id)
-    # Cameras that are held fix the world.
-    if not held:
-        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     options = robust_options()
     adjuster: Any = pycolmap.create_default_ceres_bundle_adjuster(options, config, model)
     adjuster.solve()
     model.update_point_3d_errors()
-
-
-def settle_rotations(model: Any, held: Collection[str] = ()) -> None:
-    """Change the last digits of quaternions so that normalising them changes nothing. Images ``held``, by
-    name, keep theirs.
-
-    The incremental mapper normalises them. So the cameras of a finished model stay bit for bit in the
-    next one.
-    """
-    for _, image in sorted(model.images.items()):
-        if image.has_pose and image.name not in held:
-            frame = model.frames[image.frame_id]
-            pose = frame.rig_from_world
-            frame.rig_from_world = pycolmap.Rigid3d(_settled(pose.rotation), pose.translation)
-
-
-def _settled(rotation: Any) -> Any:
-    settled = pycolmap.Rotation3d(rotation.quat)
-    for trial in range(MAX_ROUNDINGS):
-        before = settled.quat.copy()
-        settled.normalize()
-        if np.array_equal(settled.quat, before):
-            break
-        # Some quaternions alternate between two roundings: a neighbour may stay.
-        changed = settled.quat.copy()
-        changed[trial % 4] = np.nextafter(changed[trial % 4], 0)
-        settled = pycolmap.Rotation3d(changed if trial > 1 else settled.quat)
-    return settled
 
 
 def robust_options() -> Any:

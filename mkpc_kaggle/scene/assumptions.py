@@ -18,7 +18,7 @@ from math import inf
 import numpy as np
 
 from mkpc_kaggle.geometry.coordinates import Size
-from mkpc_kaggle.geometry.intrinsics import KnownCamera, PlacedCamera
+from mkpc_kaggle.geometry.intrinsics import KnownCamera
 from mkpc_kaggle.recipe import CameraSharing, SceneConfig
 from mkpc_kaggle.scene.keypoints import MergedGraph
 from mkpc_kaggle.scene.mapper import Make, Mapped, loses_points
@@ -72,16 +72,6 @@ def doubts_exif(graph: ViewGraph, reconstruction: Reconstruction) -> bool:
         and abs(np.log(registered.focal / registered.image.focal)) > MAX_EXIF_LOG_DEVIATION
     ]
     return bool(contradicting) and reconstruction.registered < matched
-
-
-def placed_lenses(graph: ViewGraph) -> dict[str, KnownCamera]:
-    """Return the distorted lens of a finished model for its new images of the same size, by digest."""
-    lenses: dict[Size, KnownCamera] = {}
-    for image in graph.images:
-        camera = graph.known.get(image.digest)
-        if isinstance(camera, PlacedCamera) and any(camera.distortion):
-            lenses.setdefault(image.size, KnownCamera(camera.model, camera.parameters))
-    return {image.digest: lenses[image.size] for image in graph.free if image.size in lenses}
 
 
 def with_lenses(

@@ -9,7 +9,6 @@ Source: Pan et al. 2024 (the global mapper).
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -21,7 +20,6 @@ from numpy.typing import NDArray
 from mkpc_kaggle.cores import available_cores
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import COLMAP_CENTRE_PX, Matrix3
-from mkpc_kaggle.geometry.intrinsics import PlacedCamera
 from mkpc_kaggle.recipe import CameraModel, SceneConfig
 from mkpc_kaggle.scene.adjustment import adjust
 from mkpc_kaggle.scene.edges import supported
@@ -38,14 +36,12 @@ from mkpc_kaggle.scene.export import (
 from mkpc_kaggle.scene.keypoints import Lens, MergedGraph
 from mkpc_kaggle.scene.models import (
     MIN_IMAGES,
-    OTHER_PICTURES,
     Reconstruction,
     RegisteredImage,
     SfmModel,
     filter_models,
     lens_of,
 )
-from mkpc_kaggle.scene.placement import misplaced_images
 from mkpc_kaggle.scene.uncertainty import camera_sigmas
 from mkpc_kaggle.scene.view_graph import (
     MIN_MATCHES,
@@ -53,7 +49,6 @@ from mkpc_kaggle.scene.view_graph import (
     SharedIntrinsics,
     ViewGraph,
     known_by_name,
-    placed_by_name,
 )
 
 # Of a verified match; 1 px loses accuracy on tourist photographs, 4 px on repeated windows
@@ -83,7 +78,7 @@ def structure_from_motion(
     Each image has its own camera, except images with ``shared`` intrinsics. The initial focal
     length is the shared one, the user's or EXIF's. All focal lengths are refined, unless the user
     knows them exactly. With ``former`` models of the same graph, their poses are refined instead of
-    computed again. Placed cameras stay, and the other images are registered among them.
+    computed again.
     """
     # Its warnings about single images would fill the log.
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
@@ -91,11 +86,6 @@ def structure_from_motion(
     with pycolmap.Database.open(":memory:") as database:
         # The refinement reads the verified matches alone; the mapper reads relative poses, too.
         _fill(database, merged, shared, config, reuse=bool(former))
-        if placed_by_name(merged.graph):
-            model, graph = register_onto(database, merged.graph, config.threads)
-            if not placed_by_name(graph):
-                return Reconstruction(graph.names, failure=OTHER_PICTURES)
-            return _reconstruction([model], graph, config)
         if former:
             models = refine_models(database, merged.graph, config.threads, former)
         else:
@@ -349,134 +339,23 @@ def _refine(cache: Any, former: Any, settings: Any) -> Any:
     for number in filter(model.exists_frame, sorted(former.reg_frame_ids())):
         model.frame(number).rig_from_world = former.frame(number).rig_from_world
         model.register_frame(number)
-    options = _incremental_options(settings)
-    mapper = _mapper_of(cache, model, settings)
-    _refine_all(mapper, options, settings)
+    mapper = pycolmap.IncrementalMapper(cache)
+    mapper.begin_reconstruction(model)
+    for image in sorted(model.reg_image_ids()):
+        mapper.triangulate_image(settings.retriangulation, image)
+    options = pycolmap.IncrementalMapperOptions(
+        {"random_seed": SEED, "num_threads": settings.num_threads}
+    )
+    # Adjust cameras and points in turn with the choice of points, until the model has converged
+    mapper.iterative_global_refinement(
+        MAX_REFINEMENTS, MIN_CHANGE, options, _least_squares(settings), settings.retriangulation
+    )
+    _filter_points(mapper.observation_manager, model, settings)
     mapper.adjust_global_bundle(options, settings.bundle_adjustment)
     _filter_points(mapper.observation_manager, model, settings)
     mapper.end_reconstruction(False)
     model.update_point_3d_errors()
     return model
-
-
-def register_onto(database: Any, graph: ViewGraph, threads: int) -> tuple[Any, ViewGraph]:
-    """Return pycolmap's model of a filled database with the placed cameras as they are, and with the
-    images that the incremental mapper registers among them.
-
-    An image whose matches contradict its placed camera is registered as a new one. In the returned
-    graph, it has no placed camera.
-    """
-    # Cameras of the model stay, also of images without verified matches.
-    cache_options = {"min_num_matches": MIN_MATCHES, "load_all_images": True}
-    cache = pycolmap.DatabaseCache.create(database, pycolmap.DatabaseCacheOptions(cache_options))
-    settings = _mapper_options(graph, threads)
-    model, numbers = _placed_model(cache, graph)
-    misplaced = misplaced_images(model, cache.correspondence_graph, numbers)
-    if misplaced:
-        wrong = {graph.images[number - 1].digest for number in misplaced}
-        right = {digest: camera for digest, camera in graph.known.items() if digest not in wrong}
-        graph = replace(graph, known=right)
-        model, numbers = _placed_model(cache, graph)
-    held = {model.images[number].camera_id for number in numbers}
-    for number, image in enumerate(graph.images, start=1):
-        if number in numbers:
-            continue
-        camera_id = model.images[number].camera_id
-        if image.digest in graph.known:
-            if not graph.known[image.digest].sigma:
-                held.add(camera_id)
-        elif not image.focal and image.digest not in graph.lenses:
-            # The points that it sees determine its focal length better than a guess.
-            model.cameras[camera_id].has_prior_focal_length = False
-    options = _incremental_options(settings)
-    options.fix_existing_frames = True
-    options.constant_cameras = held
-    mapper = _mapper_of(cache, model, settings)
-    # The best image first; each one adds points for the next.
-    while True:
-        candidates = mapper.find_next_images(options, False)
-        new = next(
-            (number for number in candidates if mapper.register_next_image(options, number)), None
-        )
-        if new is None:
-            break
-        mapper.triangulate_image(settings.retriangulation, new)
-        mapper.adjust_global_bundle(options, _least_squares(settings))
-    _refine_all(mapper, options, settings)
-    mapper.end_reconstruction(False)
-    model.update_point_3d_errors()
-    return model, graph
-
-
-def _placed_model(cache: Any, graph: ViewGraph) -> tuple[Any, list[int]]:
-    """Return pycolmap's model with the poses of placed cameras, without points, and the numbers of
-    their images.
-    """
-    placed = placed_by_name(graph)
-    model = pycolmap.Reconstruction()
-    model.load(cache)
-    numbers = []
-    for number, image in enumerate(graph.images, start=1):
-        if image.name in placed:
-            model.frame(number).rig_from_world = _rigid(placed[image.name])
-            model.register_frame(number)
-            numbers.append(number)
-    return model, numbers
-
-
-def _rigid(camera: PlacedCamera) -> Any:
-    x, y, z, w, *t = camera.pose
-    return pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([x, y, z, w])), np.array(t))
-
-
-def moved_back(model: SfmModel, graph: ViewGraph, origin: NDArray[np.float64]) -> SfmModel:
-    """Return a model of the :func:`mkpc_kaggle.scene.placement.centred` graph in the world of the ``graph``,
-    whose placed cameras it has to the last digit. pycolmap's model is changed in place.
-    """
-    model.colmap.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), origin))
-    placed = placed_by_name(graph)
-    for name in model.comparison.misplaced:
-        del placed[name]
-    poses = {}
-    for image in model.colmap.images.values():
-        if image.name in placed:
-            model.colmap.frames[image.frame_id].rig_from_world = _rigid(placed[image.name])
-        if image.has_pose:
-            poses[image.name] = np.asarray(image.cam_from_world().matrix())
-    images = tuple(
-        replace(found, camera=_posed(found.camera.K, poses[found.image.name]))
-        for found in model.images
-    )
-    return replace(model, images=images, points=model.points + origin)
-
-
-def _mapper_of(cache: Any, model: Any, settings: Any) -> Any:
-    """Return an incremental mapper that continues a model, with the points of its images."""
-    mapper = pycolmap.IncrementalMapper(cache)
-    mapper.begin_reconstruction(model)
-    for image in sorted(model.reg_image_ids()):
-        mapper.triangulate_image(settings.retriangulation, image)
-    return mapper
-
-
-def _refine_all(mapper: Any, options: Any, settings: Any) -> None:
-    """Adjust cameras and points in turn with the choice of points, until a model has converged."""
-    mapper.iterative_global_refinement(
-        MAX_REFINEMENTS,
-        MIN_CHANGE,
-        options,
-        _least_squares(settings),
-        settings.retriangulation,
-        # Cameras that are held fix the world.
-        normalize_reconstruction=not options.fix_existing_frames,
-    )
-    _filter_points(mapper.observation_manager, mapper.reconstruction, settings)
-
-
-def _incremental_options(settings: Any) -> Any:
-    return pycolmap.IncrementalMapperOptions(
-        {"random_seed": SEED, "num_threads": settings.num_threads}
-    )
 
 
 def _least_squares(settings: Any) -> Any:
@@ -508,7 +387,7 @@ def _reconstruction(mapped: Sequence[Any], graph: ViewGraph, config: SceneConfig
         for model in mapped:
             adjust(model, given_cameras)
     found = [_sfm_model(model, graph) for model in mapped]
-    models = filter_models(found, placed_by_name(graph).keys())
+    models = filter_models(found)
     return Reconstruction(
         graph.names, models, "" if models else "the matches gave no plausible model"
     )

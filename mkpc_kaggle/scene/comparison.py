@@ -18,12 +18,7 @@ import numpy as np
 import pycolmap
 
 from mkpc_kaggle.geometry.coordinates import Size
-from mkpc_kaggle.geometry.intrinsics import (
-    KnownCamera,
-    ModelCamera,
-    PlacedCamera,
-    displacement_of,
-)
+from mkpc_kaggle.geometry.intrinsics import KnownCamera, displacement_of
 from mkpc_kaggle.scene.adjustment import robust_options
 from mkpc_kaggle.scene.covariance import Covariance, covariance_of
 from mkpc_kaggle.scene.models import (
@@ -39,7 +34,6 @@ from mkpc_kaggle.scene.models import (
     SfmModel,
     lens_of,
 )
-from mkpc_kaggle.scene.placement import is_at
 
 COLMAP_PINHOLES = (pycolmap.CameraModelId.SIMPLE_PINHOLE, pycolmap.CameraModelId.PINHOLE)
 MAX_ASPECT_RATIO = 1.02  # of two focal lengths; a radial coefficient needs a common one
@@ -147,8 +141,7 @@ def compare_with_photographs(
     shared = () if lenses else tuple(_shared_focals(model))
     focals = (*given, *shared, *_exif_focals(determined, given_cameras))
     distortions = tuple(_given_distortions(noise, determined, given_cameras))
-    misplaced = tuple(_misplaced(model, given_cameras))
-    return Comparison(focals, lenses, distortions, misplaced=misplaced)
+    return Comparison(focals, lenses, distortions)
 
 
 def _thin(copy: Any) -> None:
@@ -183,8 +176,6 @@ def _given_focals(
 ) -> Iterable[FocalContradiction]:
     """Yield the user's cameras with a focal length that the photographs contradict."""
     for camera in dict.fromkeys(given_cameras.values()):
-        if isinstance(camera, ModelCamera):
-            continue
         alike = [
             freed_image
             for freed_image in freed
@@ -247,7 +238,7 @@ def _given_distortions(
 ) -> Iterable[DistortionContradiction]:
     """Yield the user's cameras with a distortion that the photographs contradict."""
     for camera in dict.fromkeys(given_cameras.values()):
-        if isinstance(camera, ModelCamera) or not any(camera.distortion):
+        if not any(camera.distortion):
             continue
         alike = [each for each in freed if given_cameras.get(each.registered.image.name) == camera]
         if len(alike) < MIN_LENS_IMAGES:
@@ -313,16 +304,6 @@ def own_focal(colmap: Any, image: Any) -> float:
         image.cam_from_world(), points2D, points3D, np.ones(len(seen), bool), camera, options
     )
     return float(camera.mean_focal_length()) if refined is not None else focal
-
-
-def _misplaced(model: SfmModel, given_cameras: Mapping[str, KnownCamera]) -> Iterable[str]:
-    """Yield the images whose cameras of a finished model were not kept."""
-    cameras = {registered.image.name: registered.camera for registered in model.images}
-    for name, given in given_cameras.items():
-        if not isinstance(given, PlacedCamera):
-            continue
-        if name not in cameras or not is_at(cameras[name], given):
-            yield name
 
 
 def _exif_focals(

@@ -1,6 +1,6 @@
 """Results of a reconstruction: cameras and points, without implausible cameras."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Any, NamedTuple
@@ -29,11 +29,6 @@ MIN_DISPLACEMENT = 0.005
 # The reason for missing and for doubtful cameras
 HARDLY_MOVED = (
     "the camera hardly moved: nothing can be triangulated; step aside between photographs"
-)
-# The reason if no photograph fits its camera in a finished model
-OTHER_PICTURES = (
-    "the photographs contradict all cameras of the model of --onto; "
-    "give the model of these photographs"
 )
 PLAUSIBLE_FOCALS = Range(0.3, 5.0)  # plausible focal lengths, in long sides of the image
 
@@ -132,7 +127,6 @@ class Comparison:
     lenses: tuple[DistortedLens, ...] = ()
     distortions: tuple[DistortionContradiction, ...] = ()
     has_moved: bool = True  # False: the camera only turned, see :mod:`mkpc_kaggle.scene.motion`
-    misplaced: tuple[str, ...] = ()  # images that do not fit their cameras in a finished model
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,16 +190,11 @@ class Reconstruction:
         return sum(found.points for model in self.models for found in model.images)
 
 
-def filter_models(models: Sequence[SfmModel], placed: Collection[str] = ()) -> tuple[SfmModel, ...]:
+def filter_models(models: Sequence[SfmModel]) -> tuple[SfmModel, ...]:
     """Remove implausible cameras, then models with too few images. Return the rest, the largest
-    first. Images with ``placed`` cameras, by name, stay.
+    first.
     """
-    cleaned = []
-    for model in models:
-        images = [
-            found for found in model.images if found.image.name in placed or is_plausible(found)
-        ]
-        cleaned.append(replace(model, images=tuple(images)))
+    cleaned = [replace(model, images=tuple(filter(is_plausible, model.images))) for model in models]
     kept = [model for model in cleaned if len(model.images) >= MIN_IMAGES]
     return tuple(sorted(kept, key=lambda model: (-len(model.images), -len(model.points))))
 

@@ -1,36 +1,29 @@
 """Reconstruction of a batch: from pairs to cameras and a choice of F for each pair, all picklable."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
-
-import numpy as np
-from numpy.typing import NDArray
 
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.intrinsics import Rows
 from mkpc_kaggle.geometry.robust import Estimate, RobustConfig
 from mkpc_kaggle.recipe import CameraModel, CameraSharing, SceneConfig
 from mkpc_kaggle.scene.align import align, read_reference
-from mkpc_kaggle.scene.assumptions import compared, placed_lenses, with_lenses, with_right_exif
+from mkpc_kaggle.scene.assumptions import compared, with_lenses, with_right_exif
 from mkpc_kaggle.scene.choose import Choice, choose, estimate_of
 from mkpc_kaggle.scene.export import HeldDirectory
 from mkpc_kaggle.scene.keypoints import MergedGraph
 from mkpc_kaggle.scene.mapper import reconstruct_component, reconstruct_connected
 from mkpc_kaggle.scene.models import Reconstruction, models_of
-from mkpc_kaggle.scene.placement import centred
 from mkpc_kaggle.scene.shared_intrinsics import (
     given_intrinsics,
     refined_intrinsics,
     share,
-    sharing_with_placed,
 )
 from mkpc_kaggle.scene.view_graph import (
-    BatchImage,
     BatchPair,
     SharedIntrinsics,
     ViewGraph,
-    placed_by_name,
 )
 
 
@@ -109,8 +102,6 @@ def reconstruct_graph(
     With a ``directory``, the graph is reconstructed as a whole, moved onto the cameras of the last complete run,
     and COLMAP's files are written there. With ``is_whole``, it is reconstructed as a whole without files.
     """
-    given_graph = graph
-    graph, origin = centred(given_graph)
     if directory is None and not is_whole:
         # Each component alone, since a bad one may make the mapper fail
         parts = list(map(MergedGraph, graph.components()))
@@ -120,15 +111,9 @@ def reconstruct_graph(
         parts = [MergedGraph(graph.strong)]
         make = partial(reconstruct_connected, config=config)
     # The user's cameras are neither compared nor shared.
-    free: Sequence[BatchImage] = graph.free
-    lenses = placed_lenses(graph) if config.camera_model is CameraModel.AUTO else {}
-    parts = [part.starting_with(lenses=lenses) for part in parts]
+    free = graph.free
     given = given_intrinsics(free, config)
     mapped = with_right_exif(parts, given, config, make)
-    if config.cameras is not CameraSharing.IMAGE:
-        mapped = sharing_with_placed(mapped, make)
-        known = {digest for part in mapped.parts for digest in part.graph.known}
-        free = [image for image in free if image.digest not in known]
     if config.cameras is CameraSharing.AUTO:
         mapped = share(mapped, free, config, make) or mapped
     mapped = compared(mapped)
@@ -136,35 +121,13 @@ def reconstruct_graph(
         mapped = with_lenses(mapped, free, config, make) or mapped
     reconstructions = list(mapped.reconstructions)
     shared = mapped.shared
-    if placed_by_name(graph):
-        reconstructions = [_in_world_of(one, given_graph, origin) for one in reconstructions]
     if directory is not None:
-        from mkpc_kaggle.scene.adjustment import settle_rotations
         from mkpc_kaggle.scene.colmap import write_files
 
-        # Before the files are written, so that files and results agree. Placed cameras have a world.
-        placed = placed_by_name(graph).keys()
-        if not placed:
-            reconstructions = align(reconstructions, read_reference(directory.path))
-        models = models_of(reconstructions)
-        for model in models:
-            # Placed cameras stay as they were read.
-            settle_rotations(model.colmap, placed - {*model.comparison.misplaced})
-        write_files(directory, mapped.parts[0], shared, models, config)
+        # Before the files are written, so that files and results agree
+        reconstructions = align(reconstructions, read_reference(directory.path))
+        write_files(directory, mapped.parts[0], shared, models_of(reconstructions), config)
     # Images without a camera have the refined focal length, and not the one it began with.
     if given:
         shared = refined_intrinsics(free, models_of(reconstructions))
     return reconstructions, shared
-
-
-def _in_world_of(
-    reconstruction: Reconstruction, graph: ViewGraph, origin: NDArray[np.float64]
-) -> Reconstruction:
-    """Return the reconstruction of a graph with placed cameras in the world of these."""
-    if not reconstruction.models:
-        return reconstruction
-    # Only with a model: pycolmap may be missing
-    from mkpc_kaggle.scene.colmap import moved_back
-
-    models = tuple(moved_back(model, graph, origin) for model in reconstruction.models)
-    return replace(reconstruction, models=models)

@@ -13,9 +13,7 @@ images of one camera at one zoom share it. ``cameras`` of [scene] (``--camera``)
   (:func:`given_intrinsics`).
 - ``image``: no image shares.
 
-New images of a finished model may have its one camera of their size, unless ``image``
-(:func:`sharing_with_placed`). Their focal length must agree within 2 %, their distortion within 0.5 % at the edge,
-and no observations may be lost. Images with a camera of the user's are not compared.
+Images with a camera of the user's are not compared.
 """
 
 from collections.abc import Sequence
@@ -25,11 +23,9 @@ import numpy as np
 
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.focal_prior import FOCAL_RATIO
-from mkpc_kaggle.geometry.intrinsics import ModelCamera, PlacedCamera, displacement_of
 from mkpc_kaggle.recipe import CameraSharing, SceneConfig
-from mkpc_kaggle.scene.keypoints import MergedGraph
 from mkpc_kaggle.scene.mapper import Make, Mapped, loses_points, refine_complete
-from mkpc_kaggle.scene.models import MIN_DISPLACEMENT, Reconstruction, SfmModel
+from mkpc_kaggle.scene.models import SfmModel
 from mkpc_kaggle.scene.view_graph import BatchImage, SharedIntrinsics
 
 TOLERANCE = 0.02  # maximum relative deviation of agreeing focal lengths from the median
@@ -126,55 +122,6 @@ def undecided_zooms(images: Sequence[BatchImage], models: Sequence[SfmModel]) ->
         if group is not None and image.digest in group.zoomed and not is_decided:
             undecided.add(image.digest)
     return undecided
-
-
-def sharing_with_placed(former: Mapped, make: Make) -> Mapped:
-    """Return the reconstructions with the intrinsics of :func:`with_placed_intrinsics`, unless images
-    then see fewer points.
-    """
-    parts = []
-    reconstructions = []
-    for part, reconstruction in former:
-        parts.append(part)
-        reconstructions.append(reconstruction)
-        placed = with_placed_intrinsics(part, reconstruction)
-        if placed is None:
-            continue
-        again = make(placed, former.shared)
-        if not loses_points([reconstruction], [again]):
-            parts[-1] = placed
-            reconstructions[-1] = again
-    return Mapped(tuple(parts), tuple(reconstructions), former.shared)
-
-
-def with_placed_intrinsics(part: MergedGraph, reconstruction: Reconstruction) -> MergedGraph | None:
-    """Return the graph whose new images have the intrinsics of a finished model, or ``None`` if no new
-    image has them.
-
-    The model's images of the size must have one camera, and the new image's own must agree with its
-    focal length and its distortion. A single new image determines these poorly.
-    """
-    known = part.graph.known
-    lenses: dict[Size, set[ModelCamera]] = {}
-    for image in part.graph.images:
-        camera = known.get(image.digest)
-        if isinstance(camera, PlacedCamera):
-            lens = ModelCamera(camera.model, camera.parameters)
-            lenses.setdefault(image.size, set()).add(lens)
-    alike = {}
-    for registered in (
-        registered for model in reconstruction.models for registered in model.images
-    ):
-        image = registered.image
-        of_size = lenses.get(image.size, set())
-        if image.digest in known or registered.lens is None or len(of_size) != 1:
-            continue
-        (lens,) = of_size
-        own, placed = (displacement_of(one, image.size) for one in (registered.lens, lens))
-        is_alike = abs(registered.focal / lens.focal - 1) < TOLERANCE
-        if is_alike and abs(own - placed) < MIN_DISPLACEMENT:
-            alike[image.digest] = lens
-    return part.starting_with(known={**known, **alike}) if alike else None
 
 
 def refined_intrinsics(

@@ -10,7 +10,7 @@ from scipy.sparse.csgraph import connected_components
 
 from mkpc_kaggle.geometry.coordinates import Matrix3, Size
 from mkpc_kaggle.geometry.focal_prior import FOCAL_RATIO
-from mkpc_kaggle.geometry.intrinsics import CameraTable, KnownCamera, PlacedCamera, Rows
+from mkpc_kaggle.geometry.intrinsics import CameraTable, KnownCamera, Rows
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.pipeline.pair import UnitResult
 
@@ -186,13 +186,4 @@ def known_by_name(graph: ViewGraph) -> dict[str, KnownCamera]:
         image.name: graph.known[image.digest]
         for image in graph.images
         if image.digest in graph.known
-    }
-
-
-def placed_by_name(graph: ViewGraph) -> dict[str, PlacedCamera]:
-    """Return the cameras of a finished model, which stay where they are, by image name."""
-    return {
-        name: camera
-        for name, camera in known_by_name(graph).items()
-        if isinstance(camera, PlacedCamera)
     }

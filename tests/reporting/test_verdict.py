@@ -30,7 +30,6 @@ from mkpc_kaggle.scene.models import (
     HARDLY_MOVED,
     MAX_CENTRE_SIGMA,
     MAX_SIGMA_IMAGES,
-    OTHER_PICTURES,
     Comparison,
     DistortedLens,
     DistortionContradiction,
@@ -134,9 +133,6 @@ SPEAKS = {
     "the cameras are not to be trusted: the camera hardly moved": log(
         scene(model(GOOD, GOOD, GOOD, GOOD, comparison=Comparison(has_moved=False)))
     ),
-    "no cameras: the photographs contradict all cameras of the model of --onto; give the": log(
-        scene(failure=OTHER_PICTURES)
-    ),
     "no camera for 3.jpg: add photographs between": log(
         scene(model(GOOD, GOOD, GOOD, names=NAMES[:3])), pairs=ALL
     ),
@@ -197,9 +193,6 @@ SPEAKS = {
     "uncertain cameras: 0.jpg; add": log(scene(model((), GOOD, GOOD, GOOD))),
     "the focal length of 287 px in --intrinsics contradicts the photographs, which fit 575 px": (
         compared(FocalContradiction(FocalSource.INTRINSICS, ("0.jpg",), 287.4, 574.9))
-    ),
-    "matches contradict the cameras of 0.jpg in the model of --onto, so these count as new": log(
-        scene(model(GOOD, GOOD, GOOD, GOOD, comparison=Comparison(misplaced=("0.jpg",))))
     ),
     "the focal length of 912 px that photographs share contradicts some of them, which fit about 684 px": (
         compared(FocalContradiction(FocalSource.SHARED, ("0.jpg",), 912.2, 684.0))

@@ -12,7 +12,6 @@ from mkpc_kaggle.scene.adjustment import (
     MAX_TWO_VIEW_ERROR_PX,
     adjust,
     remove_uncertain_points,
-    settle_rotations,
     two_view_points,
 )
 from mkpc_kaggle.scene.sfm import reconstruct_batch
@@ -77,26 +76,3 @@ def test_points_of_two_views_with_nearly_parallel_rays_are_removed(model, monkey
     others = set(model.points3D) - points
     remove_uncertain_points(model)
     assert set(model.points3D) == others
-
-
-def test_reading_a_finished_model_changes_no_digit_of_its_poses(model, tmp_path):
-    rng = np.random.default_rng(0)
-    # Of so many random quaternions, some change whenever they are normalised.
-    for _ in range(40):
-        for frame in model.frames.values():
-            quaternion = rng.normal(size=4)
-            rotation = pycolmap.Rotation3d(quaternion / np.linalg.norm(quaternion))
-            frame.rig_from_world = pycolmap.Rigid3d(rotation, np.zeros(3))
-        before = {number: frame.rig_from_world.params for number, frame in model.frames.items()}
-        settle_rotations(model)
-        for number, frame in model.frames.items():
-            pose = frame.rig_from_world
-            assert np.abs(pose.params - before[number]).max() < 1e-15
-            normalised = pycolmap.Rotation3d(pose.rotation.quat)
-            normalised.normalize()
-            np.testing.assert_array_equal(normalised.quat, pose.rotation.quat)
-    model.write(tmp_path)
-    read = pycolmap.Reconstruction(tmp_path)
-    for number, frame in model.frames.items():
-        written = frame.rig_from_world.params
-        np.testing.assert_array_equal(read.frames[number].rig_from_world.params, written)

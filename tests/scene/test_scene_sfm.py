@@ -27,8 +27,10 @@ from mkpc_kaggle.recipe import CameraSharing, SceneConfig
 from mkpc_kaggle.scene import colmap
 from mkpc_kaggle.scene.choose import Reason
 from mkpc_kaggle.scene.export import HeldDirectory
+from mkpc_kaggle.scene.keypoints import MergedGraph
+from mkpc_kaggle.scene.mapper import reconstruct_connected
 from mkpc_kaggle.scene.sfm import Solution, reconstruct_batch
-from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair
+from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair, ViewGraph
 
 
 @pytest.fixture(scope="module")
@@ -280,3 +282,26 @@ def test_an_edge_is_verified_once_for_the_same_cameras_on_any_number_of_threads(
             dump = list(database.iterdump())
         written.append(dump)
     assert written[0] == written[1]
+
+
+def test_a_refinement_without_the_matches_of_an_image_leaves_the_image_out(scene):
+    whole = MergedGraph(ViewGraph.of_pairs(scene.pairs))
+    first = reconstruct_connected(whole, {}, SceneConfig())
+    assert first.registered == 6
+    edges = [edge for edge in whole.graph.edges if 3 not in (edge.first, edge.second)]
+    lacking = MergedGraph(replace(whole.graph, edges=tuple(edges)))
+    second = reconstruct_connected(lacking, {}, SceneConfig(), first.models)
+    assert second.failure == ""
+    names = {found.image.name for found in second.models[0].images}
+    assert names == {*scene.cameras} - {"0003"}
+
+
+@pytest.mark.parametrize("error", [KeyError("6"), IndexError("6"), ValueError("6")])
+def test_an_error_within_a_reconstruction_is_a_reason(scene, monkeypatch, error):
+    def failing(*arguments: object) -> None:
+        raise error
+
+    monkeypatch.setattr(colmap, "structure_from_motion", failing)
+    found = reconstruct_connected(MergedGraph(ViewGraph.of_pairs(scene.pairs)), {}, SceneConfig())
+    assert found.models == ()
+    assert "6" in found.failure
