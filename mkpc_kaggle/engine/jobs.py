@@ -114,8 +114,7 @@ class SceneJob:
     the user's known cameras.
 
     A ``candidate`` other than the first has its own ``key``, and ``scene`` is the key of the first. A batch
-    that has files is reconstructed as a whole, ``is_whole``, even by a job that writes none. ``with_estimates``,
-    the answer also has the estimates of the pairs that take F from their cameras.
+    that has files is reconstructed as a whole, ``is_whole``, even by a job that writes none.
 
     The answer is a :class:`Solution`, with choices in the order of the pairs, which have
     ``contents``.
@@ -133,7 +132,6 @@ class SceneJob:
     candidate: str = ALL_UNITS
     scene: str = ""
     is_whole: bool = False
-    with_estimates: bool = False
     # A crash of pycolmap counts against the batch, not against its place.
     items: tuple[tuple[Hashable, ...], ...] = ()
 

@@ -60,15 +60,6 @@ class Request:
     publish: "Callable[[State], None]" = lambda _: None
     is_trial: bool = False
 
-    @property
-    def uses_cameras(self) -> bool:
-        """Whether a pair's estimate comes from its cameras where these exist, and not from MAGSAC.
-
-        The cameras are the result of a run with files, and F of a pair is for its report alone. With one
-        unit, MAGSAC takes a notable share of the time. Pairs of distorted cameras take F from MAGSAC.
-        """
-        return self.recipe.scene is not None and bool(self.exports) and len(self.recipe.units) == 1
-
 
 @dataclass(frozen=True)
 class RunReport:

@@ -85,25 +85,10 @@ def _restore_points(state: State, store: Store, wanted: list[tuple[int, int]]) -
 
 def _restore_estimates(state: State, store: Store, known: list[int]) -> None:
     today = {index: state.estimate_key(index) for index in known if state.has[index].any()}
-    by_cameras = _camera_estimate_keys(state, list(today))
-    estimates = store.get(PairEstimate, [*today.values(), *by_cameras.values()])
+    estimates = store.get(PairEstimate, today.values())
     for index, key in today.items():
-        if by_cameras.get(index) in estimates:
-            state.use_camera_estimate(index, estimates[by_cameras[index]])
-        elif key in estimates:
+        if key in estimates:
             state.use_estimate(index, estimates[key])
-
-
-def _camera_estimate_keys(state: State, known: list[int]) -> dict[int, str]:
-    """Return the keys of estimates from the cameras of today's scenes."""
-    if not state.uses_cameras:
-        return {}
-    scenes = {batch: state.scene_inputs(batch)[1] for batch in state.batches}
-    return {
-        index: state.camera_estimate_key(index, scenes[state.pairs[index].group])
-        for index in known
-        if state.batch_of[index] >= 0
-    }
 
 
 def _restore_scenes(state: State, store: Store) -> None:
@@ -132,13 +117,4 @@ def _restore_scenes(state: State, store: Store) -> None:
             has_mark = state.scenes.filed[batch] == used_scene.key
             if not (has_mark and has_files(directory.path, len(used_scene.models))):
                 continue
-        if state.uses_cameras and _lacks_estimates(state, batch):
-            continue
         state.scenes.settle(batch, state.tries.given_up)
-
-
-def _lacks_estimates(state: State, batch: str) -> bool:
-    """Return whether an estimate that came with a batch's scene is missing: a damaged row."""
-    rows = state.rows_of(batch)
-    is_of_scene = state.scene_source[rows] == SCENE
-    return bool((is_of_scene & ~state.by_cameras[rows]).any())

@@ -7,11 +7,10 @@ from mkpc_kaggle.engine.console import EventKind
 from mkpc_kaggle.engine.jobs import Cause, Failure, PairInputs, SceneJob
 from mkpc_kaggle.engine.plan.state import State
 from mkpc_kaggle.engine.run import Run
-from mkpc_kaggle.engine.store.keys import of_camera_estimate, of_candidate
+from mkpc_kaggle.engine.store.keys import of_candidate
 from mkpc_kaggle.engine.store.tables import (
     NOT_RECONSTRUCTED,
     Export,
-    PairEstimate,
     SceneRecord,
     unmatched_scene,
 )
@@ -67,7 +66,6 @@ class SceneWork:
             candidate=candidate,
             scene=key,
             is_whole=folder is not None,
-            with_estimates=state.uses_cameras,
         )
         about = format_duration(run.costs.scene(job.matches))
         text = f"reconstructing its cameras from {plural(len(pairs), 'pair')}"
@@ -97,18 +95,12 @@ class SceneWork:
         )
         # In the same transaction, a mark: these files belong to this scene.
         marks = [] if job.export is None else [Export(job.batch, job.key)]
-        estimates = self._estimates(job, answer)
-        run.store.put([record, *marks, *estimates.values()])
+        run.store.put([record, *marks])
         # The time of the loop, with the process's start: the forecast needs both.
         run.costs.observe_scene(job.matches, seconds)
         text = f"{record.registered} of {plural(record.images, 'image')}"
         more = ""  # about a further candidate
         is_best = state.use_new_scene(job.batch, job.scene, record, is_filed=job.export is not None)
-        for index, estimate in estimates.items():
-            state.use_camera_estimate(
-                index, estimate, is_current=job.batch not in state.scenes.stale
-            )
-        run.log.estimated += len(estimates)
         if job.candidate != ALL_UNITS:
             outcome = "the best so far" if is_best else "not better"
             more = f" by the tracks of {title_of(job.candidate)}, {outcome}"
@@ -117,26 +109,6 @@ class SceneWork:
         if record.loose:
             note += f", {record.loose} of them unknown to within the size of their model"
         run.progress.note(note)
-
-    def _estimates(self, job: SceneJob, answer: Solution) -> dict[int, PairEstimate]:
-        """Return the estimates of the pairs that take F from their cameras, by index."""
-        estimates = {}
-        state = self._run.state
-        # Empty if the job was not asked for any
-        for pair, contents, found in zip(job.pairs, job.contents, answer.estimates, strict=False):
-            # An image may have changed since.
-            if found is None or state.contents(pair.index) != contents:
-                continue
-            points = tuple(pair.points.values())
-            own = state.request.keys.of_estimate(state.pairs[pair.index], points)
-            estimates[pair.index] = PairEstimate(
-                of_camera_estimate(own, job.key),
-                # Of one unit; see Request.uses_cameras
-                {points[0]: found.inlier_count},
-                found.matrix,
-                support=found.stats.support,
-            )
-        return estimates
 
     def lose(self, job: SceneJob, failure: Failure) -> None:
         self._count_loss(job.batch, job.candidate, job.scene, failure, job.pairs)

@@ -24,14 +24,7 @@ from mkpc_kaggle.geometry.cameras import fundamental_of_cameras
 from mkpc_kaggle.geometry.coordinates import Matrix3
 from mkpc_kaggle.geometry.focal_prior import FocalConfig, FocalPrior, estimate_with_prior
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.geometry.robust import (
-    Estimate,
-    ModelKind,
-    RobustConfig,
-    estimate,
-    sampson_distances,
-)
-from mkpc_kaggle.pipeline.pair import with_stats
+from mkpc_kaggle.geometry.robust import RobustConfig, sampson_distances
 from mkpc_kaggle.scene.models import RegisteredImage
 from mkpc_kaggle.scene.view_graph import BatchPair
 
@@ -89,27 +82,22 @@ def choose(
     focals: Mapping[str, float] = MappingProxyType({}),
     focal: FocalConfig | None = None,
     magsac: RobustConfig | None = None,
-    *,
-    may_estimate: bool = False,
 ) -> Choice:
     """Return the F from a pair's cameras, in the first model with both cameras, or the reason for
     none.
 
     ``focals`` are the scene's focal lengths in pixels, by digest. With the recipe's prior ``focal``, a pair
-    without an F from cameras is estimated again at these, unless it contradicts the scene. With ``may_estimate``,
-    a pair without its own F is estimated if it may contradict the scene.
+    without an F from cameras is estimated again at these, unless it contradicts the scene.
     """
-    sizes = pair.image0.size, pair.image1.size
-    magsac = (magsac or RobustConfig()).in_stored_pixels(sizes)
-    choice = from_cameras(pair, models, magsac if may_estimate else None)
+    choice = from_cameras(pair, models)
     if focal is None or choice.reason in KEEPS_ITS_F:
         return choice
+    sizes = pair.image0.size, pair.image1.size
+    magsac = (magsac or RobustConfig()).in_stored_pixels(sizes)
     return replace(choice, F=estimate_at_known_focals(pair, focals, focal, magsac))
 
 
-def from_cameras(
-    pair: BatchPair, models: Sequence[ModelImages], magsac: RobustConfig | None
-) -> Choice:
+def from_cameras(pair: BatchPair, models: Sequence[ModelImages]) -> Choice:
     """Return the choice between the F of a pair's cameras and its own F, see :func:`choose`."""
     digests = pair.image0.digest, pair.image1.digest
     # Two copies of a file have one camera, and no epipolar geometry.
@@ -126,12 +114,12 @@ def from_cameras(
     except ValueError:
         # The pair's own F may still describe the matches.
         return Choice(None, Reason.SAME_CENTRE)
-    if contradicts(F, pair, magsac):
+    if contradicts(F, pair):
         return Choice(None, Reason.CONTRADICTION)
     return Choice(F, Reason.SCENE)
 
 
-def contradicts(F: Matrix3, pair: BatchPair, magsac: RobustConfig | None = None) -> bool:
+def contradicts(F: Matrix3, pair: BatchPair) -> bool:
     """Return whether a pair's matches speak against the scene's F: far fewer agree with it than with the
     pair's own F, or its evidence is far less.
 
@@ -139,19 +127,12 @@ def contradicts(F: Matrix3, pair: BatchPair, magsac: RobustConfig | None = None)
     with many times more of them, so only a tiny share counts against the scene. With more matches half of the
     evidence does. Each unit counts equally, as the scene's cameras may be of one unit's points.
     """
-    if pair.pair_fundamental is not None and _has_little_evidence(F, pair.pair_fundamental, pair):
-        return True
-    with_scene = _agreeing(F, pair)
-    # Its own F agrees with no more than all of the matches, so most pairs need no estimate.
-    most = len(pair.matches)
-    if most < CONTRADICTION_MATCHES or with_scene >= CONTRADICTION_SHARE * most:
-        return False
     own = pair.pair_fundamental
-    if own is None and magsac is not None:
-        found = estimate(pair.matches, magsac)
-        own = found.matrix if found.ok else None
     if own is None:
         return False
+    if _has_little_evidence(F, own, pair):
+        return True
+    with_scene = _agreeing(F, pair)
     with_own = _agreeing(own, pair)
     return bool(with_own >= CONTRADICTION_MATCHES and with_scene < CONTRADICTION_SHARE * with_own)
 
@@ -178,19 +159,6 @@ def _agreeing(F: Matrix3, pair: BatchPair) -> int:
     """Return the number of a pair's matches that agree with F."""
     distances = sampson_distances(F, pair.matches)
     return int(np.count_nonzero(distances < CONTRADICTION_ERROR_PX))
-
-
-def estimate_of(choice: Choice, pair: BatchPair, magsac: RobustConfig) -> Estimate | None:
-    """Return the F of a pair's cameras as its estimate, with the inliers among its matches.
-
-    Return ``None`` for a pair without an F from cameras. Its number of inliers is MAGSAC's, in 0.4 of the
-    time (``benchmarks.camera_estimates``).
-    """
-    if choice.F is None or not choice.from_scene:
-        return None
-    settings = magsac.in_stored_pixels((pair.image0.size, pair.image1.size))
-    inliers = sampson_distances(choice.F, pair.matches) < settings.threshold
-    return with_stats(Estimate(ModelKind.F, choice.F, inliers), pair.matches)
 
 
 def estimate_at_known_focals(

@@ -6,11 +6,11 @@ from functools import partial
 
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.intrinsics import Rows
-from mkpc_kaggle.geometry.robust import Estimate, RobustConfig
+from mkpc_kaggle.geometry.robust import RobustConfig
 from mkpc_kaggle.recipe import CameraModel, CameraSharing, SceneConfig
 from mkpc_kaggle.scene.align import align, read_reference
 from mkpc_kaggle.scene.assumptions import compared, with_lenses, with_right_exif
-from mkpc_kaggle.scene.choose import Choice, choose, estimate_of
+from mkpc_kaggle.scene.choose import Choice, choose
 from mkpc_kaggle.scene.export import HeldDirectory
 from mkpc_kaggle.scene.keypoints import MergedGraph
 from mkpc_kaggle.scene.mapper import reconstruct_component, reconstruct_connected
@@ -33,14 +33,12 @@ class Solution:
     pairs.
 
     Images with the same content have the name of the first of them. ``disagreement`` is the value by which
-    candidates are compared (:mod:`mkpc_kaggle.scene.candidates`). ``estimates``, if asked for, has the estimate
-    of each pair that takes its F from its cameras.
+    candidates are compared (:mod:`mkpc_kaggle.scene.candidates`).
     """
 
     reconstructions: tuple[Reconstruction, ...]
     choices: tuple[Choice, ...]
     disagreement: float = 0.0
-    estimates: tuple[Estimate | None, ...] = ()
 
 
 def reconstruct_batch(
@@ -52,15 +50,13 @@ def reconstruct_batch(
     is_whole: bool = False,
     *,
     cameras: Rows = (),
-    with_estimates: bool = False,
 ) -> Solution:
     """Reconstruct every connected component of a batch, and choose an F for each of its pairs.
 
     With the recipe's prior ``focal``, a pair without an F from cameras is re-estimated at the scene's focal
     lengths, unless the pair contradicts the scene. ``magsac`` has default settings if ``None``. With a directory
     ``export``, the batch is reconstructed as a whole, and COLMAP's files are written there. With ``is_whole``, it
-    is reconstructed in the same way without files. ``cameras`` are the user's known cameras. ``with_estimates``,
-    pairs come without their own F, and get estimates from their cameras.
+    is reconstructed in the same way without files. ``cameras`` are the user's known cameras.
 
     A missing result has a reason; bad matches never raise. Reconstruction takes seconds to minutes
     and may end the process, see :mod:`mkpc_kaggle.scene.colmap`.
@@ -76,14 +72,8 @@ def reconstruct_batch(
     for model in reversed(models):
         focals |= {digest: image.focal for digest, image in model.items()}
     # A reason for each pair, also for those without an F
-    choices = []
-    estimates = []
-    for pair in pairs:
-        choice = choose(pair, models, focals, focal, magsac, may_estimate=with_estimates)
-        choices.append(choice)
-        if with_estimates:
-            estimates.append(estimate_of(choice, pair, magsac or RobustConfig()))
-    return Solution(tuple(reconstructions), tuple(choices), estimates=tuple(estimates))
+    choices = tuple(choose(pair, models, focals, focal, magsac) for pair in pairs)
+    return Solution(tuple(reconstructions), choices)
 
 
 def reconstruct_graph(

@@ -10,9 +10,8 @@ from benchmarks.synthetic_scene import SIZE, SyntheticScene, synthetic_scene
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
-from mkpc_kaggle.geometry.robust import RobustConfig, sampson_distances
-from mkpc_kaggle.scene.choose import Choice, Reason, choose, contradicts, estimate_of
+from mkpc_kaggle.geometry.robust import RobustConfig
+from mkpc_kaggle.scene.choose import Choice, Reason, choose, contradicts
 from mkpc_kaggle.scene.models import (
     Reconstruction,
     RegisteredImage,
@@ -75,26 +74,8 @@ def test_a_wrong_camera_is_contradicted_by_the_pairs_matches(scene):
     wrong = [model(scene.cameras | {"0001": tilted})]
     true_F = scene.true_fundamental(scene.pairs[0])
     assert choice(wrong, scene, pair_fundamental=true_F).reason is Reason.CONTRADICTION
-    # Without an F of the pair, nothing contradicts the scene's,
+    # Without an F of the pair, nothing contradicts the scene's.
     assert choice(wrong, scene).from_scene
-    # unless it may be estimated.
-    by_digest = {found.image.digest: found for found in wrong[0].images}
-    assert choose(scene.pairs[0], [by_digest], may_estimate=True).reason is Reason.CONTRADICTION
-
-
-def test_an_f_from_cameras_has_the_inliers_of_the_pairs_matches(scene):
-    pair = scene.pairs[0]
-    found = choice([model(scene.cameras)], scene)
-    estimate = estimate_of(found, pair, RobustConfig(threshold=2.0))
-    assert estimate is not None
-    np.testing.assert_array_equal(estimate.matrix, found.F)
-    distances = sampson_distances(estimate.matrix, pair.matches)
-    np.testing.assert_array_equal(estimate.inliers, distances < 2.0)
-    # 0.3 of the matches are wrong, and few of them agree by chance.
-    assert 0.6 < estimate.inliers.mean() < 0.8
-    assert estimate.stats.support > MIN_SUPPORT
-    # The cameras say nothing about F.
-    assert estimate_of(choice([], scene), pair, RobustConfig()) is None
 
 
 def test_a_threshold_in_resized_pixels_is_one_in_stored_pixels_everywhere(scene):
@@ -105,9 +86,6 @@ def test_a_threshold_in_resized_pixels_is_one_in_stored_pixels_everywhere(scene)
     first, second = (choose(pair, [], focals, FocalConfig(), magsac) for magsac in (quick, resized))
     assert first.F is not None
     np.testing.assert_array_equal(first.F, second.F)
-    cameras = choice([model(scene.cameras)], scene)
-    counts = [estimate_of(cameras, pair, magsac).inlier_count for magsac in (quick, resized)]
-    assert counts[0] == counts[1] > 0
 
 
 # Images have 800 x 600 pixels, so 1e5 is a field of view below half a degree.

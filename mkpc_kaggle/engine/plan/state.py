@@ -18,7 +18,7 @@ from mkpc_kaggle.engine.plan.blame import Item, Tries
 from mkpc_kaggle.engine.plan.scene_state import SceneState
 from mkpc_kaggle.engine.request import Request, batches_of, distinct_pairs, names_of, visiting_order
 from mkpc_kaggle.engine.store.image_files import contents_of
-from mkpc_kaggle.engine.store.keys import Images, of_camera_estimate
+from mkpc_kaggle.engine.store.keys import Images
 from mkpc_kaggle.engine.store.tables import PairEstimate, SceneRecord, UnitPoints
 from mkpc_kaggle.geometry.coordinates import Matrix3
 from mkpc_kaggle.geometry.robust import (
@@ -47,7 +47,6 @@ class State:
     ``unneeded``, the pair does not need the unit, whose key stands for no points.
 
     Of a pair (N,): ``estimates``, the key of the estimate in use; ``estimated``, it is today's;
-    ``by_cameras``, it comes from the cameras of its batch;
     ``inliers``, the F ``own`` (N, 3, 3) and ``has_own``, it is no fallback. ``earlier`` (N, 3, 3) is the F
     in the last table of an earlier run, if ``has_earlier``, and ``earlier_by_scene``, if a scene gave it.
     ``matching`` and ``estimating`` are the pairs of jobs under way, and ``filling`` the pairs in the last phase.
@@ -61,7 +60,6 @@ class State:
 
     def __init__(self, request: Request, extra: Sequence[Pair] = ()) -> None:
         self.request = request
-        self.uses_cameras = request.uses_cameras
         distinct, self.pair_of_row = distinct_pairs(request.pairs)
         self.pairs = [*distinct, *extra]
         self.rows = len(distinct)
@@ -96,7 +94,6 @@ class State:
         self.estimates = np.full(count, "", object)
         self.own = np.tile(FALLBACK_FUNDAMENTAL, (count, 1, 1))
         self.estimated = np.zeros(count, bool)
-        self.by_cameras = np.zeros(count, bool)
         self.has_own = np.zeros(count, bool)
         self.earlier = np.zeros((count, 3, 3))
         self.has_earlier = np.zeros(count, bool)
@@ -134,10 +131,8 @@ class State:
 
     @property
     def lacks_estimate(self) -> Mask:
-        """(N,): the row's estimate is not from the points in use, this run can get it, and it will not
-        come with a scene.
-        """
-        lacking = self.has.any(1) & ~self.estimated & ~self.awaits_cameras
+        """(N,): the row's estimate is not from the points in use, and this run can get it."""
+        lacking = self.has.any(1) & ~self.estimated
         lacking[self.rows :] = False  # extra pairs are for scenes alone
         for item in self.tries.given_up:
             match item:
@@ -303,10 +298,6 @@ class State:
         """Return the key of an estimate from the points in use."""
         return self.request.keys.of_estimate(self.pairs[index], self.keys_in_use(index))
 
-    def camera_estimate_key(self, index: int, scene: str) -> str:
-        """Return the key of an estimate from the cameras of a scene that used the points in use."""
-        return of_camera_estimate(self.estimate_key(index), scene)
-
     def scene_inputs(self, batch: str) -> tuple[list[int], str]:
         """Return the pairs of a batch that have points, and the key of a scene from them."""
         members = self.members[self.batches[batch]]
@@ -318,8 +309,7 @@ class State:
                 self.names[index],
                 self.contents(index),
                 self.keys_in_use(index),
-                # Estimates from cameras come after the scene, which is another one than without them.
-                "by cameras" if self.uses_cameras else self.estimates[index],
+                self.estimates[index],
             ]
             for index in indices
         ]
@@ -329,11 +319,6 @@ class State:
         """Return the rows of a batch, without its extra pairs."""
         members = self.members[self.batches[batch]]
         return [int(index) for index in members if index < self.rows]
-
-    @property
-    def awaits_cameras(self) -> Mask:
-        """(N,): the estimate may come from cameras that are still to be computed."""
-        return self._awaits_scene if self.uses_cameras else np.zeros(len(self.pairs), bool)
 
     @property
     def _awaits_scene(self) -> Mask:
@@ -361,8 +346,7 @@ class State:
         assert images
         keys = zip(self.units, self.points[index], self.has[index], strict=True)
         points = {unit: key for unit, key, is_used in keys if is_used}
-        has_own = self.has_own[index] and not self.uses_cameras
-        own = self.own[index] if has_own else None
+        own = self.own[index] if self.has_own[index] else None
         return PairInputs(index, images, points, self.pairs[index].intrinsics, own)
 
     # Updates
@@ -439,7 +423,6 @@ class State:
         self.matches[index] = 0
         self.estimates[index] = ""
         self.estimated[index] = False
-        self.by_cameras[index] = False
         self.own[index] = FALLBACK_FUNDAMENTAL
         self.has_own[index] = False
         self.has_earlier[index] = False
@@ -451,7 +434,6 @@ class State:
         """Use an estimate. It is today's if it is from the points in use."""
         self.estimates[index] = estimate.key
         self.estimated[index] = estimate.key == self.estimate_key(index)
-        self.by_cameras[index] = False
         self.own[index] = estimate.F
         self.has_own[index] = not estimate.failure
         self.inliers[index] = sum(estimate.inliers.values())
@@ -465,18 +447,7 @@ class State:
         if self.has[index].any():
             self.use_estimate(index, estimate)
             self.changed.add(index)
-            # A scene that has estimates does not depend on others.
-            if not self.uses_cameras:
-                self._note_change(index)
-
-    def use_camera_estimate(
-        self, index: int, estimate: PairEstimate, *, is_current: bool = True
-    ) -> None:
-        """Use an estimate from the cameras of a pair's scene; ``is_current``, if this is today's."""
-        self.use_estimate(index, estimate)
-        self.estimated[index] = is_current
-        self.by_cameras[index] = True
-        self.changed.add(index)
+            self._note_change(index)
 
     def use_new_scene(
         self, batch: str, scene: str, record: SceneRecord, *, is_filed: bool = False
@@ -523,11 +494,7 @@ class State:
         """Note that a pair has other inputs for its scene than before: points, or an estimate."""
         self.changed.add(index)
         if self.batch_of[index] >= 0:
-            batch = self.pairs[index].group
-            self.scenes.note_change(batch)
-            if self.uses_cameras:
-                members = self.members[self.batches[batch]]
-                self.estimated[members[self.by_cameras[members]]] = False
+            self.scenes.note_change(self.pairs[index].group)
 
     def take_changed(self) -> list[int]:
         """Return the pairs that have changed since the last call."""

@@ -226,7 +226,6 @@ def compute_scene(job: Job) -> Solution:
         job.export,
         job.is_whole,
         cameras=job.cameras,
-        with_estimates=job.with_estimates,
     )
     value = disagreement(pairs, models_of(solution.reconstructions))
     return replace(solution, disagreement=value)
