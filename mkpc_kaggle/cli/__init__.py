@@ -14,7 +14,6 @@ from io import TextIOWrapper
 from pathlib import Path
 from typing import NoReturn
 
-from mkpc_kaggle.cli.help import HelpFormatter
 from mkpc_kaggle.version import __version__
 
 COMMANDS = {
@@ -167,13 +166,13 @@ def make_parser(arguments: Sequence[str] = tuple(COMMANDS)) -> argparse.Argument
     """
     text = "Two-stage image matching with Matching Key-Points Crop, offline, inside a time budget."
     epilog = "mkpc COMMAND --help has the options of a command."
-    parser = argparse.ArgumentParser(
-        "mkpc", description=text, epilog=epilog, formatter_class=HelpFormatter
-    )
+    parser = argparse.ArgumentParser("mkpc", description=text, epilog=epilog)
     parser.add_argument("--version", action="version", version=__version__)
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
     for name, summary in COMMANDS.items():
-        sub = commands.add_parser(name, help=summary, formatter_class=HelpFormatter)
+        sub = commands.add_parser(
+            name, help=summary, formatter_class=argparse.RawDescriptionHelpFormatter
+        )
         if name in arguments:
             command = import_module(f"mkpc_kaggle.cli.{name}")
             sub.description = command.HELP

@@ -63,7 +63,6 @@ def run(arguments: argparse.Namespace) -> int:
             weights=arguments.weights,
             device=arguments.device,
             precision=arguments.precision,
-            licence=arguments.licence,
             settings=options.settings_of(arguments),
             progress=True,
         )

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from math import inf
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 from mkpc_kaggle.data.competition import Pair, TrainScene, read_train_side
 from mkpc_kaggle.engine.console import Progress, drain, logger, queued
@@ -17,7 +17,6 @@ from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.recipe import Mode, parse_setting
 from mkpc_kaggle.reporting.summary import left_out_line
 from mkpc_kaggle.setup.assembly import Assembly, assemble
-from mkpc_kaggle.setup.availability import Licence
 
 
 def add_matching(parser: argparse.ArgumentParser) -> None:
@@ -30,9 +29,6 @@ def add_matching(parser: argparse.ArgumentParser) -> None:
         help="a recipe, or one matcher such as aliked_lightglue (default: auto, every matcher with its weights)",
     )
     add_weights(parser)
-    text = """permissive: only weights under Apache-2.0, BSD-3-Clause or MIT. Recipe auto omits other weights, and
-        units run their fallback; any other recipe that needs them is refused (default: any)"""
-    add("--licence", choices=list(map(str, Licence)), default="any", help=text)
     add(
         "--device",
         default="auto",
@@ -93,23 +89,6 @@ def train_side_of(arguments: argparse.Namespace) -> tuple[TrainScene, ...]:
     )
 
 
-class Moved(argparse.Action):
-    """A former option, whose error names the new form."""
-
-    def __init__(self, option_strings: Sequence[str], dest: str, now: str) -> None:
-        super().__init__(option_strings, dest, nargs="*", help=argparse.SUPPRESS)
-        self._now = now
-
-    def __call__(
-        self,
-        parser: argparse.ArgumentParser,
-        namespace: argparse.Namespace,
-        values: Any,
-        option_string: str | None = None,
-    ) -> NoReturn:
-        raise UserError(f"{option_string} is {self._now} now")
-
-
 def add_run(parser: argparse.ArgumentParser, time_limit: str | None) -> None:
     """Add the options of the engine; ``time_limit``: the default, ``None`` for no limit."""
     # A run's reader may be slow or hang.
@@ -148,7 +127,6 @@ def assembly_of(
             device=arguments.device,
             precision=arguments.precision,
             mode=Mode(mode),
-            licence=Licence(arguments.licence),
             scenes=arguments.reconstruct,
             settings=settings_of(arguments),
         )

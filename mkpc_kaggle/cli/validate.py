@@ -65,8 +65,6 @@ def _add_sources(parser: argparse.ArgumentParser) -> None:
     source.add_argument("--pairs", type=Path, metavar="FILE", help=text)
     add("--image-root", type=Path, metavar="DIR", help="directory of the images of --pairs")
     options.add_train_side(parser)
-    for name in ("--submission", "--truth", "--imc2025"):
-        add(name, action=options.Moved, now="an argument of `mkpc score`")
 
 
 def _add_estimates(parser: argparse.ArgumentParser) -> None:
@@ -82,8 +80,6 @@ def _add_estimates(parser: argparse.ArgumentParser) -> None:
     text = """run these instead of --recipe and --mode, and give the gain of each over the first with its 95 %%
         interval; such as classical:whole-images classical"""
     add("--compare", nargs="+", metavar="RECIPE[:MODE]", help=text)
-    for name in ("method", "threshold"):
-        add(f"--{name}", action=options.Moved, now=f"--set magsac.{name}=...")
     text = "settings of a published evaluation, see docs/benchmarks.md; --set changes them"
     add("--protocol", choices=list(PROTOCOLS), help=text)
     text = "the matches choose between E's two rotations, as with --protocol; default: the one nearer to the truth"

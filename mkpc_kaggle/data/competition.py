@@ -28,11 +28,6 @@ from mkpc_kaggle.geometry.coordinates import Matrix3
 
 SUBMISSION_COLUMNS = ("sample_id", "fundamental_matrix")
 
-ROUNDED = re.compile(r"-?0\.00+")  # zero in fixed digits, such as 0.000000
-# Smallest over largest singular value of a balanced matrix: 1 for the identity, 1e-6 for an F that
-# was rounded to six digits.
-MAX_RANK_3 = 1e-3
-BALANCE_STEPS = 20
 MAX_COLUMNS = 1000  # of a table; a file with more is another file
 MAX_LINE = 1 << 20  # characters of a row; other files may have lines of gigabytes
 # Characters that end lines or control a terminal.
@@ -255,48 +250,6 @@ def submission_problems(path: Path, sample_ids: Sequence[str]) -> list[str]:
         except UserError as error:
             problems.append(str(error))
     return problems
-
-
-def submission_warnings(path: Path) -> list[str]:
-    """Return a line for each kind of row that is no fundamental matrix, although it has nine
-    numbers.
-
-    Raises :class:`UserError` for a file that is not a submission.
-    """
-    rounded = []
-    of_full_rank = []
-    for where, (sample, cell) in read_rows(path, SUBMISSION_COLUMNS):
-        F = _numbers(cell, where, 9).reshape(3, 3)
-        words = cell.split()
-        # In pixels, these four are the smallest: fixed digits such as %.6f lose them first.
-        if all(ROUNDED.fullmatch(words[index]) for index in (0, 1, 3, 4)):
-            rounded.append(sample)
-        elif np.isfinite(F).all() and _rank_3(F) > MAX_RANK_3:
-            of_full_rank.append(sample)
-    found = []
-    if rounded:
-        found.append(
-            f"numbers rounded to zero: {plural(len(rounded), 'row')}, the first is {rounded[0]}; "
-            "write more digits, such as %.12g"
-        )
-    if of_full_rank:
-        found.append(
-            f"matrices of rank 3: {plural(len(of_full_rank), 'row')}, the first is {of_full_rank[0]}; "
-            "a fundamental matrix has rank 2"
-        )
-    return found
-
-
-def _rank_3(matrix: Matrix3) -> float:
-    """Return the smallest over the largest singular value, with rows and columns of equal size."""
-    # The elements of F in pixels have very different sizes, which its rank does not depend on.
-    balanced = matrix.copy()
-    for _ in range(BALANCE_STEPS):
-        for axis in (0, 1):
-            norms = np.linalg.norm(balanced, axis=axis, keepdims=True)
-            balanced /= np.where(norms, norms, 1.0)
-    values = np.linalg.svd(balanced, compute_uv=False)
-    return float(values[2] / values[0]) if values[0] else 0.0
 
 
 def read_rows(

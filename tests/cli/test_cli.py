@@ -80,19 +80,6 @@ def test_without_arguments_the_commands_are_printed(capsys):
         assert re.search(rf"^  {name} +{re.escape(summary)}", out, re.M), name
 
 
-@pytest.mark.parametrize("width", [50, 90])
-@pytest.mark.parametrize("command", COMMANDS)
-def test_help_is_wrapped_to_the_terminal(command, width, monkeypatch, capsys):
-    monkeypatch.setenv("COLUMNS", str(width))
-    with pytest.raises(SystemExit):
-        run_command(command, "--help")
-    lines = capsys.readouterr().out.splitlines()
-    usage = lines.index("")  # argparse does not break a long choice of the usage
-    too_long = [line for line in lines[usage:] if len(line) > width]
-    # Commands are not broken, so that they can be copied.
-    assert [line for line in too_long if not re.match(r" +(mkpc|python) ", line)] == []
-
-
 def test_check_accepts_a_whole_submission_and_refuses_one_with_a_missing_row(
     demo, tmp_path, capsys
 ):
@@ -176,7 +163,7 @@ def test_match_draws_a_pair_that_has_nothing_in_common(clean_environment, tmp_pa
     cv2.imwrite(str(tmp_path / "a.png"), np.full((60, 90, 3), 127, np.uint8))
     figure = tmp_path / "pair.png"
     match = ["match", tmp_path / "a.png", tmp_path / "a.png"]
-    assert run_command(*match, "--licence", "permissive", "--out", figure) == 0
+    assert run_command(*match, "--out", figure) == 0
     assert "this is the fallback: too few distinct matches" in capsys.readouterr().out
     assert figure.exists()
 
