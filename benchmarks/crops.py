@@ -4,14 +4,13 @@ python -m benchmarks.crops --out DIR [--matcher aliked_lightglue] [--layouts NAM
     -- --train-dir DIR --no-scenes [...]
 
 The layouts become recipes in OUT, and `validate` runs them on the same pairs with the options after
-``--``: of a train side, or of a list (--pairs LIST --image-root DIR). All units have one matcher;
-with --rootsift, RootSIFT's unit of `light` runs before them, so that the layout "rule" is `light`.
+``--``. All units have one matcher; with --rootsift, RootSIFT's unit of `light` runs before them, so
+that the layout "rule" is `light`.
 Recipes share a journal, so that common units run once. After a kill, rerun the command to resume.
 
 The last tables have the gain of the last layout over each other one: for all scenes, for those of
 one change of scale (SCENE_zoomN), for those whose names start with --chosen, on which the rule was
-chosen, and for the others. The gain is in mAA; of a list, in the mean of 1 - error / 20 degrees,
-which is the AUC of many pairs.
+chosen, and for the others. The gain is in mAA.
 """
 
 import argparse
@@ -23,11 +22,9 @@ from statistics import mean
 from typing import Any, TypeAlias
 
 from mkpc_kaggle.cli import main as mkpc
-from mkpc_kaggle.evaluation.compare import Paired, paired_difference
+from mkpc_kaggle.evaluation.validate import Paired, paired_difference
 
 Run: TypeAlias = dict[str, Any]  # the figures of `validate --json`
-
-MAX_ANGLE = 20.0  # degrees
 
 MORE = {"sift": ", max_matches = 8000"}  # its number of keypoints
 TAIL = """
@@ -75,45 +72,23 @@ def run(files: Sequence[Path], out: Path, options: Sequence[str]) -> tuple[int, 
 
     There are no figures if a run is incomplete.
     """
-    # `validate --compare` takes no lists of pairs, because they have no metres.
-    has_list = any(option.startswith("--pairs=") or option == "--pairs" for option in options)
-    calls = [["--recipe", str(file)] for file in files]
-    if not has_list:
-        calls = [["--compare", *map(str, files)]]
-    found: list[Run] = []
-    for call in calls:
-        figures = out / "figures.json"
-        figures.unlink(missing_ok=True)  # an incomplete comparison writes none
-        paths = ["--work-dir", str(out), "--json", str(figures)]
-        status = mkpc(["validate", *call, *paths, *options])
-        if status or not figures.exists():
-            return status or 1, []
-        values = json.loads(figures.read_text(encoding="utf-8"))
-        found += [values] if has_list else values["recipes"]
-    return 0, found
+    figures = out / "figures.json"
+    figures.unlink(missing_ok=True)
+    paths = ["--work-dir", str(out), "--json", str(figures)]
+    status = mkpc(["validate", "--compare", *map(str, files), *paths, *options])
+    if status:
+        return status, []
+    return 0, json.loads(figures.read_text(encoding="utf-8"))
 
 
 def values_of(scene: dict[str, Any]) -> list[float]:
-    """Return the value of each pair: its accuracy after the last step, the mAA's summand.
-
-    Pairs of a list have no metres. Their value is 1 - error / 20 degrees, at least 0.
-    """
-    values = []
-    for pair in scene["pairs"]:
-        *_, accuracy = pair["accuracy_by_step"].values()
-        if accuracy is None:
-            angles = pair["rotation_error_degrees"], pair["translation_error_degrees"]
-            # Null is an infinite error.
-            largest = max(MAX_ANGLE if angle is None else angle for angle in angles)
-            accuracy = max(0.0, 1 - largest / MAX_ANGLE)
-        values.append(accuracy)
-    return values
+    """Return the value of each pair: its accuracy after the last step, the mAA's summand."""
+    return [[*pair["accuracy_by_step"].values()][-1] for pair in scene["pairs"]]
 
 
 def images_of(pair: dict[str, Any]) -> tuple[str, str]:
-    """Return the names of a pair's images from its id: SCENE;IMAGE-IMAGE, or NUMBER: IMAGE IMAGE."""
-    name = pair["pair"]
-    first, second = re.split(" " if ": " in name else "-", re.sub("^.*?(;|: )", "", name))
+    """Return the paths of a pair's images."""
+    first, second = pair["images"]
     return first, second
 
 

@@ -38,8 +38,7 @@ from mkpc_kaggle.data.competition import TrainScene, TruePair, read_train_side
 from mkpc_kaggle.engine.store.database import Store
 from mkpc_kaggle.engine.store.dataframes import pair_tables
 from mkpc_kaggle.engine.store.published import Published, read_images
-from mkpc_kaggle.evaluation.compare import Difference, paired_difference
-from mkpc_kaggle.evaluation.validate import error_of
+from mkpc_kaggle.evaluation.validate import Difference, error_of, paired_difference
 from mkpc_kaggle.geometry.coordinates import Matrix3
 from mkpc_kaggle.geometry.focal_prior import FocalConfig, FocalPrior, estimate_with_prior
 from mkpc_kaggle.geometry.metrics import PoseError, pair_accuracy

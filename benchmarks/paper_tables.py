@@ -7,34 +7,68 @@ run once; the last column counts the units that a row ran. After a kill, a rerun
 N` takes a sample of each list or scene, and `--matcher` replaces all matchers. Usage:
 
 python -m benchmarks.paper_tables --out DIR --weights DIR [--yfcc LIST IMAGES] [--scannet LIST IMAGES]
-    [--imc TRAIN_DIR] [--rows "1200,1600 + 1400" ...] [--pairs N] [--protocol superglue] [--matcher NAME]
+    [--imc TRAIN_DIR] [--rows "1200,1600 + 1400" ...] [--pairs N] [--matcher NAME]
 """
 
 import argparse
 import time
 import tomllib
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from math import nan
 from pathlib import Path
 from statistics import mean
+from typing import Any
 
-from mkpc_kaggle.data.competition import TrainScene, read_train_side
-from mkpc_kaggle.data.pairs import read_pairs
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.lists import read_pairs
+from mkpc_kaggle.data.competition import TrainScene, TruePair, read_train_side
+from mkpc_kaggle.data.images import read_size
 from mkpc_kaggle.engine.plan.budget import Budget
-from mkpc_kaggle.engine.session import Session, interruptible
+from mkpc_kaggle.engine.request import RunReport
+from mkpc_kaggle.engine.session import Session, interruptible, run_pairs
+from mkpc_kaggle.engine.store.dataframes import Results, by_pair, results
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.evaluation.validate import PROTOCOLS, Validation, by_protocol, validate
-from mkpc_kaggle.geometry.metrics import AUC_THRESHOLDS
-from mkpc_kaggle.geometry.robust import Method
+from mkpc_kaggle.evaluation.validate import validate
+from mkpc_kaggle.geometry.coordinates import Box, Matrix3, View
+from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.geometry.metrics import (
+    AUC_THRESHOLDS,
+    PoseError,
+    correct_matches,
+    pose_auc,
+    pose_error,
+)
+from mkpc_kaggle.geometry.robust import calibrate
+from mkpc_kaggle.geometry.two_view import cross_matrix
 from mkpc_kaggle.recipe import Recipe, Unit, load_recipe
-from mkpc_kaggle.setup.assembly import Assembly, assemble
+from mkpc_kaggle.setup.assembly import assemble
 
+FEWEST = 5  # matches that OpenCV needs for an E
+FARTHEST = 1e9  # of points in front of both cameras
 TABLES = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 
 
-def recipe_of(table: str, row: str, method: str, given: argparse.Namespace) -> Recipe:
-    """Return a row's recipe, with the protocol and the matcher of the command, if given."""
-    whole = load_recipe("imc2022" if table == "imc" else table)
+@dataclass(frozen=True)
+class ListScore:
+    """The score of a pair of a list by SuperGlue's evaluation.
+
+    Correct matches over all matches (precision), and over keypoints of image 0 (matching score), which is
+    NaN for matchers without keypoints.
+    """
+
+    error: PoseError
+    precision: float
+    matching_score: float
+
+
+def recipe_of(table: str, row: str, given: argparse.Namespace) -> Recipe:
+    """Return a row's recipe, with the matcher of the command, if given."""
+    known_as = "imc2022" if table == "imc" else str(Path(__file__).with_name(f"{table}.toml"))
+    whole = load_recipe(known_as)
     units: list[Unit] = []
     if table == "imc":
         # A row names one matcher of the ensemble, on whole images, or the whole ensemble.
@@ -44,18 +78,15 @@ def recipe_of(table: str, row: str, method: str, given: argparse.Namespace) -> R
         # "1200,1600 + 1400": long sides of stage 1, then of stage 2.
         for stage, sides in enumerate(row.split(" + "), start=1):
             units += [sized(whole.units[0], stage, side) for side in sides.split(",")]
+        # SuperGlue's script resizes by OpenCV's bilinear filter, without antialiasing.
+        units = [replace(unit, antialias=False) for unit in units]
     # With one matcher for all, units may become equal; each runs once.
     known = {}
     for unit in units:
         changed = replace(unit, matcher=given.matcher or unit.matcher)
         known[changed.name] = changed
     options = {} if given.matcher else whole.matchers
-    recipe = replace(whole, units=tuple(known.values()), matchers=options)
-    if table != "imc" and given.protocol in PROTOCOLS:
-        recipe = by_protocol(recipe, given.protocol)
-    # The table's estimator replaces the protocol's, whose threshold stays.
-    magsac = replace(recipe.magsac, method=Method(method))
-    return replace(recipe, name=f"{row} {method}", magsac=magsac)
+    return replace(whole, units=tuple(known.values()), matchers=options)
 
 
 def sized(unit: Unit, stage: int, side: str) -> Unit:
@@ -64,6 +95,79 @@ def sized(unit: Unit, stage: int, side: str) -> Unit:
     area = f"{height}x{width}" if height else ""
     long_side = 0 if area else int(side)
     return replace(unit, stage=stage, long_side=long_side, area=area, stretch=bool(area))
+
+
+def largest_side(recipe: Recipe) -> int:
+    """Return the largest long side of stage 1: the threshold counts its pixels."""
+    sides = [unit for unit in recipe.units if unit.stage == 1]
+    return max(unit.long_side or max(map(int, unit.area.split("x"))) for unit in sides)
+
+
+def scores_of_list(found: Results, scene: TrainScene, method: str, side: int) -> list[ListScore]:
+    """Score the matches of a run by SuperGlue's evaluation, with an estimator."""
+    names = [true.pair.id for true in scene.pairs]
+    units = by_pair(found.units)
+    scores = []
+    for true, match in zip(scene.pairs, found.matches(*names), strict=True):
+        matches = match.matches
+        error = PoseError.failed()
+        pose = pose_of(matches, true, method, side)
+        if pose is not None:
+            R, t = pose
+            E = cross_matrix(t) @ R
+            cameras = true.camera0.calibrated, true.camera1.calibrated
+            error = pose_error(E, *cameras, nan, R)
+        # All matches, not only inliers
+        correct = int(correct_matches(matches, true.camera0, true.camera1).sum())
+        ran = units.get(true.pair.id)
+        keypoints = 0 if ran is None else int(ran["keypoints"].sum())
+        # Dense matchers have matches and no keypoints.
+        is_known = ran is None or ((ran["keypoints"] > 0) | (ran["matches"] == 0)).all()
+        precision = correct / max(len(matches), 1)
+        scores.append(ListScore(error, precision, correct / max(keypoints, 1) if is_known else nan))
+    return scores
+
+
+def pose_of(
+    matches: Matches, true: TruePair, method: str, side: int
+) -> tuple[Matrix3, NDArray[np.float64]] | None:
+    """Return R and t of E, by OpenCV's ``method`` at a pixel of pictures with this long side.
+
+    ``None`` without an E, or with an image that cannot be read.
+    """
+    Ks = (true.camera0.K, true.camera1.K)
+    sizes = [read_size(path) for path in true.pair.images]
+    if len(matches) < FEWEST or None in sizes:
+        return None
+    rays = [calibrate(matches.points0, Ks[0]), calibrate(matches.points1, Ks[1])]
+    focals = np.array([K.diagonal()[:2] for K in Ks])
+    views = [View.fit(Box.whole(size), long_side=side) for size in sizes if size is not None]
+    scaled = focals * [view.scale for view in views]
+    # MAGSAC integrates its score up to a fixed number of pixels, so it needs points in pixels.
+    is_magsac = method == "magsac"
+    focal = float(focals.mean()) if is_magsac else 1.0
+    found: Any = cv2.findEssentialMat(
+        focal * rays[0],
+        focal * rays[1],
+        np.diag([focal, focal, 1.0]),
+        method=cv2.USAC_MAGSAC if is_magsac else cv2.RANSAC,
+        prob=0.99999,
+        threshold=focal / float(scaled.mean()),
+        maxIters=1000,
+    )
+    stacked, mask = found
+    if stacked is None:
+        return None
+    # Five points have up to ten solutions: the one with most inliers in front of both cameras.
+    best: tuple[int, Any, Any] = (0, None, None)
+    for E in np.split(stacked, len(stacked) // 3):
+        # OpenCV changes the mask.
+        count, R, t, *_ = cv2.recoverPose(
+            E, rays[0], rays[1], np.eye(3), FARTHEST, mask=mask.copy()
+        )
+        if count > best[0]:
+            best = (count, R, t.ravel())
+    return None if best[1] is None else best[1:]
 
 
 def table(name: str, given: argparse.Namespace) -> Iterator[str]:
@@ -84,21 +188,12 @@ def table(name: str, given: argparse.Namespace) -> Iterator[str]:
     for row, method, *published in TABLES[name]:
         if row not in (given.rows or [row]):
             continue
-        assembly = assemble(recipe_of(name, row, method, given), weights=given.weights)
-        scores = run(name, assembly, scenes, given)
-        assert scores.report is not None
-        if is_imc:
-            compared = [scores.maa()] * 2
-            cells = [f"{scores.maa():.4f}"]
-        else:
-            # In percent, as published.
-            compared = [100 * scores.auc(limit) for limit in AUC_THRESHOLDS]
-            shares = [100 * share for share in scores.matching]
-            cells = [f"{cell:.2f}" for cell in (*compared, *shares)]
+        recipe = replace(recipe_of(name, row, given), name=f"{row} {method}")
+        report, compared, cells = run(name, recipe, method, scenes, given)
         both = zip(compared, published, strict=True)
         differences.append([own - other for own, other in both])
         figures = [str(figure) for figure in published]
-        yield row_of([row, method, *cells, *figures, str(scores.report.units_run)])
+        yield row_of([row, method, *cells, *figures, str(report.units_run)])
     means = [f"{mean(column):+.4f}" for column in zip(*differences, strict=True)]
     # Below the published figures.
     empty = [""] * (len(heads) - len(means))
@@ -117,18 +212,39 @@ def scenes_of(name: str, given: argparse.Namespace) -> tuple[TrainScene, ...]:
 
 
 def run(
-    name: str, assembly: Assembly, scenes: tuple[TrainScene, ...], given: argparse.Namespace
-) -> Validation:
-    """Run a row's recipe. Raise ``KeyboardInterrupt`` if it was interrupted."""
+    name: str,
+    recipe: Recipe,
+    method: str,
+    scenes: tuple[TrainScene, ...],
+    given: argparse.Namespace,
+) -> tuple[RunReport, list[float], list[str]]:
+    """Run a row's recipe. Return its report, the compared figures, and all figures as text.
+
+    Raise ``KeyboardInterrupt`` if it was interrupted: the engine ends an interrupted run in order, with
+    results of a part of the pairs.
+    """
+    assembly = assemble(recipe, weights=given.weights)
     root = str(vars(given)[name][-1])
-    in_front = given.protocol in PROTOCOLS
     with interruptible() as interrupt:
         session = Session(given.out / name, Budget(time.monotonic()), interrupt, workers=None)
-        validation = validate(scenes, assembly, session, root, in_front=in_front)
-    # The engine ends an interrupted run in order, with scores of a part of the pairs.
+        if name == "imc":
+            scores = validate(scenes, assembly, session, root)
+            report = scores.report
+            assert report is not None
+        else:
+            (scene,) = scenes
+            report = run_pairs([true.pair for true in scene.pairs], assembly, session, root)
     if interrupt.is_set():
         raise KeyboardInterrupt
-    return validation
+    if name == "imc":
+        return report, [scores.maa()] * 2, [f"{scores.maa():.4f}"]
+    found = scores_of_list(results(session.work_dir), scene, method, largest_side(recipe))
+    errors = [score.error for score in found]
+    # In percent, as published.
+    compared = [100 * pose_auc(errors, limit) for limit in AUC_THRESHOLDS]
+    precision = 100 * mean(score.precision for score in found)
+    matching = 100 * mean(score.matching_score for score in found)
+    return report, compared, [f"{cell:.2f}" for cell in (*compared, precision, matching)]
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -144,9 +260,6 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--rows", nargs="+", choices=rows, help="default: all")
     parser.add_argument(
         "--pairs", type=int, help="of each list or scene, evenly spread; default: all"
-    )
-    parser.add_argument(
-        "--protocol", choices=[*PROTOCOLS, "none"], default="superglue", help="none: as the recipe"
     )
     parser.add_argument("--matcher")
     given = parser.parse_args(arguments)

@@ -14,8 +14,7 @@ from pathlib import Path
 from statistics import mean, median
 
 from mkpc_kaggle.data.competition import TrainScene, TruePair, read_train_side
-from mkpc_kaggle.evaluation.compare import paired_difference
-from mkpc_kaggle.evaluation.validate import error_of
+from mkpc_kaggle.evaluation.validate import error_of, paired_difference
 from mkpc_kaggle.geometry.metrics import PoseError, pair_accuracy
 from mkpc_kaggle.pipeline.pair import PairMatch
 from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from mkpc_kaggle.version import __version__
 
 if TYPE_CHECKING:
+    from mkpc_kaggle.engine.store.dataframes import results
     from mkpc_kaggle.errors import UserError
     from mkpc_kaggle.geometry.coordinates import Box, Size
     from mkpc_kaggle.geometry.critical_region import CriticalRegion, MkpcConfig, critical_region
@@ -23,7 +24,6 @@ if TYPE_CHECKING:
     from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher
     from mkpc_kaggle.recipe import Recipe, Unit
     from mkpc_kaggle.reconstruction.python import reconstruct
-    from mkpc_kaggle.reporting.notebook import results
 
 __all__ = [
     "Box",
@@ -69,7 +69,7 @@ _MODULES = {
     "Picture": "matchers.contract",
     "Colour": "matchers.contract",
     "reconstruct": "reconstruction.python",
-    "results": "reporting.notebook",
+    "results": "engine.store.dataframes",
     "UserError": "errors",
 }
 

@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mkpc_kaggle.evaluation.compare import gain_of
+from mkpc_kaggle.evaluation.validate import gain_of
 from mkpc_kaggle.geometry.metrics import ROTATION_THRESHOLDS, TRANSLATION_THRESHOLDS
-from mkpc_kaggle.reporting.figures import COLOURS, DROPPED, new_figure, plain_axes
+from mkpc_kaggle.pipeline.drawing import COLOURS, DROPPED, new_figure
+from mkpc_kaggle.reporting.figures import plain_axes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -17,18 +17,18 @@ from mkpc_kaggle.geometry.critical_region import Clusters, CriticalRegion, MkpcC
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.metrics import PoseError
 from mkpc_kaggle.geometry.robust import Estimate
-from mkpc_kaggle.pipeline.pair import PairMatch
-from mkpc_kaggle.recipe import Unit
-from mkpc_kaggle.reporting.figures import (
+from mkpc_kaggle.pipeline.drawing import (
     COLOURS,
     DROPPED,
     INLIER,
     OUTLIER,
     REGION,
     new_figure,
-    plain_axes,
     sample,
 )
+from mkpc_kaggle.pipeline.pair import PairMatch
+from mkpc_kaggle.recipe import Unit
+from mkpc_kaggle.reporting.figures import plain_axes
 from mkpc_kaggle.scene.models import Reconstruction, SfmModel, models_of
 
 if TYPE_CHECKING:

@@ -47,7 +47,7 @@ def test_a_recipe_of_the_package_loads_with_options_for_every_matcher(name):
         assert recipe.in_mode(mode).units[0] == recipe.units[0]
         assert mode is Mode.TWO_STAGE or {unit.stage for unit in recipe.in_mode(mode).units} == {1}
     # The paper's recipes estimate as the paper does; ours have a prior, and so need one permutation.
-    paper = name.startswith(("yfcc", "scannet", "imc2022"))
+    paper = name.startswith("imc2022")
     assert (recipe.focal is None) == paper
     assert recipe.magsac.permutations == (8 if paper else 1)
 
@@ -76,7 +76,7 @@ def test_recipes_for_every_user_name_no_weights_for_noncommercial_use_but_with_a
     slots = {file.slot for file in manifest() if "noncommercial" in file.licence}
     bound = {name for name in recipe.matcher_names if any(map(spec_of(name, "test").uses, slots))}
     free = {unit.matcher for unit in recipe.units if not unit.fallback}
-    assert bool(bound & free) == name.startswith(("yfcc", "scannet", "imc2022", "auto"))
+    assert bool(bound & free) == name.startswith(("imc2022", "auto"))
 
 
 @pytest.mark.parametrize("name", recipe_names())

@@ -21,7 +21,7 @@ from benchmarks.gpu.record import EXPECTED, Part
 from benchmarks.gpu.setup import Setup
 from benchmarks.gpu.trained import SLOTS
 from mkpc_kaggle.data.competition import read_test_side, submission_problems
-from mkpc_kaggle.engine.store.dataframes import read_results
+from mkpc_kaggle.engine.store.dataframes import results
 from mkpc_kaggle.weights import WeightStore
 
 UNITS = 2
@@ -203,7 +203,7 @@ def _run(case: Case, recipe: Path, setup: Setup, seconds: float, limit: int) -> 
     store = WeightStore(setup.weights)
     is_trained = all(store.file_of(slot) is not None for slot in SLOTS)
     words = ["--test-dir", test_dir, "--output", output, "--recipe", recipe, "--no-report"]
-    words += ["--no-scenes", "--explain", "--device", setup.device, "--workers", case.places]
+    words += ["--no-scenes", "--device", setup.device, "--workers", case.places]
     # The limit only ends a run that hangs.
     words += ["--time-limit", f"{seconds:.0f}s"]
     for directory in setup.weights:
@@ -224,11 +224,13 @@ def _run(case: Case, recipe: Path, setup: Setup, seconds: float, limit: int) -> 
         finally:
             process.kill()
             status = process.wait()
-    text = (home / "log.txt").read_text(errors="replace")
+    # The summary names a few faults, and run.log all of them, and the decisions.
+    logs = [home / "log.txt", home / "submission.work" / "run.log"]
+    text = "\n".join(file.read_text(errors="replace") for file in logs if file.exists())
     pairs = read_test_side(test_dir)
     good: dict[str, int] = {}  # results by pair
     with suppress(KeyError):  # no unit has a result
-        units = read_results(home / "submission.work").units
+        units = results(home / "submission.work").units
         counts = units[units["failure"] == ""]["pair"].value_counts()
         good = {str(pair): int(count) for pair, count in counts.items()}
     problems = submission_problems(output, [pair.id for pair in pairs])

@@ -25,25 +25,20 @@ COMMANDS = {
     "recipes": "list recipes; with a name, its units and missing weights",
     "weights": "list, verify, fetch and convert weight files",
     "check": "compare a submission.csv with the competition's format",
-    "journal": "a run's journal -> overview, tables for pandas, report.html",
+    "journal": "how far a run is, from its journal",
     "package": "write the folders to upload to Kaggle: a dataset and a notebook",
     "demo": "render a small test set with known poses",
 }
-START_FIELD = 22  # of /proc/PID/stat, in clock ticks since the machine's start
-MAX_AGE_S = 60.0  # of a process whose start counts
 EXIT_BAD_INPUT = 2
 EXIT_BROKEN_PIPE = 128 + 13  # a shell's status for SIGPIPE, which Windows does not define
 EXIT_INTERRUPTED = 128 + 2  # a shell's status for SIGINT
 
 
 def program(arguments: Sequence[str] | None = None) -> NoReturn:
-    """Run a command and end the process at once: an orderly exit takes a second or longer.
-
-    The time limit counts from the start of the process.
-    """
+    """Run a command and end the process at once: an orderly exit takes a second or longer."""
     try:  # Ctrl-C during slow imports is not an error
         former = os.environ.get("MPLCONFIGDIR")
-        status = main(arguments, process_start())
+        status = main(arguments)
         # Set by matplotlib if it cannot write below HOME. Matplotlib removes the directory only in
         # an orderly exit.
         if (made := os.environ.get("MPLCONFIGDIR")) != former:
@@ -56,32 +51,13 @@ def program(arguments: Sequence[str] | None = None) -> NoReturn:
     leave(status)
 
 
-def process_start() -> float:
-    """Return when this process was started, on the monotonic clock: before Python's own start.
-
-    The present time where the system does not say, and for a process that is older than a minute:
-    another program ran in it before, such as a shell script that ends with ``exec``.
-    """
-    now = time.monotonic()
-    with suppress(OSError, ValueError, IndexError, AttributeError):  # no Linux
-        # After the name in brackets, which may contain spaces, comes field 3.
-        fields = Path("/proc/self/stat").read_text().rpartition(")")[2].split()
-        seconds = int(fields[START_FIELD - 3]) / os.sysconf("SC_CLK_TCK")
-        age = time.clock_gettime(time.CLOCK_BOOTTIME) - seconds
-        if 0 <= age < MAX_AGE_S:
-            return now - age
-    return now
-
-
-def main(arguments: Sequence[str] | None = None, started: float | None = None) -> int:
+def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command. Return the exit status.
 
     0: done; 1: a check failed; 2: bad input; 130, 143: ended by a signal; 141: the reader of the
-    output closed the pipe. The time limit counts from ``started`` on the monotonic clock, by default
-    from the call, before the slow imports.
+    output closed the pipe. The time limit counts from the call, before the slow imports.
     """
-    if started is None:
-        started = time.monotonic()
+    started = time.monotonic()
     from mkpc_kaggle.errors import require_libraries
 
     try:

@@ -32,6 +32,8 @@ def run(arguments: argparse.Namespace) -> None:
     # NumPy takes no negative seed.
     if arguments.seed < 0:
         raise UserError("--seed: give 0 or more")
+    # Rendering takes a quarter of a minute.
+    print(f"rendering photographs to {arguments.out}", flush=True)
     with writing(f"--out {arguments.out}"):
         demo = write_demo(arguments.out, seed=arguments.seed)
     # The directories that the commands of the help text take.

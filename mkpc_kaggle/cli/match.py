@@ -10,10 +10,11 @@ from mkpc_kaggle.data.hloc import SUFFIX, HlocPair, require_h5py, write_hloc
 from mkpc_kaggle.data.outputs import RESULTS, replacing, require_apart
 from mkpc_kaggle.errors import UserError, plural, writing
 from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
+from mkpc_kaggle.pipeline.drawing import draw_pair
 from mkpc_kaggle.pipeline.pair import PairMatch
 from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher, as_image
 from mkpc_kaggle.progress import announced
-from mkpc_kaggle.reporting.figures import draw_pair, require_format, save
+from mkpc_kaggle.reporting.figures import require_format, save
 
 HELP = """\
 Match two images. Print the fundamental matrix F (x1^T F x0 = 0, pixel centres at integers), the

@@ -1,6 +1,7 @@
 """Options shared by several commands, and tables for the terminal."""
 
 import argparse
+import json
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from math import inf
@@ -8,12 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from mkpc_kaggle.data.competition import Pair, TrainScene, read_train_side
-from mkpc_kaggle.engine.console import Progress, drain, logger, queued
+from mkpc_kaggle.engine.console import drain, logger, queued
 from mkpc_kaggle.engine.plan.budget import Budget, monotonic_of, parse_duration
-from mkpc_kaggle.engine.request import RunReport
 from mkpc_kaggle.engine.session import Interrupt, Session
 from mkpc_kaggle.engine.workers.cluster import parse_workers
-from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.recipe import Mode, parse_setting
 from mkpc_kaggle.reporting.summary import left_out_line
 from mkpc_kaggle.setup.assembly import Assembly, assemble
@@ -89,6 +89,20 @@ def train_side_of(arguments: argparse.Namespace) -> tuple[TrainScene, ...]:
     )
 
 
+def add_json(parser: argparse.ArgumentParser) -> None:
+    """Add ``--json``."""
+    text = "write all figures, per pair too: of one run, or a list"
+    parser.add_argument("--json", type=Path, metavar="FILE", help=text)
+
+
+def write_json(arguments: argparse.Namespace, figures: Sequence[Any]) -> None:
+    """Write the figures of a run, or a list of those of several runs, to the file of ``--json``."""
+    if arguments.json is not None and figures:
+        text = json.dumps(figures[0] if len(figures) == 1 else figures, indent=1)
+        with writing(f"--json {arguments.json}"):
+            arguments.json.write_text(f"{text}\n", encoding="utf-8")
+
+
 def add_run(parser: argparse.ArgumentParser, time_limit: str | None) -> None:
     """Add the options of the engine; ``time_limit``: the default, ``None`` for no limit."""
     # A run's reader may be slow or hang.
@@ -106,8 +120,6 @@ def add_run(parser: argparse.ArgumentParser, time_limit: str | None) -> None:
         ray: use the Ray cluster of this machine, one worker per GPU, or per machine without GPUs; HOST:PORT as
         printed by `ray start --head`"""
     add("--workers", type=parse_workers, metavar="N|ray[://HOST:PORT]", help=text)
-    # At the end, because the plan changes with the measured costs.
-    add("--explain", action="store_true", help="print the plan at the end: what, when and why")
 
 
 def settings_of(arguments: argparse.Namespace) -> dict[str, Any]:
@@ -174,19 +186,13 @@ def finish(session: Session, page: Path | None, pairs: Sequence[Pair]) -> int:
 
     It is that of a received signal, else the session's.
     """
-    from mkpc_kaggle.reporting.report import report_run
+    from mkpc_kaggle.reporting.page import report_run
 
     if page is not None:
-        progress = Progress(session.budget)
-        logger.info(report_run(session.work_dir, page, session.must_end(), pairs, progress))
+        logger.info(report_run(session.work_dir, page, session.must_end(), pairs))
     if session.interrupt.signal:
         return 128 + session.interrupt.signal  # as shells do
     return session.status
-
-
-def plan_lines(arguments: argparse.Namespace, report: RunReport) -> list[str]:
-    """Return the plan (what, when and why) as lines with ``--explain``, and no lines without it."""
-    return ["plan:", *map(str, report.explanations)] if arguments.explain else []
 
 
 def print_table(rows: Sequence[tuple[str, ...]]) -> None:

@@ -1,7 +1,6 @@
 """The command ``reconstruct``."""
 
 import argparse
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -13,10 +12,8 @@ from mkpc_kaggle.data.masks import Masks
 from mkpc_kaggle.data.outputs import require_apart
 from mkpc_kaggle.engine.console import logger
 from mkpc_kaggle.engine.session import interruptible
-from mkpc_kaggle.engine.store.tables import MIN_PAIRS, NOT_RECONSTRUCTED
 from mkpc_kaggle.errors import UserError, plural
 from mkpc_kaggle.geometry.intrinsics import Rows
-from mkpc_kaggle.progress import format_duration
 from mkpc_kaggle.recipe import CameraSharing
 from mkpc_kaggle.reconstruction.coordinates import keep_coordinates
 from mkpc_kaggle.reconstruction.directory import (
@@ -28,7 +25,6 @@ from mkpc_kaggle.reconstruction.export import export_matches
 from mkpc_kaggle.reconstruction.folder import (
     Datasets,
     Ends,
-    batch_names,
     pair_list_line,
     read_folder,
     read_pair_list,
@@ -42,15 +38,7 @@ from mkpc_kaggle.reconstruction.priors import (
     read_intrinsics_table,
 )
 from mkpc_kaggle.reconstruction.run import FolderResult, for_cameras, reconstruct_folder
-from mkpc_kaggle.reporting.contradictions import adopted_lenses, contradictions
-from mkpc_kaggle.reporting.summary import (
-    chosen_candidates,
-    pending_lines,
-    trouble,
-    unpaired_sentences,
-    unreadable_images,
-    weakest_line,
-)
+from mkpc_kaggle.reporting.summary import summary, trouble
 
 HELP = """\
 Match the images of a folder with the engine that makes submissions, and reconstruct their cameras. Each folder
@@ -67,7 +55,7 @@ and for all datasets together:
                   and the uncertainty of each camera: rotation_sigma (degrees), centre_sigma (of the model's size),
                   focal_sigma (percent); see docs/folder.md
   submission.csv  with --format
-  report.html     the run, with an interactive view of each scene; summary.json has the same facts
+  report.html     the run, with the cameras and points of each scene in 3D if plotly is installed
   work/           the journal: after a kill, the same command resumes the run and makes the same files
 
 Points refer to the pixels of the stored file, as COLMAP reads it, without the EXIF orientation. A file that EXIF
@@ -187,7 +175,7 @@ def run(arguments: argparse.Namespace) -> int:
         unwritten = result.report.unwritten or result.report.unsaved
         if trouble(result.report) or unwritten or result.lost or result.earlier:
             session.status = 1
-        lines = [*options.plan_lines(arguments, result.report), *_lines(result, root)]
+        lines = [summary(result.report)]
         is_here = held.is_here and all(held_files.is_here for held_files in result.held.values())
         if is_here:
             written, problems = _write_more(arguments, datasets, result, session.must_end())
@@ -197,7 +185,7 @@ def run(arguments: argparse.Namespace) -> int:
             problems = [f"{out} was moved or replaced during the run; no more is written there"]
         if problems:
             session.status = 1
-        lines += [*problems, trouble(result.report), result.report.unwritten, f"results: {out}"]
+        lines += [*problems, result.report.unwritten, f"results: {out}"]
         logger.info("\n".join(filter(None, lines)))
         # A run without pairs has no report.
         page = out / "report.html" if result.pairs and is_here else None
@@ -257,44 +245,3 @@ def _effects(
         yield line
     if listed is not None:
         yield pair_list_line(listed, root, datasets)
-
-
-def _lines(result: FolderResult, root: Path) -> Iterator[str]:
-    """Yield lines about the run, each dataset and the errors."""
-    report = result.report
-    ended = f"{report.ending} after {format_duration(report.seconds)}"
-    done = f"{plural(report.units_run, 'unit')} run, {report.estimated} F estimated"
-    if report.units_failed:
-        done += f", {plural(report.units_failed, 'unit')} failed"
-    yield f"{plural(len(result.pairs), 'pair')}: {ended}; {done}"
-    # Of the datasets that the run reached
-    reasons = {scene.batch: scene.failure for scene in report.scenes}
-    batches = batch_names(root, result.cameras)
-    pairs = Counter(pair.group for pair in result.pairs)
-    for name, found in result.cameras.items():
-        models = Counter(placed.model for placed in found.values() if placed)
-        sizes = ", ".join(str(models[number]) for number in sorted(models))
-        batch = batches[name]
-        if models:
-            why = f"models of {sizes}"
-        elif batch in reasons:
-            why = reasons[batch]
-        elif pairs[batch] < MIN_PAIRS:
-            why = f"{plural(pairs[batch], 'pair')}; cameras need at least three matched images"
-        else:
-            why = f"{NOT_RECONSTRUCTED}, too little time"
-        if name in result.earlier:
-            why += " by an earlier run"
-        count = f"{models.total()} of {plural(len(found), 'image')} with a camera"
-        yield f"{batches[name]}: {count}: {why}"
-    for batch, sentence in unpaired_sentences(report):
-        yield f"{batch}: {sentence}"
-    for fact in (*chosen_candidates(report.scenes), *adopted_lenses(report.scenes)):
-        yield "{}: {} ({})".format(*fact)
-    yield from weakest_line(report.scenes)
-    for scene in report.scenes:
-        yield from (f"{scene.batch}: {sentence}" for sentence in contradictions(scene))
-    yield from pending_lines(report)
-    unreadable = unreadable_images(report.tables.pairs)
-    yield from (f"cannot be read: {failure}" for failure in unreadable[:MAX_LINES])
-    yield from (f"fault: {fault}" for fault in report.faults[:MAX_LINES])

@@ -52,18 +52,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="for the journal; default: NAME.work next to the output",
     )
     add("--fresh", action="store_true", help="delete the journal of an earlier run")
-    text = "a page about the run; default: NAME.html next to the output"
-    add("--report", type=Path, metavar="FILE.html", help=text)
-    add("--no-report", action="store_true", help="write no page")
+    text = "write no page; otherwise it is NAME.html next to the output"
+    add("--no-report", action="store_true", help=text)
 
 
 def run(arguments: argparse.Namespace) -> int:
     output: Path = arguments.output
     work_dir: Path = arguments.work_dir or output.parent / f"{output.stem}.work"
-    page = (
-        None if arguments.no_report else arguments.report or output.parent / f"{output.stem}.html"
-    )
-    files = {"--output": output, "--report": page}
+    page = None if arguments.no_report else output.parent / f"{output.stem}.html"
+    files = {"--output": output, "the report": page}
     inputs = [*test_side(arguments.test_dir), options.recipe_file(arguments)]
     require_apart(files, filter(None, inputs), work_dir, arguments.weights)
     with interruptible() as interrupt:
@@ -82,7 +79,6 @@ def run(arguments: argparse.Namespace) -> int:
             session.status = int(bool(report.unwritten or report.unsaved or trouble(report)))
             unwritten = f" is not the last version: {report.unwritten}" if report.unwritten else ""
             # A file that could not be replaced is an earlier version; it is complete, too.
-            lines = [*options.plan_lines(arguments, report), summary(report)]
             # Before the report: drawing may exceed the time limit.
-            logger.info("\n".join([*lines, f"submission: {output}{unwritten}"]))
+            logger.info(f"{summary(report)}\nsubmission: {output}{unwritten}")
             return options.finish(session, page, pairs)

@@ -15,7 +15,7 @@ from mkpc_kaggle.errors import UserError
 RESULTS = {
     "--output": (".csv",),
     "--json": (".json",),
-    "--report": (".html", ".htm"),
+    "the report": (".html",),
     "--out": (".png", ".jpg", ".pdf", ".svg"),
     "--save": (".npz", ".h5"),
     "--export": (".h5",),
@@ -44,7 +44,7 @@ def require_apart(
             raise UserError(f"{option} {str(path)!r} is a directory; name a file")
         if lost := _lost(option, files, precious, work_dir):
             raise UserError(f"{option} {path} would overwrite {lost}; name another file")
-        if option in ("--json", "--report") and not is_result and os.path.isfile(path):  # noqa: PTH113
+        if option in ("--json", "the report") and not is_result and os.path.isfile(path):  # noqa: PTH113
             raise UserError(
                 f"{option} {path} exists and is not a {RESULTS[option][0]} file; name another file"
             )

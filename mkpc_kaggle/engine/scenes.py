@@ -15,7 +15,6 @@ from mkpc_kaggle.engine.store.tables import (
     unmatched_scene,
 )
 from mkpc_kaggle.errors import plural
-from mkpc_kaggle.progress import format_duration
 from mkpc_kaggle.scene.candidates import ALL_UNITS, title_of
 from mkpc_kaggle.scene.sfm import Solution
 
@@ -53,7 +52,7 @@ class SceneWork:
         if export is not None:
             # From now on the files may be replaced, so they belong to no stored scene.
             run.store.remove(Export, batch)
-        job = SceneJob(
+        return SceneJob(
             batch,
             of_candidate(key, candidate),
             pairs,
@@ -67,14 +66,6 @@ class SceneWork:
             scene=key,
             is_whole=folder is not None,
         )
-        about = format_duration(run.costs.scene(job.matches))
-        text = f"reconstructing its cameras from {plural(len(pairs), 'pair')}"
-        if candidate != ALL_UNITS:
-            text += f", by the tracks of {title_of(candidate)}"
-            if export is not None:
-                text += ", again for its files"
-        run.progress.note(f"batch {batch}: {text}, about {about}")
-        return job
 
     def save(self, job: SceneJob, answer: Solution, seconds: float) -> None:
         """Save and use a scene, even if it is stale: the former scene is older still.
@@ -105,10 +96,6 @@ class SceneWork:
             outcome = "the best so far" if is_best else "not better"
             more = f" by the tracks of {title_of(job.candidate)}, {outcome}"
         run.log.note(EventKind.SCENE, f"{job.batch}: {text}{more}")
-        note = f"batch {job.batch}: {text} with a camera{more}"
-        if record.loose:
-            note += f", {record.loose} of them unknown to within the size of their model"
-        run.progress.note(note)
 
     def lose(self, job: SceneJob, failure: Failure) -> None:
         self._count_loss(job.batch, job.candidate, job.scene, failure, job.pairs)

@@ -172,7 +172,7 @@ class PairMatch:
                     raise ValueError("the match is not of files: call plot(image0, image1)")
                 source = self.files[number]
             image = as_image(source, name=f"image{number}")
-            if image.size != self.sizes[number]:
+            if self.sizes and image.size != self.sizes[number]:
                 raise ValueError(f"image{number} has another size than the matched image")
             images.append(image)
         return draw_pair(images[0], images[1], self, self.mkpc)

@@ -3,12 +3,12 @@
 import os
 import threading
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from mkpc_kaggle.data.images import Unreadable, has_usable_shape, read_image, read_size
 from mkpc_kaggle.data.masks import Masks
@@ -17,7 +17,6 @@ from mkpc_kaggle.engine.plan.budget import Budget
 from mkpc_kaggle.engine.request import RunReport, name_below
 from mkpc_kaggle.engine.session import Interrupt, Session, interruptible
 from mkpc_kaggle.engine.store.database import FILE_NAME
-from mkpc_kaggle.engine.store.tables import SceneRecord
 from mkpc_kaggle.errors import UserError, plural, temporary_directory
 from mkpc_kaggle.matchers.contract import Matcher
 from mkpc_kaggle.recipe import Recipe
@@ -32,32 +31,14 @@ from mkpc_kaggle.reconstruction.priors import (
     read_intrinsics_table,
 )
 from mkpc_kaggle.reconstruction.run import for_cameras, reconstruct_folder
-from mkpc_kaggle.reporting.contradictions import adopted_lenses, contradictions
+from mkpc_kaggle.reporting.summary import trouble, unreadable_images
 from mkpc_kaggle.scene.export import MODELS
 from mkpc_kaggle.scene.models import SfmModel
 from mkpc_kaggle.setup.arguments import PathSource, Weights, member_of, shown_value, weights_of
 from mkpc_kaggle.setup.assembly import Assembly, assemble
 from mkpc_kaggle.setup.availability import Licence
 
-if TYPE_CHECKING:
-    from mkpc_kaggle.reporting.view import SceneView
-
 COLMAP = "colmap"  # in the work directory, for COLMAP's files
-
-
-class Models(tuple[SfmModel, ...]):
-    """The models of :func:`reconstruct`, the largest first, which a notebook can show."""
-
-    __slots__ = ()
-
-    def show(self, *, metres_per_unit: float | None = None) -> "SceneView":
-        """Return an interactive view of cameras and points, the last value of a notebook's cell.
-
-        With ``metres_per_unit``, the scale of a single model, a bar shows a length.
-        """
-        from mkpc_kaggle.reporting.view import show  # jinja2 is slow to import
-
-        return show(self, metres_per_unit=metres_per_unit)
 
 
 def reconstruct(
@@ -74,7 +55,7 @@ def reconstruct(
     intrinsics: str | Path | None = None,
     progress: bool = True,
     work_dir: str | Path | None = None,
-) -> Models:
+) -> tuple[SfmModel, ...]:
     """Return the models of photographs: cameras and points by structure from motion.
 
     This is a run of the command ``reconstruct`` on one set of images, without a time limit.
@@ -100,8 +81,8 @@ def reconstruct(
 
     Returns
     -------
-    Models
-        A tuple of models, the largest first; empty if too few images match. Cameras refer to the
+    tuple of SfmModel
+        The largest model first; empty if too few images match. Cameras refer to the
         stored pixels of the files, as COLMAP reads them. ``colmap`` of a model is pycolmap's. It
         has one of several identical files; ``images`` has a camera for each of them.
 
@@ -137,7 +118,7 @@ def reconstruct(
         # An empty result without its reason would look like a success.
         count = plural(len(files), "image")
         logger.warning(f"no cameras: {count} given, and at least three matched images are needed")
-        return Models()
+        return ()
     require_readable(files)
     require_perspective(files)
     root = Path(os.path.commonpath([file.parent for file in files]))
@@ -176,11 +157,6 @@ def reconstruct(
         result = reconstruct_folder(root, {".": files}, assembly, session, out)
         if session.interrupt.is_set():
             raise KeyboardInterrupt
-        from mkpc_kaggle.reporting.summary import (
-            trouble,
-            unreadable_images,
-        )  # jinja2 is slow to import
-
         if reason := trouble(result.report):
             raise UserError(reason)
         # The models are complete, but the next call computes results again.
@@ -188,8 +164,6 @@ def reconstruct(
             logger.warning(result.report.unsaved)
         for failure in unreadable_images(result.report.tables.pairs):
             logger.warning(f"cannot be read: {failure}")
-        for line in lines_about_lenses(result.report.scenes):
-            logger.warning(line)
         # In the models of an earlier call, images may be missing, and so may their files.
         if result.lost:
             reason = next(iter(result.lost.values()))
@@ -198,7 +172,7 @@ def reconstruct(
         for line in no_models(result.report) or result.causes:
             logger.warning(line)
         names = {name_below(str(root), str(file)): name for file, name in given.items()}
-        return Models(
+        return tuple(
             with_copies(
                 complete_model(model, out / MODELS / str(number), names),
                 number,
@@ -207,14 +181,6 @@ def reconstruct(
             for scene in result.report.scenes
             for number, model in enumerate(scene.models)
         )
-
-
-def lines_about_lenses(scenes: Sequence[SceneRecord]) -> Iterator[str]:
-    """Yield the assumptions that photographs contradict, and the lenses that a K does not describe."""
-    for scene in scenes:
-        yield from contradictions(scene)
-    for name, value, _ in adopted_lenses(scenes):
-        yield f"{name}: {value}; K has no distortion, the field lens of each image has it"
 
 
 def no_models(report: RunReport) -> list[str]:

@@ -1,1 +1,1 @@
-"""Reports of a run: summary, tables, HTML page and figures."""
+"""The summary of a run, its page, and figures."""

@@ -1,4 +1,4 @@
-"""Figures of pairs, and their files."""
+"""Files of figures."""
 
 from io import BytesIO
 from pathlib import Path
@@ -6,42 +6,11 @@ from typing import TYPE_CHECKING
 
 from mkpc_kaggle.data.outputs import replacing
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.pipeline.drawing import (
-    COLOURS,
-    DPI,
-    DROPPED,
-    INLIER,
-    OUTLIER,
-    REGION,
-    draw_matches,
-    draw_pair,
-    draw_strip,
-    new_figure,
-    sample,
-)
+from mkpc_kaggle.pipeline.drawing import DPI, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-# Figures of a pair are drawn below this layer, for programs.
-__all__ = [
-    "COLOURS",
-    "DPI",
-    "DROPPED",
-    "INLIER",
-    "OUTLIER",
-    "REGION",
-    "draw_matches",
-    "draw_pair",
-    "draw_strip",
-    "encode",
-    "new_figure",
-    "plain_axes",
-    "require_format",
-    "sample",
-    "save",
-]
 
 
 def require_format(path: Path) -> None:

@@ -1,5 +1,4 @@
 import os
-import re
 import subprocess
 import sys
 import threading
@@ -12,8 +11,7 @@ import numpy as np
 import pytest
 from shared import run_command
 
-from mkpc_kaggle import cli
-from mkpc_kaggle.cli import COMMANDS, options, submit
+from mkpc_kaggle.cli import COMMANDS
 from mkpc_kaggle.data.competition import read_test_side, write_submission
 from mkpc_kaggle.demo import DemoSet
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
@@ -74,10 +72,10 @@ def test_a_recipe_is_listed_with_its_units_and_missing_weights(clean_environment
 
 def test_without_arguments_the_commands_are_printed(capsys):
     assert run_command() == 0
-    out = capsys.readouterr().out
+    out = " ".join(capsys.readouterr().out.split())
     assert out.startswith("usage: mkpc [-h] [--version] COMMAND ...")
     for name, summary in COMMANDS.items():
-        assert re.search(rf"^  {name} +{re.escape(summary)}", out, re.M), name
+        assert f" {name} {summary}" in out
 
 
 def test_check_accepts_a_whole_submission_and_refuses_one_with_a_missing_row(
@@ -178,39 +176,3 @@ def test_output_is_flushed_by_the_main_thread_before_a_command_ends(monkeypatch)
     # The process ends without waiting for its printing thread, and a slow reader would miss the end.
     assert stream.whole == (stream.getvalue(), threading.main_thread())
     assert "auto " in stream.getvalue()
-
-
-@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="only Linux has /proc")
-def test_the_time_limit_counts_from_the_start_of_the_process_and_not_from_the_imports():
-    # A name with spaces and brackets, as /proc shows it before the other fields
-    code = """
-import ctypes, time
-at_start = time.monotonic()
-ctypes.CDLL(None).prctl(15, b"a) S 1 (b")  # PR_SET_NAME
-from mkpc_kaggle.cli import process_start
-print(process_start(), at_start)
-"""
-    before = time.monotonic()
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    started, at_start = map(float, done.stdout.split())
-    tick = 2 / os.sysconf("SC_CLK_TCK")
-    assert before - tick <= started < at_start
-
-
-def test_a_process_that_ran_another_program_before_counts_from_now(monkeypatch):
-    # As after a shell script that prepares for an hour, and then calls exec
-    monkeypatch.setattr(cli, "MAX_AGE_S", 0.0)
-    before = time.monotonic()
-    assert cli.process_start() >= before
-
-
-def test_a_program_gives_its_start_to_the_budget(monkeypatch):
-    started = []
-
-    def run(arguments, **_):
-        started.append(options.budget_of(arguments).started)
-        return 0
-
-    monkeypatch.setattr(submit, "run", run)
-    assert cli.main(["submit", "--test-dir", "x"], 123.5) == 0
-    assert started == [123.5]

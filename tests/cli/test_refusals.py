@@ -42,7 +42,7 @@ REFUSALS = [
         f"{SUBMIT} --recipe small.toml --output small.toml",
         "would overwrite the input small.toml",
     ),
-    (f"{SUBMIT} --output s.html", "would overwrite --report"),
+    (f"{SUBMIT} --output s.html", "would overwrite the report"),
     (
         f"{SUBMIT} --output w/journal.sqlite --work-dir w",
         "would overwrite the work directory",
@@ -52,8 +52,6 @@ REFUSALS = [
         "would overwrite the input",
     ),
     ("validate --train-dir demo/train --json x.png", "exists and is not a .json file"),
-    ("journal w --report w/journal.sqlite", "would overwrite the work directory"),
-    ("journal w --report x.png", "exists and is not a .html file"),
     (f"{MATCH} x.png", "would overwrite the input"),
     (f"{MATCH} notes.xyz", "needs a suffix"),
     ("match x.png y.png --save x.png", "would overwrite the input"),

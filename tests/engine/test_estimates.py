@@ -15,13 +15,12 @@ from synthetic import QUICK, RECIPE, SyntheticMatcher, synthetic_pairs
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.request import Ending
 from mkpc_kaggle.engine.store.database import Store
-from mkpc_kaggle.engine.store.dataframes import matrices_of
+from mkpc_kaggle.engine.store.dataframes import matrices_of, results
 from mkpc_kaggle.engine.store.tables import PairEstimate, SceneRecord
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.robust import Method
 from mkpc_kaggle.pipeline.stages import Pipeline
 from mkpc_kaggle.recipe import CameraModel, CameraSharing, Recipe, SceneConfig
-from mkpc_kaggle.reporting.run_log import read_log
 from mkpc_kaggle.reporting.summary import summary
 
 ALONE = replace(RECIPE, scene=None)
@@ -72,7 +71,7 @@ def test_a_run_resumed_with_another_estimation_ends_with_the_bytes_of_a_fresh_on
         # Without the scene F is that of the pairs' own matches, which the journal has.
         estimated = 0 if name == "no scene" else 6
         assert (report.units_run, report.estimated) == (0, estimated)
-        stored = read_log(journal).recipe
+        stored = results(journal).recipe
         # F is of cameras without distortion.
         pinholes = {"camera_model": CameraModel.SIMPLE_PINHOLE}
         scene = recipe.scene and replace(recipe.scene, **pinholes)

@@ -29,11 +29,10 @@ from mkpc_kaggle.engine.plan.state import State
 from mkpc_kaggle.engine.request import Ending
 from mkpc_kaggle.engine.store import image_files
 from mkpc_kaggle.engine.store.database import Store
-from mkpc_kaggle.engine.store.dataframes import pair_tables
+from mkpc_kaggle.engine.store.dataframes import matrices_of, pair_tables, results
 from mkpc_kaggle.engine.store.published import Published
 from mkpc_kaggle.engine.store.tables import UnitPoints
 from mkpc_kaggle.engine.workers import worker
-from mkpc_kaggle.reporting.run_log import read_log
 
 ROOT = Path(__file__).resolve().parents[2]
 PATHS = [str(ROOT), str(ROOT / "tests" / "support")]
@@ -306,9 +305,9 @@ def test_scenes_are_reconstructed_after_the_terminal_closed(demo, small_recipe, 
     # As soon as something is printed: the processes of workers and scenes are started later.
     command = [*script, *arguments_of(demo, small_recipe, output)]
     assert on_a_terminal(command, is_read=True) == 0
-    log = read_log(tmp_path / "submission.work")
-    assert log.faults == []
-    assert len(log.scenes) == 1
+    found = results(tmp_path / "submission.work")
+    assert "fault" not in set(found.events["kind"])
+    assert len(found.scenes) == 1
 
 
 def python(code: str, *arguments: str) -> subprocess.CompletedProcess[str]:
@@ -397,7 +396,8 @@ def test_a_parent_killed_at_any_moment_leaves_a_complete_file_no_orphans_and_a_r
     subprocess.run([sys.executable, str(script), str(tmp_path)], check=True)
     # A process that was killed cannot remove its unfinished file; the next one does.
     assert list(tmp_path.glob(".*.part")) == []
-    assert matrices(read_log(tmp_path / "work")) == matrices(undisturbed)
+    written = matrices_of(results(tmp_path / "work").pairs)
+    assert written.tolist() == matrices_of(undisturbed.tables.pairs).tolist()
 
 
 GUARDED = """

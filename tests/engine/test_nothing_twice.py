@@ -26,7 +26,7 @@ from simulator import Scenario, memory_store, simulate
 from mkpc_kaggle.cli import main
 from mkpc_kaggle.demo import DemoSet
 from mkpc_kaggle.engine.request import Ending, RunReport
-from mkpc_kaggle.engine.store.dataframes import read_results
+from mkpc_kaggle.engine.store.dataframes import results
 
 FIRST = '{ stage = 1, matcher = "sift", long_side = 320 }'
 SECOND = '{ stage = 2, matcher = "sift", long_side = 400 }'
@@ -271,7 +271,7 @@ def test_a_lower_factor_runs_only_the_crops_that_it_adds(room: Room, capsys) -> 
         return int(re.findall(r"(\d+) units run", capsys.readouterr().out)[-1])
 
     assert units_run(10.0) == 0, "no pair of the demo's scenes needs a crop"
-    units = read_results(room.home / "a.work").units
+    units = results(room.home / "a.work").units
     crops = units[units["stage"] == 2]
     assert len(crops) == BEFORE
     assert not crops["is_needed"].any()

@@ -16,13 +16,13 @@ from mkpc_kaggle.engine.store.dataframes import (
     NOT_REACHED,
     matrices_of,
     pair_tables,
-    read_results,
+    regions_of,
+    results,
 )
 from mkpc_kaggle.engine.store.published import Published
 from mkpc_kaggle.engine.store.rows import to_bytes
 from mkpc_kaggle.engine.store.tables import ImageFile
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
-from mkpc_kaggle.reporting.run_log import regions_of
 
 
 def test_stored_results_are_read_after_reopening(whole: Room, tmp_path: Path) -> None:
@@ -56,7 +56,8 @@ def test_stored_results_are_read_after_reopening(whole: Room, tmp_path: Path) ->
 
 
 def test_results_are_data_frames_of_pairs_units_and_cameras(whole: Room, tmp_path: Path) -> None:
-    pairs, units, cameras = read_results(tmp_path)
+    found = results(tmp_path)
+    pairs, units, cameras = found.pairs, found.units, found.cameras
     assert pairs["pair"].tolist() == ["p0", "p1", "p2"]
     assert pairs["source"].tolist() == ["scene", "pair", "fallback"]
     assert pairs[["f11", "f33"]].iloc[0].tolist() == [3.0, 27.0]

@@ -29,13 +29,12 @@ from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.jobs import SceneJob
 from mkpc_kaggle.engine.request import Ending
 from mkpc_kaggle.engine.store.database import Store
-from mkpc_kaggle.engine.store.dataframes import matrices_of
+from mkpc_kaggle.engine.store.dataframes import matrices_of, results
 from mkpc_kaggle.engine.store.published import Published, read_images
 from mkpc_kaggle.engine.workers.worker import batch_pair, results_of
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.recipe import SceneConfig
-from mkpc_kaggle.reporting.report import report_page
-from mkpc_kaggle.reporting.run_log import read_log
+from mkpc_kaggle.reporting.page import page
 from mkpc_kaggle.reporting.summary import overview, summary
 from mkpc_kaggle.scene.choose import Reason
 from mkpc_kaggle.scene.sfm import Solution
@@ -62,15 +61,15 @@ def test_pairs_get_the_f_of_their_scene_and_keep_their_own(tmp_path, monkeypatch
     assert matrices(report) == own_matrices(pairs, tmp_path / "alone")
     assert report.tables.pairs["choice"][0] == Reason.CONTRADICTION
     assert np.array_equal(published[-1], chosen)
-    log = read_log(tmp_path / "work")
-    assert "pairs with an F: 6 of 6 (5 from scenes, 1 from their own matches)" in overview(log)
-    assert "images with a camera: 4 of 4 (in 1 batch)" in overview(log)
-    weakest = "weakest cameras, with the error of the centre: 3.png (3 %), 2.png (2 %), 1.png (1 %)"
-    assert weakest in overview(log)
-    page = report_page(log)
-    assert page.index("3.png</td>") < page.index("2.png</td>"), "the weakest camera first"
-    assert "both cameras are known" in page
-    assert all(len(match.results[0].matches) for _, match in log.weakest), "drawings have points"
+    found = results(tmp_path / "work")
+    assert "6 of 6 pairs with an F, 4 of 4 images with a camera" in overview(found)
+    assert "F: 5 from cameras, 1 from their own matches" in overview(found)
+    # The page has the counts of the terminal.
+    assert "4 of 4 images with a camera" in summary(report)
+    assert "4 of 4 images with a camera" in page(found)
+    assert "both cameras are known" in page(found)
+    (match,) = found.matches(pairs[0].id)
+    assert len(match.results[0].matches), "pictures have points"
 
 
 def test_a_focal_length_of_exif_goes_to_the_pairs_the_store_and_the_scene(tmp_path, monkeypatch):
@@ -147,7 +146,7 @@ def test_a_reconstruction_that_is_lost_costs_its_scene_alone_is_named_and_tried_
     (fault,) = report.faults[1:]
     assert fault.startswith(f"batch one was not reconstructed: {reason}")
     assert report.scenes[0].failure.startswith(reason)
-    assert f"  one: {reason}" in summary(report)
+    assert f"1 batch without cameras ({reason}" in summary(report)
     # pycolmap prints to the descriptors, which would tear the progress bar.
     assert capfd.readouterr() == ("", "")
     # Failures are not stored, so the same command tries the scene again, and matches nothing.

@@ -15,12 +15,11 @@ from mkpc_kaggle.engine.request import Ending
 from mkpc_kaggle.engine.store.database import FILE_NAME, Store
 from mkpc_kaggle.engine.store.dataframes import (
     pair_tables,
-    read_results,
+    results,
 )
 from mkpc_kaggle.engine.store.sqlite_file import connected
 from mkpc_kaggle.engine.store.tables import UnitPoints
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.reporting.run_log import read_log
 
 DAMAGES = [
     (
@@ -111,8 +110,7 @@ def test_a_row_that_does_not_fit_its_digest_is_missing_and_computed_again(
     with warnings.catch_warnings(record=True):
         warnings.simplefilter("always")
         try:  # a reader has the other rows, or one line
-            read_results(tmp_path)
-            read_log(tmp_path)
+            results(tmp_path)
         except UserError as error:
             assert "the run has not begun" in str(error)
     report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path)
@@ -123,7 +121,7 @@ def test_a_row_that_does_not_fit_its_digest_is_missing_and_computed_again(
     assert matrices(report) == matrices(undisturbed)
     again = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path)
     assert (again.faults, again.units_run, again.estimated) == ((), 0, 0)
-    assert len(read_results(tmp_path).units) == 36
+    assert len(results(tmp_path).units) == 36
 
 
 def edit(directory: Path, script: str) -> int:

@@ -18,12 +18,11 @@ from mkpc_kaggle.engine.request import Ending
 from mkpc_kaggle.engine.store.database import FILE_NAME, Store
 from mkpc_kaggle.engine.store.dataframes import (
     pair_tables,
-    read_results,
+    results,
 )
 from mkpc_kaggle.engine.store.sqlite_file import connected
 from mkpc_kaggle.engine.store.tables import UnitPoints
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.reporting.run_log import read_log, write_csv
 
 
 def test_a_reader_that_has_the_file_open_neither_blocks_a_run_nor_is_blocked(
@@ -66,16 +65,14 @@ def test_readers_in_a_loop_beside_a_run_work_or_have_one_line(pairs, undisturbed
     read = []
     refused = []
 
-    def loop(tables: Path) -> None:
+    def loop() -> None:
         while not ended.is_set():
             try:
-                read.append(len(read_results(work).pairs))
-                read_log(work)
-                write_csv(work, tables)
+                read.append(len(results(work).pairs))
             except UserError as error:
                 refused.append(str(error))
 
-    threads = [threading.Thread(target=loop, args=[tmp_path / name]) for name in "ab"]
+    threads = [threading.Thread(target=loop) for _ in range(2)]
     for thread in threads:
         thread.start()
     for _ in range(2):

@@ -1,4 +1,4 @@
-"""The tables of `benchmarks.crops`: gains by groups of scenes, on train sides and on lists."""
+"""The tables of `benchmarks.crops`: gains by groups of scenes."""
 
 import pytest
 
@@ -10,7 +10,7 @@ def run(accuracies):
     """The figures of a run on scenes of one pair each."""
     scenes = []
     for scene, accuracy in accuracies.items():
-        pair = {"pair": f"{scene};b-a", "accuracy_by_step": {"MAGSAC": 0.0, "+ prior": accuracy}}
+        pair = {"images": ["b", "a"], "accuracy_by_step": {"MAGSAC": 0.0, "+ prior": accuracy}}
         scenes.append({"scene": scene, "pairs": [pair]})
     return {"scenes": scenes}
 
@@ -27,21 +27,6 @@ def test_gains_are_those_of_the_last_layout_in_each_group_of_scenes():
         "chosen on": ["2", "0.1500", "0.4000", "+0.2500"],
         "confirmed on": ["1", "0.3000", "0.9000", "+0.6000"],
     }
-
-
-def test_pairs_of_a_list_count_by_their_larger_angular_error():
-    def listed(rotation, translation):
-        pair = {
-            "pair": "1: a/x-1.jpg a/x-2.jpg",
-            "accuracy_by_step": {"MAGSAC": None},
-            "rotation_error_degrees": rotation,
-            "translation_error_degrees": translation,
-        }
-        return {"scenes": [{"scene": "list", "pairs": [pair]}]}
-
-    lines = gain_lines([listed(None, 3.0), listed(2.0, 5.0)], ["one", "rule"], chosen="")
-    # An infinite error counts as 0, an error of 5 of 20 degrees as 0.75.
-    assert lines[-1].split()[:4] == ["all", "1", "0.0000", "0.7500"]
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)

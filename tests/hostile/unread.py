@@ -6,13 +6,12 @@ import zlib
 from collections.abc import Callable
 from pathlib import Path
 
-from attack import Case, Make, prepared
+from attack import Case, Make
 from images import chunk
 from room import IMAGES_TO, REPORTED, SUBMIT, encoded, picture
 
 HEAD = 33  # bytes of a PNG's signature and first chunk
 FOLDER = "D/test_images/b1"
-JOURNAL = "journal out/s.work --report out/r.html --test-dir D"
 COMMANDS = {  # and the end of its work
     "submit in its own process": (SUBMIT, "complete after"),
     "submit in a worker": (SUBMIT.replace("--workers 0", "--workers 1"), "complete after"),
@@ -25,7 +24,6 @@ COMMANDS = {  # and the end of its work
         f"match {FOLDER}/x.png {FOLDER}/y.png --recipe quick.toml --out out/p.png",
         "figure: out/p.png",
     ),
-    "a page from a journal": (JOURNAL, "out/r.html"),
 }
 
 
@@ -39,12 +37,10 @@ def extra_restart(number: int) -> bytes:
     return whole[: len(whole) // 2] + b"\xff\xd0" + whole[len(whole) // 2 :]
 
 
-def complained_of(make: Callable[[int], bytes], command: str) -> Make:
+def complained_of(make: Callable[[int], bytes]) -> Make:
     def write(room: Path) -> None:
         for number, name in enumerate("xyz"):
             (room / FOLDER / f"{name}.png").write_bytes(make(number))
-        if command == JOURNAL:
-            prepared(SUBMIT, room)
 
     return write
 
@@ -68,7 +64,7 @@ CASES = [
         "unread",
         f"{name}: {complaint}",
         command,
-        complained_of(make, command),
+        complained_of(make),
         (0, 1),
         says,
         stderr=full_pipe,

@@ -104,13 +104,12 @@ PRINTED = {
         "2 files, 0 refused, 0 missing",
         "1 of 1 pair with an F",
         r"\n1:aliked_lightglue@\d+ +1 +[1-9]",
-        "pairs that need their crops: 0 of 1",
     ),
     WEIGHTS: (
         "3 files, 0 refused, 0 missing",
         "1:xfeat_lighterglue@1024 ",
         "1:aliked@1024 ",
-        "`mkpc recipes auto` lists them",
+        "left out, no weights: ",
     ),
     None: ("RootSIFT only; ",),
 }

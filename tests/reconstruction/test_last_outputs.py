@@ -70,7 +70,7 @@ def test_a_file_that_cannot_be_written_is_a_line_and_the_exit_status(
     assert run_command(*command(home), "--export", export_to) == 1
     said = capsys.readouterr().out
     assert words in said
-    assert "images with a camera" in said
+    assert "with a camera" in said
     assert report.exists()
     # The others were written.
     assert export_to.exists() == (name != "export")

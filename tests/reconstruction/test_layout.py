@@ -22,7 +22,6 @@ from mkpc_kaggle.reconstruction.layout import (
     write_sparse,
 )
 from mkpc_kaggle.reconstruction.run import forget_coordinates
-from mkpc_kaggle.reporting.report import linked_images
 from mkpc_kaggle.scene.align import REFERENCE
 
 
@@ -304,8 +303,6 @@ def test_a_photograph_with_an_accent_has_an_ascii_name_for_other_programs(tmp_pa
     assert all(path.is_file() for path in found.paths)
     original = pycolmap.Reconstruction(tmp_path / "out" / "models" / "0")
     assert name in {image.name for image in original.images.values()}
-    pictures = linked_images(tmp_path / "out", "images")
-    assert pictures[str(root / name)].name == "00e.png"
 
 
 def test_points_of_webp_photographs_have_their_colours(tmp_path):

@@ -31,8 +31,9 @@ from mkpc_kaggle.reconstruction.priors import (
     intrinsics_line,
     read_intrinsics_table,
 )
-from mkpc_kaggle.reconstruction.python import Models, reconstruct
+from mkpc_kaggle.reconstruction.python import reconstruct
 from mkpc_kaggle.reconstruction.run import FolderResult, for_cameras, reconstruct_folder
+from mkpc_kaggle.scene.models import SfmModel
 from mkpc_kaggle.setup.assembly import assemble
 
 HEAD = "image,model,parameters,sigma\n"
@@ -464,7 +465,7 @@ def test_python_takes_masks_and_intrinsics_as_the_command_does(tmp_path):
     table = tmp_path / "known.csv"
     table.write_text(f"{HEAD}00.png,SIMPLE_PINHOLE,901 400 300,fixed\n")
 
-    def models(**priors: object) -> Models:
+    def models(**priors: object) -> tuple[SfmModel, ...]:
         given = {"synthetic": MixedMatcher()}
         return reconstruct(files, RECIPE, device="cpu", matchers=given, **priors)
 

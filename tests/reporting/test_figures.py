@@ -11,9 +11,10 @@ from mkpc_kaggle.geometry.coordinates import Box, Size
 from mkpc_kaggle.geometry.critical_region import CriticalRegion, RegionReason
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, Estimate, ModelKind
+from mkpc_kaggle.pipeline.drawing import draw_strip
 from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
 from mkpc_kaggle.recipe import Unit
-from mkpc_kaggle.reporting.figures import draw_strip, encode
+from mkpc_kaggle.reporting.figures import encode
 from mkpc_kaggle.scene.models import RegisteredImage, SfmModel
 from mkpc_kaggle.scene.view_graph import BatchImage
 

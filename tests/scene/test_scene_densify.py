@@ -11,9 +11,8 @@ from synthetic import RECIPE, SyntheticMatcher, synthetic_pairs
 
 from mkpc_kaggle.engine.plan.state import State
 from mkpc_kaggle.engine.request import Ending
-from mkpc_kaggle.engine.store.dataframes import matrices_of
+from mkpc_kaggle.engine.store.dataframes import matrices_of, results
 from mkpc_kaggle.recipe import SceneConfig
-from mkpc_kaggle.reporting.run_log import read_log
 from mkpc_kaggle.scene.densify import extra_pairs
 
 # Each of six images with the next only.
@@ -74,6 +73,6 @@ def test_a_sparse_batch_has_a_scene_by_pairs_that_no_row_names(tmp_path):
     assert len(matcher.calls) == 12, "two pairs an image"
     # Extra pairs are in no result, table or report.
     assert set(published) == {5}
-    assert len(read_log(work).tables.pairs) == 5
+    assert len(results(work).pairs) == 5
     again = run(asked, recipe, SyntheticMatcher(), work)
     assert again.scenes == report.scenes

@@ -1,4 +1,4 @@
-"""Writes pairs in the format that :mod:`mkpc_kaggle.data.pairs` reads."""
+"""Writes pairs in the format that :mod:`benchmarks.lists` reads."""
 
 from collections.abc import Iterable
 from pathlib import Path

@@ -6,20 +6,27 @@ result is a field in :mod:`tables`, the line that computes it, and a line of a q
 
 import json
 import sqlite3
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mkpc_kaggle.engine.console import Event, read_events
 from mkpc_kaggle.engine.store.database import Store
+from mkpc_kaggle.engine.store.image_files import stored_digests
 from mkpc_kaggle.engine.store.published import Published
 from mkpc_kaggle.engine.store.sqlite_file import connected
 from mkpc_kaggle.engine.store.tables import (
     LAYOUTS,
+    MIN_PAIRS,
+    NO_CAMERAS,
+    NOT_RECONSTRUCTED,
     SCHEMA,
+    About,
     ImageFile,
     PairEstimate,
     PublishedPair,
@@ -27,8 +34,20 @@ from mkpc_kaggle.engine.store.tables import (
     SceneRecord,
     UnitPoints,
 )
+from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.geometry.coordinates import Box, Matrix3
+from mkpc_kaggle.geometry.critical_region import CriticalRegion, RegionReason
+from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
-from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
+from mkpc_kaggle.geometry.robust import (
+    FALLBACK_FUNDAMENTAL,
+    Estimate,
+    ModelKind,
+    sampson_distances,
+)
+from mkpc_kaggle.pipeline.pair import PairMatch, Regions, UnitResult
+from mkpc_kaggle.recipe import Recipe, recipe_of
+from mkpc_kaggle.scene.candidates import title_of
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -237,23 +256,83 @@ CAMERAS = Query(
     ORDER BY used.id, model.key, camera.key, alike.position
     """,
 )
+SCENE_COLUMNS = ["batch", "images", "cameras", "models", "points"]
+SCENE_COLUMNS += ["reprojection_error", "seconds", "candidate", "failure", "missing"]
 SIGMAS = ["rotation_sigma", "centre_sigma", "focal_sigma"]
 
 
-class Results(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Results:
     """The results of a run. ``pairs`` has a row for each pair, ``units`` for each unit of a pair.
 
     ``cameras`` has a row for each camera of each model; identical files share a camera, and each
-    has a row. Columns that name a pair have its id. Columns that name an image have its path below
-    the directory of the run's images. ``f11`` to ``f33`` of ``pairs`` are the matrix of ``model``:
+    has a row. ``scenes`` has a row for each batch: numbers of images, cameras, models and points, the mean
+    reprojection error in pixels, whose tracks were used, the reason if there are no cameras, and the images
+    of a folder without a camera. Columns that name a pair have its id. Columns that name an image have its
+    path below the directory of the run's images. ``f11`` to ``f33`` of ``pairs`` are the matrix of ``model``:
     F, or E for a pair with known intrinsics. ``choice`` is the reason why it is the scene's or not,
     ``units`` the number of units that ran or failed, and ``error`` the error that left the pair without
-    an F, if it was not for few matches.
+    an F, if it was not for few matches. ``events`` are those of the last session, such as faults.
     """
 
     pairs: "DataFrame"
     units: "DataFrame"
     cameras: "DataFrame"
+    scenes: "DataFrame"
+    events: Sequence[Event]
+    about: About
+    directory: Path
+    # Points (P, 3) of each model, of the longest tracks, by batch and number of the model
+    points: Mapping[tuple[str, int], NDArray[np.float64]]
+
+    @property
+    def recipe(self) -> Recipe:
+        """The recipe as it ran: its file may have changed since."""
+        settings = dict(self.about.recipe)
+        return recipe_of(settings, settings.pop("name"))
+
+    def matches(self, *pairs: str) -> Iterator[PairMatch]:
+        """Yield the matches, critical regions and own F of pairs, by id, to plot them.
+
+        An E has no residuals in pixels, so its pair has no inliers here.
+        """
+        recipe = self.recipe
+        units = {unit.name: unit for unit in recipe.units}
+        with Store.read(self.directory) as store:
+            published = Published.of(store)
+            tables = pair_tables(store, published)
+            regions = by_pair(tables.regions)
+            rows = {row.id: row for row in published.rows}
+            for row in map(rows.__getitem__, pairs):
+                points = published.points_of(store, row)
+                results = tuple(UnitResult(units[name], found) for name, found in points.items())
+                F = tables.estimates["F"][row.number]
+                count = tables.pairs["inliers"][row.number] if row.model == ModelKind.F else 0
+                estimate = nearest_to(F, results, count, tables.pairs["failure"][row.number])
+                crops = regions_of(regions[row.id]) if row.id in regions else None
+                yield PairMatch(results, crops, estimate, mkpc=recipe.mkpc)
+
+
+def nearest_to(F: Matrix3, results: Iterable[UnitResult], count: int, failure: str) -> Estimate:
+    """Return the estimate F of a pair; its inliers are the ``count`` matches that are nearest to F."""
+    distances = sampson_distances(F, Matches.concatenate(each.matches for each in results))
+    inliers = np.zeros(len(distances), bool)
+    inliers[np.argsort(distances, kind="stable")[:count]] = True
+    return Estimate(ModelKind.F, F, inliers, failure)
+
+
+def regions_of(rows: "DataFrame") -> Regions:
+    """Return the critical regions of a pair from its two rows in the table of regions."""
+    first, second = (
+        CriticalRegion(
+            Box(row["left"], row["top"], row["right"], row["bottom"]),
+            RegionReason(row["reason"]),
+            row["clusters"],
+            row["kept"],
+        )
+        for row in rows.to_dict("records")
+    )
+    return first, second
 
 
 class PairTables(NamedTuple):
@@ -269,16 +348,103 @@ class PairTables(NamedTuple):
     estimates: "DataFrame"
 
 
-def read_results(directory: Path | str) -> Results:
-    """Return the results in a work directory (NAME.work), during a run or after it.
+def results(directory: Path | str) -> Results:
+    """Return the results in a work directory, during a run or after it.
 
-    Raises :class:`UserError` if the store is missing, damaged, or of another format.
+    Parameters
+    ----------
+    directory : str or Path
+        NAME.work of a submission, ``--work-dir``, or ``work_dir`` of :func:`reconstruct`.
+
+    Returns
+    -------
+    Results
+        The DataFrames ``pairs``, ``units``, ``cameras`` and ``scenes``, and more facts.
+
+    Raises
+    ------
+    UserError
+        If the store is missing, damaged, of another format, or of a run that has not begun.
+
+    Examples
+    --------
+    >>> from mkpc_kaggle import reconstruct, results
+    >>> models = reconstruct(["a.jpg", "b.jpg"], "sift", work_dir="work", progress=False)
+    >>> tables = results("work")
+    >>> tables.pairs[["image0", "image1", "model"]].values.tolist()
+    [['a.jpg', 'b.jpg', 'F']]
     """
     with Store.read(Path(directory)) as store:
-        with published_results(store) as database:
-            found = Results(_pairs(database), UNITS.frame(database), _cameras(database))
+        published = Published.of(store)
+        about = published.run.about
+        # A store that was opened, and then ended by a signal before the first publication
+        if not about.recipe:
+            store.warn_of_damage()
+            raise UserError(f"{directory}: the run has not begun, or was stopped at its start")
+        with published_results(store, published) as database:
+            pairs = _pairs(database)
+            units = UNITS.frame(database)
+            cameras = _cameras(database)
+        scenes = [*published.scenes_of(store).values()]
+        if about.recipe.get("scene"):
+            scenes += missing_scenes(pairs, {scene.batch for scene in scenes})
+        digests = stored_digests(store, published.image_names)
         store.warn_of_damage()
-    return found
+    points = {
+        (scene.batch, number): model.points
+        for scene in scenes
+        for number, model in enumerate(scene.models)
+    }
+    table = scene_table(scenes, about.files, digests)
+    events = read_events(Path(directory))
+    return Results(pairs, units, cameras, table, events, about, Path(directory), points)
+
+
+def missing_scenes(pairs: "DataFrame", known: Collection[str]) -> Iterator[SceneRecord]:
+    """Yield a record without cameras for each further batch that could have a scene."""
+    for batch, members in pairs.groupby("group", sort=False):
+        if batch not in known and len(members) >= MIN_PAIRS:
+            may_match = (members["matches"] > 0) | (members["failure"] == NOT_REACHED)
+            images = {*members["image0"], *members["image1"]}
+            failure = NOT_RECONSTRUCTED if may_match.any() else NO_CAMERAS
+            yield SceneRecord(str(batch), images=len(images), failure=failure)
+
+
+def scene_table(
+    scenes: Iterable[SceneRecord],
+    files: Mapping[str, Sequence[str]],
+    digests: Mapping[str, str],
+) -> "DataFrame":
+    """Return the table of scenes.
+
+    ``files`` has the images of each dataset of a folder, also those in no pair, and ``digests`` their
+    contents: identical files share a camera. Without files, as in a submission, distinct images count.
+    """
+    from pandas import DataFrame
+
+    rows = []
+    for scene in scenes:
+        images = scene.images
+        cameras = scene.registered
+        missing: list[str] = []
+        if scene.batch in files:
+            names = files[scene.batch]
+            placed = {found.image.digest for model in scene.models for found in model.images}
+            missing = [name for name in names if digests.get(name) not in placed]
+            images = len(names)
+            cameras = images - len(missing)
+        # A model without points has no error, and a weight that is not 0: the sum must not vanish.
+        weights = [max(1, sum(found.points for found in each.images)) for each in scene.models]
+        errors = [each.reprojection_error for each in scene.models]
+        error = float(np.average(errors, weights=weights)) if errors else np.nan
+        counts = (images, cameras, len(errors), scene.points, error, scene.seconds)
+        text = (title_of(scene.candidate), scene.failure)
+        rows.append((scene.batch, *counts, *text, tuple(missing)))
+    for batch in files.keys() - {row[0] for row in rows}:
+        names = files[batch]
+        few = "at least three matched images are needed"
+        rows.append((batch, len(names), 0, 0, 0, np.nan, 0.0, "", few, tuple(names)))
+    return DataFrame(rows, columns=SCENE_COLUMNS)
 
 
 def pair_tables(store: Store, published: Published | None = None) -> PairTables:

@@ -3,18 +3,11 @@
 One line per pair: ``name0 name1 turns0 turns1 K0 K1 T_0to1``, separated by blanks. Names are paths
 under the image root. ``turns`` are the counter-clockwise quarter turns that set an image upright,
 after its EXIF rotation. K (9 numbers) and T (16) are row-major and refer to the stored pixels. With
-T = [R t; 0 1], X_1 = R X_0 + t. A ``.npz`` file, or a directory of them, is a list of
-MegaDepth-1500 in LoFTR's format ``scene_info``.
+T = [R t; 0 1], X_1 = R X_0 + t.
 """
 
-import pickle
-import zipfile
-from collections.abc import Iterable, Iterator
-from io import BytesIO
-from itertools import chain
 from math import nan
 from pathlib import Path, PureWindowsPath
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,42 +21,23 @@ from mkpc_kaggle.geometry.coordinates import Matrix3
 FIELDS = 2 + 2 + 9 + 9 + 16
 EXPECTED = "name0 name1 turns0 turns1 K0 (9 numbers) K1 (9) T_0to1 (16)"
 MAX_SKEWNESS = 1e-3  # deviation of R R^T from the identity; files have poses of few digits
-# The only names that pickled arrays need. Any other name might run code.
-NAMES = {
-    "ndarray": np.ndarray,
-    "dtype": np.dtype,
-    "encode": lambda text, _: text.encode("latin-1"),
-    # Their modules differ between NumPy 1 and 2, so they are taken from NumPy's own pickles.
-    "_reconstruct": np.empty(0).__reduce__()[0],
-    "scalar": np.float64(0).__reduce__()[0],
-}
 
 
 def read_pairs(file: Path, image_root: Path, *, most: int | None = None) -> TrainScene:
-    """Return the pairs of a list as a scene of unknown scale, with intrinsics to estimate E.
+    """Return the pairs of a list as a scene of unknown scale.
 
     ``most`` limits the pairs, which are then evenly spread. An unreadable image is not an error
     here. Raises :class:`UserError` for a list without pairs and for a malformed line.
     """
     if not image_root.is_dir():
-        raise UserError(f"--image-root {image_root}: no such directory")
+        raise UserError(f"{image_root}: no such directory")
     pairs = []
-    for number, line in enumerate(_lines(file), start=1):
+    for number, line in enumerate(read_text(file).splitlines(), start=1):
         if line.split():
             pairs.append(parse_line(line, file, number, image_root))
     if not pairs:
         raise UserError(f"{file} has no pairs; expected lines {EXPECTED}")
     return TrainScene(file.stem, nan, tuple(evenly_spread(pairs, most)))
-
-
-def _lines(file: Path) -> Iterable[str]:
-    """Return the lines of a list: a text file, a ``.npz`` file or a directory of these."""
-    infos = [file] if file.suffix == ".npz" else []
-    if file.is_dir():
-        infos = sorted(file.glob("*.npz"))
-    if infos:
-        return chain.from_iterable(map(lines_of_scene_info, infos))
-    return read_text(file).splitlines()
 
 
 def parse_line(line: str, file: Path, number: int, image_root: Path) -> TruePair:
@@ -99,7 +73,7 @@ def parse_line(line: str, file: Path, number: int, image_root: Path) -> TruePair
     for name, times in zip(names, turns, strict=True):
         labels.append(f"{name} turned {times}" if times else name)
     file0, file1 = (str(image_root / name) for name in names)
-    pair = Pair(f"{number}: {' '.join(labels)}", file.stem, file0, file1, (K0, K1), turns)
+    pair = Pair(f"{number}: {' '.join(labels)}", file.stem, file0, file1, turns=turns)
     # The first camera is the world.
     camera0 = Camera(K0, np.eye(3), np.zeros(3))
     camera1 = Camera(K1, T[:3, :3], T[:3, 3])
@@ -123,44 +97,3 @@ def _problem(turns: tuple[int, int], K0: Matrix3, K1: Matrix3, T: NDArray[np.flo
     if not is_rotation or tuple(T[3]) != (0, 0, 0, 1):
         return "T_0to1 = [R t; 0 0 0 1] with R a rotation"
     return ""
-
-
-def lines_of_scene_info(file: Path) -> Iterator[str]:
-    """Yield a line of the list for each pair of a ``scene_info`` file.
-
-    No code of the file is executed. A pair has two indices into ``image_paths``, ``intrinsics``
-    (3, 3) and ``poses`` (4, 4), world to camera. Raises :class:`UserError` for any other file.
-    """
-    try:
-        with zipfile.ZipFile(file) as archive:
-            names = ("pair_infos", "image_paths", "intrinsics", "poses")
-            infos, paths, Ks, poses = (_array(archive, f"{name}.npy") for name in names)
-        for (i, j), *_ in infos:
-            pose0 = np.asarray(poses[i], float)
-            pose1 = np.asarray(poses[j], float)
-            T = pose1 @ np.linalg.inv(pose0)  # from camera 0 to camera 1
-            matrices = [np.ravel(matrix) for matrix in (Ks[i], Ks[j], T)]
-            cells = [f"{number:.17g}" for number in np.concatenate(matrices)]
-            images = f"{paths[i]} {paths[j]}"
-            yield " ".join([images, "0 0", *cells])
-    except Exception as error:  # a pickle may raise anything
-        raise UserError(f"{file} is not a scene_info of MegaDepth: {error}") from error
-
-
-class _Arrays(pickle.Unpickler):
-    """An unpickler of arrays, which refuses everything else."""
-
-    def find_class(self, module: str, name: str) -> Any:
-        if module.partition(".")[0] not in ("numpy", "_codecs") or name not in NAMES:
-            raise pickle.UnpicklingError(f"it names {module}.{name}, which no array needs")
-        return NAMES[name]
-
-
-def _array(archive: zipfile.ZipFile, name: str) -> Any:
-    """Return an array of an archive, also one of objects."""
-    # A longer array is cut off, so that reading it fails.
-    stream = BytesIO(archive.open(name).read(1 << 28))
-    try:
-        return np.lib.format.read_array(stream, allow_pickle=False)
-    except ValueError:  # an array of objects: its header has been read, and its pickle follows
-        return _Arrays(stream).load()
