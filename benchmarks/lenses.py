@@ -1,16 +1,15 @@
-"""Whether the lenses that photographs show should be adopted: pinholes against ``camera_model`` AUTO.
+"""Cameras of pinholes against SIMPLE_RADIAL, the lens of `reconstruct`.
 
 python -m benchmarks.lenses --train-dir DIR --out DIR [--scenes NAME ...] [--lenses K ...]
     [--images 8] [--seeds 4] [--first 14]
 
 The photographs of a scene, seen through a lens with the radial coefficient K, are matched once by
 RootSIFT, as by ``mkpc reconstruct``. Each draw of images is then reconstructed twice from the same
-matches. A draw that shows no lens has equal cameras, so it is reconstructed once.
+matches.
 
 The table has the accuracy of poses: mAA over the pairs with a covisibility of at least 0.1, from the
 two cameras with the true intrinsics, 0 without cameras; the largest error of a centre after a
-similarity, as a share of the model's size; and the largest and the median error of a centre over its
-own sigma. Medians are over draws.
+similarity, as a share of the model's size (median over draws); and CPU seconds.
 """
 
 import argparse
@@ -19,7 +18,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from statistics import fmean, median
+from statistics import fmean
 from time import process_time
 
 import cv2
@@ -56,7 +55,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=4)
     parser.add_argument("--first", type=int, default=14, help="images of a scene that are matched")
     arguments = parser.parse_args()
-    heads = "scene", "k", "draws", "adopted", "mAA", "error %", "error / sigma", "median", "s"
+    heads = "scene", "k", "draws", "mAA", "error %", "s"
     print("|", " | ".join(heads), "|", flush=True)
     print("|", " | ".join(["---"] * len(heads)), "|", flush=True)
     for name in arguments.scenes:
@@ -127,18 +126,15 @@ class Scores:
 
     accuracy: float
     error: float
-    worst_ratio: float
-    median_ratio: float
     seconds: float
 
 
 @dataclass(frozen=True)
 class Draw:
-    """Scores by pinholes and by AUTO, and whether AUTO has adopted a lens."""
+    """Scores by pinholes and by lenses."""
 
     pinholes: Scores
-    auto: Scores
-    is_adopted: bool
+    lenses: Scores
 
 
 def draw_of(scene: TrainScene, pairs: Sequence[BatchPair], images: int, seed: int) -> Draw:
@@ -147,13 +143,11 @@ def draw_of(scene: TrainScene, pairs: Sequence[BatchPair], images: int, seed: in
     chosen = set(np.random.default_rng(seed).permutation(names)[:images].tolist())
     drawn = [pair for pair in pairs if chosen >= {pair.image0.name, pair.image1.name}]
     true = [pair for pair in scene.pairs if chosen >= set(stems_of(pair))]
-    pinholes, seconds = reconstructed(drawn, CameraModel.SIMPLE_PINHOLE)
-    before = scores_of(pinholes, true, scene, seconds)
-    if not any(model.comparison.lenses for model in pinholes):
-        return Draw(before, before, is_adopted=False)
-    models, seconds = reconstructed(drawn, CameraModel.AUTO)
-    is_adopted = any(lens.is_adopted for model in models for lens in model.comparison.lenses)
-    return Draw(before, scores_of(models, true, scene, seconds), is_adopted)
+    scores = []
+    for model in (CameraModel.SIMPLE_PINHOLE, CameraModel.SIMPLE_RADIAL):
+        models, seconds = reconstructed(drawn, model)
+        scores.append(scores_of(models, true, scene, seconds))
+    return Draw(*scores)
 
 
 def reconstructed(pairs: Sequence[BatchPair], model: CameraModel) -> tuple[list[SfmModel], float]:
@@ -179,20 +173,7 @@ def scores_of(
         targets.update(zip(stems_of(pair), (pair.camera0, pair.camera1), strict=True))
     images = [each for each in models[0].images if each.image.name in targets] if models else []
     errors = [*centre_errors(images, targets)]
-    ratios = [
-        error / found.sigmas.centre
-        for error, found in zip(
-            errors, images, strict=False
-        )  # without a similarity, no image has an error
-        if found.sigmas
-    ]
-    return Scores(
-        fmean(accuracies),
-        max(errors, default=np.nan),
-        max(ratios, default=np.nan),
-        median(ratios) if ratios else np.nan,
-        seconds,
-    )
+    return Scores(fmean(accuracies), max(errors, default=np.nan), seconds)
 
 
 def pose_of(models: Sequence[dict[str, RegisteredImage]], pair: TruePair) -> Matrix3 | None:
@@ -223,7 +204,7 @@ def centre_errors(images: Sequence[RegisteredImage], targets: dict[str, Camera])
 
 
 def row_of(name: str, k: float, draws: Sequence[Draw]) -> str:
-    """Return a row of the table: each cell by pinholes and by AUTO."""
+    """Return a row of the table: each cell by pinholes and by lenses."""
 
     def both(values: Sequence[tuple[float, float]], form: str, mean: bool = False) -> str:
         columns = zip(*values, strict=True)
@@ -235,12 +216,9 @@ def row_of(name: str, k: float, draws: Sequence[Draw]) -> str:
         name,
         f"{k:g}",
         str(len(draws)),
-        str(sum(draw.is_adopted for draw in draws)),
-        both([(draw.pinholes.accuracy, draw.auto.accuracy) for draw in draws], ".3f", mean=True),
-        both([(100 * draw.pinholes.error, 100 * draw.auto.error) for draw in draws], ".2f"),
-        both([(draw.pinholes.worst_ratio, draw.auto.worst_ratio) for draw in draws], ".1f"),
-        both([(draw.pinholes.median_ratio, draw.auto.median_ratio) for draw in draws], ".1f"),
-        both([(draw.pinholes.seconds, draw.auto.seconds) for draw in draws], ".1f"),
+        both([(draw.pinholes.accuracy, draw.lenses.accuracy) for draw in draws], ".3f", mean=True),
+        both([(100 * draw.pinholes.error, 100 * draw.lenses.error) for draw in draws], ".2f"),
+        both([(draw.pinholes.seconds, draw.lenses.seconds) for draw in draws], ".1f"),
     ]
     return f"| {' | '.join(cells)} |"
 

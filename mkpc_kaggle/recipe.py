@@ -146,7 +146,7 @@ class CameraSharing(StrEnum):
 class CameraModel(StrEnum):
     """COLMAP's camera models of perspective lenses. F of a pair needs one without distortion.
 
-    ``AUTO`` is a pinhole, and for cameras SIMPLE_RADIAL where the photographs show distortion.
+    ``AUTO`` is SIMPLE_RADIAL for cameras, and SIMPLE_PINHOLE for F.
     """
 
     SIMPLE_PINHOLE = "SIMPLE_PINHOLE"
@@ -159,7 +159,7 @@ class CameraModel(StrEnum):
 
 
 # F of two cameras exists for these models only; distortion bends its lines.
-PINHOLES = frozenset({CameraModel.SIMPLE_PINHOLE, CameraModel.PINHOLE})
+PINHOLES = frozenset({CameraModel.SIMPLE_PINHOLE, CameraModel.PINHOLE, CameraModel.AUTO})
 
 
 @dataclass(frozen=True)
@@ -172,7 +172,7 @@ class SceneConfig:
     camera_model: CameraModel = CameraModel.AUTO
     # Reconstructions of a batch to choose from, see :mod:`mkpc_kaggle.scene.candidates`
     candidates: int = 1
-    # Minimum share of inliers of an edge, see :mod:`mkpc_kaggle.scene.edges`; 0: all edges.
+    # Minimum share of inliers of an edge, see :func:`mkpc_kaggle.scene.view_graph.supported`; 0: all edges.
     min_support: float = 0.0
     # Images up to which the mapper starts from all tracks, and ends with points of two views. Larger scenes start
     # from the longest tracks of each image.

@@ -52,8 +52,7 @@ OUT gets a folder for each folder in DIR, with:
   sparse/0, 1...  the models with plain file names and colours, as gsplat, nerfstudio and others read them
 and for all datasets together:
   cameras.csv     image, model, K, R, t: X_cam = R X + t, (0, 0) is the first pixel's centre; numbers joined by ;
-                  and the uncertainty of each camera: rotation_sigma (degrees), centre_sigma (of the model's size),
-                  focal_sigma (percent); see docs/folder.md
+                  and the number of points that each image sees
   submission.csv  with --format
   report.html     the run, with the cameras and points of each scene in 3D if plotly is installed
   work/           the journal: after a kill, the same command resumes the run and makes the same files
@@ -117,7 +116,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--camera", choices=list(map(str, CameraSharing)), help=text)
     text = """known cameras, a table with the columns image (a path, a name or a pattern such as 'drone*.jpg'),
         model (COLMAP's: SIMPLE_PINHOLE, OPENCV, ...), parameters (in COLMAP's order, separated by blanks),
-        sigma (of the focal length, in percent, or fixed), and optionally size (of the images: 1536x1024)"""
+        and optionally size (of the images: 1536x1024)"""
     add("--intrinsics", type=Path, metavar="FILE.csv", help=text)
     text = "masks named as COLMAP's, MASKS/a.jpg.png for a.jpg; points on black pixels are left out"
     add("--masks", type=Path, metavar="MASKS", help=text)

@@ -8,7 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib import metadata
 from math import isfinite
 from pathlib import Path
@@ -32,7 +32,7 @@ from mkpc_kaggle.engine.workers.cluster import RaySite
 from mkpc_kaggle.engine.workers.places import LISTEN_S, LocalSite
 from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
-from mkpc_kaggle.recipe import PINHOLES, CameraModel, Recipe
+from mkpc_kaggle.recipe import PINHOLES, Recipe
 from mkpc_kaggle.setup.assembly import Assembly
 from mkpc_kaggle.version import __version__
 
@@ -222,24 +222,21 @@ def run_pairs(
     ``more`` are other fields of the request. Raises :class:`mkpc_kaggle.errors.UserError` if the store cannot be
     used or a matcher cannot be loaded, and for scenes whose cameras have distortion.
     """
-    assembly = replace(assembly, recipe=_without_distortion(assembly.recipe))
+    _require_pinholes(assembly.recipe)
     folders = dict.fromkeys(path.parent for pair in pairs for path in pair.images)
     with opened_engine(assembly, session, folders) as engine:
         engine.ask(request_of(pairs, assembly, session, root, **more))
         return engine.report()
 
 
-def _without_distortion(recipe: Recipe) -> Recipe:
-    """Return a recipe for F, whose cameras are pinholes. Raise :class:`UserError` for distorted ones."""
+def _require_pinholes(recipe: Recipe) -> None:
+    """Raise :class:`UserError` for a recipe for F whose cameras have distortion."""
     scene = recipe.scene
-    if scene is None or scene.camera_model in PINHOLES:
-        return recipe
-    if scene.camera_model is not CameraModel.AUTO:
+    if scene is not None and scene.camera_model not in PINHOLES:
         raise UserError(
             f"[scene] has cameras with distortion ({scene.camera_model}), and F ignores it: "
             "use PINHOLE or SIMPLE_PINHOLE here; `mkpc reconstruct` takes all models"
         )
-    return replace(recipe, scene=replace(scene, camera_model=CameraModel.SIMPLE_PINHOLE))
 
 
 def request_of(

@@ -1,4 +1,4 @@
-"""Intrinsics that the user knows: COLMAP's camera models, exact or with a standard deviation.
+"""Intrinsics that the user knows, in COLMAP's camera models.
 
 Parameters have COLMAP's order and units: pixels, with (0, 0) the corner of the top-left pixel, not
 its centre.
@@ -12,7 +12,6 @@ from math import isfinite
 from types import MappingProxyType
 
 from mkpc_kaggle.config import decimal
-from mkpc_kaggle.geometry.coordinates import Size
 
 # Parameters of the models that a perspective camera with a usual lens needs.
 LENS_MODELS: Mapping[str, tuple[str, ...]] = MappingProxyType(
@@ -25,21 +24,14 @@ LENS_MODELS: Mapping[str, tuple[str, ...]] = MappingProxyType(
         "FULL_OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
     }
 )
-FIXED = "fixed"
-MAX_SIGMA = 100.0  # percent; a wider prior states nothing
 
 
 @dataclass(frozen=True)
 class KnownCamera:
-    """A camera model with parameters, and its focal length's standard deviation in percent.
-
-    A standard deviation of 0 means exact: the camera is not refined at all. Raises ``ValueError``
-    for values that no camera has.
-    """
+    """A camera model with parameters. Raises ``ValueError`` for values that no camera has."""
 
     model: str
     parameters: tuple[float, ...]
-    sigma: float = 0.0
 
     def __post_init__(self) -> None:
         if self.model not in LENS_MODELS:
@@ -55,10 +47,6 @@ class KnownCamera:
         focal_count = sum(name.startswith("f") for name in names)
         if min(self.parameters[: focal_count + 2]) <= 0:
             raise ValueError("focal lengths and the principal point must be positive")
-        if not 0 <= self.sigma <= MAX_SIGMA:
-            raise ValueError(
-                f"a standard deviation must be {FIXED!r}, or above 0 and at most {MAX_SIGMA:g} percent"
-            )
 
     @property
     def focals(self) -> tuple[float, ...]:
@@ -85,13 +73,7 @@ class KnownCamera:
     def without_distortion(self) -> "KnownCamera":
         """The pinhole with the same focal lengths and principal point."""
         model = "SIMPLE_PINHOLE" if len(self.focals) == 1 else "PINHOLE"
-        return KnownCamera(model, (*self.focals, *self.principal_point), self.sigma)
-
-    def with_focal(self, focal: float) -> "KnownCamera":
-        """Return the camera with another mean focal length in pixels."""
-        ratio = focal / self.focal
-        focals = tuple(value * ratio for value in self.focals)
-        return replace(self, parameters=focals + self.parameters[len(focals) :])
+        return KnownCamera(model, (*self.focals, *self.principal_point))
 
     def scaled(self, x: float, y: float) -> "KnownCamera":
         """Return the camera of pictures that are ``x`` times as wide and ``y`` times as high."""
@@ -115,28 +97,16 @@ def radial_factor(camera: KnownCamera, radius: float) -> float:
     return numerator / (1 + k[5] * r2 + k[6] * r2**2 + k[7] * r2**3)
 
 
-def displacement_of(camera: KnownCamera, size: Size) -> float:
-    """Return the displacement of a point half the long side away from the middle of its image, by all
-    coefficients of a lens. It is a share of this distance, and negative for a barrel.
-    """
-    return radial_factor(camera, max(size) / 2 / camera.focal) - 1
-
-
 WILD = frozenset("*?[")  # in a pattern
 Rows = Sequence[tuple[str, KnownCamera]]  # a name or a pattern of images, and their camera
 
 
-def parse_row(pattern: str, model: str, parameters: str, sigma: str) -> tuple[str, KnownCamera]:
+def parse_row(pattern: str, model: str, parameters: str) -> tuple[str, KnownCamera]:
     """Return a row of a table from its cells. Raises ``ValueError`` with the reason."""
     if not pattern.strip():
         raise ValueError("the name of the image is missing")
-    if sigma.strip() != FIXED and decimal(sigma.strip()) <= 0:
-        raise ValueError(
-            f"a standard deviation must be {FIXED!r} or a number of percent above 0, not {sigma!r}"
-        )
-    percent = 0.0 if sigma.strip() == FIXED else decimal(sigma.strip())
     values = tuple(decimal(part) for part in parameters.split(" ") if part)
-    return pattern.strip(), KnownCamera(model.strip(), values, percent)
+    return pattern.strip(), KnownCamera(model.strip(), values)
 
 
 class CameraTable:

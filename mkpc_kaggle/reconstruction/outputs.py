@@ -15,7 +15,6 @@ from mkpc_kaggle.engine.console import logger
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.intrinsics import KnownCamera
 from mkpc_kaggle.reconstruction.folder import Datasets
-from mkpc_kaggle.scene.models import Sigmas
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +26,7 @@ class PlacedImage:
 
     model: int
     camera: Camera
-    sigmas: Sigmas | tuple[()] = ()
+    points: int = 0  # that the image sees
     lens: KnownCamera | None = None
     content: str = ""
 
@@ -43,7 +42,7 @@ CAMERA_HEADS = (
     "K",
     "R",
     "t",
-    *("rotation_sigma", "centre_sigma", "focal_sigma"),
+    "points",
     *("camera_model", "parameters"),
 )
 SUBMISSION_FORMATS = (
@@ -66,10 +65,10 @@ def write_tables(out: Path, cameras: Cameras, root: Path, form: str | None) -> N
 
 def camera_rows(cameras: Cameras, root: Path) -> Iterator[Sequence[str]]:
     """Yield a header, and a row per image with a camera: path below ``root``, model, K, R, t,
-    ``Sigmas``, COLMAP's camera model and its parameters.
+    number of points, COLMAP's camera model and its parameters.
 
     The centre of an image's first pixel is (0, 0); X_cam = R X + t. In COLMAP's parameters it is
-    (0.5, 0.5). Unknown sigmas are empty cells.
+    (0.5, 0.5).
     """
     yield CAMERA_HEADS
     for files in cameras.values():
@@ -77,7 +76,6 @@ def camera_rows(cameras: Cameras, root: Path) -> Iterator[Sequence[str]]:
             if placed is None:
                 continue
             camera = placed.camera
-            sigmas = [f"{value:g}" for value in placed.sigmas] or [""] * 3
             # As in a table of --intrinsics, which takes them
             lens = placed.lens
             parameters = (
@@ -89,7 +87,7 @@ def camera_rows(cameras: Cameras, root: Path) -> Iterator[Sequence[str]]:
                 joined(camera.K),
                 joined(camera.R),
                 joined(camera.t),
-                *sigmas,
+                str(placed.points),
                 "" if lens is None else lens.model,
                 parameters,
             )
@@ -120,14 +118,13 @@ def read_table_of_cameras(path: Path, root: Path, datasets: Datasets) -> Cameras
 
 def _placed(row: Sequence[str]) -> PlacedImage:
     """Invert a row of :func:`camera_rows`. Raise ``ValueError`` for any other row."""
-    _, model, K, R, t, rotation, centre, focal, name, parameters = row
+    _, model, K, R, t, points, name, parameters = row
     numbers = [np.array(text.split(";"), float) for text in (K, R, t)]
     if not all(np.isfinite(values).all() for values in numbers):
         raise ValueError("a number is not finite")
     camera = Camera(numbers[0].reshape(3, 3), numbers[1].reshape(3, 3), numbers[2].reshape(3))
-    sigmas = Sigmas(float(rotation), float(centre), float(focal)) if rotation else ()
     lens = KnownCamera(name, tuple(map(float, parameters.split()))) if name else None
-    return PlacedImage(int(model), camera, sigmas, lens)
+    return PlacedImage(int(model), camera, int(points), lens)
 
 
 def submission_rows(form: str, cameras: Cameras, root: Path) -> Iterator[Sequence[str]]:

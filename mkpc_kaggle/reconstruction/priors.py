@@ -19,7 +19,7 @@ from mkpc_kaggle.geometry.resolution import (
     text_of_point,
 )
 
-COLUMNS = ("image", "model", "parameters", "sigma")
+COLUMNS = ("image", "model", "parameters")
 OPTIONAL = ("size",)  # of the images that the parameters are for
 SIZE = re.compile(r"\s*([1-9]\d{0,5})\s*[xX]\s*([1-9]\d{0,5})\s*", re.ASCII)
 MAX_USUAL_OFFSET = 0.05  # of a principal point from the middle, as a share of the sides
@@ -33,9 +33,9 @@ def read_intrinsics_table(file: Path, root: Path, images: Iterable[Path]) -> Row
     """Return the rows of a table of known cameras.
 
     Columns: ``image``, a path below ``root``, a file name, or a pattern with ``*``; ``model`` of COLMAP, its
-    ``parameters`` separated by blanks; ``sigma`` of the focal length in percent, or ``fixed``; optionally
-    ``size``, the width x height that the parameters are for. Raises :class:`UserError` for a malformed row, a row
-    that names no image, and a camera that does not fit its image.
+    ``parameters`` separated by blanks; optionally ``size``, the width x height that the parameters are for.
+    Raises :class:`UserError` for a malformed row, a row that names no image, and a camera that does not fit its
+    image.
     """
     rows: list[tuple[str, KnownCamera]] = []
     # The file and line of each row, for messages, and its size if it has one

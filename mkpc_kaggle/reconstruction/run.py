@@ -12,7 +12,7 @@ from mkpc_kaggle.engine.request import RunReport, name_below
 from mkpc_kaggle.engine.scenes import scene_failures
 from mkpc_kaggle.engine.session import Session, opened_engine, request_of
 from mkpc_kaggle.errors import plural, writing
-from mkpc_kaggle.recipe import CameraSharing, Recipe, SceneConfig
+from mkpc_kaggle.recipe import CameraModel, CameraSharing, Recipe, SceneConfig
 from mkpc_kaggle.reconstruction.causes import causes_in_files
 from mkpc_kaggle.reconstruction.choice import choose_pairs
 from mkpc_kaggle.reconstruction.folder import Datasets, Ends, batch_names
@@ -65,11 +65,13 @@ def for_cameras(recipe: Recipe, sharing: str | None = None) -> Recipe:
     :class:`CameraSharing`; without it, the recipe's is kept.
     """
     scene = recipe.scene or SceneConfig()
+    is_chosen = scene.camera_model is not CameraModel.AUTO
     scene = replace(
         scene,
         # The folder has its pairs already.
         pairs_per_image=0.0,
         cameras=CameraSharing(sharing or scene.cameras),
+        camera_model=scene.camera_model if is_chosen else CameraModel.SIMPLE_RADIAL,
     )
     units = recipe.units
     if recipe.name == AUTO_RECIPE:
@@ -249,7 +251,7 @@ def cameras_of(datasets: Datasets, root: Path, results: State, earlier: Cameras)
             for image in reversed(model.images):
                 content = image.image.digest
                 by_digest[content] = PlacedImage(
-                    number, image.camera, image.sigmas, image.lens, content
+                    number, image.camera, image.points, image.lens, content
                 )
         digests = {file: known_digests.get(name_below(str(root), str(file)), "") for file in files}
         cameras[name] = {file: by_digest.get(digests[file]) for file in files}

@@ -4,18 +4,16 @@ The global mapper refines all focal lengths, without priors, and leaves out poin
 images see. With these, cameras of tourists' photographs are more accurate. But no third image
 reveals a wrong match, so uncertain points of two views are removed first.
 
-A prior is the mean of the mapper's focal length and the user's, weighted by their variances, as if
-bundle adjustment had one more measurement. These cameras are then held, and the rest is refined.
+Cameras that the user knows are held, and the rest is refined.
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import numpy as np
 import pycolmap
 
 from mkpc_kaggle.geometry.intrinsics import KnownCamera
-from mkpc_kaggle.scene.uncertainty import camera_sigmas
 
 # Limits for a point that two images see, close to COLMAP's incremental mapper's for any point (4 pixels,
 # 1.5 degrees). The global mapper keeps errors of a hundredth of the focal length, about ten pixels.
@@ -23,6 +21,8 @@ MAX_TWO_VIEW_ERROR_PX = 4.0
 MIN_TWO_VIEW_ANGLE_DEG = 2.0
 FINAL_ADJUSTMENT_ITERATIONS = 100
 CONVERGED = 1e-6  # relative change of the cost
+MAX_FLAT_PX = 1.0  # of a lens that counts as a pinhole, anywhere in its image
+BORDER_STEPS = 9  # of the grid of pixels that are compared
 
 
 def adjust(model: Any, cameras: Mapping[str, KnownCamera]) -> None:
@@ -37,12 +37,8 @@ def adjust(model: Any, cameras: Mapping[str, KnownCamera]) -> None:
         for _, image in sorted(model.images.items())
         if image.has_pose and image.name in cameras
     ]
-    # Computed without the user's knowledge, so that the two can be weighed
-    sigmas = camera_sigmas(model) if given else {}
     for image in given:
-        # Bundle adjustment does not determine this focal length: the user's counts alone.
-        sigma = sigmas[image.name].focal if image.name in sigmas else np.inf
-        set_camera(model.cameras[image.camera_id], cameras[image.name], sigma)
+        model.cameras[image.camera_id].params = list(cameras[image.name].parameters)
     config = pycolmap.BundleAdjustmentConfig()
     for number in sorted(model.reg_image_ids()):
         config.add_image(number)
@@ -53,6 +49,28 @@ def adjust(model: Any, cameras: Mapping[str, KnownCamera]) -> None:
     adjuster: Any = pycolmap.create_default_ceres_bundle_adjuster(options, config, model)
     adjuster.solve()
     model.update_point_3d_errors()
+
+
+def drop_flat_lenses(model: Any, given: Collection[str]) -> None:
+    """Replace lenses of pycolmap's model that move no pixel by more than ``MAX_FLAT_PX`` by pinholes.
+    Cameras of the images ``given``, by name, stay.
+    """
+    kept = {image.camera_id for image in model.images.values() if image.name in given}
+    for number, camera in model.cameras.items():
+        if number in kept or not camera.extra_params_idxs():
+            continue
+        params = np.array(camera.params)
+        focals = params[camera.focal_length_idxs()]
+        centre = params[camera.principal_point_idxs()]
+        x = np.linspace(0, camera.width, BORDER_STEPS)
+        y = np.linspace(0, camera.height, BORDER_STEPS)
+        pixels = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+        rays = np.column_stack([(pixels - centre) / focals, np.ones(len(pixels))])
+        moved = np.linalg.norm(np.array(camera.img_from_cam(rays)) - pixels, axis=1)
+        if moved.max() <= MAX_FLAT_PX:  # false for NaN
+            names = pycolmap.CameraModelId
+            camera.model = names.SIMPLE_PINHOLE if len(focals) == 1 else names.PINHOLE
+            camera.params = [*focals, *centre]
 
 
 def robust_options() -> Any:
@@ -89,16 +107,3 @@ def remove_uncertain_points(found: Any) -> None:
 def two_view_points(found: Any) -> set[int]:
     """Return the numbers of the points of pycolmap's model that two images see."""
     return {number for number, point in found.points3D.items() if point.track.length() == 2}
-
-
-def set_camera(camera: Any, known: KnownCamera, sigma: float) -> None:
-    """Set a camera's parameters; ``sigma`` is the deviation of its present focal length in percent."""
-    if not known.sigma:
-        camera.params = list(known.parameters)
-        return
-    # Of the user's value; in logarithms, where a deviation in percent has no direction
-    weight = sigma**2 / (sigma**2 + known.sigma**2) if np.isfinite(sigma) else 1.0
-    focal = np.exp((1 - weight) * np.log(camera.mean_focal_length()) + weight * np.log(known.focal))
-    params = np.array(camera.params)
-    params[camera.focal_length_idxs()] *= focal / camera.mean_focal_length()
-    camera.params = params.tolist()

@@ -22,7 +22,7 @@ from mkpc_kaggle.scene.models import SfmModel
 from mkpc_kaggle.scene.view_graph import BatchPair, tracks_of
 
 # Candidates with tracks of all units, on all edges or on edges with enough support
-# (:mod:`mkpc_kaggle.scene.edges`); each other candidate has the name of its unit.
+# (:func:`mkpc_kaggle.scene.view_graph.supported`); each other candidate has the name of its unit.
 ALL_UNITS, SUPPORTED = "", "supported"
 CANDIDATE_SUPPORT = 0.1
 # A candidate's disagreement must be smaller than this share of the first one's. Shares from 0.97 to 0.99

@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from mkpc_kaggle.cores import available_cores
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import COLMAP_CENTRE_PX, Matrix3
+from mkpc_kaggle.geometry.focal_prior import FOCAL_RATIO
 from mkpc_kaggle.recipe import CameraModel, SceneConfig
-from mkpc_kaggle.scene.adjustment import adjust
-from mkpc_kaggle.scene.edges import supported
+from mkpc_kaggle.scene.adjustment import adjust, drop_flat_lenses
 from mkpc_kaggle.scene.export import (
     DATABASE,
     FORMER,
@@ -42,13 +42,13 @@ from mkpc_kaggle.scene.models import (
     filter_models,
     lens_of,
 )
-from mkpc_kaggle.scene.uncertainty import camera_sigmas
 from mkpc_kaggle.scene.view_graph import (
     MIN_MATCHES,
     BatchImage,
     SharedIntrinsics,
     ViewGraph,
     known_by_name,
+    supported,
 )
 
 # Of a verified match; 1 px loses accuracy on tourist photographs, 4 px on repeated windows
@@ -65,6 +65,12 @@ SEED = 0
 # herz_jesus_p8. Beyond, nothing was measured.
 MAX_FOCAL_CHANGE = 2.0
 DEFAULTS = SceneConfig()
+# Configurations of a two-view geometry whose H was estimated
+WITH_HOMOGRAPHY = (
+    pycolmap.TwoViewGeometryConfiguration.PLANAR,
+    pycolmap.TwoViewGeometryConfiguration.PANORAMIC,
+    pycolmap.TwoViewGeometryConfiguration.PLANAR_OR_PANORAMIC,
+)
 
 
 def structure_from_motion(
@@ -77,7 +83,7 @@ def structure_from_motion(
 
     Each image has its own camera, except images with ``shared`` intrinsics. The initial focal
     length is the shared one, the user's or EXIF's. All focal lengths are refined, unless the user
-    knows them exactly. With ``former`` models of the same graph, their poses are refined instead of
+    knows them. With ``former`` models of the same graph, their poses are refined instead of
     computed again.
     """
     # Its warnings about single images would fill the log.
@@ -198,17 +204,16 @@ def _write_images(
 def _start_camera(
     graph: ViewGraph, image: BatchImage, camera_model: CameraModel, shared: float | None
 ) -> Any:
-    """Return pycolmap's camera that an image starts with: the user's, that of its distorted lens, or
-    one of ``camera_model``; with the ``shared`` focal length, if any.
+    """Return pycolmap's camera that an image starts with: the user's, or one of ``camera_model`` with the
+    ``shared`` focal length, EXIF's or a usual one.
     """
-    known = graph.known.get(image.digest) or graph.lenses.get(image.digest)
-    focal = shared or graph.start_focal(image)
-    # Its distortion, if any, comes later, where the photographs show it.
+    known = graph.known.get(image.digest)
+    focal = shared or image.focal or FOCAL_RATIO * max(image.size)
     plain = CameraModel.SIMPLE_PINHOLE if camera_model is CameraModel.AUTO else camera_model
     name = plain.value if known is None else known.model
     camera = pycolmap.Camera.create_from_model_name(0, name, focal, *image.size)
     if known is not None:
-        camera.params = list(known.with_focal(shared or known.focal).parameters)
+        camera.params = list(known.parameters)
     # A pair that E explains at this focal length counts as calibrated
     camera.has_prior_focal_length = True
     return camera
@@ -247,7 +252,7 @@ def verify(merged: MergedGraph, cameras: Sequence[Any], *, reuse: bool = False) 
             geometries[number] = _uncalibrated(of_edge[similar[0]])
             return
         if both not in of_edge:
-            of_edge[both] = pycolmap.estimate_two_view_geometry(
+            found: Any = pycolmap.estimate_two_view_geometry(
                 cameras[edge.first],
                 points[edge.first],
                 cameras[edge.second],
@@ -255,6 +260,10 @@ def verify(merged: MergedGraph, cameras: Sequence[Any], *, reuse: bool = False) 
                 merged.matches[number],
                 options,
             )
+            # A homography that was not found is memory that pycolmap never wrote.
+            if found.config not in WITH_HOMOGRAPHY:
+                found.H = None
+            of_edge[both] = found
         geometries[number] = of_edge[both]
 
     geometries: list[Any] = [None] * len(merged.graph.edges)
@@ -308,9 +317,8 @@ def _mapper_options(graph: ViewGraph, threads: int) -> Any:
     # Each part has a separate random generator.
     parts = dict.fromkeys(("rotation_averaging", "global_positioning", "retriangulation"), seed)
     mapper = {**seed, "num_threads": threads, **parts}
-    # With some exact cameras, the others must still be refined: those are restored afterwards.
-    exact = [digest for digest, known in graph.known.items() if not known.sigma]
-    if len(exact) == len(graph.images):
+    # With some known cameras, the others must still be refined: those are restored afterwards.
+    if len(graph.known) == len(graph.images):
         mapper["bundle_adjustment"] = {"refine_focal_length": False, "refine_extra_params": False}
     return pycolmap.GlobalMapperOptions(mapper)
 
@@ -382,10 +390,15 @@ def _filter_points(observations: Any, model: Any, settings: Any) -> None:
 def _reconstruction(mapped: Sequence[Any], graph: ViewGraph, config: SceneConfig) -> Reconstruction:
     """Return pycolmap's models with the user's cameras, without implausible images."""
     given_cameras = known_by_name(graph)
-    # In a large scene, points of two views are too many.
-    if given_cameras or len(graph.images) <= config.all_tracks:
-        for model in mapped:
+    for model in mapped:
+        drop_flat_lenses(model, given_cameras)
+        # In a large scene, points of two views are too many.
+        if given_cameras or len(graph.images) <= config.all_tracks:
             adjust(model, given_cameras)
+        # A point behind a camera has no reprojection error.
+        observations = pycolmap.ObservationManager(model)
+        if observations.filter_observations_with_negative_depth():
+            model.update_point_3d_errors()
     found = [_sfm_model(model, graph) for model in mapped]
     models = filter_models(found)
     return Reconstruction(
@@ -395,7 +408,6 @@ def _reconstruction(mapped: Sequence[Any], graph: ViewGraph, config: SceneConfig
 
 def _sfm_model(found: Any, graph: ViewGraph) -> SfmModel:
     images = []
-    sigmas = camera_sigmas(found, known_by_name(graph))
     # Sorted, because pycolmap's containers have no fixed order
     for number in sorted(found.reg_image_ids()):
         image = found.images[number]
@@ -407,7 +419,6 @@ def _sfm_model(found: Any, graph: ViewGraph) -> SfmModel:
                 graph.images[number - 1],
                 camera,
                 int(image.num_points3D),
-                sigmas.get(image.name, ()),
                 lens_of(image.camera),
             )
         )

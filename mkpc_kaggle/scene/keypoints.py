@@ -6,8 +6,6 @@ Structure from motion tracks a point through several pairs, so its positions in 
 one keypoint.
 """
 
-from copy import copy
-from dataclasses import replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -44,14 +42,6 @@ class MergedGraph:
     def __init__(self, graph: ViewGraph) -> None:
         self.graph = graph
         self.geometries: dict[int, dict[tuple[Lens, Lens], Any]] = {}
-
-    def starting_with(self, **fields: Any) -> "MergedGraph":
-        """Return the graph whose cameras start otherwise, by these fields of the view graph; the
-        rest is shared.
-        """
-        other = copy(self)
-        other.graph = replace(self.graph, **fields)
-        return other
 
     @property
     def keypoints(self) -> list[Points]:

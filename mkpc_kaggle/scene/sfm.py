@@ -1,5 +1,10 @@
-"""Reconstruction of a batch: from pairs to cameras and a choice of F for each pair, all picklable."""
+"""Reconstruction of a batch: from pairs to cameras and a choice of F for each pair, all picklable.
 
+A failure is a reason, and no exception: pycolmap may be missing, and a batch without cameras keeps the F of its
+pairs.
+"""
+
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -7,24 +12,16 @@ from functools import partial
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.intrinsics import Rows
 from mkpc_kaggle.geometry.robust import RobustConfig
-from mkpc_kaggle.recipe import CameraModel, CameraSharing, SceneConfig
+from mkpc_kaggle.recipe import CameraSharing, SceneConfig
 from mkpc_kaggle.scene.align import align, read_reference
-from mkpc_kaggle.scene.assumptions import compared, with_lenses, with_right_exif
 from mkpc_kaggle.scene.choose import Choice, choose
 from mkpc_kaggle.scene.export import HeldDirectory
 from mkpc_kaggle.scene.keypoints import MergedGraph
-from mkpc_kaggle.scene.mapper import reconstruct_component, reconstruct_connected
-from mkpc_kaggle.scene.models import Reconstruction, models_of
-from mkpc_kaggle.scene.shared_intrinsics import (
-    given_intrinsics,
-    refined_intrinsics,
-    share,
-)
-from mkpc_kaggle.scene.view_graph import (
-    BatchPair,
-    SharedIntrinsics,
-    ViewGraph,
-)
+from mkpc_kaggle.scene.models import MIN_IMAGES, Reconstruction, SfmModel, models_of
+from mkpc_kaggle.scene.shared_intrinsics import given_intrinsics, refined_intrinsics, share
+from mkpc_kaggle.scene.view_graph import BatchPair, SharedIntrinsics, ViewGraph
+
+MIN_PAIRS_PER_IMAGE = 1.35  # connected pairs; with fewer, cameras are poorly constrained
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,12 +79,7 @@ def reconstruct_graph(
     directory: HeldDirectory | None = None,
     is_whole: bool = False,
 ) -> tuple[list[Reconstruction], SharedIntrinsics]:
-    """Return the reconstruction of each component, and the shared intrinsics of the images.
-
-    Assumptions are tried one after the other: EXIF's focal lengths
-    (:func:`mkpc_kaggle.scene.assumptions.with_right_exif`), cameras that images share
-    (:mod:`mkpc_kaggle.scene.shared_intrinsics`), and lenses without distortion
-    (:func:`mkpc_kaggle.scene.assumptions.with_lenses`). The refined focal lengths are returned.
+    """Return the reconstruction of each component, and the shared intrinsics of the images, refined.
 
     With a ``directory``, the graph is reconstructed as a whole, moved onto the cameras of the last complete run,
     and COLMAP's files are written there. With ``is_whole``, it is reconstructed as a whole without files.
@@ -100,24 +92,69 @@ def reconstruct_graph(
         # COLMAP's database holds all images of a folder.
         parts = [MergedGraph(graph.strong)]
         make = partial(reconstruct_connected, config=config)
-    # The user's cameras are neither compared nor shared.
-    free = graph.free
-    given = given_intrinsics(free, config)
-    mapped = with_right_exif(parts, given, config, make)
+    # The user's cameras are not shared.
+    shared = given_intrinsics(graph.free, config)
+    reconstructions = [make(part, shared) for part in parts]
     if config.cameras is CameraSharing.AUTO:
-        mapped = share(mapped, free, config, make) or mapped
-    mapped = compared(mapped)
-    if config.camera_model is CameraModel.AUTO:
-        mapped = with_lenses(mapped, free, config, make) or mapped
-    reconstructions = list(mapped.reconstructions)
-    shared = mapped.shared
+        again = share(parts, reconstructions, graph.free, make)
+        reconstructions, shared = again or (reconstructions, shared)
     if directory is not None:
         from mkpc_kaggle.scene.colmap import write_files
 
         # Before the files are written, so that files and results agree
         reconstructions = align(reconstructions, read_reference(directory.path))
-        write_files(directory, mapped.parts[0], shared, models_of(reconstructions), config)
+        write_files(directory, parts[0], shared, models_of(reconstructions), config)
     # Images without a camera have the refined focal length, and not the one it began with.
-    if given:
-        shared = refined_intrinsics(free, models_of(reconstructions))
+    if config.cameras is CameraSharing.FOLDER:
+        shared = refined_intrinsics(graph.free, models_of(reconstructions))
     return reconstructions, shared
+
+
+def reconstruct_component(
+    merged: MergedGraph,
+    shared: SharedIntrinsics,
+    former: Sequence[SfmModel] = (),
+    *,
+    config: SceneConfig,
+) -> Reconstruction:
+    """Return the reconstruction of a connected graph, or the reason for its failure."""
+    graph = merged.graph
+    images = len(graph.images)
+    pairs = len(graph.edges)
+    if images < MIN_IMAGES:
+        return Reconstruction(
+            graph.names, failure=f"{images} images are connected; a scene needs {MIN_IMAGES}"
+        )
+    if pairs < MIN_PAIRS_PER_IMAGE * images:
+        few = (
+            f"{pairs} matched pairs connect {images} images, and reliable cameras need "
+            f"{math.ceil(MIN_PAIRS_PER_IMAGE * images)}; more overlapping images would help"
+        )
+        return Reconstruction(graph.names, failure=few)
+    return reconstruct_connected(merged, shared, former, config=config)
+
+
+def reconstruct_connected(
+    merged: MergedGraph,
+    shared: SharedIntrinsics,
+    former: Sequence[SfmModel] = (),
+    *,
+    config: SceneConfig,
+) -> Reconstruction:
+    """Return pycolmap's reconstruction of a graph, or the reason for its failure.
+
+    With ``former`` models, their poses are refined.
+    """
+    names = merged.graph.names
+    # Only a batch is lost: pairs keep their own F.
+    try:
+        # Here, because pycolmap may be missing and is slow to import
+        from mkpc_kaggle.scene.colmap import structure_from_motion
+
+        return structure_from_motion(merged, shared, config, former)
+    except ImportError as error:
+        return Reconstruction(names, failure=f"pycolmap cannot be imported: {error}")
+    except (RuntimeError, ValueError) as error:
+        return Reconstruction(names, failure=f"pycolmap failed: {error}")
+    except LookupError as error:  # its message is a mere key
+        return Reconstruction(names, failure=f"pycolmap failed: {error!r}")

@@ -6,9 +6,8 @@ images of one camera at one zoom share it. ``cameras`` of [scene] (``--camera``)
 - ``auto``, the default: if at least five images of one size are registered, and more than half of them agree on
   the focal length within 2 %, :func:`share` reconstructs a second time, with their median for all images of this
   size, registered or not. It is refused if images then have fewer than 0.99 of the observations before
-  (``MIN_OBSERVATIONS`` of :mod:`mkpc_kaggle.scene.mapper`). Images that see many points with another focal
-  length seem to have another zoom. They share only if EXIF does not differ by 10 %, and, where it is unknown, if
-  none of them loses observations.
+  (``MIN_OBSERVATIONS``). Images that see many points with another focal length seem to have another zoom. They
+  share only if EXIF does not differ by 10 %, and, where it is unknown, if none of them loses observations.
 - ``folder``: the user declares one camera for each size. The first reconstruction already shares it
   (:func:`given_intrinsics`).
 - ``image``: no image shares.
@@ -16,16 +15,18 @@ images of one camera at one zoom share it. ``cameras`` of [scene] (``--camera``)
 Images with a camera of the user's are not compared.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections import Counter
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.focal_prior import FOCAL_RATIO
 from mkpc_kaggle.recipe import CameraSharing, SceneConfig
-from mkpc_kaggle.scene.mapper import Make, Mapped, loses_points, refine_complete
-from mkpc_kaggle.scene.models import SfmModel
+from mkpc_kaggle.scene.keypoints import MergedGraph
+from mkpc_kaggle.scene.models import Reconstruction, SfmModel, models_of
 from mkpc_kaggle.scene.view_graph import BatchImage, SharedIntrinsics
 
 TOLERANCE = 0.02  # maximum relative deviation of agreeing focal lengths from the median
@@ -34,44 +35,86 @@ MIN_ALIKE = 5  # registered images of one size
 ZOOM_POINTS = 0.5
 
 EXIF_TOLERANCE = 0.1  # of one zoom; values of 35 mm film are rounded to millimetres
+MIN_OBSERVATIONS = 0.99  # share of the observations before; fewer refuse shared intrinsics
+
+# Reconstructs a graph with shared intrinsics, from the poses of former models if there are any
+Make: TypeAlias = Callable[..., Reconstruction]
 
 
 def share(
-    former: Mapped, free: Sequence[BatchImage], config: SceneConfig, make: Make
-) -> Mapped | None:
+    parts: Sequence[MergedGraph],
+    former: Sequence[Reconstruction],
+    free: Sequence[BatchImage],
+    make: Make,
+) -> tuple[list[Reconstruction], SharedIntrinsics] | None:
     """Return reconstructions with shared intrinsics of the ``free`` images that seem to share a
-    camera, or ``None`` if none do, or if images then see fewer points.
+    camera, and these; ``None`` if none do, or if images then see fewer points.
 
-    They start from the poses of the ``former`` reconstructions where these are good enough. Images that seem to
-    have another zoom share, too, unless they lose points by that.
+    They start from the poses of the ``former`` reconstructions of the ``parts`` where these are good enough.
+    Images that seem to have another zoom share, too, unless they lose points by that.
     """
-    alike = shared_intrinsics(free, former.models)
+    models = models_of(former)
+    alike = shared_intrinsics(free, models)
     if not alike:
         return None
-    everything = shared_intrinsics(free, former.models, with_zoomed=True)
+    everything = shared_intrinsics(free, models, with_zoomed=True)
     if everything.keys() != alike.keys():
         # From these poses alone: most zooms are real, and the mapper takes long.
         together = []
-        for part, reconstruction in former:
-            refined = refine_complete(part, everything, config, reconstruction)
+        for part, reconstruction in zip(parts, former, strict=True):
+            refined = refine_complete(part, everything, reconstruction, make)
             if refined is not None:
                 together.append(refined)
-        zoomed = undecided_zooms(free, former.models)
-        is_complete = len(together) == len(former.parts)
-        if is_complete and not loses_points(former.reconstructions, together, zoomed):
-            return replace(former, reconstructions=tuple(together), shared=everything)
+        zoomed = undecided_zooms(free, models)
+        is_complete = len(together) == len(parts)
+        if is_complete and not loses_points(former, together, zoomed):
+            return together, everything
     again = []
-    for part, reconstruction in former:
-        refined = refine_complete(part, alike, config, reconstruction)
+    for part, reconstruction in zip(parts, former, strict=True):
+        refined = refine_complete(part, alike, reconstruction, make)
         again.append(refined or make(part, alike))
-    if loses_points(former.reconstructions, again):
+    return None if loses_points(former, again) else (again, alike)
+
+
+def refine_complete(
+    merged: MergedGraph, shared: SharedIntrinsics, former: Reconstruction, make: Make
+) -> Reconstruction | None:
+    """Return the reconstruction with shared intrinsics from the poses of a ``former`` one.
+
+    Return ``None`` if the mapper might do better: some matched images have no common model, or
+    images see fewer points than before, so the former poses do not fit the shared intrinsics.
+    """
+    if not former.models or len(former.models[0].images) < len(merged.graph.matched):
         return None
-    return replace(former, reconstructions=tuple(again), shared=alike)
+    refined = make(merged, shared, former.models[:1])
+    if refined.observations < MIN_OBSERVATIONS * former.observations:
+        return None
+    return refined
 
 
-def given_intrinsics(
-    images: Sequence[BatchImage], config: SceneConfig, *, uses_exif: bool = True
-) -> SharedIntrinsics:
+def loses_points(
+    before: Sequence[Reconstruction],
+    after: Sequence[Reconstruction],
+    digests: Collection[str] = (),
+) -> bool:
+    """Return whether all images together, or one of these, see fewer points than before: less than 0.99
+    of them.
+
+    Images of two cameras that are forced into one lose points.
+    """
+    counts = []
+    for reconstructions in (before, after):
+        points: Counter[str] = Counter()
+        for model in models_of(reconstructions):
+            points.update({image.image.digest: image.points for image in model.images})
+        counts.append(points)
+    former, latter = counts
+    if latter.total() < MIN_OBSERVATIONS * former.total():
+        return True
+    return any(latter[digest] < MIN_OBSERVATIONS * former[digest] for digest in digests)
+
+
+def given_intrinsics(images: Sequence[BatchImage], config: SceneConfig) -> SharedIntrinsics:
     """Return one initial focal length for all images of a size, if the recipe shares cameras.
 
     The ``images`` are those whose intrinsics the user does not know, as in
@@ -82,7 +125,6 @@ def given_intrinsics(
     starts = {}
     for size in {image.size for image in images}:
         known = [image.focal for image in images if image.size == size and image.focal]
-        known = known if uses_exif else []
         starts[size] = float(np.median(known)) if known else FOCAL_RATIO * max(size)
     return {image.digest: starts[image.size] for image in images}
 

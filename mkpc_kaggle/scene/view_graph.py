@@ -1,5 +1,6 @@
 """The view graph of a batch: its distinct images, and the matches between them."""
 
+from collections import defaultdict
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TypeAlias
@@ -9,7 +10,6 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from mkpc_kaggle.geometry.coordinates import Matrix3, Size
-from mkpc_kaggle.geometry.focal_prior import FOCAL_RATIO
 from mkpc_kaggle.geometry.intrinsics import CameraTable, KnownCamera, Rows
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.pipeline.pair import UnitResult
@@ -17,6 +17,9 @@ from mkpc_kaggle.pipeline.pair import UnitResult
 MIN_MATCHES = 15  # of a connecting edge; also the minimum number of inliers of a verified edge
 # From units that make tracks; with fewer, a pair uses the matches of all units
 MIN_TRACK_MATCHES = 50
+# The support of an image is the number of inliers of its edge of this rank. A single edge may join
+# copies of one photograph, and says nothing about the others.
+SUPPORT_RANK = 3
 
 # By image digest: the focal length, in pixels, of the camera that images of one size share
 SharedIntrinsics: TypeAlias = Mapping[str, float]
@@ -68,16 +71,12 @@ class Edge:
 @dataclass(frozen=True, eq=False)
 class ViewGraph:
     """Distinct images, and their edges, sorted by image indices. ``known`` has the user's cameras,
-    by digest. Unless ``uses_exif``, cameras start without EXIF's focal lengths. ``lenses`` are the
-    cameras that images with a distorted lens start with, by digest. ``copies`` has the other names of
-    an image's content, by digest.
+    by digest. ``copies`` has the other names of an image's content, by digest.
     """
 
     images: tuple[BatchImage, ...]
     edges: tuple[Edge, ...]
     known: Mapping[str, KnownCamera] = field(default_factory=dict)
-    uses_exif: bool = True
-    lenses: Mapping[str, KnownCamera] = field(default_factory=dict)
     copies: Mapping[str, Collection[str]] = field(default_factory=dict)
 
     @property
@@ -142,10 +141,6 @@ class ViewGraph:
             self, known={digest: camera for digest, camera in found.items() if camera is not None}
         )
 
-    def start_focal(self, image: BatchImage) -> float:
-        """Return the focal length that the camera of a free image starts with, in pixels."""
-        return (self.uses_exif and image.focal) or FOCAL_RATIO * max(image.size)
-
     def components(self) -> tuple["ViewGraph", ...]:
         """Return the components connected by strong edges, ordered by first image."""
         # A few wrong matches must not join two scenes.
@@ -187,3 +182,21 @@ def known_by_name(graph: ViewGraph) -> dict[str, KnownCamera]:
         for image in graph.images
         if image.digest in graph.known
     }
+
+
+def supported(ends: Sequence[tuple[int, int]], inliers: Sequence[int], share: float) -> list[bool]:
+    """Return for each edge if it has at least ``share`` of the support of both of its images.
+
+    ``ends`` are the indices of an edge's images, ``inliers`` its verified matches. Two sides of a temple, or two
+    windows, have matches that agree with one fundamental matrix, but far fewer than the right edges of the same
+    images. A few of these edges bend all cameras.
+    """
+    counts: dict[int, list[int]] = defaultdict(list)
+    for images, count in zip(ends, inliers, strict=True):
+        for image in images:
+            counts[image].append(count)
+    support = {image: sorted(of_image)[-SUPPORT_RANK:][0] for image, of_image in counts.items()}
+    return [
+        count >= share * max(support[image] for image in images)
+        for images, count in zip(ends, inliers, strict=True)
+    ]

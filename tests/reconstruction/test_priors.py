@@ -36,8 +36,8 @@ from mkpc_kaggle.reconstruction.run import FolderResult, for_cameras, reconstruc
 from mkpc_kaggle.scene.models import SfmModel
 from mkpc_kaggle.setup.assembly import assemble
 
-HEAD = "image,model,parameters,sigma\n"
-SIZED = "image,model,parameters,sigma,size\n"
+HEAD = "image,model,parameters\n"
+SIZED = "image,model,parameters,size\n"
 
 
 def run(
@@ -79,10 +79,10 @@ def write_masks(folder: Path, root: Path, left: int = 400) -> Path:
     [
         ("", "is empty; expected the columns"),
         (HEAD, "has no rows"),
-        (HEAD + "00.png,PINHOLE,1 2 3,fixed\n", "line 2: PINHOLE has 4 parameters"),
+        (HEAD + "00.png,PINHOLE,1 2 3\n", "line 2: PINHOLE has 4 parameters"),
         (HEAD + "00.png,PINHOLE\n", "line 2: 2 cells"),
         (
-            HEAD + "none*.png,SIMPLE_PINHOLE,900 400 300,fixed\n",
+            HEAD + "none*.png,SIMPLE_PINHOLE,900 400 300\n",
             "line 2: row 'none*.png' matches no image",
         ),
         (
@@ -90,22 +90,22 @@ def write_masks(folder: Path, root: Path, left: int = 400) -> Path:
             "line 3: row '00.png' matches no image",
         ),
         (
-            HEAD + "00.png,SIMPLE_PINHOLE,9 400 300,fixed\n",
+            HEAD + "00.png,SIMPLE_PINHOLE,9 400 300\n",
             "line 2: a focal length of 9 px is implausible for 00.png",
         ),
         # Focal lengths and middles in turn, and coefficients of another convention
-        (HEAD + "*,PINHOLE,900 400 900 300,fixed\n", "the principal point 900, 300 is outside"),
+        (HEAD + "*,PINHOLE,900 400 900 300\n", "the principal point 900, 300 is outside"),
         (
-            HEAD + "*,OPENCV,900 900 400 300 -8 0 0 0,fixed\n",
+            HEAD + "*,OPENCV,900 900 400 300 -8 0 0 0\n",
             "with this distortion no pixel of 00.png is more than 122 px from the middle",
         ),
         (
-            HEAD + "00.png,SIMPLE_PINHOLE,900 4000 300,fixed\n",
+            HEAD + "00.png,SIMPLE_PINHOLE,900 4000 300\n",
             "line 2: the principal point 4000, 300 is outside",
         ),
         # A calibration at another resolution, of the rotated picture, and with its size
         (
-            HEAD + "*,PINHOLE,450 451 200 150,fixed\n",
+            HEAD + "*,PINHOLE,450 451 200 150\n",
             "the row seems to be for 400 x 300. Write the parameters 900 902 400 300",
         ),
         (
@@ -118,16 +118,16 @@ def write_masks(folder: Path, root: Path, left: int = 400) -> Path:
         ),
         # A principal point is a little off the middle, and the ratio of resolutions is simple.
         (
-            HEAD + "*,PINHOLE,450 450 197 153,fixed\n",
+            HEAD + "*,PINHOLE,450 450 197 153\n",
             "the row seems to be for 400 x 300. Write the parameters 900 900 394 306;",
         ),
         # Neither the focal length nor the principal point fits: the reason for both
         (
-            HEAD + "*,SIMPLE_PINHOLE,90 40 30,fixed\n",
+            HEAD + "*,SIMPLE_PINHOLE,90 40 30\n",
             "the row seems to be for 80 x 60. Write the parameters 900 400 300;",
         ),
         (
-            HEAD + "*,SIMPLE_PINHOLE,900 306 394,fixed\n",
+            HEAD + "*,SIMPLE_PINHOLE,900 306 394\n",
             "the row seems to be for 600 x 800. Rows are for pixels as stored",
         ),
         (
@@ -135,11 +135,11 @@ def write_masks(folder: Path, root: Path, left: int = 400) -> Path:
             "if the row is right, add the column size with",
         ),
         (
-            SIZED + "*,SIMPLE_PINHOLE,450 200 150,fixed,400x300\n",
+            SIZED + "*,SIMPLE_PINHOLE,450 200 150,400x300\n",
             "the row is for 400 x 300, and 00.png has 800 x 600 pixels. Write the parameters 900 400",
         ),
-        (SIZED + "*,SIMPLE_PINHOLE,900 300 400,fixed,600 x 800\n", "Rows are for pixels as stored"),
-        (SIZED + "*,SIMPLE_PINHOLE,900 400 300,fixed,800\n", "a size is width x height such as"),
+        (SIZED + "*,SIMPLE_PINHOLE,900 300 400,600 x 800\n", "Rows are for pixels as stored"),
+        (SIZED + "*,SIMPLE_PINHOLE,900 400 300,800\n", "a size is width x height such as"),
         ("\xff\x00", "line contains NUL"),
         (None, "no such file"),
     ],
@@ -162,10 +162,10 @@ def test_a_bad_table_of_intrinsics_is_one_line_and_nothing_is_touched(
 
 # Rows for images of 800 x 600 pixels, and the warnings about them
 ACCEPTED = {
-    "centred": (HEAD + "*,SIMPLE_PINHOLE,900 410 290,fixed\n", []),
-    "somewhat off": (HEAD + "*,SIMPLE_PINHOLE,900 460 300,fixed\n", ["far from the middle"]),
-    "off, with the size": (SIZED + "*,SIMPLE_PINHOLE,900 100 100,fixed,800x600\n", []),
-    "without the size": (SIZED + "*,SIMPLE_PINHOLE,900 400 300,fixed,\n", []),
+    "centred": (HEAD + "*,SIMPLE_PINHOLE,900 410 290\n", []),
+    "somewhat off": (HEAD + "*,SIMPLE_PINHOLE,900 460 300\n", ["far from the middle"]),
+    "off, with the size": (SIZED + "*,SIMPLE_PINHOLE,900 100 100,800x600\n", []),
+    "without the size": (SIZED + "*,SIMPLE_PINHOLE,900 400 300,\n", []),
 }
 
 
@@ -218,7 +218,7 @@ def test_focal_lengths_that_differ_are_warned_of(tmp_path, capsys):
     root = write_flat(tmp_path / "images", 3)
     table = tmp_path / "known.csv"
     for row, is_warned in (("900 300 400 300", True), ("900 905 400 300", False)):
-        table.write_text(f"{HEAD}*,PINHOLE,{row},fixed\n")
+        table.write_text(f"{HEAD}*,PINHOLE,{row}\n")
         read_intrinsics_table(table, root, sorted(root.iterdir()))
         text = capsys.readouterr().err
         assert ("fx and fy differ by 200 %, and pixels of cameras are square" in text) == is_warned
@@ -229,7 +229,7 @@ def test_the_images_without_a_known_camera_are_counted(tmp_path):
     # As cameras name them: a pattern is of one case.
     (root / "01.png").rename(root / "01.PNG")
     table = tmp_path / "known.csv"
-    table.write_text(f"{HEAD}*.png,SIMPLE_PINHOLE,900 400 300,fixed\n")
+    table.write_text(f"{HEAD}*.png,SIMPLE_PINHOLE,900 400 300\n")
     files = sorted(root.iterdir())
     known = read_intrinsics_table(table, root, files)
     line = "known cameras: 2 of 3 images; the first without one is 01.PNG"
@@ -243,7 +243,7 @@ def test_a_row_names_a_photograph_of_macos_too(tmp_path):
     (root / "00.png").rename(root / unicodedata.normalize("NFD", name))
     table = tmp_path / "known.csv"
     row = unicodedata.normalize("NFC", name)
-    table.write_text(f"{HEAD}{row},SIMPLE_PINHOLE,900 400 300,fixed\n", encoding="utf-8")
+    table.write_text(f"{HEAD}{row},SIMPLE_PINHOLE,900 400 300\n", encoding="utf-8")
     files = sorted(root.iterdir())
     known = read_intrinsics_table(table, root, files)
     assert intrinsics_line(known, root, files).startswith("known cameras: 1 of 3 images")
@@ -292,7 +292,7 @@ def test_another_mask_is_matched_again_and_other_intrinsics_are_not(tmp_path):
     before = contents(out)
     table = tmp_path / "known.csv"
     truth = MixedMatcher().scenes[0].cameras["0000"].K
-    table.write_text(f"{HEAD}00.png,SIMPLE_PINHOLE,{truth[0, 0]} 400 300,fixed\n")
+    table.write_text(f"{HEAD}00.png,SIMPLE_PINHOLE,{truth[0, 0]} 400 300\n")
     known = read_intrinsics_table(table, root, sorted(root.iterdir()))
     matcher = MixedMatcher()
     result = run(root, out, matcher, known=known)
@@ -343,9 +343,7 @@ def test_a_run_with_priors_that_was_ended_early_continues_to_the_same_bytes(tmp_
     root = write_flat(tmp_path / "images", FIRST)
     out = tmp_path / "out"
     table = tmp_path / "known.csv"
-    table.write_text(
-        f"{HEAD}00.png,SIMPLE_PINHOLE,901 400 300,fixed\n*,SIMPLE_PINHOLE,900 400 300,9\n"
-    )
+    table.write_text(f"{HEAD}00.png,SIMPLE_PINHOLE,901 400 300\n*,SIMPLE_PINHOLE,900 400 300\n")
     known = read_intrinsics_table(table, root, sorted(root.iterdir()))
     folder = write_masks(tmp_path / "masks", root, 200)
     masks = Masks.of_folder(folder, root, root.iterdir())
@@ -391,7 +389,7 @@ def test_priors_in_the_directory_of_results_are_refused_and_stay(tmp_path, capsy
     if option == "--masks":
         write_masks(given, root)
     else:
-        given.write_text(f"{HEAD}*,SIMPLE_PINHOLE,900 400 300,fixed\n")
+        given.write_text(f"{HEAD}*,SIMPLE_PINHOLE,900 400 300\n")
     before = contents(tmp_path)
     assert run_command("reconstruct", root, "--out", out, option, given) == 2
     (line,) = capsys.readouterr().err.splitlines()
@@ -405,13 +403,13 @@ def test_the_table_is_read_in_the_order_of_its_rows(tmp_path):
     with file.open("w", newline="") as stream:
         # The first row that fits counts, so the pattern comes last.
         rows = [
-            ("set/00.png", "OPENCV", "900 901 400 300 .1 0 0 0", "fixed"),
-            ("*", "SIMPLE_PINHOLE", "850 400 300", "5"),
+            ("set/00.png", "OPENCV", "900 901 400 300 .1 0 0 0"),
+            ("*", "SIMPLE_PINHOLE", "850 400 300"),
         ]
         csv.writer(stream).writerows([HEAD.strip().split(","), *rows])
     known = read_intrinsics_table(file, root, sorted(root.rglob("*.png")))
     assert known[0] == ("set/00.png", KnownCamera("OPENCV", (900, 901, 400, 300, 0.1, 0, 0, 0)))
-    assert known[1] == ("*", KnownCamera("SIMPLE_PINHOLE", (850, 400, 300), 5.0))
+    assert known[1] == ("*", KnownCamera("SIMPLE_PINHOLE", (850, 400, 300)))
 
 
 def test_a_row_with_a_path_is_the_camera_of_that_image_alone(tmp_path):
@@ -423,7 +421,7 @@ def test_a_row_with_a_path_is_the_camera_of_that_image_alone(tmp_path):
         cv2.imwrite(str(image), cv2.imread(str(image)), [cv2.IMWRITE_PNG_COMPRESSION, 1])
         assert image.read_bytes() != (root / "a" / image.name).read_bytes(), number
     table = tmp_path / "known.csv"
-    table.write_text(f"{HEAD}a/00.png,SIMPLE_PINHOLE,901 400 300,fixed\n")
+    table.write_text(f"{HEAD}a/00.png,SIMPLE_PINHOLE,901 400 300\n")
     known = read_intrinsics_table(table, root, sorted(root.rglob("*.png")))
     result = run(root, tmp_path / "out", known=known)
     focals = {
@@ -440,7 +438,7 @@ def test_all_parameters_of_a_distorted_camera_are_in_the_tables(tmp_path):
     truth = MixedMatcher().scenes[0].cameras["0000"].K[0, 0]
     given = [truth, truth, 400, 300, 0.001, -0.002, 0.0003, -0.0004]
     parameters = " ".join(f"{each:.12g}" for each in given)
-    table.write_text(f"{HEAD}00.png,OPENCV,{parameters},fixed\n")
+    table.write_text(f"{HEAD}00.png,OPENCV,{parameters}\n")
     known = read_intrinsics_table(table, root, sorted(root.iterdir()))
     result = run(root, tmp_path / "out", known=known)
     head, *rows = camera_rows(result.cameras, root)
@@ -463,7 +461,7 @@ def test_python_takes_masks_and_intrinsics_as_the_command_does(tmp_path):
     root = tmp_path / "images"
     files = sorted(write_flat(root / "set", FIRST).iterdir())
     table = tmp_path / "known.csv"
-    table.write_text(f"{HEAD}00.png,SIMPLE_PINHOLE,901 400 300,fixed\n")
+    table.write_text(f"{HEAD}00.png,SIMPLE_PINHOLE,901 400 300\n")
 
     def models(**priors: object) -> tuple[SfmModel, ...]:
         given = {"synthetic": MixedMatcher()}
@@ -520,7 +518,7 @@ def test_crops_are_counted_by_their_exif_unless_their_camera_is_given(tmp_path, 
 def test_rows_that_name_no_image_are_counted(tmp_path):
     root = write_flat(tmp_path / "photos", 2)
     table = tmp_path / "cameras.csv"
-    row = "SIMPLE_PINHOLE,800 400 300,fixed\n"
+    row = "SIMPLE_PINHOLE,800 400 300\n"
     table.write_text(HEAD + f"00,{row}" + f"01.png,{row}" + f"photos/00.png,{row}")
     expected = "line 2: row '00' matches no image, .*; 2 of 3 rows are so; a row has a path below"
     with pytest.raises(UserError, match=expected):

@@ -40,14 +40,14 @@ def write_inputs(demo: DemoSet, home: Path) -> None:
         # The upper border of the images
         mask[:40] = 0
         cv2.imwrite(str(home / "masks" / "a" / f"{file.name}.png"), mask)
-    # One camera is exact, the others have priors; dataset b has none.
-    rows = ["image,model,parameters,sigma"]
+    # Dataset b has none.
+    rows = ["image,model,parameters"]
     with (scene / "calibration.csv").open() as stream:
         intrinsics = {row["image_id"]: row["camera_intrinsics"] for row in csv.DictReader(stream)}
-    for number, file in enumerate(images[:4]):
+    for file in images[:4]:
         K = np.array(intrinsics[file.stem].split(), float).reshape(3, 3)
         camera = f"SIMPLE_PINHOLE,{K[0, 0]} {K[0, 2] + 0.5} {K[1, 2] + 0.5}"
-        rows.append(f"a/{file.name},{camera},{'5' if number else 'fixed'}")
+        rows.append(f"a/{file.name},{camera}")
     (home / "known.csv").write_text("\n".join([*rows, ""]))
 
 

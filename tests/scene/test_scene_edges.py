@@ -2,7 +2,7 @@
 
 import pytest
 
-from mkpc_kaggle.scene.edges import supported
+from mkpc_kaggle.scene.view_graph import supported
 
 # A ring of six images: neighbours share many matches, opposite sides look alike
 RING = {(0, 1): 400, (1, 2): 500, (2, 3): 400, (3, 4): 600, (4, 5): 500, (0, 5): 400}

@@ -1,4 +1,4 @@
-"""Intrinsics that the user knows: tables of them, and scenes with exact and with uncertain ones."""
+"""Intrinsics that the user knows: tables of them, and scenes with them."""
 
 import fnmatch
 from dataclasses import replace
@@ -18,7 +18,6 @@ from mkpc_kaggle.recipe import CameraSharing, SceneConfig
 from mkpc_kaggle.scene.export import HeldDirectory
 from mkpc_kaggle.scene.models import SfmModel, models_of
 from mkpc_kaggle.scene.sfm import reconstruct_graph
-from mkpc_kaggle.scene.uncertainty import combined
 from mkpc_kaggle.scene.view_graph import ViewGraph
 
 SCENE = synthetic_scene(6, points=500)
@@ -34,14 +33,14 @@ def reconstructed(
     return model
 
 
-def true_camera(name: str, factor: float = 1.0, sigma: float = 0.0) -> tuple[str, KnownCamera]:
+def true_camera(name: str, factor: float = 1.0) -> tuple[str, KnownCamera]:
     """Return a row with the image's true camera, its focal length multiplied by `factor`."""
     K = SCENE.cameras[name].K
     focal = factor * K[0, 0]
     # COLMAP's (0, 0) is the corner of the first pixel.
     cx = K[0, 2] + 0.5
     cy = K[1, 2] + 0.5
-    return name, KnownCamera("SIMPLE_PINHOLE", (focal, cx, cy), sigma)
+    return name, KnownCamera("SIMPLE_PINHOLE", (focal, cx, cy))
 
 
 def focal_ratios(model: SfmModel) -> dict[str, float]:
@@ -64,13 +63,8 @@ def test_a_camera_is_that_of_all_copies_of_its_photograph():
     assert ViewGraph.of_pairs(pairs).with_intrinsics(rows).known == {copied.digest: camera}
 
 
-@pytest.fixture(scope="module")
-def free() -> SfmModel:
-    return reconstructed([])
-
-
 @pytest.mark.parametrize("sharing", [CameraSharing.AUTO, CameraSharing.FOLDER])
-def test_exact_intrinsics_stay_and_have_no_uncertainty(free, sharing):
+def test_known_intrinsics_stay(sharing):
     names = NAMES[:3]
     # Wrong by 2 %, so that it shows whether the mapper has refined them.
     rows = [true_camera(name, 1.02) for name in names]
@@ -80,37 +74,11 @@ def test_exact_intrinsics_stay_and_have_no_uncertainty(free, sharing):
         is_known = found.image.name in names
         has_stayed = ratios[found.image.name] == pytest.approx(1.02, abs=1e-9)
         assert has_stayed == is_known, found.image.name
-        assert (found.sigmas.focal == 0) == is_known, found.image.name
 
 
-def test_intrinsics_that_are_all_exact_leave_less_uncertainty(free):
-    rows = [true_camera(name) for name in NAMES]
-    model = reconstructed(rows)
+def test_intrinsics_that_are_all_known_stay():
+    model = reconstructed([true_camera(name) for name in NAMES])
     assert focal_ratios(model) == pytest.approx(dict.fromkeys(NAMES, 1.0), abs=1e-9)
-
-    def mean_sigma(model: SfmModel, field: str) -> float:
-        return float(np.mean([getattr(found.sigmas, field) for found in model.images]))
-
-    for field in ("rotation", "centre"):
-        assert mean_sigma(model, field) < mean_sigma(free, field), field
-
-
-# Sigmas in percent: a prior of 0.01 % decides alone, one of 100 % has no effect.
-@pytest.mark.parametrize(("sigma", "is_decisive"), [(0.01, True), (100.0, False)])
-def test_a_prior_pulls_a_focal_length_as_far_as_its_deviation_allows(free, sigma, is_decisive):
-    name = NAMES[2]
-    # 10 % from the truth, far more than the scene alone is wrong.
-    model = reconstructed([true_camera(name, 1.1, sigma)])
-    expected = 1.1 if is_decisive else focal_ratios(free)[name]
-    assert focal_ratios(model)[name] == pytest.approx(expected, abs=2e-3)
-
-
-def test_a_prior_and_the_scene_together_are_less_uncertain_than_the_prior_alone():
-    name = NAMES[2]
-    prior_sigma = 0.1  # percent
-    model = reconstructed([true_camera(name, 1.0, prior_sigma)])
-    (sigma,) = (found.sigmas.focal for found in model.images if found.image.name == name)
-    assert 0 < sigma < prior_sigma
 
 
 def test_distortion_is_part_of_verification_and_of_the_model(tmp_path):
@@ -139,7 +107,7 @@ def test_names_are_looked_up_and_only_patterns_are_compared_with_each_image(monk
     compared = []
     monkeypatch.setattr(fnmatch, "fnmatchcase", lambda *texts: compared.append(texts))
     names = [f"{number:04d}.jpg" for number in range(100)]
-    rows = [parse_row(name, "SIMPLE_PINHOLE", "900 10 10", "fixed") for name in [*names, "x*.jpg"]]
+    rows = [parse_row(name, "SIMPLE_PINHOLE", "900 10 10") for name in [*names, "x*.jpg"]]
     table = CameraTable(rows)
     assert [table.row_of(f"walk/{name}") for name in names] == list(range(100))
     assert len(compared) == 2 * 100, "by path and by name, with the one pattern"
@@ -149,7 +117,7 @@ def test_a_row_names_an_image_by_its_path_its_name_or_a_pattern():
     # The focal length is the row's number.
     rows = []
     for number, pattern in enumerate(["set/a.jpg", "b.jpg", "[c].jpg", "set/*", "*.png"], start=1):
-        rows.append(parse_row(pattern, "SIMPLE_PINHOLE", f"{number} 10 10", "fixed"))
+        rows.append(parse_row(pattern, "SIMPLE_PINHOLE", f"{number} 10 10"))
     # The first row that fits counts.
     expected = {
         "set/a.jpg": 1,
@@ -171,16 +139,12 @@ def test_a_row_names_an_image_by_its_path_its_name_or_a_pattern():
 @pytest.mark.parametrize(
     ("cells", "reason"),
     [
-        (("", "PINHOLE", "1 1 1 1", "fixed"), "the name of the image is missing"),
-        (("a", "pinhole", "1 1 1 1", "fixed"), "unknown camera model"),
-        (("a", "PINHOLE", "1 1 1", "fixed"), r"has 4 parameters \(fx, fy, cx, cy\)"),
-        (("a", "PINHOLE", "1 nan 1 1", "fixed"), "not finite"),
-        (("a", "PINHOLE", "1 x 1 1", "fixed"), "is not a decimal number"),
-        (("a", "PINHOLE", "1 -1 1 1", "fixed"), "must be positive"),
-        (("a", "PINHOLE", "1 1 1 1", "0"), "above 0"),
-        (("a", "PINHOLE", "1 1 1 1", "nan"), "must be 'fixed'"),
-        (("a", "PINHOLE", "1 1 1 1", "101"), "at most 100 percent"),
-        (("a", "PINHOLE", "1 1 1 1", "exact"), "is not a decimal number"),
+        (("", "PINHOLE", "1 1 1 1"), "the name of the image is missing"),
+        (("a", "pinhole", "1 1 1 1"), "unknown camera model"),
+        (("a", "PINHOLE", "1 1 1"), r"has 4 parameters \(fx, fy, cx, cy\)"),
+        (("a", "PINHOLE", "1 nan 1 1"), "not finite"),
+        (("a", "PINHOLE", "1 x 1 1"), "is not a decimal number"),
+        (("a", "PINHOLE", "1 -1 1 1"), "must be positive"),
     ],
 )
 def test_a_row_that_no_camera_has_is_refused_with_the_reason(cells, reason):
@@ -194,8 +158,3 @@ def test_the_models_have_the_parameters_of_colmap():
         assert len(camera.params) == len(parameters)
         colmap_parameters = camera.params_info.replace(" ", "").split(",")
         assert colmap_parameters == list(parameters)
-
-
-def test_deviations_combine_as_those_of_independent_measurements():
-    # Weights add: 1 / 9 + 1 / 16 = 1 / 2.4**2.
-    assert combined(3.0, 4.0) == pytest.approx(2.4)

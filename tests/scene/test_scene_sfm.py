@@ -28,8 +28,7 @@ from mkpc_kaggle.scene import colmap
 from mkpc_kaggle.scene.choose import Reason
 from mkpc_kaggle.scene.export import HeldDirectory
 from mkpc_kaggle.scene.keypoints import MergedGraph
-from mkpc_kaggle.scene.mapper import reconstruct_connected
-from mkpc_kaggle.scene.sfm import Solution, reconstruct_batch
+from mkpc_kaggle.scene.sfm import Solution, reconstruct_batch, reconstruct_connected
 from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair, ViewGraph
 
 
@@ -286,14 +285,37 @@ def test_an_edge_is_verified_once_for_the_same_cameras_on_any_number_of_threads(
 
 def test_a_refinement_without_the_matches_of_an_image_leaves_the_image_out(scene):
     whole = MergedGraph(ViewGraph.of_pairs(scene.pairs))
-    first = reconstruct_connected(whole, {}, SceneConfig())
+    first = reconstruct_connected(whole, {}, config=SceneConfig())
     assert first.registered == 6
     edges = [edge for edge in whole.graph.edges if 3 not in (edge.first, edge.second)]
     lacking = MergedGraph(replace(whole.graph, edges=tuple(edges)))
-    second = reconstruct_connected(lacking, {}, SceneConfig(), first.models)
+    second = reconstruct_connected(lacking, {}, first.models, config=SceneConfig())
     assert second.failure == ""
     names = {found.image.name for found in second.models[0].images}
     assert names == {*scene.cameras} - {"0003"}
+
+
+def test_a_homography_that_was_not_estimated_is_not_read(scene, monkeypatch, tmp_path):
+    """pycolmap leaves it as it was in memory."""
+    estimate = colmap.pycolmap.estimate_two_view_geometry
+    written = []
+    for number, value in enumerate((np.nan, 1e300)):
+
+        def filled(*arguments: object, value: float = value) -> object:
+            geometry = estimate(*arguments)
+            assert geometry.config == colmap.pycolmap.TwoViewGeometryConfiguration.CALIBRATED
+            geometry.H = np.full((3, 3), value)
+            return geometry
+
+        monkeypatch.setattr(colmap.pycolmap, "estimate_two_view_geometry", filled)
+        out = tmp_path / str(number)
+        reconstruct_batch(scene.pairs, SceneConfig(), export=HeldDirectory.of(out))
+        with closing(sqlite3.connect(out / "database.db")) as database:
+            written.append([*database.iterdump()])
+        files = sorted((out / "models").rglob("*.bin"))
+        written[-1] += [file.read_bytes() for file in files]
+    assert len(written[0]) > 5
+    assert written[0] == written[1]
 
 
 @pytest.mark.parametrize("error", [KeyError("6"), IndexError("6"), ValueError("6")])
@@ -302,6 +324,7 @@ def test_an_error_within_a_reconstruction_is_a_reason(scene, monkeypatch, error)
         raise error
 
     monkeypatch.setattr(colmap, "structure_from_motion", failing)
-    found = reconstruct_connected(MergedGraph(ViewGraph.of_pairs(scene.pairs)), {}, SceneConfig())
+    merged = MergedGraph(ViewGraph.of_pairs(scene.pairs))
+    found = reconstruct_connected(merged, {}, config=SceneConfig())
     assert found.models == ()
     assert "6" in found.failure

@@ -188,7 +188,7 @@ def test_shared_intrinsics_stay_unless_they_explain_fewer_points_and_the_files_a
     monkeypatch.setattr(
         "mkpc_kaggle.scene.shared_intrinsics.shared_intrinsics", lambda *_, **__: everything
     )
-    monkeypatch.setattr("mkpc_kaggle.scene.mapper.MIN_OBSERVATIONS", least)
+    monkeypatch.setattr("mkpc_kaggle.scene.shared_intrinsics.MIN_OBSERVATIONS", least)
     solution = reconstruct_batch(scene.pairs, CONFIG)
     assert len(set(focals_of(solution))) == cameras
 

@@ -28,7 +28,7 @@ from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import Picture
 from mkpc_kaggle.pipeline.stages import Pipeline
 from mkpc_kaggle.scene.choose import Choice, Reason
-from mkpc_kaggle.scene.models import Reconstruction, RegisteredImage, SfmModel, Sigmas
+from mkpc_kaggle.scene.models import Reconstruction, RegisteredImage, SfmModel
 from mkpc_kaggle.scene.sfm import Solution
 from mkpc_kaggle.scene.view_graph import BatchImage
 from mkpc_kaggle.setup.assembly import Assembly
@@ -181,10 +181,7 @@ def choose_scene_for_all_but_the_first(job: SceneJob) -> Solution:
     names = tuple(sorted({image.name for pair in job.pairs for image in pair.images}))
     camera = Camera(np.eye(3), np.eye(3), np.zeros(3))
     images = (BatchImage(name, name, Size(80, 72)) for name in names)
-    registered = tuple(
-        RegisteredImage(each, camera, 99, Sigmas(0.1, 0.01 * n, 2.0))
-        for n, each in enumerate(images)
-    )
+    registered = tuple(RegisteredImage(each, camera, 99) for each in images)
     points = np.zeros((job.matches, 3))
     return Solution((Reconstruction(names, (SfmModel(registered, points, 0.5),)),), choices)
 

@@ -29,7 +29,7 @@ from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.pipeline.pair import UnitResult
 from mkpc_kaggle.recipe import Recipe, SceneConfig, Unit
 from mkpc_kaggle.scene.choose import Choice, Reason
-from mkpc_kaggle.scene.models import Reconstruction, RegisteredImage, SfmModel, Sigmas
+from mkpc_kaggle.scene.models import Reconstruction, RegisteredImage, SfmModel
 from mkpc_kaggle.scene.sfm import Solution
 from mkpc_kaggle.scene.view_graph import BatchImage
 
@@ -113,17 +113,14 @@ class Room:
     def reconstruct(self) -> None:
         state = self.state
         indices, _ = state.scene_inputs("one")
-        sigmas = {"0.png": Sigmas(0.1, 0.02, 3.0), "1.png": ()}
-        placed = [
-            RegisteredImage(BatchImage(name, "d", Size(80, 60)), CAMERA, 9, sigmas[name])
-            for name in sigmas
-        ]
+        names = ("0.png", "1.png")
+        placed = [RegisteredImage(BatchImage(name, "d", Size(80, 60)), CAMERA, 9) for name in names]
         model = SfmModel(tuple(placed), np.array([[0.0, 0.0, 5.0]]), 0.7)
         choices = [
             Choice(3 * F, Reason.SCENE),
             *[Choice(None, Reason.UNREGISTERED)] * (len(indices) - 1),
         ]
-        answer = Solution((Reconstruction(tuple(sigmas), (model,)),), tuple(choices))
+        answer = Solution((Reconstruction(names, (model,)),), tuple(choices))
         reconstructing = SceneWork(self.run)
         reconstructing.save(reconstructing.job("one"), answer, 1.5)
 

@@ -231,7 +231,6 @@ CAMERAS = Query(
         "width": (int, "json_extract(camera.value, '$.image.size[0]')"),
         "height": (int, "json_extract(camera.value, '$.image.size[1]')"),
         "points": (int, "json_extract(camera.value, '$.points')"),
-        "sigmas": (object, "json_extract(camera.value, '$.sigmas')"),
         "K": (object, "json_extract(camera.value, '$.camera.K')"),
         "R": (object, "json_extract(camera.value, '$.camera.R')"),
         "t": (object, "json_extract(camera.value, '$.camera.t')"),
@@ -258,7 +257,6 @@ CAMERAS = Query(
 )
 SCENE_COLUMNS = ["batch", "images", "cameras", "models", "points"]
 SCENE_COLUMNS += ["reprojection_error", "seconds", "candidate", "failure", "missing"]
-SIGMAS = ["rotation_sigma", "centre_sigma", "focal_sigma"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -534,13 +532,6 @@ def _cameras(database: sqlite3.Connection) -> "DataFrame":
     for name in ("K", "R", "t"):
         frame[name] = _objects(frame[name], lambda text: np.array(json.loads(text), float))
     frame["parameters"] = _objects(frame["parameters"], lambda text: tuple(json.loads(text)))
-    # pandas treats NaN as missing.
-    unknown = (np.nan,) * len(SIGMAS)
-    sigmas = [json.loads(text) or unknown for text in frame.pop("sigmas")]
-    table = np.array(sigmas, float).reshape(-1, len(SIGMAS))
-    before = list(frame.columns).index("K")
-    for number, name in enumerate(SIGMAS):
-        frame.insert(before + number, name, table[:, number])
     frame.insert(5, "focal", np.array([K[0, 0] for K in frame["K"]], float))
     return frame
 

@@ -117,7 +117,6 @@ def _models_to_sql(models: Sequence[SfmModel]) -> str:
                 "images": model.images,
                 "points": b64encode(model.points.astype("<f4").tobytes()).decode("ascii"),
                 "reprojection_error": float(model.reprojection_error),
-                "comparison": model.comparison,
             }
             for model in models
         ]

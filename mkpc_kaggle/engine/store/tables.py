@@ -142,12 +142,6 @@ class SceneRecord:
             key=key,
         )
 
-    @property
-    def loose(self) -> int:
-        """Number of images whose only cameras are in loose models (:attr:`SfmModel.is_loose`)."""
-        sure = {found.image.name for m in self.models if not m.is_loose for found in m.images}
-        return len({found.image.name for m in self.models for found in m.images} - sure)
-
     def against(self, others: Iterable["SceneRecord"]) -> "SceneRecord":
         """Return the record of the chosen candidate, with the others as rivals."""
         rivals = [Rival(each.candidate, each.disagreement, each.registered) for each in others]

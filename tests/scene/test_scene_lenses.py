@@ -1,0 +1,76 @@
+"""Lenses with distortion: found where photographs show them, and pinholes where they do not."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks.synthetic_scene import SIZE, synthetic_scene
+from mkpc_kaggle.geometry.intrinsics import KnownCamera
+from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.recipe import CameraModel, CameraSharing, SceneConfig
+from mkpc_kaggle.scene.models import SfmModel, models_of
+from mkpc_kaggle.scene.sfm import reconstruct_graph
+from mkpc_kaggle.scene.view_graph import BatchPair, ViewGraph
+
+FOCAL = 840.0
+CENTRE = np.array([SIZE.width / 2 - 0.5, SIZE.height / 2 - 0.5])
+SCENE = synthetic_scene(6, points=500, focals=[FOCAL] * 6)
+RADIAL = SceneConfig(camera_model=CameraModel.SIMPLE_RADIAL)
+
+
+def distorted(points: np.ndarray, k: float) -> np.ndarray:
+    """Return pixels as a lens with the radial coefficient ``k`` shows them."""
+    rays = (points - CENTRE) / FOCAL
+    bent = rays * (1 + k * (rays**2).sum(axis=1, keepdims=True))
+    return np.asarray(bent * FOCAL + CENTRE)
+
+
+def pairs_of(k: float) -> list[BatchPair]:
+    """Return the pairs of the scene, through a lens."""
+    pairs = []
+    for pair in SCENE.pairs:
+        points0 = distorted(pair.matches.points0, k)
+        points1 = distorted(pair.matches.points1, k)
+        pairs.append(replace(pair, by_unit=(Matches(points0, points1, pair.matches.scores),)))
+    return pairs
+
+
+def model_of(k: float, config: SceneConfig, *rows: tuple[str, KnownCamera]) -> SfmModel:
+    graph = ViewGraph.of_pairs(pairs_of(k)).with_intrinsics(rows)
+    (model,) = models_of(reconstruct_graph(graph, config)[0])
+    assert len(model.images) == 6
+    return model
+
+
+def lenses_of(model: SfmModel) -> set[str]:
+    return {image.lens.model for image in model.images if image.lens}
+
+
+@pytest.mark.parametrize("sharing", [CameraSharing.AUTO, CameraSharing.FOLDER])
+@pytest.mark.parametrize("k", [-0.2, 0.1])
+def test_a_lens_is_found_and_shared(k, sharing):
+    model = model_of(k, replace(RADIAL, cameras=sharing))
+    assert lenses_of(model) == {"SIMPLE_RADIAL"}
+    (lens,) = {image.lens for image in model.images}
+    assert lens is not None
+    assert lens.distortion == pytest.approx((k,), rel=0.05)
+    assert lens.focal == pytest.approx(FOCAL, rel=0.02)
+    assert all(image.has_distortion for image in model.images)
+
+
+def test_a_lens_that_moves_no_pixel_by_more_than_one_is_a_pinhole():
+    model = model_of(0.0, RADIAL)
+    assert lenses_of(model) == {"SIMPLE_PINHOLE"}
+    assert not any(image.has_distortion for image in model.images)
+    assert [image.focal for image in model.images] == pytest.approx([FOCAL] * 6, rel=0.02)
+
+
+def test_a_lens_that_the_user_gives_stays_however_flat_it_is():
+    lens = KnownCamera("SIMPLE_RADIAL", (FOCAL, SIZE.width / 2, SIZE.height / 2, 1e-6))
+    model = model_of(0.0, RADIAL, ("*", lens))
+    assert {image.lens for image in model.images} == {lens}
+
+
+def test_pinholes_that_are_asked_for_stay_pinholes():
+    assert lenses_of(model_of(-0.2, SceneConfig())) == {"SIMPLE_PINHOLE"}
