@@ -1,12 +1,13 @@
 """Errors and warnings for users, and parts of their texts."""
 
+import errno
 import sys
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr, suppress
 from functools import cache
 from importlib import import_module
-from io import StringIO
+from io import BufferedReader, StringIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -53,16 +54,21 @@ def warn_once(message: str) -> None:
     warnings.warn(message, stacklevel=3)
 
 
+def open_regular(path: Path) -> BufferedReader:
+    """Open a file to read its bytes. Raise ``OSError``, also for a pipe or a device, which may never end."""
+    if path.exists() and not path.is_file():
+        raise OSError(errno.EINVAL, "not a regular file", str(path))
+    return path.open("rb")
+
+
 def read_text(path: Path) -> str:
     """Return the text of a UTF-8 file of at most 16 MiB, or raise :class:`UserError`."""
     try:
-        if path.exists() and not path.is_file():
-            raise UserError(f"{path} cannot be read: not a regular file")
-        if path.exists() and (size := path.stat().st_size) > MAX_TEXT_BYTES:
-            raise UserError(
-                f"{path} is too large: {size / 2**20:.1f} MiB, the limit is 16 MiB; split it"
-            )
-        return path.read_text(encoding="utf-8-sig")
+        with open_regular(path) as stream:
+            data = stream.read(MAX_TEXT_BYTES + 1)
+        if len(data) > MAX_TEXT_BYTES:
+            raise UserError(f"{path} is too large: the limit is 16 MiB; split it")
+        return data.decode("utf-8-sig")
     except OSError as error:
         raise UserError(f"{path} cannot be read: {error.strerror}") from error
     except UnicodeDecodeError as error:

@@ -237,7 +237,8 @@ def _effects(
     on photographs that are crops.
     """
     files = [file for dataset in datasets.values() for file in dataset]
-    yield from masks.lines
+    if masks.line:
+        yield masks.line
     if cameras:
         yield intrinsics_line(cameras, root, files)
     if line := crops_line(cameras, root, files):

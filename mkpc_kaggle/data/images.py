@@ -1,34 +1,38 @@
 """Images: decoded once, in the background; an unreadable file is a value with the reason.
 
-EXIF gives the orientation of the stored pixels, and the focal length as COLMAP computes it. Source:
-``Bitmap::ExifFocalLength`` of COLMAP 4.2, without COLMAP's table of sensors, and scaled to the stored
-pixels if the photograph was reduced after it was taken.
+Pillow reads size, EXIF and stored pixels. EXIF gives the orientation of the pixels, and the focal length as
+COLMAP computes it. Source: ``Bitmap::ExifFocalLength`` of COLMAP 4.2, without COLMAP's table of sensors, and
+scaled to the stored pixels if the photograph was reduced after it was taken.
 """
 
 import hashlib
+import warnings
 from collections import OrderedDict
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
+from io import BytesIO
 from math import hypot, inf
+from numbers import Real
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import cv2
 import numpy as np
+import PIL.Image
 
 from mkpc_kaggle.config import Range
-from mkpc_kaggle.data.heads import HEIC_BRANDS, ORIENTATION, exif_tags, is_tiff, size_of
-from mkpc_kaggle.errors import shown
+from mkpc_kaggle.errors import open_regular, shown
 from mkpc_kaggle.geometry.coordinates import Pixels, Size
 
+# Pillow's names of the formats that are read. Its readers of others may start programs.
+FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "AVIF", "JPEG2000", "PPM")
 # Files that are read as photographs, by suffix; the first three also stand for the competitions'
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 MORE_SUFFIXES = (
-    *(".jpe", ".jfif", ".webp", ".tif", ".tiff", ".bmp", ".ppm", ".pgm", ".pnm", ".jp2"),
-    # OpenCV's wheels have a reader of AVIF since 2024.
-    *((".avif",) if cv2.haveImageWriter("a.avif") else ()),
+    *(".jpe", ".jfif", ".webp", ".tif", ".tiff", ".bmp", ".ppm", ".pgm", ".pnm", ".jp2", ".avif"),
 )
 READ_SUFFIXES = IMAGE_SUFFIXES + MORE_SUFFIXES
 # Photographs that nothing here decodes: of phones, of newer formats, and of sensors (raw)
@@ -41,23 +45,21 @@ OTHER_SUFFIXES = frozenset(
     )
 ) - set(READ_SUFFIXES)
 
+BLAKE2 = partial(hashlib.blake2b, digest_size=16)
 # Ratio of the sides; a longer image's views would be a few pixels high or exceed the memory.
 MAX_ASPECT = 32
 
-# Tags of EXIF.
+# Tags of EXIF and TIFF
+ORIENTATION = 0x0112
+EXIF_DIRECTORY = 0x8769  # of the tags that only EXIF has
+TIFF_SIDES = 0x0100, 0x0101
 FOCAL_MM = 0x920A
 PLANE_RESOLUTION = 0xA20E  # pixels per unit of the sensor
 PLANE_UNIT = 0xA210
-EXIF_BYTES = 1 << 17  # of a file, which has its EXIF there; a segment of JPEG has up to 64 kB
 RECORDED_SIDES = 0xA002, 0xA003  # width and height in pixels when the photograph was taken
 FOCAL_35MM = 0xA405
 FILM_MM = 43.27  # diagonal of 35 mm film
 UNITS_MM: dict[float, float] = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # inch, cm, mm, micrometre
-# Marks of JPEG, and bytes that change a picture if they are decoded
-JPEG_START, JPEG_END = b"\xff\xd8", b"\xff\xd9"
-JPEG_SCAN = 0xDA
-JPEG_FILL = b"\xaa" * 64
-MAX_TRAILER_BYTES = 1 << 16  # after the end mark, such as a maker's notes
 # In long sides of the image; a focal length outside this range counts as unknown.
 EXIF_FOCALS = Range(0.2, 20.0)
 # Ratio of the shapes of a stored and a recorded picture; more is a crop, and not rounding.
@@ -94,7 +96,7 @@ class Image:
             array = np.stack([array] * 3, axis=2)
         pixels = np.ascontiguousarray(array)
         # Two arrays of other shapes may have the same bytes.
-        return cls(f"{_content_digest(pixels)} {pixels.shape}", pixels)
+        return cls(f"{BLAKE2(pixels.data).hexdigest()} {pixels.shape}", pixels)
 
     @property
     def size(self) -> Size:
@@ -143,52 +145,51 @@ def file_state(path: Path) -> tuple[int, int]:
 def read_image(path: Path) -> Image | Unreadable:
     """Decode a file's stored pixels to RGB; return failures, never raise.
 
-    16-bit values are divided by 256. OpenCV decides whether a damaged file is readable: version 5
-    refuses a truncated file, and so do all versions if it is a JPEG. In a JPEG file,
-    only the end mark may be missing.
+    Of 16 bits, the upper eight count. A file that is cut off is unreadable.
     """
     name = str(path)
-    bgr = None
     # Before it is read, so that a later change is never missed.
-    file = file_state(path)
+    state = file_state(path)
     try:
-        if path.exists() and not path.is_file():  # a pipe or a device may never end
-            return Unreadable(name, "cannot be read: not a regular file")
-        data = np.fromfile(path, np.uint8)
-        if data.size:  # OpenCV raises for an empty array
-            bgr = decode(data)
+        with open_regular(path) as stream:
+            data = stream.read()
+        with open_picture(BytesIO(data)) as picture:
+            size = stored_size(picture)
+            if not has_usable_shape(size):
+                sides = f"{size.width} x {size.height} pixels"
+                return Unreadable(
+                    name, f"{sides}: one side is more than {MAX_ASPECT} times the other"
+                )
+            tags = exif_tags(picture)
+            pixels = rgb_pixels(picture)
+            if picture.format == "TIFF":
+                pixels = _stored(pixels, int(tags.get(ORIENTATION, 1)))
     except FileNotFoundError:
         return Unreadable(name, "no such file")
-    except (OSError, ValueError, MemoryError, cv2.error) as error:
-        return Unreadable(name, f"cannot be read: {error}")
-    if bgr is None:
-        return Unreadable(name, _undecoded(path, data))
-    height, width = bgr.shape[:2]
-    if not has_usable_shape(Size(width, height)):
-        return Unreadable(
-            name, f"{width} x {height} pixels: one side is more than {MAX_ASPECT} times the other"
-        )
-    turns, focal = read_exif(data.tobytes(), Size(width, height))
-    pixels = np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
-    return Image(name, pixels, _content_digest(data), focal, turns, file)
+    except PIL.UnidentifiedImageError:
+        return Unreadable(name, _unknown(data))
+    except Exception as error:  # a reader may raise anything for a damaged file
+        return Unreadable(name, f"cannot be read: {getattr(error, 'strerror', None) or error}")
+    turns, focal = exif_facts(tags, size)
+    return Image(name, pixels, BLAKE2(data).hexdigest(), focal, turns, state)
 
 
-def _undecoded(path: Path, data: Pixels) -> str:
-    """Return why OpenCV does not decode the bytes of a file."""
-    if not data.size:
+@contextmanager
+def open_picture(stream: BinaryIO) -> Iterator[PIL.Image.Image]:
+    """Yield Pillow's picture of a stream, which is not decoded yet."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of damaged EXIF, and of many pixels
+        with PIL.Image.open(stream, formats=FORMATS) as picture:
+            yield picture
+
+
+def _unknown(data: bytes) -> str:
+    """Return why no reader takes the bytes of a file."""
+    if not data:
         return "the file is empty"
-    # Photographs of phones are often HEIC under the name of a JPEG.
-    head = data[:12].tobytes()
-    if head[4:8] == b"ftyp" and head[8:12] in HEIC_BRANDS:
-        return "a HEIC file, which cannot be decoded here; convert it to JPEG or PNG"
-    if path.suffix.lower() in OTHER_SUFFIXES:
-        return f"{path.suffix} files cannot be decoded here; convert it to JPEG or PNG"
-    # A raw file is a TIFF file, too.
-    if is_tiff(head):
-        return (
-            "a TIFF file of a kind that cannot be decoded here; save it with 8 or 16 bits per value"
-        )
-    return "not a picture, or cut off: it cannot be decoded"
+    if data[:4] in (b"II*\0", b"MM\0*"):
+        return "a TIFF file of another kind than 1, 3 or 4 channels of 8 or 16 bits; convert it"
+    return "not a picture of a known format; convert it to JPEG or PNG"
 
 
 def has_usable_shape(size: Size) -> bool:
@@ -196,68 +197,52 @@ def has_usable_shape(size: Size) -> bool:
     return max(size) <= MAX_ASPECT * min(size)
 
 
-def decode(data: Pixels, kind: int = cv2.IMREAD_COLOR) -> Pixels | None:
-    """Return the stored pixels of a picture file, (H, W, 3) BGR or as OpenCV's ``kind``; ``None``
-    if it is unreadable.
+def stored_size(picture: PIL.Image.Image) -> Size:
+    """Return the size of a picture's stored pixels. Pillow gives the upright size of TIFF."""
+    tags = getattr(picture, "tag_v2", {})
+    width, height = (int(tags.get(tag, 0)) for tag in TIFF_SIDES)
+    return Size(width, height) if width and height else Size(*picture.size)
+
+
+def rgb_pixels(picture: PIL.Image.Image) -> Pixels:
+    """Return a picture's pixels (H, W, 3) uint8 RGB, without transparency.
+
+    Raises ``ValueError`` for values of more than 16 bits.
     """
-    pixels = _decode_file(data, kind)
-    start = data[:4].tobytes()
-    # OpenCV 5 refuses these files, and OpenCV 4 fills their missing part without a word.
-    if start.startswith(JPEG_START) and not _has_end(data):
-        # Some cameras and downloads leave the end mark out. If the picture is complete, further
-        # bytes change nothing; if it is cut off, they are decoded.
-        pixels, other = (_decode_file(_with_end(data, more), kind) for more in (b"", JPEG_FILL))
-        if pixels is None or other is None or not np.array_equal(pixels, other):
-            return None
-    if pixels is not None and is_tiff(start):
-        # OpenCV sets TIFF upright even if it is asked not to. COLMAP reads the stored pixels.
-        orientation = int(exif_tags(data.tobytes()).get(ORIENTATION, 1))
-        pixels = _stored(pixels, orientation)
-    return pixels
-
-
-def _decode_file(data: Pixels, kind: int) -> Pixels | None:
-    # OpenCV's types do not say that the pixels are bytes, as IMREAD_COLOR makes them.
-    pixels: Any = cv2.imdecode(data, kind | cv2.IMREAD_IGNORE_ORIENTATION)
-    return pixels if pixels is None else np.asarray(pixels)
-
-
-def _has_end(data: Pixels) -> bool:
-    """Return whether a JPEG file has an end mark after its first scan."""
-    scan = 2
-    # Each segment before it has a length. A thumbnail in EXIF has an end mark of its own.
-    while scan + 4 <= len(data) and data[scan] == JPEG_END[0] and data[scan + 1] != JPEG_SCAN:
-        scan += 2 + int.from_bytes(data[scan + 2 : scan + 4].tobytes(), "big")
-    # Cameras may write more after the end mark.
-    return JPEG_END in data[max(scan, len(data) - MAX_TRAILER_BYTES) :].tobytes()
-
-
-def _with_end(data: Pixels, more: bytes) -> Pixels:
-    """Return the bytes of a JPEG file without its end, with ``more`` bytes and the end mark."""
-    whole = data[:-1] if data[-1] == JPEG_END[0] else data  # the first half of the mark
-    return np.concatenate([whole, np.frombuffer(more + JPEG_END, np.uint8)])
+    if picture.mode.startswith(("I", "F")):
+        values = np.asarray(picture)
+        if picture.mode == "F" or values.min() < 0 or values.max() > 0xFFFF:
+            raise ValueError("values of more than 16 bits; save it with 8 or 16 bits per value")
+        gray = (values.astype(np.uint16) >> 8).astype(np.uint8)
+        return np.stack([gray] * 3, axis=2)
+    return np.asarray(picture if picture.mode == "RGB" else picture.convert("RGB"))
 
 
 def _stored(pixels: Pixels, orientation: int) -> Pixels:
-    """Return the stored pixels of a picture that was set upright from an EXIF orientation."""
+    """Return the stored pixels of a TIFF file, which Pillow sets upright when it decodes them."""
     if orientation in (2, 4, 5, 7):
         # Mirrored: 2 and no more; 4, 5 and 7 are also turned, like 3, 8 and 6.
         pixels = pixels[:, ::-1]
-    turns = -TURNS.get(orientation, 0)
-    return np.ascontiguousarray(np.rot90(pixels, turns))
+    return np.ascontiguousarray(np.rot90(pixels, -TURNS.get(orientation, 0)))
 
 
-def read_exif(data: bytes, size: Size) -> tuple[int, float]:
-    """Return the quarter turns that set an image upright, and its focal length in pixels.
-
-    Turns are counter-clockwise. ``data`` has the file's bytes; ``size`` is in pixels. Both results
-    are 0 if unknown. Damaged EXIF is ignored.
-    """
-    return exif_facts(exif_tags(data), size)
+def exif_tags(picture: PIL.Image.Image) -> dict[int, float]:
+    """Return the numbers among the EXIF tags of a picture, by tag; empty if damaged."""
+    tags = {}
+    try:
+        exif = picture.getexif()
+        for tag, value in {**exif, **exif.get_ifd(EXIF_DIRECTORY)}.items():
+            if isinstance(value, Real):
+                tags[tag] = float(value)
+    except Exception:  # Pillow raises many kinds of errors for damaged EXIF
+        return {}
+    return tags
 
 
 def exif_facts(tags: Mapping[int, float], size: Size) -> tuple[int, float]:
-    """Return the turns and the focal length of :func:`read_exif` from EXIF's tags."""
+    """Return the counter-clockwise quarter turns that set an image of ``size`` upright, and its focal
+    length in pixels. Both are 0 if unknown.
+    """
     turns = TURNS.get(tags.get(ORIENTATION, 1), 0)
     # In COLMAP's order: the equivalent focal length first, then the sensor's resolution. An unknown
     # unit is infinite, which gives 0.
@@ -290,42 +275,32 @@ def scale_since_taken(tags: Mapping[int, float], size: Size) -> float:
 
 
 def is_crop(path: Path, size: Size) -> bool:
-    """Return whether EXIF at the head of a picture file states that it is a part of a photograph."""
+    """Return whether EXIF of a picture file states that it is a part of a photograph."""
     try:
-        with path.open("rb") as stream:
-            head = stream.read(EXIF_BYTES)
-    except (OSError, ValueError):
+        with open_regular(path) as stream, open_picture(stream) as picture:
+            return not scale_since_taken(exif_tags(picture), size)
+    except Exception:
         return False
-    return not scale_since_taken(exif_tags(head), size)
 
 
 def read_size(path: Path) -> Size | None:
-    """Return a picture's size in stored pixels, from its head if possible; ``None`` if it is
-    unreadable.
-    """
+    """Return a picture's size in stored pixels, without decoding it; ``None`` if it is unreadable."""
     try:
-        # A pipe or a device may never end.
-        if not path.is_file():
-            return None
-        with path.open("rb") as stream:
-            size = size_of(stream)
-    except (OSError, ValueError):
+        with open_regular(path) as stream, open_picture(stream) as picture:
+            return stored_size(picture)
+    except Exception:
         return None
-    # A format without a head that Pillow reads, and a damaged head
-    if size is None and isinstance(image := read_image(path), Image):
-        return image.size
-    return size
+
+
+def is_picture(path: Path) -> bool:
+    """Return whether a file has the head of a picture, whatever its name is."""
+    return read_size(path) is not None
 
 
 def content_digest(path: Path) -> str:
-    """Return the digest of a file. Raise ``OSError`` or ``ValueError`` if it cannot be read."""
-    if not path.is_file():
-        raise FileNotFoundError(path)
-    return _content_digest(np.fromfile(path, np.uint8))
-
-
-def _content_digest(data: Pixels) -> str:
-    return hashlib.blake2b(data.data, digest_size=16).hexdigest()
+    """Return the digest of a file. Raise ``OSError`` if it cannot be read."""
+    with open_regular(path) as stream:
+        return hashlib.file_digest(stream, BLAKE2).hexdigest()
 
 
 class ByteCache:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mkpc_kaggle.data.images import Image, read_image
-from mkpc_kaggle.data.masks import MIN_SHOWN, Masks, read_mask
+from mkpc_kaggle.data.masks import Masks, read_mask
 from mkpc_kaggle.errors import UserError
 
 MAX_FILES = 12  # that are decoded, spread over the images; 24 megapixels take 0.3 s
@@ -26,6 +26,9 @@ class FileCause(NamedTuple):
 
     kind: str
     sentence: str
+
+
+MIN_SHOWN = 0.05  # share of an image; a mask that shows less is often inverted
 
 
 def causes_in_files(files: Sequence[Path], masks: Masks) -> Iterator[str]:

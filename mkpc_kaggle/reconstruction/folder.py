@@ -8,8 +8,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from mkpc_kaggle.data.competition import CONTROL
-from mkpc_kaggle.data.heads import is_picture
-from mkpc_kaggle.data.images import IMAGE_SUFFIXES, MORE_SUFFIXES, OTHER_SUFFIXES, READ_SUFFIXES
+from mkpc_kaggle.data.images import (
+    IMAGE_SUFFIXES,
+    MORE_SUFFIXES,
+    OTHER_SUFFIXES,
+    READ_SUFFIXES,
+    is_picture,
+)
 from mkpc_kaggle.engine.console import logger
 from mkpc_kaggle.errors import UserError, plural, printable, read_text
 from mkpc_kaggle.reconstruction.directory import RESERVED

@@ -250,9 +250,8 @@ def with_priors(
     """
     cameras = () if intrinsics is None else read_intrinsics_table(Path(intrinsics), root, files)
     given = assembly.masks if masks is None else Masks.of_folder(Path(masks), root, files)
-    if given.is_partial:
-        for line in given.lines:
-            logger.warning(line)
+    if masks is not None and len(given.files) < len(files):
+        logger.warning(given.line)
     if cameras and has_gaps(cameras, root, files):
         logger.warning(intrinsics_line(cameras, root, files))
     if line := crops_line(cameras, root, files):

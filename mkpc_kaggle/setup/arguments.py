@@ -16,8 +16,15 @@ import numpy as np
 import PIL.Image
 from numpy.typing import NDArray
 
-from mkpc_kaggle.data.heads import tags_of_picture
-from mkpc_kaggle.data.images import Image, ImageStore, Unreadable, exif_facts, read_image
+from mkpc_kaggle.data.images import (
+    Image,
+    ImageStore,
+    Unreadable,
+    exif_facts,
+    exif_tags,
+    read_image,
+    rgb_pixels,
+)
 from mkpc_kaggle.errors import UserError, plural
 from mkpc_kaggle.geometry.coordinates import Matrix3, Pixels
 
@@ -71,25 +78,12 @@ def _of_file(path: Path, store: ImageStore | None) -> Image:
 def _of_picture(picture: PIL.Image.Image, name: str) -> Image:
     """Return the image of PIL's stored pixels, with its EXIF, as of the file."""
     try:
-        array = _array_of_picture(picture)
-    except OSError as error:  # PIL decodes on first use
+        pixels = rgb_pixels(picture)
+    except (OSError, ValueError) as error:  # PIL decodes on first use
         raise UserError(f"{name} cannot be decoded: {error}") from error
-    image = Image.of_array(_pixels(array, name))
-    turns, focal = exif_facts(tags_of_picture(picture), image.size)
+    image = Image.of_array(pixels)
+    turns, focal = exif_facts(exif_tags(picture), image.size)
     return replace(image, turns=turns, focal=focal)
-
-
-def _array_of_picture(picture: PIL.Image.Image) -> NDArray[Any]:
-    if picture.mode.startswith("I"):
-        # 16 bits, as in files: the upper eight count.
-        values = np.clip(np.asarray(picture).astype(np.int64), 0, 0xFFFF)
-        return np.asarray(values >> 8, np.uint8)
-    if picture.mode == "F":
-        return np.asarray(picture)
-    # PIL warns of a palette with transparency unless it becomes an alpha channel first.
-    if "transparency" in picture.info:
-        picture = picture.convert("RGBA")
-    return np.asarray(picture.convert("RGB"))
 
 
 def _pixels(array: NDArray[Any], name: str, *, channels_first: bool = False) -> Pixels:
