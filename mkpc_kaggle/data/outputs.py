@@ -10,16 +10,8 @@ from typing import TextIO
 
 from mkpc_kaggle.errors import UserError
 
-# Suffixes of each option's results. In an input directory, a file with one of them is an earlier
-# result, which may be replaced.
-RESULTS = {
-    "--output": (".csv",),
-    "--json": (".json",),
-    "the report": (".html",),
-    "--out": (".png", ".jpg", ".pdf", ".svg"),
-    "--save": (".npz", ".h5"),
-    "--export": (".h5",),
-}
+# Suffix of each option's results. In an input directory, a file with it is an earlier result.
+RESULTS = {"--output": ".csv", "--json": ".json", "the report": ".html"}
 UNFINISHED: set[Path] = set()  # temporary files of this process
 
 
@@ -29,54 +21,35 @@ def require_apart(
     work_dir: Path | None = None,
     weights: Iterable[Path] = (),
 ) -> None:
-    """Raise :class:`UserError` for outputs that would overwrite an input or each other.
+    """Raise :class:`UserError` for an output that would overwrite an input, another output or the
+    journal in ``work_dir``.
 
-    The same error is raised for the journal in ``work_dir``. ``outputs`` are files, by option;
-    ``inputs`` and ``weights`` are files and directories. A new file may lie in an input directory.
-    ``--json`` and ``--report`` overwrite only files with their own suffix.
+    ``outputs`` are files, by option; ``inputs`` and ``weights`` are files and directories. A new file
+    may lie in an input directory.
     """
     files = {option: path for option, path in outputs.items() if path is not None}
     inputs = list(inputs)
-    precious = [*inputs, *weights, *weights_of_environment()]
+    sources = [*inputs, *weights, *weights_of_environment()]
     for option, path in files.items():
-        is_result = path.suffix.lower() in RESULTS[option]
         if not path.name or os.path.isdir(path):  # noqa: PTH112  Path raises for a name that is too long
             raise UserError(f"{option} {str(path)!r} is a directory; name a file")
-        if lost := _lost(option, files, precious, work_dir):
-            raise UserError(f"{option} {path} would overwrite {lost}; name another file")
-        if option in ("--json", "the report") and not is_result and os.path.isfile(path):  # noqa: PTH113
-            raise UserError(
-                f"{option} {path} exists and is not a {RESULTS[option][0]} file; name another file"
-            )
-    if work_dir is None:
-        return
+        lost = []
+        for name, other in files.items():
+            if name != option and same_file(path, other):
+                lost.append(f"{name} {other}")
+        may_replace = not os.path.lexists(path) or path.suffix.lower() == RESULTS.get(option)
+        for source in sources:
+            if same_file(path, source) or (lies_in(path, source) and not may_replace):
+                lost.append(f"the input {source}")
+        if work_dir is not None and lies_in(path, work_dir):
+            lost.append(f"the work directory {work_dir}")
+        if lost:
+            raise UserError(f"{option} {path} would overwrite {lost[0]}; name another file")
     for source in inputs:
-        if lies_in(work_dir, source):
+        if work_dir is not None and lies_in(work_dir, source):
             raise UserError(
                 f"--work-dir {work_dir} would overwrite the input {source}; name another place"
             )
-
-
-def _lost(
-    option: str, files: Mapping[str, Path], precious: Iterable[Path], work_dir: Path | None
-) -> str:
-    """Return the file or directory that an option's output would replace; empty if none."""
-    path = files[option]
-    for other, there in files.items():
-        if other != option and same_file(path, there):
-            return f"{other} {there}"
-    if work_dir is not None:
-        is_journal = path.name.startswith("journal.") and same_file(path.parent, work_dir)
-        if is_journal or lies_in(work_dir, path):
-            return f"the work directory {work_dir}"
-    # A new file takes nothing away from a directory.
-    if not os.path.lexists(path):
-        return ""
-    is_result = path.suffix.lower() in RESULTS[option]
-    for source in precious:
-        if same_file(path, source) or (lies_in(path, source) and not is_result):
-            return f"the input {source}"
-    return ""
 
 
 def require_table(path: Path, columns: Iterable[str]) -> None:

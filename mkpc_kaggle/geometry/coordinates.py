@@ -7,8 +7,7 @@ offset. A quarter turn swaps the axes and flips one of them. Padding is added ri
 coordinates do not change.
 
 The matches of every unit become full-image pixels once: ``Pipeline._match`` (``pipeline/stages.py``) calls
-``Matches.to_image``, which calls :meth:`View.to_image` for both images and drops matches on padding. All
-keypoints of an image, for programs, do so in ``PairKeypoints.of`` (``pipeline/keypoints.py``).
+``Matches.to_image``, which calls :meth:`View.to_image` for both images and drops matches on padding.
 
 Before that, matchers with other conventions convert to pixel centres: LoFTR's family by :func:`from_corner`;
 DKM, RoMa and LoMa by :func:`from_normalised`. ``sift_lightglue`` takes away the quarter of a pixel that

@@ -27,8 +27,6 @@ class Matches:
         The points in image 0 and image 1. Lists, tensors and other dtypes are converted.
     scores : array (N,) of float32
         A higher score is more certain.
-    indices : array (N, 2) of int64, optional
-        Of a matcher that detects keypoints: the rows of both keypoints.
 
     Raises
     ------
@@ -50,7 +48,6 @@ class Matches:
     points0: Points
     points1: Points
     scores: NDArray[np.float32]
-    indices: NDArray[np.int64] | None = None
 
     def __post_init__(self) -> None:
         for name, width in (("scores", ()), ("points0", (2,)), ("points1", (2,))):
@@ -68,11 +65,6 @@ class Matches:
                     f"{name} has shape {array.shape}; expected {MEANINGS[name]}, N = {len(self.scores)}"
                 )
             object.__setattr__(self, name, array)  # the class is frozen
-        if self.indices is not None:
-            indices = np.asarray(self.indices, np.int64).reshape(-1, 2)
-            if len(indices) != len(self.scores):
-                raise ValueError(f"indices has {len(indices)} rows, scores {np.shape(self.scores)}")
-            object.__setattr__(self, "indices", indices)
 
     @classmethod
     def empty(cls) -> "Matches":
@@ -81,7 +73,7 @@ class Matches:
 
     @classmethod
     def concatenate(cls, parts: Iterable["Matches"]) -> "Matches":
-        """Return all parts in order, without merging or sorting, and without their indices."""
+        """Return all parts in order, without merging or sorting."""
         parts = list(parts)
         if not parts:
             return cls.empty()
@@ -96,8 +88,7 @@ class Matches:
 
     def __getitem__(self, index: NDArray[np.bool_] | NDArray[np.integer] | slice) -> "Matches":
         """Return the matches selected by a mask, indices or a slice."""
-        indices = None if self.indices is None else self.indices[index]
-        return Matches(self.points0[index], self.points1[index], self.scores[index], indices)
+        return Matches(self.points0[index], self.points1[index], self.scores[index])
 
     def best(self, most: int) -> "Matches":
         """Return up to ``most`` matches of highest score, in their present order.
@@ -122,5 +113,4 @@ class Matches:
             view0.to_image(kept.points0).astype(np.float32),
             view1.to_image(kept.points1).astype(np.float32),
             kept.scores,
-            kept.indices,
         )

@@ -28,7 +28,6 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from mkpc_kaggle.config import POSITIVE, Range, check_ranges
-from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Box, Matrix3, Size, View
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.two_view import Vectors, robust_costs, sampson
@@ -143,11 +142,6 @@ class Estimate:
         return self.ok
 
     @property
-    def matrix_or_fallback(self) -> Matrix3:
-        """The matrix of a submission's row, which must have one."""
-        return np.asarray(vars(self)["matrix"])
-
-    @property
     def inlier_count(self) -> int:
         return int(self.inliers.sum())
 
@@ -155,30 +149,6 @@ class Estimate:
     def failed(cls, model: ModelKind, count: int, reason: str) -> "Estimate":
         """Return the fallback for ``count`` matches, with the reason."""
         return cls(model, unit_norm(_SOLVERS[model].fallback), np.zeros(count, bool), reason)
-
-
-class NoModelError(UserError):
-    """Error for the use of a model that was not found; the message has the reason."""
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class FailedEstimate(Estimate):
-    """A failed estimate for programs: its ``matrix`` raises the reason."""
-
-    @classmethod
-    def of(cls, failed: Estimate, reason: str = "") -> "FailedEstimate":
-        """Return a failed estimate, with another ``reason`` if given."""
-        reason = reason or failed.failure
-        return cls(failed.model, failed.matrix, failed.inliers, reason, stats=failed.stats)
-
-    # Not a property: the base class has a field of this name.
-    def __getattribute__(self, name: str) -> Any:
-        if name == "matrix":
-            raise NoModelError(f"no {self.model} was found: {self.failure}")
-        return super().__getattribute__(name)
-
-    def __repr__(self) -> str:
-        return f"FailedEstimate({self.model}: {self.failure})"
 
 
 def estimate(

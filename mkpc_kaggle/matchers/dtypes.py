@@ -1,4 +1,4 @@
-"""Numerical safety of networks: float32 without TF32, finite values."""
+"""Numerical safety of networks: float32 whatever the default dtype is, without TF32; finite values."""
 
 import sys
 from collections.abc import Iterator
@@ -10,7 +10,8 @@ from mkpc_kaggle.matchers.contract import NonFiniteError, arrays_of
 
 @contextmanager
 def exact_float32() -> Iterator[None]:
-    """Make NVIDIA GPUs multiply in full float32, not in TF32, which has a mantissa of 10 bits.
+    """Make float32 the default dtype, which a notebook may have changed, and make NVIDIA GPUs multiply
+    in full float32, not in TF32, which has a mantissa of 10 bits.
 
     PyTorch's default for convolutions is TF32. The settings apply to the whole process until the
     block ends. If PyTorch is not imported yet, change nothing: the import takes seconds.
@@ -34,11 +35,14 @@ def exact_float32() -> Iterator[None]:
         name = "allow_tf32"
         exact = False
     former = [getattr(setting, name) for setting in settings]
+    dtype = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float32)
     try:
         for setting in settings:
             setattr(setting, name, exact)
         yield
     finally:
+        torch.set_default_dtype(dtype)
         for setting, value in zip(settings, former, strict=True):
             setattr(setting, name, value)
 

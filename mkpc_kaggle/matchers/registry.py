@@ -6,6 +6,7 @@ from typing import Any
 
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.matchers.contract import Matcher, MatcherSpec, Placement
+from mkpc_kaggle.matchers.dtypes import exact_float32
 from mkpc_kaggle.weights import WeightStore
 
 NAMES = (
@@ -47,7 +48,9 @@ def load_matcher(
 
     Raises :class:`UserError` if its weights are missing or damaged.
     """
-    matcher: Matcher[Any] = import_module(MATCHERS[name]).load(weights, options, placement)
+    module = import_module(MATCHERS[name])
+    with exact_float32():
+        matcher: Matcher[Any] = module.load(weights, options, placement)
     return matcher
 
 

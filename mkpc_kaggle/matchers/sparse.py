@@ -107,7 +107,6 @@ def matches_of(
         points0[index0].cpu().numpy(),
         points1[index1].cpu().numpy(),
         scores.cpu().numpy(),
-        torch.stack([index0, index1], dim=1).cpu().numpy(),
     )
 
 

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mkpc_kaggle.data.images import Image
+from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Matrix3, Size
 from mkpc_kaggle.geometry.critical_region import CriticalRegion, MkpcConfig
 from mkpc_kaggle.geometry.crop_need import CropNeed
@@ -16,15 +17,13 @@ from mkpc_kaggle.geometry.overlap import support
 from mkpc_kaggle.geometry.robust import (
     Estimate,
     ModelKind,
-    NoModelError,
     RelativePose,
     estimate,
     pose_in_front,
     rotation_in_front,
 )
-from mkpc_kaggle.pipeline.keypoints import PairKeypoints
+from mkpc_kaggle.pipeline.arguments import ImageSource, as_image, intrinsics_of
 from mkpc_kaggle.recipe import Recipe, Unit
-from mkpc_kaggle.setup.arguments import ImageSource, as_image, intrinsics_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -47,7 +46,6 @@ class UnitResult:
     note: str = ""  # why the unit did not run as written
     is_float32: bool = False  # even if the run was given another precision
     keypoints: int = 0  # detected in the first view; 0 for a matcher without a detector
-    detected: PairKeypoints | None = None  # for programs, of a matcher with a detector
     need: CropNeed | None = None  # of stage 2; one that is not needed has no matches
 
     @property
@@ -126,12 +124,6 @@ class PairMatch:
         """The matches within MAGSAC's threshold of the model."""
         return self.matches[self.estimate.inliers]
 
-    @property
-    def keypoints(self) -> PairKeypoints:
-        """The keypoints of all units, in image pixels, with the indices of ``matches``."""
-        counts = [len(result.matches) for result in self.results]
-        return PairKeypoints.concatenate([result.detected for result in self.results], counts)
-
     def pose(self, K0: Matrix3, K1: Matrix3) -> RelativePose:
         """Return the pose of camera 1 relative to camera 0 from F or E: R, t, inliers in front.
 
@@ -139,7 +131,6 @@ class PairMatch:
         ``ValueError`` for a homography, and :class:`mkpc_kaggle.errors.UserError` without a model.
         """
         matrices = intrinsics_of((K0, K1))
-        assert matrices is not None
         E = self.estimate.matrix
         if self.estimate.model is ModelKind.H:
             raise ValueError("a homography has no single pose: estimate model F or E")
@@ -147,7 +138,7 @@ class PairMatch:
             E = matrices[1].T @ E @ matrices[0]
         inliers = self.estimate.inliers
         if not inliers.any():
-            raise NoModelError("no pose: the model has no inliers")
+            raise UserError(f"no pose: {self.estimate.failure or 'the model has no inliers'}")
         pose = pose_in_front(E, self.matches[inliers], matrices)
         in_front = np.zeros(len(inliers), bool)
         in_front[inliers] = pose.in_front
@@ -171,7 +162,7 @@ class PairMatch:
                 if not self.files[number : number + 1] or not self.files[number]:
                     raise ValueError("the match is not of files: call plot(image0, image1)")
                 source = self.files[number]
-            image = as_image(source, name=f"image{number}")
+            image = as_image(source)
             if self.sizes and image.size != self.sizes[number]:
                 raise ValueError(f"image{number} has another size than the matched image")
             images.append(image)

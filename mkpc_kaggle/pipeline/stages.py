@@ -4,7 +4,6 @@ Stage 1 matches whole images, MKPC finds the critical region of each image, and 
 crops.
 """
 
-import os
 import time
 import warnings
 from collections.abc import Callable, Container, Iterable, Sequence
@@ -31,7 +30,6 @@ from mkpc_kaggle.matchers.contract import (
 )
 from mkpc_kaggle.matchers.dtypes import check_finite, exact_float32
 from mkpc_kaggle.matchers.failures import FailureKind, failure_kind, reason_of
-from mkpc_kaggle.pipeline.keypoints import PairKeypoints
 from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
 from mkpc_kaggle.recipe import Recipe, Unit
 from mkpc_kaggle.setup.assembly import Assembly
@@ -39,9 +37,6 @@ from mkpc_kaggle.setup.devices import require_device
 
 ENCODING_CACHE_BYTES = 2 << 30  # on a CPU
 CACHE_SHARE = 0.25  # of a GPU's free memory, for the cached encodings of all workers on it
-
-# Ids of this process and of the ancestors it was forked from, if they matched pairs.
-matched_in: set[int] = set()
 
 
 class UnloadableError(UserError):
@@ -64,8 +59,7 @@ class Pipeline:
     Encodings of whole images, which many pairs share, are cached up to ``cache_bytes``.
     Matches with a point that ``masks`` leave out are dropped.
     Errors of the matchers in ``raising`` are raised, and do not become failed results.
-    ``synchronise()`` is called after an error, and raises if the device has failed. Results have
-    keypoints, and descriptors, if ``keeps_keypoints`` and ``keeps_descriptors`` are set.
+    ``synchronise()`` is called after an error, and raises if the device has failed.
     """
 
     def __init__(
@@ -82,8 +76,6 @@ class Pipeline:
     ) -> None:
         self._precision = precision
         self.raising: Container[str] = ()
-        self.keeps_keypoints = False
-        self.keeps_descriptors = False
         self._masks = MaskReader(masks or Masks())
         self.recipe = recipe
         self.minibatch = minibatch
@@ -159,9 +151,8 @@ class Pipeline:
         pairs. False halves the minibatch, and stops the unit before a single pair. If a
         matcher raises, the minibatch's pairs run one by one, and a pair that raises again gets a
         result with this failure. Raises device errors, memory errors on a single pair (see
-        :mod:`mkpc_kaggle.matchers.failures`), and :class:`UserError` in a forked child.
+        :mod:`mkpc_kaggle.matchers.failures`).
         """
-        require_unforked()
         # The caller's list stays as it is; ``_run`` replaces entries of this one.
         pairs = list(pairs)
         units = list(units)
@@ -291,8 +282,7 @@ class Pipeline:
         warm_up = unit not in self._ran
         self._ran.add(unit)
         results = []
-        each_pair = zip(pairs, views, firsts, encodings[1::2], found, strict=True)
-        for pair, both, encoding, other, matches in each_pair:
+        for pair, both, encoding, matches in zip(pairs, views, firsts, found, strict=True):
             in_image = self._unmasked(matches.to_image(*both), pair.images)
             if unit.matcher in self.raising and len(matches) and not len(in_image):
                 raise ValueError(
@@ -300,11 +290,6 @@ class Pipeline:
                     "their points are outside of the pictures, or points or scores are not finite"
                 )
             best = in_image.best(unit.max_matches)
-            kept = None
-            if self.keeps_keypoints:
-                kept = PairKeypoints.of(
-                    (encoding, other), both, best, with_descriptors=self.keeps_descriptors
-                )
             result = UnitResult(
                 unit,
                 best,
@@ -314,7 +299,6 @@ class Pipeline:
                 note=self._notes.get(unit.matcher, ""),
                 is_float32=self._precision is Precision.FLOAT32 or unit.matcher in self._notes,
                 keypoints=len(getattr(encoding, "points", ())),
-                detected=kept,
                 need=need_of(unit, pair, self.recipe) if unit.stage == 2 else None,
             )
             results.append(result)
@@ -453,18 +437,3 @@ def with_regions(pair: PairMatch, recipe: Recipe) -> PairMatch:
     scale = scale_between(matches, (image0.size, image1.size))
     seconds = time.perf_counter() - start
     return replace(pair, regions=(region0, region1), scale=scale, cluster_seconds=seconds)
-
-
-def require_unforked() -> None:
-    """Raise :class:`UserError` in a child that was forked after its parent had matched pairs.
-
-    A forked child inherits no threads of PyTorch and OpenCV but waits for them, even with a new
-    matcher.
-    """
-    # A fork copies the set, so a child finds its parent's id besides its own.
-    matched_in.add(os.getpid())
-    if len(matched_in) > 1:
-        raise UserError(
-            "this process was forked after its parent had matched, and would hang: use processes that are "
-            "spawned, such as multiprocessing.get_context('spawn') or DataLoader's multiprocessing_context='spawn'"
-        )

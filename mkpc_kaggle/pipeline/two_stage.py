@@ -1,38 +1,27 @@
 """The Python API: two images in, matches and two-view model out."""
 
+import os
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
-from itertools import repeat
 from os import PathLike
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from mkpc_kaggle.data.images import Image, ImageStore
-from mkpc_kaggle.errors import plural
+from mkpc_kaggle.data.images import ImageStore
 from mkpc_kaggle.geometry.coordinates import Matrix3
-from mkpc_kaggle.geometry.resolution import doubt_about_resolution
-from mkpc_kaggle.geometry.robust import FailedEstimate, ModelKind
+from mkpc_kaggle.geometry.robust import ModelKind
 from mkpc_kaggle.matchers.contract import Matcher
 from mkpc_kaggle.matchers.registry import require_methods
+from mkpc_kaggle.pipeline.arguments import ImageSource, as_image, intrinsics_of
 from mkpc_kaggle.pipeline.pair import PairMatch, with_estimate
 from mkpc_kaggle.pipeline.stages import Pipeline
-from mkpc_kaggle.progress import counted
-from mkpc_kaggle.recipe import Recipe, Unit
-from mkpc_kaggle.setup.arguments import (
-    ImageSource,
-    Weights,
-    as_image,
-    files_of,
-    intrinsics_of,
-    member_of,
-    shown_value,
-)
+from mkpc_kaggle.recipe import Recipe
+from mkpc_kaggle.setup.arguments import Weights
 from mkpc_kaggle.setup.assembly import assemble
 from mkpc_kaggle.setup.availability import Licence
-
-__all__ = ["TwoStageMatcher", "as_image"]
 
 Intrinsics = tuple[Matrix3, Matrix3]
 
@@ -61,8 +50,6 @@ class TwoStageMatcher:
     settings : mapping
         Replacements of the recipe's settings by dotted key, such as
         ``{"matchers.loftr.threshold": 0.3}``.
-    progress : bool
-        Count the units of a call on the standard error stream.
 
     Raises
     ------
@@ -96,19 +83,17 @@ class TwoStageMatcher:
         licence: Licence | str = Licence.ANY,
         matchers: Mapping[str, Matcher[Any]] | None = None,
         settings: Mapping[str, Any] = MappingProxyType({}),
-        progress: bool = False,
     ) -> None:
         self._assembly = assemble(
             recipe,
             weights=weights,
             device=device,
             precision=precision,
-            licence=member_of(Licence, licence, "licence"),
+            licence=Licence(licence),
             matchers=matchers,
             settings=settings,
         )
         self.recipe = self._assembly.recipe
-        self._progress = progress
         self._pipeline = self._new_pipeline()
 
     def _new_pipeline(self) -> Pipeline:
@@ -116,7 +101,6 @@ class TwoStageMatcher:
         pipeline = Pipeline.of(self._assembly)
         # A fault of the user's own code is the user's to see.
         pipeline.raising = self._assembly.matchers.keys()
-        pipeline.keeps_keypoints = True
         return pipeline
 
     def __getstate__(self) -> dict[str, Any]:
@@ -134,7 +118,6 @@ class TwoStageMatcher:
         *,
         model: ModelKind | str = ModelKind.F,
         intrinsics: Intrinsics | None = None,
-        descriptors: bool = False,
     ) -> PairMatch:
         """Match two images, and estimate their two-view model.
 
@@ -147,15 +130,13 @@ class TwoStageMatcher:
             "F", "E" (needs ``intrinsics``) or "H".
         intrinsics : pair of arrays (3, 3), optional
             The camera matrices, in pixels.
-        descriptors : bool
-            Keep the descriptors of matchers that detect keypoints, in ``match.keypoints``.
 
         Returns
         -------
         PairMatch
             Points, boxes and F are in pixels of the stored files; EXIF only turns the matchers'
             views upright. If no model is found, ``match.estimate`` is false, its ``failure`` has
-            the reason, and the use of its matrix raises it. The result keeps no images.
+            the reason, and its matrix is the fallback. The result keeps no images.
 
         Raises
         ------
@@ -169,14 +150,9 @@ class TwoStageMatcher:
         Warns
         -----
         RuntimeWarning
-            For a unit that fails; ``match.failures`` has its reason.
+            For a unit that fails, and if no model is found.
         """
-        kind = member_of(ModelKind, model, "model")
-        sources = (image0, image1)
-        images = (as_image(image0, name="image0"), as_image(image1, name="image1"))
-        self._pipeline.keeps_descriptors = descriptors
-        match = self._match(images, kind, intrinsics, progress=self._progress)
-        return replace(match, files=files_of(sources))
+        return self._match((image0, image1), None, ModelKind(model), intrinsics)
 
     def match_pairs(
         self,
@@ -184,126 +160,50 @@ class TwoStageMatcher:
         *,
         model: ModelKind | str = ModelKind.F,
         intrinsics: Iterable[Intrinsics | None] | None = None,
-        descriptors: bool = False,
     ) -> Iterator[PairMatch]:
         """Yield the match of each pair, as a call does for one pair.
 
         An image that appears in several pairs is decoded and encoded once, while the caches have
-        room: sort the pairs by their first image.
-
-        Parameters
-        ----------
-        pairs : iterable of two images
-            Images as for a call.
-        model, descriptors
-            As for a call.
-        intrinsics : iterable, optional
-            An item for each pair, as for a call; it may be ``None``.
-
-        Yields
-        ------
-        PairMatch
-            In the order of the pairs; a pair is matched when the loop asks for it.
-
-        Raises
-        ------
-        TypeError, ValueError, UserError
-            As a call does; for wrong arguments of a pair when its turn comes.
+        room: sort the pairs by their first image. ``intrinsics`` has an item for each pair, which may
+        be ``None``. A pair is matched when the loop asks for it, and raises what a call raises.
         """
-        kind = member_of(ModelKind, model, "model")
-        if isinstance(pairs, str | bytes) or not hasattr(pairs, "__iter__"):
-            raise TypeError(f"pairs is {shown_value(pairs)}; expected pairs of images")
-        # Checked when they are iterated, because they may be generators.
-        each = (
-            pairs,
-            _of_each_pair(intrinsics, "intrinsics"),
-        )
-        return self._match_each(zip(*each, strict=False), kind, descriptors=descriptors)
-
-    def _match_each(
-        self, given: Iterable[tuple[Any, Any]], kind: ModelKind, *, descriptors: bool
-    ) -> Iterator[PairMatch]:
         # Closed also if the caller stops early: its thread would keep the process alive.
         with closing(ImageStore()) as store:
-            for number, (pair, intrinsics) in enumerate(given):
-                name = f"pairs[{number}]"
-                if isinstance(pair, str) or not hasattr(pair, "__len__") or len(pair) != 2:
-                    raise TypeError(f"{name} is {shown_value(pair)}; expected two images")
-                first, second = pair
-                images = (
-                    as_image(first, store, f"{name}[0]"),
-                    as_image(second, store, f"{name}[1]"),
-                )
-                # Set for each pair: another call may come between.
-                self._pipeline.keeps_descriptors = descriptors
-                match = self._match(images, kind, intrinsics)
-                yield replace(match, files=files_of(pair))
+            each: Iterable[tuple[Any, Any]] = ((pair, None) for pair in pairs)
+            if intrinsics is not None:
+                each = zip(pairs, intrinsics, strict=True)
+            for sources, matrices in each:
+                yield self._match(sources, store, ModelKind(model), matrices)
 
     def _match(
         self,
-        images: tuple[Image, Image],
+        sources: Sequence[ImageSource],
+        store: ImageStore | None,
         kind: ModelKind,
         intrinsics: Intrinsics | None,
-        *,
-        progress: bool = False,
     ) -> PairMatch:
         """Check the arguments of a pair, run all units, and estimate the model."""
-        matrices = intrinsics_of(intrinsics)
+        matrices = None if intrinsics is None else intrinsics_of(intrinsics)
         if kind is ModelKind.E and matrices is None:
-            raise ValueError(
-                "model E needs intrinsics=(K0, K1), the camera matrices of both images in pixels"
-            )
-        for number, K in enumerate(matrices or ()):
-            if doubt := doubt_about_resolution(K, images[number].size):
-                warnings.warn(f"intrinsics[{number}]: {doubt}", RuntimeWarning, stacklevel=3)
-        (pair,) = self._run(images, progress=progress)
-        match = _for_programs(with_estimate(pair, self.recipe, kind, matrices))
-        match = replace(match, mkpc=self.recipe.mkpc)
+            raise ValueError("model E needs intrinsics=(K0, K1), the camera matrices in pixels")
+        source0, source1 = sources
+        images = (as_image(source0, store), as_image(source1, store))
+        (pair,) = self._pipeline.match([PairMatch(images=images)], self.recipe.units)
+        match = with_estimate(pair, self.recipe, kind, matrices)
         for name, reason in match.failures.items():
             warnings.warn(f"unit {name} failed: {reason}", RuntimeWarning, stacklevel=3)
-        return match
-
-    def _run(self, images: tuple[Image, Image], *, progress: bool) -> list[PairMatch]:
-        """Run all units on a pair, with a bar if the user wants one."""
-        pair = PairMatch(images=images)
-        units = self.recipe.units
-        if not progress:
-            return self._pipeline.match([pair], units)
-        bar = counted(units, f"matching by recipe {self.recipe.name}", "unit")
-        begun: set[Unit] = set()
-
-        def may_start(unit: Unit, _: int) -> bool:
-            # A unit that is tried again, in float32, counts once.
-            if unit not in begun:
-                begun.add(unit)
-                next(bar)
-            return True
-
-        # Closed even if a unit raises: its error is printed below the bar.
-        with closing(bar):
-            return self._pipeline.match([pair], units, may_start)
-
-
-def _of_each_pair(values: Iterable[Any] | None, name: str) -> Iterator[Any]:
-    """Yield an argument's item for each pair. Raise ``ValueError`` for a pair without one."""
-    if values is None:
-        yield from repeat(None)
-    else:
-        count = 0
-        for value in values:
-            yield value
-            count += 1
-        raise ValueError(f"{name} has items for {plural(count, 'pair')} only")
-
-
-def _for_programs(match: PairMatch) -> PairMatch:
-    """Return a match without its images, whose failed estimate cannot be used by mistake."""
-    sizes = tuple(image.size for image in match.images)
-    focals = tuple(image.focal for image in match.images)
-    estimate = match.estimate
-    if not estimate:
-        reasons = dict.fromkeys(match.failures.values())
-        has_points = len(match.failures) < len(match.results)
-        reason = estimate.failure if has_points else f"every unit failed: {'; '.join(reasons)}"
-        estimate = FailedEstimate.of(estimate, reason)
-    return replace(match, estimate=estimate, images=(), sizes=sizes, focals=focals)
+        if not match.estimate:
+            text = f"no {kind} was found: {match.estimate.failure}"
+            warnings.warn(text, RuntimeWarning, stacklevel=3)
+        files = [
+            str(Path(source).absolute()) if isinstance(source, str | os.PathLike) else ""
+            for source in sources
+        ]
+        return replace(
+            match,
+            images=(),
+            sizes=tuple(image.size for image in images),
+            focals=tuple(image.focal for image in images),
+            files=tuple(files),
+            mkpc=self.recipe.mkpc,
+        )

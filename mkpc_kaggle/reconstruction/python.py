@@ -34,7 +34,7 @@ from mkpc_kaggle.reconstruction.run import for_cameras, reconstruct_folder
 from mkpc_kaggle.reporting.summary import trouble, unreadable_images
 from mkpc_kaggle.scene.export import MODELS
 from mkpc_kaggle.scene.models import SfmModel
-from mkpc_kaggle.setup.arguments import PathSource, Weights, member_of, shown_value, weights_of
+from mkpc_kaggle.setup.arguments import PathSource, Weights, shown_value, weights_of
 from mkpc_kaggle.setup.assembly import Assembly, assemble
 from mkpc_kaggle.setup.availability import Licence
 
@@ -110,7 +110,7 @@ def reconstruct(
         weights=weights,
         device=device,
         precision=precision,
-        licence=member_of(Licence, licence, "licence"),
+        licence=Licence(licence),
         matchers=matchers,
         settings=settings,
     )

@@ -2,7 +2,6 @@ import os
 import subprocess
 import sys
 import threading
-import time
 from io import StringIO
 from pathlib import Path
 
@@ -15,7 +14,6 @@ from mkpc_kaggle.cli import COMMANDS
 from mkpc_kaggle.data.competition import read_test_side, write_submission
 from mkpc_kaggle.demo import DemoSet
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
-from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher
 from mkpc_kaggle.recipe import recipe_names
 
 
@@ -108,41 +106,6 @@ def test_match_prints_f_and_draws_the_pair(demo, small_recipe, tmp_path, capsys)
     assert [line for line in out if line != line.rstrip()] == []
     assert "1:sift@320" in "\n".join(out)
     assert cv2.imread(str(figure)).shape[1] > 1000
-
-
-def test_match_counts_the_units_that_it_has_run(demo, small_recipe, monkeypatch, capsys):
-    images = sorted((demo.train_dir / "courtyard" / "images").iterdir())[:2]
-    monkeypatch.setattr("mkpc_kaggle.progress.LINE_INTERVAL_S", 0.0)
-    monkeypatch.setattr("mkpc_kaggle.progress.WAIT_S", 1e-6)
-
-    class SlowMatcher(TwoStageMatcher):
-        def __init__(self, *given: object, **more: object) -> None:
-            # Once the libraries are imported, loading may end before the line is printed.
-            time.sleep(0.5)
-            super().__init__(*given, **more)
-
-    monkeypatch.setattr("mkpc_kaggle.cli.match.TwoStageMatcher", SlowMatcher)
-    assert run_command("match", *images, "--recipe", small_recipe) == 0
-    loading, *counts = capsys.readouterr().err.splitlines()
-    assert loading.startswith(f"loading recipe {small_recipe}: ")
-    # The first of two units is done; the result follows the second.
-    assert counts[0] == "matching by recipe small: 0/2"
-    assert counts[-1].startswith("matching by recipe small: 1/2 [")
-
-
-def test_match_saves_arrays(demo, small_recipe, tmp_path):
-    images = sorted((demo.train_dir / "courtyard" / "images").iterdir())[:2]
-    saved = tmp_path / "new" / "pair.npz"
-    assert run_command("match", *images, "--recipe", small_recipe, "--save", saved) == 0
-    # The command and the Python snippet of the README give the same F.
-    match = TwoStageMatcher(str(small_recipe))(*images)
-    with np.load(saved) as arrays:
-        assert set(arrays) == {"points0", "points1", "scores", "inliers", "F"}
-        np.testing.assert_array_equal(arrays["points0"], match.matches.points0)
-        np.testing.assert_array_equal(arrays["points1"], match.matches.points1)
-        np.testing.assert_array_equal(arrays["scores"], match.matches.scores)
-        np.testing.assert_array_equal(arrays["inliers"], match.estimate.inliers)
-        np.testing.assert_array_equal(arrays["F"], match.estimate.matrix)
 
 
 def test_matplotlib_leaves_nothing_where_home_cannot_be_written(demo, small_recipe, tmp_path):

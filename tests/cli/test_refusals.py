@@ -51,11 +51,8 @@ REFUSALS = [
         "validate --train-dir demo/train --json demo/train/scaling_factors.csv",
         "would overwrite the input",
     ),
-    ("validate --train-dir demo/train --json x.png", "exists and is not a .json file"),
     (f"{MATCH} x.png", "would overwrite the input"),
     (f"{MATCH} notes.xyz", "needs a suffix"),
-    ("match x.png y.png --save x.png", "would overwrite the input"),
-    ("match x.png y.png --save pair.npy", "the name must end in .npz"),
     # Settings have the same checks as a file of a recipe.
     (f"{SUBMIT} --set foo", "--set foo: expected TABLE.KEY=VALUE"),
     (f"{SUBMIT} --set sift.ratio=1", "the tables are mkpc, magsac, focal, matchers, scene"),

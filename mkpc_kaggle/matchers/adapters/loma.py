@@ -94,12 +94,10 @@ class LomaAdapter(PairwiseMatcher[LomaEncoding]):
 
     def _match(self, first: LomaEncoding, second: LomaEncoding) -> Matches:
         found = self._network.matcher(first.keypoints, second.keypoints, self.options.threshold)
-        indices = torch.stack([found.index0, found.index1], dim=1).cpu().numpy()
         return Matches(
-            first.points[indices[:, 0]],
-            second.points[indices[:, 1]],
+            first.points[found.index0.cpu().numpy()],
+            second.points[found.index1.cpu().numpy()],
             found.scores.cpu().numpy(),
-            indices,
         )
 
 

@@ -19,15 +19,14 @@ from mkpc_kaggle import PairMatch, TwoStageMatcher, reconstruct
 from mkpc_kaggle.cli import main
 from mkpc_kaggle.data.images import Image
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.geometry.coordinates import Box
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.adapters.sift import SiftMatcher, SiftOptions
 from mkpc_kaggle.matchers.contract import Colour, MatcherSpec
 from mkpc_kaggle.matchers.networks.aliked import Aliked
 from mkpc_kaggle.matchers.registry import MATCHERS
+from mkpc_kaggle.pipeline.arguments import as_image, intrinsics_of
 from mkpc_kaggle.recipe import Recipe, Unit, load_recipe
 from mkpc_kaggle.setup import assembly
-from mkpc_kaggle.setup.arguments import as_image, intrinsics_of
 from mkpc_kaggle.setup.assembly import recipe_of_name
 
 pytestmark = pytest.mark.usefixtures("nowhere_else")
@@ -69,23 +68,17 @@ SAME = {  # forms of one image
     "not contiguous": lambda image: np.ascontiguousarray(image[:, ::-1])[:, ::-1],
     "float64 in 0..1": lambda image: image / 255,
     "float32 in 0..1": lambda image: (image / 255).astype(np.float32),
-    "(1, H, W, 3)": lambda image: image[None],
-    "(3, H, W)": lambda image: np.moveaxis(image, 2, 0),
     "PIL": PIL.Image.fromarray,
     "PIL, with alpha": lambda image: PIL.Image.fromarray(image).convert("RGBA"),
     "Image": Image.of_array,
     "tensor (3, H, W)": chw,
-    "tensor (H, W, 3)": torch.from_numpy,
-    "tensor (1, 3, H, W)": lambda image: chw(image)[None],
     "tensor of floats": lambda image: chw(image) / 255,
     "tensor with a gradient": lambda image: (chw(image) / 255).requires_grad_(),
 }
 SAME_GRAY = {
     "(H, W)": gray,
-    "(H, W, 1)": lambda image: gray(image)[..., None],
     "PIL, L": lambda image: PIL.Image.fromarray(gray(image)),
     "PIL, 16 bits": lambda image: PIL.Image.fromarray(gray(image).astype(np.uint16) * 256),
-    "PIL, F": lambda image: PIL.Image.fromarray((gray(image) / 255).astype(np.float32)),
     "tensor (1, H, W)": lambda image: torch.from_numpy(gray(image))[None],
     "tensor (H, W)": lambda image: torch.from_numpy(gray(image) / 255),
 }
@@ -113,23 +106,16 @@ def test_a_pil_image_has_the_orientation_of_its_file(tmp_path):
 
 
 REFUSED_IMAGES = {
-    "None": (None, TypeError, ["image1 is None", "cv2.imread"]),
-    "bytes": (b"png", TypeError, ["image1 is bytes", "expected a path"]),
-    "list": ([[1, 2], [3, 4]], TypeError, ["image1 is list", "expected a path"]),
-    "number": (3, TypeError, ["image1 is int 3"]),
-    "floats to 255": (pixels().astype(float), ValueError, ["image1", "float64", "0..1", "255"]),
-    "NaN": (np.full((9, 9), np.nan), ValueError, ["image1", "nan", "0..1"]),
-    "negative": (np.full((9, 9), -0.5), ValueError, ["image1", "-0.5", "0..1"]),
-    "int64": (pixels().astype(int), ValueError, ["image1 is int64 (200, 280, 3)", "uint8"]),
-    "uint16": (pixels().astype(np.uint16), ValueError, ["image1 is uint16", "uint8"]),
-    "mask": (np.zeros((9, 9), bool), ValueError, ["image1 is bool", "uint8"]),
-    "four channels": (np.zeros((9, 9, 4), np.uint8), ValueError, ["(9, 9, 4)", "(H, W, 3)"]),
-    "batch": (np.zeros((2, 9, 9, 3), np.uint8), ValueError, ["(2, 9, 9, 3)", "(H, W, 3)"]),
-    "vector": (np.zeros(9, np.uint8), ValueError, ["(9,)", "(H, W)"]),
-    "no pixels": (np.zeros((0, 9), np.uint8), ValueError, ["(0, 9)", "(H, W)"]),
-    "batch of tensors": (torch.zeros(2, 3, 9, 9), ValueError, ["(2, 3, 9, 9)", "(3, H, W)"]),
-    "no such file": ("none.png", UserError, ["none.png: no such file"]),
-    "a folder": (".", UserError, ["not a regular file"]),
+    "None": (None, ValueError, "object"),
+    "floats to 255": (pixels().astype(float), ValueError, "0..1"),
+    "NaN": (np.full((9, 9), np.nan), ValueError, "0..1"),
+    "int64": (pixels().astype(int), ValueError, "int64 (200, 280, 3)"),
+    "four channels": (np.zeros((9, 9, 4), np.uint8), ValueError, "(9, 9, 4)"),
+    "no pixels": (np.zeros((0, 9), np.uint8), ValueError, "(0, 9)"),
+    "batch of tensors": (torch.zeros(2, 3, 9, 9, dtype=torch.uint8), ValueError, "(2, 3, 9, 9)"),
+    "PIL, floats": (PIL.Image.new("F", (9, 9)), ValueError, "more than 16 bits"),
+    "no such file": ("none.png", UserError, "none.png: no such file"),
+    "a folder": (".", UserError, "not a regular file"),
 }
 
 
@@ -149,15 +135,13 @@ def unrun(*units):
 
 
 @pytest.mark.parametrize("form", REFUSED_IMAGES)
-def test_another_value_for_an_image_is_refused_by_name_before_any_work(form):
-    value, error, words = REFUSED_IMAGES[form]
-    raises(lambda: unrun()(pixels(), value), error, *words)
-    if error is not UserError:
-        words = [word.replace("image1", "pairs[0][1]") for word in words]
-    raises(lambda: next(unrun().match_pairs([(pixels(), value)])), error, *words)
+def test_another_value_for_an_image_is_refused_before_any_matching(form):
+    value, error, word = REFUSED_IMAGES[form]
+    raises(lambda: unrun()(pixels(), value), error, word)
+    raises(lambda: next(unrun().match_pairs([(pixels(), value)])), error, word)
 
 
-# Camera matrices and boxes
+# Camera matrices
 
 
 @pytest.mark.parametrize(
@@ -170,7 +154,6 @@ def test_another_value_for_an_image_is_refused_by_name_before_any_work(form):
         [[list(map(int, row)) for row in K]] * 2,
         (torch.from_numpy(K), torch.from_numpy(K).float()),
         torch.from_numpy(np.stack([K, K])).requires_grad_(),
-        (K[None], torch.from_numpy(K)[None]),
         (K.astype(np.float32), K.astype(int)),
     ],
 )
@@ -181,30 +164,17 @@ def test_camera_matrices_in_each_form_are_the_same(given):
     assert first.dtype == second.dtype == np.float64
 
 
-REFUSED_INTRINSICS = [
-    (K, ValueError, ["intrinsics has the shape (3, 3)", "(K0, K1)"]),
-    ((K,), ValueError, ["intrinsics has 1 value", "(K0, K1)"]),
-    ((K, K, K), ValueError, ["intrinsics has 3 values"]),
-    ((K, K[:2]), ValueError, ["intrinsics[1] has the shape (2, 3)"]),
-    ((K, None), TypeError, ["intrinsics[1] is None"]),
-    ((K, "K"), TypeError, ["intrinsics[1] is str 'K'"]),
-    ((300.0, 300.0), TypeError, ["intrinsics[0] is float 300.0"]),
-    (300.0, TypeError, ["intrinsics is float 300.0"]),
-    ((K * 0, K), ValueError, ["intrinsics[0]", "positive fx and fy"]),
-    ((K, K * np.nan), ValueError, ["intrinsics[1]", "positive fx and fy"]),
-    ((K, K.T), ValueError, ["intrinsics[1]", "[fx s cx; 0 fy cy; 0 0 1]"]),
-]
-
-
-@pytest.mark.parametrize(("given", "error", "words"), REFUSED_INTRINSICS)
-def test_other_camera_matrices_are_refused_before_any_work(given, error, words):
-    raises(lambda: unrun()(pixels(), pixels(), intrinsics=given), error, *words)
-    of_pairs = unrun().match_pairs([(pixels(), pixels())], intrinsics=[given])
-    raises(lambda: next(of_pairs), error, *words)
-
-
-IMAGES = (Image.of_array(pixels()), Image.of_array(pixels(40)))
-BOX = Box(0, 10, 200, 150)
+@pytest.mark.parametrize(
+    "given",
+    [K, (K,), (K, K[:2]), (K, None), (300.0, 300.0), 300.0, (K * 0, K), (K, K.T), (K, K * np.nan)],
+)
+def test_other_camera_matrices_are_refused_before_any_matching(given):
+    for call in (
+        lambda: unrun()(pixels(), pixels(), intrinsics=given),
+        lambda: next(unrun().match_pairs([(pixels(), pixels())], intrinsics=[given])),
+    ):
+        with pytest.raises((TypeError, ValueError)):
+            call()
 
 
 # Other arguments
@@ -222,7 +192,7 @@ BOX = Box(0, 10, 200, 150)
         ({"weights": {"aliked": "a.pth"}}, UserError, ["unknown slot 'aliked'", "aliked-n16"]),
         ({"weights": {"aliked-n16": "none.pth"}}, UserError, ["aliked-n16", "none.pth", "No such"]),
         ({"weights": {"aliked-n16": None}}, TypeError, ["weights['aliked-n16'] is None"]),
-        ({"licence": "mit"}, ValueError, ["licence is str 'mit'", "'any', 'permissive'"]),
+        ({"licence": "mit"}, ValueError, ["'mit' is not a valid Licence"]),
         ({"device": "gpu"}, UserError, ["'gpu'"]),
         ({"precision": "half"}, UserError, ["'half'", "float16"]),
         ({"precision": None}, UserError, ["'None'", "float16"]),
@@ -276,11 +246,21 @@ def write_aliked(path, extra=()):
 def test_own_weights_are_a_file_for_a_slot(tmp_path):
     path = write_aliked(tmp_path / "mine.pth")
     given = {"aliked-n16": path}
-    made = TwoStageMatcher("aliked", weights=given, settings={"matchers.aliked.features": 200})
+    made_settings = {"matchers.aliked.features": 200}
+    made = TwoStageMatcher("aliked", weights=given, settings=made_settings)
     assert made.recipe.matcher_names == ("aliked",)
     match = made(pixels(), pixels(40))
     assert match.failures == {}
     assert len(match.matches) > 0
+    # A notebook may have set another default dtype: networks are float32.
+    torch.set_default_dtype(torch.float64)
+    try:
+        again = TwoStageMatcher("aliked", weights=given, settings=made_settings)(
+            pixels(), pixels(40)
+        )
+    finally:
+        torch.set_default_dtype(torch.float32)
+    assert same(again.matches, match.matches)
     # Nothing is known of their licence.
     raises(
         lambda: TwoStageMatcher("aliked", weights=given, licence="permissive"),
@@ -322,24 +302,14 @@ def test_units_have_whole_numbers_and_recipes_have_units():
     raises(lambda: Recipe(("sift",)), TypeError, "expected units", "'sift'")
 
 
-@pytest.mark.parametrize(
-    ("pairs", "word"), [("ab", "pairs is str 'ab'"), (5, "pairs is int 5"), (None, "pairs is None")]
-)
-def test_pairs_of_another_type_are_refused(pairs, word):
-    raises(lambda: unrun().match_pairs(pairs), TypeError, word)
-
-
-@pytest.mark.parametrize("pair", ["ab", ("a.png",), 5, None])
-def test_a_pair_of_another_type_is_refused(pair):
-    raises(lambda: list(unrun().match_pairs([pair])), TypeError, "pairs[0] is", "two images")
+@pytest.mark.parametrize("pairs", [5, [5], [None], [("a.png",)]])
+def test_pairs_of_another_type_are_refused(pairs):
+    with pytest.raises((TypeError, ValueError)):
+        list(unrun().match_pairs(pairs))
 
 
 def test_a_model_of_another_name_is_refused():
-    for call in (
-        lambda: unrun()(pixels(), pixels(), model="G"),
-        lambda: unrun().match_pairs([], model="G"),
-    ):
-        raises(call, ValueError, "model is str 'G'", "'F', 'E', 'H'")
+    raises(lambda: unrun()(pixels(), pixels(), model="G"), ValueError, "'G' is not a valid")
     raises(lambda: unrun()(pixels(), pixels(), model="E"), ValueError, "model E needs intrinsics")
 
 
@@ -366,7 +336,7 @@ def test_arguments_of_pairs_are_those_of_a_call():
     np.testing.assert_array_equal(found.estimate.matrix, expected.estimate.matrix)
     assert found.estimate.model == "E"
     short = matcher.match_pairs([pair, pair], intrinsics=[(K, K)])
-    raises(lambda: list(short), ValueError, "intrinsics", "1")
+    raises(lambda: list(short), ValueError, "shorter")
 
 
 # Errors
@@ -430,6 +400,7 @@ def test_another_answer_of_the_users_own_matcher_is_named(answer, word):
         Matches([(5000, 1)], [(2, 2)], [1]),
     ],
 )
+@pytest.mark.filterwarnings("ignore:no F was found")
 def test_matches_of_the_users_own_matcher_that_are_all_dropped_are_an_error(found):
     call = own(lambda *_: [found])
     raises(lambda: call(pixels(), pixels()), ValueError, "match of 'own'", "1 match were dropped")
@@ -475,27 +446,26 @@ def unlucky(monkeypatch):
 
 
 def test_a_unit_that_fails_is_a_warning_and_an_estimate_without_points_names_it(unlucky):
-    with pytest.warns(RuntimeWarning, match=r"unit 1:sift@320 failed: RuntimeError: out of luck"):
+    with (
+        pytest.warns(RuntimeWarning, match=r"unit 1:sift@320 failed: RuntimeError: out of luck"),
+        pytest.warns(RuntimeWarning, match="no F was found: too few"),
+    ):
         match = TwoStageMatcher(SIFT)(pixels(), pixels(40))
     assert match.failures == {"1:sift@320": "RuntimeError: out of luck"}
     assert not match.estimate
-    assert not match.estimate.ok
-    assert match.estimate.failure == "every unit failed: RuntimeError: out of luck"
     assert match.estimate.inlier_count == 0
-    assert "every unit failed" in repr(match.estimate)
-    raises(lambda: match.estimate.matrix, UserError, "no F was found: every unit failed")
-    assert np.isfinite(match.estimate.matrix_or_fallback).all()
-    copy = pickle.loads(pickle.dumps(match))
-    raises(lambda: copy.estimate.matrix, UserError, "no F was found: every unit failed")
+    assert np.isfinite(match.estimate.matrix).all()
 
 
-def test_a_matcher_that_cannot_be_loaded_is_a_warning_and_the_reason_of_the_estimate(monkeypatch):
+def test_a_matcher_that_cannot_be_loaded_is_a_warning(monkeypatch):
     monkeypatch.setattr(assembly, "load_matcher", fail)
     reason = "sift cannot be loaded: RuntimeError: my bug"
-    with pytest.warns(RuntimeWarning, match=f"unit 1:sift@320 failed: {reason}"):
+    with (
+        pytest.warns(RuntimeWarning, match=f"unit 1:sift@320 failed: {reason}"),
+        pytest.warns(RuntimeWarning, match="no F was found: too few"),
+    ):
         match = TwoStageMatcher(SIFT)(pixels(), pixels(40))
     assert match.failures == {"1:sift@320": reason}
-    assert match.estimate.failure == f"every unit failed: {reason}"
 
 
 @pytest.mark.parametrize(("is_unlucky", "status"), [(True, 1), (False, 0)])
@@ -519,12 +489,11 @@ def test_the_command_match_ends_with_1_if_every_unit_failed(
 
 
 def test_flat_images_have_a_failure_of_the_estimate_and_not_of_units():
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        match = TwoStageMatcher(SIFT)(np.zeros((99, 99), np.uint8), np.zeros((99, 99), np.uint8))
+    black = np.zeros((99, 99), np.uint8)
+    with pytest.warns(RuntimeWarning, match="no F was found: too few"):
+        match = TwoStageMatcher(SIFT)(black, black)
     assert match.failures == {}
     assert not match.estimate
-    raises(lambda: match.estimate.matrix, UserError, "no F was found: too few")
 
 
 # What a result keeps
