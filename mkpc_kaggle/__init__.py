@@ -77,10 +77,6 @@ _MODULES = {
 def __getattr__(name: str) -> Any:
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from mkpc_kaggle.errors import require_libraries
-
-    # One line instead of pages if OpenCV does not fit NumPy.
-    require_libraries()
     return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
 
 

@@ -1,13 +1,11 @@
 """Errors and warnings for users, and parts of their texts."""
 
 import errno
-import sys
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager, redirect_stderr, suppress
+from contextlib import contextmanager
 from functools import cache
-from importlib import import_module
-from io import BufferedReader, StringIO
+from io import BufferedReader
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -19,32 +17,6 @@ class UserError(Exception):
 
     The message states the problem, its location and the next step.
     """
-
-
-def require_native(name: str, remedy: str) -> None:
-    """Import a native library. Raise ``ImportError`` with one line if that fails.
-
-    Libraries that do not fit each other print pages on stderr before they raise.
-    """
-    said = StringIO()
-    try:
-        with redirect_stderr(said):
-            import_module(name)
-    # Not only ImportError: a library for another NumPy may raise anything.
-    except Exception as error:
-        # The first sentence, such as "A module that was compiled using NumPy 1.x cannot be run in
-        # NumPy 2.4.6 as it may crash."
-        first = " ".join(said.getvalue().split()).partition(". ")[0]
-        reason = first or f"{type(error).__name__}: {' '.join(str(error).split())}"
-        raise ImportError(f"{name} cannot be imported: {reason}; {remedy}", name=name) from None
-    # Without a terminal, or with its descriptor closed, the text is lost, and the run continues.
-    with suppress(OSError, ValueError, AttributeError):
-        sys.stderr.write(said.getvalue())
-
-
-def require_libraries() -> None:
-    """Raise ``ImportError`` with one line if OpenCV, which all of the package needs, is unusable."""
-    require_native("cv2", "install it again: pip install 'opencv-python-headless>=4.10.0.84'")
 
 
 @cache

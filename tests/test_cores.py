@@ -3,7 +3,6 @@
 import os
 import subprocess
 import sys
-from math import inf
 from pathlib import Path
 
 import pytest
@@ -11,48 +10,8 @@ import pytest
 from mkpc_kaggle import cores
 
 
-@pytest.mark.parametrize(
-    ("own", "files", "quota"),
-    [
-        ("0::/\n", {"cpu.max": "max 100000\n"}, inf),
-        ("0::/\n", {"cpu.max": "250000 100000\n"}, 2.5),
-        # A group, and one around it
-        ("0::/a/b\n", {"a/cpu.max": "150000 100000", "a/b/cpu.max": "400000 100000"}, 1.5),
-        # In a container, the host's path does not exist.
-        ("0::/host/path\n", {"cpu.max": "200000 100000"}, 2.0),
-        # Version 1, and both together
-        (
-            "4:cpu,cpuacct:/a\n3:memory:/a\n0::/a\n",
-            {
-                "cpu,cpuacct/a/cpu.cfs_quota_us": "300000",
-                "cpu,cpuacct/a/cpu.cfs_period_us": "100000",
-            },
-            3.0,
-        ),
-        (
-            "2:cpu:/\n",
-            {"cpu/cpu.cfs_quota_us": "-1\n", "cpu/cpu.cfs_period_us": "100000\n"},
-            inf,
-        ),
-        ("3:memory:/\n", {}, inf),
-        (None, {}, inf),
-    ],
-)
-def test_the_quota_is_the_smallest_of_all_control_groups(tmp_path, own, files, quota):
-    for name, text in files.items():
-        path = tmp_path / "cgroup" / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text)
-    if own is not None:
-        (tmp_path / "own").write_text(own)
-    assert cores.cpu_quota(tmp_path / "own", tmp_path / "cgroup") == quota
-
-
-@pytest.mark.parametrize(("quota", "expected"), [(inf, 6), (64.0, 6), (2.5, 2), (0.5, 1)])
-def test_cores_are_those_of_the_affinity_within_the_quota(monkeypatch, quota, expected):
-    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(6)), raising=False)
-    monkeypatch.setattr(cores, "cpu_quota", lambda: quota)
-    assert cores.available_cores() == expected
+def test_cores_are_those_of_the_affinity():
+    assert 1 <= cores.available_cores() <= len(os.sched_getaffinity(0))
 
 
 def test_nothing_else_counts_cores():

@@ -58,14 +58,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     output closed the pipe. The time limit counts from the call, before the slow imports.
     """
     started = time.monotonic()
-    from mkpc_kaggle.errors import require_libraries
-
-    try:
-        require_libraries()
-    except ImportError as error:
-        # Without logging, whose module needs the library.
-        sys.stderr.write(f"{error}\n")
-        return EXIT_BAD_INPUT
     return _main(arguments, started)
 
 

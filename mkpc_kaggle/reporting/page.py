@@ -13,6 +13,7 @@ from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.data.outputs import replacing
 from mkpc_kaggle.engine.store.dataframes import Results, results
 from mkpc_kaggle.errors import UserError, printable, writing
+from mkpc_kaggle.pipeline.arguments import as_image
 from mkpc_kaggle.pipeline.drawing import draw_strip
 from mkpc_kaggle.progress import counted
 from mkpc_kaggle.reporting.figures import encode
@@ -25,7 +26,6 @@ from mkpc_kaggle.reporting.summary import (
     left_out_line,
     unit_table,
 )
-from mkpc_kaggle.setup.arguments import as_image
 
 if TYPE_CHECKING:
     from pandas import DataFrame
