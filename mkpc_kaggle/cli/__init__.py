@@ -3,7 +3,6 @@
 import argparse
 import errno
 import os
-import shutil
 import sys
 import time
 import warnings
@@ -11,7 +10,6 @@ from collections.abc import Sequence
 from contextlib import ExitStack, nullcontext, suppress
 from importlib import import_module
 from io import TextIOWrapper
-from pathlib import Path
 from typing import NoReturn
 
 from mkpc_kaggle.version import __version__
@@ -37,12 +35,7 @@ EXIT_INTERRUPTED = 128 + 2  # a shell's status for SIGINT
 def program(arguments: Sequence[str] | None = None) -> NoReturn:
     """Run a command and end the process at once: an orderly exit takes a second or longer."""
     try:  # Ctrl-C during slow imports is not an error
-        former = os.environ.get("MPLCONFIGDIR")
         status = main(arguments)
-        # Set by matplotlib if it cannot write below HOME. Matplotlib removes the directory only in
-        # an orderly exit.
-        if (made := os.environ.get("MPLCONFIGDIR")) != former:
-            shutil.rmtree(str(made), ignore_errors=True)
         if "cv2" not in sys.modules:  # it cannot be imported, and neither can the console
             sys.exit(status)
         from mkpc_kaggle.engine.console import leave
@@ -103,19 +96,11 @@ def _main(arguments: Sequence[str] | None, started: float) -> int:
 
 def _run(given: Sequence[str], started: float, printing: ExitStack) -> int:
     """Parse the arguments and run their command; without arguments, print the commands."""
-    from mkpc_kaggle.errors import UserError
-
     parser = make_parser(given)
     if not given:
         parser.print_help()
         return 0
     parsed = parser.parse_args(given)
-    try:
-        Path.cwd()  # relative paths are undefined without it
-    except OSError as error:
-        raise UserError(
-            f"the current directory is gone ({error.strerror}); change to another"
-        ) from error
     parsed.started = started
     # After parsing: --help and errors in options need no thread that prints.
     printing.enter_context(parsed.printing())

@@ -50,7 +50,7 @@ figure { margin: 1rem 0; }
 .rows { max-height: 30rem; overflow: auto; }
 table { border-collapse: collapse; font-size: .9rem; }
 th, td { text-align: left; padding: .2rem .8rem .2rem 0; border-bottom: 1px solid #d5d8de; }
-th { position: sticky; top: 0; background: #fff; }
+th { position: sticky; top: 0; background: #fff; white-space: nowrap; }
 """
 
 
@@ -136,7 +136,7 @@ def table(rows: "DataFrame", columns: Sequence[str] = ()) -> Iterator[str]:
 
 def cameras_of(found: Results) -> Iterator[str]:
     """Yield the view of each model, and the tables of scenes and cameras."""
-    shown = found.scenes.drop(columns="missing")
+    shown = found.scenes.drop(columns=["missing", "seconds"])
     yield from table(shown)
     if find_spec("plotly") is None and len(found.cameras):
         yield '<p class="dim">With plotly (extra `plots`), cameras and points are shown here.</p>'

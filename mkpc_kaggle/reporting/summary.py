@@ -1,7 +1,7 @@
 """The summary of a run, which the terminal and the page show: a headline, counts, what failed."""
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
 from mkpc_kaggle.engine.console import EventKind
@@ -38,21 +38,29 @@ def summary(report: RunReport) -> str:
     title += f"; {plural(report.units_run, 'unit')} run, {report.estimated} F estimated"
     if report.resumed:
         title += f", {plural(report.resumed, 'pair')} from earlier runs"
-    lines = [title, *counts(pairs, scenes)]
-    if len(means := unit_table(units)):
-        lines += means[:MAX_UNITS].to_string().splitlines()
-    lines += first(failures(pairs, units, scenes, report.faults), MAX_FAILURES)
-    lines.append(trouble(report) or pending(report.ending, pairs, scenes))
+    means = unit_table(units)
+    rows = means[:MAX_UNITS].to_string().splitlines() if len(means) else []
+    failed = failures(pairs, units, scenes, report.faults)
+    last = trouble(report) or pending(report.ending, pairs, scenes)
+    lines = [
+        title,
+        *counts(pairs, scenes),
+        *rows,
+        *first(failed, MAX_FAILURES),
+        last,
+    ]
     return "\n".join(filter(None, lines))
 
 
 def overview(found: Results) -> str:
     """Return the summary of a run from its journal."""
+    ending, seconds = ending_of(found)
+    failed = failures(found.pairs, found.units, found.scenes, faults_of(found))
     lines = [
-        headline(*ending_of(found), found.pairs, found.scenes),
+        headline(ending, seconds, found.pairs, found.scenes),
         *counts(found.pairs, found.scenes),
+        *first(failed, MAX_FAILURES),
     ]
-    lines += first(failures(found.pairs, found.units, found.scenes, faults_of(found)), MAX_FAILURES)
     return "\n".join(lines)
 
 
@@ -82,25 +90,31 @@ def faults_of(found: Results) -> list[str]:
 def counts(pairs: "DataFrame", scenes: "DataFrame") -> list[str]:
     """Return lines with the numbers of a run: sources of F, inliers, models."""
     sources = Counter(pairs["source"])
-    parts = [f"{sources[name]} {text}" for name, text in SOURCES.items() if sources[name]]
+    parts = []
+    for name, text in SOURCES.items():
+        if sources[name]:
+            parts.append(f"{sources[name]} {text}")
     lines = [f"F: {', '.join(parts)}"]
     inliers = pairs["inliers"][is_solved(pairs)]
     if len(inliers):
         lines.append(f"inliers of a pair: median {inliers.median():.0f}, minimum {inliers.min()}")
-    for batch in scenes[scenes["models"] > 0][:MAX_SCENES].to_dict("records"):
-        models = plural(batch["models"], "model")
-        error = f"reprojection error {batch['reprojection_error']:.3g} px"
-        lines.append(f"{batch['batch']}: {models}, {batch['points']} points, {error}")
+    has_models = scenes["models"] > 0
+    for scene in scenes[has_models][:MAX_SCENES].to_dict("records"):
+        models = plural(scene["models"], "model")
+        error = f"reprojection error {scene['reprojection_error']:.3g} px"
+        lines.append(f"{scene['batch']}: {models}, {scene['points']} points, {error}")
     return lines
 
 
 def unit_table(units: "DataFrame") -> "DataFrame":
     """Return means of each unit, the index, in the recipe's order, over the pairs that it ran on."""
     # A unit that failed, or that a pair does not need, has no matches and no seconds.
-    ran = units[(units["failure"] == "") & units["is_needed"]]
-    ran = ran.assign(seconds=ran["encode_seconds"] + ran["match_seconds"])
-    means = ran.groupby("unit", sort=False)[["matches", "inliers", "seconds"]].mean().round(2)
-    means.insert(0, "pairs", ran.groupby("unit", sort=False).size())
+    has_run = (units["failure"] == "") & units["is_needed"]
+    seconds = units["encode_seconds"] + units["match_seconds"]
+    ran = units.assign(seconds=seconds)[has_run]
+    by_unit = ran.groupby("unit", sort=False)
+    means = by_unit[["matches", "inliers", "seconds"]].mean().round(2)
+    means.insert(0, "pairs", by_unit.size())
     return means.rename_axis(None)
 
 
@@ -109,25 +123,28 @@ def failures(
 ) -> list[str]:
     """Return a line for each kind of failure: of pairs, batches, images and units; then all faults."""
     unsolved = pairs[is_reached(pairs) & ~is_solved(pairs)]
-    lines = list(grouped(unsolved, "pair", "failure", "pair", "without an F"))
-    lost = scenes[~scenes["failure"].isin(["", NOT_RECONSTRUCTED])]
-    lines += grouped(lost, "batch", "failure", "batch", "without cameras")
-    found = scenes[scenes["failure"] == ""]
-    for batch, missing in zip(found["batch"], found["missing"], strict=True):
-        if missing:
-            lines.append(f"{batch}: no camera for {named(missing)}")
+    lines = grouped(unsolved, "pair", "pair", "without an F")
+    is_pending = scenes["failure"] == NOT_RECONSTRUCTED
+    has_cameras = scenes["failure"] == ""
+    lost = scenes[~is_pending & ~has_cameras]
+    lines += grouped(lost, "batch", "batch", "without cameras")
+    for scene in scenes[has_cameras].to_dict("records"):
+        if scene["missing"]:
+            lines.append(f"{scene['batch']}: no camera for {named(scene['missing'])}")
     raised = units[units["failure"] != ""]
     for name, rows in raised.groupby("unit", sort=False):
-        lines += grouped(rows, "pair", "failure", "pair", f"without {name}")
+        lines += grouped(rows, "pair", "pair", f"without {name}")
     return [*lines, *faults]
 
 
-def grouped(rows: "DataFrame", name: str, reason: str, noun: str, without: str) -> Iterator[str]:
-    """Yield a line for each reason, the most frequent first, with the names of its rows."""
-    reasons = Counter(rows[reason])
-    for text, count in reasons.most_common():
-        names = named(rows[name][rows[reason] == text].tolist())
-        yield f"{plural(count, noun)} {without} ({text}): {names}"
+def grouped(rows: "DataFrame", column: str, noun: str, without: str) -> list[str]:
+    """Return a line for each failure, the most frequent first, with names of rows in a column."""
+    lines = []
+    for reason, count in Counter(rows["failure"]).most_common():
+        alike = rows[rows["failure"] == reason]
+        names = named(alike[column].tolist())
+        lines.append(f"{plural(count, noun)} {without} ({reason}): {names}")
+    return lines
 
 
 def named(names: Sequence[str]) -> str:
@@ -138,19 +155,26 @@ def named(names: Sequence[str]) -> str:
 
 def first(lines: Sequence[str], most: int) -> list[str]:
     """Return up to ``most`` lines, and a line with the number of the others."""
-    more = len(lines) - most
-    return [*lines[:most], *([f"... and {more} more in the report"] if more > 0 else [])]
+    shown = list(lines[:most])
+    if len(lines) > most:
+        shown.append(f"... and {len(lines) - most} more in the report")
+    return shown
 
 
 def pending(ending: str, pairs: "DataFrame", scenes: "DataFrame") -> str:
     """Return a line on the pairs and batches that the run did not reach; empty without any."""
     # A pair may have an F from a scene without being matched.
-    waiting = int((~is_reached(pairs) & ~pairs["source"].isin(["scene", "pair"])).sum())
+    has_f = pairs["source"].isin(["scene", "pair"])
+    waiting = int((~is_reached(pairs) & ~has_f).sum())
     batches = int((scenes["failure"] == NOT_RECONSTRUCTED).sum())
-    left = [plural(count, noun) for count, noun in ((waiting, "pair"), (batches, "batch")) if count]
-    if not left and ending != Ending.INTERRUPTED:
+    parts = []
+    if waiting:
+        parts.append(f"{plural(waiting, 'pair')} left")
+    if batches:
+        parts.append(f"{plural(batches, 'batch')} left")
+    if not parts and ending != Ending.INTERRUPTED:
         return ""
-    return "; ".join([*(f"{count} left" for count in left), "run the same command to continue"])
+    return "; ".join([*parts, "run the same command to continue"])
 
 
 def is_solved(pairs: "DataFrame") -> "Series[bool]":
@@ -196,13 +220,15 @@ def left_out_line(recipe: Recipe, left_out: Sequence[str]) -> str:
 
     ``left_out`` has a text for each cause.
     """
-    parts = [f"left out, {cause}" for cause in left_out]
-    # Missing weights are the normal case at first: one way to get some, and not a list of all.
-    is_missing = [cause.startswith(UnavailableKind.NO_WEIGHTS) for cause in left_out]
-    if any(is_missing) and set(recipe.matcher_names) == {"sift"}:
-        parts = [part for part, known in zip(parts, is_missing, strict=True) if not known]
-        parts.append(
-            "RootSIFT only; `mkpc weights fetch light --out weights`, and then the option "
-            "`--weights weights`, adds learned matchers"
-        )
+    parts = []
+    for cause in left_out:
+        is_missing = cause.startswith(UnavailableKind.NO_WEIGHTS)
+        # Missing weights are the normal case at first: one way to get some, and not a list of all.
+        if is_missing and set(recipe.matcher_names) == {"sift"}:
+            parts.append(
+                "RootSIFT only; `mkpc weights fetch light --out weights`, and then the option "
+                "`--weights weights`, adds learned matchers"
+            )
+        else:
+            parts.append(f"left out, {cause}")
     return "; ".join(parts)

@@ -108,18 +108,6 @@ def test_match_prints_f_and_draws_the_pair(demo, small_recipe, tmp_path, capsys)
     assert cv2.imread(str(figure)).shape[1] > 1000
 
 
-def test_matplotlib_leaves_nothing_where_home_cannot_be_written(demo, small_recipe, tmp_path):
-    (tmp_path / "tmp").mkdir()
-    environment = dict(os.environ)
-    environment.pop("MPLCONFIGDIR", None)
-    # Nobody, not even root, makes a directory in /proc. Then matplotlib makes one in TMPDIR.
-    environment |= {"HOME": "/proc/home", "XDG_CONFIG_HOME": "/proc/home"}
-    environment["TMPDIR"] = str(tmp_path / "tmp")
-    arguments = match_arguments(demo, small_recipe, tmp_path / "pair.png")
-    subprocess.run([sys.executable, "-m", "mkpc_kaggle", *arguments], env=environment, check=True)
-    assert list((tmp_path / "tmp").iterdir()) == []
-
-
 def test_match_draws_a_pair_that_has_nothing_in_common(clean_environment, tmp_path, capsys):
     cv2.imwrite(str(tmp_path / "a.png"), np.full((60, 90, 3), 127, np.uint8))
     figure = tmp_path / "pair.png"
