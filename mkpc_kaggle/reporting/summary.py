@@ -21,7 +21,7 @@ MAX_FAILURES = 3
 MAX_SCENES = 2
 MAX_NAMED = 3  # names in a line
 # Sources of F, the best first
-SOURCES = {
+SOURCES_OF_F = {
     "scene": "from cameras",
     "pair": "from their own matches",
     "earlier": "of an earlier run",
@@ -91,7 +91,7 @@ def counts(pairs: "DataFrame", scenes: "DataFrame") -> list[str]:
     """Return lines with the numbers of a run: sources of F, inliers, models."""
     sources = Counter(pairs["source"])
     parts = []
-    for name, text in SOURCES.items():
+    for name, text in SOURCES_OF_F.items():
         if sources[name]:
             parts.append(f"{sources[name]} {text}")
     lines = [f"F: {', '.join(parts)}"]
