@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 
 from mkpc_kaggle.demo import write_demo
-from mkpc_kaggle.errors import UserError, writing
+from mkpc_kaggle.errors import writing
 
 HELP = """\
 Render scenes of stone walls and painted boxes with known cameras, in the competition's layout: DIR/train with
@@ -25,17 +25,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="directory to write (default: demo)",
     )
-    parser.add_argument("--seed", type=int, default=0, help="seed of the rendered scenes")
 
 
 def run(arguments: argparse.Namespace) -> None:
-    # NumPy takes no negative seed.
-    if arguments.seed < 0:
-        raise UserError("--seed: give 0 or more")
     # Rendering takes a quarter of a minute.
     print(f"rendering photographs to {arguments.out}", flush=True)
     with writing(f"--out {arguments.out}"):
-        demo = write_demo(arguments.out, seed=arguments.seed)
+        demo = write_demo(arguments.out)
     # The directories that the commands of the help text take.
     print(f"train side: {demo.train_dir}")
     print(f"test side: {demo.test_dir}")
