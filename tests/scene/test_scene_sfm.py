@@ -295,6 +295,29 @@ def test_a_refinement_without_the_matches_of_an_image_leaves_the_image_out(scene
     assert names == {*scene.cameras} - {"0003"}
 
 
+def test_a_point_behind_a_camera_counts_for_nothing(scene, monkeypatch):
+    adjust = colmap.adjust
+    behind = []
+
+    def adjusted(model, given_cameras):
+        adjust(model, given_cameras)
+        image = model.images[min(model.reg_image_ids())]
+        seen = [point.point3D_id for point in image.points2D if point.has_point3D()]
+        behind.extend(seen[:20])
+        for number in behind:
+            point = model.points3D[number]
+            point.xyz = 2 * image.projection_center() - point.xyz
+        model.update_point_3d_errors()
+        assert model.compute_mean_reprojection_error() > 1e100
+        behind.append(len(seen) - 20)
+
+    monkeypatch.setattr(colmap, "adjust", adjusted)
+    config = SceneConfig(cameras=CameraSharing.IMAGE)
+    (model,) = reconstruct_batch(scene.pairs, config).reconstructions[0].models
+    assert model.images[0].points == behind[-1]
+    assert model.reprojection_error < 1e6
+
+
 def test_a_homography_that_was_not_estimated_is_not_read(scene, monkeypatch, tmp_path):
     """pycolmap leaves it as it was in memory."""
     estimate = colmap.pycolmap.estimate_two_view_geometry
