@@ -62,16 +62,6 @@ def test_progress_is_shown_and_can_be_switched_off(files, capfd):
     assert capfd.readouterr() == ("", "")
 
 
-def test_intrinsics_that_the_photographs_contradict_are_warned_of(tmp_path, files, capfd):
-    table = tmp_path / "known.csv"
-    wrong = 1.5 * MixedMatcher().scenes[0].cameras["0000"].K[0, 0]
-    table.write_text(f"image,model,parameters\n00.png,SIMPLE_PINHOLE,{wrong} 400 300\n")
-    (model,) = models(files, MixedMatcher(), intrinsics=table, progress=False)
-    (focal,) = model.comparison.focals
-    assert focal.given == pytest.approx(wrong)
-    assert "in --intrinsics contradicts the photographs" in capfd.readouterr().err
-
-
 def test_a_work_directory_keeps_what_was_matched(tmp_path, files):
     work = tmp_path / "work"
     first = MixedMatcher()
