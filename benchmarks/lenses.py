@@ -24,6 +24,7 @@ from time import process_time
 import cv2
 import numpy as np
 
+from benchmarks.similarity import find_similarity, model_size
 from mkpc_kaggle.data.competition import TrainScene, TruePair, read_train_side
 from mkpc_kaggle.engine.store.database import Store
 from mkpc_kaggle.engine.store.published import Published, read_images
@@ -33,7 +34,6 @@ from mkpc_kaggle.geometry.coordinates import Matrix3, Pixels
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.metrics import pair_accuracy
 from mkpc_kaggle.recipe import CameraModel, SceneConfig
-from mkpc_kaggle.scene.align import find_similarity, model_size
 from mkpc_kaggle.scene.models import RegisteredImage, SfmModel, models_of
 from mkpc_kaggle.scene.sfm import reconstruct_batch
 from mkpc_kaggle.scene.view_graph import BatchPair

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
     from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher
     from mkpc_kaggle.recipe import Recipe, Unit
-    from mkpc_kaggle.reconstruction.python import reconstruct
+    from mkpc_kaggle.reconstruction.run import reconstruct
 
 __all__ = [
     "Box",
@@ -68,7 +68,7 @@ _MODULES = {
     "PairwiseMatcher": "matchers.contract",
     "Picture": "matchers.contract",
     "Colour": "matchers.contract",
-    "reconstruct": "reconstruction.python",
+    "reconstruct": "reconstruction.run",
     "results": "engine.store.dataframes",
     "UserError": "errors",
 }

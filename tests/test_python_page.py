@@ -35,8 +35,8 @@ def test_the_page_runs_from_top_to_bottom(names, tmp_path):
     assert names["match"].estimate.inlier_count > 50
     assert names["essential"].estimate.model == "E"
     assert not names["nothing"].estimate
-    assert names["models"] == ()
-    assert len(names["tables"].pairs) == 1
+    assert isinstance(names["models"], tuple)
+    assert len(names["tables"].pairs) == 3
 
 
 @pytest.mark.genuine

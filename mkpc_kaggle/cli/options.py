@@ -104,13 +104,21 @@ def write_json(arguments: argparse.Namespace, figures: Sequence[Any]) -> None:
 
 
 def add_run(parser: argparse.ArgumentParser, time_limit: str | None) -> None:
-    """Add the options of the engine; ``time_limit``: the default, ``None`` for no limit."""
-    # A run's reader may be slow or hang.
-    parser.set_defaults(printing=queued)
+    """Add the options of a run of pairs; ``time_limit`` as for :func:`add_limits`."""
+    add_limits(parser, time_limit)
     add = parser.add_argument
     text = """two-stage (the default): the recipe as written; stage-1: only its units of stage 1; whole-images:
         all its units on whole images, the naive ensemble of equal inference count"""
     add("--mode", choices=list(map(str, Mode)), default="two-stage", help=text)
+    # At the end, because the plan changes with the measured costs.
+    add("--explain", action="store_true", help="print the plan at the end: what, when and why")
+
+
+def add_limits(parser: argparse.ArgumentParser, time_limit: str | None) -> None:
+    """Add the options of the engine; ``time_limit``: the default, ``None`` for no limit."""
+    # A run's reader may be slow or hang.
+    parser.set_defaults(printing=queued)
+    add = parser.add_argument
     text = f"""limit from the start of the program, such as 8h45m, 90m or 60s; the run ends before it, with the
         units that fit (default: {time_limit or "none"})"""
     add("--time-limit", default=time_limit, metavar="TIME", help=text)

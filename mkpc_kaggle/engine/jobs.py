@@ -19,7 +19,6 @@ from mkpc_kaggle.geometry.robust import NO_STATS, EstimateStats
 from mkpc_kaggle.pipeline.pair import Regions, UnitResult
 from mkpc_kaggle.recipe import Recipe, Unit
 from mkpc_kaggle.scene.candidates import ALL_UNITS
-from mkpc_kaggle.scene.export import HeldDirectory
 from mkpc_kaggle.scene.sfm import Solution
 
 
@@ -127,7 +126,7 @@ class SceneJob:
     recipe: Recipe
     source: Source
     matches: int = 0
-    export: HeldDirectory | None = None
+    export: Path | None = None
     cameras: Rows = ()
     candidate: str = ALL_UNITS
     scene: str = ""

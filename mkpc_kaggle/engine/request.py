@@ -16,7 +16,6 @@ from mkpc_kaggle.engine.store.keys import Keys
 from mkpc_kaggle.engine.store.tables import MIN_PAIRS, About, SceneRecord
 from mkpc_kaggle.geometry.intrinsics import Rows
 from mkpc_kaggle.recipe import Recipe
-from mkpc_kaggle.scene.export import HeldDirectory
 
 if TYPE_CHECKING:
     from mkpc_kaggle.engine.plan.state import State
@@ -55,7 +54,7 @@ class Request:
     keys: Keys
     root: str = ""
     cameras: Rows = ()
-    exports: Mapping[str, HeldDirectory] = field(default_factory=dict)
+    exports: Mapping[str, Path] = field(default_factory=dict)
     about: About = field(default_factory=About)
     publish: "Callable[[State], None]" = lambda _: None
     is_trial: bool = False

@@ -16,7 +16,7 @@ from mkpc_kaggle.engine.store.published import Published
 from mkpc_kaggle.engine.store.tables import Export, PairEstimate, SceneRecord, UnitPoints
 from mkpc_kaggle.geometry.crop_need import pays
 from mkpc_kaggle.geometry.robust import ModelKind
-from mkpc_kaggle.scene.export import has_files
+from mkpc_kaggle.scene.export import DATABASE
 
 
 def restore(state: State, store: Store, digests: Mapping[str, str]) -> None:
@@ -115,6 +115,6 @@ def _restore_scenes(state: State, store: Store) -> None:
             # A scene without its COLMAP files is made again. Until then its cameras are used.
             used_scene = state.scenes.in_use[batch]
             has_mark = state.scenes.filed[batch] == used_scene.key
-            if not (has_mark and has_files(directory.path, len(used_scene.models))):
+            if not (has_mark and (directory / DATABASE).is_file()):
                 continue
         state.scenes.settle(batch, state.tries.given_up)

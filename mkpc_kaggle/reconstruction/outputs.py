@@ -1,167 +1,244 @@
-"""Tables of cameras: ``cameras.csv``, and submissions to the Image Matching Challenges of 2023 to
-2025.
-"""
+"""OUT of ``reconstruct``: COLMAP's models, a table of cameras, folders for Gaussian splatting."""
 
 import csv
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+import os
+import shutil
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mkpc_kaggle.data.outputs import replacing
-from mkpc_kaggle.engine.console import logger
+from mkpc_kaggle.data.outputs import lies_in
+from mkpc_kaggle.engine.store.database import FILE_NAME
+from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.geometry.cameras import Camera
-from mkpc_kaggle.geometry.intrinsics import KnownCamera
-from mkpc_kaggle.reconstruction.folder import Datasets
+from mkpc_kaggle.geometry.coordinates import COLMAP_CENTRE_PX, Size
+from mkpc_kaggle.reconstruction.folder import CAMERA_COLUMNS
+from mkpc_kaggle.reconstruction.process import Child
+from mkpc_kaggle.scene.export import DATABASE, IMAGES, MODELS, PART, SPARSE, sync
+from mkpc_kaggle.scene.models import RegisteredImage, SfmModel, lens_of
+from mkpc_kaggle.scene.view_graph import BatchImage
+
+WORK = "work"
+# In WORK: COLMAP's files as the scene's job writes them, and the largest model of the last run
+SCENE, FORMER = "scene", "former"
+TABLE = "cameras.csv"
+PAGE = "report.html"
+RESULTS = (DATABASE, MODELS, TABLE, IMAGES, SPARSE)
+MIN_COMMON = 3  # cameras
+MAX_MOVED = 0.05  # of the model's size: a camera that two runs place differently
+STILL = 1e-9  # of the numbers of a similarity; smaller ones are rounding
 
 
-@dataclass(frozen=True, eq=False)
-class PlacedImage:
-    """The camera of an image file, and the number of its model: a row of ``cameras.csv``.
-
-    ``content`` is the digest of the file, or empty for a row of an earlier run.
+def require_out(out: Path, inputs: Iterable[Path]) -> None:
+    """Create ``out``. Raise :class:`UserError` unless it is empty or of an earlier run, and apart from
+    all inputs.
     """
-
-    model: int
-    camera: Camera
-    points: int = 0  # that the image sees
-    lens: KnownCamera | None = None
-    content: str = ""
-
-
-# By dataset and file; None without a camera.
-Cameras = Mapping[str, Mapping[Path, PlacedImage | None]]
-
-NO_POSE = ";".join(["nan"] * 9), "nan;nan;nan"
-ORIGIN = "1;0;0;0;1;0;0;0;1", "0;0;0"
-CAMERA_HEADS = (
-    "image",
-    "model",
-    "K",
-    "R",
-    "t",
-    "points",
-    *("camera_model", "parameters"),
-)
-SUBMISSION_FORMATS = (
-    "imc2025",  # a cluster for each model; an image without a camera is an outlier, its pose nan
-    "imc2023",  # also for 2024: the cameras of the largest model; other images are at the origin
-)
-
-
-def write_tables(out: Path, cameras: Cameras, root: Path, form: str | None) -> None:
-    """Write ``cameras.csv``, and ``submission.csv`` if a form is given. Raise ``OSError`` if that
-    fails.
-    """
-    tables = {"cameras.csv": camera_rows(cameras, root)}
-    if form is not None:
-        tables["submission.csv"] = submission_rows(form, cameras, root)
-    for name, rows in tables.items():
-        with replacing(out / name) as stream:
-            csv.writer(stream, lineterminator="\n").writerows(rows)
-
-
-def camera_rows(cameras: Cameras, root: Path) -> Iterator[Sequence[str]]:
-    """Yield a header, and a row per image with a camera: path below ``root``, model, K, R, t,
-    number of points, COLMAP's camera model and its parameters.
-
-    The centre of an image's first pixel is (0, 0); X_cam = R X + t. In COLMAP's parameters it is
-    (0.5, 0.5).
-    """
-    yield CAMERA_HEADS
-    for files in cameras.values():
-        for file, placed in files.items():
-            if placed is None:
-                continue
-            camera = placed.camera
-            # As in a table of --intrinsics, which takes them
-            lens = placed.lens
-            parameters = (
-                "" if lens is None else " ".join(f"{value:.12g}" for value in lens.parameters)
+    for path in inputs:
+        if lies_in(path, out) or lies_in(out, path):
+            raise UserError(
+                f"--out {out} contains, or lies in, the input {path}; name another folder"
             )
+    with writing(f"--out {out}"):
+        (out / WORK).mkdir(parents=True, exist_ok=True)
+        names = {path.name for path in out.iterdir() if not path.name.startswith(".")} - {WORK}
+        if names and not (out / WORK / FILE_NAME).is_file():
+            raise UserError(
+                f"--out {out} has {min(names)}, and no run of this command made it; name an empty folder"
+            )
+        for left in out.glob(f"{PART}*"):  # of a process that was killed
+            shutil.rmtree(left, ignore_errors=True)
+        # A folder that cannot be written is found now, and not after hours.
+        TemporaryDirectory(prefix=PART, dir=out).cleanup()
+
+
+def remove_results(out: Path) -> None:
+    """Remove the models of an earlier run: today's photographs have none."""
+    with TemporaryDirectory(prefix=PART, dir=out) as name:
+        for result in RESULTS:
+            with suppress(FileNotFoundError):
+                (out / result).replace(Path(name, result))
+
+
+def keep_former(out: Path) -> None:
+    """Keep the largest model of the last run, onto which those of this run are moved."""
+    with writing(f"--out {out}"):
+        shutil.rmtree(out / WORK / FORMER, ignore_errors=True)
+        if (out / MODELS / "0").is_dir():
+            shutil.copytree(out / MODELS / "0", out / WORK / FORMER)
+
+
+class Writer:
+    """Writes ``out`` whenever the scene of a run has new files, in a process of its own: pycolmap may
+    end a process.
+    """
+
+    def __init__(self, root: Path, out: Path) -> None:
+        self._root, self._out = root, out
+        self._version = 0
+        self._child: Child | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._child is not None:
+            self._child.kill()
+
+    def update(self) -> None:
+        """Begin to write the files of a new scene."""
+        made = self._out / WORK / SCENE / MODELS
+        version = made.stat().st_mtime_ns if made.is_dir() else 0
+        if version and version != self._version:
+            self.__exit__()
+            self._version = version
+            self._child = Child(write_results, self._root, self._out)
+
+    def next(self, ends: float) -> list[SfmModel]:
+        """Return the next value of :func:`write_results`, until ``ends`` on the monotonic clock; no
+        models without files. Raise :class:`UserError` if writing failed.
+        """
+        return [] if self._child is None else list(self._child.next(ends))
+
+
+def write_results(root: Path, out: Path) -> Iterator[list[SfmModel]]:
+    """Write the models of the scene to ``out``, moved onto the former model; yield them. Then write
+    ``images`` and ``sparse``, and yield again.
+
+    Only whole files replace former ones. Raises ``OSError`` if writing fails.
+    """
+    import pycolmap
+
+    pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
+    scene = out / WORK / SCENE
+    folders = sorted((scene / MODELS).iterdir(), key=lambda folder: int(folder.name))
+    models = [pycolmap.Reconstruction(folder) for folder in folders]
+    if (out / WORK / FORMER).is_dir():
+        former = pycolmap.Reconstruction(out / WORK / FORMER)
+        for model in models:
+            align(model, former)
+    found = [sfm_model(model) for model in models]
+    with TemporaryDirectory(prefix=PART, dir=out) as name:
+        made = Path(name)
+        for number, model in enumerate(models):
+            folder = made / MODELS / str(number)
+            folder.mkdir(parents=True)
+            model.write(folder)
+        with (made / TABLE).open("w", newline="", encoding="utf-8") as stream:
+            csv.writer(stream, lineterminator="\n").writerows(camera_rows(found))
+        try:
+            os.link(scene / DATABASE, made / DATABASE)
+        except OSError:  # a file system without links
+            shutil.copy2(scene / DATABASE, made / DATABASE)
+        replace_results(made, out)
+        yield found
+        undistort(models, root, out, made)
+        replace_results(made, out)
+    yield []
+
+
+def align(model: Any, former: Any) -> None:
+    """Move a model of pycolmap's onto the cameras that it has in common with a former one, if any."""
+    import pycolmap
+
+    common = model.find_common_reg_image_ids(former)
+    if len(common) < MIN_COMMON:
+        return
+    centres = np.array([former.images[there].projection_center() for _, there in common])
+    size = float(np.sqrt(centres.var(axis=0).sum()))
+    found = pycolmap.align_reconstructions_via_proj_centers(model, former, MAX_MOVED * size)
+    # Without a change, the bytes stay.
+    if found is not None and np.abs(found.matrix() - np.eye(3, 4)).max() > STILL:
+        model.transform(found)
+
+
+def sfm_model(model: Any) -> SfmModel:
+    """Return pycolmap's model as values without it. Images have no digests."""
+    from mkpc_kaggle.scene.colmap import points_of
+
+    images = []
+    for image in images_of(model):
+        K = np.array(image.camera.calibration_matrix())
+        # The centre of an image's first pixel is (0.5, 0.5) in COLMAP, and (0, 0) here.
+        K[:2, 2] -= COLMAP_CENTRE_PX
+        pose = np.array(image.cam_from_world().matrix())
+        size = Size(image.camera.width, image.camera.height)
+        camera = Camera(K, pose[:, :3], pose[:, 3])
+        lens = lens_of(image.camera)
+        named = BatchImage(image.name, "", size)
+        images.append(RegisteredImage(named, camera, int(image.num_points3D), lens=lens))
+    error = float(model.compute_mean_reprojection_error())
+    return SfmModel(tuple(images), points_of(model), error)
+
+
+def images_of(model: Any) -> list[Any]:
+    """Return the registered images of pycolmap's model by name, since its containers have no order."""
+    return sorted((model.images[n] for n in model.reg_image_ids()), key=lambda image: image.name)
+
+
+def camera_rows(models: Sequence[SfmModel]) -> Iterator[Sequence[object]]:
+    """Yield a header and a row per image: path below the folder, model, K, R, t with X_cam = R X + t,
+    the number of its points, and its camera as in a table of ``--intrinsics``.
+    """
+    yield "image", "model", "K", "R", "t", "points", *CAMERA_COLUMNS[1:]
+    for number, model in enumerate(models):
+        for found in model.images:
+            lens = found.lens
+            assert lens is not None
+            matrices = (found.camera.K, found.camera.R, found.camera.t)
             yield (
-                file.relative_to(root).as_posix(),
-                str(placed.model),
-                joined(camera.K),
-                joined(camera.R),
-                joined(camera.t),
-                str(placed.points),
-                "" if lens is None else lens.model,
-                parameters,
+                found.image.name,
+                number,
+                # Twelve digits: later ones are rounding.
+                *(";".join(f"{value:.12g}" for value in matrix.ravel()) for matrix in matrices),
+                found.points,
+                lens.model,
+                *found.image.size,
+                " ".join(f"{value:.12g}" for value in lens.parameters),
             )
 
 
-def read_table_of_cameras(path: Path, root: Path, datasets: Datasets) -> Cameras:
-    """Return the cameras that an earlier run wrote to ``cameras.csv``, of the files that exist now.
+def undistort(models: Sequence[Any], root: Path, out: Path, made: Path) -> None:
+    """Write ``images`` and ``sparse`` of pycolmap's models to ``made``: pinholes, with colours of
+    points and without folders in names, which some readers of COLMAP's files do not expect.
 
-    Without the file, no image has one. A file that is not a table of cameras is warned of.
+    Images that have a pinhole are links to the photographs, relative to ``out``.
     """
-    placed: dict[str, PlacedImage] = {}
-    try:
-        with path.open(newline="", encoding="utf-8") as stream:
-            heads, *rows = csv.reader(stream)
-        if tuple(heads) != CAMERA_HEADS:
-            raise ValueError("it has other columns")
-        # Editors leave blank lines.
-        placed = {row[0]: _placed(row) for row in rows if row}
-    except FileNotFoundError:
-        pass
-    except (OSError, ValueError, csv.Error) as error:
-        logger.warning(f"{path}: its cameras will be replaced, they cannot be read: {error}")
-    return {
-        name: {file: placed.get(file.relative_to(root).as_posix()) for file in files}
-        for name, files in datasets.items()
-    }
+    import pycolmap
+
+    photographs, source, target = (made / name for name in ("photographs", "source", "target"))
+    for folder in (photographs, source, made / IMAGES, made / SPARSE):
+        folder.mkdir()
+    linked = out.resolve() / IMAGES
+    files: dict[str, Path] = {}
+    for number, model in enumerate(models):
+        for image in images_of(model):
+            file = (root / image.name).resolve()
+            image.name = image.name.replace("/", "_")
+            # An image may be in two models.
+            if files.setdefault(image.name, file) is file:
+                (photographs / image.name).symlink_to(file)
+        model.extract_colors_for_all_images(photographs)
+        model.write(source)
+        links = pycolmap.FileCopyType.softlink
+        pycolmap.undistort_images(target, source, photographs, copy_policy=links)
+        (target / SPARSE).replace(made / SPARSE / str(number))
+        for path in (target / IMAGES).iterdir():
+            if path.is_symlink():
+                path.unlink()
+                path.symlink_to(os.path.relpath(files[path.name], str(linked)))
+            path.replace(made / IMAGES / path.name)
+        shutil.rmtree(target)
 
 
-def _placed(row: Sequence[str]) -> PlacedImage:
-    """Invert a row of :func:`camera_rows`. Raise ``ValueError`` for any other row."""
-    _, model, K, R, t, points, name, parameters = row
-    numbers = [np.array(text.split(";"), float) for text in (K, R, t)]
-    if not all(np.isfinite(values).all() for values in numbers):
-        raise ValueError("a number is not finite")
-    camera = Camera(numbers[0].reshape(3, 3), numbers[1].reshape(3, 3), numbers[2].reshape(3))
-    lens = KnownCamera(name, tuple(map(float, parameters.split()))) if name else None
-    return PlacedImage(int(model), camera, int(points), lens)
-
-
-def submission_rows(form: str, cameras: Cameras, root: Path) -> Iterator[Sequence[str]]:
-    """Yield a header, and a row for each image, in the folder's order. Append ``_`` to repeated ids
-    and names.
-    """
-    of_2025 = form == "imc2025"
-    heads = (
-        ("image_id", "dataset", "scene", "image") if of_2025 else ("image_path", "dataset", "scene")
-    )
-    yield *heads, "rotation_matrix", "translation_vector"
-    ids = set[str]()
-    names = set(cameras) - {"."}
-    for dataset, found in cameras.items():
-        folder = _unused(root.resolve().name, names) if dataset == "." else dataset
-        parts = folder.split("/")  # dataset/scene/images in 2023, dataset/images in 2024
-        for file, placed in found.items():
-            # The file's name, except in a dataset of several folders
-            name = file.relative_to(root / dataset).as_posix()
-            pose = (joined(placed.camera.R), joined(placed.camera.t)) if placed else NO_POSE
-            if of_2025:
-                number = _unused(f"{folder}_{name}", ids)
-                cluster = f"cluster{placed.model}" if placed else "outliers"
-                yield number, folder, cluster, name, *pose
-            else:
-                place = f"{folder}/{name}", parts[0], parts[1 if len(parts) > 2 else 0]
-                yield *place, *(pose if placed and placed.model == 0 else ORIGIN)
-
-
-def joined(numbers: NDArray[np.float64]) -> str:
-    # Twelve digits: later ones are rounding.
-    return ";".join(f"{value:.12g}" for value in numbers.ravel())
-
-
-def _unused(name: str, used: set[str]) -> str:
-    """Append ``_`` to the name until it is unused, add it to ``used``, and return it."""
-    while name in used:
-        name += "_"
-    used.add(name)
-    return name
+def replace_results(made: Path, out: Path) -> None:
+    """Move the results in ``made``, a temporary folder, to ``out`` once they are on the disk."""
+    sync(made)
+    for name in RESULTS:
+        if (made / name).exists():
+            if (out / name).is_dir():
+                (out / name).replace(made / f"former-{name}")
+            (made / name).replace(out / name)

@@ -7,10 +7,10 @@ survive this, run pycolmap in a separate process. Only :func:`write_files` write
 Source: Pan et al. 2024 (the global mapper).
 """
 
+import shutil
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -23,16 +23,7 @@ from mkpc_kaggle.geometry.coordinates import COLMAP_CENTRE_PX, Matrix3
 from mkpc_kaggle.geometry.focal_prior import FOCAL_RATIO
 from mkpc_kaggle.recipe import CameraModel, SceneConfig
 from mkpc_kaggle.scene.adjustment import adjust, drop_flat_lenses
-from mkpc_kaggle.scene.export import (
-    DATABASE,
-    FORMER,
-    MODELS,
-    PART,
-    HeldDirectory,
-    remove_parts,
-    replace_models,
-    require_on_disk,
-)
+from mkpc_kaggle.scene.export import DATABASE, MODELS, sync
 from mkpc_kaggle.scene.keypoints import Lens, MergedGraph
 from mkpc_kaggle.scene.models import (
     MIN_IMAGES,
@@ -100,43 +91,37 @@ def structure_from_motion(
 
 
 def write_files(
-    held: HeldDirectory,
+    directory: Path,
     merged: MergedGraph,
     shared: SharedIntrinsics,
     models: Sequence[SfmModel],
     config: SceneConfig = DEFAULTS,
 ) -> None:
-    """Write COLMAP's files: the database and one folder per model.
+    """Write COLMAP's files: the database and one folder per model, in place of ``directory``.
 
-    A temporary folder in the directory holds the files until all are complete. Then they replace
-    earlier files. A model's files contain only its plausible images. Raises ``OSError`` if the path
-    leads to another directory now.
+    A model's files contain only its plausible images. Raises ``OSError`` if writing fails.
     """
-    directory = held.path
-    held.check()
-    remove_parts(directory)
-    with TemporaryDirectory(prefix=PART, dir=directory) as name:
-        made = Path(name)
-        try:
-            file = pycolmap.Database.open(str(made / DATABASE))
-        except RuntimeError as error:  # a full disk; its message names no file
-            raise OSError(f"{directory / DATABASE} cannot be written") from error
-        with file as database:
-            _fill(database, merged, shared, config, reuse=True)
-        for number, model in enumerate(models):
-            kept = {each.image.name for each in model.images}
-            # A list, because the loop removes frames from the mapping.
-            for frame in [frame for frame in model.colmap.frames.values() if frame.has_pose()]:
-                if model.colmap.images[frame.frame_id].name not in kept:
-                    model.colmap.deregister_frame(frame.frame_id)
-            folder = made / MODELS / str(number)
-            folder.mkdir(parents=True)
-            model.colmap.write(folder)
-        require_on_disk(made)
-        held.check()
-        # Only renames from here on: a kill leaves complete files, of one run or of two.
-        (made / DATABASE).replace(directory / DATABASE)
-        replace_models(made / MODELS, directory / MODELS, made / FORMER)
+    made = directory.with_name(f"{directory.name}.new")
+    shutil.rmtree(made, ignore_errors=True)  # of a process that was killed
+    (made / MODELS).mkdir(parents=True)
+    try:
+        file = pycolmap.Database.open(str(made / DATABASE))
+    except RuntimeError as error:  # a full disk; its message names no file
+        raise OSError(f"{directory / DATABASE} cannot be written") from error
+    with file as database:
+        _fill(database, merged, shared, config, reuse=True)
+    for number, model in enumerate(models):
+        kept = {each.image.name for each in model.images}
+        # A list, because the loop removes frames from the mapping.
+        for frame in [frame for frame in model.colmap.frames.values() if frame.has_pose()]:
+            if model.colmap.images[frame.frame_id].name not in kept:
+                model.colmap.deregister_frame(frame.frame_id)
+        folder = made / MODELS / str(number)
+        folder.mkdir()
+        model.colmap.write(folder)
+    sync(made)
+    shutil.rmtree(directory, ignore_errors=True)
+    made.rename(directory)
 
 
 def _fill(

@@ -8,14 +8,13 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.intrinsics import Rows
 from mkpc_kaggle.geometry.robust import RobustConfig
 from mkpc_kaggle.recipe import CameraSharing, SceneConfig
-from mkpc_kaggle.scene.align import align, read_reference
 from mkpc_kaggle.scene.choose import Choice, choose
-from mkpc_kaggle.scene.export import HeldDirectory
 from mkpc_kaggle.scene.keypoints import MergedGraph
 from mkpc_kaggle.scene.models import MIN_IMAGES, Reconstruction, SfmModel, models_of
 from mkpc_kaggle.scene.shared_intrinsics import given_intrinsics, refined_intrinsics, share
@@ -43,7 +42,7 @@ def reconstruct_batch(
     config: SceneConfig,
     focal: FocalConfig | None = None,
     magsac: RobustConfig | None = None,
-    export: HeldDirectory | None = None,
+    export: Path | None = None,
     is_whole: bool = False,
     *,
     cameras: Rows = (),
@@ -76,13 +75,13 @@ def reconstruct_batch(
 def reconstruct_graph(
     graph: ViewGraph,
     config: SceneConfig,
-    directory: HeldDirectory | None = None,
+    directory: Path | None = None,
     is_whole: bool = False,
 ) -> tuple[list[Reconstruction], SharedIntrinsics]:
     """Return the reconstruction of each component, and the shared intrinsics of the images, refined.
 
-    With a ``directory``, the graph is reconstructed as a whole, moved onto the cameras of the last complete run,
-    and COLMAP's files are written there. With ``is_whole``, it is reconstructed as a whole without files.
+    With a ``directory``, the graph is reconstructed as a whole, and COLMAP's files are written there.
+    With ``is_whole``, it is reconstructed as a whole without files.
     """
     if directory is None and not is_whole:
         # Each component alone, since a bad one may make the mapper fail
@@ -101,8 +100,6 @@ def reconstruct_graph(
     if directory is not None:
         from mkpc_kaggle.scene.colmap import write_files
 
-        # Before the files are written, so that files and results agree
-        reconstructions = align(reconstructions, read_reference(directory.path))
         write_files(directory, parts[0], shared, models_of(reconstructions), config)
     # Images without a camera have the refined focal length, and not the one it began with.
     if config.cameras is CameraSharing.FOLDER:

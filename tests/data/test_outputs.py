@@ -1,14 +1,11 @@
 """Files that a command writes: whole or not at all, never over an input, without remains."""
 
 import os
-import sys
 from pathlib import Path
 
 import pytest
 
-from mkpc_kaggle.data.hloc import require_h5py
 from mkpc_kaggle.data.outputs import replacing, require_apart
-from mkpc_kaggle.errors import UserError
 
 
 def test_an_earlier_submission_among_the_weights_is_replaced(tmp_path):
@@ -42,9 +39,3 @@ def test_a_device_is_written_to_and_not_replaced():
     finally:
         os.close(ours)
         os.close(terminal)
-
-
-def test_a_file_for_hloc_without_h5py_is_an_error_that_names_the_extra(monkeypatch):
-    monkeypatch.setitem(sys.modules, "h5py", None)
-    with pytest.raises(UserError, match=r"need h5py: pip install 'mkpc-kaggle\[h5\]'"):
-        require_h5py()

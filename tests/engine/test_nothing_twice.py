@@ -311,6 +311,7 @@ def test_images_added_to_a_folder_are_matched_with_each_other_and_with_the_forme
     assert run == 9
     assert cameras == reconstruct("fresh")[1]
     assert reconstruct("out") == (0, cameras)
+    (tmp_path / "out" / "work" / "scene" / "database.db").unlink()
     (tmp_path / "out" / "database.db").unlink()
     assert reconstruct("out") == (0, cameras)
     assert (tmp_path / "out" / "database.db").exists(), "the scene is made again"

@@ -35,7 +35,7 @@ READ = {  # by its path: the command that reads it, and its allowed statuses
     "D/test.csv": (SUBMIT, REFUSED),
     X: (REPORTED, (0,)),
     "quick.toml": (SUBMIT, REFUSED),
-    "I/0.png": (f"{RECONSTRUCT} --rotations", EITHER),
+    "I/0.png": (RECONSTRUCT, EITHER),
     "pairs.txt": (f"{RECONSTRUCT} --pairs pairs.txt", REFUSED),
     "a.pt": (CONVERT, REFUSED),
     f"weights/deep/{NAME}": (AUTO, (0,)),

@@ -1,7 +1,7 @@
 """Folders of images to reconstruct: odd names, results in the way, commands given again after a
 change.
 
-tests/reconstruction has more directories of results and lists of pairs.
+tests/reconstruction has more.
 """
 
 import os
@@ -44,12 +44,10 @@ GOOD_NAMES = {
 }
 # A line of a table cannot hold them.
 BAD_NAMES = {"Latin 1": b"caf\xe9", "a line feed": b"a\nb", "a line separator": "a\u2028b".encode()}
-ALIKE = {
+ODD = {
     "two of one stem": lambda folder: (folder / "0.jpg").write_bytes(encoded(".jpg")),
     "one in capitals": lambda folder: (folder / "0.PNG").write_bytes(encoded(".png")),
     "a folder called as a result": lambda folder: write_images(folder / "MODELS"),
-}
-ODD = {
     "an ending alone": lambda folder: (folder / ".png").write_bytes(encoded(".png")),
     "links that go round": lambda folder: (folder / "round").symlink_to("."),
     "folders 50 deep": lambda folder: write_images(folder.joinpath(*"abcde" * 10)),
@@ -64,7 +62,7 @@ CHANGES = {  # between two runs
         encoded(".png", picture(50))
     ),
     "an image that was removed": lambda room: (room / "I/0.png").unlink(),
-    "a dataset more": lambda room: write_images(room / "I/more"),
+    "a folder more": lambda room: write_images(room / "I/more"),
     "no database": lambda room: (room / "out/o/database.db").unlink(),
     "no journal": lambda room: room.joinpath(*JOURNAL).unlink(),
     "a journal of noise": lambda room: room.joinpath(*JOURNAL).write_bytes(os.urandom(9999)),
@@ -95,13 +93,11 @@ def names(table: dict[str, bytes]) -> dict[str, Make]:
     }
 
 
-TO_TABLES = f"{RECONSTRUCT} --format imc2025"
 CASES = [
     *options("folders", IMAGES_TO, {f"results {where}": out for where, out in OUTS.items()}),
-    *makes("folders", TO_TABLES, names(BAD_NAMES)),
-    *makes("folders", TO_TABLES, names(GOOD_NAMES), (0,)),
-    *makes("folders", TO_TABLES, below("I", ALIKE)),
-    *makes("folders", TO_TABLES, below("I", ODD), (0,)),
+    *makes("folders", RECONSTRUCT, names(BAD_NAMES)),
+    *makes("folders", RECONSTRUCT, names(GOOD_NAMES), (0,)),
+    *makes("folders", RECONSTRUCT, below("I", ODD), (0,)),
     *makes(
         "folders",
         RECONSTRUCT,

@@ -60,7 +60,6 @@ def at(name: str, make: Callable[[], bytes]) -> Make:
     return replaced(name, lambda path: path.write_bytes(make()))
 
 
-TURNING = f"{RECONSTRUCT} --rotations"
 X = "D/test_images/b1/x.png"
 DAMAGED = {
     f"{suffix[1:]}: {name}": at(X, lambda d=damage, s=suffix: d(encoded(s)))
@@ -72,7 +71,7 @@ CASES = [
     *makes("images", REPORTED, {name: at(X, make) for name, make in ODD.items()}, (0,)),
     *makes(
         "images",
-        TURNING,
+        RECONSTRUCT,
         {f"{name}, a folder": at("I/0.png", make) for name, make in ODD.items()},
         (0, 1),
     ),

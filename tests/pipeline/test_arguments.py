@@ -15,7 +15,7 @@ from light_matchers import standin
 from pictures import same
 from sklearn.datasets import load_sample_image
 
-from mkpc_kaggle import PairMatch, TwoStageMatcher, reconstruct
+from mkpc_kaggle import PairMatch, TwoStageMatcher
 from mkpc_kaggle.cli import main
 from mkpc_kaggle.data.images import Image
 from mkpc_kaggle.errors import UserError
@@ -203,10 +203,9 @@ def test_other_camera_matrices_are_refused_before_any_matching(given):
         ({"matchers": {"sift": SiftMatcher}}, TypeError, ["'sift' is a class", "instance"]),
     ],
 )
-@pytest.mark.parametrize("call", [TwoStageMatcher, lambda *a, **k: reconstruct([], *a, **k)])
-def test_another_argument_of_a_matcher_is_refused_by_name(call, arguments, error, words):
+def test_another_argument_of_a_matcher_is_refused_by_name(arguments, error, words):
     given = {"recipe": "classical"} | arguments
-    raises(lambda: call(given.pop("recipe"), **given), error, *words)
+    raises(lambda: TwoStageMatcher(given.pop("recipe"), **given), error, *words)
 
 
 @pytest.mark.parametrize(
@@ -311,17 +310,6 @@ def test_pairs_of_another_type_are_refused(pairs):
 def test_a_model_of_another_name_is_refused():
     raises(lambda: unrun()(pixels(), pixels(), model="G"), ValueError, "'G' is not a valid")
     raises(lambda: unrun()(pixels(), pixels(), model="E"), ValueError, "model E needs intrinsics")
-
-
-def test_the_images_of_reconstruct_may_be_a_folder(tmp_path):
-    raises(lambda: reconstruct(str(tmp_path / "none"), "classical"), UserError, "is no folder")
-    raises(lambda: reconstruct(5, "classical"), TypeError, "images is int 5")
-    raises(lambda: reconstruct([5], "classical"), TypeError, "images[0] is int 5")
-    for name in ("one", "two"):
-        (tmp_path / name).mkdir()
-        for number in range(2):
-            PIL.Image.fromarray(pixels()).save(tmp_path / name / f"{number}.png")
-    raises(lambda: reconstruct(tmp_path, "classical"), UserError, "several folders", "one, two")
 
 
 def test_arguments_of_pairs_are_those_of_a_call():

@@ -11,7 +11,6 @@ from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.recipe import Recipe, SceneConfig, Unit
 from mkpc_kaggle.reconstruction.run import for_cameras
 from mkpc_kaggle.scene.colmap import write_files
-from mkpc_kaggle.scene.export import HeldDirectory
 from mkpc_kaggle.scene.keypoints import MergedGraph
 from mkpc_kaggle.scene.sfm import reconstruct_batch, reconstruct_graph
 from mkpc_kaggle.scene.shared_intrinsics import given_intrinsics
@@ -41,7 +40,7 @@ def start_focals(directory: Path, settings: SceneConfig) -> tuple[list[float], i
     """Return the focal length that each image's camera starts with, and the number of cameras."""
     graph = ViewGraph((*IMAGES, TALL), ())
     intrinsics = given_intrinsics(graph.images, settings)
-    write_files(HeldDirectory.of(directory), MergedGraph(graph), intrinsics, [])
+    write_files(directory, MergedGraph(graph), intrinsics, [])
     with pycolmap.Database.open(str(directory / "database.db")) as database:
         cameras = database.read_all_cameras()
         images = database.read_all_images()

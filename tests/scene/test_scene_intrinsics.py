@@ -15,7 +15,6 @@ from mkpc_kaggle.geometry.intrinsics import (
     parse_row,
 )
 from mkpc_kaggle.recipe import CameraSharing, SceneConfig
-from mkpc_kaggle.scene.export import HeldDirectory
 from mkpc_kaggle.scene.models import SfmModel, models_of
 from mkpc_kaggle.scene.sfm import reconstruct_graph
 from mkpc_kaggle.scene.view_graph import ViewGraph
@@ -90,7 +89,7 @@ def test_distortion_is_part_of_verification_and_of_the_model(tmp_path):
         pinhole = (K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5)
         known.append((name, KnownCamera("OPENCV", (*pinhole, *distortion))))
     graph = ViewGraph.of_pairs(SCENE.pairs).with_intrinsics(known)
-    reconstruct_graph(graph, SceneConfig(), HeldDirectory.of(tmp_path))
+    reconstruct_graph(graph, SceneConfig(), tmp_path)
     with pycolmap.Database.open(str(tmp_path / "database.db")) as database:
         cameras = database.read_all_cameras()
         geometry = database.read_two_view_geometry(1, 2)

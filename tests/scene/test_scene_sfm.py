@@ -26,7 +26,6 @@ from mkpc_kaggle.geometry.robust import RobustConfig
 from mkpc_kaggle.recipe import CameraSharing, SceneConfig
 from mkpc_kaggle.scene import colmap
 from mkpc_kaggle.scene.choose import Reason
-from mkpc_kaggle.scene.export import HeldDirectory
 from mkpc_kaggle.scene.keypoints import MergedGraph
 from mkpc_kaggle.scene.sfm import Solution, reconstruct_batch, reconstruct_connected
 from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair, ViewGraph
@@ -275,7 +274,7 @@ def test_an_edge_is_verified_once_for_the_same_cameras_on_any_number_of_threads(
         calls.clear()
         out = tmp_path / str(threads)
         # Both the scene and its files use all geometries.
-        reconstruct_batch(scene.pairs, config, export=HeldDirectory.of(out))
+        reconstruct_batch(scene.pairs, config, export=out)
         assert len(calls) == len(scene.pairs)
         with closing(sqlite3.connect(out / "database.db")) as database:
             dump = list(database.iterdump())
@@ -334,7 +333,7 @@ def test_a_homography_that_was_not_estimated_is_not_read(scene, monkeypatch, tmp
 
         monkeypatch.setattr(colmap.pycolmap, "estimate_two_view_geometry", filled)
         out = tmp_path / str(number)
-        reconstruct_batch(scene.pairs, SceneConfig(), export=HeldDirectory.of(out))
+        reconstruct_batch(scene.pairs, SceneConfig(), export=out)
         with closing(sqlite3.connect(out / "database.db")) as database:
             written.append([*database.iterdump()])
         files = sorted((out / "models").rglob("*.bin"))

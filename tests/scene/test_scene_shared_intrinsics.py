@@ -24,7 +24,6 @@ from mkpc_kaggle.geometry.robust import RobustConfig
 from mkpc_kaggle.recipe import CameraSharing, SceneConfig
 from mkpc_kaggle.scene import colmap
 from mkpc_kaggle.scene.choose import estimate_at_known_focals
-from mkpc_kaggle.scene.export import HeldDirectory
 from mkpc_kaggle.scene.keypoints import MergedGraph
 from mkpc_kaggle.scene.models import RegisteredImage, SfmModel
 from mkpc_kaggle.scene.sfm import Solution, reconstruct_batch, reconstruct_graph
@@ -193,7 +192,7 @@ def test_shared_intrinsics_stay_unless_they_explain_fewer_points_and_the_files_a
     assert len(set(focals_of(solution))) == cameras
 
     graph = ViewGraph.of_pairs(scene.pairs)
-    (found,), _ = reconstruct_graph(graph, CONFIG, HeldDirectory.of(tmp_path))
+    (found,), _ = reconstruct_graph(graph, CONFIG, tmp_path)
     written = pycolmap.Reconstruction(tmp_path / "models" / "0").cameras.values()
     written_focals = {camera.focal_length for camera in written}
     assert written_focals == {image.focal for image in found.models[0].images}
@@ -279,7 +278,7 @@ def test_shared_intrinsics_verify_no_edge_again(tmp_path, monkeypatch):
 
     monkeypatch.setattr(pycolmap, "estimate_two_view_geometry", counted)
     scene = synthetic_scene(7, 15, points=250, focals=[FOCAL] * 7, seed=1)
-    solution = reconstruct_batch(scene.pairs, CONFIG, export=HeldDirectory.of(tmp_path))
+    solution = reconstruct_batch(scene.pairs, CONFIG, export=tmp_path)
     assert len(set(focals_of(solution))) == 1
     assert len(verified) == len(scene.pairs)
     with pycolmap.Database.open(str(tmp_path / "database.db")) as database:

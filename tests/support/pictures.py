@@ -66,9 +66,11 @@ def agreement(first: torch.Tensor, second: torch.Tensor, within: float, p: float
 
 
 def write_two_views(directory: Path) -> None:
-    """Write a.jpg and b.jpg: two parts of a photograph, 40 pixels apart."""
+    """Write a.jpg and b.jpg: two parts of a photograph, 40 pixels apart; and a folder of three parts."""
     photograph = load_sample_image("china.jpg")[..., ::-1]
-    for name, shift in (("a.jpg", 0), ("b.jpg", 40)):
+    (directory / "photographs").mkdir()
+    parts = [("a.jpg", 0), ("b.jpg", 40), *((f"photographs/{n}.jpg", 20 * n) for n in range(3))]
+    for name, shift in parts:
         # Small, because RootSIFT enlarges a view to 1,536 pixels.
         part = photograph[60:300, 60 + shift : 420 + shift]
         assert cv2.imwrite(str(directory / name), part)

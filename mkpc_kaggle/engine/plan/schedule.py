@@ -18,9 +18,8 @@ has had no run but its warm-up; the mean is that of the warm-up then.
 A job has the expected seconds of its units and the time left. Its worker applies the second rule again before each
 minibatch, by its own clock (:class:`mkpc_kaggle.engine.workers.worker.MatchRunner`).
 
-Other work that is dropped when time is short: extra pairs beyond a tenth of it (:func:`pairs_to_connect`),
-candidates that would not end (:func:`candidates_due`), and each of two trials of ``--rotations`` after a quarter
-of it (:mod:`mkpc_kaggle.reconstruction.choice`). The first candidate of a scene begins unchecked.
+Other work that is dropped when time is short: extra pairs beyond a tenth of it (:func:`pairs_to_connect`), and
+candidates that would not end (:func:`candidates_due`). The first candidate of a scene begins unchecked.
 """
 
 from collections.abc import Sequence

@@ -352,7 +352,7 @@ def results(directory: Path | str) -> Results:
     Parameters
     ----------
     directory : str or Path
-        NAME.work of a submission, ``--work-dir``, or ``work_dir`` of :func:`reconstruct`.
+        NAME.work of a submission, ``--work-dir``, or ``OUT/work`` of :func:`reconstruct`.
 
     Returns
     -------
@@ -367,10 +367,10 @@ def results(directory: Path | str) -> Results:
     Examples
     --------
     >>> from mkpc_kaggle import reconstruct, results
-    >>> models = reconstruct(["a.jpg", "b.jpg"], "sift", work_dir="work", progress=False)
-    >>> tables = results("work")
-    >>> tables.pairs[["image0", "image1", "model"]].values.tolist()
-    [['a.jpg', 'b.jpg', 'F']]
+    >>> models = reconstruct("photographs", "OUT", "sift", progress=False)
+    >>> tables = results("OUT/work")
+    >>> set(tables.pairs["model"])
+    {'F'}
     """
     with Store.read(Path(directory)) as store:
         published = Published.of(store)

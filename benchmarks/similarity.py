@@ -1,15 +1,7 @@
-"""Coordinates that stay: a new reconstruction moved onto the cameras of an earlier one.
+"""The similarity between two models of the same images, for errors of cameras."""
 
-A reconstruction is known up to a similarity. Programs that use earlier coordinates can use a larger
-folder if its common cameras stay where they were.
-"""
-
-import json
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any, TypeAlias
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,15 +9,9 @@ from scipy.spatial.distance import pdist
 
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Matrix3
-from mkpc_kaggle.scene.models import Reconstruction, SfmModel
 
-# In the folder of a dataset's files: its cameras at the end of the last run
-REFERENCE = ".mkpc-reference.json"
 MIN_COMMON = 3  # cameras
-STILL = 1e-9  # of a similarity's numbers
 OUTLIER = 4.0  # times the median distance: a camera that the two reconstructions place differently
-
-ModelCameras: TypeAlias = Mapping[str, Camera]  # of one model, by image name
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,15 +21,6 @@ class Similarity:
     scale: float
     R: Matrix3
     t: NDArray[np.float64]
-
-    @property
-    def is_identity(self) -> bool:
-        """True if the similarity changes rounding alone, which would change bytes of files."""
-        return bool(
-            abs(self.scale - 1) < STILL
-            and np.abs(self.R - np.eye(3)).max() < STILL
-            and np.abs(self.t).max() < STILL
-        )
 
     def of_points(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return points (N, 3) in the new world."""
@@ -86,9 +63,7 @@ def find_similarity(cameras: Sequence[Camera], targets: Sequence[Camera]) -> Sim
 
 def moved_by(cameras: Sequence[Camera], targets: Sequence[Camera]) -> NDArray[np.float64]:
     """Return the distance (N,) of each camera's centre from its target's."""
-    centres = _centres(cameras)
-    goals = _centres(targets)
-    return np.asarray(np.linalg.norm(centres - goals, axis=1))
+    return np.asarray(np.linalg.norm(_centres(cameras) - _centres(targets), axis=1))
 
 
 def model_size(cameras: Sequence[Camera]) -> float:
@@ -135,69 +110,3 @@ def _least_squares(
 
 def _centres(cameras: Sequence[Camera]) -> NDArray[np.float64]:
     return np.array([camera.centre for camera in cameras]).reshape(-1, 3)
-
-
-def align(
-    reconstructions: Sequence[Reconstruction], reference: Sequence[ModelCameras]
-) -> list[Reconstruction]:
-    """Return the reconstructions, each model moved onto the earlier model with the most common
-    images.
-    """
-
-    def aligned(model: SfmModel) -> SfmModel:
-        cameras = {image.image.name: image.camera for image in model.images}
-        # Of several models, each may belong to another earlier one.
-        earlier = max(reference, key=lambda former: len(cameras.keys() & former.keys()), default={})
-        names = sorted(cameras.keys() & earlier.keys())
-        similarity = find_similarity(
-            [cameras[name] for name in names], [earlier[name] for name in names]
-        )
-        if similarity is None or similarity.is_identity:
-            return model
-        return transformed(model, similarity)
-
-    return [
-        replace(reconstruction, models=tuple(map(aligned, reconstruction.models)))
-        for reconstruction in reconstructions
-    ]
-
-
-def transformed(model: SfmModel, similarity: Similarity) -> SfmModel:
-    """Return the model in another world. pycolmap's model is changed in place."""
-    if model.colmap is not None:
-        # Heavy, and only where a model of it exists
-        import pycolmap
-
-        rotation = pycolmap.Rotation3d(similarity.R)
-        model.colmap.transform(pycolmap.Sim3d(similarity.scale, rotation, similarity.t))
-    images = tuple(
-        replace(found, camera=similarity.of_camera(found.camera)) for found in model.images
-    )
-    return replace(model, images=images, points=similarity.of_points(model.points))
-
-
-def write_reference(stream: Any, models: Sequence[ModelCameras]) -> None:
-    """Write the cameras of models as JSON: R and t of each image."""
-    rows = [
-        {name: [*camera.R.ravel(), *camera.t] for name, camera in model.items()} for model in models
-    ]
-    json.dump(rows, stream, sort_keys=True)
-
-
-def read_reference(directory: Path) -> list[ModelCameras]:
-    """Return the cameras of each model of the last complete run, with K the identity; empty if
-    unknown.
-    """
-    # A missing or damaged file costs the coordinates and not the run.
-    models: list[ModelCameras] = []
-    with suppress(OSError, ValueError, TypeError, AttributeError, RecursionError):
-        for row in json.loads((directory / REFERENCE).read_text(encoding="utf-8")):
-            cameras = {}
-            for name, values in row.items():
-                numbers = np.array(values, np.float64)
-                if numbers.shape != (12,) or not np.isfinite(numbers).all():
-                    return []
-                R, t = np.split(numbers, [9])
-                cameras[name] = Camera(np.eye(3), R.reshape(3, 3), t)
-            models.append(cameras)
-    return models
