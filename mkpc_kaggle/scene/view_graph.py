@@ -10,7 +10,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from mkpc_kaggle.geometry.coordinates import Matrix3, Size
-from mkpc_kaggle.geometry.intrinsics import CameraTable, KnownCamera, Rows
+from mkpc_kaggle.geometry.intrinsics import KnownCamera, Rows
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.pipeline.pair import UnitResult
 
@@ -131,15 +131,14 @@ class ViewGraph:
 
     def with_intrinsics(self, rows: Rows) -> "ViewGraph":
         """Return the graph with the user's cameras of the images that the rows name."""
-        # By contents: a copy under another name is the same photograph.
-        table = CameraTable(rows)
-        found = {
-            image.digest: table.camera_of(image.name, *self.copies.get(image.digest, ()))
-            for image in self.images
-        }
-        return replace(
-            self, known={digest: camera for digest, camera in found.items() if camera is not None}
-        )
+        cameras = dict(rows)
+        known: dict[str, KnownCamera] = {}
+        for image in self.images:
+            # By contents: a copy under another name is the same photograph.
+            for name in (image.name, *self.copies.get(image.digest, ())):
+                if name in cameras:
+                    known.setdefault(image.digest, cameras[name])
+        return replace(self, known=known)
 
     def components(self) -> tuple["ViewGraph", ...]:
         """Return the components connected by strong edges, ordered by first image."""

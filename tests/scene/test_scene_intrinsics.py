@@ -1,6 +1,5 @@
 """Intrinsics that the user knows: tables of them, and scenes with them."""
 
-import fnmatch
 from dataclasses import replace
 
 import numpy as np
@@ -10,9 +9,7 @@ import pytest
 from benchmarks.synthetic_scene import synthetic_scene
 from mkpc_kaggle.geometry.intrinsics import (
     LENS_MODELS,
-    CameraTable,
     KnownCamera,
-    parse_row,
 )
 from mkpc_kaggle.recipe import CameraSharing, SceneConfig
 from mkpc_kaggle.scene.models import SfmModel, models_of
@@ -102,53 +99,18 @@ def test_distortion_is_part_of_verification_and_of_the_model(tmp_path):
         np.testing.assert_array_equal(image.camera.params, expected)
 
 
-def test_names_are_looked_up_and_only_patterns_are_compared_with_each_image(monkeypatch):
-    compared = []
-    monkeypatch.setattr(fnmatch, "fnmatchcase", lambda *texts: compared.append(texts))
-    names = [f"{number:04d}.jpg" for number in range(100)]
-    rows = [parse_row(name, "SIMPLE_PINHOLE", "900 10 10") for name in [*names, "x*.jpg"]]
-    table = CameraTable(rows)
-    assert [table.row_of(f"walk/{name}") for name in names] == list(range(100))
-    assert len(compared) == 2 * 100, "by path and by name, with the one pattern"
-
-
-def test_a_row_names_an_image_by_its_path_its_name_or_a_pattern():
-    # The focal length is the row's number.
-    rows = []
-    for number, pattern in enumerate(["set/a.jpg", "b.jpg", "[c].jpg", "set/*", "*.png"], start=1):
-        rows.append(parse_row(pattern, "SIMPLE_PINHOLE", f"{number} 10 10"))
-    # The first row that fits counts.
-    expected = {
-        "set/a.jpg": 1,
-        "x/b.jpg": 2,
-        # [c].jpg is a name and a pattern.
-        "[c].jpg": 3,
-        "c.jpg": 3,
-        "set/z.jpg": 4,
-        "y/z.png": 5,
-        "z.jpg": None,
-    }
-    found = {}
-    for name in expected:
-        camera = CameraTable(rows).camera_of(name)
-        found[name] = None if camera is None else camera.focal
-    assert found == expected
-
-
 @pytest.mark.parametrize(
-    ("cells", "reason"),
+    ("model", "parameters", "reason"),
     [
-        (("", "PINHOLE", "1 1 1 1"), "the name of the image is missing"),
-        (("a", "pinhole", "1 1 1 1"), "unknown camera model"),
-        (("a", "PINHOLE", "1 1 1"), r"has 4 parameters \(fx, fy, cx, cy\)"),
-        (("a", "PINHOLE", "1 nan 1 1"), "not finite"),
-        (("a", "PINHOLE", "1 x 1 1"), "is not a decimal number"),
-        (("a", "PINHOLE", "1 -1 1 1"), "must be positive"),
+        ("pinhole", (1, 1, 1, 1), "unknown camera model"),
+        ("PINHOLE", (1, 1, 1), r"has 4 parameters \(fx, fy, cx, cy\)"),
+        ("PINHOLE", (1, np.nan, 1, 1), "not finite"),
+        ("PINHOLE", (1, -1, 1, 1), "must be positive"),
     ],
 )
-def test_a_row_that_no_camera_has_is_refused_with_the_reason(cells, reason):
+def test_parameters_that_no_camera_has_are_refused_with_the_reason(model, parameters, reason):
     with pytest.raises(ValueError, match=reason):
-        parse_row(*cells)
+        KnownCamera(model, parameters)
 
 
 def test_the_models_have_the_parameters_of_colmap():
