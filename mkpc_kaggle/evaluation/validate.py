@@ -261,7 +261,7 @@ def paired_difference(scenes: Sequence[Paired]) -> Difference:
     # Scenes count equally, as in the mAA, with few pairs or many.
     overall = np.mean(resampled, axis=0)
     tail = (1 - LEVEL) / 2
-    low, high = np.quantile(overall, [tail, (1 + LEVEL) / 2])
+    low, high = np.quantile(overall, [tail, 1 - tail])
     return Difference(mean(means), float(low), float(high))
 
 
