@@ -14,9 +14,12 @@ from mkpc_kaggle.engine.plan.budget import Budget, monotonic_of, parse_duration
 from mkpc_kaggle.engine.session import Interrupt, Session
 from mkpc_kaggle.engine.workers.cluster import parse_workers
 from mkpc_kaggle.errors import UserError, writing
-from mkpc_kaggle.recipe import Mode, parse_setting
+from mkpc_kaggle.recipe import parse_setting, split_mode
 from mkpc_kaggle.reporting.summary import left_out_line
 from mkpc_kaggle.setup.assembly import Assembly, assemble
+
+RECIPE = """a recipe, or one matcher such as aliked_lightglue (default: auto, every matcher with its weights).
+    MODE stage-1 runs its units of stage 1 alone, whole-images all its units without crops"""
 
 
 def add_matching(parser: argparse.ArgumentParser) -> None:
@@ -25,8 +28,8 @@ def add_matching(parser: argparse.ArgumentParser) -> None:
     add(
         "--recipe",
         default="auto",
-        metavar="NAME|FILE.toml",
-        help="a recipe, or one matcher such as aliked_lightglue (default: auto, every matcher with its weights)",
+        metavar="NAME|FILE.toml[:MODE]",
+        help=RECIPE,
     )
     add_weights(parser)
     add(
@@ -49,8 +52,9 @@ def add_matching(parser: argparse.ArgumentParser) -> None:
 
 def recipe_file(arguments: argparse.Namespace) -> Path | None:
     """Return the file of the recipe, which no output may replace; ``None`` for a recipe's name."""
+    name, _ = split_mode(arguments.recipe)
     # A folder may have the name of a recipe.
-    return Path(arguments.recipe) if arguments.recipe.endswith(".toml") else None
+    return Path(name) if name.endswith(".toml") else None
 
 
 def add_weights(parser: argparse.ArgumentParser) -> None:
@@ -104,17 +108,6 @@ def write_json(arguments: argparse.Namespace, figures: Sequence[Any]) -> None:
 
 
 def add_run(parser: argparse.ArgumentParser, time_limit: str | None) -> None:
-    """Add the options of a run of pairs; ``time_limit`` as for :func:`add_limits`."""
-    add_limits(parser, time_limit)
-    add = parser.add_argument
-    text = """two-stage (the default): the recipe as written; stage-1: only its units of stage 1; whole-images:
-        all its units on whole images, the naive ensemble of equal inference count"""
-    add("--mode", choices=list(map(str, Mode)), default="two-stage", help=text)
-    # At the end, because the plan changes with the measured costs.
-    add("--explain", action="store_true", help="print the plan at the end: what, when and why")
-
-
-def add_limits(parser: argparse.ArgumentParser, time_limit: str | None) -> None:
     """Add the options of the engine; ``time_limit``: the default, ``None`` for no limit."""
     # A run's reader may be slow or hang.
     parser.set_defaults(printing=queued)
@@ -136,17 +129,16 @@ def settings_of(arguments: argparse.Namespace) -> dict[str, Any]:
     return dict(map(parse_setting, arguments.set))
 
 
-def assembly_of(
-    arguments: argparse.Namespace, recipe: str, mode: str, interrupt: Interrupt
-) -> Assembly:
-    """Return the assembly of a recipe with the command's options."""
+def assembly_of(arguments: argparse.Namespace, interrupt: Interrupt, recipe: str = "") -> Assembly:
+    """Return the assembly of a recipe, by default the command's, with the command's options."""
+    name, mode = split_mode(recipe or arguments.recipe)
     with interrupt.raising():  # computing the digests of large files takes long
         return assemble(
-            recipe,
+            name,
             weights=arguments.weights,
             device=arguments.device,
             precision=arguments.precision,
-            mode=Mode(mode),
+            mode=mode,
             scenes=arguments.reconstruct,
             settings=settings_of(arguments),
         )

@@ -44,7 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("images", type=Path, nargs="+", metavar="DIR", help="the folder of photographs")
     add("--out", type=Path, required=True, metavar="OUT", help="folder for the results")
     options.add_matching(parser)
-    options.add_limits(parser, time_limit=None)
+    options.add_run(parser, time_limit=None)
     text = "match only these: two paths below DIR per line"
     add("--pairs", type=Path, metavar="FILE", help=text)
     text = """images of one size that share a camera: if their focal lengths agree (auto), none (image), or all

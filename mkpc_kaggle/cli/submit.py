@@ -71,7 +71,7 @@ def run(arguments: argparse.Namespace) -> int:
             first_version(pairs, output),
             options.watched_session(arguments, work_dir, interrupt) as session,
         ):
-            assembly = options.assembly_of(arguments, arguments.recipe, arguments.mode, interrupt)
+            assembly = options.assembly_of(arguments, interrupt)
             effects = [line] if (line := missing_line(pairs)) else []
             options.say_start(plural(len(pairs), "pair"), assembly, work_dir, effects)
             _, images = test_side(arguments.test_dir)

@@ -11,7 +11,7 @@ from mkpc_kaggle.cli import options
 from mkpc_kaggle.data.competition import TrainScene, missing_line
 from mkpc_kaggle.data.outputs import require_apart
 from mkpc_kaggle.engine.console import logger
-from mkpc_kaggle.engine.session import Interrupt, Session, interruptible
+from mkpc_kaggle.engine.session import Session, interruptible
 from mkpc_kaggle.errors import UserError, temporary_directory
 from mkpc_kaggle.evaluation.validate import (
     Validation,
@@ -21,7 +21,6 @@ from mkpc_kaggle.evaluation.validate import (
     to_json,
     validate,
 )
-from mkpc_kaggle.recipe import split_mode
 from mkpc_kaggle.reporting.summary import left_out_line, summary, trouble
 from mkpc_kaggle.setup.assembly import Assembly
 
@@ -51,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="A,B",
         help="units to run, in this order, such as 1:sift@1536; default: the recipe's",
     )
-    text = """run these instead of --recipe and --mode, and give the gain of each over the first with its 95 %%
+    text = """run these instead of --recipe, and give the gain of each over the first with its 95 %%
         interval; such as classical:whole-images classical"""
     add("--compare", nargs="+", metavar="RECIPE[:MODE]", help=text)
     options.add_run(parser, time_limit=None)
@@ -62,19 +61,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    compared: list[str] = arguments.compare or []
-    if compared and arguments.units:
-        raise UserError("--units chooses from one recipe; --compare takes recipes as they are")
-    if len(compared) == 1:
+    recipes: list[str] = arguments.compare or [arguments.recipe]
+    if arguments.compare and len(recipes) < 2:
         raise UserError("--compare needs two recipes or more")
     # Before any work: a run of hours must not end in an output that cannot be written.
     require_apart({"--json": arguments.json}, [arguments.train_dir], arguments.work_dir)
     scenes = options.train_side_of(arguments)
-    pairs = [true.pair for scene in scenes for true in scene.pairs]
-    if line := missing_line(pairs):
+    if line := missing_line([true.pair for scene in scenes for true in scene.pairs]):
         logger.info(line)
     if line := resolution_line(scenes):
         logger.warning(line)
+    runs: list[Validation] = []
+    status = 0
     with ExitStack() as closed:
         # Without a work directory, nothing is kept.
         work_dir = arguments.work_dir or closed.enter_context(temporary_directory())
@@ -82,59 +80,54 @@ def run(arguments: argparse.Namespace) -> int:
         session = Session(work_dir, options.budget_of(arguments), interrupt)
         watched = closed.enter_context(session.watched())
         watched.save = lambda: "the time limit passed before the scores were printed"
-        status, runs = _run_recipes(arguments, scenes, work_dir, interrupt)
-    if compared and len(runs) == len(compared):
+        # All of them first: a wrong name should not end a comparison after its first run.
+        assemblies = [options.assembly_of(arguments, interrupt, text) for text in recipes]
+        # They share a journal, so that common units run once.
+        for text, assembly in zip(recipes, assemblies, strict=True):
+            session = Session(
+                work_dir, options.budget_of(arguments), interrupt, workers=arguments.workers
+            )
+            validation = _run_recipe(arguments, scenes, assembly, session)
+            runs.append(validation)
+            page = None
+            if arguments.work_dir is not None:
+                # A recipe may be a path, and a mode is joined by a colon.
+                name = re.sub(r"[^\w.-]+", "_", text) if arguments.compare else "report"
+                page = work_dir / f"{name}.html"
+            session.status = max(status, session.status)
+            status = options.finish(session, page, [true.pair for s in scenes for true in s.pairs])
+            # A comparison of unequal pairs would mean nothing.
+            if arguments.compare and not (validation.report and validation.report.ending.is_done):
+                logger.info(
+                    "nothing is compared until all is done; with a --work-dir, the same command resumes"
+                )
+                return status or 1
+    if arguments.compare:
         logger.info("\n".join(["", *comparison_table(runs)]))
     options.write_json(arguments, list(map(to_json, runs)))
     return status
 
 
-def _run_recipes(
+def _run_recipe(
     arguments: argparse.Namespace,
     scenes: Sequence[TrainScene],
-    work_dir: Path,
-    interrupt: Interrupt,
-) -> tuple[int, list[Validation]]:
-    """Run the recipes, which share a journal, so that common units run once. Return the worst exit
-    status, and the complete runs: a comparison of unequal pairs would mean nothing.
-    """
-    compared: list[str] = arguments.compare or []
-    choices = [split_mode(text) for text in compared] or [(arguments.recipe, arguments.mode)]
-    # All of them first: a wrong name should not end a comparison after its first run.
-    assemblies = [_assemble(arguments, interrupt, *choice) for choice in choices]
-    runs: list[Validation] = []
-    status = 0
-    for number, assembly in enumerate(assemblies):
-        budget = options.budget_of(arguments)
-        session = Session(work_dir, budget, interrupt, workers=arguments.workers)
-        validation = validate(scenes, assembly, session, str(arguments.train_dir))
-        report = validation.report
-        assert report is not None
-        left_out = left_out_line(assembly.recipe, assembly.left_out)
-        lines = [left_out, summary(report), f"recipe {validation.recipe}"]
-        logger.info("\n".join(filter(None, [*lines, *score_table(validation)])))
-        page = None
-        if arguments.work_dir is not None:
-            # A recipe may be a path, and a mode is joined by a colon.
-            name = re.sub(r"[^\w.-]+", "_", compared[number] if compared else "report")
-            page = work_dir / f"{name}.html"
-        session.status = max(status, bool(trouble(report) or report.unsaved))
-        pairs = [true.pair for scene in scenes for true in scene.pairs]
-        status = options.finish(session, page, pairs)
-        if compared and not report.ending.is_done:
-            logger.info(
-                "nothing is compared until all is done; with a --work-dir, the same command resumes"
-            )
-            return status or 1, runs
-        runs.append(validation)
-    return status, runs
-
-
-def _assemble(
-    arguments: argparse.Namespace, interrupt: Interrupt, name: str, mode: str
-) -> Assembly:
-    """Return the assembly of a recipe, as changed by the command's options."""
-    assembly = options.assembly_of(arguments, name, mode, interrupt)
-    if arguments.units is None:
-        return assembly
-    return replace(assembly, recipe=assembly.recipe.with_units(arguments.units.split(",")))
+    assembly: Assembly,
+    session: Session,
+) -> Validation:
+    """Run one recipe, print its summary and its scores, and set the session's exit status."""
+    recipe = assembly.recipe
+    if arguments.units is not None:
+        recipe = recipe.with_units(arguments.units.split(","))
+    assembly = replace(assembly, recipe=recipe)
+    validation = validate(scenes, assembly, session, str(arguments.train_dir))
+    report = validation.report
+    assert report is not None
+    lines = [
+        left_out_line(recipe, assembly.left_out),
+        summary(report),
+        f"recipe {validation.recipe}",
+        *score_table(validation),
+    ]
+    logger.info("\n".join(filter(None, lines)))
+    session.status = int(bool(trouble(report) or report.unsaved))
+    return validation

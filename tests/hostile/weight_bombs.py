@@ -10,7 +10,7 @@ from room import SUBMIT, written
 CONVERT = "weights convert a.pt --out out/a.safetensors"
 NAME = "xfeat_sparse_bnfolded.safetensors"
 SEARCH = "--weights weights"
-AUTO = SUBMIT.replace("quick.toml", "auto") + f" {SEARCH} --mode stage-1"
+AUTO = SUBMIT.replace("quick.toml", "auto:stage-1") + f" {SEARCH}"
 LENGTH = (6 * 10**9).to_bytes(8, "little")
 # A pickle is a program: some bytes of it ask for gigabytes, or for a depth that ends the process.
 PICKLES = {
