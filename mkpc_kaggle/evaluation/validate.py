@@ -358,8 +358,15 @@ def to_json(validation: Validation) -> dict[str, Any]:
             }
             finite = {name: value if isfinite(value) else None for name, value in values.items()}
             steps = {step: metrics.pair_accuracy(found) for step, found in pair.steps.items()}
-            facts = {"pair": pair.id, "images": pair.images, "covisibility": pair.covisibility}
-            pairs.append({**facts, **finite, "accuracy_by_step": steps})
+            pairs.append(
+                {
+                    "pair": pair.id,
+                    "images": pair.images,
+                    "covisibility": pair.covisibility,
+                    **finite,
+                    "accuracy_by_step": steps,
+                }
+            )
         scenes.append({"scene": scene.scene, "mAA": scene.maa(), "pairs": pairs})
     return {
         "recipe": validation.recipe,

@@ -49,8 +49,18 @@ def view(cameras: "DataFrame", points: NDArray[np.float64]) -> Any:
         x, y, z = axes @ values.T
         return Scatter3d(x=x, y=y, z=z, showlegend=False, **style)
 
-    cloud = scatter(shown, mode="markers", marker=POINT, hoverinfo="skip")
-    frusta = scatter(np.vstack(outlines), mode="lines", line=LINE, hoverinfo="skip")
+    cloud = scatter(
+        shown,
+        mode="markers",
+        marker=POINT,
+        hoverinfo="skip",
+    )
+    frusta = scatter(
+        np.vstack(outlines),
+        mode="lines",
+        line=LINE,
+        hoverinfo="skip",
+    )
     named = scatter(
         np.stack(centres),
         mode="markers",
