@@ -190,7 +190,7 @@ def _run(
     session: Session,
 ) -> Models:
     """Match the pairs, and write the results and the report to ``out``."""
-    from mkpc_kaggle.reporting.page import report_run  # jinja2 is slow to import
+    from mkpc_kaggle.reporting.page import report_run
     from mkpc_kaggle.reporting.summary import left_out_line, summary, trouble
 
     batch = root.resolve().name or "images"  # the root of the file system has no name

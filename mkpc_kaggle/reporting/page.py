@@ -37,8 +37,8 @@ DRAWING_S = 5.0  # pictures are drawn only if more time is left
 MAX_PICTURES = 12
 MAX_VIEWS = 12  # scenes in 3D: each adds its points to the page
 MAX_ROWS = 1000  # of a table; browsers are slow with more
-PAIR_COLUMNS = ["pair", "group", "matches", "inliers", "support", "source", "choice", "failure"]
-CAMERA_COLUMNS = ["batch", "model", "image", "points", "focal", "camera_model"]
+SHOWN_OF_PAIRS = ["pair", "group", "matches", "inliers", "support", "source", "choice", "failure"]
+SHOWN_OF_CAMERAS = ["batch", "model", "image", "points", "focal", "camera_model"]
 STYLE = """
 body { margin: 1rem auto; max-width: 76rem; padding: 0 1rem; font: 1rem/1.5 system-ui, sans-serif;
   overflow-wrap: anywhere; }
@@ -103,7 +103,7 @@ def page(found: Results, pairs: Sequence[Pair] = ()) -> str:
         *section("What failed", paragraphs(lost)),
         *section("Cameras", cameras_of(found)),
         *section("Pairs with the fewest inliers", pictures(found, pairs)),
-        *section("Pairs", table(found.pairs.sort_values("inliers", kind="stable"), PAIR_COLUMNS)),
+        *section("Pairs", table(found.pairs.sort_values("inliers", kind="stable"), SHOWN_OF_PAIRS)),
         *section("Units", table(unit_table(found.units).reset_index(names="unit"))),
     ]
     head = f'<meta charset="utf-8"><title>{escape(title)}</title><style>{STYLE}</style>'
@@ -142,7 +142,7 @@ def cameras_of(found: Results) -> Iterator[str]:
         yield '<p class="dim">With plotly (extra `plots`), cameras and points are shown here.</p>'
     elif len(found.cameras):
         yield from views(found)
-    yield from table(found.cameras.sort_values("points", kind="stable"), CAMERA_COLUMNS)
+    yield from table(found.cameras.sort_values("points", kind="stable"), SHOWN_OF_CAMERAS)
 
 
 def views(found: Results) -> Iterator[str]:

@@ -128,8 +128,9 @@ def test_each_step_of_the_estimate_has_a_column(demo, small_recipe, capsys):
 def test_a_work_directory_keeps_the_journal_and_a_report_that_shows_the_pairs(
     demo, small_recipe, tmp_path
 ):
-    options = ["--pairs-per-scene", 2, "--units", "1:sift@400"]
-    on_demo(demo, small_recipe, *options, "--work-dir", tmp_path / "work")
+    options = ["--recipe", f"{small_recipe}:whole-images", "--units", "1:sift@400"]
+    options += ["--pairs-per-scene", 2, "--work-dir", tmp_path / "work"]
+    on_demo(demo, small_recipe, *options)
     assert results(tmp_path / "work").units["unit"].tolist() == ["1:sift@400"] * 2
     page = tmp_path / "work" / "report.html"
     assert page.read_text(encoding="utf-8").count("<img ") == 2
