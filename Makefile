@@ -33,7 +33,7 @@ TORCH ?= $(shell grep '^torch==' requirements-dev.txt)
 
 # In tests/support/genuine.py, too.
 WEIGHTS = $${XDG_CACHE_HOME:-$$HOME/.cache}/mkpc-weights
-GENUINE = $(shell awk '/ wheel:/ && $$2 ~ /^[0-9]+$$/ { print $$1 }' weights_manifest.txt)
+GENUINE = $(shell awk -F'"' '/^\[/ { name = $$2 } /^wheel = / { print name }' weights_manifest.txt)
 
 .PHONY: demo quick test weights ray soak hostile gpu oldest newest install lint tests clean
 

@@ -63,8 +63,6 @@ class Unit:
         True: a view gets exactly the height and width of ``area``.
     enlarge : bool
         False: a crop smaller than the view keeps its size.
-    fallback : str
-        The matcher to use if ``matcher`` is unavailable.
     antialias : bool
         False: shrink views bilinearly, without averaging areas.
     tracks : bool
@@ -89,7 +87,6 @@ class Unit:
     area: str = ""
     stretch: bool = False
     enlarge: bool = True
-    fallback: str = ""
     antialias: bool = True
     tracks: bool = True
 
@@ -116,11 +113,6 @@ class Unit:
         """Name such as ``2:sift@1280`` or ``1:dkm@540x720``, unique in a recipe; "!": stretched."""
         stretched = "!" if self.stretch else ""
         return f"{self.stage}:{self.matcher}@{self.long_side or self.area}{stretched}"
-
-    @property
-    def with_fallback(self) -> "Unit":
-        """The unit with its fallback, if any, as its matcher."""
-        return replace(self, matcher=self.fallback or self.matcher, fallback="")
 
     def view(self, crop: Box, multiple: int, turns: int = 0) -> View:
         """Return this unit's view of a crop, rotated by quarter turns and padded to a multiple."""
@@ -251,9 +243,7 @@ class Recipe:
             raise UserError(f"{where} has no units")
         if self.units[0].stage != 1:
             raise UserError(f"{where}: the first unit sweeps all pairs, so it must have stage 1")
-        # A fallback may take the place of a unit, so it counts, too.
         names = [unit.name for unit in self.units]
-        names += [unit.with_fallback.name for unit in self.units if unit.fallback]
         # The name is the unit's key in journals.
         for name in names:
             if names.count(name) > 1:
@@ -280,14 +270,6 @@ class Recipe:
                     f"recipe {self.name!r} has no unit {name!r}; it has {', '.join(known)}"
                 )
         return replace(self, units=tuple(known[name] for name in names))
-
-    def with_fallbacks(self, unavailable: Container[str]) -> "Recipe":
-        """Return the recipe with fallbacks in place of ``unavailable`` matchers, and no others."""
-        units = []
-        for unit in self.units:
-            is_missing = unit.matcher in unavailable
-            units.append(unit.with_fallback if is_missing else replace(unit, fallback=""))
-        return replace(self, units=tuple(units))
 
     def without(self, matchers: Container[str]) -> "Recipe":
         """Return the recipe without the units of these matchers.

@@ -12,12 +12,10 @@ from hypothesis import HealthCheck, settings
 from kaggle_image import pack_wheel
 from shared import write_small_recipe
 
+from mkpc_kaggle import package
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.demo import DemoSet, write_demo
 from mkpc_kaggle.engine.request import RunReport
-from mkpc_kaggle.package import package
-from mkpc_kaggle.package.package import find_checkout
-from mkpc_kaggle.package.wheels import BUNDLED, build_wheel
 from mkpc_kaggle.weights import store as weight_store
 
 # Before torch is imported, here and in the processes of the tests: their tensors are small, and on
@@ -91,7 +89,7 @@ def undisturbed(pairs: "list[Pair]", tmp_path_factory: pytest.TempPathFactory) -
 def wheels(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The wheels that a package for Kaggle bundles."""
     directory = tmp_path_factory.mktemp("wheels")
-    for name in BUNDLED:
+    for name in package.BUNDLED:
         pack_wheel(name, directory)
     return directory
 
@@ -99,11 +97,11 @@ def wheels(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def built_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Let all packages of a module have one wheel of ours: pip takes seconds to build it."""
-    wheel = build_wheel(find_checkout(), tmp_path_factory.mktemp("own"))
+    built = tmp_path_factory.mktemp("own")
+    package.build_wheel(package.find_checkout(), built)
 
-    def copied(_: Path, directory: Path) -> Path:
-        directory.mkdir(parents=True)
-        return Path(shutil.copy2(wheel, directory))
+    def copied(_: Path, directory: Path) -> None:
+        shutil.copytree(built, directory, dirs_exist_ok=True)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(package, "build_wheel", copied)

@@ -21,7 +21,7 @@ from mkpc_kaggle.recipe import (
     recipe_names,
     split_mode,
 )
-from mkpc_kaggle.setup.availability import options_of
+from mkpc_kaggle.setup.assembly import options_of, slots_of
 from mkpc_kaggle.weights.manifest import manifest
 
 SIFT = 'units = [{ stage = 1, matcher = "sift", long_side = 640 }]\n'
@@ -70,13 +70,11 @@ def test_any_remaining_matchers_of_recipe_auto_begin_with_a_unit_of_stage_1():
 
 
 @pytest.mark.parametrize("name", recipe_names())
-def test_recipes_for_every_user_name_no_weights_for_noncommercial_use_but_with_a_fallback(name):
-    # The README names the licences of the paper's recipes; in others they would be a surprise.
+def test_recipes_with_weights_for_noncommercial_use_are_those_that_the_readme_names(name):
     recipe = load_recipe(name)
-    slots = {file.slot for file in manifest() if "noncommercial" in file.licence}
-    bound = {name for name in recipe.matcher_names if any(map(spec_of(name, "test").uses, slots))}
-    free = {unit.matcher for unit in recipe.units if not unit.fallback}
-    assert bool(bound & free) == name.startswith(("imc2022", "auto"))
+    licences = {file.slot: file.licence for file in manifest()}
+    bound = ["noncommercial" in licences[slot] for slot in slots_of(recipe, recipe.matcher_names)]
+    assert any(bound) == name.startswith(("imc2022", "auto", "best"))
 
 
 @pytest.mark.parametrize("name", recipe_names())
@@ -85,18 +83,6 @@ def test_no_shipped_recipe_changes_the_threshold_as_robust_py_says(name):
     default = RobustConfig()
     assert magsac.threshold == default.threshold
     assert magsac.threshold_side == default.threshold_side
-
-
-def test_fallbacks_replace_unfit_matchers_and_disappear_otherwise():
-    first = Unit(1, "a", 640)
-    second = Unit(1, "b", 640, fallback="c")
-    third = Unit(2, "b", 800, 9, fallback="c")
-    recipe = Recipe((first, second, third))
-    replaced = recipe.with_fallbacks({"b", "a"})
-    assert replaced.units == (first, Unit(1, "c", 640), Unit(2, "c", 800, 9))
-    # A unit's key has no fallback: its results are the same with and without one.
-    kept = recipe.with_fallbacks({"c"})
-    assert kept.units == (first, Unit(1, "b", 640), Unit(2, "b", 800, 9))
 
 
 def test_a_recipe_reads_as_written():
@@ -163,7 +149,6 @@ def unit(**changes):
         (units(unit(stage=2)), "so it must have stage 1"),
         # A unit's name is its name in tables and journals.
         (units(unit(), unit(max_matches=9)), "1:sift@640 twice"),
-        (units(unit(), unit(matcher='"a"', fallback='"sift"')), "1:sift@640 twice"),
         (units(unit(long_side=-9)), r"unit 1: long_side must be in \[0, 99999\]"),
         (units(unit(long_side=None)), "either long_side or area must be given"),
         (units(unit(area='"9x9"')), "and not both"),

@@ -24,7 +24,6 @@ from mkpc_kaggle.matchers.networks.roma import RoMa
 from mkpc_kaggle.matchers.networks.superglue import SuperGlue
 from mkpc_kaggle.matchers.networks.superpoint import SuperPoint
 from mkpc_kaggle.weights import WeightStore
-from mkpc_kaggle.weights.store import FoundFile
 from tests.support.standin import STAND_INS, narrow_roma, standin_state
 
 State = dict[str, Tensor]
@@ -53,10 +52,6 @@ class SeededWeights(WeightStore):
         super().__init__([])
         self.layers = layers
         self.narrow = narrow
-
-    def find(self, slot: str) -> FoundFile | None:
-        """Return ``None``: no slot has a file."""
-        return None
 
     def load(self, slot: str) -> State:
         return dict(_state_of(slot, self.layers, self.narrow))

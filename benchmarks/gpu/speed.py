@@ -69,13 +69,12 @@ class Case:
 
 
 def cases_of(recipes: Sequence[str]) -> list[Case]:
-    """Return the cases of recipes, each once; a fallback is a case, too."""
+    """Return the cases of recipes, each once."""
     cases: dict[Case, None] = {}
     for name in recipes:
         recipe = load_recipe(name)
         for unit in recipe.units:
-            for each in dict.fromkeys((unit, unit.with_fallback)):
-                cases[Case.of(recipe, each)] = None
+            cases[Case.of(recipe, unit)] = None
     return list(cases)
 
 

@@ -21,7 +21,7 @@ COMMANDS = {
     "validate": "a directory with known poses -> mAA and pose AUC of a recipe",
     "score": "submission.csv with known poses -> mAA",
     "recipes": "list recipes; with a name, its units and missing weights",
-    "weights": "list, verify, fetch and convert weight files",
+    "weights": "list, verify and fetch weight files",
     "check": "compare a submission.csv with the competition's format",
     "journal": "how far a run is, from its journal",
     "package": "write the folders to upload to Kaggle: a dataset and a notebook",

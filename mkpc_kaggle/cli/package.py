@@ -5,16 +5,14 @@ from pathlib import Path
 
 from mkpc_kaggle.cli import options
 from mkpc_kaggle.errors import plural
-from mkpc_kaggle.package.metadata import DATASET_METADATA, LATEST
-from mkpc_kaggle.package.package import PackageRequest, make_package
-from mkpc_kaggle.package.wheels import PYTHONS
+from mkpc_kaggle.package import DATASET_METADATA, PYTHONS, make_package
 
 HELP = """\
 Write two folders, each with the metadata for the `kaggle` command:
   DIR/dataset  our wheel, wheels of packages that may be missing on Kaggle, weights with their licences;
   DIR/kernel   the submission notebook.
 
-Run it in a checkout, with internet or with the wheels in a directory (--wheels). A second run keeps valid files.
+Run it in a checkout, with internet or with the wheels in a directory (--wheels).
 Torch checkpoints are converted to safetensors, since Kaggle unpacks uploaded archives.
 Weights whose licences do not allow redistribution are left out, unless --private is given.
 """
@@ -34,42 +32,33 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--wheels", type=Path, metavar="DIR", help="take wheels from DIR, without a network")
     text = "include weights that must not be redistributed; the dataset must then stay private"
     add("--private", action="store_true", help=text)
-    text = "attach ALIKED and LightGlue from Kaggle Models to the notebook: nothing to download or upload"
-    add("--models", action="store_true", help=text)
-    text = """Kaggle's latest image (the default), the image of the kernel's first version, or this image
-        (`kaggle kernels pull NAME/mkpc-submission -m` prints the image of a version as docker_image)"""
-    add("--image", default=LATEST, metavar="latest|original|NAME@sha256:DIGEST", help=text)
 
 
 def run(arguments: argparse.Namespace) -> None:
     out: Path = arguments.out
-    request = PackageRequest(
-        out,
-        arguments.owner,
-        weights=tuple(arguments.weights),
-        pythons=tuple(version.strip() for version in arguments.python.split(",")),
-        wheels=arguments.wheels,
-        private=arguments.private,
-        image=arguments.image,
-        models=arguments.models,
-    )
     # Kaggle creates a dataset once; each later upload is a version of it.
     is_packaged = (out / "dataset" / DATASET_METADATA).is_file()
-    package = make_package(request)
-    for folder, items in (("dataset", package.dataset), ("kernel", package.kernel)):
-        rows = [("file", "bytes", "licence", "")]
-        total = 0
-        for item in items:
-            size = item.source.stat().st_size
-            total += size
-            rows.append((item.name, str(size), item.licence or "-", item.note))
-        rows.append((plural(len(items), "file"), str(total), "", ""))
+    package = make_package(
+        out,
+        arguments.owner,
+        arguments.weights,
+        pythons=[version.strip() for version in arguments.python.split(",")],
+        wheels=arguments.wheels,
+        private=arguments.private,
+    )
+    licences = {file.name: file.licence for file in package.weights}
+    for folder, paths in (("dataset", package.dataset), ("kernel", package.kernel)):
+        rows = [("file", "bytes", "licence")]
+        sizes = [path.stat().st_size for path in paths]
+        for path, size in zip(paths, sizes, strict=True):
+            rows.append((path.name, str(size), licences.get(path.name, "")))
+        rows.append((plural(len(paths), "file"), str(sum(sizes)), ""))
         print(out / folder)
         options.print_table(rows)
         print()
     # Also with --private: then they are in the dataset, and the user must know.
     if package.restricted:
-        names = ", ".join(f"{item.name} ({item.licence})" for item in package.restricted)
+        names = ", ".join(f"{file.name} ({file.licence})" for file in package.restricted)
         print(f"{_PRIVATE if arguments.private else _LEFT_OUT}: {names}\n")
     print((_NEXT_VERSION if is_packaged else _NEXT).format(out=out))
 

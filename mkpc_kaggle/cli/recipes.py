@@ -4,8 +4,7 @@ import argparse
 
 from mkpc_kaggle.cli import options
 from mkpc_kaggle.recipe import Recipe, load_recipe, recipe_names
-from mkpc_kaggle.setup.assembly import recipe_of_name
-from mkpc_kaggle.setup.availability import UnavailableReason, fetch_command, unavailable
+from mkpc_kaggle.setup.assembly import fetch_command, listed, missing_weights, recipe_of_name
 from mkpc_kaggle.weights import WeightStore
 
 HELP = """\
@@ -28,27 +27,28 @@ def run(arguments: argparse.Namespace) -> None:
     store = WeightStore(arguments.weights)
     if arguments.name is not None:
         recipe = recipe_of_name(arguments.name)
-        print("\n".join(unit_lines(recipe, unavailable(recipe, store))))
+        print("\n".join(unit_lines(recipe, store)))
         return
     rows = [("recipe", "runs here", "matchers")]
     for name in recipe_names():
         recipe = load_recipe(name)
-        # The weights are also loaded on the device "meta": files of the right name may not fit.
-        missing = unavailable(recipe, store)
-        present = sum(matcher not in missing for matcher in recipe.matcher_names)
-        count = f"{present} of {len(recipe.matcher_names)}"
-        rows.append((name, count, recipe.description))
+        count = len(recipe.matcher_names)
+        present = count - len(missing_weights(recipe, store))
+        rows.append((name, f"{present} of {count}", recipe.description))
     options.print_table(rows)
     print("\n`mkpc recipes NAME` lists the units and the missing weights of a recipe.")
 
 
-def unit_lines(recipe: Recipe, missing: dict[str, UnavailableReason]) -> list[str]:
-    """Return lines: the description, each unit, and why matchers of the recipe cannot run here."""
+def unit_lines(recipe: Recipe, store: WeightStore) -> list[str]:
+    """Return lines: the description, each unit, and the recipe's missing weights."""
     lines = [f"{recipe.name}: {recipe.description}"]
     for unit in recipe.units:
-        fallback = f", or {unit.fallback} if its weights are missing" if unit.fallback else ""
-        lines.append(f"  {unit.name:<30}at most {unit.max_matches} matches{fallback}")
+        lines.append(f"  {unit.name:<30}at most {unit.max_matches} matches")
+    missing = missing_weights(recipe, store)
     if not missing:
         return [*lines, "all weights are available"]
-    lines.append(f"missing; `{fetch_command(recipe, missing)}` gets the weights:")
-    return [*lines, *(f"  {matcher}: {reason}" for matcher, reason in missing.items())]
+    lines.append(f"no weights; `{fetch_command(recipe, missing)}` gets them:")
+    return [
+        *lines,
+        *(f"  {name}: {listed({name: slots}, store)}" for name, slots in missing.items()),
+    ]

@@ -5,15 +5,11 @@ depends on one picture alone: keypoints and descriptors, or a backbone's feature
 whole images are cached, because many pairs share them. ``match`` computes the rest.
 """
 
-import re
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, fields, is_dataclass
 from enum import StrEnum
 from typing import Any, Generic, Protocol, TypeVar
 
-from mkpc_kaggle.config import from_table
-from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Pixels, Size, View
 from mkpc_kaggle.geometry.matches import Matches
 
@@ -41,8 +37,7 @@ class Precision(StrEnum):
 class Placement:
     """A matcher's device, such as "cpu" or "cuda:0", and precision.
 
-    Softmax, optimal transport, least squares and coordinates are always float32. A matcher on the
-    device "meta" has no numbers: it is loaded there to learn whether its weights fit.
+    Softmax, optimal transport, least squares and coordinates are always float32.
     """
 
     device: str = "cpu"
@@ -87,8 +82,6 @@ class MatcherSpec:
         The sides of pictures are padded to multiples of this.
     slots : tuple of str
         Slots of the manifest of weights; ``{name}`` stands for the value of option ``name``.
-    licences : tuple of str
-        Licence tags of weights outside the manifest.
     version : str
         Of a matcher given in Python: its results are kept for later runs under this text, so
         change it whenever equal pictures get other points. Without it, results are not kept. For a
@@ -109,28 +102,12 @@ class MatcherSpec:
     colour: Colour = Colour.RGB
     multiple: int = 1
     slots: tuple[str, ...] = ()
-    licences: tuple[str, ...] = ()
     version: str = ""
     packages: tuple[str, ...] = ()
 
     def slots_for(self, options: Any) -> tuple[str, ...]:
         """Return the manifest's slots that a matcher with these options needs."""
         return tuple(slot.format_map(vars(options)) for slot in self.slots)
-
-    def uses(self, slot: str) -> bool:
-        """Return whether the matcher uses the slot under any options."""
-        return self.options_for(slot) is not None
-
-    def options_for(self, slot: str) -> Any:
-        """Return options that use the slot, otherwise the defaults; ``None`` if none use it."""
-        for own in self.slots:
-            # A template such as "loftr-{training}" becomes a pattern with the group "training".
-            pattern = re.sub(r"\\{(\w+)\\}", r"(?P<\1>.+)", re.escape(own))
-            if found := re.fullmatch(pattern, slot):
-                # The pattern also fits values that the option does not know.
-                with suppress(UserError):
-                    return from_table(self.options, found.groupdict(), f"slot {slot}")
-        return None
 
 
 @dataclass(frozen=True, eq=False)

@@ -54,44 +54,13 @@ def load_matcher(
     return matcher
 
 
-def misfit(name: str, weights: WeightStore, options: Any) -> str:
-    """Return why the weights cannot be loaded into the matcher's networks, or an empty text.
-
-    This compares names and shapes on the device "meta", which takes no memory. Only a
-    :class:`UserError` speaks against weights.
-    """
-    import torch
-
-    try:
-        with torch.device("meta"):
-            load_matcher(name, weights.on_meta(), options, Placement("meta"))
-    except UserError as error:
-        return str(error)
-    except Exception:
-        # Says nothing of the weights: an adapter that computes while it loads fails on tensors
-        # without numbers. The run loads it on a device with numbers. If it fails there, too, the
-        # run reports that, and continues with the other matchers.
-        return ""
-    return ""
-
-
-def require_matchers(matchers: Mapping[str, Matcher[Any]]) -> Mapping[str, Matcher[Any]]:
-    """Return the user's matchers. Raise ``TypeError`` unless they are a mapping from names."""
-    if not isinstance(matchers, Mapping):
-        raise TypeError(f"matchers are a mapping from names to matchers, not {matchers!r}")
-    for name, matcher in matchers.items():
-        if isinstance(matcher, type):
+def require_matchers(matchers: Mapping[str, Matcher[Any]]) -> None:
+    """Raise ``TypeError`` unless the user's matchers are ready ones by their names."""
+    for name, matcher in dict(matchers).items():
+        has_spec = isinstance(getattr(matcher, "spec", None), MatcherSpec)
+        methods = [getattr(matcher, method, None) for method in ("encode", "match")]
+        if isinstance(matcher, type) or not has_spec or not all(map(callable, methods)):
             raise TypeError(
-                f"matcher {name!r} is a class, {matcher.__name__}; give an instance of it"
+                f"matcher {name!r} is {matcher!r}; expected an instance with `spec`, a MatcherSpec, and the "
+                "methods `encode` and `match`"
             )
-        if not isinstance(getattr(matcher, "spec", None), MatcherSpec):
-            raise TypeError(f"matcher {name!r} has no `spec` that is a MatcherSpec: {matcher!r}")
-    return matchers
-
-
-def require_methods(matchers: Mapping[str, Matcher[Any]]) -> None:
-    """Raise ``TypeError`` if a matcher of the user cannot encode or match."""
-    for name, matcher in matchers.items():
-        for method in ("encode", "match"):
-            if not callable(getattr(matcher, method, None)):
-                raise TypeError(f"matcher {name!r} has no method `{method}`: {matcher!r}")

@@ -14,14 +14,12 @@ from mkpc_kaggle.data.images import ImageStore
 from mkpc_kaggle.geometry.coordinates import Matrix3
 from mkpc_kaggle.geometry.robust import ModelKind
 from mkpc_kaggle.matchers.contract import Matcher
-from mkpc_kaggle.matchers.registry import require_methods
 from mkpc_kaggle.pipeline.arguments import ImageSource, as_image, intrinsics_of
 from mkpc_kaggle.pipeline.pair import PairMatch, with_estimate
 from mkpc_kaggle.pipeline.stages import Pipeline
 from mkpc_kaggle.recipe import Recipe
 from mkpc_kaggle.setup.arguments import Weights
 from mkpc_kaggle.setup.assembly import assemble
-from mkpc_kaggle.setup.availability import Licence
 
 Intrinsics = tuple[Matrix3, Matrix3]
 
@@ -43,8 +41,6 @@ class TwoStageMatcher:
         "auto", or torch's name of a device.
     precision : str
         "float32", "bfloat16" or "float16".
-    licence : str
-        "permissive" refuses weights that forbid some uses.
     matchers : mapping
         Custom matchers, by their names in the recipe's units.
     settings : mapping
@@ -80,7 +76,6 @@ class TwoStageMatcher:
         weights: Weights = (),
         device: str = "auto",
         precision: str = "float32",
-        licence: Licence | str = Licence.ANY,
         matchers: Mapping[str, Matcher[Any]] | None = None,
         settings: Mapping[str, Any] = MappingProxyType({}),
     ) -> None:
@@ -89,7 +84,6 @@ class TwoStageMatcher:
             weights=weights,
             device=device,
             precision=precision,
-            licence=Licence(licence),
             matchers=matchers,
             settings=settings,
         )
@@ -97,7 +91,6 @@ class TwoStageMatcher:
         self._pipeline = self._new_pipeline()
 
     def _new_pipeline(self) -> Pipeline:
-        require_methods(self._assembly.matchers)
         pipeline = Pipeline.of(self._assembly)
         # A fault of the user's own code is the user's to see.
         pipeline.raising = self._assembly.matchers.keys()

@@ -11,7 +11,6 @@ from mkpc_kaggle.engine.store.tables import NOT_RECONSTRUCTED
 from mkpc_kaggle.errors import plural
 from mkpc_kaggle.progress import format_duration
 from mkpc_kaggle.recipe import Recipe
-from mkpc_kaggle.setup.availability import UnavailableKind
 
 if TYPE_CHECKING:
     from pandas import DataFrame, Series
@@ -218,17 +217,14 @@ def unreadable_images(pairs: "DataFrame") -> list[str]:
 def left_out_line(recipe: Recipe, left_out: Sequence[str]) -> str:
     """Return a line on the matchers of the recipe that do not run; empty if all run.
 
-    ``left_out`` has a text for each cause.
+    ``left_out`` has the matchers without weights.
     """
-    parts = []
-    for cause in left_out:
-        is_missing = cause.startswith(UnavailableKind.NO_WEIGHTS)
-        # Missing weights are the normal case at first: one way to get some, and not a list of all.
-        if is_missing and set(recipe.matcher_names) == {"sift"}:
-            parts.append(
-                "RootSIFT only; `mkpc weights fetch light --out weights`, and then the option "
-                "`--weights weights`, adds learned matchers"
-            )
-        else:
-            parts.append(f"left out, {cause}")
-    return "; ".join(parts)
+    if not left_out:
+        return ""
+    # The normal case at first: one way to get some, and not a list of all.
+    if set(recipe.matcher_names) == {"sift"}:
+        return (
+            "RootSIFT only; `mkpc weights fetch light --out weights`, and then the option "
+            "`--weights weights`, adds learned matchers"
+        )
+    return f"left out, no weights: {', '.join(left_out)}"

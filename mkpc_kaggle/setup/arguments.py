@@ -12,18 +12,6 @@ Weights: TypeAlias = PathSource | Iterable[PathSource] | Mapping[str, PathSource
 MAX_SHOWN = 60  # characters of a value in a message
 
 
-def device_of(device: Any) -> str:
-    """Return a device as text; ``torch.device`` is accepted."""
-    torch = sys.modules.get("torch")
-    return str(device) if torch is not None and isinstance(device, torch.device) else device
-
-
-def precision_of(precision: Any) -> str:
-    """Return a precision as text; ``torch.dtype`` is accepted."""
-    torch = sys.modules.get("torch")
-    if torch is not None and isinstance(precision, torch.dtype):
-        return str(precision).removeprefix("torch.")
-    return str(precision)
 
 
 def weights_of(weights: Any) -> tuple[list[Path], dict[str, Path]]:

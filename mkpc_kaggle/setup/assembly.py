@@ -1,47 +1,30 @@
-"""Assembly of a run's parts: recipe, weights, device, matchers."""
+"""Assembly of a run's parts: recipe, weights, device, matchers.
+
+A matcher is available if its weights are found. Recipe ``auto`` drops the units of other matchers; every
+other recipe is refused, with the command that fetches the weights.
+"""
 
 from collections.abc import Container, Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from importlib import metadata
 from os import PathLike, fspath
-from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 from uuid import uuid4
 
 import cv2
 
+from mkpc_kaggle.config import from_table
 from mkpc_kaggle.data.masks import Masks
 from mkpc_kaggle.errors import UserError, warn_once
 from mkpc_kaggle.geometry.intrinsics import Rows
-from mkpc_kaggle.matchers.contract import Matcher, MatcherSpec, Placement, Precision
-from mkpc_kaggle.matchers.registry import (
-    MATCHERS,
-    load_matcher,
-    require_matchers,
-    spec_of,
-)
-from mkpc_kaggle.recipe import Mode, Recipe, Unit, load_recipe, with_settings
-from mkpc_kaggle.setup.arguments import (
-    Weights,
-    device_of,
-    precision_of,
-    shown_value,
-    weights_of,
-)
-from mkpc_kaggle.setup.availability import (
-    FAULTS,
-    Licence,
-    UnavailableReason,
-    left_out,
-    options_of,
-    refusal,
-    slots_of,
-    unavailable,
-)
-from mkpc_kaggle.setup.devices import AUTO, gpus_of, resolve_placement
-from mkpc_kaggle.weights import FileState, FoundFile, WeightStore
+from mkpc_kaggle.matchers.contract import Matcher, Placement, Precision
+from mkpc_kaggle.matchers.devices import AUTO, gpus_of, resolve_placement
+from mkpc_kaggle.matchers.registry import MATCHERS, load_matcher, require_matchers, spec_of
+from mkpc_kaggle.recipe import Mode, Recipe, Unit, load_recipe, recipe_names, with_settings
+from mkpc_kaggle.setup.arguments import Weights, shown_value, weights_of
+from mkpc_kaggle.weights import FoundFile, WeightStore
 
 DEFAULT_SIDE_PX = 1024  # of a single matcher that no recipe has
 CUDA_MINIBATCH = 8  # pairs at a time; on a CPU, more than one gains nothing and takes memory
@@ -54,8 +37,7 @@ class Assembly:
     recipe: Recipe
     weights: WeightStore
     placement: Placement
-    # The recipe's unavailable matchers, grouped by cause, for messages.
-    left_out: tuple[str, ...] = ()
+    left_out: tuple[str, ...] = ()  # the recipe's matchers without weights
     matchers: Mapping[str, Matcher[Any]] = field(default_factory=dict)  # the user's ready matchers
     device: str = AUTO  # as named by the user
     sharing: int = 1  # workers on the placement's device
@@ -91,12 +73,11 @@ class Assembly:
         """
         name = unit.matcher
         fields = asdict(unit)
-        # The matcher is settled, and scenes read the points without changing them.
-        del fields["fallback"], fields["tracks"]
+        del fields["tracks"]  # scenes read the points without changing them
         weights = {}
         for slot in slots_of(self.recipe, {name} - self.matchers.keys()):
             if slot in self.weight_files:
-                weights[slot] = self.weight_files[slot].digest
+                weights[slot] = f"sha256:{self.weight_files[slot].sha256}"
         # Nothing is known of the options of a user's matcher.
         is_own = name in self.matchers
         settings: dict[str, Any] = {
@@ -106,7 +87,7 @@ class Assembly:
             "weights": weights,
         }
         # The weights of a matcher of this package have digests, and its code has ``keys.POINTS_VERSION``.
-        spec = self._spec_of(name)
+        spec = self.matchers[name].spec if is_own else spec_of(name, f"matcher {name}")
         if is_own:
             settings["version"] = spec.version or self.nonce
         if spec.packages:
@@ -115,19 +96,11 @@ class Assembly:
             }
         return settings
 
-    def _spec_of(self, name: str) -> MatcherSpec:
-        given = self.matchers.get(name)
-        return given.spec if given is not None else spec_of(name, f"matcher {name}")
-
     @property
     def unversioned(self) -> list[str]:
         """The recipe's matchers whose results are not kept for later runs."""
         own = [name for name in self.recipe.matcher_names if name in self.matchers]
         return [name for name in own if not self.matchers[name].spec.version]
-
-    @property
-    def weight_paths(self) -> tuple[Path, ...]:
-        return tuple(file.path for file in self.weight_files.values())
 
     @cached_property
     def weight_files(self) -> dict[str, FoundFile]:
@@ -140,12 +113,20 @@ class Assembly:
         return files
 
     def load(self, name: str, placement: Placement | None = None) -> Matcher[Any]:
-        """Load a matcher, on the assembly's placement by default."""
+        """Load a matcher, on the assembly's placement by default.
+
+        Raises :class:`UserError` that names the weight files if one does not fit its network.
+        """
         # The user's matcher has its own precision, and is not loaded twice.
-        given = self.matchers.get(name)
-        return given or load_matcher(
-            name, self.weights, options_of(self.recipe, name), placement or self.placement
-        )
+        if name in self.matchers:
+            return self.matchers[name]
+        options = options_of(self.recipe, name)
+        try:
+            return load_matcher(name, self.weights, options, placement or self.placement)
+        except UserError as error:
+            slots = slots_of(self.recipe, [name])
+            paths = [str(self.weight_files[slot].path) for slot in slots]
+            raise UserError(f"{error} ({', '.join(paths)})") from error
 
 
 def assemble(
@@ -156,38 +137,88 @@ def assemble(
     precision: str = Precision.FLOAT32,
     mode: Mode = Mode.TWO_STAGE,
     scenes: bool | None = None,
-    licence: Licence = Licence.ANY,
     matchers: Mapping[str, Matcher[Any]] | None = None,
     settings: Mapping[str, Any] = MappingProxyType({}),
 ) -> Assembly:
-    """Check recipe, options, licences, weights, device and precision; return the assembly.
+    """Check recipe, options, weights, device and precision; return the assembly.
 
     ``recipe`` may be the name of a single matcher. ``weights`` are directories, or files by slot.
-    A fallback replaces an unavailable matcher. Without one, recipe ``auto`` drops its units, and so
-    does every recipe if the matcher cannot be loaded. ``scenes`` switches the reconstruction of
-    batches on or off; ``None`` follows the recipe. ``settings`` replace the recipe's, see
+    ``device`` and ``precision`` may be torch's. ``scenes`` switches the reconstruction of batches
+    on or off; ``None`` follows the recipe. ``settings`` replace the recipe's, see
     :func:`mkpc_kaggle.recipe.with_settings`. Raises :class:`UserError`, also if weights of a
-    recipe other than ``auto`` are missing or not permitted, and if no unit of stage 1 remains.
+    recipe other than ``auto`` are missing.
     """
-    own = require_matchers({} if matchers is None else matchers)
+    own = {} if matchers is None else matchers
+    require_matchers(own)
     directories, files = weights_of(weights)
     store = WeightStore(directories, chosen=files)
-    written = recipe_of_name(recipe, own)
+    chosen = recipe_of_name(recipe, own)
     if not isinstance(settings, Mapping):
         raise TypeError(f"settings is {shown_value(settings)}; expected a mapping from dotted keys")
     if settings:
-        written = with_settings(written, settings)
-    reasons = unavailable(written, store, licence, own)
-    chosen = _without_unavailable(written, reasons, is_auto=recipe == AUTO)
-    for name in sorted(chosen.matchers.keys() - own.keys() - reasons.keys()):
+        chosen = with_settings(chosen, settings)
+    missing = missing_weights(chosen, store, own)
+    if missing and recipe != AUTO:
+        raise UserError(
+            f"recipe {chosen.name!r} needs weights that were not found: {listed(missing, store)}. Name their "
+            f"directory with --weights, get them with `{fetch_command(chosen, missing)}`, or use --recipe auto."
+        )
+    chosen = chosen.without(missing)
+    for name in sorted(chosen.matchers.keys() - own.keys()):
         options_of(chosen, name)  # check the options of unused matchers too
-    omitted = {name: reasons[name] for name in written.matcher_names if name in reasons}
-    texts = left_out(written, omitted, is_auto=recipe == AUTO)
     chosen = chosen.with_scenes(scenes).in_mode(mode)
-    placement = resolve_placement(device_of(device), precision_of(precision))
-    made = Assembly(chosen, store, placement, texts, own, device_of(device))
+    placement = resolve_placement(str(device), str(precision).removeprefix("torch."))
+    made = Assembly(chosen, store, placement, tuple(missing), own, str(device))
     _warn_of_unverified(made.weight_files.values())
     return made
+
+
+def missing_weights(
+    recipe: Recipe, store: WeightStore, own: Container[str] = ()
+) -> dict[str, list[str]]:
+    """Return the slots without a file, by matcher, of the matchers that have any.
+
+    ``own`` has the names of the user's matchers, which have their weights. Raises
+    :class:`UserError` for an unknown matcher or option.
+    """
+    missing = {}
+    for name in recipe.matcher_names:
+        slots = [] if name in own else slots_of(recipe, [name])
+        if without := [slot for slot in slots if store.file_of(slot) is None]:
+            missing[name] = without
+    return missing
+
+
+def listed(missing: Mapping[str, Iterable[str]], store: WeightStore) -> str:
+    """Return the missing slots with the names of their files."""
+    files = {}
+    for slots in missing.values():
+        for slot in slots:
+            files[slot] = " or ".join(file.name for file in store.alternatives(slot))
+    return "; ".join(f"{slot}: {names}" for slot, names in files.items())
+
+
+def fetch_command(recipe: Recipe, missing: Mapping[str, Iterable[str]]) -> str:
+    """Return the command that gets a recipe's missing weights."""
+    # ``weights fetch`` knows the names of the package's recipes only.
+    slots = dict.fromkeys(slot for names in missing.values() for slot in names)
+    what = recipe.name if recipe.name in recipe_names() else " ".join(slots)
+    return f"mkpc weights fetch {what} --out DIR"
+
+
+def options_of(recipe: Recipe, name: str) -> Any:
+    """Return the matcher's options: defaults, overridden by the recipe's ``[matchers.NAME]``."""
+    where = f"recipe {recipe.name!r}"
+    table = recipe.matchers.get(name, {})
+    return from_table(spec_of(name, where).options, table, f"{where}, table [matchers.{name}]")
+
+
+def slots_of(recipe: Recipe, names: Iterable[str]) -> tuple[str, ...]:
+    """Return the distinct slots of a recipe's named matchers."""
+    slots: list[str] = []
+    for name in names:
+        slots += spec_of(name, f"recipe {recipe.name!r}").slots_for(options_of(recipe, name))
+    return tuple(dict.fromkeys(slots))
 
 
 def recipe_of_name(recipe: Recipe | str | PathLike[str], own: Container[str] = ()) -> Recipe:
@@ -229,33 +260,6 @@ def recipe_of_matcher(name: str) -> Recipe:
     )
 
 
-def _without_unavailable(
-    written: Recipe, reasons: Mapping[str, UnavailableReason], *, is_auto: bool
-) -> Recipe:
-    """Return the recipe with fallbacks, without the units of unavailable matchers.
-
-    Raises :class:`UserError` if that would not be the recipe that the user asked for, or if no unit
-    of stage 1 remains.
-    """
-    chosen = written.with_fallbacks(reasons)
-    missing = {name: reasons[name] for name in chosen.matcher_names if name in reasons}
-    faulty = {name for name, reason in reasons.items() if reason.kind in FAULTS}
-    # A run runs without a faulty matcher. Missing weights, and a licence that is not permitted, are
-    # the user's to settle, except for ``auto``, which takes the available weights.
-    refused = {}
-    for asked, unit in zip(written.units, chosen.units, strict=True):
-        if unit.matcher in reasons and not faulty & {asked.matcher, unit.matcher}:
-            refused[unit.matcher] = reasons[unit.matcher]
-    if refused and not is_auto:
-        raise refusal(chosen, refused)
-    if not any(unit.stage == 1 and unit.matcher not in missing for unit in chosen.units):
-        raise refusal(chosen, missing)
-    for name in dict.fromkeys((*written.matcher_names, *chosen.matcher_names)):
-        if name in faulty:
-            warn_once(f"recipe {written.name} runs without {name}: {reasons[name]}")
-    return chosen.without(missing)
-
-
 def _version_of_package(name: str) -> str:
     # OpenCV has several distributions.
     if name == "opencv":
@@ -268,7 +272,7 @@ def _version_of_package(name: str) -> str:
 
 def _warn_of_unverified(files: Iterable[FoundFile]) -> None:
     """Warn of weights without a digest, if there are any."""
-    names = sorted(file.path.name for file in files if file.state is FileState.UNVERIFIED)
+    names = sorted(file.path.name for file in files if not file.is_verified)
     if names:
         listed = ", ".join(names)
         warn_once(f"weights not verified: {listed}; `mkpc weights verify` says why")

@@ -66,7 +66,7 @@ def test_other_weights_change_the_points_of_their_units_and_of_stage_2(monkeypat
     def digests(**other: str) -> tuple[str, ...]:
         names = ("xfeat", "xfeat-lighterglue", "aliked-n16", "aliked-lightglue")
         slots = dict.fromkeys(names, "same") | other
-        files = {name: SimpleNamespace(digest=digest) for name, digest in slots.items()}
+        files = {name: SimpleNamespace(sha256=digest) for name, digest in slots.items()}
         monkeypatch.setattr(Assembly, "weight_files", files)
         keys = Keys.of(made)
         pair = Pair("p", "b", "0.png", "1.png")

@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -103,8 +104,9 @@ def test_a_machine_that_lacks_the_weights_or_the_test_set_is_named_when_the_run_
     lacking = [Pair("a", "a", str(missing / "a.png"), str(missing / "b.png"))]
     told = rf"lacks {missing}: test set and weights must have the same paths"
     workers = f"ray://{cluster.address}"
-    for asked, weights in ((lacking, ()), (pairs, (missing,))):
-        monkeypatch.setattr(Assembly, "weight_paths", weights)
+    for asked, paths in ((lacking, ()), (pairs, (missing,))):
+        files = {str(path): SimpleNamespace(path=path) for path in paths}
+        monkeypatch.setattr(Assembly, "weight_files", files)
         work_dir = tmp_path / asked[0].id
         with pytest.raises(UserError, match=told):
             run(asked, THREE_UNITS, RectifiedMatcher(), work_dir, workers=workers)

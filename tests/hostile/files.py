@@ -20,7 +20,7 @@ from room import (
     resumed,
     written,
 )
-from weight_bombs import AUTO, CONVERT, NAME, SEARCH
+from weight_bombs import AUTO, NAME, SEARCH
 
 INSTEAD = {  # of a file
     "a directory": Path.mkdir,
@@ -37,7 +37,6 @@ READ = {  # by its path: the command that reads it, and its allowed statuses
     "quick.toml": (SUBMIT, REFUSED),
     "I/0.png": (RECONSTRUCT, EITHER),
     "pairs.txt": (f"{RECONSTRUCT} --pairs pairs.txt", REFUSED),
-    "a.pt": (CONVERT, REFUSED),
     f"weights/deep/{NAME}": (AUTO, (0,)),
     "weights/deep/weights_manifest.txt": (f"weights verify {SEARCH}", (0,)),
     "truth.csv": ("score sub.csv --train-dir T --truth truth.csv", REFUSED),
@@ -86,12 +85,6 @@ def tables_of(name: str, texts: dict[str, bytes | str]) -> dict[str, Callable[[P
     return {what: written(name, text) for what, text in texts.items()}
 
 
-def unpacked(path: Path) -> None:
-    (path / "data").mkdir(parents=True)
-    (path / "data.pkl").write_bytes(b"\x80\x02}.")
-    os.mkfifo(path / "data" / "0")
-
-
 def halve(room: Path) -> None:
     path = room / "out/s.work/journal.sqlite"
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
@@ -106,7 +99,6 @@ CASES = [
     *makes("journals", SUBMIT, {"its first half, resumed": resumed(halve)}),
     *makes("journals", f"{SUBMIT} --fresh", {"its first half, forgotten": resumed(halve)}, (0,)),
     *makes("journals", "journal out/s.work --csv out/t", {"its first half, read": resumed(halve)}),
-    *makes("files", CONVERT, {"a.pt is a directory of a pipe": replaced("a.pt", unpacked)}),
     *makes("files", SUBMIT, {name: replaced(X, make) for name, make in IMAGES.items()}, (0,)),
     *makes("tables", SUBMIT, tables_of("D/test.csv", TABLES)),
     *makes("tables", SUBMIT, tables_of("D/test.csv", GOOD_TABLES), (0,)),

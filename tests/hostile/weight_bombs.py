@@ -3,14 +3,25 @@
 import io
 import zipfile
 from collections.abc import Iterator
+from pathlib import Path
 
-from attack import REFUSED, Case
-from room import SUBMIT, written
+from attack import Case
+from room import SUBMIT, UNIT, written
 
-CONVERT = "weights convert a.pt --out out/a.safetensors"
 NAME = "xfeat_sparse_bnfolded.safetensors"
 SEARCH = "--weights weights"
 AUTO = SUBMIT.replace("quick.toml", "auto:stage-1") + f" {SEARCH}"
+# No digest is known of this file, so a run loads it.
+QUADTREE = "weights/quadtree_outdoor.ckpt"
+SAFE = "weights/quadtree.safetensors"
+MANIFEST = written(
+    "weights/weights_manifest.txt",
+    '["quadtree.safetensors"]\nslot = "quadtree-outdoor"\nlicence = "MIT"\n',
+)
+RECIPE = written(
+    "quick.toml", f"units = [{UNIT.format(1)}, {UNIT.format(1).replace('sift', 'quadtree')}]"
+)
+RUN = f"{SUBMIT} {SEARCH}"
 LENGTH = (6 * 10**9).to_bytes(8, "little")
 # A pickle is a program: some bytes of it ask for gigabytes, or for a depth that ends the process.
 PICKLES = {
@@ -41,15 +52,22 @@ def archive(data: bytes) -> bytes:
     return whole.getvalue()
 
 
+def loaded(name: str, file: str, data: bytes) -> Case:
+    """The matcher of the file is left out, and the run goes on."""
+
+    def make(room: Path) -> None:
+        for part in (RECIPE, MANIFEST, written(file, data)):
+            part(room)
+
+    return Case("weights", name, RUN, make, says=f"{file} cannot be read as a checkpoint")
+
+
 def cases() -> Iterator[Case]:
     for name, data in PICKLES.items():
-        yield Case("weights", name, CONVERT, written("a.pt", archive(data)), REFUSED)
-        yield Case("weights", f"{name}, old format", CONVERT, written("a.pt", data), REFUSED)
+        yield loaded(name, QUADTREE, archive(data))
+        yield loaded(f"{name}, old format", QUADTREE, data)
     for name, data in SAFETENSORS.items():
-        convert = CONVERT.replace("a.pt", "a.safetensors")
-        yield Case(
-            "weights", f"safetensors: {name}", convert, written("a.safetensors", data), REFUSED
-        )
+        yield loaded(f"safetensors: {name}", SAFE, data)
     bomb = written(f"weights/deep/{NAME}", archive(PICKLES["a bytearray of 6 GB"]))
     yield Case("weights", f"{NAME} is a bomb", AUTO, bomb, says=NAME)
     for name, make in {

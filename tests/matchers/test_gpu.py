@@ -14,19 +14,17 @@ from mkpc_kaggle.engine.workers.places import LocalSite, Work
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import MatcherSpec, NonFiniteError, Precision
+from mkpc_kaggle.matchers.devices import (
+    fastest_precision,
+    require_device,
+    resolve_placement,
+)
 from mkpc_kaggle.matchers.dtypes import check_finite, exact_float32
 from mkpc_kaggle.matchers.failures import DeviceError
 from mkpc_kaggle.pipeline.pair import PairMatch
 from mkpc_kaggle.pipeline.stages import Pipeline
 from mkpc_kaggle.recipe import Recipe, Unit
-from mkpc_kaggle.setup import devices
 from mkpc_kaggle.setup.assembly import assemble
-from mkpc_kaggle.setup.devices import (
-    fastest_precision,
-    gpu_capabilities,
-    require_device,
-    resolve_placement,
-)
 
 UNIT = Unit(1, "own", 64)
 RECIPE = Recipe((UNIT,))
@@ -35,7 +33,7 @@ RECIPE = Recipe((UNIT,))
 def gpus_here(monkeypatch: pytest.MonkeyPatch, *capabilities: tuple[int, int]) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: len(capabilities))
-    monkeypatch.setattr(devices, "gpu_capabilities", lambda: list(capabilities))
+    monkeypatch.setattr(torch.cuda, "get_device_capability", capabilities.__getitem__)
 
 
 def test_a_missing_gpu_is_refused_and_half_precision_asks_every_gpu_that_the_run_uses(monkeypatch):
@@ -55,31 +53,10 @@ def test_the_parent_of_workers_never_initialises_cuda(monkeypatch):
     # A process that has initialised CUDA holds memory on the GPU, and its forks cannot use it.
     monkeypatch.setattr(torch.cuda, "_lazy_init", refuse)
     gpus_here(monkeypatch, (7, 5), (7, 5))
-    made = assemble("classical", device="cuda", precision="auto")
-    assert str(made.placement) == "device cuda in float16"
+    made = assemble("classical", device="cuda")
     site = LocalSite(made, None, time.monotonic)
     site.open()
     assert [place.name for place in site.of(Work.MATCH)] == ["cuda:0", "cuda:1"]
-
-
-def test_gpus_that_cannot_compute_leave_the_work_to_the_cpu(monkeypatch):
-    gpu_capabilities.cache_clear()
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    # The error of torch on a GPU that its build does not support.
-    monkeypatch.setattr(devices, "ASK_CAPABILITIES", "raise SystemExit('no kernel image')")
-    told = (
-        r"the CPU does the work: .*\(no kernel image\); on Kaggle choose the accelerator GPU T4 x2"
-    )
-    with pytest.warns(UserWarning, match=told):
-        assert str(assemble("classical").placement) == "device cpu in float32"
-
-
-def test_a_probe_of_the_gpus_that_hangs_is_ended(monkeypatch):
-    monkeypatch.setattr(devices, "ASK_CAPABILITIES", "import time; time.sleep(600)")
-    monkeypatch.setattr(devices, "PROBE_TIMEOUT_S", 0.1)
-    gpu_capabilities.cache_clear()
-    with pytest.raises(UserError, match="no answer for 0 s"):
-        gpu_capabilities()
 
 
 def test_a_device_that_multiplies_and_cannot_convolve_is_refused(monkeypatch):

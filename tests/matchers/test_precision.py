@@ -13,7 +13,7 @@ from light_matchers import MATCHERS, SHIFT, picture
 from pictures import agreement
 
 from mkpc_kaggle.matchers.contract import Placement, Precision
-from mkpc_kaggle.setup.devices import fastest_precision, resolve_placement
+from mkpc_kaggle.matchers.devices import fastest_precision, resolve_placement
 
 NAMES = ["superglue", "loftr", "quadtree", "aspanformer", "roma", "loma", "xfeat_lighterglue"]
 

@@ -16,7 +16,10 @@ import torch
 from golden import GOLDEN, needs_golden
 from torch import Tensor, nn
 
-from mkpc_kaggle.matchers.registry import misfit, spec_of
+from mkpc_kaggle.config import from_table
+from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.matchers.contract import Placement
+from mkpc_kaggle.matchers.registry import load_matcher, spec_of
 
 Shapes = Mapping[str, tuple[int, ...]]
 
@@ -27,9 +30,6 @@ class Published:
     def __init__(self, tables: Mapping[str, Shapes]) -> None:
         self.tables = tables
 
-    def on_meta(self) -> "Published":
-        return self
-
     def load(self, slot: str) -> dict[str, Tensor]:
         shapes = self.tables[slot]
         return {name: torch.empty(shape, device="meta") for name, shape in shapes.items()}
@@ -37,8 +37,22 @@ class Published:
 
 def problem_of(matcher: str, tables: Mapping[str, Shapes]) -> str:
     """Return why these checkpoints do not fit, with options that ask for the last slot."""
-    options = spec_of(matcher, "test").options_for(list(tables)[-1])
-    return misfit(matcher, Published(tables), options)
+    spec = spec_of(matcher, "test")
+    # "loftr-outdoor" of "loftr-{training}" has the training "outdoor".
+    slot = list(tables)[-1]
+    table = {}
+    for own in spec.slots:
+        beginning, _, option = own.partition("{")
+        if option and slot.startswith(beginning) and slot not in spec.slots:
+            table[option[:-1]] = slot.removeprefix(beginning)
+    options = from_table(spec.options, table, "test")
+    try:
+        # Names and shapes alone, without memory.
+        with torch.device("meta"):
+            load_matcher(matcher, Published(tables), options, Placement("meta"))
+    except UserError as error:
+        return str(error)
+    return ""
 
 
 def golden_shapes(*path: str) -> dict[str, tuple[int, ...]]:

@@ -12,9 +12,7 @@ from offline_notebook import execute, needs_namespaces, pictures, printed
 from packaging.requirements import Requirement
 from shared import DATA, WEIGHTS, problems_of
 
-from mkpc_kaggle.package.metadata import COMPETITION
-from mkpc_kaggle.package.package import PackageRequest, make_package
-from mkpc_kaggle.package.wheels import PYTHONS
+from mkpc_kaggle.package import COMPETITION, PYTHONS, make_package
 
 NOTEBOOKS = sorted((Path(__file__).resolve().parents[2] / "notebooks").glob("*.ipynb"))
 
@@ -50,9 +48,8 @@ class Kaggle:
         (self.test_dir / "test_images").symlink_to(test_dir / "test_images")
 
     def add_dataset(self, packaged: Path, weights: tuple[Path, ...] = ()) -> None:
-        make_package(
-            PackageRequest(packaged, "someone", weights, (python_version(),), self._wheels)
-        )
+        pythons = [python_version()]
+        make_package(packaged, "someone", weights, pythons=pythons, wheels=self._wheels)
         upload(packaged / "dataset", self.dataset)
         self.notebook = packaged / "kernel" / "submission.ipynb"
 
@@ -193,7 +190,7 @@ def test_if_no_wheel_fits_the_notebook_shows_pips_message_and_the_advice(kaggle,
     with pytest.raises(AssertionError, match="ERROR: ") as stopped:
         kaggle.run()
     python = python_version()
-    told = f"no wheel of pycolmap is for Python {python}: package again with --python {python}"
+    told = f"If a wheel for Python {python} is missing, package again with --python {python}"
     assert told in str(stopped.value)
 
 

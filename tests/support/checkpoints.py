@@ -109,10 +109,8 @@ def write_checkpoints(
     for file in files:
         path = directory / file.name
         torch.save(file.layout(standin_state(file.network(), STAND_INS[file.standin])), path)
-        digest = f"sha256:{hashlib.sha256(path.read_bytes()).hexdigest()}"
-        lines.append(
-            WeightFile(file.name, path.stat().st_size, digest, "none", file.slot, "made by tests")
-        )
+        digest = hashlib.sha256(path.read_bytes()).hexdigest()
+        lines.append(WeightFile(file.slot, "none", sha256=digest, name=file.name))
     return tuple(lines)
 
 

@@ -5,7 +5,6 @@ from pathlib import Path
 
 from mkpc_kaggle.weights import WeightFile, WeightStore
 from mkpc_kaggle.weights.manifest import manifest
-from mkpc_kaggle.weights.wheel import wheel_member
 
 CACHE = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
 GENUINE = CACHE / "mkpc-weights"
@@ -13,7 +12,7 @@ GENUINE = CACHE / "mkpc-weights"
 
 def genuine_files() -> list[WeightFile]:
     """Return the manifest's lines of files that an index of packages has, too."""
-    return [file for file in manifest() if wheel_member(file.source)]
+    return [file for file in manifest() if file.wheel]
 
 
 def why_not_there() -> str:

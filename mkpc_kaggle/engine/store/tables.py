@@ -219,7 +219,7 @@ class About:
     recipe: dict[str, Any] = field(default_factory=dict)
     device: str = ""
     limit: float | None = None  # in seconds; None: no limit
-    left_out: Sequence[str] = ()  # matchers that did not run, by cause
+    left_out: Sequence[str] = ()  # matchers without weights
     # Of the package and its main dependencies
     versions: dict[str, str] = field(default_factory=dict)
     # The images of each dataset of a folder, by batch, also those in no pair

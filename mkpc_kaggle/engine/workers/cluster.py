@@ -69,7 +69,8 @@ class RaySite(Site):
         self._has_joined = False
         self._assembly = assembly
         self._cluster = cluster
-        self._needed = (*assembly.weight_paths, *folders)
+        weights = [file.path for file in assembly.weight_files.values()]
+        self._needed = (*weights, *folders)
         self._workers: list[RayWorker] = []
 
     def open(self) -> None:
