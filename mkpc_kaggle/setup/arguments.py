@@ -1,7 +1,6 @@
 """Arguments of the Python API that an assembly takes: weights, device, precision."""
 
 import os
-import sys
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -10,8 +9,6 @@ PathSource: TypeAlias = str | os.PathLike[str]
 Weights: TypeAlias = PathSource | Iterable[PathSource] | Mapping[str, PathSource]
 
 MAX_SHOWN = 60  # characters of a value in a message
-
-
 
 
 def weights_of(weights: Any) -> tuple[list[Path], dict[str, Path]]:
