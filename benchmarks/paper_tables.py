@@ -44,8 +44,8 @@ from mkpc_kaggle.geometry.metrics import (
 )
 from mkpc_kaggle.geometry.robust import calibrate
 from mkpc_kaggle.geometry.two_view import cross_matrix
+from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.recipe import Recipe, Unit, load_recipe
-from mkpc_kaggle.setup.assembly import assemble
 
 FEWEST = 5  # matches that OpenCV needs for an E
 FARTHEST = 1e9  # of points in front of both cameras

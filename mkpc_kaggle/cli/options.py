@@ -14,9 +14,9 @@ from mkpc_kaggle.engine.plan.budget import Budget, monotonic_of, parse_duration
 from mkpc_kaggle.engine.session import Interrupt, Session
 from mkpc_kaggle.engine.workers.cluster import parse_workers
 from mkpc_kaggle.errors import UserError, writing
+from mkpc_kaggle.pipeline.assembly import Assembly, assemble
 from mkpc_kaggle.recipe import parse_setting, split_mode
 from mkpc_kaggle.reporting.summary import left_out_line
-from mkpc_kaggle.setup.assembly import Assembly, assemble
 
 RECIPE = """a recipe, or one matcher such as aliked_lightglue (default: auto, every matcher with its weights).
     MODE stage-1 runs its units of stage 1 alone, whole-images all its units without crops"""

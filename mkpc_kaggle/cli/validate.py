@@ -21,8 +21,8 @@ from mkpc_kaggle.evaluation.validate import (
     to_json,
     validate,
 )
+from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.reporting.summary import left_out_line, summary, trouble
-from mkpc_kaggle.setup.assembly import Assembly
 
 HELP = """\
 Run a recipe on a train side with the engine that makes submissions, and score it as the competition

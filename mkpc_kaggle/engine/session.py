@@ -32,8 +32,8 @@ from mkpc_kaggle.engine.workers.cluster import RaySite
 from mkpc_kaggle.engine.workers.places import LISTEN_S, LocalSite
 from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
+from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.recipe import PINHOLES, Recipe
-from mkpc_kaggle.setup.assembly import Assembly
 from mkpc_kaggle.version import __version__
 
 WORKERS_LOG = "workers.log"  # in the work directory, for the output of native libraries

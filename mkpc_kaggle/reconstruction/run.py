@@ -19,6 +19,7 @@ from mkpc_kaggle.engine.scenes import scene_failures
 from mkpc_kaggle.engine.session import Interrupt, Session, interruptible, opened_engine, request_of
 from mkpc_kaggle.errors import UserError, plural, temporary_directory
 from mkpc_kaggle.matchers.contract import Matcher
+from mkpc_kaggle.pipeline.assembly import Assembly, PathSource, Weights, assemble
 from mkpc_kaggle.recipe import CameraSharing, Recipe, SceneConfig
 from mkpc_kaggle.reconstruction.folder import Ends, read_folder, read_intrinsics, read_pair_list
 from mkpc_kaggle.reconstruction.outputs import (
@@ -32,8 +33,6 @@ from mkpc_kaggle.reconstruction.outputs import (
 )
 from mkpc_kaggle.reconstruction.pairs import choose_pairs
 from mkpc_kaggle.scene.models import SfmModel
-from mkpc_kaggle.setup.arguments import PathSource, Weights
-from mkpc_kaggle.setup.assembly import Assembly, assemble
 
 AUTO_RECIPE = "auto"  # the recipe of all matchers whose weights are found
 # Of MAGSAC on a pair, whose F is for the report alone. Pairs that do not overlap run all iterations.

@@ -23,10 +23,10 @@ from mkpc_kaggle.engine.store.dataframes import results
 from mkpc_kaggle.engine.store.published import Published
 from mkpc_kaggle.engine.store.tables import Rival
 from mkpc_kaggle.engine.workers.worker import compute_scene
+from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.recipe import Recipe, SceneConfig, Unit
 from mkpc_kaggle.scene.candidates import ALL_UNITS, SUPPORTED
 from mkpc_kaggle.scene.sfm import Solution
-from mkpc_kaggle.setup.assembly import assemble
 
 FIRST, _, LAST = (unit.name for unit in THREE_UNITS.units)
 # All units, and the units of stage 1 alone

@@ -34,10 +34,10 @@ from mkpc_kaggle.engine.workers.places import Place
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.matchers.contract import NonFiniteError, Placement, Precision
 from mkpc_kaggle.matchers.failures import DeviceError, FailureKind, failure_kind, reason_of
+from mkpc_kaggle.pipeline.assembly import Assembly, assemble
 from mkpc_kaggle.pipeline.stages import Pipeline
 from mkpc_kaggle.recipe import Unit
 from mkpc_kaggle.reporting.summary import summary
-from mkpc_kaggle.setup.assembly import Assembly, assemble
 
 COUNT = 12
 VICTIM = 3  # brightness 13

@@ -24,8 +24,8 @@ from mkpc_kaggle.engine.request import Ending, RunReport
 from mkpc_kaggle.engine.session import Interrupt, Session, opened_engine
 from mkpc_kaggle.engine.store.database import Store
 from mkpc_kaggle.engine.store.dataframes import by_pair, pair_tables
+from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.pipeline.stages import Pipeline
-from mkpc_kaggle.setup.assembly import assemble
 
 
 def units(report: RunReport) -> list[list[str]]:

@@ -13,10 +13,10 @@ from mkpc_kaggle.engine.store import keys
 from mkpc_kaggle.engine.store.keys import Keys
 from mkpc_kaggle.geometry.coordinates import Box, Size
 from mkpc_kaggle.matchers.contract import MatcherSpec, Placement, Precision
+from mkpc_kaggle.pipeline import assembly
+from mkpc_kaggle.pipeline.assembly import Assembly, assemble
 from mkpc_kaggle.recipe import SceneConfig, Unit, load_recipe
 from mkpc_kaggle.scene.view_graph import BatchImage
-from mkpc_kaggle.setup import assembly
-from mkpc_kaggle.setup.assembly import Assembly, assemble
 
 CLASSICAL = load_recipe("classical")
 IMAGES = (

@@ -25,7 +25,7 @@ from mkpc_kaggle.engine.request import Ending
 from mkpc_kaggle.engine.store.dataframes import matrices_of
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.setup.assembly import Assembly
+from mkpc_kaggle.pipeline.assembly import Assembly
 
 ray = pytest.importorskip("ray", reason="Ray is not installed: pip install 'mkpc-kaggle[ray]'")
 

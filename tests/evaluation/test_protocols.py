@@ -20,8 +20,8 @@ from mkpc_kaggle.engine.session import Interrupt, Session, run_pairs
 from mkpc_kaggle.engine.store.dataframes import results
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.metrics import pose_auc
+from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.recipe import load_recipe
-from mkpc_kaggle.setup.assembly import assemble
 
 OUTDOORS = ["castle_p19", "fountain_p11", "herz_jesus_p8", "reichstag_26"]
 

@@ -19,8 +19,8 @@ from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.data.masks import Masks
 from mkpc_kaggle.geometry.critical_region import When
 from mkpc_kaggle.matchers.contract import Precision
+from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.scene.view_graph import BatchImage
-from mkpc_kaggle.setup.assembly import Assembly
 
 # Versions of the algorithms, each in the digests of its kind. With a wrong version, old results would
 # pass as today's, which no later check notices.

@@ -19,8 +19,8 @@ from mkpc_kaggle.engine.jobs import Answer, Cause, Failure, Job, Loaded
 from mkpc_kaggle.engine.plan.blame import MAX_LOSSES, Item, different
 from mkpc_kaggle.engine.workers.process import ProcessWorker, ThreadWorker
 from mkpc_kaggle.engine.workers.worker import Maker, MatchRunner, estimates_runner, scene_runner
+from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.pipeline.stages import Pipeline
-from mkpc_kaggle.setup.assembly import Assembly
 
 # Times the number of workers lost in a row: scarce memory may become free meanwhile.
 RESTART_PAUSE_S = 1.0

@@ -15,10 +15,10 @@ from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.store.keys import Keys
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Size
+from mkpc_kaggle.pipeline.assembly import Assembly, assemble
 from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher
 from mkpc_kaggle.recipe import Recipe, Unit, load_recipe
 from mkpc_kaggle.scene.view_graph import BatchImage
-from mkpc_kaggle.setup.assembly import Assembly, assemble
 from mkpc_kaggle.weights import WeightFile
 from mkpc_kaggle.weights import store as weight_store
 from mkpc_kaggle.weights.manifest import manifest
@@ -125,6 +125,7 @@ def test_weights_of_another_network_cost_their_matcher_and_are_reported_once(
     assert "aliked is left out: the weights for 'aliked-n16'" in told.out
 
 
+@pytest.mark.filterwarnings("default:unit 1")  # the command prints it
 def test_match_leaves_out_weights_of_another_network_as_submit_does(
     misfits, demo, tmp_path, capsys
 ):

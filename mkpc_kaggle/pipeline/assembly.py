@@ -4,13 +4,15 @@ A matcher is available if its weights are found. Recipe ``auto`` drops the units
 other recipe is refused, with the command that fetches the weights.
 """
 
+import os
+import reprlib
 from collections.abc import Container, Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from importlib import metadata
-from os import PathLike, fspath
+from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, TypeAlias
 from uuid import uuid4
 
 import cv2
@@ -23,8 +25,10 @@ from mkpc_kaggle.matchers.contract import Matcher, Placement, Precision
 from mkpc_kaggle.matchers.devices import AUTO, gpus_of, resolve_placement
 from mkpc_kaggle.matchers.registry import MATCHERS, load_matcher, require_matchers, spec_of
 from mkpc_kaggle.recipe import Mode, Recipe, Unit, load_recipe, recipe_names, with_settings
-from mkpc_kaggle.setup.arguments import Weights, shown_value, weights_of
 from mkpc_kaggle.weights import FoundFile, WeightStore
+
+PathSource: TypeAlias = str | os.PathLike[str]
+Weights: TypeAlias = PathSource | Iterable[PathSource] | Mapping[str, PathSource]
 
 DEFAULT_SIDE_PX = 1024  # of a single matcher that no recipe has
 CUDA_MINIBATCH = 8  # pairs at a time; on a CPU, more than one gains nothing and takes memory
@@ -130,7 +134,7 @@ class Assembly:
 
 
 def assemble(
-    recipe: Recipe | str | PathLike[str],
+    recipe: Recipe | PathSource,
     *,
     weights: Weights = (),
     device: str = AUTO,
@@ -154,7 +158,9 @@ def assemble(
     store = WeightStore(directories, chosen=files)
     chosen = recipe_of_name(recipe, own)
     if not isinstance(settings, Mapping):
-        raise TypeError(f"settings is {shown_value(settings)}; expected a mapping from dotted keys")
+        raise TypeError(
+            f"settings is {reprlib.repr(settings)}; expected a mapping from dotted keys"
+        )
     if settings:
         chosen = with_settings(chosen, settings)
     missing = missing_weights(chosen, store, own)
@@ -221,18 +227,27 @@ def slots_of(recipe: Recipe, names: Iterable[str]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(slots))
 
 
-def recipe_of_name(recipe: Recipe | str | PathLike[str], own: Container[str] = ()) -> Recipe:
+def weights_of(weights: Weights) -> tuple[list[Path], dict[str, Path]]:
+    """Return the directories to search, and the files that the user gives for slots."""
+    if isinstance(weights, Mapping):
+        return [], {slot: Path(file) for slot, file in weights.items()}
+    if isinstance(weights, str | os.PathLike):
+        return [Path(weights)], {}
+    return [Path(each) for each in weights], {}
+
+
+def recipe_of_name(recipe: Recipe | PathSource, own: Container[str] = ()) -> Recipe:
     """Return the recipe of a name or file, or the recipe of a single matcher.
 
     ``own`` has the names of the user's matchers. Raises :class:`UserError` for an unknown name.
     """
     if isinstance(recipe, Recipe):
         return recipe
-    if not isinstance(recipe, str | PathLike):
+    if not isinstance(recipe, str | os.PathLike):
         raise TypeError(
-            f"recipe must be a Recipe, a name or the path of a TOML file, not {shown_value(recipe)}"
+            f"recipe must be a Recipe, a name or the path of a TOML file, not {reprlib.repr(recipe)}"
         )
-    name = fspath(recipe)
+    name = os.fspath(recipe)
     if name in own or name in MATCHERS:
         return recipe_of_matcher(name)
     try:

@@ -1,1 +1,0 @@
-"""Set-up of a run: checked arguments, available matchers and weights, devices, and their assembly."""
