@@ -61,11 +61,6 @@ def find_similarity(cameras: Sequence[Camera], targets: Sequence[Camera]) -> Sim
     return _least_squares(R, centres[near], goals[near])
 
 
-def moved_by(cameras: Sequence[Camera], targets: Sequence[Camera]) -> NDArray[np.float64]:
-    """Return the distance (N,) of each camera's centre from its target's."""
-    return np.asarray(np.linalg.norm(_centres(cameras) - _centres(targets), axis=1))
-
-
 def model_size(cameras: Sequence[Camera]) -> float:
     """Return the size of a model: the RMS distance of its cameras from their mean."""
     return float(np.sqrt(_centres(cameras).var(axis=0).sum()))

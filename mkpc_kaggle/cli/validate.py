@@ -16,7 +16,6 @@ from mkpc_kaggle.errors import UserError, temporary_directory
 from mkpc_kaggle.evaluation.validate import (
     Validation,
     comparison_table,
-    resolution_line,
     score_table,
     to_json,
     validate,
@@ -69,8 +68,6 @@ def run(arguments: argparse.Namespace) -> int:
     scenes = options.train_side_of(arguments)
     if line := missing_line([true.pair for scene in scenes for true in scene.pairs]):
         logger.info(line)
-    if line := resolution_line(scenes):
-        logger.warning(line)
     runs: list[Validation] = []
     status = 0
     with ExitStack() as closed:

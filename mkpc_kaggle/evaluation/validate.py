@@ -15,11 +15,9 @@ from numpy.typing import NDArray
 from mkpc_kaggle.data.competition import (
     TrainScene,
     TruePair,
-    evenly_spread,
     read_rows,
     read_submission,
 )
-from mkpc_kaggle.data.images import read_size
 from mkpc_kaggle.engine.request import RunReport
 from mkpc_kaggle.engine.session import Session, run_pairs
 from mkpc_kaggle.engine.store.dataframes import PairTables, matrices_of
@@ -27,13 +25,11 @@ from mkpc_kaggle.errors import UserError, plural
 from mkpc_kaggle.geometry import metrics
 from mkpc_kaggle.geometry.coordinates import Matrix3
 from mkpc_kaggle.geometry.metrics import AUC_THRESHOLDS, PoseError
-from mkpc_kaggle.geometry.resolution import doubt_about_resolution
 from mkpc_kaggle.pipeline.assembly import Assembly
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-MAX_SIZES = 100  # of images that are read and compared with their calibrations
 MAX_NAMES = 5  # of samples to list in a line
 LEVEL = 0.95  # of confidence intervals
 RESAMPLES = 10_000  # another seed moves the interval's ends by about a hundredth of its width
@@ -203,30 +199,6 @@ def score_submission(submission: Path, truth: Path, scenes: Sequence[TrainScene]
     if len(missing) == sum(len(scene.pairs) for scene in scored):
         raise UserError(f"{truth} names no pair of the scenes that {submission} has a row for")
     return Validation(submission.name, tuple(scored), missing=tuple(missing))
-
-
-def resolution_line(scenes: Sequence[TrainScene]) -> str:
-    """Return a line on images whose calibration seems to be for another resolution; empty without any.
-
-    Their true F, and so their scores, would be wrong.
-    """
-    matrices: dict[str, Matrix3] = {}
-    for true in itertools.chain.from_iterable(scene.pairs for scene in scenes):
-        matrices.setdefault(true.pair.file0, true.camera0.K)
-        matrices.setdefault(true.pair.file1, true.camera1.K)
-    doubts = []
-    sample = evenly_spread(list(matrices), MAX_SIZES)
-    for file in sample:
-        size = read_size(Path(file))  # a missing image has a line of its own
-        doubt = "" if size is None else doubt_about_resolution(matrices[file], size)
-        if doubt:
-            doubts.append(f"{file}: {doubt}")
-    if not doubts:
-        return ""
-    return (
-        f"{len(doubts)} of {plural(len(sample), 'calibration')} may be for images of another resolution, "
-        f"and then the scores are wrong; the first is {doubts[0]}"
-    )
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,6 @@
 import json
 import subprocess
 import sys
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,7 +14,6 @@ from mkpc_kaggle.engine.store.dataframes import results
 from mkpc_kaggle.evaluation.validate import (
     SceneScore,
     Step,
-    resolution_line,
     score_pair,
     score_submission,
     score_table,
@@ -179,16 +177,3 @@ def test_contradictory_options_are_refused(demo, small_recipe, options, told, ca
     assert run_command("validate", *(places.get(option, option) for option in options)) == 2
     captured = capsys.readouterr()
     assert (told in captured.err, captured.out) == (True, "")
-
-
-def test_calibrations_of_another_resolution_are_named_before_the_scores(demo):
-    scenes = read_train_side(demo.train_dir)
-    assert resolution_line(scenes) == ""
-    (first, *others), *_ = (scene.pairs for scene in scenes)
-    larger = Camera(np.diag([2.0, 2.0, 1.0]) @ first.camera0.K, first.camera0.R, first.camera0.t)
-    wrong = TrainScene("s", 1.0, (replace(first, camera0=larger), *others))
-    line = resolution_line([wrong])
-    assert line.startswith("1 of ")
-    assert "calibrations may be for images of another resolution, and then the scores" in line
-    assert f"{first.pair.file0}: the principal point" in line
-    assert "the matrix seems to be for" in line
