@@ -197,9 +197,10 @@ def _run(
     pairs = [Pair(f"{names[a]} {names[b]}", batch, str(a), str(b)) for a, b in ends]
     recipe = assembly.recipe
     say = logger.info if session.progress else lambda _: None
-    say(f"{plural(len(files), 'image')}, recipe {recipe.name}, {assembly.placement}, OUT {out}")
-    if line := left_out_line(recipe, assembly.left_out):
-        say(line)
+    header = f"{plural(len(files), 'image')}, recipe {recipe.name}, {assembly.placement}, OUT {out}"
+    known = f"known cameras: {len(assembly.cameras)}" if assembly.cameras else ""
+    lines = [header, left_out_line(recipe, assembly.left_out), assembly.masks.line, known]
+    say("\n".join(filter(None, lines)))
     with Writer(root, out) as writer:
 
         def publish(state: State) -> None:

@@ -361,10 +361,14 @@ def test_the_command_writes_models_a_table_a_database_and_a_page(
     text = small_recipe.read_text()
     small_recipe.write_text(text.replace("320", "480").replace("400", "640"))
     out = tmp_path / "out"
-    options = ["--recipe", small_recipe, "--workers", 0]
+    (tmp_path / "masks").mkdir()
+    mask = np.full(cv2.imread(str(root / names[0])).shape[:2], 255, np.uint8)
+    cv2.imwrite(str(tmp_path / "masks" / f"{names[0]}.png"), mask)
+    options = ["--recipe", small_recipe, "--workers", 0, "--masks", tmp_path / "masks"]
     assert run_command("reconstruct", root, "--out", out, *options) == 0
     said = capsys.readouterr()
     assert "1 file not read: 1 .txt" in said.err
+    assert f"masks: 1 of {len(names) + 1} images" in said.out
     assert f"{len(names)} of {len(names) + 1} images with a camera" in said.out
     assert "no camera for unreadable.jpg" in said.out
     expected = {"cameras.csv", "database.db", "models/0/images.bin", "sparse/0/points3D.bin"}
