@@ -136,7 +136,7 @@ class CameraSharing(StrEnum):
 
 
 class CameraModel(StrEnum):
-    """COLMAP's camera models of perspective lenses. F of a pair needs one without distortion.
+    """COLMAP's camera models. F of a pair needs one without distortion.
 
     ``AUTO`` is SIMPLE_RADIAL for cameras, and SIMPLE_PINHOLE for F.
     """

@@ -58,15 +58,9 @@ class KnownCamera:
         return sum(self.focals) / len(self.focals)
 
     @property
-    def principal_point(self) -> tuple[float, float]:
-        """The point (cx, cy); the centre of the top-left pixel is (0.5, 0.5)."""
-        x, y = self.parameters[len(self.focals) :][:2]
-        return x, y
-
-    @property
-    def distortion(self) -> tuple[float, ...]:
-        """The coefficients of distortion, in COLMAP's and OpenCV's order; none of a pinhole."""
-        return self.parameters[len(self.focals) + 2 :]
+    def has_distortion(self) -> bool:
+        """Whether F of the camera does not fit the pixels, as of any fisheye."""
+        return "FISHEYE" in self.model or any(self.parameters[len(self.focals) + 2 :])
 
 
 Rows = Sequence[tuple[str, KnownCamera]]  # the path of an image below its folder, and its camera

@@ -38,7 +38,7 @@ class RegisteredImage:
     @property
     def has_distortion(self) -> bool:
         """Whether F of its camera does not fit the pixels."""
-        return self.lens is not None and any(self.lens.distortion)
+        return self.lens is not None and self.lens.has_distortion
 
 
 @dataclass(frozen=True, eq=False)

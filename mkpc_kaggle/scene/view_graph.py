@@ -135,7 +135,7 @@ class ViewGraph:
         known: dict[str, KnownCamera] = {}
         for image in self.images:
             # By contents: a copy under another name is the same photograph.
-            for name in (image.name, *self.copies.get(image.digest, ())):
+            for name in (image.name, *sorted(self.copies.get(image.digest, ()))):
                 if name in cameras:
                     known.setdefault(image.digest, cameras[name])
         return replace(self, known=known)

@@ -54,7 +54,7 @@ def test_a_lens_is_found_and_shared(k, sharing):
     assert lenses_of(model) == {"SIMPLE_RADIAL"}
     (lens,) = {image.lens for image in model.images}
     assert lens is not None
-    assert lens.distortion == pytest.approx((k,), rel=0.05)
+    assert lens.parameters[-1] == pytest.approx(k, rel=0.05)
     assert lens.focal == pytest.approx(FOCAL, rel=0.02)
     assert all(image.has_distortion for image in model.images)
 
@@ -68,9 +68,27 @@ def test_a_lens_that_moves_no_pixel_by_more_than_one_is_a_pinhole():
 
 def test_a_lens_that_the_user_gives_stays_however_flat_it_is():
     lens = KnownCamera("SIMPLE_RADIAL", (FOCAL, SIZE.width / 2, SIZE.height / 2, 1e-6))
-    model = model_of(0.0, RADIAL, ("*", lens))
+    model = model_of(0.0, RADIAL, *[(image.name, lens) for image in SCENE.images])
     assert {image.lens for image in model.images} == {lens}
 
 
 def test_pinholes_that_are_asked_for_stay_pinholes():
     assert lenses_of(model_of(-0.2, SceneConfig())) == {"SIMPLE_PINHOLE"}
+
+
+def test_a_fisheye_that_is_asked_for_is_found():
+    """An equidistant lens shows a ray at its angle with the axis."""
+    pairs = []
+    for pair in SCENE.pairs:
+        seen = []
+        for points in (pair.matches.points0, pair.matches.points1):
+            rays = (points - CENTRE) / FOCAL
+            radius = np.linalg.norm(rays, axis=1, keepdims=True)
+            seen.append(rays * np.arctan(radius) / radius * FOCAL + CENTRE)
+        pairs.append(replace(pair, by_unit=(Matches(*seen, pair.matches.scores),)))
+    config = SceneConfig(camera_model=CameraModel.SIMPLE_RADIAL_FISHEYE)
+    (model,) = models_of(reconstruct_graph(ViewGraph.of_pairs(pairs), config)[0])
+    assert lenses_of(model) == {"SIMPLE_RADIAL_FISHEYE"}
+    assert len(model.images) == 6
+    assert all(image.has_distortion for image in model.images)
+    assert model.reprojection_error < 1
