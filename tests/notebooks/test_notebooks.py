@@ -1,6 +1,7 @@
 """``mkpc_tour.ipynb`` and ``validate.ipynb`` from a clean kernel without a network, on the demo set."""
 
 import os
+import re
 import sys
 from pathlib import Path
 
@@ -47,7 +48,9 @@ def test_the_tour_runs_on_a_train_side_without_a_network(demo, tmp_path):
     )
     executed = execute(TOUR, tmp_path / "executed.ipynb", sys.executable, tmp_path, variables)
     assert pictures(executed) == figures_of(executed) == 18
-    assert printed(executed) == ""
+    # Of small views, a stage may have too few matches.
+    warned = [line for line in printed(executed).splitlines() if "Warning: " in line]
+    assert [line for line in warned if "no F was found" not in line] == []
 
 
 @needs_namespaces
@@ -88,7 +91,7 @@ def test_without_a_train_side_recipes_are_compared_on_the_demo_set(small_recipe,
     text = printed(executed)
     assert "courtyard              4 pairs" in text
     assert "small against small (stage-1): gain of mAA, 95% interval" in text
-    assert text.count("mean over scenes         4") == 3
+    assert len(re.findall("mean over scenes +4 ", text)) == 3
     assert "On these 4 pairs, small " in text
     assert text.count(": covisibility 0.") == 3
     assert pictures(executed) == 3 + 3, "scores, gains, errors; the hardest pairs"

@@ -152,7 +152,7 @@ def test_a_saved_version_without_a_network_writes_a_submission_and_shows_pairs(
     assert "good: 1 row" in printed
     assert "recipe auto" in printed
     assert "of 525 minutes used" in printed
-    assert printed.count("sweep: ") == 1, "a notebook keeps every line, so progress is few of them"
+    assert printed.count("sweep: ") <= 2, "a notebook keeps every line, so progress is few of them"
     assert f"report: {kaggle.working / 'submission.html'}" in printed
     assert (kaggle.working / "submission.html").is_file()
     assert (kaggle.root / "temp" / "submission.work" / "journal.sqlite").is_file()
