@@ -2,7 +2,7 @@
 
 import argparse
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from math import inf
 from pathlib import Path
@@ -16,7 +16,6 @@ from mkpc_kaggle.engine.workers.cluster import parse_workers
 from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.pipeline.assembly import Assembly, assemble
 from mkpc_kaggle.recipe import parse_setting, split_mode
-from mkpc_kaggle.reporting.summary import left_out_line
 
 RECIPE = """a recipe, or one matcher such as aliked_lightglue (default: auto, every matcher with its weights).
     MODE stage-1 runs its units of stage 1 alone, whole-images all its units without crops"""
@@ -169,16 +168,6 @@ def watched_session(
     with opened.watched() as session:
         yield session
         drain()  # while the watchdog is active: the reader of the output may hang
-
-
-def say_start(what: str, assembly: Assembly, work_dir: Path, effects: Iterable[str] = ()) -> None:
-    """Print the input, the recipe and the omitted matchers, and which parts of the input take
-    effect.
-    """
-    # One call, so that no worker's line comes between.
-    header = f"{what}, recipe {assembly.recipe.name}, {assembly.placement}, journal in {work_dir}"
-    left_out = left_out_line(assembly.recipe, assembly.left_out)
-    logger.info("\n".join(filter(None, [header, left_out, *effects])))
 
 
 def finish(session: Session, page: Path | None, pairs: Sequence[Pair]) -> int:

@@ -9,7 +9,7 @@ from mkpc_kaggle.data.outputs import require_apart
 from mkpc_kaggle.engine.console import logger
 from mkpc_kaggle.engine.session import first_version, interruptible, submit
 from mkpc_kaggle.errors import plural
-from mkpc_kaggle.reporting.summary import summary, trouble
+from mkpc_kaggle.reporting.summary import left_out_line, summary, trouble
 
 HELP = """\
 Match every pair of test.csv and write one row per pair, its fundamental matrix.
@@ -72,8 +72,14 @@ def run(arguments: argparse.Namespace) -> int:
             options.watched_session(arguments, work_dir, interrupt) as session,
         ):
             assembly = options.assembly_of(arguments, interrupt)
-            effects = [line] if (line := missing_line(pairs)) else []
-            options.say_start(plural(len(pairs), "pair"), assembly, work_dir, effects)
+            recipe = assembly.recipe
+            about = f"{plural(len(pairs), 'pair')}, recipe {recipe.name}, {assembly.placement}"
+            lines = [
+                f"{about}, journal in {work_dir}",
+                left_out_line(recipe, assembly.left_out),
+                missing_line(pairs),
+            ]
+            logger.info("\n".join(filter(None, lines)))
             _, images = test_side(arguments.test_dir)
             report = submit(pairs, assembly, session, output, str(images))
             session.status = int(bool(report.unwritten or report.unsaved or trouble(report)))
