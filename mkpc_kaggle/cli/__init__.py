@@ -36,8 +36,6 @@ def program(arguments: Sequence[str] | None = None) -> NoReturn:
     """Run a command and end the process at once: an orderly exit takes a second or longer."""
     try:  # Ctrl-C during slow imports is not an error
         status = main(arguments)
-        if "cv2" not in sys.modules:  # it cannot be imported, and neither can the console
-            sys.exit(status)
         from mkpc_kaggle.engine.console import leave
     except KeyboardInterrupt:
         os._exit(EXIT_INTERRUPTED)
@@ -51,11 +49,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     output closed the pipe. The time limit counts from the call, before the slow imports.
     """
     started = time.monotonic()
-    return _main(arguments, started)
-
-
-def _main(arguments: Sequence[str] | None, started: float) -> int:
-    """Run a command with the package's libraries, and print its errors, one line each."""
     from mkpc_kaggle.engine.console import logger
     from mkpc_kaggle.errors import UserError
 
@@ -72,14 +65,6 @@ def _main(arguments: Sequence[str] | None, started: float) -> int:
             return _run(given, started, printing)
         except UserError as error:
             logger.error(str(error))
-            return EXIT_BAD_INPUT
-        except ImportError as error:
-            # Of a native library, such as torch without its CUDA; a fault of the package is a
-            # traceback.
-            if str(error.name).startswith("mkpc_kaggle"):
-                raise
-            reason = " ".join(str(error).split())
-            logger.error(f"a library cannot be imported: {reason}; install the package again")
             return EXIT_BAD_INPUT
         except KeyboardInterrupt as error:
             logger.error("interrupted")

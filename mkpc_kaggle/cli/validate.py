@@ -66,7 +66,8 @@ def run(arguments: argparse.Namespace) -> int:
     # Before any work: a run of hours must not end in an output that cannot be written.
     require_apart({"--json": arguments.json}, [arguments.train_dir], arguments.work_dir)
     scenes = options.train_side_of(arguments)
-    if line := missing_line([true.pair for scene in scenes for true in scene.pairs]):
+    pairs = [true.pair for scene in scenes for true in scene.pairs]
+    if line := missing_line(pairs):
         logger.info(line)
     runs: list[Validation] = []
     status = 0
@@ -74,16 +75,14 @@ def run(arguments: argparse.Namespace) -> int:
         # Without a work directory, nothing is kept.
         work_dir = arguments.work_dir or closed.enter_context(temporary_directory())
         interrupt = closed.enter_context(interruptible())
-        session = Session(work_dir, options.budget_of(arguments), interrupt)
-        watched = closed.enter_context(session.watched())
-        watched.save = lambda: "the time limit passed before the scores were printed"
+        budget = options.budget_of(arguments)
+        session = Session(work_dir, budget, interrupt, workers=arguments.workers)
+        closed.enter_context(session.watched())
+        session.save = lambda: "the time limit passed before the scores were printed"
         # All of them first: a wrong name should not end a comparison after its first run.
         assemblies = [options.assembly_of(arguments, interrupt, text) for text in recipes]
         # They share a journal, so that common units run once.
         for text, assembly in zip(recipes, assemblies, strict=True):
-            session = Session(
-                work_dir, options.budget_of(arguments), interrupt, workers=arguments.workers
-            )
             validation = _run_recipe(arguments, scenes, assembly, session)
             runs.append(validation)
             page = None
@@ -92,7 +91,7 @@ def run(arguments: argparse.Namespace) -> int:
                 name = re.sub(r"[^\w.-]+", "_", text) if arguments.compare else "report"
                 page = work_dir / f"{name}.html"
             session.status = max(status, session.status)
-            status = options.finish(session, page, [true.pair for s in scenes for true in s.pairs])
+            status = options.finish(session, page, pairs)
             # A comparison of unequal pairs would mean nothing.
             if arguments.compare and not (validation.report and validation.report.ending.is_done):
                 logger.info(
