@@ -27,7 +27,7 @@ TEST_PROCESSES ?= 2
 # Folders and files whose tests need neither a run of the engine nor a network.
 QUICK := tests/geometry tests/data tests/weights tests/scene tests/evaluation/test_compare.py tests/test_recipe.py \
     tests/test_errors.py tests/reporting/test_summary.py tests/reconstruction/test_folder.py tests/demo tests/test_bars.py \
-    $(addprefix tests/engine/test_, budget.py keys.py progress.py store.py)
+    $(addprefix tests/engine/test_, budget.py keys.py store.py)
 # Not the declared floor: on most indexes old versions of torch have no build for the CPU, and bring CUDA along.
 TORCH ?= $(shell grep '^torch==' requirements-dev.txt)
 
