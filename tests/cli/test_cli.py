@@ -108,6 +108,7 @@ def test_match_prints_f_and_draws_the_pair(demo, small_recipe, tmp_path, capsys)
     assert cv2.imread(str(figure)).shape[1] > 1000
 
 
+@pytest.mark.filterwarnings("ignore:no F was found")
 def test_match_draws_a_pair_that_has_nothing_in_common(clean_environment, tmp_path, capsys):
     cv2.imwrite(str(tmp_path / "a.png"), np.full((60, 90, 3), 127, np.uint8))
     figure = tmp_path / "pair.png"
