@@ -55,8 +55,7 @@ def autocast(placement: Placement) -> torch.autocast:
     """
     enabled = placement.precision is not Precision.FLOAT32
     device = torch.device(placement.device).type
-    # Nothing is computed on the device "meta", which has no autocast.
-    return torch.autocast("cpu" if device == "meta" else device, dtype_of(placement), enabled)
+    return torch.autocast(device, dtype_of(placement), enabled)
 
 
 def dtype_of(placement: Placement) -> torch.dtype:
