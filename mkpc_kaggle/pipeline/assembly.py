@@ -227,13 +227,13 @@ def slots_of(recipe: Recipe, names: Iterable[str]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(slots))
 
 
-def weights_of(weights: Weights) -> tuple[list[Path], dict[str, Path]]:
+def weights_of(weights: Weights | None) -> tuple[list[Path], dict[str, Path]]:
     """Return the directories to search, and the files that the user gives for slots."""
     if isinstance(weights, Mapping):
         return [], {slot: Path(file) for slot, file in weights.items()}
     if isinstance(weights, str | os.PathLike):
         return [Path(weights)], {}
-    return [Path(each) for each in weights], {}
+    return [Path(each) for each in weights or ()], {}
 
 
 def recipe_of_name(recipe: Recipe | PathSource, own: Container[str] = ()) -> Recipe:

@@ -241,6 +241,7 @@ def write_aliked(path, extra=()):
     return path
 
 
+@pytest.mark.filterwarnings("ignore:no F was found")
 def test_own_weights_are_a_file_for_a_slot(tmp_path):
     path = write_aliked(tmp_path / "mine.pth")
     given = {"aliked-n16": path}
