@@ -89,7 +89,8 @@ def test_pages_name_only_commands_and_options_that_exist(page):
 
 # Options of other programs that pages name: pip, kaggle, ray, accelerators of Kaggle, COLMAP, nerfstudio.
 OTHERS = {"--no-deps", "--follow", "--head", "--accelerator"}
-OTHERS |= {"--colmap-path", "--data", "--database", "--downscale-factor", "--import", "--result"}
+OTHERS |= {"--colmap-path", "--data", "--database", "--downscale-factor", "--image", "--import"}
+OTHERS |= {"--result"}
 OPTION = re.compile(r"(?<![\w-])--[a-z][a-z0-9-]*")
 
 
