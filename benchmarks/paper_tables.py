@@ -33,23 +33,44 @@ from mkpc_kaggle.engine.session import Session, interruptible, run_pairs
 from mkpc_kaggle.engine.store.dataframes import Results, by_pair, results
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.evaluation.validate import validate
+from mkpc_kaggle.geometry.cameras import Camera, relative_pose
 from mkpc_kaggle.geometry.coordinates import Box, Matrix3, View
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.metrics import (
     AUC_THRESHOLDS,
     PoseError,
-    correct_matches,
     pose_auc,
     pose_error,
 )
-from mkpc_kaggle.geometry.robust import calibrate
+from mkpc_kaggle.geometry.robust import calibrate, homogeneous
 from mkpc_kaggle.geometry.two_view import cross_matrix
 from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.recipe import Recipe, Unit, load_recipe
 
+# A correct match's maximum sum of both squared epipolar distances, on the planes z = 1.
+CORRECT = 5e-4
 FEWEST = 5  # matches that OpenCV needs for an E
 FARTHEST = 1e9  # of points in front of both cameras
 TABLES = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
+
+
+def correct_matches(matches: Matches, camera0: Camera, camera1: Camera) -> NDArray[np.bool_]:
+    """Return an (N,) mask of the matches that fit the true cameras within :data:`CORRECT`."""
+    R, t = relative_pose(camera0, camera1)
+    E = cross_matrix(t) @ R
+    x0 = homogeneous(calibrate(matches.points0, camera0.K))
+    x1 = homogeneous(calibrate(matches.points1, camera1.K))
+    lines0 = x1 @ E  # epipolar lines (N, 3) in image 0
+    lines1 = x0 @ E.T
+    # The squared distance of a point to its line is (x1^T E x0)^2 over the squared norm of the
+    # line's normal, in each image.
+    squared_normal0 = (lines0[:, :2] ** 2).sum(axis=1)
+    squared_normal1 = (lines1[:, :2] ** 2).sum(axis=1)
+    # With equal camera centres, no match is correct.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inverse = 1 / squared_normal0 + 1 / squared_normal1
+        distances = (x1 * lines1).sum(axis=1) ** 2 * inverse
+        return np.asarray(distances < CORRECT)
 
 
 @dataclass(frozen=True)

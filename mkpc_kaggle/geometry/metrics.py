@@ -6,22 +6,16 @@ from math import inf, isfinite
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.integrate import trapezoid
 
 from mkpc_kaggle.geometry.cameras import Camera, relative_pose
 from mkpc_kaggle.geometry.coordinates import Matrix3
-from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.geometry.robust import calibrate, homogeneous
-from mkpc_kaggle.geometry.two_view import cross_matrix
 
 # The competition's rules. The i-th rotation threshold, degrees, goes with the i-th translation
 # threshold, metres.
 ROTATION_THRESHOLDS = np.linspace(1, 10, 10)
 TRANSLATION_THRESHOLDS = np.geomspace(0.2, 5, 10)
 AUC_THRESHOLDS = (5.0, 10.0, 20.0)  # degrees
-# A correct match's maximum sum of both squared epipolar distances, on the planes z = 1.
-CORRECT = 5e-4
 
 
 @dataclass(frozen=True)
@@ -101,25 +95,6 @@ def pair_accuracy(error: PoseError) -> float:
     """
     meets = (error.rotation < ROTATION_THRESHOLDS) & (error.translation < TRANSLATION_THRESHOLDS)
     return float(np.mean(meets))
-
-
-def correct_matches(matches: Matches, camera0: Camera, camera1: Camera) -> NDArray[np.bool_]:
-    """Return an (N,) mask of the matches that fit the true cameras within :data:`CORRECT`."""
-    R, t = relative_pose(camera0, camera1)
-    E = cross_matrix(t) @ R
-    x0 = homogeneous(calibrate(matches.points0, camera0.K))
-    x1 = homogeneous(calibrate(matches.points1, camera1.K))
-    lines0 = x1 @ E  # epipolar lines (N, 3) in image 0
-    lines1 = x0 @ E.T
-    # The squared distance of a point to its line is (x1^T E x0)^2 over the squared norm of the
-    # line's normal, in each image.
-    squared_normal0 = (lines0[:, :2] ** 2).sum(axis=1)
-    squared_normal1 = (lines1[:, :2] ** 2).sum(axis=1)
-    # With equal camera centres, no match is correct.
-    with np.errstate(divide="ignore", invalid="ignore"):
-        inverse = 1 / squared_normal0 + 1 / squared_normal1
-        distances = (x1 * lines1).sum(axis=1) ** 2 * inverse
-        return np.asarray(distances < CORRECT)
 
 
 def pose_auc(errors: Sequence[PoseError], threshold: float) -> float:

@@ -14,12 +14,11 @@ import numpy as np
 from mkpc_kaggle.data.outputs import lies_in
 from mkpc_kaggle.engine.store.database import FILE_NAME
 from mkpc_kaggle.errors import UserError, writing
-from mkpc_kaggle.geometry.cameras import Camera
-from mkpc_kaggle.geometry.coordinates import COLMAP_CENTRE_PX, Size
+from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.reconstruction.folder import CAMERA_COLUMNS
 from mkpc_kaggle.reconstruction.process import Child
 from mkpc_kaggle.scene.export import DATABASE, IMAGES, MODELS, PART, SPARSE, sync
-from mkpc_kaggle.scene.models import RegisteredImage, SfmModel, lens_of
+from mkpc_kaggle.scene.models import SfmModel
 from mkpc_kaggle.scene.view_graph import BatchImage
 
 WORK = "work"
@@ -120,7 +119,7 @@ def write_results(root: Path, out: Path) -> Iterator[list[SfmModel]]:
         former = pycolmap.Reconstruction(out / WORK / FORMER)
         for model in models:
             align(model, former)
-    found = [sfm_model(model) for model in models]
+    found = [values_of(model) for model in models]
     with TemporaryDirectory(prefix=PART, dir=out) as name:
         made = Path(name)
         for number, model in enumerate(models):
@@ -155,23 +154,15 @@ def align(model: Any, former: Any) -> None:
         model.transform(found)
 
 
-def sfm_model(model: Any) -> SfmModel:
-    """Return pycolmap's model as values without it. Images have no digests."""
-    from mkpc_kaggle.scene.colmap import points_of
+def values_of(model: Any) -> SfmModel:
+    """Return pycolmap's model as values. Images have no digests."""
+    from mkpc_kaggle.scene.colmap import sfm_model
 
-    images = []
+    named = []
     for image in images_of(model):
-        K = np.array(image.camera.calibration_matrix())
-        # The centre of an image's first pixel is (0.5, 0.5) in COLMAP, and (0, 0) here.
-        K[:2, 2] -= COLMAP_CENTRE_PX
-        pose = np.array(image.cam_from_world().matrix())
         size = Size(image.camera.width, image.camera.height)
-        camera = Camera(K, pose[:, :3], pose[:, 3])
-        lens = lens_of(image.camera)
-        named = BatchImage(image.name, "", size)
-        images.append(RegisteredImage(named, camera, int(image.num_points3D), lens=lens))
-    error = float(model.compute_mean_reprojection_error())
-    return SfmModel(tuple(images), points_of(model), error)
+        named.append((image, BatchImage(image.name, "", size)))
+    return sfm_model(model, named)
 
 
 def images_of(model: Any) -> list[Any]:

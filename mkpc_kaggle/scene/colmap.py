@@ -8,7 +8,7 @@ Source: Pan et al. 2024 (the global mapper).
 """
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from mkpc_kaggle.cores import available_cores
 from mkpc_kaggle.geometry.cameras import Camera
-from mkpc_kaggle.geometry.coordinates import COLMAP_CENTRE_PX, Matrix3
+from mkpc_kaggle.geometry.coordinates import COLMAP_CENTRE_PX
 from mkpc_kaggle.geometry.focal_prior import FOCAL_RATIO
 from mkpc_kaggle.recipe import CameraModel, SceneConfig
 from mkpc_kaggle.scene.adjustment import adjust, drop_flat_lenses
@@ -384,36 +384,32 @@ def _reconstruction(mapped: Sequence[Any], graph: ViewGraph, config: SceneConfig
         observations = pycolmap.ObservationManager(model)
         if observations.filter_observations_with_negative_depth():
             model.update_point_3d_errors()
-    found = [_sfm_model(model, graph) for model in mapped]
+    found = []
+    for model in mapped:
+        # Sorted, because pycolmap's containers have no fixed order
+        numbers = sorted(model.reg_image_ids())
+        named = [(model.images[number], graph.images[number - 1]) for number in numbers]
+        found.append(sfm_model(model, named))
     models = filter_models(found)
     return Reconstruction(
         graph.names, models, "" if models else "the matches gave no plausible model"
     )
 
 
-def _sfm_model(found: Any, graph: ViewGraph) -> SfmModel:
-    images = []
-    # Sorted, because pycolmap's containers have no fixed order
-    for number in sorted(found.reg_image_ids()):
-        image = found.images[number]
+def sfm_model(found: Any, images: Iterable[tuple[Any, BatchImage]]) -> SfmModel:
+    """Return pycolmap's model, with the registered ``images`` and ours of the same names."""
+    registered = []
+    for image, named in images:
         K = np.array(image.camera.calibration_matrix())
+        # The centre of an image's first pixel is (0.5, 0.5) in COLMAP, and (0, 0) here.
         K[:2, 2] -= COLMAP_CENTRE_PX
-        camera = _posed(K, np.asarray(image.cam_from_world().matrix()))
-        images.append(
-            RegisteredImage(
-                graph.images[number - 1],
-                camera,
-                int(image.num_points3D),
-                lens_of(image.camera),
-            )
-        )
+        pose = np.asarray(image.cam_from_world().matrix())
+        # Copies: the views would keep pycolmap's memory.
+        camera = Camera(K, pose[:, :3].copy(), pose[:, 3].copy())
+        points = int(image.num_points3D)
+        registered.append(RegisteredImage(named, camera, points, lens_of(image.camera)))
     error = float(found.compute_mean_reprojection_error()) if found.num_points3D() else 0.0
-    return SfmModel(tuple(images), points_of(found), error, found)
-
-
-def _posed(K: Matrix3, pose: NDArray[np.float64]) -> Camera:
-    # Copies: the views would keep pycolmap's memory.
-    return Camera(K, pose[:, :3].copy(), pose[:, 3].copy())
+    return SfmModel(tuple(registered), points_of(found), error, found)
 
 
 def points_of(found: Any) -> NDArray[np.float64]:

@@ -14,7 +14,6 @@ from mkpc_kaggle.scene.view_graph import BatchImage
 
 MIN_IMAGES = 3  # in a model
 MIN_POINTS = 30  # seen by a plausible image
-MAX_POINTS = 20_000  # of a model, for pictures and views: the points of the longest tracks
 PLAUSIBLE_FOCALS = Range(0.3, 5.0)  # plausible focal lengths, in long sides of the image
 
 

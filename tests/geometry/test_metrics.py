@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mkpc_kaggle.geometry import metrics
+from benchmarks.paper_tables import correct_matches
 from mkpc_kaggle.geometry.cameras import Camera, fundamental_of_cameras, relative_pose
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.metrics import (
@@ -200,5 +200,5 @@ def test_matches_are_correct_within_superglues_distance_of_both_epipolar_lines()
     # 5e-4 is the limit, which is 12.65 rows.
     points1 = np.array([(90, 12.6), (7, -12.7), (0, 0)])
     matches = Matches(points0, points1, np.ones(3))
-    is_correct = metrics.correct_matches(matches, left, right)
+    is_correct = correct_matches(matches, left, right)
     assert is_correct.tolist() == [True, False, True]
