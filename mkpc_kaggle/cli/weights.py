@@ -91,7 +91,7 @@ def _fetch(arguments: argparse.Namespace) -> int:
     status = 0
     with temporary_directory() as temporary:
         downloads = Downloads(arguments.out, temporary)
-        for file in dict.fromkeys(choose(files, arguments.out) for files in wanted):
+        for file in dict.fromkeys(preferred(files, arguments.out) for files in wanted):
             # Before the download: a licence may be a reason not to fetch the file.
             size = f", {file.size / 1e6:.1f} MB" if file.size else ""
             print(f"{file.name}: licence {file.licence}{size}", flush=True)
@@ -106,7 +106,7 @@ def _fetch(arguments: argparse.Namespace) -> int:
     return status
 
 
-def choose(alternatives: list[WeightFile], directory: Path) -> WeightFile:
+def preferred(alternatives: list[WeightFile], directory: Path) -> WeightFile:
     """Choose a slot's file: the first good one there, else one to download, else the first."""
     there = []
     for file in alternatives:
