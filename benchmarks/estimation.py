@@ -35,11 +35,10 @@ import numpy as np
 
 from mkpc_kaggle.config import from_table
 from mkpc_kaggle.data.competition import TrainScene, TruePair, read_train_side
-from mkpc_kaggle.engine.store.database import Store
-from mkpc_kaggle.engine.store.dataframes import pair_tables
-from mkpc_kaggle.engine.store.published import Published, read_images
+from mkpc_kaggle.engine.frames import about_run, pair_tables, points_of
+from mkpc_kaggle.engine.store import Store
 from mkpc_kaggle.evaluation.validate import Difference, error_of, paired_difference
-from mkpc_kaggle.geometry.coordinates import Matrix3
+from mkpc_kaggle.geometry.coordinates import Matrix3, Size
 from mkpc_kaggle.geometry.focal_prior import FocalConfig, FocalPrior, estimate_with_prior
 from mkpc_kaggle.geometry.metrics import PoseError, pair_accuracy
 from mkpc_kaggle.geometry.robust import Estimate, RobustConfig, estimate, sampson_distances
@@ -204,23 +203,24 @@ def extra_of(pairs: Sequence[Known], every: Sequence[Known], config: SceneConfig
 def read_journal(directory: Path) -> tuple[str, dict[str, tuple[PairMatch, Matrix3 | None]]]:
     """Return the recipe's name, and each pair's matches and own F by pair id."""
     with Store.read(directory) as store:
-        published = Published.of(store)
-        tables = pair_tables(store, published)
-        table = dict(published.run.about.recipe)
+        tables = pair_tables(store.db)
+        table = about_run(store.db)["recipe"]
         recipe = recipe_of(table, table.pop("name"))
         units = {unit.name: unit for unit in recipe.units}
         found = {}
-        for number, row in enumerate(published.rows):
-            pair = tables.pairs.loc[number]
+        for number, pair in enumerate(tables.pairs.to_dict("records")):
             # A pair that was never matched, or whose image is unreadable.
             if not pair["units"]:
                 continue
-            images = read_images(store, row)
-            points = published.points_of(store, row)
+            names = [pair["image0"], pair["image1"]]
+            sizes = {
+                n: Size(w, h) for n, w, h in store.select("image", "name, width, height", names)
+            }
+            points = points_of(store, number)
             results = tuple(UnitResult(units[name], matches) for name, matches in points.items())
-            match = PairMatch(results, sizes=tuple(image.size for image in images))
+            match = PairMatch(results, sizes=tuple(map(sizes.__getitem__, names)))
             F = None if pair["failure"] else tables.estimates["F"][number]
-            found[row.id] = (match, F)
+            found[pair["pair"]] = (match, F)
     return recipe.name, found
 
 

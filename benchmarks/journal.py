@@ -16,12 +16,11 @@ from pathlib import Path
 import numpy as np
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine.plan.state import State
 from mkpc_kaggle.engine.request import Request
-from mkpc_kaggle.engine.restore import restore
-from mkpc_kaggle.engine.store.database import Store
-from mkpc_kaggle.engine.store.image_files import stored_digests
+from mkpc_kaggle.engine.state import State
+from mkpc_kaggle.engine.store import FILE_NAME, Store
 from mkpc_kaggle.geometry.matches import Matches
+from mkpc_kaggle.scene.view_graph import BatchImage
 from tests.support import simulator
 from tests.support.simulator import Scenario, simulate
 
@@ -41,7 +40,7 @@ def main() -> None:
             started = time.process_time()
             ran = simulate(scenario, store)
             seconds = time.process_time() - started
-        size = store.path.stat().st_size
+        size = (Path(directory) / FILE_NAME).stat().st_size
         started, cpu = time.perf_counter(), time.process_time()
         with Store.open(Path(directory)) as store:
             state = restored(scenario, store)
@@ -51,7 +50,7 @@ def main() -> None:
     )
     print(f"{what}, {len(ran.scenes)} scenes: {ran.report.ending}")
     print(f"CPU: {1e3 * seconds / arguments.pairs:.2f} ms a pair; store: {size / 1e6:.0f} MB")
-    stale = f"{len(state.scenes.stale)} scenes out of date"
+    stale = f"{state.stale.sum()} scenes out of date"
     print(f"start from the store: {resuming:.2f} s, {resuming_cpu:.2f} s CPU; {stale}")
     print(f"memory: {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3:.0f} MB")
 
@@ -78,8 +77,10 @@ def restored(scenario: Scenario, store: Store) -> State:
     """Return the state that a resumed run of the scenario starts with."""
     share = max(1, scenario.batches) / scenario.pairs
     pairs = [Pair(str(n), f"{int(n * share):03d}", f"{n:07d}", "b") for n in range(scenario.pairs)]
-    state = State(Request(pairs, scenario.recipe, scenario.keys))
-    restore(state, store, stored_digests(store, [name for names in state.names for name in names]))
+    names = {name for pair in pairs for name in (pair.file0, pair.file1)}
+    images = {name: BatchImage(name, name, simulator.SIZE) for name in names}
+    state = State(Request(pairs, scenario.recipe, scenario.keys), images, {})
+    state.restore(store)
     return state
 
 

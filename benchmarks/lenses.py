@@ -26,17 +26,17 @@ import numpy as np
 
 from benchmarks.similarity import find_similarity, model_size
 from mkpc_kaggle.data.competition import TrainScene, TruePair, read_train_side
-from mkpc_kaggle.engine.store.database import Store
-from mkpc_kaggle.engine.store.published import Published, read_images
+from mkpc_kaggle.engine.frames import pair_tables, points_of
+from mkpc_kaggle.engine.store import Store
 from mkpc_kaggle.evaluation.validate import error_of
 from mkpc_kaggle.geometry.cameras import Camera, fundamental_of_cameras
-from mkpc_kaggle.geometry.coordinates import Matrix3, Pixels
+from mkpc_kaggle.geometry.coordinates import Matrix3, Pixels, Size
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.metrics import pair_accuracy
 from mkpc_kaggle.recipe import CameraModel, SceneConfig
 from mkpc_kaggle.scene.models import RegisteredImage, SfmModel, models_of
 from mkpc_kaggle.scene.sfm import reconstruct_batch
-from mkpc_kaggle.scene.view_graph import BatchPair
+from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair
 
 RECIPE = 'units = [{ stage = 1, matcher = "sift", long_side = 1024 }]\n'
 MIN_COVISIBILITY = 0.1
@@ -111,11 +111,14 @@ def read_pairs(out: Path) -> list[BatchPair]:
     """Return the pairs of a journal with their matches."""
     pairs = []
     with Store.read(out / "results/work") as store:
-        published = Published.of(store)
-        for row in published.rows:
-            images = read_images(store, row)
-            found = Matches.concatenate(published.points_of(store, row).values())
-            first, second = (replace(image, name=Path(image.name).stem) for image in images)
+        columns = "name, digest, width, height, focal"
+        images = {
+            row[0]: BatchImage(Path(row[0]).stem, row[1], Size(*row[2:4]), row[4])
+            for row in store.db.execute(f"SELECT {columns} FROM image")
+        }
+        for number, row in enumerate(pair_tables(store.db).pairs.to_dict("records")):
+            found = Matches.concatenate(points_of(store, number).values())
+            first, second = (images[row[name]] for name in ("image0", "image1"))
             pairs.append(BatchPair(first, second, (found,)))
     return pairs
 

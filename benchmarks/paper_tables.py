@@ -27,10 +27,10 @@ from numpy.typing import NDArray
 from benchmarks.lists import read_pairs
 from mkpc_kaggle.data.competition import TrainScene, TruePair, read_train_side
 from mkpc_kaggle.data.images import read_size
-from mkpc_kaggle.engine.plan.budget import Budget
+from mkpc_kaggle.engine.budget import Budget
+from mkpc_kaggle.engine.frames import Results, by_pair, results
 from mkpc_kaggle.engine.request import RunReport
 from mkpc_kaggle.engine.session import Session, interruptible, run_pairs
-from mkpc_kaggle.engine.store.dataframes import Results, by_pair, results
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.evaluation.validate import validate
 from mkpc_kaggle.geometry.cameras import Camera, relative_pose

@@ -17,7 +17,7 @@ from collections import Counter
 
 import numpy as np
 
-from mkpc_kaggle.engine.plan.budget import parse_duration
+from mkpc_kaggle.engine.budget import parse_duration
 from mkpc_kaggle.progress import format_duration
 from tests.support.simulator import (
     MECHANISMS,

@@ -24,9 +24,9 @@ import cv2
 import numpy as np
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine.plan.budget import Budget
+from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.session import Session, interruptible, run_pairs
-from mkpc_kaggle.engine.store.database import FILE_NAME
+from mkpc_kaggle.engine.store import FILE_NAME
 from mkpc_kaggle.geometry.coordinates import Size, View
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import MatcherSpec, Picture

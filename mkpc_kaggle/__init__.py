@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from mkpc_kaggle.version import __version__
 
 if TYPE_CHECKING:
-    from mkpc_kaggle.engine.store.dataframes import results
+    from mkpc_kaggle.engine.frames import results
     from mkpc_kaggle.errors import UserError
     from mkpc_kaggle.geometry.coordinates import Box, Size
     from mkpc_kaggle.geometry.critical_region import CriticalRegion, MkpcConfig, critical_region
@@ -69,7 +69,7 @@ _MODULES = {
     "Picture": "matchers.contract",
     "Colour": "matchers.contract",
     "reconstruct": "reconstruction.run",
-    "results": "engine.store.dataframes",
+    "results": "engine.frames",
     "UserError": "errors",
 }
 

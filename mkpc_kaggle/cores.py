@@ -9,7 +9,7 @@
   cores. Its mapper has ``threads`` of [scene], one by default, and its last adjustment one.
 - A thread of the user's process (``--workers 0``) leaves the limits of the process as they are.
 
-The number of processes is decided in :mod:`mkpc_kaggle.engine.workers.places`.
+The number of processes is decided in :mod:`mkpc_kaggle.engine.places`.
 """
 
 import os

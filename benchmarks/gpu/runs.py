@@ -21,7 +21,7 @@ from benchmarks.gpu.record import EXPECTED, Part
 from benchmarks.gpu.setup import Setup
 from benchmarks.gpu.trained import SLOTS
 from mkpc_kaggle.data.competition import read_test_side, submission_problems
-from mkpc_kaggle.engine.store.dataframes import results
+from mkpc_kaggle.engine.frames import results
 from mkpc_kaggle.weights import WeightStore
 
 UNITS = 2

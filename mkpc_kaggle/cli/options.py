@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from mkpc_kaggle.data.competition import Pair, TrainScene, read_train_side
+from mkpc_kaggle.engine.budget import Budget, monotonic_of, parse_duration
+from mkpc_kaggle.engine.cluster import parse_workers
 from mkpc_kaggle.engine.console import drain, logger, queued
-from mkpc_kaggle.engine.plan.budget import Budget, monotonic_of, parse_duration
 from mkpc_kaggle.engine.session import Interrupt, Session
-from mkpc_kaggle.engine.workers.cluster import parse_workers
 from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.pipeline.assembly import Assembly, assemble
 from mkpc_kaggle.recipe import parse_setting, split_mode

@@ -10,15 +10,14 @@ import os
 import queue
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from enum import StrEnum
 from logging.handlers import QueueHandler, QueueListener
-from math import isfinite
+from math import inf, isfinite
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
 
-from mkpc_kaggle.engine.plan.budget import Budget
 from mkpc_kaggle.errors import printable
 from mkpc_kaggle.progress import LINE_INTERVAL_S, REDRAW_S, format_duration, is_terminal, print_to
 
@@ -106,8 +105,8 @@ class Progress:
     line every half minute where lines stay.
     """
 
-    def __init__(self, budget: Budget, *, is_shown: bool = True) -> None:
-        self._budget = budget
+    def __init__(self, left: Callable[[], float] = lambda: inf, *, is_shown: bool = True) -> None:
+        self._left = left  # seconds of the run
         self._is_shown = is_shown
         self._bar: Any = None
         # A notebook's `!command` has a terminal, but Jupyter keeps every state of a line. It sets
@@ -135,10 +134,8 @@ class Progress:
                 mininterval=interval,
                 ncols=None if self._is_redrawn else 80,
             )
-        if isfinite(self._budget.time_limit):
-            bar.set_postfix_str(
-                f"budget left {format_duration(self._budget.left())}", refresh=False
-            )
+        if isfinite(left := self._left()):
+            bar.set_postfix_str(f"budget left {format_duration(left)}", refresh=False)
         bar.update(done - bar.n)
 
     def note(self, text: str) -> None:

@@ -1,4 +1,7 @@
-"""The request of a run, its distinct pairs and batches, and the final report."""
+"""The request of a run, the messages between its loop and the workers, and its final report.
+
+Messages are pickled, so none has a connection, a lock, or a large array that the worker can read itself.
+"""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -11,14 +14,194 @@ from numpy.typing import NDArray
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.console import Event
-from mkpc_kaggle.engine.store.dataframes import PairTables
-from mkpc_kaggle.engine.store.keys import Keys
-from mkpc_kaggle.engine.store.tables import MIN_PAIRS, About, SceneRecord
+from mkpc_kaggle.engine.keys import Images, Keys
+from mkpc_kaggle.engine.records import SceneRecord
+from mkpc_kaggle.engine.store import Source
+from mkpc_kaggle.geometry.coordinates import Matrix3
 from mkpc_kaggle.geometry.intrinsics import Rows
-from mkpc_kaggle.recipe import Recipe
+from mkpc_kaggle.geometry.robust import NO_STATS, EstimateStats
+from mkpc_kaggle.pipeline.pair import Regions, UnitResult
+from mkpc_kaggle.recipe import Recipe, Unit
+from mkpc_kaggle.scene.candidates import ALL_UNITS
+from mkpc_kaggle.scene.sfm import Solution
 
 if TYPE_CHECKING:
-    from mkpc_kaggle.engine.plan.state import State
+    from mkpc_kaggle.engine.frames import PairTables
+    from mkpc_kaggle.engine.state import State
+
+MIN_PAIRS = 2  # of a batch that is reconstructed: the minimum to connect three images
+
+
+@dataclass(frozen=True)
+class About:
+    """Facts for reports about the run that wrote the store."""
+
+    # The table of a recipe's file, and the recipe's name
+    recipe: dict[str, Any] = field(default_factory=dict)
+    device: str = ""
+    limit: float | None = None  # in seconds; None: no limit
+    left_out: Sequence[str] = ()  # matchers that did not run, by cause
+    # Of the package and its main dependencies
+    versions: dict[str, str] = field(default_factory=dict)
+    # The images of each dataset of a folder, by batch, also those in no pair
+    files: dict[str, Sequence[str]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Request:
+    """A request for points, estimates and scenes of ``pairs``, whose images are below ``root``.
+
+    ``cameras`` are the user's known cameras. With ``scenes_dir``, a batch is reconstructed as a whole, and
+    each scene has COLMAP's files in a folder there, named by its key. ``publish`` is called with the state, whose
+    ``fundamentals``, ``scenes`` and ``digests`` are the results so far: at the start, every half minute (less
+    often if slow), after each scene with files, and at the end.
+    """
+
+    pairs: Sequence[Pair]
+    recipe: Recipe
+    keys: Keys
+    root: str = ""
+    cameras: Rows = ()
+    scenes_dir: Path | None = None
+    about: About = field(default_factory=About)
+    publish: "Callable[[State], None]" = lambda _: None
+
+
+# Messages
+
+
+@dataclass(frozen=True, eq=False)
+class MatchJob:
+    """Run ``units`` on pairs whose images have these ``digests``, in the recipe's order.
+
+    ``expected`` are the expected seconds of each unit on a pair. A unit begins only if it is expected to end
+    within ``seconds`` of the job's start. ``given`` has the points of each pair that its crops come from,
+    besides the job's own. ``upcoming`` are the images that will probably be matched next.
+    """
+
+    indices: Sequence[int]
+    units: Sequence[Unit]
+    expected: Sequence[float]
+    seconds: float
+    pairs: Sequence[Pair]
+    digests: Sequence[tuple[str, ...]]
+    given: Sequence[tuple[UnitResult, ...]] = ()
+    upcoming: Sequence[Path] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class PairInputs:
+    """Inputs of a pair's estimate or of a scene: its images, and the keys of its points by unit.
+
+    The units are in the recipe's order. ``own`` is for a scene: F from the pair's own matches.
+    """
+
+    index: int
+    images: Images
+    points: Mapping[Unit, str]
+    # An E is estimated if both are known.
+    intrinsics: tuple[Matrix3, Matrix3] | None = None
+    own: Matrix3 | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class EstimateJob:
+    """Estimate F of each pair, or E if the pair has intrinsics."""
+
+    pairs: tuple[PairInputs, ...]
+    recipe: Recipe
+    source: Source
+
+    @property
+    def indices(self) -> list[int]:
+        return [pair.index for pair in self.pairs]
+
+
+@dataclass(frozen=True, eq=False)
+class SceneJob:
+    """Reconstruct a batch from ``matches`` matches, with COLMAP's files in ``folder``, if any.
+
+    A ``candidate`` other than the first has its own ``key``, and ``scene`` is the key of the first. The
+    answer is a :class:`Solution`, with choices in the order of the pairs, which have ``contents``.
+    """
+
+    batch: str
+    key: str
+    pairs: tuple[PairInputs, ...]
+    contents: tuple[str, ...]
+    recipe: Recipe
+    source: Source
+    matches: int = 0
+    folder: Path | None = None
+    cameras: Rows = ()
+    candidate: str = ALL_UNITS
+    scene: str = ""
+
+
+Job = MatchJob | EstimateJob | SceneJob
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """A worker's first answer: it is ready. ``refused`` has the reason for each matcher that could not be
+    loaded.
+    """
+
+    refused: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """Result of a match job on one pair. ``failure`` names an image that cannot be read, or that has changed."""
+
+    results: tuple[UnitResult, ...] = ()
+    regions: Regions | None = None
+    failure: str = ""
+    decode_seconds: float = 0.0
+    cluster_seconds: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Estimated:
+    """The estimate of a pair from the points with these keys; ``inliers`` has a count for each key."""
+
+    points: tuple[str, ...]
+    inliers: tuple[int, ...]
+    F: Matrix3
+    failure: str = ""
+    magsac: Matrix3 | None = None
+    stats: EstimateStats = NO_STATS
+    seconds: float = 0.0
+
+
+class Cause(StrEnum):
+    """Cause of a missing result."""
+
+    NOT_STARTED = "the worker could not be started"
+    REFUSED = "the matchers cannot be loaded"
+    DIED = "the worker died"
+    TIMED_OUT = "the worker hung"
+    DEVICE = "the device failed"
+    OUT_OF_MEMORY = "out of memory"
+    RAISED = "the worker failed"
+
+
+@dataclass(frozen=True)
+class Failure:
+    """The answer when a job failed or a worker cannot take jobs, with the cause."""
+
+    cause: Cause
+    message: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.cause}: {self.message}" if self.message else str(self.cause)
+
+
+# The answer to a match job or an estimate job has a value for each pair, in the order of the job.
+Answer = Loaded | tuple[Outcome, ...] | tuple[Estimated, ...] | Solution | Failure
+
+
+# The report
 
 
 class Ending(StrEnum):
@@ -39,28 +222,6 @@ class Ending(StrEnum):
 
 
 @dataclass(frozen=True)
-class Request:
-    """A request for points, estimates and scenes of ``pairs``, whose images are below ``root``.
-
-    ``cameras`` are the user's known cameras. ``exports`` are the directories for COLMAP's
-    files, by batch. ``publish`` is called with the state, whose
-    ``fundamentals``, ``scenes`` and ``digests`` are the results so far: at the start, every half minute (less
-    often if slow), after each scene with files, and at the end. A trial is not the run's result: its table of
-    pairs is not stored.
-    """
-
-    pairs: Sequence[Pair]
-    recipe: Recipe
-    keys: Keys
-    root: str = ""
-    cameras: Rows = ()
-    exports: Mapping[str, Path] = field(default_factory=dict)
-    about: About = field(default_factory=About)
-    publish: "Callable[[State], None]" = lambda _: None
-    is_trial: bool = False
-
-
-@dataclass(frozen=True)
 class RunReport:
     """The outcome of a run: tables with a row for each pair, in order, and how the run ended.
 
@@ -68,7 +229,7 @@ class RunReport:
     ``unwritten`` says why the last version of the results could not be written.
     """
 
-    tables: PairTables
+    tables: "PairTables"
     ending: Ending
     seconds: float
     resumed: int = 0
@@ -78,12 +239,13 @@ class RunReport:
     unsaved: str = ""  # why the journal does not have all results
     scenes: tuple[SceneRecord, ...] = ()
     units_run: int = 0
-    units_failed: int = 0  # that raised
     estimated: int = 0
-    log: Path | None = None  # the output of workers' libraries, if any
     # As About.files, and the digests of the contents of images in pairs, by name
     files: Mapping[str, Sequence[str]] = field(default_factory=dict)
     digests: Mapping[str, str] = field(default_factory=dict)
+
+
+# Pairs
 
 
 def distinct_pairs(rows: Iterable[Pair]) -> tuple[list[Pair], NDArray[np.int_]]:

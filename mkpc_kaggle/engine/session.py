@@ -1,5 +1,6 @@
-"""Assembly of a run: store, site, engine, signal handling, and the end at the time limit."""
+"""Assembly of a run: store, site, signal handling, and the end at the time limit."""
 
+import hashlib
 import platform
 import shutil
 import signal
@@ -17,20 +18,26 @@ from types import FrameType, MappingProxyType
 from typing import Any, Self
 
 import cv2
+import numpy as np
 
-from mkpc_kaggle.data.competition import Pair, submission_problems, write_submission
+from mkpc_kaggle.data.competition import (
+    Pair,
+    read_submission,
+    submission_problems,
+    write_submission,
+)
 from mkpc_kaggle.data.outputs import remove_unfinished, replacing
-from mkpc_kaggle.engine.console import LOG_NAME, EventKind, leave, logger
-from mkpc_kaggle.engine.loop import Engine
-from mkpc_kaggle.engine.plan.budget import Budget
-from mkpc_kaggle.engine.plan.state import State
-from mkpc_kaggle.engine.request import Request, RunReport
-from mkpc_kaggle.engine.store.database import Store
-from mkpc_kaggle.engine.store.keys import Keys
-from mkpc_kaggle.engine.store.tables import About
-from mkpc_kaggle.engine.workers.cluster import RaySite
-from mkpc_kaggle.engine.workers.places import LISTEN_S, LocalSite
+from mkpc_kaggle.engine.budget import Budget
+from mkpc_kaggle.engine.cluster import RaySite
+from mkpc_kaggle.engine.console import LOG_NAME, Progress, leave, logger
+from mkpc_kaggle.engine.keys import Keys, image_facts
+from mkpc_kaggle.engine.places import LISTEN_S, LocalSite
+from mkpc_kaggle.engine.request import About, Request, RunReport, names_of
+from mkpc_kaggle.engine.run import Run
+from mkpc_kaggle.engine.state import State
+from mkpc_kaggle.engine.store import Store
 from mkpc_kaggle.errors import UserError, writing
+from mkpc_kaggle.geometry.coordinates import Matrix3
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.recipe import PINHOLES, Recipe
@@ -88,7 +95,7 @@ class Session:
     """The environment of a run: everything besides its pairs and its recipe.
 
     ``workers`` is the number of worker processes, or the name of a Ray cluster (see
-    :func:`mkpc_kaggle.engine.workers.cluster.join`). 0 means this process; ``None`` means a process
+    :func:`mkpc_kaggle.engine.cluster.join`). 0 means this process; ``None`` means a process
     for each device.
     ``save`` writes the submission. It returns an empty string, or why the file is not the last version. ``status``
     is the exit status so far; the watchdog uses it if it ends the program during the final report.
@@ -158,13 +165,29 @@ def submit(
     output: Path,
     root: str = "",
 ) -> RunReport:
-    """Match all pairs. ``output`` always has a row for each pair, with the fallback F if necessary."""
+    """Match all pairs. ``output`` always has a row for each pair, with the fallback F if necessary.
+
+    A complete file of an earlier run is kept in the work directory, since this run begins without its results.
+    """
+    ids = [pair.id for pair in pairs]
+    former: dict[str, Matrix3] = {}
+    with suppress(UserError):  # it is missing
+        former = {} if submission_problems(output, ids) else read_submission(output)
 
     def publish(state: State) -> None:
-        ids = (pair.id for pair in pairs)
-        write_submission(output, dict(zip(ids, state.fundamentals, strict=True)))
+        rows = dict(zip(ids, state.fundamentals, strict=True))
+        if any(_is_fallback(rows[each]) and not _is_fallback(F) for each, F in former.items()):
+            # By content: a run that begins often keeps each version once.
+            name = hashlib.blake2b(output.read_bytes(), digest_size=4).hexdigest()
+            shutil.copyfile(output, session.work_dir / f"earlier-{name}.csv")
+        former.clear()
+        write_submission(output, rows)
 
     return run_pairs(pairs, assembly, session, root, publish=publish)
+
+
+def _is_fallback(F: Matrix3) -> bool:
+    return bool(np.allclose(F, FALLBACK_FUNDAMENTAL))
 
 
 @contextmanager
@@ -224,9 +247,11 @@ def run_pairs(
     """
     _require_pinholes(assembly.recipe)
     folders = dict.fromkeys(path.parent for pair in pairs for path in pair.images)
-    with opened_engine(assembly, session, folders) as engine:
-        engine.ask(request_of(pairs, assembly, session, root, **more))
-        return engine.report()
+    with opened_store(session) as store:
+        request = request_of(pairs, assembly, session, root, **more)
+        with opened_run(request, assembly, session, store, folders) as run:
+            run.run()
+            return run.report()
 
 
 def _require_pinholes(recipe: Recipe) -> None:
@@ -270,36 +295,59 @@ def request_of(
 
 
 @contextmanager
-def opened_engine(
+def opened_store(session: Session) -> Iterator[Store]:
+    """Open the store of a session, for one run."""
+    with Store.open(session.work_dir, fresh=session.fresh) as store:
+        # The summary names the workers' log if this run wrote to it.
+        names = [WORKERS_LOG, LOG_NAME] if session.fresh else [WORKERS_LOG]
+        for name in names:
+            with suppress(OSError):
+                (session.work_dir / name).unlink(missing_ok=True)
+        yield store
+
+
+@contextmanager
+def opened_run(
+    request: Request,
     assembly: Assembly,
     session: Session,
+    store: Store,
     folders: Iterable[Path] = (),
-) -> Iterator[Engine]:
-    """Open an engine and its store. On leaving, end the workers and publish the last results.
+) -> Iterator[Run]:
+    """Open a run of a request. On leaving, end the workers and publish the last results.
 
     ``folders`` hold the images, and must exist on every machine.
     """
-    budget = session.budget
+    clock = session.budget.clock
     workers = session.workers
-    with Store.open(session.work_dir, fresh=session.fresh) as store:
-        log = session.work_dir / WORKERS_LOG
-        # The summary names the file if this run wrote to it.
-        with suppress(OSError):
-            log.unlink(missing_ok=True)
-            if session.fresh:
-                (session.work_dir / LOG_NAME).unlink(missing_ok=True)
-        engine = Engine(
-            RaySite(assembly, workers, budget.clock, folders, log)
-            if isinstance(workers, str)
-            else LocalSite(assembly, workers, budget.clock, log),
-            store,
-            budget,
-            interrupt=session.interrupt,
-            progress=session.progress,
-        )
-        engine.log.note(EventKind.START)
-        session.save = engine.save_results
-        with engine:
-            yield engine
-        # Only without an error. Reports call a session without this event "not ended".
-        engine.log.note(EventKind.END, engine.ending)
+    log = session.work_dir / WORKERS_LOG
+    site = (
+        RaySite(assembly, workers, clock, folders, log)
+        if isinstance(workers, str)
+        else LocalSite(assembly, workers, clock, log)
+    )
+    budget, interrupt = session.budget, session.interrupt
+    progress = Progress(budget.left, is_shown=session.progress)
+    files: dict[str, Path] = {}
+    for pair in request.pairs:
+        files |= zip(names_of(pair, request.root), pair.images, strict=True)
+    facts = image_facts(
+        store,
+        files,
+        lambda: interrupt.is_set() or budget.clock() >= budget.stop_waiting,
+        lambda done, total: progress.count("reading", done, total, "image"),
+    )
+    progress.close()
+    state = State(request, *facts)
+    state.restore(store)
+    run = Run(
+        state,
+        site,
+        store,
+        budget,
+        interrupt=interrupt,
+        progress=session.progress,
+    )
+    session.save = run.publication.save
+    with run:
+        yield run

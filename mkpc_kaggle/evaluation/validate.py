@@ -18,9 +18,9 @@ from mkpc_kaggle.data.competition import (
     read_rows,
     read_submission,
 )
+from mkpc_kaggle.engine.frames import PairTables, matrices_of
 from mkpc_kaggle.engine.request import RunReport
 from mkpc_kaggle.engine.session import Session, run_pairs
-from mkpc_kaggle.engine.store.dataframes import PairTables, matrices_of
 from mkpc_kaggle.errors import UserError, plural
 from mkpc_kaggle.geometry import metrics
 from mkpc_kaggle.geometry.coordinates import Matrix3
@@ -138,19 +138,16 @@ def score_pair(
 ) -> PairScore:
     """Return the score of the pair in a row of the run's tables.
 
-    An F from the fallback counts as a failure. The F of an earlier run, perhaps with other settings,
-    does not count.
+    An F from the fallback counts as a failure.
     """
     pair = tables.pairs.loc[row]
     estimate = tables.estimates.loc[row]
     own: Any = None if pair["failure"] else estimate["F"]
     # Without a prior, the pair's F is MAGSAC's.
     matrices = {Step.MAGSAC: estimate["magsac"] if Step.PRIOR in steps else own, Step.PRIOR: own}
-    matrices[Step.SCENE] = own
-    if pair["source"] != "earlier":
-        # The row of the submission: the scene's F, else the pair's.
-        written = matrices_of(tables.pairs.loc[[row]])[0]
-        matrices[Step.SCENE] = None if pair["source"] == "fallback" else written
+    # The row of the submission: the scene's F, else the pair's.
+    written = matrices_of(tables.pairs.loc[[row]])[0]
+    matrices[Step.SCENE] = None if pair["source"] == "fallback" else written
     # The last step's error is the pair's, also where a step was not made.
     errors = {step: error_of(matrix, true, scene) for step, matrix in matrices.items()}
     return scored_pair(true, errors[Step.SCENE], {step: errors[step] for step in steps})

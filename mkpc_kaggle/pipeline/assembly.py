@@ -70,11 +70,8 @@ class Assembly:
     def on_cpu(self) -> "Assembly":
         return replace(self, placement=Placement(), sharing=1)
 
-    def unit_settings(self, unit: Unit, precision: Precision | None = None) -> dict[str, Any]:
-        """Return all settings that determine a unit's points on given views, as JSON values.
-
-        ``precision`` is the one that the points were computed in; default: the placement's.
-        """
+    def unit_settings(self, unit: Unit) -> dict[str, Any]:
+        """Return all settings that determine a unit's points on given views, as JSON values."""
         name = unit.matcher
         fields = asdict(unit)
         del fields["tracks"]  # scenes read the points without changing them
@@ -87,7 +84,7 @@ class Assembly:
         settings: dict[str, Any] = {
             "unit": fields,
             "options": None if is_own else asdict(options_of(self.recipe, name)),
-            "precision": precision or self.placement.precision,
+            "precision": self.placement.precision,
             "weights": weights,
         }
         # The weights of a matcher of this package have digests, and its code has ``keys.POINTS_VERSION``.

@@ -44,7 +44,6 @@ class UnitResult:
     failure: str = ""  # the reason for a result without matches
     warm_up: bool = False  # the first run of the unit in this process, which may take much longer
     note: str = ""  # why the unit did not run as written
-    is_float32: bool = False  # even if the run was given another precision
     keypoints: int = 0  # detected in the first view; 0 for a matcher without a detector
     need: CropNeed | None = None  # of stage 2; one that is not needed has no matches
 

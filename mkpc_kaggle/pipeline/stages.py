@@ -71,10 +71,8 @@ class Pipeline:
         cache_bytes: int = ENCODING_CACHE_BYTES,
         load_float32: Callable[[str], Matcher[Any]] | None = None,
         masks: Masks | None = None,
-        precision: Precision = Precision.FLOAT32,
         synchronise: Callable[[], None] | None = None,
     ) -> None:
-        self._precision = precision
         self.raising: Container[str] = ()
         self._masks = MaskReader(masks or Masks())
         self.recipe = recipe
@@ -116,7 +114,6 @@ class Pipeline:
             cache_bytes=cache_bytes,
             load_float32=None if exact == placement else partial(assembly.load, placement=exact),
             masks=assembly.masks,
-            precision=placement.precision,
             synchronise=synchronise,
         )
 
@@ -145,8 +142,9 @@ class Pipeline:
     ) -> list[PairMatch]:
         """Run each unit on the pairs that have no result of it.
 
-        First the units of stage 1, then the critical regions, then the units of stage 2 on the pairs
-        that need them. A unit that a pair does not need has a result without matches.
+        In the order of the recipe: the critical regions of a unit of stage 2 come from the matches of the
+        units of stage 1 before it, and it is left out on a pair that lacks one of these for want of time. A
+        unit that a pair does not need has a result without matches.
         ``may_start(unit, pairs)`` is called before each minibatch of a unit, with its number of
         pairs. False halves the minibatch, and stops the unit before a single pair. If a
         matcher raises, the minibatch's pairs run one by one, and a pair that raises again gets a
@@ -155,22 +153,23 @@ class Pipeline:
         """
         # The caller's list stays as it is; ``_run`` replaces entries of this one.
         pairs = list(pairs)
-        units = list(units)
-        for unit in units:
-            if unit.stage == 1:
-                self._run(unit, pairs, may_start)
-        crops = [unit for unit in units if unit.stage == 2]
-        if crops:
-            pairs = [with_regions(pair, self.recipe) for pair in pairs]
-        for unit in crops:
-            pairs = [self._with_need(pair, unit) for pair in pairs]
-            self._run(unit, pairs, may_start)
+        units = sorted(units, key=self.recipe.units.index)
+        for number, unit in enumerate(units):
+            before = [each for each in units[:number] if each.stage == 1]
+            waiting = []
+            for index, pair in enumerate(pairs):
+                done = {result.unit for result in pair.results}
+                if unit not in done and (unit.stage == 1 or done.issuperset(before)):
+                    waiting.append(index)
+            if unit.stage == 2:
+                for index in waiting:
+                    pairs[index] = self._with_need(pairs[index], unit)
+            self._run(unit, pairs, waiting, may_start)
         return pairs
 
     def _with_need(self, pair: PairMatch, unit: Unit) -> PairMatch:
-        """Return the pair with an empty result if it does not need a unit of stage 2."""
-        if unit in (result.unit for result in pair.results):
-            return pair
+        """Return the pair with the regions of a unit of stage 2, and an empty result if it does not need it."""
+        pair = with_regions(pair, self.recipe, unit)
         need = need_of(unit, pair, self.recipe)
         if need.is_needed:
             return pair
@@ -178,12 +177,16 @@ class Pipeline:
         return replace(pair, results=(*pair.results, result))
 
     def _run(
-        self, unit: Unit, pairs: list[PairMatch], may_start: Callable[[Unit, int], bool]
+        self,
+        unit: Unit,
+        pairs: list[PairMatch],
+        chosen: Sequence[int],
+        may_start: Callable[[Unit, int], bool],
     ) -> None:
-        """Add the unit's results to the pairs, in place."""
+        """Add the unit's results to the chosen pairs that have none, in place."""
         waiting = []
-        for number, pair in enumerate(pairs):
-            if unit not in (result.unit for result in pair.results):
+        for number in chosen:
+            if unit not in (result.unit for result in pairs[number].results):
                 waiting.append(number)
         while waiting:
             size = min(len(waiting), self._minibatches.get(unit, self.minibatch))
@@ -297,7 +300,6 @@ class Pipeline:
                 (matched - encoded) / len(pairs),
                 warm_up=warm_up,
                 note=self._notes.get(unit.matcher, ""),
-                is_float32=self._precision is Precision.FLOAT32 or unit.matcher in self._notes,
                 keypoints=len(getattr(encoding, "points", ())),
                 need=need_of(unit, pair, self.recipe) if unit.stage == 2 else None,
             )
@@ -404,7 +406,7 @@ def need_of(unit: Unit, pair: PairMatch, recipe: Recipe) -> CropNeed:
     assert pair.regions is not None
     image0, image1 = pair.images
     region0, region1 = pair.regions
-    seen = [result.unit for result in pair.results if result.unit.stage == 1]
+    seen = [result.unit for result in _before(pair, recipe, unit)]
 
     def whole(size: Size) -> float:
         # The finest view of stage 1; without one, the image as it is stored.
@@ -425,15 +427,24 @@ def _scale_of(unit: Unit, crop: Box) -> float:
     return min(unit.view(crop, multiple=1).scale)
 
 
-def with_regions(pair: PairMatch, recipe: Recipe) -> PairMatch:
-    """Return the pair with each image's critical region, from the matches of stage 1."""
+def with_regions(pair: PairMatch, recipe: Recipe, crop: Unit) -> PairMatch:
+    """Return the pair with each image's critical region for a unit of stage 2."""
     start = time.perf_counter()
-    # In the recipe's order: after an interrupted run, units of stage 1 may have run in another.
-    ordered = sorted(pair.results, key=lambda result: recipe.units.index(result.unit))
-    matches = Matches.concatenate(result.matches for result in ordered if result.unit.stage == 1)
+    found = _before(pair, recipe, crop)
+    matches = Matches.concatenate(result.matches for result in found)
     image0, image1 = pair.images
     region0 = critical_region(matches.points0, image0.size, recipe.mkpc)
     region1 = critical_region(matches.points1, image1.size, recipe.mkpc)
     scale = scale_between(matches, (image0.size, image1.size))
-    seconds = time.perf_counter() - start
+    seconds = pair.cluster_seconds + time.perf_counter() - start
     return replace(pair, regions=(region0, region1), scale=scale, cluster_seconds=seconds)
+
+
+def _before(pair: PairMatch, recipe: Recipe, crop: Unit) -> list[UnitResult]:
+    """Return the pair's results of stage 1 before a unit of stage 2, in the recipe's order."""
+    order = recipe.units.index
+    found = [result for result in pair.results if result.unit.stage == 1]
+    return sorted(
+        (result for result in found if order(result.unit) < order(crop)),
+        key=lambda result: order(result.unit),
+    )

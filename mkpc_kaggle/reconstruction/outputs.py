@@ -12,7 +12,7 @@ from typing import Any, Self
 import numpy as np
 
 from mkpc_kaggle.data.outputs import lies_in
-from mkpc_kaggle.engine.store.database import FILE_NAME
+from mkpc_kaggle.engine.store import FILE_NAME
 from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.reconstruction.folder import CAMERA_COLUMNS
@@ -22,8 +22,8 @@ from mkpc_kaggle.scene.models import SfmModel
 from mkpc_kaggle.scene.view_graph import BatchImage
 
 WORK = "work"
-# In WORK: COLMAP's files as the scene's job writes them, and the largest model of the last run
-SCENE, FORMER = "scene", "former"
+# In WORK: COLMAP's files of each scene by its key, and the largest model of the last run
+SCENES, FORMER = "scenes", "former"
 TABLE = "cameras.csv"
 PAGE = "report.html"
 RESULTS = (DATABASE, MODELS, TABLE, IMAGES, SPARSE)
@@ -77,7 +77,7 @@ class Writer:
 
     def __init__(self, root: Path, out: Path) -> None:
         self._root, self._out = root, out
-        self._version = 0
+        self._scene = ""  # the key of the scene that is written
         self._child: Child | None = None
 
     def __enter__(self) -> Self:
@@ -87,14 +87,13 @@ class Writer:
         if self._child is not None:
             self._child.kill()
 
-    def update(self) -> None:
-        """Begin to write the files of a new scene."""
-        made = self._out / WORK / SCENE / MODELS
-        version = made.stat().st_mtime_ns if made.is_dir() else 0
-        if version and version != self._version:
+    def update(self, scene: str) -> None:
+        """Begin to write the files of the scene with this key."""
+        folder = self._out / WORK / SCENES / scene
+        if scene != self._scene:
             self.__exit__()
-            self._version = version
-            self._child = Child(write_results, self._root, self._out)
+            self._scene = scene
+            self._child = Child(write_results, self._root, self._out, folder)
 
     def next(self, ends: float) -> list[SfmModel]:
         """Return the next value of :func:`write_results`, until ``ends`` on the monotonic clock; no
@@ -103,7 +102,7 @@ class Writer:
         return [] if self._child is None else list(self._child.next(ends))
 
 
-def write_results(root: Path, out: Path) -> Iterator[list[SfmModel]]:
+def write_results(root: Path, out: Path, scene: Path) -> Iterator[list[SfmModel]]:
     """Write the models of the scene to ``out``, moved onto the former model; yield them. Then write
     ``images`` and ``sparse``, and yield again.
 
@@ -112,7 +111,6 @@ def write_results(root: Path, out: Path) -> Iterator[list[SfmModel]]:
     import pycolmap
 
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
-    scene = out / WORK / SCENE
     folders = sorted((scene / MODELS).iterdir(), key=lambda folder: int(folder.name))
     models = [pycolmap.Reconstruction(folder) for folder in folders]
     if (out / WORK / FORMER).is_dir():

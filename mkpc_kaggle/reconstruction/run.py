@@ -12,11 +12,17 @@ from typing import Any
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.data.masks import Masks
+from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.console import logger
-from mkpc_kaggle.engine.plan.budget import Budget
-from mkpc_kaggle.engine.plan.state import State
-from mkpc_kaggle.engine.scenes import scene_failures
-from mkpc_kaggle.engine.session import Interrupt, Session, interruptible, opened_engine, request_of
+from mkpc_kaggle.engine.session import (
+    Interrupt,
+    Session,
+    interruptible,
+    opened_run,
+    opened_store,
+    request_of,
+)
+from mkpc_kaggle.engine.state import State
 from mkpc_kaggle.errors import UserError, plural, temporary_directory
 from mkpc_kaggle.matchers.contract import Matcher
 from mkpc_kaggle.pipeline.assembly import Assembly, PathSource, Weights, assemble
@@ -24,7 +30,7 @@ from mkpc_kaggle.recipe import CameraSharing, Recipe, SceneConfig
 from mkpc_kaggle.reconstruction.folder import Ends, read_folder, read_intrinsics, read_pair_list
 from mkpc_kaggle.reconstruction.outputs import (
     PAGE,
-    SCENE,
+    SCENES,
     WORK,
     Writer,
     keep_former,
@@ -204,8 +210,8 @@ def _run(
     with Writer(root, out) as writer:
 
         def publish(state: State) -> None:
-            if batch in state.scenes.in_use:
-                writer.update()
+            if batch in state.scenes:
+                writer.update(state.scenes[batch].key)
 
         request = request_of(
             pairs,
@@ -213,15 +219,18 @@ def _run(
             session,
             str(root),
             {batch: list(names.values())},
-            exports={batch: out / WORK / SCENE},
+            scenes_dir=out / WORK / SCENES,
             publish=publish,
         )
-        with opened_engine(assembly, session, {file.parent for file in files}) as engine:
+        folders = {file.parent for file in files}
+        with (
+            opened_store(session) as store,
+            opened_run(request, assembly, session, store, folders) as run,
+        ):
             keep_former(out)
-            engine.ask(request)
-            assert engine.state is not None
-            failures = [str(failure) for failure in scene_failures(engine.state).values()]
-            report = engine.report()
+            run.run()
+            failures = [*run.state.scene_failures.values()]
+            report = run.report()
         problems = [trouble(report), report.unwritten, report.unsaved, *failures]
         has_models = any(record.models for record in report.scenes)
         models: list[SfmModel] = []

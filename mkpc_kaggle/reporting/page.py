@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.data.outputs import replacing
-from mkpc_kaggle.engine.store.dataframes import Results, results
+from mkpc_kaggle.engine.frames import Results, results
 from mkpc_kaggle.errors import UserError, printable, writing
 from mkpc_kaggle.pipeline.arguments import as_image
 from mkpc_kaggle.pipeline.drawing import draw_strip

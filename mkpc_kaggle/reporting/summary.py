@@ -5,9 +5,9 @@ from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
 from mkpc_kaggle.engine.console import EventKind
+from mkpc_kaggle.engine.frames import NOT_REACHED, Results, scene_table
+from mkpc_kaggle.engine.records import NOT_RECONSTRUCTED
 from mkpc_kaggle.engine.request import Ending, RunReport
-from mkpc_kaggle.engine.store.dataframes import NOT_REACHED, Results, scene_table
-from mkpc_kaggle.engine.store.tables import NOT_RECONSTRUCTED
 from mkpc_kaggle.errors import plural
 from mkpc_kaggle.progress import format_duration
 from mkpc_kaggle.recipe import Recipe
@@ -23,7 +23,6 @@ MAX_NAMED = 3  # names in a line
 SOURCES_OF_F = {
     "scene": "from cameras",
     "pair": "from their own matches",
-    "earlier": "of an earlier run",
     "fallback": "the fallback",
 }
 
@@ -210,7 +209,6 @@ def unreadable_images(pairs: "DataFrame") -> list[str]:
     """Return the reason of each image that could not be decoded, sorted."""
     # An image that cannot be read fails in all of its pairs, with one text.
     failures = set(pairs["failure"][is_reached(pairs) & (pairs["units"] == 0)])
-    # An F may be of an earlier run, without a unit of this one.
     return sorted(failures - {""})
 
 

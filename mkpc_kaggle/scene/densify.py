@@ -6,7 +6,7 @@
 - How: matched by the unit of the sweep alone, the recipe's first one of stage 1 that can run, and without an F,
   because they serve scenes alone.
 - When: with [scene], in the phase *Connect*, after the sweep and before any other unit, for up to a tenth of the
-  time that is left then (``pairs_to_connect`` of :mod:`mkpc_kaggle.engine.plan.schedule`). Pairs of the sparsest
+  time that is left then (``pairs_to_connect`` of :mod:`mkpc_kaggle.engine.plan`). Pairs of the sparsest
   batches are kept first.
 """
 

@@ -7,7 +7,7 @@ import pytest
 from rectified import SECOND, SWEEP
 from store_room import Room
 
-from mkpc_kaggle.engine.store.database import Store
+from mkpc_kaggle.engine.store import Store
 
 
 @pytest.fixture

@@ -4,7 +4,7 @@ import time
 import numpy as np
 import pytest
 
-from mkpc_kaggle.engine.plan.budget import (
+from mkpc_kaggle.engine.budget import (
     PACE_WINDOW,
     SCENE_MARGIN,
     SCENE_START_S,

@@ -14,15 +14,12 @@ from rectified import SIZE, THREE_UNITS, RectifiedMatcher, batch_pairs, run
 from simulator import Scenario, memory_store, simulate
 from synthetic import QUICK, SyntheticMatcher, synthetic_pairs
 
-from mkpc_kaggle.engine.jobs import SceneJob
-from mkpc_kaggle.engine.plan.budget import Budget
-from mkpc_kaggle.engine.request import Ending, RunReport
+from mkpc_kaggle.engine.budget import Budget
+from mkpc_kaggle.engine.frames import results
+from mkpc_kaggle.engine.records import Rival, SceneRecord
+from mkpc_kaggle.engine.request import Ending, RunReport, SceneJob
 from mkpc_kaggle.engine.session import Interrupt, Session, run_pairs
-from mkpc_kaggle.engine.store.database import Store
-from mkpc_kaggle.engine.store.dataframes import results
-from mkpc_kaggle.engine.store.published import Published
-from mkpc_kaggle.engine.store.tables import Rival
-from mkpc_kaggle.engine.workers.worker import compute_scene
+from mkpc_kaggle.engine.worker import compute_scene
 from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.recipe import Recipe, SceneConfig, Unit
 from mkpc_kaggle.scene.candidates import ALL_UNITS, SUPPORTED
@@ -88,10 +85,6 @@ def test_a_candidate_is_a_result_under_its_key_and_is_not_made_twice(tmp_path, m
     assert made == []
     assert again.scenes == first.scenes
     assert again.scenes[0].rivals == first.scenes[0].rivals
-    with Store.open(tmp_path / "work") as store:
-        store.prune(Published.of(store).keys)
-    run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
-    assert made == [], "a prune keeps the others, too"
     # Fewer candidates are no reason to make the first again, more make only the missing ones.
     one = replace(RECIPE, scene=SceneConfig())
     assert numbers(run(pairs, one, RectifiedMatcher(), tmp_path / "work")) == {1.0}
@@ -127,7 +120,7 @@ def test_a_candidate_that_is_lost_costs_itself_alone_and_the_next_run_tries_it_a
     report = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
     assert report.ending is Ending.COMPLETE
     assert numbers(report) == {4.0}
-    fault = f"batch one was not reconstructed from the tracks of {FIRST}"
+    fault = f"batch one was not reconstructed by the tracks of {FIRST}"
     assert any(each.startswith(fault) for each in report.faults)
     assert not report.scenes[0].failure
     del made[:]
@@ -184,7 +177,9 @@ def test_interrupted_and_resumed_runs_choose_as_an_undisturbed_one(until):
     assert sum(again.values()) <= sum(jobs.values()) + 1
 
 
-def test_files_of_colmap_are_those_of_the_chosen_candidate(tmp_path, monkeypatch):
+def test_each_candidate_has_its_files_of_colmap_and_one_without_them_is_made_again(
+    tmp_path, monkeypatch
+):
     """Real reconstructions; the second agrees best."""
     width = 640
     units = (Unit(1, "synthetic", width), Unit(1, "synthetic", width // 2))
@@ -197,25 +192,26 @@ def test_files_of_colmap_are_those_of_the_chosen_candidate(tmp_path, monkeypatch
 
     scenes_by(monkeypatch, judge)
     pairs = synthetic_pairs(tmp_path / "images", 4)
-    out = tmp_path / "colmap"
+    scenes = tmp_path / "work" / "scenes"
 
-    def ask() -> str:
+    def ask() -> SceneRecord:
         matcher = SyntheticMatcher(images=4)
         assembly = assemble(recipe, matchers={matcher.name: matcher}, device="cpu")
         session = Session(tmp_path / "work", Budget(time.monotonic()), Interrupt(), progress=False)
-        (scene,) = run_pairs(pairs, assembly, session, exports={"batch": out}).scenes
-        return scene.candidate
+        (scene,) = run_pairs(pairs, assembly, session, scenes_dir=scenes).scenes
+        return scene
 
-    assert ask() == units[1].name
-    # The last job makes the best one again, with its files.
-    assert {job.candidate for job in jobs[1:4]} == {SUPPORTED, *(unit.name for unit in units)}
-    assert [jobs[0].candidate, jobs[4].candidate] == [ALL_UNITS, units[1].name]
-    assert [job.export is not None for job in jobs] == [True, False, False, False, True]
-    assert sorted(path.name for path in out.iterdir()) == ["database.db", "models"]
-    chosen = (out / "models" / "0" / "images.bin").read_bytes()
+    scene = ask()
+    assert scene.candidate == units[1].name
+    assert sorted(path.name for path in scenes.iterdir()) == sorted(job.key for job in jobs)
+    folder = scenes / scene.key
+    assert sorted(path.name for path in folder.iterdir()) == ["database.db", "models"]
+    chosen = (folder / "models" / "0" / "images.bin").read_bytes()
     # Nothing is made again while the files are there.
-    assert ask() == units[1].name
-    assert len(jobs) == 5
-    shutil.rmtree(out)
-    assert ask() == units[1].name
-    assert (out / "models" / "0" / "images.bin").read_bytes() == chosen
+    del jobs[:]
+    assert ask().key == scene.key
+    assert jobs == []
+    shutil.rmtree(folder)
+    assert ask().key == scene.key
+    assert [job.candidate for job in jobs] == [units[1].name]
+    assert (folder / "models" / "0" / "images.bin").read_bytes() == chosen

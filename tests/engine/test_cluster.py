@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from rectified import THREE_UNITS, RectifiedMatcher, run, write_pairs
 
-from mkpc_kaggle.engine.workers.cluster import join, parse_workers
+from mkpc_kaggle.engine.cluster import join, parse_workers
 from mkpc_kaggle.errors import UserError
 
 

@@ -2,25 +2,24 @@
 
 import os
 import signal
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
 import pytest
-from rectified import RectifiedMatcher, run, sources
+from rectified import RectifiedMatcher, run
 from synthetic import QUICK, RECIPE, SyntheticMatcher, synthetic_pairs
 
 from mkpc_kaggle.data.competition import Pair
+from mkpc_kaggle.engine.frames import results
 from mkpc_kaggle.engine.request import Ending
-from mkpc_kaggle.engine.store.database import Store
-from mkpc_kaggle.engine.store.dataframes import matrices_of, results
-from mkpc_kaggle.engine.store.tables import PairEstimate, SceneRecord
+from mkpc_kaggle.engine.store import Store
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.robust import Method
 from mkpc_kaggle.pipeline.stages import Pipeline
-from mkpc_kaggle.recipe import CameraModel, CameraSharing, Recipe, SceneConfig
+from mkpc_kaggle.recipe import CameraSharing, Recipe, SceneConfig
 from mkpc_kaggle.reporting.summary import summary
 
 ALONE = replace(RECIPE, scene=None)
@@ -72,10 +71,7 @@ def test_a_run_resumed_with_another_estimation_ends_with_the_bytes_of_a_fresh_on
         estimated = 0 if name == "no scene" else 6
         assert (report.units_run, report.estimated) == (0, estimated)
         stored = results(journal).recipe
-        # F is of cameras without distortion.
-        pinholes = {"camera_model": CameraModel.SIMPLE_PINHOLE}
-        scene = recipe.scene and replace(recipe.scene, **pinholes)
-        assert stored == replace(recipe, name=stored.name, scene=scene)
+        assert stored == replace(recipe, name=stored.name)
     assert "0 units run, 6 F estimated" in summary(report)
 
 
@@ -85,9 +81,8 @@ def die_at_a_write(pairs: Sequence[Pair], recipe: Recipe, work_dir: Path, *, aft
     """
     put = Store.put
 
-    def put_and_die(store: Store, results: Iterable[object]) -> None:
-        rows = list(results)
-        is_due = any(isinstance(row, PairEstimate | SceneRecord) for row in rows)
+    def put_and_die(store: Store, rows: dict[str, list[object]]) -> None:
+        is_due = "result" in rows
         if after or not is_due:
             put(store, rows)
         if is_due:
@@ -117,18 +112,6 @@ def test_a_run_that_is_killed_while_it_estimates_again_ends_with_the_same_bytes(
         assert process.exitcode == -signal.SIGKILL
     written, _ = submission(pairs, other, tmp_path / "work", NoMatcher(name="synthetic"))
     assert written == undisturbed
-
-
-def test_the_file_has_the_former_f_until_a_new_one_exists(tmp_path):
-    pairs = synthetic_pairs(tmp_path / "images", 4)
-    versions = []
-    first = run(pairs, RECIPE, SyntheticMatcher(images=4), tmp_path / "work")
-    other = replace(RECIPE, magsac=replace(QUICK, threshold=1.0))
-    publish = lambda state: versions.append(state.fundamentals)  # noqa: E731
-    last = run(pairs, other, SyntheticMatcher(images=4), tmp_path / "work", publish=publish)
-    assert np.array_equal(versions[0], matrices_of(first.tables.pairs))
-    assert set(sources(last)) == {"scene"}
-    assert last.estimated == 6
 
 
 def test_e_is_estimated_from_the_points_of_f(tmp_path):

@@ -23,16 +23,12 @@ from shared import write_small_recipe
 from mkpc_kaggle.cli import main
 from mkpc_kaggle.data.competition import read_test_side, submission_problems
 from mkpc_kaggle.demo import DemoSet
-from mkpc_kaggle.engine import session
-from mkpc_kaggle.engine.matching import Matching
-from mkpc_kaggle.engine.plan.state import State
+from mkpc_kaggle.engine import keys, session, worker
+from mkpc_kaggle.engine.frames import matrices_of, pair_tables, results
 from mkpc_kaggle.engine.request import Ending
-from mkpc_kaggle.engine.store import image_files
-from mkpc_kaggle.engine.store.database import Store
-from mkpc_kaggle.engine.store.dataframes import matrices_of, pair_tables, results
-from mkpc_kaggle.engine.store.published import Published
-from mkpc_kaggle.engine.store.tables import UnitPoints
-from mkpc_kaggle.engine.workers import worker
+from mkpc_kaggle.engine.run import Run
+from mkpc_kaggle.engine.state import State
+from mkpc_kaggle.engine.store import Source, Store
 
 ROOT = Path(__file__).resolve().parents[2]
 PATHS = [str(ROOT), str(ROOT / "tests" / "support")]
@@ -81,7 +77,7 @@ def test_a_signal_ends_a_resumed_run_while_an_image_is_digested(tmp_path, monkey
             digested.append(path)
         return "changed"
 
-    monkeypatch.setattr(image_files, "content_digest", digest)
+    monkeypatch.setattr(keys, "content_digest", digest)
     # Copied or restored files have other times: whether they changed, only a digest can tell.
     for path in (tmp_path / "images").iterdir():
         os.utime(path, (0, 0))
@@ -95,22 +91,22 @@ def test_a_signal_ends_a_resumed_run_while_an_image_is_digested(tmp_path, monkey
 def test_an_error_of_the_engine_itself_leaves_the_latest_version_behind(
     pairs, tmp_path, monkeypatch
 ):
-    use = Matching._use
-    used = []
+    save = Run._save_points
+    saved = []
     published = []
 
-    def fail_later(matching: Matching, *arguments: Any) -> None:
-        used.append(matching)
-        if len(used) > 2:
+    def fail_later(self: Run, *arguments: Any) -> None:
+        saved.append(self)
+        if len(saved) > 2:
             raise KeyError("a bug")
-        use(matching, *arguments)
+        save(self, *arguments)
 
-    monkeypatch.setattr(Matching, "_use", fail_later)
+    monkeypatch.setattr(Run, "_save_points", fail_later)
     with pytest.raises(KeyError, match="a bug"):
         run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work", publish=published.append)
     assert len(published[-1].fundamentals) == 12
     with Store.read(tmp_path / "work") as store:
-        has_units = pair_tables(store).pairs["units"] > 0
+        has_units = pair_tables(store.db).pairs["units"] > 0
     assert has_units.tolist() == [True, True] + [False] * 10
 
 
@@ -122,7 +118,7 @@ def test_a_run_whose_store_is_full_keeps_its_results_in_memory(
     def small(self: Store) -> None:
         prepare(self)
         # SQLite then reports a full disk after a few results.
-        self._db.execute("PRAGMA max_page_count = 40")
+        self.db.execute("PRAGMA max_page_count = 40")
 
     monkeypatch.setattr(Store, "_prepare", small)
     report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
@@ -139,37 +135,18 @@ def test_an_error_of_the_disk_when_points_are_read_costs_a_job_and_the_run_goes_
     pairs, undisturbed, tmp_path, monkeypatch
 ):
     errors = iter([sqlite3.OperationalError("disk I/O error")])
-    data = Store.data
+    matches = Source.matches
 
-    def failing(store: Store, kind: type, keys: Any) -> dict[str, bytes]:
-        for error in errors:
-            raise error
-        return data(store, kind, keys)
+    def failing(source: Source, keys: Any) -> Any:
+        if keys := list(keys):
+            for error in errors:
+                raise error
+        return matches(source, keys)
 
-    monkeypatch.setattr(Store, "data", failing)
+    monkeypatch.setattr(Source, "matches", failing)
     report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
     assert report.ending is Ending.COMPLETE
     assert any("disk I/O error" in fault for fault in report.faults)
-    assert matrices(report) == matrices(undisturbed)
-
-
-def test_a_result_that_cannot_be_saved_costs_its_job_and_is_computed_again(
-    pairs, undisturbed, tmp_path, monkeypatch
-):
-    errors = iter([sqlite3.OperationalError("disk I/O error")])
-    put = Store.put
-
-    def failing(store: Store, rows: Any) -> None:
-        rows = list(rows)
-        # Of a worker's answer, and not of a table at the start
-        if any(isinstance(row, UnitPoints) for row in rows):
-            for error in errors:
-                raise error
-        put(store, rows)
-
-    monkeypatch.setattr(Store, "put", failing)
-    report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
-    assert "a result cannot be saved: disk I/O error" in report.faults
     assert matrices(report) == matrices(undisturbed)
 
 
@@ -216,9 +193,8 @@ def test_results_whose_file_cannot_be_written_stay_in_the_table_for_the_next_run
     report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work", publish=full)
     assert "No space left on device" in report.unwritten
     assert report.faults == (report.unwritten,)
-    with Store.open(tmp_path / "work") as store:
-        store.prune(Published.of(store).keys)  # what no version names is lost here
-        assert pair_tables(store).pairs["units"].tolist() == [3] * 12
+    with Store.read(tmp_path / "work") as store:
+        assert pair_tables(store.db).pairs["units"].tolist() == [3] * 12
     written: list[list[bytes]] = []
 
     def note(state: State) -> None:
@@ -306,7 +282,7 @@ def test_scenes_are_reconstructed_after_the_terminal_closed(demo, small_recipe, 
     command = [*script, *arguments_of(demo, small_recipe, output)]
     assert on_a_terminal(command, is_read=True) == 0
     found = results(tmp_path / "submission.work")
-    assert "fault" not in set(found.events["kind"])
+    assert "fault" not in {event.kind for event in found.events}
     assert len(found.scenes) == 1
 
 
@@ -329,12 +305,12 @@ import sys, time
 sys.path[:0] = {path!r}
 from pathlib import Path
 from rectified import THREE_UNITS, RectifiedMatcher, run, write_pairs
-from mkpc_kaggle.engine.plan.budget import Budget
-from mkpc_kaggle.engine.workers.places import LocalSite
-from mkpc_kaggle.engine.plan.state import State
+from mkpc_kaggle.engine.budget import Budget
+from mkpc_kaggle.engine.places import LocalSite
+from mkpc_kaggle.engine.state import State
 
 budget = Budget(time.monotonic(), 1000.0)
-wait, use, saved = LocalSite.wait, State.use_new_estimate, []
+wait, use, saved = LocalSite.wait, State.use_estimate, []
 def noted(self, *estimate):
     use(self, *estimate)
     saved.append(estimate)
@@ -343,7 +319,7 @@ def stuck(self, until):
         return wait(self, until)
     budget.time_limit = budget.spent() + 1
     time.sleep(1000)
-State.use_new_estimate, LocalSite.wait = noted, stuck
+State.use_estimate, LocalSite.wait = noted, stuck
 home = Path(sys.argv[1])
 pairs = write_pairs(home / "pairs", 40)
 def publish(state):
@@ -402,7 +378,7 @@ def test_a_parent_killed_at_any_moment_leaves_a_complete_file_no_orphans_and_a_r
 
 GUARDED = """
 import multiprocessing, os, signal, sys, time
-from mkpc_kaggle.engine.plan.budget import Budget
+from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.session import Interrupt, Session
 
 if __name__ == "__main__":
@@ -490,7 +466,7 @@ def test_a_full_disk_for_the_journal_alone_is_exit_status_one(
 
     def small(self: Store) -> None:
         prepare(self)
-        self._db.execute("PRAGMA max_page_count = 6")
+        self.db.execute("PRAGMA max_page_count = 6")
 
     monkeypatch.setattr(Store, "_prepare", small)
     output = tmp_path / "submission.csv"

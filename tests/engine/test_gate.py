@@ -9,9 +9,9 @@ from faulty import runner
 from rectified import THREE_UNITS, RectifiedMatcher, run, sources, write_pairs
 
 from mkpc_kaggle.data.competition import submission_problems
-from mkpc_kaggle.engine.jobs import Estimated, EstimateJob
-from mkpc_kaggle.engine.workers import places
-from mkpc_kaggle.engine.workers.worker import do_estimates_job
+from mkpc_kaggle.engine import places
+from mkpc_kaggle.engine.request import Estimated, EstimateJob
+from mkpc_kaggle.engine.worker import do_estimates_job
 
 
 def estimate_wrongly(F: np.ndarray, job: EstimateJob) -> tuple[Estimated, ...]:

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine.store import keys
-from mkpc_kaggle.engine.store.keys import Keys
+from mkpc_kaggle.engine import keys
+from mkpc_kaggle.engine.keys import Keys
 from mkpc_kaggle.geometry.coordinates import Box, Size
-from mkpc_kaggle.matchers.contract import MatcherSpec, Placement, Precision
+from mkpc_kaggle.matchers.contract import MatcherSpec
 from mkpc_kaggle.pipeline import assembly
 from mkpc_kaggle.pipeline.assembly import Assembly, assemble
 from mkpc_kaggle.recipe import SceneConfig, Unit, load_recipe
@@ -72,7 +72,7 @@ def test_other_weights_change_the_points_of_their_units_and_of_stage_2(monkeypat
         pair = Pair("p", "b", "0.png", "1.png")
         first = [keys.of_points(unit, pair, IMAGES, []) for unit in (0, 1)]
         # Stage 2 looks at crops from all of stage 1, so it depends on both matchers' weights.
-        second = keys.of_points(2, pair, IMAGES, keys.crops_of(first))
+        second = keys.of_points(2, pair, IMAGES, [keys.mkpc, *first])
         return (*first, second)
 
     pairs = zip(digests(), digests(**{slot: "other"}), strict=True)
@@ -114,18 +114,6 @@ def test_a_matcher_given_in_python_has_the_versions_of_its_packages_in_its_keys(
     assert Keys.of(made).units != former
 
 
-def test_a_unit_in_half_precision_has_the_keys_of_float32_where_it_ran_in_that():
-    exact = assemble(CLASSICAL)
-    half = replace(exact, placement=Placement("cpu", Precision.FLOAT16))
-    pair = Pair("p", "b", "0.png", "1.png")
-
-    def key(keys: Keys, *, is_float32: bool) -> str:
-        return keys.of_points(0, pair, IMAGES, [], is_float32=is_float32)
-
-    assert key(Keys.of(half), is_float32=False) != key(Keys.of(exact), is_float32=False)
-    assert key(Keys.of(half), is_float32=True) == key(Keys.of(exact), is_float32=False)
-
-
 # Another input, and whether the points of stage 1, those of stage 2, the estimate and the scene then
 # have other keys
 OTHERS = {
@@ -151,7 +139,7 @@ def test_a_key_is_the_digest_of_all_inputs_of_a_result(other, changed):
         first_image, second_image = IMAGES
         images = (replace(first_image, digest=digest), second_image)
         one = keys.of_points(0, pair, images, [])
-        two = keys.of_points(1, pair, images, keys.crops_of([first or one]))
+        two = keys.of_points(1, pair, images, [keys.mkpc, first or one])
         points = [two, one] if first_is_last else [one, two]
         estimate = keys.of_estimate(pair, points)
         return [one, two, estimate, keys.of_scene([["names", points, estimate]])]

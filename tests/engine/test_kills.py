@@ -22,13 +22,12 @@ from simulator import VirtualClock
 from synthetic import RECIPE, SyntheticMatcher, synthetic_pairs
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine import session
-from mkpc_kaggle.engine.plan.budget import Budget
+from mkpc_kaggle.engine import places, session
+from mkpc_kaggle.engine.budget import Budget
+from mkpc_kaggle.engine.frames import matrices_of
+from mkpc_kaggle.engine.places import LocalSite
+from mkpc_kaggle.engine.process import ProcessWorker
 from mkpc_kaggle.engine.request import Ending, RunReport
-from mkpc_kaggle.engine.store.dataframes import matrices_of
-from mkpc_kaggle.engine.workers import places
-from mkpc_kaggle.engine.workers.places import LocalSite
-from mkpc_kaggle.engine.workers.process import ProcessWorker
 from mkpc_kaggle.geometry.robust import RobustConfig
 
 BATCHES = WORKERS = 3  # in a run so many scene workers and so many matching workers are disturbed
@@ -169,7 +168,7 @@ def test_a_run_whose_workers_are_killed_and_stopped_at_random_moments_ends_as_th
         pairs += synthetic_pairs(folder, batch=str(batch))
     budget = Budget(0.0, inf, VirtualClock())
     monkeypatch.setattr(places, "ProcessWorker", DoomedWorker)
-    monkeypatch.setattr(places, "RESTART_PAUSE_S", 0.0)
+    monkeypatch.setattr("mkpc_kaggle.engine.run.RESTART_PAUSE_S", 0.0)
     monkeypatch.setattr(session, "LocalSite", PatientSite)
 
     def run_whole(name: str) -> RunReport:

@@ -11,7 +11,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -25,8 +24,8 @@ from simulator import Scenario, memory_store, simulate
 
 from mkpc_kaggle.cli import main
 from mkpc_kaggle.demo import DemoSet
+from mkpc_kaggle.engine.frames import results
 from mkpc_kaggle.engine.request import Ending, RunReport
-from mkpc_kaggle.engine.store.dataframes import results
 
 FIRST = '{ stage = 1, matcher = "sift", long_side = 320 }'
 SECOND = '{ stage = 2, matcher = "sift", long_side = 400 }'
@@ -112,6 +111,10 @@ CHANGES: dict[str, tuple[Callable[[Room], None], Callable[[Room], int]]] = {
     "a unit removed": (lambda room: room.units(FIRST), lambda room: 0),
     "a unit of stage 1 added": (
         lambda room: room.units(FIRST, SECOND, THIRD),
+        lambda room: BEFORE,
+    ),
+    "a unit of stage 1 before the crop": (
+        lambda room: room.units(FIRST, THIRD, SECOND),
         lambda room: 2 * BEFORE,
     ),
     "another threshold": (
@@ -156,7 +159,6 @@ def test_a_simulated_run_cut_by_its_limit_at_a_random_moment_and_finished_later_
     seed,
 ):
     rng = np.random.default_rng(seed)
-    # Units of stage 1, 2, 1, ...: points of stage 2 are computed again after a later unit of stage 1.
     count = rng.integers(3, 6)
     costs = tuple(rng.uniform(0.2, 2.0, count).tolist())
     crops = (1.0, 0.3)[seed % 2]
@@ -173,21 +175,6 @@ def test_a_simulated_run_cut_by_its_limit_at_a_random_moment_and_finished_later_
     assert finished.keys == fresh.keys
     assert finished.stale == set()
     assert cut.keys != fresh.keys or cut.report.ending is Ending.COMPLETE
-
-
-def test_points_of_stage_2_are_computed_again_when_the_pair_has_new_points_of_stage_1():
-    """The limit leaves time for two of three units on all pairs, and the second looks at crops of
-    the first.
-    """
-    whole = Scenario(60, (1.0, 1.0, 1.0), 1, math.inf, spread=0.1, warm_up=0, misses=0)
-    store = memory_store()
-    cut = simulate(replace(whole, limit=150.0), store)
-    units = Counter(cut.report.tables.pairs["units"])
-    assert units[2] > 20
-    assert units[3] > 0
-    finished = simulate(whole, store)
-    assert finished.keys == simulate(whole).keys
-    assert finished.report.units_run >= 2 * units[2], "the third unit, and the second on its crops"
 
 
 @pytest.mark.parametrize("moments", [4, pytest.param(20, marks=pytest.mark.slow)])
@@ -243,27 +230,6 @@ def test_ten_kills_after_a_change_leave_the_same_bytes(room: Room, change: str) 
     assert room.run() == room.run("fresh.csv")
 
 
-def test_a_prune_frees_the_results_of_former_settings_and_keeps_those_of_the_last_run(
-    room: Room, capsys
-) -> None:
-    room.units(FIRST, SECOND, more="[matchers.sift]\nratio = 0.75")
-    last = room.run()
-    capsys.readouterr()
-    store = room.home / "a.work" / "journal.sqlite"
-    before = store.stat().st_size
-    tables = room.home / "tables"
-    assert main(["journal", str(store.parent), "--prune", "--csv", str(tables)]) == 0
-    assert (tables / "pairs.csv").exists()
-    (freed,) = re.findall(r"(\d+\.\d\d) MB are free again", capsys.readouterr().out)
-    assert float(freed) == round((before - store.stat().st_size) / 1e6, 2) > 0
-    assert room.run() == last
-    assert "0 units run, 0 F estimated" in capsys.readouterr().out
-    # The former settings again: their results are gone.
-    room.units(FIRST, SECOND)
-    room.run()
-    assert f"{2 * BEFORE} units run" in capsys.readouterr().out
-
-
 def test_a_lower_factor_runs_only_the_crops_that_it_adds(room: Room, capsys) -> None:
     def units_run(factor: float) -> int:
         room.units(FIRST, SECOND.replace("400", "360"), more=RULE.format(factor))
@@ -291,7 +257,8 @@ def test_images_added_to_a_folder_are_matched_with_each_other_and_with_the_forme
     (tmp_path / "in").mkdir()
     recipe = tmp_path / "small.toml"
     folder = tmp_path / "in"
-    recipe.write_text(f"units = [{FIRST}]\n")
+    # Enough matches for a model of four images
+    recipe.write_text(f"units = [{FIRST.replace('320', '640')}]\n")
 
     def reconstruct(out: str) -> tuple[int, list[str]]:
         options = ["--recipe", str(recipe), "--workers", "0", "--out", str(tmp_path / out)]
@@ -311,7 +278,7 @@ def test_images_added_to_a_folder_are_matched_with_each_other_and_with_the_forme
     assert run == 9
     assert cameras == reconstruct("fresh")[1]
     assert reconstruct("out") == (0, cameras)
-    (tmp_path / "out" / "work" / "scene" / "database.db").unlink()
+    shutil.rmtree(tmp_path / "out" / "work" / "scenes")
     (tmp_path / "out" / "database.db").unlink()
     assert reconstruct("out") == (0, cameras)
     assert (tmp_path / "out" / "database.db").exists(), "the scene is made again"

@@ -16,10 +16,9 @@ import numpy as np
 import pytest
 from faulty import choose_scene_for_all_but_the_first, on_fork, runner
 
-from mkpc_kaggle.engine.jobs import Cause, Failure, Loaded, SceneJob
-from mkpc_kaggle.engine.store.database import Source
-from mkpc_kaggle.engine.store.tables import UnitPoints
-from mkpc_kaggle.engine.workers.process import WORKER_ENVIRONMENT, ProcessWorker
+from mkpc_kaggle.engine.process import WORKER_ENVIRONMENT, ProcessWorker
+from mkpc_kaggle.engine.request import Cause, Failure, Loaded, SceneJob
+from mkpc_kaggle.engine.store import Source
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.recipe import Recipe, SceneConfig, Unit
@@ -35,9 +34,7 @@ IMAGES = (
 POINTS = np.random.default_rng(1).uniform(0, 70, (50_000, 2)).astype(np.float32)
 MATCHES = Matches(POINTS, POINTS, POINTS[:, 0])
 SCENES = Recipe((Unit(1, "m", 80),), scene=SceneConfig())
-LARGE = SceneJob(
-    "one", "key", (BatchPair(*IMAGES, (MATCHES,)),), ("ab",), SCENES, Source(UnitPoints)
-)
+LARGE = SceneJob("one", "key", (BatchPair(*IMAGES, (MATCHES,)),), ("ab",), SCENES, Source())
 
 
 class Worker(ProcessWorker):
@@ -113,7 +110,7 @@ import os, signal, sys
 sys.path[:0] = {path!r}
 from functools import partial
 from faulty import befall, hang, runner
-from mkpc_kaggle.engine.workers.process import ProcessWorker
+from mkpc_kaggle.engine.process import ProcessWorker
 from test_process import LARGE
 
 if __name__ == "__main__":
@@ -153,7 +150,7 @@ def test_a_worker_at_work_ends_with_its_parent_and_prints_nothing(tmp_path, is_s
 CHECKS = """
 import signal
 from pathlib import Path
-from mkpc_kaggle.engine.workers.process import WORKER_ENVIRONMENT
+from mkpc_kaggle.engine.process import WORKER_ENVIRONMENT
 
 def check():
     entries = Path("/proc/self/environ").read_text().split(chr(0))
@@ -165,8 +162,8 @@ def check():
 STARTS = """
 import os, signal, threading
 from checks import check
-from mkpc_kaggle.engine.jobs import Loaded
-from mkpc_kaggle.engine.workers.process import WORKER_ENVIRONMENT, ProcessWorker
+from mkpc_kaggle.engine.request import Loaded
+from mkpc_kaggle.engine.process import WORKER_ENVIRONMENT, ProcessWorker
 
 answers = threading.Semaphore(0)
 worker = ProcessWorker("scene", check, answers.release)

@@ -21,8 +21,8 @@ from synthetic import RECIPE as SYNTHETIC
 from synthetic import SyntheticMatcher, synthetic_pairs
 
 from mkpc_kaggle.data.competition import Pair
+from mkpc_kaggle.engine.frames import matrices_of
 from mkpc_kaggle.engine.request import Ending
-from mkpc_kaggle.engine.store.dataframes import matrices_of
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.pipeline.assembly import Assembly

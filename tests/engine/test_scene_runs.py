@@ -1,6 +1,5 @@
 """Scenes in whole runs: whose F a pair gets, and what a reconstruction that goes wrong costs."""
 
-import sqlite3
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -26,12 +25,10 @@ from synthetic import RECIPE as SYNTHETIC
 from synthetic import SyntheticMatcher, synthetic_pairs
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine.jobs import SceneJob
-from mkpc_kaggle.engine.request import Ending
-from mkpc_kaggle.engine.store.database import Store
-from mkpc_kaggle.engine.store.dataframes import matrices_of, results
-from mkpc_kaggle.engine.store.published import Published, read_images
-from mkpc_kaggle.engine.workers.worker import batch_pair, results_of
+from mkpc_kaggle.engine.frames import matrices_of, results
+from mkpc_kaggle.engine.request import Ending, SceneJob
+from mkpc_kaggle.engine.store import Store
+from mkpc_kaggle.engine.worker import batch_pair, results_of
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.recipe import SceneConfig
 from mkpc_kaggle.reporting.page import page
@@ -93,34 +90,13 @@ def test_a_focal_length_of_exif_goes_to_the_pairs_the_store_and_the_scene(tmp_pa
     for name, expected in cases:
         reports.append(run(pairs, recipe, RectifiedMatcher(), tmp_path / name))
         with Store.read(tmp_path / name) as store:
-            rows = Published.of(store).rows
-            focals = [tuple(image.focal for image in read_images(store, row)) for row in rows]
-        assert focals == expected
+            known = dict(store.db.execute("SELECT name, focal FROM image"))
+        assert [(known[pair.file0], known[pair.file1]) for pair in pairs] == expected
         set_exif(pairs[0].images[0], tA405=28)
     without, with_exif = (each.tables.estimates["F"] for each in reports)
     assert not np.array_equal(without[0], with_exif[0])
     assert np.array_equal(without[2], with_exif[2]), "the pair of the other images"
     assert [pair.images[0].focal for pair in jobs[-1].pairs] == [told, told, 0]
-
-
-@pytest.mark.parametrize(("count", "expected"), [(1, "scene"), (9, "pair")])
-def test_an_error_of_the_disk_when_a_scene_begins_costs_that_job_and_the_run_goes_on(
-    tmp_path, monkeypatch, count, expected
-):
-    scenes_by(monkeypatch, choose_scene_for_all_but_the_first)
-    errors = iter([sqlite3.OperationalError("disk I/O error")] * count)
-    source = Store.source
-
-    def failing(store: Store, kind: type, keys: Any) -> Any:
-        for error in errors:
-            raise error
-        return source(store, kind, keys)
-
-    monkeypatch.setattr(Store, "source", failing)
-    pairs = batch_pairs(tmp_path / "images")
-    report = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
-    assert any("the store cannot be read: disk I/O error" in fault for fault in report.faults)
-    assert sources(report) == ["pair"] + [expected] * 5
 
 
 @pytest.mark.parametrize(
@@ -212,9 +188,7 @@ def test_the_scene_of_a_run_is_made_of_tracks_and_judged_by_all_matches(tmp_path
     assert all(0 < len(pair.tracks) < len(pair.matches) for pair in given)
 
 
-def test_a_resumed_run_reconstructs_only_the_batch_whose_image_was_replaced(
-    tmp_path, monkeypatch, capsys
-):
+def test_a_resumed_run_reconstructs_only_the_batch_whose_image_was_replaced(tmp_path, monkeypatch):
     scenes_by(monkeypatch, choose_scene_for_all_but_the_first)
     one = batch_pairs(tmp_path / "images")
     two = batch_pairs(tmp_path / "others", 3, "two")
@@ -224,7 +198,6 @@ def test_a_resumed_run_reconstructs_only_the_batch_whose_image_was_replaced(
     # From now on every reconstruction fails, so a success is the stored one.
     scenes_by(monkeypatch, partial(befall, lack_an_image))
     again = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
-    assert "1 image changed; matching 3 pairs again" in capsys.readouterr().err
     assert sources(again) == ["pair"] * 6 + ["pair", "scene", "scene"]
     has_failed = {scene.batch: bool(scene.failure) for scene in again.scenes}
     assert has_failed == {"one": True, "two": False}

@@ -18,7 +18,6 @@ from mkpc_kaggle.engine.console import (
     logger,
     read_events,
 )
-from mkpc_kaggle.engine.plan.budget import Budget
 
 ROOT = Path(__file__).resolve().parents[2]
 QUIET_LIBRARY = """
@@ -32,7 +31,7 @@ LOGS = """
 import sys, threading
 from library import complain
 from pathlib import Path
-from mkpc_kaggle.engine.workers.process import ProcessWorker
+from mkpc_kaggle.engine.process import ProcessWorker
 
 answers = threading.Semaphore(0)
 worker = ProcessWorker("decoder", complain, answers.release)
@@ -57,10 +56,9 @@ def test_output_of_native_code_in_a_worker_goes_to_a_file_of_the_run(tmp_path):
 
 UNREAD = """
 from mkpc_kaggle.engine.console import Progress, leave, logger, queued
-from mkpc_kaggle.engine.plan.budget import Budget
 
 with queued():
-    progress = Progress(Budget(0.0))
+    progress = Progress()
     for number in range(20_000):
         progress.count("sweep", number % 2, 2)
         logger.warning("pair %d of 20000 %s", number, 100 * "x")
@@ -92,7 +90,7 @@ def test_messages_have_their_level_and_go_to_the_streams_of_the_moment(capsys):
 
 
 def test_a_file_gets_a_line_when_a_phase_begins_and_at_the_end(capsys):
-    progress = Progress(Budget(0.0))
+    progress = Progress()
     for done in range(40, 101):  # resumed pairs took no time of this run
         progress.count("sweep", done, 100)
     progress.note("batch one: 4 of 4 images with a camera")
@@ -110,7 +108,7 @@ def test_a_file_gets_a_line_when_a_phase_begins_and_at_the_end(capsys):
 
 
 def test_a_run_that_shows_no_progress_prints_nothing(capsys):
-    progress = Progress(Budget(0.0), is_shown=False)
+    progress = Progress(is_shown=False)
     progress.count("sweep", 1, 2)
     progress.note("text")
     progress.close()

@@ -5,9 +5,8 @@ from typing import Any
 
 import pytest
 
-from mkpc_kaggle.engine.jobs import EstimateJob, FeatureJob, Job, MatchJob, Phase, SceneJob
-from mkpc_kaggle.engine.plan.budget import ESTIMATE, Budget, Costs
-from mkpc_kaggle.engine.plan.time_limits import start_limit, time_limit
+from mkpc_kaggle.engine.budget import ESTIMATE, Budget, Costs, start_limit, time_limit
+from mkpc_kaggle.engine.request import EstimateJob, Job, MatchJob, SceneJob
 from mkpc_kaggle.recipe import Unit
 
 HOURS = 9 * 3600.0
@@ -16,7 +15,7 @@ SOME: Any = None  # which no limit depends on
 
 
 def matching(pairs: int) -> MatchJob:
-    return MatchJob(Phase.SWEEP, tuple(range(pairs)), (UNIT,), (0.0,), 100.0)
+    return MatchJob(range(pairs), [UNIT], [0.0], 100.0, [], [])
 
 
 def scene(matches: int) -> SceneJob:
@@ -57,9 +56,7 @@ def test_a_warm_up_alone_is_no_measurement_and_is_allowed_again_after_one() -> N
     assert limit_of(matching(1), costs) == limit_of(matching(1), measured(UNIT.name, 1.0)) + 50
 
 
-@pytest.mark.parametrize(
-    "job", [matching(1), matching(64), FeatureJob("key", list)], ids=["unit", "units", "features"]
-)
+@pytest.mark.parametrize("job", [matching(1), matching(64)], ids=["unit", "units"])
 def test_a_job_of_unknown_cost_may_take_a_share_of_the_remaining_time(job: Job) -> None:
     early, late = (limit_of(job, Costs(), 3600.0, since) for since in (0.0, 1800.0))
     assert 0 < late < early < 3600 / 3

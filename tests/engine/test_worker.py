@@ -4,8 +4,9 @@ import pytest
 from faulty import NarrowMatcher
 from rectified import SWEEP, THREE_UNITS
 
-from mkpc_kaggle.engine.jobs import MatchJob, Phase
-from mkpc_kaggle.engine.workers.worker import MatchRunner
+from mkpc_kaggle.data.images import content_digest
+from mkpc_kaggle.engine.request import MatchJob
+from mkpc_kaggle.engine.worker import MatchRunner
 from mkpc_kaggle.pipeline.stages import Pipeline
 
 
@@ -28,16 +29,26 @@ def test_a_minibatch_that_would_not_end_in_time_gets_smaller_or_does_not_begin(
         is_limited=False,
     )
     job = MatchJob(
-        Phase.SWEEP,
-        tuple(range(8)),
-        (SWEEP,),
-        expected=(1e5,),
+        range(8),
+        [SWEEP],
+        expected=[1e5],
         seconds=seconds,
-        pairs=tuple(pairs[:8]),
-        names=tuple((pair.file0, pair.file1) for pair in pairs[:8]),
-        stage_1=((),) * 8,
-        crops=((),) * 8,
+        pairs=pairs[:8],
+        digests=[tuple(map(content_digest, pair.images)) for pair in pairs[:8]],
     )
     answer = runner(job)
     assert matcher.sizes == sizes
     assert sum(bool(outcome.results) for outcome in answer) == sum(sizes)
+
+
+def test_an_image_that_changed_since_the_run_read_it_fails_its_pair_alone(pairs):
+    matcher = NarrowMatcher(most=8)
+    runner = MatchRunner(
+        lambda: Pipeline(THREE_UNITS, {matcher.name: matcher}.__getitem__), is_limited=False
+    )
+    digests = [tuple(map(content_digest, pair.images)) for pair in pairs[:2]]
+    digests[0] = (digests[0][0], "other")
+    job = MatchJob(range(2), [SWEEP], [0.0], 1e6, pairs[:2], digests)
+    changed, good = runner(job)
+    assert changed.failure.endswith(": changed during the run")
+    assert (changed.results, len(good.results)) == ((), 1)

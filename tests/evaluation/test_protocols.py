@@ -15,9 +15,9 @@ from benchmarks.lists import read_pairs
 from benchmarks.paper_tables import largest_side, scores_of_list
 from mkpc_kaggle.data.competition import read_train_side
 from mkpc_kaggle.data.images import read_image
-from mkpc_kaggle.engine.plan.budget import Budget
+from mkpc_kaggle.engine.budget import Budget
+from mkpc_kaggle.engine.frames import results
 from mkpc_kaggle.engine.session import Interrupt, Session, run_pairs
-from mkpc_kaggle.engine.store.dataframes import results
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.metrics import pose_auc
 from mkpc_kaggle.pipeline.assembly import assemble

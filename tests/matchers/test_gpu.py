@@ -10,7 +10,7 @@ import torch
 from device_double import DeviceDouble
 
 from mkpc_kaggle.data.images import Image
-from mkpc_kaggle.engine.workers.places import LocalSite, Work
+from mkpc_kaggle.engine.places import Kind, LocalSite
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import MatcherSpec, NonFiniteError, Precision
@@ -56,7 +56,7 @@ def test_the_parent_of_workers_never_initialises_cuda(monkeypatch):
     made = assemble("classical", device="cuda")
     site = LocalSite(made, None, time.monotonic)
     site.open()
-    assert [place.name for place in site.of(Work.MATCH)] == ["cuda:0", "cuda:1"]
+    assert [place.name for place in site.of(Kind.MATCH)] == ["cuda:0", "cuda:1"]
 
 
 def test_a_device_that_multiplies_and_cannot_convolve_is_refused(monkeypatch):

@@ -12,7 +12,7 @@ from weight_files import digest_of
 
 from mkpc_kaggle import reconstruct
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine.store.keys import Keys
+from mkpc_kaggle.engine.keys import Keys
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.pipeline.assembly import Assembly, assemble

@@ -255,7 +255,20 @@ def test_regions_come_from_stage_1_alone():
     stray = Matches(points, points, np.ones(999))
     first, second = work.results
     strayed = replace(work, results=(first, replace(second, matches=stray)))
-    assert stages.with_regions(strayed, TWO_STAGES).regions == work.regions
+    crop = TWO_STAGES.units[1]
+    assert stages.with_regions(strayed, TWO_STAGES, crop).regions == work.regions
+
+
+def test_crops_come_from_the_units_before_them_and_a_pair_without_these_has_none():
+    first, crop, later = Unit(1, "sift", 480), Unit(2, "sift", 440), Unit(1, "sift", 360)
+    recipe = Recipe((first, crop, later))
+    (work,) = pipeline(recipe).match(works(), recipe.units)
+    (alone,) = pipeline(recipe).match(works(), [first, crop])
+    assert [result.unit for result in work.results] == [first, crop, later]
+    assert work.regions == alone.regions
+    # There was no time for the unit before the crop.
+    (cut,) = pipeline(recipe).match(works(), recipe.units, lambda unit, _: unit is not first)
+    assert [result.unit for result in cut.results] == [later]
 
 
 def test_a_minibatch_gives_what_pairs_give_alone():

@@ -9,7 +9,7 @@ import pycolmap
 import pytest
 
 from mkpc_kaggle.data.images import Image, read_image
-from mkpc_kaggle.engine.store.database import FILE_NAME
+from mkpc_kaggle.engine.store import FILE_NAME
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.reconstruction import outputs
 from mkpc_kaggle.reconstruction.outputs import (
@@ -88,7 +88,7 @@ def test_an_out_in_an_input_or_around_it_is_refused(tmp_path, out):
 def test_pinholes_are_links_that_move_with_the_folders(tmp_path):
     out = tmp_path / "project" / "out"
     write_scene(model_of(NAMES, tmp_path / "project" / "images"), out)
-    list(write_results(tmp_path / "project" / "images", out))
+    list(write_results(tmp_path / "project" / "images", out, out / "work" / "scene"))
     (tmp_path / "project").rename(tmp_path / "renamed")
     out = tmp_path / "renamed" / "out"
     assert sorted(path.name for path in (out / "images").iterdir()) == [
@@ -110,7 +110,7 @@ def test_pinholes_are_links_that_move_with_the_folders(tmp_path):
 
 def test_a_distorted_lens_gets_undistorted_copies(tmp_path):
     write_scene(model_of(NAMES, tmp_path / "images", k=-0.1), tmp_path / "out")
-    list(write_results(tmp_path / "images", tmp_path / "out"))
+    list(write_results(tmp_path / "images", tmp_path / "out", tmp_path / "out" / "work" / "scene"))
     model = pycolmap.Reconstruction(tmp_path / "out" / "sparse" / "0")
     for image in model.images.values():
         picture = read_image(tmp_path / "out" / "images" / image.name)
@@ -124,13 +124,13 @@ def test_models_of_a_folder_that_grows_keep_their_coordinates(tmp_path):
     out = tmp_path / "out"
     first = model_of(NAMES, tmp_path / "images")
     write_scene(first, out)
-    list(write_results(tmp_path / "images", out))
+    list(write_results(tmp_path / "images", out, out / "work" / "scene"))
     grown = model_of(NAMES, tmp_path / "images")
     turn = pycolmap.Rotation3d(np.array([0.1, 0.2, 0.3, 0.9]))
     grown.transform(pycolmap.Sim3d(2.5, turn, np.array([3.0, -4.0, 7.0])))
     write_scene(grown, out)
     keep_former(out)
-    (found,), _ = write_results(tmp_path / "images", out)
+    (found,), _ = write_results(tmp_path / "images", out, out / "work" / "scene")
     for image in found.images:
         expected = centres(first)[image.image.name]
         np.testing.assert_allclose(image.camera.centre, expected, atol=1e-6)
@@ -138,7 +138,7 @@ def test_models_of_a_folder_that_grows_keep_their_coordinates(tmp_path):
     before = (out / "models" / "0" / "images.bin").read_bytes()
     write_scene(pycolmap.Reconstruction(out / "models" / "0"), out)
     keep_former(out)
-    list(write_results(tmp_path / "images", out))
+    list(write_results(tmp_path / "images", out, out / "work" / "scene"))
     assert (out / "models" / "0" / "images.bin").read_bytes() == before
 
 
@@ -152,7 +152,7 @@ def test_a_model_with_too_few_common_cameras_stays_where_it_is(tmp_path):
 def test_a_full_disk_leaves_the_former_results(tmp_path, monkeypatch):
     out = tmp_path / "out"
     write_scene(model_of(NAMES, tmp_path / "images"), out)
-    list(write_results(tmp_path / "images", out))
+    list(write_results(tmp_path / "images", out, out / "work" / "scene"))
     before = sorted(path.relative_to(out) for path in out.rglob("*"))
 
     def full(_: Path) -> None:
@@ -160,7 +160,7 @@ def test_a_full_disk_leaves_the_former_results(tmp_path, monkeypatch):
 
     monkeypatch.setattr(outputs, "sync", full)
     with pytest.raises(OSError, match="No space left"):
-        list(write_results(tmp_path / "images", out))
+        list(write_results(tmp_path / "images", out, out / "work" / "scene"))
     assert sorted(path.relative_to(out) for path in out.rglob("*")) == before
 
 
@@ -168,7 +168,7 @@ def test_a_link_to_a_folder_of_the_users_is_replaced_and_not_emptied(tmp_path):
     out = tmp_path / "out"
     write_scene(model_of(NAMES, tmp_path / "images"), out)
     (out / "images").symlink_to(tmp_path / "images")
-    list(write_results(tmp_path / "images", out))
+    list(write_results(tmp_path / "images", out, out / "work" / "scene"))
     remove_results(out)
     assert (tmp_path / "images" / "inner" / "a.png").exists()
     assert [path.name for path in out.iterdir()] == ["work"]

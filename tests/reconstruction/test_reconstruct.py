@@ -250,7 +250,7 @@ def test_results_that_were_removed_are_made_again(tmp_path):
     out = tmp_path / "out"
     run(root, out)
     before = contents(out)
-    for name in ("models", "sparse", "images", "work/scene"):
+    for name in ("models", "sparse", "images", "work/scenes"):
         shutil.rmtree(out / name)
     (out / "cameras.csv").unlink()
     run(root, out)

@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 from rectified import THREE_UNITS, RectifiedMatcher, run, write_pairs
 
-from mkpc_kaggle.engine.store.dataframes import results
+from mkpc_kaggle.engine.frames import results
 from mkpc_kaggle.reporting import page as module
 from mkpc_kaggle.reporting.page import page, report_run
 from mkpc_kaggle.reporting.view import view

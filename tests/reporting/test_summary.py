@@ -9,8 +9,8 @@ from rectified import THREE_UNITS, RectifiedMatcher, run, write_pairs
 from run_tables import UNIT, Described, tables_of
 from shared import run_command
 
+from mkpc_kaggle.engine.records import NOT_RECONSTRUCTED, SceneRecord
 from mkpc_kaggle.engine.request import Ending, RunReport
-from mkpc_kaggle.engine.store.tables import NOT_RECONSTRUCTED, SceneRecord
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.recipe import load_recipe
@@ -33,14 +33,13 @@ def report(ending: Ending, *pairs: Described, **fields: object) -> RunReport:
     return RunReport(tables_of(*pairs), ending, 60.0, **fields)
 
 
-def test_sources_of_f_are_counted_and_an_earlier_f_is_one():
-    """With other settings, this run knows neither its matches nor its inliers."""
-    earlier = Described(source="earlier", failure=None)
+def test_sources_of_f_are_counted():
+    scene = Described(source="scene", matches=200, inliers=100)
     done = Described(source="pair", matches=200, inliers=100)
-    text = summary(report(Ending.INTERRUPTED, earlier, done, UNREACHED))
+    text = summary(report(Ending.INTERRUPTED, scene, done, UNREACHED))
     assert text.startswith("interrupted after 1m00s: 2 of 3 pairs with an F; 0 units run")
-    assert "F: 1 from their own matches, 1 of an earlier run, 1 the fallback" in text
-    assert text.endswith("2 pairs left; run the same command to continue")
+    assert "F: 1 from cameras, 1 from their own matches, 1 the fallback" in text
+    assert text.endswith("1 pair left; run the same command to continue")
 
 
 def test_the_means_of_a_unit_leave_out_the_pairs_on_which_it_failed():

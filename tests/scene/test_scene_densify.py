@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from rectified import run, sources
 from synthetic import RECIPE, SyntheticMatcher, synthetic_pairs
 
-from mkpc_kaggle.engine.plan.state import State
+from mkpc_kaggle.engine.frames import matrices_of, results
 from mkpc_kaggle.engine.request import Ending
-from mkpc_kaggle.engine.store.dataframes import matrices_of, results
+from mkpc_kaggle.engine.state import State
 from mkpc_kaggle.recipe import SceneConfig
 from mkpc_kaggle.scene.densify import extra_pairs
 

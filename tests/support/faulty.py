@@ -16,12 +16,12 @@ import numpy as np
 import pytest
 from rectified import THREE_UNITS, RectifiedMatcher, Seen
 
-from mkpc_kaggle.engine import session
-from mkpc_kaggle.engine.jobs import SceneJob
-from mkpc_kaggle.engine.workers import places
-from mkpc_kaggle.engine.workers.places import LocalSite, Place, Work
-from mkpc_kaggle.engine.workers.process import ThreadWorker
-from mkpc_kaggle.engine.workers.worker import MatchRunner, compute_scene
+from mkpc_kaggle.engine import places, session
+from mkpc_kaggle.engine import run as engine_run
+from mkpc_kaggle.engine.places import Kind, LocalSite, Place
+from mkpc_kaggle.engine.process import ThreadWorker
+from mkpc_kaggle.engine.request import SceneJob
+from mkpc_kaggle.engine.worker import MatchRunner, compute_scene
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches
@@ -230,13 +230,13 @@ def use_places(
 
     def site_of(assembly: Assembly, _: int, clock: Callable[[], float], log: Path) -> LocalSite:
         site = LocalSite(assembly, 0, clock, log)
-        site.places = [*(place for place in site.places if place.work is not Work.MATCH), *used]
+        site.places = [*(place for place in site.places if place.kind is not Kind.MATCH), *used]
         site.fallback = list(fallback)
         return site
 
     monkeypatch.setattr(session, "LocalSite", site_of)
     monkeypatch.setattr(places, "LISTEN_S", 0.01)
-    monkeypatch.setattr(places, "RESTART_PAUSE_S", 0.0)
+    monkeypatch.setattr(engine_run, "RESTART_PAUSE_S", 0.0)
 
 
 def on_fork(monkeypatch: pytest.MonkeyPatch, act: Callable[[int], None]) -> None:

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine.plan.budget import Budget
+from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.request import RunReport
 from mkpc_kaggle.engine.session import Interrupt, Session, run_pairs, submit
 from mkpc_kaggle.geometry.coordinates import Size, View

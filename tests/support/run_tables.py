@@ -1,15 +1,13 @@
 """Tables of a run whose pairs a test describes, made as those of a real run."""
 
-from dataclasses import replace
+import json
+from contextlib import closing
+from pathlib import Path
+from typing import Any
 
-from mkpc_kaggle.engine.store.dataframes import PairTables, database_of, tables_in
-from mkpc_kaggle.engine.store.tables import (
-    LAYOUTS,
-    PairEstimate,
-    PublishedPair,
-    PublishedRun,
-    UnitPoints,
-)
+from mkpc_kaggle.engine.frames import PairTables, pair_tables
+from mkpc_kaggle.engine.store import Store
+from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 
 UNIT = "1:sift@640"
 
@@ -35,37 +33,34 @@ class Described:
         seconds: float = 0.0,
         **statistics: float,
     ) -> None:
-        self.pair = PublishedPair(
-            0,
-            name,
-            group,
-            *images,
-            points=["points" if matches else ""],
-            estimate="" if failure is None else "estimate",
-            source=source,
-            choice=choice,
-            failures={UNIT: error} if error else {},
-        )
-        self.estimate = PairEstimate(
-            "estimate", {"points": inliers}, failure=failure or "", **statistics
-        )
-        self.points = UnitPoints("points", UNIT, matches, match_seconds=seconds)
+        self.about = (name, group, *images, "F")
+        self.failure = failure
+        self.reasons = {UNIT: error} if error else {}
+        self.source, self.choice = source, choice
+        self.matches, self.inliers, self.seconds = matches, inliers, seconds
+        self.statistics = statistics
+
+    def rows(self, number: int) -> dict[str, list[tuple[Any, ...]]]:
+        """The rows of the store, with a key for each pair."""
+        key = f"points {number}" if self.matches else ""
+        F = FALLBACK_FUNDAMENTAL
+        facts = {"F": F.ravel().tolist(), "failure": self.failure, "inliers": {key: self.inliers}}
+        estimate = "" if self.failure is None else f"estimate {number}"
+        points = (key, self.matches, 0, 0.0, 0.0, self.seconds, 0.0, None, None, "", "", b"")
+        pair = (json.dumps([[key, True]]), estimate, F.tobytes(), self.source, self.choice)
+        return {
+            "points": [points] if key else [],
+            "result": [(estimate, json.dumps(facts | self.statistics))] if estimate else [],
+            "pair": [(number, *self.about, *pair, json.dumps(self.reasons))],
+        }
 
 
 def tables_of(*described: Described) -> PairTables:
     """Return the tables of these pairs."""
-    rows = {PublishedRun: [PublishedRun(units=[(UNIT, 1)], rows=len(described))]}
-    rows |= {PublishedPair: [], PairEstimate: [], UnitPoints: []}
-    for number, each in enumerate(described):
-        # A key for each pair
-        points = [key and f"points {number}" for key in each.pair.points]
-        estimate = each.pair.estimate and f"estimate {number}"
-        named = {"number": number, "points": points, "estimate": estimate}
-        rows[PublishedPair].append(replace(each.pair, **named))
-        inliers = {f"points {number}": count for count in each.estimate.inliers.values()}
-        key = {"key": f"estimate {number}", "inliers": inliers}
-        rows[PairEstimate].append(replace(each.estimate, **key))
-        rows[UnitPoints].append(replace(each.points, key=f"points {number}"))
-    facts = {kind: map(LAYOUTS[kind].values, some) for kind, some in rows.items()}
-    with database_of(facts) as database:
-        return tables_in(database)
+    store = Store.in_memory(Path())
+    with closing(store.db):
+        for number, each in enumerate(described):
+            store.put(each.rows(number))
+        about = {"units": [(UNIT, 1)], "rows": len(described)}
+        store.put({"run": [(0, json.dumps(about))]})
+        return pair_tables(store.db)

@@ -18,8 +18,13 @@ from typing import Any
 import numpy as np
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine import matching
-from mkpc_kaggle.engine.jobs import (
+from mkpc_kaggle.engine import budget, plan
+from mkpc_kaggle.engine.budget import MAX_SILENCE_S, SCENE_MARGIN, SCENE_START_S, Budget
+from mkpc_kaggle.engine.frames import PairTables
+from mkpc_kaggle.engine.keys import Keys
+from mkpc_kaggle.engine.places import Kind, Place, Site
+from mkpc_kaggle.engine.plan import RESERVE_SHARE
+from mkpc_kaggle.engine.request import (
     Answer,
     Cause,
     Estimated,
@@ -29,20 +34,13 @@ from mkpc_kaggle.engine.jobs import (
     Loaded,
     MatchJob,
     Outcome,
+    Request,
+    RunReport,
     SceneJob,
 )
-from mkpc_kaggle.engine.loop import Engine
-from mkpc_kaggle.engine.plan import blame, budget, schedule, time_limits
-from mkpc_kaggle.engine.plan.blame import MAX_TRIES
-from mkpc_kaggle.engine.plan.budget import MAX_SILENCE_S, SCENE_MARGIN, SCENE_START_S, Budget
-from mkpc_kaggle.engine.plan.schedule import RESERVE_SHARE
-from mkpc_kaggle.engine.request import Request, RunReport
-from mkpc_kaggle.engine.store.database import Store
-from mkpc_kaggle.engine.store.dataframes import PairTables
-from mkpc_kaggle.engine.store.keys import Keys
-from mkpc_kaggle.engine.store.sqlite_file import connected
-from mkpc_kaggle.engine.store.tables import SCHEMA
-from mkpc_kaggle.engine.workers.places import Place, Site, Work
+from mkpc_kaggle.engine.run import Run
+from mkpc_kaggle.engine.state import GIVEN_UP, State
+from mkpc_kaggle.engine.store import Store
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.crop_need import CropNeed
 from mkpc_kaggle.geometry.matches import Matches
@@ -66,15 +64,13 @@ SWEEP_SHARE = 0.7  # of the limit, within which the sweep is said to fit
 
 # Changes that switch each of them off
 MECHANISMS: dict[str, tuple[tuple[object, str, object], ...]] = {
-    "reserve for scenes": ((schedule, "RESERVE_SHARE", 0.0),),
+    "reserve for scenes": ((plan, "RESERVE_SHARE", 0.0),),
     "margin of scenes": ((budget, "SCENE_MARGIN", 1.0),),
     "margin of units": ((budget, "MARGIN", 0.0), (budget, "MIN_MARGIN", 0.0)),
     "latest costs": ((budget, "WINDOW", 10**9),),
-    "short jobs": ((schedule, "JOB_SHARE", math.inf),),
-    "connect share": ((schedule, "CONNECT_SHARE", 1.0),),
-    "time limits": ((time_limits, "HANG_FACTOR", math.inf),),
-    "second try": ((blame, "MAX_TRIES", 1),),
-    "end of tries": ((matching, "MAX_FAILED_PAIRS", 10**9),),
+    "short jobs": ((plan, "JOB_SHARE", math.inf),),
+    "connect share": ((plan, "CONNECT_SHARE", 1.0),),
+    "time limits": ((budget, "HANG_FACTOR", math.inf),),
 }
 
 
@@ -144,9 +140,7 @@ class Scenario:
 
     @property
     def keys(self) -> Keys:
-        return Keys(
-            tuple(unit.name for unit in self.recipe.units), "mkpc", "rule", "estimate", "scene"
-        )
+        return Keys(tuple(unit.name for unit in self.recipe.units), "mkpc", "estimate", "scene")
 
     @property
     def fates(self) -> dict[int, Cause]:
@@ -275,14 +269,15 @@ class SimulatedSite(Site):
         self.bad_names = [f"place {n}" for n in range(good, scenario.workers)]
         self.on_fallback = 0  # jobs
         makers = [
-            (f"place {n}", partial(self.match_worker, is_bad=n >= good), Work.MATCH)
+            (f"place {n}", partial(self.match_worker, is_bad=n >= good), Kind.MATCH)
             for n in range(scenario.workers)
         ]
-        makers.append(("estimates", lambda: SimulatedWorker(self, self.estimate), Work.ESTIMATE))
+        makers.append(("estimates", lambda: SimulatedWorker(self, self.estimate), Kind.ESTIMATE))
         for number in range(scenario.scene_places):
-            makers.append((f"scenes {number}", self.scene_worker, Work.SCENE))
+            makers.append((f"scenes {number}", self.scene_worker, Kind.SCENE))
         self.places = [Place(*maker) for maker in makers]
-        self.matching = self.of(Work.MATCH)
+        self.matching = self.of(Kind.MATCH)
+        self.is_open = True
         for place in self.matching:
             place.minibatch = scenario.minibatch
         if scenario.fallback:
@@ -306,13 +301,15 @@ class SimulatedSite(Site):
         return SimulatedWorker(self, self.reconstruct)
 
     def wait(self, until: float) -> None:
-        moment = min([until, *(worker.ready for worker in self.workers)])
+        now = self.clock.now
+        pauses = [place.restart_at for place in self.places if place.restart_at > now]
+        moment = min([until, *pauses, *(worker.ready for worker in self.workers)])
         assert moment < math.inf, "the engine waits for ever"
         moment = min(moment, self.clock.now + WAKE_S)
-        if any(place.job for place in self.of(Work.SCENE)):
+        if any(place.job for place in self.of(Kind.SCENE)):
             # After a loss, a place gets another worker only when there is work for it.
             now = self.clock.now
-            idle = sum(place.is_idle or place.may_start(now) for place in self.of(Work.MATCH))
+            idle = sum(place.is_idle or place.may_start(now) for place in self.of(Kind.MATCH))
             self.for_scenes += idle * max(0.0, min(moment, self.stop) - now)
         self.clock.now = max(self.clock.now, moment)
 
@@ -367,8 +364,11 @@ class SimulatedSite(Site):
                 return math.inf, Failure(Cause.TIMED_OUT), stall
             spent = len(job.indices) * sum(self.costs[unit.name] for unit in job.units)
         found: list[list[UnitResult]] = [[] for _ in job.indices]
-        for unit in sorted(job.units, key=lambda unit: unit.stage):
+        for number, unit in enumerate(job.units):
+            before = {each for each in job.units[:number] if each.stage == 1}
             for index, rows in zip(job.indices, found, strict=True):
+                if unit.stage == 2 and not before <= {row.unit for row in rows}:
+                    continue  # its crops come from points that there was no time for
                 if unit.stage == 2 and not scenario.needs_crops(index):
                     rows.append(UnitResult(unit, Matches.empty(), need=CropNeed(False)))
                     continue
@@ -391,13 +391,11 @@ class SimulatedSite(Site):
                 spent += took
                 rows.append(UnitResult(unit, POINTS, 0.0, took, warm_up=unit.name not in warm))
                 warm.add(unit.name)
-        images = [tuple(BatchImage(name, name, SIZE) for name in names) for names in job.names]
-        files = [((0, 0), (0, 0))] * len(images)
-        return spent, tuple(map(Outcome, images, files, map(tuple, found))), stalled
+        return spent, tuple(map(Outcome, map(tuple, found))), stalled
 
-    def estimate(self, job: EstimateJob, rng: np.random.Generator | None = None) -> Drawn:
+    def estimate(self, job: EstimateJob) -> Drawn:
         """Draw an answer: each pair has from 20 to 79 inliers by its number."""
-        rng = rng or self.rng
+        rng = self.rng
         if rng.random() < self.scenario.job_faults:
             return 0.0 if rng.random() < 0.5 else math.inf, Failure(Cause.DIED), 0.0
         estimates = []
@@ -407,10 +405,7 @@ class SimulatedSite(Site):
             estimates.append(Estimated(points, inliers, FALLBACK_FUNDAMENTAL, seconds=ESTIMATE_S))
         return ESTIMATE_S * len(estimates), tuple(estimates), 0.0
 
-    def reconstruct(self, job: SceneJob | EstimateJob) -> Drawn:
-        # The process of a scene also estimates a pair that the workers of estimates gave up.
-        if isinstance(job, EstimateJob):
-            return self.estimate(job, self._scene_rng)
+    def reconstruct(self, job: SceneJob) -> Drawn:
         scenario = self.scenario
         rng = self._scene_rng
         begun = self.clock.now
@@ -441,7 +436,6 @@ class SimulatedWorker:
         self._start_s = start_s
         self._answer: Answer = Loaded()
         self._begun = self._fault = 0.0
-        self._is_check = False  # whose result is not used
 
     def start(self) -> None:
         site = self._site
@@ -454,7 +448,6 @@ class SimulatedWorker:
             site.faults += max(0.0, min(self._start_s, site.stop - site.clock.now))
 
     def submit(self, job: Job) -> None:
-        self._is_check = isinstance(job, MatchJob) and job.is_check
         self._begun = self._site.clock.now
         taken, self._answer, self._fault = self._draw(job)
         self.ready = self._begun + taken
@@ -464,21 +457,10 @@ class SimulatedWorker:
         if site.clock.now < self.ready:
             return None
         if self._start_s and isinstance(self._answer, tuple):
-            spent = max(0.0, min(self.ready, site.stop) - self._begun)
-            # The result of a check is not used. Its warm-up is, by the worker's next job.
-            site.kept += min(spent, self._warm_up_seconds()) if self._is_check else spent
+            site.kept += max(0.0, min(self.ready, site.stop) - self._begun)
             site.last_job = self.ready
         self.ready = math.inf
         return self._answer
-
-    def _warm_up_seconds(self) -> float:
-        """Return the seconds of the warm-ups in an answer."""
-        assert isinstance(self._answer, tuple)
-        count = 0
-        for outcome in self._answer:
-            assert isinstance(outcome, Outcome)
-            count += sum(result.warm_up for result in outcome.results)
-        return count * self._site.scenario.warm_up
 
     def kill(self) -> None:
         """End the worker, which died, hangs, or computes."""
@@ -494,10 +476,8 @@ class SimulatedWorker:
 def memory_store() -> Store:
     """A store that leaves no file."""
     with TemporaryDirectory() as directory:
-        store = Store(Path(directory))
-        store._db = connected(":memory:")
-        store._db.executescript(SCHEMA)
-        weakref.finalize(store, store._db.close)  # since 3.13, Python warns of open connections
+        store = Store.in_memory(Path(directory))
+        weakref.finalize(store, store.db.close)  # since 3.13, Python warns of open connections
         return store
 
 
@@ -533,7 +513,7 @@ class Ran:
     closed: tuple[str, ...] = ()
     wrongly_closed: tuple[str, ...] = ()
     on_fallback: int = 0
-    given_up: tuple[tuple[Any, ...], ...] = ()  # items
+    given_up: tuple[tuple[Any, ...], ...] = ()  # pairs and units
     work_left: bool = False
 
 
@@ -544,10 +524,15 @@ def simulate(scenario: Scenario, store: Store | None = None, until: float = math
     site = SimulatedSite(scenario, clock, time.stop_units)
     share = max(1, scenario.batches) / scenario.pairs
     pairs = [Pair(str(n), f"{int(n * share):03d}", f"{n:07d}", "b") for n in range(scenario.pairs)]
+    names = {name for pair in pairs for name in (pair.file0, pair.file1)}
     published: list[int] = []
     interrupt = threading.Event()
     store = memory_store() if store is None else store
-    engine = Engine(site, store, time, interrupt=interrupt, progress=False)
+    publish = lambda state: published.append(len(state.fundamentals))  # noqa: E731
+    request = Request(pairs, scenario.recipe, scenario.keys, publish=publish)
+    state = State(request, {name: BatchImage(name, name, SIZE) for name in names}, {})
+    state.restore(store)
+    run = Run(state, site, store, time, interrupt=interrupt, progress=False)
 
     def wait(moment: float) -> None:
         whole_wait(min(moment, until))
@@ -556,24 +541,22 @@ def simulate(scenario: Scenario, store: Store | None = None, until: float = math
 
     whole_wait = site.wait
     site.wait = wait
-    with engine:
-        publish = lambda state: published.append(len(state.fundamentals))  # noqa: E731
-        engine.ask(Request(pairs, scenario.recipe, scenario.keys, publish=publish))
-        report = engine.report()
-    state = engine.state
+    with run:
+        run.run()
+        report = run.report()
     # A bad pair can have no F, except on the place that takes over.
     bad = list(scenario.fates)
-    swept = state.has[: scenario.pairs].any(1)
+    swept = state.used[: scenario.pairs].any(1)
     swept[bad] = True
     lacks_units = state.missing[: scenario.pairs].any(1)
     lacks_units[bad] = False
     closed = [place for place in site.matching if place.closed]
     # A place that is closed has no time to use.
-    site.faults += sum(max(0.0, site.stop - place.limit) for place in closed)
+    site.faults += sum(max(0.0, site.stop - place.restart_at) for place in closed)
     sweep_fits = sweep_seconds(scenario) < SWEEP_SHARE * scenario.limit
     given = scenario.workers * (site.stop - RESTART_S) - site.faults
     faulty = {scene.batch for scene in site.scenes if scene.is_faulty}
-    matches = zip(state.batches, state.matches_of_batches(), strict=True)
+    matches = zip(state.batches, state.matches_of_batches, strict=True)
     matched = {batch for batch, count in matches if count}
     made = set(report.tables.pairs.query("choice != ''")["group"])
     missed = matched - faulty - made
@@ -590,12 +573,15 @@ def simulate(scenario: Scenario, store: Store | None = None, until: float = math
         and not any(math.isinf(scene.seconds) for scene in site.scenes),
         site.last_job,
         tuple(site.scenes),
-        set(state.scenes.stale),
-        [[*points, state.estimates[index]] for index, points in enumerate(state.points.tolist())],
+        {batch for batch, number in state.batches.items() if state.stale[number]},
+        [
+            [*points, key]
+            for points, key in zip(state.points.tolist(), state.estimate.tolist(), strict=True)
+        ],
         tuple(place.name for place in closed),
         tuple(place.name for place in closed if place.name not in site.bad_names),
         site.on_fallback,
-        tuple(state.tries.given_up),
+        tuple(map(tuple, np.argwhere(state.losses >= GIVEN_UP).tolist())),
         bool(lacks_units.any() or missed),
     )
 
@@ -612,8 +598,8 @@ def sweep_seconds(scenario: Scenario) -> float:
     stalls = scenario.stalls * (STALL - 1) * unit
     faults = (scenario.crashes + scenario.hangs) * start + scenario.hangs * STALL * unit
     faults += scenario.job_faults * (start + STALL * unit)
-    hang = FATES[Cause.TIMED_OUT] * (time_limits.HANG_FACTOR * unit + MAX_SILENCE_S)
-    faults += scenario.bad_pairs * MAX_TRIES * (start + hang)
+    hang = FATES[Cause.TIMED_OUT] * (budget.HANG_FACTOR * unit + MAX_SILENCE_S)
+    faults += scenario.bad_pairs * GIVEN_UP * (start + hang)
     workers = max(1, scenario.workers - scenario.bad_places)
     return start + scenario.pairs * (unit + stalls + faults) / workers
 

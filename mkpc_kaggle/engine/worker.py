@@ -1,4 +1,4 @@
-"""The work of workers: matching, estimates, features of images, reconstructions.
+"""The work of workers: matching, estimates, reconstructions.
 
 Importing this module does not import torch, which estimates and scenes do not need.
 The threads of each worker are decided in :mod:`mkpc_kaggle.cores`.
@@ -13,15 +13,14 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 
 from mkpc_kaggle.cores import limit_matching_threads, limit_to_one_thread
+from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.data.images import Image, ImageStore
-from mkpc_kaggle.engine.jobs import (
+from mkpc_kaggle.engine.request import (
     Answer,
     Cause,
     Estimated,
     EstimateJob,
     Failure,
-    FeatureJob,
-    Found,
     Job,
     Loaded,
     MatchJob,
@@ -29,7 +28,7 @@ from mkpc_kaggle.engine.jobs import (
     PairInputs,
     SceneJob,
 )
-from mkpc_kaggle.errors import UserError
+from mkpc_kaggle.errors import UserError, shown
 from mkpc_kaggle.geometry.robust import ModelKind
 from mkpc_kaggle.matchers import failures
 from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult, with_estimate
@@ -42,7 +41,7 @@ from mkpc_kaggle.scene.candidates import (
 )
 from mkpc_kaggle.scene.models import models_of
 from mkpc_kaggle.scene.sfm import Solution, reconstruct_batch
-from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair
+from mkpc_kaggle.scene.view_graph import BatchPair
 
 if TYPE_CHECKING:
     from mkpc_kaggle.pipeline.stages import Pipeline
@@ -110,64 +109,56 @@ class MatchRunner:
         def may_start(unit: Unit, pairs: int) -> bool:
             return time.monotonic() + pairs * expected[unit] < deadline
 
-        opened = [self._open(job, number) for number in range(len(job.pairs))]
+        given = job.given or [()] * len(job.pairs)
+        opened = list(map(self._open, job.pairs, job.digests, given))
         # Decoding the next pairs' images takes place while a GPU matches.
         self._images.prefetch(job.upcoming)
         # An unreadable image fails its pair alone, not the minibatch.
         readable = [pair for pair in opened if not pair.failure]
         matched = iter(self._pipeline.match(readable, job.units, may_start))
         done = [pair if pair.failure else next(matched) for pair in opened]
-        return tuple(self._outcome(job, number, pair) for number, pair in enumerate(done))
+        return tuple(
+            Outcome(
+                pair.results[len(before) :],  # without the given points
+                pair.regions,
+                pair.failure,
+                pair.decode_seconds,
+                pair.cluster_seconds,
+            )
+            for pair, before in zip(done, given, strict=True)
+        )
 
-    def _open(self, job: MatchJob, number: int) -> PairMatch:
-        """Return a pair with its images; ``failure`` names an unreadable image."""
+    def _open(
+        self, pair: Pair, digests: tuple[str, ...], given: tuple[UnitResult, ...]
+    ) -> PairMatch:
+        """Return a pair with its images; ``failure`` names an image that is unreadable, or has changed."""
         start = time.perf_counter()
-        pair = job.pairs[number]
-        files = zip(pair.images, pair.turns, strict=True)
-        images = [self._images.get(path).turned(turns) for path, turns in files]
+        images = []
+        failure = ""
+        for path, turns, digest in zip(pair.images, pair.turns, digests, strict=True):
+            image = self._images.get(path).turned(turns)
+            if not isinstance(image, Image):
+                failure = failure or str(image)
+            # Otherwise wrong points would have a right key for ever.
+            elif image.version != digest:
+                failure = failure or f"{shown(path)}: changed during the run"
+            else:
+                images.append(image)
         seconds = time.perf_counter() - start
-        readable = tuple(image for image in images if isinstance(image, Image))
-        failure = next((str(image) for image in images if not isinstance(image, Image)), "")
-        return PairMatch(
-            job.stage_1[number],
-            images=() if failure else readable,
-            failure=failure,
-            decode_seconds=seconds,
-        )
-
-    def _outcome(self, job: MatchJob, number: int, pair: PairMatch) -> Outcome:
-        """Return the new results of a pair, and its images with the digests of the matched
-        contents.
-        """
-        if pair.failure:
-            return Outcome(failure=pair.failure)
-        image0, image1 = (
-            BatchImage(name, image.version, image.size, image.focal)
-            for name, image in zip(job.names[number], pair.images, strict=True)
-        )
-        return Outcome(
-            (image0, image1),
-            tuple(image.file for image in pair.images),
-            pair.results[len(job.stage_1[number]) :],  # without the given points of stage 1
-            pair.regions,
-            "",
-            pair.decode_seconds,
-            pair.cluster_seconds,
-        )
+        shown_images = () if failure else tuple(images)
+        return PairMatch(given, images=shown_images, failure=failure, decode_seconds=seconds)
 
 
 def estimates_runner(*, in_process: bool = True) -> Runner:
-    """Return the runner of estimates and image features. A separate process has one thread."""
+    """Return the runner of estimates. A separate process has one thread."""
     # The user's own process keeps its thread limits.
     if in_process:
         limit_to_one_thread()
     return do_estimates_job
 
 
-def do_estimates_job(job: Job) -> tuple[Estimated, ...] | Found:
-    """Return the estimates of a job's pairs, or the feature of an image."""
-    if isinstance(job, FeatureJob):
-        return Found(job.do())
+def do_estimates_job(job: Job) -> tuple[Estimated, ...]:
+    """Return the estimates of a job's pairs."""
     assert isinstance(job, EstimateJob)
     return tuple(estimate_pair(pair, results, job.recipe) for pair, results in results_of(job))
 
@@ -197,14 +188,8 @@ def estimate_pair(pair: PairInputs, results: tuple[UnitResult, ...], recipe: Rec
 
 
 def scene_runner() -> Runner:
-    """Return the runner of a process that does one job: a scene, or the estimate of a pair that the
-    workers of estimates gave up.
-    """
-    return do_single_job
-
-
-def do_single_job(job: Job) -> Answer:
-    return compute_scene(job) if isinstance(job, SceneJob) else do_estimates_job(job)
+    """Return the runner of a process that does one job: a scene."""
+    return compute_scene
 
 
 def compute_scene(job: Job) -> Solution:
@@ -213,18 +198,16 @@ def compute_scene(job: Job) -> Solution:
     """
     assert isinstance(job, SceneJob) and job.recipe.scene is not None
     inputs = results_of(job)
-    pairs = [
-        batch_pair(*pair, keeps_paths=job.is_whole, candidate=job.candidate) for pair in inputs
-    ]
+    is_whole = job.folder is not None
+    pairs = [batch_pair(*pair, keeps_paths=is_whole, candidate=job.candidate) for pair in inputs]
     recipe = job.recipe
-    config = candidate_settings(job.candidate, job.recipe.scene)
     solution = reconstruct_batch(
         pairs,
-        config,
+        candidate_settings(job.candidate, job.recipe.scene),
         recipe.focal,
         recipe.magsac,
-        job.export,
-        job.is_whole,
+        job.folder,
+        is_whole,
         cameras=job.cameras,
     )
     value = disagreement(pairs, models_of(solution.reconstructions))

@@ -1,4 +1,9 @@
-"""The time of a run: durations, four deadlines, and the measured costs of units."""
+"""The time of a run: durations, four deadlines, the measured costs of units, and when a silent worker hangs.
+
+:func:`time_limit` says how long a job may take, by the costs that are known now. A worker that has not answered by
+then gets SIGKILL (a Ray actor is killed by Ray), and its job is lost. A worker in a thread of the user's process
+cannot be killed: the run continues without its answer.
+"""
 
 import re
 import time
@@ -11,6 +16,7 @@ from statistics import fmean, median_low
 import numpy as np
 from numpy.typing import NDArray
 
+from mkpc_kaggle.engine.request import EstimateJob, Job, MatchJob
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.recipe import Unit
 
@@ -34,6 +40,17 @@ SCENE_MATCH_S = 5e-4
 # Factor on a forecast: the time of scenes depends on more than their matches.
 SCENE_MARGIN = 1.5
 ESTIMATE = "estimate"  # the name of the cost of an estimate
+# A job that takes this multiple of its measured cost hangs. Stalls of twenty times the cost, as in the
+# simulator, must not cost a worker.
+HANG_FACTOR = 30.0
+# A job of unknown cost that takes longer than this share of the time left hangs. A first job may be
+# slow (a warm-up, a slow disk), but the rest of the run must be able to make up for it.
+UNKNOWN_SHARE = 0.25
+MAX_UNKNOWN_S = 3600.0  # without a limit, no share is finite
+# Expected seconds of an estimate that was not measured yet: eight permutations of 50,000 iterations
+# of MAGSAC take 0.7 s, and a busy machine is slower.
+UNMEASURED_ESTIMATE_S = 1.0
+START_S = 300.0  # for a worker to load its matchers, which is slow from a network disk
 MAX_STEP_BACK_S = 60.0  # of the wall clock, between --started-at and the start
 
 
@@ -201,6 +218,45 @@ class Costs:
     def warm_up(self, units: Iterable[Unit]) -> float:
         """Return the longest warm-up of these units, in seconds, by the latest of each unit."""
         return max((self._warm_up.get(unit.name, 0.0) for unit in units), default=0.0)
+
+
+def start_limit(budget: Budget, since: float, *, loads_matchers: bool) -> float:
+    """Return the seconds after ``since`` within which a worker must have started."""
+    return START_S if loads_matchers else min(START_S, max(budget.silence, unknown(budget, since)))
+
+
+def unknown(budget: Budget, since: float) -> float:
+    """Return the seconds that work of unknown cost may take from ``since``."""
+    return min(MAX_UNKNOWN_S, UNKNOWN_SHARE * max(0.0, budget.stop_units - since))
+
+
+def time_limit(job: Job, costs: Costs, budget: Budget, since: float) -> float:
+    """Return the seconds after ``since``, the beginning of a job, within which its worker must answer.
+
+    It is :attr:`Budget.silence`, and:
+
+    - Matching: 30 times the mean seconds of the job's units, for each pair, and their longest warm-up once. Until
+      all are measured: a quarter of the time that is left, an hour at most.
+    - Estimates: 30 times the mean; until it is known, 30 s a pair, and no more than that quarter.
+    - A scene: 30 times the seconds expected from other scenes, at least of 3 s and 0.5 ms per match.
+    """
+    seconds = unknown(budget, since)
+    if isinstance(job, MatchJob):
+        # A warm-up alone says little: it may take a hundred times as long as a later run, or less.
+        if all(costs.is_known(unit.name) for unit in job.units):
+            of_pair = sum(costs.mean(unit.name) for unit in job.units)
+            seconds = HANG_FACTOR * len(job.indices) * of_pair + costs.warm_up(job.units)
+    elif isinstance(job, EstimateJob):
+        of_pair = costs.mean(ESTIMATE)
+        seconds = HANG_FACTOR * len(job.pairs) * (of_pair or UNMEASURED_ESTIMATE_S)
+        # A hung first estimate must not use up a short limit.
+        if not of_pair:
+            seconds = min(seconds, unknown(budget, since))
+    else:
+        # Small scenes measured so far say little about the time of a large one.
+        unmeasured = SCENE_START_S + SCENE_MATCH_S * job.matches
+        seconds = HANG_FACTOR * max(costs.scene(job.matches), unmeasured)
+    return budget.silence + seconds
 
 
 def monotonic_of(epoch: float) -> float:

@@ -17,10 +17,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from mkpc_kaggle.engine.jobs import Answer, Cause, Failure
-from mkpc_kaggle.engine.workers.places import Place, Site, Work
-from mkpc_kaggle.engine.workers.process import EXIT_TIMEOUT_S, ThreadWorker
-from mkpc_kaggle.engine.workers.worker import Executor, Maker, MatchRunner, Message, Runner
+from mkpc_kaggle.engine.places import Kind, Place, Site
+from mkpc_kaggle.engine.process import EXIT_TIMEOUT_S, ThreadWorker
+from mkpc_kaggle.engine.request import Answer, Cause, Failure
+from mkpc_kaggle.engine.worker import Executor, Maker, MatchRunner, Message, Runner
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.pipeline.stages import Pipeline
@@ -74,6 +74,7 @@ class RaySite(Site):
         self._workers: list[RayWorker] = []
 
     def open(self) -> None:
+        super().open()
         # A program that has joined a cluster itself keeps it after the run.
         self._has_joined = not self._ray.is_initialized()
         if self._has_joined:
@@ -98,10 +99,11 @@ class RaySite(Site):
                 make = partial(MatchRunner, partial(Pipeline.of, self._assembly), threads=cores)
                 name = f"machine {number} ({node['NodeManagerHostname']})"
                 self._add(name, make, self._assembly.minibatch, num_cpus=cores)
-        if not self.of(Work.MATCH):
+        if not self.of(Kind.MATCH):
             raise UserError("the Ray cluster offers neither a CPU nor a GPU")
 
     def close(self) -> None:
+        super().close()
         if self._has_joined and self._ray.is_initialized():
             until = time.monotonic() + EXIT_TIMEOUT_S
             for worker in self._workers:  # killed already; the threads end soon

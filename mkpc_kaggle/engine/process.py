@@ -24,8 +24,8 @@ from multiprocessing.context import SpawnProcess
 from pathlib import Path
 from typing import cast
 
-from mkpc_kaggle.engine.jobs import Answer, Cause, Failure, Job
-from mkpc_kaggle.engine.workers.worker import Executor, Maker, Message, Runner, failure_of
+from mkpc_kaggle.engine.request import Answer, Cause, Failure, Job
+from mkpc_kaggle.engine.worker import Executor, Maker, Message, Runner, failure_of
 
 # For PyTorch, which reads these once. OpenMP threads that wait for each other then sleep; by default they spin
 # and keep the cores from decoding, MAGSAC and other processes. On Linux, tensors of 2 MiB or more use huge pages:

@@ -1,12 +1,11 @@
-"""Places of workers. A place has one worker at a time, and is closed after it loses three different
-items in a row (:mod:`mkpc_kaggle.engine.plan.blame`).
+"""Places of workers. A place has one worker at a time.
 
-A hung worker ends here: :meth:`Place.poll` kills a worker that has not answered by :attr:`Place.limit`, which the
-loop sets (:mod:`mkpc_kaggle.engine.plan.time_limits`).
+A hung worker ends here: :meth:`Place.poll` kills a worker that has not answered in time
+(:func:`mkpc_kaggle.engine.budget.time_limit`).
 """
 
 import queue
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -15,49 +14,55 @@ from math import inf
 from pathlib import Path
 
 from mkpc_kaggle.cores import available_cores
-from mkpc_kaggle.engine.jobs import Answer, Cause, Failure, Job, Loaded
-from mkpc_kaggle.engine.plan.blame import MAX_LOSSES, Item, different
-from mkpc_kaggle.engine.workers.process import ProcessWorker, ThreadWorker
-from mkpc_kaggle.engine.workers.worker import Maker, MatchRunner, estimates_runner, scene_runner
+from mkpc_kaggle.engine.process import ProcessWorker, ThreadWorker
+from mkpc_kaggle.engine.request import Answer, Cause, Failure, Job, Loaded
+from mkpc_kaggle.engine.worker import Maker, MatchRunner, estimates_runner, scene_runner
 from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.pipeline.stages import Pipeline
 
-# Times the number of workers lost in a row: scarce memory may become free meanwhile.
-RESTART_PAUSE_S = 1.0
 LISTEN_S = 0.2  # between checks for an interrupt, since a signal does not ring
 # An estimate takes a fraction of a pair's matching on a CPU; on a GPU, the other cores decode images.
 CORES_PER_ESTIMATOR = 4
 
 
-class Work(StrEnum):
+class Kind(StrEnum):
     """The work of a place's workers."""
 
     MATCH = "matching"
-    ESTIMATE = "estimates"  # and features of images
+    ESTIMATE = "estimates"
     SCENE = "scenes"
+
+
+@dataclass(frozen=True)
+class Lost:
+    """The pairs and units of a lost job, no units for estimates; ``blamed`` are those that never ran."""
+
+    indices: list[int]
+    units: list[int]
+    blamed: list[int] = field(default_factory=list)
 
 
 @dataclass(eq=False)
 class Place:
     """A place such as "cuda:0", with its worker and the worker's job, which began at ``since``.
 
-    ``since`` and ``limit`` are times of the engine's clock. A worker must answer by ``limit``; without a worker,
-    the next may start then. ``closed`` is the reason why no more workers start here, else empty. ``lost`` has the
-    items of each job that was lost since the last answer.
+    ``strikes`` and ``lost`` are of the losses since the last answer that count against it, and of all.
+    ``closed`` is the reason why no more workers start here, else empty. Times are of the engine's clock.
     """
 
     name: str
     make: Callable[[], ThreadWorker]
-    work: Work = Work.MATCH
+    kind: Kind = Kind.MATCH
     minibatch: int = 1  # pairs of a job of matching
     worker: ThreadWorker | None = None
     job: Job | None = None
     is_loaded: bool = False
-    lost: list[frozenset[Item]] = field(default_factory=list)
-    failed_starts: int = 0  # since the last answer
+    has_answered: bool = False  # to any job
+    strikes: int = 0
+    lost: list[Lost] = field(default_factory=list)
     closed: str = ""
     since: float = 0.0
-    limit: float = -inf  # in the past: a worker may start at once
+    restart_at: float = -inf
 
     @property
     def is_idle(self) -> bool:
@@ -65,94 +70,54 @@ class Place:
 
     @property
     def is_starting(self) -> bool:
-        """Return whether a worker is loading, or will be started again after a pause."""
-        has_begun = self.worker is not None or bool(self.lost) or self.failed_starts > 0
-        return has_begun and not self.is_loaded and not self.closed
+        return self.worker is not None and not self.is_loaded
 
     def may_start(self, now: float) -> bool:
-        return self.worker is None and not self.closed and now >= self.limit
+        return self.worker is None and not self.closed and now >= self.restart_at
 
-    def start(self, now: float, timeout: float) -> None:
+    def start(self, now: float) -> None:
         """Start a worker. Its first answer says whether it is loaded."""
         self.since = now
-        self.limit = now + timeout
         self.worker = self.make()
         self.worker.start()
 
-    def submit(self, job: Job, time_limit: float, now: float) -> None:
+    def submit(self, job: Job, now: float) -> None:
         """Hand a job to the idle worker."""
         assert self.worker is not None
         self.job = job
         self.since = now
-        self.limit = now + time_limit
         self.worker.submit(job)
 
-    def poll(self, now: float) -> Answer | None:
-        """Return the worker's answer, or a :class:`Failure` if it hangs; ``None`` while it
-        computes.
+    def poll(self, now: float, seconds: float) -> Answer | None:
+        """Return the worker's answer, or a :class:`Failure` if it did not answer within ``seconds``; ``None``
+        while it computes, and without a worker.
+
+        A failure ends the worker, unless only its job failed. After an out-of-memory error, memory stays
+        fragmented, and a failed device keeps failing.
         """
         if self.worker is None:
             return None
         # An answer counts even after the limit: its work is done.
         answer = self.worker.answer()
-        if answer is None and now >= self.limit:
+        if answer is None and not self.is_idle and now >= self.since + seconds:
             answer = Failure(Cause.TIMED_OUT, f"no answer for {now - self.since:.0f} s")
-        if answer is None:
-            return None
-        self.limit = inf  # an idle worker may wait as long as it likes
-        if isinstance(answer, Failure):
-            self._fail(answer, now)
-        elif isinstance(answer, Loaded):
+        if isinstance(answer, Loaded):
             self.is_loaded = True
-        else:
-            self._note_answer()
+        elif isinstance(answer, Failure) and not (self.is_loaded and answer.cause is Cause.RAISED):
+            self.kill()
         return answer
 
-    def lose(
-        self, items: Collection[Item], failure: Failure, now: float, given_up: Collection[Item]
-    ) -> None:
-        """Count a lost job, and close the place if it is at fault. ``given_up`` are items at fault.
-
-        Without items, the job says nothing about its place, nor does any job of a place for scenes:
-        each has a new process.
-        """
-        if items and self.work is not Work.SCENE:
-            self.lost.append(frozenset(items))
-            self._judge(failure, now, given_up)
+    def note_answer(self) -> None:
+        """Note that the worker works: it answered a job, if only by an ordinary error."""
+        self.has_answered = True
+        self.strikes = 0
+        self.lost = []
 
     def kill(self) -> None:
         if self.worker is not None:
             self.worker.kill()
             self.worker = None
             self.is_loaded = False
-            self.limit = -inf
-
-    def _note_answer(self) -> None:
-        self.lost = []
-        self.failed_starts = 0
-
-    def _fail(self, failure: Failure, now: float) -> None:
-        """End the worker, unless only its job failed.
-
-        After an out-of-memory error, memory stays fragmented. A failed device keeps failing.
-        """
-        if self.is_loaded and failure.cause is Cause.RAISED:
-            self._note_answer()  # the worker and its device work
-            return
-        has_started = self.is_loaded
-        self.kill()
-        self.limit = now  # the next worker may start, unless the loop counts the job
-        if not has_started:
-            self.failed_starts += 1
-            self._judge(failure, now, ())
-
-    def _judge(self, failure: Failure, now: float, given_up: Collection[Item]) -> None:
-        """Close the place after three losses in a row, or set the pause before the next worker."""
-        losses = self.failed_starts + len(different(self.lost, given_up))
-        # A refusal is an answer of the configuration, which no other worker would change.
-        if losses >= MAX_LOSSES or failure.cause is Cause.REFUSED:
-            self.closed = f"{self.name}: {failure}"
-        self.limit = now + RESTART_PAUSE_S * losses
 
 
 class Site:
@@ -178,15 +143,16 @@ class Site:
         self._worker = ThreadWorker if threads else ProcessWorker
         self._log = log
         self._cores = available_cores()
+        self.is_open = False  # the places for matching exist
         # In this process, a second thread would take its time from the thread that matches.
         estimators = 1 if threads else max(1, self._cores // CORES_PER_ESTIMATOR)
         make = partial(estimates_runner, in_process=not threads)
         self.places = [
-            Place(f"estimates {n}", partial(self._make, "estimates", make), Work.ESTIMATE)
+            Place(f"estimates {n}", partial(self._make, "estimates", make), Kind.ESTIMATE)
             for n in range(estimators)
         ]
         self.places += [
-            Place("scenes" if n == 0 else f"scenes {n}", self.scene_worker, Work.SCENE)
+            Place("scenes" if n == 0 else f"scenes {n}", self.scene_worker, Kind.SCENE)
             for n in range(self._cores)
         ]
         self.fallback: list[Place] = []
@@ -196,37 +162,56 @@ class Site:
         worker.log = self._log
         return worker
 
-    def scenes_at_a_time(self, *, is_matching: bool) -> int:
-        """Return the number of cores for scenes: the ones that matching leaves free, at least one."""
-        return max(1, self._cores - self.matching_cores * is_matching)
-
-    def printed(self) -> Path | None:
-        """Return the log file of the workers' output, if it is not empty."""
-        with suppress(OSError):  # it does not exist if nothing was printed
-            if self._log is not None and self._log.stat().st_size:
-                return self._log
-        return None
-
-    def of(self, work: Work) -> list[Place]:
-        return [place for place in self.places if place.work is work]
-
-    def open(self) -> None:
-        """Add places for matching. Raise :class:`mkpc_kaggle.errors.UserError` if none is possible."""
-
-    def fall_back(self) -> None:
-        """Let the fallback places take over matching."""
-        for place in self.of(Work.MATCH):
-            place.kill()
-            self.places.remove(place)
-        self.places += self.fallback
-        self.fallback = []
-        self.matching_cores = self._cores  # the CPU computes now
-
     def scene_worker(self) -> ThreadWorker:
         """Return a worker for a scene, always in a process, since pycolmap may crash."""
         worker = ProcessWorker("scene", scene_runner, self.ring)
         worker.log = self._log
         return worker
+
+    def open(self) -> None:
+        """Join other machines, if any. Raise :class:`mkpc_kaggle.errors.UserError` if that fails."""
+        self.is_open = True
+
+    def of(self, kind: Kind) -> list[Place]:
+        """Return the places of a kind that are not closed."""
+        return [place for place in self.places if place.kind is kind and not place.closed]
+
+    def free(self, now: float) -> list[Place]:
+        """Return the places that can take a job: those with an idle worker, then those that may start one."""
+        places = [place for place in self.places if place.is_idle]
+        return places + [place for place in self.places if place.may_start(now)]
+
+    def has_other(self, place: Place) -> bool:
+        """Return whether another place can do what a place for matching does."""
+        return bool(self.fallback) or self.of(Kind.MATCH) != [place]
+
+    @property
+    def has_jobs(self) -> bool:
+        return any(place.job is not None for place in self.places)
+
+    @property
+    def is_closed(self) -> bool:
+        """No worker of matching is started any more."""
+        return self.is_open and not self.of(Kind.MATCH)
+
+    @property
+    def reason(self) -> str:
+        """Why places for matching are closed; empty if none is."""
+        places = [place for place in self.places if place.kind is Kind.MATCH]
+        return "; ".join(place.closed for place in places if place.closed)
+
+    def scenes_at_a_time(self, *, is_matching: bool) -> int:
+        """Return the number of cores for scenes: the ones that matching leaves free, at least one."""
+        return max(1, self._cores - self.matching_cores * is_matching)
+
+    def fall_back(self) -> None:
+        """Let the fallback places take over matching."""
+        for place in [place for place in self.places if place.kind is Kind.MATCH]:
+            place.kill()
+            self.places.remove(place)
+        self.places += self.fallback
+        self.fallback = []
+        self.matching_cores = self._cores  # the CPU computes now
 
     def ring(self) -> None:
         self._bell.put(None)
@@ -239,7 +224,9 @@ class Site:
             self._bell.get(timeout=max(0.0, min(LISTEN_S, until - self._clock())))
 
     def close(self) -> None:
-        """Release the site, after its workers have been killed."""
+        """End all workers."""
+        for place in [*self.places, *self.fallback]:
+            place.kill()
 
 
 class LocalSite(Site):

@@ -1,6 +1,5 @@
 """The tables of a run hold what their columns say, in every run."""
 
-import csv
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -8,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from rectified import SWEEP, RectifiedMatcher, run, write_pairs
-from shared import run_command
 
 from mkpc_kaggle import results
 from mkpc_kaggle.recipe import Recipe
@@ -32,19 +30,12 @@ def matrix(row) -> np.ndarray:
     return np.array([[float(row[f"f{i}{j}"]) for j in (1, 2, 3)] for i in (1, 2, 3)])
 
 
-def test_the_model_of_a_pair_says_whether_its_matrix_is_f_or_e(work, tmp_path):
+def test_the_model_of_a_pair_says_whether_its_matrix_is_f_or_e(work):
     pairs = results(work).pairs
     assert pairs["model"].tolist() == ["F", "E"]
     # The pictures are rectified, so F and E are [e_x]x of pixels and of calibrated points.
     singular = [np.linalg.svd(matrix(row), compute_uv=False) for _, row in pairs.iterrows()]
     np.testing.assert_allclose(singular[1] / singular[1][0], [1, 1, 0], atol=1e-6)
-    assert run_command("journal", work, "--csv", tmp_path / "csv") == 0
-    with (tmp_path / "csv" / "pairs.csv").open(newline="") as stream:
-        rows = list(csv.DictReader(stream))
-    assert [row["model"] for row in rows] == ["F", "E"]
-    for row, (_, expected) in zip(rows, pairs.iterrows(), strict=True):
-        np.testing.assert_array_equal(matrix(row), matrix(expected))
-        assert row["image0"] == expected["image0"]
 
 
 def test_images_of_one_file_name_have_two_names(work):
@@ -68,15 +59,3 @@ def test_tables_without_rows_have_their_columns(work):
     assert tables.cameras.query("focal > 0").empty
     joined = tables.pairs.merge(tables.cameras, left_on="image0", right_on="image", how="left")
     assert joined["focal"].isna().all()
-
-
-def test_a_run_that_has_only_begun_has_tables_with_all_columns(work, tmp_path):
-    from mkpc_kaggle.engine.store.database import Store
-
-    with Store.open(tmp_path / "work"):
-        pass
-    begun = results(tmp_path / "work")
-    complete = results(work)
-    for empty, filled in zip(begun, complete, strict=True):
-        assert len(empty) == 0
-        assert list(empty.columns) == list(filled.columns)

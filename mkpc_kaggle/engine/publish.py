@@ -1,0 +1,119 @@
+"""Versions of the results: in the request's own files, and as the table of pairs that reports read."""
+
+import json
+import threading
+from dataclasses import asdict
+
+import numpy as np
+
+from mkpc_kaggle.engine.budget import Budget
+from mkpc_kaggle.engine.state import SOURCES, State
+from mkpc_kaggle.engine.store import Store
+from mkpc_kaggle.geometry.robust import ModelKind
+
+INTERVAL_S = 30.0  # between versions: a run that is killed loses at most this from its submission
+TIME_SHARE = 0.05  # maximum share of the time for writing versions, if a disk is slow
+
+
+class Publication:
+    """The versions of a request's results. The loop publishes; the watchdog may save the last
+    version from its own thread. ``unwritten`` says why the latest version could not be written.
+    """
+
+    def __init__(self, state: State, store: Store, budget: Budget) -> None:
+        self._state = state
+        self._store = store
+        self._budget = budget
+        self._lock = threading.Lock()
+        self._has_ended = False
+        self._published = budget.clock()
+        self._sources = np.full(len(state.pair_of_row), -1)  # of the rows, as in the last version
+        self.unwritten = ""
+
+    def is_due(self, now: float) -> bool:
+        interval = max(INTERVAL_S, self._budget.writing / TIME_SHARE)
+        return now - self._published > interval
+
+    def publish(self) -> None:
+        """Write the results, and the rows of the pairs that have changed since the last version."""
+        # Without pairs, as in a folder of one image, no file of the request changes.
+        if not self._state.rows:
+            return
+        start = self._budget.clock()
+        self.save()
+        self._store.put({"pair": self._rows(), "run": [(0, json.dumps(self._about()))]})
+        # The measured time decides when the last version is written.
+        self._published = self._budget.clock()
+        self._budget.note_write(self._published - start)
+
+    def save(self) -> str:
+        """Write the results unless the run has ended. Return why that failed, or an empty text."""
+        # The loop and the watchdog would write the same temporary file.
+        with self._lock:
+            if not self._has_ended:
+                try:
+                    self._state.request.publish(self._state)
+                    self.unwritten = ""
+                # A full disk must not end the run; other errors are bugs and do.
+                except OSError as error:
+                    self.unwritten = f"the results cannot be written: {error}"
+        return self.unwritten
+
+    def end(self) -> None:
+        """Publish the last version. After it, the watchdog writes no other."""
+        self.publish()
+        self._has_ended = True
+
+    def _about(self) -> dict[str, object]:
+        state = self._state
+        scenes = {
+            batch: [scene.key for scene in state.made[number].values()]
+            for batch, number in state.batches.items()
+        }
+        return {
+            **asdict(state.request.about),
+            "units": [(unit.name, unit.stage) for unit in state.units],
+            "rows": len(state.pair_of_row),
+            # The one in use first
+            "scenes": {
+                batch: sorted(keys, key=state.scenes[batch].key.__ne__)
+                for batch, keys in scenes.items()
+                if keys
+            },
+        }
+
+    def _rows(self) -> list[tuple[object, ...]]:
+        """Return the rows of the pairs that have changed."""
+        state = self._state
+        sources, fundamentals = state.written
+        # A pair may get another F although it has no new result: its scene is another one.
+        moved = state.pair_of_row[sources != self._sources].tolist()
+        self._sources = sources
+        changed = np.zeros(len(state.pairs), bool)
+        changed[state.take_dirty(moved)] = True
+        scenes = state.scenes
+        rows: list[tuple[object, ...]] = []
+        for number in np.flatnonzero(changed[state.pair_of_row]).tolist():
+            index = int(state.pair_of_row[number])
+            pair = state.pairs[index]
+            scene = scenes.get(pair.group)
+            choice = scene.choices.get(state.contents(index)) if scene is not None else None
+            both = zip(state.points[index].tolist(), state.done[index].tolist(), strict=True)
+            points = [key.decode() if done else "" for key, done in both]
+            used = zip(points, state.needed[index].tolist(), strict=True)
+            rows.append(
+                (
+                    number,
+                    state.request.pairs[number].id,
+                    pair.group,
+                    *state.names[index],
+                    ModelKind.F if pair.intrinsics is None else ModelKind.E,
+                    json.dumps([(key, needed) for key, needed in used]),
+                    state.estimate[index].decode(),
+                    np.asarray(fundamentals[number], "<f8").tobytes(),
+                    SOURCES[sources[number]],
+                    "" if choice is None else choice.reason,
+                    json.dumps(state.reasons.get(index, {})),
+                )
+            )
+        return rows
