@@ -29,7 +29,6 @@ Run: TypeAlias = dict[str, Any]  # the figures of `validate --json`
 MORE = {"sift": ", max_matches = 8000"}  # its number of keypoints
 TAIL = """
 [magsac]
-permutations = 1
 [focal]
 scale = 0.25
 [matchers.sift]

@@ -50,7 +50,7 @@ from mkpc_kaggle.scene.sfm import reconstruct_batch
 from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair, tracks_of
 
 MIN_COVISIBILITY = 0.1  # of a scored pair, as in the competition
-MAGSAC = RobustConfig(permutations=1)  # with a prior, the permutations are starts of a search
+MAGSAC = RobustConfig()
 FOCAL = FocalConfig()
 LIGHT = FocalConfig(scale=0.25)  # of the recipe `light`
 # Names of estimates.
@@ -123,7 +123,6 @@ def by_threshold(pixels: float) -> dict[str, Estimator]:
 
 
 PAIR_ESTIMATORS: dict[str, Estimator] = {
-    "MAGSAC, 8 permutations": by_pair(lambda found: estimate(found.matches, RobustConfig())),
     "MAGSAC": by_pair(lambda found: estimate(found.matches, MAGSAC)),
     "prior": by_pair(with_prior),
     "prior of light": by_pair(partial(with_prior, focal=LIGHT)),

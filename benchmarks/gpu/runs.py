@@ -188,7 +188,7 @@ def _recipe(setup: Setup) -> Path:
     side = QUICK_SIDE if setup.quick else LONG_SIDE
     features = QUICK_FEATURES if setup.quick else FEATURES
     units = [f'{{ stage = {n}, matcher = "aliked_lightglue", long_side = {side} }}' for n in (1, 2)]
-    text = f"units = [{', '.join(units)}]\n[magsac]\npermutations = 1\nmax_iterations = 5000\n"
+    text = f"units = [{', '.join(units)}]\n[magsac]\nmax_iterations = 5000\n"
     path = setup.out / "runs.toml"
     path.write_text(f"{text}[matchers.aliked_lightglue]\nfeatures = {features}\n")
     return path

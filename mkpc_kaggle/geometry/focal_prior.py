@@ -39,7 +39,6 @@ from mkpc_kaggle.geometry.robust import (
     RobustConfig,
     consensus,
     homogeneous,
-    permutation,
     unit_norm,
 )
 from mkpc_kaggle.geometry.two_view import Problem, TwoView, Vectors, robust_costs, sampson
@@ -218,15 +217,14 @@ class _Search:
         starts: list[TwoView] = []
         failures: list[str] = []
         count = len(self.rays[0])
-        for number in range(magsac.permutations):
-            plain = self._consensus(permutation(number, count), magsac)
-            if not plain.ok:
-                failures.append(plain.failure)
-                continue
+        plain = self._consensus(np.arange(count), magsac)
+        if plain.ok:
             F = self._for_rays(plain.matrix)
             view = self._decomposed(F)
             starts.append(view)
             free.append(_Candidate(F, self._cost(F, view) + FREE_COST))
+        else:
+            failures.append(plain.failure)
         for number in range(ESSENTIAL_STARTS):
             # Another quantile of the prior, and another subset of the matches.
             logs = NormalDist().inv_cdf((number + 0.5) / ESSENTIAL_STARTS) * self._sigmas
@@ -237,8 +235,8 @@ class _Search:
                 failures.append(essential.failure)
         return free, starts, failures
 
-    def _essential(self, number: int, logs: Vectors, magsac: RobustConfig) -> Estimate:
-        """Estimate E at focal lengths of ``logs`` from part of the permutation ``number``."""
+    def _essential(self, seed: int, logs: Vectors, magsac: RobustConfig) -> Estimate:
+        """Estimate E at focal lengths of ``logs`` from a part of the matches by ``seed``."""
         config = replace(
             magsac, threshold=ESSENTIAL_THRESHOLD_PX, max_iterations=ESSENTIAL_ITERATIONS
         )
@@ -247,7 +245,8 @@ class _Search:
         prior0, prior1 = self._priors
         K0 = prior0.scaled(float(np.exp(logs[0])))
         K1 = prior1.scaled(float(np.exp(logs[1])))
-        return self._consensus(permutation(number, count)[:size], config, (K0, K1))
+        chosen = np.random.default_rng(seed).permutation(count)[:size]
+        return self._consensus(chosen, config, (K0, K1))
 
     def refined(self, starts: Sequence[TwoView]) -> list[_Candidate]:
         """Search from all starts. Return the best results, refined."""
@@ -287,8 +286,7 @@ class _Search:
         points0 = self._distinct.points0[chosen]
         points1 = self._distinct.points1[chosen]
         model = ModelKind.E if intrinsics else ModelKind.F
-        # The permutation is the caller's: each of its results is a start.
-        return consensus(points0, points1, replace(config, permutations=1), model, intrinsics)
+        return consensus(points0, points1, config, model, intrinsics)
 
     def _decomposed(self, F: Matrix3) -> TwoView:
         """Decompose an F for rays into two views, with the best-fitting focal lengths of a grid."""

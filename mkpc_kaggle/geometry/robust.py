@@ -1,23 +1,19 @@
 """Two-view models from matches: F, E or H by MAGSAC++.
 
 MAGSAC's threshold is :attr:`RobustConfig.threshold`, ``[magsac] threshold`` of a recipe: 0.2 px of the stored
-image, which no shipped recipe changes. ``threshold_side``, 0 in all of them, would make it pixels of a resized
-image (:meth:`RobustConfig.in_stored_pixels`). For an E it is divided by the mean focal length. With ``[focal]``, F
+image, which no shipped recipe changes. For an E it is divided by the mean focal length. With ``[focal]``, F
 is refined by that table's ``scale``, and this threshold counts the inliers.
-
-At most 50,000 iterations; `reconstruct` has 2,000. One order of the matches in auto, light, best, permissive and
-classical, and in `reconstruct`; eight in the recipes of the paper, and by default.
 
 Other limits, in pixels of the stored image, are for other purposes: 0.4 for rough starts under a prior
 (``ESSENTIAL_THRESHOLD_PX``), 2.0 for pycolmap's verification (``MAX_ERROR_PX``), 2.0 for matches that speak
-against a scene's F (:mod:`mkpc_kaggle.scene.choose`), 1.0 for the support of an F, 2.0 and 4.0 for homographies.
-``validate --protocol`` has published ones. ``threshold`` in a matcher's table is a confidence.
+against a scene's F (:mod:`mkpc_kaggle.scene.choose`), 1.0 for the support of an F. ``threshold`` in a matcher's
+table is a confidence.
 
 An estimate always has a matrix. If no model is found, it holds the reason and the fallback matrix,
 which is finite and of the right rank. So a submission is always complete.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Any, NamedTuple
@@ -28,9 +24,9 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from mkpc_kaggle.config import POSITIVE, Range, check_ranges
-from mkpc_kaggle.geometry.coordinates import Box, Matrix3, Size, View
+from mkpc_kaggle.geometry.coordinates import Matrix3
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.geometry.two_view import Vectors, robust_costs, sampson
+from mkpc_kaggle.geometry.two_view import Vectors, sampson
 
 # The second and third singular value of F, in pixels. MAGSAC's own F, from seven matches, has a
 # third value of up to 4e-7 of the second; the second is at least 3e-7 of the first. A false alarm
@@ -52,53 +48,17 @@ class ModelKind(StrEnum):
     H = "H"
 
 
-class Method(StrEnum):
-    """The robust estimator: MAGSAC++, or plain RANSAC for published evaluations with it."""
-
-    MAGSAC = "magsac"
-    RANSAC = "ransac"
-
-
 @dataclass(frozen=True)
 class RobustConfig:
-    """Settings of :func:`estimate`, table ``[magsac]`` of a recipe.
+    """Settings of :func:`estimate`, table ``[magsac]`` of a recipe."""
 
-    Depending on the order of the matches, the estimator may stop before it finds the best model. So
-    it runs on several permutations. The model with the lowest robust cost at twice the threshold
-    wins.
-    """
-
-    method: Method = Method.MAGSAC
     threshold: float = 0.2  # pixels of the stored image
     max_iterations: int = 50_000
     confidence: float = 0.99999  # probability that no better model remains, where iterations stop
-    permutations: int = 8  # number of fixed permutations; the first keeps the order of the matches
-    # If not 0, the threshold is in pixels of the image resized to this long side.
-    threshold_side: int = 0
-    # Keep exact duplicates, and estimate from the fewest matches that OpenCV accepts.
-    every_match: bool = False
 
     def __post_init__(self) -> None:
         check_ranges(self, threshold=POSITIVE, max_iterations=Range(1, 10**6))
         check_ranges(self, confidence=Range(0, 1, "()"))
-        check_ranges(self, permutations=Range(1, 100), threshold_side=Range(0, 99_999))
-
-    def in_stored_pixels(
-        self, sizes: Sequence[Size], intrinsics: tuple[Matrix3, Matrix3] | None = None
-    ) -> "RobustConfig":
-        """Return settings with the threshold in stored pixels.
-
-        Its ratio to the mean focal length is the same as in the resized images.
-        """
-        if not self.threshold_side:
-            return self
-        views = [View.fit(Box.whole(size), long_side=self.threshold_side) for size in sizes]
-        scales = np.array([view.scale for view in views])  # (2, 2): x and y of both images
-        # Without intrinsics, all focal lengths count as equal.
-        matrices = intrinsics or (np.eye(3), np.eye(3))
-        focals = np.array([K.diagonal()[:2] for K in matrices])  # (2, 2)
-        stored = self.threshold * focals.sum() / (focals * scales).sum()
-        return replace(self, threshold=stored, threshold_side=0)
 
 
 @dataclass(frozen=True)
@@ -159,7 +119,7 @@ def estimate(
 ) -> Estimate:
     """Estimate a two-view model from ``matches`` (image pixels).
 
-    Ignores non-finite points and, by default, exact duplicates. Duplicates of an inlier are
+    Ignores non-finite points and exact duplicates. Duplicates of an inlier are
     inliers. E needs both camera matrices (3, 3): the points are calibrated, and the threshold is
     divided by the mean focal length. Raises ``ValueError`` for E without intrinsics, but never
     because of the points. The same input gives the same bytes.
@@ -168,7 +128,7 @@ def estimate(
         raise ValueError(
             "an essential matrix needs the intrinsics, the camera matrix K of both images"
         )
-    distinct = DistinctMatches.of(matches, merge=not config.every_match)
+    distinct = DistinctMatches.of(matches)
     found = consensus(distinct.points0, distinct.points1, config, model, intrinsics)
     return replace(found, inliers=distinct.mask_of_all(found.inliers))
 
@@ -182,73 +142,30 @@ def consensus(
 ) -> Estimate:
     """Estimate a model as :func:`estimate` does, from finite points (N, 2), duplicates included."""
     count = len(points0)
-    threshold = config.threshold
     solver = _SOLVERS[model]
-    if count < (solver.minimal if config.every_match else solver.min_matches):
+    if count < solver.min_matches:
         return Estimate.failed(model, count, f"too few distinct matches for {model}: {count}")
-    settings = _settings(config)
-    if intrinsics is not None and model is ModelKind.E:
-        points0 = calibrate(points0, intrinsics[0])
-        points1 = calibrate(points1, intrinsics[1])
-        focals = [K[axis, axis] for K in intrinsics for axis in (0, 1)]
-        settings["focal"] = float(np.mean(focals))
-        threshold /= settings["focal"]
-    settings["ransacReprojThreshold"] = threshold
-
-    candidates: list[_PermutedModel] = []
-    failure = f"no {model} fits {count} distinct matches"
-    for number in range(config.permutations):
-        try:
-            candidates += _model_of(solver, points0, points1, permutation(number, count), settings)
-        except cv2.error as error:  # it may reject points in one order and accept them in another
-            failure = f"OpenCV refused the points: {error.err}"
-    if not candidates:
-        return Estimate.failed(model, count, failure)
-    # The number of inliers does not decide: MAGSAC scores distances up to several times the
-    # threshold.
-    best = min(candidates, key=lambda candidate: candidate.cost)
-    if not best.inliers.any():
-        failure = f"no {model} has inliers among {count} distinct matches"
-        return Estimate.failed(model, count, failure)
-    cost = best.cost if np.isfinite(best.cost) else 0.0
-    stats = EstimateStats(candidates=len(candidates), cost=cost, magsac_cost=cost)
-    return Estimate(model, unit_norm(best.matrix), best.inliers, stats=stats)
-
-
-def _settings(config: RobustConfig) -> dict[str, Any]:
-    """Return OpenCV's arguments that do not depend on the model."""
-    return {
-        "method": cv2.USAC_MAGSAC if config.method is Method.MAGSAC else cv2.RANSAC,
+    settings: dict[str, Any] = {
+        "method": cv2.USAC_MAGSAC,
+        "ransacReprojThreshold": config.threshold,
         "confidence": config.confidence,
         "maxIters": config.max_iterations,
     }
-
-
-class _PermutedModel(NamedTuple):
-    """OpenCV's model of one permutation, with the mask (N,) of its inliers."""
-
-    matrix: Matrix3
-    inliers: NDArray[np.bool_]
-    cost: float
-
-
-def _model_of(
-    solver: "_Solver",
-    points0: Vectors,
-    points1: Vectors,
-    order: NDArray[np.intp],
-    settings: dict[str, Any],
-) -> list[_PermutedModel]:
-    """Return OpenCV's model of the points in an order, if it finds one. May raise ``cv2.error``."""
-    matrix, mask = solver.find(points0[order], points1[order], **settings)
+    if intrinsics is not None and model is ModelKind.E:
+        points0 = calibrate(points0, intrinsics[0])
+        points1 = calibrate(points1, intrinsics[1])
+        settings["focal"] = float(np.mean([K[axis, axis] for K in intrinsics for axis in (0, 1)]))
+    try:
+        matrix, mask = solver.find(points0, points1, **settings)
+    except cv2.error as error:
+        return Estimate.failed(model, count, f"OpenCV refused the points: {error.err}")
     if not _is_model(matrix):
-        return []
-    inliers = np.zeros(len(order), bool)
-    inliers[order] = mask.ravel().astype(bool)  # back in the order of the points
-    with np.errstate(over="ignore", invalid="ignore"):  # points may be any numbers
-        distances = solver.distances(matrix, points0, points1)
-        costs = robust_costs(distances, 2 * settings["ransacReprojThreshold"])
-        return [_PermutedModel(matrix, inliers, float(np.sum(costs)))]
+        return Estimate.failed(model, count, f"no {model} fits {count} distinct matches")
+    inliers = mask.ravel().astype(bool)
+    if not inliers.any():
+        failure = f"no {model} has inliers among {count} distinct matches"
+        return Estimate.failed(model, count, failure)
+    return Estimate(model, unit_norm(matrix), inliers)
 
 
 def _is_model(matrix: Any) -> bool:
@@ -288,12 +205,8 @@ class DistinctMatches:
     index: NDArray[np.intp]  # (N,) the row of each match, -1 for a match that is not finite
 
     @classmethod
-    def of(cls, matches: Matches, *, merge: bool = True) -> "DistinctMatches":
-        """Return the distinct matches; without ``merge`` all finite matches."""
+    def of(cls, matches: Matches) -> "DistinctMatches":
         pairs = np.hstack([matches.points0, matches.points1]).astype(np.float64)
-        if not merge:
-            # A row's number makes it distinct.
-            pairs = np.column_stack([pairs, np.arange(len(pairs))])
         finite = np.isfinite(pairs).all(axis=1)
         first, inverse = _distinct_rows(pairs[finite])
         # The order is that of the values; MAGSAC needs that of the matches. ``rank`` is the row of
@@ -302,7 +215,7 @@ class DistinctMatches:
         index = np.full(len(pairs), -1)
         index[finite] = rank[inverse]
         pairs = pairs[finite][np.sort(first)]
-        return cls(pairs[:, :2], pairs[:, 2:4], index)
+        return cls(pairs[:, :2], pairs[:, 2:], index)
 
     def mask_of_all(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Expand a mask (M,) of the distinct matches to all N matches, duplicates included."""
@@ -381,13 +294,6 @@ def sampson_distances(F: Matrix3, matches: Matches) -> Vectors:
     return _epipolar_distances(F, points0, points1)
 
 
-def permutation(number: int, count: int) -> NDArray[np.intp]:
-    """Return the fixed permutation ``number`` of ``count`` matches; number 0 keeps their order."""
-    if number == 0:
-        return np.arange(count)
-    return np.random.default_rng(number).permutation(count)
-
-
 def homogeneous(points: NDArray[np.floating]) -> Vectors:
     """Append a 1 to each point: (N, 2) -> (N, 3)."""
     return np.column_stack([points, np.ones(len(points))])
@@ -398,20 +304,12 @@ def _epipolar_distances(matrix: Matrix3, points0: Vectors, points1: Vectors) -> 
     return np.abs(sampson(matrix, homogeneous(points0), homogeneous(points1)))
 
 
-def _transfer_distances(matrix: Matrix3, points0: Vectors, points1: Vectors) -> Vectors:
-    """Return (N,) distances of the second image's points to the first's, mapped by H."""
-    mapped = cv2.perspectiveTransform(points0[None], matrix)[0]
-    return np.asarray(np.hypot(*(mapped - points1).T))
-
-
 class _Solver(NamedTuple):
-    """OpenCV's function for a model, with its limits and the residual."""
+    """OpenCV's function for a model, with its limit."""
 
-    minimal: int  # the fewest matches that OpenCV accepts
     min_matches: int  # more than a minimal sample, so that matches can contradict the model
     fallback: Matrix3
     find: Callable[..., Any]  # returns OpenCV's matrix (``None`` without a model) and mask
-    distances: Callable[[Matrix3, Vectors, Vectors], Vectors]
 
 
 def _find_fundamental(points0: Vectors, points1: Vectors, **settings: Any) -> Any:
@@ -427,11 +325,10 @@ def _find_essential(
 ) -> Any:
     """Find E from calibrated points (N, 2): return OpenCV's matrix and mask."""
     # MAGSAC integrates its score up to a fixed number of pixels, so it needs points in pixels.
-    scale = focal if settings["method"] == cv2.USAC_MAGSAC else 1.0
-    settings["threshold"] = scale * settings.pop("ransacReprojThreshold")
-    K = np.diag([scale, scale, 1.0])
+    settings["threshold"] = settings.pop("ransacReprojThreshold")
+    K = np.diag([focal, focal, 1.0])
     stacked, mask = cv2.findEssentialMat(
-        scale * points0, scale * points1, K, prob=confidence, **settings
+        focal * points0, focal * points1, K, prob=confidence, **settings
     )
     if stacked is None or len(stacked) <= 3:
         return stacked, mask
@@ -446,7 +343,7 @@ def _find_essential(
 
 
 _SOLVERS = {
-    ModelKind.F: _Solver(8, 8, FALLBACK_FUNDAMENTAL, _find_fundamental, _epipolar_distances),
-    ModelKind.E: _Solver(5, 6, FALLBACK_FUNDAMENTAL, _find_essential, _epipolar_distances),
-    ModelKind.H: _Solver(4, 5, np.eye(3), cv2.findHomography, _transfer_distances),
+    ModelKind.F: _Solver(8, FALLBACK_FUNDAMENTAL, _find_fundamental),
+    ModelKind.E: _Solver(6, FALLBACK_FUNDAMENTAL, _find_essential),
+    ModelKind.H: _Solver(5, np.eye(3), cv2.findHomography),
 }

@@ -189,10 +189,9 @@ def with_estimate(
     results = tuple(ordered)
     matches = Matches.concatenate(result.matches for result in results)
     sizes = pair.sizes or tuple(image.size for image in pair.images)
-    magsac = recipe.magsac.in_stored_pixels(sizes, intrinsics)
     # The prior is on the focal lengths of F and E.
     if recipe.focal is None or model is ModelKind.H:
-        found = estimate(matches, magsac, model, intrinsics)
+        found = estimate(matches, recipe.magsac, model, intrinsics)
     else:
         if intrinsics is not None:
             priors = [FocalPrior(K, 0.0) for K in intrinsics]  # known: no deviation
@@ -201,7 +200,7 @@ def with_estimate(
             both = zip(sizes, focals, strict=True)
             priors = [FocalPrior.of_image(size, focal) for size, focal in both]
         first, second = priors
-        found = estimate_with_prior(matches, (first, second), magsac, recipe.focal, model)
+        found = estimate_with_prior(matches, (first, second), recipe.magsac, recipe.focal, model)
     if found.ok and model is not ModelKind.H:
         found = with_stats(found, matches, intrinsics if model is ModelKind.E else None)
     return replace(pair, results=results, estimate=found)

@@ -182,7 +182,7 @@ def for_cameras(recipe: Recipe, sharing: str | None = None) -> Recipe:
     # F of a pair is for the report alone: its inliers, and doubts about the pair.
     magsac = recipe.magsac
     iterations = min(magsac.max_iterations, MAGSAC_ITERATIONS)
-    magsac = replace(magsac, permutations=1, max_iterations=iterations)
+    magsac = replace(magsac, max_iterations=iterations)
     return replace(recipe, units=units, magsac=magsac, focal=None, scene=scene)
 
 

@@ -92,8 +92,7 @@ def choose(
     choice = from_cameras(pair, models)
     if focal is None or choice.reason in KEEPS_ITS_F:
         return choice
-    sizes = pair.image0.size, pair.image1.size
-    magsac = (magsac or RobustConfig()).in_stored_pixels(sizes)
+    magsac = magsac or RobustConfig()
     return replace(choice, F=estimate_at_known_focals(pair, focals, focal, magsac))
 
 

@@ -17,7 +17,6 @@ from mkpc_kaggle.engine.frames import results
 from mkpc_kaggle.engine.request import Ending
 from mkpc_kaggle.engine.store import Store
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
-from mkpc_kaggle.geometry.robust import Method
 from mkpc_kaggle.pipeline.stages import Pipeline
 from mkpc_kaggle.recipe import CameraSharing, Recipe, SceneConfig
 from mkpc_kaggle.reporting.summary import summary
@@ -27,7 +26,6 @@ ESTIMATIONS = {  # in this order; each continues from the journal of the one bef
     "scene": RECIPE,
     "no scene": ALONE,
     "threshold": replace(ALONE, magsac=replace(QUICK, threshold=1.0)),
-    "RANSAC": replace(ALONE, magsac=replace(QUICK, method=Method.RANSAC)),
     "prior": replace(ALONE, focal=FocalConfig()),
     "another scene": replace(
         RECIPE, focal=FocalConfig(scale=0.2), scene=SceneConfig(cameras=CameraSharing.IMAGE)

@@ -33,7 +33,7 @@ from mkpc_kaggle.geometry.robust import RobustConfig
 BATCHES = WORKERS = 3  # in a run so many scene workers and so many matching workers are disturbed
 SCENE = "scene"  # the name of all workers for scenes, on any place
 A_SCENE = "a scene of this run was disturbed"
-QUICK = replace(RECIPE, magsac=RobustConfig(max_iterations=1000, permutations=1))
+QUICK = replace(RECIPE, magsac=RobustConfig(max_iterations=1000))
 
 
 class DoomedWorker(ProcessWorker):

@@ -50,7 +50,7 @@ class Room:
 
     def units(self, *units: str, more: str = "") -> None:
         # Quick estimates, with all kinds of results: units, F under a prior, scenes
-        magsac = "[magsac]\npermutations = 1\nmax_iterations = 2000\n"
+        magsac = "[magsac]\nmax_iterations = 2000\n"
         others = "[focal]\n[scene]\npairs_per_image = 0\n"
         self.recipe.write_text(f"units = [{', '.join(units)}]\n{magsac}{more}\n{others}")
 

@@ -14,7 +14,7 @@ from mkpc_kaggle.geometry.robust import ModelKind, RobustConfig, estimate, samps
 
 SIZE = Size(1024, 768)
 CENTRE = np.array([511.5, 383.5])
-MAGSAC = RobustConfig(permutations=1, max_iterations=2000)
+MAGSAC = RobustConfig(max_iterations=2000)
 CONFIG = FocalConfig()
 WEAK = FocalPrior.of_image(SIZE), FocalPrior.of_image(SIZE)
 

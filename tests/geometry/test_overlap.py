@@ -7,7 +7,7 @@ from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.overlap import MIN_SUPPORT, support
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL, RobustConfig, estimate
 
-QUICK = RobustConfig(permutations=1, max_iterations=2000)
+QUICK = RobustConfig(max_iterations=2000)
 
 
 def rectified(right, wrong, seed=0, box=(800, 600)):

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 HEADER = "sample_id,batch_id,image_1_id,image_2_id\n"
 TABLE = HEADER + "b1;x-y,b1,x,y\nb1;y-z,b1,y,z\n"
 UNIT = '{{ stage = {}, matcher = "sift", long_side = 200, max_matches = 500 }}'
-SETTINGS = "[matchers.sift]\nfeatures = 500\n[magsac]\npermutations = 1\n"
+SETTINGS = "[matchers.sift]\nfeatures = 500\n"
 RECIPE = f"units = [{UNIT.format(1)}, {UNIT.format(2)}]\n{SETTINGS}"
 CALIBRATION = "image_id,camera_intrinsics,rotation_matrix,translation_vector\n" + "".join(
     f"{name},200 0 80 0 200 80 0 0 1,1 0 0 0 1 0 0 0 1,{shift} 0 0\n"

@@ -70,7 +70,6 @@ def test_odd_small_and_blank_pictures_are_matched_without_an_error(
         [matchers.{matcher}]
         {options}
         [magsac]
-        permutations = 1
         max_iterations = 2000
     """)
     output = tmp_path / "out.csv"

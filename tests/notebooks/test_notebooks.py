@@ -36,7 +36,7 @@ def figures_of(notebook: nbformat.NotebookNode) -> int:
 @needs_namespaces
 def test_the_tour_runs_on_a_train_side_without_a_network(demo, tmp_path):
     # Two small units and one permutation: the figures are the same in number.
-    more = "[magsac]\npermutations = 1\n[scene]"
+    more = "[scene]"
     recipe = write_recipe(tmp_path / "tour.toml", (1, 480), (2, 640), more=more)
     variables = environment(
         MKPC_RECIPE=str(recipe),
@@ -55,7 +55,7 @@ def test_the_tour_runs_on_a_train_side_without_a_network(demo, tmp_path):
 
 @needs_namespaces
 def test_the_tour_takes_two_photographs_without_truth(demo, tmp_path):
-    more = "[magsac]\npermutations = 1"
+    more = ""
     recipe = write_recipe(tmp_path / "tour.toml", (1, 480), (2, 640), more=more)
     photographs = sorted((demo.train_dir / "courtyard" / "images").iterdir())[:2]
     variables = environment(

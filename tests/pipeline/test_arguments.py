@@ -217,7 +217,7 @@ def test_another_argument_of_a_matcher_is_refused_by_name(arguments, error, word
         {"device": torch.device("cpu")},
         {"precision": torch.float32},
         {"settings": {"magsac.threshold": np.linspace(0.1, 1, 3)[1]}},
-        {"settings": {"magsac.threshold": np.float32(0.5), "magsac.every_match": np.True_}},
+        {"settings": {"magsac.threshold": np.float32(0.5), "matchers.sift.ratio": np.float64(0.5)}},
         {"settings": {"magsac.threshold": torch.tensor(0.5)}},
         {"settings": {"matchers.sift.features": np.arange(1000, 4000, 1000)[1]}},
         {"settings": {"magsac.max_iterations": np.array(1000)}},

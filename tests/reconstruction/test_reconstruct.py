@@ -179,9 +179,8 @@ def test_without_weights_one_unit_of_rootsift_runs_and_enlarges_no_image(
 
 def test_estimates_that_only_the_report_needs_are_the_cheap_ones():
     recipe = Recipe((Unit(1, "sift", 640),), focal=FocalConfig(), magsac=RobustConfig())
-    assert recipe.magsac.permutations > 1
     kept = for_cameras(recipe)
-    assert (kept.focal, kept.magsac.permutations) == (None, 1)
+    assert kept.focal is None
     assert kept.magsac.max_iterations < recipe.magsac.max_iterations
     # A recipe with fewer keeps its own.
     few = replace(recipe, magsac=RobustConfig(max_iterations=100))

@@ -8,9 +8,7 @@ import pytest
 
 from benchmarks.synthetic_scene import SIZE, SyntheticScene, synthetic_scene
 from mkpc_kaggle.geometry.cameras import Camera
-from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.geometry.robust import RobustConfig
 from mkpc_kaggle.scene.choose import Choice, Reason, choose, contradicts
 from mkpc_kaggle.scene.models import (
     Reconstruction,
@@ -76,16 +74,6 @@ def test_a_wrong_camera_is_contradicted_by_the_pairs_matches(scene):
     assert choice(wrong, scene, pair_fundamental=true_F).reason is Reason.CONTRADICTION
     # Without an F of the pair, nothing contradicts the scene's.
     assert choice(wrong, scene).from_scene
-
-
-def test_a_threshold_in_resized_pixels_is_one_in_stored_pixels_everywhere(scene):
-    pair = scene.pairs[0]
-    focals = {pair.image0.digest: 700.0, pair.image1.digest: 700.0}
-    quick = RobustConfig(threshold=0.5, permutations=1, max_iterations=2000)
-    resized = replace(quick, threshold=1.0, threshold_side=2 * max(SIZE))
-    first, second = (choose(pair, [], focals, FocalConfig(), magsac) for magsac in (quick, resized))
-    assert first.F is not None
-    np.testing.assert_array_equal(first.F, second.F)
 
 
 # Images have 800 x 600 pixels, so 1e5 is a field of view below half a degree.

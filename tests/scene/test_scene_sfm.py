@@ -147,7 +147,7 @@ def test_a_pair_that_the_scene_lacks_is_estimated_at_its_focal_lengths(scene):
     # 3 are too few for any F.
     too_few = replace(outside[0], by_unit=(matches[:3],))
     pairs = (few, too_few, *inside)
-    magsac = RobustConfig(permutations=1, max_iterations=2000)
+    magsac = RobustConfig(max_iterations=2000)
     solution = reconstruct_batch(pairs, SceneConfig(), FocalConfig(), magsac)
     found, hopeless, *others = solution.choices
     assert (found.reason, found.from_scene) == (Reason.UNREGISTERED, False)

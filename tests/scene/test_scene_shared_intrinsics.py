@@ -262,7 +262,7 @@ def test_an_image_that_the_scene_lacks_has_the_shared_focal_length():
     (pair,) = scene.pairs
     focal = FocalConfig()
     # Fewer trials than the default: whether there is an F does not depend on them.
-    magsac = RobustConfig(permutations=1, max_iterations=2000)
+    magsac = RobustConfig(max_iterations=2000)
     both = {pair.image0.digest: FOCAL, pair.image1.digest: FOCAL}
     assert estimate_at_known_focals(pair, both, focal, magsac) is not None
     assert estimate_at_known_focals(pair, {}, focal, magsac) is None

@@ -53,5 +53,5 @@ def write_recipe(path: Path, *units: tuple[int, int], more: str = "") -> Path:
 
 
 def write_small_recipe(directory: Path) -> Path:
-    magsac = "[magsac]\npermutations = 1\nmax_iterations = 5000\n"
+    magsac = "[magsac]\nmax_iterations = 5000\n"
     return write_recipe(directory / "small.toml", (1, 320), (2, 400), more=magsac)

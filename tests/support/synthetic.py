@@ -12,7 +12,7 @@ from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import RobustConfig
 from mkpc_kaggle.recipe import Recipe, SceneConfig, Unit
 
-QUICK = RobustConfig(permutations=1, max_iterations=2000)
+QUICK = RobustConfig(max_iterations=2000)
 RECIPE = Recipe((Unit(1, "synthetic", SIZE.width),), magsac=QUICK, scene=SceneConfig())
 
 
