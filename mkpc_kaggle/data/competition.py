@@ -13,8 +13,9 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache
+from io import TextIOWrapper
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,14 +23,12 @@ from numpy.typing import NDArray
 from mkpc_kaggle.config import decimal
 from mkpc_kaggle.data.images import IMAGE_SUFFIXES, MORE_SUFFIXES
 from mkpc_kaggle.data.outputs import replacing
-from mkpc_kaggle.errors import UserError, plural
+from mkpc_kaggle.errors import UserError, open_regular, plural
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Matrix3
 
 SUBMISSION_COLUMNS = ("sample_id", "fundamental_matrix")
 
-MAX_COLUMNS = 1000  # of a table; a file with more is another file
-MAX_LINE = 1 << 20  # characters of a row; other files may have lines of gigabytes
 # Characters that end lines or control a terminal.
 CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")
 # Names that are empty, "." or "..", or contain a Windows drive, a slash or a control character.
@@ -118,28 +117,23 @@ def read_test_side(directory: Path) -> tuple[Pair, ...]:
 
 def missing_line(pairs: Iterable[Pair]) -> str:
     """Return a line on the images of pairs that are missing; empty if all exist."""
+
+    # Each folder is listed once: a network disk takes long to look for each file.
+    @cache
+    def names_in(folder: str) -> set[str]:
+        with suppress(OSError, ValueError):  # the folder is missing, too, or cannot be read
+            return {path.name for path in Path(folder).iterdir()}
+        return set()
+
     wanted = dict.fromkeys(file for pair in pairs for file in (pair.file0, pair.file1))
-    listed: dict[str, set[str]] = {}
-    unreadable: dict[str, str] = {}
     missing = []
     for file in wanted:
         folder, _, name = file.rpartition(os.sep)
-        # Each folder is listed once: a network disk takes long to look for each file.
-        if folder not in listed:
-            listed[folder] = set()
-            try:
-                listed[folder] = {path.name for path in Path(folder).iterdir()}
-            except (FileNotFoundError, ValueError):  # the folder is missing, too
-                pass
-            except OSError as error:  # no permission, or a file in the place of the folder
-                unreadable[folder] = f"{folder} cannot be read: {error.strerror}"
-        if name not in listed[folder]:
+        if name not in names_in(folder):
             missing.append(file)
     if not missing:
         return ""
-    count = f"{len(missing)} of {plural(len(wanted), 'image')}"
-    reason = next(iter(unreadable.values()), "")
-    return f"missing: {count}, the first is {missing[0]}" + (f"; {reason}" if reason else "")
+    return f"missing: {len(missing)} of {plural(len(wanted), 'image')}, the first is {missing[0]}"
 
 
 def read_train_side(
@@ -222,106 +216,57 @@ def read_submission(path: Path) -> dict[str, Matrix3]:
     """Return F by sample id. Raise :class:`UserError` for a file that is not a submission."""
     found = {}
     for where, (sample, cell) in read_rows(path, SUBMISSION_COLUMNS):
-        found[sample] = _numbers(cell, where, 9).reshape(3, 3)
+        found[sample] = finite_numbers(cell, where, 9).reshape(3, 3)
     return found
 
 
 def submission_problems(path: Path, sample_ids: Sequence[str]) -> list[str]:
-    """Return a submission's problems, one sentence each; empty if the competition accepts it."""
+    """Return the first wrong line of a submission; empty if the competition accepts the file."""
+    wanted = iter(sample_ids)
     try:
-        rows = [cells for _, cells in read_rows(path, SUBMISSION_COLUMNS, only=True)]
+        for where, (sample, cell) in read_rows(path, SUBMISSION_COLUMNS):
+            expected = next(wanted, "no more rows")
+            if sample != expected:
+                return [f"{where}: the sample is {sample}, and {expected} was expected"]
+            if not finite_numbers(cell, where, 9).any():
+                return [f"{where}: the matrix is zero"]
     except UserError as error:
         return [str(error)]
-    problems = []
-    # Dictionaries keep the order, for messages that name the first, and find names quickly.
-    found = dict.fromkeys(sample for sample, _ in rows)
-    wanted = dict.fromkeys(sample_ids)
-    if missing := [sample for sample in wanted if sample not in found]:
-        problems.append(f"missing samples: {len(missing)}, the first is {missing[0]}")
-    elif surplus := [sample for sample in found if sample not in wanted]:
-        problems.append(f"samples not in test.csv: {len(surplus)}, the first is {surplus[0]}")
-    elif [sample for sample, _ in rows] != [*wanted]:
-        problems.append("the samples are not in the order of test.csv, or a sample appears twice")
-    for sample, cell in rows:
-        try:
-            F = _numbers(cell, sample, 9)
-            if not F.any() or not np.isfinite(F).all():
-                problems.append(f"{sample}: the matrix is zero, or a number in it is not finite")
-        except UserError as error:
-            problems.append(str(error))
-    return problems
+    return [f"{path} ends before sample {sample}" for sample in wanted][:1]
 
 
 def read_rows(
-    path: Path, columns: Sequence[str], *, only: bool = False, optional: Sequence[str] = ()
+    path: Path, columns: Sequence[str], *, optional: Sequence[str] = ()
 ) -> Iterator[tuple[str, list[str]]]:
     """Yield each row of a CSV file as its location, for messages, and its cells in ``columns`` and
     ``optional``.
 
-    Cells are the text of the file: ids such as "007", "1e3" and "NA" are no numbers. Empty rows are
-    skipped. Of columns with the same name, the first one counts. ``only`` requires that the file has
-    no other columns. Cells of an ``optional`` column that the file does not have are empty. Raises
-    :class:`UserError` for a file that is not a regular table with these columns.
+    Cells are the text of the file: ids such as "007", "1e3" and "NA" are no numbers. Empty lines are
+    skipped. Cells of an ``optional`` column that the file does not have are empty. Raises
+    :class:`UserError` for a file that is not a table with these columns, and for its first wrong line.
     """
-    # A pipe or a device may never end.
-    if path.exists() and not path.is_file():
-        raise UserError(f"{path} is not a regular file")
-    last = 0  # the line where the last complete row ended
     try:
-        with path.open(encoding="utf-8-sig", newline="") as stream:
+        with (
+            open_regular(path) as file,
+            TextIOWrapper(file, encoding="utf-8-sig", newline="") as stream,
+        ):
             # ``strict``: a quoted cell without an end is an error, and not the rest of the file.
-            table = csv.reader(_limited_lines(stream), strict=True)
-            header: list[str] = []
-            indices: list[int] = []
+            table = csv.DictReader(stream, strict=True)
+            header = table.fieldnames or ()
+            if missing := [column for column in columns if column not in header]:
+                found = ", ".join(header)[:200] or "none"
+                raise UserError(f"{path}: missing columns {', '.join(missing)}; it has {found}")
             for row in table:
-                last = table.line_num
-                if not header and any(row):
-                    header = row
-                    indices = _column_indices(path, header, columns, only, optional)
-                elif len(row) > len(header) or (any(row) and len(row) < len(header)):
-                    cells = plural(len(row), "cell")
-                    raise UserError(f"{path}, line {last}: {cells}, the header has {len(header)}")
-                elif any(row):
-                    # An empty cell at the end stands for a missing column.
-                    row.append("")
-                    yield f"{path}, line {last}", [row[index] for index in indices]
+                where = f"{path}, line {table.line_num}"
+                # As the reader stands for cells beyond the header, and for missing ones
+                if None in row or None in row.values():
+                    raise UserError(f"{where}: the header has {plural(len(header), 'cell')}")
+                yield where, [row.get(column, "") for column in (*columns, *optional)]
     except FileNotFoundError as error:
         raise UserError(f"{path}: no such file") from error
-    except csv.Error as error:
-        reason = str(error)
-        if reason == "unexpected end of data":
-            reason = f"EOF inside string, in the row that begins in line {last + 1}"
+    except (OSError, ValueError, csv.Error) as error:
+        reason = getattr(error, "strerror", None) or error
         raise UserError(f"{path} cannot be read as a table: {reason}") from error
-    except (OSError, ValueError) as error:
-        raise UserError(f"{path} cannot be read as a table: {error}") from error
-    if not header:
-        raise UserError(f"{path} is empty; expected the columns {', '.join(columns)}")
-
-
-def _limited_lines(stream: TextIO) -> Iterator[str]:
-    """Yield the lines of a text. Raise ``ValueError`` for a long line and for a NUL character."""
-    # A line of another file may have gigabytes, so it is not read to its end.
-    while line := stream.readline(MAX_LINE + 2):
-        if len(line) > MAX_LINE and len(line.rstrip("\r\n")) > MAX_LINE:
-            raise ValueError(f"a line of more than {MAX_LINE} characters")
-        if "\0" in line:
-            raise ValueError("line contains NUL")
-        yield line
-
-
-def _column_indices(
-    path: Path, header: list[str], columns: Sequence[str], only: bool, optional: Sequence[str]
-) -> list[int]:
-    """Return the index of each column in a row; -1 for an optional one that is missing."""
-    if len(header) > MAX_COLUMNS:
-        raise UserError(f"{path} has {len(header)} columns; at most {MAX_COLUMNS} are read")
-    found = ", ".join(header)[:200]
-    if missing := [column for column in columns if column not in header]:
-        raise UserError(f"{path}: missing columns {', '.join(missing)}; it has {found}")
-    if only and header != list(columns):
-        raise UserError(f"{path}: the header is {found}, not {', '.join(columns)}")
-    wanted = (*columns, *optional)
-    return [header.index(column) if column in header else -1 for column in wanted]
 
 
 def plain_name(name: str, where: str) -> str:
@@ -361,19 +306,11 @@ def image_files(directory: Path) -> Callable[[str], str]:
 
 
 def finite_numbers(cell: str, where: str, count: int) -> NDArray[np.float64]:
-    """Return the ``count`` numbers of a cell. Raise :class:`UserError` unless they are finite."""
-    numbers = _numbers(cell, where, count)
-    if not np.isfinite(numbers).all():
-        raise UserError(f"{where}: a number is not finite: {cell!r}")
-    return numbers
-
-
-def _numbers(cell: str, where: str, count: int) -> NDArray[np.float64]:
     """Return the ``count`` numbers of a cell. Raise :class:`UserError` for any other cell."""
     # Blanks alone: readers of the competition's files may not take other white space.
     parts = [part for part in cell.split(" ") if part]
     with suppress(ValueError):
-        if len(parts) == count:
-            return np.array([decimal(part) for part in parts])
-    words = plural(len(parts), "word")
-    raise UserError(f"{where}: expected {count} numbers, found {words}: {cell!r}")
+        numbers = np.array([decimal(part) for part in parts])
+        if len(parts) == count and np.isfinite(numbers).all():
+            return numbers
+    raise UserError(f"{where}: expected {count} finite numbers, found {cell!r}")

@@ -151,7 +151,7 @@ CASES = [
         SCORE,
         written("sub.csv", ""),
         REFUSED,
-        "is empty; expected the columns",
+        "missing columns",
     ),
     Case(
         "arguments", "an owner that is a path", "package --out out/p --owner ../x", statuses=REFUSED
