@@ -50,8 +50,8 @@ def main() -> None:
     match = print_errors(*known[DECIDED], RECIPE)
     print(f"{FLAT}: the crop hardly helps: nearly all matches lie on one plane")
     print_errors(*known[FLAT], load_recipe("classical"))
-    _, street = known[DECIDED]
-    save(match.plot(), arguments.out)
+    decided, street = known[DECIDED]
+    save(match.plot(*decided.pair.images), arguments.out)
 
     pairs = [true for true in street.pairs if len(WIDE & set(true.pair.names)) == 1]
     print("\nTelephoto pairs: mAA, and the median error of the rotation in degrees")

@@ -137,7 +137,7 @@ def unit(**changes):
             SIFT + "[mkpc]\nmin_samples = 5.0\n",
             r"\[mkpc\], key 'min_samples': expected int, got 5.0",
         ),
-        (SIFT + '[magsac]\nmethod = "MAGSAC"\n', r"'MAGSAC' is none of 'magsac', 'ransac'"),
+        (SIFT + '[mkpc]\nwhen = "ALWAYS"\n', r"'ALWAYS' is none of 'always', 'scale'"),
         (units(unit(stage="true")), r"key 'stage': expected int, got True"),
         ('units = "sift"\n', "units|unit 1"),
         # The first unit sweeps all pairs, and no crop exists before it.

@@ -8,7 +8,6 @@ from mkpc_kaggle.data.outputs import require_apart
 from mkpc_kaggle.errors import plural
 from mkpc_kaggle.geometry.overlap import MIN_SUPPORT
 from mkpc_kaggle.pipeline.arguments import as_image
-from mkpc_kaggle.pipeline.drawing import draw_pair
 from mkpc_kaggle.pipeline.pair import PairMatch
 from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher
 from mkpc_kaggle.reporting.figures import require_format, save
@@ -53,7 +52,7 @@ def run(arguments: argparse.Namespace) -> int:
     match = matcher(*images)
     print("\n".join(_lines(match, matcher.recipe.name)))
     if arguments.out is not None:
-        save(draw_pair(*images, match, matcher.recipe.mkpc), arguments.out)
+        save(match.plot(*images), arguments.out)
         print(f"figure: {arguments.out}")
     return EXIT_NOTHING_RAN if _nothing_ran(match) else 0
 

@@ -10,7 +10,7 @@ from mkpc_kaggle.data.competition import evenly_spread
 from mkpc_kaggle.data.images import Image
 from mkpc_kaggle.errors import UserError, plural
 from mkpc_kaggle.geometry.coordinates import Box, View
-from mkpc_kaggle.geometry.critical_region import CriticalRegion, MkpcConfig, find_clusters
+from mkpc_kaggle.geometry.critical_region import CriticalRegion, find_clusters
 from mkpc_kaggle.pipeline.pair import PairMatch
 
 if TYPE_CHECKING:
@@ -28,21 +28,20 @@ MAX_INLIERS = 150
 MAX_OUTLIERS = 50
 
 
-def draw_pair(image0: Image, image1: Image, match: PairMatch, config: MkpcConfig) -> "Figure":
+def draw_pair(images: tuple[Image, Image], match: PairMatch) -> "Figure":
     """Draw the matches of all units and the critical regions, and below them the clusters of stage
     1.
     """
     figure = new_figure(12, 9)  # inches: legible on a screen of 1,320 pixels
     panels = figure.subplot_mosaic([["matches", "matches"], ["0", "1"]])
-    # The title joins what is known: a failure is empty for most pairs.
-    inliers = plural(match.estimate.inlier_count, "inlier")
-    counts = f"{plural(len(match.matches), 'match')}, {inliers}"
-    drawn = draw_matches(panels["matches"], (image0, image1), match)
-    panels["matches"].set_title(
-        "; ".join(filter(None, [counts, match.estimate.failure, drawn])), loc="left"
+    draw_matches(panels["matches"], images, match)
+    counts = (
+        f"{plural(len(match.matches), 'match')}, {plural(match.estimate.inlier_count, 'inlier')}"
     )
-    for side, image in enumerate((image0, image1)):
-        _draw_clusters(panels[str(side)], image, match, config, side)
+    failure = f"; {match.estimate.failure}" if match.estimate.failure else ""
+    panels["matches"].set_title(f"{counts} (green){failure}", loc="left")
+    for side, image in enumerate(images):
+        _draw_clusters(panels[str(side)], image, match, side)
     return figure
 
 
@@ -58,9 +57,8 @@ def draw_strip(images: tuple[Image, Image], match: PairMatch) -> "Figure":
 
 def draw_matches(
     axes: "Axes", images: tuple[Image, Image], match: PairMatch, height_px: int | None = None
-) -> str:
-    """Draw the images side by side, matches as lines, and critical regions as boxes. Return a
-    caption.
+) -> None:
+    """Draw the images side by side, matches as lines, and critical regions as boxes.
 
     Of many matches, an even sample is drawn. In axes coordinates, each image is one unit high.
     Images are reduced to ``height_px``, if given: matplotlib takes several times as long to do it.
@@ -90,12 +88,9 @@ def draw_matches(
         )
         x, y = lines[some].reshape(-1, 2).T
         axes.scatter(x, y, s=5, color=colour, linewidths=0)
-    return f"{plural(len(inliers), 'inlier')} (green) and {plural(len(outliers), 'outlier')} (orange) drawn"
 
 
-def _draw_clusters(
-    axes: "Axes", image: Image, match: PairMatch, config: MkpcConfig, side: int
-) -> None:
+def _draw_clusters(axes: "Axes", image: Image, match: PairMatch, side: int) -> None:
     view = _upright(image)
     _show(axes, image, view, match.regions and match.regions[side])
     axes.set(xticks=[], yticks=[])
@@ -106,7 +101,7 @@ def _draw_clusters(
     # Clusters are not stored. The same points give the same clusters as in the run.
     stage1 = match.matches[match.in_stage(1)]
     points = stage1.points1 if side else stage1.points0
-    clusters = find_clusters(points, image.size, config)
+    clusters = find_clusters(points, image.size, match.mkpc)
     shown = view.from_image(points) + 0.5  # (0, 0) is the top-left corner in the figure
     x, y = shown[~clusters.in_kept].T
     axes.scatter(x, y, s=8, color=DROPPED, marker="x", linewidths=0.7)
@@ -136,14 +131,10 @@ def _show(
     axes.imshow(view.render(image.pixels), extent=(left, left + scale * width, scale * height, 0))
     if region is not None:
         box = region.box
-        ends = [
-            (box.left, box.top),
-            (box.left, box.bottom),
-            (box.right, box.bottom),
-            (box.right, box.top),
-        ]
+        x = np.array([box.left, box.left, box.right, box.right])
+        y = np.array([box.top, box.bottom, box.bottom, box.top])
         # A box has borders of pixels, a view maps centres. A view may be turned.
-        corners = view.from_image(np.array(ends) - 0.5) + 0.5
+        corners = view.from_image(np.column_stack([x, y]) - 0.5) + 0.5
         axes.add_patch(
             Polygon(scale * corners + (left, 0), fill=False, edgecolor=REGION, linewidth=2.5)
         )
@@ -151,10 +142,10 @@ def _show(
 
 def _upright(image: Image, height_px: int | None = None) -> View:
     """Return the upright view of the whole image, up to ``height_px`` high if given."""
-    view = View.fit(Box.whole(image.size), long_side=max(image.size), turns=image.turns)
-    if height_px is None or view.content.height <= height_px:
-        return view
-    long_side = round(max(image.size) * height_px / view.content.height)
+    width, height = image.size
+    upright_height = width if image.turns % 2 else height
+    reduction = min(1.0, (height_px or upright_height) / upright_height)
+    long_side = round(max(image.size) * reduction)
     return View.fit(Box.whole(image.size), long_side=long_side, turns=image.turns)
 
 

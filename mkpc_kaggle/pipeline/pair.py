@@ -78,8 +78,8 @@ class PairMatch:
         The image that cannot be read.
     decode_seconds, cluster_seconds : float
         Times of reading the images and of MKPC.
-    files, mkpc
-        Of a match of files: their paths and the settings of MKPC, for ``plot()``.
+    mkpc : MkpcConfig
+        The settings of MKPC, for ``plot()``.
     scale : float
         The ratio of the scales of both images, known with the regions.
 
@@ -104,7 +104,6 @@ class PairMatch:
     failure: str = ""
     decode_seconds: float = 0.0
     cluster_seconds: float = 0.0
-    files: tuple[str, ...] = ()
     mkpc: MkpcConfig = field(default_factory=MkpcConfig)
     scale: float = 1.0
 
@@ -143,29 +142,18 @@ class PairMatch:
         in_front[inliers] = pose.in_front
         return pose._replace(in_front=in_front)
 
-    def plot(
-        self, image0: "ImageSource | None" = None, image1: "ImageSource | None" = None
-    ) -> "Figure":
-        """Draw the matches, the clusters and the critical regions, as reports do.
+    def plot(self, image0: "ImageSource", image1: "ImageSource") -> "Figure":
+        """Draw the matches, the clusters and the critical regions on the two images.
 
-        The images are read again if the match is of files; otherwise they must be given. Raises
-        ``ValueError`` for images of another size, and :class:`mkpc_kaggle.errors.UserError`
+        Raises ``ValueError`` for images of another size, and :class:`mkpc_kaggle.errors.UserError`
         without matplotlib.
         """
         from mkpc_kaggle.pipeline.drawing import draw_pair  # it draws this class
 
-        images = []
-        for number, given in enumerate((image0, image1)):
-            source = given
-            if source is None:
-                if not self.files[number : number + 1] or not self.files[number]:
-                    raise ValueError("the match is not of files: call plot(image0, image1)")
-                source = self.files[number]
-            image = as_image(source)
-            if self.sizes and image.size != self.sizes[number]:
-                raise ValueError(f"image{number} has another size than the matched image")
-            images.append(image)
-        return draw_pair(images[0], images[1], self, self.mkpc)
+        images = (as_image(image0), as_image(image1))
+        if self.sizes and tuple(image.size for image in images) != self.sizes:
+            raise ValueError("an image has another size than the matched one")
+        return draw_pair(images, self)
 
     def in_stage(self, stage: int) -> NDArray[np.bool_]:
         """Return the (N,) mask of the ``matches`` that units of this stage found."""

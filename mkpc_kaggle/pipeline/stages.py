@@ -373,19 +373,12 @@ class Pipeline:
 
 def require_answers(answers: Any, count: int, what: str) -> None:
     """Raise ``TypeError`` unless ``answers`` is a sequence of ``count`` :class:`Matches`."""
-    is_sequence = isinstance(answers, Sequence)
-    if (
-        is_sequence
-        and len(answers) == count
-        and all(isinstance(answer, Matches) for answer in answers)
-    ):
-        return
-    answer = answers[0] if is_sequence and answers else answers
-    returned = f"{len(answers)} items, such as" if is_sequence and answers else "a"
-    raise TypeError(
-        f"{what} must return a list of Matches, one for each of {plural(count, 'pair')}, "
-        f"not {returned} {type(answer).__name__}"
-    )
+    is_sequence = isinstance(answers, Sequence) and len(answers) == count
+    if not is_sequence or not all(isinstance(answer, Matches) for answer in answers):
+        raise TypeError(
+            f"{what} must return a list of Matches, one for each of {plural(count, 'pair')}, "
+            f"not {answers!r:.80}"
+        )
 
 
 def _text_of(error: Exception) -> str:

@@ -1,12 +1,10 @@
 """The Python API: two images in, matches and two-view model out."""
 
-import os
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
 from os import PathLike
-from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
@@ -187,15 +185,10 @@ class TwoStageMatcher:
         if not match.estimate:
             text = f"no {kind} was found: {match.estimate.failure}"
             warnings.warn(text, RuntimeWarning, stacklevel=3)
-        files = [
-            str(Path(source).absolute()) if isinstance(source, str | os.PathLike) else ""
-            for source in sources
-        ]
         return replace(
             match,
             images=(),
             sizes=tuple(image.size for image in images),
             focals=tuple(image.focal for image in images),
-            files=tuple(files),
             mkpc=self.recipe.mkpc,
         )

@@ -362,13 +362,11 @@ ONE = Matches([(1, 1)], [(2, 2)], [1])
 @pytest.mark.parametrize(
     ("answer", "word"),
     [
-        (None, "not a NoneType"),
+        (None, "not None"),
         ([], "one for each of 1 pair"),
-        (ONE, "not a Matches"),
-        ([None], "not 1 items, such as NoneType"),
-        ([(ONE.points0, ONE.points1, ONE.scores)], "not 1 items, such as tuple"),
-        ([{"keypoints0": ONE.points0}], "not 1 items, such as dict"),
-        ([ONE, ONE], "not 2 items, such as Matches"),
+        (ONE, "not Matches"),
+        ([None], "not [None]"),
+        ([ONE, ONE], "not [Matches"),
     ],
 )
 def test_another_answer_of_the_users_own_matcher_is_named(answer, word):
