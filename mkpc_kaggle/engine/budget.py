@@ -47,8 +47,8 @@ HANG_FACTOR = 30.0
 # slow (a warm-up, a slow disk), but the rest of the run must be able to make up for it.
 UNKNOWN_SHARE = 0.25
 MAX_UNKNOWN_S = 3600.0  # without a limit, no share is finite
-# Expected seconds of an estimate that was not measured yet: eight permutations of 50,000 iterations
-# of MAGSAC take 0.7 s, and a busy machine is slower.
+# Expected seconds of an estimate that was not measured yet: 50,000 iterations of MAGSAC take
+# 0.2 s, and a busy machine is slower.
 UNMEASURED_ESTIMATE_S = 1.0
 START_S = 300.0  # for a worker to load its matchers, which is slow from a network disk
 MAX_STEP_BACK_S = 60.0  # of the wall clock, between --started-at and the start

@@ -56,13 +56,11 @@ STATISTICS = {
     "focal0": 0.0,
     "focal1": 0.0,
     "estimate_seconds": 0.0,
-    "candidates": 0,
     "cost": 0.0,
-    "magsac_cost": 0.0,
 }
 PAIRS = ["pair", "group", "image0", "image1", "failure", "source", "matches", "inliers", "overlaps"]
 PAIRS += ["support", "focal0", "focal1", "model", *ELEMENTS, *SECONDS]
-PAIRS += ["candidates", "cost", "magsac_cost", "choice", "units", "error"]
+PAIRS += ["cost", "choice", "units", "error"]
 UNITS = [
     "pair",
     "unit",
@@ -340,8 +338,8 @@ def _estimates(pairs: Iterable[str], estimates: Iterable[Mapping[str, Any]]) -> 
         magsac = facts.get("magsac")
         F = np.array(facts["F"]).reshape(3, 3) if facts else FALLBACK_FUNDAMENTAL
         matrix = None if magsac is None else np.array(magsac).reshape(3, 3)
-        rows.append((pair, F, matrix, facts.get("rotation", [0.0, 0.0, 0.0])))
-    return DataFrame(rows, columns=["pair", "F", "magsac", "rotation"])
+        rows.append((pair, F, matrix))
+    return DataFrame(rows, columns=["pair", "F", "magsac"])
 
 
 def scenes_of(store: Store) -> dict[str, SceneRecord]:

@@ -618,11 +618,8 @@ def _estimate_facts(found: Estimated) -> dict[str, object]:
         "magsac": None if found.magsac is None else found.magsac.ravel().tolist(),
         "inliers": dict(zip(found.points, found.inliers, strict=True)),
         "seconds": found.seconds,
-        "candidates": stats.candidates,
         "cost": stats.cost,
-        "magsac_cost": stats.magsac_cost,
         "focal0": stats.focals[0],
         "focal1": stats.focals[1],
         "support": stats.support,
-        "rotation": list(stats.rotation),
     }

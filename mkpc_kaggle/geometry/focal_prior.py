@@ -156,9 +156,8 @@ def estimate_with_prior(
             return Estimate.failed(model, len(matches), reasons)
         inliers = np.abs(sampson(best.fundamental, *search.rays)) < magsac.threshold
         matrix = best.fundamental if model is ModelKind.E else search.for_pixels(best.fundamental)
-    magsac_cost = plain.cost if plain else 0.0
     own = unit_norm(search.for_pixels(plain.fundamental)) if plain else None
-    stats = EstimateStats(len(candidates), best.cost, magsac_cost, search.focals(best))
+    stats = EstimateStats(best.cost, search.focals(best))
     all_inliers = distinct.mask_of_all(inliers)
     return Estimate(model, unit_norm(matrix), all_inliers, magsac=own, stats=stats)
 

@@ -21,7 +21,6 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
 from mkpc_kaggle.config import POSITIVE, Range, check_ranges
 from mkpc_kaggle.geometry.coordinates import Matrix3
@@ -63,20 +62,13 @@ class RobustConfig:
 
 @dataclass(frozen=True)
 class EstimateStats:
-    """Statistics of an estimate, for the diagnosis of bad pairs.
+    """Statistics of an estimate, for the diagnosis of bad pairs."""
 
-    A cost is the sum of the robust costs of the distinct matches, at most 0.5 each. Under a prior
-    on focal lengths, it also includes the cost of the prior, or the penalty for an F without focal
-    lengths.
-    """
-
-    candidates: int = 0  # number of compared models
-    cost: float = 0.0  # of the result
-    magsac_cost: float = 0.0  # of MAGSAC's own F; 0 without one
+    # Under a prior on focal lengths: the sum of the robust costs of the distinct matches, at most 0.5
+    # each, and of the prior, or the penalty for an F without focal lengths
+    cost: float = 0.0
     focals: tuple[float, float] = (0.0, 0.0)  # in pixels, of both images; 0 if unknown
     support: float = 0.0  # see :mod:`mkpc_kaggle.geometry.overlap`
-    # Of an E, chosen by inliers, see :func:`rotation_in_front`.
-    rotation: tuple[float, ...] = (0.0, 0.0, 0.0)
 
 
 NO_STATS = EstimateStats()
@@ -248,18 +240,6 @@ def calibrate(points: NDArray[np.floating], K: Matrix3) -> Vectors:
     """Convert (N, 2) pixels to (N, 2) coordinates in the plane z = 1 of a camera with matrix K."""
     mapped = homogeneous(points) @ np.linalg.inv(K).T
     return np.asarray(mapped[:, :2] / mapped[:, 2:])
-
-
-def rotation_in_front(
-    E: Matrix3, matches: Matches, intrinsics: tuple[Matrix3, Matrix3]
-) -> list[float]:
-    """Return the rotation of E with most points in front of both cameras.
-
-    It is a rotation vector (3,) in radians.
-    """
-    R = pose_in_front(E, matches, intrinsics).R
-    rotation: list[float] = Rotation.from_matrix(R).as_rotvec().tolist()
-    return rotation
 
 
 class RelativePose(NamedTuple):

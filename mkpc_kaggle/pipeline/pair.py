@@ -20,7 +20,6 @@ from mkpc_kaggle.geometry.robust import (
     RelativePose,
     estimate,
     pose_in_front,
-    rotation_in_front,
 )
 from mkpc_kaggle.pipeline.arguments import ImageSource, as_image, intrinsics_of
 from mkpc_kaggle.recipe import Recipe, Unit
@@ -190,19 +189,8 @@ def with_estimate(
         first, second = priors
         found = estimate_with_prior(matches, (first, second), recipe.magsac, recipe.focal, model)
     if found.ok and model is not ModelKind.H:
-        found = with_stats(found, matches, intrinsics if model is ModelKind.E else None)
+        K0, K1 = (intrinsics if model is ModelKind.E else None) or (np.eye(3), np.eye(3))
+        # The overlap test compares points in pixels, so an E becomes an F.
+        F = np.linalg.inv(K1).T @ found.matrix @ np.linalg.inv(K0)
+        found = replace(found, stats=replace(found.stats, support=support(F, matches)))
     return replace(pair, results=results, estimate=found)
-
-
-def with_stats(
-    found: Estimate, matches: Matches, intrinsics: tuple[Matrix3, Matrix3] | None = None
-) -> Estimate:
-    """Return an F, or an E with ``intrinsics``, with its support, and for an E its rotation."""
-    K0, K1 = intrinsics or (np.eye(3), np.eye(3))
-    # The overlap test compares points in pixels, so an E becomes an F.
-    F = np.linalg.inv(K1).T @ found.matrix @ np.linalg.inv(K0)
-    stats = replace(found.stats, support=support(F, matches))
-    if intrinsics and found.inliers.any():
-        rotation = rotation_in_front(found.matrix, matches[found.inliers], intrinsics)
-        stats = replace(stats, rotation=tuple(rotation))
-    return replace(found, stats=stats)
