@@ -242,28 +242,6 @@ def calibrate(points: NDArray[np.floating], K: Matrix3) -> Vectors:
     return np.asarray(mapped[:, :2] / mapped[:, 2:])
 
 
-class RelativePose(NamedTuple):
-    """The pose of camera 1 relative to camera 0: X_1 = R X_0 + t, with a t of unit length."""
-
-    R: Matrix3
-    t: NDArray[np.float64]  # (3,)
-    in_front: NDArray[np.bool_]  # (N,) mask of the matches in front of both cameras
-
-
-def pose_in_front(
-    E: Matrix3, matches: Matches, intrinsics: tuple[Matrix3, Matrix3]
-) -> RelativePose:
-    """Return the pose of E with most points in front of both cameras."""
-    x0 = calibrate(matches.points0, intrinsics[0])
-    x1 = calibrate(matches.points1, intrinsics[1])
-    _, R, t, mask, *_ = cv2.recoverPose(E, x0, x1, np.eye(3), FARTHEST)
-    return RelativePose(
-        np.asarray(R, np.float64),
-        np.asarray(t, np.float64).ravel(),
-        np.asarray(mask).ravel().astype(bool),
-    )
-
-
 def sampson_distances(F: Matrix3, matches: Matches) -> Vectors:
     """Return (N,) Sampson distances in pixels; OpenCV compares these with the threshold of F.
 

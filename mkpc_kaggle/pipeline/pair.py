@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mkpc_kaggle.data.images import Image
-from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Matrix3, Size
 from mkpc_kaggle.geometry.critical_region import CriticalRegion, MkpcConfig
 from mkpc_kaggle.geometry.crop_need import CropNeed
@@ -17,11 +16,9 @@ from mkpc_kaggle.geometry.overlap import support
 from mkpc_kaggle.geometry.robust import (
     Estimate,
     ModelKind,
-    RelativePose,
     estimate,
-    pose_in_front,
 )
-from mkpc_kaggle.pipeline.arguments import ImageSource, as_image, intrinsics_of
+from mkpc_kaggle.pipeline.arguments import ImageSource, as_image
 from mkpc_kaggle.recipe import Recipe, Unit
 
 if TYPE_CHECKING:
@@ -84,14 +81,10 @@ class PairMatch:
 
     Examples
     --------
-    >>> import numpy as np
     >>> from mkpc_kaggle import TwoStageMatcher
     >>> match = TwoStageMatcher("sift")("a.jpg", "b.jpg")
     >>> len(match.inliers) == match.estimate.inlier_count
     True
-    >>> K = np.array([[600, 0, 180], [0, 600, 120], [0, 0, 1]])
-    >>> match.pose(K, K).R.shape
-    (3, 3)
     """
 
     results: tuple[UnitResult, ...] = ()
@@ -120,26 +113,6 @@ class PairMatch:
     def inliers(self) -> Matches:
         """The matches within MAGSAC's threshold of the model."""
         return self.matches[self.estimate.inliers]
-
-    def pose(self, K0: Matrix3, K1: Matrix3) -> RelativePose:
-        """Return the pose of camera 1 relative to camera 0 from F or E: R, t, inliers in front.
-
-        K0 and K1 are the camera matrices in pixels. ``in_front`` is a mask over ``matches``. Raises
-        ``ValueError`` for a homography, and :class:`mkpc_kaggle.errors.UserError` without a model.
-        """
-        matrices = intrinsics_of((K0, K1))
-        E = self.estimate.matrix
-        if self.estimate.model is ModelKind.H:
-            raise ValueError("a homography has no single pose: estimate model F or E")
-        if self.estimate.model is ModelKind.F:
-            E = matrices[1].T @ E @ matrices[0]
-        inliers = self.estimate.inliers
-        if not inliers.any():
-            raise UserError(f"no pose: {self.estimate.failure or 'the model has no inliers'}")
-        pose = pose_in_front(E, self.matches[inliers], matrices)
-        in_front = np.zeros(len(inliers), bool)
-        in_front[inliers] = pose.in_front
-        return pose._replace(in_front=in_front)
 
     def plot(self, image0: "ImageSource", image1: "ImageSource") -> "Figure":
         """Draw the matches, the clusters and the critical regions on the two images.
