@@ -1,6 +1,6 @@
 """The adapter of semi-dense networks: it encodes pictures, and matches a pair's coarse cells."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -12,11 +12,13 @@ from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Size, from_corner
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import (
+    Colour,
     MatcherSpec,
     PairwiseMatcher,
     Picture,
     Placement,
     TrainedOptions,
+    Training,
 )
 from mkpc_kaggle.matchers.networks.fine_matching import COARSE_STRIDE
 from mkpc_kaggle.matchers.networks.placement import prepared
@@ -89,16 +91,22 @@ class SemiDenseMatcher(PairwiseMatcher[SemiDenseEncoding]):
         return Matches(points0, points1, found.coarse.scores.float().cpu().numpy())
 
 
+def semi_dense_spec(name: str, network: type[SemiDenseNetwork]) -> MatcherSpec:
+    """Return the spec of a network with weights for outdoors and indoors."""
+    slots = (f"{name}-{{training}}",)
+    return MatcherSpec(name, SemiDenseOptions, Colour.GRAY, network.multiple, slots)
+
+
 def load_semi_dense(
     spec: MatcherSpec,
-    network: SemiDenseNetwork,
+    make: Callable[[Training], SemiDenseNetwork],
     weights: WeightStore,
     options: SemiDenseOptions,
     placement: Placement,
     *,
     unused: str = "$^",
 ) -> SemiDenseMatcher:
-    """Load the published checkpoint into a network.
+    """Load the published checkpoint into a network from ``make``.
 
     The training wrapper's prefix is removed from names. Names that match ``unused`` are ignored,
     and so are position tables, which the network computes. Raises :class:`UserError` for weights
@@ -111,6 +119,7 @@ def load_semi_dense(
             f"the weights for {slot!r} match by optimal transport, this network by dual softmax: take the file "
             "trained with it (LoFTR's are called outdoor_ds and indoor_ds_new, not outdoor_ot and indoor_ot)"
         )
+    network = make(options.training)
     load_into(network, tensors, what=slot, unused=rf".*pos_encoding\.pe$|{unused}")
     network.threshold = options.threshold
     return SemiDenseMatcher(prepared(network, placement), spec, placement.device)

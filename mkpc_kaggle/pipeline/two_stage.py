@@ -24,8 +24,6 @@ Intrinsics = tuple[Matrix3, Matrix3]
 class TwoStageMatcher:
     """Matcher of pairs of images: two stages, then a two-view model.
 
-    A matcher can be pickled if the user's own matchers can. A copy loads its networks again.
-
     Parameters
     ----------
     recipe : Recipe, str or path
@@ -76,7 +74,7 @@ class TwoStageMatcher:
         matchers: Mapping[str, Matcher[Any]] | None = None,
         settings: Mapping[str, Any] = MappingProxyType({}),
     ) -> None:
-        self._assembly = assemble(
+        assembly = assemble(
             recipe,
             weights=weights,
             device=device,
@@ -84,22 +82,10 @@ class TwoStageMatcher:
             matchers=matchers,
             settings=settings,
         )
-        self.recipe = self._assembly.recipe
-        self._pipeline = self._new_pipeline()
-
-    def _new_pipeline(self) -> Pipeline:
-        pipeline = Pipeline.of(self._assembly)
+        self.recipe = assembly.recipe
+        self._pipeline = Pipeline.of(assembly)
         # A fault of the user's own code is the user's to see.
-        pipeline.raising = self._assembly.matchers.keys()
-        return pipeline
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Return the state without the loaded matchers."""
-        return {name: value for name, value in vars(self).items() if name != "_pipeline"}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        vars(self).update(state)
-        self._pipeline = self._new_pipeline()
+        self._pipeline.raising = assembly.matchers.keys()
 
     def __call__(
         self,

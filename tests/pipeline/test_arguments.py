@@ -513,10 +513,3 @@ def test_a_result_keeps_no_image_and_can_be_pickled():
         assert same(copy.matches, match.matches)
         assert copy.regions == match.regions
         np.testing.assert_array_equal(copy.estimate.matrix, match.estimate.matrix)
-
-
-def test_a_copy_of_a_matcher_by_pickle_gives_the_same_matches():
-    matcher = TwoStageMatcher(TWO_STAGES, settings={"matchers.sift.features": 500})
-    expected = matcher(pixels(), pixels(40))
-    copy = pickle.loads(pickle.dumps(matcher))
-    assert same(copy(pixels(), pixels(40)).matches, expected.matches)

@@ -1,14 +1,9 @@
 """LoFTR (Sun et al. 2021), weights with dual softmax: ``outdoor_ds`` and ``indoor_ds_new``."""
 
-from mkpc_kaggle.matchers.contract import Colour, MatcherSpec, Placement
+from functools import partial
+
 from mkpc_kaggle.matchers.networks.loftr import Loftr
-from mkpc_kaggle.matchers.semi_dense import SemiDenseMatcher, SemiDenseOptions, load_semi_dense
-from mkpc_kaggle.weights import WeightStore
+from mkpc_kaggle.matchers.semi_dense import load_semi_dense, semi_dense_spec
 
-SPEC = MatcherSpec(
-    "loftr", SemiDenseOptions, Colour.GRAY, Loftr.multiple, slots=("loftr-{training}",)
-)
-
-
-def load(weights: WeightStore, options: SemiDenseOptions, placement: Placement) -> SemiDenseMatcher:
-    return load_semi_dense(SPEC, Loftr(options.training), weights, options, placement)
+SPEC = semi_dense_spec("loftr", Loftr)
+load = partial(load_semi_dense, SPEC, Loftr)

@@ -1,14 +1,9 @@
 """LoFTR with QuadTree attention (Tang et al. 2022)."""
 
-from mkpc_kaggle.matchers.contract import Colour, MatcherSpec, Placement
+from functools import partial
+
 from mkpc_kaggle.matchers.networks.quadtree import Quadtree
-from mkpc_kaggle.matchers.semi_dense import SemiDenseMatcher, SemiDenseOptions, load_semi_dense
-from mkpc_kaggle.weights import WeightStore
+from mkpc_kaggle.matchers.semi_dense import load_semi_dense, semi_dense_spec
 
-SPEC = MatcherSpec(
-    "quadtree", SemiDenseOptions, Colour.GRAY, Quadtree.multiple, slots=("quadtree-{training}",)
-)
-
-
-def load(weights: WeightStore, options: SemiDenseOptions, placement: Placement) -> SemiDenseMatcher:
-    return load_semi_dense(SPEC, Quadtree(options.training), weights, options, placement)
+SPEC = semi_dense_spec("quadtree", Quadtree)
+load = partial(load_semi_dense, SPEC, Quadtree)
