@@ -23,6 +23,9 @@ PLASTER = (150, 200, 215)
 GLASS = (75, 70, 60)
 FRAME = (205, 215, 220)
 
+# Of the shapes of a texture: maximum side in metres, maximum aspect, contrast
+STONE_LEAVES = (1.2, 0.6, 0.06)
+PAINT_LEAVES = (0.9, 1.0, 0.4)
 WINDOW_M = (1.3, 1.9)  # width, height
 WINDOW_STEP_M = 3.1  # between the left or lower edges of two windows
 # The grid of places for boxes, before each is moved by up to a metre.
@@ -196,14 +199,7 @@ def paint(
     height = max(16, round(height_m * scale))
     picture = np.full((height, width, 3), colour, dtype=np.uint8)
     count = width * height // 60
-    if is_stone:
-        max_side_m = 1.2
-        max_aspect = 0.6
-        contrast = 0.06
-    else:
-        max_side_m = 0.9
-        max_aspect = 1.0
-        contrast = 0.4
+    max_side_m, max_aspect, contrast = STONE_LEAVES if is_stone else PAINT_LEAVES
     sides = _leaf_sides(rng, count, max_side_m * scale, max_aspect)
     centres = rng.uniform((0, 0), (width, height), (count, 2))
     angles = rng.uniform(0, 180, count)

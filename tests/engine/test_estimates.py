@@ -56,7 +56,7 @@ def test_a_run_resumed_with_another_estimation_ends_with_the_bytes_of_a_fresh_on
     for name, recipe in ESTIMATIONS.items():
         fresh[name], _ = submission(pairs, recipe, tmp_path / name)
     # Equal bytes everywhere would prove nothing.
-    assert len(set(fresh.values())) >= 5
+    assert len(set(fresh.values())) >= 4
     journal = tmp_path / "scene"
     for path in (tmp_path / "images").iterdir():
         path.unlink()  # no image is read
