@@ -235,15 +235,12 @@ def submission_problems(path: Path, sample_ids: Sequence[str]) -> list[str]:
     return [f"{path} ends before sample {sample}" for sample in wanted][:1]
 
 
-def read_rows(
-    path: Path, columns: Sequence[str], *, optional: Sequence[str] = ()
-) -> Iterator[tuple[str, list[str]]]:
-    """Yield each row of a CSV file as its location, for messages, and its cells in ``columns`` and
-    ``optional``.
+def read_rows(path: Path, columns: Sequence[str]) -> Iterator[tuple[str, list[str]]]:
+    """Yield each row of a CSV file as its location, for messages, and its cells in ``columns``.
 
     Cells are the text of the file: ids such as "007", "1e3" and "NA" are no numbers. Empty lines are
-    skipped. Cells of an ``optional`` column that the file does not have are empty. Raises
-    :class:`UserError` for a file that is not a table with these columns, and for its first wrong line.
+    skipped. Raises :class:`UserError` for a file that is not a table with these columns, and for its
+    first wrong line.
     """
     try:
         with (
@@ -261,7 +258,7 @@ def read_rows(
                 # As the reader stands for cells beyond the header, and for missing ones
                 if None in row or None in row.values():
                     raise UserError(f"{where}: the header has {plural(len(header), 'cell')}")
-                yield where, [row.get(column, "") for column in (*columns, *optional)]
+                yield where, [row[column] for column in columns]
     except FileNotFoundError as error:
         raise UserError(f"{path}: no such file") from error
     except (OSError, ValueError, csv.Error) as error:

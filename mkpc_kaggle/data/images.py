@@ -35,15 +35,6 @@ MORE_SUFFIXES = (
     *(".jpe", ".jfif", ".webp", ".tif", ".tiff", ".bmp", ".ppm", ".pgm", ".pnm", ".jp2", ".avif"),
 )
 READ_SUFFIXES = IMAGE_SUFFIXES + MORE_SUFFIXES
-# Photographs that nothing here decodes: of phones, of newer formats, and of sensors (raw)
-OTHER_SUFFIXES = frozenset(
-    (
-        *(".heic", ".heif", ".hif", ".avif", ".jxl", ".jxr", ".exr", ".psd", ".gif", ".insp"),
-        *(".dng", ".raw", ".cr2", ".cr3", ".crw", ".nef", ".nrw", ".arw", ".sr2", ".srf", ".orf"),
-        *(".rw2", ".raf", ".pef", ".srw", ".x3f", ".3fr", ".iiq", ".rwl", ".erf", ".mrw", ".kdc"),
-        ".gpr",
-    )
-) - set(READ_SUFFIXES)
 
 BLAKE2 = partial(hashlib.blake2b, digest_size=16)
 # Ratio of the sides; a longer image's views would be a few pixels high or exceed the memory.
@@ -155,7 +146,7 @@ def read_image(path: Path) -> Image | Unreadable:
             data = stream.read()
         with open_picture(BytesIO(data)) as picture:
             size = stored_size(picture)
-            if not has_usable_shape(size):
+            if max(size) > MAX_ASPECT * min(size):
                 sides = f"{size.width} x {size.height} pixels"
                 return Unreadable(
                     name, f"{sides}: one side is more than {MAX_ASPECT} times the other"
@@ -190,11 +181,6 @@ def _unknown(data: bytes) -> str:
     if data[:4] in (b"II*\0", b"MM\0*"):
         return "a TIFF file of another kind than 1, 3 or 4 channels of 8 or 16 bits; convert it"
     return "not a picture of a known format; convert it to JPEG or PNG"
-
-
-def has_usable_shape(size: Size) -> bool:
-    """Return whether no side is more than ``MAX_ASPECT`` times the other."""
-    return max(size) <= MAX_ASPECT * min(size)
 
 
 def stored_size(picture: PIL.Image.Image) -> Size:
@@ -274,15 +260,6 @@ def scale_since_taken(tags: Mapping[int, float], size: Size) -> float:
     return scale
 
 
-def is_crop(path: Path, size: Size) -> bool:
-    """Return whether EXIF of a picture file states that it is a part of a photograph."""
-    try:
-        with open_regular(path) as stream, open_picture(stream) as picture:
-            return not scale_since_taken(exif_tags(picture), size)
-    except Exception:
-        return False
-
-
 def read_size(path: Path) -> Size | None:
     """Return a picture's size in stored pixels, without decoding it; ``None`` if it is unreadable."""
     try:
@@ -290,11 +267,6 @@ def read_size(path: Path) -> Size | None:
             return stored_size(picture)
     except Exception:
         return None
-
-
-def is_picture(path: Path) -> bool:
-    """Return whether a file has the head of a picture, whatever its name is."""
-    return read_size(path) is not None
 
 
 def content_digest(path: Path) -> str:

@@ -52,17 +52,6 @@ def require_apart(
             )
 
 
-def require_table(path: Path, columns: Iterable[str]) -> None:
-    """Raise :class:`UserError` if ``path`` exists and is not a table with these columns."""
-    with suppress(OSError):
-        if path.is_file() and not path.is_symlink():  # a pipe would block
-            with path.open(encoding="utf-8", errors="replace") as stream:
-                if stream.readline(1 << 16).rstrip("\n") == ",".join(columns):
-                    return
-    if os.path.lexists(path):
-        raise UserError(f"{path} exists and is another table; name another directory")
-
-
 def weights_of_environment() -> list[Path]:
     """Return the directories in ``$MKPC_WEIGHTS``."""
     return [Path(name) for name in os.environ.get("MKPC_WEIGHTS", "").split(os.pathsep) if name]

@@ -247,19 +247,14 @@ def sampson_distances(F: Matrix3, matches: Matches) -> Vectors:
 
     Source: Hartley and Zisserman, Multiple View Geometry, 11.4.3.
     """
-    points0 = matches.points0.astype(np.float64)
-    points1 = matches.points1.astype(np.float64)
-    return _epipolar_distances(F, points0, points1)
+    rays0 = homogeneous(matches.points0.astype(np.float64))
+    rays1 = homogeneous(matches.points1.astype(np.float64))
+    return np.abs(sampson(F, rays0, rays1))
 
 
 def homogeneous(points: NDArray[np.floating]) -> Vectors:
     """Append a 1 to each point: (N, 2) -> (N, 3)."""
     return np.column_stack([points, np.ones(len(points))])
-
-
-def _epipolar_distances(matrix: Matrix3, points0: Vectors, points1: Vectors) -> Vectors:
-    """Return (N,) Sampson distances to an F or E."""
-    return np.abs(sampson(matrix, homogeneous(points0), homogeneous(points1)))
 
 
 class _Solver(NamedTuple):
