@@ -261,7 +261,10 @@ def test_own_weights_are_a_file_for_a_slot(tmp_path):
         torch.set_default_dtype(torch.float32)
     assert same(again.matches, match.matches)
     write_aliked(path, {"module.head": torch.zeros(1)})
-    with pytest.warns(RuntimeWarning, match=r'Unexpected key.* "head".*mine\.pth'):
+    with (
+        pytest.warns(RuntimeWarning, match=r'Unexpected key.* "head".*mine\.pth'),
+        pytest.warns(RuntimeWarning, match="no F was found"),
+    ):
         match = TwoStageMatcher("aliked", weights=given)(pixels(), pixels(40))
     assert not match.estimate
 

@@ -58,7 +58,6 @@ def test_an_option_changes_the_settings_of_its_unit(clean_environment, matcher, 
 @pytest.mark.parametrize(
     ("key", "value"),
     [
-        ("magsac.method", "ransac"),
         ("magsac.threshold", 0.5),
         ("magsac.confidence", 0.999),
         ("magsac.max_iterations", 1000),
