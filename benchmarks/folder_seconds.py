@@ -25,6 +25,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -35,6 +36,8 @@ import numpy as np
 from mkpc_kaggle.demo.camera import look_at
 from mkpc_kaggle.demo.render import Surface, render
 from mkpc_kaggle.demo.world import box, build_world, facade, paint, quad
+from mkpc_kaggle.engine.store.dataframes import results
+from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.progress import counted
 
 HERE = Path(__file__).resolve().parents[1]
@@ -188,10 +191,14 @@ def facts_of(out: Path) -> tuple[int, float]:
     if (out / "facts.json").exists():
         facts = json.loads((out / "facts.json").read_text())
         return facts["cameras"], facts["mapping"]
+    # Versions 0.7 and 0.8.
     if (out / "summary.json").exists():
         scenes = json.loads((out / "summary.json").read_text())["scenes"]
         return sum(scene["cameras"] for scene in scenes), sum(scene["seconds"] for scene in scenes)
-    # Versions before the summary.
+    # A journal of this version; others are refused.
+    with suppress(UserError):
+        found = results(out / "work").scenes
+        return int(found["cameras"].sum()), float(found["seconds"].sum())
     with (out / "cameras.csv").open() as stream:
         return len(stream.readlines()) - 1, float("nan")
 

@@ -70,10 +70,10 @@ def _lines(match: PairMatch, recipe: str) -> list[str]:
     inliers = plural(found.inlier_count, "inlier")
     lines.append(f"{plural(len(match.matches), 'match')}, {inliers}")
     if not _nothing_ran(match):  # failed units say nothing of the images
-        verdict = "the images may not overlap"
-        if found.stats.support >= MIN_SUPPORT:
-            verdict = "the images overlap"
-        lines.append(f"{found.stats.support:.1f} times the inliers expected by chance: {verdict}")
+        lines.append(
+            f"{found.stats.support:.1f} times the inliers expected by chance; "
+            f"images overlap from {MIN_SUPPORT:g} on"
+        )
     for result in match.results:
         counts = f"{plural(len(result.matches), 'match'):>14}  {result.seconds:.2f} s"
         remark = result.failure or result.note or (str(result.need) if result.need else "")
