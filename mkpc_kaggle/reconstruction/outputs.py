@@ -26,7 +26,8 @@ WORK = "work"
 SCENES, FORMER = "scenes", "former"
 TABLE = "cameras.csv"
 PAGE = "report.html"
-RESULTS = (DATABASE, MODELS, TABLE, IMAGES, SPARSE)
+FOLDERS = (MODELS, IMAGES, SPARSE)
+RESULTS = (DATABASE, TABLE, *FOLDERS)
 MIN_COMMON = 3  # cameras
 MAX_MOVED = 0.05  # of the model's size: a camera that two runs place differently
 STILL = 1e-9  # of the numbers of a similarity; smaller ones are rounding
@@ -54,10 +55,10 @@ def require_out(out: Path, inputs: Iterable[Path]) -> None:
         TemporaryDirectory(prefix=PART, dir=out).cleanup()
 
 
-def remove_results(out: Path) -> None:
-    """Remove the models of an earlier run: today's photographs have none."""
+def remove_results(out: Path, results: Iterable[str] = RESULTS) -> None:
+    """Remove results of an earlier run: today's photographs have no models."""
     with TemporaryDirectory(prefix=PART, dir=out) as name:
-        for result in RESULTS:
+        for result in results:
             with suppress(FileNotFoundError):
                 (out / result).replace(Path(name, result))
 
@@ -94,6 +95,10 @@ class Writer:
             self.__exit__()
             self._scene = scene
             self._child = Child(write_results, self._root, self._out, folder)
+
+    @property
+    def has_scene(self) -> bool:
+        return self._child is not None
 
     def next(self, ends: float) -> list[SfmModel]:
         """Return the next value of :func:`write_results`, until ``ends`` on the monotonic clock; no

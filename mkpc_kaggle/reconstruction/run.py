@@ -29,7 +29,9 @@ from mkpc_kaggle.pipeline.assembly import Assembly, PathSource, Weights, assembl
 from mkpc_kaggle.recipe import CameraSharing, Recipe, SceneConfig
 from mkpc_kaggle.reconstruction.folder import Ends, read_folder, read_intrinsics, read_pair_list
 from mkpc_kaggle.reconstruction.outputs import (
+    FOLDERS,
     PAGE,
+    RESULTS,
     SCENES,
     WORK,
     Writer,
@@ -234,14 +236,15 @@ def _run(
         problems = [trouble(report), report.unwritten, report.unsaved, *failures]
         has_models = any(record.models for record in report.scenes)
         models: list[SfmModel] = []
+        try:
+            models = writer.next(session.must_end())
+            writer.next(session.must_end())
+        except UserError as error:
+            problems.append(f"{out} is not complete: {error}; the same command completes it")
         if report.ending.is_done and not has_models and not failures:
-            remove_results(out)
-        else:
-            try:
-                models = writer.next(session.must_end())
-                writer.next(session.must_end())
-            except UserError as error:
-                problems.append(f"{out} is not complete: {error}; the same command completes it")
+            models = []
+            # A scene without models has its database and an empty table.
+            remove_results(out, FOLDERS if writer.has_scene else RESULTS)
     say(summary(report))
     session.status = int(not models)
     say(report_run(session.work_dir, out / PAGE, session.must_end(), pairs))

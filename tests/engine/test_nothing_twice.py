@@ -265,7 +265,8 @@ def test_images_added_to_a_folder_are_matched_with_each_other_and_with_the_forme
         assert main(["reconstruct", str(folder), *options]) in (0, 1)
         printed = capsys.readouterr()
         (run,) = re.findall(r"(\d+) units run", printed.out)
-        return int(run), (tmp_path / out / "cameras.csv").read_text().splitlines()
+        table = tmp_path / out / "cameras.csv"
+        return int(run), table.read_text().splitlines() if table.exists() else []
 
     # Six pairs of four images, then nine more of six
     for path in images[:4]:
@@ -279,6 +280,6 @@ def test_images_added_to_a_folder_are_matched_with_each_other_and_with_the_forme
     assert cameras == reconstruct("fresh")[1]
     assert reconstruct("out") == (0, cameras)
     shutil.rmtree(tmp_path / "out" / "work" / "scenes")
-    (tmp_path / "out" / "database.db").unlink()
+    (tmp_path / "out" / "database.db").unlink(missing_ok=True)
     assert reconstruct("out") == (0, cameras)
     assert (tmp_path / "out" / "database.db").exists(), "the scene is made again"

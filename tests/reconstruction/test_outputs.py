@@ -172,3 +172,14 @@ def test_a_link_to_a_folder_of_the_users_is_replaced_and_not_emptied(tmp_path):
     remove_results(out)
     assert (tmp_path / "images" / "inner" / "a.png").exists()
     assert [path.name for path in out.iterdir()] == ["work"]
+
+
+def test_a_scene_without_models_has_its_database_and_an_empty_table(tmp_path):
+    out = tmp_path / "out"
+    write_scene(model_of(NAMES, tmp_path / "images"), out)
+    list(write_results(tmp_path / "images", out, out / "work" / "scene"))
+    shutil.rmtree(out / "work" / "scene" / "models" / "0")
+    assert list(write_results(tmp_path / "images", out, out / "work" / "scene")) == [[], []]
+    remove_results(out, outputs.FOLDERS)
+    assert sorted(path.name for path in out.iterdir()) == ["cameras.csv", "database.db", "work"]
+    assert len((out / "cameras.csv").read_text().splitlines()) == 1
