@@ -265,8 +265,9 @@ def test_images_added_to_a_folder_are_matched_with_each_other_and_with_the_forme
         assert main(["reconstruct", str(folder), *options]) in (0, 1)
         printed = capsys.readouterr()
         (run,) = re.findall(r"(\d+) units run", printed.out)
-        table = tmp_path / out / "cameras.csv"
-        return int(run), table.read_text().splitlines() if table.exists() else []
+        # Cameras that were moved onto former ones have other last digits.
+        table = (tmp_path / out / "cameras.csv").read_text().splitlines()
+        return int(run), [row.partition(",")[0] for row in table]
 
     # Six pairs of four images, then nine more of six
     for path in images[:4]:
@@ -280,6 +281,6 @@ def test_images_added_to_a_folder_are_matched_with_each_other_and_with_the_forme
     assert cameras == reconstruct("fresh")[1]
     assert reconstruct("out") == (0, cameras)
     shutil.rmtree(tmp_path / "out" / "work" / "scenes")
-    (tmp_path / "out" / "database.db").unlink(missing_ok=True)
+    (tmp_path / "out" / "database.db").unlink()
     assert reconstruct("out") == (0, cameras)
     assert (tmp_path / "out" / "database.db").exists(), "the scene is made again"
