@@ -26,7 +26,7 @@ from mkpc_kaggle.engine.state import State
 from mkpc_kaggle.errors import UserError, plural, temporary_directory
 from mkpc_kaggle.matchers.contract import Matcher
 from mkpc_kaggle.pipeline.assembly import Assembly, PathSource, Weights, assemble
-from mkpc_kaggle.recipe import CameraSharing, Recipe, SceneConfig
+from mkpc_kaggle.recipe import CameraModel, CameraSharing, Recipe, SceneConfig
 from mkpc_kaggle.reconstruction.folder import Ends, read_folder, read_intrinsics, read_pair_list
 from mkpc_kaggle.reconstruction.outputs import (
     FOLDERS,
@@ -172,6 +172,8 @@ def for_cameras(recipe: Recipe, sharing: str | None = None) -> Recipe:
     scene = recipe.scene or SceneConfig()
     # The folder has its pairs already.
     scene = replace(scene, pairs_per_image=0.0, cameras=CameraSharing(sharing or scene.cameras))
+    if scene.camera_model is CameraModel.AUTO:
+        scene = replace(scene, camera_model=CameraModel.SIMPLE_RADIAL)  # as in COLMAP
     units = recipe.units
     if recipe.name == AUTO_RECIPE:
         scene = replace(scene, all_tracks=min(scene.all_tracks, ALL_TRACKS))

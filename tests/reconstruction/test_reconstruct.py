@@ -31,7 +31,7 @@ from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import RobustConfig
 from mkpc_kaggle.matchers.adapters.sift import SiftMatcher, SiftOptions
 from mkpc_kaggle.pipeline.assembly import assemble
-from mkpc_kaggle.recipe import Recipe, SceneConfig, Unit
+from mkpc_kaggle.recipe import CameraModel, Recipe, SceneConfig, Unit
 from mkpc_kaggle.reconstruction.run import Models, for_cameras, reconstruct
 from mkpc_kaggle.scene.models import SfmModel
 
@@ -160,7 +160,7 @@ def test_the_table_of_a_run_is_a_table_of_known_cameras(mixed, tmp_path):
     ("name", "more", "units"),
     [
         ("auto", {}, ["1:sift@1536"]),
-        ("classical", {}, ["1:sift@1536", "2:sift@1440", "1:sift@1280"]),
+        ("classical", {}, ["1:sift@1536", "1:sift@1280", "2:sift@1440"]),
         ("auto", {"loma": SiftMatcher(SiftOptions(), "cpu")}, None),
     ],
 )
@@ -173,6 +173,7 @@ def test_without_weights_one_unit_of_rootsift_runs_and_enlarges_no_image(
     kept = changed.units
     assert [unit.name for unit in kept] == (units or [unit.name for unit in recipe.units])
     assert all(unit.enlarge for unit in kept) == (len(kept) > 1)
+    assert changed.scene.camera_model is CameraModel.SIMPLE_RADIAL
     # A larger folder starts from fewer tracks by recipe auto alone, with any matchers.
     assert (changed.scene.all_tracks < SceneConfig().all_tracks) == (name == "auto")
 
