@@ -499,7 +499,7 @@ def test_a_place_that_fails_is_closed_and_its_pairs_are_matched_elsewhere(broken
     assert ran.given_up == ()
     assert units_of(ran) == 600
     # All of them: the CPU takes over.
-    alone = simulate(replace(scenario, workers=1, fallback=True, limit=3000.0))
+    alone = simulate(replace(scenario, workers=1, fallback=True, limit=3000.0, broken=broken / 3))
     assert alone.on_fallback > 0
     assert units_of(alone) == 600
 
