@@ -33,10 +33,10 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from mkpc_kaggle import results
 from mkpc_kaggle.demo.camera import look_at
 from mkpc_kaggle.demo.render import Surface, render
 from mkpc_kaggle.demo.world import box, build_world, facade, paint, quad
-from mkpc_kaggle.engine.store.dataframes import results
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.progress import counted
 
