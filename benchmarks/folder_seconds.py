@@ -32,7 +32,6 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from mkpc_kaggle.engine.store.dataframes import results
 
 from mkpc_kaggle import results
 from mkpc_kaggle.demo.camera import look_at
