@@ -299,11 +299,11 @@ class Run:
             candidate=candidate,
             scene=first,
         )
-        about = format_duration(self.costs.scene(job.matches))
-        text = (
-            f"reconstructing its cameras from {plural(len(pairs), 'pair')}{_by_tracks(candidate)}"
-        )
-        self._progress.note(f"batch {name}: {text}, about {about}")
+        # Other candidates are lines of the log.
+        if candidate == ALL_UNITS:
+            about = format_duration(self.costs.scene(job.matches))
+            text = f"reconstructing its cameras from {plural(len(pairs), 'pair')}, about {about}"
+            self._progress.note(f"batch {name}: {text}")
         state.making.add(due)
         place.submit(job, now)
 
@@ -392,11 +392,12 @@ class Run:
         self.state.making.discard((batch, job.candidate))
         is_best = self.state.use_scene(batch, record, job.scene)
         text = f"{record.registered} of {plural(record.images, 'image')}"
-        more = _by_tracks(job.candidate)
-        if more:
-            more += ", the best so far" if is_best else ", not better"
-        self.note(EventKind.SCENE, f"{job.batch}: {text}{more}")
-        self._progress.note(f"batch {job.batch}: {text} with a camera{more}")
+        if job.candidate == ALL_UNITS:
+            self._progress.note(f"batch {job.batch}: {text} with a camera")
+        else:
+            text += _by_tracks(job.candidate)
+            text += ", the best so far" if is_best else ", not better"
+        self.note(EventKind.SCENE, f"{job.batch}: {text}")
         if job.folder is not None:
             self._publish()  # tables of cameras should agree with COLMAP's files
 
