@@ -5,7 +5,7 @@ A recipe is a TOML file: ``mkpc_kaggle/recipes/NAME.toml`` or a custom file.
 
 import re
 import tomllib
-from collections.abc import Callable, Container, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from enum import StrEnum
 from functools import cached_property
@@ -257,19 +257,6 @@ class Recipe:
     def only(self, wanted: Callable[[Unit], bool]) -> "Recipe":
         """Return the recipe with only the units that ``wanted`` accepts."""
         return replace(self, units=tuple(filter(wanted, self.units)))
-
-    def with_units(self, names: Sequence[str]) -> "Recipe":
-        """Return the recipe with only these units, in this order.
-
-        Raises :class:`UserError` for an unknown unit.
-        """
-        known = {unit.name: unit for unit in self.units}
-        for name in names:
-            if name not in known:
-                raise UserError(
-                    f"recipe {self.name!r} has no unit {name!r}; it has {', '.join(known)}"
-                )
-        return replace(self, units=tuple(known[name] for name in names))
 
     def without(self, matchers: Container[str]) -> "Recipe":
         """Return the recipe without the units of these matchers.

@@ -4,7 +4,6 @@ import argparse
 import re
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import replace
 from pathlib import Path
 
 from mkpc_kaggle.cli import options
@@ -44,11 +43,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     options.add_matching(parser)
     text = "F from each pair's matches alone, even if the recipe reconstructs scenes"
     add("--no-scenes", dest="reconstruct", action="store_const", const=False, help=text)
-    add(
-        "--units",
-        metavar="A,B",
-        help="units to run, in this order, such as 1:sift@1536; default: the recipe's",
-    )
     text = """run these instead of --recipe, and give the gain of each over the first with its 95 %%
         interval; such as classical:whole-images classical"""
     add("--compare", nargs="+", metavar="RECIPE[:MODE]", help=text)
@@ -111,15 +105,11 @@ def _run_recipe(
     session: Session,
 ) -> Validation:
     """Run one recipe, print its summary and its scores, and set the session's exit status."""
-    recipe = assembly.recipe
-    if arguments.units is not None:
-        recipe = recipe.with_units(arguments.units.split(","))
-    assembly = replace(assembly, recipe=recipe)
     validation = validate(scenes, assembly, session, str(arguments.train_dir))
     report = validation.report
     assert report is not None
     lines = [
-        left_out_line(recipe, assembly.left_out),
+        left_out_line(assembly.recipe, assembly.left_out),
         summary(report),
         f"recipe {validation.recipe}",
         *score_table(validation),

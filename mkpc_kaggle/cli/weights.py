@@ -9,9 +9,8 @@ from mkpc_kaggle.errors import UserError, plural, temporary_directory
 from mkpc_kaggle.pipeline.assembly import slots_of
 from mkpc_kaggle.recipe import load_recipe, recipe_names
 from mkpc_kaggle.weights import WeightFile, WeightStore
-from mkpc_kaggle.weights.fetch import Downloads
+from mkpc_kaggle.weights.fetch import Downloads, preferred
 from mkpc_kaggle.weights.manifest import manifest
-from mkpc_kaggle.weights.store import compare
 
 HELP = """\
 Manage the weight files of the matchers. The package contains none.
@@ -104,17 +103,6 @@ def _fetch(arguments: argparse.Namespace) -> int:
             note = "" if file.sha256 else ", not verified: no digest is known"
             print(f"{file.name}: {'fetched' if is_new else 'already there'}{note}")
     return status
-
-
-def preferred(alternatives: list[WeightFile], directory: Path) -> WeightFile:
-    """Choose a slot's file: the first good one there, else one to download, else the first."""
-    there = []
-    for file in alternatives:
-        path = directory / file.name
-        if path.exists() and not compare(path, file).fault:
-            there.append(file)
-    with_address = [file for file in alternatives if file.url or file.wheel]
-    return [*there, *with_address, *alternatives][0]
 
 
 def alternatives_of(name: str) -> list[list[WeightFile]]:

@@ -108,6 +108,17 @@ class Downloads:
         part.replace(path)
 
 
+def preferred(alternatives: list[WeightFile], directory: Path) -> WeightFile:
+    """Choose a slot's file: the first good one there, else one to download, else the first."""
+    there = []
+    for file in alternatives:
+        path = directory / file.name
+        if path.exists() and not compare(path, file).fault:
+            there.append(file)
+    with_address = [file for file in alternatives if file.url or file.wheel]
+    return [*there, *with_address, *alternatives][0]
+
+
 @contextmanager
 def timeout(seconds: float) -> Iterator[None]:
     """Set the timeout of new connections, which ``torch.hub`` has no argument for."""

@@ -123,10 +123,10 @@ def test_each_step_of_the_estimate_has_a_column(demo, small_recipe, capsys):
 def test_a_work_directory_keeps_the_journal_and_a_report_that_shows_the_pairs(
     demo, small_recipe, tmp_path
 ):
-    options = ["--recipe", f"{small_recipe}:whole-images", "--units", "1:sift@400"]
+    options = ["--recipe", f"{small_recipe}:stage-1"]
     options += ["--pairs-per-scene", 2, "--work-dir", tmp_path / "work"]
     on_demo(demo, small_recipe, *options)
-    assert results(tmp_path / "work").units["unit"].tolist() == ["1:sift@400"] * 2
+    assert results(tmp_path / "work").units["unit"].tolist() == ["1:sift@320"] * 2
     page = tmp_path / "work" / "report.html"
     assert page.read_text(encoding="utf-8").count("<img ") == 2
     assert len(results(tmp_path / "work").pairs) == 2
@@ -153,10 +153,6 @@ def test_a_validation_that_hangs_ends_at_its_limit(demo):
 @pytest.mark.parametrize(
     ("options", "told"),
     [
-        (
-            ["--train-dir", "T", "--recipe", "R", "--units", "sift"],
-            "no unit 'sift'; it has 1:sift@320, 2:",
-        ),
         (
             ["--train-dir", "T", "--recipe", "classical", "--set", "magsac.threshold=0"],
             "threshold must be in",
