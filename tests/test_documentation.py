@@ -108,7 +108,7 @@ def test_every_option_is_in_the_pages_and_every_option_of_the_pages_exists():
     pages = {page.stem: set(OPTION.findall(page.read_text("utf-8"))) for page in PAGES}
     named = set().union(*pages.values()) - {"--help", "--version"}
     known = all_options()
-    assert len(known) > 30
+    assert len(known) > 20
     assert sorted(known - named) == [], "options that no page names"
     measured = "\n".join(path.read_text("utf-8") for path in (ROOT / "benchmarks").rglob("*.py"))
     benchmarks = set(OPTION.findall(measured))

@@ -49,7 +49,8 @@ def test_a_rehearsal_on_the_cpu_runs_every_part(tmp_path):
     assert reasons.keys() <= {"golden", "trained"}
     assert "no golden vectors" in reasons["golden"]
     networks = parts["networks"]["rows"]
-    assert [row["verdict"] for row in networks] == [EXPECTED] * len(networks)
+    # What half precision changes depends on the processor.
+    assert [row["device and CPU"] for row in networks] == [1.0] * len(networks)
     assert all(row["new"] > row["cached"] > 0 for row in parts["speed"]["rows"])
     # A device-side assert at one place, and at two
     asserts = parts["runs"]["rows"]
@@ -152,7 +153,7 @@ def test_a_forecast_counts_one_new_image_on_whole_images_and_two_on_crops():
     part = part_after(lambda part: forecast.measure(part, whole, speed))
     (row, _) = [row for row in part.rows if row["recipe"] == "classical"]
     # Two units on whole images, and one on crops
-    assert load_recipe("classical").units[1].stage == 2
+    assert load_recipe("classical").units[2].stage == 2
     assert row["seconds a pair"] == 2 * (1.0 + 0.5) + (2.0 + 0.5)
     assert row["pairs, 1 GPU"] == int(8.75 * 3600 / 5.5)
     assert row["pairs, 2 GPUs"] == 10_000

@@ -22,7 +22,8 @@ def names_in(tree: ast.Module) -> tuple[set[str], set[str]]:
         for target in targets:
             if isinstance(target, ast.Name) and not is_type_variable(node):
                 # A type alias is in capitals like a class.
-                (others if target.id.isupper() else kinds).add(target.id)
+                is_kind = target.id[0].isupper() and not target.id.isupper()
+                (kinds if is_kind else others).add(target.id)
     return kinds, others
 
 

@@ -34,7 +34,7 @@ from mkpc_kaggle.recipe import Recipe, Unit, load_recipe
 from mkpc_kaggle.weights import WeightStore
 
 # The most useful recipes first: what follows may not be reached.
-RECIPES = ("light", "best", "auto", "permissive", "imc2022", "classical", "yfcc", "scannet")
+RECIPES = ("light", "best", "auto", "permissive", "imc2022", "classical")
 QUICK_RECIPES = ("light",)
 PHOTOGRAPH = Size(1600, 1200)
 SINGLE_PAIRS = 3  # of a round with one pair at a time

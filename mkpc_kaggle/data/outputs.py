@@ -11,7 +11,7 @@ from typing import TextIO
 from mkpc_kaggle.errors import UserError
 
 # Suffix of each option's results. In an input directory, a file with it is an earlier result.
-RESULTS = {"--output": ".csv", "--json": ".json", "the report": ".html"}
+SUFFIXES = {"--output": ".csv", "--json": ".json", "the report": ".html"}
 UNFINISHED: set[Path] = set()  # temporary files of this process
 
 
@@ -37,7 +37,7 @@ def require_apart(
         for name, other in files.items():
             if name != option and same_file(path, other):
                 lost.append(f"{name} {other}")
-        may_replace = not os.path.lexists(path) or path.suffix.lower() == RESULTS.get(option)
+        may_replace = not os.path.lexists(path) or path.suffix.lower() == SUFFIXES.get(option)
         for source in sources:
             if same_file(path, source) or (lies_in(path, source) and not may_replace):
                 lost.append(f"the input {source}")

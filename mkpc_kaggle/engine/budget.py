@@ -39,7 +39,7 @@ SCENE_START_S = 3.0  # start-up time of a scene's process
 SCENE_MATCH_S = 5e-4
 # Factor on a forecast: the time of scenes depends on more than their matches.
 SCENE_MARGIN = 1.5
-ESTIMATE = "estimate"  # the name of the cost of an estimate
+COST_OF_ESTIMATES = "estimate"  # the name of the cost of an estimate
 # A job that takes this multiple of its measured cost hangs. Stalls of twenty times the cost, as in the
 # simulator, must not cost a worker.
 HANG_FACTOR = 30.0
@@ -247,7 +247,7 @@ def time_limit(job: Job, costs: Costs, budget: Budget, since: float) -> float:
             of_pair = sum(costs.mean(unit.name) for unit in job.units)
             seconds = HANG_FACTOR * len(job.indices) * of_pair + costs.warm_up(job.units)
     elif isinstance(job, EstimateJob):
-        of_pair = costs.mean(ESTIMATE)
+        of_pair = costs.mean(COST_OF_ESTIMATES)
         seconds = HANG_FACTOR * len(job.pairs) * (of_pair or UNMEASURED_ESTIMATE_S)
         # A hung first estimate must not use up a short limit.
         if not of_pair:

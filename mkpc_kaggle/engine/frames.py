@@ -188,10 +188,10 @@ def results(directory: Path | str) -> Results:
     Examples
     --------
     >>> from mkpc_kaggle import reconstruct, results
-    >>> models = reconstruct(["a.jpg", "b.jpg"], "sift", work_dir="work", progress=False)
-    >>> tables = results("work")
-    >>> tables.pairs[["image0", "image1", "model"]].values.tolist()
-    [['a.jpg', 'b.jpg', 'F']]
+    >>> models = reconstruct("photographs", "OUT", "sift", progress=False)
+    >>> tables = results("OUT/work")
+    >>> tables.pairs[["image0", "image1", "model"]].values.tolist()[0]
+    ['0.jpg', '1.jpg', 'F']
     """
     directory = Path(directory)
     with Store.read(directory) as store, undamaged(directory):

@@ -10,7 +10,6 @@ import hashlib
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
-from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -195,12 +194,13 @@ def image_facts(
 
 def _read_facts(name: str, path: Path) -> BatchImage | tuple[str, str]:
     """Return the facts about an image file, or its name and the reason why it cannot be read."""
-    # Any error of Pillow: the decoder then says what is wrong.
-    with suppress(Exception), open_regular(path) as stream, open_picture(stream) as picture:
-        size = stored_size(picture)
-        _, focal = exif_facts(exif_tags(picture), size)
-        return BatchImage(name, content_digest(path), size, focal)
-    image = read_image(path)
+    try:
+        with open_regular(path) as stream, open_picture(stream) as picture:
+            size = stored_size(picture)
+            _, focal = exif_facts(exif_tags(picture), size)
+            return BatchImage(name, content_digest(path), size, focal)
+    except Exception:  # any error of Pillow: the decoder says what is wrong
+        image = read_image(path)
     if isinstance(image, Image):
         return BatchImage(name, image.version, image.size, image.focal)
     return name, str(image)

@@ -144,7 +144,11 @@ def plan(
 
 def time_left(state: State, costs: Costs, budget: Budget, crew: Crew, now: float) -> float:
     """Return the seconds until no unit may run, so that estimates, scenes and candidates have theirs."""
-    seconds = costs.mean(times.ESTIMATE) * int(state.lacks_estimate.sum()) / max(1, crew.estimators)
+    seconds = (
+        costs.mean(times.COST_OF_ESTIMATES)
+        * int(state.lacks_estimate.sum())
+        / max(1, crew.estimators)
+    )
     if crew.scenes and state.batches:
         forecasts = costs.scenes(state.matches_of_batches)
         due = forecasts[[state.may_make(batch) for batch in range(len(state.batches))]]

@@ -366,7 +366,7 @@ class Run:
             state.losses[pair.index, ESTIMATE] = 0
             state.reasons.get(pair.index, {}).pop("estimate", None)
             state.use_estimate(pair.index, key, facts)
-            self.costs.observe(times.ESTIMATE, found.seconds)
+            self.costs.observe(times.COST_OF_ESTIMATES, found.seconds)
         self.store.put({"result": rows})
         self.estimated += len(answer)
         # While pairs are matched, the bar shows those.

@@ -110,6 +110,11 @@ def write_files(
         raise OSError(f"{directory / DATABASE} cannot be written") from error
     with file as database:
         _fill(database, merged, shared, config, reuse=True)
+        # A lens that became a pinhole: COLMAP refuses a model whose cameras are of another kind.
+        for model in models:
+            for camera in model.colmap.cameras.values():
+                if database.read_camera(camera.camera_id).model != camera.model:
+                    database.update_camera(camera)
     for number, model in enumerate(models):
         kept = {each.image.name for each in model.images}
         # A list, because the loop removes frames from the mapping.

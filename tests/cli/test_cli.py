@@ -85,7 +85,7 @@ def test_check_accepts_a_whole_submission_and_refuses_one_with_a_missing_row(
     assert "good: 8 rows" in capsys.readouterr().out
     write_submission(path, dict.fromkeys(ids[1:], np.full((3, 3), np.nan)))
     assert run_command("check", path, "--test-dir", demo.test_dir) == 1
-    assert "ends before sample" in capsys.readouterr().out
+    assert "was expected" in capsys.readouterr().out
     assert run_command("check", path, "--test-dir", tmp_path) == 2
 
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from mkpc_kaggle.engine.budget import ESTIMATE, Budget, Costs, start_limit, time_limit
+from mkpc_kaggle.engine.budget import COST_OF_ESTIMATES, Budget, Costs, start_limit, time_limit
 from mkpc_kaggle.engine.request import EstimateJob, Job, MatchJob, SceneJob
 from mkpc_kaggle.recipe import Unit
 
@@ -37,7 +37,9 @@ def measured(name: str, seconds: float) -> Costs:
 
 
 @pytest.mark.parametrize(
-    ("name", "make"), [(UNIT.name, matching), (ESTIMATE, estimates)], ids=["units", "estimates"]
+    ("name", "make"),
+    [(UNIT.name, matching), (COST_OF_ESTIMATES, estimates)],
+    ids=["units", "estimates"],
 )
 def test_a_measured_job_has_many_times_its_cost_and_more_pairs_have_more(
     name: str, make: Callable[[int], Job]

@@ -23,7 +23,7 @@ def load(weights, options, placement):
 FAULTS = {  # and a part of the output
     "prints bytes": (
         "sys.stdout.reconfigure(); sys.stdout.buffer.write(b'arrived\\n')",
-        "messages of image and device libraries: out/s.work/workers.log",
+        "complete after",
     ),
     "ends its process": ("os._exit(3)", "2 units run"),
     "meets an illegal instruction": ("os.kill(os.getpid(), signal.SIGILL)", "2 units run"),

@@ -125,17 +125,13 @@ def test_all_names_and_shapes_of_a_checkpoint_must_fit_except_unused_ones():
     surplus = {"2.bias": torch.ones(2)}
     misshapen = {"0.weight": torch.ones(3, 2)}
     for wrong, says in (
-        (whole | surplus, r"the file also has 2\.bias$"),
-        (part, r"the network also has 1\.bias$"),
-        (whole | misshapen, r"other shapes 0\.weight \(3, 2\) instead of \(2, 2\)$"),
-        (part | surplus, r"the network also has 1\.bias; the file also has 2\.bias$"),
-        (
-            {f"x.{n}": torch.ones(1) for n in range(9)},
-            r".*; the file also has x\.0, .* and 4 more$",
-        ),
+        (whole | surplus, r"Unexpected .*2\.bias"),
+        (part, r"Missing .*1\.bias"),
+        (whole | misshapen, r"size mismatch for 0\.weight"),
     ):
-        with pytest.raises(UserError, match=f"'w' do not fit the network: {says}"):
+        with pytest.raises(UserError, match=f"'w' do not fit the network: .*{says}"):
             load_into(network, wrong, unused="nothing", what="w")
+    network = nn.Sequential(nn.Linear(2, 2), nn.Linear(2, 2))
     load_into(network, part | surplus, unused=r"1\.bias|2\.", what="w")
     assert (network[0].weight == 1).all() and not (network[1].bias == 1).any()
 

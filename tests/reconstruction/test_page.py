@@ -29,10 +29,11 @@ def test_snippets_are_short():
 
 def test_the_snippets_run_from_top_to_bottom(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    run(write_flat(Path("DIR"), FIRST - 1), Path("OUT"))
+    pinholes = {"scene.camera_model": "SIMPLE_PINHOLE"}
+    run(write_flat(Path("DIR"), FIRST - 1), Path("OUT"), settings=pinholes)
     shutil.copytree("OUT/models/0", "OLD")
     former = pycolmap.Reconstruction("OLD")
-    run(write_flat(Path("DIR"), FIRST), Path("OUT"))
+    run(write_flat(Path("DIR"), FIRST), Path("OUT"), settings=pinholes)
     Path("NEW").mkdir()
     names: dict[str, object] = {}
     for block in COLMAP:
