@@ -130,7 +130,7 @@ def test_results_are_one_json_file_and_one_page(tmp_path):
 def test_the_seconds_of_every_unit_of_every_recipe_are_measured():
     names = {case.name for case in cases_of(RECIPES)}
     assert len(names) == len(cases_of(RECIPES))
-    assert {"loma l@1024", "loma b128@1024", "roma@864x864!", "superglue indoor@1280"} <= names
+    assert {"loma l@1024", "loma b128@1024", "roma@864x864!"} <= names
 
 
 def test_every_matcher_is_measured_before_a_second_size_of_any():
