@@ -205,13 +205,6 @@ def trouble(report: RunReport) -> str:
     )
 
 
-def unreadable_images(pairs: "DataFrame") -> list[str]:
-    """Return the reason of each image that could not be decoded, sorted."""
-    # An image that cannot be read fails in all of its pairs, with one text.
-    failures = set(pairs["failure"][is_reached(pairs) & (pairs["units"] == 0)])
-    return sorted(failures - {""})
-
-
 def left_out_line(recipe: Recipe, left_out: Sequence[str]) -> str:
     """Return a line on the matchers of the recipe that do not run; empty if all run.
 
