@@ -13,20 +13,17 @@ import torch
 from exif_files import set_exif
 from light_matchers import standin
 from pictures import same
+from shared import run_command, write_recipe
 from sklearn.datasets import load_sample_image
 
 from mkpc_kaggle import PairMatch, TwoStageMatcher
-from mkpc_kaggle.cli import main
-from mkpc_kaggle.data.images import Image
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.adapters.sift import SiftMatcher, SiftOptions
 from mkpc_kaggle.matchers.contract import Colour, MatcherSpec
 from mkpc_kaggle.matchers.networks.aliked import Aliked
-from mkpc_kaggle.matchers.registry import MATCHERS
 from mkpc_kaggle.pipeline import assembly
 from mkpc_kaggle.pipeline.arguments import as_image, intrinsics_of
-from mkpc_kaggle.pipeline.assembly import recipe_of_name
 from mkpc_kaggle.recipe import Recipe, Unit, load_recipe
 
 pytestmark = pytest.mark.usefixtures("nowhere_else")
@@ -65,35 +62,23 @@ def raises(call, error, *words):
 
 SAME = {  # forms of one image
     "uint8": lambda image: image,
-    "not contiguous": lambda image: np.ascontiguousarray(image[:, ::-1])[:, ::-1],
     "float64 in 0..1": lambda image: image / 255,
-    "float32 in 0..1": lambda image: (image / 255).astype(np.float32),
-    "PIL": PIL.Image.fromarray,
     "PIL, with alpha": lambda image: PIL.Image.fromarray(image).convert("RGBA"),
-    "Image": Image.of_array,
     "tensor (3, H, W)": chw,
-    "tensor of floats": lambda image: chw(image) / 255,
     "tensor with a gradient": lambda image: (chw(image) / 255).requires_grad_(),
 }
 SAME_GRAY = {
     "(H, W)": gray,
-    "PIL, L": lambda image: PIL.Image.fromarray(gray(image)),
     "PIL, 16 bits": lambda image: PIL.Image.fromarray(gray(image).astype(np.uint16) * 256),
     "tensor (1, H, W)": lambda image: torch.from_numpy(gray(image))[None],
-    "tensor (H, W)": lambda image: torch.from_numpy(gray(image) / 255),
 }
 
 
-@pytest.mark.parametrize("form", SAME)
+@pytest.mark.parametrize("form", [*SAME, *SAME_GRAY])
 def test_an_image_in_each_form_has_the_same_pixels(form):
-    found = as_image(SAME[form](pixels()))
-    np.testing.assert_array_equal(found.pixels, pixels())
-
-
-@pytest.mark.parametrize("form", SAME_GRAY)
-def test_a_gray_image_in_each_form_has_the_same_pixels(form):
-    found = as_image(SAME_GRAY[form](pixels()))
-    np.testing.assert_array_equal(found.pixels, np.stack([gray(pixels())] * 3, axis=2))
+    found = as_image((SAME | SAME_GRAY)[form](pixels()))
+    expected = pixels() if form in SAME else np.stack([gray(pixels())] * 3, axis=2)
+    np.testing.assert_array_equal(found.pixels, expected)
 
 
 def test_a_pil_image_has_the_orientation_of_its_file(tmp_path):
@@ -109,9 +94,7 @@ REFUSED_IMAGES = {
     "None": (None, ValueError, "object"),
     "floats to 255": (pixels().astype(float), ValueError, "0..1"),
     "NaN": (np.full((9, 9), np.nan), ValueError, "0..1"),
-    "int64": (pixels().astype(int), ValueError, "int64 (200, 280, 3)"),
     "four channels": (np.zeros((9, 9, 4), np.uint8), ValueError, "(9, 9, 4)"),
-    "no pixels": (np.zeros((0, 9), np.uint8), ValueError, "(0, 9)"),
     "batch of tensors": (torch.zeros(2, 3, 9, 9, dtype=torch.uint8), ValueError, "(2, 3, 9, 9)"),
     "PIL, floats": (PIL.Image.new("F", (9, 9)), ValueError, "more than 16 bits"),
     "no such file": ("none.png", UserError, "none.png: no such file"),
@@ -138,7 +121,6 @@ def unrun(*units):
 def test_another_value_for_an_image_is_refused_before_any_matching(form):
     value, error, word = REFUSED_IMAGES[form]
     raises(lambda: unrun()(pixels(), value), error, word)
-    raises(lambda: next(unrun().match_pairs([(pixels(), value)])), error, word)
 
 
 # Camera matrices
@@ -148,13 +130,9 @@ def test_another_value_for_an_image_is_refused_before_any_matching(form):
     "given",
     [
         (K, K),
-        [K, K],
         np.stack([K, K]),
-        (K.tolist(), K.tolist()),
         [[list(map(int, row)) for row in K]] * 2,
-        (torch.from_numpy(K), torch.from_numpy(K).float()),
-        torch.from_numpy(np.stack([K, K])).requires_grad_(),
-        (K.astype(np.float32), K.astype(int)),
+        (torch.from_numpy(K), torch.from_numpy(K).float().requires_grad_()),
     ],
 )
 def test_camera_matrices_in_each_form_are_the_same(given):
@@ -164,17 +142,10 @@ def test_camera_matrices_in_each_form_are_the_same(given):
     assert first.dtype == second.dtype == np.float64
 
 
-@pytest.mark.parametrize(
-    "given",
-    [K, (K,), (K, K[:2]), (K, None), (300.0, 300.0), 300.0, (K * 0, K), (K, K.T), (K, K * np.nan)],
-)
+@pytest.mark.parametrize("given", [K, (K, None), 300.0, (K * 0, K), (K, K.T), (K, K * np.nan)])
 def test_other_camera_matrices_are_refused_before_any_matching(given):
-    for call in (
-        lambda: unrun()(pixels(), pixels(), intrinsics=given),
-        lambda: next(unrun().match_pairs([(pixels(), pixels())], intrinsics=[given])),
-    ):
-        with pytest.raises((TypeError, ValueError)):
-            call()
+    with pytest.raises((TypeError, ValueError)):
+        unrun()(pixels(), pixels(), intrinsics=given)
 
 
 # Other arguments
@@ -187,16 +158,12 @@ def test_other_camera_matrices_are_refused_before_any_matching(given):
         ({"recipe": "sfit"}, UserError, ["'sfit'", "classical", "aliked_lightglue"]),
         ({"recipe": Path("none.toml")}, UserError, ["none.toml cannot be read"]),
         ({"weights": 5}, TypeError, ["int", "iterable"]),
-        ({"weights": [None]}, TypeError, ["NoneType"]),
         ({"weights": "none"}, UserError, ["weights none: no such directory"]),
         ({"weights": {"aliked": "a.pth"}}, UserError, ["unknown slot 'aliked'", "aliked-n16"]),
         ({"weights": {"aliked-n16": "none.pth"}}, UserError, ["aliked-n16", "none.pth", "No such"]),
-        ({"weights": {"aliked-n16": None}}, TypeError, ["NoneType"]),
         ({"device": "gpu"}, UserError, ["'gpu'"]),
         ({"precision": "half"}, UserError, ["'half'", "float16"]),
-        ({"precision": None}, UserError, ["'None'", "float16"]),
         ({"settings": [1]}, TypeError, ["settings is [1]", "dotted keys"]),
-        ({"settings": {1: 2}}, UserError, ["settings", "got 1"]),
         ({"settings": {"magsac.threshold": "wide"}}, UserError, ["threshold", "'wide'"]),
         ({"settings": {"magsac.threshold": np.ones(2)}}, UserError, ["threshold", "array"]),
         ({"matchers": {"sift": SiftMatcher}}, TypeError, ["'sift' is <class", "instance"]),
@@ -205,33 +172,6 @@ def test_other_camera_matrices_are_refused_before_any_matching(given):
 def test_another_argument_of_a_matcher_is_refused_by_name(arguments, error, words):
     given = {"recipe": "classical"} | arguments
     raises(lambda: TwoStageMatcher(given.pop("recipe"), **given), error, *words)
-
-
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        {"weights": "."},
-        {"weights": Path()},
-        {"weights": None},
-        {"weights": (Path(), ".")},
-        {"device": torch.device("cpu")},
-        {"precision": torch.float32},
-        {"settings": {"magsac.threshold": np.linspace(0.1, 1, 3)[1]}},
-        {"settings": {"magsac.threshold": np.float32(0.5), "matchers.sift.ratio": np.float64(0.5)}},
-        {"settings": {"magsac.threshold": torch.tensor(0.5)}},
-        {"settings": {"matchers.sift.features": np.arange(1000, 4000, 1000)[1]}},
-        {"settings": {"magsac.max_iterations": np.array(1000)}},
-    ],
-)
-def test_an_argument_of_a_matcher_is_taken_where_its_meaning_is_plain(arguments):
-    for recipe in ("classical", SIFT):
-        made = TwoStageMatcher(recipe, **arguments)
-        for key, value in arguments.get("settings", {}).items():
-            table, *_, name = key.split(".")
-            settings = (
-                made.recipe.matchers["sift"] if table == "matchers" else vars(made.recipe.magsac)
-            )
-            assert settings[name] == value
 
 
 def write_aliked(path, extra=()):
@@ -251,15 +191,7 @@ def test_own_weights_are_a_file_for_a_slot(tmp_path):
     match = made(pixels(), pixels(40))
     assert match.failures == {}
     assert len(match.matches) > 0
-    # A notebook may have set another default dtype: networks are float32.
-    torch.set_default_dtype(torch.float64)
-    try:
-        again = TwoStageMatcher("aliked", weights=given, settings=made_settings)(
-            pixels(), pixels(40)
-        )
-    finally:
-        torch.set_default_dtype(torch.float32)
-    assert same(again.matches, match.matches)
+
     write_aliked(path, {"module.head": torch.zeros(1)})
     with (
         pytest.warns(RuntimeWarning, match=r'Unexpected key.* "head".*mine\.pth'),
@@ -281,29 +213,6 @@ def test_the_name_of_a_matcher_is_a_recipe(tmp_path):
     )
     (unit,) = TwoStageMatcher("own", matchers={"own": Own(fail)}).recipe.units
     assert unit == Unit(1, "own", 1024)
-    for name in MATCHERS:
-        (unit,) = recipe_of_name(name).units
-        assert (unit.stage, unit.matcher, unit.tracks) == (1, name, True)
-
-
-def test_a_recipe_may_be_a_path(tmp_path):
-    path = tmp_path / "mine.toml"
-    path.write_text('units = [{ stage = 1, matcher = "sift", long_side = 320 }]\n')
-    assert TwoStageMatcher(path).recipe == TwoStageMatcher(str(path)).recipe
-
-
-def test_units_have_whole_numbers_and_recipes_have_units():
-    assert Unit(np.int64(1), "sift", np.int32(640)) == Unit(1, "sift", 640)
-    for values in (("1", "sift", 640), (1, "sift", 640.0), (True, "sift", 640)):
-        raises(lambda values=values: Unit(*values), ValueError, "must be a whole number")
-    assert Recipe([Unit(1, "sift", 640)]).units == (Unit(1, "sift", 640),)
-    raises(lambda: Recipe(("sift",)), TypeError, "expected units", "'sift'")
-
-
-@pytest.mark.parametrize("pairs", [5, [5], [None], [("a.png",)]])
-def test_pairs_of_another_type_are_refused(pairs):
-    with pytest.raises((TypeError, ValueError)):
-        list(unrun().match_pairs(pairs))
 
 
 def test_a_model_of_another_name_is_refused():
@@ -366,9 +275,7 @@ ONE = Matches([(1, 1)], [(2, 2)], [1])
     ("answer", "word"),
     [
         (None, "not None"),
-        ([], "one for each of 1 pair"),
         (ONE, "not Matches"),
-        ([None], "not [None]"),
         ([ONE, ONE], "not [Matches"),
     ],
 )
@@ -393,28 +300,6 @@ def test_matches_of_the_users_own_matcher_that_are_all_dropped_are_an_error(foun
     both = Matches.concatenate([found, ONE])
     assert len(own(lambda *_: [both])(pixels(), pixels()).matches) == 1
     assert len(own(lambda *_: [Matches.empty()])(pixels(), pixels()).matches) == 0
-
-
-def test_matches_may_be_tensors_with_gradients():
-    points = torch.ones(3, 2, requires_grad=True)
-    found = Matches(points, points * 2, torch.ones(3))
-    np.testing.assert_array_equal(found.points1, np.full((3, 2), 2))
-    raises(lambda: Matches(points, points, None), TypeError, "scores is None", "(N,)")
-    raises(lambda: Matches(None, points, torch.ones(3)), TypeError, "points0 is None", "(N, 2)")
-
-
-def test_a_matcher_without_a_method_is_refused():
-    class Half:
-        spec = MatcherSpec("own")
-
-        def encode(self, pictures):
-            return pictures
-
-    raises(
-        lambda: TwoStageMatcher(Recipe((Unit(1, "own", 320),)), matchers={"own": Half()}),
-        TypeError,
-        "methods `encode` and `match`",
-    )
 
 
 class Unlucky(SiftMatcher):
@@ -442,77 +327,33 @@ def test_a_unit_that_fails_is_a_warning_and_an_estimate_without_points_names_it(
     assert np.isfinite(match.estimate.matrix).all()
 
 
-def test_a_matcher_that_cannot_be_loaded_is_a_warning(monkeypatch):
-    monkeypatch.setattr(assembly, "load_matcher", fail)
-    reason = "sift cannot be loaded: RuntimeError: my bug"
-    with (
-        pytest.warns(RuntimeWarning, match=f"unit 1:sift@320 failed: {reason}"),
-        pytest.warns(RuntimeWarning, match="no F was found: too few"),
-    ):
-        match = TwoStageMatcher(SIFT)(pixels(), pixels(40))
-    assert match.failures == {"1:sift@320": reason}
-
-
-@pytest.mark.parametrize(("is_unlucky", "status"), [(True, 1), (False, 0)])
-def test_the_command_match_ends_with_1_if_every_unit_failed(
-    tmp_path, monkeypatch, capsys, request, is_unlucky, status
-):
-    if is_unlucky:
-        request.getfixturevalue("unlucky")
+@pytest.mark.usefixtures("unlucky")
+def test_the_command_match_ends_with_1_if_every_unit_failed(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    for name in "ab":
-        PIL.Image.fromarray(pixels()).save(f"{name}.png")
-    Path("one.toml").write_text('units = [{ stage = 1, matcher = "sift", long_side = 320 }]\n')
+    PIL.Image.fromarray(pixels()).save("a.png")
+    write_recipe(Path("one.toml"), (1, 320))
     with warnings.catch_warnings():  # a command prints them
         warnings.simplefilter("always")
-        found = main(["match", "a.png", "b.png", "--recipe", "one.toml", "--device", "cpu"])
+        assert run_command("match", "a.png", "a.png", "--recipe", "one.toml") == 1
     printed = capsys.readouterr()
-    assert found == status, printed
-    assert ("overlap" in printed.out) != is_unlucky
-    assert ("out of luck" in printed.err) == is_unlucky
-    assert ("out of luck" in printed.out) == is_unlucky
-
-
-def test_flat_images_have_a_failure_of_the_estimate_and_not_of_units():
-    black = np.zeros((99, 99), np.uint8)
-    with pytest.warns(RuntimeWarning, match="no F was found: too few"):
-        match = TwoStageMatcher(SIFT)(black, black)
-    assert match.failures == {}
-    assert not match.estimate
+    assert "overlap" not in printed.out
+    assert "out of luck" in printed.err
+    assert "out of luck" in printed.out
 
 
 # What a result keeps
 
 
-def arrays_in(value, seen=None):
-    """All arrays that an object holds, at any depth."""
-    seen = set() if seen is None else seen
-    if id(value) in seen:
-        return []
-    seen.add(id(value))
-    if isinstance(value, np.ndarray):
-        return [value]
-    parts = []
-    if isinstance(value, dict):
-        parts = list(value.values())
-    elif isinstance(value, tuple | list):
-        parts = list(value)
-    elif hasattr(value, "__dict__"):
-        parts = list(vars(value).values())
-    return [array for part in parts for array in arrays_in(part, seen)]
-
-
 def test_a_result_keeps_no_image_and_can_be_pickled():
     matcher = TwoStageMatcher(TWO_STAGES)
-    alone = matcher(pixels(), pixels(40))
-    for match in (alone, *matcher.match_pairs([(pixels(), pixels(40))])):
+    for match in (
+        matcher(pixels(), pixels(40)),
+        *matcher.match_pairs([(pixels(), pixels(40))]),
+    ):
         assert match.images == ()
         assert match.sizes == ((280, 200), (280, 200))
-        assert match.focals == (0.0, 0.0)
-        kept = arrays_in(match)
-        assert kept
-        assert all(array.dtype != np.uint8 for array in kept)
-        copy: PairMatch = pickle.loads(pickle.dumps(match))
+        data = pickle.dumps(match)
+        assert len(data) < pixels().nbytes / 2
+        copy: PairMatch = pickle.loads(data)
         assert same(copy.matches, match.matches)
-        assert copy.regions == match.regions
         np.testing.assert_array_equal(copy.estimate.matrix, match.estimate.matrix)

@@ -1,8 +1,6 @@
 """Assembly of a run: the units that a recipe keeps, and the refusal of a recipe without weights."""
 
-import re
 from dataclasses import replace
-from functools import partial
 
 import pytest
 import torch
@@ -10,13 +8,11 @@ from safetensors.torch import save_file
 from shared import WEIGHTS, needs_weights, problems_of, run_command
 from weight_files import digest_of
 
-from mkpc_kaggle import reconstruct
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.keys import Keys
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.pipeline.assembly import Assembly, assemble
-from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher
 from mkpc_kaggle.recipe import Recipe, Unit, load_recipe
 from mkpc_kaggle.scene.view_graph import BatchImage
 from mkpc_kaggle.weights import WeightFile
@@ -24,14 +20,6 @@ from mkpc_kaggle.weights import store as weight_store
 from mkpc_kaggle.weights.manifest import manifest
 
 pytestmark = pytest.mark.usefixtures("nowhere_else")
-
-
-@pytest.mark.parametrize("bad", [{"recipe": 5}, {"matchers": [1]}, {"matchers": {"own": object()}}])
-def test_an_argument_of_a_wrong_type_is_named(bad):
-    # Such values fail deep in a worker otherwise, minutes later.
-    for call in (TwoStageMatcher, partial(reconstruct, [])):
-        with pytest.raises(TypeError):
-            call(**({"recipe": "classical"} | bad))
 
 
 def test_recipe_auto_leaves_out_the_units_whose_weights_are_missing():
@@ -123,19 +111,6 @@ def test_weights_of_another_network_cost_their_matcher_and_are_reported_once(
     told = capsys.readouterr()
     assert told.err.count("aliked is left out: the weights for 'aliked-n16'") == 1
     assert "aliked is left out: the weights for 'aliked-n16'" in told.out
-
-
-@pytest.mark.filterwarnings("default:unit 1")  # the command prints it
-def test_match_leaves_out_weights_of_another_network_as_submit_does(
-    misfits, demo, tmp_path, capsys
-):
-    (tmp_path / "own.toml").write_text(TWO_UNITS)
-    images = sorted((demo.test_dir / "test_images").rglob("*.png"))[:2]
-    options = ["--recipe", tmp_path / "own.toml", "--weights", misfits]
-    assert run_command("match", *images, *options) == 0
-    told = capsys.readouterr()
-    assert "1:sift@320" in told.out
-    assert re.search(r"aliked-n16' do not fit the network: .*\(.*a\.safetensors\)", told.err)
 
 
 def points_keys(assembly: Assembly) -> tuple[str, ...]:

@@ -55,23 +55,3 @@ def test_an_option_changes_the_settings_of_its_unit(clean_environment, matcher, 
 
 
 # A changed threshold must not match pairs again: points do not depend on later steps.
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [
-        ("magsac.threshold", 0.5),
-        ("magsac.confidence", 0.999),
-        ("magsac.max_iterations", 1000),
-        ("mkpc.eps", 0.1),
-        ("mkpc.share", 0.1),
-        ("scene.camera_model", "SIMPLE_RADIAL"),
-        ("scene.threads", 2),
-        ("scene.cameras", "image"),
-    ],
-)
-def test_a_setting_of_a_later_step_changes_its_table_alone(key, value):
-    recipe = Recipe((Unit(1, "sift", 640),)).with_scenes(True)
-    table, _, name = key.partition(".")
-    former = recipe.table()
-    new = with_settings(recipe, {key: value}).table()
-    assert former[table].pop(name) != new[table].pop(name) == value
-    assert former == new

@@ -22,7 +22,6 @@ from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import ModelKind
 from mkpc_kaggle.matchers.adapters.sift import SiftMatcher, SiftOptions
 from mkpc_kaggle.matchers.contract import MatcherSpec
-from mkpc_kaggle.pipeline import stages
 from mkpc_kaggle.pipeline.pair import PairMatch, with_estimate
 from mkpc_kaggle.pipeline.stages import Pipeline
 from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher
@@ -161,22 +160,6 @@ def test_a_prior_on_focal_lengths_comes_from_the_sizes_of_the_images_unless_the_
     assert homography.estimate.magsac is None
 
 
-def test_paths_arrays_and_images_give_the_same(tmp_path):
-    paths = []
-    for number, pixels in enumerate(pair()):
-        paths.append(tmp_path / f"{number}.png")
-        cv2.imwrite(str(paths[-1]), pixels[..., ::-1])
-    matcher = TwoStageMatcher(SIFT)
-    expected = matcher(*pair()).matches
-    assert same(matcher(*paths).matches, expected)
-    assert same(matcher(*map(str, paths)).matches, expected)
-    assert same(matcher(*map(Image.of_array, pair())).matches, expected)
-    gray = [cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY) for pixels in pair()]
-    assert same(matcher(*gray).matches, expected)
-    with pytest.raises(UserError, match=r"none\.png: no such file"):
-        matcher(tmp_path / "none.png", pair()[1])
-
-
 def test_a_photograph_on_its_side_gives_the_same_matches_in_its_stored_pixels(tmp_path):
     paths = []
     views = []
@@ -245,18 +228,6 @@ def test_results_so_far_are_returned_when_no_unit_may_start():
     (none,) = runner.match(works(), TWO_STAGES.units, lambda *_: False)
     assert none.results == ()
     assert with_estimate(none, TWO_STAGES).estimate.failure
-
-
-def test_regions_come_from_stage_1_alone():
-    # Otherwise a repeated stage 2 would crop otherwise than the first one did.
-    (work,) = pipeline(TWO_STAGES).match(works(), TWO_STAGES.units)
-    rng = np.random.default_rng(0)
-    points = rng.uniform(0, 300, (999, 2))
-    stray = Matches(points, points, np.ones(999))
-    first, second = work.results
-    strayed = replace(work, results=(first, replace(second, matches=stray)))
-    crop = TWO_STAGES.units[1]
-    assert stages.with_regions(strayed, TWO_STAGES, crop).regions == work.regions
 
 
 def test_crops_come_from_the_units_before_them_and_a_pair_without_these_has_none():
@@ -385,14 +356,6 @@ def test_pairs_with_a_common_image_encode_it_once_and_match_as_single_pairs(tmp_
         assert_array_equal(match.estimate.matrix, expected.estimate.matrix)
 
 
-def test_match_pairs_names_an_unreadable_image(tmp_path):
-    path = tmp_path / "a.png"
-    path.write_bytes(b"")
-    found = TwoStageMatcher(SIFT).match_pairs([(path, path)])
-    with pytest.raises(UserError, match="the file is empty"):
-        next(found)
-
-
 class Loader:
     """Loads a matcher without matches, or raises the error of that name; counts the calls."""
 
@@ -433,33 +396,3 @@ def test_a_pipeline_without_a_matcher_that_can_be_loaded_raises_the_first_error(
     load = Loader(good=UserError("first"), bad=UserError("second"))
     with pytest.raises(UserError, match="first"):
         Pipeline(TWO_MATCHERS, load).load()
-
-
-@pytest.mark.parametrize("error", [MemoryError("weights"), RuntimeError("CUDA error: no device")])
-def test_errors_of_memory_or_of_a_device_while_loading_are_raised(error):
-    with pytest.raises(type(error)):
-        Pipeline(TWO_MATCHERS, Loader(bad=error)).load()
-
-
-class Brightness(Scripted):
-    """Encodes the mean of a picture, and returns it as the x of a match."""
-
-    def encode(self, pictures):
-        return [float(picture.pixels.mean()) for picture in pictures]
-
-    def match(self, encodings0, encodings1):
-        return [Matches([[value, 1]], [[1, 1]], [1]) for value in encodings0]
-
-
-def test_a_file_that_is_replaced_during_a_run_is_encoded_again():
-    unit = Unit(1, "own", 64)
-    pipeline = Pipeline(Recipe((unit,)), lambda _: Brightness())
-    found = []
-    for value in (10, 50):
-        images = []
-        for name, level in (("a.png", value), ("b.png", 7)):
-            pixels = np.full((64, 64, 3), level, np.uint8)
-            images.append(Image(name, pixels, version=f"digest of {level}"))
-        (match,) = pipeline.match([PairMatch(images=tuple(images))], [unit])
-        found.append(match.matches.points0[0, 0])
-    assert found == [10, 50]
