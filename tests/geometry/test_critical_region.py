@@ -100,19 +100,6 @@ def test_clusters_are_kept_down_to_the_share_largest_first_and_equal_ones_in_the
         assert_array_equal(regions.keep_clusters(np.array(sizes, int), 0.05), kept)
 
 
-def test_clusters_label_noise_and_mark_the_points_of_kept_clusters():
-    small = block(600, 600, 640, 640, 5)
-    large = block(100, 100, 140, 140, 101)
-    points = np.concatenate([small, lone(3), large])
-    clusters = regions.find_clusters(points, SQUARE, PAPER)
-    assert_array_equal(clusters.sizes, [5, 101])
-    assert_array_equal(clusters.labels, [0] * 5 + [-1] * 3 + [1] * 101)
-    assert_array_equal(clusters.kept, [1])  # 5 / 101 < 0.05
-    assert_array_equal(clusters.in_kept, [False] * 8 + [True] * 101)
-    # Noise and the rest are outside
-    assert critical_region(points, SQUARE, BARE).box == Box(100, 100, 141, 141)
-
-
 def test_x_is_normalised_by_the_width_and_y_by_the_height():
     size = Size(1000, 200)  # eps is 50 pixels along x and 10 along y
     stack = np.full((6, 2), (500, 100), np.float32)

@@ -17,10 +17,8 @@ from benchmarks.synthetic_scene import project
 from mkpc_kaggle.geometry import robust
 from mkpc_kaggle.geometry.cameras import Camera, fundamental_of_cameras
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.geometry.metrics import pose_error
 from mkpc_kaggle.geometry.robust import (
     FALLBACK_FUNDAMENTAL,
-    DistinctMatches,
     ModelKind,
     RobustConfig,
     estimate,
@@ -147,22 +145,6 @@ def test_the_essential_matrix_and_the_homography_of_a_plane_are_found_among_outl
     assert np.hypot(*(moved - fresh.points1).T).max() < 0.05
 
 
-def test_magsac_finds_the_pose_of_noisy_matches_at_a_threshold_of_a_pixel():
-    errors = []
-    config = RobustConfig(threshold=1.0)
-    for seed in range(12):
-        matches, _ = scene(seed)
-        rng = np.random.default_rng(seed)
-        noise0, noise1 = rng.normal(0, 0.5, (2, *matches.points0.shape))
-        noisy = Matches(matches.points0 + noise0, matches.points1 + noise1, matches.scores)
-        result = estimated(ModelKind.E, noisy, config, seed)
-        first, second = cameras(seed)
-        error = pose_error(result.matrix, first.calibrated, second.calibrated, 1.0)
-        errors.append(error.angle)
-    # Degrees; 0.9 in units of the focal length, where the score has no scale
-    assert np.median(errors) < 0.4
-
-
 def test_sampson_distance_is_in_pixels_and_the_same_in_either_order():
     points0 = np.array([(10, 20), (30, 40)])
     points1 = np.array([(500, 20), (7, 43)])
@@ -269,18 +251,6 @@ def test_any_points_give_a_finite_matrix_of_norm_1_and_a_mask(data, n, model):
     assert not result.inliers[~is_finite].any()
 
 
-def test_points_that_opencv_refuses_fail_the_estimate(monkeypatch):
-    def find(*points, **settings):
-        error = cv2.error("no")
-        error.err = "sample_size <= points_size_"
-        raise error
-
-    solver = robust._SOLVERS[ModelKind.F]._replace(find=find)
-    monkeypatch.setitem(robust._SOLVERS, ModelKind.F, solver)
-    found = estimate(seen(0, 60), DEFAULT)
-    assert found.failure == "OpenCV refused the points: sample_size <= points_size_"
-
-
 def test_a_matrix_of_rank_3_is_no_fundamental_matrix(monkeypatch):
     """OpenCV returns one for some sets of wrong matches. It would be a wrong answer of its worker."""
     matches = seen(0, 60)
@@ -289,23 +259,3 @@ def test_a_matrix_of_rank_3_is_no_fundamental_matrix(monkeypatch):
     found = estimate(matches, DEFAULT)
     assert found.failure.startswith("no F fits 60 distinct matches")
     assert_array_equal(found.matrix, FALLBACK_FUNDAMENTAL / np.linalg.norm(FALLBACK_FUNDAMENTAL))
-
-
-VALUES = st.sampled_from([0.0, -0.0, 1.0, 2.5, -3.0, np.nan, np.inf])
-
-
-@given(arrays(np.float32, st.tuples(st.integers(0, 40), st.just(4)), elements=VALUES))
-def test_distinct_matches_are_those_of_numpy_in_order_of_first_appearance(rows):
-    found = DistinctMatches.of(Matches(rows[:, :2], rows[:, 2:], np.ones(len(rows), np.float32)))
-    finite = np.isfinite(rows).all(axis=1)
-    wanted: list[tuple[float, ...]] = []
-    for row in map(tuple, rows[finite].tolist()):
-        if row not in wanted:
-            wanted.append(row)
-    made = np.hstack([found.points0, found.points1])
-    assert list(map(tuple, made.tolist())) == wanted
-    numbers = [
-        wanted.index(tuple(row)) if ok else -1
-        for row, ok in zip(rows.tolist(), finite, strict=True)
-    ]
-    assert found.index.tolist() == numbers
