@@ -31,8 +31,6 @@ def palette(path: Path) -> None:
 KINDS: dict[str, Callable[[Path], None]] = {
     "gray": lambda path: save(HALF, path),
     "one bit": lambda path: PIL.Image.fromarray(HALF).convert("1").save(path),
-    "0 and 1": lambda path: save((HALF > 0).astype(np.uint8), path),
-    "16 bits, 0 and 255": lambda path: cv2.imwrite(str(path), HALF.astype(np.uint16)),
     "16 bits, 0 and 1": lambda path: cv2.imwrite(str(path), (HALF > 0).astype(np.uint16)),
     "palette": palette,
     "opaque": lambda path: save(np.dstack([HALF, HALF, HALF, WHITE[..., 0]]), path),
