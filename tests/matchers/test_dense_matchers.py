@@ -14,9 +14,8 @@ from mkpc_kaggle.matchers.dense import DenseMatcher, DenseOptions
 from mkpc_kaggle.matchers.networks import dense_sampling
 from mkpc_kaggle.matchers.networks.dense_sampling import sample_matches
 from mkpc_kaggle.matchers.networks.dense_warp import DenseWarp
-from mkpc_kaggle.matchers.networks.dkm import DKM
 from mkpc_kaggle.matchers.networks.grids import as_grid
-from mkpc_kaggle.matchers.networks.warp_refiner import WarpEstimate, identity_map
+from mkpc_kaggle.matchers.networks.warp_refiner import identity_map
 
 
 @pytest.mark.parametrize("floats", [1, 64, 1 << 20])
@@ -26,21 +25,6 @@ def test_a_density_is_the_same_in_blocks_of_any_size(monkeypatch, floats):
     squares = (points[:, None] - points).square().sum(2)
     expected = (squares / (-2 * dense_sampling.BANDWIDTH**2)).clamp(min=-80).exp().sum(1)
     torch.testing.assert_close(dense_sampling.density(points), expected)
-
-
-@torch.inference_mode()
-def test_corrections_are_in_pixels_of_the_query_for_supports_of_any_size(monkeypatch):
-    network = DKM()
-    refiner = network.decoder.conv_refiner["8"]
-    monkeypatch.setattr(refiner, "forward", lambda *_: torch.ones(1, 3, 6, 8))
-    query = network.encode(torch.zeros(1, 3, 48, 64)).coarse
-    support = network.encode(torch.zeros(1, 3, 72, 40)).coarse
-    estimate = WarpEstimate(torch.zeros(1, 2, 6, 8), torch.zeros(1, 1, 6, 8))
-    # A grid of 6 x 8 cells spans 2 in each direction, and the correction is an eighth of a cell.
-    cell = torch.tensor([2 / 8, 2 / 6])
-    for other in (query, support):
-        flow = network.decoder.correct(estimate, query, other, 8).flow
-        torch.testing.assert_close(flow[0, :, 0, 0], cell / 8)
 
 
 def test_matches_without_certainty_are_never_drawn():

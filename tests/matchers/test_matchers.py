@@ -2,25 +2,20 @@
 none.
 """
 
-import threading
 from functools import cache
 
 import cv2
 import numpy as np
 import pytest
-import torch
 from numpy.testing import assert_allclose
 from pictures import as_picture, match_one
 from shared import WEIGHTS, needs_weights
 from sklearn.datasets import load_sample_image
-from torch import nn
 
-from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Box, Size
-from mkpc_kaggle.matchers.adapters.sift import SiftOptions
 from mkpc_kaggle.matchers.contract import Colour, Placement
 from mkpc_kaggle.matchers.registry import load_matcher, spec_of
-from mkpc_kaggle.weights import WeightStore, load_into
+from mkpc_kaggle.weights import WeightStore
 
 # Small, so that networks take less than a second on a CPU.
 SIZE = Size(256, 192)
@@ -116,45 +111,3 @@ def test_sift_has_no_offset_at_any_scale():
         off = offsets(matches, H)
         # OpenCV's own offset, a quarter pixel, would be 0.13 at half the size and 0.25 at twice.
         assert_allclose(np.median(off[np.hypot(*off.T) < 3], axis=0), 0, atol=0.06)
-
-
-def test_all_names_and_shapes_of_a_checkpoint_must_fit_except_unused_ones():
-    network = nn.Sequential(nn.Linear(2, 2), nn.Linear(2, 2))
-    whole = {name: torch.ones_like(tensor) for name, tensor in network.state_dict().items()}
-    part = {name: tensor for name, tensor in whole.items() if name != "1.bias"}
-    surplus = {"2.bias": torch.ones(2)}
-    misshapen = {"0.weight": torch.ones(3, 2)}
-    for wrong, says in (
-        (whole | surplus, r"Unexpected .*2\.bias"),
-        (part, r"Missing .*1\.bias"),
-        (whole | misshapen, r"size mismatch for 0\.weight"),
-    ):
-        with pytest.raises(UserError, match=f"'w' do not fit the network: .*{says}"):
-            load_into(network, wrong, unused="nothing", what="w")
-    network = nn.Sequential(nn.Linear(2, 2), nn.Linear(2, 2))
-    load_into(network, part | surplus, unused=r"1\.bias|2\.", what="w")
-    assert (network[0].weight == 1).all() and not (network[1].bias == 1).any()
-
-
-@pytest.mark.parametrize("count", [1, 5])
-def test_sift_finds_the_same_in_several_pictures_at_a_time(monkeypatch, count):
-    gray = cv2.cvtColor(photograph(), cv2.COLOR_RGB2GRAY)
-    pictures = [as_picture(np.roll(gray, 7 * number, axis=1), 1) for number in range(count)]
-    matcher = load_matcher("sift", WeightStore([]), SiftOptions(), Placement())
-    one_by_one = [matcher.encode([picture])[0] for picture in pictures]
-    makers = set()
-    make = cv2.SIFT_create
-
-    def made(*arguments, **settings):
-        makers.add(threading.current_thread().name)
-        return make(*arguments, **settings)
-
-    monkeypatch.setattr(cv2, "SIFT_create", made)
-    monkeypatch.setattr(cv2, "getNumThreads", lambda: 8)
-    parallel = load_matcher("sift", WeightStore([]), SiftOptions(), Placement()).encode(pictures)
-    # A single picture needs no thread.
-    assert (threading.current_thread().name in makers) == (count == 1)
-    for alone, together in zip(one_by_one, parallel, strict=True):
-        assert len(alone) > 100
-        assert torch.equal(alone.points, together.points)
-        assert torch.equal(alone.descriptors, together.descriptors)

@@ -45,8 +45,9 @@ def brute_force(first, second):
     return index0, index1, similarity[index0, index1], np.array(ratios)
 
 
-def found(first, second, dtype=torch.float64):
-    descriptors = [torch.tensor(each, dtype=dtype) for each in (first, second)]
+def found(first, second):
+    descriptors = [torch.tensor(each, dtype=torch.float64) for each in (first, second)]
+
     got = mutual_neighbours(*descriptors)
     parts = (got.index0, got.index1, got.similarity, got.ratio)
     return tuple(part.numpy() for part in parts)
@@ -54,26 +55,17 @@ def found(first, second, dtype=torch.float64):
 
 # One and two descriptors have no second neighbour, or just one.
 @pytest.mark.parametrize(("n", "m"), [(1, 1), (1, 9), (9, 1), (2, 2), (150, 61), (61, 150)])
-@pytest.mark.parametrize(
-    ("dtype", "tolerance"),
-    [
-        (torch.float32, 1e-4),
-        (torch.float64, 1e-9),
-    ],
-)
 # Blocks that end within, at and after the last row.
 @pytest.mark.parametrize("rows", [7, 61, 4096])
-def test_neighbours_are_those_of_brute_force_in_blocks_of_any_size(
-    n, m, dtype, tolerance, rows, monkeypatch
-):
+def test_neighbours_are_those_of_brute_force_in_blocks_of_any_size(n, m, rows, monkeypatch):
     monkeypatch.setattr(neighbours, "BLOCK_ROWS", {"cpu": rows})
     first, second = related(n, n, m)
-    index0, index1, *values = found(first, second, dtype)
+    index0, index1, *values = found(first, second)
     true0, true1, *true_values = brute_force(first, second)
     assert_array_equal(index0, true0)
     assert_array_equal(index1, true1)
     for value, truth in zip(values, true_values, strict=True):
-        assert_allclose(value, truth, rtol=0, atol=tolerance)
+        assert_allclose(value, truth, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("max_ratio", [0.0, 0.3, 0.8])

@@ -32,8 +32,10 @@ def matches_of(name, precision=Precision.FLOAT32, noise=0):
     return torch.from_numpy(np.hstack([found.points0, found.points1]))
 
 
-@pytest.mark.parametrize("precision", [Precision.BFLOAT16, Precision.FLOAT16])
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    ("name", "precision"),
+    [("superglue", Precision.BFLOAT16), *((name, Precision.FLOAT16) for name in NAMES)],
+)
 def test_half_precision_moves_matches_less_than_noise_does(name, precision):
     exact = matches_of(name)
     half = matches_of(name, precision)

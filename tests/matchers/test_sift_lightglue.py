@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 from golden import golden_arrays, needs_golden, seeded_tensor
 from light_matchers import lightglue_matcher
 from numpy.testing import assert_allclose
@@ -95,18 +94,3 @@ def test_a_picture_matches_itself_turned_by_quarter_turns(turns):
     assert np.mean(distances < 1) > 0.9
     # OpenCV's offset of a quarter pixel, uncorrected, turns with the picture: up to 0.5 apart.
     assert_allclose(np.median(offsets, axis=0), 0, atol=0.06)
-
-
-def test_a_pixel_has_one_keypoint_and_the_strongest_are_kept():
-    (few,) = sift_encoder(20, "cpu")([PICTURE])
-    (many,) = sift_encoder(500, "cpu")([PICTURE])
-    # OpenCV gives a point with two orientations twice.
-    pixels = (many.points - 0.25).round()
-    assert len(many) == len(pixels.unique(dim=0)) > 100
-    to_nearest = torch.cdist(few.points, many.points).min(dim=1).values
-    assert to_nearest.max() < 0.5
-    # Sixteen equal squares: OpenCV keeps all keypoints that are as strong as the weakest kept.
-    square = np.full((6, 6), 255, np.uint8)
-    equal = np.tile(np.pad(square, 13), (4, 4))
-    (five,) = sift_encoder(5, "cpu")([as_picture(equal)])
-    assert len(five) == 5

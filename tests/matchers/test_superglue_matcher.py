@@ -47,30 +47,6 @@ def test_a_plan_spreads_the_mass_of_each_keypoint_even_if_scores_are_far_apart(b
     torch.testing.assert_close(plan.sum(dim=1), masses, rtol=1e-3, atol=1e-3)
 
 
-def test_the_threshold_is_strict_and_the_limit_keeps_the_strongest_in_order():
-    scores = torch.zeros(16, 24)
-    scores[4, 4] = 0.25
-    scores[4, 19] = 0.5
-    scores[11, 4] = 0.75
-    scores[11, 19] = 0.125  # on the threshold
-    # Within the border of 4 pixels, but not of 3.
-    scores[12, 9] = 1
-    scores[9, 20] = 1
-
-    def selected(**options):
-        network = SuperPoint(keypoint_threshold=0.125, **options)
-        points, kept = network.select_keypoints(scores)
-        x, y = points.long().T
-        assert torch.equal(scores[y, x], kept)
-        return points.tolist()
-
-    in_rows = [[4, 4], [19, 4], [4, 11]]
-    # Keypoints are in the order of rows until the limit sorts them by score.
-    assert selected() == selected(max_keypoints=3) == selected(max_keypoints=9) == in_rows
-    assert selected(max_keypoints=2) == [[4, 11], [19, 4]]
-    assert [20, 9] in selected(border=3)
-
-
 def test_superpoint_finds_in_a_batch_what_it_finds_in_each_image():
     network = filled(SuperPoint(max_keypoints=20), "superpoint")
     batch = torch.rand(3, 1, 45, 62)

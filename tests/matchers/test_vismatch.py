@@ -68,8 +68,9 @@ def test_the_example_runs_in_both_stages_on_rgb_images_in_0_to_1(names):
 
 
 # Its matchers count pixels from a corner or from a centre, and some have no confidences.
-@pytest.mark.parametrize("corner", [0.0, 0.5])
-@pytest.mark.parametrize("confidences", [None, np.linspace(0, 1, len(POINTS))])
+@pytest.mark.parametrize(
+    ("corner", "confidences"), [(0.0, None), (0.5, np.linspace(0, 1, len(POINTS)))]
+)
 def test_the_centre_of_the_first_pixel_is_at_0_and_confidences_are_scores(
     names, corner, confidences
 ):
