@@ -5,7 +5,7 @@ from functools import cache, partial
 
 import numpy as np
 import torch
-from dense_stages import batch_of, resized_by_pil
+from dense_stages import resized_by_pil
 from golden import Stage, Within, compared, golden_arrays, in_order, recorded, standin_state
 from sparse_stages import assignment_values
 
@@ -19,7 +19,6 @@ from mkpc_kaggle.matchers.networks.loma_matcher import (
     LomaMatcher,
     log_scores,
 )
-from mkpc_kaggle.matchers.networks.pixels import resized
 from mkpc_kaggle.matchers.networks.placement import prepared
 from mkpc_kaggle.weights import load_into
 
@@ -100,31 +99,6 @@ def sampling_stages():
         yield Stage(f"{name} points", found, expected, 1e-6)
 
 
-def resize_stages():
-    golden = golden_arrays("loma", "resize_cases")
-    source = golden["source"]
-    for name, expected in golden.items():
-        if name.startswith(("detector", "descriptor")) and not name.endswith("float"):
-            size = tuple(expected.shape[:2])
-            by_name = int(name.split("_")[1])
-            wanted = Size(by_name, by_name)
-            if name.startswith("detector"):
-                wanted = detector_size(Size(source.shape[1], source.shape[0]), by_name)
-            yield Stage(f"{name} size", torch.tensor(wanted[::-1]), torch.tensor(size))
-            got = (resized(batch_of(source), size) * 255).round()
-            # The reference rounds to bytes: a value on a half may fall to either side.
-            yield Stage(name, got, batch_of(expected).float(), 1)
-            differing = (got != batch_of(expected)).float().mean()
-            yield Stage(f"{name}, share", differing, torch.tensor(0.0), 0.02)
-    # A picture of the right size is not resized, only divided by 255.
-    exact = resized(batch_of(golden["detector_48"]), golden["detector_48"].shape[:2])
-    yield Stage("detector_48_float", exact[0], golden["detector_48_float"], 1e-7)
-    # Sizes decide where a keypoint lies, so they must agree to the pixel.
-    for width, height, long_side, *expected in golden["size_table"].tolist():
-        got = detector_size(Size(width, height), long_side)
-        yield Stage(f"{width} x {height}", torch.tensor(got), torch.tensor(expected))
-
-
 def descriptor_stages(variant, case):
     """Yield descriptors at every third pixel of an image, and at its keypoints."""
     golden = golden_arrays("loma", f"descriptor_{case}")
@@ -193,14 +167,10 @@ def pipeline_stages(case, variant):
 
 DETECTIONS = ("160x208", "157x203", "batch2_72x96")
 CASES = {f"loma detector_{case}": partial(detector_stages, case) for case in DETECTIONS}
-CASES |= {"loma sampling": sampling_stages, "loma resize": resize_stages}
+CASES["loma sampling"] = sampling_stages
 CASES["loma descriptor_b128"] = partial(descriptor_stages, Variant.B128, "b128_157x203")
 CASES |= {
     f"loma matcher_{case}": partial(matcher_stages, case)
-    for case in ("b_60x47", "b128_33x71", "l_24x18", "g_14x11", "b_batch2_20x26", "b_1x3", "b_1x1")
+    for case in ("b_60x47", "b128_33x71", "l_24x18", "b_batch2_20x26", "b_1x3", "b_1x1")
 }
 CASES["loma pipeline_b128"] = partial(pipeline_stages, "pipeline_b128", Variant.B128)
-SLOW = {
-    "loma descriptor_g": partial(descriptor_stages, Variant.B, "g_168x210"),
-    "loma pipeline_b": partial(pipeline_stages, "pipeline_b", Variant.B),
-}

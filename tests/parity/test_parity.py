@@ -13,16 +13,11 @@ import torch
 from golden import assert_stages, needs_golden
 
 # Parity is of arithmetic: stand-in weights of a seed show it as well as trained ones.
-FAST = sparse_stages.CASES | semi_dense_stages.CASES | dense_stages.CASES | loma_stages.CASES
-CASES = [pytest.param(stages, id=name) for name, stages in FAST.items()]
-CASES += [
-    pytest.param(stages, id=name, marks=pytest.mark.slow)
-    for name, stages in loma_stages.SLOW.items()
-]
+CASES = sparse_stages.CASES | semi_dense_stages.CASES | dense_stages.CASES | loma_stages.CASES
 
 
 @needs_golden
-@pytest.mark.parametrize("stages", CASES)
+@pytest.mark.parametrize("stages", CASES.values(), ids=CASES)
 @torch.inference_mode()
 def test_every_stage_agrees_with_the_golden_file(stages):
     assert_stages(stages())
