@@ -67,12 +67,3 @@ def test_a_wrong_point_of_two_views_is_removed_and_one_of_more_views_is_not(mode
     remove_uncertain_points(model)
     assert points - two_view_points(model) == {wrong}
     assert more_views in model.points3D
-
-
-def test_points_of_two_views_with_nearly_parallel_rays_are_removed(model, monkeypatch):
-    points = two_view_points(model)
-    # The angles of the synthetic cameras are between 10 and 80 degrees.
-    monkeypatch.setattr("mkpc_kaggle.scene.adjustment.MIN_TWO_VIEW_ANGLE_DEG", 179.0)
-    others = set(model.points3D) - points
-    remove_uncertain_points(model)
-    assert set(model.points3D) == others

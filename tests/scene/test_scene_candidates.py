@@ -14,7 +14,6 @@ from mkpc_kaggle.scene.candidates import (
     ALL_UNITS,
     SUPPORTED,
     best_of,
-    candidate_settings,
     candidate_tracks,
     candidates_of,
     disagreement,
@@ -78,14 +77,6 @@ def test_cameras_of_a_part_of_the_images_do_not_win_by_leaving_out_the_rest():
     assert disagreement(PAIRS, []) == 10.0
 
 
-def test_pairs_without_an_f_do_not_count():
-    first, *others = PAIRS
-    extra = replace(first, pair_fundamental=None)
-    copies = replace(first, image1=first.image0)
-    assert disagreement([extra, copies, *others], [model()]) == pytest.approx(0, abs=1e-3)
-    assert disagreement([extra], [model()]) == 0
-
-
 @pytest.mark.parametrize(
     ("units", "most", "expected"),
     [
@@ -108,14 +99,6 @@ def test_a_candidate_of_one_unit_has_the_tracks_of_that_unit():
     assert len(candidate_tracks(results, FEW.name)) == len(few)
     for candidate in (ALL_UNITS, SUPPORTED):
         assert len(candidate_tracks(results, candidate)) == len(tracks_of(results))
-
-
-def test_only_the_candidate_of_supported_edges_leaves_out_others():
-    config = SceneConfig()
-    assert candidate_settings(ALL_UNITS, config) == candidate_settings(MANY.name, config) == config
-    assert candidate_settings(SUPPORTED, config).min_support > 0
-    strict = SceneConfig(min_support=0.5)
-    assert candidate_settings(SUPPORTED, strict) == strict
 
 
 def test_the_first_candidate_stays_unless_another_is_clearly_better():

@@ -11,11 +11,9 @@ from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.scene.choose import Choice, Reason, choose, contradicts
 from mkpc_kaggle.scene.models import (
-    Reconstruction,
     RegisteredImage,
     SfmModel,
     filter_models,
-    models_of,
 )
 from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair
 
@@ -96,17 +94,6 @@ def test_a_model_that_is_too_small_is_left_out(scene):
     assert sizes == [4]
 
 
-def test_the_models_of_all_components_are_numbered_by_size(scene):
-    first_three = list(scene.cameras.items())[:3]
-    small = model(dict(first_three))
-    large = model(scene.cameras)
-    components = [
-        Reconstruction(("a",), (small,)),
-        Reconstruction(("b",), (large,)),
-    ]
-    assert models_of(components) == (large, small)
-
-
 # F of a camera that moves along x, whose lines are the rows, and along y, whose lines are the columns
 ALONG_X = np.array([[0, 0, 0], [0, 0, -1], [0, 1, 0]]) / np.sqrt(2)
 ALONG_Y = np.array([[0, 0, 1], [0, 0, 0], [-1, 0, 0]]) / np.sqrt(2)
@@ -152,7 +139,3 @@ def test_the_evidence_of_a_larger_photograph_has_larger_errors():
     by_unit = (Matches.concatenate([moved(100, 0), off]),)
     assert contradicts(ALONG_X, pair_of(*by_unit))
     assert not contradicts(ALONG_X, pair_of(*by_unit, side=8 * 1536))
-
-
-def test_a_pair_without_its_own_f_does_not_contradict():
-    assert not contradicts(ALONG_X, replace(pair_of(moved(100, 40)), pair_fundamental=None))

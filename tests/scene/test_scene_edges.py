@@ -20,18 +20,8 @@ def test_edges_between_opposite_sides_have_too_little_support():
     assert kept(edges, 0.1) == {**RING, **SECOND}.keys()
 
 
-def test_without_a_share_all_edges_stay_even_unverified_ones():
-    edges = {**RING, (0, 2): 0}
-    assert kept(edges, 0) == edges.keys()
-
-
 @pytest.mark.parametrize("copies", [20_000, 400])
 def test_one_strong_edge_sets_no_standard_for_the_others(copies):
     """Two copies of a photograph share all their matches."""
     edges = {**RING, **SECOND, (0, 1): copies}
     assert kept(edges, 0.1) == edges.keys()
-
-
-def test_the_order_of_the_edges_does_not_count():
-    edges = {**RING, **OPPOSITE, **SECOND}
-    assert kept(dict(reversed(edges.items())), 0.1) == kept(edges, 0.1)

@@ -72,11 +72,6 @@ def test_known_intrinsics_stay(sharing):
         assert has_stayed == is_known, found.image.name
 
 
-def test_intrinsics_that_are_all_known_stay():
-    model = reconstructed([true_camera(name) for name in NAMES])
-    assert focal_ratios(model) == pytest.approx(dict.fromkeys(NAMES, 1.0), abs=1e-9)
-
-
 def test_distortion_is_part_of_verification_and_of_the_model(tmp_path):
     known = []
     for name in NAMES:

@@ -47,8 +47,9 @@ def lenses_of(model: SfmModel) -> set[str]:
     return {image.lens.model for image in model.images if image.lens}
 
 
-@pytest.mark.parametrize("sharing", [CameraSharing.AUTO, CameraSharing.FOLDER])
-@pytest.mark.parametrize("k", [-0.2, 0.1])
+@pytest.mark.parametrize(
+    ("k", "sharing"), [(-0.2, CameraSharing.AUTO), (0.1, CameraSharing.FOLDER)]
+)
 def test_a_lens_is_found_and_shared(k, sharing):
     model = model_of(k, replace(RADIAL, cameras=sharing))
     assert lenses_of(model) == {"SIMPLE_RADIAL"}
@@ -70,10 +71,6 @@ def test_a_lens_that_the_user_gives_stays_however_flat_it_is():
     lens = KnownCamera("SIMPLE_RADIAL", (FOCAL, SIZE.width / 2, SIZE.height / 2, 1e-6))
     model = model_of(0.0, RADIAL, *[(image.name, lens) for image in SCENE.images])
     assert {image.lens for image in model.images} == {lens}
-
-
-def test_pinholes_that_are_asked_for_stay_pinholes():
-    assert lenses_of(model_of(-0.2, SceneConfig())) == {"SIMPLE_PINHOLE"}
 
 
 def test_a_fisheye_that_is_asked_for_is_found():

@@ -18,13 +18,9 @@ from benchmarks.synthetic_scene import (
 )
 from mkpc_kaggle.geometry.cameras import Camera, relative_pose
 from mkpc_kaggle.geometry.coordinates import Size
-from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.geometry.robust import RobustConfig
 from mkpc_kaggle.recipe import CameraSharing, SceneConfig
 from mkpc_kaggle.scene import colmap
-from mkpc_kaggle.scene.choose import estimate_at_known_focals
-from mkpc_kaggle.scene.keypoints import MergedGraph
 from mkpc_kaggle.scene.models import RegisteredImage, SfmModel
 from mkpc_kaggle.scene.sfm import Solution, reconstruct_batch, reconstruct_graph
 from mkpc_kaggle.scene.shared_intrinsics import shared_intrinsics, undecided_zooms
@@ -215,22 +211,6 @@ def mappings(monkeypatch) -> list[int]:
     return sizes
 
 
-def test_shared_intrinsics_start_from_the_poses_of_the_first_reconstruction(mappings, monkeypatch):
-    scene = synthetic_scene(7, 12, points=250, focals=[FOCAL] * 7, seed=1)
-    refined = reconstruct_batch(scene.pairs, CONFIG)
-    assert mappings == [7]
-    monkeypatch.setattr("mkpc_kaggle.scene.shared_intrinsics.refine_complete", lambda *_: None)
-    mapped = reconstruct_batch(scene.pairs, CONFIG)
-    assert mappings == [7, 7, 7]
-    # The same optimum, from other starts
-    assert focals_of(refined) == pytest.approx(focals_of(mapped), rel=1e-3)
-    for found, other in zip(refined.choices, mapped.choices, strict=True):
-        assert found.from_scene
-        # F has norm 1 and either sign, so the product of equal matrices is 1 or -1.
-        product = np.sum(found.F * other.F)
-        assert abs(product) == pytest.approx(1, abs=1e-4)
-
-
 def test_an_incomplete_reconstruction_is_mapped_again_with_shared_intrinsics(mappings):
     scene = synthetic_scene(7, points=300, focals=[FOCAL] * 7)
     first = scene.images[0]
@@ -243,29 +223,6 @@ def test_an_incomplete_reconstruction_is_mapped_again_with_shared_intrinsics(map
     (found,) = reconstruct_batch([*scene.pairs, wrong], CONFIG).reconstructions
     assert found.registered == 7
     assert mappings == [8, 8]
-
-
-def test_poses_with_which_images_see_fewer_points_are_mapped_again(mappings, monkeypatch):
-    scene = synthetic_scene(6, points=300)
-    # The images have different focal lengths, so no poses fit a shared one.
-    everything = {image.digest: FOCAL for image in scene.images}
-    monkeypatch.setattr(
-        "mkpc_kaggle.scene.shared_intrinsics.shared_intrinsics", lambda *_, **__: everything
-    )
-    solution = reconstruct_batch(scene.pairs, CONFIG)
-    assert len(set(focals_of(solution))) == 6
-    assert mappings == [6, 6]
-
-
-def test_an_image_that_the_scene_lacks_has_the_shared_focal_length():
-    scene = synthetic_scene(2, points=300, focals=[FOCAL] * 2)
-    (pair,) = scene.pairs
-    focal = FocalConfig()
-    # Fewer trials than the default: whether there is an F does not depend on them.
-    magsac = RobustConfig(max_iterations=2000)
-    both = {pair.image0.digest: FOCAL, pair.image1.digest: FOCAL}
-    assert estimate_at_known_focals(pair, both, focal, magsac) is not None
-    assert estimate_at_known_focals(pair, {}, focal, magsac) is None
 
 
 def test_shared_intrinsics_verify_no_edge_again(tmp_path, monkeypatch):
@@ -287,30 +244,3 @@ def test_shared_intrinsics_verify_no_edge_again(tmp_path, monkeypatch):
             assert len(geometry.inlier_matches) > 15
             # Of the camera before, E would be wrong.
             assert geometry.E is None or not geometry.E.any()
-
-
-def test_a_geometry_of_other_focal_lengths_stands_in_without_its_essential_matrix():
-    scene = synthetic_scene(4, 6, points=250)
-    merged = MergedGraph(ViewGraph.of_pairs(scene.pairs))
-
-    def verified(
-        focal: float, model: str = "SIMPLE_PINHOLE", *, reuse: bool = False
-    ) -> list[pycolmap.TwoViewGeometry]:
-        camera = pycolmap.Camera.create_from_model_name(1, model, focal, *WIDE)
-        camera.has_prior_focal_length = True
-        return colmap.verify(merged, [camera] * 4, reuse=reuse)
-
-    first = verified(FOCAL)
-    for focal in (0.6 * FOCAL, 1.9 * FOCAL):
-        for again, former in zip(verified(focal, reuse=True), first, strict=True):
-            assert np.array_equal(again.inlier_matches, former.inlier_matches)
-            assert np.array_equal(again.F, former.F)
-            assert again.E is None
-    # The mapper reads relative poses, so without ``reuse`` each edge is verified; also with another
-    # model of the camera, and at quite another focal length.
-    for others in (
-        verified(0.9 * FOCAL),
-        verified(FOCAL, "SIMPLE_RADIAL", reuse=True),
-        verified(4 * FOCAL, reuse=True),
-    ):
-        assert all(geometry.E is not None for geometry in others)
