@@ -31,8 +31,4 @@ def run(arguments: argparse.Namespace) -> None:
     # Rendering takes a quarter of a minute.
     print(f"rendering photographs to {arguments.out}", flush=True)
     with writing(f"--out {arguments.out}"):
-        demo = write_demo(arguments.out)
-    # The directories that the commands of the help text take.
-    print(f"train side: {demo.train_dir}")
-    print(f"test side: {demo.test_dir}")
-    print(f"truth of the test side: {demo.truth_csv}")
+        write_demo(arguments.out)

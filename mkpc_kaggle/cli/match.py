@@ -22,9 +22,6 @@ Exit status: 0 done, 1 every unit failed, 2 bad input.
 """
 
 
-EXIT_NOTHING_RAN = 1
-
-
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("image0", type=Path, help="first image")
     parser.add_argument("image1", type=Path, help="second image")
@@ -54,7 +51,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.out is not None:
         save(match.plot(*images), arguments.out)
         print(f"figure: {arguments.out}")
-    return EXIT_NOTHING_RAN if _nothing_ran(match) else 0
+    return int(_nothing_ran(match))
 
 
 def _nothing_ran(match: PairMatch) -> bool:

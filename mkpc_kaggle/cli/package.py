@@ -4,8 +4,7 @@ import argparse
 from pathlib import Path
 
 from mkpc_kaggle.cli import options
-from mkpc_kaggle.errors import plural
-from mkpc_kaggle.package import DATASET_METADATA, PYTHONS, make_package
+from mkpc_kaggle.package import PYTHONS, make_package
 
 HELP = """\
 Write two folders, each with the metadata for the `kaggle` command:
@@ -36,8 +35,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     out: Path = arguments.out
-    # Kaggle creates a dataset once; each later upload is a version of it.
-    is_packaged = (out / "dataset" / DATASET_METADATA).is_file()
     package = make_package(
         out,
         arguments.owner,
@@ -49,10 +46,8 @@ def run(arguments: argparse.Namespace) -> None:
     licences = {file.name: file.licence for file in package.weights}
     for folder, paths in (("dataset", package.dataset), ("kernel", package.kernel)):
         rows = [("file", "bytes", "licence")]
-        sizes = [path.stat().st_size for path in paths]
-        for path, size in zip(paths, sizes, strict=True):
-            rows.append((path.name, str(size), licences.get(path.name, "")))
-        rows.append((plural(len(paths), "file"), str(sum(sizes)), ""))
+        for path in paths:
+            rows.append((path.name, str(path.stat().st_size), licences.get(path.name, "")))
         print(out / folder)
         options.print_table(rows)
         print()
@@ -60,7 +55,7 @@ def run(arguments: argparse.Namespace) -> None:
     if package.restricted:
         names = ", ".join(f"{file.name} ({file.licence})" for file in package.restricted)
         print(f"{_PRIVATE if arguments.private else _LEFT_OUT}: {names}\n")
-    print((_NEXT_VERSION if is_packaged else _NEXT).format(out=out))
+    print(_NEXT.format(out=out))
 
 
 _LEFT_OUT = (
@@ -69,12 +64,9 @@ _LEFT_OUT = (
 _PRIVATE = """\
 Included, although their licences do not clearly allow redistribution. Keep the dataset private on Kaggle, do not
 share it, and check what the licences say about competitions"""
+# Kaggle creates a dataset once; each later upload is a version of it.
 _NEXT = """\
 Next, with the `kaggle` command (README.md; details in docs/kaggle.md):
-  kaggle datasets create -p {out}/dataset
-  kaggle kernels push -p {out}/kernel"""
-_NEXT_VERSION = """\
-Next, with the `kaggle` command. The folder was packaged before, so the dataset on Kaggle gets a new version. If it
-is not on Kaggle yet, the first command is `kaggle datasets create -p {out}/dataset`:
+  kaggle datasets create -p {out}/dataset, or of a dataset that exists:
   kaggle datasets version -p {out}/dataset -m "new files"
   kaggle kernels push -p {out}/kernel"""

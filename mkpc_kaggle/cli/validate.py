@@ -1,7 +1,6 @@
 """The command ``validate``."""
 
 import argparse
-import re
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -48,8 +47,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--compare", nargs="+", metavar="RECIPE[:MODE]", help=text)
     options.add_run(parser, time_limit=None)
     options.add_json(parser)
-    text = """keep the journal there and resume from it; report.html (with --compare, a page for each recipe) shows
-        the run; default: a temporary directory"""
+    text = """keep the journal there and resume from it; report.html shows the run (with --compare, the last
+        recipe's); default: a temporary directory"""
     add("--work-dir", type=Path, metavar="DIR", help=text)
 
 
@@ -76,14 +75,10 @@ def run(arguments: argparse.Namespace) -> int:
         # All of them first: a wrong name should not end a comparison after its first run.
         assemblies = [options.assembly_of(arguments, interrupt, text) for text in recipes]
         # They share a journal, so that common units run once.
-        for text, assembly in zip(recipes, assemblies, strict=True):
+        for assembly in assemblies:
             validation = _run_recipe(arguments, scenes, assembly, session)
             runs.append(validation)
-            page = None
-            if arguments.work_dir is not None:
-                # A recipe may be a path, and a mode is joined by a colon.
-                name = re.sub(r"[^\w.-]+", "_", text) if arguments.compare else "report"
-                page = work_dir / f"{name}.html"
+            page = None if arguments.work_dir is None else work_dir / "report.html"
             session.status = max(status, session.status)
             status = options.finish(session, page, pairs)
             # A comparison of unequal pairs would mean nothing.
