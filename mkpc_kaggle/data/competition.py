@@ -11,7 +11,7 @@ import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cache
 from io import TextIOWrapper
 from pathlib import Path
@@ -43,8 +43,6 @@ class Pair:
     group: str  # its batch or scene
     file0: str  # paths of the images; text saves memory, since a table may have a million rows
     file1: str
-    # If they are given, E is estimated instead of F.
-    intrinsics: tuple[Matrix3, Matrix3] | None = field(default=None, compare=False)
     turns: tuple[int, int] = (0, 0)  # counter-clockwise quarter turns of each image before matching
 
     @property

@@ -59,7 +59,7 @@ STATISTICS = {
     "cost": 0.0,
 }
 PAIRS = ["pair", "group", "image0", "image1", "failure", "source", "matches", "inliers", "overlaps"]
-PAIRS += ["support", "focal0", "focal1", "model", *ELEMENTS, *SECONDS]
+PAIRS += ["support", "focal0", "focal1", *ELEMENTS, *SECONDS]
 PAIRS += ["cost", "choice", "units", "error"]
 UNITS = [
     "pair",
@@ -87,8 +87,8 @@ class Results:
     has a row. ``scenes`` has a row for each batch: numbers of images, cameras, models and points, the mean
     reprojection error in pixels, whose tracks were used, the reason if there are no cameras, and the images
     of a folder without a camera. Columns that name a pair have its id. Columns that name an image have its
-    path below the directory of the run's images. ``f11`` to ``f33`` of ``pairs`` are the matrix of ``model``:
-    F, or E for a pair with known intrinsics. ``choice`` is the reason why it is the scene's or not,
+    path below the directory of the run's images. ``f11`` to ``f33`` of ``pairs`` are F.
+    ``choice`` is the reason why it is the scene's or not,
     ``units`` the number of units that ran or failed, and ``error`` the error that left the pair without
     an F, if it was not for few matches. ``events`` are those of the last session, such as faults.
     """
@@ -110,10 +110,7 @@ class Results:
         return recipe_of(settings, settings.pop("name"))
 
     def matches(self, *pairs: str) -> Iterator[PairMatch]:
-        """Yield the matches, critical regions and own F of pairs, by id, to plot them.
-
-        An E has no residuals in pixels, so its pair has no inliers here.
-        """
+        """Yield the matches, critical regions and own F of pairs, by id, to plot them."""
         recipe = self.recipe
         units = {unit.name: unit for unit in recipe.units}
         with Store.read(self.directory) as store:
@@ -126,8 +123,7 @@ class Results:
                 points = points_of(store, number)
                 found = tuple(UnitResult(units[name], each) for name, each in points.items())
                 F = tables.estimates["F"][number]
-                count = row["inliers"] if row["model"] == ModelKind.F else 0
-                estimate = nearest_to(F, found, count, row["failure"])
+                estimate = nearest_to(F, found, row["inliers"], row["failure"])
                 crops = regions_of(regions[pair]) if pair in regions else None
                 yield PairMatch(found, crops, estimate, mkpc=recipe.mkpc)
 
@@ -190,8 +186,8 @@ def results(directory: Path | str) -> Results:
     >>> from mkpc_kaggle import reconstruct, results
     >>> models = reconstruct("photographs", "OUT", "sift", progress=False)
     >>> tables = results("OUT/work")
-    >>> tables.pairs[["image0", "image1", "model"]].values.tolist()[0]
-    ['0.jpg', '1.jpg', 'F']
+    >>> tables.pairs[["image0", "image1", "failure"]].values.tolist()[0]
+    ['0.jpg', '1.jpg', '']
     """
     directory = Path(directory)
     with Store.read(directory) as store, undamaged(directory):

@@ -113,11 +113,9 @@ class Keys:
             [self.units[unit], image0.digest, image1.digest, *turns, *masked, *first]
         )
 
-    def of_estimate(self, pair: Pair, points: Iterable[str]) -> str:
+    def of_estimate(self, points: Iterable[str]) -> str:
         """Return the key of a pair's estimate from its points, in the recipe's order."""
-        # As bytes, because a decimal text may not name each float exactly.
-        known = [] if pair.intrinsics is None else [K.tobytes().hex() for K in pair.intrinsics]
-        return text_digest([self.estimate, *known, "points", *points])
+        return text_digest([self.estimate, *points])
 
     def of_scene(self, inputs: Sequence[Sequence[Any]]) -> str:
         """Return the key of a scene. Each input is a pair: names, digests, keys of its points and

@@ -9,7 +9,6 @@ import numpy as np
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.state import SOURCES, State
 from mkpc_kaggle.engine.store import Store
-from mkpc_kaggle.geometry.robust import ModelKind
 
 INTERVAL_S = 30.0  # between versions: a run that is killed loses at most this from its submission
 TIME_SHARE = 0.05  # maximum share of the time for writing versions, if a disk is slow
@@ -107,7 +106,6 @@ class Publication:
                     state.request.pairs[number].id,
                     pair.group,
                     *state.names[index],
-                    ModelKind.F if pair.intrinsics is None else ModelKind.E,
                     json.dumps([(key, needed) for key, needed in used]),
                     state.estimate[index].decode(),
                     np.asarray(fundamentals[number], "<f8").tobytes(),

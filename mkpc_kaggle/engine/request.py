@@ -99,14 +99,12 @@ class PairInputs:
     index: int
     images: Images
     points: Mapping[Unit, str]
-    # An E is estimated if both are known.
-    intrinsics: tuple[Matrix3, Matrix3] | None = None
     own: Matrix3 | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class EstimateJob:
-    """Estimate F of each pair, or E if the pair has intrinsics."""
+    """Estimate F of each pair."""
 
     pairs: tuple[PairInputs, ...]
     recipe: Recipe
@@ -257,9 +255,7 @@ def distinct_pairs(rows: Iterable[Pair]) -> tuple[list[Pair], NDArray[np.int_]]:
     known: dict[Any, int] = {}
     pair_of_row = []
     for pair in rows:
-        # With other intrinsics, another E is estimated.
-        intrinsics = pair.intrinsics and tuple(K.tobytes() for K in pair.intrinsics)
-        key = (pair.group, pair.file0, pair.file1, pair.turns, intrinsics)
+        key = (pair.group, pair.file0, pair.file1, pair.turns)
         if key not in known:
             known[key] = len(pairs)
             pairs.append(pair)
@@ -278,14 +274,10 @@ def name_below(root: str, file: str) -> str:
 
 
 def batches_of(pairs: Iterable[Pair]) -> dict[str, list[int]]:
-    """Return the pair indices of each batch that can be reconstructed: two or more pairs without
-    intrinsics.
-    """
+    """Return the pair indices of each batch that can be reconstructed, of two or more pairs."""
     batches: dict[str, list[int]] = {}
     for index, pair in enumerate(pairs):
-        # With known intrinsics, a pair gets an E, which no scene can replace.
-        if pair.intrinsics is None:
-            batches.setdefault(pair.group, []).append(index)
+        batches.setdefault(pair.group, []).append(index)
     return {name: members for name, members in batches.items() if len(members) >= MIN_PAIRS}
 
 

@@ -360,7 +360,7 @@ class Run:
         for pair, found in zip(job.pairs, answer, strict=True):
             state.estimating[pair.index] = False
             # Under the key of the points that the worker read, which may be older than the state's
-            key = state.request.keys.of_estimate(state.pairs[pair.index], found.points)
+            key = state.request.keys.of_estimate(found.points)
             facts = _estimate_facts(found)
             rows.append((key, json.dumps(facts)))
             state.losses[pair.index, ESTIMATE] = 0

@@ -32,8 +32,6 @@ from mkpc_kaggle.engine.store import Store
 from mkpc_kaggle.geometry.crop_need import pays
 from mkpc_kaggle.geometry.robust import (
     FALLBACK_FUNDAMENTAL,
-    MAX_THIRD,
-    MAX_THIRD_OF_E,
     are_models,
 )
 from mkpc_kaggle.scene.candidates import ALL_UNITS, best_of, candidates_of
@@ -99,9 +97,6 @@ class State:
         self.names = [names_of(pair, request.root) for pair in self.pairs]
         # Pairs with a common image are visited together, since its encodings are cached.
         self.order = np.asarray(visiting_order(self.pairs), int)
-        # An E has a third singular value of rounding alone.
-        is_f = [pair.intrinsics is None for pair in distinct]
-        self._max_third = np.where(is_f, MAX_THIRD, MAX_THIRD_OF_E)
         self._start_pairs(len(self.pairs), len(self.units))
         self._start_batches()
         for index, names in enumerate(self.names):
@@ -216,7 +211,7 @@ class State:
         sources[by_scene] = self.scene_source[rows][by_scene]
         matrices = np.where(by_scene[:, None, None], self.by_scene[rows], self.F[rows])
         # The last gate of the submission: the competition refuses a whole file for one matrix.
-        sources[~are_models(matrices, self._max_third)] = FALLBACK
+        sources[~are_models(matrices)] = FALLBACK
         matrices[sources == FALLBACK] = FALLBACK_FUNDAMENTAL
         return sources[self.pair_of_row], matrices[self.pair_of_row]
 
@@ -331,7 +326,7 @@ class State:
 
     def estimate_key(self, index: int) -> str:
         """Return the key of an estimate from the points in use."""
-        return self.request.keys.of_estimate(self.pairs[index], self.keys_in_use(index))
+        return self.request.keys.of_estimate(self.keys_in_use(index))
 
     def scene_inputs(self, batch: int) -> tuple[list[int], str]:
         """Return the pairs of a batch that have points, and the key of a scene from them."""
@@ -356,7 +351,7 @@ class State:
         numbers = np.flatnonzero(self.used[index]).tolist()
         points = {self.units[number]: self.points[index, number].decode() for number in numbers}
         own = self.F[index] if self.has_f[index] else None
-        return PairInputs(index, images, points, self.pairs[index].intrinsics, own)
+        return PairInputs(index, images, points, own)
 
     # Updates
 

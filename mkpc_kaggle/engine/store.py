@@ -40,7 +40,7 @@ TABLES = {
     "image": """name TEXT PRIMARY KEY, size INTEGER, changed INTEGER, digest TEXT, width INTEGER, height INTEGER,
         focal REAL""",
     # The rows of the version that was published last
-    "pair": """number INTEGER PRIMARY KEY, id TEXT, batch TEXT, image0 TEXT, image1 TEXT, model TEXT, points TEXT,
+    "pair": """number INTEGER PRIMARY KEY, id TEXT, batch TEXT, image0 TEXT, image1 TEXT, points TEXT,
         estimate TEXT, F BLOB, source TEXT, choice TEXT, reasons TEXT""",
     "run": "number INTEGER PRIMARY KEY, about TEXT",
 }

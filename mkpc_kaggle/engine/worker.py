@@ -29,7 +29,6 @@ from mkpc_kaggle.engine.request import (
     SceneJob,
 )
 from mkpc_kaggle.errors import UserError, shown
-from mkpc_kaggle.geometry.robust import ModelKind
 from mkpc_kaggle.matchers import failures
 from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult, with_estimate
 from mkpc_kaggle.recipe import Recipe, Unit
@@ -164,14 +163,13 @@ def do_estimates_job(job: Job) -> tuple[Estimated, ...]:
 
 
 def estimate_pair(pair: PairInputs, results: tuple[UnitResult, ...], recipe: Recipe) -> Estimated:
-    """Estimate F of a pair, or E with intrinsics, from its points of all units."""
+    """Estimate F of a pair from its points of all units."""
     start = time.perf_counter()
     # From the digested contents, so the images are not decoded again.
     sizes = tuple(image.size for image in pair.images)
     focals = tuple(image.focal for image in pair.images)
     match = PairMatch(results, sizes=sizes, focals=focals)
-    model = ModelKind.F if pair.intrinsics is None else ModelKind.E
-    found = with_estimate(match, recipe, model, pair.intrinsics).estimate
+    found = with_estimate(match, recipe).estimate
     # The inliers of each unit, by the bounds of its matches among all
     counts = [len(result.matches) for result in results]
     masks = np.split(found.inliers, np.cumsum(counts)[:-1])

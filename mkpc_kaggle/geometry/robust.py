@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from mkpc_kaggle.config import POSITIVE, Range, check_ranges
 from mkpc_kaggle.geometry.coordinates import Matrix3
@@ -31,8 +31,6 @@ from mkpc_kaggle.geometry.two_view import Vectors, sampson
 # third value of up to 4e-7 of the second; the second is at least 3e-7 of the first. A false alarm
 # would cost a pair its F, so the bounds are far from these.
 MAX_THIRD, MIN_SECOND = 0.1, 1e-12
-# OpenCV's E is of rank 2 to within 3e-3 only (tests/engine/test_estimates.py).
-MAX_THIRD_OF_E = 0.5
 # F of a pure sideways motion, [e_x]_x: finite, rank 2; the epipolar lines are the image rows.
 FALLBACK_FUNDAMENTAL: Matrix3 = np.array([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 FALLBACK_FUNDAMENTAL.setflags(write=False)
@@ -167,24 +165,20 @@ def _is_model(matrix: Any) -> bool:
     return bool(np.isfinite(matrix).all() and matrix.any())
 
 
-def is_fundamental(F: Any, max_third: float = MAX_THIRD) -> bool:
-    """Return whether F is a real (3, 3) matrix with finite numbers, of rank 2: its third singular
-    value is below ``max_third`` of the second.
-    """
+def is_fundamental(F: Any) -> bool:
+    """Return whether F is a real (3, 3) matrix with finite numbers, of rank 2."""
     if not isinstance(F, np.ndarray) or F.shape != (3, 3) or F.dtype.kind != "f":
         return False
-    return bool(are_models(F[None], max_third)[0])
+    return bool(are_models(F[None])[0])
 
 
-def are_models(
-    matrices: NDArray[np.float64], max_third: ArrayLike = MAX_THIRD
-) -> NDArray[np.bool_]:
-    """Return which of the matrices (N, 3, 3) are finite and of rank 2; ``max_third`` is one number or (N,)."""
+def are_models(matrices: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which of the matrices (N, 3, 3) are finite and of rank 2."""
     finite = np.isfinite(matrices).all((1, 2))
     known = matrices.copy()
     known[~finite] = 0
     first, second, third = np.linalg.svd(known, compute_uv=False).T
-    is_rank_2 = (second > MIN_SECOND * first) & (third < np.asarray(max_third) * second)
+    is_rank_2 = (second > MIN_SECOND * first) & (third < MAX_THIRD * second)
     return np.asarray(finite & is_rank_2)
 
 

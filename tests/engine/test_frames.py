@@ -4,7 +4,6 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 from rectified import SWEEP, RectifiedMatcher, run, write_pairs
 
@@ -12,30 +11,17 @@ from mkpc_kaggle import results
 from mkpc_kaggle.recipe import Recipe
 
 RECIPE = Recipe((SWEEP,))
-K = np.array([[90.0, 0, 39.5], [0, 90, 35.5], [0, 0, 1]])
 
 
 @pytest.fixture(scope="module")
 def work(tmp_path_factory) -> Path:
-    """A run over two pairs of folders with the same file names, one of them with intrinsics."""
+    """A run over two pairs of folders with the same file names."""
     home = tmp_path_factory.mktemp("tables")
     first, second = write_pairs(home / "left", 2)
     shutil.copytree(home / "left", home / "right")
-    moved = replace(second, file0=first.file0.replace("left", "right"), intrinsics=(K, K))
+    moved = replace(second, file0=first.file0.replace("left", "right"))
     run([first, moved], RECIPE, RectifiedMatcher(), home / "work")
     return home / "work"
-
-
-def matrix(row) -> np.ndarray:
-    return np.array([[float(row[f"f{i}{j}"]) for j in (1, 2, 3)] for i in (1, 2, 3)])
-
-
-def test_the_model_of_a_pair_says_whether_its_matrix_is_f_or_e(work):
-    pairs = results(work).pairs
-    assert pairs["model"].tolist() == ["F", "E"]
-    # The pictures are rectified, so F and E are [e_x]x of pixels and of calibrated points.
-    singular = [np.linalg.svd(matrix(row), compute_uv=False) for _, row in pairs.iterrows()]
-    np.testing.assert_allclose(singular[1] / singular[1][0], [1, 1, 0], atol=1e-6)
 
 
 def test_images_of_one_file_name_have_two_names(work):

@@ -5,7 +5,6 @@ from importlib.metadata import PackageNotFoundError
 from types import SimpleNamespace
 
 import cv2
-import numpy as np
 import pytest
 
 from mkpc_kaggle.data.competition import Pair
@@ -124,24 +123,21 @@ OTHERS = {
     "points of stage 1": ({"first": "other"}, (False, True, True, True)),
     # MAGSAC's result depends on the order of the matches.
     "order": ({"first_is_last": True}, (False, False, True, True)),
-    "intrinsics": ({"intrinsics": (np.eye(3), 2 * np.eye(3))}, (False, False, True, True)),
     "scene": ({"scene": "other"}, (False, False, False, True)),
 }
 
 
 @pytest.mark.parametrize(("other", "changed"), OTHERS.values(), ids=OTHERS)
 def test_a_key_is_the_digest_of_all_inputs_of_a_result(other, changed):
-    def chain(
-        digest="d", first="", turns=(0, 0), intrinsics=None, first_is_last=False, **settings
-    ) -> list[str]:
+    def chain(digest="d", first="", turns=(0, 0), first_is_last=False, **settings) -> list[str]:
         keys = Keys(("u", "v"), **{"mkpc": "m", "estimate": "e", "scene": "s"} | settings)
-        pair = Pair("p", "b", "0.png", "1.png", intrinsics, turns)
+        pair = Pair("p", "b", "0.png", "1.png", turns)
         first_image, second_image = IMAGES
         images = (replace(first_image, digest=digest), second_image)
         one = keys.of_points(0, pair, images, [])
         two = keys.of_points(1, pair, images, [keys.mkpc, first or one])
         points = [two, one] if first_is_last else [one, two]
-        estimate = keys.of_estimate(pair, points)
+        estimate = keys.of_estimate(points)
         return [one, two, estimate, keys.of_scene([["names", points, estimate]])]
 
     keys = zip(chain(), chain(**other), strict=True)

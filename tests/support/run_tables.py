@@ -33,7 +33,7 @@ class Described:
         seconds: float = 0.0,
         **statistics: float,
     ) -> None:
-        self.about = (name, group, *images, "F")
+        self.about = (name, group, *images)
         self.failure = failure
         self.reasons = {UNIT: error} if error else {}
         self.source, self.choice = source, choice
