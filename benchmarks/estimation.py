@@ -35,7 +35,7 @@ import numpy as np
 
 from mkpc_kaggle.config import from_table
 from mkpc_kaggle.data.competition import TrainScene, TruePair, read_train_side
-from mkpc_kaggle.engine.frames import about_run, pair_tables, points_of
+from mkpc_kaggle.engine.frames import results
 from mkpc_kaggle.engine.store import Store
 from mkpc_kaggle.evaluation.validate import Difference, error_of, paired_difference
 from mkpc_kaggle.geometry.coordinates import Matrix3, Size
@@ -43,8 +43,8 @@ from mkpc_kaggle.geometry.focal_prior import FocalConfig, FocalPrior, estimate_w
 from mkpc_kaggle.geometry.metrics import PoseError, pair_accuracy
 from mkpc_kaggle.geometry.robust import Estimate, RobustConfig, estimate, sampson_distances
 from mkpc_kaggle.geometry.two_view import robust_costs
-from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
-from mkpc_kaggle.recipe import SceneConfig, recipe_of
+from mkpc_kaggle.pipeline.pair import PairMatch
+from mkpc_kaggle.recipe import SceneConfig
 from mkpc_kaggle.scene.densify import extra_pairs
 from mkpc_kaggle.scene.sfm import reconstruct_batch
 from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair, tracks_of
@@ -202,25 +202,17 @@ def extra_of(pairs: Sequence[Known], every: Sequence[Known], config: SceneConfig
 def read_journal(directory: Path) -> tuple[str, dict[str, tuple[PairMatch, Matrix3 | None]]]:
     """Return the recipe's name, and each pair's matches and own F by pair id."""
     with Store.read(directory) as store:
-        tables = pair_tables(store.db)
-        table = about_run(store.db)["recipe"]
-        recipe = recipe_of(table, table.pop("name"))
-        units = {unit.name: unit for unit in recipe.units}
-        found = {}
-        for number, pair in enumerate(tables.pairs.to_dict("records")):
-            # A pair that was never matched, or whose image is unreadable.
-            if not pair["units"]:
-                continue
-            names = [pair["image0"], pair["image1"]]
-            sizes = {
-                n: Size(w, h) for n, w, h in store.select("image", "name, width, height", names)
-            }
-            points = points_of(store, number)
-            results = tuple(UnitResult(units[name], matches) for name, matches in points.items())
-            match = PairMatch(results, sizes=tuple(map(sizes.__getitem__, names)))
-            F = None if pair["failure"] else tables.estimates["F"][number]
-            found[pair["pair"]] = (match, F)
-    return recipe.name, found
+        query = "SELECT name, width, height FROM image"
+        sizes = {name: Size(*size) for name, *size in store.db.execute(query)}
+    tables = results(directory)
+    # Others were never matched, or have an unreadable image.
+    pairs = tables.pairs[tables.pairs["units"] > 0]
+    found = {}
+    for pair, match in zip(pairs.to_dict("records"), tables.matches(*pairs["pair"]), strict=True):
+        known = replace(match, sizes=(sizes[pair["image0"]], sizes[pair["image1"]]))
+        F = None if pair["failure"] else np.reshape(pair["own"], (3, 3))
+        found[pair["pair"]] = (known, F)
+    return tables.recipe.name, found
 
 
 @dataclass(frozen=True, eq=False)

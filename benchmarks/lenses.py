@@ -26,12 +26,11 @@ import numpy as np
 
 from benchmarks.similarity import find_similarity, model_size
 from mkpc_kaggle.data.competition import TrainScene, TruePair, read_train_side
-from mkpc_kaggle.engine.frames import pair_tables, points_of
+from mkpc_kaggle.engine.frames import results
 from mkpc_kaggle.engine.store import Store
 from mkpc_kaggle.evaluation.validate import error_of
 from mkpc_kaggle.geometry.cameras import Camera, fundamental_of_cameras
 from mkpc_kaggle.geometry.coordinates import Matrix3, Pixels, Size
-from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.metrics import pair_accuracy
 from mkpc_kaggle.recipe import CameraModel, SceneConfig
 from mkpc_kaggle.scene.models import RegisteredImage, SfmModel, models_of
@@ -116,10 +115,11 @@ def read_pairs(out: Path) -> list[BatchPair]:
             row[0]: BatchImage(Path(row[0]).stem, row[1], Size(*row[2:4]), row[4])
             for row in store.db.execute(f"SELECT {columns} FROM image")
         }
-        for number, row in enumerate(pair_tables(store.db).pairs.to_dict("records")):
-            found = Matches.concatenate(points_of(store, number).values())
-            first, second = (images[row[name]] for name in ("image0", "image1"))
-            pairs.append(BatchPair(first, second, (found,)))
+    found = results(out / "results/work")
+    for row in found.pairs.to_dict("records"):
+        (match,) = found.matches(row["pair"])
+        first, second = (images[row[name]] for name in ("image0", "image1"))
+        pairs.append(BatchPair(first, second, (match.matches,)))
     return pairs
 
 

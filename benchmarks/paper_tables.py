@@ -28,7 +28,7 @@ from benchmarks.lists import read_pairs
 from mkpc_kaggle.data.competition import TrainScene, TruePair, read_train_side
 from mkpc_kaggle.data.images import read_size
 from mkpc_kaggle.engine.budget import Budget
-from mkpc_kaggle.engine.frames import Results, by_pair, results
+from mkpc_kaggle.engine.frames import Results, results
 from mkpc_kaggle.engine.request import RunReport
 from mkpc_kaggle.engine.session import Session, interruptible, run_pairs
 from mkpc_kaggle.errors import UserError
@@ -127,7 +127,7 @@ def largest_side(recipe: Recipe) -> int:
 def scores_of_list(found: Results, scene: TrainScene, method: str, side: int) -> list[ListScore]:
     """Score the matches of a run by SuperGlue's evaluation, with an estimator."""
     names = [true.pair.id for true in scene.pairs]
-    units = by_pair(found.units)
+    units = dict(list(found.units.groupby("pair")))
     scores = []
     for true, match in zip(scene.pairs, found.matches(*names), strict=True):
         matches = match.matches

@@ -7,7 +7,7 @@ from dataclasses import asdict
 import numpy as np
 
 from mkpc_kaggle.engine.budget import Budget
-from mkpc_kaggle.engine.state import SOURCES, State
+from mkpc_kaggle.engine.state import FALLBACK, SOURCES, State
 from mkpc_kaggle.engine.store import Store
 
 INTERVAL_S = 30.0  # between versions: a run that is killed loses at most this from its submission
@@ -35,12 +35,10 @@ class Publication:
 
     def publish(self) -> None:
         """Write the results, and the rows of the pairs that have changed since the last version."""
-        # Without pairs, as in a folder of one image, no file of the request changes.
-        if not self._state.rows:
-            return
         start = self._budget.clock()
         self.save()
-        self._store.put({"pair": self._rows(), "run": [(0, json.dumps(self._about()))]})
+        about = (0, len(self._sources), json.dumps(self._about()))
+        self._store.put({"pair": self._rows(), "run": [about]})
         # The measured time decides when the last version is written.
         self._published = self._budget.clock()
         self._budget.note_write(self._published - start)
@@ -65,21 +63,15 @@ class Publication:
 
     def _about(self) -> dict[str, object]:
         state = self._state
-        scenes = {
-            batch: [scene.key for scene in state.made[number].values()]
-            for batch, number in state.batches.items()
-        }
-        return {
-            **asdict(state.request.about),
-            "units": [(unit.name, unit.stage) for unit in state.units],
-            "rows": len(state.pair_of_row),
-            # The one in use first
-            "scenes": {
-                batch: sorted(keys, key=state.scenes[batch].key.__ne__)
-                for batch, keys in scenes.items()
-                if keys
-            },
-        }
+        scenes = state.scenes
+        # The key of each batch's scene, or the reason why it has none
+        keys = [
+            (batch, scenes[batch].key, "")
+            if batch in scenes
+            else (batch, "", state.missing_scene(batch))
+            for batch in state.batches
+        ]
+        return {**asdict(state.request.about), "scenes": keys}
 
     def _rows(self) -> list[tuple[object, ...]]:
         """Return the rows of the pairs that have changed."""
@@ -91,27 +83,43 @@ class Publication:
         changed = np.zeros(len(state.pairs), bool)
         changed[state.take_dirty(moved)] = True
         scenes = state.scenes
+        pending = state.lacks_estimate
         rows: list[tuple[object, ...]] = []
         for number in np.flatnonzero(changed[state.pair_of_row]).tolist():
             index = int(state.pair_of_row[number])
             pair = state.pairs[index]
             scene = scenes.get(pair.group)
             choice = scene.choices.get(state.contents(index)) if scene is not None else None
-            both = zip(state.points[index].tolist(), state.done[index].tolist(), strict=True)
-            points = [key.decode() if done else "" for key, done in both]
-            used = zip(points, state.needed[index].tolist(), strict=True)
+            reasons = state.reasons.get(index, {})
+            # An error counts if it left the pair without an F.
+            is_lost = sources[number] == FALLBACK and not pending[index]
             rows.append(
                 (
                     number,
                     state.request.pairs[number].id,
                     pair.group,
                     *state.names[index],
-                    json.dumps([(key, needed) for key, needed in used]),
+                    json.dumps(self._units(index)),
                     state.estimate[index].decode(),
                     np.asarray(fundamentals[number], "<f8").tobytes(),
                     SOURCES[sources[number]],
                     "" if choice is None else choice.reason,
-                    json.dumps(state.reasons.get(index, {})),
+                    next(iter(reasons.values()), "") if is_lost else "",
                 )
             )
         return rows
+
+    def _units(self, index: int) -> list[tuple[str, str, bool, str]]:
+        """Return name, key, need and failure of each unit of a pair that has points, or a failure."""
+        state = self._state
+        reasons = state.reasons.get(index, {})
+        units = []
+        done = state.done[index].tolist()
+        needed = state.needed[index].tolist()
+        for number, key in enumerate(state.points[index].tolist()):
+            name = state.units[number].name
+            if done[number]:
+                units.append((name, key.decode(), needed[number], ""))
+            elif name in reasons:
+                units.append((name, "", needed[number], reasons[name]))
+        return units

@@ -15,18 +15,17 @@ from numpy.typing import NDArray
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.console import Event
 from mkpc_kaggle.engine.keys import Images, Keys
-from mkpc_kaggle.engine.records import SceneRecord
 from mkpc_kaggle.engine.store import Source
 from mkpc_kaggle.geometry.coordinates import Matrix3
 from mkpc_kaggle.geometry.intrinsics import Rows
 from mkpc_kaggle.geometry.robust import NO_STATS, EstimateStats
-from mkpc_kaggle.pipeline.pair import Regions, UnitResult
+from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
 from mkpc_kaggle.recipe import Recipe, Unit
 from mkpc_kaggle.scene.candidates import ALL_UNITS
 from mkpc_kaggle.scene.sfm import Solution
 
 if TYPE_CHECKING:
-    from mkpc_kaggle.engine.frames import PairTables
+    from mkpc_kaggle.engine.frames import Results
     from mkpc_kaggle.engine.state import State
 
 MIN_PAIRS = 2  # of a batch that is reconstructed: the minimum to connect three images
@@ -149,17 +148,6 @@ class Loaded:
 
 
 @dataclass(frozen=True, eq=False)
-class Outcome:
-    """Result of a match job on one pair. ``failure`` names an image that cannot be read, or that has changed."""
-
-    results: tuple[UnitResult, ...] = ()
-    regions: Regions | None = None
-    failure: str = ""
-    decode_seconds: float = 0.0
-    cluster_seconds: float = 0.0
-
-
-@dataclass(frozen=True, eq=False)
 class Estimated:
     """The estimate of a pair from the points with these keys; ``inliers`` has a count for each key."""
 
@@ -195,8 +183,9 @@ class Failure:
         return f"{self.cause}: {self.message}" if self.message else str(self.cause)
 
 
-# The answer to a match job or an estimate job has a value for each pair, in the order of the job.
-Answer = Loaded | tuple[Outcome, ...] | tuple[Estimated, ...] | Solution | Failure
+# The answer to a match job or an estimate job has a value for each pair, in the order of the job. A matched
+# pair has the results of its job, and no images; its ``failure`` names an unreadable or changed image.
+Answer = Loaded | tuple[PairMatch, ...] | tuple[Estimated, ...] | Solution | Failure
 
 
 # The report
@@ -221,13 +210,13 @@ class Ending(StrEnum):
 
 @dataclass(frozen=True)
 class RunReport:
-    """The outcome of a run: tables with a row for each pair, in order, and how the run ended.
+    """The outcome of a run: its tables, and how it ended.
 
     ``resumed`` is the number of pairs that earlier runs finished. ``faults`` are lost jobs and unwritten files.
     ``unwritten`` says why the last version of the results could not be written.
     """
 
-    tables: "PairTables"
+    tables: "Results"
     ending: Ending
     seconds: float
     resumed: int = 0
@@ -235,12 +224,8 @@ class RunReport:
     explanations: tuple[Event, ...] = ()  # decisions of the schedule
     unwritten: str = ""
     unsaved: str = ""  # why the journal does not have all results
-    scenes: tuple[SceneRecord, ...] = ()
     units_run: int = 0
     estimated: int = 0
-    # As About.files, and the digests of the contents of images in pairs, by name
-    files: Mapping[str, Sequence[str]] = field(default_factory=dict)
-    digests: Mapping[str, str] = field(default_factory=dict)
 
 
 # Pairs

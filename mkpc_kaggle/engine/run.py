@@ -16,12 +16,11 @@ import numpy as np
 from mkpc_kaggle.engine import budget as times
 from mkpc_kaggle.engine.budget import Budget, Costs, start_limit, time_limit
 from mkpc_kaggle.engine.console import Event, EventKind, Progress, append_event, logger
-from mkpc_kaggle.engine.frames import pair_tables
+from mkpc_kaggle.engine.frames import results_of
 from mkpc_kaggle.engine.keys import of_candidate
 from mkpc_kaggle.engine.places import Kind, Lost, Place, Site
 from mkpc_kaggle.engine.plan import Crew, MatchPlan, NextWork, is_complete, outlook, plan
 from mkpc_kaggle.engine.publish import Publication
-from mkpc_kaggle.engine.records import SceneRecord, points_row, scene_facts
 from mkpc_kaggle.engine.request import (
     Answer,
     Cause,
@@ -32,17 +31,17 @@ from mkpc_kaggle.engine.request import (
     Job,
     Loaded,
     MatchJob,
-    Outcome,
     PairInputs,
     RunReport,
     SceneJob,
 )
 from mkpc_kaggle.engine.state import DEEPEN, ESTIMATE, NEVER, PHASES, RAISED, SWEEP, State
-from mkpc_kaggle.engine.store import Store
+from mkpc_kaggle.engine.store import Store, points_row
 from mkpc_kaggle.errors import UserError, plural
-from mkpc_kaggle.pipeline.pair import UnitResult
+from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
 from mkpc_kaggle.progress import format_duration
 from mkpc_kaggle.scene.candidates import ALL_UNITS, title_of
+from mkpc_kaggle.scene.records import SceneRecord
 from mkpc_kaggle.scene.sfm import Solution
 
 # Pairs of a job of estimates. More would make the last F of a run wait for each other; single pairs, each with a
@@ -242,7 +241,7 @@ class Run:
         keys = [key for pair in inputs for key in pair.values()] if crops else []
         try:
             points = self.store.source(keys).matches(keys)
-        except (sqlite3.Error, KeyError) as error:  # a disk that fails costs the job
+        except (UserError, sqlite3.Error, KeyError) as error:  # a disk that fails costs the job
             self._lose_job(job, f"the store cannot be read: {error}")
             return
         if crops:
@@ -324,7 +323,7 @@ class Run:
         if self.store.trouble:
             self.fault(self.store.trouble)
 
-    def _save_points(self, job: MatchJob, answer: Sequence[Outcome]) -> None:
+    def _save_points(self, job: MatchJob, answer: Sequence[PairMatch]) -> None:
         state = self.state
         rows = []
         for index, outcome in zip(job.indices, answer, strict=True):
@@ -332,7 +331,6 @@ class Run:
             # An unreadable image stays unreadable in this run.
             if outcome.failure:
                 state.note_unreadable(index, outcome.failure)
-            good = [found for found in outcome.results if not found.failure]
             for found in outcome.results:
                 unit = state.number_of[found.unit.name]
                 # Failures are not stored: the next run tries them again.
@@ -344,9 +342,7 @@ class Run:
                 key = state.key(index, unit)
                 state.losses[index, unit] = 0
                 regions = (outcome.regions or ()) if found.unit.stage == 2 else ()
-                # The pair's own seconds are shared by the units of a job.
-                shared = (outcome.decode_seconds / len(good), outcome.cluster_seconds / len(good))
-                rows.append(points_row(key, found, regions, *shared))
+                rows.append(points_row(key, found, regions))
                 state.use_points(index, unit, key, len(found.matches), is_needed=found.is_needed)
                 # A unit that the pair does not need took no time.
                 if found.is_needed:
@@ -378,14 +374,14 @@ class Run:
         record = SceneRecord.of(
             job.batch,
             answer.reconstructions,
-            seconds,
+            seconds=seconds,
             choices=dict(zip(job.contents, answer.choices, strict=True)),
             candidate=job.candidate,
             # Later digits vary between processors
             disagreement=float(f"{answer.disagreement:.6g}"),
             key=job.key,
         )
-        self.store.put({"result": [(job.key, scene_facts(record))]})
+        self.store.put({"result": [(job.key, record.to_json())]})
         # The time of the loop, with the process's start: the forecast needs both.
         self.costs.observe_scene(job.matches, seconds)
         batch = self.state.batches[job.batch]
@@ -585,9 +581,8 @@ class Run:
         unsaved = self.store.flush()  # the disk may have room again
         if unsaved:
             self.fault(unsaved)
-        state = self.state
         return RunReport(
-            tables=pair_tables(self.store.db),
+            tables=results_of(self.store),
             ending=self.ending,
             seconds=self.budget.spent(),
             resumed=self.resumed,
@@ -595,11 +590,8 @@ class Run:
             explanations=tuple(self.plans),
             unwritten=self.publication.unwritten,
             unsaved=unsaved,
-            scenes=state.scene_records,
             units_run=self.units_run,
             estimated=self.estimated,
-            files=state.request.about.files,
-            digests=state.digests,
         )
 
 
@@ -612,15 +604,10 @@ def _by_tracks(candidate: str) -> str:
 
 
 def _estimate_facts(found: Estimated) -> dict[str, object]:
-    stats = found.stats
     return {
         "F": found.F.ravel().tolist(),
         "failure": found.failure,
         "magsac": None if found.magsac is None else found.magsac.ravel().tolist(),
         "inliers": dict(zip(found.points, found.inliers, strict=True)),
-        "seconds": found.seconds,
-        "cost": stats.cost,
-        "focal0": stats.focals[0],
-        "focal1": stats.focals[1],
-        "support": stats.support,
+        "support": found.stats.support,
     }

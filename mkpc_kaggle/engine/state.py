@@ -14,12 +14,6 @@ from numpy.typing import NDArray
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.keys import Images, contents_of, of_candidate
-from mkpc_kaggle.engine.records import (
-    NOT_RECONSTRUCTED,
-    SceneRecord,
-    scene_of,
-    unmatched_scene,
-)
 from mkpc_kaggle.engine.request import (
     PairInputs,
     Request,
@@ -36,6 +30,7 @@ from mkpc_kaggle.geometry.robust import (
 )
 from mkpc_kaggle.scene.candidates import ALL_UNITS, best_of, candidates_of
 from mkpc_kaggle.scene.densify import extra_pairs_of
+from mkpc_kaggle.scene.records import NO_CAMERAS, NOT_RECONSTRUCTED, SceneRecord
 from mkpc_kaggle.scene.view_graph import BatchImage
 
 Mask = NDArray[np.bool_]
@@ -237,7 +232,7 @@ class State:
         made = self.made[batch]
         named = {name: made[name].disagreement for name in self.candidates if name in made}
         best = best_of(named)
-        return made[best].against(other for name, other in made.items() if name != best)
+        return made[best]
 
     def untried(self, batch: int) -> list[str]:
         """Return the further candidates of a batch that are missing, once its first is today's; of a stale
@@ -267,21 +262,10 @@ class State:
         rows = self.rows_of(batch)
         return not (self.missing[rows].any() or self.matches[rows].any())
 
-    @property
-    def scene_records(self) -> tuple[SceneRecord, ...]:
-        """The scene of each batch, in order; ``failure`` is the reason for a missing scene."""
-        records = []
-        for batch, number in self.batches.items():
-            if self.made[number]:
-                records.append(self.scene(number))
-            elif number in self.scene_failures:
-                records.append(SceneRecord(batch, failure=self.scene_failures[number]))
-            elif self.is_unmatched(batch):
-                names = {name for index in self.rows_of(batch) for name in self.names[index]}
-                records.append(unmatched_scene(batch, names))
-            else:
-                records.append(SceneRecord(batch, failure=NOT_RECONSTRUCTED))
-        return tuple(records)
+    def missing_scene(self, batch: str) -> str:
+        """Return the reason why a batch has no scene."""
+        reason = NO_CAMERAS if self.is_unmatched(batch) else NOT_RECONSTRUCTED
+        return self.scene_failures.get(self.batches[batch], reason)
 
     @property
     def has_failures(self) -> bool:
@@ -397,7 +381,7 @@ class State:
         found = store.facts(keys.values())
         for name, key in keys.items():
             if key in found and (name == ALL_UNITS or not self.stale[batch]):
-                self.use_scene(batch, scene_of(key, found[key]), first)
+                self.use_scene(batch, SceneRecord.from_json(found[key]), first)
 
     def use_points(
         self, index: int, unit: int, key: str, matches: int, *, is_needed: bool = True

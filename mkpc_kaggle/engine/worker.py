@@ -24,7 +24,6 @@ from mkpc_kaggle.engine.request import (
     Job,
     Loaded,
     MatchJob,
-    Outcome,
     PairInputs,
     SceneJob,
 )
@@ -98,7 +97,7 @@ class MatchRunner:
         self.refused = self._pipeline.unloadable
         self._images = ImageStore()
 
-    def __call__(self, job: Job) -> tuple[Outcome, ...]:
+    def __call__(self, job: Job) -> tuple[PairMatch, ...]:
         """Match the pairs of a job with each unit that is expected to end in time."""
         assert isinstance(job, MatchJob)
         # Durations and not moments in the job: other machines have other clocks.
@@ -116,14 +115,9 @@ class MatchRunner:
         readable = [pair for pair in opened if not pair.failure]
         matched = iter(self._pipeline.match(readable, job.units, may_start))
         done = [pair if pair.failure else next(matched) for pair in opened]
+        # Without the given points, and without pixels
         return tuple(
-            Outcome(
-                pair.results[len(before) :],  # without the given points
-                pair.regions,
-                pair.failure,
-                pair.decode_seconds,
-                pair.cluster_seconds,
-            )
+            replace(pair, results=pair.results[len(before) :], images=())
             for pair, before in zip(done, given, strict=True)
         )
 
@@ -131,7 +125,6 @@ class MatchRunner:
         self, pair: Pair, digests: tuple[str, ...], given: tuple[UnitResult, ...]
     ) -> PairMatch:
         """Return a pair with its images; ``failure`` names an image that is unreadable, or has changed."""
-        start = time.perf_counter()
         images = []
         failure = ""
         for path, turns, digest in zip(pair.images, pair.turns, digests, strict=True):
@@ -143,9 +136,7 @@ class MatchRunner:
                 failure = failure or f"{shown(path)}: changed during the run"
             else:
                 images.append(image)
-        seconds = time.perf_counter() - start
-        shown_images = () if failure else tuple(images)
-        return PairMatch(given, images=shown_images, failure=failure, decode_seconds=seconds)
+        return PairMatch(given, images=() if failure else tuple(images), failure=failure)
 
 
 def estimates_runner(*, in_process: bool = True) -> Runner:

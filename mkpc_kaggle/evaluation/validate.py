@@ -10,7 +10,7 @@ from statistics import mean
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from mkpc_kaggle.data.competition import (
     TrainScene,
@@ -18,7 +18,7 @@ from mkpc_kaggle.data.competition import (
     read_rows,
     read_submission,
 )
-from mkpc_kaggle.engine.frames import PairTables, matrices_of
+from mkpc_kaggle.engine.frames import matrices_of
 from mkpc_kaggle.engine.request import RunReport
 from mkpc_kaggle.engine.session import Session, run_pairs
 from mkpc_kaggle.errors import UserError, plural
@@ -128,25 +128,26 @@ def validate(
     rows = itertools.count()  # in the order of the pairs
     scored = []
     for scene in scenes:
-        scores = [score_pair(true, report.tables, next(rows), scene, steps) for true in scene.pairs]
+        scores = [
+            score_pair(true, report.tables.pairs, next(rows), scene, steps) for true in scene.pairs
+        ]
         scored.append(SceneScore(scene.name, tuple(scores)))
     return Validation(assembly.recipe.name, tuple(scored), report, tuple(steps))
 
 
 def score_pair(
-    true: TruePair, tables: PairTables, row: int, scene: TrainScene, steps: Sequence[Step] = ()
+    true: TruePair, pairs: "DataFrame", row: int, scene: TrainScene, steps: Sequence[Step] = ()
 ) -> PairScore:
-    """Return the score of the pair in a row of the run's tables.
+    """Return the score of the pair in a row of the run's table of pairs.
 
     An F from the fallback counts as a failure.
     """
-    pair = tables.pairs.loc[row]
-    estimate = tables.estimates.loc[row]
-    own: Any = None if pair["failure"] else estimate["F"]
+    pair = pairs.loc[row]
+    own = None if pair["failure"] else pair["own"]
     # Without a prior, the pair's F is MAGSAC's.
-    matrices = {Step.MAGSAC: estimate["magsac"] if Step.PRIOR in steps else own, Step.PRIOR: own}
+    matrices = {Step.MAGSAC: pair["magsac"] if Step.PRIOR in steps else own, Step.PRIOR: own}
     # The row of the submission: the scene's F, else the pair's.
-    written = matrices_of(tables.pairs.loc[[row]])[0]
+    written = matrices_of(pairs.loc[[row]])[0]
     matrices[Step.SCENE] = None if pair["source"] == "fallback" else written
     # The last step's error is the pair's, also where a step was not made.
     errors = {step: error_of(matrix, true, scene) for step, matrix in matrices.items()}
@@ -160,11 +161,12 @@ def scored_pair(
     return PairScore(true.pair.id, images, true.covisibility, error, steps or {})
 
 
-def error_of(matrix: Matrix3 | None, true: TruePair, scene: TrainScene) -> PoseError:
+def error_of(matrix: ArrayLike | None, true: TruePair, scene: TrainScene) -> PoseError:
     """Return the error of a pair's F; infinite without one."""
     if matrix is None:
         return PoseError.failed()
-    return metrics.pose_error(matrix, true.camera0, true.camera1, scene.metres_per_unit)
+    F = np.reshape(matrix, (3, 3))
+    return metrics.pose_error(F, true.camera0, true.camera1, scene.metres_per_unit)
 
 
 def score_submission(submission: Path, truth: Path, scenes: Sequence[TrainScene]) -> Validation:

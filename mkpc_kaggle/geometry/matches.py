@@ -72,6 +72,17 @@ class Matches:
         return cls(points, points, np.zeros(0, np.float32))
 
     @classmethod
+    def from_bytes(cls, data: bytes) -> "Matches":
+        """Invert :meth:`to_bytes`."""
+        table = np.frombuffer(data, "<f4").reshape(-1, 5)
+        return cls(table[:, :2], table[:, 2:4], table[:, 4])
+
+    def to_bytes(self) -> bytes:
+        """Return the bytes of x0, y0, x1, y1 and score of each match, as little-endian float32."""
+        columns = [self.points0, self.points1, self.scores]
+        return np.column_stack(columns).astype("<f4").tobytes()
+
+    @classmethod
     def concatenate(cls, parts: Iterable["Matches"]) -> "Matches":
         """Return all parts in order, without merging or sorting."""
         parts = list(parts)

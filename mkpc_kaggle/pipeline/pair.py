@@ -72,8 +72,6 @@ class PairMatch:
         Width and height, and the focal length by EXIF, of each image, in pixels.
     failure : str
         The image that cannot be read.
-    decode_seconds, cluster_seconds : float
-        Times of reading the images and of MKPC.
     mkpc : MkpcConfig
         The settings of MKPC, for ``plot()``.
     scale : float
@@ -94,8 +92,6 @@ class PairMatch:
     sizes: tuple[Size, ...] = ()
     focals: tuple[float, ...] = ()
     failure: str = ""
-    decode_seconds: float = 0.0
-    cluster_seconds: float = 0.0
     mkpc: MkpcConfig = field(default_factory=MkpcConfig)
     scale: float = 1.0
 

@@ -422,15 +422,13 @@ def _scale_of(unit: Unit, crop: Box) -> float:
 
 def with_regions(pair: PairMatch, recipe: Recipe, crop: Unit) -> PairMatch:
     """Return the pair with each image's critical region for a unit of stage 2."""
-    start = time.perf_counter()
     found = _before(pair, recipe, crop)
     matches = Matches.concatenate(result.matches for result in found)
     image0, image1 = pair.images
     region0 = critical_region(matches.points0, image0.size, recipe.mkpc)
     region1 = critical_region(matches.points1, image1.size, recipe.mkpc)
     scale = scale_between(matches, (image0.size, image1.size))
-    seconds = pair.cluster_seconds + time.perf_counter() - start
-    return replace(pair, regions=(region0, region1), scale=scale, cluster_seconds=seconds)
+    return replace(pair, regions=(region0, region1), scale=scale)
 
 
 def _before(pair: PairMatch, recipe: Recipe, crop: Unit) -> list[UnitResult]:

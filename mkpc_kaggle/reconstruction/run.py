@@ -236,7 +236,7 @@ def _run(
             failures = [*run.state.scene_failures.values()]
             report = run.report()
         problems = [trouble(report), report.unwritten, report.unsaved, *failures]
-        has_models = any(record.models for record in report.scenes)
+        has_models = report.tables.scenes["models"].any()
         models: list[SfmModel] = []
         try:
             models = writer.next(session.must_end())

@@ -5,12 +5,12 @@ from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
 from mkpc_kaggle.engine.console import EventKind
-from mkpc_kaggle.engine.frames import NOT_REACHED, Results, scene_table
-from mkpc_kaggle.engine.records import NOT_RECONSTRUCTED
+from mkpc_kaggle.engine.frames import NOT_REACHED, Results
 from mkpc_kaggle.engine.request import Ending, RunReport
 from mkpc_kaggle.errors import plural
 from mkpc_kaggle.progress import format_duration
 from mkpc_kaggle.recipe import Recipe
+from mkpc_kaggle.scene.records import NOT_RECONSTRUCTED
 
 if TYPE_CHECKING:
     from pandas import DataFrame, Series
@@ -31,7 +31,7 @@ def summary(report: RunReport) -> str:
     """Return the summary at the end of a run, in up to 15 lines."""
     pairs = report.tables.pairs
     units = report.tables.units
-    scenes = scene_table(report.scenes, report.files, report.digests)
+    scenes = report.tables.scenes
     title = headline(report.ending, report.seconds, pairs, scenes)
     title += f"; {plural(report.units_run, 'unit')} run, {report.estimated} F estimated"
     if report.resumed:
@@ -108,9 +108,7 @@ def unit_table(units: "DataFrame") -> "DataFrame":
     """Return means of each unit, the index, in the recipe's order, over the pairs that it ran on."""
     # A unit that failed, or that a pair does not need, has no matches and no seconds.
     has_run = (units["failure"] == "") & units["is_needed"]
-    seconds = units["encode_seconds"] + units["match_seconds"]
-    ran = units.assign(seconds=seconds)[has_run]
-    by_unit = ran.groupby("unit", sort=False)
+    by_unit = units[has_run].groupby("unit", sort=False)
     means = by_unit[["matches", "inliers", "seconds"]].mean().round(2)
     means.insert(0, "pairs", by_unit.size())
     return means.rename_axis(None)

@@ -13,8 +13,7 @@ from genuine import GENUINE
 from shared import DATA, needs_data, problems_of, run_command, write_small_recipe
 
 from mkpc_kaggle.demo import DemoSet
-from mkpc_kaggle.engine.frames import pair_tables
-from mkpc_kaggle.engine.store import Store
+from mkpc_kaggle.engine.frames import results
 from mkpc_kaggle.errors import UserError
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -150,9 +149,9 @@ def test_the_light_recipe_with_genuine_weights_matches_photographs_with_aliked_a
     assert "2 of 2 pairs with an F" in done.stdout
     faults = "left out|without an F|without 1:"
     assert not re.search(faults, done.stdout + done.stderr)
-    with Store.read(tmp_path / "submission.work") as store:
-        pairs, units, *_ = pair_tables(store.db)
-    for pair in pairs["pair"]:
+    tables = results(tmp_path / "submission.work")
+    units = tables.units
+    for pair in tables.pairs["pair"]:
         # A pair that does not need the crops has none of their matches.
         is_whole = units["unit"].str.contains("1:aliked_lightglue@")
         counts = units["matches"][is_whole & (units["pair"] == pair)].tolist()

@@ -1,5 +1,6 @@
 """Candidates of a scene in whole runs: which one is used, and what the others cost."""
 
+import json
 import shutil
 import time
 from collections import Counter
@@ -16,9 +17,9 @@ from synthetic import QUICK, SyntheticMatcher, synthetic_pairs
 
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.frames import results
-from mkpc_kaggle.engine.records import Rival, SceneRecord
 from mkpc_kaggle.engine.request import Ending, RunReport, SceneJob
 from mkpc_kaggle.engine.session import Interrupt, Session, run_pairs
+from mkpc_kaggle.engine.store import Store
 from mkpc_kaggle.engine.worker import compute_scene
 from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.recipe import Recipe, SceneConfig, Unit
@@ -61,19 +62,13 @@ def made(monkeypatch: pytest.MonkeyPatch) -> list[SceneJob]:
     return jobs
 
 
-def test_the_candidate_that_agrees_best_is_used_and_the_others_are_named(tmp_path, made):
+def test_the_candidate_that_agrees_best_is_used(tmp_path, made):
     pairs = batch_pairs(tmp_path / "images")
     report = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
     assert report.ending is Ending.COMPLETE
     assert candidates(made) == [ALL_UNITS, SUPPORTED, FIRST, LAST]
     assert numbers(report) == {3.0}
-    (scene,) = report.scenes
-    assert (scene.candidate, scene.disagreement) == (FIRST, 1.0)
-    assert scene.rivals == (
-        Rival(LAST, 3.0, 4),
-        Rival(SUPPORTED, 4.0, 4),
-        Rival(ALL_UNITS, 5.0, 4),
-    )
+    assert report.tables.scenes["candidate"].tolist() == [FIRST]
     assert results(tmp_path / "work").scenes["candidate"].tolist() == [FIRST]
 
 
@@ -83,8 +78,7 @@ def test_a_candidate_is_a_result_under_its_key_and_is_not_made_twice(tmp_path, m
     del made[:]
     again = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
     assert made == []
-    assert again.scenes == first.scenes
-    assert again.scenes[0].rivals == first.scenes[0].rivals
+    assert again.tables.scenes.equals(first.tables.scenes)
     # Fewer candidates are no reason to make the first again, more make only the missing ones.
     one = replace(RECIPE, scene=SceneConfig())
     assert numbers(run(pairs, one, RectifiedMatcher(), tmp_path / "work")) == {1.0}
@@ -122,7 +116,7 @@ def test_a_candidate_that_is_lost_costs_itself_alone_and_the_next_run_tries_it_a
     assert numbers(report) == {4.0}
     fault = f"batch one was not reconstructed by the tracks of {FIRST}"
     assert any(each.startswith(fault) for each in report.faults)
-    assert not report.scenes[0].failure
+    assert report.tables.scenes["failure"].tolist() == [""]
     del made[:]
     scenes_by(monkeypatch, partial(solve, made, DISAGREEMENTS))
     again = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
@@ -144,7 +138,7 @@ def test_a_candidate_of_former_images_is_not_compared_with_others(tmp_path, made
     del made[:]
     report = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
     assert candidates(made) == [ALL_UNITS, SUPPORTED, FIRST, LAST]
-    assert len(report.scenes[0].rivals) == 3
+    assert numbers(report) == {3.0}
 
 
 def test_without_time_for_others_the_first_candidate_is_all(tmp_path, made):
@@ -167,11 +161,9 @@ def test_interrupted_and_resumed_runs_choose_as_an_undisturbed_one(until):
     store = memory_store()
     cut = simulate(scenario, store, until=until)
     resumed = simulate(scenario, store)
-    assert [scene.candidate for scene in resumed.report.scenes] == [
-        scene.candidate for scene in whole.report.scenes
-    ]
-    assert len({scene.candidate for scene in whole.report.scenes}) > 1, "a choice was made"
-    assert all(len(scene.rivals) == 3 for scene in resumed.report.scenes)
+    chosen = [ran.report.tables.scenes["candidate"].tolist() for ran in (whole, resumed)]
+    assert chosen[0] == chosen[1]
+    assert len(set(chosen[0])) > 1, "a choice was made"
     # What an interrupted process was making is made again, and nothing else.
     again = Counter(scene.batch for scene in [*cut.scenes, *resumed.scenes])
     assert sum(again.values()) <= sum(jobs.values()) + 1
@@ -194,24 +186,28 @@ def test_each_candidate_has_its_files_of_colmap_and_one_without_them_is_made_aga
     pairs = synthetic_pairs(tmp_path / "images", 4)
     scenes = tmp_path / "work" / "scenes"
 
-    def ask() -> SceneRecord:
+    def ask() -> str:
         matcher = SyntheticMatcher(images=4)
         assembly = assemble(recipe, matchers={matcher.name: matcher}, device="cpu")
         session = Session(tmp_path / "work", Budget(time.monotonic()), Interrupt(), progress=False)
-        (scene,) = run_pairs(pairs, assembly, session, scenes_dir=scenes).scenes
-        return scene
+        report = run_pairs(pairs, assembly, session, scenes_dir=scenes)
+        assert report.tables.scenes["candidate"].tolist() == [units[1].name]
+        with Store.read(tmp_path / "work") as store:
+            ((_, key, _),) = json.loads(store.db.execute("SELECT about FROM run").fetchone()[0])[
+                "scenes"
+            ]
+        return key
 
-    scene = ask()
-    assert scene.candidate == units[1].name
+    key = ask()
     assert sorted(path.name for path in scenes.iterdir()) == sorted(job.key for job in jobs)
-    folder = scenes / scene.key
+    folder = scenes / key
     assert sorted(path.name for path in folder.iterdir()) == ["database.db", "models"]
     chosen = (folder / "models" / "0" / "images.bin").read_bytes()
     # Nothing is made again while the files are there.
     del jobs[:]
-    assert ask().key == scene.key
+    assert ask() == key
     assert jobs == []
     shutil.rmtree(folder)
-    assert ask().key == scene.key
+    assert ask() == key
     assert [job.candidate for job in jobs] == [units[1].name]
     assert (folder / "models" / "0" / "images.bin").read_bytes() == chosen

@@ -27,7 +27,6 @@ from rectified import SECOND, SWEEP, THIRD, THREE_UNITS, RectifiedMatcher, matri
 from mkpc_kaggle.cli import main, options
 from mkpc_kaggle.data.competition import read_test_side, submission_problems
 from mkpc_kaggle.engine.budget import Costs
-from mkpc_kaggle.engine.frames import by_pair
 from mkpc_kaggle.engine.places import Place
 from mkpc_kaggle.engine.request import Ending, RunReport
 from mkpc_kaggle.errors import UserError
@@ -287,7 +286,8 @@ def test_a_unit_too_large_for_the_memory_is_skipped_on_that_pair_alone_and_tried
     ]
     assert [event.text for event in report.explanations if "skipped" in event.text] == told
     victim = report.tables.pairs.loc[VICTIM]
-    failures = by_pair(report.tables.units)[victim["pair"]].set_index("unit")["failure"]
+    units = report.tables.units
+    failures = units[units["pair"] == victim["pair"]].set_index("unit")["failure"]
     assert failures[SWEEP.name] == ""
     assert failures[[SECOND.name, THIRD.name]].str.startswith("out of memory").all()
     assert victim["inliers"] > 100, "it keeps the F that it has"

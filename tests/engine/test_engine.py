@@ -18,7 +18,6 @@ from rectified import (
     write_pairs,
 )
 
-from mkpc_kaggle.engine.frames import by_pair
 from mkpc_kaggle.engine.request import Ending, RunReport
 from mkpc_kaggle.engine.session import Interrupt
 from mkpc_kaggle.engine.state import State
@@ -27,7 +26,7 @@ from mkpc_kaggle.pipeline.stages import Pipeline
 
 def units(report: RunReport) -> list[list[str]]:
     """The names of the units of each pair."""
-    rows = by_pair(report.tables.units)
+    rows = dict(list(report.tables.units.groupby("pair")))
     return [rows[pair]["unit"].tolist() for pair in report.tables.pairs["pair"]]
 
 
@@ -47,14 +46,15 @@ def test_a_run_without_a_limit_gives_every_pair_every_unit(tmp_path):
     report = run(write_pairs(tmp_path, 11), THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
     assert report.ending is Ending.COMPLETE
     assert units(report) == [[SWEEP.name, SECOND.name, THIRD.name]] * 11
-    pairs, _, regions, estimates = report.tables
+    pairs = report.tables.pairs
     assert (pairs["failure"] == "").all()
     # Stage 2 sees the critical region only, so a few points at its border are lost.
     assert pairs["matches"].between(351, 450).all()
     assert (pairs["inliers"] == pairs["matches"]).all()
-    for F in estimates["F"]:
+    for own in pairs["own"]:
+        F = np.reshape(own, (3, 3))
         np.testing.assert_allclose(np.abs(F[1:, 1:]), [[0, 0.5**0.5], [0.5**0.5, 0]], atol=2e-3)
-    assert regions["pair"].tolist() == [pair for pair in pairs["pair"] for _ in range(2)]
+    assert all(match.regions for match in report.tables.matches(*pairs["pair"]))
 
 
 def test_every_published_version_is_complete_and_the_first_comes_before_any_work(tmp_path):

@@ -10,6 +10,7 @@ import sys
 import termios
 import threading
 import time
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,7 @@ from mkpc_kaggle.cli import main
 from mkpc_kaggle.data.competition import read_test_side, submission_problems
 from mkpc_kaggle.demo import DemoSet
 from mkpc_kaggle.engine import keys, session, worker
-from mkpc_kaggle.engine.frames import matrices_of, pair_tables, results
+from mkpc_kaggle.engine.frames import matrices_of, results, results_of
 from mkpc_kaggle.engine.request import Ending
 from mkpc_kaggle.engine.run import Run
 from mkpc_kaggle.engine.state import State
@@ -106,21 +107,24 @@ def test_an_error_of_the_engine_itself_leaves_the_latest_version_behind(
         run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work", publish=published.append)
     assert len(published[-1].fundamentals) == 12
     with Store.read(tmp_path / "work") as store:
-        has_units = pair_tables(store.db).pairs["units"] > 0
+        has_units = results_of(store).pairs["units"] > 0
     assert has_units.tolist() == [True, True] + [False] * 10
+
+
+def small_store(
+    pages: int, directory: Path, *, opened: Callable[..., Store] = Store.open, fresh: bool = False
+) -> Store:
+    """Open a store whose file cannot grow beyond its present size and these pages."""
+    store = opened(directory, fresh=fresh)
+    store.db.execute(f"PRAGMA main.max_page_count = {pages}")
+    return store
 
 
 def test_a_run_whose_store_is_full_keeps_its_results_in_memory(
     pairs, undisturbed, tmp_path, monkeypatch
 ):
-    prepare = Store._prepare
-
-    def small(self: Store) -> None:
-        prepare(self)
-        # SQLite then reports a full disk after a few results.
-        self.db.execute("PRAGMA max_page_count = 40")
-
-    monkeypatch.setattr(Store, "_prepare", small)
+    # SQLite then reports a full disk after a few results.
+    monkeypatch.setattr(Store, "open", partial(small_store, 40))
     report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
     assert any("is full" in fault for fault in report.faults)
     assert matrices(report) == matrices(undisturbed)
@@ -194,7 +198,7 @@ def test_results_whose_file_cannot_be_written_stay_in_the_table_for_the_next_run
     assert "No space left on device" in report.unwritten
     assert report.faults == (report.unwritten,)
     with Store.read(tmp_path / "work") as store:
-        assert pair_tables(store.db).pairs["units"].tolist() == [3] * 12
+        assert results_of(store).pairs["units"].tolist() == [3] * 12
     written: list[list[bytes]] = []
 
     def note(state: State) -> None:
@@ -462,13 +466,7 @@ def test_a_signal_that_the_parent_program_ignores_is_ignored(number):
 def test_a_full_disk_for_the_journal_alone_is_exit_status_one(
     demo, small_recipe, tmp_path, monkeypatch, capsys
 ):
-    prepare = Store._prepare
-
-    def small(self: Store) -> None:
-        prepare(self)
-        self.db.execute("PRAGMA max_page_count = 6")
-
-    monkeypatch.setattr(Store, "_prepare", small)
+    monkeypatch.setattr(Store, "open", partial(small_store, 6))
     output = tmp_path / "submission.csv"
     assert main(["submit", *arguments_of(demo, small_recipe, output), "--workers", "0"]) == 1
     said = capsys.readouterr().out

@@ -140,7 +140,7 @@ def forks(monkeypatch) -> None:
 
 
 def matrices(report: RunReport, batches: set[str], pairs: list[Pair]) -> list[bytes]:
-    own = report.tables.estimates["F"]
+    own = report.tables.pairs["own"]
     rows = zip(pairs, own, matrices_of(report.tables.pairs), strict=True)
     return [
         own.tobytes() + written.tobytes() for pair, own, written in rows if pair.group in batches

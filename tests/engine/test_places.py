@@ -10,10 +10,11 @@ from rectified import THREE_UNITS, RectifiedMatcher, run, write_pairs
 from mkpc_kaggle.engine import places
 from mkpc_kaggle.engine.places import Kind, LocalSite, Place
 from mkpc_kaggle.engine.process import ThreadWorker
-from mkpc_kaggle.engine.request import Cause, Failure, Loaded, MatchJob, Outcome
+from mkpc_kaggle.engine.request import Cause, Failure, Loaded, MatchJob
 from mkpc_kaggle.engine.worker import scene_runner
+from mkpc_kaggle.pipeline.pair import PairMatch
 
-DONE = (Outcome(failure="unreadable"),)
+DONE = (PairMatch(failure="unreadable"),)
 
 
 def job():

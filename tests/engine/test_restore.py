@@ -6,18 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from rectified import SECOND, SWEEP, THIRD
-from store_room import RECIPE, REGIONS, F, Room, matches_of, pair_of
+from store_room import CAMERA, RECIPE, REGIONS, F, Room, matches_of, pair_of
 
-from mkpc_kaggle.engine.frames import (
-    NOT_REACHED,
-    matrices_of,
-    pair_tables,
-    points_of,
-    regions_of,
-    results,
-    scenes_of,
-)
-from mkpc_kaggle.engine.records import to_bytes
+from mkpc_kaggle.engine.frames import NOT_REACHED, matrices_of, results, results_of
 from mkpc_kaggle.engine.store import Store
 from mkpc_kaggle.geometry.critical_region import When
 from mkpc_kaggle.geometry.crop_need import CropNeed
@@ -25,31 +16,31 @@ from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 
 
 def test_stored_results_are_read_after_reopening(whole: Room, tmp_path: Path) -> None:
-    before = pair_tables(whole.store.db)
-    scenes_before = scenes_of(whole.store)
+    before = results_of(whole.store)
     whole.store.close()
     with Store.open(tmp_path) as again:
-        scenes = scenes_of(again)
-        pairs, units, regions, estimates = pair_tables(again.db)
-        assert pairs["source"].tolist() == ["scene", "pair", "fallback"]
-        assert pairs["failure"].tolist() == ["", "", NOT_REACHED]
-        assert pairs["error"].tolist() == [""] * 3
-        found = units[units["pair"] == "p1"][["unit", "matches", "inliers"]].to_numpy().tolist()
-        assert found == [[SWEEP.name, 30, 7], [SECOND.name, 30, 8]]
-        assert regions_of(regions[regions["pair"] == "p0"]) == REGIONS
-        assert np.array_equal(matrices_of(pairs)[0], 3 * F)
-        assert np.array_equal(estimates["magsac"][0], 2 * F)
-        assert scenes == scenes_before
-        (model,) = scenes["one"].models
-        (known,) = scenes_before["one"].models
-        assert (model.points.tolist(), model.reprojection_error) == ([[0.0, 0.0, 5.0]], 0.7)
-        # The comparison of scenes leaves out their models.
-        for image, other in zip(model.images, known.images, strict=True):
-            assert (image.image, image.points) == (other.image, other.points)
-            for part in ("K", "R", "t"):
-                assert np.array_equal(getattr(image.camera, part), getattr(other.camera, part))
-        assert units.equals(before.units)
-        assert to_bytes(points_of(again, 0)[SWEEP.name]) == to_bytes(matches_of(0))
+        found = results_of(again)
+    pairs = found.pairs
+    assert pairs["source"].tolist() == ["scene", "pair", "fallback"]
+    assert pairs["failure"].tolist() == ["", "", NOT_REACHED]
+    assert pairs["error"].tolist() == [""] * 3
+    units = found.units[found.units["pair"] == "p1"][["unit", "matches", "inliers"]]
+    assert units.to_numpy().tolist() == [[SWEEP.name, 30, 7], [SECOND.name, 30, 8]]
+    assert np.array_equal(matrices_of(pairs)[0], 3 * F)
+    assert pairs["magsac"][0] == (2 * F).ravel().tolist()
+    assert found.units.equals(before.units)
+    assert found.scenes.equals(before.scenes)
+    assert found.scenes.loc[0, ["cameras", "reprojection_error"]].tolist() == [2, 0.7]
+    assert found.points["one", 0].tolist() == [[0.0, 0.0, 5.0]]
+    cameras = found.cameras.to_dict("records")
+    assert [camera["image"] for camera in cameras] == ["0.png", "1.png"]
+    for camera in cameras:
+        for part in ("K", "R", "t"):
+            assert np.array_equal(camera[part], getattr(CAMERA, part))
+    (match,) = found.matches("p0")
+    assert match.regions == REGIONS
+    assert np.array_equal(match.estimate.matrix, F)
+    assert match.results[0].matches.to_bytes() == matches_of(0).to_bytes()
 
 
 def test_results_are_data_frames_of_pairs_units_and_cameras(whole: Room, tmp_path: Path) -> None:
@@ -134,11 +125,11 @@ def test_reports_show_the_f_that_was_written_last_and_decide_nothing_themselves(
     # Stored, but not in the submission yet: the report must agree with the file.
     whole.match(2, SWEEP)
     whole.estimate(2)
-    pairs = pair_tables(whole.store.db).pairs
+    pairs = results_of(whole.store).pairs
     assert pairs[["source", "units"]].loc[2].tolist() == ["fallback", 0]
     assert np.array_equal(matrices_of(pairs)[2], FALLBACK_FUNDAMENTAL)
     whole.publish()
-    pairs = pair_tables(whole.store.db).pairs
+    pairs = results_of(whole.store).pairs
     assert pairs[["source", "units"]].loc[2].tolist() == ["pair", 1]
     assert np.array_equal(matrices_of(pairs)[2], F)
 
@@ -152,7 +143,7 @@ def test_rows_of_the_same_images_share_their_points_and_turned_images_are_others
     room.match(0, SWEEP)
     room.estimate(0)
     room.publish()
-    rows = pair_tables(room.store.db).pairs
+    rows = results_of(room.store).pairs
     assert rows["pair"].tolist() == ["p0", "p1", "again"]
     assert rows["source"].tolist() == ["pair", "fallback", "pair"]
     room.ask(pairs=[replace(pairs[0], turns=(1, 0))])

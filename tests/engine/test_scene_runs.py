@@ -93,7 +93,7 @@ def test_a_focal_length_of_exif_goes_to_the_pairs_the_store_and_the_scene(tmp_pa
             known = dict(store.db.execute("SELECT name, focal FROM image"))
         assert [(known[pair.file0], known[pair.file1]) for pair in pairs] == expected
         set_exif(pairs[0].images[0], tA405=28)
-    without, with_exif = (each.tables.estimates["F"] for each in reports)
+    without, with_exif = (each.tables.pairs["own"] for each in reports)
     assert not np.array_equal(without[0], with_exif[0])
     assert np.array_equal(without[2], with_exif[2]), "the pair of the other images"
     assert [pair.images[0].focal for pair in jobs[-1].pairs] == [told, told, 0]
@@ -121,7 +121,7 @@ def test_a_reconstruction_that_is_lost_costs_its_scene_alone_is_named_and_tried_
     assert sources(report) == ["pair"] * 6
     (fault,) = report.faults[1:]
     assert fault.startswith(f"batch one was not reconstructed: {reason}")
-    assert report.scenes[0].failure.startswith(reason)
+    assert report.tables.scenes["failure"][0].startswith(reason)
     assert f"1 batch without cameras ({reason}" in summary(report)
     # pycolmap prints to the descriptors, which would tear the progress bar.
     assert capfd.readouterr() == ("", "")
@@ -168,7 +168,7 @@ def test_a_death_within_pycolmap_costs_the_scene_alone_and_leaves_no_files(tmp_p
     report = run(pairs, SYNTHETIC, SyntheticMatcher(images=4), tmp_path / "work")
     assert report.ending is Ending.WITH_FAILURES
     assert sources(report) == ["pair"] * 6
-    assert report.scenes[0].failure
+    assert report.tables.scenes["failure"][0]
     assert list((tmp_path / "temporary").iterdir()) == []
 
 
@@ -199,6 +199,7 @@ def test_a_resumed_run_reconstructs_only_the_batch_whose_image_was_replaced(tmp_
     scenes_by(monkeypatch, partial(befall, lack_an_image))
     again = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
     assert sources(again) == ["pair"] * 6 + ["pair", "scene", "scene"]
-    has_failed = {scene.batch: bool(scene.failure) for scene in again.scenes}
+    failures = again.tables.scenes.set_index("batch")["failure"]
+    has_failed = (failures != "").to_dict()
     assert has_failed == {"one": True, "two": False}
     assert matrices(again) == own_matrices(pairs, tmp_path / "alone")

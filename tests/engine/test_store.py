@@ -1,6 +1,5 @@
 """The store: rows are saved all or none, a full disk costs none, readers do not block a run."""
 
-import os
 import sqlite3
 import subprocess
 import sys
@@ -13,7 +12,7 @@ import pytest
 from rectified import THREE_UNITS, RectifiedMatcher, matrices, run
 from store_room import Room
 
-from mkpc_kaggle.engine.frames import pair_tables, results
+from mkpc_kaggle.engine.frames import results, results_of
 from mkpc_kaggle.engine.request import Ending
 from mkpc_kaggle.engine.store import FILE_NAME, Store, connected
 from mkpc_kaggle.errors import UserError
@@ -46,11 +45,11 @@ def test_rows_that_a_full_disk_refuses_stay_in_memory_and_are_written_later(
         assert "full" in store.trouble
         assert len(keys_in(store)) == 200
         # A row that is written again is the one in memory.
-        store.put({"run": [(0, "first")]})
-        store.put({"run": [(0, "second")]})
+        store.put({"run": [(0, 1, "first")]})
+        store.put({"run": [(0, 1, "second")]})
         assert store.db.execute("SELECT about FROM run").fetchall() == [("second",)]
         # The worker that estimates F gets points that only memory has.
-        row: Any = ("points", 0, 0, 0.0, 0.0, 0.0, 0.0, None, None, "", "", b"")
+        row: Any = ("points", 0, 0, 0.0, None, None, "", "", b"")
         store.put({"points": [row]})
         assert len(store.source(["points"]).matches(["points"])["points"]) == 0
         # The user deletes files: the next write takes all.
@@ -105,19 +104,6 @@ def test_a_disk_without_a_free_byte_is_refused_in_one_line(tmp_path: Path) -> No
     assert last.endswith(
         f"UserError: the work directory {tmp_path} cannot be written: disk I/O error"
     )
-
-
-def test_files_in_the_place_of_the_store_or_its_lock_are_named(tmp_path: Path) -> None:
-    for name in ("journal.lock", "journal.sqlite"):
-        directory = tmp_path / f"with {name}"
-        directory.mkdir()
-        # Opening a pipe without a writer would block forever.
-        os.mkfifo(directory / name)
-        with pytest.raises(UserError, match=f"{name} is not a regular file"):
-            Store.open(directory)
-    (tmp_path / "journal.lock").write_bytes(b"not a database" * 100)
-    with pytest.raises(UserError, match=r"journal\.lock is damaged .*remove it"):
-        Store.open(tmp_path)
 
 
 def test_a_store_in_use_is_refused(tmp_path: Path) -> None:
@@ -179,13 +165,13 @@ def test_a_reader_that_has_the_file_open_neither_blocks_a_run_nor_is_blocked(
     whole.store.close()
     # A transaction, as of a backup or of a notebook
     with Store.read(tmp_path) as reader:
-        before = pair_tables(reader.db).pairs
+        before = results_of(reader).pairs
         with Store.open(tmp_path) as store:
             put(store, 1)
             assert store.flush() == ""
             with Store.read(tmp_path) as other:
                 assert keys_in(other) == {"key 1"}
-        assert pair_tables(reader.db).pairs.equals(before)
+        assert results_of(reader).pairs.equals(before)
     with Store.read(tmp_path) as again:
         assert keys_in(again) == {"key 1"}
     # Nor does a reader leave files of SQLite's behind.

@@ -89,8 +89,8 @@ def test_a_failed_pair_counts_as_failed_even_where_the_fallback_happens_to_be_ri
         Described("p", failure="too few matches"),
         Described("p", source="pair"),
     )
-    failed = score_pair(true, tables, 0, scene, [Step.MAGSAC])
-    right = score_pair(true, tables, 1, scene)
+    failed = score_pair(true, tables.pairs, 0, scene, [Step.MAGSAC])
+    right = score_pair(true, tables.pairs, 1, scene)
     assert SceneScore("s", (right, failed, right)).maa() == pytest.approx(2 / 3)
     assert failed.error.rotation == failed.steps[Step.MAGSAC].rotation == np.inf
     assert right.error.angle < 1e-6

@@ -11,8 +11,7 @@ from shared import problems_of, run_command
 from standin import narrow_roma, scene
 
 from mkpc_kaggle.data.competition import read_submission
-from mkpc_kaggle.engine.frames import pair_tables
-from mkpc_kaggle.engine.store import Store
+from mkpc_kaggle.engine.frames import results
 from mkpc_kaggle.matchers.adapters import roma
 
 # The sizes of the units of stages 1 and 2, which fit no network's multiple.
@@ -80,10 +79,9 @@ def test_odd_small_and_blank_pictures_are_matched_without_an_error(
     for F in read_submission(output).values():
         strengths = np.linalg.svd(F, compute_uv=False)
         assert strengths[2] < 1e-6 * strengths[0] < 1e6 * strengths[1]
-    with Store.read(tmp_path / "out.work") as store:
-        pairs, units, *_ = pair_tables(store.db)
-    number = {pair: index for index, pair in enumerate(pairs["pair"])}
-    found = {(number[unit.pair], unit.stage): unit for unit in units.itertuples()}
+    tables = results(tmp_path / "out.work")
+    number = {pair: index for index, pair in enumerate(tables.pairs["pair"])}
+    found = {(number[unit.pair], int(unit.unit[0])): unit for unit in tables.units.itertuples()}
     assert found.keys() == {(pair, stage) for pair in range(3) for stage in (1, 2)}
     assert {unit.failure for unit in found.values()} == {""}
     assert found[0, 1].matches >= 8

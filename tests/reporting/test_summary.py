@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,13 +10,13 @@ from rectified import THREE_UNITS, RectifiedMatcher, run, write_pairs
 from run_tables import UNIT, Described, tables_of
 from shared import run_command
 
-from mkpc_kaggle.engine.records import NOT_RECONSTRUCTED, SceneRecord
 from mkpc_kaggle.engine.request import Ending, RunReport
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.recipe import load_recipe
 from mkpc_kaggle.reporting.summary import left_out_line, summary, trouble, unit_table
-from mkpc_kaggle.scene.models import RegisteredImage, SfmModel
+from mkpc_kaggle.scene.models import Reconstruction, RegisteredImage, SfmModel
+from mkpc_kaggle.scene.records import NOT_RECONSTRUCTED, SceneRecord
 from mkpc_kaggle.scene.view_graph import BatchImage
 
 # As a run leaves a pair that it had no time for
@@ -26,11 +27,17 @@ def scene(*names: str, **fields: object) -> SceneRecord:
     pose = Camera(np.eye(3), np.eye(3), np.zeros(3))
     images = [RegisteredImage(BatchImage(name, name, Size(80, 60)), pose, 50) for name in names]
     models = (SfmModel(tuple(images), np.zeros((0, 3)), 0.5),) if names else ()
-    return replace(SceneRecord("batch", models=models), **fields)
+    record = SceneRecord.of("batch", [Reconstruction(names, models)], key="scene of batch")
+    return replace(record, **fields)
 
 
-def report(ending: Ending, *pairs: Described, **fields: object) -> RunReport:
-    return RunReport(tables_of(*pairs), ending, 60.0, **fields)
+def report(
+    ending: Ending,
+    *pairs: Described,
+    faults: tuple[str, ...] = (),
+    **more: Any,
+) -> RunReport:
+    return RunReport(tables_of(*pairs, **more), ending, 60.0, faults=faults)
 
 
 def test_sources_of_f_are_counted():
@@ -50,7 +57,7 @@ def test_the_means_of_a_unit_leave_out_the_pairs_on_which_it_failed():
 
 
 def test_an_interrupted_run_says_how_to_continue_and_lists_no_failures():
-    pending = scene(failure=NOT_RECONSTRUCTED)
+    pending = scene(failure=NOT_RECONSTRUCTED, key="")
     text = summary(report(Ending.INTERRUPTED, UNREACHED, UNREACHED, scenes=(pending,)))
     assert text.endswith("2 pairs left; 1 batch left; run the same command to continue")
     assert "not reached" not in text
@@ -60,7 +67,8 @@ def test_an_interrupted_run_says_how_to_continue_and_lists_no_failures():
 def test_images_of_a_folder_without_a_camera_are_named():
     files = {"batch": ["a", "copy of a", "b", "c", "d", "e"]}
     digests = {"a": "a", "copy of a": "a", "b": "b"}
-    found = report(Ending.COMPLETE, scenes=(scene("a"),), files=files, digests=digests)
+    pairs = [Described(images=("a", "copy of a")), Described(images=("a", "b"))]
+    found = report(Ending.COMPLETE, *pairs, scenes=(scene("a"),), files=files, digests=digests)
     text = summary(found)
     # Identical files share a camera.
     assert "2 of 6 images with a camera" in text
@@ -69,7 +77,9 @@ def test_images_of_a_folder_without_a_camera_are_named():
 
 def test_a_summary_with_all_kinds_of_failures_is_one_screen():
     pairs = [Described(error=f"error {number}") for number in range(30)]
-    scenes = tuple(replace(scene("a", "b", "c"), batch=f"batch {n}") for n in range(30))
+    scenes = tuple(
+        replace(scene("a", "b", "c"), batch=f"batch {n}", key=f"scene {n}") for n in range(30)
+    )
     text = summary(report(Ending.COMPLETE, *pairs, scenes=scenes, faults=("x", "y", "z")))
     lines = text.splitlines()
     assert len(lines) <= 13  # and then the submission and the page

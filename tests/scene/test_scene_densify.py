@@ -75,4 +75,4 @@ def test_a_sparse_batch_has_a_scene_by_pairs_that_no_row_names(tmp_path):
     assert set(published) == {5}
     assert len(results(work).pairs) == 5
     again = run(asked, recipe, SyntheticMatcher(), work)
-    assert again.scenes == report.scenes
+    assert again.tables.scenes.equals(report.tables.scenes)

@@ -23,7 +23,6 @@ from mkpc_kaggle.engine.process import ThreadWorker
 from mkpc_kaggle.engine.request import SceneJob
 from mkpc_kaggle.engine.worker import MatchRunner, compute_scene
 from mkpc_kaggle.geometry.cameras import Camera
-from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import Picture
 from mkpc_kaggle.pipeline.assembly import Assembly
@@ -31,7 +30,6 @@ from mkpc_kaggle.pipeline.stages import Pipeline
 from mkpc_kaggle.scene.choose import Choice, Reason
 from mkpc_kaggle.scene.models import Reconstruction, RegisteredImage, SfmModel
 from mkpc_kaggle.scene.sfm import Solution
-from mkpc_kaggle.scene.view_graph import BatchImage
 
 BROKEN = "CUDA error: an illegal memory access was encountered"
 ASSERTED = "CUDA error: device-side assert triggered"
@@ -178,10 +176,10 @@ def choose_scene_for_all_but_the_first(job: SceneJob) -> Solution:
     """Answer as a reconstruction would, with one point for each match."""
     by_scene = (Choice(SCENE_F, Reason.SCENE),) * (len(job.pairs) - 1)
     choices = (Choice(None, Reason.CONTRADICTION), *by_scene)
-    names = tuple(sorted({image.name for pair in job.pairs for image in pair.images}))
+    images = {image.name: image for pair in job.pairs for image in pair.images}
+    names = tuple(sorted(images))
     camera = Camera(np.eye(3), np.eye(3), np.zeros(3))
-    images = (BatchImage(name, name, Size(80, 72)) for name in names)
-    registered = tuple(RegisteredImage(each, camera, 99) for each in images)
+    registered = tuple(RegisteredImage(images[name], camera, 99) for name in names)
     points = np.zeros((job.matches, 3))
     return Solution((Reconstruction(names, (SfmModel(registered, points, 0.5),)),), choices)
 

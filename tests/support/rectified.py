@@ -139,7 +139,7 @@ def run(
 
 def matrices(report: RunReport) -> list[bytes]:
     """The bytes of each pair's own F."""
-    return [F.tobytes() for F in report.tables.estimates["F"]]
+    return [np.array(F).tobytes() for F in report.tables.pairs["own"]]
 
 
 def sources(report: RunReport) -> list[str]:

@@ -1,13 +1,18 @@
 """Tables of a run whose pairs a test describes, made as those of a real run."""
 
 import json
+from collections.abc import Mapping, Sequence
 from contextlib import closing
+from dataclasses import asdict
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
-from mkpc_kaggle.engine.frames import PairTables, pair_tables
+from mkpc_kaggle.engine.frames import Results, results_of
+from mkpc_kaggle.engine.request import About
 from mkpc_kaggle.engine.store import Store
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
+from mkpc_kaggle.scene.records import SceneRecord
 
 UNIT = "1:sift@640"
 
@@ -35,7 +40,7 @@ class Described:
     ) -> None:
         self.about = (name, group, *images)
         self.failure = failure
-        self.reasons = {UNIT: error} if error else {}
+        self.error = error
         self.source, self.choice = source, choice
         self.matches, self.inliers, self.seconds = matches, inliers, seconds
         self.statistics = statistics
@@ -46,21 +51,34 @@ class Described:
         F = FALLBACK_FUNDAMENTAL
         facts = {"F": F.ravel().tolist(), "failure": self.failure, "inliers": {key: self.inliers}}
         estimate = "" if self.failure is None else f"estimate {number}"
-        points = (key, self.matches, 0, 0.0, 0.0, self.seconds, 0.0, None, None, "", "", b"")
-        pair = (json.dumps([[key, True]]), estimate, F.tobytes(), self.source, self.choice)
+        points = (key, self.matches, 0, self.seconds, None, None, "", "", b"")
+        has_run = bool(key or self.error)
+        units = json.dumps([[UNIT, key, True, self.error]] if has_run else [])
+        error = self.error if self.source == "fallback" else ""
+        pair = (units, estimate, F.tobytes(), self.source, self.choice, error)
         return {
             "points": [points] if key else [],
             "result": [(estimate, json.dumps(facts | self.statistics))] if estimate else [],
-            "pair": [(number, *self.about, *pair, json.dumps(self.reasons))],
+            "pair": [(number, *self.about, *pair)],
         }
 
 
-def tables_of(*described: Described) -> PairTables:
-    """Return the tables of these pairs."""
+def tables_of(
+    *described: Described,
+    scenes: Sequence[SceneRecord] = (),
+    files: Mapping[str, Sequence[str]] = MappingProxyType({}),
+    digests: Mapping[str, str] = MappingProxyType({}),
+) -> Results:
+    """Return the tables of these pairs and scenes; ``digests`` are of images by name."""
     store = Store.in_memory(Path())
     with closing(store.db):
         for number, each in enumerate(described):
             store.put(each.rows(number))
-        about = {"units": [(UNIT, 1)], "rows": len(described)}
-        store.put({"run": [(0, json.dumps(about))]})
-        return pair_tables(store.db)
+        images = [(name, 0, 0, content, 80, 60, 0.0) for name, content in digests.items()]
+        store.put(
+            {"image": images, "result": [(each.key, each.to_json()) for each in scenes if each.key]}
+        )
+        about = asdict(About({"name": "x"}, files=dict(files)))
+        about["scenes"] = [(each.batch, each.key, each.failure) for each in scenes]
+        store.put({"run": [(0, len(described), json.dumps(about))]})
+        return results_of(store)

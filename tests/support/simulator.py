@@ -20,7 +20,6 @@ import numpy as np
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine import budget, plan
 from mkpc_kaggle.engine.budget import MAX_SILENCE_S, SCENE_MARGIN, SCENE_START_S, Budget
-from mkpc_kaggle.engine.frames import PairTables
 from mkpc_kaggle.engine.keys import Keys
 from mkpc_kaggle.engine.places import Kind, Place, Site
 from mkpc_kaggle.engine.plan import RESERVE_SHARE
@@ -33,7 +32,6 @@ from mkpc_kaggle.engine.request import (
     Job,
     Loaded,
     MatchJob,
-    Outcome,
     Request,
     RunReport,
     SceneJob,
@@ -45,7 +43,7 @@ from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.geometry.crop_need import CropNeed
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
-from mkpc_kaggle.pipeline.pair import UnitResult
+from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
 from mkpc_kaggle.recipe import Recipe, SceneConfig, Unit
 from mkpc_kaggle.scene.choose import Choice, Reason
 from mkpc_kaggle.scene.sfm import Solution
@@ -392,7 +390,7 @@ class SimulatedSite(Site):
                 spent += took
                 rows.append(UnitResult(unit, POINTS, 0.0, took, warm_up=unit.name not in warm))
                 warm.add(unit.name)
-        return spent, tuple(map(Outcome, map(tuple, found))), stalled
+        return spent, tuple(map(PairMatch, map(tuple, found))), stalled
 
     def estimate(self, job: EstimateJob) -> Drawn:
         """Draw an answer: each pair has from 20 to 79 inliers by its number."""
@@ -607,5 +605,6 @@ def sweep_seconds(scenario: Scenario) -> float:
 
 def without_tables(ran: Ran) -> Ran:
     """Return the run without its tables: a thousand runs with theirs would fill the memory."""
-    nothing = PairTables(*(table.iloc[:0] for table in ran.report.tables))
+    tables = ran.report.tables
+    nothing = replace(tables, pairs=tables.pairs[:0], units=tables.units[:0])
     return replace(ran, report=replace(ran.report, tables=nothing), scenes=(), keys=[])

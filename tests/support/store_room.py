@@ -15,7 +15,6 @@ from mkpc_kaggle.engine.request import (
     Estimated,
     EstimateJob,
     MatchJob,
-    Outcome,
     Request,
     SceneJob,
 )
@@ -27,7 +26,7 @@ from mkpc_kaggle.geometry.coordinates import Box, Size
 from mkpc_kaggle.geometry.critical_region import CriticalRegion, RegionReason
 from mkpc_kaggle.geometry.crop_need import CropNeed
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.pipeline.pair import UnitResult
+from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
 from mkpc_kaggle.recipe import Recipe, SceneConfig, Unit
 from mkpc_kaggle.scene.choose import Choice, Reason
 from mkpc_kaggle.scene.models import Reconstruction, RegisteredImage, SfmModel
@@ -69,7 +68,7 @@ def state_of(
         name: BatchImage(name, (contents or {}).get(name, name), Size(80, 60), 99.0)
         for name in names
     }
-    about = About({"name": "x", "scene": recipe.scene and {}})
+    about = About({**recipe.table(), "name": "x"})
     return State(Request(pairs, recipe, keys_of(recipe, **other), about=about), images, {})
 
 
@@ -89,6 +88,10 @@ class Room:
     ) -> None:
         """Begin a run, as a session does. ``other`` are other settings."""
         self.state = state_of(recipe, pairs, contents, **other)
+        facts = [
+            (image.name, 0, 0, image.digest, 80, 60, 0.0) for image in self.state.images.values()
+        ]
+        self.store.put({"image": facts})
         self.state.restore(self.store)
         budget = Budget(0.0)
         site = Site(budget.clock)
@@ -102,7 +105,7 @@ class Room:
             for unit in units
         )
         job = MatchJob([index], units, [0.0] * len(units), 0.0, [self.state.pairs[index]], [])
-        self.run.save(job, (Outcome(found, REGIONS, "", 0.1, 0.2),), 0.5)
+        self.run.save(job, (PairMatch(found, REGIONS),), 0.5)
 
     def estimate(self, index: int) -> None:
         inputs = self.state.inputs_of(index)
