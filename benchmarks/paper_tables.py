@@ -29,7 +29,6 @@ from mkpc_kaggle.data.competition import TrainScene, TruePair, read_train_side
 from mkpc_kaggle.data.images import read_size
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.frames import Results, results
-from mkpc_kaggle.engine.request import RunReport
 from mkpc_kaggle.engine.session import Session, interruptible, run_pairs
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.evaluation.validate import validate
@@ -214,7 +213,7 @@ def table(name: str, given: argparse.Namespace) -> Iterator[str]:
         both = zip(compared, published, strict=True)
         differences.append([own - other for own, other in both])
         figures = [str(figure) for figure in published]
-        yield row_of([row, method, *cells, *figures, str(report.units_run)])
+        yield row_of([row, method, *cells, *figures, str(report.about.units_run)])
     means = [f"{mean(column):+.4f}" for column in zip(*differences, strict=True)]
     # Below the published figures.
     empty = [""] * (len(heads) - len(means))
@@ -238,7 +237,7 @@ def run(
     method: str,
     scenes: tuple[TrainScene, ...],
     given: argparse.Namespace,
-) -> tuple[RunReport, list[float], list[str]]:
+) -> tuple[Results, list[float], list[str]]:
     """Run a row's recipe. Return its report, the compared figures, and all figures as text.
 
     Raise ``KeyboardInterrupt`` if it was interrupted: the engine ends an interrupted run in order, with

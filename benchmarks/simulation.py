@@ -1,51 +1,21 @@
 """The engine's use of time in random simulated runs.
 
-Statistics of many runs:
-
-    python -m benchmarks.simulation [--scenarios 1000] [--seed 0] [--pairs 10000] [--without MECHANISM]
-
-The timeline of one run; the costs are the seconds of each unit on a pair:
-
-    python -m benchmarks.simulation --costs 0.6 0.4 0.35 [--batches 15] [--pairs 10000] [--scene-seconds 0.15]
-        [--limit 8h45m] [--workers 1] [--candidates 1]
-        [--crops 0.1]
+python -m benchmarks.simulation [--scenarios 1000] [--seed 0] [--pairs 10000] [--without MECHANISM]
 """
 
 import argparse
 import math
-from collections import Counter
 
 import numpy as np
 
-from mkpc_kaggle.engine.budget import parse_duration
-from mkpc_kaggle.progress import format_duration
 from tests.support.simulator import (
     MECHANISMS,
     Ran,
-    Scenario,
     random_scenario,
     simulate,
     switch_off,
     without_tables,
 )
-
-
-def timeline(scenario: Scenario) -> None:
-    """Print the start times of the phases of a run, and the scenes of its batches."""
-    ran = simulate(scenario)
-    for explanation in ran.report.explanations:
-        print(explanation)
-    for scene in ran.scenes:
-        begun, ended = map(format_duration, (scene.begun, scene.begun + scene.seconds))
-        print(f"{begun:>7}  batch {scene.batch} is reconstructed until {ended}")
-    units = Counter(ran.report.tables.pairs["units"])
-    had = ", ".join(f"{pairs} pairs with {count} units" for count, pairs in sorted(units.items()))
-    print(
-        f"{format_duration(ran.report.seconds):>7}  {ran.report.ending}: {had}; {ran.missed} scenes missed"
-    )
-    print(
-        f"workers busy: {ran.utilisation:.4f} of their time; late: {ran.late:.0f} s; rows lost: {ran.lost}"
-    )
 
 
 def summary(runs: list[Ran]) -> None:
@@ -58,7 +28,7 @@ def summary(runs: list[Ran]) -> None:
     wrongly = sum(len(run.wrongly_closed) for run in runs)
     pairs = sum(len(run.scenario.fates) for run in runs)
     print(f"bad pairs: {pairs}; bad places: {bad}; places closed: {closed}, good ones: {wrongly}")
-    print(f"units run: {sum(run.report.units_run for run in runs)}")
+    print(f"units run: {sum(run.report.about.units_run for run in runs)}")
     fit = [run for run in runs if run.scenario.batches and run.scenes_fit]
     batches = sum(run.scenario.batches for run in fit)
     missed = sum(run.missed for run in fit)
@@ -87,35 +57,9 @@ def main() -> None:
     parser.add_argument(
         "--without", choices=MECHANISMS, action="append", default=[], help="may be repeated"
     )
-    parser.add_argument("--costs", type=float, nargs="+")
-    parser.add_argument("--batches", type=int, default=15)
-    parser.add_argument(
-        "--scene-seconds", type=float, default=Scenario.scene_seconds, help="for each pair"
-    )
-    parser.add_argument("--limit", type=parse_duration, default=parse_duration("8h45m"))
-    parser.add_argument("--workers", type=int, default=1)
-    parser.add_argument("--candidates", type=int, default=1, help="of a scene")
-    parser.add_argument(
-        "--crops", type=float, default=1.0, metavar="SHARE", help="of the pairs need the last unit"
-    )
     arguments = parser.parse_args()
     for name in arguments.without:
         switch_off(name)
-    if arguments.costs is not None:
-        timeline(
-            Scenario(
-                arguments.pairs,
-                tuple(arguments.costs),
-                arguments.workers,
-                arguments.limit,
-                batches=arguments.batches,
-                scene_seconds=arguments.scene_seconds,
-                candidates=arguments.candidates,
-                crop_share=arguments.crops,
-                seed=arguments.seed,
-            )
-        )
-        return
     seeds = range(arguments.seed, arguments.seed + arguments.scenarios)
     summary([without_tables(simulate(random_scenario(seed, arguments.pairs))) for seed in seeds])
 

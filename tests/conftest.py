@@ -15,7 +15,7 @@ from shared import write_small_recipe
 from mkpc_kaggle import package
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.demo import DemoSet, write_demo
-from mkpc_kaggle.engine.request import RunReport
+from mkpc_kaggle.engine.frames import Results
 from mkpc_kaggle.weights import store as weight_store
 
 # Before torch is imported, here and in the processes of the tests: their tensors are small, and on
@@ -78,7 +78,7 @@ def pairs(tmp_path_factory: pytest.TempPathFactory) -> "list[Pair]":
 
 
 @pytest.fixture(scope="session")
-def undisturbed(pairs: "list[Pair]", tmp_path_factory: pytest.TempPathFactory) -> "RunReport":
+def undisturbed(pairs: "list[Pair]", tmp_path_factory: pytest.TempPathFactory) -> "Results":
     """A run over these pairs in which nothing goes wrong."""
     from rectified import THREE_UNITS, RectifiedMatcher, run
 

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 
 from mkpc_kaggle.engine.frames import results
-from mkpc_kaggle.reporting.summary import overview
+from mkpc_kaggle.reporting.summary import summary
 
 HELP = """\
 Show how far a run is, also while it is running. DIR is the run's work directory, NAME.work next to
@@ -19,4 +19,4 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    print(overview(results(arguments.work_dir)))  # refuses a directory without a run
+    print(summary(results(arguments.work_dir)))  # refuses a directory without a run

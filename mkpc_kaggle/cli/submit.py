@@ -67,10 +67,8 @@ def run(arguments: argparse.Namespace) -> int:
         pairs = read_test_side(arguments.test_dir)
         # The first version precedes the watchdog: a run that starts after its limit must leave a
         # complete file.
-        with (
-            first_version(pairs, output),
-            options.watched_session(arguments, work_dir, interrupt) as session,
-        ):
+        first_version(pairs, output)
+        with options.watched_session(arguments, work_dir, interrupt) as session:
             assembly = options.assembly_of(arguments, interrupt)
             recipe = assembly.recipe
             about = f"{plural(len(pairs), 'pair')}, recipe {recipe.name}, {assembly.placement}"
@@ -82,8 +80,14 @@ def run(arguments: argparse.Namespace) -> int:
             logger.info("\n".join(filter(None, lines)))
             _, images = test_side(arguments.test_dir)
             report = submit(pairs, assembly, session, output, str(images))
-            session.status = int(bool(report.unwritten or report.unsaved or trouble(report)))
-            unwritten = f" is not the last version: {report.unwritten}" if report.unwritten else ""
+            session.status = int(
+                bool(report.about.unwritten or report.about.unsaved or trouble(report))
+            )
+            unwritten = (
+                f" is not the last version: {report.about.unwritten}"
+                if report.about.unwritten
+                else ""
+            )
             # A file that could not be replaced is an earlier version; it is complete, too.
             # Before the report: drawing may exceed the time limit.
             logger.info(f"{summary(report)}\nsubmission: {output}{unwritten}")

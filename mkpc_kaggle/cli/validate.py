@@ -110,5 +110,5 @@ def _run_recipe(
         *score_table(validation),
     ]
     logger.info("\n".join(filter(None, lines)))
-    session.status = int(bool(trouble(report) or report.unsaved))
+    session.status = int(bool(trouble(report) or report.about.unsaved))
     return validation

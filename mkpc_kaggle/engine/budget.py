@@ -29,9 +29,6 @@ MAX_WRITE_SHARE = 0.05  # maximum share of the limit for the forecast of a write
 MAX_SILENCE_S, MIN_SILENCE_S, SILENCE_SHARE = 60.0, 5.0, 0.02
 # Number of the latest measurements in the mean: costs drift when a GPU heats up or a disk is shared.
 WINDOW = 64
-# Number of the latest measurements that state the machine's pace. A forecast of all pairs needs the
-# longer window; a sudden change would take minutes to show in it.
-PACE_WINDOW = 16
 # Margin of a forecast from one measurement, sqrt(n) times smaller from n measurements.
 MARGIN, MIN_MARGIN = 0.4, 0.01
 SCENE_START_S = 3.0  # start-up time of a scene's process
@@ -151,10 +148,9 @@ class Costs:
         # the plan.
         self._means: dict[str, float] = {}
         self._warm_up: dict[str, float] = {}
-        # Of this run's scenes, without their starts, at the pace of the latest one
+        # Of this run's scenes, without their starts
         self._scene_seconds = 0.0
         self._scene_matches = 0
-        self._scene_paces: dict[str, float] = {}  # of units, when the latest scene was measured
 
     def observe(self, unit: str, seconds: float, *, warm_up: bool = False) -> None:
         if warm_up:
@@ -185,20 +181,8 @@ class Costs:
         return self.mean(unit) * (1 + margin)
 
     def observe_scene(self, matches: int, seconds: float) -> None:
-        former = self._slowdown() * self._scene_seconds
-        self._scene_seconds = former + max(0.0, seconds - SCENE_START_S)
+        self._scene_seconds += max(0.0, seconds - SCENE_START_S)
         self._scene_matches += matches
-        self._scene_paces = {unit: self._pace(unit) for unit in self._measured}
-
-    def _pace(self, unit: str) -> float:
-        """Return the mean of a unit's latest few measurements."""
-        return fmean(list(self._measured[unit])[-PACE_WINDOW:])
-
-    def _slowdown(self) -> float:
-        """Return how many times as long units take as when the latest scene was measured."""
-        then = sum(self._scene_paces.values())
-        now = sum(self._pace(unit) for unit in self._scene_paces)
-        return now / then if then else 1.0
 
     def scenes(self, matches: NDArray[np.int_]) -> NDArray[np.float64]:
         """Return the expected seconds of scenes with these numbers of matches, each alone."""
@@ -206,10 +190,7 @@ class Costs:
         rate = SCENE_MATCH_S
         if self._scene_matches:
             rate = self._scene_seconds / self._scene_matches
-        # Scenes are few, units are many: a machine that became slow for units is slow for scenes. Units
-        # also become faster, by encodings that are cached, which scenes do not use.
-        slowdown = max(1.0, self._slowdown())
-        return np.asarray(slowdown * (SCENE_START_S + matches * SCENE_MARGIN * rate))
+        return np.asarray(SCENE_START_S + matches * SCENE_MARGIN * rate)
 
     def scene(self, matches: int) -> float:
         """Return the expected seconds of a scene with this number of matches."""

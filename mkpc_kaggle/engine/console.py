@@ -1,4 +1,4 @@
-"""Messages by logging: lines for the user, the progress of a run, and the events in its ``run.log``.
+"""Messages by logging: lines for the user, the progress of a run, and its log file.
 
 A terminal without a reader (Ctrl-S) blocks a write forever. So a run prints from a bounded queue
 (:func:`queued`): a blocked terminal costs lines, and not the run.
@@ -12,13 +12,11 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from enum import StrEnum
 from logging.handlers import QueueHandler, QueueListener
 from math import inf, isfinite
 from pathlib import Path
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NoReturn
 
-from mkpc_kaggle.errors import printable
 from mkpc_kaggle.progress import LINE_INTERVAL_S, REDRAW_S, format_duration, is_terminal, print_to
 
 LOG_NAME = "run.log"  # in the work directory
@@ -30,6 +28,9 @@ class Console(logging.Handler):
     """Print records: warnings and errors on stderr after their level, a state of the progress on stderr as
     it is, others on stdout.
     """
+
+    def __init__(self) -> None:
+        super().__init__(logging.INFO)
 
     def emit(self, record: logging.LogRecord) -> None:
         # Looked up for each record, because notebooks and tests replace streams.
@@ -48,15 +49,28 @@ class Dropping(QueueHandler):
     def __init__(self) -> None:
         self.waiting: queue.Queue[Any] = queue.Queue(MAX_WAITING)
         super().__init__(self.waiting)
+        self.setLevel(logging.INFO)
 
     def enqueue(self, record: logging.LogRecord) -> None:
         with suppress(queue.Full):
             self.waiting.put_nowait(record)
 
 
+class LogFile(logging.FileHandler):
+    """A file of all records with their times, also of those of level DEBUG, which are for it alone."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path, encoding="utf-8", errors="backslashreplace")
+        self.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+        self.addFilter(lambda record: not hasattr(record, "progress"))
+
+    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802
+        """Lose the line: the disk is full."""
+
+
 # The messages of the package; a program may give this logger other handlers.
 logger = logging.getLogger("mkpc_kaggle")
-logger.setLevel(logging.INFO)
+logger.setLevel(logging.DEBUG)
 logger.propagate = False
 logger.addHandler(Console())
 
@@ -76,6 +90,23 @@ def queued() -> Iterator[None]:
         if drain():
             listener.stop()
         logger.handlers = handlers
+
+
+@contextmanager
+def logged(path: Path) -> Iterator[None]:
+    """Append the messages to a log file, if it can be written."""
+    try:
+        handler = LogFile(path)
+    except OSError:
+        yield
+        return
+    logger.addHandler(handler)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+        with suppress(OSError):  # a full disk
+            handler.close()
 
 
 def drain(seconds: float = DRAIN_S) -> bool:
@@ -101,8 +132,8 @@ def leave(status: int, seconds: float = DRAIN_S) -> NoReturn:
 
 
 class Progress:
-    """The progress of a run on stderr: the pairs of a phase that are done, on a line that is drawn again; a
-    line every half minute where lines stay.
+    """The progress of a run on stderr: a count on a line that is drawn again; a line every half minute where
+    lines stay.
     """
 
     def __init__(self, left: Callable[[], float] = lambda: inf, *, is_shown: bool = True) -> None:
@@ -113,12 +144,12 @@ class Progress:
         # JPY_PARENT_PID for these processes.
         self._is_redrawn = is_terminal(sys.stderr) and "JPY_PARENT_PID" not in os.environ
 
-    def count(self, phase: str, done: int, total: int, unit: str = "pair") -> None:
-        """Show how many are done. A phase without any, or with fewer done than before, begins anew."""
+    def count(self, phase: str, done: int, total: int, unit: str) -> None:
+        """Show the units that are done in a phase. Other units, or fewer than before, have a line of their own."""
         if not self._is_shown or not total:
             return
         bar = self._bar
-        if bar is None or bar.desc != phase or done < bar.n or total != bar.total:
+        if bar is None or bar.unit != unit or done < bar.n or total != bar.total:
             from tqdm import tqdm  # most commands do not need it
 
             self.close()
@@ -134,6 +165,7 @@ class Progress:
                 mininterval=interval,
                 ncols=None if self._is_redrawn else 80,
             )
+        bar.set_description(phase, refresh=False)
         if isfinite(left := self._left()):
             bar.set_postfix_str(f"budget left {format_duration(left)}", refresh=False)
         bar.update(done - bar.n)
@@ -162,48 +194,3 @@ class Progress:
     def fileno(self) -> int:
         """Return the descriptor whose width tqdm asks for."""
         return sys.stderr.fileno()
-
-
-class EventKind(StrEnum):
-    """Kinds of events."""
-
-    START = "start"  # the program began or resumed the run
-    PLAN = "plan"  # a decision, with its reason
-    SCENE = "scene"  # a batch was reconstructed; the text states its registered part
-    FAULT = "fault"
-    END = "end"  # the run ended; the text states the ending
-
-
-class Event(NamedTuple):
-    """A line of ``run.log``: seconds since the start of the program, kind and text."""
-
-    seconds: float
-    kind: str
-    text: str = ""
-
-    def __str__(self) -> str:
-        return f"{format_duration(self.seconds):>7}  {self.text}"
-
-
-def append_event(directory: Path, event: Event) -> None:
-    text = " ".join(printable(event.text).splitlines())
-    with (
-        suppress(OSError),
-        (directory / LOG_NAME).open("a", encoding="utf-8") as stream,
-    ):  # full disk
-        stream.write(f"{event.seconds:.1f} {event.kind} {text}\n")
-
-
-def read_events(directory: Path) -> list[Event]:
-    """Return the events of the last session in a work directory, which is the last start of its run."""
-    events: list[Event] = []
-    with suppress(OSError):
-        for line in (
-            (directory / LOG_NAME).read_text(encoding="utf-8", errors="replace").splitlines()
-        ):
-            seconds, kind, text = f"{line}  ".split(" ", 2)
-            # A kill may have cut a line off.
-            with suppress(ValueError):
-                event = Event(float(seconds), EventKind(kind), text.strip())
-                events = [event] if event.kind == EventKind.START else [*events, event]
-    return events

@@ -6,15 +6,14 @@ They are all that reports, the summary, notebooks and scores read.
 import json
 from base64 import b64decode
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mkpc_kaggle.engine.console import Event, read_events
-from mkpc_kaggle.engine.request import About
+from mkpc_kaggle.engine.request import About, Ending
 from mkpc_kaggle.engine.store import Store, undamaged
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.coordinates import Box, Matrix3
@@ -70,19 +69,21 @@ class Results:
     path below the directory of the run's images. ``f11`` to ``f33`` of ``pairs`` are F; ``own`` is the F of
     the pair's matches alone, and ``magsac`` that before the prior, nine numbers or ``None``. ``choice`` is the
     reason why F is the scene's or not, ``units`` the number of units that ran or failed, and ``error`` the
-    error that left the pair without an F, if it was not for few matches. ``events`` are those of the last
-    session, such as faults.
+    error that left the pair without an F, if it was not for few matches.
     """
 
     pairs: "DataFrame"
     units: "DataFrame"
     cameras: "DataFrame"
     scenes: "DataFrame"
-    events: Sequence[Event]
     about: About
     directory: Path
     # Points (P, 3) of each model, of the longest tracks, by batch and number of the model
     points: Mapping[tuple[str, int], NDArray[np.float64]]
+
+    @property
+    def ending(self) -> Ending:
+        return self.about.ending
 
     @property
     def recipe(self) -> Recipe:
@@ -176,6 +177,7 @@ def results_of(store: Store) -> Results:
         raise UserError(f"{store.directory}: the run has not begun, or was stopped at its start")
     facts = json.loads(row[0])
     about = About(**{name: facts[name] for name in vars(About())})
+    about = replace(about, ending=Ending(about.ending))
     estimates = {key: json.loads(text) for key, text in store.db.execute(ESTIMATES)}
     units = unit_table(store, estimates)
     pairs = frame_of(store, PAIRS)
@@ -212,7 +214,6 @@ def results_of(store: Store) -> Results:
         units.drop(columns=["number", "estimate", "key"]),
         camera_table(scenes, images),
         scene_table(scenes, images, about.files),
-        read_events(store.directory),
         about,
         store.directory,
         points,

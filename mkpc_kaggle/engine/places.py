@@ -15,7 +15,7 @@ from pathlib import Path
 
 from mkpc_kaggle.cores import available_cores
 from mkpc_kaggle.engine.process import ProcessWorker, ThreadWorker
-from mkpc_kaggle.engine.request import Answer, Cause, Failure, Job, Loaded
+from mkpc_kaggle.engine.request import Answer, Cause, EstimateJob, Failure, Job, Loaded, MatchJob
 from mkpc_kaggle.engine.worker import Maker, MatchRunner, estimates_runner, scene_runner
 from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.pipeline.stages import Pipeline
@@ -33,20 +33,12 @@ class Kind(StrEnum):
     SCENE = "scenes"
 
 
-@dataclass(frozen=True)
-class Lost:
-    """The pairs and units of a lost job, no units for estimates; ``blamed`` are those that never ran."""
-
-    indices: list[int]
-    units: list[int]
-    blamed: list[int] = field(default_factory=list)
-
-
 @dataclass(eq=False)
 class Place:
     """A place such as "cuda:0", with its worker and the worker's job, which began at ``since``.
 
-    ``strikes`` and ``lost`` are of the losses since the last answer that count against it, and of all.
+    ``strikes`` and ``lost`` are of the losses since the last answer that count against it, and of all, each
+    with the numbers of the units that are blamed for it.
     ``closed`` is the reason why no more workers start here, else empty. Times are of the engine's clock.
     """
 
@@ -59,7 +51,7 @@ class Place:
     is_loaded: bool = False
     has_answered: bool = False  # to any job
     strikes: int = 0
-    lost: list[Lost] = field(default_factory=list)
+    lost: list[tuple[MatchJob | EstimateJob, list[int]]] = field(default_factory=list)
     closed: str = ""
     since: float = 0.0
     restart_at: float = -inf

@@ -21,8 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mkpc_kaggle.engine import budget as times
-from mkpc_kaggle.engine.budget import Budget, Costs
+from mkpc_kaggle.engine.budget import COST_OF_ESTIMATES, Budget, Costs
 from mkpc_kaggle.engine.state import (
     CONNECT,
     DEEPEN,
@@ -34,8 +33,6 @@ from mkpc_kaggle.engine.state import (
     Mask,
     State,
 )
-from mkpc_kaggle.errors import plural
-from mkpc_kaggle.progress import format_duration
 from mkpc_kaggle.scene.candidates import ALL_UNITS
 
 # Maximum share of the time after the sweep for extra pairs: they only serve scenes.
@@ -53,6 +50,8 @@ CANDIDATES_SHARE = 0.05
 # loop more than the jobs in a run of 500,000 pairs.
 MAX_DUE = 1000
 NEIGHBOURS = 100  # minibatches in which pairs with the same missing units are searched
+
+Phases = NDArray[np.int8]
 
 
 @dataclass(frozen=True)
@@ -87,18 +86,12 @@ class MatchPlan:
 @dataclass(frozen=True)
 class NextWork:
     """Work for idle workers: the next job of matching, the first estimates that are due, and all scenes, as
-    (batch, candidate).
-
-    ``done`` of ``total`` pairs are finished in the ``phase``. The first ``fit`` units of the recipe fit for all
-    pairs.
+    (batch, candidate). The first ``fit`` units of the recipe fit for all pairs.
     """
 
     match: MatchPlan | None
     estimates: list[int]
     scenes: list[tuple[int, str]]
-    phase: int
-    done: int
-    total: int
     fit: int
 
 
@@ -106,12 +99,10 @@ def plan(
     state: State, costs: Costs, budget: Budget, crew: Crew, now: float, lost: int = 0
 ) -> NextWork:
     """Return what to do next. ``lost`` counts the jobs that the asking place lost since its last answer."""
-    lacks = state.lacks_estimate & bool(crew.estimators)
     left = time_left(state, costs, budget, crew, now)
     missing = state.missing
     fit = prefix_that_fits(state, missing, costs, crew, left)
-    extra = min(len(state.pairs) - state.rows, extra_share(state, costs, crew, left))
-    phases = phases_of(state, missing, fit, extra)
+    phases = phases_of(state, missing, fit, extra_share(state, costs, crew, left))
     means = np.array([costs.mean(unit.name) for unit in state.units])
     wanted = in_time(state, missing, phases, means, left)
     first = wanted.min(1)
@@ -122,12 +113,12 @@ def plan(
         # A job takes the units of its phase and of earlier phases, which other pairs have finished.
         order = order_of(state, ready == phase, phase, lost)
         match = job_of(state, costs, crew, order, wanted <= phase, phase, left, lost)
-    estimates = estimates_due(state, lacks, first)
-    is_matching = match is not None or bool((state.busy < NEVER).any())
-    pending = state.estimating.copy()
-    pending[estimates] = True
+    estimates = estimates_due(state, crew, first)
     scenes: list[tuple[int, str]] = []
     if crew.scenes:
+        pending = state.estimating.copy()
+        pending[estimates] = True
+        is_matching = match is not None or bool((state.busy < NEVER).any())
         held = pairs_held(state, pending, first, phase, left, is_matching=is_matching)
         # Further candidates wait for the end of matching, and must be expected to end in time.
         most = -inf if is_matching else budget.stop_units - now
@@ -135,20 +126,13 @@ def plan(
             seconds = costs.scene(state.matches_of_candidate(batch, name))
             if name == ALL_UNITS or seconds <= most:
                 scenes.append((batch, name))
-    is_extra = phase == CONNECT
-    counted = phases[state.rows :] if is_extra else phases[: state.rows]
-    total = extra if is_extra else state.rows
-    done = total - int((counted.min(1) <= phase).sum())
-    return NextWork(match, estimates[:MAX_DUE].tolist(), scenes, phase, done, total, fit)
+    return NextWork(match, estimates[:MAX_DUE].tolist(), scenes, fit)
 
 
 def time_left(state: State, costs: Costs, budget: Budget, crew: Crew, now: float) -> float:
     """Return the seconds until no unit may run, so that estimates, scenes and candidates have theirs."""
-    seconds = (
-        costs.mean(times.COST_OF_ESTIMATES)
-        * int(state.lacks_estimate.sum())
-        / max(1, crew.estimators)
-    )
+    waiting = int(state.lacks_estimate.sum())
+    seconds = costs.mean(COST_OF_ESTIMATES) * waiting / max(1, crew.estimators)
     if crew.scenes and state.batches:
         forecasts = costs.scenes(state.matches_of_batches)
         due = forecasts[[state.may_make(batch) for batch in range(len(state.batches))]]
@@ -172,31 +156,26 @@ def prefix_that_fits(state: State, missing: Mask, costs: Costs, crew: Crew, left
     """
     if left <= 0:  # an unmeasured unit needs no time, but fits no more
         return 0
-    seconds = seconds_of_prefixes(state, missing, costs)
-    return int(np.searchsorted(seconds, left * max(1, crew.matchers), side="right"))
-
-
-def seconds_of_prefixes(state: State, missing: Mask, costs: Costs) -> NDArray[np.float64]:
-    """Return the seconds (U,) of one worker for the missing units of each prefix of the recipe."""
     # Extra pairs are left out: they have a share of the time, not a claim.
     rows = slice(state.rows)
     forecasts = np.array([costs.forecast(unit.name) for unit in state.units])
     # The share of the known pairs that need a unit, and one more that needs it
     needed = (state.used[rows].sum(0) + 1) / (state.done[rows].sum(0) + 1)
-    return np.asarray(np.cumsum(missing[rows].sum(0) * forecasts * needed))
+    seconds = np.cumsum(missing[rows].sum(0) * forecasts * needed)
+    return int(np.searchsorted(seconds, left * max(1, crew.matchers), side="right"))
 
 
 def extra_share(state: State, costs: Costs, crew: Crew, left: float) -> int:
     """Return the number of extra pairs that fit in a tenth of the time, the most useful first."""
     seconds = costs.forecast(state.units[state.sweep].name) / max(1, crew.matchers)
-    # A share of the time after the sweep, as it was before the first extra pair
-    had = int(state.done[state.rows :, state.sweep].sum())
     if not seconds or not isfinite(left):
         return len(state.pairs)
+    # A share of the time after the sweep, as it was before the first extra pair
+    had = int(state.done[state.rows :, state.sweep].sum())
     return int(CONNECT_SHARE * (left + had * seconds) / seconds)
 
 
-def phases_of(state: State, missing: Mask, fit: int, extra: int) -> NDArray[Any]:
+def phases_of(state: State, missing: Mask, fit: int, extra: int) -> Phases:
     """Return the phase (N, U) of each pair's missing units; ``NEVER`` for the other units."""
     phases = np.full(missing.shape, NEVER, np.int8, order="F")
     phases[: state.rows, :fit] = DEEPEN
@@ -211,19 +190,18 @@ def phases_of(state: State, missing: Mask, fit: int, extra: int) -> NDArray[Any]
 
 
 def in_time(
-    state: State, missing: Mask, phases: NDArray[Any], means: NDArray[Any], left: float
-) -> NDArray[Any]:
+    state: State, missing: Mask, phases: Phases, means: NDArray[Any], left: float
+) -> Phases:
     """Return the phases (N, U) without units that would not end in time, and without crops that depend on them."""
     wanted = phases.copy(order="F")
     wanted[:, (means >= left) | (left <= 0)] = NEVER
     for unit in np.flatnonzero(state.is_crop).tolist():
-        before = ~state.is_crop[:unit]
-        waits = missing[:, :unit][:, before] & (wanted[:, :unit][:, before] == NEVER)
-        wanted[waits.any(1), unit] = NEVER
+        never = missing[:, :unit] & (wanted[:, :unit] == NEVER)
+        wanted[(never & ~state.is_crop[:unit]).any(1), unit] = NEVER
     return wanted
 
 
-def order_of(state: State, ready: Mask, phase: int, lost: int) -> NDArray[Any]:
+def order_of(state: State, ready: Mask, phase: int, lost: int) -> NDArray[np.int_]:
     """Return the pairs that are ready in their order: visiting order, for the cache of encodings, and in the
     last phase the weakest first. Suspects, with a lost job, come last.
 
@@ -242,7 +220,7 @@ def job_of(
     state: State,
     costs: Costs,
     crew: Crew,
-    order: NDArray[Any],
+    order: NDArray[np.int_],
     wanted: Mask,
     phase: int,
     left: float,
@@ -256,7 +234,7 @@ def job_of(
     first = int(order[0])
     numbers = np.flatnonzero(wanted[first]).tolist()
     names = [state.units[number].name for number in numbers]
-    expected = [costs.mean(name) for name in names]
+    expected = list(map(costs.mean, names))
     pairs = [first]
     if lost or state.losses[first, :-1].any():
         numbers = numbers[:1]
@@ -269,9 +247,7 @@ def job_of(
             alike = (wanted[near] == wanted[first]).all(1) & ~state.losses[near, :-1].any(1)
             pairs = near[alike][:size].tolist()
         # An unmeasured unit counts as infinitely long, so its cost is learnt from a job of one unit.
-        known = [
-            mean if costs.is_known(n) else inf for n, mean in zip(names, expected, strict=True)
-        ]
+        known = [costs.mean(name) if costs.is_known(name) else inf for name in names]
         count = int((np.cumsum(known) * len(pairs) < JOB_SHARE * left).sum())
         numbers = numbers[: max(1, count)]
     # In the last phase, the order depends on inliers that come meanwhile.
@@ -282,7 +258,7 @@ def job_of(
 # Estimates and scenes
 
 
-def estimates_due(state: State, lacks: Mask, first: NDArray[Any]) -> NDArray[Any]:
+def estimates_due(state: State, crew: Crew, first: Phases) -> NDArray[np.int_]:
     """Return the rows to estimate now: first rows without any F, then rows with all units that fit
     in time; those with a lost job last.
 
@@ -291,7 +267,8 @@ def estimates_due(state: State, lacks: Mask, first: NDArray[Any]) -> NDArray[Any
     # A settled pair gets no other unit soon. A pair without an F is estimated at once: any F is better
     # than the fallback.
     settled = (first >= FILL) & (state.busy == NEVER)
-    due = lacks & ~state.estimating & (settled | ~state.has_f)
+    due = state.lacks_estimate & ~state.estimating & (settled | ~state.has_f)
+    due &= bool(crew.estimators)
     order = state.order[due[state.order]]
     rank = state.has_f[order] + 2 * (state.losses[order, ESTIMATE] > 0)
     return np.asarray(order[np.argsort(rank, kind="stable")])
@@ -300,7 +277,7 @@ def estimates_due(state: State, lacks: Mask, first: NDArray[Any]) -> NDArray[Any
 def pairs_held(
     state: State,
     pending: Mask,
-    first: NDArray[Any],
+    first: Phases,
     phase: int,
     left: float,
     *,
@@ -341,35 +318,12 @@ def scenes_due(state: State, held: Mask, held_later: Mask) -> list[tuple[int, st
     return [each for each in due if each not in state.making]
 
 
-# The end, and the outlook
+# The end
 
 
 def is_complete(state: State, crew: Crew) -> bool:
     """Whether all rows have all results that this run can compute, and so do all batches."""
     if state.missing[: state.rows].any() or state.lacks_estimate.any():
         return False
-    if not crew.scenes:
-        return True
-    matches = state.matches_of_batches
-    return not any(
-        state.may_make(batch) or (state.made[batch] and state.untried(batch))
-        for batch in np.flatnonzero(matches).tolist()
-    )
-
-
-def outlook(state: State, costs: Costs, budget: Budget, crew: Crew, now: float) -> str:
-    """Return how long all missing units would take, and how many units fit in the time left.
-
-    Empty until each unit was measured.
-    """
-    usable = [unit for unit, lost in zip(state.units, state.dead, strict=True) if not lost]
-    if not all(costs.is_known(unit.name) for unit in usable):
-        return ""
-    missing = state.missing
-    seconds = seconds_of_prefixes(state, missing, costs)[-1] / max(1, crew.matchers)
-    text = f"all units on all pairs would take {format_duration(seconds)}"
-    if not isfinite(budget.stop_units):
-        return f"{text}; there is no time limit"
-    left = time_left(state, costs, budget, crew, now)
-    fit = min(prefix_that_fits(state, missing, costs, crew, left), len(usable))
-    return f"{text}; {fit} of {plural(len(usable), 'unit')} can run in the remaining {format_duration(left)}"
+    nobody = np.zeros(len(state.batches), bool)
+    return not (crew.scenes and scenes_due(state, nobody, nobody))

@@ -7,6 +7,7 @@ from dataclasses import asdict
 import numpy as np
 
 from mkpc_kaggle.engine.budget import Budget
+from mkpc_kaggle.engine.request import About
 from mkpc_kaggle.engine.state import FALLBACK, SOURCES, State
 from mkpc_kaggle.engine.store import Store
 
@@ -33,12 +34,12 @@ class Publication:
         interval = max(INTERVAL_S, self._budget.writing / TIME_SHARE)
         return now - self._published > interval
 
-    def publish(self) -> None:
+    def publish(self, about: About) -> None:
         """Write the results, and the rows of the pairs that have changed since the last version."""
         start = self._budget.clock()
         self.save()
-        about = (0, len(self._sources), json.dumps(self._about()))
-        self._store.put({"pair": self._rows(), "run": [about]})
+        run = (0, len(self._sources), json.dumps(self._facts(about)))
+        self._store.put({"pair": self._rows(), "run": [run]})
         # The measured time decides when the last version is written.
         self._published = self._budget.clock()
         self._budget.note_write(self._published - start)
@@ -56,12 +57,12 @@ class Publication:
                     self.unwritten = f"the results cannot be written: {error}"
         return self.unwritten
 
-    def end(self) -> None:
+    def end(self, about: About) -> None:
         """Publish the last version. After it, the watchdog writes no other."""
-        self.publish()
+        self.publish(about)
         self._has_ended = True
 
-    def _about(self) -> dict[str, object]:
+    def _facts(self, about: About) -> dict[str, object]:
         state = self._state
         scenes = state.scenes
         # The key of each batch's scene, or the reason why it has none
@@ -71,7 +72,7 @@ class Publication:
             else (batch, "", state.missing_scene(batch))
             for batch in state.batches
         ]
-        return {**asdict(state.request.about), "scenes": keys}
+        return {**asdict(about), "scenes": keys}
 
     def _rows(self) -> list[tuple[object, ...]]:
         """Return the rows of the pairs that have changed."""

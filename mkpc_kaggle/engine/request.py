@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine.console import Event
 from mkpc_kaggle.engine.keys import Images, Keys
 from mkpc_kaggle.engine.store import Source
 from mkpc_kaggle.geometry.coordinates import Matrix3
@@ -25,15 +24,36 @@ from mkpc_kaggle.scene.candidates import ALL_UNITS
 from mkpc_kaggle.scene.sfm import Solution
 
 if TYPE_CHECKING:
-    from mkpc_kaggle.engine.frames import Results
     from mkpc_kaggle.engine.state import State
 
 MIN_PAIRS = 2  # of a batch that is reconstructed: the minimum to connect three images
 
 
+class Ending(StrEnum):
+    """Why a run ended, in a report."""
+
+    COMPLETE = "complete"
+    # Something was given up. All else is complete, and the next run tries it again.
+    WITH_FAILURES = "ended with failures"
+    TIME_IS_UP = "time is up"
+    INTERRUPTED = "interrupted"
+    NO_WORKER = "no worker left"
+    NOTHING_RUNS = "every unit was skipped"
+    NOT_ENDED = "not ended (at work, or killed)"
+
+    @property
+    def is_done(self) -> bool:
+        """Whether the run has computed everything that it could."""
+        return self in (Ending.COMPLETE, Ending.WITH_FAILURES)
+
+
 @dataclass(frozen=True)
 class About:
-    """Facts for reports about the run that wrote the store."""
+    """Facts for reports about the run that wrote the store.
+
+    ``resumed`` is the number of pairs that earlier runs finished. ``faults`` are lost jobs, places and units that
+    were closed, and unwritten files. ``failures`` are the reasons of batches that were given up.
+    """
 
     # The table of a recipe's file, and the recipe's name
     recipe: dict[str, Any] = field(default_factory=dict)
@@ -44,6 +64,15 @@ class About:
     versions: dict[str, str] = field(default_factory=dict)
     # The images of each dataset of a folder, by batch, also those in no pair
     files: dict[str, Sequence[str]] = field(default_factory=dict)
+    ending: Ending = Ending.NOT_ENDED
+    seconds: float = 0.0
+    resumed: int = 0
+    units_run: int = 0
+    estimated: int = 0
+    faults: Sequence[str] = ()
+    failures: Sequence[str] = ()
+    unwritten: str = ""  # why the last version of the results could not be written
+    unsaved: str = ""  # why the journal does not have all results
 
 
 @dataclass(frozen=True)
@@ -186,46 +215,6 @@ class Failure:
 # The answer to a match job or an estimate job has a value for each pair, in the order of the job. A matched
 # pair has the results of its job, and no images; its ``failure`` names an unreadable or changed image.
 Answer = Loaded | tuple[PairMatch, ...] | tuple[Estimated, ...] | Solution | Failure
-
-
-# The report
-
-
-class Ending(StrEnum):
-    """Why a run ended."""
-
-    COMPLETE = "complete"
-    # Something was given up. All else is complete, and the next run tries it again.
-    WITH_FAILURES = "ended with failures"
-    TIME_IS_UP = "time is up"
-    INTERRUPTED = "interrupted"
-    NO_WORKER = "no worker left"
-    NOTHING_RUNS = "every unit was skipped"
-
-    @property
-    def is_done(self) -> bool:
-        """Whether the run has computed everything that it could."""
-        return self in (Ending.COMPLETE, Ending.WITH_FAILURES)
-
-
-@dataclass(frozen=True)
-class RunReport:
-    """The outcome of a run: its tables, and how it ended.
-
-    ``resumed`` is the number of pairs that earlier runs finished. ``faults`` are lost jobs and unwritten files.
-    ``unwritten`` says why the last version of the results could not be written.
-    """
-
-    tables: "Results"
-    ending: Ending
-    seconds: float
-    resumed: int = 0
-    faults: tuple[str, ...] = ()
-    explanations: tuple[Event, ...] = ()  # decisions of the schedule
-    unwritten: str = ""
-    unsaved: str = ""  # why the journal does not have all results
-    units_run: int = 0
-    estimated: int = 0
 
 
 # Pairs

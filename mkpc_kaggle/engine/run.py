@@ -9,19 +9,17 @@ import threading
 from collections.abc import Sequence
 from dataclasses import replace
 from importlib import import_module
-from typing import Self
+from typing import Self, cast
 
-import numpy as np
-
-from mkpc_kaggle.engine import budget as times
-from mkpc_kaggle.engine.budget import Budget, Costs, start_limit, time_limit
-from mkpc_kaggle.engine.console import Event, EventKind, Progress, append_event, logger
-from mkpc_kaggle.engine.frames import results_of
+from mkpc_kaggle.engine.budget import COST_OF_ESTIMATES, Budget, Costs, start_limit, time_limit
+from mkpc_kaggle.engine.console import Progress, logger
+from mkpc_kaggle.engine.frames import Results, results_of
 from mkpc_kaggle.engine.keys import of_candidate
-from mkpc_kaggle.engine.places import Kind, Lost, Place, Site
-from mkpc_kaggle.engine.plan import Crew, MatchPlan, NextWork, is_complete, outlook, plan
+from mkpc_kaggle.engine.places import Kind, Place, Site
+from mkpc_kaggle.engine.plan import Crew, MatchPlan, NextWork, is_complete, plan
 from mkpc_kaggle.engine.publish import Publication
 from mkpc_kaggle.engine.request import (
+    About,
     Answer,
     Cause,
     Ending,
@@ -31,15 +29,12 @@ from mkpc_kaggle.engine.request import (
     Job,
     Loaded,
     MatchJob,
-    PairInputs,
-    RunReport,
     SceneJob,
 )
-from mkpc_kaggle.engine.state import DEEPEN, ESTIMATE, NEVER, PHASES, RAISED, SWEEP, State
+from mkpc_kaggle.engine.state import DEEPEN, ESTIMATE, PHASES, RAISED, State
 from mkpc_kaggle.engine.store import Store, points_row
 from mkpc_kaggle.errors import UserError, plural
 from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
-from mkpc_kaggle.progress import format_duration
 from mkpc_kaggle.scene.candidates import ALL_UNITS, title_of
 from mkpc_kaggle.scene.records import SceneRecord
 from mkpc_kaggle.scene.sfm import Solution
@@ -48,12 +43,9 @@ from mkpc_kaggle.scene.sfm import Solution
 # message and a transaction, would cost the loop more.
 MAX_ESTIMATES = 8
 MAX_LOSSES = 3  # of a place in a row, without an answer in between
-RESTART_PAUSE_S = (
-    1.0  # times the losses of a place in a row: scarce memory may become free meanwhile
-)
-# Faults of a run with different texts, and its decisions. The number of units that fit may change with
-# each job, for hours.
-MAX_FAULTS, MAX_PLANS = 1000, 10_000
+# Times the losses of a place in a row: scarce memory may become free meanwhile
+RESTART_PAUSE_S = 1.0
+MAX_FAULTS = 1000  # with different texts
 
 
 class Run:
@@ -71,6 +63,7 @@ class Run:
         interrupt: threading.Event,
         progress: bool = True,
     ) -> None:
+        self.state = state
         self.site = site
         self.store = store
         self.budget = budget
@@ -78,43 +71,37 @@ class Run:
         # By this run's answers alone: another machine may have computed the stored results.
         self.costs = Costs()
         self.faults: list[str] = []
-        self.plans: list[Event] = []
         self.units_run = self.estimated = 0
-        self._progress = Progress(budget.left, is_shown=progress)
-        self._explained = ""  # the phase that was explained last
-        self._is_announced = False  # the outlook, once all costs were measured
-        self._has_loaded = False  # some worker of matching was ready
-        self._has_ended = False
-        self.note(EventKind.START)
-        # For the report: an interrupted program has two seconds for it, and the import takes one.
-        import_module("pandas")
-        self.state = state
         self.resumed = int(state.complete.sum())
         self.publication = Publication(state, store, budget)
+        self._progress = Progress(budget.left, is_shown=progress)
+        self._explained = ""  # the phase that was explained last
+        self._has_loaded = False  # some worker of matching was ready
+        self._has_ended = False
+        # For the report: an interrupted program has two seconds for it, and the import takes one.
+        import_module("pandas")
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: object, *_: object) -> None:
+    def __exit__(self, *_: object) -> None:
         self.end()
-        # Reports call a session without this event "not ended".
-        if kind is None:
-            self.note(EventKind.END, self.ending)
 
     def end(self) -> None:
         """End all workers, and publish for the last time."""
         if not self._has_ended:  # report() and leaving the context both end the run
             self._has_ended = True
             self.site.close()
+            self.state.making.clear()
             self._progress.close()
-            self._publish(is_last=True)
+            self._publish()
 
     # The loop
 
     def run(self) -> None:
         if self.resumed:
             pairs = plural(self.state.rows, "pair")
-            self._progress.note(f"{self.resumed} of {pairs} from earlier runs")
+            self._say(f"{self.resumed} of {pairs} from earlier runs")
         self._publish()
         while not self.is_over():
             now = self.budget.clock()
@@ -139,25 +126,6 @@ class Run:
         if self.site.is_closed and not self._has_loaded:
             raise UserError(f"no worker could be started: {self.site.reason}")
 
-    def _take(self, place: Place, answer: Answer, now: float) -> None:
-        job, place.job = place.job, None
-        if isinstance(answer, Failure):
-            self.lose(place, job, answer, now)
-        elif job is None:
-            self._note_loaded(place, answer)
-        else:
-            place.note_answer()
-            self.save(job, answer, now - place.since)
-        if job is not None and place.kind is Kind.SCENE:
-            place.kill()  # pycolmap's memory does not return
-
-    def _seconds_of(self, place: Place) -> float:
-        """Return how long the worker of a place may start, or compute its job, by the costs known now."""
-        if place.job is not None:
-            return time_limit(place.job, self.costs, self.budget, place.since)
-        loads_matchers = place.kind is Kind.MATCH
-        return start_limit(self.budget, place.since, loads_matchers=loads_matchers)
-
     def is_over(self) -> bool:
         return self.interrupt.is_set() or self.budget.clock() >= self.budget.stop_waiting
 
@@ -174,151 +142,133 @@ class Run:
         count = len(matchers) if site.is_open else 1
         return Crew(count, len(site.of(Kind.ESTIMATE)), len(site.of(Kind.SCENE)), minibatch)
 
-    def _publish(self, *, is_last: bool = False) -> None:
-        if is_last:
-            self.publication.end()
+    def _seconds_of(self, place: Place) -> float:
+        """Return how long the worker of a place may start, or compute its job, by the costs known now."""
+        if place.job is not None:
+            return time_limit(place.job, self.costs, self.budget, place.since)
+        loads_matchers = place.kind is Kind.MATCH
+        return start_limit(self.budget, place.since, loads_matchers=loads_matchers)
+
+    def _take(self, place: Place, answer: Answer, now: float) -> None:
+        job, place.job = place.job, None
+        if isinstance(answer, Failure):
+            self.lose(place, job, answer, now)
+        elif job is None:
+            self._has_loaded = self._has_loaded or place.kind is Kind.MATCH
+            self._leave_out(cast(Loaded, answer))
         else:
-            self.publication.publish()
-        for text in (self.publication.unwritten, self.store.trouble):
-            if text:
-                self.fault(text)
+            place.note_answer()
+            self.save(job, answer, now - place.since)
+        if job is not None and place.kind is Kind.SCENE:
+            place.kill()  # pycolmap's memory does not return
 
     # Handing out
 
     def _give(self, place: Place, work: NextWork, now: float) -> None:
         """Give a job to a free place, or start a worker there if there is one to give."""
+        job: Job | None = None
         if place.kind is Kind.MATCH:
             # Again for each place: the former one's job has changed what is next.
             work = self.plan(now, len(place.lost))
-            self._explain(work, now)
-            if not place.is_idle:
-                if work.match is not None:
-                    place.start(now)
-            elif work.match is not None:
-                self._give_pairs(place, work.match, now)
+            if work.match is not None:
+                self._show(work.match.phase, work.fit)
+                job = self._match_job(work.match) if place.is_idle else None
         elif place.kind is Kind.ESTIMATE and work.estimates:
-            if place.is_idle:
-                self._give_estimates(place, work.estimates, now)
-            else:
-                place.start(now)
-        elif place.kind is Kind.SCENE and len(work.scenes) > 0:
-            if place.is_idle:
-                self._give_scene(place, work.scenes.pop(0), now)
-            elif self._has_room_for_scene(work):
-                place.start(now)
+            job = self._estimate_job(work.estimates) if place.is_idle else None
+        elif place.kind is Kind.SCENE and work.scenes:
+            job = self._scene_job(*work.scenes.pop(0)) if place.is_idle else None
+        else:
+            return
+        if job is not None:
+            place.submit(job, now)
+        elif not place.is_idle and self._has_room(place, work):
+            place.start(now)
 
-    def _has_room_for_scene(self, work: NextWork) -> bool:
-        """Return whether another process may start: there is a scene for it, and a core."""
+    def _has_room(self, place: Place, work: NextWork) -> bool:
+        """Return whether another worker may start: there is work for it, and for a scene a core."""
+        if place.kind is not Kind.SCENE:
+            return place.kind is not Kind.MATCH or work.match is not None
         places = self.site.of(Kind.SCENE)
         starting = sum(place.is_starting for place in places)
         # While matching uses the other cores, scenes have only the cores that it leaves free.
-        is_matching = work.match is not None or self._is_matching
+        is_matching = work.match is not None or self.state.is_matching
         most = self.site.scenes_at_a_time(is_matching=is_matching)
         busy = starting + sum(place.job is not None for place in places)
         return starting < len(work.scenes) and busy < most
 
-    @property
-    def _is_matching(self) -> bool:
-        return bool((self.state.busy < NEVER).any())
-
-    def _give_pairs(self, place: Place, chosen: MatchPlan, now: float) -> None:
+    def _match_job(self, chosen: MatchPlan) -> MatchJob | None:
         state = self.state
         crops = [number for number in chosen.units if state.is_crop[number]]
         # The points that the last crop comes from; the worker leaves out those after an earlier one.
-        inputs = [self._points_before(index, max(crops, default=0)) for index in chosen.pairs]
-        digests = []
-        for index in chosen.pairs:
-            digests.append(tuple(image.digest for image in state.images_of(index)))
+        inputs = [state.points_before(index, max(crops, default=0)) for index in chosen.pairs]
+        keys = [key for points in inputs for key in points.values()]
         job = MatchJob(
             chosen.pairs,
             [state.units[number] for number in chosen.units],
             chosen.expected,
             chosen.seconds,
             [state.pairs[index] for index in chosen.pairs],
-            digests,
+            [tuple(image.digest for image in state.images_of(index)) for index in chosen.pairs],
             upcoming=[path for index in chosen.upcoming for path in state.pairs[index].images],
         )
-        keys = [key for pair in inputs for key in pair.values()] if crops else []
         try:
             points = self.store.source(keys).matches(keys)
         except (UserError, sqlite3.Error, KeyError) as error:  # a disk that fails costs the job
             self._lose_job(job, f"the store cannot be read: {error}")
-            return
-        if crops:
-            given = [
-                tuple(UnitResult(state.units[number], points[key]) for number, key in pair.items())
-                for pair in inputs
-            ]
-            job = replace(job, given=given)
+            return None
         state.busy[chosen.pairs] = chosen.phase
-        place.submit(job, now)
+        given = [
+            tuple(UnitResult(unit, points[key]) for unit, key in pair.items()) for pair in inputs
+        ]
+        return replace(job, given=given)
 
-    def _points_before(self, index: int, unit: int) -> dict[int, str]:
-        """Return the keys of a pair's points of stage 1 before a unit, by the number of their unit."""
+    def _estimate_job(self, due: list[int]) -> EstimateJob:
+        """Take the first pairs that are due; one with a lost job is alone."""
         state = self.state
-        chosen = np.flatnonzero(state.done[index, :unit] & ~state.is_crop[:unit]).tolist()
-        return {number: state.points[index, number].decode() for number in chosen}
-
-    def _give_estimates(self, place: Place, due: list[int], now: float) -> None:
-        """Give the first pairs that are due; one with a lost job is alone."""
-        losses = self.state.losses[:, ESTIMATE]
-        fresh = [index for index in due[:MAX_ESTIMATES] if not losses[index]]
+        fresh = [index for index in due[:MAX_ESTIMATES] if not state.losses[index, ESTIMATE]]
         chosen = fresh or due[:1]
         due[:] = [index for index in due if index not in chosen]
-        self.state.estimating[chosen] = True
-        place.submit(self._estimate_job(chosen), now)
+        state.estimating[chosen] = True
+        pairs = tuple(map(state.inputs_of, chosen))
+        keys = [key for pair in pairs for key in pair.points.values()]
+        return EstimateJob(pairs, state.request.recipe, self.store.source(keys))
 
-    def _estimate_job(self, indices: Sequence[int]) -> EstimateJob:
-        pairs = tuple(map(self.state.inputs_of, indices))
-        source = self.store.source(_keys_of(pairs))
-        return EstimateJob(pairs, self.state.request.recipe, source)
-
-    def _give_scene(self, place: Place, due: tuple[int, str], now: float) -> None:
-        """Give a batch's candidate, from the results in use now.
+    def _scene_job(self, batch: int, candidate: str) -> SceneJob:
+        """Take a batch's candidate, from the results in use now.
 
         If its pairs get other results meanwhile, the scene is stale when it arrives.
         """
         state = self.state
-        batch, candidate = due
         request = state.request
         indices, first = state.scene_inputs(batch)
         pairs = tuple(map(state.inputs_of, indices))
         key = of_candidate(first, candidate)
-        name = list(state.batches)[batch]
-        job = SceneJob(
-            name,
+        state.making.add((batch, candidate))
+        return SceneJob(
+            list(state.batches)[batch],
             key,
             pairs,
             contents=tuple(map(state.contents, indices)),
             recipe=request.recipe,
-            source=self.store.source(_keys_of(pairs)),
+            source=self.store.source([key for pair in pairs for key in pair.points.values()]),
             matches=state.matches_of_candidate(batch, candidate),
             folder=None if request.scenes_dir is None else request.scenes_dir / key,
             cameras=request.cameras,
             candidate=candidate,
             scene=first,
         )
-        # Other candidates are lines of the log.
-        if candidate == ALL_UNITS:
-            about = format_duration(self.costs.scene(job.matches))
-            text = f"reconstructing its cameras from {plural(len(pairs), 'pair')}, about {about}"
-            self._progress.note(f"batch {name}: {text}")
-        state.making.add(due)
-        place.submit(job, now)
 
     # Answers
 
     def save(self, job: Job, answer: object, seconds: float) -> None:
-        """Save an answer, first in the store, then in the state: results in the state are never lost."""
+        """Use an answer, and store it in one transaction."""
+        self.state.release(job)
         if isinstance(job, MatchJob):
-            assert isinstance(answer, tuple)
-            self._save_points(job, answer)
+            self._save_points(job, cast(Sequence[PairMatch], answer))
         elif isinstance(job, EstimateJob):
-            assert isinstance(answer, tuple)
-            self._save_estimates(job, answer)
+            self._save_estimates(job, cast(Sequence[Estimated], answer))
         else:
-            assert isinstance(answer, Solution)
-            self._save_scene(job, answer, seconds)
+            self._save_scene(job, cast(Solution, answer), seconds)
         # A full disk or a lock: the run continues, and the user may make room.
         if self.store.trouble:
             self.fault(self.store.trouble)
@@ -327,7 +277,6 @@ class Run:
         state = self.state
         rows = []
         for index, outcome in zip(job.indices, answer, strict=True):
-            state.busy[index] = NEVER
             # An unreadable image stays unreadable in this run.
             if outcome.failure:
                 state.note_unreadable(index, outcome.failure)
@@ -354,7 +303,6 @@ class Run:
         state = self.state
         rows = []
         for pair, found in zip(job.pairs, answer, strict=True):
-            state.estimating[pair.index] = False
             # Under the key of the points that the worker read, which may be older than the state's
             key = state.request.keys.of_estimate(found.points)
             facts = _estimate_facts(found)
@@ -362,13 +310,14 @@ class Run:
             state.losses[pair.index, ESTIMATE] = 0
             state.reasons.get(pair.index, {}).pop("estimate", None)
             state.use_estimate(pair.index, key, facts)
-            self.costs.observe(times.COST_OF_ESTIMATES, found.seconds)
+            self.costs.observe(COST_OF_ESTIMATES, found.seconds)
         self.store.put({"result": rows})
         self.estimated += len(answer)
-        # While pairs are matched, the bar shows those.
-        if not (state.busy < NEVER).any():
+        # While pairs are matched, the bar shows their units.
+        if not state.is_matching:
             total = int(state.used[: state.rows].any(1).sum())
-            self._progress.count("estimate", total - int(state.lacks_estimate.sum()), total)
+            done = total - int(state.lacks_estimate.sum())
+            self._progress.count("estimate", done, total, "pair")
 
     def _save_scene(self, job: SceneJob, answer: Solution, seconds: float) -> None:
         record = SceneRecord.of(
@@ -384,28 +333,22 @@ class Run:
         self.store.put({"result": [(job.key, record.to_json())]})
         # The time of the loop, with the process's start: the forecast needs both.
         self.costs.observe_scene(job.matches, seconds)
-        batch = self.state.batches[job.batch]
-        self.state.making.discard((batch, job.candidate))
-        is_best = self.state.use_scene(batch, record, job.scene)
-        text = f"{record.registered} of {plural(record.images, 'image')}"
+        is_best = self.state.use_scene(self.state.batches[job.batch], record, job.scene)
+        text = f"batch {job.batch}: {record.registered} of {plural(record.images, 'image')}"
         if job.candidate == ALL_UNITS:
-            self._progress.note(f"batch {job.batch}: {text} with a camera")
+            self._say(f"{text} with a camera")
         else:
-            text += _by_tracks(job.candidate)
-            text += ", the best so far" if is_best else ", not better"
-        self.note(EventKind.SCENE, f"{job.batch}: {text}")
+            # Other candidates are lines of the log.
+            better = "the best so far" if is_best else "not better"
+            logger.debug(f"{text}{_by_tracks(job.candidate)}, {better}")
         if job.folder is not None:
             self._publish()  # tables of cameras should agree with COLMAP's files
 
-    def _note_loaded(self, place: Place, answer: object) -> None:
+    def _leave_out(self, answer: Loaded) -> None:
         """Continue without the matchers that could not be loaded, and say so once."""
-        assert isinstance(answer, Loaded)
-        self._has_loaded = self._has_loaded or place.kind is Kind.MATCH
         for name, reason in answer.refused.items():
             if name not in self.state.refused:
-                text = f"{name} is left out: {reason}"
-                self.explain(text)
-                self.warning(text)
+                self.warn(f"{name} is left out: {reason}")
         self.state.refuse(answer.refused)
 
     # Losses
@@ -434,25 +377,22 @@ class Run:
 
     def _count_loss(self, place: Place, job: Job, failure: Failure) -> None:
         state = self.state
-        units: list[int] = []
-        is_fresh = new = False
-        if isinstance(job, MatchJob):
-            units = [state.number_of[unit.name] for unit in job.units]
-            is_fresh = not state.losses[list(job.indices), :-1].any()
-            new = not any(self.costs.mean(unit.name) for unit in job.units)
-        elif isinstance(job, EstimateJob):
-            is_fresh = not state.losses[job.indices, ESTIMATE].any()
+        is_fresh = not state.has_losses(job)
         self._lose_job(job, str(failure))
         # A worker that reports an ordinary error works, and each scene has a process of its own.
         if failure.cause is Cause.RAISED or isinstance(job, SceneJob):
             place.note_answer()
             return
-        place.lost.append(Lost(list(job.indices), units, blamed=units if is_fresh and new else []))
+        blamed: list[int] = []
+        is_match = isinstance(job, MatchJob)
+        if isinstance(job, MatchJob) and not any(self.costs.mean(each.name) for each in job.units):
+            blamed = state.columns_of(job)
         if is_fresh:
-            place.strikes += not place.has_answered or not (new or place.kind is Kind.ESTIMATE)
-            self._blame(place.lost[-1].blamed, failure)
-        elif place.kind is Kind.MATCH and not place.has_answered and self.site.has_other(place):
+            self._blame(blamed, failure)
+            place.strikes += not place.has_answered or (is_match and not blamed)
+        elif is_match and not place.has_answered and self.site.has_other(place):
             place.strikes = MAX_LOSSES
+        place.lost.append((job, blamed if is_fresh else []))
 
     def _blame(self, units: Sequence[int], failure: Failure) -> None:
         """Count a loss of units that never ran."""
@@ -462,106 +402,99 @@ class Run:
             if state.unit_losses[unit] == len(self.site.of(Kind.MATCH)) + 1:
                 state.dead[unit] = True
                 name = state.units[unit].name
-                self.explain(f"{name} is skipped on all pairs: it never ran ({failure})")
+                self.fault(f"{name} is skipped on all pairs: it never ran ({failure})")
 
     def _lose_job(self, job: Job, reason: str) -> None:
         """Count a lost job of its pairs, or of its scene."""
-        state = self.state
-        if isinstance(job, MatchJob):
-            indices = list(job.indices)
-            state.busy[indices] = NEVER
-            units = [state.number_of[unit.name] for unit in job.units]
-            for index, unit in state.lose_units(indices, units, reason):
-                self.explain(f"{state.units[unit].name} is skipped on pair {index} ({reason})")
-        elif isinstance(job, EstimateJob):
-            state.estimating[job.indices] = False
-            for index, _ in state.lose_units(job.indices, [ESTIMATE], reason):
-                self.explain(f"pair {index} keeps the F it has: {reason}")
+        self.state.release(job)
+        if isinstance(job, SceneJob):
+            self.fault(
+                f"batch {job.batch} was not reconstructed{_by_tracks(job.candidate)}: {reason}"
+            )
+            self.state.lose_scene(self.state.batches[job.batch], job.candidate, reason)
         else:
-            tracks = _by_tracks(job.candidate)
-            self.fault(f"batch {job.batch} was not reconstructed{tracks}: {reason}")
-            batch = state.batches[job.batch]
-            state.making.discard((batch, job.candidate))
-            state.lose_scene(batch, job.candidate, reason)
+            for index, name in self.state.lose(job, reason):
+                logger.debug(f"{name} is skipped on pair {index} ({reason})")
 
     def _close(self, place: Place, failure: Failure) -> None:
         """Start no worker at a place any more, and take back its losses."""
         state = self.state
         place.closed = f"{place.name}: {failure}"
-        self.explain(f"no worker is started any more on {place.closed}")
-        for lost in place.lost:
-            state.take_back(lost.indices, lost.units or [ESTIMATE])
-            state.unit_losses[lost.blamed] -= 1
+        again = f"; {plural(len(place.lost), 'lost job')} tried again" if place.lost else ""
+        self.fault(f"no worker is started any more on {place.closed}{again}")
+        for job, blamed in place.lost:
+            state.take_back(job)
+            state.unit_losses[blamed] -= 1
         state.dead = state.unit_losses > max(1, len(self.site.of(Kind.MATCH)))
         state.refuse({})
         if not self.site.of(Kind.SCENE):
             state.give_up_scenes(str(failure))
-        if place.lost:
-            count = plural(len(place.lost), "lost job")
-            self.explain(f"{count} of {place.name} will be tried again elsewhere")
 
     def _fall_back(self) -> None:
         """Continue on the fallback places: all matching places are closed, or every unit is skipped."""
-        text = f"matching continues on the {self.site.fallback[0].name}: "
-        text += self.site.reason or Ending.NOTHING_RUNS
-        self.warning(text)
-        self.explain(text)
+        reason = self.site.reason or Ending.NOTHING_RUNS
+        self.warn(f"matching continues on the {self.site.fallback[0].name}: {reason}")
         self.site.fall_back()
         # Costs, losses and refusals say nothing about the other device.
         self.costs.forget()
         self.state.begin_anew()
-        self._explained = ""
 
     # Messages
-
-    def note(self, kind: EventKind, text: str = "") -> Event:
-        event = Event(self.budget.spent(), kind, text)
-        append_event(self.store.directory, event)
-        return event
-
-    def explain(self, text: str) -> None:
-        """Record a decision."""
-        if len(self.plans) < MAX_PLANS:
-            self.plans.append(self.note(EventKind.PLAN, text))
 
     def fault(self, text: str) -> None:
         """Record a fault, once for each text: a broken disk would fill the log with them."""
         if text not in self.faults and len(self.faults) < MAX_FAULTS:
             self.faults.append(text)
-            self.note(EventKind.FAULT, text)
+            logger.debug(text)
 
-    def warning(self, text: str) -> None:
+    def warn(self, text: str) -> None:
         """Record a fault, and print it at once."""
-        self.fault(text)
+        self.faults.append(text)
         logger.warning(text)
 
-    def _explain(self, work: NextWork, now: float) -> None:
-        """Show the phase, and explain a change of it or of the units that fit. Announce the outlook once it is
-        measured.
-        """
-        if work.match is None:
-            return
-        phase = PHASES[work.phase]
-        self._progress.count(phase, work.done, work.total)
-        # During the sweep, only one cost is measured.
-        if work.phase == SWEEP:
-            return
+    def _say(self, text: str) -> None:
+        self._progress.note(text)
+        logger.debug(text)
+
+    def _show(self, phase: int, fit: int) -> None:
+        """Show the phase and the units that are done; a change of phase is a line of the log."""
+        done = self.state.done[: self.state.rows]
+        self._progress.count(PHASES[phase], int(done.sum()), done.size, "unit")
+        text = PHASES[phase]
         # In other phases, the number of units that fit changes with each pair.
-        fitting = f"{phase} {work.fit if work.phase == DEEPEN else ''}"
-        if fitting == self._explained and self._is_announced:
-            return
-        # Nothing is announced before it is measured.
-        text = outlook(self.state, self.costs, self.budget, self.crew, now)
-        if not text:
-            fitting = f"{phase}, unmeasured"
-        if fitting != self._explained:
-            self.explain(f"{phase}: {text or 'not all units were measured yet'}")
-            self._explained = fitting
-        if text and not self._is_announced:
-            self._progress.note(text)
-            self._is_announced = True
+        if phase == DEEPEN:
+            text = f"{text}: {fit} of {plural(len(self.state.units), 'unit')} fit for all pairs"
+        if text != self._explained:
+            self._explained = text
+            logger.debug(text)
 
     # The end
+
+    def _publish(self) -> None:
+        if self._has_ended:
+            self.publication.end(self.about)
+        else:
+            self.publication.publish(self.about)
+        for text in (self.publication.unwritten, self.store.trouble):
+            if text:
+                self.fault(text)
+
+    @property
+    def about(self) -> About:
+        """Facts about the run so far."""
+        state = self.state
+        return replace(
+            state.request.about,
+            ending=self.ending if self._has_ended else Ending.NOT_ENDED,
+            seconds=self.budget.spent(),
+            resumed=self.resumed,
+            units_run=self.units_run,
+            estimated=self.estimated,
+            faults=self.faults,
+            failures=list(state.scene_failures.values()),
+            unwritten=self.publication.unwritten,
+            unsaved=self.store.trouble,
+        )
 
     @property
     def ending(self) -> Ending:
@@ -575,28 +508,13 @@ class Run:
         has_estimators = bool(self.site.of(Kind.ESTIMATE))
         return Ending.TIME_IS_UP if has_estimators and not self.site.is_closed else Ending.NO_WORKER
 
-    def report(self) -> RunReport:
+    def report(self) -> Results:
         """End the run. Return its results."""
         self.end()
-        unsaved = self.store.flush()  # the disk may have room again
-        if unsaved:
+        if unsaved := self.store.flush():  # the disk may have room again
             self.fault(unsaved)
-        return RunReport(
-            tables=results_of(self.store),
-            ending=self.ending,
-            seconds=self.budget.spent(),
-            resumed=self.resumed,
-            faults=tuple(self.faults),
-            explanations=tuple(self.plans),
-            unwritten=self.publication.unwritten,
-            unsaved=unsaved,
-            units_run=self.units_run,
-            estimated=self.estimated,
-        )
-
-
-def _keys_of(pairs: Sequence[PairInputs]) -> list[str]:
-    return [key for pair in pairs for key in pair.points.values()]
+        # Facts that a full disk kept from the store
+        return replace(results_of(self.store), about=self.about)
 
 
 def _by_tracks(candidate: str) -> str:

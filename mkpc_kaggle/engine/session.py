@@ -7,7 +7,7 @@ import signal
 import sqlite3
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from importlib import metadata
@@ -15,7 +15,7 @@ from math import isfinite
 from pathlib import Path
 from tempfile import TemporaryFile
 from types import FrameType, MappingProxyType
-from typing import Any, Self
+from typing import Self
 
 import cv2
 import numpy as np
@@ -26,13 +26,14 @@ from mkpc_kaggle.data.competition import (
     submission_problems,
     write_submission,
 )
-from mkpc_kaggle.data.outputs import remove_unfinished, replacing
+from mkpc_kaggle.data.outputs import remove_unfinished
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.cluster import RaySite
-from mkpc_kaggle.engine.console import LOG_NAME, Progress, leave, logger
+from mkpc_kaggle.engine.console import LOG_NAME, Progress, leave, logged, logger
+from mkpc_kaggle.engine.frames import Results
 from mkpc_kaggle.engine.keys import Keys, image_facts
-from mkpc_kaggle.engine.places import LISTEN_S, LocalSite
-from mkpc_kaggle.engine.request import About, Request, RunReport, names_of
+from mkpc_kaggle.engine.places import LISTEN_S, LocalSite, Site
+from mkpc_kaggle.engine.request import About, Request, names_of
 from mkpc_kaggle.engine.run import Run
 from mkpc_kaggle.engine.state import State
 from mkpc_kaggle.engine.store import Store
@@ -40,7 +41,8 @@ from mkpc_kaggle.errors import UserError, writing
 from mkpc_kaggle.geometry.coordinates import Matrix3
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 from mkpc_kaggle.pipeline.assembly import Assembly
-from mkpc_kaggle.recipe import PINHOLES, Recipe
+from mkpc_kaggle.recipe import PINHOLES
+from mkpc_kaggle.scene.view_graph import BatchImage
 from mkpc_kaggle.version import __version__
 
 WORKERS_LOG = "workers.log"  # in the work directory, for the output of native libraries
@@ -164,7 +166,7 @@ def submit(
     session: Session,
     output: Path,
     root: str = "",
-) -> RunReport:
+) -> Results:
     """Match all pairs. ``output`` always has a row for each pair, with the fallback F if necessary.
 
     A complete file of an earlier run is kept in the work directory, since this run begins without its results.
@@ -190,47 +192,20 @@ def _is_fallback(F: Matrix3) -> bool:
     return bool(np.allclose(F, FALLBACK_FUNDAMENTAL))
 
 
-@contextmanager
-def first_version(pairs: Sequence[Pair], output: Path) -> Iterator[None]:
+def first_version(pairs: Sequence[Pair], output: Path) -> None:
     """Write fallback rows, unless the file is complete, before using weights, devices or images,
     which may hang.
 
-    If the run is refused before its first own results, restore the former file, or remove the new
-    one. Raises :class:`mkpc_kaggle.errors.UserError` if ``output`` cannot be written.
+    Raises :class:`mkpc_kaggle.errors.UserError` if ``output`` cannot be written.
     """
     if output.is_char_device() or output.is_block_device():
         raise UserError(f"--output {output} is a device; name a file")
-    ours = None  # the version that is written here
-    former = None  # the file that was there before
     ids = [pair.id for pair in pairs]
-    with ExitStack() as closed:
-        with writing(f"--output {output}"):
-            output.parent.mkdir(parents=True, exist_ok=True)
-            TemporaryFile(dir=output.parent).close()  # before hours of work, not after them
-            if not output.exists() or (output.is_file() and submission_problems(output, ids)):
-                if output.is_file():
-                    # The open file outlives its name
-                    former = closed.enter_context(output.open("rb"))
-                write_submission(output, dict.fromkeys(ids, FALLBACK_FUNDAMENTAL))
-                ours = _identity(output)
-        try:
-            yield
-        except UserError:
-            with suppress(OSError):  # another process has removed it
-                if ours == _identity(output):
-                    output.unlink()
-                    if former is not None:
-                        with replacing(output) as stream:
-                            shutil.copyfileobj(former, stream.buffer)
-            raise
-
-
-def _identity(path: Path) -> tuple[int, int]:
-    """Identify a version of a file by inode and time, since a new file may reuse a deleted file's
-    inode.
-    """
-    status = path.stat()
-    return status.st_ino, status.st_mtime_ns
+    with writing(f"--output {output}"):
+        output.parent.mkdir(parents=True, exist_ok=True)
+        TemporaryFile(dir=output.parent).close()  # before hours of work, not after them
+        if not output.exists() or (output.is_file() and submission_problems(output, ids)):
+            write_submission(output, dict.fromkeys(ids, FALLBACK_FUNDAMENTAL))
 
 
 def run_pairs(
@@ -238,44 +213,46 @@ def run_pairs(
     assembly: Assembly,
     session: Session,
     root: str = "",
-    **more: Any,
-) -> RunReport:
+    *,
+    scenes_dir: Path | None = None,
+    files: Mapping[str, Sequence[str]] = MappingProxyType({}),
+    publish: Callable[[State], None] = lambda _: None,
+) -> Results:
     """Run the recipe on all pairs. In the store, an image's name is its path below ``root``.
 
-    ``more`` are other fields of the request. Raises :class:`mkpc_kaggle.errors.UserError` if the store cannot be
-    used or a matcher cannot be loaded, and for scenes whose cameras have distortion.
+    ``scenes_dir`` and ``publish`` are as in :class:`mkpc_kaggle.engine.request.Request`, ``files`` as in
+    :class:`mkpc_kaggle.engine.request.About`. Raises :class:`mkpc_kaggle.errors.UserError` if the store cannot be
+    used or a matcher cannot be loaded, and for F from cameras with distortion.
     """
-    _require_pinholes(assembly.recipe)
-    folders = dict.fromkeys(path.parent for pair in pairs for path in pair.images)
-    with opened_store(session) as store:
-        request = request_of(pairs, assembly, session, root, **more)
-        with opened_run(request, assembly, session, store, folders) as run:
-            run.run()
-            return run.report()
-
-
-def _require_pinholes(recipe: Recipe) -> None:
-    """Raise :class:`UserError` for a recipe for F whose cameras have distortion."""
-    scene = recipe.scene
-    if scene is not None and scene.camera_model not in PINHOLES:
+    scene = assembly.recipe.scene
+    if scenes_dir is None and scene is not None and scene.camera_model not in PINHOLES:
         raise UserError(
             f"[scene] has cameras with distortion ({scene.camera_model}), and F ignores it: "
             "use PINHOLE or SIMPLE_PINHOLE here; `mkpc reconstruct` takes all models"
         )
+    budget, interrupt, work_dir = session.budget, session.interrupt, session.work_dir
+    about = about_of(assembly, budget, files)
+    keys = Keys.of(assembly)
+    request = Request(
+        pairs, assembly.recipe, keys, root, assembly.cameras, scenes_dir, about, publish
+    )
+    with Store.open(work_dir, fresh=session.fresh) as store:
+        # The workers' log is that of this run.
+        for name in (WORKERS_LOG, LOG_NAME) if session.fresh else (WORKERS_LOG,):
+            with suppress(OSError):
+                (work_dir / name).unlink(missing_ok=True)
+        state = State(request, *_facts(request, store, session))
+        state.restore(store)
+        site = _site(pairs, assembly, session)
+        run = Run(state, site, store, budget, interrupt=interrupt, progress=session.progress)
+        session.save = run.publication.save
+        with logged(work_dir / LOG_NAME), run:
+            run.run()
+            return run.report()
 
 
-def request_of(
-    pairs: Sequence[Pair],
-    assembly: Assembly,
-    session: Session,
-    root: str = "",
-    files: Mapping[str, Sequence[str]] = MappingProxyType({}),
-    **more: Any,
-) -> Request:
-    """Return a request for these pairs. ``files`` are the images of each dataset of a folder, ``more`` other
-    fields of the request.
-    """
-    budget = session.budget
+def about_of(assembly: Assembly, budget: Budget, files: Mapping[str, Sequence[str]]) -> About:
+    """Return the facts about a run that are known at its start."""
     recipe = assembly.recipe
     limit = budget.time_limit if isfinite(budget.time_limit) else None
     table = {**recipe.table(), "name": recipe.name}
@@ -288,45 +265,15 @@ def request_of(
         "NumPy": metadata.version("numpy"),
         "SQLite": sqlite3.sqlite_version,
     }
-    about = About(
-        table, str(assembly.placement), limit, assembly.left_out, versions, files=dict(files)
-    )
-    return Request(pairs, recipe, Keys.of(assembly), root, assembly.cameras, about=about, **more)
+    placement = str(assembly.placement)
+    return About(table, placement, limit, assembly.left_out, versions, files=dict(files))
 
 
-@contextmanager
-def opened_store(session: Session) -> Iterator[Store]:
-    """Open the store of a session, for one run."""
-    with Store.open(session.work_dir, fresh=session.fresh) as store:
-        # The summary names the workers' log if this run wrote to it.
-        names = [WORKERS_LOG, LOG_NAME] if session.fresh else [WORKERS_LOG]
-        for name in names:
-            with suppress(OSError):
-                (session.work_dir / name).unlink(missing_ok=True)
-        yield store
-
-
-@contextmanager
-def opened_run(
-    request: Request,
-    assembly: Assembly,
-    session: Session,
-    store: Store,
-    folders: Iterable[Path] = (),
-) -> Iterator[Run]:
-    """Open a run of a request. On leaving, end the workers and publish the last results.
-
-    ``folders`` hold the images, and must exist on every machine.
-    """
-    clock = session.budget.clock
-    workers = session.workers
-    log = session.work_dir / WORKERS_LOG
-    site = (
-        RaySite(assembly, workers, clock, folders, log)
-        if isinstance(workers, str)
-        else LocalSite(assembly, workers, clock, log)
-    )
-    budget, interrupt = session.budget, session.interrupt
+def _facts(
+    request: Request, store: Store, session: Session
+) -> tuple[dict[str, BatchImage], dict[str, str]]:
+    """Return the facts about the images of a request, as :func:`image_facts`."""
+    budget = session.budget
     progress = Progress(budget.left, is_shown=session.progress)
     files: dict[str, Path] = {}
     for pair in request.pairs:
@@ -334,20 +281,17 @@ def opened_run(
     facts = image_facts(
         store,
         files,
-        lambda: interrupt.is_set() or budget.clock() >= budget.stop_waiting,
+        lambda: session.interrupt.is_set() or budget.clock() >= budget.stop_waiting,
         lambda done, total: progress.count("reading", done, total, "image"),
     )
     progress.close()
-    state = State(request, *facts)
-    state.restore(store)
-    run = Run(
-        state,
-        site,
-        store,
-        budget,
-        interrupt=interrupt,
-        progress=session.progress,
-    )
-    session.save = run.publication.save
-    with run:
-        yield run
+    return facts
+
+
+def _site(pairs: Sequence[Pair], assembly: Assembly, session: Session) -> Site:
+    clock, workers, log = session.budget.clock, session.workers, session.work_dir / WORKERS_LOG
+    if isinstance(workers, str):
+        # The folders of the images must exist on every machine.
+        folders = dict.fromkeys(path.parent for pair in pairs for path in pair.images)
+        return RaySite(assembly, workers, clock, folders, log)
+    return LocalSite(assembly, workers, clock, log)

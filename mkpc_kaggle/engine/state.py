@@ -7,6 +7,7 @@ units of stage 1 before it. A result is used only under today's key.
 import json
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -15,8 +16,12 @@ from numpy.typing import NDArray
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.keys import Images, contents_of, of_candidate
 from mkpc_kaggle.engine.request import (
+    EstimateJob,
+    Job,
+    MatchJob,
     PairInputs,
     Request,
+    SceneJob,
     batches_of,
     distinct_pairs,
     names_of,
@@ -28,6 +33,7 @@ from mkpc_kaggle.geometry.robust import (
     FALLBACK_FUNDAMENTAL,
     are_models,
 )
+from mkpc_kaggle.recipe import Unit
 from mkpc_kaggle.scene.candidates import ALL_UNITS, best_of, candidates_of
 from mkpc_kaggle.scene.densify import extra_pairs_of
 from mkpc_kaggle.scene.records import NO_CAMERAS, NOT_RECONSTRUCTED, SceneRecord
@@ -94,6 +100,7 @@ class State:
         self.order = np.asarray(visiting_order(self.pairs), int)
         self._start_pairs(len(self.pairs), len(self.units))
         self._start_batches()
+        self.titles = [*self.number_of, "estimate"]  # of the columns of losses
         for index, names in enumerate(self.names):
             if reasons := [unreadable[name] for name in names if name in unreadable]:
                 self.note_unreadable(index, reasons[0])
@@ -159,6 +166,10 @@ class State:
         return np.asarray(lacking)
 
     @property
+    def is_matching(self) -> bool:
+        return bool((self.busy < NEVER).any())
+
+    @property
     def sweep(self) -> int:
         """The number of the first unit that can run, of stage 1 if possible."""
         usable = np.flatnonzero(~self.dead).tolist()
@@ -216,11 +227,6 @@ class State:
         return self.written[1]
 
     @property
-    def digests(self) -> dict[str, str]:
-        """The digest of each image's content, by name."""
-        return {name: image.digest for name, image in self.images.items()}
-
-    @property
     def scenes(self) -> dict[str, SceneRecord]:
         """The scene in use of each batch that has one."""
         return {
@@ -231,8 +237,7 @@ class State:
         """Return the finished candidate with the smallest disagreement."""
         made = self.made[batch]
         named = {name: made[name].disagreement for name in self.candidates if name in made}
-        best = best_of(named)
-        return made[best]
+        return made[best_of(named)]
 
     def untried(self, batch: int) -> list[str]:
         """Return the further candidates of a batch that are missing, once its first is today's; of a stale
@@ -249,23 +254,12 @@ class State:
         """Return whether the first scene of a batch is missing, and may be made."""
         return bool(self.stale[batch]) and self.scene_losses[batch, ALL_UNITS] < GIVEN_UP
 
-    def rows_of(self, batch: str) -> list[int]:
-        """Return the rows of a batch, without its extra pairs."""
-        members = self.members[self.batches[batch]]
-        return [int(index) for index in members if index < self.rows]
-
-    def is_unmatched(self, batch: str) -> bool:
-        """Return whether all units have run on the rows of a batch, and none found a match.
-
-        No scene is made for this batch, and no further run would change that.
-        """
-        rows = self.rows_of(batch)
-        return not (self.missing[rows].any() or self.matches[rows].any())
-
     def missing_scene(self, batch: str) -> str:
         """Return the reason why a batch has no scene."""
-        reason = NO_CAMERAS if self.is_unmatched(batch) else NOT_RECONSTRUCTED
-        return self.scene_failures.get(self.batches[batch], reason)
+        number = self.batches[batch]
+        rows = self.members[number][self.members[number] < self.rows]
+        may_match = self.missing[rows].any() or self.matches[rows].any()
+        return self.scene_failures.get(number, NOT_RECONSTRUCTED if may_match else NO_CAMERAS)
 
     @property
     def has_failures(self) -> bool:
@@ -296,17 +290,22 @@ class State:
         keys = self.request.keys
         first: list[str] = []
         if self.is_crop[unit]:
-            first = [keys.mkpc, *self.keys_before(index, unit)]
+            first = [keys.mkpc, *self.points_before(index, unit).values()]
         return keys.of_points(unit, self.pairs[index], images, first)
 
-    def keys_before(self, index: int, unit: int) -> list[str]:
+    def points_before(self, index: int, unit: int) -> dict[Unit, str]:
         """Return the keys of the points of stage 1 that a unit's crops come from."""
         chosen = self.done[index, :unit] & ~self.is_crop[:unit]
-        return [key.decode() for key in self.points[index, :unit][chosen]]
+        return self._keys(index, chosen)
+
+    def _keys(self, index: int, chosen: Mask) -> dict[Unit, str]:
+        """Return the keys of a pair's points of these units, in the recipe's order."""
+        numbers = np.flatnonzero(chosen).tolist()
+        return {self.units[number]: self.points[index, number].decode() for number in numbers}
 
     def keys_in_use(self, index: int) -> list[str]:
         """Return the keys of a pair's points in use, in the recipe's order."""
-        return [key.decode() for key in self.points[index][self.used[index]]]
+        return list(self._keys(index, self.done[index] & self.needed[index]).values())
 
     def estimate_key(self, index: int) -> str:
         """Return the key of an estimate from the points in use."""
@@ -332,8 +331,7 @@ class State:
         """Return the inputs of a pair's estimate, or of its batch's scene."""
         images = self.images_of(index)
         assert images
-        numbers = np.flatnonzero(self.used[index]).tolist()
-        points = {self.units[number]: self.points[index, number].decode() for number in numbers}
+        points = self._keys(index, self.done[index] & self.needed[index])
         own = self.F[index] if self.has_f[index] else None
         return PairInputs(index, images, points, own)
 
@@ -444,7 +442,30 @@ class State:
             for name in self.candidates:
                 del self.scene_losses[int(batch), name]
 
-    # Failures
+    # Jobs and failures
+
+    def columns_of(self, job: MatchJob | EstimateJob) -> list[int]:
+        """Return the columns of ``losses`` of a job."""
+        if isinstance(job, EstimateJob):
+            return [ESTIMATE]
+        return [self.number_of[unit.name] for unit in job.units]
+
+    def release(self, job: Job) -> None:
+        """Note that a job is not under way any more."""
+        if isinstance(job, MatchJob):
+            self.busy[list(job.indices)] = NEVER
+        elif isinstance(job, EstimateJob):
+            self.estimating[job.indices] = False
+        else:
+            self.making.discard((self.batches[job.batch], job.candidate))
+
+    def has_losses(self, job: Job) -> bool:
+        """Return whether a pair of a job had a lost job of the same kind."""
+        if isinstance(job, SceneJob):
+            return False
+        losses = self.losses[list(job.indices)]
+        kind = losses[:, ESTIMATE] if isinstance(job, EstimateJob) else losses[:, :ESTIMATE]
+        return bool(kind.any())
 
     def note_reason(self, index: int, what: str, reason: str) -> None:
         self.reasons.setdefault(index, {})[what] = reason
@@ -454,31 +475,22 @@ class State:
         self.unreadable[index] = True
         self.note_reason(index, "", reason)
 
-    def lose_units(
-        self, indices: Sequence[int], units: Sequence[int], reason: str
-    ) -> list[tuple[int, int]]:
-        """Count a lost job of these units, or of the estimate, on these pairs. Return what is given up now."""
+    def lose(self, job: MatchJob | EstimateJob, reason: str) -> list[tuple[int, str]]:
+        """Count a lost job of its pairs. Return the pairs and units that are given up now."""
         given_up = []
-        for index in indices:
-            for unit in units:
-                if self.losses[index, unit] < GIVEN_UP:
-                    self.losses[index, unit] += 1
-                    if self.losses[index, unit] == GIVEN_UP:
-                        given_up.append((index, unit))
-                        self.note_reason(index, self._title(unit), reason)
+        for index, unit in product(job.indices, self.columns_of(job)):
+            if self.losses[index, unit] < GIVEN_UP:
+                self.losses[index, unit] += 1
+                if self.losses[index, unit] == GIVEN_UP:
+                    given_up.append((index, self.titles[unit]))
+                    self.note_reason(index, self.titles[unit], reason)
         return given_up
 
-    def _title(self, unit: int) -> str:
-        return "estimate" if unit == ESTIMATE else self.units[unit].name
-
-    def take_back(self, indices: Sequence[int], units: Sequence[int]) -> None:
+    def take_back(self, job: MatchJob | EstimateJob) -> None:
         """Forget a lost job of a place that was at fault."""
-        for index in indices:
-            for unit in units:
-                if 0 < self.losses[index, unit] <= GIVEN_UP:
-                    self.losses[index, unit] -= 1
-                    self.reasons.get(index, {}).pop(self._title(unit), None)
-                    self.dirty[index] = True
+        for index, unit in product(job.indices, self.columns_of(job)):
+            if 0 < self.losses[index, unit] <= GIVEN_UP:
+                self.losses[index, unit] -= 1
 
     def refuse(self, refused: Mapping[str, str]) -> None:
         """Skip the units whose matchers cannot be loaded."""
@@ -503,12 +515,6 @@ class State:
         self.unit_losses[:] = 0
         self.dead[:] = False
         self.refused = {}
-        names = {unit.name for unit in self.units}
-        self.reasons = {
-            index: {what: reason for what, reason in reasons.items() if what not in names}
-            for index, reasons in self.reasons.items()
-        }
-        self.dirty[:] = True
 
     def take_dirty(self, more: Iterable[int] = ()) -> list[int]:
         """Return the pairs that have changed since the last call, and ``more``."""

@@ -18,8 +18,7 @@ from mkpc_kaggle.data.competition import (
     read_rows,
     read_submission,
 )
-from mkpc_kaggle.engine.frames import matrices_of
-from mkpc_kaggle.engine.request import RunReport
+from mkpc_kaggle.engine.frames import Results, matrices_of
 from mkpc_kaggle.engine.session import Session, run_pairs
 from mkpc_kaggle.errors import UserError, plural
 from mkpc_kaggle.geometry import metrics
@@ -95,7 +94,7 @@ class Validation:
 
     recipe: str
     scenes: tuple[SceneScore, ...]
-    report: RunReport | None = None
+    report: Results | None = None
     steps: tuple[Step, ...] = ()
     missing: tuple[str, ...] = ()
 
@@ -123,14 +122,12 @@ def validate(
     steps = [Step.MAGSAC]
     if assembly.recipe.focal is not None:
         steps.append(Step.PRIOR)
-    if (report.tables.pairs["choice"] != "").any():
+    if (report.pairs["choice"] != "").any():
         steps.append(Step.SCENE)
     rows = itertools.count()  # in the order of the pairs
     scored = []
     for scene in scenes:
-        scores = [
-            score_pair(true, report.tables.pairs, next(rows), scene, steps) for true in scene.pairs
-        ]
+        scores = [score_pair(true, report.pairs, next(rows), scene, steps) for true in scene.pairs]
         scored.append(SceneScore(scene.name, tuple(scores)))
     return Validation(assembly.recipe.name, tuple(scored), report, tuple(steps))
 

@@ -92,6 +92,8 @@ class Writer:
         """Begin to write the files of the scene with this key."""
         folder = self._out / WORK / SCENES / scene
         if scene != self._scene:
+            if self._child is None:
+                keep_former(self._out)
             self.__exit__()
             self._scene = scene
             self._child = Child(write_results, self._root, self._out, folder)

@@ -14,14 +14,7 @@ from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.data.masks import Masks
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.console import logger
-from mkpc_kaggle.engine.session import (
-    Interrupt,
-    Session,
-    interruptible,
-    opened_run,
-    opened_store,
-    request_of,
-)
+from mkpc_kaggle.engine.session import Interrupt, Session, interruptible, run_pairs
 from mkpc_kaggle.engine.state import State
 from mkpc_kaggle.errors import UserError, plural, temporary_directory
 from mkpc_kaggle.matchers.contract import Matcher
@@ -35,7 +28,6 @@ from mkpc_kaggle.reconstruction.outputs import (
     SCENES,
     WORK,
     Writer,
-    keep_former,
     remove_results,
     require_out,
 )
@@ -217,26 +209,18 @@ def _run(
             if batch in state.scenes:
                 writer.update(state.scenes[batch].key)
 
-        request = request_of(
+        report = run_pairs(
             pairs,
             assembly,
             session,
             str(root),
-            {batch: list(names.values())},
             scenes_dir=out / WORK / SCENES,
+            files={batch: list(names.values())},
             publish=publish,
         )
-        folders = {file.parent for file in files}
-        with (
-            opened_store(session) as store,
-            opened_run(request, assembly, session, store, folders) as run,
-        ):
-            keep_former(out)
-            run.run()
-            failures = [*run.state.scene_failures.values()]
-            report = run.report()
-        problems = [trouble(report), report.unwritten, report.unsaved, *failures]
-        has_models = report.tables.scenes["models"].any()
+        failures = report.about.failures
+        problems = [trouble(report), report.about.unwritten, report.about.unsaved, *failures]
+        has_models = report.scenes["models"].any()
         models: list[SfmModel] = []
         try:
             models = writer.next(session.must_end())

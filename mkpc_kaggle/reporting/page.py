@@ -19,9 +19,7 @@ from mkpc_kaggle.progress import counted
 from mkpc_kaggle.reporting.figures import encode
 from mkpc_kaggle.reporting.summary import (
     counts,
-    ending_of,
     failures,
-    faults_of,
     headline,
     left_out_line,
     unit_table,
@@ -90,17 +88,16 @@ def write_page(found: Results, path: Path, pairs: Sequence[Pair] = ()) -> None:
 
 def page(found: Results, pairs: Sequence[Pair] = ()) -> str:
     """Return an HTML document that needs no network. All text from files is escaped."""
-    title = headline(*ending_of(found), found.pairs, found.scenes)
     about = found.about
+    title = headline(found)
     versions = ", ".join(f"{name} {version}" for name, version in about.versions.items())
     settings = f"recipe {found.recipe.name}, {about.device}; {versions}"
-    lost = failures(found.pairs, found.units, found.scenes, faults_of(found))
     left_out = left_out_line(found.recipe, about.left_out)
     body = [
         f"<h1>{escape(title)}</h1>",
         *paragraphs(counts(found.pairs, found.scenes)),
         *paragraphs(filter(None, [settings, left_out]), "dim"),
-        *section("What failed", paragraphs(lost)),
+        *section("What failed", paragraphs(failures(found))),
         *section("Cameras", cameras_of(found)),
         *section("Pairs with the fewest inliers", pictures(found, pairs)),
         *section("Pairs", table(found.pairs.sort_values("inliers", kind="stable"), SHOWN_OF_PAIRS)),

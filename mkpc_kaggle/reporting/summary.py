@@ -1,12 +1,11 @@
 """The summary of a run, which the terminal and the page show: a headline, counts, what failed."""
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from mkpc_kaggle.engine.console import EventKind
 from mkpc_kaggle.engine.frames import NOT_REACHED, Results
-from mkpc_kaggle.engine.request import Ending, RunReport
+from mkpc_kaggle.engine.request import Ending
 from mkpc_kaggle.errors import plural
 from mkpc_kaggle.progress import format_duration
 from mkpc_kaggle.recipe import Recipe
@@ -27,62 +26,33 @@ SOURCES_OF_F = {
 }
 
 
-def summary(report: RunReport) -> str:
-    """Return the summary at the end of a run, in up to 15 lines."""
-    pairs = report.tables.pairs
-    units = report.tables.units
-    scenes = report.tables.scenes
-    title = headline(report.ending, report.seconds, pairs, scenes)
-    title += f"; {plural(report.units_run, 'unit')} run, {report.estimated} F estimated"
-    if report.resumed:
-        title += f", {plural(report.resumed, 'pair')} from earlier runs"
-    means = unit_table(units)
+def summary(found: Results) -> str:
+    """Return the summary of a run, in up to 15 lines."""
+    about = found.about
+    title = headline(found)
+    title += f"; {plural(about.units_run, 'unit')} run, {about.estimated} F estimated"
+    if about.resumed:
+        title += f", {plural(about.resumed, 'pair')} from earlier runs"
+    means = unit_table(found.units)
     rows = means[:MAX_UNITS].to_string().splitlines() if len(means) else []
-    failed = failures(pairs, units, scenes, report.faults)
-    last = trouble(report) or pending(report.ending, pairs, scenes)
     lines = [
         title,
-        *counts(pairs, scenes),
+        *counts(found.pairs, found.scenes),
         *rows,
-        *first(failed, MAX_FAILURES),
-        last,
+        *first(failures(found), MAX_FAILURES),
+        trouble(found) or pending(found),
     ]
     return "\n".join(filter(None, lines))
 
 
-def overview(found: Results) -> str:
-    """Return the summary of a run from its journal."""
-    ending, seconds = ending_of(found)
-    failed = failures(found.pairs, found.units, found.scenes, faults_of(found))
-    lines = [
-        headline(ending, seconds, found.pairs, found.scenes),
-        *counts(found.pairs, found.scenes),
-        *first(failed, MAX_FAILURES),
-    ]
-    return "\n".join(lines)
-
-
-def headline(ending: str, seconds: float, pairs: "DataFrame", scenes: "DataFrame") -> str:
+def headline(found: Results) -> str:
     """Return a line: how the run ended, its duration, and the numbers of F and of cameras."""
-    found = f"{is_solved(pairs).sum()} of {plural(len(pairs), 'pair')} with an F"
+    pairs, scenes = found.pairs, found.scenes
+    text = f"{is_solved(pairs).sum()} of {plural(len(pairs), 'pair')} with an F"
     if len(scenes):
         images = plural(int(scenes["images"].sum()), "image")
-        found += f", {scenes['cameras'].sum()} of {images} with a camera"
-    return f"{ending} after {format_duration(seconds)}: {found}"
-
-
-def ending_of(found: Results) -> tuple[str, float]:
-    """Return how the last session of a run ended, and its duration until the last event."""
-    if not found.events:
-        return "not ended", 0.0
-    last = found.events[-1]
-    ended = last.kind == EventKind.END
-    return last.text if ended else "not ended (at work, or killed)", last.seconds
-
-
-def faults_of(found: Results) -> list[str]:
-    """Return the faults of the last session."""
-    return [event.text for event in found.events if event.kind == EventKind.FAULT]
+        text += f", {scenes['cameras'].sum()} of {images} with a camera"
+    return f"{found.ending} after {format_duration(found.about.seconds)}: {text}"
 
 
 def counts(pairs: "DataFrame", scenes: "DataFrame") -> list[str]:
@@ -114,10 +84,9 @@ def unit_table(units: "DataFrame") -> "DataFrame":
     return means.rename_axis(None)
 
 
-def failures(
-    pairs: "DataFrame", units: "DataFrame", scenes: "DataFrame", faults: Iterable[str]
-) -> list[str]:
+def failures(found: Results) -> list[str]:
     """Return a line for each kind of failure: of pairs, batches, images and units; then all faults."""
+    pairs, units, scenes = found.pairs, found.units, found.scenes
     unsolved = pairs[is_reached(pairs) & ~is_solved(pairs)]
     lines = grouped(unsolved, "pair", "pair", "without an F")
     is_pending = scenes["failure"] == NOT_RECONSTRUCTED
@@ -130,7 +99,7 @@ def failures(
     raised = units[units["failure"] != ""]
     for name, rows in raised.groupby("unit", sort=False):
         lines += grouped(rows, "pair", "pair", f"without {name}")
-    return [*lines, *faults]
+    return [*lines, *found.about.faults]
 
 
 def grouped(rows: "DataFrame", column: str, noun: str, without: str) -> list[str]:
@@ -157,8 +126,9 @@ def first(lines: Sequence[str], most: int) -> list[str]:
     return shown
 
 
-def pending(ending: str, pairs: "DataFrame", scenes: "DataFrame") -> str:
+def pending(found: Results) -> str:
     """Return a line on the pairs and batches that the run did not reach; empty without any."""
+    pairs, scenes = found.pairs, found.scenes
     # A pair may have an F from a scene without being matched.
     has_f = pairs["source"].isin(["scene", "pair"])
     waiting = int((~is_reached(pairs) & ~has_f).sum())
@@ -168,7 +138,7 @@ def pending(ending: str, pairs: "DataFrame", scenes: "DataFrame") -> str:
         parts.append(f"{plural(waiting, 'pair')} left")
     if batches:
         parts.append(f"{plural(batches, 'batch')} left")
-    if not parts and ending != Ending.INTERRUPTED:
+    if not parts and found.ending is not Ending.INTERRUPTED:
         return ""
     return "; ".join([*parts, "run the same command to continue"])
 
@@ -181,16 +151,16 @@ def is_reached(pairs: "DataFrame") -> "Series[bool]":
     return pairs["failure"] != NOT_REACHED
 
 
-def trouble(report: RunReport) -> str:
+def trouble(found: Results) -> str:
     """Return why a run with a complete file failed, or an empty string.
 
     A pair without an F counts only if an error is the cause, rather than few matches or little
     time.
     """
     # Nothing could run, so counts of pairs would say nothing.
-    if report.ending in (Ending.NO_WORKER, Ending.NOTHING_RUNS):
-        return f"the run failed: {report.ending}, the faults say why; the same command resumes"
-    pairs = report.tables.pairs
+    if found.ending in (Ending.NO_WORKER, Ending.NOTHING_RUNS):
+        return f"the run failed: {found.ending}, the faults say why; the same command resumes"
+    pairs = found.pairs
     reached = pairs[is_reached(pairs)]
     reasons = Counter(filter(None, reached["error"]))
     # Single unreadable images are normal; most pairs without an F are not.

@@ -11,13 +11,14 @@ import cv2
 import numpy as np
 import pytest
 from faulty import choose_scene_for_all_but_the_first, scenes_by
+from pandas.testing import assert_frame_equal
 from rectified import SIZE, THREE_UNITS, RectifiedMatcher, batch_pairs, run
 from simulator import Scenario, memory_store, simulate
 from synthetic import QUICK, SyntheticMatcher, synthetic_pairs
 
 from mkpc_kaggle.engine.budget import Budget
-from mkpc_kaggle.engine.frames import results
-from mkpc_kaggle.engine.request import Ending, RunReport, SceneJob
+from mkpc_kaggle.engine.frames import Results, results
+from mkpc_kaggle.engine.request import Ending, SceneJob
 from mkpc_kaggle.engine.session import Interrupt, Session, run_pairs
 from mkpc_kaggle.engine.store import Store
 from mkpc_kaggle.engine.worker import compute_scene
@@ -44,9 +45,9 @@ def solve(made: list[SceneJob], disagreements: dict[str, float], job: SceneJob) 
     return replace(found, choices=choices, disagreement=disagreements[job.candidate])
 
 
-def numbers(report: RunReport) -> set[float]:
+def numbers(report: Results) -> set[float]:
     """The numbers of the candidates whose F was written."""
-    return set(report.tables.pairs.query("source == 'scene'")["f11"])
+    return set(report.pairs.query("source == 'scene'")["f11"])
 
 
 def candidates(jobs: list[SceneJob]) -> list[str]:
@@ -62,13 +63,13 @@ def made(monkeypatch: pytest.MonkeyPatch) -> list[SceneJob]:
     return jobs
 
 
-def test_the_candidate_that_agrees_best_is_used(tmp_path, made):
+def test_the_candidate_that_agrees_best_is_used_and_no_other(tmp_path, made):
     pairs = batch_pairs(tmp_path / "images")
     report = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
     assert report.ending is Ending.COMPLETE
     assert candidates(made) == [ALL_UNITS, SUPPORTED, FIRST, LAST]
     assert numbers(report) == {3.0}
-    assert report.tables.scenes["candidate"].tolist() == [FIRST]
+    assert report.scenes["candidate"].tolist() == [FIRST]
     assert results(tmp_path / "work").scenes["candidate"].tolist() == [FIRST]
 
 
@@ -78,7 +79,7 @@ def test_a_candidate_is_a_result_under_its_key_and_is_not_made_twice(tmp_path, m
     del made[:]
     again = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
     assert made == []
-    assert again.tables.scenes.equals(first.tables.scenes)
+    assert_frame_equal(again.scenes, first.scenes)
     # Fewer candidates are no reason to make the first again, more make only the missing ones.
     one = replace(RECIPE, scene=SceneConfig())
     assert numbers(run(pairs, one, RectifiedMatcher(), tmp_path / "work")) == {1.0}
@@ -115,8 +116,8 @@ def test_a_candidate_that_is_lost_costs_itself_alone_and_the_next_run_tries_it_a
     assert report.ending is Ending.COMPLETE
     assert numbers(report) == {4.0}
     fault = f"batch one was not reconstructed by the tracks of {FIRST}"
-    assert any(each.startswith(fault) for each in report.faults)
-    assert report.tables.scenes["failure"].tolist() == [""]
+    assert any(each.startswith(fault) for each in report.about.faults)
+    assert report.scenes["failure"].tolist() == [""]
     del made[:]
     scenes_by(monkeypatch, partial(solve, made, DISAGREEMENTS))
     again = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
@@ -161,9 +162,9 @@ def test_interrupted_and_resumed_runs_choose_as_an_undisturbed_one(until):
     store = memory_store()
     cut = simulate(scenario, store, until=until)
     resumed = simulate(scenario, store)
-    chosen = [ran.report.tables.scenes["candidate"].tolist() for ran in (whole, resumed)]
-    assert chosen[0] == chosen[1]
-    assert len(set(chosen[0])) > 1, "a choice was made"
+    chosen = whole.report.scenes["candidate"].tolist()
+    assert resumed.report.scenes["candidate"].tolist() == chosen
+    assert len(set(chosen)) > 1, "a choice was made"
     # What an interrupted process was making is made again, and nothing else.
     again = Counter(scene.batch for scene in [*cut.scenes, *resumed.scenes])
     assert sum(again.values()) <= sum(jobs.values()) + 1
@@ -191,7 +192,7 @@ def test_each_candidate_has_its_files_of_colmap_and_one_without_them_is_made_aga
         assembly = assemble(recipe, matchers={matcher.name: matcher}, device="cpu")
         session = Session(tmp_path / "work", Budget(time.monotonic()), Interrupt(), progress=False)
         report = run_pairs(pairs, assembly, session, scenes_dir=scenes)
-        assert report.tables.scenes["candidate"].tolist() == [units[1].name]
+        assert report.scenes["candidate"].tolist() == [units[1].name]
         with Store.read(tmp_path / "work") as store:
             ((_, key, _),) = json.loads(store.db.execute("SELECT about FROM run").fetchone()[0])[
                 "scenes"

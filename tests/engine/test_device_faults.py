@@ -27,8 +27,9 @@ from rectified import SECOND, SWEEP, THIRD, THREE_UNITS, RectifiedMatcher, matri
 from mkpc_kaggle.cli import main, options
 from mkpc_kaggle.data.competition import read_test_side, submission_problems
 from mkpc_kaggle.engine.budget import Costs
+from mkpc_kaggle.engine.frames import Results
 from mkpc_kaggle.engine.places import Place
-from mkpc_kaggle.engine.request import Ending, RunReport
+from mkpc_kaggle.engine.request import Ending
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.matchers.failures import DeviceError, FailureKind, failure_kind, reason_of
 from mkpc_kaggle.pipeline.assembly import Assembly, assemble
@@ -82,20 +83,20 @@ def test_each_error_is_a_kind_of_failure_by_its_text():
 
 
 @pytest.fixture
-def run_at(pairs, tmp_path, monkeypatch) -> Callable[..., RunReport]:
+def run_at(pairs, tmp_path, monkeypatch) -> Callable[..., Results]:
     """A run whose workers are at these places."""
 
-    def run_there(*places: Place, fallback: Sequence[Place] = ()) -> RunReport:
+    def run_there(*places: Place, fallback: Sequence[Place] = ()) -> Results:
         use_places(monkeypatch, *places, fallback=fallback)
         return run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
 
     return run_there
 
 
-def assert_as_if_nothing_had_failed(report: RunReport, undisturbed: RunReport) -> None:
+def assert_as_if_nothing_had_failed(report: Results, undisturbed: Results) -> None:
     assert report.ending is Ending.COMPLETE
     assert matrices(report) == matrices(undisturbed)
-    assert set(report.tables.units["failure"]) == {""}
+    assert set(report.units["failure"]) == {""}
 
 
 @pytest.mark.parametrize(
@@ -118,9 +119,9 @@ def test_a_device_that_fails_once_costs_a_worker_and_no_unit(run_at, undisturbed
     report = run_at(
         thread_place("cuda:0", FaultyMatcher(fault=break_device, once=tmp_path / "broken"))
     )
-    assert report.faults == (
-        f"a job was lost on cuda:0: the device failed: RuntimeError: {BROKEN}, in 1:rectified@96",
-    )
+    assert report.about.faults == [
+        f"a job was lost on cuda:0: the device failed: RuntimeError: {BROKEN}, in 1:rectified@96"
+    ]
     assert_as_if_nothing_had_failed(report, undisturbed)
 
 
@@ -149,9 +150,10 @@ def test_a_pair_that_fails_on_each_gpu_costs_its_own_units_and_no_gpu(
     assert report.ending is Ending.WITH_FAILURES
     assert cpu.calls == []
     assert [place.name for place in places if place.closed] == []
-    skipped = [event.text for event in report.explanations if "skipped" in event.text]
-    assert len(skipped) == len(THREE_UNITS.units)
-    assert all(f"on pair {VICTIM} (the device failed: RuntimeError: {error}" in s for s in skipped)
+    lost = report.units.query("failure != ''")
+    assert lost["unit"].tolist() == [unit.name for unit in THREE_UNITS.units]
+    assert set(lost["pair"]) == {report.pairs["pair"][VICTIM]}
+    assert lost["failure"].str.startswith(f"the device failed: RuntimeError: {error}").all()
     assert matrices(report)[:VICTIM] == matrices(undisturbed)[:VICTIM]
     assert matrices(report)[VICTIM + 1 :] == matrices(undisturbed)[VICTIM + 1 :]
 
@@ -174,8 +176,8 @@ def test_a_pair_that_spoils_its_process_costs_no_other_pair_a_unit(
     places = [thread_place(f"cuda:{n}", cpu, pipeline=started) for n in range(gpus)]
     report = run_at(*places, fallback=[thread_place("cpu", cpu)])
     assert (cpu.calls, [place.name for place in places if place.closed]) == ([], [])
-    failed = report.tables.units.query("failure != ''")
-    assert set(failed["pair"]) == {report.tables.pairs["pair"][VICTIM]}
+    failed = report.units.query("failure != ''")
+    assert set(failed["pair"]) == {report.pairs["pair"][VICTIM]}
     reasons = {reason.partition(", in ")[0] for reason in failed["failure"]}
     assert reasons == {f"the device failed: RuntimeError: {ASSERTED}"}
     assert matrices(report)[:VICTIM] == matrices(undisturbed)[:VICTIM]
@@ -192,7 +194,7 @@ def test_one_or_two_pairs_that_a_gpu_cannot_match_are_left_to_the_cpu(
     recipe = replace(THREE_UNITS, units=(SWEEP,))
     report = run(pairs[:count], recipe, RectifiedMatcher(), tmp_path / "work")
     assert report.ending is Ending.COMPLETE
-    assert set(report.tables.pairs["units"]) == {1}
+    assert set(report.pairs["units"]) == {1}
 
 
 def test_a_pair_on_which_a_device_failed_is_matched_by_a_healthy_one(run_at, undisturbed):
@@ -200,8 +202,8 @@ def test_a_pair_on_which_a_device_failed_is_matched_by_a_healthy_one(run_at, und
     # Slow enough that the other one gets pairs
     healthy = RectifiedMatcher(seconds=0.02)
     report = run_at(thread_place("cuda:0", broken), thread_place("cuda:1", healthy))
-    assert report.faults
-    assert all("a job was lost on cuda:0: the device failed" in fault for fault in report.faults)
+    assert report.about.faults
+    assert all("cuda:0: the device failed" in fault for fault in report.about.faults)
     assert_as_if_nothing_had_failed(report, undisturbed)
 
 
@@ -233,8 +235,8 @@ def test_a_unit_that_raises_is_no_measurement(pairs, tmp_path, monkeypatch):
 
     recipe = replace(THREE_UNITS, units=(SWEEP,))
     report = run(pairs, recipe, RectifiedMatcher(matches=answer), tmp_path / "work")
-    assert report.units_run == 3
-    assert (report.tables.units["failure"] != "").sum() == 9
+    assert report.about.units_run == 3
+    assert (report.units["failure"] != "").sum() == 9
     assert measured.count(SWEEP.name) == 3
 
 
@@ -279,14 +281,8 @@ def test_a_unit_too_large_for_the_memory_is_skipped_on_that_pair_alone_and_tried
     # Views above 100 pixels of the victim: its sweep at 96 succeeds.
     report = run_at(thread_place("cuda:0", FaultyMatcher(fault=exhaust_gpu, above=100)))
     assert report.ending is Ending.WITH_FAILURES
-    memory = "out of memory: RuntimeError: CUDA out of memory. Tried to allocate 20.00 GiB, in {0}"
-    told = [
-        f"{unit.name} is skipped on pair {VICTIM} ({memory.format(unit.name)})"
-        for unit in (SECOND, THIRD)
-    ]
-    assert [event.text for event in report.explanations if "skipped" in event.text] == told
-    victim = report.tables.pairs.loc[VICTIM]
-    units = report.tables.units
+    victim = report.pairs.loc[VICTIM]
+    units = report.units
     failures = units[units["pair"] == victim["pair"]].set_index("unit")["failure"]
     assert failures[SWEEP.name] == ""
     assert failures[[SECOND.name, THIRD.name]].str.startswith("out of memory").all()
@@ -303,7 +299,7 @@ def test_a_minibatch_too_large_for_the_memory_is_halved_once_and_no_worker_is_lo
 ):
     matcher = NarrowMatcher(most=2)
     report = run_at(thread_place("cuda:0", matcher, minibatch=8))
-    assert report.faults == ()
+    assert report.about.faults == []
     assert_as_if_nothing_had_failed(report, undisturbed)
     # Each further try of the large size would repeat the failure.
     too_large = [size for size in matcher.sizes if size > 2]
@@ -384,9 +380,9 @@ def test_a_matcher_that_a_worker_cannot_load_costs_its_units_alone_and_is_told_o
         pairs, recipe, RectifiedMatcher(), tmp_path / "work", more=[RectifiedMatcher(name="broken")]
     )
     assert_as_if_nothing_had_failed(report, undisturbed)
-    assert report.faults == (f"broken is left out: {told}",)
+    assert report.about.faults == [f"broken is left out: {told}"]
     assert capsys.readouterr().err.count(told) == 1
-    assert set(report.tables.pairs["units"]) == {3}
+    assert set(report.pairs["units"]) == {3}
 
 
 def test_a_worker_that_cannot_be_started_again_ends_the_run_with_all_rows(run_at):
@@ -401,6 +397,6 @@ def test_a_worker_that_cannot_be_started_again_ends_the_run_with_all_rows(run_at
 
     report = run_at(thread_place("cpu", broken, pipeline=once))
     assert report.ending is Ending.NO_WORKER
-    assert "cpu: the matchers cannot be loaded: the weights are gone" in report.faults
-    assert report.tables.pairs["units"][0] > 0
-    assert len(report.tables.pairs) == COUNT
+    assert "cpu: the matchers cannot be loaded: the weights are gone" in report.about.faults
+    assert report.pairs["units"][0] > 0
+    assert len(report.pairs) == COUNT

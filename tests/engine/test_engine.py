@@ -18,16 +18,17 @@ from rectified import (
     write_pairs,
 )
 
-from mkpc_kaggle.engine.request import Ending, RunReport
+from mkpc_kaggle.engine.frames import Results
+from mkpc_kaggle.engine.request import Ending
 from mkpc_kaggle.engine.session import Interrupt
 from mkpc_kaggle.engine.state import State
 from mkpc_kaggle.pipeline.stages import Pipeline
 
 
-def units(report: RunReport) -> list[list[str]]:
+def units(report: Results) -> list[list[str]]:
     """The names of the units of each pair."""
-    rows = dict(list(report.tables.units.groupby("pair")))
-    return [rows[pair]["unit"].tolist() for pair in report.tables.pairs["pair"]]
+    rows = dict(list(report.units.groupby("pair")))
+    return [rows[pair]["unit"].tolist() for pair in report.pairs["pair"]]
 
 
 def after_calls(count: int, act: Callable[[], None]) -> Callable[[int], int]:
@@ -46,7 +47,7 @@ def test_a_run_without_a_limit_gives_every_pair_every_unit(tmp_path):
     report = run(write_pairs(tmp_path, 11), THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
     assert report.ending is Ending.COMPLETE
     assert units(report) == [[SWEEP.name, SECOND.name, THIRD.name]] * 11
-    pairs = report.tables.pairs
+    pairs = report.pairs
     assert (pairs["failure"] == "").all()
     # Stage 2 sees the critical region only, so a few points at its border are lost.
     assert pairs["matches"].between(351, 450).all()
@@ -54,7 +55,7 @@ def test_a_run_without_a_limit_gives_every_pair_every_unit(tmp_path):
     for own in pairs["own"]:
         F = np.reshape(own, (3, 3))
         np.testing.assert_allclose(np.abs(F[1:, 1:]), [[0, 0.5**0.5], [0.5**0.5, 0]], atol=2e-3)
-    assert all(match.regions for match in report.tables.matches(*pairs["pair"]))
+    assert all(match.regions for match in report.matches(*pairs["pair"]))
 
 
 def test_every_published_version_is_complete_and_the_first_comes_before_any_work(tmp_path):
@@ -80,7 +81,7 @@ def test_an_interrupted_run_resumes_and_ends_with_the_same_bytes(tmp_path):
     first = RectifiedMatcher(matches=after_calls(25, interrupt.set))
     cut = run(pairs, THREE_UNITS, first, tmp_path / "work", interrupt=interrupt)
     assert cut.ending is Ending.INTERRUPTED
-    assert cut.tables.pairs["units"].any(), "results are saved"
+    assert cut.pairs["units"].any(), "results are saved"
     second = RectifiedMatcher()
     resumed = run(pairs, THREE_UNITS, second, tmp_path / "work")
     assert matrices(resumed) == matrices(undisturbed)
@@ -100,7 +101,7 @@ def test_a_finished_run_loads_no_matcher_again(tmp_path, monkeypatch):
     twice = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
     assert not loaded
     assert matrices(once) == matrices(twice)
-    assert twice.resumed == 3
+    assert twice.about.resumed == 3
 
 
 @pytest.mark.parametrize(
@@ -126,7 +127,7 @@ def test_a_unit_that_never_returns_holds_the_run_neither_past_its_limit_nor_afte
         )
         assert not released.is_set(), "the run ends while the unit is under way"
         assert report.ending is ending
-        assert len(report.tables.pairs) == 12
-        assert report.tables.pairs["units"][0] > 0
+        assert len(report.pairs) == 12
+        assert report.pairs["units"][0] > 0
     finally:
         released.set()

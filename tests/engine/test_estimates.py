@@ -66,7 +66,7 @@ def test_a_run_resumed_with_another_estimation_ends_with_the_bytes_of_a_fresh_on
         assert written == fresh[name], name
         # Without the scene F is that of the pairs' own matches, which the journal has.
         estimated = 0 if name == "no scene" else 6
-        assert (report.units_run, report.estimated) == (0, estimated)
+        assert (report.about.units_run, report.about.estimated) == (0, estimated)
         stored = results(journal).recipe
         assert stored == replace(recipe, name=stored.name)
     assert "0 units run, 6 F estimated" in summary(report)

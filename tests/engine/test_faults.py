@@ -43,7 +43,7 @@ def test_worker_processes_give_the_bytes_of_a_run_in_this_process_and_estimate_f
     )
     report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work", workers=2)
     assert report.ending is Ending.COMPLETE
-    assert report.faults == ()
+    assert report.about.faults == []
     assert matrices(report) == matrices(undisturbed)
 
 
@@ -58,7 +58,7 @@ def test_a_worker_lost_once_costs_time_alone(pairs, undisturbed, tmp_path, fault
     matcher = FaultyMatcher(fault=fault, once=tmp_path / "once")
     report = run(pairs, THREE_UNITS, matcher, tmp_path / "work", workers=1)
     assert report.ending is Ending.COMPLETE
-    assert [reason in fault for fault in report.faults] == [True]
+    assert [reason in fault for fault in report.about.faults] == [True]
     assert matrices(report) == matrices(undisturbed)
 
 
@@ -126,7 +126,7 @@ def test_a_run_whose_store_is_full_keeps_its_results_in_memory(
     # SQLite then reports a full disk after a few results.
     monkeypatch.setattr(Store, "open", partial(small_store, 40))
     report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
-    assert any("is full" in fault for fault in report.faults)
+    assert any("is full" in fault for fault in report.about.faults)
     assert matrices(report) == matrices(undisturbed)
     # Later there is room: what was not written is computed again.
     monkeypatch.undo()
@@ -150,7 +150,7 @@ def test_an_error_of_the_disk_when_points_are_read_costs_a_job_and_the_run_goes_
     monkeypatch.setattr(Source, "matches", failing)
     report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
     assert report.ending is Ending.COMPLETE
-    assert any("disk I/O error" in fault for fault in report.faults)
+    assert any("disk I/O error" in fault for fault in report.about.faults)
     assert matrices(report) == matrices(undisturbed)
 
 
@@ -195,8 +195,8 @@ def test_results_whose_file_cannot_be_written_stay_in_the_table_for_the_next_run
         raise OSError(28, "No space left on device")
 
     report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work", publish=full)
-    assert "No space left on device" in report.unwritten
-    assert report.faults == (report.unwritten,)
+    assert "No space left on device" in report.about.unwritten
+    assert report.about.faults == [report.about.unwritten]
     with Store.read(tmp_path / "work") as store:
         assert results_of(store).pairs["units"].tolist() == [3] * 12
     written: list[list[bytes]] = []
@@ -205,7 +205,7 @@ def test_results_whose_file_cannot_be_written_stay_in_the_table_for_the_next_run
         written.append([F.tobytes() for F in state.fundamentals])
 
     resumed = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work", publish=note)
-    assert (resumed.units_run, resumed.estimated) == (0, 0)
+    assert (resumed.about.units_run, resumed.about.estimated) == (0, 0)
     assert written[0] == matrices(undisturbed), "before any work"
 
 
@@ -286,7 +286,7 @@ def test_scenes_are_reconstructed_after_the_terminal_closed(demo, small_recipe, 
     command = [*script, *arguments_of(demo, small_recipe, output)]
     assert on_a_terminal(command, is_read=True) == 0
     found = results(tmp_path / "submission.work")
-    assert "fault" not in {event.kind for event in found.events}
+    assert found.about.faults == []
     assert len(found.scenes) == 1
 
 
@@ -377,7 +377,7 @@ def test_a_parent_killed_at_any_moment_leaves_a_complete_file_no_orphans_and_a_r
     # A process that was killed cannot remove its unfinished file; the next one does.
     assert list(tmp_path.glob(".*.part")) == []
     written = matrices_of(results(tmp_path / "work").pairs)
-    assert written.tolist() == matrices_of(undisturbed.tables.pairs).tolist()
+    assert written.tolist() == matrices_of(undisturbed.pairs).tolist()
 
 
 GUARDED = """

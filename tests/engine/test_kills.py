@@ -24,10 +24,10 @@ from synthetic import RECIPE, SyntheticMatcher, synthetic_pairs
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine import places, session
 from mkpc_kaggle.engine.budget import Budget
-from mkpc_kaggle.engine.frames import matrices_of
+from mkpc_kaggle.engine.frames import Results, matrices_of
 from mkpc_kaggle.engine.places import LocalSite
 from mkpc_kaggle.engine.process import ProcessWorker
-from mkpc_kaggle.engine.request import Ending, RunReport
+from mkpc_kaggle.engine.request import Ending
 from mkpc_kaggle.geometry.robust import RobustConfig
 
 BATCHES = WORKERS = 3  # in a run so many scene workers and so many matching workers are disturbed
@@ -139,9 +139,9 @@ def forks(monkeypatch) -> None:
     on_fork(monkeypatch, tell_worker)
 
 
-def matrices(report: RunReport, batches: set[str], pairs: list[Pair]) -> list[bytes]:
-    own = report.tables.pairs["own"]
-    rows = zip(pairs, own, matrices_of(report.tables.pairs), strict=True)
+def matrices(report: Results, batches: set[str], pairs: list[Pair]) -> list[bytes]:
+    own = report.pairs["own"]
+    rows = zip(pairs, own, matrices_of(report.pairs), strict=True)
     return [
         own.tobytes() + written.tobytes() for pair, own, written in rows if pair.group in batches
     ]
@@ -171,20 +171,20 @@ def test_a_run_whose_workers_are_killed_and_stopped_at_random_moments_ends_as_th
     monkeypatch.setattr("mkpc_kaggle.engine.run.RESTART_PAUSE_S", 0.0)
     monkeypatch.setattr(session, "LocalSite", PatientSite)
 
-    def run_whole(name: str) -> RunReport:
+    def run_whole(name: str) -> Results:
         DoomedWorker.spared.discard(A_SCENE)
         report = run(
             pairs, QUICK, SyntheticMatcher(), tmp_path / name, budget=budget, workers=WORKERS
         )
-        assert report.ending is Ending.COMPLETE, report.faults
-        assert report.tables.pairs["units"].all()
+        assert report.ending is Ending.COMPLETE, report.about.faults
+        assert report.pairs["units"].all()
         # Neither a stopped process nor one that was just started may stay behind.
         for process in multiprocessing.active_children():
             assert has_ended(process), process
         return report
 
     undisturbed = run_whole("undisturbed")
-    assert undisturbed.faults == ()
+    assert undisturbed.about.faults == []
     # Later moments are drawn from the whole life of a worker, its start and its end included.
     for worker in DoomedWorker.known.values():
         longest = DoomedWorker.lives.get(worker.kind, 0.0)
@@ -192,13 +192,12 @@ def test_a_run_whose_workers_are_killed_and_stopped_at_random_moments_ends_as_th
     compared = 0
     while len(DoomedWorker.sent) < moments:
         report = run_whole(f"disturbed {len(DoomedWorker.sent)}")
-        # "UNIT is skipped on pair INDEX (...)": a pair whose unit was lost twice may differ.
-        texts = [event.text for event in report.explanations]
-        skipped = {text.split()[4] for text in texts if " is skipped on pair " in text}
-        given_up = {pairs[int(index)].group for index in skipped}
+        # A pair whose unit was lost twice may differ.
+        lost = report.units.query("failure != ''")["pair"]
+        given_up = {pair.group for pair in pairs if pair.id in set(lost)}
         intact = {pair.group for pair in pairs} - given_up
         assert matrices(report, intact, pairs) == matrices(undisturbed, intact, pairs), (
-            report.faults
+            report.about.faults
         )
         compared += len(intact)
     # Otherwise some kind of worker, or one of the signals, was not tested.

@@ -24,8 +24,8 @@ from simulator import Scenario, memory_store, simulate
 
 from mkpc_kaggle.cli import main
 from mkpc_kaggle.demo import DemoSet
-from mkpc_kaggle.engine.frames import results
-from mkpc_kaggle.engine.request import Ending, RunReport
+from mkpc_kaggle.engine.frames import Results, results
+from mkpc_kaggle.engine.request import Ending
 
 FIRST = '{ stage = 1, matcher = "sift", long_side = 320 }'
 SECOND = '{ stage = 2, matcher = "sift", long_side = 400 }'
@@ -192,14 +192,14 @@ def test_a_run_cut_by_its_limit_at_a_random_moment_and_finished_later_has_the_by
         assert matches_of_units(report) == matches_of_units(undisturbed)
 
 
-def matches_of_units(report: RunReport) -> list[list[object]]:
-    return report.tables.units[["pair", "unit", "matches"]].to_numpy().tolist()
+def matches_of_units(report: Results) -> list[list[object]]:
+    return report.units[["pair", "unit", "matches"]].to_numpy().tolist()
 
 
-def failed_units(report: RunReport) -> list[tuple[int, str]]:
+def failed_units(report: Results) -> list[tuple[int, str]]:
     """The index of the pair and the name of each unit that failed."""
-    indices = {pair: index for index, pair in enumerate(report.tables.pairs["pair"])}
-    failed = report.tables.units.query("failure != ''")
+    indices = {pair: index for index, pair in enumerate(report.pairs["pair"])}
+    failed = report.units.query("failure != ''")
     return [(indices[pair], unit) for pair, unit in failed[["pair", "unit"]].to_numpy()]
 
 
@@ -209,7 +209,7 @@ def test_the_next_run_repeats_only_units_that_raised(pairs, undisturbed, tmp_pat
     assert failed.ending is Ending.WITH_FAILURES
     assert failed_units(failed) == [(3, unit.name) for unit in THREE_UNITS.units[1:]]
     mended = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
-    assert mended.units_run == 2
+    assert mended.about.units_run == 2
     assert matrices(mended) == matrices(undisturbed)
     assert failed_units(mended) == []
 

@@ -30,7 +30,6 @@ from mkpc_kaggle.engine.plan import (
     Crew,
     MatchPlan,
     NextWork,
-    outlook,
     plan,
     prefix_that_fits,
     time_left,
@@ -207,17 +206,6 @@ def test_a_first_unit_that_never_runs_leaves_the_sweep_to_the_next_of_stage_1():
     assert swept == [2] * 5
 
 
-def test_no_forecast_is_printed_before_all_units_were_measured():
-    run = Planned(limit=1000.0, had=[(SWEEP,)] * 40)
-    told = lambda: outlook(run.state, run.costs, run.budget, run.crew, 0.0)  # noqa: E731
-    run.learn(SWEEP, THIRD)
-    assert told() == ""
-    run.learn(SECOND)
-    assert told().startswith(
-        "all units on all pairs would take 1m52s; 3 of 3 units can run in the remaining "
-    )
-
-
 def test_a_part_of_many_due_estimates_is_handed_out_and_nothing_forgets_the_others(monkeypatch):
     monkeypatch.setattr(plan_module, "MAX_DUE", 3)
     run = Planned(count=8, had=[UNITS] * 8)
@@ -313,7 +301,7 @@ def test_more_time_never_means_fewer_units():
 
 def units_of(ran):
     """The number of results of units of all pairs."""
-    return int((ran.report.tables.units["failure"] == "").sum())
+    return int((ran.report.units["failure"] == "").sum())
 
 
 def test_random_runs_are_never_late_never_lose_a_row_and_use_their_time():
@@ -382,7 +370,7 @@ def test_a_scene_that_hangs_is_ended_and_the_others_have_their_turn():
     ran = simulate(Scenario(900, (0.5, 1.0), 1, 7200.0, batches=9, scene_faults=0.4, seed=3))
     assert any(scene.seconds == math.inf for scene in ran.scenes)
     assert ran.late == ran.lost == ran.missed == 0
-    assert any("the worker hung" in fault for fault in ran.report.faults)
+    assert any("the worker hung" in fault for fault in ran.report.about.faults)
 
 
 @pytest.mark.parametrize("moment", [50, 450, 850])
@@ -411,7 +399,7 @@ def test_the_simulator_counts_no_time_as_wasted_in_which_there_is_nothing_to_do(
 def test_time_reserved_for_scenes_is_used_for_units_when_they_need_less():
     ran = simulate(Scenario(600, (0.1, 0.2, 0.3), 1, 280.0, warm_up=1, batches=1))
     assert ran.work_left
-    assert ran.report.seconds > 275.0
+    assert ran.report.about.seconds > 275.0
 
 
 def test_scenes_that_never_begin_are_named_and_the_run_ends(monkeypatch):
@@ -421,8 +409,8 @@ def test_scenes_that_never_begin_are_named_and_the_run_ends(monkeypatch):
     monkeypatch.setattr(SimulatedSite, "scene_worker", never_ready)
     ran = simulate(Scenario(300, (0.5, 1.0), 1, 900.0, batches=3, misses=0))
     assert ran.late == 0
-    assert explained(ran.report.faults, "scenes 0: the worker hung: no answer for ")
-    assert (ran.report.tables.scenes["failure"] != "").all()
+    assert explained(ran.report.about.faults, "scenes 0: the worker hung: no answer for ")
+    assert ran.report.scenes["failure"].all()
 
 
 def test_scenes_at_several_places_take_less_time_and_end_as_at_one():
@@ -434,8 +422,8 @@ def test_scenes_at_several_places_take_less_time_and_end_as_at_one():
     for places in (1, 4):
         ran = simulate(replace(scenario, scene_places=places))
         assert ran.missed == 0
-        seconds.append(ran.report.seconds)
-        written.append(matrices_of(ran.report.tables.pairs).tobytes())
+        seconds.append(ran.report.about.seconds)
+        written.append(matrices_of(ran.report.pairs).tobytes())
     assert seconds[1] < 0.6 * seconds[0]
     assert written[0] == written[1]
 
@@ -462,8 +450,9 @@ def test_a_lost_job_comes_back_as_single_units_and_a_unit_lost_twice_is_skipped_
     # First with the pair's other unit; then alone
     assert FailingSite.lost == [["2:m1@100", "1:m2@100"], ["1:m2@100"]]
     assert ran.given_up == ((2, 2),)
-    told = "1:m2@100 is skipped on pair 2 (the worker died: signal SIGKILL)"
-    assert explained(ran.report.explanations, told)
+    units = ran.report.units
+    (reason,) = units["failure"][units["unit"] == "1:m2@100"][2:3]
+    assert reason == "the worker died: signal SIGKILL"
     assert ran.report.ending is Ending.WITH_FAILURES
     assert units_of(ran) == 11
 
@@ -471,11 +460,13 @@ def test_a_lost_job_comes_back_as_single_units_and_a_unit_lost_twice_is_skipped_
 def test_a_unit_that_never_ran_is_skipped_on_all_pairs_after_two():
     ran = simulate(Scenario(200, (1.0,) * 3, 1, math.inf, misses=0, never="m1"))
     # On each pair it would cost two workers.
-    assert explained(ran.report.explanations, "2:m1@100 is skipped on all pairs: it never ran")
+    assert explained(ran.report.about.faults, "2:m1@100 is skipped on all pairs: it never ran")
     assert units_of(ran) == 400
     assert ran.closed == ()
     assert ran.report.ending is Ending.WITH_FAILURES
-    assert sum("lost" in fault for fault in ran.report.faults) == 1, "the same text is told once"
+    assert sum("was lost" in fault for fault in ran.report.about.faults) == 1, (
+        "the same text is told once"
+    )
 
 
 @pytest.mark.parametrize("seed", range(8))

@@ -75,7 +75,9 @@ def test_actors_give_the_bytes_of_a_run_in_one_process_though_an_actor_dies(
     matcher = FaultyMatcher(fault=die, once=tmp_path / "died")
     report = run(pairs, THREE_UNITS, matcher, tmp_path / "w", workers=f"ray://{cluster.address}")
     assert report.ending is Ending.COMPLETE
-    assert ["the worker died" in fault for fault in report.faults] == [True], report.faults
+    assert ["the worker died" in fault for fault in report.about.faults] == [True], (
+        report.about.faults
+    )
     assert matrices(report) == matrices(undisturbed)
     assert not ray.is_initialized(), "the run lets go of the cluster"
 
@@ -93,7 +95,7 @@ def test_a_machine_lost_during_the_run_costs_its_job_alone(cluster, pairs, undis
     threading.Thread(target=lose, daemon=True).start()
     report = run(pairs, THREE_UNITS, matcher, tmp_path / "w", workers=f"ray://{cluster.address}")
     assert report.ending is Ending.COMPLETE
-    assert "a job was lost on machine " in report.faults[0]
+    assert "a job was lost on machine " in report.about.faults[0]
     assert matrices(report) == matrices(undisturbed)
 
 
@@ -117,9 +119,9 @@ def test_batches_are_reconstructed_on_the_cluster_to_the_same_bytes(cluster, tmp
     here = run(batch, SYNTHETIC, SyntheticMatcher(), tmp_path / "here")
     workers = f"ray://{cluster.address}"
     report = run(batch, SYNTHETIC, SyntheticMatcher(), tmp_path / "w", workers=workers)
-    assert report.faults == ()
+    assert report.about.faults == []
     assert sources(report) == ["scene"] * len(batch)
-    chosen = [matrices_of(each.tables.pairs) for each in (report, here)]
+    chosen = [matrices_of(each.pairs) for each in (report, here)]
     assert np.array_equal(*chosen)
 
 

@@ -32,7 +32,7 @@ from mkpc_kaggle.engine.worker import batch_pair, results_of
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.recipe import SceneConfig
 from mkpc_kaggle.reporting.page import page
-from mkpc_kaggle.reporting.summary import overview, summary
+from mkpc_kaggle.reporting.summary import summary
 from mkpc_kaggle.scene.choose import Reason
 from mkpc_kaggle.scene.sfm import Solution
 from mkpc_kaggle.scene.view_graph import BatchPair
@@ -52,15 +52,15 @@ def test_pairs_get_the_f_of_their_scene_and_keep_their_own(tmp_path, monkeypatch
     report = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work", publish=publish)
     assert report.ending is Ending.COMPLETE
     assert sources(report) == ["pair"] + ["scene"] * 5
-    chosen = matrices_of(report.tables.pairs)
+    chosen = matrices_of(report.pairs)
     assert all(np.array_equal(F, SCENE_F) for F in chosen[1:])
     # A scene replaces no pair's own F: another setting of scenes may need it.
     assert matrices(report) == own_matrices(pairs, tmp_path / "alone")
-    assert report.tables.pairs["choice"][0] == Reason.CONTRADICTION
+    assert report.pairs["choice"][0] == Reason.CONTRADICTION
     assert np.array_equal(published[-1], chosen)
     found = results(tmp_path / "work")
-    assert "6 of 6 pairs with an F, 4 of 4 images with a camera" in overview(found)
-    assert "F: 5 from cameras, 1 from their own matches" in overview(found)
+    assert "6 of 6 pairs with an F, 4 of 4 images with a camera" in summary(found)
+    assert "F: 5 from cameras, 1 from their own matches" in summary(found)
     # The page has the counts of the terminal.
     assert "4 of 4 images with a camera" in summary(report)
     assert "4 of 4 images with a camera" in page(found)
@@ -93,7 +93,7 @@ def test_a_focal_length_of_exif_goes_to_the_pairs_the_store_and_the_scene(tmp_pa
             known = dict(store.db.execute("SELECT name, focal FROM image"))
         assert [(known[pair.file0], known[pair.file1]) for pair in pairs] == expected
         set_exif(pairs[0].images[0], tA405=28)
-    without, with_exif = (each.tables.pairs["own"] for each in reports)
+    without, with_exif = (each.pairs["own"] for each in reports)
     assert not np.array_equal(without[0], with_exif[0])
     assert np.array_equal(without[2], with_exif[2]), "the pair of the other images"
     assert [pair.images[0].focal for pair in jobs[-1].pairs] == [told, told, 0]
@@ -119,9 +119,9 @@ def test_a_reconstruction_that_is_lost_costs_its_scene_alone_is_named_and_tried_
     assert report.ending is Ending.WITH_FAILURES
     assert matrices(report) == own_matrices(pairs, tmp_path / "alone")
     assert sources(report) == ["pair"] * 6
-    (fault,) = report.faults[1:]
+    (fault,) = report.about.faults[1:]
     assert fault.startswith(f"batch one was not reconstructed: {reason}")
-    assert report.tables.scenes["failure"][0].startswith(reason)
+    assert report.scenes["failure"][0].startswith(reason)
     assert f"1 batch without cameras ({reason}" in summary(report)
     # pycolmap prints to the descriptors, which would tear the progress bar.
     assert capfd.readouterr() == ("", "")
@@ -142,7 +142,7 @@ def test_a_scene_process_that_cannot_be_started_costs_its_scene_alone(tmp_path, 
     assert report.ending is Ending.WITH_FAILURES
     assert (
         "scenes: the worker could not be started: [Errno 12] Cannot allocate memory"
-        in report.faults
+        in report.about.faults
     )
 
 
@@ -150,10 +150,10 @@ def test_a_run_reconstructs_the_true_cameras_and_a_gigabyte_is_enough(tmp_path, 
     scenes_by(monkeypatch, scene_in_a_gigabyte, process=True)
     matcher = SyntheticMatcher()
     report = run(synthetic_pairs(tmp_path / "images"), SYNTHETIC, matcher, tmp_path / "work")
-    assert report.faults == ()
+    assert report.about.faults == []
     assert sources(report) == ["scene"] * 15
     distances = []
-    for F, pair in zip(matrices_of(report.tables.pairs), matcher.scene.pairs, strict=True):
+    for F, pair in zip(matrices_of(report.pairs), matcher.scene.pairs, strict=True):
         distances.append(matcher.scene.median_distance(F, pair))
     # Pixels between true points and the lines of F
     assert max(distances) < 0.5
@@ -168,7 +168,7 @@ def test_a_death_within_pycolmap_costs_the_scene_alone_and_leaves_no_files(tmp_p
     report = run(pairs, SYNTHETIC, SyntheticMatcher(images=4), tmp_path / "work")
     assert report.ending is Ending.WITH_FAILURES
     assert sources(report) == ["pair"] * 6
-    assert report.tables.scenes["failure"][0]
+    assert report.scenes["failure"].all()
     assert list((tmp_path / "temporary").iterdir()) == []
 
 
@@ -199,7 +199,6 @@ def test_a_resumed_run_reconstructs_only_the_batch_whose_image_was_replaced(tmp_
     scenes_by(monkeypatch, partial(befall, lack_an_image))
     again = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
     assert sources(again) == ["pair"] * 6 + ["pair", "scene", "scene"]
-    failures = again.tables.scenes.set_index("batch")["failure"]
-    has_failed = (failures != "").to_dict()
-    assert has_failed == {"one": True, "two": False}
+    has_failed = again.scenes.set_index("batch")["failure"] != ""
+    assert has_failed.to_dict() == {"one": True, "two": False}
     assert matrices(again) == own_matrices(pairs, tmp_path / "alone")

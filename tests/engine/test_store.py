@@ -197,7 +197,7 @@ def test_readers_in_a_loop_beside_a_run_work_or_have_one_line(pairs, undisturbed
         thread.start()
     for _ in range(2):
         report = run(pairs, THREE_UNITS, RectifiedMatcher(seconds=0.005), work)
-        assert (report.ending, report.faults) == (Ending.COMPLETE, ())
+        assert (report.ending, report.about.faults) == (Ending.COMPLETE, [])
         assert matrices(report) == matrices(undisturbed)
     ended.set()
     for thread in threads:

@@ -7,16 +7,11 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
-
 from mkpc_kaggle.engine.console import (
     LOG_NAME,
-    Event,
-    EventKind,
     Progress,
-    append_event,
+    logged,
     logger,
-    read_events,
 )
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -60,7 +55,7 @@ from mkpc_kaggle.engine.console import Progress, leave, logger, queued
 with queued():
     progress = Progress()
     for number in range(20_000):
-        progress.count("sweep", number % 2, 2)
+        progress.count("sweep", number % 2, 2, "unit")
         logger.warning("pair %d of 20000 %s", number, 100 * "x")
     print("done", flush=True)
     leave(0, seconds=0.5)
@@ -89,43 +84,40 @@ def test_messages_have_their_level_and_go_to_the_streams_of_the_moment(capsys):
     )
 
 
-def test_a_file_gets_a_line_when_a_phase_begins_and_at_the_end(capsys):
+def test_a_file_gets_a_line_when_a_count_begins_and_at_its_end(capsys):
     progress = Progress()
     for done in range(40, 101):  # resumed pairs took no time of this run
-        progress.count("sweep", done, 100)
+        progress.count("sweep", done, 200, "unit")
     progress.note("batch one: 4 of 4 images with a camera")
-    progress.count("deepen", 1, 2)
-    progress.count("deepen", 2, 2)
+    progress.count("deepen", 200, 200, "unit")
+    progress.count("estimate", 1, 2, "pair")
     progress.close()
     lines = capsys.readouterr().err.splitlines()
     assert [line.partition("%")[0] for line in lines] == [
-        "sweep:  40",
+        "sweep:  20",
         "batch one: 4 of 4 images with a camera",
-        "sweep: 100",
-        "deepen:  50",
         "deepen: 100",
+        "estimate:  50",
+        "estimate:  50",
     ]
 
 
 def test_a_run_that_shows_no_progress_prints_nothing(capsys):
     progress = Progress(is_shown=False)
-    progress.count("sweep", 1, 2)
+    progress.count("sweep", 1, 2, "unit")
     progress.note("text")
     progress.close()
     assert capsys.readouterr() == ("", "")
 
 
-@pytest.mark.parametrize("cut", [b"", b"3.0 faul", b"\xff\xfe"])
-def test_events_are_lines_of_which_the_last_session_is_read(tmp_path, cut):
-    former = [Event(0.0, EventKind.START), Event(1.0, EventKind.FAULT, "of the former session")]
-    last = [
-        Event(0.1, EventKind.START),
-        Event(2.5, EventKind.SCENE, "a: 3 of 4 images \udc80".strip()),
+def test_a_log_file_has_all_messages_and_one_that_cannot_be_written_costs_nothing(tmp_path, capsys):
+    for path in (tmp_path / LOG_NAME, tmp_path / "none" / LOG_NAME):
+        with logged(path):
+            logger.debug("sweep")
+            logger.warning("a device failed")
+    lines = (tmp_path / LOG_NAME).read_text().splitlines()
+    assert [line.split(" ", 2)[2] for line in lines] == [
+        "DEBUG sweep",
+        "WARNING a device failed",
     ]
-    for event in [*former, *last]:
-        append_event(tmp_path, event)
-    with (tmp_path / LOG_NAME).open("ab") as stream:
-        stream.write(cut)
-    texts = [(event.kind, event.text) for event in read_events(tmp_path)]
-    assert texts == [("start", ""), ("scene", r"a: 3 of 4 images \udc80")]
-    assert read_events(tmp_path / "none") == []
+    assert "sweep" not in capsys.readouterr().err

@@ -1,6 +1,7 @@
 """The summary of a run on the terminal, and the command ``journal``."""
 
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -10,7 +11,8 @@ from rectified import THREE_UNITS, RectifiedMatcher, run, write_pairs
 from run_tables import UNIT, Described, tables_of
 from shared import run_command
 
-from mkpc_kaggle.engine.request import Ending, RunReport
+from mkpc_kaggle.engine.frames import Results
+from mkpc_kaggle.engine.request import Ending
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.recipe import load_recipe
@@ -34,10 +36,12 @@ def scene(*names: str, **fields: object) -> SceneRecord:
 def report(
     ending: Ending,
     *pairs: Described,
-    faults: tuple[str, ...] = (),
+    faults: Sequence[str] = (),
     **more: Any,
-) -> RunReport:
-    return RunReport(tables_of(*pairs, **more), ending, 60.0, faults=faults)
+) -> Results:
+    found = tables_of(*pairs, **more)
+    about = replace(found.about, ending=ending, seconds=60.0, faults=faults)
+    return replace(found, about=about)
 
 
 def test_sources_of_f_are_counted():

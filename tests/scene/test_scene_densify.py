@@ -6,6 +6,7 @@ from itertools import combinations
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
+from pandas.testing import assert_frame_equal
 from rectified import run, sources
 from synthetic import RECIPE, SyntheticMatcher, synthetic_pairs
 
@@ -68,11 +69,11 @@ def test_a_sparse_batch_has_a_scene_by_pairs_that_no_row_names(tmp_path):
     assert report.ending is Ending.COMPLETE
     assert sources(report) == ["scene"] * 5
     true_pairs = [matcher.scene.pairs[index] for index in indices]
-    for F, pair in zip(matrices_of(report.tables.pairs), true_pairs, strict=True):
+    for F, pair in zip(matrices_of(report.pairs), true_pairs, strict=True):
         assert matcher.scene.median_distance(F, pair) < 0.5
     assert len(matcher.calls) == 12, "two pairs an image"
     # Extra pairs are in no result, table or report.
     assert set(published) == {5}
     assert len(results(work).pairs) == 5
     again = run(asked, recipe, SyntheticMatcher(), work)
-    assert again.tables.scenes.equals(report.tables.scenes)
+    assert_frame_equal(again.scenes, report.scenes)

@@ -16,7 +16,7 @@ import numpy as np
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.budget import Budget
-from mkpc_kaggle.engine.request import RunReport
+from mkpc_kaggle.engine.frames import Results
 from mkpc_kaggle.engine.session import Interrupt, Session, run_pairs, submit
 from mkpc_kaggle.geometry.coordinates import Size, View
 from mkpc_kaggle.geometry.matches import Matches
@@ -122,7 +122,7 @@ def run(
     workers: int | str | None = 0,
     is_watched: bool = False,
     more: Sequence[RectifiedMatcher] = (),
-) -> RunReport:
+) -> Results:
     """Run the recipe with these matchers; the submission is written to ``output``, or given to
     ``publish``.
     """
@@ -137,11 +137,11 @@ def run(
         return run_pairs(pairs, assembly, session, publish=publish)
 
 
-def matrices(report: RunReport) -> list[bytes]:
+def matrices(report: Results) -> list[bytes]:
     """The bytes of each pair's own F."""
-    return [np.array(F).tobytes() for F in report.tables.pairs["own"]]
+    return [np.array(F).tobytes() for F in report.pairs["own"]]
 
 
-def sources(report: RunReport) -> list[str]:
+def sources(report: Results) -> list[str]:
     """Where the written F of each pair comes from."""
-    return report.tables.pairs["source"].tolist()
+    return report.pairs["source"].tolist()

@@ -20,10 +20,12 @@ import numpy as np
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine import budget, plan
 from mkpc_kaggle.engine.budget import MAX_SILENCE_S, SCENE_MARGIN, SCENE_START_S, Budget
+from mkpc_kaggle.engine.frames import Results
 from mkpc_kaggle.engine.keys import Keys
 from mkpc_kaggle.engine.places import Kind, Place, Site
 from mkpc_kaggle.engine.plan import RESERVE_SHARE
 from mkpc_kaggle.engine.request import (
+    About,
     Answer,
     Cause,
     Estimated,
@@ -33,7 +35,6 @@ from mkpc_kaggle.engine.request import (
     Loaded,
     MatchJob,
     Request,
-    RunReport,
     SceneJob,
 )
 from mkpc_kaggle.engine.run import Run
@@ -498,7 +499,7 @@ class Ran:
     """
 
     scenario: Scenario
-    report: RunReport
+    report: Results
     utilisation: float
     late: float
     lost: int
@@ -528,7 +529,8 @@ def simulate(scenario: Scenario, store: Store | None = None, until: float = math
     interrupt = threading.Event()
     store = memory_store() if store is None else store
     publish = lambda state: published.append(len(state.fundamentals))  # noqa: E731
-    request = Request(pairs, scenario.recipe, scenario.keys, publish=publish)
+    about = About({"scene": {}} if scenario.batches else {})
+    request = Request(pairs, scenario.recipe, scenario.keys, about=about, publish=publish)
     state = State(request, {name: BatchImage(name, name, SIZE) for name in names}, {})
     state.restore(store)
     run = Run(state, site, store, time, interrupt=interrupt, progress=False)
@@ -557,7 +559,7 @@ def simulate(scenario: Scenario, store: Store | None = None, until: float = math
     faulty = {scene.batch for scene in site.scenes if scene.is_faulty}
     matches = zip(state.batches, state.matches_of_batches, strict=True)
     matched = {batch for batch, count in matches if count}
-    made = set(report.tables.pairs.query("choice != ''")["group"])
+    made = set(report.pairs.query("choice != ''")["group"])
     missed = matched - faulty - made
     return Ran(
         scenario,
@@ -605,6 +607,6 @@ def sweep_seconds(scenario: Scenario) -> float:
 
 def without_tables(ran: Ran) -> Ran:
     """Return the run without its tables: a thousand runs with theirs would fill the memory."""
-    tables = ran.report.tables
-    nothing = replace(tables, pairs=tables.pairs[:0], units=tables.units[:0])
-    return replace(ran, report=replace(ran.report, tables=nothing), scenes=(), keys=[])
+    report = ran.report
+    nothing = replace(report, pairs=report.pairs[:0], units=report.units[:0])
+    return replace(ran, report=nothing, scenes=(), keys=[])
