@@ -71,7 +71,6 @@ class RaySite(Site):
         self._cluster = cluster
         weights = [file.path for file in assembly.weight_files.values()]
         self._needed = (*weights, *folders)
-        self._workers: list[RayWorker] = []
 
     def open(self) -> None:
         super().open()
@@ -86,46 +85,38 @@ class RaySite(Site):
         ]
         gpus = sum(int(node["Resources"].get("GPU", 0)) for node in machines)
         # This machine belongs to the cluster, so scenes get only the cores that its actors leave.
-        self.matching_cores = self._cores
         if gpus and self._assembly.device != "cpu":
             self.matching_cores = gpus
-            assembly = self._assembly.on("cuda:0")
-            make = partial(MatchRunner, partial(Pipeline.of, assembly))
             for number in range(gpus):
-                self._add(f"gpu {number}", make, assembly.minibatch, num_gpus=1)
+                self._add(f"gpu {number}", self._assembly.on("cuda:0"), num_gpus=1)
         else:
+            self.matching_cores = self._cores
             for number, node in enumerate(machines):  # several machines may have the same name
                 cores = int(node["Resources"]["CPU"])
-                make = partial(MatchRunner, partial(Pipeline.of, self._assembly), threads=cores)
                 name = f"machine {number} ({node['NodeManagerHostname']})"
-                self._add(name, make, self._assembly.minibatch, num_cpus=cores)
+                self._add(name, self._assembly, threads=cores, num_cpus=cores)
         if not self.of(Kind.MATCH):
             raise UserError("the Ray cluster offers neither a CPU nor a GPU")
 
     def close(self) -> None:
+        workers = [place.worker for place in self.places if place.worker is not None]
         super().close()
         if self._has_joined and self._ray.is_initialized():
             until = time.monotonic() + EXIT_TIMEOUT_S
-            for worker in self._workers:  # killed already; the threads end soon
+            for worker in workers:  # killed already; the threads end soon
                 if worker.thread.is_alive():
                     worker.thread.join(max(0.0, until - time.monotonic()))
             self._ray.shutdown()
 
-    def _add(self, name: str, make: Maker, minibatch: int, **where: float) -> None:
+    def _add(self, name: str, assembly: Assembly, threads: int = 0, **where: float) -> None:
         """Add a place for workers that need these resources of Ray."""
+        runner = partial(MatchRunner, partial(Pipeline.of, assembly), threads=threads)
         # Checked on the machine, since other versions or files would give other results silently.
-        make = partial(make_alike, make, __version__, self._needed)
-
-        def worker() -> RayWorker:
-            # Workers that ended long ago would stay in memory.
-            self._workers = [each for each in self._workers if each.thread.is_alive()]
-            self._workers.append(
-                # Ray reserves a CPU for each actor by default, also for an actor with a GPU.
-                RayWorker(name, make, self.ring, self._ray, {"num_cpus": 0, **where})
-            )
-            return self._workers[-1]
-
-        self.places.append(Place(name, worker, minibatch=minibatch))
+        make = partial(make_alike, runner, __version__, self._needed)
+        # Ray reserves a CPU for each actor by default, also for an actor with a GPU.
+        resources = {"num_cpus": 0, **where}
+        worker = partial(RayWorker, name, make, self.ring, self._ray, resources)
+        self.places.append(Place(name, worker, minibatch=assembly.minibatch))
 
 
 class RayWorker(ThreadWorker):
@@ -162,9 +153,7 @@ class RayWorker(ThreadWorker):
             answer: Answer = self._ray.get(self._actor.answer.remote(message))
         except self._ray.exceptions.RayError as error:
             is_memory = isinstance(error, self._ray.exceptions.OutOfMemoryError)
-            # Ray's message, without lines of Ray's ids
-            lines = [line for line in str(error).splitlines() if not re.match(r"\t\w+: ", line)]
-            reason = textwrap.shorten(" ".join(lines[1:] or lines), 240)
+            reason = textwrap.shorten(str(error), 240)
             return Failure(Cause.OUT_OF_MEMORY if is_memory else Cause.DIED, reason)
         return answer
 

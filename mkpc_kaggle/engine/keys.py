@@ -52,8 +52,7 @@ Images = tuple[BatchImage, BatchImage]
 def digest(value: Any) -> str:
     """Return the digest of a value of JSON types, as 32 hexadecimal digits."""
     # Sorted, since the order of a TOML file's keys means nothing. Paths and enums are texts.
-    text = json.dumps(value, sort_keys=True, default=str)
-    return hashlib.blake2b(text.encode("utf-8", "backslashreplace"), digest_size=16).hexdigest()
+    return text_digest([json.dumps(value, sort_keys=True, default=str)])
 
 
 def text_digest(lines: Iterable[str]) -> str:

@@ -132,13 +132,6 @@ class ProcessWorker(ThreadWorker):
         return answer
 
 
-def append_to(path: Path | str) -> None:
-    """Let stdout and stderr append to a file. Raise ``OSError`` if it cannot be opened."""
-    file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o666)
-    os.dup2(file, 1)
-    os.dup2(file, 2)
-
-
 def spawn(name: str, log: Path | None = None) -> tuple[SpawnProcess, Connection]:
     """Start a process that serves the other end of the returned pipe. Its output is appended to
     ``log``.
@@ -185,9 +178,11 @@ def serve(pipe: Connection, log: Path | None = None) -> None:
     """Answer messages in a worker process, one after another; the first is the maker of the runner."""
     # A file never blocks a library that prints, as a pipe without a reader does.
     try:
-        append_to(log or os.devnull)
+        output = os.open(log or os.devnull, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o666)
     except OSError:  # a full disk
-        append_to(os.devnull)
+        output = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(output, 1)
+    os.dup2(output, 2)
 
     def make() -> Runner:
         return cast(Maker, pipe.recv())()  # unpickling may raise, which is an answer, too
