@@ -27,7 +27,6 @@ class Publication:
         self._lock = threading.Lock()
         self._has_ended = False
         self._published = budget.clock()
-        self._sources = np.full(len(state.pair_of_row), -1)  # of the rows, as in the last version
         self.unwritten = ""
 
     def is_due(self, now: float) -> bool:
@@ -38,7 +37,7 @@ class Publication:
         """Write the results, and the rows of the pairs that have changed since the last version."""
         start = self._budget.clock()
         self.save()
-        run = (0, len(self._sources), json.dumps(self._facts(about)))
+        run = (0, len(self._state.pair_of_row), json.dumps(self._facts(about)))
         self._store.put({"pair": self._rows(), "run": [run]})
         # The measured time decides when the last version is written.
         self._published = self._budget.clock()
@@ -78,15 +77,12 @@ class Publication:
         """Return the rows of the pairs that have changed."""
         state = self._state
         sources, fundamentals = state.written
-        # A pair may get another F although it has no new result: its scene is another one.
-        moved = state.pair_of_row[sources != self._sources].tolist()
-        self._sources = sources
-        changed = np.zeros(len(state.pairs), bool)
-        changed[state.take_dirty(moved)] = True
         scenes = state.scenes
         pending = state.lacks_estimate
+        changed = np.flatnonzero(state.dirty[state.pair_of_row]).tolist()
+        state.dirty[:] = False
         rows: list[tuple[object, ...]] = []
-        for number in np.flatnonzero(changed[state.pair_of_row]).tolist():
+        for number in changed:
             index = int(state.pair_of_row[number])
             pair = state.pairs[index]
             scene = scenes.get(pair.group)

@@ -6,7 +6,7 @@ units of stage 1 before it. A result is used only under today's key.
 
 import json
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import product
 from typing import Any
 
@@ -515,10 +515,3 @@ class State:
         self.unit_losses[:] = 0
         self.dead[:] = False
         self.refused = {}
-
-    def take_dirty(self, more: Iterable[int] = ()) -> list[int]:
-        """Return the pairs that have changed since the last call, and ``more``."""
-        self.dirty[list(more)] = True
-        changed = np.flatnonzero(self.dirty).tolist()
-        self.dirty[:] = False
-        return changed
