@@ -29,7 +29,7 @@ from mkpc_kaggle.data.competition import TrainScene, TruePair, read_train_side
 from mkpc_kaggle.data.images import read_size
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.frames import Results, results
-from mkpc_kaggle.engine.session import Session, interruptible, run_pairs
+from mkpc_kaggle.engine.session import Session, run_pairs
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.evaluation.validate import validate
 from mkpc_kaggle.geometry.cameras import Camera, relative_pose
@@ -45,6 +45,7 @@ from mkpc_kaggle.geometry.robust import calibrate, homogeneous
 from mkpc_kaggle.geometry.two_view import cross_matrix
 from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.recipe import Recipe, Unit, load_recipe
+from mkpc_kaggle.signals import interruptible
 
 # A correct match's maximum sum of both squared epipolar distances, on the planes z = 1.
 CORRECT = 5e-4

@@ -25,13 +25,14 @@ import numpy as np
 
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.budget import Budget
-from mkpc_kaggle.engine.session import Session, interruptible, run_pairs
+from mkpc_kaggle.engine.session import Session, run_pairs
 from mkpc_kaggle.engine.store import FILE_NAME
 from mkpc_kaggle.geometry.coordinates import Size, View
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import MatcherSpec, Picture
 from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.recipe import Recipe, Unit
+from mkpc_kaggle.signals import interruptible
 
 PAGE = os.sysconf("SC_PAGE_SIZE")
 MAX_GROWTH, MAX_GROWTH_BYTES = 0.05, 50e6

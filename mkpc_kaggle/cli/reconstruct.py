@@ -5,11 +5,11 @@ from pathlib import Path
 
 from mkpc_kaggle.cli import options
 from mkpc_kaggle.data.images import READ_SUFFIXES
-from mkpc_kaggle.engine.session import interruptible
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.recipe import CameraSharing
 from mkpc_kaggle.reconstruction.outputs import WORK
 from mkpc_kaggle.reconstruction.run import reconstruct
+from mkpc_kaggle.signals import interruptible
 
 HELP = f"""\
 Match the photographs below a folder ({", ".join(READ_SUFFIXES)}) with the engine that makes submissions, and

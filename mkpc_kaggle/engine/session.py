@@ -3,18 +3,17 @@
 import hashlib
 import platform
 import shutil
-import signal
 import sqlite3
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib import metadata
 from math import isfinite
 from pathlib import Path
 from tempfile import TemporaryFile
-from types import FrameType, MappingProxyType
+from types import MappingProxyType
 from typing import Self
 
 import cv2
@@ -43,53 +42,12 @@ from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
 from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.recipe import PINHOLES
 from mkpc_kaggle.scene.view_graph import BatchImage
+from mkpc_kaggle.signals import Interrupt
 from mkpc_kaggle.version import __version__
 
 WORKERS_LOG = "workers.log"  # in the work directory, for the output of native libraries
 EXIT_S = 0.2  # for the system to end a process
 REPORT_S = 2.0  # for an interrupted program's report; enough for the tables
-
-
-class Interrupt(threading.Event):
-    """Event that is set when the run must end early. ``signal`` is the number of the signal
-    received, or 0.
-    """
-
-    signal = 0
-    raises = False
-
-    @contextmanager
-    def raising(self) -> Iterator[None]:
-        """Raise ``KeyboardInterrupt(number)`` on a signal, for work that does not check the event."""
-        self.raises = True
-        try:
-            yield
-        finally:
-            self.raises = False
-
-
-@contextmanager
-def interruptible() -> Iterator[Interrupt]:
-    """Let SIGTERM and Ctrl-C set the interrupt, unless the parent program ignores them. A second
-    signal has its default effect.
-    """
-    interrupt = Interrupt()
-    with ExitStack() as restored:
-
-        def note(number: int, _: FrameType | None) -> None:
-            restored.close()  # first, so that a second signal ends even a hung program
-            interrupt.signal = number
-            interrupt.set()
-            if interrupt.raises:
-                raise KeyboardInterrupt(number)
-
-        for number in (signal.SIGINT, signal.SIGTERM):
-            former = signal.getsignal(number)
-            # A shell's background job ignores Ctrl-C, which is for the script, and so does nohup.
-            if former is not signal.SIG_IGN:
-                restored.callback(signal.signal, number, former)
-                signal.signal(number, note)
-        yield interrupt
 
 
 @dataclass

@@ -14,7 +14,7 @@ from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.data.masks import Masks
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.console import logger
-from mkpc_kaggle.engine.session import Interrupt, Session, interruptible, run_pairs
+from mkpc_kaggle.engine.session import Session, run_pairs
 from mkpc_kaggle.engine.state import State
 from mkpc_kaggle.errors import UserError, plural, temporary_directory
 from mkpc_kaggle.matchers.contract import Matcher
@@ -33,6 +33,7 @@ from mkpc_kaggle.reconstruction.outputs import (
 )
 from mkpc_kaggle.reconstruction.pairs import choose_pairs
 from mkpc_kaggle.scene.models import SfmModel
+from mkpc_kaggle.signals import Interrupt, interruptible
 
 AUTO_RECIPE = "auto"  # the recipe of all matchers whose weights are found
 # Of MAGSAC on a pair, whose F is for the report alone. Pairs that do not overlap run all iterations.

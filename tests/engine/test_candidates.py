@@ -19,13 +19,14 @@ from synthetic import QUICK, SyntheticMatcher, synthetic_pairs
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.frames import Results, results
 from mkpc_kaggle.engine.request import Ending, SceneJob
-from mkpc_kaggle.engine.session import Interrupt, Session, run_pairs
+from mkpc_kaggle.engine.session import Session, run_pairs
 from mkpc_kaggle.engine.store import Store
 from mkpc_kaggle.engine.worker import compute_scene
 from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.recipe import Recipe, SceneConfig, Unit
 from mkpc_kaggle.scene.candidates import ALL_UNITS, SUPPORTED
 from mkpc_kaggle.scene.sfm import Solution
+from mkpc_kaggle.signals import Interrupt
 
 FIRST, _, LAST = (unit.name for unit in THREE_UNITS.units)
 # All units, and the units of stage 1 alone

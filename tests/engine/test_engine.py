@@ -20,9 +20,9 @@ from rectified import (
 
 from mkpc_kaggle.engine.frames import Results
 from mkpc_kaggle.engine.request import Ending
-from mkpc_kaggle.engine.session import Interrupt
 from mkpc_kaggle.engine.state import State
 from mkpc_kaggle.pipeline.stages import Pipeline
+from mkpc_kaggle.signals import Interrupt
 
 
 def units(report: Results) -> list[list[str]]:

@@ -30,6 +30,7 @@ from mkpc_kaggle.engine.request import Ending
 from mkpc_kaggle.engine.run import Run
 from mkpc_kaggle.engine.state import State
 from mkpc_kaggle.engine.store import Source, Store
+from mkpc_kaggle.signals import interruptible
 
 ROOT = Path(__file__).resolve().parents[2]
 PATHS = [str(ROOT), str(ROOT / "tests" / "support")]
@@ -82,7 +83,7 @@ def test_a_signal_ends_a_resumed_run_while_an_image_is_digested(tmp_path, monkey
     # Copied or restored files have other times: whether they changed, only a digest can tell.
     for path in (tmp_path / "images").iterdir():
         os.utime(path, (0, 0))
-    with session.interruptible() as interrupt:
+    with interruptible() as interrupt:
         report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work", interrupt=interrupt)
     assert digested == [], "the run ends before that digest"
     released.set()
@@ -383,7 +384,8 @@ def test_a_parent_killed_at_any_moment_leaves_a_complete_file_no_orphans_and_a_r
 GUARDED = """
 import multiprocessing, os, signal, sys, time
 from mkpc_kaggle.engine.budget import Budget
-from mkpc_kaggle.engine.session import Interrupt, Session
+from mkpc_kaggle.engine.session import Session
+from mkpc_kaggle.signals import Interrupt
 
 if __name__ == "__main__":
     with Session("", Budget(time.monotonic(), {limit}), Interrupt()).watched() as session:
@@ -447,7 +449,7 @@ def test_a_limit_of_ten_million_years_is_no_limit():
 def test_a_signal_that_the_parent_program_ignores_is_ignored(number):
     # A shell lets its background jobs ignore Ctrl-C.
     code = (
-        "import os, signal; from mkpc_kaggle.engine.session import interruptible\n"
+        "import os, signal; from mkpc_kaggle.signals import interruptible\n"
         "with interruptible() as interrupt:\n"
         f"    os.kill(os.getpid(), {int(number)})\n"
         "    print(interrupt.is_set())"

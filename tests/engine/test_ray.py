@@ -131,7 +131,7 @@ sys.path[:0] = {path!r}
 from pathlib import Path
 from faulty import FaultyMatcher
 from rectified import THREE_UNITS, run, write_pairs
-from mkpc_kaggle.engine.session import interruptible
+from mkpc_kaggle.signals import interruptible
 
 if __name__ == "__main__":
     home = Path(sys.argv[1])

@@ -17,11 +17,12 @@ from mkpc_kaggle.data.competition import read_train_side
 from mkpc_kaggle.data.images import read_image
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.frames import results
-from mkpc_kaggle.engine.session import Interrupt, Session, run_pairs
+from mkpc_kaggle.engine.session import Session, run_pairs
 from mkpc_kaggle.geometry.cameras import Camera
 from mkpc_kaggle.geometry.metrics import pose_auc
 from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.recipe import load_recipe
+from mkpc_kaggle.signals import Interrupt
 
 OUTDOORS = ["castle_p19", "fountain_p11", "herz_jesus_p8", "reichstag_26"]
 

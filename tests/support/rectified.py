@@ -17,12 +17,13 @@ import numpy as np
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.budget import Budget
 from mkpc_kaggle.engine.frames import Results
-from mkpc_kaggle.engine.session import Interrupt, Session, run_pairs, submit
+from mkpc_kaggle.engine.session import Session, run_pairs, submit
 from mkpc_kaggle.geometry.coordinates import Size, View
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.matchers.contract import MatcherSpec, Picture
 from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.recipe import Recipe, Unit
+from mkpc_kaggle.signals import Interrupt
 
 
 @dataclass(frozen=True, eq=False)
