@@ -41,10 +41,10 @@ def parse_workers(text: str) -> int | str:
 
 
 class RaySite(Site):
-    """Places on the machines of a cluster, which :meth:`open` joins; see :func:`join`.
+    """Places on the machines of a cluster; see :func:`join`.
 
     Each machine must have the weights, and the ``folders`` with the images. Raises
-    :class:`UserError` if Ray is not installed.
+    :class:`UserError` if Ray is not installed, and if the cluster cannot be joined or has no CPU.
     """
 
     def __init__(
@@ -66,18 +66,12 @@ class RaySite(Site):
             told = '--workers ray needs Ray, which is not installed: pip install "mkpc-kaggle[ray]"'
             raise UserError(told) from error
         self._ray = ray
-        self._has_joined = False
-        self._assembly = assembly
-        self._cluster = cluster
         weights = [file.path for file in assembly.weight_files.values()]
         self._needed = (*weights, *folders)
-
-    def open(self) -> None:
-        super().open()
         # A program that has joined a cluster itself keeps it after the run.
         self._has_joined = not self._ray.is_initialized()
         if self._has_joined:
-            join(self._ray, self._cluster)
+            join(self._ray, cluster)
         machines = [
             node
             for node in self._ray.nodes()
@@ -85,16 +79,16 @@ class RaySite(Site):
         ]
         gpus = sum(int(node["Resources"].get("GPU", 0)) for node in machines)
         # This machine belongs to the cluster, so scenes get only the cores that its actors leave.
-        if gpus and self._assembly.device != "cpu":
+        if gpus and assembly.device != "cpu":
             self.matching_cores = gpus
             for number in range(gpus):
-                self._add(f"gpu {number}", self._assembly.on("cuda:0"), num_gpus=1)
+                self._add(f"gpu {number}", assembly.on("cuda:0"), num_gpus=1)
         else:
             self.matching_cores = self._cores
             for number, node in enumerate(machines):  # several machines may have the same name
                 cores = int(node["Resources"]["CPU"])
                 name = f"machine {number} ({node['NodeManagerHostname']})"
-                self._add(name, self._assembly, threads=cores, num_cpus=cores)
+                self._add(name, assembly, threads=cores, num_cpus=cores)
         if not self.of(Kind.MATCH):
             raise UserError("the Ray cluster offers neither a CPU nor a GPU")
 

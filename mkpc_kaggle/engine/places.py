@@ -135,7 +135,6 @@ class Site:
         self._worker = ThreadWorker if threads else ProcessWorker
         self._log = log
         self._cores = available_cores()
-        self.is_open = False  # the places for matching exist
         # In this process, a second thread would take its time from the thread that matches.
         estimators = 1 if threads else max(1, self._cores // CORES_PER_ESTIMATOR)
         make = partial(estimates_runner, in_process=not threads)
@@ -160,10 +159,6 @@ class Site:
         worker.log = self._log
         return worker
 
-    def open(self) -> None:
-        """Join other machines, if any. Raise :class:`mkpc_kaggle.errors.UserError` if that fails."""
-        self.is_open = True
-
     def of(self, kind: Kind) -> list[Place]:
         """Return the places of a kind that are not closed."""
         return [place for place in self.places if place.kind is kind and not place.closed]
@@ -184,7 +179,7 @@ class Site:
     @property
     def is_closed(self) -> bool:
         """No worker of matching is started any more."""
-        return self.is_open and not self.of(Kind.MATCH)
+        return not self.of(Kind.MATCH)
 
     @property
     def reason(self) -> str:

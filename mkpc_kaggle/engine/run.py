@@ -113,9 +113,6 @@ class Run:
             if self.site.fallback and (self.site.is_closed or self.state.dead.all()):
                 self._fall_back()
             work = self.plan(now)
-            if work.match is not None and not self.site.is_open:
-                # A finished run joins no cluster and starts no worker of matching.
-                self.site.open()
             for place in self.site.free(now):
                 self._give(place, work, now)
             if not (work.match or work.estimates or work.scenes or self.site.has_jobs):
@@ -137,10 +134,9 @@ class Run:
         """The workers that exist now, without places that are closed."""
         site = self.site
         matchers = site.of(Kind.MATCH)
-        # Before the places are open, one is assumed. All have the same kind of device.
+        # All have the same kind of device.
         minibatch = max((place.minibatch for place in matchers), default=1)
-        count = len(matchers) if site.is_open else 1
-        return Crew(count, len(site.of(Kind.ESTIMATE)), len(site.of(Kind.SCENE)), minibatch)
+        return Crew(len(matchers), len(site.of(Kind.ESTIMATE)), len(site.of(Kind.SCENE)), minibatch)
 
     def _seconds_of(self, place: Place) -> float:
         """Return how long the worker of a place may start, or compute its job, by the costs known now."""

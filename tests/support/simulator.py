@@ -276,7 +276,6 @@ class SimulatedSite(Site):
             makers.append((f"scenes {number}", self.scene_worker, Kind.SCENE))
         self.places = [Place(*maker) for maker in makers]
         self.matching = self.of(Kind.MATCH)
-        self.is_open = True
         for place in self.matching:
             place.minibatch = scenario.minibatch
         if scenario.fallback:
