@@ -167,7 +167,17 @@ def test_the_python_of_the_pages_runs(block, tmp_path, monkeypatch):
 def test_a_folder_uses_those_above_it_and_never_those_below():
     page = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
     folders = re.findall(r"^\| `(\w+)/` \|", page, re.M)
-    order = ["errors", "version", "config", "progress", "cores", folders[0], "recipe", *folders[1:]]
+    order = [
+        "errors",
+        "version",
+        "config",
+        "progress",
+        "cores",
+        "signals",
+        folders[0],
+        "recipe",
+        *folders[1:],
+    ]
     package = ROOT / "mkpc_kaggle"
     found = {path.name for path in package.iterdir() if (path / "__init__.py").is_file()}
     assert found == set(folders)

@@ -36,8 +36,8 @@ if TYPE_CHECKING:
 NOT_REACHED = "not reached in time"
 TOO_FEW = "at least three matched images are needed"
 ELEMENTS = [f"f{row}{column}" for row in (1, 2, 3) for column in (1, 2, 3)]  # of F, row by row
-SCENES = ["batch", "images", "cameras", "models", "points", "reprojection_error", "seconds"]
-SCENES += ["candidate", "failure", "missing"]
+SCENE_COLUMNS = ["batch", "images", "cameras", "models", "points", "reprojection_error", "seconds"]
+SCENE_COLUMNS += ["candidate", "failure", "missing"]
 
 # The store unites two databases by views. So its tables are not joined: SQLite would copy one of them.
 # A former run may have had more rows.
@@ -179,7 +179,7 @@ def results_of(store: Store) -> Results:
     about = About(**{name: facts[name] for name in vars(About())})
     about = replace(about, ending=Ending(about.ending))
     estimates = {key: json.loads(text) for key, text in store.db.execute(ESTIMATES)}
-    units = unit_table(store, estimates)
+    units = unit_rows(store, estimates)
     pairs = frame_of(store, PAIRS)
     of_pair = units.groupby("number")
     pairs["units"] = of_pair.size().reindex(pairs.index, fill_value=0)
@@ -227,7 +227,7 @@ def frame_of(store: Store, query: str) -> "DataFrame":
     return DataFrame(rows.fetchall(), columns=[column for column, *_ in rows.description])
 
 
-def unit_table(store: Store, estimates: Mapping[str, Mapping[str, Any]]) -> "DataFrame":
+def unit_rows(store: Store, estimates: Mapping[str, Mapping[str, Any]]) -> "DataFrame":
     """Return a row for each unit of a pair that has points, or a reason why it has none."""
     units = frame_of(store, UNITS).astype({"is_needed": bool})
     units = units.merge(frame_of(store, POINTS), how="left", on="key")
@@ -276,7 +276,7 @@ def scene_table(
         sizes = (scene.reprojection_error, scene.seconds)
         text = (title_of(scene.candidate), scene.failure)
         table.append((scene.batch, *counts, *sizes, *text, missing))
-    return DataFrame(table, columns=SCENES)
+    return DataFrame(table, columns=SCENE_COLUMNS)
 
 
 def matrices_of(pairs: "DataFrame") -> NDArray[np.float64]:

@@ -150,7 +150,7 @@ def estimates_runner(*, in_process: bool = True) -> Runner:
 def do_estimates_job(job: Job) -> tuple[Estimated, ...]:
     """Return the estimates of a job's pairs."""
     assert isinstance(job, EstimateJob)
-    return tuple(estimate_pair(pair, results, job.recipe) for pair, results in results_of(job))
+    return tuple(estimate_pair(pair, results, job.recipe) for pair, results in with_points(job))
 
 
 def estimate_pair(pair: PairInputs, results: tuple[UnitResult, ...], recipe: Recipe) -> Estimated:
@@ -186,7 +186,7 @@ def compute_scene(job: Job) -> Solution:
     process.
     """
     assert isinstance(job, SceneJob) and job.recipe.scene is not None
-    inputs = results_of(job)
+    inputs = with_points(job)
     is_whole = job.folder is not None
     pairs = [batch_pair(*pair, keeps_paths=is_whole, candidate=job.candidate) for pair in inputs]
     recipe = job.recipe
@@ -223,7 +223,7 @@ def batch_pair(
     return BatchPair(image0, image1, by_unit, pair.own, candidate_tracks(results, candidate))
 
 
-def results_of(
+def with_points(
     job: EstimateJob | SceneJob,
 ) -> list[tuple[PairInputs, tuple[UnitResult, ...]]]:
     """Return each pair of a job with the points of its units."""

@@ -143,7 +143,9 @@ def matrices(report: Results, batches: set[str], pairs: list[Pair]) -> list[byte
     own = report.pairs["own"]
     rows = zip(pairs, own, matrices_of(report.pairs), strict=True)
     return [
-        own.tobytes() + written.tobytes() for pair, own, written in rows if pair.group in batches
+        np.array(own, float).tobytes() + written.tobytes()
+        for pair, own, written in rows
+        if pair.group in batches
     ]
 
 

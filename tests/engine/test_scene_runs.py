@@ -28,7 +28,7 @@ from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.frames import matrices_of, results
 from mkpc_kaggle.engine.request import Ending, SceneJob
 from mkpc_kaggle.engine.store import Store
-from mkpc_kaggle.engine.worker import batch_pair, results_of
+from mkpc_kaggle.engine.worker import batch_pair, with_points
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.recipe import SceneConfig
 from mkpc_kaggle.reporting.page import page
@@ -176,7 +176,7 @@ def test_the_scene_of_a_run_is_made_of_tracks_and_judged_by_all_matches(tmp_path
     given: list[BatchPair] = []
 
     def note(job: SceneJob) -> Solution:
-        given[:] = [batch_pair(*each, keeps_paths=False) for each in results_of(job)]
+        given[:] = [batch_pair(*each, keeps_paths=False) for each in with_points(job)]
         return choose_scene_for_all_but_the_first(job)
 
     scenes_by(monkeypatch, note)
