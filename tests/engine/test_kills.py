@@ -15,6 +15,7 @@ from math import inf
 from multiprocessing.process import BaseProcess
 from typing import Any, ClassVar
 
+import numpy as np
 import pytest
 from faulty import on_fork
 from rectified import run
