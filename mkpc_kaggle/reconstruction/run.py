@@ -38,7 +38,7 @@ from mkpc_kaggle.signals import Interrupt, interruptible
 AUTO_RECIPE = "auto"  # the recipe of all matchers whose weights are found
 # Of MAGSAC on a pair, whose F is for the report alone. Pairs that do not overlap run all iterations.
 # On 20 pairs of reichstag_26, 2,000 take 15 ms a pair and 10,000 take 24 ms. They find 1.00 of the
-# inliers, and doubt the same pairs.
+# inliers.
 MAGSAC_ITERATIONS = 2_000
 # ``all_tracks`` of [scene] for recipe auto. Cameras of 25 rendered photographs take 38 CPU seconds from all
 # tracks and 18 from a few, with errors of 0.038 and 0.031 % of the model's size. Of 20 tourists'
@@ -176,7 +176,7 @@ def for_cameras(recipe: Recipe, sharing: str | None = None) -> Recipe:
     # is written.
     if recipe.name == AUTO_RECIPE and recipe.matcher_names == ("sift",):
         units = (replace(units[0], enlarge=False),)
-    # F of a pair is for the report alone: its inliers, and doubts about the pair.
+    # F of a pair is for the report alone, and for its inliers.
     magsac = recipe.magsac
     iterations = min(magsac.max_iterations, MAGSAC_ITERATIONS)
     magsac = replace(magsac, max_iterations=iterations)

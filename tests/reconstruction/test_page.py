@@ -23,7 +23,7 @@ def test_the_page_names_the_suffixes_of_photographs():
 
 
 def test_snippets_are_short():
-    assert len(BLOCKS) >= 7
+    assert len(BLOCKS) >= 6
     assert [block for block in BLOCKS if len(block.strip().splitlines()) > 5] == []
 
 

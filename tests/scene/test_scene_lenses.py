@@ -67,6 +67,15 @@ def test_a_lens_that_moves_no_pixel_by_more_than_one_is_a_pinhole():
     assert [image.focal for image in model.images] == pytest.approx([FOCAL] * 6, rel=0.02)
 
 
+@pytest.mark.parametrize(
+    ("sharing", "lens"),
+    [(CameraSharing.FOLDER, "SIMPLE_RADIAL"), (CameraSharing.IMAGE, "SIMPLE_PINHOLE")],
+)
+def test_a_small_lens_needs_several_images(sharing, lens):
+    """It moves no pixel by more than 0.7 % of the long side."""
+    assert lenses_of(model_of(-0.03, replace(RADIAL, cameras=sharing))) == {lens}
+
+
 def test_a_lens_that_the_user_gives_stays_however_flat_it_is():
     lens = KnownCamera("SIMPLE_RADIAL", (FOCAL, SIZE.width / 2, SIZE.height / 2, 1e-6))
     model = model_of(0.0, RADIAL, *[(image.name, lens) for image in SCENE.images])
