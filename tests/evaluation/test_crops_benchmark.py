@@ -1,9 +1,6 @@
 """The tables of `benchmarks.crops`: gains by groups of scenes."""
 
-import pytest
-
-from benchmarks.crops import LAYOUTS, gain_lines, recipe
-from mkpc_kaggle.recipe import load_recipe
+from benchmarks.crops import gain_lines
 
 
 def run(accuracies):
@@ -27,12 +24,3 @@ def test_gains_are_those_of_the_last_layout_in_each_group_of_scenes():
         "chosen on": ["2", "0.1500", "0.4000", "+0.2500"],
         "confirmed on": ["1", "0.3000", "0.9000", "+0.6000"],
     }
-
-
-@pytest.mark.parametrize("layout", LAYOUTS)
-def test_each_layout_is_a_recipe(tmp_path, layout):
-    file = tmp_path / "layout.toml"
-    file.write_text(recipe("aliked_lightglue", layout, rootsift=True))
-    units = [unit.name for unit in load_recipe(str(file)).units]
-    assert units[0] == "1:sift@1536"
-    assert len(units) == 1 + len(LAYOUTS[layout][0])
