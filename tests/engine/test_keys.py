@@ -11,7 +11,7 @@ import pytest
 from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine import keys
 from mkpc_kaggle.engine.keys import Keys
-from mkpc_kaggle.geometry.coordinates import Box, Size
+from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.matchers.contract import MatcherSpec
 from mkpc_kaggle.pipeline import assembly
 from mkpc_kaggle.pipeline.assembly import Assembly, assemble
@@ -23,7 +23,6 @@ IMAGES = (
     BatchImage("0.png", "d", Size(80, 60)),
     BatchImage("1.png", "c", Size(80, 60)),
 )
-BOXES = (Box(0, 0, 9, 9), Box(0, 0, 8, 8))
 
 
 @pytest.mark.parametrize(
