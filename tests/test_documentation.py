@@ -179,15 +179,6 @@ def test_a_folder_uses_those_above_it_and_never_those_below():
         assert [name for name in used if name not in order[: layer + 1]] == [], path
 
 
-def test_the_store_uses_no_other_room_of_the_engine_and_the_plan_no_worker():
-    engine = ROOT / "mkpc_kaggle" / "engine"
-    importing = re.compile(r"^\s*(?:from|import) mkpc_kaggle\.engine\.(\w+)", re.M)
-    for room, forbidden in {"store": {"plan", "workers"}, "plan": {"workers"}}.items():
-        for path in (engine / room).glob("*.py"):
-            used = set(importing.findall(path.read_text(encoding="utf-8")))
-            assert used.isdisjoint(forbidden), path
-
-
 def test_references_to_modules_name_modules_that_exist():
     package = ROOT / "mkpc_kaggle"
     wrong = []
