@@ -7,7 +7,6 @@ from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
 
-import numpy as np
 import pytest
 from rectified import RectifiedMatcher, run
 from synthetic import QUICK, RECIPE, SyntheticMatcher, synthetic_pairs
@@ -110,20 +109,3 @@ def test_a_run_that_is_killed_while_it_estimates_again_ends_with_the_same_bytes(
         assert process.exitcode == -signal.SIGKILL
     written, _ = submission(pairs, other, tmp_path / "work", NoMatcher(name="synthetic"))
     assert written == undisturbed
-
-
-def test_e_is_estimated_from_the_points_of_f(tmp_path):
-    pairs = synthetic_pairs(tmp_path / "images", 4)
-    submission(pairs, ALONE, tmp_path / "work")
-    # Known intrinsics change what is estimated, and nothing that is matched.
-    K = np.array(
-        [
-            [900.0, 0, 400],
-            [0, 900, 300],
-            [0, 0, 1],
-        ]
-    )
-    known = [replace(pair, intrinsics=(K, K)) for pair in pairs]
-    written, report = submission(known, ALONE, tmp_path / "work")
-    assert (report.units_run, report.estimated) == (0, 6)
-    assert written == submission(known, ALONE, tmp_path / "fresh")[0]

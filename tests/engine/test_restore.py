@@ -14,7 +14,6 @@ from mkpc_kaggle.engine.frames import (
     pair_tables,
     points_of,
     regions_of,
-    results,
     scenes_of,
 )
 from mkpc_kaggle.engine.records import to_bytes
@@ -50,16 +49,6 @@ def test_stored_results_are_read_after_reopening(whole: Room, tmp_path: Path) ->
                 assert np.array_equal(getattr(image.camera, part), getattr(other.camera, part))
         assert units.equals(before.units)
         assert to_bytes(points_of(again, 0)[SWEEP.name]) == to_bytes(matches_of(0))
-
-
-def test_results_are_data_frames_of_pairs_units_and_cameras(whole: Room, tmp_path: Path) -> None:
-    found = results(tmp_path)
-    pairs, units, cameras = found.pairs, found.units, found.cameras
-    assert pairs["pair"].tolist() == ["p0", "p1", "p2"]
-    assert pairs["source"].tolist() == ["scene", "pair", "fallback"]
-    assert pairs[["f11", "f33"]].iloc[0].tolist() == [3.0, 27.0]
-    assert units.groupby("unit")["inliers"].sum().to_dict() == {SWEEP.name: 14, SECOND.name: 16}
-    assert cameras[["image", "focal"]].to_numpy().tolist() == [["0.png", 500.0], ["1.png", 500.0]]
 
 
 SECOND_360 = replace(SECOND, long_side=360)

@@ -15,7 +15,6 @@ from mkpc_kaggle.engine.console import (
     EventKind,
     Progress,
     append_event,
-    logger,
     read_events,
 )
 
@@ -77,34 +76,6 @@ def test_a_stderr_that_is_not_read_costs_lines_and_not_the_run():
     os.close(pipe)
     os.close(reader)
     assert (done.returncode, done.stdout) == (0, b"done\n")
-
-
-def test_messages_have_their_level_and_go_to_the_streams_of_the_moment(capsys):
-    logger.info("pairs: %d", 3)
-    logger.warning("a mask fits no image")
-    logger.error("no such file")
-    assert capsys.readouterr() == (
-        "pairs: 3\n",
-        "warning: a mask fits no image\nerror: no such file\n",
-    )
-
-
-def test_a_file_gets_a_line_when_a_phase_begins_and_at_the_end(capsys):
-    progress = Progress()
-    for done in range(40, 101):  # resumed pairs took no time of this run
-        progress.count("sweep", done, 100)
-    progress.note("batch one: 4 of 4 images with a camera")
-    progress.count("deepen", 1, 2)
-    progress.count("deepen", 2, 2)
-    progress.close()
-    lines = capsys.readouterr().err.splitlines()
-    assert [line.partition("%")[0] for line in lines] == [
-        "sweep:  40",
-        "batch one: 4 of 4 images with a camera",
-        "sweep: 100",
-        "deepen:  50",
-        "deepen: 100",
-    ]
 
 
 def test_a_run_that_shows_no_progress_prints_nothing(capsys):
