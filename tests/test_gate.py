@@ -50,15 +50,3 @@ def test_a_ratio_above_its_tolerance_comes_first_and_ends_with_1(baseline, monke
     assert lines[0].startswith("REGRESSION") and "worse" in lines[0]
     assert lines[-1].startswith("new")
     assert json.loads(baseline.read_text())["ratios"] == known
-
-
-def test_a_written_baseline_has_its_machine_and_no_regression(baseline, monkeypatch, capsys):
-    baseline.write_text(
-        json.dumps({"machine": "another", "ratios": {"other": {"ratio": 3.0, "tolerance": 0.2}}})
-    )
-    assert run(monkeypatch, "--write") == 0
-    written = json.loads(baseline.read_text())
-    assert written["ratios"].keys() == {*RATIOS, "first", "other"}
-    assert written["ratios"]["worse"] == {"ratio": 1.2, "tolerance": 0.1}
-    assert written["versions"]["numpy"]
-    assert run(monkeypatch) == 0

@@ -20,7 +20,6 @@ from mkpc_kaggle.recipe import (
     load_recipe,
     parse_recipe,
     recipe_names,
-    split_mode,
 )
 from mkpc_kaggle.weights.manifest import manifest
 
@@ -208,13 +207,3 @@ def test_modes_keep_stage_1_or_show_every_unit_the_whole_image_and_none_twice():
     # Both units of SIFT at 640 pixels would see the same pictures.
     names = [unit.name for unit in whole.units]
     assert names == ["1:sift@640", "1:aliked@800", "1:aliked@640", "1:sift@320"]
-
-
-def test_a_mode_follows_the_last_colon_of_a_choice_if_it_is_one():
-    for text, recipe, mode in (
-        ("classical", "classical", Mode.TWO_STAGE),
-        ("my/own.toml:stage-1", "my/own.toml", Mode.STAGE_1),
-        ("C:own.toml", "C:own.toml", Mode.TWO_STAGE),
-        (":stage-1", ":stage-1", Mode.TWO_STAGE),
-    ):
-        assert split_mode(text) == (recipe, mode)
