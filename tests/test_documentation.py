@@ -189,28 +189,6 @@ def test_a_folder_uses_those_above_it_and_never_those_below():
         assert [name for name in used if name not in order[: layer + 1]] == [], path
 
 
-def test_the_store_uses_no_other_room_of_the_engine_and_the_plan_no_worker():
-    engine = ROOT / "mkpc_kaggle" / "engine"
-    importing = re.compile(r"^\s*(?:from|import) mkpc_kaggle\.engine\.(\w+)", re.M)
-    for room, forbidden in {"store": {"plan", "workers"}, "plan": {"workers"}}.items():
-        for path in (engine / room).glob("*.py"):
-            used = set(importing.findall(path.read_text(encoding="utf-8")))
-            assert used.isdisjoint(forbidden), path
-
-
-def test_references_to_modules_name_modules_that_exist():
-    package = ROOT / "mkpc_kaggle"
-    wrong = []
-    for path in sorted(package.rglob("*.py")):
-        for name in re.findall(r":mod:`([^`]+)`", path.read_text(encoding="utf-8")):
-            # A short name is a module of the same folder.
-            inner = name.removeprefix("mkpc_kaggle").lstrip(".").replace(".", "/")
-            base = package if name.startswith("mkpc_kaggle") else path.parent
-            if not ((base / f"{inner}.py").is_file() or (base / inner).is_dir()):
-                wrong.append(f"{path.relative_to(package)}: {name}")
-    assert wrong == []
-
-
 def test_no_error_of_any_type_is_dropped():
     # Such a block turns a limit of a library into "no information".
     dropped = re.compile(r"suppress\((Base)?Exception\b|except( (Base)?Exception)?:\s+pass\b")

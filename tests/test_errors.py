@@ -2,13 +2,7 @@
 
 import pytest
 
-from mkpc_kaggle.errors import UserError, plural, temporary_directory
-
-
-def test_counts_are_in_the_singular_and_the_plural():
-    assert [plural(count, "batch") for count in (0, 1, 2)] == ["0 batches", "1 batch", "2 batches"]
-    assert plural(1, "match") == "1 match"
-    assert plural(2, "pair") == "2 pairs"
+from mkpc_kaggle.errors import UserError, temporary_directory
 
 
 def test_the_errors_of_the_interface_have_a_name_in_it():

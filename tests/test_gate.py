@@ -5,12 +5,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-import torch
-from genuine import genuine_store
 
 from benchmarks import gate
-from benchmarks.originals import Record
-from mkpc_kaggle.data.competition import Pair
 
 RATIOS = {"same": 1.04, "worse": 1.2, "better": 0.5}
 
@@ -54,32 +50,3 @@ def test_a_ratio_above_its_tolerance_comes_first_and_ends_with_1(baseline, monke
     assert lines[0].startswith("REGRESSION") and "worse" in lines[0]
     assert lines[-1].startswith("new")
     assert json.loads(baseline.read_text())["ratios"] == known
-
-
-def test_a_written_baseline_has_its_machine_and_no_regression(baseline, monkeypatch, capsys):
-    baseline.write_text(
-        json.dumps({"machine": "another", "ratios": {"other": {"ratio": 3.0, "tolerance": 0.2}}})
-    )
-    assert run(monkeypatch, "--write") == 0
-    written = json.loads(baseline.read_text())
-    assert written["ratios"].keys() == {*RATIOS, "first", "other"}
-    assert written["ratios"]["worse"] == {"ratio": 1.2, "tolerance": 0.1}
-    assert written["versions"]["numpy"]
-    assert run(monkeypatch) == 0
-
-
-def test_nothing_measured_is_neither_a_success_nor_a_regression(baseline, monkeypatch, capsys):
-    monkeypatch.setattr(gate, "MEASUREMENTS", {"networks": (lambda _: iter(()), 0.1)})
-    assert run(monkeypatch) == 2
-
-
-@pytest.mark.genuine
-def test_without_the_authors_lightglue_aliked_is_compared_alone():
-    example = Path(__file__).parents[1] / "docs" / "example"
-    pair = Pair("example", "example", str(example / "a.jpg"), str(example / "b.jpg"))
-    record = Record()
-    with torch.inference_mode():
-        comparison = gate.comparison_of("aliked_lightglue", genuine_store(), None)
-        comparison.measure(pair, record)
-    assert list(record.equal) == ["aliked"]
-    assert set(record.seconds) == {("aliked", "ours"), ("aliked", "theirs")}

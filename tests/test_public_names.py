@@ -1,7 +1,6 @@
 """The names of ``mkpc_kaggle``: documented in sections, with examples that run."""
 
 import doctest
-import inspect
 import subprocess
 import sys
 
@@ -37,21 +36,6 @@ def test_the_examples_of_a_public_name_run(name, tmp_path, monkeypatch):
     said = []
     result = doctest.DocTestRunner().run(examples, out=said.append)
     assert result.failed == 0, "".join(said)
-
-
-@pytest.mark.parametrize("name", DOCUMENTED)
-def test_the_help_of_a_public_name_describes_each_parameter(name):
-    public = getattr(mkpc_kaggle, name)
-    text = inspect.getdoc(public)
-    parameters = list(inspect.signature(public).parameters)
-    if name == "PairwiseMatcher":  # a base class, made without arguments
-        return
-    assert "\nParameters\n----------\n" in text
-    described = text.split("\nParameters\n----------\n")[1].split("\n----")[0]
-    # A line such as "left, top : int".
-    heads = [line.split(" : ")[0] for line in described.splitlines() if line[:1].strip()]
-    words = {word for head in heads for word in head.split(", ")}
-    assert [parameter for parameter in parameters if parameter not in words] == []
 
 
 def test_every_public_name_exists_and_is_listed_for_completion():

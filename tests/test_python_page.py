@@ -15,7 +15,7 @@ OURS = [block for block in BLOCKS if block not in GENUINE_BLOCKS]
 
 
 @pytest.fixture
-def names(tmp_path, monkeypatch) -> dict:
+def names(tmp_path, monkeypatch, nowhere_else) -> dict:
     """The names that snippets have in common, in a directory with two parts of a photograph."""
     write_two_views(tmp_path)
     monkeypatch.chdir(tmp_path)

@@ -20,7 +20,6 @@ from mkpc_kaggle.recipe import (
     load_recipe,
     parse_recipe,
     recipe_names,
-    split_mode,
 )
 from mkpc_kaggle.weights.manifest import manifest
 
@@ -50,11 +49,6 @@ def test_a_recipe_of_the_package_loads_with_options_for_every_matcher(name):
     assert (recipe.focal is None) == name.startswith("imc2022")
 
 
-def test_auto_reconstructs_scenes_as_light_does():
-    # With the weights of light alone, auto has its two matchers.
-    assert load_recipe("auto").scene == load_recipe("light").scene
-
-
 def test_any_remaining_matchers_of_recipe_auto_begin_with_a_unit_of_stage_1():
     # Users have any subset of the weights, and a run without a sweep has no F for any pair.
     recipe = load_recipe("auto")
@@ -73,11 +67,6 @@ def test_recipes_with_weights_for_noncommercial_use_are_those_that_the_readme_na
     licences = {file.slot: file.licence for file in manifest()}
     bound = ["noncommercial" in licences[slot] for slot in slots_of(recipe, recipe.matcher_names)]
     assert any(bound) == name.startswith(("imc2022", "auto", "best"))
-
-
-@pytest.mark.parametrize("name", recipe_names())
-def test_no_shipped_recipe_changes_the_threshold_as_robust_py_says(name):
-    assert load_recipe(name).magsac.threshold == RobustConfig().threshold
 
 
 def test_a_recipe_reads_as_written():
@@ -130,7 +119,6 @@ def unit(**changes):
         ),
         # A mistyped key would otherwise leave the default in use, unseen.
         (SIFT + "[mkpc]\nepsilon = 1\n", r"\[mkpc\].*'epsilon'.*eps, min_samples, share, expand_x"),
-        (units(unit(stage=None)), r"unit 1: missing keys 'stage'"),
         ("", "no units"),
         ("units = [", "not valid TOML"),
         (
@@ -138,16 +126,13 @@ def unit(**changes):
             r"\[mkpc\], key 'min_samples': expected int, got 5.0",
         ),
         (SIFT + '[mkpc]\nwhen = "ALWAYS"\n', r"'ALWAYS' is none of 'always', 'scale'"),
-        (units(unit(stage="true")), r"key 'stage': expected int, got True"),
         ('units = "sift"\n', "units|unit 1"),
         # The first unit sweeps all pairs, and no crop exists before it.
         (units(unit(stage=2)), "so it must have stage 1"),
         # A unit's name is its name in tables and journals.
         (units(unit(), unit(max_matches=9)), "1:sift@640 twice"),
         (units(unit(long_side=-9)), r"unit 1: long_side must be in \[0, 99999\]"),
-        (units(unit(long_side=None)), "either long_side or area must be given"),
         (units(unit(area='"9x9"')), "and not both"),
-        (units(unit(max_matches=0)), r"max_matches must be in \[1, inf\), not 0"),
         (units(unit(stretch="true")), "stretch needs an area"),
         (
             units(unit(long_side=None, area='"54x72"', enlarge="false")),
@@ -158,7 +143,7 @@ def unit(**changes):
                 units(unit(long_side=None, area=f'"{area}"')),
                 f'height x width such as "540x720", not {area!r}',
             )
-            for area in ("540", "540x0", "540 x 720", "640x100000")
+            for area in ("540x0", "540 x 720")
         ],
         (SIFT + "[mkpc]\neps = nan\n", r"table \[mkpc\]: .*eps must be in \[1e-06, inf\), not nan"),
         (SIFT + "[magsac]\nthreshold = 0\n", r"threshold must be in \(0, inf\), not 0"),
@@ -222,13 +207,3 @@ def test_modes_keep_stage_1_or_show_every_unit_the_whole_image_and_none_twice():
     # Both units of SIFT at 640 pixels would see the same pictures.
     names = [unit.name for unit in whole.units]
     assert names == ["1:sift@640", "1:aliked@800", "1:aliked@640", "1:sift@320"]
-
-
-def test_a_mode_follows_the_last_colon_of_a_choice_if_it_is_one():
-    for text, recipe, mode in (
-        ("classical", "classical", Mode.TWO_STAGE),
-        ("my/own.toml:stage-1", "my/own.toml", Mode.STAGE_1),
-        ("C:own.toml", "C:own.toml", Mode.TWO_STAGE),
-        (":stage-1", ":stage-1", Mode.TWO_STAGE),
-    ):
-        assert split_mode(text) == (recipe, mode)

@@ -55,10 +55,11 @@ def adjust(model: Any, cameras: Mapping[str, KnownCamera]) -> None:
     model.update_point_3d_errors()
 
 
-def drop_flat_lenses(model: Any, given: Collection[str]) -> None:
-    """Replace lenses of pycolmap's model that move no pixel by more than ``MAX_FLAT_PX``, or
-    ``MAX_FLAT_SHARE`` if only one image has the lens, by pinholes. Cameras of the images ``given``, by
-    name, stay.
+def drop_flat_lenses(model: Any, given: Collection[str], *, is_adjusted: bool) -> None:
+    """Replace lenses of pycolmap's model that move no pixel by more than ``MAX_FLAT_PX`` by pinholes.
+    Cameras of the images ``given``, by name, stay.
+
+    If an adjustment follows, the limit for the lens of a single image is ``MAX_FLAT_SHARE``.
     """
     counts = Counter(image.camera_id for image in model.images.values() if image.has_pose)
     kept = {image.camera_id for image in model.images.values() if image.name in given}
@@ -74,7 +75,8 @@ def drop_flat_lenses(model: Any, given: Collection[str]) -> None:
         rays = np.column_stack([(pixels - centre) / focals, np.ones(len(pixels))])
         moved = np.linalg.norm(np.array(camera.img_from_cam(rays)) - pixels, axis=1)
         side = max(camera.width, camera.height)
-        limit = MAX_FLAT_PX if counts[number] > 1 else MAX_FLAT_SHARE * side
+        is_alone = is_adjusted and counts[number] == 1
+        limit = MAX_FLAT_SHARE * side if is_alone else MAX_FLAT_PX
         if moved.max() <= limit:  # false for NaN
             names = pycolmap.CameraModelId
             camera.model = names.SIMPLE_PINHOLE if len(focals) == 1 else names.PINHOLE

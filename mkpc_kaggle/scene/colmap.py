@@ -380,10 +380,11 @@ def _filter_points(observations: Any, model: Any, settings: Any) -> None:
 def _reconstruction(mapped: Sequence[Any], graph: ViewGraph, config: SceneConfig) -> Reconstruction:
     """Return pycolmap's models with the user's cameras, without implausible images."""
     given_cameras = known_by_name(graph)
+    # In a large scene, points of two views are too many.
+    is_adjusted = bool(given_cameras) or len(graph.images) <= config.all_tracks
     for model in mapped:
-        drop_flat_lenses(model, given_cameras)
-        # In a large scene, points of two views are too many.
-        if given_cameras or len(graph.images) <= config.all_tracks:
+        drop_flat_lenses(model, given_cameras, is_adjusted=is_adjusted)
+        if is_adjusted:
             adjust(model, given_cameras)
         # A point behind a camera has no reprojection error.
         observations = pycolmap.ObservationManager(model)

@@ -10,11 +10,9 @@ import numpy as np
 import pytest
 from shared import run_command
 
-from mkpc_kaggle.cli import COMMANDS
 from mkpc_kaggle.data.competition import read_test_side, write_submission
 from mkpc_kaggle.demo import DemoSet
 from mkpc_kaggle.geometry.robust import FALLBACK_FUNDAMENTAL
-from mkpc_kaggle.recipe import recipe_names
 
 
 def test_importing_the_package_is_cheap_and_geometry_and_weights_bring_no_torch():
@@ -42,17 +40,6 @@ def test_a_reader_that_leaves_ends_the_command_quietly():
     assert (done.returncode, done.stderr) == (141, b"")
 
 
-def test_recipes_are_listed_in_one_line_each(clean_environment, capsys):
-    assert run_command("recipes") == 0
-    lines = capsys.readouterr().out.splitlines()
-    names = [line.split()[0] for line in lines[1 : len(recipe_names()) + 1]]
-    assert names == recipe_names()
-    (classical,) = (line for line in lines if line.startswith("classical"))
-    assert "1 of 1" in classical
-    # It was 100 lines of "at most 4096".
-    assert max(map(len, lines)) <= 120
-
-
 def test_a_recipe_is_listed_with_its_units_and_missing_weights(clean_environment, capsys):
     assert run_command("recipes", "best") == 0
     lines = capsys.readouterr().out.splitlines()
@@ -65,14 +52,6 @@ def test_a_recipe_is_listed_with_its_units_and_missing_weights(clean_environment
     assert "`mkpc weights fetch aliked-n16 aliked-lightglue --out DIR`" in listed
     assert run_command("recipes", "classical") == 0
     assert "all weights are available" in capsys.readouterr().out
-
-
-def test_without_arguments_the_commands_are_printed(capsys):
-    assert run_command() == 0
-    out = " ".join(capsys.readouterr().out.split())
-    assert out.startswith("usage: mkpc [-h] [--version] COMMAND ...")
-    for name, summary in COMMANDS.items():
-        assert f" {name} {summary}" in out
 
 
 def test_check_accepts_a_whole_submission_and_refuses_one_with_a_missing_row(

@@ -6,10 +6,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from shared import contents
 
 from mkpc_kaggle.demo import DemoSet, write_demo
-from mkpc_kaggle.demo.camera import covisibility, look_at, project, unproject, visible_mask
+from mkpc_kaggle.demo.camera import look_at, project, unproject, visible_mask
 from mkpc_kaggle.demo.render import render
 from mkpc_kaggle.demo.world import SCENES, build_world, quad
 from mkpc_kaggle.geometry.cameras import Camera, fundamental_of_cameras
@@ -91,28 +90,6 @@ def test_a_view_warped_by_its_depth_agrees_with_the_other_view():
         assert difference(shift) > 3 * unshifted
 
 
-def test_covisibility_counts_the_shared_half_of_a_wall_but_no_sky_and_no_hidden_points():
-    # A view is 10 m wide at the wall; half of that is a baseline of 5 m.
-    a = look_at((0.0, 0, 0), (0.0, 10, 0), 200, (200, 150))
-    b = look_at((5.0, 0, 0), (5.0, 10, 0), 200, (200, 150))
-    texture = blobs()
-    wall = upright((-50, 10), (50, 10), -50, 50, texture)
-    # 2 m before the second camera, it fills that view.
-    screen = upright((3, 2), (7, 2), -50, 50, texture)
-    cases = [
-        ([wall], 0.5),
-        ([wall, screen], 0),
-        ([], 0),
-    ]
-    for surfaces, shared in cases:
-        _, depth_a = render(surfaces, a)
-        _, depth_b = render(surfaces, b)
-        found = covisibility(a, depth_a, b, depth_b)
-        # A view has 200 columns, so a border that is one column off costs 0.005.
-        assert found == pytest.approx(shared, abs=0.02)
-        assert found == covisibility(b, depth_b, a, depth_a)
-
-
 @pytest.mark.parametrize("scene_name", SCENES)
 def test_fundamental_matrices_and_pictures_are_those_of_the_cameras(small_demo, scene_name):
     train = small_demo.train_dir / scene_name
@@ -160,34 +137,3 @@ def test_the_test_side_has_covisible_pairs_of_renamed_train_images(small_demo):
             difference = np.abs(png.astype(int) - jpg).mean()
             # Grey levels of JPEG's loss: the train side is stored as JPEG, the test side as PNG.
             assert difference < 6, "the same picture"
-
-
-def test_the_street_has_wide_photographs_and_lenses_of_two_and_four_times_their_focal_length(
-    small_demo,
-):
-    street = small_demo.train_dir / "street"
-    focal = {}
-    for row in rows(street / "calibration.csv"):
-        K = numbers(row["camera_intrinsics"], 3, 3)
-        # Over the image's width: the principal point is its centre.
-        focal[row["image_id"]] = K[0, 0] / K[0, 2]
-    ratios = []
-    for row in rows(street / "pair_covisibility.csv"):
-        first, second = row["pair"].split("-")
-        is_wide = [name in {"street_0000", "street_0001"} for name in (first, second)]
-        if is_wide == [False, True]:
-            ratios.append(focal[first] / focal[second])
-            # A lens of four times the focal length shows at most a sixteenth of the wide photograph.
-            assert float(row["covisibility"]) > 0.02
-    np.testing.assert_allclose(sorted(ratios), 8 * [2.0] + 8 * [4.0], rtol=0.02)
-
-
-def test_a_scene_has_the_same_bytes_with_and_without_the_other_scenes(tmp_path, small_demo):
-    alone = write_demo(tmp_path, scenes=["market"], image_scale=SCALE)
-    scenes = [path.name for path in alone.train_dir.iterdir() if path.is_dir()]
-    assert scenes == ["market"]
-    market = contents(alone.train_dir / "market")
-    assert market == contents(small_demo.train_dir / "market")
-    of_all = contents(small_demo.test_dir / "test_images")
-    of_market = contents(alone.test_dir / "test_images")
-    assert of_market.items() <= of_all.items()

@@ -14,7 +14,6 @@ from mkpc_kaggle.engine.budget import (
     parse_duration,
 )
 from mkpc_kaggle.errors import UserError
-from mkpc_kaggle.progress import format_duration
 
 
 @pytest.mark.parametrize(
@@ -31,22 +30,6 @@ from mkpc_kaggle.progress import format_duration
 )
 def test_durations_are_read(text: str, seconds: float) -> None:
     assert parse_duration(text) == seconds
-
-
-@pytest.mark.parametrize(
-    "text",
-    # "8h45" may mean minutes or seconds, and a limit of no time is a mistake.
-    ["", "h", "8 hours", "-5s", "1m1h", "0", "0s", "nan", "9:00", "8h45", "1h30m20"],
-)
-def test_a_text_that_is_no_duration_is_refused(text: str) -> None:
-    with pytest.raises(UserError):
-        parse_duration(text)
-
-
-def test_durations_are_printed_in_a_short_form() -> None:
-    # 3599.9 s would be "60m00s" if minutes were rounded before hours are split off.
-    shown = [format_duration(seconds) for seconds in (4.24, 59.9, 61, 3599.9, 31500)]
-    assert shown == ["4.2s", "59.9s", "1m01s", "1h00m", "8h45m"]
 
 
 def test_the_four_moments_of_a_budget_follow_each_other() -> None:

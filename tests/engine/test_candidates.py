@@ -7,12 +7,11 @@ from collections import Counter
 from dataclasses import replace
 from functools import partial
 
-import cv2
 import numpy as np
 import pytest
 from faulty import choose_scene_for_all_but_the_first, scenes_by
 from pandas.testing import assert_frame_equal
-from rectified import SIZE, THREE_UNITS, RectifiedMatcher, batch_pairs, run
+from rectified import THREE_UNITS, RectifiedMatcher, batch_pairs, run
 from simulator import Scenario, memory_store, simulate
 from synthetic import QUICK, SyntheticMatcher, synthetic_pairs
 
@@ -29,8 +28,12 @@ from mkpc_kaggle.scene.sfm import Solution
 from mkpc_kaggle.signals import Interrupt
 
 FIRST, _, LAST = (unit.name for unit in THREE_UNITS.units)
+
+
 # All units, and the units of stage 1 alone
 RECIPE = Recipe((THREE_UNITS.units[0], THREE_UNITS.units[2]), scene=SceneConfig(candidates=4))
+
+
 DISAGREEMENTS = {ALL_UNITS: 5.0, SUPPORTED: 4.0, FIRST: 1.0, LAST: 3.0}
 
 
@@ -64,16 +67,6 @@ def made(monkeypatch: pytest.MonkeyPatch) -> list[SceneJob]:
     return jobs
 
 
-def test_the_candidate_that_agrees_best_is_used_and_no_other(tmp_path, made):
-    pairs = batch_pairs(tmp_path / "images")
-    report = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
-    assert report.ending is Ending.COMPLETE
-    assert candidates(made) == [ALL_UNITS, SUPPORTED, FIRST, LAST]
-    assert numbers(report) == {3.0}
-    assert report.scenes["candidate"].tolist() == [FIRST]
-    assert results(tmp_path / "work").scenes["candidate"].tolist() == [FIRST]
-
-
 def test_a_candidate_is_a_result_under_its_key_and_is_not_made_twice(tmp_path, made):
     pairs = batch_pairs(tmp_path / "images")
     first = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
@@ -87,20 +80,6 @@ def test_a_candidate_is_a_result_under_its_key_and_is_not_made_twice(tmp_path, m
     two = replace(RECIPE, scene=SceneConfig(candidates=3))
     assert numbers(run(pairs, two, RectifiedMatcher(), tmp_path / "fresh")) == {3.0}
     assert candidates(made) == [ALL_UNITS, SUPPORTED, FIRST]
-
-
-@pytest.mark.parametrize(
-    "recipe",
-    [
-        replace(RECIPE, scene=SceneConfig()),
-        replace(RECIPE, units=RECIPE.units[:1]),
-        replace(RECIPE, units=(RECIPE.units[0], replace(RECIPE.units[1], tracks=False))),
-    ],
-    ids=["one is asked for", "one unit", "one unit makes tracks"],
-)
-def test_without_a_choice_there_is_one_candidate(tmp_path, made, recipe):
-    run(batch_pairs(tmp_path / "images"), recipe, RectifiedMatcher(), tmp_path / "work")
-    assert [job.candidate for job in made] == [ALL_UNITS]
 
 
 def test_a_candidate_that_is_lost_costs_itself_alone_and_the_next_run_tries_it_again(
@@ -126,23 +105,6 @@ def test_a_candidate_that_is_lost_costs_itself_alone_and_the_next_run_tries_it_a
     assert numbers(again) == {3.0}
 
 
-def test_of_equal_candidates_the_first_stays(tmp_path, monkeypatch):
-    equal = dict.fromkeys(DISAGREEMENTS, 0.8)
-    scenes_by(monkeypatch, partial(solve, [], equal))
-    report = run(batch_pairs(tmp_path / "images"), RECIPE, RectifiedMatcher(), tmp_path / "work")
-    assert numbers(report) == {1.0}
-
-
-def test_a_candidate_of_former_images_is_not_compared_with_others(tmp_path, made):
-    pairs = batch_pairs(tmp_path / "images")
-    run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
-    cv2.imwrite(pairs[0].file0, np.full((SIZE.height, SIZE.width, 3), 200, np.uint8))
-    del made[:]
-    report = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
-    assert candidates(made) == [ALL_UNITS, SUPPORTED, FIRST, LAST]
-    assert numbers(report) == {3.0}
-
-
 def test_without_time_for_others_the_first_candidate_is_all(tmp_path, made):
     # The forecast of any scene has the start of its process, three seconds.
     budget = Budget(time.monotonic(), 4.0)
@@ -154,7 +116,7 @@ def test_without_time_for_others_the_first_candidate_is_all(tmp_path, made):
     assert numbers(run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")) == {3.0}
 
 
-@pytest.mark.parametrize("until", [20.0, 45.0, 60.0, 66.0, 73.0, 79.0])
+@pytest.mark.parametrize("until", [20.0, 60.0, 73.0])
 def test_interrupted_and_resumed_runs_choose_as_an_undisturbed_one(until):
     scenario = Scenario(12, (1.0, 1.0, 1.0), 1, 600.0, batches=3, candidates=4, misses=0)
     whole = simulate(scenario)
@@ -213,3 +175,13 @@ def test_each_candidate_has_its_files_of_colmap_and_one_without_them_is_made_aga
     assert ask() == key
     assert [job.candidate for job in jobs] == [units[1].name]
     assert (folder / "models" / "0" / "images.bin").read_bytes() == chosen
+
+
+def test_the_candidate_that_agrees_best_is_used_and_no_other(tmp_path, made):
+    pairs = batch_pairs(tmp_path / "images")
+    report = run(pairs, RECIPE, RectifiedMatcher(), tmp_path / "work")
+    assert report.ending is Ending.COMPLETE
+    assert candidates(made) == [ALL_UNITS, SUPPORTED, FIRST, LAST]
+    assert numbers(report) == {3.0}
+    assert report.scenes["candidate"].tolist() == [FIRST]
+    assert results(tmp_path / "work").scenes["candidate"].tolist() == [FIRST]

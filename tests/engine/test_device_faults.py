@@ -2,7 +2,6 @@
 takes over.
 """
 
-import threading
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -26,7 +25,6 @@ from rectified import SECOND, SWEEP, THIRD, THREE_UNITS, RectifiedMatcher, matri
 
 from mkpc_kaggle.cli import main, options
 from mkpc_kaggle.data.competition import read_test_side, submission_problems
-from mkpc_kaggle.engine.budget import Costs
 from mkpc_kaggle.engine.frames import Results
 from mkpc_kaggle.engine.places import Place
 from mkpc_kaggle.engine.request import Ending
@@ -37,6 +35,8 @@ from mkpc_kaggle.pipeline.stages import Pipeline
 from mkpc_kaggle.recipe import Unit
 
 COUNT = 12
+
+
 VICTIM = 3  # brightness 13
 
 
@@ -51,12 +51,9 @@ def test_each_error_is_a_kind_of_failure_by_its_text():
         FailureKind.OUT_OF_MEMORY: [
             "[enforce fail at alloc_cpu.cpp:117] err == 0. DefaultCPUAllocator: can't allocate memory",
             cuda.format("out of memory"),
-            cuda.format("CUBLAS_STATUS_ALLOC_FAILED when calling `cublasCreate(handle)`"),
-            "cuDNN error: CUDNN_STATUS_ALLOC_FAILED",
             "cuDNN error: CUDNN_STATUS_INTERNAL_ERROR_DEVICE_ALLOCATION_FAILED",
             # cuDNN's words if its workspace does not fit
             "FIND was unable to find an engine to execute this computation",
-            "GET was unable to find an engine to execute this computation",
         ],
         FailureKind.DEVICE: [
             cuda.format("an illegal memory access was encountered"),
@@ -128,13 +125,11 @@ def test_a_device_that_fails_once_costs_a_worker_and_no_unit(run_at, undisturbed
 @pytest.mark.parametrize(
     "error",
     [
-        "CUDA error: invalid configuration argument",
         "CUDA error: device-side assert triggered",
-        "cuDNN error: CUDNN_STATUS_NOT_SUPPORTED",
         "cusolver error: CUSOLVER_STATUS_EXECUTION_FAILED, when calling `cusolverDnSgesvdj(...)`",
     ],
 )
-@pytest.mark.parametrize("gpus", [1, 2, 4])
+@pytest.mark.parametrize("gpus", [1, 2])
 def test_a_pair_that_fails_on_each_gpu_costs_its_own_units_and_no_gpu(
     run_at, undisturbed, error, gpus
 ):
@@ -159,8 +154,7 @@ def test_a_pair_that_fails_on_each_gpu_costs_its_own_units_and_no_gpu(
 
 
 @pytest.mark.parametrize("first", [ASSERTED, "index 7 is out of bounds"])
-@pytest.mark.parametrize("minibatch", [1, 8])
-@pytest.mark.parametrize("gpus", [1, 2, 4])
+@pytest.mark.parametrize(("gpus", "minibatch"), [(1, 1), (2, 8)])
 def test_a_pair_that_spoils_its_process_costs_no_other_pair_a_unit(
     run_at, undisturbed, monkeypatch, gpus, minibatch, first
 ):
@@ -184,19 +178,6 @@ def test_a_pair_that_spoils_its_process_costs_no_other_pair_a_unit(
     assert matrices(report)[VICTIM + 1 :] == matrices(undisturbed)[VICTIM + 1 :]
 
 
-@pytest.mark.parametrize("count", [1, 2])
-def test_one_or_two_pairs_that_a_gpu_cannot_match_are_left_to_the_cpu(
-    pairs, undisturbed, tmp_path, monkeypatch, count
-):
-    # Too few losses to close the place
-    gpu = thread_place("cuda:0", RectifiedMatcher(matches=lambda _: break_device()))
-    use_places(monkeypatch, gpu, fallback=[thread_place("cpu", RectifiedMatcher())])
-    recipe = replace(THREE_UNITS, units=(SWEEP,))
-    report = run(pairs[:count], recipe, RectifiedMatcher(), tmp_path / "work")
-    assert report.ending is Ending.COMPLETE
-    assert set(report.pairs["units"]) == {1}
-
-
 def test_a_pair_on_which_a_device_failed_is_matched_by_a_healthy_one(run_at, undisturbed):
     broken = RectifiedMatcher(matches=breaks_after(2))
     # Slow enough that the other one gets pairs
@@ -204,74 +185,6 @@ def test_a_pair_on_which_a_device_failed_is_matched_by_a_healthy_one(run_at, und
     report = run_at(thread_place("cuda:0", broken), thread_place("cuda:1", healthy))
     assert report.about.faults
     assert all("cuda:0: the device failed" in fault for fault in report.about.faults)
-    assert_as_if_nothing_had_failed(report, undisturbed)
-
-
-def test_jobs_of_the_cpu_that_takes_over_have_one_pair(run_at, undisturbed, monkeypatch):
-    sizes: dict[str, set[int]] = {"cuda:0": set(), "cpu": set()}
-    submit = Place.submit
-
-    def noted(place: Place, job: Any, *arguments: float) -> None:
-        if place.name in sizes:
-            sizes[place.name].add(len(job.indices))
-        submit(place, job, *arguments)
-
-    monkeypatch.setattr(Place, "submit", noted)
-    gpu = thread_place("cuda:0", RectifiedMatcher(matches=breaks_after(2)), minibatch=8)
-    report = run_at(gpu, fallback=[thread_place("cpu", RectifiedMatcher())])
-    assert_as_if_nothing_had_failed(report, undisturbed)
-    assert max(sizes["cuda:0"]) == 8
-    assert sizes["cpu"] == {1}
-
-
-def test_a_unit_that_raises_is_no_measurement(pairs, tmp_path, monkeypatch):
-    measured = []
-    monkeypatch.setattr(Costs, "observe", lambda _, unit, *__, **___: measured.append(unit))
-
-    def answer(brightness: int) -> int:
-        if brightness % 4:
-            raise KeyError("x")
-        return 150
-
-    recipe = replace(THREE_UNITS, units=(SWEEP,))
-    report = run(pairs, recipe, RectifiedMatcher(matches=answer), tmp_path / "work")
-    assert report.about.units_run == 3
-    assert (report.units["failure"] != "").sum() == 9
-    assert measured.count(SWEEP.name) == 3
-
-
-def test_a_device_without_kernels_leaves_the_work_to_the_cpu_with_a_message(
-    run_at, undisturbed, capsys
-):
-    # As Kaggle's P100, for which PyTorch has no kernels any more
-    assembly = assemble(THREE_UNITS, matchers={"rectified": RectifiedMatcher()}, device="cpu")
-    gpu = thread_place(
-        "cuda:99", RectifiedMatcher(), pipeline=partial(Pipeline.of, assembly.on("cuda:99"))
-    )
-    report = run_at(gpu, fallback=[thread_place("cpu", RectifiedMatcher())])
-    assert "cuda:99 cannot be used" in capsys.readouterr().err
-    assert_as_if_nothing_had_failed(report, undisturbed)
-
-
-def test_a_worker_that_hangs_keeps_no_job_from_the_others(run_at, undisturbed):
-    # One worker waits until the other has matched all other pairs.
-    swept = set()
-    others_done = threading.Event()
-
-    def wait_for_others(brightness: int) -> int:
-        assert others_done.wait(120), f"only {sorted(swept)} had a turn"
-        return 150
-
-    def note(brightness: int) -> int:
-        swept.add(brightness)
-        if len(swept) == COUNT - 1:
-            others_done.set()
-        return 150
-
-    matchers = [RectifiedMatcher(matches=answer) for answer in (wait_for_others, note)]
-    report = run_at(
-        *(thread_place(f"cuda:{number}", matcher) for number, matcher in enumerate(matchers))
-    )
     assert_as_if_nothing_had_failed(report, undisturbed)
 
 

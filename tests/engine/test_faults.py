@@ -4,7 +4,6 @@ import os
 import pty
 import random
 import signal
-import sqlite3
 import subprocess
 import sys
 import termios
@@ -28,11 +27,12 @@ from mkpc_kaggle.engine import keys, session, worker
 from mkpc_kaggle.engine.frames import matrices_of, results, results_of
 from mkpc_kaggle.engine.request import Ending
 from mkpc_kaggle.engine.run import Run
-from mkpc_kaggle.engine.state import State
-from mkpc_kaggle.engine.store import Source, Store
+from mkpc_kaggle.engine.store import Store
 from mkpc_kaggle.signals import interruptible
 
 ROOT = Path(__file__).resolve().parents[2]
+
+
 PATHS = [str(ROOT), str(ROOT / "tests" / "support")]
 
 
@@ -112,15 +112,6 @@ def test_an_error_of_the_engine_itself_leaves_the_latest_version_behind(
     assert has_units.tolist() == [True, True] + [False] * 10
 
 
-def small_store(
-    pages: int, directory: Path, *, opened: Callable[..., Store] = Store.open, fresh: bool = False
-) -> Store:
-    """Open a store whose file cannot grow beyond its present size and these pages."""
-    store = opened(directory, fresh=fresh)
-    store.db.execute(f"PRAGMA main.max_page_count = {pages}")
-    return store
-
-
 def test_a_run_whose_store_is_full_keeps_its_results_in_memory(
     pairs, undisturbed, tmp_path, monkeypatch
 ):
@@ -134,39 +125,6 @@ def test_a_run_whose_store_is_full_keeps_its_results_in_memory(
     resumed = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
     assert resumed.ending is Ending.COMPLETE
     assert matrices(resumed) == matrices(undisturbed)
-
-
-def test_an_error_of_the_disk_when_points_are_read_costs_a_job_and_the_run_goes_on(
-    pairs, undisturbed, tmp_path, monkeypatch
-):
-    errors = iter([sqlite3.OperationalError("disk I/O error")])
-    matches = Source.matches
-
-    def failing(source: Source, keys: Any) -> Any:
-        if keys := list(keys):
-            for error in errors:
-                raise error
-        return matches(source, keys)
-
-    monkeypatch.setattr(Source, "matches", failing)
-    report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work")
-    assert report.ending is Ending.COMPLETE
-    assert any("disk I/O error" in fault for fault in report.about.faults)
-    assert matrices(report) == matrices(undisturbed)
-
-
-def test_an_error_of_the_disk_at_the_start_is_no_bad_input(
-    demo, small_recipe, tmp_path, monkeypatch
-):
-    def failing(*_: Any) -> dict[str, Any]:
-        raise sqlite3.OperationalError("disk I/O error")
-
-    monkeypatch.setattr(Store, "facts", failing)
-    output = tmp_path / "submission.csv"
-    # A traceback, with status 1: status 2 would ask the user to correct the input.
-    with pytest.raises(sqlite3.OperationalError):
-        main(["submit", *arguments_of(demo, small_recipe, output), "--workers", "0"])
-    assert submission_problems(output, [pair.id for pair in read_test_side(demo.test_dir)]) == []
 
 
 def test_a_submission_that_the_disk_refuses_is_reported_and_the_exit_status_is_one(
@@ -187,27 +145,6 @@ def test_a_submission_that_the_disk_refuses_is_reported_and_the_exit_status_is_o
     assert main(["submit", *arguments_of(demo, small_recipe, output), "--workers", "0"]) == 1
     assert "is not the last version" in capsys.readouterr().out
     assert submission_problems(output, [pair.id for pair in read_test_side(demo.test_dir)]) == []
-
-
-def test_results_whose_file_cannot_be_written_stay_in_the_table_for_the_next_run(
-    pairs, undisturbed, tmp_path
-):
-    def full(_: State) -> None:
-        raise OSError(28, "No space left on device")
-
-    report = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work", publish=full)
-    assert "No space left on device" in report.about.unwritten
-    assert report.about.faults == [report.about.unwritten]
-    with Store.read(tmp_path / "work") as store:
-        assert results_of(store).pairs["units"].tolist() == [3] * 12
-    written: list[list[bytes]] = []
-
-    def note(state: State) -> None:
-        written.append([F.tobytes() for F in state.fundamentals])
-
-    resumed = run(pairs, THREE_UNITS, RectifiedMatcher(), tmp_path / "work", publish=note)
-    assert (resumed.about.units_run, resumed.about.estimated) == (0, 0)
-    assert written[0] == matrices(undisturbed), "before any work"
 
 
 def arguments_of(demo: DemoSet, recipe: Path, output: Path) -> list[str]:
@@ -247,14 +184,9 @@ def without_a_reader(command: list[str]) -> int:
         return subprocess.run(command, stdout=gone, stderr=gone, check=False).returncode
 
 
-def with_stderr_closed(command: list[str]) -> int:
-    return subprocess.run(["sh", "-c", 'exec "$@" 2>&-', "sh", *command], check=False).returncode
-
-
 CANNOT_PRINT = {  # tests/hostile/unread.py has pipes that are full
     "closed terminal": on_a_terminal,
     "stopped terminal": partial(on_a_terminal, is_stopped=True),
-    "stderr closed": with_stderr_closed,
     "no reader": without_a_reader,
 }
 
@@ -280,29 +212,9 @@ def test_a_run_that_cannot_print_makes_the_whole_submission(
     assert output.read_bytes() == told
 
 
-def test_scenes_are_reconstructed_after_the_terminal_closed(demo, small_recipe, tmp_path):
-    output = tmp_path / "submission.csv"
-    script = [sys.executable, str(ROOT / "make_submission.py"), "--scenes"]
-    # As soon as something is printed: the processes of workers and scenes are started later.
-    command = [*script, *arguments_of(demo, small_recipe, output)]
-    assert on_a_terminal(command, is_read=True) == 0
-    found = results(tmp_path / "submission.work")
-    assert found.about.faults == []
-    assert len(found.scenes) == 1
-
-
 def python(code: str, *arguments: str) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-c", code, *arguments]
     return subprocess.run(command, capture_output=True, text=True, check=False)
-
-
-def test_a_program_exits_without_the_interpreters_shutdown():
-    # An orderly exit takes a second or longer, and waits for threads that hang.
-    late = "import atexit; atexit.register(print, 'late'); "
-    done = python(late + "from mkpc_kaggle.cli import program; program(['recipes'])")
-    assert (done.returncode, done.stderr) == (0, "")
-    assert "auto " in done.stdout
-    assert "late" not in done.stdout
 
 
 STUCK = """
@@ -437,14 +349,6 @@ def test_the_watchdog_leaves_no_unfinished_file(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_limit_of_ten_million_years_is_no_limit():
-    # More seconds than the clock of the system has; a wait for them raises OverflowError.
-    done = python(
-        GUARDED.format(limit=359999999996400, body="time.sleep(0.5); print('ended by itself')")
-    )
-    assert (done.returncode, done.stdout, done.stderr) == (0, "ended by itself\n", "")
-
-
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_that_the_parent_program_ignores_is_ignored(number):
     # A shell lets its background jobs ignore Ctrl-C.
@@ -474,3 +378,12 @@ def test_a_full_disk_for_the_journal_alone_is_exit_status_one(
     said = capsys.readouterr().out
     assert "the journal cannot be written (database or disk is full)" in said
     assert submission_problems(output, [pair.id for pair in read_test_side(demo.test_dir)]) == []
+
+
+def small_store(
+    pages: int, directory: Path, *, opened: Callable[..., Store] = Store.open, fresh: bool = False
+) -> Store:
+    """Open a store whose file cannot grow beyond its present size and these pages."""
+    store = opened(directory, fresh=fresh)
+    store.db.execute(f"PRAGMA main.max_page_count = {pages}")
+    return store

@@ -1,16 +1,13 @@
 """Which settings decide which keys."""
 
 from dataclasses import replace
-from importlib.metadata import PackageNotFoundError
 from types import SimpleNamespace
 
-import cv2
 import pytest
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine import keys
 from mkpc_kaggle.engine.keys import Keys
-from mkpc_kaggle.geometry.coordinates import Box, Size
+from mkpc_kaggle.geometry.coordinates import Size
 from mkpc_kaggle.matchers.contract import MatcherSpec
 from mkpc_kaggle.pipeline import assembly
 from mkpc_kaggle.pipeline.assembly import Assembly, assemble
@@ -18,11 +15,12 @@ from mkpc_kaggle.recipe import SceneConfig, Unit, load_recipe
 from mkpc_kaggle.scene.view_graph import BatchImage
 
 CLASSICAL = load_recipe("classical")
+
+
 IMAGES = (
     BatchImage("0.png", "d", Size(80, 60)),
     BatchImage("1.png", "c", Size(80, 60)),
 )
-BOXES = (Box(0, 0, 9, 9), Box(0, 0, 8, 8))
 
 
 @pytest.mark.parametrize(
@@ -102,17 +100,6 @@ def test_another_version_of_a_library_changes_the_points_that_come_from_it(
     assert [before != after for before, after in pairs] == changed
 
 
-def test_a_matcher_given_in_python_has_the_versions_of_its_packages_in_its_keys(monkeypatch):
-    spec = MatcherSpec("mine", version="1", packages=("opencv", "no distribution"))
-    recipe = replace(CLASSICAL, units=(Unit(1, "mine", 640),))
-    given = {"mine": SimpleNamespace(spec=spec)}
-    made = replace(assemble(CLASSICAL), recipe=recipe, matchers=given)
-    former = Keys.of(made).units
-    assert Keys.of(made).units == former
-    monkeypatch.setattr(cv2, "__version__", "another")
-    assert Keys.of(made).units != former
-
-
 # Another input, and whether the points of stage 1, those of stage 2, the estimate and the scene then
 # have other keys
 OTHERS = {
@@ -155,15 +142,3 @@ def test_another_version_of_a_matcher_given_in_python_makes_other_points():
     assert key("1.4") != key("1.5")
     # Without a version, it may be any.
     assert key("") != key("")
-
-
-def test_without_pycolmap_there_are_keys_and_none_is_that_of_an_installed_one(monkeypatch):
-    installed = Keys.of(assemble(CLASSICAL))
-
-    def version(name: str) -> str:
-        raise PackageNotFoundError(name)
-
-    monkeypatch.setattr(keys, "version", version)
-    missing = Keys.of(assemble(CLASSICAL))
-    assert (missing.units, missing.estimate) == (installed.units, installed.estimate)
-    assert missing.scene != installed.scene

@@ -5,7 +5,6 @@ import threading
 from types import SimpleNamespace
 
 import pytest
-from rectified import THREE_UNITS, RectifiedMatcher, run, write_pairs
 
 from mkpc_kaggle.engine import places
 from mkpc_kaggle.engine.places import Kind, LocalSite, Place
@@ -122,25 +121,3 @@ def test_the_cpu_that_takes_over_has_its_own_sizes_and_all_cores(monkeypatch):
     assert [place.minibatch for place in site.of(Kind.MATCH)] == [1]
     assert site.scenes_at_a_time(is_matching=True) == 1
     assert site.fallback == []
-
-
-def test_workers_in_threads_leave_the_limits_of_the_users_process_as_they_are(tmp_path):
-    import cv2
-    from threadpoolctl import threadpool_info, threadpool_limits
-
-    # Numbers that the workers would not set themselves
-    former = cv2.getNumThreads()
-    cv2.setNumThreads(3)
-    try:
-        with threadpool_limits(2):
-            run(
-                write_pairs(tmp_path, 2),
-                THREE_UNITS,
-                RectifiedMatcher(),
-                tmp_path / "work",
-                workers=0,
-            )
-            assert cv2.getNumThreads() == 3
-            assert 2 in [pool["num_threads"] for pool in threadpool_info()]
-    finally:
-        cv2.setNumThreads(former)

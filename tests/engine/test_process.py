@@ -80,21 +80,6 @@ def test_a_process_that_dies_at_its_start_is_reported(monkeypatch, start):
     assert start().next_answer() == Failure(Cause.DIED, "signal SIGKILL")
 
 
-def test_a_process_that_stops_at_its_start_blocks_nothing(monkeypatch, start):
-    on_fork(monkeypatch, lambda pid: os.kill(pid, signal.SIGSTOP))
-    assert start().answer() is None
-
-
-def test_a_start_returns_before_the_process_exists(monkeypatch, start):
-    # On a busy machine a start takes seconds, for which the loop must not wait.
-    has_returned = threading.Event()
-    on_fork(monkeypatch, lambda _: has_returned.wait())
-    worker = start()
-    assert worker.answer() is None
-    has_returned.set()
-    assert worker.next_answer() == Loaded()
-
-
 def test_a_large_job_goes_to_a_stopped_process_without_blocking(monkeypatch, start):
     born: list[int] = []
     on_fork(monkeypatch, born.append)

@@ -12,26 +12,28 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
 import pytest
 from faulty import FaultyMatcher, die
 from processes import started_with
-from rectified import THREE_UNITS, RectifiedMatcher, Seen, matrices, run, sources
-from synthetic import RECIPE as SYNTHETIC
-from synthetic import SyntheticMatcher, synthetic_pairs
+from rectified import THREE_UNITS, RectifiedMatcher, Seen, matrices, run
 
 from mkpc_kaggle.data.competition import Pair
-from mkpc_kaggle.engine.frames import matrices_of
 from mkpc_kaggle.engine.request import Ending
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.matches import Matches
 from mkpc_kaggle.pipeline.assembly import Assembly
 
-ray = pytest.importorskip("ray", reason="Ray is not installed: pip install 'mkpc-kaggle[ray]'")
-
 TESTS = Path(__file__).parents[1]
 # What machines can import
 IMPORTED = [str(TESTS.parent), str(TESTS / "engine"), str(TESTS / "support")]
+
+
+ray = pytest.importorskip("ray", reason="Ray is not installed: pip install 'mkpc-kaggle[ray]'")
+
+
+TESTS = Path(__file__).parents[1]
+
+
 STORE_BYTES = 80 << 20  # of each machine; Ray would take a share of the whole memory
 
 
@@ -112,17 +114,6 @@ def test_a_machine_that_lacks_the_weights_or_the_test_set_is_named_when_the_run_
         work_dir = tmp_path / asked[0].id
         with pytest.raises(UserError, match=told):
             run(asked, THREE_UNITS, RectifiedMatcher(), work_dir, workers=workers)
-
-
-def test_batches_are_reconstructed_on_the_cluster_to_the_same_bytes(cluster, tmp_path):
-    batch = synthetic_pairs(tmp_path / "images")
-    here = run(batch, SYNTHETIC, SyntheticMatcher(), tmp_path / "here")
-    workers = f"ray://{cluster.address}"
-    report = run(batch, SYNTHETIC, SyntheticMatcher(), tmp_path / "w", workers=workers)
-    assert report.about.faults == []
-    assert sources(report) == ["scene"] * len(batch)
-    chosen = [matrices_of(each.pairs) for each in (report, here)]
-    assert np.array_equal(*chosen)
 
 
 LOCAL = """

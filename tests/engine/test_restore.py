@@ -8,7 +8,11 @@ import pytest
 from rectified import SECOND, SWEEP, THIRD
 from store_room import CAMERA, RECIPE, REGIONS, F, Room, matches_of, pair_of
 
-from mkpc_kaggle.engine.frames import NOT_REACHED, matrices_of, results, results_of
+from mkpc_kaggle.engine.frames import (
+    NOT_REACHED,
+    matrices_of,
+    results_of,
+)
 from mkpc_kaggle.engine.store import Store
 from mkpc_kaggle.geometry.critical_region import When
 from mkpc_kaggle.geometry.crop_need import CropNeed
@@ -43,18 +47,12 @@ def test_stored_results_are_read_after_reopening(whole: Room, tmp_path: Path) ->
     assert match.results[0].matches.to_bytes() == matches_of(0).to_bytes()
 
 
-def test_results_are_data_frames_of_pairs_units_and_cameras(whole: Room, tmp_path: Path) -> None:
-    found = results(tmp_path)
-    pairs, units, cameras = found.pairs, found.units, found.cameras
-    assert pairs["pair"].tolist() == ["p0", "p1", "p2"]
-    assert pairs["source"].tolist() == ["scene", "pair", "fallback"]
-    assert pairs[["f11", "f33"]].iloc[0].tolist() == [3.0, 27.0]
-    assert units.groupby("unit")["inliers"].sum().to_dict() == {SWEEP.name: 14, SECOND.name: 16}
-    assert cameras[["image", "focal"]].to_numpy().tolist() == [["0.png", 500.0], ["1.png", 500.0]]
-
-
 SECOND_360 = replace(SECOND, long_side=360)
+
+
 FOUR = [pair_of(number) for number in range(4)]
+
+
 # A change, then the number of pairs with points in use, the number of pairs whose estimate is up to
 # date, and whether the scene is
 CHANGES = {

@@ -3,7 +3,6 @@
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -28,14 +27,12 @@ from mkpc_kaggle.data.competition import Pair
 from mkpc_kaggle.engine.frames import matrices_of, results
 from mkpc_kaggle.engine.request import Ending, SceneJob
 from mkpc_kaggle.engine.store import Store
-from mkpc_kaggle.engine.worker import batch_pair, with_points
 from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.recipe import SceneConfig
 from mkpc_kaggle.reporting.page import page
 from mkpc_kaggle.reporting.summary import summary
 from mkpc_kaggle.scene.choose import Reason
 from mkpc_kaggle.scene.sfm import Solution
-from mkpc_kaggle.scene.view_graph import BatchPair
 
 RECIPE = replace(THREE_UNITS, scene=SceneConfig())
 
@@ -133,19 +130,6 @@ def test_a_reconstruction_that_is_lost_costs_its_scene_alone_is_named_and_tried_
     assert matcher.calls == []
 
 
-def test_a_scene_process_that_cannot_be_started_costs_its_scene_alone(tmp_path, monkeypatch):
-    def no_memory(_: Any) -> None:
-        raise OSError(12, "Cannot allocate memory")
-
-    monkeypatch.setattr("multiprocessing.context.SpawnProcess.start", no_memory)
-    report = run(batch_pairs(tmp_path / "images"), RECIPE, RectifiedMatcher(), tmp_path / "work")
-    assert report.ending is Ending.WITH_FAILURES
-    assert (
-        "scenes: the worker could not be started: [Errno 12] Cannot allocate memory"
-        in report.about.faults
-    )
-
-
 def test_a_run_reconstructs_the_true_cameras_and_a_gigabyte_is_enough(tmp_path, monkeypatch):
     scenes_by(monkeypatch, scene_in_a_gigabyte, process=True)
     matcher = SyntheticMatcher()
@@ -170,22 +154,6 @@ def test_a_death_within_pycolmap_costs_the_scene_alone_and_leaves_no_files(tmp_p
     assert sources(report) == ["pair"] * 6
     assert report.scenes["failure"].all()
     assert list((tmp_path / "temporary").iterdir()) == []
-
-
-def test_the_scene_of_a_run_is_made_of_tracks_and_judged_by_all_matches(tmp_path, monkeypatch):
-    given: list[BatchPair] = []
-
-    def note(job: SceneJob) -> Solution:
-        given[:] = [batch_pair(*each, keeps_paths=False) for each in with_points(job)]
-        return choose_scene_for_all_but_the_first(job)
-
-    scenes_by(monkeypatch, note)
-    # A unit may be too inaccurate for tracks, and still decide whether a pair agrees.
-    first, *others = THREE_UNITS.units
-    recipe = replace(RECIPE, units=(replace(first, tracks=False), *others))
-    run(batch_pairs(tmp_path / "images"), recipe, RectifiedMatcher(), tmp_path / "work")
-    assert len(given) == 6
-    assert all(0 < len(pair.tracks) < len(pair.matches) for pair in given)
 
 
 def test_a_resumed_run_reconstructs_only_the_batch_whose_image_was_replaced(tmp_path, monkeypatch):

@@ -3,17 +3,14 @@
 import sqlite3
 import subprocess
 import sys
-import threading
 from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import pytest
-from rectified import THREE_UNITS, RectifiedMatcher, matrices, run
 from store_room import Room
 
-from mkpc_kaggle.engine.frames import results, results_of
-from mkpc_kaggle.engine.request import Ending
+from mkpc_kaggle.engine.frames import results_of
 from mkpc_kaggle.engine.store import FILE_NAME, Store, connected
 from mkpc_kaggle.errors import UserError
 
@@ -177,32 +174,3 @@ def test_a_reader_that_has_the_file_open_neither_blocks_a_run_nor_is_blocked(
     # Nor does a reader leave files of SQLite's behind.
     names = sorted(path.name for path in tmp_path.glob("journal*"))
     assert names == ["journal.lock", "journal.sqlite"]
-
-
-def test_readers_in_a_loop_beside_a_run_work_or_have_one_line(pairs, undisturbed, tmp_path) -> None:
-    work = tmp_path / "work"
-    ended = threading.Event()
-    read = []
-    refused = []
-
-    def loop() -> None:
-        while not ended.is_set():
-            try:
-                read.append(len(results(work).pairs))
-            except UserError as error:
-                refused.append(str(error))
-
-    threads = [threading.Thread(target=loop) for _ in range(2)]
-    for thread in threads:
-        thread.start()
-    for _ in range(2):
-        report = run(pairs, THREE_UNITS, RectifiedMatcher(seconds=0.005), work)
-        assert (report.ending, report.about.faults) == (Ending.COMPLETE, [])
-        assert matrices(report) == matrices(undisturbed)
-    ended.set()
-    for thread in threads:
-        thread.join()
-    assert 12 in read
-    # Before the first table of pairs
-    reasons = ("has no journal.sqlite", "has no results yet", "the run has not begun")
-    assert [text for text in refused if not any(reason in text for reason in reasons)] == []

@@ -15,6 +15,8 @@ from mkpc_kaggle.engine.console import (
 )
 
 ROOT = Path(__file__).resolve().parents[2]
+
+
 QUIET_LIBRARY = """
 import os
 
@@ -22,6 +24,8 @@ def complain():
     os.write(1, b"libpng warning, ")
     os.write(2, b"libjpeg: premature end")
 """
+
+
 LOGS = """
 import sys, threading
 from library import complain
@@ -74,14 +78,12 @@ def test_a_stderr_that_is_not_read_costs_lines_and_not_the_run():
     assert (done.returncode, done.stdout) == (0, b"done\n")
 
 
-def test_messages_have_their_level_and_go_to_the_streams_of_the_moment(capsys):
-    logger.info("pairs: %d", 3)
-    logger.warning("a mask fits no image")
-    logger.error("no such file")
-    assert capsys.readouterr() == (
-        "pairs: 3\n",
-        "warning: a mask fits no image\nerror: no such file\n",
-    )
+def test_a_run_that_shows_no_progress_prints_nothing(capsys):
+    progress = Progress(is_shown=False)
+    progress.count("sweep", 1, 2, "unit")
+    progress.note("text")
+    progress.close()
+    assert capsys.readouterr() == ("", "")
 
 
 def test_a_file_gets_a_line_when_a_count_begins_and_at_its_end(capsys):
@@ -100,14 +102,6 @@ def test_a_file_gets_a_line_when_a_count_begins_and_at_its_end(capsys):
         "estimate:  50",
         "estimate:  50",
     ]
-
-
-def test_a_run_that_shows_no_progress_prints_nothing(capsys):
-    progress = Progress(is_shown=False)
-    progress.count("sweep", 1, 2, "unit")
-    progress.note("text")
-    progress.close()
-    assert capsys.readouterr() == ("", "")
 
 
 def test_a_log_file_has_all_messages_and_one_that_cannot_be_written_costs_nothing(tmp_path, capsys):

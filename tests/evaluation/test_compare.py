@@ -96,19 +96,3 @@ def test_a_comparison_of_runs_that_failed_or_ended_early_has_their_status(
     printed = capsys.readouterr().out
     assert "nothing is compared" in printed
     assert "gain of mAA" not in printed
-
-
-def test_units_that_recipes_share_are_matched_once(demo, small_recipe, tmp_path, capsys):
-    text = small_recipe.read_text()
-    third = tmp_path / "third.toml"
-    third.write_text(f"{text}threshold = 1.0\n")  # the last table is [magsac]
-    other = tmp_path / "other.toml"
-    other.write_text(text.replace("400", "440") + "\n[focal]\nscale = 0.3\n")
-    recipes = [small_recipe, third, other]
-    assert compare(demo, "--compare", *recipes, "--work-dir", tmp_path / "work") == 0
-    printed = capsys.readouterr().out
-    assert re.findall(r"(\d+) units run", printed) == ["8", "0", "4"], "each common unit runs once"
-    shared = printed.split("recipe other")[-1]
-    assert compare(demo, "--recipe", other, "--work-dir", tmp_path / "alone") == 0
-    scores = shared.splitlines()[1:4]
-    assert "\n".join(scores) in capsys.readouterr().out, "as if it had been matched"

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from pair_lists import line_of
 
-from benchmarks.lists import parse_line, read_pairs
+from benchmarks.lists import parse_line
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.geometry.cameras import Camera, fundamental_of_cameras
 
@@ -42,13 +42,11 @@ def test_a_line_gives_the_images_turns_and_cameras_that_were_written():
         ("a b", "expected 38 fields, name0 name1 .* found 2"),
         # SuperGlue's lists count quarter turns of EXIF.
         (f"a b 0 4 {EYE}", "expected 0, 1, 2 or 3 quarter turns, found 0 and 4"),
-        (f"a b 0 0 {EYE}".replace("1 0 0 0 1", "1 0 x 0 1", 1), "expected numbers .*'x'"),
         (
             f"a b 0 0 {EYE}".replace("1 0 0 0 1", "1 0 nan 0 1", 1),
             "expected finite numbers for K0, K1 and T_0to1",
         ),
         (f"a b 0 0 {EYE}".replace("1 0 0 0 1", "-1 0 0 0 1", 1), "expected K0 and K1 = fx s cx"),
-        (f"a b 0 0 {EYE}".replace("0 0 0 1", "0 0 0 2").strip(), "expected T_0to1 = .*|expected K"),
         (f"a b 0 0 {EYE}".replace("1 0 0 1 0 1 0 0", "-1 0 0 1 0 1 0 0"), "with R a rotation"),
     ],
 )
@@ -63,11 +61,7 @@ def test_a_malformed_line_is_named_with_what_was_expected(line, expected):
         "/etc/passwd",
         "../a.jpg",
         "a/../../b.jpg",
-        "..",
-        "//host/a",
         "..\\a",
-        "a\\..\\b",
-        "\\a",
         "C:\\a",
     ],
 )
@@ -78,17 +72,3 @@ def test_no_name_leads_out_of_the_image_root(name):
             parse_line(f"{names} 0 0 {EYE}", *WHERE)
     pair = parse_line(f"a/b..c.jpg ./d.jpg 0 0 {EYE}", *WHERE).pair
     assert pair.images == (Path("images/a/b..c.jpg"), Path("images/d.jpg"))
-
-
-def test_a_list_without_pairs_is_refused(tmp_path):
-    path = tmp_path / "list.txt"
-    for root, told in (
-        (".", r"list.txt cannot be read: No such file"),
-        ("x", r"x: no such directory"),
-    ):
-        with pytest.raises(UserError, match=told):
-            read_pairs(path, tmp_path / root)
-    for content, told in ((b"\n \n", "has no pairs"), (b"\xff\xfe", "not UTF-8")):
-        path.write_bytes(content)
-        with pytest.raises(UserError, match=told):
-            read_pairs(path, tmp_path)

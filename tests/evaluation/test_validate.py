@@ -10,7 +10,6 @@ from shared import run_command, scores_of
 from mkpc_kaggle.data import competition
 from mkpc_kaggle.data.competition import Pair, TrainScene, TruePair, read_test_side, read_train_side
 from mkpc_kaggle.demo import DemoSet
-from mkpc_kaggle.engine.frames import results
 from mkpc_kaggle.evaluation.validate import (
     SceneScore,
     Step,
@@ -118,18 +117,6 @@ def test_each_step_of_the_estimate_has_a_column(demo, small_recipe, capsys):
     assert row[4:7] == [f"{value:.4f}" for value in by_step.values()]
     for pair, former in zip(scores["scenes"][0]["pairs"], plain["scenes"][0]["pairs"], strict=True):
         assert pair["accuracy_by_step"]["MAGSAC"] == former["accuracy_by_step"]["MAGSAC"]
-
-
-def test_a_work_directory_keeps_the_journal_and_a_report_that_shows_the_pairs(
-    demo, small_recipe, tmp_path
-):
-    options = ["--recipe", f"{small_recipe}:stage-1"]
-    options += ["--pairs-per-scene", 2, "--work-dir", tmp_path / "work"]
-    on_demo(demo, small_recipe, *options)
-    assert results(tmp_path / "work").units["unit"].tolist() == ["1:sift@320"] * 2
-    page = tmp_path / "work" / "report.html"
-    assert page.read_text(encoding="utf-8").count("<img ") == 2
-    assert len(results(tmp_path / "work").pairs) == 2
 
 
 # The command has 8 s, and the patched validation never returns.

@@ -158,28 +158,6 @@ def test_a_crop_that_is_not_resized_is_copied_and_padded_with_black_right_and_bo
     assert not picture[:, 50:].any()
 
 
-def test_a_box_holds_the_points_on_its_pixels_half_open_and_never_nan():
-    box = Box(2, 3, 10, 7)
-    last = (np.nextafter(9.5, 0), np.nextafter(6.5, 0))
-    inside = [(1.5, 2.5), (2, 3), (9, 6), last]
-    # Adjacent boxes share no point, because a box is open to the right and at the bottom.
-    outside = [
-        (np.nextafter(1.5, 0), 4),
-        (4, np.nextafter(2.5, 0)),
-        (9.5, 4),
-        (4, 6.5),
-        (np.nan, 4),
-        (4, np.nan),
-        (np.inf, 4),
-        (4, -np.inf),
-        (np.nan, np.nan),
-    ]
-    assert box.contains(np.array(inside)).all()
-    assert not box.contains(np.array(outside)).any()
-    assert box.contains(np.zeros((0, 2))).shape == (0,)
-    assert (box.size, box.area) == (Size(8, 4), 32)
-
-
 @pytest.mark.parametrize("content", [Size(64, 16), Size(64, 19), Size(32, 16), Size(90, 16)])
 def test_shrinking_averages_stripes_that_would_alias(content):
     rows = np.array([[0], [255]] * 32, np.uint8)

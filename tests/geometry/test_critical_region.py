@@ -1,7 +1,5 @@
 """The critical region: the paper's Algorithm 1 and Crop Area Expansion; DBSCAN of merged points."""
 
-from itertools import product
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -75,19 +73,6 @@ def test_every_region_has_its_reason_and_is_the_whole_image_unless_cropped(
     got = critical_region(points, SQUARE, PAPER)
     assert (got.reason, got.clusters, got.kept) == (reason, clusters, kept)
     assert (reason is RegionReason.CROPPED) == (got.box != Box.whole(SQUARE))
-
-
-def test_a_cluster_of_exactly_the_share_is_kept_for_every_percentage():
-    # `size >= share * largest` differs from Algorithm 1 by rounding: 0.07 * 100 is above 7.
-    for percent, hundreds in product(range(1, 100), (1, 7, 11)):
-        share = percent / 100
-        largest = 100 * hundreds
-        least = percent * hundreds
-        assert least / largest >= share  # Algorithm 1's own words
-        kept = regions.keep_clusters(np.array([largest, least]), share)
-        assert len(kept) == 2, (least, largest)
-        kept = regions.keep_clusters(np.array([largest, least - 1]), share)
-        assert len(kept) == 1, (least, largest)
 
 
 def test_clusters_are_kept_down_to_the_share_largest_first_and_equal_ones_in_their_order():

@@ -145,26 +145,6 @@ def test_the_essential_matrix_and_the_homography_of_a_plane_are_found_among_outl
     assert np.hypot(*(moved - fresh.points1).T).max() < 0.05
 
 
-def test_sampson_distance_is_in_pixels_and_the_same_in_either_order():
-    points0 = np.array([(10, 20), (30, 40)])
-    points1 = np.array([(500, 20), (7, 43)])
-    matches = Matches(points0, points1, np.ones(2))
-    # The fallback's lines are rows. Three rows off, each image takes half of the correction.
-    distances = robust.sampson_distances(FALLBACK_FUNDAMENTAL, matches)
-    assert_allclose(distances, [0, 3 / np.sqrt(2)])
-    # The second image is half as high: y1 = y0 / 2
-    twice = FALLBACK_FUNDAMENTAL @ np.diag([1, 0.5, 1])
-    point0 = np.array([(10, 20)])
-    point1 = np.array([(500, 13)])
-    matches = Matches(point0, point1, np.ones(1))
-    distance = 3 / np.sqrt(1 + 0.5**2)
-    assert_allclose(robust.sampson_distances(twice, matches), [distance])
-    swapped = Matches(matches.points1, matches.points0, np.ones(1))
-    # F has no scale: solvers return it at any.
-    assert_allclose(robust.sampson_distances(1e-6 * twice.T, swapped), [distance])
-    assert robust.sampson_distances(twice, Matches.empty()).shape == (0,)
-
-
 @pytest.mark.parametrize("model", ModelKind)
 def test_a_model_needs_one_match_more_than_its_minimum_else_the_fallback_is_given(model):
     # One more than the minimal sample of each solver (7, 5, 4): with a minimal sample alone,

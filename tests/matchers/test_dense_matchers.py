@@ -5,9 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from light_matchers import dkm_matcher, ours
+from light_matchers import dkm_matcher
 from pictures import match_one, picture, same
-from standin import narrow_roma
 
 from mkpc_kaggle.matchers.contract import MatcherSpec, Placement
 from mkpc_kaggle.matchers.dense import DenseMatcher, DenseOptions
@@ -91,17 +90,3 @@ def test_points_of_either_picture_are_in_its_own_pixels():
 def are_whole(points):
     distances = np.abs(points - np.rint(points))
     return distances.max(axis=1) < 1e-4
-
-
-@pytest.mark.parametrize(("passes", "sides"), [(2, (56, 84)), (1, (84, 126))])
-def test_sides_of_the_first_pass_are_multiples_of_14(passes, sides):
-    network = ours(Placement(), "roma", narrow_roma)
-    options = DenseOptions(passes=passes, first_pass=0.648)
-    matcher = DenseMatcher(MatcherSpec("given"), network, options, "cpu", multiple=14)
-    (encoded,) = matcher.encode([picture(86, 130)])
-    features = encoded.features
-    assert features.coarse.at(1).shape[2:] == sides
-    # DINOv2 needs patches of 14 pixels; the second pass has no DINOv2, and keeps the size.
-    assert bool(features.fine) == (passes == 2)
-    if features.fine:
-        assert features.fine.at(1).shape[2:] == (86, 130)

@@ -6,8 +6,6 @@ import pytest
 import torch
 from light_matchers import MATCHERS
 from pictures import same
-from standin import scene
-from synthetic import QUICK
 from torch.nn import functional
 
 from mkpc_kaggle.matchers.contract import (
@@ -18,8 +16,6 @@ from mkpc_kaggle.matchers.contract import (
     encoding_bytes,
 )
 from mkpc_kaggle.matchers.dtypes import check_finite
-from mkpc_kaggle.pipeline.two_stage import TwoStageMatcher
-from mkpc_kaggle.recipe import Recipe, Unit
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*is not verified")
 # Odd sides, a wide strip, and a picture of one column.
@@ -80,17 +76,6 @@ def test_an_encoding_keeps_only_counted_memory_and_no_pairs_give_no_matches(matc
         kept = sum(tensor.untyped_storage().nbytes() for tensor in arrays_of(encoding))
         assert encoding_bytes(encoding) == kept > 0
     assert list(matcher.match([], [])) == []
-
-
-@pytest.mark.filterwarnings("ignore:no F was found")
-def test_both_stages_run_with_an_odd_flat_picture(matcher):
-    name = matcher.spec.name
-    recipe = Recipe((Unit(1, name, 64), Unit(2, name, 48)), magsac=QUICK)
-    run = TwoStageMatcher(recipe, matchers={name: matcher})
-    flat = np.full((33, 47, 3), 128, np.uint8)
-    found = run(flat, scene(90, 70, 3))
-    assert [result.failure for result in found.results] == ["", ""]
-    assert np.isfinite(found.estimate.matrix).all()
 
 
 def overflow(monkeypatch):

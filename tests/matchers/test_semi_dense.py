@@ -2,24 +2,19 @@
 checkpoints.
 """
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 import torch
 from checkpoints import PublicFile, store_of, wrapped
-from light_matchers import MATCHERS, standin
+from light_matchers import MATCHERS
 from pictures import picture
 
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.matchers.adapters import loftr
 from mkpc_kaggle.matchers.contract import Placement
 from mkpc_kaggle.matchers.networks.adaptive_span import CELLS_AT_ONCE, span_attention
-from mkpc_kaggle.matchers.networks.aspanformer import AspanFormer
 from mkpc_kaggle.matchers.networks.coarse_matching import coarse_matches
 from mkpc_kaggle.matchers.networks.loftr import Loftr
-from mkpc_kaggle.matchers.networks.quadtree import Quadtree
-from mkpc_kaggle.matchers.registry import load_matcher, spec_of
 
 
 @pytest.mark.parametrize("held", [0, 2**20])
@@ -95,22 +90,3 @@ def test_points_of_image_0_are_centres_of_cells_within_the_border_of_the_content
     border = matcher._network.border
     assert (cells >= border).all()
     assert (cells < np.array([17, 13]) - border).all()
-
-
-@pytest.mark.parametrize(
-    ("name", "make"), [("loftr", Loftr), ("quadtree", Quadtree), ("aspanformer", AspanFormer)]
-)
-def test_the_threshold_of_the_options_decides_which_cells_match(name, make):
-    state = standin(name, make).state_dict()
-    weights = SimpleNamespace(load=lambda slot: dict(state))
-    counts = []
-    # A confidence is never above 1, so the second threshold leaves no match.
-    for threshold in (0.0, 1.0):
-        options = spec_of(name, "test").options(threshold=threshold)
-        matcher = load_matcher(name, weights, options, Placement())
-        view = picture(64, 96, channels=1, multiple=matcher.spec.multiple)
-        encoded = matcher.encode([view])
-        (matches,) = matcher.match(encoded, encoded)
-        counts.append(len(matches))
-        assert (matches.scores > threshold).all()
-    assert counts[0] > counts[1] == 0

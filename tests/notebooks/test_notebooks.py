@@ -53,19 +53,6 @@ def test_the_tour_runs_on_a_train_side_without_a_network(demo, tmp_path):
     assert [line for line in warned if "no F was found" not in line] == []
 
 
-@needs_namespaces
-def test_the_tour_takes_two_photographs_without_truth(demo, tmp_path):
-    more = ""
-    recipe = write_recipe(tmp_path / "tour.toml", (1, 480), (2, 640), more=more)
-    photographs = sorted((demo.train_dir / "courtyard" / "images").iterdir())[:2]
-    variables = environment(
-        MKPC_RECIPE=str(recipe), PYTHONPATH=PATHS, MKPC_PHOTOS=",".join(map(str, photographs))
-    )
-    executed = execute(TOUR, tmp_path / "executed.ipynb", sys.executable, tmp_path, variables)
-    assert pictures(executed) == 9, "images, stage 1, four of MKPC, stage 2, both, epipolar lines"
-    assert "The tour of your photographs ends here." in printed(executed)
-
-
 def test_the_tour_is_committed_with_all_its_pictures_and_nothing_else():
     tour = nbformat.read(TOUR, as_version=4)
     assert with_pictures_alone(tour) == tour

@@ -179,21 +179,6 @@ def test_a_failed_run_fails_the_notebook_but_not_the_hidden_rerun(kaggle, demo, 
     assert kaggle.problems() == []
 
 
-@needs_namespaces
-def test_if_no_wheel_fits_the_notebook_shows_pips_message_and_the_advice(kaggle, demo, tmp_path):
-    kaggle.add_test_side(demo.test_dir, pairs=1)
-    kaggle.add_dataset(tmp_path / "package")
-    # Other tests have installed into the shared image
-    kaggle.image = make_image(tmp_path / "image")
-    (wheel,) = kaggle.dataset.glob("pycolmap-*.whl")
-    wheel.rename(wheel.with_name("pycolmap-4.2.1-cp27-cp27m-manylinux_2_28_x86_64.whl"))
-    with pytest.raises(AssertionError, match="ERROR: ") as stopped:
-        kaggle.run()
-    python = python_version()
-    told = f"If a wheel for Python {python} is missing, package again with --python {python}"
-    assert told in str(stopped.value)
-
-
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_notebooks_are_committed_without_traces_of_a_run_except_pictures(path):
     text = path.read_text(encoding="utf-8")

@@ -13,7 +13,7 @@ from kaggle_image import UNPACKED, python_version, upload
 from shared import contents, run_command
 from weight_files import digest_of, line, put
 
-from mkpc_kaggle import __version__, package
+from mkpc_kaggle import __version__
 from mkpc_kaggle.cli import weights
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.package import (
@@ -146,21 +146,6 @@ def test_the_kernel_runs_on_a_gpu_without_internet_on_the_latest_image(out):
     assert code == (find_checkout() / "notebooks" / "submission.ipynb").read_bytes()
 
 
-def test_without_weights_the_notebook_asks_for_no_gpu(wanted):
-    # Hours of GPU are limited, and RootSIFT uses none.
-    make_package(**wanted | {"weights": ()})
-    kernel = metadata_of(wanted["out"])[1]
-    assert kernel["enable_gpu"] is False
-    assert "machine_shape" not in kernel
-
-
-def test_the_page_of_the_dataset_has_no_relative_links(out):
-    # It was the README, with broken pictures and links.
-    page = (out / "dataset" / "README.md").read_text(encoding="utf-8")
-    assert "Licences of the weights: MIT." in page
-    assert "](" not in page
-
-
 def test_the_same_request_gives_the_same_bytes(wanted, out):
     make_package(**wanted)
     assert contents(wanted["out"]) == contents(out)
@@ -223,21 +208,3 @@ def test_the_wheel_holds_what_a_run_needs(tmp_path):
         "mkpc_kaggle/package/page.md",
     } <= set(names)
     assert not [name for name in names if name.startswith(("tests/", "notebooks/"))]
-
-
-def test_an_installed_copy_packages_the_clone_that_it_is_called_in(tmp_path, monkeypatch):
-    clone = find_checkout()
-    site = tmp_path / "site-packages"
-    monkeypatch.setattr(package, "__file__", str(site / "mkpc_kaggle" / "package" / "__init__.py"))
-    monkeypatch.chdir(clone)
-    assert find_checkout() == clone
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(UserError, match="run `mkpc package` in a clone"):
-        find_checkout()
-    # A clone that was updated after the installation
-    (tmp_path / "notebooks").mkdir()
-    (tmp_path / "notebooks" / "submission.ipynb").touch()
-    (tmp_path / "mkpc_kaggle").mkdir()
-    (tmp_path / "mkpc_kaggle" / "version.py").write_text('__version__ = "99.0"\n')
-    with pytest.raises(UserError, match="another version"):
-        find_checkout()

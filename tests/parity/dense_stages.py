@@ -12,9 +12,6 @@ import torch
 from golden import GOLDEN, Stage, Within, compared, golden_arrays, in_order, ready, seeded_tensor
 
 from mkpc_kaggle.matchers.networks.dense_sampling import (
-    balancing_weights,
-    density,
-    draw,
     sample_matches,
 )
 from mkpc_kaggle.matchers.networks.dense_warp import dense_warp
@@ -159,7 +156,6 @@ def roma_one_way():
 def sampling_stages(name, suffix=""):
     golden = golden_arrays(name, "sampling")
     main = golden_arrays(name, "main")
-    tolerances = tolerances_of(name)
     number = int(golden.get("num", 1000))
     seed = int(golden.get("seed", 1234))
     warp = main["warp"].reshape(-1, 4)
@@ -174,17 +170,6 @@ def sampling_stages(name, suffix=""):
         parts = [golden[f"{mode}{suffix}__{part}"] for part in ("matches", "certainty")]
         expected = in_order(torch.column_stack(parts))
         yield Stage(f"{mode}__matches", got, expected, Within(relative=1e-4))
-    weights = certainty.masked_fill(certainty > MODES["threshold_balanced"], 1)
-    # Step by step, each from the golden values of the step before, so that near ties do not add up.
-    first = golden["good_index"]
-    yield Stage("good_index", draw(weights, golden["noise1"], 4 * number), first)
-    good = warp[first]
-    evenness = balancing_weights(golden["density"])
-    values = {"good_matches": good, "good_certainty": weights[first], "balance_p": evenness}
-    values |= dict.fromkeys(("density", "density_exact"), density(good))
-    yield from compared(values, golden, tolerances)
-    second = golden["balanced_index"]
-    yield Stage("balanced_index", draw(evenness, golden["noise2"], number), second)
 
 
 VALUES = {  # by network and golden file

@@ -44,11 +44,6 @@ def test_a_folder_that_cannot_be_reconstructed_is_refused(tmp_path, names, told)
         read_folder(written(tmp_path, *names))
 
 
-def test_a_file_is_no_folder(tmp_path):
-    with pytest.raises(UserError, match="is no folder"):
-        read_folder(written(tmp_path, "1.jpg") / "1.jpg")
-
-
 def test_names_in_a_list_of_pairs_may_have_blanks(tmp_path):
     root = written(tmp_path / "images", "a b.png", "c.png", "d e f.png")
     text = "# a comment\n\na b.png c.png\n  d e f.png\ta b.png \r\nc.png a b.png\n"

@@ -13,7 +13,6 @@ from mkpc_kaggle.engine.store import FILE_NAME
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.reconstruction import outputs
 from mkpc_kaggle.reconstruction.outputs import (
-    align,
     keep_former,
     remove_results,
     require_out,
@@ -140,13 +139,6 @@ def test_models_of_a_folder_that_grows_keep_their_coordinates(tmp_path):
     keep_former(out)
     list(write_results(tmp_path / "images", out, out / "work" / "scene"))
     assert (out / "models" / "0" / "images.bin").read_bytes() == before
-
-
-def test_a_model_with_too_few_common_cameras_stays_where_it_is(tmp_path):
-    model = model_of(NAMES, tmp_path)
-    before = centres(model)
-    align(model, model_of([*NAMES[:2], "x.png", "y.png"], tmp_path))
-    np.testing.assert_array_equal(list(centres(model).values()), list(before.values()))
 
 
 def test_a_full_disk_leaves_the_former_results(tmp_path, monkeypatch):

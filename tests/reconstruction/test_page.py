@@ -9,22 +9,9 @@ import pandas as pd
 import pycolmap
 from test_reconstruct import FIRST, run, write_flat
 
-from mkpc_kaggle.data.images import READ_SUFFIXES
-
 PAGE = (Path(__file__).resolve().parents[2] / "docs" / "folder.md").read_text(encoding="utf-8")
 BLOCKS = re.findall(r"^```python\n(.*?)^```", PAGE, re.M | re.S)
 *COLMAP, OURS = BLOCKS
-
-
-def test_the_page_names_the_suffixes_of_photographs():
-    assert [
-        suffix for suffix in READ_SUFFIXES if f"{suffix}" not in PAGE.partition("files. ")[0]
-    ] == []
-
-
-def test_snippets_are_short():
-    assert len(BLOCKS) >= 6
-    assert [block for block in BLOCKS if len(block.strip().splitlines()) > 5] == []
 
 
 def test_the_snippets_run_from_top_to_bottom(tmp_path, monkeypatch, capsys):
@@ -51,7 +38,8 @@ def test_the_snippets_run_from_top_to_bottom(tmp_path, monkeypatch, capsys):
     assert list(pd.read_csv("submission.csv")["scene"]) == ["cluster0"] * FIRST
 
 
-def test_the_call_of_the_page_returns_models(demo, tmp_path, monkeypatch):
+def test_the_call_of_the_page_returns_models(demo, tmp_path, monkeypatch, nowhere_else):
+
     monkeypatch.chdir(tmp_path)
     shutil.copytree(demo.train_dir / "courtyard" / "images", "DIR")
     names: dict[str, object] = {}

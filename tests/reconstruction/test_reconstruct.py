@@ -6,7 +6,7 @@ import shutil
 import signal
 import sqlite3
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
 from pathlib import Path
@@ -26,9 +26,7 @@ from synthetic import QUICK, SyntheticMatcher
 from benchmarks.synthetic_scene import SIZE, SyntheticScene, synthetic_scene
 from mkpc_kaggle import results
 from mkpc_kaggle.data.images import TURNS
-from mkpc_kaggle.geometry.focal_prior import FocalConfig
 from mkpc_kaggle.geometry.matches import Matches
-from mkpc_kaggle.geometry.robust import RobustConfig
 from mkpc_kaggle.matchers.adapters.sift import SiftMatcher, SiftOptions
 from mkpc_kaggle.pipeline.assembly import assemble
 from mkpc_kaggle.recipe import CameraModel, Recipe, SceneConfig, Unit
@@ -178,16 +176,6 @@ def test_without_weights_one_unit_of_rootsift_runs_and_enlarges_no_image(
     assert (changed.scene.all_tracks < SceneConfig().all_tracks) == (name == "auto")
 
 
-def test_estimates_that_only_the_report_needs_are_the_cheap_ones():
-    recipe = Recipe((Unit(1, "sift", 640),), focal=FocalConfig(), magsac=RobustConfig())
-    kept = for_cameras(recipe)
-    assert kept.focal is None
-    assert kept.magsac.max_iterations < recipe.magsac.max_iterations
-    # A recipe with fewer keeps its own.
-    few = replace(recipe, magsac=RobustConfig(max_iterations=100))
-    assert for_cameras(few).magsac.max_iterations == 100
-
-
 ORIENTATIONS = (1, 6, 8, 3, 6, 1)  # of the images of a phone, by EXIF
 
 
@@ -244,21 +232,6 @@ def test_new_photographs_cost_their_own_pairs(tmp_path):
     assert sorted(more.calls) == [(number, FIRST - 1) for number in range(FIRST - 1)]
     assert len(grown.images) == FIRST
     assert len(results(tmp_path / "out" / "work").pairs) == FIRST * (FIRST - 1) // 2
-
-
-def test_results_that_were_removed_are_made_again(tmp_path):
-    root = write_flat(tmp_path / "images", FIRST)
-    out = tmp_path / "out"
-    run(root, out)
-    before = contents(out)
-    for name in ("models", "sparse", "images", "work/scenes"):
-        shutil.rmtree(out / name)
-    (out / "cameras.csv").unlink()
-    run(root, out)
-    after = contents(out)
-    assert {name: text for name, text in after.items() if name not in PAGES} == {
-        name: text for name, text in before.items() if name not in PAGES
-    }
 
 
 def test_models_of_an_earlier_run_are_removed_once_no_image_has_a_match(tmp_path):

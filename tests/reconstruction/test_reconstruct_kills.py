@@ -19,6 +19,7 @@ from test_reconstruct import contents
 
 from mkpc_kaggle.demo import DemoSet
 
+ROUNDS = 4
 ENDS = 5  # of each round, before the run that nobody disturbs
 SIGNALS = (signal.SIGKILL, signal.SIGINT, signal.SIGTERM)
 
@@ -50,20 +51,11 @@ def write_inputs(demo: DemoSet, home: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
-@pytest.mark.parametrize(
-    ("units", "more", "rounds"),
-    [
-        (((1, 480), (2, 640)), "", 4),
-        (((1, 480),), "", 2),
-        (((1, 480), (1, 640)), "[scene]\ncandidates = 4\n", 2),
-    ],
-    ids=["two stages", "one unit", "candidates"],
-)
-def test_a_run_that_is_ended_at_random_moments_ends_with_the_same_files(
-    demo, tmp_path, units, more, rounds
-):
+def test_a_run_that_is_ended_at_random_moments_ends_with_the_same_files(demo, tmp_path):
     write_inputs(demo, tmp_path)
-    write_recipe(tmp_path / "small.toml", *units, more=more)
+    write_recipe(
+        tmp_path / "small.toml", (1, 480), (1, 640), (2, 640), more="[scene]\ncandidates = 4\n"
+    )
 
     def begin(out: str, *more: str) -> "subprocess.Popen[bytes]":
         options = ["--recipe", str(tmp_path / "small.toml"), "--workers", "1"]
@@ -91,7 +83,7 @@ def test_a_run_that_is_ended_at_random_moments_ends_with_the_same_files(
     assert {"database.db", "models/0/points3D.bin"} <= names
     rng = random.Random(0)
     ended = 0
-    for number in range(rounds):
+    for number in range(ROUNDS):
         out = f"out{number}"
         for _ in range(ENDS):
             seconds = rng.uniform(0.0, 0.6 * whole_s)
@@ -111,5 +103,5 @@ def test_a_run_that_is_ended_at_random_moments_ends_with_the_same_files(
         # A run that ended early has left a scene of fewer matches, too.
         assert expected.items() <= files_of(out).items()
         assert contents(tmp_path / out).keys() == contents(tmp_path / "undisturbed").keys()
-    assert ended >= rounds
+    assert ended >= ROUNDS
     assert {name: text for name, text in contents(tmp_path).items() if name in inputs} == inputs

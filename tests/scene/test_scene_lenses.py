@@ -68,12 +68,18 @@ def test_a_lens_that_moves_no_pixel_by_more_than_one_is_a_pinhole():
 
 
 @pytest.mark.parametrize(
-    ("sharing", "lens"),
-    [(CameraSharing.FOLDER, "SIMPLE_RADIAL"), (CameraSharing.IMAGE, "SIMPLE_PINHOLE")],
+    ("sharing", "all_tracks", "lens"),
+    [
+        (CameraSharing.FOLDER, 6, "SIMPLE_RADIAL"),
+        (CameraSharing.IMAGE, 6, "SIMPLE_PINHOLE"),
+        # A large scene is not adjusted to its pinholes.
+        (CameraSharing.IMAGE, 5, "SIMPLE_RADIAL"),
+    ],
 )
-def test_a_small_lens_needs_several_images(sharing, lens):
+def test_a_small_lens_needs_several_images(sharing, all_tracks, lens):
     """It moves no pixel by more than 0.7 % of the long side."""
-    assert lenses_of(model_of(-0.03, replace(RADIAL, cameras=sharing))) == {lens}
+    config = replace(RADIAL, cameras=sharing, all_tracks=all_tracks)
+    assert lenses_of(model_of(-0.03, config)) == {lens}
 
 
 def test_a_lens_that_the_user_gives_stays_however_flat_it_is():

@@ -122,13 +122,11 @@ def nasty(sentinel: Path) -> dict[str, object]:
     return {
         "os.system": Call(os.system, command),
         "builtins.eval": Call(eval, f"__import__('pathlib').Path({str(sentinel)!r}).touch()"),
-        "os.mkdir": Call(os.mkdir, str(sentinel)),
         # By names that no list of forbidden functions has.
         "builtins.getattr": Call(
             operator.call, Call(getattr, Call(__import__, "os"), "system"), command
         ),
         "torch.load": Call(torch.load, str(hidden), "cpu", Call(__import__, "pickle")),
-        "torch.save": Call(torch.save, 1, str(sentinel)),
         "state": Call(types.SimpleNamespace, state={"x": Call(os.system, command)}),
         "rebuild": Call(
             torch._utils._rebuild_parameter, Call(os.system, command), False, OrderedDict()
