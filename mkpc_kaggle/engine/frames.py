@@ -60,7 +60,8 @@ IMAGES = f"""{ROWS} SELECT batch, digest, name AS image FROM (
 
 @dataclass(frozen=True, eq=False)
 class Results:
-    """The results of a run. ``pairs`` has a row for each pair, ``units`` for each unit of a pair.
+    """The results of a run. ``pairs`` has a row for each pair, ``units`` for each unit of a pair, with the
+    ``key`` of its points in the store.
 
     ``cameras`` has a row for each camera of each model; identical files share a camera, and each
     has a row. ``scenes`` has a row for each batch: numbers of images, cameras, models and points, the mean
@@ -96,24 +97,19 @@ class Results:
         recipe = self.recipe
         units = {unit.name: unit for unit in recipe.units}
         known = self.pairs.set_index("pair")
-        query = f"{ROWS} SELECT units FROM rows WHERE id = ?"
         with Store.read(self.directory) as store:
             for pair in pairs:
                 row: Any = known.loc[pair]
-                (text,) = store.db.execute(query, [pair]).fetchone()
-                used = json.loads(text)
+                used = self.units[self.units["pair"] == pair]
                 columns = "key, data, regions"
-                stored = {
-                    key: more
-                    for key, *more in store.select("points", columns, [each[1] for each in used])
-                }
+                stored = {key: more for key, *more in store.select("points", columns, used["key"])}
                 found = []
                 crops = None
-                for name, key, is_needed, _ in used:
-                    data, regions = stored.get(key, (None, ""))
+                for unit in used.to_dict("records"):
+                    data, regions = stored.get(unit["key"], (None, ""))
                     # Points that the pair does not need are not used.
-                    if is_needed and data is not None:
-                        found.append(UnitResult(units[name], Matches.from_bytes(data)))
+                    if unit["is_needed"] and data is not None:
+                        found.append(UnitResult(units[unit["unit"]], Matches.from_bytes(data)))
                     crops = crops or (regions_of(regions) if regions else None)
                 F = FALLBACK_FUNDAMENTAL if row["own"] is None else np.reshape(row["own"], (3, 3))
                 estimate = nearest_to(F, found, row["inliers"], row["failure"])
@@ -211,7 +207,7 @@ def results_of(store: Store) -> Results:
     }
     return Results(
         pairs,
-        units.drop(columns=["number", "estimate", "key"]),
+        units.drop(columns=["number", "estimate"]),
         camera_table(scenes, images),
         scene_table(scenes, images, about.files),
         about,
