@@ -16,7 +16,7 @@ from pathlib import Path
 from mkpc_kaggle.cores import available_cores
 from mkpc_kaggle.engine.process import ProcessWorker, ThreadWorker
 from mkpc_kaggle.engine.request import Answer, Cause, EstimateJob, Failure, Job, Loaded, MatchJob
-from mkpc_kaggle.engine.worker import Maker, MatchRunner, estimates_runner, scene_runner
+from mkpc_kaggle.engine.worker import MatchRunner, estimates_runner, scene_runner
 from mkpc_kaggle.pipeline.assembly import Assembly
 from mkpc_kaggle.pipeline.stages import Pipeline
 
@@ -138,26 +138,17 @@ class Site:
         # In this process, a second thread would take its time from the thread that matches.
         estimators = 1 if threads else max(1, self._cores // CORES_PER_ESTIMATOR)
         make = partial(estimates_runner, in_process=not threads)
-        self.places = [
-            Place(f"estimates {n}", partial(self._make, "estimates", make), Kind.ESTIMATE)
-            for n in range(estimators)
-        ]
+        worker = partial(self._worker, "estimates", make, self.ring, log)
+        self.places = [Place(f"estimates {n}", worker, Kind.ESTIMATE) for n in range(estimators)]
         self.places += [
             Place("scenes" if n == 0 else f"scenes {n}", self.scene_worker, Kind.SCENE)
             for n in range(self._cores)
         ]
         self.fallback: list[Place] = []
 
-    def _make(self, name: str, make: Maker) -> ThreadWorker:
-        worker = self._worker(name, make, self.ring)
-        worker.log = self._log
-        return worker
-
     def scene_worker(self) -> ThreadWorker:
         """Return a worker for a scene, always in a process, since pycolmap may crash."""
-        worker = ProcessWorker("scene", scene_runner, self.ring)
-        worker.log = self._log
-        return worker
+        return ProcessWorker("scene", scene_runner, self.ring, self._log)
 
     def of(self, kind: Kind) -> list[Place]:
         """Return the places of a kind that are not closed."""
@@ -252,5 +243,5 @@ class LocalSite(Site):
         is_process = self._worker is ProcessWorker
         pipeline = partial(Pipeline.of, assembly)
         make = partial(MatchRunner, pipeline, share=share, is_limited=is_process)
-        worker = partial(self._make, f"mkpc {name}", make)
+        worker = partial(self._worker, f"mkpc {name}", make, self.ring, self._log)
         return Place(name, worker, minibatch=assembly.minibatch)

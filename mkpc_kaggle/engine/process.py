@@ -52,10 +52,16 @@ class ThreadWorker:
     device. Both need processes.
     """
 
-    log: Path | None = None  # of native libraries' text, for a process; None: it is dropped
-
-    def __init__(self, name: str, make: Maker, on_answer: Callable[[], None]) -> None:
-        self.name, self._on_answer = name, on_answer
+    def __init__(
+        self,
+        name: str,
+        make: Maker,
+        on_answer: Callable[[], None],
+        log: Path | None = None,
+    ) -> None:
+        self.name = name
+        self.log = log  # of native libraries' text, for a process; None: it is dropped
+        self._on_answer = on_answer
         self._executor = Executor()
         self._messages: queue.SimpleQueue[Message | None] = queue.SimpleQueue()
         self._answers: queue.SimpleQueue[Answer] = queue.SimpleQueue()
