@@ -31,7 +31,7 @@ from mkpc_kaggle.engine.request import (
     MatchJob,
     SceneJob,
 )
-from mkpc_kaggle.engine.state import DEEPEN, ESTIMATE, PHASES, RAISED, State
+from mkpc_kaggle.engine.state import DEEPEN, ESTIMATE, NEVER, PHASES, RAISED, State
 from mkpc_kaggle.engine.store import Store, points_row
 from mkpc_kaggle.errors import UserError, plural
 from mkpc_kaggle.pipeline.pair import PairMatch, UnitResult
@@ -164,8 +164,10 @@ class Run:
         """Give a job to a free place, or start a worker there if there is one to give."""
         job: Job | None = None
         if place.kind is Kind.MATCH:
-            # Again for each place: the former one's job has changed what is next.
-            work = self.plan(now, len(place.lost))
+            # Again if a former place has taken these pairs, and for a place that continues elsewhere.
+            is_taken = work.match and self.state.busy[work.match.pairs].min() < NEVER
+            if place.lost or is_taken:
+                work = self.plan(now, len(place.lost))
             if work.match is not None:
                 self._show(work.match.phase, work.fit)
                 job = self._match_job(work.match) if place.is_idle else None
