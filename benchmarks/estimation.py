@@ -1,32 +1,27 @@
 """Scores of F by MAGSAC, with a prior on focal lengths, and from cameras, on the same matches.
 
 python -m benchmarks.estimation --train-dir DIR --journals DIR [DIR ...] [--scenes NAME ...]
-    [--estimates NAME ...] [--thresholds PIXELS ...] [--settings TOML ...] [--units A,B ...]
-    [--images 18 24] [--shares 1 0.3 0.12] [--seeds 8]
+    [--estimates NAME ...] [--thresholds PIXELS ...] [--settings TOML ...]
+    [--images 18] [--seeds 8]
 
 Journals, the work directories of `validate`, provide the matches and each pair's own F. A journal
 made with ``--min-covisibility 0`` also has the extra pairs that a scene may add; they are not
 scored.
 
-The unit of evidence is a draw: some or all images of a scene, and a share of their pairs. The
-output has a table for each share. Each row has an estimate's mAA by scene, gain over the first row,
-and CPU seconds per pair or batch. Of several journals, only pairs that all of them have are used,
-so their draws are the same. Intervals resample images if each scene has one draw, and draws
-otherwise; the mean's interval then also resamples scenes. ``--settings`` gives a row for each line
-of a recipe's table [scene], such as "cameras = 'image'". ``--units`` gives a row for each choice of
-the journals' units, such as ``1:sift@1536,1:aliked_lightglue@1024-``; a unit with a minus connects
-images but makes no tracks. F of a pair is then estimated again, from these units. ``--thresholds``
-replaces the rows by two rows for each threshold of MAGSAC.
+The unit of evidence is a draw: some or all images of a scene. The output has a table for each
+journal. Each row has an estimate's mAA by scene, gain over the first row, and CPU seconds per pair
+or batch. Intervals resample images if each scene has one draw, and draws otherwise; the mean's
+interval then also resamples scenes. ``--settings`` gives a row for each line of a recipe's table
+[scene], such as "cameras = 'image'". ``--thresholds`` replaces the rows by two rows for each
+threshold of MAGSAC.
 """
 
 import argparse
 import time
 import tomllib
-from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
-from itertools import product
 from pathlib import Path
 from statistics import mean
 from typing import TypeAlias
@@ -41,8 +36,7 @@ from mkpc_kaggle.evaluation.validate import Difference, error_of, paired_differe
 from mkpc_kaggle.geometry.coordinates import Matrix3, Size
 from mkpc_kaggle.geometry.focal_prior import FocalConfig, FocalPrior, estimate_with_prior
 from mkpc_kaggle.geometry.metrics import PoseError, pair_accuracy
-from mkpc_kaggle.geometry.robust import Estimate, RobustConfig, estimate, sampson_distances
-from mkpc_kaggle.geometry.two_view import robust_costs
+from mkpc_kaggle.geometry.robust import Estimate, RobustConfig, estimate
 from mkpc_kaggle.pipeline.pair import PairMatch
 from mkpc_kaggle.recipe import SceneConfig
 from mkpc_kaggle.scene.densify import extra_pairs
@@ -51,8 +45,6 @@ from mkpc_kaggle.scene.view_graph import BatchImage, BatchPair, tracks_of
 
 MIN_COVISIBILITY = 0.1  # of a scored pair, as in the competition
 MAGSAC = RobustConfig()
-FOCAL = FocalConfig()
-LIGHT = FocalConfig(scale=0.25)  # of the recipe `light`
 # Names of estimates.
 OWN = "own F"
 SCENE = "scene"
@@ -76,29 +68,11 @@ class Known:
 Estimator: TypeAlias = Callable[[Sequence[Known], Sequence[Known]], Sequence[Matrix3 | None]]
 
 
-def with_prior(
-    found: PairMatch, magsac: RobustConfig = MAGSAC, focal: FocalConfig = FOCAL
-) -> Estimate:
+def with_prior(found: PairMatch, magsac: RobustConfig = MAGSAC) -> Estimate:
     """Estimate F with a prior that knows the images' sizes only, not their EXIF."""
     size0, size1 = found.sizes
     priors = (FocalPrior.of_image(size0), FocalPrior.of_image(size1))
-    return estimate_with_prior(found.matches, priors, magsac, focal)
-
-
-def cheapest_of_stages(found: PairMatch) -> Estimate:
-    """Return F of stage 1, of stage 2, or of both: the one with the lowest robust cost on all points."""
-    candidates = [with_prior(found, focal=LIGHT)]
-    for stage in (1, 2):
-        results = tuple(result for result in found.results if result.unit.stage == stage)
-        candidates.append(with_prior(replace(found, results=results), focal=LIGHT))
-
-    def cost(candidate: Estimate) -> float:
-        if not candidate.ok:
-            return np.inf
-        distances = sampson_distances(candidate.matrix, found.matches)
-        return float(robust_costs(distances, LIGHT.scale).sum())
-
-    return min(candidates, key=cost)
+    return estimate_with_prior(found.matches, priors, magsac, FocalConfig())
 
 
 def by_pair(make: Callable[[PairMatch], Estimate]) -> Estimator:
@@ -125,38 +99,8 @@ def by_threshold(pixels: float) -> dict[str, Estimator]:
 PAIR_ESTIMATORS: dict[str, Estimator] = {
     "MAGSAC": by_pair(lambda found: estimate(found.matches, MAGSAC)),
     "prior": by_pair(with_prior),
-    "prior of light": by_pair(partial(with_prior, focal=LIGHT)),
-    "cheapest of stages": by_pair(cheapest_of_stages),
     OWN: lambda pairs, _: [pair.F for pair in pairs],
 }
-
-
-def with_units(known: Known, choice: str) -> Known:
-    """Return the pair with the results of the chosen units, in their order, and F from them.
-
-    Raises :class:`KeyError` for a unit that the journal does not have.
-    """
-    by_name = {result.unit.name: result for result in known.found.results}
-    results = []
-    for name in choice.split(","):
-        result = by_name[name.removesuffix("-")]
-        makes_tracks = result.unit.tracks and not name.endswith("-")
-        results.append(replace(result, unit=replace(result.unit, tracks=makes_tracks)))
-    found = replace(known.found, results=tuple(results))
-    made = with_prior(found)
-    return Known(known.true, found, made.matrix if made.ok else None)
-
-
-def of_units(choice: str, make: Estimator) -> Estimator:
-    """Return the estimator on the matches of the chosen units."""
-    chosen = cache(partial(with_units, choice=choice))
-
-    def estimator(pairs: Sequence[Known], every: Sequence[Known]) -> Sequence[Matrix3 | None]:
-        own = [chosen(pair) for pair in pairs]
-        others = [chosen(pair) for pair in every]
-        return make(own, others)
-
-    return estimator
 
 
 def by_scene(settings: str, pairs: Sequence[Known], every: Sequence[Known]) -> list[Matrix3 | None]:
@@ -199,8 +143,12 @@ def extra_of(pairs: Sequence[Known], every: Sequence[Known], config: SceneConfig
     return [pair for pair in every if frozenset(pair.names) in wanted]
 
 
-def read_journal(directory: Path) -> tuple[str, dict[str, tuple[PairMatch, Matrix3 | None]]]:
-    """Return the recipe's name, and each pair's matches and own F by pair id."""
+# Each pair's matches and own F by pair id
+Journal: TypeAlias = dict[str, tuple[PairMatch, Matrix3 | None]]
+
+
+def read_journal(directory: Path) -> tuple[str, Journal]:
+    """Return the recipe's name and the pairs of a run."""
     with Store.read(directory) as store:
         query = "SELECT name, width, height FROM image"
         sizes = {name: Size(*size) for name, *size in store.db.execute(query)}
@@ -238,22 +186,14 @@ def score(
     return Score(accuracies, [pair.names for pair in pairs], seconds)
 
 
-def drawn(
-    every: Sequence[Known], images: int, share: float, seed: int
-) -> tuple[list[Known], list[Known]]:
-    """Draw random images, or all if ``images`` is 0.
-
-    Return a share of their scored pairs, and all their pairs.
-    """
+def drawn(every: Sequence[Known], images: int, seed: int) -> tuple[list[Known], list[Known]]:
+    """Draw random images, or all if ``images`` is 0. Return their scored pairs, and all of them."""
     generator = np.random.default_rng(seed)
     # Sorted, because the order of a set differs between runs.
     names = sorted({name for pair in every for name in pair.names})
     chosen = set(generator.permutation(names)[: images or None].tolist())
     inside = [pair for pair in every if chosen >= set(pair.names)]
-    scored = [pair for pair in inside if pair.true.covisibility >= MIN_COVISIBILITY]
-    count = round(share * len(scored))
-    kept = np.sort(generator.permutation(len(scored))[:count])
-    return [scored[index] for index in kept], inside
+    return [pair for pair in inside if pair.true.covisibility >= MIN_COVISIBILITY], inside
 
 
 # The score of each estimate, by scene and draw.
@@ -326,14 +266,40 @@ def _seconds(draws: Draws, name: str) -> float:
     return sum(each.seconds for each in scores) / runs
 
 
+def draws_of(
+    scene: TrainScene,
+    journal: Journal,
+    estimators: Mapping[str, Estimator],
+    images: int,
+    seeds: int,
+) -> list[dict[str, Score]]:
+    """Return the scores of each draw of a scene by estimate; none if the journal has other scenes."""
+    every = [Known(true, *journal[true.pair.id]) for true in scene.pairs if true.pair.id in journal]
+    if not every:
+        return []
+    draws = []
+    # All images of a scene make a single draw.
+    for seed in range(seeds if images else 1):
+        pairs, inside = drawn(every, images, seed)
+        draws.append({name: score(make, pairs, inside, scene) for name, make in estimators.items()})
+    return draws
+
+
 def main() -> None:
-    parser = draws_parser(__doc__ or "")
-    parser.add_argument("--thresholds", type=float, nargs="+", default=())
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    add = parser.add_argument
+    add("--train-dir", type=Path, required=True)
+    add("--journals", type=Path, nargs="+", required=True)
+    add("--scenes", nargs="*", default=())
+    add("--images", type=int, default=0, help="of a draw; 0, the default: all")
+    add("--seeds", type=int, default=1, help="draws of each scene")
+    add("--thresholds", type=float, nargs="+", default=())
     # The first is the one that the others are compared with.
     names = [*PAIR_ESTIMATORS, SCENE]
-    parser.add_argument("--estimates", nargs="+", choices=names, default=names)
-    parser.add_argument("--settings", nargs="+", default=[""], metavar="TOML")
-    parser.add_argument("--units", nargs="+", default=(), metavar="A,B")
+    add("--estimates", nargs="+", choices=names, default=names)
+    add("--settings", nargs="+", default=[""], metavar="TOML")
     arguments = parser.parse_args()
     estimators = {name: PAIR_ESTIMATORS[name] for name in arguments.estimates if name != SCENE}
     if arguments.thresholds:
@@ -344,68 +310,16 @@ def main() -> None:
         for line in arguments.settings:
             name = f"{SCENE}, {line}" if line else SCENE
             estimators[name] = partial(by_scene, line)
-    if arguments.units:
-        estimators = {
-            f"{name}, {choice}": of_units(choice, make)
-            for name, make in estimators.items()
-            for choice in arguments.units
-        }
-    compare(estimators, arguments)
-
-
-def draws_parser(description: str) -> argparse.ArgumentParser:
-    """Return a parser of the options that choose journals, scenes and draws."""
-    parser = argparse.ArgumentParser(
-        description=description, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--train-dir", type=Path, required=True)
-    parser.add_argument("--journals", type=Path, nargs="+", required=True)
-    parser.add_argument("--scenes", nargs="*", default=())
-    parser.add_argument(
-        "--images", nargs="+", type=int, default=[0], help="of a draw; 0, the default: all"
-    )
-    parser.add_argument("--shares", nargs="+", type=float, default=[1.0])
-    parser.add_argument(
-        "--seeds", type=int, default=1, help="draws of each number of images and share"
-    )
-    return parser
-
-
-def compare(estimators: Mapping[str, Estimator], arguments: argparse.Namespace) -> None:
-    """Print a table for each share, with a row for each estimator and journal."""
-    journals = {str(directory): read_journal(directory) for directory in arguments.journals}
-    recipes = ", ".join(dict.fromkeys(recipe for recipe, _ in journals.values()))
-    # By share of the pairs, then by scene: the scores of each draw.
-    done: dict[float, dict[str, list[dict[str, Score]]]]
-    done = defaultdict(lambda: defaultdict(list))
     # Pairs without overlap, too: a scene may match them.
     scenes = read_train_side(arguments.train_dir, scenes=arguments.scenes, min_covisibility=0)
-    for scene in scenes:
-        common = []
-        for true in scene.pairs:
-            if all(true.pair.id in journal for _, journal in journals.values()):
-                common.append(true)
-        if not common:  # the journals have other scenes
-            continue
-        known = {}
-        for directory, (_, journal) in journals.items():
-            known[directory] = [Known(true, *journal[true.pair.id]) for true in common]
-        plan = product(arguments.shares, arguments.images, range(arguments.seeds))
-        for share, images, seed in plan:
-            if seed and not images and share == 1:
-                continue  # all images of a scene make a single draw
-            scores = {}
-            for directory, every in known.items():
-                pairs, inside = drawn(every, images, share, seed)
-                for name, make in estimators.items():
-                    row = name if len(journals) == 1 else f"{name} ({directory})"
-                    scores[row] = score(make, pairs, inside, scene)
-            done[share][scene.name].append(scores)
-    for share, draws in done.items():
-        title = f"{recipes}, {share:.0%} of the pairs"
-        # Every draw has the same rows.
-        rows = list(next(iter(draws.values()))[0])
-        print("\n".join(table(title, draws, rows)), "\n", flush=True)
+    for directory in arguments.journals:
+        recipe, journal = read_journal(directory)
+        found = {
+            scene.name: draws_of(scene, journal, estimators, arguments.images, arguments.seeds)
+            for scene in scenes
+        }
+        draws = {name: scores for name, scores in found.items() if scores}
+        print("\n".join(table(recipe, draws, [*estimators])), "\n", flush=True)
 
 
 if __name__ == "__main__":

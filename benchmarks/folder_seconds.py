@@ -1,17 +1,14 @@
 """Seconds of ``reconstruct`` next to pycolmap alone, on the same folders of images.
 
     python -m benchmarks.folder_seconds --images DIR... [--code NAME=CHECKOUT...] [--rounds N]
-        [--mappers incremental global] [--recipe NAME] [--render N [--street]] [--unrelated N]
-        [--sequential]
+        [--mappers incremental global] [--recipe NAME] [--render N]
 
 The programs alternate. Each runs in a separate process with one thread per library. Its seconds are
 CPU seconds of that process and of all processes that it started. pycolmap has its default settings,
 and one SIMPLE_PINHOLE camera per image as ``reconstruct`` has. ``reconstruct`` also writes its
 tables and its report. ``--code`` adds other versions of this package, such as
 ``before=../checkout``. ``--render`` first fills the folder with N rendered photographs of one
-courtyard, taken on a walk; with ``--street``, of a street of 20 houses. ``--unrelated`` adds
-photographs of as many other worlds. With ``--sequential`` pycolmap matches each image with the next
-ten in the order of names, and with images 2, 4, 8, ... places away.
+courtyard, taken on a walk.
 
 The column "MB" has the resident memory of the largest process. The column "mapping" has CPU seconds
 of pycolmap alone, and seconds by the clock of ``reconstruct``, with the start of the process.
@@ -24,19 +21,18 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Sequence
 from dataclasses import dataclass
+from math import nan
 from pathlib import Path
-from typing import NamedTuple
 
 import cv2
 import numpy as np
 
 from mkpc_kaggle import results
 from mkpc_kaggle.demo.camera import look_at
-from mkpc_kaggle.demo.render import Surface, render
-from mkpc_kaggle.demo.world import box, build_world, facade, paint, quad
+from mkpc_kaggle.demo.render import render
+from mkpc_kaggle.demo.world import build_world
 from mkpc_kaggle.errors import UserError
 from mkpc_kaggle.progress import counted
 
@@ -46,17 +42,6 @@ ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_
 RENDERED = (768, 576)  # width and height of a rendered photograph, in pixels
 RENDERED_FOCAL = 0.9  # over the width
 ALONE = "from benchmarks.folder_seconds import pycolmap_alone; pycolmap_alone(*__import__('sys').argv[1:])"
-HOUSES = 20
-HOUSE_M = 20.0  # metres of the street
-NEAR_M = 35.0  # houses further away are not drawn
-
-
-class View(NamedTuple):
-    """What a rendered photograph shows: surfaces, and the camera's position and target in metres."""
-
-    surfaces: Sequence[Surface]
-    position: tuple[float, float, float]
-    target: tuple[float, float, float]
 
 
 @dataclass(frozen=True)
@@ -88,74 +73,21 @@ class Program:
         return used.ru_utime + used.ru_stime, used.ru_maxrss / 1024
 
 
-def write_rendered(folder: Path, count: int, views: Callable[[float], View], prefix: str) -> None:
-    """Write photographs of one camera on a walk; ``views`` has the view at a share of the way."""
+def write_rendered(folder: Path, count: int) -> None:
+    """Write photographs of one camera, of a demo world on a walk from its west to its east side."""
     folder.mkdir(parents=True, exist_ok=True)
+    surfaces, _ = build_world("courtyard")
     focal = RENDERED_FOCAL * RENDERED[0]
     for number in counted(range(count), "rendering", "image"):
-        surfaces, position, target = views(number / max(1, count - 1))
-        picture, _ = render(surfaces, look_at(position, target, focal, RENDERED))
-        cv2.imwrite(str(folder / f"{prefix}{number:04d}.jpg"), picture.round().astype(np.uint8))
-
-
-def courtyard() -> Callable[[float], View]:
-    """Return views of a demo world, on a walk from its west to its east side."""
-    surfaces, _ = build_world("courtyard")
-
-    def view(along: float) -> View:
+        along = number / max(1, count - 1)
         # Back and forth, and up and down, as of a person who looks for views
         position = (18 * along - 9, -4 + 3 * np.sin(9 * along), 1.7 + np.sin(23 * along) ** 2)
-        return View(surfaces, position, (8 * along - 4, 20, 4))
-
-    return view
-
-
-def street() -> Callable[[float], View]:
-    """Return views of a row of houses, along it."""
-    rng = np.random.default_rng(0)
-    houses: list[list[Surface]] = []
-    for number in range(HOUSES):
-        left, right = number * HOUSE_M, (number + 1) * HOUSE_M
-        colour = tuple(rng.integers(60, 205, 3).tolist())
-        height, front = rng.uniform(7, 12), 20 + rng.uniform(0, 3)
-        wall = facade(rng, HOUSE_M, height, colour)
-        ground = paint(rng, HOUSE_M, front, (110, 115, 120), is_stone=True)
-        house = [
-            quad((left, front, height), (right, front, height), (left, front, 0), wall),
-            quad((left, front, 0), (right, front, 0), (left, 0, 0), ground),
-        ]
-        for at in (0.3, 0.7):
-            centre = np.array([left + at * HOUSE_M, front - rng.uniform(2, 5)])
-            house += box(rng, centre, rng.uniform(0.8, 2, 3), rng.uniform(-45, 45))
-        houses.append(house)
-
-    def view(along: float) -> View:
-        x = along * HOUSES * HOUSE_M
-        near = [
-            house
-            for number, house in enumerate(houses)
-            if abs(x - (number + 0.5) * HOUSE_M) < NEAR_M
-        ]
-        position = (x, 5 + 2 * np.sin(40 * along), 1.7 + np.sin(230 * along) ** 2)
-        target = (x + 8 * np.sin(90 * along), 20, 4)
-        return View([surface for house in near for surface in house], position, target)
-
-    return view
+        camera = look_at(position, (8 * along - 4, 20, 4), focal, RENDERED)
+        picture, _ = render(surfaces, camera)
+        cv2.imwrite(str(folder / f"walk{number:04d}.jpg"), picture.round().astype(np.uint8))
 
 
-def other_worlds() -> Callable[[float], View]:
-    """Return views of worlds that have nothing in common."""
-
-    def view(along: float) -> View:
-        surfaces, cameras = build_world("market", seed=1 + round(1e6 * along))
-        camera = cameras[0]
-        ahead = camera.centre + 20 * camera.R[2]
-        return View(surfaces, tuple(camera.centre.tolist()), tuple(ahead.tolist()))
-
-    return view
-
-
-def pycolmap_alone(images: str, out: str, mapper: str, pairing: str = "exhaustive") -> None:
+def pycolmap_alone(images: str, out: str, mapper: str) -> None:
     """Reconstruct a folder with pycolmap's features, matching of pairs and mapper."""
     import pycolmap
 
@@ -172,8 +104,7 @@ def pycolmap_alone(images: str, out: str, mapper: str, pairing: str = "exhaustiv
         device=pycolmap.Device.cpu,
     )
     matching = pycolmap.FeatureMatchingOptions({"num_threads": 1})
-    match = pycolmap.match_sequential if pairing == "sequential" else pycolmap.match_exhaustive
-    match(database, matching, device=pycolmap.Device.cpu)
+    pycolmap.match_exhaustive(database, matching, device=pycolmap.Device.cpu)
     matched = time.process_time()
     if mapper == "incremental":
         options = pycolmap.IncrementalPipelineOptions({"num_threads": 1})
@@ -191,24 +122,20 @@ def facts_of(out: Path) -> tuple[int, float]:
     if (out / "facts.json").exists():
         facts = json.loads((out / "facts.json").read_text())
         return facts["cameras"], facts["mapping"]
-    # Versions 0.7 and 0.8.
-    if (out / "summary.json").exists():
-        scenes = json.loads((out / "summary.json").read_text())["scenes"]
-        return sum(scene["cameras"] for scene in scenes), sum(scene["seconds"] for scene in scenes)
-    # A journal of this version; others are refused.
-    with suppress(UserError):
+    # Another version's journal is refused.
+    try:
         found = results(out / "work").scenes
         return int(found["cameras"].sum()), float(found["seconds"].sum())
-    with (out / "cameras.csv").open() as stream:
-        return len(stream.readlines()) - 1, float("nan")
+    except UserError:
+        lines = (out / "cameras.csv").read_text(encoding="utf-8").splitlines()
+        return len(lines) - 1, nan
 
 
 def programs_of(arguments: argparse.Namespace) -> list[Program]:
     """Return the programs to compare: pycolmap alone first, then this package's versions."""
     python = sys.executable
-    pairing = "sequential" if arguments.sequential else "exhaustive"
     alone = [
-        Program(f"pycolmap, {mapper}", (python, "-c", ALONE, "{images}", "{out}", mapper, pairing))
+        Program(f"pycolmap, {mapper}", (python, "-c", ALONE, "{images}", "{out}", mapper))
         for mapper in arguments.mappers
     ]
     package = (python, "-m", "mkpc_kaggle")
@@ -253,15 +180,9 @@ def main() -> None:
     )
     parser.add_argument("--recipe", default="auto")
     parser.add_argument("--render", type=int, metavar="N", help="into the new folder of --images")
-    parser.add_argument("--street", action="store_true", help="render a street, not a courtyard")
-    parser.add_argument("--unrelated", type=int, default=0, metavar="N", help="added to the folder")
-    parser.add_argument("--sequential", action="store_true", help="pairs of pycolmap alone")
     arguments = parser.parse_args()
     if arguments.render:
-        views = street() if arguments.street else courtyard()
-        write_rendered(arguments.images[0], arguments.render, views, "walk")
-    if arguments.unrelated:
-        write_rendered(arguments.images[0], arguments.unrelated, other_worlds(), "other")
+        write_rendered(arguments.images[0], arguments.render)
     print(
         f"{'folder':<28}{'program':<26}{'round':>6}{'CPU s':>8}{'MB':>7}{'mapping':>9}{'cameras':>9}"
     )

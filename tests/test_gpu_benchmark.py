@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 def test_a_rehearsal_on_the_cpu_runs_every_part(tmp_path):
     command = [sys.executable, "-m", "benchmarks.gpu", "--device", "cpu", "--quick"]
-    command += ["--out", str(tmp_path), "--golden", str(tmp_path / "none")]
+    command += ["--out", str(tmp_path)]
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
     environment.pop("MKPC_WEIGHTS", None)
     done = subprocess.run(
@@ -25,8 +25,7 @@ def test_a_rehearsal_on_the_cpu_runs_every_part(tmp_path):
     found = json.loads((tmp_path / "gpu.json").read_text())
     parts = {part["name"]: part for part in found["parts"]}
     reasons = {part["name"]: part["reason"] for part in parts.values() if not part["rows"]}
-    assert reasons.keys() <= {"golden", "trained"}
-    assert "no golden vectors" in reasons["golden"]
+    assert reasons.keys() <= {"trained"}
     networks = parts["networks"]["rows"]
     # What half precision changes depends on the processor.
     assert [row["device and CPU"] for row in networks] == [1.0] * len(networks)
@@ -35,7 +34,5 @@ def test_a_rehearsal_on_the_cpu_runs_every_part(tmp_path):
     asserts = parts["runs"]["rows"]
     assert [row["verdict"] for row in asserts] == [EXPECTED] * 2, done.stdout
     assert all(row["devices"] == "cpu" and row["errors of calls"] > 0 for row in asserts)
-    text = (tmp_path / "gpu.md").read_text()
-    assert all(f"## {part['title']}" in text for part in parts.values())
     # The runs' images and journals are gone.
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["gpu.json", "gpu.md"]
+    assert [path.name for path in tmp_path.iterdir()] == ["gpu.json"]

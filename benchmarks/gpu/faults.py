@@ -20,7 +20,6 @@ EVENTS = "events.jsonl"  # a line for each call of a matcher
 VICTIM = "victim"  # the file that names the pair of the fault
 VICTIM_NUMBER = 2  # its index in the minibatch that comes first
 ASSERT = "CUDA error: device-side assert triggered"
-REHEARSED_PICTURES = 4  # that a rehearsal of a small memory holds
 
 
 class Fault(StrEnum):
@@ -86,8 +85,6 @@ class FaultyMatcher:
 
     def encode(self, pictures: Sequence[Picture]) -> list[Seen]:
         with self._noted("encode", len(pictures)):
-            if self._fault is Fault.MEMORY and self._device == "cpu":
-                _rehearse_short_memory(len(pictures))
             encodings = self._inner.encode(pictures)
         sums = [zlib.crc32(picture.pixels.tobytes()) for picture in pictures]
         return [Seen(*both) for both in zip(encodings, sums, strict=True)]
@@ -146,11 +143,6 @@ def break_device(device: str) -> NoReturn:
         # An index out of range: the kernel asserts, and the next synchronisation reports it.
         values[torch.tensor([1_000_000], device=device)].sum().item()
     raise RuntimeError(ASSERT)
-
-
-def _rehearse_short_memory(pictures: int) -> None:
-    if pictures > REHEARSED_PICTURES:
-        raise RuntimeError(f"CUDA out of memory. A rehearsal: {pictures} pictures at a time")
 
 
 def _allocated(device: str) -> int:

@@ -1,7 +1,6 @@
-"""The results: parts with rows, written as JSON and as Markdown after each part."""
+"""The results: parts with rows, written as JSON after each part."""
 
 import json
-import sys
 import time
 import traceback
 from collections.abc import Callable, Iterator
@@ -117,56 +116,16 @@ def say(text: str) -> None:
 
 
 def write(directory: Path, machine: Row, parts: list[Part]) -> None:
-    """Write ``gpu.json`` and ``gpu.md``; each replaces its former version at once."""
-    table = {"machine": machine, "parts": [_without_time(part) for part in parts]}
-    _replace(directory / "gpu.json", json.dumps(table, indent=1, default=str) + "\n")
-    _replace(directory / "gpu.md", markdown(machine, parts))
-
-
-def _without_time(part: Part) -> Row:
-    values = asdict(part)
-    del values["until"]  # a time of this process's clock
-    return values
-
-
-def _replace(path: Path, text: str) -> None:
+    """Write ``gpu.json``, which replaces its former version at once."""
+    table = {"machine": machine, "parts": [asdict(part) for part in parts]}
     # A killed benchmark leaves the former version.
-    unfinished = path.with_name(f".{path.name}.part")
-    unfinished.write_text(text, encoding="utf-8")
-    unfinished.replace(path)
-
-
-def markdown(machine: Row, parts: list[Part]) -> str:
-    """Return the machine as a list, and each part as a table."""
-    lines = ["# The package on a GPU", ""]
-    lines += [f"- {name}: {text_of(value)}" for name, value in machine.items()]
-    for part in parts:
-        lines += ["", f"## {part.title}", "", f"{part.status}, {part.seconds:.1f} s"]
-        if part.reason:
-            lines += ["", "```", part.reason, "```"]
-        if part.rows:
-            lines += ["", *table_lines(part.rows)]
-    return "\n".join(lines) + "\n"
-
-
-def table_lines(rows: list[Row]) -> list[str]:
-    """Return rows as a Markdown table; its columns are those of all rows, in order."""
-    columns = list(dict.fromkeys(name for row in rows for name in row))
-    lines = [_cells(columns), _cells(["---"] * len(columns))]
-    lines += [_cells([text_of(row.get(name, "")) for name in columns]) for row in rows]
-    return lines
-
-
-def _cells(texts: list[str]) -> str:
-    return f"| {' | '.join(text.replace('|', '/') for text in texts)} |"
+    unfinished = directory / ".gpu.json.part"
+    unfinished.write_text(json.dumps(table, indent=1, default=str) + "\n", encoding="utf-8")
+    unfinished.replace(directory / "gpu.json")
 
 
 def text_of(value: Any) -> str:
-    """Return a value as the text of a cell: one line, floats with four significant digits."""
+    """Return a value as one line, floats with four significant digits."""
     if isinstance(value, float):
         return f"{value:.4g}"
     return " / ".join(str(value).splitlines())
-
-
-def complain(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)

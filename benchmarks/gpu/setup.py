@@ -1,19 +1,18 @@
 """The options of the benchmark that all parts share, and its machine."""
 
-import os
 import platform
-import subprocess
 import time
 from dataclasses import dataclass
-from importlib import metadata
+from importlib.metadata import version
 from pathlib import Path
 
+import joblib
 import torch
 
 from benchmarks.gpu.record import Row
 from mkpc_kaggle.demo import DemoSet, write_demo
 
-LIBRARIES = ("torch", "numpy", "opencv-python-headless", "opencv-python", "kornia", "pycolmap")
+LIBRARIES = ("torch", "numpy", "kornia", "pycolmap")
 QUICK_SCALE = 0.3  # of the images of the demo set
 
 
@@ -24,7 +23,6 @@ class Setup:
     device: str
     quick: bool
     out: Path
-    golden: Path | None
     weights: tuple[Path, ...]
 
     @property
@@ -56,30 +54,12 @@ def machine(setup: Setup) -> Row:
         facts["GPU"] = properties.name
         facts["GPU memory"] = f"{properties.total_memory / 2**30:.1f} GiB"
         facts["compute capability"] = f"{properties.major}.{properties.minor}"
-        facts["driver"] = _driver()
         facts["CUDA of torch"] = torch.version.cuda
         facts["cuDNN"] = torch.backends.cudnn.version()  # type: ignore[no-untyped-call]
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    facts["cores"] = cores
+    facts["cores"] = joblib.cpu_count()
     facts["Python"] = platform.python_version()
     for name in LIBRARIES:
-        facts[name] = _version(name)
+        facts[name] = version(name)
     facts["quick"] = setup.quick
     facts["time"] = time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime())
-    return {name: value for name, value in facts.items() if value is not None}
-
-
-def _version(name: str) -> str | None:
-    try:
-        return metadata.version(name)
-    except metadata.PackageNotFoundError:
-        return None
-
-
-def _driver() -> str:
-    command = ["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"]
-    try:
-        done = subprocess.run(command, check=True, capture_output=True, text=True, timeout=20)
-    except (OSError, subprocess.SubprocessError) as error:
-        return f"unknown ({type(error).__name__})"
-    return done.stdout.split("\n")[0]
+    return facts
