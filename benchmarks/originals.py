@@ -88,13 +88,14 @@ class Comparison:
     aliked: nn.Module | None
 
     @classmethod
-    def load(cls, matcher: str, weights: WeightStore, make: type[nn.Module]) -> "Comparison":
+    def load(cls, matcher: str, weights: WeightStore, make: type[nn.Module] | None) -> "Comparison":
+        """Load both sides; without ``make``, the published network, the encoders alone."""
         settings = {"complete": COMPLETE, "early": EARLY[matcher]}
         slot = spec_of(matcher, "benchmark").slots[-1]
-        theirs = {
-            kind: published_glue(make, weights, slot, SHAPES[matcher] | of_kind)
-            for kind, of_kind in settings.items()
-        }
+        theirs = {}
+        if make is not None:
+            for kind, of_kind in settings.items():
+                theirs[kind] = published_glue(make, weights, slot, SHAPES[matcher] | of_kind)
         ours = {kind: loaded(matcher, weights, of_kind) for kind, of_kind in settings.items()}
         aliked = kornias_aliked(weights) if matcher == "aliked_lightglue" else None
         return cls(matcher, ours, theirs, aliked)

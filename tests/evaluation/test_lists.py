@@ -41,13 +41,11 @@ def test_a_line_gives_the_images_turns_and_cameras_that_were_written():
     [
         ("a b", "expected 38 fields, name0 name1 .* found 2"),
         # SuperGlue's lists count quarter turns of EXIF.
-        (f"a b 0 4 {EYE}", "expected 0, 1, 2 or 3 quarter turns, found 0 and 4"),
+        (f"a b 0 4 {EYE}", "0, 1, 2 or 3 quarter turns"),
         (
             f"a b 0 0 {EYE}".replace("1 0 0 0 1", "1 0 nan 0 1", 1),
-            "expected finite numbers for K0, K1 and T_0to1",
+            "expected finite numbers",
         ),
-        (f"a b 0 0 {EYE}".replace("1 0 0 0 1", "-1 0 0 0 1", 1), "expected K0 and K1 = fx s cx"),
-        (f"a b 0 0 {EYE}".replace("1 0 0 1 0 1 0 0", "-1 0 0 1 0 1 0 0"), "with R a rotation"),
     ],
 )
 def test_a_malformed_line_is_named_with_what_was_expected(line, expected):
