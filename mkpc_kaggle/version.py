@@ -1,3 +1,3 @@
 """The version: a leaf, so that any layer may say it."""
 
-__version__ = "0.8.0"
+__version__ = "1.0.0"
